@@ -1,0 +1,1 @@
+"""The screens of spherloc: viser app, rerun recorder, command line."""
