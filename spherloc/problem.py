@@ -1,0 +1,195 @@
+"""A localization problem: correspondences, camera, gravity, and the truth where it is known."""
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spherloc.cameras.base import BoolArray, Camera, FloatArray
+from spherloc.errors import ProblemError
+from spherloc.geometry import align_to_down, pose
+
+IntArray = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """N measured 2D-3D correspondences of one query image. Arrays are copied and made read-only."""
+
+    name: str
+    """Shown to people; also the stem of recordings."""
+    camera: Camera
+    """The query camera."""
+    pixels: FloatArray
+    """Measured pixels (N, 2)."""
+    points: FloatArray
+    """Matched map points (N, 3), metres, map frame."""
+    gravity_camera: FloatArray
+    """Unit vector (3,) pointing down in the camera frame (known roll and pitch)."""
+    gravity_map: FloatArray
+    """Unit vector (3,) pointing down in the map frame."""
+    gravity_bound_rad: float = 0.0
+    """Bound on the angular error of ``gravity_camera``."""
+    bound_px: float | None = None
+    """Pixel bound asked for by the scene; None leaves it to the estimator."""
+    truth_cam_from_map: FloatArray | None = None
+    """True pose (3, 4), if known."""
+    truth_inliers: BoolArray | None = None
+    """True inlier mask (N,), if known."""
+    image: Path | None = None
+    """The query image, if there is one."""
+    scene: str = field(default="")
+    """Where the problem comes from: a scene file or a description."""
+
+    def __post_init__(self) -> None:
+        pixels, points = _array(self, "pixels", (-1, 2)), _array(self, "points", (-1, 3))
+        if len(pixels) != len(points):
+            raise ProblemError(f"{self.name}: {len(pixels)} pixels but {len(points)} points; give one point a pixel.")
+        for name in ("gravity_camera", "gravity_map"):
+            _unit(self, name)
+        if not (np.isfinite(self.gravity_bound_rad) and 0.0 <= self.gravity_bound_rad < np.pi / 2):
+            raise ProblemError(f"{self.name}: the gravity bound must lie between 0 and 90 degrees.")
+        if self.bound_px is not None and not (np.isfinite(self.bound_px) and self.bound_px > 0):
+            raise ProblemError(f"{self.name}: bound_px is {self.bound_px}; give a positive number of pixels.")
+        if self.truth_cam_from_map is not None:
+            _check_rotation(self.name, _array(self, "truth_cam_from_map", (3, 4)))
+        if self.truth_inliers is not None:
+            mask = np.array(self.truth_inliers, dtype=bool)
+            if mask.shape != (len(pixels),):
+                raise ProblemError(f"{self.name}: {len(mask)} inlier labels for {len(pixels)} correspondences.")
+            mask.setflags(write=False)
+            object.__setattr__(self, "truth_inliers", mask)
+        usable = int(np.count_nonzero(self.usable))
+        if usable < 2:
+            raise ProblemError(
+                f"{self.name}: {usable} usable of {len(pixels)} correspondences; "
+                "two with pixels that the camera can see are the least that fix a pose."
+            )
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+    @cached_property
+    def _unprojected(self) -> tuple[FloatArray, BoolArray]:
+        bearings, valid = self.camera.unproject(self.pixels)
+        bearings.setflags(write=False)
+        return bearings, valid
+
+    @property
+    def bearings(self) -> FloatArray:
+        """Unit bearings (N, 3), camera frame; NaN where the camera model cannot see the pixel."""
+        return self._unprojected[0]
+
+    @property
+    def usable(self) -> BoolArray:
+        """Mask (N,): the pixel has a bearing. Others are kept and always count as outliers."""
+        return self._unprojected[1]
+
+    @cached_property
+    def pixel_from_bearing(self) -> FloatArray:
+        """(N, 2, 3): maps a unit bearing close to the measured one to its pixel residual, to first order.
+
+        It is the pseudo-inverse of the unprojection's Jacobian, so that estimators measure reprojection
+        error in pixels without knowing the camera model.
+        """
+        out = np.full((len(self), 2, 3), np.nan)
+        jacobian = self.camera.unprojection_jacobian(self.pixels[self.usable])
+        out[self.usable] = np.linalg.pinv(jacobian)
+        out.setflags(write=False)
+        return out
+
+    @cached_property
+    def radians_per_pixel(self) -> FloatArray:
+        """(N,): the largest singular value of the unprojection's Jacobian, rad/px."""
+        out = np.full(len(self), np.nan)
+        jacobian = self.camera.unprojection_jacobian(self.pixels[self.usable])
+        out[self.usable] = np.linalg.norm(jacobian, ord=2, axis=(1, 2))
+        out.setflags(write=False)
+        return out
+
+    @cached_property
+    def aligned(self) -> "AlignedProblem":
+        """The usable correspondences with gravity turned to +y in both frames: what estimators see."""
+        camera_turn, map_turn = align_to_down(self.gravity_camera), align_to_down(self.gravity_map)
+        index = np.flatnonzero(self.usable)
+        arrays = {
+            "bearings": self.bearings[index] @ camera_turn.T,
+            "points": self.points[index] @ map_turn.T,
+            "pixel_from_bearing": self.pixel_from_bearing[index] @ camera_turn.T,
+            "radians_per_pixel": self.radians_per_pixel[index],
+        }
+        arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+        for array in arrays.values():
+            array.setflags(write=False)
+        return AlignedProblem(index=index, count=len(self), camera_turn=camera_turn, map_turn=map_turn, **arrays)
+
+
+@dataclass(frozen=True, eq=False)
+class AlignedProblem:
+    """M usable correspondences in frames whose y axes point down; the unknowns are yaw and translation."""
+
+    index: IntArray
+    """Their places (M,) in the problem."""
+    count: int
+    """N, the number of correspondences in the problem."""
+    camera_turn: FloatArray
+    """Rotation (3, 3), aligned camera frame from camera frame."""
+    map_turn: FloatArray
+    """Rotation (3, 3), aligned map frame from map frame."""
+    bearings: FloatArray
+    """Unit bearings (M, 3)."""
+    points: FloatArray
+    """Map points (M, 3), metres."""
+    pixel_from_bearing: FloatArray
+    """(M, 2, 3), see ``Problem.pixel_from_bearing``."""
+    radians_per_pixel: FloatArray
+    """(M,), rad/px."""
+
+    def unalign_pose(self, cam_from_map: FloatArray) -> FloatArray:
+        """The pose (3, 4) between the problem's own frames, from one between the aligned frames."""
+        rotation = self.camera_turn.T @ cam_from_map[:, :3] @ self.map_turn
+        return pose(rotation, self.camera_turn.T @ cam_from_map[:, 3])
+
+    def align_pose(self, cam_from_map: FloatArray) -> FloatArray:
+        """The inverse of ``unalign_pose``."""
+        rotation = self.camera_turn @ cam_from_map[:, :3] @ self.map_turn.T
+        return pose(rotation, self.camera_turn @ cam_from_map[:, 3])
+
+    def full_mask(self, mask: BoolArray) -> BoolArray:
+        """A mask (M,) over the usable correspondences as one (N,) over all."""
+        full = np.zeros(self.count, dtype=bool)
+        full[self.index[mask]] = True
+        return full
+
+
+def _array(problem: Problem, name: str, shape: tuple[int, int]) -> FloatArray:
+    array = np.array(getattr(problem, name), dtype=np.float64)
+    if array.ndim != 2 or array.shape[1] != shape[1] or (shape[0] >= 0 and array.shape[0] != shape[0]):
+        rows = "N" if shape[0] < 0 else shape[0]
+        raise ProblemError(f"{problem.name}: {name} has shape {array.shape}; give ({rows}, {shape[1]}).")
+    if not np.isfinite(array).all():
+        row = int(np.argwhere(~np.isfinite(array))[0, 0])
+        raise ProblemError(f"{problem.name}: {name} row {row} is not a finite number; correct or remove it.")
+    array.setflags(write=False)
+    object.__setattr__(problem, name, array)
+    return array
+
+
+def _unit(problem: Problem, name: str) -> None:
+    vector = np.array(getattr(problem, name), dtype=np.float64)
+    if vector.shape != (3,) or not np.isfinite(vector).all():
+        raise ProblemError(f"{problem.name}: {name} must be three finite numbers.")
+    length = float(np.linalg.norm(vector))
+    if abs(length - 1.0) > 1e-3:
+        raise ProblemError(f"{problem.name}: {name} has length {length:.4g}; give a unit vector pointing down.")
+    vector /= length
+    vector.setflags(write=False)
+    object.__setattr__(problem, name, vector)
+
+
+def _check_rotation(name: str, cam_from_map: FloatArray) -> None:
+    rotation = cam_from_map[:, :3]
+    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) or np.linalg.det(rotation) < 0:
+        raise ProblemError(f"{name}: the left 3x3 block of the true cam_from_map is no rotation matrix.")

@@ -1,0 +1,154 @@
+"""One run, one frozen ``Trace``: what an estimator computed at every stage, and nothing to draw."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from types import MappingProxyType
+from typing import Any, ClassVar, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spherloc.cameras.base import BoolArray, FloatArray
+from spherloc.problem import Problem
+
+IndexArray = NDArray[np.int32]
+StageT = TypeVar("StageT", bound="Stage")
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """Base of every stage. Arrays become read-only."""
+
+    kind: ClassVar[str]
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if isinstance(value, np.ndarray):
+                value.setflags(write=False)
+
+
+@dataclass(frozen=True, eq=False)
+class RansacStage(Stage):
+    """Algorithm 1: the hypotheses that improved on the best one so far. J of them."""
+
+    kind = "ransac"
+    iterations: int
+    """Samples drawn."""
+    improved_at: IndexArray
+    """(J,) iteration of each improvement."""
+    samples: IndexArray
+    """(J, 2) indices of the two sampled correspondences in the problem."""
+    cam_from_map: FloatArray
+    """(J, 3, 4) hypotheses."""
+    inlier_masks: BoolArray
+    """(J, N) correspondences within the bound."""
+
+
+@dataclass(frozen=True, eq=False)
+class YawStage(Stage):
+    """Algorithm 2, lines 3-13: one arc of feasible yaw a root and pair, and where most of them overlap.
+
+    A arcs; the yaw is the one of the gravity-aligned frames. Arc ends satisfy -pi <= lo < pi and
+    lo <= hi <= lo + 2 pi, so an arc with hi > pi wraps.
+    """
+
+    kind = "yaw"
+    pairs_total: int
+    """Pairs of usable correspondences, K."""
+    pairs: IndexArray
+    """(A, 2) indices of the arc's two correspondences in the problem."""
+    lo_rad: FloatArray
+    """(A,) lower ends."""
+    hi_rad: FloatArray
+    """(A,) upper ends."""
+    curve_yaw_rad: FloatArray
+    """(B,) yaws, ascending from -pi, at which the overlap count changes."""
+    curve_count: IndexArray
+    """(B,) arcs that cover the yaws from ``curve_yaw_rad[b]`` to the next."""
+    best_rad: tuple[float, float]
+    """The interval covered most often."""
+    yaw_rad: float
+    """Its middle: the estimated yaw."""
+    clique: IndexArray
+    """Indices of the arcs that cover ``yaw_rad``: the maximum clique of the rotation graph (Eq. 37)."""
+
+
+@dataclass(frozen=True, eq=False)
+class TranslationStage(Stage):
+    """Algorithm 2, lines 14-23: one ball of feasible camera positions a pair, and their maximum clique.
+
+    M balls, in the gravity-aligned map frame.
+    """
+
+    kind = "translation"
+    candidates: int
+    """Pairs in the rotation clique, before thinning."""
+    rule: str
+    """The rule by which candidates became balls, in words with this run's numbers."""
+    pairs: IndexArray
+    """(M, 2) indices of the ball's two correspondences in the problem."""
+    centres_m: FloatArray
+    """(M, 3) camera positions in the aligned map frame."""
+    radii_m: FloatArray
+    """(M,) radii."""
+    edges: IndexArray
+    """(E, 2) overlapping balls (Eq. 38)."""
+    clique: IndexArray
+    """Indices of the balls in the maximum clique."""
+    proven: bool
+    """Whether the clique was proven to be maximum (false if the search reached its limit)."""
+    cam_from_map: FloatArray
+    """(3, 4) pose from the yaw and the clique, before refinement."""
+
+
+@dataclass(frozen=True, eq=False)
+class RefinementStage(Stage):
+    """Gauss-Newton on the sphere. I + 1 states, the first one being the initial pose."""
+
+    kind = "refinement"
+    dof: int
+    """6, or 4 (yaw and translation) where too few inliers would fix all six."""
+    cam_from_map: FloatArray
+    """(I + 1, 3, 4) poses."""
+    cost_px2: FloatArray
+    """(I + 1,) mean squared residual of the inliers at each state, px^2."""
+    inlier_counts: IndexArray
+    """(I + 1,) correspondences within the bound at each state."""
+
+
+@dataclass(frozen=True, eq=False)
+class Trace:
+    """Everything about one run. N correspondences."""
+
+    problem: Problem
+    """What was solved."""
+    estimator: str
+    """Registered name."""
+    options: Any
+    """The estimator's frozen options dataclass, resolved: what really was used."""
+    seed: int
+    """Seed of every random draw."""
+    versions: Mapping[str, str]
+    """Versions of spherloc, python and the numeric libraries."""
+    stages: tuple[Stage, ...]
+    """In the order in which they ran."""
+    timings_ms: Mapping[str, float]
+    """Wall time a stage, and ``total``."""
+    cam_from_map: FloatArray | None
+    """Estimated pose (3, 4), or None if the data allow none."""
+    inlier_mask: BoolArray
+    """(N,) correspondences within the bound of the estimated pose."""
+    message: str
+    """The outcome in one sentence."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "versions", MappingProxyType(dict(self.versions)))
+        object.__setattr__(self, "timings_ms", MappingProxyType(dict(self.timings_ms)))
+        for array in (self.cam_from_map, self.inlier_mask):
+            if array is not None:
+                array.setflags(write=False)
+
+    def stage(self, kind: type[StageT]) -> StageT | None:
+        """The stage of that type, or None if the run did not reach it."""
+        return next((stage for stage in self.stages if isinstance(stage, kind)), None)

@@ -1,0 +1,138 @@
+"""The few neutral things that a painter can draw. Both the page and the recording draw these and nothing else.
+
+Scene positions are metres in the gravity-aligned map frame: y points down. Colours are sRGB bytes.
+"""
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+ColorArray = NDArray[np.uint8]
+
+
+@dataclass(frozen=True, eq=False)
+class Primitive:
+    """Base of all scene primitives."""
+
+    name: str
+    """Unique path within a picture, such as "camera/estimate"; stable over steps and runs."""
+    layer: str
+    """The layer that a person switches on and off; one of ``style.LAYERS``."""
+
+
+@dataclass(frozen=True, eq=False)
+class Points(Primitive):
+    """Dots."""
+
+    positions: FloatArray
+    """(N, 3)."""
+    colors: ColorArray
+    """(N, 3)."""
+    radius_m: float
+    """Radius of every dot."""
+    ids: NDArray[np.int64] | None = None
+    """(N,) index of the correspondence that each dot shows, if it shows one."""
+
+
+@dataclass(frozen=True, eq=False)
+class Segments(Primitive):
+    """Straight lines."""
+
+    points: FloatArray
+    """(N, 2, 3) ends."""
+    colors: ColorArray
+    """(N, 3)."""
+    width_px: float
+    """Thickness on the screen."""
+
+
+@dataclass(frozen=True, eq=False)
+class Balls(Primitive):
+    """Translucent spheres."""
+
+    centers: FloatArray
+    """(N, 3)."""
+    radii_m: FloatArray
+    """(N,)."""
+    colors: ColorArray
+    """(N, 3)."""
+    opacity: float
+    """0 to 1, of every ball."""
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh(Primitive):
+    """A triangle mesh of one colour."""
+
+    vertices: FloatArray
+    """(V, 3)."""
+    faces: NDArray[np.int64]
+    """(F, 3)."""
+    color: tuple[int, int, int]
+    opacity: float
+    """0 to 1."""
+
+
+SceneItem = Points | Segments | Balls | Mesh
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """One line of a chart."""
+
+    label: str
+    x: FloatArray
+    """(K,) ascending."""
+    y: FloatArray
+    """(K,)."""
+    color: tuple[int, int, int]
+    kind: Literal["line", "step", "marker"] = "line"
+    """"step" holds y[k] from x[k] to x[k + 1]; "marker" is an upright line at x[0] from y = 0 to y[0]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Chart:
+    """A plot."""
+
+    name: str
+    """Unique in a picture, such as "yaw"."""
+    title: str
+    x_label: str
+    y_label: str
+    curves: tuple[Curve, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """Rows of text and numbers."""
+
+    name: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[Any, ...], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """One stop on the timeline of a run."""
+
+    key: str
+    """Stable name, such as "yaw-arcs" or "sample-3"."""
+    title: str
+    """A few words."""
+    caption: str
+    """Two sentences with this run's own numbers, plain text."""
+    equation: str
+    """The equation that this step computes, with its number in the paper, plain text; may be empty."""
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """What a step of a run looks like."""
+
+    step: Step
+    scene: tuple[SceneItem, ...]
+    charts: tuple[Chart, ...]
+    tables: tuple[Table, ...]

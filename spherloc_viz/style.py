@@ -1,0 +1,36 @@
+"""One colour means one thing, in the page, in the recording and in the documentation."""
+
+RGB = tuple[int, int, int]
+
+INLIER: RGB = (0, 158, 115)
+OUTLIER: RGB = (213, 70, 60)
+CLIQUE: RGB = (240, 180, 30)
+ESTIMATE: RGB = (40, 120, 220)
+TRUTH: RGB = (160, 130, 210)
+SAMPLE: RGB = (230, 90, 190)
+UNDECIDED: RGB = (140, 146, 156)
+SPHERE: RGB = (170, 190, 215)
+
+LEGEND: tuple[tuple[RGB, str], ...] = (
+    (INLIER, "inlier"),
+    (OUTLIER, "outlier"),
+    (CLIQUE, "maximum clique"),
+    (SAMPLE, "sampled pair"),
+    (ESTIMATE, "estimate"),
+    (TRUTH, "truth"),
+    (UNDECIDED, "not decided yet"),
+)
+"""What each colour means, in the order in which the legend shows it."""
+
+LAYERS: tuple[str, ...] = ("map", "cameras", "sphere", "rays", "yaw ring", "balls")
+"""Layers of the canvas that can be switched on and off."""
+
+MAX_DRAWN_RAYS = 600
+MAX_DRAWN_ARCS = 1500
+MAX_DRAWN_BALLS = 300
+MAX_DRAWN_EDGES = 2500
+
+
+def css(color: RGB) -> str:
+    """The colour as "#rrggbb"."""
+    return "#{:02x}{:02x}{:02x}".format(*color)
