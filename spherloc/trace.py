@@ -62,10 +62,8 @@ class YawStage(Stage):
     """(A,) lower ends."""
     hi_rad: FloatArray
     """(A,) upper ends."""
-    curve_yaw_rad: FloatArray
-    """(B,) yaws, ascending from -pi, at which the overlap count changes."""
-    curve_count: IndexArray
-    """(B,) arcs that cover the yaws from ``curve_yaw_rad[b]`` to the next."""
+    overlap: IndexArray
+    """(1440,) the most arcs that cover any one yaw in each quarter of a degree, from -pi upwards."""
     best_rad: tuple[float, float]
     """The interval covered most often."""
     yaw_rad: float

@@ -1,0 +1,151 @@
+"""Checks that every camera model shares: calibration values, ``[camera]`` tables and coordinate arrays."""
+
+import reprlib
+from collections.abc import Mapping
+from dataclasses import fields
+from math import inf, isfinite
+from numbers import Integral, Real
+from typing import Any, TypeVar
+
+import numpy as np
+
+from spherloc.cameras.base import FloatArray
+from spherloc.errors import CalibrationError, ProblemError
+
+MAX_SIDE_PX = 100_000
+"""Largest width or height: beyond any panorama, so that a corrupt size cannot exhaust the memory."""
+
+C = TypeVar("C")
+
+
+def whole_pixels(key: str, value: Any) -> int:
+    """An image side in pixels; raises ``CalibrationError`` if it is not a whole number from 1 to ``MAX_SIDE_PX``."""
+    if not isinstance(value, Integral) or isinstance(value, bool) or not 1 <= value <= MAX_SIDE_PX:
+        raise _bad(key, value, f"give a whole number of pixels from 1 to {MAX_SIDE_PX}")
+    return int(value)
+
+
+def finite(key: str, value: Any) -> float:
+    """A finite number; raises ``CalibrationError`` otherwise."""
+    number = _as_float(value)
+    if number is None or not isfinite(number):
+        raise _bad(key, value, "give a finite number")
+    return number
+
+
+def positive(key: str, value: Any) -> float:
+    """A finite number greater than zero; raises ``CalibrationError`` otherwise."""
+    number = _as_float(value)
+    if number is None or not 0 < number < inf:
+        raise _bad(key, value, "give a finite number greater than zero")
+    return number
+
+
+def coefficients(key: str, value: Any, names: str) -> tuple[float, ...]:
+    """As many finite numbers as ``names`` ("k1, k2") lists; raises ``CalibrationError`` otherwise."""
+    count = len(names.split(","))
+    numbers = [_as_float(item) for item in value] if isinstance(value, list | tuple | np.ndarray) else []
+    if len(numbers) != count or not all(number is not None and isfinite(number) for number in numbers):
+        raise _bad(key, value, f"give a list of {count} finite numbers, {names}")
+    return tuple(number for number in numbers if number is not None)
+
+
+def check_lens(camera: Any, coefficient_names: str) -> None:
+    """Check and normalise, in place, the fields of a frozen fisheye camera while it is being constructed.
+
+    These are width, height, fx, fy, cx, cy and distortion; raises ``CalibrationError`` for an unusable value.
+    """
+    checked: dict[str, Any] = {key: whole_pixels(key, getattr(camera, key)) for key in ("width", "height")}
+    checked |= {key: positive(key, getattr(camera, key)) for key in ("fx", "fy")}
+    checked |= {key: finite(key, getattr(camera, key)) for key in ("cx", "cy")}
+    checked["distortion"] = coefficients("distortion", camera.distortion, coefficient_names)
+    for key, value in checked.items():
+        object.__setattr__(camera, key, value)
+
+
+def check_sees_image(camera: Any, rim: float) -> None:
+    """Raise ``CalibrationError`` for a fisheye camera that can unproject no pixel of its own image.
+
+    ``rim`` is the distorted radius, in focal lengths, of the last direction that the model can invert.
+    """
+    if not 1.0 <= rim * min(camera.fx, camera.fy) < inf:
+        raise CalibrationError(
+            f"camera key 'distortion' is {_show(camera.distortion)}, which cannot be inverted one pixel away from the "
+            "principal point: check the order and the signs of the coefficients."
+        )
+    nearest = [[min(max(camera.cx, 0.0), camera.width), min(max(camera.cy, 0.0), camera.height)]]
+    if not camera.unproject(np.array(nearest))[1][0]:
+        raise CalibrationError(
+            f"camera keys 'cx', 'cy' are {camera.cx:g}, {camera.cy:g}, from where the lens reaches no pixel of the "
+            f"{camera.width} x {camera.height} image: give the principal point in pixels."
+        )
+
+
+def camera_from_keys(cls: type[C], table: Any, where: str) -> C:
+    """Build the camera ``cls`` from a table whose keys are exactly ``model`` and the fields of ``cls``.
+
+    Raises ``CalibrationError``, one sentence that starts with ``where``, for an unknown, missing or bad value.
+    """
+    if not isinstance(table, Mapping):
+        raise CalibrationError(f"{where}: the camera is {_show(table)}: give a table of keys and values.")
+    model: str = getattr(cls, "model", "")
+    known = ["model", *(field.name for field in fields(cls))]  # pyright: ignore[reportArgumentType]
+    for key in table:
+        if key not in known:
+            raise CalibrationError(
+                f"{where}: camera key {_show(key)} is unknown to the model '{model}': "
+                f"remove it, its keys are {', '.join(known)}."
+            )
+    for key in known:
+        if key not in table:
+            raise CalibrationError(f"{where}: camera key '{key}' is missing: add it, the model '{model}' needs it.")
+    if table["model"] != model:
+        raise CalibrationError(f"{where}: camera key 'model' is {_show(table['model'])}: give '{model}' here.")
+    return build(cls, where, **{key: value for key, value in table.items() if key != "model"})
+
+
+def build(cls: type[C], where: str, **values: Any) -> C:
+    """``cls(**values)`` whose ``CalibrationError`` starts with ``where``."""
+    try:
+        return cls(**values)
+    except CalibrationError as error:
+        raise CalibrationError(f"{where}: {error}") from None
+
+
+def camera_to_table(camera: Any) -> dict[str, Any]:
+    """The ``[camera]`` table of a camera: plain numbers and lists, ready for TOML or JSON."""
+    table: dict[str, Any] = {"model": camera.model}
+    for field in fields(camera):
+        value = getattr(camera, field.name)
+        table[field.name] = list(value) if isinstance(value, tuple) else value
+    return table
+
+
+def rows(name: str, array: Any, columns: int) -> FloatArray:
+    """``array`` as float64 (N, columns); raises ``ProblemError`` if it is not such an array of real numbers."""
+    try:
+        given = np.asarray(array)
+        if given.dtype.kind not in "fiu":
+            raise ProblemError(f"{name} hold {given.dtype} values: give an array of real numbers.")
+    except ValueError:
+        raise ProblemError(f"{name} have rows of different lengths: give an array of shape (N, {columns}).") from None
+    if given.ndim != 2 or given.shape[1] != columns:
+        raise ProblemError(f"{name} have the shape {given.shape}: give an array of shape (N, {columns}).")
+    return given.astype(np.float64, copy=False)
+
+
+def _as_float(value: Any) -> float | None:
+    if not isinstance(value, Real) or isinstance(value, bool):
+        return None
+    try:
+        return float(value)
+    except OverflowError:
+        return inf
+
+
+def _bad(key: str, value: Any, remedy: str) -> CalibrationError:
+    return CalibrationError(f"camera key '{key}' is {_show(value)}: {remedy}.")
+
+
+def _show(value: Any) -> str:
+    return " ".join(reprlib.repr(value).split())

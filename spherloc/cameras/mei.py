@@ -1,0 +1,221 @@
+"""MEI omnidirectional camera (Sec. IV-B.2, Eq. 8-14), with the tangential terms p1, p2 that the paper leaves out.
+
+A bearing is moved by xi along z and divided by its new depth (Eq. 11-12), which gives an undistorted point (x, y) of
+the plane; the distortion (Eq. 8) moves that point. Both steps can fold. With xi > 1 the plane point turns back where
+z = -1/xi, and the distortion turns back where its Jacobian stops being positive definite. That Jacobian is the Hessian
+of a potential, since it is symmetric: on a disc where it is positive definite the distortion is the gradient of a strictly
+convex function and therefore one to one. ``max_radius`` is the radius of the largest such disc that can be
+guaranteed, and all that is valid lies in it.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from math import atan, hypot, sqrt
+from typing import Any, ClassVar, Self
+
+import numpy as np
+
+from spherloc.cameras import _checks
+from spherloc.cameras._radial import RIM_MARGIN, InverseTable, first_positive_root
+from spherloc.cameras.base import BoolArray, FloatArray
+from spherloc.errors import CalibrationError
+
+_FARTHEST = 1e4
+"""Largest ``max_radius``: with xi <= 1 the plane has no end, but no image is ten thousand focal lengths wide."""
+_TABLE_NODES = 1025
+_NEWTON_STEPS = 3
+"""Enough from a table of this size for the tangential terms of real lenses."""
+_DAMPED_STEPS = 60
+_TOLERANCE = 1e-13
+"""Residual of Eq. 8, relative to 1 + the distorted radius, that counts as solved."""
+
+
+@dataclass(frozen=True)
+class Mei:
+    """Unified omnidirectional camera with radial and tangential distortion."""
+
+    model: ClassVar[str] = "mei"
+
+    width: int
+    """Image width in pixels."""
+    height: int
+    """Image height in pixels."""
+    fx: float
+    """Generalised focal length along x in pixels: KITTI-360's gamma1."""
+    fy: float
+    """Generalised focal length along y in pixels: KITTI-360's gamma2."""
+    cx: float
+    """Principal point, x in pixels; the centre of the top-left pixel is 0.5."""
+    cy: float
+    """Principal point, y in pixels; the centre of the top-left pixel is 0.5."""
+    xi: float
+    """Offset of the projection centre from the centre of the unit sphere, above -1; 0 is a pinhole, 1 stereographic."""
+    distortion: tuple[float, float, float, float]
+    """k1, k2 (radial) and p1, p2 (tangential), without unit."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "xi", _checks.finite("xi", self.xi))
+        if self.xi <= -1.0:
+            raise CalibrationError(f"camera key 'xi' is {self.xi:g}, which sees nothing: give a number above -1.")
+        _checks.check_lens(self, "k1, k2, p1, p2")
+        with np.errstate(all="ignore"):
+            _checks.check_sees_image(self, self._reach)
+
+    @cached_property
+    def max_radius(self) -> float:
+        """Radius sqrt(x^2 + y^2) in the undistorted plane below which the model is one to one."""
+        sphere = 1.0 / sqrt(self.xi**2 - 1.0) if self.xi > 1.0 else np.inf
+        return min(self._fold_radius, sphere * (1.0 - RIM_MARGIN))
+
+    @cached_property
+    def _fold_radius(self) -> float:
+        """Radius below which the distortion alone is one to one.
+
+        The radial distortion has the Hessian eigenvalues 1 + 3 k1 r^2 + 5 k2 r^4 and 1 + k1 r^2 + k2 r^4, and the
+        tangential one subtracts at most 6 r hypot(p1, p2) from them.
+        """
+        k1, k2, p1, p2 = self.distortion
+        tangential = -6.0 * hypot(p1, p2)
+        along = first_positive_root([tangential, 3.0 * k1, 0.0, 5.0 * k2])
+        across = first_positive_root([tangential, k1, 0.0, k2])
+        return min(along, across, _FARTHEST) * (1.0 - RIM_MARGIN)
+
+    def project(self, points: FloatArray) -> tuple[FloatArray, BoolArray]:
+        """Pixels (N, 2) of camera-frame points (N, 3) in metres, and the mask (N,) of directions that are valid.
+
+        Valid is what lies before both folds (see the module's text); other pixels are NaN.
+        Raises ``ProblemError`` for a wrong shape.
+        """
+        px, py, pz = _checks.rows("points", points, 3).T
+        with np.errstate(all="ignore"):
+            norm = np.hypot(np.hypot(px, py), pz)
+            depth = pz + self.xi * norm
+            x, y = px / depth, py / depth
+            valid = (depth > 0.0) & (norm + self.xi * pz > 0.0) & (norm < np.inf) & (np.hypot(x, y) < self.max_radius)
+            x, y = self._distort(x, y)
+            pixels = np.column_stack([self.cx + self.fx * x, self.cy + self.fy * y])
+        pixels[~valid] = np.nan
+        return pixels, valid
+
+    def unproject(self, pixels: FloatArray) -> tuple[FloatArray, BoolArray]:
+        """Unit bearings (N, 3) of pixels (N, 2), and the mask (N,) of pixels that the lens reaches (Eq. 8, 13, 14).
+
+        Raises ``ProblemError`` for a wrong shape.
+        """
+        with np.errstate(all="ignore"):
+            x, y = self._undistort(pixels)
+            s = x * x + y * y
+            root = np.sqrt(1.0 + s * (1.0 - self.xi**2))
+            scale = (self.xi + root) / (1.0 + s)
+            # Eq. 14 has z = scale - xi; this form of it does not cancel for a large xi.
+            bearings = np.column_stack([scale * x, scale * y, (root - self.xi * s) / (1.0 + s)])
+        return bearings, ~np.isnan(x)
+
+    def unprojection_jacobian(self, pixels: FloatArray) -> FloatArray:
+        """d bearing / d pixel (N, 3, 2), per pixel; NaN where ``unproject`` is invalid."""
+        with np.errstate(all="ignore"):
+            x, y = self._undistort(pixels)
+            s = x * x + y * y
+            root = np.sqrt(1.0 + s * (1.0 - self.xi**2))
+            scale = (self.xi + root) / (1.0 + s)
+            # d scale / d s, twice, since s changes by 2 (x dx + y dy)
+            slope = ((1.0 - self.xi**2) / root - 2.0 * scale) / (1.0 + s)
+            lift = np.empty((len(x), 3, 2))
+            lift[:, 0, 0] = scale + slope * x * x
+            lift[:, 0, 1] = lift[:, 1, 0] = slope * x * y
+            lift[:, 1, 1] = scale + slope * y * y
+            lift[:, 2, 0] = slope * x
+            lift[:, 2, 1] = slope * y
+            xx, xy, yy = self._hessian(x, y)
+            undistort = np.stack([yy, -xy, -xy, xx], axis=-1).reshape(-1, 2, 2) / (xx * yy - xy * xy)[:, None, None]
+            return lift @ undistort / (self.fx, self.fy)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The ``[camera]`` table: model, width, height, fx, fy, cx, cy, xi, distortion."""
+        return _checks.camera_to_table(self)
+
+    @classmethod
+    def from_dict(cls, table: dict[str, Any], where: str) -> Self:
+        """Build from a ``[camera]`` table; raises ``CalibrationError`` (see ``Camera.from_dict``)."""
+        return _checks.camera_from_keys(cls, table, where)
+
+    @cached_property
+    def _inverse(self) -> InverseTable:
+        k1, k2, _, _ = self.distortion
+        # Nodes at equal angles, since the disc may be without end.
+        nodes = np.tan(np.linspace(0.0, atan(self.max_radius), _TABLE_NODES))
+        return InverseTable(lambda r: r * (1.0 + r * r * (k1 + k2 * r * r)), nodes)
+
+    @cached_property
+    def _reach(self) -> float:
+        """No valid point has a larger distorted radius: the tangential terms add at most 3 r^2 hypot(p1, p2)."""
+        return self._inverse.end + 3.0 * self.max_radius**2 * hypot(*self.distortion[2:])
+
+    def _distort(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Eq. 8 with p1, p2: where the lens moves the points (x, y) of the plane, each (N,)."""
+        k1, k2, p1, p2 = self.distortion
+        s = x * x + y * y
+        # Both tangential terms share this factor: 2 p1 x y + p2 (s + 2 x^2) = p2 s + 2 x (p2 x + p1 y).
+        common = 1.0 + s * (k1 + k2 * s) + 2.0 * (p2 * x + p1 * y)
+        return x * common + p2 * s, y * common + p1 * s
+
+    def _hessian(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Entries xx, xy, yy, each (N,), of the symmetric Jacobian of ``_distort``."""
+        k1, k2, p1, p2 = self.distortion
+        s = x * x + y * y
+        common = 1.0 + s * (k1 + k2 * s) + 2.0 * (p2 * x + p1 * y)
+        bend = 2.0 * (k1 + 2.0 * k2 * s)
+        xx = common + x * (bend * x + 4.0 * p2)
+        yy = common + y * (bend * y + 4.0 * p1)
+        return xx, bend * x * y + 2.0 * (p1 * x + p2 * y), yy
+
+    def _undistort(self, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Solve Eq. 8 with p1, p2 for the undistorted points x, y of pixels (N, 2), each (N,); NaN beyond the rim."""
+        u, v = _checks.rows("pixels", pixels, 2).T
+        x0, y0 = (u - self.cx) / self.fx, (v - self.cy) / self.fy
+        radius = np.hypot(x0, y0)
+        shrink = np.where(radius > 0.0, self._inverse(radius) / radius, 1.0)
+        x, y = shrink * x0, shrink * y0
+        for _ in range(_NEWTON_STEPS):
+            step_x, step_y, _ = self._newton_step(x, y, x0, y0)
+            x, y = x + step_x, y + step_y
+        hard = ~self._is_solution(x, y, x0, y0) & (radius < self._reach)
+        if hard.any():
+            start_x, start_y = shrink[hard] * x0[hard], shrink[hard] * y0[hard]
+            x[hard], y[hard] = self._undistort_damped(start_x, start_y, x0[hard], y0[hard])
+        seen = self._is_solution(x, y, x0, y0) & (np.hypot(x, y) < self.max_radius)
+        x[~seen] = y[~seen] = np.nan
+        return x, y
+
+    def _undistort_damped(
+        self, x: FloatArray, y: FloatArray, x0: FloatArray, y0: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Newton's method kept in the disc and shortened until it improves: for pixels near a fold or past the rim."""
+        share = np.ones_like(x)
+        for _ in range(_DAMPED_STEPS):
+            step_x, step_y, residual = self._newton_step(x, y, x0, y0)
+            new_x, new_y = x + share * step_x, y + share * step_y
+            inward = np.minimum(1.0, self._fold_radius / np.hypot(new_x, new_y))
+            new_x, new_y = inward * new_x, inward * new_y
+            better = self._residual(new_x, new_y, x0, y0) < residual
+            x, y = np.where(better, new_x, x), np.where(better, new_y, y)
+            share = np.where(better, np.minimum(1.0, 2.0 * share), 0.25 * share)
+        return x, y
+
+    def _residual(self, x: FloatArray, y: FloatArray, x0: FloatArray, y0: FloatArray) -> FloatArray:
+        dx, dy = self._distort(x, y)
+        return np.hypot(dx - x0, dy - y0)
+
+    def _newton_step(
+        self, x: FloatArray, y: FloatArray, x0: FloatArray, y0: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        dx, dy = self._distort(x, y)
+        dx, dy = x0 - dx, y0 - dy
+        xx, xy, yy = self._hessian(x, y)
+        determinant = xx * yy - xy * xy
+        return (yy * dx - xy * dy) / determinant, (xx * dy - xy * dx) / determinant, np.hypot(dx, dy)
+
+    def _is_solution(self, x: FloatArray, y: FloatArray, x0: FloatArray, y0: FloatArray) -> BoolArray:
+        """Whether (x, y) solves Eq. 8 before the fold, where there is no second solution."""
+        small = self._residual(x, y, x0, y0) <= _TOLERANCE * (1.0 + np.hypot(x0, y0))
+        return small & (np.hypot(x, y) < self._fold_radius)

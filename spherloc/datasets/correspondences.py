@@ -1,0 +1,139 @@
+"""Measured problems: a CSV of 2D-3D matches beside a TOML with camera, gravity and, where known, the truth."""
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from spherloc.cameras.base import Camera
+from spherloc.cameras.calibration import camera_from_table
+from spherloc.datasets import scene_file
+from spherloc.errors import InputError, ProblemError
+from spherloc.problem import Problem
+
+COLUMNS = ("u", "v", "X", "Y", "Z")
+MAX_CSV_BYTES = 200_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class CorrespondencesScene:
+    """A measured problem, read and checked."""
+
+    measured: Problem
+    """The problem as it stands in the files."""
+
+    @property
+    def name(self) -> str:
+        """The scene's name."""
+        return self.measured.name
+
+    @property
+    def camera(self) -> Camera:
+        """The query camera."""
+        return self.measured.camera
+
+    def problem(self, seed: int | None = None) -> Problem:
+        """The problem; measurements have nothing random, so ``seed`` changes nothing."""
+        return self.measured
+
+
+def load(table: dict[str, Any], path: Path) -> CorrespondencesScene:
+    """Read a scene of ``kind = "correspondences"``.
+
+    Paths in it are relative to its file. Raises ``InputError`` for a missing file, a wrong key or value, or a bad row.
+    """
+    where = str(path)
+    required = {"kind", "name", "correspondences", "camera", "gravity"}
+    scene_file.check_keys(table, required, {"image", "truth", "options", "about"}, where)
+    gravity = scene_file.section(table, "gravity", where)
+    scene_file.check_keys(gravity, {"camera", "map"}, set(), f"{where} [gravity]")
+    truth = scene_file.section(table, "truth", where)
+    scene_file.check_keys(truth, {"cam_from_map"} if truth else set(), set(), f"{where} [truth]")
+    rows, inliers = read_csv(path.parent / scene_file.text(table, "correspondences", where))
+    name = scene_file.text(table, "name", where)
+    try:
+        problem = Problem(
+            name=name,
+            camera=camera_from_table(scene_file.section(table, "camera", where), where),
+            pixels=rows[:, :2],
+            points=rows[:, 2:],
+            gravity_camera=scene_file.numbers(gravity["camera"], (3,), "camera", f"{where} [gravity]"),
+            gravity_map=scene_file.numbers(gravity["map"], (3,), "map", f"{where} [gravity]"),
+            bound_px=scene_file.bound_px(table, where),
+            truth_cam_from_map=scene_file.numbers(truth["cam_from_map"], (3, 4), "cam_from_map", f"{where} [truth]")
+            if truth
+            else None,
+            truth_inliers=inliers,
+            image=_image(table, path),
+            scene=where,
+        )
+    except ProblemError as error:
+        raise InputError(f"{where}: {error}") from None
+    return CorrespondencesScene(problem)
+
+
+def _image(table: dict[str, Any], path: Path) -> Path | None:
+    if "image" not in table:
+        return None
+    image = path.parent / scene_file.text(table, "image", str(path))
+    if not image.is_file():
+        raise InputError(f"{path}: the image {image} does not exist; correct the path or remove the key 'image'.")
+    return image
+
+
+def read_csv(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
+    """Rows u, v, X, Y, Z as (N, 5), and the ``inlier`` column as a mask (N,), or None without that column.
+
+    Other columns are ignored. Raises ``InputError`` with the file and line of what is wrong.
+    """
+    try:
+        if path.stat().st_size > MAX_CSV_BYTES:
+            raise InputError(f"{path}: larger than {MAX_CSV_BYTES:,} bytes; split it.")
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            return _parse(csv.reader(file), path)
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; correct the key 'correspondences'.") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); correct the key 'correspondences'.") from None
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path}: not a CSV text file in UTF-8 ({error}).") from None
+
+
+def _parse(reader: Any, path: Path) -> tuple[np.ndarray, np.ndarray | None]:
+    header = [name.strip() for name in next(reader, [])]
+    for name in (*COLUMNS, "inlier"):
+        if header.count(name) > 1 or (name in COLUMNS and name not in header):
+            what = "missing" if name not in header else "given twice"
+            raise InputError(f"{path}: column '{name}' is {what}; the first line must name {', '.join(COLUMNS)}.")
+    wanted = [header.index(name) for name in COLUMNS]
+    label_at = header.index("inlier") if "inlier" in header else None
+    rows, labels = [], []
+    for line in reader:
+        if not line:
+            continue
+        place = f"{path}, line {reader.line_num}"
+        if len(line) != len(header):
+            raise InputError(f"{place}: {len(line)} values under {len(header)} columns; correct the line.")
+        rows.append([_number(line[at], header[at], place) for at in wanted])
+        if label_at is not None:
+            labels.append(_label(line[label_at], place))
+    array = np.array(rows, dtype=np.float64).reshape(-1, 5)
+    return array, np.array(labels, dtype=bool) if label_at is not None else None
+
+
+def _number(value: str, column: str, place: str) -> float:
+    try:
+        number = float(value)
+    except ValueError:
+        raise InputError(f"{place}: {column} is '{value.strip()[:40]}', not a number; correct or remove it.") from None
+    if not np.isfinite(number):
+        raise InputError(f"{place}: {column} is {value.strip()}, not a finite number; correct or remove the line.")
+    return number
+
+
+def _label(value: str, place: str) -> bool:
+    if value.strip() not in ("0", "1"):
+        raise InputError(f"{place}: inlier is '{value.strip()[:40]}'; give 0 or 1.")
+    return value.strip() == "1"

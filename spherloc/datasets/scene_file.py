@@ -1,0 +1,120 @@
+"""Scene files: small TOML documents whose ``kind`` names the dataset loader that reads them."""
+
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from spherloc import registry
+from spherloc.errors import InputError
+from spherloc.problem import Problem
+
+MAX_BYTES = 1_000_000
+BUNDLED = Path(__file__).resolve().parents[2] / "scenes"
+
+
+class Scene(Protocol):
+    """Something that gives a localization problem."""
+
+    @property
+    def name(self) -> str:
+        """Shown to people."""
+        ...
+
+    def problem(self, seed: int | None = None) -> Problem:
+        """The problem; ``seed`` replaces the scene's own seed where the scene is random."""
+        ...
+
+
+def load_scene(path: Path) -> Scene:
+    """Read a scene file.
+
+    Raises ``InputError``, in one sentence with the file's name, if it is missing, unreadable, or has a wrong key.
+    """
+    path = Path(path)
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise InputError(f"{path}: larger than {MAX_BYTES:,} bytes, so it is no scene file; give a TOML scene.")
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; give the path of a scene file (TOML).") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); give the path of a scene file (TOML).") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: not a text file in UTF-8; give the path of a scene file (TOML).") from None
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{path}: not valid TOML: {error}; correct it there.") from None
+    kind = text(table, "kind", str(path))
+    try:
+        load = registry.lookup("datasets", kind)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    return load(table, path)
+
+
+def bundled_scenes() -> dict[str, Path]:
+    """Scene files that come with the project, by stem."""
+    return {path.stem: path for path in sorted(BUNDLED.glob("*.toml"))}
+
+
+def check_keys(table: Mapping[str, Any], required: set[str], optional: set[str], where: str) -> None:
+    """Raise ``InputError`` for a missing or an unknown key of ``table``; ``where`` names its place."""
+    for key in table:
+        if key not in required | optional:
+            known = ", ".join(sorted(required | optional))
+            raise InputError(f"{where}: unknown key '{key}'; the known ones are {known}.")
+    for key in sorted(required):
+        if key not in table:
+            raise InputError(f"{where}: key '{key}' is missing; add it.")
+
+
+def text(table: Mapping[str, Any], key: str, where: str) -> str:
+    """A text value that must exist."""
+    value = table.get(key)
+    if not isinstance(value, str) or not value:
+        raise InputError(f"{where}: key '{key}' must be a text; add {key} = \"...\".")
+    return value
+
+
+def section(table: Mapping[str, Any], key: str, where: str) -> dict[str, Any]:
+    """A sub-table; empty if absent."""
+    value = table.get(key, {})
+    if not isinstance(value, dict):
+        raise InputError(f"{where}: '{key}' must be a section [{key}].")
+    return value
+
+
+def number(table: Mapping[str, Any], key: str, where: str, lowest: float, highest: float) -> float:
+    """A finite number within limits that must exist."""
+    value = table.get(key)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not lowest <= value <= highest:
+        raise InputError(f"{where}: {key} is {value!r}; give a number from {lowest:g} to {highest:g}.")
+    return float(value)
+
+
+def integer(table: Mapping[str, Any], key: str, where: str, lowest: int, highest: int) -> int:
+    """A whole number within limits that must exist."""
+    value = table.get(key)
+    if isinstance(value, bool) or not isinstance(value, int) or not lowest <= value <= highest:
+        raise InputError(f"{where}: {key} is {value!r}; give a whole number from {lowest} to {highest}.")
+    return value
+
+
+def numbers(value: Any, shape: tuple[int, ...], key: str, where: str) -> np.ndarray:
+    """A (nested) list of finite numbers of the given shape."""
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        array = np.empty(0)
+    if array.shape != shape or not np.isfinite(array).all():
+        raise InputError(f"{where}: {key} must hold {' x '.join(map(str, shape))} finite numbers.")
+    return array
+
+
+def bound_px(table: Mapping[str, Any], where: str) -> float | None:
+    """``[options] bound_px``, or None where the scene states none."""
+    options = section(table, "options", where)
+    check_keys(options, set(), {"bound_px"}, f"{where} [options]")
+    return number(options, "bound_px", f"{where} [options]", 1e-6, 1e4) if options else None

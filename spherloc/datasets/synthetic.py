@@ -1,0 +1,149 @@
+"""The paper's simulation (Sec. VI-A): map points in the cube [-5, 5]^3 seen by a level camera.
+
+Where the paper is silent or breaks: points and positions are uniform in the cube; points are drawn until N are
+visible, that is valid for the camera model and inside the image after noise; an outlier is the projection of its map
+point by a random wrong pose of its own.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spherloc.cameras.base import Camera, in_image
+from spherloc.cameras.calibration import camera_from_table
+from spherloc.datasets import scene_file
+from spherloc.errors import InputError
+from spherloc.geometry import DOWN, pose, transform, yaw_rotation
+from spherloc.problem import Problem
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+HALF_SIZE_M = 5.0
+BATCH = 512
+MAX_BATCHES = 400
+MOST_CORRESPONDENCES = 10_000
+
+
+@dataclass(frozen=True)
+class SyntheticScene:
+    """A random problem with known truth. The same seed keeps points and pose while noise or outliers change."""
+
+    name: str
+    """Shown to people."""
+    camera: Camera
+    """The query camera."""
+    correspondences: int
+    """How many, N."""
+    outlier_rate: float
+    """Share of wrong correspondences, 0 to 1; rounded to whole correspondences."""
+    noise_px: float
+    """Standard deviation of the pixel noise, px."""
+    seed: int
+    """Seed of every random draw."""
+    bound_px: float | None = None
+    """Pixel bound asked of estimators; None leaves it to them."""
+
+    def __post_init__(self) -> None:
+        for name, lowest, highest in (
+            ("correspondences", 2, MOST_CORRESPONDENCES),
+            ("outlier_rate", 0.0, 1.0),
+            ("noise_px", 0.0, 100.0),
+            ("seed", 0, 2**63 - 1),
+        ):
+            value = getattr(self, name)
+            if not lowest <= value <= highest:
+                raise InputError(f"{self.name}: {name} is {value}; give a number from {lowest:g} to {highest:g}.")
+
+    def problem(self, seed: int | None = None) -> Problem:
+        """Draw the problem; ``seed`` replaces the scene's own.
+
+        Raises ``InputError`` if the camera sees too little of the cube to find the correspondences.
+        """
+        seed = self.seed if seed is None else seed
+        geometry, noise, choice, wrong = (np.random.default_rng([seed, stream]) for stream in range(4))
+        truth = _random_poses(geometry, 1)[0]
+        points, pixels = self._visible_points(geometry, noise, truth)
+        outliers = np.zeros(self.correspondences, dtype=bool)
+        outliers[choice.permutation(self.correspondences)[: round(self.outlier_rate * self.correspondences)]] = True
+        pixels[outliers] = self._wrong_pixels(wrong, points)[outliers]
+        return Problem(
+            name=self.name,
+            camera=self.camera,
+            pixels=pixels,
+            points=points,
+            gravity_camera=DOWN,
+            gravity_map=DOWN,
+            bound_px=self.bound_px,
+            truth_cam_from_map=truth,
+            truth_inliers=~outliers,
+            scene=f"synthetic: N {self.correspondences}, outliers {self.outlier_rate:g}, noise {self.noise_px:g} px, "
+            f"seed {seed}",
+        )
+
+    def _seen(self, pixels: FloatArray) -> BoolArray:
+        return in_image(self.camera, pixels) & self.camera.unproject(pixels)[1]
+
+    def _visible_points(
+        self, geometry: np.random.Generator, noise: np.random.Generator, truth: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """The first N random points (N, 3) that are visible, and their noisy pixels (N, 2)."""
+        found: list[tuple[FloatArray, FloatArray]] = []
+        count = 0
+        for _ in range(MAX_BATCHES):
+            points = geometry.uniform(-HALF_SIZE_M, HALF_SIZE_M, (BATCH, 3))
+            pixels, valid = self.camera.project(transform(truth, points))
+            shift = self.noise_px * noise.standard_normal((BATCH, 2))
+            visible = valid & in_image(self.camera, pixels) & self._seen(pixels + shift)
+            found.append((points[visible], (pixels + shift)[visible]))
+            count += int(np.count_nonzero(visible))
+            if count >= self.correspondences:
+                points, pixels = (np.concatenate(parts)[: self.correspondences] for parts in zip(*found, strict=True))
+                return points, pixels
+        raise InputError(
+            f"{self.name}: only {count} of {BATCH * MAX_BATCHES:,} random points are visible to the camera; "
+            "give a wider camera, less noise, fewer correspondences or another seed."
+        )
+
+    def _wrong_pixels(self, wrong: np.random.Generator, points: FloatArray) -> FloatArray:
+        """Pixels (N, 2) of the points (N, 3) under a random pose each under which it is visible."""
+        pixels = np.full((len(points), 2), np.nan)
+        for _ in range(MAX_BATCHES):
+            poses = _random_poses(wrong, len(points))
+            missing = np.isnan(pixels[:, 0])
+            rays = np.einsum("nij,nj->ni", poses[:, :, :3], points) + poses[:, :, 3]
+            candidates, valid = self.camera.project(rays)
+            visible = missing & valid
+            visible[visible] = self._seen(candidates[visible])
+            pixels[visible] = candidates[visible]
+            if not np.isnan(pixels).any():
+                return pixels
+        raise InputError(f"{self.name}: the camera sees too little of the cube to make outliers; give a wider camera.")
+
+
+def _random_poses(rng: np.random.Generator, count: int) -> FloatArray:
+    """Level poses (count, 3, 4): any yaw, translation uniform in the cube."""
+    yaws = rng.uniform(-np.pi, np.pi, count)
+    translations = rng.uniform(-HALF_SIZE_M, HALF_SIZE_M, (count, 3))
+    return np.array([pose(yaw_rotation(yaw), t) for yaw, t in zip(yaws, translations, strict=True)])
+
+
+def load(table: dict[str, Any], path: Path) -> SyntheticScene:
+    """Read a scene of ``kind = "synthetic"``; raises ``InputError`` for a wrong key or value."""
+    where = str(path)
+    scene_file.check_keys(table, {"kind", "name", "camera", "simulation"}, {"options", "about"}, where)
+    simulation = scene_file.section(table, "simulation", where)
+    place = f"{where} [simulation]"
+    scene_file.check_keys(simulation, {"correspondences", "outlier_rate", "noise_px", "seed"}, set(), place)
+    return SyntheticScene(
+        name=scene_file.text(table, "name", where),
+        camera=camera_from_table(scene_file.section(table, "camera", where), where),
+        correspondences=scene_file.integer(simulation, "correspondences", place, 2, MOST_CORRESPONDENCES),
+        outlier_rate=scene_file.number(simulation, "outlier_rate", place, 0.0, 1.0),
+        noise_px=scene_file.number(simulation, "noise_px", place, 0.0, 100.0),
+        seed=scene_file.integer(simulation, "seed", place, 0, 2**63 - 1),
+        bound_px=scene_file.bound_px(table, where),
+    )

@@ -1,0 +1,138 @@
+"""What every estimator offers, and the one function that runs one."""
+
+import platform
+import time
+from contextlib import contextmanager
+from dataclasses import dataclass, fields
+from importlib.metadata import version
+from typing import Any, ClassVar, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spherloc import registry
+from spherloc.errors import InputError
+from spherloc.problem import AlignedProblem, Problem
+from spherloc.trace import Stage, Trace
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What an estimator returns to ``estimate``: stages, and the pose and inliers in the aligned frames."""
+
+    stages: tuple[Stage, ...]
+    """In the order in which they ran."""
+    cam_from_map: FloatArray | None
+    """Aligned pose (3, 4), or None."""
+    inlier_mask: BoolArray
+    """(M,) over the usable correspondences."""
+    reason: str = ""
+    """Why there is no pose, as a sentence; empty if there is one."""
+
+
+class Estimator(Protocol):
+    """A robust pose estimator, registered by entry point."""
+
+    Options: ClassVar[type]
+    """A frozen dataclass with a default for every field; ``bound_px`` is one of them."""
+
+    @staticmethod
+    def run(aligned: AlignedProblem, options: Any, bounds: "Bounds", seed: int, clock: "Clock") -> Outcome:
+        """Solve; take every random draw from ``seed`` and report each stage's time to ``clock``."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Bounds:
+    """What noise may do to each of M bearings: the pixel bound and the gravity bound together."""
+
+    pixels: FloatArray
+    """(M,) bound on the reprojection error, px."""
+    radians: FloatArray
+    """(M,) bound on the angular error of the aligned bearing, rad."""
+
+
+class Clock:
+    """Collects the wall time of named stages, ms."""
+
+    def __init__(self) -> None:
+        self.timings_ms: dict[str, float] = {}
+
+    @contextmanager
+    def stage(self, name: str):
+        """Time the body as ``name``."""
+        start = time.perf_counter()
+        yield
+        self.timings_ms[name] = (time.perf_counter() - start) * 1e3
+
+
+def bounds_of(aligned: AlignedProblem, bound_px: float, gravity_bound_rad: float) -> Bounds:
+    """Bounds of every bearing from one pixel bound: through the largest stretch of its unprojection, plus gravity."""
+    radians = bound_px * aligned.radians_per_pixel + gravity_bound_rad
+    return Bounds(bound_px + gravity_bound_rad / aligned.radians_per_pixel, np.minimum(radians, np.pi / 2))
+
+
+def versions() -> dict[str, str]:
+    """Versions of everything that can change a number."""
+    packages = ("spherloc", "numpy", "scipy", "numba")
+    return {"python": platform.python_version()} | {name: version(name) for name in packages}
+
+
+def options_type(estimator: str) -> type:
+    """The options dataclass of a registered estimator; ``InputError`` if there is none of that name."""
+    return registry.lookup("estimators", estimator).Options
+
+
+def default_options(estimator: str, problem: Problem) -> Any:
+    """The estimator's default options, with the problem's own pixel bound if it states one."""
+    given = {} if problem.bound_px is None else {"bound_px": problem.bound_px}
+    return options_type(estimator)(**given)
+
+
+def check_positive(options: Any, **allow_zero: bool) -> None:
+    """Raise ``InputError`` if a number among the fields of ``options`` is not finite and positive."""
+    for item in fields(options):
+        value = getattr(options, item.name)
+        if value is None:
+            continue
+        if not np.isfinite(value) or value < 0 or (value == 0 and not allow_zero.get(item.name, False)):
+            raise InputError(f"option {item.name} is {value}; give a positive number.")
+
+
+def estimate(problem: Problem, estimator: str = "mc", options: Any = None, seed: int = 0) -> Trace:
+    """Solve a problem and return the record of the run.
+
+    ``options`` is an instance of ``options_type(estimator)``; None takes the defaults. The same arguments give the
+    same trace but for its timings. Raises ``InputError`` for an unknown estimator, options of another estimator, or a
+    seed outside 0 to 2^63 - 1.
+    """
+    kind = registry.lookup("estimators", estimator)
+    options = default_options(estimator, problem) if options is None else options
+    if not isinstance(options, kind.Options):
+        raise InputError(f"estimator {estimator} takes {kind.Options.__name__}, not {type(options).__name__}.")
+    if not 0 <= seed < 2**63:
+        raise InputError(f"seed is {seed}; give a number from 0 to 2^63 - 1.")
+    aligned = problem.aligned
+    bounds = bounds_of(aligned, options.bound_px, problem.gravity_bound_rad)
+    clock = Clock()
+    start = time.perf_counter()
+    outcome = kind.run(aligned, options, bounds, seed, clock)
+    clock.timings_ms["total"] = (time.perf_counter() - start) * 1e3
+    pose = None if outcome.cam_from_map is None else aligned.unalign_pose(outcome.cam_from_map)
+    mask = aligned.full_mask(outcome.inlier_mask)
+    found = f"Pose found: {np.count_nonzero(mask)} of {len(problem)} correspondences agree with it."
+    return Trace(
+        problem=problem,
+        estimator=estimator,
+        options=options,
+        seed=seed,
+        versions=versions(),
+        stages=outcome.stages,
+        timings_ms=clock.timings_ms,
+        cam_from_map=pose,
+        inlier_mask=mask,
+        message=outcome.reason or found,
+    )

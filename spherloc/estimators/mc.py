@@ -1,0 +1,129 @@
+"""MC, the paper's Algorithm 2: yaw arcs of all pairs, the yaw most of them share, translation balls at that yaw, their
+maximum clique, refinement. Deterministic: no random draw.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spherloc.consensus.max_clique import max_clique
+from spherloc.consensus.translation_balls import overlapping, translation_balls
+from spherloc.consensus.yaw_arcs import yaw_arcs
+from spherloc.consensus.yaw_sweep import YawConsensus, deepest_yaw
+from spherloc.errors import InputError
+from spherloc.estimators.base import Bounds, Clock, Outcome, check_positive
+from spherloc.geometry import pose, yaw_rotation
+from spherloc.problem import AlignedProblem
+from spherloc.refine import refine
+from spherloc.trace import Stage, TranslationStage, YawStage
+
+FloatArray = NDArray[np.float64]
+IndexArray = NDArray[np.int32]
+
+
+@dataclass(frozen=True)
+class McOptions:
+    """Options of MC."""
+
+    bound_px: float = 3.0
+    """Bound on the noise of an inlier, px. Arcs and balls grow with it, so it is tighter than RANSAC's."""
+    max_balls: int = 500
+    """Pairs of the rotation clique that become balls: those with the smallest radii, if there are more."""
+
+    def __post_init__(self) -> None:
+        check_positive(self)
+        if self.max_balls != int(self.max_balls) or self.max_balls > 5000:
+            raise InputError(f"option max_balls is {self.max_balls}; give a whole number up to 5000.")
+
+
+class MaximumConsensus:
+    """Registered as "mc"."""
+
+    Options = McOptions
+
+    @staticmethod
+    def run(aligned: AlignedProblem, options: McOptions, bounds: Bounds, seed: int, clock: Clock) -> Outcome:
+        """Algorithm 2; ``seed`` is not used."""
+        count = len(aligned.bearings)
+        nobody = np.zeros(count, dtype=bool)
+        with clock.stage("yaw"):
+            pairs, lo, hi = yaw_arcs(aligned, bounds.radians)
+            consensus = deepest_yaw(lo, hi)
+        if consensus is None:
+            return Outcome((), None, nobody, f"No pose: none of {count * (count - 1) // 2} pairs fixes a yaw.")
+        yaw = _yaw_stage(aligned, pairs, lo, hi, consensus)
+        with clock.stage("translation"):
+            translation, start = _locate(aligned, options, bounds, pairs, lo, hi, consensus)
+        if translation is None or start is None:
+            reason = "No pose: every pair in the rotation clique puts a point behind the camera."
+            return Outcome((yaw,), None, nobody, reason)
+        with clock.stage("refinement"):
+            members = np.zeros(aligned.count, dtype=bool)
+            members[translation.pairs[translation.clique].ravel()] = True
+            refined, inliers, refinement = refine(aligned, start, members[aligned.index], bounds.pixels)
+        stages: tuple[Stage, ...] = (yaw, translation, refinement)
+        return Outcome(stages, refined, inliers)
+
+
+def _yaw_stage(
+    aligned: AlignedProblem, pairs: IndexArray, lo: FloatArray, hi: FloatArray, consensus: YawConsensus
+) -> YawStage:
+    count = len(aligned.bearings)
+    return YawStage(
+        pairs_total=count * (count - 1) // 2,
+        pairs=aligned.index.astype(np.int32)[pairs],
+        lo_rad=lo,
+        hi_rad=hi,
+        overlap=consensus.overlap,
+        best_rad=consensus.interval_rad,
+        yaw_rad=consensus.yaw_rad,
+        clique=consensus.clique,
+    )
+
+
+def _locate(
+    aligned: AlignedProblem,
+    options: McOptions,
+    bounds: Bounds,
+    pairs: IndexArray,
+    lo: FloatArray,
+    hi: FloatArray,
+    consensus: YawConsensus,
+) -> tuple[TranslationStage | None, FloatArray | None]:
+    """Balls of the rotation clique, their maximum clique, and the aligned pose (3, 4) that it proposes."""
+    yaw, arcs = consensus.yaw_rad, consensus.clique
+    turns = np.where(lo[arcs] <= yaw, 0.0, 2 * np.pi)
+    slack = np.maximum(yaw + turns - lo[arcs], hi[arcs] - yaw - turns)
+    centres, radii = translation_balls(aligned, bounds.radians, pairs[arcs], yaw, slack)
+    kept = np.flatnonzero(np.isfinite(radii))
+    if len(kept) == 0:
+        return None, None
+    kept = kept[np.argsort(radii[kept], kind="stable")][: int(options.max_balls)]
+    centres, radii, pairs = centres[kept], radii[kept], pairs[arcs][kept]
+    overlap = overlapping(centres, radii)
+    clique = max_clique(overlap)
+    weights = radii[clique.nodes] ** -2.0
+    centre = weights @ centres[clique.nodes] / weights.sum()
+    rotation = yaw_rotation(yaw)
+    start = pose(rotation, -rotation @ centre)
+    stage = TranslationStage(
+        candidates=len(arcs),
+        rule=_rule(len(kept), len(arcs), int(options.max_balls)),
+        pairs=aligned.index.astype(np.int32)[pairs],
+        centres_m=centres,
+        radii_m=radii,
+        edges=np.argwhere(np.triu(overlap)).astype(np.int32),
+        clique=clique.nodes,
+        proven=clique.proven,
+        cam_from_map=aligned.unalign_pose(start),
+    )
+    return stage, start
+
+
+def _rule(kept: int, candidates: int, most: int) -> str:
+    if kept == candidates:
+        return f"All {candidates:,} pairs of the rotation clique."
+    if kept == most:
+        return f"The {kept:,} smallest balls of the {candidates:,} pairs in the rotation clique."
+    return f"The {kept:,} of {candidates:,} pairs in the rotation clique with both points before the camera."

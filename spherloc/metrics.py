@@ -1,0 +1,74 @@
+"""Errors and scores of Sec. VI."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spherloc.geometry import rotation_angle
+from spherloc.trace import Trace
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+SUCCESS_DEG = 1.0
+SUCCESS_M = 0.1
+
+
+@dataclass(frozen=True)
+class Metrics:
+    """Scores of one run; None where the truth they need is unknown."""
+
+    rotation_error_deg: float | None
+    """Angle between true and estimated rotation, degrees."""
+    translation_error_m: float | None
+    """|t_true - t|, metres."""
+    success: bool | None
+    """Both errors below 1 degree and 0.1 m; a run without a pose has failed."""
+    precision: float | None
+    """Share of the reported inliers that are true inliers."""
+    recall: float | None
+    """Share of the true inliers that were reported."""
+    f1: float | None
+    """Harmonic mean of precision and recall."""
+
+
+def rotation_error_deg(truth: FloatArray, estimate: FloatArray) -> float:
+    """Angle (degrees) of R_true^T R of two poses (3, 4): the paper's arccos form, computed by atan2."""
+    return float(np.degrees(rotation_angle(truth[:, :3].T @ estimate[:, :3])))
+
+
+def translation_error_m(truth: FloatArray, estimate: FloatArray) -> float:
+    """|t_true - t| (metres) of two poses (3, 4)."""
+    return float(np.linalg.norm(truth[:, 3] - estimate[:, 3]))
+
+
+def precision_recall_f1(truth: BoolArray, reported: BoolArray) -> tuple[float, float, float]:
+    """Scores of a reported inlier mask (N,) against the true one (N,); 0 where a denominator is 0."""
+    hits = float(np.count_nonzero(truth & reported))
+    precision = hits / max(1, np.count_nonzero(reported))
+    recall = hits / max(1, np.count_nonzero(truth))
+    return precision, recall, 2 * precision * recall / (precision + recall) if hits else 0.0
+
+
+def ransac_success_probability(inlier_rate: float, sample_size: int, iterations: int) -> float:
+    """Eq. 28: P = 1 - (1 - w^n)^k, without cancellation for small w^n."""
+    if inlier_rate >= 1.0:
+        return 1.0 if iterations > 0 else 0.0
+    return float(-np.expm1(iterations * np.log1p(-(inlier_rate**sample_size))))
+
+
+def evaluate(trace: Trace) -> Metrics:
+    """Score a run against what is known of its truth."""
+    problem, estimate = trace.problem, trace.cam_from_map
+    rotation = translation = success = None
+    if problem.truth_cam_from_map is not None:
+        success = False
+        if estimate is not None:
+            rotation = rotation_error_deg(problem.truth_cam_from_map, estimate)
+            translation = translation_error_m(problem.truth_cam_from_map, estimate)
+            success = rotation < SUCCESS_DEG and translation < SUCCESS_M
+    scores: tuple[float | None, ...] = (None, None, None)
+    if problem.truth_inliers is not None:
+        scores = precision_recall_f1(problem.truth_inliers, trace.inlier_mask)
+    return Metrics(rotation, translation, success, *scores)

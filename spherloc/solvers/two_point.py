@@ -1,0 +1,101 @@
+"""2P: yaw and position of a gravity-aligned camera from two correspondences.
+
+Paper, Eq. 18-27, solved without its divisions by y_c, which fail for horizontal bearings. With d = p_i - p_j
+and n = v_i x v_j, both rays and R d lie in one plane: n . (R d) = 0, that is Eq. 22 with
+
+    d1 = n_x d_x + n_z d_z,   d2 = n_x d_z - n_z d_x,   d3 = n_y d_y,
+
+the paper's Eq. 23 times n_x / (y_ci y_cj). Two roots in yaw; positive depths settle most of the ambiguity.
+Degenerate only if n or d is vertical (both bearings horizontal; one point above the other) or if two bearings
+or two points coincide.
+"""
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from spherloc.errors import ProblemError
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+DEGENERATE = 1e-12
+"""Below this, relative to |d|, the pair says nothing about yaw."""
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def yaw_coefficients(vi, vj, pi, pj):
+    """(d1, d2, d3) of Eq. 22, |n|^2 = sin^2 of the angle between the bearings, and |d|^2."""
+    dx, dy, dz = pi[0] - pj[0], pi[1] - pj[1], pi[2] - pj[2]
+    nx = vi[1] * vj[2] - vi[2] * vj[1]
+    ny = vi[2] * vj[0] - vi[0] * vj[2]
+    nz = vi[0] * vj[1] - vi[1] * vj[0]
+    return nx * dx + nz * dz, nx * dz - nz * dx, ny * dy, nx * nx + ny * ny + nz * nz, dx * dx + dy * dy + dz * dz
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def depths(vi, vj, pi, pj, cosine, sine, sin2):
+    """Depths (s_i, s_j) with R d = s_i v_i - s_j v_j in the least-squares sense; sin2 = |v_i x v_j|^2."""
+    dx, dy, dz = pi[0] - pj[0], pi[1] - pj[1], pi[2] - pj[2]
+    rx, rz = dx * cosine + dz * sine, dz * cosine - dx * sine
+    dot = vi[0] * vj[0] + vi[1] * vj[1] + vi[2] * vj[2]
+    along_i = vi[0] * rx + vi[1] * dy + vi[2] * rz
+    along_j = vj[0] * rx + vj[1] * dy + vj[2] * rz
+    return (along_i - dot * along_j) / sin2, (dot * along_i - along_j) / sin2
+
+
+@numba.njit(cache=True, nogil=True)
+def solve_pair(vi, vj, pi, pj, yaws, translations):
+    """Write the roots with positive depths into ``yaws`` (2,) and ``translations`` (2, 3); return how many."""
+    d1, d2, d3, sin2, dist2 = yaw_coefficients(vi, vj, pi, pj)
+    rho = np.sqrt(d1 * d1 + d2 * d2)
+    if rho <= DEGENERATE * np.sqrt(dist2) or abs(d3) > rho:
+        return 0
+    phi, half = np.arctan2(d2, d1), np.arccos(-d3 / rho)
+    found = 0
+    for sign in (1.0, -1.0):
+        yaw = phi + sign * half
+        c, s = np.cos(yaw), np.sin(yaw)
+        si, sj = depths(vi, vj, pi, pj, c, s, sin2)
+        if si <= 0.0 or sj <= 0.0:
+            continue
+        yaws[found] = yaw
+        # Eq. 27 at an exact root: both rays agree, and their mean halves the rounding error.
+        translations[found, 0] = 0.5 * (
+            si * vi[0] + sj * vj[0] - (pi[0] + pj[0]) * c - (pi[2] + pj[2]) * s
+        )
+        translations[found, 1] = 0.5 * (si * vi[1] + sj * vj[1] - pi[1] - pj[1])
+        translations[found, 2] = 0.5 * (
+            si * vi[2] + sj * vj[2] + (pi[0] + pj[0]) * s - (pi[2] + pj[2]) * c
+        )
+        found += 1
+    return found
+
+
+@numba.njit(cache=True, nogil=True)
+def _solve_batch(bearings, points, yaws, translations, valid):
+    for b in range(len(bearings)):
+        found = solve_pair(
+            bearings[b, 0], bearings[b, 1], points[b, 0], points[b, 1], yaws[b], translations[b]
+        )
+        valid[b, :found] = True
+
+
+def two_point(bearings: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Solve B pairs of correspondences between gravity-aligned frames (y down).
+
+    ``bearings`` (B, 2, 3) are unit vectors, ``points`` (B, 2, 3) metres. Returns yaws (B, 2), rad, translations
+    (B, 2, 3), metres, and which of the two roots exist (B, 2); p_cam = R_y(yaw) p_map + t. Missing roots are NaN.
+
+    Raises ``ProblemError`` for other shapes.
+    """
+    bearings = np.ascontiguousarray(bearings, dtype=np.float64)
+    points = np.ascontiguousarray(points, dtype=np.float64)
+    for name, array in (("bearings", bearings), ("points", points)):
+        if array.ndim != 3 or array.shape != (len(bearings), 2, 3):
+            raise ProblemError(f"two_point: {name} have shape {array.shape}; give ({len(bearings)}, 2, 3).")
+    count = len(bearings)
+    yaws, translations = np.full((count, 2), np.nan), np.full((count, 2, 3), np.nan)
+    valid = np.zeros((count, 2), dtype=bool)
+    _solve_batch(bearings, points, yaws, translations, valid)
+    return yaws, translations, valid
