@@ -20,8 +20,6 @@ MAX_ROUNDS = 10
 STEP_TOLERANCE = 1e-10
 LEAST_FOR_SIX_DOF = 4
 """Three points leave up to four poses and two leave a curve, so fewer inliers keep the known roll and pitch."""
-FIRST_GATE = 4.0
-"""The first round accepts correspondences within this multiple of the bound, then tightens to the bound."""
 
 
 def residuals_px(aligned: AlignedProblem, cam_from_map: FloatArray) -> FloatArray:
@@ -35,31 +33,28 @@ def residuals_px(aligned: AlignedProblem, cam_from_map: FloatArray) -> FloatArra
 
 
 def refine(
-    aligned: AlignedProblem, cam_from_map: FloatArray, seed_mask: BoolArray, bound_px: FloatArray
+    aligned: AlignedProblem, cam_from_map: FloatArray, bound_px: FloatArray
 ) -> tuple[FloatArray, BoolArray, RefinementStage]:
     """Refine a pose (3, 4) between the aligned frames and its inliers until neither changes.
 
-    ``seed_mask`` (M,) marks correspondences that proposed the pose; ``bound_px`` (M,) is each one's pixel bound.
-    Alternates Gauss-Newton on the inliers with a new choice of them, as no start is close enough to know them all.
-    Returns the pose, the inlier mask (M,) and the stage with poses of the aligned frames turned back.
+    ``bound_px`` (M,) is each correspondence's pixel bound. Alternates Gauss-Newton on the inliers with a new choice of
+    them. Returns the last pose, its inlier mask (M,), and the stage, whose poses are
+    turned back.
     """
     history = [cam_from_map]
-    error = residuals_px(aligned, cam_from_map)
-    gate = FIRST_GATE
-    mask = (error <= bound_px) | (seed_mask & (error <= gate * bound_px))
+    mask = residuals_px(aligned, cam_from_map) <= bound_px
     dof = 6
     for _ in range(MAX_ROUNDS):
         if np.count_nonzero(mask) < 2:
             break
         dof = 6 if np.count_nonzero(mask) >= LEAST_FOR_SIX_DOF else 4
         history += _gauss_newton(aligned, history[-1], mask, dof)
-        gate = max(1.0, gate / 2)
-        chosen = residuals_px(aligned, history[-1]) <= gate * bound_px
-        if gate == 1.0 and np.array_equal(chosen, mask):
+        chosen = residuals_px(aligned, history[-1]) <= bound_px
+        if np.array_equal(chosen, mask):
             break
         mask = chosen
-    inliers = residuals_px(aligned, history[-1]) <= bound_px
     errors = [residuals_px(aligned, state) for state in history]
+    inliers = errors[-1] <= bound_px
     stage = RefinementStage(
         dof=dof,
         cam_from_map=np.array([aligned.unalign_pose(state) for state in history]),

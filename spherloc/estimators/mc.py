@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from spherloc.consensus.inliers import count_inliers
 from spherloc.consensus.max_clique import max_clique
 from spherloc.consensus.translation_balls import overlapping, translation_balls
 from spherloc.consensus.yaw_arcs import yaw_arcs
@@ -16,6 +17,7 @@ from spherloc.estimators.base import Bounds, Clock, Outcome, check_positive
 from spherloc.geometry import pose, yaw_rotation
 from spherloc.problem import AlignedProblem
 from spherloc.refine import refine
+from spherloc.solvers.two_point import two_point
 from spherloc.trace import Stage, TranslationStage, YawStage
 
 FloatArray = NDArray[np.float64]
@@ -59,9 +61,7 @@ class MaximumConsensus:
             reason = "No pose: every pair in the rotation clique puts a point behind the camera."
             return Outcome((yaw,), None, nobody, reason)
         with clock.stage("refinement"):
-            members = np.zeros(aligned.count, dtype=bool)
-            members[translation.pairs[translation.clique].ravel()] = True
-            refined, inliers, refinement = refine(aligned, start, members[aligned.index], bounds.pixels)
+            refined, inliers, refinement = refine(aligned, start, bounds.pixels)
         stages: tuple[Stage, ...] = (yaw, translation, refinement)
         return Outcome(stages, refined, inliers)
 
@@ -103,10 +103,7 @@ def _locate(
     centres, radii, pairs = centres[kept], radii[kept], pairs[arcs][kept]
     overlap = overlapping(centres, radii)
     clique = max_clique(overlap)
-    weights = radii[clique.nodes] ** -2.0
-    centre = weights @ centres[clique.nodes] / weights.sum()
-    rotation = yaw_rotation(yaw)
-    start = pose(rotation, -rotation @ centre)
+    start = _best_start(aligned, bounds, pairs[clique.nodes], yaw, centres[clique.nodes], radii[clique.nodes])
     stage = TranslationStage(
         candidates=len(arcs),
         rule=_rule(len(kept), len(arcs), int(options.max_balls)),
@@ -119,6 +116,24 @@ def _locate(
         cam_from_map=aligned.unalign_pose(start),
     )
     return stage, start
+
+
+def _best_start(
+    aligned: AlignedProblem, bounds: Bounds, pairs: IndexArray, yaw: float, centres: FloatArray, radii: FloatArray
+) -> FloatArray:
+    """The aligned pose (3, 4) that explains most correspondences, among those which the clique proposes.
+
+    These are its own yaw with the mean of its balls, weighted by radius^-2, and the 2P poses of its pairs: the yaw is
+    only as sharp as the widest arcs allow, while some pair of the clique is sharper.
+    """
+    weights = radii**-2.0
+    mean = pose(yaw_rotation(yaw), -yaw_rotation(yaw) @ (weights @ centres / weights.sum()))
+    yaws, translations, exists = two_point(aligned.bearings[pairs], aligned.points[pairs])
+    yaws, translations = np.append(yaw, yaws[exists]), np.vstack([mean[:, 3], translations[exists]])
+    data = (aligned.bearings, aligned.points, aligned.pixel_from_bearing, bounds.pixels)
+    support = [count_inliers(angle, t, *data) for angle, t in zip(yaws, translations, strict=True)]
+    best = int(np.argmax(support))
+    return pose(yaw_rotation(yaws[best]), translations[best])
 
 
 def _rule(kept: int, candidates: int, most: int) -> str:

@@ -6,6 +6,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from spherloc.consensus.inliers import count_inliers
 from spherloc.errors import InputError
 from spherloc.estimators.base import Bounds, Clock, Outcome, check_positive
 from spherloc.geometry import pose, yaw_rotation
@@ -69,7 +70,7 @@ class TwoPointRansac:
             reason = f"No pose: none of {drawn} sampled pairs has a solution in front of the camera."
             return Outcome((stage,), None, np.zeros(count, dtype=bool), reason)
         with clock.stage("refinement"):
-            refined, inliers, refinement = refine(aligned, states[-1], masks[-1], bounds.pixels)
+            refined, inliers, refinement = refine(aligned, states[-1], bounds.pixels)
         return Outcome((stage, refinement), refined, inliers)
 
 
@@ -78,24 +79,6 @@ def draw_pairs(rng: np.random.Generator, count: int, draws: int) -> NDArray[np.i
     pairs = rng.integers(0, [count, count - 1], size=(draws, 2))
     pairs[:, 1] += pairs[:, 1] >= pairs[:, 0]
     return pairs
-
-
-@numba.njit(cache=True, nogil=True)
-def count_inliers(yaw, translation, bearings, points, weights, bound_px):
-    """Correspondences whose first-order reprojection error is within their bound; see ``refine.residuals_px``."""
-    c, s = np.cos(yaw), np.sin(yaw)
-    inliers = 0
-    for k in range(len(points)):
-        x = points[k, 0] * c + points[k, 2] * s + translation[0]
-        y = points[k, 1] + translation[1]
-        z = points[k, 2] * c - points[k, 0] * s + translation[2]
-        if bearings[k, 0] * x + bearings[k, 1] * y + bearings[k, 2] * z <= 0.0:
-            continue
-        du = weights[k, 0, 0] * x + weights[k, 0, 1] * y + weights[k, 0, 2] * z
-        dv = weights[k, 1, 0] * x + weights[k, 1, 1] * y + weights[k, 1, 2] * z
-        if du * du + dv * dv <= bound_px[k] * bound_px[k] * (x * x + y * y + z * z):
-            inliers += 1
-    return inliers
 
 
 @numba.njit(cache=True, nogil=True)

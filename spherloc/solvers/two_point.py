@@ -61,13 +61,9 @@ def solve_pair(vi, vj, pi, pj, yaws, translations):
             continue
         yaws[found] = yaw
         # Eq. 27 at an exact root: both rays agree, and their mean halves the rounding error.
-        translations[found, 0] = 0.5 * (
-            si * vi[0] + sj * vj[0] - (pi[0] + pj[0]) * c - (pi[2] + pj[2]) * s
-        )
+        translations[found, 0] = 0.5 * (si * vi[0] + sj * vj[0] - (pi[0] + pj[0]) * c - (pi[2] + pj[2]) * s)
         translations[found, 1] = 0.5 * (si * vi[1] + sj * vj[1] - pi[1] - pj[1])
-        translations[found, 2] = 0.5 * (
-            si * vi[2] + sj * vj[2] + (pi[0] + pj[0]) * s - (pi[2] + pj[2]) * c
-        )
+        translations[found, 2] = 0.5 * (si * vi[2] + sj * vj[2] + (pi[0] + pj[0]) * s - (pi[2] + pj[2]) * c)
         found += 1
     return found
 
@@ -75,9 +71,7 @@ def solve_pair(vi, vj, pi, pj, yaws, translations):
 @numba.njit(cache=True, nogil=True)
 def _solve_batch(bearings, points, yaws, translations, valid):
     for b in range(len(bearings)):
-        found = solve_pair(
-            bearings[b, 0], bearings[b, 1], points[b, 0], points[b, 1], yaws[b], translations[b]
-        )
+        found = solve_pair(bearings[b, 0], bearings[b, 1], points[b, 0], points[b, 1], yaws[b], translations[b])
         valid[b, :found] = True
 
 
