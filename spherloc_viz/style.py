@@ -26,7 +26,7 @@ LAYERS: tuple[str, ...] = ("map", "cameras", "sphere", "rays", "yaw ring", "ball
 """Layers of the canvas that can be switched on and off."""
 
 MAX_DRAWN_RAYS = 600
-MAX_DRAWN_ARCS = 1500
+MAX_DRAWN_ARCS = 240
 MAX_DRAWN_BALLS = 300
 MAX_DRAWN_EDGES = 2500
 

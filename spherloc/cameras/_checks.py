@@ -1,7 +1,8 @@
 """Checks that every camera model shares: calibration values, ``[camera]`` tables and coordinate arrays."""
 
 import reprlib
-from collections.abc import Mapping
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import fields
 from math import inf, isfinite
 from numbers import Integral, Real
@@ -20,9 +21,10 @@ C = TypeVar("C")
 
 def whole_pixels(key: str, value: Any) -> int:
     """An image side in pixels; raises ``CalibrationError`` if it is not a whole number from 1 to ``MAX_SIDE_PX``."""
-    if not isinstance(value, Integral) or isinstance(value, bool) or not 1 <= value <= MAX_SIDE_PX:
+    side = int(value) if isinstance(value, Integral) and not isinstance(value, bool) else 0
+    if not 1 <= side <= MAX_SIDE_PX:
         raise _bad(key, value, f"give a whole number of pixels from 1 to {MAX_SIDE_PX}")
-    return int(value)
+    return side
 
 
 def finite(key: str, value: Any) -> float:
@@ -70,8 +72,8 @@ def check_sees_image(camera: Any, rim: float) -> None:
     """
     if not 1.0 <= rim * min(camera.fx, camera.fy) < inf:
         raise CalibrationError(
-            f"camera key 'distortion' is {_show(camera.distortion)}, which cannot be inverted one pixel away from the "
-            "principal point: check the order and the signs of the coefficients."
+            f"camera key 'distortion' is {show(list(camera.distortion))}, which cannot be inverted one pixel away from "
+            "the principal point: check the order and the signs of the coefficients."
         )
     nearest = [[min(max(camera.cx, 0.0), camera.width), min(max(camera.cy, 0.0), camera.height)]]
     if not camera.unproject(np.array(nearest))[1][0]:
@@ -86,30 +88,32 @@ def camera_from_keys(cls: type[C], table: Any, where: str) -> C:
 
     Raises ``CalibrationError``, one sentence that starts with ``where``, for an unknown, missing or bad value.
     """
-    if not isinstance(table, Mapping):
-        raise CalibrationError(f"{where}: the camera is {_show(table)}: give a table of keys and values.")
-    model: str = getattr(cls, "model", "")
-    known = ["model", *(field.name for field in fields(cls))]  # pyright: ignore[reportArgumentType]
-    for key in table:
-        if key not in known:
-            raise CalibrationError(
-                f"{where}: camera key {_show(key)} is unknown to the model '{model}': "
-                f"remove it, its keys are {', '.join(known)}."
-            )
-    for key in known:
-        if key not in table:
-            raise CalibrationError(f"{where}: camera key '{key}' is missing: add it, the model '{model}' needs it.")
-    if table["model"] != model:
-        raise CalibrationError(f"{where}: camera key 'model' is {_show(table['model'])}: give '{model}' here.")
-    return build(cls, where, **{key: value for key, value in table.items() if key != "model"})
+    with located(where):
+        if not isinstance(table, dict):
+            raise CalibrationError(f"the camera is {show(table)}: give a table of keys and values.")
+        model: str = getattr(cls, "model", "")
+        known = ["model", *(field.name for field in fields(cls))]  # pyright: ignore[reportArgumentType]
+        for key in table:
+            if key not in known:
+                raise CalibrationError(
+                    f"camera key {show(key)} is unknown to the model '{model}': "
+                    f"remove it, the keys are {', '.join(known)}."
+                )
+        for key in known:
+            if key not in table:
+                raise CalibrationError(f"camera key '{key}' is missing: add it, the model '{model}' needs it.")
+        if table["model"] != model:
+            raise CalibrationError(f"camera key 'model' is {show(table['model'])}: give '{model}' here.")
+        return cls(**{key: value for key, value in table.items() if key != "model"})
 
 
-def build(cls: type[C], where: str, **values: Any) -> C:
-    """``cls(**values)`` whose ``CalibrationError`` starts with ``where``."""
+@contextmanager
+def located(place: str) -> Iterator[None]:
+    """Put ``place`` in front of a ``CalibrationError`` that is raised inside; places nest."""
     try:
-        return cls(**values)
+        yield
     except CalibrationError as error:
-        raise CalibrationError(f"{where}: {error}") from None
+        raise CalibrationError(f"{place}: {error}") from None
 
 
 def camera_to_table(camera: Any) -> dict[str, Any]:
@@ -119,6 +123,14 @@ def camera_to_table(camera: Any) -> dict[str, Any]:
         value = getattr(camera, field.name)
         table[field.name] = list(value) if isinstance(value, tuple) else value
     return table
+
+
+def show(value: Any) -> str:
+    """A value for an error message: shortened and on one line."""
+    try:
+        return " ".join(reprlib.repr(value).split())
+    except ValueError:  # Python refuses to print integers of thousands of digits
+        return "a number of too many digits"
 
 
 def rows(name: str, array: Any, columns: int) -> FloatArray:
@@ -144,8 +156,4 @@ def _as_float(value: Any) -> float | None:
 
 
 def _bad(key: str, value: Any, remedy: str) -> CalibrationError:
-    return CalibrationError(f"camera key '{key}' is {_show(value)}: {remedy}.")
-
-
-def _show(value: Any) -> str:
-    return " ".join(reprlib.repr(value).split())
+    return CalibrationError(f"camera key '{key}' is {show(value)}: {remedy}.")

@@ -7,8 +7,7 @@ import numpy as np
 from spherloc.cameras.base import FloatArray
 
 RIM_MARGIN = 1e-6
-"""Share of a validity limit given up: under a thousandth of a pixel; at the limit itself the slope is
-zero and nothing can be inverted."""
+"""Share of a validity limit given up, under a thousandth of a pixel: at the limit itself nothing can be inverted."""
 
 _REAL_ROOT = 1e-7
 """Two real roots that coincide come out as a complex pair this close (about sqrt(eps)) to the real axis."""
@@ -17,8 +16,11 @@ _REAL_ROOT = 1e-7
 def first_positive_root(coefficients: Sequence[float]) -> float:
     """Smallest t > 0 with 1 + c1 t + c2 t^2 + ... = 0, or inf; ``coefficients`` are c1, c2, ...
 
-    Solved for 1/t: that polynomial has the leading coefficient 1, so that vanishing coefficients cannot blow up.
+    Solved for 1/t: that polynomial has the leading coefficient 1, so that vanishing coefficients cannot blow up. A
+    coefficient that overflowed gives 0.
     """
+    if not np.isfinite(coefficients).all():
+        return 0.0
     reciprocal = np.roots(np.trim_zeros(np.concatenate([[1.0], coefficients]), "b"))
     real = reciprocal.real[np.abs(reciprocal.imag) <= _REAL_ROOT * np.abs(reciprocal)]
     largest = float(real.max(initial=0.0))

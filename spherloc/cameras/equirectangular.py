@@ -1,7 +1,7 @@
 """Equirectangular panorama (Sec. IV-B.3, Eq. 15-17), the same as COLMAP's EQUIRECTANGULAR.
 
-The paper's vertical is z (Eq. 17), while the yaw of Eq. 1 turns about y. It is permuted here, once: with
-x_paper = z, y_paper = x, z_paper = -y the centre of the image looks along +z, its right half at +x, its lower half at +y.
+The paper's vertical is z (Eq. 17), while the yaw of Eq. 1 turns about y. It is permuted here, once: x_paper = z,
+y_paper = x, z_paper = -y. The centre of the image looks along +z, its right half at +x, its lower half at +y.
 """
 
 from dataclasses import dataclass

@@ -14,13 +14,14 @@ import numpy as np
 from spherloc.cameras import _checks
 from spherloc.cameras._radial import RIM_MARGIN, InverseTable, first_positive_root
 from spherloc.cameras.base import BoolArray, FloatArray
-from spherloc.errors import CalibrationError
 
 _TABLE_NODES = 1025
 _NEWTON_STEPS = 2
 """Enough from a table of this size: its error of about 1e-6 rad is squared twice."""
 _TOLERANCE = 1e-13
 """Residual of Eq. 4, relative to 1 + theta_d, that counts as solved."""
+_ROUNDING = 1e-12
+"""Error of theta_d that the rounding of a pixel may cause, with some reserve, and share of theta given up for it."""
 _BISECTIONS = 60
 """Halvings of pi down to the last digit of a double."""
 _ON_AXIS = 1e-100
@@ -62,14 +63,14 @@ class KannalaBrandt:
     def project(self, points: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Pixels (N, 2) of camera-frame points (N, 3) in metres, and the mask (N,) of directions that are valid.
 
-        Valid is what is closer to the optical axis than ``max_angle_rad``; other pixels are NaN.
+        Valid is what is within ``max_angle_rad`` of the optical axis; other pixels are NaN.
         Raises ``ProblemError`` for a wrong shape.
         """
         x, y, z = _checks.rows("points", points, 3).T
         with np.errstate(all="ignore"):
             lateral = np.hypot(x, y)
             theta = np.arctan2(lateral, z)
-            valid = (theta < self.max_angle_rad) & np.isfinite(lateral + z) & ((lateral > 0) | (z > 0))
+            valid = (theta <= self.max_angle_rad) & np.isfinite(lateral + z) & ((lateral > 0) | (z > 0))
             scale = np.where(lateral > 0, self._theta_d(theta) / lateral, 0.0)
             pixels = np.column_stack([self.cx + self.fx * (scale * x), self.cy + self.fy * (scale * y)])
         pixels[~valid] = np.nan
@@ -135,7 +136,7 @@ class KannalaBrandt:
         return 1.0 + s * (3.0 * k1 + s * (5.0 * k2 + s * (7.0 * k3 + s * (9.0 * k4))))
 
     def _polar(self, pixels: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Unit direction (x, y) in the image plane and distance theta_d from the principal point (Eq. 3), each (N,)."""
+        """Unit direction in the image plane, x and y, and distance theta_d from the principal point (Eq. 3), (N,)."""
         u, v = _checks.rows("pixels", pixels, 2).T
         x0, y0 = (u - self.cx) / self.fx, (v - self.cy) / self.fy
         theta_d = np.hypot(x0, y0)
@@ -147,7 +148,8 @@ class KannalaBrandt:
         theta = self._inverse(theta_d)
         for _ in range(_NEWTON_STEPS):
             theta -= (self._theta_d(theta) - theta_d) / self._slope(theta)
-        inside = theta_d < self._inverse.end
+        # A direction at the rim stays valid although its pixel was rounded, and its bearing stays within the rim.
+        inside = theta_d <= self._inverse.end + _ROUNDING
         solved = np.abs(self._theta_d(theta) - theta_d) <= _TOLERANCE * (1.0 + theta_d)
         # Newton may leave the interval where the slope nearly vanishes; there theta_d still increases: bisect.
         solved &= (theta >= 0.0) & (theta <= self.max_angle_rad)
@@ -155,7 +157,7 @@ class KannalaBrandt:
         hard = inside & ~solved
         if hard.any():
             theta[hard] = self._bisect(theta_d[hard])
-        return theta
+        return np.minimum(theta, self.max_angle_rad * (1.0 - _ROUNDING))
 
     def _bisect(self, theta_d: FloatArray) -> FloatArray:
         low, high = np.zeros_like(theta_d), np.full_like(theta_d, self.max_angle_rad)

@@ -1,11 +1,10 @@
 """MEI omnidirectional camera (Sec. IV-B.2, Eq. 8-14), with the tangential terms p1, p2 that the paper leaves out.
 
-A bearing is moved by xi along z and divided by its new depth (Eq. 11-12), which gives an undistorted point (x, y) of
-the plane; the distortion (Eq. 8) moves that point. Both steps can fold. With xi > 1 the plane point turns back where
-z = -1/xi, and the distortion turns back where its Jacobian stops being positive definite. That Jacobian is the Hessian
-of a potential, since it is symmetric: on a disc where it is positive definite the distortion is the gradient of a strictly
-convex function and therefore one to one. ``max_radius`` is the radius of the largest such disc that can be
-guaranteed, and all that is valid lies in it.
+A bearing is moved by xi along z and divided by its new depth (Eq. 11-12): a point (x, y) of the undistorted plane. The
+distortion (Eq. 8) then moves that point. Both steps can fold: with xi > 1 the plane point turns back where z = -1/xi,
+and the distortion where its Jacobian stops being positive definite. That Jacobian is symmetric, the Hessian of a
+potential; on a disc where it is positive definite the distortion is the gradient of a strictly convex function and
+therefore one to one. Such a disc, of the radius ``max_radius``, holds all that is valid.
 """
 
 from dataclasses import dataclass
@@ -22,6 +21,8 @@ from spherloc.errors import CalibrationError
 
 _FARTHEST = 1e4
 """Largest ``max_radius``: with xi <= 1 the plane has no end, but no image is ten thousand focal lengths wide."""
+_LARGEST_XI = 1e3
+"""Far beyond any lens, for which xi is a few at most."""
 _TABLE_NODES = 1025
 _NEWTON_STEPS = 3
 """Enough from a table of this size for the tangential terms of real lenses."""
@@ -55,8 +56,8 @@ class Mei:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "xi", _checks.finite("xi", self.xi))
-        if self.xi <= -1.0:
-            raise CalibrationError(f"camera key 'xi' is {self.xi:g}, which sees nothing: give a number above -1.")
+        if not -1.0 < self.xi <= _LARGEST_XI:
+            raise CalibrationError(f"camera key 'xi' is {self.xi:g}: give a number above -1 and up to {_LARGEST_XI:g}.")
         _checks.check_lens(self, "k1, k2, p1, p2")
         with np.errstate(all="ignore"):
             _checks.check_sees_image(self, self._reach)
@@ -118,17 +119,18 @@ class Mei:
             s = x * x + y * y
             root = np.sqrt(1.0 + s * (1.0 - self.xi**2))
             scale = (self.xi + root) / (1.0 + s)
-            # d scale / d s, twice, since s changes by 2 (x dx + y dy)
+            # d scale = slope (x dx + y dy), and z = scale - xi changes by as much
             slope = ((1.0 - self.xi**2) / root - 2.0 * scale) / (1.0 + s)
-            lift = np.empty((len(x), 3, 2))
-            lift[:, 0, 0] = scale + slope * x * x
-            lift[:, 0, 1] = lift[:, 1, 0] = slope * x * y
-            lift[:, 1, 1] = scale + slope * y * y
-            lift[:, 2, 0] = slope * x
-            lift[:, 2, 1] = slope * y
             xx, xy, yy = self._hessian(x, y)
-            undistort = np.stack([yy, -xy, -xy, xx], axis=-1).reshape(-1, 2, 2) / (xx * yy - xy * xy)[:, None, None]
-            return lift @ undistort / (self.fx, self.fy)
+            determinant = xx * yy - xy * xy
+            jacobian = np.empty((len(x), 3, 2))
+            for column, (dx, dy, focal) in enumerate(((yy, -xy, self.fx), (-xy, xx, self.fy))):
+                dx, dy = dx / (determinant * focal), dy / (determinant * focal)
+                dz = slope * (x * dx + y * dy)
+                jacobian[:, 0, column] = scale * dx + x * dz
+                jacobian[:, 1, column] = scale * dy + y * dz
+                jacobian[:, 2, column] = dz
+        return jacobian
 
     def to_dict(self) -> dict[str, Any]:
         """The ``[camera]`` table: model, width, height, fx, fy, cx, cy, xi, distortion."""

@@ -1,0 +1,56 @@
+"""The steps before any estimate: the matches as they come, and their bearings on the unit sphere."""
+
+import numpy as np
+
+from spherloc_viz import style
+from spherloc_viz.layers.frame import Frame, RunView
+from spherloc_viz.layers.primitives import Step
+
+
+def frames(view: RunView) -> list[Frame]:
+    """Problem and bearings."""
+    problem = view.trace.problem
+    count, lost = len(problem), int(np.count_nonzero(~problem.usable))
+    grey = view.colors(style.UNDECIDED)
+    everybody = ~view.nobody()
+    known = ""
+    if problem.truth_inliers is not None:
+        wrong = count - int(np.count_nonzero(problem.truth_inliers))
+        known = f", {wrong} of them wrong by construction" if wrong else ", all of them right by construction"
+    hidden = f" {lost} pixels lie where the camera sees nothing and count as outliers." if lost else ""
+    start = view.standing(np.eye(3))
+    return [
+        Frame(
+            Step(
+                "problem",
+                "The matches",
+                f"{count} pixels are matched to map points{known}; each line ties a bearing to its point. "
+                f"Nothing is known about yaw or position yet, so the camera stands in the middle of the map.{hidden}",
+                "s v = R p + t   (Eq. 18)",
+            ),
+            start,
+            grey,
+            everybody,
+        ),
+        Frame(
+            Step(
+                "bearings",
+                "Bearings on the unit sphere",
+                f"The {problem.camera.model.replace('_', ' ')} camera turns each of its {count - lost} usable pixels "
+                "into a direction, a dot on the unit sphere, whatever its lens. "
+                "Gravity is known, so the sphere stands upright and only its yaw and position are open.",
+                _lens_equation(problem.camera.model),
+            ),
+            start,
+            grey,
+            view.nobody(),
+        ),
+    ]
+
+
+def _lens_equation(model: str) -> str:
+    return {
+        "mei": "v = (λx, λy, λ − ξ)   (Eq. 8-14)",
+        "kannala_brandt": "θd = θ(1 + k1θ² + k2θ⁴ + k3θ⁶ + k4θ⁸)   (Eq. 3-7)",
+        "equirectangular": "lon = 2π(u/W − ½), lat = π(½ − v/H)   (Eq. 15-17)",
+    }.get(model, "")

@@ -1,0 +1,32 @@
+"""Tables that go with a run."""
+
+import numpy as np
+
+from spherloc.geometry import camera_centre
+from spherloc.metrics import evaluate
+from spherloc.trace import Trace
+from spherloc_viz.layers.primitives import Table
+
+
+def outcome_table(trace: Trace) -> Table:
+    """Pose, errors, scores and times of a run."""
+    metrics = evaluate(trace)
+    rows: list[tuple[str, str]] = [("estimator", trace.estimator), ("outcome", _verdict(trace, metrics.success))]
+    if trace.cam_from_map is not None:
+        rows.append(("camera position", " ".join(f"{value:.3f}" for value in camera_centre(trace.cam_from_map)) + " m"))
+    if metrics.rotation_error_deg is not None and metrics.translation_error_m is not None:
+        rows.append(("rotation error", f"{metrics.rotation_error_deg:.3f}°"))
+        rows.append(("position error", f"{100 * metrics.translation_error_m:.2f} cm"))
+    rows.append(("inliers", f"{np.count_nonzero(trace.inlier_mask)} of {len(trace.problem)}"))
+    if metrics.precision is not None and metrics.recall is not None and metrics.f1 is not None:
+        rows.append(("precision / recall", f"{100 * metrics.precision:.0f} % / {100 * metrics.recall:.0f} %"))
+        rows.append(("F1", f"{100 * metrics.f1:.0f} %"))
+    stages = ", ".join(f"{name} {value:.1f}" for name, value in trace.timings_ms.items() if name != "total")
+    rows.append(("time", f"{trace.timings_ms['total']:.1f} ms" + (f" ({stages})" if stages else "")))
+    return Table("outcome", ("", "this run"), tuple(rows))
+
+
+def _verdict(trace: Trace, success: bool | None) -> str:
+    if trace.cam_from_map is None:
+        return "no pose"
+    return {True: "success", False: "failure", None: "pose found, truth unknown"}[success]

@@ -1,0 +1,91 @@
+"""Translation: the balls of feasible camera positions, their overlaps, and the maximum clique."""
+
+import numpy as np
+
+from spherloc.geometry import camera_centre
+from spherloc.trace import TranslationStage, YawStage
+from spherloc_viz import style
+from spherloc_viz.layers import yaw
+from spherloc_viz.layers.frame import Frame, RunView, one_color
+from spherloc_viz.layers.primitives import Balls, Points, SceneItem, Segments, Step
+
+
+def frames(view: RunView, stage: TranslationStage) -> list[Frame]:
+    """All balls, then their maximum clique."""
+    start = view.aligned_pose(stage.cam_from_map)
+    yaw_stage = view.trace.stage(YawStage)
+    charts = () if yaw_stage is None else (yaw.chart(view, yaw_stage, found=True),)
+    members = np.unique(stage.pairs[stage.clique])
+    drawn = _drawn(stage)
+    shown = "" if len(drawn) == len(stage.radii_m) else f" {len(drawn)} of {len(stage.radii_m):,} balls are drawn."
+    bound = "" if stage.proven else " The search reached its limit, so a larger clique may exist."
+    inside = view.colors(style.UNDECIDED, (np.unique(stage.pairs), style.CLIQUE))
+    return [
+        Frame(
+            Step(
+                "balls",
+                "Balls of camera positions",
+                f"With the yaw known, each pair says where the camera is, up to a ball; {len(stage.edges):,} pairs of "
+                f"balls overlap. {stage.rule}{shown}",
+                "H t = b,  |t_k − t| ≤ r_k   (Eq. 24-27)",
+            ),
+            view.standing(start[:, :3]),
+            inside,
+            view.nobody(),
+            extra=lambda: _balls(view, stage, drawn, found=False),
+            charts=charts,
+        ),
+        Frame(
+            Step(
+                "clique",
+                "The maximum clique of balls",
+                f"{len(stage.clique):,} of {len(stage.radii_m):,} balls overlap pairwise, from {len(members)} matches: "
+                f"the largest such set.{bound} The best of its pairs puts the camera at {view.position(start)}.",
+                "‖t_k1 − t_k2‖ ≤ r_k1 + r_k2   (Eq. 38)",
+            ),
+            start,
+            view.colors(style.UNDECIDED, (members, style.CLIQUE)),
+            view.nobody(),
+            located=True,
+            extra=lambda: _balls(view, stage, drawn, found=True),
+            charts=charts,
+        ),
+    ]
+
+
+def _drawn(stage: TranslationStage) -> np.ndarray:
+    """Indices of the balls to draw: the clique and then the others, each from the smallest, up to the limit."""
+    inside = np.zeros(len(stage.radii_m), dtype=bool)
+    inside[stage.clique] = True
+    return np.lexsort([stage.radii_m, ~inside])[: style.MAX_DRAWN_BALLS]
+
+
+def _balls(view: RunView, stage: TranslationStage, drawn: np.ndarray, found: bool) -> tuple[SceneItem, ...]:
+    inside = np.zeros(len(stage.radii_m), dtype=bool)
+    if found:
+        inside[stage.clique] = True
+    items: list[SceneItem] = []
+    for name, chosen, color, opacity in (
+        ("balls/others", drawn[~inside[drawn]], style.UNDECIDED, 0.10),
+        ("balls/clique", drawn[inside[drawn]], style.CLIQUE, 0.16),
+    ):
+        if len(chosen):
+            centres, colors = stage.centres_m[chosen], one_color(color, len(chosen))
+            items.append(Balls(name, "balls", centres, stage.radii_m[chosen], colors, opacity))
+            items.append(Points(f"{name}-centres", "balls", centres, colors, 0.035 * view.sphere_m))
+    items.append(_edges(stage, drawn, inside))
+    if view.truth is not None:
+        truth = camera_centre(view.truth)[None]
+        items.append(Points("balls/truth", "balls", truth, one_color(style.TRUTH, 1), 0.09 * view.sphere_m))
+    return tuple(items)
+
+
+def _edges(stage: TranslationStage, drawn: np.ndarray, inside: np.ndarray) -> Segments:
+    """Overlaps between drawn balls, those within the clique first, up to the limit."""
+    visible = np.isin(stage.edges, drawn).all(axis=1)
+    edges = stage.edges[visible]
+    within = inside[edges].all(axis=1)
+    order = np.argsort(~within, kind="stable")[: style.MAX_DRAWN_EDGES]
+    colors = one_color(style.UNDECIDED, len(order))
+    colors[within[order]] = style.CLIQUE
+    return Segments("balls/edges", "balls", stage.centres_m[edges[order]], colors, 1.0)

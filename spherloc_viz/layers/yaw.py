@@ -1,0 +1,135 @@
+"""Yaw: the ring of arcs around the sphere, and how many overlap at each yaw.
+
+On the ring, the direction of a yaw is where the camera looks with that yaw.
+"""
+
+import numpy as np
+
+from spherloc.geometry import camera_centre, wrap_angle, yaw_of, yaw_rotation
+from spherloc.trace import YawStage
+from spherloc_viz import style
+from spherloc_viz.layers.frame import Frame, RunView, one_color
+from spherloc_viz.layers.primitives import Chart, Curve, FloatArray, SceneItem, Segments, Step
+
+INNER, OUTER, CURVE = 1.3, 1.95, 2.05
+"""Radii of the band of arcs and of the overlap outline's foot, in sphere radii."""
+OUTLINE = 0.9
+"""Height of the overlap outline at its peak, in sphere radii."""
+STEP_RAD = np.radians(4.0)
+
+
+def frames(view: RunView, stage: YawStage) -> list[Frame]:
+    """All arcs, then the deepest overlap."""
+    pairs, arcs = stage.pairs_total, len(stage.lo_rad)
+    members = np.unique(stage.pairs[stage.clique])
+    start, turned = view.standing(np.eye(3)), view.standing(yaw_rotation(stage.yaw_rad))
+    drawn = _drawn(stage)
+    shown = "" if len(drawn) == arcs else f" {len(drawn)} of {arcs:,} arcs are drawn, the narrowest."
+    width = np.degrees(float(np.median(stage.hi_rad - stage.lo_rad)))
+    yaw = np.degrees(stage.yaw_rad)
+    interval = np.degrees(stage.best_rad[1] - stage.best_rad[0])
+    off = ""
+    if view.truth is not None:
+        off = f", {abs(np.degrees(wrap_angle(stage.yaw_rad - yaw_of(view.truth[:, :3])))):.2f}° from the truth"
+    return [
+        Frame(
+            Step(
+                "yaw-arcs",
+                "Yaw arcs of all pairs",
+                f"Two matches fix the yaw up to their noise: {pairs:,} pairs give {arcs:,} arcs, {width:.1f}° wide at "
+                f"the median. The ring shows where the camera would look; the outline counts the arcs.{shown}",
+                "|d1 cos θ + d2 sin θ + d3| ≤ τ   (Eq. 22, 33)",
+            ),
+            start,
+            view.colors(style.UNDECIDED),
+            view.nobody(),
+            extra=lambda: _ring(view, stage, start, found=False),
+            charts=(chart(view, stage, found=False),),
+        ),
+        Frame(
+            Step(
+                "yaw-clique",
+                "The yaw most arcs share",
+                f"{len(stage.clique):,} arcs overlap at {yaw:.2f}°{off}; no other yaw lies in more. "
+                f"They are a maximum clique of the rotation graph and agree on an interval of {interval:.2f}°.",
+                "max over θ of Σ 1(|f(θ)| ≤ τ)   (Eq. 34, 37)",
+            ),
+            turned,
+            view.colors(style.UNDECIDED, (members, style.CLIQUE)),
+            view.nobody(),
+            extra=lambda: _ring(view, stage, turned, found=True),
+            charts=(chart(view, stage, found=True),),
+        ),
+    ]
+
+
+def chart(view: RunView, stage: YawStage, found: bool) -> Chart:
+    """Overlap count over yaw, with the truth and, once found, the estimate."""
+    yaws = np.degrees(np.linspace(-np.pi, np.pi, len(stage.overlap) + 1)[:-1])
+    peak = float(stage.overlap.max(initial=1))
+    curves = [Curve("arcs that overlap", yaws, stage.overlap.astype(np.float64), style.UNDECIDED, "step")]
+    if view.truth is not None:
+        curves.append(_marker("truth", np.degrees(yaw_of(view.truth[:, :3])), peak, style.TRUTH))
+    if found:
+        curves.append(_marker("estimate", np.degrees(stage.yaw_rad), peak, style.ESTIMATE))
+    return Chart("yaw", "Arcs that overlap at each yaw", "yaw (°)", "arcs", tuple(curves))
+
+
+def _marker(label: str, x: float, height: float, color: style.RGB) -> Curve:
+    return Curve(label, np.array([x]), np.array([height]), color, "marker")
+
+
+def _drawn(stage: YawStage) -> np.ndarray:
+    """Indices of the arcs to draw: the narrowest, half of them from the clique where it has as many."""
+    width = stage.hi_rad - stage.lo_rad
+    inside = np.zeros(len(width), dtype=bool)
+    inside[stage.clique] = True
+    order = np.argsort(width, kind="stable")
+    members, others = order[inside[order]], order[~inside[order]]
+    room = style.MAX_DRAWN_ARCS
+    take = min(len(members), max(room // 2, room - len(others)))
+    return np.concatenate([members[:take], others[: room - take]])
+
+
+def _directions(yaw_rad: FloatArray) -> FloatArray:
+    """Where the camera looks (N, 3) with the yaws (N,): R^T e_z."""
+    return np.column_stack([-np.sin(yaw_rad), np.zeros_like(yaw_rad), np.cos(yaw_rad)])
+
+
+def _ring(view: RunView, stage: YawStage, cam_from_map: FloatArray, found: bool) -> tuple[SceneItem, ...]:
+    centre, drawn = camera_centre(cam_from_map), _drawn(stage)
+    tracks = INNER + (OUTER - INNER) * (np.arange(len(drawn)) + 0.5) / max(1, len(drawn))
+    steps = np.maximum(1, np.ceil((stage.hi_rad - stage.lo_rad)[drawn] / STEP_RAD)).astype(int)
+    arc = np.repeat(np.arange(len(drawn)), steps)
+    part = np.arange(len(arc)) - np.repeat(np.cumsum(steps) - steps, steps)
+    width = (stage.hi_rad - stage.lo_rad)[drawn][arc] / steps[arc]
+    ends = stage.lo_rad[drawn][arc][:, None] + width[:, None] * (part[:, None] + np.array([0.0, 1.0]))
+    points = centre + view.sphere_m * tracks[arc][:, None, None] * _directions(ends.ravel()).reshape(-1, 2, 3)
+    colors = one_color(style.UNDECIDED, len(arc))
+    if found:
+        colors[np.isin(drawn, stage.clique)[arc]] = style.CLIQUE
+    items: list[SceneItem] = [
+        Segments("ring/arcs", "yaw ring", points, colors, 2.0),
+        _outline(view, stage, centre),
+    ]
+    if found:
+        items.append(_spoke("ring/estimate", view, centre, stage.yaw_rad, style.ESTIMATE))
+    if view.truth is not None:
+        items.append(_spoke("ring/truth", view, centre, yaw_of(view.truth[:, :3]), style.TRUTH))
+    return tuple(items)
+
+
+def _outline(view: RunView, stage: YawStage, centre: FloatArray) -> Segments:
+    """The overlap curve bent around the ring, at one point a degree."""
+    height = stage.overlap.reshape(360, -1).max(axis=1)
+    radius = CURVE + OUTLINE * height / max(1, int(height.max()))
+    yaws = np.radians(np.arange(360) - 179.5)
+    line = centre + view.sphere_m * radius[:, None] * _directions(yaws)
+    points = np.stack([line, np.roll(line, -1, axis=0)], axis=1)
+    return Segments("ring/overlap", "yaw ring", points, one_color(style.SPHERE, 360), 2.5)
+
+
+def _spoke(name: str, view: RunView, centre: FloatArray, yaw_rad: float, color: style.RGB) -> Segments:
+    radii = view.sphere_m * np.array([1.0, CURVE + OUTLINE + 0.15])
+    ends = centre + radii[:, None] * _directions(np.array([yaw_rad]))
+    return Segments(name, "yaw ring", ends[None], one_color(color, 1), 4.0)
