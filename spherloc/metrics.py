@@ -24,7 +24,7 @@ class Metrics:
     translation_error_m: float | None
     """Distance between the true and the estimated camera position, metres."""
     t_error_m: float | None
-    """|t_true - t| of ``cam_from_map``, metres: Sec. VI to the letter; it grows with the distance to the map's origin."""
+    """|t_true - t| of ``cam_from_map``, metres: Sec. VI to the letter; grows with the distance to the map's origin."""
     success: bool | None
     """Both errors below 1 degree and 0.1 m; a run without a pose has failed."""
     precision: float | None

@@ -75,7 +75,7 @@ def _gauss_newton(aligned: AlignedProblem, start: FloatArray, mask: BoolArray, d
     residual, jacobian = residual_and_jacobian(points, weights, current, dof)
     cost = float(residual @ residual)
     for _ in range(MAX_ITERATIONS):
-        step = np.linalg.lstsq(jacobian, -residual, rcond=None)[0]
+        step = np.asarray(np.linalg.lstsq(jacobian, -residual, rcond=None)[0], dtype=np.float64)
         for _halving in range(8):
             candidate = apply_step(points, current, step)
             residual, jacobian = residual_and_jacobian(points, weights, candidate, dof)

@@ -99,7 +99,7 @@ def _lowest_bit(word: np.uint64) -> int:
 
 
 @numba.njit(cache=True, nogil=True)
-def _colour(candidates, rows, needed, order, bound):  # noqa: ANN001 - numba kernel
+def _colour(candidates, rows, needed, order, bound):
     """Colour the candidate bitset greedily; list the nodes whose colour exceeds ``needed``, with the colour.
 
     A clique uses each colour once, so only such nodes can be the last of a clique that beats the best one.
@@ -132,7 +132,7 @@ def _colour(candidates, rows, needed, order, bound):  # noqa: ANN001 - numba ker
 
 
 @numba.njit(cache=True, nogil=True)
-def _search(rows, branch_limit):  # noqa: ANN001 - numba kernel
+def _search(rows, branch_limit):
     """Members of a largest clique, and whether the search was finished. Explicit stack, no recursion."""
     count, words = rows.shape
     candidates = np.zeros((count + 1, words), np.uint64)

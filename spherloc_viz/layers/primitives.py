@@ -126,6 +126,8 @@ class Step:
     """Two sentences with this run's own numbers, plain text."""
     equation: str
     """The equation that this step computes, with its number in the paper, plain text; may be empty."""
+    note: str = ""
+    """What the picture leaves out and by which rule, plain text; may be empty."""
 
 
 @dataclass(frozen=True, eq=False)

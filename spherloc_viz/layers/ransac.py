@@ -28,7 +28,7 @@ def _improvement(view: RunView, stage: RansacStage, k: int) -> Frame:
             f"sample-{k + 1}",
             f"Sample {drawn:,}" + (": the best" if last else ""),
             f"Matches {i} and {j} fix a pose that explains {inliers} of {count} matches; {then}. "
-            f"At that share of inliers, {drawn:,} samples contain a clean pair with probability {chance:.3g}.",
+            f"At that share of inliers, {_samples(drawn)} a clean pair with probability {chance:.3g}.",
             "P = 1 − (1 − wⁿ)ᵏ,  n = 2   (Eq. 28)",
         ),
         view.aligned_pose(stage.cam_from_map[k]),
@@ -37,6 +37,10 @@ def _improvement(view: RunView, stage: RansacStage, k: int) -> Frame:
         located=True,
         charts=(chart(stage),),
     )
+
+
+def _samples(drawn: int) -> str:
+    return "one sample is" if drawn == 1 else f"{drawn:,} samples contain"
 
 
 def chart(stage: RansacStage) -> Chart:

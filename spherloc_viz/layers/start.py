@@ -17,7 +17,9 @@ def frames(view: RunView) -> list[Frame]:
     if problem.truth_inliers is not None:
         wrong = count - int(np.count_nonzero(problem.truth_inliers))
         known = f", {wrong} of them wrong by construction" if wrong else ", all of them right by construction"
-    hidden = f" {lost} pixels lie where the camera sees nothing and count as outliers." if lost else ""
+    note = f"{lost} pixels lie where the camera sees nothing and count as outliers." if lost else ""
+    if count - lost > style.MAX_DRAWN_RAYS:
+        note = f"The first {style.MAX_DRAWN_RAYS} of {count - lost:,} lines are drawn. {note}".strip()
     start = view.standing(np.eye(3))
     return [
         Frame(
@@ -25,8 +27,9 @@ def frames(view: RunView) -> list[Frame]:
                 "problem",
                 "The matches",
                 f"{count} pixels are matched to map points{known}; each line ties a bearing to its point. "
-                f"Nothing is known about yaw or position yet, so the camera stands in the middle of the map.{hidden}",
+                f"Nothing is known about yaw or position yet, so the camera stands in the middle of the map.",
                 "s v = R p + t   (Eq. 18)",
+                note,
             ),
             start,
             grey,

@@ -17,8 +17,8 @@ def frames(view: RunView, stage: TranslationStage) -> list[Frame]:
     charts = () if yaw_stage is None else (yaw.chart(view, yaw_stage, found=True),)
     members = np.unique(stage.pairs[stage.clique])
     drawn = _drawn(stage)
-    shown = "" if len(drawn) == len(stage.radii_m) else f" {len(drawn)} of {len(stage.radii_m):,} balls are drawn."
-    bound = "" if stage.proven else " The search reached its limit, so a larger clique may exist."
+    note = _note(stage, drawn)
+    largest = "the largest such set" if stage.proven else "the largest set found before the search reached its limit"
     inside = view.colors(style.UNDECIDED, (np.unique(stage.pairs), style.CLIQUE))
     return [
         Frame(
@@ -26,8 +26,9 @@ def frames(view: RunView, stage: TranslationStage) -> list[Frame]:
                 "balls",
                 "Balls of camera positions",
                 f"With the yaw known, each pair says where the camera is, up to a ball; {len(stage.edges):,} pairs of "
-                f"balls overlap. {stage.rule}{shown}",
+                f"balls overlap. Small balls come from near points under a wide angle, and inliers share one spot.",
                 "H t = b,  |t_k − t| ≤ r_k   (Eq. 24-27)",
+                note,
             ),
             view.standing(start[:, :3]),
             inside,
@@ -40,8 +41,9 @@ def frames(view: RunView, stage: TranslationStage) -> list[Frame]:
                 "clique",
                 "The maximum clique of balls",
                 f"{len(stage.clique):,} of {len(stage.radii_m):,} balls overlap pairwise, from {len(members)} matches: "
-                f"the largest such set.{bound} The best of its pairs puts the camera at {view.position(start)}.",
+                f"{largest}. The best of its pairs puts the camera at {view.position(start)}.",
                 "‖t_k1 − t_k2‖ ≤ r_k1 + r_k2   (Eq. 38)",
+                note,
             ),
             start,
             view.colors(style.UNDECIDED, (members, style.CLIQUE)),
@@ -51,6 +53,16 @@ def frames(view: RunView, stage: TranslationStage) -> list[Frame]:
             charts=charts,
         ),
     ]
+
+
+def _note(stage: TranslationStage, drawn: np.ndarray) -> str:
+    """By which rules balls and edges were left out."""
+    parts = [stage.rule]
+    if len(drawn) < len(stage.radii_m):
+        parts.append(f"{len(drawn)} of {len(stage.radii_m):,} balls are drawn: the clique first, small before large.")
+    if len(stage.edges) > style.MAX_DRAWN_EDGES:
+        parts.append(f"At most {style.MAX_DRAWN_EDGES:,} of {len(stage.edges):,} edges are drawn, the clique's first.")
+    return " ".join(parts)
 
 
 def _drawn(stage: TranslationStage) -> np.ndarray:
@@ -84,8 +96,8 @@ def _edges(stage: TranslationStage, drawn: np.ndarray, inside: np.ndarray) -> Se
     """Overlaps between drawn balls, those within the clique first, up to the limit."""
     visible = np.isin(stage.edges, drawn).all(axis=1)
     edges = stage.edges[visible]
-    within = inside[edges].all(axis=1)
+    within = np.logical_and(inside[edges[:, 0]], inside[edges[:, 1]])
     order = np.argsort(~within, kind="stable")[: style.MAX_DRAWN_EDGES]
     colors = one_color(style.UNDECIDED, len(order))
-    colors[within[order]] = style.CLIQUE
+    colors[np.take(within, order)] = style.CLIQUE
     return Segments("balls/edges", "balls", stage.centres_m[edges[order]], colors, 1.0)

@@ -24,7 +24,7 @@ def frames(view: RunView, stage: YawStage) -> list[Frame]:
     members = np.unique(stage.pairs[stage.clique])
     start, turned = view.standing(np.eye(3)), view.standing(yaw_rotation(stage.yaw_rad))
     drawn = _drawn(stage)
-    shown = "" if len(drawn) == arcs else f" {len(drawn)} of {arcs:,} arcs are drawn, the narrowest."
+    note = "" if len(drawn) == arcs else f"The {len(drawn)} narrowest of {arcs:,} arcs are drawn, half from the clique."
     width = np.degrees(float(np.median(stage.hi_rad - stage.lo_rad)))
     yaw = np.degrees(stage.yaw_rad)
     interval = np.degrees(stage.best_rad[1] - stage.best_rad[0])
@@ -37,8 +37,9 @@ def frames(view: RunView, stage: YawStage) -> list[Frame]:
                 "yaw-arcs",
                 "Yaw arcs of all pairs",
                 f"Two matches fix the yaw up to their noise: {pairs:,} pairs give {arcs:,} arcs, {width:.1f}° wide at "
-                f"the median. The ring shows where the camera would look; the outline counts the arcs.{shown}",
+                f"the median. The ring shows where the camera would look; the outline counts the arcs.",
                 "|d1 cos θ + d2 sin θ + d3| ≤ τ   (Eq. 22, 33)",
+                note,
             ),
             start,
             view.colors(style.UNDECIDED),
@@ -53,6 +54,7 @@ def frames(view: RunView, stage: YawStage) -> list[Frame]:
                 f"{len(stage.clique):,} arcs overlap at {yaw:.2f}°{off}; no other yaw lies in more. "
                 f"They are a maximum clique of the rotation graph and agree on an interval of {interval:.2f}°.",
                 "max over θ of Σ 1(|f(θ)| ≤ τ)   (Eq. 34, 37)",
+                note,
             ),
             turned,
             view.colors(style.UNDECIDED, (members, style.CLIQUE)),
