@@ -6,7 +6,7 @@ import numpy as np
 
 @numba.njit(cache=True, nogil=True)
 def count_inliers(yaw, translation, bearings, points, weights, bound_px):
-    """Correspondences whose first-order reprojection error is within their bound; the same residual as in ``refine``."""
+    """Correspondences whose first-order reprojection error is within their bound; as in ``refine``."""
     c, s = np.cos(yaw), np.sin(yaw)
     inliers = 0
     for k in range(len(points)):
