@@ -56,6 +56,8 @@ class YawStage(Stage):
     kind = "yaw"
     pairs_total: int
     """Pairs of usable correspondences, K."""
+    rule: str
+    """The rule by which arcs were left out, in words."""
     pairs: IndexArray
     """(A, 2) indices of the arc's two correspondences in the problem."""
     lo_rad: FloatArray

@@ -3,19 +3,21 @@
 Paper, Eq. 24-27 and 38, stated for the camera position C = -R^T t in the aligned map frame instead of t: the two rays
 of a pair start at their map points, and C is where they come closest. (Eq. 25's H loses rank for horizontal bearings;
 the distance to both rays, H = [I - v_i v_i^T; I - v_j v_j^T], does not, and its least-squares solution is the middle of
-their shortest connection.) The ball around C contains the true position of a pair of inliers, to first order, since
+their shortest connection.) With depth bounds S (see ``depth_bounds``) and a true yaw at most delta away, a pair of
+inliers has
 
-    |C - C_true| <= ||H^+|| hypot(s_i sin eps_i, s_j sin eps_j) + |dC/dyaw| |yaw - yaw_true|,
+    |C - C_true| <= ||H^+|| hypot(S_i sin eps_i, S_j sin eps_j) + |C'| delta + |C''| delta^2 / 2,
 
-||H^+|| = (1 - |cos alpha|)^(-1/2), and the true yaw lies in the pair's own arc.
+where ||H^+|| = (1 - |cos alpha|)^(-1/2), the derivatives are by yaw, and S and |C''| are taken at their largest within
+delta: the ball contains the true position.
 """
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from spherloc.consensus.depth_bounds import pair_sinusoids
 from spherloc.problem import AlignedProblem
-from spherloc.solvers.two_point import depths, yaw_coefficients
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -27,11 +29,11 @@ def translation_balls(
 ) -> tuple[FloatArray, FloatArray]:
     """Camera positions (P, 3) and radii (P,), metres, of ``pairs`` (P, 2) of places in ``aligned`` at a yaw.
 
-    ``yaw_slack_rad`` (P,) bounds how far the true yaw may lie from ``yaw_rad``. A pair with a negative depth at this
-    yaw gets the radius inf.
+    ``yaw_slack_rad`` (P,) bounds how far the true yaw may lie from ``yaw_rad``. A pair that bounds nothing has the
+    radius inf.
     """
     centres, radii = np.empty((len(pairs), 3)), np.empty(len(pairs))
-    _fill(aligned.bearings, aligned.points, np.sin(bound_rad), pairs, yaw_rad, yaw_slack_rad, centres, radii)
+    _fill(aligned.bearings, aligned.points, bound_rad, pairs, yaw_rad, yaw_slack_rad, centres, radii)
     return centres, radii
 
 
@@ -44,36 +46,55 @@ def overlapping(centres: FloatArray, radii: FloatArray) -> BoolArray:
 
 
 @numba.njit(cache=True, nogil=True)
-def _fill(bearings, points, sin_eps, pairs, yaw, slack, centres, radii):
+def _fill(bearings, points, eps, pairs, yaw, slack, centres, radii):
     c, s = np.cos(yaw), np.sin(yaw)
+    wave = np.empty((6, 3))
     for k in range(len(pairs)):
         i, j = pairs[k]
         vi, vj, pi, pj = bearings[i], bearings[j], points[i], points[j]
-        sin2 = yaw_coefficients(vi, vj, pi, pj)[3]
-        si, sj = depths(vi, vj, pi, pj, c, s, sin2)
-        # d depth / d yaw: R'(yaw) d is R(yaw + pi/2) d without its y part, so the vertical offset drops out.
-        di, dj = depths(vi, vj, pi, pj, -s, c, sin2)
-        vi_y, vj_y, dot = vi[1], vj[1], vi[0] * vj[0] + vi[1] * vj[1] + vi[2] * vj[2]
-        height = pi[1] - pj[1]
-        di -= (vi_y - dot * vj_y) * height / sin2
-        dj -= (dot * vi_y - vj_y) * height / sin2
+        if pair_sinusoids(vi, vj, pi, pj, eps[i], eps[j], wave) == 0.0:
+            centres[k], radii[k] = 0.5 * (pi + pj), np.inf
+            continue
+        si, sj = _value(wave[1], c, s), _value(wave[2], c, s)
+        di, dj = _slope(wave[1], c, s), _slope(wave[2], c, s)
         slope2 = 0.0
         for axis in range(3):
             ray_i, turn_i = _turned_back(vi, c, s, axis)
             ray_j, turn_j = _turned_back(vj, c, s, axis)
             centres[k, axis] = 0.5 * (pi[axis] - si * ray_i + pj[axis] - sj * ray_j)
             slope2 += (0.5 * (di * ray_i + si * turn_i + dj * ray_j + sj * turn_j)) ** 2
-        if si <= 0.0 or sj <= 0.0:
-            radii[k] = np.inf
-            continue
-        noise = np.sqrt(((si * sin_eps[i]) ** 2 + (sj * sin_eps[j]) ** 2) / _one_minus_abs_cos(dot, sin2))
-        radii[k] = noise + np.sqrt(slope2) * slack[k]
+        delta = slack[k]
+        # |(s v)''| <= |s''| + 2 |s'| + |s|, and a sinusoid's derivatives are at most its amplitude.
+        bend = 0.5 * (_amplitude(wave[1]) * 4.0 + abs(wave[1, 2]) + _amplitude(wave[2]) * 4.0 + abs(wave[2, 2]))
+        most_i = max(0.0, _value(wave[3], c, s) + _amplitude(wave[3]) * delta)
+        most_j = max(0.0, _value(wave[4], c, s) + _amplitude(wave[4]) * delta)
+        spread2 = (most_i * np.sin(eps[i])) ** 2 + (most_j * np.sin(eps[j])) ** 2
+        noise = np.sqrt(spread2 / _one_minus_abs_cos(vi, vj))
+        radii[k] = noise + np.sqrt(slope2) * delta + 0.5 * bend * delta * delta
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _value(wave, c, s):
+    return wave[0] * c + wave[1] * s + wave[2]
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _slope(wave, c, s):
+    return wave[1] * c - wave[0] * s
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _amplitude(wave):
+    return np.sqrt(wave[0] * wave[0] + wave[1] * wave[1])
 
 
 @numba.njit(cache=True, nogil=True)
-def _one_minus_abs_cos(dot, sin2):
-    """1 - |cos alpha|, without cancellation for small angles."""
-    return sin2 / (1.0 + abs(dot))
+def _one_minus_abs_cos(vi, vj):
+    """1 - |cos| of the angle between two unit vectors, without cancellation for small angles."""
+    cx = vi[1] * vj[2] - vi[2] * vj[1]
+    cy = vi[2] * vj[0] - vi[0] * vj[2]
+    cz = vi[0] * vj[1] - vi[1] * vj[0]
+    return (cx * cx + cy * cy + cz * cz) / (1.0 + abs(vi[0] * vj[0] + vi[1] * vj[1] + vi[2] * vj[2]))
 
 
 @numba.njit(cache=True, nogil=True)

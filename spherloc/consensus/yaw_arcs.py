@@ -1,86 +1,105 @@
-"""Yaw arcs: for every pair of correspondences, the yaws that agree with it up to its bounds.
+"""Yaw arcs: for every pair of correspondences, the yaws at which both can be inliers.
 
-With measured bearings, f(yaw) = rho cos(yaw - phi) + d3 (Eq. 22, 33) need not vanish at the true yaw. If the
-bearings are off by at most eps_i and eps_j, then |f| <= tau with
-
-    tau = sin(alpha) (s_i sin eps_i + s_j sin eps_j),
-
-where alpha is the angle between the measured bearings and s are the true depths: f is linear in each bearing, and
-v_i x v_j has the component |sin(alpha)| |sin eps| along the other ray. The true depths are unknown; those at the root
-stand in for them (first order). A pair whose bearings are closer than eps_i + eps_j, or whose points coincide, says
-nothing and has no arc; nor has a root with a negative depth.
+At the true yaw of a pair of inliers, |f| <= tau, S_i >= 0 and S_j >= 0 (see ``depth_bounds``). Each of these is
+A cos yaw + B sin yaw + C <= 0, which is one arc, so the feasible yaws are an intersection of four arcs in closed form:
+usually one short arc around each root of Eq. 22 with positive depths. The arcs bound: the true yaw cannot be
+outside while the noise is within its bound.
 """
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from spherloc.consensus.depth_bounds import pair_sinusoids
 from spherloc.problem import AlignedProblem
-from spherloc.solvers.two_point import DEGENERATE, depths, yaw_coefficients
 
 FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int32]
 
+FULL = 2.0 * np.pi
+MOST_ARCS = 4
+"""Four arcs of a circle intersect in at most four."""
+ROUNDING = 1e-12
+"""Slack of every condition, relative to its amplitude, so that rounding never excludes the true yaw."""
 
-def yaw_arcs(aligned: AlignedProblem, bound_rad: FloatArray) -> tuple[IndexArray, FloatArray, FloatArray]:
+
+def yaw_arcs(
+    aligned: AlignedProblem, bound_rad: FloatArray, widest_rad: float = FULL
+) -> tuple[IndexArray, FloatArray, FloatArray]:
     """All arcs: pairs (A, 2) of places in ``aligned``, lower ends (A,) in [-pi, pi), upper ends (A,) >= lower.
 
-    ``bound_rad`` (M,) bounds the angular error of each bearing.
+    ``bound_rad`` (M,) bounds the angular error of each bearing. Arcs wider than ``widest_rad`` are left out, and so is
+    a pair that bounds nothing: it would cover every yaw alike.
     """
     count = len(aligned.bearings)
-    room = count * (count - 1)
+    room = MOST_ARCS * (count * (count - 1) // 2)
+    # Memory that is never touched is never used, so room for the worst case costs nothing.
     pairs = np.empty((room, 2), np.int32)
     lo, hi = np.empty(room), np.empty(room)
-    used = _fill(aligned.bearings, aligned.points, np.sin(bound_rad), pairs, lo, hi)
+    used = _fill(aligned.bearings, aligned.points, bound_rad, widest_rad, pairs, lo, hi)
     return pairs[:used].copy(), lo[:used].copy(), hi[:used].copy()
 
 
 @numba.njit(cache=True, nogil=True)
-def _branch(vi, vj, pi, pj, sin_i, sin_j, coefficients, sign):
-    """Arc offsets (near, far) from phi on one branch, 0 <= near <= far <= pi; far < 0 if there is none."""
-    d1, d2, d3, sin2, _ = coefficients
-    rho, phi = np.sqrt(d1 * d1 + d2 * d2), np.arctan2(d2, d1)
-    root = phi + sign * np.arccos(min(1.0, max(-1.0, -d3 / rho)))
-    si, sj = depths(vi, vj, pi, pj, np.cos(root), np.sin(root), sin2)
-    if si <= 0.0 or sj <= 0.0:
+def _where_not_positive(a, b, c):
+    """The arc (start, width) on which a cos + b sin + c <= 0; its width is below 0 if there is none."""
+    amplitude = np.sqrt(a * a + b * b)
+    c -= ROUNDING * (amplitude + abs(c))
+    if c > amplitude:
         return 0.0, -1.0
-    tau = np.sqrt(sin2) * (si * sin_i + sj * sin_j)
-    if abs(d3) - tau > rho:
-        return 0.0, -1.0
-    return np.arccos(min(1.0, (tau - d3) / rho)), np.arccos(max(-1.0, (-tau - d3) / rho))
+    if c <= -amplitude:
+        return -np.pi, FULL
+    half = np.pi - np.arccos(-c / amplitude)
+    return np.arctan2(-b, -a) - half, 2.0 * half
 
 
 @numba.njit(cache=True, nogil=True)
-def _fill(bearings, points, sin_eps, pairs, lo, hi):
-    used, full = 0, 2.0 * np.pi
+def _intersect(arcs, count, start, width, out):
+    """Intersect ``count`` arcs, rows (start, width), with one more into ``out``; return how many there are."""
+    kept = 0
+    for k in range(count):
+        if arcs[k, 1] >= FULL or width >= FULL:
+            out[kept, 0], out[kept, 1] = (start, width) if arcs[k, 1] >= FULL else (arcs[k, 0], arcs[k, 1])
+            kept += 1
+            continue
+        offset = (start - arcs[k, 0]) % FULL
+        if offset <= arcs[k, 1]:
+            out[kept, 0], out[kept, 1] = start, min(arcs[k, 1] - offset, width)
+            kept += 1
+        if offset + width >= FULL:
+            out[kept, 0], out[kept, 1] = arcs[k, 0], min(arcs[k, 1], offset + width - FULL)
+            kept += 1
+    return kept
+
+
+@numba.njit(cache=True, nogil=True)
+def _fill(bearings, points, eps, widest, pairs, lo, hi):
+    used = 0
+    wave = np.empty((6, 3))
+    arcs, scratch = np.empty((MOST_ARCS + 1, 2)), np.empty((MOST_ARCS + 1, 2))
     for i in range(len(bearings)):
         for j in range(i + 1, len(bearings)):
-            vi, vj, pi, pj = bearings[i], bearings[j], points[i], points[j]
-            coefficients = yaw_coefficients(vi, vj, pi, pj)
-            d1, d2, _, sin2, dist2 = coefficients
-            if sin2 <= (sin_eps[i] + sin_eps[j]) ** 2 or d1 * d1 + d2 * d2 <= DEGENERATE**2 * dist2:
+            if pair_sinusoids(bearings[i], bearings[j], points[i], points[j], eps[i], eps[j], wave) == 0.0:
                 continue
-            phi = np.arctan2(d2, d1)
-            near_p, far_p = _branch(vi, vj, pi, pj, sin_eps[i], sin_eps[j], coefficients, 1.0)
-            near_m, far_m = _branch(vi, vj, pi, pj, sin_eps[i], sin_eps[j], coefficients, -1.0)
-            first = used
-            if far_p >= 0.0 and far_m >= 0.0 and near_p == 0.0 and near_m == 0.0:
-                # Both branches reach phi: one arc, or the whole circle if they meet again on the far side.
-                lo[used], hi[used] = phi - far_m, phi + far_p
+            f, most_i, most_j, tau = wave[0], wave[3], wave[4], wave[5]
+            arcs[0] = _where_not_positive(f[0] - tau[0], f[1] - tau[1], f[2] - tau[2])
+            count = 1 if arcs[0, 1] >= 0.0 else 0
+            for a, b, c in (
+                (-f[0] - tau[0], -f[1] - tau[1], -f[2] - tau[2]),
+                (-most_i[0], -most_i[1], -most_i[2]),
+                (-most_j[0], -most_j[1], -most_j[2]),
+            ):
+                if count == 0:
+                    break
+                start, width = _where_not_positive(a, b, c)
+                count = _intersect(arcs, count, start, width, scratch) if width >= 0.0 else 0
+                arcs, scratch = scratch, arcs
+            for k in range(count):
+                if arcs[k, 1] > widest:
+                    continue
+                start = (arcs[k, 0] + np.pi) % FULL - np.pi
+                start -= FULL if start >= np.pi else 0.0
+                pairs[used, 0], pairs[used, 1] = i, j
+                lo[used], hi[used] = start, start + min(arcs[k, 1], FULL)
                 used += 1
-            elif far_p >= 0.0 and far_m >= 0.0 and far_p == np.pi and far_m == np.pi:
-                lo[used], hi[used] = phi + near_p, phi + full - near_m
-                used += 1
-            else:
-                if far_p >= 0.0:
-                    lo[used], hi[used] = phi + near_p, phi + far_p
-                    used += 1
-                if far_m >= 0.0:
-                    lo[used], hi[used] = phi - far_m, phi - near_m
-                    used += 1
-            for k in range(first, used):
-                width = min(hi[k] - lo[k], full)
-                start = (lo[k] + np.pi) % full - np.pi
-                pairs[k, 0], pairs[k, 1] = i, j
-                lo[k], hi[k] = start, start + width
     return used

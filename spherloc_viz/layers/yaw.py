@@ -24,7 +24,9 @@ def frames(view: RunView, stage: YawStage) -> list[Frame]:
     members = np.unique(stage.pairs[stage.clique])
     start, turned = view.standing(np.eye(3)), view.standing(yaw_rotation(stage.yaw_rad))
     drawn = _drawn(stage)
-    note = "" if len(drawn) == arcs else f"The {len(drawn)} narrowest of {arcs:,} arcs are drawn, half from the clique."
+    note = stage.rule
+    if len(drawn) < arcs:
+        note += f" The {len(drawn)} narrowest of {arcs:,} arcs are drawn, half of them from the clique."
     width = np.degrees(float(np.median(stage.hi_rad - stage.lo_rad)))
     yaw = np.degrees(stage.yaw_rad)
     interval = np.degrees(stage.best_rad[1] - stage.best_rad[0])

@@ -1,0 +1,42 @@
+# Everything is installed into .venv by scripts/setup.sh; `make help` says the rest.
+SCENE ?= scenes/mei_outliers_80.toml
+PORT ?=
+ARGS ?=
+PYTHON ?= python3
+BIN := .venv/bin
+
+export PYTHON
+
+.DEFAULT_GOAL := help
+.NOTPARALLEL:
+.PHONY: help play test lint clean
+
+help: ## Show this
+	@printf 'spherloc: see why visual localization works, and why it fails\n\n'
+	@sed -n 's/^\([a-z]*\):.*## \(.*\)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 16
+	@printf '\nOptions, with what they are now:\n'
+	@printf '  %-12s  %s\n' 'SCENE=FILE' 'scene to play ($(SCENE))' \
+	  'PORT=NUMBER' 'port of the playground ($(or $(PORT),whatever `spherloc play` chooses))' \
+	  'ARGS=...' "more for pytest or spherloc play: make test ARGS='-k mei -x'" \
+	  'PYTHON=FILE' 'Python 3.11 or newer to start from ($(PYTHON))'
+
+play: ## Install what it needs, start the playground and print its address
+	@scripts/setup.sh play
+	@trap : INT; $(BIN)/spherloc play '$(SCENE)' $(if $(PORT),--port $(PORT)) $(ARGS) || [ $$? -eq 130 ] # Ctrl-C is its end
+
+test: ## Install what the tests need, a Chromium included, and run them all
+	@SPHERLOC_CHROMIUM="$$(scripts/setup.sh test)" && export SPHERLOC_CHROMIUM && \
+	  printf 'spherloc: running the tests; browser: %s\n' "$$SPHERLOC_CHROMIUM" && \
+	  exec $(BIN)/python -m pytest $(ARGS)
+
+lint: ## Check style, format and types
+	@scripts/setup.sh lint
+	@status=0; \
+	$(BIN)/python -m ruff check . || status=1; \
+	$(BIN)/python -m ruff format --check . || status=1; \
+	PYRIGHT_PYTHON_IGNORE_WARNINGS=1 $(BIN)/python -m pyright || status=1; \
+	exit $$status
+
+clean: ## Remove what make installed and built here: .venv and caches
+	rm -rf .venv build *.egg-info .pytest_cache .hypothesis .ruff_cache
+	find . -name .git -prune -o -type d -name __pycache__ -exec rm -rf {} +
