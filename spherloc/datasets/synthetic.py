@@ -5,7 +5,7 @@ visible, that is valid for the camera model and inside the image after noise; an
 point by a random wrong pose of its own.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -61,10 +61,11 @@ class SyntheticScene:
     def problem(self, seed: int | None = None) -> Problem:
         """Draw the problem; ``seed`` replaces the scene's own.
 
-        Raises ``InputError`` if the camera sees too little of the cube to find the correspondences.
+        Raises ``InputError`` for a negative seed or if the camera sees too little of the cube.
         """
-        seed = self.seed if seed is None else seed
-        geometry, noise, choice, wrong = (np.random.default_rng([seed, stream]) for stream in range(4))
+        if seed is not None and seed != self.seed:
+            return replace(self, seed=seed).problem()
+        geometry, noise, choice, wrong = (np.random.default_rng([self.seed, stream]) for stream in range(4))
         truth = _random_poses(geometry, 1)[0]
         points, pixels = self._visible_points(geometry, noise, truth)
         outliers = np.zeros(self.correspondences, dtype=bool)
@@ -81,7 +82,7 @@ class SyntheticScene:
             truth_cam_from_map=truth,
             truth_inliers=~outliers,
             scene=f"synthetic: N {self.correspondences}, outliers {self.outlier_rate:g}, noise {self.noise_px:g} px, "
-            f"seed {seed}",
+            f"seed {self.seed}",
         )
 
     def _seen(self, pixels: FloatArray) -> BoolArray:
