@@ -150,17 +150,16 @@ class KannalaBrandt:
             theta -= (self._theta_d(theta) - theta_d) / self._slope(theta)
         # A direction at the rim stays valid although its pixel was rounded, and its bearing stays within the rim.
         inside = theta_d <= self._inverse.end + _ROUNDING
-        solved = np.abs(self._theta_d(theta) - theta_d) <= _TOLERANCE * (1.0 + theta_d)
-        # Newton may leave the interval where the slope nearly vanishes; there theta_d still increases: bisect.
-        solved &= (theta >= 0.0) & (theta <= self.max_angle_rad)
-        theta[~inside] = np.nan
-        hard = inside & ~solved
+        rim = self.max_angle_rad * (1.0 - _ROUNDING)
+        theta = np.where(inside, np.minimum(theta, rim), np.nan)
+        # Newton may jump where the slope nearly vanishes; theta_d still increases there: bisect.
+        hard = inside & ~(np.abs(self._theta_d(theta) - theta_d) <= _TOLERANCE * (1.0 + theta_d))
         if hard.any():
-            theta[hard] = self._bisect(theta_d[hard])
-        return np.minimum(theta, self.max_angle_rad * (1.0 - _ROUNDING))
+            theta[hard] = self._bisect(theta_d[hard], rim)
+        return theta
 
-    def _bisect(self, theta_d: FloatArray) -> FloatArray:
-        low, high = np.zeros_like(theta_d), np.full_like(theta_d, self.max_angle_rad)
+    def _bisect(self, theta_d: FloatArray, rim: float) -> FloatArray:
+        low, high = np.zeros_like(theta_d), np.full_like(theta_d, rim)
         for _ in range(_BISECTIONS):
             middle = 0.5 * (low + high)
             below = self._theta_d(middle) < theta_d

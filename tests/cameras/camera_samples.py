@@ -1,0 +1,115 @@
+"""Cameras that the camera tests share: real calibrations, inline or from the data folder beside the project."""
+
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from spherloc.cameras.base import Camera
+from spherloc.cameras.equirectangular import Equirectangular
+from spherloc.cameras.kannala_brandt import KannalaBrandt
+from spherloc.cameras.mei import Mei
+
+SHARED_DATA = Path(__file__).resolve().parents[2] / ".." / "shared" / "data"
+
+KITTI360_IMAGE_02 = Mei(
+    width=1400,
+    height=1400,
+    fx=1336.3220825849971,
+    fy=1335.7883350012958,
+    cx=716.94323510126321 + 0.5,
+    cy=705.76498308221585 + 0.5,
+    xi=2.2134047507854890,
+    distortion=(1.6798235660113681e-02, 1.6548773243373522, 4.2223943394772046e-04, 4.2462134260997584e-04),
+)
+
+# A 220-degree lens whose image circle (radius 1.92 * 300 px) fits into the image.
+BEYOND_180 = KannalaBrandt(1200, 1200, 300.0, 301.0, 600.5, 598.0, (-0.02, 0.003, -0.0008, 0.00001))
+
+INLINE: dict[str, Camera] = {
+    "kitti360-image_02": KITTI360_IMAGE_02,
+    "mei-pinhole": Mei(640, 480, 320.0, 322.0, 318.0, 243.0, 0.0, (0.0, 0.0, 0.0, 0.0)),
+    "mei-xi-below-1": Mei(752, 480, 520.0, 518.0, 370.0, 245.0, 0.9, (-0.05, 0.02, 1e-3, -2e-3)),
+    "mei-stereographic": Mei(1000, 1000, 260.0, 260.0, 500.0, 500.0, 1.0, (0.01, 0.0, 0.0, 1e-4)),
+    "mei-negative-distortion": Mei(1000, 900, 800.0, 805.0, 510.0, 440.0, 1.4, (-0.35, -0.2, -2e-3, 1e-3)),
+    "mei-negative-xi": Mei(640, 480, 300.0, 300.0, 320.0, 240.0, -0.2, (-0.05, 0.01, 1e-3, 1e-3)),
+    "kb-beyond-180": BEYOND_180,
+    "kb-equidistant": KannalaBrandt(900, 900, 120.0, 120.0, 450.0, 450.0, (0.0, 0.0, 0.0, 0.0)),
+    "kb-aria-rgb": KannalaBrandt(
+        1408,
+        1408,
+        611.8529287,
+        611.8500556,
+        715.7118008,
+        716.4760432,
+        (0.394091358527, -0.548741152556, 0.778500221599, -0.4553790203),
+    ),
+    "panorama-2048x1024": Equirectangular(2048, 1024),
+    "panorama-odd-size": Equirectangular(1919, 961),
+}
+
+
+def _load(name: str) -> Camera:
+    """A Kannala-Brandt calibration of the data folder, read without the project's own loader."""
+    path = SHARED_DATA / name
+    if path.suffix == ".toml":
+        table = tomllib.loads(path.read_text())["camera"]
+        return KannalaBrandt(**{key: value for key, value in table.items() if key != "model"})
+    text = path.read_text().removeprefix("%YAML:1.0")
+    document = yaml.safe_load(text)
+    if "image" in document:
+        table, (width, height) = document["parameter"], document["image"].values()
+    else:
+        table = document["Camera"]
+        width, height = table["cols"], table["rows"]
+    lens = tuple(table[key] for key in ("k1", "k2", "k3", "k4"))
+    return KannalaBrandt(width, height, table["fx"], table["fy"], table["cx"] + 0.5, table["cy"] + 0.5, lens)
+
+
+SHARED = (
+    "aria_adt_fisheye/rgb.toml",
+    "aria_adt_fisheye/slam_left.toml",
+    "aria_adt_fisheye/slam_right.toml",
+    "formats_real/adapter_euroc_KB.yml",
+    "formats_real/stella_fisheye.yaml",
+    "formats_real/stella_tum_vi_mono.yaml",
+)
+
+EVERY = (*INLINE, *SHARED)
+
+
+def sample(name: str) -> Camera:
+    """The camera ``name`` of ``EVERY``; skips the test where its file is absent."""
+    if name in INLINE:
+        return INLINE[name]
+    require_shared(name)
+    return _load(name)
+
+
+def require_shared(name: str) -> Path:
+    """The path of a file of the data folder; skips the test where it is absent."""
+    path = SHARED_DATA / name
+    if not path.is_file():
+        pytest.skip(f"no real data: ../shared/data/{name} is absent")
+    return path
+
+
+def pixel_grid(camera: Camera, step: float = 3.0) -> np.ndarray:
+    """Pixels (N, 2) all over the image, its borders and its corners included."""
+    u = np.append(np.arange(0.0, camera.width, step), camera.width)
+    v = np.append(np.arange(0.0, camera.height, step), camera.height)
+    return np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+
+
+def random_directions(seed: int, count: int) -> np.ndarray:
+    """Points (N, 3) in all directions, 0.1 to 100 m away."""
+    rng = np.random.default_rng(seed)
+    points = rng.normal(size=(count, 3))
+    return points / np.linalg.norm(points, axis=1, keepdims=True) * 10.0 ** rng.uniform(-1, 2, size=(count, 1))
+
+
+def angle_rad(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Angle between rows of (N, 3), exact for small angles."""
+    return np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), np.sum(a * b, axis=1))
