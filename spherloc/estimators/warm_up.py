@@ -8,7 +8,7 @@ from spherloc.estimators.base import estimate
 
 def warm_up() -> None:
     """Run every estimator once on a tiny problem: seconds after an installation, a fraction of one later."""
-    camera = Equirectangular(width=64, height=32)
+    camera = Equirectangular(width=2048, height=1024)  # sharp enough for every stage to have something to do
     scene = SyntheticScene("warm-up", camera, correspondences=8, outlier_rate=0.25, noise_px=0.1, seed=0)
     for estimator in registry.names("estimators"):
         estimate(scene.problem(), estimator)

@@ -1,0 +1,35 @@
+"""Nobody waits for a compiler once the kernels are warm."""
+
+import subprocess
+import sys
+
+SCRIPT = """
+import importlib, pkgutil, numba
+import spherloc
+from spherloc.datasets import bundled_scenes, load_scene
+from spherloc.estimators import estimate, warm_up
+
+def compiled():
+    found = {}
+    for module in pkgutil.walk_packages(spherloc.__path__, "spherloc."):
+        for name, item in vars(importlib.import_module(module.name)).items():
+            if isinstance(item, numba.core.registry.CPUDispatcher):
+                found[item.__module__ + "." + item.__name__] = len(item.signatures)
+    return found
+
+warm_up()
+before = compiled()
+for path in bundled_scenes().values():
+    for estimator in ("mc", "ransac-2p"):
+        estimate(load_scene(path).problem(), estimator)
+after = compiled()
+print(len(after), sorted(name for name in after if after[name] != before[name]))
+"""
+
+
+def test_warm_up_leaves_nothing_to_compile() -> None:
+    """A kernel that warm-up does not reach would make the first user wait for it."""
+    done = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=True, timeout=280)
+    count, late = done.stdout.split(" ", 1)
+    assert int(count) >= 10
+    assert late.strip() == "[]"
