@@ -59,45 +59,55 @@ def _note(stage: TranslationStage, drawn: np.ndarray) -> str:
     """By which rules balls and edges were left out."""
     parts = [stage.rule]
     if len(drawn) < len(stage.radii_m):
-        parts.append(f"{len(drawn)} of {len(stage.radii_m):,} balls are drawn: the clique first, small before large.")
+        parts.append(
+            f"The {len(drawn)} smallest of {len(stage.radii_m):,} balls are drawn, half of them from the clique; "
+            "of the others only the centres."
+        )
     if len(stage.edges) > style.MAX_DRAWN_EDGES:
         parts.append(f"At most {style.MAX_DRAWN_EDGES:,} of {len(stage.edges):,} edges are drawn, the clique's first.")
     return " ".join(parts)
 
 
 def _drawn(stage: TranslationStage) -> np.ndarray:
-    """Indices of the balls to draw: the clique and then the others, each from the smallest, up to the limit."""
-    inside = np.zeros(len(stage.radii_m), dtype=bool)
-    inside[stage.clique] = True
-    return np.lexsort([stage.radii_m, ~inside])[: style.MAX_DRAWN_BALLS]
+    """Indices of the balls to draw: the smallest, half of them from the clique where it has as many.
+
+    Large balls hold the whole picture in them and hide it.
+    """
+    order = np.argsort(stage.radii_m, kind="stable")
+    inside = np.isin(order, stage.clique)
+    members, others = order[inside], order[~inside]
+    room = style.MAX_DRAWN_BALLS
+    take = min(len(members), max(room // 2, room - len(others)))
+    return np.concatenate([members[:take], others[: room - take]])
 
 
 def _balls(view: RunView, stage: TranslationStage, drawn: np.ndarray, found: bool) -> tuple[SceneItem, ...]:
     inside = np.zeros(len(stage.radii_m), dtype=bool)
     if found:
         inside[stage.clique] = True
-    items: list[SceneItem] = []
-    for name, chosen, color, opacity in (
-        ("balls/others", drawn[~inside[drawn]], style.UNDECIDED, 0.10),
-        ("balls/clique", drawn[inside[drawn]], style.CLIQUE, 0.16),
+    items: list[SceneItem] = [_edges(stage, inside)]
+    for name, members, color, opacity in (
+        ("balls/others", ~inside, style.UNDECIDED, 0.10),
+        ("balls/clique", inside, style.CLIQUE, 0.16),
     ):
+        chosen = drawn[members[drawn]]
+        centres = stage.centres_m[members]
         if len(chosen):
-            centres, colors = stage.centres_m[chosen], one_color(color, len(chosen))
-            items.append(Balls(name, "balls", centres, stage.radii_m[chosen], colors, opacity))
-            items.append(Points(f"{name}-centres", "balls", centres, colors, 0.035 * view.sphere_m))
-    items.append(_edges(stage, drawn, inside))
+            colors = one_color(color, len(chosen))
+            items.append(Balls(name, "balls", stage.centres_m[chosen], stage.radii_m[chosen], colors, opacity))
+        if len(centres):
+            dots = one_color(color, len(centres))
+            items.append(Points(f"{name}-centres", "balls", centres, dots, 0.035 * view.sphere_m))
     if view.truth is not None:
         truth = camera_centre(view.truth)[None]
         items.append(Points("balls/truth", "balls", truth, one_color(style.TRUTH, 1), 0.09 * view.sphere_m))
     return tuple(items)
 
 
-def _edges(stage: TranslationStage, drawn: np.ndarray, inside: np.ndarray) -> Segments:
-    """Overlaps between drawn balls, those within the clique first, up to the limit."""
-    visible = np.isin(stage.edges, drawn).all(axis=1)
-    edges = stage.edges[visible]
-    within = np.logical_and(inside[edges[:, 0]], inside[edges[:, 1]])
-    order = np.argsort(~within, kind="stable")[: style.MAX_DRAWN_EDGES]
+def _edges(stage: TranslationStage, inside: np.ndarray) -> Segments:
+    """Overlaps between balls, up to the limit: the clique's first, and small balls, which come first, before large."""
+    within = np.logical_and(inside[stage.edges[:, 0]], inside[stage.edges[:, 1]])
+    order = np.lexsort([stage.edges[:, 1], ~within])[: style.MAX_DRAWN_EDGES]
     colors = one_color(style.UNDECIDED, len(order))
     colors[np.take(within, order)] = style.CLIQUE
-    return Segments("balls/edges", "balls", stage.centres_m[edges[order]], colors, 1.0)
+    return Segments("balls/edges", "balls", stage.centres_m[stage.edges[order]], colors, 1.0)
