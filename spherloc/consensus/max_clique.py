@@ -132,6 +132,22 @@ def _colour(candidates, rows, needed, order, bound):
 
 
 @numba.njit(cache=True, nogil=True)
+def _greedy(rows):
+    """Members of some clique: each node in turn that is adjacent to all before it. A first bound for the search."""
+    members = np.empty(len(rows), np.int64)
+    taken = 0
+    for node in range(len(rows)):
+        fits = True
+        for k in range(taken):
+            member = members[k]
+            fits = fits and (rows[node, member // 64] >> np.uint64(member % 64)) & np.uint64(1) != 0
+        if fits:
+            members[taken] = node
+            taken += 1
+    return members[:taken].copy()
+
+
+@numba.njit(cache=True, nogil=True)
 def _search(rows, branch_limit):
     """Members of a largest clique, and whether the search was finished. Explicit stack, no recursion."""
     count, words = rows.shape
@@ -142,8 +158,8 @@ def _search(rows, branch_limit):
     bound = np.empty((count + 1, count), np.int32)
     place = np.zeros(count + 1, np.int64)
     current = np.empty(count, np.int64)
-    best = np.empty(0, np.int64)
-    place[0] = _colour(candidates[0], rows, 0, order[0], bound[0]) - 1
+    best = _greedy(rows)
+    place[0] = _colour(candidates[0], rows, len(best), order[0], bound[0]) - 1
     depth, branches = 0, 0
     while depth >= 0:
         if place[depth] < 0 or depth + bound[depth, place[depth]] <= len(best):
