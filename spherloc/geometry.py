@@ -25,7 +25,8 @@ def yaw_of(rotation: FloatArray) -> float:
 
 def wrap_angle(angle_rad: ArrayLike) -> FloatArray:
     """Angles brought into [-pi, pi)."""
-    return (np.asarray(angle_rad, dtype=np.float64) + np.pi) % (2 * np.pi) - np.pi
+    wrapped = (np.asarray(angle_rad, dtype=np.float64) + np.pi) % (2 * np.pi) - np.pi
+    return np.where(wrapped >= np.pi, -np.pi, wrapped)  # rounding may reach pi
 
 
 def skew(vector: FloatArray) -> FloatArray:
@@ -57,6 +58,16 @@ def align_to_down(gravity: FloatArray) -> FloatArray:
     if sine < 1e-12:
         return np.eye(3) if cosine > 0 else np.diag([1.0, -1.0, -1.0])
     return so3_exp(axis / sine * np.arctan2(sine, cosine))
+
+
+def tangent_basis(directions: FloatArray) -> FloatArray:
+    """Two unit vectors (N, 2, 3) as rows, orthogonal to each other and to each of the unit ``directions`` (N, 3)."""
+    # The coordinate axis farthest from the direction keeps the cross product well conditioned.
+    helper = np.eye(3)[np.argmin(np.abs(directions), axis=1)]
+    first: FloatArray = np.cross(directions, helper)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    second: FloatArray = np.cross(directions, first)
+    return np.stack([first, second], axis=1)
 
 
 def pose(rotation: FloatArray, translation: FloatArray) -> FloatArray:

@@ -3,15 +3,19 @@
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spherloc.cameras.base import BoolArray, Camera, FloatArray
 from spherloc.errors import ProblemError
-from spherloc.geometry import align_to_down, pose
+from spherloc.geometry import align_to_down, pose, tangent_basis
 
 IntArray = NDArray[np.int64]
+
+LEAST_STRETCH = 0.01
+"""Smallest ratio of the two singular values of an unprojection's Jacobian that residuals believe in."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,8 +63,7 @@ class Problem:
             mask = np.array(self.truth_inliers, dtype=bool)
             if mask.shape != (len(pixels),):
                 raise ProblemError(f"{self.name}: {len(mask)} inlier labels for {len(pixels)} correspondences.")
-            mask.setflags(write=False)
-            object.__setattr__(self, "truth_inliers", mask)
+            object.__setattr__(self, "truth_inliers", _frozen(mask))
         usable = int(np.count_nonzero(self.usable))
         if usable < 2:
             raise ProblemError(
@@ -74,8 +77,7 @@ class Problem:
     @cached_property
     def _unprojected(self) -> tuple[FloatArray, BoolArray]:
         bearings, valid = self.camera.unproject(self.pixels)
-        bearings.setflags(write=False)
-        return bearings, valid
+        return _frozen(bearings), _frozen(valid)
 
     @property
     def bearings(self) -> FloatArray:
@@ -88,26 +90,33 @@ class Problem:
         return self._unprojected[1]
 
     @cached_property
+    def _stretch(self) -> tuple[FloatArray, FloatArray]:
+        """``pixel_from_bearing`` and ``radians_per_pixel``."""
+        count, usable = len(self), self.usable
+        inverse = np.full((count, 2, 3), np.nan)
+        largest = np.full(count, np.nan)
+        basis = tangent_basis(self.bearings[usable])
+        jacobian = basis @ self.camera.unprojection_jacobian(self.pixels[usable])
+        left, stretch, right = np.linalg.svd(jacobian)
+        largest[usable] = stretch[:, 0]
+        # At a panorama's pole one direction collapses; without a floor a point far away would cost nothing.
+        stretch = np.maximum(stretch, LEAST_STRETCH * stretch[:, :1])
+        inverse[usable] = np.einsum("nji,nj,nkj,nkl->nil", right, 1.0 / stretch, left, basis)
+        return _frozen(inverse), _frozen(largest)
+
+    @property
     def pixel_from_bearing(self) -> FloatArray:
         """(N, 2, 3): maps a unit bearing close to the measured one to its pixel residual, to first order.
 
-        It is the pseudo-inverse of the unprojection's Jacobian, so that estimators measure reprojection
+        It is the inverse of the unprojection's Jacobian on the tangent plane, so that estimators measure reprojection
         error in pixels without knowing the camera model.
         """
-        out = np.full((len(self), 2, 3), np.nan)
-        jacobian = self.camera.unprojection_jacobian(self.pixels[self.usable])
-        out[self.usable] = np.linalg.pinv(jacobian)
-        out.setflags(write=False)
-        return out
+        return self._stretch[0]
 
-    @cached_property
+    @property
     def radians_per_pixel(self) -> FloatArray:
         """(N,): the largest singular value of the unprojection's Jacobian, rad/px."""
-        out = np.full(len(self), np.nan)
-        jacobian = self.camera.unprojection_jacobian(self.pixels[self.usable])
-        out[self.usable] = np.linalg.norm(jacobian, ord=2, axis=(1, 2))
-        out.setflags(write=False)
-        return out
+        return self._stretch[1]
 
     @cached_property
     def aligned(self) -> "AlignedProblem":
@@ -119,11 +128,11 @@ class Problem:
             "points": self.points[index] @ map_turn.T,
             "pixel_from_bearing": self.pixel_from_bearing[index] @ camera_turn.T,
             "radians_per_pixel": self.radians_per_pixel[index],
+            "camera_turn": camera_turn,
+            "map_turn": map_turn,
         }
-        arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
-        for array in arrays.values():
-            array.setflags(write=False)
-        return AlignedProblem(index=index, count=len(self), camera_turn=camera_turn, map_turn=map_turn, **arrays)
+        frozen = {name: _frozen(np.ascontiguousarray(array)) for name, array in arrays.items()}
+        return AlignedProblem(index=_frozen(index), count=len(self), **frozen)
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,6 +156,11 @@ class AlignedProblem:
     radians_per_pixel: FloatArray
     """(M,), rad/px."""
 
+    @cached_property
+    def pixels_per_radian(self) -> FloatArray:
+        """(M,), px/rad in the direction in which it is largest."""
+        return np.linalg.norm(self.pixel_from_bearing, ord=2, axis=(1, 2))
+
     def unalign_pose(self, cam_from_map: FloatArray) -> FloatArray:
         """The pose (3, 4) between the problem's own frames, from one between the aligned frames."""
         rotation = self.camera_turn.T @ cam_from_map[:, :3] @ self.map_turn
@@ -164,29 +178,40 @@ class AlignedProblem:
         return full
 
 
+def _frozen(array: Any) -> Any:
+    """The array, made read-only."""
+    array.setflags(write=False)
+    return array
+
+
+def _numbers(problem: Problem, name: str) -> FloatArray:
+    try:
+        return np.array(getattr(problem, name), dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ProblemError(f"{problem.name}: {name} is no array of numbers.") from None
+
+
 def _array(problem: Problem, name: str, shape: tuple[int, int]) -> FloatArray:
-    array = np.array(getattr(problem, name), dtype=np.float64)
+    array = _numbers(problem, name)
     if array.ndim != 2 or array.shape[1] != shape[1] or (shape[0] >= 0 and array.shape[0] != shape[0]):
         rows = "N" if shape[0] < 0 else shape[0]
         raise ProblemError(f"{problem.name}: {name} has shape {array.shape}; give ({rows}, {shape[1]}).")
     if not np.isfinite(array).all():
         row = int(np.argwhere(~np.isfinite(array))[0, 0])
         raise ProblemError(f"{problem.name}: {name} row {row} is not a finite number; correct or remove it.")
-    array.setflags(write=False)
-    object.__setattr__(problem, name, array)
+    object.__setattr__(problem, name, _frozen(array))
     return array
 
 
 def _unit(problem: Problem, name: str) -> None:
-    vector = np.array(getattr(problem, name), dtype=np.float64)
+    vector = _numbers(problem, name)
     if vector.shape != (3,) or not np.isfinite(vector).all():
         raise ProblemError(f"{problem.name}: {name} must be three finite numbers.")
     length = float(np.linalg.norm(vector))
     if abs(length - 1.0) > 1e-3:
         raise ProblemError(f"{problem.name}: {name} has length {length:.4g}; give a unit vector pointing down.")
-    vector /= length
-    vector.setflags(write=False)
-    object.__setattr__(problem, name, vector)
+    # A vector that is a unit vector already keeps its last bit, so that a problem read back is the same problem.
+    object.__setattr__(problem, name, _frozen(vector / length if abs(length - 1.0) > 1e-15 else vector))
 
 
 def _check_rotation(name: str, cam_from_map: FloatArray) -> None:

@@ -4,7 +4,7 @@ from functools import cache
 from importlib.metadata import entry_points
 from typing import Any
 
-from spherloc.errors import InputError
+from spherloc.errors import InputError, show
 
 
 @cache
@@ -21,4 +21,4 @@ def lookup(kind: str, name: str) -> Any:
     """
     for point in entry_points(group=f"spherloc.{kind}", name=name):
         return point.load()
-    raise InputError(f"unknown {kind[:-1]} '{name}': choose one of {', '.join(names(kind))}.")
+    raise InputError(f"unknown {kind[:-1]} {show(name)}: choose one of {', '.join(names(kind))}.")

@@ -23,7 +23,7 @@ class YawConsensus:
     """The deepest yaw of A arcs."""
 
     interval_rad: tuple[float, float]
-    """The longest of the intervals covered by most arcs."""
+    """The longest of the intervals covered by most arcs; its upper end exceeds pi where it crosses the seam."""
     yaw_rad: float
     """Its middle, in [-pi, pi)."""
     clique: IndexArray
@@ -33,40 +33,57 @@ class YawConsensus:
 
 
 def deepest_yaw(lo_rad: FloatArray, hi_rad: FloatArray) -> YawConsensus | None:
-    """The yaw that most of the closed arcs [lo, hi] cover (-pi <= lo < pi, hi <= lo + 2 pi); None without arcs."""
+    """The yaw that most of the closed arcs [lo, hi] cover (-pi <= lo < pi, hi <= lo + 2 pi); None without arcs.
+
+    -pi and pi are one yaw.
+    """
     if len(lo_rad) == 0:
         return None
-    wraps = hi_rad > np.pi
-    starts = np.sort(lo_rad)
-    ends = np.sort(np.where(wraps, hi_rad - 2 * np.pi, hi_rad))
+    full = hi_rad - lo_rad >= 2 * np.pi
+    wraps = (hi_rad >= np.pi) & ~full
+    ends = np.where(wraps, hi_rad - 2 * np.pi, hi_rad)
     overlap = np.zeros(BINS, np.int32)
-    start, end = _sweep(starts, ends, int(np.count_nonzero(wraps)), overlap)
+    always = int(np.count_nonzero(full))
+    start, end = _sweep(np.sort(lo_rad[~full]), np.sort(ends[~full]), always + int(np.count_nonzero(wraps)), overlap)
     yaw = 0.5 * (start + end)
-    covers = ((lo_rad <= yaw) & (yaw <= hi_rad)) | (yaw + 2 * np.pi <= hi_rad)
+    yaw -= 2 * np.pi if yaw >= np.pi else 0.0
+    covers = full | np.where(wraps, (lo_rad <= yaw) | (yaw <= ends), (lo_rad <= yaw) & (yaw <= ends))
     return YawConsensus((start, end), yaw, np.flatnonzero(covers).astype(np.int32), overlap)
 
 
 @numba.njit(cache=True, nogil=True)
+def _mark(overlap, start, end, depth):
+    """Raise the bins that touch [start, end] to ``depth``."""
+    bins = len(overlap)
+    first = max(0, min(bins - 1, int((start + np.pi) / (2 * np.pi) * bins)))
+    last = max(0, min(bins - 1, int((end + np.pi) / (2 * np.pi) * bins)))
+    for b in range(first, last + 1):
+        overlap[b] = max(overlap[b], depth)
+
+
+@numba.njit(cache=True, nogil=True)
 def _sweep(starts, ends, depth, overlap):
-    """Walk the sorted ends from -pi to pi, starting with ``depth`` arcs that wrap; fill ``overlap``.
+    """Walk the sorted ends from -pi to pi, starting with ``depth`` arcs that cover -pi; fill ``overlap``.
 
     Returns the longest interval of greatest depth. Where an arc ends and another starts at the same yaw, both
     cover it, since arcs are closed.
     """
-    bins, count = len(overlap), len(starts)
+    count = len(starts)
     opened, closed = 0, 0
     here, best, best_lo, best_hi = -np.pi, -1, -np.pi, np.pi
+    # The interval that starts at -pi continues the one that ends at pi.
+    seam_depth, seam_end = -1, -np.pi
     while True:
         next_open = starts[opened] if opened < count else np.inf
         next_close = ends[closed] if closed < count else np.inf
         there = min(next_open, next_close, np.pi)
-        if depth > best or (depth == best and there - here > best_hi - best_lo):
-            best, best_lo, best_hi = depth, here, there
-        first = max(0, min(bins - 1, int((here + np.pi) / (2 * np.pi) * bins)))
-        last = max(0, min(bins - 1, int((there + np.pi) / (2 * np.pi) * bins)))
-        for b in range(first, last + 1):
-            overlap[b] = max(overlap[b], depth)
-        if opened == count and (closed == count or next_close >= np.pi):
+        _mark(overlap, here, there, depth)
+        if seam_depth < 0 and there > -np.pi:
+            seam_depth, seam_end = depth, there
+        far = there + (seam_end + np.pi if there == np.pi and depth == seam_depth and here > -np.pi else 0.0)
+        if depth > best or (depth == best and far - here > best_hi - best_lo):
+            best, best_lo, best_hi = depth, here, far
+        if there == np.pi:
             return best_lo, best_hi
         if next_open <= next_close:
             depth += 1

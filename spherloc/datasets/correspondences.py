@@ -10,7 +10,7 @@ import numpy as np
 from spherloc.cameras.base import Camera
 from spherloc.cameras.calibration import camera_from_table
 from spherloc.datasets import scene_file
-from spherloc.errors import InputError, ProblemError
+from spherloc.errors import InputError, ProblemError, show
 from spherloc.problem import Problem
 
 COLUMNS = ("u", "v", "X", "Y", "Z")
@@ -97,7 +97,7 @@ def read_csv(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
         raise InputError(f"{path}: no such file; correct the key 'correspondences'.") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); correct the key 'correspondences'.") from None
-    except (UnicodeDecodeError, csv.Error) as error:
+    except (UnicodeDecodeError, csv.Error, ValueError) as error:
         raise InputError(f"{path}: not a CSV text file in UTF-8 ({error}).") from None
 
 
@@ -127,13 +127,13 @@ def _number(value: str, column: str, place: str) -> float:
     try:
         number = float(value)
     except ValueError:
-        raise InputError(f"{place}: {column} is '{value.strip()[:40]}', not a number; correct or remove it.") from None
+        raise InputError(f"{place}: {column} is {show(value)}, not a number; correct or remove it.") from None
     if not np.isfinite(number):
-        raise InputError(f"{place}: {column} is {value.strip()}, not a finite number; correct or remove the line.")
+        raise InputError(f"{place}: {column} is {number}, not a finite number; correct or remove the line.")
     return number
 
 
 def _label(value: str, place: str) -> bool:
     if value.strip() not in ("0", "1"):
-        raise InputError(f"{place}: inlier is '{value.strip()[:40]}'; give 0 or 1.")
+        raise InputError(f"{place}: inlier is {show(value)}; give 0 or 1.")
     return value.strip() == "1"

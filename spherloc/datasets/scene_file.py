@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from spherloc import registry
-from spherloc.errors import InputError
+from spherloc.errors import InputError, show
 from spherloc.problem import Problem
 
 MAX_BYTES = 1_000_000
@@ -45,7 +45,9 @@ def load_scene(path: Path) -> Scene:
     except UnicodeDecodeError:
         raise InputError(f"{path}: not a text file in UTF-8; give the path of a scene file (TOML).") from None
     except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}: not valid TOML: {error}; correct it there.") from None
+        raise InputError(f"{path}: not valid TOML: {str(error)[:200]}; correct it there.") from None
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: no usable scene file ({str(error)[:100]}); correct or replace it.") from None
     kind = text(table, "kind", str(path))
     try:
         load = registry.lookup("datasets", kind)
@@ -64,7 +66,7 @@ def check_keys(table: Mapping[str, Any], required: set[str], optional: set[str],
     for key in table:
         if key not in required | optional:
             known = ", ".join(sorted(required | optional))
-            raise InputError(f"{where}: unknown key '{key}'; the known ones are {known}.")
+            raise InputError(f"{where}: unknown key {show(key)}; the known ones are {known}.")
     for key in sorted(required):
         if key not in table:
             raise InputError(f"{where}: key '{key}' is missing; add it.")
@@ -90,7 +92,7 @@ def number(table: Mapping[str, Any], key: str, where: str, lowest: float, highes
     """A finite number within limits that must exist."""
     value = table.get(key)
     if isinstance(value, bool) or not isinstance(value, int | float) or not lowest <= value <= highest:
-        raise InputError(f"{where}: {key} is {value!r}; give a number from {lowest:g} to {highest:g}.")
+        raise InputError(f"{where}: {key} is {show(value)}; give a number from {lowest:g} to {highest:g}.")
     return float(value)
 
 
@@ -98,15 +100,17 @@ def integer(table: Mapping[str, Any], key: str, where: str, lowest: int, highest
     """A whole number within limits that must exist."""
     value = table.get(key)
     if isinstance(value, bool) or not isinstance(value, int) or not lowest <= value <= highest:
-        raise InputError(f"{where}: {key} is {value!r}; give a whole number from {lowest} to {highest}.")
+        raise InputError(f"{where}: {key} is {show(value)}; give a whole number from {lowest} to {highest}.")
     return value
 
 
 def numbers(value: Any, shape: tuple[int, ...], key: str, where: str) -> np.ndarray:
     """A (nested) list of finite numbers of the given shape."""
     try:
-        array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
+        array = np.array(value, dtype=object)
+        real = all(isinstance(item, int | float) and not isinstance(item, bool) for item in array.flat)
+        array = array.astype(np.float64) if real else np.empty(0)
+    except (TypeError, ValueError, OverflowError):
         array = np.empty(0)
     if array.shape != shape or not np.isfinite(array).all():
         raise InputError(f"{where}: {key} must hold {' x '.join(map(str, shape))} finite numbers.")

@@ -97,9 +97,10 @@ class SyntheticScene:
         for _ in range(MAX_BATCHES):
             points = geometry.uniform(-HALF_SIZE_M, HALF_SIZE_M, (BATCH, 3))
             pixels, valid = self.camera.project(transform(truth, points))
-            shift = self.noise_px * noise.standard_normal((BATCH, 2))
-            visible = valid & in_image(self.camera, pixels) & self._seen(pixels + shift)
-            found.append((points[visible], (pixels + shift)[visible]))
+            visible = valid & in_image(self.camera, pixels)
+            visible[visible] = self._seen(pixels[visible])
+            shift = noise.standard_normal((BATCH, 2))[visible]
+            found.append((points[visible], self._noisy(pixels[visible], shift)))
             count += int(np.count_nonzero(visible))
             if count >= self.correspondences:
                 points, pixels = (np.concatenate(parts)[: self.correspondences] for parts in zip(*found, strict=True))
@@ -108,6 +109,19 @@ class SyntheticScene:
             f"{self.name}: only {count} of {BATCH * MAX_BATCHES:,} random points are visible to the camera; "
             "give a wider camera, less noise, fewer correspondences or another seed."
         )
+
+    def _noisy(self, pixels: FloatArray, shift: FloatArray) -> FloatArray:
+        """Pixels (K, 2) moved by ``noise_px`` times ``shift`` (K, 2); at the border inwards, so that all stay visible.
+
+        The points must not depend on the noise: dragging it would otherwise replace some of them.
+        """
+        shift = self.noise_px * shift
+        for attempt in range(60):
+            lost = ~self._seen(pixels + shift)
+            if not lost.any():
+                break
+            shift[lost] *= -1.0 if attempt % 2 == 0 else -0.5
+        return pixels + shift
 
     def _wrong_pixels(self, wrong: np.random.Generator, points: FloatArray) -> FloatArray:
         """Pixels (N, 2) of the points (N, 3) under a random pose each under which it is visible."""

@@ -5,13 +5,14 @@ import time
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from importlib.metadata import version
+from numbers import Real
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spherloc import registry
-from spherloc.errors import InputError
+from spherloc.errors import InputError, show
 from spherloc.problem import AlignedProblem, Problem
 from spherloc.trace import Stage, Trace
 
@@ -70,9 +71,12 @@ class Clock:
 
 
 def bounds_of(aligned: AlignedProblem, bound_px: float, gravity_bound_rad: float) -> Bounds:
-    """Bounds of every bearing from one pixel bound: through the largest stretch of its unprojection, plus gravity."""
-    radians = bound_px * aligned.radians_per_pixel + gravity_bound_rad
-    return Bounds(bound_px + gravity_bound_rad / aligned.radians_per_pixel, np.minimum(radians, np.pi / 2))
+    """Bounds of every bearing from one pixel bound, through the largest stretch of its unprojection, plus gravity.
+
+    Residuals are measured in the tangent plane, so that ``bound_px`` reaches as far as the angle whose sine it is.
+    """
+    radians = np.arcsin(np.minimum(1.0, bound_px * aligned.radians_per_pixel)) + gravity_bound_rad
+    return Bounds(bound_px + gravity_bound_rad * aligned.pixels_per_radian, np.minimum(radians, np.pi / 2))
 
 
 def versions() -> dict[str, str]:
@@ -92,14 +96,14 @@ def default_options(estimator: str, problem: Problem) -> Any:
     return options_type(estimator)(**given)
 
 
-def check_positive(options: Any, **allow_zero: bool) -> None:
-    """Raise ``InputError`` if a number among the fields of ``options`` is not finite and positive."""
+def check_positive(options: Any) -> None:
+    """Raise ``InputError`` if a field of ``options`` is no finite positive number."""
     for item in fields(options):
         value = getattr(options, item.name)
-        if value is None:
+        if value is None and item.default is None:
             continue
-        if not np.isfinite(value) or value < 0 or (value == 0 and not allow_zero.get(item.name, False)):
-            raise InputError(f"option {item.name} is {value}; give a positive number.")
+        if isinstance(value, bool) or not isinstance(value, Real) or not 0 < float(value) < np.inf:
+            raise InputError(f"option {item.name} is {show(value)}; give a positive number.")
 
 
 def estimate(problem: Problem, estimator: str = "mc", options: Any = None, seed: int = 0) -> Trace:

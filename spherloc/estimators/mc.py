@@ -29,6 +29,10 @@ WIDEST_RAD = np.radians(60.0)
 and only raise the count everywhere. At 90 % outliers this turns 95 % success into 99 % (MEI) and costs nothing."""
 
 
+MOST_CORRESPONDENCES = 10_000
+"""Their 50 million pairs take about a minute and 5 GB."""
+
+
 @dataclass(frozen=True)
 class McOptions:
     """Options of MC."""
@@ -53,6 +57,11 @@ class MaximumConsensus:
     def run(aligned: AlignedProblem, options: McOptions, bounds: Bounds, seed: int, clock: Clock) -> Outcome:
         """Algorithm 2; ``seed`` is not used."""
         count = len(aligned.bearings)
+        if count > MOST_CORRESPONDENCES:
+            raise InputError(
+                f"mc compares all pairs and takes up to {MOST_CORRESPONDENCES:,} correspondences, not {count:,}; "
+                "thin them or use ransac-2p."
+            )
         nobody = np.zeros(count, dtype=bool)
         with clock.stage("yaw"):
             pairs, lo, hi = yaw_arcs(aligned, bounds.radians, WIDEST_RAD)

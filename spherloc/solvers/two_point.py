@@ -49,9 +49,11 @@ def solve_pair(vi, vj, pi, pj, yaws, translations):
     """Write the roots with positive depths into ``yaws`` (2,) and ``translations`` (2, 3); return how many."""
     d1, d2, d3, sin2, dist2 = yaw_coefficients(vi, vj, pi, pj)
     rho = np.sqrt(d1 * d1 + d2 * d2)
-    if rho <= DEGENERATE * np.sqrt(dist2) or abs(d3) > rho:
+    # Where both roots meet, rounding may put |d3| above rho.
+    rounding = DEGENERATE * np.sqrt(dist2)
+    if rho <= rounding or abs(d3) > rho + rounding:
         return 0
-    phi, half = np.arctan2(d2, d1), np.arccos(-d3 / rho)
+    phi, half = np.arctan2(d2, d1), np.arccos(min(1.0, max(-1.0, -d3 / rho)))
     found = 0
     for sign in (1.0, -1.0):
         yaw = phi + sign * half

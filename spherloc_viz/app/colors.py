@@ -1,0 +1,43 @@
+"""Colours that arrive on the screen as the legend shows them.
+
+viser's renderer takes the colours of lines and of batched meshes as linear light, applies the ACES filmic curve to
+everything but point clouds, and encodes the result as sRGB. Sent as they are, green becomes mint. So colours are
+sent through the inverse of that chain; what remains is shading.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+ByteArray = NDArray[np.uint8]
+FloatArray = NDArray[np.float64]
+
+# three.js, ACESFilmicToneMapping: matrix, rational curve (v^2 + A v - B) / (C v^2 + D v + E), matrix, at exposure 1.
+_INTO = np.array([[0.59719, 0.35458, 0.04823], [0.07600, 0.90834, 0.01566], [0.02840, 0.13383, 0.83777]])
+_OUT = np.array([[1.60475, -0.53108, -0.07367], [-0.10208, 1.10813, -0.00605], [-0.00327, -0.07276, 1.07602]])
+_A, _B, _C, _D, _E = 0.0245786, 0.000090537, 0.983729, 0.4329510, 0.238081
+_EXPOSURE = 1.0 / 0.6
+
+
+def light_bytes(colors: ByteArray) -> ByteArray:
+    """Linear bytes (..., 3) for lines and batched meshes that show the sRGB bytes ``colors`` (..., 3)."""
+    return _bytes(_before_filmic(colors))
+
+
+def surface_bytes(colors: ByteArray) -> ByteArray:
+    """sRGB bytes (..., 3) for a single mesh, whose colour viser does decode, that show ``colors`` (..., 3)."""
+    light = _before_filmic(colors)
+    return _bytes(np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055))
+
+
+def _before_filmic(colors: ByteArray) -> FloatArray:
+    """Linear light (..., 3) in [0, 1] which the filmic curve turns into the sRGB bytes ``colors``."""
+    srgb = np.asarray(colors, dtype=np.float64) / 255.0
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    y = linear @ np.linalg.inv(_OUT).T
+    square, slope, rest = 1.0 - _C * y, _A - _D * y, -_B - _E * y
+    v = (np.sqrt(np.maximum(slope**2 - 4.0 * square * rest, 0.0)) - slope) / (2.0 * square)
+    return np.clip(v @ np.linalg.inv(_INTO).T / _EXPOSURE, 0.0, 1.0)
+
+
+def _bytes(values: FloatArray) -> ByteArray:
+    return np.round(255.0 * values).astype(np.uint8)

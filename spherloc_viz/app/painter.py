@@ -1,0 +1,162 @@
+"""Draws a picture's primitives into one client's canvas, changing what is there rather than drawing anew."""
+
+from collections.abc import Iterable
+from functools import cache
+from typing import Any
+
+import numpy as np
+import trimesh
+import viser
+
+from spherloc_viz.app.colors import light_bytes, surface_bytes
+from spherloc_viz.layers.primitives import Balls, Mesh, Points, SceneItem, Segments
+
+SHELLS = 12
+"""Nodes that share the balls of one primitive."""
+MOST_ROUND = 400
+"""Above this many, dots get fewer faces."""
+MOST_BATCHED = 3000
+"""Above this many, dots become a point cloud, which costs less and cannot be clicked."""
+
+
+class Painter:
+    """The canvas of one client."""
+
+    def __init__(self, client: viser.ClientHandle) -> None:
+        self._client = client
+        self._drawn: dict[str, tuple[Any, tuple, str]] = {}
+
+    def draw(self, items: Iterable[SceneItem], layers: frozenset[str]) -> None:
+        """Show these primitives, those of ``layers`` only, and hide all others."""
+        names = set()
+        with self._client.atomic():
+            for item in items:
+                look = _look(item)
+                for part in _parts(item):
+                    self._put(part, look)
+                    names.add(part.name)
+            for name, (handle, _, layer) in self._drawn.items():
+                handle.visible = name in names and layer in layers
+
+    def _put(self, item: SceneItem, look: tuple) -> None:
+        handle, known, _ = self._drawn.get(item.name, (None, None, ""))
+        if handle is None or known != look:
+            handle = _add(self._client.scene, item)
+        else:
+            for name, value in _changing(item).items():
+                setattr(handle, name, value)
+        self._drawn[item.name] = (handle, look, item.layer)
+
+
+def _parts(item: SceneItem) -> list[SceneItem]:
+    """The item as nodes that are drawn one after another; none if there is nothing to draw.
+
+    Balls within balls: a translucent surface hides what is drawn after it and lies behind. Within a node viser draws
+    by distance of the centres, which says nothing about balls around one spot; but nodes are drawn in the order in
+    which they were added. So balls are drawn in shells, the smallest first.
+    """
+    if not _size(item):
+        return []
+    if not isinstance(item, Balls):
+        return [item]
+    shells = np.array_split(np.argsort(item.radii_m, kind="stable"), min(SHELLS, len(item.radii_m)))
+    return [
+        Balls(f"{item.name}/{k}", item.layer, item.centers[at], item.radii_m[at], item.colors[at], item.opacity)
+        for k, at in enumerate(shells)
+    ]
+
+
+def _size(item: SceneItem) -> int:
+    """How many things it draws; viser cannot draw none."""
+    match item:
+        case Points():
+            return len(item.positions)
+        case Segments():
+            return len(item.points)
+        case Balls():
+            return len(item.centers)
+        case Mesh():
+            return len(item.faces)
+
+
+def _look(item: SceneItem) -> tuple:
+    """What cannot change without adding the node anew: its kind, its size, and what viser sets once."""
+    extra: tuple = ()
+    if isinstance(item, Mesh):
+        extra = (len(item.vertices), item.color, item.opacity)
+    elif isinstance(item, Balls):
+        extra = (item.opacity,)
+    elif isinstance(item, Segments):
+        extra = (item.width_px,)
+    return (type(item), _size(item), *extra)
+
+
+def _changing(item: SceneItem) -> dict[str, Any]:
+    """The properties of a node that follow the item."""
+    match item:
+        case Points() if len(item.positions) > MOST_BATCHED:
+            return {"points": np.float32(item.positions), "colors": item.colors, "point_size": 2.0 * item.radius_m}
+        case Points():
+            return _instances(item.positions, np.full(len(item.positions), item.radius_m), item.colors)
+        case Segments():
+            colors = np.repeat(light_bytes(item.colors)[:, None], 2, axis=1)
+            return {"points": np.float32(item.points), "colors": colors}
+        case Balls():
+            return _instances(item.centers, item.radii_m, item.colors)
+        case Mesh():
+            return {"vertices": np.float32(item.vertices), "faces": np.uint32(item.faces)}
+
+
+def _instances(positions: np.ndarray, radii_m: np.ndarray, colors: np.ndarray) -> dict[str, Any]:
+    return {
+        "batched_positions": np.float32(positions),
+        "batched_scales": np.float32(radii_m),
+        "batched_colors": light_bytes(colors),
+    }
+
+
+@cache
+def _unit_ball(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
+    mesh = trimesh.creation.icosphere(subdivisions=subdivisions)
+    return np.asarray(mesh.vertices), np.asarray(mesh.faces)
+
+
+def _add(scene: viser.SceneApi, item: SceneItem) -> Any:
+    name, props = f"/{item.name}", _changing(item)
+    match item:
+        case Points() if "points" in props:
+            return scene.add_point_cloud(name, point_shape="circle", precision="float32", **props)
+        case Points():
+            fine = len(item.positions) <= MOST_ROUND
+            return _add_batch(scene, name, 2 if fine else 1, None, props)
+        case Segments():
+            return scene.add_line_segments(name, thickness=item.width_px, thickness_units="screen", **props)
+        case Balls():
+            return _add_batch(scene, name, 3, item.opacity, props)
+        case Mesh():
+            return scene.add_mesh_simple(
+                name,
+                color=surface_bytes(np.array(item.color, np.uint8)),
+                opacity=item.opacity,
+                cast_shadow=False,
+                receive_shadow=False,
+                **props,
+            )
+
+
+def _add_batch(
+    scene: viser.SceneApi, name: str, subdivisions: int, opacity: float | None, props: dict[str, Any]
+) -> Any:
+    vertices, faces = _unit_ball(subdivisions)
+    upright = np.tile(np.array([1.0, 0.0, 0.0, 0.0], np.float32), (len(props["batched_positions"]), 1))
+    return scene.add_batched_meshes_simple(
+        name,
+        vertices,
+        faces,
+        batched_wxyzs=upright,
+        opacity=opacity,
+        lod="off",
+        cast_shadow=False,
+        receive_shadow=False,
+        **props,
+    )

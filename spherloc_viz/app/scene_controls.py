@@ -1,0 +1,80 @@
+"""The widgets that choose a scene and change it."""
+
+from collections.abc import Callable
+
+import viser
+
+from spherloc.errors import InputError
+from spherloc_viz.app.catalog import OWN_CAMERA, Catalog, SceneWish
+
+MOST_POINTS, MOST_NOISE_PX, MOST_OUTLIERS = 500, 10.0, 99.0
+
+
+class SceneControls:
+    """Scene, camera, number of points, noise, outliers and seed."""
+
+    def __init__(self, gui: viser.GuiApi, catalog: Catalog, changed: Callable[[object], None]) -> None:
+        self._catalog = catalog
+        self._scene = gui.add_dropdown("Scene", tuple(catalog.scenes))
+        self._camera = gui.add_dropdown(
+            "Camera", (OWN_CAMERA, *catalog.cameras), hint="Sees the same simulation through another lens."
+        )
+        self._points = gui.add_slider("Points", 10, MOST_POINTS, 1, 100, hint="Correspondences, N.")
+        self._noise = gui.add_slider("Noise (px)", 0.0, MOST_NOISE_PX, 0.1, 1.0, hint="Standard deviation of a pixel.")
+        self._outliers = gui.add_slider("Outliers (%)", 0.0, MOST_OUTLIERS, 1.0, 80.0, hint="Share of wrong matches.")
+        self._seed = gui.add_text("Seed", "0", hint="Of the simulation and of the estimator's random draws.")
+        self._simulated = (self._camera, self._points, self._noise, self._outliers)
+        self._followed = ""
+        for widget in self.widgets:
+            widget.on_update(changed)
+
+    @property
+    def widgets(self) -> tuple:
+        """All of them."""
+        return (self._scene, *self._simulated, self._seed)
+
+    def follow_scene(self) -> bool:
+        """If another scene was chosen, set the other widgets to what it says, and tell so."""
+        label = self._scene.value
+        if label == self._followed:
+            return False
+        self._followed = label
+        scene = self._catalog.synthetic(label)
+        for widget in self._simulated:
+            widget.visible = scene is not None
+        if scene is None:
+            return True
+        self._camera.value = OWN_CAMERA
+        self._points.min, self._points.max = min(10, scene.correspondences), max(MOST_POINTS, scene.correspondences)
+        self._points.value = scene.correspondences
+        self._noise.max = max(MOST_NOISE_PX, scene.noise_px)
+        self._noise.value = float(scene.noise_px)
+        percent = round(100.0 * scene.outlier_rate, 6)
+        self._outliers.max = max(MOST_OUTLIERS, percent)
+        self._outliers.value = percent
+        self._seed.value = str(scene.seed)
+        return True
+
+    def read(self) -> SceneWish:
+        """What the widgets say now.
+
+        Raises ``InputError`` if the seed is no seed.
+        """
+        label, seed = self._scene.value, self._read_seed()
+        if self._catalog.synthetic(label) is None:
+            return SceneWish(label, seed)
+        rate = round(self._outliers.value / 100.0, 8)
+        return SceneWish(label, seed, self._camera.value, int(self._points.value), float(self._noise.value), rate)
+
+    def next_seed(self) -> None:
+        """The next seed; 0 after what is no seed."""
+        try:
+            self._seed.value = str((self._read_seed() + 1) % 2**63)
+        except InputError:
+            self._seed.value = "0"
+
+    def _read_seed(self) -> int:
+        text = self._seed.value.strip()
+        if not (text.isascii() and text.isdigit() and len(text) <= 19 and int(text) < 2**63):
+            raise InputError(f"the seed '{text[:30]}' is no whole number from 0 to 2^63 - 1; type one.")
+        return int(text)

@@ -1,0 +1,108 @@
+"""Starts the playground and ends it."""
+
+import asyncio
+import contextlib
+import secrets
+import signal
+import socket
+import sys
+import threading
+from pathlib import Path
+
+import viser
+
+from spherloc.errors import RecordingError
+from spherloc.estimators import warm_up
+from spherloc_viz.app.catalog import Catalog
+from spherloc_viz.app.front_door import FrontDoor, open_socket
+from spherloc_viz.app.session import Session
+from spherloc_viz.app.viser_seams import start_viser, stop_viser
+from spherloc_viz.recording.background import Recorder
+
+
+def serve(scene: Path | None, host: str, port: int, recordings: Path, record: bool = True) -> None:
+    """Run the playground until Ctrl-C or a termination signal.
+
+    ``scene`` is offered first, before those that come with the project; port 0 takes any free port. Runs that a
+    page settles on are recorded into ``recordings`` unless ``record`` is false. Raises ``InputError`` if the
+    scene cannot be used or the port cannot be had.
+    """
+    catalog = Catalog(scene)
+    with open_socket(host, port) as listener, contextlib.ExitStack() as stack:
+        print("preparing the solvers (a few seconds after an installation) …", file=sys.stderr, flush=True)
+        warm_up()
+        sessions = Sessions(catalog)
+        if record:
+            sessions.recorder = stack.enter_context(Recorder(recordings, on_error=sessions.report))
+        key = secrets.token_urlsafe(32)
+        server = start_viser(key)
+        stack.callback(stop_viser, server)
+        stack.callback(sessions.close)
+        sessions.attend(server)
+        asyncio.run(_serve_until_told(FrontDoor(host, server.get_port(), key), listener))
+
+
+class Sessions:
+    """The sessions of all connected clients."""
+
+    def __init__(self, catalog: Catalog) -> None:
+        self._catalog = catalog
+        self.recorder: Recorder | None = None
+        """Where settled runs go; None if they are not recorded."""
+        self._open: dict[int, Session] = {}
+        self._lock = threading.Lock()
+
+    def attend(self, server: viser.ViserServer) -> None:
+        """Open a session for every client that connects and close it when the client leaves."""
+        server.scene.world_axes.visible = False
+        server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
+        server.on_client_connect(lambda client: self._welcome(server, client))
+        server.on_client_disconnect(lambda client: self._dismiss(client.client_id))
+
+    def report(self, error: RecordingError) -> None:
+        """Tell every page that a run could not be recorded."""
+        with self._lock:
+            sessions = tuple(self._open.values())
+        for session in sessions:
+            session.complain(str(error))
+
+    def close(self) -> None:
+        """Close them all."""
+        for number in tuple(self._open):
+            self._dismiss(number)
+
+    def _welcome(self, server: viser.ViserServer, client: viser.ClientHandle) -> None:
+        session = Session(client, self._catalog, self.recorder)
+        with self._lock:
+            self._open[client.client_id] = session
+        session.start()
+        # viser runs these callbacks side by side: the client may have left before it was welcomed.
+        if client.client_id not in server.get_clients():
+            self._dismiss(client.client_id)
+
+    def _dismiss(self, number: int) -> None:
+        with self._lock:
+            session = self._open.pop(number, None)
+        if session is not None:
+            session.close()
+
+
+async def _serve_until_told(door: FrontDoor, listener: socket.socket) -> None:
+    stop = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        try:
+            loop.add_signal_handler(number, stop.set)
+        except NotImplementedError:  # Windows: asyncio.run ends on Ctrl-C by itself
+            break
+    runner = await door.start(listener)
+    print(f"spherloc playground: {_address(listener)}", flush=True)
+    try:
+        await stop.wait()
+    finally:
+        await runner.cleanup()
+
+
+def _address(listener: socket.socket) -> str:
+    host, port = listener.getsockname()[:2]
+    return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"

@@ -1,0 +1,206 @@
+"""One browser client: its own widgets, canvas, run and threads."""
+
+import logging
+import threading
+from dataclasses import dataclass
+from typing import Any
+
+import viser
+
+from spherloc.errors import RecordingError, SpherlocError
+from spherloc.estimators import estimate
+from spherloc.trace import Trace
+from spherloc_viz.app import views
+from spherloc_viz.app.catalog import Catalog, SceneWish
+from spherloc_viz.app.charts import ChartPanel
+from spherloc_viz.app.display_controls import DisplayControls
+from spherloc_viz.app.estimator_controls import EstimatorControls
+from spherloc_viz.app.newest import Newest
+from spherloc_viz.app.painter import Painter
+from spherloc_viz.app.scene_controls import SceneControls
+from spherloc_viz.app.steps_panel import StepsPanel
+from spherloc_viz.app.text import legend_html, status_html, table_html
+from spherloc_viz.app.viser_seams import put_back
+from spherloc_viz.layers import paint, steps
+from spherloc_viz.layers.primitives import Picture
+from spherloc_viz.layers.tables import outcome_table
+from spherloc_viz.recording.background import Recorder
+
+QUIET_S = 0.7
+"""Runs count as settled, and are recorded, when nothing has changed for this long."""
+PANELS_PX = ((1600, 460, 380), (0, 360, 340))
+"""From this width of the window on: widths of the panels left and right of the canvas."""
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Wish:
+    """All that a run depends on."""
+
+    scene: SceneWish
+    estimator: str
+    options: Any
+
+
+class Session:
+    """Lives as long as the tab's connection.
+
+    Two threads, so that steps can be walked while the next run is being solved: one solves the newest wish,
+    one shows the newest run. Both leave the interpreter while they compute or wait.
+    """
+
+    def __init__(self, client: viser.ClientHandle, catalog: Catalog, recorder: Recorder | None) -> None:
+        self._client, self._catalog, self._recorder = client, catalog, recorder
+        self._solver = Newest(f"spherloc-solver-{client.client_id}", self._guarded(self._solve))
+        self._page = Newest(f"spherloc-page-{client.client_id}", self._guarded(self._show))
+        self._solved: Wish | None = None
+        self._trace: Trace | None = None
+        self._recorded: Trace | None = None
+        self._viewed: tuple[str, str, bool] | None = None
+        self._complaint: tuple[str, viser.NotificationHandle] | None = None
+        self._complaining = threading.Lock()
+        self._full_width = client.camera.image_width
+        self._panels_px = next(widths for least, *widths in PANELS_PX if self._full_width >= least)
+        self._build()
+        self._painter = Painter(client)
+
+    def start(self) -> None:
+        """Solve and show the first problem."""
+        self._page.start()
+        self._solver.start()
+        self._solver.ask()
+
+    def close(self) -> None:
+        """End the threads; does not wait."""
+        self._solver.close()
+        self._page.close()
+
+    def _build(self) -> None:
+        gui = self._client.gui
+        self._client.scene.set_up_direction("-y")
+        self._outcome = gui.add_html("")
+        self._scene = SceneControls(gui, self._catalog, self._changed)
+        gui.add_button_group("", ("New seed",)).on_click(self._next_seed)
+        self._estimator = EstimatorControls(gui, self._changed)
+        self._display = DisplayControls(gui, self._redraw)
+        self._status = gui.add_html(status_html("Solving the first problem …"))
+        story = gui.add_panel()
+        with story.add_tab("Steps"):
+            self._steps = StepsPanel(gui, self._redraw)
+            gui.add_html(legend_html())
+            self._charts = ChartPanel(gui)
+        story.dock_left()
+        story.set_width(self._panels_px[0])
+        gui.main_panel.dock_right()
+        gui.main_panel.set_width(self._panels_px[1])
+
+    def _changed(self, event: Any) -> None:
+        # Widgets that Python itself sets have no client; what they mean is known already.
+        if event.client is not None:
+            self._solver.ask()
+
+    def _redraw(self, event: Any) -> None:
+        self._page.ask()
+
+    def _next_seed(self, event: Any) -> None:
+        self._scene.next_seed()
+        self._solver.ask()
+
+    def _solve(self, asked: bool) -> float | None:
+        """The solver thread's job: solve what the page asks for now, or record what it has settled on."""
+        if not asked:
+            self._settle()
+            return None
+        if self._scene.follow_scene():
+            self._estimator.follow_problem(self._catalog.problem(self._scene.read()))
+        wish = Wish(self._scene.read(), *self._estimator.read())
+        if wish != self._solved:
+            self._status.content = status_html(f"Solving with {wish.estimator} …")
+            problem = self._catalog.problem(wish.scene)
+            self._trace = estimate(problem, wish.estimator, wish.options, wish.scene.seed)
+            self._solved = wish
+            self._page.ask()
+        self._status.content = status_html(
+            "Runs are not recorded." if self._recorder is None else "Will be recorded when nothing changes any more."
+        )
+        self._withdraw()
+        return QUIET_S
+
+    def _settle(self) -> None:
+        for widget in (*self._scene.widgets, *self._estimator.widgets, *self._display.widgets, *self._steps.widgets):
+            put_back(widget)
+        trace = self._trace
+        if self._recorder is None or trace is None or trace is self._recorded:
+            return
+        path = self._recorder.submit(trace)
+        self._recorded = trace
+        self._status.content = status_html(f"Recorded as {path.name}")
+
+    def _show(self, asked: bool) -> float | None:
+        """The page thread's job: show the step at hand of the newest run."""
+        trace = self._trace
+        if trace is None:
+            return None
+        timeline = steps(trace)
+        index, pause = self._steps.settle(timeline, asked)
+        picture = paint(trace, index)
+        with self._client.atomic():
+            self._painter.draw(picture.scene, self._display.layers())
+            self._steps.show(playing=pause is not None)
+            self._charts.draw(picture.charts)
+            self._outcome.content = table_html(outcome_table(trace))
+            self._move_viewer(trace, picture)
+        self._client.flush()
+        return pause
+
+    def _move_viewer(self, trace: Trace, picture: Picture) -> None:
+        """Go where the person wants, or, if that is to follow the steps, where the step's subject reads best."""
+        wanted = self._display.take_view()
+        name, ring = views.fitting(picture)
+        fitting = (trace.problem.name, name, ring)
+        if wanted is None and (self._viewed is None or (self._display.follow and fitting != self._viewed)):
+            wanted = name
+        self._viewed = fitting
+        if wanted is not None:
+            views.look(self._client, views.find(wanted, picture, self._aspect()))
+
+    def _aspect(self) -> float:
+        """Width over height of the canvas."""
+        camera = self._client.camera
+        # The page tells its size before it docks the panels, and again some frames later.
+        docked = sum(self._panels_px) if camera.image_width == self._full_width else 0
+        return max(0.3, (camera.image_width - docked) / max(1, camera.image_height))
+
+    def complain(self, sentence: str) -> None:
+        """Say in one sentence what went wrong; the page keeps its last run and stays usable."""
+        sentence = sentence[:1].upper() + sentence[1:]
+        with self._complaining:
+            self._status.content = status_html(sentence, wrong=True)
+            if self._complaint is not None:
+                if self._complaint[0] == sentence:
+                    return
+                self._complaint[1].remove()
+            note = self._client.add_notification("Cannot do that", sentence, color="red")
+            self._complaint = (sentence, note)
+
+    def _withdraw(self) -> None:
+        with self._complaining:
+            if self._complaint is not None:
+                self._complaint[1].remove()
+                self._complaint = None
+
+    def _guarded(self, job):
+        def run(asked: bool) -> float | None:
+            try:
+                return job(asked)
+            except RecordingError as error:
+                self.complain(str(error))
+            except SpherlocError as error:
+                self.complain(str(error))
+            except Exception as error:
+                log.exception("session %s", self._client.client_id)
+                self.complain(f"This is a bug in the playground ({error!r}); change a setting or reload the page.")
+            return None
+
+        return run

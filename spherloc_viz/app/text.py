@@ -1,0 +1,62 @@
+"""Text and tables as HTML. viser puts HTML into the page as it is, so every string is escaped here."""
+
+from html import escape
+
+from spherloc_viz import style
+from spherloc_viz.layers.primitives import Step, Table
+
+DIM = "opacity:.65"
+WORDS = {"success": style.INLIER, "failure": style.OUTLIER, "no pose": style.OUTLIER}
+"""Values of a table that are shown in colour."""
+
+
+def box(content: str, css: str = "") -> str:
+    """A block with the page's margins and type size."""
+    return f'<div style="padding:0 .8em .6em;font-size:13px;line-height:1.4;{css}">{content}</div>'
+
+
+def step_html(step: Step) -> str:
+    """Title, caption, equation and note of a step."""
+    parts = [
+        f'<div style="font-size:15px;font-weight:600;padding-bottom:.25em">{escape(step.title)}</div>',
+        f"<div>{escape(step.caption)}</div>",
+    ]
+    if step.equation:
+        face = "font-family:Cambria,Georgia,serif;font-style:italic;font-size:14px"
+        parts.append(f'<div style="{face};padding-top:.4em;{DIM}">{escape(step.equation)}</div>')
+    if step.note:
+        parts.append(f'<div style="font-size:11.5px;padding-top:.35em;{DIM}">{escape(step.note)}</div>')
+    return box("".join(parts))
+
+
+def table_html(table: Table) -> str:
+    """A table of names and values, without its headings."""
+    cell = "padding:.09em 0;vertical-align:top"
+    rows = "".join(
+        f'<tr><td style="{cell};padding-right:.9em;white-space:nowrap;{DIM}">{escape(str(name))}</td>'
+        f'<td style="{cell};{_value_css(value)}">{escape(str(value))}</td></tr>'
+        for name, value in table.rows
+    )
+    return box(f'<table style="border-collapse:collapse;width:100%">{rows}</table>')
+
+
+def _value_css(value: object) -> str:
+    color = WORDS.get(str(value))
+    return f"color:{style.css(color)};font-weight:600" if color else "font-variant-numeric:tabular-nums"
+
+
+def legend_html() -> str:
+    """What each colour means."""
+    items = "".join(
+        '<span style="white-space:nowrap;margin-right:.9em;display:inline-block">'
+        '<span style="display:inline-block;width:.75em;height:.75em;border-radius:50%;margin-right:.35em;'
+        f'background:{style.css(color)}"></span>{escape(meaning)}</span>'
+        for color, meaning in style.LEGEND
+    )
+    return box(items, "font-size:12px")
+
+
+def status_html(sentence: str, wrong: bool = False) -> str:
+    """A line about what is going on; red if something went wrong."""
+    color = f"color:{style.css(style.OUTLIER)}" if wrong else DIM
+    return box(f'<div style="{color};overflow-wrap:anywhere">{escape(sentence)}</div>', "font-size:12px")

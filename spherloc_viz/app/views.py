@@ -1,0 +1,119 @@
+"""Where the viewer stands: places from which a picture reads well."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import viser
+
+from spherloc_viz.layers.primitives import Balls, FloatArray, Mesh, Picture, Points, Segments
+
+FIELD_OF_VIEW_RAD = np.radians(45.0)
+UP = np.array([0.0, -1.0, 0.0])
+MARGIN = 0.06
+"""Share of the canvas that stays free on every side."""
+ROUNDS = 4
+"""Perspective shifts the middle of what is seen, so the target is moved there a few times."""
+ROOM = 1.35
+"""Radius of what the view of the sphere holds, in sphere radii."""
+RING = 3.0
+"""Radius of the yaw ring with its outline, in sphere radii."""
+DIRECTIONS = {
+    "Overview": (0.55, -0.6, -0.75),
+    "Above": (0.0, -1.0, -0.02),
+    "Sphere": (0.3, -0.75, -0.6),
+    "Balls": (0.35, -0.45, -0.8),
+}
+"""From the subject to the viewer; y points down."""
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A place to look from."""
+
+    position: FloatArray
+    target: FloatArray
+
+
+def look(client: viser.ClientHandle, view: View) -> None:
+    """Move a client's viewer there."""
+    with client.atomic():
+        camera = client.camera
+        camera.up_direction = UP
+        camera.fov = FIELD_OF_VIEW_RAD
+        camera.position = view.position
+        camera.look_at = view.target
+
+
+def fitting(picture: Picture) -> tuple[str, bool]:
+    """The name of the view that shows what this step is about, and whether it is about the yaw ring."""
+    layers = {item.layer for item in picture.scene if not isinstance(item, Segments) or len(item.points)}
+    ring = "yaw ring" in layers
+    if "balls" in layers:
+        return "Balls", ring
+    return "Overview" if "rays" in layers and not ring else "Sphere", ring
+
+
+def find(name: str, picture: Picture, aspect: float) -> View:
+    """The view of that name, fitted to a picture and to a canvas of that width over height."""
+    subject = _subject(name, picture)
+    backward = np.array(DIRECTIONS[name])
+    backward /= np.linalg.norm(backward)
+    right = np.cross(UP, backward)
+    right /= np.linalg.norm(right)
+    sideways = np.column_stack([right, np.cross(backward, right)])
+    slopes = np.tan(FIELD_OF_VIEW_RAD / 2) * (1.0 - MARGIN) * np.array([aspect, 1.0])
+    target, distance = (np.min(subject, axis=0) + np.max(subject, axis=0)) / 2, 1.0
+    for _ in range(ROUNDS):
+        offset = subject - target
+        depth, across = offset @ backward, offset @ sideways
+        distance = max(1e-3, float(np.max(np.max(np.abs(across) / slopes, axis=1) + depth)))
+        seen = across / np.maximum(distance - depth, 1e-3)[:, None]
+        target = target + distance * sideways @ ((np.min(seen, axis=0) + np.max(seen, axis=0)) / 2)
+    return View(target + distance * backward, target)
+
+
+def _subject(name: str, picture: Picture) -> FloatArray:
+    """Points (K, 3) that a view must hold."""
+    items = {item.name: item for item in picture.scene}
+    if name == "Sphere":
+        return _sphere(items["sphere/surface"], any(item.layer == "yaw ring" for item in picture.scene))
+    if name == "Balls":
+        for key in ("balls/clique", "balls/others"):
+            balls = items.get(key)
+            if isinstance(balls, Balls):
+                return _balls(balls)
+    points, surface = items["map/points"], items["sphere/surface"]
+    assert isinstance(points, Points) and isinstance(surface, Mesh)
+    cameras = [
+        item.points.reshape(-1, 3) for item in picture.scene if isinstance(item, Segments) and item.layer == "cameras"
+    ]
+    return np.vstack([_dense(points.positions), surface.vertices, *cameras])
+
+
+def _sphere(surface: object, ring: bool) -> FloatArray:
+    """The sphere with some room, or the ring around it."""
+    assert isinstance(surface, Mesh)
+    centre = (np.min(surface.vertices, axis=0) + np.max(surface.vertices, axis=0)) / 2
+    if not ring:
+        return centre + ROOM * (surface.vertices - centre)
+    angle = np.linspace(0, 2 * np.pi, 36)
+    circle = np.column_stack([np.cos(angle), 0 * angle, np.sin(angle)])
+    return centre + RING * np.max(surface.vertices[:, 0] - centre[0]) * circle
+
+
+def _balls(balls: Balls) -> FloatArray:
+    """Boxes around the denser half of the balls, and as much again around these.
+
+    These are the balls nearest to the median of the smaller half.
+    """
+    small = np.argsort(balls.radii_m)[: max(1, len(balls.radii_m) // 2)]
+    away = np.linalg.norm(balls.centers - np.median(balls.centers[small], axis=0), axis=1)
+    near = np.argsort(away)[: max(1, len(away) // 2)]
+    reach = 1.6 * balls.radii_m[near, None]
+    return np.vstack([balls.centers[near] - reach, balls.centers[near] + reach])
+
+
+def _dense(positions: FloatArray) -> FloatArray:
+    """Without stray points, which would make all others small."""
+    away = np.linalg.norm(positions - np.median(positions, axis=0), axis=1)
+    return positions[away <= 4.0 * np.median(away)]

@@ -1,0 +1,82 @@
+"""Everything that leans on viser's insides, so that a new version of viser is checked against one file."""
+
+import contextlib
+import hmac
+import io
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import viser
+import websockets.asyncio.server
+from viser import _messages
+
+KEY_HEADER = "X-Spherloc-Key"
+"""Request header that carries the key; a web page cannot set headers on a websocket, a program can."""
+
+
+def start_viser(key: str) -> viser.ViserServer:
+    """A viser server on a free loopback port that answers only requests carrying ``key``.
+
+    viser checks neither Host nor Origin and lets any client open a public tunnel. So it listens on loopback
+    only, every request without the key is refused before the websocket opens (a page of another site that
+    guesses the port gets a 403), and the tunnel messages do nothing.
+    """
+    # viser greets with a panel naming the internal address, which nobody can use.
+    with _demand(key), contextlib.redirect_stdout(io.StringIO()):
+        server = viser.ViserServer(host="127.0.0.1", port=0, label="spherloc", verbose=False)
+    _disable_sharing(server)
+    return server
+
+
+def stop_viser(server: viser.ViserServer) -> None:
+    """Stop it without its farewell."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        server.stop()
+
+
+def put_back(handle: Any) -> None:
+    """Show the value that Python holds in the widget, also if the page lost one on its way here.
+
+    The page throttles all widgets together and drops messages; assigning ``handle.value`` would not help,
+    since it sends nothing when Python's value stays the same.
+    """
+    state = handle._impl
+    message = _messages.GuiUpdateMessage(state.uuid, {"value": state.value})
+    state.gui_api._websock_interface.queue_message(message)
+
+
+@contextlib.contextmanager
+def _demand(key: str) -> Iterator[None]:
+    """While open, websocket servers that are started demand the key of every request.
+
+    ``websockets`` has a hook for this (``process_request``) but viser fills it itself and offers no other, so
+    the call is wrapped for the moment of viser's start. If viser should start its server in another way, this
+    raises rather than leave the port open.
+    """
+    original = websockets.asyncio.server.serve
+    started = []
+
+    def serve(*args: Any, process_request: Callable[..., Any], **options: Any) -> Any:
+        started.append(True)
+
+        def checked(connection: Any, request: Any) -> Any:
+            if not hmac.compare_digest(request.headers.get(KEY_HEADER, "").encode(), key.encode()):
+                return connection.respond(403, "Forbidden\n")
+            return process_request(connection, request)
+
+        return original(*args, process_request=checked, **options)
+
+    websockets.asyncio.server.serve = serve  # type: ignore[assignment]
+    try:
+        yield
+    finally:
+        websockets.asyncio.server.serve = original
+    if not started:
+        raise RuntimeError("this version of viser starts its server in an unknown way; install viser 1.1.1.")
+
+
+def _disable_sharing(server: viser.ViserServer) -> None:
+    connection = server._websock_server
+    for message in (_messages.ShareUrlRequest, _messages.ShareUrlDisconnect):
+        connection.unregister_handler(message)
+        connection.register_handler(message, lambda client, message: None)

@@ -1,0 +1,106 @@
+"""The numbers behind the pictures: the trace as raw arrow rows under ``/data``, and back, bit for bit.
+
+A row has one column an array, typed by its dtype and shape, and a column ``scalars`` with all the rest as JSON.
+"""
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+from rerun.chunk import Chunk
+
+from spherloc.cameras.calibration import camera_from_table
+from spherloc.problem import Problem
+from spherloc.trace import Trace
+
+MAX_ARRAY_BYTES = 65_536
+"""Stage arrays above this are left out: they follow from the problem, the options and the seed."""
+
+Row = dict[str, Any]
+
+
+def data_chunks(trace: Trace) -> Iterator[Chunk]:
+    """Static chunks with the problem, the result and the small arrays of every stage."""
+    yield _chunk("/data/problem", _problem_row(trace.problem))
+    yield _chunk("/data/run", _run_row(trace))
+    for stage in trace.stages:
+        row = {item.name: getattr(stage, item.name) for item in fields(stage)}
+        small = {name: value for name, value in row.items() if getattr(value, "nbytes", 0) <= MAX_ARRAY_BYTES}
+        yield _chunk(f"/data/stages/{stage.kind}", small)
+
+
+def _problem_row(problem: Problem) -> Row:
+    row = {item.name: getattr(problem, item.name) for item in fields(problem)}
+    image = None if problem.image is None else str(problem.image)
+    return row | {"camera": problem.camera.to_dict(), "image": image}
+
+
+def _run_row(trace: Trace) -> Row:
+    return {
+        "estimator": trace.estimator,
+        "options": asdict(trace.options),
+        "seed": trace.seed,
+        "versions": dict(trace.versions),
+        "timings_ms": dict(trace.timings_ms),
+        "cam_from_map": trace.cam_from_map,
+        "inlier_mask": trace.inlier_mask,
+        "message": trace.message,
+    }
+
+
+def problem_from_row(row: Row, where: str) -> Problem:
+    """The recorded problem, bit for bit.
+
+    Raises ``SpherlocError`` if the row describes none, and ``KeyError`` or ``TypeError`` if it is no problem's row.
+    """
+    image = None if row["image"] is None else Path(row["image"])
+    problem = Problem(**row | {"camera": camera_from_table(row["camera"], where), "image": image})
+    for name in ("gravity_camera", "gravity_map"):
+        # Problem scales directions to unit length, and doing so twice can change the last bit.
+        object.__setattr__(problem, name, row[name])
+    return problem
+
+
+def _chunk(path: str, row: Row) -> Chunk:
+    arrays = {name: value for name, value in row.items() if isinstance(value, np.ndarray)}
+    scalars = json.dumps({name: value for name, value in row.items() if name not in arrays}, default=_plain)
+    columns = {name: _arrow(value) for name, value in arrays.items()} | {"scalars": pa.array([[scalars]])}
+    return Chunk.from_record_batch(pa.RecordBatch.from_pydict(columns), index=None, entity_path=path)[0]
+
+
+def _plain(value: Any) -> Any:
+    """What JSON has no word for: numpy's scalars and arrays, read-only mappings."""
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    return dict(value) if isinstance(value, Mapping) else str(value)
+
+
+def _arrow(array: NDArray[Any]) -> pa.Array:
+    """One row that holds ``array``; all axes but the first become fixed-size lists, which keeps the shape."""
+    values = pa.array(array.ravel())
+    for size in reversed(array.shape[1:]):
+        values = pa.FixedSizeListArray.from_arrays(values, size)
+    return pa.ListArray.from_arrays(pa.array([0, len(array)], pa.int32()), values)
+
+
+def read_row(chunk: Chunk) -> Row:
+    """Arrays and scalars of a chunk that ``data_chunks`` made; the arrays are read-only."""
+    batch = chunk.to_record_batch()
+    columns = {name: batch.column(name) for name in batch.schema.names if pa.types.is_list(batch.column(name).type)}
+    row: Row = json.loads(columns.pop("scalars")[0].values[0].as_py())
+    return row | {name: _numpy(column[0].values) for name, column in columns.items()}
+
+
+def _numpy(values: pa.Array) -> NDArray[Any]:
+    shape = [len(values)]
+    while isinstance(values, pa.FixedSizeListArray):
+        shape.append(values.type.list_size)
+        values = values.flatten()
+    array = values.to_numpy(zero_copy_only=False).reshape(shape)
+    array.setflags(write=False)
+    return array

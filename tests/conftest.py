@@ -1,0 +1,53 @@
+"""What all tests share: reproducible randomness, the bundled scenes with changes, and real data where it is present."""
+
+import os
+import zlib
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import settings
+
+from spherloc.datasets import load_scene
+from spherloc.datasets.synthetic import SyntheticScene
+
+ROOT = Path(__file__).resolve().parents[1]
+SUITE_SEED = int(os.environ.get("SPHERLOC_TEST_SEED", "0"))
+
+settings.register_profile("spherloc", derandomize=True, deadline=None, database=None)
+settings.load_profile("spherloc")
+
+
+def pytest_report_header() -> str:
+    """A failing random test is repeated by the same seed."""
+    return f"SPHERLOC_TEST_SEED={SUITE_SEED}"
+
+
+@pytest.fixture
+def rng(request: pytest.FixtureRequest) -> np.random.Generator:
+    """Randomness of one test: the same in every run and whatever tests run beside it."""
+    return np.random.default_rng([SUITE_SEED, zlib.crc32(request.node.nodeid.encode())])
+
+
+@pytest.fixture(scope="session")
+def scene_of() -> Callable[..., SyntheticScene]:
+    """``scene_of("mei", outlier_rate=0.5)``: the simulation with the "mei", "fisheye" or "panorama" camera, changed."""
+
+    def make(camera: str, **changes: Any) -> SyntheticScene:
+        scene = load_scene(ROOT / "scenes" / f"{camera}_outliers_80.toml")
+        assert isinstance(scene, SyntheticScene)
+        return replace(scene, **changes)
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def aria() -> Path:
+    """Folder of the real fisheye problems beside the project; the test is skipped where it is absent."""
+    folder = ROOT / ".." / "shared" / "data" / "aria_adt_fisheye"
+    if not folder.is_dir():
+        pytest.skip("the real fisheye data (../shared/data/aria_adt_fisheye) is not on this machine")
+    return folder

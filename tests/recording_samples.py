@@ -1,0 +1,81 @@
+"""Runs to record, and the rows of a recording as rerun's own reader gives them."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rerun.chunk import RrdReader
+
+from spherloc.cameras.equirectangular import Equirectangular
+from spherloc.datasets import bundled_scenes, load_scene
+from spherloc.estimators import estimate
+from spherloc.geometry import so3_exp
+from spherloc.problem import Problem
+from spherloc.trace import Trace
+
+RUNS = (("mei_outliers_80", "mc"), ("fisheye_outliers_80", "ransac-2p"), ("panorama_outliers_90", "mc"))
+
+
+def scene_problem(name: str) -> Problem:
+    """The problem of a bundled scene."""
+    return load_scene(bundled_scenes()[name]).problem(None)
+
+
+def odd_problem(rng: np.random.Generator, turn: int) -> Problem:
+    """A problem in which nothing is round: tilted gravity, and by turns no truth, an image, a pixel bound."""
+    camera = Equirectangular(width=1000, height=500)
+    pixels, points = rng.uniform((0, 0), (1000, 500), (9, 2)), rng.normal(size=(9, 3)) * 1e3
+    rotation = so3_exp(rng.normal(size=3))
+    known = bool(turn % 2)
+    return Problem(
+        name=f'“{turn}” / ../odd: "name"\n',
+        camera=camera,
+        pixels=pixels,
+        points=points,
+        gravity_camera=rotation[0],
+        gravity_map=rotation[1],
+        gravity_bound_rad=float(rng.uniform(0, 0.1)),
+        bound_px=float(rng.uniform(1, 9)) if turn % 3 else None,
+        truth_cam_from_map=np.column_stack([rotation, rng.normal(size=3)]) if known else None,
+        truth_inliers=rng.random(9) < 0.5 if known else None,
+        image=Path("some folder/query ü.jpg") if known else None,
+        scene="a | scene",
+    )
+
+
+def lost_run() -> Trace:
+    """A run without a pose: all matches are of one map point, so that no pair fixes a yaw."""
+    problem = scene_problem("mei_outliers_80")
+    alone = np.tile(problem.points[:1], (len(problem), 1))
+    trace = estimate(replace(problem, points=alone, truth_cam_from_map=None, truth_inliers=None), "mc")
+    assert trace.cam_from_map is None
+    return trace
+
+
+class Recorded:
+    """A recording as rerun's reader gives it: rows of every entity, the newest one at a step."""
+
+    def __init__(self, path: Path) -> None:
+        self.rows: dict[str, list[tuple[int, dict[str, Any]]]] = {}
+        reader = RrdReader(path)
+        for chunk in reader.stream(store=reader.recordings()[0]):
+            batch = chunk.to_record_batch()
+            for index in range(batch.num_rows):
+                row = {name: batch.column(name)[index] for name in batch.schema.names}
+                step = row["step"].as_py() if "step" in row else -1
+                self.rows.setdefault(chunk.entity_path, []).append((step, row))
+
+    def at(self, entity: str, step: int) -> dict[str, Any] | None:
+        """The components of an entity that a viewer shows at a step; None if there are none or all are cleared."""
+        rows = [row for when, row in sorted(self.rows[entity], key=lambda item: item[0]) if when <= step]
+        shown = (
+            {name: value for name, value in rows[-1].items() if ":" in name or name == "correspondence"} if rows else {}
+        )
+        return shown if any(len(value) for value in shown.values() if value.is_valid) else None
+
+    def array(self, entity: str, step: int, component: str) -> np.ndarray:
+        """A component at a step as an array."""
+        row = self.at(entity, step)
+        assert row is not None
+        return np.array(row[component].as_py())

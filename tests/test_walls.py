@@ -1,0 +1,186 @@
+"""The house keeps its walls and floors (docs: the four walls; one reads the code from the ground to the roof).
+
+1. ``spherloc`` knows no screen: no viewer, server or command line library, and no ``spherloc_viz``.
+2. A file imports only from floors below its own, or from its own floor where that makes no circle.
+3. What both painters draw (``spherloc_viz.layers``) knows neither of them, and no painter knows the program around it.
+"""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import networkx as nx
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+SCREENS = {"viser", "rerun", "rerun_sdk", "rerun_bindings", "plotly", "aiohttp", "tyro", "spherloc_viz"}
+
+FLOORS = (
+    ("spherloc.errors", "spherloc"),
+    ("spherloc.registry", "spherloc.geometry"),
+    ("spherloc.cameras", "spherloc.solvers"),
+    ("spherloc.problem", "spherloc.consensus"),
+    ("spherloc.trace", "spherloc.refine", "spherloc.metrics", "spherloc.datasets", "spherloc.frontend"),
+    ("spherloc.estimators", "spherloc.diagnosis", "spherloc.experiments"),
+    ("spherloc_viz.style", "spherloc_viz.layers", "spherloc_viz"),
+    ("spherloc_viz.recording", "spherloc_viz.app", "spherloc_viz.lessons"),
+    ("spherloc_viz.batch", "spherloc_viz.cli"),
+)
+"""From the ground up; a room is a module or a package with all of its files."""
+
+FORBIDDEN = (
+    # (files whose name starts with this, must not import this, why)
+    ("spherloc_viz.layers", ("viser", "rerun", "aiohttp", "tyro"), "layers describe pictures for both painters"),
+    ("spherloc_viz.style", ("viser", "rerun", "aiohttp", "tyro"), "colours are for both painters"),
+    ("spherloc_viz.recording", ("viser", "tyro", "spherloc_viz.app"), "recordings are written without a page"),
+    ("spherloc_viz.app", ("rerun", "tyro"), "the page does not draw recordings itself"),
+)
+
+
+def sources():
+    """Path of every module by its dotted name."""
+    found = {}
+    for package in ("spherloc", "spherloc_viz"):
+        for path in sorted((ROOT / package).rglob("*.py")):
+            parts = path.relative_to(ROOT).with_suffix("").parts
+            found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    return found
+
+
+MODULES = sources()
+
+
+def imports(module):
+    """(line, dotted name) of every import of a module, inside functions too; the name of a file if it is one."""
+    path = MODULES[module]
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from ((node.lineno, alias.name) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = node.module or ""
+            if node.level:
+                package = module if path.stem == "__init__" else module.rpartition(".")[0]
+                above = package.split(".")[: len(package.split(".")) - node.level + 1]
+                base = ".".join([*above, *([base] if base else [])])
+            for alias in node.names:
+                whole = f"{base}.{alias.name}"
+                yield node.lineno, whole if whole in MODULES else base
+
+
+def inside(name, room):
+    return name == room or name.startswith(room + ".")
+
+
+def room_of(module):
+    rooms = [room for floor in FLOORS for room in floor if inside(module, room)]
+    return max(rooms, key=len)
+
+
+def floor_of(module):
+    return next(number for number, floor in enumerate(FLOORS) if room_of(module) in floor)
+
+
+def place(module, line):
+    return f"{MODULES[module].relative_to(ROOT)}:{line}"
+
+
+def test_every_module_has_a_floor():
+    """A new room must be given a place, else its imports would go unchecked."""
+    homeless = [name for name in MODULES if room_of(name) in ("spherloc", "spherloc_viz") and "." in name]
+    assert not homeless, f"no floor for {', '.join(homeless)}: add the room to FLOORS in {Path(__file__).name}"
+
+
+def test_spherloc_names_no_screen():
+    broken = [
+        f"{place(module, line)} imports {name}"
+        for module in MODULES
+        if inside(module, "spherloc")
+        for line, name in imports(module)
+        if name.partition(".")[0] in SCREENS
+    ]
+    assert not broken, "spherloc must work without any screen; move this to spherloc_viz:\n" + "\n".join(broken)
+
+
+LOADER = """
+import importlib, sys
+for name in {names!r}:
+    importlib.import_module(name)
+print(" ".join(sorted({{name.partition(".")[0] for name in sys.modules}})))
+"""
+
+
+def loaded_by(names):
+    """Top-level modules in a fresh interpreter after importing ``names``."""
+    code = LOADER.format(names=sorted(names))
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return set(done.stdout.split())
+
+
+@pytest.mark.parametrize("package", ["spherloc", "spherloc_viz.layers", "spherloc_viz.style"])
+def test_no_screen_is_loaded(package):
+    """Also not by something that is imported by something else."""
+    screens = SCREENS - {package.partition(".")[0]}
+    loaded = loaded_by(name for name in MODULES if inside(name, package))
+    assert package.partition(".")[0] in loaded
+    assert not loaded & screens, f"importing all of {package} also loads {', '.join(sorted(loaded & screens))}"
+
+
+def test_every_import_goes_down():
+    broken = []
+    for module in MODULES:
+        for line, name in imports(module):
+            if name in MODULES and floor_of(name) > floor_of(module):
+                broken.append(
+                    f"{place(module, line)} (floor {floor_of(module)}) imports {name} (floor {floor_of(name)}): "
+                    "move what both need down, or this file up"
+                )
+    assert not broken, "a file may import from its own floor and those below only:\n" + "\n".join(broken)
+
+
+def pairwise_around(circle):
+    return zip(circle, circle[1:] + circle[:1], strict=True)
+
+
+def test_no_circles():
+    """Between files and between rooms: two rooms of one floor may lean on each other in one direction only."""
+    for unit, what in ((lambda name: name, "files"), (room_of, "rooms")):
+        graph = nx.DiGraph()
+        for module in MODULES:
+            for line, name in imports(module):
+                if name in MODULES and unit(name) != unit(module):
+                    graph.add_edge(unit(module), unit(name), where=place(module, line))
+        circles = [
+            "\n    ".join(
+                [" -> ".join(circle + circle[:1]), *(graph.edges[edge]["where"] for edge in pairwise_around(circle))]
+            )
+            for circle in nx.simple_cycles(graph)
+        ]
+        assert not circles, f"{what} import each other in a circle:\n" + "\n".join(circles)
+
+
+@pytest.mark.parametrize("room, names, why", FORBIDDEN)
+def test_painters_are_kept_apart(room, names, why):
+    broken = [
+        f"{place(module, line)} imports {name}"
+        for module in MODULES
+        if inside(module, room)
+        for line, name in imports(module)
+        if any(inside(name, forbidden) for forbidden in names)
+    ]
+    assert not broken, f"{why}:\n" + "\n".join(broken)
+
+
+def test_walls_would_be_noticed(monkeypatch, tmp_path):
+    """The checks above read imports of every form; a form that they overlook would be a hole in the wall."""
+    path = tmp_path / "hole.py"
+    path.write_text(
+        "import viser.uplot as u\nfrom rerun import blueprint\n"
+        "def f():\n    from spherloc_viz import app\n    from . import errors\n    from .cameras import base as b\n"
+    )
+    monkeypatch.setitem(MODULES, "spherloc.hole", path)
+    names = [name for _, name in imports("spherloc.hole")]
+    assert names == ["viser.uplot", "rerun", "spherloc_viz.app", "spherloc.errors", "spherloc.cameras.base"]
+    assert room_of("spherloc.hole") == "spherloc"
