@@ -8,7 +8,6 @@ import tyro
 from tyro.conf import Positional, arg
 from tyro.extras import SubcommandApp
 
-from spherloc import registry
 from spherloc.errors import SpherlocError
 
 RECORDINGS = Path("recordings")
