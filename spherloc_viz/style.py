@@ -27,8 +27,7 @@ LAYERS: tuple[str, ...] = ("map", "cameras", "sphere", "rays", "yaw ring", "ball
 
 MAX_DRAWN_RAYS = 600
 MAX_DRAWN_ARCS = 240
-MAX_DRAWN_BALLS = 80
-MAX_DRAWN_EDGES = 2500
+MAX_DRAWN_BALLS = 70
 
 
 def css(color: RGB) -> str:

@@ -101,15 +101,17 @@ def _look(chart: Chart) -> tuple:
 
 
 def _series(chart: Chart) -> tuple[uplot.Series, ...]:
-    lines = [uplot.Series(label=chart.x_label)]
+    """The first marker broad, those after it thin and dashed, so that both show where they coincide."""
+    lines, marked = [uplot.Series(label=chart.x_label)], False
     for curve in chart.curves:
         color = style.css(curve.color)
         line = uplot.Series(label=curve.label, stroke=color, points={"show": False})
-        line["width"] = 2.5 if curve.kind == "marker" else 1.5
-        if curve.kind == "marker":
-            line["dash"] = (6, 3)
+        line["width"] = 4.0 if curve.kind == "marker" else 1.5
+        if curve.kind == "marker" and marked:
+            line["width"], line["dash"] = 2.0, (5, 5)
         elif curve.kind == "step":
             line["fill"] = f"{color}40"
+        marked = marked or curve.kind == "marker"
         lines.append(line)
     return tuple(lines)
 

@@ -13,6 +13,7 @@ import viser
 
 from spherloc.errors import RecordingError
 from spherloc.estimators import warm_up
+from spherloc_viz.app import views
 from spherloc_viz.app.catalog import Catalog
 from spherloc_viz.app.front_door import FrontDoor, open_socket
 from spherloc_viz.app.session import Session
@@ -55,6 +56,8 @@ class Sessions:
     def attend(self, server: viser.ViserServer) -> None:
         """Open a session for every client that connects and close it when the client leaves."""
         server.scene.world_axes.visible = False
+        # A page that opens with another up would turn over after its first view is set.
+        server.initial_camera.up = tuple(views.UP)
         server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         server.on_client_connect(lambda client: self._welcome(server, client))
         server.on_client_disconnect(lambda client: self._dismiss(client.client_id))

@@ -21,13 +21,15 @@ class Frame:
 
     step: Step
     cam_from_map: FloatArray
-    """Pose (3, 4) between the aligned frames at which the sphere is drawn."""
+    """Pose (3, 4) between the aligned frames: the camera's, or where to stand before a position is known."""
     colors: ColorArray
     """(N, 3) colour of every correspondence."""
     rays: np.ndarray
     """(N,) mask: correspondences whose match is drawn as a line."""
     located: bool = False
     """Whether the position is an estimate (the camera is drawn) or a place to stand (only the sphere is)."""
+    sphere_aside: bool = False
+    """Whether the sphere stays in the middle of the map, where it does not hide the estimated position."""
     extra: Callable[[], tuple[SceneItem, ...]] = tuple
     """What this stage adds to the canvas."""
     charts: tuple[Chart, ...] = ()
@@ -90,3 +92,9 @@ class RunView:
 def one_color(color: style.RGB, count: int) -> ColorArray:
     """(count, 3) of one colour."""
     return np.tile(np.array(color, np.uint8), (count, 1))
+
+
+def even(indices: np.ndarray, count: int) -> np.ndarray:
+    """At most ``count`` of the indices, evenly spaced."""
+    places = np.unique(np.linspace(0, len(indices) - 1, min(count, len(indices))).round().astype(int))
+    return indices[places]

@@ -19,10 +19,10 @@ def _icosphere() -> tuple[np.ndarray, np.ndarray]:
 
 def base_items(view: RunView, frame: Frame) -> tuple[SceneItem, ...]:
     """The primitives that do not depend on the stage."""
-    centre, rotation = camera_centre(frame.cam_from_map), frame.cam_from_map[:, :3]
+    centre = camera_centre(frame.cam_from_map)
     items: list[SceneItem] = [
         Points("map/points", "map", view.points, frame.colors, 0.07 * view.sphere_m, np.arange(len(view.points))),
-        *_sphere(view, frame, centre, rotation),
+        *_sphere(view, frame),
     ]
     if frame.located:
         items.append(camera("cameras/estimate", frame.cam_from_map, 1.9 * view.sphere_m, style.ESTIMATE, 2.5))
@@ -34,17 +34,19 @@ def base_items(view: RunView, frame: Frame) -> tuple[SceneItem, ...]:
     return tuple(items)
 
 
-def _sphere(view: RunView, frame: Frame, centre: FloatArray, rotation: FloatArray) -> list[SceneItem]:
+def _sphere(view: RunView, frame: Frame) -> list[SceneItem]:
+    rotation = frame.cam_from_map[:, :3]
+    centre = camera_centre(view.standing(rotation) if frame.sphere_aside else frame.cam_from_map)
     vertices, faces = _icosphere()
     aligned = view.trace.problem.aligned
     dots = centre + view.sphere_m * aligned.bearings @ rotation
     drawn = np.flatnonzero(frame.rays[aligned.index])[: style.MAX_DRAWN_RAYS]
     ends = np.stack([dots[drawn], view.points[aligned.index[drawn]]], axis=1)
     colors = frame.colors[aligned.index]
-    surface = Mesh("sphere/surface", "sphere", centre + view.sphere_m * vertices, faces, style.SPHERE, 0.22)
+    surface = Mesh("sphere/surface", "sphere", centre + view.sphere_m * vertices, faces, style.SPHERE, 0.25)
     return [
         surface,
-        Points("sphere/bearings", "sphere", dots, colors, 0.055 * view.sphere_m, aligned.index),
+        Points("sphere/bearings", "sphere", dots, colors, 0.04 * view.sphere_m, aligned.index),
         Segments("rays", "rays", ends, colors[drawn], 1.5),
     ]
 

@@ -6,7 +6,7 @@ from spherloc.geometry import camera_centre
 from spherloc.trace import TranslationStage, YawStage
 from spherloc_viz import style
 from spherloc_viz.layers import yaw
-from spherloc_viz.layers.frame import Frame, RunView, one_color
+from spherloc_viz.layers.frame import Frame, RunView, even, one_color
 from spherloc_viz.layers.primitives import Balls, Points, SceneItem, Segments, Step
 
 
@@ -49,6 +49,7 @@ def frames(view: RunView, stage: TranslationStage) -> list[Frame]:
             view.colors(style.UNDECIDED, (members, style.CLIQUE)),
             view.nobody(),
             located=True,
+            sphere_aside=True,
             extra=lambda: _balls(view, stage, drawn, found=True),
             charts=charts,
         ),
@@ -56,36 +57,34 @@ def frames(view: RunView, stage: TranslationStage) -> list[Frame]:
 
 
 def _note(stage: TranslationStage, drawn: np.ndarray) -> str:
-    """By which rules balls and edges were left out."""
-    parts = [stage.rule]
-    if len(drawn) < len(stage.radii_m):
-        parts.append(
-            f"The {len(drawn)} smallest of {len(stage.radii_m):,} balls are drawn, half of them from the clique; "
-            "of the others only the centres."
-        )
-    if len(stage.edges) > style.MAX_DRAWN_EDGES:
-        parts.append(f"At most {style.MAX_DRAWN_EDGES:,} of {len(stage.edges):,} edges are drawn, the clique's first.")
-    return " ".join(parts)
+    """By which rules balls were left out."""
+    if len(drawn) == len(stage.radii_m):
+        return stage.rule
+    return (
+        f"{stage.rule} {len(drawn)} of {len(stage.radii_m):,} balls are drawn with the overlaps between them: an even "
+        "sample of the smaller half of the clique, and of the others; of the rest only the centres."
+    )
 
 
 def _drawn(stage: TranslationStage) -> np.ndarray:
-    """Indices of the balls to draw: the smallest, half of them from the clique where it has as many.
+    """Indices of the balls to draw: of the clique and of the others an even sample of the smaller half.
 
     Large balls hold the whole picture in them and hide it.
     """
     order = np.argsort(stage.radii_m, kind="stable")
+    if len(order) <= style.MAX_DRAWN_BALLS:
+        return order
     inside = np.isin(order, stage.clique)
-    members, others = order[inside], order[~inside]
-    room = style.MAX_DRAWN_BALLS
-    take = min(len(members), max(room // 2, room - len(others)))
-    return np.concatenate([members[:take], others[: room - take]])
+    halves = [group[: max(1, len(group) // 2)] for group in (order[inside], order[~inside])]
+    take = min(len(halves[0]), max(style.MAX_DRAWN_BALLS // 2, style.MAX_DRAWN_BALLS - len(halves[1])))
+    return np.concatenate([even(halves[0], take), even(halves[1], style.MAX_DRAWN_BALLS - take)])
 
 
 def _balls(view: RunView, stage: TranslationStage, drawn: np.ndarray, found: bool) -> tuple[SceneItem, ...]:
     inside = np.zeros(len(stage.radii_m), dtype=bool)
     if found:
         inside[stage.clique] = True
-    items: list[SceneItem] = [_edges(stage, inside)]
+    items: list[SceneItem] = [_edges(stage, drawn, inside)]
     for name, members, color, opacity in (
         ("balls/others", ~inside, style.UNDECIDED, 0.10),
         ("balls/clique", inside, style.CLIQUE, 0.16),
@@ -97,17 +96,18 @@ def _balls(view: RunView, stage: TranslationStage, drawn: np.ndarray, found: boo
             items.append(Balls(name, "balls", stage.centres_m[chosen], stage.radii_m[chosen], colors, opacity))
         if len(centres):
             dots = one_color(color, len(centres))
-            items.append(Points(f"{name}-centres", "balls", centres, dots, 0.035 * view.sphere_m))
+            items.append(Points(f"{name}-centres", "balls", centres, dots, 0.02 * view.sphere_m))
     if view.truth is not None:
         truth = camera_centre(view.truth)[None]
-        items.append(Points("balls/truth", "balls", truth, one_color(style.TRUTH, 1), 0.09 * view.sphere_m))
+        items.append(Points("balls/truth", "balls", truth, one_color(style.TRUTH, 1), 0.05 * view.sphere_m))
     return tuple(items)
 
 
-def _edges(stage: TranslationStage, inside: np.ndarray) -> Segments:
-    """Overlaps between balls, up to the limit: the clique's first, and small balls, which come first, before large."""
-    within = np.logical_and(inside[stage.edges[:, 0]], inside[stage.edges[:, 1]])
-    order = np.lexsort([stage.edges[:, 1], ~within])[: style.MAX_DRAWN_EDGES]
-    colors = one_color(style.UNDECIDED, len(order))
-    colors[np.take(within, order)] = style.CLIQUE
-    return Segments("balls/edges", "balls", stage.centres_m[stage.edges[order]], colors, 1.0)
+def _edges(stage: TranslationStage, drawn: np.ndarray, inside: np.ndarray) -> Segments:
+    """Overlaps between the drawn balls."""
+    visible = np.zeros(len(stage.radii_m), dtype=bool)
+    visible[drawn] = True
+    edges = stage.edges[np.logical_and(visible[stage.edges[:, 0]], visible[stage.edges[:, 1]])]
+    colors = one_color(style.UNDECIDED, len(edges))
+    colors[np.logical_and(inside[edges[:, 0]], inside[edges[:, 1]])] = style.CLIQUE
+    return Segments("balls/edges", "balls", stage.centres_m[edges], colors, 1.5)

@@ -8,7 +8,7 @@ import numpy as np
 from spherloc.geometry import camera_centre, wrap_angle, yaw_of, yaw_rotation
 from spherloc.trace import YawStage
 from spherloc_viz import style
-from spherloc_viz.layers.frame import Frame, RunView, one_color
+from spherloc_viz.layers.frame import Frame, RunView, even, one_color
 from spherloc_viz.layers.primitives import Chart, Curve, FloatArray, SceneItem, Segments, Step
 
 INNER, OUTER, CURVE = 1.3, 1.95, 2.05
@@ -26,7 +26,7 @@ def frames(view: RunView, stage: YawStage) -> list[Frame]:
     drawn = _drawn(stage)
     note = stage.rule
     if len(drawn) < arcs:
-        note += f" The {len(drawn)} narrowest of {arcs:,} arcs are drawn, half of them from the clique."
+        note += f" An even sample of {len(drawn)} of {arcs:,} arcs is drawn, half of them from the clique."
     width = np.degrees(float(np.median(stage.hi_rad - stage.lo_rad)))
     yaw = np.degrees(stage.yaw_rad)
     interval = np.degrees(stage.best_rad[1] - stage.best_rad[0])
@@ -84,15 +84,15 @@ def _marker(label: str, x: float, height: float, color: style.RGB) -> Curve:
 
 
 def _drawn(stage: YawStage) -> np.ndarray:
-    """Indices of the arcs to draw: the narrowest, half of them from the clique where it has as many."""
-    width = stage.hi_rad - stage.lo_rad
-    inside = np.zeros(len(width), dtype=bool)
+    """Indices of the arcs to draw: an even sample of the clique's and of the others, ordered by their middles."""
+    middles = 0.5 * (stage.lo_rad + stage.hi_rad)
+    inside = np.zeros(len(middles), dtype=bool)
     inside[stage.clique] = True
-    order = np.argsort(width, kind="stable")
+    order = np.argsort(middles, kind="stable")
     members, others = order[inside[order]], order[~inside[order]]
     room = style.MAX_DRAWN_ARCS
     take = min(len(members), max(room // 2, room - len(others)))
-    return np.concatenate([members[:take], others[: room - take]])
+    return np.concatenate([even(members, take), even(others, room - take)])
 
 
 def _directions(yaw_rad: FloatArray) -> FloatArray:
