@@ -97,7 +97,11 @@ def _binned(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _look(chart: Chart) -> tuple:
-    return (chart.title, *((curve.label, curve.color, curve.kind) for curve in chart.curves))
+    return (
+        chart.title,
+        len(f"{_top(chart):,.0f}"),
+        *((curve.label, curve.color, curve.kind) for curve in chart.curves),
+    )
 
 
 def _series(chart: Chart) -> tuple[uplot.Series, ...]:
@@ -117,7 +121,7 @@ def _series(chart: Chart) -> tuple[uplot.Series, ...]:
 
 
 def _scales(chart: Chart) -> dict[str, uplot.Scale]:
-    top = max((float(np.max(curve.y)) for curve in chart.curves if len(curve.y)), default=1.0)
+    top = _top(chart)
     return {"x": uplot.Scale(time=False), "y": uplot.Scale(range=(0.0, 1.06 * top if top > 0 else 1.0))}
 
 
@@ -125,4 +129,10 @@ def _axes(chart: Chart) -> tuple[uplot.Axis, ...]:
     x = uplot.Axis(label=chart.x_label, labelSize=18, size=28, labelGap=0)
     if "°" in chart.x_label:
         x["splits"] = DEGREES
-    return x, uplot.Axis(label=chart.y_label, labelSize=18, size=44, labelGap=0)
+    # Room for the tick labels, which uPlot would cut off: a digit is about 7 px wide.
+    digits = len(f"{_top(chart):,.0f}")
+    return x, uplot.Axis(label=chart.y_label, labelSize=18, size=22 + 7 * max(3, digits), labelGap=0)
+
+
+def _top(chart: Chart) -> float:
+    return max((float(np.max(curve.y)) for curve in chart.curves if len(curve.y)), default=1.0)

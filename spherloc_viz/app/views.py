@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import viser
 
+from spherloc.geometry import yaw_rotation
 from spherloc_viz.layers.primitives import Balls, FloatArray, Mesh, Picture, Points, Segments
 
 FIELD_OF_VIEW_RAD = np.radians(45.0)
@@ -24,6 +25,8 @@ DIRECTIONS = {
     "Balls": (0.35, -0.45, -0.8),
 }
 """From the subject to the viewer; y points down."""
+TURNS_RAD = np.radians([0, 30, -30, 60, -60, 90, -90, 120, -120, 150, -150, 180])
+"""Turns of a view about the vertical, the least first."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,10 +57,22 @@ def fitting(picture: Picture) -> tuple[str, bool]:
 
 
 def find(name: str, picture: Picture, aspect: float) -> View:
-    """The view of that name, fitted to a picture and to a canvas of that width over height."""
+    """The view of that name, fitted to a picture and to a canvas of that width over height.
+
+    Close views are turned about the vertical until few map points stand in their way.
+    """
     subject = _subject(name, picture)
-    backward = np.array(DIRECTIONS[name])
-    backward /= np.linalg.norm(backward)
+    turns = TURNS_RAD if name in ("Sphere", "Balls") else TURNS_RAD[:1]
+    directions = [yaw_rotation(turn) @ np.array(DIRECTIONS[name]) for turn in turns]
+    views = [_fit(subject, direction, aspect) for direction in directions]
+    points = next(item for item in picture.scene if isinstance(item, Points) and item.name == "map/points")
+    hidden = [_in_the_way(view, points.positions) + 0.5 * k for k, view in enumerate(views)]
+    return views[int(np.argmin(hidden))]
+
+
+def _fit(subject: FloatArray, direction: FloatArray, aspect: float) -> View:
+    """The nearest place in that direction from which the canvas holds all of the subject (K, 3)."""
+    backward = direction / np.linalg.norm(direction)
     right = np.cross(UP, backward)
     right /= np.linalg.norm(right)
     sideways = np.column_stack([right, np.cross(backward, right)])
@@ -70,6 +85,17 @@ def find(name: str, picture: Picture, aspect: float) -> View:
         seen = across / np.maximum(distance - depth, 1e-3)[:, None]
         target = target + distance * sideways @ ((np.min(seen, axis=0) + np.max(seen, axis=0)) / 2)
     return View(target + distance * backward, target)
+
+
+def _in_the_way(view: View, positions: FloatArray) -> float:
+    """How much of a view the points (N, 3) before its target cover; one as far as the target counts 1."""
+    forward = view.target - view.position
+    distance = float(np.linalg.norm(forward))
+    offset = positions - view.position
+    depth = offset @ forward / distance
+    away = np.linalg.norm(offset, axis=1)
+    before = (depth > 0) & (depth < 0.9 * distance) & (depth > np.cos(FIELD_OF_VIEW_RAD / 2) * away)
+    return float(np.sum((distance / np.maximum(depth[before], 1e-3)) ** 2))
 
 
 def _subject(name: str, picture: Picture) -> FloatArray:

@@ -6,7 +6,7 @@ import pytest
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.errors import InputError
 from spherloc.estimators import estimate, options_type
-from spherloc.geometry import DOWN, camera_centre, yaw_of
+from spherloc.geometry import DOWN, camera_centre, yaw_of, yaw_rotation
 from spherloc.problem import Problem
 from spherloc.trace import RefinementStage, TranslationStage, YawStage
 
@@ -62,6 +62,25 @@ def test_stages_fit_together(scene_of):
         assert all((a, b) in edges for a in clique.tolist() for b in clique.tolist() if a < b)
         np.testing.assert_array_equal(translation.cam_from_map, refinement.cam_from_map[0])
         np.testing.assert_array_equal(trace.cam_from_map, refinement.cam_from_map[-1])
+
+
+@pytest.mark.parametrize("offset_rad", [-0.05, -1e-3, 0.0, 1e-3, 0.05])
+def test_yaw_at_the_seam_is_like_any_other(scene_of, offset_rad):
+    """Turning the map until the yaw is +-pi, where arcs wrap, must turn the picture and change nothing else."""
+    problem = scene_of("mei").problem(4)
+    here = run(problem)
+    turn = yaw_rotation(here.stage(YawStage).yaw_rad - np.pi + offset_rad)
+    points = problem.points @ turn.T
+    there = run(Problem("turned", problem.camera, problem.pixels, points, DOWN, DOWN))
+    np.testing.assert_array_equal(here.inlier_mask, there.inlier_mask)
+    one, other = here.stage(YawStage), there.stage(YawStage)
+    assert abs(np.sin((other.yaw_rad - np.pi + offset_rad) / 2)) < 1e-9
+    np.testing.assert_allclose(np.diff(one.best_rad), np.diff(other.best_rad), atol=1e-9)
+    assert {tuple(pair) for pair in one.pairs[one.clique]} == {tuple(pair) for pair in other.pairs[other.clique]}
+    balls, others = here.stage(TranslationStage), there.stage(TranslationStage)
+    np.testing.assert_array_equal(balls.pairs, others.pairs)
+    np.testing.assert_allclose(balls.radii_m, others.radii_m, rtol=1e-6)
+    np.testing.assert_allclose(balls.centres_m @ turn.T, others.centres_m, atol=1e-6)
 
 
 def test_inlier_pairs_hold_the_truth(scene_of):

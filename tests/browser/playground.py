@@ -1,0 +1,134 @@
+"""The playground as a user meets it: a real server, a real Chromium, and what is on the page."""
+
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from playwright.sync_api import Browser, Locator, Page, expect
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "microsoft-edge")
+FLAGS = (
+    "--no-sandbox",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--ignore-gpu-blocklist",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--no-first-run",
+)
+SIZE = {"width": 1200, "height": 700}
+PATIENCE_MS = 60_000
+
+
+def find_chromium() -> str:
+    """Path of a Chromium; skips the test without one, but fails where one is required."""
+    path = os.environ.get("SPHERLOC_CHROMIUM") or next(filter(None, map(shutil.which, BROWSERS)), None)
+    if path is None:
+        reason = "no Chromium found: install Debian's chromium or set SPHERLOC_CHROMIUM to the path of one"
+        if os.environ.get("CI"):
+            pytest.fail(reason)
+        pytest.skip(reason)
+    return path
+
+
+@contextmanager
+def served(*words: str | Path) -> Iterator[tuple[str, subprocess.Popen[str]]]:
+    """``spherloc play`` with these words on a free port: its address and process, ended with Ctrl-C."""
+    program = Path(sys.executable).with_name("spherloc")
+    server = subprocess.Popen(
+        [program, "play", *map(str, words), "--port", "0"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert server.stdout is not None
+    try:
+        line = server.stdout.readline()
+        match = re.fullmatch(r"spherloc playground: (http://127\.0\.0\.1:\d+)\n", line)
+        assert match, line or server.communicate(timeout=10)
+        yield match[1], server
+    finally:
+        server.send_signal(signal.SIGINT)
+        try:
+            server.communicate(timeout=20)
+        except subprocess.TimeoutExpired:
+            server.kill()
+            raise
+
+
+class Playground:
+    """One tab."""
+
+    def __init__(self, browser: Browser, address: str) -> None:
+        self.page: Page = browser.new_context(viewport=SIZE).new_page()  # pyright: ignore[reportArgumentType]
+        self.page.set_default_timeout(PATIENCE_MS)
+        self.errors: list[str] = []
+        self.hosts: set[str] = set()
+        self.page.on("console", lambda message: self.errors.append(message.text) if message.type == "error" else None)
+        self.page.on("pageerror", lambda error: self.errors.append(str(error)))
+        self.page.on("request", lambda request: self.hosts.add(request.url.split("/")[2]))
+        self.page.goto(address)
+        expect(self.value("outcome")).not_to_be_empty(timeout=PATIENCE_MS)
+
+    def close(self) -> None:
+        """Close the tab."""
+        self.page.context.close()
+
+    def value(self, name: str) -> Locator:
+        """The cell of the outcome table beside a name."""
+        return self.page.locator(f"//tr[td[1][normalize-space()='{name}']]/td[2]")
+
+    def widget(self, label: str) -> Locator:
+        """The element that a widget's label is for."""
+        name = self.page.locator("label", has_text=re.compile(rf"^{re.escape(label)}$"))
+        return self.page.locator(f"[id='{name.get_attribute('for')}']")
+
+    def thumb(self, label: str) -> Locator:
+        """The part of a slider that is dragged."""
+        return self.widget(label).get_by_role("slider")
+
+    def choose(self, label: str, option: str) -> None:
+        """Choose from a list."""
+        self.widget(label).click()
+        self.page.get_by_role("option", name=option, exact=True).click()
+
+    def press(self, button: str) -> None:
+        """Click a button."""
+        self.page.get_by_role("button", name=button, exact=True).click()
+
+    @property
+    def step(self) -> Locator:
+        """The list of steps, whose value names the step at hand."""
+        return self.widget("Step")
+
+    def node(self, name: str) -> dict[str, Any] | None:
+        """A node of the canvas: how many bytes each of its arrays has, and whether it is visible; None if absent."""
+        script = """name => {
+            const node = window.__viserSceneTree.getState()[name];
+            if (!node) return null;
+            const props = node.message.props, sizes = {};
+            for (const key in props) if (props[key] && props[key].byteLength) sizes[key] = props[key].byteLength;
+            return JSON.stringify({visible: node.effectiveVisibility, ...sizes});
+        }"""
+        found = self.page.evaluate(script, name)
+        return None if found is None else json.loads(found)
+
+    def instances(self, name: str) -> int:
+        """How many balls or dots a batched node shows; 0 if it is absent or hidden."""
+        node = self.node(name)
+        return 0 if node is None or not node["visible"] else node.get("batched_positions", 0) // 12
+
+    def until(self, condition: Callable[[], bool], what: str) -> None:
+        """Wait until something is so on the page."""
+        end = time.monotonic() + PATIENCE_MS / 1000
+        while not condition():
+            assert time.monotonic() < end, f"waited in vain until {what}"
+            self.page.wait_for_timeout(50)

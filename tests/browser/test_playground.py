@@ -1,0 +1,197 @@
+"""What a user does on the page, and what the page then says and shows."""
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from playground import Playground, served
+from playwright.sync_api import Browser, expect
+
+from spherloc.estimators import estimate
+from spherloc_viz.app.catalog import Catalog
+from spherloc_viz.layers import steps
+from spherloc_viz.recording.reader import read_recording
+
+pytestmark = [pytest.mark.browser, pytest.mark.timeout(280)]
+
+
+def test_page_shows_a_localization_and_talks_to_nobody_else(tab: Playground, address: str) -> None:
+    expect(tab.page).to_have_title("spherloc")
+    expect(tab.value("outcome")).to_have_text("success")
+    expect(tab.value("inliers")).to_have_text(re.compile(r"^(1[89]|2[0-2]) of 40$"))
+    expect(tab.page.get_by_text("maximum clique", exact=True)).to_be_visible()
+    assert tab.instances("/map/points") == 40 and tab.instances("/sphere/bearings") == 40
+    for name in ("/sphere/surface", "/rays", "/cameras/estimate", "/cameras/truth"):
+        tab.until(lambda name=name: bool((tab.node(name) or {}).get("visible")), f"{name} is shown")
+    assert tab.hosts == {address.removeprefix("http://")}
+    assert tab.errors == []
+
+
+def test_outlier_slider_changes_the_numbers(tab: Playground) -> None:
+    before = tab.value("inliers").inner_text()
+    assert before != "40 of 40"
+    tab.thumb("Outliers (%)").focus()
+    tab.page.keyboard.press("Home")
+    expect(tab.thumb("Outliers (%)")).to_have_attribute("aria-valuenow", "0")
+    expect(tab.value("inliers")).to_have_text(re.compile(r"^(39|40) of 40$"))
+    expect(tab.value("outcome")).to_have_text("success")
+    tab.page.keyboard.press("End")
+    expect(tab.value("inliers")).to_have_text(re.compile(r"^\d of 40$"))
+    expect(tab.value("outcome")).not_to_have_text("success")
+    assert tab.errors == []
+
+
+def test_dragging_ends_at_what_the_slider_shows(tab: Playground) -> None:
+    """Many changes in a row: none is lost, none queues up, and the page ends with the run of the last one."""
+    thumb = tab.thumb("Outliers (%)")
+    start, track = thumb.bounding_box(), tab.widget("Outliers (%)").bounding_box()
+    assert start is not None and track is not None
+    tab.page.mouse.move(start["x"] + start["width"] / 2, start["y"] + start["height"] / 2)
+    tab.page.mouse.down()
+    for share in (0.4, 0.3, 0.2, 0.1, 0.0):
+        tab.page.mouse.move(track["x"] + share * track["width"], start["y"], steps=4)
+    tab.page.mouse.up()
+    expect(thumb).to_have_attribute("aria-valuenow", "0")
+    expect(tab.value("inliers")).to_have_text(re.compile(r"^(39|40) of 40$"))
+
+
+def test_every_step_of_both_estimators(tab: Playground) -> None:
+    """Next walks from the matches to the outcome; the clique is found in the scene and nowhere else."""
+    for estimator in ("ransac-2p", "mc"):
+        tab.choose("Estimator", estimator)
+        expect(tab.value("estimator")).to_have_text(estimator)
+        titles = walk(tab)
+        assert titles[0] == "The matches" and titles[-1] == "Outcome"
+        assert ("The maximum clique of balls" in titles) == (estimator == "mc")
+        assert any(title.startswith("Sample ") for title in titles) == (estimator == "ransac-2p")
+    assert tab.errors == []
+
+
+def walk(tab: Playground) -> list[str]:
+    """Go to the first step and then Next to the last; returns the titles met."""
+    count = int(tab.step.input_value().split("/")[1].split()[0])
+    for _ in range(count - 1):
+        tab.press("Previous")
+    expect(tab.step).to_have_value(re.compile(rf"^1/{count} "))
+    titles = [look(tab)]
+    for number in range(2, count + 1):
+        tab.press("Next")
+        expect(tab.step).to_have_value(re.compile(rf"^{number}/{count} "))
+        titles.append(look(tab))
+    return titles
+
+
+def look(tab: Playground) -> str:
+    """Title of the step at hand, once its heading and the canvas agree with it."""
+    title = tab.step.input_value().split(maxsplit=1)[1]
+    expect(tab.page.locator("div").get_by_text(title, exact=True).first).to_be_visible()
+    clique = title == "The maximum clique of balls"
+    tab.until(lambda: (tab.instances("/balls/clique") > 2) == clique, f"clique drawn is {clique} at '{title}'")
+    ring = title in ("Yaw arcs of all pairs", "The yaw most arcs share")
+    tab.until(lambda: bool((tab.node("/ring/arcs") or {}).get("visible")) == ring, f"ring drawn is {ring} at '{title}'")
+    return title
+
+
+def test_captions_are_those_of_the_run(tab: Playground, tmp_path: Path) -> None:
+    """What the page says is what the core computes for the same scene and seed."""
+    from conftest import SCENE
+
+    (tmp_path / "small.toml").write_text(SCENE)
+    catalog = Catalog(tmp_path / "small.toml")
+    trace = estimate(catalog.scenes["small street"].problem(), "mc", seed=3)
+    for step in reversed(steps(trace)[:-1]):
+        tab.press("Previous")
+        expect(tab.page.get_by_text(step.caption, exact=True)).to_be_visible()
+
+
+def test_options_of_the_estimator_change_the_run(tab: Playground) -> None:
+    tab.choose("Estimator", "ransac-2p")
+    expect(tab.value("estimator")).to_have_text("ransac-2p")
+    tab.widget("Iterations").fill("1")
+    tab.widget("Iterations").press("Enter")
+    expect(tab.page.get_by_text(re.compile(r"(no pose|failure|success)")).first).to_be_visible()
+    tab.until(lambda: tab.step.input_value().split("/")[1].startswith(("4 ", "5 ", "3 ")), "one sample makes few steps")
+
+
+def test_scene_and_camera_can_be_changed(tab: Playground) -> None:
+    tab.choose("Scene", "MEI fisheye, 90 % outliers")
+    expect(tab.value("inliers")).to_have_text(re.compile(r" of 100$"))
+    expect(tab.thumb("Outliers (%)")).to_have_attribute("aria-valuenow", "90")
+    tab.choose("Camera", "kannala brandt, 512 × 512")
+    tab.press("Previous")
+    tab.until(lambda: "/" in tab.step.input_value(), "steps are listed")
+    while not tab.step.input_value().startswith("2/"):
+        tab.press("Previous")
+        tab.page.wait_for_timeout(200)
+    expect(tab.page.get_by_text(re.compile("The kannala brandt camera turns each of its"))).to_be_visible()
+
+
+def test_tabs_have_their_own_state(open_tab: Callable[[], Playground]) -> None:
+    first, second = open_tab(), open_tab()
+    untouched = second.value("inliers").inner_text(), second.value("rotation error").inner_text()
+    first.choose("Estimator", "ransac-2p")
+    first.thumb("Outliers (%)").focus()
+    first.page.keyboard.press("Home")
+    expect(first.value("inliers")).to_have_text(re.compile(r"^(39|40) of 40$"))
+    second.press("Previous")
+    expect(second.step).to_have_value(re.compile("Refinement"))
+    assert first.step.input_value().endswith("Outcome")
+    assert (second.value("inliers").inner_text(), second.value("rotation error").inner_text()) == untouched
+    expect(second.value("estimator")).to_have_text("mc")
+
+
+def test_a_wrong_seed_is_a_sentence_and_the_page_stays_usable(tab: Playground) -> None:
+    seed = tab.widget("Seed")
+    seed.fill("-7")
+    seed.press("Enter")
+    expect(tab.page.get_by_text(re.compile("seed '-7' is no whole number")).first).to_be_visible()
+    expect(tab.value("outcome")).to_have_text("success")
+    before = tab.value("rotation error").inner_text()
+    seed.fill("8")
+    seed.press("Enter")
+    expect(tab.value("rotation error")).not_to_have_text(before)
+    expect(tab.page.get_by_text(re.compile("seed '-7' is no whole number"))).to_have_count(0)
+
+
+def test_layers_switch_off(tab: Playground) -> None:
+    assert tab.instances("/map/points") == 40
+    tab.page.get_by_text("Layers", exact=True).click()
+    tab.widget("Map").uncheck()
+    tab.until(lambda: tab.instances("/map/points") == 0, "the map is hidden")
+    assert tab.instances("/sphere/bearings") == 40
+    tab.widget("Map").check()
+    tab.until(lambda: tab.instances("/map/points") == 40, "the map is back")
+
+
+def test_a_settled_run_is_recorded(tab: Playground, recordings: Path) -> None:
+    seed = tab.widget("Seed")
+    seed.fill("4711")
+    seed.press("Enter")
+    said = tab.page.get_by_text(re.compile(r"Recorded as \S+_4711_\S+\.rrd"))
+    expect(said).to_be_visible()
+    path = recordings / said.inner_text().split()[-1]
+    tab.until(path.is_file, "the recording is written")
+    run = read_recording(path)
+    assert run.properties["scene"] == "small street" or "small" in str(run.properties["scene"])
+    inliers = tab.value("inliers").inner_text()
+    assert inliers == f"{int(run.inlier_mask.sum())} of {len(run.problem)}"
+
+
+def test_hotkeys_step(tab: Playground) -> None:
+    tab.page.locator("canvas").first.click(position={"x": 30, "y": 400}, force=True)
+    tab.page.keyboard.press("b")
+    expect(tab.step).to_have_value(re.compile("Refinement"))
+    tab.page.keyboard.press("n")
+    expect(tab.step).to_have_value(re.compile("Outcome"))
+
+
+def test_ctrl_c_ends_at_once_with_a_tab_open(browser: Browser, tmp_path: Path) -> None:
+    from conftest import SCENE
+
+    (tmp_path / "small.toml").write_text(SCENE)
+    with served(tmp_path / "small.toml", "--no-record") as (address, server):
+        tab = Playground(browser, address)
+        expect(tab.page.get_by_text("Runs are not recorded.")).to_be_visible()
+    assert server.returncode in (0, 130)
+    tab.close()
