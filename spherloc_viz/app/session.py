@@ -57,7 +57,7 @@ class Session:
         self._solved: Wish | None = None
         self._trace: Trace | None = None
         self._recorded: Trace | None = None
-        self._viewed: tuple[str, str, bool] | None = None
+        self._viewed: tuple[str, str, str] | None = None
         self._complaint: tuple[str, viser.NotificationHandle] | None = None
         self._complaining = threading.Lock()
         self._full_width = client.camera.image_width
@@ -157,8 +157,8 @@ class Session:
     def _move_viewer(self, trace: Trace, picture: Picture) -> None:
         """Go where the person wants, or, if that is to follow the steps, where the step's subject reads best."""
         wanted = self._display.take_view()
-        name, ring = views.fitting(picture)
-        fitting = (trace.problem.name, name, ring)
+        name, subject = views.fitting(picture)
+        fitting = (trace.problem.name, name, subject)
         if wanted is None and (self._viewed is None or (self._display.follow and fitting != self._viewed)):
             wanted = name
         self._viewed = fitting

@@ -25,6 +25,14 @@ DIRECTIONS = {
     "Balls": (0.35, -0.45, -0.8),
 }
 """From the subject to the viewer; y points down."""
+SUBJECTS = (
+    ("Balls", "balls/clique"),
+    ("Balls", "balls/others"),
+    ("Sphere", "ring/arcs"),
+    ("Overview", "rays"),
+    ("Sphere", "sphere/surface"),
+)
+"""What a step is about: the first of these primitives that it draws, and the view that shows it."""
 TURNS_RAD = np.radians([0, 30, -30, 60, -60, 90, -90, 120, -120, 150, -150, 180])
 """Turns of a view about the vertical, the least first."""
 
@@ -47,13 +55,13 @@ def look(client: viser.ClientHandle, view: View) -> None:
         camera.look_at = view.target
 
 
-def fitting(picture: Picture) -> tuple[str, bool]:
-    """The name of the view that shows what this step is about, and whether it is about the yaw ring."""
-    layers = {item.layer for item in picture.scene if not isinstance(item, Segments) or len(item.points)}
-    ring = "yaw ring" in layers
-    if "balls" in layers:
-        return "Balls", ring
-    return "Overview" if "rays" in layers and not ring else "Sphere", ring
+def fitting(picture: Picture) -> tuple[str, str]:
+    """The name of the view that shows what this step is about, and the primitive that it is about."""
+    drawn = {item.name: item for item in picture.scene if not isinstance(item, Segments) or len(item.points)}
+    for name, subject in SUBJECTS:
+        if subject in drawn:
+            return name, subject
+    return "Overview", "map/points"
 
 
 def find(name: str, picture: Picture, aspect: float) -> View:
@@ -135,7 +143,7 @@ def _balls(balls: Balls) -> FloatArray:
     small = np.argsort(balls.radii_m)[: max(1, len(balls.radii_m) // 2)]
     away = np.linalg.norm(balls.centers - np.median(balls.centers[small], axis=0), axis=1)
     near = np.argsort(away)[: max(1, len(away) // 2)]
-    reach = 1.6 * balls.radii_m[near, None]
+    reach = 2.0 * balls.radii_m[near, None]
     return np.vstack([balls.centers[near] - reach, balls.centers[near] + reach])
 
 

@@ -42,7 +42,7 @@ def test_measured_scene_is_read(tmp_path):
 def test_what_is_optional(tmp_path):
     """No truth, no labels, no options; columns in any order with spaces, others ignored; Windows line ends and BOM."""
     scene = MEASURED[: MEASURED.index("[truth]")].replace("[camera]", 'about = "where it is from"\n[camera]', 1)
-    matches = "\ufeffquality, Z ,Y,X,v, u\r\n9,3,2,1,20.5,10.5\r\n\r\nbad,6,5,4,30,40\r\n"
+    matches = "\ufeffZ, quality ,Y,X,v, u\r\n3,9,2,1,20.5,10.5\r\n\r\n6,bad,5,4,30,40\r\n"
     problem = load_scene(write_measured(tmp_path, scene, matches)).problem()
     np.testing.assert_array_equal(problem.pixels, [[10.5, 20.5], [40.0, 30.0]])
     np.testing.assert_array_equal(problem.points, [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])

@@ -1,13 +1,18 @@
 """MC (Algorithm 2): deterministic, honest about what it left out, and with a sentence where there is no pose."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from spherloc.cameras.equirectangular import Equirectangular
+from spherloc.consensus.translation_balls import translation_balls
 from spherloc.errors import InputError
 from spherloc.estimators import estimate, options_type
+from spherloc.estimators.base import bounds_of
 from spherloc.geometry import DOWN, camera_centre, yaw_of, yaw_rotation
 from spherloc.problem import Problem
+from spherloc.solvers.two_point import two_point
 from spherloc.trace import RefinementStage, TranslationStage, YawStage
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
@@ -62,6 +67,50 @@ def test_stages_fit_together(scene_of):
         assert all((a, b) in edges for a in clique.tolist() for b in clique.tolist() if a < b)
         np.testing.assert_array_equal(translation.cam_from_map, refinement.cam_from_map[0])
         np.testing.assert_array_equal(trace.cam_from_map, refinement.cam_from_map[-1])
+
+
+def test_balls_are_those_of_the_arcs(scene_of):
+    """Each ball's slack is the distance from the estimated yaw to the farther end of its pair's arc."""
+    problem = scene_of("fisheye").problem(2)
+    trace = run(problem)
+    yaw, translation = trace.stage(YawStage), trace.stage(TranslationStage)
+    farther = {}
+    for arc in yaw.clique:
+        at = yaw.yaw_rad + (0.0 if yaw.lo_rad[arc] <= yaw.yaw_rad else 2 * np.pi)
+        farther[tuple(yaw.pairs[arc])] = max(at - yaw.lo_rad[arc], yaw.hi_rad[arc] - at)
+    slack = np.array([farther[tuple(pair)] for pair in translation.pairs])
+    bounds = bounds_of(problem.aligned, 3.0, 0.0)
+    centres, radii = translation_balls(problem.aligned, bounds.radians, translation.pairs, yaw.yaw_rad, slack)
+    np.testing.assert_allclose(translation.centres_m, centres, atol=1e-12)
+    np.testing.assert_allclose(translation.radii_m, radii, rtol=1e-12)
+
+
+def test_pairs_name_places_in_the_problem(scene_of):
+    """With unusable pixels in between, indices among the usable ones would be off."""
+    problem = scene_of("fisheye", outlier_rate=0.2).problem()
+    pixels = problem.pixels.copy()
+    pixels[::3] = -1000.0
+    problem = replace(problem, pixels=pixels)
+    trace = run(problem)
+    yaw, translation = trace.stage(YawStage), trace.stage(TranslationStage)
+    for pairs in (yaw.pairs, yaw.pairs[yaw.clique], translation.pairs, translation.pairs[translation.clique]):
+        assert len(pairs) and problem.usable[pairs].all()
+    assert not trace.inlier_mask[::3].any() and trace.inlier_mask.sum() > 40
+
+
+def test_start_where_no_pair_has_a_root():
+    """Near a double root noise leaves no exact solution: the yaw and the ball of the arc are the start."""
+    camera = Equirectangular(2048, 1024)
+    points = np.array([[0.3, 1.0, 1.0], [0.3, 2.01, 2.0]])
+    pixels = camera.project(np.array([[0.3, 1.0, 1.0], [0.3, 2.0, 2.0]]))[0]
+    problem = Problem("tangent", camera, pixels, points, DOWN, DOWN)
+    assert not two_point(problem.bearings[None], problem.points[None])[2].any()
+    trace = run(problem)
+    translation = trace.stage(TranslationStage)
+    start = translation.cam_from_map
+    np.testing.assert_allclose(start[:, :3], yaw_rotation(trace.stage(YawStage).yaw_rad), atol=1e-12)
+    np.testing.assert_allclose(camera_centre(start), translation.centres_m[0], atol=1e-12)
+    assert trace.inlier_mask.all()
 
 
 @pytest.mark.parametrize("offset_rad", [-0.05, -1e-3, 0.0, 1e-3, 0.05])
