@@ -1,6 +1,5 @@
 """What all tests share: reproducible randomness, the bundled scenes with changes, and real data where it is present."""
 
-import hashlib
 import os
 import zlib
 from collections.abc import Callable
@@ -12,16 +11,10 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
+from spherloc.datasets import load_scene
+from spherloc.datasets.synthetic import SyntheticScene
+
 ROOT = Path(__file__).resolve().parents[1]
-
-# numba's cache of a kernel does not notice that a function which it calls from another file has changed: the tests would
-# go on with the old machine code. A cache for each state of the sources does notice; it must be chosen before any import.
-SOURCES = b"".join(path.read_bytes() for path in sorted((ROOT / "spherloc").rglob("*.py")))
-os.environ["NUMBA_CACHE_DIR"] = str(ROOT / ".pytest_cache" / f"numba-{hashlib.sha256(SOURCES).hexdigest()[:16]}")
-
-from spherloc.datasets import load_scene  # noqa: E402
-from spherloc.datasets.synthetic import SyntheticScene  # noqa: E402
-
 SUITE_SEED = int(os.environ.get("SPHERLOC_TEST_SEED", "0"))
 
 settings.register_profile("spherloc", derandomize=True, deadline=None, database=None)

@@ -33,15 +33,16 @@ def open_socket(host: str, port: int) -> socket.socket:
 
     Raises ``InputError`` if the address cannot be had.
     """
+    if not 0 <= port < 2**16:
+        raise InputError(f"port {port} does not exist; give --port a number up to 65535, or 0 for any free one.")
     where = f"{host}:{port}"
     try:
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         return socket.create_server(address[:2], family=family)
     except socket.gaierror:
         raise InputError(f"'{host}' is no address of this machine; use --host 127.0.0.1.") from None
-    except (OSError, OverflowError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
-        raise InputError(f"cannot listen on {where} ({reason}); choose another port with --port.") from None
+    except OSError as error:
+        raise InputError(f"cannot listen on {where} ({error.strerror}); choose another port with --port.") from None
 
 
 def is_own_name(netloc: str, host: str) -> bool:

@@ -88,10 +88,9 @@ class Playground:
         return self.page.locator(f"//tr[td[1][normalize-space()='{name}']]/td[2]")
 
     def widget(self, label: str) -> Locator:
-        """The element that a widget's label is for; the box beside it where viser gives that no id."""
+        """The element that a widget's label is for."""
         name = self.page.locator("label", has_text=re.compile(rf"^{re.escape(label)}$"))
-        found = self.page.locator(f"[id='{name.get_attribute('for')}']")
-        return found if found.count() else name.locator("xpath=ancestor::*[contains(@class, 'Flex-root')][1]//input")
+        return self.page.locator(f"[id='{name.get_attribute('for')}']")
 
     def entry(self, label: str) -> Locator:
         """The box that is typed into."""

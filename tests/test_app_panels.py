@@ -1,0 +1,247 @@
+"""The parts of the page that need no browser: colours, plots, text, steps, scenes, options, views, threads."""
+
+import dataclasses
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from spherloc import registry
+from spherloc.datasets import bundled_scenes, load_scene
+from spherloc.datasets.synthetic import SyntheticScene
+from spherloc.errors import InputError
+from spherloc.estimators import estimate, options_type
+from spherloc_viz import style
+from spherloc_viz.app import views
+from spherloc_viz.app.catalog import OWN_CAMERA, Catalog, SceneWish
+from spherloc_viz.app.charts import MOST_STEPS, aligned_data
+from spherloc_viz.app.colors import light_bytes, surface_bytes
+from spherloc_viz.app.estimator_controls import field_docs
+from spherloc_viz.app.newest import Newest
+from spherloc_viz.app.steps_panel import find_step
+from spherloc_viz.app.text import status_html, step_html, table_html
+from spherloc_viz.layers import paint, steps
+from spherloc_viz.layers.primitives import Balls, Chart, Curve, Points, Step, Table
+
+COLORS = np.array([color for color, _ in style.LEGEND] + [style.SPHERE], np.uint8)
+
+
+def on_screen(light: np.ndarray) -> np.ndarray:
+    """What three.js shows for linear light: ACESFilmicToneMapping as in its shader, then sRGB, as bytes."""
+    into = np.array([[0.59719, 0.35458, 0.04823], [0.07600, 0.90834, 0.01566], [0.02840, 0.13383, 0.83777]])
+    out = np.array([[1.60475, -0.53108, -0.07367], [-0.10208, 1.10813, -0.00605], [-0.00327, -0.07276, 1.07602]])
+    v = light / 0.6 @ into.T
+    v = (v * (v + 0.0245786) - 0.000090537) / (v * (0.983729 * v + 0.4329510) + 0.238081)
+    linear = np.clip(v @ out.T, 0, 1)
+    return 255 * np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+
+
+def test_colours_arrive_as_the_legend_shows_them() -> None:
+    shown = on_screen(light_bytes(COLORS) / 255.0)
+    # The filmic curve cannot show pure hues: the yellow of the clique keeps a little blue.
+    assert np.abs(shown - COLORS).max() <= 18
+    assert np.abs(shown - COLORS).mean() <= 2
+    assert np.abs(on_screen(COLORS / 255.0) - COLORS).mean() > 30, "sent as they are they would be far off"
+
+
+def test_surface_colours_are_encoded_once_more() -> None:
+    srgb = surface_bytes(COLORS) / 255.0
+    light = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    assert np.abs(255 * light - light_bytes(COLORS)).max() <= 1.5
+
+
+def chart(*curves: Curve) -> Chart:
+    return Chart("any", "Any", "x", "y", curves)
+
+
+def test_plot_data_share_one_ascending_x() -> None:
+    count = 1440
+    steps_curve = Curve("counts", np.linspace(-180, 179.75, count), np.arange(count, dtype=np.float64) % 97.0, style.UNDECIDED, "step")
+    truth = Curve("truth", np.array([12.3]), np.array([96.0]), style.TRUTH, "marker")
+    found = Curve("estimate", np.array([12.3]), np.array([96.0]), style.ESTIMATE, "marker")
+    x, y, *markers = aligned_data(chart(steps_curve, truth, found))
+    assert len(x) <= 2 * MOST_STEPS + 4 and np.all(np.diff(x) >= 0)
+    assert np.isfinite(y).all() and y.max() == 96.0
+    for marker in markers:
+        known = np.isfinite(marker)
+        assert np.array_equal(x[known], [12.3, 12.3]) and np.array_equal(marker[known], [0.0, 96.0])
+
+
+def test_few_steps_keep_every_corner() -> None:
+    x, y = aligned_data(chart(Curve("best", np.array([1.0, 4.0, 9.0]), np.array([2.0, 5.0, 5.0]), (0, 0, 0), "step")))
+    assert np.array_equal(x, [1, 4, 4, 9, 9]) and np.array_equal(y, [2, 2, 5, 5, 5])
+
+
+def test_a_peak_survives_thinning() -> None:
+    y = np.ones(5000)
+    y[1234] = 77.0
+    _, shown = aligned_data(chart(Curve("counts", np.arange(5000.0), y, (0, 0, 0), "step")))
+    assert shown.max() == 77.0
+
+
+EVIL = '<img src=x onerror="alert(1)">&\'"'
+
+
+def test_every_text_is_escaped() -> None:
+    pieces = [
+        step_html(Step("key", EVIL, EVIL, EVIL, EVIL)),
+        table_html(Table("any", ("", ""), ((EVIL, EVIL), ("number", 3.0)))),
+        status_html(EVIL, wrong=True),
+    ]
+    for html in pieces:
+        assert "<img" not in html and "&lt;img src=x onerror=&quot;alert(1)&quot;&gt;&amp;" in html
+
+
+@pytest.mark.parametrize(
+    "key, found",
+    [
+        ("yaw-arcs", "outcome"),
+        ("sample-2", "sample-2"),
+        ("sample-9", "sample-3"),
+        ("bearings", "bearings"),
+        ("", "outcome"),
+    ],
+)
+def test_a_step_is_kept_over_runs_where_it_can(key: str, found: str) -> None:
+    keys = ["problem", "bearings", "sample-1", "sample-2", "sample-3", "outcome"]
+    timeline = [Step(name, name, "", "") for name in keys]
+    assert keys[find_step(timeline, key)] == found
+
+
+def wish_of(catalog: Catalog, label: str) -> SceneWish:
+    scene = catalog.synthetic(label)
+    assert scene is not None
+    return SceneWish(label, scene.seed, OWN_CAMERA, scene.correspondences, scene.noise_px, scene.outlier_rate)
+
+
+def test_untouched_controls_give_the_scene_itself() -> None:
+    catalog = Catalog(None)
+    for label, path in zip(catalog.scenes, bundled_scenes().values(), strict=True):
+        expected, given = load_scene(path).problem(), catalog.problem(wish_of(catalog, label))
+        assert np.array_equal(expected.pixels, given.pixels) and np.array_equal(expected.points, given.points)
+
+
+def test_another_camera_sees_the_same_simulation() -> None:
+    catalog = Catalog(None)
+    label = next(iter(catalog.scenes))
+    assert len(catalog.cameras) == 3
+    for name, camera in catalog.cameras.items():
+        problem = catalog.problem(dataclasses.replace(wish_of(catalog, label), camera=name))
+        assert problem.camera is camera and len(problem) == 100
+
+
+def test_the_given_scene_comes_first_and_once(tmp_path: Path) -> None:
+    bundled = list(bundled_scenes().values())
+    copy = tmp_path / "mine.toml"
+    copy.write_text(bundled[0].read_text())
+    labels = list(Catalog(copy).scenes)
+    assert len(labels) == len(bundled) + 1 and labels[1] == f"{labels[0]} ({bundled[0].name})"
+    assert len(Catalog(bundled[2]).scenes) == len(bundled)
+    with pytest.raises(InputError):
+        Catalog(tmp_path / "missing.toml")
+
+
+@pytest.mark.parametrize("estimator", registry.names("estimators"))
+def test_every_option_has_its_hint(estimator: str) -> None:
+    kind = options_type(estimator)
+    docs = field_docs(kind)
+    assert set(docs) == {field.name for field in dataclasses.fields(kind)}
+    assert all(text.endswith(".") for text in docs.values())
+
+
+@pytest.mark.parametrize("estimator", ["mc", "ransac-2p"])
+@pytest.mark.parametrize("aspect", [0.6, 1.0, 2.2])
+def test_views_hold_what_they_are_about(scene_of: Callable[..., SyntheticScene], estimator: str, aspect: float) -> None:
+    trace = estimate(scene_of("panorama", correspondences=60).problem(), estimator)
+    for index in range(len(steps(trace))):
+        picture = paint(trace, index)
+        name, subject = views.fitting(picture)
+        assert name in views.DIRECTIONS and any(item.name == subject for item in picture.scene)
+        for button in views.DIRECTIONS:
+            view = views.find(button, picture, aspect)
+            assert np.isfinite(view.position).all() and np.linalg.norm(view.position - view.target) > 0
+        items = {item.name: item for item in picture.scene}
+        points, surface = items["map/points"], items["sphere/surface"]
+        assert isinstance(points, Points)
+        for button, held in (("Overview", points.positions), ("Sphere", surface.vertices)):  # type: ignore[union-attr]
+            across = projected(views.find(button, picture, aspect), held)
+            limit = np.tan(views.FIELD_OF_VIEW_RAD / 2) * np.array([aspect, 1.0])
+            share = np.mean(np.all(np.abs(across) <= limit, axis=1))
+            assert share >= (0.9 if button == "Overview" else 1.0)
+
+
+def projected(view: views.View, positions: np.ndarray) -> np.ndarray:
+    """Right and up over depth (N, 2) of points as seen from a view."""
+    forward = (view.target - view.position) / np.linalg.norm(view.target - view.position)
+    right = np.cross(forward, views.UP)
+    right /= np.linalg.norm(right)
+    offset = positions - view.position
+    return offset @ np.column_stack([right, np.cross(right, forward)]) / (offset @ forward)[:, None]
+
+
+def test_the_view_of_the_clique_shows_its_balls(scene_of: Callable[..., SyntheticScene]) -> None:
+    trace = estimate(scene_of("fisheye").problem(), "mc")
+    index = [step.key for step in steps(trace)].index("clique")
+    picture = paint(trace, index)
+    assert views.fitting(picture) == ("Balls", "balls/clique")
+    balls = next(item for item in picture.scene if item.name == "balls/clique")
+    assert isinstance(balls, Balls)
+    across = projected(views.find("Balls", picture, 1.0), balls.centers)
+    assert np.mean(np.all(np.abs(across) <= np.tan(views.FIELD_OF_VIEW_RAD / 2), axis=1)) >= 0.5
+
+
+def until(condition: Callable[[], bool]) -> None:
+    end = time.monotonic() + 60
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.005)
+
+
+def test_requests_never_queue() -> None:
+    """However often it is asked while it works, the job runs once more, and it runs for the newest state."""
+    state, seen = [0], []
+    gate, inside = threading.Event(), threading.Event()
+
+    def job(asked: bool) -> None:
+        seen.append(state[0])
+        inside.set()
+        gate.wait(60)
+
+    worker = Newest("test", job)
+    worker.start()
+    worker.ask()
+    assert inside.wait(60)
+    for number in range(1, 50):
+        state[0] = number
+        worker.ask()
+    gate.set()
+    until(lambda: len(seen) == 2)
+    worker.close()
+    worker.join(60)
+    assert seen == [0, 49]
+
+
+def test_an_alarm_rings_once_and_a_request_puts_it_off() -> None:
+    calls: list[bool] = []
+    worker = Newest("test", lambda asked: calls.append(asked) or (0.01 if asked else None))
+    worker.start()
+    worker.ask()
+    until(lambda: calls == [True, False])
+    worker.ask()
+    until(lambda: calls == [True, False, True, False])
+    worker.close()
+    worker.join(60)
+
+
+def test_close_ends_a_waiting_thread() -> None:
+    before = threading.active_count()
+    workers = [Newest("test", lambda asked: 1000.0) for _ in range(3)]
+    for worker in workers:
+        worker.start()
+        worker.ask()
+        worker.close()
+        worker.join(60)
+    assert threading.active_count() == before
