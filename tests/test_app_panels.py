@@ -59,7 +59,9 @@ def chart(*curves: Curve) -> Chart:
 
 def test_plot_data_share_one_ascending_x() -> None:
     count = 1440
-    steps_curve = Curve("counts", np.linspace(-180, 179.75, count), np.arange(count, dtype=np.float64) % 97.0, style.UNDECIDED, "step")
+    steps_curve = Curve(
+        "counts", np.linspace(-180, 179.75, count), np.arange(count, dtype=np.float64) % 97.0, style.UNDECIDED, "step"
+    )
     truth = Curve("truth", np.array([12.3]), np.array([96.0]), style.TRUTH, "marker")
     found = Curve("estimate", np.array([12.3]), np.array([96.0]), style.ESTIMATE, "marker")
     x, y, *markers = aligned_data(chart(steps_curve, truth, found))

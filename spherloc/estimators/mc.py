@@ -115,7 +115,11 @@ def _locate(
     kept = np.flatnonzero(np.isfinite(radii))
     if len(kept) == 0:
         return None, None
-    kept = kept[np.argsort(radii[kept], kind="stable")][: int(options.max_balls)]
+    most = min(int(options.max_balls), len(kept))
+    # Only the smallest need be sorted, of what may be millions.
+    limit = np.partition(radii[kept], most - 1)[most - 1]
+    kept = kept[radii[kept] <= limit]
+    kept = kept[np.argsort(radii[kept], kind="stable")][:most]
     centres, radii, pairs = centres[kept], radii[kept], pairs[arcs][kept]
     overlap = overlapping(centres, radii)
     clique = max_clique(overlap)

@@ -41,6 +41,6 @@ class DisplayControls:
         wanted, self._wanted = self._wanted, None
         return wanted
 
-    def _press(self, event: viser.GuiEvent) -> None:
+    async def _press(self, event: viser.GuiEvent) -> None:
         self._wanted = event.target.value
         self._changed(event)

@@ -7,7 +7,7 @@ from typing import Any
 
 import viser
 
-from spherloc.errors import RecordingError, SpherlocError
+from spherloc.errors import SpherlocError
 from spherloc.estimators import estimate
 from spherloc.trace import Trace
 from spherloc_viz.app import views
@@ -15,7 +15,7 @@ from spherloc_viz.app.catalog import Catalog, SceneWish
 from spherloc_viz.app.charts import ChartPanel
 from spherloc_viz.app.display_controls import DisplayControls
 from spherloc_viz.app.estimator_controls import EstimatorControls
-from spherloc_viz.app.newest import Newest
+from spherloc_viz.app.newest import Job, Newest
 from spherloc_viz.app.painter import Painter
 from spherloc_viz.app.scene_controls import SceneControls
 from spherloc_viz.app.steps_panel import StepsPanel
@@ -56,7 +56,7 @@ class Session:
         self._page = Newest(f"spherloc-page-{client.client_id}", self._guarded(self._show))
         self._solved: Wish | None = None
         self._trace: Trace | None = None
-        self._recorded: Trace | None = None
+        self._recorded: tuple[Trace, str] | None = None
         self._viewed: tuple[str, str, str] | None = None
         self._complaint: tuple[str, viser.NotificationHandle] | None = None
         self._complaining = threading.Lock()
@@ -130,12 +130,11 @@ class Session:
     def _settle(self) -> None:
         for widget in (*self._scene.widgets, *self._estimator.widgets, *self._display.widgets, *self._steps.widgets):
             put_back(widget)
-        trace = self._trace
-        if self._recorder is None or trace is None or trace is self._recorded:
+        if self._recorder is None or self._trace is None:
             return
-        path = self._recorder.submit(trace)
-        self._recorded = trace
-        self._status.content = status_html(f"Recorded as {path.name}")
+        if self._recorded is None or self._recorded[0] is not self._trace:
+            self._recorded = self._trace, self._recorder.submit(self._trace).name
+        self._status.content = status_html(f"Recorded as {self._recorded[1]}")
 
     def _show(self, asked: bool) -> float | None:
         """The page thread's job: show the step at hand of the newest run."""
@@ -190,12 +189,12 @@ class Session:
                 self._complaint[1].remove()
                 self._complaint = None
 
-    def _guarded(self, job):
+    def _guarded(self, job: Job) -> Job:
+        """The job with its errors turned into sentences on the page."""
+
         def run(asked: bool) -> float | None:
             try:
                 return job(asked)
-            except RecordingError as error:
-                self.complain(str(error))
             except SpherlocError as error:
                 self.complain(str(error))
             except Exception as error:

@@ -23,7 +23,7 @@ class StepsPanel:
         self._changed = changed
         self._lock = threading.Lock()
         self._moves = 0
-        self._picked = False
+        self._picked: str | None = None
         self._playing = False
         self._steps: tuple[Step, ...] = ()
         self._index = 0
@@ -32,7 +32,7 @@ class StepsPanel:
         self._buttons = gui.add_button_group("Keys B, N, P", (PREVIOUS, NEXT, PLAY))
         self._text = gui.add_html("")
         self._choice.on_update(self._pick)
-        self._buttons.on_click(lambda event: self._press(event.target.value))
+        self._buttons.on_click(self._click)
         for button, label, hotkey in HOTKEYS:
             command: Any = gui.add_command(label, hotkey=hotkey)  # type: ignore[arg-type]
             command.on_trigger(lambda event, button=button: self._press(button))
@@ -49,10 +49,10 @@ class StepsPanel:
             self._steps, self._index = steps, find_step(steps, key)
         with self._lock:
             moves, self._moves = self._moves, 0
-            picked, self._picked = self._picked, False
+            picked, self._picked = self._picked, None
             last = len(steps) - 1
-            if picked and self._choice.value in self._choice.options:
-                self._index = self._choice.options.index(self._choice.value)
+            if picked in self._choice.options:
+                self._index = self._choice.options.index(picked)
             if self._playing and not asked:
                 moves += 1
             self._index = min(max(0, min(self._index, last) + moves), last)
@@ -70,12 +70,18 @@ class StepsPanel:
         self._buttons.options = (PREVIOUS, NEXT, PAUSE if playing else PLAY)
         self._text.content = step_html(self._steps[self._index])
 
-    def _pick(self, event: viser.GuiEvent) -> None:
+    # viser runs a coroutine as soon as the message is there, a plain function later on some thread: by then the next
+    # click, or the next step that is shown, may have changed the widget's value.
+
+    async def _pick(self, event: viser.GuiEvent) -> None:
         # Showing a step sets the list too; only a choice made on the page counts.
         if event.client is not None:
             with self._lock:
-                self._picked, self._playing = True, False
+                self._picked, self._moves, self._playing = event.target.value, 0, False
             self._changed(event)
+
+    async def _click(self, event: viser.GuiEvent) -> None:
+        self._press(event.target.value)
 
     def _press(self, button: str) -> None:
         with self._lock:

@@ -3,6 +3,7 @@
 import contextlib
 import hmac
 import io
+import warnings
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -25,6 +26,8 @@ def start_viser(key: str) -> viser.ViserServer:
     with _demand(key), contextlib.redirect_stdout(io.StringIO()):
         server = viser.ViserServer(host="127.0.0.1", port=0, label="spherloc", verbose=False)
     _disable_sharing(server)
+    # A page that leaves while it is being drawn is no news for the terminal.
+    warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
     return server
 
 

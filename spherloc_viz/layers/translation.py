@@ -85,6 +85,7 @@ def _balls(view: RunView, stage: TranslationStage, drawn: np.ndarray, found: boo
     if found:
         inside[stage.clique] = True
     items: list[SceneItem] = [_edges(stage, drawn, inside)]
+    dot_m = min(0.02 * view.sphere_m, 0.1 * float(np.median(stage.radii_m[drawn])))
     for name, members, color, opacity in (
         ("balls/others", ~inside, style.UNDECIDED, 0.10),
         ("balls/clique", inside, style.CLIQUE, 0.16),
@@ -96,10 +97,10 @@ def _balls(view: RunView, stage: TranslationStage, drawn: np.ndarray, found: boo
             items.append(Balls(name, "balls", stage.centres_m[chosen], stage.radii_m[chosen], colors, opacity))
         if len(centres):
             dots = one_color(color, len(centres))
-            items.append(Points(f"{name}-centres", "balls", centres, dots, 0.02 * view.sphere_m))
+            items.append(Points(f"{name}-centres", "balls", centres, dots, dot_m))
     if view.truth is not None:
         truth = camera_centre(view.truth)[None]
-        items.append(Points("balls/truth", "balls", truth, one_color(style.TRUTH, 1), 0.05 * view.sphere_m))
+        items.append(Points("balls/truth", "balls", truth, one_color(style.TRUTH, 1), 2.0 * dot_m))
     return tuple(items)
 
 

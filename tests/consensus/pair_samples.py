@@ -44,7 +44,7 @@ def aligned_problem(bearings, points):
     return AlignedProblem(**(unused | given))
 
 
-def sample(rng, bound_rad, count=46):
+def sample(rng, bound_rad, count=46, yaw=None):
     """All-round bearings (some level, some clustered, some opposite), depths of 0.1 to 100 m, errors up to the bound.
 
     Half of the errors lie exactly on the bound: in a random direction, towards or away from another bearing, or across.
@@ -56,7 +56,8 @@ def sample(rng, bound_rad, count=46):
     third = count // 3
     bearings[-third:] = unit(bearings[:third] * rng.choice([-1, 1], (third, 1)) + 0.1 * rng.normal(size=(third, 3)))
     depths = 10 ** rng.uniform(-1, 2, count)
-    yaw, centre = rng.uniform(-np.pi, np.pi), rng.uniform(-5, 5, 3)
+    yaw = rng.uniform(-np.pi, np.pi) if yaw is None else yaw
+    centre = rng.uniform(-5, 5, 3)
     points = centre + (depths[:, None] * bearings) @ yaw_rotation(yaw)
     bounds = bound_rad * rng.uniform(0.2, 1.0, count)
 

@@ -89,8 +89,8 @@ def test_arcs_are_where_the_conditions_hold(rng, bound):
     """The closed form against a fine grid of yaws: wrong roots, lost arcs, bad wrapping and double cover show here."""
     grid = np.linspace(-np.pi, np.pi, 2001)
     arcs_a_pair, wraps = [], 0
-    for _ in range(3):
-        s = sample(rng, bound, 30)
+    for yaw in (None, None, np.pi):
+        s = sample(rng, bound, 30, yaw)
         pairs, lo, hi = yaw_arcs(s.aligned, s.bound_rad)
         assert (-np.pi <= lo).all() and (lo < np.pi).all() and (lo <= hi).all() and (hi <= lo + TWO_PI).all()
         every = s.pairs[~s.bounds_nothing(s.pairs)]
@@ -103,7 +103,7 @@ def test_arcs_are_where_the_conditions_hold(rng, bound):
             np.testing.assert_array_equal(times[clear], holds[clear] > 0, err_msg=f"pair {pair}")
             arcs_a_pair.append(int(mine.sum()))
         wraps += np.count_nonzero(hi > np.pi)
-    assert wraps > 0
+    assert wraps > 100
     assert {1, 2} <= set(arcs_a_pair)
 
 

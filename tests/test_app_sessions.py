@@ -1,0 +1,270 @@
+"""A session from connect to disconnect, driven by the messages that a page would send; no browser needed."""
+
+import asyncio
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import aiohttp
+import msgspec
+import numpy as np
+import pytest
+import viser
+
+from spherloc.errors import RecordingError
+from spherloc.estimators import estimate
+from spherloc.trace import Trace
+from spherloc_viz.app import session as session_module
+from spherloc_viz.app.catalog import Catalog
+from spherloc_viz.app.server import Sessions
+from spherloc_viz.app.session import Session
+from spherloc_viz.app.viser_seams import KEY_HEADER, start_viser, stop_viser
+
+KEY = "a key of this test"
+SCENE = """
+kind = "synthetic"
+name = "tiny"
+[camera]
+model = "equirectangular"
+width = 512
+height = 256
+[simulation]
+correspondences = 20
+outlier_rate = 0.25
+noise_px = 0.5
+seed = 1
+"""
+HELLO = {
+    "type": "ViewerCameraMessage",
+    "wxyz": (1.0, 0.0, 0.0, 0.0),
+    "position": (0.0, 0.0, -3.0),
+    "fov": 1.0,
+    "near": 0.01,
+    "far": 100.0,
+    "image_height": 720,
+    "image_width": 1280,
+    "look_at": (0.0, 0.0, 0.0),
+    "up_direction": (0.0, -1.0, 0.0),
+}
+
+
+class Notes:
+    """Stands in for the recorder: notes what it was given."""
+
+    def __init__(self) -> None:
+        self.traces: list[Trace] = []
+        self.full = False
+
+    def submit(self, trace: Trace) -> Path:
+        if self.full:
+            raise RecordingError("run.rrd: the disk is full; make room.")
+        self.traces.append(trace)
+        return Path(f"run-{len(self.traces)}.rrd")
+
+
+class Page:
+    """One connected page on a thread of its own, which reads and drops whatever it is sent."""
+
+    def __init__(self, port: int) -> None:
+        self._port = port
+        self._loop = asyncio.new_event_loop()
+        self._socket: aiohttp.ClientWebSocketResponse | None = None
+        self._thread = threading.Thread(target=self._loop.run_until_complete, args=(self._live(),), daemon=True)
+        self._thread.start()
+        until(lambda: self._socket is not None)
+        self.send(HELLO)
+
+    async def _live(self) -> None:
+        async with aiohttp.ClientSession() as client:
+            self._socket = await client.ws_connect(
+                f"http://127.0.0.1:{self._port}/",
+                headers={KEY_HEADER: KEY},
+                protocols=[f"viser-v{viser.__version__}"],
+                max_msg_size=0,
+            )
+            async for _ in self._socket:
+                pass
+
+    def send(self, message: dict[str, Any]) -> None:
+        assert self._socket is not None
+        sending = self._socket.send_bytes(msgspec.msgpack.encode(message))
+        asyncio.run_coroutine_threadsafe(sending, self._loop).result(60)
+
+    def set(self, widget: Any, value: Any) -> None:
+        """Change a widget, as the page tells it."""
+        self.send({"type": "GuiUpdateMessage", "uuid": widget._impl.uuid, "updates": {"value": value}})
+
+    def close(self) -> None:
+        if self._socket is not None and not self._socket.closed:
+            asyncio.run_coroutine_threadsafe(self._socket.close(), self._loop).result(60)
+        self._thread.join(60)
+
+
+def until(condition: Callable[[], bool]) -> None:
+    end = time.monotonic() + 60
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+def threads() -> int:
+    return sum(thread.name.startswith("spherloc-") for thread in threading.enumerate())
+
+
+class House:
+    """A server with its sessions and pages."""
+
+    def __init__(self, catalog: Catalog) -> None:
+        self.notes = Notes()
+        self.sessions = Sessions(catalog)
+        self.sessions.recorder = self.notes  # type: ignore[assignment]
+        self.server = start_viser(KEY)
+        self.sessions.attend(self.server)
+        self.pages: list[Page] = []
+
+    def visit(self) -> tuple[Page, Session]:
+        """A new page, once its first run is recorded."""
+        known, recorded = set(self.sessions._open), len(self.notes.traces)
+        self.pages.append(Page(self.server.get_port()))
+        until(lambda: len(self.notes.traces) > recorded)
+        (number,) = set(self.sessions._open) - known
+        return self.pages[-1], self.sessions._open[number]
+
+    def close(self) -> None:
+        for page in self.pages:
+            page.close()
+        self.sessions.close()
+        stop_viser(self.server)
+
+
+@pytest.fixture
+def house(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[House]:
+    monkeypatch.setattr(session_module, "QUIET_S", 0.3)
+    (tmp_path / "tiny.toml").write_text(SCENE)
+    opened = House(Catalog(tmp_path / "tiny.toml"))
+    yield opened
+    opened.close()
+
+
+def shown(session: Session) -> str:
+    """The step at hand, the outcome and the status, as HTML."""
+    return session._steps._text.content + session._outcome.content + session._status.content
+
+
+def test_only_the_run_that_is_settled_on_is_recorded(house: House) -> None:
+    page, session = house.visit()
+    slider = session._scene._outliers
+    for percent in range(60, -1, -1):
+        page.set(slider, float(percent))
+    until(lambda: len(house.notes.traces) == 2)
+    last = house.notes.traces[-1].problem
+    assert last.truth_inliers is not None and last.truth_inliers.all(), "the last value, and with no outliers"
+    until(lambda: "Recorded as run-2.rrd" in shown(session))
+    # There and back again within the pause: the run on the page is recorded already.
+    page.set(slider, 5.0)
+    page.set(slider, 0.0)
+    until(lambda: slider.value == 0.0 and "Recorded as run-" in shown(session))
+    assert np.array_equal(house.notes.traces[-1].problem.pixels, last.pixels)
+
+
+def test_steps_can_be_walked_while_a_run_is_solved(house: House, monkeypatch: pytest.MonkeyPatch) -> None:
+    page, session = house.visit()
+    entered, gate, solved = threading.Event(), threading.Event(), []
+
+    def slow(*words: Any) -> Trace:
+        entered.set()
+        assert gate.wait(60)
+        solved.append(words)
+        return estimate(*words)
+
+    monkeypatch.setattr(session_module, "estimate", slow)
+    page.set(session._scene._noise, 1.0)
+    assert entered.wait(60)
+    for noise in np.linspace(1.1, 3.0, 15):
+        page.set(session._scene._noise, float(noise))
+    page.set(session._steps._buttons, "Previous")
+    until(lambda: "Refinement" in shown(session))
+    assert not solved, "and it is still being solved"
+    gate.set()
+    until(lambda: len(house.notes.traces) == 2)
+    assert len(solved) == 2, "of fifteen changes meanwhile only the newest was run"
+    assert session._steps._choice.value.endswith("Refinement"), "the stage is kept"
+
+
+def test_stepping_solves_nothing(house: House, monkeypatch: pytest.MonkeyPatch) -> None:
+    page, session = house.visit()
+    monkeypatch.setattr(session_module, "estimate", lambda *_: pytest.fail("solved again"))
+    for button, title in (("Previous", "Refinement"), ("Next", "Outcome"), ("Next", "Outcome")):
+        page.set(session._steps._buttons, button)
+        until(lambda title=title: title in session._steps._choice.value)
+    page.set(session._steps._choice, session._steps._choice.options[0])
+    until(lambda: "The matches" in session._steps._text.content)
+    page.set(session._display._layers["map"], False)
+    until(lambda: not session._painter._drawn["map/points"][0].visible)
+    assert len(house.notes.traces) == 1
+
+
+def test_play_goes_to_the_end_and_stops(house: House, monkeypatch: pytest.MonkeyPatch) -> None:
+    from spherloc_viz.app import steps_panel
+
+    monkeypatch.setattr(steps_panel, "PLAY_S", 0.05)
+    page, session = house.visit()
+    page.set(session._steps._buttons, "Play")
+    until(lambda: session._steps._playing)
+    until(lambda: not session._steps._playing)
+    until(lambda: session._steps._choice.value.endswith("Outcome"))
+    until(lambda: "Play" in session._steps._buttons.options)
+
+
+@pytest.mark.parametrize("seed", ["", "x", "-1", "1.5", "9223372036854775808", "٣", "1" * 400])
+def test_a_wrong_seed_is_a_sentence_and_the_page_goes_on(house: House, seed: str) -> None:
+    page, session = house.visit()
+    before = session._trace
+    page.set(session._scene._seed, seed)
+    until(lambda: session._complaint is not None)
+    assert session._complaint is not None and session._complaint[0].endswith("type one.")
+    assert "no whole number" in shown(session) and session._trace is before
+    page.set(session._scene._seed, "7")
+    until(lambda: session._complaint is None and len(house.notes.traces) == 2)
+    assert house.notes.traces[-1].seed == 7
+
+
+def test_a_wrong_option_is_a_sentence(house: House) -> None:
+    page, session = house.visit()
+    page.set(session._estimator._estimator, "ransac-2p")
+    until(lambda: session._trace is not None and session._trace.estimator == "ransac-2p")
+    assert [name for name, folder in session._estimator._folders.items() if folder.visible] == ["ransac-2p"]
+    page.set(session._estimator._options["ransac-2p"]["iterations"], 10**9)
+    until(lambda: "give a whole number up to" in shown(session))
+
+
+def test_a_full_disk_and_a_bug_are_sentences(house: House, monkeypatch: pytest.MonkeyPatch) -> None:
+    page, session = house.visit()
+    house.notes.full = True
+    page.set(session._scene._seed, "5")
+    until(lambda: "the disk is full; make room." in shown(session))
+    house.notes.full = False
+    monkeypatch.setattr(session_module, "estimate", lambda *_: 1 / 0)
+    page.set(session._scene._seed, "6")
+    until(lambda: "a bug in the playground (ZeroDivisionError" in shown(session))
+    monkeypatch.undo()
+    page.set(session._scene._seed, "8")
+    until(lambda: session._complaint is None and session._trace is not None and session._trace.seed == 8)
+
+
+def test_pages_share_nothing_and_leave_nothing(house: House) -> None:
+    before = threads()
+    (first, one), (second, two) = house.visit(), house.visit()
+    assert threads() == before + 4
+    kept = two._trace
+    first.set(one._scene._points, 33)
+    until(lambda: one._trace is not None and len(one._trace.problem) == 33)
+    first.set(one._steps._buttons, "Previous")
+    until(lambda: one._steps._choice.value.endswith("Refinement"))
+    assert two._trace is kept and two._scene._points.value == 20 and two._steps._choice.value.endswith("Outcome")
+    first.close()
+    until(lambda: threads() == before + 2 and len(house.sessions._open) == 1)
+    second.close()
+    until(lambda: threads() == before and not house.sessions._open)
