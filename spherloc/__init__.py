@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+import sys
 from importlib.metadata import version
 from pathlib import Path
 
@@ -19,6 +20,8 @@ def _keep_kernels_fresh() -> None:
     home = package if os.access(package, os.W_OK) else Path.home() / ".cache" / "spherloc"
     folder = home / "__pycache__" / f"kernels-{hashlib.sha256(sources).hexdigest()[:16]}"
     os.environ.setdefault("NUMBA_CACHE_DIR", str(folder))
+    if "numba" in sys.modules:  # imported before us, it has read its settings already
+        sys.modules["numba"].config.CACHE_DIR = os.environ["NUMBA_CACHE_DIR"]
 
 
 _keep_kernels_fresh()

@@ -7,6 +7,7 @@ import re
 import socket
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
+from pathlib import Path
 from types import SimpleNamespace
 
 import aiohttp
@@ -20,6 +21,7 @@ from spherloc.errors import InputError
 from spherloc_viz.app import viser_seams
 from spherloc_viz.app.front_door import FrontDoor, is_own_name, open_socket, refusal
 from spherloc_viz.app.page import load_page
+from spherloc_viz.app.server import serve
 
 KEY = "a key of this test"
 VERSION = f"viser-v{viser.__version__}"
@@ -69,9 +71,13 @@ def test_let_in() -> None:
         assert refusal(both, "127.0.0.1", upgrade=True) is None
 
 
-def test_port_in_use_is_one_sentence() -> None:
-    with open_socket("127.0.0.1", 0) as taken, pytest.raises(InputError, match=r"choose another port with --port\.$"):
-        open_socket("127.0.0.1", taken.getsockname()[1])
+def test_port_in_use_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with open_socket("127.0.0.1", 0) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(InputError, match=rf"^cannot listen on 127.0.0.1:{port} \([\w ]+\); choose another port"):
+            serve(None, "127.0.0.1", port, tmp_path)
+    assert capsys.readouterr() == ("", ""), "said before anything else is begun"
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("host, port", [("no such name.invalid", 0), ("127.0.0.1", 70_000), ("203.0.113.9", 0)])

@@ -71,11 +71,9 @@ def test_it_serves_nothing_else_and_nobody_else(server: tuple[str, subprocess.Po
     foreign = get(f"{address}?url=http://example.org/x.rrd")
     assert foreign[0] == 200 and "example.org" not in foreign[2]["url"]
     port = int(address.rsplit(":", 1)[1].strip("/"))
-    others = [info[4][0] for info in socket.getaddrinfo(socket.gethostname(), port, socket.AF_INET, socket.SOCK_STREAM)]
-    for other in {str(host) for host in others} - {"127.0.0.1"}:
-        if not other.startswith("127."):
-            with pytest.raises(OSError):
-                socket.create_connection((other, port), timeout=5).close()
+    # A server that listens on all addresses would also answer on this machine's other loopback ones.
+    with pytest.raises(OSError):
+        socket.create_connection(("127.0.0.2", port), timeout=5).close()
 
 
 def test_ctrl_c_ends_it(path: Path) -> None:

@@ -15,6 +15,7 @@ delta: the ball contains the true position.
 import numba
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
 
 from spherloc.consensus.depth_bounds import pair_sinusoids
 from spherloc.problem import AlignedProblem
@@ -39,8 +40,7 @@ def translation_balls(
 
 def overlapping(centres: FloatArray, radii: FloatArray) -> BoolArray:
     """Eq. 38: symmetric matrix (M, M) of balls that overlap; false on the diagonal."""
-    distance = np.linalg.norm(centres[:, None, :] - centres[None, :, :], axis=2)
-    overlap = distance <= radii[:, None] + radii[None, :]
+    overlap = cdist(centres, centres) <= radii[:, None] + radii[None, :]
     np.fill_diagonal(overlap, False)
     return overlap
 

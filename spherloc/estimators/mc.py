@@ -44,8 +44,8 @@ class McOptions:
 
     def __post_init__(self) -> None:
         check_positive(self)
-        if self.max_balls != int(self.max_balls) or self.max_balls > 5000:
-            raise InputError(f"option max_balls is {self.max_balls}; give a whole number up to 5000.")
+        if self.max_balls != int(self.max_balls) or self.max_balls > 2000:
+            raise InputError(f"option max_balls is {self.max_balls}; give a whole number up to 2000.")
 
 
 class MaximumConsensus:

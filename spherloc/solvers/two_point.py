@@ -38,10 +38,13 @@ def depths(vi, vj, pi, pj, cosine, sine, sin2):
     """Depths (s_i, s_j) with R d = s_i v_i - s_j v_j in the least-squares sense; sin2 = |v_i x v_j|^2."""
     dx, dy, dz = pi[0] - pj[0], pi[1] - pj[1], pi[2] - pj[2]
     rx, rz = dx * cosine + dz * sine, dz * cosine - dx * sine
-    dot = vi[0] * vj[0] + vi[1] * vj[1] + vi[2] * vj[2]
-    along_i = vi[0] * rx + vi[1] * dy + vi[2] * rz
-    along_j = vj[0] * rx + vj[1] * dy + vj[2] * rz
-    return (along_i - dot * along_j) / sin2, (dot * along_i - along_j) / sin2
+    nx = vi[1] * vj[2] - vi[2] * vj[1]
+    ny = vi[2] * vj[0] - vi[0] * vj[2]
+    nz = vi[0] * vj[1] - vi[1] * vj[0]
+    # s_i = (v_i x v_j) . (R d x v_j) / sin2: no difference of nearly equal numbers for nearly parallel bearings.
+    si = nx * (dy * vj[2] - rz * vj[1]) + ny * (rz * vj[0] - rx * vj[2]) + nz * (rx * vj[1] - dy * vj[0])
+    sj = nx * (dy * vi[2] - rz * vi[1]) + ny * (rz * vi[0] - rx * vi[2]) + nz * (rx * vi[1] - dy * vi[0])
+    return si / sin2, sj / sin2
 
 
 @numba.njit(cache=True, nogil=True)
@@ -61,7 +64,7 @@ def solve_pair(vi, vj, pi, pj, yaws, translations):
         si, sj = depths(vi, vj, pi, pj, c, s, sin2)
         if si <= 0.0 or sj <= 0.0:
             continue
-        yaws[found] = yaw
+        yaws[found] = np.arctan2(s, c)
         # Eq. 27 at an exact root: both rays agree, and their mean halves the rounding error.
         translations[found, 0] = 0.5 * (si * vi[0] + sj * vj[0] - (pi[0] + pj[0]) * c - (pi[2] + pj[2]) * s)
         translations[found, 1] = 0.5 * (si * vi[1] + sj * vj[1] - pi[1] - pj[1])
@@ -80,8 +83,9 @@ def _solve_batch(bearings, points, yaws, translations, valid):
 def two_point(bearings: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Solve B pairs of correspondences between gravity-aligned frames (y down).
 
-    ``bearings`` (B, 2, 3) are unit vectors, ``points`` (B, 2, 3) metres. Returns yaws (B, 2), rad, translations
-    (B, 2, 3), metres, and which of the two roots exist (B, 2); p_cam = R_y(yaw) p_map + t. Missing roots are NaN.
+    ``bearings`` (B, 2, 3) are unit vectors, ``points`` (B, 2, 3) metres. Returns yaws (B, 2), rad in [-pi, pi],
+    translations (B, 2, 3), metres, and which of the two roots exist (B, 2); p_cam = R_y(yaw) p_map + t. Missing roots
+    are NaN.
 
     Raises ``ProblemError`` for other shapes.
     """

@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import ipaddress
+import os
 import re
 import socket
 from urllib.parse import urlsplit
@@ -42,7 +43,9 @@ def open_socket(host: str, port: int) -> socket.socket:
     except socket.gaierror:
         raise InputError(f"'{host}' is no address of this machine; use --host 127.0.0.1.") from None
     except OSError as error:
-        raise InputError(f"cannot listen on {where} ({error.strerror}); choose another port with --port.") from None
+        # Python adds its own words to the system's.
+        reason = os.strerror(error.errno) if error.errno else str(error)
+        raise InputError(f"cannot listen on {where} ({reason}); choose another port with --port.") from None
 
 
 def is_own_name(netloc: str, host: str) -> bool:

@@ -37,9 +37,9 @@ def address(tmp_path_factory: pytest.TempPathFactory, recordings: Path) -> Itera
         yield found
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
-    """A headless Chromium with WebGL in software."""
+    """A headless Chromium with WebGL in software. Not kept for the session: Playwright's event loop blocks others."""
     path = find_chromium()
     with sync_playwright() as playwright:
         chromium = playwright.chromium.launch(executable_path=path, headless=True, args=list(FLAGS))

@@ -137,7 +137,7 @@ def test_inlier_pairs_hold_the_truth(scene_of):
     of such arcs hold the true position."""
     for camera in ("mei", "fisheye", "panorama"):
         problem = scene_of(camera, noise_px=0.5, outlier_rate=0.7).problem(1)
-        trace = run(problem, bound_px=4.0, max_balls=5000)
+        trace = run(problem, bound_px=4.0, max_balls=2000)
         yaw, translation = trace.stage(YawStage), trace.stage(TranslationStage)
         true_yaw = yaw_of(problem.truth_cam_from_map[:, :3])
         inlier_pair = problem.truth_inliers[yaw.pairs].all(axis=1)
@@ -240,7 +240,7 @@ def test_only_outliers(scene_of):
         {"max_balls": 0},
         {"max_balls": -1},
         {"max_balls": 1.5},
-        {"max_balls": 5001},
+        {"max_balls": 2001},
         {"max_balls": None},
     ],
 )
