@@ -161,8 +161,8 @@ def test_inlier_pairs_hold_the_truth(scene_of):
 
 
 def test_thinning_says_what_it_did(scene_of):
-    problem = scene_of("mei", outlier_rate=0.3).problem()
-    every, few = (run(problem, max_balls=most).stage(TranslationStage) for most in (5000, 20))
+    problem = scene_of("mei", outlier_rate=0.5).problem()
+    every, few = (run(problem, max_balls=most).stage(TranslationStage) for most in (2000, 20))
     assert every.candidates == few.candidates == len(every.radii_m) > 500
     assert every.rule == f"All {every.candidates:,} pairs of the rotation clique."
     assert few.rule == f"The 20 smallest balls of the {few.candidates:,} pairs in the rotation clique."
