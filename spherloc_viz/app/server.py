@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import ipaddress
 import secrets
 import signal
 import socket
@@ -100,6 +101,8 @@ async def _serve_until_told(door: FrontDoor, listener: socket.socket) -> None:
             break
     runner = await door.start(listener)
     print(f"spherloc playground: {_address(listener)}", flush=True)
+    if not ipaddress.ip_address(listener.getsockname()[0]).is_loopback:
+        print("warning: whoever reaches this address can use the playground.", file=sys.stderr, flush=True)
     try:
         await stop.wait()
     finally:
