@@ -59,6 +59,7 @@ class Sessions:
         server.scene.world_axes.visible = False
         # A page that opens with another up would turn over after its first view is set.
         server.initial_camera.up = tuple(views.UP)
+        server.initial_camera.position = views.START
         server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         server.on_client_connect(lambda client: self._welcome(server, client))
         server.on_client_disconnect(lambda client: self._dismiss(client.client_id))

@@ -31,6 +31,9 @@ QUIET_S = 0.7
 PANELS_PX = ((1600, 460, 380), (0, 360, 340))
 """From this width of the window on: widths of the panels left and right of the canvas."""
 
+FIRST_CHECKS, CHECK_S = 8, 0.4
+"""A page that is still building itself drops its first view and reports that its viewer has not moved."""
+
 log = logging.getLogger(__name__)
 
 
@@ -58,6 +61,7 @@ class Session:
         self._trace: Trace | None = None
         self._recorded: tuple[Trace, str] | None = None
         self._viewed: tuple[str, str, str] | None = None
+        self._checks = FIRST_CHECKS
         self._complaint: tuple[str, viser.NotificationHandle] | None = None
         self._complaining = threading.Lock()
         self._full_width = client.camera.image_width
@@ -151,6 +155,9 @@ class Session:
             self._outcome.content = table_html(outcome_table(trace))
             self._move_viewer(trace, picture)
         self._client.flush()
+        if pause is None and self._checks > 0:
+            self._checks -= 1
+            return CHECK_S
         return pause
 
     def _move_viewer(self, trace: Trace, picture: Picture) -> None:
@@ -158,7 +165,7 @@ class Session:
         wanted = self._display.take_view()
         name, subject = views.fitting(picture)
         fitting = (trace.problem.name, name, subject)
-        if wanted is None and (self._viewed is None or (self._display.follow and fitting != self._viewed)):
+        if wanted is None and (views.is_unmoved(self._client) or (self._display.follow and fitting != self._viewed)):
             wanted = name
         self._viewed = fitting
         if wanted is not None:

@@ -10,6 +10,8 @@ from spherloc_viz.layers.primitives import Balls, FloatArray, Mesh, Picture, Poi
 
 FIELD_OF_VIEW_RAD = np.radians(45.0)
 UP = np.array([0.0, -1.0, 0.0])
+START = (3.0, -3.0, 3.0)
+"""Where a page's viewer stands until its first view is set."""
 MARGIN = 0.06
 """Share of the canvas that stays free on every side."""
 ROUNDS = 4
@@ -43,6 +45,11 @@ class View:
 
     position: FloatArray
     target: FloatArray
+
+
+def is_unmoved(client: viser.ClientHandle) -> bool:
+    """Whether the page says that its viewer still stands where it started."""
+    return bool(np.allclose(client.camera.position, START))
 
 
 def look(client: viser.ClientHandle, view: View) -> None:
