@@ -1,15 +1,17 @@
 """The painter changes what is on the canvas instead of drawing it anew, and hides what a picture does not show."""
 
-from contextlib import nullcontext
+from collections.abc import Iterator
+from dataclasses import dataclass
 from itertools import pairwise
-from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
+import viser
 
 from spherloc_viz import style
 from spherloc_viz.app.painter import MOST_BATCHED, SHELLS, Painter
+from spherloc_viz.app.viser_seams import start_viser, stop_viser
 from spherloc_viz.layers.frame import one_color
 from spherloc_viz.layers.primitives import Balls, Mesh, Points, Segments
 
@@ -17,36 +19,54 @@ ALL = frozenset(style.LAYERS)
 
 
 class Canvas:
-    """Stands in for viser's scene: notes what was added, in order."""
+    """viser's own scene, with a note of what was added to it, in order."""
 
-    def __init__(self) -> None:
+    def __init__(self, scene: viser.SceneApi) -> None:
+        self.scene = scene
         self.added: list[str] = []
         self.nodes: dict[str, Any] = {}
+        self.calls: dict[str, tuple[str, dict[str, Any]]] = {}
 
     def __getattr__(self, method: str) -> Any:
-        if not method.startswith("add_"):
-            raise AttributeError(method)
+        real = getattr(self.scene, method)
 
-        def add(name: str, *args: Any, **props: Any) -> SimpleNamespace:
+        def add(name: str, *args: Any, **props: Any) -> Any:
             self.added.append(name)
-            self.nodes[name] = SimpleNamespace(kind=method, visible=True, **props)
+            self.calls[name] = method, props
+            self.nodes[name] = real(name, *args, **props)
             return self.nodes[name]
 
-        return add
+        return add if method.startswith("add_") else real
 
     @property
     def shown(self) -> set[str]:
         return {name for name, node in self.nodes.items() if node.visible}
 
 
-@pytest.fixture
-def canvas() -> Canvas:
-    return Canvas()
+@dataclass
+class Client:
+    """What a painter needs of a client."""
+
+    scene: Any
+    atomic: Any
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[viser.ViserServer]:
+    server = start_viser("a key of this test")
+    yield server
+    stop_viser(server)
 
 
 @pytest.fixture
-def painter(canvas: Canvas) -> Painter:
-    return Painter(SimpleNamespace(scene=canvas, atomic=nullcontext))  # type: ignore[arg-type]
+def canvas(server: viser.ViserServer) -> Canvas:
+    server.scene.reset()
+    return Canvas(server.scene)
+
+
+@pytest.fixture
+def painter(server: viser.ViserServer, canvas: Canvas) -> Painter:
+    return Painter(cast(viser.ClientHandle, Client(canvas, server.atomic)))
 
 
 def dots(count: int, at: float = 0.0, color: style.RGB = style.INLIER) -> Points:
@@ -91,10 +111,11 @@ def test_layers_switch_off(painter: Painter, canvas: Canvas) -> None:
 
 def test_many_dots_become_a_cloud_of_full_precision(painter: Painter, canvas: Canvas) -> None:
     painter.draw([dots(MOST_BATCHED)], ALL)
-    assert canvas.nodes["/map/points"].kind == "add_batched_meshes_simple"
+    assert canvas.calls["/map/points"][0] == "add_batched_meshes_simple"
     painter.draw([dots(MOST_BATCHED + 1)], ALL)
     node = canvas.nodes["/map/points"]
-    assert node.kind == "add_point_cloud" and node.precision == "float32"
+    method, props = canvas.calls["/map/points"]
+    assert method == "add_point_cloud" and props["precision"] == "float32"
     assert node.points.dtype == np.float32 and np.array_equal(node.colors[0], style.INLIER), "clouds take sRGB"
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from spherloc import registry
 from spherloc.errors import InputError
-from spherloc.estimators import default_options, estimate, options_type, warm_up
+from spherloc.estimators import default_options, estimate, options_type
 from spherloc.trace import RansacStage, RefinementStage, TranslationStage, YawStage
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
@@ -115,7 +115,3 @@ def test_wrong_arguments_are_input_errors(scene_of):
         with pytest.raises(InputError, match=f"seed is {seed}"):
             estimate(problem, "mc", seed=seed)
     assert estimate(problem, "ransac-2p", seed=2**63 - 1).seed == 2**63 - 1
-
-
-def test_warm_up_runs():
-    warm_up()
