@@ -32,7 +32,7 @@ def run_scenes(
     if not paths:
         raise InputError("no scene given; name one or more scene files, such as scenes/mei_outliers_80.toml.")
     changes = parse_settings(estimator, settings)
-    warm_up()
+    warm = False
     jobs: list[Future[int]] = []
     worst = 0
     # One thread writes and prints, in order, while the next scene is being solved.
@@ -41,6 +41,9 @@ def run_scenes(
             try:
                 scene = load_scene(path)
                 problem = scene.problem(seed)
+                if not warm:
+                    warm_up(_say)
+                    warm = True
                 used = getattr(scene, "seed", 0) if seed is None else seed
                 trace = estimate(problem, estimator, resolved_options(estimator, problem, changes), used)
             except SpherlocError as error:
@@ -78,8 +81,12 @@ def _names(known: set[str]) -> str:
     return ", ".join(sorted(known))
 
 
+def _say(sentence: str) -> None:
+    print(f"spherloc: {sentence}", file=sys.stderr, flush=True)
+
+
 def _report(error: SpherlocError) -> int:
-    print(f"spherloc: {error}", file=sys.stderr, flush=True)
+    _say(str(error))
     return 2
 
 

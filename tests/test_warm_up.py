@@ -1,7 +1,9 @@
 """Nobody waits for a compiler once the kernels are warm."""
 
+import os
 import subprocess
 import sys
+from pathlib import Path
 
 SCRIPT = """
 import importlib, pkgutil, numba
@@ -33,3 +35,16 @@ def test_warm_up_leaves_nothing_to_compile() -> None:
     count, late = done.stdout.split(" ", 1)
     assert int(count) >= 10
     assert late.strip() == "[]"
+
+
+def test_a_cold_start_is_announced_once(tmp_path: Path) -> None:
+    """Seconds of silence look like a hang; a sentence at every start would be noise."""
+    script = "from spherloc.estimators import warm_up; warm_up(print)"
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    said = [
+        subprocess.run(
+            [sys.executable, "-c", script], capture_output=True, text=True, check=True, env=environment
+        ).stdout
+        for _ in range(2)
+    ]
+    assert "preparing the solvers" in said[0] and said[1] == ""

@@ -31,8 +31,7 @@ def serve(scene: Path | None, host: str, port: int, recordings: Path, record: bo
     """
     catalog = Catalog(scene)
     with open_socket(host, port) as listener, contextlib.ExitStack() as stack:
-        print("preparing the solvers (a few seconds after an installation) …", file=sys.stderr, flush=True)
-        warm_up()
+        warm_up(lambda sentence: print(f"spherloc: {sentence}", file=sys.stderr, flush=True))
         sessions = Sessions(catalog)
         if record:
             sessions.recorder = stack.enter_context(Recorder(recordings, on_error=sessions.report))
