@@ -13,6 +13,8 @@ from spherloc_viz.layers.primitives import Chart, ColorArray, FloatArray, SceneI
 
 SPHERE_SHARE = 0.17
 """Radius at which the unit sphere is drawn, as a share of the map's typical extent."""
+FEW_DOTS = 200
+"""Up to this many, dots have their full size."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +59,11 @@ class RunView:
         """Radius at which the unit sphere is drawn, metres."""
         extent = float(np.median(np.linalg.norm(self.points - self.middle, axis=1)))
         return SPHERE_SHARE * max(extent, 1e-3)
+
+    @cached_property
+    def dot_m(self) -> float:
+        """What dots are measured by, metres: the sphere's radius, less where there are many."""
+        return self.sphere_m * min(1.0, (FEW_DOTS / len(self.points)) ** (1 / 3))
 
     @cached_property
     def truth(self) -> FloatArray | None:

@@ -21,7 +21,7 @@ def base_items(view: RunView, frame: Frame) -> tuple[SceneItem, ...]:
     """The primitives that do not depend on the stage."""
     centre = camera_centre(frame.cam_from_map)
     items: list[SceneItem] = [
-        Points("map/points", "map", view.points, frame.colors, 0.07 * view.sphere_m, np.arange(len(view.points))),
+        Points("map/points", "map", view.points, frame.colors, 0.07 * view.dot_m, np.arange(len(view.points))),
         *_sphere(view, frame),
     ]
     if frame.located:
@@ -46,7 +46,7 @@ def _sphere(view: RunView, frame: Frame) -> list[SceneItem]:
     surface = Mesh("sphere/surface", "sphere", centre + view.sphere_m * vertices, faces, style.SPHERE, 0.25)
     return [
         surface,
-        Points("sphere/bearings", "sphere", dots, colors, 0.04 * view.sphere_m, aligned.index),
+        Points("sphere/bearings", "sphere", dots, colors, 0.04 * view.dot_m, aligned.index),
         Segments("rays", "rays", ends, colors[drawn], 1.5),
     ]
 

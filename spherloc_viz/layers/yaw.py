@@ -54,7 +54,7 @@ def frames(view: RunView, stage: YawStage) -> list[Frame]:
                 "yaw-clique",
                 "The yaw most arcs share",
                 f"{len(stage.clique):,} arcs overlap at {yaw:.2f}°{off}; no other yaw lies in more. "
-                f"They are a maximum clique of the rotation graph and agree on an interval of {interval:.2f}°.",
+                f"They are a maximum clique of the rotation graph and agree on an interval of {interval:.2g}°.",
                 "max over θ of Σ 1(|f(θ)| ≤ τ)   (Eq. 34, 37)",
                 note,
             ),
