@@ -36,6 +36,8 @@ class Problem:
     """Unit vector (3,) pointing down in the map frame."""
     gravity_bound_rad: float = 0.0
     """Bound on the angular error of ``gravity_camera``."""
+    gravity_sd_rad: float | None = None
+    """Standard deviation of each of its two tilts; None takes a third of the bound."""
     bound_px: float | None = None
     """Pixel bound asked for by the scene; None leaves it to the estimator."""
     truth_cam_from_map: FloatArray | None = None
@@ -55,6 +57,9 @@ class Problem:
             _unit(self, name)
         if not (np.isfinite(self.gravity_bound_rad) and 0.0 <= self.gravity_bound_rad < np.pi / 2):
             raise ProblemError(f"{self.name}: the gravity bound must lie between 0 and 90 degrees.")
+        sd = self.gravity_sd_rad
+        if sd is not None and not sd >= 0.0:
+            raise ProblemError(f"{self.name}: gravity_sd_rad is {sd}; give 0 or more, or inf if nothing is known.")
         if self.bound_px is not None and not (np.isfinite(self.bound_px) and self.bound_px > 0):
             raise ProblemError(f"{self.name}: bound_px is {self.bound_px}; give a positive number of pixels.")
         if self.truth_cam_from_map is not None:
@@ -132,7 +137,14 @@ class Problem:
             "map_turn": map_turn,
         }
         frozen = {name: _frozen(np.ascontiguousarray(array)) for name, array in arrays.items()}
-        return AlignedProblem(index=_frozen(index), count=len(self), **frozen)
+        bound, sd = self.gravity_bound_rad, self.gravity_sd_rad
+        return AlignedProblem(
+            index=_frozen(index),
+            count=len(self),
+            gravity_bound_rad=bound,
+            gravity_sd_rad=bound / 3.0 if sd is None else sd,
+            **frozen,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,6 +167,10 @@ class AlignedProblem:
     """(M, 2, 3), see ``Problem.pixel_from_bearing``."""
     radians_per_pixel: FloatArray
     """(M,), rad/px."""
+    gravity_bound_rad: float
+    """Bound on the angle between the true gravity and +y in the camera frame."""
+    gravity_sd_rad: float
+    """Standard deviation of each of its two tilts: 0 where gravity is exact, inf where it is unknown."""
 
     @cached_property
     def pixels_per_radian(self) -> FloatArray:

@@ -5,9 +5,14 @@ unprojection's Jacobian at the measured pixel (``Problem.pixel_from_bearing``): 
 Eq. 2, in pixels, for any camera model and across panorama seams.
 """
 
+from dataclasses import dataclass
+from typing import Literal, get_args
+
 import numpy as np
 from numpy.typing import NDArray
 
+from spherloc.bounds import Bounds
+from spherloc.errors import InputError, show
 from spherloc.geometry import pose, so3_exp, transform, yaw_rotation
 from spherloc.problem import AlignedProblem
 from spherloc.trace import RefinementStage
@@ -22,6 +27,30 @@ LEAST_FOR_SIX_DOF = 4
 """Three points leave up to four poses and two leave a curve, so fewer inliers keep the known roll and pitch."""
 
 
+Robust = Literal["none", "huber", "cauchy"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RefinementOptions:
+    """What the refinement knows about noise: the last options of every estimator."""
+
+    noise_px: float = 1.0
+    """Standard deviation of an inlier's pixel noise, px: weighs pixels against gravity, and scales the covariance."""
+    gravity_sd_deg: float | None = None
+    """Standard deviation of the known roll and pitch, degrees: 0 keeps them (4 DoF), inf ignores them (the paper's
+    6 DoF). None takes the problem's."""
+    robust: Robust = "none"
+    """Kernel that weighs down large residuals."""
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.noise_px < np.inf:
+            raise InputError(f"option noise_px is {show(self.noise_px)}; give a positive number of pixels.")
+        if self.gravity_sd_deg is not None and not self.gravity_sd_deg >= 0.0:
+            raise InputError(f"option gravity_sd_deg is {show(self.gravity_sd_deg)}; give 0 or more, or inf.")
+        if self.robust not in get_args(Robust):
+            raise InputError(f"option robust is {show(self.robust)}; give one of {', '.join(get_args(Robust))}.")
+
+
 def residuals_px(aligned: AlignedProblem, cam_from_map: FloatArray) -> FloatArray:
     """Reprojection error (M,), pixels to first order; inf for points behind their measured bearing."""
     rays = transform(cam_from_map, aligned.points)
@@ -33,7 +62,7 @@ def residuals_px(aligned: AlignedProblem, cam_from_map: FloatArray) -> FloatArra
 
 
 def refine(
-    aligned: AlignedProblem, cam_from_map: FloatArray, bound_px: FloatArray
+    aligned: AlignedProblem, cam_from_map: FloatArray, bounds: Bounds, options: RefinementOptions
 ) -> tuple[FloatArray, BoolArray, RefinementStage]:
     """Refine a pose (3, 4) between the aligned frames and its inliers until neither changes.
 
@@ -41,7 +70,7 @@ def refine(
     them. Returns the last pose, its inlier mask (M,), and the stage, whose poses are
     turned back.
     """
-    history = [cam_from_map]
+    history, bound_px = [cam_from_map], bounds.pixels
     mask = residuals_px(aligned, cam_from_map) <= bound_px
     dof = 6
     for _ in range(MAX_ROUNDS):

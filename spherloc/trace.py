@@ -103,6 +103,49 @@ class TranslationStage(Stage):
 
 
 @dataclass(frozen=True, eq=False)
+class ConsensusStage(Stage):
+    """Exact consensus: correspondences are nodes, and a pair is an edge where one of its arcs covers the yaw.
+
+    The consensus set of any pose is a clique of the graph at its yaw, so the largest clique bounds every consensus.
+    """
+
+    kind = "consensus"
+    arcs: int
+    """Arcs of feasible yaw of all pairs."""
+    seed_support: int
+    """Correspondences that the first guess explained: cliques must be larger to be looked for."""
+    bound: IndexArray
+    """(1440,) no pose with a yaw in that quarter of a degree explains more correspondences, from -pi upwards."""
+    branches: int
+    """Branches of the clique searches, all together."""
+    finished: bool
+    """False if the search ran out of its budget, so that ``bound`` is larger than it might be."""
+    yaw_rad: float
+    """A yaw at which ``clique`` is one."""
+    clique: IndexArray
+    """The largest clique found: (S,) indices of correspondences in the problem."""
+    cam_from_map: FloatArray
+    """(C, 3, 4) poses that were verified, best first, the best of every clearly different one."""
+    support: IndexArray
+    """(C,) correspondences that each of them explains."""
+
+
+@dataclass(frozen=True, eq=False)
+class DecisionStage(Stage):
+    """Which estimator was chosen for this problem, and why."""
+
+    kind = "decision"
+    chosen: str
+    """Registered name."""
+    reason: str
+    """A sentence with this problem's numbers."""
+    samples: int
+    """Pairs that the probe sampled."""
+    inlier_rate: float
+    """Share of the correspondences that the probe's best pose explains."""
+
+
+@dataclass(frozen=True, eq=False)
 class RefinementStage(Stage):
     """Gauss-Newton on the sphere. I + 1 states, the first one being the initial pose."""
 
@@ -115,6 +158,32 @@ class RefinementStage(Stage):
     """(I + 1,) mean squared residual of the inliers at each state, px^2."""
     inlier_counts: IndexArray
     """(I + 1,) correspondences within the bound at each state."""
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """What is proven about the consensus of a run.
+
+    Both bounds count correspondences within the noise bound at a pose whose tilt is within the gravity bound.
+    """
+
+    upper_bound: int
+    """No pose explains more correspondences."""
+    lower_bound: int
+    """Some pose explains as many."""
+    chance_sets: float
+    """Expected number of sets of ``lower_bound`` outliers that agree with some pose by chance. If it is not far below
+    1, no method can know the answer."""
+
+    @property
+    def gap(self) -> int:
+        """How many more correspondences a better pose could explain."""
+        return self.upper_bound - self.lower_bound
+
+    @property
+    def proven(self) -> bool:
+        """Whether no pose explains more than the one that was found."""
+        return self.gap <= 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,6 +210,8 @@ class Trace:
     """(N,) correspondences within the bound of the estimated pose."""
     message: str
     """The outcome in one sentence."""
+    certificate: Certificate | None = None
+    """What is proven about the consensus; None if the estimator proves nothing."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "versions", MappingProxyType(dict(self.versions)))

@@ -21,7 +21,7 @@ FLOORS = (
     ("spherloc.errors", "spherloc"),
     ("spherloc.registry", "spherloc.geometry"),
     ("spherloc.cameras", "spherloc.solvers"),
-    ("spherloc.problem", "spherloc.consensus"),
+    ("spherloc.problem", "spherloc.bounds", "spherloc.consensus"),
     ("spherloc.trace", "spherloc.refine", "spherloc.metrics", "spherloc.datasets", "spherloc.frontend"),
     ("spherloc.estimators", "spherloc.diagnosis", "spherloc.experiments"),
     ("spherloc_viz.style", "spherloc_viz.layers", "spherloc_viz"),

@@ -12,12 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spherloc import registry
+from spherloc.bounds import Bounds, bounds_of
 from spherloc.errors import InputError, show
 from spherloc.problem import AlignedProblem, Problem
-from spherloc.trace import Stage, Trace
+from spherloc.refine import RefinementOptions
+from spherloc.trace import Certificate, Stage, Trace
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
+
+REFINEMENT_FIELDS = {item.name for item in fields(RefinementOptions)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +36,8 @@ class Outcome:
     """(M,) over the usable correspondences."""
     reason: str = ""
     """Why there is no pose, as a sentence; empty if there is one."""
+    certificate: Certificate | None = None
+    """What is proven about the consensus, if the estimator proves anything."""
 
 
 class Estimator(Protocol):
@@ -41,19 +47,9 @@ class Estimator(Protocol):
     """A frozen dataclass with a default for every field; ``bound_px`` is one of them."""
 
     @staticmethod
-    def run(aligned: AlignedProblem, options: Any, bounds: "Bounds", seed: int, clock: "Clock") -> Outcome:
+    def run(aligned: AlignedProblem, options: Any, bounds: Bounds, seed: int, clock: "Clock") -> Outcome:
         """Solve; take every random draw from ``seed`` and report each stage's time to ``clock``."""
         ...
-
-
-@dataclass(frozen=True, eq=False)
-class Bounds:
-    """What noise may do to each of M bearings: the pixel bound and the gravity bound together."""
-
-    pixels: FloatArray
-    """(M,) bound on the reprojection error, px."""
-    radians: FloatArray
-    """(M,) bound on the angular error of the aligned bearing, rad."""
 
 
 class Clock:
@@ -68,15 +64,6 @@ class Clock:
         start = time.perf_counter()
         yield
         self.timings_ms[name] = (time.perf_counter() - start) * 1e3
-
-
-def bounds_of(aligned: AlignedProblem, bound_px: float, gravity_bound_rad: float) -> Bounds:
-    """Bounds of every bearing from one pixel bound, through the largest stretch of its unprojection, plus gravity.
-
-    Residuals are measured in the tangent plane, so that ``bound_px`` reaches as far as the angle whose sine it is.
-    """
-    radians = np.arcsin(np.minimum(1.0, bound_px * aligned.radians_per_pixel)) + gravity_bound_rad
-    return Bounds(bound_px + gravity_bound_rad * aligned.pixels_per_radian, np.minimum(radians, np.pi / 2))
 
 
 def versions() -> dict[str, str]:
@@ -100,6 +87,8 @@ def check_positive(options: Any) -> None:
     """Raise ``InputError`` if a field of ``options`` is no finite positive number."""
     for item in fields(options):
         value = getattr(options, item.name)
+        if item.name in REFINEMENT_FIELDS:
+            continue  # RefinementOptions checks its own
         if value is None and item.default is None:
             continue
         if isinstance(value, bool) or not isinstance(value, Real) or not 0 < float(value) < np.inf:
@@ -120,7 +109,7 @@ def estimate(problem: Problem, estimator: str = "mc", options: Any = None, seed:
     if not 0 <= seed < 2**63:
         raise InputError(f"seed is {seed}; give a number from 0 to 2^63 - 1.")
     aligned = problem.aligned
-    bounds = bounds_of(aligned, options.bound_px, problem.gravity_bound_rad)
+    bounds = bounds_of(aligned, options.bound_px)
     clock = Clock()
     start = time.perf_counter()
     outcome = kind.run(aligned, options, bounds, seed, clock)
@@ -139,4 +128,5 @@ def estimate(problem: Problem, estimator: str = "mc", options: Any = None, seed:
         cam_from_map=pose,
         inlier_mask=mask,
         message=outcome.reason or found,
+        certificate=outcome.certificate,
     )

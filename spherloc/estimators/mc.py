@@ -7,16 +7,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from spherloc.bounds import Bounds
 from spherloc.consensus.inliers import count_inliers
 from spherloc.consensus.max_clique import max_clique
 from spherloc.consensus.translation_balls import overlapping, translation_balls
 from spherloc.consensus.yaw_arcs import yaw_arcs
 from spherloc.consensus.yaw_sweep import YawConsensus, deepest_yaw
 from spherloc.errors import InputError
-from spherloc.estimators.base import Bounds, Clock, Outcome, check_positive
+from spherloc.estimators.base import Clock, Outcome, check_positive
 from spherloc.geometry import pose, yaw_rotation
 from spherloc.problem import AlignedProblem
-from spherloc.refine import refine
+from spherloc.refine import RefinementOptions, refine
 from spherloc.solvers.two_point import two_point
 from spherloc.trace import Stage, TranslationStage, YawStage
 
@@ -34,7 +35,7 @@ MOST_CORRESPONDENCES = 10_000
 
 
 @dataclass(frozen=True)
-class McOptions:
+class McOptions(RefinementOptions):
     """Options of MC."""
 
     bound_px: float = 3.0
@@ -43,6 +44,7 @@ class McOptions:
     """Pairs of the rotation clique that become balls: those with the smallest radii, if there are more."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         check_positive(self)
         if self.max_balls != int(self.max_balls) or self.max_balls > 2000:
             raise InputError(f"option max_balls is {self.max_balls}; give a whole number up to 2000.")
@@ -76,7 +78,7 @@ class MaximumConsensus:
             reason = "No pose: no pair in the rotation clique bounds the camera's position."
             return Outcome((yaw,), None, nobody, reason)
         with clock.stage("refinement"):
-            refined, inliers, refinement = refine(aligned, start, bounds.pixels)
+            refined, inliers, refinement = refine(aligned, start, bounds, options)
         stages: tuple[Stage, ...] = (yaw, translation, refinement)
         return Outcome(stages, refined, inliers)
 

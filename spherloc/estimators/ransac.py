@@ -6,12 +6,13 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from spherloc.bounds import Bounds
 from spherloc.consensus.inliers import count_inliers
 from spherloc.errors import InputError
-from spherloc.estimators.base import Bounds, Clock, Outcome, check_positive
+from spherloc.estimators.base import Clock, Outcome, check_positive
 from spherloc.geometry import pose, yaw_rotation
 from spherloc.problem import AlignedProblem
-from spherloc.refine import refine, residuals_px
+from spherloc.refine import RefinementOptions, refine, residuals_px
 from spherloc.solvers.two_point import solve_pair
 from spherloc.trace import RansacStage
 
@@ -19,7 +20,7 @@ FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class RansacOptions:
+class RansacOptions(RefinementOptions):
     """Options of 2P-RANSAC."""
 
     bound_px: float = 8.0
@@ -30,6 +31,7 @@ class RansacOptions:
     """Stop as soon as Eq. 28 gives this probability of having drawn two inliers; None draws all samples."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         check_positive(self)
         if self.iterations != int(self.iterations) or self.iterations > 10_000_000:
             raise InputError(f"option iterations is {self.iterations}; give a whole number up to 10,000,000.")
@@ -70,7 +72,7 @@ class TwoPointRansac:
             reason = f"No pose: none of {drawn} sampled pairs has a solution in front of the camera."
             return Outcome((stage,), None, np.zeros(count, dtype=bool), reason)
         with clock.stage("refinement"):
-            refined, inliers, refinement = refine(aligned, states[-1], bounds.pixels)
+            refined, inliers, refinement = refine(aligned, states[-1], bounds, options)
         return Outcome((stage, refinement), refined, inliers)
 
 

@@ -2,12 +2,13 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from spherloc.bounds import bounds_of
 from spherloc.cameras.equirectangular import Equirectangular
-from spherloc.estimators.base import bounds_of
 from spherloc.geometry import DOWN, pose, so3_exp
 from spherloc.problem import Problem
 from spherloc.refine import residuals_px
@@ -32,7 +33,7 @@ def test_inliers_lie_within_the_angular_bound(rng, scene_of, camera, bound_px):
     """Arcs exclude nothing only for bearings within ``Bounds.radians``: no inlier by pixels may be farther away."""
     problem = scene_of(camera, correspondences=1000, outlier_rate=0.0).problem()
     aligned = problem.aligned
-    bounds = bounds_of(aligned, bound_px, 0.0)
+    bounds = bounds_of(aligned, bound_px)
     for share in (0.9, 0.99, 0.9999, 1.0, 1.0001, 1.01):
         rays = beside(rng, aligned.bearings, np.arcsin(np.minimum(share * bound_px * aligned.radians_per_pixel, 1.0)))
         moved = Problem("moved", problem.camera, problem.pixels, rays, DOWN, DOWN)
@@ -48,19 +49,19 @@ def test_gravity_error_within_its_bound_keeps_the_inliers(rng, scene_of, camera)
     aligned, bound_rad = problem.aligned, np.radians(0.5)
     tilt = so3_exp(bound_rad * np.array([0.8, 0.0, 0.6]))
     tilted = pose(tilt @ problem.truth_cam_from_map[:, :3], tilt @ problem.truth_cam_from_map[:, 3])
-    error, bounds = residuals_px(aligned, tilted), bounds_of(aligned, 1.0, bound_rad)
+    error, bounds = residuals_px(aligned, tilted), bounds_of(replace(aligned, gravity_bound_rad=bound_rad), 1.0)
     lost = np.count_nonzero(error > bounds.pixels)
     assert lost == 0, f"{lost} of 1000 lie outside, the worst by a factor of {np.max(error / bounds.pixels):.1f}"
 
 
 def test_bounds_add_up(scene_of):
     aligned = scene_of("fisheye").problem().aligned
-    bare, with_gravity = bounds_of(aligned, 3.0, 0.0), bounds_of(aligned, 3.0, 0.01)
+    bare, with_gravity = bounds_of(aligned, 3.0), bounds_of(replace(aligned, gravity_bound_rad=0.01), 3.0)
     np.testing.assert_array_equal(bare.pixels, 3.0)
     np.testing.assert_allclose(bare.radians, 3.0 * aligned.radians_per_pixel, rtol=1e-3)
     np.testing.assert_allclose(with_gravity.radians, bare.radians + 0.01, rtol=1e-3)
     assert (with_gravity.pixels > bare.pixels + 1.0).all()
-    assert (bounds_of(aligned, 1e4, 0.0).radians == np.pi / 2).all()
+    assert (bounds_of(aligned, 1e4).radians == np.pi / 2).all()
 
 
 def test_poles_of_a_panorama_are_not_free_inliers():

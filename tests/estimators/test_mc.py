@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from spherloc.bounds import bounds_of
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.consensus.translation_balls import translation_balls
 from spherloc.errors import InputError
 from spherloc.estimators import estimate, options_type
-from spherloc.estimators.base import bounds_of
 from spherloc.geometry import DOWN, camera_centre, yaw_of, yaw_rotation
 from spherloc.problem import Problem
 from spherloc.solvers.two_point import two_point
@@ -79,7 +79,7 @@ def test_balls_are_those_of_the_arcs(scene_of):
         at = yaw.yaw_rad + (0.0 if yaw.lo_rad[arc] <= yaw.yaw_rad else 2 * np.pi)
         farther[tuple(yaw.pairs[arc])] = max(at - yaw.lo_rad[arc], yaw.hi_rad[arc] - at)
     slack = np.array([farther[tuple(pair)] for pair in translation.pairs])
-    bounds = bounds_of(problem.aligned, 3.0, 0.0)
+    bounds = bounds_of(problem.aligned, 3.0)
     centres, radii = translation_balls(problem.aligned, bounds.radians, translation.pairs, yaw.yaw_rad, slack)
     np.testing.assert_allclose(translation.centres_m, centres, atol=1e-12)
     np.testing.assert_allclose(translation.radii_m, radii, rtol=1e-12)

@@ -1,0 +1,33 @@
+"""Bounds on the error of a measured bearing: its noise, and the error of the gravity that it was aligned by."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spherloc.problem import AlignedProblem
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Bounds:
+    """What an inlier's residual may be. M correspondences."""
+
+    noise_px: float
+    """Bound on the reprojection error at a pose whose tilt is right, px."""
+    pixels: FloatArray
+    """(M,) bound on the reprojection error at a pose with the given gravity, px: the noise and the gravity bound."""
+    radians: FloatArray
+    """(M,) bound on the angular error of the aligned bearing, rad."""
+
+
+def bounds_of(aligned: AlignedProblem, bound_px: float) -> Bounds:
+    """Bounds of every bearing from one pixel bound, through the largest stretch of its unprojection, plus gravity.
+
+    Residuals are measured in the tangent plane, so that ``bound_px`` reaches as far as the angle whose sine it is.
+    """
+    gravity_rad = aligned.gravity_bound_rad
+    radians = np.arcsin(np.minimum(1.0, bound_px * aligned.radians_per_pixel)) + gravity_rad
+    pixels = bound_px + gravity_rad * aligned.pixels_per_radian
+    return Bounds(bound_px, pixels, np.minimum(radians, np.pi / 2))
