@@ -1,4 +1,4 @@
-"""Gauss-Newton refinement of a pose on the sphere, in pixels, and the choice of its inliers.
+"""Refinement of a pose on the sphere, in pixels, with gravity as a measurement, and the choice of its inliers.
 
 The residual of a correspondence is r = P v', v' the unit vector towards R p + t and P the pseudo-inverse of the
 unprojection's Jacobian at the measured pixel (``Problem.pixel_from_bearing``): to first order the reprojection error of
@@ -8,24 +8,35 @@ Eq. 2, in pixels, for any camera model and across panorama seams.
 from dataclasses import dataclass
 from typing import Literal, get_args
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from spherloc.bounds import Bounds
 from spherloc.errors import InputError, show
-from spherloc.geometry import pose, so3_exp, transform, yaw_rotation
+from spherloc.gauss_newton import (
+    LEAST_GRAVITY_SD_RAD,
+    ROBUST_NONE,
+    degrees_of_freedom,
+    levelled,
+    middle_of,
+    normal_equations,
+    polish_path,
+    solve,
+    tilt_of,
+)
+from spherloc.geometry import skew
 from spherloc.problem import AlignedProblem
 from spherloc.trace import RefinementStage
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
-MAX_ITERATIONS = 15
+MAX_STEPS = 15
 MAX_ROUNDS = 10
-STEP_TOLERANCE = 1e-10
-LEAST_FOR_SIX_DOF = 4
-"""Three points leave up to four poses and two leave a curve, so fewer inliers keep the known roll and pitch."""
-
+MAX_RESCUES = 8
+RESCUE_FACTOR = 1.5
+"""By which the residuals of inliers that least squares would lose grow from one rescue to the next."""
 
 Robust = Literal["none", "huber", "cauchy"]
 
@@ -40,7 +51,8 @@ class RefinementOptions:
     """Standard deviation of the known roll and pitch, degrees: 0 keeps them (4 DoF), inf ignores them (the paper's
     6 DoF). None takes the problem's."""
     robust: Robust = "none"
-    """Kernel that weighs down large residuals."""
+    """Kernel that weighs down large residuals: beyond 1.345 (huber) or around 2.385 (cauchy) times ``noise_px``, the
+    usual constants, which cost 5 % efficiency if the noise is normal."""
 
     def __post_init__(self) -> None:
         if not 0.0 < self.noise_px < np.inf:
@@ -51,14 +63,13 @@ class RefinementOptions:
             raise InputError(f"option robust is {show(self.robust)}; give one of {', '.join(get_args(Robust))}.")
 
 
+ROBUST_CODES = {name: code for code, name in enumerate(get_args(Robust))}
+"""In the order of ``gauss_newton.ROBUST_*``."""
+
+
 def residuals_px(aligned: AlignedProblem, cam_from_map: FloatArray) -> FloatArray:
     """Reprojection error (M,), pixels to first order; inf for points behind their measured bearing."""
-    rays = transform(cam_from_map, aligned.points)
-    length = np.linalg.norm(rays, axis=1)
-    rays /= np.maximum(length, np.finfo(float).tiny)[:, None]
-    error = np.linalg.norm(np.einsum("nij,nj->ni", aligned.pixel_from_bearing, rays), axis=1)
-    error[np.einsum("ni,ni->n", rays, aligned.bearings) <= 0.0] = np.inf
-    return error
+    return _residuals(aligned.bearings, aligned.points, aligned.pixel_from_bearing.copy(), cam_from_map.copy())
 
 
 def refine(
@@ -66,86 +77,175 @@ def refine(
 ) -> tuple[FloatArray, BoolArray, RefinementStage]:
     """Refine a pose (3, 4) between the aligned frames and its inliers until neither changes.
 
-    ``bound_px`` (M,) is each correspondence's pixel bound. Alternates Gauss-Newton on the inliers with a new choice of
-    them. Returns the last pose, its inlier mask (M,), and the stage, whose poses are
-    turned back.
+    Alternates Gauss-Newton on the inliers with a new choice of them: at first by ``bounds.pixels``, and once the tilt
+    is estimated by ``bounds.noise_px``, since gravity's error is no longer in the residuals. Least squares may lose
+    inliers on the way or go round in circles, so what counts is the round that ended with the most inliers (ties: the
+    smaller cost). Where the start explains more than that, by the same bound, its inliers are fitted with growing
+    weights on those that would be lost; if this fails too the start is returned. So refinement loses no consensus.
+    (Exact gravity turns the start to a pure yaw first.)
+
+    Returns the pose, its inlier mask (M,), and the stage, whose poses and covariance are those of the problem's own
+    frames.
     """
-    history, bound_px = [cam_from_map], bounds.pixels
-    mask = residuals_px(aligned, cam_from_map) <= bound_px
-    dof = 6
-    for _ in range(MAX_ROUNDS):
-        if np.count_nonzero(mask) < 2:
-            break
-        dof = 6 if np.count_nonzero(mask) >= LEAST_FOR_SIX_DOF else 4
-        history += _gauss_newton(aligned, history[-1], mask, dof)
-        chosen = residuals_px(aligned, history[-1]) <= bound_px
-        if np.array_equal(chosen, mask):
-            break
-        mask = chosen
-    errors = [residuals_px(aligned, state) for state in history]
-    inliers = errors[-1] <= bound_px
+    sd = aligned.gravity_sd_rad if options.gravity_sd_deg is None else float(np.radians(options.gravity_sd_deg))
+    # A copy may be written to: one type of array, so that the kernels below are compiled once.
+    data = (aligned.points, aligned.pixel_from_bearing.copy())
+    model = (options.noise_px, sd, ROBUST_CODES[options.robust])
+    path, limit_px = _alternate(aligned.bearings, *data, bounds.pixels, bounds.noise_px, cam_from_map.copy(), *model)
+    inliers, costs, counts = _account(aligned.bearings, *data, np.minimum(bounds.pixels, limit_px), path)
+    last = path[-1].copy()
+    dof, centre, steps = _step_covariance(*data, inliers, last, *model)
     stage = RefinementStage(
         dof=dof,
-        cam_from_map=np.array([aligned.unalign_pose(state) for state in history]),
-        cost_px2=np.array([_mean_square(error[inliers]) for error in errors]),
-        inlier_counts=np.array([np.count_nonzero(error <= bound_px) for error in errors], np.int32),
+        cam_from_map=_unaligned(aligned, path),
+        cost_px2=costs,
+        inlier_counts=counts,
+        covariance=_covariance(aligned, last, centre, steps),
+        gravity_sd_rad=sd,
+        tilt_rad=float(tilt_of(last)),
     )
-    return history[-1], inliers, stage
+    return last, inliers, stage
 
 
-def _mean_square(error: FloatArray) -> float:
-    return float(np.mean(np.square(error))) if len(error) else float("nan")
+def _unaligned(aligned: AlignedProblem, path: FloatArray) -> FloatArray:
+    """Poses (K, 3, 4) of the problem's own frames. The ends are those of ``unalign_pose`` to the last bit."""
+    turned = aligned.camera_turn.T @ path
+    turned[:, :, :3] = turned[:, :, :3] @ aligned.map_turn
+    turned[0], turned[-1] = aligned.unalign_pose(path[0]), aligned.unalign_pose(path[-1])
+    return turned
 
 
-def _gauss_newton(aligned: AlignedProblem, start: FloatArray, mask: BoolArray, dof: int) -> list[FloatArray]:
-    """States after each accepted step from ``start`` on the masked correspondences."""
-    points, weights = aligned.points[mask], aligned.pixel_from_bearing[mask]
-    states, current = [], start
-    residual, jacobian = residual_and_jacobian(points, weights, current, dof)
-    cost = float(residual @ residual)
-    for _ in range(MAX_ITERATIONS):
-        step = np.asarray(np.linalg.lstsq(jacobian, -residual, rcond=None)[0], dtype=np.float64)
-        for _halving in range(8):
-            candidate = apply_step(points, current, step)
-            residual, jacobian = residual_and_jacobian(points, weights, candidate, dof)
-            if float(residual @ residual) <= cost:
-                break
-            step *= 0.5
+def _covariance(aligned: AlignedProblem, cam_from_map: FloatArray, centre: FloatArray, steps: FloatArray) -> FloatArray:
+    """Covariance (6, 6) as in ``RefinementStage``, from that of a step (w, d) about ``centre`` (3,), aligned frames."""
+    rotation = cam_from_map[:, :3]
+    middle = rotation @ centre + cam_from_map[:, 3]
+    # The position -R^T t = c - R^T m moves by R^T (w x m - d).
+    by_step = np.zeros((6, 6))
+    by_step[:3, :3] = aligned.camera_turn.T
+    by_step[3:, :3] = -aligned.map_turn.T @ rotation.T @ skew(middle)
+    by_step[3:, 3:] = -aligned.map_turn.T @ rotation.T
+    return by_step @ steps @ by_step.T
+
+
+@numba.njit(cache=True, nogil=True)
+def _residuals(bearings, points, weights, cam_from_map):
+    """See ``residuals_px``."""
+    errors = np.empty(len(points))
+    p = cam_from_map
+    for k in range(len(points)):
+        x = p[0, 0] * points[k, 0] + p[0, 1] * points[k, 1] + p[0, 2] * points[k, 2] + p[0, 3]
+        y = p[1, 0] * points[k, 0] + p[1, 1] * points[k, 1] + p[1, 2] * points[k, 2] + p[1, 3]
+        z = p[2, 0] * points[k, 0] + p[2, 1] * points[k, 1] + p[2, 2] * points[k, 2] + p[2, 3]
+        if bearings[k, 0] * x + bearings[k, 1] * y + bearings[k, 2] * z > 0.0:
+            du = weights[k, 0, 0] * x + weights[k, 0, 1] * y + weights[k, 0, 2] * z
+            dv = weights[k, 1, 0] * x + weights[k, 1, 1] * y + weights[k, 1, 2] * z
+            errors[k] = np.sqrt((du * du + dv * dv) / (x * x + y * y + z * z))
         else:
-            return states
-        states.append(candidate)
-        current, gain, cost = candidate, cost - float(residual @ residual), float(residual @ residual)
-        if np.linalg.norm(step) < STEP_TOLERANCE or gain <= 1e-12 * cost:
+            errors[k] = np.inf
+    return errors
+
+
+@numba.njit(cache=True, nogil=True)
+def _alternate(bearings, points, weights, wide_px, tight_px, start, noise_px, gravity_sd_rad, robust):
+    """The states (I + 1, 3, 4) from ``start`` (3, 4) to the one to return; an inlier's bound, if below ``wide_px``."""
+    path = np.empty((2 + (MAX_ROUNDS + MAX_RESCUES) * MAX_STEPS, 3, 4))
+    path[0], states = start, 1
+    errors = _residuals(bearings, points, weights, start)
+    mask = errors <= wide_px
+    if np.count_nonzero(mask) < 2:
+        return path[:1], np.inf
+    if gravity_sd_rad < LEAST_GRAVITY_SD_RAD and tilt_of(start) > 0.0:
+        path[1], states = levelled(start, middle_of(points, mask)[1]), 2
+        errors = _residuals(bearings, points, weights, path[1])
+        mask = errors <= wide_px
+    first, first_errors, limit_px = states, errors, np.inf
+    kept, most, least_cost = states, -1, np.inf
+    rotation, translation = path[states - 1, :, :3].copy(), path[states - 1, :, 3].copy()
+    for _ in range(MAX_ROUNDS):
+        if limit_px == np.inf and degrees_of_freedom(np.count_nonzero(mask), gravity_sd_rad) == 6:
+            limit_px, most = tight_px, -1
+        states += polish_path(
+            points, weights, mask, rotation, translation, noise_px, gravity_sd_rad, robust, MAX_STEPS, path[states:]
+        )
+        errors = _residuals(bearings, points, weights, path[states - 1])
+        before, mask = mask, errors <= np.minimum(wide_px, limit_px)
+        inliers, cost = np.count_nonzero(mask), np.sum(errors[mask] ** 2)
+        if inliers > most or (inliers == most and cost < least_cost):
+            kept, most, least_cost = states, inliers, cost
+        if inliers < 2 or np.array_equal(mask, before):
             break
-    return states
+    explained = first_errors <= np.minimum(wide_px, limit_px)
+    if np.count_nonzero(explained) > most:
+        limits = np.minimum(wide_px, limit_px)
+        steps = _rescue(bearings, points, weights, limits, explained, path, kept, noise_px, gravity_sd_rad)
+        kept = kept + steps if steps >= 0 else first
+    return path[:kept].copy(), limit_px
 
 
-def apply_step(points: FloatArray, cam_from_map: FloatArray, step: FloatArray) -> FloatArray:
-    """The pose after a step: a rotation vector (3,) or a yaw (1,), then a translation (3,), camera frame.
+@numba.njit(cache=True, nogil=True)
+def _rescue(bearings, points, weights, limits_px, explained, path, states, noise_px, gravity_sd_rad):
+    """Move on from the last of ``states`` until as many as are in ``explained`` are inliers; the steps, or -1.
 
-    It turns about the middle of ``points``, which keeps rotation and translation from trading against each other when
-    the points are far away.
+    Least squares on these, each of them weighing more the more often it was found to be outside.
     """
-    middle = transform(cam_from_map, points.mean(axis=0)[None])[0]
-    turn = so3_exp(step[:3]) if len(step) == 6 else yaw_rotation(step[0])
-    return pose(turn @ cam_from_map[:, :3], turn @ (cam_from_map[:, 3] - middle) + middle + step[-3:])
+    heavy, steps = weights.copy(), 0
+    rotation, translation = path[states - 1, :, :3].copy(), path[states - 1, :, 3].copy()
+    for _ in range(MAX_RESCUES):
+        steps += polish_path(
+            points,
+            heavy,
+            explained,
+            rotation,
+            translation,
+            noise_px,
+            gravity_sd_rad,
+            ROBUST_NONE,
+            MAX_STEPS,
+            path[states + steps :],
+        )
+        inside = _residuals(bearings, points, weights, path[states + steps - 1]) <= limits_px
+        if np.count_nonzero(inside) >= np.count_nonzero(explained):
+            return steps
+        for k in np.flatnonzero(explained & ~inside):
+            heavy[k] *= RESCUE_FACTOR
+    return -1
 
 
-def residual_and_jacobian(
-    points: FloatArray, weights: FloatArray, cam_from_map: FloatArray, dof: int
-) -> tuple[FloatArray, FloatArray]:
-    """Residuals (2 K,), px, and their derivative (2 K, dof) by the step of ``apply_step`` at zero.
+@numba.njit(cache=True, nogil=True)
+def _account(bearings, points, weights, limits_px, path):
+    """Inlier mask (M,) of the last state; mean squared residual of these, and number of inliers, at every state."""
+    inliers = _residuals(bearings, points, weights, path[-1]) <= limits_px
+    costs, counts = np.full(len(path), np.nan), np.zeros(len(path), np.int32)
+    for k in range(len(path)):
+        errors, total = _residuals(bearings, points, weights, path[k]), 0.0
+        for i in range(len(errors)):
+            counts[k] += errors[i] <= limits_px[i]
+            total += errors[i] ** 2 if inliers[i] else 0.0
+        if inliers.any():
+            costs[k] = total / np.count_nonzero(inliers)
+    return inliers, costs, counts
 
-    ``weights`` (K, 2, 3) is ``pixel_from_bearing`` of the ``points`` (K, 3).
-    """
-    rays = transform(cam_from_map, points)
-    length = np.linalg.norm(rays, axis=1)[:, None]
-    unit = rays / length
-    by_ray = (weights - np.einsum("nij,nj,nk->nik", weights, unit, unit)) / length[..., None]
-    arm = rays - rays.mean(axis=0)
-    # -skew(arm): columns are e_x x arm, e_y x arm, e_z x arm.
-    by_turn = np.cross(np.eye(3)[None], arm[:, None, :]).transpose(0, 2, 1)
+
+@numba.njit(cache=True, nogil=True)
+def _step_covariance(points, weights, inliers, cam_from_map, noise_px, gravity_sd_rad, robust):
+    """Degrees of freedom; middle (3,) of the inliers; covariance (6, 6) of a step (w, d), NaN if it has none."""
+    count, centre = middle_of(points, inliers)
+    dof = degrees_of_freedom(count, gravity_sd_rad)
+    covariance = np.full((6, 6), np.nan)
+    if count < 2 or (dof == 4 and gravity_sd_rad == np.inf):
+        return dof, centre, covariance
+    rotation = cam_from_map[:, :3].copy()
+    middle = rotation @ centre + cam_from_map[:, 3]
+    hessian, factor, unit, column = np.empty((6, 6)), np.empty((6, 6)), np.zeros(6), np.empty(6)
+    normal_equations(
+        points, weights, inliers, centre, rotation, middle, noise_px, gravity_sd_rad, robust, dof, hessian, unit
+    )
+    for k in range(6):
+        unit[:] = 0.0
+        unit[k] = -1.0
+        if not solve(hessian, unit, 0.0, factor, column):
+            return dof, centre, np.full((6, 6), np.nan)
+        covariance[:, k] = column
     if dof == 4:
-        by_turn = by_turn[:, :, 1:2]
-    jacobian = np.concatenate([by_ray @ by_turn, by_ray], axis=2)
-    return np.einsum("nij,nj->ni", weights, unit).ravel(), jacobian.reshape(-1, dof)
+        covariance[0, 0] = covariance[2, 2] = 0.0
+    return dof, centre, 0.5 * (covariance + covariance.T)

@@ -35,14 +35,20 @@ class RansacStage(Stage):
     kind = "ransac"
     iterations: int
     """Samples drawn."""
+    confidence_reached: float
+    """Probability by Eq. 28 that one of them held inliers of the last hypothesis only; what an early test may have lost
+    is taken off."""
     improved_at: IndexArray
     """(J,) iteration of each improvement."""
     samples: IndexArray
-    """(J, 2) indices of the two sampled correspondences in the problem."""
+    """(J, n) indices of the sampled correspondences in the problem; n is 2 for 2P."""
     cam_from_map: FloatArray
     """(J, 3, 4) hypotheses."""
     inlier_masks: BoolArray
     """(J, N) correspondences within the bound."""
+    locally_optimized: BoolArray
+    """(J,) true where the hypothesis is a fit to the inliers of the one before it, whose iteration and sample it has;
+    false where it is the pose of its sample."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,14 +122,15 @@ class ConsensusStage(Stage):
     """Correspondences that the first guess explained: cliques must be larger to be looked for."""
     bound: IndexArray
     """(1440,) no pose with a yaw in that quarter of a degree explains more correspondences, from -pi upwards."""
-    branches: int
-    """Branches of the clique searches, all together."""
+    effort: int
+    """Words of bitsets that the clique searches touched, all together."""
     finished: bool
     """False if the search ran out of its budget, so that ``bound`` is larger than it might be."""
     yaw_rad: float
-    """A yaw at which ``clique`` is one."""
+    """Yaw of the best pose."""
     clique: IndexArray
-    """The largest clique found: (S,) indices of correspondences in the problem."""
+    """The largest clique found: (S,) indices of correspondences in the problem. Larger than the best support if no
+    pose explains all of it."""
     cam_from_map: FloatArray
     """(C, 3, 4) poses that were verified, best first, the best of every clearly different one."""
     support: IndexArray
@@ -147,17 +154,26 @@ class DecisionStage(Stage):
 
 @dataclass(frozen=True, eq=False)
 class RefinementStage(Stage):
-    """Gauss-Newton on the sphere. I + 1 states, the first one being the initial pose."""
+    """Gauss-Newton on the sphere. I + 1 states, the first one being the initial pose, the last one the result."""
 
     kind = "refinement"
     dof: int
-    """6, or 4 (yaw and translation) where too few inliers would fix all six."""
+    """6, or 4 (yaw and translation) where gravity is exact or, unknown, too few inliers would fix all six."""
     cam_from_map: FloatArray
     """(I + 1, 3, 4) poses."""
     cost_px2: FloatArray
-    """(I + 1,) mean squared residual of the inliers at each state, px^2."""
+    """(I + 1,) mean squared residual of the last state's inliers at each state, px^2."""
     inlier_counts: IndexArray
-    """(I + 1,) correspondences within the bound at each state."""
+    """(I + 1,) correspondences at each state within the bound by which the last one's inliers were chosen."""
+    covariance: FloatArray
+    """(6, 6) of the last pose's error, given its inliers: first the rotation vector w, rad, in the problem's camera
+    frame (true R = Exp(w) R), then the camera's position, m, in the problem's map frame (true C = C + error). Roll and
+    pitch have no variance where gravity is exact, so that it is singular there. NaN where inliers and gravity do not
+    determine the pose."""
+    gravity_sd_rad: float
+    """Standard deviation of each tilt that weighed the given gravity: 0 kept it, inf ignored it."""
+    tilt_rad: float
+    """Angle between the given gravity and that of the last pose."""
 
 
 @dataclass(frozen=True)

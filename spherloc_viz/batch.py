@@ -1,11 +1,9 @@
 """``spherloc run``: solve scenes one after another, print and record each."""
 
-import json
 import sys
-import typing
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -13,11 +11,14 @@ from typing import Any
 import numpy as np
 
 from spherloc.datasets import load_scene
+from spherloc.diagnosis import Diagnosis, diagnose
 from spherloc.errors import InputError, SpherlocError
 from spherloc.estimators import default_options, estimate, options_type, warm_up
 from spherloc.metrics import evaluate
 from spherloc.problem import Problem
 from spherloc.trace import Trace
+from spherloc_viz.layers.certificate import chance, proof, warning
+from spherloc_viz.options import json_text, option_fields
 
 
 def run_scenes(
@@ -57,28 +58,19 @@ def run_scenes(
 
 def parse_settings(estimator: str, settings: Sequence[str]) -> dict[str, Any]:
     """Option values from "key=value" texts; raises ``InputError`` for an unknown key or a value of another type."""
-    kind = options_type(estimator)
-    hints = typing.get_type_hints(kind)
-    known = {item.name for item in fields(kind)}
+    known = {field.name: field for field in option_fields(options_type(estimator))}
     changes: dict[str, Any] = {}
     for setting in settings:
         key, equals, value = setting.partition("=")
         if not equals or key not in known:
-            raise InputError(f"option '{setting}' is unknown to {estimator}; give KEY=VALUE with {_names(known)}.")
-        try:
-            changes[key] = int(value) if hints[key] is int else float(value)
-        except ValueError:
-            raise InputError(f"option {key} is '{value}'; give a number.") from None
+            raise InputError(f"option '{setting}' is unknown to {estimator}; give KEY=VALUE with {', '.join(known)}.")
+        changes[key] = known[key].parse(value)
     return changes
 
 
 def resolved_options(estimator: str, problem: Problem, changes: dict[str, Any]) -> Any:
     """The estimator's options for a problem, with the user's changes last."""
     return replace(default_options(estimator, problem), **changes)
-
-
-def _names(known: set[str]) -> str:
-    return ", ".join(sorted(known))
 
 
 def _say(sentence: str) -> None:
@@ -102,13 +94,18 @@ def _finish(path: Path, trace: Trace, as_json: bool, recordings: Path | None) ->
             recording = write_recording(trace, recordings / file_name(trace, datetime.now(UTC)))
         except SpherlocError as error:
             code = _report(error)
-    print(json.dumps(as_record(path, trace, recording)) if as_json else as_text(path, trace, recording), flush=True)
+    diagnosis = diagnose(trace)
+    if as_json:
+        print(json_text(as_record(path, trace, diagnosis, recording)), flush=True)
+    else:
+        print(as_text(path, trace, diagnosis, recording), flush=True)
     return code
 
 
-def as_record(path: Path, trace: Trace, recording: Path | None) -> dict[str, Any]:
-    """A run as a JSON object."""
-    pose = trace.cam_from_map
+def as_record(path: Path, trace: Trace, diagnosis: Diagnosis, recording: Path | None) -> dict[str, Any]:
+    """A run as what ``json_text`` writes."""
+    pose, certificate = trace.cam_from_map, trace.certificate
+    proven = {} if certificate is None else {"gap": certificate.gap, "proven": certificate.proven}
     return {
         "scene": str(path),
         "name": trace.problem.name,
@@ -121,11 +118,13 @@ def as_record(path: Path, trace: Trace, recording: Path | None) -> dict[str, Any
         "time_ms": trace.timings_ms["total"],
         **asdict(evaluate(trace)),
         "message": trace.message,
+        "certificate": None if certificate is None else asdict(certificate) | proven,
+        "diagnosis": asdict(diagnosis),
         "recording": None if recording is None else str(recording),
     }
 
 
-def as_text(path: Path, trace: Trace, recording: Path | None) -> str:
+def as_text(path: Path, trace: Trace, diagnosis: Diagnosis, recording: Path | None) -> str:
     """A run as a few lines for people."""
     metrics, pose = evaluate(trace), trace.cam_from_map
     lines = [f"{trace.problem.name} ({path}), {trace.estimator}, seed {trace.seed}"]
@@ -146,6 +145,11 @@ def as_text(path: Path, trace: Trace, recording: Path | None) -> str:
         )
     if metrics.precision is not None and metrics.recall is not None and metrics.f1 is not None:
         lines.append(f"  precision {metrics.precision:.3f}, recall {metrics.recall:.3f}, F1 {metrics.f1:.3f}")
+    if trace.certificate is not None:
+        lines.append(f"  {proof(trace.certificate)}; expected false sets of this size: {chance(trace.certificate)}")
+        lines += [f"  {sentence}" for sentence in (warning(trace.certificate),) if sentence]
+    if diagnosis.doubtful:
+        lines.append(f"  diagnosis: {diagnosis.cause}. {diagnosis.summary} {diagnosis.advice}".rstrip())
     if recording is not None:
         lines.append(f"  recorded: {recording}")
     return "\n".join(lines)

@@ -28,8 +28,9 @@ def run(
 ) -> int:
     """Solve localization problems and record each run.
 
-    Prints pose, inliers and time of every scene and, where the truth is known, the errors. Ends with 0 if every scene
-    has a pose, 1 if one has none, 2 if an input is wrong.
+    Prints pose, inliers and time of every scene; where the truth is known, the errors; what is proven; and what is
+    wrong with a run that failed or is doubtful. Ends with 0 if every scene has a pose, 1 if one has none, 2 if an
+    input is wrong.
 
     For example:
 
@@ -39,12 +40,14 @@ def run(
 
     spherloc run scenes/mei_outliers_90.toml --estimator ransac-2p --option iterations=5000 confidence=0.999
 
+    spherloc run scenes/mei_outliers_90.toml --option gravity_sd_deg=inf robust=huber
+
     Args:
         scenes: Scene files (TOML), one or more.
-        estimator: mc (deterministic maximum consensus) or ransac-2p.
+        estimator: mc (deterministic maximum consensus), ransac-2p or another one; a wrong name lists them all.
         seed: Seed of the estimator and, in synthetic scenes, of the simulation; the scene's own if not given.
-        option: Options of the estimator, such as bound_px=4.
-        json: Print one JSON object a scene, on one line.
+        option: Options of the estimator, such as bound_px=4; none and inf are values where they make sense.
+        json: Print one JSON object a scene, on one line; infinity is the text "inf".
         record: Write a recording of each run.
         recordings: Folder of the recordings.
     """

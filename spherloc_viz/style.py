@@ -7,6 +7,7 @@ OUTLIER: RGB = (213, 70, 60)
 CLIQUE: RGB = (240, 180, 30)
 ESTIMATE: RGB = (40, 120, 220)
 TRUTH: RGB = (160, 130, 210)
+RIVAL: RGB = (110, 205, 215)
 SAMPLE: RGB = (230, 90, 190)
 UNDECIDED: RGB = (140, 146, 156)
 SPHERE: RGB = (170, 190, 215)
@@ -15,19 +16,22 @@ LEGEND: tuple[tuple[RGB, str], ...] = (
     (INLIER, "inlier"),
     (OUTLIER, "outlier"),
     (CLIQUE, "maximum clique"),
-    (SAMPLE, "sampled pair"),
+    (SAMPLE, "sample"),
     (ESTIMATE, "estimate"),
     (TRUTH, "truth"),
+    (RIVAL, "rival pose"),
     (UNDECIDED, "not decided yet"),
 )
 """What each colour means, in the order in which the legend shows it."""
 
-LAYERS: tuple[str, ...] = ("map", "cameras", "sphere", "rays", "yaw ring", "balls")
+LAYERS: tuple[str, ...] = ("map", "cameras", "sphere", "rays", "yaw ring", "balls", "pairs")
 """Layers of the canvas that can be switched on and off."""
 
 MAX_DRAWN_RAYS = 600
 MAX_DRAWN_ARCS = 240
 MAX_DRAWN_BALLS = 70
+MAX_DRAWN_PAIRS = 200
+MAX_DRAWN_RIVALS = 8
 
 
 def css(color: RGB) -> str:

@@ -10,11 +10,16 @@ from rerun.chunk import RrdReader
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.datasets import bundled_scenes, load_scene
 from spherloc.estimators import estimate
-from spherloc.geometry import so3_exp
+from spherloc.geometry import so3_exp, yaw_of, yaw_rotation
 from spherloc.problem import Problem
-from spherloc.trace import Trace
+from spherloc.trace import Certificate, ConsensusStage, DecisionStage, RefinementStage, Trace
 
-RUNS = (("mei_outliers_80", "mc"), ("fisheye_outliers_80", "ransac-2p"), ("panorama_outliers_90", "mc"))
+RUNS = (
+    ("mei_outliers_80", "mc"),
+    ("fisheye_outliers_80", "ransac-2p"),
+    ("panorama_outliers_90", "mc"),
+    ("mei_outliers_90", "mc-exact"),
+)
 
 
 def scene_problem(name: str) -> Problem:
@@ -36,6 +41,7 @@ def odd_problem(rng: np.random.Generator, turn: int) -> Problem:
         gravity_camera=rotation[0],
         gravity_map=rotation[1],
         gravity_bound_rad=float(rng.uniform(0, 0.1)),
+        gravity_sd_rad=(None, 0.0, 0.01, np.inf)[turn % 4],
         bound_px=float(rng.uniform(1, 9)) if turn % 3 else None,
         truth_cam_from_map=np.column_stack([rotation, rng.normal(size=3)]) if known else None,
         truth_inliers=rng.random(9) < 0.5 if known else None,
@@ -51,6 +57,36 @@ def lost_run() -> Trace:
     trace = estimate(replace(problem, points=alone, truth_cam_from_map=None, truth_inliers=None), "mc")
     assert trace.cam_from_map is None
     return trace
+
+
+def exact_run(**changes: Any) -> Trace:
+    """A run by hand as "auto" and an exact estimator leave it, with its certificate; ``changes`` are of the stage.
+
+    Its bound peaks where the best pose looks, and there is a rival.
+    """
+    trace = estimate(scene_problem("mei_outliers_80"), "mc")
+    pose, clique = trace.cam_from_map, np.flatnonzero(trace.inlier_mask)
+    refinement = trace.stage(RefinementStage)
+    assert pose is not None and refinement is not None
+    rival = np.column_stack([pose[:, :3] @ yaw_rotation(0.5), pose[:, 3] + [1.0, 0.0, 2.0]])
+    yaw_rad = yaw_of(trace.problem.aligned.align_pose(pose)[:, :3])
+    bound = np.full(1440, len(clique) - 3, np.int32)
+    bound[int((yaw_rad + np.pi) / np.pi * 720)] = len(clique)
+    stage = ConsensusStage(
+        arcs=12_345,
+        seed_support=len(clique) - 2,
+        bound=bound,
+        effort=678,
+        finished=True,
+        yaw_rad=yaw_rad,
+        clique=clique.astype(np.int32),
+        cam_from_map=np.array([pose, rival]),
+        support=np.array([len(clique), 6], np.int32),
+    )
+    decision = DecisionStage("mc-exact", "100 matches are few enough to compare all pairs.", 500, 0.2)
+    certificate = Certificate(upper_bound=len(clique), lower_bound=len(clique), chance_sets=2e-9)
+    stages = (decision, replace(stage, **changes), refinement)
+    return replace(trace, estimator="auto", stages=stages, certificate=certificate)
 
 
 class Recorded:

@@ -1,17 +1,22 @@
 """The parts of the page that need no browser: colours, plots, text, steps, scenes, options, views, threads."""
 
 import dataclasses
+import math
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
+import viser
 
 from spherloc import registry
 from spherloc.datasets import bundled_scenes, load_scene
 from spherloc.datasets.synthetic import SyntheticScene
+from spherloc.diagnosis import Cause, Diagnosis
 from spherloc.errors import InputError
 from spherloc.estimators import estimate, options_type
 from spherloc_viz import style
@@ -19,12 +24,14 @@ from spherloc_viz.app import views
 from spherloc_viz.app.catalog import OWN_CAMERA, Catalog, SceneWish
 from spherloc_viz.app.charts import MOST_STEPS, aligned_data
 from spherloc_viz.app.colors import light_bytes, surface_bytes
-from spherloc_viz.app.estimator_controls import field_docs
+from spherloc_viz.app.estimator_controls import EstimatorControls, Option, estimator_labels
 from spherloc_viz.app.newest import Newest
 from spherloc_viz.app.steps_panel import find_step
-from spherloc_viz.app.text import status_html, step_html, table_html
+from spherloc_viz.app.text import diagnosis_html, status_html, step_html, table_html
+from spherloc_viz.app.viser_seams import start_viser, stop_viser
 from spherloc_viz.layers import paint, steps
 from spherloc_viz.layers.primitives import Balls, Chart, Curve, Points, Step, Table
+from spherloc_viz.options import option_fields
 
 COLORS = np.array([color for color, _ in style.LEGEND] + [style.SPHERE], np.uint8)
 
@@ -91,6 +98,9 @@ def test_every_text_is_escaped() -> None:
     pieces = [
         step_html(Step("key", EVIL, EVIL, EVIL, EVIL)),
         table_html(Table("any", ("", ""), ((EVIL, EVIL), ("number", 3.0)))),
+        table_html(Table("any", (EVIL, "", ""), ((EVIL, EVIL, EVIL),))),
+        diagnosis_html(Diagnosis(Cause.AMBIGUOUS, True, EVIL, (EVIL,), EVIL, False)),
+        diagnosis_html(Diagnosis(Cause.OK, False, EVIL, (), "", True)),
         status_html(EVIL, wrong=True),
     ]
     for html in pieces:
@@ -116,7 +126,15 @@ def test_a_step_is_kept_over_runs_where_it_can(key: str, found: str) -> None:
 def wish_of(catalog: Catalog, label: str) -> SceneWish:
     scene = catalog.synthetic(label)
     assert scene is not None
-    return SceneWish(label, scene.seed, OWN_CAMERA, scene.correspondences, scene.noise_px, scene.outlier_rate)
+    return SceneWish(
+        label,
+        scene.seed,
+        OWN_CAMERA,
+        scene.correspondences,
+        scene.noise_px,
+        scene.outlier_rate,
+        scene.gravity_error_deg,
+    )
 
 
 def test_untouched_controls_give_the_scene_itself() -> None:
@@ -135,6 +153,14 @@ def test_another_camera_sees_the_same_simulation() -> None:
         assert problem.camera is camera and len(problem) == 100
 
 
+def test_gravity_error_is_simulated_and_stated() -> None:
+    catalog = Catalog(None)
+    wish = wish_of(catalog, next(iter(catalog.scenes)))
+    exact, off = catalog.problem(wish), catalog.problem(replace(wish, gravity_error_deg=0.5))
+    assert off.gravity_sd_rad == pytest.approx(np.radians(0.5)) and np.array_equal(exact.points, off.points)
+    assert not np.array_equal(exact.gravity_camera, off.gravity_camera)
+
+
 def test_the_given_scene_comes_first_and_once(tmp_path: Path) -> None:
     bundled = list(bundled_scenes().values())
     copy = tmp_path / "mine.toml"
@@ -146,15 +172,120 @@ def test_the_given_scene_comes_first_and_once(tmp_path: Path) -> None:
         Catalog(tmp_path / "missing.toml")
 
 
+def test_a_diagnosis_tells_cause_evidence_and_advice_and_is_quiet_about_good_runs() -> None:
+    wrong = Diagnosis(Cause.GRAVITY_OFF, True, "The summary.", ("One.", "Two."), "The advice.", False)
+    html = diagnosis_html(wrong)
+    for part in ("Gravity prior off", "The summary.", "<li", "One.", "Two.", "The advice.", "without the truth"):
+        assert part in html
+    quiet = diagnosis_html(replace(wrong, cause=Cause.OK, doubtful=False, evidence=()))
+    assert "The summary." in quiet and "advice" not in quiet and style.css(style.OUTLIER) not in quiet
+
+
+def test_wide_tables_have_headings_and_narrow_ones_none() -> None:
+    assert "off the truth" in table_html(Table("poses", ("", "yaw", "off the truth"), (("1", "2", "3"),)))
+    assert "this run" not in table_html(Table("outcome", ("", "this run"), (("1", "2"),)))
+
+
+def test_estimators_are_offered_in_their_order() -> None:
+    names = ("auto", "mc", "mc-exact", "ransac-2p", "ransac-epnp", "ransac-svd", "zebra")
+    labels = estimator_labels(names)
+    assert list(labels.values()) == ["mc-exact", "mc", "ransac-2p", "auto", "ransac-epnp", "ransac-svd", "zebra"]
+    assert all(label.startswith(name) for label, name in labels.items()) and len(labels) == len(names)
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[viser.ViserServer]:
+    server = start_viser("a key of this test")
+    yield server
+    stop_viser(server)
+
+
+@dataclasses.dataclass(frozen=True)
+class Every:
+    """One option of every form."""
+
+    limit: float | None = None
+    """A limit."""
+    confidence: float | None = 0.95
+    """A preset that is not in the list."""
+    gravity_sd_deg: float | None = None
+    """A preset."""
+    kernel: Literal["none", "soft_l1"] = "none"
+    """A choice."""
+    wise: bool = True
+    """A switch."""
+    tries: int = 7
+    """A number."""
+    time_budget_s: float = math.inf
+    """A limit that need not be."""
+    bound_px: float = 3.0
+    """A slider."""
+
+
+def test_every_form_of_option_has_a_widget_that_gives_its_default(server: viser.ViserServer) -> None:
+    fields = option_fields(Every)
+    options = {field.name: Option(server.gui, field) for field in fields}
+    assert Every(**{name: option.read() for name, option in options.items()}) == Every()
+    assert {name: type(option.widget).__name__ for name, option in options.items()} == {
+        "limit": "GuiTextHandle",
+        "confidence": "GuiDropdownHandle",
+        "gravity_sd_deg": "GuiDropdownHandle",
+        "kernel": "GuiDropdownHandle",
+        "wise": "GuiCheckboxHandle",
+        "tries": "GuiNumberHandle",
+        "time_budget_s": "GuiTextHandle",
+        "bound_px": "GuiSliderHandle",
+    }
+    assert options["time_budget_s"].widget.label == "Time budget (s)"
+
+
+@pytest.mark.parametrize(
+    ("name", "shown", "value"),
+    [
+        ("limit", "2.5", 2.5),
+        ("limit", "inf", math.inf),
+        ("limit", "", None),
+        ("gravity_sd_deg", "unknown (6 DoF)", math.inf),
+        ("gravity_sd_deg", "0: exact (4 DoF)", 0.0),
+        ("gravity_sd_deg", "as the problem states", None),
+        ("kernel", "soft l1", "soft_l1"),
+        ("wise", False, False),
+        ("time_budget_s", "0.5", 0.5),
+    ],
+)
+def test_widgets_mean_what_they_show(server: viser.ViserServer, name: str, shown: object, value: object) -> None:
+    field = next(field for field in option_fields(Every) if field.name == name)
+    option = Option(server.gui, field)
+    option.widget.value = shown
+    assert option.read() == value and type(option.read()) is type(value)
+
+
+def test_what_is_no_number_is_a_sentence(server: viser.ViserServer) -> None:
+    field = next(field for field in option_fields(Every) if field.name == "limit")
+    option = Option(server.gui, field)
+    option.widget.value = "soon"
+    with pytest.raises(InputError, match=r"option limit is 'soon'; give a number or none\."):
+        option.read()
+
+
+def test_controls_offer_every_estimator_with_its_defaults(server: viser.ViserServer) -> None:
+    controls = EstimatorControls(server.gui, lambda event: None)
+    assert controls.read() == ("mc", options_type("mc")())
+    for label, name in estimator_labels(registry.names("estimators")).items():
+        controls._estimator.value = label
+        assert controls.read() == (name, options_type(name)())
+        assert [other for other, folder in controls._folders.items() if folder.visible] == [name]
+
+
 @pytest.mark.parametrize("estimator", registry.names("estimators"))
 def test_every_option_has_its_hint(estimator: str) -> None:
-    kind = options_type(estimator)
-    docs = field_docs(kind)
-    assert set(docs) == {field.name for field in dataclasses.fields(kind)}
-    assert all(text.endswith(".") for text in docs.values())
+    fields = option_fields(options_type(estimator))
+    assert all(field.doc.endswith(".") for field in fields)
+    assert {field.name for field in fields if field.shared} == {"noise_px", "gravity_sd_deg", "robust"}
+    assert {"bound_px"} <= {field.name for field in fields if not field.shared}
 
 
-@pytest.mark.parametrize("estimator", ["mc", "ransac-2p"])
+@pytest.mark.parametrize("estimator", ["mc", "mc-exact", "ransac-2p"])
 @pytest.mark.parametrize("aspect", [0.6, 1.0, 2.2])
 def test_views_hold_what_they_are_about(scene_of: Callable[..., SyntheticScene], estimator: str, aspect: float) -> None:
     trace = estimate(scene_of("panorama", correspondences=60).problem(), estimator)

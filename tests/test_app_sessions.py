@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import viser
 
+from spherloc.diagnosis import Cause, Diagnosis
 from spherloc.errors import RecordingError
 from spherloc.estimators import estimate
 from spherloc.trace import Trace
@@ -36,6 +37,7 @@ outlier_rate = 0.25
 noise_px = 0.5
 seed = 1
 """
+RIVAL = np.column_stack([np.eye(3), [1.0, 2.0, 3.0]])
 HELLO = {
     "type": "ViewerCameraMessage",
     "wxyz": (1.0, 0.0, 0.0, 0.0),
@@ -233,11 +235,50 @@ def test_a_wrong_seed_is_a_sentence_and_the_page_goes_on(house: House, seed: str
 
 def test_a_wrong_option_is_a_sentence(house: House) -> None:
     page, session = house.visit()
-    page.set(session._estimator._estimator, "ransac-2p")
+    page.set(session._estimator._estimator, "ransac-2p (two points)")
     until(lambda: session._trace is not None and session._trace.estimator == "ransac-2p")
     assert [name for name, folder in session._estimator._folders.items() if folder.visible] == ["ransac-2p"]
-    page.set(session._estimator._options["ransac-2p"]["iterations"], 10**9)
+    page.set(session._estimator._options["ransac-2p"]["iterations"].widget, 10**9)
     until(lambda: "give a whole number up to" in shown(session))
+
+
+def test_unknown_gravity_reaches_the_estimator(house: House) -> None:
+    page, session = house.visit()
+    page.set(session._estimator._options["mc"]["gravity_sd_deg"].widget, "unknown (6 DoF)")
+    until(lambda: session._trace is not None and session._trace.options.gravity_sd_deg == np.inf)
+    until(lambda: len(house.notes.traces) == 2)
+
+
+def test_diagnosis_comes_after_the_picture_and_only_for_the_newest_run(
+    house: House, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page, session = house.visit()
+    until(lambda: session._diagnosed is not None and session._diagnosed[0] is session._trace)
+    entered, gate, seen = threading.Event(), threading.Event(), []
+
+    def slow(trace: Trace) -> Diagnosis:
+        seen.append(trace)
+        entered.set()
+        assert gate.wait(60)
+        return Diagnosis(Cause.AMBIGUOUS, True, "Two poses.", ("Both explain 9.",), "Look twice.", True, RIVAL)
+
+    monkeypatch.setattr(session_module, "diagnose", slow)
+    page.set(session._scene._noise, 1.0)
+    assert entered.wait(60)
+    until(lambda: "Diagnosing" in session._diagnosis.content)
+    for noise in np.linspace(1.1, 3.0, 15):
+        page.set(session._scene._noise, float(noise))
+    until(lambda: session._trace is not seen[0] and len(house.notes.traces) == 2)
+    page.set(session._steps._buttons, "Previous")
+    until(lambda: "Refinement" in shown(session))
+    assert len(seen) == 1 and "cameras/rival" not in session._painter._drawn, "the page goes on meanwhile"
+    gate.set()
+    until(lambda: "Two poses." in session._diagnosis.content)
+    assert len(seen) == 2 and seen[1] is session._trace, "of fifteen runs meanwhile only the newest was diagnosed"
+    page.set(session._steps._buttons, "Next")
+    until(lambda: "cameras/rival" in session._painter._drawn)
+    page.set(session._steps._buttons, "Previous")
+    until(lambda: not session._painter._drawn["cameras/rival"][0].visible)
 
 
 def test_a_full_disk_and_a_bug_are_sentences(house: House, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -257,7 +298,7 @@ def test_a_full_disk_and_a_bug_are_sentences(house: House, monkeypatch: pytest.M
 def test_pages_share_nothing_and_leave_nothing(house: House) -> None:
     before = threads()
     (first, one), (second, two) = house.visit(), house.visit()
-    assert threads() == before + 4
+    assert threads() == before + 6
     kept = two._trace
     first.set(one._scene._points, 33)
     until(lambda: one._trace is not None and len(one._trace.problem) == 33)
@@ -265,6 +306,6 @@ def test_pages_share_nothing_and_leave_nothing(house: House) -> None:
     until(lambda: one._steps._choice.value.endswith("Refinement"))
     assert two._trace is kept and two._scene._points.value == 20 and two._steps._choice.value.endswith("Outcome")
     first.close()
-    until(lambda: threads() == before + 2 and len(house.sessions._open) == 1)
+    until(lambda: threads() == before + 3 and len(house.sessions._open) == 1)
     second.close()
     until(lambda: threads() == before and not house.sessions._open)

@@ -4,10 +4,20 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
+
+from spherloc.datasets import load_scene
+from spherloc.diagnosis import Cause, Diagnosis
+from spherloc.errors import InputError
+from spherloc.estimators import estimate
+from spherloc.trace import Certificate
+from spherloc_viz import batch
+from spherloc_viz.options import json_text
 
 ROOT = Path(__file__).resolve().parents[1]
 SCENE = ROOT / "scenes" / "mei_outliers_80.toml"
@@ -54,7 +64,7 @@ def tiny(folder: Path, toml: str = HEAD + CAMERA + GRAVITY, rows: str | bytes = 
     return folder / "scene.toml"
 
 
-@pytest.mark.parametrize("estimator", ["mc", "ransac-2p"])
+@pytest.mark.parametrize("estimator", ["mc", "mc-exact", "ransac-2p"])
 def test_run_prints_one_json_object_a_scene_and_records_each(tmp_path: Path, estimator: str) -> None:
     scenes = [SCENE, ROOT / "scenes" / "panorama_outliers_90.toml"]
     result = spherloc("run", *scenes, "--estimator", estimator, "--seed", "5", "--json", cwd=tmp_path)
@@ -89,7 +99,126 @@ def test_same_seed_same_pose_and_other_seed_other_problem(tmp_path: Path) -> Non
 def test_options_reach_the_estimator(tmp_path: Path) -> None:
     words = ("--estimator", "ransac-2p", "--option", "iterations=50", "confidence=0.9", "--json", "--no-record")
     record = json.loads(spherloc("run", SCENE, *words, cwd=tmp_path).stdout)
-    assert record["options"] == {"bound_px": 8.0, "iterations": 50, "confidence": 0.9}
+    options = record["options"]
+    assert (options["bound_px"], options["iterations"], options["confidence"]) == (8.0, 50, 0.9)
+
+
+def refuse(word: str) -> None:
+    raise AssertionError(f"{word} is no JSON")
+
+
+def test_options_of_every_form_reach_the_estimator_and_json(tmp_path: Path) -> None:
+    words = ("gravity_sd_deg=inf", "robust=huber", "confidence=none", "local_optimization=true")
+    result = spherloc(
+        "run", SCENE, "--estimator", "ransac-2p", "--json", "--no-record", "--option", *words, cwd=tmp_path
+    )
+    (line,) = result.stdout.splitlines()
+    options = json.loads(line, parse_constant=refuse)["options"]
+    assert options["gravity_sd_deg"] == "inf" and options["robust"] == "huber"
+    assert options["confidence"] is None and options["local_optimization"] is True
+
+
+@pytest.mark.parametrize("estimator", ["mc", "mc-exact"])
+def test_json_has_certificate_and_diagnosis(tmp_path: Path, estimator: str) -> None:
+    scene = ROOT / "scenes" / "mei_outliers_90.toml"
+    result = spherloc("run", scene, "--estimator", estimator, "--json", "--no-record", cwd=tmp_path)
+    record = json.loads(result.stdout, parse_constant=refuse)
+    if estimator == "mc":
+        assert record["certificate"] is None
+    else:
+        certificate = record["certificate"]
+        assert certificate["upper_bound"] - certificate["lower_bound"] == certificate["gap"] == 0
+        assert certificate["proven"] is True and 0 <= certificate["chance_sets"] < 1e-6
+    assert set(record["diagnosis"]) == {item.name for item in fields(Diagnosis)}
+    assert record["diagnosis"]["cause"] == "ok" and record["diagnosis"]["doubtful"] is False
+
+
+def test_text_tells_what_is_proven(tmp_path: Path) -> None:
+    scene = ROOT / "scenes" / "mei_outliers_90.toml"
+    result = spherloc("run", scene, "--estimator", "mc-exact", "--no-record", cwd=tmp_path)
+    assert "proven optimal: no pose explains more than" in result.stdout
+    assert "expected false sets of this size:" in result.stdout and "diagnosis" not in result.stdout
+
+
+def test_doubtful_runs_get_a_line_of_diagnosis() -> None:
+    trace = estimate(load_scene(SCENE).problem(), "mc")
+    wrong = Diagnosis(
+        Cause.GRAVITY_OFF, True, "It leans.", ("By 3 degrees.",), "Give better gravity.", True, np.eye(3, 4)
+    )
+    text = batch.as_text(SCENE, trace, wrong, None)
+    assert "\n  diagnosis: gravity prior off. It leans. Give better gravity." in text
+    assert "diagnosis" not in batch.as_text(SCENE, trace, replace(wrong, cause=Cause.OK, doubtful=False), None)
+    record = json.loads(json_text(batch.as_record(SCENE, trace, wrong, None)))
+    assert record["diagnosis"]["cause"] == "gravity prior off" and record["diagnosis"]["evidence"] == ["By 3 degrees."]
+    assert record["diagnosis"]["rival_cam_from_map"] == np.eye(3, 4).tolist()
+
+
+def test_an_answer_that_cannot_be_known_is_said() -> None:
+    trace = estimate(load_scene(SCENE).problem(), "mc")
+    fine = Diagnosis(Cause.OK, False, "", (), "", True)
+    text = batch.as_text(SCENE, replace(trace, certificate=Certificate(6, 4, np.inf)), fine, None)
+    assert "not proven optimal: no pose explains more than 6, so at most 2 more" in text
+    assert "The answer cannot be known: inf sets of 4 wrong matches" in text
+
+
+@dataclass(frozen=True)
+class Every:
+    """One option of every form."""
+
+    bound_px: float = 3.0
+    tries: int = 7
+    wise: bool = False
+    kernel: Literal["none", "huber"] = "none"
+    limit: float | None = 1.0
+    choice: Literal["a", "b"] | None = None
+
+
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [
+        ("bound_px=4", 4.0),
+        ("bound_px=inf", np.inf),
+        ("bound_px= 1e-2 ", 0.01),
+        ("tries=12", 12),
+        ("wise=true", True),
+        ("wise=False", False),
+        ("kernel=none", "none"),
+        ("kernel=huber", "huber"),
+        ("limit=none", None),
+        ("limit=None", None),
+        ("limit=2", 2.0),
+        ("limit=inf", np.inf),
+        ("choice=b", "b"),
+        ("choice=none", None),
+    ],
+)
+def test_option_values(monkeypatch: pytest.MonkeyPatch, setting: str, value: object) -> None:
+    monkeypatch.setattr(batch, "options_type", lambda name: Every)
+    found = batch.parse_settings("any", [setting])[setting.partition("=")[0]]
+    assert found == value and type(found) is type(value)
+
+
+@pytest.mark.parametrize(
+    ("setting", "said"),
+    [
+        ("bound_px=wide", "bound_px is 'wide'; give a number."),
+        ("bound_px=nan", "bound_px is 'nan'; give a number."),
+        ("bound_px=none", "bound_px is 'none'; give a number."),
+        ("tries=1.5", "tries is '1.5'; give a whole number."),
+        ("wise=1", "wise is '1'; give true or false."),
+        ("kernel=cauchy", "kernel is 'cauchy'; give none or huber."),
+        ("limit=soon", "limit is 'soon'; give a number or none."),
+        ("choice=c", "choice is 'c'; give a, b or none."),
+        ("choice=", "choice is ''; give a, b or none."),
+        ("colour=3", "option 'colour=3' is unknown to any; give KEY=VALUE with bound_px, tries,"),
+        ("tries", "option 'tries' is unknown to any"),
+    ],
+)
+def test_wrong_option_values_name_what_may_be_given(monkeypatch: pytest.MonkeyPatch, setting: str, said: str) -> None:
+    monkeypatch.setattr(batch, "options_type", lambda name: Every)
+    with pytest.raises(InputError) as error:
+        batch.parse_settings("any", [setting])
+    assert said in str(error.value)
 
 
 def test_bound_of_the_scene_is_used_and_truth_may_be_unknown(tmp_path: Path) -> None:
@@ -155,6 +284,7 @@ def test_bad_input_is_one_sentence_and_exit_code_2(
         (("run", SCENE, "--option", "colour=3"), "colour"),
         (("run", SCENE, "--option", "bound_px=wide"), "wide"),
         (("run", SCENE, "--option", "bound_px=-1"), "bound_px"),
+        (("run", SCENE, "--option", "robust=tukey"), "none, huber or cauchy"),
         (("run", SCENE, "--seed", "-4"), "seed"),
         (("view", "missing.rrd"), "missing.rrd"),
         (("play", "missing.toml"), "missing.toml"),

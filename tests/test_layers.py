@@ -4,16 +4,25 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from recording_samples import exact_run, scene_problem
 
 from spherloc.datasets import bundled_scenes, load_scene
 from spherloc.estimators import estimate
 from spherloc.estimators.ransac import RansacOptions
 from spherloc.geometry import camera_centre, transform, yaw_of
 from spherloc.problem import Problem
-from spherloc.trace import RansacStage, RefinementStage, Trace, TranslationStage, YawStage
+from spherloc.trace import (
+    Certificate,
+    ConsensusStage,
+    RansacStage,
+    RefinementStage,
+    Trace,
+    TranslationStage,
+    YawStage,
+)
 from spherloc_viz import style
 from spherloc_viz.layers import paint, steps
-from spherloc_viz.layers.primitives import Balls, Mesh, Picture, Points, SceneItem, Segments
+from spherloc_viz.layers.primitives import Balls, Curve, Mesh, Picture, Points, SceneItem, Segments
 
 SCENES = sorted(bundled_scenes())
 
@@ -66,6 +75,182 @@ def test_every_step_is_drawable(scene: str, estimator: str) -> None:
             for curve in chart.curves:
                 assert len(curve.x) == len(curve.y) and np.isfinite(curve.x).all() and np.isfinite(curve.y).all()
                 assert (np.diff(curve.x) >= 0).all()
+
+
+@pytest.fixture(scope="module")
+def exact() -> Trace:
+    return exact_run()
+
+
+def test_every_step_of_an_exact_run_is_drawable(exact: Trace) -> None:
+    assert [step.key for step in steps(exact)][2:] == [
+        "decision",
+        "consensus-bound",
+        "consensus-clique",
+        "consensus-poses",
+        "refinement",
+        "outcome",
+    ]
+    for index, step in enumerate(steps(exact)):
+        picture = paint(exact, index)
+        assert step.caption.count(". ") == 1 and step.caption.endswith("."), step.caption
+        names = [found.name for found in picture.scene]
+        assert len(set(names)) == len(names)
+        for found in picture.scene:
+            assert found.layer in style.LAYERS
+            check_item(found)
+
+
+def test_consensus_chart_holds_the_bound_against_what_is_explained(exact: Trace) -> None:
+    stage = exact.stage(ConsensusStage)
+    assert stage is not None and exact.problem.truth_cam_from_map is not None
+    curves = curves_of(at(exact, "consensus-clique"), "consensus")
+    np.testing.assert_array_equal(curves["bound"].y, stage.bound)
+    assert curves["bound"].x[0] == -180 and curves["bound"].x[-1] == pytest.approx(179.75)
+    assert set(curves["first guess"].y) == {stage.seed_support} and set(curves["best pose"].y) == {stage.support[0]}
+    assert curves["truth"].x[0] == pytest.approx(np.degrees(yaw_of(exact.problem.truth_cam_from_map[:, :3])))
+    assert curves["estimate"].x[0] == pytest.approx(np.degrees(stage.yaw_rad))
+
+
+def curves_of(picture: Picture, name: str) -> dict[str, Curve]:
+    return {curve.label: curve for chart in picture.charts if chart.name == name for curve in chart.curves}
+
+
+def test_the_peak_of_the_bound_is_gold_where_the_estimate_looks(exact: Trace) -> None:
+    picture = at(exact, "consensus-bound")
+    bars, spoke = item(picture, "ring/bars"), item(picture, "ring/estimate")
+    assert isinstance(bars, Segments) and isinstance(spoke, Segments)
+    gold = is_color(bars.colors, style.CLIQUE)
+    assert np.count_nonzero(gold) == 1
+    along = [line[1] - line[0] for line in (bars.points[gold][0], spoke.points[0])]
+    cosine = along[0] @ along[1] / np.linalg.norm(along[0]) / np.linalg.norm(along[1])
+    assert cosine > np.cos(np.radians(1.0))
+
+
+def test_what_pokes_out_of_the_green_circle_may_hide_a_better_pose() -> None:
+    """The circle has the height of the best support: a bar is longer exactly where the bound is larger."""
+    bound = np.random.default_rng(4).integers(0, 31, 1440).astype(np.int32)
+    trace = exact_run(bound=bound)
+    picture = at(trace, "consensus-bound")
+    bars, circle = item(picture, "ring/bars"), item(picture, "ring/support")
+    assert isinstance(bars, Segments) and isinstance(circle, Segments)
+    centre = item(picture, "sphere/surface").vertices.mean(axis=0)  # pyright: ignore[reportAttributeAccessIssue]
+    reach, limit = (np.linalg.norm(ends - centre, axis=1) for ends in (bars.points[:, 1], circle.points[:, 0]))
+    stage = trace.stage(ConsensusStage)
+    assert stage is not None
+    np.testing.assert_array_equal(reach > limit + 1e-9, bound.reshape(360, 4).max(axis=1) > stage.support[0])
+    share = 100 * np.mean(bound > stage.support[0])
+    assert f"{share:.3g} % of all yaws could hide a better one" in picture.step.caption
+
+
+def test_the_clique_is_gold_on_the_sphere_and_on_the_map(exact: Trace) -> None:
+    stage = exact.stage(ConsensusStage)
+    assert stage is not None
+    picture = at(exact, "consensus-clique")
+    for name in ("map/points", "sphere/bearings"):
+        dots = item(picture, name)
+        assert isinstance(dots, Points) and dots.ids is not None
+        np.testing.assert_array_equal(dots.ids[is_color(dots.colors, style.CLIQUE)], np.sort(stage.clique))
+    pairs = item(picture, "pairs/clique")
+    assert isinstance(pairs, Segments) and len(pairs.points) == len(stage.clique) * (len(stage.clique) - 1) // 2
+    assert f"All {len(pairs.points)} pairs" in picture.step.note
+
+
+def test_pairs_of_a_large_clique_are_thinned_by_a_stated_rule() -> None:
+    trace = exact_run(clique=np.arange(60, dtype=np.int32))
+    picture = at(trace, "consensus-clique")
+    pairs = item(picture, "pairs/clique")
+    assert isinstance(pairs, Segments) and len(pairs.points) == style.MAX_DRAWN_PAIRS
+    assert f"{style.MAX_DRAWN_PAIRS} of 1,770 pairs" in picture.step.note
+
+
+def test_rivals_are_ghosts_and_rows(exact: Trace) -> None:
+    stage, aligned = exact.stage(ConsensusStage), exact.problem.aligned
+    assert stage is not None
+    picture = at(exact, "consensus-poses")
+    best, rivals = item(picture, "cameras/estimate"), item(picture, "cameras/rivals")
+    assert isinstance(best, Segments) and isinstance(rivals, Segments)
+    np.testing.assert_allclose(best.points[0, 0], camera_centre(aligned.align_pose(stage.cam_from_map[0])), atol=1e-9)
+    np.testing.assert_allclose(rivals.points[0, 0], camera_centre(aligned.align_pose(stage.cam_from_map[1])), atol=1e-9)
+    assert is_color(rivals.colors, style.RIVAL).all()
+    assert [row[1] for row in picture.tables[0].rows] == [str(support) for support in stage.support]
+    assert picture.tables[0].columns[-1] == "off the truth"
+
+
+def test_many_rivals_are_thinned_and_none_is_said() -> None:
+    pose = exact_run().cam_from_map
+    assert pose is not None
+    many = exact_run(cam_from_map=np.tile(pose, (20, 1, 1)), support=np.arange(40, 20, -1, dtype=np.int32))
+    picture = at(many, "consensus-poses")
+    assert len(picture.tables[0].rows) == 1 + style.MAX_DRAWN_RIVALS
+    assert f"{style.MAX_DRAWN_RIVALS} of 19 other poses" in picture.step.note
+    alone = at(exact_run(cam_from_map=pose[None], support=np.array([20], np.int32)), "consensus-poses")
+    assert "cameras/rivals" not in {found.name for found in alone.scene}
+    assert "No clearly different pose" in alone.step.caption
+
+
+def test_a_set_that_no_pose_explains_is_said() -> None:
+    picture = at(exact_run(clique=np.arange(30, dtype=np.int32)), "consensus-clique")
+    assert "10 more than the best pose explains" in picture.step.caption
+    labels = scene_problem("mei_outliers_80").truth_inliers
+    assert labels is not None and f" {np.count_nonzero(labels[:30])} of them right ones" in picture.step.caption
+
+
+def test_a_search_that_found_nothing_has_its_bound_only() -> None:
+    empty = exact_run(clique=np.zeros(0, np.int32), cam_from_map=np.zeros((0, 3, 4)), support=np.zeros(0, np.int32))
+    keys = [step.key for step in steps(empty)]
+    assert "consensus-bound" in keys and "consensus-clique" not in keys and "consensus-poses" not in keys
+    assert "estimate" not in curves_of(at(empty, "consensus-bound"), "consensus")
+    assert "ring/estimate" not in {found.name for found in at(empty, "consensus-bound").scene}
+
+
+def test_a_budget_that_ran_out_is_said() -> None:
+    assert "the budget ran out" in at(exact_run(finished=False), "consensus-bound").step.note
+    assert "searched to its end" in at(exact_run(), "consensus-bound").step.note
+
+
+def test_the_decision_has_its_reason_and_its_numbers(exact: Trace) -> None:
+    step = at(exact, "decision").step
+    assert step.title == "Chosen: mc-exact" and step.caption.startswith("100 matches are few enough")
+    assert "20 of 100 matches" in step.caption and "w = 0.2" in step.equation
+
+
+@pytest.mark.parametrize(
+    ("certificate", "said", "knowable"),
+    [
+        (Certificate(42, 42, 2e-9), "Proven optimal: no pose explains more than 42", True),
+        (Certificate(45, 42, 0.0), "so at most 3 more", True),
+        (Certificate(5, 5, 0.01), "Proven optimal", False),
+        (Certificate(5, 4, np.inf), "so at most 1 more", False),
+    ],
+)
+def test_the_certificate_is_in_the_outcome(exact: Trace, certificate: Certificate, said: str, knowable: bool) -> None:
+    picture = at(replace(exact, certificate=certificate), "outcome")
+    rows = dict(picture.tables[-1].rows)
+    assert said in rows["certificate"] and said.lower() in picture.step.caption.lower()
+    assert ("warning" in rows) != knowable
+    assert ("The answer cannot be known" in picture.step.note) != knowable
+    assert "certificate" not in dict(at(replace(exact, certificate=None), "outcome").tables[-1].rows)
+
+
+@pytest.mark.parametrize("size", [2, 3, 6])
+def test_samples_of_any_size_are_shown(ransac: Trace, size: int) -> None:
+    stage = ransac.stage(RansacStage)
+    assert stage is not None
+    samples = np.arange(size * len(stage.samples), dtype=np.int32).reshape(-1, size)
+    again = np.arange(len(samples)) % 2 == 1
+    trace = replace(ransac, stages=(replace(stage, samples=samples, locally_optimized=again), *ransac.stages[1:]))
+    pink = []
+    for k in range(len(samples)):
+        picture = at(trace, f"sample-{k + 1}")
+        assert f"n = {size} " in picture.step.equation
+        points = item(picture, "map/points")
+        assert isinstance(points, Points)
+        pink.append(np.flatnonzero(is_color(points.colors, style.SAMPLE)).tolist())
+        if not again[k]:
+            listed = ", ".join(map(str, samples[k][:-1])) + f" and {samples[k][-1]}"
+            assert picture.step.caption.startswith(f"Matches {listed} fix a pose")
+    assert pink == [[] if fitted else sample.tolist() for sample, fitted in zip(samples, again, strict=True)]
 
 
 def check_item(found: SceneItem) -> None:

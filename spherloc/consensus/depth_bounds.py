@@ -27,28 +27,40 @@ def _along(v, dx, dy, dz):
 
 
 @numba.njit(cache=True, nogil=True)
-def pair_sinusoids(vi, vj, pi, pj, eps_i, eps_j, out):
-    """Fill ``out`` (6, 3) with f, s_i, s_j, S_i, S_j, tau as (cos, sin, constant); return sin alpha, or 0.
+def chord(angle):
+    """Distance between unit vectors at this angle."""
+    return 2.0 * np.sin(0.5 * angle)
 
-    0 means that the pair bounds nothing: its bearings are too close, or its points coincide.
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def pair_sinusoids(vi, vj, pi, pj, chord_i, chord_j, sin_i, sin_j):
+    """From ``chord`` and sin of the bounds: sin alpha, and the (cos, sin, constant) of f, s_i, s_j, S_i, S_j, tau.
+
+    sin alpha is 0 for a pair that bounds nothing: its bearings are too close, or its points coincide.
     """
+    zero = (0.0, 0.0, 0.0)
     dx, dy, dz = pi[0] - pj[0], pi[1] - pj[1], pi[2] - pj[2]
     nx = vi[1] * vj[2] - vi[2] * vj[1]
     ny = vi[2] * vj[0] - vi[0] * vj[2]
     nz = vi[0] * vj[1] - vi[1] * vj[0]
     sin2 = nx * nx + ny * ny + nz * nz
     sin_alpha = np.sqrt(sin2)
-    chord_i, chord_j = 2.0 * np.sin(0.5 * eps_i), 2.0 * np.sin(0.5 * eps_j)
     if sin_alpha <= chord_i + chord_j or (dx == 0.0 and dy == 0.0 and dz == 0.0):
-        return 0.0
+        return 0.0, zero, zero, zero, zero, zero, zero
     dot = vi[0] * vj[0] + vi[1] * vj[1] + vi[2] * vj[2]
     gi, gj = chord_i / sin_alpha, chord_j / sin_alpha
-    scale, sin_i, sin_j = 1.0 / (1.0 - gi - gj), np.sin(eps_i), np.sin(eps_j)
-    out[0, 0], out[0, 1], out[0, 2] = nx * dx + nz * dz, nx * dz - nz * dx, ny * dy
+    scale = 1.0 / (1.0 - gi - gj)
+    f = (nx * dx + nz * dz, nx * dz - nz * dx, ny * dy)
     along_i, along_j = _along(vi, dx, dy, dz), _along(vj, dx, dy, dz)
-    for k in range(3):
-        si, sj = (along_i[k] - dot * along_j[k]) / sin2, (dot * along_i[k] - along_j[k]) / sin2
-        most_i, most_j = scale * ((1.0 - gj) * si + gj * sj), scale * ((1.0 - gi) * sj + gi * si)
-        out[1, k], out[2, k], out[3, k], out[4, k] = si, sj, most_i, most_j
-        out[5, k] = sin_alpha * (sin_i * most_i + sin_j * most_j)
-    return sin_alpha
+    per_sin2 = 1.0 / sin2
+    si = _mix(per_sin2, along_i, -dot * per_sin2, along_j)
+    sj = _mix(dot * per_sin2, along_i, -per_sin2, along_j)
+    most_i = _mix(scale * (1.0 - gj), si, scale * gj, sj)
+    most_j = _mix(scale * (1.0 - gi), sj, scale * gi, si)
+    return sin_alpha, f, si, sj, most_i, most_j, _mix(sin_alpha * sin_i, most_i, sin_alpha * sin_j, most_j)
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _mix(a, u, b, v):
+    """a u + b v of two sinusoids."""
+    return a * u[0] + b * v[0], a * u[1] + b * v[1], a * u[2] + b * v[2]

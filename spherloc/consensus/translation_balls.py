@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
-from spherloc.consensus.depth_bounds import pair_sinusoids
+from spherloc.consensus.depth_bounds import chord, pair_sinusoids
 from spherloc.problem import AlignedProblem
 
 FloatArray = NDArray[np.float64]
@@ -47,30 +47,38 @@ def overlapping(centres: FloatArray, radii: FloatArray) -> BoolArray:
 
 @numba.njit(cache=True, nogil=True)
 def _fill(bearings, points, eps, pairs, yaw, slack, centres, radii):
+    chords, sines = chord(eps), np.sin(eps)
     c, s = np.cos(yaw), np.sin(yaw)
-    wave = np.empty((6, 3))
     for k in range(len(pairs)):
         i, j = pairs[k]
-        vi, vj, pi, pj = bearings[i], bearings[j], points[i], points[j]
-        if pair_sinusoids(vi, vj, pi, pj, eps[i], eps[j], wave) == 0.0:
-            centres[k], radii[k] = 0.5 * (pi + pj), np.inf
-            continue
-        si, sj = _value(wave[1], c, s), _value(wave[2], c, s)
-        di, dj = _slope(wave[1], c, s), _slope(wave[2], c, s)
-        slope2 = 0.0
-        for axis in range(3):
-            ray_i, turn_i = _turned_back(vi, c, s, axis)
-            ray_j, turn_j = _turned_back(vj, c, s, axis)
-            centres[k, axis] = 0.5 * (pi[axis] - si * ray_i + pj[axis] - sj * ray_j)
-            slope2 += (0.5 * (di * ray_i + si * turn_i + dj * ray_j + sj * turn_j)) ** 2
-        delta = slack[k]
-        # |(s v)''| <= |s''| + 2 |s'| + |s|, and a sinusoid's derivatives are at most its amplitude.
-        bend = 0.5 * (_amplitude(wave[1]) * 4.0 + abs(wave[1, 2]) + _amplitude(wave[2]) * 4.0 + abs(wave[2, 2]))
-        most_i = max(0.0, _value(wave[3], c, s) + _amplitude(wave[3]) * delta)
-        most_j = max(0.0, _value(wave[4], c, s) + _amplitude(wave[4]) * delta)
-        spread2 = (most_i * np.sin(eps[i])) ** 2 + (most_j * np.sin(eps[j])) ** 2
-        noise = np.sqrt(spread2 / _one_minus_abs_cos(vi, vj))
-        radii[k] = noise + np.sqrt(slope2) * delta + 0.5 * bend * delta * delta
+        radii[k] = ball_of_pair(i, j, bearings, points, chords, sines, c, s, slack[k], centres[k])
+
+
+@numba.njit(cache=True, nogil=True)
+def ball_of_pair(i, j, bearings, points, chords, sines, c, s, slack, centre):
+    """Radius of the ball of a pair at the yaw (c, s), inf if it bounds nothing; its centre is written."""
+    vi, vj, pi, pj = bearings[i], bearings[j], points[i], points[j]
+    sin_alpha, _, depth_i, depth_j, largest_i, largest_j, _ = pair_sinusoids(
+        vi, vj, pi, pj, chords[i], chords[j], sines[i], sines[j]
+    )
+    if sin_alpha == 0.0:
+        centre[:] = 0.5 * (pi + pj)
+        return np.inf
+    si, sj = _value(depth_i, c, s), _value(depth_j, c, s)
+    di, dj = _slope(depth_i, c, s), _slope(depth_j, c, s)
+    slope2 = 0.0
+    for axis in range(3):
+        ray_i, turn_i = _turned_back(vi, c, s, axis)
+        ray_j, turn_j = _turned_back(vj, c, s, axis)
+        centre[axis] = 0.5 * (pi[axis] - si * ray_i + pj[axis] - sj * ray_j)
+        slope2 += (0.5 * (di * ray_i + si * turn_i + dj * ray_j + sj * turn_j)) ** 2
+    # |(s v)''| <= |s''| + 2 |s'| + |s|, and a sinusoid's derivatives are at most its amplitude.
+    bend = 0.5 * (_amplitude(depth_i) * 4.0 + abs(depth_i[2]) + _amplitude(depth_j) * 4.0 + abs(depth_j[2]))
+    most_i = max(0.0, _value(largest_i, c, s) + _amplitude(largest_i) * slack)
+    most_j = max(0.0, _value(largest_j, c, s) + _amplitude(largest_j) * slack)
+    spread2 = (most_i * sines[i]) ** 2 + (most_j * sines[j]) ** 2
+    noise = np.sqrt(spread2 / _one_minus_abs_cos(vi, vj))
+    return noise + np.sqrt(slope2) * slack + 0.5 * bend * slack * slack
 
 
 @numba.njit(cache=True, nogil=True, inline="always")

@@ -10,7 +10,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from spherloc.consensus.depth_bounds import pair_sinusoids
+from spherloc.consensus.depth_bounds import chord, pair_sinusoids
 from spherloc.problem import AlignedProblem
 
 FloatArray = NDArray[np.float64]
@@ -75,13 +75,15 @@ def _intersect(arcs, count, start, width, out):
 @numba.njit(cache=True, nogil=True)
 def _fill(bearings, points, eps, widest, pairs, lo, hi):
     used = 0
-    wave = np.empty((6, 3))
+    chords, sines = chord(eps), np.sin(eps)
     arcs, scratch = np.empty((MOST_ARCS + 1, 2)), np.empty((MOST_ARCS + 1, 2))
     for i in range(len(bearings)):
         for j in range(i + 1, len(bearings)):
-            if pair_sinusoids(bearings[i], bearings[j], points[i], points[j], eps[i], eps[j], wave) == 0.0:
+            sin_alpha, f, _, _, most_i, most_j, tau = pair_sinusoids(
+                bearings[i], bearings[j], points[i], points[j], chords[i], chords[j], sines[i], sines[j]
+            )
+            if sin_alpha == 0.0:
                 continue
-            f, most_i, most_j, tau = wave[0], wave[3], wave[4], wave[5]
             arcs[0] = _where_not_positive(f[0] - tau[0], f[1] - tau[1], f[2] - tau[2])
             count = 1 if arcs[0, 1] >= 0.0 else 0
             for a, b, c in (

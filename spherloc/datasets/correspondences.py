@@ -48,7 +48,8 @@ def load(table: dict[str, Any], path: Path) -> CorrespondencesScene:
     required = {"kind", "name", "correspondences", "camera", "gravity"}
     scene_file.check_keys(table, required, {"image", "truth", "options", "about"}, where)
     gravity = scene_file.section(table, "gravity", where)
-    scene_file.check_keys(gravity, {"camera", "map"}, set(), f"{where} [gravity]")
+    scene_file.check_keys(gravity, {"camera", "map"}, {"bound_deg", "sd_deg"}, f"{where} [gravity]")
+    gravity_bound_rad, gravity_sd_rad = scene_file.gravity_error_rad(gravity, f"{where} [gravity]")
     truth = scene_file.section(table, "truth", where)
     scene_file.check_keys(truth, {"cam_from_map"} if truth else set(), set(), f"{where} [truth]")
     rows, inliers = read_csv(path.parent / scene_file.text(table, "correspondences", where))
@@ -61,6 +62,8 @@ def load(table: dict[str, Any], path: Path) -> CorrespondencesScene:
             points=rows[:, 2:],
             gravity_camera=scene_file.numbers(gravity["camera"], (3,), "camera", f"{where} [gravity]"),
             gravity_map=scene_file.numbers(gravity["map"], (3,), "map", f"{where} [gravity]"),
+            gravity_bound_rad=gravity_bound_rad,
+            gravity_sd_rad=gravity_sd_rad,
             bound_px=scene_file.bound_px(table, where),
             truth_cam_from_map=scene_file.numbers(truth["cam_from_map"], (3, 4), "cam_from_map", f"{where} [truth]")
             if truth

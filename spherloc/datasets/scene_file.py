@@ -1,5 +1,6 @@
 """Scene files: small TOML documents whose ``kind`` names the dataset loader that reads them."""
 
+import math
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -122,3 +123,15 @@ def bound_px(table: Mapping[str, Any], where: str) -> float | None:
     options = section(table, "options", where)
     check_keys(options, set(), {"bound_px"}, f"{where} [options]")
     return number(options, "bound_px", f"{where} [options]", 1e-6, 1e4) if options else None
+
+
+def gravity_error_rad(table: Mapping[str, Any], where: str) -> tuple[float, float | None]:
+    """Bound and standard deviation of gravity's error (rad) from the optional ``bound_deg`` and ``sd_deg``.
+
+    A bound alone is taken for three standard deviations (the standard deviation is None: ``Problem`` says so), and a
+    standard deviation alone for a third of the bound.
+    """
+    sd_rad = math.radians(number(table, "sd_deg", where, 0.0, 180.0)) if "sd_deg" in table else None
+    if "bound_deg" in table:
+        return math.radians(number(table, "bound_deg", where, 0.0, 90.0)), sd_rad
+    return (0.0 if sd_rad is None else 3.0 * sd_rad), sd_rad

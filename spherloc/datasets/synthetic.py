@@ -2,7 +2,7 @@
 
 Where the paper is silent or breaks: points and positions are uniform in the cube; points are drawn until N are
 visible, that is valid for the camera model and inside the image after noise; an outlier is the projection of its map
-point by a random wrong pose of its own.
+point by a random wrong pose of its own. The paper's gravity is exact; here it may be off.
 """
 
 from dataclasses import dataclass, replace
@@ -16,7 +16,7 @@ from spherloc.cameras.base import Camera, in_image
 from spherloc.cameras.calibration import camera_from_table
 from spherloc.datasets import scene_file
 from spherloc.errors import InputError
-from spherloc.geometry import DOWN, pose, transform, yaw_rotation
+from spherloc.geometry import DOWN, pose, so3_exp, transform, yaw_rotation
 from spherloc.problem import Problem
 
 FloatArray = NDArray[np.float64]
@@ -26,6 +26,9 @@ HALF_SIZE_M = 5.0
 BATCH = 512
 MAX_BATCHES = 400
 MOST_CORRESPONDENCES = 10_000
+MOST_GRAVITY_ERROR_DEG = 10.0
+GRAVITY_BOUND_SD = 3.0
+"""The bound on gravity, in standard deviations. Errors beyond it (1.1 %) are drawn again, so that the bound is true."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +49,9 @@ class SyntheticScene:
     """Seed of every random draw."""
     bound_px: float | None = None
     """Pixel bound asked of estimators; None leaves it to them."""
+    gravity_error_deg: float = 0.0
+    """Standard deviation of the error of the known roll and of the known pitch, degrees. The problem states it, and
+    three times as much as the bound on the angle between the known and the true gravity, which is kept."""
 
     def __post_init__(self) -> None:
         for name, lowest, highest in (
@@ -53,6 +59,7 @@ class SyntheticScene:
             ("outlier_rate", 0.0, 1.0),
             ("noise_px", 0.0, 100.0),
             ("seed", 0, 2**63 - 1),
+            ("gravity_error_deg", 0.0, MOST_GRAVITY_ERROR_DEG),
         ):
             value = getattr(self, name)
             if not lowest <= value <= highest:
@@ -65,24 +72,28 @@ class SyntheticScene:
         """
         if seed is not None and seed != self.seed:
             return replace(self, seed=seed).problem()
-        geometry, noise, choice, wrong = (np.random.default_rng([self.seed, stream]) for stream in range(4))
+        geometry, noise, choice, wrong, tilt = (np.random.default_rng([self.seed, stream]) for stream in range(5))
         truth = _random_poses(geometry, 1)[0]
         points, pixels = self._visible_points(geometry, noise, truth)
         outliers = np.zeros(self.correspondences, dtype=bool)
         outliers[choice.permutation(self.correspondences)[: round(self.outlier_rate * self.correspondences)]] = True
         pixels[outliers] = self._wrong_pixels(wrong, points)[outliers]
+        gravity_sd_rad = float(np.radians(self.gravity_error_deg))
         return Problem(
             name=self.name,
             camera=self.camera,
             pixels=pixels,
             points=points,
-            gravity_camera=DOWN,
+            gravity_camera=_tilted_down(tilt, gravity_sd_rad),
             gravity_map=DOWN,
+            gravity_bound_rad=GRAVITY_BOUND_SD * gravity_sd_rad,
+            gravity_sd_rad=gravity_sd_rad or None,
             bound_px=self.bound_px,
             truth_cam_from_map=truth,
             truth_inliers=~outliers,
             scene=f"synthetic: N {self.correspondences}, outliers {self.outlier_rate:g}, noise {self.noise_px:g} px, "
-            f"seed {self.seed}",
+            + (f"gravity error {self.gravity_error_deg:g} deg, " if self.gravity_error_deg else "")
+            + f"seed {self.seed}",
         )
 
     def _seen(self, pixels: FloatArray) -> BoolArray:
@@ -146,13 +157,23 @@ def _random_poses(rng: np.random.Generator, count: int) -> FloatArray:
     return np.array([pose(yaw_rotation(yaw), t) for yaw, t in zip(yaws, translations, strict=True)])
 
 
+def _tilted_down(rng: np.random.Generator, sd_rad: float) -> FloatArray:
+    """Gravity (3,) as a camera that is level would measure it: its pitch and roll are off by ``sd_rad`` each."""
+    tilt = rng.standard_normal(2)
+    while np.linalg.norm(tilt) > GRAVITY_BOUND_SD:
+        tilt = rng.standard_normal(2)
+    pitch, roll = sd_rad * tilt
+    return so3_exp(np.array([pitch, 0.0, roll])) @ DOWN
+
+
 def load(table: dict[str, Any], path: Path) -> SyntheticScene:
     """Read a scene of ``kind = "synthetic"``; raises ``InputError`` for a wrong key or value."""
     where = str(path)
     scene_file.check_keys(table, {"kind", "name", "camera", "simulation"}, {"options", "about"}, where)
     simulation = scene_file.section(table, "simulation", where)
     place = f"{where} [simulation]"
-    scene_file.check_keys(simulation, {"correspondences", "outlier_rate", "noise_px", "seed"}, set(), place)
+    required = {"correspondences", "outlier_rate", "noise_px", "seed"}
+    scene_file.check_keys(simulation, required, {"gravity_error_deg"}, place)
     return SyntheticScene(
         name=scene_file.text(table, "name", where),
         camera=camera_from_table(scene_file.section(table, "camera", where), where),
@@ -161,4 +182,7 @@ def load(table: dict[str, Any], path: Path) -> SyntheticScene:
         noise_px=scene_file.number(simulation, "noise_px", place, 0.0, 100.0),
         seed=scene_file.integer(simulation, "seed", place, 0, 2**63 - 1),
         bound_px=scene_file.bound_px(table, where),
+        gravity_error_deg=scene_file.number(
+            {"gravity_error_deg": 0.0} | simulation, "gravity_error_deg", place, 0.0, MOST_GRAVITY_ERROR_DEG
+        ),
     )

@@ -4,6 +4,7 @@ import platform
 import time
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
+from functools import lru_cache
 from importlib.metadata import version
 from numbers import Real
 from typing import Any, ClassVar, Protocol
@@ -66,6 +67,7 @@ class Clock:
         self.timings_ms[name] = (time.perf_counter() - start) * 1e3
 
 
+@lru_cache(maxsize=1)
 def versions() -> dict[str, str]:
     """Versions of everything that can change a number."""
     packages = ("spherloc", "numpy", "scipy", "numba")

@@ -25,6 +25,7 @@ class SceneWish:
     correspondences: int = 0
     noise_px: float = 0.0
     outlier_rate: float = 0.0
+    gravity_error_deg: float = 0.0
 
 
 class Catalog:
@@ -64,6 +65,7 @@ class Catalog:
             correspondences=wish.correspondences,
             noise_px=wish.noise_px,
             outlier_rate=wish.outlier_rate,
+            gravity_error_deg=wish.gravity_error_deg,
         )
         return changed.problem(wish.seed)
 

@@ -113,6 +113,8 @@ def _series(chart: Chart) -> tuple[uplot.Series, ...]:
         line["width"] = 4.0 if curve.kind == "marker" else 1.5
         if curve.kind == "marker" and marked:
             line["width"], line["dash"] = 2.0, (5, 5)
+        elif curve.kind == "level":
+            line["dash"] = (3, 3)
         elif curve.kind == "step":
             line["fill"] = f"{color}40"
         marked = marked or curve.kind == "marker"

@@ -1,10 +1,7 @@
 """The widgets that choose an estimator and its options, made from the fields of its options dataclass."""
 
-import ast
-import dataclasses
-import inspect
-import textwrap
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import viser
@@ -12,91 +9,138 @@ import viser
 from spherloc import registry
 from spherloc.estimators import default_options, options_type
 from spherloc.problem import Problem
+from spherloc_viz.options import NONE, OptionField, option_fields
 
-SLIDERS: dict[str, tuple[str, float, float, float]] = {
+ABOUT: Mapping[str, str] = {
+    "mc-exact": "exact, certified",
+    "mc": "the paper's",
+    "ransac-2p": "two points",
+    "auto": "chooses itself",
+}
+"""Those that are offered first, in this order, and a word about each; others follow in alphabetical order."""
+START = "mc"
+"""The estimator that a page starts with."""
+SLIDERS: Mapping[str, tuple[str, float, float, float]] = {
     "bound_px": ("Bound (px)", 0.5, 20.0, 0.5),
+    "noise_px": ("Noise of an inlier (px)", 0.1, 5.0, 0.1),
     "max_balls": ("Most balls", 10, 1000, 10),
 }
-"""Label, least, most and step of options that are best dragged; others become boxes to type in."""
-NO_CONFIDENCE = "draw them all"
-CONFIDENCES = (NO_CONFIDENCE, "0.9", "0.99", "0.999", "0.9999")
+"""Label, least, most and step of options that are best dragged."""
+PRESETS: Mapping[str, tuple[str, Mapping[str, float | None]]] = {
+    "confidence": ("Confidence", {"draw them all": None, "0.9": 0.9, "0.99": 0.99, "0.999": 0.999, "0.9999": 0.9999}),
+    "gravity_sd_deg": (
+        "Gravity error (deg)",
+        {
+            "as the problem states": None,
+            "0: exact (4 DoF)": 0.0,
+            "0.1": 0.1,
+            "0.5": 0.5,
+            "1": 1.0,
+            "unknown (6 DoF)": math.inf,
+        },
+    ),
+}
+"""Label of options that are best chosen from a few values, and what they are called."""
+UNITS = {"px": "px", "deg": "deg", "ms": "ms", "s": "s", "m": "m"}
+
+
+class Option:
+    """The widget of one option."""
+
+    def __init__(self, gui: viser.GuiApi, field: OptionField) -> None:
+        self.field = field
+        self._values: Mapping[str, Any] | None = None
+        label, hint, value = _label(field.name), field.doc, field.default
+        if field.name in SLIDERS:
+            label, least, most, step = SLIDERS[field.name]
+            self.widget: Any = gui.add_slider(label, least, most, step, value, hint=hint)
+        elif field.name in PRESETS:
+            label, self._values = PRESETS[field.name]
+        elif field.choices:
+            self._values = {choice.replace("_", " "): choice for choice in field.choices}
+        elif field.kind is bool and not field.optional:
+            self.widget = gui.add_checkbox(label, value, hint=hint)
+        elif field.optional or not math.isfinite(value):
+            self.widget = gui.add_text(label, _typed(value), hint=f"{hint} {_range(field)}")
+        else:
+            self.widget = gui.add_number(label, value, min=0, hint=hint)
+        if self._values is not None:
+            if value not in self._values.values():
+                self._values = {_typed(value): value, **self._values}
+            start = _name(self._values, value)
+            self.widget = gui.add_dropdown(label, tuple(self._values), initial_value=start, hint=hint)
+
+    def read(self) -> Any:
+        """The option's value; raises ``InputError`` if what is typed is none."""
+        value = self.widget.value
+        if self._values is not None:
+            return self._values[value]
+        return self.field.parse(value or NONE) if isinstance(value, str) else value
 
 
 class EstimatorControls:
     """A choice of estimators, and the options of the chosen one."""
 
     def __init__(self, gui: viser.GuiApi, changed: Callable[[object], None]) -> None:
-        names = registry.names("estimators")
-        self._estimator = gui.add_dropdown("Estimator", names)
+        self._names = estimator_labels(registry.names("estimators"))
+        start = _name(self._names, START)
+        self._estimator = gui.add_dropdown("Estimator", tuple(self._names), initial_value=start)
         self._estimator.on_update(changed)
         self._folders: dict[str, viser.GuiFolderHandle] = {}
-        self._options: dict[str, dict[str, Any]] = {}
-        for name in names:
-            with gui.add_folder(None, visible=name == self._estimator.value) as folder:
-                widgets = _widgets(gui, options_type(name))
-            self._folders[name], self._options[name] = folder, widgets
-            for widget in widgets.values():
-                widget.on_update(changed)
+        self._options: dict[str, dict[str, Option]] = {}
+        for label, name in self._names.items():
+            fields = option_fields(options_type(name))
+            with gui.add_folder(None, visible=label == start) as folder:
+                options = {field.name: Option(gui, field) for field in fields if not field.shared}
+                with gui.add_folder("Refinement", expand_by_default=False):
+                    options |= {field.name: Option(gui, field) for field in fields if field.shared}
+            self._folders[name], self._options[name] = folder, options
+            for option in options.values():
+                option.widget.on_update(changed)
 
     @property
     def widgets(self) -> tuple:
         """All of them."""
-        return (self._estimator, *(widget for group in self._options.values() for widget in group.values()))
+        return (self._estimator, *(option.widget for group in self._options.values() for option in group.values()))
 
     def read(self) -> tuple[str, Any]:
         """The chosen estimator and its options; shows the widgets of these options only.
 
         Raises ``InputError`` for options that cannot be.
         """
-        chosen = self._estimator.value
+        chosen = self._names[self._estimator.value]
         for name, folder in self._folders.items():
             folder.visible = name == chosen
-        values = {name: _option(widget.value) for name, widget in self._options[chosen].items()}
+        values = {name: option.read() for name, option in self._options[chosen].items()}
         return chosen, options_type(chosen)(**values)
 
     def follow_problem(self, problem: Problem) -> None:
         """Set every estimator's pixel bound to what the problem states, or to the estimator's default."""
-        for name, widgets in self._options.items():
-            if "bound_px" in widgets:
-                widgets["bound_px"].value = default_options(name, problem).bound_px
+        for name, options in self._options.items():
+            options["bound_px"].widget.value = default_options(name, problem).bound_px
 
 
-def _option(value: Any) -> Any:
-    if value == NO_CONFIDENCE:
-        return None
-    return float(value) if isinstance(value, str) else value
+def estimator_labels(names: tuple[str, ...]) -> dict[str, str]:
+    """Labels of registered estimators, in the order in which they are offered, and their names."""
+    order = sorted(names, key=lambda name: list(ABOUT).index(name) if name in ABOUT else len(ABOUT))
+    return {f"{name} ({ABOUT[name]})" if name in ABOUT else name: name for name in order}
 
 
-def _widgets(gui: viser.GuiApi, kind: type) -> dict[str, Any]:
-    """One widget for every field of an options dataclass that is a number."""
-    hints = field_docs(kind)
-    out: dict[str, Any] = {}
-    for field in dataclasses.fields(kind):
-        name, hint = field.name, hints.get(field.name)
-        value: Any = field.default
-        if name in SLIDERS:
-            label, least, most, step = SLIDERS[name]
-            out[name] = gui.add_slider(label, least, most, step, value, hint=hint)
-        elif name == "confidence":
-            start = NO_CONFIDENCE if value is None else str(value)
-            out[name] = gui.add_dropdown("Confidence", CONFIDENCES, initial_value=start, hint=hint)
-        elif isinstance(value, bool):
-            out[name] = gui.add_checkbox(_label(name), value, hint=hint)
-        elif isinstance(value, int | float):
-            out[name] = gui.add_number(_label(name), value, min=0, hint=hint)
-    return out
+def _name(values: Mapping[str, Any], wanted: Any) -> str:
+    """What a value is called; the first one if it is none of them."""
+    return next((name for name, value in values.items() if value == wanted), next(iter(values)))
+
+
+def _typed(value: Any) -> str:
+    return NONE if value is None else f"{value:g}"
+
+
+def _range(field: OptionField) -> str:
+    return f"A number, or {NONE}." if field.optional else "A number, or inf."
 
 
 def _label(name: str) -> str:
-    return name.replace("_", " ").capitalize()
-
-
-def field_docs(kind: type) -> dict[str, str]:
-    """The docstring under each field of a dataclass, which Python itself does not keep."""
-    body = ast.parse(textwrap.dedent(inspect.getsource(kind))).body[0]
-    assert isinstance(body, ast.ClassDef)
-    docs: dict[str, str] = {}
-    for field, text in zip(body.body, body.body[1:], strict=False):
-        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and isinstance(text, ast.Expr):
-            docs[field.target.id] = " ".join(str(ast.literal_eval(text.value)).split())
-    return docs
+    """ "time_budget_ms" as "Time budget (ms)"."""
+    words, _, unit = name.rpartition("_")
+    text, suffix = (words, f" ({UNITS[unit]})") if unit in UNITS and words else (name, "")
+    return text.replace("_", " ").capitalize() + suffix

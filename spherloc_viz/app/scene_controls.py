@@ -7,11 +7,11 @@ import viser
 from spherloc.errors import InputError
 from spherloc_viz.app.catalog import OWN_CAMERA, Catalog, SceneWish
 
-MOST_POINTS, MOST_NOISE_PX, MOST_OUTLIERS = 500, 10.0, 99.0
+MOST_POINTS, MOST_NOISE_PX, MOST_OUTLIERS, MOST_GRAVITY_DEG = 500, 10.0, 99.0, 2.0
 
 
 class SceneControls:
-    """Scene, camera, number of points, noise, outliers and seed."""
+    """Scene, camera, number of points, noise, outliers, gravity error and seed."""
 
     def __init__(self, gui: viser.GuiApi, catalog: Catalog, changed: Callable[[object], None]) -> None:
         self._catalog = catalog
@@ -22,8 +22,16 @@ class SceneControls:
         self._points = gui.add_slider("Points", 10, MOST_POINTS, 1, 100, hint="Correspondences, N.")
         self._noise = gui.add_slider("Noise (px)", 0.0, MOST_NOISE_PX, 0.1, 1.0, hint="Standard deviation of a pixel.")
         self._outliers = gui.add_slider("Outliers (%)", 0.0, MOST_OUTLIERS, 1.0, 80.0, hint="Share of wrong matches.")
+        self._gravity = gui.add_slider(
+            "Gravity error (deg)",
+            0.0,
+            MOST_GRAVITY_DEG,
+            0.05,
+            0.0,
+            hint="Standard deviation of the error of the known roll and pitch; the problem states it.",
+        )
         self._seed = gui.add_text("Seed", "0", hint="Of the simulation and of the estimator's random draws.")
-        self._simulated = (self._camera, self._points, self._noise, self._outliers)
+        self._simulated = (self._camera, self._points, self._noise, self._outliers, self._gravity)
         self._followed = ""
         for widget in self.widgets:
             widget.on_update(changed)
@@ -52,6 +60,8 @@ class SceneControls:
         percent = round(100.0 * scene.outlier_rate, 6)
         self._outliers.max = max(MOST_OUTLIERS, percent)
         self._outliers.value = percent
+        self._gravity.max = max(MOST_GRAVITY_DEG, scene.gravity_error_deg)
+        self._gravity.value = float(scene.gravity_error_deg)
         self._seed.value = str(scene.seed)
         return True
 
@@ -64,7 +74,15 @@ class SceneControls:
         if self._catalog.synthetic(label) is None:
             return SceneWish(label, seed)
         rate = round(self._outliers.value / 100.0, 8)
-        return SceneWish(label, seed, self._camera.value, int(self._points.value), float(self._noise.value), rate)
+        return SceneWish(
+            label,
+            seed,
+            self._camera.value,
+            int(self._points.value),
+            float(self._noise.value),
+            rate,
+            float(self._gravity.value),
+        )
 
     def next_seed(self) -> None:
         """The next seed; 0 after what is no seed."""

@@ -7,6 +7,7 @@ from typing import Any
 
 import viser
 
+from spherloc.diagnosis import Diagnosis, diagnose
 from spherloc.errors import SpherlocError
 from spherloc.estimators import estimate
 from spherloc.trace import Trace
@@ -19,15 +20,17 @@ from spherloc_viz.app.newest import Job, Newest
 from spherloc_viz.app.painter import Painter
 from spherloc_viz.app.scene_controls import SceneControls
 from spherloc_viz.app.steps_panel import StepsPanel
-from spherloc_viz.app.text import legend_html, status_html, table_html
+from spherloc_viz.app.text import diagnosis_html, legend_html, status_html, table_html
 from spherloc_viz.app.viser_seams import put_back
-from spherloc_viz.layers import paint, steps
+from spherloc_viz.layers import paint, steps, with_rival
 from spherloc_viz.layers.primitives import Picture
 from spherloc_viz.layers.tables import outcome_table
 from spherloc_viz.recording.background import Recorder
 
 QUIET_S = 0.7
 """Runs count as settled, and are recorded, when nothing has changed for this long."""
+DIAGNOSE_AFTER_S = 0.2
+"""A diagnosis costs more than many a run, so it waits until the picture has stood still for this long."""
 PANELS_PX = ((1600, 460, 380), (0, 360, 340))
 """From this width of the window on: widths of the panels left and right of the canvas."""
 
@@ -49,16 +52,18 @@ class Wish:
 class Session:
     """Lives as long as the tab's connection.
 
-    Two threads, so that steps can be walked while the next run is being solved: one solves the newest wish,
-    one shows the newest run. Both leave the interpreter while they compute or wait.
+    Three threads, so that steps can be walked while the next run is being solved: one solves the newest wish,
+    one shows the newest run, one diagnoses it. All leave the interpreter while they compute or wait.
     """
 
     def __init__(self, client: viser.ClientHandle, catalog: Catalog, recorder: Recorder | None) -> None:
         self._client, self._catalog, self._recorder = client, catalog, recorder
         self._solver = Newest(f"spherloc-solver-{client.client_id}", self._guarded(self._solve))
         self._page = Newest(f"spherloc-page-{client.client_id}", self._guarded(self._show))
+        self._doctor = Newest(f"spherloc-doctor-{client.client_id}", self._guarded(self._examine))
         self._solved: Wish | None = None
         self._trace: Trace | None = None
+        self._diagnosed: tuple[Trace, Diagnosis] | None = None
         self._recorded: tuple[Trace, str] | None = None
         self._viewed: tuple[str, str, str] | None = None
         self._checks = FIRST_CHECKS
@@ -72,13 +77,14 @@ class Session:
     def start(self) -> None:
         """Solve and show the first problem."""
         self._page.start()
+        self._doctor.start()
         self._solver.start()
         self._solver.ask()
 
     def close(self) -> None:
         """End the threads; does not wait."""
-        self._solver.close()
-        self._page.close()
+        for thread in (self._solver, self._page, self._doctor):
+            thread.close()
 
     def _build(self) -> None:
         gui = self._client.gui
@@ -92,6 +98,7 @@ class Session:
         story = gui.add_panel()
         with story.add_tab("Steps"):
             self._steps = StepsPanel(gui, self._redraw)
+            self._diagnosis = gui.add_html("")
             gui.add_html(legend_html())
             self._charts = ChartPanel(gui)
         story.dock_left()
@@ -145,20 +152,40 @@ class Session:
         trace = self._trace
         if trace is None:
             return None
-        timeline = steps(trace)
+        timeline, outcome = steps(trace), outcome_table(trace)
         index, pause = self._steps.settle(timeline, asked)
         picture = paint(trace, index)
+        tables = [table for table in picture.tables if table.name != outcome.name]
+        diagnosis = None
+        if self._diagnosed is not None and self._diagnosed[0] is trace:
+            diagnosis = self._diagnosed[1]
+            if index == len(timeline) - 1 and diagnosis.rival_cam_from_map is not None:
+                picture = with_rival(picture, trace, diagnosis.rival_cam_from_map)
         with self._client.atomic():
             self._painter.draw(picture.scene, self._display.layers())
-            self._steps.show(playing=pause is not None)
+            self._steps.show(playing=pause is not None, tables=tables)
             self._charts.draw(picture.charts)
-            self._outcome.content = table_html(outcome_table(trace))
+            self._outcome.content = table_html(outcome)
+            self._diagnosis.content = status_html("Diagnosing …") if diagnosis is None else diagnosis_html(diagnosis)
             self._move_viewer(trace, picture)
         self._client.flush()
+        if diagnosis is None:
+            self._doctor.ask()
         if pause is None and self._checks > 0:
             self._checks -= 1
             return CHECK_S
         return pause
+
+    def _examine(self, asked: bool) -> float | None:
+        """The doctor thread's job: once nothing has changed for a while, diagnose the newest run and show it."""
+        trace = self._trace
+        if trace is None or (self._diagnosed is not None and self._diagnosed[0] is trace):
+            return None
+        if asked:
+            return DIAGNOSE_AFTER_S
+        self._diagnosed = trace, diagnose(trace)
+        self._page.ask()
+        return None
 
     def _move_viewer(self, trace: Trace, picture: Picture) -> None:
         """Go where the person wants, or, if that is to follow the steps, where the step's subject reads best."""

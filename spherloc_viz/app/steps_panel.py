@@ -6,8 +6,8 @@ from typing import Any
 
 import viser
 
-from spherloc_viz.app.text import step_html
-from spherloc_viz.layers.primitives import Step
+from spherloc_viz.app.text import step_html, table_html
+from spherloc_viz.layers.primitives import Step, Table
 
 PLAY_S = 3.0
 """How long a step stays while playing: time to read its two sentences."""
@@ -61,14 +61,14 @@ class StepsPanel:
             playing = self._playing
         return self._index, PLAY_S if playing else None
 
-    def show(self, playing: bool) -> None:
-        """Put the step at hand on the page."""
+    def show(self, playing: bool, tables: Sequence[Table]) -> None:
+        """Put the step at hand and its tables on the page."""
         titles = tuple(f"{k}/{len(self._steps)}  {step.title}" for k, step in enumerate(self._steps, 1))
         if self._choice.options != titles:
             self._choice.options = titles
         self._choice.value = titles[self._index]
         self._buttons.options = (PREVIOUS, NEXT, PAUSE if playing else PLAY)
-        self._text.content = step_html(self._steps[self._index])
+        self._text.content = step_html(self._steps[self._index]) + "".join(table_html(table) for table in tables)
 
     # viser runs a coroutine as soon as the message is there, a plain function later on some thread: by then the next
     # click, or the next step that is shown, may have changed the widget's value.

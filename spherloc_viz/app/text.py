@@ -2,11 +2,13 @@
 
 from html import escape
 
+from spherloc.diagnosis import Diagnosis
 from spherloc_viz import style
+from spherloc_viz.layers.certificate import UNKNOWABLE
 from spherloc_viz.layers.primitives import Step, Table
 
 DIM = "opacity:.65"
-WORDS = {"success": style.INLIER, "failure": style.OUTLIER, "no pose": style.OUTLIER}
+WORDS = {"success": style.INLIER, "failure": style.OUTLIER, "no pose": style.OUTLIER, UNKNOWABLE: style.OUTLIER}
 """Values of a table that are shown in colour."""
 
 
@@ -30,14 +32,35 @@ def step_html(step: Step) -> str:
 
 
 def table_html(table: Table) -> str:
-    """A table of names and values, without its headings."""
-    cell = "padding:.09em 0;vertical-align:top"
+    """A table: of names and values without headings, a wider one with them."""
+    cell = "padding:.09em .9em .09em 0;vertical-align:top"
+    name_css, value_css = f"{cell};white-space:nowrap;{DIM}", f"{cell};"
+    head = ""
+    if len(table.columns) > 2:
+        head = "".join(f'<td style="{name_css}">{escape(name)}</td>' for name in table.columns)
     rows = "".join(
-        f'<tr><td style="{cell};padding-right:.9em;white-space:nowrap;{DIM}">{escape(str(name))}</td>'
-        f'<td style="{cell};{_value_css(value)}">{escape(str(value))}</td></tr>'
-        for name, value in table.rows
+        f'<tr><td style="{name_css}">{escape(str(row[0]))}</td>'
+        + "".join(f'<td style="{value_css}{_value_css(value)}">{escape(str(value))}</td>' for value in row[1:])
+        + "</tr>"
+        for row in table.rows
     )
-    return box(f'<table style="border-collapse:collapse;width:100%">{rows}</table>')
+    return box(f'<table style="border-collapse:collapse;width:100%"><tr>{head}</tr>{rows}</table>')
+
+
+def diagnosis_html(diagnosis: Diagnosis) -> str:
+    """Cause, summary, evidence and advice; of a run that looks right, the summary alone."""
+    if not diagnosis.doubtful:
+        return box(f'<div style="{DIM}">{escape(diagnosis.summary)}</div>', "font-size:12px")
+    evidence = "".join(f'<li style="padding-bottom:.2em">{escape(line)}</li>' for line in diagnosis.evidence)
+    known = "Judged with the truth." if diagnosis.used_truth else "Judged without the truth."
+    parts = (
+        f'<div style="font-weight:600;color:{style.css(style.OUTLIER)}">{escape(diagnosis.cause.capitalize())}</div>',
+        f"<div>{escape(diagnosis.summary)}</div>",
+        f'<ul style="margin:.4em 0;padding-left:1.2em;font-size:12px">{evidence}</ul>' if evidence else "",
+        f"<div>{escape(diagnosis.advice)}</div>",
+        f'<div style="font-size:11.5px;padding-top:.35em;{DIM}">{known}</div>',
+    )
+    return box("".join(parts))
 
 
 def _value_css(value: object) -> str:

@@ -30,7 +30,9 @@ DIRECTIONS = {
 SUBJECTS = (
     ("Balls", "balls/clique"),
     ("Balls", "balls/others"),
+    ("Overview", "pairs/clique"),
     ("Sphere", "ring/arcs"),
+    ("Sphere", "ring/bound"),
     ("Overview", "rays"),
     ("Sphere", "sphere/surface"),
 )

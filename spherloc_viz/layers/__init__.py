@@ -1,20 +1,33 @@
 """Turns (trace, step) into primitives. The page and the recording draw these and nothing else."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
-from spherloc.trace import RansacStage, RefinementStage, Stage, Trace, TranslationStage, YawStage
-from spherloc_viz.layers import ransac, refinement, start, translation, yaw
+from spherloc.trace import (
+    ConsensusStage,
+    DecisionStage,
+    RansacStage,
+    RefinementStage,
+    Stage,
+    Trace,
+    TranslationStage,
+    YawStage,
+)
+from spherloc_viz import style
+from spherloc_viz.layers import consensus, decision, ransac, refinement, start, translation, yaw
 from spherloc_viz.layers.frame import Frame, RunView
-from spherloc_viz.layers.primitives import Picture, Step
-from spherloc_viz.layers.scene import base_items
+from spherloc_viz.layers.primitives import FloatArray, Picture, Step
+from spherloc_viz.layers.scene import base_items, camera
 from spherloc_viz.layers.tables import outcome_table
 
 FRAMES: dict[type[Stage], Callable[[RunView, Any], list[Frame]]] = {
+    DecisionStage: decision.frames,
     RansacStage: ransac.frames,
     YawStage: yaw.frames,
     TranslationStage: translation.frames,
+    ConsensusStage: consensus.frames,
     RefinementStage: refinement.frames,
 }
 """The file that draws each kind of stage."""
@@ -41,3 +54,10 @@ def paint(trace: Trace, index: int) -> Picture:
     charts = {chart.name: chart for earlier in frames[: index + 1] for chart in earlier.charts}
     tables = (*frame.tables, outcome_table(trace)) if index == len(frames) - 1 else frame.tables
     return Picture(frame.step, base_items(view, frame) + frame.extra(), tuple(charts.values()), tables)
+
+
+def with_rival(picture: Picture, trace: Trace, cam_from_map: FloatArray) -> Picture:
+    """The picture with another pose (3, 4) beside the run's own."""
+    view = _timeline(trace)[0]
+    rival = camera("cameras/rival", view.aligned_pose(cam_from_map), 1.7 * view.sphere_m, style.RIVAL, 2.5)
+    return replace(picture, scene=(*picture.scene, rival))

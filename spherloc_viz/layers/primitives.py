@@ -89,8 +89,9 @@ class Curve:
     y: FloatArray
     """(K,)."""
     color: tuple[int, int, int]
-    kind: Literal["line", "step", "marker"] = "line"
-    """"step" holds y[k] from x[k] to x[k + 1]; "marker" is an upright line at x[0] from y = 0 to y[0]."""
+    kind: Literal["line", "step", "marker", "level"] = "line"
+    """"step" holds y[k] from x[k] to x[k + 1]; "marker" is an upright line at x[0] from y = 0 to y[0]; "level" is a
+    line from (x[0], y[0]) to (x[1], y[0]), a limit to hold other curves against."""
 
 
 @dataclass(frozen=True, eq=False)

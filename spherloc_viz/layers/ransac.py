@@ -1,4 +1,4 @@
-"""RANSAC: every hypothesis that beat those before it, with the pair that made it."""
+"""RANSAC: every hypothesis that beat those before it, with the sample that made it."""
 
 import numpy as np
 
@@ -15,32 +15,38 @@ def frames(view: RunView, stage: RansacStage) -> list[Frame]:
 
 
 def _improvement(view: RunView, stage: RansacStage, k: int) -> Frame:
-    i, j = stage.samples[k]
-    mask = stage.inlier_masks[k]
-    inliers, count = int(np.count_nonzero(mask)), len(mask)
+    sample, mask, refitted = stage.samples[k], stage.inlier_masks[k], bool(stage.locally_optimized[k])
+    inliers, count, size = int(np.count_nonzero(mask)), len(mask), len(sample)
     drawn = int(stage.improved_at[k]) + 1
-    chance = ransac_success_probability(inliers / count, 2, drawn)
+    chance = ransac_success_probability(inliers / count, size, drawn)
     last = k == len(stage.improved_at) - 1
     then = f"none of the other {stage.iterations - drawn:,} samples beats it" if last else "a later one beats it"
-    pair = np.array([i, j])
+    source = "A fit to the inliers of the step before gives" if refitted else f"Matches {_listed(sample)} fix"
     return Frame(
         Step(
             f"sample-{k + 1}",
-            f"Sample {drawn:,}" + (": the best" if last else ""),
-            f"Matches {i} and {j} fix a pose that explains {inliers} of {count} matches; {then}. "
-            f"At that share of inliers, {_samples(drawn)} a clean pair with probability {chance:.3g}.",
-            "P = 1 − (1 − wⁿ)ᵏ,  n = 2   (Eq. 28)",
+            f"Sample {drawn:,}" + (", fitted again" if refitted else "") + (": the best" if last else ""),
+            f"{source} a pose that explains {inliers} of {count} matches; {then}. "
+            f"At that share of inliers, {_samples(drawn)} only right matches with probability {chance:.3g}.",
+            f"P = 1 − (1 − wⁿ)ᵏ,  n = {size}   (Eq. 28)",
+            f"Confidence reached: {100 * stage.confidence_reached:.4g} %." if last else "",
         ),
         view.aligned_pose(stage.cam_from_map[k]),
-        view.colors(style.UNDECIDED, (mask, style.INLIER), (pair, style.SAMPLE)),
-        mask | np.isin(np.arange(count), pair),
+        view.colors(style.UNDECIDED, (mask, style.INLIER), *(() if refitted else ((sample, style.SAMPLE),))),
+        mask | np.isin(np.arange(count), sample),
         located=True,
         charts=(chart(stage),),
     )
 
 
+def _listed(sample: np.ndarray) -> str:
+    """The numbers of the sampled matches, "3, 14 and 15"."""
+    words = [str(number) for number in sample]
+    return ", ".join(words[:-1]) + f" and {words[-1]}" if words[1:] else words[0]
+
+
 def _samples(drawn: int) -> str:
-    return "one sample is" if drawn == 1 else f"{drawn:,} samples contain"
+    return "one sample has" if drawn == 1 else f"one of {drawn:,} samples has"
 
 
 def chart(stage: RansacStage) -> Chart:

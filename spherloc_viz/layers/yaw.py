@@ -1,20 +1,16 @@
-"""Yaw: the ring of arcs around the sphere, and how many overlap at each yaw.
-
-On the ring, the direction of a yaw is where the camera looks with that yaw.
-"""
+"""Yaw: the ring of arcs around the sphere, and how many overlap at each yaw."""
 
 import numpy as np
 
-from spherloc.geometry import camera_centre, wrap_angle, yaw_of, yaw_rotation
+from spherloc.geometry import camera_centre, yaw_rotation
 from spherloc.trace import YawStage
 from spherloc_viz import style
+from spherloc_viz.layers import ring
 from spherloc_viz.layers.frame import Frame, RunView, even, one_color
-from spherloc_viz.layers.primitives import Chart, Curve, FloatArray, SceneItem, Segments, Step
+from spherloc_viz.layers.primitives import Chart, FloatArray, SceneItem, Segments, Step
 
-INNER, OUTER, CURVE = 1.3, 1.95, 2.05
-"""Radii of the band of arcs and of the overlap outline's foot, in sphere radii."""
-OUTLINE = 0.9
-"""Height of the overlap outline at its peak, in sphere radii."""
+INNER, OUTER = 1.3, 1.95
+"""Radii of the band of arcs, in sphere radii."""
 STEP_RAD = np.radians(4.0)
 
 
@@ -30,9 +26,7 @@ def frames(view: RunView, stage: YawStage) -> list[Frame]:
     width = np.degrees(float(np.median(stage.hi_rad - stage.lo_rad)))
     yaw = np.degrees(stage.yaw_rad)
     interval = np.degrees(stage.best_rad[1] - stage.best_rad[0])
-    off = ""
-    if view.truth is not None:
-        off = f", {abs(np.degrees(wrap_angle(stage.yaw_rad - yaw_of(view.truth[:, :3])))):.2f}° from the truth"
+    off = ring.off_truth(view, stage.yaw_rad)
     return [
         Frame(
             Step(
@@ -69,18 +63,12 @@ def frames(view: RunView, stage: YawStage) -> list[Frame]:
 
 def chart(view: RunView, stage: YawStage, found: bool) -> Chart:
     """Overlap count over yaw, with the truth and, once found, the estimate."""
-    yaws = np.degrees(np.linspace(-np.pi, np.pi, len(stage.overlap) + 1)[:-1])
     peak = float(stage.overlap.max(initial=1))
-    curves = [Curve("arcs that overlap", yaws, stage.overlap.astype(np.float64), style.UNDECIDED, "step")]
-    if view.truth is not None:
-        curves.append(_marker("truth", np.degrees(yaw_of(view.truth[:, :3])), peak, style.TRUTH))
-    if found:
-        curves.append(_marker("estimate", np.degrees(stage.yaw_rad), peak, style.ESTIMATE))
+    curves = [
+        ring.step_curve("arcs that overlap", stage.overlap),
+        *ring.markers(view, peak, stage.yaw_rad if found else None),
+    ]
     return Chart("yaw", "Arcs that overlap at each yaw", "yaw (°)", "arcs", tuple(curves))
-
-
-def _marker(label: str, x: float, height: float, color: style.RGB) -> Curve:
-    return Curve(label, np.array([x]), np.array([height]), color, "marker")
 
 
 def _drawn(stage: YawStage) -> np.ndarray:
@@ -95,11 +83,6 @@ def _drawn(stage: YawStage) -> np.ndarray:
     return np.concatenate([even(members, take), even(others, room - take)])
 
 
-def _directions(yaw_rad: FloatArray) -> FloatArray:
-    """Where the camera looks (N, 3) with the yaws (N,): R^T e_z."""
-    return np.column_stack([-np.sin(yaw_rad), np.zeros_like(yaw_rad), np.cos(yaw_rad)])
-
-
 def _ring(view: RunView, stage: YawStage, cam_from_map: FloatArray, found: bool) -> tuple[SceneItem, ...]:
     centre, drawn = camera_centre(cam_from_map), _drawn(stage)
     tracks = INNER + (OUTER - INNER) * (np.arange(len(drawn)) + 0.5) / max(1, len(drawn))
@@ -108,32 +91,14 @@ def _ring(view: RunView, stage: YawStage, cam_from_map: FloatArray, found: bool)
     part = np.arange(len(arc)) - np.repeat(np.cumsum(steps) - steps, steps)
     width = (stage.hi_rad - stage.lo_rad)[drawn][arc] / steps[arc]
     ends = stage.lo_rad[drawn][arc][:, None] + width[:, None] * (part[:, None] + np.array([0.0, 1.0]))
-    points = centre + view.sphere_m * tracks[arc][:, None, None] * _directions(ends.ravel()).reshape(-1, 2, 3)
+    points = centre + view.sphere_m * tracks[arc][:, None, None] * ring.directions(ends.ravel()).reshape(-1, 2, 3)
     colors = one_color(style.UNDECIDED, len(arc))
     if found:
         colors[np.isin(drawn, stage.clique)[arc]] = style.CLIQUE
-    items: list[SceneItem] = [
+    heights = ring.by_degree(stage.overlap)
+    line = ring.circle(view, centre, heights / max(1, int(heights.max())))
+    return (
         Segments("ring/arcs", "yaw ring", points, colors, 2.0),
-        _outline(view, stage, centre),
-    ]
-    if found:
-        items.append(_spoke("ring/estimate", view, centre, stage.yaw_rad, style.ESTIMATE))
-    if view.truth is not None:
-        items.append(_spoke("ring/truth", view, centre, yaw_of(view.truth[:, :3]), style.TRUTH))
-    return tuple(items)
-
-
-def _outline(view: RunView, stage: YawStage, centre: FloatArray) -> Segments:
-    """The overlap curve bent around the ring, at one point a degree."""
-    height = stage.overlap.reshape(360, -1).max(axis=1)
-    radius = CURVE + OUTLINE * height / max(1, int(height.max()))
-    yaws = np.radians(np.arange(360) - 179.5)
-    line = centre + view.sphere_m * radius[:, None] * _directions(yaws)
-    points = np.stack([line, np.roll(line, -1, axis=0)], axis=1)
-    return Segments("ring/overlap", "yaw ring", points, one_color(style.SPHERE, 360), 2.5)
-
-
-def _spoke(name: str, view: RunView, centre: FloatArray, yaw_rad: float, color: style.RGB) -> Segments:
-    radii = view.sphere_m * np.array([1.0, CURVE + OUTLINE + 0.15])
-    ends = centre + radii[:, None] * _directions(np.array([yaw_rad]))
-    return Segments(name, "yaw ring", ends[None], one_color(color, 1), 4.0)
+        ring.outline("ring/overlap", line, style.SPHERE),
+        *ring.spokes(view, centre, stage.yaw_rad if found else None),
+    )

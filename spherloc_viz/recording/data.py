@@ -1,10 +1,11 @@
 """The numbers behind the pictures: the trace as raw arrow rows under ``/data``, and back, bit for bit.
 
-A row has one column an array, typed by its dtype and shape, and a column ``scalars`` with all the rest as JSON.
+A row has one column an array, typed by its dtype and shape, and a column ``scalars`` with all the rest as JSON, in
+which a number that JSON has no word for is ``{"number": "inf"}`` (or "-inf", "nan").
 """
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
@@ -17,9 +18,13 @@ from rerun.chunk import Chunk
 from spherloc.cameras.calibration import camera_from_table
 from spherloc.problem import Problem
 from spherloc.trace import Trace
+from spherloc_viz.options import plain
 
 MAX_ARRAY_BYTES = 65_536
 """Stage arrays above this are left out: they follow from the problem, the options and the seed."""
+
+NOT_FINITE = "number"
+"""Key of the table that stands for infinity or NaN."""
 
 Row = dict[str, Any]
 
@@ -50,6 +55,7 @@ def _run_row(trace: Trace) -> Row:
         "cam_from_map": trace.cam_from_map,
         "inlier_mask": trace.inlier_mask,
         "message": trace.message,
+        "certificate": None if trace.certificate is None else asdict(trace.certificate),
     }
 
 
@@ -68,16 +74,15 @@ def problem_from_row(row: Row, where: str) -> Problem:
 
 def _chunk(path: str, row: Row) -> Chunk:
     arrays = {name: value for name, value in row.items() if isinstance(value, np.ndarray)}
-    scalars = json.dumps({name: value for name, value in row.items() if name not in arrays}, default=_plain)
+    others = {name: value for name, value in row.items() if name not in arrays}
+    scalars = json.dumps(plain(others, lambda number: {NOT_FINITE: str(number)}), allow_nan=False)
     columns = {name: _arrow(value) for name, value in arrays.items()} | {"scalars": pa.array([[scalars]])}
     return Chunk.from_record_batch(pa.RecordBatch.from_pydict(columns), index=None, entity_path=path)[0]
 
 
-def _plain(value: Any) -> Any:
-    """What JSON has no word for: numpy's scalars and arrays, read-only mappings."""
-    if isinstance(value, np.generic | np.ndarray):
-        return value.tolist()
-    return dict(value) if isinstance(value, Mapping) else str(value)
+def _number(table: dict[str, Any]) -> Any:
+    """A table of JSON, or the number that it stands for."""
+    return float(table[NOT_FINITE]) if set(table) == {NOT_FINITE} else table
 
 
 def _arrow(array: NDArray[Any]) -> pa.Array:
@@ -92,7 +97,7 @@ def read_row(chunk: Chunk) -> Row:
     """Arrays and scalars of a chunk that ``data_chunks`` made; the arrays are read-only."""
     batch = chunk.to_record_batch()
     columns = {name: batch.column(name) for name in batch.schema.names if pa.types.is_list(batch.column(name).type)}
-    row: Row = json.loads(columns.pop("scalars")[0].values[0].as_py())
+    row: Row = json.loads(columns.pop("scalars")[0].values[0].as_py(), object_hook=_number)
     return row | {name: _numpy(column[0].values) for name, column in columns.items()}
 
 

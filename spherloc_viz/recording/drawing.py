@@ -18,6 +18,7 @@ TIMELINE = "step"
 
 MARKER_SHARE = 0.003
 """Width of a marker's bar, as a share of the chart."""
+LEVEL_OPACITY = 0.15
 LINE_SHARE = 0.8
 """Width of the bar of a line's sample, as a share of the least distance between samples."""
 
@@ -40,11 +41,15 @@ class Bars:
     widths: NDArray[np.float64]
     """(K,)."""
     color: tuple[int, int, int]
+    opacity: float = 1.0
 
 
 def bars(chart: Chart, curve: Curve) -> Bars:
-    """A step curve is exactly its bars; a line becomes bars around its samples, and a marker one narrow bar."""
+    """A step curve is exactly its bars; a line becomes bars around its samples, a marker one narrow bar, and a level
+    one translucent bar up to it."""
     x = np.asarray(curve.x, dtype=np.float64)
+    if curve.kind == "level":
+        return Bars(x[:1], curve.y[:1], x[-1:] - x[:1], curve.color, LEVEL_OPACITY)
     if curve.kind == "step":
         return Bars(x, curve.y, np.diff(x, append=x[-1:]), curve.color)
     if curve.kind == "marker":

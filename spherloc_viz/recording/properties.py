@@ -12,6 +12,7 @@ from rerun.chunk import Chunk
 
 from spherloc.metrics import Metrics
 from spherloc.trace import Trace
+from spherloc_viz.options import json_text
 
 FORMAT_VERSION = 1
 """Of what is recorded and how. A reader refuses others."""
@@ -25,8 +26,17 @@ def outcome(metrics: Metrics) -> str:
 def property_chunks(trace: Trace, metrics: Metrics, created: datetime) -> Iterator[Chunk]:
     """The property ``run``, and the name and time that the Rerun viewer shows for the recording.
 
-    Unknown values are absent, so that a query finds nulls.
+    Unknown values are absent, so that a query finds nulls. In ``options``, which is JSON, infinity is the text "inf".
     """
+    certificate = trace.certificate
+    proven: dict[str, Any] = {}
+    if certificate is not None:
+        proven = {
+            "upper_bound": certificate.upper_bound,
+            "lower_bound": certificate.lower_bound,
+            "proven": certificate.proven,
+            "chance_sets": certificate.chance_sets,
+        }
     values: dict[str, Any] = {
         "format_version": FORMAT_VERSION,
         "created": created.isoformat(timespec="milliseconds"),
@@ -34,7 +44,7 @@ def property_chunks(trace: Trace, metrics: Metrics, created: datetime) -> Iterat
         "name": trace.problem.name,
         "estimator": trace.estimator,
         "seed": trace.seed,
-        "options": json.dumps(asdict(trace.options)),
+        "options": json_text(asdict(trace.options)),
         "outcome": outcome(metrics),
         "message": trace.message,
         "rotation_error_deg": metrics.rotation_error_deg,
@@ -43,6 +53,7 @@ def property_chunks(trace: Trace, metrics: Metrics, created: datetime) -> Iterat
         "correspondences": len(trace.problem),
         "time_ms": trace.timings_ms.get("total"),
         "versions": json.dumps(dict(trace.versions)),
+        **proven,
     }
     known = {name: value for name, value in values.items() if value is not None}
     yield Chunk.from_property("run", rr.AnyValues(**known))

@@ -12,6 +12,7 @@ from rerun.error_utils import RerunWarning
 from spherloc.cameras.base import BoolArray, FloatArray
 from spherloc.errors import InputError, RecordingError
 from spherloc.problem import Problem
+from spherloc.trace import Certificate
 from spherloc_viz.recording.data import problem_from_row, read_row
 from spherloc_viz.recording.layout import APPLICATION_ID
 from spherloc_viz.recording.properties import FORMAT_VERSION, read_properties
@@ -26,7 +27,8 @@ class RecordedRun:
 
     properties: Mapping[str, Any]
     """What lists show: scene, name, estimator, seed, options and versions (JSON), outcome ("success", "failure" or
-    "unknown"), message, errors (absent if unknown), inliers, correspondences, created (ISO, UTC), format_version."""
+    "unknown"), message, errors (absent if unknown), inliers, correspondences, created (ISO, UTC), format_version; of
+    runs with a certificate also upper_bound, lower_bound, proven and chance_sets."""
     problem: Problem
     """What was solved, equal to the original in every bit."""
     estimator: str
@@ -47,6 +49,8 @@ class RecordedRun:
     """The outcome in one sentence."""
     stages: Mapping[str, Mapping[str, Any]]
     """Fields of each stage by its kind; large arrays are left out, as they follow from the rest."""
+    certificate: Certificate | None
+    """What is proven about the consensus; None if nothing is, as in recordings older than certificates."""
 
 
 def read_recording(path: Path) -> RecordedRun:
@@ -96,4 +100,6 @@ def _run(chunks: Mapping[str, Chunk], where: str) -> RecordedRun:
     run = read_row(chunks["/data/run"])
     stages = {path[len(STAGES) :]: read_row(chunk) for path, chunk in chunks.items() if path.startswith(STAGES)}
     problem = problem_from_row(read_row(chunks["/data/problem"]), where)
-    return RecordedRun(properties=properties, problem=problem, stages=stages, **run)
+    found = run.pop("certificate", None)
+    certificate = None if found is None else Certificate(**found)
+    return RecordedRun(properties=properties, problem=problem, stages=stages, certificate=certificate, **run)

@@ -88,7 +88,7 @@ def test_diagonal_is_ignored_and_the_input_kept(rng):
 def test_limit_gives_a_clique_and_does_not_call_it_proven(rng, limit):
     """A hard graph: the limit is reached, and what is returned is still a clique, of at least one node."""
     adjacency = random_graph(rng, 150, 0.8)
-    found = max_clique(adjacency, branch_limit=limit)
+    found = max_clique(adjacency, effort_limit=limit)
     assert not found.proven
     assert is_clique(adjacency, found.nodes) and len(found.nodes) >= 1
 
@@ -97,7 +97,7 @@ def test_larger_limits_never_give_smaller_cliques_and_end_proven(rng):
     adjacency = random_graph(rng, 60, 0.7)
     sizes = []
     for limit in (100, 1000, 10_000, 200_000):
-        found = max_clique(adjacency, branch_limit=limit)
+        found = max_clique(adjacency, effort_limit=limit)
         sizes.append(len(found.nodes))
     assert sizes == sorted(sizes)
     assert found.proven and sizes[-1] == clique_number(adjacency)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from pair_samples import aligned_problem, sample, unit
 
-from spherloc.consensus.depth_bounds import pair_sinusoids
+from spherloc.consensus.depth_bounds import chord, pair_sinusoids
 from spherloc.consensus.yaw_arcs import yaw_arcs
 from spherloc.geometry import yaw_rotation
 from spherloc.solvers.two_point import two_point
@@ -44,18 +44,18 @@ def test_true_yaw_is_never_outside(rng, bound):
 @pytest.mark.parametrize("bound", BOUNDS)
 def test_depth_bounds_hold(rng, bound):
     """The upper bounds S on the true depths, tau on |f|, and the measured depths, each against its definition."""
-    wave = np.empty((6, 3))
     for _ in range(10):
         s = sample(rng, bound)
         v, p, eps = s.aligned.bearings, s.aligned.points, s.bound_rad
         at = np.array([np.cos(s.yaw), np.sin(s.yaw), 1.0])
         pairs = s.pairs
         for (i, j), hopeless in zip(pairs, s.bounds_nothing(pairs), strict=True):
-            sine = pair_sinusoids(v[i], v[j], p[i], p[j], eps[i], eps[j], wave)
+            chords, sines = chord(eps[[i, j]]), np.sin(eps[[i, j]])
+            sine, *waves = pair_sinusoids(v[i], v[j], p[i], p[j], *chords, *sines)
             assert (sine == 0.0) == hopeless
             if hopeless:
                 continue
-            f, si, sj, most_i, most_j, tau = wave @ at
+            f, si, sj, most_i, most_j, tau = np.array(waves) @ at
             w = yaw_rotation(s.yaw) @ (p[i] - p[j])
             normal = np.cross(v[i], v[j])
             depths = np.linalg.lstsq(np.column_stack([v[i], -v[j]]), w, rcond=None)[0]

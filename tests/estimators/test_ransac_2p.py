@@ -7,9 +7,9 @@ import pytest
 from scipy.stats import chisquare
 
 from spherloc.cameras.equirectangular import Equirectangular
+from spherloc.consensus.two_point_search import sample_pair
 from spherloc.errors import InputError
 from spherloc.estimators import estimate, options_type
-from spherloc.estimators.ransac import draw_pairs
 from spherloc.geometry import DOWN
 from spherloc.metrics import ransac_success_probability
 from spherloc.problem import Problem
@@ -28,13 +28,36 @@ def run(problem, seed=0, **options):
 @pytest.mark.parametrize("count", [2, 3, 7])
 def test_pairs_are_uniform_and_never_equal(count):
     """Every ordered pair equally often: a sampler that never draws the last index, or favours one, is caught."""
-    pairs = draw_pairs(np.random.default_rng(1), count, 100_000)
-    assert pairs.shape == (100_000, 2)
-    assert (pairs[:, 0] != pairs[:, 1]).all()
+    pairs = np.array([sample_pair(np.uint64(1), k, count) for k in range(100_000)])
+    assert (pairs[:, 0] != pairs[:, 1]).all() and pairs.min() == 0 and pairs.max() == count - 1
     table = np.bincount(pairs[:, 0] * count + pairs[:, 1], minlength=count * count).reshape(count, count)
     frequency = table[~np.eye(count, dtype=bool)]
     assert frequency.sum() == 100_000
     assert chisquare(frequency).pvalue > 1e-3
+
+
+def test_first_samples_of_many_seeds_are_uniform():
+    """Neighbouring seeds are as good as distant ones."""
+    firsts = [sample_pair(np.uint64(seed), 0, 5) for seed in range(50_000)]
+    table = np.bincount([5 * i + j for i, j in firsts], minlength=25).reshape(5, 5)
+    assert chisquare(table[~np.eye(5, dtype=bool)]).pvalue > 1e-3
+
+
+def split_mix(state):
+    """SplitMix64's output function in Python's own integers."""
+    state = (state ^ (state >> 30)) * 0xBF58476D1CE4E5B9 % 2**64
+    state = (state ^ (state >> 27)) * 0x94D049BB133111EB % 2**64
+    return state ^ (state >> 31)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2**63 - 1])
+def test_samples_are_the_same_on_every_machine(seed):
+    """Integer arithmetic only, here without a word of fixed width."""
+    assert split_mix(0x9E3779B97F4A7C15) == 0xE220A8397B1DCDAF, "the first output of the published generator at 0"
+    for k in range(200):
+        bits = split_mix((split_mix(seed) + (k + 1) * 0x9E3779B97F4A7C15) % 2**64)
+        i, j = (bits >> 32) * 5000 >> 32, (bits % 2**32) * 4999 >> 32
+        assert sample_pair(np.uint64(seed), k, 5000) == (i, j + (j >= i))
 
 
 def test_seed_decides_everything(scene_of):
@@ -80,15 +103,27 @@ def test_confidence_stops_as_eq_28_says(scene_of, confidence):
         problem = scene_of("mei", outlier_rate=0.7).problem(seed)
         stage = run(problem, seed, confidence=confidence, iterations=100_000).stage(RansacStage)
         rate = stage.inlier_masks[-1].mean()
+        lost = 1e-3 * (1.0 - confidence)  # what the early test may lose is earned by more samples
         assert stage.iterations < 100_000
-        assert ransac_success_probability(rate, 2, stage.iterations) >= confidence
+        reached = ransac_success_probability(rate, 2, stage.iterations) - lost
+        assert stage.confidence_reached == pytest.approx(reached, abs=1e-12) and reached >= confidence
         if stage.iterations - 1 != stage.improved_at[-1]:
-            assert ransac_success_probability(rate, 2, stage.iterations - 1) < confidence
+            assert ransac_success_probability(rate, 2, stage.iterations - 1) - lost < confidence
+
+
+def test_confidence_of_the_plain_form(scene_of):
+    """All samples are drawn, all are counted in full, and Eq. 28 holds to the letter."""
+    stage = run(scene_of("mei").problem(), iterations=70).stage(RansacStage)
+    rate = stage.inlier_masks[-1].mean()
+    assert stage.confidence_reached == pytest.approx(ransac_success_probability(rate, 2, 70), abs=1e-12)
 
 
 def test_confidence_never_exceeds_the_iterations(scene_of):
+    """And one can see that they ran out."""
     problem = scene_of("mei", outlier_rate=0.9).problem()
-    assert run(problem, confidence=0.999999, iterations=50).stage(RansacStage).iterations == 50
+    stage = run(problem, confidence=0.999999, iterations=50).stage(RansacStage)
+    assert stage.iterations == 50
+    assert stage.confidence_reached < 0.5
 
 
 def test_perfect_data_need_one_sample(scene_of):
@@ -129,7 +164,7 @@ def test_no_pose_is_a_sentence():
     assert not trace.inlier_mask.any() and trace.inlier_mask.shape == (9,)
     assert trace.stage(RefinementStage) is None
     stage = trace.stage(RansacStage)
-    assert stage.samples.shape == (0, 2)
+    assert stage.samples.shape == (0, 2) and stage.confidence_reached == 0.0
     assert stage.cam_from_map.shape == (0, 3, 4) and stage.inlier_masks.shape == (0, 9)
 
 
@@ -160,6 +195,13 @@ def test_smallest_problems(scene_of, count):
         {"confidence": 0.0},
         {"confidence": 1.0},
         {"confidence": np.nan},
+        {"confidence": True},
+        {"scoring": "mlesac"},
+        {"scoring": None},
+        {"scoring": 1},
+        {"local_optimization": None},
+        {"local_optimization": "yes"},
+        {"local_optimization": 1},
     ],
 )
 def test_bad_options_are_input_errors(options):

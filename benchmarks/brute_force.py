@@ -1,0 +1,193 @@
+"""Largest consensus of a small problem, the slow and plain way: shares no search and no arithmetic with ``spherloc``
+but the 2P solver that proposes where to start.
+
+A pose is (yaw, translation, tilt): R = exp([a, 0, c]) R_y(yaw) with |(a, c)| at most the gravity bound. From the 2P pose
+of every pair, level and tilted, and from the true pose, Gauss-Newton steps whose weights favour the worst residual try
+to win one correspondence more, then another.
+"""
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from spherloc.geometry import rotation_angle, yaw_of, yaw_rotation
+from spherloc.problem import AlignedProblem
+from spherloc.solvers.two_point import two_point
+
+FloatArray = NDArray[np.float64]
+
+STEPS = 8
+STEP = 1e-6
+TILTS = 4
+"""Directions in which gravity is also taken to be off, each by half the bound."""
+NEAR = 3
+"""Starts that explain fewer than the best by more than this are not climbed from."""
+
+
+@numba.njit(cache=True, nogil=True)
+def _rotation(state, out):
+    """R of a state, by Rodrigues' formula for the tilt."""
+    a, c = state[4], state[5]
+    angle = np.sqrt(a * a + c * c)
+    first = np.sin(angle) / angle if angle > 1e-12 else 1.0
+    second = (1.0 - np.cos(angle)) / (angle * angle) if angle > 1e-12 else 0.5
+    tilt = np.array(
+        [
+            [1.0 - second * c * c, -first * c, second * a * c],
+            [first * c, 1.0 - second * (a * a + c * c), -first * a],
+            [second * a * c, first * a, 1.0 - second * a * a],
+        ]
+    )
+    cosine, sine = np.cos(state[0]), np.sin(state[0])
+    for i in range(3):
+        out[i, 0] = tilt[i, 0] * cosine - tilt[i, 2] * sine
+        out[i, 1] = tilt[i, 1]
+        out[i, 2] = tilt[i, 0] * sine + tilt[i, 2] * cosine
+
+
+@numba.njit(cache=True, nogil=True)
+def _residuals(state, bearings, points, weights, out):
+    """Residuals (N, 2), px, of a state; inf behind the measured bearing."""
+    rotation = np.empty((3, 3))
+    _rotation(state, rotation)
+    for k in range(len(points)):
+        ray = np.empty(3)
+        for i in range(3):
+            ray[i] = state[1 + i]
+            for j in range(3):
+                ray[i] += rotation[i, j] * points[k, j]
+        length = np.sqrt(ray[0] ** 2 + ray[1] ** 2 + ray[2] ** 2)
+        ahead = bearings[k, 0] * ray[0] + bearings[k, 1] * ray[1] + bearings[k, 2] * ray[2] > 0.0
+        for row in range(2):
+            value = (weights[k, row, 0] * ray[0] + weights[k, row, 1] * ray[1] + weights[k, row, 2] * ray[2]) / length
+            out[k, row] = value if ahead else np.inf
+
+
+@numba.njit(cache=True, nogil=True)
+def _support(state, data, bound_px, norms):
+    """How many a state explains; writes the norm (N,) of every residual."""
+    bearings, points, weights = data
+    residuals = np.empty((len(points), 2))
+    _residuals(state, bearings, points, weights, residuals)
+    count = 0
+    for k in range(len(points)):
+        norms[k] = np.sqrt(residuals[k, 0] ** 2 + residuals[k, 1] ** 2)
+        count += norms[k] <= bound_px
+    return count
+
+
+@numba.njit(cache=True, nogil=True)
+def _step(state, data, members, norms, bound_px, limit_rad):
+    """One weighted Gauss-Newton step on ``members``, in place; false where it is impossible."""
+    bearings, points, weights = data
+    free = 6 if limit_rad > 0.0 else 4
+    rows = 2 * len(members)
+    jacobian, residual = np.zeros((rows, free)), np.zeros(rows)
+    here, ahead = np.empty((len(points), 2)), np.empty((len(points), 2))
+    _residuals(state, bearings, points, weights, here)
+    for column in range(free):
+        moved = state.copy()
+        moved[column] += STEP
+        _residuals(moved, bearings, points, weights, ahead)
+        for m in range(len(members)):
+            k = members[m]
+            weight = min(max(norms[k] / bound_px, 0.3), 3.0) ** 2
+            for row in range(2):
+                residual[2 * m + row] = weight * here[k, row]
+                jacobian[2 * m + row, column] = weight * (ahead[k, row] - here[k, row]) / STEP
+    normal = jacobian.T @ jacobian
+    for column in range(free):
+        normal[column, column] += 1e-9 * normal[column, column] + 1e-12
+    right = jacobian.T @ residual
+    if not (np.isfinite(normal).all() and np.isfinite(right).all()):
+        return False
+    change = np.linalg.solve(normal, right)
+    state[:free] -= change
+    tilt = np.sqrt(state[4] ** 2 + state[5] ** 2)
+    if tilt > limit_rad:
+        state[4] *= limit_rad / tilt
+        state[5] *= limit_rad / tilt
+    return True
+
+
+@numba.njit(cache=True, nogil=True)
+def _climb(start, data, bound_px, limit_rad):
+    """The most that steps from a state lead to, winning one correspondence at a time."""
+    norms = np.empty(len(data[1]))
+    best_state, best = start.copy(), _support(start, data, bound_px, norms)
+    improved = True
+    while improved and best < len(norms):
+        improved = False
+        for more in range(3):  # fit what it explains and its next neighbours
+            state = best_state.copy()
+            count = _support(state, data, bound_px, norms)
+            members = np.argsort(norms)[: min(count + more, len(norms))]
+            if not np.isfinite(norms[members]).all() or len(members) < 2:
+                break
+            for _ in range(STEPS):
+                if not _step(state, data, members, norms, bound_px, limit_rad):
+                    break
+                count = _support(state, data, bound_px, norms)
+                if count > best:
+                    best, best_state, improved = count, state.copy(), True
+            if improved:
+                break
+    return best
+
+
+@numba.njit(cache=True, nogil=True)
+def _search(starts, data, bound_px, limit_rad):
+    """The largest consensus reached from any of the states (S, 6)."""
+    supports, norms = np.empty(len(starts), np.int64), np.empty(len(data[1]))
+    for s in range(len(starts)):
+        supports[s] = _support(starts[s], data, bound_px, norms)
+    best = 0
+    for s in np.argsort(-supports):
+        if supports[s] < best - NEAR:
+            break
+        best = max(best, _climb(starts[s], data, bound_px, limit_rad))
+    return best
+
+
+def _state_of(aligned: AlignedProblem, cam_from_map: FloatArray) -> FloatArray:
+    """(yaw, translation, tilt) (6,) of a pose between the problem's own frames."""
+    rotation, translation = np.hsplit(aligned.align_pose(cam_from_map), [3])
+    down = rotation[:, 1]
+    angle = rotation_angle(rotation @ yaw_rotation(yaw_of(rotation)).T)
+    axis = np.array([down[2], 0.0, -down[0]])  # y x down: about which y was turned to where it is
+    length = float(np.linalg.norm(axis))
+    angle = float(np.arctan2(length, down[1]))
+    a, _, c = axis / length * angle if length > 0.0 else np.zeros(3)
+    state, tilt = np.array([0.0, *translation.ravel(), a, c]), np.empty((3, 3))
+    _rotation(state, tilt)
+    state[0] = yaw_of(tilt.T @ rotation)
+    return state
+
+
+def largest_consensus(aligned: AlignedProblem, bound_px: float, truth: FloatArray) -> int:
+    """Correspondences within ``bound_px`` at the best pose found whose tilt is within the gravity bound.
+
+    A lower bound of the true maximum, and so of every honest upper bound; ``truth`` (3, 4) is the true pose.
+    """
+    limit_rad = aligned.gravity_bound_rad
+    first, second = np.triu_indices(len(aligned.points), 1)
+    pairs = np.column_stack([np.append(first, second), np.append(second, first)])
+    tilts = [(0.0, 0.0)]
+    if limit_rad > 0.0:
+        around = 2 * np.pi * np.arange(TILTS) / TILTS
+        tilts += [(0.5 * limit_rad * np.cos(angle), 0.5 * limit_rad * np.sin(angle)) for angle in around]
+    state = _state_of(aligned, truth)
+    tilt = float(np.hypot(*state[4:]))
+    state[4:] *= min(1.0, limit_rad / tilt) if tilt > 0.0 else 0.0
+    starts = [state[None]]
+    for a, c in tilts:
+        turn = np.empty((3, 3))
+        _rotation(np.array([0.0, 0.0, 0.0, 0.0, a, c]), turn)
+        # p = T (R_y m + t'): the level pose (R_y, t') of the bearings turned back.
+        yaws, translations, exists = two_point(aligned.bearings[pairs] @ turn, aligned.points[pairs])
+        count = int(np.count_nonzero(exists))
+        starts.append(
+            np.column_stack([yaws[exists], translations[exists] @ turn.T, np.full(count, a), np.full(count, c)])
+        )
+    data = (aligned.bearings, aligned.points, aligned.pixel_from_bearing)
+    return int(_search(np.concatenate(starts), data, bound_px, limit_rad))

@@ -1,0 +1,37 @@
+"""What chance alone explains: when it explains as much as the best pose, no method can know the answer."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gammaln
+
+FloatArray = NDArray[np.float64]
+
+NEIGHBOURHOOD_RAD = 0.2
+"""Bearings are counted within this angle, to know how dense they are around each other."""
+MOST_BEARINGS = 500
+"""More are thinned: the density is a mean."""
+
+
+def chance_rate(bearings: FloatArray, bound_rad: FloatArray) -> float:
+    """Probability that a wrong pose explains a correspondence: that of M bearings one falls within its bound of another.
+
+    It is counted in a wider neighbourhood and scaled by the areas of both caps, so that bearings which are all in one
+    part of the image meet more often by chance than bearings all around. ``bearings`` (M, 3), ``bound_rad`` (M,).
+    """
+    step = -(-len(bearings) // MOST_BEARINGS)
+    some = bearings[::step]
+    near = np.count_nonzero(some @ some.T >= np.cos(NEIGHBOURHOOD_RAD)) - len(some)
+    density = max(near, 1) / (len(some) * max(len(some) - 1, 1))
+    cap = np.mean(np.sin(0.5 * bound_rad) ** 2) / np.sin(0.5 * NEIGHBOURHOOD_RAD) ** 2
+    return float(min(1.0, density * cap))
+
+
+def chance_sets(count: int, size: int, rate: float) -> float:
+    """Expected number of sets of ``size`` among ``count`` correspondences that agree with some pose by chance.
+
+    Two of them fix a pose and each other one is explained with probability ``rate``: C(count, size) rate^(size - 2).
+    """
+    if size < 2:
+        return float(count)
+    ways = gammaln(count + 1) - gammaln(size + 1) - gammaln(count - size + 1)
+    return float(np.exp(min(700.0, ways + (size - 2) * np.log(rate))))

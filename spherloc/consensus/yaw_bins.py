@@ -1,0 +1,71 @@
+"""First pass of the exact search: the circle in bins of yaw, and in each a cheap bound on the clique number.
+
+The graph of a bin has an edge for every pair with an arc that touches the bin, so it contains the graphs of all yaws in
+the bin. A clique of k nodes needs k nodes of degree k - 1 at least: the largest such k bounds the consensus.
+"""
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from spherloc.consensus.pair_arcs import CIRCLE
+
+FloatArray = NDArray[np.float64]
+IndexArray = NDArray[np.int32]
+
+BINS = 512
+"""Narrow beside the arcs of an error of some pixels, and few enough to cost nothing."""
+BIN_TURN = CIRCLE / BINS
+
+
+@numba.njit(cache=True, nogil=True)
+def sort_into_bins(lo: FloatArray, hi: FloatArray) -> tuple[NDArray[np.int64], IndexArray]:
+    """Places (BINS + 1,) where each bin's arcs start in a list of arcs, and the list."""
+    starts = np.zeros(BINS + 1, np.int64)
+    for arc in range(len(lo)):
+        first, last = _bins(lo[arc], hi[arc])
+        for b in range(first, last + 1):
+            starts[b % BINS + 1] += 1
+    for b in range(BINS):
+        starts[b + 1] += starts[b]
+    arcs = np.empty(starts[BINS], np.int32)
+    place = starts[:BINS].copy()
+    for arc in range(len(lo)):
+        first, last = _bins(lo[arc], hi[arc])
+        for b in range(first, last + 1):
+            arcs[place[b % BINS]] = arc
+            place[b % BINS] += 1
+    return starts, arcs
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _bins(lo, hi):
+    """First and last bin that an arc touches; not more than all."""
+    first, last = int(lo / BIN_TURN), int(hi / BIN_TURN)
+    return first, min(last, first + BINS - 1)
+
+
+@numba.njit(cache=True, nogil=True)
+def degree_bounds(count: int, pairs: IndexArray, starts: NDArray[np.int64], arcs: IndexArray) -> IndexArray:
+    """(BINS,) bound on the clique number of each bin's graph of ``count`` nodes."""
+    bound = np.empty(BINS, np.int32)
+    degree, tally = np.empty(count, np.int64), np.empty(count + 1, np.int64)
+    for b in range(BINS):
+        degree[:] = 0
+        for place in range(starts[b], starts[b + 1]):
+            arc = arcs[place]
+            degree[pairs[arc, 0]] += 1
+            degree[pairs[arc, 1]] += 1
+        tally[:] = 0
+        for node in range(count):
+            tally[min(degree[node], count)] += 1
+        # Nodes of degree k - 1 at least, for falling k, until there are k of them.
+        nodes = tally[count]
+        k = count
+        while k > 1:
+            nodes += tally[k - 1]
+            if nodes >= k:
+                break
+            k -= 1
+        bound[b] = k
+    return bound

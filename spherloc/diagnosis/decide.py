@@ -1,0 +1,125 @@
+"""From evidence to a cause. Which cause is asked for first matters: each may look like a later one, seldom the reverse."""
+
+import numpy as np
+
+from spherloc.diagnosis.causes import Cause, Diagnosis
+from spherloc.diagnosis.evidence import Evidence, Truth, different, gather, gather_truth
+from spherloc.diagnosis.experiments import WIDER, Fit, certify
+from spherloc.diagnosis.words import describe
+from spherloc.metrics import SUCCESS_DEG, SUCCESS_M
+from spherloc.trace import Trace
+
+CHANCE = 0.01
+"""A consensus is believed if fewer sets of its size are expected by chance."""
+LEAST = 4
+"""Nor is a smaller consensus ever believed: two matches fix a pose, and a third one agrees too easily."""
+LEAST_RIGHT_RATE = 0.04
+"""Share of right matches that any right reference image gives: with this many matches, none standing out means that
+the reference is wrong. Without the truth nothing else tells the two apart."""
+SPREAD = 1.5
+"""The bound is too small if twice of it holds this many times as many matches: noise of 0.75 times the bound does so."""
+TILT_SDS = 4.0
+"""Gravity is off if the matches tilt it beyond its bound by as many standard deviations..."""
+HARM = 0.5
+"""... and by as large a share of the noise bound, in the image: less does no harm."""
+AS_GOOD = 0.9
+"""Provided that the tilted pose has this share of the best level one's support: a true one has more, but wrong matches
+within the wider bound may have pulled it."""
+EQUAL = 0.88
+"""Two poses are equally supported from this ratio on; a measured one varies as noise moves matches over the bound."""
+STRONG = 0.45
+"""A second pose with this share of the best one's support is no coincidence: structure repeats itself."""
+MISSED = 0.85
+"""A run whose pose has less than this share of the best pose's support has missed it."""
+TO_BE_PROVEN = (Cause.FALSE_CONSENSUS, Cause.AMBIGUOUS, Cause.ITERATIONS_RAN_OUT)
+"""Causes whose evidence is complete only with a bound on every pose's support."""
+
+
+def diagnose(trace: Trace, use_truth: bool = True) -> Diagnosis:
+    """The cause that explains a run best, with evidence.
+
+    Runs further experiments on the problem, some tens of milliseconds for 200 correspondences. ``use_truth`` looks at
+    the problem's true pose and labels too, if it has them.
+    """
+    evidence = gather(trace)
+    truth = gather_truth(trace, evidence.bound_px) if use_truth else None
+    cause = without_truth(evidence) if truth is None else with_truth(evidence, truth)
+    certificate = certify(trace) if cause in TO_BE_PROVEN else trace.certificate
+    return describe(trace, evidence, truth, cause, certificate)
+
+
+def without_truth(e: Evidence) -> Cause:
+    """The cause as far as the matches themselves tell."""
+    best = 0 if e.best is None else e.best.support(e.bound_px)
+    believed = stands_out(e, best)
+    if believed and undetermined(e.rotation_sd_rad, e.position_sd_m):
+        return Cause.DEGENERATE
+    if stands_out(e, int(e.found(WIDER)), WIDER) and e.free is not None:
+        free = e.free.support(e.bound_px)
+        if free >= max(LEAST, AS_GOOD * best) and tilts(e, e.free.tilt_rad, TILT_SDS * e.free_tilt_sd_rad):
+            return Cause.GRAVITY_OFF
+        if e.found(2.0) >= SPREAD * max(1, free, best):
+            return Cause.BOUND_TOO_SMALL
+    if not believed:
+        expected = int(LEAST_RIGHT_RATE * len(e.aligned.points))
+        return Cause.WRONG_REFERENCE if stands_out(e, expected) else Cause.TOO_FEW_INLIERS
+    second = 0 if e.rival is None else e.rival.support(e.bound_px)
+    if stands_out(e, second) and second >= STRONG * best:
+        return Cause.AMBIGUOUS if second >= EQUAL * best else Cause.FALSE_CONSENSUS
+    return Cause.ITERATIONS_RAN_OUT if missed(e, best) else Cause.OK
+
+
+def with_truth(e: Evidence, t: Truth) -> Cause:
+    """The cause, given the true pose and which matches are right."""
+    right = int(np.count_nonzero(t.right))
+    if right < 2:
+        return Cause.WRONG_REFERENCE
+    if not stands_out(e, right):
+        return Cause.TOO_FEW_INLIERS
+    if undetermined(t.rotation_sd_rad, t.position_sd_m):
+        return Cause.DEGENERATE
+    if tilts(e, t.tilt_rad, 0.0):
+        return Cause.GRAVITY_OFF
+    errors = t.fit.errors_px[t.right]
+    within, twice = (np.count_nonzero(errors <= factor * e.bound_px) for factor in (1.0, 2.0))
+    if twice >= SPREAD * max(1, within):
+        return Cause.BOUND_TOO_SMALL
+    true, other = t.fit.support(e.bound_px), _other(e, t.fit)
+    if stands_out(e, other) and other >= EQUAL * true:
+        return Cause.FALSE_CONSENSUS if true < EQUAL * other else Cause.AMBIGUOUS
+    if t.success:
+        return Cause.OK
+    near = e.run is not None and not different(e.run.cam_from_map, t.fit.cam_from_map)
+    return Cause.DEGENERATE if near else Cause.ITERATIONS_RAN_OUT
+
+
+def stands_out(e: Evidence, size: int, wider: float = 1.0) -> bool:
+    """Whether a consensus of that size is more than chance gives."""
+    return size >= LEAST and e.chance_sets(size, wider) < CHANCE
+
+
+def undetermined(rotation_sd_rad: float, position_sd_m: float) -> bool:
+    """Whether one standard deviation is already more than the error of a success."""
+    return rotation_sd_rad > np.radians(SUCCESS_DEG) or position_sd_m > SUCCESS_M
+
+
+def tilts(e: Evidence, tilt_rad: float, slack_rad: float) -> bool:
+    """Whether gravity is off by more than its bound, and so much that it matters."""
+    excess = tilt_rad - e.aligned.gravity_bound_rad
+    harm_px = excess * float(np.median(e.aligned.pixels_per_radian))
+    return excess > slack_rad and harm_px > HARM * e.bound_px
+
+
+def missed(e: Evidence, best: int) -> bool:
+    """Whether the run's pose is another than the best one and explains clearly less."""
+    if e.run is None or e.best is None:
+        return True
+    less = e.run.support(e.bound_px) < MISSED * best
+    return less and different(e.run.cam_from_map, e.best.cam_from_map)
+
+
+def _other(e: Evidence, true: Fit) -> int:
+    """Most support of a pose that is clearly not the true one."""
+    fits = [fit for fit in (e.run, e.best, e.rival) if fit is not None]
+    wrong = [fit for fit in fits if different(fit.cam_from_map, true.cam_from_map)]
+    return max((fit.support(e.bound_px) for fit in wrong), default=0)

@@ -1,0 +1,249 @@
+"""RANSAC around any solver of ``spherloc.solvers``: the baselines that the paper compares 2P with (Sec. VI).
+
+Algorithm 1 with a 6-DoF solver in the place of 2P: sample, solve, count inliers, keep the best, refine. Gravity is not
+used unless ``gravity_sd_deg`` asks the refinement to.
+
+The pinhole solvers see the correspondences inside a rectified virtual camera only, from sampling to refinement; those
+outside are lost to them and never count as inliers. For these solvers the paper takes RANSAC "to remove outliers for
+them" (Sec. VI-C): EPnP solves the samples, as in OpenCV's RANSAC, and the solver in question all inliers of the best.
+Residuals and bounds stay those of the original pixels.
+"""
+
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spherloc.bounds import Bounds
+from spherloc.errors import InputError
+from spherloc.estimators.base import Clock, Outcome, check_positive
+from spherloc.metrics import ransac_success_probability
+from spherloc.problem import AlignedProblem
+from spherloc.refine import RefinementOptions, refine, residuals_px
+from spherloc.solvers.base import Solver
+from spherloc.solvers.epnp import Epnp
+from spherloc.solvers.epropnp import EproPnp
+from spherloc.solvers.mlpnp import Mlpnp
+from spherloc.solvers.odlt import Odlt
+from spherloc.solvers.svd import Svd
+from spherloc.solvers.virtual_pinhole import VirtualPinhole
+from spherloc.trace import RansacStage
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.int64]
+
+MOST_ITERATIONS = 1_000_000
+
+
+@dataclass(frozen=True)
+class SolverRansacOptions(RefinementOptions):
+    """Options of the baselines. The defaults are the paper's."""
+
+    bound_px: float = 8.0
+    """Reprojection error up to which a correspondence is an inlier, px (8, as OpenCV's default and the paper's)."""
+    iterations: int = 100
+    """Samples drawn; with a confidence, the most that are drawn."""
+    confidence: float | None = None
+    """Stop as soon as Eq. 28 gives this probability of having drawn inliers only; None draws all samples."""
+    gravity_sd_deg: float | None = np.inf
+    """Standard deviation of the known roll and pitch, degrees, for the refinement: inf ignores them, as the paper's
+    baselines do; None takes the problem's."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_positive(self)
+        if self.iterations != int(self.iterations) or self.iterations > MOST_ITERATIONS:
+            raise InputError(f"option iterations is {self.iterations}; give a whole number up to {MOST_ITERATIONS:,}.")
+        if self.confidence is not None and self.confidence >= 1.0:
+            raise InputError(f"option confidence is {self.confidence}; give a probability below 1.")
+
+
+@dataclass(frozen=True, eq=False)
+class _View:
+    """What a solver gets to see of the problem, V of its M usable correspondences."""
+
+    seen: BoolArray
+    """(M,)."""
+    aligned: AlignedProblem
+    """The V correspondences."""
+    bounds: Bounds
+    """Theirs."""
+    bearings: FloatArray
+    """(V, 3), camera frame."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Hypothesis:
+    """A pose that beat those before it, or the fit to all inliers of the last one."""
+
+    iteration: int
+    sample: IntArray
+    cam_from_map: FloatArray
+    """(3, 4), aligned frames."""
+    mask: BoolArray
+    """(V,)."""
+    fitted: bool = False
+
+
+@dataclass(frozen=True)
+class SolverRansac:
+    """An estimator that samples for one solver and may fit the inliers by another."""
+
+    name: str
+    """As it is registered."""
+    sampler: Solver
+    """Solves the samples."""
+    fitter: Solver | None = None
+    """Solves all inliers of the best hypothesis; None leaves that to the refinement, as Algorithm 1 does."""
+    Options: ClassVar = SolverRansacOptions
+
+    def run(
+        self, aligned: AlignedProblem, options: SolverRansacOptions, bounds: Bounds, seed: int, clock: Clock
+    ) -> Outcome:
+        """Algorithm 1."""
+        view = _view(aligned, bounds, self.sampler.pinhole)
+        with clock.stage("ransac"):
+            drawn, found = self._search(view, options, np.random.default_rng(seed))
+            reason = self._no_pose(view, drawn, found)
+            if not reason and self.fitter is not None:
+                fit = self._fit(view, found[-1])
+                found += [] if fit is None else [fit]
+                reason = "" if fit is not None else self._no_fit(found[-1])
+            stage = _stage(view, drawn, found, self.sampler.sample_size)
+        inlier_mask = np.zeros(len(aligned.bearings), dtype=bool)
+        if reason:
+            return Outcome((stage,), None, inlier_mask, reason + _lost(view))
+        with clock.stage("refinement"):
+            refined, inliers, refinement = refine(view.aligned, found[-1].cam_from_map, view.bounds, options)
+        inlier_mask[view.seen] = inliers
+        return Outcome((stage, refinement), refined, inlier_mask, _found(view, int(np.count_nonzero(inliers))))
+
+    def _search(
+        self, view: _View, options: SolverRansacOptions, rng: np.random.Generator
+    ) -> tuple[int, list[_Hypothesis]]:
+        """Samples drawn, and every hypothesis that explains more than all before it."""
+        count, size, points = len(view.bearings), self.sampler.sample_size, view.aligned.points
+        found: list[_Hypothesis] = []
+        if count < size:
+            return 0, found
+        samples = draw_samples(rng, count, size, int(options.iterations))
+        best, drawn, needed = 0, 0, float(len(samples))
+        while drawn < len(samples) and drawn < needed:
+            sample = samples[drawn]
+            for solution in self.sampler.solve(view.bearings[sample], points[sample]):
+                state = view.aligned.camera_turn @ solution
+                inliers, mask = _explained(view, state)
+                if inliers <= best:
+                    continue
+                best = inliers
+                found.append(_Hypothesis(drawn, sample, state, mask))
+                if options.confidence is not None:
+                    needed = _samples_needed(options.confidence, inliers / count, size)
+            drawn += 1
+        return drawn, found
+
+    def _fit(self, view: _View, best: _Hypothesis) -> _Hypothesis | None:
+        """The fitter's pose from all inliers of the best hypothesis, if it finds one that explains any."""
+        assert self.fitter is not None
+        if np.count_nonzero(best.mask) < self.fitter.sample_size:
+            return None
+        for solution in self.fitter.solve(view.bearings[best.mask], view.aligned.points[best.mask]):
+            state = view.aligned.camera_turn @ solution
+            inliers, mask = _explained(view, state)
+            if inliers:
+                return replace(best, cam_from_map=state, mask=mask, fitted=True)
+        return None
+
+    def _no_pose(self, view: _View, drawn: int, found: list[_Hypothesis]) -> str:
+        """Why there is no hypothesis; empty if there is one."""
+        count, size = len(view.bearings), self.sampler.sample_size
+        if count < size:
+            where = "inside its virtual camera" if self.sampler.pinhole else "usable"
+            verb = "is" if count == 1 else "are"
+            return f"No pose: {self.name} needs {size} correspondences, {count} {verb} {where}."
+        return "" if found else f"No pose: none of {drawn} samples has a solution that explains a correspondence."
+
+    def _no_fit(self, best: _Hypothesis) -> str:
+        """Why the fitter has no pose."""
+        assert self.fitter is not None
+        inliers, size = int(np.count_nonzero(best.mask)), self.fitter.sample_size
+        if inliers < size:
+            return f"No pose: {self.fitter.name} needs {size} inliers, the best sample's pose has {inliers}."
+        return f"No pose: {self.fitter.name} finds none from the {inliers} inliers of the best sample's pose."
+
+
+RANSAC_SVD = SolverRansac("ransac-svd", Svd())
+RANSAC_MLPNP = SolverRansac("ransac-mlpnp", Mlpnp())
+RANSAC_EPNP = SolverRansac("ransac-epnp", Epnp(), Epnp())
+RANSAC_ODLT = SolverRansac("ransac-odlt", Epnp(), Odlt())
+RANSAC_EPROPNP = SolverRansac("ransac-epropnp", Epnp(), EproPnp())
+
+
+def draw_samples(rng: np.random.Generator, count: int, size: int, draws: int) -> IntArray:
+    """Uniform sets (draws, size) of different numbers below ``count``, by Floyd's algorithm, column by column."""
+    samples = np.empty((draws, size), dtype=np.int64)
+    for column in range(size):
+        last = count - size + column
+        drawn = rng.integers(0, last + 1, draws)
+        taken = (samples[:, :column] == drawn[:, None]).any(axis=1)
+        samples[:, column] = np.where(taken, last, drawn)
+    return samples
+
+
+def _samples_needed(confidence: float, inlier_rate: float, size: int) -> float:
+    """Samples after which Eq. 28 gives ``confidence``."""
+    clean = inlier_rate**size
+    return float(np.log1p(-confidence) / np.log1p(-clean)) if clean < 1.0 else 0.0
+
+
+def _view(aligned: AlignedProblem, bounds: Bounds, pinhole: bool) -> _View:
+    bearings = aligned.bearings @ aligned.camera_turn
+    if not pinhole:
+        return _View(np.ones(len(bearings), dtype=bool), aligned, bounds, bearings)
+    seen = VirtualPinhole().sees(bearings)
+    names = ("index", "bearings", "points", "pixel_from_bearing", "radians_per_pixel")
+    part = {name: getattr(aligned, name)[seen] for name in names}
+    for array in part.values():
+        array.setflags(write=False)  # as in the whole: kernels are compiled for one or the other
+    part_bounds = replace(bounds, pixels=bounds.pixels[seen], radians=bounds.radians[seen])
+    return _View(seen, replace(aligned, **part), part_bounds, bearings[seen])
+
+
+def _lost(view: _View) -> str:
+    """The correspondences that the virtual camera does not see, as a sentence to append; empty if it sees all."""
+    lost = int(np.count_nonzero(~view.seen))
+    if not lost:
+        return ""
+    return (
+        f" {lost} of {len(view.seen)} usable correspondences {'lies' if lost == 1 else 'lie'} outside the virtual "
+        f"camera's {VirtualPinhole().fov_deg:g} degrees."
+    )
+
+
+def _found(view: _View, inliers: int) -> str:
+    """The outcome in a sentence that the usual one would not tell: what was lost; empty if nothing was."""
+    lost = _lost(view)
+    return f"Pose found: {inliers} of {view.aligned.count} correspondences agree with it.{lost}" if lost else ""
+
+
+def _explained(view: _View, cam_from_map: FloatArray) -> tuple[int, BoolArray]:
+    """How many correspondences a pose explains, and which (V,). Its tilt is free, so the bound is that of the noise."""
+    mask = residuals_px(view.aligned, cam_from_map) <= view.bounds.noise_px
+    return int(np.count_nonzero(mask)), mask
+
+
+def _stage(view: _View, drawn: int, found: list[_Hypothesis], size: int) -> RansacStage:
+    """The record of a search, in the problem's own frames and numbers."""
+    aligned = view.aligned
+    rate = np.count_nonzero(found[-1].mask) / len(found[-1].mask) if found else 0.0
+    return RansacStage(
+        iterations=drawn,
+        confidence_reached=ransac_success_probability(rate, size, drawn),
+        improved_at=np.array([item.iteration for item in found], dtype=np.int32),
+        samples=aligned.index.astype(np.int32)[np.array([item.sample for item in found], dtype=int).reshape(-1, size)],
+        cam_from_map=np.array([aligned.unalign_pose(item.cam_from_map) for item in found]).reshape(-1, 3, 4),
+        inlier_masks=np.array([aligned.full_mask(item.mask) for item in found], bool).reshape(-1, aligned.count),
+        locally_optimized=np.array([item.fitted for item in found], dtype=bool),
+    )

@@ -1,0 +1,314 @@
+"""Damped Gauss-Newton on the sphere: pose, gravity prior and their normal equations, compiled.
+
+The cost is sum rho(|P v'|^2 / noise_px^2) + |tilt|^2 / gravity_sd_rad^2: v' is the unit vector towards R p + t, P the
+pseudo-inverse of the unprojection's Jacobian at the measured pixel (``Problem.pixel_from_bearing``), and tilt the
+horizontal rotation vector from +y to the map's down direction in the camera, R e_y. All frames are gravity-aligned.
+
+The pose is moved as (R, m), m = R c + t being the middle c of the chosen points in the camera frame: a step (w, d)
+makes (Exp(w) R, m + d). It turns about the middle, which keeps rotation and translation from trading against each other
+when the points are far away or the map's origin is.
+"""
+
+import numba
+import numpy as np
+
+ROBUST_NONE, ROBUST_HUBER, ROBUST_CAUCHY = 0, 1, 2
+HUBER_WIDTH, CAUCHY_WIDTH = 1.345, 2.3849
+"""In standard deviations of the noise: the usual constants, 95 % efficient for a normal residual."""
+LEAST_FOR_SIX_DOF = 4
+"""Three points leave up to four poses and two leave a curve, so fewer keep their tilt if gravity is unknown."""
+LEAST_GRAVITY_SD_RAD = 1e-9
+"""A prior sharper than this is exact: its residual would be rounding."""
+RANK_TOLERANCE = 1e-12
+"""Least pivot of normal equations whose columns have length 1."""
+GAIN_TOLERANCE = 1e-9
+"""Relative fall of the cost at which a minimum is reached: the step was 1e-3 of the noise's effect or less, and the
+next would be a hundred times shorter."""
+RESIDUAL_TOLERANCE = 1e-10
+"""Root mean square residual, in standard deviations, that is nothing but rounding."""
+LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e4
+
+
+@numba.njit(cache=True, nogil=True)
+def polish(points, weights, chosen, rotation, translation, noise_px, gravity_sd_rad, robust, most_steps):
+    """Minimise the cost over the chosen correspondences; return the accepted steps. The pose is changed in place.
+
+    ``points`` (M, 3) m, ``weights`` (M, 2, 3) px, ``chosen`` (M,) bool, ``rotation`` (3, 3), ``translation`` (3,) m.
+    ``gravity_sd_rad`` of 0 is 4 DoF: the rotation is projected to a pure yaw first. inf is 6 DoF without prior, or
+    4 DoF at the given tilt for fewer than ``LEAST_FOR_SIX_DOF``. Fewer than two chosen leave the pose. ``robust`` is
+    one of ``ROBUST_*``. The cost never rises (after the projection), and no NaN is written. Chosen points must lie in
+    front of their bearings.
+    """
+    return polish_path(
+        points,
+        weights,
+        chosen,
+        rotation,
+        translation,
+        noise_px,
+        gravity_sd_rad,
+        robust,
+        most_steps,
+        np.empty((0, 3, 4)),
+    )
+
+
+@numba.njit(cache=True, nogil=True)
+def polish_path(points, weights, chosen, rotation, translation, noise_px, gravity_sd_rad, robust, most_steps, path):
+    """As ``polish``; the pose after each accepted step is written to ``path`` (K, 3, 4) as far as that reaches."""
+    count, centre = middle_of(points, chosen)
+    if count < 2:
+        return 0
+    middle = rotation @ centre + translation
+    if gravity_sd_rad < LEAST_GRAVITY_SD_RAD:
+        rotation[:] = nearest_yaw(rotation)
+        translation[:] = middle - rotation @ centre
+    dof = degrees_of_freedom(count, gravity_sd_rad)
+    hessian, gradient, step = np.empty((6, 6)), np.empty(6), np.empty(6)
+    next_hessian, next_gradient = np.empty((6, 6)), np.empty(6)
+    turned, moved, factor = np.empty((3, 3)), np.empty(3), np.empty((6, 6))
+    cost = normal_equations(
+        points, weights, chosen, centre, rotation, middle, noise_px, gravity_sd_rad, robust, dof, hessian, gradient
+    )
+    floor = count * RESIDUAL_TOLERANCE**2
+    steps, damping = 0, 0.0
+    while steps < most_steps and floor < cost < np.inf and damping <= MOST_DAMPING:
+        lower = np.inf
+        if solve(hessian, gradient, damping, factor, step):
+            turn(step, rotation, turned)
+            moved[:] = middle + step[3:]
+            lower = normal_equations(
+                points, weights, chosen, centre, turned, moved,
+                noise_px, gravity_sd_rad, robust, dof, next_hessian, next_gradient,
+            )  # fmt: skip
+        if not lower < cost:
+            expected = -(gradient @ step)
+            if lower < np.inf and expected <= GAIN_TOLERANCE * cost:
+                break
+            damping = max(LEAST_DAMPING, 10.0 * damping)
+            continue
+        gain, cost = cost - lower, lower
+        rotation[:], middle[:] = turned, moved
+        translation[:] = middle - rotation @ centre
+        hessian, next_hessian = next_hessian, hessian
+        gradient, next_gradient = next_gradient, gradient
+        damping = 0.1 * damping if damping > LEAST_DAMPING else 0.0
+        if steps < len(path):
+            path[steps, :, :3], path[steps, :, 3] = rotation, translation
+        steps += 1
+        if gain <= GAIN_TOLERANCE * cost:
+            break
+    return steps
+
+
+@numba.njit(cache=True, nogil=True)
+def degrees_of_freedom(count, gravity_sd_rad):
+    """6, or 4 where the tilt stays as it is: gravity exact, or unknown with too few points to find it."""
+    unknown = gravity_sd_rad == np.inf and count < LEAST_FOR_SIX_DOF
+    return 4 if unknown or gravity_sd_rad < LEAST_GRAVITY_SD_RAD else 6
+
+
+@numba.njit(cache=True, nogil=True)
+def middle_of(points, chosen):
+    """Number of chosen points, and their mean (3,)."""
+    count, x, y, z = 0, 0.0, 0.0, 0.0
+    for k in range(len(points)):
+        if chosen[k]:
+            count, x, y, z = count + 1, x + points[k, 0], y + points[k, 1], z + points[k, 2]
+    return count, np.array([x, y, z]) / max(count, 1)
+
+
+@numba.njit(cache=True, nogil=True)
+def nearest_yaw(rotation):
+    """The rotation (3, 3) about y closest to ``rotation``; see ``geometry.yaw_of``."""
+    yaw = np.arctan2(rotation[0, 2] - rotation[2, 0], rotation[0, 0] + rotation[2, 2])
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+
+
+@numba.njit(cache=True, nogil=True)
+def levelled(cam_from_map, centre):
+    """The pose (3, 4) with the nearest yaw for its rotation that leaves the point ``centre`` (3,) where it is."""
+    rotation = cam_from_map[:, :3].copy()
+    level = np.empty((3, 4))
+    level[:, :3] = nearest_yaw(rotation)
+    level[:, 3] = cam_from_map[:, 3] + (rotation - level[:, :3]) @ centre
+    return level
+
+
+@numba.njit(cache=True, nogil=True)
+def turn(step, rotation, turned):
+    """Write Exp(w) R with w = ``step[:3]`` (Rodrigues, exact to rounding at zero)."""
+    wx, wy, wz = step[0], step[1], step[2]
+    angle = np.sqrt(wx * wx + wy * wy + wz * wz)
+    first, second = 1.0, 0.5
+    if angle > 1e-8:
+        half = np.sin(0.5 * angle) / angle
+        first, second = np.sin(angle) / angle, 2.0 * half * half
+    for k in range(3):
+        x, y, z = rotation[0, k], rotation[1, k], rotation[2, k]
+        dx, dy, dz = wy * z - wz * y, wz * x - wx * z, wx * y - wy * x
+        turned[0, k] = x + first * dx + second * (wy * dz - wz * dy)
+        turned[1, k] = y + first * dy + second * (wz * dx - wx * dz)
+        turned[2, k] = z + first * dz + second * (wx * dy - wy * dx)
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def robust_weight(square, robust):
+    """rho(s) and its derivative, s a squared residual in units of the noise's variance."""
+    if robust == ROBUST_HUBER and square > HUBER_WIDTH * HUBER_WIDTH:
+        norm = np.sqrt(square)
+        return HUBER_WIDTH * (2.0 * norm - HUBER_WIDTH), HUBER_WIDTH / norm
+    if robust == ROBUST_CAUCHY:
+        share = square / (CAUCHY_WIDTH * CAUCHY_WIDTH)
+        return CAUCHY_WIDTH * CAUCHY_WIDTH * np.log1p(share), 1.0 / (1.0 + share)
+    return square, 1.0
+
+
+@numba.njit(cache=True, nogil=True)
+def normal_equations(
+    points, weights, chosen, centre, rotation, middle, noise_px, gravity_sd_rad, robust, dof, hessian, gradient
+):
+    """The cost at (R, m); write J^T J (6, 6) and J^T r (6,) of the step (w, d) at zero.
+
+    Only the chosen points count; inf if one of them lies at the camera's centre. ``dof`` of 4 leaves w_x and w_z out:
+    theirs are the rows of a unit matrix, so that a step does not change them.
+    """
+    r00, r01, r02 = rotation[0, 0], rotation[0, 1], rotation[0, 2]
+    r10, r11, r12 = rotation[1, 0], rotation[1, 1], rotation[1, 2]
+    r20, r21, r22 = rotation[2, 0], rotation[2, 1], rotation[2, 2]
+    precision = (1.0 / noise_px) ** 2
+    h00 = h01 = h02 = h03 = h04 = h05 = h11 = h12 = h13 = h14 = h15 = 0.0
+    h22 = h23 = h24 = h25 = h33 = h34 = h35 = h44 = h45 = h55 = 0.0
+    g0 = g1 = g2 = g3 = g4 = g5 = cost = 0.0
+    for k in range(len(points)):
+        if not chosen[k]:
+            continue
+        px, py, pz = points[k, 0] - centre[0], points[k, 1] - centre[1], points[k, 2] - centre[2]
+        ax, ay, az = r00 * px + r01 * py + r02 * pz, r10 * px + r11 * py + r12 * pz, r20 * px + r21 * py + r22 * pz
+        x, y, z = ax + middle[0], ay + middle[1], az + middle[2]
+        square = x * x + y * y + z * z
+        if not square > 0.0:
+            return np.inf
+        inverse = 1.0 / np.sqrt(square)
+        x, y, z = x * inverse, y * inverse, z * inverse
+        u0, u1, u2, v0, v1, v2 = (
+            weights[k, 0, 0], weights[k, 0, 1], weights[k, 0, 2], weights[k, 1, 0], weights[k, 1, 1], weights[k, 1, 2],
+        )  # fmt: skip
+        ru, rv = u0 * x + u1 * y + u2 * z, v0 * x + v1 * y + v2 * z
+        loss, weight = robust_weight((ru * ru + rv * rv) * precision, robust)
+        cost += loss
+        # By the ray, J = (P - P v' v'^T) / |ray|; a turn moves the ray by w x arm: J^T times K = skew(arm). With
+        # A = J^T J the blocks are A, K A and K A K^T, which is fewer products than all six columns' would be.
+        u0, u1, u2, v0, v1, v2 = u0 - ru * x, u1 - ru * y, u2 - ru * z, v0 - rv * x, v1 - rv * y, v2 - rv * z
+        scale = weight * inverse * inverse
+        a33, a34, a35 = scale * (u0 * u0 + v0 * v0), scale * (u0 * u1 + v0 * v1), scale * (u0 * u2 + v0 * v2)
+        a44, a45, a55 = scale * (u1 * u1 + v1 * v1), scale * (u1 * u2 + v1 * v2), scale * (u2 * u2 + v2 * v2)
+        m03, m04, m05 = ay * a35 - az * a34, ay * a45 - az * a44, ay * a55 - az * a45
+        m13, m14, m15 = az * a33 - ax * a35, az * a34 - ax * a45, az * a35 - ax * a55
+        m23, m24, m25 = ax * a34 - ay * a33, ax * a44 - ay * a34, ax * a45 - ay * a35
+        h33, h34, h35, h44, h45, h55 = h33 + a33, h34 + a34, h35 + a35, h44 + a44, h45 + a45, h55 + a55
+        h03, h04, h05, h13, h14, h15 = h03 + m03, h04 + m04, h05 + m05, h13 + m13, h14 + m14, h15 + m15
+        h23, h24, h25 = h23 + m23, h24 + m24, h25 + m25
+        h00, h01, h02 = h00 + ay * m05 - az * m04, h01 + az * m03 - ax * m05, h02 + ax * m04 - ay * m03
+        h11, h12, h22 = h11 + az * m13 - ax * m15, h12 + ax * m14 - ay * m13, h22 + ax * m24 - ay * m23
+        scale = weight * inverse
+        b0, b1, b2 = scale * (u0 * ru + v0 * rv), scale * (u1 * ru + v1 * rv), scale * (u2 * ru + v2 * rv)
+        g0, g1, g2 = g0 + ay * b2 - az * b1, g1 + az * b0 - ax * b2, g2 + ax * b1 - ay * b0
+        g3, g4, g5 = g3 + b0, g4 + b1, g5 + b2
+    hessian[0] = h00, h01, h02, h03, h04, h05
+    hessian[1] = h01, h11, h12, h13, h14, h15
+    hessian[2] = h02, h12, h22, h23, h24, h25
+    hessian[3] = h03, h13, h23, h33, h34, h35
+    hessian[4] = h04, h14, h24, h34, h44, h45
+    hessian[5] = h05, h15, h25, h35, h45, h55
+    gradient[:] = g0, g1, g2, g3, g4, g5
+    hessian *= precision
+    gradient *= precision
+    if dof == 4:
+        for k in (0, 2):
+            hessian[k, :], hessian[:, k], hessian[k, k], gradient[k] = 0.0, 0.0, 1.0, 0.0
+        return cost
+    return cost + add_gravity(rotation, gravity_sd_rad, hessian, gradient)
+
+
+@numba.njit(cache=True, nogil=True)
+def tilt_of(rotation):
+    """Angle (rad) between the map's down direction, R e_y, and the +y of the aligned camera."""
+    return np.arctan2(np.hypot(rotation[0, 1], rotation[2, 1]), rotation[1, 1])
+
+
+@numba.njit(cache=True, nogil=True)
+def add_gravity(rotation, gravity_sd_rad, hessian, gradient):
+    """Cost of the gravity prior; add its J^T J and J^T r.
+
+    The residual is the tilt's angle times the horizontal direction u of R e_y = (u sin, cos), not its sine, which
+    would fold beyond 90 degrees.
+    """
+    if gravity_sd_rad == np.inf:
+        return 0.0
+    gx, gy, gz = rotation[0, 1], rotation[1, 1], rotation[2, 1]
+    sine = np.sqrt(gx * gx + gz * gz)
+    angle = tilt_of(rotation)
+    # Level, any direction will do, and upside down none is better.
+    ux, uz, stretch = (gx / sine, gz / sine, min(angle / sine, 1e6)) if sine > 0.0 else (1.0, 0.0, 1.0)
+    by_x, by_y, by_z = np.array([0.0, gz, -gy]), np.array([-gz, 0.0, gx]), np.array([gy, -gx, 0.0])  # of w x R e_y
+    outward = ux * by_x + uz * by_z
+    by_angle = gy * outward - sine * by_y
+    for u, by in ((ux, by_x), (uz, by_z)):
+        row = (u * by_angle + stretch * (by - u * outward)) / gravity_sd_rad
+        residual = angle * u / gravity_sd_rad
+        for a in range(3):
+            gradient[a] += row[a] * residual
+            for b in range(3):
+                hessian[a, b] += row[a] * row[b]
+    return (angle / gravity_sd_rad) ** 2
+
+
+@numba.njit(cache=True, nogil=True)
+def factorise(hessian, damping, factor):
+    """Write the Cholesky factor of the damped matrix with its diagonal scaled to 1; False if it has no full rank.
+
+    Returned in ``factor`` (6, 6): below and on the diagonal L, of S H S = L L^T; above, nothing. The scale of
+    column k is 1 / sqrt(H_kk), or 1 for a column of zeros.
+    """
+    for a in range(6):
+        for b in range(a + 1):
+            total = hessian[a, b] * scale_of(hessian, a) * scale_of(hessian, b)
+            if a == b:
+                total += damping
+            for k in range(b):
+                total -= factor[a, k] * factor[b, k]
+            if a > b:
+                factor[a, b] = total / factor[b, b]
+            elif total > RANK_TOLERANCE:
+                factor[a, a] = np.sqrt(total)
+            else:
+                return False
+    return True
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def scale_of(hessian, k):
+    """What scales a column of the normal equations to length 1."""
+    return 1.0 / np.sqrt(hessian[k, k]) if hessian[k, k] > 0.0 else 1.0
+
+
+@numba.njit(cache=True, nogil=True)
+def solve(hessian, gradient, damping, factor, step):
+    """Write the damped step -(H + damping diag H)^-1 g; False if H has no full rank."""
+    if not factorise(hessian, damping, factor):
+        return False
+    for a in range(6):
+        total = -gradient[a] * scale_of(hessian, a)
+        for k in range(a):
+            total -= factor[a, k] * step[k]
+        step[a] = total / factor[a, a]
+    for a in range(5, -1, -1):
+        total = step[a]
+        for k in range(a + 1, 6):
+            total -= factor[k, a] * step[k]
+        step[a] = total / factor[a, a]
+    for a in range(6):
+        step[a] *= scale_of(hessian, a)
+    return True

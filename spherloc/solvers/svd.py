@@ -1,0 +1,43 @@
+"""SVD: the direct linear transform on bearings, the paper's linear 6-DoF solver for the unified sphere.
+
+    v_i x (A p_i + b) = 0,   [A | b] = alpha [R | t]
+
+Two independent rows a correspondence, twelve unknowns up to scale: six correspondences. The null vector comes from a
+singular value decomposition, its sign from positive depths, R is the rotation closest to A, and t solves the rows again
+with R given. Works on the whole sphere. The rows weigh far points more than near ones and ignore that A is a rotation,
+so it is not statistically optimal.
+
+Degenerate if the points lie in one plane or on a twisted cubic with the camera (noise then decides the pose).
+
+Abdel-Aziz, Karara: Direct linear transformation from comparator coordinates into object space coordinates in
+close-range photogrammetry, 1971. Conditioning: Hartley, In defense of the eight-point algorithm, PAMI 1997.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spherloc.solvers.base import NO_POSES, checked, poses
+from spherloc.solvers.linear_pose import condition, linear_pose, projectors
+
+FloatArray = NDArray[np.float64]
+
+
+class Svd:
+    """The direct linear transform on bearings."""
+
+    name = "SVD"
+    sample_size = 6
+    pinhole = False
+
+    def solve(self, bearings: FloatArray, points: FloatArray) -> FloatArray:
+        """See ``Solver.solve``; at most one pose."""
+        bearings, points = checked(self, bearings, points)
+        conditioned = condition(points)
+        if conditioned is None:
+            return NO_POSES
+        points, middle, scale = conditioned
+        found = linear_pose(bearings, projectors(bearings), points)
+        if found is None:
+            return NO_POSES
+        rotation, translation = found
+        return poses(rotation, translation / scale - rotation @ middle)
