@@ -9,7 +9,7 @@ export PYTHON
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help play test lint clean
+.PHONY: help play test lint bench clean
 
 help: ## Show this
 	@printf 'spherloc: see why visual localization works, and why it fails\n\n'
@@ -36,6 +36,10 @@ lint: ## Check style, format and types
 	$(BIN)/python -m ruff format --check . || status=1; \
 	PYRIGHT_PYTHON_IGNORE_WARNINGS=1 $(BIN)/python -m pyright || status=1; \
 	exit $$status
+
+bench: ## Measure spherloc beside its peers, some 25 minutes; a stopped run goes on
+	@scripts/setup.sh bench
+	@exec $(BIN)/python -m benchmarks.run $(ARGS)
 
 clean: ## Remove what make installed and built here: .venv and caches
 	rm -rf .venv build *.egg-info .pytest_cache .hypothesis .ruff_cache

@@ -1,16 +1,16 @@
 """Largest consensus of a small problem, the slow and plain way: shares no search and no arithmetic with ``spherloc``
 but the 2P solver that proposes where to start.
 
-A pose is (yaw, translation, tilt): R = exp([a, 0, c]) R_y(yaw) with |(a, c)| at most the gravity bound. From the 2P pose
-of every pair, level and tilted, and from the true pose, Gauss-Newton steps whose weights favour the worst residual try
-to win one correspondence more, then another.
+A pose is (yaw, translation, tilt): R = exp([a, 0, c]) R_y(yaw) with |(a, c)| at most the gravity bound. From the 2P
+pose of every pair, level and tilted, and from the true pose, Gauss-Newton steps whose weights favour the worst residual
+try to win one correspondence more, then another.
 """
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from spherloc.geometry import rotation_angle, yaw_of, yaw_rotation
+from spherloc.geometry import yaw_of
 from spherloc.problem import AlignedProblem
 from spherloc.solvers.two_point import two_point
 
@@ -18,7 +18,7 @@ FloatArray = NDArray[np.float64]
 
 STEPS = 8
 STEP = 1e-6
-TILTS = 4
+TILTS = 3
 """Directions in which gravity is also taken to be off, each by half the bound."""
 NEAR = 3
 """Starts that explain fewer than the best by more than this are not climbed from."""
@@ -31,18 +31,15 @@ def _rotation(state, out):
     angle = np.sqrt(a * a + c * c)
     first = np.sin(angle) / angle if angle > 1e-12 else 1.0
     second = (1.0 - np.cos(angle)) / (angle * angle) if angle > 1e-12 else 0.5
-    tilt = np.array(
-        [
-            [1.0 - second * c * c, -first * c, second * a * c],
-            [first * c, 1.0 - second * (a * a + c * c), -first * a],
-            [second * a * c, first * a, 1.0 - second * a * a],
-        ]
-    )
     cosine, sine = np.cos(state[0]), np.sin(state[0])
-    for i in range(3):
-        out[i, 0] = tilt[i, 0] * cosine - tilt[i, 2] * sine
-        out[i, 1] = tilt[i, 1]
-        out[i, 2] = tilt[i, 0] * sine + tilt[i, 2] * cosine
+    out[0, 1], out[1, 1], out[2, 1] = -first * c, 1.0 - second * angle * angle, first * a
+    for i, left, right in (
+        (0, 1.0 - second * c * c, second * a * c),
+        (1, first * c, -first * a),
+        (2, second * a * c, 1.0 - second * a * a),
+    ):
+        out[i, 0] = left * cosine - right * sine
+        out[i, 2] = left * sine + right * cosine
 
 
 @numba.njit(cache=True, nogil=True)
@@ -51,15 +48,14 @@ def _residuals(state, bearings, points, weights, out):
     rotation = np.empty((3, 3))
     _rotation(state, rotation)
     for k in range(len(points)):
-        ray = np.empty(3)
-        for i in range(3):
-            ray[i] = state[1 + i]
-            for j in range(3):
-                ray[i] += rotation[i, j] * points[k, j]
-        length = np.sqrt(ray[0] ** 2 + ray[1] ** 2 + ray[2] ** 2)
-        ahead = bearings[k, 0] * ray[0] + bearings[k, 1] * ray[1] + bearings[k, 2] * ray[2] > 0.0
+        p0, p1, p2 = points[k, 0], points[k, 1], points[k, 2]
+        x = state[1] + rotation[0, 0] * p0 + rotation[0, 1] * p1 + rotation[0, 2] * p2
+        y = state[2] + rotation[1, 0] * p0 + rotation[1, 1] * p1 + rotation[1, 2] * p2
+        z = state[3] + rotation[2, 0] * p0 + rotation[2, 1] * p1 + rotation[2, 2] * p2
+        length = np.sqrt(x * x + y * y + z * z)
+        ahead = bearings[k, 0] * x + bearings[k, 1] * y + bearings[k, 2] * z > 0.0
         for row in range(2):
-            value = (weights[k, row, 0] * ray[0] + weights[k, row, 1] * ray[1] + weights[k, row, 2] * ray[2]) / length
+            value = (weights[k, row, 0] * x + weights[k, row, 1] * y + weights[k, row, 2] * z) / length
             out[k, row] = value if ahead else np.inf
 
 
@@ -153,7 +149,6 @@ def _state_of(aligned: AlignedProblem, cam_from_map: FloatArray) -> FloatArray:
     """(yaw, translation, tilt) (6,) of a pose between the problem's own frames."""
     rotation, translation = np.hsplit(aligned.align_pose(cam_from_map), [3])
     down = rotation[:, 1]
-    angle = rotation_angle(rotation @ yaw_rotation(yaw_of(rotation)).T)
     axis = np.array([down[2], 0.0, -down[0]])  # y x down: about which y was turned to where it is
     length = float(np.linalg.norm(axis))
     angle = float(np.arctan2(length, down[1]))
@@ -170,8 +165,7 @@ def largest_consensus(aligned: AlignedProblem, bound_px: float, truth: FloatArra
     A lower bound of the true maximum, and so of every honest upper bound; ``truth`` (3, 4) is the true pose.
     """
     limit_rad = aligned.gravity_bound_rad
-    first, second = np.triu_indices(len(aligned.points), 1)
-    pairs = np.column_stack([np.append(first, second), np.append(second, first)])
+    pairs = np.column_stack(np.triu_indices(len(aligned.points), 1))
     tilts = [(0.0, 0.0)]
     if limit_rad > 0.0:
         around = 2 * np.pi * np.arange(TILTS) / TILTS

@@ -32,6 +32,22 @@ PEER_BUDGET_S = 40.0
 OUR_BUDGET_S = 150.0
 
 
+GOALS = {
+    **{(f"n100-{rate}", "mc-exact"): "100 % in 3 ms" for rate in (0, 20, 40, 60, 80, 90)},
+    ("n200-95", "mc-exact"): "99.5 % in 8 ms",
+    ("n200-97", "mc-exact"): "95 % in 8 ms",
+    ("n1000-99", "mc-exact"): "99 % in 150 ms",
+    ("n5000-90", "mc-exact"): "100 % in 5 s",
+    ("gravity", "mc-exact"): "99 %",
+    **{(f"aria-{image}", "mc-exact"): "100 % in 0.5 s" for image in ("rgb", "slam-left", "slam-right")},
+    ("n100-90", PLAIN): "2 ms",
+    ("n200-90", ADAPTIVE): "100 % in 2 ms",
+    ("n1000-90", ADAPTIVE): "100 % in 5 ms",
+    ("n5000-90", ADAPTIVE): "100 % in 20 ms",
+}
+"""What we want of a row, by case and method."""
+
+
 @dataclass(frozen=True, eq=False)
 class Case:
     """One row: problems by seed, and how many of them each method gets."""
@@ -103,7 +119,5 @@ def aria_cases(folder: Path) -> list[Case]:
         scene = load_scene(path)
         counts = {"mc-exact": 100, ADAPTIVE: 100, **dict.fromkeys(PEERS, 100), "mc": 3}
         title = f"real image {image}, {len(scene.problem())} matches"
-        cases.append(
-            Case(f"aria-{image.replace('_', '-')}", title, scene.problem, counts, degrees, metres)
-        )
+        cases.append(Case(f"aria-{image.replace('_', '-')}", title, scene.problem, counts, degrees, metres))
     return cases

@@ -67,7 +67,8 @@ def _networkx(graph: Graph) -> Callable[[], Iterable[int]]:
     import networkx
 
     converted = networkx.from_numpy_array(np.triu(graph, 1))
-    return lambda: networkx.max_weight_clique(converted, weight=None)[0]
+    # None counts nodes, as networkx documents; its annotation forgets it.
+    return lambda: networkx.max_weight_clique(converted, weight=None)[0]  # pyright: ignore[reportArgumentType]
 
 
 LIBRARIES = {"spherloc": _ours, "NetworKit": _networkit, "networkx": _networkx}

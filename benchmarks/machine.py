@@ -21,12 +21,21 @@ PACKAGES = (
     "opencv-python-headless",
     "networkit",
     "networkx",
-    "matplotlib",
 )
 
-ONE_THREAD = {
-    name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
-}
+MEASURING = (
+    "brute_force.py",
+    "cases.py",
+    "certificate.py",
+    "clique.py",
+    "measure.py",
+    "memory.py",
+    "methods.py",
+    "peers.py",
+)
+"""The files here that decide what a row says; the others only show it."""
+
+ONE_THREAD = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")}
 
 
 def restart_on_one_core(module: str) -> None:
@@ -54,14 +63,16 @@ def describe() -> dict[str, Any]:
         "python": platform.python_version(),
         "versions": {name: _version(name) for name in PACKAGES},
         "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
-        "load_1min": round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None,
+        "load_1min": round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else 0.0,
     }
 
 
 def fingerprint() -> str:
-    """Changes with the sources of spherloc and of the benchmarks: rows of another state are measured again."""
-    sources = sorted([*(ROOT / "spherloc").rglob("*.py"), *(ROOT / "benchmarks").rglob("*.py")])
-    return hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:16]
+    """Changes with the machine, the versions, and what is measured: rows of another state are measured again."""
+    sources = [*sorted((ROOT / "spherloc").rglob("*.py")), *(ROOT / "benchmarks" / name for name in MEASURING)]
+    state = b"".join(path.read_bytes() for path in sources)
+    state += repr([_cpu_model(), platform.python_version(), *(_version(name) for name in PACKAGES)]).encode()
+    return hashlib.sha256(state).hexdigest()[:16]
 
 
 def _cpu_model() -> str:

@@ -13,7 +13,9 @@ from spherloc.metrics import rotation_error_deg, translation_error_m
 from spherloc.problem import Problem
 
 LEAST_PROBLEMS = 20
-"""A method gets as many even if that takes it longer than its budget."""
+"""A method gets as many even if that takes it longer than its budget, ..."""
+PATIENCE = 3.0
+"""... but not longer than as many budgets."""
 WARM_UP_SEED = 10**9
 
 
@@ -100,4 +102,5 @@ def measure(case: Case, methods: dict[str, Method], counts: dict[str, int]) -> d
 
 def _spent(tally: Tally, method: Method) -> bool:
     budget_s = OUR_BUDGET_S if method.ours else PEER_BUDGET_S
-    return len(tally.times_ms) >= LEAST_PROBLEMS and sum(tally.times_ms) > 1e3 * budget_s
+    budgets = 1e-3 * sum(tally.times_ms) / budget_s
+    return budgets > (1.0 if len(tally.times_ms) >= LEAST_PROBLEMS else PATIENCE)

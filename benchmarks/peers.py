@@ -168,7 +168,7 @@ def _colmap_rig(problem: Problem, seed: int) -> Solve:
     extrinsics = [pycolmap.Rigid3d(pycolmap.Rotation3d(face), np.zeros(3)) for face in FACES]
     size = int(2 * FOCAL_PX)
     camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=size, height=size, params=np.array([FOCAL_PX, 0.0, 0.0]))
-    arguments = pixels, problem.points[rows], faces, extrinsics, [camera] * len(FACES)
+    arguments = pixels, problem.points[rows], faces.tolist(), extrinsics, [camera] * len(FACES)
     options = _colmap_options(threshold, seed)
 
     def solve() -> Answer:
@@ -205,7 +205,16 @@ def peers() -> dict[str, Method]:
         Method("PoseLib rig", _poselib_rig, {"camera": rig, **_POSELIB}),
         Method("PoseLib fisheye", _poselib_fisheye, {"camera": "OPENCV_FISHEYE, k = 0; front half", **_POSELIB}),
         Method("pycolmap rig", _colmap_rig, {"camera": rig, **_COLMAP}),
-        Method("pycolmap panorama", _colmap_panorama, {"camera": "EQUIRECTANGULAR", "threshold_factor": PANORAMA_SLACK, **_COLMAP}),
+        Method(
+            "pycolmap panorama",
+            _colmap_panorama,
+            {"camera": "EQUIRECTANGULAR", "threshold_factor": PANORAMA_SLACK, **_COLMAP},
+        ),
         Method("OpenCV USAC", _opencv_usac, {"camera": "pinhole plane, points within 87 degrees", **usac}),
     )
     return {method.name: method for method in methods}
+
+
+def use_one_thread() -> None:
+    """For the library that is told at run time; the others are told by the environment and by their options."""
+    cv2.setNumThreads(1)

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Installs what a make target needs into .venv and, if the system lacks it, from Debian; a repeated call is quick.
 #
-#   scripts/setup.sh play|test|lint     "test" prints the path of the browser for the tests on stdout
+#   scripts/setup.sh play|test|lint|bench     "test" prints the path of the browser for the tests on stdout
 #
 # It works, or it ends with one sentence that says what to do.  Python is $PYTHON, else python3.
 set -euo pipefail
@@ -9,10 +9,11 @@ cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
 target=${1:-}
 case $target in
-  play) extras='' enough=(play test lint) ;; # any of these targets' packages will do
+  play) extras='' enough=(play test lint bench) ;; # any of these targets' packages will do
   test) extras='[test]' enough=(test lint) ;;
   lint) extras='[test,lint]' enough=(lint) ;;
-  *) echo "usage: scripts/setup.sh play|test|lint" >&2 && exit 2 ;;
+  bench) extras='[bench]' enough=(bench) ;;
+  *) echo "usage: scripts/setup.sh play|test|lint|bench" >&2 && exit 2 ;;
 esac
 python=${PYTHON:-python3}
 venv=.venv/bin/python
@@ -69,7 +70,7 @@ missing_packages() {
   if ! venv_works; then
     "$python" -c 'import ensurepip, venv' 2>/dev/null || echo python3-venv
   fi
-  if [ "$target" != play ] && [ "$(uname -s)" = Linux ]; then
+  if [[ $target = @(test|lint) ]] && [ "$(uname -s)" = Linux ]; then
     # Playwright's own node is linked against it.
     "$python" -c 'import ctypes; ctypes.CDLL("libatomic.so.1")' 2>/dev/null || echo libatomic1
   fi

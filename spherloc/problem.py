@@ -175,7 +175,10 @@ class AlignedProblem:
     @cached_property
     def pixels_per_radian(self) -> FloatArray:
         """(M,), px/rad in the direction in which it is largest."""
-        return np.linalg.norm(self.pixel_from_bearing, ord=2, axis=(1, 2))
+        # The larger singular value of two rows a, b.
+        a, b = self.pixel_from_bearing[:, 0], self.pixel_from_bearing[:, 1]
+        aa, bb, ab = (np.einsum("ni,ni->n", u, v) for u, v in ((a, a), (b, b), (a, b)))
+        return np.sqrt(0.5 * (aa + bb) + np.hypot(0.5 * (aa - bb), ab))
 
     def unalign_pose(self, cam_from_map: FloatArray) -> FloatArray:
         """The pose (3, 4) between the problem's own frames, from one between the aligned frames."""

@@ -379,6 +379,40 @@ def test_refinement_chart_is_its_cost(ransac: Trace) -> None:
     np.testing.assert_allclose(chart.curves[0].y ** 2, stage.cost_px2)
 
 
+def with_covariance(trace: Trace, **changes: object) -> Trace:
+    stage = trace.stage(RefinementStage)
+    assert stage is not None
+    return replace(trace, stages=(*trace.stages[:-1], replace(stage, **changes)))  # pyright: ignore[reportArgumentType]
+
+
+def test_standard_deviations_are_those_of_the_covariance(mc: Trace) -> None:
+    """Angles in degrees, positions in centimetres, and their root mean squares over the axes."""
+    covariance = np.diag(np.square([*np.radians([0.1, 0.2, 0.2]), 0.01, 0.02, 0.02]))
+    trace = with_covariance(mc, covariance=covariance, tilt_rad=np.radians(0.25), gravity_sd_rad=np.radians(0.5))
+    picture = at(trace, "refinement")
+    assert dict(picture.tables[0].rows) == {
+        "rotation about x, y, z": "0.100°, 0.200°, 0.200°",
+        "position x, y, z": "1.00 cm, 2.00 cm, 2.00 cm",
+        "tilt": "0.250°",
+    }
+    assert "its error is 0.300° and 3.00 cm RMS." in picture.step.caption
+    assert "leans 0.250° from the given gravity, which was trusted to 0.5°" in picture.step.note
+    assert "tilt / σ_g" in picture.step.equation
+    assert dict(at(trace, "outcome").tables[-1].rows)["expected error"] == "0.300° and 3.00 cm RMS"
+
+
+@pytest.mark.parametrize(("sd", "said"), [(0.0, "is kept"), (np.inf, "was not used")])
+def test_gravity_that_is_exact_or_unknown_is_said(mc: Trace, sd: float, said: str) -> None:
+    step = at(with_covariance(mc, gravity_sd_rad=sd), "refinement").step
+    assert said in step.note and "σ_g" not in step.equation
+
+
+def test_a_pose_that_is_left_open_is_said(mc: Trace) -> None:
+    picture = at(with_covariance(mc, covariance=np.full((6, 6), np.nan)), "refinement")
+    assert "unknown: the inliers leave it open." in picture.step.caption
+    assert dict(picture.tables[0].rows)["position x, y, z"] == "open, open, open"
+
+
 def test_no_pose_and_no_truth_are_said() -> None:
     level = np.array([[100.0, 50.0], [150.0, 50.0], [30.0, 50.0]])
     camera = load_scene(bundled_scenes()["panorama_outliers_80"]).camera  # pyright: ignore[reportAttributeAccessIssue]

@@ -1,4 +1,4 @@
-"""Refinement: its derivatives, its residual against real reprojection, where it converges to, and what it never loses."""
+"""Refinement: its derivatives, its residual against real reprojection, where it converges, and what it never loses."""
 
 from dataclasses import replace
 
@@ -251,18 +251,12 @@ def test_noise_and_outliers(scene_of, camera, options):
 def test_history_is_in_the_frames_of_the_problem(rng, scene_of):
     """Both gravities point somewhere: every state is turned back, and the ends are the poses themselves."""
     problem = scene_of("mei", outlier_rate=0.5).problem(6)
-    camera_turn, map_turn = so3_exp(rng.normal(size=3)), so3_exp(rng.normal(size=3))
-    turned = replace(
-        problem,
-        points=problem.points @ map_turn.T,
-        gravity_map=map_turn @ problem.gravity_map,
-        truth_cam_from_map=None,
-    )
-    assert not np.allclose(turned.aligned.map_turn, np.eye(3)) and camera_turn is not None
-    aligned = turned.aligned
+    map_turn = so3_exp(rng.normal(size=3))
+    anywhere = {"gravity_camera": so3_exp(rng.normal(size=3)) @ DOWN, "gravity_map": so3_exp(rng.normal(size=3)) @ DOWN}
+    aligned = replace(problem, points=problem.points @ map_turn.T, truth_cam_from_map=None, **anywhere).aligned
     truth = pose(problem.truth_cam_from_map[:, :3] @ map_turn.T, problem.truth_cam_from_map[:, 3])
-    start = moved(aligned, aligned.align_pose(truth), [0.0, 0.005, 0.0], [0.01, 0.0, 0.01])
-    found, _, stage = refine(aligned, start, bounds_of(aligned, 4.0), RefinementOptions(gravity_sd_deg=0.5))
+    start = moved(aligned, aligned.align_pose(truth), rng.normal(0, 0.003, 3), rng.normal(0, 0.01, 3))
+    found, _, stage = refine(aligned, start, bounds_of(aligned, 4.0), SIX)
     np.testing.assert_array_equal(stage.cam_from_map[0], aligned.unalign_pose(start))
     np.testing.assert_array_equal(stage.cam_from_map[-1], aligned.unalign_pose(found))
     for state, count in zip(stage.cam_from_map, stage.inlier_counts, strict=True):
@@ -304,7 +298,7 @@ def test_gravity_error_leaves_the_bound_once_it_is_estimated(rng, scene_of):
         np.testing.assert_array_equal(inliers, residuals_px(aligned, found) <= 3.0)
         assert stage.gravity_sd_rad == sd and stage.dof == 6
         assert stage.tilt_rad == pytest.approx(np.radians(1.0), abs=np.radians(0.3))
-        assert stage.inlier_counts[0] < 0.5 * stage.inlier_counts[-1]
+        assert stage.inlier_counts[0] < 0.7 * stage.inlier_counts[-1]
         assert np.count_nonzero(inliers & problem.truth_inliers) > 90
         # Who insists on the wrong gravity keeps its error in the residuals, and so the widened bound.
         found, inliers, stage = refine(aligned, start, bounds, FOUR)
@@ -359,10 +353,12 @@ def test_degenerate_inputs(rng, kind, gravity_sd_deg):
     options = RefinementOptions(gravity_sd_deg=gravity_sd_deg)
     found, inliers, stage = refine(aligned, start, bounds_of(aligned, 50.0), options)
     assert np.isfinite(found).all() and inliers.all()
-    assert stage.cost_px2[-1] < 1.0 < stage.cost_px2[0]
-    determined = kind in ("a line", "two points", "three points") and gravity_sd_deg < np.inf
-    assert np.isfinite(stage.covariance).all() == determined
-    assert np.isnan(stage.covariance).all() != determined
+    assert stage.cost_px2[-1] < (stage.cost_px2[0] if kind == "one pixel" else 1.0)
+    if kind == "one pixel":  # noise fixes what the points leave open, and the covariance says how badly
+        assert not np.linalg.norm(np.sqrt(np.diag(stage.covariance)[3:])) < 50.0
+    else:
+        determined = kind != "one point" and gravity_sd_deg < np.inf
+        assert (np.isfinite(stage.covariance) == determined).all()
 
 
 def test_unknown_options_are_errors():

@@ -7,16 +7,20 @@ neighbours need these be searched. One pair may own two arcs: an edge is cleared
 import numba
 import numpy as np
 
+from spherloc.consensus.balls_of_pairs import apart_balls, may_be_seen, pair_ball, star_balls, view_between
 from spherloc.consensus.clique_search import ONE, clear_edge, colour_bound, larger_clique, popcount, set_edge, subgraph
-from spherloc.consensus.depth_bounds import chord
-from spherloc.consensus.pair_arcs import CIRCLE, middle_of_turns
-from spherloc.consensus.support import verify
-from spherloc.consensus.translation_balls import ball_of_pair
+from spherloc.consensus.pair_arcs import CIRCLE
+from spherloc.consensus.region import search_region
+from spherloc.consensus.support import climb, keep, verify
 
-MOST_PARTED = 32
-"""Common neighbours of a pair up to which theirs balls are compared too."""
 MOST_TRIALS = 16
-"""Cliques of a bin that are looked at before only larger ones are searched for."""
+"""Cliques of a bin that may stay without pose or proof before only larger ones are searched for."""
+MOST_SPARE = 8
+"""Nodes of a bin more than the best support up to which the whole bin is tried to be settled at once."""
+MOST_CELLS = 4000
+"""Cells of yaw and position in one proof."""
+CELL_EFFORT = 64
+"""Words that take as long as a cell."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -42,9 +46,12 @@ def peel(count, pairs, arcs, least):
 
 
 @numba.njit(cache=True, nogil=True)
-def _pieces(pairs, lo, hi, arcs, places, start, end):
-    """Ends of node pairs (a, b) clipped to the bin: rows (E, 2) of nodes, and their ends (E,), (E,)."""
-    nodes = np.empty((2 * len(arcs), 2), np.int64)
+def _pieces(pairs, lo, hi, arcs, nodes, count, start, end):
+    """Arcs among ``nodes``, clipped to the bin: their places (E, 2) in ``nodes``, and their ends (E,), (E,)."""
+    places = np.full(count, -1, np.int64)
+    for k in range(len(nodes)):
+        places[nodes[k]] = k
+    edges = np.empty((2 * len(arcs), 2), np.int64)
     first, last = np.empty(2 * len(arcs)), np.empty(2 * len(arcs))
     used = 0
     for arc in arcs:
@@ -53,10 +60,10 @@ def _pieces(pairs, lo, hi, arcs, places, start, end):
             continue
         for turns in (0.0, CIRCLE):
             if lo[arc] - turns <= end and hi[arc] - turns >= start:
-                nodes[used, 0], nodes[used, 1] = a, b
+                edges[used, 0], edges[used, 1] = a, b
                 first[used], last[used] = max(lo[arc] - turns, start), min(hi[arc] - turns, end)
                 used += 1
-    return nodes[:used], first[:used], last[:used]
+    return edges[:used], first[:used], last[:used]
 
 
 @numba.njit(cache=True, nogil=True)
@@ -86,74 +93,24 @@ def _members(bits, count):
 
 
 @numba.njit(cache=True, nogil=True)
-def _sees(view, eps, ball, k):
-    """Whether point ``k`` may be seen from some place in the ball (centre, radius) at a yaw of the view."""
-    bearings, points, c, s, slack = view
-    x, y, z = points[k, 0] - ball[0], points[k, 1] - ball[1], points[k, 2] - ball[2]
-    distance = np.sqrt(x * x + y * y + z * z)
-    if distance <= ball[3]:
-        return True
-    v = bearings[k]
-    cosine = (v[0] * (c * x + s * z) + v[1] * y + v[2] * (c * z - s * x)) / distance
-    angle = np.arccos(min(1.0, max(-1.0, cosine)))
-    return angle <= (eps[k] + slack + np.arcsin(ball[3] / distance)) * (1.0 + 1e-9) + 1e-7
+def _candidates(view, limits, ball, nodes, common, shared):
+    """Places of the common neighbours that may be seen from somewhere in the ball of their pair."""
+    kept, used = np.empty(shared, np.int64), 0
+    for k in _members(common, shared):
+        if may_be_seen(view, limits, nodes[k], ball):
+            kept[used] = k
+            used += 1
+    return kept[:used]
 
 
 @numba.njit(cache=True, nogil=True)
-def _ball(view, trig, i, j):
-    """The ball of a pair in a view: its centre and radius."""
-    bearings, points, c, s, slack = view
-    ball = np.empty(4)
-    ball[3] = ball_of_pair(i, j, bearings, points, trig[0], trig[1], c, s, slack, ball[:3])
-    return ball
-
-
-@numba.njit(cache=True, nogil=True)
-def _drop_unseen(view, eps, trig, nodes, a, b, common):
-    """Drop from ``common`` what is seen from nowhere in the ball of the pair (a, b); returns how many stay.
-
-    A pose that explains all three lies in the ball.
-    """
-    ball = _ball(view, trig, nodes[a], nodes[b])
-    kept = 0
-    for w in range(len(common)):
-        word = common[w]
-        while word != 0:
-            low = word & (~word + ONE)
-            word ^= low
-            if _sees(view, eps, ball, nodes[w * 64 + popcount(low - ONE)]):
-                kept += 1
-            else:
-                common[w] &= ~low
-    return kept
-
-
-@numba.njit(cache=True, nogil=True)
-def _part_unseen(view, eps, trig, nodes, ends, members, small):
-    """Part those of ``members`` in their graph ``small`` that are not both seen from the balls with one of ``ends``."""
-    for end in ends:
-        for k in range(len(members)):
-            ball = _ball(view, trig, nodes[end], nodes[members[k]])
-            for m in range(len(members)):
-                joined = (small[k, m >> 6] >> np.uint64(m & 63)) & ONE != 0
-                if joined and not _sees(view, eps, ball, nodes[members[m]]):
-                    clear_edge(small, k, m)
-
-
-@numba.njit(cache=True, nogil=True)
-def _completed(view, eps, trig, nodes, rows, a, b, common, floor, effort_limit):
+def _completed(rows, a, b, candidates, floor, effort_limit):
     """A clique with both nodes and more than ``floor`` nodes in all, or nothing; the effort; whether it is exact."""
-    shared = _drop_unseen(view, eps, trig, nodes, a, b, common)
-    nothing = np.empty(0, np.int64)
-    if shared + 2 <= floor:
-        return nothing, 0, True
-    small, old = subgraph(rows, _members(common, shared))
-    if shared <= MOST_PARTED:
-        _part_unseen(view, eps, trig, nodes, (a, b), old, small)
+    small, old = subgraph(rows, candidates)
     inside, effort, exact = larger_clique(small, floor - 2, effort_limit)
-    effort += shared * shared
+    effort += len(candidates) * len(candidates)
     if len(inside) == 0 and floor >= 2:
-        return nothing, effort, exact
+        return inside, effort, exact
     clique = np.empty(len(inside) + 2, np.int64)
     for k in range(len(inside)):
         clique[k] = old[inside[k]]
@@ -162,40 +119,67 @@ def _completed(view, eps, trig, nodes, rows, a, b, common, floor, effort_limit):
 
 
 @numba.njit(cache=True, nogil=True)
-def sweep_bin(data, eps, pairs, lo, hi, arcs, start, end, poses, supports, masks, known, effort_limit):
+def _settle(data, limits, view, everybody, balls, poses, supports, masks, known):
+    """Prove that no pose explains more of ``everybody`` than the best known one does; ``balls`` (B, 4) hold all that might.
+
+    Better poses that are met become known, and the proof goes on against them. Returns how many are known, whether
+    it is proven, and the cells.
+    """
+    found = np.empty((3, 4))
+    mask = np.empty(masks.shape[1], np.bool_)
+    cells, b = 0, 0
+    while b < len(balls):
+        if not balls[b, 3] < np.inf:
+            return known, False, cells
+        best = supports[0]
+        proven, most, used = search_region(view, limits, everybody, balls[b], best, MOST_CELLS - cells, found)
+        cells += used
+        if most > best:
+            support = climb(data, found[:, :3], found[:, 3], mask)
+            known = keep(found[:, :3], found[:, 3], support, mask, poses, supports, masks, known)
+        elif proven:
+            b += 1
+        else:
+            return known, False, cells
+    return known, True, cells
+
+
+@numba.njit(cache=True, nogil=True)
+def sweep_bin(data, limits, trig, pairs, lo, hi, arcs, start, end, poses, supports, masks, known, effort_limit):
     """Search one bin.
 
-    ``data`` is what ``verify`` takes. ``poses`` (K, 3, 4), ``supports`` (K,) and ``masks`` (K, M) hold ``known`` verified
-    poses, the first one with the largest support; better ones are added in place. Returns how many are known, the
-    bound for the bin, its largest clique (nodes; empty if none is larger than the support was), the effort, and
-    whether the bin was searched to its end.
+    ``data`` is what ``verify`` takes, ``limits`` what ``search_region`` takes, ``trig`` the chords and sines of the
+    angular bounds. ``poses`` (K, 3, 4), ``supports`` (K,) and ``masks`` (K, M) hold ``known`` verified poses, the first one
+    with the largest support; better ones are added in place. Returns how many are known, the bound for the bin, its
+    largest clique that may have a pose (nodes; empty if none is larger than the support), the effort, and whether the
+    bin was searched to its end.
     """
-    count = masks.shape[1]
-    best = supports[0]
     nothing = np.empty(0, np.int64)
-    nodes = peel(count, pairs, arcs, best)
-    if len(nodes) <= best:
-        return known, best, nothing, len(arcs), True
-    places = np.full(count, -1, np.int64)
-    for k in range(len(nodes)):
-        places[nodes[k]] = k
-    edges, first, last = _pieces(pairs, lo, hi, arcs, places, start, end)
+    nodes = peel(masks.shape[1], pairs, arcs, supports[0])
+    if len(nodes) <= supports[0]:
+        return known, supports[0], nothing, len(arcs), True
+    edges, first, last = _pieces(pairs, lo, hi, arcs, nodes, masks.shape[1], start, end)
     rows = np.zeros((len(nodes), (len(nodes) + 63) // 64), np.uint64)
     for k in range(len(edges)):
         set_edge(rows, edges[k, 0], edges[k, 1])
     whole = colour_bound(rows)
     effort = len(arcs) + rows.size
-    if whole <= best:
-        return known, best, nothing, effort, True
+    if whole <= supports[0]:
+        return known, supports[0], nothing, effort, True
+    if len(nodes) - supports[0] <= MOST_SPARE:
+        view = view_between(data, start, end)
+        balls = apart_balls(view, trig, nodes, len(nodes) - supports[0])
+        known, proven, cells = _settle(data, limits, view, nodes, balls, poses, supports, masks, known)
+        effort += cells * CELL_EFFORT
+        if proven:
+            return known, supports[0], nothing, effort, True
     rows[:] = 0
     owned = np.zeros((len(nodes), len(nodes)), np.uint8)
     common = np.empty(rows.shape[1], np.uint64)
-    trig = (chord(eps), np.sin(eps))
     opening, closing = np.argsort(first), np.argsort(last)
-    largest, floor, trials, closed = nothing, best, 0, 0
+    largest, trials, closed, floor = nothing, 0, 0, supports[0]
     exact = True
-    for k in range(len(edges)):
-        edge = opening[k]
+    for edge in opening:
         while last[closing[closed]] < first[edge]:
             a, b = edges[closing[closed], 0], edges[closing[closed], 1]
             owned[a, b] -= 1
@@ -211,17 +195,25 @@ def sweep_bin(data, eps, pairs, lo, hi, arcs, start, end, poses, supports, masks
             continue
         if effort >= effort_limit:
             return known, whole, largest, effort, False
-        view = (data[0], data[1], *middle_of_turns(first[edge], last[edge]))
-        clique, work, done = _completed(view, eps, trig, nodes, rows, a, b, common, floor, effort_limit - effort)
+        # Who completes a clique with this edge is seen from its ball, at a yaw of its arc.
+        view = view_between(data, first[edge], last[edge])
+        ball = pair_ball(view, trig, nodes[a], nodes[b])
+        candidates = _candidates(view, limits, ball, nodes, common, shared)
+        clique, work, done = _completed(rows, a, b, candidates, floor, effort_limit - effort)
         effort += work
         exact = exact and done
         if len(clique) == 0:
             continue
-        clique = nodes[clique]
-        if len(clique) > len(largest):
-            largest = clique
-        trials += 1
-        known = verify(data, clique, poses, supports, masks, known)
-        best = supports[0]
-        floor = best if trials < MOST_TRIALS else max(best, len(largest))
+        known = verify(data, nodes[clique], poses, supports, masks, known)
+        floor = max(floor, supports[0])
+        if len(clique) <= floor:
+            continue
+        everybody = np.append(nodes[candidates], nodes[np.array([a, b])])
+        balls = star_balls(view, trig, everybody, len(everybody) - supports[0], ball)
+        known, proven, cells = _settle(data, limits, view, everybody, balls, poses, supports, masks, known)
+        effort += cells * CELL_EFFORT
+        if not proven and len(clique) > len(largest):
+            largest = nodes[clique]
+        trials += not proven
+        floor = supports[0] if trials < MOST_TRIALS else max(supports[0], len(largest))
     return known, max(floor, len(largest)) if exact else whole, largest, effort, exact

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from spherloc.bounds import Bounds
 from spherloc.consensus.clique_sweep import sweep_bin
+from spherloc.consensus.depth_bounds import chord
 from spherloc.consensus.pair_arcs import pair_arcs, turn_of
 from spherloc.consensus.support import climb, keep
 from spherloc.consensus.yaw_bins import BIN_TURN, BINS, degree_bounds, sort_into_bins
@@ -79,6 +80,8 @@ def exact_consensus(
     # Rounding must not exclude what the pixel bound allows.
     least_cos = np.cos(np.minimum(bounds.radians + 1e-9, np.pi / 2))
     data = (aligned.bearings, aligned.points, aligned.pixel_from_bearing, bounds.pixels, least_cos, noise_px)
+    limits = (aligned.pixel_from_bearing, bounds.pixels, bounds.radians, aligned.pixels_per_radian)
+    trig = (chord(bounds.radians), np.sin(bounds.radians))
     poses, supports = np.empty((MOST_POSES, 3, 4)), np.zeros(MOST_POSES, np.int32)
     masks = np.zeros((MOST_POSES, count), np.bool_)
     known = 0
@@ -100,7 +103,7 @@ def exact_consensus(
         inside = arcs[starts[b] : starts[b + 1]]
         edges = (b * BIN_TURN, (b + 1) * BIN_TURN)
         known, most, found, work, exact = sweep_bin(
-            data, bounds.radians, pairs, lo, hi, inside, *edges, poses, supports, masks, known, effort_limit - effort
+            data, limits, trig, pairs, lo, hi, inside, *edges, poses, supports, masks, known, effort_limit - effort
         )
         effort += work
         finished = finished and exact

@@ -52,7 +52,7 @@ def squeeze(data, members, rotation, translation, mask):
     A fit of least squares leaves out a correspondence beyond its bound though another pose explains it as well as all
     others. Weights that grow with the residual come close to the pose of least largest residual. Returns its support.
     """
-    bearings, points, weights, bound_px, least_cos, noise_px = data
+    bearings, points, weights, bound_px, _, noise_px = data
     best = mark_support(data, rotation, translation, mask)
     few, rays = points[members], bearings[members]
     flat, everyone = weights[members], np.ones(len(members), np.bool_)

@@ -80,7 +80,7 @@ def search_two_point(
         aligned.bearings,
         aligned.points,
         aligned.pixel_from_bearing,
-        bound_px,
+        np.array(bound_px),  # a copy: for a read-only array numba would compile the kernel once more
         np.uint64(seed),
         iterations,
         np.nan if confidence is None else 1.0 - confidence,

@@ -166,9 +166,9 @@ def _cameras() -> tuple[Camera, ...]:
 
 
 def _ok(make: _Maker) -> FailureCase:
-    """Up to 75 % outliers; some with repeated structure that is clearly weaker, some with a gravity error in its bound."""
+    """Up to 80 % outliers; some with repeated structure that is clearly weaker, some with a gravity error in its bound."""
     count = make.whole(60, 300)
-    inliers = round(count * make.between(0.25, 1.0))
+    inliers = round(count * make.between(0.2, 1.0))
     make.right(inliers)
     if make.rng.random() < 0.25:
         make.coherent(min(count - inliers, round(make.between(0.05, 0.25) * inliers)))
@@ -221,17 +221,14 @@ def _ambiguous(make: _Maker) -> FailureCase:
 
 
 def _gravity_off(make: _Maker) -> FailureCase:
-    """Gravity is off by 2.5 to 10 degrees, though at most 1 degree is said."""
+    """Gravity is off by 3 to 10 degrees more than is said."""
     count = make.whole(60, 300)
     inliers = round(count * make.between(0.4, 0.9))
     make.right(inliers)
     make.random(count - inliers)
-    bound = np.radians(make.rng.choice([0.0, 0.5, 1.0]))
-    return make.case(
-        "gravity prior off",
-        gravity_camera=make.tilted(np.radians(make.between(2.5, 10.0))),
-        gravity_bound_rad=float(bound),
-    )
+    bound = float(np.radians(make.rng.choice([0.0, 0.5, 1.0])))
+    gravity = make.tilted(bound + np.radians(make.between(3.0, 10.0)))
+    return make.case("gravity prior off", gravity_camera=gravity, gravity_bound_rad=bound)
 
 
 def _bound_too_small(make: _Maker) -> FailureCase:

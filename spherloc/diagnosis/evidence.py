@@ -48,10 +48,19 @@ class Evidence:
     position_sd_m: float
     """The same of its position."""
 
-    def chance_sets(self, size: int, wider: float = 1.0) -> float:
-        """Expected number of chance sets of that size within ``wider`` times the bound."""
+    def chance_sets(self, size: int, wider: float = 1.0, fixed_by: int = 2) -> float:
+        """Expected number of chance sets of that size within ``wider`` times the bound.
+
+        ``fixed_by`` correspondences fix a pose: 2, or 3 where gravity is free.
+        """
         rate = min(1.0, self.chance_rate * wider**2)
-        return chance_sets(len(self.aligned.points), size, rate)
+        return chance_sets(len(self.aligned.points), size, rate) * rate ** (2 - fixed_by)
+
+    def rivals_own(self) -> int:
+        """Correspondences that the rival explains and the best pose does not."""
+        if self.rival is None or self.best is None:
+            return 0
+        return int(np.count_nonzero((self.rival.errors_px <= self.bound_px) & (self.best.errors_px > self.bound_px)))
 
     def found(self, factor: float) -> float:
         """Support of the free pose within ``factor`` times the bound, less what is there by chance."""

@@ -71,7 +71,9 @@ class _View:
     bounds: Bounds
     """Theirs."""
     bearings: FloatArray
-    """(V, 3), camera frame."""
+    """(V, 3), camera frame: solvers see nothing that gravity has turned."""
+    points: FloatArray
+    """(V, 3), map frame."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +126,7 @@ class SolverRansac:
         self, view: _View, options: SolverRansacOptions, rng: np.random.Generator
     ) -> tuple[int, list[_Hypothesis]]:
         """Samples drawn, and every hypothesis that explains more than all before it."""
-        count, size, points = len(view.bearings), self.sampler.sample_size, view.aligned.points
+        count, size = len(view.bearings), self.sampler.sample_size
         found: list[_Hypothesis] = []
         if count < size:
             return 0, found
@@ -132,8 +134,8 @@ class SolverRansac:
         best, drawn, needed = 0, 0, float(len(samples))
         while drawn < len(samples) and drawn < needed:
             sample = samples[drawn]
-            for solution in self.sampler.solve(view.bearings[sample], points[sample]):
-                state = view.aligned.camera_turn @ solution
+            for solution in self.sampler.solve(view.bearings[sample], view.points[sample]):
+                state = view.aligned.align_pose(solution)
                 inliers, mask = _explained(view, state)
                 if inliers <= best:
                     continue
@@ -149,8 +151,8 @@ class SolverRansac:
         assert self.fitter is not None
         if np.count_nonzero(best.mask) < self.fitter.sample_size:
             return None
-        for solution in self.fitter.solve(view.bearings[best.mask], view.aligned.points[best.mask]):
-            state = view.aligned.camera_turn @ solution
+        for solution in self.fitter.solve(view.bearings[best.mask], view.points[best.mask]):
+            state = view.aligned.align_pose(solution)
             inliers, mask = _explained(view, state)
             if inliers:
                 return replace(best, cam_from_map=state, mask=mask, fitted=True)
@@ -199,16 +201,16 @@ def _samples_needed(confidence: float, inlier_rate: float, size: int) -> float:
 
 
 def _view(aligned: AlignedProblem, bounds: Bounds, pinhole: bool) -> _View:
-    bearings = aligned.bearings @ aligned.camera_turn
+    bearings, points = aligned.bearings @ aligned.camera_turn, aligned.points @ aligned.map_turn
     if not pinhole:
-        return _View(np.ones(len(bearings), dtype=bool), aligned, bounds, bearings)
+        return _View(np.ones(len(bearings), dtype=bool), aligned, bounds, bearings, points)
     seen = VirtualPinhole().sees(bearings)
     names = ("index", "bearings", "points", "pixel_from_bearing", "radians_per_pixel")
     part = {name: getattr(aligned, name)[seen] for name in names}
     for array in part.values():
         array.setflags(write=False)  # as in the whole: kernels are compiled for one or the other
     part_bounds = replace(bounds, pixels=bounds.pixels[seen], radians=bounds.radians[seen])
-    return _View(seen, replace(aligned, **part), part_bounds, bearings[seen])
+    return _View(seen, replace(aligned, **part), part_bounds, bearings[seen], points[seen])
 
 
 def _lost(view: _View) -> str:

@@ -27,7 +27,8 @@ FloatArray = NDArray[np.float64]
 HUBER = 0.1
 """Width of the Huber kernel, as a share of the spread of the image points."""
 ITERATIONS = 50
-STEP_TOLERANCE = 1e-12
+DECREASE_TOLERANCE = 1e-15
+"""Relative to the cost: what rounding hides."""
 FIRST_RADIUS, MOST_RADIUS = 30.0, 1e16
 LEAST_SIGMA = 1e-6
 """On the image plane, about a thousandth of a pixel: perfect data have a posterior too."""
@@ -92,7 +93,9 @@ def _cost(
     return np.where((rays[..., 2] > 0.0).all(axis=1), 0.5 * rho.sum(axis=1), np.inf)
 
 
-def _linearized(image: FloatArray, points: FloatArray, cam_from_map: FloatArray, width: float):
+def _linearized(
+    image: FloatArray, points: FloatArray, cam_from_map: FloatArray, width: float
+) -> tuple[FloatArray, FloatArray, float]:
     """Residuals (2 K,) scaled so that half their square is rho to first order, their Jacobian (2 K, 6), and the cost.
 
     The step is a rotation vector about the middle of the points (the origin here), then a translation.
@@ -122,15 +125,15 @@ def _mode(image: FloatArray, points: FloatArray, start: FloatArray) -> FloatArra
         damping = np.diag(np.maximum(np.diag(normal), 1e-6 * np.trace(normal)) / radius)
         step = -np.linalg.solve(normal + damping, gradient)
         foretold = -step @ (0.5 * normal @ step + gradient)
+        if foretold <= DECREASE_TOLERANCE * cost:
+            break
         candidate = pose(so3_exp(step[:3]) @ state[:, :3], state[:, 3] + step[3:])
         reached = float(_cost(image, points, candidate[None, :, :3], candidate[None, :, 3], width)[0])
-        ratio = (cost - reached) / foretold if foretold > 0.0 else 0.0
+        ratio = (cost - reached) / foretold
         if ratio >= 1e-3:
             state, shrink = candidate, 2.0
             radius = min(radius / max(1.0 / 3.0, 1.0 - (2.0 * ratio - 1.0) ** 3), MOST_RADIUS)
             residual, jacobian, cost = _linearized(image, points, state, width)
         else:
             radius, shrink = radius / shrink, 2.0 * shrink
-        if np.linalg.norm(step) < STEP_TOLERANCE:
-            break
     return state

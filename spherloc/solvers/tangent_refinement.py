@@ -14,31 +14,30 @@ def refine_on_tangents(basis, points, rotation, translation):
     ``basis`` (K, 2, 3) holds both tangents n of every bearing. Points (K, 3) must have their mean at the origin: steps
     turn about it.
     """
-    best_rotation, best_translation, least = rotation.copy(), translation.copy(), np.inf
-    turned, moved = rotation.copy(), translation.copy()
-    normal, step = np.empty((6, 6)), np.empty(6)
+    least = np.inf
+    turned, moved = rotation, translation
     for _ in range(ITERATIONS):
+        normal, step = np.zeros((6, 6)), np.zeros(6)
         cost = _normal_equations(basis, points, turned, moved, normal, step)
         if not cost < least:
             break
-        best_rotation[:], best_translation[:], least = turned, moved, cost
+        rotation, translation, least = turned, moved, cost
         if not _solve(normal, step):
             break
-        _turn(step, best_rotation, turned)
+        turned, moved = np.empty((3, 3)), np.empty(3)
+        _turn(step, rotation, turned)
         size2 = 0.0
         for a in range(3):
-            moved[a] += step[3 + a]
-        for a in range(6):
-            size2 += step[a] * step[a]
+            moved[a] = translation[a] + step[3 + a]
+            size2 += step[a] * step[a] + step[3 + a] * step[3 + a]
         if size2 < STEP_TOLERANCE * STEP_TOLERANCE:
             return turned, moved
-    return best_rotation, best_translation
+    return rotation, translation
 
 
 @numba.njit(cache=True, nogil=True)
 def _normal_equations(basis, points, rotation, translation, normal, right):
-    """Fill J^T J (6, 6) and -J^T r (6,) for a rotation vector and a translation; return r^T r."""
-    normal[:], right[:] = 0.0, 0.0
+    """Add J^T J (6, 6) and -J^T r (6,) for a rotation vector and a translation; return r^T r."""
     cost = 0.0
     arm, ray, row = np.empty(3), np.empty(3), np.empty(6)
     for k in range(len(points)):

@@ -29,7 +29,7 @@ SLIDERS: Mapping[str, tuple[str, float, float, float]] = {
 PRESETS: Mapping[str, tuple[str, Mapping[str, float | None]]] = {
     "confidence": ("Confidence", {"draw them all": None, "0.9": 0.9, "0.99": 0.99, "0.999": 0.999, "0.9999": 0.9999}),
     "gravity_sd_deg": (
-        "Gravity error (deg)",
+        "Gravity sd (deg)",
         {
             "as the problem states": None,
             "0: exact (4 DoF)": 0.0,

@@ -41,8 +41,8 @@ def _bound(view: RunView, stage: ConsensusStage) -> Frame:
         Step(
             "consensus-bound",
             "What no pose can beat, at each yaw",
-            f"Matches that one pose explains agree in pairs at its yaw, as {stage.arcs:,} arcs tell, so the largest set "
-            f"that agrees at a yaw is a bound: no pose explains more than {most} of {len(view.points)} matches. "
+            f"Matches that one pose explains agree in pairs at its yaw, as {stage.arcs:,} arcs tell, so the largest "
+            f"set that agrees at a yaw is a bound: no pose explains more than {most} of {len(view.points)} matches. "
             f"The first guess explains {stage.seed_support} and the best pose {best}, and {left}.",
             f"max over θ of ω(G(θ)) = {most},  ij ∈ G(θ) ⇔ |f_ij(θ)| ≤ τ_ij",
             _effort(stage),
@@ -158,10 +158,11 @@ def _ghosts(view: RunView, rivals: list[FloatArray]) -> tuple[SceneItem, ...]:
 def _table(view: RunView, stage: ConsensusStage, states: list[FloatArray]) -> Table:
     rows = []
     for rank, (state, support) in enumerate(zip(states, stage.support, strict=False), 1):
-        row = (str(rank), str(support), f"{np.degrees(yaw_of(state[:, :3])):.2f}°", view.position(state))
-        off = () if view.truth is None else (f"{100 * translation_error_m(view.truth, state):.1f} cm",)
-        rows.append((*row, *off))
-    columns = ("", "explains", "yaw", "camera", *(() if view.truth is None else ("off the truth",)))
+        centre = camera_centre(view.trace.problem.aligned.unalign_pose(state))
+        place = " ".join(f"{value:.2f}" for value in centre)
+        off = () if view.truth is None else (f"{translation_error_m(view.truth, state):.3f} m",)
+        rows.append((str(rank), str(support), f"{np.degrees(yaw_of(state[:, :3])):.2f}°", place, *off))
+    columns = ("", "explains", "yaw", "camera (m)", *(() if view.truth is None else ("off the truth",)))
     return Table("verified poses", columns, tuple(rows))
 
 

@@ -13,6 +13,8 @@ from spherloc_viz.app.catalog import Catalog
 from spherloc_viz.layers import steps
 from spherloc_viz.recording.reader import read_recording
 
+EXACT, MC, RANSAC = "mc-exact (exact, certified)", "mc (the paper's)", "ransac-2p (two points)"
+
 pytestmark = [pytest.mark.browser, pytest.mark.timeout(280)]
 
 
@@ -58,13 +60,63 @@ def test_dragging_ends_at_what_the_slider_shows(tab: Playground) -> None:
 
 def test_every_step_of_both_estimators(tab: Playground) -> None:
     """Next walks from the matches to the outcome; the clique is found in the scene and nowhere else."""
-    for estimator in ("ransac-2p", "mc"):
-        tab.choose("Estimator", estimator)
+    for estimator, label in (("ransac-2p", RANSAC), ("mc", MC)):
+        tab.choose("Estimator", label)
         expect(tab.value("estimator")).to_have_text(estimator)
         titles = walk(tab)
         assert titles[0] == "The matches" and titles[-1] == "Outcome"
         assert ("The maximum clique of balls" in titles) == (estimator == "mc")
         assert any(title.startswith("Sample ") for title in titles) == (estimator == "ransac-2p")
+    assert tab.errors == []
+
+
+def test_the_exact_estimator_says_what_is_proven_and_shows_its_steps(tab: Playground) -> None:
+    tab.choose("Estimator", EXACT)
+    expect(tab.value("estimator")).to_have_text("mc-exact")
+    proven = re.compile(r"^Proven optimal: no pose explains more than (1[89]|2[0-2])$")
+    expect(tab.value("certificate")).to_have_text(proven)
+    expect(tab.value("expected false sets")).to_have_text(re.compile(r"e-\d+ of (1[89]|2[0-2]) matches$"))
+    expect(tab.page.get_by_text(re.compile("; proven optimal: no pose explains more than"))).to_be_visible()
+    titles = walk(tab)
+    assert titles[2:5] == [
+        "What no pose can beat, at each yaw",
+        "The largest set that agrees",
+        "The poses that were verified",
+    ]
+    for number, node in ((3, "/ring/bars"), (4, "/pairs/clique"), (5, "/cameras/estimate")):
+        tab.choose("Step", f"{number}/{len(titles)}  {titles[number - 1]}")
+        tab.until(lambda node=node: bool((tab.node(node) or {}).get("visible")), f"{node} is shown")
+    for text in ("off the truth", "best pose", "first guess"):
+        expect(tab.page.get_by_text(text, exact=True)).to_be_visible()
+    assert tab.errors == []
+
+
+def test_a_doubtful_run_is_diagnosed_and_a_good_one_is_not(tab: Playground) -> None:
+    expect(tab.page.get_by_text("Diagnosing …")).to_have_count(0)
+    expect(tab.page.get_by_text(re.compile("^Judged with"))).to_have_count(0)
+    tab.thumb("Outliers (%)").focus()
+    tab.page.keyboard.press("End")
+    expect(tab.value("outcome")).not_to_have_text("success")
+    expect(tab.page.get_by_text(re.compile("^Judged with"))).to_be_visible()
+    tab.press("Previous")
+    expect(tab.step).to_have_value(re.compile("Refinement"))
+    tab.thumb("Outliers (%)").focus()
+    tab.page.keyboard.press("Home")
+    expect(tab.value("outcome")).to_have_text("success")
+    expect(tab.page.get_by_text(re.compile("^Judged with"))).to_have_count(0)
+    assert tab.errors == []
+
+
+def test_gravity_can_be_off_and_the_estimator_told(tab: Playground) -> None:
+    tab.thumb("Gravity error (deg)").focus()
+    tab.page.keyboard.press("End")
+    tab.page.get_by_text("Refinement", exact=True).click()
+    tab.press("Previous")
+    expect(tab.page.get_by_text(re.compile(r"which was trusted to 2° \(standard deviation\)"))).to_be_visible()
+    tab.choose("Gravity sd (deg)", "unknown (6 DoF)")
+    expect(tab.page.get_by_text(re.compile("from the given gravity, which was not used"))).to_be_visible()
+    tab.choose("Gravity sd (deg)", "0: exact (4 DoF)")
+    expect(tab.page.get_by_text("The given gravity is kept.")).to_be_visible()
     assert tab.errors == []
 
 
@@ -112,7 +164,7 @@ def test_captions_are_those_of_the_run(tab: Playground, tmp_path: Path) -> None:
 
 
 def test_options_of_the_estimator_change_the_run(tab: Playground) -> None:
-    tab.choose("Estimator", "ransac-2p")
+    tab.choose("Estimator", RANSAC)
     expect(tab.value("estimator")).to_have_text("ransac-2p")
     tab.entry("Iterations").fill("1")
     tab.entry("Iterations").press("Enter")
@@ -133,7 +185,7 @@ def test_scene_and_camera_can_be_changed(tab: Playground) -> None:
 def test_tabs_have_their_own_state(open_tab: Callable[[], Playground]) -> None:
     first, second = open_tab(), open_tab()
     untouched = second.value("inliers").inner_text(), second.value("rotation error").inner_text()
-    first.choose("Estimator", "ransac-2p")
+    first.choose("Estimator", RANSAC)
     first.thumb("Outliers (%)").focus()
     first.page.keyboard.press("Home")
     expect(first.value("inliers")).to_have_text(re.compile(r"^(39|40) of 40$"))

@@ -81,9 +81,9 @@ def test_gravity_changes_nothing(estimator, scene_of, rng):
     first, second = run(problem, estimator), run(other, estimator)
     np.testing.assert_allclose(first.cam_from_map, second.cam_from_map, atol=1e-6)
     np.testing.assert_array_equal(first.inlier_mask, second.inlier_mask)
-    np.testing.assert_allclose(
-        first.stage(RansacStage).cam_from_map, second.stage(RansacStage).cam_from_map, atol=1e-6
-    )
+    if estimator in SPHERE:  # OpenCV's EPnP turns rounding errors of five points into other hypotheses
+        hypotheses = [trace.stage(RansacStage).cam_from_map for trace in (first, second)]
+        np.testing.assert_allclose(*hypotheses, atol=1e-6)
 
 
 def test_the_refinement_uses_gravity_if_asked(scene_of):
@@ -111,7 +111,9 @@ def test_lost_correspondences_are_counted(estimator, scene_of):
         )
         trace = run(problem, estimator)
         lost = np.count_nonzero(~seen)
-        match = re.search(r"(\d+) of 100 usable correspondences lies? outside the virtual camera's 120 deg", trace.message)
+        match = re.search(
+            r"(\d+) of 100 usable correspondences lies? outside the virtual camera's 120 deg", trace.message
+        )
         assert match and int(match[1]) == lost
         assert not trace.inlier_mask[~seen].any()
         if trace.cam_from_map is not None:

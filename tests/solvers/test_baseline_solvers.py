@@ -116,9 +116,7 @@ def test_wrong_input_is_a_problem_error(solver, rng):
             solver.solve(*arguments)
 
 
-@pytest.mark.parametrize(
-    "solver", [solver for solver in SOLVERS if solver.pinhole], ids=lambda solver: solver.name
-)
+@pytest.mark.parametrize("solver", [solver for solver in SOLVERS if solver.pinhole], ids=lambda solver: solver.name)
 def test_a_pinhole_says_what_it_cannot_see(solver, rng):
     bearings, points, _ = ahead(rng, 10)
     bearings[3] *= -1.0

@@ -62,7 +62,9 @@ def test_mode_with_outliers_is_hubers_optimum(rng):
             error = np.linalg.norm(image_residuals(image, points, turned_about_the_middle(found, points, x)), axis=1)
             return np.where(error <= width, 0.5 * error**2, width * (error - 0.5 * width)).sum()
 
-        assert minimize(cost, np.zeros(6), method="Powell", options={"xtol": 1e-10}).fun >= cost(np.zeros(6)) * (1 - 1e-7)
+        assert minimize(cost, np.zeros(6), method="Powell", options={"xtol": 1e-10}).fun >= cost(np.zeros(6)) * (
+            1 - 1e-7
+        )
         assert errors(truth, found[None])[0] < 0.02
 
 
@@ -89,7 +91,7 @@ def test_posterior_has_the_gauss_newton_covariance(count, noise_rad, rng):
         assert posterior.weights.sum() == pytest.approx(1.0)
         assert errors(mode, posterior.mean[None])[0] < np.sqrt(np.trace(expected[:3, :3]))
     low, high = np.median(ratios, axis=0)[[0, -1]]
-    assert 0.5 < low and high < 1.7
+    assert low > 0.5 and high < 1.7
 
 
 def test_posterior_is_that_of_the_points_that_were_given(rng):

@@ -1,4 +1,4 @@
-"""MLPnP: it reaches the maximum of the likelihood, planes included, and compares well with its author's implementation."""
+"""MLPnP: it reaches the maximum of the likelihood, planes included, and compares well with its author's code."""
 
 import numpy as np
 import pytest

@@ -23,7 +23,12 @@ def test_sees_what_lies_in_its_image(fov_deg, rng):
 def test_edges_belong_to_the_image():
     sixty = np.radians(60.0) * (1 - 1e-12)
     inside = [[0, 0, 1], [np.sin(sixty), 0, np.cos(sixty)], [0, -np.sin(sixty), np.cos(sixty)]]
-    outside = [[0, 0, -1], [1, 0, 0], [np.sin(1.01 * sixty), 0, np.cos(1.01 * sixty)], [0, np.sin(sixty), -np.cos(sixty)]]
+    outside = [
+        [0, 0, -1],
+        [1, 0, 0],
+        [np.sin(1.01 * sixty), 0, np.cos(1.01 * sixty)],
+        [0, np.sin(sixty), -np.cos(sixty)],
+    ]
     assert VirtualPinhole().sees(np.array(inside, float)).all()
     assert not VirtualPinhole().sees(np.array(outside, float)).any()
 
