@@ -37,6 +37,9 @@ MAX_ROUNDS = 10
 MAX_RESCUES = 8
 RESCUE_FACTOR = 1.5
 """By which the residuals of inliers that least squares would lose grow from one rescue to the next."""
+RESCUE_REACH = 16.8
+"""How much a rescue may raise the cost, in variances of the noise: 99 % of chi-square with 6 degrees of freedom, so
+that the pose stays where the true one may be. Without it, one outlier near a loose bound bends the pose by degrees."""
 
 Robust = Literal["none", "huber", "cauchy"]
 
@@ -81,8 +84,8 @@ def refine(
     is estimated by ``bounds.noise_px``, since gravity's error is no longer in the residuals. Least squares may lose
     inliers on the way or go round in circles, so what counts is the round that ended with the most inliers (ties: the
     smaller cost). Where the start explains more than that, by the same bound, its inliers are fitted with growing
-    weights on those that would be lost; if this fails too the start is returned. So refinement loses no consensus.
-    (Exact gravity turns the start to a pure yaw first.)
+    weights on those that would be lost. So the consensus of the start is kept, unless that takes a pose that noise
+    cannot have brought about (``RESCUE_REACH``). Exact gravity turns the start to a pure yaw first.
 
     Returns the pose, its inlier mask (M,), and the stage, whose poses and covariance are those of the problem's own
     frames.
@@ -158,7 +161,7 @@ def _alternate(bearings, points, weights, wide_px, tight_px, start, noise_px, gr
         path[1], states = levelled(start, middle_of(points, mask)[1]), 2
         errors = _residuals(bearings, points, weights, path[1])
         mask = errors <= wide_px
-    first, first_errors, limit_px = states, errors, np.inf
+    first_errors, limit_px = errors, np.inf
     kept, most, least_cost = states, -1, np.inf
     rotation, translation = path[states - 1, :, :3].copy(), path[states - 1, :, 3].copy()
     for _ in range(MAX_ROUNDS):
@@ -174,20 +177,25 @@ def _alternate(bearings, points, weights, wide_px, tight_px, start, noise_px, gr
             kept, most, least_cost = states, inliers, cost
         if inliers < 2 or np.array_equal(mask, before):
             break
-    explained = first_errors <= np.minimum(wide_px, limit_px)
-    if np.count_nonzero(explained) > most:
-        limits = np.minimum(wide_px, limit_px)
-        steps = _rescue(bearings, points, weights, limits, explained, path, kept, noise_px, gravity_sd_rad)
-        kept = kept + steps if steps >= 0 else first
+    limits = np.minimum(wide_px, limit_px)
+    if np.count_nonzero(first_errors <= limits) > most:
+        explained = first_errors <= limits
+        kept += _rescue(bearings, points, weights, limits, explained, path, kept, noise_px, gravity_sd_rad)
     return path[:kept].copy(), limit_px
 
 
 @numba.njit(cache=True, nogil=True)
 def _rescue(bearings, points, weights, limits_px, explained, path, states, noise_px, gravity_sd_rad):
-    """Move on from the last of ``states`` until as many as are in ``explained`` are inliers; the steps, or -1.
+    """Move on from the last of ``states`` until as many as are in ``explained`` are inliers; the steps, 0 if in vain.
 
-    Least squares on these, each of them weighing more the more often it was found to be outside.
+    Least squares on these, each of them weighing more the more often it was found to be outside. In vain too if the
+    pose ends farther from the least-squares one, in the latter's residuals, than noise explains: then it would be bent
+    towards an outlier.
     """
+    errors = _residuals(bearings, points, weights, path[states - 1])
+    fitted = errors <= limits_px
+    cost = np.sum(errors[fitted] ** 2)
+    variance = max(noise_px * noise_px, cost / max(2 * np.count_nonzero(fitted), 1))
     heavy, steps = weights.copy(), 0
     rotation, translation = path[states - 1, :, :3].copy(), path[states - 1, :, 3].copy()
     for _ in range(MAX_RESCUES):
@@ -203,12 +211,15 @@ def _rescue(bearings, points, weights, limits_px, explained, path, states, noise
             MAX_STEPS,
             path[states + steps :],
         )
-        inside = _residuals(bearings, points, weights, path[states + steps - 1]) <= limits_px
+        errors = _residuals(bearings, points, weights, path[states + steps - 1])
+        if np.sum(errors[fitted] ** 2) - cost > RESCUE_REACH * variance:
+            return 0
+        inside = errors <= limits_px
         if np.count_nonzero(inside) >= np.count_nonzero(explained):
             return steps
         for k in np.flatnonzero(explained & ~inside):
             heavy[k] *= RESCUE_FACTOR
-    return -1
+    return 0
 
 
 @numba.njit(cache=True, nogil=True)

@@ -9,6 +9,7 @@ import numpy as np
 
 from spherloc.consensus.balls_of_pairs import apart_balls, may_be_seen, pair_ball, star_balls, view_between
 from spherloc.consensus.clique_search import ONE, clear_edge, colour_bound, larger_clique, popcount, set_edge, subgraph
+from spherloc.consensus.dual_proof import FOUND, IMPOSSIBLE, UNKNOWN, prove_none
 from spherloc.consensus.pair_arcs import CIRCLE
 from spherloc.consensus.region import search_region
 from spherloc.consensus.support import climb, keep, verify
@@ -19,8 +20,10 @@ MOST_SPARE = 8
 """Nodes of a bin more than the best support up to which the whole bin is tried to be settled at once."""
 MOST_CELLS = 4000
 """Cells of yaw and position in one proof."""
-CELL_EFFORT = 64
-"""Words that take as long as a cell."""
+MOST_IN_CELLS = 16
+"""Correspondences up to which cells are tried where duality proves nothing."""
+CELL_EFFORT, ROUND_EFFORT = 100, 40
+"""Words that take as long as a cell, and as one correspondence in a round of a proof."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -123,25 +126,30 @@ def _settle(data, limits, view, everybody, balls, poses, supports, masks, known)
     """Prove that no pose explains more of ``everybody`` than the best known one does; ``balls`` (B, 4) hold all that might.
 
     Better poses that are met become known, and the proof goes on against them. Returns how many are known, whether
-    it is proven, and the cells.
+    it is proven, and the effort.
     """
     found = np.empty((3, 4))
     mask = np.empty(masks.shape[1], np.bool_)
-    cells, b = 0, 0
+    effort, b = 0, 0
     while b < len(balls):
         if not balls[b, 3] < np.inf:
-            return known, False, cells
+            return known, False, effort
         best = supports[0]
-        proven, most, used = search_region(view, limits, everybody, balls[b], best, MOST_CELLS - cells, found)
-        cells += used
-        if most > best:
+        answer, work = prove_none(view, limits, everybody, balls[b], best, found)
+        effort += work * ROUND_EFFORT
+        if answer == UNKNOWN and len(everybody) <= MOST_IN_CELLS:
+            answer, cells = search_region(view, limits, everybody, balls[b], best, MOST_CELLS, found)
+            effort += work
+        if answer == FOUND:
             support = climb(data, found[:, :3], found[:, 3], mask)
             known = keep(found[:, :3], found[:, 3], support, mask, poses, supports, masks, known)
-        elif proven:
+            if supports[0] <= best:  # it climbed down by rounding
+                return known, False, effort
+        elif answer == IMPOSSIBLE:
             b += 1
         else:
-            return known, False, cells
-    return known, True, cells
+            return known, False, effort
+    return known, True, effort
 
 
 @numba.njit(cache=True, nogil=True)
@@ -169,8 +177,8 @@ def sweep_bin(data, limits, trig, pairs, lo, hi, arcs, start, end, poses, suppor
     if len(nodes) - supports[0] <= MOST_SPARE:
         view = view_between(data, start, end)
         balls = apart_balls(view, trig, nodes, len(nodes) - supports[0])
-        known, proven, cells = _settle(data, limits, view, nodes, balls, poses, supports, masks, known)
-        effort += cells * CELL_EFFORT
+        known, proven, work = _settle(data, limits, view, nodes, balls, poses, supports, masks, known)
+        effort += work
         if proven:
             return known, supports[0], nothing, effort, True
     rows[:] = 0
@@ -210,8 +218,8 @@ def sweep_bin(data, limits, trig, pairs, lo, hi, arcs, start, end, poses, suppor
             continue
         everybody = np.append(nodes[candidates], nodes[np.array([a, b])])
         balls = star_balls(view, trig, everybody, len(everybody) - supports[0], ball)
-        known, proven, cells = _settle(data, limits, view, everybody, balls, poses, supports, masks, known)
-        effort += cells * CELL_EFFORT
+        known, proven, work = _settle(data, limits, view, everybody, balls, poses, supports, masks, known)
+        effort += work
         if not proven and len(clique) > len(largest):
             largest = nodes[clique]
         trials += not proven

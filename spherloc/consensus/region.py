@@ -9,24 +9,27 @@ more than ``floor`` is dropped; others are split until none is left, or the limi
 import numba
 import numpy as np
 
+from spherloc.consensus.dual_proof import FOUND, IMPOSSIBLE, UNKNOWN, write_pose
+
 MOST_WAITING = 4096
 """Cells that wait to be split; more are not needed since the deepest is split first."""
+LEAST_CELL_RAD = 1e-5
+"""A cell that moves rays by less is not split: it holds a pose that explains one more to within rounding, or nearly."""
 HALF_DIAGONAL = np.sqrt(3.0)
 
 
 @numba.njit(cache=True, nogil=True)
 def search_region(view, limits, few, ball, floor, cell_limit, found):
-    """Whether no level pose of the region explains more than ``floor`` of ``few``; the most that one did; the cells.
+    """Whether some level pose of the region explains more than ``floor`` of ``few``: as ``prove_none``; and the cells.
 
     ``view`` is (bearings, points, cos, sin and half width of the yaw interval); ``limits`` are the weights (M, 2, 3), the
-    bounds (M,) px, the angular bounds (M,) rad and the px/rad (M,); ``ball`` (4,) centre and radius of camera positions. If
-    the answer is no, ``found`` (3, 4) is a pose with the most; it is left alone otherwise.
+    bounds (M,) px, the angular bounds (M,) rad and the px/rad (M,); ``ball`` (4,) centre and radius of camera positions.
     """
     c0, s0, slack = view[2], view[3], view[4]
     order = few.copy()
     cells = np.empty((MOST_WAITING, 6))
     cells[0, 0], cells[0, 1], cells[0, 2:5], cells[0, 5] = 0.0, slack, ball[:3], ball[3]
-    waiting, used, best, exact = 1, 0, floor, True
+    waiting, used, exact = 1, 0, True
     reach = _mean_distance(view[1], few, ball)
     while waiting > 0:
         if used >= cell_limit or waiting > MOST_WAITING - 8:
@@ -37,15 +40,14 @@ def search_region(view, limits, few, ball, floor, cell_limit, found):
         yaw, half_yaw, half = cells[waiting, 0], cells[waiting, 1], cells[waiting, 5]
         x, y, z = cells[waiting, 2], cells[waiting, 3], cells[waiting, 4]
         c, s = c0 * np.cos(yaw) - s0 * np.sin(yaw), s0 * np.cos(yaw) + c0 * np.sin(yaw)
-        if not _may_explain(view, limits, order, c, s, x, y, z, half_yaw, half * HALF_DIAGONAL, best):
+        if not _may_explain(view, limits, order, c, s, x, y, z, half_yaw, half * HALF_DIAGONAL, floor):
             continue
-        here = _explained(view, limits, few, c, s, x, y, z)
-        if here > best:
-            best = here
-            found[0, 0], found[0, 1], found[0, 2] = c, 0.0, s
-            found[1, 0], found[1, 1], found[1, 2] = 0.0, 1.0, 0.0
-            found[2, 0], found[2, 1], found[2, 2] = -s, 0.0, c
-            found[0, 3], found[1, 3], found[2, 3] = -(c * x + s * z), -y, s * x - c * z
+        if _explained(view, limits, few, c, s, x, y, z) > floor:
+            write_pose((c, s, x, y, z), found)
+            return FOUND, used
+        if half_yaw + half * HALF_DIAGONAL / reach < LEAST_CELL_RAD:
+            exact = False
+            continue
         if half_yaw * reach > half * HALF_DIAGONAL:
             for side in (-0.5, 0.5):
                 cells[waiting, 0], cells[waiting, 1] = yaw + side * half_yaw, 0.5 * half_yaw
@@ -59,7 +61,7 @@ def search_region(view, limits, few, ball, floor, cell_limit, found):
             cells[waiting, 3] = y + (half if corner & 2 else -half)
             cells[waiting, 4] = z + (half if corner & 4 else -half)
             waiting += 1
-    return exact and best == floor, best, used
+    return (IMPOSSIBLE if exact else UNKNOWN), used
 
 
 @numba.njit(cache=True, nogil=True)

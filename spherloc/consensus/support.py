@@ -50,23 +50,29 @@ def squeeze(data, members, rotation, translation, mask):
     """Turn and move a level pose so that the worst of ``members`` fits better, and keep what explains most; in place.
 
     A fit of least squares leaves out a correspondence beyond its bound though another pose explains it as well as all
-    others. Weights that grow with the residual come close to the pose of least largest residual. Returns its support.
+    others. Lawson's iteration, which multiplies each weight by its residual, comes close to the pose of least largest
+    residual. Returns its support.
     """
     bearings, points, weights, bound_px, _, noise_px = data
     best = mark_support(data, rotation, translation, mask)
     few, rays = points[members], bearings[members]
     flat, everyone = weights[members], np.ones(len(members), np.bool_)
-    scaled = np.empty_like(flat)
+    scaled, heavy = np.empty_like(flat), np.ones(len(members))
     turned, moved, chosen = rotation.copy(), translation.copy(), np.empty_like(mask)
     for _ in range(SQUEEZES):
         for k in range(len(members)):
             share = residual(turned, moved, rays[k], few[k], flat[k], 0.0) / bound_px[members[k]]
-            scaled[k] = flat[k] * min(max(share, 0.3), 3.0) ** 3
+            heavy[k] *= min(max(share, 1e-3), 10.0)
+        heavy /= np.mean(heavy)
+        for k in range(len(members)):
+            scaled[k] = flat[k] * np.sqrt(heavy[k])
         polish(few, scaled, everyone, turned, moved, noise_px, 0.0, 0, 1)
         support = mark_support(data, turned, moved, chosen)
         if support > best:
             best = support
             rotation[:], translation[:], mask[:] = turned, moved, chosen
+        if best >= len(members):
+            break
     return best
 
 

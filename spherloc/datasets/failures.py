@@ -234,7 +234,7 @@ def _gravity_off(make: _Maker) -> FailureCase:
 def _bound_too_small(make: _Maker) -> FailureCase:
     """The noise's standard deviation is 1 to 2.5 times the bound: 8 to 39 % of the right matches are within it."""
     count = make.whole(80, 300)
-    bound = make.between(1.0, 3.0)
+    bound = make.between(1.0, 2.0)
     make.noise_px = bound * make.between(1.0, 2.5)
     inliers = round(count * make.between(0.5, 1.0))
     make.right(inliers)

@@ -59,8 +59,8 @@ class EproPnp:
         image, middle = image_plane(bearings), points.mean(axis=0)
         centred, start = points - middle, _moved(mode, middle)
         residual, jacobian, _ = _linearized(image, centred, start, _huber_width(image))
-        sigma = max(np.sqrt(residual @ residual / max(1, len(residual) - 6)), LEAST_SIGMA)
-        covariance = np.linalg.pinv(jacobian.T @ jacobian) * sigma**2
+        sigma = max(float(np.sqrt(residual @ residual / max(1, len(residual) - 6))), LEAST_SIGMA)
+        covariance = np.asarray(np.linalg.pinv(jacobian.T @ jacobian), dtype=np.float64) * sigma**2
 
         def log_likelihood(rotations: FloatArray, translations: FloatArray) -> FloatArray:
             return -_cost(image, centred, rotations, translations, _huber_width(image)) / sigma**2
@@ -123,7 +123,7 @@ def _mode(image: FloatArray, points: FloatArray, start: FloatArray) -> FloatArra
     for _ in range(ITERATIONS):
         normal, gradient = jacobian.T @ jacobian, jacobian.T @ residual
         damping = np.diag(np.maximum(np.diag(normal), 1e-6 * np.trace(normal)) / radius)
-        step = -np.linalg.solve(normal + damping, gradient)
+        step = np.asarray(-np.linalg.solve(normal + damping, gradient), dtype=np.float64)
         foretold = -step @ (0.5 * normal @ step + gradient)
         if foretold <= DECREASE_TOLERANCE * cost:
             break

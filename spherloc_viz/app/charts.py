@@ -99,7 +99,7 @@ def _binned(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _look(chart: Chart) -> tuple:
     return (
         chart.title,
-        len(f"{_top(chart):,.0f}"),
+        _digits(chart),
         *((curve.label, curve.color, curve.kind) for curve in chart.curves),
     )
 
@@ -132,8 +132,12 @@ def _axes(chart: Chart) -> tuple[uplot.Axis, ...]:
     if "°" in chart.x_label:
         x["splits"] = DEGREES
     # Room for the tick labels, which uPlot would cut off: a digit is about 7 px wide.
-    digits = len(f"{_top(chart):,.0f}")
-    return x, uplot.Axis(label=chart.y_label, labelSize=18, size=22 + 7 * max(3, digits), labelGap=0)
+    return x, uplot.Axis(label=chart.y_label, labelSize=18, size=22 + 7 * _digits(chart), labelGap=0)
+
+
+def _digits(chart: Chart) -> int:
+    """Characters that the tick labels take; at least so many that few runs need another plot than the one before."""
+    return max(3, len(f"{_top(chart):,.0f}"))
 
 
 def _top(chart: Chart) -> float:

@@ -49,6 +49,24 @@ def test_what_is_optional(tmp_path):
     assert problem.truth_inliers is None and problem.truth_cam_from_map is None and problem.bound_px is None
 
 
+def test_gravity_error_of_a_simulation(tmp_path):
+    scene = load_scene(write(tmp_path, SYNTHETIC + "gravity_error_deg = 0.5\n"))
+    problem = scene.problem()
+    assert problem.gravity_bound_rad == pytest.approx(np.radians(1.5)) and "0.5 deg" in problem.scene
+    assert load_scene(write(tmp_path, SYNTHETIC)).problem().gravity_bound_rad == 0.0
+
+
+@pytest.mark.parametrize(
+    "lines, bound_deg, sd_deg",
+    [("", 0.0, 0.0), ("bound_deg = 1.5", 1.5, 0.5), ("sd_deg = 2", 6.0, 2.0), ("bound_deg = 3\nsd_deg = 0.25", 3, 0.25)],
+)
+def test_gravity_error_of_a_measured_scene(tmp_path, lines, bound_deg, sd_deg):
+    """One of both gives the other."""
+    problem = load_scene(write_measured(tmp_path, added(MEASURED, f"[gravity]{lines}"))).problem()
+    assert np.degrees(problem.gravity_bound_rad) == pytest.approx(bound_deg)
+    assert np.degrees(problem.aligned.gravity_sd_rad) == pytest.approx(sd_deg)
+
+
 def test_image_is_found_beside_the_scene(tmp_path):
     (tmp_path / "photo.png").write_bytes(b"x")
     path = write_measured(tmp_path, MEASURED.replace("[camera]", 'image = "photo.png"\n[camera]', 1))
@@ -136,6 +154,8 @@ BAD_TOML = {
     "rate above one": (replaced(SYNTHETIC, "outlier_rate = 0.3", "outlier_rate = 1.5"), "outlier_rate is 1.5"),
     "rate NaN": (replaced(SYNTHETIC, "outlier_rate = 0.3", "outlier_rate = nan"), "outlier_rate is nan"),
     "noise text": (replaced(SYNTHETIC, "noise_px = 0.5", 'noise_px = "0.5"'), "noise_px is '0.5'"),
+    "gravity error below zero": (SYNTHETIC + "gravity_error_deg = -1", "gravity_error_deg is -1"),
+    "gravity error text": (SYNTHETIC + "gravity_error_deg = 'small'", "gravity_error_deg is 'small'"),
     "bound zero": (SYNTHETIC + "[options]\nbound_px = 0", "bound_px is 0"),
     "bound infinite": (SYNTHETIC + "[options]\nbound_px = inf", "bound_px is inf"),
     "options no section": ("options = 3\n" + SYNTHETIC, "'options'"),
@@ -160,6 +180,12 @@ BAD_MEASURED = {
     "gravity true": (replaced(MEASURED, "[0.0, 1.0, 0.0]", "[false, true, false]"), "[gravity]", "camera"),
     "gravity huge": (replaced(MEASURED, "[0.0, 1.0, 0.0]", f"[0, {10**400}, 0]"), "[gravity]", "camera"),
     "gravity in m/s2": (replaced(MEASURED, "[0.0, 1.0, 0.0]", "[0.0, 9.81, 0.0]"), "length 9.81"),
+    "gravity bound text": (replaced(MEASURED, "[gravity]", "[gravity]\nbound_deg = '1'"), "bound_deg is '1'"),
+    "gravity bound below zero": (replaced(MEASURED, "[gravity]", "[gravity]\nbound_deg = -1"), "bound_deg is -1"),
+    "gravity bound too large": (replaced(MEASURED, "[gravity]", "[gravity]\nbound_deg = 91"), "bound_deg is 91"),
+    "gravity bound of 90": (replaced(MEASURED, "[gravity]", "[gravity]\nbound_deg = 90"), "gravity bound"),
+    "gravity sd NaN": (replaced(MEASURED, "[gravity]", "[gravity]\nsd_deg = nan"), "sd_deg is nan"),
+    "gravity sd too large": (replaced(MEASURED, "[gravity]", "[gravity]\nsd_deg = 40"), "gravity bound"),
     "gravity no section": ("gravity = 1\n" + MEASURED.replace("[gravity]", "[other]"), "gravity"),
     "truth of two rows": (replaced(MEASURED, ", [0.0, 0.0, 1.0, 2.0]]", "]"), "[truth]", "3 x 4"),
     "truth no rotation": (replaced(MEASURED, "[[1.0,", "[[2.0,"), "rotation"),

@@ -133,6 +133,36 @@ def test_panorama_has_points_on_both_sides_of_the_seam(scene_of):
     assert (u < 4).sum() > 5 and (u > 2044).sum() > 5
 
 
+def test_gravity_error_changes_only_what_is_known_of_gravity(scene_of):
+    """The camera stays level; the problem's gravity is off, by no more than it says."""
+    for seed in SEEDS:
+        exact, off = (scene_of("mei", gravity_error_deg=error).problem(seed) for error in (0.0, 0.5))
+        np.testing.assert_array_equal(exact.pixels, off.pixels)
+        np.testing.assert_array_equal(geometry_of(exact), geometry_of(off))
+        np.testing.assert_array_equal(exact.gravity_map, off.gravity_map)
+        assert exact.gravity_bound_rad == 0.0 and exact.aligned.gravity_sd_rad == 0.0
+        assert 0.0 < np.arccos(off.gravity_camera @ DOWN) <= off.gravity_bound_rad
+        assert off.gravity_bound_rad == pytest.approx(np.radians(1.5))
+        assert off.gravity_sd_rad == pytest.approx(np.radians(0.5))
+
+
+def test_gravity_error_has_the_stated_size(scene_of):
+    """In roll and in pitch, and never beyond the bound, so that 3 sd are a true bound."""
+    scene = scene_of("panorama", correspondences=2, outlier_rate=0.0, gravity_error_deg=2.0)
+    known = np.array([scene.problem(seed).gravity_camera for seed in range(2000)])
+    roll_pitch = np.degrees(known[:, [0, 2]])
+    np.testing.assert_allclose(roll_pitch.std(axis=0), 2.0, rtol=0.07)
+    np.testing.assert_allclose(roll_pitch.mean(axis=0), 0.0, atol=0.15)
+    assert 5.0 < np.degrees(np.arccos(known @ DOWN)).max() <= 6.0
+
+
+def test_larger_gravity_error_tilts_the_same_way(scene_of):
+    """So that a slider shows one change at a time."""
+    small, large = (scene_of("mei", gravity_error_deg=error).problem(3).gravity_camera for error in (1.0, 3.0))
+    assert np.cross(small, large) @ np.cross(DOWN, small) > 0
+    np.testing.assert_allclose(np.arccos(large @ DOWN), 3.0 * np.arccos(small @ DOWN), rtol=1e-9)
+
+
 def test_camera_that_sees_nothing_is_an_input_error(scene_of):
     """A telescope: the search for visible points must end, in a sentence."""
     narrow = KannalaBrandt(10, 10, 1e6, 1e6, 5.0, 5.0, (0.0, 0.0, 0.0, 0.0))
@@ -141,6 +171,7 @@ def test_camera_that_sees_nothing_is_an_input_error(scene_of):
 
 
 BAD = [("correspondences", 1), ("correspondences", 10_001), ("outlier_rate", -0.1), ("outlier_rate", np.nan)]
+BAD += [("gravity_error_deg", -0.1), ("gravity_error_deg", 10.1), ("gravity_error_deg", np.nan)]
 BAD += [("noise_px", -1.0), ("noise_px", np.inf), ("seed", -1)]
 
 

@@ -1,0 +1,153 @@
+"""The diagnosis names the cause of cases that are made to fail, says so with numbers, and tells truth from data."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from spherloc.bounds import bounds_of
+from spherloc.datasets.failures import failure_case
+from spherloc.diagnosis import Cause, diagnose
+from spherloc.diagnosis.measures import apart, pose_sd
+from spherloc.estimators import default_options, estimate
+from spherloc.problem import Problem
+from spherloc.refine import RefinementOptions, refine, residuals_px
+from spherloc.trace import ConsensusStage
+
+SEEDS = range(3000, 3006)
+
+
+def run(cause, seed):
+    case = failure_case(cause, seed)
+    options = replace(default_options(case.estimator, case.problem), **case.options)
+    return estimate(case.problem, case.estimator, options, case.seed)
+
+
+@pytest.fixture(scope="module")
+def traces():
+    return {cause: [run(cause, seed) for seed in SEEDS] for cause in Cause}
+
+
+@pytest.mark.parametrize("use_truth, least", [(True, 0.95), (False, 0.85)])
+def test_causes_are_named(traces, use_truth, least):
+    """A small confusion matrix; ``benchmarks/diagnosis.py`` makes the large one."""
+    called = [(cause, diagnose(trace, use_truth).cause) for cause in Cause for trace in traces[cause]]
+    wrong = [f"{cause} called {name}" for cause, name in called if cause != name]
+    assert len(wrong) <= (1 - least) * len(called), wrong
+    assert all(sum(cause == name for cause, name in called if cause == row) >= 0.5 * len(SEEDS) for row in Cause)
+
+
+@pytest.mark.parametrize("use_truth", [True, False])
+@pytest.mark.parametrize("cause", Cause)
+def test_words(traces, cause, use_truth):
+    """Sentences with this run's numbers, and a doubt unless the run is fine."""
+    for trace in traces[cause][:3]:
+        diagnosis = diagnose(trace, use_truth)
+        assert diagnosis.doubtful == (diagnosis.cause != Cause.OK)
+        assert diagnosis.used_truth == use_truth
+        sentences = [diagnosis.summary, diagnosis.advice, *diagnosis.evidence]
+        assert all(text[0].isupper() and text.endswith(".") and "nan" not in text for text in sentences), sentences
+        assert not any("inf" in text.split() or "inf°" in text for text in sentences), sentences
+        assert str(len(trace.problem)) in " ".join(diagnosis.evidence)
+        assert any(text.startswith("Truth") for text in diagnosis.evidence) == use_truth
+
+
+@pytest.mark.parametrize("use_truth", [True, False])
+@pytest.mark.parametrize("cause", [Cause.AMBIGUOUS, Cause.FALSE_CONSENSUS])
+def test_the_other_pose_is_shown(traces, cause, use_truth):
+    """It is another pose, many correspondences support it, and the certificate says what no pose exceeds."""
+    for trace in traces[cause]:
+        diagnosis = diagnose(trace, use_truth)
+        if diagnosis.cause != cause:
+            continue
+        aligned, rival = trace.problem.aligned, diagnosis.rival_cam_from_map
+        assert rival is not None and trace.cam_from_map is not None
+        turn, distance = apart(rival, trace.cam_from_map)
+        assert turn > np.radians(3) or distance > 0.3
+        support = np.count_nonzero(residuals_px(aligned, aligned.align_pose(rival)) <= trace.options.bound_px)
+        assert support > 0.4 * np.count_nonzero(trace.inlier_mask)
+        assert any("no pose explains more than" in text.lower() for text in diagnosis.evidence)
+
+
+def test_truth_shows_the_true_pose(traces):
+    for trace in traces[Cause.FALSE_CONSENSUS]:
+        rival = diagnose(trace).rival_cam_from_map
+        assert rival is not None and trace.problem.truth_cam_from_map is not None
+        turn, distance = apart(rival, trace.problem.truth_cam_from_map)
+        assert turn < np.radians(1) and distance < 0.1
+
+
+def changed(trace, **fields):
+    return replace(trace, problem=replace(trace.problem, **fields))
+
+
+def test_truth_is_not_looked_at_unless_asked_for(traces):
+    for cause in Cause:
+        trace = traces[cause][0]
+        blind = changed(trace, truth_cam_from_map=None, truth_inliers=None)
+        told, asked = diagnose(trace, use_truth=False), diagnose(blind, use_truth=True)
+        assert (told.cause, told.summary, told.evidence) == (asked.cause, asked.summary, asked.evidence)
+        assert not told.used_truth and not asked.used_truth
+
+
+@pytest.mark.parametrize("kept", ["truth_cam_from_map", "truth_inliers"])
+def test_half_a_truth_is_used(traces, kept):
+    """The true pose alone, or labels alone, tell nearly as much as both."""
+    other = {"truth_cam_from_map", "truth_inliers"} - {kept}
+    right = 0
+    for cause in (Cause.OK, Cause.FALSE_CONSENSUS, Cause.ITERATIONS_RAN_OUT, Cause.BOUND_TOO_SMALL):
+        for trace in traces[cause]:
+            diagnosis = diagnose(changed(trace, **dict.fromkeys(other)))
+            assert diagnosis.used_truth
+            right += diagnosis.cause == cause
+    assert right >= 0.9 * 4 * len(SEEDS)
+
+
+def test_same_run_same_diagnosis(traces):
+    trace = traces[Cause.AMBIGUOUS][1]
+    one, two = diagnose(trace), diagnose(trace)
+    assert (one.cause, one.evidence) == (two.cause, two.evidence)
+    np.testing.assert_array_equal(one.rival_cam_from_map, two.rival_cam_from_map)
+
+
+def test_rivals_of_the_exact_search_are_heard(traces):
+    """Its stage has verified poses; a second one that shares most matches with the first is found there only."""
+    trace = next(t for t in traces[Cause.AMBIGUOUS] + traces[Cause.FALSE_CONSENSUS] if t.stage(ConsensusStage))
+    assert diagnose(trace, use_truth=False).cause in (Cause.AMBIGUOUS, Cause.FALSE_CONSENSUS)
+
+
+@settings(max_examples=25)
+@given(st.integers(2, 9), st.integers(0, 10_000), st.sampled_from(["ransac-2p", "mc", "mc-exact"]))
+def test_tiny_problems_are_never_ok(count, seed, estimator):
+    """Random matches; whatever few of them allow, it is no error and no success."""
+    rng = np.random.default_rng(seed)
+    camera = failure_case(Cause.OK, seed % 5).problem.camera
+    pixels = np.array([camera.width, camera.height]) * rng.uniform(0.35, 0.65, (count, 2))
+    points = rng.uniform(-5, 5, (count, 3))
+    problem = Problem("tiny", camera, pixels, points, np.array([0.0, 1, 0]), np.array([0.0, 1, 0]))
+    diagnosis = diagnose(estimate(problem, estimator, seed=seed))
+    assert diagnosis.cause in (Cause.TOO_FEW_INLIERS, Cause.WRONG_REFERENCE) and diagnosis.doubtful
+
+
+def test_standard_deviations_are_those_of_the_refinement(traces):
+    """Two derivations of one covariance: about the camera here, about the points' middle there."""
+    for trace in traces[Cause.OK] + traces[Cause.GRAVITY_OFF]:
+        aligned = trace.problem.aligned
+        options = RefinementOptions(gravity_sd_deg=0.2)
+        start = aligned.align_pose(trace.cam_from_map)
+        fitted, inliers, stage = refine(aligned, start, bounds_of(aligned, 8.0), options)
+        rotation, position, _ = pose_sd(aligned, fitted, inliers, 1.0, np.radians(0.2), 0)
+        expected = [np.sqrt(np.linalg.norm(block, 2)) for block in (stage.covariance[:3, :3], stage.covariance[3:, 3:])]
+        np.testing.assert_allclose([rotation, position], expected, rtol=0.02)
+
+
+def test_one_wrong_match_does_not_hide_a_degenerate_set(traces):
+    """Without the matches that the position hangs on most, the valley shows."""
+    for trace in traces[Cause.DEGENERATE]:
+        aligned, true = trace.problem.aligned, trace.problem.aligned.align_pose(trace.problem.truth_cam_from_map)
+        mask = trace.problem.truth_inliers.copy()
+        open_m = pose_sd(aligned, true, mask, 1.0, 0.0, 0)[1]
+        mask[np.flatnonzero(~mask)[:1]] = True
+        assert pose_sd(aligned, true, mask, 1.0, 0.0, 1)[1] > 0.7 * open_m > 0.07
