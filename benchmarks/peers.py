@@ -1,8 +1,9 @@
 """The peers: each gets the same correspondences in the form that it takes, prepared before the clock starts.
 
 No released peer has a robust path for known gravity or takes bare bearings, so bearings are projected into a camera
-that the peer knows. The threshold of each is ours, 3 px of the scene's camera, times the median of (peer's pixels per
-scene pixel) over the correspondences it gets; the ratio at one of them is sqrt |det| of d peer pixel / d scene pixel.
+that the peer knows. All of them end with a refinement of the pose, as ours do. The threshold of each is ours, 3 px of
+the scene's camera, times the median of (peer's pixels per scene pixel) over the correspondences it gets; the ratio at
+one of them is sqrt |det| of d peer pixel / d scene pixel.
 """
 
 from collections.abc import Callable
@@ -158,7 +159,9 @@ def _colmap_panorama(problem: Problem, seed: int) -> Solve:
     options.ransac = _colmap_options(threshold, seed)
 
     def solve() -> Answer:
-        return _colmap_answer(pycolmap.estimate_absolute_pose(pixels, points, camera, options), "cam_from_world")
+        return _colmap_answer(
+            pycolmap.estimate_and_refine_absolute_pose(pixels, points, camera, options), "cam_from_world"
+        )
 
     return solve
 
@@ -172,7 +175,9 @@ def _colmap_rig(problem: Problem, seed: int) -> Solve:
     options = _colmap_options(threshold, seed)
 
     def solve() -> Answer:
-        return _colmap_answer(pycolmap.estimate_generalized_absolute_pose(*arguments, options), "rig_from_world")
+        return _colmap_answer(
+            pycolmap.estimate_and_refine_generalized_absolute_pose(*arguments, options), "rig_from_world"
+        )
 
     return solve
 

@@ -138,12 +138,19 @@ def _name_lines(axes: Axes) -> None:
             color="#333333",
             fontsize=9,
             va="center",
-            arrowprops={"arrowstyle": "-", "color": line.get_color(), "linewidth": 1.0, "shrinkA": 2, "shrinkB": 4},
+            arrowprops={
+                "arrowstyle": "-",
+                "color": line.get_color(),
+                "linewidth": 1.0,
+                "relpos": (0, 0.5),
+                "shrinkA": 1,
+                "shrinkB": 4,
+            },
         )
 
 
 def _apart(heights: np.ndarray, gap: float) -> np.ndarray:
-    """Ascending heights, moved as little as is needed to be ``gap`` apart: pools of neighbours around their mean."""
+    """Ascending heights from 0 to 1, moved as little as is needed to be ``gap`` apart: neighbours around their mean."""
     pools: list[tuple[float, int]] = []  # (mean of height - rank * gap, members)
     for rank, height in enumerate(heights):
         mean, size = float(height - rank * gap), 1
@@ -151,8 +158,9 @@ def _apart(heights: np.ndarray, gap: float) -> np.ndarray:
             other, members = pools.pop()
             mean, size = (other * members + mean * size) / (members + size), members + size
         pools.append((mean, size))
+    top = 1.0 - gap * (len(heights) - 1)
     base = np.concatenate([np.full(size, mean) for mean, size in pools]) if pools else np.empty(0)
-    return base + gap * np.arange(len(heights))
+    return np.clip(base, 0.0, max(top, 0.0)) + gap * np.arange(len(heights))
 
 
 def _save(figure: Figure, folder: Path, name: str) -> list[Path]:

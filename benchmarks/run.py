@@ -43,7 +43,8 @@ def arguments(argv: list[str]) -> argparse.Namespace:
     chosen = parser.parse_args(argv)
     if chosen.problems is not None and chosen.problems < 1:
         parser.error("--problems takes a number from 1 upwards")
-    chosen.problems = QUICK_PROBLEMS if chosen.quick else chosen.problems
+    if chosen.quick and chosen.problems is None:
+        chosen.problems = QUICK_PROBLEMS
     if chosen.out is None:
         chosen.out = RESULTS if chosen.problems is None and chosen.method is None else TRIAL_RESULTS
     return chosen

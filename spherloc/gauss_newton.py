@@ -39,17 +39,9 @@ def polish(points, weights, chosen, rotation, translation, noise_px, gravity_sd_
     one of ``ROBUST_*``. The cost never rises (after the projection), and no NaN is written. Chosen points must lie in
     front of their bearings.
     """
+    no_path = np.empty((0, 3, 4))
     return polish_path(
-        points,
-        weights,
-        chosen,
-        rotation,
-        translation,
-        noise_px,
-        gravity_sd_rad,
-        robust,
-        most_steps,
-        np.empty((0, 3, 4)),
+        points, weights, chosen, rotation, translation, noise_px, gravity_sd_rad, robust, most_steps, no_path
     )
 
 

@@ -199,18 +199,9 @@ def _rescue(bearings, points, weights, limits_px, explained, path, states, noise
     heavy, steps = weights.copy(), 0
     rotation, translation = path[states - 1, :, :3].copy(), path[states - 1, :, 3].copy()
     for _ in range(MAX_RESCUES):
-        steps += polish_path(
-            points,
-            heavy,
-            explained,
-            rotation,
-            translation,
-            noise_px,
-            gravity_sd_rad,
-            ROBUST_NONE,
-            MAX_STEPS,
-            path[states + steps :],
-        )
+        rest = path[states + steps :]
+        model = (noise_px, gravity_sd_rad, ROBUST_NONE)
+        steps += polish_path(points, heavy, explained, rotation, translation, *model, MAX_STEPS, rest)
         errors = _residuals(bearings, points, weights, path[states + steps - 1])
         if np.sum(errors[fitted] ** 2) - cost > RESCUE_REACH * variance:
             return 0

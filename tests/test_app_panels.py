@@ -99,8 +99,8 @@ def test_every_text_is_escaped() -> None:
         step_html(Step("key", EVIL, EVIL, EVIL, EVIL)),
         table_html(Table("any", ("", ""), ((EVIL, EVIL), ("number", 3.0)))),
         table_html(Table("any", (EVIL, "", ""), ((EVIL, EVIL, EVIL),))),
-        diagnosis_html(Diagnosis(Cause.AMBIGUOUS, True, EVIL, (EVIL,), EVIL, False)),
-        diagnosis_html(Diagnosis(Cause.OK, False, EVIL, (), "", True)),
+        diagnosis_html(Diagnosis(Cause.AMBIGUOUS, True, EVIL, (EVIL,), EVIL, False), whole=True),
+        diagnosis_html(Diagnosis(Cause.OK, False, EVIL, (), "", True), whole=True),
         status_html(EVIL, wrong=True),
     ]
     for html in pieces:
@@ -174,10 +174,12 @@ def test_the_given_scene_comes_first_and_once(tmp_path: Path) -> None:
 
 def test_a_diagnosis_tells_cause_evidence_and_advice_and_is_quiet_about_good_runs() -> None:
     wrong = Diagnosis(Cause.GRAVITY_OFF, True, "The summary.", ("One.", "Two."), "The advice.", False)
-    html = diagnosis_html(wrong)
+    html = diagnosis_html(wrong, whole=True)
     for part in ("Gravity prior off", "The summary.", "<li", "One.", "Two.", "The advice.", "without the truth"):
         assert part in html
-    quiet = diagnosis_html(replace(wrong, cause=Cause.OK, doubtful=False, evidence=()))
+    short = diagnosis_html(wrong, whole=False)
+    assert "Gravity prior off" in short and "The summary." in short and "<li" not in short and "advice" not in short
+    quiet = diagnosis_html(replace(wrong, cause=Cause.OK, doubtful=False, evidence=()), whole=True)
     assert "The summary." in quiet and "advice" not in quiet and style.css(style.OUTLIER) not in quiet
 
 

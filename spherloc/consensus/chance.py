@@ -8,7 +8,7 @@ FloatArray = NDArray[np.float64]
 
 NEIGHBOURHOOD_RAD = 0.2
 """Bearings are counted within this angle, to know how dense they are around each other."""
-MOST_BEARINGS = 500
+MOST_BEARINGS = 200
 """More are thinned: the density is a mean."""
 
 

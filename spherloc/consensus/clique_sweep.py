@@ -12,6 +12,7 @@ from spherloc.consensus.clique_search import ONE, clear_edge, colour_bound, larg
 from spherloc.consensus.dual_proof import FOUND, IMPOSSIBLE, UNKNOWN, prove_none
 from spherloc.consensus.pair_arcs import CIRCLE
 from spherloc.consensus.region import search_region
+from spherloc.consensus.scout import core_graph
 from spherloc.consensus.support import climb, keep, verify
 
 MOST_TRIALS = 16
@@ -22,30 +23,8 @@ MOST_CELLS = 4000
 """Cells of yaw and position in one proof."""
 MOST_IN_CELLS = 16
 """Correspondences up to which cells are tried where duality proves nothing."""
-CELL_EFFORT, ROUND_EFFORT = 100, 40
-"""Words that take as long as a cell, and as one correspondence in a round of a proof."""
-
-
-@numba.njit(cache=True, nogil=True)
-def peel(count, pairs, arcs, least):
-    """Nodes that are left after removing, again and again, those with fewer than ``least`` edges among ``arcs``."""
-    alive = np.ones(count, np.bool_)
-    degree = np.empty(count, np.int64)
-    changed = True
-    while changed:
-        changed = False
-        degree[:] = 0
-        for arc in arcs:
-            i, j = pairs[arc, 0], pairs[arc, 1]
-            if alive[i] and alive[j]:
-                degree[i] += 1
-                degree[j] += 1
-        for node in range(count):
-            if alive[node] and degree[node] < least:
-                alive[node] = False
-                changed = True
-    nodes = np.flatnonzero(alive)
-    return nodes[np.argsort(-degree[nodes])]
+CELL_EFFORT, ROUND_EFFORT, VERIFY_EFFORT = 200, 40, 200
+"""Words that take as long as a cell, as one correspondence in a round of a proof, and as one when a pose is verified."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -138,7 +117,7 @@ def _settle(data, limits, view, everybody, balls, poses, supports, masks, known)
         answer, work = prove_none(view, limits, everybody, balls[b], best, found)
         effort += work * ROUND_EFFORT
         if answer == UNKNOWN and len(everybody) <= MOST_IN_CELLS:
-            answer, cells = search_region(view, limits, everybody, balls[b], best, MOST_CELLS, found)
+            answer, work = search_region(view, limits, everybody, balls[b], best, MOST_CELLS, found)
             effort += work
         if answer == FOUND:
             support = climb(data, found[:, :3], found[:, 3], mask)
@@ -163,13 +142,9 @@ def sweep_bin(data, limits, trig, pairs, lo, hi, arcs, start, end, poses, suppor
     bin was searched to its end.
     """
     nothing = np.empty(0, np.int64)
-    nodes = peel(masks.shape[1], pairs, arcs, supports[0])
+    nodes, rows = core_graph(masks.shape[1], pairs, arcs, supports[0])
     if len(nodes) <= supports[0]:
         return known, supports[0], nothing, len(arcs), True
-    edges, first, last = _pieces(pairs, lo, hi, arcs, nodes, masks.shape[1], start, end)
-    rows = np.zeros((len(nodes), (len(nodes) + 63) // 64), np.uint64)
-    for k in range(len(edges)):
-        set_edge(rows, edges[k, 0], edges[k, 1])
     whole = colour_bound(rows)
     effort = len(arcs) + rows.size
     if whole <= supports[0]:
@@ -181,6 +156,7 @@ def sweep_bin(data, limits, trig, pairs, lo, hi, arcs, start, end, poses, suppor
         effort += work
         if proven:
             return known, supports[0], nothing, effort, True
+    edges, first, last = _pieces(pairs, lo, hi, arcs, nodes, masks.shape[1], start, end)
     rows[:] = 0
     owned = np.zeros((len(nodes), len(nodes)), np.uint8)
     common = np.empty(rows.shape[1], np.uint64)
@@ -213,6 +189,7 @@ def sweep_bin(data, limits, trig, pairs, lo, hi, arcs, start, end, poses, suppor
         if len(clique) == 0:
             continue
         known = verify(data, nodes[clique], poses, supports, masks, known)
+        effort += VERIFY_EFFORT * masks.shape[1]
         floor = max(floor, supports[0])
         if len(clique) <= floor:
             continue

@@ -13,9 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spherloc.bounds import Bounds
+from spherloc.consensus.chance import chance_sets
 from spherloc.consensus.clique_sweep import sweep_bin
 from spherloc.consensus.depth_bounds import chord
 from spherloc.consensus.pair_arcs import pair_arcs, turn_of
+from spherloc.consensus.scout import scout
 from spherloc.consensus.support import climb, keep
 from spherloc.consensus.yaw_bins import BIN_TURN, BINS, degree_bounds, sort_into_bins
 from spherloc.problem import AlignedProblem
@@ -24,6 +26,8 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 IndexArray = NDArray[np.int32]
 
+DOUBTFUL = 1e-6
+"""Expected number of chance sets of the size of the guess above which better guesses are looked for."""
 MOST_POSES = 8
 """Clearly different poses that are remembered."""
 
@@ -65,13 +69,14 @@ def exact_consensus(
     aligned: AlignedProblem,
     bounds: Bounds,
     noise_px: float,
+    wrong_rate: float,
     guesses: list[tuple[FloatArray, FloatArray]],
     effort_limit: int,
     time_budget_s: float,
 ) -> ExactConsensus:
     """Search all yaws.
 
-    ``guesses`` are level poses (rotation (3, 3), translation (3,)) to start from: the more the best of them explains,
+    ``wrong_rate`` is the probability that a wrong pose explains a correspondence. ``guesses`` are level poses (rotation (3, 3), translation (3,)) to start from: the more the best of them explains,
     the less is left to be searched. After ``effort_limit`` words or ``time_budget_s`` seconds the search stops, and the
     bounds say how far it came.
     """
@@ -92,6 +97,8 @@ def exact_consensus(
     pairs, lo, hi = pair_arcs(aligned, bounds.radians)
     starts, arcs = sort_into_bins(lo, hi)
     bound = degree_bounds(count, pairs, starts, arcs)
+    if chance_sets(count, int(supports[0]), wrong_rate) > DOUBTFUL:
+        known = scout(data, pairs, starts, arcs, bound, poses, supports, masks, known)
     effort, finished = len(arcs), True
     clique = np.empty(0, np.int64)
     for b in np.argsort(-bound, kind="stable"):

@@ -1,172 +1,30 @@
 """Runs that fail for one known cause each: what the diagnosis is measured on, and what lessons show.
 
-Every case is a problem with truth, an estimator with options, and a seed. The cause is in how the case is made, so a case
-must differ from a good one by its cause alone: ``tests/datasets/test_failures.py`` checks that taking the cause away
-makes the run succeed.
+Every case is a problem with truth, an estimator with options, and a seed. The cause is in how the case is made, so a
+case must differ from a good one by its cause alone: ``tests/datasets/test_failures.py`` checks that taking the cause
+away makes the run succeed.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
-from functools import cache
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spherloc.cameras.base import Camera, in_image
 from spherloc.consensus.two_point_search import sample_pair
-from spherloc.datasets.scene_file import bundled_scenes, load_scene
+from spherloc.datasets.failure_parts import CaseMaker, Cloud, FailureCase
 from spherloc.datasets.synthetic import HALF_SIZE_M
 from spherloc.errors import InputError, show
-from spherloc.geometry import DOWN, camera_centre, pose, so3_exp, transform, wrap_angle, yaw_of, yaw_rotation
-from spherloc.problem import Problem
+from spherloc.geometry import camera_centre, pose, yaw_rotation
 
 FloatArray = NDArray[np.float64]
-Cloud = Callable[[np.random.Generator, int], FloatArray]
 
-SCENES = ("mei_outliers_80", "fisheye_outliers_80", "panorama_outliers_80")
-"""Bundled scenes whose cameras the cases use."""
-ESTIMATORS = ("mc", "mc-exact", "ransac-2p")
 GUESSES = 500
 """Pairs that mc-exact samples for its first guess."""
-BATCH = 512
-MAX_BATCHES = 40
 
 
-@dataclass(frozen=True, eq=False)
-class FailureCase:
-    """One run that fails or is doubtful for a known cause, or is ok."""
-
-    cause: str
-    """Value of ``spherloc.diagnosis.Cause``."""
-    problem: Problem
-    """With truth and labels."""
-    estimator: str
-    """Registered name."""
-    options: Mapping[str, Any]
-    """The estimator's options that differ from its defaults for this problem."""
-    seed: int
-    """Seed of the run."""
-
-
-@dataclass
-class _Maker:
-    """Draws the parts of one case: a camera, the true pose, and groups of correspondences."""
-
-    rng: np.random.Generator
-    camera: Camera = field(init=False)
-    truth: FloatArray = field(init=False)
-    estimator: str = field(init=False)
-    noise_px: float = field(init=False)
-    parts: list[tuple[FloatArray, FloatArray, bool]] = field(default_factory=list)
-    """Pixels (K, 2), points (K, 3), and whether they are right."""
-
-    def __post_init__(self) -> None:
-        self.camera = _cameras()[self.rng.integers(len(SCENES))]
-        self.truth = self.random_pose()
-        self.estimator = str(self.rng.choice(ESTIMATORS))
-        self.noise_px = self.rng.uniform(0.5, 1.1)
-
-    def random_pose(self) -> FloatArray:
-        """A level pose (3, 4): any yaw, position within half the cube."""
-        centre = self.rng.uniform(-0.5 * HALF_SIZE_M, 0.5 * HALF_SIZE_M, 3)
-        rotation = yaw_rotation(self.rng.uniform(-np.pi, np.pi))
-        return pose(rotation, -rotation @ centre)
-
-    def between(self, low: float, high: float) -> float:
-        return float(self.rng.uniform(low, high))
-
-    def whole(self, low: int, high: int) -> int:
-        """From ``low`` to ``high``, both included."""
-        return int(self.rng.integers(low, high + 1))
-
-    def cube(self, rng: np.random.Generator, count: int) -> FloatArray:
-        return rng.uniform(-HALF_SIZE_M, HALF_SIZE_M, (count, 3))
-
-    def seen(self, points: FloatArray, cam_from_map: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
-        """Noisy pixels (K, 2) of points (K, 3), and which of them the camera sees."""
-        pixels, valid = self.camera.project(transform(cam_from_map, points))
-        pixels = np.where(valid[:, None], pixels, -1.0) + self.noise_px * self.rng.standard_normal(pixels.shape)
-        return pixels, valid & in_image(self.camera, pixels) & self.camera.unproject(pixels)[1]
-
-    def visible(self, count: int, cloud: Cloud, *poses: FloatArray) -> tuple[FloatArray, list[FloatArray]] | None:
-        """``count`` points (count, 3) of the cloud that are seen from every pose, and their noisy pixels from each."""
-        found = []
-        for _ in range(MAX_BATCHES):
-            points = cloud(self.rng, BATCH)
-            views = [self.seen(points, cam_from_map) for cam_from_map in poses]
-            kept = np.logical_and.reduce([valid for _, valid in views])
-            found.append(np.hstack([points[kept], *(pixels[kept] for pixels, _ in views)]))
-            if sum(map(len, found)) >= count:
-                rows = np.concatenate(found)[:count]
-                return rows[:, :3], [rows[:, 3 + 2 * k : 5 + 2 * k] for k in range(len(poses))]
-        return None
-
-    def right(self, count: int, cloud: Cloud | None = None) -> None:
-        """Add right correspondences; the true pose is drawn anew until it sees enough of the cloud."""
-        while (found := self.visible(count, cloud or self.cube, self.truth)) is None:
-            self.truth = self.random_pose()
-        self.parts.append((found[1][0], found[0], True))
-
-    def random(self, count: int, cloud: Cloud | None = None) -> None:
-        """Add wrong correspondences: random pixels that the camera sees."""
-        size = np.array([self.camera.width, self.camera.height])
-        pixels = np.empty((0, 2))
-        while len(pixels) < count:
-            more = self.rng.uniform(0.0, 1.0, (BATCH, 2)) * size
-            pixels = np.concatenate([pixels, more[self.camera.unproject(more)[1]]])
-        self.parts.append((pixels[:count], (cloud or self.cube)(self.rng, count), False))
-
-    def coherent(self, count: int, twins: int = 0) -> None:
-        """Add wrong correspondences that agree with one wrong pose, as repeated structure makes them.
-
-        The first ``twins`` of them take the pixels' points twice: each point was matched in both of its places.
-        """
-        found = None
-        while found is None:
-            wrong = self.random_pose()
-            if np.linalg.norm(camera_centre(wrong) - camera_centre(self.truth)) < 1.0:
-                continue
-            if abs(wrap_angle(yaw_of(wrong[:, :3] @ self.truth[:, :3].T))) < np.radians(10.0):
-                continue
-            found = self.visible(count, self.cube, self.truth, wrong)
-        points, (right, off) = found
-        self.parts.append((off, points, False))
-        if twins:
-            self.parts.append((right[:twins], points[:twins], True))
-
-    def case(self, cause: str, **changes: Any) -> FailureCase:
-        """The parts in random order as a case; ``options`` and fields of the problem can be given."""
-        options = changes.pop("options", {})
-        pixels, points = (np.concatenate([part[k] for part in self.parts]) for k in range(2))
-        labels = np.concatenate([np.full(len(part[0]), part[2]) for part in self.parts])
-        order = self.rng.permutation(len(pixels))
-        known = {"gravity_camera": DOWN, "gravity_map": DOWN, "truth_cam_from_map": self.truth} | changes
-        problem = Problem(
-            name=cause,
-            camera=self.camera,
-            pixels=pixels[order],
-            points=points[order],
-            truth_inliers=labels[order],
-            scene=f"made to show: {cause}",
-            **known,
-        )
-        return FailureCase(cause, problem, self.estimator, options, int(self.rng.integers(2**31)))
-
-    def tilted(self, angle_rad: float) -> FloatArray:
-        """Gravity (3,) that is off by that angle, to any side."""
-        side = self.between(-np.pi, np.pi)
-        return so3_exp(angle_rad * np.array([np.cos(side), 0.0, np.sin(side)])) @ DOWN
-
-
-@cache
-def _cameras() -> tuple[Camera, ...]:
-    scenes = bundled_scenes()
-    return tuple(load_scene(scenes[name]).camera for name in SCENES)  # type: ignore[attr-defined]
-
-
-def _ok(make: _Maker) -> FailureCase:
-    """Up to 80 % outliers; some with repeated structure that is clearly weaker, some with a gravity error in its bound."""
+def _ok(make: CaseMaker) -> FailureCase:
+    """Up to 80 % outliers; some with weaker repeated structure, some with a gravity error within its bound."""
     count = make.whole(60, 300)
     inliers = round(count * make.between(0.2, 1.0))
     make.right(inliers)
@@ -180,7 +38,7 @@ def _ok(make: _Maker) -> FailureCase:
     return make.case("ok")
 
 
-def _too_few_inliers(make: _Maker) -> FailureCase:
+def _too_few_inliers(make: CaseMaker) -> FailureCase:
     """Two or three right matches among 40 to 105: as many agree with some wrong pose by chance."""
     count, inliers = make.whole(40, 105), make.whole(2, 3)
     make.right(inliers)
@@ -188,7 +46,7 @@ def _too_few_inliers(make: _Maker) -> FailureCase:
     return make.case("too few inliers")
 
 
-def _wrong_reference(make: _Maker) -> FailureCase:
+def _wrong_reference(make: CaseMaker) -> FailureCase:
     """95 to 300 matches to points of another place, none right."""
     corner = make.rng.uniform(-HALF_SIZE_M, HALF_SIZE_M, 3)
     size = make.rng.uniform(1.0, 5.0, 3)
@@ -196,7 +54,7 @@ def _wrong_reference(make: _Maker) -> FailureCase:
     return make.case("wrong reference image")
 
 
-def _false_consensus(make: _Maker) -> FailureCase:
+def _false_consensus(make: CaseMaker) -> FailureCase:
     """Repeated structure: 1.3 to 2 times as many matches agree with one wrong pose as with the true one."""
     count = make.whole(80, 300)
     right = round(count * make.between(0.15, 0.32))
@@ -207,8 +65,8 @@ def _false_consensus(make: _Maker) -> FailureCase:
     return make.case("larger false consensus")
 
 
-def _ambiguous(make: _Maker) -> FailureCase:
-    """A wrong pose with as many matches as the true one: by two parts of the map that look alike, or every point twice."""
+def _ambiguous(make: CaseMaker) -> FailureCase:
+    """A wrong pose with as many matches as the true one: parts of the map look alike, or each point is there twice."""
     count = make.whole(80, 300)
     half = round(count * make.between(0.2, 0.45))
     if make.rng.random() < 0.5:
@@ -220,7 +78,7 @@ def _ambiguous(make: _Maker) -> FailureCase:
     return make.case("ambiguous")
 
 
-def _gravity_off(make: _Maker) -> FailureCase:
+def _gravity_off(make: CaseMaker) -> FailureCase:
     """Gravity is off by 3 to 10 degrees more than is said."""
     count = make.whole(60, 300)
     inliers = round(count * make.between(0.4, 0.9))
@@ -231,7 +89,7 @@ def _gravity_off(make: _Maker) -> FailureCase:
     return make.case("gravity prior off", gravity_camera=gravity, gravity_bound_rad=bound)
 
 
-def _bound_too_small(make: _Maker) -> FailureCase:
+def _bound_too_small(make: CaseMaker) -> FailureCase:
     """The noise's standard deviation is 1 to 2.5 times the bound: 8 to 39 % of the right matches are within it."""
     count = make.whole(80, 300)
     bound = make.between(1.0, 2.0)
@@ -242,7 +100,7 @@ def _bound_too_small(make: _Maker) -> FailureCase:
     return make.case("noise bound too small", bound_px=bound)
 
 
-def _degenerate(make: _Maker) -> FailureCase:
+def _degenerate(make: CaseMaker) -> FailureCase:
     """Right matches on one pole, at one spot, or too far away to fix the position."""
     count = make.whole(40, 200)
     inliers = round(count * make.between(0.5, 1.0))
@@ -251,13 +109,13 @@ def _degenerate(make: _Maker) -> FailureCase:
     return make.case("degenerate geometry")
 
 
-def _place(make: _Maker, near: float, far: float) -> FloatArray:
+def _place(make: CaseMaker, near: float, far: float) -> FloatArray:
     """A point (3,) at a distance from the camera, not above or below it."""
     side, distance = make.between(-np.pi, np.pi), make.between(near, far)
     return camera_centre(make.truth) + distance * np.array([np.cos(side), make.between(-0.3, 0.3), np.sin(side)])
 
 
-def _pole(make: _Maker) -> Cloud:
+def _pole(make: CaseMaker) -> Cloud:
     """A vertical line 3 cm thick and some metres high."""
 
     def cloud(rng: np.random.Generator, count: int) -> FloatArray:
@@ -269,14 +127,14 @@ def _pole(make: _Maker) -> Cloud:
     return cloud
 
 
-def _spot(make: _Maker) -> Cloud:
+def _spot(make: CaseMaker) -> Cloud:
     """A ball of a few centimetres."""
     middle, radius = _place(make, 3.0, 8.0), make.between(0.01, 0.04)
     make.truth = _facing(make.truth, middle)
     return lambda rng, count: middle + rng.uniform(-radius, radius, (count, 3))
 
 
-def _far(make: _Maker) -> Cloud:
+def _far(make: CaseMaker) -> Cloud:
     """Mountains 2 to 20 km away on all sides."""
 
     def cloud(rng: np.random.Generator, count: int) -> FloatArray:
@@ -294,7 +152,7 @@ def _facing(cam_from_map: FloatArray, point: FloatArray) -> FloatArray:
     return pose(rotation, -rotation @ centre)
 
 
-def _iterations_ran_out(make: _Maker) -> FailureCase:
+def _iterations_ran_out(make: CaseMaker) -> FailureCase:
     """3 to 12 % right matches, at least nine, and no two of them are sampled together before the search has to end.
 
     RANSAC is given too few iterations; mc-exact is given no effort, so that only its first guess is left.
@@ -324,7 +182,7 @@ def _unlucky_seed(rng: np.random.Generator, labels: NDArray[np.bool_] | None, sa
             return seed
 
 
-MAKERS: Mapping[str, Callable[[_Maker], FailureCase]] = {
+MAKERS: Mapping[str, Callable[[CaseMaker], FailureCase]] = {
     "ok": _ok,
     "too few inliers": _too_few_inliers,
     "larger false consensus": _false_consensus,
@@ -346,4 +204,4 @@ def failure_case(cause: str, seed: int) -> FailureCase:
         raise InputError(f"unknown cause {show(cause)}: choose one of {', '.join(MAKERS)}.")
     if seed < 0:
         raise InputError(f"seed is {seed}; give 0 or more.")
-    return MAKERS[cause](_Maker(np.random.default_rng([seed, list(MAKERS).index(cause)])))
+    return MAKERS[cause](CaseMaker(np.random.default_rng([seed, list(MAKERS).index(cause)])))

@@ -7,17 +7,28 @@ from spherloc.cameras.base import FloatArray
 
 
 class Cause(StrEnum):
-    """Why a run failed or is doubtful; what each means is in docs of ``spherloc.diagnosis``."""
+    """Why a run failed or is doubtful."""
 
     OK = "ok"
+    """The pose stands out from chance and nothing speaks against it; with the truth: it is right."""
     TOO_FEW_INLIERS = "too few inliers"
+    """So few matches are right that as many agree with some wrong pose by chance: no method can know the answer."""
     FALSE_CONSENSUS = "larger false consensus"
+    """A wrong pose explains more matches than the true one, so that no method by consensus finds the true one. Without
+    the truth: a second pose explains many, though fewer, of the matches that the best one does not."""
     WRONG_REFERENCE = "wrong reference image"
+    """No match is right. Without the truth: no pose stands out, though there are so many matches that a right
+    reference image would have given one."""
     GRAVITY_OFF = "gravity prior off"
+    """Gravity is off by more than its bound, and by more than the noise bound in the image."""
     BOUND_TOO_SMALL = "noise bound too small"
+    """Many right matches are farther off than the noise bound: twice of it holds half as many again, or more."""
     DEGENERATE = "degenerate geometry"
+    """Enough matches agree, but they leave the pose open by more than the error of a success."""
     ITERATIONS_RAN_OUT = "iterations ran out"
+    """The search ended before it found the best pose; another run would find it."""
     AMBIGUOUS = "ambiguous"
+    """Two clearly different poses explain (nearly) as many matches."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""From evidence to a cause. Which cause is asked for first matters: each may look like a later one, seldom the reverse."""
+"""From evidence to a cause. The order matters: a cause may look like one asked for later, seldom vice versa."""
 
 import numpy as np
 
@@ -17,12 +17,12 @@ LEAST_RIGHT_RATE = 0.04
 """Share of right matches that any right reference image gives: with this many matches, none standing out means that
 the reference is wrong. Without the truth nothing else tells the two apart."""
 SPREAD = 1.5
-"""The bound is too small if twice of it holds this many times as many matches: noise of 0.75 times the bound does so."""
+"""The bound is too small if twice of it holds as many times as many matches: noise of 0.75 times the bound does so."""
 TILT_SDS = 4.0
 """Gravity is off if the matches tilt it beyond its bound by as many standard deviations..."""
 HARM = 1.0
-"""... and by as many noise bounds in the image: less does no harm. (A calibration that is a little off tilts real images
-by some tenths of a degree.)"""
+"""... and by as many noise bounds in the image: less does no harm. (A calibration that is a little off tilts real
+images by some tenths of a degree.)"""
 AS_GOOD = 0.9
 """Provided that the tilted pose has this share of the best level one's support: a true one has more, but wrong matches
 within the wider bound may have pulled it."""

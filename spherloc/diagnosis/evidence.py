@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from spherloc.bounds import bounds_of
+from spherloc.bounds import Bounds, bounds_of
 from spherloc.cameras.base import BoolArray, FloatArray
 from spherloc.consensus.chance import chance_rate, chance_sets
 from spherloc.diagnosis.experiments import WIDER, Fit, fit_of, free_fit, rival, search, subset
@@ -93,12 +93,7 @@ def gather(trace: Trace) -> Evidence:
     bound_px = float(options.bound_px)
     bounds = bounds_of(aligned, bound_px)
     run = None if trace.cam_from_map is None else fit_of(aligned, aligned.align_pose(trace.cam_from_map))
-    fits = [run] if run is not None else []
-    if (found := search(aligned, bound_px, options)) is not None:
-        fits.append(fit_of(aligned, found))
-    if (stage := trace.stage(ConsensusStage)) is not None:
-        starts = (aligned.align_pose(pose) for pose in stage.cam_from_map)
-        fits += [fit_of(aligned, refine(aligned, start, bounds, options)[0]) for start in starts]
+    fits = ([] if run is None else [run]) + _other_fits(trace, bounds)
     best = max(fits, key=lambda fit: fit.support(bound_px), default=None)
     second, sd = None, (np.inf, np.inf)
     if best is not None:
@@ -119,6 +114,16 @@ def gather(trace: Trace) -> Evidence:
         rotation_sd_rad=sd[0],
         position_sd_m=sd[1],
     )
+
+
+def _other_fits(trace: Trace, bounds: Bounds) -> list[Fit]:
+    """What a longer search finds, and what the run itself found beside its pose."""
+    aligned, options = trace.problem.aligned, trace.options
+    found = search(aligned, bounds.noise_px, options)
+    stage = trace.stage(ConsensusStage)
+    verified = [] if stage is None else [aligned.align_pose(pose) for pose in stage.cam_from_map]
+    poses = [refine(aligned, pose, bounds, options)[0] for pose in verified]
+    return [fit_of(aligned, pose) for pose in ([] if found is None else [found]) + poses]
 
 
 def different(one: FloatArray, other: FloatArray) -> bool:

@@ -18,7 +18,12 @@ def apart(one: FloatArray, other: FloatArray) -> tuple[float, float]:
 
 
 def pose_sd(
-    aligned: AlignedProblem, cam_from_map: FloatArray, mask: BoolArray, noise_px: float, gravity_sd_rad: float, drop: int
+    aligned: AlignedProblem,
+    cam_from_map: FloatArray,
+    mask: BoolArray,
+    noise_px: float,
+    gravity_sd_rad: float,
+    drop: int,
 ) -> tuple[float, float, float]:
     """Standard deviations of rotation (rad), position (m) and tilt (rad) in their worst directions.
 
@@ -43,7 +48,7 @@ def _worst(covariance: FloatArray) -> float:
 
 
 def _information(aligned: AlignedProblem, cam_from_map: FloatArray, mask: BoolArray) -> FloatArray:
-    """What each masked correspondence says (K, 6, 6) of a small rotation and of the camera's shift, camera frame, px."""
+    """What each masked correspondence says (K, 6, 6) of a turn and a shift of the camera, in its frame, at 1 px."""
     rays, weights = transform(cam_from_map, aligned.points[mask]), aligned.pixel_from_bearing[mask]
     length = np.linalg.norm(rays, axis=1)[:, None]
     unit = rays / length

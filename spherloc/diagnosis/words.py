@@ -4,7 +4,6 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from spherloc.cameras.base import FloatArray
 from spherloc.diagnosis.causes import Cause, Diagnosis
 from spherloc.diagnosis.evidence import Evidence, Truth, different
 from spherloc.diagnosis.experiments import Fit
@@ -15,11 +14,11 @@ from spherloc.trace import Certificate, RansacStage, Trace
 ADVICE = {
     Cause.OK: "Nothing to do.",
     Cause.TOO_FEW_INLIERS: "Get more right matches: more features, a stricter matcher, or more reference images.",
-    Cause.FALSE_CONSENSUS: "Look at both poses; take out matches to structure that repeats itself, or decide by a prior.",
+    Cause.FALSE_CONSENSUS: "Look at both poses; take out matches to structure that repeats, or decide by a prior.",
     Cause.WRONG_REFERENCE: "Retrieve other reference images; no estimator can help with these matches.",
     Cause.GRAVITY_OFF: "Correct the known roll and pitch, or state a larger gravity bound and standard deviation.",
-    Cause.BOUND_TOO_SMALL: "Raise bound_px to about three standard deviations of the noise, or improve the calibration.",
-    Cause.DEGENERATE: "Add matches elsewhere in the image and at other depths; do not trust the undetermined direction.",
+    Cause.BOUND_TOO_SMALL: "Raise bound_px to about three standard deviations of the noise, or calibrate better.",
+    Cause.DEGENERATE: "Add matches elsewhere in the image and at other depths; until then do not trust the pose.",
     Cause.ITERATIONS_RAN_OUT: "Raise the iterations or the effort, set a confidence, or use mc-exact.",
     Cause.AMBIGUOUS: "Look at both poses and decide by something else: a prior, a second image, other matches.",
 }
@@ -62,38 +61,44 @@ def _other(e: Evidence, truth: Truth | None, cause: Cause) -> Fit | None:
 
 
 def _summary(e: Evidence, truth: Truth | None, cause: Cause, other: Fit | None) -> str:
-    total, bound = len(e.aligned.points), f"{e.bound_px:.3g} px"
-    run = 0 if e.run is None else e.run.support(e.bound_px)
-    best = 0 if e.best is None else e.best.support(e.bound_px)
-    if cause is Cause.TOO_FEW_INLIERS:
-        right = best if truth is None else int(np.count_nonzero(truth.right))
-        return f"Only {right} of {total} matches agree or are right, which chance alone can do."
-    if cause is Cause.FALSE_CONSENSUS:
-        less = 0 if other is None else other.support(e.bound_px)
-        if truth is None:
-            return f"Two clearly different poses stand out, with {best} and {less} of {total} matches: either may be false."
-        return f"A wrong pose explains more than the true one: {best} of {total} matches against {less}."
-    if cause is Cause.WRONG_REFERENCE:
-        return f"None of {total} matches seems right: at most {best} agree with any pose, which chance alone can do."
-    if cause is Cause.GRAVITY_OFF:
-        tilt = truth.tilt_rad if truth is not None else e.free.tilt_rad if e.free is not None else np.nan
-        return f"The known gravity is off by {np.degrees(tilt):.1f}°, its bound is {_deg(e.aligned.gravity_bound_rad)}."
-    if cause is Cause.BOUND_TOO_SMALL:
-        errors = e.free.errors_px if truth is None and e.free is not None else truth.fit.errors_px[truth.right]  # type: ignore[union-attr]
-        one, two = (int(np.count_nonzero(errors <= factor * e.bound_px)) for factor in (1, 2))
-        return f"The noise is larger than the bound of {bound}: {one} matches are within it, {two} within twice of it."
+    total, bound = len(e.aligned.points), e.bound_px
+    run, best, second = (0 if fit is None else fit.support(bound) for fit in (e.run, e.best, other))
+    match cause:
+        case Cause.OK:
+            return f"{run} of {total} matches agree within {bound:.3g} px, and no other pose comes near."
+        case Cause.TOO_FEW_INLIERS if truth is not None:
+            return f"Only {np.count_nonzero(truth.right)} of {total} matches are right, no more than chance gives."
+        case Cause.TOO_FEW_INLIERS:
+            return f"Only {best} of {total} matches agree with any pose, no more than chance gives."
+        case Cause.WRONG_REFERENCE:
+            return f"None of {total} matches seems right: {best} agree with the best pose, no more than chance gives."
+        case Cause.FALSE_CONSENSUS if truth is not None:
+            return f"A wrong pose explains more than the true one: {best} of {total} matches against {second}."
+        case Cause.FALSE_CONSENSUS:
+            return f"Two different poses stand out, with {best} and {second} of {total} matches: either may be false."
+        case Cause.AMBIGUOUS:
+            return f"Two clearly different poses are supported alike: by {run} and by {second} of {total} matches."
+        case Cause.ITERATIONS_RAN_OUT:
+            better = max(best, second)
+            return f"The search missed the best pose: one with {better} of {total} matches exists, the run's has {run}."
+    return _measured_summary(e, truth, cause)
+
+
+def _measured_summary(e: Evidence, truth: Truth | None, cause: Cause) -> str:
+    """Causes that are a size: by the true pose, or else by the pose that neither gravity nor the bound holds back."""
     if cause is Cause.DEGENERATE:
-        rotation, position = (
-            (e.rotation_sd_rad, e.position_sd_m) if truth is None else (truth.rotation_sd_rad, truth.position_sd_m)
-        )
-        return f"Many matches agree, but they fix the pose to no better than {_metres(position)} and {_deg(rotation)}."
-    if cause is Cause.ITERATIONS_RAN_OUT:
-        better = best if truth is None else max(best, truth.fit.support(e.bound_px))
-        return f"The search missed the best pose: one with {better} matches exists, the run's own has {run}."
-    if cause is Cause.AMBIGUOUS:
-        second = 0 if other is None else other.support(e.bound_px)
-        return f"Two clearly different poses are supported alike: by {run} and by {second} of {total} matches."
-    return f"{run} of {total} matches agree within {bound}, far more than chance, and no other pose comes near."
+        source = e if truth is None else truth
+        fixed = f"{_metres(source.position_sd_m)} and {_deg(source.rotation_sd_rad)}"
+        return f"Many matches agree, but they fix the pose to no better than {fixed} (1 sd)."
+    fit = e.free if truth is None else truth.fit
+    if fit is None:
+        raise ValueError(f"{cause} was found without a pose to show it")
+    if cause is Cause.GRAVITY_OFF:
+        tilt_rad = fit.tilt_rad if truth is None else truth.tilt_rad
+        return f"The known gravity is off by {_deg(tilt_rad)}, but its bound is {_deg(e.aligned.gravity_bound_rad)}."
+    errors = fit.errors_px if truth is None else fit.errors_px[truth.right]
+    one, two = (int(np.count_nonzero(errors <= factor * e.bound_px)) for factor in (1, 2))
+    return f"The noise exceeds the bound: {one} matches are within its {e.bound_px:.3g} px, {two} within twice as much."
 
 
 def _sentences(trace: Trace, e: Evidence, truth: Truth | None, certificate: Certificate | None) -> Iterator[str]:
@@ -108,16 +113,17 @@ def _sentences(trace: Trace, e: Evidence, truth: Truth | None, certificate: Cert
             yield f"A longer search finds a pose that {best} agree with."
         yield f"Sets of {best} that agree by chance: {_expected(e.chance_sets(best))} expected."
         if np.isfinite(e.position_sd_m):
-            yield f"They fix its position to {_metres(e.position_sd_m)} and its rotation to {_deg(e.rotation_sd_rad)} (1 sd)."
+            fixed = f"{_metres(e.position_sd_m)} and {_deg(e.rotation_sd_rad)}"
+            yield f"They fix it to {fixed} (1 sd)."
     if e.best is not None and e.rival is not None and e.rival.support(bound) > 1:
         turn, distance = apart(e.best.cam_from_map, e.rival.cam_from_map)
         yield f"The next pose, {_metres(distance)} and {_deg(turn)} away from the best, has {e.rival.support(bound)}."
     if e.free is not None and np.isfinite(e.free_tilt_sd_rad):
         one, two, four = (e.free.support(factor * bound) for factor in (1, 2, 4))
         yield (
-            f"Where gravity is not believed, {one} agree within the bound, {two} within twice and {four} within four times of it; "
-            f"gravity then tilts by {_deg(e.free.tilt_rad)}, give or take {_deg(e.free_tilt_sd_rad)}, "
-            f"and its bound is {_deg(e.aligned.gravity_bound_rad)}."
+            f"Where gravity is not believed, {one} agree within the bound, {two} within twice and {four} within "
+            f"four times of it; gravity then tilts by {_deg(e.free.tilt_rad)}, "
+            f"give or take {_deg(e.free_tilt_sd_rad)}, and its bound is {_deg(e.aligned.gravity_bound_rad)}."
         )
     yield from _proofs(trace, certificate)
     if truth is not None:

@@ -20,8 +20,8 @@ FloatArray = NDArray[np.float64]
 
 MOST_CORRESPONDENCES = 10_000
 """Their 50 million pairs take some 10 s and 3 GB."""
-SEED_SAMPLES = 500
-"""Samples of the 2P-RANSAC that finds the first lower bound: enough at 10 % inliers, and little beside the search."""
+SEED_SAMPLES = 3000
+"""Samples of the 2P-RANSAC that finds the first lower bound: enough at 4 % inliers, and little beside the search."""
 SEED_CONFIDENCE = 0.999
 YAW_BINS = 1440
 
@@ -66,11 +66,17 @@ class ExactMaximumConsensus:
                 aligned, bounds.pixels, seed, SEED_SAMPLES, SEED_CONFIDENCE, local_optimization=True
             )
         with clock.stage("consensus"):
+            rate = chance_rate(aligned.bearings, bounds.radians)
             found = exact_consensus(
-                aligned, bounds, options.noise_px, _poses(guess), int(options.effort * EFFORT), options.time_budget_s
+                aligned,
+                bounds,
+                options.noise_px,
+                rate,
+                _poses(guess),
+                int(options.effort * EFFORT),
+                options.time_budget_s,
             )
         stage = _stage(aligned, guess, found)
-        rate = chance_rate(aligned.bearings, bounds.radians)
         upper = int(found.bound.max(initial=1))
         if len(found.poses) == 0:
             certificate = Certificate(upper, 1, chance_sets(count, 1, rate))

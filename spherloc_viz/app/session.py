@@ -98,8 +98,8 @@ class Session:
         story = gui.add_panel()
         with story.add_tab("Steps"):
             self._steps = StepsPanel(gui, self._redraw)
-            self._diagnosis = gui.add_html("")
             gui.add_html(legend_html())
+            self._diagnosis = gui.add_html("")
             self._charts = ChartPanel(gui)
         story.dock_left()
         story.set_width(self._panels_px[0])
@@ -156,17 +156,19 @@ class Session:
         index, pause = self._steps.settle(timeline, asked)
         picture = paint(trace, index)
         tables = [table for table in picture.tables if table.name != outcome.name]
-        diagnosis = None
+        last = index == len(timeline) - 1
+        diagnosis, remark = None, status_html("Diagnosing …")
         if self._diagnosed is not None and self._diagnosed[0] is trace:
             diagnosis = self._diagnosed[1]
-            if index == len(timeline) - 1 and diagnosis.rival_cam_from_map is not None:
+            remark = diagnosis_html(diagnosis, whole=last)
+            if last and diagnosis.rival_cam_from_map is not None:
                 picture = with_rival(picture, trace, diagnosis.rival_cam_from_map)
         with self._client.atomic():
             self._painter.draw(picture.scene, self._display.layers())
             self._steps.show(playing=pause is not None, tables=tables)
             self._charts.draw(picture.charts)
             self._outcome.content = table_html(outcome)
-            self._diagnosis.content = status_html("Diagnosing …") if diagnosis is None else diagnosis_html(diagnosis)
+            self._diagnosis.content = remark
             self._move_viewer(trace, picture)
         self._client.flush()
         if diagnosis is None:

@@ -47,19 +47,22 @@ def table_html(table: Table) -> str:
     return box(f'<table style="border-collapse:collapse;width:100%"><tr>{head}</tr>{rows}</table>')
 
 
-def diagnosis_html(diagnosis: Diagnosis) -> str:
-    """Cause, summary, evidence and advice; of a run that looks right, the summary alone."""
+def diagnosis_html(diagnosis: Diagnosis, whole: bool) -> str:
+    """Cause and summary and, if ``whole``, evidence and advice; of a run that looks right, the summary alone."""
     if not diagnosis.doubtful:
         return box(f'<div style="{DIM}">{escape(diagnosis.summary)}</div>', "font-size:12px")
-    evidence = "".join(f'<li style="padding-bottom:.2em">{escape(line)}</li>' for line in diagnosis.evidence)
-    known = "Judged with the truth." if diagnosis.used_truth else "Judged without the truth."
-    parts = (
+    parts = [
         f'<div style="font-weight:600;color:{style.css(style.OUTLIER)}">{escape(diagnosis.cause.capitalize())}</div>',
         f"<div>{escape(diagnosis.summary)}</div>",
-        f'<ul style="margin:.4em 0;padding-left:1.2em;font-size:12px">{evidence}</ul>' if evidence else "",
-        f"<div>{escape(diagnosis.advice)}</div>",
-        f'<div style="font-size:11.5px;padding-top:.35em;{DIM}">{known}</div>',
-    )
+    ]
+    if whole:
+        evidence = "".join(f'<li style="padding-bottom:.2em">{escape(line)}</li>' for line in diagnosis.evidence)
+        known = "Judged with the truth." if diagnosis.used_truth else "Judged without the truth."
+        parts += [
+            f'<ul style="margin:.4em 0;padding-left:1.2em;font-size:12px">{evidence}</ul>' if evidence else "",
+            f"<div>{escape(diagnosis.advice)}</div>",
+            f'<div style="font-size:11.5px;padding-top:.35em;{DIM}">{known}</div>',
+        ]
     return box("".join(parts))
 
 

@@ -53,13 +53,14 @@ def chart(stage: RefinementStage) -> Chart:
 def outcome_frame(view: RunView) -> Frame:
     """The last frame: the pose with its inliers and outliers, or why there is none."""
     trace, metrics = view.trace, evaluate(view.trace)
+    message, _, remark = trace.message.partition(". ")
     if trace.cam_from_map is None:
-        caption = f"{trace.message} Give more matches, a wider bound or better gravity."
-        everybody_wrong = view.colors(style.OUTLIER)
-        return Frame(Step("outcome", "No pose", caption, ""), view.standing(np.eye(3)), everybody_wrong, view.nobody())
+        caption = f"{message.rstrip('.')}. Give more matches, a wider bound or better gravity."
+        step = Step("outcome", "No pose", caption, "", remark)
+        return Frame(step, view.standing(np.eye(3)), view.colors(style.OUTLIER), view.nobody())
     inliers = int(np.count_nonzero(trace.inlier_mask))
     total = trace.timings_ms["total"]
-    proven, note = ("", "") if trace.certificate is None else _certified(trace.certificate)
+    proven, chances = ("", "") if trace.certificate is None else _certified(trace.certificate)
     caption = f"{inliers} of {len(trace.problem)} matches agree with the pose, found in {total:.1f} ms{proven}. "
     if metrics.rotation_error_deg is None or metrics.translation_error_m is None:
         caption += "The truth is unknown, so the share of agreeing matches is all there is to judge it by."
@@ -70,7 +71,13 @@ def outcome_frame(view: RunView) -> Frame:
             f"{verdict} by the limits of 1° and 10 cm."
         )
     return Frame(
-        Step("outcome", "Outcome", caption, "success: error < 1° and < 0.1 m   (Sec. VI-A)", note),
+        Step(
+            "outcome",
+            "Outcome",
+            caption,
+            "success: error < 1° and < 0.1 m   (Sec. VI-A)",
+            f"{chances} {remark}".strip(),
+        ),
         view.aligned_pose(trace.cam_from_map),
         view.colors(style.OUTLIER, (trace.inlier_mask, style.INLIER)),
         trace.inlier_mask,

@@ -18,7 +18,8 @@ TIMELINE = "step"
 
 MARKER_SHARE = 0.003
 """Width of a marker's bar, as a share of the chart."""
-LEVEL_OPACITY = 0.15
+LEVEL_OPACITY = 0.25
+"""Of the bar that stands for a level, so that what it is held against shows through."""
 LINE_SHARE = 0.8
 """Width of the bar of a line's sample, as a share of the least distance between samples."""
 

@@ -58,7 +58,12 @@ def test_gravity_error_of_a_simulation(tmp_path):
 
 @pytest.mark.parametrize(
     "lines, bound_deg, sd_deg",
-    [("", 0.0, 0.0), ("bound_deg = 1.5", 1.5, 0.5), ("sd_deg = 2", 6.0, 2.0), ("bound_deg = 3\nsd_deg = 0.25", 3, 0.25)],
+    [
+        ("", 0.0, 0.0),
+        ("bound_deg = 1.5", 1.5, 0.5),
+        ("sd_deg = 2", 6.0, 2.0),
+        ("bound_deg = 3\nsd_deg = 0.25", 3, 0.25),
+    ],
 )
 def test_gravity_error_of_a_measured_scene(tmp_path, lines, bound_deg, sd_deg):
     """One of both gives the other."""
