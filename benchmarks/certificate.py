@@ -149,6 +149,7 @@ def measure(problems: int) -> dict[str, Any]:
     if hasattr(os, "sched_setaffinity"):
         pinned = os.sched_getaffinity(0)
         os.sched_setaffinity(0, range(os.cpu_count() or 1))
+    check(0)  # here, so that no two processes compile the same kernels
     with ProcessPoolExecutor(mp_context=get_context("spawn")) as pool:
         checks = list(pool.map(check, range(problems), chunksize=50))
     if hasattr(os, "sched_setaffinity"):

@@ -59,9 +59,8 @@ def polish_path(points, weights, chosen, rotation, translation, noise_px, gravit
     hessian, gradient, step = np.empty((6, 6)), np.empty(6), np.empty(6)
     next_hessian, next_gradient = np.empty((6, 6)), np.empty(6)
     turned, moved, factor = np.empty((3, 3)), np.empty(3), np.empty((6, 6))
-    cost = normal_equations(
-        points, weights, chosen, centre, rotation, middle, noise_px, gravity_sd_rad, robust, dof, hessian, gradient
-    )
+    data, model = (points, weights, chosen, centre), (noise_px, gravity_sd_rad, robust, dof)
+    cost = normal_equations(*data, rotation, middle, *model, hessian, gradient)
     floor = count * RESIDUAL_TOLERANCE**2
     steps, damping = 0, 0.0
     while steps < most_steps and floor < cost < np.inf and damping <= MOST_DAMPING:
@@ -69,13 +68,9 @@ def polish_path(points, weights, chosen, rotation, translation, noise_px, gravit
         if solve(hessian, gradient, damping, factor, step):
             turn(step, rotation, turned)
             moved[:] = middle + step[3:]
-            lower = normal_equations(
-                points, weights, chosen, centre, turned, moved,
-                noise_px, gravity_sd_rad, robust, dof, next_hessian, next_gradient,
-            )  # fmt: skip
+            lower = normal_equations(*data, turned, moved, *model, next_hessian, next_gradient)
         if not lower < cost:
-            expected = -(gradient @ step)
-            if lower < np.inf and expected <= GAIN_TOLERANCE * cost:
+            if lower < np.inf and -(gradient @ step) <= GAIN_TOLERANCE * cost:
                 break
             damping = max(LEAST_DAMPING, 10.0 * damping)
             continue
@@ -259,10 +254,9 @@ def add_gravity(rotation, gravity_sd_rad, hessian, gradient):
 
 @numba.njit(cache=True, nogil=True)
 def factorise(hessian, damping, factor):
-    """Write the Cholesky factor of the damped matrix with its diagonal scaled to 1; False if it has no full rank.
+    """Write L of S H S + damping I = L L^T, S scaling the columns to length 1; False if there is no full rank.
 
-    Returned in ``factor`` (6, 6): below and on the diagonal L, of S H S = L L^T; above, nothing. The scale of
-    column k is 1 / sqrt(H_kk), or 1 for a column of zeros.
+    Nothing is written above the diagonal of ``factor`` (6, 6).
     """
     for a in range(6):
         for b in range(a + 1):

@@ -43,7 +43,7 @@ class McExactOptions(RefinementOptions):
         check_positive(self)
 
 
-EFFORT = 400_000_000
+EFFORT = 150_000_000
 """Words touched by an ``effort`` of 1."""
 
 
