@@ -1,6 +1,6 @@
 """A localization problem: correspondences, camera, gravity, and the truth where it is known."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -171,6 +171,13 @@ class AlignedProblem:
     """Bound on the angle between the true gravity and +y in the camera frame."""
     gravity_sd_rad: float
     """Standard deviation of each of its two tilts: 0 where gravity is exact, inf where it is unknown."""
+
+    def __post_init__(self) -> None:
+        # Compiled kernels are made for read-only arrays; others would have them compiled once more.
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if isinstance(value, np.ndarray):
+                value.setflags(write=False)
 
     @cached_property
     def pixels_per_radian(self) -> FloatArray:

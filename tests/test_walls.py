@@ -21,10 +21,11 @@ FLOORS = (
     ("spherloc.errors", "spherloc"),
     ("spherloc.registry", "spherloc.geometry"),
     ("spherloc.cameras", "spherloc.solvers"),
+    ("spherloc.gauss_newton",),
     ("spherloc.problem", "spherloc.bounds", "spherloc.consensus"),
     ("spherloc.trace", "spherloc.refine", "spherloc.metrics", "spherloc.datasets", "spherloc.frontend"),
     ("spherloc.estimators", "spherloc.diagnosis", "spherloc.experiments"),
-    ("spherloc_viz.style", "spherloc_viz.layers", "spherloc_viz"),
+    ("spherloc_viz.style", "spherloc_viz.layers", "spherloc_viz.options", "spherloc_viz"),
     ("spherloc_viz.recording", "spherloc_viz.app", "spherloc_viz.lessons"),
     ("spherloc_viz.batch", "spherloc_viz.cli"),
 )

@@ -8,6 +8,8 @@ from pathlib import Path
 SCRIPT = """
 import importlib, pkgutil, numba
 import spherloc
+from spherloc import registry
+from spherloc.diagnosis import diagnose
 from spherloc.datasets import bundled_scenes, load_scene
 from spherloc.estimators import estimate, warm_up
 
@@ -22,8 +24,8 @@ def compiled():
 warm_up()
 before = compiled()
 for path in bundled_scenes().values():
-    for estimator in ("mc", "ransac-2p"):
-        estimate(load_scene(path).problem(), estimator)
+    for estimator in registry.names("estimators"):
+        diagnose(estimate(load_scene(path).problem(), estimator))
 after = compiled()
 print(len(after), sorted(name for name in after if after[name] != before[name]))
 """

@@ -1,7 +1,8 @@
 """Where the camera may be: balls of pairs, chosen so that every consensus of a given size has its camera in one.
 
-A ``view`` is (bearings, points, cos, sin, half width of an interval of yaw). ``trig`` are chords and sines of the angular
-bounds. A set that leaves out at most m of the candidates holds at least one of any m + 1 disjoint pairs entirely.
+A ``view`` is (bearings, points, cos, sin, half width of an interval of yaw). ``trig`` are chords and sines of the
+angular bounds. A set that leaves out at most m of the candidates holds at least one of any m + 1 disjoint pairs
+entirely.
 """
 
 import numba

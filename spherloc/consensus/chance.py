@@ -13,7 +13,8 @@ MOST_BEARINGS = 200
 
 
 def chance_rate(bearings: FloatArray, bound_rad: FloatArray) -> float:
-    """Probability that a wrong pose explains a correspondence: that of M bearings one falls within its bound of another.
+    """Probability that a wrong pose explains a correspondence: that of M bearings one falls within its bound of
+    another.
 
     It is counted in a wider neighbourhood and scaled by the areas of both caps, so that bearings which are all in one
     part of the image meet more often by chance than bearings all around. ``bearings`` (M, 3), ``bound_rad`` (M,).
@@ -24,6 +25,11 @@ def chance_rate(bearings: FloatArray, bound_rad: FloatArray) -> float:
     density = max(near, 1) / (len(some) * max(len(some) - 1, 1))
     cap = np.mean(np.sin(0.5 * bound_rad) ** 2) / np.sin(0.5 * NEIGHBOURHOOD_RAD) ** 2
     return float(min(1.0, density * cap))
+
+
+def least_size(count: int, rate: float, expected: float) -> int:
+    """The least size of which at most ``expected`` chance sets are expected: see ``chance_sets``."""
+    return next((size for size in range(2, count) if chance_sets(count, size, rate) <= expected), count)
 
 
 def chance_sets(count: int, size: int, rate: float) -> float:

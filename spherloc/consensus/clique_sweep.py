@@ -7,45 +7,53 @@ neighbours need these be searched. One pair may own two arcs: an edge is cleared
 import numba
 import numpy as np
 
-from spherloc.consensus.balls_of_pairs import apart_balls, may_be_seen, pair_ball, star_balls, view_between
+from spherloc.consensus.balls_of_pairs import may_be_seen, pair_ball, star_balls, view_between
 from spherloc.consensus.clique_search import ONE, clear_edge, colour_bound, larger_clique, popcount, set_edge, subgraph
 from spherloc.consensus.dual_proof import FOUND, IMPOSSIBLE, UNKNOWN, prove_none
 from spherloc.consensus.pair_arcs import CIRCLE
 from spherloc.consensus.region import search_region
-from spherloc.consensus.scout import core_graph
-from spherloc.consensus.support import climb, keep, verify
+from spherloc.consensus.support import improve, verify
 
 MOST_TRIALS = 16
 """Cliques of a bin that may stay without pose or proof before only larger ones are searched for."""
-MOST_SPARE = 8
-"""Nodes of a bin more than the best support up to which the whole bin is tried to be settled at once."""
 MOST_CELLS = 4000
 """Cells of yaw and position in one proof."""
 MOST_IN_CELLS = 16
 """Correspondences up to which cells are tried where duality proves nothing."""
+SORT_EFFORT = 70
+"""Words that take as long as sorting an arc in."""
 CELL_EFFORT, ROUND_EFFORT, VERIFY_EFFORT = 200, 40, 200
-"""Words that take as long as a cell, as one correspondence in a round of a proof, and as one when a pose is verified."""
+"""Words that take as long as a cell, as one correspondence in a round of a proof, and as one when a pose is verified.
+"""
 
 
 @numba.njit(cache=True, nogil=True)
-def _pieces(pairs, lo, hi, arcs, nodes, count, start, end):
-    """Arcs among ``nodes``, clipped to the bin: their places (E, 2) in ``nodes``, and their ends (E,), (E,)."""
+def _pieces(pairs, lo, hi, nodes, count, start, end):
+    """Arcs among ``nodes`` that touch the bin, clipped to it: their places (E, 2) in ``nodes`` and their ends (E,),
+    (E,).
+    """
     places = np.full(count, -1, np.int64)
     for k in range(len(nodes)):
         places[nodes[k]] = k
-    edges = np.empty((2 * len(arcs), 2), np.int64)
-    first, last = np.empty(2 * len(arcs)), np.empty(2 * len(arcs))
-    used = 0
-    for arc in arcs:
-        a, b = places[pairs[arc, 0]], places[pairs[arc, 1]]
-        if a < 0 or b < 0:
-            continue
-        for turns in (0.0, CIRCLE):
-            if lo[arc] - turns <= end and hi[arc] - turns >= start:
+    used, room = 0, 0
+    edges, first, last = np.empty((0, 2), np.int64), np.empty(0), np.empty(0)
+    for counting in (True, False):
+        for arc in range(len(lo)):
+            for turns in (0.0, CIRCLE):
+                if lo[arc] - turns > end or hi[arc] - turns < start:
+                    continue
+                a, b = places[pairs[arc, 0]], places[pairs[arc, 1]]
+                if a < 0 or b < 0:
+                    continue
+                if counting:
+                    room += 1
+                    continue
                 edges[used, 0], edges[used, 1] = a, b
                 first[used], last[used] = max(lo[arc] - turns, start), min(hi[arc] - turns, end)
                 used += 1
-    return edges[:used], first[:used], last[:used]
+        if counting:
+            edges, first, last = np.empty((room, 2), np.int64), np.empty(room), np.empty(room)
+    return edges, first, last
 
 
 @numba.njit(cache=True, nogil=True)
@@ -101,14 +109,14 @@ def _completed(rows, a, b, candidates, floor, effort_limit):
 
 
 @numba.njit(cache=True, nogil=True)
-def _settle(data, limits, view, everybody, balls, poses, supports, masks, known):
-    """Prove that no pose explains more of ``everybody`` than the best known one does; ``balls`` (B, 4) hold all that might.
+def settle(data, limits, view, everybody, balls, poses, supports, masks, known):
+    """Prove that no pose explains more of ``everybody`` than the best known one does; ``balls`` (B, 4) hold all that
+    might.
 
     Better poses that are met become known, and the proof goes on against them. Returns how many are known, whether
     it is proven, and the effort.
     """
-    found = np.empty((3, 4))
-    mask = np.empty(masks.shape[1], np.bool_)
+    found = np.empty(5)
     effort, b = 0, 0
     while b < len(balls):
         if not balls[b, 3] < np.inf:
@@ -120,8 +128,7 @@ def _settle(data, limits, view, everybody, balls, poses, supports, masks, known)
             answer, work = search_region(view, limits, everybody, balls[b], best, MOST_CELLS, found)
             effort += work
         if answer == FOUND:
-            support = climb(data, found[:, :3], found[:, 3], mask)
-            known = keep(found[:, :3], found[:, 3], support, mask, poses, supports, masks, known)
+            known = improve(data, everybody, found, poses, supports, masks, known)
             if supports[0] <= best:  # it climbed down by rounding
                 return known, False, effort
         elif answer == IMPOSSIBLE:
@@ -132,31 +139,21 @@ def _settle(data, limits, view, everybody, balls, poses, supports, masks, known)
 
 
 @numba.njit(cache=True, nogil=True)
-def sweep_bin(data, limits, trig, pairs, lo, hi, arcs, start, end, poses, supports, masks, known, effort_limit):
-    """Search one bin.
+def sweep_bin(data, limits, trig, pairs, lo, hi, nodes, rows, span, poses, supports, masks, known, effort_limit):
+    """Search the bin between the turns ``span``.
 
     ``data`` is what ``verify`` takes, ``limits`` what ``search_region`` takes, ``trig`` the chords and sines of the
-    angular bounds. ``poses`` (K, 3, 4), ``supports`` (K,) and ``masks`` (K, M) hold ``known`` verified poses, the first one
-    with the largest support; better ones are added in place. Returns how many are known, the bound for the bin, its
-    largest clique that may have a pose (nodes; empty if none is larger than the support), the effort, and whether the
-    bin was searched to its end.
+    angular bounds; ``nodes`` and ``rows`` are the bin's core and its graph, which is used up. ``poses`` (K, 5),
+    ``supports`` (K,) and ``masks`` (K, M) hold ``known`` verified poses, the first one with the largest support; better
+    ones are added in place. Returns how many are known, the bound for the bin, its largest clique that may have a pose
+    (nodes; empty if none is larger than the support), the effort, and whether the bin was searched to its end.
     """
     nothing = np.empty(0, np.int64)
-    nodes, rows = core_graph(masks.shape[1], pairs, arcs, supports[0])
-    if len(nodes) <= supports[0]:
-        return known, supports[0], nothing, len(arcs), True
     whole = colour_bound(rows)
-    effort = len(arcs) + rows.size
-    if whole <= supports[0]:
-        return known, supports[0], nothing, effort, True
-    if len(nodes) - supports[0] <= MOST_SPARE:
-        view = view_between(data, start, end)
-        balls = apart_balls(view, trig, nodes, len(nodes) - supports[0])
-        known, proven, work = _settle(data, limits, view, nodes, balls, poses, supports, masks, known)
-        effort += work
-        if proven:
-            return known, supports[0], nothing, effort, True
-    edges, first, last = _pieces(pairs, lo, hi, arcs, nodes, masks.shape[1], start, end)
+    edges, first, last = _pieces(pairs, lo, hi, nodes, masks.shape[1], span[0], span[1])
+    effort = len(lo) + SORT_EFFORT * len(edges)
+    if effort > effort_limit:
+        return known, whole, nothing, len(lo), False
     rows[:] = 0
     owned = np.zeros((len(nodes), len(nodes)), np.uint8)
     common = np.empty(rows.shape[1], np.uint64)
@@ -195,7 +192,7 @@ def sweep_bin(data, limits, trig, pairs, lo, hi, arcs, start, end, poses, suppor
             continue
         everybody = np.append(nodes[candidates], nodes[np.array([a, b])])
         balls = star_balls(view, trig, everybody, len(everybody) - supports[0], ball)
-        known, proven, work = _settle(data, limits, view, everybody, balls, poses, supports, masks, known)
+        known, proven, work = settle(data, limits, view, everybody, balls, poses, supports, masks, known)
         effort += work
         if not proven and len(clique) > len(largest):
             largest = nodes[clique]

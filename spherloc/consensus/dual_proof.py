@@ -1,12 +1,12 @@
 """Proof that no level pose of a small region explains more than a given number of correspondences, by duality.
 
-If a pose explains all of a set, its residuals are within their bounds, |r_i| <= b_i, so for any weights w >= 0 the weighted
-cost sum w_i |r_i|^2 is at most sum w_i b_i^2. Around a pose of the region r_i is linear up to e_i, so that no pose of the
-region has a root of this cost below sqrt(c) - sqrt(sum w_i e_i^2), where c is the least cost of the linear residuals. Where
-that exceeds sqrt(sum w_i b_i^2), the set cannot be explained: the weights are the proof. Otherwise all poses that explain
-it lie in an ellipsoid around the least cost, which may be smaller than the region, and then e_i is smaller too.
-Lawson's iteration, which multiplies each weight by its residual, finds both the weights and the pose of least largest
-residual.
+If a pose explains all of a set, its residuals are within their bounds, |r_i| <= b_i, so for any weights w >= 0 the
+weighted cost sum w_i |r_i|^2 is at most sum w_i b_i^2. Around a pose of the region r_i is linear up to e_i, so that
+no pose of the region has a root of this cost below sqrt(c) - sqrt(sum w_i e_i^2), where c is the least cost of the
+linear residuals. Where that exceeds sqrt(sum w_i b_i^2), the set cannot be explained: the weights are the proof.
+Otherwise all poses that explain it lie in an ellipsoid around the least cost, which may be smaller than the region,
+and then e_i is smaller too. Lawson's iteration, which multiplies each weight by its residual, finds both the weights
+and the pose of least largest residual.
 
 A set that cannot be explained must lose one of its members of large weight, which gives a tree over what is left out
 (as Chin et al., "Efficient globally optimal consensus maximisation with tree search", 2015).
@@ -14,6 +14,8 @@ A set that cannot be explained must lose one of its members of large weight, whi
 
 import numba
 import numpy as np
+
+from spherloc.consensus.level_fit import accumulate, move, ray, slope_of, solve_step
 
 ROUNDS = 24
 """Of Lawson's iteration."""
@@ -34,9 +36,10 @@ UNKNOWN, FOUND, IMPOSSIBLE = 0, 1, 2
 def prove_none(view, limits, everybody, ball, floor, found):
     """Whether no level pose of the region explains more than ``floor`` of ``everybody``.
 
-    ``view`` is (bearings, points, cos, sin and half width of the yaw interval); ``limits`` are the weights (M, 2, 3), the
-    bounds (M,) px, the angular bounds (M,) rad and the px/rad (M,); ``ball`` (4,) centre and radius of camera positions.
-    Returns FOUND, with such a pose in ``found`` (3, 4), IMPOSSIBLE if there is none, or UNKNOWN; and the effort.
+    ``view`` is (bearings, points, cos, sin and half width of the yaw interval); ``limits`` are the weights (M, 2, 3),
+    the bounds (M,) px, the angular bounds (M,) rad and the px/rad (M,); ``ball`` (4,) centre and radius of camera
+    positions. Returns FOUND, with such a pose in ``found`` (5,), see ``level_fit``, IMPOSSIBLE if there is none, or
+    UNKNOWN; and the effort.
     """
     count = len(everybody)
     spare = count - floor
@@ -55,7 +58,7 @@ def prove_none(view, limits, everybody, ball, floor, found):
         answer, rounds = _lawson(view, limits, everybody, gone, ball, floor, here, weight, residual, ROUNDS)
         effort += rounds * count
         if answer == FOUND:
-            write_pose(here, found)
+            found[:] = here
         if answer != IMPOSSIBLE or nodes >= MOST_NODES or waiting + BASIS[-1] > len(places):
             return (answer if answer == FOUND else UNKNOWN), effort
         if np.count_nonzero(gone) + 1 >= spare:
@@ -71,15 +74,6 @@ def prove_none(view, limits, everybody, ball, floor, found):
             waiting += 1
             stay[k] = True
     return IMPOSSIBLE, effort
-
-
-@numba.njit(cache=True, nogil=True)
-def write_pose(here, found):
-    """The pose (3, 4) of cos, sin of the yaw and a camera position."""
-    c, s, x, y, z = here
-    found[0, 0], found[0, 1], found[0, 2], found[0, 3] = c, 0.0, s, -(c * x + s * z)
-    found[1, 0], found[1, 1], found[1, 2], found[1, 3] = 0.0, 1.0, 0.0, -y
-    found[2, 0], found[2, 1], found[2, 2], found[2, 3] = -s, 0.0, c, s * x - c * z
 
 
 @numba.njit(cache=True, nogil=True)
@@ -106,7 +100,8 @@ def _basis(view, limits, everybody, gone, ball, here, weight, residual):
 
 @numba.njit(cache=True, nogil=True)
 def _lawson(view, limits, everybody, gone, ball, floor, here, weight, residual, rounds):
-    """Lawson's iteration on those not ``gone``: whether a pose explains more than ``floor`` of everybody, or none all of them.
+    """Lawson's iteration on those not ``gone``: whether a pose explains more than ``floor`` of everybody, or none all
+    of them.
 
     ``here`` (5,), cos, sin and position, and ``weight`` (count,), 0 for those gone, are moved; ``residual`` (count,) is
     written. Returns the answer and the rounds.
@@ -120,31 +115,23 @@ def _lawson(view, limits, everybody, gone, ball, floor, here, weight, residual, 
         )
         if explained > floor:
             return FOUND, k + 1
-        fall = _solve(normal, slope, step)
+        fall = solve_step(normal, slope, step)
         if fall < 0.0:
             return UNKNOWN, k + 1
         least, most = max(0.0, cost - fall), (MARGIN * (np.sqrt(allowed) + np.sqrt(bend))) ** 2
         if least > most:
             return IMPOSSIBLE, k + 1
-        _move(here, step)
+        move(here, step)
         _contract(normal, most - least, here, region)
         _reweight(gone, residual, weight)
     return UNKNOWN, rounds
 
 
 @numba.njit(cache=True, nogil=True)
-def _move(here, step):
-    """Turn and move a pose by a step in camera axes."""
-    c, s = here[0], here[1]
-    here[2] += c * step[1] - s * step[3]
-    here[3] += step[2]
-    here[4] += s * step[1] + c * step[3]
-    here[0], here[1] = c * np.cos(step[0]) - s * np.sin(step[0]), s * np.cos(step[0]) + c * np.sin(step[0])
-
-
-@numba.njit(cache=True, nogil=True)
 def _contract(root, room, here, region):
-    """Shrink the region to the ellipsoid of steps x from ``here`` with |root^T x|^2 <= ``room``, where that is smaller."""
+    """Shrink the region to the ellipsoid of steps x from ``here`` with |root^T x|^2 <= ``room``, where that is
+    smaller.
+    """
     inverse = np.zeros((4, 4))
     for a in range(4):
         inverse[a, a] = 1.0 / root[a, a]
@@ -189,28 +176,17 @@ def _normal_equations(view, limits, everybody, region, here, weight, residual, n
     normal[:] = 0.0
     slope[:] = 0.0
     explained, cost, allowed, bend = 0, 0.0, 0.0, 0.0
-    row = np.empty(4)
     for m in range(len(everybody)):
         k = everybody[m]
-        dx, dy, dz = points[k, 0] - x0, points[k, 1] - y0, points[k, 2] - z0
-        distance = max(np.sqrt(dx * dx + dy * dy + dz * dz), 1e-12)
-        gx, gy, gz = (c * dx + s * dz) / distance, dy / distance, (c * dz - s * dx) / distance
+        gx, gy, gz, distance = ray(points[k], here)
         along = bearings[k, 0] * gx + bearings[k, 1] * gy + bearings[k, 2] * gz
         size2 = 0.0
         used = weight[m] if distance > 1.01 * reach else 0.0
         for axis in range(2):
-            wx, wy, wz = weights[k, axis, 0], weights[k, axis, 1], weights[k, axis, 2]
-            r = wx * gx + wy * gy + wz * gz
+            r, by_yaw, by_x, by_y, by_z = slope_of(weights[k, axis], gx, gy, gz, distance)
             size2 += r * r
-            if used == 0.0:
-                continue
-            row[0] = wx * gz - wz * gx
-            row[1], row[2], row[3] = (r * gx - wx) / distance, (r * gy - wy) / distance, (r * gz - wz) / distance
-            for a in range(4):
-                slope[a] += used * row[a] * r
-                for b in range(a + 1):
-                    normal[a, b] += used * row[a] * row[b]
-            cost += used * r * r
+            accumulate(normal, slope, used, r, by_yaw, by_x, by_y, by_z)
+        cost += used * size2
         residual[m] = np.sqrt(size2) / bound_px[k]
         if residual[m] <= 1.0 and along > 0.0 and along >= np.cos(bound_rad[k]):
             explained += 1
@@ -219,29 +195,3 @@ def _normal_equations(view, limits, everybody, region, here, weight, residual, n
             movement = swing + reach / (distance - reach)
             bend += used * (0.5 * BEND * pixels_per_radian[k] * movement * movement) ** 2
     return explained, cost, allowed, bend
-
-
-@numba.njit(cache=True, nogil=True)
-def _solve(normal, slope, step):
-    """Write the step of the normal equations (lower triangle, overwritten); return by how much it lowers the cost, or -1."""
-    fall = 0.0
-    for a in range(4):
-        pivot = normal[a, a]
-        for b in range(a):
-            for d in range(b):
-                normal[a, b] -= normal[a, d] * normal[b, d]
-            normal[a, b] /= normal[b, b]
-            normal[a, a] -= normal[a, b] ** 2
-        if not normal[a, a] > 1e-10 * pivot:
-            return -1.0
-        normal[a, a] = np.sqrt(normal[a, a])
-        step[a] = -slope[a]
-        for b in range(a):
-            step[a] -= normal[a, b] * step[b]
-        step[a] /= normal[a, a]
-        fall += step[a] ** 2
-    for a in range(3, -1, -1):
-        for b in range(a + 1, 4):
-            step[a] -= normal[b, a] * step[b]
-        step[a] /= normal[a, a]
-    return fall

@@ -13,13 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spherloc.bounds import Bounds
-from spherloc.consensus.chance import chance_sets
-from spherloc.consensus.clique_sweep import sweep_bin
+from spherloc.consensus.balls_of_pairs import apart_balls, view_between
+from spherloc.consensus.chance import chance_sets, least_size
+from spherloc.consensus.clique_search import colour_bound
+from spherloc.consensus.clique_sweep import settle, sweep_bin
 from spherloc.consensus.depth_bounds import chord
+from spherloc.consensus.level_fit import place, translation_of
 from spherloc.consensus.pair_arcs import pair_arcs, turn_of
-from spherloc.consensus.scout import scout
-from spherloc.consensus.support import climb, keep
+from spherloc.consensus.scout import core_graph, scout
+from spherloc.consensus.support import improve
 from spherloc.consensus.yaw_bins import BIN_TURN, BINS, degree_bounds, sort_into_bins
+from spherloc.geometry import yaw_rotation
 from spherloc.problem import AlignedProblem
 
 FloatArray = NDArray[np.float64]
@@ -28,6 +32,10 @@ IndexArray = NDArray[np.int32]
 
 DOUBTFUL = 1e-6
 """Expected number of chance sets of the size of the guess above which better guesses are looked for."""
+HOPELESS = 1000.0
+"""Expected number of chance sets of a size at which it says nothing."""
+MOST_SPARE = 8
+"""Nodes of a bin more than the best support up to which the whole bin is tried to be settled at once."""
 MOST_POSES = 8
 """Clearly different poses that are remembered."""
 
@@ -68,38 +76,41 @@ class ExactConsensus:
 def exact_consensus(
     aligned: AlignedProblem,
     bounds: Bounds,
-    noise_px: float,
     wrong_rate: float,
-    guesses: list[tuple[FloatArray, FloatArray]],
+    guesses: list[tuple[float, FloatArray]],
     effort_limit: int,
     time_budget_s: float,
 ) -> ExactConsensus:
     """Search all yaws.
 
-    ``wrong_rate`` is the probability that a wrong pose explains a correspondence. ``guesses`` are level poses (rotation (3, 3), translation (3,)) to start from: the more the best of them explains,
-    the less is left to be searched. After ``effort_limit`` words or ``time_budget_s`` seconds the search stops, and the
-    bounds say how far it came.
+    ``wrong_rate`` is the probability that a wrong pose explains a correspondence. ``guesses`` are level poses
+    (yaw, rad, and translation (3,)) to start from: the more the best of them explains, the less is left to be
+    searched. After ``effort_limit`` words or ``time_budget_s`` seconds the search stops, and the bounds say how far
+    it came.
     """
     deadline = time.perf_counter() + time_budget_s
     count = len(aligned.bearings)
     # Rounding must not exclude what the pixel bound allows.
     least_cos = np.cos(np.minimum(bounds.radians + 1e-9, np.pi / 2))
-    data = (aligned.bearings, aligned.points, aligned.pixel_from_bearing, bounds.pixels, least_cos, noise_px)
+    data = (aligned.bearings, aligned.points, aligned.pixel_from_bearing, bounds.pixels, least_cos)
     limits = (aligned.pixel_from_bearing, bounds.pixels, bounds.radians, aligned.pixels_per_radian)
     trig = (chord(bounds.radians), np.sin(bounds.radians))
-    poses, supports = np.empty((MOST_POSES, 3, 4)), np.zeros(MOST_POSES, np.int32)
+    poses, supports = np.empty((MOST_POSES, 5)), np.zeros(MOST_POSES, np.int32)
     masks = np.zeros((MOST_POSES, count), np.bool_)
     known = 0
-    for rotation, translation in guesses:
-        mask = np.empty(count, np.bool_)
-        support = climb(data, rotation, translation, mask)
-        known = keep(rotation, translation, support, mask, poses, supports, masks, known)
+    for yaw, translation in guesses:
+        here = np.empty(5)
+        place(yaw, translation, here)
+        known = improve(data, np.empty(0, np.int64), here, poses, supports, masks, known)
     pairs, lo, hi = pair_arcs(aligned, bounds.radians)
-    starts, arcs = sort_into_bins(lo, hi)
-    bound = degree_bounds(count, pairs, starts, arcs)
-    if chance_sets(count, int(supports[0]), wrong_rate) > DOUBTFUL:
-        known = scout(data, pairs, starts, arcs, bound, poses, supports, masks, known)
-    effort, finished = len(arcs), True
+    starts, edges = sort_into_bins(pairs, lo, hi)
+    bound = degree_bounds(count, starts, edges)
+    # What chance explains too often to be told apart is looked for last.
+    for expected in (HOPELESS, np.inf):
+        if chance_sets(count, int(supports[0]), wrong_rate) > DOUBTFUL:
+            floor = least_size(count, wrong_rate, expected) - 1
+            known = scout(data, starts, edges, bound, floor, poses, supports, masks, known)
+    effort, finished = len(edges), True
     clique = np.empty(0, np.int64)
     for b in np.argsort(-bound, kind="stable"):
         if bound[b] <= supports[0]:
@@ -107,10 +118,15 @@ def exact_consensus(
         if effort >= effort_limit or time.perf_counter() >= deadline:
             finished = False
             break
-        inside = arcs[starts[b] : starts[b + 1]]
-        edges = (b * BIN_TURN, (b + 1) * BIN_TURN)
+        nodes, rows = core_graph(count, edges[starts[b] : starts[b + 1]], supports[0])
+        span = (b * BIN_TURN, (b + 1) * BIN_TURN)
+        known, most, work = _settle_bin(data, limits, trig, nodes, rows, span, poses, supports, masks, known)
+        effort += work
+        bound[b] = min(bound[b], most)
+        if bound[b] <= supports[0]:
+            continue
         known, most, found, work, exact = sweep_bin(
-            data, limits, trig, pairs, lo, hi, inside, *edges, poses, supports, masks, known, effort_limit - effort
+            data, limits, trig, pairs, lo, hi, nodes, rows, span, poses, supports, masks, known, effort_limit - effort
         )
         effort += work
         finished = finished and exact
@@ -120,7 +136,7 @@ def exact_consensus(
     if len(clique) <= supports[0]:
         clique = np.flatnonzero(masks[0])
     return ExactConsensus(
-        poses=poses[:known],
+        poses=_as_matrices(poses[:known]),
         supports=supports[:known],
         mask=masks[0],
         bound=bound,
@@ -129,3 +145,29 @@ def exact_consensus(
         effort=effort,
         finished=finished,
     )
+
+
+def _settle_bin(data, limits, trig, nodes, rows, span, poses, supports, masks, known) -> tuple[int, int, int]:
+    """Bound a bin without walking its arcs: by colours, and by proof where few nodes more than the best support are
+    left.
+
+    The arguments are those of ``sweep_bin``. Returns how many poses are known, the bound, and the effort.
+    """
+    best, effort = int(supports[0]), rows.size
+    most = min(len(nodes), colour_bound(rows)) if len(nodes) > best else best
+    if most > best and len(nodes) - best <= MOST_SPARE:
+        view = view_between(data, *span)
+        balls = apart_balls(view, trig, nodes, len(nodes) - best)
+        known, proven, work = settle(data, limits, view, nodes, balls, poses, supports, masks, known)
+        effort += work
+        most = 0 if proven else most
+    return int(known), int(max(most, supports[0])), int(effort)
+
+
+def _as_matrices(poses: FloatArray) -> FloatArray:
+    """Level poses (C, 5) as (C, 3, 4)."""
+    matrices = np.zeros((len(poses), 3, 4))
+    for here, matrix in zip(poses, matrices, strict=True):
+        matrix[:, :3] = yaw_rotation(np.arctan2(here[1], here[0]))
+        translation_of(here, matrix[:, 3])
+    return matrices

@@ -90,5 +90,3 @@ def _greedy(rows):
             members[taken] = node
             taken += 1
     return members[:taken].copy()
-
-

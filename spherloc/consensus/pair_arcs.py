@@ -3,8 +3,8 @@
 The conditions are those of ``depth_bounds``: |f| <= tau where depths may be positive. The exact search only compares
 yaws, so an end (cos, sin) becomes its turn, the length along the square |cos| + |sin| = 1, from 0 to 4, which grows
 with yaw and costs one division. The arcs bound as those of ``yaw_arcs`` do and are a little wider: a depth that
-changes its sign within an arc does not shorten it. A pair that bounds nothing has the whole circle: its edge is in every
-graph.
+changes its sign within an arc does not shorten it. A pair that bounds nothing has the whole circle: its edge is in
+every graph.
 """
 
 import numba

@@ -1,15 +1,15 @@
 """Branch and bound over level poses in a small region: does any of them explain more than a given number?
 
-A cell is an interval of yaw and a cube of camera positions. A unit ray moves by at most the cell's half yaw plus the chord
-that its half diagonal spans at the point, and the residual is linear in the ray, so a correspondence whose residual in
-the middle exceeds its bound by more than that movement is explained nowhere in the cell. A cell that cannot explain
-more than ``floor`` is dropped; others are split until none is left, or the limit is reached.
+A cell is an interval of yaw and a cube of camera positions. A unit ray moves by at most the cell's half yaw plus the
+chord that its half diagonal spans at the point, and the residual is linear in the ray, so a correspondence whose
+residual in the middle exceeds its bound by more than that movement is explained nowhere in the cell. A cell that
+cannot explain more than ``floor`` is dropped; others are split until none is left, or the limit is reached.
 """
 
 import numba
 import numpy as np
 
-from spherloc.consensus.dual_proof import FOUND, IMPOSSIBLE, UNKNOWN, write_pose
+from spherloc.consensus.dual_proof import FOUND, IMPOSSIBLE, UNKNOWN
 
 MOST_WAITING = 4096
 """Cells that wait to be split; more are not needed since the deepest is split first."""
@@ -22,8 +22,9 @@ HALF_DIAGONAL = np.sqrt(3.0)
 def search_region(view, limits, few, ball, floor, cell_limit, found):
     """Whether some level pose of the region explains more than ``floor`` of ``few``: as ``prove_none``; and the cells.
 
-    ``view`` is (bearings, points, cos, sin and half width of the yaw interval); ``limits`` are the weights (M, 2, 3), the
-    bounds (M,) px, the angular bounds (M,) rad and the px/rad (M,); ``ball`` (4,) centre and radius of camera positions.
+    ``view`` is (bearings, points, cos, sin and half width of the yaw interval); ``limits`` are the weights (M, 2, 3),
+    the bounds (M,) px, the angular bounds (M,) rad and the px/rad (M,); ``ball`` (4,) centre and radius of camera
+    positions.
     """
     c0, s0, slack = view[2], view[3], view[4]
     order = few.copy()
@@ -43,7 +44,7 @@ def search_region(view, limits, few, ball, floor, cell_limit, found):
         if not _may_explain(view, limits, order, c, s, x, y, z, half_yaw, half * HALF_DIAGONAL, floor):
             continue
         if _explained(view, limits, few, c, s, x, y, z) > floor:
-            write_pose((c, s, x, y, z), found)
+            found[0], found[1], found[2], found[3], found[4] = c, s, x, y, z
             return FOUND, used
         if half_yaw + half * HALF_DIAGONAL / reach < LEAST_CELL_RAD:
             exact = False
@@ -75,7 +76,9 @@ def _mean_distance(points, few, ball):
 
 @numba.njit(cache=True, nogil=True, inline="always")
 def _excess(view, limits, k, c, s, x, y, z):
-    """Residual less its bound, px (inf behind the bearing), and the distance, of a correspondence seen from (x, y, z)."""
+    """Residual less its bound, px (inf behind the bearing), and the distance, of a correspondence seen from (x, y,
+    z).
+    """
     bearings, points = view[0], view[1]
     weights, bound_px = limits[0], limits[1]
     dx, dy, dz = points[k, 0] - x, points[k, 1] - y, points[k, 2] - z
@@ -99,7 +102,9 @@ def _explained(view, limits, few, c, s, x, y, z):
 
 @numba.njit(cache=True, nogil=True)
 def _may_explain(view, limits, order, c, s, x, y, z, half_yaw, reach, floor):
-    """Whether some pose of a cell might explain more than ``floor``. Those that it surely does not come first next time."""
+    """Whether some pose of a cell might explain more than ``floor``. Those that it surely does not come first next
+    time.
+    """
     eps, pixels_per_radian = limits[2], limits[3]
     spare = len(order) - floor
     out = 0

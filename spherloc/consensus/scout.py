@@ -12,20 +12,22 @@ from spherloc.consensus.support import verify
 
 EFFORT_LIMIT = 200_000
 """Words touched in one bin."""
+RUMOUR = 3
+"""How much smaller than a clique without pose the next one may be."""
 
 
 @numba.njit(cache=True, nogil=True)
-def scout(data, pairs, starts, arcs, bound, poses, supports, masks, known):
+def scout(data, starts, edges, bound, least, poses, supports, masks, known):
     """Verify the largest clique of each bin; better poses become known, and the bound of each bin is lowered in place.
 
-    A clique must be larger than the best support, and no smaller than the largest clique that had no pose. Returns
-    how many poses are known.
+    A clique must be larger than the best support. While that is not above ``least`` it must be larger than this, and
+    not much smaller than the largest clique that had no pose. Returns how many poses are known.
     """
-    floor = supports[0]
+    floor = max(least, supports[0])
     for b in np.argsort(-bound, kind="mergesort"):
         if bound[b] <= floor:
             break
-        nodes, rows = core_graph(masks.shape[1], pairs, arcs[starts[b] : starts[b + 1]], floor)
+        nodes, rows = core_graph(masks.shape[1], edges[starts[b] : starts[b + 1]], floor)
         if len(nodes) <= floor or colour_bound(rows) <= floor:
             bound[b] = floor
             continue
@@ -34,26 +36,29 @@ def scout(data, pairs, starts, arcs, bound, poses, supports, masks, known):
             bound[b] = max(floor, len(clique))
         if len(clique):
             known = verify(data, nodes[clique], poses, supports, masks, known)
-            floor = max(supports[0], len(clique) - 1)
+            floor = supports[0] if supports[0] > least else max(floor, len(clique) - RUMOUR)
     return known
 
 
 @numba.njit(cache=True, nogil=True)
-def core_graph(count, pairs, arcs, least):
-    """Nodes with at least ``least`` edges among themselves, by falling degree, and the graph of ``arcs`` on them."""
+def core_graph(count, edges, least):
+    """Nodes with at least ``least`` edges among themselves, by falling degree, and their graph.
+
+    Two edges between the same nodes count as two here, but are one in the graph.
+    """
     degree, alive = np.empty(count, np.int64), np.ones(count, np.bool_)
-    left = arcs.copy()
+    left = edges.copy()
     changed = True
     while changed:
         changed = False
         degree[:] = 0
         used = 0
-        for arc in left:
-            i, j = pairs[arc, 0], pairs[arc, 1]
+        for k in range(len(left)):
+            i, j = left[k, 0], left[k, 1]
             if alive[i] and alive[j]:
                 degree[i] += 1
                 degree[j] += 1
-                left[used] = arc
+                left[used, 0], left[used, 1] = i, j
                 used += 1
         left = left[:used]
         for node in range(count):
@@ -66,8 +71,6 @@ def core_graph(count, pairs, arcs, least):
     for k in range(len(nodes)):
         places[nodes[k]] = k
     rows = np.zeros((len(nodes), (len(nodes) + 63) // 64), np.uint64)
-    for arc in left:
-        a, b = places[pairs[arc, 0]], places[pairs[arc, 1]]
-        if a >= 0 and b >= 0:
-            set_edge(rows, a, b)
+    for k in range(len(left)):
+        set_edge(rows, places[left[k, 0]], places[left[k, 1]])
     return nodes, rows

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spherloc.consensus.inliers import BLOCK, pack_blocks, reaches, score_inliers
-from spherloc.gauss_newton import ROBUST_NONE, polish
+from spherloc.consensus.level_fit import fit, place, translation_of
 from spherloc.problem import AlignedProblem
 from spherloc.solvers.two_point import solve_pair
 
@@ -176,12 +176,14 @@ def _optimize(yaw, translation, bearings, points, weights, bound_px, mask):
     would reach farther still, but where gravity's error has widened the bounds it lets in too many false ones
     (measured).
     """
-    c, s = np.cos(yaw), np.sin(yaw)
-    rotation = np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+    here, heavy = np.empty(5), np.empty(len(points))
+    place(yaw, translation, here)
     for _ in range(OPTIMIZATION_ROUNDS):
         score_inliers(yaw, translation, bearings, points, weights, bound_px, mask)
-        polish(points, weights, mask, rotation, translation, 1.0, 0.0, ROBUST_NONE, OPTIMIZATION_STEPS)
-        yaw = np.arctan2(rotation[0, 2], rotation[0, 0])
+        heavy[:] = mask
+        fit(points, weights, heavy, here, OPTIMIZATION_STEPS)
+        yaw = np.arctan2(here[1], here[0])
+        translation_of(here, translation)
     return yaw
 
 

@@ -12,15 +12,19 @@ from spherloc.consensus.pair_arcs import CIRCLE
 
 FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int32]
+EdgeArray = NDArray[np.uint16]
 
-BINS = 512
+BINS = 256
 """Narrow beside the arcs of an error of some pixels, and few enough to cost nothing."""
 BIN_TURN = CIRCLE / BINS
 
 
 @numba.njit(cache=True, nogil=True)
-def sort_into_bins(lo: FloatArray, hi: FloatArray) -> tuple[NDArray[np.int64], IndexArray]:
-    """Places (BINS + 1,) where each bin's arcs start in a list of arcs, and the list."""
+def sort_into_bins(pairs: IndexArray, lo: FloatArray, hi: FloatArray) -> tuple[NDArray[np.int64], EdgeArray]:
+    """Places (BINS + 1,) where each bin's edges start in a list of edges (E, 2), and the list: nodes below 65,536.
+
+    An arc is an edge of every bin that it touches. Nodes are copied, so that a bin is read from one place.
+    """
     starts = np.zeros(BINS + 1, np.int64)
     for arc in range(len(lo)):
         first, last = _bins(lo[arc], hi[arc])
@@ -28,17 +32,17 @@ def sort_into_bins(lo: FloatArray, hi: FloatArray) -> tuple[NDArray[np.int64], I
             starts[b % BINS + 1] += 1
     for b in range(BINS):
         starts[b + 1] += starts[b]
-    arcs = np.empty(starts[BINS], np.int32)
+    edges = np.empty((starts[BINS], 2), np.uint16)
     place = starts[:BINS].copy()
     for arc in range(len(lo)):
         first, last = _bins(lo[arc], hi[arc])
         for b in range(first, last + 1):
-            arcs[place[b % BINS]] = arc
+            edges[place[b % BINS], 0], edges[place[b % BINS], 1] = pairs[arc, 0], pairs[arc, 1]
             place[b % BINS] += 1
-    return starts, arcs
+    return starts, edges
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@numba.njit(cache=True, nogil=True)
 def _bins(lo, hi):
     """First and last bin that an arc touches; not more than all."""
     first, last = int(lo / BIN_TURN), int(hi / BIN_TURN)
@@ -46,16 +50,15 @@ def _bins(lo, hi):
 
 
 @numba.njit(cache=True, nogil=True)
-def degree_bounds(count: int, pairs: IndexArray, starts: NDArray[np.int64], arcs: IndexArray) -> IndexArray:
+def degree_bounds(count: int, starts: NDArray[np.int64], edges: EdgeArray) -> IndexArray:
     """(BINS,) bound on the clique number of each bin's graph of ``count`` nodes."""
     bound = np.empty(BINS, np.int32)
     degree, tally = np.empty(count, np.int64), np.empty(count + 1, np.int64)
     for b in range(BINS):
         degree[:] = 0
         for place in range(starts[b], starts[b + 1]):
-            arc = arcs[place]
-            degree[pairs[arc, 0]] += 1
-            degree[pairs[arc, 1]] += 1
+            degree[edges[place, 0]] += 1
+            degree[edges[place, 1]] += 1
         tally[:] = 0
         for node in range(count):
             tally[min(degree[node], count)] += 1

@@ -37,6 +37,8 @@ class Outcome:
     """(M,) over the usable correspondences."""
     reason: str = ""
     """Why there is no pose, as a sentence; empty if there is one."""
+    note: str = ""
+    """What should be known about a pose that was found, as sentences."""
     certificate: Certificate | None = None
     """What is proven about the consensus, if the estimator proves anything."""
 
@@ -91,6 +93,8 @@ def check_positive(options: Any) -> None:
         value = getattr(options, item.name)
         if item.name in REFINEMENT_FIELDS:
             continue  # RefinementOptions checks its own
+        if isinstance(item.default, bool | str):
+            continue  # words and switches are their estimator's to check
         if value is None and item.default is None:
             continue
         if isinstance(value, bool) or not isinstance(value, Real) or not 0 < float(value) < np.inf:
@@ -129,6 +133,6 @@ def estimate(problem: Problem, estimator: str = "mc", options: Any = None, seed:
         timings_ms=clock.timings_ms,
         cam_from_map=pose,
         inlier_mask=mask,
-        message=outcome.reason or found,
+        message=outcome.reason or " ".join(filter(None, (found, outcome.note))),
         certificate=outcome.certificate,
     )

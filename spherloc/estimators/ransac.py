@@ -1,8 +1,7 @@
 """2P-RANSAC, the paper's Algorithm 1: sample two correspondences, solve, count inliers, keep the best, refine."""
 
 from dataclasses import dataclass
-from numbers import Real
-from typing import Any, get_args
+from typing import get_args
 
 import numpy as np
 
@@ -10,7 +9,7 @@ from spherloc.bounds import Bounds
 from spherloc.consensus.inliers import mark_each
 from spherloc.consensus.two_point_search import Scoring, TwoPointSearch, search_two_point
 from spherloc.errors import InputError, show
-from spherloc.estimators.base import Clock, Outcome
+from spherloc.estimators.base import Clock, Outcome, check_positive
 from spherloc.geometry import pose, yaw_rotation
 from spherloc.problem import AlignedProblem
 from spherloc.refine import RefinementOptions, refine
@@ -38,8 +37,7 @@ class RansacOptions(RefinementOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("bound_px", "iterations", "confidence"):
-            _check_positive(name, getattr(self, name), may_be_none=name == "confidence")
+        check_positive(self)
         if self.iterations != int(self.iterations) or self.iterations > MOST_ITERATIONS:
             raise InputError(f"option iterations is {self.iterations}; give a whole number up to {MOST_ITERATIONS:,}.")
         if self.confidence is not None and self.confidence >= 1.0:
@@ -48,13 +46,6 @@ class RansacOptions(RefinementOptions):
             raise InputError(f"option scoring is {show(self.scoring)}; give one of {', '.join(get_args(Scoring))}.")
         if not isinstance(self.local_optimization, bool):
             raise InputError(f"option local_optimization is {show(self.local_optimization)}; give true or false.")
-
-
-def _check_positive(name: str, value: Any, may_be_none: bool) -> None:
-    if value is None and may_be_none:
-        return
-    if isinstance(value, bool) or not isinstance(value, Real) or not 0 < float(value) < np.inf:
-        raise InputError(f"option {name} is {show(value)}; give a positive number.")
 
 
 class TwoPointRansac:

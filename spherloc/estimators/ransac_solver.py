@@ -116,11 +116,11 @@ class SolverRansac:
             stage = _stage(view, drawn, found, self.sampler.sample_size)
         inlier_mask = np.zeros(len(aligned.bearings), dtype=bool)
         if reason:
-            return Outcome((stage,), None, inlier_mask, reason + _lost(view))
+            return Outcome((stage,), None, inlier_mask, " ".join(filter(None, (reason, _lost(view)))))
         with clock.stage("refinement"):
             refined, inliers, refinement = refine(view.aligned, found[-1].cam_from_map, view.bounds, options)
         inlier_mask[view.seen] = inliers
-        return Outcome((stage, refinement), refined, inlier_mask, _found(view, int(np.count_nonzero(inliers))))
+        return Outcome((stage, refinement), refined, inlier_mask, note=_lost(view))
 
     def _search(
         self, view: _View, options: SolverRansacOptions, rng: np.random.Generator
@@ -214,20 +214,14 @@ def _view(aligned: AlignedProblem, bounds: Bounds, pinhole: bool) -> _View:
 
 
 def _lost(view: _View) -> str:
-    """The correspondences that the virtual camera does not see, as a sentence to append; empty if it sees all."""
+    """The correspondences that the virtual camera does not see, as a sentence; empty if it sees all."""
     lost = int(np.count_nonzero(~view.seen))
     if not lost:
         return ""
     return (
-        f" {lost} of {len(view.seen)} usable correspondences {'lies' if lost == 1 else 'lie'} outside the virtual "
+        f"{lost} of {len(view.seen)} usable correspondences {'lies' if lost == 1 else 'lie'} outside the virtual "
         f"camera's {VirtualPinhole().fov_deg:g} degrees."
     )
-
-
-def _found(view: _View, inliers: int) -> str:
-    """The outcome in a sentence that the usual one would not tell: what was lost; empty if nothing was."""
-    lost = _lost(view)
-    return f"Pose found: {inliers} of {view.aligned.count} correspondences agree with it.{lost}" if lost else ""
 
 
 def _explained(view: _View, cam_from_map: FloatArray) -> tuple[int, BoolArray]:

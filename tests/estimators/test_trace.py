@@ -107,7 +107,7 @@ def test_defaults_take_the_scenes_bound(scene_of):
 
 def test_wrong_arguments_are_input_errors(scene_of):
     problem = scene_of("mei").problem()
-    with pytest.raises(InputError, match="unknown estimator 'nothing': choose one of mc, ransac-2p"):
+    with pytest.raises(InputError, match="unknown estimator 'nothing': choose one of auto, mc, mc-exact, ransac-2p, "):
         estimate(problem, "nothing")
     with pytest.raises(InputError, match="takes McOptions, not RansacOptions"):
         estimate(problem, "mc", options_type("ransac-2p")())

@@ -1,0 +1,92 @@
+"""auto: chooses between ``mc-exact`` and ``ransac-2p`` from what can be measured beforehand, and says why."""
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from spherloc.bounds import Bounds
+from spherloc.consensus.chance import chance_rate, chance_sets
+from spherloc.consensus.two_point_search import TwoPointSearch, search_two_point
+from spherloc.estimators.base import Clock, Outcome, check_positive
+from spherloc.estimators.mc_exact import MOST_CORRESPONDENCES, ExactMaximumConsensus, McExactOptions
+from spherloc.estimators.ransac import RansacOptions, TwoPointRansac
+from spherloc.problem import AlignedProblem
+from spherloc.refine import RefinementOptions
+from spherloc.trace import DecisionStage
+
+PROBE_SAMPLES = 500
+PROBE_CONFIDENCE = 0.99
+CHEAP = 500
+"""Correspondences up to which the proof costs a few hundredths of a second, so that nothing speaks against it."""
+CERTAIN = 1e-6
+"""Expected number of chance sets of the size of the probe's consensus below which it is no chance."""
+RANSAC_CONFIDENCE = 0.9999
+RANSAC_SAMPLES = 100_000
+
+
+@dataclass(frozen=True)
+class AutoOptions(RefinementOptions):
+    """Options of auto: those that all estimators share."""
+
+    bound_px: float = 3.0
+    """Bound on the noise of an inlier, px."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_positive(self)
+
+
+class Auto:
+    """Registered as "auto"."""
+
+    Options = AutoOptions
+
+    @staticmethod
+    def run(aligned: AlignedProblem, options: AutoOptions, bounds: Bounds, seed: int, clock: Clock) -> Outcome:
+        """Probe, choose, run what was chosen; its stages follow the decision."""
+        with clock.stage("probe"):
+            probe = search_two_point(
+                aligned, bounds.pixels, seed, PROBE_SAMPLES, PROBE_CONFIDENCE, local_optimization=True
+            )
+            decision = _decide(aligned, bounds, probe)
+        shared = {item.name: getattr(options, item.name) for item in fields(options)}
+        if decision.chosen == "mc-exact":
+            outcome = ExactMaximumConsensus.run(aligned, McExactOptions(**shared), bounds, seed, clock)
+        else:
+            sampling = RansacOptions(
+                **shared,
+                iterations=RANSAC_SAMPLES,
+                confidence=RANSAC_CONFIDENCE,
+                scoring="msac",
+                local_optimization=True,
+            )
+            outcome = TwoPointRansac.run(aligned, sampling, bounds, seed, clock)
+        return Outcome(
+            (decision, *outcome.stages),
+            outcome.cam_from_map,
+            outcome.inlier_mask,
+            outcome.reason,
+            outcome.note,
+            outcome.certificate,
+        )
+
+
+def _decide(aligned: AlignedProblem, bounds: Bounds, probe: TwoPointSearch) -> DecisionStage:
+    count = len(aligned.bearings)
+    support = int(probe.support.max(initial=0))
+    chance = chance_sets(count, support, chance_rate(aligned.bearings, bounds.radians))
+    share = f"{100 * support / count:.0f} % of {count:,} matches agree with the best of {probe.drawn} sampled pairs"
+    if count > MOST_CORRESPONDENCES:
+        chosen, reason = "ransac-2p", f"{count:,} matches have too many pairs to compare them all."
+    elif count <= CHEAP:
+        chosen, reason = "mc-exact", f"{count:,} matches are few enough to prove the answer in a moment."
+    elif chance < CERTAIN:
+        chosen, reason = "ransac-2p", f"{share}, which is no chance: sampling finds the pose and is faster."
+    else:
+        chosen, reason = "mc-exact", f"only {share}, which may be chance: all pairs must be compared."
+    return DecisionStage(
+        chosen=chosen,
+        reason=reason[0].upper() + reason[1:],
+        samples=probe.drawn,
+        inlier_rate=float(np.float64(support) / count),
+    )
