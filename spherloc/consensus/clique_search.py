@@ -153,3 +153,32 @@ def subgraph(rows, nodes):
             if (rows[old[a], old[b] >> 6] >> np.uint64(old[b] & 63)) & ONE != 0:
                 set_edge(small, a, b)
     return small, old
+
+
+@numba.njit(cache=True, nogil=True)
+def thin(rows, floor):
+    """Clear, again and again, edges whose ends have less than ``floor`` - 1 common neighbours; return nodes left with
+    any.
+
+    No clique of more than ``floor`` nodes, two at least, loses an edge.
+    """
+    count, words = rows.shape
+    changed = True
+    while changed:
+        changed = False
+        for a in range(count):
+            for w in range(a >> 6, words):
+                word = rows[a, w]
+                while word != 0:
+                    low = word & (~word + ONE)
+                    word ^= low
+                    b = w * 64 + popcount(low - ONE)
+                    if b <= a:
+                        continue
+                    common = 0
+                    for x in range(words):
+                        common += popcount(rows[a, x] & rows[b, x])
+                    if common < floor - 1:
+                        clear_edge(rows, a, b)
+                        changed = True
+    return np.array([a for a in range(count) if np.any(rows[a] != 0)], np.int64)

@@ -10,7 +10,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from spherloc.consensus.clique_search import larger_clique
+from spherloc.consensus.clique_search import all_nodes, larger_clique, lowest_bit
 
 EFFORT_LIMIT = 200_000_000
 """Words touched, see ``clique_search``, before the search returns the best clique so far as not proven: about 0.2 s."""
@@ -31,62 +31,70 @@ def max_clique(adjacency: NDArray[np.bool_], effort_limit: int = EFFORT_LIMIT) -
     count = len(adjacency)
     if count == 0:
         return Clique(np.empty(0, np.int32), True)
-    graph = adjacency.copy()
-    np.fill_diagonal(graph, False)
-    order = _degeneracy_order(graph)
-    rows = _pack(graph[np.ix_(order, order)])
+    rows, order = _pack(adjacency)
     members = _greedy(rows)
     larger, _, proven = larger_clique(rows, len(members), effort_limit)
     members = larger if len(larger) else members
     nodes = np.sort(order[members]).astype(np.int32)
-    inside = graph[np.ix_(nodes, nodes)]
-    if int(np.count_nonzero(inside)) != len(nodes) * (len(nodes) - 1):
+    if not _all_adjacent(adjacency, nodes):
         raise AssertionError("the maximum clique search returned nodes that are not all adjacent")
     return Clique(nodes, bool(proven))
 
 
-def _pack(graph: NDArray[np.bool_]) -> NDArray[np.uint64]:
-    """Rows of the adjacency as (M, ceil(M / 64)) words, node k in bit k % 64 of word k // 64."""
-    words = (len(graph) + 63) // 64
-    padded = np.zeros((len(graph), words * 64), dtype=bool)
-    padded[:, : len(graph)] = graph
-    return np.packbits(padded, axis=1, bitorder="little").view(np.uint64)
+@numba.njit(cache=True, nogil=True)
+def _pack(adjacency):
+    """The graph as bitsets of renumbered nodes, as ``clique_search`` takes it, and each one's old number."""
+    count, order = len(adjacency), _degeneracy_order(adjacency)
+    rows = np.zeros((count, (count + 63) // 64), np.uint64)
+    for place in range(count):
+        row = adjacency[order[place]]
+        for word in range(rows.shape[1]):
+            bits = np.uint64(0)
+            for bit in range(min(64, count - 64 * word)):
+                bits |= np.uint64(row[order[64 * word + bit]]) << np.uint64(bit)
+            rows[place, word] = bits
+        rows[place, place >> 6] &= ~(np.uint64(1) << np.uint64(place & 63))
+    return rows, order
 
 
 @numba.njit(cache=True, nogil=True)
-def _degeneracy_order(graph: NDArray[np.bool_]) -> NDArray[np.int64]:
+def _all_adjacent(adjacency, nodes):
+    for a in nodes:
+        for b in nodes:
+            if a != b and not adjacency[a, b]:
+                return False
+    return True
+
+
+@numba.njit(cache=True, nogil=True)
+def _degeneracy_order(adjacency):
     """Nodes by repeated removal of one of least degree, the first removed last: dense nodes are coloured first."""
-    count = len(graph)
-    degree = np.zeros(count, np.int64)
-    for i in range(count):
-        for j in range(count):
-            degree[i] += graph[i, j]
+    count = len(adjacency)
+    degree = np.empty(count, np.int32)
+    for node in range(count):
+        degree[node] = np.count_nonzero(adjacency[node]) - adjacency[node, node]
     order = np.empty(count, np.int64)
-    left = np.ones(count, np.bool_)
     for place in range(count - 1, -1, -1):
-        least = -1
-        for i in range(count):
-            if left[i] and (least < 0 or degree[i] < degree[least]):
-                least = i
+        least = np.argmin(degree)
         order[place] = least
-        left[least] = False
-        for j in range(count):
-            if graph[least, j]:
-                degree[j] -= 1
+        row = adjacency[least]
+        for node in range(count):
+            degree[node] -= row[node]
+        # A removed node stays above all degrees, whatever is still subtracted from it.
+        degree[least] = 2 * count + place
     return order
 
 
 @numba.njit(cache=True, nogil=True)
 def _greedy(rows):
     """Members of some clique: each node in turn that is adjacent to all before it. A first bound for the search."""
-    members = np.empty(len(rows), np.int64)
-    taken = 0
-    for node in range(len(rows)):
-        fits = True
-        for k in range(taken):
-            member = members[k]
-            fits = fits and (rows[node, member // 64] >> np.uint64(member % 64)) & np.uint64(1) != 0
-        if fits:
+    members, taken = np.empty(len(rows), np.int64), 0
+    fitting = all_nodes(len(rows))
+    for word in range(len(fitting)):
+        while fitting[word] != 0:
+            node = word * 64 + lowest_bit(fitting[word])
+            fitting[word] &= fitting[word] - np.uint64(1)
+            fitting &= rows[node]
             members[taken] = node
             taken += 1
     return members[:taken].copy()

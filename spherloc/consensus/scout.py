@@ -7,11 +7,13 @@ bin's graph holds all of its yaws at once, so its cliques bound those of each ya
 import numba
 import numpy as np
 
-from spherloc.consensus.clique_search import colour_bound, larger_clique, set_edge
+from spherloc.consensus.clique_search import colour_bound, larger_clique, set_edge, subgraph, thin
 from spherloc.consensus.support import verify
 
 EFFORT_LIMIT = 200_000
 """Words touched in one bin."""
+MOST_THINNED = 1_000_000
+"""Edges times words of a graph up to which it is thinned."""
 RUMOUR = 3
 """How much smaller than a clique without pose the next one may be."""
 
@@ -42,9 +44,10 @@ def scout(data, starts, edges, bound, least, poses, supports, masks, known):
 
 @numba.njit(cache=True, nogil=True)
 def core_graph(count, edges, least):
-    """Nodes with at least ``least`` edges among themselves, by falling degree, and their graph.
+    """Nodes that may belong to a clique of more than ``least``, by falling degree, and their graph.
 
-    Two edges between the same nodes count as two here, but are one in the graph.
+    Nodes have ``least`` edges among themselves or more (two between the same nodes count as two, but are one in the
+    graph), and in a graph that is not too large the ends of every edge have ``least`` - 1 neighbours in common.
     """
     degree, alive = np.empty(count, np.int64), np.ones(count, np.bool_)
     left = edges.copy()
@@ -73,4 +76,8 @@ def core_graph(count, edges, least):
     rows = np.zeros((len(nodes), (len(nodes) + 63) // 64), np.uint64)
     for k in range(len(left)):
         set_edge(rows, places[left[k, 0]], places[left[k, 1]])
-    return nodes, rows
+    if len(left) * rows.shape[1] > MOST_THINNED or len(nodes) <= least:
+        return nodes, rows
+    kept = thin(rows, least)
+    small, old = subgraph(rows, kept)
+    return nodes[old], small

@@ -15,7 +15,6 @@ delta: the ball contains the true position.
 import numba
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.distance import cdist
 
 from spherloc.consensus.depth_bounds import chord, pair_sinusoids
 from spherloc.problem import AlignedProblem
@@ -23,6 +22,9 @@ from spherloc.problem import AlignedProblem
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 IndexArray = NDArray[np.int32]
+
+ROUNDING = 1e-9
+"""Part by which a lower bound is lowered, so that rounding never turns away a ball."""
 
 
 def translation_balls(
@@ -38,11 +40,104 @@ def translation_balls(
     return centres, radii
 
 
+def smallest_balls(
+    aligned: AlignedProblem,
+    bound_rad: FloatArray,
+    arcs: tuple[IndexArray, FloatArray, FloatArray],
+    covering: IndexArray,
+    yaw_rad: float,
+    most: int,
+) -> tuple[IndexArray, FloatArray, FloatArray]:
+    """The ``most`` smallest balls of the pairs whose arcs cover a yaw, smallest first: pairs (S, 2), centres, radii.
+
+    ``arcs`` are those of ``yaw_arcs``, ``covering`` (K,) the indices of those that cover ``yaw_rad``; the slack of each
+    reaches to its arc's farther end. Pairs that bound nothing are left out. Of equal balls the first counts as smaller.
+    """
+    data = (aligned.bearings, aligned.points, bound_rad)
+    pairs, centres, radii = _smallest(*data, *arcs, covering, yaw_rad, most)
+    kept = np.argsort(radii, kind="stable")[:most]
+    return pairs[kept], centres[kept], radii[kept]
+
+
 def overlapping(centres: FloatArray, radii: FloatArray) -> BoolArray:
     """Eq. 38: symmetric matrix (M, M) of balls that overlap; false on the diagonal."""
-    overlap = cdist(centres, centres) <= radii[:, None] + radii[None, :]
-    np.fill_diagonal(overlap, False)
+    overlap = np.zeros((len(radii), len(radii)), dtype=bool)
+    _overlap(np.ascontiguousarray(centres.T), radii, overlap)
     return overlap
+
+
+def edges_of(overlap: BoolArray) -> IndexArray:
+    """(E, 2) places of the balls that overlap, the smaller one first, in ascending order."""
+    return _edges(overlap, np.count_nonzero(overlap) // 2)
+
+
+@numba.njit(cache=True, nogil=True)
+def _edges(overlap, count):
+    edges = np.empty((count + 1, 2), np.int32)
+    found = 0
+    for a in range(len(overlap)):
+        for b in range(a + 1, len(overlap)):
+            edges[found, 0], edges[found, 1] = a, b
+            found += overlap[a, b]
+    return edges[:count]
+
+
+@numba.njit(cache=True, nogil=True)
+def _overlap(centres, radii, overlap):
+    x, y, z = centres
+    for a in range(len(radii)):
+        for b in range(a):
+            dx, dy, dz, reach = x[a] - x[b], y[a] - y[b], z[a] - z[b], radii[a] + radii[b]
+            overlap[a, b] = overlap[b, a] = dx * dx + dy * dy + dz * dz <= reach * reach
+
+
+@numba.njit(cache=True, nogil=True)
+def _smallest(bearings, points, eps, pairs, lo, hi, covering, yaw, most):
+    """Pairs (S, 2) in their order, centres and radii: the ``most`` smallest balls and some more."""
+    chords, sines = chord(eps), np.sin(eps)
+    c, s = np.cos(yaw), np.sin(yaw)
+    room = 2 * most
+    near, centres, radii = np.empty((room, 2), np.int32), np.empty((room, 3)), np.empty(room)
+    count, limit = 0, np.inf
+    for arc in covering:
+        i, j = pairs[arc, 0], pairs[arc, 1]
+        if not _least_squared_radius(i, j, bearings, points, chords, sines, c, s) < limit * limit:
+            continue
+        at = yaw if lo[arc] <= yaw else yaw + 2.0 * np.pi
+        slack = max(at - lo[arc], hi[arc] - at)
+        radii[count] = ball_of_pair(i, j, bearings, points, chords, sines, c, s, slack, centres[count])
+        near[count, 0], near[count, 1] = i, j
+        count += radii[count] < limit
+        if count < room:
+            continue
+        # Keep the smallest, of equal ones the first, and look for smaller ones only.
+        limit = np.partition(radii, most - 1)[most - 1]
+        ties, count = most - np.count_nonzero(radii < limit), 0
+        for place in range(room):
+            if radii[place] < limit or (radii[place] == limit and ties > 0):
+                ties -= radii[place] == limit
+                near[count], centres[count], radii[count] = near[place], centres[place], radii[place]
+                count += 1
+    return near[:count].copy(), centres[:count].copy(), radii[:count].copy()
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _least_squared_radius(i, j, bearings, points, chords, sines, c, s):
+    """A lower bound on the squared radius of ``ball_of_pair``, whatever its slack, for a fraction of the time."""
+    vi, vj, pi, pj = bearings[i], bearings[j], points[i], points[j]
+    dx, dy, dz = pi[0] - pj[0], pi[1] - pj[1], pi[2] - pj[2]
+    x, z = dx * c + dz * s, dz * c - dx * s
+    along_i, along_j = vi[0] * x + vi[1] * dy + vi[2] * z, vj[0] * x + vj[1] * dy + vj[2] * z
+    dot, sin2 = vi[0] * vj[0] + vi[1] * vj[1] + vi[2] * vj[2], _sin2_between(vi, vj)
+    spare = np.sqrt(sin2) - chords[i] - chords[j]
+    if spare <= 0.0:
+        return np.inf
+    # The depths and their bounds as in ``pair_sinusoids``, with the divisions left for the end.
+    depth_i, depth_j = along_i - dot * along_j, dot * along_i - along_j
+    most_i = max(0.0, (spare + chords[i]) * depth_i + chords[j] * depth_j) * sines[i]
+    most_j = max(0.0, (spare + chords[j]) * depth_j + chords[i] * depth_i) * sines[j]
+    squared = (most_i * most_i + most_j * most_j) * (1.0 + abs(dot)) / (spare * spare * sin2 * sin2 * sin2)
+    return squared * (1.0 - ROUNDING)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -77,7 +172,9 @@ def ball_of_pair(i, j, bearings, points, chords, sines, c, s, slack, centre):
     most_i = max(0.0, _value(largest_i, c, s) + _amplitude(largest_i) * slack)
     most_j = max(0.0, _value(largest_j, c, s) + _amplitude(largest_j) * slack)
     spread2 = (most_i * sines[i]) ** 2 + (most_j * sines[j]) ** 2
-    noise = np.sqrt(spread2 / _one_minus_abs_cos(vi, vj))
+    dot = vi[0] * vj[0] + vi[1] * vj[1] + vi[2] * vj[2]
+    # 1 - |cos| = sin^2 / (1 + |cos|)
+    noise = np.sqrt(spread2 * (1.0 + abs(dot)) / _sin2_between(vi, vj))
     return noise + np.sqrt(slope2) * slack + 0.5 * bend * slack * slack
 
 
@@ -96,13 +193,13 @@ def _amplitude(wave):
     return np.sqrt(wave[0] * wave[0] + wave[1] * wave[1])
 
 
-@numba.njit(cache=True, nogil=True)
-def _one_minus_abs_cos(vi, vj):
-    """1 - |cos| of the angle between two unit vectors, without cancellation for small angles."""
+@numba.njit(cache=True, nogil=True, inline="always")
+def _sin2_between(vi, vj):
+    """sin^2 of the angle between two unit vectors, without cancellation for small angles."""
     cx = vi[1] * vj[2] - vi[2] * vj[1]
     cy = vi[2] * vj[0] - vi[0] * vj[2]
     cz = vi[0] * vj[1] - vi[1] * vj[0]
-    return (cx * cx + cy * cy + cz * cz) / (1.0 + abs(vi[0] * vj[0] + vi[1] * vj[1] + vi[2] * vj[2]))
+    return cx * cx + cy * cy + cz * cz
 
 
 @numba.njit(cache=True, nogil=True)

@@ -1,9 +1,12 @@
 """Yaw arcs: for every pair of correspondences, the yaws at which both can be inliers.
 
 At the true yaw of a pair of inliers, |f| <= tau, S_i >= 0 and S_j >= 0 (see ``depth_bounds``). Each of these is
-A cos yaw + B sin yaw + C <= 0, which is one arc, so the feasible yaws are an intersection of four arcs in closed form:
+A cos yaw + B sin yaw + C >= 0, which is one arc, so the feasible yaws are an intersection of four arcs in closed form:
 usually one short arc around each root of Eq. 22 with positive depths. The arcs bound: the true yaw cannot be
 outside while the noise is within its bound.
+
+Arcs are intersected as pairs of unit vectors (cos, sin), from the first end counterclockwise to the second, so that
+angles are computed only of the arcs that are returned: half of all pairs have none.
 """
 
 import numba
@@ -21,6 +24,8 @@ MOST_ARCS = 4
 """Four arcs of a circle intersect in at most four."""
 ROUNDING = 1e-12
 """Slack of every condition, relative to its amplitude, so that rounding never excludes the true yaw."""
+SAME = 1e-9
+"""Sine of the angle by which the ends of a short arc may be swapped by rounding. No long arc leaves so little open."""
 
 
 def yaw_arcs(
@@ -37,46 +42,130 @@ def yaw_arcs(
     pairs = np.empty((room, 2), np.int32)
     lo, hi = np.empty(room), np.empty(room)
     used = _fill(aligned.bearings, aligned.points, bound_rad, widest_rad, pairs, lo, hi)
-    return pairs[:used].copy(), lo[:used].copy(), hi[:used].copy()
+    return pairs[:used], lo[:used], hi[:used]
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _sine_and_cosine(u0, v0, u1, v1):
+    """Of an arc's width, from its ends; the sine is below 0 only if the arc is longer than half the circle."""
+    sine, cosine = u0 * v1 - v0 * u1, u0 * u1 + v0 * v1
+    return (0.0 if sine < 0.0 and sine > -SAME and cosine > 0.0 else sine), cosine
 
 
 @numba.njit(cache=True, nogil=True)
-def _where_not_positive(a, b, c):
-    """The arc (start, width) on which a cos + b sin + c <= 0; its width is below 0 if there is none."""
-    amplitude = np.sqrt(a * a + b * b)
-    c -= ROUNDING * (amplitude + abs(c))
-    if c > amplitude:
-        return 0.0, -1.0
-    if c <= -amplitude:
-        return -np.pi, FULL
-    half = np.pi - np.arccos(-c / amplitude)
-    return np.arctan2(-b, -a) - half, 2.0 * half
+def _holds(u0, v0, u1, v1, x, y):
+    """Whether an arc holds the direction (x, y)."""
+    after_first, before_second = u0 * y - v0 * x >= 0.0, x * v1 - y * u1 >= 0.0
+    if _sine_and_cosine(u0, v0, u1, v1)[0] >= 0.0:
+        return after_first and before_second and u0 * x + v0 * y + u1 * x + v1 * y >= 0.0
+    return after_first or before_second
 
 
 @numba.njit(cache=True, nogil=True)
-def _intersect(arcs, count, start, width, out):
-    """Intersect ``count`` arcs, rows (start, width), with one more into ``out``; return how many there are."""
-    kept = 0
+def _cut(arcs, count, a, b, c):
+    """Replace ``count`` arcs, rows (u0, v0, u1, v1), by what of them has a cos + b sin + c >= 0; return how many are
+    left. A row of zeros is the whole circle.
+    """
+    square = a * a + b * b
+    amplitude = np.sqrt(square)
+    c += ROUNDING * (amplitude + abs(c))
+    if c >= amplitude:
+        return count
+    if c < -amplitude:
+        return 0
+    kept, split = 0, count
     for k in range(count):
-        if arcs[k, 1] >= FULL or width >= FULL:
-            out[kept, 0], out[kept, 1] = (start, width) if arcs[k, 1] >= FULL else (arcs[k, 0], arcs[k, 1])
-            kept += 1
+        u0, v0, u1, v1 = arcs[k, 0], arcs[k, 1], arcs[k, 2], arcs[k, 3]
+        at_first, at_second = a * u0 + b * v0 + c, a * u1 + b * v1 + c
+        sine, cosine = _sine_and_cosine(u0, v0, u1, v1)
+        # Between the ends of a short arc, a wave leaves the range of its values there by this at most.
+        bulge = 0.5 * amplitude * (1.0 - cosine)
+        if sine > 0.0 and max(at_first, at_second) < -bulge:
             continue
-        offset = (start - arcs[k, 0]) % FULL
-        if offset <= arcs[k, 1]:
-            out[kept, 0], out[kept, 1] = start, min(arcs[k, 1] - offset, width)
-            kept += 1
-        if offset + width >= FULL:
-            out[kept, 0], out[kept, 1] = arcs[k, 0], min(arcs[k, 1], offset + width - FULL)
-            kept += 1
+        if sine <= 0.0 or min(at_first, at_second) < bulge:
+            # The condition holds from ``first`` to ``second``, around (a, b).
+            root, per_square = np.sqrt(max(square - c * c, 0.0)), 1.0 / square
+            first_u, first_v = (b * root - c * a) * per_square, (-a * root - c * b) * per_square
+            second_u, second_v = (-b * root - c * a) * per_square, (a * root - c * b) * per_square
+            whole, outside = u0 == 0.0 and v0 == 0.0, at_first < 0.0 and at_second < 0.0
+            if outside and not whole and not _holds(u0, v0, u1, v1, a, b):
+                continue
+            if at_first >= 0.0 and at_second >= 0.0 and not whole and _holds(u0, v0, u1, v1, -a, -b):
+                arcs[split, 0], arcs[split, 1], arcs[split, 2], arcs[split, 3] = first_u, first_v, u1, v1
+                split += 1
+                u1, v1 = second_u, second_v
+            if at_first < 0.0 or whole:
+                u0, v0 = first_u, first_v
+            if at_second < 0.0 or whole:
+                u1, v1 = second_u, second_v
+        arcs[kept, 0], arcs[kept, 1], arcs[kept, 2], arcs[kept, 3] = u0, v0, u1, v1
+        kept += 1
+    for k in range(count, split):
+        arcs[kept] = arcs[k]
+        kept += 1
     return kept
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _clear_sign(wave, u0, v0, u1, v1, cosine):
+    """1 or -1 if the wave has this sign on all of a short arc with the given cosine of its width, 0 if unclear."""
+    at_first, at_second = wave[0] * u0 + wave[1] * v0 + wave[2], wave[0] * u1 + wave[1] * v1 + wave[2]
+    # At least the bulge of ``_cut``.
+    amplitude = abs(wave[0]) + abs(wave[1])
+    bulge = 0.5 * amplitude * (1.0 - cosine)
+    below = -bulge - ROUNDING * (amplitude + abs(wave[2]))
+    return (min(at_first, at_second) >= bulge) - (max(at_first, at_second) < below)
+
+
+@numba.njit(cache=True, nogil=True)
+def _arcs_at_roots(f, tau, most_i, most_j, arcs):
+    """The arcs where all conditions hold if there is at most a short one at each of two roots of f; else -1.
+
+    Gives what four cuts give, for most pairs, with few branches.
+    """
+    a, b, c = tau[0] - f[0], tau[1] - f[1], tau[2] - f[2]
+    d, e, g = tau[0] + f[0], tau[1] + f[1], tau[2] + f[2]
+    square, square2 = a * a + b * b, d * d + e * e
+    amplitude, amplitude2 = np.sqrt(square), np.sqrt(square2)
+    c += ROUNDING * (amplitude + abs(c))
+    g += ROUNDING * (amplitude2 + abs(g))
+    if c < -amplitude or g < -amplitude2:
+        return 0
+    if c >= amplitude or g >= amplitude2:
+        return -1
+    root, per_square = np.sqrt(square - c * c), 1.0 / square
+    root2, per_square2 = np.sqrt(square2 - g * g), 1.0 / square2
+    ends = (
+        ((b * root - c * a) * per_square, (-a * root - c * b) * per_square),
+        ((-e * root2 - g * d) * per_square2, (d * root2 - g * e) * per_square2),
+        ((e * root2 - g * d) * per_square2, (-d * root2 - g * e) * per_square2),
+        ((-b * root - c * a) * per_square, (a * root - c * b) * per_square),
+    )
+    below = -2.0 * ROUNDING * (amplitude + abs(c) + amplitude2 + abs(g))
+    count, roots, clear = 0, 0, True
+    for k in (0, 2):
+        u0, v0 = ends[k]
+        u1, v1 = ends[k + 1]
+        sine, cosine = _sine_and_cosine(u0, v0, u1, v1)
+        # At the ends |f| = |tau|: where tau is negative there, no yaw near the root fulfils both conditions.
+        at_first, at_second = tau[0] * u0 + tau[1] * v0 + tau[2], tau[0] * u1 + tau[1] * v1 + tau[2]
+        real, none = (at_first >= 0.0) & (at_second >= 0.0), (at_first < below) & (at_second < below)
+        sign_i, sign_j = _clear_sign(most_i, u0, v0, u1, v1, cosine), _clear_sign(most_j, u0, v0, u1, v1, cosine)
+        holds = real & (sign_i > 0) & (sign_j > 0)
+        clear &= none | (real & (sine > 0.0) & (holds | (sign_i < 0) | (sign_j < 0)))
+        arcs[count, 0], arcs[count, 1], arcs[count, 2], arcs[count, 3] = u0, v0, u1, v1
+        count += holds
+        roots += real
+    # The second condition must fail in the middle of where the first holds, or the arcs around two roots are one.
+    return count if clear and (roots < 2 or c * amplitude2 >= a * d + b * e) else -1
 
 
 @numba.njit(cache=True, nogil=True)
 def _fill(bearings, points, eps, widest, pairs, lo, hi):
     used = 0
     chords, sines = chord(eps), np.sin(eps)
-    arcs, scratch = np.empty((MOST_ARCS + 1, 2)), np.empty((MOST_ARCS + 1, 2))
+    least_cosine = np.cos(widest) - SAME if widest < np.pi else -2.0
+    arcs = np.empty((2 * MOST_ARCS, 4))
     for i in range(len(bearings)):
         for j in range(i + 1, len(bearings)):
             sin_alpha, f, _, _, most_i, most_j, tau = pair_sinusoids(
@@ -84,24 +173,25 @@ def _fill(bearings, points, eps, widest, pairs, lo, hi):
             )
             if sin_alpha == 0.0:
                 continue
-            arcs[0] = _where_not_positive(f[0] - tau[0], f[1] - tau[1], f[2] - tau[2])
-            count = 1 if arcs[0, 1] >= 0.0 else 0
-            for a, b, c in (
-                (-f[0] - tau[0], -f[1] - tau[1], -f[2] - tau[2]),
-                (-most_i[0], -most_i[1], -most_i[2]),
-                (-most_j[0], -most_j[1], -most_j[2]),
-            ):
-                if count == 0:
-                    break
-                start, width = _where_not_positive(a, b, c)
-                count = _intersect(arcs, count, start, width, scratch) if width >= 0.0 else 0
-                arcs, scratch = scratch, arcs
+            count = _arcs_at_roots(f, tau, most_i, most_j, arcs)
+            if count < 0:
+                arcs[0] = 0.0
+                count = _cut(arcs, 1, tau[0] - f[0], tau[1] - f[1], tau[2] - f[2])
+                count = _cut(arcs, count, tau[0] + f[0], tau[1] + f[1], tau[2] + f[2])
+                count = _cut(arcs, count, most_i[0], most_i[1], most_i[2])
+                count = _cut(arcs, count, most_j[0], most_j[1], most_j[2])
             for k in range(count):
-                if arcs[k, 1] > widest:
-                    continue
-                start = (arcs[k, 0] + np.pi) % FULL - np.pi
-                start -= FULL if start >= np.pi else 0.0
-                pairs[used, 0], pairs[used, 1] = i, j
-                lo[used], hi[used] = start, start + min(arcs[k, 1], FULL)
-                used += 1
+                u0, v0, u1, v1 = arcs[k, 0], arcs[k, 1], arcs[k, 2], arcs[k, 3]
+                start, width = -np.pi, FULL
+                if u0 != 0.0 or v0 != 0.0:
+                    sine, cosine = _sine_and_cosine(u0, v0, u1, v1)
+                    if cosine < least_cosine:
+                        continue
+                    start, width = np.arctan2(v0, u0), np.arctan2(sine, cosine)
+                    start -= FULL if start >= np.pi else 0.0
+                    width += FULL if width < 0.0 else 0.0
+                if width <= widest:
+                    pairs[used, 0], pairs[used, 1] = i, j
+                    lo[used], hi[used] = start, start + width
+                    used += 1
     return used

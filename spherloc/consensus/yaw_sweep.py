@@ -39,26 +39,53 @@ def deepest_yaw(lo_rad: FloatArray, hi_rad: FloatArray) -> YawConsensus | None:
     """
     if len(lo_rad) == 0:
         return None
-    full = hi_rad - lo_rad >= 2 * np.pi
-    wraps = (hi_rad >= np.pi) & ~full
-    ends = np.where(wraps, hi_rad - 2 * np.pi, hi_rad)
+    starts, ends, depth = _ends(lo_rad, hi_rad)
+    starts.sort()
+    ends.sort()
     overlap = np.zeros(BINS, np.int32)
-    always = int(np.count_nonzero(full))
-    start, end = _sweep(np.sort(lo_rad[~full]), np.sort(ends[~full]), always + int(np.count_nonzero(wraps)), overlap)
+    start, end = _sweep(starts, ends, depth, overlap)
     yaw = 0.5 * (start + end)
     yaw -= 2 * np.pi if yaw >= np.pi else 0.0
-    covers = full | np.where(wraps, (lo_rad <= yaw) | (yaw <= ends), (lo_rad <= yaw) & (yaw <= ends))
-    return YawConsensus((start, end), yaw, np.flatnonzero(covers).astype(np.int32), overlap)
+    return YawConsensus((start, end), yaw, _covering(lo_rad, hi_rad, yaw), overlap)
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _kind(lo, hi):
+    """Whether an arc is the whole circle, whether it crosses the seam, and its upper end below pi."""
+    full = hi - lo >= 2 * np.pi
+    wraps = hi >= np.pi and not full
+    return full, wraps, hi - 2 * np.pi if wraps else hi
 
 
 @numba.njit(cache=True, nogil=True)
-def _mark(overlap, start, end, depth):
-    """Raise the bins that touch [start, end] to ``depth``."""
-    bins = len(overlap)
-    first = max(0, min(bins - 1, int((start + np.pi) / (2 * np.pi) * bins)))
-    last = max(0, min(bins - 1, int((end + np.pi) / (2 * np.pi) * bins)))
-    for b in range(first, last + 1):
-        overlap[b] = max(overlap[b], depth)
+def _ends(lo, hi):
+    """Lower and upper ends of the arcs but whole circles, in any order, and how many arcs cover -pi from before."""
+    starts, ends = np.empty(len(lo)), np.empty(len(lo))
+    count, depth = 0, 0
+    for k in range(len(lo)):
+        full, wraps, end = _kind(lo[k], hi[k])
+        starts[count], ends[count] = lo[k], end
+        count += not full
+        depth += full or wraps
+    return starts[:count], ends[:count], depth
+
+
+@numba.njit(cache=True, nogil=True)
+def _covering(lo, hi, yaw):
+    """Indices of the arcs that cover a yaw of [-pi, pi)."""
+    covering = np.empty(len(lo), np.int32)
+    count = 0
+    for k in range(len(lo)):
+        full, wraps, end = _kind(lo[k], hi[k])
+        above, below = lo[k] <= yaw, yaw <= end
+        covering[count] = k
+        count += full | (wraps & (above | below)) | (above & below)
+    return covering[:count].copy()
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _bin(yaw):
+    return max(0, min(BINS - 1, int((yaw + np.pi) * (BINS / (2 * np.pi)))))
 
 
 @numba.njit(cache=True, nogil=True)
@@ -70,14 +97,16 @@ def _sweep(starts, ends, depth, overlap):
     """
     count = len(starts)
     opened, closed = 0, 0
-    here, best, best_lo, best_hi = -np.pi, -1, -np.pi, np.pi
+    here, first, best, best_lo, best_hi = -np.pi, 0, -1, -np.pi, np.pi
     # The interval that starts at -pi continues the one that ends at pi.
     seam_depth, seam_end = -1, -np.pi
     while True:
         next_open = starts[opened] if opened < count else np.inf
         next_close = ends[closed] if closed < count else np.inf
         there = min(next_open, next_close, np.pi)
-        _mark(overlap, here, there, depth)
+        last = _bin(there)
+        for b in range(first, last + 1):
+            overlap[b] = max(overlap[b], depth)
         if seam_depth < 0 and there > -np.pi:
             seam_depth, seam_end = depth, there
         far = there + (seam_end + np.pi if there == np.pi and depth == seam_depth and here > -np.pi else 0.0)
@@ -85,10 +114,9 @@ def _sweep(starts, ends, depth, overlap):
             best, best_lo, best_hi = depth, here, far
         if there == np.pi:
             return best_lo, best_hi
-        if next_open <= next_close:
-            depth += 1
-            opened += 1
-        else:
-            depth -= 1
-            closed += 1
-        here = there
+        # Which one comes next is as good as random: arithmetic instead of a branch.
+        opens = np.int64(next_open <= next_close)
+        depth += 2 * opens - 1
+        opened += opens
+        closed += 1 - opens
+        here, first = there, last

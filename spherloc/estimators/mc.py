@@ -4,13 +4,14 @@ maximum clique, refinement. Deterministic: no random draw.
 
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from spherloc.bounds import Bounds
-from spherloc.consensus.inliers import count_inliers
+from spherloc.consensus.inliers import BLOCK, ROWS, count_inliers, pack_blocks, reaches
 from spherloc.consensus.max_clique import max_clique
-from spherloc.consensus.translation_balls import overlapping, translation_balls
+from spherloc.consensus.translation_balls import edges_of, overlapping, smallest_balls
 from spherloc.consensus.yaw_arcs import yaw_arcs
 from spherloc.consensus.yaw_sweep import YawConsensus, deepest_yaw
 from spherloc.errors import InputError
@@ -111,28 +112,20 @@ def _locate(
 ) -> tuple[TranslationStage | None, FloatArray | None]:
     """Balls of the rotation clique, their maximum clique, and the aligned pose (3, 4) that it proposes."""
     yaw, arcs = consensus.yaw_rad, consensus.clique
-    turns = np.where(lo[arcs] <= yaw, 0.0, 2 * np.pi)
-    slack = np.maximum(yaw + turns - lo[arcs], hi[arcs] - yaw - turns)
-    centres, radii = translation_balls(aligned, bounds.radians, pairs[arcs], yaw, slack)
-    kept = np.flatnonzero(np.isfinite(radii))
-    if len(kept) == 0:
+    most = int(options.max_balls)
+    pairs, centres, radii = smallest_balls(aligned, bounds.radians, (pairs, lo, hi), arcs, yaw, most)
+    if len(pairs) == 0:
         return None, None
-    most = min(int(options.max_balls), len(kept))
-    # Only the smallest need be sorted, of what may be millions.
-    limit = np.partition(radii[kept], most - 1)[most - 1]
-    kept = kept[radii[kept] <= limit]
-    kept = kept[np.argsort(radii[kept], kind="stable")][:most]
-    centres, radii, pairs = centres[kept], radii[kept], pairs[arcs][kept]
     overlap = overlapping(centres, radii)
     clique = max_clique(overlap)
     start = _best_start(aligned, bounds, pairs[clique.nodes], yaw, centres[clique.nodes], radii[clique.nodes])
     stage = TranslationStage(
         candidates=len(arcs),
-        rule=_rule(len(kept), len(arcs), int(options.max_balls)),
+        rule=_rule(len(pairs), len(arcs), most),
         pairs=aligned.index.astype(np.int32)[pairs],
         centres_m=centres,
         radii_m=radii,
-        edges=np.argwhere(np.triu(overlap)).astype(np.int32),
+        edges=edges_of(overlap),
         clique=clique.nodes,
         proven=clique.proven,
         cam_from_map=aligned.unalign_pose(start),
@@ -153,9 +146,23 @@ def _best_start(
     yaws, translations, exists = two_point(aligned.bearings[pairs], aligned.points[pairs])
     yaws, translations = np.append(yaw, yaws[exists]), np.vstack([mean[:, 3], translations[exists]])
     data = (aligned.bearings, aligned.points, aligned.pixel_from_bearing, bounds.pixels)
-    support = [count_inliers(angle, t, *data) for angle, t in zip(yaws, translations, strict=True)]
-    best = int(np.argmax(support))
+    best = _most_inliers(yaws, translations, *data)
     return pose(yaw_rotation(yaws[best]), translations[best])
+
+
+@numba.njit(cache=True, nogil=True)
+def _most_inliers(yaws, translations, bearings, points, weights, bound_px):
+    """Index of the pose that explains most correspondences, the first of equals."""
+    count = len(points)
+    blocks = pack_blocks(points, weights, bound_px, np.arange(count))
+    left = np.maximum(count - BLOCK * np.arange(1, len(blocks) // (ROWS * BLOCK) + 1), 0)
+    best, most = 0, -1
+    for k in range(len(yaws)):
+        if reaches(yaws[k], translations[k], blocks, most + 1 - left):
+            inliers = count_inliers(yaws[k], translations[k], bearings, points, weights, bound_px)
+            if inliers > most:
+                best, most = k, inliers
+    return best
 
 
 def _rule(kept: int, candidates: int, most: int) -> str:

@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 from pair_samples import aligned_problem, sample, unit
 
-from spherloc.consensus.translation_balls import overlapping, translation_balls
+from spherloc.consensus.translation_balls import edges_of, overlapping, smallest_balls, translation_balls
+from spherloc.consensus.yaw_arcs import yaw_arcs
+from spherloc.consensus.yaw_sweep import deepest_yaw
 from spherloc.geometry import yaw_rotation
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
@@ -96,6 +98,48 @@ def test_centre_is_where_the_rays_come_closest(rng):
         expected = np.linalg.lstsq(np.vstack(projectors), b.ravel(), rcond=None)[0]
         scale = np.linalg.norm(points[0] - points[1]) / np.linalg.norm(np.cross(*rays)) ** 2
         np.testing.assert_allclose(centre, expected, atol=1e-11 * scale)
+
+
+@pytest.mark.parametrize("most", [1, 2, 17, 100, 5000])
+@pytest.mark.parametrize("bound", [1e-3, 0.02])
+def test_smallest_balls_are_the_first_of_all_balls_sorted(rng, bound, most):
+    """Against all balls and a stable sort; every correspondence is there twice, so that balls are equal in fours."""
+    s = sample(rng, bound, 40)
+    twice = aligned_problem(np.repeat(s.aligned.bearings, 2, axis=0), np.repeat(s.aligned.points, 2, axis=0))
+    bounds = np.repeat(s.bound_rad, 2)
+    pairs, lo, hi = yaw_arcs(twice, bounds)
+    found = deepest_yaw(lo, hi)
+    assert found is not None and len(found.clique) > 200
+    covering, yaw = found.clique, found.yaw_rad
+    at = np.where(lo[covering] <= yaw, yaw, yaw + 2 * np.pi)
+    slack = np.maximum(at - lo[covering], hi[covering] - at)
+    centres, radii = translation_balls(twice, bounds, pairs[covering], yaw, slack)
+    first = np.argsort(radii, kind="stable")[:most]
+    small, small_centres, small_radii = smallest_balls(twice, bounds, (pairs, lo, hi), covering, yaw, most)
+    np.testing.assert_array_equal(small, pairs[covering][first])
+    np.testing.assert_array_equal(small_centres, centres[first])
+    np.testing.assert_array_equal(small_radii, radii[first])
+
+
+def test_smallest_balls_leave_out_pairs_that_bound_nothing(rng):
+    """Two equal bearings have no ball, whatever arc they are given."""
+    v, p = unit(rng.normal(size=(3, 3))), rng.uniform(-5, 5, (3, 3))
+    v[1] = v[0]
+    pairs = np.array([[0, 1], [0, 2], [1, 2]], np.int32)
+    arcs = pairs, np.full(3, -0.1), np.full(3, 0.1)
+    every = np.arange(3, dtype=np.int32)
+    small, _, radii = smallest_balls(aligned_problem(v, p), np.full(3, 1e-3), arcs, every, 0.0, 10)
+    assert sorted(map(tuple, small.tolist())) == [(0, 2), (1, 2)] and np.isfinite(radii).all()
+    none = smallest_balls(aligned_problem(v, p), np.full(3, 1e-3), arcs, every[:1], 0.0, 10)
+    assert [len(part) for part in none] == [0, 0, 0]
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 40])
+def test_edges_are_the_upper_triangle(rng, count):
+    matrix = overlapping(rng.uniform(-3, 3, (count, 3)), rng.uniform(0, 2, count))
+    edges = edges_of(matrix)
+    assert edges.dtype == np.int32 and edges.shape[1:] == (2,)
+    np.testing.assert_array_equal(edges, np.argwhere(np.triu(matrix)))
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 40])

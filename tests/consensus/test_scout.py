@@ -1,0 +1,91 @@
+"""The core of a bin's graph against an exact one; the scout's bounds hold, and its poses explain what they say."""
+
+import networkx as nx
+import numpy as np
+import pytest
+from small_problems import explained, good_poses, tight_problem
+
+from spherloc.consensus.pair_arcs import pair_arcs, turn_of
+from spherloc.consensus.scout import core_graph, scout
+from spherloc.consensus.yaw_bins import BIN_TURN, BINS, degree_bounds, sort_into_bins
+
+pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
+
+
+def adjacency_of(rows):
+    count = len(rows)
+    return np.unpackbits(rows.view(np.uint8).reshape(count, -1), axis=1, bitorder="little")[:, :count].astype(bool)
+
+
+@pytest.mark.parametrize("count", [5, 63, 64, 65, 100])
+def test_core_graph_is_the_k_core(rng, count):
+    """No node with too few edges among those that are left, and all edges of the others."""
+    for density in (0.05, 0.2, 0.6):
+        every = np.column_stack(np.triu_indices(count, 1))
+        edges = every[rng.random(len(every)) < density].astype(np.uint16)
+        graph = nx.empty_graph(count)
+        graph.add_edges_from(edges.tolist())
+        before = edges.copy()
+        for least in {0, 1, 2, count // 10, count // 4, count}:
+            nodes, rows = core_graph(count, edges, least)
+            expected = nx.k_core(graph, least)
+            assert sorted(nodes.tolist()) == sorted(expected.nodes)
+            assert rows.shape == (len(nodes), (len(nodes) + 63) // 64)
+            if len(nodes):
+                inside = nx.to_numpy_array(expected, nodelist=nodes.tolist()).astype(bool)
+                np.testing.assert_array_equal(adjacency_of(rows), inside)
+                assert (np.diff(inside.sum(axis=0)) <= 0).all(), "not by falling degree"
+        np.testing.assert_array_equal(edges, before)
+
+
+def test_two_arcs_of_a_pair_are_one_edge(rng):
+    """They may keep a node that has too few edges, which costs time; the edge itself is there once."""
+    edges = np.array([[0, 1], [0, 1], [1, 2]], np.uint16)
+    nodes, rows = core_graph(3, edges, 1)
+    inside = adjacency_of(rows)[np.ix_(np.argsort(nodes), np.argsort(nodes))]
+    np.testing.assert_array_equal(inside, [[0, 1, 0], [1, 0, 1], [0, 1, 0]])
+
+
+def run(problem, floor):
+    """Bounds of the bins before and after a scout that knows nothing, and what it found."""
+    aligned, bounds = problem.aligned, problem.bounds
+    count = len(aligned.bearings)
+    least_cos = np.cos(np.minimum(bounds.radians + 1e-9, np.pi / 2))
+    data = (aligned.bearings, aligned.points, aligned.pixel_from_bearing, bounds.pixels, least_cos)
+    pairs, lo, hi = pair_arcs(aligned, bounds.radians)
+    starts, edges = sort_into_bins(pairs, lo, hi)
+    before = degree_bounds(count, starts, edges)
+    bound = before.copy()
+    poses, supports, masks = np.empty((8, 5)), np.zeros(8, np.int32), np.zeros((8, count), np.bool_)
+    known = scout(data, starts, edges, bound, floor, poses, supports, masks, 0)
+    return before, bound, poses[:known], supports[:known], masks[:known]
+
+
+@pytest.mark.parametrize("floor", [0, 2, 4])
+@pytest.mark.parametrize("outliers", [0, 5, 9])
+def test_bounds_hold_and_poses_explain_what_they_say(rng, outliers, floor):
+    """Inliers on the edge of their bounds at the true pose: the bin of the true yaw must allow for all of them."""
+    found_all, trials = 0, 12
+    for _ in range(trials):
+        problem = tight_problem(rng, 14, outliers, rng.choice([1.0, 5.0]), share=rng.choice([0.7, 0.999]))
+        before, bound, poses, supports, masks = run(problem, floor)
+        assert (bound <= before).all()
+        yaws, centres = good_poses(problem.aligned, problem.bounds)
+        yaws, centres = np.append(yaws, problem.yaw), np.vstack([centres, problem.centre])
+        most = explained(problem.aligned, problem.bounds, yaws, centres).sum(axis=1)
+        bins = np.floor(turn_of(yaws) / BIN_TURN).astype(int) % BINS
+        assert (most <= bound[bins]).all(), "a pose explains more than the bound of its bin"
+        assert (np.diff(supports) <= 0).all()
+        mine = explained(problem.aligned, problem.bounds, np.arctan2(poses[:, 1], poses[:, 0]), poses[:, 2:])
+        np.testing.assert_array_equal(mine, masks)
+        np.testing.assert_array_equal(masks.sum(axis=1), supports)
+        found_all += len(supports) > 0 and supports[0] >= 0.7 * problem.inliers.sum()
+    if floor < 14 - outliers:
+        assert found_all >= trials // 2
+
+
+def test_nothing_is_looked_for_below_the_floor(rng):
+    problem = tight_problem(rng, 12, 6, 2.0)
+    before, bound, poses, _, _ = run(problem, 12)
+    assert len(poses) == 0
+    np.testing.assert_array_equal(bound, before)
