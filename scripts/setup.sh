@@ -143,6 +143,11 @@ install_python() {
   say "installing Python packages into .venv (the first time takes a minute or more)"
   watch "$venv" -m pip install --disable-pip-version-check -e ".$extras" ||
     die "pip could not install the packages, for the reason above; mend that and try again."
+  if [ "$target" != lint ]; then
+    say "preparing the solvers, once: about a minute"
+    "$venv" -c 'from spherloc.estimators import warm_up; warm_up()' ||
+      die "the solvers could not be prepared, for the reason above; mend that and try again."
+  fi
   printf '%s\n' "$state" >"$stamp$target"
 }
 

@@ -188,7 +188,7 @@ def test_bound_over_yaw_has_every_bin(rng):
     found = search(tight_problem(rng, 6, 3, 2.0))
     fine = np.linspace(-np.pi, np.pi, 60_001)
     turns = turn_of(fine) / BIN_TURN
-    for bins in (2, 7, 360, 1440, 5000):
+    for bins in (2, 8, 360, 1440, 5000):
         for b in (0, 1, *(k * BINS // 4 + more for k in (1, 2, 3) for more in (-1, 0, 1)), BINS - 2, BINS - 1):
             peak = np.zeros(BINS, np.int32)
             peak[b] = 5
