@@ -62,7 +62,7 @@ class ExactConsensus:
     """Whether every bin was searched to its end."""
 
     def bound_over_yaw(self, bins: int) -> IndexArray:
-        """``bound`` (bins,) by yaw, from -pi upwards in equal steps."""
+        """``bound`` by yaw, from -pi upwards in an even number of equal steps."""
         ends = turn_of(np.linspace(-np.pi, np.pi, bins + 1)) / BIN_TURN
         first = np.floor(ends[:-1] + 1e-9).astype(int) % BINS
         last = np.maximum(first, np.ceil(ends[1:] - 1e-9).astype(int) - 1)
@@ -139,7 +139,7 @@ def exact_consensus(
         poses=_as_matrices(poses[:known]),
         supports=supports[:known],
         mask=masks[0],
-        bound=bound,
+        bound=np.maximum(bound, 1),  # a camera can always be where it sees one point
         clique=clique.astype(np.int32),
         arcs=len(pairs),
         effort=effort,

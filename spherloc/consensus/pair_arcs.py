@@ -27,7 +27,8 @@ def turn_of(yaw_rad: FloatArray) -> FloatArray:
     """Turns in [0, 4) of yaws (any shape), rad."""
     c, s = np.cos(yaw_rad), np.sin(yaw_rad)
     quarter = s / (np.abs(c) + np.abs(s))
-    return np.where(c >= 0.0, quarter, 2.0 - quarter) % CIRCLE
+    turn = np.where(c >= 0.0, quarter, 2.0 - quarter) % CIRCLE
+    return np.where(turn < CIRCLE, turn, 0.0)
 
 
 def pair_arcs(aligned: AlignedProblem, bound_rad: FloatArray) -> tuple[IndexArray, FloatArray, FloatArray]:

@@ -21,12 +21,12 @@ SAME_CONSENSUS = 0.5
 
 
 @numba.njit(cache=True, nogil=True)
-def residual(data, k, here):
-    """Residual of a correspondence, px; inf farther from its bearing than its angular bound allows."""
+def residual(data, k, here, least_cos):
+    """Residual of a correspondence, px; inf farther from its bearing than the angle of that cosine, or behind it."""
     gx, gy, gz, _ = ray(data[1][k], here)
     v, weight = data[0][k], data[2][k]
     along = v[0] * gx + v[1] * gy + v[2] * gz
-    if along <= 0.0 or along < data[4][k]:
+    if along <= 0.0 or along < least_cos:
         return np.inf
     du = weight[0, 0] * gx + weight[0, 1] * gy + weight[0, 2] * gz
     dv = weight[1, 0] * gx + weight[1, 1] * gy + weight[1, 2] * gz
@@ -38,7 +38,7 @@ def mark_support(data, here, mask):
     """Set ``mask`` (M,) to what a level pose explains; returns how many."""
     inliers = 0
     for k in range(len(mask)):
-        mask[k] = residual(data, k, here) <= data[3][k]
+        mask[k] = residual(data, k, here, data[4][k]) <= data[3][k]
         inliers += mask[k]
     return inliers
 
@@ -57,8 +57,6 @@ def explain_more(data, members, here, mask):
     heavy, moved, chosen = np.empty(count), here.copy(), mask.copy()
     climbing = True
     for k in range(ROUNDS + SQUEEZES):
-        if climbing and k == ROUNDS:
-            climbing = False
         if climbing:
             heavy[:] = chosen
         else:
@@ -67,10 +65,11 @@ def explain_more(data, members, here, mask):
             _reweight(data, members, moved, heavy)
         fit(points, weights, heavy, moved, STEPS if climbing else 1)
         support = mark_support(data, moved, chosen)
-        if support > best:
+        grown = support > best
+        if grown:
             best = support
             here[:], mask[:] = moved, chosen
-        elif climbing:
+        if climbing and not (grown and k + 1 < ROUNDS):
             climbing = False
             moved[:] = here
             heavy[:] = 0.0
@@ -83,7 +82,7 @@ def _reweight(data, members, here, heavy):
     """Multiply the members' weights by the share of the bound that their residuals take; their mean becomes 1."""
     total = 0.0
     for k in members:
-        heavy[k] *= min(max(residual(data, k, here) / data[3][k], 1e-3), 10.0)
+        heavy[k] *= min(max(residual(data, k, here, 0.0) / data[3][k], 1e-3), 10.0)
         total += heavy[k]
     for k in members:
         heavy[k] *= len(members) / total

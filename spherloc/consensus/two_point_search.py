@@ -92,8 +92,8 @@ def search_two_point(
         confidence_reached=reached,
         improved_at=log[:, 0].astype(np.int32),
         samples=log[:, 1:3].astype(np.int32),
-        yaws_rad=log[:, 3],
-        translations=log[:, 4:7],
+        yaws_rad=log[:, 3].copy(),
+        translations=log[:, 4:7].copy(),
         support=log[:, 7].astype(np.int32),
         locally_optimized=log[:, 8] != 0.0,
     )

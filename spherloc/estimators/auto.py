@@ -44,7 +44,7 @@ class Auto:
     @staticmethod
     def run(aligned: AlignedProblem, options: AutoOptions, bounds: Bounds, seed: int, clock: Clock) -> Outcome:
         """Probe, choose, run what was chosen; its stages follow the decision."""
-        with clock.stage("probe"):
+        with clock.stage("decision"):
             probe = search_two_point(
                 aligned, bounds.pixels, seed, PROBE_SAMPLES, PROBE_CONFIDENCE, local_optimization=True
             )

@@ -17,25 +17,32 @@ def adjacency_of(rows):
     return np.unpackbits(rows.view(np.uint8).reshape(count, -1), axis=1, bitorder="little")[:, :count].astype(bool)
 
 
-@pytest.mark.parametrize("count", [5, 63, 64, 65, 100])
-def test_core_graph_is_the_k_core(rng, count):
-    """No node with too few edges among those that are left, and all edges of the others."""
-    for density in (0.05, 0.2, 0.6):
+@pytest.mark.parametrize("count, densities", [(5, (0.3, 0.8)), (20, (0.1, 0.6)), (64, (0.05, 0.2)), (65, (0.3,))])
+def test_core_graph_keeps_every_larger_clique(rng, count, densities):
+    """Whatever it leaves out, nodes or edges, is in no clique of more than the least, and it invents nothing."""
+    thinner = 0
+    for density in densities:
         every = np.column_stack(np.triu_indices(count, 1))
         edges = every[rng.random(len(every)) < density].astype(np.uint16)
         graph = nx.empty_graph(count)
         graph.add_edges_from(edges.tolist())
+        given = nx.to_numpy_array(graph).astype(bool)
         before = edges.copy()
-        for least in {0, 1, 2, count // 10, count // 4, count}:
+        for least in (1, 2, 3, 4, 6, count):
             nodes, rows = core_graph(count, edges, least)
-            expected = nx.k_core(graph, least)
-            assert sorted(nodes.tolist()) == sorted(expected.nodes)
             assert rows.shape == (len(nodes), (len(nodes) + 63) // 64)
+            left = np.zeros((count, count), dtype=bool)
             if len(nodes):
-                inside = nx.to_numpy_array(expected, nodelist=nodes.tolist()).astype(bool)
-                np.testing.assert_array_equal(adjacency_of(rows), inside)
-                assert (np.diff(inside.sum(axis=0)) <= 0).all(), "not by falling degree"
+                left[np.ix_(nodes, nodes)] = adjacency_of(rows)
+            assert not (left & ~given).any()
+            assert set(nodes.tolist()) <= set(nx.k_core(graph, least).nodes)
+            for clique in nx.find_cliques(graph):
+                if len(clique) > least:
+                    assert set(clique) <= set(nodes.tolist())
+                    assert (left[np.ix_(clique, clique)] | np.eye(len(clique), dtype=bool)).all()
+            thinner += len(nodes) < count
         np.testing.assert_array_equal(edges, before)
+    assert thinner > 0
 
 
 def test_two_arcs_of_a_pair_are_one_edge(rng):

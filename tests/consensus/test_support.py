@@ -36,7 +36,7 @@ def test_residuals_are_those_of_refinement(rng):
         yaw, centre = problem.yaw + rng.normal(0, 0.02), problem.centre + rng.normal(0, 0.05, 3)
         turn, here = yaw_rotation(yaw), here_of(yaw, centre)
         expected = residuals_px(problem.aligned, pose(turn, -turn @ centre))
-        mine = np.array([residual(data_of(problem), k, here) for k in range(30)])
+        mine = np.array([residual(data_of(problem), k, here, data_of(problem)[4][k]) for k in range(30)])
         ray = (problem.aligned.points - centre) @ turn.T
         cosine = np.sum(ray * problem.aligned.bearings, axis=1) / np.linalg.norm(ray, axis=1)
         inside = np.arccos(np.clip(cosine, -1, 1)) <= problem.bounds.radians
