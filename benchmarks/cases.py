@@ -28,7 +28,7 @@ FRONT_CAMERA = KannalaBrandt(
 """An equidistant lens of 184 degrees from corner to corner: peers that see only the front half lose hardly a point.
 The other simulated camera sees 37 % of its points behind the image plane."""
 
-PEER_BUDGET_S = 40.0
+PEER_BUDGET_S = 20.0
 OUR_BUDGET_S = 150.0
 
 

@@ -106,7 +106,7 @@ def exact_consensus(
     starts, edges = sort_into_bins(pairs, lo, hi)
     bound = degree_bounds(count, starts, edges)
     # What chance explains too often to be told apart is looked for last.
-    for expected in (HOPELESS, np.inf):
+    for expected in (HOPELESS, np.inf) if len(edges) < effort_limit else ():
         if chance_sets(count, int(supports[0]), wrong_rate) > DOUBTFUL:
             floor = least_size(count, wrong_rate, expected) - 1
             known = scout(data, starts, edges, bound, floor, poses, supports, masks, known)

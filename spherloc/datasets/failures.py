@@ -19,8 +19,8 @@ from spherloc.geometry import camera_centre, pose, yaw_rotation
 
 FloatArray = NDArray[np.float64]
 
-GUESSES = 500
-"""Pairs that mc-exact samples for its first guess."""
+GUESSES = 100
+"""Pairs that mc-exact samples with the least effort."""
 
 
 def _ok(make: CaseMaker) -> FailureCase:

@@ -11,7 +11,7 @@ from spherloc.consensus.exact import ExactConsensus, exact_consensus
 from spherloc.consensus.two_point_search import TwoPointSearch, search_two_point
 from spherloc.errors import InputError
 from spherloc.estimators.base import Clock, Outcome, check_positive
-from spherloc.geometry import rotation_angle, yaw_of, yaw_rotation
+from spherloc.geometry import yaw_of
 from spherloc.problem import AlignedProblem
 from spherloc.refine import RefinementOptions, refine, residuals_px
 from spherloc.trace import Certificate, ConsensusStage
@@ -22,6 +22,7 @@ MOST_CORRESPONDENCES = 10_000
 """Their 50 million pairs take some 10 s and 3 GB."""
 SEED_SAMPLES = 20_000
 """Most samples of the 2P-RANSAC that finds the first lower bound: enough at 1.5 % inliers, and some milliseconds."""
+LEAST_SAMPLES = 100
 SEED_CONFIDENCE = 0.99
 YAW_BINS = 1440
 
@@ -61,10 +62,9 @@ class ExactMaximumConsensus:
                 f"mc-exact compares all pairs and takes up to {MOST_CORRESPONDENCES:,} correspondences, not {count:,}; "
                 "thin them or use ransac-2p."
             )
+        samples = max(LEAST_SAMPLES, round(min(1.0, options.effort) * SEED_SAMPLES))
         with clock.stage("guess"):
-            guess = search_two_point(
-                aligned, bounds.pixels, seed, SEED_SAMPLES, SEED_CONFIDENCE, local_optimization=True
-            )
+            guess = search_two_point(aligned, bounds.pixels, seed, samples, SEED_CONFIDENCE, local_optimization=True)
         with clock.stage("consensus"):
             rate = chance_rate(aligned.bearings, bounds.radians)
             found = exact_consensus(
@@ -83,7 +83,7 @@ class ExactMaximumConsensus:
             return Outcome((stage,), None, np.zeros(count, dtype=bool), reason, certificate=certificate)
         with clock.stage("refinement"):
             refined, inliers, refinement = refine(aligned, found.poses[0], bounds, options)
-        lower = _lower_bound(aligned, bounds, found, refined)
+        lower = _lower_bound(aligned, bounds, found, refined, refinement.tilt_rad)
         certificate = Certificate(max(upper, lower), lower, chance_sets(count, lower, rate))
         return Outcome((stage, refinement), refined, inliers, certificate=certificate)
 
@@ -96,11 +96,12 @@ def _poses(guess: TwoPointSearch) -> list[tuple[float, FloatArray]]:
     return [(float(guess.yaws_rad[best]), guess.translations[best])]
 
 
-def _lower_bound(aligned: AlignedProblem, bounds: Bounds, found: ExactConsensus, refined: FloatArray) -> int:
+def _lower_bound(
+    aligned: AlignedProblem, bounds: Bounds, found: ExactConsensus, refined: FloatArray, tilt_rad: float
+) -> int:
     """What a pose within the gravity bound surely explains: the best verified one, or the refined one."""
     lower = np.count_nonzero(residuals_px(aligned, found.poses[0]) <= bounds.noise_px)
-    tilt = refined[:, :3] @ yaw_rotation(yaw_of(refined[:, :3])).T
-    if rotation_angle(tilt) <= aligned.gravity_bound_rad + 1e-12:
+    if tilt_rad <= aligned.gravity_bound_rad + 1e-12:
         lower = max(lower, np.count_nonzero(residuals_px(aligned, refined) <= bounds.noise_px))
     return int(lower)
 
