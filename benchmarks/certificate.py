@@ -37,7 +37,10 @@ def random_problem(seed: int) -> tuple[Problem, float, str]:
     truth = pose(mount @ so3_exp(rng.uniform(-np.pi, np.pi) * DOWN), rng.uniform(-5.0, 5.0, 3))
     seen = _seen_rays(rng, camera, kind, mount, count)
     points = (seen * _depths(rng, kind, mount, seen) - truth[:, 3]) @ truth[:, :3]
-    pixels = camera.project(seen)[0] + _noise(rng, count, bound_px)
+    clean = camera.project(seen)[0]
+    pixels = clean + _noise(rng, count, bound_px)
+    lost = ~camera.unproject(pixels)[1]  # noise must not take a pixel out of what the camera sees
+    pixels[lost] = clean[lost]
     outliers = rng.random(count) < rng.uniform(0.0, 1.0)
     points[outliers] = rng.uniform(-10.0, 10.0, (np.count_nonzero(outliers), 3))
     if kind == "repeated":
