@@ -22,7 +22,11 @@ from spherloc_viz import style
 from spherloc_viz.recording.view import view
 from spherloc_viz.recording.writer import write_recording
 
-PROGRAM = "import sys; from spherloc_viz.recording.view import view; view(sys.argv[1], web=True)"
+# A shell's background job, and what it starts, ignores SIGINT.
+PROGRAM = (
+    "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+    "from spherloc_viz.recording.view import view; view(sys.argv[1], web=True)"
+)
 
 
 @pytest.fixture(scope="module")
