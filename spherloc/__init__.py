@@ -8,6 +8,9 @@ from pathlib import Path
 
 __version__ = version("spherloc")
 
+KERNEL_SOURCES = ("geometry.py", "gauss_newton.py", "refine.py", "solvers", "consensus", "estimators")
+"""Files and folders of this package that hold compiled kernels and whatever their values come from."""
+
 
 def _keep_kernels_fresh() -> None:
     """Give numba a cache for just this state of the sources; must run before any kernel is defined.
@@ -16,7 +19,9 @@ def _keep_kernels_fresh() -> None:
     would go on with the old machine code after an update.
     """
     package = Path(__file__).parent
-    sources = b"".join(path.read_bytes() for path in sorted(package.rglob("*.py")))
+    rooms = [package / name for name in KERNEL_SOURCES]
+    files = sorted(file for room in rooms for file in (room.rglob("*.py") if room.is_dir() else [room]))
+    sources = b"".join(file.read_bytes() for file in files)
     home = package if os.access(package, os.W_OK) else Path.home() / ".cache" / "spherloc"
     folder = home / "__pycache__" / f"kernels-{hashlib.sha256(sources).hexdigest()[:16]}"
     os.environ.setdefault("NUMBA_CACHE_DIR", str(folder))

@@ -48,6 +48,14 @@ class Problem:
     """The query image, if there is one."""
     scene: str = field(default="")
     """Where the problem comes from: a scene file or a description."""
+    reference_images: tuple[Path, ...] = ()
+    """Images that the query was matched with, if its correspondences come from images."""
+    reference_index: IntArray | None = None
+    """(N,) index into ``reference_images`` of each correspondence."""
+    reference_pixels: FloatArray | None = None
+    """(N, 2) its pixel there; NaN where it is unknown."""
+    estimated_outlier_rate: float | None = None
+    """What the front end expects from the statistics of its matches, 0 to 1; a rough guess."""
 
     def __post_init__(self) -> None:
         pixels, points = _array(self, "pixels", (-1, 2)), _array(self, "points", (-1, 3))
@@ -69,6 +77,7 @@ class Problem:
             if mask.shape != (len(pixels),):
                 raise ProblemError(f"{self.name}: {len(mask)} inlier labels for {len(pixels)} correspondences.")
             object.__setattr__(self, "truth_inliers", _frozen(mask))
+        _check_references(self)
         usable = int(np.count_nonzero(self.usable))
         if usable < 2:
             raise ProblemError(
@@ -227,6 +236,26 @@ def _array(problem: Problem, name: str, shape: tuple[int, int]) -> FloatArray:
         raise ProblemError(f"{problem.name}: {name} row {row} is not a finite number; correct or remove it.")
     object.__setattr__(problem, name, _frozen(array))
     return array
+
+
+def _check_references(problem: Problem) -> None:
+    count, images = len(problem.pixels), len(problem.reference_images)
+    if problem.reference_index is not None:
+        index = np.array(problem.reference_index, dtype=np.int64)
+        if index.shape != (count,) or not ((index >= 0) & (index < images)).all():
+            raise ProblemError(
+                f"{problem.name}: reference_index must name one of {images} reference images for each of {count} "
+                "correspondences."
+            )
+        object.__setattr__(problem, "reference_index", _frozen(index))
+    if problem.reference_pixels is not None:
+        pixels = _numbers(problem, "reference_pixels")
+        if pixels.shape != (count, 2):
+            raise ProblemError(f"{problem.name}: reference_pixels has shape {pixels.shape}; give ({count}, 2).")
+        object.__setattr__(problem, "reference_pixels", _frozen(pixels))
+    rate = problem.estimated_outlier_rate
+    if rate is not None and not 0.0 <= rate <= 1.0:
+        raise ProblemError(f"{problem.name}: estimated_outlier_rate is {rate}; give a share from 0 to 1.")
 
 
 def _unit(problem: Problem, name: str) -> None:

@@ -19,9 +19,9 @@ SCREENS = {"viser", "rerun", "rerun_sdk", "rerun_bindings", "plotly", "aiohttp",
 
 FLOORS = (
     ("spherloc.errors", "spherloc"),
-    ("spherloc.registry", "spherloc.geometry"),
-    ("spherloc.cameras", "spherloc.solvers"),
-    ("spherloc.gauss_newton",),
+    ("spherloc.registry", "spherloc.geometry", "spherloc.extras", "spherloc.disk_cache", "spherloc.images"),
+    ("spherloc.cameras", "spherloc.solvers", "spherloc.trajectory"),
+    ("spherloc.gauss_newton", "spherloc.worlds"),
     ("spherloc.problem", "spherloc.bounds", "spherloc.consensus"),
     ("spherloc.trace", "spherloc.refine", "spherloc.metrics", "spherloc.datasets", "spherloc.frontend"),
     ("spherloc.estimators", "spherloc.diagnosis", "spherloc.experiments"),

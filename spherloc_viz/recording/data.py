@@ -42,7 +42,8 @@ def data_chunks(trace: Trace) -> Iterator[Chunk]:
 def _problem_row(problem: Problem) -> Row:
     row = {item.name: getattr(problem, item.name) for item in fields(problem)}
     image = None if problem.image is None else str(problem.image)
-    return row | {"camera": problem.camera.to_dict(), "image": image}
+    references = [str(path) for path in problem.reference_images]
+    return row | {"camera": problem.camera.to_dict(), "image": image, "reference_images": references}
 
 
 def _run_row(trace: Trace) -> Row:
@@ -65,7 +66,9 @@ def problem_from_row(row: Row, where: str) -> Problem:
     Raises ``SpherlocError`` if the row describes none, and ``KeyError`` or ``TypeError`` if it is no problem's row.
     """
     image = None if row["image"] is None else Path(row["image"])
-    problem = Problem(**row | {"camera": camera_from_table(row["camera"], where), "image": image})
+    references = tuple(Path(text) for text in row.get("reference_images", ()))
+    changed = {"camera": camera_from_table(row["camera"], where), "image": image, "reference_images": references}
+    problem = Problem(**row | changed)
     for name in ("gravity_camera", "gravity_map"):
         # Problem scales directions to unit length, and doing so twice can change the last bit.
         object.__setattr__(problem, name, row[name])

@@ -1,0 +1,130 @@
+"""A map with reference images, and query images to be localized in it: what every loader of images returns."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from spherloc.cameras.base import FloatArray
+from spherloc.datasets.registration import Registration
+from spherloc.errors import InputError, show
+from spherloc.frontend.view import Matcher, Matches, View
+from spherloc.problem import Problem
+from spherloc.refine import residuals_px
+
+TRUE_INLIER_PX = 8.0
+"""Matches this close to their true pixel count as true inliers (Sec. VI-B.1)."""
+
+Thresholds = tuple[tuple[float, float], ...]
+"""Limits (degrees, metres) within which a localization counts as a success, strictest first."""
+
+DEFAULT_THRESHOLDS: Thresholds = ((1.0, 0.1), (2.0, 0.25), (5.0, 0.5))
+
+
+@dataclass(frozen=True, eq=False)
+class MapScene:
+    """Queries, references and how to get from one to the other."""
+
+    name: str
+    """Shown to people."""
+    where: str
+    """The scene file."""
+    queries: tuple[View, ...]
+    """In the order of the sequence; at least one."""
+    references: tuple[View, ...]
+    """With poses; at least one."""
+    matcher: Matcher
+    """Finds 2D-3D correspondences of a query."""
+    gravity_map: FloatArray
+    """Unit vector (3,) pointing down in the map frame."""
+    gravity_bound_rad: float = 0.0
+    """Bound on the error of a query's known gravity, whether measured or taken from its reference."""
+    gravity_sd_rad: float | None = None
+    """Standard deviation of each of its two tilts; None takes a third of the bound."""
+    bound_px: float | None = None
+    """Pixel bound asked of estimators; None leaves it to them."""
+    thresholds: Thresholds = DEFAULT_THRESHOLDS
+    """The dataset's own limits of success."""
+    registration: Registration | None = None
+    """Judges a pose by registering point clouds, where no true pose can be trusted."""
+    mesh: Callable[[], bytes] | None = None
+    """A binary glTF of the map in the map frame, metres, for the canvas."""
+    remarks: tuple[str, ...] = ()
+    """What the loader skipped and why, in sentences."""
+
+    def __post_init__(self) -> None:
+        for what, views in (("query", self.queries), ("reference", self.references)):
+            if not views:
+                raise InputError(f"{self.where}: there is no {what} image; {' '.join(self.remarks) or 'name some.'}")
+            names = [view.name for view in views]
+            twice = next((name for name in names if names.count(name) > 1), None)
+            if twice is not None:
+                raise InputError(f"{self.where}: the {what} image {show(twice)} is there twice; name it once.")
+
+    @cached_property
+    def _by_name(self) -> Mapping[str, View]:
+        return {view.name: view for view in self.queries}
+
+    def query(self, name: str | None = None) -> View:
+        """The query image of that name, by default the first.
+
+        Raises ``InputError`` if there is none of that name.
+        """
+        if name is None:
+            return self.queries[0]
+        if name not in self._by_name:
+            some = ", ".join(view.name for view in self.queries[:5])
+            more = f" and {len(self.queries) - 5} more" if len(self.queries) > 5 else ""
+            raise InputError(f"{self.where}: no query image {show(name)}; there are {some}{more}.")
+        return self._by_name[name]
+
+    def problem(self, seed: int | None = None, query: str | None = None) -> Problem:
+        """The localization problem of a query image; images have nothing random, so ``seed`` changes nothing.
+
+        Raises ``InputError`` if the image cannot be used, or if it has too few correspondences for a problem.
+        """
+        view = self.query(query)
+        return self.problem_of(view, self.matcher(view))
+
+    def problem_of(self, view: View, matches: Matches) -> Problem:
+        """The problem of a query and the correspondences that ``matcher`` found for it.
+
+        Gravity is the query's own if it is measured, else that of the most similar reference (Sec. III: a vehicle's
+        roll and pitch are about those of the vehicle that mapped the place). Raises ``ProblemError`` for too few.
+        """
+        problem = Problem(
+            name=f"{self.name}, {view.name}",
+            camera=view.camera,
+            pixels=matches.pixels,
+            points=matches.points,
+            gravity_camera=self._gravity(view, matches),
+            gravity_map=self.gravity_map,
+            gravity_bound_rad=self.gravity_bound_rad,
+            gravity_sd_rad=self.gravity_sd_rad,
+            bound_px=self.bound_px,
+            truth_cam_from_map=view.cam_from_map,
+            image=view.path,
+            scene=self.where,
+            reference_images=tuple(reference.path for reference in matches.references),
+            reference_index=matches.reference_index,
+            reference_pixels=matches.reference_pixels,
+            estimated_outlier_rate=matches.estimated_outlier_rate,
+        )
+        if view.cam_from_map is None:
+            return problem
+        aligned = problem.aligned
+        close = residuals_px(aligned, aligned.align_pose(view.cam_from_map)) <= TRUE_INLIER_PX
+        return replace(problem, truth_inliers=aligned.full_mask(close))
+
+    def _gravity(self, view: View, matches: Matches) -> FloatArray:
+        if view.gravity_camera is not None:
+            return view.gravity_camera
+        posed = [reference for reference in matches.references if reference.cam_from_map is not None]
+        if not posed:
+            raise InputError(
+                f"{self.where}: gravity is not known in the query image {show(view.name)}, and none of its references "
+                "has a pose to take it from; give its gravity."
+            )
+        down = np.asarray(posed[0].cam_from_map)[:, :3] @ self.gravity_map
+        return down / np.linalg.norm(down)

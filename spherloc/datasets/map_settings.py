@@ -1,0 +1,80 @@
+"""The keys that all scenes made of images share."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from spherloc.datasets import scene_file
+from spherloc.datasets.map_scene import DEFAULT_THRESHOLDS, Thresholds
+from spherloc.errors import InputError
+
+REQUIRED = {"kind", "name"}
+OPTIONAL = {"about", "frontend", "gravity", "options", "thresholds"}
+
+
+@dataclass(frozen=True)
+class MapSettings:
+    """What the shared keys say."""
+
+    name: str
+    frontend: Mapping[str, Any]
+    """The section [frontend], for ``image_matcher`` to check."""
+    gravity_bound_rad: float
+    gravity_sd_rad: float | None
+    bound_px: float | None
+    thresholds: Thresholds
+
+
+def read_settings(
+    table: Mapping[str, Any], where: str, gravity_bound_deg: float, thresholds: Thresholds = DEFAULT_THRESHOLDS
+) -> MapSettings:
+    """The shared keys of a scene file; ``gravity_bound_deg`` and ``thresholds`` are the loader's defaults.
+
+    Keys of the loader's own are for it to check, by ``scene_file.check_keys`` with ``REQUIRED`` and ``OPTIONAL``
+    among the known ones. Raises ``InputError`` for a wrong value.
+    """
+    gravity = {"bound_deg": gravity_bound_deg} | scene_file.section(table, "gravity", where)
+    scene_file.check_keys(gravity, set(), {"bound_deg", "sd_deg"}, f"{where} [gravity]")
+    bound_rad, sd_rad = scene_file.gravity_error_rad(gravity, f"{where} [gravity]")
+    return MapSettings(
+        name=scene_file.text(table, "name", where),
+        frontend=scene_file.section(table, "frontend", where),
+        gravity_bound_rad=bound_rad,
+        gravity_sd_rad=sd_rad,
+        bound_px=scene_file.bound_px(table, where),
+        thresholds=_thresholds(table["thresholds"], where) if "thresholds" in table else thresholds,
+    )
+
+
+def _thresholds(value: Any, where: str) -> Thresholds:
+    """``thresholds = [[deg, m], ...]``."""
+    rows = len(value) if isinstance(value, list) else 0
+    if not 1 <= rows <= 10:
+        raise InputError(f"{where}: thresholds must be a list of pairs [degrees, metres], strictest first.")
+    pairs = scene_file.numbers(value, (rows, 2), "thresholds", where)
+    if not (pairs > 0).all():
+        raise InputError(f"{where}: thresholds must be pairs of positive numbers [degrees, metres].")
+    return tuple((float(degrees), float(metres)) for degrees, metres in pairs)
+
+
+def folder(table: Mapping[str, Any], key: str, path: Path) -> Path:
+    """An existing folder, given relative to the scene file ``path`` or absolutely.
+
+    Raises ``InputError`` if there is none.
+    """
+    named = path.parent / scene_file.text(table, key, str(path))
+    if not named.is_dir():
+        raise InputError(f"{path}: {key} names the folder {named}, which does not exist; correct the path.")
+    return named
+
+
+def needed_file(root: Path, name: str, where: str, what: str) -> Path:
+    """A file that a dataset's layout demands; raises ``InputError`` that names it if it is missing.
+
+    ``what`` says what it holds ("the calibration of image_02").
+    """
+    named = root / name
+    if not named.is_file():
+        raise InputError(f"{where}: {named} is missing, {what}; check that 'root' is the dataset's own folder.")
+    return named

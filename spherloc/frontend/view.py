@@ -1,0 +1,113 @@
+"""An image with its camera and whatever is known of it: what dataset loaders make and the front end works on."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spherloc.cameras.base import BoolArray, Camera, FloatArray
+from spherloc.errors import InputError
+from spherloc.images import ByteImage, read_image
+
+
+class Lift(Protocol):
+    """Gives pixels of a reference image their places in the map."""
+
+    def __call__(self, pixels: FloatArray) -> tuple[FloatArray, BoolArray]:
+        """Map points (N, 3), metres, of pixels (N, 2), and a mask (N,) of those that have one; others are NaN.
+
+        Loads what it needs when it is first called, and raises ``InputError`` if that cannot be read.
+        """
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One image of a map or of a query sequence. Cheap to make: pixels and depths are read when they are asked for."""
+
+    name: str
+    """Unique within its scene, such as "image_02/0000000386.png"."""
+    camera: Camera
+    path: Path
+    """The image file."""
+    cam_from_map: FloatArray | None = None
+    """Pose (3, 4): a reference's known pose, or a query's true one; None if unknown."""
+    gravity_camera: FloatArray | None = None
+    """Unit vector (3,) pointing down in the camera frame, if something measured it (an IMU)."""
+    timestamp_s: float | None = None
+    """When it was taken, seconds."""
+    lift: Lift | None = None
+    """How a reference's pixels get map points; None if they have none."""
+    mask: Callable[[], BoolArray] | None = None
+    """(H, W) of the pixels that may be used; None for all that the camera model can see."""
+
+    def read(self) -> ByteImage:
+        """The pixels, (H, W, 3) BGR or (H, W) grey, read anew every time: a long sequence must not fill the memory.
+
+        Raises ``InputError`` if the file cannot be read or has another size than the calibration.
+        """
+        image = read_image(self.path)
+        if image.shape[:2] != (self.camera.height, self.camera.width):
+            raise InputError(
+                f"{self.path}: is {image.shape[1]} x {image.shape[0]} pixels, but its calibration is for "
+                f"{self.camera.width} x {self.camera.height}; give the calibration of this image."
+            )
+        return image
+
+    def usable_pixels(self) -> BoolArray:
+        """(H, W): pixels that the camera model can see and that ``mask`` allows.
+
+        Raises ``InputError`` if the mask cannot be read or has another size than the image.
+        """
+        seen = seen_pixels(self.camera)
+        if self.mask is None:
+            return seen
+        allowed = self.mask()
+        if allowed.shape != seen.shape:
+            raise InputError(
+                f"{self.name}: its mask is {allowed.shape[1]} x {allowed.shape[0]} pixels, the image "
+                f"{seen.shape[1]} x {seen.shape[0]}; give a mask of the image's size."
+            )
+        return seen & allowed
+
+
+@lru_cache(maxsize=8)
+def seen_pixels(camera: Camera) -> BoolArray:
+    """(H, W), read-only: pixels whose centre the camera model can see."""
+    columns, rows = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    _, seen = camera.unproject(np.column_stack([columns.ravel(), rows.ravel()]))
+    seen = seen.reshape(camera.height, camera.width)
+    seen.setflags(write=False)
+    return seen
+
+
+@dataclass(frozen=True, eq=False)
+class Matches:
+    """2D-3D correspondences of one query image, as a front end found them."""
+
+    pixels: FloatArray
+    """(N, 2) in the query image."""
+    points: FloatArray
+    """(N, 3), map frame, metres."""
+    references: tuple[View, ...]
+    """Reference images that were matched, the most similar one first."""
+    reference_index: NDArray[np.int64]
+    """(N,) index into ``references``."""
+    reference_pixels: FloatArray
+    """(N, 2) in the reference image; NaN where unknown."""
+    estimated_outlier_rate: float | None = None
+    """0 to 1, guessed from the statistics of the matches."""
+    remarks: tuple[str, ...] = ()
+    """What was skipped and why, in sentences."""
+
+
+class Matcher(Protocol):
+    """Finds the 2D-3D correspondences of a query image."""
+
+    def __call__(self, query: View) -> Matches:
+        """Raises ``InputError`` if the query image cannot be read; what is wrong with single references is a remark."""
+        ...

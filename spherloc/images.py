@@ -1,0 +1,73 @@
+"""Reads images. Pixels are taken as they are stored: calibrations know nothing of a photograph's orientation tag."""
+
+import struct
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from spherloc.errors import InputError
+
+ByteImage = NDArray[np.uint8]
+
+MAX_BYTES = 200_000_000
+MAX_PIXELS = 200_000_000
+"""Beyond any panorama, so that a corrupt header cannot exhaust the memory."""
+
+
+def read_image(path: Path) -> ByteImage:
+    """An image as (H, W, 3) BGR or (H, W) grey bytes.
+
+    Raises ``InputError`` for what is missing, unreadable, too large or no image.
+    """
+    image = _decode(path, cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    if image.dtype != np.uint8 or image.ndim not in (2, 3):
+        raise InputError(f"{path}: has {image.dtype} pixels; give an image with 8 bits a channel.")
+    return image
+
+
+def read_depth_png(path: Path) -> NDArray[np.uint16]:
+    """A depth map (H, W) of 16-bit numbers, whose unit the caller knows.
+
+    Raises ``InputError`` for what is missing, unreadable, too large or has other than 16 bits and one channel.
+    """
+    image = _decode(path, cv2.IMREAD_UNCHANGED)
+    if image.dtype != np.uint16 or image.ndim != 2:
+        raise InputError(f"{path}: is no depth map; give a PNG with one channel of 16 bits.")
+    return image
+
+
+def grey(image: ByteImage) -> ByteImage:
+    """(H, W) of a BGR or grey image."""
+    return image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+
+
+def _decode(path: Path, flags: int) -> NDArray:
+    path = Path(path)
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise InputError(f"{path}: larger than {MAX_BYTES:,} bytes; give a smaller image.")
+        content = path.read_bytes()
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; correct the path of the image.") from None
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"{path}: cannot be read ({reason}); correct the path of the image.") from None
+    if _claimed_pixels(content) > MAX_PIXELS:
+        raise InputError(f"{path}: claims more than {MAX_PIXELS:,} pixels; give a smaller image.")
+    try:
+        image = cv2.imdecode(np.frombuffer(content, np.uint8), flags) if content else None
+    except cv2.error:
+        image = None
+    if image is None or image.size == 0:
+        raise InputError(f"{path}: not an image that can be read, or a damaged one; replace it.")
+    return image
+
+
+def _claimed_pixels(content: bytes) -> int:
+    """Width times height in the header of a PNG; 0 for other formats, whose decoders check it themselves."""
+    if content[:8] == b"\x89PNG\r\n\x1a\n" and len(content) >= 24:
+        width, height = struct.unpack(">II", content[16:24])
+        return width * height
+    return 0
