@@ -27,7 +27,7 @@ def key_of(*parts: object) -> str:
 
 
 def store(path: Path, content: bytes) -> bool:
-    """Write a file of the cache so that no reader sees half of it; False if it cannot be written, which only costs time."""
+    """Write a file of the cache so that no reader sees half of it; False if that fails, which only costs time."""
     part = path.with_name(f"{path.name}.{uuid.uuid4().hex[:8]}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
