@@ -152,6 +152,7 @@ class Problem:
             count=len(self),
             gravity_bound_rad=bound,
             gravity_sd_rad=bound / 3.0 if sd is None else sd,
+            estimated_outlier_rate=self.estimated_outlier_rate,
             **frozen,
         )
 
@@ -180,6 +181,8 @@ class AlignedProblem:
     """Bound on the angle between the true gravity and +y in the camera frame."""
     gravity_sd_rad: float
     """Standard deviation of each of its two tilts: 0 where gravity is exact, inf where it is unknown."""
+    estimated_outlier_rate: float | None = None
+    """What the front end expects, 0 to 1."""
 
     def __post_init__(self) -> None:
         # Compiled kernels are made for read-only arrays; others would have them compiled once more.

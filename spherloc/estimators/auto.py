@@ -15,6 +15,7 @@ from spherloc.refine import RefinementOptions
 from spherloc.trace import DecisionStage
 
 PROBE_SAMPLES = 500
+MOST_PROBE_SAMPLES = 5000
 PROBE_CONFIDENCE = 0.99
 CHEAP = 500
 """Correspondences up to which the proof costs a few hundredths of a second, so that nothing speaks against it."""
@@ -46,7 +47,7 @@ class Auto:
         """Probe, choose, run what was chosen; its stages follow the decision."""
         with clock.stage("decision"):
             probe = search_two_point(
-                aligned, bounds.pixels, seed, PROBE_SAMPLES, PROBE_CONFIDENCE, local_optimization=True
+                aligned, bounds.pixels, seed, _probe_samples(aligned), PROBE_CONFIDENCE, local_optimization=True
             )
             decision = _decide(aligned, bounds, probe)
         shared = {item.name: getattr(options, item.name) for item in fields(options)}
@@ -71,11 +72,24 @@ class Auto:
         )
 
 
+def _probe_samples(aligned: AlignedProblem) -> int:
+    """Enough to meet two inliers (Eq. 28) if there are as few as the front end expects, and never less than usual."""
+    if aligned.estimated_outlier_rate is None:
+        return PROBE_SAMPLES
+    clean = (1.0 - aligned.estimated_outlier_rate) ** 2
+    needed = np.log1p(-PROBE_CONFIDENCE) / np.log1p(-clean) if 0.0 < clean < 1.0 else 0.0 if clean else np.inf
+    return int(np.clip(needed, PROBE_SAMPLES, MOST_PROBE_SAMPLES))
+
+
 def _decide(aligned: AlignedProblem, bounds: Bounds, probe: TwoPointSearch) -> DecisionStage:
     count = len(aligned.bearings)
     support = int(probe.support.max(initial=0))
     chance = chance_sets(count, support, chance_rate(aligned.bearings, bounds.radians))
-    share = f"{100 * support / count:.0f} % of {count:,} matches agree with the best of {probe.drawn} sampled pairs"
+    expected = aligned.estimated_outlier_rate
+    guess = "" if expected is None else f", and the front end expects {100 * (1 - expected):.0f} %"
+    share = (
+        f"{100 * support / count:.0f} % of {count:,} matches agree with the best of {probe.drawn} sampled pairs{guess}"
+    )
     if count > MOST_CORRESPONDENCES:
         chosen, reason = "ransac-2p", f"{count:,} matches have too many pairs to compare them all."
     elif count <= CHEAP:
