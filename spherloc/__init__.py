@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+import shutil
 import sys
 from importlib.metadata import version
 from pathlib import Path
@@ -10,6 +11,9 @@ __version__ = version("spherloc")
 
 KERNEL_SOURCES = ("geometry.py", "gauss_newton.py", "refine.py", "solvers", "consensus", "estimators")
 """Files and folders of this package that hold compiled kernels and whatever their values come from."""
+
+KEPT_KERNELS = 4
+"""States of the sources whose compiled kernels are kept."""
 
 
 def _keep_kernels_fresh() -> None:
@@ -24,6 +28,9 @@ def _keep_kernels_fresh() -> None:
     sources = b"".join(file.read_bytes() for file in files)
     home = package if os.access(package, os.W_OK) else Path.home() / ".cache" / "spherloc"
     folder = home / "__pycache__" / f"kernels-{hashlib.sha256(sources).hexdigest()[:16]}"
+    others = sorted(set(folder.parent.glob("kernels-*")) - {folder}, key=lambda path: path.stat().st_mtime)
+    for old in others[:-KEPT_KERNELS]:  # of earlier states of the sources; a few stay for whoever goes back and forth
+        shutil.rmtree(old, ignore_errors=True)
     os.environ.setdefault("NUMBA_CACHE_DIR", str(folder))
     if "numba" in sys.modules:  # imported before us, it has read its settings already
         sys.modules["numba"].config.CACHE_DIR = os.environ["NUMBA_CACHE_DIR"]

@@ -56,6 +56,8 @@ class Problem:
     """(N, 2) its pixel there; NaN where it is unknown."""
     estimated_outlier_rate: float | None = None
     """What the front end expects from the statistics of its matches, 0 to 1; a rough guess."""
+    remarks: tuple[str, ...] = ()
+    """What the front end skipped and why, in sentences."""
 
     def __post_init__(self) -> None:
         pixels, points = _array(self, "pixels", (-1, 2)), _array(self, "points", (-1, 3))

@@ -24,9 +24,10 @@ LEGEND: tuple[tuple[RGB, str], ...] = (
 )
 """What each colour means, in the order in which the legend shows it."""
 
-LAYERS: tuple[str, ...] = ("map", "cameras", "sphere", "rays", "yaw ring", "balls", "pairs")
+LAYERS: tuple[str, ...] = ("mesh", "map", "cameras", "trajectory", "sphere", "rays", "yaw ring", "balls", "pairs")
 """Layers of the canvas that can be switched on and off."""
 
+MAX_DRAWN_MATCHES = 120
 MAX_DRAWN_RAYS = 600
 MAX_DRAWN_ARCS = 240
 MAX_DRAWN_BALLS = 70

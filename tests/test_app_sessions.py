@@ -223,11 +223,11 @@ def test_play_goes_to_the_end_and_stops(house: House, monkeypatch: pytest.Monkey
 @pytest.mark.parametrize("seed", ["", "x", "-1", "1.5", "9223372036854775808", "٣", "1" * 400])
 def test_a_wrong_seed_is_a_sentence_and_the_page_goes_on(house: House, seed: str) -> None:
     page, session = house.visit()
-    before = session._trace
+    before = session._run.trace
     page.set(session._scene._seed, seed)
     until(lambda: session._complaint is not None)
     assert session._complaint is not None and session._complaint[0].endswith("type one.")
-    assert "no whole number" in shown(session) and session._trace is before
+    assert "no whole number" in shown(session) and session._run.trace is before
     page.set(session._scene._seed, "7")
     until(lambda: session._complaint is None and len(house.notes.traces) == 2)
     assert house.notes.traces[-1].seed == 7
@@ -236,7 +236,7 @@ def test_a_wrong_seed_is_a_sentence_and_the_page_goes_on(house: House, seed: str
 def test_a_wrong_option_is_a_sentence(house: House) -> None:
     page, session = house.visit()
     page.set(session._estimator._estimator, "ransac-2p (two points)")
-    until(lambda: session._trace is not None and session._trace.estimator == "ransac-2p")
+    until(lambda: session._run is not None and session._run.trace.estimator == "ransac-2p")
     assert [name for name, folder in session._estimator._folders.items() if folder.visible] == ["ransac-2p"]
     page.set(session._estimator._options["ransac-2p"]["iterations"].widget, 10**9)
     until(lambda: "give a whole number up to" in shown(session))
@@ -245,7 +245,7 @@ def test_a_wrong_option_is_a_sentence(house: House) -> None:
 def test_unknown_gravity_reaches_the_estimator(house: House) -> None:
     page, session = house.visit()
     page.set(session._estimator._options["mc"]["gravity_sd_deg"].widget, "unknown (6 DoF)")
-    until(lambda: session._trace is not None and session._trace.options.gravity_sd_deg == np.inf)
+    until(lambda: session._run is not None and session._run.trace.options.gravity_sd_deg == np.inf)
     until(lambda: len(house.notes.traces) == 2)
 
 
@@ -253,7 +253,7 @@ def test_diagnosis_comes_after_the_picture_and_only_for_the_newest_run(
     house: House, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     page, session = house.visit()
-    until(lambda: session._diagnosed is not None and session._diagnosed[0] is session._trace)
+    until(lambda: session._diagnosed is not None and session._diagnosed[0] is session._run.trace)
     entered, gate, seen = threading.Event(), threading.Event(), []
 
     def slow(trace: Trace) -> Diagnosis:
@@ -268,13 +268,13 @@ def test_diagnosis_comes_after_the_picture_and_only_for_the_newest_run(
     until(lambda: "Diagnosing" in session._diagnosis.content)
     for noise in np.linspace(1.1, 3.0, 15):
         page.set(session._scene._noise, float(noise))
-    until(lambda: session._trace is not seen[0] and len(house.notes.traces) == 2)
+    until(lambda: session._run.trace is not seen[0] and len(house.notes.traces) == 2)
     page.set(session._steps._buttons, "Previous")
     until(lambda: "Refinement" in shown(session))
     assert len(seen) == 1 and "cameras/rival" not in session._painter._drawn, "the page goes on meanwhile"
     gate.set()
     until(lambda: "Two poses." in session._diagnosis.content)
-    assert len(seen) == 2 and seen[1] is session._trace, "of fifteen runs meanwhile only the newest was diagnosed"
+    assert len(seen) == 2 and seen[1] is session._run.trace, "of fifteen runs meanwhile only the newest was diagnosed"
     page.set(session._steps._buttons, "Next")
     until(lambda: "cameras/rival" in session._painter._drawn)
     page.set(session._steps._buttons, "Previous")
@@ -292,19 +292,19 @@ def test_a_full_disk_and_a_bug_are_sentences(house: House, monkeypatch: pytest.M
     until(lambda: "a bug in the playground (ZeroDivisionError" in shown(session))
     monkeypatch.undo()
     page.set(session._scene._seed, "8")
-    until(lambda: session._complaint is None and session._trace is not None and session._trace.seed == 8)
+    until(lambda: session._complaint is None and session._run is not None and session._run.trace.seed == 8)
 
 
 def test_pages_share_nothing_and_leave_nothing(house: House) -> None:
     before = threads()
     (first, one), (second, two) = house.visit(), house.visit()
     assert threads() == before + 6
-    kept = two._trace
+    kept = two._run.trace
     first.set(one._scene._points, 33)
-    until(lambda: one._trace is not None and len(one._trace.problem) == 33)
+    until(lambda: one._run is not None and len(one._run.trace.problem) == 33)
     first.set(one._steps._buttons, "Previous")
     until(lambda: one._steps._choice.value.endswith("Refinement"))
-    assert two._trace is kept and two._scene._points.value == 20 and two._steps._choice.value.endswith("Outcome")
+    assert two._run.trace is kept and two._scene._points.value == 20 and two._steps._choice.value.endswith("Outcome")
     first.close()
     until(lambda: threads() == before + 3 and len(house.sessions._open) == 1)
     second.close()

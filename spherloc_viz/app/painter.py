@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import trimesh
 import viser
+import viser.transforms as vtf
 
 from spherloc_viz.app.colors import light_bytes, surface_bytes
 from spherloc_viz.layers.primitives import Balls, Mesh, Points, SceneItem, Segments
@@ -25,6 +26,7 @@ class Painter:
     def __init__(self, client: viser.ClientHandle) -> None:
         self._client = client
         self._drawn: dict[str, tuple[Any, tuple, str]] = {}
+        self._backdrop: tuple[bytes, Any] | None = None
 
     def draw(self, items: Iterable[SceneItem], layers: frozenset[str]) -> None:
         """Show these primitives, those of ``layers`` only, and hide all others."""
@@ -37,6 +39,23 @@ class Painter:
                     names.add(part.name)
             for name, (handle, _, layer) in self._drawn.items():
                 handle.visible = name in names and layer in layers
+
+    def draw_backdrop(self, glb: bytes | None, aligned_from_map: np.ndarray, visible: bool) -> None:
+        """Show the map's mesh, a binary glTF in the map frame, behind the pictures of a run; None for none.
+
+        It belongs to the scene and not to the run, so that recordings, which must be small, do without it.
+        """
+        if self._backdrop is not None and self._backdrop[0] is not glb:
+            self._backdrop[1].remove()
+            self._backdrop = None
+        if glb is None:
+            return
+        if self._backdrop is None:
+            handle = self._client.scene.add_glb("/backdrop", glb, cast_shadow=False, receive_shadow=False)
+            self._backdrop = (glb, handle)
+        handle = self._backdrop[1]
+        handle.wxyz = vtf.SO3.from_matrix(aligned_from_map).wxyz
+        handle.visible = visible
 
     def _put(self, item: SceneItem, look: tuple) -> None:
         handle, known, _ = self._drawn.get(item.name, (None, None, ""))

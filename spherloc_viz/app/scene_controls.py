@@ -11,11 +11,13 @@ MOST_POINTS, MOST_NOISE_PX, MOST_OUTLIERS, MOST_GRAVITY_DEG = 500, 10.0, 99.0, 2
 
 
 class SceneControls:
-    """Scene, camera, number of points, noise, outliers, gravity error and seed."""
+    """Scene, query image, camera, number of points, noise, outliers, gravity error and seed."""
 
     def __init__(self, gui: viser.GuiApi, catalog: Catalog, changed: Callable[[object], None]) -> None:
         self._catalog = catalog
         self._scene = gui.add_dropdown("Scene", tuple(catalog.scenes))
+        queries: list[str] = ["-"]
+        self._query = gui.add_dropdown("Query", queries, visible=False, hint="The image to localize in the map.")
         self._camera = gui.add_dropdown(
             "Camera", (OWN_CAMERA, *catalog.cameras), hint="Sees the same simulation through another lens."
         )
@@ -39,7 +41,7 @@ class SceneControls:
     @property
     def widgets(self) -> tuple:
         """All of them."""
-        return (self._scene, *self._simulated, self._seed)
+        return (self._scene, self._query, *self._simulated, self._seed)
 
     def follow_scene(self) -> bool:
         """If another scene was chosen, set the other widgets to what it says, and tell so."""
@@ -50,6 +52,11 @@ class SceneControls:
         scene = self._catalog.synthetic(label)
         for widget in self._simulated:
             widget.visible = scene is not None
+        images = self._catalog.map_scene(label)
+        self._query.visible = images is not None
+        if images is not None:
+            self._query.options = tuple(view.name for view in images.queries)
+            self._query.value = self._query.options[0]
         if scene is None:
             return True
         self._camera.value = OWN_CAMERA
@@ -65,23 +72,29 @@ class SceneControls:
         self._seed.value = str(scene.seed)
         return True
 
+    def reads_images(self) -> bool:
+        """Whether the chosen scene is made of images, so that its problem takes a while."""
+        return self._catalog.map_scene(self._scene.value) is not None
+
     def read(self) -> SceneWish:
         """What the widgets say now.
 
         Raises ``InputError`` if the seed is no seed.
         """
         label, seed = self._scene.value, self._read_seed()
+        if self._catalog.map_scene(label) is not None:
+            return SceneWish(label, seed, self._query.value)
         if self._catalog.synthetic(label) is None:
             return SceneWish(label, seed)
         rate = round(self._outliers.value / 100.0, 8)
         return SceneWish(
             label,
             seed,
-            self._camera.value,
-            int(self._points.value),
-            float(self._noise.value),
-            rate,
-            float(self._gravity.value),
+            camera=self._camera.value,
+            correspondences=int(self._points.value),
+            noise_px=float(self._noise.value),
+            outlier_rate=rate,
+            gravity_error_deg=float(self._gravity.value),
         )
 
     def next_seed(self) -> None:

@@ -16,6 +16,7 @@ from spherloc_viz.app.catalog import Catalog, SceneWish
 from spherloc_viz.app.charts import ChartPanel
 from spherloc_viz.app.display_controls import DisplayControls
 from spherloc_viz.app.estimator_controls import EstimatorControls
+from spherloc_viz.app.image_panel import ImagePanel
 from spherloc_viz.app.newest import Job, Newest
 from spherloc_viz.app.painter import Painter
 from spherloc_viz.app.scene_controls import SceneControls
@@ -49,6 +50,14 @@ class Wish:
     options: Any
 
 
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A wish fulfilled."""
+
+    wish: Wish
+    trace: Trace
+
+
 class Session:
     """Lives as long as the tab's connection.
 
@@ -61,8 +70,7 @@ class Session:
         self._solver = Newest(f"spherloc-solver-{client.client_id}", self._guarded(self._solve))
         self._page = Newest(f"spherloc-page-{client.client_id}", self._guarded(self._show))
         self._doctor = Newest(f"spherloc-doctor-{client.client_id}", self._guarded(self._examine))
-        self._solved: Wish | None = None
-        self._trace: Trace | None = None
+        self._run: Run | None = None
         self._diagnosed: tuple[Trace, Diagnosis] | None = None
         self._recorded: tuple[Trace, str] | None = None
         self._viewed: tuple[str, str, str] | None = None
@@ -100,6 +108,7 @@ class Session:
             self._steps = StepsPanel(gui, self._redraw)
             gui.add_html(legend_html())
             self._diagnosis = gui.add_html("")
+            self._images = ImagePanel(gui)
             self._charts = ChartPanel(gui)
         story.dock_left()
         story.set_width(self._panels_px[0])
@@ -123,14 +132,15 @@ class Session:
         if not asked:
             self._settle()
             return None
+        if self._scene.reads_images():
+            self._status.content = status_html("Reading and matching images …")
         if self._scene.follow_scene():
             self._estimator.follow_problem(self._catalog.problem(self._scene.read()))
         wish = Wish(self._scene.read(), *self._estimator.read())
-        if wish != self._solved:
+        if self._run is None or wish != self._run.wish:
             self._status.content = status_html(f"Solving with {wish.estimator} …")
             problem = self._catalog.problem(wish.scene)
-            self._trace = estimate(problem, wish.estimator, wish.options, wish.scene.seed)
-            self._solved = wish
+            self._run = Run(wish, estimate(problem, wish.estimator, wish.options, wish.scene.seed))
             self._page.ask()
         self._status.content = status_html(
             "Runs are not recorded." if self._recorder is None else "Will be recorded when nothing changes any more."
@@ -141,17 +151,19 @@ class Session:
     def _settle(self) -> None:
         for widget in (*self._scene.widgets, *self._estimator.widgets, *self._display.widgets, *self._steps.widgets):
             put_back(widget)
-        if self._recorder is None or self._trace is None:
+        if self._recorder is None or self._run is None:
             return
-        if self._recorded is None or self._recorded[0] is not self._trace:
-            self._recorded = self._trace, self._recorder.submit(self._trace).name
+        trace = self._run.trace
+        if self._recorded is None or self._recorded[0] is not trace:
+            self._recorded = trace, self._recorder.submit(trace).name
         self._status.content = status_html(f"Recorded as {self._recorded[1]}")
 
     def _show(self, asked: bool) -> float | None:
         """The page thread's job: show the step at hand of the newest run."""
-        trace = self._trace
-        if trace is None:
+        run = self._run
+        if run is None:
             return None
+        trace = run.trace
         timeline, outcome = steps(trace), outcome_table(trace)
         index, pause = self._steps.settle(timeline, asked)
         picture = paint(trace, index)
@@ -163,8 +175,12 @@ class Session:
             remark = diagnosis_html(diagnosis, whole=last)
             if last and diagnosis.rival_cam_from_map is not None:
                 picture = with_rival(picture, trace, diagnosis.rival_cam_from_map)
+        mesh = self._catalog.mesh(run.wish.scene.scene)
+        layers = self._display.layers()
         with self._client.atomic():
-            self._painter.draw(picture.scene, self._display.layers())
+            self._painter.draw(picture.scene, layers)
+            self._painter.draw_backdrop(mesh, trace.problem.aligned.map_turn, "mesh" in layers)
+            self._images.draw(trace, picture)
             self._steps.show(playing=pause is not None, tables=tables)
             self._charts.draw(picture.charts)
             self._outcome.content = table_html(outcome)
@@ -180,12 +196,12 @@ class Session:
 
     def _examine(self, asked: bool) -> float | None:
         """The doctor thread's job: once nothing has changed for a while, diagnose the newest run and show it."""
-        trace = self._trace
-        if trace is None or (self._diagnosed is not None and self._diagnosed[0] is trace):
+        run = self._run
+        if run is None or (self._diagnosed is not None and self._diagnosed[0] is run.trace):
             return None
         if asked:
             return DIAGNOSE_AFTER_S
-        self._diagnosed = trace, diagnose(trace)
+        self._diagnosed = run.trace, diagnose(run.trace)
         self._page.ask()
         return None
 

@@ -16,10 +16,12 @@ def frames(view: RunView) -> list[Frame]:
     known = ""
     if problem.truth_inliers is not None:
         wrong = count - int(np.count_nonzero(problem.truth_inliers))
-        known = f", {wrong} of them wrong by construction" if wrong else ", all of them right by construction"
+        how = "by construction" if problem.image is None else "by the true pose"
+        known = f", {wrong} of them wrong {how}" if wrong else f", all of them right {how}"
     note = f"{lost} pixels lie where the camera sees nothing and count as outliers." if lost else ""
     if count - lost > style.MAX_DRAWN_RAYS:
         note = f"The first {style.MAX_DRAWN_RAYS} of {count - lost:,} lines are drawn. {note}".strip()
+    note = " ".join([note, *problem.remarks]).strip()
     start = view.standing(np.eye(3))
     return [
         Frame(

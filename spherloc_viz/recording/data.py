@@ -68,6 +68,7 @@ def problem_from_row(row: Row, where: str) -> Problem:
     image = None if row["image"] is None else Path(row["image"])
     references = tuple(Path(text) for text in row.get("reference_images", ()))
     changed = {"camera": camera_from_table(row["camera"], where), "image": image, "reference_images": references}
+    changed["remarks"] = tuple(row.get("remarks", ()))
     problem = Problem(**row | changed)
     for name in ("gravity_camera", "gravity_map"):
         # Problem scales directions to unit length, and doing so twice can change the last bit.

@@ -1,0 +1,213 @@
+"""Files of KITTI-360 (cvlibs.net/datasets/kitti-360, autonomousvision/kitti360Scripts): layout, calibration, poses, scans.
+
+Transformations are (4, 4), named ``to_from_from``: p_to = to_from_from @ p_from, metres.
+"""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from spherloc.cameras.base import Camera, FloatArray
+from spherloc.cameras.calibration import load_camera
+from spherloc.datasets.map_settings import needed_file
+from spherloc.datasets.number_files import numbers, records, rigid
+from spherloc.errors import InputError
+
+MAX_SCAN_BYTES = 1 << 28
+"""A hundred times a scan of the dataset."""
+FARTHEST_M = 10_000.0
+"""Laser returns beyond this, a hundred times the sensor's range, are no returns but damage."""
+MAX_FRAME = 10**10 - 1
+"""Frames are named by ten digits."""
+_POINT_BYTES = 16
+_TIME = re.compile(r"(\d{4}-\d\d-\d\d) (\d\d:\d\d:\d\d)(\.\d{1,9})?")
+
+
+@dataclass(frozen=True, eq=False)
+class Rig:
+    """A fisheye camera and the laser scanner on the vehicle."""
+
+    camera: Camera
+    imu_from_camera: FloatArray
+    imu_from_velodyne: FloatArray
+
+
+@dataclass(frozen=True)
+class Drive:
+    """Where the files of one sequence are."""
+
+    root: Path
+    number: int
+
+    @property
+    def name(self) -> str:
+        """The sequence's folder."""
+        return f"2013_05_28_drive_{self.number:04d}_sync"
+
+    @property
+    def poses(self) -> Path:
+        """Poses of the IMU in the world."""
+        return self.root / "data_poses" / self.name / "poses.txt"
+
+    def images(self, camera: str) -> Path:
+        """Folder of a fisheye camera's images."""
+        return self.root / "data_2d_raw" / self.name / camera / "data_rgb"
+
+    def timestamps(self, camera: str) -> Path:
+        """Times of a camera's images, a line a frame; not everybody downloads them."""
+        return self.root / "data_2d_raw" / self.name / camera / "timestamps.txt"
+
+    @property
+    def scans(self) -> Path:
+        """Folder of the Velodyne's scans."""
+        return self.root / "data_3d_raw" / self.name / "velodyne_points" / "data"
+
+
+def read_rig(root: Path, camera: str, where: str) -> Rig:
+    """The calibration of the camera "image_02" or "image_03".
+
+    cam_k -> velo = cam_to_velo inv(cam_to_pose[0]) cam_to_pose[k] (kitti360Scripts, issue 15). The pixel centre's 0.5
+    is added (``load_camera``). Raises ``InputError`` that names a missing or wrong file.
+    """
+
+    def calibration(name: str, what: str) -> Path:
+        return needed_file(root / "calibration", name, where, what)
+
+    camera_file = calibration(f"{camera}.yaml", f"the calibration of {camera}")
+    to_pose_file = calibration("calib_cam_to_pose.txt", "where the cameras are on the vehicle")
+    to_velodyne_file = calibration("calib_cam_to_velo.txt", "where the laser scanner is")
+    imu_from = read_cam_to_pose(to_pose_file)
+    for key in ("image_00", camera):
+        if key not in imu_from:
+            raise InputError(f"{to_pose_file}: there is no line '{key}:'; take the dataset's own file.")
+    velodyne_from_image_00 = read_cam_to_velo(to_velodyne_file)
+    return Rig(
+        camera=load_camera(camera_file),
+        imu_from_camera=imu_from[camera],
+        imu_from_velodyne=imu_from["image_00"] @ np.linalg.inv(velodyne_from_image_00),
+    )
+
+
+def read_cam_to_pose(path: Path) -> dict[str, FloatArray]:
+    """``imu_from_camera`` by camera, of lines "image_0X: " and twelve numbers."""
+    found = {}
+    for line, words in records(path, "the dataset's calib_cam_to_pose.txt"):
+        place = f"{path}, line {line}"
+        key = words[0].rstrip(":")
+        if key in found:
+            raise InputError(f"{place}: {key} is there twice; remove one of the lines.")
+        found[key] = rigid(numbers(words[1:], 12, place), place)
+    return found
+
+
+def read_cam_to_velo(path: Path) -> FloatArray:
+    """``velodyne_from_image_00``, the twelve numbers of the only line."""
+    lines = list(records(path, "the dataset's calib_cam_to_velo.txt"))
+    if len(lines) != 1:
+        raise InputError(f"{path}: has {len(lines)} lines of numbers instead of one; take the dataset's own file.")
+    place = f"{path}, line {lines[0][0]}"
+    return rigid(numbers(lines[0][1], 12, place), place)
+
+
+def read_poses(path: Path) -> dict[int, FloatArray]:
+    """``world_from_imu`` by frame, in growing order, of lines with a frame and twelve numbers. Frames have gaps."""
+    poses: dict[int, FloatArray] = {}
+    last = -1
+    for line, words in records(path, "the poses.txt of a sequence"):
+        place = f"{path}, line {line}"
+        frame, *values = numbers(words, 13, place)
+        if not last < frame <= MAX_FRAME or frame != int(frame):
+            raise InputError(f"{place}: the frame {words[0][:20]} does not follow {last}; sort the lines by frame.")
+        last = int(frame)
+        poses[last] = rigid(values, place)
+    if not poses:
+        raise InputError(f"{path}: holds no pose; take the dataset's own file.")
+    return poses
+
+
+def read_timestamps(path: Path) -> list[float]:
+    """Seconds since 1970 (UTC) of every frame, of lines "2013-05-28 08:46:02.904094720"."""
+    times = []
+    for line, words in records(path, "the timestamps.txt of a camera"):
+        match = _TIME.fullmatch(" ".join(words))
+        try:
+            if match is None:
+                raise ValueError
+            whole = datetime.fromisoformat(f"{match[1]}T{match[2]}").replace(tzinfo=timezone.utc)
+        except ValueError:
+            raise InputError(f"{path}, line {line}: no time like 2013-05-28 08:46:02.904094720; correct it.") from None
+        times.append(whole.timestamp() + float(match[3] or 0))
+    return times
+
+
+def frames_in(folder: Path, ending: str, where: str, what: str) -> set[int]:
+    """Frames of the files in a folder that are named by ten digits and ``ending``; others are left alone.
+
+    Raises ``InputError`` if there is no such folder; ``what`` says what it should hold.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{where}: the folder {folder} is missing, {what}; check 'root' and the sequence.")
+    named = re.compile(r"\d{10}" + re.escape(ending), re.ASCII)
+    return {int(entry.name[:10]) for entry in folder.iterdir() if named.fullmatch(entry.name)}
+
+
+def read_scan(path: Path) -> FloatArray:
+    """Laser returns (N, 3), Velodyne frame, metres, of little-endian float32 x, y, z, reflectance.
+
+    Rays without a return, at exactly (0, 0, 0), are no points. Raises ``InputError``, naming the byte, for a damaged
+    file, and for one without any point.
+    """
+    try:
+        size = path.stat().st_size
+        if size > MAX_SCAN_BYTES or size % _POINT_BYTES:
+            raise InputError(
+                f"{path}: {size} bytes, but a scan has {_POINT_BYTES} for each point and at most {MAX_SCAN_BYTES}; "
+                "the file is damaged or no scan: replace it."
+            )
+        content = path.read_bytes()
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; download the scan or leave out its frame.") from None
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error}); check it.") from None
+    rows = np.frombuffer(content[: len(content) // _POINT_BYTES * _POINT_BYTES], dtype="<f4").reshape(-1, 4)
+    points = rows[:, :3].astype(np.float64)
+    bad = np.flatnonzero(~(np.abs(points) <= FARTHEST_M).all(axis=1))
+    if len(bad):
+        x, y, z = points[bad[0]]
+        raise InputError(
+            f"{path}, byte {bad[0] * _POINT_BYTES}: the point ({x:g}, {y:g}, {z:g}) is no laser return in metres; "
+            "the file is damaged: replace it."
+        )
+    points = points[points.any(axis=1)]
+    if not len(points):
+        raise InputError(f"{path}: holds no point; replace it or leave out its frame.")
+    return points
+
+
+def scan_motion(poses: Mapping[int, FloatArray], frame: int, imu_from_velodyne: FloatArray) -> FloatArray | None:
+    """How the scanner moved during the turn of a frame: its pose a turn before, in that of the frame.
+
+    From the frame before, else the frame after, as the dataset's own tools do; None where neither has a pose.
+    """
+    for earlier, later in ((frame - 1, frame), (frame, frame + 1)):
+        if earlier in poses and later in poses:
+            later_from_earlier = np.linalg.inv(poses[later]) @ poses[earlier]
+            return np.linalg.inv(imu_from_velodyne) @ later_from_earlier @ imu_from_velodyne
+    return None
+
+
+def unwrapped(points: FloatArray, motion: FloatArray) -> FloatArray:
+    """Returns (N, 3) of one turn as if the scanner had stood still where it looked ahead, when the cameras fire.
+
+    Raw scans are not corrected for the vehicle's motion (kitti360Scripts, issue 87): at 10 m/s and 10 Hz, what lies
+    beside the vehicle, where the fisheyes look, is off by a quarter of a metre. The scanner turns clockwise, so that
+    a return at the azimuth a > 0 is a / 2 pi turns old.
+    """
+    turns = np.arctan2(points[:, 1], points[:, 0])[:, None] / (2.0 * np.pi)
+    rotation_vector = Rotation.from_matrix(motion[:3, :3]).as_rotvec()
+    return Rotation.from_rotvec(turns * rotation_vector).apply(points) + turns * motion[:3, 3]

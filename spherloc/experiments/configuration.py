@@ -1,0 +1,151 @@
+"""What decides the results of a sequence: written beside them, so that nobody mixes the results of two settings."""
+
+import hashlib
+import json
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from spherloc.cameras.base import FloatArray
+from spherloc.datasets.map_scene import MapScene, Thresholds
+from spherloc.datasets.scene_file import numbers
+from spherloc.errors import InputError, show
+from spherloc.estimators.base import versions
+
+FORMAT = 1
+MAX_BYTES = 1_000_000
+_UNCOMPARED = {"scene"}
+"""A scene file that was moved or copied is still the same scene."""
+
+
+@dataclass(frozen=True, eq=False)
+class Configuration:
+    """The resolved settings of a sequence's run."""
+
+    scene: str
+    """The scene file."""
+    scene_sha256: str
+    """Hash of its content."""
+    name: str
+    """The scene's name."""
+    estimator: str
+    """Registered name."""
+    options: Mapping[str, Any]
+    """The estimator's options, all of them."""
+    seed: int
+    """Seed of the estimator, the same for every query."""
+    versions: Mapping[str, str]
+    """Of everything that can change a number."""
+    queries: int
+    """Query images in the scene."""
+    gravity_map: FloatArray
+    """Unit vector (3,) pointing down in the map frame."""
+    thresholds: Thresholds
+    """Limits of success (degrees, metres), strictest first."""
+    registration_thresholds_m: tuple[float, ...] | None
+    """Limits of success of the registration error; None if the scene does not judge by it."""
+
+    def json_text(self) -> str:
+        """As ``configuration.json`` holds it; infinity is the text "inf"."""
+        return json.dumps({"format": FORMAT} | _plain(self), indent=2, allow_nan=False) + "\n"
+
+    def differences(self, now: "Configuration") -> list[str]:
+        """What is not the same in ``now``, as phrases such as "seed is 1, was 0"."""
+        before, after = (dict(_flat(_plain(item))) for item in (self, now))
+        return [
+            f"{key} is {show(after.get(key, 'absent'))}, was {show(before.get(key, 'absent'))}"
+            for key in [*after, *(key for key in before if key not in after)]
+            if before.get(key) != after.get(key)
+        ]
+
+
+def configuration_of(scene: MapScene, path: Path, estimator: str, options: Any, seed: int) -> Configuration:
+    """The configuration of localizing the queries of the scene file ``path``; ``options`` is the resolved dataclass.
+
+    Raises ``InputError`` if the file can no longer be read.
+    """
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); keep the scene file where it is.") from None
+    return Configuration(
+        scene=str(path),
+        scene_sha256=hashlib.sha256(content).hexdigest(),
+        name=scene.name,
+        estimator=estimator,
+        options=asdict(options),
+        seed=seed,
+        versions={**versions(), "opencv": cv2.__version__},
+        queries=len(scene.queries),
+        gravity_map=np.asarray(scene.gravity_map, dtype=np.float64),
+        thresholds=scene.thresholds,
+        registration_thresholds_m=None if scene.registration is None else tuple(scene.registration.thresholds_m),
+    )
+
+
+def read_configuration(path: Path) -> Configuration:
+    """A ``configuration.json``. Raises ``InputError`` if it is missing, unreadable, damaged or of another version."""
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise InputError(f"{path}: larger than {MAX_BYTES:,} bytes, so it is no configuration of a run.")
+        table = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; give the folder of a sequence's results.") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); make it readable.") from None
+    except (ValueError, RecursionError):
+        raise InputError(f"{path}: is damaged; give another folder and localize the sequence again.") from None
+    if isinstance(table, dict) and table.get("format") != FORMAT:
+        raise InputError(f"{path}: has the format {show(table.get('format'))}, not {FORMAT}; give another folder.")
+    try:
+        return _parsed(table, str(path))
+    except (KeyError, TypeError, ValueError, AttributeError, InputError):
+        raise InputError(f"{path}: is damaged; give another folder and localize the sequence again.") from None
+
+
+def _parsed(table: Any, where: str) -> Configuration:
+    limits = table["thresholds"]
+    pairs = numbers(limits, (len(limits), 2), "thresholds", where)
+    registration = table["registration_thresholds_m"]
+    for key, kind in {"scene": str, "scene_sha256": str, "name": str, "estimator": str, "seed": int, "queries": int}.items():
+        if type(table[key]) is not kind:
+            raise TypeError(key)
+    return Configuration(
+        **{key: table[key] for key in ("scene", "scene_sha256", "name", "estimator", "seed", "queries")},
+        options={key: math.inf if value == "inf" else value for key, value in table["options"].items()},
+        versions={str(key): str(value) for key, value in table["versions"].items()},
+        gravity_map=numbers(table["gravity_map"], (3,), "gravity_map", where),
+        thresholds=tuple((float(degrees), float(metres)) for degrees, metres in pairs),
+        registration_thresholds_m=None
+        if registration is None
+        else tuple(map(float, numbers(registration, (len(registration),), "registration_thresholds_m", where))),
+    )
+
+
+def _plain(configuration: Configuration) -> dict[str, Any]:
+    """With nothing but what JSON has."""
+    values = dict(vars(configuration))
+    values["options"] = {
+        key: "inf" if isinstance(value, float) and math.isinf(value) else value
+        for key, value in configuration.options.items()
+    }
+    values["versions"] = dict(configuration.versions)
+    values["gravity_map"] = configuration.gravity_map.tolist()
+    values["thresholds"] = [list(pair) for pair in configuration.thresholds]
+    if configuration.registration_thresholds_m is not None:
+        values["registration_thresholds_m"] = list(configuration.registration_thresholds_m)
+    return values
+
+
+def _flat(table: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
+    """Values by dotted keys, such as "options.bound_px"."""
+    for key, value in table.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{above}{key}.")
+        elif key not in _UNCOMPARED:
+            yield above + key, value

@@ -1,0 +1,248 @@
+"""The folder of a sequence's results: every finished query is safe on the disk before the next one is begun."""
+
+import contextlib
+import os
+import uuid
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+
+from spherloc.cameras.base import FloatArray
+from spherloc.errors import InputError
+from spherloc.experiments.configuration import Configuration, read_configuration
+from spherloc.experiments.rows import LOCALIZED, QueryResult, csv_text, json_line, row_of_json
+
+CONFIGURATION, ROWS, TABLE = "configuration.json", "results.jsonl", "results.csv"
+MAX_BYTES = 2_000_000_000
+MAX_DIFFERENCES = 3
+
+
+@dataclass(frozen=True, eq=False)
+class SequenceResults:
+    """A sequence's results, in the order of its query images. Q rows."""
+
+    folder: Path
+    """Where they were read."""
+    configuration: Configuration
+    """How they were made."""
+    rows: tuple[QueryResult, ...]
+    """One a query that is done."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """(Q,) names of the query images."""
+        return tuple(row.query for row in self.rows)
+
+    @property
+    def status(self) -> tuple[str, ...]:
+        """(Q,) "localized", "failed" or "unreadable"."""
+        return tuple(row.status for row in self.rows)
+
+    @cached_property
+    def positions_m(self) -> FloatArray:
+        """(Q, 3) estimated camera positions, map frame; NaN without a pose."""
+        return np.array([row.position_m for row in self.rows]).reshape(-1, 3)
+
+    @cached_property
+    def true_positions_m(self) -> FloatArray:
+        """(Q, 3) true camera positions, map frame; NaN where they are unknown."""
+        return np.array([row.true_position_m for row in self.rows]).reshape(-1, 3)
+
+    @property
+    def rotation_errors_deg(self) -> FloatArray:
+        """(Q,) degrees; NaN without a pose or its truth."""
+        return self._numbers("rotation_error_deg")
+
+    @property
+    def translation_errors_m(self) -> FloatArray:
+        """(Q,) metres; NaN without a pose or its truth."""
+        return self._numbers("translation_error_m")
+
+    @property
+    def registration_errors_m(self) -> FloatArray:
+        """(Q,) metres; NaN without a pose or where nothing was registered."""
+        return self._numbers("registration_error_m")
+
+    @property
+    def recordings(self) -> tuple[Path | None, ...]:
+        """(Q,) files of the recordings; they may have been moved or deleted since."""
+        return tuple(None if row.recording is None else self.folder / row.recording for row in self.rows)
+
+    def _numbers(self, name: str) -> FloatArray:
+        values = [getattr(row, name) for row in self.rows]
+        return np.array([np.nan if value is None else value for value in values], dtype=np.float64)
+
+
+def read_results(folder: Path) -> SequenceResults:
+    """What ``spherloc localize`` wrote into a folder, finished or not.
+
+    A last line that a killed process left half written is passed over. Raises ``InputError`` that names the file and
+    the line if a file is missing, unreadable or damaged.
+    """
+    folder = Path(folder)
+    configuration = read_configuration(folder / CONFIGURATION)
+    rows, _ = _read_rows(folder / ROWS)
+    return SequenceResults(folder, configuration, rows)
+
+
+def _read_rows(path: Path) -> tuple[tuple[QueryResult, ...], int]:
+    """Rows in the order of the sequence, and how many bytes of the file hold whole lines."""
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise InputError(f"{path}: larger than {MAX_BYTES:,} bytes, so it holds no results of a sequence.")
+        content = path.read_bytes()
+    except FileNotFoundError:
+        return (), 0
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); make it readable.") from None
+    whole = content[: content.rfind(b"\n") + 1]
+    rows: dict[str, QueryResult] = {}
+    for number, line in enumerate(whole.split(b"\n")[:-1], start=1):
+        place = f"{path}, line {number}"
+        row = row_of_json(line.decode("utf-8", errors="replace"), place)
+        if row.query in rows:
+            raise InputError(f"{place}: the query {row.query} is there a second time; delete one of the two lines.")
+        rows[row.query] = row
+    return tuple(sorted(rows.values(), key=lambda row: row.index)), len(whole)
+
+
+class ResultsLog:
+    """Appends rows to the results in a folder. Use it as a context manager; one process at a time may have it."""
+
+    def __init__(self, folder: Path, configuration: Configuration) -> None:
+        """Begin a folder of results or go on with one.
+
+        Raises ``InputError`` if the folder cannot be written, if its results were made with another configuration, if
+        they are damaged, or if another process is writing there.
+        """
+        self.folder = Path(folder)
+        self.rows: dict[str, QueryResult] = {}
+        """The results by query name, those of earlier runs too."""
+        self.repaired = False
+        """Whether a line that an earlier run left half written was removed."""
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            self._file = (self.folder / ROWS).open("ab")
+        except OSError as error:
+            reason = error.strerror or error
+            raise InputError(f"{folder}: results cannot be written there ({reason}); give another folder.") from None
+        try:
+            self._lock()
+            self._configure(configuration)
+            rows, whole_bytes = _read_rows(self.folder / ROWS)
+            self.rows = {row.query: row for row in rows}
+            self._repair(whole_bytes)
+            self._write_table()
+        except BaseException:
+            self._file.close()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._file.close()
+
+    def append(self, row: QueryResult) -> None:
+        """Have a row on the disk before this returns. Raises ``InputError`` if that fails; other rows are kept."""
+        with self._writing(ROWS):
+            self._file.write(f"{json_line(row)}\n".encode())
+            self._file.flush()
+            os.fsync(self._file.fileno())
+        self.rows[row.query] = row
+        with self._writing(TABLE), (self.folder / TABLE).open("a", encoding="utf-8", newline="") as table:
+            table.write(csv_text([row], header=False))
+
+    def forget_failures(self) -> int:
+        """Remove the rows of queries without a pose, so that they are done again; returns how many.
+
+        Raises ``InputError`` if the files cannot be written.
+        """
+        kept = {name: row for name, row in self.rows.items() if row.status == LOCALIZED}
+        removed = len(self.rows) - len(kept)
+        if removed:
+            content = "".join(f"{json_line(row)}\n" for row in kept.values())
+            self.write(ROWS, content.encode())
+            self._file.close()
+            with self._writing(ROWS):
+                self._file = (self.folder / ROWS).open("ab")
+            self._lock()
+            self.rows = kept
+            self._write_table()
+        return removed
+
+    def results(self) -> SequenceResults:
+        """What is done by now, in the order of the sequence, also in ``results.csv``."""
+        self._write_table()
+        ordered = sorted(self.rows.values(), key=lambda row: row.index)
+        return SequenceResults(self.folder, self.configuration, tuple(ordered))
+
+    def write(self, name: str, content: bytes) -> None:
+        """Write a whole file into the folder, so that no reader sees half of it. Raises ``InputError`` if that fails."""
+        path = self.folder / name
+        part = path.with_name(f".{name}.{uuid.uuid4().hex[:8]}.part")
+        try:
+            with self._writing(name):
+                with part.open("wb") as file:
+                    file.write(content)
+                    file.flush()
+                    os.fsync(file.fileno())
+                part.replace(path)
+        finally:
+            with contextlib.suppress(OSError):
+                part.unlink(missing_ok=True)
+
+    @contextlib.contextmanager
+    def _writing(self, name: str):
+        try:
+            yield
+        except OSError as error:
+            reason = error.strerror or error
+            raise InputError(
+                f"{self.folder / name}: cannot be written ({reason}); the results of {len(self.rows)} queries are kept: "
+                "make room there and give the same command to go on."
+            ) from None
+
+    def _lock(self) -> None:
+        """The system releases it whatever ends the process."""
+        try:
+            import fcntl
+        except ImportError:  # Windows has no such lock
+            return
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise InputError(
+                f"{self.folder}: another process is localizing into it; wait for it or give another folder."
+            ) from None
+        except OSError:  # a file system without locks
+            return
+
+    def _configure(self, configuration: Configuration) -> None:
+        path = self.folder / CONFIGURATION
+        if path.exists():
+            differences = read_configuration(path).differences(configuration)
+            if differences:
+                more = len(differences) - MAX_DIFFERENCES
+                listed = "; ".join(differences[:MAX_DIFFERENCES]) + (f"; and {more} more" if more > 0 else "")
+                raise InputError(f"{self.folder}: holds results of another configuration ({listed}); give another folder.")
+        elif (self.folder / ROWS).stat().st_size:
+            raise InputError(f"{self.folder}: holds results without their {CONFIGURATION}; give another folder.")
+        else:
+            self.write(CONFIGURATION, configuration.json_text().encode())
+        self.configuration = configuration
+
+    def _repair(self, whole_bytes: int) -> None:
+        with self._writing(ROWS):
+            if (self.folder / ROWS).stat().st_size > whole_bytes:
+                self._file.truncate(whole_bytes)
+                self.repaired = True
+
+    def _write_table(self) -> None:
+        self.write(TABLE, csv_text(sorted(self.rows.values(), key=lambda row: row.index)).encode())

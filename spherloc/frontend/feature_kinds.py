@@ -1,0 +1,120 @@
+"""The kinds of local features: how OpenCV makes each, and what its keypoints mean."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from spherloc.cameras.base import FloatArray
+from spherloc.errors import InputError
+from spherloc.frontend import learned
+from spherloc.images import ByteImage, grey
+
+Descriptors = NDArray[np.float32] | NDArray[np.uint8]
+
+SIFT_CONTRAST = 0.02
+"""COLMAP's threshold (its peak threshold is a third of it): half of OpenCV's, which finds little in dim rooms."""
+
+
+@dataclass(frozen=True)
+class Kind:
+    """One kind of features."""
+
+    run: Callable[[ByteImage, ByteImage, int, Path | None], tuple[FloatArray, Any]]
+    """``detect`` of this kind: image, mask, most features, weights -> keypoints (N, 5) and descriptors."""
+    binary: bool = False
+    """Its descriptors are bits, compared by their Hamming distance."""
+    learned: bool = False
+    """It needs a file of weights."""
+    reach: float = 0.5
+    """How far its detector looks around a keypoint, as a part of the keypoint's size."""
+
+
+def detect(
+    method: str, image: ByteImage, mask: ByteImage, most: int, weights: Path | None
+) -> tuple[FloatArray, Descriptors]:
+    """Features of an image, (H, W) or (H, W, 3) BGR, at the non-zero pixels of ``mask`` (H, W).
+
+    Returns keypoints (N, 5): pixel u, v with the first pixel's centre at (0.5, 0.5), size px, angle rad, score; and
+    descriptors (N, D). There may be more than ``most`` features. Raises ``InputError`` if this OpenCV lacks the method
+    or its weights cannot be used.
+    """
+    keypoints, descriptors = KINDS[method].run(image, mask, most, weights)
+    if descriptors is None or len(keypoints) == 0:
+        return np.empty((0, 5)), np.empty((0, 1), np.uint8 if KINDS[method].binary else np.float32)
+    return keypoints, descriptors
+
+
+def keypoint_table(keypoints: Any, shift_px: float = 0.5) -> FloatArray:
+    """(N, 5) of OpenCV's keypoints, whose first pixel has its centre at ``-shift_px + 0.5``."""
+    rows = [(point.pt[0], point.pt[1], point.size, np.radians(point.angle), point.response) for point in keypoints]
+    table = np.array(rows, np.float64).reshape(-1, 5)
+    table[:, :2] += shift_px
+    return table
+
+
+def _sift(image: ByteImage, mask: ByteImage, _most: int, _weights: Path | None) -> tuple[FloatArray, Any]:
+    # Not ``nfeatures``: OpenCV applies it before the mask, and what the mask removes would have used it up.
+    # Without the precise upscale every keypoint lies a quarter of a pixel too far right and down.
+    sift = cv2.SIFT_create(contrastThreshold=SIFT_CONTRAST, enable_precise_upscale=True)
+    keypoints, descriptors = sift.detectAndCompute(grey(image), mask)
+    return keypoint_table(keypoints), None if descriptors is None else root_normalised(descriptors)
+
+
+def root_normalised(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
+    """RootSIFT (Arandjelovic and Zisserman 2012, Sec. 3): square roots of L1-normalised descriptors (N, D).
+
+    Their Euclidean distance is the Hellinger distance of the histograms.
+    """
+    total = descriptors.sum(axis=1, keepdims=True)
+    return np.sqrt(descriptors / np.maximum(total, np.finfo(np.float32).tiny))
+
+
+def _orb(image: ByteImage, mask: ByteImage, most: int, _weights: Path | None) -> tuple[FloatArray, Any]:
+    keypoints, descriptors = cv2.ORB_create(nfeatures=most).detectAndCompute(grey(image), mask)
+    return keypoint_table(keypoints), descriptors
+
+
+def _akaze(image: ByteImage, mask: ByteImage, _most: int, _weights: Path | None) -> tuple[FloatArray, Any]:
+    # OpenCV 5 moved it to the contributed modules.
+    create = getattr(cv2, "AKAZE_create", None) or _contributed("AKAZE_create")
+    if create is None:
+        raise InputError(
+            f"AKAZE features are not in this OpenCV ({cv2.__version__}); install OpenCV 4 (opencv-python-headless<5) or "
+            "opencv-contrib-python-headless, or take the features 'sift'."
+        )
+    keypoints, descriptors = create().detectAndCompute(grey(image), mask)
+    return keypoint_table(keypoints), descriptors
+
+
+def _surf(image: ByteImage, mask: ByteImage, _most: int, _weights: Path | None) -> tuple[FloatArray, Any]:
+    create = _contributed("SURF_create")
+    try:
+        surf = None if create is None else create(hessianThreshold=100.0, extended=True)
+    except cv2.error:  # the contributed modules have it, but were built without it
+        surf = None
+    if surf is None:
+        raise InputError(
+            f"SURF features are not in this OpenCV ({cv2.__version__}); build OpenCV with its contributed modules and "
+            "OPENCV_ENABLE_NONFREE, or take the features 'sift'."
+        )
+    keypoints, descriptors = surf.detectAndCompute(grey(image), mask)
+    return keypoint_table(keypoints), descriptors
+
+
+def _contributed(name: str) -> Any:
+    return getattr(getattr(cv2, "xfeatures2d", None), name, None)
+
+
+KINDS = {
+    "sift": Kind(_sift),
+    "orb": Kind(_orb, binary=True, reach=0.2),
+    "akaze": Kind(_akaze, binary=True),
+    "surf": Kind(_surf),
+    "aliked": Kind(learned.aliked, learned=True),
+    "disk": Kind(learned.disk, learned=True),
+}

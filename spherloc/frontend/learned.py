@@ -1,0 +1,106 @@
+"""Learned features and matching through OpenCV 5, with the weight files (ONNX) that the user gives."""
+
+from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
+from threading import Lock
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from spherloc.cameras.base import FloatArray
+from spherloc.errors import InputError
+from spherloc.images import ByteImage
+
+ALIKED_INPUT_PX = 640
+DISK_INPUT_PX = 1024
+"""Width and height that OpenCV gives to these networks: what their published files are made for."""
+
+_one_at_a_time = Lock()
+"""OpenCV's networks keep the state of a run, and are shared by all threads."""
+
+
+def aliked(image: ByteImage, _mask: ByteImage, _most: int, weights: Path | None) -> tuple[FloatArray, Any]:
+    """ALIKED features (Zhao et al. 2023) of an image: keypoints (N, 5) as in ``feature_kinds.detect``, descriptors.
+
+    Everywhere in the image: OpenCV's ALIKED knows no mask. Raises ``InputError`` for what is no network of ALIKED.
+    """
+    rows, descriptors = _detect("ALIKED", weights, image, None)
+    # The network gives -1 to 1 from the first pixel's centre to the last one's; OpenCV takes them for the image's rim.
+    scale = np.array(image.shape[1::-1]) / ALIKED_INPUT_PX
+    rows[:, :2] = rows[:, :2] * (ALIKED_INPUT_PX - 1) / ALIKED_INPUT_PX + 0.5 * scale
+    return rows, descriptors
+
+
+def disk(image: ByteImage, mask: ByteImage, _most: int, weights: Path | None) -> tuple[FloatArray, Any]:
+    """DISK features (Tyszkiewicz et al. 2020), as ``aliked``."""
+    rows, descriptors = _detect("DISK", weights, image, mask)
+    rows[:, :2] += 0.5 * np.array(image.shape[1::-1]) / DISK_INPUT_PX  # the centre of a pixel of the network
+    return rows, descriptors
+
+
+def lightglue(
+    weights: Path,
+    query: tuple[FloatArray, NDArray[np.float32], tuple[int, int]],
+    reference: tuple[FloatArray, NDArray[np.float32], tuple[int, int]],
+) -> NDArray[np.int64]:
+    """Index pairs (K, 2) that LightGlue (Lindenberger et al. 2023) finds between two images.
+
+    Each image is given by pixels (N, 2), descriptors (N, D) and its size (width, height). Raises ``InputError`` for
+    what is no network of LightGlue for such descriptors.
+    """
+    (pixels, descriptors, size), (other_pixels, other_descriptors, other_size) = query, reference
+    matcher = _network("LightGlueMatcher", weights)
+    with _one_at_a_time:
+        try:
+            matcher.setPairInfo(pixels.astype(np.float32), other_pixels.astype(np.float32), size, other_size)
+            found = matcher.match(descriptors, other_descriptors)
+        except cv2.error as error:
+            raise _refusal("LightGlueMatcher", weights, error) from None
+    return np.array([(match.queryIdx, match.trainIdx) for match in found], np.int64).reshape(-1, 2)
+
+
+def _detect(name: str, weights: Path | None, image: ByteImage, mask: ByteImage | None) -> tuple[FloatArray, Any]:
+    if weights is None:
+        raise InputError(f"{name} features need a file of weights; give its ONNX file as weights.")
+    network = _network(name, weights)
+    colour = image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
+    with _one_at_a_time:
+        try:
+            keypoints, descriptors = network.detectAndCompute(colour, mask)
+        except cv2.error as error:
+            raise _refusal(name, weights, error) from None
+    rows = np.array([(*point.pt, point.size, 0.0, point.response) for point in keypoints], np.float64).reshape(-1, 5)
+    return rows, descriptors
+
+
+def _network(name: str, weights: Path) -> Any:
+    create = getattr(cv2, f"{name}_create", None)
+    if create is None:
+        raise InputError(
+            f"{name} is not in this OpenCV ({cv2.__version__}); install OpenCV 5 (opencv-python-headless>=5), or take "
+            "the features 'sift' with the matching 'nearest'."
+        )
+    try:
+        status = Path(weights).stat()
+        with Path(weights).open("rb"):
+            pass
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"{weights}: weights of {name} cannot be read ({reason}); give its ONNX file.") from None
+    return _loaded(name, create, Path(weights), status.st_mtime_ns, status.st_size)
+
+
+@lru_cache(maxsize=3)
+def _loaded(name: str, create: Callable[[str], Any], weights: Path, _changed: int, _size: int) -> Any:
+    try:
+        return create(str(weights))
+    except cv2.error as error:
+        raise _refusal(name, weights, error) from None
+
+
+def _refusal(name: str, weights: Path, error: cv2.error) -> InputError:
+    said = " ".join(str(getattr(error, "err", error)).split())[:120]
+    return InputError(f"{weights}: OpenCV cannot use it for {name} ({said}); give an ONNX file of {name}.")

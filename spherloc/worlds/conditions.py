@@ -1,0 +1,90 @@
+"""Under which conditions a picture is taken: light, season, passers-by, and the camera's own faults."""
+
+import math
+from dataclasses import dataclass
+
+from spherloc.errors import InputError, show
+
+
+@dataclass(frozen=True)
+class Light:
+    """Linear brightness of what lights a world; 1 makes a white wall white."""
+
+    sun: tuple[float, float, float]
+    """Red, green, blue of the sun on a surface that faces it."""
+    sky: tuple[float, float, float]
+    """Of the light from above on a level surface."""
+    azimuth_deg: float
+    """Where the sun stands, anticlockwise from the world's x axis."""
+    elevation_deg: float
+    """Its height above the horizon."""
+    zenith: tuple[float, float, float]
+    """Colour of the sky above."""
+    horizon: tuple[float, float, float]
+    """Colour of the sky at the horizon, and of the haze."""
+    clouds: float
+    """How much of the sky they cover, 0 to 1."""
+    lamps: float
+    """Strength of lamps and lit windows, 0 to 1."""
+
+
+LIGHTS = {
+    "day": Light((1.25, 1.15, 0.98), (0.42, 0.48, 0.58), 55, 42, (0.10, 0.24, 0.60), (0.62, 0.74, 0.90), 0.45, 0.0),
+    "morning": Light((1.1, 0.92, 0.68), (0.38, 0.44, 0.55), 150, 24, (0.16, 0.30, 0.62), (0.85, 0.80, 0.76), 0.3, 0.0),
+    "overcast": Light((0.0, 0.0, 0.0), (0.82, 0.86, 0.92), 55, 50, (0.62, 0.66, 0.72), (0.82, 0.84, 0.87), 1.0, 0.0),
+    "dusk": Light((0.55, 0.26, 0.10), (0.17, 0.17, 0.26), 205, 9, (0.06, 0.08, 0.22), (0.85, 0.38, 0.16), 0.55, 0.8),
+    "night": Light((0.03, 0.035, 0.05), (0.02, 0.024, 0.04), 100, 50, (0.006, 0.008, 0.02), (0.03, 0.03, 0.05), 0.2, 1.0),
+}
+"""By name."""
+
+SEASONS = ("summer", "spring", "autumn", "winter")
+
+LIMITS = {
+    "sun_azimuth_deg": (-360.0, 360.0),
+    "sun_elevation_deg": (2.0, 90.0),
+    "occluders": (0, 60),
+    "motion_blur_px": (0.0, 40.0),
+    "defocus_px": (0.0, 20.0),
+    "noise": (0.0, 80.0),
+    "exposure_stops": (-4.0, 4.0),
+}
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """Of one picture; the default is a clear summer day, nobody about, and a perfect camera."""
+
+    light: str = "day"
+    """One of ``LIGHTS``."""
+    season: str = "summer"
+    """One of ``SEASONS``: leaves and lawns turn with it, and winter brings snow."""
+    sun_azimuth_deg: float | None = None
+    """Where the sun stands, anticlockwise from the world's x axis; None for what the light says."""
+    sun_elevation_deg: float | None = None
+    """Its height above the horizon; None for what the light says."""
+    occluders: int = 0
+    """How many cars, people and boxes stand about that the map has not."""
+    motion_blur_px: float = 0.0
+    """Length of the smear that a turning camera makes, px, along the rows."""
+    defocus_px: float = 0.0
+    """Standard deviation of an unsharp lens's blur, px."""
+    noise: float = 0.0
+    """Standard deviation of the sensor's noise, grey levels of 255."""
+    exposure_stops: float = 0.0
+    """Brighter (positive) or darker by powers of two."""
+
+    def __post_init__(self) -> None:
+        for key, known in (("light", tuple(LIGHTS)), ("season", SEASONS)):
+            if getattr(self, key) not in known:
+                raise InputError(f"conditions: no {key} {show(getattr(self, key))}; there are {', '.join(known)}.")
+        for key, (lowest, highest) in LIMITS.items():
+            value = getattr(self, key)
+            if value is None and key.startswith("sun_"):
+                continue
+            whole = key == "occluders"
+            number = isinstance(value, int if whole else (int, float)) and not isinstance(value, bool)
+            if not number or not math.isfinite(value) or not lowest <= value <= highest:
+                kind = "whole number" if whole else "number"
+                raise InputError(f"conditions: {key} is {show(value)}; give a {kind} from {lowest:g} to {highest:g}.")
+            if not whole:
+                object.__setattr__(self, key, float(value))
