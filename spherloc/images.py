@@ -1,11 +1,13 @@
 """Reads images. Pixels are taken as they are stored: calibrations know nothing of a photograph's orientation tag."""
 
 import struct
+import warnings
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from spherloc.errors import InputError
 
@@ -36,6 +38,25 @@ def read_depth_png(path: Path) -> NDArray[np.uint16]:
     if image.dtype != np.uint16 or image.ndim != 2:
         raise InputError(f"{path}: is no depth map; give a PNG with one channel of 16 bits.")
     return image
+
+
+def read_size(path: Path) -> tuple[int, int]:
+    """Width and height of an image by its header alone.
+
+    Raises ``InputError`` for what is missing, too large or no image.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            with Image.open(path) as image:
+                width, height = image.size
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; correct the path of the image.") from None
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError, struct.error):
+        raise InputError(f"{path}: not an image that can be read, or a damaged one; replace it.") from None
+    if not 0 < width * height <= MAX_PIXELS:
+        raise InputError(f"{path}: claims {width} x {height} pixels; give a smaller image.")
+    return width, height
 
 
 def grey(image: ByteImage) -> ByteImage:

@@ -52,28 +52,35 @@ def coefficients(key: str, value: Any, names: str) -> tuple[float, ...]:
     return tuple(number for number in numbers if number is not None)
 
 
-def check_lens(camera: Any, coefficient_names: str) -> None:
-    """Check and normalise, in place, the fields of a frozen fisheye camera while it is being constructed.
+def check_focal(camera: Any) -> None:
+    """Check and normalise width, height, fx, fy, cx and cy of a frozen camera while it is being constructed.
 
-    These are width, height, fx, fy, cx, cy and distortion; raises ``CalibrationError`` for an unusable value.
+    Raises ``CalibrationError`` for an unusable value.
     """
     checked: dict[str, Any] = {key: whole_pixels(key, getattr(camera, key)) for key in ("width", "height")}
     checked |= {key: positive(key, getattr(camera, key)) for key in ("fx", "fy")}
     checked |= {key: finite(key, getattr(camera, key)) for key in ("cx", "cy")}
-    checked["distortion"] = coefficients("distortion", camera.distortion, coefficient_names)
     for key, value in checked.items():
         object.__setattr__(camera, key, value)
 
 
-def check_sees_image(camera: Any, rim: float) -> None:
+def check_lens(camera: Any, coefficient_names: str) -> None:
+    """``check_focal``, and the same for ``distortion``; raises ``CalibrationError`` for an unusable value."""
+    check_focal(camera)
+    object.__setattr__(camera, "distortion", coefficients("distortion", camera.distortion, coefficient_names))
+
+
+def check_sees_image(camera: Any, rim: float, shape: str | None = None) -> None:
     """Raise ``CalibrationError`` for a fisheye camera that can unproject no pixel of its own image.
 
-    ``rim`` is the distorted radius, in focal lengths, of the last direction that the model can invert.
+    ``rim`` is the distorted radius, in focal lengths, of the last direction that the model can invert; ``shape``
+    quotes the keys that decide on it, by default the distortion.
     """
     if not 1.0 <= rim * min(camera.fx, camera.fy) < inf:
+        quoted = shape or f"camera key 'distortion' is {show(list(camera.distortion))}"
         raise CalibrationError(
-            f"camera key 'distortion' is {show(list(camera.distortion))}, which cannot be inverted one pixel away from "
-            "the principal point: check the order and the signs of the coefficients."
+            f"{quoted}, which cannot be inverted one pixel away from the principal point: "
+            "check the order and the signs of the coefficients."
         )
     nearest = [[min(max(camera.cx, 0.0), camera.width), min(max(camera.cy, 0.0), camera.height)]]
     if not camera.unproject(np.array(nearest))[1][0]:
@@ -144,6 +151,19 @@ def rows(name: str, array: Any, columns: int) -> FloatArray:
     if given.ndim != 2 or given.shape[1] != columns:
         raise ProblemError(f"{name} have the shape {given.shape}: give an array of shape (N, {columns}).")
     return given.astype(np.float64, copy=False)
+
+
+def plane(camera: Any, pixels: Any, max_radius: float) -> tuple[FloatArray, FloatArray]:
+    """Pixels (N, 2) in focal lengths from the principal point, x and y, each (N,); NaN from ``max_radius`` on.
+
+    Raises ``ProblemError`` for a wrong shape.
+    """
+    u, v = rows("pixels", pixels, 2).T
+    with np.errstate(all="ignore"):
+        x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
+        outside = ~(np.hypot(x, y) < max_radius)
+    x[outside] = y[outside] = np.nan
+    return x, y
 
 
 def _as_float(value: Any) -> float | None:

@@ -134,7 +134,7 @@ def _camera(parameters: list[str], place: str) -> Camera:
     width, height, *numbers = finite_numbers(parameters[1:], place)
     if not (width.is_integer() and height.is_integer()):
         raise InputError(f"{place}: an image of {width:g} x {height:g} pixels; give whole numbers.")
-    return camera_from_colmap(parameters[0], int(width), int(height), np.array(numbers), place)
+    return camera_from_colmap(parameters[0], int(width), int(height), tuple(numbers), place)
 
 
 def _rigs(path: Path, sensors: set[str]) -> dict[str, dict[str, FloatArray | None]]:

@@ -6,7 +6,7 @@ default), ``reference_step`` and ``query_step`` (every n-th usable frame) and ``
 make up the points of a reference, by default its own).
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -17,7 +17,6 @@ import numpy as np
 from spherloc.cameras.base import FloatArray
 from spherloc.datasets import scene_file
 from spherloc.datasets.kitti360_files import (
-    MAX_FRAME,
     Drive,
     Rig,
     frames_in,
@@ -34,7 +33,7 @@ from spherloc.errors import InputError, show
 from spherloc.frontend.lifting import PointCloudLift
 from spherloc.frontend.pipeline import image_matcher
 from spherloc.frontend.view import View
-from spherloc.geometry import transform
+from spherloc.geometry import pose, transform
 
 CAMERAS = ("image_02", "image_03")
 THRESHOLDS = ((1.0, 0.5), (2.0, 1.0), (5.0, 2.0))
@@ -44,6 +43,8 @@ GRAVITY_BOUND_DEG = 2.0
 GRAVITY_MAP = np.array([0.0, 0.0, -1.0])
 """The world's z axis points up."""
 MAX_SCANS = 99
+_LAST_FRAME = 10**10 - 1
+"""Frames are named by ten digits."""
 
 
 def load(table: dict[str, Any], path: Path) -> MapScene:
@@ -57,32 +58,139 @@ def load(table: dict[str, Any], path: Path) -> MapScene:
     choices = {"reference_frames", "reference_step", "query_frames", "query_step", "scans"}
     scene_file.check_keys(table, REQUIRED | own, OPTIONAL | choices, where)
     settings = read_settings(table, where, GRAVITY_BOUND_DEG, THRESHOLDS)
+    scans = scene_file.integer({"scans": 1} | table, "scans", where, 1, MAX_SCANS)
     if table["camera"] not in CAMERAS:
         raise InputError(f"{where}: camera is {show(table['camera'])}; give one of {', '.join(CAMERAS)}.")
     root = folder(table, "root", path)
     rig = read_rig(root, table["camera"], where)
-    mapped, references = _recorded("reference", table, root, where)
-    asked, queries = _recorded("query", table, root, where)
-    scans, remark = _with_scans(mapped, references, where)
-    both = set(scans) & set(queries) if mapped.drive == asked.drive else set()
+    mapped = _recorded("reference", table, root, where)
+    asked = _recorded("query", table, root, where)
+    both = set(mapped.frames) & set(asked.frames) if mapped.drive == asked.drive else set()
     if both:
         raise InputError(f"{where}: frame {min(both)} is both query and reference; give other frames or sequences.")
-    count = scene_file.integer({"scans": 1} | table, "scans", where, 1, MAX_SCANS)
-    reference_views = tuple(
-        mapped.view(frame, rig, PointCloudLift(partial(_points, mapped, rig, near), rig.camera, mapped.pose(frame, rig)))
-        for frame, near in _neighbours(scans, mapped, count)
-    )
-    remarks = (*mapped.remarks, *remark, *asked.remarks)
+    references = tuple(mapped.references(rig, scans))
+    queries = tuple(asked.view(frame, rig) for frame in asked.frames)
     return MapScene(
         name=settings.name,
         where=where,
-        queries=tuple(asked.view(frame, rig, None) for frame in queries),
-        references=reference_views,
-        matcher=image_matcher(reference_views, settings.frontend, where, path.parent),
+        queries=queries,
+        references=references,
+        matcher=image_matcher(references, settings.frontend, where, path.parent),
         gravity_map=GRAVITY_MAP,
         gravity_bound_rad=settings.gravity_bound_rad,
         gravity_sd_rad=settings.gravity_sd_rad,
         bound_px=settings.bound_px,
         thresholds=settings.thresholds,
-        remarks=remarks,
+        remarks=mapped.remarks + asked.remarks,
     )
+
+
+@dataclass(frozen=True, eq=False)
+class _Recorded:
+    """The frames of a sequence that can be used."""
+
+    drive: Drive
+    camera: str
+    frames: Sequence[int]
+    """Asked for, with an image, a pose and, for references, a scan; growing."""
+    poses: Mapping[int, FloatArray]
+    """``world_from_imu`` of all frames that have one."""
+    scans: Sequence[int]
+    """All frames with a pose and a scan, growing; empty for queries."""
+    times_s: Sequence[float]
+    """By frame; empty if unknown."""
+    remarks: tuple[str, ...]
+
+    def view(self, frame: int, rig: Rig, lift: PointCloudLift | None = None) -> View:
+        """The image of a frame."""
+        file = f"{frame:010d}.png"
+        return View(
+            name=f"{self.drive.number:04d}/{self.camera}/{file}",
+            camera=rig.camera,
+            path=self.drive.images(self.camera) / file,
+            cam_from_map=self.camera_pose(frame, rig),
+            timestamp_s=self.times_s[frame] if frame < len(self.times_s) else None,
+            lift=lift,
+        )
+
+    def camera_pose(self, frame: int, rig: Rig) -> FloatArray:
+        """``cam_from_map`` (3, 4); cam_k -> world = pose cam_to_pose[k]."""
+        map_from_cam = self.poses[frame] @ rig.imu_from_camera
+        return pose(map_from_cam[:3, :3].T, -map_from_cam[:3, :3].T @ map_from_cam[:3, 3])
+
+    def references(self, rig: Rig, scans: int) -> Iterator[View]:
+        """The images with points: of their frame's scan and of its neighbours, as many as ``scans`` in all."""
+        place = {frame: number for number, frame in enumerate(self.scans)}
+        for frame in self.frames:
+            first = max(0, min(place[frame] - scans // 2, len(self.scans) - scans))
+            points = partial(_points, self, rig, self.scans[first : first + scans])
+            yield self.view(frame, rig, PointCloudLift(points, rig.camera, self.camera_pose(frame, rig)))
+
+
+def _points(recorded: _Recorded, rig: Rig, frames: Sequence[int]) -> FloatArray:
+    """Laser returns (M, 3) of some scans in the map frame."""
+    found = []
+    for frame in frames:
+        points = read_scan(recorded.drive.scan(frame))
+        motion = scan_motion(recorded.poses, frame, rig.imu_from_velodyne)
+        if motion is not None:
+            points = unwrapped(points, motion)
+        found.append(transform((recorded.poses[frame] @ rig.imu_from_velodyne)[:3], points))
+    return np.concatenate(found)
+
+
+def _recorded(role: str, table: dict[str, Any], root: Path, where: str) -> _Recorded:
+    """The usable frames of the "reference" or "query" sequence."""
+    drive = Drive(root, scene_file.integer(table, f"{role}_sequence", where, 0, 9999))
+    camera = table["camera"]
+    first, last = _range(table, f"{role}_frames", where)
+    step = scene_file.integer({f"{role}_step": 1} | table, f"{role}_step", where, 1, 100_000)
+    needed_file(drive.poses.parent, drive.poses.name, where, f"the poses of sequence {drive.number}")
+    poses = read_poses(drive.poses)
+    images = frames_in(drive.images(camera), ".png", where, f"the images of {camera}")
+    images = {frame for frame in images if first <= frame <= last}
+    posed = {frame for frame in poses if first <= frame <= last}
+    remarks = [
+        _remark(images - posed, f"of the {len(images)} images of {drive.name}, {camera}, have no pose"),
+        _remark(posed - images, f"of the {len(posed)} poses of {drive.name} have no image of {camera}"),
+    ]
+    usable, scans = images & posed, []
+    if role == "reference":
+        scans = sorted(frames_in(drive.scans, ".bin", where, "the laser scans") & set(poses))
+        remarks.append(_remark(usable - set(scans), f"images of {drive.name}, {camera}, have no laser scan"))
+        usable &= set(scans)
+        still = {frame for frame in usable if scan_motion(poses, frame, np.eye(4)) is None}
+        if still:
+            remarks.append(
+                f"{_frames(still)} of {drive.name}: no pose before or after, so the scan is not corrected for motion."
+            )
+    times = drive.timestamps(camera)
+    return _Recorded(
+        drive=drive,
+        camera=camera,
+        frames=sorted(usable)[::step],
+        poses=poses,
+        scans=scans,
+        times_s=read_timestamps(times) if times.is_file() else (),
+        remarks=tuple(filter(None, remarks)),
+    )
+
+
+def _range(table: Mapping[str, Any], key: str, where: str) -> tuple[int, int]:
+    """First and last frame asked for."""
+    value = table.get(key, [0, _LAST_FRAME])
+    whole = isinstance(value, list) and all(isinstance(item, int) and not isinstance(item, bool) for item in value)
+    if not whole or len(value) != 2 or not 0 <= value[0] <= value[1] <= _LAST_FRAME:
+        raise InputError(f"{where}: {key} is {show(value)}; give [first, last], two whole numbers in this order.")
+    return value[0], value[1]
+
+
+def _remark(frames: set[int], what: str) -> str:
+    """Empty if there are no such frames."""
+    return f"{_frames(frames)} {what}: skipped." if frames else ""
+
+
+def _frames(frames: set[int]) -> str:
+    """ "12 (3, 5, 8, ...)"."""
+    some = ", ".join(map(str, sorted(frames)[:3]))
+    return f"{len(frames)} ({some}{', ...' if len(frames) > 3 else ''})"

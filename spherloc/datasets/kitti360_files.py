@@ -1,4 +1,4 @@
-"""Files of KITTI-360 (cvlibs.net/datasets/kitti-360, autonomousvision/kitti360Scripts): layout, calibration, poses, scans.
+"""Files of KITTI-360 (cvlibs.net, kitti360Scripts): layout, calibration, poses, laser scans.
 
 Transformations are (4, 4), named ``to_from_from``: p_to = to_from_from @ p_from, metres.
 """
@@ -6,7 +6,7 @@ Transformations are (4, 4), named ``to_from_from``: p_to = to_from_from @ p_from
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from datetime import datetime, timezone
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -15,15 +15,17 @@ from scipy.spatial.transform import Rotation
 from spherloc.cameras.base import Camera, FloatArray
 from spherloc.cameras.calibration import load_camera
 from spherloc.datasets.map_settings import needed_file
-from spherloc.datasets.number_files import numbers, records, rigid
-from spherloc.errors import InputError
+from spherloc.datasets.text_rows import finite_numbers, rows
+from spherloc.errors import InputError, show
 
 MAX_SCAN_BYTES = 1 << 28
 """A hundred times a scan of the dataset."""
 FARTHEST_M = 10_000.0
 """Laser returns beyond this, a hundred times the sensor's range, are no returns but damage."""
-MAX_FRAME = 10**10 - 1
-"""Frames are named by ten digits."""
+FARTHEST_ORIGIN_M = 1e9
+"""Beyond this, 25 times around the Earth, a position has lost its millimetres."""
+ROTATION_TOLERANCE = 1e-3
+"""Rotations written with four digits are about this far from orthonormal."""
 _POINT_BYTES = 16
 _TIME = re.compile(r"(\d{4}-\d\d-\d\d) (\d\d:\d\d:\d\d)(\.\d{1,9})?")
 
@@ -67,6 +69,10 @@ class Drive:
         """Folder of the Velodyne's scans."""
         return self.root / "data_3d_raw" / self.name / "velodyne_points" / "data"
 
+    def scan(self, frame: int) -> Path:
+        """The scan of a frame."""
+        return self.scans / f"{frame:010d}.bin"
+
 
 def read_rig(root: Path, camera: str, where: str) -> Rig:
     """The calibration of the camera "image_02" or "image_03".
@@ -78,7 +84,7 @@ def read_rig(root: Path, camera: str, where: str) -> Rig:
     def calibration(name: str, what: str) -> Path:
         return needed_file(root / "calibration", name, where, what)
 
-    camera_file = calibration(f"{camera}.yaml", f"the calibration of {camera}")
+    lens_file = calibration(f"{camera}.yaml", f"the calibration of {camera}")
     to_pose_file = calibration("calib_cam_to_pose.txt", "where the cameras are on the vehicle")
     to_velodyne_file = calibration("calib_cam_to_velo.txt", "where the laser scanner is")
     imu_from = read_cam_to_pose(to_pose_file)
@@ -87,7 +93,7 @@ def read_rig(root: Path, camera: str, where: str) -> Rig:
             raise InputError(f"{to_pose_file}: there is no line '{key}:'; take the dataset's own file.")
     velodyne_from_image_00 = read_cam_to_velo(to_velodyne_file)
     return Rig(
-        camera=load_camera(camera_file),
+        camera=load_camera(lens_file),
         imu_from_camera=imu_from[camera],
         imu_from_velodyne=imu_from["image_00"] @ np.linalg.inv(velodyne_from_image_00),
     )
@@ -95,52 +101,69 @@ def read_rig(root: Path, camera: str, where: str) -> Rig:
 
 def read_cam_to_pose(path: Path) -> dict[str, FloatArray]:
     """``imu_from_camera`` by camera, of lines "image_0X: " and twelve numbers."""
-    found = {}
-    for line, words in records(path, "the dataset's calib_cam_to_pose.txt"):
-        place = f"{path}, line {line}"
-        key = words[0].rstrip(":")
+    found: dict[str, FloatArray] = {}
+    for place, text in rows(path, "the dataset's calib_cam_to_pose.txt"):
+        key, _, values = text.partition(":")
         if key in found:
-            raise InputError(f"{place}: {key} is there twice; remove one of the lines.")
-        found[key] = rigid(numbers(words[1:], 12, place), place)
+            raise InputError(f"{place}: {show(key)} is there twice; remove one of the lines.")
+        found[key] = _rigid(values.split(), place)
     return found
 
 
 def read_cam_to_velo(path: Path) -> FloatArray:
     """``velodyne_from_image_00``, the twelve numbers of the only line."""
-    lines = list(records(path, "the dataset's calib_cam_to_velo.txt"))
+    lines = list(rows(path, "the dataset's calib_cam_to_velo.txt"))
     if len(lines) != 1:
         raise InputError(f"{path}: has {len(lines)} lines of numbers instead of one; take the dataset's own file.")
-    place = f"{path}, line {lines[0][0]}"
-    return rigid(numbers(lines[0][1], 12, place), place)
+    place, text = lines[0]
+    return _rigid(text.split(), place)
 
 
 def read_poses(path: Path) -> dict[int, FloatArray]:
     """``world_from_imu`` by frame, in growing order, of lines with a frame and twelve numbers. Frames have gaps."""
     poses: dict[int, FloatArray] = {}
     last = -1
-    for line, words in records(path, "the poses.txt of a sequence"):
-        place = f"{path}, line {line}"
-        frame, *values = numbers(words, 13, place)
-        if not last < frame <= MAX_FRAME or frame != int(frame):
-            raise InputError(f"{place}: the frame {words[0][:20]} does not follow {last}; sort the lines by frame.")
+    for place, text in rows(path, "the poses.txt of a sequence"):
+        frame, *values = text.split()
+        if not (frame.isascii() and frame.isdigit() and len(frame) <= 10 and int(frame) > last):
+            raise InputError(f"{place}: the frame {show(frame)} is none after {last}; sort the lines by frame.")
         last = int(frame)
-        poses[last] = rigid(values, place)
+        poses[last] = _rigid(values, place)
     if not poses:
         raise InputError(f"{path}: holds no pose; take the dataset's own file.")
     return poses
 
 
+def _rigid(words: list[str], place: str) -> FloatArray:
+    """The rigid motion (4, 4) of twelve numbers, 3 x 4 row by row, its rotation made exactly orthonormal.
+
+    Raises ``InputError`` if the rotation is farther than ``ROTATION_TOLERANCE`` from one.
+    """
+    values = finite_numbers(words, place)
+    if len(values) != 12:
+        raise InputError(f"{place}: has {len(values)} numbers for a 3 x 4 matrix, which needs 12; correct the line.")
+    given = np.reshape(values, (3, 4))
+    if np.abs(given[:, 3]).max() > FARTHEST_ORIGIN_M:
+        raise InputError(f"{place}: its position is beyond {FARTHEST_ORIGIN_M:g} m; correct it.")
+    left, _, right = np.linalg.svd(np.clip(given[:, :3], -2.0, 2.0))
+    motion = np.eye(4)
+    motion[:3, :3], motion[:3, 3] = left @ right, given[:, 3]
+    if not np.abs(motion[:3, :3] - given[:, :3]).max() <= ROTATION_TOLERANCE or np.linalg.det(left @ right) < 0:
+        raise InputError(f"{place}: its 3 x 3 part is no rotation; check the order and number of the values.")
+    return motion
+
+
 def read_timestamps(path: Path) -> list[float]:
     """Seconds since 1970 (UTC) of every frame, of lines "2013-05-28 08:46:02.904094720"."""
     times = []
-    for line, words in records(path, "the timestamps.txt of a camera"):
-        match = _TIME.fullmatch(" ".join(words))
+    for place, text in rows(path, "the timestamps.txt of a camera"):
+        match = _TIME.fullmatch(text)
         try:
             if match is None:
                 raise ValueError
-            whole = datetime.fromisoformat(f"{match[1]}T{match[2]}").replace(tzinfo=timezone.utc)
+            whole = datetime.fromisoformat(f"{match[1]}T{match[2]}").replace(tzinfo=UTC)
         except ValueError:
-            raise InputError(f"{path}, line {line}: no time like 2013-05-28 08:46:02.904094720; correct it.") from None
+            raise InputError(f"{place}: no time like 2013-05-28 08:46:02.904094720; correct it.") from None
         times.append(whole.timestamp() + float(match[3] or 0))
     return times
 

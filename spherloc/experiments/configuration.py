@@ -19,6 +19,7 @@ from spherloc.estimators.base import versions
 
 FORMAT = 1
 MAX_BYTES = 1_000_000
+_KINDS = {"scene": str, "scene_sha256": str, "name": str, "estimator": str, "seed": int, "queries": int}
 _UNCOMPARED = {"scene"}
 """A scene file that was moved or copied is still the same scene."""
 
@@ -112,11 +113,18 @@ def _parsed(table: Any, where: str) -> Configuration:
     limits = table["thresholds"]
     pairs = numbers(limits, (len(limits), 2), "thresholds", where)
     registration = table["registration_thresholds_m"]
-    for key, kind in {"scene": str, "scene_sha256": str, "name": str, "estimator": str, "seed": int, "queries": int}.items():
+    for key, kind in {
+        "scene": str,
+        "scene_sha256": str,
+        "name": str,
+        "estimator": str,
+        "seed": int,
+        "queries": int,
+    }.items():
         if type(table[key]) is not kind:
             raise TypeError(key)
     return Configuration(
-        **{key: table[key] for key in ("scene", "scene_sha256", "name", "estimator", "seed", "queries")},
+        **{key: table[key] for key in _KINDS},
         options={key: math.inf if value == "inf" else value for key, value in table["options"].items()},
         versions={str(key): str(value) for key, value in table["versions"].items()},
         gravity_map=numbers(table["gravity_map"], (3,), "gravity_map", where),

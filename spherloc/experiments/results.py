@@ -126,20 +126,16 @@ class ResultsLog:
         """Whether a line that an earlier run left half written was removed."""
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            self._file = (self.folder / ROWS).open("ab")
         except OSError as error:
-            reason = error.strerror or error
-            raise InputError(f"{folder}: results cannot be written there ({reason}); give another folder.") from None
-        try:
-            self._lock()
+            raise self._unwritable(error) from None
+        with contextlib.ExitStack() as stack:
+            self._lock(stack)
             self._configure(configuration)
             rows, whole_bytes = _read_rows(self.folder / ROWS)
             self.rows = {row.query: row for row in rows}
             self._repair(whole_bytes)
             self._write_table()
-        except BaseException:
-            self._file.close()
-            raise
+            self._open = stack.pop_all()
 
     def __enter__(self) -> Self:
         return self
@@ -147,14 +143,14 @@ class ResultsLog:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._file.close()
+        self._open.close()
 
     def append(self, row: QueryResult) -> None:
         """Have a row on the disk before this returns. Raises ``InputError`` if that fails; other rows are kept."""
-        with self._writing(ROWS):
-            self._file.write(f"{json_line(row)}\n".encode())
-            self._file.flush()
-            os.fsync(self._file.fileno())
+        with self._writing(ROWS), (self.folder / ROWS).open("ab") as file:
+            file.write(f"{json_line(row)}\n".encode())
+            file.flush()
+            os.fsync(file.fileno())
         self.rows[row.query] = row
         with self._writing(TABLE), (self.folder / TABLE).open("a", encoding="utf-8", newline="") as table:
             table.write(csv_text([row], header=False))
@@ -169,10 +165,6 @@ class ResultsLog:
         if removed:
             content = "".join(f"{json_line(row)}\n" for row in kept.values())
             self.write(ROWS, content.encode())
-            self._file.close()
-            with self._writing(ROWS):
-                self._file = (self.folder / ROWS).open("ab")
-            self._lock()
             self.rows = kept
             self._write_table()
         return removed
@@ -184,7 +176,7 @@ class ResultsLog:
         return SequenceResults(self.folder, self.configuration, tuple(ordered))
 
     def write(self, name: str, content: bytes) -> None:
-        """Write a whole file into the folder, so that no reader sees half of it. Raises ``InputError`` if that fails."""
+        """Write a file into the folder, so that no reader sees half of it. Raises ``InputError`` if that fails."""
         path = self.folder / name
         part = path.with_name(f".{name}.{uuid.uuid4().hex[:8]}.part")
         try:
@@ -205,18 +197,24 @@ class ResultsLog:
         except OSError as error:
             reason = error.strerror or error
             raise InputError(
-                f"{self.folder / name}: cannot be written ({reason}); the results of {len(self.rows)} queries are kept: "
-                "make room there and give the same command to go on."
+                f"{self.folder / name}: cannot be written ({reason}); the results of {len(self.rows)} queries are "
+                "kept: make room there and give the same command to go on."
             ) from None
 
-    def _lock(self) -> None:
-        """The system releases it whatever ends the process."""
+    def _unwritable(self, error: OSError) -> InputError:
+        reason = error.strerror or error
+        return InputError(f"{self.folder}: results cannot be written there ({reason}); give another folder.")
+
+    def _lock(self, stack: contextlib.ExitStack) -> None:
+        """Keep other processes out of the folder; the system ends the lock whatever ends this process."""
         try:
             import fcntl
         except ImportError:  # Windows has no such lock
             return
         try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            handle = os.open(self.folder, os.O_RDONLY)
+            stack.callback(os.close, handle)
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise InputError(
                 f"{self.folder}: another process is localizing into it; wait for it or give another folder."
@@ -231,17 +229,20 @@ class ResultsLog:
             if differences:
                 more = len(differences) - MAX_DIFFERENCES
                 listed = "; ".join(differences[:MAX_DIFFERENCES]) + (f"; and {more} more" if more > 0 else "")
-                raise InputError(f"{self.folder}: holds results of another configuration ({listed}); give another folder.")
-        elif (self.folder / ROWS).stat().st_size:
+                raise InputError(
+                    f"{self.folder}: holds results of another configuration ({listed}); give another folder."
+                )
+        elif (self.folder / ROWS).exists():
             raise InputError(f"{self.folder}: holds results without their {CONFIGURATION}; give another folder.")
         else:
             self.write(CONFIGURATION, configuration.json_text().encode())
         self.configuration = configuration
 
     def _repair(self, whole_bytes: int) -> None:
+        path = self.folder / ROWS
         with self._writing(ROWS):
-            if (self.folder / ROWS).stat().st_size > whole_bytes:
-                self._file.truncate(whole_bytes)
+            if path.exists() and path.stat().st_size > whole_bytes:
+                os.truncate(path, whole_bytes)
                 self.repaired = True
 
     def _write_table(self) -> None:

@@ -14,7 +14,7 @@ from spherloc.errors import InputError
 from spherloc.frontend import learned
 from spherloc.images import ByteImage, grey
 
-Descriptors = NDArray[np.float32] | NDArray[np.uint8]
+Descriptors = NDArray[np.float32 | np.uint8]
 
 SIFT_CONTRAST = 0.02
 """COLMAP's threshold (its peak threshold is a third of it): half of OpenCV's, which finds little in dim rooms."""
@@ -60,9 +60,11 @@ def keypoint_table(keypoints: Any, shift_px: float = 0.5) -> FloatArray:
 def _sift(image: ByteImage, mask: ByteImage, _most: int, _weights: Path | None) -> tuple[FloatArray, Any]:
     # Not ``nfeatures``: OpenCV applies it before the mask, and what the mask removes would have used it up.
     # Without the precise upscale every keypoint lies a quarter of a pixel too far right and down.
-    sift = cv2.SIFT_create(contrastThreshold=SIFT_CONTRAST, enable_precise_upscale=True)
+    sift = cv2.SIFT.create(contrastThreshold=SIFT_CONTRAST, enable_precise_upscale=True)
     keypoints, descriptors = sift.detectAndCompute(grey(image), mask)
-    return keypoint_table(keypoints), None if descriptors is None else root_normalised(descriptors)
+    return keypoint_table(keypoints), None if descriptors is None else root_normalised(
+        np.asarray(descriptors, np.float32)
+    )
 
 
 def root_normalised(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -75,7 +77,7 @@ def root_normalised(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _orb(image: ByteImage, mask: ByteImage, most: int, _weights: Path | None) -> tuple[FloatArray, Any]:
-    keypoints, descriptors = cv2.ORB_create(nfeatures=most).detectAndCompute(grey(image), mask)
+    keypoints, descriptors = cv2.ORB.create(nfeatures=most).detectAndCompute(grey(image), mask)
     return keypoint_table(keypoints), descriptors
 
 
@@ -84,8 +86,8 @@ def _akaze(image: ByteImage, mask: ByteImage, _most: int, _weights: Path | None)
     create = getattr(cv2, "AKAZE_create", None) or _contributed("AKAZE_create")
     if create is None:
         raise InputError(
-            f"AKAZE features are not in this OpenCV ({cv2.__version__}); install OpenCV 4 (opencv-python-headless<5) or "
-            "opencv-contrib-python-headless, or take the features 'sift'."
+            f"AKAZE features are not in this OpenCV ({cv2.__version__}); install OpenCV 4 (opencv-python-headless<5), "
+            "or opencv-contrib-python-headless, or take the features 'sift'."
         )
     keypoints, descriptors = create().detectAndCompute(grey(image), mask)
     return keypoint_table(keypoints), descriptors

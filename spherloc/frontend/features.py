@@ -1,14 +1,16 @@
 """Local features of an image: keypoints and descriptors, within its valid pixels, across a panorama's seam."""
 
 from dataclasses import dataclass
+from math import ceil, pi, tau
 from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from spherloc.cameras.base import FloatArray
+from spherloc.cameras.base import BoolArray, FloatArray
 from spherloc.errors import InputError, show
-from spherloc.frontend.feature_cache import fetch, keep
+from spherloc.frontend.feature_cache import feature_file, fetch, keep
 from spherloc.frontend.feature_kinds import KINDS, Descriptors, detect
 from spherloc.frontend.view import View
 from spherloc.images import ByteImage
@@ -90,14 +92,82 @@ def extract(view: View, options: FeatureOptions | None = None) -> Features:
     usable = view.usable_pixels()
     seam = view.camera.model == "equirectangular"
     path = feature_file(view.path, usable, options, seam)
-    size = (view.camera.width, view.camera.height)
-    arrays = fetch(path) if path else None
-    if arrays is None:
-        arrays = _detected(view.read(), usable.astype(np.uint8), options, seam)
+    found = fetch(path) if path else None
+    if found is None:
+        found = _detected(view.read(), usable.astype(np.uint8), options, seam)
         if path:
-            keep(path, arrays)
-    table, descriptors = arrays
-    return Features(
-        np.ascontiguousarray(table[:, :2]), *(table[:, column].copy() for column in (2, 3, 4)), descriptors,
-        options.method, size,
-    )
+            keep(path, *found)
+    table, descriptors = found
+    pixels, (sizes, angles, scores) = table[:, :2].copy(), table[:, 2:].T.copy()
+    size = (view.camera.width, view.camera.height)
+    return Features(pixels, sizes, angles, scores, descriptors, options.method, size)
+
+
+def _detected(
+    image: ByteImage, usable: ByteImage, options: FeatureOptions, seam: bool
+) -> tuple[FloatArray, Descriptors]:
+    """Keypoints (N, 5) and descriptors of an image in its own pixels, the strongest first."""
+    height, width = image.shape[:2]
+    shrink = min(1.0, (MOST_PIXELS / (width * height)) ** 0.5)
+    if shrink < 1.0:
+        small = (max(1, round(width * shrink)), max(1, round(height * shrink)))
+        image = np.asarray(cv2.resize(image, small, interpolation=cv2.INTER_AREA), np.uint8)
+        usable = np.asarray(cv2.resize(usable, small, interpolation=cv2.INTER_NEAREST), np.uint8)
+    rows, columns = usable.shape
+    wrap = _wrap_px(columns) if seam else 0
+    if wrap:
+        image, usable = (np.concatenate([part[:, -wrap:], part, part[:, :wrap]], axis=1) for part in (image, usable))
+    kind = KINDS[options.method]
+    room = _room_px(usable)
+    mask = (room > RIM_PX).astype(np.uint8)
+    margin = int(SEAM_TWIN_PX) if wrap else 0
+    mask[:, : wrap - margin], mask[:, columns + wrap + margin :] = 0, 0
+    table, descriptors = detect(options.method, image, mask, options.max_features, options.weights)
+    kept = _usable_rows(table, descriptors, mask, room, kind.reach)
+    table, descriptors = table[kept], descriptors[kept]
+    table[:, 0] -= wrap
+    order = np.lexsort([*table.T[[2, 3, 0, 1]], -table[:, 4]])
+    table, descriptors = table[order], descriptors[order]
+    if wrap:
+        table[:, 0] %= columns
+        kept = _without_twins(table, columns)
+        table, descriptors = table[kept], descriptors[kept]
+    table[:, :3] *= width / columns, height / rows, width / columns
+    return table[: options.max_features], np.ascontiguousarray(descriptors[: options.max_features])
+
+
+def _wrap_px(columns: int) -> int:
+    return min(columns, SEAM_STEP_PX * ceil(SEAM_WRAP * columns / SEAM_STEP_PX))
+
+
+def _room_px(usable: ByteImage) -> NDArray[np.float32]:
+    """(H, W) distance to the nearest pixel that may not be used; the image's own border is none."""
+    if usable.all():
+        return np.full(usable.shape, np.inf, np.float32)
+    return np.asarray(cv2.distanceTransform(usable, cv2.DIST_L2, cv2.DIST_MASK_PRECISE), np.float32)
+
+
+def _usable_rows(
+    table: FloatArray, descriptors: Descriptors, mask: ByteImage, room_px: NDArray[np.float32], reach: float
+) -> BoolArray:
+    """(N,) features that are finite, at pixels of the mask (not all detectors heed it), and clear of the rim."""
+    finite = np.isfinite(table).all(axis=1) & np.isfinite(descriptors).all(axis=1)
+    rows, columns = mask.shape
+    u, v = np.floor(np.where(finite, table[:, :2].T, 0.0)).clip(-1, max(rows, columns)).astype(np.int64)
+    inside = finite & (u >= 0) & (u < columns) & (v >= 0) & (v < rows)
+    u, v = np.where(inside, u, 0), np.where(inside, v, 0)
+    return inside & (mask[v, u] > 0) & (room_px[v, u] > RIM_PX + reach * table[:, 2])
+
+
+def _without_twins(table: FloatArray, columns: int) -> BoolArray:
+    """(N,) all but the weaker of two features that are the same one, found on both sides of the seam."""
+    kept = np.ones(len(table), bool)
+    near = np.flatnonzero(np.minimum(table[:, 0], columns - table[:, 0]) <= SEAM_TWIN_PX)
+    for position, one in enumerate(near):
+        others = near[:position][kept[near[:position]]]
+        apart = np.abs(table[others, :2] - table[one, :2])
+        apart[:, 0] = np.minimum(apart[:, 0], columns - apart[:, 0])
+        turned = np.abs((table[others, 3] - table[one, 3] + pi) % tau - pi)
+        growth = np.abs(np.log(table[others, 2] / table[one, 2]))
+        kept[one] = not ((apart.max(axis=1) < SEAM_TWIN_PX / 2) & (turned < 0.2) & (growth < 0.2)).any()
+    return kept

@@ -57,5 +57,7 @@ def _lens_equation(model: str) -> str:
     return {
         "mei": "v = (λx, λy, λ − ξ)   (Eq. 8-14)",
         "kannala_brandt": "θd = θ(1 + k1θ² + k2θ⁴ + k3θ⁶ + k4θ⁸)   (Eq. 3-7)",
+        "double_sphere": "m = (x, y), mz from ξ and α; v = s (m, mz) − (0, 0, ξ)   (Usenko et al. 2018)",
+        "eucm": "v ∝ (x, y, mz(α, β, x² + y²))   (Khomutenko et al. 2015)",
         "equirectangular": "lon = 2π(u/W − ½), lat = π(½ − v/H)   (Eq. 15-17)",
     }.get(model, "")

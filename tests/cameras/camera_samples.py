@@ -8,7 +8,9 @@ import pytest
 import yaml
 
 from spherloc.cameras.base import Camera
+from spherloc.cameras.double_sphere import DoubleSphere
 from spherloc.cameras.equirectangular import Equirectangular
+from spherloc.cameras.eucm import Eucm
 from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.cameras.mei import Mei
 
@@ -46,6 +48,19 @@ INLINE: dict[str, Camera] = {
         716.4760432,
         (0.394091358527, -0.548741152556, 0.778500221599, -0.4553790203),
     ),
+    "ds-tum-vi": DoubleSphere(
+        512, 512, 158.28600034966977, 158.2743455478755, 255.46116578191653, 257.3894394501779, -0.17213086, 0.5931177
+    ),
+    "ds-euroc": DoubleSphere(752, 480, 348.11275, 347.11099, 366.312, 249.8556, -0.24425190195, 0.56574136736),
+    "ds-infinite-image": DoubleSphere(800, 700, 260.0, 262.0, 410.0, 345.0, 0.35, 0.4),
+    "ds-beyond-180": DoubleSphere(1000, 1000, 290.0, 290.0, 500.0, 500.0, 0.2, 0.7),
+    "ds-far-centre": DoubleSphere(640, 480, 700.0, 705.0, 320.0, 240.0, 1.6, 0.55),
+    "eucm-tum-vi": Eucm(
+        512, 512, 191.14799836282189, 191.13150963902818, 255.4585771534443, 257.38154645599448, 0.62910608, 1.04180673
+    ),
+    "eucm-infinite-image": Eucm(640, 480, 300.0, 301.0, 318.0, 243.0, 0.3, 0.7),
+    "eucm-beyond-180": Eucm(1000, 1000, 350.0, 350.0, 500.0, 500.0, 0.75, 1.2),
+    "eucm-pinhole": Eucm(640, 480, 320.0, 322.0, 318.0, 243.0, 0.0, 1.0),
     "panorama-2048x1024": Equirectangular(2048, 1024),
     "panorama-odd-size": Equirectangular(1919, 961),
 }

@@ -1,0 +1,79 @@
+"""COLMAP's camera models (src/colmap/sensor/models.h), read as this project's.
+
+COLMAP too puts the centre of the top-left pixel at (0.5, 0.5): principal points are taken as they are.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from spherloc.cameras._checks import coefficients, located, show
+from spherloc.cameras.base import Camera
+from spherloc.cameras.equirectangular import Equirectangular
+from spherloc.cameras.eucm import Eucm
+from spherloc.cameras.kannala_brandt import KannalaBrandt
+from spherloc.cameras.mei import Mei
+from spherloc.errors import CalibrationError
+
+
+def camera_from_colmap(model: str, width: int, height: int, params: Sequence[float] | np.ndarray, where: str) -> Camera:
+    """The camera of a COLMAP model's name, image size in pixels and parameters in COLMAP's order.
+
+    The perspective models become MEI with xi = 0, which is a pinhole with radial and tangential distortion, and the
+    fisheye models Kannala-Brandt with the missing coefficients 0.
+
+    Raises ``CalibrationError``, one sentence that starts with ``where``, for another model, a wrong number of
+    parameters and unusable values.
+    """
+    with located(where):
+        if not isinstance(model, str) or model not in _MODELS:
+            raise CalibrationError(
+                f"the COLMAP model {show(model)} is not supported: convert it to one of {', '.join(_MODELS)}."
+            )
+        names, build = _MODELS[model]
+        values = np.asarray(params).tolist() if isinstance(params, np.ndarray) else list(params)
+        return build(width, height, *coefficients("params", values, names))
+
+
+def _perspective(width: int, height: int, fx: float, fy: float, cx: float, cy: float, *lens: float) -> Mei:
+    k1, k2, p1, p2 = (*lens, 0.0, 0.0, 0.0, 0.0)[:4]
+    return Mei(width, height, fx, fy, cx, cy, 0.0, (k1, k2, p1, p2))
+
+
+def _fisheye(width: int, height: int, fx: float, fy: float, cx: float, cy: float, *lens: float) -> KannalaBrandt:
+    k1, k2, k3, k4 = (*lens, 0.0, 0.0, 0.0, 0.0)[:4]
+    return KannalaBrandt(width, height, fx, fy, cx, cy, (k1, k2, k3, k4))
+
+
+def _one_focal_length(build: Callable[..., Camera]) -> Callable[..., Camera]:
+    def with_both(width: int, height: int, f: float, cx: float, cy: float, *lens: float) -> Camera:
+        return build(width, height, f, f, cx, cy, *lens)
+
+    return with_both
+
+
+def _panorama(width: int, height: int, w: float, h: float) -> Equirectangular:
+    if (w, h) != (width, height):
+        raise CalibrationError(
+            f"the panorama has the parameters {w:g}, {h:g} and the size {width} x {height}: make them equal, "
+            "a crop is not supported."
+        )
+    return Equirectangular(width, height)
+
+
+_MODELS: dict[str, tuple[str, Callable[..., Any]]] = {
+    "SIMPLE_PINHOLE": ("f, cx, cy", _one_focal_length(_perspective)),
+    "PINHOLE": ("fx, fy, cx, cy", _perspective),
+    "SIMPLE_RADIAL": ("f, cx, cy, k", _one_focal_length(_perspective)),
+    "RADIAL": ("f, cx, cy, k1, k2", _one_focal_length(_perspective)),
+    "OPENCV": ("fx, fy, cx, cy, k1, k2, p1, p2", _perspective),
+    "SIMPLE_FISHEYE": ("f, cx, cy", _one_focal_length(_fisheye)),
+    "FISHEYE": ("fx, fy, cx, cy", _fisheye),
+    "SIMPLE_RADIAL_FISHEYE": ("f, cx, cy, k", _one_focal_length(_fisheye)),
+    "RADIAL_FISHEYE": ("f, cx, cy, k1, k2", _one_focal_length(_fisheye)),
+    "OPENCV_FISHEYE": ("fx, fy, cx, cy, k1, k2, k3, k4", _fisheye),
+    "EUCM": ("fx, fy, cx, cy, alpha, beta", Eucm),
+    "EQUIRECTANGULAR": ("w, h", _panorama),
+}
+"""Names of the parameters, in COLMAP's order, and what makes a camera of the size and of them."""

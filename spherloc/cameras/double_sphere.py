@@ -1,0 +1,119 @@
+"""Double sphere camera model (Usenko, Demmel, Cremers: The Double Sphere Camera Model, 3DV 2018, Sec. III).
+
+A bearing is moved by xi along z, as in the unified model, and then goes through that model's projection (``_unified``
+with beta = 1). Both steps can fold: the first, with xi > 1, where z = -1/xi, the second, with alpha > 1/2, where the
+moved ray has z = -d2 (1 - alpha) / alpha. With xi >= 1 the first comes first, since the moved ray never looks back.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from math import sqrt
+from typing import Any, ClassVar, Self
+
+import numpy as np
+
+from spherloc.cameras import _checks, _unified
+from spherloc.cameras._radial import RIM_MARGIN
+from spherloc.cameras.base import BoolArray, FloatArray
+from spherloc.errors import CalibrationError
+
+_LARGEST_XI = 1e3
+"""Far beyond any lens, for which xi is between -1 and 1."""
+_TOUCHES = 1.0 - 1e-6
+"""From here on the centre counts as lying on the first sphere: what would look back are a few thousandths of a radian."""
+
+
+@dataclass(frozen=True)
+class DoubleSphere:
+    """Fisheye camera that projects onto two unit spheres, one after the other, and from there onto the plane."""
+
+    model: ClassVar[str] = "double_sphere"
+
+    width: int
+    """Image width in pixels."""
+    height: int
+    """Image height in pixels."""
+    fx: float
+    """Focal length along x in pixels, of the projection behind both spheres."""
+    fy: float
+    """Focal length along y in pixels, of the projection behind both spheres."""
+    cx: float
+    """Principal point, x in pixels; the centre of the top-left pixel is 0.5."""
+    cy: float
+    """Principal point, y in pixels; the centre of the top-left pixel is 0.5."""
+    xi: float
+    """Distance between the centres of the two spheres, above -1."""
+    alpha: float
+    """Share of the distance to the second sphere in the depth, 0 to 1; beyond 1/2 the image is finite."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "xi", _checks.finite("xi", self.xi))
+        if not -1.0 < self.xi <= _LARGEST_XI:
+            raise CalibrationError(f"camera key 'xi' is {self.xi:g}: give a number above -1 and up to {_LARGEST_XI:g}.")
+        object.__setattr__(self, "alpha", _unified.alpha_of(self.alpha))
+        _checks.check_focal(self)
+        with np.errstate(all="ignore"):
+            keys = f"camera keys 'xi', 'alpha' are {self.xi:g}, {self.alpha:g}"
+            _checks.check_sees_image(self, self.max_radius, keys)
+
+    @cached_property
+    def max_radius(self) -> float:
+        """Distance from the principal point, in focal lengths, below which the model is one to one."""
+        second = _unified.max_radius(self.alpha, 1.0)
+        if self.xi < _TOUCHES:
+            return second
+        # At the end of the first sphere the moved ray has the sine 1 / xi, and it looks sideways where xi is 1.
+        sine = min(1.0 / self.xi, 1.0)
+        first = sine / (self.alpha + (1.0 - self.alpha) * sqrt(1.0 - sine * sine))
+        return min(first * (1.0 - RIM_MARGIN), second)
+
+    def project(self, points: FloatArray) -> tuple[FloatArray, BoolArray]:
+        """Pixels (N, 2) of camera-frame points (N, 3) in metres, and the mask (N,) of directions that are valid.
+
+        Valid is what lies before both folds (see the module's text); other pixels are NaN.
+        Raises ``ProblemError`` for a wrong shape.
+        """
+        x, y, z = _checks.rows("points", points, 3).T
+        with np.errstate(all="ignore"):
+            norm = np.hypot(np.hypot(x, y), z)
+            mx, my, valid = _unified.plane_points(x, y, z + self.xi * norm, self.alpha, 1.0)
+            valid &= (norm + self.xi * z > 0.0) & (norm < np.inf) & (np.hypot(mx, my) < self.max_radius)
+            pixels = np.column_stack([self.cx + self.fx * mx, self.cy + self.fy * my])
+        pixels[~valid] = np.nan
+        return pixels, valid
+
+    def unproject(self, pixels: FloatArray) -> tuple[FloatArray, BoolArray]:
+        """Unit bearings (N, 3) of pixels (N, 2), and the mask (N,) of pixels that the lens reaches.
+
+        Raises ``ProblemError`` for a wrong shape.
+        """
+        mx, my = _checks.plane(self, pixels, self.max_radius)
+        moved = _unified.rays(mx, my, self.alpha, 1.0)
+        root, reach = self._first_sphere(moved)
+        z = moved[:, 2] * root - self.xi * (moved[:, 0] ** 2 + moved[:, 1] ** 2)
+        return np.column_stack([reach * moved[:, 0], reach * moved[:, 1], z]), ~np.isnan(mx)
+
+    def unprojection_jacobian(self, pixels: FloatArray) -> FloatArray:
+        """d bearing / d pixel (N, 3, 2), per pixel; NaN where ``unproject`` is invalid."""
+        mx, my = _checks.plane(self, pixels, self.max_radius)
+        moved = _unified.rays(mx, my, self.alpha, 1.0)
+        jacobian = _unified.rays_jacobian(mx, my, self.alpha, 1.0) / (self.fx, self.fy)
+        root, reach = self._first_sphere(moved)
+        # d reach = xi reach / root dz, where dz is that of the moved ray
+        longer = (self.xi / root)[:, None, None] * moved[:, :, None] * jacobian[:, None, 2, :]
+        return reach[:, None, None] * (jacobian + longer)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The ``[camera]`` table: model, width, height, fx, fy, cx, cy, xi, alpha."""
+        return _checks.camera_to_table(self)
+
+    @classmethod
+    def from_dict(cls, table: dict[str, Any], where: str) -> Self:
+        """Build from a ``[camera]`` table; raises ``CalibrationError`` (see ``Camera.from_dict``)."""
+        return _checks.camera_from_keys(cls, table, where)
+
+    def _first_sphere(self, moved: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Where unit rays (N, 3) from (0, 0, -xi) meet the unit sphere: the root in the solution, and the distance."""
+        sine_squared = moved[:, 0] ** 2 + moved[:, 1] ** 2
+        root = np.sqrt(1.0 - self.xi**2 * sine_squared)
+        return root, self.xi * moved[:, 2] + root

@@ -1,0 +1,135 @@
+"""Which way is down, from an inertial measurement unit: Newer College's CSV, and a filter of its two sensors.
+
+An accelerometer measures gravity plus the motion's own acceleration, which for a walking person exceeds a metre per
+second squared but averages out within seconds. The gyroscope says how the unit turned meanwhile: its turns are
+accumulated into a frame that keeps its direction, in which the measured forces are averaged over time. Unlike a filter
+that runs forward only, the window is symmetric, so that to first order a constant bias of the gyroscope cancels.
+"""
+
+from array import array
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import fftconvolve
+from scipy.spatial.transform import Rotation
+
+from spherloc.cameras.base import FloatArray
+from spherloc.datasets.text_rows import finite_numbers, rows
+from spherloc.errors import InputError
+from spherloc.trajectory import NS_PER_S
+
+GRAVITY_M_S2 = 9.81
+WINDOW_S = 3.0
+"""Standard deviation of the averaging window: some ten steps of a walking person, and a gyroscope's bias of 0.01 rad/s
+turns the average by no more than 1.5 degrees at the ends of a recording, where the window has one side only."""
+MAX_GAP_S = 0.1
+"""A longer gap separates the measurements: how the unit turned in it is not known."""
+LEAST_S = 1.0
+"""Of measurements without a gap that a direction must come from."""
+DISTURBED_M_S2 = 2.0
+"""Forces that differ from gravity by this much weigh 0.6 of the others."""
+_COLUMNS = "counter,sec,nsec,wx,wy,wz,ax,ay,az"
+_LARGEST_S = 2**33
+_LARGEST_RATE_RAD_S = 1000.0
+_LARGEST_FORCE_M_S2 = 10_000.0
+
+
+@dataclass(frozen=True, eq=False)
+class ImuSamples:
+    """Inertial measurements at growing times, in the unit's own frame."""
+
+    timestamps_ns: NDArray[np.int64]
+    """(K,)"""
+    rates_rad_s: FloatArray
+    """(K, 3) gyroscope."""
+    forces_m_s2: FloatArray
+    """(K, 3) accelerometer: acceleration less gravity, so that it points up at rest."""
+
+
+def read_imu(path: Path) -> ImuSamples:
+    """Rows ``counter,sec,nsec,wx,wy,wz,ax,ay,az``, rad/s and m/s^2.
+
+    Raises ``InputError``, one sentence with the file and the line, for whatever is no such file.
+    """
+    times, numbers = array("q"), array("d")
+    for place, text in rows(path, f"lines of {_COLUMNS}"):
+        words = text.split(",")
+        if len(words) != 9:
+            raise InputError(f"{place}: has {len(words)} columns; give {_COLUMNS}.")
+        _, sec, nsec, *measured = finite_numbers([word.strip() for word in words], place)
+        if not (0 <= sec <= _LARGEST_S and 0 <= nsec < NS_PER_S and sec == int(sec) and nsec == int(nsec)):
+            raise InputError(f"{place}: sec {sec:g} and nsec {nsec:g} are no time; check the order of the columns.")
+        time_ns = int(sec) * NS_PER_S + int(nsec)
+        if times and time_ns <= times[-1]:
+            raise InputError(f"{place}: its time is not after that of the line before; sort the lines by time.")
+        if max(map(abs, measured[:3])) > _LARGEST_RATE_RAD_S or max(map(abs, measured[3:])) > _LARGEST_FORCE_M_S2:
+            raise InputError(f"{place}: no rate in rad/s or acceleration in m/s^2 is that large; check the columns.")
+        times.append(time_ns)
+        numbers.extend(measured)
+    if not times:
+        raise InputError(f"{path}: holds no measurement; give lines of {_COLUMNS}.")
+    table = np.frombuffer(numbers, dtype=np.float64).reshape(-1, 6)
+    typical = float(np.median(np.linalg.norm(table[:, 3:], axis=1)))
+    if not 0.8 * GRAVITY_M_S2 <= typical <= 1.25 * GRAVITY_M_S2:
+        raise InputError(
+            f"{path}: the accelerometer's median is {typical:.3g}, not the {GRAVITY_M_S2} m/s^2 of gravity; "
+            "check its unit and the order of the columns."
+        )
+    return ImuSamples(np.array(times, dtype=np.int64), table[:, :3], table[:, 3:])
+
+
+def down_at(samples: ImuSamples, timestamps_ns: NDArray[np.int64]) -> FloatArray:
+    """Unit vectors (N, 3) pointing down in the unit's frame at the given times (N,).
+
+    NaN before the first and after the last measurement, in gaps longer than ``MAX_GAP_S`` and where there are less
+    than ``LEAST_S`` of measurements between two gaps.
+    """
+    down = np.full((len(timestamps_ns), 3), np.nan)
+    times_ns = samples.timestamps_ns
+    cuts = np.flatnonzero(np.diff(times_ns) > MAX_GAP_S * NS_PER_S) + 1
+    for first, end in zip([0, *cuts], [*cuts, len(times_ns)], strict=True):
+        piece, first_ns, last_ns = slice(first, end), times_ns[first], times_ns[end - 1]
+        asked = np.flatnonzero((timestamps_ns >= first_ns) & (timestamps_ns <= last_ns))
+        if len(asked) and last_ns - first_ns >= LEAST_S * NS_PER_S:
+            times_s = (times_ns[piece] - first_ns) / NS_PER_S
+            asked_s = (timestamps_ns[asked] - first_ns) / NS_PER_S
+            down[asked] = _down(times_s, samples.rates_rad_s[piece], samples.forces_m_s2[piece], asked_s)
+    return down
+
+
+def _down(times_s: FloatArray, rates_rad_s: FloatArray, forces_m_s2: FloatArray, asked_s: FloatArray) -> FloatArray:
+    """Down (N, 3) in the unit's frame at times (N,) within one piece (K,) without gaps."""
+    steps_s = np.diff(times_s)
+    turns = Rotation.from_rotvec(steps_s[:, None] * (rates_rad_s[1:] + rates_rad_s[:-1]) / 2.0)
+    steady_from_unit = _accumulated(np.vstack([[0.0, 0.0, 0.0, 1.0], turns.as_quat()]))
+    # The window counts samples, so each weighs the time around it.
+    spans_s = np.gradient(times_s)
+    disturbance = (np.linalg.norm(forces_m_s2, axis=1) - GRAVITY_M_S2) / DISTURBED_M_S2
+    weights = spans_s / (1.0 + disturbance**2)
+    width = min(WINDOW_S / float(np.median(steps_s)), float(len(times_s)))
+    reach = int(3.0 * width)
+    window = np.exp(-0.5 * (np.arange(-reach, reach + 1) / width) ** 2)
+    forces = weights[:, None] * steady_from_unit.apply(forces_m_s2)
+    # A sum instead of an average: only its direction is asked for, at the ends of the piece too.
+    up = fftconvolve(np.pad(forces, ((reach, reach), (0, 0))), window[:, None], mode="valid", axes=0)
+    at = np.minimum(np.searchsorted(times_s, asked_s, side="right") - 1, len(times_s) - 1)
+    since_s = asked_s - times_s[at]
+    unit_at = Rotation.from_quat(steady_from_unit.as_quat()[at]) * Rotation.from_rotvec(
+        since_s[:, None] * rates_rad_s[at]
+    )
+    down = unit_at.inv().apply(-up[at])
+    length = np.linalg.norm(down, axis=1, keepdims=True)
+    return down / np.where(length > 0.0, length, np.nan)
+
+
+def _accumulated(quaternions: FloatArray) -> Rotation:
+    """Products of the first k rotations, for every k: pairs, then pairs of pairs, so that numpy does the work."""
+    product = Rotation.from_quat(quaternions)
+    reach = 1
+    while reach < len(quaternions):
+        longer = product[:-reach] * product[reach:]
+        product = Rotation.concatenate([product[:reach], longer])
+        reach *= 2
+    return product

@@ -1,0 +1,147 @@
+"""Matterport360: panoramas of buildings with dense depth, from Matterport3D's scans.
+
+Layout (researchdata.bath.ac.uk/1126): a folder a building, and in it ``<id>_rgb.png``, ``<id>_depth.dpt`` and
+``<id>_pose.txt`` of every panorama. Depth is taken along the ray unless ``depth`` says "z"; the dataset does not tell.
+"""
+
+import fnmatch
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from spherloc.cameras.base import FloatArray
+from spherloc.cameras.equirectangular import Equirectangular
+from spherloc.datasets import map_settings, scene_file
+from spherloc.datasets.dpt import read_dpt
+from spherloc.datasets.map_scene import MapScene
+from spherloc.datasets.registration import DepthRegistration
+from spherloc.errors import InputError, show
+from spherloc.frontend.lifting import DepthLift
+from spherloc.frontend.pipeline import image_matcher
+from spherloc.frontend.view import Lift, View
+from spherloc.geometry import pose
+from spherloc.images import read_size
+from spherloc.trajectory import rotation_from_wxyz
+
+GRAVITY_MAP = (0.0, 0.0, -1.0)
+GRAVITY_BOUND_DEG = 2.0
+"""The scanner stands on a levelled tripod."""
+REGISTRATION_M = (0.4, 0.6, 0.8)
+"""Limits of Table III."""
+CAMERA_FROM_BLENDER = np.diag([1.0, -1.0, -1.0])
+"""Poses have Blender's camera axes: x right, y up, z backward."""
+AT_CAMERA = np.eye(3, 4)
+
+EXAMPLE = """\
+kind = "matterport360"
+name = "Matterport360, one building"
+root = "Matterport360/17DRP5sb8fy"     # folder of a building
+queries = ["*5_rgb.png"]               # names or patterns; the others are references
+depth = "ray"                          # or "z"
+trust_poses = true                     # false: poses are judged by registration alone (Sec. VI-B.2)
+"""
+
+
+def load(table: dict[str, Any], path: Path) -> MapScene:
+    """Read a scene of ``kind = "matterport360"``.
+
+    Raises ``InputError`` for a wrong key, a missing folder, or if nothing of the layout is there.
+    """
+    where = str(path)
+    own = {"root", "queries"}
+    scene_file.check_keys(table, map_settings.REQUIRED | own, map_settings.OPTIONAL | {"depth", "trust_poses"}, where)
+    settings = map_settings.read_settings(table, where, GRAVITY_BOUND_DEG)
+    root = map_settings.folder(table, "root", path)
+    along = table.get("depth", "ray")
+    if along not in ("ray", "z"):
+        raise InputError(f'{where}: depth is {show(along)}; give "ray" or "z".')
+    trusted = table.get("trust_poses", True)
+    if not isinstance(trusted, bool):
+        raise InputError(f"{where}: trust_poses is {show(trusted)}; give true or false.")
+    views, remarks = _views(root, along, where)
+    wanted = _patterns(table["queries"], where)
+    chosen = [view for view in views if any(fnmatch.fnmatchcase(view.name, pattern) for pattern in wanted)]
+    names = {view.name for view in chosen}
+    references = tuple(view for view in views if view.name not in names)
+    queries = tuple(_as_query(view, trusted) for view in chosen)
+    # Without trusted poses the map is one reference image, whatever its pose: only the motion between two is judged.
+    frontend = settings.frontend if trusted else {**settings.frontend, "references": 1}
+    return MapScene(
+        name=settings.name,
+        where=where,
+        queries=queries,
+        references=references,
+        matcher=image_matcher(references, frontend, where, path.parent),
+        gravity_map=np.array(GRAVITY_MAP),
+        gravity_bound_rad=settings.gravity_bound_rad,
+        gravity_sd_rad=settings.gravity_sd_rad,
+        bound_px=settings.bound_px,
+        thresholds=settings.thresholds,
+        registration=DepthRegistration(REGISTRATION_M, GRAVITY_MAP, lambda view: _own_depth(view, along)),
+        remarks=remarks,
+    )
+
+
+def _patterns(value: Any, where: str) -> list[str]:
+    if not isinstance(value, list) or not value or not all(isinstance(item, str) and item for item in value):
+        raise InputError(f'{where}: queries must be a list of names or patterns, such as ["*5_rgb.png"].')
+    return value
+
+
+def _views(root: Path, along: Any, where: str) -> tuple[list[View], tuple[str, ...]]:
+    """All panoramas with depth and pose, by name, and what was left out."""
+    images = sorted(root.glob("*_rgb.png"))
+    if not images:
+        raise InputError(f"{where}: {root} has no file *_rgb.png; give the folder of one building as root.")
+    views, remarks = [], []
+    for image in images:
+        stem = image.name.removesuffix("_rgb.png")
+        missing = [name for end in ("_depth.dpt", "_pose.txt") if not (root / (name := f"{stem}{end}")).is_file()]
+        if missing:
+            remarks.append(f"{image.name} was skipped, since {' and '.join(missing)} is missing.")
+            continue
+        try:
+            camera = Equirectangular(*read_size(image))
+            cam_from_map = read_pose(root / f"{stem}_pose.txt")
+        except InputError as error:
+            remarks.append(f"{image.name} was skipped: {error}")
+            continue
+        lift = DepthLift(lambda file=_depth_file(image): read_dpt(file), camera, cam_from_map, along)
+        views.append(View(image.name, camera, image, cam_from_map, lift=lift))
+    return views, tuple(remarks)
+
+
+def _as_query(view: View, trusted: bool) -> View:
+    return View(view.name, view.camera, view.path, view.cam_from_map if trusted else None)
+
+
+def _depth_file(image: Path) -> Path:
+    return image.with_name(image.name.removesuffix("_rgb.png") + "_depth.dpt")
+
+
+def _own_depth(view: View, along: Any) -> Lift:
+    return DepthLift(lambda: read_dpt(_depth_file(view.path)), view.camera, AT_CAMERA, along)
+
+
+def read_pose(path: Path) -> FloatArray:
+    """``cam_from_map`` (3, 4) of a pose file: camera centre, then the quaternion x y z w of camera to world.
+
+    Raises ``InputError`` unless the file holds just seven finite numbers of which four are a rotation.
+    """
+    try:
+        words = path.read_bytes()[:4096].decode("ascii").split()
+        numbers = np.array([float(word) for word in words])
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); correct or remove it.") from None
+    except ValueError:
+        raise InputError(f"{path}: holds something else than numbers; replace it.") from None
+    if numbers.shape != (7,) or not np.isfinite(numbers).all():
+        raise InputError(f"{path}: holds {len(numbers)} numbers; a pose has 7 finite ones, x y z qx qy qz qw.")
+    x, y, z, w = numbers[3:]
+    try:
+        world_from_blender = rotation_from_wxyz(np.array([w, x, y, z]))
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    rotation = CAMERA_FROM_BLENDER @ world_from_blender.T
+    return pose(rotation, -rotation @ numbers[:3])

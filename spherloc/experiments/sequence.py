@@ -1,0 +1,166 @@
+"""Localizes the query images of a map scene, one after another; the next one is matched while one is solved."""
+
+import re
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+
+from spherloc.cameras.base import FloatArray
+from spherloc.datasets.map_scene import MapScene
+from spherloc.diagnosis import diagnose
+from spherloc.errors import InputError, SpherlocError, show
+from spherloc.estimators import estimate
+from spherloc.experiments.rows import FAILED, LOCALIZED, UNREADABLE, QueryResult
+from spherloc.frontend.view import Matches, View
+from spherloc.metrics import evaluate
+from spherloc.trace import Trace
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+_SLICE = re.compile(r"(-?\d{0,9}):(-?\d{0,9})(?::(-?\d{0,9}))?")
+
+
+def chosen_queries(scene: MapScene, words: Sequence[str]) -> tuple[View, ...]:
+    """The queries that ``words`` choose, in the order of the sequence; all of them without words.
+
+    A word is a query's name or FIRST:LAST:STEP, places counted from 0 without LAST, as Python slices. Raises
+    ``InputError`` for a name that does not exist and for a slice that chooses nothing.
+    """
+    places = {view.name: place for place, view in enumerate(scene.queries)}
+    chosen: set[int] = set() if words else set(places.values())
+    for word in words:
+        match = _SLICE.fullmatch(word)
+        if word in places or match is None:
+            chosen.add(places[scene.query(word).name])
+            continue
+        first, last, step = (int(part) if part else None for part in match.groups())
+        found = range(len(places))[slice(first, last, step)] if step != 0 else range(0)
+        if not found:
+            raise InputError(
+                f"{show(word)} chooses none of the {len(places)} queries of {scene.where}; give FIRST:LAST:STEP, "
+                "counted from 0."
+            )
+        chosen.update(found)
+    return tuple(scene.queries[place] for place in sorted(chosen))
+
+
+def localize(
+    scene: MapScene, queries: Iterable[View], estimator: str, options: Any, seed: int
+) -> Iterator[tuple[QueryResult, Trace | None]]:
+    """Match and solve queries of the scene in their order; ``options`` is the estimator's dataclass.
+
+    Gives each query's result, and its trace if there was a problem to solve. What is wrong with one query is said in
+    its result and does not stop the others. Raises ``InputError`` for an unknown estimator, wrong options or seed.
+    """
+    places = {view.name: place for place, view in enumerate(scene.queries)}
+    for view, (matches, matching_ms) in _one_ahead(lambda view: _match(scene, view), queries):
+        row = QueryResult(places[view.name], view.name, FAILED, view.timestamp_s, matching_ms=matching_ms)
+        row = replace(row, truth_cam_from_map=_array(view.cam_from_map))
+        yield _solve(scene, view, matches, row, (estimator, options, seed))
+
+
+def _match(scene: MapScene, view: View) -> tuple[Matches | SpherlocError, float]:
+    start = time.perf_counter()
+    try:
+        found: Matches | SpherlocError = scene.matcher(view)
+    except SpherlocError as error:
+        found = error
+    return found, (time.perf_counter() - start) * 1e3
+
+
+def _solve(
+    scene: MapScene, view: View, matches: Matches | SpherlocError, row: QueryResult, how: tuple[str, Any, int]
+) -> tuple[QueryResult, Trace | None]:
+    if isinstance(matches, SpherlocError):
+        return replace(row, status=_status_without_matches(view), message=str(matches)), None
+    row = replace(row, matches=len(matches.pixels), references=len(matches.references), remarks=matches.remarks)
+    try:
+        problem = scene.problem_of(view, matches)
+    except InputError as error:
+        return replace(row, message=str(error), estimated_outlier_rate=matches.estimated_outlier_rate), None
+    estimator, options, seed = how
+    trace = estimate(problem, estimator, options, seed)
+    return _judged(scene, view, trace, row), trace
+
+
+def _status_without_matches(view: View) -> str:
+    """An image that cannot be used judges no method; one that can, and that was not matched, is a failure."""
+    try:
+        view.read()
+        view.usable_pixels()
+    except InputError:
+        return UNREADABLE
+    return FAILED
+
+
+def _judged(scene: MapScene, view: View, trace: Trace, row: QueryResult) -> QueryResult:
+    """The row with all that the trace tells."""
+    problem, metrics, pose = trace.problem, evaluate(trace), trace.cam_from_map
+    registration_error_m, remarks = None, row.remarks
+    if scene.registration is not None and pose is not None:
+        try:
+            registration_error_m = float(scene.registration(view, pose))
+        except InputError as error:
+            remarks = (*remarks, f"Not registered: {error}")
+    return replace(
+        row,
+        status=FAILED if pose is None else LOCALIZED,
+        inliers=int(np.count_nonzero(trace.inlier_mask)),
+        estimated_outlier_rate=problem.estimated_outlier_rate,
+        true_outlier_rate=None if problem.truth_inliers is None else float(np.mean(~problem.truth_inliers)),
+        rotation_error_deg=metrics.rotation_error_deg,
+        translation_error_m=metrics.translation_error_m,
+        registration_error_m=registration_error_m,
+        precision=metrics.precision,
+        recall=metrics.recall,
+        f1=metrics.f1,
+        estimating_ms=trace.timings_ms["total"],
+        diagnosis=str(diagnose(trace).cause),
+        message=trace.message,
+        remarks=remarks,
+        cam_from_map=pose,
+    )
+
+
+def _array(value: Any) -> FloatArray | None:
+    return None if value is None else np.asarray(value, dtype=np.float64)
+
+
+class _Job(threading.Thread, Generic[R]):
+    """Work in a thread of its own, which ends with the process: Ctrl-C does not wait for it."""
+
+    def __init__(self, work: Callable[[], R]) -> None:
+        super().__init__(name="spherloc-matching", daemon=True)
+        self._work = work
+        self._done: R
+        self._error: BaseException | None = None
+        self.start()
+
+    def run(self) -> None:
+        try:
+            self._done = self._work()
+        except BaseException as error:
+            self._error = error
+
+    def result(self) -> R:
+        self.join()
+        if self._error is not None:
+            raise self._error
+        return self._done
+
+
+def _one_ahead(work: Callable[[T], R], items: Iterable[T]) -> Iterator[tuple[T, R]]:
+    """Each item with ``work`` of it, in order; a thread works on the next item while the caller has this one."""
+    waiting: tuple[T, _Job[R]] | None = None
+    for item in items:
+        done = None if waiting is None else (waiting[0], waiting[1].result())
+        waiting = item, _Job(lambda item=item: work(item))
+        if done is not None:
+            yield done
+    if waiting is not None:
+        yield waiting[0], waiting[1].result()

@@ -1,0 +1,155 @@
+"""What a sequence's results come to: success rates with their uncertainty, medians, and what was not judged."""
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from spherloc.experiments.results import SequenceResults
+from spherloc.experiments.rows import FAILED, LOCALIZED, UNREADABLE, QueryResult
+
+Z_95 = 1.959963984540054
+"""Standard normal quantile of a two-sided interval of 95 %."""
+
+
+@dataclass(frozen=True)
+class SuccessRate:
+    """How many queries are within one limit."""
+
+    degrees: float | None
+    """Limit of the rotation error; None where poses are judged by registration."""
+    metres: float
+    """Limit of the position error, or of the registration error."""
+    successes: int
+    """Queries with errors below the limits."""
+    judged: int
+    """Queries that could be judged: failed ones too, but not those without truth or with an unreadable image."""
+    rate: float | None
+    """Their ratio, 0 to 1; None if none was judged."""
+    low: float | None
+    """Lower end of the 95 % Wilson interval of the rate."""
+    high: float | None
+    """Its upper end."""
+
+
+@dataclass(frozen=True)
+class Summary:
+    """A sequence in numbers. Means and medians are None where nothing is known to take them of."""
+
+    queries: int
+    """In the scene."""
+    done: int
+    """With a result."""
+    localized: int
+    """With a pose."""
+    failed: int
+    """Usable images without a pose; they count as failures."""
+    unreadable: int
+    """Images that could not be used; they are skipped, not judged."""
+    without_truth: int
+    """Usable images whose true pose is unknown; they are skipped where the truth is needed."""
+    not_registered: int
+    """Poses that could not be registered, where a scene judges so; they are skipped there."""
+    success: tuple[SuccessRate, ...]
+    """At the scene's limits of pose errors; empty if no query's truth is known."""
+    registration_success: tuple[SuccessRate, ...]
+    """At the scene's limits of registration errors; empty if the scene has none."""
+    median_rotation_error_deg: float | None
+    """Over localized queries with known truth, as the next one."""
+    median_translation_error_m: float | None
+    """Metres."""
+    median_registration_error_m: float | None
+    """Over registered queries."""
+    scored: int
+    """Queries with labelled correspondences, which the next three are the means of; without a pose they count 0."""
+    mean_precision: float | None
+    """Of the inliers, at 8 px."""
+    mean_recall: float | None
+    """Of the inliers, at 8 px."""
+    mean_f1: float | None
+    """Of the inliers, at 8 px."""
+    median_true_outlier_rate: float | None
+    """Over queries with labelled correspondences."""
+    median_estimated_outlier_rate: float | None
+    """Over queries for which the front end guessed it."""
+    median_matching_ms: float | None
+    """Over all queries that were matched."""
+    median_estimating_ms: float | None
+    """Over all queries that were solved."""
+    diagnoses: dict[str, int]
+    """Queries by the cause of their diagnosis, most frequent first."""
+
+
+def wilson(successes: int, judged: int) -> tuple[float, float]:
+    """The 95 % interval of a rate by Wilson's score (1927): right also near 0 and 1 and for few queries."""
+    rate, z2 = successes / judged, Z_95**2 / judged
+    centre = (rate + z2 / 2) / (1 + z2)
+    half = math.sqrt(rate * (1 - rate) * z2 + z2**2 / 4) / (1 + z2)
+    return max(0.0, centre - half), min(1.0, centre + half)
+
+
+def summarize(results: SequenceResults) -> Summary:
+    """The summary of what is done by now."""
+    rows, setting = results.rows, results.configuration
+    usable = [row for row in rows if row.status != UNREADABLE]
+    with_truth = [row for row in usable if row.truth_cam_from_map is not None]
+    scored = [row for row in rows if row.f1 is not None]
+    limits_m = setting.registration_thresholds_m
+    registered = [row for row in usable if row.status == FAILED or row.registration_error_m is not None]
+    causes = [row.diagnosis for row in rows if row.diagnosis is not None]
+    return Summary(
+        queries=setting.queries,
+        done=len(rows),
+        localized=sum(row.status == LOCALIZED for row in rows),
+        failed=sum(row.status == FAILED for row in rows),
+        unreadable=len(rows) - len(usable),
+        without_truth=len(usable) - len(with_truth),
+        not_registered=0 if limits_m is None else len(usable) - len(registered),
+        success=tuple(_rate(with_truth, *limits) for limits in setting.thresholds) if with_truth else (),
+        registration_success=tuple(_rate(registered, None, metres) for metres in limits_m or ()),
+        median_rotation_error_deg=_median(row.rotation_error_deg for row in rows),
+        median_translation_error_m=_median(row.translation_error_m for row in rows),
+        median_registration_error_m=_median(row.registration_error_m for row in rows),
+        scored=len(scored),
+        mean_precision=_mean(row.precision for row in scored),
+        mean_recall=_mean(row.recall for row in scored),
+        mean_f1=_mean(row.f1 for row in scored),
+        median_true_outlier_rate=_median(row.true_outlier_rate for row in rows),
+        median_estimated_outlier_rate=_median(row.estimated_outlier_rate for row in rows),
+        median_matching_ms=_median(row.matching_ms for row in rows if row.matches is not None),
+        median_estimating_ms=_median(row.estimating_ms for row in rows),
+        diagnoses={cause: causes.count(cause) for cause in sorted(set(causes), key=lambda c: (-causes.count(c), c))},
+    )
+
+
+def _rate(judged: Sequence[QueryResult], degrees: float | None, metres: float) -> SuccessRate:
+    successes = sum(_within(row, degrees, metres) for row in judged)
+    if not judged:
+        return SuccessRate(degrees, metres, 0, 0, None, None, None)
+    return SuccessRate(
+        degrees, metres, successes, len(judged), successes / len(judged), *wilson(successes, len(judged))
+    )
+
+
+def _within(row: QueryResult, degrees: float | None, metres: float) -> bool:
+    """Below the limits, as in Sec. VI; a query without a pose never is."""
+    if degrees is None:
+        return row.registration_error_m is not None and row.registration_error_m < metres
+    if row.rotation_error_deg is None or row.translation_error_m is None:
+        return False
+    return row.rotation_error_deg < degrees and row.translation_error_m < metres
+
+
+def _known(values: Iterable[float | None]) -> list[float]:
+    return [value for value in values if value is not None]
+
+
+def _median(values: Iterable[float | None]) -> float | None:
+    known = _known(values)
+    return float(np.median(known)) if known else None
+
+
+def _mean(values: Iterable[float | None]) -> float | None:
+    known = _known(values)
+    return float(np.mean(known)) if known else None

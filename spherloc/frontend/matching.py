@@ -1,0 +1,166 @@
+"""Matching of local features between a query and a reference image."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spherloc.cameras.base import BoolArray, FloatArray
+from spherloc.errors import InputError, show
+from spherloc.frontend import learned
+from spherloc.frontend.feature_kinds import KINDS, Descriptors
+from spherloc.frontend.features import Features
+
+METHODS = ("nearest", "lightglue")
+BLOCK_BYTES = 16_000_000
+"""Similarities are computed for so much of the query at once."""
+
+
+@dataclass(frozen=True)
+class MatchOptions:
+    """How features are matched."""
+
+    method: str = "nearest"
+    """"nearest": nearest neighbours of descriptors; "lightglue": a network that sees all of both images."""
+    ratio: float | None = 0.8
+    """Nearest over second nearest distance is below it (Lowe 2004, Sec. 7.1); None takes all. Not for LightGlue."""
+    mutual: bool = True
+    """The query's feature must be the nearest of the reference's one, too. LightGlue's always are."""
+    weights: Path | None = None
+    """ONNX file of LightGlue."""
+
+    def __post_init__(self) -> None:
+        if self.method not in METHODS:
+            raise InputError(f"There is no matching {show(self.method)}; take one of {', '.join(METHODS)}.")
+        number = isinstance(self.ratio, int | float) and not isinstance(self.ratio, bool)
+        if self.ratio is not None and not (number and 0.0 < self.ratio <= 1.0):
+            raise InputError(f"The ratio of matching is {show(self.ratio)}; give a number above 0, up to 1.")
+        if self.method == "lightglue" and self.weights is None:
+            raise InputError("LightGlue matching needs a file of weights; give its ONNX file as weights.")
+        if self.method == "nearest" and self.weights is not None:
+            raise InputError("Nearest matching has no weights; leave weights out, or take lightglue.")
+
+
+@dataclass(frozen=True, eq=False)
+class FeatureMatches:
+    """Pairs of features, in the order of the query's."""
+
+    query_index: NDArray[np.int64]
+    """(K,) into the query's features."""
+    reference_index: NDArray[np.int64]
+    """(K,) into the reference's features."""
+    ratios: FloatArray
+    """(K,) distance of the nearest over that of the second nearest descriptor, 0 to 1; NaN where unknown."""
+
+    def __len__(self) -> int:
+        return len(self.query_index)
+
+
+def match(query: Features, reference: Features, options: MatchOptions | None = None) -> FeatureMatches:
+    """Matches of two images; none if one has no features.
+
+    A place that has several features (SIFT gives one for each orientation) is matched to another place only once:
+    pairs that say the same would count as independent evidence. Raises ``InputError`` if the features are of different
+    kinds, or if LightGlue cannot be used for them.
+    """
+    options = options or MatchOptions()
+    if query.method != reference.method:
+        raise InputError(
+            f"Features {query.method} cannot be matched with {reference.method}; extract the same ones from all images."
+        )
+    if len(query) == 0 or len(reference) == 0:
+        return FeatureMatches(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0))
+    if query.descriptors.shape[1] != reference.descriptors.shape[1]:
+        raise InputError(
+            f"Features {query.method} of {query.descriptors.shape[1]} and of {reference.descriptors.shape[1]} numbers "
+            "cannot be matched; extract all with the same weights."
+        )
+    found = (
+        _by_lightglue(query, reference, options)
+        if options.method == "lightglue"
+        else _nearest(query, reference, options)
+    )
+    return _once_a_place(found, query, reference)
+
+
+def _by_lightglue(query: Features, reference: Features, options: MatchOptions) -> FeatureMatches:
+    if options.weights is None:  # FeatureOptions refuses that
+        raise InputError("LightGlue matching needs a file of weights; give its ONNX file as weights.")
+    if not KINDS[query.method].learned:
+        raise InputError(f"LightGlue has no network for {query.method} features; take aliked or disk, or nearest.")
+    sides = ((one.pixels, one.descriptors.astype(np.float32), one.image_size) for one in (query, reference))
+    pairs = learned.lightglue(options.weights, *sides)
+    pairs = pairs[np.argsort(pairs[:, 0], kind="stable")]
+    return FeatureMatches(pairs[:, 0], pairs[:, 1], np.full(len(pairs), np.nan))
+
+
+def _nearest(query: Features, reference: Features, options: MatchOptions) -> FeatureMatches:
+    binary = KINDS[query.method].binary
+    nearest, distances, mutual = two_nearest(*(_comparable(one.descriptors, binary) for one in (query, reference)))
+    if binary:
+        distances = distances**2  # of bits: their Hamming distance
+    with np.errstate(invalid="ignore", divide="ignore"):
+        # Two at no distance are as alike as two can be.
+        ratios = np.where(distances[:, 1] == 0.0, 1.0, distances[:, 0] / distances[:, 1])
+    kept = mutual if options.mutual else np.ones(len(nearest), bool)
+    if options.ratio is not None:
+        kept &= ~(ratios >= options.ratio)  # a lone reference feature has no second: NaN passes
+    index = np.flatnonzero(kept)
+    return FeatureMatches(index, nearest[index], ratios[index])
+
+
+def _comparable(descriptors: Descriptors, binary: bool) -> NDArray[np.float32]:
+    numbers = np.unpackbits(descriptors.astype(np.uint8), axis=1) if binary else descriptors
+    return numbers.astype(np.float32)
+
+
+def two_nearest(
+    query: NDArray[np.float32], reference: NDArray[np.float32]
+) -> tuple[NDArray[np.int64], FloatArray, BoolArray]:
+    """Exact nearest neighbours of N descriptors (N, D) among M others (M, D), by Euclidean distance.
+
+    Returns the nearest (N,), the distances (N, 2) to the two nearest (NaN for a second of one), and a mask (N,) of
+    those that are the nearest to their nearest; among equals the first is. No more than a block of the (N, M) distances
+    is in the memory.
+    """
+    count, other = len(query), len(reference)
+    # With two more columns the product itself is -d^2 / 2 = q r - |q|^2 / 2 - |r|^2 / 2.
+    ones = np.ones
+    left = np.column_stack([query, -0.5 * np.square(query).sum(axis=1), ones(count)]).astype(np.float32)
+    right = np.column_stack([reference, ones(other), -0.5 * np.square(reference).sum(axis=1)]).astype(np.float32)
+    two = np.empty((count, min(2, other)), np.int64)
+    best, best_of_reference = np.empty(count, np.float32), np.full(other, -np.inf, np.float32)
+    rows = max(1, BLOCK_BYTES // (4 * other))
+    for start in range(0, count, rows):
+        near = left[start : start + rows] @ right.T
+        np.maximum(best_of_reference, near.max(axis=0), out=best_of_reference)
+        every, part = np.arange(len(near)), slice(start, start + rows)
+        for place in range(two.shape[1]):
+            two[part, place] = near.argmax(axis=1)
+            if place == 0:
+                best[part] = near[every, two[part, 0]]
+                near[every, two[part, 0]] = -np.inf
+    distances = np.full((count, 2), np.nan)
+    # Anew, as the product loses the digits of small distances.
+    for place in range(two.shape[1]):
+        distances[:, place] = np.linalg.norm(query - reference[two[:, place]], axis=1)
+    return two[:, 0], distances, _first_of(two[:, 0], best == best_of_reference[two[:, 0]])
+
+
+def _first_of(labels: NDArray[np.int64], wanted: BoolArray) -> BoolArray:
+    """The first of the wanted (N,) with each label (N,)."""
+    index = np.flatnonzero(wanted)
+    _, first = np.unique(labels[index], return_index=True)
+    mask = np.zeros(len(wanted), bool)
+    mask[index[first]] = True
+    return mask
+
+
+def _once_a_place(found: FeatureMatches, query: Features, reference: Features) -> FeatureMatches:
+    """Of the pairs between the same two pixels only the one with the best ratio, or the first."""
+    places = np.column_stack([query.pixels[found.query_index], reference.pixels[found.reference_index]])
+    best_first = np.argsort(found.ratios, kind="stable")  # NaN comes last
+    _, first = np.unique(places[best_first], axis=0, return_index=True)
+    kept = np.sort(best_first[first])
+    return FeatureMatches(found.query_index[kept], found.reference_index[kept], found.ratios[kept])

@@ -1,0 +1,230 @@
+"""The front end: features of a query, its most similar references, matches with each, and their points in the map."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spherloc.cameras.base import BoolArray, FloatArray
+from spherloc.errors import InputError, show
+from spherloc.frontend import retrieval
+from spherloc.frontend.features import Features, extract
+from spherloc.frontend.frontend_options import FrontendOptions, frontend_options
+from spherloc.frontend.matching import match
+from spherloc.frontend.outlier_rate import outlier_rate
+from spherloc.frontend.view import Matcher, Matches, View
+from spherloc.geometry import camera_centre
+
+SAME_POINT = 0.02
+"""Points of two references are one if they are closer than this share of their distance to the first of them."""
+VOCABULARY_IMAGES = 64
+"""The words are learnt from so many references, spread over all."""
+
+
+def image_matcher(
+    references: tuple[View, ...],
+    table: Mapping[str, Any],
+    where: str,
+    folder: Path,
+    pairs: Mapping[str, tuple[str, ...]] | None = None,
+) -> Matcher:
+    """The matcher that a scene's section [frontend], ``table``, describes.
+
+    ``where`` names the scene file in messages, ``folder`` is what files of weights are relative to, and ``pairs`` gives
+    names of references, the most similar first, by the name of a query, instead of retrieval. Raises ``InputError``
+    for an unknown key or a wrong value. No image is read yet.
+    """
+    return ImageMatcher(references, frontend_options(table, where, folder), pairs)
+
+
+@dataclass(frozen=True, eq=False)
+class ImageMatcher:
+    """Finds the correspondences of a query with the references most similar to it.
+
+    Up to ``options.references`` references are all matched; of more, retrieval picks that many. An image is never
+    matched with itself: a map's own images can be localized in it. References with more correspondences are the more
+    similar ones. Where several references give a query keypoint the same point (``SAME_POINT``), it counts once, from
+    the most similar of them; different points are rivals and all stay.
+    """
+
+    references: tuple[View, ...]
+    options: FrontendOptions
+    pairs: Mapping[str, tuple[str, ...]] | None = None
+    """Names of references by the name of a query, the most similar first."""
+
+    def __call__(self, query: View) -> Matches:
+        """See ``Matcher``; none of the references being usable gives no correspondences, and remarks."""
+        features = extract(query, self.options.features)
+        tried, remarks = self._candidates(query, features)
+        found: list[_Found] = []
+        for reference in tried:
+            try:
+                found.append(_correspondences(features, reference, self.options))
+            except InputError as error:
+                remarks.append(f"Reference {reference.name} was skipped: {error}")
+        return _joined(found, tried, remarks)
+
+    def _candidates(self, query: View, features: Features) -> tuple[list[View], list[str]]:
+        """References to match with, at most as many as the options say, and what to remark."""
+        remarks: list[str] = []
+        if self.pairs is not None:
+            if query.name in self.pairs:
+                return self._paired(query)
+            remarks.append(f"{query.name} is not in the list of pairs, so that its references were retrieved.")
+        others = [index for index, view in enumerate(self.references) if not _same_file(view, query)]
+        if len(others) > self.options.references:
+            index = self._index
+            remarks += index.remarks
+            allowed = set(others)
+            order = index.views[retrieval.rank(index.describe(features), index.vectors)].tolist()
+            others = [place for place in order if place in allowed][: self.options.references]
+        return [self.references[place] for place in others], remarks
+
+    def _paired(self, query: View) -> tuple[list[View], list[str]]:
+        names = (self.pairs or {})[query.name]
+        known = [self._by_name[name] for name in names if name in self._by_name]
+        unknown = [name for name in names if name not in self._by_name]
+        remarks = []
+        if unknown:
+            remarks.append(
+                f"{len(unknown)} of the {len(names)} references paired with {query.name} are not in the map, "
+                f"the first is {show(unknown[0])}."
+            )
+        return [view for view in known if not _same_file(view, query)][: self.options.references], remarks
+
+    @cached_property
+    def _by_name(self) -> dict[str, View]:
+        return {view.name: view for view in self.references}
+
+    @cached_property
+    def _index(self) -> "_Index":
+        return _index(self.references, self.options)
+
+
+@dataclass(frozen=True, eq=False)
+class _Index:
+    """Global descriptors of all references that can be read."""
+
+    words: retrieval.Floats
+    vectors: retrieval.Floats
+    """(R, K * D)."""
+    views: NDArray[np.int64]
+    """(R,) which references these are."""
+    remarks: list[str]
+
+    def describe(self, features: Features) -> retrieval.Floats:
+        if not self.vectors.any():  # no reference has a feature
+            return np.zeros(self.words.size, np.float32)
+        return retrieval.vlad(retrieval.real_descriptors(features), self.words)
+
+
+def _index(references: Sequence[View], options: FrontendOptions) -> _Index:
+    """Features come from the cache on disk the second time, so that they are not held: thousands would not fit."""
+    failures: dict[int, str] = {}
+
+    def described(index: int) -> retrieval.Floats | None:
+        try:
+            return retrieval.real_descriptors(extract(references[index], options.features))
+        except InputError as error:
+            failures[index] = str(error)
+            return None
+
+    spread = np.unique(np.linspace(0, len(references) - 1, VOCABULARY_IMAGES).round().astype(np.int64))
+    samples = [image for index in spread.tolist() if (image := described(index)) is not None and len(image)]
+    words = retrieval.vocabulary(samples) if samples else np.zeros((1, 1), np.float32)
+    vectors = {
+        index: retrieval.vlad(image, words)
+        for index in range(len(references))
+        if (image := described(index)) is not None
+    }
+    remarks = []
+    if failures:
+        first = min(failures)
+        remarks.append(
+            f"{len(failures)} of {len(references)} references were skipped, the first is {references[first].name}: "
+            f"{failures[first]}"
+        )
+    stacked = np.stack(list(vectors.values())) if vectors else np.empty((0, words.size), np.float32)
+    return _Index(words, stacked, np.array(list(vectors), dtype=np.int64), remarks)
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """Correspondences through one reference."""
+
+    reference: View
+    pixels: FloatArray
+    points: FloatArray
+    reference_pixels: FloatArray
+    ratios: FloatArray
+    unlifted: int
+    """Matches whose pixel in the reference has no point in the map."""
+
+
+def _correspondences(query: Features, reference: View, options: FrontendOptions) -> _Found:
+    if reference.lift is None:
+        raise InputError("nothing gives its pixels points in the map; give depth, lidar or a model.")
+    features = extract(reference, options.features)
+    matches = match(query, features, options.matching)
+    reference_pixels = features.pixels[matches.reference_index]
+    points, lifted = reference.lift(reference_pixels)
+    return _Found(
+        reference=reference,
+        pixels=query.pixels[matches.query_index[lifted]],
+        points=points[lifted],
+        reference_pixels=reference_pixels[lifted],
+        ratios=matches.ratios[lifted],
+        unlifted=int(np.count_nonzero(~lifted)),
+    )
+
+
+def _joined(found: Sequence[_Found], tried: Sequence[View], remarks: list[str]) -> Matches:
+    ranked = sorted((part for part in found if len(part.pixels)), key=lambda part: -len(part.pixels))
+    unlifted = sum(part.unlifted for part in found)
+    total = unlifted + sum(len(part.pixels) for part in found)
+    if unlifted:
+        remarks.append(f"{unlifted:,} of {total:,} matches have no point in the map.")
+    if not ranked:
+        none = np.empty((0, 2))
+        return Matches(none, np.empty((0, 3)), tuple(tried), np.empty(0, np.int64), none, None, tuple(remarks))
+    pixels = np.concatenate([part.pixels for part in ranked])
+    points = np.concatenate([part.points for part in ranked])
+    index = np.repeat(np.arange(len(ranked)), [len(part.pixels) for part in ranked])
+    centres = np.stack([_centre(part.reference) for part in ranked])
+    keep = ~_repeated(pixels, points, np.linalg.norm(points - centres[index], axis=1))
+    return Matches(
+        pixels=pixels[keep],
+        points=points[keep],
+        references=tuple(part.reference for part in ranked),
+        reference_index=index[keep],
+        reference_pixels=np.concatenate([part.reference_pixels for part in ranked])[keep],
+        estimated_outlier_rate=outlier_rate([part.ratios for part in ranked]),
+        remarks=tuple(remarks),
+    )
+
+
+def _repeated(pixels: FloatArray, points: FloatArray, ranges: FloatArray) -> BoolArray:
+    """(N,): an earlier row has the same pixel and, within ``SAME_POINT`` of its range (N,), the same point."""
+    _, label = np.unique(pixels, axis=0, return_inverse=True)
+    order = np.argsort(label.ravel(), kind="stable")
+    label, points, ranges = label.ravel()[order], points[order], ranges[order]
+    repeated = np.zeros(len(pixels), dtype=bool)
+    for step in range(1, len(pixels)):
+        same = label[step:] == label[:-step]
+        if not same.any():
+            break
+        apart = np.linalg.norm(points[step:] - points[:-step], axis=1)
+        repeated[order[step:]] |= same & (apart <= SAME_POINT * ranges[:-step])
+    return repeated
+
+
+def _centre(reference: View) -> FloatArray:
+    return np.full(3, np.nan) if reference.cam_from_map is None else camera_centre(reference.cam_from_map)
+
+
+def _same_file(reference: View, query: View) -> bool:
+    return reference.path == query.path

@@ -1,0 +1,81 @@
+"""Image retrieval: which references look like the query. VLAD over local features stands in for NetVLAD.
+
+H. Jegou, M. Douze, C. Schmid, P. Perez: Aggregating local descriptors into a compact image representation, CVPR 2010;
+normalised within each word as by R. Arandjelovic and A. Zisserman: All about VLAD, CVPR 2013.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spherloc.frontend.features import Features
+
+WORDS = 64
+MOST_SAMPLES = 20_000
+"""Descriptors that the vocabulary is learnt from, 300 a word."""
+LEAST_SAMPLES_A_WORD = 30
+"""With fewer, a word would describe single features."""
+
+_ROUNDS = 12
+"""Of Lloyd's algorithm: from random starts, words hardly move after ten."""
+_CHUNK = 4096
+
+Floats = NDArray[np.float32]
+
+
+def real_descriptors(features: Features) -> Floats:
+    """Descriptors (N, D) as unit vectors; the bits of binary ones count as +1 and -1, so that distances agree."""
+    descriptors = features.descriptors
+    if descriptors.dtype == np.uint8:
+        descriptors = 2.0 * np.unpackbits(descriptors.astype(np.uint8), axis=1) - 1.0
+    lengths = np.linalg.norm(descriptors, axis=1, keepdims=True)
+    return (descriptors / np.where(lengths > 0, lengths, 1.0)).astype(np.float32)
+
+
+def vocabulary(images: Sequence[Floats], seed: int = 0) -> Floats:
+    """Words (K, D) by k-means over the descriptors of some images; K is at most ``WORDS``, fewer for few features.
+
+    Every image gives about as many samples. The same descriptors and seed give the same words.
+    """
+    random = np.random.default_rng(seed)
+    share = -(-MOST_SAMPLES // max(1, len(images)))
+    samples = np.concatenate([image[_some(random, len(image), share)] for image in images])
+    samples = samples[_some(random, len(samples), MOST_SAMPLES)]
+    count = max(1, min(WORDS, len(samples) // LEAST_SAMPLES_A_WORD))
+    words = samples[_some(random, len(samples), count)]
+    for _ in range(_ROUNDS):
+        index = _nearest_word(samples, words)
+        sums = np.zeros_like(words)
+        np.add.at(sums, index, samples)
+        sizes = np.bincount(index, minlength=len(words))[:, None]
+        words = np.where(sizes > 0, sums / np.maximum(sizes, 1), words)
+    return words
+
+
+def vlad(descriptors: Floats, words: Floats) -> Floats:
+    """Unit vector (K * D,) of an image with descriptors (N, D); zero for an image without features."""
+    index = _nearest_word(descriptors, words)
+    residuals = np.zeros_like(words)
+    np.add.at(residuals, index, descriptors - words[index])
+    residuals = np.sign(residuals) * np.sqrt(np.abs(residuals))
+    # Within a word first: one repeated texture (a hedge, a row of windows) must not drown the others.
+    residuals /= np.maximum(np.linalg.norm(residuals, axis=1, keepdims=True), 1e-12)
+    length = np.linalg.norm(residuals)
+    return (residuals / max(float(length), 1e-12)).ravel()
+
+
+def rank(query: Floats, references: Floats) -> NDArray[np.int64]:
+    """Indices of the references (R, K * D), the one most similar to the query (K * D,) first."""
+    return np.argsort(-(references @ query), kind="stable")
+
+
+def _some(random: np.random.Generator, count: int, most: int) -> NDArray[np.int64]:
+    return np.sort(random.choice(count, most, replace=False)) if count > most else np.arange(count)
+
+
+def _nearest_word(descriptors: Floats, words: Floats) -> NDArray[np.int64]:
+    half = 0.5 * (words**2).sum(axis=1)
+    chunks = range(0, len(descriptors), _CHUNK)
+    parts = [(descriptors[start : start + _CHUNK] @ words.T - half).argmax(axis=1) for start in chunks]
+    return np.concatenate(parts) if parts else np.zeros(0, dtype=np.int64)

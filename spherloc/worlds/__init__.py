@@ -1,0 +1,29 @@
+"""Places built by code, and pictures of them through any camera, with exact depth and poses."""
+
+from collections.abc import Callable
+from functools import lru_cache
+
+from spherloc.errors import InputError, show
+from spherloc.worlds.cache import image_path, render
+from spherloc.worlds.conditions import Conditions
+from spherloc.worlds.render import Render
+from spherloc.worlds.street import build_street
+from spherloc.worlds.world import World
+
+__all__ = ["WORLDS", "Conditions", "Render", "World", "build_world", "image_path", "render"]
+
+WORLDS: dict[str, Callable[[int], World]] = {"street": build_street}
+"""By kind."""
+
+
+@lru_cache(maxsize=4)
+def build_world(kind: str, seed: int = 0) -> World:
+    """The world of that kind; another seed gives another one of the same sort.
+
+    Raises ``InputError`` for an unknown kind or a negative seed.
+    """
+    if kind not in WORLDS:
+        raise InputError(f"no world {show(kind)}; there are {', '.join(WORLDS)}.")
+    if seed < 0:
+        raise InputError(f"world {kind}: seed is {seed}; give 0 or more.")
+    return WORLDS[kind](seed)

@@ -1,0 +1,132 @@
+"""Pictures of a world through any camera model, with the distance along every ray."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from spherloc.cameras.base import BoolArray, Camera
+from spherloc.geometry import camera_centre
+from spherloc.images import ByteImage
+from spherloc.worlds.conditions import Conditions
+from spherloc.worlds.occluders import with_occluders
+from spherloc.worlds.rays import Hits, RayScene
+from spherloc.worlds.shading import GAMMA, Lighting
+from spherloc.worlds.world import World
+
+FloatArray = NDArray[np.float64]
+
+CORNERS = np.array([[-0.125, -0.375], [0.375, -0.125], [0.125, 0.375], [-0.375, 0.125]])
+"""Where a pixel at an edge is sampled, from its centre, px."""
+SAME_PLANE_M = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class Render:
+    """One picture."""
+
+    image: ByteImage
+    """(H, W, 3) BGR; black where the camera model cannot see."""
+    range_m: NDArray[np.float32]
+    """(H, W) distance along the ray of each pixel's centre; inf where nothing is hit, NaN where the model cannot see."""
+
+
+def draw(
+    world: World, camera: Camera, cam_from_world: FloatArray, conditions: Conditions = Conditions(), seed: int = 0
+) -> Render:
+    """Cast a ray through every pixel, and four more where surfaces meet. ``seed`` places occluders and makes noise."""
+    rotation, centre = cam_from_world[:, :3], camera_centre(cam_from_world)
+    rays = with_occluders(world, centre, conditions.occluders, seed)
+    lighting = Lighting(world, rays, conditions)
+    shape = (camera.height, camera.width)
+    grid = np.stack(np.meshgrid(np.arange(shape[1]) + 0.5, np.arange(shape[0]) + 0.5), axis=-1)
+    bearings, seen = camera.unproject(grid.reshape(-1, 2))
+    angle = _pixel_angle(bearings.reshape(*shape, 3)).ravel()
+    inside = np.flatnonzero(seen)
+    directions = bearings[inside] @ rotation
+    hits = rays.cast(centre, directions)
+    colours = np.zeros((seen.size, 3), np.float32)
+    colours[inside] = lighting.colours(centre, directions, hits, angle[inside])
+    face, range_m = np.full(seen.size, -2, np.int32), np.full(seen.size, np.nan)
+    face[inside], range_m[inside] = hits.face, hits.range_m
+    places = np.full((seen.size, 3), np.nan)
+    places[inside] = centre + directions * np.where(np.isfinite(hits.range_m), hits.range_m, 0.0)[:, None]
+    edges = np.flatnonzero(_edges(rays, face.reshape(shape), places.reshape(*shape, 3)).ravel() & seen)
+    colours[edges] = _refined(lighting, camera, rotation, centre, grid.reshape(-1, 2)[edges], angle[edges])
+    linear = colours.reshape(*shape, 3)
+    return Render(_developed(linear, seen.reshape(shape), camera, conditions, seed), range_m.reshape(shape).astype("f4"))
+
+
+def _pixel_angle(bearings: FloatArray) -> FloatArray:
+    """(H, W): the larger of a pixel's two sizes, radians."""
+    size = np.zeros(bearings.shape[:2])
+    for axis in (0, 1):
+        step = np.linalg.norm(np.diff(bearings, axis=axis), axis=2)
+        pad = [(0, 1) if a == axis else (0, 0) for a in (0, 1)]
+        size = np.fmax(size, np.pad(step, pad, mode="edge"))
+    return np.maximum(size, 1e-5)
+
+
+def _edges(rays: RayScene, face: NDArray[np.int32], places: FloatArray) -> BoolArray:
+    """(H, W): pixels one of whose neighbours shows another part that does not continue this one's plane."""
+    surface = np.where(face >= 0, rays.mesh.surface[face], face)
+    edge = np.zeros(face.shape, dtype=bool)
+    for axis in (0, 1):
+        first = tuple(slice(None, -1) if a == axis else slice(None) for a in (0, 1))
+        second = tuple(slice(1, None) if a == axis else slice(None) for a in (0, 1))
+        rows, columns = np.nonzero((surface[first] != surface[second]) & (face[first] > -2) & (face[second] > -2))
+        other = (rows + (axis == 0), columns + (axis == 1))
+        here, there = face[rows, columns], face[other]
+        step = places[other] - places[rows, columns]
+        off = np.abs(np.einsum("ij,ij->i", rays.normals[here], step))
+        turned = np.einsum("ij,ij->i", rays.normals[here], rays.normals[there]) < 0.999
+        apart = (here < 0) | (there < 0) | turned | (off > SAME_PLANE_M)
+        edge[rows[apart], columns[apart]] = True
+        edge[other[0][apart], other[1][apart]] = True
+    return edge
+
+
+def _refined(
+    lighting: Lighting, camera: Camera, rotation: FloatArray, centre: FloatArray, pixels: FloatArray, angle: FloatArray
+) -> NDArray[np.float32]:
+    """Mean colour (N, 3) of four rays through each of ``pixels`` (N, 2)."""
+    if len(pixels) == 0:
+        return np.empty((0, 3), np.float32)
+    spread = (pixels[:, None] + CORNERS).reshape(-1, 2)
+    bearings, seen = camera.unproject(spread)
+    directions = bearings[seen] @ rotation
+    hits: Hits = lighting.rays.cast(centre, directions)
+    colours = np.zeros((len(spread), 3), np.float32)
+    colours[seen] = lighting.colours(centre, directions, hits, 0.5 * np.repeat(angle, len(CORNERS))[seen])
+    weights = seen.reshape(-1, len(CORNERS), 1)
+    return (colours.reshape(-1, len(CORNERS), 3) * weights).sum(axis=1) / np.maximum(weights.sum(axis=1), 1)
+
+
+def _developed(
+    linear: NDArray[np.float32], seen: BoolArray, camera: Camera, conditions: Conditions, seed: int
+) -> ByteImage:
+    """Bytes BGR of linear RGB: blur, exposure, a film's soft shoulder, noise."""
+    linear = _blurred(linear, conditions, wraps=camera.model == "equirectangular")
+    bright = linear * np.float32(2.0**conditions.exposure_stops)
+    # A soft shoulder: highlights lose contrast before they burn out.
+    mapped = bright * (1 + bright / 6.0) / (1 + 0.55 * bright)
+    picture = 255 * np.clip(mapped, 0, 1) ** (1 / GAMMA)
+    if conditions.noise > 0:
+        rng = np.random.default_rng([seed, 53])
+        picture = picture + conditions.noise * rng.standard_normal(picture.shape, dtype=np.float32)
+    picture[~seen] = 0
+    return np.round(np.clip(picture, 0, 255)).astype(np.uint8)[..., ::-1].copy()
+
+
+def _blurred(linear: NDArray[np.float32], conditions: Conditions, wraps: bool) -> NDArray[np.float32]:
+    margin = int(np.ceil(3 * conditions.defocus_px + conditions.motion_blur_px)) + 1
+    if margin == 1:
+        return linear
+    wide = np.pad(linear, [(0, 0), (margin, margin), (0, 0)], mode="wrap" if wraps else "edge")
+    if conditions.defocus_px > 0:
+        wide = cv2.GaussianBlur(wide, (0, 0), conditions.defocus_px)
+    if conditions.motion_blur_px > 1:
+        length = round(conditions.motion_blur_px)
+        wide = cv2.blur(wide, (length, 1))
+    return wide[:, margin:-margin]

@@ -1,0 +1,146 @@
+"""Light on surfaces: Lambert's law for sun, sky and lamps, with shadows; haze; and the sky itself."""
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spherloc.worlds.conditions import LIGHTS, Conditions, Light
+from spherloc.worlds.paint import noise
+from spherloc.worlds.rays import Hits, RayScene
+from spherloc.worlds.seasons import SNOW, recoloured
+from spherloc.worlds.world import World
+
+FloatArray = NDArray[np.float64]
+Colours = NDArray[np.float32]
+
+GAMMA = 2.2
+HAZE_M = 260.0
+LAMP_COLOUR = np.array([1.0, 0.78, 0.48], np.float32)
+INDOOR_LAMP = np.array([1.0, 0.93, 0.82], np.float32)
+OFF_SURFACE_M = 2e-3
+"""Rays that leave a surface start this far above it, beyond Embree's single precision."""
+
+
+@dataclass(frozen=True, eq=False)
+class Lighting:
+    """Everything that colours depend on besides the rays."""
+
+    world: World
+    rays: RayScene
+    """The world's own, or with occluders in it."""
+    conditions: Conditions
+
+    @property
+    def light(self) -> Light:
+        """With the sun where the conditions want it."""
+        light, given = LIGHTS[self.conditions.light], self.conditions
+        return replace(
+            light,
+            azimuth_deg=light.azimuth_deg if given.sun_azimuth_deg is None else given.sun_azimuth_deg,
+            elevation_deg=light.elevation_deg if given.sun_elevation_deg is None else given.sun_elevation_deg,
+        )
+
+    def colours(self, origin: FloatArray, directions: FloatArray, hits: Hits, angle_rad: FloatArray) -> Colours:
+        """Linear RGB (N, 3) of what rays (N, 3) from ``origin`` (3,) hit; ``angle_rad`` (N,) is a pixel's size."""
+        result = np.empty((len(directions), 3), np.float32)
+        seen = hits.face >= 0
+        result[~seen] = self.sky(directions[~seen])
+        hit = Hits(hits.face[seen], hits.weights[seen], hits.range_m[seen])
+        result[seen] = self._surface(origin, directions[seen], hit, angle_rad[seen])
+        return result
+
+    def _surface(self, origin: FloatArray, directions: FloatArray, hits: Hits, angle_rad: FloatArray) -> Colours:
+        mesh = self.rays.mesh
+        places = origin + directions * hits.range_m[:, None]
+        normals = self.rays.normals[hits.face]
+        # Lit from the side that is looked at, so that thin things have two faces.
+        facing = np.einsum("ij,ij->i", normals, directions)
+        normals = np.where(facing[:, None] > 0, -normals, normals)
+        corners = mesh.faces[hits.face]
+        uv = np.einsum("ij,ijk->ik", hits.weights, mesh.uv[corners])
+        tint = np.einsum("ij,ijk->ik", hits.weights, mesh.tint[corners])
+        # A pixel on a slanted surface is longer than wide; the mean of both keeps near ground crisp and far ground calm.
+        slant = np.sqrt(np.maximum(np.abs(facing), 0.05))
+        texels = self.rays.texels_per_metre[hits.face] * hits.range_m * angle_rad / slant
+        atlas = recoloured(self.world.atlas, self.conditions.season)
+        level = np.log2(np.maximum(texels, 1e-6)).astype(np.float32)
+        texture = atlas.sample(uv.astype(np.float32), mesh.tile[hits.face], level) / np.float32(255)
+        base = texture[:, :3]
+        if self.conditions.season == "winter" and not self.world.indoor:
+            base = _snowed(base, places, normals)
+        albedo = base**GAMMA * tint
+        colour = albedo * self._irradiance(places, normals)
+        glow = texture[:, 3] * mesh.lit[hits.face] * max(self.light.lamps, float(self.world.indoor))
+        colour = colour + (1.6 * glow)[:, None] * np.where(base > 0.5, 1.0, 0.6) * LAMP_COLOUR
+        if self.world.indoor:
+            return colour.astype(np.float32)
+        clear = np.exp(-hits.range_m / HAZE_M)[:, None]
+        return (clear * colour + (1 - clear) * np.asarray(self.light.horizon)).astype(np.float32)
+
+    def _irradiance(self, places: FloatArray, normals: FloatArray) -> Colours:
+        light = self.light
+        up = normals[:, 2:3]
+        sky = np.asarray(light.sky, np.float32)
+        lit = sky * (0.62 + 0.38 * up)
+        sun = np.asarray(light.sun, np.float32)
+        if sun.any() and not self.world.indoor:
+            azimuth, elevation = np.radians([light.azimuth_deg, light.elevation_deg])
+            level = np.cos(elevation)
+            towards = np.array([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
+            facing = normals @ towards
+            chosen = np.flatnonzero(facing > 0)
+            start = places[chosen] + OFF_SURFACE_M * normals[chosen]
+            dark = self.rays.blocked(start, np.broadcast_to(towards, start.shape), 1e3)
+            strength = np.zeros(len(places), np.float32)
+            strength[chosen] = np.where(dark, 0.0, facing[chosen])
+            # What the sun lights also lights the shade a little.
+            lit = lit + strength[:, None] * sun + 0.10 * sun
+        power = 1.0 if self.world.indoor else light.lamps
+        if power > 0 and len(self.world.lamps):
+            lit = lit + power * self._lamplight(places, normals)
+        return lit.astype(np.float32)
+
+    def _lamplight(self, places: FloatArray, normals: FloatArray) -> Colours:
+        total = np.zeros(len(places), np.float32)
+        reach = self.world.lamp_reach_m
+        for lamp in self.world.lamps:
+            way = lamp - places
+            distance = np.linalg.norm(way, axis=1)
+            facing = np.einsum("ij,ij->i", way, normals) / np.maximum(distance, 1e-6)
+            chosen = np.flatnonzero((distance < reach) & (facing > 0))
+            direction = way[chosen] / distance[chosen, None]
+            start = places[chosen] + OFF_SURFACE_M * normals[chosen]
+            dark = self.rays.blocked(start, direction, distance[chosen] - 0.3)
+            fall = (1 - (distance[chosen] / reach) ** 2) ** 2 / (1 + (distance[chosen] / (0.25 * reach)) ** 2)
+            total[chosen] += np.where(dark, 0.0, facing[chosen] * fall)
+        return 1.3 * total[:, None] * (INDOOR_LAMP if self.world.indoor else LAMP_COLOUR)
+
+    def sky(self, directions: FloatArray) -> Colours:
+        """Linear RGB (N, 3) of the sky: from the horizon to the zenith, with clouds."""
+        light = self.light
+        height = np.clip(directions[:, 2], 0.0, 1.0)
+        share = (height**0.55)[:, None]
+        colour = (1 - share) * np.asarray(light.horizon) + share * np.asarray(light.zenith)
+        at = directions[:, :2] / (height[:, None] + 0.12)
+        clouds = _clouds(self.world.seed)
+        size = clouds.shape[0]
+        column, row = np.moveaxis((at * size * 0.11).astype(int) % size, -1, 0)
+        cover = np.clip(1.6 * (clouds[row, column] + light.clouds - 0.45), 0, 1) * np.clip(height * 6, 0, 1)
+        bright = 0.55 * np.asarray(light.sky) * 2 + 0.35 * np.asarray(light.sun)
+        return (colour + (0.75 * cover[:, None]) * (bright - colour)).astype(np.float32)
+
+
+def _snowed(base: Colours, places: FloatArray, normals: FloatArray) -> Colours:
+    """Snow on what faces up, trodden thin in patches that stay in place."""
+    pattern = _clouds(7)
+    size = pattern.shape[0]
+    column, row = np.moveaxis((places[:, :2] * 22).astype(int) % size, -1, 0)
+    depth = np.clip((normals[:, 2] - 0.35) * 3, 0, 1) * np.clip(0.86 + 0.35 * pattern[row, column], 0, 1)
+    return (base + depth[:, None] * (SNOW - base)).astype(np.float32)
+
+
+@lru_cache(maxsize=4)
+def _clouds(seed: int) -> NDArray[np.float32]:
+    return noise(np.random.default_rng([seed, 41]), 1024, 1024, 8, 6)

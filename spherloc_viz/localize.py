@@ -1,0 +1,226 @@
+"""``spherloc localize``: a query sequence against a map, with a progress bar, resumable, into one folder."""
+
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from spherloc.datasets import load_scene
+from spherloc.datasets.map_scene import MapScene
+from spherloc.errors import InputError, RecordingError, show
+from spherloc.estimators import options_type, warm_up
+from spherloc.experiments.configuration import configuration_of
+from spherloc.experiments.results import ResultsLog, SequenceResults
+from spherloc.experiments.rows import LOCALIZED, UNREADABLE, QueryResult
+from spherloc.experiments.sequence import chosen_queries, localize
+from spherloc.experiments.summary import SuccessRate, Summary, summarize
+from spherloc.experiments.trajectories import estimated_trajectory, timed, true_trajectory
+from spherloc.frontend.view import View
+from spherloc.trace import Trace
+from spherloc.trajectory import write_tum
+from spherloc_viz.batch import parse_settings
+from spherloc_viz.options import json_text
+
+TRAJECTORY, TRUE_TRAJECTORY, PICTURE, SUMMARY = "trajectory.tum", "truth.tum", "trajectory.png", "summary.json"
+LINE_EVERY_S = 30.0
+"""Where the output is no terminal, progress is a line now and then."""
+MAX_TOLD = 5
+
+
+def localize_sequence(
+    path: Path,
+    estimator: str,
+    seed: int,
+    settings: Sequence[str],
+    queries: Sequence[str],
+    output: Path,
+    recordings: Path | None,
+    retry_failed: bool,
+) -> int:
+    """Localize the chosen queries that ``output`` has no result of; returns the exit code.
+
+    0 if every chosen query has a pose, else 1. Raises ``InputError`` for whatever makes all of it impossible.
+    """
+    scene = load_scene(path)
+    if not isinstance(scene, MapScene):
+        raise InputError(f"{path}: is one problem, no sequence of query images; solve it by: spherloc run {path}")
+    if not 0 <= seed < 2**63:
+        raise InputError(f"seed is {seed}; give a number from 0 to 2^63 - 1.")
+    chosen = chosen_queries(scene, queries)
+    options = _options(scene, estimator, settings)
+    for remark in scene.remarks:
+        _say(remark)
+    with ResultsLog(output, configuration_of(scene, path, estimator, options, seed)) as log:
+        todo = _todo(scene, chosen, log, retry_failed)
+        if todo:
+            warm_up(_say)
+            _work(scene, todo, log, (estimator, options, seed), recordings)
+        results = log.results()
+        _finish(log, results)
+    print(_text(results, summarize(results)), flush=True)
+    names = {view.name for view in chosen}
+    return 0 if all(row.status == LOCALIZED for row in results.rows if row.query in names) else 1
+
+
+def _options(scene: MapScene, estimator: str, settings: Sequence[str]) -> Any:
+    """What ``resolved_options`` gives for every query of the scene."""
+    given = {} if scene.bound_px is None else {"bound_px": scene.bound_px}
+    return options_type(estimator)(**(given | parse_settings(estimator, settings)))
+
+
+def _todo(scene: MapScene, chosen: Sequence[View], log: ResultsLog, retry_failed: bool) -> list[View]:
+    known = {view.name for view in scene.queries}
+    strange = next((name for name in log.rows if name not in known), None)
+    if strange is not None:
+        raise InputError(
+            f"{log.folder}: holds a result of {show(strange)}, no query of this scene; give another folder."
+        )
+    if log.repaired:
+        _say(f"{log.folder}: removed a half written line; its query is done again.")
+    if retry_failed and (again := log.forget_failures()):
+        _say(f"{log.folder}: {again} queries without a pose are done again.")
+    todo = [view for view in chosen if view.name not in log.rows]
+    if len(todo) < len(chosen):
+        _say(f"{log.folder}: {len(chosen) - len(todo)} of {len(chosen)} queries are done already.")
+    return todo
+
+
+def _work(
+    scene: MapScene, todo: list[View], log: ResultsLog, how: tuple[str, Any, int], recordings: Path | None
+) -> None:
+    failed = 0
+    try:
+        with _progress(len(todo)) as progress:
+            for row, trace in localize(scene, todo, *how):
+                if recordings is not None and trace is not None:
+                    row = replace(row, recording=_record(trace, recordings, log))
+                # Its recording is complete by now, so a row never names one that a killed process left unwritten.
+                log.append(row)
+                failed += row.status != LOCALIZED
+                progress(failed)
+    except KeyboardInterrupt:
+        _say(f"stopped; {len(log.rows)} queries are kept in {log.folder}, and the same command goes on from there.")
+        raise
+
+
+def _record(trace: Trace, folder: Path, log: ResultsLog) -> str | None:
+    from spherloc_viz.recording.background import file_name
+    from spherloc_viz.recording.writer import write_recording
+
+    try:
+        path = write_recording(trace, folder / file_name(trace, datetime.now(UTC)))
+    except RecordingError as error:
+        if isinstance(error.__cause__, OSError):  # no room: the next ones would be lost too
+            raise InputError(
+                f"{error} The results of {len(log.rows)} queries are kept, and the same command goes on from there."
+            ) from None
+        _say(str(error))
+        return None
+    try:
+        return path.resolve().relative_to(log.folder.resolve()).as_posix()
+    except ValueError:
+        return str(path.resolve())
+
+
+@contextmanager
+def _progress(count: int) -> Iterator[Any]:
+    """A bar on a terminal, else a line now and then; called after every query with how many have no pose."""
+    if sys.stderr.isatty():
+        with tqdm(total=count, unit="query", file=sys.stderr, dynamic_ncols=True) as bar:
+
+            def advance(failed: int) -> None:
+                bar.set_postfix_str(f"{failed} without a pose", refresh=False)
+                bar.update()
+
+            yield advance
+        return
+    done, said = 0, time.monotonic()
+
+    def line(failed: int) -> None:
+        nonlocal done, said
+        done += 1
+        if time.monotonic() - said > LINE_EVERY_S:
+            _say(f"{done} of {count} queries, {failed} without a pose.")
+            said = time.monotonic()
+
+    yield line
+
+
+def _finish(log: ResultsLog, results: SequenceResults) -> None:
+    """Trajectories, picture and summary of all that is done by now."""
+    from spherloc_viz.trajectory_plot import trajectory_png
+
+    truth = true_trajectory(results)
+    write_tum(log.folder / TRAJECTORY, estimated_trajectory(results))
+    if len(truth):
+        write_tum(log.folder / TRUE_TRAJECTORY, truth)
+    log.write(PICTURE, trajectory_png(results))
+    log.write(SUMMARY, (json_text(asdict(summarize(results))) + "\n").encode())
+
+
+def _text(results: SequenceResults, summary: Summary) -> str:
+    """The summary for people."""
+    setting = results.configuration
+    lines = [
+        f"{setting.name} ({setting.scene}), {setting.estimator}, seed {setting.seed}",
+        f"  {summary.localized} of {summary.done} queries have a pose"
+        + (f", of {summary.queries} in the scene" if summary.done < summary.queries else ""),
+    ]
+    lines += [f"  success {_rate(rate)}" for rate in (*summary.success, *summary.registration_success)]
+    if summary.median_rotation_error_deg is not None and summary.median_translation_error_m is not None:
+        lines.append(
+            f"  median error {summary.median_rotation_error_deg:.3f} deg and "
+            f"{100 * summary.median_translation_error_m:.2f} cm, of queries with a pose"
+        )
+    if summary.median_registration_error_m is not None:
+        lines.append(f"  median registration error {100 * summary.median_registration_error_m:.2f} cm")
+    if summary.mean_f1 is not None:
+        lines.append(
+            f"  inliers at 8 px: mean precision {summary.mean_precision:.3f}, recall {summary.mean_recall:.3f}, "
+            f"F1 {summary.mean_f1:.3f}"
+        )
+    if summary.median_estimating_ms is not None:
+        lines.append(
+            f"  median time {summary.median_matching_ms or 0:.0f} ms for matching, "
+            f"{summary.median_estimating_ms:.1f} ms for estimating"
+        )
+    lines += [f"  {line}" for line in (*_skipped(summary), *_without_pose(results.rows))]
+    if not timed(results):
+        lines.append("  trajectory: times are places in the sequence, as the queries have no growing times")
+    return "\n".join([*lines, f"  written to {results.folder}"])
+
+
+def _rate(rate: SuccessRate) -> str:
+    limits = f"{rate.metres:g} m" if rate.degrees is None else f"{rate.degrees:g} deg, {rate.metres:g} m"
+    what = "registration within " if rate.degrees is None else "within "
+    if rate.rate is None or rate.low is None or rate.high is None:
+        return f"{what}{limits}: nothing to judge"
+    interval = f"{100 * rate.low:.1f} to {100 * rate.high:.1f} %"
+    return f"{what}{limits}: {100 * rate.rate:.1f} % ({rate.successes} of {rate.judged}; 95 %: {interval})"
+
+
+def _skipped(summary: Summary) -> Iterator[str]:
+    if summary.unreadable:
+        yield f"not judged: {summary.unreadable} with an unreadable image"
+    if summary.without_truth:
+        yield f"not judged by the truth: {summary.without_truth} whose true pose is unknown"
+    if summary.not_registered:
+        yield f"not judged by registration: {summary.not_registered} that could not be registered"
+
+
+def _without_pose(rows: Sequence[QueryResult]) -> Iterator[str]:
+    lost = [row for row in rows if row.status != LOCALIZED]
+    for row in lost[:MAX_TOLD]:
+        yield f"{'unreadable' if row.status == UNREADABLE else 'no pose'}: {row.query}: {row.message}"
+    if len(lost) > MAX_TOLD:
+        yield f"and {len(lost) - MAX_TOLD} more without a pose, see results.csv"
+
+
+def _say(sentence: str) -> None:
+    print(f"spherloc: {sentence}", file=sys.stderr, flush=True)

@@ -1,0 +1,130 @@
+"""The trajectory of a sequence from above, coloured by error (as Fig. 10), as a PNG."""
+
+import io
+import warnings
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from spherloc.cameras.base import BoolArray, FloatArray
+from spherloc.experiments.results import SequenceResults
+from spherloc.experiments.rows import FAILED
+from spherloc.geometry import align_to_down
+from spherloc_viz.style import ESTIMATE, OUTLIER, TRUTH, css
+
+SIZE_INCHES = (9.0, 7.0)
+DPI = 150
+MARGIN = 0.08
+LEAST_EXTENT_M = 1.0
+"""So that a camera that stands still is not magnified to its noise."""
+
+
+def trajectory_png(results: SequenceResults) -> bytes:
+    """PNG of the estimated positions coloured by their error, the true way as a line, and failures as crosses.
+
+    Errors beyond the loosest limit of success have one colour. Where the truth is unknown, errors are those of the
+    registration, if there are any. The same results give the same bytes.
+    """
+    figure = Figure(figsize=SIZE_INCHES, dpi=DPI, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    places = _from_above(results, results.positions_m)
+    true_places = _from_above(results, results.true_positions_m)
+    _frame(axes, places, true_places)
+    _truth(axes, true_places)
+    _estimates(figure, axes, results, places)
+    _without_place(axes, results, places, true_places)
+    axes.set_title(_title(results), parse_math=False, fontsize=11)
+    axes.set_xlabel("metres, in the map")
+    axes.set_ylabel("metres, in the map")
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(loc="best", fontsize=9)
+    file = io.BytesIO()
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Glyph .* missing")  # names in scripts that the font lacks
+        figure.savefig(file, format="png", metadata={"Software": None})
+    return file.getvalue()
+
+
+def _from_above(results: SequenceResults, positions_m: FloatArray) -> FloatArray:
+    """(Q, 2): to the right and up on the page, seen against gravity and not mirrored."""
+    turned = positions_m @ align_to_down(results.configuration.gravity_map).T
+    return turned[:, [0, 2]]
+
+
+def _frame(axes: Axes, places: FloatArray, true_places: FloatArray) -> None:
+    """Limits of the true way if it is known: one wrong pose far away must not shrink all the others to a dot."""
+    known = true_places[np.isfinite(true_places).all(axis=1)]
+    shown = known if len(known) else places[np.isfinite(places).all(axis=1)]
+    axes.set_aspect("equal", adjustable="datalim" if not len(shown) else "box")
+    axes.grid(color="0.9", linewidth=0.6)
+    axes.set_axisbelow(True)
+    if len(shown):
+        low, high = shown.min(axis=0), shown.max(axis=0)
+        half = 0.5 * np.maximum(high - low, LEAST_EXTENT_M)
+        half = np.maximum(half, 0.3 * half.max()) + MARGIN * 2 * half.max()
+        middle = 0.5 * (low + high)
+        axes.set_xlim(middle[0] - half[0], middle[0] + half[0])
+        axes.set_ylim(middle[1] - half[1], middle[1] + half[1])
+
+
+def _truth(axes: Axes, true_places: FloatArray) -> None:
+    if np.isfinite(true_places).any():
+        axes.plot(*true_places.T, color=css(TRUTH), linewidth=1.4, marker=".", markersize=3, label="truth", zorder=2)
+
+
+def _estimates(figure: Figure, axes: Axes, results: SequenceResults, places: FloatArray) -> None:
+    errors_m, what, limit_m = _errors(results)
+    plain = np.isfinite(places).all(axis=1) & ~np.isfinite(errors_m)
+    if plain.any():
+        axes.plot(*places[plain].T, "o", color=css(ESTIMATE), markersize=5, label="estimate, error unknown", zorder=3)
+    coloured = np.isfinite(places).all(axis=1) & np.isfinite(errors_m)
+    if not coloured.any():
+        return
+    largest_m = float(errors_m[coloured].max())
+    top_m = max(min(limit_m, largest_m), 1e-6)
+    dots = axes.scatter(
+        *places[coloured].T, c=errors_m[coloured], cmap="viridis", vmin=0.0, vmax=top_m, s=30, edgecolors="0.2",
+        linewidths=0.4, label="estimate", zorder=3,
+    )  # fmt: skip
+    beyond = largest_m > top_m
+    dots.get_cmap()
+    if beyond:
+        dots.set_cmap(dots.get_cmap().with_extremes(over=css(OUTLIER)))
+    bar = figure.colorbar(dots, ax=axes, extend="max" if beyond else "neither", shrink=0.85)
+    bar.set_label(f"{what}, metres" + (f" (largest: {largest_m:.3g})" if beyond else ""))
+
+
+def _errors(results: SequenceResults) -> tuple[FloatArray, str, float]:
+    """(Q,) errors in metres, what they are, and the loosest limit of success."""
+    setting = results.configuration
+    limits_m = setting.registration_thresholds_m
+    if limits_m and not np.isfinite(results.translation_errors_m).any():
+        errors = results.registration_errors_m
+        return np.where(np.isposinf(errors), 1e9, errors), "registration error", max(limits_m)
+    return results.translation_errors_m, "position error", max(metres for _, metres in setting.thresholds)
+
+
+def _without_place(axes: Axes, results: SequenceResults, places: FloatArray, true_places: FloatArray) -> None:
+    """Crosses where queries without a pose truly were; what has no place in the picture is counted in the legend."""
+    failed = np.array([status == FAILED for status in results.status], dtype=bool)
+    at = failed & np.isfinite(true_places).all(axis=1)
+    if at.any():
+        label = f"no pose: {np.count_nonzero(at)}"
+        axes.plot(*true_places[at].T, "x", color=css(OUTLIER), markersize=7, markeredgewidth=1.8, label=label, zorder=4)
+    outside = np.isfinite(places).all(axis=1) & ~_inside(axes, places)
+    for mask, label in ((failed & ~at, "no pose, place unknown"), (outside, "estimates outside the picture")):
+        if mask.any():
+            axes.plot([], [], " ", label=f"{label}: {np.count_nonzero(mask)}")
+
+
+def _inside(axes: Axes, places: FloatArray) -> BoolArray:
+    (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
+    return (places[:, 0] >= left) & (places[:, 0] <= right) & (places[:, 1] >= bottom) & (places[:, 1] <= top)
+
+
+def _title(results: SequenceResults) -> str:
+    setting = results.configuration
+    return f"{setting.name}: {setting.estimator}, seed {setting.seed}, {len(results.rows)} of {setting.queries} queries"
