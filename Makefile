@@ -27,7 +27,7 @@ play: ## Install what it needs, start the playground and print its address
 test: ## Install what the tests need, a Chromium included, and run them all
 	@SPHERLOC_CHROMIUM="$$(scripts/setup.sh test)" && export SPHERLOC_CHROMIUM && \
 	  printf 'spherloc: running the tests; browser: %s\n' "$$SPHERLOC_CHROMIUM" && \
-	  exec $(BIN)/python -m pytest $(ARGS)
+	  exec $(BIN)/python -m pytest -n 2 --dist loadfile $(ARGS)
 
 lint: ## Check style, format and types
 	@scripts/setup.sh lint

@@ -61,7 +61,7 @@ def read_size(path: Path) -> tuple[int, int]:
 
 def grey(image: ByteImage) -> ByteImage:
     """(H, W) of a BGR or grey image."""
-    return image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
 
 
 def _decode(path: Path, flags: int) -> NDArray:

@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from spherloc.datasets import load_scene
+from spherloc.datasets import Scene, load_scene
+from spherloc.datasets.map_scene import MapScene
 from spherloc.diagnosis import Diagnosis, diagnose
 from spherloc.errors import InputError, SpherlocError
 from spherloc.estimators import default_options, estimate, options_type, warm_up
@@ -28,8 +29,12 @@ def run_scenes(
     settings: Sequence[str],
     as_json: bool,
     recordings: Path | None,
+    query: str | None = None,
 ) -> int:
-    """Solve every scene; returns the exit code. A wrong input is reported and the others are still solved."""
+    """Solve every scene; returns the exit code. A wrong input is reported and the others are still solved.
+
+    ``query`` chooses a query image of scenes made of images, by default their first.
+    """
     if not paths:
         raise InputError("no scene given; name one or more scene files, such as scenes/mei_outliers_80.toml.")
     changes = parse_settings(estimator, settings)
@@ -41,7 +46,7 @@ def run_scenes(
         for path in paths:
             try:
                 scene = load_scene(path)
-                problem = scene.problem(seed)
+                problem = _problem(path, scene, seed, query)
                 if not warm:
                     warm_up(_say)
                     warm = True
@@ -54,6 +59,21 @@ def run_scenes(
         for job in jobs:
             worst = max(worst, job.result())
     return worst
+
+
+def _problem(path: Path, scene: Scene, seed: int | None, query: str | None) -> Problem:
+    """A scene's problem; what its loader and its front end skipped is said."""
+    if not isinstance(scene, MapScene):
+        if query is not None:
+            raise InputError(f"{path}: has no query images to choose from; leave out --query.")
+        return scene.problem(seed)
+    for remark in scene.remarks:
+        _say(remark)
+    view = scene.query(query)
+    matches = scene.matcher(view)
+    for remark in matches.remarks:
+        _say(remark)
+    return scene.problem_of(view, matches)
 
 
 def parse_settings(estimator: str, settings: Sequence[str]) -> dict[str, Any]:

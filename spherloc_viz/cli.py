@@ -1,4 +1,4 @@
-"""The command line: run, play, view, scenes."""
+"""The command line: run, localize, play, view, scenes."""
 
 import sys
 from pathlib import Path
@@ -25,6 +25,7 @@ def run(
     json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
     record: bool = True,
     recordings: Path = RECORDINGS,
+    query: str | None = None,
 ) -> int:
     """Solve localization problems and record each run.
 
@@ -50,10 +51,57 @@ def run(
         json: Print one JSON object a scene, on one line; infinity is the text "inf".
         record: Write a recording of each run.
         recordings: Folder of the recordings.
+        query: Name of the query image, in scenes made of images; the first one if not given.
     """
     from spherloc_viz import batch
 
-    return batch.run_scenes(scenes, estimator, seed, option, json, recordings if record else None)
+    return batch.run_scenes(scenes, estimator, seed, option, json, recordings if record else None, query)
+
+
+@app.command
+def localize(
+    scene: Positional[Path],
+    /,
+    estimator: str = "mc",
+    seed: int = 0,
+    option: Annotated[tuple[str, ...], arg(metavar="KEY=VALUE ...")] = (),
+    queries: Annotated[tuple[str, ...], arg(metavar="NAME|FIRST:LAST:STEP ...")] = (),
+    output: Path | None = None,
+    record: bool = True,
+    recordings: Path | None = None,
+    retry_failed: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
+) -> int:
+    """Localize a sequence of query images against a map.
+
+    Every finished query is safe in the output folder at once: stop it when you like, the same command goes on. The
+    folder gets results.csv and results.jsonl (a row a query), trajectory.tum and truth.tum (camera poses in the map),
+    trajectory.png (coloured by error), summary.json (success rates at the scene's limits), configuration.json, and
+    a recording of each query. Ends with 0 if every query has a pose, 1 if one has none, 2 if an input is wrong.
+
+    For example:
+
+    spherloc localize scenes/street.toml
+
+    spherloc localize my_scene.toml --estimator mc-exact --queries 0:100:5 --output results/every_fifth
+
+    spherloc localize my_scene.toml --queries left/0001.png left/0002.png --no-record
+
+    Args:
+        scene: Scene file (TOML) with query and reference images; spherloc scenes lists what kinds there are.
+        estimator: mc (deterministic maximum consensus), mc-exact or another one; a wrong name lists them all.
+        seed: Seed of the estimator, the same for every query.
+        option: Options of the estimator, such as bound_px=4; none and inf are values where they make sense.
+        queries: Only these: names, or places counted from 0, the last one not included; all if not given.
+        output: Folder of the results; recordings/SCENE_ESTIMATOR_SEED if not given.
+        record: Write a recording of each query.
+        recordings: Folder of the recordings; a folder of that name in the output folder if not given.
+        retry_failed: Do queries again that have no pose yet.
+    """
+    from spherloc_viz.localize import localize_sequence
+
+    folder = output or RECORDINGS / f"{scene.stem}_{estimator}_{seed}"
+    kept = (recordings or folder / "recordings") if record else None
+    return localize_sequence(scene, estimator, seed, option, queries, folder, kept, retry_failed)
 
 
 @app.command
@@ -113,17 +161,21 @@ def view(
 
 
 @app.command
-def scenes() -> int:
-    """List the bundled scenes.
+def scenes(kind: Positional[str | None] = None, /) -> int:
+    """List the bundled scenes and the kinds of scene files, or show how a kind is written.
 
     For example:
 
     spherloc scenes
-    """
-    from spherloc.datasets import bundled_scenes, load_scene
 
-    for path in bundled_scenes().values():
-        print(f"{path}  {load_scene(path).name}")
+    spherloc scenes kitti360
+
+    Args:
+        kind: A kind of scene file to be described, such as kitti360.
+    """
+    from spherloc_viz.scene_list import all_scenes, one_kind
+
+    print(all_scenes() if kind is None else one_kind(kind))
     return 0
 
 

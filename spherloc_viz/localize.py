@@ -217,10 +217,12 @@ def _skipped(summary: Summary) -> Iterator[str]:
 def _without_pose(rows: Sequence[QueryResult]) -> Iterator[str]:
     lost = [row for row in rows if row.status != LOCALIZED]
     for row in lost[:MAX_TOLD]:
-        yield f"{'unreadable' if row.status == UNREADABLE else 'no pose'}: {row.query}: {row.message}"
+        what = row.message if row.query in row.message else f"{row.query}: {row.message}"
+        yield f"{'unreadable' if row.status == UNREADABLE else 'no pose'}: {what}"
     if len(lost) > MAX_TOLD:
         yield f"and {len(lost) - MAX_TOLD} more without a pose, see results.csv"
 
 
 def _say(sentence: str) -> None:
-    print(f"spherloc: {sentence}", file=sys.stderr, flush=True)
+    tqdm.write(f"spherloc: {sentence}", file=sys.stderr)  # above the bar, if there is one
+    sys.stderr.flush()

@@ -1,5 +1,8 @@
 """One colour means one thing, in the page, in the recording and in the documentation."""
 
+import numpy as np
+from numpy.typing import NDArray
+
 RGB = tuple[int, int, int]
 
 INLIER: RGB = (0, 158, 115)
@@ -38,3 +41,15 @@ MAX_DRAWN_RIVALS = 8
 def css(color: RGB) -> str:
     """The colour as "#rrggbb"."""
     return "#{:02x}{:02x}{:02x}".format(*color)
+
+
+ERROR_RAMP: tuple[RGB, ...] = ((48, 96, 214), (72, 190, 190), (245, 205, 70), (214, 62, 48))
+"""Colours of errors from zero to the worst that is told apart: the bluer, the smaller (as in Fig. 10)."""
+
+
+def error_colors(errors: NDArray[np.float64], worst: float) -> NDArray[np.uint8]:
+    """Colours (N, 3) of errors (N,) by the ramp, whose last colour stands for ``worst`` and all beyond."""
+    ramp = np.array(ERROR_RAMP, dtype=np.float64)
+    place = (len(ramp) - 1) * np.clip(np.nan_to_num(errors / worst, nan=1.0, posinf=1.0), 0.0, 1.0)
+    columns = [np.interp(place, np.arange(len(ramp)), ramp[:, channel]) for channel in range(3)]
+    return np.column_stack(columns).round().astype(np.uint8)

@@ -4,6 +4,7 @@ import io
 import warnings
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -58,7 +59,7 @@ def _frame(axes: Axes, places: FloatArray, true_places: FloatArray) -> None:
     """Limits of the true way if it is known: one wrong pose far away must not shrink all the others to a dot."""
     known = true_places[np.isfinite(true_places).all(axis=1)]
     shown = known if len(known) else places[np.isfinite(places).all(axis=1)]
-    axes.set_aspect("equal", adjustable="datalim" if not len(shown) else "box")
+    axes.set_aspect("equal")
     axes.grid(color="0.9", linewidth=0.6)
     axes.set_axisbelow(True)
     if len(shown):
@@ -77,24 +78,24 @@ def _truth(axes: Axes, true_places: FloatArray) -> None:
 
 def _estimates(figure: Figure, axes: Axes, results: SequenceResults, places: FloatArray) -> None:
     errors_m, what, limit_m = _errors(results)
-    plain = np.isfinite(places).all(axis=1) & ~np.isfinite(errors_m)
+    plain = np.isfinite(places).all(axis=1) & np.isnan(errors_m)
     if plain.any():
         axes.plot(*places[plain].T, "o", color=css(ESTIMATE), markersize=5, label="estimate, error unknown", zorder=3)
-    coloured = np.isfinite(places).all(axis=1) & np.isfinite(errors_m)
+    coloured = np.isfinite(places).all(axis=1) & ~np.isnan(errors_m)
     if not coloured.any():
         return
-    largest_m = float(errors_m[coloured].max())
-    top_m = max(min(limit_m, largest_m), 1e-6)
+    shown_m = errors_m[coloured]
+    beyond = shown_m > limit_m
+    # Up to the largest of the others, so that small errors too use all of the colours.
+    top_m = max(shown_m[~beyond], default=limit_m) or limit_m
     dots = axes.scatter(
-        *places[coloured].T, c=errors_m[coloured], cmap="viridis", vmin=0.0, vmax=top_m, s=30, edgecolors="0.2",
-        linewidths=0.4, label="estimate", zorder=3,
+        *places[coloured].T, c=np.minimum(shown_m, 2.0 * limit_m), vmin=0.0, vmax=top_m, s=30,
+        cmap=colormaps["viridis"].with_extremes(over=css(OUTLIER)), edgecolors="0.2", linewidths=0.4,
+        label="estimate", zorder=3,
     )  # fmt: skip
-    beyond = largest_m > top_m
-    dots.get_cmap()
-    if beyond:
-        dots.set_cmap(dots.get_cmap().with_extremes(over=css(OUTLIER)))
-    bar = figure.colorbar(dots, ax=axes, extend="max" if beyond else "neither", shrink=0.85)
-    bar.set_label(f"{what}, metres" + (f" (largest: {largest_m:.3g})" if beyond else ""))
+    bar = figure.colorbar(dots, ax=axes, extend="max" if beyond.any() else "neither", shrink=0.85)
+    red = f" (red: {np.count_nonzero(beyond)} beyond {limit_m:g}, up to {shown_m.max():.3g})" if beyond.any() else ""
+    bar.set_label(f"{what}, metres{red}")
 
 
 def _errors(results: SequenceResults) -> tuple[FloatArray, str, float]:
@@ -102,22 +103,23 @@ def _errors(results: SequenceResults) -> tuple[FloatArray, str, float]:
     setting = results.configuration
     limits_m = setting.registration_thresholds_m
     if limits_m and not np.isfinite(results.translation_errors_m).any():
-        errors = results.registration_errors_m
-        return np.where(np.isposinf(errors), 1e9, errors), "registration error", max(limits_m)
+        return results.registration_errors_m, "registration error", max(limits_m)
     return results.translation_errors_m, "position error", max(metres for _, metres in setting.thresholds)
 
 
 def _without_place(axes: Axes, results: SequenceResults, places: FloatArray, true_places: FloatArray) -> None:
-    """Crosses where queries without a pose truly were; what has no place in the picture is counted in the legend."""
+    """Marks where queries without a pose, or with one outside the picture, truly were; others are only counted."""
     failed = np.array([status == FAILED for status in results.status], dtype=bool)
-    at = failed & np.isfinite(true_places).all(axis=1)
-    if at.any():
-        label = f"no pose: {np.count_nonzero(at)}"
-        axes.plot(*true_places[at].T, "x", color=css(OUTLIER), markersize=7, markeredgewidth=1.8, label=label, zorder=4)
     outside = np.isfinite(places).all(axis=1) & ~_inside(axes, places)
-    for mask, label in ((failed & ~at, "no pose, place unknown"), (outside, "estimates outside the picture")):
-        if mask.any():
-            axes.plot([], [], " ", label=f"{label}: {np.count_nonzero(mask)}")
+    known = np.isfinite(true_places).all(axis=1)
+    marks = ((failed, "x", "without a pose"), (outside, "s", "with a pose outside the picture"))
+    for mask, marker, what in marks:
+        style = {"markersize": 7, "markeredgewidth": 1.8, "fillstyle": "none", "color": css(OUTLIER), "zorder": 4}
+        if (mask & known).any():
+            label = f"{what}: {np.count_nonzero(mask & known)}"
+            axes.plot(*true_places[mask & known].T, marker, label=label, **style)
+        if (mask & ~known).any():
+            axes.plot([], [], " ", label=f"{what}, place unknown: {np.count_nonzero(mask & ~known)}")
 
 
 def _inside(axes: Axes, places: FloatArray) -> BoolArray:

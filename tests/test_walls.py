@@ -27,7 +27,13 @@ FLOORS = (
     ("spherloc.estimators", "spherloc.diagnosis", "spherloc.experiments"),
     ("spherloc_viz.style", "spherloc_viz.layers", "spherloc_viz.options", "spherloc_viz"),
     ("spherloc_viz.recording", "spherloc_viz.app", "spherloc_viz.lessons"),
-    ("spherloc_viz.batch", "spherloc_viz.cli"),
+    (
+        "spherloc_viz.batch",
+        "spherloc_viz.localize",
+        "spherloc_viz.trajectory_plot",
+        "spherloc_viz.scene_list",
+        "spherloc_viz.cli",
+    ),
 )
 """From the ground up; a room is a module or a package with all of its files."""
 

@@ -21,19 +21,20 @@ def camera_from_colmap(model: str, width: int, height: int, params: Sequence[flo
     """The camera of a COLMAP model's name, image size in pixels and parameters in COLMAP's order.
 
     The perspective models become MEI with xi = 0, which is a pinhole with radial and tangential distortion, and the
-    fisheye models Kannala-Brandt with the missing coefficients 0.
+    fisheye models Kannala-Brandt with the missing coefficients 0. SphereSfM's SPHERE is a panorama.
 
     Raises ``CalibrationError``, one sentence that starts with ``where``, for another model, a wrong number of
     parameters and unusable values.
     """
     with located(where):
+        if model == "RAD_TAN_THIN_PRISM_FISHEYE" and len(params) == 3:
+            model = "SPHERE"  # SphereSfM, a fork of COLMAP 3.8, gave it the number 11, which COLMAP gave to this one
         if not isinstance(model, str) or model not in _MODELS:
             raise CalibrationError(
                 f"the COLMAP model {show(model)} is not supported: convert it to one of {', '.join(_MODELS)}."
             )
         names, build = _MODELS[model]
-        values = np.asarray(params).tolist() if isinstance(params, np.ndarray) else list(params)
-        return build(width, height, *coefficients("params", values, names))
+        return build(width, height, *coefficients("params", params, names))
 
 
 def _perspective(width: int, height: int, fx: float, fy: float, cx: float, cy: float, *lens: float) -> Mei:
@@ -62,6 +63,16 @@ def _panorama(width: int, height: int, w: float, h: float) -> Equirectangular:
     return Equirectangular(width, height)
 
 
+def _sphere(width: int, height: int, _f: float, cx: float, cy: float) -> Equirectangular:
+    """SphereSfM's panorama: EQUIRECTANGULAR with the principal point at the centre and square degrees."""
+    if not width == 2 * height == 2 * cx == 4 * cy:
+        raise CalibrationError(
+            f"the panorama SPHERE has the size {width} x {height} and the centre {cx:g}, {cy:g}: give a width of "
+            "twice the height and the centre in the middle, a crop is not supported."
+        )
+    return Equirectangular(width, height)
+
+
 _MODELS: dict[str, tuple[str, Callable[..., Any]]] = {
     "SIMPLE_PINHOLE": ("f, cx, cy", _one_focal_length(_perspective)),
     "PINHOLE": ("fx, fy, cx, cy", _perspective),
@@ -75,5 +86,6 @@ _MODELS: dict[str, tuple[str, Callable[..., Any]]] = {
     "OPENCV_FISHEYE": ("fx, fy, cx, cy, k1, k2, k3, k4", _fisheye),
     "EUCM": ("fx, fy, cx, cy, alpha, beta", Eucm),
     "EQUIRECTANGULAR": ("w, h", _panorama),
+    "SPHERE": ("f, cx, cy", _sphere),
 }
 """Names of the parameters, in COLMAP's order, and what makes a camera of the size and of them."""

@@ -20,7 +20,7 @@ from spherloc.errors import CalibrationError
 _LARGEST_XI = 1e3
 """Far beyond any lens, for which xi is between -1 and 1."""
 _TOUCHES = 1.0 - 1e-6
-"""From here on the centre counts as lying on the first sphere: what would look back are a few thousandths of a radian."""
+"""From here on the centre counts as lying on the first sphere; this loses 0.0015 rad around straight back."""
 
 
 @dataclass(frozen=True)

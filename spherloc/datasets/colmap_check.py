@@ -1,81 +1,37 @@
-"""Walks the files of a COLMAP model in binary form before anything else reads them.
+"""Walks the files of a COLMAP model in binary form (little endian) before anything else reads them.
 
-COLMAP's own reader takes a truncated file for a shorter one, believes every count, and passes NaN on. So the walk
-compares counts with the file's size before anything is allocated, and says at which byte what is wrong. On its way it
-collects the columns of observations and points, for which COLMAP has an object each.
-Layout: doc/format.rst of COLMAP 4.2; little endian.
+Counts are compared with the size of the file before anything is allocated; see ``colmap_walk``.
 """
 
 import struct
-from collections.abc import Callable
-from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spherloc.cameras.base import FloatArray
-from spherloc.errors import InputError, show
-
-MODELS = (
-    *(("SIMPLE_PINHOLE", 3), ("PINHOLE", 4), ("SIMPLE_RADIAL", 4), ("RADIAL", 5), ("OPENCV", 8)),
-    *(("OPENCV_FISHEYE", 8), ("FULL_OPENCV", 12), ("FOV", 5), ("SIMPLE_RADIAL_FISHEYE", 4), ("RADIAL_FISHEYE", 5)),
-    *(("THIN_PRISM_FISHEYE", 12), ("RAD_TAN_THIN_PRISM_FISHEYE", 16), ("SIMPLE_DIVISION", 4), ("DIVISION", 5)),
-    *(("SIMPLE_FISHEYE", 3), ("FISHEYE", 4), ("EUCM", 6), ("EQUIRECTANGULAR", 2)),
+from spherloc.datasets.colmap_walk import (
+    MODELS,
+    OBSERVATION,
+    ORDER,
+    SPHERE,
+    Observed,
+    Walked,
+    check_observations,
+    check_pose,
+    make_points,
 )
-"""Name and number of parameters of COLMAP's camera models, by id."""
+from spherloc.errors import InputError
 
-SPHERE_ID, SPHERE_PARAMETERS = 11, 3
-"""The fork SphereSfM gave this id, which is another model's now, to panoramas."""
-
-SPHERE = (
-    "has panoramas of the camera model SPHERE, which only the fork SphereSfM knows and whose id is another model's in "
-    "COLMAP; make the model anew with COLMAP 4.1 or later and its camera model EQUIRECTANGULAR."
-)
-
-OBSERVATION = np.dtype([("pixel", "<f8", (2,)), ("point", "<i8")])
-"""A pixel and the id of its point, -1 for none."""
-
+_SPHERE_ID, _SPHERE_PARAMETERS = 11, 3
+_CAMERA = 0
+"""Type of a sensor."""
 _POINT = np.dtype([("id", "<i8"), ("xyz", "<f8", (3,)), ("rgb", "u1", (3,)), ("error", "<f8"), ("track", "<u8")])
+_TRACK = np.dtype([("image", "<u4"), ("place", "<u4")])
 _MAX_NAME_BYTES = 4096
-_NORM_TOLERANCE = 1e-3
-
-
-@dataclass(frozen=True, eq=False)
-class Observed:
-    """An image as its file has it."""
-
-    name: str
-    camera_id: int
-    count: int
-    """Number of observations."""
-    load: Callable[[], NDArray]
-    """The ``OBSERVATION`` records, (count,)."""
-
-
-@dataclass(frozen=True, eq=False)
-class Points:
-    """Columns of P points, by rising id."""
-
-    ids: NDArray[np.int64]
-    """(P,)"""
-    xyz: FloatArray
-    """(P, 3), metres if the model has them."""
-    errors_px: FloatArray
-    """(P,) mean reprojection error; -1 where COLMAP did not compute it."""
-    track_lengths: NDArray[np.int64]
-    """(P,) number of images that see the point."""
-
-
-@dataclass(eq=False)
-class Walked:
-    """What a walk through all files of a model found."""
-
-    images: dict[int, Observed] = field(default_factory=dict)
-    """By id."""
-    points: Points = field(default_factory=lambda: make_points([], np.empty((0, 3)), [], []))
+_TRACK_BYTES = 8_000_000
+"""Tracks are checked in pieces of this size."""
 
 
 class _Reader:
@@ -84,7 +40,7 @@ class _Reader:
     def __init__(self, path: Path, file: BinaryIO) -> None:
         self.path, self.file, self.at, self.size = path, file, 0, path.stat().st_size
 
-    def take(self, layout: str, what: str) -> tuple:
+    def take(self, layout: str, what: str) -> tuple[Any, ...]:
         """The numbers of a ``struct`` layout."""
         return struct.unpack(layout, self.bytes(struct.calcsize(layout), what))
 
@@ -94,10 +50,6 @@ class _Reader:
             raise self.broken(f"the file ends within {what}")
         self.at += length
         return content
-
-    def skip(self, length: int) -> None:
-        self.file.seek(length, 1)
-        self.at += length
 
     def count(self, layout: str, least_bytes: int, what: str) -> int:
         """A number of records that follow, each of ``least_bytes`` at least."""
@@ -111,7 +63,9 @@ class _Reader:
             raise self.broken(f"{self.size - self.at} bytes follow the last record")
 
     def broken(self, what: str) -> InputError:
-        return InputError(f"{self.path}, byte {self.at}: {what}; the file is damaged, so export the model again.")
+        return InputError(
+            f"{self.path}, before byte {self.at}: {what}; the file is damaged, so export the model again."
+        )
 
 
 def walk_binary(folder: Path) -> Walked:
@@ -120,8 +74,7 @@ def walk_binary(folder: Path) -> Walked:
     Raises ``InputError`` with the file and the byte of what is wrong.
     """
     walked = Walked()
-    steps = {"cameras": _cameras, "rigs": _rigs, "frames": _frames, "images": _images, "points3D": _points}
-    for name, step in steps.items():
+    for name, step in zip(ORDER, (_cameras, _rigs, _frames, _images, _points), strict=True):
         path = folder / f"{name}.bin"
         if name in ("rigs", "frames") and not path.is_file():
             continue
@@ -137,35 +90,37 @@ def walk_binary(folder: Path) -> Walked:
 
 def _cameras(reader: _Reader, walked: Walked) -> None:
     count = reader.count("<Q", 24, "cameras")
-    sphere_bytes = 8 + count * (24 + 8 * SPHERE_PARAMETERS)
+    sphere_bytes = 8 + count * (24 + 8 * _SPHERE_PARAMETERS)
     for _ in range(count):
         number, model, _, _ = reader.take("<IiQQ", "a camera")
-        if model == SPHERE_ID and reader.size == sphere_bytes:
+        if model == _SPHERE_ID and reader.size == sphere_bytes:
             raise InputError(f"{reader.path}: {SPHERE}")
         if not 0 <= model < len(MODELS):
             raise reader.broken(f"camera {number} has the unknown model {model}")
         params = reader.take(f"<{MODELS[model][1]}d", f"the parameters of camera {number}")
-        if not np.isfinite(params).all():
-            raise reader.broken(f"a parameter of camera {number} is not a finite number")
+        walked.camera(number, params, reader.broken)
 
 
 def _rigs(reader: _Reader, walked: Walked) -> None:
     for _ in range(reader.count("<Q", 8, "rigs")):
-        number, sensors = reader.take("<II", "a rig")
-        if sensors:
-            reader.take("<iI", f"the sensors of rig {number}")
-        for _ in range(sensors - 1):
-            *_, has_pose = reader.take("<iIB", f"the sensors of rig {number}")
+        number, count = reader.take("<II", "a rig")
+        what = f"the sensors of rig {number}"
+        sensors = [reader.take("<iI", what)] if count else []
+        for _ in range(count - 1):
+            *sensor, has_pose = reader.take("<iIB", what)
+            sensors.append(tuple(sensor))
             if has_pose:
-                pose = reader.take("<7d", f"the sensors of rig {number}")
-                check_pose(pose, reader.broken, f"rig {number}")
+                check_pose(reader.take("<7d", what), reader.broken, f"a sensor of rig {number}")
+        walked.rig(number, [sensor for kind, sensor in sensors if kind == _CAMERA], reader.broken)
 
 
 def _frames(reader: _Reader, walked: Walked) -> None:
     for _ in range(reader.count("<Q", 68, "frames")):
-        number, _, *pose = reader.take("<II7d", "a frame")
+        number, rig, *pose = reader.take("<II7d", "a frame")
         check_pose(pose, reader.broken, f"frame {number}")
-        reader.skip(16 * reader.count("<I", 16, f"images of frame {number}"))
+        what = f"images of frame {number}"
+        data = [reader.take("<iIQ", what) for _ in range(reader.count("<I", 16, what))]
+        walked.frame(number, rig, [(sensor, image) for kind, sensor, image in data if kind == _CAMERA], reader.broken)
 
 
 def _images(reader: _Reader, walked: Walked) -> None:
@@ -177,7 +132,7 @@ def _images(reader: _Reader, walked: Walked) -> None:
         load = partial(_load, reader.path, reader.at, count)
         observations = np.frombuffer(reader.bytes(count * OBSERVATION.itemsize, "observations"), OBSERVATION)
         check_observations(observations, reader.broken, f"image {number}")
-        add_image(walked, number, Observed(name, camera_id, count, load), reader.broken)
+        walked.image(number, Observed(name, camera_id, count, load), reader.broken)
 
 
 def _name(reader: _Reader, number: int) -> str:
@@ -192,7 +147,7 @@ def _name(reader: _Reader, number: int) -> str:
         raise reader.broken(f"the name of image {number} is no text in UTF-8") from None
 
 
-def _load(path: Path, offset: int, count: int) -> NDArray:
+def _load(path: Path, offset: int, count: int) -> NDArray[Any]:
     """Observations are read when they are asked for: those of thousands of images would fill the memory."""
     try:
         observations = np.fromfile(path, OBSERVATION, count, offset=offset)
@@ -204,12 +159,16 @@ def _load(path: Path, offset: int, count: int) -> NDArray:
 
 
 def _points(reader: _Reader, walked: Walked) -> None:
-    records = bytearray()
+    records, tracks = bytearray(), bytearray()
     for _ in range(reader.count("<Q", _POINT.itemsize, "points")):
         records += reader.bytes(_POINT.itemsize - 8, "a point")
-        elements = reader.count("<Q", 8, "images of a point")
-        records += elements.to_bytes(8, "little")
-        reader.skip(8 * elements)
+        length = reader.count("<Q", _TRACK.itemsize, "keypoints of a point")
+        records += length.to_bytes(8, "little")
+        tracks += reader.bytes(length * _TRACK.itemsize, "the keypoints of a point")
+        if len(tracks) > _TRACK_BYTES:
+            _check_tracks(reader, walked, tracks)
+            tracks = bytearray()
+    _check_tracks(reader, walked, tracks)
     table = np.frombuffer(bytes(records), _POINT)
     wrong = np.flatnonzero(~np.isfinite(table["xyz"]).all(axis=1) | (table["id"] < 0))
     if len(wrong):
@@ -217,38 +176,6 @@ def _points(reader: _Reader, walked: Walked) -> None:
     walked.points = make_points(table["id"], table["xyz"], table["error"], table["track"])
 
 
-def make_points(ids, xyz, errors_px, track_lengths) -> Points:
-    """Columns in the order of ids."""
-    numbers = np.asarray(ids, dtype=np.int64)
-    order = np.argsort(numbers, kind="stable")
-    return Points(
-        ids=numbers[order],
-        xyz=np.asarray(xyz, dtype=np.float64)[order],
-        errors_px=np.asarray(errors_px, dtype=np.float64)[order],
-        track_lengths=np.asarray(track_lengths, dtype=np.int64)[order],
-    )
-
-
-def add_image(walked: Walked, number: int, image: Observed, broken: Callable[[str], InputError]) -> None:
-    """Keep an image whose id and name are new; ``broken`` makes the error otherwise."""
-    if number in walked.images:
-        raise broken(f"image {number} is there twice")
-    if not image.name:
-        raise broken(f"image {number} has no name")
-    walked.images[number] = image
-
-
-def check_pose(numbers, broken: Callable[[str], InputError], what: str) -> None:
-    """Raise what ``broken`` makes unless ``numbers`` are a unit quaternion and a finite translation."""
-    values = np.asarray(numbers, dtype=np.float64)
-    with np.errstate(over="ignore"):
-        length = float(np.linalg.norm(values[:4]))
-    if not np.isfinite(values).all() or abs(length - 1.0) > _NORM_TOLERANCE:
-        raise broken(f"the pose of {what} is {show(list(numbers))}, not a unit quaternion and a finite translation")
-
-
-def check_observations(observations: NDArray, broken: Callable[[str], InputError], what: str) -> None:
-    """Raise what ``broken`` makes unless all ``OBSERVATION`` records have a finite pixel and a possible point."""
-    wrong = np.flatnonzero(~np.isfinite(observations["pixel"]).all(axis=1) | (observations["point"] < -1))
-    if len(wrong):
-        raise broken(f"observation {wrong[0] + 1} of {what} has no finite pixel or an impossible point")
+def _check_tracks(reader: _Reader, walked: Walked, content: bytearray) -> None:
+    track = np.frombuffer(bytes(content), _TRACK)
+    walked.tracks(track["image"].astype(np.int64), track["place"].astype(np.int64), reader.broken)

@@ -14,8 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spherloc.cameras.base import Camera, FloatArray
-from spherloc.datasets.colmap_check import Points, Walked, walk_binary
+from spherloc.cameras.colmap_models import camera_from_colmap
+from spherloc.datasets.colmap_check import walk_binary
 from spherloc.datasets.colmap_text import walk_text
+from spherloc.datasets.colmap_walk import Points, Walked
 from spherloc.errors import CalibrationError, InputError, show
 from spherloc.extras import require
 
@@ -33,8 +35,8 @@ class ColmapImage:
     camera_id: int
     cam_from_map: FloatArray
     """Pose (3, 4), absolute, also for an image of a rig."""
-    load: Callable[[], NDArray]
-    """Its observations, records of ``colmap_check.OBSERVATION``."""
+    load: Callable[[], NDArray[Any]]
+    """Its observations, records of ``colmap_walk.OBSERVATION``."""
 
     @property
     def pixels(self) -> FloatArray:
@@ -96,8 +98,6 @@ class ColmapModel:
 
 
 def _converted(name: str, width: int, height: int, params: tuple[float, ...], where: str) -> Camera | str:
-    from spherloc.cameras.colmap_models import camera_from_colmap
-
     try:
         return camera_from_colmap(name, width, height, params, where)
     except CalibrationError as error:

@@ -1,19 +1,20 @@
-"""Walks the files of a COLMAP model in text form before anything else reads them; see ``colmap_check``."""
+"""Walks the files of a COLMAP model in text form before anything else reads them; see ``colmap_walk``."""
 
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spherloc.datasets.colmap_check import (
+from spherloc.datasets.colmap_walk import (
     MODELS,
     OBSERVATION,
+    ORDER,
     SPHERE,
     Observed,
     Walked,
-    add_image,
     check_observations,
     check_pose,
     make_points,
@@ -50,18 +51,22 @@ class _Line:
             values = [np.nan]
         if not np.isfinite(values).all() or any("_" in word for word in words):
             wrong = next((word for word in words if not _is_number(word)), "")
-            raise self.broken(f"{show(wrong)} is not a finite number{self._hint(wrong)}")
+            raise self._no_number(wrong, "a finite number")
         return values
 
     def whole(self, word: str) -> int:
         """A whole number that is not negative."""
         if not (word.isascii() and word.isdecimal() and len(word) < 20 and int(word) < 2**63):
-            raise self.broken(f"{show(word)} is not a whole number from 0{self._hint(word)}")
+            raise self._no_number(word, "a whole number from 0")
         return int(word)
 
-    @staticmethod
-    def _hint(word: str) -> str:
-        return " (COLMAP puts spaces between values, but no commas: replace ', ' by ' ')" if "," in word else ""
+    def _no_number(self, word: str, wanted: str) -> InputError:
+        if "," in word:
+            return InputError(
+                f"{self.path}, line {self.number}: has commas between its values, where COLMAP has spaces only; "
+                "replace ', ' by ' ', or load a kapture folder by kind = \"kapture\"."
+            )
+        return self.broken(f"{show(word)} is not {wanted}")
 
 
 def _is_number(word: str) -> bool:
@@ -77,8 +82,7 @@ def walk_text(folder: Path) -> Walked:
     Raises ``InputError`` with the file and the line of what is wrong.
     """
     walked = Walked()
-    steps = {"cameras": _cameras, "rigs": _rigs, "frames": _frames, "images": _images, "points3D": _points}
-    for name, step in steps.items():
+    for name, step in zip(ORDER, (_cameras, _rigs, _frames, _images, _points), strict=True):
         path = folder / f"{name}.txt"
         if name in ("rigs", "frames") and not path.is_file():
             continue
@@ -107,47 +111,53 @@ def _records(lines: Iterator[_Line]) -> Iterator[_Line]:
 def _cameras(lines: Iterator[_Line], walked: Walked) -> None:
     for line in _records(lines):
         number, model, width, height, *params = line.words(4, "CAMERA_ID, MODEL, WIDTH, HEIGHT and parameters")
-        for word in (number, width, height):
+        for word in (width, height):
             line.whole(word)
         if model in ("SPHERE", "SPHERICAL"):
             raise InputError(f"{line.path}, line {line.number}: {SPHERE}")
         if model not in _PARAMETERS:
             raise line.broken(f"the camera model {show(model)} is unknown")
-        if len(line.numbers(params)) != _PARAMETERS[model]:
-            raise line.broken(f"{len(params)} parameters instead of the {_PARAMETERS[model]} of {model}")
+        numbers = line.numbers(params)
+        if len(numbers) != _PARAMETERS[model]:
+            raise line.broken(f"{len(numbers)} parameters instead of the {_PARAMETERS[model]} of {model}")
+        walked.camera(line.whole(number), numbers, line.broken)
 
 
 def _rigs(lines: Iterator[_Line], walked: Walked) -> None:
     for line in _records(lines):
-        number, sensors, *words = line.words(2, "RIG_ID, NUM_SENSORS and the sensors")
-        line.whole(number)
-        words = words[2:]
-        for _ in range(line.whole(sensors) - 1):
-            size = 10 if len(words) > 2 and words[2] == "1" else 3
+        number, count, *words = line.words(2, "RIG_ID, NUM_SENSORS and the sensors")
+        words[2:2] = ["0"] if len(words) >= 2 else []  # the reference has no pose, as others may have none
+        cameras = []
+        for _ in range(line.whole(count)):
+            size = 10 if words[2:3] == ["1"] else 3
             if len(words) < size:
-                raise line.broken("the sensors are incomplete")
-            line.whole(words[1])
+                raise line.broken("its sensors are incomplete")
+            if words[0] == "CAMERA":
+                cameras.append(line.whole(words[1]))
             if size == 10:
-                check_pose(line.numbers(words[3:10]), line.broken, f"rig {number}")
+                check_pose(line.numbers(words[3:10]), line.broken, f"a sensor of rig {number}")
             words = words[size:]
         if words:
-            raise line.broken(f"{len(words)} values follow the {sensors} sensors")
+            raise line.broken(f"{len(words)} values follow its {count} sensors")
+        walked.rig(line.whole(number), cameras, line.broken)
 
 
 def _frames(lines: Iterator[_Line], walked: Walked) -> None:
     for line in _records(lines):
         number, rig, *rest = line.words(10, "FRAME_ID, RIG_ID, a pose, NUM_DATA_IDS and the images")
-        for word in (number, rig):
-            line.whole(word)
         check_pose(line.numbers(rest[:7]), line.broken, f"frame {number}")
-        if len(rest) - 8 != 3 * line.whole(rest[7]):
-            raise line.broken(f"{len(rest) - 8} values instead of three for each of {rest[7]} images")
+        data = rest[8:]
+        if len(data) != 3 * line.whole(rest[7]):
+            raise line.broken(f"{len(data)} values instead of three for each of {rest[7]} images")
+        triples = zip(data[0::3], data[1::3], data[2::3], strict=True)
+        images = [(line.whole(sensor), line.whole(image)) for kind, sensor, image in triples if kind == "CAMERA"]
+        walked.frame(line.whole(number), line.whole(rig), images, line.broken)
 
 
 def _images(lines: Iterator[_Line], walked: Walked) -> None:
     for line in _records(lines):
         *head, name = [*line.text.split(maxsplit=9), ""][:10]
-        if not name:
+        if len(head) < 9:
             raise line.broken("too few values instead of IMAGE_ID, a pose, CAMERA_ID and NAME")
         number, camera_id = line.whole(head[0]), line.whole(head[8])
         check_pose(line.numbers(head[1:8]), line.broken, f"image {number}")
@@ -157,14 +167,14 @@ def _images(lines: Iterator[_Line], walked: Walked) -> None:
         observations = _observations(second)
         check_observations(observations, second.broken, f"image {number}")
         image = Observed(name, camera_id, len(observations), partial(_same, observations))
-        add_image(walked, number, image, line.broken)
+        walked.image(number, image, line.broken)
 
 
-def _same(observations: NDArray) -> NDArray:
+def _same(observations: NDArray[Any]) -> NDArray[Any]:
     return observations
 
 
-def _observations(line: _Line) -> NDArray:
+def _observations(line: _Line) -> NDArray[Any]:
     words = line.text.split()
     if len(words) % 3:
         raise line.broken(f"{len(words)} values instead of X, Y, POINT3D_ID for every observation")
@@ -181,8 +191,10 @@ def _points(lines: Iterator[_Line], walked: Walked) -> None:
         if len(rest) % 2 == 0:
             raise line.broken("the track is no list of pairs IMAGE_ID, POINT2D_IDX")
         ids.append(line.whole(number))
-        for word in (*rest[3:6], *rest[7:]):
+        track = np.array([line.whole(word) for word in rest[7:]], dtype=np.int64).reshape(-1, 2)
+        walked.tracks(track[:, 0], track[:, 1], line.broken)
+        for word in rest[3:6]:
             line.whole(word)
-        columns.append((*line.numbers(rest[:3]), float(line.numbers(rest[6:7])[0]), (len(rest) - 7) // 2))
+        columns.append((*line.numbers([*rest[:3], rest[6]]), len(track)))
     table = np.array(columns, dtype=np.float64).reshape(-1, 5)
     walked.points = make_points(ids, table[:, :3], table[:, 3], table[:, 4])

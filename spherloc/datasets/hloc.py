@@ -1,33 +1,51 @@
 """Scenes of ``kind = "hloc"``: what hloc wrote (features, matches, pairs), and the COLMAP model that it made.
 
+.. code-block:: toml
+
+    kind = "hloc"
+    name = "my city"
+    model = "outputs/sfm"                      # COLMAP model of the references, binary or text; needs pycolmap
+    images = "images"                          # folder of the images
+    queries = "queries_with_intrinsics.txt"    # rows: name MODEL width height parameters
+    pairs = "outputs/pairs-netvlad.txt"        # rows: query reference, the most similar one first
+    features = "outputs/feats.h5"              # of the queries; needs h5py
+    matches = "outputs/matches.h5"             # of the pairs
+    truth = "outputs/results.txt"              # optional, rows: name qw qx qy qz tx ty tz
+
+    [gravity]                                  # optional
+    map = [0.0, 0.0, -1.0]                     # down; else the mean +y axis of the reference cameras
+    bound_deg = 5.0                            # how far a query's roll and pitch may be from its reference's
+
+Without ``features`` and ``matches``, the project's own features are matched as [frontend] says: the pairs, or what
+``global_features = "outputs/global-feats.h5"`` retrieves, or what the project retrieves by itself. hloc's models keep
+the order of the keypoints: the i-th in features.h5 is the i-th of the model's image.
+
 P.-E. Sarlin, C. Cadena, R. Siegwart, M. Dymczyk: From Coarse to Fine: Robust Hierarchical Localization at Large Scale,
-CVPR 2019. hloc's models keep the order of the keypoints: the i-th of features.h5 is the i-th of the model's image.
+CVPR 2019.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from spherloc.cameras.base import BoolArray, Camera, FloatArray
+from spherloc.cameras.base import Camera, FloatArray
 from spherloc.datasets import map_settings, scene_file
-from spherloc.datasets.colmap_model import ColmapImage, ColmapModel, read_model
-from spherloc.datasets.hloc_files import read_global_descriptors, read_pairs, read_queries, read_results
+from spherloc.datasets.colmap_model import ColmapModel, read_model
+from spherloc.datasets.colmap_views import gravity_of_map, model_views, some, split_gravity
+from spherloc.datasets.hloc_files import open_hdf5, read_global_descriptors, read_pairs, read_queries, read_results
 from spherloc.datasets.hloc_matches import HlocMatcher
 from spherloc.datasets.map_scene import MapScene
-from spherloc.errors import CalibrationError, InputError
-from spherloc.frontend.lifting import SfmLift
+from spherloc.errors import InputError
+from spherloc.frontend.frontend_options import MOST_REFERENCES
 from spherloc.frontend.pipeline import image_matcher
 from spherloc.frontend.view import Matcher, View
 
+EXTRAS = ("colmap", "hloc")
+
 GRAVITY_BOUND_DEG = 5.0
 """A reference's roll and pitch are not the query's: cameras are held by hand."""
-RETRIEVED = 20
-"""References of a query by global descriptors; hloc's recipes take 10 to 50."""
-_LEAST_AGREEMENT = 0.5
-"""Length of the references' mean direction down, below which they do not agree on one."""
 
 
 def load(table: dict[str, Any], path: Path) -> MapScene:
@@ -37,30 +55,33 @@ def load(table: dict[str, Any], path: Path) -> MapScene:
     matches the pairs, or what ``global_features`` retrieve. Raises ``InputError`` for a missing file or a wrong key.
     """
     where = str(path)
-    optional = {"features", "matches", "pairs", "global_features", "truth", "gravity_map"}
     required = map_settings.REQUIRED | {"model", "images", "queries"}
+    optional = {"features", "matches", "pairs", "global_features", "truth"}
     scene_file.check_keys(table, required, map_settings.OPTIONAL | optional, where)
     _check_combination(table, where)
-    settings = map_settings.read_settings(table, where, GRAVITY_BOUND_DEG)
-    model = read_model(map_settings.folder(table, "model", path))
+    shared_gravity, gravity = split_gravity(table, where)
+    scene_file.check_keys(gravity, set(), {"map"}, f"{where} [gravity]")
+    settings = map_settings.read_settings(table | {"gravity": shared_gravity}, where, GRAVITY_BOUND_DEG)
     images = map_settings.folder(table, "images", path)
-    references, remarks = _references(model, images)
+    model = read_model(map_settings.folder(table, "model", path))
+    references, remarks = model_views(model, images)
+    down, assumed = gravity_of_map(gravity, references, where)
     cameras, skipped = read_queries(_file(table, "queries", path))
     truth, unknown = _truth(_file(table, "truth", path), cameras) if "truth" in table else ({}, [])
-    queries = tuple(View(name, camera, images / name, truth.get(name)) for name, camera in cameras.items())
+    queries, missing = _queries(cameras, images, truth)
     pairs, unpaired = _pairs(table, path, queries, references)
     return MapScene(
         name=settings.name,
         where=where,
         queries=queries,
-        references=references,
-        matcher=_matcher(table, path, model, references, pairs),
-        gravity_map=_gravity_map(table, where, references),
+        references=tuple(references),
+        matcher=_matcher(table, path, model, tuple(references), pairs),
+        gravity_map=down,
         gravity_bound_rad=settings.gravity_bound_rad,
         gravity_sd_rad=settings.gravity_sd_rad,
         bound_px=settings.bound_px,
         thresholds=settings.thresholds,
-        remarks=(*model.remarks, *remarks, *skipped, *unknown, *unpaired),
+        remarks=(*remarks, *assumed, *skipped, *unknown, *missing, *unpaired),
     )
 
 
@@ -79,31 +100,17 @@ def _file(table: Mapping[str, Any], key: str, path: Path) -> Path:
     return path.parent / scene_file.text(table, key, str(path))
 
 
-@dataclass(frozen=True, eq=False)
-class _ModelLift:
-    """An image's points in the model, read when they are first asked for."""
-
-    model: ColmapModel
-    image: ColmapImage
-
-    def __call__(self, pixels: FloatArray) -> tuple[FloatArray, BoolArray]:
-        """See ``Lift``."""
-        return SfmLift(*self.image.observed(self.model))(pixels)
-
-
-def _references(model: ColmapModel, images: Path) -> tuple[tuple[View, ...], list[str]]:
-    """A view of every image of the model whose camera can be used, and a remark on the others."""
-    views, faults = [], []
-    for image in model.images.values():
-        try:
-            camera = model.camera(image.camera_id)
-        except CalibrationError as error:
-            faults.append(str(error))
-            continue
-        lift = _ModelLift(model, image)
-        views.append(View(image.name, camera, images / image.name, image.cam_from_map, lift=lift))
-    remark = f"{len(faults)} of the model's images are skipped for their cameras: {faults[0]}" if faults else ""
-    return tuple(views), [remark] if remark else []
+def _queries(
+    cameras: Mapping[str, Camera], images: Path, truth: Mapping[str, FloatArray]
+) -> tuple[tuple[View, ...], list[str]]:
+    """A view of every query whose image exists, and a remark on the others."""
+    views, missing = [], []
+    for name, camera in cameras.items():
+        if (images / name).is_file():
+            views.append(View(name, camera, images / name, truth.get(name)))
+        else:
+            missing.append(name)
+    return tuple(views), [f"{some(missing, 'query')} not found in {images}: left out."] if missing else []
 
 
 def _truth(path: Path, cameras: Mapping[str, Camera]) -> tuple[dict[str, FloatArray], list[str]]:
@@ -128,7 +135,7 @@ def _truth(path: Path, cameras: Mapping[str, Camera]) -> tuple[dict[str, FloatAr
 
 
 def _pairs(
-    table: Mapping[str, Any], path: Path, queries: tuple[View, ...], references: tuple[View, ...]
+    table: Mapping[str, Any], path: Path, queries: Sequence[View], references: Sequence[View]
 ) -> tuple[dict[str, tuple[str, ...]] | None, list[str]]:
     """Names of references by query, None where nothing gives them, and what was left out."""
     if "global_features" in table:
@@ -138,29 +145,31 @@ def _pairs(
     file = _file(table, "pairs", path)
     listed = read_pairs(file)
     known = {view.name for view in references}
-    pairs = {view.name: tuple(name for name in listed.get(view.name, ()) if name in known) for view in queries}
+    in_map = {view.name: tuple(name for name in listed.get(view.name, ()) if name in known) for view in queries}
+    pairs = {name: names for name, names in in_map.items() if names}
     remarks = []
     absent = sum(name not in known for view in queries for name in listed.get(view.name, ()))
     if absent:
-        remarks.append(f"{absent} pairs of {file} are skipped: their reference is not in the model.")
-    alone = [name for name, names in pairs.items() if not names]
+        remarks.append(f"{absent} pairs of {file} are skipped: their reference is none of the map.")
+    alone = [name for name in in_map if name not in pairs]
     if alone:
         remarks.append(f"{len(alone)} of {len(queries)} queries have no pair in {file}, the first is {alone[0]}.")
     return pairs, remarks
 
 
 def _retrieved(
-    file: Path, queries: tuple[View, ...], references: tuple[View, ...]
+    file: Path, queries: Sequence[View], references: Sequence[View]
 ) -> tuple[dict[str, tuple[str, ...]], list[str]]:
-    """The ``RETRIEVED`` references of every query whose global descriptors are the most similar."""
+    """References of every query by their global descriptors, the most similar first."""
     names = [view.name for view in (*queries, *references)]
     descriptors = read_global_descriptors(file, names)
-    known = np.isfinite(descriptors).all(axis=1) if descriptors.size else np.zeros(len(names), dtype=bool)
+    known = np.isfinite(descriptors[:, 0])
     rows = len(queries) + np.flatnonzero(known[len(queries) :])
     pairs = {}
     for row, view in enumerate(queries):
         order = np.argsort(-(descriptors[rows] @ descriptors[row]), kind="stable") if known[row] else []
-        pairs[view.name] = tuple(names[rows[place]] for place in order[:RETRIEVED])
+        if len(order):
+            pairs[view.name] = tuple(names[rows[place]] for place in order[:MOST_REFERENCES])
     missing = int(np.count_nonzero(~known))
     return pairs, [f"{missing} of {len(names)} images have no descriptor in {file}."] if missing else []
 
@@ -175,23 +184,14 @@ def _matcher(
     if "matches" not in table or pairs is None:
         frontend = scene_file.section(table, "frontend", str(path))
         return image_matcher(references, frontend, str(path), path.parent, pairs)
+    features, matches = _file(table, "features", path), _file(table, "matches", path)
+    for file in (features, matches):
+        with open_hdf5(file):  # says now what is wrong with it
+            pass
     return HlocMatcher(
-        features=_file(table, "features", path),
-        matches=_file(table, "matches", path),
+        features=features,
+        matches=matches,
         model=model,
         references={view.name: view for view in references},
         pairs=pairs,
     )
-
-
-def _gravity_map(table: Mapping[str, Any], where: str, references: tuple[View, ...]) -> FloatArray:
-    """The key ``gravity_map``, else the mean direction of the references' image columns, downwards."""
-    if "gravity_map" in table:
-        return scene_file.numbers(table["gravity_map"], (3,), "gravity_map", where)
-    down = np.mean([np.asarray(view.cam_from_map)[1, :3] for view in references], axis=0) if references else np.ones(3)
-    length = float(np.linalg.norm(down))
-    if length < _LEAST_AGREEMENT:
-        raise InputError(
-            f"{where}: the references are rolled too differently to say where down is; add gravity_map = [x, y, z]."
-        )
-    return down / length

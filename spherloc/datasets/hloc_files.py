@@ -123,8 +123,10 @@ class Hdf5:
         place = f"{self.path}: {show('/'.join(names))}"
         with _guarded(place):
             dataset = self._find(names, place)
-            kind = dataset.attrs.get_id(name) if dataset is not None and name in dataset.attrs else None
-            if kind is None or kind.dtype.kind not in "fiu" or kind.shape not in ((), (1,)):
+            if dataset is None or name not in dataset.attrs:
+                return None
+            kind = dataset.attrs.get_id(name)
+            if kind.dtype.kind not in "fiu" or kind.shape not in ((), (1,)):
                 return None
             number = float(np.ravel(dataset.attrs[name])[0])
             return number if np.isfinite(number) else None
@@ -204,7 +206,7 @@ def read_matches(file: Hdf5, query: str, reference: str, counts: tuple[int, int]
     return None
 
 
-def read_global_descriptors(path: Path, names: Sequence[str]) -> FloatArray:
+def read_global_descriptors(path: Path, names: Sequence[str]) -> NDArray[np.float32]:
     """Unit rows (N, D) that describe whole images; rows of images that the file does not have are NaN.
 
     Raises ``InputError`` for damaged ones, and for more than ``MAX_TOTAL_BYTES``.
@@ -224,7 +226,8 @@ def read_global_descriptors(path: Path, names: Sequence[str]) -> FloatArray:
                     f"{MAX_TOTAL_BYTES >> 20} MiB; give a list of pairs instead."
                 )
             found[row] = (array / length).astype(np.float32)
-    descriptors = np.full((len(names), len(next(iter(found.values()), ()))), np.nan, dtype=np.float32)
+    size = len(next(iter(found.values()))) if found else 1
+    descriptors = np.full((len(names), size), np.nan, dtype=np.float32)
     for row, array in found.items():
         descriptors[row] = array
     return descriptors

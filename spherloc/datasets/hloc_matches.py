@@ -124,13 +124,13 @@ class _Found:
             remarks.append(f"{len(self.faults)} of {count} pairs of {query.name} are skipped: {self.faults[0]}")
         if keypoints.rounding_px >= _WORTH_SAYING_PX:
             remarks.append(
-                f"Keypoints of {query.name} are half floats, which are rounded to {keypoints.rounding_px:g} px at the far "
-                "edge of the image; extract features with as_half = False."
+                f"Keypoints of {query.name} are half floats, which are rounded to {keypoints.rounding_px:g} px at the "
+                "far edge of the image; extract features with as_half = False."
             )
         if (keypoints.uncertainty_px or 0.0) > _WORTH_SAYING_PX:
             remarks.append(
-                f"Keypoints of {query.name} are uncertain by {keypoints.uncertainty_px:.2g} px, as they were found in a "
-                "smaller image; bound_px should be larger than that."
+                f"Keypoints of {query.name} are uncertain by {keypoints.uncertainty_px:.2g} px, as they were found in "
+                "a smaller image; bound_px should be larger than that."
             )
         return remarks
 

@@ -5,6 +5,7 @@ Layout (researchdata.bath.ac.uk/1126): a folder a building, and in it ``<id>_rgb
 """
 
 import fnmatch
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -107,7 +108,7 @@ def _views(root: Path, along: Any, where: str) -> tuple[list[View], tuple[str, .
         except InputError as error:
             remarks.append(f"{image.name} was skipped: {error}")
             continue
-        lift = DepthLift(lambda file=_depth_file(image): read_dpt(file), camera, cam_from_map, along)
+        lift = DepthLift(partial(read_dpt, _depth_file(image)), camera, cam_from_map, along)
         views.append(View(image.name, camera, image, cam_from_map, lift=lift))
     return views, tuple(remarks)
 
@@ -121,7 +122,7 @@ def _depth_file(image: Path) -> Path:
 
 
 def _own_depth(view: View, along: Any) -> Lift:
-    return DepthLift(lambda: read_dpt(_depth_file(view.path)), view.camera, AT_CAMERA, along)
+    return DepthLift(partial(read_dpt, _depth_file(view.path)), view.camera, AT_CAMERA, along)
 
 
 def read_pose(path: Path) -> FloatArray:

@@ -28,7 +28,7 @@ GATES_M = (1.0, 0.2)
 STILL_M = 1e-4
 FITS_M = 0.1
 LEAST_FIT = 0.4
-"""Share of the query's upright surfaces that must lie within ``FITS_M`` of the map: floors and ceilings fit anywhere."""
+"""Share of the query's upright surfaces that must lie within ``FITS_M`` of the map: floors fit anywhere."""
 UPRIGHT = 0.7
 """A surface is upright if its normal has less than this along gravity."""
 
@@ -106,7 +106,8 @@ def registration_error_m(start: Surfaces, fixed: Surfaces, down: FloatArray) -> 
         near = np.isfinite(distance)
         if near.sum() < 6:
             return np.inf
-        motion = _step(points[near], fixed.points[nearest[near]], fixed.normals[nearest[near]])
+        found = np.asarray(nearest)[near]
+        motion = _step(points[near], fixed.points[found], fixed.normals[found])
         moved = transform(motion, points)
         normals = normals @ motion[:, :3].T
         still = float(np.abs(moved - points).max()) < STILL_M
@@ -124,7 +125,7 @@ def _step(points: FloatArray, targets: FloatArray, normals: FloatArray) -> Float
     middle = points.mean(axis=0)
     rows = np.column_stack([np.cross(points - middle, normals), normals])
     offset = np.einsum("ni,ni->n", targets - points, normals)
-    solved = np.linalg.lstsq(rows, offset, rcond=1e-6)[0]
+    solved = np.asarray(np.linalg.lstsq(rows, offset, rcond=1e-6)[0], np.float64)
     rotation = so3_exp(solved[:3])
     return pose(rotation, middle - rotation @ middle + solved[3:])
 

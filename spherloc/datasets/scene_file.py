@@ -35,10 +35,24 @@ def load_scene(path: Path) -> Scene:
     Raises ``InputError``, in one sentence with the file's name, if it is missing, unreadable, or has a wrong key.
     """
     path = Path(path)
+    table = read_table(path)
+    kind = text(table, "kind", str(path))
+    try:
+        load = registry.lookup("datasets", kind)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    return load(table, path)
+
+
+def read_table(path: Path) -> dict[str, Any]:
+    """The keys of a scene file, not checked yet.
+
+    Raises ``InputError`` for a missing file and for one that is no TOML.
+    """
     try:
         if path.stat().st_size > MAX_BYTES:
             raise InputError(f"{path}: larger than {MAX_BYTES:,} bytes, so it is no scene file; give a TOML scene.")
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
+        return tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; give the path of a scene file (TOML).") from None
     except OSError as error:
@@ -49,12 +63,6 @@ def load_scene(path: Path) -> Scene:
         raise InputError(f"{path}: not valid TOML: {str(error)[:200]}; correct it there.") from None
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: no usable scene file ({str(error)[:100]}); correct or replace it.") from None
-    kind = text(table, "kind", str(path))
-    try:
-        load = registry.lookup("datasets", kind)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
-    return load(table, path)
 
 
 def bundled_scenes() -> dict[str, Path]:

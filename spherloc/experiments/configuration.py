@@ -58,11 +58,10 @@ class Configuration:
     def differences(self, now: "Configuration") -> list[str]:
         """What is not the same in ``now``, as phrases such as "seed is 1, was 0"."""
         before, after = (dict(_flat(_plain(item))) for item in (self, now))
-        return [
-            f"{key} is {show(after.get(key, 'absent'))}, was {show(before.get(key, 'absent'))}"
-            for key in [*after, *(key for key in before if key not in after)]
-            if before.get(key) != after.get(key)
-        ]
+        different = [key for key in {**before, **after} if before.get(key) != after.get(key)]
+        if "estimator" in different:  # another one has other options
+            different = [key for key in different if not key.startswith("options.")]
+        return [f"{key} is {_shown(after, key)}, was {_shown(before, key)}" for key in different]
 
 
 def configuration_of(scene: MapScene, path: Path, estimator: str, options: Any, seed: int) -> Configuration:
@@ -148,6 +147,10 @@ def _plain(configuration: Configuration) -> dict[str, Any]:
     if configuration.registration_thresholds_m is not None:
         values["registration_thresholds_m"] = list(configuration.registration_thresholds_m)
     return values
+
+
+def _shown(table: Mapping[str, Any], key: str) -> str:
+    return show(table[key]) if key in table else "absent"
 
 
 def _flat(table: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:

@@ -85,7 +85,7 @@ def _solve(
         return replace(row, message=str(error), estimated_outlier_rate=matches.estimated_outlier_rate), None
     estimator, options, seed = how
     trace = estimate(problem, estimator, options, seed)
-    return _judged(scene, view, trace, row), trace
+    return _judged(scene, view, matches.references, trace, row), trace
 
 
 def _status_without_matches(view: View) -> str:
@@ -98,13 +98,13 @@ def _status_without_matches(view: View) -> str:
     return FAILED
 
 
-def _judged(scene: MapScene, view: View, trace: Trace, row: QueryResult) -> QueryResult:
+def _judged(scene: MapScene, view: View, references: tuple[View, ...], trace: Trace, row: QueryResult) -> QueryResult:
     """The row with all that the trace tells."""
     problem, metrics, pose = trace.problem, evaluate(trace), trace.cam_from_map
     registration_error_m, remarks = None, row.remarks
     if scene.registration is not None and pose is not None:
         try:
-            registration_error_m = float(scene.registration(view, pose))
+            registration_error_m = float(scene.registration(view, pose, references))
         except InputError as error:
             remarks = (*remarks, f"Not registered: {error}")
     return replace(

@@ -1,5 +1,7 @@
 """Estimated and true camera poses of a sequence as trajectories."""
 
+from decimal import Decimal
+
 import numpy as np
 
 from spherloc.experiments.results import SequenceResults
@@ -40,4 +42,4 @@ def _trajectory(results: SequenceResults, field: str) -> Trajectory:
 
 def _nanoseconds(row: QueryResult, by_time: bool) -> int:
     seconds = row.timestamp_s if by_time and row.timestamp_s is not None else row.index
-    return round(seconds * NS_PER_S)
+    return round(Decimal(repr(seconds)) * NS_PER_S)  # the decimals that were written, not their nearest double

@@ -41,7 +41,7 @@ class FeatureOptions:
     """ONNX file of the learned methods, ALIKED and DISK."""
 
     def __post_init__(self) -> None:
-        if self.method not in KINDS:
+        if not isinstance(self.method, str) or self.method not in KINDS:
             raise InputError(f"There are no features {show(self.method)}; take one of {', '.join(METHODS)}.")
         count = self.max_features
         if isinstance(count, bool) or not isinstance(count, int) or not 1 <= count <= MOST_FEATURES:

@@ -18,6 +18,8 @@ ALIKED_INPUT_PX = 640
 DISK_INPUT_PX = 1024
 """Width and height that OpenCV gives to these networks: what their published files are made for."""
 
+_CREATE = {"ALIKED": "ALIKED_create", "DISK": "DISK_create", "LightGlue": "LightGlueMatcher_create"}
+
 _one_at_a_time = Lock()
 """OpenCV's networks keep the state of a run, and are shared by all threads."""
 
@@ -42,29 +44,27 @@ def disk(image: ByteImage, mask: ByteImage, _most: int, weights: Path | None) ->
 
 
 def lightglue(
-    weights: Path,
+    weights: Path | None,
     query: tuple[FloatArray, NDArray[np.float32], tuple[int, int]],
     reference: tuple[FloatArray, NDArray[np.float32], tuple[int, int]],
 ) -> NDArray[np.int64]:
-    """Index pairs (K, 2) that LightGlue (Lindenberger et al. 2023) finds between two images.
+    """Index pairs (K, 2) that LightGlue (Lindenberger et al. 2023) finds between two images with features of ALIKED.
 
     Each image is given by pixels (N, 2), descriptors (N, D) and its size (width, height). Raises ``InputError`` for
     what is no network of LightGlue for such descriptors.
     """
     (pixels, descriptors, size), (other_pixels, other_descriptors, other_size) = query, reference
-    matcher = _network("LightGlueMatcher", weights)
+    matcher = _network("LightGlue", weights)
     with _one_at_a_time:
         try:
             matcher.setPairInfo(pixels.astype(np.float32), other_pixels.astype(np.float32), size, other_size)
             found = matcher.match(descriptors, other_descriptors)
         except cv2.error as error:
-            raise _refusal("LightGlueMatcher", weights, error) from None
+            raise _refusal("LightGlue", weights, error) from None
     return np.array([(match.queryIdx, match.trainIdx) for match in found], np.int64).reshape(-1, 2)
 
 
 def _detect(name: str, weights: Path | None, image: ByteImage, mask: ByteImage | None) -> tuple[FloatArray, Any]:
-    if weights is None:
-        raise InputError(f"{name} features need a file of weights; give its ONNX file as weights.")
     network = _network(name, weights)
     colour = image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
     with _one_at_a_time:
@@ -76,21 +76,23 @@ def _detect(name: str, weights: Path | None, image: ByteImage, mask: ByteImage |
     return rows, descriptors
 
 
-def _network(name: str, weights: Path) -> Any:
-    create = getattr(cv2, f"{name}_create", None)
+def _network(name: str, weights: Path | None) -> Any:
+    if weights is None:
+        raise InputError(f"{name} needs a file of weights; give its ONNX file as weights.")
+    create = getattr(cv2, _CREATE[name], None)
     if create is None:
         raise InputError(
             f"{name} is not in this OpenCV ({cv2.__version__}); install OpenCV 5 (opencv-python-headless>=5), or take "
             "the features 'sift' with the matching 'nearest'."
         )
     try:
-        status = Path(weights).stat()
-        with Path(weights).open("rb"):
+        status = weights.stat()
+        with weights.open("rb"):
             pass
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"{weights}: weights of {name} cannot be read ({reason}); give its ONNX file.") from None
-    return _loaded(name, create, Path(weights), status.st_mtime_ns, status.st_size)
+    return _loaded(name, create, weights, status.st_mtime_ns, status.st_size)
 
 
 @lru_cache(maxsize=3)
@@ -101,6 +103,6 @@ def _loaded(name: str, create: Callable[[str], Any], weights: Path, _changed: in
         raise _refusal(name, weights, error) from None
 
 
-def _refusal(name: str, weights: Path, error: cv2.error) -> InputError:
+def _refusal(name: str, weights: Path | None, error: cv2.error) -> InputError:
     said = " ".join(str(getattr(error, "err", error)).split())[:120]
     return InputError(f"{weights}: OpenCV cannot use it for {name} ({said}); give an ONNX file of {name}.")

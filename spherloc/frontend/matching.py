@@ -85,10 +85,10 @@ def match(query: Features, reference: Features, options: MatchOptions | None = N
 
 
 def _by_lightglue(query: Features, reference: Features, options: MatchOptions) -> FeatureMatches:
-    if options.weights is None:  # FeatureOptions refuses that
-        raise InputError("LightGlue matching needs a file of weights; give its ONNX file as weights.")
-    if not KINDS[query.method].learned:
-        raise InputError(f"LightGlue has no network for {query.method} features; take aliked or disk, or nearest.")
+    if query.method != "aliked":  # OpenCV 5.0 places the keypoints as the networks for ALIKED want them
+        raise InputError(
+            f"LightGlue is for aliked features, not {query.method}; take those, or the matching 'nearest'."
+        )
     sides = ((one.pixels, one.descriptors.astype(np.float32), one.image_size) for one in (query, reference))
     pairs = learned.lightglue(options.weights, *sides)
     pairs = pairs[np.argsort(pairs[:, 0], kind="stable")]

@@ -4,7 +4,9 @@ from collections.abc import Callable
 from functools import lru_cache
 
 from spherloc.errors import InputError, show
+from spherloc.worlds.apartment import build_apartment
 from spherloc.worlds.cache import image_path, render
+from spherloc.worlds.campus import build_campus
 from spherloc.worlds.conditions import Conditions
 from spherloc.worlds.render import Render
 from spherloc.worlds.street import build_street
@@ -12,7 +14,11 @@ from spherloc.worlds.world import World
 
 __all__ = ["WORLDS", "Conditions", "Render", "World", "build_world", "image_path", "render"]
 
-WORLDS: dict[str, Callable[[int], World]] = {"street": build_street}
+WORLDS: dict[str, Callable[[int], World]] = {
+    "street": build_street,
+    "apartment": build_apartment,
+    "campus": build_campus,
+}
 """By kind."""
 
 

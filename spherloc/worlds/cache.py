@@ -2,6 +2,7 @@
 
 import io
 import zipfile
+import zlib
 from functools import cache
 from pathlib import Path
 
@@ -63,7 +64,7 @@ def stored_range(path: Path, camera: Camera) -> NDArray[np.float32] | None:
     try:
         with np.load(path.with_suffix(".npz"), allow_pickle=False) as content:
             range_m = content["range_m"]
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, NotImplementedError):
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError):
         return None
     right = range_m.shape == (camera.height, camera.width) and range_m.dtype == np.float32
     return range_m if right else None

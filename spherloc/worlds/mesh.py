@@ -91,7 +91,7 @@ class MeshBuilder:
         """
         left, top, right, bottom = uv
         at = [(left, bottom), (right, bottom), (right, top), (left, top)]
-        self._add(np.asarray(corners, np.float64), [[0, 1, 2], [0, 2, 3]], at, tile, tint, lit)
+        self.add(np.asarray(corners, np.float64), [[0, 1, 2], [0, 2, 3]], at, tile, tint, lit)
 
     def sheet(
         self, origin: ArrayLike, right: ArrayLike, up: ArrayLike, cells: tuple[int, int], tile: str, **more: Any
@@ -144,7 +144,7 @@ class MeshBuilder:
         at = np.array([(k / sides, 1 - row) for row in range(2) for k in range(sides + 1)])
         n = sides + 1
         faces = [f for k in range(sides) for f in ([k, k + 1, n + k + 1], [k, n + k + 1, n + k])]
-        self._add(vertices, faces, at, tile, tint, False)
+        self.add(vertices, faces, at, tile, tint)
 
     def blob(
         self,
@@ -164,17 +164,22 @@ class MeshBuilder:
         # Folded back and forth, so that there is no seam where a triangle would span the whole tile.
         longitude = np.arctan2(direction[:, 1], direction[:, 0])
         at = np.column_stack([np.abs(longitude) / np.pi, np.arccos(np.clip(direction[:, 2], -1, 1)) / np.pi])
-        self._add(vertices, ball.faces, at, tile, tint, False)
+        self.add(vertices, ball.faces, at, tile, tint)
 
-    def _add(
+    def add(
         self,
         vertices: FloatArray,
         faces: ArrayLike,
         at: ArrayLike,
         tile: str,
-        tint: ArrayLike,
-        lit: bool,
+        tint: ArrayLike = WHITE,
+        lit: bool = False,
+        surfaces: ArrayLike = 0,
     ) -> None:
+        """Triangles (F, 3) over vertices (V, 3) whose places in the tile are ``at`` (V, 2), 0 to 1 from its top left.
+
+        Triangles with the same number in ``surfaces`` ((F,) or one for all) are one part.
+        """
         number = self.atlas.index[tile]
         box = self.atlas.boxes[number].astype(np.float32)
         faces = np.asarray(faces, dtype=np.int32)
@@ -185,7 +190,7 @@ class MeshBuilder:
                 uv=box[:2] + np.asarray(at, np.float32) * box[2:],
                 tint=np.broadcast_to(np.asarray(tint, np.float32), (len(vertices), 3)),
                 tile=np.full(len(faces), number, np.int32),
-                surface=np.zeros(len(faces), np.int32),
+                surface=np.broadcast_to(np.asarray(surfaces, np.int32), len(faces)),
                 lit=np.full(len(faces), lit),
             )
         )

@@ -98,10 +98,11 @@ def _side(
 
 
 def _disc(builder: MeshBuilder, hub: FloatArray, axes: FloatArray, side: int) -> None:
-    right = -side * axes[0] * 0.32
-    up = axes[2] * 0.32
-    corners = [hub - right - up, hub + right - up, hub + right + up, hub - right + up]
-    builder.quad(np.array(corners) + 0.005 * side * axes[1], "wheel")
+    angle = np.linspace(0, 2 * np.pi, 10, endpoint=False)
+    round_ = np.column_stack([np.cos(angle), np.sin(angle)])
+    rim = hub + 0.32 * (-side * round_[:, :1] * axes[0] + round_[:, 1:] * axes[2]) + 0.005 * side * axes[1]
+    faces = [(0, k, k + 1) for k in range(1, 9)]
+    builder.add(rim, faces, 0.5 + 0.5 * round_ * (1, -1), "wheel")
 
 
 def add_person(builder: MeshBuilder, rng: np.random.Generator, place: FloatArray) -> None:

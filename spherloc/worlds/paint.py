@@ -76,17 +76,19 @@ def text(canvas: Canvas, words: str, box: Sequence[float], colour: Colour, bold:
     (wide, high), _ = cv2.getTextSize(words, cv2.FONT_HERSHEY_SIMPLEX, 1.0, bold)
     scale = min((right - left) / wide, 0.75 * (bottom - top) / high)
     origin = (int((left + right - wide * scale) / 2), int((top + bottom + high * scale) / 2))
-    picture = np.ascontiguousarray(canvas)
-    cv2.putText(picture, words, origin, cv2.FONT_HERSHEY_SIMPLEX, scale, tuple(colour), bold, cv2.LINE_AA)
-    canvas[:] = picture
+    ink = np.zeros(canvas.shape[:2], np.uint8)
+    cv2.putText(ink, words, origin, cv2.FONT_HERSHEY_SIMPLEX, scale, (255,), bold, cv2.LINE_AA)
+    cover = (ink.astype(np.float32) / 255)[..., None]
+    canvas += cover * (np.asarray(colour, np.float32) - canvas)
 
 
 def poster(rng: np.random.Generator, height: int, width: int) -> Canvas:
     """A picture of bright shapes and lines, unlike any other: what a wall needs to be recognized."""
     canvas = plain(height, width, rng.uniform(0.15, 0.95, 3))
     canvas += 0.25 * noise(rng, height, width, 4, 3)[..., None] * rng.uniform(-1, 1, 3).astype(np.float32)
+    canvas = to_bytes(canvas)
     for _ in range(int(rng.integers(7, 14))):
-        colour = rng.uniform(0.02, 1.0, 3).tolist()
+        colour = rng.uniform(5, 255, 3).tolist()
         x, y = int(rng.integers(0, width)), int(rng.integers(0, height))
         size = int(rng.integers(height // 14, height // 3))
         match rng.integers(0, 4):
@@ -100,13 +102,23 @@ def poster(rng: np.random.Generator, height: int, width: int) -> Canvas:
             case _:
                 end = (int(rng.integers(0, width)), int(rng.integers(0, height)))
                 cv2.line(canvas, (x, y), end, colour, max(2, size // 10), cv2.LINE_AA)
-    return mottle(np.clip(canvas, 0, 1), rng, 32, 0.05, 2)
+    return mottle(from_bytes(canvas), rng, 32, 0.05, 2)
+
+
+def to_bytes(canvas: Canvas) -> NDArray[np.uint8]:
+    """For OpenCV, which draws smooth edges on bytes alone."""
+    return np.round(255 * np.clip(canvas, 0, 1)).astype(np.uint8)
+
+
+def from_bytes(picture: NDArray[np.uint8]) -> Canvas:
+    """A canvas again."""
+    return picture.astype(np.float32) / 255
 
 
 def finish(canvas: Canvas, glow: Canvas | None = None) -> NDArray[np.uint8]:
     """(H, W, 4) bytes of a canvas; the fourth channel says which part shines when a lamp is lit behind it."""
     light = np.zeros(canvas.shape[:2], np.float32) if glow is None else glow
-    return np.round(np.clip(np.dstack([canvas, light]), 0, 1) * 255).astype(np.uint8)
+    return to_bytes(np.dstack([canvas, light]))
 
 
 def _pixels(canvas: Canvas, box: Sequence[float]) -> tuple[int, int, int, int]:

@@ -61,11 +61,10 @@ class RayScene:
 
     def blocked(self, origins: FloatArray, directions: FloatArray, reach_m: FloatArray | float) -> NDArray[np.bool_]:
         """Which rays (N,) hit anything closer than ``reach_m`` ((N,) or a number)."""
-        reach = np.broadcast_to(np.asarray(reach_m, np.float32), len(directions))
-        return self._run(origins, directions, dists=np.ascontiguousarray(reach), query="OCCLUDED") >= 0
+        reach = np.full(len(directions), reach_m, np.float32)
+        return self._run(origins, directions, dists=reach, query="OCCLUDED") >= 0
 
     def _run(self, origins: FloatArray, directions: FloatArray, **options: object):
         start = np.broadcast_to(origins - self.centre, directions.shape)
-        return self._scene.run(
-            np.ascontiguousarray(start, np.float32), np.ascontiguousarray(directions, np.float32), **options
-        )
+        # Embree's binding refuses read-only arrays, which broadcast ones are.
+        return self._scene.run(start.astype(np.float32), directions.astype(np.float32), **options)

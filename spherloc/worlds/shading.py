@@ -73,9 +73,10 @@ class Lighting:
         albedo = base**GAMMA * tint
         colour = albedo * self._irradiance(places, normals)
         glow = texture[:, 3] * mesh.lit[hits.face] * max(self.light.lamps, float(self.world.indoor))
-        colour = colour + (1.6 * glow)[:, None] * np.where(base > 0.5, 1.0, 0.6) * LAMP_COLOUR
         if self.world.indoor:
-            return colour.astype(np.float32)
+            # What shines indoors is the daylight behind a window and the shades of lamps, in their own colours.
+            return (colour + (1.1 * glow)[:, None] * albedo).astype(np.float32)
+        colour = colour + (1.6 * glow)[:, None] * np.where(base > 0.5, 1.0, 0.6) * LAMP_COLOUR
         clear = np.exp(-hits.range_m / HAZE_M)[:, None]
         return (clear * colour + (1 - clear) * np.asarray(self.light.horizon)).astype(np.float32)
 

@@ -2,13 +2,14 @@
 
 import logging
 import threading
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import viser
 
+from spherloc.datasets.map_scene import MapScene
 from spherloc.diagnosis import Diagnosis, diagnose
-from spherloc.errors import SpherlocError
+from spherloc.errors import InputError, SpherlocError
 from spherloc.estimators import estimate
 from spherloc.trace import Trace
 from spherloc_viz.app import views
@@ -20,12 +21,14 @@ from spherloc_viz.app.image_panel import ImagePanel
 from spherloc_viz.app.newest import Job, Newest
 from spherloc_viz.app.painter import Painter
 from spherloc_viz.app.scene_controls import SceneControls
+from spherloc_viz.app.sequence_panel import SequencePanel
 from spherloc_viz.app.steps_panel import StepsPanel
 from spherloc_viz.app.text import diagnosis_html, legend_html, status_html, table_html
 from spherloc_viz.app.viser_seams import put_back
 from spherloc_viz.layers import paint, steps, with_rival
-from spherloc_viz.layers.primitives import Picture
+from spherloc_viz.layers.primitives import Picture, SceneItem
 from spherloc_viz.layers.tables import outcome_table
+from spherloc_viz.layers.trajectory import trajectory_items
 from spherloc_viz.recording.background import Recorder
 
 QUIET_S = 0.7
@@ -91,8 +94,8 @@ class Session:
 
     def close(self) -> None:
         """End the threads; does not wait."""
-        for thread in (self._solver, self._page, self._doctor):
-            thread.close()
+        for worker in (self._solver, self._page, self._doctor, self._sequence):
+            worker.close()
 
     def _build(self) -> None:
         gui = self._client.gui
@@ -101,6 +104,7 @@ class Session:
         self._scene = SceneControls(gui, self._catalog, self._changed)
         gui.add_button_group("", ("New seed",)).on_click(self._next_seed)
         self._estimator = EstimatorControls(gui, self._changed)
+        self._sequence = SequencePanel(gui, self._chosen_sequence, self._localized)
         self._display = DisplayControls(gui, self._redraw)
         self._status = gui.add_html(status_html("Solving the first problem …"))
         story = gui.add_panel()
@@ -123,6 +127,23 @@ class Session:
     def _redraw(self, event: Any) -> None:
         self._page.ask()
 
+    def _chosen_sequence(self) -> tuple[str, MapScene, str, Any, int]:
+        """What the sequence panel localizes; raises ``InputError`` if the page says nothing that can be."""
+        wish = self._scene.read()
+        scene = self._catalog.map_scene(wish.scene)
+        if scene is None:
+            raise InputError("this scene has no query images; choose one that has.")
+        return wish.scene, scene, *self._estimator.read(), wish.seed
+
+    def _localized(self, trace: Trace | None) -> None:
+        """One more query of a sequence is done."""
+        if trace is not None and self._recorder is not None:
+            try:
+                self._recorder.submit(trace)
+            except SpherlocError as error:
+                self.complain(str(error))
+        self._page.ask()
+
     def _next_seed(self, event: Any) -> None:
         self._scene.next_seed()
         self._solver.ask()
@@ -135,6 +156,7 @@ class Session:
         if self._scene.reads_images():
             self._status.content = status_html("Reading and matching images …")
         if self._scene.follow_scene():
+            self._sequence.show(self._catalog.map_scene(self._scene.read().scene))
             self._estimator.follow_problem(self._catalog.problem(self._scene.read()))
         wish = Wish(self._scene.read(), *self._estimator.read())
         if self._run is None or wish != self._run.wish:
@@ -175,6 +197,7 @@ class Session:
             remark = diagnosis_html(diagnosis, whole=last)
             if last and diagnosis.rival_cam_from_map is not None:
                 picture = with_rival(picture, trace, diagnosis.rival_cam_from_map)
+        picture = replace(picture, scene=picture.scene + self._trajectory(run))
         mesh = self._catalog.mesh(run.wish.scene.scene)
         layers = self._display.layers()
         with self._client.atomic():
@@ -193,6 +216,14 @@ class Session:
             self._checks -= 1
             return CHECK_S
         return pause
+
+    def _trajectory(self, run: Run) -> tuple[SceneItem, ...]:
+        """The sequence that was localized in the scene at hand, if any."""
+        label = run.wish.scene.scene
+        scene, rows = self._catalog.map_scene(label), self._sequence.rows(label)
+        if scene is None or not rows:
+            return ()
+        return trajectory_items(rows, run.trace.problem.aligned.map_turn, scene.thresholds[-1][1])
 
     def _examine(self, asked: bool) -> float | None:
         """The doctor thread's job: once nothing has changed for a while, diagnose the newest run and show it."""

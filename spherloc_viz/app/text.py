@@ -82,6 +82,14 @@ def legend_html() -> str:
     return box(items, "font-size:12px")
 
 
+def ramp_html(best: str, worst: str) -> str:
+    """The colours of errors as a bar between two texts."""
+    colors = ",".join(style.css(color) for color in style.ERROR_RAMP)
+    bar = f'<span style="flex:1;height:.7em;border-radius:.35em;background:linear-gradient(90deg,{colors})"></span>'
+    row = f'<span>{escape(best)}</span>{bar}<span style="white-space:nowrap">{escape(worst)}</span>'
+    return box(f'<div style="display:flex;align-items:center;gap:.6em">{row}</div>', "font-size:12px")
+
+
 def status_html(sentence: str, wrong: bool = False) -> str:
     """A line about what is going on; red if something went wrong."""
     color = f"color:{style.css(style.OUTLIER)}" if wrong else DIM

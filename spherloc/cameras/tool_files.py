@@ -1,0 +1,166 @@
+"""Calibrations of KITTI-360, Basalt, stella_vslam (OpenVSLAM), 360Loc and fisheye-calib-adapter.
+
+All but 360Loc put the centre of the top-left pixel at (0, 0): 0.5 is added to their principal points here.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+from spherloc.cameras._checks import located, show
+from spherloc.cameras._files import PIXEL_CENTRE_SHIFT, numbers_of, section_of, size_of, table_of, value_of
+from spherloc.cameras.base import Camera
+from spherloc.cameras.double_sphere import DoubleSphere
+from spherloc.cameras.equirectangular import Equirectangular
+from spherloc.cameras.eucm import Eucm
+from spherloc.cameras.kannala_brandt import KannalaBrandt
+from spherloc.cameras.mei import Mei
+from spherloc.errors import CalibrationError
+
+STELLA_PREFIX = "Camera."
+"""In front of OpenVSLAM's keys, where stella_vslam has a section."""
+
+_NO_LENS = (0.0, 0.0, 0.0, 0.0)
+
+
+def kitti360(document: dict[Any, Any], name: str | None) -> Camera:
+    """MEI with gamma1, gamma2, u0, v0."""
+    if document["model_type"] != "MEI":
+        raise CalibrationError(f"the model_type {show(document['model_type'])} is not supported: give MEI.")
+    own_name = document.get("camera_name")
+    if name is not None and name != own_name:
+        raise CalibrationError(f"describes the camera {show(own_name)} only: ask for it instead of {show(name)}.")
+    (xi,) = section_of(document, "mirror_parameters", "xi")
+    k1, k2, p1, p2 = section_of(document, "distortion_parameters", "k1", "k2", "p1", "p2")
+    fx, fy, u0, v0 = section_of(document, "projection_parameters", "gamma1", "gamma2", "u0", "v0")
+    size = value_of(document, "image_width"), value_of(document, "image_height")
+    return Mei(*size, fx, fy, u0 + PIXEL_CENTRE_SHIFT, v0 + PIXEL_CENTRE_SHIFT, xi, (k1, k2, p1, p2))
+
+
+def basalt(document: dict[Any, Any], name: str | None) -> Camera:
+    """A camera of a Basalt JSON; they have no names there and are called cam0, cam1, ... in their order."""
+    with located("value0"):
+        rig = table_of(document["value0"])
+        cameras, sizes = value_of(rig, "intrinsics"), value_of(rig, "resolution")
+        if not isinstance(cameras, list) or not isinstance(sizes, list) or not 1 <= len(cameras) == len(sizes):
+            raise CalibrationError("keys 'intrinsics' and 'resolution' are no lists with an entry a camera: add them.")
+        names = [f"cam{number}" for number in range(len(cameras))]
+        if name is not None and name not in names:
+            raise CalibrationError(f"has no camera {show(name)}: choose one of {', '.join(names)}.")
+        chosen = names.index(name or "cam0")
+        with located(names[chosen]):
+            camera = table_of(cameras[chosen])
+            kind = value_of(camera, "camera_type")
+            if not isinstance(kind, str) or kind not in _BASALT:
+                raise CalibrationError(f"the camera_type {show(kind)} is not supported: give {', '.join(_BASALT)}.")
+            return _BASALT[kind](
+                size_of({"resolution": sizes[chosen]}, "resolution"), table_of(value_of(camera, "intrinsics"))
+            )
+
+
+def stella(document: dict[Any, Any]) -> Camera:
+    """The ``Camera`` section of stella_vslam, or OpenVSLAM's keys ``Camera.model``, ``Camera.fx``, ..."""
+    dotted = {
+        key.removeprefix(STELLA_PREFIX): value for key, value in document.items() if str(key).startswith(STELLA_PREFIX)
+    }
+    with located("Camera"):
+        table = dotted or table_of(document["Camera"])
+        kind = value_of(table, "model")
+        size = value_of(table, "cols"), value_of(table, "rows")
+        if kind == "equirectangular":
+            return Equirectangular(*size)
+        if kind == "fisheye":
+            return _kannala_brandt(size, table)
+        if kind == "perspective":
+            return _perspective(size, table)
+        raise CalibrationError(
+            f"the model {show(kind)} is not supported: give equirectangular, fisheye or perspective."
+        )
+
+
+def loc360(document: dict[Any, Any]) -> Camera:
+    """A camera_config of 360Loc: a double sphere, or a pinhole where xi and alpha are absent.
+
+    Its process.py casts the ray of pixel (u, v) through u + 0.5: the principal point is taken as it is.
+    """
+    size = value_of(document, "imgw"), value_of(document, "imgh")
+    fx, fy, cx, cy = numbers_of(document, "fx", "fy", "cx", "cy")
+    if "xi" in document or "alpha" in document:
+        return DoubleSphere(*size, fx, fy, cx, cy, *numbers_of(document, "xi", "alpha"))
+    return Mei(*size, fx, fy, cx, cy, 0.0, _NO_LENS)
+
+
+def adapter(document: dict[Any, Any]) -> Camera:
+    """A file of fisheye-calib-adapter, which names no model: it is known by its keys."""
+    image = value_of(document, "image")
+    with located("image"):
+        size = value_of(table_of(image), "width"), value_of(image, "height")
+    with located("parameter"):
+        table = table_of(document["parameter"])
+        for keys, build in _ADAPTER:
+            if all(key in table for key in keys):
+                return build(size, table)
+        raise CalibrationError(
+            f"the keys {show(sorted(map(str, table)))} are those of no supported model: "
+            "give the Kannala-Brandt, double sphere, EUCM or radtan file."
+        )
+
+
+Size = tuple[Any, Any]
+
+
+def _focal(table: dict[Any, Any]) -> tuple[float, float, float, float]:
+    """fx, fy, cx, cy, with the shift of the principal point."""
+    fx, fy, cx, cy = numbers_of(table, "fx", "fy", "cx", "cy")
+    return fx, fy, cx + PIXEL_CENTRE_SHIFT, cy + PIXEL_CENTRE_SHIFT
+
+
+def _kannala_brandt(size: Size, table: dict[Any, Any]) -> Camera:
+    fx, fy, cx, cy = _focal(table)
+    k1, k2, k3, k4 = numbers_of(table, "k1", "k2", "k3", "k4")
+    return KannalaBrandt(*size, fx, fy, cx, cy, (k1, k2, k3, k4))
+
+
+def _double_sphere(size: Size, table: dict[Any, Any]) -> Camera:
+    return DoubleSphere(*size, *_focal(table), *numbers_of(table, "xi", "alpha"))
+
+
+def _eucm(size: Size, table: dict[Any, Any]) -> Camera:
+    return Eucm(*size, *_focal(table), *numbers_of(table, "alpha", "beta"))
+
+
+def _unified(size: Size, table: dict[Any, Any]) -> Camera:
+    """Basalt's "ucm" is the EUCM on a sphere."""
+    (alpha,) = numbers_of(table, "alpha")
+    return Eucm(*size, *_focal(table), alpha, 1.0)
+
+
+def _pinhole(size: Size, table: dict[Any, Any]) -> Camera:
+    fx, fy, cx, cy = _focal(table)
+    return Mei(*size, fx, fy, cx, cy, 0.0, _NO_LENS)
+
+
+def _perspective(size: Size, table: dict[Any, Any]) -> Camera:
+    """Radial and tangential distortion; a third radial term is refused, since MEI has two."""
+    fx, fy, cx, cy = _focal(table)
+    k1, k2, p1, p2 = numbers_of(table, "k1", "k2", "p1", "p2")
+    if "k3" in table and numbers_of(table, "k3") != [0.0]:
+        raise CalibrationError(f"key 'k3' is {show(table['k3'])}: calibrate with k1, k2, p1, p2 alone, k3 must be 0.")
+    return Mei(*size, fx, fy, cx, cy, 0.0, (k1, k2, p1, p2))
+
+
+_Build = Callable[[Size, dict[Any, Any]], Camera]
+
+_BASALT: dict[str, _Build] = {
+    "ds": _double_sphere,
+    "eucm": _eucm,
+    "kb4": _kannala_brandt,
+    "pinhole": _pinhole,
+    "ucm": _unified,
+}
+
+_ADAPTER: tuple[tuple[tuple[str, ...], _Build], ...] = (
+    (("xi", "alpha"), _double_sphere),
+    (("alpha", "beta"), _eucm),
+    (("k1", "k2", "k3", "k4"), _kannala_brandt),
+    (("k1", "k2", "p1", "p2"), _perspective),
+)

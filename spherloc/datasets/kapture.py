@@ -1,0 +1,233 @@
+"""Scenes of ``kind = "kapture"``: posed images of cameras and rigs (kapture 1.1), some localized against the others.
+
+.. code-block:: toml
+
+    kind = "kapture"
+    name = "my robot"
+    root = "mapping"               # folder that holds sensors/
+    queries = ["cam001/0002.jpg"]  # names of images or patterns of them, or a section [queries] as below
+
+    [references]                   # optional: all other images with a pose
+    images = ["cam00*/*"]          # names or patterns
+    devices = ["cam001", "cam002"]
+    timestamps = [0, 1000]         # first and last, as in the files
+    every = 5                      # every fifth of these, by time
+
+    [gravity]                      # optional
+    map = [0.0, 1.0, 0.0]          # down; else the mean +y axis of the reference cameras
+    bound_deg = 5.0                # how far a query's roll and pitch may be from its reference's
+
+kapture has no depth here: points of a reference are triangulated from other references, those first that a rig took at
+the same time. What a rig took together with a query is no reference. A query's pose, if it has one, is the truth.
+
+https://github.com/naver/kapture/blob/main/kapture_format.adoc
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from spherloc.datasets import map_settings, scene_file
+from spherloc.datasets.colmap_views import gravity_of_map, some, split_gravity
+from spherloc.datasets.kapture_files import Kapture, Record, read_kapture
+from spherloc.datasets.map_scene import MapScene
+from spherloc.errors import InputError, show
+from spherloc.frontend.frontend_options import FrontendOptions, frontend_options
+from spherloc.frontend.pipeline import image_matcher
+from spherloc.frontend.triangulation import TriangulationLift
+from spherloc.frontend.view import View
+from spherloc.geometry import camera_centre
+
+GRAVITY_BOUND_DEG = 5.0
+"""A reference's roll and pitch are not the query's: cameras are held by hand."""
+_LEAST_NANOSECONDS = 10**17
+"""Timestamps from here on, March 1973, are nanoseconds; smaller ones may be running numbers."""
+_NEIGHBOURS = 64
+"""Among so many of the nearest references, those are sought that points are triangulated with."""
+_OTHERS = 4
+"""Not counting what the rig took at the same time: each costs one matching, once."""
+_GROWTH = 2.0
+"""Each is so many times farther than the one before: near things need a short baseline, far things a long one."""
+_LEAST_COSINE = 0.5
+"""Between optical axes: those that look elsewhere see other things."""
+_SELECTION = {"images", "devices", "timestamps", "every"}
+
+
+def load(table: dict[str, Any], path: Path) -> MapScene:
+    """Read a scene of ``kind = "kapture"``; paths in it are relative to its file.
+
+    Raises ``InputError`` for a missing file, a wrong line in one, or a wrong key.
+    """
+    where = str(path)
+    required = map_settings.REQUIRED | {"root", "queries"}
+    scene_file.check_keys(table, required, map_settings.OPTIONAL | {"references"}, where)
+    shared_gravity, gravity = split_gravity(table, where)
+    scene_file.check_keys(gravity, set(), {"map"}, f"{where} [gravity]")
+    settings = map_settings.read_settings(table | {"gravity": shared_gravity}, where, GRAVITY_BOUND_DEG)
+    root = map_settings.folder(table, "root", path)
+    kapture = read_kapture(root, where)
+    records, remarks = _usable(kapture, root)
+    queries = _selected(records, table, "queries", where)
+    asked = set(queries)
+    others = [record for record in records if record not in asked]
+    if "references" in table:
+        others = _selected(others, table, "references", where)
+    others, left_out = _posed_apart(kapture, others, queries)
+    references = _references(kapture, root, others, frontend_options(settings.frontend, where, path.parent))
+    down, assumed = gravity_of_map(gravity, references, where)
+    return MapScene(
+        name=settings.name,
+        where=where,
+        queries=tuple(_view(kapture, root, record) for record in queries),
+        references=references,
+        matcher=image_matcher(references, settings.frontend, where, path.parent),
+        gravity_map=down,
+        gravity_bound_rad=settings.gravity_bound_rad,
+        gravity_sd_rad=settings.gravity_sd_rad,
+        bound_px=settings.bound_px,
+        thresholds=settings.thresholds,
+        remarks=(*kapture.remarks, *remarks, *left_out, *assumed),
+    )
+
+
+def _file(root: Path, record: Record) -> Path:
+    return root / "sensors" / "records_data" / record.image
+
+
+def _usable(kapture: Kapture, root: Path) -> tuple[list[Record], list[str]]:
+    """Records with a camera and an image, by time, and a remark on those without an image."""
+    known = [record for record in kapture.records if record.device in kapture.cameras]
+    missing = [record.image for record in known if not _file(root, record).is_file()]
+    gone = set(missing)
+    folder = root / "sensors" / "records_data"
+    remarks = [f"{some(missing, 'image')} not found in {folder}: left out."] if missing else []
+    return sorted((record for record in known if record.image not in gone), key=lambda one: one.timestamp), remarks
+
+
+def _selected(records: Sequence[Record], table: Mapping[str, Any], key: str, where: str) -> list[Record]:
+    """The records that ``queries`` or ``references`` means: a list of names and patterns, or a section."""
+    wanted = table[key] if isinstance(table[key], dict) else {"images": table[key]}
+    place = f"{where} [{key}]"
+    scene_file.check_keys(wanted, set(), _SELECTION, place)
+    chosen = list(records)
+    if "images" in wanted:
+        patterns = _texts(wanted["images"], "images", place)
+        _must_fit(patterns, [record.image for record in records], place)
+        chosen = [record for record in chosen if any(fnmatchcase(record.image, pattern) for pattern in patterns)]
+    if "devices" in wanted:
+        devices = _texts(wanted["devices"], "devices", place)
+        chosen = [record for record in chosen if record.device in devices]
+    if "timestamps" in wanted:
+        first, last = _two_integers(wanted["timestamps"], place)
+        chosen = [record for record in chosen if first <= record.timestamp <= last]
+    if "every" in wanted:
+        chosen = chosen[:: scene_file.integer(wanted, "every", place, 1, 10**9)]
+    if not chosen and records:
+        raise InputError(f"{place}: fits none of the {len(records)} images, such as {records[0].image}; correct it.")
+    return chosen
+
+
+def _texts(value: Any, key: str, place: str) -> list[str]:
+    texts = [value] if isinstance(value, str) else value
+    if not isinstance(texts, list) or not texts or not all(isinstance(text, str) and text for text in texts):
+        raise InputError(f"{place}: {key} is {show(value)}; give a list of texts.")
+    return texts
+
+
+def _must_fit(patterns: Sequence[str], images: Sequence[str], place: str) -> None:
+    for pattern in patterns:
+        if images and not any(fnmatchcase(image, pattern) for image in images):
+            raise InputError(
+                f"{place}: {show(pattern)} fits none of the {len(images)} images, such as {images[0]}; correct it."
+            )
+
+
+def _two_integers(value: Any, place: str) -> tuple[int, int]:
+    good = isinstance(value, list) and len(value) == 2 and all(type(item) is int for item in value)
+    if not good or value[0] > value[1]:
+        raise InputError(f"{place}: timestamps is {show(value)}; give the first and the last, two whole numbers.")
+    return value[0], value[1]
+
+
+def _posed_apart(
+    kapture: Kapture, records: Sequence[Record], queries: Sequence[Record]
+) -> tuple[list[Record], list[str]]:
+    """Records with a pose that no rig took together with a query, and remarks on the others."""
+    taken = {(query.timestamp, rig) for query in queries for rig in kapture.carriers(query.device)}
+    partners = [
+        record.image
+        for record in records
+        if any((record.timestamp, rig) in taken for rig in kapture.carriers(record.device))
+    ]
+    together = set(partners)
+    apart = [record for record in records if record.image not in together]
+    unposed = [record.image for record in apart if kapture.pose(record.timestamp, record.device) is None]
+    remarks = [f"{some(partners, 'image')} taken together with a query: no reference."] if partners else []
+    if unposed:
+        remarks.append(f"{some(unposed, 'image')} without a pose: no reference.")
+    lost = set(unposed)
+    return [record for record in apart if record.image not in lost], remarks
+
+
+def _view(kapture: Kapture, root: Path, record: Record) -> View:
+    nanoseconds = abs(record.timestamp) >= _LEAST_NANOSECONDS
+    return View(
+        name=record.image,
+        camera=kapture.cameras[record.device],
+        path=_file(root, record),
+        cam_from_map=kapture.pose(record.timestamp, record.device),
+        timestamp_s=record.timestamp / 1e9 if nanoseconds else None,
+    )
+
+
+def _references(kapture: Kapture, root: Path, records: Sequence[Record], options: FrontendOptions) -> tuple[View, ...]:
+    """Views whose points are triangulated with others of them."""
+    views = [_view(kapture, root, record) for record in records]
+    return tuple(
+        replace(
+            view,
+            lift=TriangulationLift(view, tuple(views[other] for other in others), options.features, options.matching),
+        )
+        for view, others in zip(views, _neighbours(kapture, records, views), strict=True)
+    )
+
+
+def _neighbours(kapture: Kapture, records: Sequence[Record], views: Sequence[View]) -> list[list[int]]:
+    """For each of R posed records, which others show the same things from elsewhere, its rig's own first."""
+    if len(records) < 2:
+        return [[] for _ in records]
+    poses = np.array([view.cam_from_map for view in views])
+    centres, axes = np.stack([camera_centre(pose) for pose in poses]), poses[:, 2, :3]
+    count = min(_NEIGHBOURS, len(records))
+    distances, nearest = map(np.asarray, KDTree(centres).query(centres, k=count))
+    by_rig: dict[tuple[int, str], list[int]] = {}
+    for index, record in enumerate(records):
+        for rig in kapture.carriers(record.device):
+            by_rig.setdefault((record.timestamp, rig), []).append(index)
+    chosen = []
+    for index, record in enumerate(records):
+        rigs = sorted(kapture.carriers(record.device))
+        partners = list(dict.fromkeys(other for rig in rigs for other in by_rig[record.timestamp, rig]))
+        similar = axes @ axes[index] >= _LEAST_COSINE
+        near = [
+            (distance, other)
+            for distance, other in zip(distances[index].tolist(), nearest[index].tolist(), strict=True)
+            if similar[other] and other not in partners
+        ]
+        chosen.append([other for other in partners if other != index and similar[other]] + _spread(near))
+    return chosen
+
+
+def _spread(near: Sequence[tuple[float, int]]) -> list[int]:
+    """At most ``_OTHERS`` of some neighbours at rising distances, metres, that lie ever farther apart."""
+    found, last = [], 0.0
+    for distance, other in near:
+        if distance > 0.0 and distance >= _GROWTH * last and len(found) < _OTHERS:
+            found.append(other)
+            last = distance
+    return found

@@ -1,0 +1,98 @@
+"""Localizes all queries of a scene in the background and shows how it goes."""
+
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import viser
+
+from spherloc.datasets.map_scene import MapScene
+from spherloc.errors import SpherlocError
+from spherloc.experiments.rows import QueryResult
+from spherloc.experiments.sequence import localize
+from spherloc.experiments.summary import success_rates
+from spherloc.trace import Trace
+from spherloc_viz.app.text import ramp_html, status_html, table_html
+from spherloc_viz.layers.primitives import Table
+
+START, STOP = "Localize all queries", "Stop"
+
+
+class SequencePanel:
+    """A button, a bar and a table; ``rows`` are what is done by now of the sequence that was started last."""
+
+    def __init__(
+        self,
+        gui: viser.GuiApi,
+        chosen: Callable[[], tuple[str, MapScene, str, Any, int]],
+        done: Callable[[Trace | None], None],
+    ) -> None:
+        """``chosen`` tells the scene's label, the scene, estimator, options and seed; ``done`` is called for every
+        query with its run, if it came so far."""
+        self._chosen, self._done = chosen, done
+        self._folder = gui.add_folder("Sequence", visible=False)
+        with self._folder:
+            self._button = gui.add_button(START)
+            self._bar = gui.add_progress_bar(0.0, visible=False)
+            self._text = gui.add_html("")
+        self._button.on_click(self._press)
+        self._lock = threading.Lock()
+        self._stop: threading.Event | None = None
+        self._label, self._rows = "", ()
+
+    def show(self, scene: MapScene | None) -> None:
+        """Show the panel for scenes with queries, and hide it for others."""
+        self._folder.visible = scene is not None
+
+    def rows(self, label: str) -> tuple[QueryResult, ...]:
+        """Results by now, in the order of the sequence; none if the last sequence was of another scene."""
+        with self._lock:
+            return self._rows if label == self._label else ()
+
+    def close(self) -> None:
+        """End after the query at hand; does not wait."""
+        with self._lock:
+            if self._stop is not None:
+                self._stop.set()
+
+    def _press(self, event: viser.GuiEvent) -> None:
+        with self._lock:
+            if self._stop is not None:
+                self._stop.set()
+                return
+            self._stop = threading.Event()
+            stop = self._stop
+        threading.Thread(target=self._run, args=(stop,), name="spherloc-sequence", daemon=True).start()
+
+    def _run(self, stop: threading.Event) -> None:
+        self._button.label, self._bar.visible, self._bar.value = STOP, True, 0.0
+        try:
+            label, scene, estimator, options, seed = self._chosen()
+            with self._lock:
+                self._label, self._rows = label, ()
+            for row, trace in localize(scene, scene.queries, estimator, options, seed):
+                with self._lock:
+                    self._rows = (*self._rows, row)
+                    rows = self._rows
+                self._bar.value = 100.0 * len(rows) / len(scene.queries)
+                self._text.content = sequence_html(rows, scene)
+                self._done(trace)
+                if stop.is_set():
+                    break
+        except SpherlocError as error:
+            self._text.content = status_html(str(error), wrong=True)
+        finally:
+            self._button.label, self._bar.visible = START, False
+            with self._lock:
+                self._stop = None
+
+
+def sequence_html(rows: tuple[QueryResult, ...], scene: MapScene) -> str:
+    """How far the sequence is, how many succeed within each limit, and what the colours of the dots mean."""
+    rates = success_rates(rows, scene.thresholds)
+    lines = [
+        (f"within {rate.degrees:g}° and {rate.metres:g} m", f"{rate.successes} of {rate.judged}") for rate in rates
+    ]
+    done = ("queries", f"{len(rows)} of {len(scene.queries)}")
+    ramp = ramp_html("0 m", f"{scene.thresholds[-1][1]:g} m off") if rates else ""
+    return table_html(Table("sequence", ("", ""), (done, *lines))) + ramp

@@ -1,0 +1,21 @@
+"""The drawn sequence as a kind of scene files that is found inside the test's own process."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from sequence_samples import plug_in
+
+from spherloc import registry
+
+
+@pytest.fixture
+def drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, str]]:
+    """Installs ``kind = "drawn"``; gives the environment in which other processes find it too."""
+    environment = plug_in(tmp_path / "plug-in")
+    monkeypatch.syspath_prepend(tmp_path / "plug-in")
+    for found in (registry.lookup, registry.names):
+        found.cache_clear()
+    yield environment
+    for found in (registry.lookup, registry.names):
+        found.cache_clear()

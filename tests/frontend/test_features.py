@@ -1,0 +1,324 @@
+"""Features lie where the picture has them, only where it may be used, and the same ones wherever a seam falls."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from spherloc.errors import InputError
+from spherloc.frontend import features as module
+from spherloc.frontend.features import METHODS, FeatureOptions, extract
+from spherloc.frontend.matching import match
+from tests.frontend.pictures import blobs, disc, fisheye, texture, view_of
+
+CLASSICAL = ("sift", "orb")
+"""What every OpenCV has, without weights."""
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("SPHERLOC_CACHE", str(tmp_path / "cache"))
+
+
+def cached(tmp_path):
+    return sorted((tmp_path / "cache" / "features").glob("*"))
+
+
+def apart(first, second, width=np.inf):
+    """(N, M) largest difference of a coordinate between pixels, around a panorama of that width."""
+    offset = np.abs(first[:, None] - second[None])
+    offset[:, :, 0] = np.minimum(offset[:, :, 0], width - offset[:, :, 0])
+    return offset.max(axis=2)
+
+
+@pytest.mark.parametrize("sigma_px", [2.5, 6.0, 14.0])
+def test_sift_lies_at_the_centre_of_a_blob(tmp_path, rng, sigma_px):
+    """In the convention of the cameras: half a pixel or OpenCV's quarter of a pixel would be seen."""
+    grid = np.stack(np.meshgrid(np.linspace(80, 560, 4), np.linspace(80, 400, 3)), axis=-1).reshape(-1, 2)
+    centres = grid + rng.uniform(-1, 1, grid.shape)
+    found = extract(view_of(tmp_path, blobs(480, 640, centres, sigma_px), fisheye_of(640, 480)))
+    error = found.pixels[:, None] - centres[None]
+    nearest = np.abs(error).max(axis=2).argmin(axis=0)
+    error = error[nearest, np.arange(len(centres))]
+    assert np.abs(error).max() < 0.15 + 0.02 * sigma_px
+    assert np.abs(error.mean(axis=0)).max() < 0.05 + 0.01 * sigma_px
+    # OpenCV's size is the diameter, 2 sigma, of the Gaussian that the blob resembles.
+    assert np.allclose(found.sizes_px[nearest], 2 * sigma_px, rtol=0.25)
+
+
+def fisheye_of(width, height):
+    camera = fisheye(max(width, height))
+    return type(camera)(width, height, camera.fx, camera.fy, width / 2, height / 2, camera.distortion)
+
+
+def test_descriptors_of_sift_are_root_normalised(tmp_path, rng):
+    """Unit vectors whose squares are the L1-normalised descriptors that OpenCV gives."""
+    image = texture(rng, 200, 300)
+    found = extract(view_of(tmp_path, image, fisheye_of(300, 200)))
+    assert len(found) > 50 and found.descriptors.dtype == np.float32
+    assert np.allclose(np.linalg.norm(found.descriptors, axis=1), 1.0, atol=1e-5)
+    sift = cv2.SIFT_create(contrastThreshold=0.02, enable_precise_upscale=True)
+    keypoints, raw = sift.detectAndCompute(image, None)
+    places = np.array([(*one.pt, one.size, np.radians(one.angle)) for one in keypoints])
+    ours = np.column_stack([found.pixels - 0.5, found.sizes_px, found.angles_rad])
+    twin = np.abs(ours[:, None] - places[None]).sum(axis=2).argmin(axis=1)
+    assert np.allclose(ours, places[twin])
+    assert np.allclose(found.descriptors**2, raw[twin] / raw[twin].sum(axis=1, keepdims=True), atol=1e-6)
+
+
+@pytest.mark.parametrize("method", CLASSICAL)
+def test_what_features_hold(tmp_path, rng, method):
+    found = extract(view_of(tmp_path, texture(rng, 240, 480)), FeatureOptions(method))
+    assert len(found) > 50 and found.method == method and found.image_size == (480, 240)
+    assert found.pixels.shape == (len(found), 2) and found.pixels.dtype == np.float64
+    assert (found.pixels >= 0.0).all() and (found.pixels <= (480, 240)).all()
+    assert (found.sizes_px > 0.0).all() and (np.abs(found.angles_rad) <= 2 * np.pi).all()
+    assert np.ptp(found.angles_rad) > 3.0
+    assert (np.diff(found.scores) <= 0.0).all()
+    assert (found.descriptors.dtype, found.descriptors.shape[1]) == ((np.float32, 128), (np.uint8, 32))[method == "orb"]
+    with pytest.raises(ValueError, match="read-only"):
+        found.pixels[0] = 0.0
+
+
+def test_the_strongest_are_kept(tmp_path, rng):
+    view = view_of(tmp_path, texture(rng, 240, 480))
+    every, some = extract(view), extract(view, FeatureOptions(max_features=40))
+    assert len(every) > 100 and len(some) == 40
+    assert np.array_equal(some.pixels, every.pixels[:40])
+    assert np.array_equal(some.descriptors, every.descriptors[:40])
+
+
+def test_orb_keeps_no_more_than_asked(tmp_path, rng):
+    view = view_of(tmp_path, texture(rng, 240, 480))
+    assert len(extract(view, FeatureOptions("orb", max_features=40))) == 40
+
+
+@pytest.mark.parametrize("method", CLASSICAL)
+def test_the_rim_of_a_fisheye_makes_no_features(tmp_path, method):
+    """A grey circle on black has nothing but its rim. Without a mask that is full of features."""
+    circle = disc(400, 180)
+    image = np.where(circle, 150, 0).astype(np.uint8)
+    image[::9, ::7] //= 2  # specks, outside and inside
+    image[disc(400, 190) & ~disc(400, 120)] = 0
+    image[disc(400, 180) & ~disc(400, 120)] = 150
+    masked = extract(view_of(tmp_path, image, fisheye(400), mask=lambda: circle), FeatureOptions(method))
+    free = extract(view_of(tmp_path, image, fisheye(400)), FeatureOptions(method))
+    radius = np.hypot(*(masked.pixels - 200.0).T)
+    assert len(masked) > 20 and radius.max() < 150.0
+    assert (np.hypot(*(free.pixels - 200.0).T) > 170.0).sum() > 20
+
+
+@pytest.mark.parametrize("method", CLASSICAL)
+def test_masked_features_use_up_no_places(tmp_path, rng, method):
+    """What must not be used is much stronger than the rest, which gets all the places nonetheless."""
+    image = texture(rng, 300, 300)
+    image[:, 100:] = np.clip(128 + 0.2 * (image[:, 100:].astype(float) - 128), 0, 255)
+    allowed = np.zeros((300, 300), bool)
+    allowed[:, 110:] = True
+    found = extract(
+        view_of(tmp_path, image, fisheye(300), mask=lambda: allowed), FeatureOptions(method, max_features=30)
+    )
+    assert len(found) == 30 and found.pixels[:, 0].min() > 110.0
+
+
+@pytest.mark.parametrize("method", CLASSICAL)
+def test_colour_and_grey_agree(tmp_path, rng, method):
+    image = texture(rng, 150, 300)
+    grey = extract(view_of(tmp_path, image, name="grey.png"), FeatureOptions(method))
+    colour = extract(view_of(tmp_path, cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), name="c.png"), FeatureOptions(method))
+    assert len(grey) > 20 and np.array_equal(grey.pixels, colour.pixels)
+    assert np.array_equal(grey.descriptors, colour.descriptors)
+
+
+@pytest.mark.parametrize("method", CLASSICAL)
+def test_nothing_to_find(tmp_path, rng, method):
+    """A flat picture and one without any usable pixel have no features, and no matches."""
+    flat = extract(view_of(tmp_path, np.full((100, 200), 90, np.uint8)), FeatureOptions(method))
+    mask = np.zeros((100, 200), bool)
+    hidden = extract(view_of(tmp_path, texture(rng, 100, 200), mask=lambda: mask), FeatureOptions(method))
+    assert len(flat) == len(hidden) == len(match(flat, hidden)) == 0
+    assert flat.pixels.shape == (0, 2) and hidden.pixels.shape == (0, 2)
+
+
+@pytest.mark.parametrize("size", [(1, 2), (2, 4), (7, 14), (31, 62)])
+@pytest.mark.parametrize("method", CLASSICAL)
+def test_tiny_pictures(tmp_path, rng, method, size):
+    found = extract(view_of(tmp_path, texture(rng, *size)), FeatureOptions(method))
+    assert len(np.unique(np.column_stack([found.pixels, found.sizes_px, found.angles_rad]), axis=0)) == len(found)
+
+
+@pytest.mark.parametrize("method", CLASSICAL)
+@pytest.mark.parametrize("roll", [32, 131, 320])
+def test_a_rolled_panorama_has_the_same_features(tmp_path, rng, method, roll):
+    """Wherever the seam falls: by a multiple of the pyramid's steps almost exactly, by any other as well as it can."""
+    width = 640
+    image = texture(rng, 320, width)
+    options = FeatureOptions(method, max_features=50_000)
+    plain = extract(view_of(tmp_path, image), options)
+    rolled = extract(view_of(tmp_path, np.roll(image, roll, axis=1), name="rolled.png"), options)
+    moved = (plain.pixels + (roll, 0)) % (width, 1000)
+    lost = apart(moved, rolled.pixels, width).min(axis=1) > 0.6
+    close = np.minimum(plain.pixels[:, 0], width - plain.pixels[:, 0]) < 30
+    close |= np.minimum(moved[:, 0], width - moved[:, 0]) < 30
+    most = 0.02 if roll == 320 and method == "sift" else 0.15
+    assert len(plain) > 200 and close.sum() > 30
+    assert lost.mean() < most and lost[close].mean() < most + 0.05
+    assert abs(len(plain) - len(rolled)) < most * len(plain)
+
+
+@pytest.mark.parametrize("width", [640, 500])
+@pytest.mark.parametrize("offset", [-0.4, -0.02, 0.0, 0.013, 0.3])
+def test_a_blob_on_the_seam_is_found_once(tmp_path, width, offset):
+    """Both of the wrapped copies are seen, on either side of the seam; also where the width halves badly."""
+    image = blobs(width // 2, width, [(offset, 90.3)], 5.0, periodic=True)
+    found = extract(view_of(tmp_path, image))
+    strong = found.scores > 0.5 * found.scores.max()
+    rows = np.column_stack([found.pixels, found.sizes_px, found.angles_rad])[strong]
+    distance = apart(found.pixels[strong], np.array([[offset % width, 90.3]]), width)[:, 0]
+    assert len(rows) >= 1 and distance.max() < 0.3
+    for first, second in zip(*np.triu_indices(len(rows), 1), strict=True):  # it may have several orientations
+        assert np.abs(np.angle(np.exp(1j * (rows[first, 3] - rows[second, 3])))) > 0.3
+
+
+def test_features_match_across_the_seam(tmp_path, rng):
+    """Content at the seam of one panorama, in the middle of the other."""
+    width = 640
+    image = texture(rng, 320, width)
+    query = extract(view_of(tmp_path, image))
+    reference = extract(view_of(tmp_path, np.roll(image, 317, axis=1), name="rolled.png"))
+    pairs = match(query, reference)
+    seam = np.minimum(query.pixels[:, 0], width - query.pixels[:, 0]) < 15
+    matched = seam[pairs.query_index]
+    expected = (query.pixels[pairs.query_index] + (317, 0)) % (width, 1000)
+    error = np.abs(expected - reference.pixels[pairs.reference_index])
+    right = np.minimum(error, (width, np.inf) - error).max(axis=1) < 1.0
+    assert seam.sum() > 10 and right[matched].sum() > 0.75 * seam.sum()
+    assert right.mean() > 0.97
+
+
+def test_the_wrap_changes_nothing_far_from_the_seam(tmp_path, rng):
+    """The same picture, taken for a panorama and for another camera that sees all of it."""
+    image = texture(rng, 320, 640)
+    options = FeatureOptions(max_features=50_000)
+    wrapped, plain = extract(view_of(tmp_path, image), options), extract(view_of(tmp_path, image, fisheye_of(640, 320)))
+    inner = [one.pixels[(np.abs(one.pixels[:, 0] - 320) < 160) & (one.sizes_px < 15)] for one in (wrapped, plain)]
+    assert len(inner[0]) > 100
+    assert apart(*inner).min(axis=0).max() < 0.01 and apart(*inner).min(axis=1).max() < 0.01
+
+
+def test_large_images_are_shrunk_for_detection(tmp_path, rng, monkeypatch):
+    """Their features are still given in the image's own pixels, also where the sides shrink unlike each other."""
+    monkeypatch.setattr(module, "MOST_PIXELS", 60_003)
+    centres = np.array([(150.5, 200.25), (411.0, 120.0), (600.2, 300.7)])
+    found = extract(view_of(tmp_path, blobs(441, 801, centres, 11.0), fisheye_of(801, 441)))
+    best = found.pixels[apart(found.pixels, centres).argmin(axis=0)]
+    assert np.abs(best - centres).max() < 0.5
+    assert np.allclose(found.sizes_px[apart(found.pixels, centres).argmin(axis=0)], 22.0, rtol=0.25)
+
+
+@pytest.mark.parametrize(
+    "options, reason",
+    [
+        ({"method": "surfer"}, "features 'surfer'.*sift, orb, akaze, surf, aliked, disk"),
+        ({"method": ["sift"]}, "features"),
+        ({"max_features": 0}, "max_features is 0.*1 to"),
+        ({"max_features": 10**9}, "max_features"),
+        ({"max_features": 4.0}, "max_features"),
+        ({"max_features": True}, "max_features"),
+        ({"method": "disk"}, "disk features need a file of weights"),
+        ({"weights": Path("a.onnx")}, "sift features have no weights"),
+    ],
+)
+def test_wrong_options(options, reason):
+    with pytest.raises(InputError, match=reason):
+        FeatureOptions(**options)
+
+
+@pytest.mark.parametrize(
+    "method, creators",
+    [("akaze", ("AKAZE_create", "xfeatures2d_AKAZE_create")), ("surf", ("xfeatures2d_SURF_create",))],
+)
+def test_what_this_opencv_may_lack(tmp_path, rng, method, creators):
+    """It is used where it is there, and named in one sentence where it is not."""
+    view = view_of(tmp_path, texture(rng, 200, 400))
+    try:
+        found = extract(view, FeatureOptions(method))
+    except InputError as error:
+        assert f"{method.upper()} features are not in this OpenCV ({cv2.__version__}); " in str(error)
+        assert "\n" not in str(error) and "AKAZE_create" not in dir(cv2) or method == "surf"
+    else:
+        assert len(found) > 20 and len(match(found, found)) > 10
+    assert method in METHODS
+
+
+def test_what_cannot_be_read(tmp_path, rng):
+    view = view_of(tmp_path, texture(rng, 100, 200))
+    view.path.write_bytes(b"no image")
+    with pytest.raises(InputError, match=r"picture\.png"):
+        extract(view)
+    view.path.unlink()
+    with pytest.raises(InputError, match="no such file"):
+        extract(view)
+    assert not cached(tmp_path)
+
+
+def test_the_second_time_comes_from_the_cache(tmp_path, rng):
+    view = view_of(tmp_path, texture(rng, 150, 300))
+    first = extract(view)
+    (file,) = cached(tmp_path)
+    with np.load(file, allow_pickle=False) as stored:
+        changed = dict(stored)
+    changed["table"][:, 4] += 1000.0
+    np.savez(file, **changed)
+    again = extract(view)
+    assert np.array_equal(again.scores, first.scores + 1000.0)
+    assert np.array_equal(again.pixels, first.pixels) and np.array_equal(again.descriptors, first.descriptors)
+    assert not again.pixels.flags.writeable
+
+
+def test_the_cache_knows_what_features_depend_on(tmp_path, rng):
+    """Content, options, mask, and whether the picture is a panorama; not the file's name."""
+    image = texture(rng, 100, 200)
+    mask = np.ones((100, 200), bool)
+    mask[:30] = False
+    views = [view_of(tmp_path, image), view_of(tmp_path, image, mask=lambda: mask)]
+    views += [view_of(tmp_path, image, fisheye_of(200, 100)), view_of(tmp_path, np.roll(image, 9, 0), name="rolled.png")]
+    for number, view in enumerate(views, start=1):
+        extract(view)
+        assert len(cached(tmp_path)) == number
+    extract(views[0], FeatureOptions("orb"))
+    extract(views[0], FeatureOptions(max_features=10))
+    extract(view_of(tmp_path, image, name="same content.png"))
+    assert len(cached(tmp_path)) == len(views) + 2
+
+
+@settings(max_examples=60)
+@given(data=st.data())
+def test_a_damaged_cache_is_computed_again(data, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("damaged")
+    view = view_of(folder, texture(np.random.default_rng(0), 60, 120))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SPHERLOC_CACHE", str(folder / "cache"))
+        first = extract(view)
+        (file,) = cached(folder)
+        content = bytearray(file.read_bytes())
+        if data.draw(st.booleans()):
+            del content[data.draw(st.integers(0, len(content) - 1)) :]
+        else:
+            # The first and last bytes are the headers.
+            place = data.draw(st.integers(0, len(content) - 1) | st.integers(0, 200) | st.integers(-300, -1))
+            content[place] ^= 1 << data.draw(st.integers(0, 7))
+        file.write_bytes(bytes(content))
+        again = extract(view)
+    assert len(first) > 5 and np.array_equal(again.pixels, first.pixels)
+    assert np.array_equal(again.descriptors, first.descriptors) and np.array_equal(again.scores, first.scores)
+
+
+def test_without_a_place_for_the_cache(tmp_path, rng, monkeypatch):
+    (tmp_path / "file").write_text("in the way")
+    monkeypatch.setenv("SPHERLOC_CACHE", str(tmp_path / "file"))
+    view = view_of(tmp_path, texture(rng, 100, 200))
+    assert np.array_equal(extract(view).pixels, extract(view).pixels)
