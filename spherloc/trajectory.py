@@ -233,10 +233,10 @@ def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
 
 def _words(content: bytes, place: str) -> list[str]:
     """The words of a line between spaces and commas; none for an empty line and a comment."""
-    if content.lstrip().startswith(b"#"):
-        return []
     if len(content) == _MAX_LINE_BYTES:
         raise InputError(f"{place}: is longer than {_MAX_LINE_BYTES} bytes; give one pose a line.")
+    if content.lstrip().startswith(b"#"):
+        return []
     # An underscore is no part of a number, though Python reads over it.
     if not content.isascii() or b"_" in content:
         raise InputError(f"{place}: holds characters that no number has; start comments with #.")

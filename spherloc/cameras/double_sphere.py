@@ -1,8 +1,9 @@
-"""Double sphere camera model (Usenko, Demmel, Cremers: The Double Sphere Camera Model, 3DV 2018, Sec. III).
+"""Double sphere camera model (Usenko, Demmel, Cremers: The Double Sphere Camera Model, 3DV 2018).
 
 A bearing is moved by xi along z, as in the unified model, and then goes through that model's projection (``_unified``
 with beta = 1). Both steps can fold: the first, with xi > 1, where z = -1/xi, the second, with alpha > 1/2, where the
 moved ray has z = -d2 (1 - alpha) / alpha. With xi >= 1 the first comes first, since the moved ray never looks back.
+These are the folds themselves; the limit w2 that the paper prints is up to a few degrees off the second one.
 """
 
 from dataclasses import dataclass
@@ -64,8 +65,8 @@ class DoubleSphere:
             return second
         # At the end of the first sphere the moved ray has the sine 1 / xi, and it looks sideways where xi is 1.
         sine = min(1.0 / self.xi, 1.0)
-        first = sine / (self.alpha + (1.0 - self.alpha) * sqrt(1.0 - sine * sine))
-        return min(first * (1.0 - RIM_MARGIN), second)
+        depth = self.alpha + (1.0 - self.alpha) * sqrt(1.0 - sine * sine)
+        return min(sine / depth * (1.0 - RIM_MARGIN), second) if depth > 0.0 else second
 
     def project(self, points: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Pixels (N, 2) of camera-frame points (N, 3) in metres, and the mask (N,) of directions that are valid.

@@ -1,6 +1,6 @@
 """Extended unified camera model (Khomutenko, Garnier, Martinet: An enhanced unified camera model, RA-L 2015).
 
-The formulas and the limits are those of Usenko et al. 2018, Sec. II-C. COLMAP, Kalibr and Basalt call it EUCM.
+The formulas and the limits are as in Usenko, Demmel, Cremers (3DV 2018). COLMAP, Kalibr and Basalt have it.
 """
 
 from dataclasses import dataclass

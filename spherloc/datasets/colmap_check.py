@@ -63,9 +63,7 @@ class _Reader:
             raise self.broken(f"{self.size - self.at} bytes follow the last record")
 
     def broken(self, what: str) -> InputError:
-        return InputError(
-            f"{self.path}, before byte {self.at}: {what}; the file is damaged, so export the model again."
-        )
+        return InputError(f"{self.path}, up to byte {self.at}: {what}; replace the damaged file.")
 
 
 def walk_binary(folder: Path) -> Walked:

@@ -156,18 +156,20 @@ def _frames(lines: Iterator[_Line], walked: Walked) -> None:
 
 def _images(lines: Iterator[_Line], walked: Walked) -> None:
     for line in _records(lines):
-        *head, name = [*line.text.split(maxsplit=9), ""][:10]
-        if len(head) < 9:
-            raise line.broken("too few values instead of IMAGE_ID, a pose, CAMERA_ID and NAME")
-        number, camera_id = line.whole(head[0]), line.whole(head[8])
-        check_pose(line.numbers(head[1:8]), line.broken, f"image {number}")
+        words = line.words(10, "IMAGE_ID, a pose, CAMERA_ID and NAME")
+        number, *pose, camera_id, name = words[:10]
+        check_pose(line.numbers(pose), line.broken, f"image {number}")
+        if len(words) > 10:
+            raise line.broken(
+                "the image's name has a space, which only COLMAP's binary form can hold"
+            )
         second = next(lines, None)
         if second is None:
             raise line.broken("the line with the observations after it is missing")
         observations = _observations(second)
         check_observations(observations, second.broken, f"image {number}")
-        image = Observed(name, camera_id, len(observations), partial(_same, observations))
-        walked.image(number, image, line.broken)
+        image = Observed(name, line.whole(camera_id), len(observations), partial(_same, observations))
+        walked.image(line.whole(number), image, line.broken)
 
 
 def _same(observations: NDArray[Any]) -> NDArray[Any]:

@@ -147,9 +147,7 @@ class Walked:
         there[there] = places[there] < counts[index[there]]
         if not there.all():
             first = int(np.flatnonzero(~there)[0])
-            raise broken(
-                f"a point is seen in keypoint {places[first]} of image {image_ids[first]}, which does not exist"
-            )
+            raise broken(f"a point has keypoint {places[first]} of image {image_ids[first]}, which does not exist")
 
 
 def check_pose(numbers: Sequence[float], broken: Broken, what: str) -> None:

@@ -121,14 +121,15 @@ def _truth(path: Path, cameras: Mapping[str, Camera]) -> tuple[dict[str, FloatAr
         for start in range(len(parts)):
             by_tail.setdefault("/".join(parts[start:]), []).append(name)
     poses, others = {}, 0
-    for named, cam_from_map in read_results(path).items():
+    results = read_results(path)
+    for named, cam_from_map in results.items():
         meant = [named] if named in cameras else by_tail.get(named, [])
         if len(meant) > 1:
             raise InputError(f"{path}: {named} may be {meant[0]} or {meant[1]}; name the images with their folders.")
         if meant:
             poses[meant[0]] = cam_from_map
         others += not meant
-    remarks = [f"{others} poses of {path} are of no query."] if others else []
+    remarks = [f"{others} of {len(results)} poses in {path} are of no query."] if others else []
     if len(poses) < len(cameras):
         remarks.append(f"{len(cameras) - len(poses)} of {len(cameras)} queries have no pose in {path}.")
     return poses, remarks
@@ -148,9 +149,13 @@ def _pairs(
     in_map = {view.name: tuple(name for name in listed.get(view.name, ()) if name in known) for view in queries}
     pairs = {name: names for name, names in in_map.items() if names}
     remarks = []
-    absent = sum(name not in known for view in queries for name in listed.get(view.name, ()))
+    asked = [name for view in queries for name in listed.get(view.name, ())]
+    absent = [name for name in asked if name not in known]
     if absent:
-        remarks.append(f"{absent} pairs of {file} are skipped: their reference is none of the map.")
+        remarks.append(
+            f"{len(absent)} of {len(asked)} pairs in {file} are skipped: their reference is not in the map, the first "
+            f"is {absent[0]}."
+        )
     alone = [name for name in in_map if name not in pairs]
     if alone:
         remarks.append(f"{len(alone)} of {len(queries)} queries have no pair in {file}, the first is {alone[0]}.")

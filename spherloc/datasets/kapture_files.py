@@ -94,7 +94,8 @@ def read_kapture(root: Path, where: str) -> Kapture:
     known = devices | {rig for members in rigs.values() for rig in members}
     trajectories, open_poses = _trajectories(trajectories_file, known)
     if open_poses:
-        remarks.append(f"{open_poses} poses of {trajectories_file} lack a rotation or a position and are skipped.")
+        count = len(trajectories) + open_poses
+        remarks.append(f"{open_poses} of {count} poses in {trajectories_file} lack a rotation or a position: skipped.")
     return Kapture(cameras, rigs, trajectories, _records(records_file, devices), tuple(remarks))
 
 

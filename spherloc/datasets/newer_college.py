@@ -161,8 +161,8 @@ def _queries(place: _Place, rig: _Rig) -> tuple[list[View], list[str]]:
     without_gravity = len(images) - without_pose - len(views)
     return views, _remarks(
         (untimed, f"images of {folder_of_images} have no time in their names ({NAME_RULE})"),
-        (without_pose, f"of the {len(images)} query images fall into gaps of {truth_file} or outside of it"),
-        (without_gravity, f"of the {len(images)} query images fall into gaps of {imu_file} or outside of it"),
+        (without_pose, f"of the {len(images)} query images fall into gaps of {truth_file.name} or outside of it"),
+        (without_gravity, f"of the {len(images)} query images fall into gaps of {imu_file.name} or outside of it"),
     )
 
 
@@ -187,7 +187,10 @@ def _references(place: _Place, rig: _Rig) -> tuple[list[View], list[str]]:
             views.append(_view(image, rig.camera, cam_from_map, PointCloudLift(points, rig.camera, cam_from_map)))
     return views, _remarks(
         (untimed, f"reference images have no time in their names ({NAME_RULE})"),
-        (len(images) - len(views), f"of the {len(images)} reference images fall into gaps of {truth_file}"),
+        (
+            len(images) - len(views),
+            f"of the {len(images)} reference images fall into gaps of {truth_file.name} or outside of it",
+        ),
     )
 
 

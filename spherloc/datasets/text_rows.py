@@ -19,8 +19,8 @@ _LENGTH_TOLERANCE = 0.05
 _LARGEST_M = 1e9
 
 _PICKLES = (".pkl", ".pickle", ".pt", ".pth")
-_PICKLE_START = re.compile(rb"\x80[\x02-\x05]|\(?[dl]p\d+\n|c[\w.]+\n\w+\n")
-"""Binary protocols announce themselves; text protocols begin with a memo or with the name of a class."""
+_PICKLE_START = re.compile(rb"\x80[\x02-\x05]|\(?[dl]p\d+\n|[}\]]q|c[\w.]+\n\w+\n")
+"""Binary protocols announce themselves; the older ones begin with a container or the name of a class."""
 
 
 def refuse_pickle(path: Path) -> None:

@@ -150,7 +150,7 @@ def _damaged(place: str, what: str) -> InputError:
 
 
 def csv_text(rows: Iterable[QueryResult], header: bool = True) -> str:
-    """The rows as CSV: unknown values are empty, and no cell is taken for a formula by a spreadsheet."""
+    """The rows as CSV, a line each: what is unknown is empty, and no spreadsheet takes a cell for a formula."""
     file = io.StringIO(newline="")
     writer = csv.writer(file, lineterminator="\n")
     if header:
@@ -166,6 +166,7 @@ def _cell(value: Any) -> str:
     if isinstance(value, tuple):
         value = " ".join(value)
     if isinstance(value, str):
-        # A file name such as "=cmd()" must stay a text where the table is opened.
-        return f"'{value}" if value[:1] in ("=", "+", "-", "@", "\t", "\r", "\n") else value
+        # A line break in a file name must not break the row, and "=cmd()" must stay a text where the table is opened.
+        value = "".join(character if character.isprintable() else " " for character in value)
+        return f"'{value}" if value.lstrip()[:1] in ("=", "+", "-", "@") else value
     return repr(value)

@@ -18,6 +18,8 @@ Descriptors = NDArray[np.float32 | np.uint8]
 
 SIFT_CONTRAST = 0.02
 """COLMAP's threshold (its peak threshold is a third of it): half of OpenCV's, which finds little in dim rooms."""
+SMALLEST_PX = 16
+"""OpenCV fails on images with a smaller side, in which there is nothing to find."""
 
 
 @dataclass(frozen=True)
@@ -26,12 +28,12 @@ class Kind:
 
     run: Callable[[ByteImage, ByteImage, int, Path | None], tuple[FloatArray, Any]]
     """``detect`` of this kind: image, mask, most features, weights -> keypoints (N, 5) and descriptors."""
+    reach: float
+    """How far around a keypoint its detector looks, as a part of the keypoint's size."""
     binary: bool = False
     """Its descriptors are bits, compared by their Hamming distance."""
     learned: bool = False
     """It needs a file of weights."""
-    reach: float = 0.5
-    """How far its detector looks around a keypoint, as a part of the keypoint's size."""
 
 
 def detect(
@@ -43,10 +45,11 @@ def detect(
     descriptors (N, D). There may be more than ``most`` features. Raises ``InputError`` if this OpenCV lacks the method
     or its weights cannot be used.
     """
-    keypoints, descriptors = KINDS[method].run(image, mask, most, weights)
-    if descriptors is None or len(keypoints) == 0:
-        return np.empty((0, 5)), np.empty((0, 1), np.uint8 if KINDS[method].binary else np.float32)
-    return keypoints, descriptors
+    if min(mask.shape) >= SMALLEST_PX and mask.any():
+        keypoints, descriptors = KINDS[method].run(image, mask, most, weights)
+        if descriptors is not None and len(keypoints) > 0:
+            return keypoints, descriptors
+    return np.empty((0, 5)), np.empty((0, 1), np.uint8 if KINDS[method].binary else np.float32)
 
 
 def keypoint_table(keypoints: Any, shift_px: float = 0.5) -> FloatArray:
@@ -113,10 +116,11 @@ def _contributed(name: str) -> Any:
 
 
 KINDS = {
-    "sift": Kind(_sift),
-    "orb": Kind(_orb, binary=True, reach=0.2),
-    "akaze": Kind(_akaze, binary=True),
-    "surf": Kind(_surf),
-    "aliked": Kind(learned.aliked, learned=True),
-    "disk": Kind(learned.disk, learned=True),
+    # Two standard deviations of the Gaussian at which the keypoint was found; size means something else to each.
+    "sift": Kind(_sift, reach=1.0),
+    "orb": Kind(_orb, reach=0.2, binary=True),
+    "akaze": Kind(_akaze, reach=0.7, binary=True),
+    "surf": Kind(_surf, reach=0.5),
+    "aliked": Kind(learned.aliked, reach=1.0, learned=True),
+    "disk": Kind(learned.disk, reach=1.0, learned=True),
 }

@@ -15,7 +15,8 @@ from spherloc.frontend import retrieval
 from spherloc.frontend.features import Features, extract
 from spherloc.frontend.frontend_options import FrontendOptions, frontend_options
 from spherloc.frontend.matching import match
-from spherloc.frontend.outlier_rate import outlier_rate
+from spherloc.frontend.outlier_rate import wrong_matches
+from spherloc.frontend.triangulation import TriangulationLift
 from spherloc.frontend.view import Matcher, Matches, View
 from spherloc.geometry import camera_centre
 
@@ -66,6 +67,9 @@ class ImageMatcher:
                 found.append(_correspondences(features, reference, self.options))
             except InputError as error:
                 remarks.append(f"Reference {reference.name} was skipped: {error}")
+                continue
+            if isinstance(reference.lift, TriangulationLift):
+                remarks += reference.lift.remarks
         return _joined(found, tried, remarks)
 
     def _candidates(self, query: View, features: Features) -> tuple[list[View], list[str]]:
@@ -73,7 +77,7 @@ class ImageMatcher:
         remarks: list[str] = []
         if self.pairs is not None:
             if query.name in self.pairs:
-                return self._paired(query)
+                return self._paired(query, self.pairs[query.name])
             remarks.append(f"{query.name} is not in the list of pairs, so that its references were retrieved.")
         others = [index for index, view in enumerate(self.references) if not _same_file(view, query)]
         if len(others) > self.options.references:
@@ -84,8 +88,7 @@ class ImageMatcher:
             others = [place for place in order if place in allowed][: self.options.references]
         return [self.references[place] for place in others], remarks
 
-    def _paired(self, query: View) -> tuple[list[View], list[str]]:
-        names = (self.pairs or {})[query.name]
+    def _paired(self, query: View, names: Sequence[str]) -> tuple[list[View], list[str]]:
         known = [self._by_name[name] for name in names if name in self._by_name]
         unknown = [name for name in names if name not in self._by_name]
         remarks = []
@@ -160,9 +163,10 @@ class _Found:
     pixels: FloatArray
     points: FloatArray
     reference_pixels: FloatArray
-    ratios: FloatArray
-    unlifted: int
-    """Matches whose pixel in the reference has no point in the map."""
+    wrong: float | None
+    """How many of them are probably wrong, if anything is known of it."""
+    matches: int
+    """Before lifting."""
 
 
 def _correspondences(query: Features, reference: View, options: FrontendOptions) -> _Found:
@@ -172,22 +176,24 @@ def _correspondences(query: Features, reference: View, options: FrontendOptions)
     matches = match(query, features, options.matching)
     reference_pixels = features.pixels[matches.reference_index]
     points, lifted = reference.lift(reference_pixels)
+    wrong = None
+    if options.matching.method == "nearest" and len(matches):
+        wrong = wrong_matches(len(query), len(matches), options.matching.ratio) * float(lifted.mean())
     return _Found(
         reference=reference,
         pixels=query.pixels[matches.query_index[lifted]],
         points=points[lifted],
         reference_pixels=reference_pixels[lifted],
-        ratios=matches.ratios[lifted],
-        unlifted=int(np.count_nonzero(~lifted)),
+        wrong=wrong,
+        matches=len(matches),
     )
 
 
 def _joined(found: Sequence[_Found], tried: Sequence[View], remarks: list[str]) -> Matches:
     ranked = sorted((part for part in found if len(part.pixels)), key=lambda part: -len(part.pixels))
-    unlifted = sum(part.unlifted for part in found)
-    total = unlifted + sum(len(part.pixels) for part in found)
-    if unlifted:
-        remarks.append(f"{unlifted:,} of {total:,} matches have no point in the map.")
+    total, lifted = sum(part.matches for part in found), sum(len(part.pixels) for part in found)
+    if lifted < total:
+        remarks.append(f"{total - lifted:,} of {total:,} matches have no point in the map.")
     if not ranked:
         none = np.empty((0, 2))
         return Matches(none, np.empty((0, 3)), tuple(tried), np.empty(0, np.int64), none, None, tuple(remarks))
@@ -202,9 +208,15 @@ def _joined(found: Sequence[_Found], tried: Sequence[View], remarks: list[str]) 
         references=tuple(part.reference for part in ranked),
         reference_index=index[keep],
         reference_pixels=np.concatenate([part.reference_pixels for part in ranked])[keep],
-        estimated_outlier_rate=outlier_rate([part.ratios for part in ranked]),
+        estimated_outlier_rate=_outlier_rate(ranked, int(keep.sum())),
         remarks=tuple(remarks),
     )
+
+
+def _outlier_rate(ranked: Sequence[_Found], kept: int) -> float | None:
+    """Of what is kept: repetitions, which are left out, are of right matches."""
+    wrong = [part.wrong for part in ranked if part.wrong is not None]
+    return min(1.0, sum(wrong) / kept) if wrong else None
 
 
 def _repeated(pixels: FloatArray, points: FloatArray, ranges: FloatArray) -> BoolArray:

@@ -11,7 +11,7 @@ from spherloc.worlds.mesh import MeshBuilder
 from spherloc.worlds.occluder_tiles import occluder_tiles
 from spherloc.worlds.outdoor_tiles import nature_tiles
 from spherloc.worlds.rooms import Opening, Room, add_room
-from spherloc.worlds.world import Lane, World
+from spherloc.worlds.world import Lane, Surfaces, World
 
 FloatArray = NDArray[np.float64]
 
@@ -56,7 +56,22 @@ def _rooms() -> tuple[Room, ...]:
 
 
 def build_apartment(seed: int) -> World:
-    """11 m x 10.2 m: living room, kitchen, hall, bedroom, study, bath; the path passes through five of them."""
+    """11 m x 10.2 m: living room, kitchen, hall, bedroom, study, bath; the path passes through all but the bath."""
+    corners = [(1.0, 9.3), (2.0, 8.0), (2.0, 5.75), (3.2, 5.75), (3.2, 2.5), (7.6, 2.4), (8.2, 3.6), (8.2, 5.75)]
+    way = _rounded(np.array([*corners, (6.2, 5.75), (6.2, 8.6)]))
+    return World(
+        kind="apartment",
+        seed=seed,
+        provenance=PROVENANCE,
+        build=lambda: _surfaces(seed),
+        path=np.column_stack([way, np.full(len(way), EYE_M)]),
+        lanes=(Lane("person", (-0.7, 0.7), 2.0), Lane("box", (-0.9, 0.9), 1.0)),
+        indoor=True,
+        lamp_reach_m=6.0,
+    )
+
+
+def _surfaces(seed: int) -> Surfaces:
     rng = np.random.default_rng([seed, 12])
     atlas = pack(room_tiles(rng) | furniture_tiles(rng) | nature_tiles(rng) | occluder_tiles(rng))
     builder = MeshBuilder(atlas)
@@ -66,23 +81,9 @@ def build_apartment(seed: int) -> World:
     _living(builder, rng, pictures)
     _kitchen(builder, rng, pictures)
     _quiet_rooms(builder, rng, pictures)
-    lamps = [put.ceiling_lamp(builder, spot) for spot in ((3, 2.6), (8.5, 2.5), (2.8, 5.75), (8, 5.75))]
-    lamps += [put.ceiling_lamp(builder, spot) for spot in ((2.3, 8.4), (6.4, 8.4), (9.6, 8.4))]
-    corners = [(1.0, 9.3), (2.0, 8.0), (2.0, 5.75), (3.2, 5.75), (3.2, 2.5), (7.6, 2.4), (8.2, 3.6), (8.2, 5.75)]
-    corners += [(6.2, 5.75), (6.2, 8.6)]
-    way = _rounded(np.array(corners))
-    return World(
-        kind="apartment",
-        seed=seed,
-        provenance=PROVENANCE,
-        mesh=with_dark_corners(builder.mesh(), 1.2),
-        atlas=atlas,
-        path=np.column_stack([way, np.full(len(way), EYE_M)]),
-        lanes=(Lane("person", (-0.7, 0.7), 2.0), Lane("box", (-0.9, 0.9), 1.0)),
-        lamps=np.array(lamps),
-        indoor=True,
-        lamp_reach_m=6.0,
-    )
+    places = ((3, 2.6), (8.5, 2.5), (2.8, 5.75), (8, 5.75), (2.3, 8.4), (6.4, 8.4), (9.6, 8.4))
+    lamps = np.array([put.ceiling_lamp(builder, place) for place in places])
+    return Surfaces(with_dark_corners(builder.mesh(), 1.2), atlas, lamps)
 
 
 def _rounded(corners: FloatArray) -> FloatArray:

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import cv2
 import numpy as np
@@ -34,7 +35,7 @@ class Atlas:
     @cached_property
     def pyramid(self) -> tuple[ByteImage, ...]:
         """The atlas, and copies of half the size each."""
-        levels = [self.texels]
+        levels: list[Any] = [self.texels]
         for _ in range(int(np.log2(self.boxes[:, 2:].min())), 0, -1):
             height, width = levels[-1].shape[:2]
             levels.append(cv2.resize(levels[-1], (width // 2, height // 2), interpolation=cv2.INTER_AREA))

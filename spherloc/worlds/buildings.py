@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spherloc.worlds.mesh import WHITE, MeshBuilder
+from spherloc.worlds.mesh import WHITE, MeshBuilder, xyz
 from spherloc.worlds.outdoor_tiles import DOOR, SHOPS, WINDOW
 
 FloatArray = NDArray[np.float64]
@@ -71,9 +71,19 @@ def add_opening(
 
 
 def add_house(
-    builder: MeshBuilder, rng: np.random.Generator, front: Front, bays: int, storeys: int, style: int, number: int
+    builder: MeshBuilder,
+    rng: np.random.Generator,
+    front: Front,
+    bays: int,
+    storeys: int,
+    style: int,
+    number: int,
+    recessed: int = 3,
 ) -> None:
-    """A house of ``bays`` x ``storeys`` behind ``front``: shops or a door below, windows above, cornice, roof."""
+    """A house of ``bays`` x ``storeys`` behind ``front``: shops or a door below, windows above, cornice, roof.
+
+    The windows of the lowest ``recessed`` storeys lie deeper than the wall; farther ones look the same without.
+    """
     variant = int(rng.integers(2))
     tint = np.clip(rng.uniform(0.86, 1.0) + rng.uniform(-0.04, 0.04, 3), 0, 1)
     door = int(rng.integers(bays))
@@ -95,7 +105,11 @@ def add_house(
                 _poster(builder, rng, front, left)
         for storey in range(1, storeys):
             lit = {"lit": bool(rng.random() < 0.4), "tint": tint}
-            add_opening(builder, front, left, storey * STOREY_M, f"window_{style}_{variant}", WINDOW, **lit)
+            low, tile = storey * STOREY_M, f"window_{style}_{variant}"
+            if storey < recessed:
+                add_opening(builder, front, left, low, tile, WINDOW, **lit)
+            else:
+                builder.quad(front.patch(left, left + BAY_M, low, low + STOREY_M), tile, **lit)
             if style == 4 and storey == 2 and bay % 2 == 0:
                 _balcony(builder, front, left, storey * STOREY_M)
     _top(builder, rng, front, bays, storeys, style)
@@ -146,4 +160,4 @@ def _top(builder: MeshBuilder, rng: np.random.Generator, front: Front, bays: int
     for _ in range(int(rng.integers(1, 3))):
         middle = front.at(rng.uniform(1, width - 1), height + 0.4 + 0.6 * rise, 3.0)
         turn = float(np.arctan2(front.right[1], front.right[0]))
-        builder.box(middle - [0.4, 0.3, 0.8], middle + [0.4, 0.3, 1.6], "wall_0", turn)
+        builder.box(middle - xyz(0.4, 0.3, 0.8), middle + xyz(0.4, 0.3, 1.6), "wall_0", turn)

@@ -14,7 +14,7 @@ from spherloc.cameras.base import Camera
 from spherloc.disk_cache import cache_folder, key_of, store
 from spherloc.errors import InputError
 from spherloc.images import read_image
-from spherloc.worlds.conditions import Conditions
+from spherloc.worlds.conditions import CLEAR, Conditions
 from spherloc.worlds.render import Render, draw
 from spherloc.worlds.world import World
 
@@ -29,7 +29,7 @@ def sources_hash() -> str:
 
 
 def image_path(
-    world: World, camera: Camera, cam_from_world: FloatArray, conditions: Conditions = Conditions(), seed: int = 0
+    world: World, camera: Camera, cam_from_world: FloatArray, conditions: Conditions = CLEAR, seed: int = 0
 ) -> Path:
     """Where the picture is kept, whether or not it was drawn yet; its distances are beside it with the suffix .npz."""
     place = np.ascontiguousarray(cam_from_world, np.float64).tobytes()
@@ -38,12 +38,12 @@ def image_path(
 
 
 def render(
-    world: World, camera: Camera, cam_from_world: FloatArray, conditions: Conditions = Conditions(), seed: int = 0
+    world: World, camera: Camera, cam_from_world: FloatArray, conditions: Conditions = CLEAR, seed: int = 0
 ) -> Render:
     """A picture and its distances, from the cache on disk if they are there.
 
-    ``cam_from_world`` (3, 4) is [R | t], metres. The same arguments give the same picture; a damaged file of the cache is drawn
-    again, and a cache that cannot be written costs only time.
+    ``cam_from_world`` (3, 4) is [R | t], metres. The same arguments give the same picture; a damaged file of the cache
+    is drawn again, and a cache that cannot be written costs only time.
     """
     path = image_path(world, camera, cam_from_world, conditions, seed)
     image, range_m = _stored_image(path, camera), stored_range(path, camera)

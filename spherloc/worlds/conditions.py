@@ -1,7 +1,7 @@
 """Under which conditions a picture is taken: light, season, passers-by, and the camera's own faults."""
 
-import math
 from dataclasses import dataclass
+from typing import Any
 
 from spherloc.errors import InputError, show
 
@@ -33,7 +33,9 @@ LIGHTS = {
     "morning": Light((1.1, 0.92, 0.68), (0.38, 0.44, 0.55), 150, 24, (0.16, 0.30, 0.62), (0.85, 0.80, 0.76), 0.3, 0.0),
     "overcast": Light((0.0, 0.0, 0.0), (0.82, 0.86, 0.92), 55, 50, (0.62, 0.66, 0.72), (0.82, 0.84, 0.87), 1.0, 0.0),
     "dusk": Light((0.55, 0.26, 0.10), (0.17, 0.17, 0.26), 205, 9, (0.06, 0.08, 0.22), (0.85, 0.38, 0.16), 0.55, 0.8),
-    "night": Light((0.03, 0.035, 0.05), (0.02, 0.024, 0.04), 100, 50, (0.006, 0.008, 0.02), (0.03, 0.03, 0.05), 0.2, 1.0),
+    "night": Light(
+        (0.03, 0.035, 0.05), (0.02, 0.024, 0.04), 100, 50, (0.006, 0.008, 0.02), (0.03, 0.03, 0.05), 0.2, 1.0
+    ),
 }
 """By name."""
 
@@ -78,13 +80,16 @@ class Conditions:
             if getattr(self, key) not in known:
                 raise InputError(f"conditions: no {key} {show(getattr(self, key))}; there are {', '.join(known)}.")
         for key, (lowest, highest) in LIMITS.items():
-            value = getattr(self, key)
+            value: Any = getattr(self, key)
             if value is None and key.startswith("sun_"):
                 continue
             whole = key == "occluders"
             number = isinstance(value, int if whole else (int, float)) and not isinstance(value, bool)
-            if not number or not math.isfinite(value) or not lowest <= value <= highest:
+            if not number or not lowest <= value <= highest:
                 kind = "whole number" if whole else "number"
                 raise InputError(f"conditions: {key} is {show(value)}; give a {kind} from {lowest:g} to {highest:g}.")
-            if not whole:
-                object.__setattr__(self, key, float(value))
+            object.__setattr__(self, key, value if whole else 1.0 * value)
+
+
+CLEAR = Conditions()
+"""A clear summer day."""

@@ -86,7 +86,10 @@ def plant(builder: MeshBuilder, rng: np.random.Generator, place: XY) -> None:
 
 
 def ceiling_lamp(builder: MeshBuilder, place: XY) -> tuple[float, float, float]:
-    """A shade under the ceiling; returns where its light is."""
-    builder.prism([*place, 2.2], [*place, 2.45], (0.22, 0.14), "shade", 10)
-    builder.prism([*place, 2.45], [*place, 2.6], (0.01, 0.01), "white", 4)
-    return (*place, 2.12)
+    """A flat shade under the ceiling; returns where its light is."""
+    builder.prism([*place, 2.5], [*place, 2.6], (0.2, 0.24), "shade", 12)
+    angle = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    flat = np.column_stack([np.cos(angle), np.sin(angle)])
+    rim = np.column_stack([place + 0.2 * flat, np.full(12, 2.5)])
+    builder.add(rim, [(0, k + 1, k) for k in range(1, 11)], 0.5 + 0.5 * flat, "shade", lit=True)
+    return (*place, 2.4)

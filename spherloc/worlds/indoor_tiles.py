@@ -1,5 +1,6 @@
 """Textures of an apartment: walls with next to nothing on them, furniture, and a few things that stand out."""
 
+import cv2
 import numpy as np
 
 from spherloc.worlds import paint
@@ -24,7 +25,7 @@ def room_tiles(rng: np.random.Generator) -> Tiles:
     flat = paint.plain(256, 256, (0.88, 0.91, 0.92))
     tiles["ceramic"] = ("wall", paint.finish(0.25 * ceramic + 0.75 * np.where(ceramic < 0.69, ceramic, flat)))
     boards = paint.bricks(rng, (256, 256), (14, 2), (0.60, 0.42, 0.26), (0.30, 0.20, 0.12))
-    grain = 1 + 0.12 * np.repeat(paint.noise(rng, 256, 32, 64, 3), 8, axis=1)[..., None]
+    grain = 1 + 0.12 * cv2.resize(paint.noise(rng, 256, 32, 128, 3), (256, 256))[..., None]
     tiles["parquet"] = ("floor", paint.finish(boards * grain))
     stone = paint.bricks(rng, (256, 256), (6, 6), (0.62, 0.60, 0.58), (0.42, 0.41, 0.40))
     tiles["stone_floor"] = ("floor", paint.finish(paint.mottle(stone, rng, 32, 0.07, 3)))
@@ -43,7 +44,7 @@ def furniture_tiles(rng: np.random.Generator) -> Tiles:
     """Wood, cloth, books, kitchen fronts, pictures."""
     tiles: Tiles = {}
     for number, colour in enumerate(((0.52, 0.34, 0.19), (0.80, 0.68, 0.50), (0.24, 0.17, 0.13))):
-        rings = np.repeat(paint.noise(rng, 128, 16, 32, 4), 8, axis=1)[..., None]
+        rings = cv2.resize(paint.noise(rng, 8, 128, 40, 4), (128, 128))[..., None]
         tiles[f"timber_{number}"] = ("wood", paint.finish(paint.plain(128, 128, colour) * (1 + 0.22 * rings)))
     for number, colour in enumerate(((0.28, 0.36, 0.46), (0.62, 0.30, 0.24), (0.82, 0.80, 0.74))):
         weave = paint.plain(128, 128, colour) * (1 + 0.10 * rng.standard_normal((128, 128, 1)).astype(np.float32))

@@ -49,6 +49,11 @@ class Mesh:
         return np.sqrt(flat / np.maximum(world, 1e-12)).astype(np.float32)
 
 
+def xyz(x: float, y: float, z: float) -> FloatArray:
+    """A vector (3,)."""
+    return np.array([x, y, z], dtype=np.float64)
+
+
 def joined(meshes: Sequence[Mesh]) -> Mesh:
     """One mesh of several that share an atlas."""
     starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
@@ -115,7 +120,7 @@ class MeshBuilder:
 
         def corner(x: int, y: int, z: int) -> FloatArray:
             dx, dy, dz = half * (x, y, z)
-            return middle + (c * dx - s * dy, s * dx + c * dy, dz)
+            return middle + xyz(c * dx - s * dy, s * dx + c * dy, dz)
 
         for (x0, y0), (x1, y1) in (
             ((-1, -1), (1, -1)),

@@ -1,9 +1,11 @@
 """Cars, people and boxes that stand about in one picture and not in the map."""
 
+from itertools import pairwise
+
 import numpy as np
 from numpy.typing import NDArray
 
-from spherloc.worlds.mesh import MeshBuilder, joined
+from spherloc.worlds.mesh import MeshBuilder, joined, xyz
 from spherloc.worlds.rays import RayScene
 from spherloc.worlds.world import Lane, World
 
@@ -57,10 +59,19 @@ def add_car(builder: MeshBuilder, rng: np.random.Generator, place: FloatArray, t
     tint = np.asarray(PAINTS[int(rng.integers(len(PAINTS)))])
     half = 0.86
     # (x, z) from the rear bumper over the roof to the front bumper.
-    outline = [(-2.1, 0.3), (-2.15, 0.85), (-1.95, 1.0), (-1.35, 1.45), (0.35, 1.47), (1.05, 1.0), (2.0, 0.85), (2.15, 0.5)]
+    outline = [
+        (-2.1, 0.3),
+        (-2.15, 0.85),
+        (-1.95, 1.0),
+        (-1.35, 1.45),
+        (0.35, 1.47),
+        (1.05, 1.0),
+        (2.0, 0.85),
+        (2.15, 0.5),
+    ]
     outline = [*outline, (2.1, 0.3)]
     glass = {2, 4}
-    for number, ((x0, z0), (x1, z1)) in enumerate(zip(outline, outline[1:], strict=False)):
+    for number, ((x0, z0), (x1, z1)) in enumerate(pairwise(outline)):
         corners = [(x0, half, z0), (x0, -half, z0), (x1, -half, z1), (x1, half, z1)]
         tile, colour = ("car_glass", (1, 1, 1)) if number in glass else ("car_paint", tint)
         tile = "car_rear" if number == 0 else "car_front" if number == len(outline) - 2 else tile
@@ -132,6 +143,6 @@ def add_boxes(builder: MeshBuilder, rng: np.random.Generator, place: FloatArray)
     for _ in range(2):
         half = np.append(rng.uniform(0.18, 0.36, 2), 0.0)
         rise = rng.uniform(0.3, 0.55)
-        low = place - half + [0, 0, height]
-        builder.box(low, place + half + [0, 0, height + rise], "cardboard", float(rng.uniform(0, np.pi)))
+        low = place - half + xyz(0, 0, height)
+        builder.box(low, place + half + xyz(0, 0, height + rise), "cardboard", float(rng.uniform(0, np.pi)))
         height += rise

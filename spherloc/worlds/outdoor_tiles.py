@@ -92,7 +92,10 @@ def nature_tiles(rng: np.random.Generator) -> Tiles:
     tiles: Tiles = {}
     for number, colour in enumerate(((0.20, 0.36, 0.11), (0.28, 0.42, 0.14), (0.14, 0.30, 0.13))):
         tiles[f"leaves_{number}"] = ("foliage", paint.finish(_leaves(rng, colour)))
-    bark = paint.plain(128, 64, (0.34, 0.26, 0.19)) * (1 + 0.4 * cv2.resize(paint.noise(rng, 16, 64, 32), (64, 128)))[..., None]
+    bark = (
+        paint.plain(128, 64, (0.34, 0.26, 0.19))
+        * (1 + 0.4 * cv2.resize(paint.noise(rng, 16, 64, 32), (64, 128)))[..., None]
+    )
     tiles["bark"] = ("wood", paint.finish(bark))
     planks = paint.bricks(rng, (64, 64), (4, 1), (0.48, 0.32, 0.18), (0.16, 0.10, 0.06))
     tiles["planks"] = ("wood", paint.finish(planks))

@@ -1,13 +1,14 @@
-"""Brushes for procedural textures. A canvas is (H, W, 3), RGB from 0 to 1; every draw comes from the given generator."""
+"""Brushes for procedural textures. A canvas is (H, W, 3), RGB from 0 to 1; all that is random comes from ``rng``."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Canvas = NDArray[np.float32]
-Colour = Sequence[float]
+Canvas = NDArray[np.floating[Any]]
+Colour = Sequence[float] | NDArray[np.floating[Any]]
 
 
 def noise(rng: np.random.Generator, height: int, width: int, cells: int, octaves: int = 4) -> Canvas:
@@ -34,7 +35,8 @@ def mottle(
     canvas: Canvas, rng: np.random.Generator, cells: int = 8, strength: float = 0.06, octaves: int = 5
 ) -> Canvas:
     """The canvas with uneven brightness, as weather and wear leave it."""
-    return canvas * (1 + strength * noise(rng, *canvas.shape[:2], cells, octaves)[..., None])
+    height, width = canvas.shape[:2]
+    return canvas * (1 + strength * noise(rng, height, width, cells, octaves)[..., None])
 
 
 def rectangle(canvas: Canvas, box: Sequence[float], colour: Colour) -> None:

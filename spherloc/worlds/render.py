@@ -1,6 +1,7 @@
 """Pictures of a world through any camera model, with the distance along every ray."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 from spherloc.cameras.base import BoolArray, Camera
 from spherloc.geometry import camera_centre
 from spherloc.images import ByteImage
-from spherloc.worlds.conditions import Conditions
+from spherloc.worlds.conditions import CLEAR, Conditions
 from spherloc.worlds.occluders import with_occluders
 from spherloc.worlds.rays import Hits, RayScene
 from spherloc.worlds.shading import GAMMA, Lighting
@@ -29,19 +30,20 @@ class Render:
     image: ByteImage
     """(H, W, 3) BGR; black where the camera model cannot see."""
     range_m: NDArray[np.float32]
-    """(H, W) distance along the ray of each pixel's centre; inf where nothing is hit, NaN where the model cannot see."""
+    """(H, W) distance along the ray of each pixel's centre; inf where nothing is hit, NaN where none can see."""
 
 
 def draw(
-    world: World, camera: Camera, cam_from_world: FloatArray, conditions: Conditions = Conditions(), seed: int = 0
+    world: World, camera: Camera, cam_from_world: FloatArray, conditions: Conditions = CLEAR, seed: int = 0
 ) -> Render:
     """Cast a ray through every pixel, and four more where surfaces meet. ``seed`` places occluders and makes noise."""
     rotation, centre = cam_from_world[:, :3], camera_centre(cam_from_world)
     rays = with_occluders(world, centre, conditions.occluders, seed)
     lighting = Lighting(world, rays, conditions)
     shape = (camera.height, camera.width)
-    grid = np.stack(np.meshgrid(np.arange(shape[1]) + 0.5, np.arange(shape[0]) + 0.5), axis=-1)
-    bearings, seen = camera.unproject(grid.reshape(-1, 2))
+    columns, rows = np.meshgrid(np.arange(float(shape[1])) + 0.5, np.arange(float(shape[0])) + 0.5)
+    pixels: FloatArray = np.column_stack([columns.ravel(), rows.ravel()])
+    bearings, seen = camera.unproject(pixels)
     angle = _pixel_angle(bearings.reshape(*shape, 3)).ravel()
     inside = np.flatnonzero(seen)
     directions = bearings[inside] @ rotation
@@ -53,9 +55,11 @@ def draw(
     places = np.full((seen.size, 3), np.nan)
     places[inside] = centre + directions * np.where(np.isfinite(hits.range_m), hits.range_m, 0.0)[:, None]
     edges = np.flatnonzero(_edges(rays, face.reshape(shape), places.reshape(*shape, 3)).ravel() & seen)
-    colours[edges] = _refined(lighting, camera, rotation, centre, grid.reshape(-1, 2)[edges], angle[edges])
+    colours[edges] = _refined(lighting, camera, rotation, centre, pixels[edges], angle[edges])
     linear = colours.reshape(*shape, 3)
-    return Render(_developed(linear, seen.reshape(shape), camera, conditions, seed), range_m.reshape(shape).astype("f4"))
+    return Render(
+        _developed(linear, seen.reshape(shape), camera, conditions, seed), range_m.reshape(shape).astype("f4")
+    )
 
 
 def _pixel_angle(bearings: FloatArray) -> FloatArray:
@@ -119,7 +123,7 @@ def _developed(
     return np.round(np.clip(picture, 0, 255)).astype(np.uint8)[..., ::-1].copy()
 
 
-def _blurred(linear: NDArray[np.float32], conditions: Conditions, wraps: bool) -> NDArray[np.float32]:
+def _blurred(linear: NDArray[np.float32], conditions: Conditions, wraps: bool) -> NDArray[Any]:
     margin = int(np.ceil(3 * conditions.defocus_px + conditions.motion_blur_px)) + 1
     if margin == 1:
         return linear

@@ -1,6 +1,6 @@
 """Rooms: floor, ceiling, walls with openings for doors and windows."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -61,7 +61,9 @@ def add_room(builder: MeshBuilder, room: Room) -> None:
         _add_wall(builder, room, np.array(start), np.array(end), room.openings.get(side, ()))
 
 
-def _add_wall(builder: MeshBuilder, room: Room, start: FloatArray, end: FloatArray, openings: Sequence[Opening]) -> None:
+def _add_wall(
+    builder: MeshBuilder, room: Room, start: FloatArray, end: FloatArray, openings: Sequence[Opening]
+) -> None:
     axis = int(np.argmax(np.abs(end - start)))
     length = float(np.linalg.norm(end - start))
     along = (end - start) / length
@@ -87,7 +89,14 @@ def _add_wall(builder: MeshBuilder, room: Room, start: FloatArray, end: FloatArr
             _add_opening(builder, room, patch, left, right, opening)
 
 
-def _add_opening(builder: MeshBuilder, room: Room, patch, left: float, right: float, opening: Opening) -> None:
+def _add_opening(
+    builder: MeshBuilder,
+    room: Room,
+    patch: Callable[..., list[FloatArray]],
+    left: float,
+    right: float,
+    opening: Opening,
+) -> None:
     low, high = opening.low_m, opening.high_m
     builder.quad(patch(left, right, high, HEIGHT_M), room.paper, (0, 0, 1, 1 - high / HEIGHT_M))
     if low > 0:

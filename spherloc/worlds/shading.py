@@ -61,13 +61,13 @@ class Lighting:
         corners = mesh.faces[hits.face]
         uv = np.einsum("ij,ijk->ik", hits.weights, mesh.uv[corners])
         tint = np.einsum("ij,ijk->ik", hits.weights, mesh.tint[corners])
-        # A pixel on a slanted surface is longer than wide; the mean of both keeps near ground crisp and far ground calm.
+        # On a slanted surface a pixel is longer than wide: the mean of both keeps near ground crisp, far ground calm.
         slant = np.sqrt(np.maximum(np.abs(facing), 0.05))
         texels = self.rays.texels_per_metre[hits.face] * hits.range_m * angle_rad / slant
         atlas = recoloured(self.world.atlas, self.conditions.season)
         level = np.log2(np.maximum(texels, 1e-6)).astype(np.float32)
         texture = atlas.sample(uv.astype(np.float32), mesh.tile[hits.face], level) / np.float32(255)
-        base = texture[:, :3]
+        base = texture[:, :3].astype(np.float32)
         if self.conditions.season == "winter" and not self.world.indoor:
             base = _snowed(base, places, normals)
         albedo = base**GAMMA * tint
@@ -76,7 +76,7 @@ class Lighting:
         if self.world.indoor:
             # What shines indoors is the daylight behind a window and the shades of lamps, in their own colours.
             return (colour + (1.1 * glow)[:, None] * albedo).astype(np.float32)
-        colour = colour + (1.6 * glow)[:, None] * np.where(base > 0.5, 1.0, 0.6) * LAMP_COLOUR
+        colour = colour + (1.5 * glow)[:, None] * (0.2 + base.mean(axis=1, keepdims=True)) * LAMP_COLOUR
         clear = np.exp(-hits.range_m / HAZE_M)[:, None]
         return (clear * colour + (1 - clear) * np.asarray(self.light.horizon)).astype(np.float32)
 
@@ -84,6 +84,8 @@ class Lighting:
         light = self.light
         up = normals[:, 2:3]
         sky = np.asarray(light.sky, np.float32)
+        if self.world.indoor:  # daylight is only what comes through windows, and white walls spread it
+            sky = np.float32(1.1 * sky.mean()) * INDOOR_LAMP
         lit = sky * (0.62 + 0.38 * up)
         sun = np.asarray(light.sun, np.float32)
         if sun.any() and not self.world.indoor:
@@ -138,7 +140,7 @@ def _snowed(base: Colours, places: FloatArray, normals: FloatArray) -> Colours:
     pattern = _clouds(7)
     size = pattern.shape[0]
     column, row = np.moveaxis((places[:, :2] * 22).astype(int) % size, -1, 0)
-    depth = np.clip((normals[:, 2] - 0.35) * 3, 0, 1) * np.clip(0.86 + 0.35 * pattern[row, column], 0, 1)
+    depth = np.clip((normals[:, 2] - 0.35) * 3, 0, 1) * np.clip(0.72 + 0.5 * pattern[row, column], 0, 1)
     return (base + depth[:, None] * (SNOW - base)).astype(np.float32)
 
 

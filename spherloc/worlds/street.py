@@ -10,7 +10,7 @@ from spherloc.worlds.mesh import MeshBuilder
 from spherloc.worlds.occluder_tiles import occluder_tiles
 from spherloc.worlds.occluders import add_car
 from spherloc.worlds.outdoor_tiles import STYLES, facade_tiles, ground_tiles, nature_tiles, sign_tiles
-from spherloc.worlds.world import Lane, World
+from spherloc.worlds.world import Lane, Surfaces, World
 
 LENGTH_M = 108.0
 ROAD_M = 3.6
@@ -27,29 +27,28 @@ PROVENANCE = (
 
 def build_street(seed: int) -> World:
     """108 m of street along x with houses on both sides, closed by houses at its ends."""
-    rng = np.random.default_rng([seed, 11])
-    atlas = pack(
-        facade_tiles(rng) | sign_tiles(rng) | ground_tiles(rng) | nature_tiles(rng) | occluder_tiles(rng),
-    )
-    builder = MeshBuilder(atlas)
-    _ground(builder, rng)
-    _houses(builder, rng)
-    lamps = _things(builder, rng)
     return World(
         kind="street",
         seed=seed,
         provenance=PROVENANCE,
-        mesh=with_dark_corners(builder.mesh(), 3.0),
-        atlas=atlas,
+        build=lambda: _surfaces(seed),
         path=np.array([[6.0, -1.7, 1.6], [LENGTH_M - 6.0, -1.7, 1.6]]),
         lanes=(
-            Lane("car", (0.0, 0.4), 1.0),
-            Lane("car", (3.2, 3.6), 1.5),
+            Lane("car", (3.2, 3.6), 2.0),
             Lane("person", (-5.8, -3.2), 1.5),
             Lane("person", (6.6, 9.2), 1.5),
         ),
-        lamps=lamps,
     )
+
+
+def _surfaces(seed: int) -> Surfaces:
+    rng = np.random.default_rng([seed, 11])
+    atlas = pack(facade_tiles(rng) | sign_tiles(rng) | ground_tiles(rng) | nature_tiles(rng) | occluder_tiles(rng))
+    builder = MeshBuilder(atlas)
+    _ground(builder, rng)
+    _houses(builder, rng)
+    lamps = _things(builder, rng)
+    return Surfaces(with_dark_corners(builder.mesh(), 3.0), atlas, lamps)
 
 
 def _ground(builder: MeshBuilder, rng: np.random.Generator) -> None:
@@ -65,12 +64,9 @@ def _ground(builder: MeshBuilder, rng: np.random.Generator) -> None:
     for side in (-1, 1):
         low, high = sorted((side * ROAD_M, side * HOUSES_M))
         builder.sheet([0, low, KERB_M], [LENGTH_M, 0, 0], [0, high - low, 0], (columns, 1), "slabs")
-        start, along = ([LENGTH_M, ROAD_M, 0], [-LENGTH_M, 0, 0]) if side > 0 else ([0, -ROAD_M, 0], [LENGTH_M, 0, 0])
-        if side < 0:
-            start, along = [LENGTH_M, -ROAD_M, 0], [-LENGTH_M, 0, 0]
-            builder.sheet([0, -ROAD_M, 0], [LENGTH_M, 0, 0], [0, 0, KERB_M], (columns, 1), "kerb")
-        else:
-            builder.sheet(start, along, [0, 0, KERB_M], (columns, 1), "kerb")
+        # Seen from the road, the kerb on its left runs along x and the one on its right against it.
+        start = [0 if side > 0 else LENGTH_M, side * ROAD_M, 0]
+        builder.sheet(start, [side * LENGTH_M, 0, 0], [0, 0, KERB_M], (columns, 1), "kerb")
 
 
 def _houses(builder: MeshBuilder, rng: np.random.Generator) -> None:
@@ -94,9 +90,7 @@ def _houses(builder: MeshBuilder, rng: np.random.Generator) -> None:
     for x, way in ((-7.0, -1.0), (LENGTH_M + 7.0, 1.0)):
         front = Front(np.array([x, 15.0 * way, 0.0]), np.array([0, -way, 0]), np.array([way, 0, 0]))
         add_house(builder, rng, front, 10, 4, int(rng.integers(len(STYLES))), number)
-        builder.sheet(
-            [min(x, x - 7 * way), -15, -0.01], [7, 0, 0], [0, 30, 0], (2, 7), "slabs"
-        )
+        builder.sheet([min(x, x - 7 * way), -15, -0.01], [7, 0, 0], [0, 30, 0], (2, 7), "slabs")
 
 
 def _things(builder: MeshBuilder, rng: np.random.Generator) -> np.ndarray:

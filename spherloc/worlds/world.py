@@ -1,5 +1,6 @@
 """A place built by code: its surfaces, its textures, and a path through it."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -32,6 +33,18 @@ class Lane:
 
 
 @dataclass(frozen=True, eq=False)
+class Surfaces:
+    """What a world looks like."""
+
+    mesh: Mesh
+    """All surfaces."""
+    atlas: Atlas
+    """Their textures, in summer."""
+    lamps: FloatArray
+    """(L, 3) places of lamps."""
+
+
+@dataclass(frozen=True, eq=False)
 class World:
     """Frame: metres, z up, gravity (0, 0, -1)."""
 
@@ -41,20 +54,36 @@ class World:
     """Of every random draw in its making."""
     provenance: str
     """Where geometry and textures come from."""
-    mesh: Mesh
-    """All surfaces."""
-    atlas: Atlas
-    """Their textures, in summer."""
+    build: Callable[[], Surfaces]
+    """Makes its surfaces, which takes a second: who only asks for a route need not wait for them."""
     path: FloatArray
     """(P, 3) corners of the way that cameras travel, at the height of the eye."""
     lanes: tuple[Lane, ...]
     """Where occluders may stand."""
-    lamps: FloatArray
-    """(L, 3) places of lamps."""
     indoor: bool = False
     """Lamps are always on, and no snow falls."""
     lamp_reach_m: float = 14.0
     """Beyond it a lamp gives no light."""
+
+    @cached_property
+    def surfaces(self) -> Surfaces:
+        """Made when they are first asked for."""
+        return self.build()
+
+    @property
+    def mesh(self) -> Mesh:
+        """All surfaces."""
+        return self.surfaces.mesh
+
+    @property
+    def atlas(self) -> Atlas:
+        """Their textures, in summer."""
+        return self.surfaces.atlas
+
+    @property
+    def lamps(self) -> FloatArray:
+        """(L, 3) places of lamps."""
+        return self.surfaces.lamps
 
     @property
     def name(self) -> str:

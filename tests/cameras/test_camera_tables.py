@@ -19,6 +19,8 @@ pytestmark = pytest.mark.filterwarnings("error")
 MEI = KITTI360_IMAGE_02.to_dict()
 KB = INLINE["kb-beyond-180"].to_dict()
 PANORAMA = Equirectangular(2048, 1024).to_dict()
+DOUBLE_SPHERE = INLINE["ds-tum-vi"].to_dict()
+EUCM = INLINE["eucm-tum-vi"].to_dict()
 
 
 def refused(table: object) -> str:
@@ -47,7 +49,7 @@ def test_a_bad_value_is_named(table, key, value):
     assert f"camera key '{key}' is " in refused({**table, key: value})
 
 
-@pytest.mark.parametrize("table", [MEI, KB, PANORAMA])
+@pytest.mark.parametrize("table", [MEI, KB, PANORAMA, DOUBLE_SPHERE, EUCM])
 def test_every_key_is_needed(table):
     for key in table:
         message = refused({name: value for name, value in table.items() if name != key})
@@ -132,12 +134,14 @@ anything = st.one_of(
 
 
 @settings(max_examples=400, derandomize=True, deadline=None)
-@given(st.sampled_from([MEI, KB, PANORAMA]), st.data())
+@given(st.sampled_from([MEI, KB, PANORAMA, DOUBLE_SPHERE, EUCM]), st.data())
 def test_any_table_is_a_working_camera_or_a_calibration_error(table, data):
     table = dict(table)
     for key in data.draw(st.lists(st.sampled_from(sorted(table)), max_size=3)):
         if key == "distortion":
             table[key] = data.draw(st.lists(st.floats() | st.floats(-2, 2), min_size=4, max_size=4) | anything)
+        elif key in ("xi", "alpha", "beta"):
+            table[key] = data.draw(st.floats(-1, 2) | st.sampled_from([0.0, 0.5, 1.0, 5e-324, 1e300]) | anything)
         else:
             table[key] = data.draw(anything)
     try:

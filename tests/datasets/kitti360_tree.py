@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from spherloc.cameras.mei import Mei
-from spherloc.worlds import build_world, render
+from spherloc.worlds import Conditions, build_world, render
 
 SIDE_PX = 500
 SCALE = SIDE_PX / 1400
@@ -87,7 +87,7 @@ class Tree:
 
 
 def drive_poses(world, frames, offset_m, start_m, tilts_deg):
-    """``world_from_imu`` (4, 4) by frame, for all ``frames`` and one before and after each; ``tilts_deg`` are (roll, pitch)."""
+    """``world_from_imu`` (4, 4) by frame, also one before and one after ``frames``; ``tilts_deg``: roll, pitch."""
     wanted = range(min(frames) - 1, max(frames) + 2)
     shares = [(start_m + STEP_M * (frame - min(frames))) / world.length_m for frame in wanted]
     poses = {}
@@ -101,9 +101,10 @@ def drive_poses(world, frames, offset_m, start_m, tilts_deg):
 
 def scan_of(world, poses, frame):
     """(N, 4) float32 of one turn of the scanner on the moving car: azimuth 0 is seen at the time of the frame."""
-    azimuth, elevation = (grid.ravel() for grid in np.meshgrid(
-        np.linspace(-np.pi, np.pi, AZIMUTHS, endpoint=False), np.radians(BEAMS_DEG)
-    ))
+    azimuth, elevation = (
+        grid.ravel()
+        for grid in np.meshgrid(np.linspace(-np.pi, np.pi, AZIMUTHS, endpoint=False), np.radians(BEAMS_DEG))
+    )
     beams = np.column_stack(
         [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
     )
@@ -159,6 +160,21 @@ def write_drive(tree, sequence, frames, conditions=None, scans=()):
         tree.scan(sequence, frame).write_bytes(scan_of(world, poses, frame).tobytes())
     times = "".join(f"2013-05-28 08:46:{2 + frame // 10:02d}.{frame % 10}04094720\n" for frame in range(max(poses) + 1))
     tree.image(sequence, 0).parent.parent.joinpath("timestamps.txt").write_text(times)
+
+
+REFERENCES, QUERIES = (100, 102, 104), (31, 32)
+
+
+def write_tree(root):
+    """All of it: two drives in one street, the second half a metre to the left and under clouds."""
+    world = build_world("street")
+    mapped = drive_poses(world, REFERENCES, 0.0, 30.0, (0.3, -0.2))
+    asked = drive_poses(world, QUERIES, 0.6, 31.0, (-0.2, 0.4))
+    tree = Tree(root, {REFERENCE: mapped, QUERY: asked})
+    write_calibration(root)
+    write_drive(tree, REFERENCE, REFERENCES, scans=range(REFERENCES[0], REFERENCES[-1] + 1))
+    write_drive(tree, QUERY, QUERIES, {"conditions": Conditions(light="overcast"), "seed": 1})
+    return tree
 
 
 SCENE = """

@@ -1,7 +1,6 @@
-"""Writes a small Newer College: two walks through a rendered street, with ground truth, IMU, COLMAP model and prior map."""
+"""Writes a small Newer College: two walks through a rendered street, with ground truth, IMU, model and prior map."""
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -86,7 +85,7 @@ class Walk:
         before, at, after = (self.map_from_imu(times_s + step) for step in (-h, 0.0, h))
         rates = (before[0].inv() * after[0]).as_rotvec() / (2 * h)
         accelerations = (before[1] - 2 * at[1] + after[1]) / h**2
-        forces = at[0].inv().apply(accelerations + [0.0, 0.0, 9.81])
+        forces = at[0].inv().apply(accelerations + np.array([0.0, 0.0, 9.81]))
         rates += bias_rad_s * np.array([1.0, -1.0, 0.5]) + rng.normal(0, 0.005, rates.shape)
         return rates, forces + 0.03 + rng.normal(0, 0.05, forces.shape)
 
@@ -151,8 +150,8 @@ def seen_points(picture, cam_from_map, pixels):
     bearings, _ = CAMERA.unproject(pixels)
     rows, columns = pixels.astype(int)[:, ::-1].T
     ranges = picture.range_m[rows, columns].astype(np.float64)
-    points = (bearings * ranges[:, None] - cam_from_map[:, 3]) @ cam_from_map[:, :3]
-    return np.where(np.isfinite(ranges)[:, None], points, np.nan)
+    ranges[~np.isfinite(ranges)] = np.nan
+    return (bearings * ranges[:, None] - cam_from_map[:, 3]) @ cam_from_map[:, :3]
 
 
 def write_model(folder, walk, pictures):
@@ -173,7 +172,9 @@ def write_model(folder, walk, pictures):
         images.append(f"{number} {' '.join(map(repr, [*map(float, [w, x, y, z, *translation])]))} 1 {image_name(time)}")
         observed = []
         for index, (pixel, point) in enumerate(zip(pixels[known], in_model(points[known]), strict=True)):
-            rows.append(f"{len(rows) + 1} {point[0]:.9f} {point[1]:.9f} {point[2]:.9f} 128 128 128 0.1 {number} {index}")
+            rows.append(
+                f"{len(rows) + 1} {point[0]:.9f} {point[1]:.9f} {point[2]:.9f} 128 128 128 0.1 {number} {index}"
+            )
             observed.append(f"{pixel[0]:.6f} {pixel[1]:.6f} {len(rows)}")
         images.append(" ".join(observed))
     (folder / "images.txt").write_text("\n".join(images) + "\n")

@@ -1,5 +1,6 @@
 """The drawn sequence as a kind of scene files that is found inside the test's own process."""
 
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,6 +15,7 @@ def drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str,
     """Installs ``kind = "drawn"``; gives the environment in which other processes find it too."""
     environment = plug_in(tmp_path / "plug-in")
     monkeypatch.syspath_prepend(tmp_path / "plug-in")
+    monkeypatch.delitem(sys.modules, "drawn_matches", raising=False)
     for found in (registry.lookup, registry.names):
         found.cache_clear()
     yield environment

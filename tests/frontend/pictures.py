@@ -14,9 +14,9 @@ def texture(rng, height, width):
     """(H, W) bytes full of corners and blobs of all sizes; its left border continues its right one."""
     spectrum = np.fft.rfft2(rng.normal(size=(height, width)))
     rate = np.hypot(np.fft.fftfreq(height)[:, None], np.fft.rfftfreq(width)[None])
-    band = np.where(rate > 0.0, np.minimum(1.0, 0.02 / np.maximum(rate, 1e-9)), 0.0) * (rate < 0.2)
+    band = np.where(rate > 0.0, np.minimum(1.0, 0.02 / np.maximum(rate, 1e-9)), 0.0) * (rate < 0.1)
     noise = np.fft.irfft2(spectrum * band, s=(height, width))
-    return np.clip(128.0 + 40.0 * noise / noise.std(), 0, 255).astype(np.uint8)
+    return np.clip(128.0 + 40.0 * noise / max(noise.std(), 1e-9), 0, 255).astype(np.uint8)
 
 
 def blobs(height, width, centres, sigma_px, periodic=False):

@@ -1,0 +1,195 @@
+"""Rendered scenes: a street, an apartment or a campus, built and drawn by code, with true poses and depth.
+
+References travel along the world's path in good conditions; queries come later, beside the path, in other light,
+another season, with strangers about. Pictures are drawn when they are first needed and kept on disk.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spherloc.cameras.base import BoolArray, Camera, FloatArray
+from spherloc.cameras.calibration import camera_from_table
+from spherloc.datasets import map_settings, scene_file
+from spherloc.datasets.map_scene import MapScene
+from spherloc.errors import InputError
+from spherloc.frontend.lifting import DepthLift
+from spherloc.frontend.pipeline import image_matcher
+from spherloc.frontend.view import View
+from spherloc.geometry import pose, so3_exp
+from spherloc.images import ByteImage
+from spherloc.worlds import Conditions, World, build_world, image_path, render, stored_range
+
+MOST_VIEWS = 500
+MOST_PIXELS = 4_000_000
+"""A picture of more takes too long to draw."""
+ROUTE_LIMITS = {"offset_m": (-50.0, 50.0), "heading_deg": (-180.0, 180.0), "start": (0.0, 1.0), "stop": (0.0, 1.0)}
+CONDITION_KEYS = {field.name for field in fields(Conditions)}
+GRAVITY_DOWN = np.array([0.0, 0.0, -1.0])
+
+EXAMPLE = """kind = "rendered"
+name = "Street at dusk"
+provenance = "Built and drawn by spherloc's own code."
+world = "street"                  # or "apartment", "campus"
+seed = 0                          # optional: another street of the sort
+
+[camera]
+model = "equirectangular"
+width = 1024
+height = 512
+
+[references]                      # along the world's path
+count = 20
+
+[queries]                         # start, stop: shares of the path; offset_m, heading_deg: to the left
+count = 5
+start = 0.1
+stop = 0.9
+offset_m = 0.8
+tilt_deg = 0.5                    # roll and pitch that nobody knows, at most
+light = "dusk"                    # day, morning, overcast, dusk, night
+season = "autumn"                 # summer, spring, autumn, winter
+occluders = 6
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """What a picture follows from."""
+
+    world: World
+    camera: Camera
+    cam_from_map: FloatArray
+    conditions: Conditions
+    seed: int
+
+    @property
+    def path(self) -> Path:
+        """Where it is kept."""
+        return image_path(self.world, self.camera, self.cam_from_map, self.conditions, self.seed)
+
+    def image(self) -> ByteImage:
+        """(H, W, 3) BGR, drawn if it is not there yet."""
+        return render(self.world, self.camera, self.cam_from_map, self.conditions, self.seed).image
+
+    def range_m(self) -> NDArray[np.float32]:
+        """(H, W) metres along the ray."""
+        kept = stored_range(self.path, self.camera)
+        if kept is not None:
+            return kept
+        return render(self.world, self.camera, self.cam_from_map, self.conditions, self.seed).range_m
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RenderedView(View):
+    """A view whose file is drawn when it is first needed."""
+
+    picture: Picture
+
+    def read(self) -> ByteImage:
+        """See ``View``."""
+        return self.picture.image()
+
+    def usable_pixels(self) -> BoolArray:
+        """See ``View``. Features are kept by their image's content, and this is asked before they are sought."""
+        if not self.path.is_file():
+            self.picture.image()
+        return super().usable_pixels()
+
+
+def load(table: dict[str, Any], path: Path) -> MapScene:
+    """Read a scene file with ``kind = "rendered"``; nothing is drawn yet.
+
+    Raises ``InputError`` for unknown or missing keys, an unknown world, or a value out of its limits.
+    """
+    where = str(path)
+    known = map_settings.REQUIRED | {"world", "provenance", "camera", "references", "queries"}
+    scene_file.check_keys(table, known, map_settings.OPTIONAL | {"seed"}, where)
+    scene_file.text(table, "provenance", where)
+    seed = scene_file.integer(table, "seed", where, 0, 2**31 - 1) if "seed" in table else 0
+    try:
+        world = build_world(scene_file.text(table, "world", where), seed)
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
+    camera = camera_from_table(scene_file.section(table, "camera", where), f"{where} [camera]")
+    if camera.width * camera.height > MOST_PIXELS:
+        raise InputError(f"{where} [camera]: more than {MOST_PIXELS:,} pixels take too long to draw; give fewer.")
+    queries, tilt_deg = _queries(scene_file.section(table, "queries", where), f"{where} [queries]", world, camera)
+    settings = map_settings.read_settings(table, where, gravity_bound_deg=tilt_deg)
+    references = _references(scene_file.section(table, "references", where), f"{where} [references]", world, camera)
+    return MapScene(
+        name=settings.name,
+        where=where,
+        queries=queries,
+        references=references,
+        matcher=image_matcher(references, settings.frontend, where, path.parent),
+        gravity_map=GRAVITY_DOWN,
+        gravity_bound_rad=settings.gravity_bound_rad,
+        gravity_sd_rad=settings.gravity_sd_rad,
+        bound_px=settings.bound_px,
+        thresholds=settings.thresholds,
+        mesh=world.glb,
+    )
+
+
+def _references(table: Mapping[str, Any], where: str, world: World, camera: Camera) -> tuple[View, ...]:
+    """Level cameras with depth."""
+    scene_file.check_keys(table, {"count"}, ROUTE_LIMITS.keys() | CONDITION_KEYS, where)
+    conditions = _conditions(table, where)
+    views = []
+    for number, place in enumerate(_poses(table, where, world)):
+        picture = Picture(world, camera, place, conditions, number)
+        lift = DepthLift(picture.range_m, camera, place, along="ray")
+        views.append(_view(f"reference_{number:03d}", picture, lift=lift))
+    return tuple(views)
+
+
+def _queries(table: Mapping[str, Any], where: str, world: World, camera: Camera) -> tuple[tuple[View, ...], float]:
+    """Views, and the limit of their tilt, degrees: their gravity is taken from a reference, which is level."""
+    scene_file.check_keys(table, {"count"}, ROUTE_LIMITS.keys() | CONDITION_KEYS | {"tilt_deg"}, where)
+    conditions = _conditions(table, where)
+    tilt_deg = scene_file.number(table, "tilt_deg", where, 0.0, 10.0) if "tilt_deg" in table else 0.0
+    views = []
+    for number, place in enumerate(_poses(table, where, world)):
+        # Occluders and noise differ from those of the references.
+        picture = Picture(world, camera, _tilted(place, tilt_deg, number), conditions, MOST_VIEWS + number)
+        views.append(_view(f"query_{number:03d}", picture))
+    return tuple(views), tilt_deg
+
+
+def _view(name: str, picture: Picture, lift: DepthLift | None = None) -> RenderedView:
+    return RenderedView(
+        name=name,
+        camera=picture.camera,
+        path=picture.path,
+        cam_from_map=picture.cam_from_map,
+        lift=lift,
+        picture=picture,
+    )
+
+
+def _poses(table: Mapping[str, Any], where: str, world: World) -> FloatArray:
+    count = scene_file.integer(table, "count", where, 1, MOST_VIEWS)
+    number = partial(scene_file.number, table, where=where)
+    route = {key: number(key, lowest=low, highest=high) for key, (low, high) in ROUTE_LIMITS.items() if key in table}
+    return world.route(count, **route)
+
+
+def _conditions(table: Mapping[str, Any], where: str) -> Conditions:
+    try:
+        return Conditions(**{key: table[key] for key in CONDITION_KEYS & table.keys()})
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
+
+
+def _tilted(cam_from_map: FloatArray, tilt_deg: float, number: int) -> FloatArray:
+    """The pose turned about a level axis through the camera, by at most ``tilt_deg``."""
+    rng = np.random.default_rng([number, 37])
+    angle, size = rng.uniform(0, 2 * np.pi), np.radians(tilt_deg) * np.sqrt(rng.uniform())
+    turn = so3_exp(size * np.array([np.cos(angle), 0.0, np.sin(angle)]))
+    return pose(turn @ cam_from_map[:, :3], turn @ cam_from_map[:, 3])

@@ -1,0 +1,275 @@
+"""``spherloc localize`` as a user calls it: what it leaves in its folder, and how it ends, even when it is killed."""
+
+import csv
+import importlib
+import json
+import resource
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from sequence_samples import true_pose, write_scene
+
+from spherloc import registry
+from spherloc.errors import SpherlocError
+from spherloc.estimators import warm_up
+from spherloc.experiments import read_results
+from spherloc.trajectory import read_tum
+from spherloc_viz.localize import localize_sequence
+from spherloc_viz.recording.reader import read_recording
+from spherloc_viz.scene_list import all_scenes, one_kind
+from spherloc_viz.trajectory_plot import trajectory_png
+
+ROOT = Path(__file__).resolve().parents[2]
+PROGRAM = [sys.executable, "-c", "import signal\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n"
+           "from spherloc_viz.cli import main\nmain()", "localize"]  # fmt: skip
+"""A shell's background job, and what it starts, ignores SIGINT."""
+
+
+def command(*words: str | Path, environment: dict[str, str], **more) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [*PROGRAM, *map(str, words)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment, **more
+    )
+
+
+def run(scene: Path, output: Path, **changes: Any) -> int:
+    words = {"estimator": "mc", "seed": 0, "settings": (), "queries": (), "retry_failed": False, "recordings": None}
+    return localize_sequence(scene, output=output, **(words | changes))
+
+
+def table(folder: Path) -> list[dict[str, str]]:
+    with (folder / "results.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def lines(path: Path) -> int:
+    return path.read_bytes().count(b"\n") if path.exists() else 0
+
+
+def wait_for(reached, process: subprocess.Popen[str]) -> None:
+    while not reached():
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.02)
+
+
+def test_everything_is_written(tmp_path: Path, drawn: dict[str, str], capsys: pytest.CaptureFixture[str]) -> None:
+    scene, out = write_scene(tmp_path, queries=5, few=[1], broken=[3], timed=True), tmp_path / "out"
+    assert run(scene, out, recordings=out / "recordings") == 1
+    rows = table(out)
+    assert [row["query"] for row in rows] == [f"image{place}.png" for place in range(5)]
+    assert [row["status"] for row in rows] == ["localized", "failed", "localized", "unreadable", "localized"]
+    assert rows[0]["timestamp_s"] == "1520530308.25" and rows[1]["remarks"] == "image1.png: few matches."
+    results = read_results(out)
+    assert [None if path is None else path.parent for path in results.recordings] == [
+        out / "recordings", None, out / "recordings", None, out / "recordings"
+    ]  # fmt: skip
+    assert len(list((out / "recordings").iterdir())) == 3
+    assert results.recordings[2] is not None
+    recorded = read_recording(results.recordings[2])
+    np.testing.assert_array_equal(recorded.cam_from_map, results.rows[2].cam_from_map)
+    estimated, truth = read_tum(out / "trajectory.tum"), read_tum(out / "truth.tum")
+    assert len(estimated) == 3 and len(truth) == 5
+    for at, place in enumerate((0, 2, 4)):
+        whole = np.vstack([true_pose(place), [0, 0, 0, 1]])
+        np.testing.assert_allclose(truth.map_from_body[place], np.linalg.inv(whole)[:3], atol=1e-9)
+        off = np.linalg.norm(estimated.map_from_body[at][:, 3] - truth.map_from_body[place][:, 3])
+        assert off == pytest.approx(float(rows[place]["translation_error_m"]), abs=1e-9)
+    summary = json.loads((out / "summary.json").read_text())
+    assert (summary["localized"], summary["failed"], summary["unreadable"]) == (3, 1, 1)
+    assert [rate["judged"] for rate in summary["success"]] == [4, 4]
+    configuration = json.loads((out / "configuration.json").read_text())
+    assert configuration["options"]["bound_px"] == 3.0 and configuration["versions"]["opencv"] == cv2.__version__
+    told = capsys.readouterr()
+    assert "75.0 % (3 of 4; 95 %: 30.1 to 95.4 %)" in told.out and "not judged: 1 with an unreadable image" in told.out
+    assert "no pose: drawn walk, image1.png: 1 usable of 1" in told.out
+    assert "The loader skipped nothing of note." in told.err
+
+
+def test_a_killed_run_goes_on_and_ends_as_if_nothing_had_happened(tmp_path: Path, drawn: dict[str, str]) -> None:
+    scene, out, whole = write_scene(tmp_path, queries=6, seconds=0.3), tmp_path / "out", tmp_path / "whole"
+    words = (scene, "--output", out, "--estimator", "ransac-2p", "--seed", "3")
+    process = command(*words, environment=drawn)
+    wait_for(lambda: lines(out / "results.jsonl") >= 2, process)
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    done = lines(out / "results.jsonl")
+    assert 2 <= done < 6
+    # Not more than the query in flight is lost: nothing else was recorded.
+    assert done <= len([path for path in (out / "recordings").iterdir() if path.suffix == ".rrd"]) <= done + 1
+    half = (out / "results.jsonl").read_bytes() + b'{"index": 5, "query": "ima'
+    (out / "results.jsonl").write_bytes(half)
+    process = command(*words, environment=drawn)
+    _, errors = process.communicate(timeout=200)
+    assert process.returncode == 0, errors
+    assert "removed a half written line" in errors and f"{done} of 6 queries are done already" in errors
+    assert run(scene, whole, estimator="ransac-2p", seed=3) == 0
+    resumed, at_once = read_results(out), read_results(whole)
+    assert resumed.names == at_once.names and len(resumed.names) == 6
+    for a, b in zip(resumed.rows, at_once.rows, strict=True):
+        np.testing.assert_array_equal(a.cam_from_map, b.cam_from_map)
+    assert all(path is not None and read_recording(path) for path in resumed.recordings)
+    assert (out / "trajectory.tum").read_bytes() == (whole / "trajectory.tum").read_bytes()
+    assert (out / "trajectory.png").read_bytes() == (whole / "trajectory.png").read_bytes()
+
+
+def test_ctrl_c_ends_at_once_and_says_how_to_go_on(tmp_path: Path, drawn: dict[str, str]) -> None:
+    scene, out = write_scene(tmp_path, queries=3, seconds=0.5), tmp_path / "out"
+    process = command(scene, "--output", out, "--no-record", environment=drawn)
+    wait_for(lambda: lines(out / "results.jsonl") >= 1, process)
+    process.send_signal(signal.SIGINT)
+    output, errors = process.communicate(timeout=60)
+    assert process.returncode == 130 and output == ""
+    assert f"are kept in {out}, and the same command goes on from there." in errors and "Traceback" not in errors
+
+
+def test_a_full_disk_keeps_what_is_done(tmp_path: Path, drawn: dict[str, str]) -> None:
+    warm_up()  # whose cache the limit below would otherwise hit
+    scene, out = write_scene(tmp_path, queries=9), tmp_path / "out"
+
+    def limit() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (4000, 4000))
+
+    process = command(scene, "--output", out, "--no-record", environment=drawn, preexec_fn=limit)
+    output, errors = process.communicate(timeout=200)
+    assert process.returncode == 2 and output == "", errors
+    (sentence,) = errors.strip().splitlines()
+    kept = lines(out / "results.jsonl")
+    assert kept >= 1 and f"the results of {kept} queries are kept: make room there" in sentence
+    assert "results.jsonl: cannot be written (File too large)" in sentence
+    assert run(scene, out) == 0 and len(read_results(out).rows) == 9
+
+
+def test_a_recording_that_finds_no_room_ends_the_run(
+    tmp_path: Path, drawn: dict[str, str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Not recorded is not done: when there is room again, no recording is missing."""
+    scene, out = write_scene(tmp_path, queries=2), tmp_path / "out"
+    out.mkdir()
+    (out / "recordings").write_text("in the way")
+    process = command(scene, "--output", out, environment=drawn)
+    _, errors = process.communicate(timeout=200)
+    assert process.returncode == 2 and len(errors.strip().splitlines()) == 1 and "recordings" in errors, errors
+    assert lines(out / "results.jsonl") == 0
+    (out / "recordings").unlink()
+    assert run(scene, out, recordings=out / "recordings") == 0 and None not in read_results(out).recordings
+
+
+@pytest.mark.usefixtures("drawn")
+def test_chosen_queries_first_then_the_others(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene, out = write_scene(tmp_path, queries=5, few=[3]), tmp_path / "out"
+    assert run(scene, out, queries=["0:5:4"]) == 0
+    assert [row["query"] for row in table(out)] == ["image0.png", "image4.png"]
+    assert "2 of 2 queries have a pose, of 5 in the scene" in capsys.readouterr().out
+    assert run(scene, out, queries=["image4.png", "image2.png"]) == 0
+    assert [row["index"] for row in table(out)] == ["0", "2", "4"]
+    assert run(scene, out) == 1
+    assert run(scene, out, queries=["0:3"]) == 0
+
+
+@pytest.mark.usefixtures("drawn")
+def test_failures_are_done_again_when_asked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene, out = write_scene(tmp_path, queries=3, broken=[1]), tmp_path / "out"
+    assert run(scene, out) == 1
+    first = table(out)
+    (tmp_path / "images" / "image1.png").write_bytes((tmp_path / "images" / "image0.png").read_bytes())
+    assert run(scene, out) == 1
+    assert run(scene, out, retry_failed=True) == 0
+    assert [row["status"] for row in table(out)] == ["localized"] * 3
+    assert table(out)[0] == first[0]
+    assert "1 queries without a pose are done again" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("drawn")
+def test_wrong_words_are_one_sentence(tmp_path: Path) -> None:
+    scene, out = write_scene(tmp_path, queries=2), tmp_path / "out"
+    assert run(scene, out) == 0
+    bundled = ROOT / "scenes" / "mei_outliers_80.toml"
+    for path, changes, said in (
+        (scene, {"seed": 1}, "(seed is 1, was 0); give another folder."),
+        (scene, {"settings": ["bound_px=4"]}, "(options.bound_px is 4.0, was 3.0); give another folder."),
+        (scene, {"settings": ["bound_px=-1"]}, "bound_px"),
+        (scene, {"queries": ["7:9"]}, "'7:9' chooses none of the 2 queries"),
+        (scene, {"estimator": "magic"}, "'magic': choose one of"),
+        (scene, {"seed": -1}, "seed is -1"),
+        (bundled, {}, f"is one problem, no sequence of query images; solve it by: spherloc run {bundled}"),
+    ):
+        with pytest.raises(SpherlocError) as error:
+            run(path, out, **changes)
+        assert said in str(error.value)
+    scene.write_text(scene.read_text() + "# edited\n")
+    with pytest.raises(SpherlocError, match=r"\(scene_sha256 is '[0-9a-f]+...[0-9a-f]+', was"):
+        run(scene, out)
+    assert len(table(out)) == 2
+
+
+def pixels_of(png: bytes) -> np.ndarray:
+    image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
+    assert image is not None
+    return image[..., ::-1].astype(int)
+
+
+def near(image: np.ndarray, color: tuple[int, int, int]) -> int:
+    return int((np.abs(image - color).max(axis=2) < 12).sum())
+
+
+@pytest.mark.usefixtures("drawn")
+def test_the_picture_shows_truth_errors_and_failures(tmp_path: Path) -> None:
+    from spherloc_viz.style import OUTLIER, TRUTH
+
+    good = write_scene(tmp_path, queries=4)
+    assert run(good, tmp_path / "good") == 0
+    png = (tmp_path / "good" / "trajectory.png").read_bytes()
+    assert trajectory_png(read_results(tmp_path / "good")) == png
+    assert near(pixels_of(png), TRUTH) > 500 and near(pixels_of(png), OUTLIER) == 0
+    (tmp_path / "bad").mkdir()
+    bad = write_scene(tmp_path / "bad", queries=4, few=[1], wrong=[2])
+    run(bad, tmp_path / "bad" / "out")
+    shown = pixels_of((tmp_path / "bad" / "out" / "trajectory.png").read_bytes())
+    assert near(shown, OUTLIER) > 200
+    (tmp_path / "blind").mkdir()
+    blind = write_scene(tmp_path / "blind", queries=3, unknown=[0, 1, 2], few=[1])
+    blind.write_text(blind.read_text().replace("drawn walk", r"cost $\\frac$ 5 \u8857"))
+    assert run(blind, tmp_path / "blind" / "out") == 1
+    assert near(pixels_of((tmp_path / "blind" / "out" / "trajectory.png").read_bytes()), TRUTH) == 0
+    assert not (tmp_path / "blind" / "out" / "truth.tum").exists()
+    (tmp_path / "none").mkdir()
+    assert run(write_scene(tmp_path / "none", queries=2, few=[0, 1]), tmp_path / "none" / "out") == 1
+
+
+def test_one_query_of_a_scene_can_be_run_alone(tmp_path: Path, drawn: dict[str, str]) -> None:
+    scene = write_scene(tmp_path, queries=3, few=[1], timed=True)
+
+    def alone(*words: str | Path) -> subprocess.CompletedProcess[str]:
+        program = [Path(sys.executable).with_name("spherloc"), "run", "--no-record", "--json", *map(str, words)]
+        return subprocess.run(program, env=drawn, capture_output=True, text=True, timeout=200, check=False)
+
+    found = alone(scene, "--query", "image2.png")
+    assert found.returncode == 0 and "The loader skipped nothing of note." in found.stderr
+    record = json.loads(found.stdout)
+    assert record["name"] == "drawn walk, image2.png" and record["translation_error_m"] < 0.1
+    few = alone(scene, "--query", "image1.png")
+    assert few.returncode == 2 and "image1.png: few matches." in few.stderr and "1 usable of 1" in few.stderr
+    other = alone(ROOT / "scenes" / "mei_outliers_80.toml", "--query", "image1.png")
+    assert other.returncode == 2 and "has no query images to choose from; leave out --query." in other.stderr
+
+
+@pytest.mark.usefixtures("drawn")
+def test_scenes_names_kinds_that_others_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(sys.modules, "drawn_matches", raising=False)
+    assert "A map scene whose matches are drawn" in one_kind("drawn")
+    with pytest.raises(SpherlocError, match=r"choose one of .*drawn"):
+        one_kind("magic")
+    registry.lookup.cache_clear()
+    monkeypatch.delitem(sys.modules, "drawn_matches")
+    (tmp_path / "plug-in" / "drawn_matches.py").write_text("import nothing_of_that_name\n")
+    importlib.invalidate_caches()
+    (line,) = [line for line in all_scenes().splitlines() if line.split()[:1] == ["drawn"]]
+    assert "cannot be read: ModuleNotFoundError: No module named 'nothing_of_that_name'" in line
+    with pytest.raises(SpherlocError, match="scenes of kind drawn cannot be read"):
+        one_kind("drawn")
