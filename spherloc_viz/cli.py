@@ -1,5 +1,6 @@
 """The command line: run, localize, play, view, scenes."""
 
+import os
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -11,6 +12,8 @@ from tyro.extras import SubcommandApp
 from spherloc.errors import SpherlocError
 
 RECORDINGS = Path("recordings")
+INTERRUPTED = 130
+"""Exit code after Ctrl-C, as shells have it."""
 
 app = SubcommandApp()
 
@@ -101,7 +104,11 @@ def localize(
 
     folder = output or RECORDINGS / f"{scene.stem}_{estimator}_{seed}"
     kept = (recordings or folder / "recordings") if record else None
-    return localize_sequence(scene, estimator, seed, option, queries, folder, kept, retry_failed)
+    try:
+        return localize_sequence(scene, estimator, seed, option, queries, folder, kept, retry_failed)
+    except KeyboardInterrupt:
+        # Without waiting for the thread that matches the next query; all that is done is on the disk.
+        os._exit(INTERRUPTED)
 
 
 @app.command
@@ -191,7 +198,7 @@ def main() -> None:
         print(f"spherloc: {error}", file=sys.stderr)
         code = 2
     except KeyboardInterrupt:
-        code = 130
+        code = INTERRUPTED
     except BrokenPipeError:
         sys.stderr.close()
         code = 141

@@ -9,7 +9,7 @@ from spherloc.errors import InputError
 
 
 def all_scenes() -> str:
-    """A line a bundled scene: file, kind, name and what it is about; then a line a kind. Renders and reads no image."""
+    """File, kind and name of every bundled scene, what it is about, and a line a kind. Renders and reads no image."""
     lines = [_scene(path) for path in bundled_scenes().values()]
     kinds = scene_kinds()
     width = max((len(kind.name) for kind in kinds), default=0)
@@ -18,12 +18,16 @@ def all_scenes() -> str:
 
 
 def one_kind(name: str) -> str:
-    """What a kind reads, its example file and the packages it needs. Raises ``InputError`` for an unknown kind."""
+    """How a kind is written, the packages it needs, and bundled scenes. Raises ``InputError`` for an unknown kind."""
     kind = scene_kind(name)
     if kind.problem:
         raise InputError(f"scenes of kind {name} cannot be read: {kind.problem}")
-    parts = [kind.documentation, *([f"Needs: {_install(kind)}"] if kind.extras else [])]
-    return "\n\n".join([*parts, *([f"For example:\n\n{kind.example.strip()}"] if kind.example else [])])
+    parts = [_plain(kind.documentation)]
+    if kind.example:
+        parts.append(f"For example:\n\n{kind.example.strip()}")
+    if bundled := [str(path) for path in bundled_scenes().values() if _kind(path) == name]:
+        parts.append("\n".join(["Bundled:", *bundled]))
+    return "\n\n".join([*parts, *([f"Needs: {_install(kind)}"] if kind.extras else [])])
 
 
 def _scene(path: Path) -> str:
@@ -32,14 +36,26 @@ def _scene(path: Path) -> str:
     except InputError as error:
         return f"{path}  cannot be used: {error}"
     about = " ".join(str(table.get("about", "")).split())
-    return f"{path}  {table.get('kind')}  {table.get('name')}" + (f". {about}" if about else "")
+    return f"{path}  {table.get('kind')}  {table.get('name')}" + (f"\n    {about}" if about else "")
+
+
+def _kind(path: Path) -> object:
+    try:
+        return read_table(path).get("kind")
+    except InputError:
+        return None
 
 
 def _line(kind: SceneKind) -> str:
     if kind.problem:
         return f"cannot be read: {kind.problem}"
-    first = kind.documentation.partition("\n")[0]
+    first = _plain(kind.documentation).partition("\n")[0].removeprefix(f'Scenes of kind = "{kind.name}": ')
     return first + (f" Needs: {_install(kind)}" if kind.extras else "")
+
+
+def _plain(documentation: str) -> str:
+    """A docstring without its markup."""
+    return documentation.replace("``", "").replace(".. code-block:: toml\n\n", "")
 
 
 def _install(kind: SceneKind) -> str:

@@ -15,7 +15,8 @@ from spherloc.experiments.rows import FAILED
 from spherloc.geometry import align_to_down
 from spherloc_viz.style import ESTIMATE, OUTLIER, TRUTH, css
 
-SIZE_INCHES = (9.0, 7.0)
+WIDTH_INCHES = 9.0
+HEIGHT_INCHES = (4.0, 9.0)
 DPI = 150
 MARGIN = 0.08
 LEAST_EXTENT_M = 1.0
@@ -28,12 +29,17 @@ def trajectory_png(results: SequenceResults) -> bytes:
     Errors beyond the loosest limit of success have one colour. Where the truth is unknown, errors are those of the
     registration, if there are any. The same results give the same bytes.
     """
-    figure = Figure(figsize=SIZE_INCHES, dpi=DPI, layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.add_subplot()
     places = _from_above(results, results.positions_m)
     true_places = _from_above(results, results.true_positions_m)
-    _frame(axes, places, true_places)
+    middle, half = _frame(places, true_places)
+    # About as high as the picture of the map, so that the bar of colours beside it is not longer.
+    height = float(np.clip(0.75 * WIDTH_INCHES * half[1] / half[0] + 1.1, *HEIGHT_INCHES))
+    figure = Figure(figsize=(WIDTH_INCHES, height), dpi=DPI, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot(aspect="equal", axisbelow=True)
+    axes.grid(color="0.9", linewidth=0.6)
+    axes.set_xlim(middle[0] - half[0], middle[0] + half[0])
+    axes.set_ylim(middle[1] - half[1], middle[1] + half[1])
     _truth(axes, true_places)
     _estimates(figure, axes, results, places)
     _without_place(axes, results, places, true_places)
@@ -55,20 +61,18 @@ def _from_above(results: SequenceResults, positions_m: FloatArray) -> FloatArray
     return turned[:, [0, 2]]
 
 
-def _frame(axes: Axes, places: FloatArray, true_places: FloatArray) -> None:
-    """Limits of the true way if it is known: one wrong pose far away must not shrink all the others to a dot."""
+def _frame(places: FloatArray, true_places: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Middle (2,) and half the extent (2,) of the picture, metres.
+
+    Those of the true way if it is known: one wrong pose far away must not shrink all the others to a dot.
+    """
     known = true_places[np.isfinite(true_places).all(axis=1)]
     shown = known if len(known) else places[np.isfinite(places).all(axis=1)]
-    axes.set_aspect("equal")
-    axes.grid(color="0.9", linewidth=0.6)
-    axes.set_axisbelow(True)
-    if len(shown):
-        low, high = shown.min(axis=0), shown.max(axis=0)
-        half = 0.5 * np.maximum(high - low, LEAST_EXTENT_M)
-        half = np.maximum(half, 0.3 * half.max()) + MARGIN * 2 * half.max()
-        middle = 0.5 * (low + high)
-        axes.set_xlim(middle[0] - half[0], middle[0] + half[0])
-        axes.set_ylim(middle[1] - half[1], middle[1] + half[1])
+    if not len(shown):
+        return np.zeros(2), np.full(2, 0.5 * LEAST_EXTENT_M)
+    low, high = shown.min(axis=0), shown.max(axis=0)
+    half = 0.5 * np.maximum(high - low, LEAST_EXTENT_M)
+    return 0.5 * (low + high), np.maximum(half, 0.3 * half.max()) + 2.0 * MARGIN * half.max()
 
 
 def _truth(axes: Axes, true_places: FloatArray) -> None:

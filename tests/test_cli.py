@@ -303,7 +303,7 @@ def test_a_folder_that_cannot_be_written_keeps_the_result(tmp_path: Path) -> Non
     assert record["success"] is True and record["recording"] is None
 
 
-@pytest.mark.parametrize("command", ["run", "play", "view", "scenes"])
+@pytest.mark.parametrize("command", ["run", "localize", "play", "view", "scenes"])
 def test_help_has_examples(tmp_path: Path, command: str) -> None:
     result = spherloc(command, "--help", cwd=tmp_path)
     assert result.returncode == 0
@@ -311,9 +311,22 @@ def test_help_has_examples(tmp_path: Path, command: str) -> None:
 
 
 def test_scenes_lists_what_play_and_run_accept(tmp_path: Path) -> None:
-    result = spherloc("scenes", cwd=tmp_path)
-    listed = [Path(line.split("  ")[0]) for line in result.stdout.splitlines()]
-    assert len(listed) >= 6 and all(path.is_file() for path in listed)
+    bundled, kinds = spherloc("scenes", cwd=tmp_path).stdout.split("\n\n")
+    rows = [line.split("  ") for line in bundled.splitlines() if not line.startswith(" ")]
+    assert len(rows) >= 9 and all(Path(path).is_file() for path, _, _ in rows)
+    by_stem = {Path(path).stem: (kind, name) for path, kind, name in rows}
+    assert by_stem["mei_outliers_80"] == ("synthetic", "MEI fisheye, 80 % outliers")
+    assert "rendered" in {kind for kind, _ in by_stem.values()}
+    listed = [line.split()[0] for line in kinds.splitlines()[1:]]
+    assert listed == sorted(listed) and {"correspondences", "kitti360", "colmap", "rendered"} <= set(listed)
+    assert "cannot be read" not in kinds
+
+
+def test_scenes_shows_how_a_kind_is_written(tmp_path: Path) -> None:
+    shown = spherloc("scenes", "colmap", cwd=tmp_path).stdout
+    assert 'kind = "colmap"' in shown and "``" not in shown and "code-block" not in shown
+    assert str(SCENE) in spherloc("scenes", "synthetic", cwd=tmp_path).stdout
+    assert "'magic'" in one_sentence(spherloc("scenes", "magic", cwd=tmp_path))
 
 
 @pytest.mark.skipif(not ARIA.is_dir(), reason="the shared Aria data are not beside the project")

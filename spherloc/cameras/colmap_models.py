@@ -12,6 +12,7 @@ from spherloc.cameras._checks import coefficients, located, show
 from spherloc.cameras.base import Camera
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.cameras.eucm import Eucm
+from spherloc.cameras.fisheye624 import Fisheye624
 from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.cameras.mei import Mei
 from spherloc.errors import CalibrationError
@@ -27,7 +28,7 @@ def camera_from_colmap(model: str, width: int, height: int, params: Sequence[flo
     parameters and unusable values.
     """
     with located(where):
-        if model == "RAD_TAN_THIN_PRISM_FISHEYE" and len(params) == 3:
+        if model == "RAD_TAN_THIN_PRISM_FISHEYE" and np.shape(params) == (3,):
             model = "SPHERE"  # SphereSfM, a fork of COLMAP 3.8, gave it the number 11, which COLMAP gave to this one
         if not isinstance(model, str) or model not in _MODELS:
             raise CalibrationError(
@@ -45,6 +46,10 @@ def _perspective(width: int, height: int, fx: float, fy: float, cx: float, cy: f
 def _fisheye(width: int, height: int, fx: float, fy: float, cx: float, cy: float, *lens: float) -> KannalaBrandt:
     k1, k2, k3, k4 = (*lens, 0.0, 0.0, 0.0, 0.0)[:4]
     return KannalaBrandt(width, height, fx, fy, cx, cy, (k1, k2, k3, k4))
+
+
+def _aria(width: int, height: int, fx: float, fy: float, cx: float, cy: float, *lens: float) -> Fisheye624:
+    return Fisheye624(width, height, fx, fy, cx, cy, lens)
 
 
 def _one_focal_length(build: Callable[..., Camera]) -> Callable[..., Camera]:
@@ -84,6 +89,7 @@ _MODELS: dict[str, tuple[str, Callable[..., Any]]] = {
     "SIMPLE_RADIAL_FISHEYE": ("f, cx, cy, k", _one_focal_length(_fisheye)),
     "RADIAL_FISHEYE": ("f, cx, cy, k1, k2", _one_focal_length(_fisheye)),
     "OPENCV_FISHEYE": ("fx, fy, cx, cy, k1, k2, k3, k4", _fisheye),
+    "RAD_TAN_THIN_PRISM_FISHEYE": ("fx, fy, cx, cy, k0, k1, k2, k3, k4, k5, p0, p1, s0, s1, s2, s3", _aria),
     "EUCM": ("fx, fy, cx, cy, alpha, beta", Eucm),
     "EQUIRECTANGULAR": ("w, h", _panorama),
     "SPHERE": ("f, cx, cy", _sphere),

@@ -12,20 +12,8 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from spherloc.cameras import _checks
-from spherloc.cameras._radial import RIM_MARGIN, InverseTable, first_positive_root
+from spherloc.cameras._angle_curve import AngleCurve
 from spherloc.cameras.base import BoolArray, FloatArray
-
-_TABLE_NODES = 1025
-_NEWTON_STEPS = 2
-"""Enough from a table of this size: its error of about 1e-6 rad is squared twice."""
-_TOLERANCE = 1e-13
-"""Residual of Eq. 4, relative to 1 + theta_d, that counts as solved."""
-_ROUNDING = 1e-12
-"""Error of theta_d that the rounding of a pixel may cause, with some reserve, and share of theta given up for it."""
-_BISECTIONS = 60
-"""Halvings of pi down to the last digit of a double."""
-_ON_AXIS = 1e-100
-"""theta_d below which a pixel is the principal point: the direction of so small a vector has no digits left."""
 
 
 @dataclass(frozen=True)
@@ -52,13 +40,12 @@ class KannalaBrandt:
     def __post_init__(self) -> None:
         _checks.check_lens(self, "k1, k2, k3, k4")
         with np.errstate(all="ignore"):
-            _checks.check_sees_image(self, self._inverse.end)
+            _checks.check_sees_image(self, self._curve.end)
 
-    @cached_property
+    @property
     def max_angle_rad(self) -> float:
         """Largest angle to the optical axis that the model can invert: the first maximum of theta_d, at most pi."""
-        slope = [(2 * n + 1) * k for n, k in enumerate(self.distortion, start=1)]
-        return float(min(np.sqrt(first_positive_root(slope)), np.pi) * (1.0 - RIM_MARGIN))
+        return self._curve.max_angle_rad
 
     def project(self, points: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Pixels (N, 2) of camera-frame points (N, 3) in metres, and the mask (N,) of directions that are valid.
@@ -66,13 +53,10 @@ class KannalaBrandt:
         Valid is what is within ``max_angle_rad`` of the optical axis; other pixels are NaN.
         Raises ``ProblemError`` for a wrong shape.
         """
-        x, y, z = _checks.rows("points", points, 3).T
+        points = _checks.rows("points", points, 3)
         with np.errstate(all="ignore"):
-            lateral = np.hypot(x, y)
-            theta = np.arctan2(lateral, z)
-            valid = (theta <= self.max_angle_rad) & np.isfinite(lateral + z) & ((lateral > 0) | (z > 0))
-            scale = np.where(lateral > 0, self._theta_d(theta) / lateral, 0.0)
-            pixels = np.column_stack([self.cx + self.fx * (scale * x), self.cy + self.fy * (scale * y)])
+            x, y, valid = self._curve.plane(points)
+            pixels = np.column_stack([self.cx + self.fx * x, self.cy + self.fy * y])
         pixels[~valid] = np.nan
         return pixels, valid
 
@@ -81,34 +65,17 @@ class KannalaBrandt:
 
         Raises ``ProblemError`` for a wrong shape.
         """
+        u, v = _checks.rows("pixels", pixels, 2).T
         with np.errstate(all="ignore"):
-            east, south, theta_d = self._polar(pixels)
-            theta = self._theta(theta_d)
-            sine = np.sin(theta)
-            bearings = np.column_stack([sine * east, sine * south, np.cos(theta)])
-        return bearings, ~np.isnan(theta)
+            bearings = self._curve.bearings((u - self.cx) / self.fx, (v - self.cy) / self.fy)
+        return bearings, ~np.isnan(bearings[:, 2])
 
     def unprojection_jacobian(self, pixels: FloatArray) -> FloatArray:
-        """d bearing / d pixel (N, 3, 2), per pixel; NaN where ``unproject`` is invalid.
-
-        Along the radius the bearing turns by d theta / d theta_d, across it by sin(theta) / theta_d.
-        """
+        """d bearing / d pixel (N, 3, 2), per pixel; NaN where ``unproject`` is invalid."""
+        u, v = _checks.rows("pixels", pixels, 2).T
         with np.errstate(all="ignore"):
-            east, south, theta_d = self._polar(pixels)
-            theta = self._theta(theta_d)
-            sine, cosine = np.sin(theta), np.cos(theta)
-            turn = 1.0 / self._slope(theta)
-            radial, across = cosine * turn, np.where(theta_d > _ON_AXIS, sine / theta_d, 1.0)
-            mixed = (radial - across) * east * south
-            jacobian = np.empty((len(theta), 3, 2))
-            jacobian[:, 0, 0] = radial * east**2 + across * south**2
-            jacobian[:, 0, 1] = jacobian[:, 1, 0] = mixed
-            jacobian[:, 1, 1] = radial * south**2 + across * east**2
-            jacobian[:, 2, 0] = -sine * turn * east
-            jacobian[:, 2, 1] = -sine * turn * south
-            jacobian /= (self.fx, self.fy)
-        jacobian[np.isnan(theta)] = np.nan
-        return jacobian
+            jacobian = self._curve.jacobian((u - self.cx) / self.fx, (v - self.cy) / self.fy)
+        return jacobian / (self.fx, self.fy)
 
     def to_dict(self) -> dict[str, Any]:
         """The ``[camera]`` table: model, width, height, fx, fy, cx, cy, distortion."""
@@ -120,48 +87,5 @@ class KannalaBrandt:
         return _checks.camera_from_keys(cls, table, where)
 
     @cached_property
-    def _inverse(self) -> InverseTable:
-        return InverseTable(self._theta_d, np.linspace(0.0, self.max_angle_rad, _TABLE_NODES))
-
-    def _theta_d(self, theta: FloatArray) -> FloatArray:
-        """Eq. 4."""
-        k1, k2, k3, k4 = self.distortion
-        s = theta * theta
-        return theta * (1.0 + s * (k1 + s * (k2 + s * (k3 + s * k4))))
-
-    def _slope(self, theta: FloatArray) -> FloatArray:
-        """d theta_d / d theta."""
-        k1, k2, k3, k4 = self.distortion
-        s = theta * theta
-        return 1.0 + s * (3.0 * k1 + s * (5.0 * k2 + s * (7.0 * k3 + s * (9.0 * k4))))
-
-    def _polar(self, pixels: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Unit direction in the image plane, x and y, and distance theta_d from the principal point (Eq. 3), (N,)."""
-        u, v = _checks.rows("pixels", pixels, 2).T
-        x0, y0 = (u - self.cx) / self.fx, (v - self.cy) / self.fy
-        theta_d = np.hypot(x0, y0)
-        on_axis = theta_d <= _ON_AXIS
-        return np.where(on_axis, 1.0, x0 / theta_d), np.where(on_axis, 0.0, y0 / theta_d), theta_d
-
-    def _theta(self, theta_d: FloatArray) -> FloatArray:
-        """Solve Eq. 4 for theta (N,); NaN beyond the rim."""
-        theta = self._inverse(theta_d)
-        for _ in range(_NEWTON_STEPS):
-            theta -= (self._theta_d(theta) - theta_d) / self._slope(theta)
-        # A direction at the rim stays valid although its pixel was rounded, and its bearing stays within the rim.
-        inside = theta_d <= self._inverse.end + _ROUNDING
-        rim = self.max_angle_rad * (1.0 - _ROUNDING)
-        theta = np.where(inside, np.minimum(theta, rim), np.nan)
-        # Newton may jump where the slope nearly vanishes; theta_d still increases there: bisect.
-        hard = inside & ~(np.abs(self._theta_d(theta) - theta_d) <= _TOLERANCE * (1.0 + theta_d))
-        if hard.any():
-            theta[hard] = self._bisect(theta_d[hard], rim)
-        return theta
-
-    def _bisect(self, theta_d: FloatArray, rim: float) -> FloatArray:
-        low, high = np.zeros_like(theta_d), np.full_like(theta_d, rim)
-        for _ in range(_BISECTIONS):
-            middle = 0.5 * (low + high)
-            below = self._theta_d(middle) < theta_d
-            low, high = np.where(below, middle, low), np.where(below, high, middle)
-        return 0.5 * (low + high)
+    def _curve(self) -> AngleCurve:
+        return AngleCurve(self.distortion)

@@ -66,7 +66,7 @@ def _chosen(value: Any, names: list[str], where: str) -> list[str]:
     if isinstance(value, list) and value and all(isinstance(name, str) for name in value):
         unknown = sorted(set(value) - set(names))
         if unknown:
-            raise InputError(f"{where}: {some(unknown, 'query')} not in the model; name images of the model.")
+            raise InputError(f"{where}: {some(unknown, 'query image')} not in the model; name images of the model.")
         return value
     if isinstance(value, str) and value:
         chosen = [name for name in names if fnmatchcase(name, value)]

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spherloc.datasets.colmap_walk import (
+    LARGEST,
     MODELS,
     OBSERVATION,
     ORDER,
@@ -168,9 +169,11 @@ def _points(reader: _Reader, walked: Walked) -> None:
             tracks = bytearray()
     _check_tracks(reader, walked, tracks)
     table = np.frombuffer(bytes(records), _POINT)
-    wrong = np.flatnonzero(~np.isfinite(table["xyz"]).all(axis=1) | (table["id"] < 0))
-    if len(wrong):
-        raise reader.broken(f"record {wrong[0] + 1} of the points has no finite position or an impossible id")
+    possible = (np.abs(table["xyz"]) <= LARGEST).all(axis=1) & (table["id"] >= 0)
+    if not possible.all():
+        raise reader.broken(
+            f"record {int(np.flatnonzero(~possible)[0]) + 1} of the points has no possible position or id"
+        )
     walked.points = make_points(table["id"], table["xyz"], table["error"], table["track"])
 
 

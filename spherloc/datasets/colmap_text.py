@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spherloc.datasets.colmap_walk import (
+    LARGEST,
     MODELS,
     OBSERVATION,
     ORDER,
@@ -160,9 +161,7 @@ def _images(lines: Iterator[_Line], walked: Walked) -> None:
         number, *pose, camera_id, name = words[:10]
         check_pose(line.numbers(pose), line.broken, f"image {number}")
         if len(words) > 10:
-            raise line.broken(
-                "the image's name has a space, which only COLMAP's binary form can hold"
-            )
+            raise line.broken("the image's name has a space, which only COLMAP's binary form can hold")
         second = next(lines, None)
         if second is None:
             raise line.broken("the line with the observations after it is missing")
@@ -197,6 +196,9 @@ def _points(lines: Iterator[_Line], walked: Walked) -> None:
         walked.tracks(track[:, 0], track[:, 1], line.broken)
         for word in rest[3:6]:
             line.whole(word)
-        columns.append((*line.numbers([*rest[:3], rest[6]]), len(track)))
+        *xyz, error_px = line.numbers([*rest[:3], rest[6]])
+        if max(map(abs, xyz)) > LARGEST:
+            raise line.broken(f"the position {show(xyz)} is impossible")
+        columns.append((*xyz, error_px, len(track)))
     table = np.array(columns, dtype=np.float64).reshape(-1, 5)
     walked.points = make_points(ids, table[:, :3], table[:, 3], table[:, 4])

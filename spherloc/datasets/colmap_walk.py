@@ -38,6 +38,9 @@ OBSERVATION = np.dtype([("pixel", "<f8", (2,)), ("point", "<i8")])
 Broken = Callable[[str], InputError]
 """Makes the error that says at which place of which file what is wrong."""
 
+LARGEST = 1e12
+"""Coordinates beyond this are damage, whatever the model's unit: what is computed from them would overflow."""
+
 _NORM_TOLERANCE = 1e-3
 
 
@@ -153,14 +156,15 @@ class Walked:
 def check_pose(numbers: Sequence[float], broken: Broken, what: str) -> None:
     """Raise what ``broken`` makes unless ``numbers`` are a unit quaternion and a finite translation."""
     values = np.asarray(numbers, dtype=np.float64)
-    with np.errstate(over="ignore"):
+    with np.errstate(over="ignore", invalid="ignore"):
         length = float(np.linalg.norm(values[:4]))
-    if not np.isfinite(values).all() or abs(length - 1.0) > _NORM_TOLERANCE:
-        raise broken(f"the pose of {what} is {show(list(numbers))}, no unit quaternion and finite translation")
+    if not ((np.abs(values) <= LARGEST).all() and abs(length - 1.0) <= _NORM_TOLERANCE):
+        raise broken(f"the pose of {what} is {show(list(numbers))}, no unit quaternion and possible translation")
 
 
 def check_observations(observations: NDArray[Any], broken: Broken, what: str) -> None:
     """Raise what ``broken`` makes unless all ``OBSERVATION`` records have a finite pixel and a possible point."""
-    wrong = np.flatnonzero(~np.isfinite(observations["pixel"]).all(axis=1) | (observations["point"] < -1))
-    if len(wrong):
-        raise broken(f"observation {wrong[0] + 1} of {what} has no finite pixel or an impossible point")
+    possible = (np.abs(observations["pixel"]) <= LARGEST).all(axis=1) & (observations["point"] >= -1)
+    if not possible.all():
+        first = int(np.flatnonzero(~possible)[0]) + 1
+        raise broken(f"observation {first} of {what} has no possible pixel or point")

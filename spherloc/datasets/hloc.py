@@ -1,20 +1,4 @@
-"""Scenes of ``kind = "hloc"``: what hloc wrote (features, matches, pairs), and the COLMAP model that it made.
-
-.. code-block:: toml
-
-    kind = "hloc"
-    name = "my city"
-    model = "outputs/sfm"                      # COLMAP model of the references, binary or text; needs pycolmap
-    images = "images"                          # folder of the images
-    queries = "queries_with_intrinsics.txt"    # rows: name MODEL width height parameters
-    pairs = "outputs/pairs-netvlad.txt"        # rows: query reference, the most similar one first
-    features = "outputs/feats.h5"              # of the queries; needs h5py
-    matches = "outputs/matches.h5"             # of the pairs
-    truth = "outputs/results.txt"              # optional, rows: name qw qx qy qz tx ty tz
-
-    [gravity]                                  # optional
-    map = [0.0, 0.0, -1.0]                     # down; else the mean +y axis of the reference cameras
-    bound_deg = 5.0                            # how far a query's roll and pitch may be from its reference's
+"""hloc: its features, matches and pairs, and the COLMAP model that it made.
 
 Without ``features`` and ``matches``, the project's own features are matched as [frontend] says: the pairs, or what
 ``global_features = "outputs/global-feats.h5"`` retrieves, or what the project retrieves by itself. hloc's models keep
@@ -43,6 +27,21 @@ from spherloc.frontend.pipeline import image_matcher
 from spherloc.frontend.view import Matcher, View
 
 EXTRAS = ("colmap", "hloc")
+EXAMPLE = """\
+kind = "hloc"
+name = "my city"
+model = "outputs/sfm"                      # COLMAP model of the references, binary or text
+images = "images"                          # folder of the images
+queries = "queries_with_intrinsics.txt"    # rows: name MODEL width height parameters
+pairs = "outputs/pairs-netvlad.txt"        # rows: query reference, the most similar one first
+features = "outputs/feats.h5"              # of the queries
+matches = "outputs/matches.h5"             # of the pairs
+truth = "outputs/results.txt"              # optional, rows: name qw qx qy qz tx ty tz
+
+[gravity]                                  # optional
+map = [0.0, 0.0, -1.0]                     # down; else the mean +y axis of the reference cameras
+bound_deg = 5.0                            # how far a query's roll and pitch may be from its reference's
+"""
 
 GRAVITY_BOUND_DEG = 5.0
 """A reference's roll and pitch are not the query's: cameras are held by hand."""

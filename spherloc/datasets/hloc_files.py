@@ -27,6 +27,9 @@ MAX_BYTES = 1 << 28
 MAX_TOTAL_BYTES = 1 << 30
 """Of all global descriptors together."""
 
+_LARGEST_PX = 1e6
+"""Beyond any image; it refuses NaN and infinity too."""
+
 
 def read_queries(path: Path) -> tuple[dict[str, Camera], list[str]]:
     """Cameras by query from lines ``name MODEL width height parameters...``, and remarks on those skipped.
@@ -162,8 +165,8 @@ def read_keypoints(file: Hdf5, name: str) -> Keypoints | None:
         return None
     place = f"{file.path}: {show(name)}"
     pixels = array.astype(np.float64)
-    if pixels.shape[1] < 2 or not np.isfinite(pixels[:, :2]).all():
-        raise InputError(f"{place}: its keypoints are not rows of two finite numbers; extract the features again.")
+    if pixels.shape[1] < 2 or not (np.abs(pixels[:, :2]) <= _LARGEST_PX).all():
+        raise InputError(f"{place}: its keypoints are not rows of two pixel coordinates; extract the features again.")
     size = file.array((name, "image_size"), "iuf", 1)
     if size is not None and (len(size) != 2 or not np.isfinite(size).all() or not (size > 0).all()):
         raise InputError(f"{place}: its image_size is not a width and a height; extract the features again.")
@@ -217,7 +220,8 @@ def read_global_descriptors(path: Path, names: Sequence[str]) -> NDArray[np.floa
             array = file.array((name, "global_descriptor"), "f", 1)
             if array is None:
                 continue
-            length = np.linalg.norm(array.astype(np.float64))
+            with np.errstate(all="ignore"):
+                length = np.linalg.norm(array.astype(np.float64))
             if not np.isfinite(length) or length == 0.0 or len(array) != len(next(iter(found.values()), array)):
                 raise InputError(f"{path}: the descriptor of {show(name)} is damaged; extract it again.")
             if len(array) * len(names) * 4 > MAX_TOTAL_BYTES:

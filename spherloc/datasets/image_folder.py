@@ -112,7 +112,7 @@ def _queries(
             reasons.setdefault(reason, []).append(name)
         else:
             views.append(View(name, camera, root / name, truth.get(name), gravity_camera=down))
-    return tuple(views), [f"{some(bad, 'query')} left out: {reason}." for reason, bad in reasons.items()]
+    return tuple(views), [f"{some(bad, 'query image')} left out: {reason}." for reason, bad in reasons.items()]
 
 
 def _names(table: dict[str, Any], path: Path) -> tuple[Path, list[str]]:

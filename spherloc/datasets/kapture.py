@@ -1,23 +1,6 @@
-"""Scenes of ``kind = "kapture"``: posed images of cameras and rigs (kapture 1.1), some localized against the others.
+"""kapture 1.1: posed images of cameras and rigs, some of them localized against the others.
 
-.. code-block:: toml
-
-    kind = "kapture"
-    name = "my robot"
-    root = "mapping"               # folder that holds sensors/
-    queries = ["cam001/0002.jpg"]  # names of images or patterns of them, or a section [queries] as below
-
-    [references]                   # optional: all other images with a pose
-    images = ["cam00*/*"]          # names or patterns
-    devices = ["cam001", "cam002"]
-    timestamps = [0, 1000]         # first and last, as in the files
-    every = 5                      # every fifth of these, by time
-
-    [gravity]                      # optional
-    map = [0.0, 1.0, 0.0]          # down; else the mean +y axis of the reference cameras
-    bound_deg = 5.0                # how far a query's roll and pitch may be from its reference's
-
-kapture has no depth here: points of a reference are triangulated from other references, those first that a rig took at
+Depth records are not read: points of a reference are triangulated from other references, those first that a rig took at
 the same time. What a rig took together with a query is no reference. A query's pose, if it has one, is the truth.
 
 https://github.com/naver/kapture/blob/main/kapture_format.adoc
@@ -42,6 +25,23 @@ from spherloc.frontend.pipeline import image_matcher
 from spherloc.frontend.triangulation import TriangulationLift
 from spherloc.frontend.view import View
 from spherloc.geometry import camera_centre
+
+EXAMPLE = """\
+kind = "kapture"
+name = "my robot"
+root = "mapping"                 # folder that holds sensors/
+queries = ["cam001/*5.jpg"]      # names or patterns of images, or a section [queries] like the next
+
+[references]                     # optional, and so are its keys: else all other images with a pose
+images = ["cam001/*", "cam002/*"]
+devices = ["cam001", "cam002"]
+timestamps = [0, 1000]           # first and last, as in the files
+every = 5                        # every fifth of these, by time
+
+[gravity]                        # optional
+map = [0.0, 1.0, 0.0]            # down; else the mean +y axis of the reference cameras
+bound_deg = 5.0                  # how far a query's roll and pitch may be from its reference's
+"""
 
 GRAVITY_BOUND_DEG = 5.0
 """A reference's roll and pitch are not the query's: cameras are held by hand."""
@@ -213,13 +213,13 @@ def _neighbours(kapture: Kapture, records: Sequence[Record], views: Sequence[Vie
     for index, record in enumerate(records):
         rigs = sorted(kapture.carriers(record.device))
         partners = list(dict.fromkeys(other for rig in rigs for other in by_rig[record.timestamp, rig]))
-        similar = axes @ axes[index] >= _LEAST_COSINE
         near = [
             (distance, other)
             for distance, other in zip(distances[index].tolist(), nearest[index].tolist(), strict=True)
-            if similar[other] and other not in partners
+            if axes[other] @ axes[index] >= _LEAST_COSINE and other not in partners
         ]
-        chosen.append([other for other in partners if other != index and similar[other]] + _spread(near))
+        alike = [other for other in partners if other != index and axes[other] @ axes[index] >= _LEAST_COSINE]
+        chosen.append(alike + _spread(near))
     return chosen
 
 

@@ -3,7 +3,8 @@
 ``kind = "kitti360"`` with ``root`` (the dataset's folder), ``reference_sequence``, ``query_sequence`` (numbers) and
 ``camera`` ("image_02" or "image_03"). Optional: ``reference_frames`` and ``query_frames`` ([first, last], all by
 default), ``reference_step`` and ``query_step`` (every n-th usable frame) and ``scans`` (how many neighbouring scans
-make up the points of a reference, by default its own).
+make up the points of a reference, by default its own). Where the dataset's ``fisheye/mask_left_fisheye.npy`` (or right)
+is there, what shows the vehicle itself is not used.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,6 +18,7 @@ import numpy as np
 from spherloc.cameras.base import FloatArray
 from spherloc.datasets import scene_file
 from spherloc.datasets.kitti360_files import (
+    SIDES,
     Drive,
     Rig,
     frames_in,
@@ -26,6 +28,7 @@ from spherloc.datasets.kitti360_files import (
     read_timestamps,
     scan_motion,
     unwrapped,
+    without_car,
 )
 from spherloc.datasets.map_scene import MapScene
 from spherloc.datasets.map_settings import OPTIONAL, REQUIRED, folder, needed_file, read_settings
@@ -35,7 +38,6 @@ from spherloc.frontend.pipeline import image_matcher
 from spherloc.frontend.view import View
 from spherloc.geometry import pose, transform
 
-CAMERAS = ("image_02", "image_03")
 THRESHOLDS = ((1.0, 0.5), (2.0, 1.0), (5.0, 2.0))
 """Table II."""
 GRAVITY_BOUND_DEG = 2.0
@@ -59,8 +61,8 @@ def load(table: dict[str, Any], path: Path) -> MapScene:
     scene_file.check_keys(table, REQUIRED | own, OPTIONAL | choices, where)
     settings = read_settings(table, where, GRAVITY_BOUND_DEG, THRESHOLDS)
     scans = scene_file.integer({"scans": 1} | table, "scans", where, 1, MAX_SCANS)
-    if table["camera"] not in CAMERAS:
-        raise InputError(f"{where}: camera is {show(table['camera'])}; give one of {', '.join(CAMERAS)}.")
+    if table["camera"] not in tuple(SIDES):
+        raise InputError(f"{where}: camera is {show(table['camera'])}; give one of {', '.join(SIDES)}.")
     root = folder(table, "root", path)
     rig = read_rig(root, table["camera"], where)
     mapped = _recorded("reference", table, root, where)
@@ -111,6 +113,7 @@ class _Recorded:
             cam_from_map=self.camera_pose(frame, rig),
             timestamp_s=self.times_s[frame] if frame < len(self.times_s) else None,
             lift=lift,
+            mask=partial(without_car, rig.car_mask, rig.camera) if rig.car_mask else None,
         )
 
     def camera_pose(self, frame: int, rig: Rig) -> FloatArray:

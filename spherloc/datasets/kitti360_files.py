@@ -9,10 +9,11 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
+import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from spherloc.cameras.base import Camera, FloatArray
+from spherloc.cameras.base import BoolArray, Camera, FloatArray
 from spherloc.cameras.calibration import load_camera
 from spherloc.datasets.map_settings import needed_file
 from spherloc.datasets.text_rows import finite_numbers, rows
@@ -22,10 +23,13 @@ MAX_SCAN_BYTES = 1 << 28
 """A hundred times a scan of the dataset."""
 FARTHEST_M = 10_000.0
 """Laser returns beyond this, a hundred times the sensor's range, are no returns but damage."""
+MAX_SIDE_PX = 10_000
 FARTHEST_ORIGIN_M = 1e9
 """Beyond this, 25 times around the Earth, a position has lost its millimetres."""
 ROTATION_TOLERANCE = 1e-3
 """Rotations written with four digits are about this far from orthonormal."""
+SIDES = {"image_02": "left", "image_03": "right"}
+"""Where the fisheye cameras look."""
 _POINT_BYTES = 16
 _TIME = re.compile(r"(\d{4}-\d\d-\d\d) (\d\d:\d\d:\d\d)(\.\d{1,9})?")
 
@@ -37,6 +41,8 @@ class Rig:
     camera: Camera
     imu_from_camera: FloatArray
     imu_from_velodyne: FloatArray
+    car_mask: Path | None
+    """Where the image shows the vehicle itself; not everybody has that file."""
 
 
 @dataclass(frozen=True)
@@ -92,10 +98,12 @@ def read_rig(root: Path, camera: str, where: str) -> Rig:
         if key not in imu_from:
             raise InputError(f"{to_pose_file}: there is no line '{key}:'; take the dataset's own file.")
     velodyne_from_image_00 = read_cam_to_velo(to_velodyne_file)
+    car_mask = root / "fisheye" / f"mask_{SIDES[camera]}_fisheye.npy"
     return Rig(
         camera=load_camera(lens_file),
         imu_from_camera=imu_from[camera],
         imu_from_velodyne=imu_from["image_00"] @ np.linalg.inv(velodyne_from_image_00),
+        car_mask=car_mask if car_mask.is_file() else None,
     )
 
 
@@ -168,6 +176,24 @@ def read_timestamps(path: Path) -> list[float]:
     return times
 
 
+def without_car(path: Path, camera: Camera) -> BoolArray:
+    """(H, W), false where ``fisheye/mask_{left,right}_fisheye.npy`` is not zero: the vehicle, which moves along.
+
+    The mask may be smaller than the image. Raises ``InputError`` for what is no such mask.
+    """
+    try:
+        # Mapped: a header that claims more than the file holds is refused before anything is allocated.
+        mask = np.load(path, mmap_mode="r", allow_pickle=False)
+    except Exception:  # numpy lets whatever its header's parser stumbles over through
+        mask = None
+    sides = mask.shape if isinstance(mask, np.ndarray) and mask.dtype.kind in "buif" else ()
+    if mask is None or len(sides) != 2 or not 0 < min(sides) <= max(sides) <= MAX_SIDE_PX:
+        raise InputError(f"{path}: no array of rows and columns, as the mask of the car has; replace or remove it.")
+    size = (camera.width, camera.height)
+    car = cv2.resize((np.asarray(mask) != 0).astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+    return car == 0
+
+
 def frames_in(folder: Path, ending: str, where: str, what: str) -> set[int]:
     """Frames of the files in a folder that are named by ten digits and ``ending``; others are left alone.
 
@@ -176,7 +202,10 @@ def frames_in(folder: Path, ending: str, where: str, what: str) -> set[int]:
     if not folder.is_dir():
         raise InputError(f"{where}: the folder {folder} is missing, {what}; check 'root' and the sequence.")
     named = re.compile(r"\d{10}" + re.escape(ending), re.ASCII)
-    return {int(entry.name[:10]) for entry in folder.iterdir() if named.fullmatch(entry.name)}
+    try:
+        return {int(entry.name[:10]) for entry in folder.iterdir() if named.fullmatch(entry.name)}
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be read ({error.strerror}); check its permissions.") from None
 
 
 def read_scan(path: Path) -> FloatArray:

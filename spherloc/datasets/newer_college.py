@@ -25,7 +25,7 @@ from spherloc.datasets.colmap_model import ColmapImage, ColmapModel, read_model
 from spherloc.datasets.imu import down_at, read_imu
 from spherloc.datasets.map_scene import MapScene
 from spherloc.datasets.map_settings import OPTIONAL, REQUIRED, folder, needed_file, read_settings
-from spherloc.datasets.newer_college_files import NAME_RULE, TimedImage, images_in, read_cloud, timestamp_of
+from spherloc.datasets.newer_college_files import NAME_RULE, TimedImage, images_in, is_there, read_cloud, timestamp_of
 from spherloc.datasets.similarity import Similarity, align, similarity_of
 from spherloc.errors import InputError, show
 from spherloc.frontend.lifting import PointCloudLift, SfmLift
@@ -44,8 +44,6 @@ MAX_GAP_S = 0.5
 """Of the ground truth, which comes at 10 Hz."""
 MAP_REACH_M = 60.0
 """Points of the prior map that are farther from a reference are left out of it."""
-WORST_FIT = 0.1
-"""Of the extent of the camera positions: a larger residual means that they are not the same positions."""
 
 
 def load(table: dict[str, Any], path: Path) -> MapScene:
@@ -94,7 +92,7 @@ class _Place:
     def folder(self, key: str) -> Path:
         """An existing folder that a key names."""
         named = self.root / scene_file.text(self.table, key, self.where)
-        if not named.is_dir():
+        if not is_there(named.is_dir):
             raise InputError(f"{self.where}: {key} names the folder {named}, which does not exist; correct the path.")
         return named
 
@@ -204,7 +202,7 @@ def _model_references(place: _Place, rig: _Rig) -> tuple[list[View], list[str]]:
     files = place.folder("reference_images")
     similarity, remark = _map_from_model(place, rig, model)
     images = list(model.images.values())[:: place.step("reference_step")]
-    present = [image for image in images if (files / image.name).is_file()]
+    present = [image for image in images if is_there((files / image.name).is_file)]
     views = [
         View(
             name=image.name,
@@ -238,14 +236,7 @@ def _map_from_model(place: _Place, rig: _Rig, model: ColmapModel) -> tuple[Simil
             "so the model cannot be placed; give map_from_model."
         )
     old, new = np.array(pairs).transpose(1, 0, 2)
-    found = align(
-        old, new, f"{place.where}: the cameras of {model.folder} against {truth_file} (or give map_from_model)"
-    )
-    if found.rms_m > WORST_FIT * found.extent_m:
-        raise InputError(
-            f"{place.where}: {model.folder} does not fit {truth_file}, {found.rms_m:.2g} m off over "
-            f"{found.extent_m:.2g} m; give the ground truth of the same sequence."
-        )
+    found = align(old, new, f"{place.where}: the cameras of {model.folder} cannot be placed by {truth_file}")
     return found.similarity, [
         f"{model.folder} was placed by {found.used} of {len(pairs)} camera positions of {truth_file.name}: scale "
         f"{found.similarity.scale:.4g}, residual {found.rms_m:.2g} m (root mean square)."

@@ -1,6 +1,7 @@
 """Files of the Newer College Dataset: images whose names carry their time, and the prior map's point cloud."""
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
@@ -33,6 +34,14 @@ class TimedImage:
     timestamp_ns: int
 
 
+def is_there(test: Callable[[], bool]) -> bool:
+    """What ``path.is_file`` or ``path.is_dir`` says; False also for names that are too long for any file."""
+    try:
+        return test()
+    except OSError:
+        return False
+
+
 def timestamp_of(name: str) -> int | None:
     """Nanoseconds that an image's name ends with, as <seconds>_<nanoseconds> or as nanoseconds; None for other names.
 
@@ -51,7 +60,10 @@ def images_in(folder: Path) -> tuple[list[TimedImage], int]:
 
     Raises ``InputError`` if none carries a time, or if two carry the same one.
     """
-    files = [path for path in folder.iterdir() if path.suffix.lower() in ENDINGS]
+    try:
+        files = [path for path in folder.iterdir() if path.suffix.lower() in ENDINGS]
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be read ({error.strerror}); check its permissions.") from None
     timed = [(timestamp_of(path.name), path) for path in files]
     images = sorted(
         (TimedImage(path.name, path, time) for time, path in timed if time is not None),

@@ -1,5 +1,6 @@
 """The entries [[references]] of a scene: images with a camera, a pose and a depth map each."""
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache, partial
@@ -146,11 +147,11 @@ def read_depth(path: Path, unit_m: float) -> NDArray[np.float32]:
         return read_depth_png(path).astype(np.float32) * np.float32(unit_m)
     try:
         # Mapped, so that a header that announces more than the file holds is refused before anything is allocated.
-        depth = np.lib.format.open_memmap(path, mode="r")
-        if depth.ndim != 2 or depth.dtype.kind not in "fiu":
-            raise InputError(f"{path}: has the shape {depth.shape} of {depth.dtype}; give numbers of shape (H, W).")
-        return depth.astype(np.float32) * np.float32(unit_m)
-    except InputError:
-        raise
-    except (OSError, ValueError, TypeError, SyntaxError, EOFError, OverflowError, MemoryError, RecursionError):
-        raise InputError(f"{path}: no .npy file with an array of numbers; save the depth map again.") from None
+        with warnings.catch_warnings(action="ignore"):
+            depth = np.lib.format.open_memmap(path, mode="r")
+        if depth.ndim == 2 and depth.dtype.kind in "fiu":
+            return depth.astype(np.float32) * np.float32(unit_m)
+        reason = f"has the shape {depth.shape} of {depth.dtype}"
+    except Exception:  # numpy reads the header as Python text, and lets through whatever that makes of a damaged one
+        reason = "is missing or damaged, or holds Python objects"
+    raise InputError(f"{path}: {reason}; give an .npy file with numbers of shape (H, W).")

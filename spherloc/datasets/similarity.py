@@ -16,6 +16,11 @@ LEAST_SPREAD = 0.02
 """Positions whose second extent is a smaller share of the first lie on a line, which fixes no rotation about it."""
 FARTHEST = 1e9
 """In the units of either frame."""
+WORST_FIT = 0.1
+"""Of the extent of the positions: a larger residual means that they are not the same positions."""
+LEAST_USED = 0.8
+"""Share of the positions that must fit: three of four always do, whatever they are."""
+_REMEDY = "give map_from_model"
 _ROUNDS = 30
 _INLIER_MEDIANS = 4.0
 
@@ -49,8 +54,6 @@ class Alignment:
     """Pairs that fit."""
     rms_m: float
     """Of their residuals."""
-    extent_m: float
-    """Root mean square distance of the positions from their mean."""
 
 
 def similarity_of(value: Any, key: str, where: str) -> Similarity:
@@ -70,32 +73,41 @@ def align(old: FloatArray, new: FloatArray, where: str) -> Alignment:
     """The similarity that takes the positions ``old`` (N, 3) to ``new`` (N, 3), against a few wrong ones among them.
 
     Umeyama's closed form (1991), reweighted so that the sum of distances is least instead of that of squares.
-    Raises ``InputError`` for fewer than three pairs and for positions on a line.
+    Raises ``InputError`` for fewer than three pairs, for positions on a line, and for positions that do not fit.
     """
     if len(old) < 3:
-        raise InputError(f"{where}: {len(old)} positions are known in both frames, and an alignment needs three.")
+        raise InputError(f"{where}: only {len(old)} positions are known in both, and it takes three; {_REMEDY}.")
     if not (np.abs(old) <= FARTHEST).all():
         raise InputError(f"{where}: a position lies beyond {FARTHEST:g}; correct or remove it.")
+    _check_spread(old, new, where)
     weights = np.ones(len(old))
     for _ in range(_ROUNDS):
-        found = _umeyama(old, new, weights, where)
+        found = _umeyama(old, new, weights / weights.sum())
         residuals = np.linalg.norm(found.points(old) - new, axis=1)
         weights = 1.0 / np.maximum(residuals, 1e-3 + 0.1 * np.median(residuals))
-    good = np.less_equal(residuals, _INLIER_MEDIANS * max(float(np.median(residuals)), 1e-9))
-    rms = float(np.sqrt(np.mean(residuals[good] ** 2)))
+    good = np.less_equal(residuals, max(_INLIER_MEDIANS * float(np.median(residuals)), 1e-3))
+    used, rms = int(good.sum()), float(np.sqrt(np.mean(residuals[good] ** 2)))
     extent = float(np.sqrt(np.mean(np.sum((new - new.mean(axis=0)) ** 2, axis=1))))
-    return Alignment(found, int(good.sum()), rms, extent)
+    if rms > WORST_FIT * extent or used < LEAST_USED * len(old):
+        raise InputError(
+            f"{where}: the positions do not fit, {used} of {len(old)} by {rms:.2g} m over {extent:.2g} m; take both "
+            f"from the same recording, or {_REMEDY}."
+        )
+    _check_spread(old[good], new[good], where)
+    return Alignment(found, used, rms)
 
 
-def _umeyama(old: FloatArray, new: FloatArray, weights: FloatArray, where: str) -> Similarity:
-    """Least weighted squares."""
-    weights = weights / weights.sum()
+def _check_spread(old: FloatArray, new: FloatArray, where: str) -> None:
+    for positions in (old, new):
+        extents = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False)
+        if not extents[1] > LEAST_SPREAD * extents[0]:
+            raise InputError(f"{where}: the positions lie on a line, so that a rotation stays open; {_REMEDY}.")
+
+
+def _umeyama(old: FloatArray, new: FloatArray, weights: FloatArray) -> Similarity:
+    """Least weighted squares; weights (N,) that sum to 1."""
     old_mean, new_mean = weights @ old, weights @ new
     old_centred, new_centred = old - old_mean, new - new_mean
-    for centred in (old_centred, new_centred):
-        extents = np.linalg.svd(np.sqrt(weights)[:, None] * centred, compute_uv=False)
-        if not extents[1] > LEAST_SPREAD * extents[0]:
-            raise InputError(f"{where}: the positions lie on a line, which leaves open the rotation about it.")
     left, sizes, right = np.linalg.svd((weights[:, None] * new_centred).T @ old_centred)
     signs = np.array([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
     rotation = left @ np.diag(signs) @ right

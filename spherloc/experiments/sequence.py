@@ -132,10 +132,10 @@ def _array(value: Any) -> FloatArray | None:
 
 
 class _Job(threading.Thread, Generic[R]):
-    """Work in a thread of its own, which ends with the process: Ctrl-C does not wait for it."""
+    """Work in a thread of its own. Python ends after it: to stop a thread inside OpenCV would crash the process."""
 
     def __init__(self, work: Callable[[], R]) -> None:
-        super().__init__(name="spherloc-matching", daemon=True)
+        super().__init__(name="spherloc-matching")
         self._work = work
         self._done: R
         self._error: BaseException | None = None

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from spherloc.datasets.map_scene import Thresholds
 from spherloc.experiments.results import SequenceResults
 from spherloc.experiments.rows import FAILED, LOCALIZED, UNREADABLE, QueryResult
 
@@ -106,7 +107,7 @@ def summarize(results: SequenceResults) -> Summary:
         unreadable=len(rows) - len(usable),
         without_truth=len(usable) - len(with_truth),
         not_registered=0 if limits_m is None else len(usable) - len(registered),
-        success=tuple(_rate(with_truth, *limits) for limits in setting.thresholds) if with_truth else (),
+        success=success_rates(rows, setting.thresholds),
         registration_success=tuple(_rate(registered, None, metres) for metres in limits_m or ()),
         median_rotation_error_deg=_median(row.rotation_error_deg for row in rows),
         median_translation_error_m=_median(row.translation_error_m for row in rows),
@@ -121,6 +122,12 @@ def summarize(results: SequenceResults) -> Summary:
         median_estimating_ms=_median(row.estimating_ms for row in rows),
         diagnoses={cause: causes.count(cause) for cause in sorted(set(causes), key=lambda c: (-causes.count(c), c))},
     )
+
+
+def success_rates(rows: Sequence[QueryResult], thresholds: Thresholds) -> tuple[SuccessRate, ...]:
+    """How many queries with known truth are within each of the limits (degrees, metres); none without any truth."""
+    judged = [row for row in rows if row.status != UNREADABLE and row.truth_cam_from_map is not None]
+    return tuple(_rate(judged, *limits) for limits in thresholds) if judged else ()
 
 
 def _rate(judged: Sequence[QueryResult], degrees: float | None, metres: float) -> SuccessRate:

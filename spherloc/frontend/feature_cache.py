@@ -14,7 +14,7 @@ from spherloc.disk_cache import cache_folder, key_of, store
 from spherloc.frontend.feature_kinds import Descriptors
 from spherloc.images import MAX_BYTES
 
-VERSION = 1
+VERSION = 2
 """Raised when the same options give other features, so that old files are not taken for them."""
 
 _DAMAGED = (OSError, ValueError, KeyError, EOFError, MemoryError, zipfile.BadZipFile, zlib.error, NotImplementedError)

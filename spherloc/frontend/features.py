@@ -21,12 +21,14 @@ RIM_PX = 4.0
 """Features this close to pixels that may not be used, and farther for large ones, are the rim's and not the scene's."""
 SEAM_WRAP = 0.05
 """Part of a panorama's width that is repeated beyond its seam, so that features there see both sides."""
+SEAM_LEAST_PX = 128
+"""Repeated of a small one: ORB finds nothing within 31 pixels of the border of its coarsest level, 111 of the image."""
 SEAM_STEP_PX = 32
 """The wrap is a multiple of it, so that the coarse levels of the pyramid sample the same pixels as without it."""
 SEAM_TWIN_PX = 1.0
 """A feature this close to the seam may be found on both sides of it."""
-MOST_PIXELS = 6_000_000
-"""Larger images are shrunk to this for detection, as COLMAP does: SIFT needs about 180 bytes a pixel."""
+MOST_PIXELS = 5_000_000
+"""Larger images are shrunk to this for detection, as COLMAP does: SIFT needs 250 bytes a pixel."""
 
 
 @dataclass(frozen=True)
@@ -120,12 +122,13 @@ def _detected(
     kind = KINDS[options.method]
     room = _room_px(usable)
     mask = (room > RIM_PX).astype(np.uint8)
-    margin = int(SEAM_TWIN_PX) if wrap else 0
-    mask[:, : wrap - margin], mask[:, columns + wrap + margin :] = 0, 0
-    table, descriptors = detect(options.method, image, mask, options.max_features, options.weights)
-    kept = _usable_rows(table, descriptors, mask, room, kind.reach)
-    table, descriptors = table[kept], descriptors[kept]
+    most = ceil(options.max_features * mask.shape[1] / columns)
+    table, descriptors = detect(options.method, image, mask, most, options.weights)
+    kept = _usable_rows(table, descriptors, room, kind.reach)
     table[:, 0] -= wrap
+    if wrap:
+        kept &= (table[:, 0] >= -SEAM_TWIN_PX) & (table[:, 0] < columns + SEAM_TWIN_PX)
+    table, descriptors = table[kept], descriptors[kept]
     order = np.lexsort([*table.T[[2, 3, 0, 1]], -table[:, 4]])
     table, descriptors = table[order], descriptors[order]
     if wrap:
@@ -137,7 +140,7 @@ def _detected(
 
 
 def _wrap_px(columns: int) -> int:
-    return min(columns, SEAM_STEP_PX * ceil(SEAM_WRAP * columns / SEAM_STEP_PX))
+    return min(columns, SEAM_STEP_PX * ceil(max(SEAM_WRAP * columns, SEAM_LEAST_PX) / SEAM_STEP_PX))
 
 
 def _room_px(usable: ByteImage) -> NDArray[np.float32]:
@@ -147,16 +150,14 @@ def _room_px(usable: ByteImage) -> NDArray[np.float32]:
     return np.asarray(cv2.distanceTransform(usable, cv2.DIST_L2, cv2.DIST_MASK_PRECISE), np.float32)
 
 
-def _usable_rows(
-    table: FloatArray, descriptors: Descriptors, mask: ByteImage, room_px: NDArray[np.float32], reach: float
-) -> BoolArray:
-    """(N,) features that are finite, at pixels of the mask (not all detectors heed it), and clear of the rim."""
+def _usable_rows(table: FloatArray, descriptors: Descriptors, room_px: NDArray[np.float32], reach: float) -> BoolArray:
+    """(N,) features that are finite, in the image, and clear of the rim."""
     finite = np.isfinite(table).all(axis=1) & np.isfinite(descriptors).all(axis=1)
-    rows, columns = mask.shape
+    rows, columns = room_px.shape
     u, v = np.floor(np.where(finite, table[:, :2].T, 0.0)).clip(-1, max(rows, columns)).astype(np.int64)
     inside = finite & (u >= 0) & (u < columns) & (v >= 0) & (v < rows)
     u, v = np.where(inside, u, 0), np.where(inside, v, 0)
-    return inside & (mask[v, u] > 0) & (room_px[v, u] > RIM_PX + reach * table[:, 2])
+    return inside & (room_px[v, u] > RIM_PX + reach * np.where(finite, table[:, 2], 0.0))
 
 
 def _without_twins(table: FloatArray, columns: int) -> BoolArray:

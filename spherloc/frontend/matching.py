@@ -99,7 +99,7 @@ def _nearest(query: Features, reference: Features, options: MatchOptions) -> Fea
     binary = KINDS[query.method].binary
     nearest, distances, mutual = two_nearest(*(_comparable(one.descriptors, binary) for one in (query, reference)))
     if binary:
-        distances = distances**2  # of bits: their Hamming distance
+        distances = np.round(distances**2)  # of bits: their Hamming distance
     with np.errstate(invalid="ignore", divide="ignore"):
         # Two at no distance are as alike as two can be.
         ratios = np.where(distances[:, 1] == 0.0, 1.0, distances[:, 0] / distances[:, 1])

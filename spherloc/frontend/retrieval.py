@@ -45,19 +45,15 @@ def vocabulary(images: Sequence[Floats], seed: int = 0) -> Floats:
     count = max(1, min(WORDS, len(samples) // LEAST_SAMPLES_A_WORD))
     words = samples[_some(random, len(samples), count)]
     for _ in range(_ROUNDS):
-        index = _nearest_word(samples, words)
-        sums = np.zeros_like(words)
-        np.add.at(sums, index, samples)
-        sizes = np.bincount(index, minlength=len(words))[:, None]
+        sums, sizes = _sums(samples, words)
         words = np.where(sizes > 0, sums / np.maximum(sizes, 1), words)
     return words
 
 
 def vlad(descriptors: Floats, words: Floats) -> Floats:
     """Unit vector (K * D,) of an image with descriptors (N, D); zero for an image without features."""
-    index = _nearest_word(descriptors, words)
-    residuals = np.zeros_like(words)
-    np.add.at(residuals, index, descriptors - words[index])
+    sums, sizes = _sums(descriptors, words)
+    residuals = sums - sizes * words
     residuals = np.sign(residuals) * np.sqrt(np.abs(residuals))
     # Within a word first: one repeated texture (a hedge, a row of windows) must not drown the others.
     residuals /= np.maximum(np.linalg.norm(residuals, axis=1, keepdims=True), 1e-12)
@@ -74,8 +70,14 @@ def _some(random: np.random.Generator, count: int, most: int) -> NDArray[np.int6
     return np.sort(random.choice(count, most, replace=False)) if count > most else np.arange(count)
 
 
-def _nearest_word(descriptors: Floats, words: Floats) -> NDArray[np.int64]:
+def _sums(descriptors: Floats, words: Floats) -> tuple[Floats, Floats]:
+    """Of the descriptors that are nearest to each word, their sum (K, D) and their number (K, 1)."""
     half = 0.5 * (words**2).sum(axis=1)
-    chunks = range(0, len(descriptors), _CHUNK)
-    parts = [(descriptors[start : start + _CHUNK] @ words.T - half).argmax(axis=1) for start in chunks]
-    return np.concatenate(parts) if parts else np.zeros(0, dtype=np.int64)
+    sums, sizes = np.zeros_like(words), np.zeros((len(words), 1), np.float32)
+    for start in range(0, len(descriptors), _CHUNK):
+        part = descriptors[start : start + _CHUNK]
+        nearest = (part @ words.T - half).argmax(axis=1)
+        chosen = (np.arange(len(words))[:, None] == nearest).astype(np.float32)
+        sums += chosen @ part
+        sizes += chosen.sum(axis=1, keepdims=True)
+    return sums, sizes

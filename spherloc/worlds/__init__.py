@@ -22,7 +22,7 @@ WORLDS: dict[str, Callable[[int], World]] = {
 """By kind."""
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=8)
 def build_world(kind: str, seed: int = 0) -> World:
     """The world of that kind; another seed gives another one of the same sort.
 

@@ -86,7 +86,7 @@ class Lighting:
         sky = np.asarray(light.sky, np.float32)
         if self.world.indoor:  # daylight is only what comes through windows, and white walls spread it
             sky = np.float32(1.1 * sky.mean()) * INDOOR_LAMP
-        lit = sky * (0.62 + 0.38 * up)
+        lit = sky * (0.85 + 0.15 * up if self.world.indoor else 0.62 + 0.38 * up)
         sun = np.asarray(light.sun, np.float32)
         if sun.any() and not self.world.indoor:
             azimuth, elevation = np.radians([light.azimuth_deg, light.elevation_deg])

@@ -136,6 +136,10 @@ class World:
 
     def glb(self) -> bytes:
         """The mesh with its texture as a binary glTF in the world's own frame (z up), metres."""
+        return self._glb
+
+    @cached_property
+    def _glb(self) -> bytes:
         return write_glb(self.mesh, self.atlas)
 
     def identity(self) -> tuple[Any, ...]:

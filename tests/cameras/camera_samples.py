@@ -11,6 +11,7 @@ from spherloc.cameras.base import Camera
 from spherloc.cameras.double_sphere import DoubleSphere
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.cameras.eucm import Eucm
+from spherloc.cameras.fisheye624 import Fisheye624
 from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.cameras.mei import Mei
 
@@ -61,6 +62,23 @@ INLINE: dict[str, Camera] = {
     "eucm-infinite-image": Eucm(640, 480, 300.0, 301.0, 318.0, 243.0, 0.3, 0.7),
     "eucm-beyond-180": Eucm(1000, 1000, 350.0, 350.0, 500.0, 500.0, 0.75, 1.2),
     "eucm-pinhole": Eucm(640, 480, 320.0, 322.0, 318.0, 243.0, 0.0, 1.0),
+    "624-aria-rgb": Fisheye624(
+        1408,
+        1408,
+        610.9410078676575,
+        610.9410078676575,
+        715.6148341104505,
+        717.2147122529825,
+        (
+            *(0.4060356696288849, -0.489948419647729, 0.1745652818132035),
+            *(1.132983686620576, -1.701635218233742, 0.6511555293441647),
+            *(0.0006211469747214578, 1.932200015697112e-05),
+            *(-1.485525650871087e-05, 0.0002601225712292815, -0.0006582109778598294, 3.761395141407565e-05),
+        ),
+    ),
+    "624-strong-prism": Fisheye624(
+        800, 600, 300.0, 305.0, 410.0, 295.0, (-0.02, 0.003, 0, 0, 0, 0, 0.01, -0.008, 0.02, -0.003, -0.015, 0.004)
+    ),
     "panorama-2048x1024": Equirectangular(2048, 1024),
     "panorama-odd-size": Equirectangular(1919, 961),
 }

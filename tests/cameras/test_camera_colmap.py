@@ -8,6 +8,7 @@ from spherloc.cameras.base import Camera
 from spherloc.cameras.colmap_models import camera_from_colmap
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.cameras.eucm import Eucm
+from spherloc.cameras.fisheye624 import Fisheye624
 from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.cameras.mei import Mei
 from spherloc.errors import CalibrationError
@@ -26,6 +27,11 @@ MODELS: dict[str, tuple[list[float], type[Camera], float]] = {
     "RADIAL_FISHEYE": ([300.0, 318.0, 243.0, -0.05, 0.02], KannalaBrandt, 89.0),
     "OPENCV_FISHEYE": ([300.0, 310.0, 318.0, 243.0, -0.05, 0.02, 1e-3, -2e-3], KannalaBrandt, 85.0),
     "EUCM": ([300.0, 310.0, 318.0, 243.0, 0.6, 1.1], Eucm, 89.9),
+    "RAD_TAN_THIN_PRISM_FISHEYE": (
+        [300.0, 310.0, 318.0, 243.0, -0.03, 0.01, -4e-3, 1e-3, 2e-4, -1e-4, 2e-3, -3e-3, 4e-3, -1e-3, -2e-3, 5e-4],
+        Fisheye624,
+        85.0,
+    ),
     "EQUIRECTANGULAR": ([640.0, 480.0], Equirectangular, 180.0),
 }
 """Parameters, the class that they become, and how far from the axis COLMAP's own functions work (degrees)."""
@@ -85,6 +91,7 @@ def test_the_panorama_of_spheresfm_is_an_equirectangular_one():
 @pytest.mark.parametrize(
     ("model", "size", "params", "part"),
     [
+        ("RAD_TAN_THIN_PRISM_FISHEYE", (640, 480), [1.0] * 15, "give a list of 16 finite numbers, fx, fy, cx, cy, k0"),
         ("FOV", (640, 480), [1.0] * 5, "the COLMAP model 'FOV' is not supported: convert it to one of SIMPLE_PINHOLE"),
         ("pinhole", (640, 480), [1.0] * 4, "the COLMAP model 'pinhole' is not supported"),
         (None, (640, 480), [1.0] * 4, "the COLMAP model None is not supported"),

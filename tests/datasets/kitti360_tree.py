@@ -100,7 +100,10 @@ def drive_poses(world, frames, offset_m, start_m, tilts_deg):
 
 
 def scan_of(world, poses, frame):
-    """(N, 4) float32 of one turn of the scanner on the moving car: azimuth 0 is seen at the time of the frame."""
+    """One turn of the scanner on the moving car, (N, 3) as measured and (N, 3) in the world.
+
+    Azimuth 0 is seen at the time of the frame.
+    """
     azimuth, elevation = (
         grid.ravel()
         for grid in np.meshgrid(np.linspace(-np.pi, np.pi, AZIMUTHS, endpoint=False), np.radians(BEAMS_DEG))
@@ -119,9 +122,9 @@ def scan_of(world, poses, frame):
         origins[sign] = here[:3, 3] + share * (there[:3, 3] - here[:3, 3])
         directions[sign] = rotations.apply(beams[sign])
     ranges = world.rays.cast(origins, directions).range_m
-    hit = np.isfinite(ranges) & (ranges < 80)
-    points = beams[hit] * ranges[hit, None]
-    return np.column_stack([points, np.full(len(points), 0.3)]).astype("<f4")
+    hit = ranges < 80
+    ranges[~hit] = 0.0
+    return beams[hit] * ranges[hit, None], (origins + directions * ranges[:, None])[hit]
 
 
 def row(matrix):
@@ -157,7 +160,8 @@ def write_drive(tree, sequence, frames, conditions=None, scans=()):
         cv2.imwrite(str(tree.image(sequence, frame)), picture.image)
     for frame in scans:
         tree.scan(sequence, frame).parent.mkdir(parents=True, exist_ok=True)
-        tree.scan(sequence, frame).write_bytes(scan_of(world, poses, frame).tobytes())
+        points, _ = scan_of(world, poses, frame)
+        tree.scan(sequence, frame).write_bytes(np.insert(points, 3, 0.3, axis=1).astype("<f4").tobytes())
     times = "".join(f"2013-05-28 08:46:{2 + frame // 10:02d}.{frame % 10}04094720\n" for frame in range(max(poses) + 1))
     tree.image(sequence, 0).parent.parent.joinpath("timestamps.txt").write_text(times)
 

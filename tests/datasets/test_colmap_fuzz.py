@@ -141,6 +141,7 @@ def changed(sample, what):
         "NaN pixel": lambda: replace(sample, images=[(*image[:4], [(np.nan, 1.0, 100)]), *more]),
         "infinite translation": lambda: replace(sample, images=[(image[0], far, *image[2:]), *more]),
         "NaN point": lambda: replace(sample, points=[(100, np.array([0, np.nan, 0]), *point[2:]), *rest]),
+        "far point": lambda: replace(sample, points=[(100, np.array([0, -1e200, 0]), *point[2:]), *rest]),
         "track of no image": lambda: replace(sample, points=[(*point[:3], [(999, 0)]), *rest]),
         "track of no keypoint": lambda: replace(sample, points=[(*point[:3], [(10, 999)]), *rest]),
     }[what]()
@@ -153,9 +154,10 @@ SENTENCES = {
     "no such camera": r"images.*image 10 has the camera 55, which is not among the cameras",
     "image twice": r"images.*image 10 is there twice",
     "no name": r"images.*(image 10 has no name|9 values instead of IMAGE_ID)",
-    "NaN pixel": r"images.*(observation 1 of image 10 has no finite pixel|'nan' is not a finite number)",
+    "NaN pixel": r"images.*(observation 1 of image 10 has no possible pixel|'nan' is not a finite number)",
     "infinite translation": r"images.*(the pose of image 10|'inf' is not a finite number)",
-    "NaN point": r"points3D.*(no finite position|'nan' is not a finite number)",
+    "NaN point": r"points3D.*(record 1 of the points has no possible position|'nan' is not a finite number)",
+    "far point": r"points3D.*(record 1 of the points has no possible position|is impossible)",
     "track of no image": r"points3D.*keypoint 0 of image 999, which does not exist",
     "track of no keypoint": r"points3D.*keypoint 999 of image 10, which does not exist",
 }

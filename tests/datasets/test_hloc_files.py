@@ -193,10 +193,12 @@ def test_global_descriptors(tmp_path, monkeypatch):
         file["b.jpg/global_descriptor"] = np.array([0.0, -2.0], np.float32)
         file["zero/global_descriptor"] = np.zeros(2)
         file["long/global_descriptor"] = np.ones(3)
+        file["inf/global_descriptor"] = np.array([1.0, np.inf], np.float16)
+        file["large/global_descriptor"] = np.array([1e200, 1e200])
     found = read_global_descriptors(path, ["b.jpg", "nobody", "a/1.jpg"])
     assert np.allclose(found, [[0.0, -1.0], [np.nan, np.nan], [0.6, 0.8]], equal_nan=True, atol=1e-6)
     assert np.isnan(read_global_descriptors(path, ["x", "y"])).all()
-    for name in ("zero", "long"):
+    for name in ("zero", "long", "inf", "large"):
         with pytest.raises(InputError, match=f"the descriptor of '{name}' is damaged"):
             read_global_descriptors(path, ["b.jpg", name])
     monkeypatch.setattr(hloc_files, "MAX_TOTAL_BYTES", 20)
@@ -222,6 +224,8 @@ def hostile(path, kind, trap):
             group["keypoints"] = np.ones((4, 1))
         elif kind == "nan":
             group["keypoints"] = np.full((4, 2), np.nan)
+        elif kind == "far":
+            group["keypoints"] = np.full((4, 2), -1e300)
         elif kind == "empty":
             group.create_dataset("keypoints", data=h5py.Empty("f4"))
         elif kind == "group":
@@ -254,8 +258,9 @@ def hostile(path, kind, trap):
         ("objects", "holds 'object' in 1 dimensions"),
         ("integers", "holds 'int32' in 2 dimensions"),
         ("flat", "holds 'float64' in 1 dimensions"),
-        ("one column", "not rows of two finite numbers"),
-        ("nan", "not rows of two finite numbers"),
+        ("one column", "not rows of two pixel coordinates"),
+        ("nan", "not rows of two pixel coordinates"),
+        ("far", "not rows of two pixel coordinates"),
         ("empty", "in 0 dimensions"),
         ("group", "is not an array of numbers"),
         ("type", "is not an array of numbers"),

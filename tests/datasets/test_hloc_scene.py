@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hloc_samples import QUERY, REFERENCES, SCENE, make_world, matches_of, write_all, write_features, write_text
 
-from spherloc.datasets import load_scene
+from spherloc.datasets import hloc, load_scene
 from spherloc.errors import InputError
 from spherloc.estimators import estimate
 from spherloc.metrics import evaluate
@@ -162,6 +162,16 @@ def test_wrong_keys(world, rng, removed, added, said):
         load_scene(world.scene)
 
 
+def test_the_example_of_a_scene(world, rng):
+    """What users are shown can be loaded."""
+    write_all(world, rng)
+    own = hloc.EXAMPLE
+    for shown, real in (("queries_with_intrinsics", "queries"), ("pairs-netvlad", "pairs"), ("results", "truth")):
+        own = own.replace(shown, real)
+    world.scene.write_text(own)
+    assert load_scene(world.scene).gravity_bound_rad == pytest.approx(np.radians(5.0))
+
+
 @pytest.mark.parametrize("name", ["queries.txt", "outputs/pairs.txt", "outputs/feats.h5", "outputs/truth.txt"])
 def test_missing_files_are_named(world, rng, name):
     write_all(world, rng)
@@ -185,11 +195,12 @@ max_features = 4000
 
 
 @pytest.mark.parametrize("more", ['pairs = "pairs.txt"', 'global_features = "global.h5"'])
-def test_own_matching_of_real_panoramas(tmp_path, rng, more):
+def test_own_matching_of_real_panoramas(tmp_path, tmp_path_factory, monkeypatch, rng, more):
     """Without hloc's matches the project finds its own, of the pairs or of what global descriptors retrieve."""
     data = (ROOT / ".." / "shared" / "data" / "stella_equirect_pair").resolve()
     if not data.is_dir():
         pytest.skip("the real panoramas (../shared/data/stella_equirect_pair) are not on this machine")
+    monkeypatch.setenv("SPHERLOC_CACHE", str(tmp_path_factory.getbasetemp() / "hloc_cache"))
     query, reference = "equirectangular_image_002.jpg", "equirectangular_image_001.jpg"
     rows = (data / "colmap_equirect" / "0" / "images.txt").read_text().splitlines()
     words = next(row.split() for row in rows if row.endswith(query))

@@ -5,12 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from kitti360_tree import CAMERA, QUERIES, QUERY, REFERENCE, REFERENCES, SCENE, write_tree
+from kitti360_tree import CAMERA, QUERIES, QUERY, REFERENCE, REFERENCES, SCENE, scan_of, write_tree
 
 from spherloc.datasets import load_scene
 from spherloc.errors import InputError
 from spherloc.estimators.base import estimate
-from spherloc.frontend.lifting import PointCloudLift
 from spherloc.geometry import camera_centre, rotation_angle
 from spherloc.worlds import build_world, render
 
@@ -75,25 +74,25 @@ def test_views_are_those_of_the_files(tree):
     assert scene.queries[0].timestamp_s == pytest.approx(1369730762 + 3.1 + 0.004094720, abs=1e-5)
 
 
-def test_points_of_a_moving_scanner_fit_the_image(tree, monkeypatch):
-    """The scanner turns while the car drives: without the correction, poles and cars are seen elsewhere."""
-    scene = load(tree)
+def test_points_of_a_moving_scanner_are_where_they_were_seen(tree, monkeypatch):
+    """The scanner turns while the car drives: without the correction, what is beside the car is off."""
+    view, frame = load(tree).references[1], REFERENCES[1]
+    _, true = scan_of(build_world("street"), tree.world_from_imu[REFERENCE], frame)
+    off = np.linalg.norm(view.lift.load_points() - true, axis=1)
+    monkeypatch.setattr("spherloc.datasets.kitti360.scan_motion", lambda *_: None)
+    uncorrected = np.linalg.norm(view.lift.load_points() - true, axis=1)
+    assert np.quantile(off, 0.99) < 0.01
+    assert np.median(uncorrected) > 0.15 and uncorrected.max() > 0.4
+
+
+def test_lifted_pixels_are_as_far_as_the_picture_says(tree):
+    view = load(tree).references[0]
     columns, rows = np.meshgrid(np.arange(0, 500, 3) + 0.5, np.arange(0, 500, 3) + 0.5)
-    pixels = np.column_stack([columns.ravel(), rows.ravel()])
-
-    def worst(view):
-        true = render(build_world("street"), CAMERA, view.cam_from_map).range_m[rows.astype(int), columns.astype(int)]
-        points, known = PointCloudLift(view.lift.load_points, view.camera, view.cam_from_map)(pixels)
-        off = np.abs(np.linalg.norm(points - camera_centre(view.cam_from_map), axis=1) - true.ravel())
-        return np.quantile(off[known & np.isfinite(true.ravel())], 0.9), known.mean()
-
-    for view in scene.references[:2]:
-        off, share = worst(view)
-        with monkeypatch.context() as patch:
-            patch.setattr("spherloc.datasets.kitti360.scan_motion", lambda *_: None)
-            off_uncorrected, _ = worst(view)
-        assert share > 0.1
-        assert off < 0.15 and off < 0.5 * off_uncorrected
+    points, known = view.lift(np.column_stack([columns.ravel(), rows.ravel()]))
+    true = render(build_world("street"), CAMERA, view.cam_from_map).range_m[rows.astype(int), columns.astype(int)]
+    off = np.abs(np.linalg.norm(points - camera_centre(view.cam_from_map), axis=1) - true.ravel())[known]
+    assert known.mean() > 0.1
+    assert np.median(off) < 0.01 and np.quantile(off, 0.85) < 0.15
 
 
 def test_neighbouring_scans_make_a_denser_cloud(tree):
@@ -214,6 +213,20 @@ def test_wrong_value_is_one_sentence(tree, without, line, says):
         load(tree, line, without=without)
     message = str(caught.value)
     assert message.startswith(str(tree.root.parent)) and says in message and message.isprintable()
+
+
+def test_car_in_the_image_is_masked(copy):
+    """The dataset's mask is not zero where the car itself is seen; it may have another size than the image."""
+    mask = np.zeros((250, 125), dtype=np.uint8)
+    mask[150:] = 255
+    (copy.root / "fisheye").mkdir()
+    np.save(copy.root / "fisheye/mask_left_fisheye.npy", mask)
+    scene = load(copy)
+    usable = scene.queries[0].usable_pixels()
+    assert usable[:300].mean() > 0.6 and not usable[300:].any()
+    problem = scene.problem()
+    assert len(problem) > 20 and problem.pixels[:, 1].max() < 301
+    assert load(copy).problem().reference_pixels[:, 1].max() < 301
 
 
 def test_gravity_and_options_can_be_changed(tree):

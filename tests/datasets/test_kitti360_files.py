@@ -1,5 +1,7 @@
 """Readers of KITTI-360 files: what they hold, and one sentence for whatever bytes are in them."""
 
+import io
+import pickle
 import struct
 
 import numpy as np
@@ -9,6 +11,7 @@ from hypothesis import strategies as st
 from mutations import mutations
 from scipy.spatial.transform import Rotation
 
+from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.datasets.kitti360_files import (
     frames_in,
     read_cam_to_pose,
@@ -18,6 +21,7 @@ from spherloc.datasets.kitti360_files import (
     read_timestamps,
     scan_motion,
     unwrapped,
+    without_car,
 )
 from spherloc.errors import InputError
 
@@ -180,7 +184,46 @@ def test_motion_is_the_scanner_s_own():
     assert scan_motion(poses, 9, imu_from_velodyne) is None
 
 
+def npy(array):
+    """A file of numpy's."""
+    content = io.BytesIO()
+    np.save(content, array)
+    return content.getvalue()
+
+
+MASK = npy(np.eye(6, 4, dtype=np.uint8))
+
+
+def read_mask(path):
+    return without_car(path, Equirectangular(40, 20))
+
+
+def test_mask_of_the_car(folder):
+    allowed = read_mask(write(folder, npy(np.array([[0, 0], [0, 1]], dtype=np.uint8)), "mask.npy"))
+    assert allowed.shape == (20, 40) and allowed[:10].all() and allowed[:, :20].all() and not allowed[10:, 20:].any()
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        npy(np.zeros(5)),
+        npy(np.zeros((0, 5))),
+        npy(np.zeros((3, 4, 5))),
+        npy(np.zeros((2, 2), dtype="U3")),
+        MASK.replace(b"(6, 4)", b"(9999, 9999)").replace(b"      \n", b"\n"),
+        pickle.dumps([1]),
+    ],
+)
+def test_wrong_mask_is_one_sentence(folder, content):
+    path = write(folder, content, "wrong.npy")
+    with pytest.raises(InputError, match="mask of the car") as caught:
+        read_mask(path)
+    assert str(caught.value).startswith(str(path))
+
+
 READERS = {
+    "mask": (read_mask, MASK),
     "poses": (read_poses, POSES),
     "cam_to_pose": (read_cam_to_pose, CAM_TO_POSE),
     "cam_to_velo": (read_cam_to_velo, CAM_TO_VELO),

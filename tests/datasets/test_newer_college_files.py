@@ -151,7 +151,7 @@ def test_down_of_a_walking_person(rng):
     off = degrees_between(down_at(samples, samples.timestamps_ns), true_down(samples.timestamps_ns))
     alone = degrees_between(-samples.forces_m_s2, true_down(samples.timestamps_ns))
     assert off.max() < 2.0 and np.median(off) < 0.7
-    assert np.quantile(alone, 0.9) > 5.0
+    assert np.quantile(alone, 0.9) > 2.0 * np.quantile(off, 0.9)
 
 
 def test_bias_of_the_gyroscope_cancels_but_at_the_ends(rng):
@@ -239,7 +239,6 @@ def test_alignment_ignores_a_few_wrong_positions(rng):
     assert found.similarity.scale == pytest.approx(true.scale, rel=2e-3)
     np.testing.assert_allclose(found.similarity.points(old), true.points(old), atol=0.03)
     assert 45 <= found.used <= 50 and 0.005 < found.rms_m < 0.03
-    assert found.extent_m > 10
 
 
 def test_alignment_of_exact_positions_is_exact(rng):
@@ -249,10 +248,17 @@ def test_alignment_of_exact_positions_is_exact(rng):
     np.testing.assert_allclose(found.rotation, true.rotation, atol=1e-7)
 
 
+def test_positions_that_have_nothing_in_common_do_not_fit(rng):
+    """Also few of them, most of which any similarity would bring to each other."""
+    for count in (4, 5, 40):
+        with pytest.raises(InputError, match="do not fit"):
+            align(rng.normal(0, 5, (count, 3)), rng.normal(0, 5, (count, 3)), "here")
+
+
 @pytest.mark.parametrize(
     "old, says",
     [
-        (np.zeros((2, 3)), "needs three"),
+        (np.zeros((2, 3)), "it takes three"),
         (np.zeros((5, 3)), "on a line"),
         (np.outer(np.arange(6), [1.0, 2.0, 3.0]), "on a line"),
         (np.array([[1e300, 0, 0], [0, 1, 0], [0, 0, 1]]), "beyond"),

@@ -119,13 +119,16 @@ def test_a_killed_run_goes_on_and_ends_as_if_nothing_had_happened(tmp_path: Path
 
 
 def test_ctrl_c_ends_at_once_and_says_how_to_go_on(tmp_path: Path, drawn: dict[str, str]) -> None:
-    scene, out = write_scene(tmp_path, queries=3, seconds=0.5), tmp_path / "out"
+    scene, out = write_scene(tmp_path, queries=3, stuck=[1]), tmp_path / "out"
     process = command(scene, "--output", out, "--no-record", environment=drawn)
-    wait_for(lambda: lines(out / "results.jsonl") >= 1, process)
+    wait_for(lambda: lines(out / "results.jsonl") >= 1, process)  # and then the second query is being matched
     process.send_signal(signal.SIGINT)
     output, errors = process.communicate(timeout=60)
     assert process.returncode == 130 and output == ""
-    assert f"are kept in {out}, and the same command goes on from there." in errors and "Traceback" not in errors
+    assert (
+        f"stopped; 1 queries are kept in {out}, and the same command goes on from there." in errors
+        and "Traceback" not in errors
+    )
 
 
 def test_a_full_disk_keeps_what_is_done(tmp_path: Path, drawn: dict[str, str]) -> None:
@@ -145,16 +148,14 @@ def test_a_full_disk_keeps_what_is_done(tmp_path: Path, drawn: dict[str, str]) -
     assert run(scene, out) == 0 and len(read_results(out).rows) == 9
 
 
-def test_a_recording_that_finds_no_room_ends_the_run(
-    tmp_path: Path, drawn: dict[str, str], capsys: pytest.CaptureFixture[str]
-) -> None:
+@pytest.mark.usefixtures("drawn")
+def test_a_recording_that_finds_no_room_ends_the_run(tmp_path: Path) -> None:
     """Not recorded is not done: when there is room again, no recording is missing."""
     scene, out = write_scene(tmp_path, queries=2), tmp_path / "out"
     out.mkdir()
     (out / "recordings").write_text("in the way")
-    process = command(scene, "--output", out, environment=drawn)
-    _, errors = process.communicate(timeout=200)
-    assert process.returncode == 2 and len(errors.strip().splitlines()) == 1 and "recordings" in errors, errors
+    with pytest.raises(SpherlocError, match=r"recordings.*the run cannot be recorded.* 0 queries are kept"):
+        run(scene, out, recordings=out / "recordings")
     assert lines(out / "results.jsonl") == 0
     (out / "recordings").unlink()
     assert run(scene, out, recordings=out / "recordings") == 0 and None not in read_results(out).recordings

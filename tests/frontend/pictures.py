@@ -39,8 +39,13 @@ def disc(side, radius_px):
 
 def fisheye(side):
     """An equidistant fisheye: 180 degrees fill the width of the image."""
-    focal, centre = side / np.pi, side / 2
-    return KannalaBrandt(side, side, focal, focal, centre, centre, (0.0, 0.0, 0.0, 0.0))
+    return fisheye_of(side, side)
+
+
+def fisheye_of(width, height):
+    """An equidistant fisheye that sees all of an image: 180 degrees fill its longer side."""
+    focal = max(width, height) / np.pi
+    return KannalaBrandt(width, height, focal, focal, width / 2, height / 2, (0.0, 0.0, 0.0, 0.0))
 
 
 def view_of(folder, image, camera=None, name="picture.png", **known):

@@ -60,9 +60,9 @@ def map_scene(references, queries, table=None):
 def test_a_query_is_localized_against_a_reference_of_any_other_model(references, queries, of_reference, of_query):
     query = queries[of_query]
     problem = map_scene([references[of_reference]], [query]).problem()
-    assert len(problem) > 60 and problem.truth_inliers is not None
+    assert len(problem) > 40 and problem.truth_inliers is not None
     assert problem.truth_inliers.mean() > 0.5
-    pose, truth = estimate(problem, "ransac-2p").pose, query.cam_from_map
+    pose, truth = estimate(problem, "ransac-2p").cam_from_map, query.cam_from_map
     assert pose is not None and truth is not None
     assert np.degrees(rotation_angle(pose[:, :3] @ truth[:, :3].T)) < 0.3
     assert np.linalg.norm(camera_centre(pose) - camera_centre(truth)) < 0.03
@@ -163,7 +163,7 @@ def test_nothing_usable_gives_no_matches_and_one_sentence(queries, folder):
 
 def test_pictures_without_features_give_no_matches(references, folder):
     path = folder / "fog.png"
-    cv2.imwrite(str(path), np.full((380, 400), 90, np.uint8))
+    cv2.imwrite(str(path), np.full((290, 300), 90, np.uint8))
     fog = View("fog", FISHEYE, path, lift=references["fisheye"].lift)
     assert len(matcher(references.values())(fog).pixels) == 0
     assert len(matcher([fog])(references["fisheye"]).pixels) == 0

@@ -1,5 +1,6 @@
 """Pictures of rooms with random wallpaper, through any camera, with exact ranges: real matching on known geometry."""
 
+from functools import lru_cache
 from pathlib import Path
 
 import cv2
@@ -14,22 +15,24 @@ from spherloc.frontend.lifting import DepthLift
 from spherloc.frontend.view import View
 from spherloc.geometry import camera_centre, pose, so3_exp
 
-PANORAMA = Equirectangular(640, 320)
-FISHEYE = KannalaBrandt(400, 380, 125.0, 126.0, 201.0, 188.0, (0.02, -0.01, 0.003, -0.0005))
-MEI = Mei(400, 400, 330.0, 330.0, 199.0, 202.0, 1.4, (0.05, -0.02, 0.0003, -0.0002))
+PANORAMA = Equirectangular(512, 256)
+FISHEYE = KannalaBrandt(300, 290, 94.0, 95.0, 151.0, 144.0, (0.02, -0.01, 0.003, -0.0005))
+MEI = Mei(300, 300, 247.0, 247.0, 149.0, 152.0, 1.4, (0.05, -0.02, 0.0003, -0.0002))
 HALF_M = np.array([3.0, 1.6, 4.0])
-TEXELS = 400
+TEXELS = 300
 
 
+@lru_cache
 def wallpaper(seed: int) -> np.ndarray:
-    """(6, TEXELS, TEXELS) grey levels with detail at several scales."""
+    """(6, TEXELS, TEXELS) grey levels, spots and stripes of sizes that differ from one paper to another."""
     random = np.random.default_rng(seed)
     walls = np.zeros((6, TEXELS, TEXELS), np.float32)
+    sizes = [(10, 10), (40, 40), *random.permutation([(15, 90), (90, 15), (80, 80)])[:2]]
     for wall in walls:
-        for side in (10, 40, 100):
-            noise = random.normal(size=(side, side)).astype(np.float32)
+        for size in sizes:
+            noise = random.normal(size=size).astype(np.float32)
             wall += cv2.resize(noise, (TEXELS, TEXELS), interpolation=cv2.INTER_CUBIC)
-    return np.clip(128 + 40 * walls, 0, 255)
+    return np.clip(128 + 35 * walls, 0, 255)
 
 
 def look(camera: Camera, cam_from_map: FloatArray, walls: np.ndarray) -> tuple[np.ndarray, FloatArray]:

@@ -1,0 +1,176 @@
+"""Rendered scenes: loaded at once, drawn when needed, localized by real matching."""
+
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from spherloc.datasets import bundled_scenes, load_scene, rendered
+from spherloc.datasets.map_scene import MapScene
+from spherloc.errors import InputError
+from spherloc.estimators import estimate
+from spherloc.geometry import camera_centre, rotation_angle
+
+BUNDLED = {
+    name: path for name, path in bundled_scenes().items() if tomllib.loads(path.read_text())["kind"] == "rendered"
+}
+
+SMALL = """
+kind = "rendered"
+name = "Small street"
+provenance = "Made by code."
+world = "street"
+[camera]
+model = "equirectangular"
+width = 384
+height = 192
+[references]
+count = 4
+start = 0.40
+stop = 0.52
+[queries]
+count = 2
+start = 0.44
+stop = 0.48
+offset_m = 0.4
+tilt_deg = 0.5
+light = "morning"
+occluders = 3
+[frontend]
+references = 2
+"""
+
+
+@pytest.fixture
+def cache(monkeypatch, tmp_path):
+    folder = tmp_path / "cache"
+    monkeypatch.setenv("SPHERLOC_CACHE", str(folder))
+    return folder
+
+
+def scene_of(tmp_path, text=SMALL):
+    path = tmp_path / "scene.toml"
+    path.write_text(text)
+    scene = load_scene(path)
+    assert isinstance(scene, MapScene)
+    return scene
+
+
+def drawn(cache):
+    return sorted(cache.glob("renders/*.png"))
+
+
+def errors_of(trace):
+    """(degrees, metres) of the estimated pose."""
+    truth, found = trace.problem.truth_cam_from_map, trace.cam_from_map
+    angle = np.degrees(rotation_angle(truth[:, :3].T @ found[:, :3]))
+    return angle, np.linalg.norm(camera_centre(truth) - camera_centre(found))
+
+
+def test_bundled_scenes_cover_worlds_cameras_and_conditions():
+    tables = [tomllib.loads(path.read_text()) for path in BUNDLED.values()]
+    assert len(tables) >= 6
+    assert {table["world"] for table in tables} == {"street", "apartment", "campus"}
+    assert {table["camera"]["model"] for table in tables} == {"mei", "kannala_brandt", "equirectangular"}
+    assert {"dusk", "night"} <= {table["queries"].get("light") for table in tables}
+    assert {"autumn", "winter"} <= {table["queries"].get("season") for table in tables}
+    assert all(table["about"] for table in tables)
+
+
+@pytest.mark.parametrize("name", sorted(BUNDLED))
+def test_bundled_scenes_load_without_drawing(name, cache):
+    scene = load_scene(BUNDLED[name])
+    assert isinstance(scene, MapScene)
+    assert not cache.exists()
+    assert all(view.cam_from_map is not None for view in (*scene.queries, *scene.references))
+    assert all(view.lift is not None for view in scene.references)
+    assert scene.gravity_bound_rad > 0
+
+
+def test_a_query_is_localized(cache, tmp_path):
+    scene = scene_of(tmp_path)
+    assert not drawn(cache)
+    problem = scene.problem()
+    assert 3 <= len(drawn(cache)) <= 5  # the query and its references
+    assert problem.image is not None and problem.image.is_file()
+    assert all(path.is_file() for path in problem.reference_images)
+    assert problem.truth_inliers is not None and 20 < problem.truth_inliers.sum() < len(problem)
+    angle, distance = errors_of(estimate(problem, "mc-exact"))
+    assert angle < 1.0 and distance < 0.1
+    again = scene_of(tmp_path).problem()
+    np.testing.assert_array_equal(problem.pixels, again.pixels)
+    np.testing.assert_array_equal(problem.points, again.points)
+
+
+def test_drawn_again_if_the_cache_is_emptied(cache, tmp_path):
+    scene = scene_of(tmp_path)
+    first = scene.references[0].read()
+    for file in cache.rglob("*.*"):
+        file.unlink()
+    assert (scene.references[0].read() == first).all()
+    assert scene.references[0].path.is_file()
+
+
+def test_points_of_a_reference_project_where_they_were_lifted(cache, tmp_path, rng):
+    view = scene_of(tmp_path).references[1]
+    pixels = rng.uniform((0, 60), (384, 150), (200, 2))
+    points, valid = view.lift(pixels)
+    assert valid.mean() > 0.8
+    in_camera = points[valid] @ view.cam_from_map[:, :3].T + view.cam_from_map[:, 3]
+    np.testing.assert_allclose(view.camera.project(in_camera)[0], pixels[valid], atol=1e-3)
+
+
+def test_gravity_is_off_by_no_more_than_is_said(tmp_path):
+    scene = scene_of(tmp_path, SMALL.replace("count = 2", "count = 60"))
+    bound = np.radians(0.5)
+    assert scene.gravity_bound_rad == pytest.approx(bound)
+    down = np.array([0.0, 1.0, 0.0])  # in a level reference
+    np.testing.assert_allclose(scene.references[0].cam_from_map[:, :3] @ scene.gravity_map, down, atol=1e-12)
+    tilts = [np.arccos(np.clip(view.cam_from_map[:, :3] @ scene.gravity_map @ down, -1, 1)) for view in scene.queries]
+    assert 0.6 * bound < max(tilts) <= bound * 1.0001
+
+
+def test_queries_and_references_have_their_own_strangers(tmp_path):
+    scene = scene_of(tmp_path, SMALL.replace("stop = 0.52", "stop = 0.52\noccluders = 3"))
+    assert len({view.path for view in (*scene.queries, *scene.references)}) == 6
+
+
+def test_mesh_is_that_of_the_world(tmp_path):
+    scene = scene_of(tmp_path)
+    assert scene.mesh is not None and scene.mesh()[:4] == b"glTF"
+
+
+@pytest.mark.parametrize(
+    "old, new, words",
+    [
+        ('world = "street"', 'world = "moon"', "no world 'moon'; there are street"),
+        ('world = "street"', "world = 3", "'world' must be a text"),
+        ('provenance = "Made by code."', "", "'provenance' is missing"),
+        ("occluders = 3", "occluder = 3", "unknown key 'occluder'"),
+        ("occluders = 3", "occluders = 1000000", "occluders is 1000000"),
+        ('light = "morning"', 'light = "noon"', "no light 'noon'"),
+        ('light = "morning"', "light = 7", "no light 7"),
+        ("count = 4", "count = 100000000", "from 1 to 500"),
+        ("count = 4\n", "", "'count' is missing"),
+        ("start = 0.44", "start = 1.5", "start is 1.5"),
+        ("tilt_deg = 0.5", "tilt_deg = nan", "tilt_deg is nan"),
+        ("[references]", "[references]\ntilt_deg = 1", "unknown key 'tilt_deg'"),
+        ("width = 384\nheight = 192", "width = 38400\nheight = 19200", "give fewer"),
+        ('world = "street"', 'world = "street"\nseed = -1', "seed is -1"),
+        ("references = 2", "reference = 2", "unknown key 'reference'"),
+        ('world = "street"', 'world = "street"\nqueries_ = 1', "unknown key 'queries_'"),
+    ],
+)
+def test_what_is_wrong_is_said_in_one_sentence(tmp_path, old, new, words):
+    assert old in SMALL
+    with pytest.raises(InputError) as caught:
+        scene_of(tmp_path, SMALL.replace(old, new, 1))
+    message = str(caught.value)
+    assert words in message and "scene.toml" in message and "\n" not in message
+
+
+def test_example_of_the_loader_loads(tmp_path):
+    scene = scene_of(tmp_path, rendered.EXAMPLE)
+    assert (len(scene.references), len(scene.queries)) == (20, 5)
+    assert Path(scene.where).name == "scene.toml"

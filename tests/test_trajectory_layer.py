@@ -1,0 +1,57 @@
+"""A sequence on the canvas: places, colours by error, and what has no pose."""
+
+import numpy as np
+
+from spherloc.experiments.rows import FAILED, LOCALIZED, QueryResult
+from spherloc.geometry import align_to_down, pose
+from spherloc_viz import style
+from spherloc_viz.layers.primitives import Points, Segments
+from spherloc_viz.layers.trajectory import trajectory_items
+
+WORST_M = 1.0
+
+
+def row(index: int, found: tuple[float, float, float] | None, truth: tuple[float, float, float] | None) -> QueryResult:
+    """A query whose camera was found and truly was at these places, unturned."""
+    poses = [None if place is None else pose(np.eye(3), -np.array(place)) for place in (found, truth)]
+    status = FAILED if found is None else LOCALIZED
+    return QueryResult(index, f"q{index}", status, cam_from_map=poses[0], truth_cam_from_map=poses[1])
+
+
+def drawn(rows: list[QueryResult], map_turn: np.ndarray) -> tuple[Points, Segments, Segments]:
+    dots, truth, errors = trajectory_items(rows, map_turn, WORST_M)
+    assert isinstance(dots, Points) and isinstance(truth, Segments) and isinstance(errors, Segments)
+    return dots, truth, errors
+
+
+def test_dots_stand_where_cameras_were_found_and_have_the_colour_of_their_error() -> None:
+    turn = align_to_down(np.array([0.0, 0.0, -1.0]))
+    rows = [row(0, (0, 0, 0), (0, 0, 0)), row(1, (1, 0.5, 0), (1, 0, 0)), row(2, (2, 9, 0), (2, 0, 0))]
+    dots, truth, errors = drawn(rows, turn)
+    assert np.allclose(dots.positions, np.array([[0, 0, 0], [1, 0.5, 0], [2, 9, 0]]) @ turn.T)
+    assert dots.ids is not None and dots.ids.tolist() == [0, 1, 2]
+    assert tuple(dots.colors[0]) == style.ERROR_RAMP[0] and tuple(dots.colors[2]) == style.ERROR_RAMP[-1]
+    middle = style.error_colors(np.array([0.5]), WORST_M)[0]
+    assert np.array_equal(dots.colors[1], middle) and tuple(middle) not in style.ERROR_RAMP
+    assert len(truth.points) == 2 and np.allclose(truth.points[1], np.array([[1, 0, 0], [2, 0, 0]]) @ turn.T)
+    assert np.allclose(np.linalg.norm(errors.points[:, 1] - errors.points[:, 0], axis=1), [0, 0.5, 9])
+
+
+def test_failures_are_marked_where_they_should_be_and_gaps_are_left_open() -> None:
+    rows = [row(0, (0, 0, 0), (0, 0, 0)), row(1, None, (1, 0, 0)), row(2, (2, 0, 0), None), row(3, None, None)]
+    dots, truth, errors = drawn(rows, np.eye(3))
+    assert np.allclose(dots.positions, [[0, 0, 0], [1, 0, 0], [2, 0, 0]])
+    assert tuple(dots.colors[1]) == style.OUTLIER and tuple(dots.colors[2]) == style.ESTIMATE
+    assert len(truth.points) == 1 and len(errors.points) == 1
+    assert np.isfinite(dots.positions).all() and dots.radius_m > 0
+
+
+def test_a_single_query_has_a_dot_of_some_size() -> None:
+    dots, truth, errors = drawn([row(0, (5, 5, 5), None)], np.eye(3))
+    assert len(dots.positions) == 1 and dots.radius_m > 0 and len(truth.points) == len(errors.points) == 0
+
+
+def test_the_ramp_ends_at_its_ends() -> None:
+    colors = style.error_colors(np.array([0.0, 2.0, 50.0, np.inf, np.nan]), 2.0)
+    assert tuple(colors[0]) == style.ERROR_RAMP[0]
+    assert all(tuple(color) == style.ERROR_RAMP[-1] for color in colors[1:])
