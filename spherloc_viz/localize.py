@@ -84,7 +84,7 @@ def _todo(scene: MapScene, chosen: Sequence[View], log: ResultsLog, retry_failed
     if log.repaired:
         _say(f"{log.folder}: removed a half written line; its query is done again.")
     if retry_failed and (again := log.forget_failures()):
-        _say(f"{log.folder}: {again} queries without a pose are done again.")
+        _say(f"{log.folder}: queries without a pose that are done again: {again}.")
     todo = [view for view in chosen if view.name not in log.rows]
     if len(todo) < len(chosen):
         _say(f"{log.folder}: {len(chosen) - len(todo)} of {len(chosen)} queries are done already.")
@@ -105,7 +105,8 @@ def _work(
                 failed += row.status != LOCALIZED
                 progress(failed)
     except KeyboardInterrupt:
-        _say(f"stopped; {len(log.rows)} queries are kept in {log.folder}, and the same command goes on from there.")
+        done = f"{len(log.rows)} of {log.configuration.queries} queries are done"
+        _say(f"stopped; {done} in {log.folder}, and the same command goes on from there.")
         raise
 
 
@@ -118,7 +119,8 @@ def _record(trace: Trace, folder: Path, log: ResultsLog) -> str | None:
     except RecordingError as error:
         if isinstance(error.__cause__, OSError):  # no room: the next ones would be lost too
             raise InputError(
-                f"{error} The results of {len(log.rows)} queries are kept, and the same command goes on from there."
+                f"{error} What is done is kept ({len(log.rows)} of {log.configuration.queries} queries), and the same "
+                "command goes on from there."
             ) from None
         _say(str(error))
         return None

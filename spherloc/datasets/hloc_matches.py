@@ -64,8 +64,8 @@ class HlocMatcher:
 
     def _pair(self, features: Hdf5, matches: Hdf5, query: str, count: int, reference: View) -> _Pair | None:
         """None if the pair was not matched."""
-        image = self.model.images[reference.name]
-        pixels = image.pixels
+        observations = self.model.images[reference.name].load()
+        pixels = observations["pixel"]
         own = read_keypoints(features, reference.name)
         if own is not None and len(own.pixels) != len(pixels):
             raise InputError(
@@ -75,7 +75,7 @@ class HlocMatcher:
         index = read_matches(matches, query, reference.name, (count, len(pixels)))
         if index is None:
             return None
-        ids = image.point_ids[index[:, 1]]
+        ids = observations["point"][index[:, 1]]
         points = self.model.point_xyz(ids)
         known = np.isfinite(points).all(axis=1) & np.isfinite(pixels[index[:, 1]]).all(axis=1)
         return _Pair(reference, index[known, 0], ids[known], points[known], pixels[index[known, 1]])

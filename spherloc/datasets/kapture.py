@@ -116,9 +116,8 @@ def _selected(records: Sequence[Record], table: Mapping[str, Any], key: str, whe
     scene_file.check_keys(wanted, set(), _SELECTION, place)
     chosen = list(records)
     if "images" in wanted:
-        patterns = _texts(wanted["images"], "images", place)
-        _must_fit(patterns, [record.image for record in records], place)
-        chosen = [record for record in chosen if any(fnmatchcase(record.image, pattern) for pattern in patterns)]
+        images = _fitting([record.image for record in records], _texts(wanted["images"], "images", place), place)
+        chosen = [record for record in chosen if record.image in images]
     if "devices" in wanted:
         devices = _texts(wanted["devices"], "devices", place)
         chosen = [record for record in chosen if record.device in devices]
@@ -139,12 +138,18 @@ def _texts(value: Any, key: str, place: str) -> list[str]:
     return texts
 
 
-def _must_fit(patterns: Sequence[str], images: Sequence[str], place: str) -> None:
+def _fitting(images: Sequence[str], patterns: Sequence[str], place: str) -> set[str]:
+    """The images that are named or fit a pattern; raises ``InputError`` for a pattern that none fits."""
+    known = set(images)
+    found: set[str] = set()
     for pattern in patterns:
-        if images and not any(fnmatchcase(image, pattern) for image in images):
+        fits = {pattern} & known or {image for image in images if fnmatchcase(image, pattern)}
+        if images and not fits:
             raise InputError(
                 f"{place}: {show(pattern)} fits none of the {len(images)} images, such as {images[0]}; correct it."
             )
+        found |= fits
+    return found
 
 
 def _two_integers(value: Any, place: str) -> tuple[int, int]:

@@ -197,8 +197,8 @@ class ResultsLog:
         except OSError as error:
             reason = error.strerror or error
             raise InputError(
-                f"{self.folder / name}: cannot be written ({reason}); the results of {len(self.rows)} queries are "
-                "kept: make room there and give the same command to go on."
+                f"{self.folder / name}: cannot be written ({reason}); what is done is kept ({len(self.rows)} queries): "
+                "make room there and give the same command to go on."
             ) from None
 
     def _unwritable(self, error: OSError) -> InputError:

@@ -1,5 +1,7 @@
 """Learned features and matching through OpenCV 5, with the weight files (ONNX) that the user gives."""
 
+import subprocess
+import sys
 from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
@@ -19,6 +21,15 @@ DISK_INPUT_PX = 1024
 """Width and height that OpenCV gives to these networks: what their published files are made for."""
 
 _CREATE = {"ALIKED": "ALIKED_create", "DISK": "DISK_create", "LightGlue": "LightGlueMatcher_create"}
+
+TRIAL_S = 120.0
+_TRIAL = """
+import sys, cv2, numpy as np
+network = getattr(cv2, sys.argv[1])(sys.argv[2])
+if hasattr(network, "detectAndCompute"):
+    network.detectAndCompute(np.zeros((64, 64, 3), np.uint8), None)
+"""
+"""Loads a network and, if it finds features, runs it once; an error is the parent's to report."""
 
 _one_at_a_time = Lock()
 """OpenCV's networks keep the state of a run, and are shared by all threads."""
@@ -97,10 +108,22 @@ def _network(name: str, weights: Path | None) -> Any:
 
 @lru_cache(maxsize=3)
 def _loaded(name: str, create: Callable[[str], Any], weights: Path, _changed: int, _size: int) -> Any:
+    _try_in_child(name, weights)
     try:
         return create(str(weights))
     except cv2.error as error:
         raise _refusal(name, weights, error) from None
+
+
+def _try_in_child(name: str, weights: Path) -> None:
+    """Raise ``InputError`` if a damaged file ends the whole process or holds it up, as OpenCV 5.0 lets some do."""
+    command = [sys.executable, "-c", _TRIAL, _CREATE[name], str(weights)]
+    try:
+        done = subprocess.run(command, capture_output=True, timeout=TRIAL_S, check=False)
+    except subprocess.TimeoutExpired:
+        raise InputError(f"{weights}: OpenCV takes too long to load it; give an ONNX file of {name}.") from None
+    if done.returncode < 0:
+        raise InputError(f"{weights}: OpenCV crashes on it, so it is damaged; give an ONNX file of {name}.")
 
 
 def _refusal(name: str, weights: Path | None, error: cv2.error) -> InputError:

@@ -13,6 +13,9 @@ from spherloc.cameras.base import BoolArray, Camera, FloatArray
 from spherloc.errors import InputError
 from spherloc.images import ByteImage, read_image
 
+PIXELS_AT_ONCE = 200_000
+"""A large panorama unprojected as a whole would take gigabytes."""
+
 
 class Lift(Protocol):
     """Gives pixels of a reference image their places in the map."""
@@ -78,9 +81,13 @@ class View:
 @lru_cache(maxsize=8)
 def seen_pixels(camera: Camera) -> BoolArray:
     """(H, W), read-only: pixels whose centre the camera model can see."""
-    columns, rows = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    _, seen = camera.unproject(np.column_stack([columns.ravel(), rows.ravel()]))
-    seen = seen.reshape(camera.height, camera.width)
+    columns = np.arange(camera.width) + 0.5
+    seen = np.empty((camera.height, camera.width), dtype=bool)
+    rows = max(1, PIXELS_AT_ONCE // camera.width)
+    for top in range(0, camera.height, rows):
+        block = np.arange(top, min(top + rows, camera.height)) + 0.5
+        u, v = np.meshgrid(columns, block)
+        seen[top : top + rows] = camera.unproject(np.column_stack([u.ravel(), v.ravel()]))[1].reshape(u.shape)
     seen.setflags(write=False)
     return seen
 

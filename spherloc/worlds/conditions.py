@@ -1,6 +1,7 @@
 """Under which conditions a picture is taken: light, season, passers-by, and the camera's own faults."""
 
 from dataclasses import dataclass
+from typing import Any
 
 from spherloc.errors import InputError, show
 
@@ -79,7 +80,7 @@ class Conditions:
             if getattr(self, key) not in known:
                 raise InputError(f"conditions: no {key} {show(getattr(self, key))}; there are {', '.join(known)}.")
         for key, (lowest, highest) in LIMITS.items():
-            value = vars(self)[key]
+            value: Any = vars(self)[key]
             if value is None and key.startswith("sun_"):
                 continue
             whole = key == "occluders"
@@ -87,7 +88,7 @@ class Conditions:
             if not number or not lowest <= value <= highest:
                 kind = "whole number" if whole else "number"
                 raise InputError(f"conditions: {key} is {show(value)}; give a {kind} from {lowest:g} to {highest:g}.")
-            object.__setattr__(self, key, value if whole else float(value))
+            object.__setattr__(self, key, int(value) if whole else float(value))
 
 
 CLEAR = Conditions()

@@ -6,6 +6,7 @@ import pytest
 from hloc_samples import PANORAMA, QUERY, REFERENCES, SCENE, make_world, numbers, pickled, write_all, write_features
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mutations import mutations
 
 from spherloc.datasets import hloc_files, load_scene
 from spherloc.datasets.hloc_files import (
@@ -90,25 +91,6 @@ def test_pickles_are_refused_unopened(tmp_path, protocol, name):
     with pytest.raises(InputError, match="is a Python pickle"), open_hdf5(path):
         pass
     assert not trap.exists()
-
-
-PIECES = [b"nan", b"-1e999", b"9" * 400, b"\n", b" ", b"#", b"\xef\xbb\xbf"]
-
-
-@st.composite
-def mutations(draw, base):
-    """Some bytes overwritten, inserted, removed or repeated, and perhaps the end cut off."""
-    data = bytearray(base.encode())
-    for _ in range(draw(st.integers(1, 4))):
-        at = draw(st.integers(0, len(data)))
-        size = draw(st.integers(0, 12))
-        piece = draw(
-            st.one_of(st.binary(max_size=4), st.sampled_from([b"nan", b"-1e999", b"9" * 400, b"\n", b" ", b"#"]))
-        )
-        data[at : at + draw(st.sampled_from([0, size]))] = draw(
-            st.sampled_from([piece, bytes(data[at : at + size]) * 2])
-        )
-    return bytes(data[: draw(st.integers(0, len(data)))] if draw(st.booleans()) else data)
 
 
 @settings(max_examples=200)

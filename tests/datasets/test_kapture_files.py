@@ -7,6 +7,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from kapture_samples import FILES, RECORDS, RIGS, SENSORS, TRAJECTORIES, write_kapture
+from mutations import mutations
 
 from spherloc.datasets.kapture_files import read_kapture
 from spherloc.errors import InputError, SpherlocError
@@ -140,22 +141,6 @@ def test_cameras_that_are_not_supported_are_said(folder):
     kapture = read_kapture(write_kapture(folder, sensors=sensors), "scene.toml")
     assert list(kapture.cameras) == ["left"]
     assert "'right' are skipped: " in kapture.remarks[0] and "sensors.txt, line 4" in kapture.remarks[0]
-
-
-PIECES = [b"nan", b"-1e999", b"9" * 400, b"\n", b",", b"#", b"\xff", b"left", b"head", b"\xef\xbb\xbf", b"\x80\x04"]
-
-
-@st.composite
-def mutations(draw, base):
-    """Some bytes overwritten, inserted, removed or repeated, and perhaps the end cut off."""
-    data = bytearray(base.encode())
-    for _ in range(draw(st.integers(1, 4))):
-        at = draw(st.integers(0, len(data)))
-        size = draw(st.integers(0, 12))
-        piece = draw(st.one_of(st.binary(max_size=4), st.sampled_from(PIECES)))
-        repeat = bytes(data[at : at + size]) * 2
-        data[at : at + draw(st.sampled_from([0, size]))] = draw(st.sampled_from([piece, repeat]))
-    return bytes(data[: draw(st.integers(0, len(data)))] if draw(st.booleans()) else data)
 
 
 @settings(max_examples=300)

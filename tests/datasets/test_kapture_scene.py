@@ -120,6 +120,11 @@ def names(views):
         ('queries = ["left/1.jpg"]', ["left/1.jpg"], ["left/0.jpg", "right/0.jpg", "right/2.jpg"]),
         ('queries = "*/1.jpg"', ["left/1.jpg", "right/1.jpg"], ["left/0.jpg", "right/0.jpg", "right/2.jpg"]),
         (
+            'queries = ["left/1.jpg", "right/[1-9].jpg", "*/1.*"]',
+            ["left/1.jpg", "right/1.jpg", "right/2.jpg"],
+            ["left/0.jpg", "right/0.jpg"],
+        ),
+        (
             '[queries]\ndevices = ["left"]\ntimestamps = [1553180224000000000, 1553180224150000000]\nevery = 2',
             ["left/0.jpg"],
             ["left/1.jpg", "right/1.jpg", "right/2.jpg"],
@@ -137,7 +142,9 @@ def test_selection(tmp_path, rest, queries, references):
     assert scene.queries[0].timestamp_s == pytest.approx(1553180224 + 0.1 * int(queries[0][-5]), abs=1e-6)
     remarks = " ".join(scene.remarks)
     assert "1 image (left/3.jpg) not found in" in remarks and "UNKNOWN_CAMERA" in remarks
-    assert ("1 image (left/2.jpg) without a pose: no reference." in remarks) == ("[references]" not in rest)
+    # left/2.jpg has no pose; where right/2.jpg is a query, it is no reference for another reason.
+    unposed = "1 image (left/2.jpg) without a pose: no reference." in remarks
+    assert unposed == ("[references]" not in rest and "right/2.jpg" not in queries)
 
 
 def test_the_example_of_a_scene(tmp_path):

@@ -115,6 +115,7 @@ def test_drawn_again_if_the_cache_is_emptied(cache, tmp_path):
 def test_points_of_a_reference_project_where_they_were_lifted(cache, tmp_path, rng):
     view = scene_of(tmp_path).references[1]
     pixels = rng.uniform((0, 60), (384, 150), (200, 2))
+    assert view.lift is not None and view.cam_from_map is not None
     points, valid = view.lift(pixels)
     assert valid.mean() > 0.8
     in_camera = points[valid] @ view.cam_from_map[:, :3].T + view.cam_from_map[:, 3]
@@ -126,8 +127,9 @@ def test_gravity_is_off_by_no_more_than_is_said(tmp_path):
     bound = np.radians(0.5)
     assert scene.gravity_bound_rad == pytest.approx(bound)
     down = np.array([0.0, 1.0, 0.0])  # in a level reference
-    np.testing.assert_allclose(scene.references[0].cam_from_map[:, :3] @ scene.gravity_map, down, atol=1e-12)
-    tilts = [np.arccos(np.clip(view.cam_from_map[:, :3] @ scene.gravity_map @ down, -1, 1)) for view in scene.queries]
+    level, *tilted = (np.asarray(view.cam_from_map)[:, :3] for view in (scene.references[0], *scene.queries))
+    np.testing.assert_allclose(level @ scene.gravity_map, down, atol=1e-12)
+    tilts = [np.arccos(np.clip(rotation @ scene.gravity_map @ down, -1, 1)) for rotation in tilted]
     assert 0.6 * bound < max(tilts) <= bound * 1.0001
 
 

@@ -143,7 +143,7 @@ def test_a_full_disk_keeps_what_is_done(tmp_path: Path, drawn: dict[str, str]) -
     assert process.returncode == 2 and output == "", errors
     (sentence,) = errors.strip().splitlines()
     kept = lines(out / "results.jsonl")
-    assert kept >= 1 and f"the results of {kept} queries are kept: make room there" in sentence
+    assert kept >= 1 and f"what is done is kept ({kept} queries): make room there" in sentence
     assert "results.jsonl: cannot be written (File too large)" in sentence
     assert run(scene, out) == 0 and len(read_results(out).rows) == 9
 
@@ -154,7 +154,7 @@ def test_a_recording_that_finds_no_room_ends_the_run(tmp_path: Path) -> None:
     scene, out = write_scene(tmp_path, queries=2), tmp_path / "out"
     out.mkdir()
     (out / "recordings").write_text("in the way")
-    with pytest.raises(SpherlocError, match=r"recordings.*the run cannot be recorded.* 0 queries are kept"):
+    with pytest.raises(SpherlocError, match=r"recordings.*the run cannot be recorded.* is kept \(0 of 2 queries\)"):
         run(scene, out, recordings=out / "recordings")
     assert lines(out / "results.jsonl") == 0
     (out / "recordings").unlink()
@@ -183,7 +183,7 @@ def test_failures_are_done_again_when_asked(tmp_path: Path, capsys: pytest.Captu
     assert run(scene, out, retry_failed=True) == 0
     assert [row["status"] for row in table(out)] == ["localized"] * 3
     assert table(out)[0] == first[0]
-    assert "1 queries without a pose are done again" in capsys.readouterr().err
+    assert "queries without a pose that are done again: 1." in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("drawn")

@@ -11,6 +11,7 @@ from textured_rooms import FISHEYE, MEI, PANORAMA, room_view, standing, wallpape
 from spherloc.datasets.map_scene import MapScene
 from spherloc.errors import InputError, ProblemError
 from spherloc.estimators import estimate
+from spherloc.frontend.features import FeatureOptions
 from spherloc.frontend.frontend_options import frontend_options
 from spherloc.frontend.lifting import DepthLift, SfmLift
 from spherloc.frontend.pipeline import image_matcher
@@ -47,7 +48,7 @@ def queries(folder) -> dict[str, View]:
 
 
 def matcher(references, table=None, pairs=None):
-    return image_matcher(tuple(references), table or {}, "scene.toml", Path(), pairs)
+    return image_matcher(tuple(references), {"max_features": 1000} | (table or {}), "scene.toml", Path(), pairs)
 
 
 def map_scene(references, queries, table=None):
@@ -220,7 +221,7 @@ def test_triangulated_points_are_on_the_walls(many, folder):
     """Two posed images without depth give the third one its points, and these are where its depth says."""
     view, others = many[0], (many[3], many[6])
     gone = replace(many[9], name="gone", path=folder / "gone.png")
-    lift = TriangulationLift(view, (gone, *others))
+    lift = TriangulationLift(view, (gone, *others), FeatureOptions(max_features=1000))
     pixels = lift._found[0].pixels
     points, has = lift(pixels)
     truth, _ = view.lift(pixels)
@@ -230,7 +231,7 @@ def test_triangulated_points_are_on_the_walls(many, folder):
     matches = matcher([replace(view, lift=lift)])(others[0])
     assert len(matches.pixels) > 100 and any("gone.png" in remark for remark in matches.remarks)
     with pytest.raises(InputError, match="no other image can be used"):
-        TriangulationLift(view, (gone,))(pixels)
+        TriangulationLift(view, (gone,), FeatureOptions(max_features=1000))(pixels)
 
 
 WRONG_TABLES = [

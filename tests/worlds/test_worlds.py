@@ -54,7 +54,7 @@ def test_glb_is_the_mesh(kind):
     content = world.glb()
     assert content is world.glb()  # a viewer knows by this that it has it already
     assert len(content) <= 1.1 * MOST_BYTES
-    scene = trimesh.load(io.BytesIO(content), file_type="glb")
+    scene = trimesh.load_scene(io.BytesIO(content), file_type="glb")
     np.testing.assert_allclose(
         scene.bounds, [world.mesh.vertices.min(axis=0), world.mesh.vertices.max(axis=0)], atol=1e-4
     )
