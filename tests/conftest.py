@@ -2,7 +2,7 @@
 
 import os
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,16 @@ settings.load_profile("spherloc")
 def pytest_report_header() -> str:
     """A failing random test is repeated by the same seed."""
     return f"SPHERLOC_TEST_SEED={SUITE_SEED}"
+
+
+@pytest.fixture(scope="session", autouse=True)
+def own_disk_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Renders and features of the tests stay out of the user's cache; processes that test side by side share one."""
+    base = tmp_path_factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "spherloc-cache"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SPHERLOC_CACHE", str(folder))
+        yield folder
 
 
 @pytest.fixture

@@ -12,7 +12,16 @@ from typing import Any
 import numpy as np
 
 from spherloc.cameras._checks import located, show
-from spherloc.cameras._files import PIXEL_CENTRE_SHIFT, list_of, parse_yaml, read_text, size_of, table_of, value_of
+from spherloc.cameras._files import (
+    PIXEL_CENTRE_SHIFT,
+    list_of,
+    numbers_of,
+    parse_yaml,
+    read_text,
+    size_of,
+    table_of,
+    value_of,
+)
 from spherloc.cameras.base import Camera, FloatArray
 from spherloc.cameras.double_sphere import DoubleSphere
 from spherloc.cameras.eucm import Eucm
@@ -34,6 +43,8 @@ class KalibrCamera:
     """``T_cam_imu`` (4, 4), metres; None if the file has none."""
     cam_from_previous: FloatArray | None
     """``T_cn_cnm1`` (4, 4), metres, from the camera before it in the chain; None if the file has none."""
+    timeshift_s: float = 0.0
+    """``timeshift_cam_imu``: what is added to a time of the camera to get the same moment by the IMU's clock."""
 
 
 def read_kalibr_chain(path: str | Path) -> dict[str, KalibrCamera]:
@@ -49,7 +60,8 @@ def read_kalibr_chain(path: str | Path) -> dict[str, KalibrCamera]:
         for name, table in tables.items():
             camera = camera_of(name, table)
             with located(name):
-                chain[name] = KalibrCamera(camera, _rigid(table, "T_cam_imu"), _rigid(table, "T_cn_cnm1"))
+                (shift_s,) = numbers_of({"timeshift_cam_imu": 0.0} | table, "timeshift_cam_imu")
+                chain[name] = KalibrCamera(camera, _rigid(table, "T_cam_imu"), _rigid(table, "T_cn_cnm1"), shift_s)
         return chain
 
 

@@ -1,5 +1,6 @@
 """A map with reference images, and query images to be localized in it: what every loader of images returns."""
 
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -57,8 +58,7 @@ class MapScene:
         for what, views in (("query", self.queries), ("reference", self.references)):
             if not views:
                 raise InputError(f"{self.where}: there is no {what} image; {' '.join(self.remarks) or 'name some.'}")
-            names = [view.name for view in views]
-            twice = next((name for name in names if names.count(name) > 1), None)
+            twice = next((name for name, times in Counter(view.name for view in views).items() if times > 1), None)
             if twice is not None:
                 raise InputError(f"{self.where}: the {what} image {show(twice)} is there twice; name it once.")
 

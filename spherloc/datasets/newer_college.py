@@ -110,6 +110,8 @@ class _Rig:
     """(4, 4)"""
     cam_from_base: FloatArray
     """(4, 4), the base being the body of the ground truth."""
+    timeshift_s: float
+    """Added to a time of the camera to get that of the IMU's clock."""
 
     def cam_from_map(self, truth: Trajectory, timestamp_ns: int) -> FloatArray | None:
         """Pose (3, 4) at a time; None where the ground truth has a gap."""
@@ -135,7 +137,7 @@ def _rig(place: _Place) -> _Rig:
         if abs(given.scale - 1.0) > 1e-3:
             raise InputError(f"{place.where}: the 3 x 3 part of cam_from_base has the scale {given.scale:g}; give 1.")
         cam_from_base = np.vstack([pose(given.rotation, given.translation), [0.0, 0.0, 0.0, 1.0]])
-    return _Rig(cameras[name].camera, cam_from_imu, cam_from_base)
+    return _Rig(cameras[name].camera, cam_from_imu, cam_from_base, cameras[name].timeshift_s)
 
 
 def _queries(place: _Place, rig: _Rig) -> tuple[list[View], list[str]]:
@@ -147,7 +149,8 @@ def _queries(place: _Place, rig: _Rig) -> tuple[list[View], list[str]]:
     images = images[:: place.step("query_step")]
     truth = read_newer_college(truth_file)
     poses = [rig.cam_from_map(truth, image.timestamp_ns) for image in images]
-    down = down_at(read_imu(imu_file), np.array([image.timestamp_ns for image in images]))
+    shift_ns = round(rig.timeshift_s * NS_PER_S)
+    down = down_at(read_imu(imu_file), np.array([image.timestamp_ns + shift_ns for image in images]))
     down_camera = down @ rig.cam_from_imu[:3, :3].T
     known = [bool(np.isfinite(direction).all()) for direction in down_camera]
     views = [

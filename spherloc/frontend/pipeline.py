@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from spherloc.cameras.base import BoolArray, FloatArray
 from spherloc.errors import InputError, show
 from spherloc.frontend import retrieval
+from spherloc.frontend.feature_kinds import KINDS
 from spherloc.frontend.features import Features, extract
 from spherloc.frontend.frontend_options import FrontendOptions, frontend_options
 from spherloc.frontend.matching import match
@@ -178,7 +179,8 @@ def _correspondences(query: Features, reference: View, options: FrontendOptions)
     points, lifted = reference.lift(reference_pixels)
     wrong = None
     if options.matching.method == "nearest" and len(matches):
-        wrong = wrong_matches(len(query), len(matches), options.matching.ratio) * float(lifted.mean())
+        binary = KINDS[query.method].binary
+        wrong = wrong_matches(len(query), len(matches), options.matching.ratio, binary) * float(lifted.mean())
     return _Found(
         reference=reference,
         pixels=query.pixels[matches.query_index[lifted]],

@@ -22,6 +22,7 @@ LEAST_SAMPLES_A_WORD = 30
 _ROUNDS = 12
 """Of Lloyd's algorithm: from random starts, words hardly move after ten."""
 _CHUNK = 4096
+_ROUNDING = 1e-5
 
 Floats = NDArray[np.float32]
 
@@ -56,6 +57,8 @@ def vlad(descriptors: Floats, words: Floats) -> Floats:
     """Unit vector (K * D,) of an image with descriptors (N, D); zero for an image without features."""
     sums, sizes = _sums(descriptors, words)
     residuals = sums - sizes * words
+    # Where a word's features average to the word itself, normalisation would make a direction of rounding errors.
+    residuals[np.abs(residuals) < _ROUNDING * sizes] = 0.0
     residuals = np.sign(residuals) * np.sqrt(np.abs(residuals))
     # Within a word first: one repeated texture (a hedge, a row of windows) must not drown the others.
     residuals /= np.maximum(np.linalg.norm(residuals, axis=1, keepdims=True), 1e-12)

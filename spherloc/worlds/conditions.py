@@ -84,11 +84,14 @@ class Conditions:
             if value is None and key.startswith("sun_"):
                 continue
             whole = key == "occluders"
-            number = isinstance(value, int if whole else (int, float)) and not isinstance(value, bool)
-            if not number or not lowest <= value <= highest:
+            if not _is_number(value, whole) or not lowest <= value <= highest:
                 kind = "whole number" if whole else "number"
                 raise InputError(f"conditions: {key} is {show(value)}; give a {kind} from {lowest:g} to {highest:g}.")
             object.__setattr__(self, key, int(value) if whole else float(value))
+
+
+def _is_number(value: Any, whole: bool) -> bool:
+    return isinstance(value, int if whole else (int, float)) and not isinstance(value, bool)
 
 
 CLEAR = Conditions()

@@ -123,7 +123,7 @@ def test_poses_round_trip(tmp_path: Path, rng: np.random.Generator) -> None:
 
 
 def test_a_camera_that_looks_forward_stands_upright(tmp_path: Path) -> None:
-    """Turned by 90 degrees about x, Blender's camera looks along the world's y with z up: what the format's text says."""
+    """Turned by 90 degrees about x, Blender's camera looks along the world's y, with z up."""
     half = np.sqrt(0.5)
     (tmp_path / "pose.txt").write_text(f"1 2 3 {half} 0 0 {half}")
     found = read_pose(tmp_path / "pose.txt")

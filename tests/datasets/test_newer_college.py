@@ -1,6 +1,7 @@
 """A small Newer College, rendered with known truth: loaded, placed, localized with the IMU's gravity, with holes."""
 
 import shutil
+import tomllib
 
 import numpy as np
 import pytest
@@ -84,6 +85,23 @@ def test_gravity_comes_from_the_imu(base):
         assert np.arccos(view.gravity_camera @ down) < 0.5 * scene.gravity_bound_rad
         assert np.arccos(down @ [0.0, 1.0, 0.0]) > scene.gravity_bound_rad
         assert view.timestamp_s == pytest.approx(time / 1e9, abs=1e-6)
+
+
+def test_the_imu_s_own_clock_is_believed(base, copy):
+    """An IMU whose clock is 0.4 s ahead, with that written into the calibration, says the same."""
+    folder = copy / "newer-college"
+    table = tomllib.loads(SCENE)
+    imu, calibration = folder / table["query_imu"], folder / table["calibration"]
+    rows = [line.split(",") for line in imu.read_text().splitlines()[1:]]
+    times = [int(sec) * 10**9 + int(nsec) + 400_000_000 for _, sec, nsec, *_ in rows]
+    ahead = [
+        ",".join([row[0], str(time // 10**9), str(time % 10**9), *row[3:]])
+        for row, time in zip(rows, times, strict=True)
+    ]
+    imu.write_text("\n".join(["#counter,sec,nsec,wx,wy,wz,ax,ay,az", *ahead]) + "\n")
+    calibration.write_text(calibration.read_text() + "  timeshift_cam_imu: 0.4\n")
+    for view, expected in zip(load(copy).queries, load(base).queries, strict=True):
+        assert np.allclose(view.gravity_camera, expected.gravity_camera, atol=1e-9)
 
 
 def test_poses_are_the_ground_truth_s(base):

@@ -128,6 +128,18 @@ def test_weights_that_are_none(tmp_path, rng, method, content):
 
 
 @needs_opencv_5
+def test_weights_on_which_opencv_crashes(tmp_path, rng):
+    """Bits found by trying: with them OpenCV 5.0.0 ends in a segmentation fault. Other versions may refuse the file."""
+    weights = network(tmp_path, "aliked")
+    content = bytearray(weights.read_bytes())
+    for place, value in ((477, 2), (1003, 49), (1014, 190), (1675, 193), (1676, 102)):
+        content[place] = value
+    weights.write_bytes(content)
+    with pytest.raises(InputError, match=r"aliked\.onnx: OpenCV .*give an ONNX file of ALIKED"):
+        extract(view_of(tmp_path, texture(rng, 100, 200)), FeatureOptions("aliked", weights=weights))
+
+
+@needs_opencv_5
 def test_weights_of_another_network(tmp_path, rng):
     view = view_of(tmp_path, texture(rng, 100, 200))
     weights = tmp_path / "lightglue.onnx"

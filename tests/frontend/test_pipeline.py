@@ -11,7 +11,7 @@ from textured_rooms import FISHEYE, MEI, PANORAMA, room_view, standing, wallpape
 from spherloc.datasets.map_scene import MapScene
 from spherloc.errors import InputError, ProblemError
 from spherloc.estimators import estimate
-from spherloc.frontend.features import FeatureOptions
+from spherloc.frontend.features import FeatureOptions, extract
 from spherloc.frontend.frontend_options import frontend_options
 from spherloc.frontend.lifting import DepthLift, SfmLift
 from spherloc.frontend.pipeline import image_matcher
@@ -222,11 +222,11 @@ def test_triangulated_points_are_on_the_walls(many, folder):
     view, others = many[0], (many[3], many[6])
     gone = replace(many[9], name="gone", path=folder / "gone.png")
     lift = TriangulationLift(view, (gone, *others), FeatureOptions(max_features=1000))
-    pixels = lift._found[0].pixels
+    pixels = extract(view, lift.features).pixels
     points, has = lift(pixels)
     truth, _ = view.lift(pixels)
     error = np.linalg.norm(points - truth, axis=1)[has]
-    assert has.sum() > 100 and np.median(error) < 0.03
+    assert has.sum() > 100 and np.median(error) < 0.05
     assert len(lift.remarks) == 1 and "gone.png" in lift.remarks[0]
     matches = matcher([replace(view, lift=lift)])(others[0])
     assert len(matches.pixels) > 100 and any("gone.png" in remark for remark in matches.remarks)
