@@ -1,16 +1,4 @@
-"""Scenes of ``kind = "colmap"``: some images of a COLMAP model are localized against the others.
-
-.. code-block:: toml
-
-    kind = "colmap"
-    name = "my model"
-    model = "sparse/0"        # folder with cameras, images and points3D, binary or text; needs pycolmap
-    images = "images"         # folder of the images
-    queries = "night/*"       # a pattern of names, a list of names, or a number n for every n-th image
-
-    [gravity]                 # optional
-    map = [0.0, 0.0, -1.0]    # down; else the mean +y axis of the reference cameras
-    bound_deg = 3.0           # how far a query's roll and pitch may be from its reference's
+"""COLMAP: some images of a model are localized against the others.
 
 Queries are no references, and their poses in the model are the truth. Lengths are those of the model.
 """
@@ -25,6 +13,19 @@ from spherloc.datasets.colmap_views import gravity_of_map, model_views, some, sp
 from spherloc.datasets.map_scene import MapScene
 from spherloc.errors import InputError, show
 from spherloc.frontend.pipeline import image_matcher
+
+EXTRAS = ("colmap",)
+EXAMPLE = """\
+kind = "colmap"
+name = "my model"
+model = "sparse/0"        # folder with cameras, images and points3D, binary or text
+images = "images"         # folder of the images
+queries = "night/*"       # a pattern of names, a list of names, or a number n for every n-th image
+
+[gravity]                 # optional
+map = [0.0, 0.0, -1.0]    # down; else the mean +y axis of the reference cameras
+bound_deg = 3.0           # how far a query's roll and pitch may be from its reference's
+"""
 
 GRAVITY_BOUND_DEG = 3.0
 """Default bound on how far a query's roll and pitch are from those of its most similar reference."""

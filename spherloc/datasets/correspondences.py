@@ -13,6 +13,35 @@ from spherloc.datasets import scene_file
 from spherloc.errors import InputError, ProblemError, show
 from spherloc.problem import Problem
 
+EXAMPLE = """\
+kind = "correspondences"
+name = "my query"
+correspondences = "matches.csv"   # beside this file; columns u, v (px), X, Y, Z (m), optional inlier (0 or 1)
+image = "query.png"               # optional
+
+[camera]
+model = "kannala_brandt"
+width = 1408
+height = 1408
+fx = 611.85
+fy = 611.85
+cx = 715.72
+cy = 716.48
+distortion = [0.394, -0.549, 0.779, -0.455]
+
+[gravity]                         # unit vectors pointing down
+camera = [0.0, 1.0, 0.0]
+map = [0.0, 0.0, -1.0]
+bound_deg = 1.5                   # optional: how far the camera's may be off; 0 if neither is given
+sd_deg = 0.5                      # optional: standard deviation of its roll and of its pitch; a third of the bound
+
+[truth]                           # optional
+cam_from_map = [[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0]]
+
+[options]                         # optional
+bound_px = 4
+"""
+
 COLUMNS = ("u", "v", "X", "Y", "Z")
 MAX_CSV_BYTES = 200_000_000
 

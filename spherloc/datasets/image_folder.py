@@ -1,33 +1,4 @@
-"""Scenes of ``kind = "image-folder"``: a user's own panoramas or fisheyes, localized in a map.
-
-.. code-block:: toml
-
-    kind = "image-folder"
-    name = "my walk"
-    images = "queries"              # a folder of query images, or a list of files
-    calibration = "camera.yaml"     # of the queries: any file that spherloc reads; or a section [camera]
-
-    [map]                           # the references: a COLMAP model ...
-    model = "sparse/0"
-    images = "mapping"
-
-    [[references]]                  # ... or images with pose and depth
-    image = "reference.png"
-    calibration = "other.yaml"      # or camera = {...}; that of the queries if absent
-    cam_from_map = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]
-    # or: trajectory = "poses.txt" (TUM), trajectory_unit = "s" or "ns", timestamp_ns, body_from_camera (3 or 4 rows)
-    depth = "reference_depth.png"   # 16-bit PNG or .npy
-    depth_unit_m = 0.001
-    along = "z"                     # or "ray"
-
-    [gravity]                       # optional
-    map = [0.0, 0.0, -1.0]          # down; else the mean +y axis of the reference cameras
-    camera = [0.0, 1.0, 0.0]        # down in all queries; else as in the most similar reference
-    bound_deg = 3.0
-
-    [truth]                         # optional: cam_from_map of queries
-    "a.jpg" = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]
-"""
+"""Image folder: a user's own panoramas or fisheyes, localized in a COLMAP model or among images with pose and depth."""
 
 import warnings
 from collections.abc import Mapping
@@ -45,6 +16,34 @@ from spherloc.datasets.posed_images import read_camera, read_pose, read_referenc
 from spherloc.errors import InputError, show
 from spherloc.frontend.pipeline import image_matcher
 from spherloc.frontend.view import View
+
+EXAMPLE = """\
+kind = "image-folder"
+name = "my walk"
+images = "queries"              # a folder of query images, or a list of files
+calibration = "camera.yaml"     # of the queries: any file that spherloc reads; or a section [camera]
+
+[map]                           # the references are a COLMAP model (needs pip install 'spherloc[colmap]') ...
+model = "sparse/0"
+images = "mapping"
+
+# [[references]]                # ... or images with pose and depth
+# image = "reference.png"
+# calibration = "other.yaml"    # or camera = {...}; that of the queries if absent
+# cam_from_map = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]
+# # or: trajectory = "poses.txt" (TUM), trajectory_unit = "s" or "ns", timestamp_ns, body_from_camera (3 or 4 rows)
+# depth = "reference_depth.png" # 16-bit PNG or .npy
+# depth_unit_m = 0.001
+# along = "z"                   # or "ray"
+
+[gravity]                       # optional
+map = [0.0, 0.0, -1.0]          # down; else the mean +y axis of the reference cameras
+bound_deg = 3.0
+# camera = [0.0, 1.0, 0.0]      # down in all queries; else as in the most similar reference
+
+# [truth]                       # optional: cam_from_map of queries
+# "a.jpg" = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]
+"""
 
 GRAVITY_BOUND_DEG = 3.0
 """Default bound on a query's gravity, taken from its most similar reference; 0 where the scene states it."""

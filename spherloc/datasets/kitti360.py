@@ -1,10 +1,6 @@
 """KITTI-360: fisheye images of one drive, localized in another with poses and laser scans (Sec. VI-B.1).
 
-``kind = "kitti360"`` with ``root`` (the dataset's folder), ``reference_sequence``, ``query_sequence`` (numbers) and
-``camera`` ("image_02" or "image_03"). Optional: ``reference_frames`` and ``query_frames`` ([first, last], all by
-default), ``reference_step`` and ``query_step`` (every n-th usable frame) and ``scans`` (how many neighbouring scans
-make up the points of a reference, by default its own). Where the dataset's ``fisheye/mask_left_fisheye.npy`` (or right)
-is there, what shows the vehicle itself is not used.
+Where the dataset's ``fisheye/mask_left_fisheye.npy`` (or right) is there, what shows the vehicle itself is not used.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -37,6 +33,18 @@ from spherloc.frontend.lifting import PointCloudLift
 from spherloc.frontend.pipeline import image_matcher
 from spherloc.frontend.view import View
 from spherloc.geometry import pose, transform
+
+EXAMPLE = """\
+kind = "kitti360"
+name = "KITTI-360, drive 4 in drive 5"
+root = "KITTI-360"             # the dataset's folder
+reference_sequence = 5
+query_sequence = 4
+camera = "image_02"            # or "image_03"
+# reference_frames = [0, 2000] # first and last; all if absent. Likewise query_frames
+# reference_step = 5           # every n-th usable frame; likewise query_step
+# scans = 3                    # neighbouring scans that make up the points of a reference; its own one if absent
+"""
 
 THRESHOLDS = ((1.0, 0.5), (2.0, 1.0), (5.0, 2.0))
 """Table II."""

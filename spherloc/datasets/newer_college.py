@@ -1,14 +1,7 @@
 """Newer College: fisheye images of a walk, localized in the map of another with gravity from the IMU (Sec. VI-B.3).
 
-``kind = "newer-college"`` with ``root`` and, relative to it: ``calibration`` (a Kalibr camera chain with T_cam_imu),
-``camera`` (its name there), ``query_images``, ``query_ground_truth``, ``query_imu``, ``reference_images``, and the map:
-
-- ``model``: a COLMAP model of the reference images. It has its own frame and scale: ``map_from_model`` gives the
-  similarity, or ``reference_ground_truth`` lets the loader fit one to the camera positions.
-- or ``prior_map``: a PLY point cloud in the frame of ``reference_ground_truth``, which gives the references' poses.
-
-Optional: ``cam_from_base``, where the ground truth is that of another body than the IMU of the calibration, and
-``query_step``, ``reference_step`` (every n-th image).
+The map is a COLMAP model of the reference images, whose frame and scale ``map_from_model`` gives or the references'
+ground truth lets the loader fit, or a point cloud in the frame of the ground truth.
 """
 
 from dataclasses import dataclass
@@ -33,6 +26,24 @@ from spherloc.frontend.pipeline import image_matcher
 from spherloc.frontend.view import Lift, View
 from spherloc.geometry import camera_centre, pose
 from spherloc.trajectory import NS_PER_S, Trajectory, pose_at, read_newer_college
+
+EXTRAS = ("colmap",)
+EXAMPLE = """\
+kind = "newer-college"
+name = "Newer College, quad-hard in quad-easy"
+root = "newer-college"                     # the paths that follow are relative to it
+calibration = "calibration/camchain.yaml"  # Kalibr camera chain with T_cam_imu
+camera = "cam0"
+query_images = "quad-hard/cam0"            # names end in <sec>_<nsec> or in nanoseconds
+query_ground_truth = "gt-nc-quad-hard.csv"
+query_imu = "quad-hard/imu.csv"
+reference_images = "quad-easy/cam0"
+reference_ground_truth = "gt-nc-quad-easy.csv"
+model = "quad-easy/colmap"                 # or prior_map = "cloud.ply"
+# map_from_model = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]   # a similarity; else fitted to the ground truth
+# cam_from_base = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]    # where the ground truth's body is not the IMU
+# query_step = 10                          # every n-th image; likewise reference_step
+"""
 
 THRESHOLDS = ((2.0, 0.25), (5.0, 0.5), (8.0, 1.0))
 """Table IV."""

@@ -22,6 +22,23 @@ from spherloc.problem import Problem
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
+EXAMPLE = """\
+kind = "synthetic"
+name = "panorama, 80 % outliers"
+
+[camera]
+model = "equirectangular"
+width = 2048
+height = 1024
+
+[simulation]
+correspondences = 100
+outlier_rate = 0.8
+noise_px = 1.0
+seed = 0
+gravity_error_deg = 0.0           # optional: standard deviation of the error of the known roll and pitch
+"""
+
 HALF_SIZE_M = 5.0
 BATCH = 512
 MAX_BATCHES = 400

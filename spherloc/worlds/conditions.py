@@ -79,8 +79,9 @@ class Conditions:
         for key, known in (("light", tuple(LIGHTS)), ("season", SEASONS)):
             if getattr(self, key) not in known:
                 raise InputError(f"conditions: no {key} {show(getattr(self, key))}; there are {', '.join(known)}.")
+        values: dict[str, Any] = dict(vars(self))
         for key, (lowest, highest) in LIMITS.items():
-            value: Any = vars(self)[key]
+            value = values[key]
             if value is None and key.startswith("sun_"):
                 continue
             whole = key == "occluders"

@@ -3,6 +3,7 @@
 import csv
 import importlib
 import json
+import re
 import resource
 import signal
 import subprocess
@@ -125,9 +126,10 @@ def test_ctrl_c_ends_at_once_and_says_how_to_go_on(tmp_path: Path, drawn: dict[s
     process.send_signal(signal.SIGINT)
     output, errors = process.communicate(timeout=60)
     assert process.returncode == 130 and output == ""
-    assert (
-        f"stopped; 1 queries are kept in {out}, and the same command goes on from there." in errors
-        and "Traceback" not in errors
+    (sentence,) = errors.splitlines()
+    # Ctrl-C may come after the row is on the disk and before the program has counted it.
+    assert re.search(
+        r"stopped; [01] of 3 queries are done in .*out, and the same command goes on from there\.$", sentence
     )
 
 
