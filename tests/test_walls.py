@@ -21,7 +21,7 @@ FLOORS = (
     ("spherloc.errors", "spherloc"),
     ("spherloc.registry", "spherloc.geometry", "spherloc.extras", "spherloc.disk_cache", "spherloc.images"),
     ("spherloc.cameras", "spherloc.solvers", "spherloc.trajectory"),
-    ("spherloc.gauss_newton", "spherloc.worlds"),
+    ("spherloc.gauss_newton", "spherloc.worlds", "spherloc.formats"),
     ("spherloc.problem", "spherloc.bounds", "spherloc.consensus"),
     ("spherloc.trace", "spherloc.refine", "spherloc.metrics", "spherloc.datasets", "spherloc.frontend"),
     ("spherloc.estimators", "spherloc.diagnosis", "spherloc.experiments"),

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from spherloc.datasets import map_settings, scene_file
-from spherloc.datasets.colmap_model import read_model
 from spherloc.datasets.colmap_views import gravity_of_map, model_views, some, split_gravity
 from spherloc.datasets.map_scene import MapScene
 from spherloc.errors import InputError, show
+from spherloc.formats.colmap_model import read_model
 from spherloc.frontend.pipeline import image_matcher
 
 EXTRAS = ("colmap",)

@@ -10,8 +10,8 @@ import numpy as np
 
 from spherloc.cameras.base import BoolArray, FloatArray
 from spherloc.datasets import scene_file
-from spherloc.datasets.colmap_model import ColmapImage, ColmapModel
 from spherloc.errors import CalibrationError, InputError
+from spherloc.formats.colmap_model import ColmapImage, ColmapModel
 from spherloc.frontend.lifting import SfmLift
 from spherloc.frontend.view import View
 

@@ -16,12 +16,12 @@ import numpy as np
 
 from spherloc.cameras.base import Camera, FloatArray
 from spherloc.datasets import map_settings, scene_file
-from spherloc.datasets.colmap_model import ColmapModel, read_model
 from spherloc.datasets.colmap_views import gravity_of_map, model_views, some, split_gravity
-from spherloc.datasets.hloc_files import open_hdf5, read_global_descriptors, read_pairs, read_queries, read_results
 from spherloc.datasets.hloc_matches import HlocMatcher
 from spherloc.datasets.map_scene import MapScene
 from spherloc.errors import InputError
+from spherloc.formats.colmap_model import ColmapModel, read_model
+from spherloc.formats.hloc_files import open_hdf5, read_global_descriptors, read_pairs, read_queries, read_results
 from spherloc.frontend.frontend_options import MOST_REFERENCES
 from spherloc.frontend.pipeline import image_matcher
 from spherloc.frontend.view import Matcher, View

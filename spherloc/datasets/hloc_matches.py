@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from spherloc.cameras.base import FloatArray
-from spherloc.datasets.colmap_model import ColmapModel
-from spherloc.datasets.hloc_files import Hdf5, IntArray, Keypoints, open_hdf5, read_keypoints, read_matches
 from spherloc.errors import InputError, show
+from spherloc.formats.colmap_model import ColmapModel
+from spherloc.formats.hloc_files import Hdf5, IntArray, Keypoints, open_hdf5, read_keypoints, read_matches
 from spherloc.frontend.view import Matches, View
 
 _WORTH_SAYING_PX = 1.0

@@ -9,11 +9,11 @@ from PIL import Image
 
 from spherloc.cameras.base import Camera, FloatArray
 from spherloc.datasets import map_settings, scene_file
-from spherloc.datasets.colmap_model import read_model
 from spherloc.datasets.colmap_views import gravity_of_map, model_views, some, split_gravity, unit_vector
 from spherloc.datasets.map_scene import MapScene
 from spherloc.datasets.posed_images import read_camera, read_pose, read_references
 from spherloc.errors import InputError, show
+from spherloc.formats.colmap_model import read_model
 from spherloc.frontend.pipeline import image_matcher
 from spherloc.frontend.view import View
 

@@ -16,8 +16,8 @@ from scipy.signal import fftconvolve
 from scipy.spatial.transform import Rotation
 
 from spherloc.cameras.base import FloatArray
-from spherloc.datasets.text_rows import finite_numbers, rows
 from spherloc.errors import InputError
+from spherloc.formats.text_rows import finite_numbers, rows
 from spherloc.trajectory import NS_PER_S
 
 GRAVITY_M_S2 = 9.81

@@ -17,9 +17,9 @@ from scipy.spatial import KDTree
 
 from spherloc.datasets import map_settings, scene_file
 from spherloc.datasets.colmap_views import gravity_of_map, some, split_gravity
-from spherloc.datasets.kapture_files import Kapture, Record, read_kapture
 from spherloc.datasets.map_scene import MapScene
 from spherloc.errors import InputError, show
+from spherloc.formats.kapture_files import Kapture, Record, read_kapture
 from spherloc.frontend.frontend_options import FrontendOptions, frontend_options
 from spherloc.frontend.pipeline import image_matcher
 from spherloc.frontend.triangulation import TriangulationLift

@@ -13,7 +13,10 @@ import numpy as np
 
 from spherloc.cameras.base import FloatArray
 from spherloc.datasets import scene_file
-from spherloc.datasets.kitti360_files import (
+from spherloc.datasets.map_scene import MapScene
+from spherloc.datasets.map_settings import OPTIONAL, REQUIRED, folder, read_settings
+from spherloc.errors import InputError, show
+from spherloc.formats.kitti360_files import (
     SIDES,
     Drive,
     Rig,
@@ -26,9 +29,7 @@ from spherloc.datasets.kitti360_files import (
     unwrapped,
     without_car,
 )
-from spherloc.datasets.map_scene import MapScene
-from spherloc.datasets.map_settings import OPTIONAL, REQUIRED, folder, needed_file, read_settings
-from spherloc.errors import InputError, show
+from spherloc.formats.layout import needed_file
 from spherloc.frontend.lifting import PointCloudLift
 from spherloc.frontend.pipeline import image_matcher
 from spherloc.frontend.view import View

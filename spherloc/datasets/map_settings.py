@@ -1,6 +1,6 @@
 """The keys that all scenes made of images share."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -8,6 +8,7 @@ from typing import Any
 from spherloc.datasets import scene_file
 from spherloc.datasets.map_scene import DEFAULT_THRESHOLDS, Thresholds
 from spherloc.errors import InputError
+from spherloc.formats.layout import is_there
 
 REQUIRED = {"kind", "name"}
 OPTIONAL = {"about", "frontend", "gravity", "options", "thresholds"}
@@ -64,25 +65,6 @@ def folder(table: Mapping[str, Any], key: str, path: Path) -> Path:
     Raises ``InputError`` if there is none.
     """
     named = path.parent / scene_file.text(table, key, str(path))
-    if not _exists(named.is_dir):
+    if not is_there(named.is_dir):
         raise InputError(f"{path}: {key} names the folder {named}, which does not exist; correct the path.")
     return named
-
-
-def needed_file(root: Path, name: str, where: str, what: str) -> Path:
-    """A file that a dataset's layout demands; raises ``InputError`` that names it if it is missing.
-
-    ``what`` says what it holds ("the calibration of image_02").
-    """
-    named = root / name
-    if not _exists(named.is_file):
-        raise InputError(f"{where}: {named} is missing, {what}; check that 'root' is the dataset's own folder.")
-    return named
-
-
-def _exists(check: Callable[[], bool]) -> bool:
-    """False also for a path that the system cannot even look up: too long, or with a zero byte."""
-    try:
-        return check()
-    except (OSError, ValueError):
-        return False

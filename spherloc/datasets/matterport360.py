@@ -14,10 +14,10 @@ import numpy as np
 from spherloc.cameras.base import FloatArray
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.datasets import map_settings, scene_file
-from spherloc.datasets.dpt import read_dpt
 from spherloc.datasets.map_scene import MapScene
 from spherloc.datasets.registration import DepthRegistration
 from spherloc.errors import InputError, show
+from spherloc.formats.dpt import read_dpt
 from spherloc.frontend.lifting import DepthLift
 from spherloc.frontend.pipeline import image_matcher
 from spherloc.frontend.view import Lift, View

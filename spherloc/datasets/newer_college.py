@@ -14,13 +14,14 @@ import numpy as np
 from spherloc.cameras.base import BoolArray, Camera, FloatArray
 from spherloc.cameras.kalibr import read_kalibr_chain
 from spherloc.datasets import scene_file
-from spherloc.datasets.colmap_model import ColmapImage, ColmapModel, read_model
 from spherloc.datasets.imu import down_at, read_imu
 from spherloc.datasets.map_scene import MapScene
-from spherloc.datasets.map_settings import OPTIONAL, REQUIRED, folder, needed_file, read_settings
-from spherloc.datasets.newer_college_files import NAME_RULE, TimedImage, images_in, is_there, read_cloud, timestamp_of
+from spherloc.datasets.map_settings import OPTIONAL, REQUIRED, folder, read_settings
 from spherloc.datasets.similarity import Similarity, align, similarity_of
 from spherloc.errors import InputError, show
+from spherloc.formats.colmap_model import ColmapImage, ColmapModel, read_model
+from spherloc.formats.layout import is_there, needed_file
+from spherloc.formats.newer_college_files import NAME_RULE, TimedImage, images_in, read_cloud, timestamp_of
 from spherloc.frontend.lifting import PointCloudLift, SfmLift
 from spherloc.frontend.pipeline import image_matcher
 from spherloc.frontend.view import Lift, View

@@ -11,10 +11,10 @@ from colmap_samples import binary_files, sample_model, text_files, with_rigs, wr
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from spherloc.datasets.colmap_check import walk_binary
-from spherloc.datasets.colmap_model import read_model
-from spherloc.datasets.colmap_text import walk_text
 from spherloc.errors import InputError
+from spherloc.formats.colmap_check import walk_binary
+from spherloc.formats.colmap_model import read_model
+from spherloc.formats.colmap_text import walk_text
 
 NASTY = (
     b"\xff" * 8,

@@ -17,8 +17,8 @@ from colmap_samples import (
 from conftest import ROOT
 from scipy.spatial.transform import Rotation
 
-from spherloc.datasets.colmap_model import _read_by_pycolmap, read_model
 from spherloc.errors import CalibrationError, InputError
+from spherloc.formats.colmap_model import _read_by_pycolmap, read_model
 
 FORMS = pytest.mark.parametrize("files_of", [binary_files, text_files], ids=["binary", "text"])
 SHARED = ROOT / ".." / "shared" / "data"

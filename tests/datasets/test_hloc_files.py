@@ -8,8 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mutations import mutations
 
-from spherloc.datasets import hloc_files, load_scene
-from spherloc.datasets.hloc_files import (
+from spherloc.datasets import load_scene
+from spherloc.errors import InputError, SpherlocError
+from spherloc.formats import hloc_files
+from spherloc.formats.hloc_files import (
     open_hdf5,
     read_global_descriptors,
     read_keypoints,
@@ -18,7 +20,6 @@ from spherloc.datasets.hloc_files import (
     read_queries,
     read_results,
 )
-from spherloc.errors import InputError, SpherlocError
 from spherloc.trajectory import rotation_from_wxyz
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")

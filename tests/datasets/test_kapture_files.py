@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from kapture_samples import FILES, RECORDS, RIGS, SENSORS, TRAJECTORIES, write_kapture
 from mutations import mutations
 
-from spherloc.datasets.kapture_files import read_kapture
 from spherloc.errors import InputError, SpherlocError
+from spherloc.formats.kapture_files import read_kapture
 from spherloc.geometry import pose
 from spherloc.trajectory import rotation_from_wxyz
 

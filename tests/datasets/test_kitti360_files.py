@@ -12,7 +12,8 @@ from mutations import mutations
 from scipy.spatial.transform import Rotation
 
 from spherloc.cameras.equirectangular import Equirectangular
-from spherloc.datasets.kitti360_files import (
+from spherloc.errors import InputError
+from spherloc.formats.kitti360_files import (
     frames_in,
     read_cam_to_pose,
     read_cam_to_velo,
@@ -23,7 +24,6 @@ from spherloc.datasets.kitti360_files import (
     unwrapped,
     without_car,
 )
-from spherloc.errors import InputError
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
 

@@ -10,11 +10,11 @@ from matterport360_tree import write_building, write_dpt, write_pose
 from scipy.spatial.transform import Rotation
 
 from spherloc.datasets import load_scene
-from spherloc.datasets.dpt import read_dpt
 from spherloc.datasets.map_scene import MapScene
 from spherloc.datasets.matterport360 import read_pose
 from spherloc.errors import InputError
 from spherloc.estimators import estimate
+from spherloc.formats.dpt import read_dpt
 from spherloc.geometry import camera_centre, pose, so3_exp
 from spherloc.metrics import evaluate
 

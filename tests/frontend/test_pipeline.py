@@ -48,7 +48,7 @@ def queries(folder) -> dict[str, View]:
 
 
 def matcher(references, table=None, pairs=None):
-    return image_matcher(tuple(references), {"max_features": 1000} | (table or {}), "scene.toml", Path(), pairs)
+    return image_matcher(tuple(references), {"max_features": 700} | (table or {}), "scene.toml", Path(), pairs)
 
 
 def map_scene(references, queries, table=None):

@@ -147,8 +147,9 @@ def truth_of(folder: Path, name: str) -> NDArray:
     return np.array(tomllib.loads((folder / name).read_text())["truth"]["cam_from_map"])
 
 
-@pytest.mark.parametrize("estimator", ["ransac-2p", "mc-exact"])
-@pytest.mark.parametrize("of_query", ["rgb", "slam-left"])
+@pytest.mark.parametrize(
+    "of_query, estimator", [("rgb", "ransac-2p"), ("rgb", "mc-exact"), ("slam-left", "mc-exact"), ("slam-left", "auto")]
+)
 def test_a_real_fisheye_is_localized_against_the_depth_of_another_camera(aria, of_query, estimator):
     """Colour against grey, 1408 against 640 pixels, half a minute apart, 8-11 cm beside each other."""
     glasses = Aria(aria)

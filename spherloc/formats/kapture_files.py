@@ -13,9 +13,9 @@ import numpy as np
 
 from spherloc.cameras.base import Camera, FloatArray
 from spherloc.cameras.colmap_models import camera_from_colmap
-from spherloc.datasets.map_settings import needed_file
-from spherloc.datasets.text_rows import finite_numbers, pose_from_words, rows
 from spherloc.errors import CalibrationError, InputError, show
+from spherloc.formats.layout import needed_file
+from spherloc.formats.text_rows import finite_numbers, pose_from_words, rows
 from spherloc.geometry import pose
 
 _LARGEST_TIMESTAMP = 2**63

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from spherloc.cameras.base import Camera, FloatArray
 from spherloc.cameras.colmap_models import camera_from_colmap
-from spherloc.datasets.colmap_check import walk_binary
-from spherloc.datasets.colmap_text import walk_text
-from spherloc.datasets.colmap_walk import Points, Walked
 from spherloc.errors import CalibrationError, InputError, show
 from spherloc.extras import require
+from spherloc.formats.colmap_check import walk_binary
+from spherloc.formats.colmap_text import walk_text
+from spherloc.formats.colmap_walk import Points, Walked
 
 _FILES = ("cameras", "images", "points3D")
 _PATIENCE_S = 120.0

@@ -11,7 +11,8 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from spherloc.datasets.colmap_walk import (
+from spherloc.errors import InputError
+from spherloc.formats.colmap_walk import (
     LARGEST,
     MODELS,
     OBSERVATION,
@@ -23,7 +24,6 @@ from spherloc.datasets.colmap_walk import (
     check_pose,
     make_points,
 )
-from spherloc.errors import InputError
 
 _SPHERE_ID, _SPHERE_PARAMETERS = 11, 3
 _CAMERA = 0

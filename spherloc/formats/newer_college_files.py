@@ -1,7 +1,6 @@
 """Files of the Newer College Dataset: images whose names carry their time, and the prior map's point cloud."""
 
 import re
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
@@ -32,14 +31,6 @@ class TimedImage:
     """Its path below the folder, with forward slashes."""
     path: Path
     timestamp_ns: int
-
-
-def is_there(test: Callable[[], bool]) -> bool:
-    """What ``path.is_file`` or ``path.is_dir`` says; False also for names that are too long for any file."""
-    try:
-        return test()
-    except OSError:
-        return False
 
 
 def timestamp_of(name: str) -> int | None:

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spherloc.datasets.colmap_walk import (
+from spherloc.errors import InputError, show
+from spherloc.formats.colmap_walk import (
     LARGEST,
     MODELS,
     OBSERVATION,
@@ -20,7 +21,6 @@ from spherloc.datasets.colmap_walk import (
     check_pose,
     make_points,
 )
-from spherloc.errors import InputError, show
 
 _MAX_LINE = 64_000_000
 """Characters of a line: the observations of a million keypoints."""

@@ -15,9 +15,9 @@ from scipy.spatial.transform import Rotation
 
 from spherloc.cameras.base import BoolArray, Camera, FloatArray
 from spherloc.cameras.calibration import load_camera
-from spherloc.datasets.map_settings import needed_file
-from spherloc.datasets.text_rows import finite_numbers, rows
 from spherloc.errors import InputError, show
+from spherloc.formats.layout import needed_file
+from spherloc.formats.text_rows import finite_numbers, rows
 
 MAX_SCAN_BYTES = 1 << 28
 """A hundred times a scan of the dataset."""

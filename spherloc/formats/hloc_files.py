@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from spherloc.cameras.base import Camera, FloatArray
 from spherloc.cameras.colmap_models import camera_from_colmap
-from spherloc.datasets.text_rows import finite_numbers, pose_from_words, refuse_pickle, rows
 from spherloc.errors import CalibrationError, InputError, show
 from spherloc.extras import require
+from spherloc.formats.text_rows import finite_numbers, pose_from_words, refuse_pickle, rows
 
 IntArray = NDArray[np.int64]
 
