@@ -25,7 +25,7 @@ from spherloc_viz import style
 from spherloc_viz.layers import paint, steps
 from spherloc_viz.layers.primitives import Balls, Curve, Mesh, Picture, Points, SceneItem, Segments
 
-SCENES = sorted(bundled_scenes())
+SCENES = sorted(name for name, path in bundled_scenes().items() if 'kind = "synthetic"' in path.read_text())
 
 
 def trace_of(scene: str, estimator: str, **changes: object) -> Trace:

@@ -87,7 +87,8 @@ def seen_pixels(camera: Camera) -> BoolArray:
     for top in range(0, camera.height, rows):
         block = np.arange(top, min(top + rows, camera.height)) + 0.5
         u, v = np.meshgrid(columns, block)
-        seen[top : top + rows] = camera.unproject(np.column_stack([u.ravel(), v.ravel()]))[1].reshape(u.shape)
+        pixels = np.column_stack([u.ravel(), v.ravel()]).astype(np.float64)
+        seen[top : top + rows] = camera.unproject(pixels)[1].reshape(u.shape)
     seen.setflags(write=False)
     return seen
 
