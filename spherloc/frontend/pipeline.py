@@ -16,7 +16,7 @@ from spherloc.frontend.feature_kinds import KINDS
 from spherloc.frontend.features import Features, extract
 from spherloc.frontend.frontend_options import FrontendOptions, frontend_options
 from spherloc.frontend.matching import match
-from spherloc.frontend.outlier_rate import wrong_matches
+from spherloc.frontend.outlier_rate import right_shares, wrong_matches
 from spherloc.frontend.triangulation import TriangulationLift
 from spherloc.frontend.view import Matcher, Matches, View
 from spherloc.geometry import camera_centre
@@ -217,8 +217,13 @@ def _joined(found: Sequence[_Found], tried: Sequence[View], remarks: list[str]) 
 
 def _outlier_rate(ranked: Sequence[_Found], kept: int) -> float | None:
     """Of what is kept: repetitions, which are left out, are of right matches."""
-    wrong = [part.wrong for part in ranked if part.wrong is not None]
-    return min(1.0, sum(wrong) / kept) if wrong else None
+    if all(part.wrong is None for part in ranked):
+        return None
+    ranges = [np.linalg.norm(part.points - _centre(part.reference), axis=1) for part in ranked]
+    right = right_shares([part.pixels for part in ranked], [part.points for part in ranked], ranges)
+    by_agreement = [(1.0 - share) * len(part.pixels) for share, part in zip(right, ranked, strict=True)]
+    by_chance = [part.wrong or 0.0 for part in ranked]
+    return min(1.0, float(np.fmax(by_agreement, by_chance).sum()) / kept)
 
 
 def _repeated(pixels: FloatArray, points: FloatArray, ranges: FloatArray) -> BoolArray:

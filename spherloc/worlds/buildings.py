@@ -84,35 +84,48 @@ def add_house(
 
     The windows of the lowest ``recessed`` storeys lie deeper than the wall; farther ones look the same without.
     """
-    variant = int(rng.integers(2))
+    windows = f"window_{style}_{int(rng.integers(2))}"
     tint = np.clip(rng.uniform(0.86, 1.0) + rng.uniform(-0.04, 0.04, 3), 0, 1)
+    _ground_floor(builder, rng, front, bays, style, number, windows, tint)
+    for bay in range(bays):
+        left = bay * BAY_M
+        for storey in range(1, storeys):
+            lit, low = bool(rng.random() < 0.4), storey * STOREY_M
+            if storey < recessed:
+                add_opening(builder, front, left, low, windows, WINDOW, tint, lit)
+            else:
+                builder.quad(front.patch(left, left + BAY_M, low, low + STOREY_M), windows, tint=tint, lit=lit)
+            if style == 4 and storey == 2 and bay % 2 == 0:
+                _balcony(builder, front, left, low)
+    _top(builder, rng, front, bays, storeys, style)
+
+
+def _ground_floor(
+    builder: MeshBuilder,
+    rng: np.random.Generator,
+    front: Front,
+    bays: int,
+    style: int,
+    number: int,
+    windows: str,
+    tint: FloatArray,
+) -> None:
     door = int(rng.integers(bays))
     shops = rng.random() < 0.6
     for bay in range(bays):
-        left = bay * BAY_M
-        lit = {"lit": bool(rng.random() < 0.45), "tint": tint}
+        left, lit = bay * BAY_M, bool(rng.random() < 0.45)
         if bay == door:
-            add_opening(builder, front, left, 0, f"door_{style}", DOOR, **lit)
+            add_opening(builder, front, left, 0, f"door_{style}", DOOR, tint, lit)
             plate = front.patch(left + 2.25, left + 2.55, 1.85, 2.15, -0.02)
             builder.quad(plate, f"number_{number % 16}")
         elif shops:
-            builder.quad(front.patch(left, left + BAY_M, 0, STOREY_M), f"shop_{style}", tint=tint, lit=lit["lit"])
+            builder.quad(front.patch(left, left + BAY_M, 0, STOREY_M), f"shop_{style}", tint=tint, lit=lit)
             if bay != door + 1 and rng.random() < 0.75:
                 _sign(builder, rng, front, left)
         else:
-            add_opening(builder, front, left, 0, f"window_{style}_{variant}", WINDOW, **lit)
+            add_opening(builder, front, left, 0, windows, WINDOW, tint, lit)
             if rng.random() < 0.15:
                 _poster(builder, rng, front, left)
-        for storey in range(1, storeys):
-            lit = {"lit": bool(rng.random() < 0.4), "tint": tint}
-            low, tile = storey * STOREY_M, f"window_{style}_{variant}"
-            if storey < recessed:
-                add_opening(builder, front, left, low, tile, WINDOW, **lit)
-            else:
-                builder.quad(front.patch(left, left + BAY_M, low, low + STOREY_M), tile, **lit)
-            if style == 4 and storey == 2 and bay % 2 == 0:
-                _balcony(builder, front, left, storey * STOREY_M)
-    _top(builder, rng, front, bays, storeys, style)
 
 
 def _sign(builder: MeshBuilder, rng: np.random.Generator, front: Front, left: float) -> None:

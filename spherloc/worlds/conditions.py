@@ -79,16 +79,18 @@ class Conditions:
         for key, known in (("light", tuple(LIGHTS)), ("season", SEASONS)):
             if getattr(self, key) not in known:
                 raise InputError(f"conditions: no {key} {show(getattr(self, key))}; there are {', '.join(known)}.")
-        values: dict[str, Any] = dict(vars(self))
-        for key, (lowest, highest) in LIMITS.items():
-            value = values[key]
-            if value is None and key.startswith("sun_"):
-                continue
-            whole = key == "occluders"
-            if not _is_number(value, whole) or not lowest <= value <= highest:
-                kind = "whole number" if whole else "number"
-                raise InputError(f"conditions: {key} is {show(value)}; give a {kind} from {lowest:g} to {highest:g}.")
-            object.__setattr__(self, key, int(value) if whole else float(value))
+        for key in LIMITS:
+            if getattr(self, key) is not None or not key.startswith("sun_"):
+                object.__setattr__(self, key, _limited(key, getattr(self, key)))
+
+
+def _limited(key: str, value: Any) -> float | int:
+    lowest, highest = LIMITS[key]
+    whole = key == "occluders"
+    if not _is_number(value, whole) or not lowest <= value <= highest:
+        kind = "whole number" if whole else "number"
+        raise InputError(f"conditions: {key} is {show(value)}; give a {kind} from {lowest:g} to {highest:g}.")
+    return int(value) if whole else float(value)
 
 
 def _is_number(value: Any, whole: bool) -> bool:

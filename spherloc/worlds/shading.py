@@ -71,11 +71,16 @@ class Lighting:
         if self.conditions.season == "winter" and not self.world.indoor:
             base = _snowed(base, places, normals)
         albedo = base**GAMMA * tint
-        colour = albedo * self._irradiance(places, normals)
-        glow = texture[:, 3] * mesh.lit[hits.face] * max(self.light.lamps, float(self.world.indoor))
+        glow = texture[:, 3] * mesh.lit[hits.face]
         if self.world.indoor:
-            # What shines indoors is the daylight behind a window and the shades of lamps, in their own colours.
-            return (colour + (1.1 * glow)[:, None] * albedo).astype(np.float32)
+            # Lamps are always on; the view from a window is as bright as the day.
+            behind_glass = (
+                np.array([kind == "glass" for kind in atlas.kinds])[mesh.tile[hits.face]] & mesh.lit[hits.face]
+            )
+            albedo *= np.where(behind_glass, min(1.0, 1.8 * float(np.mean(self.light.sky))), 1.0)[:, None]
+            return (albedo * (self._irradiance(places, normals) + (1.1 * glow)[:, None])).astype(np.float32)
+        colour = albedo * self._irradiance(places, normals)
+        glow *= self.light.lamps
         colour = colour + (1.5 * glow)[:, None] * (0.2 + base.mean(axis=1, keepdims=True)) * LAMP_COLOUR
         clear = np.exp(-hits.range_m / HAZE_M)[:, None]
         return (clear * colour + (1 - clear) * np.asarray(self.light.horizon)).astype(np.float32)

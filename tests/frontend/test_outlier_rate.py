@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from spherloc.frontend.features import Features
 from spherloc.frontend.matching import MatchOptions, match
-from spherloc.frontend.outlier_rate import BINARY_SHARES, RATIOS, SHARES, wrong_matches
+from spherloc.frontend.outlier_rate import BINARY_SHARES, LEAST_SHARED, RATIOS, SHARES, right_shares, wrong_matches
 
 
 def features(descriptors: np.ndarray, random: np.random.Generator) -> Features:
@@ -55,3 +55,33 @@ def test_more_overlap_means_a_lower_rate(rng):
         guesses.append(wrong_matches(1500, len(found), 0.8, False) / len(found))
     assert np.all(np.diff(truths) < 0) and np.all(np.diff(guesses) < 0)
     assert np.abs(np.subtract(guesses, truths)).max() < 0.25
+
+
+def drawn_matches(rng, truths, features=600, matched=400):
+    """Matches of as many references as there are shares of right ones: pixels, points and ranges of each."""
+    pixels, points = rng.uniform(0, 1000, (features, 2)), rng.uniform(-5, 5, (features, 3)) + [0, 0, 20]
+    parts = []
+    for share in truths:
+        chosen = rng.permutation(features)[:matched]
+        right = rng.random(matched) < share
+        wrong = rng.uniform(-5, 5, (matched, 3)) + [0, 0, 20]
+        found = np.where(right[:, None], points[chosen] + 0.02 * rng.normal(size=(matched, 3)), wrong)
+        parts.append((pixels[chosen], found, np.linalg.norm(found, axis=1)))
+    return [list(column) for column in zip(*parts, strict=True)]
+
+
+def test_agreement_tells_how_many_are_right_in_each_reference(rng):
+    truths = [0.9, 0.6, 0.3, 0.1]
+    found = right_shares(*drawn_matches(rng, truths))
+    assert np.abs(found - truths).max() < 0.12 and np.all(np.diff(found) < 0)
+
+
+def test_agreement_says_nothing_of_references_that_share_too_little(rng):
+    pixels, points, ranges = drawn_matches(rng, [0.9, 0.8])
+    alone = pixels[0] + 5000.0  # other features of the query
+    found = right_shares([*pixels, alone], [*points, points[0]], [*ranges, ranges[0]])
+    assert np.isfinite(found[:2]).all() and np.isnan(found[2])
+    assert np.isnan(right_shares(pixels[:1], points[:1], ranges[:1])).all()
+    few = LEAST_SHARED - 1
+    short = right_shares([pixels[0][:few], pixels[0]], [points[0][:few], points[0]], [ranges[0][:few], ranges[0]])
+    assert np.isnan(short).all()
