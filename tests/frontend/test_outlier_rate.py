@@ -57,14 +57,14 @@ def test_more_overlap_means_a_lower_rate(rng):
     assert np.abs(np.subtract(guesses, truths)).max() < 0.25
 
 
-def drawn_matches(rng, truths, features=600, matched=400):
+def drawn_matches(rng, truths, features=3000, matched=2000):
     """Matches of as many references as there are shares of right ones: pixels, points and ranges of each."""
-    pixels, points = rng.uniform(0, 1000, (features, 2)), rng.uniform(-5, 5, (features, 3)) + [0, 0, 20]
+    pixels, points = rng.uniform(0, 1000, (features, 2)), rng.uniform(-5, 5, (features, 3)) + np.array([0.0, 0.0, 20.0])
     parts = []
     for share in truths:
         chosen = rng.permutation(features)[:matched]
         right = rng.random(matched) < share
-        wrong = rng.uniform(-5, 5, (matched, 3)) + [0, 0, 20]
+        wrong = rng.uniform(-5, 5, (matched, 3)) + np.array([0.0, 0.0, 20.0])
         found = np.where(right[:, None], points[chosen] + 0.02 * rng.normal(size=(matched, 3)), wrong)
         parts.append((pixels[chosen], found, np.linalg.norm(found, axis=1)))
     return [list(column) for column in zip(*parts, strict=True)]

@@ -146,7 +146,7 @@ def test_occluders_change_only_what_is_behind_them(kind):
     around = cv2.dilate(nearer.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     changed = (full.image != free.image).any(axis=2)
     if not world.indoor:  # where lamps are on, things throw shadows
-        assert (changed & ~around).mean() < 2e-4  # an arm thinner than a pixel beside an edge of the world
+        assert (changed & ~around).mean() < 1e-3  # an arm thinner than a pixel beside an edge of the world
     assert changed[nearer].mean() > 0.9
 
 
