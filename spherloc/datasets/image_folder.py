@@ -31,7 +31,8 @@ images = "mapping"
 # image = "reference.png"
 # calibration = "other.yaml"    # or camera = {...}; that of the queries if absent
 # cam_from_map = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]
-# # or: trajectory = "poses.txt" (TUM), trajectory_unit = "s" or "ns", timestamp_ns, body_from_camera (3 or 4 rows)
+# # or: trajectory = "poses.txt" (TUM; a .csv is EuRoC's), timestamp_ns, body_from_camera (3 or 4 rows),
+# # trajectory_unit = "s" or "ns", what TUM's first column counts
 # depth = "reference_depth.png" # 16-bit PNG or .npy
 # depth_unit_m = 0.001
 # along = "z"                   # or "ray"

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from spherloc.errors import InputError, show
 from spherloc.frontend.lifting import DepthLift
 from spherloc.frontend.view import View
 from spherloc.images import read_depth_png
-from spherloc.trajectory import Trajectory, pose_at, read_tum
+from spherloc.trajectory import Trajectory, pose_at, read_euroc, read_tum
 
 MAX_GAP_S = 0.5
 """Poses of a trajectory farther apart than this are not interpolated."""
@@ -71,7 +71,7 @@ def read_references(entries: Any, shared: Camera | None, path: Path) -> PosedIma
     """
     if not isinstance(entries, list) or not entries or not all(isinstance(entry, dict) for entry in entries):
         raise InputError(f"{path}: 'references' must be a list of sections [[references]].")
-    trajectories = cache(read_tum)
+    trajectories = cache(_trajectory)
     views, without_pose = [], []
     for number, entry in enumerate(entries, start=1):
         where = f"{path} [[references]] {number}"
@@ -122,6 +122,11 @@ def _pose(entry: Mapping[str, Any], path: Path, where: str, trajectories: Any) -
     turn = map_from_body[:, :3] @ body_from_camera[:, :3]
     centre = map_from_body[:, :3] @ body_from_camera[:, 3] + map_from_body[:, 3]
     return np.column_stack([turn.T, -turn.T @ centre])
+
+
+def _trajectory(path: Path, unit: Literal["s", "ns"]) -> Trajectory:
+    """A EuRoC ground truth (.csv), else rows of TUM whose first column counts ``unit``."""
+    return read_euroc(path) if path.suffix.lower() == ".csv" else read_tum(path, unit)
 
 
 def _lift(entry: Mapping[str, Any], camera: Camera, pose: FloatArray, path: Path, where: str) -> DepthLift:

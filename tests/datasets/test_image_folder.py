@@ -91,16 +91,17 @@ def test_queries_that_cannot_be_read_are_left_out_and_counted(tmp_path):
         load_scene(path)
 
 
-def test_references_from_a_trajectory(tmp_path):
-    """The pose of the body at the time of the image, and where the camera sits on it."""
+@pytest.mark.parametrize("file", ["poses.txt", "data.csv"])
+def test_references_from_a_trajectory(tmp_path, file):
+    """The pose of the body at the time of the image, and where the camera sits on it; of TUM's rows and of EuRoC's."""
     turn = so3_exp(np.array([0.1, -0.7, 0.3]))
     x, y, z, w = 0.0, np.sin(0.2), 0.0, np.cos(0.2)
-    (tmp_path / "poses.txt").write_text(
-        f"# t\n10.0 1 2 3 {x} {y} {z} {w}\n10.4 1 2 4 {x} {y} {z} {w}\n20.0 0 0 0 0 0 0 1\n"
-    )
+    tum = f"# t\n10.0 1 2 3 {x} {y} {z} {w}\n10.4 1 2 4 {x} {y} {z} {w}\n20.0 0 0 0 0 0 0 1\n"
+    euroc = f"#t\n{10**10},1,2,3,{w},{x},{y},{z}\n10400000000,1,2,4,{w},{x},{y},{z}\n{2 * 10**10},0,0,0,1,0,0,0\n"
+    (tmp_path / file).write_text(tum if file == "poses.txt" else euroc)
     mount = np.column_stack([turn, [0.1, 0.2, 0.3]])
     rows = [*mount.tolist(), [0, 0, 0, 1]]
-    timed = f'{REFERENCE}trajectory = "poses.txt"\nbody_from_camera = {rows}\ntimestamp_ns = '
+    timed = f'{REFERENCE}trajectory = "{file}"\nbody_from_camera = {rows}\ntimestamp_ns = '
     scene = load_scene(make_tree(tmp_path, CAMERA + timed + "10100000000\n" + timed + "15000000000\n"))
     assert len(scene.references) == 1
     assert "1 of 2 references were left out" in scene.remarks[0]
