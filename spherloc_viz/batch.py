@@ -70,6 +70,7 @@ def _problem(path: Path, scene: Scene, seed: int | None, query: str | None) -> P
     for remark in scene.remarks:
         _say(remark)
     view = scene.query(query)
+    _say(f"{path}: reading and matching images; what is new to this machine takes up to a minute")
     matches = scene.matcher(view)
     for remark in matches.remarks:
         _say(remark)

@@ -60,8 +60,9 @@ occluders = 6
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """What a picture follows from."""
+    """What a picture follows from, and what it is called."""
 
+    name: str
     world: World
     camera: Camera
     cam_from_map: FloatArray
@@ -71,18 +72,22 @@ class Picture:
     @property
     def path(self) -> Path:
         """Where it is kept."""
-        return image_path(self.world, self.camera, self.cam_from_map, self.conditions, self.seed)
+        return image_path(*self._all)
+
+    @property
+    def _all(self) -> tuple[World, Camera, FloatArray, Conditions, int, str]:
+        return self.world, self.camera, self.cam_from_map, self.conditions, self.seed, self.name
 
     def image(self) -> ByteImage:
         """(H, W, 3) BGR, drawn if it is not there yet."""
-        return render(self.world, self.camera, self.cam_from_map, self.conditions, self.seed).image
+        return render(*self._all).image
 
     def range_m(self) -> NDArray[np.float32]:
         """(H, W) metres along the ray."""
         kept = stored_range(self.path, self.camera)
         if kept is not None:
             return kept
-        return render(self.world, self.camera, self.cam_from_map, self.conditions, self.seed).range_m
+        return render(*self._all).range_m
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -143,9 +148,9 @@ def _references(table: Mapping[str, Any], where: str, world: World, camera: Came
     conditions = _conditions(table, where)
     views = []
     for number, place in enumerate(_poses(table, where, world)):
-        picture = Picture(world, camera, place, conditions, number)
+        picture = Picture(f"reference_{number:03d}", world, camera, place, conditions, number)
         lift = DepthLift(picture.range_m, camera, place, along="ray")
-        views.append(_view(f"reference_{number:03d}", picture, lift=lift))
+        views.append(_view(picture, lift=lift))
     return tuple(views)
 
 
@@ -157,14 +162,14 @@ def _queries(table: Mapping[str, Any], where: str, world: World, camera: Camera)
     views = []
     for number, place in enumerate(_poses(table, where, world)):
         # Occluders and noise differ from those of the references.
-        picture = Picture(world, camera, _tilted(place, tilt_deg, number), conditions, MOST_VIEWS + number)
-        views.append(_view(f"query_{number:03d}", picture))
+        tilted, seed = _tilted(place, tilt_deg, number), MOST_VIEWS + number
+        views.append(_view(Picture(f"query_{number:03d}", world, camera, tilted, conditions, seed)))
     return tuple(views), tilt_deg
 
 
-def _view(name: str, picture: Picture, lift: DepthLift | None = None) -> RenderedView:
+def _view(picture: Picture, lift: DepthLift | None = None) -> RenderedView:
     return RenderedView(
-        name=name,
+        name=picture.name,
         camera=picture.camera,
         path=picture.path,
         cam_from_map=picture.cam_from_map,

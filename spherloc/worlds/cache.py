@@ -29,23 +29,36 @@ def sources_hash() -> str:
 
 
 def image_path(
-    world: World, camera: Camera, cam_from_world: FloatArray, conditions: Conditions = CLEAR, seed: int = 0
+    world: World,
+    camera: Camera,
+    cam_from_world: FloatArray,
+    conditions: Conditions = CLEAR,
+    seed: int = 0,
+    name: str = "render",
 ) -> Path:
-    """Where the picture is kept, whether or not it was drawn yet; its distances are beside it with the suffix .npz."""
+    """Where the picture is kept, whether or not it was drawn yet; its distances are beside it with the suffix .npz.
+
+    ``name`` is the stem of the file, for people to read.
+    """
     place = np.ascontiguousarray(cam_from_world, np.float64).tobytes()
     key = key_of(*world.identity(), sorted(camera.to_dict().items()), place, conditions, seed, sources_hash())
-    return cache_folder("renders") / f"{key}.png"
+    return cache_folder("renders") / key / f"{name}.png"
 
 
 def render(
-    world: World, camera: Camera, cam_from_world: FloatArray, conditions: Conditions = CLEAR, seed: int = 0
+    world: World,
+    camera: Camera,
+    cam_from_world: FloatArray,
+    conditions: Conditions = CLEAR,
+    seed: int = 0,
+    name: str = "render",
 ) -> Render:
     """A picture and its distances, from the cache on disk if they are there.
 
     ``cam_from_world`` (3, 4) is [R | t], metres. The same arguments give the same picture; a damaged file of the cache
     is drawn again, and a cache that cannot be written costs only time.
     """
-    path = image_path(world, camera, cam_from_world, conditions, seed)
+    path = image_path(world, camera, cam_from_world, conditions, seed, name)
     image, range_m = _stored_image(path, camera), stored_range(path, camera)
     if image is not None and range_m is not None:
         return Render(image, range_m)

@@ -154,7 +154,9 @@ class Session:
             self._settle()
             return None
         if self._scene.reads_images():
-            self._status.content = status_html("Reading and matching images …")
+            self._status.content = status_html(
+                "Reading and matching images; what is new to this machine takes up to a minute …"
+            )
         if self._scene.follow_scene():
             self._sequence.show(self._catalog.map_scene(self._scene.read().scene))
             self._estimator.follow_problem(self._catalog.problem(self._scene.read()))
