@@ -12,7 +12,6 @@ from spherloc.datasets.colmap_views import gravity_of_map, model_views, some, sp
 from spherloc.datasets.map_scene import MapScene
 from spherloc.errors import InputError, show
 from spherloc.formats.colmap_model import read_model
-from spherloc.frontend.pipeline import image_matcher
 
 EXTRAS = ("colmap",)
 EXAMPLE = """\
@@ -47,19 +46,8 @@ def load(table: dict[str, Any], path: Path) -> MapScene:
     views, remarks = model_views(model, images)
     references = tuple(view for view in views if view.name not in chosen)
     down, assumed = gravity_of_map(gravity, references, where)
-    return MapScene(
-        name=settings.name,
-        where=where,
-        queries=tuple(view for view in views if view.name in chosen),
-        references=references,
-        matcher=image_matcher(references, settings.frontend, where, path.parent),
-        gravity_map=down,
-        gravity_bound_rad=settings.gravity_bound_rad,
-        gravity_sd_rad=settings.gravity_sd_rad,
-        bound_px=settings.bound_px,
-        thresholds=settings.thresholds,
-        remarks=(*remarks, *assumed),
-    )
+    queries = (view for view in views if view.name in chosen)
+    return settings.scene(path, queries, references, down, (*remarks, *assumed))
 
 
 def _chosen(value: Any, names: list[str], where: str) -> list[str]:

@@ -69,19 +69,9 @@ def load(table: dict[str, Any], path: Path) -> MapScene:
     truth, unknown = _truth(_file(table, "truth", path), cameras) if "truth" in table else ({}, [])
     queries, missing = _queries(cameras, images, truth)
     pairs, unpaired = _pairs(table, path, queries, references)
-    return MapScene(
-        name=settings.name,
-        where=where,
-        queries=queries,
-        references=tuple(references),
-        matcher=_matcher(table, path, model, tuple(references), pairs),
-        gravity_map=down,
-        gravity_bound_rad=settings.gravity_bound_rad,
-        gravity_sd_rad=settings.gravity_sd_rad,
-        bound_px=settings.bound_px,
-        thresholds=settings.thresholds,
-        remarks=(*remarks, *assumed, *skipped, *unknown, *missing, *unpaired),
-    )
+    said = (*remarks, *assumed, *skipped, *unknown, *missing, *unpaired)
+    matcher = _matcher(table, path, model, tuple(references), pairs)
+    return settings.scene(path, queries, references, down, said, matcher=matcher)
 
 
 def _check_combination(table: Mapping[str, Any], where: str) -> None:

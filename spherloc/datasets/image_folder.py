@@ -14,7 +14,6 @@ from spherloc.datasets.map_scene import MapScene
 from spherloc.datasets.posed_images import read_camera, read_pose, read_references
 from spherloc.errors import InputError, show
 from spherloc.formats.colmap_model import read_model
-from spherloc.frontend.pipeline import image_matcher
 from spherloc.frontend.view import View
 
 EXAMPLE = """\
@@ -69,19 +68,7 @@ def load(table: dict[str, Any], path: Path) -> MapScene:
     queries, remarks = _queries(table, camera, gravity, path)
     references, more = _references(table, camera, path)
     down, assumed = gravity_of_map(gravity, references, where)
-    return MapScene(
-        name=settings.name,
-        where=where,
-        queries=queries,
-        references=references,
-        matcher=image_matcher(references, settings.frontend, where, path.parent),
-        gravity_map=down,
-        gravity_bound_rad=settings.gravity_bound_rad,
-        gravity_sd_rad=settings.gravity_sd_rad,
-        bound_px=settings.bound_px,
-        thresholds=settings.thresholds,
-        remarks=(*remarks, *more, *assumed),
-    )
+    return settings.scene(path, queries, references, down, (*remarks, *more, *assumed))
 
 
 def _references(table: dict[str, Any], camera: Camera, path: Path) -> tuple[tuple[View, ...], list[str]]:

@@ -21,7 +21,6 @@ from spherloc.datasets.map_scene import MapScene
 from spherloc.errors import InputError, show
 from spherloc.formats.kapture_files import Kapture, Record, read_kapture
 from spherloc.frontend.frontend_options import FrontendOptions, frontend_options
-from spherloc.frontend.pipeline import image_matcher
 from spherloc.frontend.triangulation import TriangulationLift
 from spherloc.frontend.view import View
 from spherloc.geometry import camera_centre
@@ -80,19 +79,8 @@ def load(table: dict[str, Any], path: Path) -> MapScene:
     others, left_out = _posed_apart(kapture, others, queries)
     references = _references(kapture, root, others, frontend_options(settings.frontend, where, path.parent))
     down, assumed = gravity_of_map(gravity, references, where)
-    return MapScene(
-        name=settings.name,
-        where=where,
-        queries=tuple(_view(kapture, root, record) for record in queries),
-        references=references,
-        matcher=image_matcher(references, settings.frontend, where, path.parent),
-        gravity_map=down,
-        gravity_bound_rad=settings.gravity_bound_rad,
-        gravity_sd_rad=settings.gravity_sd_rad,
-        bound_px=settings.bound_px,
-        thresholds=settings.thresholds,
-        remarks=(*kapture.remarks, *remarks, *left_out, *assumed),
-    )
+    views = (_view(kapture, root, record) for record in queries)
+    return settings.scene(path, views, references, down, (*kapture.remarks, *remarks, *left_out, *assumed))
 
 
 def _file(root: Path, record: Record) -> Path:

@@ -31,7 +31,6 @@ from spherloc.formats.kitti360_files import (
 )
 from spherloc.formats.layout import needed_file
 from spherloc.frontend.lifting import PointCloudLift
-from spherloc.frontend.pipeline import image_matcher
 from spherloc.frontend.view import View
 from spherloc.geometry import pose, transform
 
@@ -81,19 +80,7 @@ def load(table: dict[str, Any], path: Path) -> MapScene:
         raise InputError(f"{where}: frame {min(both)} is both query and reference; give other frames or sequences.")
     references = tuple(mapped.references(rig, scans))
     queries = tuple(asked.view(frame, rig) for frame in asked.frames)
-    return MapScene(
-        name=settings.name,
-        where=where,
-        queries=queries,
-        references=references,
-        matcher=image_matcher(references, settings.frontend, where, path.parent),
-        gravity_map=GRAVITY_MAP,
-        gravity_bound_rad=settings.gravity_bound_rad,
-        gravity_sd_rad=settings.gravity_sd_rad,
-        bound_px=settings.bound_px,
-        thresholds=settings.thresholds,
-        remarks=mapped.remarks + asked.remarks,
-    )
+    return settings.scene(path, queries, references, GRAVITY_MAP, mapped.remarks + asked.remarks)
 
 
 @dataclass(frozen=True, eq=False)

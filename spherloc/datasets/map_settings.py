@@ -1,14 +1,17 @@
 """The keys that all scenes made of images share."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from spherloc.cameras.base import FloatArray
 from spherloc.datasets import scene_file
-from spherloc.datasets.map_scene import DEFAULT_THRESHOLDS, Thresholds
+from spherloc.datasets.map_scene import DEFAULT_THRESHOLDS, MapScene, Thresholds
 from spherloc.errors import InputError
 from spherloc.formats.layout import is_there
+from spherloc.frontend.pipeline import image_matcher
+from spherloc.frontend.view import View
 
 REQUIRED = {"kind", "name"}
 OPTIONAL = {"about", "frontend", "gravity", "options", "thresholds"}
@@ -25,6 +28,37 @@ class MapSettings:
     gravity_sd_rad: float | None
     bound_px: float | None
     thresholds: Thresholds
+
+    def scene(
+        self,
+        path: Path,
+        queries: Iterable[View],
+        references: Iterable[View],
+        gravity_map: FloatArray,
+        remarks: Iterable[str] = (),
+        **others: Any,
+    ) -> MapScene:
+        """The scene of these images; ``path`` is its file, and ``others`` are further fields of ``MapScene``.
+
+        Without a ``matcher`` among them, the front end that [frontend] describes is taken. Raises ``InputError`` for a
+        wrong [frontend] and if there is no query or no reference.
+        """
+        given = tuple(references)
+        if "matcher" not in others:
+            others["matcher"] = image_matcher(given, self.frontend, str(path), path.parent)
+        return MapScene(
+            name=self.name,
+            where=str(path),
+            queries=tuple(queries),
+            references=given,
+            gravity_map=gravity_map,
+            gravity_bound_rad=self.gravity_bound_rad,
+            gravity_sd_rad=self.gravity_sd_rad,
+            bound_px=self.bound_px,
+            thresholds=self.thresholds,
+            remarks=tuple(remarks),
+            **others,
+        )
 
 
 def read_settings(

@@ -5,6 +5,7 @@ Layout (researchdata.bath.ac.uk/1126): a folder a building, and in it ``<id>_rgb
 """
 
 import fnmatch
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,6 @@ from spherloc.datasets.registration import DepthRegistration
 from spherloc.errors import InputError, show
 from spherloc.formats.dpt import read_dpt
 from spherloc.frontend.lifting import DepthLift
-from spherloc.frontend.pipeline import image_matcher
 from spherloc.frontend.view import Lift, View
 from spherloc.geometry import pose
 from spherloc.images import read_size
@@ -66,22 +66,11 @@ def load(table: dict[str, Any], path: Path) -> MapScene:
     names = {view.name for view in chosen}
     references = tuple(view for view in views if view.name not in names)
     queries = tuple(_as_query(view, trusted) for view in chosen)
-    # Without trusted poses the map is one reference image, whatever its pose: only the motion between two is judged.
-    frontend = settings.frontend if trusted else {**settings.frontend, "references": 1}
-    return MapScene(
-        name=settings.name,
-        where=where,
-        queries=queries,
-        references=references,
-        matcher=image_matcher(references, frontend, where, path.parent),
-        gravity_map=np.array(GRAVITY_MAP),
-        gravity_bound_rad=settings.gravity_bound_rad,
-        gravity_sd_rad=settings.gravity_sd_rad,
-        bound_px=settings.bound_px,
-        thresholds=settings.thresholds,
-        registration=DepthRegistration(REGISTRATION_M, GRAVITY_MAP, lambda view: _own_depth(view, along)),
-        remarks=remarks,
-    )
+    if not trusted:
+        # The map is then one reference image, whatever its pose: only the motion between two is judged.
+        settings = replace(settings, frontend={**settings.frontend, "references": 1})
+    registration = DepthRegistration(REGISTRATION_M, GRAVITY_MAP, lambda view: _own_depth(view, along))
+    return settings.scene(path, queries, references, np.array(GRAVITY_MAP), remarks, registration=registration)
 
 
 def _patterns(value: Any, where: str) -> list[str]:

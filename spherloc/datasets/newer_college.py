@@ -23,7 +23,6 @@ from spherloc.formats.colmap_model import ColmapImage, ColmapModel, read_model
 from spherloc.formats.layout import is_there, needed_file
 from spherloc.formats.newer_college_files import NAME_RULE, TimedImage, images_in, read_cloud, timestamp_of
 from spherloc.frontend.lifting import PointCloudLift, SfmLift
-from spherloc.frontend.pipeline import image_matcher
 from spherloc.frontend.view import Lift, View
 from spherloc.geometry import camera_centre, pose
 from spherloc.trajectory import NS_PER_S, Trajectory, pose_at, read_newer_college
@@ -74,19 +73,7 @@ def load(table: dict[str, Any], path: Path) -> MapScene:
     rig = _rig(place)
     queries, query_remarks = _queries(place, rig)
     references, reference_remarks = _references(place, rig)
-    return MapScene(
-        name=settings.name,
-        where=where,
-        queries=tuple(queries),
-        references=tuple(references),
-        matcher=image_matcher(tuple(references), settings.frontend, where, path.parent),
-        gravity_map=GRAVITY_MAP,
-        gravity_bound_rad=settings.gravity_bound_rad,
-        gravity_sd_rad=settings.gravity_sd_rad,
-        bound_px=settings.bound_px,
-        thresholds=settings.thresholds,
-        remarks=(*reference_remarks, *query_remarks),
-    )
+    return settings.scene(path, queries, references, GRAVITY_MAP, (*reference_remarks, *query_remarks))
 
 
 @dataclass(frozen=True, eq=False)

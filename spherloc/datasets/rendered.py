@@ -19,7 +19,6 @@ from spherloc.datasets import map_settings, scene_file
 from spherloc.datasets.map_scene import MapScene
 from spherloc.errors import InputError
 from spherloc.frontend.lifting import DepthLift
-from spherloc.frontend.pipeline import image_matcher
 from spherloc.frontend.view import View
 from spherloc.geometry import pose, so3_exp
 from spherloc.images import ByteImage
@@ -127,19 +126,7 @@ def load(table: dict[str, Any], path: Path) -> MapScene:
     queries, tilt_deg = _queries(scene_file.section(table, "queries", where), f"{where} [queries]", world, camera)
     settings = map_settings.read_settings(table, where, gravity_bound_deg=tilt_deg)
     references = _references(scene_file.section(table, "references", where), f"{where} [references]", world, camera)
-    return MapScene(
-        name=settings.name,
-        where=where,
-        queries=queries,
-        references=references,
-        matcher=image_matcher(references, settings.frontend, where, path.parent),
-        gravity_map=GRAVITY_DOWN,
-        gravity_bound_rad=settings.gravity_bound_rad,
-        gravity_sd_rad=settings.gravity_sd_rad,
-        bound_px=settings.bound_px,
-        thresholds=settings.thresholds,
-        mesh=world.glb,
-    )
+    return settings.scene(path, queries, references, GRAVITY_DOWN, mesh=world.glb)
 
 
 def _references(table: Mapping[str, Any], where: str, world: World, camera: Camera) -> tuple[View, ...]:

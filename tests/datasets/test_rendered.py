@@ -58,7 +58,7 @@ def scene_of(tmp_path, text=SMALL):
 
 
 def drawn(cache):
-    return sorted(cache.glob("renders/*.png"))
+    return sorted(cache.glob("renders/*/*.png"))
 
 
 def errors_of(trace):
