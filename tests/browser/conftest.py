@@ -4,22 +4,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from playground import FLAGS, Playground, find_chromium, served
+from playground import FLAGS, SCENE, Playground, find_chromium, served
 from playwright.sync_api import Browser, sync_playwright
-
-SCENE = """
-kind = "synthetic"
-name = "small street"
-[camera]
-model = "equirectangular"
-width = 2048
-height = 1024
-[simulation]
-correspondences = 40
-outlier_rate = 0.5
-noise_px = 1.0
-seed = 3
-"""
 
 
 @pytest.fixture(scope="session")

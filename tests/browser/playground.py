@@ -16,6 +16,20 @@ from typing import Any
 import pytest
 from playwright.sync_api import Browser, Locator, Page, expect
 
+SCENE = """
+kind = "synthetic"
+name = "small street"
+[camera]
+model = "equirectangular"
+width = 2048
+height = 1024
+[simulation]
+correspondences = 40
+outlier_rate = 0.5
+noise_px = 1.0
+seed = 3
+"""
+
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "microsoft-edge")
 FLAGS = (
     "--no-sandbox",

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from playground import Playground, served
+from playground import SCENE, Playground, served
 from playwright.sync_api import Browser, expect
 
 from spherloc.estimators import estimate
@@ -153,8 +153,6 @@ def look(tab: Playground) -> str:
 
 def test_captions_are_those_of_the_run(tab: Playground, tmp_path: Path) -> None:
     """What the page says is what the core computes for the same scene and seed."""
-    from conftest import SCENE
-
     (tmp_path / "small.toml").write_text(SCENE)
     catalog = Catalog(tmp_path / "small.toml")
     trace = estimate(catalog.scenes["small street"].problem(), "mc", seed=3)
@@ -242,8 +240,6 @@ def test_hotkeys_step(tab: Playground) -> None:
 
 
 def test_ctrl_c_ends_at_once_with_a_tab_open(browser: Browser, tmp_path: Path) -> None:
-    from conftest import SCENE
-
     (tmp_path / "small.toml").write_text(SCENE)
     with served(tmp_path / "small.toml", "--no-record") as (address, server):
         tab = Playground(browser, address)

@@ -1,6 +1,7 @@
 """COLMAP models: what is read is what was written, by pycolmap or by hand, in all of the format's forms."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pycolmap
@@ -14,11 +15,12 @@ from colmap_samples import (
     with_rigs,
     write,
 )
-from conftest import ROOT
 from scipy.spatial.transform import Rotation
 
 from spherloc.errors import CalibrationError, InputError
 from spherloc.formats.colmap_model import _read_by_pycolmap, read_model
+
+ROOT = Path(__file__).resolve().parents[2]
 
 FORMS = pytest.mark.parametrize("files_of", [binary_files, text_files], ids=["binary", "text"])
 SHARED = ROOT / ".." / "shared" / "data"

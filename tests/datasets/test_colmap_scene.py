@@ -1,16 +1,18 @@
 """Scenes of kind "colmap": which images are queries, what is left out, where down is; and the real panorama pair."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from colmap_samples import EQUIRECTANGULAR, NO_POINT, OPENCV_FISHEYE, binary_files, mean_down, sample_model, write
-from conftest import ROOT
 
 from spherloc.datasets import load_scene
 from spherloc.errors import InputError
 from spherloc.estimators.base import estimate
 from spherloc.metrics import rotation_error_deg, translation_error_m
+
+ROOT = Path(__file__).resolve().parents[2]
 
 STELLA = ROOT / ".." / "shared" / "data" / "stella_equirect_pair"
 

@@ -3,12 +3,12 @@
 import json
 import pickle
 import tomllib
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from colmap_samples import OPENCV_FISHEYE, binary_files, sample_model, write
-from conftest import ROOT
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -18,6 +18,8 @@ from spherloc.errors import InputError
 from spherloc.estimators.base import estimate
 from spherloc.geometry import so3_exp, transform
 from spherloc.metrics import rotation_error_deg, translation_error_m
+
+ROOT = Path(__file__).resolve().parents[2]
 
 STELLA = ROOT / ".." / "shared" / "data" / "stella_equirect_pair"
 
