@@ -43,13 +43,22 @@ def css(color: RGB) -> str:
     return "#{:02x}{:02x}{:02x}".format(*color)
 
 
-ERROR_RAMP: tuple[RGB, ...] = ((48, 96, 214), (72, 190, 190), (245, 205, 70), (214, 62, 48))
-"""Colours of errors from zero to the worst that is told apart: the bluer, the smaller (as in Fig. 10)."""
+ERROR_RAMP: tuple[RGB, ...] = ((48, 96, 214), (60, 190, 180), (245, 205, 70))
+"""Colours of errors from zero to the largest success: the bluer, the smaller (as in Fig. 10). Failures are red."""
 
 
-def error_colors(errors: NDArray[np.float64], worst: float) -> NDArray[np.uint8]:
-    """Colours (N, 3) of errors (N,) by the ramp, whose last colour stands for ``worst`` and all beyond."""
+def error_scale(errors: NDArray[np.float64], limit: float) -> float:
+    """The error with the ramp's last colour: the largest within ``limit``, so that small errors use all colours too."""
+    within = errors[errors <= limit]
+    return float(within.max(initial=0.0)) or limit
+
+
+def error_colors(errors: NDArray[np.float64], limit: float) -> NDArray[np.uint8]:
+    """Colours (N, 3) of errors (N,) by the ramp over ``error_scale``; beyond ``limit``, or unknown, the outliers'."""
     ramp = np.array(ERROR_RAMP, dtype=np.float64)
-    place = (len(ramp) - 1) * np.clip(np.nan_to_num(errors / worst, nan=1.0, posinf=1.0), 0.0, 1.0)
+    share = np.nan_to_num(errors / error_scale(errors, limit), nan=1.0, posinf=1.0)
+    place = (len(ramp) - 1) * np.clip(share, 0.0, 1.0)
     columns = [np.interp(place, np.arange(len(ramp)), ramp[:, channel]) for channel in range(3)]
-    return np.column_stack(columns).round().astype(np.uint8)
+    colors = np.column_stack(columns).round().astype(np.uint8)
+    colors[~(errors <= limit)] = OUTLIER
+    return colors

@@ -4,16 +4,16 @@ import io
 import warnings
 
 import numpy as np
-from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 
 from spherloc.cameras.base import BoolArray, FloatArray
 from spherloc.experiments.results import SequenceResults
 from spherloc.experiments.rows import FAILED
 from spherloc.geometry import align_to_down
-from spherloc_viz.style import ESTIMATE, OUTLIER, TRUTH, css
+from spherloc_viz.style import ERROR_RAMP, ESTIMATE, OUTLIER, TRUTH, css, error_scale
 
 WIDTH_INCHES = 9.0
 HEIGHT_INCHES = (4.0, 9.0)
@@ -41,7 +41,7 @@ def trajectory_png(results: SequenceResults) -> bytes:
     axes.set_xlim(middle[0] - half[0], middle[0] + half[0])
     axes.set_ylim(middle[1] - half[1], middle[1] + half[1])
     _truth(axes, true_places)
-    _estimates(figure, axes, results, places)
+    _estimates(figure, axes, results, places, true_places)
     _without_place(axes, results, places, true_places)
     axes.set_title(_title(results), parse_math=False, fontsize=11)
     axes.set_xlabel("metres, in the map")
@@ -80,7 +80,9 @@ def _truth(axes: Axes, true_places: FloatArray) -> None:
         axes.plot(*true_places.T, color=css(TRUTH), linewidth=1.4, marker=".", markersize=3, label="truth", zorder=2)
 
 
-def _estimates(figure: Figure, axes: Axes, results: SequenceResults, places: FloatArray) -> None:
+def _estimates(
+    figure: Figure, axes: Axes, results: SequenceResults, places: FloatArray, true_places: FloatArray
+) -> None:
     errors_m, what, limit_m = _errors(results)
     plain = np.isfinite(places).all(axis=1) & np.isnan(errors_m)
     if plain.any():
@@ -88,18 +90,18 @@ def _estimates(figure: Figure, axes: Axes, results: SequenceResults, places: Flo
     coloured = np.isfinite(places).all(axis=1) & ~np.isnan(errors_m)
     if not coloured.any():
         return
-    shown_m = errors_m[coloured]
-    beyond = shown_m > limit_m
-    # Up to the largest of the others, so that small errors too use all of the colours.
-    top_m = max(shown_m[~beyond], default=limit_m) or limit_m
+    good, bad = coloured & (errors_m <= limit_m), coloured & ~(errors_m <= limit_m)
+    ramp = LinearSegmentedColormap.from_list("errors", [css(color) for color in ERROR_RAMP])
     dots = axes.scatter(
-        *places[coloured].T, c=np.minimum(shown_m, 2.0 * limit_m), vmin=0.0, vmax=top_m, s=30,
-        cmap=colormaps["viridis"].with_extremes(over=css(OUTLIER)), edgecolors="0.2", linewidths=0.4,
-        label="estimate", zorder=3,
+        *places[good].T, c=errors_m[good], vmin=0.0, vmax=error_scale(errors_m[coloured], limit_m), s=30,
+        cmap=ramp, edgecolors="0.2", linewidths=0.4, label="estimate" if good.any() else None, zorder=3,
     )  # fmt: skip
-    bar = figure.colorbar(dots, ax=axes, extend="max" if beyond.any() else "neither", shrink=0.85)
-    red = f" (red: {np.count_nonzero(beyond)} beyond {limit_m:g}, up to {shown_m.max():.3g})" if beyond.any() else ""
-    bar.set_label(f"{what}, metres{red}")
+    figure.colorbar(dots, ax=axes, shrink=0.85).set_label(f"{what}, metres")
+    if bad.any():
+        label = f"{np.count_nonzero(bad)} beyond {limit_m:g} m, up to {errors_m[bad].max():.3g} m"
+        axes.plot(*places[bad].T, "o", color=css(OUTLIER), markersize=5.5, label=label, zorder=3)
+        for start, end in zip(true_places[bad], places[bad], strict=True):
+            axes.plot(*np.stack([start, end]).T, color=css(OUTLIER), linewidth=0.8, zorder=1)
 
 
 def _errors(results: SequenceResults) -> tuple[FloatArray, str, float]:

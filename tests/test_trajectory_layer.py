@@ -8,7 +8,7 @@ from spherloc_viz import style
 from spherloc_viz.layers.primitives import Points, Segments
 from spherloc_viz.layers.trajectory import trajectory_items
 
-WORST_M = 1.0
+LIMIT_M = 1.0
 
 
 def row(index: int, found: tuple[float, float, float] | None, truth: tuple[float, float, float] | None) -> QueryResult:
@@ -19,7 +19,7 @@ def row(index: int, found: tuple[float, float, float] | None, truth: tuple[float
 
 
 def drawn(rows: list[QueryResult], map_turn: np.ndarray) -> tuple[Points, Segments, Segments]:
-    dots, truth, errors = trajectory_items(rows, map_turn, WORST_M)
+    dots, truth, errors = trajectory_items(rows, map_turn, LIMIT_M)
     assert isinstance(dots, Points) and isinstance(truth, Segments) and isinstance(errors, Segments)
     return dots, truth, errors
 
@@ -30,9 +30,7 @@ def test_dots_stand_where_cameras_were_found_and_have_the_colour_of_their_error(
     dots, truth, errors = drawn(rows, turn)
     assert np.allclose(dots.positions, np.array([[0, 0, 0], [1, 0.5, 0], [2, 9, 0]]) @ turn.T)
     assert dots.ids is not None and dots.ids.tolist() == [0, 1, 2]
-    assert tuple(dots.colors[0]) == style.ERROR_RAMP[0] and tuple(dots.colors[2]) == style.ERROR_RAMP[-1]
-    middle = style.error_colors(np.array([0.5]), WORST_M)[0]
-    assert np.array_equal(dots.colors[1], middle) and tuple(middle) not in style.ERROR_RAMP
+    assert [tuple(color) for color in dots.colors] == [style.ERROR_RAMP[0], style.ERROR_RAMP[-1], style.OUTLIER]
     assert len(truth.points) == 2 and np.allclose(truth.points[1], np.array([[1, 0, 0], [2, 0, 0]]) @ turn.T)
     assert np.allclose(np.linalg.norm(errors.points[:, 1] - errors.points[:, 0], axis=1), [0, 0.5, 9])
 
@@ -51,7 +49,9 @@ def test_a_single_query_has_a_dot_of_some_size() -> None:
     assert len(dots.positions) == 1 and dots.radius_m > 0 and len(truth.points) == len(errors.points) == 0
 
 
-def test_the_ramp_ends_at_its_ends() -> None:
-    colors = style.error_colors(np.array([0.0, 2.0, 50.0, np.inf, np.nan]), 2.0)
-    assert tuple(colors[0]) == style.ERROR_RAMP[0]
-    assert all(tuple(color) == style.ERROR_RAMP[-1] for color in colors[1:])
+def test_the_ramp_spans_the_successes() -> None:
+    colors = style.error_colors(np.array([0.0, 0.1, 0.2, 50.0, np.inf, np.nan]), 2.0)
+    assert [tuple(color) for color in colors[:3]] == list(style.ERROR_RAMP)
+    assert all(tuple(color) == style.OUTLIER for color in colors[3:])
+    assert style.error_scale(np.array([0.0, np.nan]), 2.0) == 2.0 and style.error_scale(np.array([3.0]), 2.0) == 2.0
+    assert tuple(style.error_colors(np.array([0.0]), 2.0)[0]) == style.ERROR_RAMP[0]

@@ -4,6 +4,7 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import viser
 
 from spherloc.datasets.map_scene import MapScene
@@ -14,6 +15,7 @@ from spherloc.experiments.summary import success_rates
 from spherloc.trace import Trace
 from spherloc_viz.app.text import ramp_html, status_html, table_html
 from spherloc_viz.layers.primitives import Table
+from spherloc_viz.style import error_scale
 
 START, STOP = "Localize all queries", "Stop"
 
@@ -94,5 +96,7 @@ def sequence_html(rows: tuple[QueryResult, ...], scene: MapScene) -> str:
         (f"within {rate.degrees:g}° and {rate.metres:g} m", f"{rate.successes} of {rate.judged}") for rate in rates
     ]
     done = ("queries", f"{len(rows)} of {len(scene.queries)}")
-    ramp = ramp_html("0 m", f"{scene.thresholds[-1][1]:g} m off") if rates else ""
-    return table_html(Table("sequence", ("", ""), (done, *lines))) + ramp
+    limit_m = scene.thresholds[-1][1]
+    errors = [row.translation_error_m for row in rows if row.translation_error_m is not None]
+    worst = f"{100.0 * error_scale(np.array(errors), limit_m):.2g} cm; red beyond {limit_m:g} m"
+    return table_html(Table("sequence", ("", ""), (done, *lines))) + (ramp_html("0", worst) if errors else "")

@@ -130,7 +130,8 @@ def _subject(name: str, picture: Picture) -> FloatArray:
     cameras = [
         item.points.reshape(-1, 3) for item in picture.scene if isinstance(item, Segments) and item.layer == "cameras"
     ]
-    return np.vstack([_dense(points.positions), surface.vertices, *cameras])
+    route = [item.positions for item in picture.scene if isinstance(item, Points) and item.layer == "trajectory"]
+    return np.vstack([_dense(points.positions), surface.vertices, *cameras, *route])
 
 
 def _sphere(surface: object, ring: bool) -> FloatArray:
