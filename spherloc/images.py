@@ -1,8 +1,9 @@
 """Reads images. Pixels are taken as they are stored: calibrations know nothing of a photograph's orientation tag."""
 
-import struct
+import io
 import warnings
 from pathlib import Path
+from typing import BinaryIO
 
 import cv2
 import numpy as np
@@ -14,7 +15,7 @@ from spherloc.errors import InputError
 ByteImage = NDArray[np.uint8]
 
 MAX_BYTES = 200_000_000
-MAX_PIXELS = 200_000_000
+MAX_PIXELS = 150_000_000
 """Beyond any panorama, so that a corrupt header cannot exhaust the memory."""
 
 
@@ -45,18 +46,15 @@ def read_size(path: Path) -> tuple[int, int]:
 
     Raises ``InputError`` for what is missing, too large or no image.
     """
+    path = Path(path)
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            with Image.open(path) as image:
-                width, height = image.size
+        with path.open("rb") as file:
+            return _size(file, path)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; correct the path of the image.") from None
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError, struct.error):
-        raise InputError(f"{path}: not an image that can be read, or a damaged one; replace it.") from None
-    if not 0 < width * height <= MAX_PIXELS:
-        raise InputError(f"{path}: claims {width} x {height} pixels; give a smaller image.")
-    return width, height
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"{path}: cannot be read ({reason}); correct the path of the image.") from None
 
 
 def grey(image: ByteImage) -> ByteImage:
@@ -75,8 +73,7 @@ def _decode(path: Path, flags: int) -> NDArray:
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"{path}: cannot be read ({reason}); correct the path of the image.") from None
-    if _claimed_pixels(content) > MAX_PIXELS:
-        raise InputError(f"{path}: claims more than {MAX_PIXELS:,} pixels; give a smaller image.")
+    _size(io.BytesIO(content), path)
     try:
         image = cv2.imdecode(np.frombuffer(content, np.uint8), flags) if content else None
     except cv2.error:
@@ -86,9 +83,15 @@ def _decode(path: Path, flags: int) -> NDArray:
     return image
 
 
-def _claimed_pixels(content: bytes) -> int:
-    """Width times height in the header of a PNG; 0 for other formats, whose decoders check it themselves."""
-    if content[:8] == b"\x89PNG\r\n\x1a\n" and len(content) >= 24:
-        width, height = struct.unpack(">II", content[16:24])
-        return width * height
-    return 0
+def _size(file: BinaryIO, path: Path) -> tuple[int, int]:
+    """Width and height by the header; decoders would take all memory that a damaged one asks for."""
+    try:
+        with warnings.catch_warnings(action="ignore"), Image.open(file) as image:
+            width, height = image.size
+    except Image.DecompressionBombError:  # Pillow's own limit is a little higher than ours
+        width, height = MAX_PIXELS, MAX_PIXELS
+    except Exception:  # Pillow's readers let through whatever a damaged header makes them stumble over
+        raise InputError(f"{path}: not an image that can be read, or a damaged one; replace it.") from None
+    if not 0 < width * height <= MAX_PIXELS:
+        raise InputError(f"{path}: claims no pixels or more than {MAX_PIXELS:,}; give a smaller image.")
+    return width, height

@@ -57,7 +57,7 @@ class Problem:
     estimated_outlier_rate: float | None = None
     """What the front end expects from the statistics of its matches, 0 to 1; a rough guess."""
     remarks: tuple[str, ...] = ()
-    """What the front end skipped and why, in sentences."""
+    """What the loader and the front end skipped and why, in sentences."""
 
     def __post_init__(self) -> None:
         pixels, points = _array(self, "pixels", (-1, 2)), _array(self, "points", (-1, 3))

@@ -110,7 +110,7 @@ class MapScene:
             reference_index=matches.reference_index,
             reference_pixels=matches.reference_pixels,
             estimated_outlier_rate=matches.estimated_outlier_rate,
-            remarks=matches.remarks,
+            remarks=(*self.remarks, *matches.remarks),
         )
         if view.cam_from_map is None:
             return problem

@@ -21,6 +21,8 @@ def frames(view: RunView) -> list[Frame]:
     note = f"{lost} pixels lie where the camera sees nothing and count as outliers." if lost else ""
     if count - lost > style.MAX_DRAWN_RAYS:
         note = f"The first {style.MAX_DRAWN_RAYS} of {count - lost:,} lines are drawn. {note}".strip()
+    if problem.estimated_outlier_rate is not None:
+        note += f" The front end expects about {100 * problem.estimated_outlier_rate:.0f} % to be wrong."
     note = " ".join([note, *problem.remarks]).strip()
     start = view.standing(np.eye(3))
     return [
