@@ -47,6 +47,11 @@ def odd_problem(rng: np.random.Generator, turn: int) -> Problem:
         truth_inliers=rng.random(9) < 0.5 if known else None,
         image=Path("some folder/query ü.jpg") if known else None,
         scene="a | scene",
+        reference_images=(Path("some folder/a.jpg"), Path("b.jpg")) if known else (),
+        reference_index=rng.integers(0, 2, 9) if known else None,
+        reference_pixels=np.where(rng.random((9, 1)) < 0.3, np.nan, rng.normal(size=(9, 2))) if known else None,
+        estimated_outlier_rate=float(rng.random()) if known else None,
+        remarks=("Two of “three” references were skipped.",) if known else (),
     )
 
 

@@ -72,7 +72,8 @@ def test_missing_and_foreign_files(tmp_path: Path, read) -> None:
 def claiming(width: int, height: int) -> bytes:
     """A PNG whose header is right but for the size that it claims."""
     header = b"IHDR" + struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + header + struct.pack(">I", zlib.crc32(header))
+    start = b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + header + struct.pack(">I", zlib.crc32(header))
+    return start + encoded(".png")[len(start) :]
 
 
 def test_a_huge_claim_is_refused_before_anything_is_allocated(tmp_path: Path) -> None:

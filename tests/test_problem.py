@@ -1,5 +1,7 @@
 """What a ``Problem`` accepts, what it refuses in one sentence, and what it derives."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -52,6 +54,10 @@ BAD = {
     "mirrored truth": ({"truth_cam_from_map": pose(np.diag([1.0, 1.0, -1.0]), DOWN)}, "no rotation matrix"),
     "NaN truth": ({"truth_cam_from_map": pose(np.eye(3), [0.0, np.nan, 0.0])}, "truth_cam_from_map row 1"),
     "too few labels": ({"truth_inliers": np.ones(3, bool)}, "3 inlier labels for 4"),
+    "reference of nobody": ({"reference_index": [0, 0, 0, 1], "reference_images": (Path("a.png"),)}, "one of 1 ref"),
+    "too few references": ({"reference_index": [0], "reference_images": (Path("a.png"),)}, "each of 4"),
+    "too few reference pixels": ({"reference_pixels": PIXELS[:3]}, r"reference_pixels has shape \(3, 2\)"),
+    "outlier rate": ({"estimated_outlier_rate": 1.5}, "estimated_outlier_rate is 1.5"),
     "pixels outside the image": ({"pixels": PIXELS + 1000.0}, "0 usable of 4"),
 }
 
@@ -85,8 +91,10 @@ def test_arrays_are_copies():
 
 def test_every_array_is_read_only():
     """One writable array is enough to let a drawing or a test change a run's record."""
-    problem = make(truth_cam_from_map=pose(np.eye(3), np.zeros(3)), truth_inliers=np.ones(4, bool))
-    names = ("pixels", "points", "gravity_camera", "gravity_map", "truth_cam_from_map", "truth_inliers")
+    matched = {"reference_images": (Path("a.png"),), "reference_index": np.zeros(4), "reference_pixels": PIXELS}
+    problem = make(truth_cam_from_map=pose(np.eye(3), np.zeros(3)), truth_inliers=np.ones(4, bool), **matched)
+    names = ("reference_index", "reference_pixels")
+    names += ("pixels", "points", "gravity_camera", "gravity_map", "truth_cam_from_map", "truth_inliers")
     names += ("bearings", "usable", "pixel_from_bearing", "radians_per_pixel")
     arrays = {name: getattr(problem, name) for name in names}
     aligned = vars(problem.aligned).items()
