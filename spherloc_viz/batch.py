@@ -1,6 +1,5 @@
 """``spherloc run``: solve scenes one after another, print and record each."""
 
-import sys
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, replace
@@ -20,6 +19,7 @@ from spherloc.problem import Problem
 from spherloc.trace import Trace
 from spherloc_viz.layers.certificate import chance, proof, warning
 from spherloc_viz.options import json_text, option_fields
+from spherloc_viz.progress import prepare, say
 
 
 def run_scenes(
@@ -48,7 +48,7 @@ def run_scenes(
                 scene = load_scene(path)
                 problem = _problem(path, scene, seed, query)
                 if not warm:
-                    warm_up(_say)
+                    warm_up(say)
                     warm = True
                 used = getattr(scene, "seed", 0) if seed is None else seed
                 trace = estimate(problem, estimator, resolved_options(estimator, problem, changes), used)
@@ -68,12 +68,13 @@ def _problem(path: Path, scene: Scene, seed: int | None, query: str | None) -> P
             raise InputError(f"{path}: has no query images to choose from; leave out --query.")
         return scene.problem(seed)
     for remark in scene.remarks:
-        _say(remark)
+        say(remark)
     view = scene.query(query)
-    _say(f"{path}: reading and matching images; what is new to this machine takes up to a minute")
+    say(f"{path}: reading and matching images; what is new to this machine takes a while")
+    prepare(scene)
     matches = scene.matcher(view)
     for remark in matches.remarks:
-        _say(remark)
+        say(remark)
     return scene.problem_of(view, matches)
 
 
@@ -94,12 +95,8 @@ def resolved_options(estimator: str, problem: Problem, changes: dict[str, Any]) 
     return replace(default_options(estimator, problem), **changes)
 
 
-def _say(sentence: str) -> None:
-    print(f"spherloc: {sentence}", file=sys.stderr, flush=True)
-
-
 def _report(error: SpherlocError) -> int:
-    _say(str(error))
+    say(str(error))
     return 2
 
 

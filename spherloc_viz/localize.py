@@ -1,15 +1,10 @@
 """``spherloc localize``: a query sequence against a map, with a progress bar, resumable, into one folder."""
 
-import sys
-import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
-
-from tqdm import tqdm
 
 from spherloc.datasets import load_scene
 from spherloc.datasets.map_scene import MapScene
@@ -26,10 +21,9 @@ from spherloc.trace import Trace
 from spherloc.trajectory import write_tum
 from spherloc_viz.batch import parse_settings
 from spherloc_viz.options import json_text
+from spherloc_viz.progress import prepare, progress, say
 
 TRAJECTORY, TRUE_TRAJECTORY, PICTURE, SUMMARY = "trajectory.tum", "truth.tum", "trajectory.png", "summary.json"
-LINE_EVERY_S = 30.0
-"""Where the output is no terminal, progress is a line now and then."""
 MAX_TOLD = 5
 
 
@@ -55,11 +49,11 @@ def localize_sequence(
     chosen = chosen_queries(scene, queries)
     options = _options(scene, estimator, settings)
     for remark in scene.remarks:
-        _say(remark)
+        say(remark)
     with ResultsLog(output, configuration_of(scene, path, estimator, options, seed)) as log:
         todo = _todo(scene, chosen, log, retry_failed)
         if todo:
-            warm_up(_say)
+            warm_up(say)
             _work(scene, todo, log, (estimator, options, seed), recordings)
         results = log.results()
         _finish(log, results)
@@ -82,12 +76,12 @@ def _todo(scene: MapScene, chosen: Sequence[View], log: ResultsLog, retry_failed
             f"{log.folder}: holds a result of {show(strange)}, no query of this scene; give another folder."
         )
     if log.repaired:
-        _say(f"{log.folder}: removed a half written line; its query is done again.")
+        say(f"{log.folder}: removed a half written line; its query is done again.")
     if retry_failed and (again := log.forget_failures()):
-        _say(f"{log.folder}: queries without a pose that are done again: {again}.")
+        say(f"{log.folder}: queries without a pose that are done again: {again}.")
     todo = [view for view in chosen if view.name not in log.rows]
     if len(todo) < len(chosen):
-        _say(f"{log.folder}: {len(chosen) - len(todo)} of {len(chosen)} queries are done already.")
+        say(f"{log.folder}: {len(chosen) - len(todo)} of {len(chosen)} queries are done already.")
     return todo
 
 
@@ -96,17 +90,18 @@ def _work(
 ) -> None:
     failed = 0
     try:
-        with _progress(len(todo)) as progress:
+        prepare(scene)
+        with progress(len(todo), "queries") as advance:
             for row, trace in localize(scene, todo, *how):
                 if recordings is not None and trace is not None:
                     row = replace(row, recording=_record(trace, recordings, log))
                 # Its recording is complete by now, so a row never names one that a killed process left unwritten.
                 log.append(row)
                 failed += row.status != LOCALIZED
-                progress(failed)
+                advance(f"{failed} without a pose")
     except KeyboardInterrupt:
         done = f"{len(log.rows)} of {log.configuration.queries} queries are done"
-        _say(f"stopped; {done} in {log.folder}, and the same command goes on from there.")
+        say(f"stopped; {done} in {log.folder}, and the same command goes on from there.")
         raise
 
 
@@ -122,36 +117,12 @@ def _record(trace: Trace, folder: Path, log: ResultsLog) -> str | None:
                 f"{error} What is done is kept ({len(log.rows)} of {log.configuration.queries} queries), and the same "
                 "command goes on from there."
             ) from None
-        _say(str(error))
+        say(str(error))
         return None
     try:
         return path.resolve().relative_to(log.folder.resolve()).as_posix()
     except ValueError:
         return str(path.resolve())
-
-
-@contextmanager
-def _progress(count: int) -> Iterator[Any]:
-    """A bar on a terminal, else a line now and then; called after every query with how many have no pose."""
-    if sys.stderr.isatty():
-        with tqdm(total=count, unit="query", file=sys.stderr, dynamic_ncols=True) as bar:
-
-            def advance(failed: int) -> None:
-                bar.set_postfix_str(f"{failed} without a pose", refresh=False)
-                bar.update()
-
-            yield advance
-        return
-    done, said = 0, time.monotonic()
-
-    def line(failed: int) -> None:
-        nonlocal done, said
-        done += 1
-        if time.monotonic() - said > LINE_EVERY_S:
-            _say(f"{done} of {count} queries, {failed} without a pose.")
-            said = time.monotonic()
-
-    yield line
 
 
 def _finish(log: ResultsLog, results: SequenceResults) -> None:
@@ -223,8 +194,3 @@ def _without_pose(rows: Sequence[QueryResult]) -> Iterator[str]:
         yield f"{'unreadable' if row.status == UNREADABLE else 'no pose'}: {what}"
     if len(lost) > MAX_TOLD:
         yield f"and {len(lost) - MAX_TOLD} more without a pose, see results.csv"
-
-
-def _say(sentence: str) -> None:
-    tqdm.write(f"spherloc: {sentence}", file=sys.stderr)  # above the bar, if there is one
-    sys.stderr.flush()

@@ -32,6 +32,7 @@ FLOORS = (
         "spherloc_viz.localize",
         "spherloc_viz.trajectory_plot",
         "spherloc_viz.scene_list",
+        "spherloc_viz.progress",
         "spherloc_viz.cli",
     ),
 )

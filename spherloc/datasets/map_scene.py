@@ -10,7 +10,7 @@ import numpy as np
 from spherloc.cameras.base import FloatArray
 from spherloc.datasets.registration import Registration
 from spherloc.errors import InputError, show
-from spherloc.frontend.view import Matcher, Matches, View
+from spherloc.frontend.view import Matcher, Matches, NeedsPreparing, Report, View
 from spherloc.problem import Problem
 from spherloc.refine import residuals_px
 
@@ -78,6 +78,11 @@ class MapScene:
             more = f" and {len(self.queries) - 5} more" if len(self.queries) > 5 else ""
             raise InputError(f"{self.where}: no query image {show(name)}; there are {some}{more}.")
         return self._by_name[name]
+
+    def prepare(self, report: Report) -> None:
+        """Do what is needed once for all queries, so that it can be watched: describing a large map takes a while."""
+        if isinstance(self.matcher, NeedsPreparing):
+            self.matcher.prepare(report)
 
     def problem(self, seed: int | None = None, query: str | None = None) -> Problem:
         """The localization problem of a query image; images have nothing random, so ``seed`` changes nothing.

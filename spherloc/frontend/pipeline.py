@@ -18,7 +18,7 @@ from spherloc.frontend.frontend_options import FrontendOptions, frontend_options
 from spherloc.frontend.matching import match
 from spherloc.frontend.outlier_rate import right_shares, wrong_matches
 from spherloc.frontend.triangulation import TriangulationLift
-from spherloc.frontend.view import Matcher, Matches, View
+from spherloc.frontend.view import Matcher, Matches, Report, View
 from spherloc.geometry import camera_centre
 
 SAME_POINT = 0.02
@@ -73,6 +73,12 @@ class ImageMatcher:
                 remarks += reference.lift.remarks
         return _joined(found, tried, remarks)
 
+    def prepare(self, report: Report) -> None:
+        """Describe all references, if there are so many that retrieval has to choose."""
+        if self.pairs is None and len(self.references) > self.options.references and "_index" not in vars(self):
+            # Where cached_property keeps it; that cannot pass on who is to be told.
+            vars(self)["_index"] = _index(self.references, self.options, report)
+
     def _candidates(self, query: View, features: Features) -> tuple[list[View], list[str]]:
         """References to match with, at most as many as the options say, and what to remark."""
         remarks: list[str] = []
@@ -106,7 +112,7 @@ class ImageMatcher:
 
     @cached_property
     def _index(self) -> "_Index":
-        return _index(self.references, self.options)
+        return _index(self.references, self.options, lambda done, count: None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,9 +132,10 @@ class _Index:
         return retrieval.vlad(retrieval.real_descriptors(features), self.words)
 
 
-def _index(references: Sequence[View], options: FrontendOptions) -> _Index:
+def _index(references: Sequence[View], options: FrontendOptions, report: Report) -> _Index:
     """Features come from the cache on disk the second time, so that they are not held: thousands would not fit."""
     failures: dict[int, str] = {}
+    seen: set[int] = set()
 
     def described(index: int) -> retrieval.Floats | None:
         try:
@@ -136,6 +143,10 @@ def _index(references: Sequence[View], options: FrontendOptions) -> _Index:
         except InputError as error:
             failures[index] = str(error)
             return None
+        finally:
+            if index not in seen:
+                seen.add(index)
+                report(len(seen), len(references))
 
     spread = np.unique(np.linspace(0, len(references) - 1, VOCABULARY_IMAGES).round().astype(np.int64))
     samples = [image for index in spread.tolist() if (image := described(index)) is not None and len(image)]

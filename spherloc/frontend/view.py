@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -111,6 +111,19 @@ class Matches:
     """0 to 1, guessed from the statistics of the matches."""
     remarks: tuple[str, ...] = ()
     """What was skipped and why, in sentences."""
+
+
+Report = Callable[[int, int], None]
+"""Told how many pieces of a long job are done, and how many there are."""
+
+
+@runtime_checkable
+class NeedsPreparing(Protocol):
+    """A matcher with work to do once for all queries, which the first of them would otherwise wait for."""
+
+    def prepare(self, report: Report) -> None:
+        """Do it, if it is not done; what is wrong is said with each query."""
+        ...
 
 
 class Matcher(Protocol):

@@ -72,10 +72,6 @@ class SceneControls:
         self._seed.value = str(scene.seed)
         return True
 
-    def reads_images(self) -> bool:
-        """Whether the chosen scene is made of images, so that its problem takes a while."""
-        return self._catalog.map_scene(self._scene.value) is not None
-
     def read(self) -> SceneWish:
         """What the widgets say now.
 

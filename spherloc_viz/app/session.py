@@ -11,6 +11,7 @@ from spherloc.datasets.map_scene import MapScene
 from spherloc.diagnosis import Diagnosis, diagnose
 from spherloc.errors import InputError, SpherlocError
 from spherloc.estimators import estimate
+from spherloc.problem import Problem
 from spherloc.trace import Trace
 from spherloc_viz.app import views
 from spherloc_viz.app.catalog import Catalog, SceneWish
@@ -153,17 +154,13 @@ class Session:
         if not asked:
             self._settle()
             return None
-        if self._scene.reads_images():
-            self._status.content = status_html(
-                "Reading and matching images; what is new to this machine takes up to a minute …"
-            )
         if self._scene.follow_scene():
             self._sequence.show(self._catalog.map_scene(self._scene.read().scene))
-            self._estimator.follow_problem(self._catalog.problem(self._scene.read()))
+            self._estimator.follow_problem(self._problem(self._scene.read()))
         wish = Wish(self._scene.read(), *self._estimator.read())
         if self._run is None or wish != self._run.wish:
+            problem = self._problem(wish.scene)
             self._status.content = status_html(f"Solving with {wish.estimator} …")
-            problem = self._catalog.problem(wish.scene)
             self._run = Run(wish, estimate(problem, wish.estimator, wish.options, wish.scene.seed))
             self._page.ask()
         self._status.content = status_html(
@@ -171,6 +168,18 @@ class Session:
         )
         self._withdraw()
         return QUIET_S
+
+    def _problem(self, wish: SceneWish) -> Problem:
+        """The problem that the page asks for; of images, with word of how far they are."""
+        scene = self._catalog.map_scene(wish.scene)
+        if scene is not None:
+
+            def report(done: int, count: int) -> None:
+                self._status.content = status_html(f"Describing the map: {done} of {count} reference images …")
+
+            scene.prepare(report)
+            self._status.content = status_html("Reading and matching images …")
+        return self._catalog.problem(wish)
 
     def _settle(self) -> None:
         for widget in (*self._scene.widgets, *self._estimator.widgets, *self._display.widgets, *self._steps.widgets):

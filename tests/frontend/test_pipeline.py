@@ -202,6 +202,21 @@ def test_unreadable_references_are_counted_once_by_retrieval(many, queries, fold
     assert sum("3 of 15 references were skipped, the first is bad0.png" in remark for remark in matches.remarks) == 1
 
 
+def test_preparing_is_reported_and_spares_the_first_query_the_work(many, queries):
+    prepared, plain = matcher(many), matcher(many)
+    reports = []
+    prepared.prepare(lambda done, count: reports.append((done, count)))
+    assert reports == [(done, len(many)) for done in range(1, len(many) + 1)]
+    prepared.prepare(lambda done, count: reports.append("again"))
+    assert "again" not in reports
+    query = next(iter(queries.values()))
+    assert np.array_equal(prepared(query).points, plain(query).points)
+
+
+def test_little_to_choose_from_needs_no_preparing(references):
+    matcher(tuple(references.values())[:2], {"references": 2}).prepare(lambda done, count: pytest.fail("no work"))
+
+
 def test_pairs_take_the_place_of_retrieval(many, queries):
     query = queries["fisheye"]
     find = matcher(many, {"references": 2}, {query.name: ("room1_3", "gone", "room1_0", "room1_1")})

@@ -1,0 +1,55 @@
+"""How far a long job is, on stderr."""
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from tqdm import tqdm
+
+from spherloc.datasets.map_scene import MapScene
+
+LINE_EVERY_S = 30.0
+"""Where the output is no terminal, progress is a line now and then."""
+BAR_AFTER_S = 1.0
+"""Jobs that end sooner show nothing."""
+
+
+def say(sentence: str) -> None:
+    """One line on stderr."""
+    tqdm.write(f"spherloc: {sentence}", file=sys.stderr)  # above the bar, if there is one
+    sys.stderr.flush()
+
+
+@contextmanager
+def progress(count: int, plural: str) -> Iterator[Callable[[str], None]]:
+    """A bar on a terminal, else a line now and then.
+
+    The function that it gives is called after each of ``count`` pieces of work ("queries") with a remark, which may be
+    empty.
+    """
+    if sys.stderr.isatty():
+        with tqdm(total=count, unit=f" {plural}", file=sys.stderr, dynamic_ncols=True, delay=BAR_AFTER_S) as bar:
+
+            def advance(remark: str) -> None:
+                bar.set_postfix_str(remark, refresh=False)
+                bar.update()
+
+            yield advance
+        return
+    done, said = 0, time.monotonic()
+
+    def line(remark: str) -> None:
+        nonlocal done, said
+        done += 1
+        if time.monotonic() - said > LINE_EVERY_S:
+            say(f"{done:,} of {count:,} {plural}{f', {remark}' if remark else ''}.")
+            said = time.monotonic()
+
+    yield line
+
+
+def prepare(scene: MapScene) -> None:
+    """Have the scene do what it needs once for all queries, and show how far it is."""
+    with progress(len(scene.references), "references") as advance:
+        scene.prepare(lambda done, count: advance(""))
