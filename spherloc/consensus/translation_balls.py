@@ -59,6 +59,36 @@ def smallest_balls(
     return pairs[kept], centres[kept], radii[kept]
 
 
+def share_of_each(count: int, most: int) -> int:
+    """How many of ``most`` balls each of ``count`` correspondences may be part of: 2 (most / count)^2, rounded up.
+
+    The smallest balls of all are those of the few points nearest to the camera. Among the thousand matches of real
+    images these may all be wrong alike, where structure repeats; among a hundred the few right ones need several each.
+    """
+    return max(1, int(np.ceil(2.0 * (most / count) ** 2)))
+
+
+def spread_balls(
+    aligned: AlignedProblem,
+    bound_rad: FloatArray,
+    arcs: tuple[IndexArray, FloatArray, FloatArray],
+    covering: IndexArray,
+    yaw_rad: float,
+    most: int,
+) -> tuple[IndexArray, FloatArray, FloatArray, int]:
+    """Pairs (S, 2), centres and radii as of ``smallest_balls``, and how many pairs bound a position.
+
+    If these are more than ``most``, the smallest are taken, no correspondence having more than ``share_of_each``.
+    """
+    pairs, centres, radii = smallest_balls(aligned, bound_rad, arcs, covering, yaw_rad, max(1, len(covering)))
+    bounded = len(pairs)
+    if bounded <= most:
+        return pairs, centres, radii, bounded
+    count = len(aligned.bearings)
+    kept = _spread(pairs, share_of_each(count, most), most, count)
+    return pairs[kept], centres[kept], radii[kept], bounded
+
+
 def overlapping(centres: FloatArray, radii: FloatArray) -> BoolArray:
     """Eq. 38: symmetric matrix (M, M) of balls that overlap; false on the diagonal."""
     overlap = np.zeros((len(radii), len(radii)), dtype=bool)
@@ -92,11 +122,26 @@ def _overlap(centres, radii, overlap):
 
 
 @numba.njit(cache=True, nogil=True)
+def _spread(pairs, share, most, count):
+    """Places of the first ``most`` pairs in which nobody has more than ``share``."""
+    kept, used = np.empty(most, np.int64), np.zeros(count, np.int64)
+    found = 0
+    for k in range(len(pairs)):
+        i, j = pairs[k, 0], pairs[k, 1]
+        if found < most and used[i] < share and used[j] < share:
+            used[i] += 1
+            used[j] += 1
+            kept[found] = k
+            found += 1
+    return kept[:found]
+
+
+@numba.njit(cache=True, nogil=True)
 def _smallest(bearings, points, eps, pairs, lo, hi, covering, yaw, most):
     """Pairs (S, 2) in their order, centres and radii: the ``most`` smallest balls and some more."""
     chords, sines = chord(eps), np.sin(eps)
     c, s = np.cos(yaw), np.sin(yaw)
-    room = 2 * most
+    room = min(2 * most, len(covering) + 1)
     near, centres, radii = np.empty((room, 2), np.int32), np.empty((room, 3)), np.empty(room)
     count, limit = 0, np.inf
     for arc in covering:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from spherloc.bounds import Bounds
 from spherloc.consensus.inliers import BLOCK, ROWS, count_inliers, pack_blocks, reaches
 from spherloc.consensus.max_clique import max_clique
-from spherloc.consensus.translation_balls import edges_of, overlapping, smallest_balls
+from spherloc.consensus.translation_balls import edges_of, overlapping, share_of_each, spread_balls
 from spherloc.consensus.yaw_arcs import yaw_arcs
 from spherloc.consensus.yaw_sweep import YawConsensus, deepest_yaw
 from spherloc.errors import InputError
@@ -42,7 +42,8 @@ class McOptions(RefinementOptions):
     bound_px: float = 3.0
     """Bound on the noise of an inlier, px. Arcs and balls grow with it, so it is tighter than RANSAC's."""
     max_balls: int = 500
-    """Pairs of the rotation clique that become balls: those with the smallest radii, if there are more."""
+    """Pairs of the rotation clique that become balls, if there are more: the smallest, and of each correspondence no
+    more than its share."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -113,7 +114,7 @@ def _locate(
     """Balls of the rotation clique, their maximum clique, and the aligned pose (3, 4) that it proposes."""
     yaw, arcs = consensus.yaw_rad, consensus.clique
     most = int(options.max_balls)
-    pairs, centres, radii = smallest_balls(aligned, bounds.radians, (pairs, lo, hi), arcs, yaw, most)
+    pairs, centres, radii, bounded = spread_balls(aligned, bounds.radians, (pairs, lo, hi), arcs, yaw, most)
     if len(pairs) == 0:
         return None, None
     overlap = overlapping(centres, radii)
@@ -121,7 +122,7 @@ def _locate(
     start = _best_start(aligned, bounds, pairs[clique.nodes], yaw, centres[clique.nodes], radii[clique.nodes])
     stage = TranslationStage(
         candidates=len(arcs),
-        rule=_rule(len(pairs), len(arcs), most),
+        rule=_rule(len(pairs), bounded, len(arcs), share_of_each(len(aligned.bearings), most)),
         pairs=aligned.index.astype(np.int32)[pairs],
         centres_m=centres,
         radii_m=radii,
@@ -165,9 +166,10 @@ def _most_inliers(yaws, translations, bearings, points, weights, bound_px):
     return best
 
 
-def _rule(kept: int, candidates: int, most: int) -> str:
+def _rule(kept: int, bounded: int, candidates: int, share: int) -> str:
     if kept == candidates:
         return f"All {candidates:,} pairs of the rotation clique."
-    if kept == most:
-        return f"The {kept:,} smallest balls of the {candidates:,} pairs in the rotation clique."
-    return f"The {kept:,} of {candidates:,} pairs in the rotation clique that bound a position."
+    if kept == bounded:
+        return f"The {kept:,} of {candidates:,} pairs in the rotation clique that bound a position."
+    each = "once" if share == 1 else f"at most {share} times"
+    return f"The {kept:,} smallest balls of the {candidates:,} pairs in the rotation clique, each match used {each}."

@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 from pair_samples import aligned_problem, sample, unit
 
-from spherloc.consensus.translation_balls import edges_of, overlapping, smallest_balls, translation_balls
+from spherloc.consensus.translation_balls import (
+    edges_of,
+    overlapping,
+    share_of_each,
+    smallest_balls,
+    spread_balls,
+    translation_balls,
+)
 from spherloc.consensus.yaw_arcs import yaw_arcs
 from spherloc.consensus.yaw_sweep import deepest_yaw
 from spherloc.geometry import yaw_rotation
@@ -119,6 +126,31 @@ def test_smallest_balls_are_the_first_of_all_balls_sorted(rng, bound, most):
     np.testing.assert_array_equal(small, pairs[covering][first])
     np.testing.assert_array_equal(small_centres, centres[first])
     np.testing.assert_array_equal(small_radii, radii[first])
+
+
+@pytest.mark.parametrize("most", [3, 25, 60, 5000])
+def test_spread_balls_are_the_smallest_that_leave_room_for_others(rng, most):
+    """Against a plain loop over all balls; what is taken is taken in the order of size."""
+    s = sample(rng, 0.01, 60)
+    pairs, lo, hi = yaw_arcs(s.aligned, s.bound_rad)
+    found = deepest_yaw(lo, hi)
+    assert found is not None
+    arcs, data = (pairs, lo, hi), (s.aligned, s.bound_rad)
+    every, centres, radii = smallest_balls(*data, arcs, found.clique, found.yaw_rad, 10**6)
+    kept, kept_centres, kept_radii, bounded = spread_balls(*data, arcs, found.clique, found.yaw_rad, most)
+    share, used, expected = share_of_each(60, most), np.zeros(60, int), []
+    for place, pair in enumerate(every):
+        if len(every) <= most or (len(expected) < most and (used[pair] < share).all()):
+            used[pair] += 1
+            expected.append(place)
+    assert bounded == len(every) > 60
+    np.testing.assert_array_equal(kept, every[expected])
+    np.testing.assert_array_equal(kept_centres, centres[expected])
+    np.testing.assert_array_equal(kept_radii, radii[expected])
+
+
+def test_each_has_a_larger_share_where_there_are_few():
+    assert [share_of_each(count, 500) for count in (50, 100, 200, 400, 500, 800, 5000)] == [200, 50, 13, 4, 2, 1, 1]
 
 
 def test_smallest_balls_leave_out_pairs_that_bound_nothing(rng):
