@@ -42,6 +42,8 @@ FLAGS = (
     "--no-first-run",
 )
 SIZE = {"width": 1200, "height": 700}
+SHARPNESS = 0.4
+"""Pixels of the screen by those of the page: what is read is the same, and software draws a sixth of the pixels."""
 PATIENCE_MS = 60_000
 expect.set_options(timeout=PATIENCE_MS)
 
@@ -83,7 +85,7 @@ class Playground:
     """One tab."""
 
     def __init__(self, browser: Browser, address: str) -> None:
-        self.page: Page = browser.new_context(viewport=SIZE).new_page()  # pyright: ignore[reportArgumentType]
+        self.page: Page = browser.new_context(viewport=SIZE, device_scale_factor=SHARPNESS).new_page()  # pyright: ignore[reportArgumentType]
         self.page.set_default_timeout(PATIENCE_MS)
         self.errors: list[str] = []
         self.hosts: set[str] = set()
