@@ -47,6 +47,8 @@ class Segments(Primitive):
     """(N, 3)."""
     width_px: float
     """Thickness on the screen."""
+    ids: NDArray[np.int64] | None = None
+    """(N, 2) the two correspondences that each line shows, if it shows a pair."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +63,8 @@ class Balls(Primitive):
     """(N, 3)."""
     opacity: float
     """0 to 1, of every ball."""
+    ids: NDArray[np.int64] | None = None
+    """(N, 2) the two correspondences that each ball shows, if it shows a pair."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +80,30 @@ class Mesh(Primitive):
     """0 to 1."""
 
 
-SceneItem = Points | Segments | Balls | Mesh
+@dataclass(frozen=True, eq=False)
+class Textured(Primitive):
+    """A triangle mesh with a picture on it."""
+
+    vertices: FloatArray
+    """(V, 3)."""
+    faces: NDArray[np.int64]
+    """(F, 3)."""
+    uv: FloatArray
+    """(V, 2) place of each vertex in the picture, from its lower left corner, 0 to 1."""
+    image: ColorArray
+    """(H, W, 3) sRGB."""
+
+
+@dataclass(frozen=True, eq=False)
+class Label(Primitive):
+    """A word at a place."""
+
+    position: FloatArray
+    """(3,)."""
+    text: str
+
+
+SceneItem = Points | Segments | Balls | Mesh | Textured | Label
 
 
 @dataclass(frozen=True, eq=False)
