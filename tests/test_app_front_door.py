@@ -3,6 +3,7 @@
 import asyncio
 import base64
 import hashlib
+import json
 import re
 import socket
 from collections.abc import AsyncIterator, Awaitable, Callable
@@ -22,6 +23,7 @@ from spherloc_viz.app import viser_seams
 from spherloc_viz.app.front_door import FrontDoor, is_own_name, open_socket, refusal
 from spherloc_viz.app.page import load_page
 from spherloc_viz.app.server import serve
+from spherloc_viz.app.touch import MOST_BYTES, Touch, TouchDesk, Touches
 
 KEY = "a key of this test"
 VERSION = f"viser-v{viser.__version__}"
@@ -105,6 +107,10 @@ class Door:
         self.url = f"http://127.0.0.1:{port}/"
         self._client = client
 
+    async def touch(self, body: bytes, origin: str | None = "own") -> aiohttp.ClientResponse:
+        sent = {} if origin is None else {"Origin": self.url.rstrip("/") if origin == "own" else origin}
+        return await self._client.post(self.url + "touch", data=body, headers=sent)
+
     async def get(self, path: str = "", method: str = "GET", **sent: str) -> aiohttp.ClientResponse:
         response = await self._client.request(method, self.url + path, headers=sent, allow_redirects=False)
         await response.read()
@@ -116,9 +122,9 @@ class Door:
 
 
 @asynccontextmanager
-async def door_to(port: int) -> AsyncIterator[Door]:
+async def door_to(port: int, desk: TouchDesk | None = None) -> AsyncIterator[Door]:
     listener = open_socket("127.0.0.1", 0)
-    runner = await FrontDoor("127.0.0.1", port, KEY).start(listener)
+    runner = await FrontDoor("127.0.0.1", port, KEY, desk or TouchDesk()).start(listener)
     try:
         async with aiohttp.ClientSession() as client:
             yield Door(listener.getsockname()[1], client)
@@ -280,3 +286,59 @@ def test_another_viser_fails_closed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(viser, "ViserServer", lambda **_: SimpleNamespace())
     with pytest.raises(RuntimeError, match="viser"):
         viser_seams.start_viser(KEY)
+
+
+def report(token: str, action: str = "select:12", **changes: object) -> bytes:
+    return json.dumps(
+        {"session": token, "action": action, "at": [0.75, 0.5], "from": [0.25, 0.5], "extend": True} | changes
+    ).encode()
+
+
+def test_a_press_on_the_page_reaches_its_own_session_only() -> None:
+    async def press() -> None:
+        heard: list[tuple[str, Touch]] = []
+        desk, one, two = TouchDesk(), Touches(failed=errors.append), Touches(failed=errors.append)
+        for name, touches in (("one", one), ("two", two)):
+            touches.on("select", lambda touch, name=name: heard.append((name, touch)))
+            desk.add(touches)
+        two.on("break", lambda touch: 1 / 0)
+        async with door_to(1, desk) as door:
+            assert (await door.touch(report(two.token))).status == 204
+            assert heard == [("two", Touch("select", "12", 0.75, 0.5, 0.25, 0.5, True))]
+            assert (await door.touch(report(one.token, "select:a:b", extend=1))).status == 204
+            assert heard[-1] == ("one", Touch("select", "a:b", 0.75, 0.5, 0.25, 0.5, False))
+            assert (await door.touch(report(one.token, "gone:1"))).status == 204, "the page may be older than Python"
+            assert (await door.touch(report(two.token, "break:"))).status == 204
+            assert [type(error) for error in errors] == [ZeroDivisionError]
+            desk.remove(one)
+            assert (await door.touch(report(one.token))).status == 400
+            assert len(heard) == 2
+
+    errors: list[Exception] = []
+    asyncio.run(press())
+
+
+def test_presses_from_elsewhere_are_refused() -> None:
+    async def press() -> None:
+        desk, touches = TouchDesk(), Touches(failed=lambda error: None)
+        touches.on("select", lambda touch: pytest.fail("let in"))
+        desk.add(touches)
+        async with door_to(1, desk) as door:
+            for origin in (None, "null", "http://evil.example", "http://127.0.0.1:1"):
+                assert (await door.touch(report(touches.token), origin)).status == 403
+            for body in (
+                b"",
+                b"[]",
+                b"{}",
+                b"\xff",
+                b"[" * 2000,
+                report("another"),
+                report(touches.token, at=[0.5]),
+                report(touches.token, at=[2.0, 0.5]),
+                report(touches.token, at=[float("nan"), 0.5]),
+                report(touches.token, at="ab"),
+            ):
+                assert (await door.touch(body)).status == 400, body
+            assert (await door.touch(b" " * MOST_BYTES + report(touches.token))).status == 413
+
+    asyncio.run(press())

@@ -14,6 +14,7 @@ from multidict import CIMultiDictProxy
 
 from spherloc.errors import InputError
 from spherloc_viz.app.page import Page, load_page
+from spherloc_viz.app.touch import MOST_BYTES, TouchDesk
 from spherloc_viz.app.viser_seams import KEY_HEADER
 
 MAX_MESSAGE_BYTES = 50 * 1024 * 1024
@@ -82,10 +83,11 @@ def _same_origins(netloc: str) -> tuple[str, str]:
 
 
 class FrontDoor:
-    """Serves one page and one websocket; everything else is refused."""
+    """Serves one page and one websocket, and takes reports of presses on the page; everything else is refused."""
 
-    def __init__(self, host: str, viser_port: int, key: str) -> None:
+    def __init__(self, host: str, viser_port: int, key: str, desk: TouchDesk) -> None:
         self._host = host
+        self._desk = desk
         self._upstream = f"http://127.0.0.1:{viser_port}/"
         self._key = key
         self._page: Page = load_page()
@@ -94,7 +96,7 @@ class FrontDoor:
 
     async def start(self, listener: socket.socket) -> web.AppRunner:
         """Start serving on a listening socket."""
-        app = web.Application()
+        app = web.Application(client_max_size=MOST_BYTES)
         app.router.add_route("*", "/{path:.*}", self._answer)
         app.cleanup_ctx.append(self._connections)
         app.on_shutdown.append(self._hang_up)
@@ -115,6 +117,8 @@ class FrontDoor:
         reason = refusal(request.headers, self._host, upgrade)
         if reason is not None:
             return web.Response(status=403, text=reason + "\n")
+        if request.method == "POST" and request.path == "/touch":
+            return await self._touch(request)
         if request.method not in ("GET", "HEAD"):
             return web.Response(status=405, text="Only GET is served.\n", headers={"Allow": "GET, HEAD"})
         if not request.query.keys() <= PARAMETERS:
@@ -122,6 +126,15 @@ class FrontDoor:
         if request.path != "/":
             return web.Response(status=404, text="There is nothing here; open /.\n")
         return await self._pass_on(request) if upgrade else self._page_response(request)
+
+    async def _touch(self, request: web.Request) -> web.Response:
+        """Only a page of this server can send one: others do not know its token, and are told apart by their Origin."""
+        if "Origin" not in request.headers:
+            return web.Response(status=403, text="Only the playground's page may report presses.\n")
+        body = await request.read()
+        loop = asyncio.get_running_loop()
+        known = await loop.run_in_executor(None, self._desk.deliver, body)
+        return web.Response(status=204) if known else web.Response(status=400, text="No page of this playground.\n")
 
     def _page_response(self, request: web.Request) -> web.Response:
         headers = {

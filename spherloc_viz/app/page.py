@@ -14,6 +14,8 @@ QUIET = (
 )
 """viser loads a sorter for Gaussian splats that wants ``eval``. The policy denies it, nobody here draws splats,
 and the console stays clean for errors that matter."""
+TOUCH = "<style>{css}</style><script>{script}</script>"
+"""What reports presses, see ``spherloc_viz.app.touch``."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +33,10 @@ def load_page() -> Page:
     """The page of the installed viser."""
     path = Path(viser.__file__).parent / "client" / "build" / "index.html"
     html = path.read_text(encoding="utf-8")
-    html = html.replace("<title>Viser</title>", f"<title>spherloc</title>{QUIET}", 1)
+    own = Path(__file__).parent
+    css, script = (own.joinpath(name).read_text(encoding="utf-8") for name in ("touch.css", "touch.js"))
+    ours = QUIET + TOUCH.format(css=css, script=script)
+    html = html.replace("<title>Viser</title>", f"<title>spherloc</title>{ours}", 1)
     data = html.encode()
     return Page(html=data, zipped=gzip.compress(data, mtime=0), policy=content_policy(html))
 

@@ -18,6 +18,7 @@ from spherloc_viz.app import views
 from spherloc_viz.app.catalog import Catalog
 from spherloc_viz.app.front_door import FrontDoor, open_socket
 from spherloc_viz.app.session import Session
+from spherloc_viz.app.touch import TouchDesk
 from spherloc_viz.app.viser_seams import start_viser, stop_viser
 from spherloc_viz.recording.background import Recorder
 
@@ -40,7 +41,7 @@ def serve(scene: Path | None, host: str, port: int, recordings: Path, record: bo
         stack.callback(stop_viser, server)
         stack.callback(sessions.close)
         sessions.attend(server)
-        asyncio.run(_serve_until_told(FrontDoor(host, server.get_port(), key), listener))
+        asyncio.run(_serve_until_told(FrontDoor(host, server.get_port(), key, sessions.desk), listener))
 
 
 class Sessions:
@@ -50,6 +51,8 @@ class Sessions:
         self._catalog = catalog
         self.recorder: Recorder | None = None
         """Where settled runs go; None if they are not recorded."""
+        self.desk = TouchDesk()
+        """Where presses on the pages arrive."""
         self._open: dict[int, Session] = {}
         self._lock = threading.Lock()
 

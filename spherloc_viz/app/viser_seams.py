@@ -5,6 +5,7 @@ import hmac
 import io
 import warnings
 from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, Future
 from typing import Any
 
 import viser
@@ -46,6 +47,30 @@ def put_back(handle: Any) -> None:
     state = handle._impl
     message = _messages.GuiUpdateMessage(state.uuid, {"value": state.value})
     state.gui_api._websock_interface.queue_message(message)
+
+
+class _GuardedExecutor:
+    """An executor whose tasks report what they raise, instead of a traceback on the server's terminal."""
+
+    def __init__(self, executor: Executor, failed: Callable[[Exception], None]) -> None:
+        self._executor, self._failed = executor, failed
+
+    def submit(self, task: Callable[..., Any], *words: Any) -> Future[None]:
+        """As ``Executor.submit``."""
+        return self._executor.submit(self._run, task, words)
+
+    def _run(self, task: Callable[..., Any], words: tuple[Any, ...]) -> None:
+        try:
+            task(*words)
+        except Exception as error:
+            self._failed(error)
+
+
+def guard_callbacks(client: viser.ClientHandle, failed: Callable[[Exception], None]) -> None:
+    """Have ``failed`` called with whatever a callback of this client's widgets and scene raises."""
+    for part in (client.gui, client.scene):
+        executor: Any = _GuardedExecutor(part._thread_executor, failed)
+        part._thread_executor = executor
 
 
 @contextlib.contextmanager

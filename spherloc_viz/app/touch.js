@@ -1,0 +1,104 @@
+// Tells the server what a person presses in the HTML and SVG that it sent: elements with data-touch="ACTION:ARGUMENT".
+// With data-drag a drag across the element is told too; data-copy="TEXT" puts TEXT on the clipboard.
+(() => {
+  const TOUCHABLE = "[data-touch],[data-copy]", LEAST_DRAG_PX = 6;
+  let sent = Promise.resolve(), press = null, shade = null;
+
+  const found = (event) => (event.target instanceof Element ? event.target.closest(TOUCHABLE) : null);
+  const fraction = (value, start, size) => Math.min(1, Math.max(0, (value - start) / Math.max(size, 1)));
+
+  function tell(action, box, event, from) {
+    const session = document.querySelector("[data-session]")?.dataset.session;
+    if (!session) return;
+    const at = (x, y) => [fraction(x, box.left, box.width), fraction(y, box.top, box.height)];
+    const body = JSON.stringify({
+      session,
+      action,
+      at: at(event.clientX, event.clientY),
+      from: at(from.x, from.y),
+      extend: event.shiftKey || event.ctrlKey || event.metaKey,
+    });
+    // One after another, so that presses arrive in their order.
+    sent = sent
+      .then(() => fetch("/touch", { method: "POST", headers: { "Content-Type": "application/json" }, body }))
+      .catch(() => undefined);
+  }
+
+  async function copy(element) {
+    const text = element.dataset.copy;
+    try {
+      await navigator.clipboard.writeText(text);
+    } catch {
+      const area = document.createElement("textarea");
+      area.value = text;
+      document.body.append(area);
+      area.select();
+      document.execCommand("copy");
+      area.remove();
+    }
+    element.classList.add("copied");
+    setTimeout(() => element.classList.remove("copied"), 1200);
+  }
+
+  function drawShade(event) {
+    const { box, from } = press;
+    if (!shade) {
+      shade = document.createElement("div");
+      shade.className = "touch-shade";
+      document.body.append(shade);
+    }
+    const ends = [from.x, Math.min(box.right, Math.max(box.left, event.clientX))].sort((a, b) => a - b);
+    Object.assign(shade.style, {
+      left: `${ends[0]}px`,
+      width: `${ends[1] - ends[0]}px`,
+      top: `${box.top}px`,
+      height: `${box.height}px`,
+    });
+  }
+
+  function end() {
+    press = null;
+    shade?.remove();
+    shade = null;
+  }
+
+  addEventListener("pointerdown", (event) => {
+    const element = event.button === 0 ? found(event) : null;
+    if (!element) return;
+    const drag = element.closest("[data-drag]");
+    // The server may replace the element while it is pressed, so its box is remembered.
+    press = {
+      element, drag, box: element.getBoundingClientRect(), from: { x: event.clientX, y: event.clientY },
+      dragBox: drag?.getBoundingClientRect(),
+    };
+  }, true);
+
+  addEventListener("pointermove", (event) => {
+    if (!press?.drag) return;
+    if (Math.abs(event.clientX - press.from.x) < LEAST_DRAG_PX && !shade) return;
+    press.box = press.dragBox;
+    drawShade(event);
+    event.preventDefault();
+  }, true);
+
+  addEventListener("pointerup", (event) => {
+    if (!press) return;
+    const { element, drag, box, from } = press, dragged = shade !== null;
+    end();
+    if (dragged) tell(drag.dataset.touch, box, event, from);
+    else if (element.dataset.copy !== undefined) copy(element);
+    else tell(element.dataset.touch, box, event, from);
+  }, true);
+
+  addEventListener("pointercancel", end, true);
+
+  addEventListener("keydown", (event) => {
+    if ((event.key !== "Enter" && event.key !== " ") || !(event.target instanceof Element)) return;
+    if (!event.target.matches(TOUCHABLE)) return;
+    event.preventDefault();
+    event.stopPropagation();
+    const box = event.target.getBoundingClientRect(), middle = { x: box.left + box.width / 2, y: box.top + box.height / 2 };
+    if (event.target.dataset.copy !== undefined) copy(event.target);
+    else tell(event.target.dataset.touch, box, { clientX: middle.x, clientY: middle.y, shiftKey: event.shiftKey }, middle);
+  }, true);
+})();

@@ -1,0 +1,31 @@
+"""What a page asks for, and what it got."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spherloc.trace import Trace
+from spherloc_viz.app.catalog import SceneWish
+
+
+@dataclass(frozen=True)
+class Wish:
+    """All that a run depends on."""
+
+    scene: SceneWish
+    estimator: str
+    """Registered name."""
+    options: Any
+    """The estimator's options dataclass."""
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A wish fulfilled."""
+
+    wish: Wish
+    trace: Trace
+    kept: NDArray[np.int64]
+    """(N,) number that each correspondence of the problem has where nothing is hidden."""
