@@ -11,6 +11,7 @@ import numpy as np
 
 from spherloc.datasets import Scene, load_scene
 from spherloc.datasets.map_scene import MapScene
+from spherloc.datasets.variation import Variation, used_seed
 from spherloc.diagnosis import Diagnosis, diagnose
 from spherloc.errors import InputError, SpherlocError
 from spherloc.estimators import default_options, estimate, options_type, warm_up
@@ -30,10 +31,12 @@ def run_scenes(
     as_json: bool,
     recordings: Path | None,
     query: str | None = None,
+    variation: Variation | None = None,
 ) -> int:
     """Solve every scene; returns the exit code. A wrong input is reported and the others are still solved.
 
-    ``query`` chooses a query image of scenes made of images, by default their first.
+    ``query`` chooses a query image of scenes made of images, by default their first; ``variation`` changes every
+    scene.
     """
     if not paths:
         raise InputError("no scene given; name one or more scene files, such as scenes/mei_outliers_80.toml.")
@@ -46,12 +49,12 @@ def run_scenes(
         for path in paths:
             try:
                 scene = load_scene(path)
-                problem = _problem(path, scene, seed, query)
+                problem = _problem(path, scene, seed, query, variation or Variation())
                 if not warm:
                     warm_up(say)
                     warm = True
-                used = getattr(scene, "seed", 0) if seed is None else seed
-                trace = estimate(problem, estimator, resolved_options(estimator, problem, changes), used)
+                options = resolved_options(estimator, problem, changes)
+                trace = estimate(problem, estimator, options, used_seed(scene, seed))
             except SpherlocError as error:
                 jobs.append(finisher.submit(_report, error))
                 continue
@@ -61,21 +64,23 @@ def run_scenes(
     return worst
 
 
-def _problem(path: Path, scene: Scene, seed: int | None, query: str | None) -> Problem:
+def _problem(path: Path, scene: Scene, seed: int | None, query: str | None, variation: Variation) -> Problem:
     """A scene's problem; what its loader and its front end skipped is said."""
-    if not isinstance(scene, MapScene):
-        if query is not None:
-            raise InputError(f"{path}: has no query images to choose from; leave out --query.")
-        return scene.problem(seed)
-    for remark in scene.remarks:
+    try:
+        changed = variation.scene(scene)
+        if not isinstance(changed, MapScene):
+            return variation.problem(scene, seed, query)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    for remark in changed.remarks:
         say(remark)
-    view = scene.query(query)
+    view = changed.query(query)
     say(f"{path}: reading and matching images; what is new to this machine takes a while")
-    prepare(scene)
-    matches = scene.matcher(view)
+    prepare(changed)
+    matches = changed.matcher(view)
     for remark in matches.remarks:
         say(remark)
-    return scene.problem_of(view, matches)
+    return variation.edit(changed.problem_of(view, matches), used_seed(scene, seed))
 
 
 def parse_settings(estimator: str, settings: Sequence[str]) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 import os
 import sys
+from itertools import chain
 from pathlib import Path
 from typing import Annotated
 
@@ -12,6 +13,8 @@ from tyro.extras import SubcommandApp
 from spherloc.errors import SpherlocError
 
 RECORDINGS = Path("recordings")
+Settings = Annotated[tyro.conf.UseAppendAction[tuple[tuple[str, ...], ...]], arg(metavar="KEY=VALUE ...")]
+"""Several after one flag, or the flag several times."""
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
 
@@ -24,7 +27,11 @@ def run(
     /,
     estimator: str = "mc",
     seed: int | None = None,
-    option: Annotated[tuple[str, ...], arg(metavar="KEY=VALUE ...")] = (),
+    option: Settings = (),
+    set: Settings = (),
+    spoil: str | None = None,
+    mend: str | None = None,
+    hide: str | None = None,
     json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
     record: bool = True,
     recordings: Path = RECORDINGS,
@@ -46,19 +53,28 @@ def run(
 
     spherloc run scenes/mei_outliers_90.toml --option gravity_sd_deg=inf robust=huber
 
+    spherloc run scenes/mei_outliers_90.toml --set outlier_rate=0.5 outlier_kind=coherent --spoil 3,5 --hide 1
+
     Args:
         scenes: Scene files (TOML), one or more.
         estimator: mc (deterministic maximum consensus), ransac-2p or another one; a wrong name lists them all.
         seed: Seed of the estimator and, in synthetic scenes, of the simulation; the scene's own if not given.
         option: Options of the estimator, such as bound_px=4; none and inf are values where they make sense.
+        set: Changes to synthetic scenes, such as noise_px=2 or true_camera=30,1,0,2; a wrong one lists them all.
+        spoil: Numbers of matches, such as 3,5, that get a wrong pixel; the first match is 0.
+        mend: Numbers of matches that get the right pixel, where the truth is known.
+        hide: Numbers of matches that are left out.
         json: Print one JSON object a scene, on one line; infinity is the text "inf".
         record: Write a recording of each run.
         recordings: Folder of the recordings.
         query: Name of the query image, in scenes made of images; the first one if not given.
     """
+    from spherloc.datasets.variation_text import parse_variation
     from spherloc_viz import batch
 
-    return batch.run_scenes(scenes, estimator, seed, option, json, recordings if record else None, query)
+    variation = parse_variation(list(chain(*set)), spoil, mend, hide)
+    kept = recordings if record else None
+    return batch.run_scenes(scenes, estimator, seed, list(chain(*option)), json, kept, query, variation)
 
 
 @app.command

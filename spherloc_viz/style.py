@@ -14,6 +14,9 @@ RIVAL: RGB = (110, 205, 215)
 SAMPLE: RGB = (230, 90, 190)
 UNDECIDED: RGB = (140, 146, 156)
 SPHERE: RGB = (170, 190, 215)
+SELECTED: RGB = (190, 50, 255)
+SCALE: RGB = (128, 132, 140)
+"""Of the scale bar, which means nothing but its length."""
 
 LEGEND: tuple[tuple[RGB, str], ...] = (
     (INLIER, "inlier"),
@@ -24,10 +27,25 @@ LEGEND: tuple[tuple[RGB, str], ...] = (
     (TRUTH, "truth"),
     (RIVAL, "rival pose"),
     (UNDECIDED, "not decided yet"),
+    (SELECTED, "selected"),
 )
 """What each colour means, in the order in which the legend shows it."""
 
-LAYERS: tuple[str, ...] = ("mesh", "map", "cameras", "trajectory", "sphere", "rays", "yaw ring", "balls", "pairs")
+LAYERS: tuple[str, ...] = (
+    "mesh",
+    "map",
+    "cameras",
+    "uncertainty",
+    "trajectory",
+    "sphere",
+    "image",
+    "rays",
+    "yaw ring",
+    "balls",
+    "pairs",
+    "selection",
+    "scale bar",
+)
 """Layers of the canvas that can be switched on and off."""
 
 MAX_DRAWN_MATCHES = 120
@@ -36,6 +54,12 @@ MAX_DRAWN_ARCS = 240
 MAX_DRAWN_BALLS = 70
 MAX_DRAWN_PAIRS = 200
 MAX_DRAWN_RIVALS = 8
+MAX_SELECTED_DOTS = 500
+MAX_SELECTED_ARCS = 40
+MAX_SELECTED_BALLS = 6
+
+DIM = 0.6
+"""How far the colours of what is not selected move towards grey."""
 
 
 def css(color: RGB) -> str:

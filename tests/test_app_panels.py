@@ -16,13 +16,13 @@ import viser
 from spherloc import registry
 from spherloc.datasets import bundled_scenes, load_scene
 from spherloc.datasets.synthetic import SyntheticScene
+from spherloc.datasets.variation import Variation
 from spherloc.diagnosis import Cause, Diagnosis
 from spherloc.errors import InputError
 from spherloc.estimators import estimate, options_type
 from spherloc_viz import style
 from spherloc_viz.app import views
-from spherloc_viz.app.catalog import OWN_CAMERA, Catalog, SceneWish
-from spherloc_viz.app.charts import MOST_STEPS, aligned_data
+from spherloc_viz.app.catalog import Catalog, SceneWish, camera_label
 from spherloc_viz.app.colors import light_bytes, surface_bytes
 from spherloc_viz.app.estimator_controls import EstimatorControls, Option, estimator_labels
 from spherloc_viz.app.newest import Newest
@@ -30,7 +30,7 @@ from spherloc_viz.app.steps_panel import find_step
 from spherloc_viz.app.text import diagnosis_html, status_html, step_html, table_html
 from spherloc_viz.app.viser_seams import start_viser, stop_viser
 from spherloc_viz.layers import paint, steps
-from spherloc_viz.layers.primitives import Balls, Chart, Curve, Points, Step, Table
+from spherloc_viz.layers.primitives import Balls, Points, Step, Table
 from spherloc_viz.options import option_fields
 
 COLORS = np.array([color for color, _ in style.LEGEND] + [style.SPHERE], np.uint8)
@@ -58,37 +58,6 @@ def test_surface_colours_are_encoded_once_more() -> None:
     srgb = surface_bytes(COLORS) / 255.0
     light = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
     assert np.abs(255 * light - light_bytes(COLORS)).max() <= 1.5
-
-
-def chart(*curves: Curve) -> Chart:
-    return Chart("any", "Any", "x", "y", curves)
-
-
-def test_plot_data_share_one_ascending_x() -> None:
-    count = 1440
-    steps_curve = Curve(
-        "counts", np.linspace(-180, 179.75, count), np.arange(count, dtype=np.float64) % 97.0, style.UNDECIDED, "step"
-    )
-    truth = Curve("truth", np.array([12.3]), np.array([96.0]), style.TRUTH, "marker")
-    found = Curve("estimate", np.array([12.3]), np.array([96.0]), style.ESTIMATE, "marker")
-    x, y, *markers = aligned_data(chart(steps_curve, truth, found))
-    assert len(x) <= 2 * MOST_STEPS + 4 and np.all(np.diff(x) >= 0)
-    assert np.isfinite(y).all() and y.max() == 96.0
-    for marker in markers:
-        known = np.isfinite(marker)
-        assert np.array_equal(x[known], [12.3, 12.3]) and np.array_equal(marker[known], [0.0, 96.0])
-
-
-def test_few_steps_keep_every_corner() -> None:
-    x, y = aligned_data(chart(Curve("best", np.array([1.0, 4.0, 9.0]), np.array([2.0, 5.0, 5.0]), (0, 0, 0), "step")))
-    assert np.array_equal(x, [1, 4, 4, 9, 9]) and np.array_equal(y, [2, 2, 5, 5, 5])
-
-
-def test_a_peak_survives_thinning() -> None:
-    y = np.ones(5000)
-    y[1234] = 77.0
-    _, shown = aligned_data(chart(Curve("counts", np.arange(5000.0), y, (0, 0, 0), "step")))
-    assert shown.max() == 77.0
 
 
 EVIL = '<img src=x onerror="alert(1)">&\'"'
@@ -126,15 +95,7 @@ def test_a_step_is_kept_over_runs_where_it_can(key: str, found: str) -> None:
 def wish_of(catalog: Catalog, label: str) -> SceneWish:
     scene = catalog.synthetic(label)
     assert scene is not None
-    return SceneWish(
-        label,
-        scene.seed,
-        camera=OWN_CAMERA,
-        correspondences=scene.correspondences,
-        noise_px=scene.noise_px,
-        outlier_rate=scene.outlier_rate,
-        gravity_error_deg=scene.gravity_error_deg,
-    )
+    return SceneWish(label, scene.seed)
 
 
 def test_untouched_controls_give_the_scene_itself() -> None:
@@ -150,15 +111,15 @@ def test_another_camera_sees_the_same_simulation() -> None:
     catalog = Catalog(None)
     label = next(iter(catalog.scenes))
     assert len(catalog.cameras) == 3
-    for name, camera in catalog.cameras.items():
-        problem = catalog.problem(dataclasses.replace(wish_of(catalog, label), camera=name))
-        assert problem.camera is camera and len(problem) == 100
+    for name, path in catalog.cameras.items():
+        problem = catalog.problem(replace(wish_of(catalog, label), variation=Variation(camera=path)))
+        assert camera_label(problem.camera) == name and len(problem) == 100
 
 
 def test_gravity_error_is_simulated_and_stated() -> None:
     catalog = Catalog(None)
     wish = wish_of(catalog, next(iter(catalog.scenes)))
-    exact, off = catalog.problem(wish), catalog.problem(replace(wish, gravity_error_deg=0.5))
+    exact, off = catalog.problem(wish), catalog.problem(replace(wish, variation=Variation(gravity_error_deg=0.5)))
     assert off.gravity_sd_rad == pytest.approx(np.radians(0.5)) and np.array_equal(exact.points, off.points)
     assert not np.array_equal(exact.gravity_camera, off.gravity_camera)
 

@@ -49,7 +49,7 @@ def test_the_reference_with_most_inliers_and_the_colours_of_the_step(problem: Pr
     inliers = np.array([True, False, False, False, False, False, True, True, True, False])
     shown = match_image(problem, colors_of(inliers), inliers)
     assert shown is not None and problem.reference_pixels is not None
-    assert "query.png above reference1.png, one of 2 references: 4 matches" in shown.caption
+    assert "query.png and reference1.png, one of 2 references: 4 matches" in shown.caption
     height = round(SCALE * 150)
     assert shown.image.shape == (height + GAP_PX + WIDTH_PX // 2, WIDTH_PX, 3)
     red, green, blue = at(shown.image, (10.0, 10.0))

@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spherloc.cameras.base import Camera, in_image
+from spherloc.cameras.base import Camera
+from spherloc.datasets.outliers import clearly_apart
+from spherloc.datasets.point_cloud import HALF_SIZE_M, sees
 from spherloc.datasets.scene_file import bundled_scenes, load_scene
-from spherloc.datasets.synthetic import HALF_SIZE_M
-from spherloc.geometry import DOWN, camera_centre, pose, so3_exp, transform, wrap_angle, yaw_of, yaw_rotation
+from spherloc.geometry import DOWN, pose, so3_exp, transform, yaw_rotation
 from spherloc.problem import Problem
 
 FloatArray = NDArray[np.float64]
@@ -79,7 +80,7 @@ class CaseMaker:
         """Noisy pixels (K, 2) of points (K, 3), and which of them the camera sees."""
         pixels, valid = self.camera.project(transform(cam_from_map, points))
         pixels = np.where(valid[:, None], pixels, -1.0) + self.noise_px * self.rng.standard_normal(pixels.shape)
-        return pixels, valid & in_image(self.camera, pixels) & self.camera.unproject(pixels)[1]
+        return pixels, valid & sees(self.camera, pixels)
 
     def visible(self, count: int, cloud: Cloud, *poses: FloatArray) -> tuple[FloatArray, list[FloatArray]] | None:
         """``count`` points (count, 3) of the cloud that are seen from every pose, and their noisy pixels from each."""
@@ -117,11 +118,8 @@ class CaseMaker:
         found = None
         while found is None:
             wrong = self.random_pose()
-            if np.linalg.norm(camera_centre(wrong) - camera_centre(self.truth)) < 1.0:
-                continue
-            if abs(wrap_angle(yaw_of(wrong[:, :3] @ self.truth[:, :3].T))) < np.radians(10.0):
-                continue
-            found = self.visible(count, self.cube, self.truth, wrong)
+            if clearly_apart(wrong, self.truth):
+                found = self.visible(count, self.cube, self.truth, wrong)
         points, (right, off) = found
         self.parts.append((off, points, False))
         if twins:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from spherloc.consensus.two_point_search import sample_pair
 from spherloc.datasets.failure_parts import CaseMaker, Cloud, FailureCase
-from spherloc.datasets.synthetic import HALF_SIZE_M
+from spherloc.datasets.point_cloud import HALF_SIZE_M
 from spherloc.errors import InputError, show
 from spherloc.geometry import camera_centre, pose, yaw_rotation
 

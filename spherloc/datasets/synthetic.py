@@ -2,25 +2,25 @@
 
 Where the paper is silent or breaks: points and positions are uniform in the cube; points are drawn until N are
 visible, that is valid for the camera model and inside the image after noise; an outlier is the projection of its map
-point by a random wrong pose of its own. The paper's gravity is exact; here it may be off.
+point by a random wrong pose of its own. The paper's gravity is exact; here it may be off. Beyond the paper, outliers
+may agree with each other, the field of view and the height of the cloud may be smaller, and the camera can be placed.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from spherloc.cameras.base import Camera, in_image
+from spherloc.cameras.base import Camera
 from spherloc.cameras.calibration import camera_from_table
 from spherloc.datasets import scene_file
-from spherloc.errors import InputError
-from spherloc.geometry import DOWN, pose, so3_exp, transform, yaw_rotation
+from spherloc.datasets.outliers import OUTLIER_KINDS, OutlierKind, copies, random_pixels, random_poses, second_pose
+from spherloc.datasets.point_cloud import HALF_SIZE_M, WHOLE_SPHERE_DEG, Cloud, FloatArray, Lens
+from spherloc.errors import InputError, show
+from spherloc.geometry import DOWN, camera_centre, pose, so3_exp, transform, yaw_rotation
 from spherloc.problem import Problem
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 EXAMPLE = """\
 kind = "synthetic"
@@ -37,20 +37,41 @@ outlier_rate = 0.8
 noise_px = 1.0
 seed = 0
 gravity_error_deg = 0.0           # optional: standard deviation of the error of the known roll and pitch
+outlier_kind = "random"           # optional: "random", "coherent" (one wrong pose) or "repeated" (a facade's copies)
+field_of_view_deg = 360.0         # optional: points farther than half of it from the optical axis are not seen
+cloud_height_m = 10.0             # optional: height of the cloud of points, around the camera's if less than 10
+# true_camera = [30, 1, 0, 2]     # optional: yaw (deg) and position (m) of the camera; drawn if absent
 """
 
-HALF_SIZE_M = 5.0
-BATCH = 512
-MAX_BATCHES = 400
 MOST_CORRESPONDENCES = 10_000
 MOST_GRAVITY_ERROR_DEG = 10.0
 GRAVITY_BOUND_SD = 3.0
 """The bound on gravity, in standard deviations. Errors beyond it (1.1 %) are drawn again, so that the bound is true."""
+LIMITS: Mapping[str, tuple[float, float]] = {
+    "correspondences": (2, MOST_CORRESPONDENCES),
+    "outlier_rate": (0.0, 1.0),
+    "noise_px": (0.0, 100.0),
+    "seed": (0, 2**63 - 1),
+    "gravity_error_deg": (0.0, MOST_GRAVITY_ERROR_DEG),
+    "field_of_view_deg": (10.0, WHOLE_SPHERE_DEG),
+    "cloud_height_m": (0.0, 2 * HALF_SIZE_M),
+}
+"""Least and most of every number of a simulation."""
+TRUE_CAMERA_LIMITS = (360.0, 100.0, 100.0, 100.0)
+"""Largest absolute yaw (deg) and coordinates (m)."""
+
+TrueCamera = tuple[float, float, float, float]
+"""Yaw (deg) and position x, y, z (m) of the camera in the map frame."""
 
 
 @dataclass(frozen=True)
 class SyntheticScene:
-    """A random problem with known truth. The same seed keeps points and pose while noise or outliers change."""
+    """A random problem with known truth.
+
+    The same seed keeps points and pose while noise or outliers change. Where the true camera, the field of view or
+    the kind of outliers change, a point keeps its number, noise and label for as long as it is seen; else another
+    takes its place, if need be one outside the cube, 1 to 10 m in front of the camera.
+    """
 
     name: str
     """Shown to people."""
@@ -69,18 +90,36 @@ class SyntheticScene:
     gravity_error_deg: float = 0.0
     """Standard deviation of the error of the known roll and of the known pitch, degrees. The problem states it, and
     three times as much as the bound on the angle between the known and the true gravity, which is kept."""
+    outlier_kind: OutlierKind = "random"
+    """"random": each outlier agrees with a wrong pose of its own. "coherent": all with one wrong level pose, up to
+    noise; all points are then seen from both poses. "repeated": the pixel is right, but matched with a copy of its
+    point one or two steps of 2 m along x away, so that the outliers agree with poses shifted along it."""
+    field_of_view_deg: float = WHOLE_SPHERE_DEG
+    """Whatever is farther than half of it from the optical axis is not seen, degrees."""
+    cloud_height_m: float = 2 * HALF_SIZE_M
+    """Height of the cloud of points, m. Less than the cube's 10 m flattens it to the height of the drawn camera:
+    near 0 all right bearings are horizontal."""
+    true_camera: TrueCamera | None = None
+    """Yaw (deg) and position (m) of the true camera in the map frame; None for the one that is drawn."""
 
     def __post_init__(self) -> None:
-        for name, lowest, highest in (
-            ("correspondences", 2, MOST_CORRESPONDENCES),
-            ("outlier_rate", 0.0, 1.0),
-            ("noise_px", 0.0, 100.0),
-            ("seed", 0, 2**63 - 1),
-            ("gravity_error_deg", 0.0, MOST_GRAVITY_ERROR_DEG),
-        ):
+        for name, (lowest, highest) in LIMITS.items():
             value = getattr(self, name)
             if not lowest <= value <= highest:
                 raise InputError(f"{self.name}: {name} is {value}; give a number from {lowest:g} to {highest:g}.")
+        if self.outlier_kind not in OUTLIER_KINDS:
+            raise InputError(
+                f"{self.name}: outlier_kind is {show(self.outlier_kind)}; give one of {', '.join(OUTLIER_KINDS)}."
+            )
+        placed = self.true_camera
+        if placed is not None and not (
+            len(placed) == len(TRUE_CAMERA_LIMITS)
+            and all(abs(value) <= most for value, most in zip(placed, TRUE_CAMERA_LIMITS, strict=True))
+        ):
+            raise InputError(
+                f"{self.name}: true_camera is {show(placed)}; give its yaw from -360 to 360 degrees and its position "
+                "x, y, z, each from -100 to 100 metres."
+            )
 
     def problem(self, seed: int | None = None) -> Problem:
         """Draw the problem; ``seed`` replaces the scene's own.
@@ -89,12 +128,23 @@ class SyntheticScene:
         """
         if seed is not None and seed != self.seed:
             return replace(self, seed=seed).problem()
-        geometry, noise, choice, wrong, tilt = (np.random.default_rng([self.seed, stream]) for stream in range(5))
-        truth = _random_poses(geometry, 1)[0]
-        points, pixels = self._visible_points(geometry, noise, truth)
+        streams = [np.random.default_rng([self.seed, stream]) for stream in range(7)]
+        geometry, noise, choice, wrong, tilt, second, ahead = streams
+        drawn, lens = random_poses(geometry, 1)[0], Lens(self.camera, self.field_of_view_deg)
+        truth = drawn if self.true_camera is None else _placed(self.true_camera)
+        other = second_pose(second, truth, self.field_of_view_deg) if self.outlier_kind == "coherent" else None
+        poses = [truth] if other is None else [truth, other]
+        cloud = Cloud(self.name, float(camera_centre(drawn)[1]), self.cloud_height_m)
+        points, shift = cloud.seen_from((geometry, noise, ahead), self.correspondences, lens, drawn, poses)
         outliers = np.zeros(self.correspondences, dtype=bool)
         outliers[choice.permutation(self.correspondences)[: round(self.outlier_rate * self.correspondences)]] = True
-        pixels[outliers] = self._wrong_pixels(wrong, points)[outliers]
+        pixels = self._noisy_pixels(lens, truth, points, shift)
+        if other is not None:
+            pixels[outliers] = self._noisy_pixels(lens, other, points, shift)[outliers]
+        elif self.outlier_kind == "repeated":
+            points[outliers] = copies(second, lens, truth, points)[outliers]
+        else:
+            pixels[outliers] = random_pixels(wrong, lens, points, self.name)[outliers]
         gravity_sd_rad = float(np.radians(self.gravity_error_deg))
         return Problem(
             name=self.name,
@@ -108,70 +158,43 @@ class SyntheticScene:
             bound_px=self.bound_px,
             truth_cam_from_map=truth,
             truth_inliers=~outliers,
-            scene=f"synthetic: N {self.correspondences}, outliers {self.outlier_rate:g}, noise {self.noise_px:g} px, "
-            + (f"gravity error {self.gravity_error_deg:g} deg, " if self.gravity_error_deg else "")
-            + f"seed {self.seed}",
+            scene=self._description(),
         )
 
-    def _seen(self, pixels: FloatArray) -> BoolArray:
-        return in_image(self.camera, pixels) & self.camera.unproject(pixels)[1]
+    def _description(self) -> str:
+        """Where a problem comes from, in a line."""
+        kind = "" if self.outlier_kind == "random" else f" {self.outlier_kind}"
+        parts = [
+            f"N {self.correspondences}, outliers {self.outlier_rate:g}{kind}, noise {self.noise_px:g} px",
+            f"gravity error {self.gravity_error_deg:g} deg" if self.gravity_error_deg else "",
+            f"field of view {self.field_of_view_deg:g} deg" if self.field_of_view_deg < WHOLE_SPHERE_DEG else "",
+            f"cloud {self.cloud_height_m:g} m high" if self.cloud_height_m < 2 * HALF_SIZE_M else "",
+            "camera placed" if self.true_camera is not None else "",
+            f"seed {self.seed}",
+        ]
+        return f"synthetic: {', '.join(filter(None, parts))}"
 
-    def _visible_points(
-        self, geometry: np.random.Generator, noise: np.random.Generator, truth: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """The first N random points (N, 3) that are visible, and their noisy pixels (N, 2)."""
-        found: list[tuple[FloatArray, FloatArray]] = []
-        count = 0
-        for _ in range(MAX_BATCHES):
-            points = geometry.uniform(-HALF_SIZE_M, HALF_SIZE_M, (BATCH, 3))
-            pixels, valid = self.camera.project(transform(truth, points))
-            visible = valid & in_image(self.camera, pixels)
-            visible[visible] = self._seen(pixels[visible])
-            shift = noise.standard_normal((BATCH, 2))[visible]
-            found.append((points[visible], self._noisy(pixels[visible], shift)))
-            count += int(np.count_nonzero(visible))
-            if count >= self.correspondences:
-                points, pixels = (np.concatenate(parts)[: self.correspondences] for parts in zip(*found, strict=True))
-                return points, pixels
-        raise InputError(
-            f"{self.name}: only {count} of {BATCH * MAX_BATCHES:,} random points are visible to the camera; "
-            "give a wider camera, less noise, fewer correspondences or another seed."
-        )
+    def _noisy_pixels(self, lens: Lens, cam_from_map: FloatArray, points: FloatArray, shift: FloatArray) -> FloatArray:
+        """Pixels (N, 2) of the points (N, 3), moved by ``noise_px`` times ``shift`` (N, 2).
 
-    def _noisy(self, pixels: FloatArray, shift: FloatArray) -> FloatArray:
-        """Pixels (K, 2) moved by ``noise_px`` times ``shift`` (K, 2); at the border inwards, so that all stay visible.
-
-        The points must not depend on the noise: dragging it would otherwise replace some of them.
+        At the border inwards, so that all stay visible: the points must not depend on the noise, since dragging it
+        would otherwise replace some of them.
         """
+        pixels = self.camera.project(transform(cam_from_map, points))[0]
         shift = self.noise_px * shift
         for attempt in range(60):
-            lost = ~self._seen(pixels + shift)
+            lost = ~lens.sees(pixels + shift)
             if not lost.any():
                 break
             shift[lost] *= -1.0 if attempt % 2 == 0 else -0.5
         return pixels + shift
 
-    def _wrong_pixels(self, wrong: np.random.Generator, points: FloatArray) -> FloatArray:
-        """Pixels (N, 2) of the points (N, 3) under a random pose each under which it is visible."""
-        pixels = np.full((len(points), 2), np.nan)
-        for _ in range(MAX_BATCHES):
-            poses = _random_poses(wrong, len(points))
-            missing = np.isnan(pixels[:, 0])
-            rays = np.einsum("nij,nj->ni", poses[:, :, :3], points) + poses[:, :, 3]
-            candidates, valid = self.camera.project(rays)
-            visible = missing & valid
-            visible[visible] = self._seen(candidates[visible])
-            pixels[visible] = candidates[visible]
-            if not np.isnan(pixels).any():
-                return pixels
-        raise InputError(f"{self.name}: the camera sees too little of the cube to make outliers; give a wider camera.")
 
-
-def _random_poses(rng: np.random.Generator, count: int) -> FloatArray:
-    """Level poses (count, 3, 4): any yaw, translation uniform in the cube."""
-    yaws = rng.uniform(-np.pi, np.pi, count)
-    translations = rng.uniform(-HALF_SIZE_M, HALF_SIZE_M, (count, 3))
-    return np.array([pose(yaw_rotation(yaw), t) for yaw, t in zip(yaws, translations, strict=True)])
+def _placed(true_camera: TrueCamera) -> FloatArray:
+    """The level pose (3, 4) of a camera with that yaw (deg) and position (m)."""
+    yaw_deg, *position = true_camera
+    rotation = yaw_rotation(float(np.radians(yaw_deg)))
+    return pose(rotation, -rotation @ np.array(position, dtype=np.float64))
 
 
 def _tilted_down(rng: np.random.Generator, sd_rad: float) -> FloatArray:
@@ -190,16 +213,21 @@ def load(table: dict[str, Any], path: Path) -> SyntheticScene:
     simulation = scene_file.section(table, "simulation", where)
     place = f"{where} [simulation]"
     required = {"correspondences", "outlier_rate", "noise_px", "seed"}
-    scene_file.check_keys(simulation, required, {"gravity_error_deg"}, place)
-    return SyntheticScene(
-        name=scene_file.text(table, "name", where),
-        camera=camera_from_table(scene_file.section(table, "camera", where), where),
-        correspondences=scene_file.integer(simulation, "correspondences", place, 2, MOST_CORRESPONDENCES),
-        outlier_rate=scene_file.number(simulation, "outlier_rate", place, 0.0, 1.0),
-        noise_px=scene_file.number(simulation, "noise_px", place, 0.0, 100.0),
-        seed=scene_file.integer(simulation, "seed", place, 0, 2**63 - 1),
-        bound_px=scene_file.bound_px(table, where),
-        gravity_error_deg=scene_file.number(
-            {"gravity_error_deg": 0.0} | simulation, "gravity_error_deg", place, 0.0, MOST_GRAVITY_ERROR_DEG
-        ),
-    )
+    numbers = {"gravity_error_deg", "field_of_view_deg", "cloud_height_m"}
+    scene_file.check_keys(simulation, required, numbers | {"outlier_kind", "true_camera"}, place)
+    given: dict[str, Any] = {
+        key: scene_file.number(simulation, key, place, *LIMITS[key])
+        for key in ("outlier_rate", "noise_px", *sorted(numbers & simulation.keys()))
+    }
+    for key, most in (("correspondences", MOST_CORRESPONDENCES), ("seed", 2**63 - 1)):
+        given[key] = scene_file.integer(simulation, key, place, int(LIMITS[key][0]), most)
+    if "outlier_kind" in simulation:
+        given["outlier_kind"] = scene_file.text(simulation, "outlier_kind", place)
+    if "true_camera" in simulation:
+        given["true_camera"] = tuple(scene_file.numbers(simulation["true_camera"], (4,), "true_camera", place).tolist())
+    name, bound_px = scene_file.text(table, "name", where), scene_file.bound_px(table, where)
+    camera = camera_from_table(scene_file.section(table, "camera", where), where)
+    try:
+        return SyntheticScene(name=name, camera=camera, bound_px=bound_px, **given)
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None

@@ -5,23 +5,15 @@ Matches have the numbers that they have where nothing is hidden.
 
 import threading
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from spherloc.datasets.variation import Variation
 from spherloc_viz.app.catalog import SceneWish
 
 Numbers = tuple[int, ...]
-
-
-@dataclass(frozen=True)
-class Changes:
-    """What was done to the matches of one problem."""
-
-    spoiled: Numbers = ()
-    mended: Numbers = ()
-    hidden: Numbers = ()
 
 
 class Edits:
@@ -31,12 +23,17 @@ class Edits:
         self._lock = threading.Lock()
         self._selected: Numbers = ()
         self._owner: tuple = ()
-        self._changes = Changes()
+        self._changes = Variation()
 
     @property
     def selected(self) -> Numbers:
         """Numbers of the selected matches, ascending."""
         return self._selected
+
+    @property
+    def changes(self) -> Variation:
+        """What is spoiled, mended and hidden."""
+        return self._changes
 
     def select(self, numbers: Iterable[int], extend: bool = False) -> None:
         """Select these and no others; with ``extend`` add them, or take them away if all are selected already."""
@@ -49,16 +46,18 @@ class Edits:
 
     def spoil(self) -> None:
         """Make the selected matches wrong."""
-        self._change("spoiled", "mended")
+        with self._lock:
+            self._changes = self._changes.spoil(self._selected)
 
     def mend(self) -> None:
         """Make the selected matches right."""
-        self._change("mended", "spoiled")
+        with self._lock:
+            self._changes = self._changes.mend(self._selected)
 
     def hide(self) -> None:
         """Leave the selected matches out, and select none."""
-        self._change("hidden")
-        self.select(())
+        with self._lock:
+            self._changes, self._selected = self._changes.hide(self._selected), ()
 
     def show_all(self) -> None:
         """Hide no match any more."""
@@ -68,39 +67,30 @@ class Edits:
     def clear(self) -> None:
         """Take back all changes."""
         with self._lock:
-            self._changes = Changes()
+            self._changes = Variation()
 
     def write(self, wish: SceneWish) -> None:
         """Take over the changes of a wish."""
-        variation = wish.variation
+        known = wish.variation
         with self._lock:
             self._owner = _owner(wish)
-            self._changes = Changes(variation.spoiled, variation.mended, variation.hidden)
+            self._changes = Variation(spoiled=known.spoiled, mended=known.mended, hidden=known.hidden)
 
     def apply(self, wish: SceneWish) -> SceneWish:
         """The wish with the changes. Those of another problem are dropped, and the selection with them."""
         with self._lock:
             if _owner(wish) != self._owner:
-                self._owner, self._changes, self._selected = _owner(wish), Changes(), ()
-            changes, count = self._changes, wish.variation.correspondences
-            within = (
-                tuple(number for number in numbers if count is None or number < count)
-                for numbers in (changes.spoiled, changes.mended, changes.hidden)
-            )
-            spoiled, mended, hidden = within
-            return replace(wish, variation=replace(wish.variation, spoiled=spoiled, mended=mended, hidden=hidden))
+                self._owner, self._changes, self._selected = _owner(wish), Variation(), ()
+            edited, count = self._changes, wish.variation.correspondences
+            changes = {
+                name: tuple(number for number in getattr(edited, name) if count is None or number < count)
+                for name in ("spoiled", "mended", "hidden")
+            }
+            return replace(wish, variation=replace(wish.variation, **changes))
 
     def places(self, kept: NDArray[np.int64]) -> Numbers:
         """Where the selected matches are in a problem in which the matches ``kept`` (N,) are left."""
         return tuple(np.flatnonzero(np.isin(kept, self._selected)).tolist())
-
-    def _change(self, into: str, out_of: str | None = None) -> None:
-        with self._lock:
-            chosen = set(self._selected)
-            values = {into: tuple(sorted(chosen | set(getattr(self._changes, into))))}
-            if out_of is not None:
-                values[out_of] = tuple(sorted(set(getattr(self._changes, out_of)) - chosen))
-            self._changes = replace(self._changes, **values)
 
 
 def _owner(wish: SceneWish) -> tuple:

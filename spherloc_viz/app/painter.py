@@ -1,8 +1,8 @@
 """Draws a picture's primitives into one client's canvas, changing what is there rather than drawing anew."""
 
-from collections.abc import Iterable
-from functools import cache
-from typing import Any
+from collections.abc import Callable, Iterable
+from functools import cache, partial
+from typing import Any, Literal
 
 import numpy as np
 import trimesh
@@ -10,35 +10,56 @@ import viser
 import viser.transforms as vtf
 
 from spherloc_viz.app.colors import light_bytes, surface_bytes
-from spherloc_viz.layers.primitives import Balls, Mesh, Points, SceneItem, Segments
+from spherloc_viz.app.picking import inside, nearest, viewer_of
+from spherloc_viz.app.texture import textured_glb
+from spherloc_viz.layers.primitives import Balls, ColorArray, Label, Mesh, Points, SceneItem, Segments, Textured
+
+OnPick = Callable[[tuple[int, ...], bool], None]
+"""Gets the correspondences (numbers in the problem) that were picked, and whether they extend the selection."""
 
 SHELLS = 12
 """Nodes that share the balls of one primitive."""
 MOST_ROUND = 400
 """Above this many, dots get fewer faces."""
 MOST_BATCHED = 3000
-"""Above this many, dots become a point cloud, which costs less and cannot be clicked."""
+"""Above this many, dots become a point cloud, which costs less."""
+LABEL_SCALE = 0.9
+"""Size of words, by viser's own."""
 
 
 class Painter:
-    """The canvas of one client."""
+    """The canvas of one client. What is picked there is found here, by the ray of the click: so lines, dots of a
+    point cloud and balls within balls can be picked too, and a small dot within some pixels."""
 
-    def __init__(self, client: viser.ClientHandle) -> None:
-        self._client = client
+    def __init__(self, client: viser.ClientHandle, on_pick: OnPick = lambda ids, extend: None) -> None:
+        """``on_pick`` is called on viser's threads; a click on nothing picks ()."""
+        self._client, self._on_pick = client, on_pick
         self._drawn: dict[str, tuple[Any, tuple, str]] = {}
+        self._pictures: dict[str, ColorArray] = {}
+        self._shown: tuple[SceneItem, ...] = ()
         self._backdrop: tuple[bytes, Any] | None = None
+        scene, extend = client.scene, partial(self._clicked, extend=True)
+        scene.on_click()(partial(self._clicked, extend=False))
+        scene.on_click(modifier="shift")(extend)
+        scene.on_click(modifier="cmd/ctrl")(extend)
+        scene.on_rect_select(modifier="shift")(self._framed)
 
     def draw(self, items: Iterable[SceneItem], layers: frozenset[str]) -> None:
         """Show these primitives, those of ``layers`` only, and hide all others."""
-        names = set()
+        names, shown = set(), []
         with self._client.atomic():
             for item in items:
-                look = _look(item)
-                for part in _parts(item):
+                if item.layer in layers:
+                    shown.append(item)
+                elif isinstance(item, Textured):
+                    continue
+                look = self._look(item)
+                for part in _parts(item, look):
                     self._put(part, look)
                     names.add(part.name)
             for name, (handle, _, layer) in self._drawn.items():
                 handle.visible = name in names and layer in layers
+        self._shown = tuple(shown)
 
     def draw_backdrop(self, glb: bytes | None, aligned_from_map: np.ndarray, visible: bool) -> None:
         """Show the map's mesh, a binary glTF in the map frame, behind the pictures of a run; None for none.
@@ -60,21 +81,56 @@ class Painter:
     def _put(self, item: SceneItem, look: tuple) -> None:
         handle, known, _ = self._drawn.get(item.name, (None, None, ""))
         if handle is None or known != look:
-            handle = _add(self._client.scene, item)
+            handle = _add(self._client.scene, item, self._pictures.get(item.name))
         else:
             for name, value in _changing(item).items():
                 setattr(handle, name, value)
         self._drawn[item.name] = (handle, look, item.layer)
 
+    def _look(self, item: SceneItem) -> tuple:
+        """What cannot change without adding the node anew: its kind, its size, and what viser sets once."""
+        extra: tuple = ()
+        match item:
+            case Points():
+                extra = (item.rim,)
+            case Mesh():
+                extra = (len(item.vertices), item.color, item.opacity)
+            case Balls():
+                extra = (item.opacity,)
+            case Segments():
+                extra = (item.width_px,)
+            case Label():
+                extra = (item.height_m is None,)
+            case Textured():
+                extra = (id(self._picture(item)), item.vertices.tobytes(), item.uv.tobytes())
+        return (type(item), _size(item), *extra)
 
-def _parts(item: SceneItem) -> list[SceneItem]:
+    def _picture(self, item: Textured) -> ColorArray | None:
+        """The item's picture: the very array that was drawn before if it shows the same."""
+        image, known = item.image(), self._pictures.get(item.name)
+        if image is None:
+            return None
+        if known is None or not (known is image or np.array_equal(known, image)):
+            self._pictures[item.name] = image
+        return self._pictures[item.name]
+
+    def _clicked(self, event: viser.SceneClickEvent, extend: bool) -> None:
+        viewer = viewer_of(event.client.camera)
+        origin, direction = np.array(event.ray_origin), np.array(event.ray_direction)
+        self._on_pick(nearest(self._shown, origin, direction, viewer.radians_per_pixel), extend)
+
+    def _framed(self, event: viser.SceneRectSelectEvent) -> None:
+        self._on_pick(inside(self._shown, viewer_of(event.client.camera), event.screen_min, event.screen_max), False)
+
+
+def _parts(item: SceneItem, look: tuple) -> list[SceneItem]:
     """The item as nodes that are drawn one after another; none if there is nothing to draw.
 
     Balls within balls: a translucent surface hides what is drawn after it and lies behind. Within a node viser draws
     by distance of the centres, which says nothing about balls around one spot; but nodes are drawn in the order in
     which they were added. So balls are drawn in shells, the smallest first.
     """
-    if not _size(item):
+    if not _size(item) or (isinstance(item, Textured) and look[2] == id(None)):
         return []
     if not isinstance(item, Balls):
         return [item]
@@ -94,20 +150,10 @@ def _size(item: SceneItem) -> int:
             return len(item.points)
         case Balls():
             return len(item.centers)
-        case Mesh():
+        case Mesh() | Textured():
             return len(item.faces)
-
-
-def _look(item: SceneItem) -> tuple:
-    """What cannot change without adding the node anew: its kind, its size, and what viser sets once."""
-    extra: tuple = ()
-    if isinstance(item, Mesh):
-        extra = (len(item.vertices), item.color, item.opacity)
-    elif isinstance(item, Balls):
-        extra = (item.opacity,)
-    elif isinstance(item, Segments):
-        extra = (item.width_px,)
-    return (type(item), _size(item), *extra)
+        case Label():
+            return int(item.text != "")
 
 
 def _changing(item: SceneItem) -> dict[str, Any]:
@@ -124,6 +170,14 @@ def _changing(item: SceneItem) -> dict[str, Any]:
             return _instances(item.centers, item.radii_m, item.colors)
         case Mesh():
             return {"vertices": np.float32(item.vertices), "faces": np.uint32(item.faces)}
+        case Textured():
+            turn = item.map_from_mesh[:, :3]
+            scale = float(np.cbrt(np.linalg.det(turn)))
+            wxyz = vtf.SO3.from_matrix(turn / scale).wxyz
+            return {"wxyz": wxyz, "position": item.map_from_mesh[:, 3], "scale": scale}
+        case Label():
+            height = {} if item.height_m is None else {"font_scene_height": item.height_m}
+            return {"text": item.text, "position": item.position, **height}
 
 
 def _instances(positions: np.ndarray, radii_m: np.ndarray, colors: np.ndarray) -> dict[str, Any]:
@@ -140,14 +194,14 @@ def _unit_ball(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(mesh.vertices), np.asarray(mesh.faces)
 
 
-def _add(scene: viser.SceneApi, item: SceneItem) -> Any:
+def _add(scene: viser.SceneApi, item: SceneItem, picture: ColorArray | None) -> Any:
     name, props = f"/{item.name}", _changing(item)
     match item:
         case Points() if "points" in props:
             return scene.add_point_cloud(name, point_shape="circle", precision="float32", **props)
         case Points():
             fine = len(item.positions) <= MOST_ROUND
-            return _add_batch(scene, name, 2 if fine else 1, None, props)
+            return _add_batch(scene, name, 2 if fine else 1, None, props, "back" if item.rim else "front")
         case Segments():
             return scene.add_line_segments(name, thickness=item.width_px, thickness_units="screen", **props)
         case Balls():
@@ -161,10 +215,24 @@ def _add(scene: viser.SceneApi, item: SceneItem) -> Any:
                 receive_shadow=False,
                 **props,
             )
+        case Textured():
+            assert picture is not None
+            glb = textured_glb(item.vertices, item.faces, item.uv, picture)
+            return scene.add_glb(name, glb, cast_shadow=False, receive_shadow=False, **props)
+        case Label():
+            mode = "screen" if item.height_m is None else "scene"
+            return scene.add_label(
+                name, font_size_mode=mode, font_screen_scale=LABEL_SCALE, anchor="center-center", **props
+            )
 
 
 def _add_batch(
-    scene: viser.SceneApi, name: str, subdivisions: int, opacity: float | None, props: dict[str, Any]
+    scene: viser.SceneApi,
+    name: str,
+    subdivisions: int,
+    opacity: float | None,
+    props: dict[str, Any],
+    side: Literal["front", "back"] = "front",
 ) -> Any:
     vertices, faces = _unit_ball(subdivisions)
     upright = np.tile(np.array([1.0, 0.0, 0.0, 0.0], np.float32), (len(props["batched_positions"]), 1))
@@ -177,5 +245,6 @@ def _add_batch(
         lod="off",
         cast_shadow=False,
         receive_shadow=False,
+        side=side,
         **props,
     )

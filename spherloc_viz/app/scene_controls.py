@@ -4,9 +4,11 @@ from collections.abc import Callable
 
 import viser
 
+from spherloc.datasets.variation import Variation
 from spherloc.errors import InputError
-from spherloc_viz.app.catalog import OWN_CAMERA, Catalog, SceneWish
+from spherloc_viz.app.catalog import Catalog, SceneWish
 
+OWN_CAMERA = "the scene's own"
 MOST_POINTS, MOST_NOISE_PX, MOST_OUTLIERS, MOST_GRAVITY_DEG = 500, 10.0, 99.0, 2.0
 
 
@@ -82,16 +84,15 @@ class SceneControls:
             return SceneWish(label, seed, self._query.value)
         if self._catalog.synthetic(label) is None:
             return SceneWish(label, seed)
-        rate = round(self._outliers.value / 100.0, 8)
-        return SceneWish(
-            label,
-            seed,
-            camera=self._camera.value,
-            correspondences=int(self._points.value),
-            noise_px=float(self._noise.value),
-            outlier_rate=rate,
-            gravity_error_deg=float(self._gravity.value),
-        )
+        changes = {
+            "correspondences": int(self._points.value),
+            "noise_px": float(self._noise.value),
+            "outlier_rate": round(self._outliers.value / 100.0, 8),
+            "gravity_error_deg": float(self._gravity.value),
+        }
+        scene = self._catalog.synthetic(label)
+        changed: dict = {name: value for name, value in changes.items() if value != getattr(scene, name)}
+        return SceneWish(label, seed, None, Variation(camera=self._catalog.cameras.get(self._camera.value), **changed))
 
     def next_seed(self) -> None:
         """The next seed; 0 after what is no seed."""

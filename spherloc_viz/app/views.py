@@ -6,9 +6,11 @@ import numpy as np
 import viser
 
 from spherloc.geometry import yaw_rotation
-from spherloc_viz.layers.primitives import Balls, FloatArray, Mesh, Picture, Points, Segments
+from spherloc_viz.layers.primitives import Balls, FloatArray, Mesh, Picture, Points, SceneItem, Segments, Textured
 
 FIELD_OF_VIEW_RAD = np.radians(45.0)
+WIDE_RAD = np.radians(85.0)
+"""Field of view of who stands in the camera."""
 UP = np.array([0.0, -1.0, 0.0])
 START = (3.0, -3.0, 3.0)
 """Where a page's viewer stands until its first view is set."""
@@ -27,6 +29,11 @@ DIRECTIONS = {
     "Balls": (0.35, -0.45, -0.8),
 }
 """From the subject to the viewer; y points down."""
+INSIDE = "From the camera"
+NAMES = (*DIRECTIONS, INSIDE)
+"""All views."""
+TURNING = 0.02
+"""How far before the eye of who stands in the camera the point lies around which the mouse turns, in sphere radii."""
 SUBJECTS = (
     ("Balls", "balls/clique"),
     ("Balls", "balls/others"),
@@ -47,6 +54,7 @@ class View:
 
     position: FloatArray
     target: FloatArray
+    field_of_view_rad: float = FIELD_OF_VIEW_RAD
 
 
 def is_unmoved(client: viser.ClientHandle) -> bool:
@@ -59,7 +67,7 @@ def look(client: viser.ClientHandle, view: View) -> None:
     with client.atomic():
         camera = client.camera
         camera.up_direction = UP
-        camera.fov = FIELD_OF_VIEW_RAD
+        camera.fov = view.field_of_view_rad
         camera.position = view.position
         camera.look_at = view.target
 
@@ -78,6 +86,8 @@ def find(name: str, picture: Picture, aspect: float) -> View:
 
     Close views are turned about the vertical until few map points stand in their way.
     """
+    if name == INSIDE:
+        return _inside(picture)
     subject = _subject(name, picture)
     turns = TURNS_RAD if name in ("Sphere", "Balls") else TURNS_RAD[:1]
     directions = [yaw_rotation(turn) @ np.array(DIRECTIONS[name]) for turn in turns]
@@ -85,6 +95,30 @@ def find(name: str, picture: Picture, aspect: float) -> View:
     points = next(item for item in picture.scene if isinstance(item, Points) and item.name == "map/points")
     hidden = [_in_the_way(view, points.positions) + 0.5 * k for k, view in enumerate(views)]
     return views[int(np.argmin(hidden))]
+
+
+def _inside(picture: Picture) -> View:
+    """From where the camera, or, while its position is unknown, the sphere is, along its axis."""
+    items = {item.name: item for item in picture.scene}
+    surface = items["sphere/surface"]
+    assert isinstance(surface, Mesh)
+    centre = _centre(surface)
+    axis = _axis(items)
+    camera = items.get("cameras/estimate")
+    if isinstance(camera, Segments):
+        centre = camera.points[0, 0]
+    radius = float(np.max(surface.vertices[:, 0] - _centre(surface)[0]))
+    return View(centre, centre + TURNING * radius * axis, WIDE_RAD)
+
+
+def _axis(items: dict[str, SceneItem]) -> FloatArray:
+    """Where the camera looks (3,); +z of the map if the picture does not tell."""
+    camera, image = items.get("cameras/estimate"), items.get("sphere/image")
+    if isinstance(camera, Segments):
+        axis = np.sum(camera.points[:4, 1] - camera.points[:4, 0], axis=0)
+    else:
+        axis = image.map_from_mesh[:, 2] if isinstance(image, Textured) else np.array([0.0, 0.0, 1.0])
+    return axis / np.linalg.norm(axis)
 
 
 def _fit(subject: FloatArray, direction: FloatArray, aspect: float) -> View:
@@ -137,12 +171,16 @@ def _subject(name: str, picture: Picture) -> FloatArray:
 def _sphere(surface: object, ring: bool) -> FloatArray:
     """The sphere with some room, or the ring around it."""
     assert isinstance(surface, Mesh)
-    centre = (np.min(surface.vertices, axis=0) + np.max(surface.vertices, axis=0)) / 2
+    centre = _centre(surface)
     if not ring:
         return centre + ROOM * (surface.vertices - centre)
     angle = np.linspace(0, 2 * np.pi, 36)
     circle = np.column_stack([np.cos(angle), 0 * angle, np.sin(angle)])
     return centre + RING * np.max(surface.vertices[:, 0] - centre[0]) * circle
+
+
+def _centre(surface: Mesh) -> FloatArray:
+    return (np.min(surface.vertices, axis=0) + np.max(surface.vertices, axis=0)) / 2
 
 
 def _balls(balls: Balls) -> FloatArray:

@@ -1,8 +1,8 @@
 """Turns (trace, step) into primitives. The page and the recording draw these and nothing else."""
 
+import threading
 from collections.abc import Callable
-from dataclasses import replace
-from functools import lru_cache
+from dataclasses import dataclass, replace
 from typing import Any
 
 from spherloc.trace import (
@@ -16,48 +16,79 @@ from spherloc.trace import (
     YawStage,
 )
 from spherloc_viz import style
-from spherloc_viz.layers import consensus, decision, ransac, refinement, start, translation, yaw
-from spherloc_viz.layers.frame import Frame, RunView
-from spherloc_viz.layers.primitives import FloatArray, Picture, Step
+from spherloc_viz.layers import consensus, decision, outcome, ransac, refinement, start, translation, yaw
+from spherloc_viz.layers.frame import Plan, RunView
+from spherloc_viz.layers.primitives import Chart, FloatArray, Picture, Step, Stop
 from spherloc_viz.layers.scene import base_items, camera
 from spherloc_viz.layers.tables import outcome_table
 
-FRAMES: dict[type[Stage], Callable[[RunView, Any], list[Frame]]] = {
-    DecisionStage: decision.frames,
-    RansacStage: ransac.frames,
-    YawStage: yaw.frames,
-    TranslationStage: translation.frames,
-    ConsensusStage: consensus.frames,
-    RefinementStage: refinement.frames,
+STAGES: dict[type[Stage], tuple[str, Callable[[RunView, Any], list[Plan]]]] = {
+    DecisionStage: ("Choice", decision.plans),
+    RansacStage: ("Samples", ransac.plans),
+    YawStage: ("Yaw", yaw.plans),
+    TranslationStage: ("Translation", translation.plans),
+    ConsensusStage: ("Consensus", consensus.plans),
+    RefinementStage: ("Refinement", refinement.plans),
 }
-"""The file that draws each kind of stage."""
+"""What each kind of stage is called, and what draws it."""
+FIRST, LAST = "Matches", "Outcome"
+"""Stages that every run has."""
 
 
-@lru_cache(maxsize=4)
-def _timeline(trace: Trace) -> tuple[RunView, tuple[Frame, ...]]:
-    view = RunView(trace)
-    frames = start.frames(view)
-    for stage in trace.stages:
-        frames += FRAMES[type(stage)](view, stage)
-    return view, (*frames, refinement.outcome_frame(view))
+@dataclass(frozen=True, eq=False)
+class _Timeline:
+    view: RunView
+    plans: tuple[Plan, ...]
+    stops: tuple[Stop, ...]
 
 
-def steps(trace: Trace) -> tuple[Step, ...]:
-    """The stops on the run's timeline, from the matches to the outcome."""
-    return tuple(frame.step for frame in _timeline(trace)[1])
+class _Kept(threading.local):
+    """The timeline that was used last. Each page has a thread that paints, and each of them stays with one run."""
+
+    timeline: _Timeline | None = None
+
+
+_kept = _Kept()
+
+
+def _timeline(trace: Trace) -> _Timeline:
+    known = _kept.timeline
+    if known is None or known.view.trace is not trace:
+        known = _kept.timeline = _planned(RunView(trace))
+    return known
+
+
+def _planned(view: RunView) -> _Timeline:
+    parts = [(FIRST, start.plans(view))]
+    for stage in view.trace.stages:
+        name, plans = STAGES[type(stage)]
+        parts.append((name, plans(view, stage)))
+    parts.append((LAST, outcome.plans(view)))
+    named = [(name, plan) for name, plans in parts for plan in plans]
+    stops = tuple(Stop(plan.key, plan.title, name) for name, plan in named)
+    return _Timeline(view, tuple(plan for _, plan in named), stops)
+
+
+def steps(trace: Trace) -> tuple[Stop, ...]:
+    """The stops on the run's timeline, from the matches to the outcome. What they say is painted with them."""
+    return _timeline(trace).stops
 
 
 def paint(trace: Trace, index: int) -> Picture:
     """What the step at ``index`` looks like. Charts of earlier steps stay."""
-    view, frames = _timeline(trace)
-    frame = frames[index]
-    charts = {chart.name: chart for earlier in frames[: index + 1] for chart in earlier.charts}
-    tables = (*frame.tables, outcome_table(trace)) if index == len(frames) - 1 else frame.tables
-    return Picture(frame.step, base_items(view, frame) + frame.extra(), tuple(charts.values()), tables)
+    timeline = _timeline(trace)
+    stop, frame = timeline.stops[index], timeline.plans[index].draw()
+    charts: dict[str, Callable[[], Chart]] = {}
+    for plan in timeline.plans[: index + 1]:
+        charts.update(plan.charts)
+    tables = (*frame.tables, outcome_table(trace)) if index == len(timeline.plans) - 1 else frame.tables
+    step = Step(stop.key, stop.title, frame.caption, frame.equation, frame.note, stop.stage)
+    scene = base_items(timeline.view, frame) + frame.items
+    return Picture(step, scene, tuple(chart() for chart in charts.values()), tables)
 
 
 def with_rival(picture: Picture, trace: Trace, cam_from_map: FloatArray) -> Picture:
     """The picture with another pose (3, 4) beside the run's own."""
-    view = _timeline(trace)[0]
+    view = _timeline(trace).view
     rival = camera("cameras/rival", view.aligned_pose(cam_from_map), 1.7 * view.sphere_m, style.RIVAL, 2.5)
     return replace(picture, scene=(*picture.scene, rival))

@@ -1,6 +1,6 @@
 """Exact consensus: the bound over yaw, the largest set of matches that agrees, and the poses that were verified."""
 
-from itertools import combinations
+from functools import partial
 
 import numpy as np
 
@@ -9,86 +9,54 @@ from spherloc.metrics import rotation_error_deg, translation_error_m
 from spherloc.trace import ConsensusStage
 from spherloc_viz import style
 from spherloc_viz.layers import ring
-from spherloc_viz.layers.frame import Frame, RunView, even, one_color
-from spherloc_viz.layers.primitives import Chart, Curve, FloatArray, SceneItem, Segments, Step, Table
+from spherloc_viz.layers import yaw_bound as bound
+from spherloc_viz.layers.frame import Frame, Plan, RunView, even, growing, one_color
+from spherloc_viz.layers.primitives import FloatArray, SceneItem, Segments, Table
 from spherloc_viz.layers.scene import camera
+from spherloc_viz.layers.yaw_bound import best_support, highest_bound
+
+CLIQUE_SIZES = (2, 3, 5, 10, 20, 50, 100)
+"""How many members of the largest set are shown before all are."""
 
 
-def frames(view: RunView, stage: ConsensusStage) -> list[Frame]:
-    """The bound; then the clique and the poses, where the search has found any."""
-    out = [_bound(view, stage)]
+def plans(view: RunView, stage: ConsensusStage) -> list[Plan]:
+    """The first guess and the bound; then the set and the poses, where the search has found any."""
+    charts = {"consensus": partial(bound.chart, view, stage)}
+    out = bound.plans(view, stage)
+    for size in growing(len(stage.clique), *CLIQUE_SIZES):
+        title, draw = f"{size} matches that agree", partial(_members, view, stage, size)
+        out.append(Plan(f"consensus-clique-{size}", title, draw, charts))
     if len(stage.clique):
-        out.append(_clique(view, stage))
+        title = "The largest set that agrees"
+        out.append(Plan("consensus-clique", title, lambda: _clique(view, stage), charts))
+    shown = min(len(stage.support), 1 + style.MAX_DRAWN_RIVALS)
+    for rank in range(shown if shown > 1 else 0):
+        title = "The best pose" if rank == 0 else f"Rival pose {rank}"
+        out.append(Plan(f"consensus-pose-{rank + 1}", title, partial(_pose, view, stage, rank), charts))
     if len(stage.support):
-        out.append(_poses(view, stage))
+        out.append(Plan("consensus-poses", "The poses that were verified", lambda: _poses(view, stage), charts))
     return out
 
 
-def _most(stage: ConsensusStage) -> int:
-    return int(stage.bound.max())
-
-
-def _best(stage: ConsensusStage) -> int:
-    """Correspondences that the best known pose explains."""
-    return int(stage.support.max(initial=stage.seed_support))
-
-
-def _bound(view: RunView, stage: ConsensusStage) -> Frame:
-    most, best, start = _most(stage), _best(stage), view.standing(np.eye(3))
-    open_share = 100.0 * np.count_nonzero(stage.bound > best) / len(stage.bound)
-    left = f"{open_share:.3g} % of all yaws could hide a better one" if open_share else "no yaw could hide a better one"
-    return Frame(
-        Step(
-            "consensus-bound",
-            "What no pose can beat, at each yaw",
-            f"Matches that one pose explains agree in pairs at its yaw, as {stage.arcs:,} arcs tell, so the largest "
-            f"set that agrees at a yaw is a bound: no pose explains more than {most} of {len(view.points)} matches. "
-            f"The first guess explains {stage.seed_support} and the best pose {best}, and {left}.",
-            f"max over θ of ω(G(θ)) = {most},  ij ∈ G(θ) ⇔ |f_ij(θ)| ≤ τ_ij",
-            _effort(stage),
-        ),
-        start,
-        view.colors(style.UNDECIDED),
-        view.nobody(),
-        extra=lambda: _ring(view, stage, start),
-        charts=(chart(view, stage),),
-    )
-
-
-def _effort(stage: ConsensusStage) -> str:
-    end = (
-        "every yaw that could hide a better pose was searched to its end."
-        if stage.finished
-        else "the budget ran out before every yaw was searched, so that the bound is larger than it might be."
-    )
-    return f"Effort: {stage.effort:,} words of bitsets; {end}"
-
-
 def _clique(view: RunView, stage: ConsensusStage) -> Frame:
-    turned = view.standing(yaw_rotation(stage.yaw_rad))
-    size, most = len(stage.clique), _most(stage)
-    pairs, note = _pairs(stage)
+    size, most = len(stage.clique), highest_bound(stage)
+    pairs, note = _pairs(stage.clique)
     return Frame(
-        Step(
-            "consensus-clique",
-            "The largest set that agrees",
-            _agreement(view, stage),
-            f"{size} ≤ max over θ of ω(G(θ)) ≤ {most}",
-            note,
-        ),
-        turned,
+        _agreement(view, stage),
+        f"{size} ≤ max over θ of ω(G(θ)) ≤ {most}",
+        view.standing(yaw_rotation(stage.yaw_rad)),
         view.colors(style.UNDECIDED, (stage.clique, style.CLIQUE)),
         view.nobody(),
-        extra=lambda: (_edges(view, pairs),),
-        charts=(chart(view, stage),),
+        note=note,
+        items=(_edges(view, pairs),),
     )
 
 
 def _agreement(view: RunView, stage: ConsensusStage) -> str:
     """What the largest set is, and what follows."""
-    size, most, best = len(stage.clique), _most(stage), _best(stage)
+    size, most, best = len(stage.clique), highest_bound(stage), best_support(stage)
     labels = view.trace.problem.truth_inliers
-    right = "" if labels is None else f", {np.count_nonzero(labels[stage.clique])} of them right ones,"
+    right = "" if labels is None else f"{view.right_ones(stage.clique)},"
     if size > best:
         return (
             f"{size} matches{right} agree in pairs at some yaw, {size - best} more than the best pose explains. "
@@ -103,9 +71,26 @@ def _agreement(view: RunView, stage: ConsensusStage) -> str:
     )
 
 
-def _pairs(stage: ConsensusStage) -> tuple[np.ndarray, str]:
-    """Pairs (P, 2) of the clique to draw, and the rule by which others are left out."""
-    pairs = np.array(list(combinations(stage.clique.tolist(), 2)), dtype=np.int64).reshape(-1, 2)
+def _members(view: RunView, stage: ConsensusStage, size: int) -> Frame:
+    """The first members of the largest set."""
+    chosen, whole = stage.clique[:size], len(stage.clique)
+    pairs, note = _pairs(chosen)
+    return Frame(
+        f"{size} of the {whole} matches{view.right_ones(chosen)}{',' if view.right_ones(chosen) else ''} agree in all "
+        f"{size * (size - 1) // 2:,} pairs at one yaw. The next one must agree with each of these {size}, which a "
+        "wrong match seldom does.",
+        f"{size} ≤ max over θ of ω(G(θ))",
+        view.standing(yaw_rotation(stage.yaw_rad)),
+        view.colors(style.UNDECIDED, (chosen, style.CLIQUE)),
+        view.nobody(),
+        note=note,
+        items=(_edges(view, pairs),),
+    )
+
+
+def _pairs(clique: np.ndarray) -> tuple[np.ndarray, str]:
+    """Pairs (P, 2) of a set to draw, and the rule by which others are left out."""
+    pairs = clique[np.column_stack(np.triu_indices(len(clique), 1))].astype(np.int64)
     drawn = pairs[even(np.arange(len(pairs)), style.MAX_DRAWN_PAIRS)]
     if len(drawn) == len(pairs):
         return drawn, f"All {len(pairs):,} pairs are drawn, as lines on the map."
@@ -116,12 +101,37 @@ def _pairs(stage: ConsensusStage) -> tuple[np.ndarray, str]:
 
 
 def _edges(view: RunView, pairs: np.ndarray) -> Segments:
-    return Segments("pairs/clique", "pairs", view.points[pairs], one_color(style.CLIQUE, len(pairs)), 1.0)
+    colors = one_color(style.CLIQUE, len(pairs))
+    return Segments("pairs/clique", "pairs", view.points[pairs], colors, 1.0, ids=pairs)
+
+
+def _pose(view: RunView, stage: ConsensusStage, rank: int) -> Frame:
+    """One of the verified poses, with what it explains."""
+    state, support = view.aligned_pose(stage.cam_from_map[rank]), int(stage.support[rank])
+    explained = np.zeros(len(view.points), dtype=bool)
+    aligned = view.trace.problem.aligned
+    explained[aligned.index] = view.residuals_px(state)[aligned.index] <= view.bounds.pixels
+    off = "" if view.truth is None else f", {translation_error_m(view.truth, state):.3f} m from the true one"
+    if rank == 0:
+        then = "No other pose that was tried explains more, so it is what refinement starts from."
+    else:
+        best = view.aligned_pose(stage.cam_from_map[0])
+        away, turned = translation_error_m(best, state), rotation_error_deg(best, state)
+        both = np.count_nonzero(explained & view.mask(stage.clique))
+        then = f"It is {away:.2f} m and {turned:.1f}° away from the best pose, and shares {both} matches with the set."
+    return Frame(
+        f"The pose at {view.position(state)}{off} explains {support} of {len(view.points)} matches. {then}",
+        f"Σ 1(‖π(R p + t) − u‖ ≤ ε) = {support}",
+        state,
+        view.colors(style.UNDECIDED, (explained, style.INLIER)),
+        explained,
+        located=True,
+    )
 
 
 def _poses(view: RunView, stage: ConsensusStage) -> Frame:
-    states = [view.aligned_pose(state) for state in stage.cam_from_map]
-    rivals, count = states[1 : 1 + style.MAX_DRAWN_RIVALS], len(states)
+    states = [view.aligned_pose(state) for state in stage.cam_from_map[: 1 + style.MAX_DRAWN_RIVALS]]
+    rivals, count, most = states[1:], len(stage.support), highest_bound(stage)
     if rivals:
         away, turned = translation_error_m(states[0], states[1]), rotation_error_deg(states[0], states[1])
         other = f"The best other pose, {away:.2f} m and {turned:.1f}° away, explains {stage.support[1]}"
@@ -129,21 +139,16 @@ def _poses(view: RunView, stage: ConsensusStage) -> Frame:
         other = "No clearly different pose was found beside it"
     note = f"The best and {len(rivals)} of {count - 1:,} other poses are shown." if count > len(rivals) + 1 else ""
     return Frame(
-        Step(
-            "consensus-poses",
-            "The poses that were verified",
-            f"The best pose explains {stage.support[0]} of {len(view.points)} matches from {view.position(states[0])}. "
-            f"{other}; no pose explains more than {_most(stage)}.",
-            f"{_best(stage)} ≤ max over R, t of Σ 1(‖π(R p + t) − u‖ ≤ ε) ≤ {_most(stage)}",
-            note,
-        ),
+        f"The best pose explains {stage.support[0]} of {len(view.points)} matches from {view.position(states[0])}. "
+        f"{other}; no pose explains more than {most}.",
+        f"{best_support(stage)} ≤ max over R, t of Σ 1(‖π(R p + t) − u‖ ≤ ε) ≤ {most}",
         states[0],
         view.colors(style.UNDECIDED, (stage.clique, style.CLIQUE)),
-        np.isin(np.arange(len(view.points)), stage.clique),
+        view.mask(stage.clique),
+        note=note,
         located=True,
-        extra=lambda: _ghosts(view, rivals),
-        charts=(chart(view, stage),),
-        tables=(_table(view, stage, [states[0], *rivals]),),
+        items=_ghosts(view, rivals),
+        tables=(_table(view, stage, states),),
     )
 
 
@@ -164,36 +169,3 @@ def _table(view: RunView, stage: ConsensusStage, states: list[FloatArray]) -> Ta
         rows.append((str(rank), str(support), f"{np.degrees(yaw_of(state[:, :3])):.2f}°", place, *off))
     columns = ("", "explains", "yaw", "camera (m)", *(() if view.truth is None else ("off the truth",)))
     return Table("verified poses", columns, tuple(rows))
-
-
-def chart(view: RunView, stage: ConsensusStage) -> Chart:
-    """The bound over yaw, what the first guess and the best pose explain, the truth and the estimate."""
-    peak, ends = float(max(_most(stage), 1)), np.array([-180.0, 180.0])
-    curves = [
-        ring.step_curve("bound", stage.bound),
-        Curve("first guess", ends, np.full(2, float(stage.seed_support)), style.SAMPLE, "level"),
-        Curve("best pose", ends, np.full(2, float(_best(stage))), style.INLIER, "level"),
-        *ring.markers(view, peak, _yaw(stage)),
-    ]
-    return Chart("consensus", "No pose with this yaw explains more than", "yaw (°)", "matches", tuple(curves))
-
-
-def _yaw(stage: ConsensusStage) -> float | None:
-    """Yaw of the best pose, if there is one."""
-    return stage.yaw_rad if len(stage.support) else None
-
-
-def _ring(view: RunView, stage: ConsensusStage, cam_from_map: FloatArray) -> tuple[SceneItem, ...]:
-    """The bound around the sphere, where it is largest in the colour of the clique, and the best pose's support as a
-    circle: what pokes out of it could hide a better pose."""
-    centre, heights, most = camera_centre(cam_from_map), ring.by_degree(stage.bound), max(1, _most(stage))
-    feet, tops = ring.circle(view, centre, np.zeros(())), ring.circle(view, centre, heights / most)
-    colors = one_color(style.UNDECIDED, len(feet))
-    colors[heights == most] = style.CLIQUE
-    support = ring.circle(view, centre, np.array(_best(stage) / most))
-    return (
-        ring.bars("ring/bars", feet, tops, colors),
-        ring.outline("ring/bound", tops, style.SPHERE),
-        ring.outline("ring/support", support, style.INLIER),
-        *ring.spokes(view, centre, _yaw(stage)),
-    )

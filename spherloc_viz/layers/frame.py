@@ -1,15 +1,24 @@
-"""A frame: one stop on a run's timeline, before it is turned into primitives."""
+"""A frame: one stop on a run's timeline, before it is turned into primitives.
 
-from collections.abc import Callable
-from dataclasses import dataclass
+A run has up to 200 stops and a page shows one at a time, so a stop is planned first, which costs next to nothing, and
+drawn when it is looked at.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
+from spherloc.bounds import Bounds, bounds_of
 from spherloc.geometry import camera_centre, pose
+from spherloc.refine import residuals_px
 from spherloc.trace import Trace
 from spherloc_viz import style
-from spherloc_viz.layers.primitives import Chart, ColorArray, FloatArray, SceneItem, Step, Table
+from spherloc_viz.layers.primitives import Chart, ColorArray, FloatArray, SceneItem, Table
+
+BoolArray = NDArray[np.bool_]
 
 SPHERE_SHARE = 0.17
 """Radius at which the unit sphere is drawn, as a share of the map's typical extent."""
@@ -19,23 +28,38 @@ FEW_DOTS = 200
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """What is known at one step."""
+    """What one step says and shows."""
 
-    step: Step
+    caption: str
+    """Two sentences with this run's own numbers."""
+    equation: str
     cam_from_map: FloatArray
     """Pose (3, 4) between the aligned frames: the camera's, or where to stand before a position is known."""
     colors: ColorArray
     """(N, 3) colour of every correspondence."""
-    rays: np.ndarray
+    rays: BoolArray
     """(N,) mask: correspondences whose match is drawn as a line."""
+    note: str = ""
+    """What the picture leaves out and by which rule."""
     located: bool = False
     """Whether the position is an estimate (the camera is drawn) or a place to stand (only the sphere is)."""
     sphere_aside: bool = False
     """Whether the sphere stays in the middle of the map, where it does not hide the estimated position."""
-    extra: Callable[[], tuple[SceneItem, ...]] = tuple
+    items: tuple[SceneItem, ...] = ()
     """What this stage adds to the canvas."""
-    charts: tuple[Chart, ...] = ()
     tables: tuple[Table, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """A stop and how to draw it."""
+
+    key: str
+    """Stable name, such as "yaw-arcs-100"."""
+    title: str
+    draw: Callable[[], Frame]
+    charts: Mapping[str, Callable[[], Chart]] = field(default_factory=dict)
+    """Charts by name. They stay until a later stop has one of the same name."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +95,11 @@ class RunView:
         known = self.trace.problem.truth_cam_from_map
         return None if known is None else self.trace.problem.aligned.align_pose(known)
 
+    @cached_property
+    def bounds(self) -> Bounds:
+        """What an inlier's residual may be."""
+        return bounds_of(self.trace.problem.aligned, self.trace.options.bound_px)
+
     def standing(self, rotation: FloatArray) -> FloatArray:
         """A pose (3, 4) in the middle of the map with a given rotation: where to draw before a position is known."""
         return pose(rotation, -rotation @ self.middle)
@@ -79,29 +108,71 @@ class RunView:
         """A pose (3, 4) of the trace, between the aligned frames."""
         return self.trace.problem.aligned.align_pose(cam_from_map)
 
+    def residuals_px(self, cam_from_map: FloatArray) -> FloatArray:
+        """Reprojection error (N,) at an aligned pose (3, 4), px; inf for points behind their bearings and for pixels
+        without one."""
+        aligned = self.trace.problem.aligned
+        out = np.full(len(self.points), np.inf)
+        out[aligned.index] = residuals_px(aligned, cam_from_map)
+        return out
+
     def colors(self, color: style.RGB, *marks: tuple[np.ndarray, style.RGB]) -> ColorArray:
         """(N, 3): one colour for all, then others for masks or indices, later ones winning."""
-        out = np.tile(np.array(color, np.uint8), (len(self.points), 1))
+        out = np.empty((len(self.points), 3), np.uint8)
+        out[:] = color
         for where, mark in marks:
             out[where] = mark
         return out
 
-    def nobody(self) -> np.ndarray:
+    def nobody(self) -> BoolArray:
         """An empty mask (N,)."""
         return np.zeros(len(self.points), dtype=bool)
 
+    def mask(self, indices: np.ndarray) -> BoolArray:
+        """A mask (N,) of the correspondences of these indices, of any shape."""
+        out = self.nobody()
+        out[indices.ravel()] = True
+        return out
+
     def position(self, cam_from_map: FloatArray) -> str:
         """Camera position of an aligned pose in the problem's own map frame, as text."""
-        x, y, z = camera_centre(self.trace.problem.aligned.unalign_pose(cam_from_map))
+        return self.place(camera_centre(cam_from_map))
+
+    def place(self, position: FloatArray) -> str:
+        """A place (3,) of the aligned map frame in the problem's own map frame, as text."""
+        x, y, z = self.trace.problem.aligned.map_turn.T @ position
         return f"({x:.2f}, {y:.2f}, {z:.2f}) m"
+
+    def right_ones(self, indices: np.ndarray) -> str:
+        """How many of these correspondences are right, as part of a sentence; empty if that is unknown."""
+        labels = self.trace.problem.truth_inliers
+        return "" if labels is None else f", {np.count_nonzero(labels[indices])} of them right ones"
 
 
 def one_color(color: style.RGB, count: int) -> ColorArray:
     """(count, 3) of one colour."""
-    return np.tile(np.array(color, np.uint8), (count, 1))
+    out = np.empty((count, 3), np.uint8)
+    out[:] = color
+    return out
 
 
 def even(indices: np.ndarray, count: int) -> np.ndarray:
     """At most ``count`` of the indices, evenly spaced."""
     places = np.unique(np.linspace(0, len(indices) - 1, min(count, len(indices))).round().astype(int))
     return indices[places]
+
+
+def growing(total: int, *sizes: int) -> list[int]:
+    """The sizes below ``total``: how something of that size is put together."""
+    return [size for size in sizes if size < total]
+
+
+def length(metres: float) -> str:
+    """A length to read: metres, or centimetres where it is short."""
+    return (
+        f"{metres:.2f} m"
+        if metres >= 1.0
+        else f"{100.0 * metres:.2g} cm"
+        if metres < 0.1
+        else f"{100.0 * metres:.0f} cm"
+    )

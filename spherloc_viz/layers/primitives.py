@@ -3,6 +3,7 @@
 Scene positions are metres in the gravity-aligned map frame: y points down. Colours are sRGB bytes.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -35,6 +36,8 @@ class Points(Primitive):
     """Radius of every dot."""
     ids: NDArray[np.int64] | None = None
     """(N,) index of the correspondence that each dot shows, if it shows one."""
+    rim: bool = False
+    """Whether a dot is seen only around what stands at its place: a ring, from wherever one looks."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,16 +85,19 @@ class Mesh(Primitive):
 
 @dataclass(frozen=True, eq=False)
 class Textured(Primitive):
-    """A triangle mesh with a picture on it."""
+    """A triangle mesh with a picture on it, seen from both sides."""
 
     vertices: FloatArray
-    """(V, 3)."""
+    """(V, 3) in the mesh's own frame."""
     faces: NDArray[np.int64]
     """(F, 3)."""
     uv: FloatArray
     """(V, 2) place of each vertex in the picture, from its lower left corner, 0 to 1."""
-    image: ColorArray
-    """(H, W, 3) sRGB."""
+    map_from_mesh: FloatArray
+    """(3, 4) rotation times scale, and shift, so that a mesh that moves keeps its vertices and its picture."""
+    image: Callable[[], ColorArray | None]
+    """Makes the picture, (H, W, 3) sRGB or (H, W, 4) with holes where the last is below 128; None if there is none.
+    It is large, so it is made only where it is drawn; equal pictures are sent once."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,8 +105,10 @@ class Label(Primitive):
     """A word at a place."""
 
     position: FloatArray
-    """(3,)."""
+    """(3,) of its middle."""
     text: str
+    height_m: float | None = None
+    """Of its letters, so that it shrinks with what it names; None keeps it readable from anywhere."""
 
 
 SceneItem = Points | Segments | Balls | Mesh | Textured | Label
@@ -142,9 +150,21 @@ class Table:
     rows: tuple[tuple[Any, ...], ...]
 
 
+@dataclass(frozen=True)
+class Stop:
+    """One stop on the timeline of a run, by name: what is known of a step before it is painted."""
+
+    key: str
+    """Stable name, such as "yaw-arcs" or "sample-3"."""
+    title: str
+    """A few words."""
+    stage: str = ""
+    """Named stage, such as "Yaw"."""
+
+
 @dataclass(frozen=True, eq=False)
 class Step:
-    """One stop on the timeline of a run."""
+    """What one stop on the timeline of a run says."""
 
     key: str
     """Stable name, such as "yaw-arcs" or "sample-3"."""
@@ -156,6 +176,8 @@ class Step:
     """The equation that this step computes, with its number in the paper, plain text; may be empty."""
     note: str = ""
     """What the picture leaves out and by which rule, plain text; may be empty."""
+    stage: str = ""
+    """Named stage, such as "Yaw"."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,41 +1,176 @@
-"""Refinement and the outcome."""
+"""Refinement: each Gauss-Newton state, who agrees in the end and who does not, how sure the pose is."""
+
+from functools import partial
 
 import numpy as np
 
-from spherloc.metrics import evaluate
-from spherloc.trace import Certificate, RefinementStage
+from spherloc.geometry import camera_centre
+from spherloc.metrics import rotation_error_deg, translation_error_m
+from spherloc.trace import RefinementStage
 from spherloc_viz import style
 from spherloc_viz.layers import uncertainty
-from spherloc_viz.layers.certificate import chance, proof, warning
-from spherloc_viz.layers.frame import Frame, RunView
-from spherloc_viz.layers.primitives import Chart, Curve, Step
+from spherloc_viz.layers.frame import BoolArray, Frame, Plan, RunView, even, length, one_color
+from spherloc_viz.layers.primitives import Chart, Curve, FloatArray, SceneItem, Segments
+
+MOST_STATES = 20
+"""More states are thinned evenly; the first and the last stay."""
 
 
-def frames(view: RunView, stage: RefinementStage) -> list[Frame]:
-    """One frame: from the first pose to the last."""
-    rms = np.sqrt(stage.cost_px2)
-    counts = stage.inlier_counts
-    mask = view.trace.inlier_mask
-    return [
-        Frame(
-            Step(
-                "refinement",
-                "Refinement",
-                f"{len(rms) - 1} Gauss-Newton steps in {stage.dof} degrees of freedom take the inliers from "
-                f"{rms[0]:.2f} to {rms[-1]:.2f} px RMS, and their number from {counts[0]} to {counts[-1]}. "
-                f"The camera ends at {view.position(view.aligned_pose(stage.cam_from_map[-1]))}, and its error is "
-                f"{uncertainty.spread(stage)}.",
-                _objective(stage),
-                uncertainty.tilt(stage),
-            ),
-            view.aligned_pose(stage.cam_from_map[-1]),
-            view.colors(style.UNDECIDED, (mask, style.INLIER)),
-            mask,
-            located=True,
-            charts=(chart(stage),),
-            tables=(uncertainty.table(stage),),
-        )
+def plans(view: RunView, stage: RefinementStage) -> list[Plan]:
+    """Every state; inliers, outliers and errors of the last one; and the summary."""
+    count = len(stage.cost_px2)
+    out = []
+    for k in even(np.arange(count), MOST_STATES).tolist():
+        title = "The pose before refinement" if k == 0 else f"Gauss-Newton step {k}"
+        charts = {"refinement": partial(chart, stage, k)}
+        out.append(Plan(f"refinement-{k}", title, partial(_state, view, stage, k), charts))
+    out += [
+        Plan("refinement-inliers", "Who agrees", lambda: _inliers(view, stage)),
+        Plan("refinement-outliers", "Who does not", lambda: _outliers(view, stage)),
+        Plan("refinement-error", "How sure the pose is", lambda: _error(view, stage)),
+        Plan("refinement", "Refinement", lambda: _summary(view, stage), {"refinement": partial(chart, stage)}),
     ]
+    return out
+
+
+def _state(view: RunView, stage: RefinementStage, k: int) -> Frame:
+    """One of the states, and how it moved since the one before."""
+    state, count = view.aligned_pose(stage.cam_from_map[k]), len(stage.cost_px2)
+    rms, inliers = np.sqrt(stage.cost_px2), stage.inlier_counts
+    off = "" if view.truth is None else f", {length(translation_error_m(view.truth, state))} from the true one"
+    if k == 0:
+        moved = f"{count - 1} Gauss-Newton steps follow, each a linear problem in {stage.dof} unknowns."
+    else:
+        before = view.aligned_pose(stage.cam_from_map[k - 1])
+        away, turned = translation_error_m(before, state), rotation_error_deg(before, state)
+        moved = f"The step moved the camera by {length(away)} and turned it by {turned:.2g}°."
+    note = "" if count <= MOST_STATES else f"{MOST_STATES} of {count} states are shown, evenly."
+    mask = _explained(view, stage, k, state)
+    return Frame(
+        f"At {view.position(state)}{off}, the final inliers are off by {rms[k]:.3f} px RMS, and {inliers[k]} matches "
+        f"are within the bound. {moved}",
+        f"Σ ‖r‖² / n = {stage.cost_px2[k]:.4g} px²,  δ = −(JᵀWJ)⁻¹ JᵀW r",
+        state,
+        view.colors(style.UNDECIDED, (mask, style.INLIER)),
+        mask,
+        note=note,
+        located=True,
+        items=_path(view, stage, k),
+    )
+
+
+def _explained(view: RunView, stage: RefinementStage, k: int, state: FloatArray) -> BoolArray:
+    """Who is within the bound at a state, by the bound that the stage counted with; else the final inliers."""
+    aligned, bounds = view.trace.problem.aligned, view.bounds
+    errors = view.residuals_px(state)[aligned.index]
+    for limits in (bounds.pixels, np.minimum(bounds.pixels, bounds.noise_px)):
+        if np.count_nonzero(errors <= limits) == stage.inlier_counts[k]:
+            return aligned.full_mask(errors <= limits)
+    return view.trace.inlier_mask
+
+
+def _path(view: RunView, stage: RefinementStage, k: int) -> tuple[SceneItem, ...]:
+    """Where the camera has been."""
+    states = [camera_centre(view.aligned_pose(state)) for state in stage.cam_from_map[: k + 1]]
+    ends = np.stack([states[:-1], states[1:]], axis=1) if k else np.zeros((0, 2, 3))
+    return (Segments("cameras/path", "cameras", ends, one_color(style.ESTIMATE, len(ends)), 3.0),)
+
+
+def _last(view: RunView, stage: RefinementStage) -> tuple[FloatArray, BoolArray]:
+    """The last pose and its inliers."""
+    return view.aligned_pose(stage.cam_from_map[-1]), view.trace.inlier_mask
+
+
+def _inliers(view: RunView, stage: RefinementStage) -> Frame:
+    state, mask = _last(view, stage)
+    errors, labels = view.residuals_px(state)[mask], view.trace.problem.truth_inliers
+    if not len(errors):
+        told = "No match is within the bound. The pose stays where it started"
+    else:
+        told = (
+            f"{len(errors)} of {len(mask)} matches are within the bound, the median one is off by "
+            f"{np.median(errors):.2f} px and the worst by {errors.max():.2f} px. "
+        )
+        told += (
+            "Their rays leave the sphere straight towards their points"
+            if labels is None
+            else f"In truth {np.count_nonzero(labels[mask])} of them are right, of {np.count_nonzero(labels)} in all"
+        )
+    return Frame(
+        f"{told}.",
+        "‖π(R p + t) − u‖ ≤ ε",
+        state,
+        view.colors(style.UNDECIDED, (mask, style.INLIER)),
+        mask,
+        located=True,
+    )
+
+
+def _outliers(view: RunView, stage: RefinementStage) -> Frame:
+    state, mask = _last(view, stage)
+    errors = view.residuals_px(state)[~mask]
+    seen = errors[np.isfinite(errors)]
+    behind = len(errors) - len(seen)
+    if not len(errors):
+        told = "Nobody disagrees: all matches are within the bound. There is nothing to reject"
+    elif not len(seen):
+        told = f"All {len(errors)} other matches lie behind the camera at this pose. No bound would make them agree"
+    else:
+        told = (
+            f"{len(errors)} matches disagree, {behind} of them since their points would be behind their bearings. "
+            f"The median of the others is off by {np.median(seen):.0f} px and the nearest by {seen.min():.2f} px"
+        )
+    return Frame(
+        f"{told}.",
+        "‖π(R p + t) − u‖ > ε",
+        state,
+        view.colors(style.UNDECIDED, (~mask, style.OUTLIER)),
+        ~mask,
+        note=f"The first {style.MAX_DRAWN_RAYS} lines are drawn." if len(errors) > style.MAX_DRAWN_RAYS else "",
+        located=True,
+    )
+
+
+def _error(view: RunView, stage: RefinementStage) -> Frame:
+    state, mask = _last(view, stage)
+    known = uncertainty.rms(stage)
+    expected = (
+        "The inliers leave the pose open, so that its error is unknown."
+        if known is None
+        else f"By its covariance the pose is off by {known[0]:.3f}° and {known[1]:.2f} cm RMS, if its inliers are right."
+    )
+    if view.truth is None:
+        happened = "The truth is not known here, so that nobody can check."
+    else:
+        turned, away = rotation_error_deg(view.truth, state), translation_error_m(view.truth, state)
+        happened = f"In truth it is off by {turned:.3f}° and {100 * away:.2f} cm."
+    return Frame(
+        f"{expected} {happened}",
+        "Σ = σ² (JᵀWJ)⁻¹",
+        state,
+        view.colors(style.UNDECIDED, (mask, style.INLIER)),
+        view.nobody(),
+        note=uncertainty.tilt(stage),
+        located=True,
+        tables=(uncertainty.table(stage),),
+    )
+
+
+def _summary(view: RunView, stage: RefinementStage) -> Frame:
+    rms, counts = np.sqrt(stage.cost_px2), stage.inlier_counts
+    state, mask = _last(view, stage)
+    return Frame(
+        f"{len(rms) - 1} Gauss-Newton steps in {stage.dof} degrees of freedom take the inliers from "
+        f"{rms[0]:.2f} to {rms[-1]:.2f} px RMS, and their number from {counts[0]} to {counts[-1]}. "
+        f"The camera ends at {view.position(state)}, and its error is {uncertainty.spread(stage)}.",
+        _objective(stage),
+        state,
+        view.colors(style.UNDECIDED, (mask, style.INLIER)),
+        mask,
+        note=uncertainty.tilt(stage),
+        located=True,
+        tables=(uncertainty.table(stage),),
+    )
 
 
 def _objective(stage: RefinementStage) -> str:
@@ -43,49 +178,9 @@ def _objective(stage: RefinementStage) -> str:
     return f"min over R, t of Σ (‖π(R p + t) − u‖ / σ)²{gravity}   (Algorithm 1, line 16; Algorithm 2, line 24)"
 
 
-def chart(stage: RefinementStage) -> Chart:
-    """RMS residual of the final inliers over the steps."""
-    rms = np.sqrt(stage.cost_px2)
-    curve = Curve("RMS of the inliers", np.arange(len(rms), dtype=np.float64), rms, style.ESTIMATE)
+def chart(stage: RefinementStage, last: int | None = None) -> Chart:
+    """RMS residual of the final inliers over the steps, up to one of them."""
+    rms = np.sqrt(stage.cost_px2)[: None if last is None else last + 1]
+    known = np.isfinite(rms)
+    curve = Curve("RMS of the inliers", np.flatnonzero(known).astype(np.float64), rms[known], style.ESTIMATE)
     return Chart("refinement", "Residual during refinement", "Gauss-Newton step", "RMS (px)", (curve,))
-
-
-def outcome_frame(view: RunView) -> Frame:
-    """The last frame: the pose with its inliers and outliers, or why there is none."""
-    trace, metrics = view.trace, evaluate(view.trace)
-    message, _, remark = trace.message.partition(". ")
-    if trace.cam_from_map is None:
-        caption = f"{message.rstrip('.')}. Give more matches, a wider bound or better gravity."
-        step = Step("outcome", "No pose", caption, "", remark)
-        return Frame(step, view.standing(np.eye(3)), view.colors(style.OUTLIER), view.nobody())
-    inliers = int(np.count_nonzero(trace.inlier_mask))
-    total = trace.timings_ms["total"]
-    proven, chances = ("", "") if trace.certificate is None else _certified(trace.certificate)
-    caption = f"{inliers} of {len(trace.problem)} matches agree with the pose, found in {total:.1f} ms{proven}. "
-    if metrics.rotation_error_deg is None or metrics.translation_error_m is None:
-        caption += "The truth is unknown, so the share of agreeing matches is all there is to judge it by."
-    else:
-        verdict = "a success" if metrics.success else "a failure"
-        caption += (
-            f"It is {metrics.rotation_error_deg:.3f}° and {100 * metrics.translation_error_m:.1f} cm off the truth: "
-            f"{verdict} by the limits of 1° and 10 cm."
-        )
-    return Frame(
-        Step(
-            "outcome",
-            "Outcome",
-            caption,
-            "success: error < 1° and < 0.1 m   (Sec. VI-A)",
-            f"{chances} {remark}".strip(),
-        ),
-        view.aligned_pose(trace.cam_from_map),
-        view.colors(style.OUTLIER, (trace.inlier_mask, style.INLIER)),
-        trace.inlier_mask,
-        located=True,
-    )
-
-
-def _certified(certificate: Certificate) -> tuple[str, str]:
-    """What is proven, as the end of a sentence, and what chance alone would do, as a note."""
-    note = f"Expected false sets of this size: {chance(certificate)}. {warning(certificate)}"
-    return f"; {proof(certificate)}", note.strip()

@@ -23,6 +23,10 @@ def directions(yaw_rad: FloatArray) -> FloatArray:
     return np.column_stack([-np.sin(yaw_rad), np.zeros_like(yaw_rad), np.cos(yaw_rad)])
 
 
+_EVERY_DEGREE = directions(np.radians(np.arange(DEGREES) - 179.5))
+_CIRCLE = directions(np.radians(np.arange(-180, 180, 5)))
+
+
 def by_degree(counts: np.ndarray) -> np.ndarray:
     """The largest of the counts (K,), K a multiple of 360, within each degree (360,)."""
     return counts.reshape(DEGREES, -1).max(axis=1)
@@ -31,14 +35,23 @@ def by_degree(counts: np.ndarray) -> np.ndarray:
 def circle(view: RunView, centre: FloatArray, heights: FloatArray) -> FloatArray:
     """Points (360, 3) around the ring, one a degree, at heights (360,) or () of which 1 is the peak."""
     radius = np.broadcast_to(FOOT + HEIGHT * np.asarray(heights), DEGREES)
-    yaws = np.radians(np.arange(DEGREES) - 179.5)
-    return centre + view.sphere_m * radius[:, None] * directions(yaws)
+    return centre + view.sphere_m * radius[:, None] * _EVERY_DEGREE
+
+
+def circle_of(view: RunView, centre: FloatArray, radius: float) -> FloatArray:
+    """Points (72, 3) around the sphere at a radius in sphere radii."""
+    return centre + view.sphere_m * radius * _CIRCLE
+
+
+def loop(name: str, layer: str, line: FloatArray, color: style.RGB) -> Segments:
+    """The closed line through the points (K, 3)."""
+    points = np.stack([line, np.roll(line, -1, axis=0)], axis=1)
+    return Segments(name, layer, points, one_color(color, len(line)), 2.5)
 
 
 def outline(name: str, line: FloatArray, color: style.RGB) -> Segments:
-    """The closed line through the points (K, 3)."""
-    points = np.stack([line, np.roll(line, -1, axis=0)], axis=1)
-    return Segments(name, "yaw ring", points, one_color(color, len(line)), 2.5)
+    """A closed line of the ring through the points (K, 3)."""
+    return loop(name, "yaw ring", line, color)
 
 
 def bars(name: str, feet: FloatArray, tops: FloatArray, colors: ColorArray) -> Segments:
@@ -48,13 +61,14 @@ def bars(name: str, feet: FloatArray, tops: FloatArray, colors: ColorArray) -> S
 
 def spokes(view: RunView, centre: FloatArray, yaw_rad: float | None) -> list[Segments]:
     """Where the camera looks with the estimated yaw, if there is one yet, and with the true one, if that is known."""
-    out = [] if yaw_rad is None else [_spoke("ring/estimate", view, centre, yaw_rad, style.ESTIMATE)]
+    out = [] if yaw_rad is None else [spoke("ring/estimate", view, centre, yaw_rad, style.ESTIMATE)]
     if view.truth is not None:
-        out.append(_spoke("ring/truth", view, centre, yaw_of(view.truth[:, :3]), style.TRUTH))
+        out.append(spoke("ring/truth", view, centre, yaw_of(view.truth[:, :3]), style.TRUTH))
     return out
 
 
-def _spoke(name: str, view: RunView, centre: FloatArray, yaw_rad: float, color: style.RGB) -> Segments:
+def spoke(name: str, view: RunView, centre: FloatArray, yaw_rad: float, color: style.RGB) -> Segments:
+    """A line from the sphere through the ring where the camera looks with a yaw."""
     radii = view.sphere_m * np.array([1.0, FOOT + HEIGHT + 0.15])
     ends = centre + radii[:, None] * directions(np.array([yaw_rad]))
     return Segments(name, "yaw ring", ends[None], one_color(color, 1), 4.0)
@@ -62,7 +76,7 @@ def _spoke(name: str, view: RunView, centre: FloatArray, yaw_rad: float, color: 
 
 def step_curve(label: str, counts: np.ndarray) -> Curve:
     """Counts over all yaws as a curve in degrees."""
-    yaws = np.degrees(np.linspace(-np.pi, np.pi, len(counts) + 1)[:-1])
+    yaws = np.linspace(-180.0, 180.0, len(counts) + 1)[:-1]
     return Curve(label, yaws, counts.astype(np.float64), style.UNDECIDED, "step")
 
 
@@ -70,13 +84,14 @@ def markers(view: RunView, height: float, yaw_rad: float | None) -> list[Curve]:
     """The true yaw, if it is known, and the estimated one, if there is one yet, in a chart."""
     out = []
     if view.truth is not None:
-        out.append(_marker("truth", yaw_of(view.truth[:, :3]), height, style.TRUTH))
+        out.append(marker("truth", yaw_of(view.truth[:, :3]), height, style.TRUTH))
     if yaw_rad is not None:
-        out.append(_marker("estimate", yaw_rad, height, style.ESTIMATE))
+        out.append(marker("estimate", yaw_rad, height, style.ESTIMATE))
     return out
 
 
-def _marker(label: str, yaw_rad: float, height: float, color: style.RGB) -> Curve:
+def marker(label: str, yaw_rad: float, height: float, color: style.RGB) -> Curve:
+    """A yaw in a chart."""
     return Curve(label, np.array([np.degrees(yaw_rad)]), np.array([height]), color, "marker")
 
 
@@ -85,3 +100,26 @@ def off_truth(view: RunView, yaw_rad: float) -> str:
     if view.truth is None:
         return ""
     return f", {abs(np.degrees(wrap_angle(yaw_rad - yaw_of(view.truth[:, :3])))):.2f}° from the truth"
+
+
+def peaks(counts: np.ndarray, reach: int, most: int) -> np.ndarray:
+    """Places of the ``most`` highest peaks of counts (K,) around the circle, highest first.
+
+    At a peak no count within ``reach`` places is larger, and no higher peak, or earlier one as high, is that close.
+    """
+    around = np.concatenate([counts[-reach:], counts, counts[:reach]])
+    highest = np.lib.stride_tricks.sliding_window_view(around, 2 * reach + 1).max(axis=1)
+    found: list[int] = []
+    candidates = np.flatnonzero((counts == highest) & (counts > 0))
+    for place in candidates[np.argsort(-counts[candidates], kind="stable")]:
+        away = [abs(int(place) - other) for other in found]
+        if all(min(gap, len(counts) - gap) > reach for gap in away):
+            found.append(int(place))
+        if len(found) == most:
+            break
+    return np.array(found, dtype=np.int64)
+
+
+def degrees_of(place: float, places: int) -> float:
+    """Yaw, in degrees, where the given one of ``places`` equal parts of the circle begins."""
+    return -180.0 + 360.0 * place / places

@@ -1,14 +1,29 @@
-"""What every picture shows: map points, the unit sphere with its bearings, matches, true and estimated camera."""
+"""What every picture shows: map points, the unit sphere with its bearings and the query image, matches, true and
+estimated camera with the error, and a scale bar."""
 
-from functools import cache
+from functools import cache, lru_cache, partial
 
+import cv2
 import numpy as np
 import trimesh
 
+from spherloc.cameras.base import Camera, in_image
+from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.geometry import camera_centre
+from spherloc.problem import Problem
 from spherloc_viz import style
 from spherloc_viz.layers.frame import Frame, RunView, one_color
-from spherloc_viz.layers.primitives import FloatArray, Mesh, Points, SceneItem, Segments
+from spherloc_viz.layers.primitives import ColorArray, FloatArray, Mesh, Points, SceneItem, Segments, Textured
+from spherloc_viz.layers.scale_bar import scale_bar
+from spherloc_viz.layers.sphere_image import sphere_texture
+from spherloc_viz.layers.uncertainty import error_items
+
+UNDER_IMAGE = 0.98
+"""Radius of the bare sphere where the query image is around it, in sphere radii."""
+COLUMNS, ROWS = 96, 48
+"""Cells of the sphere that wears the image."""
+COVERAGE = Equirectangular(512, 256)
+"""At these pixels of the image on the sphere the camera is asked what it sees."""
 
 
 @cache
@@ -31,7 +46,7 @@ def base_items(view: RunView, frame: Frame) -> tuple[SceneItem, ...]:
         if frame.located:
             ends = np.array([[camera_centre(view.truth), centre]])
             items.append(Segments("cameras/error", "cameras", ends, one_color(style.OUTLIER, 1), 3.0))
-    return tuple(items)
+    return (*items, *error_items(view, frame), *scale_bar(view))
 
 
 def _sphere(view: RunView, frame: Frame) -> list[SceneItem]:
@@ -43,12 +58,58 @@ def _sphere(view: RunView, frame: Frame) -> list[SceneItem]:
     drawn = np.flatnonzero(frame.rays[aligned.index])[: style.MAX_DRAWN_RAYS]
     ends = np.stack([dots[drawn], view.points[aligned.index[drawn]]], axis=1)
     colors = frame.colors[aligned.index]
-    surface = Mesh("sphere/surface", "sphere", centre + view.sphere_m * vertices, faces, style.SPHERE, 0.25)
+    problem = view.trace.problem
+    radius_m = view.sphere_m if problem.image is None else UNDER_IMAGE * view.sphere_m
+    image = [] if problem.image is None else [_image(problem, centre, view.sphere_m * rotation.T)]
     return [
-        surface,
+        Mesh("sphere/surface", "sphere", centre + radius_m * vertices, faces, style.SPHERE, 0.25),
+        *image,
         Points("sphere/bearings", "sphere", dots, colors, 0.04 * view.dot_m, aligned.index),
         Segments("rays", "rays", ends, colors[drawn], 1.5),
     ]
+
+
+def _image(problem: Problem, centre: FloatArray, map_from_sphere: FloatArray) -> Textured:
+    """The query image on the sphere. Vertices are bearings of the aligned camera frame."""
+    vertices, faces, uv = _panorama()
+    placed = np.column_stack([map_from_sphere, centre])
+    return Textured("sphere/image", "image", vertices, faces, uv, placed, partial(_sphere_image, problem))
+
+
+@cache
+def _panorama() -> tuple[FloatArray, np.ndarray, FloatArray]:
+    """A sphere cut open along its seam: vertices (V, 3), faces (F, 3), and places (V, 2) in a panorama around it."""
+    across, up = np.meshgrid(np.linspace(0.0, 1.0, COLUMNS + 1), np.linspace(0.0, 1.0, ROWS + 1))
+    uv = np.column_stack([across.ravel(), up.ravel()])
+    longitude, latitude = 2.0 * np.pi * (uv[:, 0] - 0.5), np.pi * (uv[:, 1] - 0.5)
+    level = np.cos(latitude)
+    vertices = np.column_stack([level * np.sin(longitude), -np.sin(latitude), level * np.cos(longitude)])
+    corner = (np.arange(ROWS)[:, None] * (COLUMNS + 1) + np.arange(COLUMNS)).ravel()
+    beside, above = corner + 1, corner + COLUMNS + 1
+    faces = np.concatenate([np.stack(cell, axis=1) for cell in ((corner, above, beside), (beside, above, above + 1))])
+    return vertices, faces, uv
+
+
+def _sphere_image(problem: Problem) -> ColorArray | None:
+    """The query image around the sphere, with a hole where the camera sees nothing."""
+    texture = sphere_texture(problem)
+    if texture is None:
+        return None
+    seen = _seen(problem.camera, problem.aligned.camera_turn.tobytes())
+    if seen.all():
+        return texture
+    height, width = texture.shape[:2]
+    alpha = cv2.resize(seen, (width, height), interpolation=cv2.INTER_LINEAR)
+    return np.asarray(np.dstack([texture, alpha]), np.uint8)
+
+
+@lru_cache(maxsize=4)
+def _seen(camera: Camera, camera_turn: bytes) -> ColorArray:
+    """255 where the camera sees what lies behind a pixel of ``COVERAGE``, else 0."""
+    columns, rows = np.meshgrid(np.arange(COVERAGE.width) + 0.5, np.arange(COVERAGE.height) + 0.5)
+    bearings, _ = COVERAGE.unproject(np.column_stack([columns.ravel(), rows.ravel()]).astype(np.float64))
+    pixels, valid = camera.project(bearings @ np.frombuffer(camera_turn).reshape(3, 3))
+    return np.where(valid & in_image(camera, pixels), 255, 0).astype(np.uint8).reshape(rows.shape)
 
 
 def camera(name: str, cam_from_map: FloatArray, size_m: float, color: style.RGB, width_px: float) -> Segments:

@@ -1,58 +1,151 @@
-"""The steps before any estimate: the matches as they come, and their bearings on the unit sphere."""
+"""The steps before any estimate: the matches, their bearings on the unit sphere, and what gravity leaves open."""
 
 import numpy as np
 
+from spherloc.problem import Problem
 from spherloc_viz import style
-from spherloc_viz.layers.frame import Frame, RunView
-from spherloc_viz.layers.primitives import Step
+from spherloc_viz.layers import ring
+from spherloc_viz.layers.frame import Frame, Plan, RunView, one_color
+from spherloc_viz.layers.primitives import SceneItem, Segments
 
 
-def frames(view: RunView) -> list[Frame]:
-    """Problem and bearings."""
+def plans(view: RunView) -> list[Plan]:
+    """Problem, bearings, one match, gravity, and the four unknowns."""
+    return [
+        Plan("problem", "The matches", lambda: _problem(view)),
+        Plan("bearings", "Bearings on the unit sphere", lambda: _bearings(view)),
+        Plan("match", "One match is one ray", lambda: _match(view)),
+        Plan("gravity", "What gravity gives", lambda: _gravity(view)),
+        Plan("unknowns", "What gravity leaves open", lambda: _unknowns(view)),
+    ]
+
+
+def _lost(problem: Problem) -> int:
+    """Matches whose pixels have no bearing."""
+    return int(np.count_nonzero(~problem.usable))
+
+
+def _problem(view: RunView) -> Frame:
     problem = view.trace.problem
-    count, lost = len(problem), int(np.count_nonzero(~problem.usable))
-    grey = view.colors(style.UNDECIDED)
-    everybody = ~view.nobody()
+    count, lost = len(problem), _lost(problem)
     known = ""
     if problem.truth_inliers is not None:
         wrong = count - int(np.count_nonzero(problem.truth_inliers))
         how = "by construction" if problem.image is None else "by the true pose"
         known = f", {wrong} of them wrong {how}" if wrong else f", all of them right {how}"
+    return Frame(
+        f"{count} pixels are matched to map points{known}; each line ties a bearing to its point. "
+        f"Nothing is known about yaw or position yet, so the camera stands in the middle of the map.",
+        "s v = R p + t   (Eq. 18)",
+        view.standing(np.eye(3)),
+        view.colors(style.UNDECIDED),
+        ~view.nobody(),
+        note=_problem_note(problem, count, lost),
+    )
+
+
+def _problem_note(problem: Problem, count: int, lost: int) -> str:
     note = f"{lost} pixels lie where the camera sees nothing and count as outliers." if lost else ""
     if count - lost > style.MAX_DRAWN_RAYS:
         note = f"The first {style.MAX_DRAWN_RAYS} of {count - lost:,} lines are drawn. {note}".strip()
     if problem.estimated_outlier_rate is not None:
         note += f" The front end expects about {100 * problem.estimated_outlier_rate:.0f} % to be wrong."
-    note = " ".join([note, *problem.remarks]).strip()
-    start = view.standing(np.eye(3))
-    return [
-        Frame(
-            Step(
-                "problem",
-                "The matches",
-                f"{count} pixels are matched to map points{known}; each line ties a bearing to its point. "
-                f"Nothing is known about yaw or position yet, so the camera stands in the middle of the map.",
-                "s v = R p + t   (Eq. 18)",
-                note,
-            ),
-            start,
-            grey,
-            everybody,
-        ),
-        Frame(
-            Step(
-                "bearings",
-                "Bearings on the unit sphere",
-                f"The {problem.camera.model.replace('_', ' ')} camera turns each of its {count - lost} usable pixels "
-                "into a direction, a dot on the unit sphere, whatever its lens. "
-                "Gravity is known, so the sphere stands upright and only its yaw and position are open.",
-                _lens_equation(problem.camera.model),
-            ),
-            start,
-            grey,
-            view.nobody(),
-        ),
-    ]
+    return " ".join([note, *problem.remarks]).strip()
+
+
+def _bearings(view: RunView) -> Frame:
+    problem = view.trace.problem
+    return Frame(
+        f"The {problem.camera.model.replace('_', ' ')} camera turns each of its {len(problem) - _lost(problem)} usable "
+        "pixels into a direction, a dot on the unit sphere, whatever its lens. "
+        "Gravity is known, so the sphere stands upright and only its yaw and position are open.",
+        _lens_equation(problem.camera.model),
+        view.standing(np.eye(3)),
+        view.colors(style.UNDECIDED),
+        view.nobody(),
+    )
+
+
+def example(view: RunView) -> int:
+    """A match to explain things by: the first that agrees with the pose, or else the first with a bearing."""
+    agreeing = np.flatnonzero(view.trace.inlier_mask)
+    return int(agreeing[0] if len(agreeing) else view.trace.problem.aligned.index[0])
+
+
+def _match(view: RunView) -> Frame:
+    number, problem = example(view), view.trace.problem
+    (u, v), mask = problem.pixels[number], view.mask(np.array(number))
+    return Frame(
+        f"Match {number} says that the pixel ({u:.1f}, {v:.1f}) shows the map point {view.place(view.points[number])}, "
+        "so the camera stands somewhere on the ray that ends there. "
+        "Which way that ray runs depends on how the camera is turned; it is drawn for a yaw of 0°.",
+        "p = C + s Rᵀ v,  s > 0",
+        view.standing(np.eye(3)),
+        view.colors(style.UNDECIDED, (mask, style.SAMPLE)),
+        mask,
+        items=(_ray(view, number),),
+    )
+
+
+def _ray(view: RunView, number: int) -> Segments:
+    """Where the camera could stand with a yaw of 0: from the point backwards along its bearing."""
+    aligned, point = view.trace.problem.aligned, view.points[number]
+    bearing = aligned.bearings[int(np.searchsorted(aligned.index, number))]
+    reach = 2.0 * float(np.linalg.norm(point - view.middle))
+    ends = np.array([[point, point - reach * bearing]])
+    return Segments("pairs/ray", "pairs", ends, one_color(style.SAMPLE, 1), 3.0)
+
+
+def _gravity(view: RunView) -> Frame:
+    problem = view.trace.problem
+    lean = np.degrees(np.arctan2(np.hypot(*problem.gravity_camera[[0, 2]]), problem.gravity_camera[1]))
+    bound = problem.gravity_bound_rad
+    known = "exactly" if bound == 0.0 else f"to within {np.degrees(bound):.2g}°"
+    return Frame(
+        f"Gravity is known {known} in the camera, where it points {lean:.1f}° away from the image's down, and in the "
+        "map. Both frames are turned until it points straight down, which settles roll and pitch.",
+        "R = A_camᵀ R_y(θ) A_map,  A g = e_y   (Eq. 1)",
+        view.standing(np.eye(3)),
+        view.colors(style.UNDECIDED),
+        view.nobody(),
+        items=_upright(view),
+    )
+
+
+def _upright(view: RunView) -> tuple[SceneItem, ...]:
+    """The horizon of the sphere, and down."""
+    down = view.middle + view.sphere_m * np.array([[0.0, 0.0, 0.0], [0.0, 1.9, 0.0]])
+    heads = [[[0.0, 1.9, 0.0], [x, 1.6, z]] for x, z in ((0.12, 0.0), (-0.12, 0.0), (0.0, 0.12), (0.0, -0.12))]
+    arrow = np.concatenate([down[None], view.middle + view.sphere_m * np.array(heads)])
+    return (
+        Segments("sphere/gravity", "sphere", arrow, one_color(style.ESTIMATE, len(arrow)), 4.0),
+        ring.loop("sphere/horizon", "sphere", ring.circle_of(view, view.middle, 1.02), style.ESTIMATE),
+    )
+
+
+def _unknowns(view: RunView) -> Frame:
+    usable = len(view.trace.problem.aligned.index)
+    return Frame(
+        "One angle and a position are left: yaw, around the ring, and where the camera stands, 4 numbers instead of 6. "
+        f"A match gives 2 equations, so 2 of the {usable} matches fix a pose up to a twin, and {usable - 2} can vote.",
+        "θ, C:  1 + 3 = 2 · 2   (Eq. 18-22)",
+        view.standing(np.eye(3)),
+        view.colors(style.UNDECIDED),
+        view.nobody(),
+        items=(*_upright(view), *_compass(view)),
+    )
+
+
+def _compass(view: RunView) -> tuple[SceneItem, ...]:
+    """The ring that yaw turns on, with a tick every 10 degrees."""
+    yaws = np.radians(np.arange(-180, 180, 10))
+    radii = np.tile([1.9, 2.05], (len(yaws), 1))
+    radii[::3, 0] = 1.7
+    ticks = view.middle + view.sphere_m * radii[:, :, None] * ring.directions(yaws)[:, None]
+    return (
+        Segments("ring/ticks", "yaw ring", ticks, one_color(style.SPHERE, len(ticks)), 2.0),
+        ring.loop("ring/circle", "yaw ring", ring.circle_of(view, view.middle, ring.FOOT), style.SPHERE),
+    )
 
 
 def _lens_equation(model: str) -> str:

@@ -1,114 +1,176 @@
-"""Translation: the balls of feasible camera positions, their overlaps, and the maximum clique."""
+"""Translation: the balls of feasible camera positions gather, their overlaps, and their maximum clique."""
+
+from functools import partial
 
 import numpy as np
 
 from spherloc.geometry import camera_centre
-from spherloc.trace import TranslationStage, YawStage
+from spherloc.trace import TranslationStage
 from spherloc_viz import style
-from spherloc_viz.layers import yaw
-from spherloc_viz.layers.frame import Frame, RunView, even, one_color
-from spherloc_viz.layers.primitives import Balls, Points, SceneItem, Segments, Step
+from spherloc_viz.layers.balls import BallSet, IndexArray
+from spherloc_viz.layers.frame import Frame, Plan, RunView, growing, length, one_color
+from spherloc_viz.layers.primitives import FloatArray, Segments
+
+SIZES = (3, 10, 30, 100, 300)
+"""How many balls are shown before all are."""
+CLIQUE_SIZES = (2, 5, 10, 30, 100)
+"""How many members of the maximum clique are shown before all are."""
 
 
-def frames(view: RunView, stage: TranslationStage) -> list[Frame]:
-    """All balls, then their maximum clique."""
-    start = view.aligned_pose(stage.cam_from_map)
-    yaw_stage = view.trace.stage(YawStage)
-    charts = () if yaw_stage is None else (yaw.chart(view, yaw_stage, found=True),)
-    members = np.unique(stage.pairs[stage.clique])
-    drawn = _drawn(stage)
-    note = _note(stage, drawn)
-    largest = "the largest such set" if stage.proven else "the largest set found before the search reached its limit"
-    inside = view.colors(style.UNDECIDED, (np.unique(stage.pairs), style.CLIQUE))
-    return [
-        Frame(
-            Step(
-                "balls",
-                "Balls of camera positions",
-                f"With the yaw known, each pair says where the camera is, up to a ball; {len(stage.edges):,} pairs of "
-                f"balls overlap. Small balls come from near points under a wide angle, and inliers share one spot.",
-                "H t = b,  |t_k − t| ≤ r_k   (Eq. 24-27)",
-                note,
-            ),
-            view.standing(start[:, :3]),
-            inside,
-            view.nobody(),
-            extra=lambda: _balls(view, stage, drawn, found=False),
-            charts=charts,
-        ),
-        Frame(
-            Step(
-                "clique",
-                "The maximum clique of balls",
-                f"{len(stage.clique):,} of {len(stage.radii_m):,} balls overlap pairwise, from {len(members)} matches: "
-                f"{largest}. The best of its pairs puts the camera at {view.position(start)}.",
-                "‖t_k1 − t_k2‖ ≤ r_k1 + r_k2   (Eq. 38)",
-                note,
-            ),
-            start,
-            view.colors(style.UNDECIDED, (members, style.CLIQUE)),
-            view.nobody(),
-            located=True,
-            sphere_aside=True,
-            extra=lambda: _balls(view, stage, drawn, found=True),
-            charts=charts,
-        ),
-    ]
+def plans(view: RunView, stage: TranslationStage) -> list[Plan]:
+    """One ball, more and more of them, two greedy cliques, and the maximum one."""
+    balls = BallSet(stage)
+    out = [Plan("balls-pair", "One pair, one ball", lambda: _pair(view, balls))]
+    for size in growing(len(balls), *SIZES):
+        out.append(Plan(f"balls-{size}", f"The {size} smallest balls", partial(_some, view, balls, size)))
+    out.append(Plan("balls", "Balls of camera positions", lambda: _all(view, balls)))
+    out.append(Plan("clique-greedy-smallest", "A clique from the smallest ball", lambda: _from_smallest(view, balls)))
+    out.append(Plan("clique-greedy-degree", "A clique from the busiest ball", lambda: _from_busiest(view, balls)))
+    for size in growing(len(stage.clique), *CLIQUE_SIZES):
+        title = f"{size} balls of the maximum clique"
+        out.append(Plan(f"clique-{size}", title, partial(_members, view, balls, size)))
+    out.append(Plan("clique", "The maximum clique of balls", lambda: _clique(view, balls)))
+    return out
 
 
-def _note(stage: TranslationStage, drawn: np.ndarray) -> str:
+def _turned(view: RunView, balls: BallSet) -> FloatArray:
+    """The sphere in the middle of the map, at the estimated yaw."""
+    return view.standing(view.aligned_pose(balls.stage.cam_from_map)[:, :3])
+
+
+def _note(balls: BallSet, shown: IndexArray, inside: np.ndarray) -> str:
     """By which rules balls were left out."""
-    if len(drawn) == len(stage.radii_m):
-        return stage.rule
+    drawn = len(balls.drawn(shown, inside))
+    if drawn == len(shown):
+        return balls.stage.rule
     return (
-        f"{stage.rule} {len(drawn)} of {len(stage.radii_m):,} balls are drawn with the overlaps between them: an even "
+        f"{balls.stage.rule} {drawn} of {len(shown):,} balls are drawn with the overlaps between them: an even "
         "sample of the smaller half of the clique, and of the others; of the rest only the centres."
     )
 
 
-def _drawn(stage: TranslationStage) -> np.ndarray:
-    """Indices of the balls to draw: of the clique and of the others an even sample of the smaller half.
-
-    Large balls hold the whole picture in them and hide it.
-    """
-    order = np.argsort(stage.radii_m, kind="stable")
-    if len(order) <= style.MAX_DRAWN_BALLS:
-        return order
-    inside = np.isin(order, stage.clique)
-    halves = [group[: max(1, len(group) // 2)] for group in (order[inside], order[~inside])]
-    take = min(len(halves[0]), max(style.MAX_DRAWN_BALLS // 2, style.MAX_DRAWN_BALLS - len(halves[1])))
-    return np.concatenate([even(halves[0], take), even(halves[1], style.MAX_DRAWN_BALLS - take)])
+def _from_truth(view: RunView, position: FloatArray) -> str:
+    """How far a place (3,) is from the true position, as part of a sentence; empty if that is unknown."""
+    if view.truth is None:
+        return ""
+    return f", {length(float(np.linalg.norm(position - camera_centre(view.truth))))} from the truth"
 
 
-def _balls(view: RunView, stage: TranslationStage, drawn: np.ndarray, found: bool) -> tuple[SceneItem, ...]:
-    inside = np.zeros(len(stage.radii_m), dtype=bool)
-    if found:
-        inside[stage.clique] = True
-    items: list[SceneItem] = [_edges(stage, drawn, inside)]
-    dot_m = min(0.02 * view.sphere_m, 0.1 * float(np.median(stage.radii_m[drawn])))
-    for name, members, color, opacity in (
-        ("balls/others", ~inside, style.UNDECIDED, 0.10),
-        ("balls/clique", inside, style.CLIQUE, 0.16),
-    ):
-        chosen = drawn[members[drawn]]
-        centres = stage.centres_m[members]
-        if len(chosen):
-            colors = one_color(color, len(chosen))
-            items.append(Balls(name, "balls", stage.centres_m[chosen], stage.radii_m[chosen], colors, opacity))
-        if len(centres):
-            dots = one_color(color, len(centres))
-            items.append(Points(f"{name}-centres", "balls", centres, dots, dot_m))
-    if view.truth is not None:
-        truth = camera_centre(view.truth)[None]
-        items.append(Points("balls/truth", "balls", truth, one_color(style.TRUTH, 1), 2.0 * dot_m))
-    return tuple(items)
+def _pair(view: RunView, balls: BallSet) -> Frame:
+    """The smallest ball, and the rays of its pair."""
+    stage, ball = balls.stage, balls.by_radius[:1]
+    first, second = (int(number) for number in stage.pairs[ball[0]])
+    centre, mask = stage.centres_m[ball[0]], view.mask(stage.pairs[ball[0]])
+    ends = np.stack([view.points[[first, second]], np.tile(centre, (2, 1))], axis=1)
+    nobody = np.zeros(len(balls), dtype=bool)
+    return Frame(
+        f"With the yaw known, matches {first} and {second} have rays of known directions, which come nearest to each "
+        f"other at {view.place(centre)}{_from_truth(view, centre)}. If both are right, noise can move the camera by "
+        f"{length(float(stage.radii_m[ball[0]]))} from there at most: that is the smallest ball.",
+        "H t = b,  |t_k − t| ≤ r_k   (Eq. 24-27)",
+        _turned(view, balls),
+        view.colors(style.UNDECIDED, (mask, style.SAMPLE)),
+        view.nobody(),
+        note=stage.rule,
+        items=(
+            *balls.items(view, ball, nobody),
+            Segments("pairs/rays", "pairs", ends, one_color(style.SAMPLE, 2), 2.0),
+        ),
+    )
 
 
-def _edges(stage: TranslationStage, drawn: np.ndarray, inside: np.ndarray) -> Segments:
-    """Overlaps between the drawn balls."""
-    visible = np.zeros(len(stage.radii_m), dtype=bool)
-    visible[drawn] = True
-    edges = stage.edges[np.logical_and(visible[stage.edges[:, 0]], visible[stage.edges[:, 1]])]
-    colors = one_color(style.UNDECIDED, len(edges))
-    colors[np.logical_and(inside[edges[:, 0]], inside[edges[:, 1]])] = style.CLIQUE
-    return Segments("balls/edges", "balls", stage.centres_m[edges], colors, 1.5)
+def _some(view: RunView, balls: BallSet, size: int) -> Frame:
+    """The smallest balls."""
+    stage, shown, inside = balls.stage, balls.by_radius[:size], np.zeros(len(balls), dtype=bool)
+    mask = balls.mask(shown)
+    edges, possible = len(balls.edges_within(mask)), size * (size - 1) // 2
+    return Frame(
+        f"The {size} smallest of {len(balls):,} balls reach {length(float(stage.radii_m[shown[-1]]))}, and {edges:,} "
+        f"of their {possible:,} pairs overlap. An overlap means that one position of the camera can suit both pairs of "
+        "matches.",
+        "‖t_k1 − t_k2‖ ≤ r_k1 + r_k2   (Eq. 38)",
+        _turned(view, balls),
+        view.colors(style.UNDECIDED, (view.mask(stage.pairs[shown]), style.CLIQUE)),
+        view.nobody(),
+        note=_note(balls, shown, inside),
+        items=balls.items(view, shown, inside),
+    )
+
+
+def _all(view: RunView, balls: BallSet) -> Frame:
+    stage, inside = balls.stage, np.zeros(len(balls), dtype=bool)
+    return Frame(
+        f"With the yaw known, each pair says where the camera is, up to a ball; {len(stage.edges):,} pairs of "
+        f"balls overlap. Small balls come from near points under a wide angle, and inliers share one spot.",
+        "H t = b,  |t_k − t| ≤ r_k   (Eq. 24-27)",
+        _turned(view, balls),
+        view.colors(style.UNDECIDED, (view.mask(stage.pairs), style.CLIQUE)),
+        view.nobody(),
+        note=_note(balls, balls.by_radius, inside),
+        items=balls.items(view, balls.by_radius, inside),
+    )
+
+
+def _from_smallest(view: RunView, balls: BallSet) -> Frame:
+    found = balls.greedy(balls.by_radius)
+    return _greedy(view, balls, found, "the smallest ball", "the next larger one")
+
+
+def _from_busiest(view: RunView, balls: BallSet) -> Frame:
+    found = balls.greedy(np.argsort(-balls.degrees, kind="stable"))
+    most = int(balls.degrees[found[0]])
+    return _greedy(view, balls, found, f"the ball that overlaps most others, {most:,}", "the next busiest one")
+
+
+def _greedy(view: RunView, balls: BallSet, found: IndexArray, first: str, then: str) -> Frame:
+    """A clique that was put together without looking back."""
+    missing = len(balls.stage.clique) - len(found)
+    verdict = "which is as large as the maximum" if missing == 0 else f"{missing:,} fewer than the maximum has"
+    inside = balls.mask(found)
+    return Frame(
+        f"From {first}, always taking {then} that overlaps all taken so far, a clique grows to {len(found):,} balls, "
+        f"{verdict}. Such a clique is a lower bound for the search, which must look into every larger one.",
+        f"{len(found):,} ≤ ω(G) = {len(balls.stage.clique):,}" if balls.stage.proven else f"{len(found):,} ≤ ω(G)",
+        _turned(view, balls),
+        view.colors(style.UNDECIDED, (view.mask(balls.stage.pairs[found]), style.SAMPLE)),
+        view.nobody(),
+        note=_note(balls, balls.by_radius, inside),
+        items=balls.items(view, balls.by_radius, inside, style.SAMPLE),
+    )
+
+
+def _members(view: RunView, balls: BallSet, size: int) -> Frame:
+    """The smallest balls of the maximum clique."""
+    stage, chosen = balls.stage, balls.members[:size]
+    weights = stage.radii_m[chosen] ** -2.0
+    mean = weights @ stage.centres_m[chosen] / weights.sum()
+    inside, matches = balls.mask(chosen), view.mask(stage.pairs[chosen])
+    return Frame(
+        f"The {size} smallest of the {len(stage.clique):,} balls of the maximum clique come from "
+        f"{np.count_nonzero(matches)} matches, and all {size * (size - 1) // 2:,} pairs of them overlap. "
+        f"Their mean, weighted by precision, puts the camera at {view.place(mean)}{_from_truth(view, mean)}.",
+        "C ≈ Σ r_k⁻² C_k / Σ r_k⁻²",
+        _turned(view, balls),
+        view.colors(style.UNDECIDED, (matches, style.CLIQUE)),
+        view.nobody(),
+        note=_note(balls, balls.by_radius, inside),
+        items=balls.items(view, balls.by_radius, inside),
+    )
+
+
+def _clique(view: RunView, balls: BallSet) -> Frame:
+    stage, start = balls.stage, view.aligned_pose(balls.stage.cam_from_map)
+    members = view.mask(stage.pairs[stage.clique])
+    largest = "the largest such set" if stage.proven else "the largest set found before the search reached its limit"
+    return Frame(
+        f"{len(stage.clique):,} of {len(balls):,} balls overlap pairwise, from {np.count_nonzero(members)} matches: "
+        f"{largest}. The best of its pairs puts the camera at {view.position(start)}.",
+        "‖t_k1 − t_k2‖ ≤ r_k1 + r_k2   (Eq. 38)",
+        start,
+        view.colors(style.UNDECIDED, (members, style.CLIQUE)),
+        view.nobody(),
+        note=_note(balls, balls.by_radius, balls.in_clique),
+        located=True,
+        sphere_aside=True,
+        items=balls.items(view, balls.by_radius, balls.in_clique),
+    )

@@ -1,9 +1,119 @@
-"""How far a refined pose may be off, by its covariance, in words and as a table."""
+"""How far a pose is off, and how far it may be off by its covariance: in words, as a table and on the canvas."""
+
+from itertools import pairwise
 
 import numpy as np
 
+from spherloc.geometry import camera_centre
+from spherloc.metrics import rotation_error_deg
 from spherloc.trace import RefinementStage
-from spherloc_viz.layers.primitives import FloatArray, Table
+from spherloc_viz import style
+from spherloc_viz.layers.frame import Frame, RunView, one_color
+from spherloc_viz.layers.primitives import FloatArray, Label, Points, SceneItem, Segments, Table
+from spherloc_viz.layers.scale_bar import angle_text, length_text
+
+LAYER = "uncertainty"
+SIGMAS = 3.0
+"""Half axes of the ellipsoid, in standard deviations."""
+VISIBLE = 0.45
+"""What is drawn of an error is magnified until it is as long as this, in sphere radii."""
+FACTORS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
+ROOM = 3.0
+"""An error that would be longer than this, in sphere radii, is not magnified."""
+CORNERS = 40
+"""Of each ellipse."""
+AHEAD = 2.2
+"""Length of the viewing directions, in sphere radii."""
+BESIDE = 1.2
+"""Where words stand, so that they hide nothing from afar either: so many sphere radii below, or beyond an arc."""
+ARC_STEP_RAD = np.radians(3.0)
+
+
+def error_items(view: RunView, frame: Frame) -> list[SceneItem]:
+    """The error of the frame's pose where the truth is known, and what its covariance allows where that is known."""
+    if not frame.located:
+        return []
+    deviations = _half_axes(view, frame)
+    factor = 1 if deviations is None else _factor(np.linalg.norm(deviations, axis=1).max(), view.sphere_m)
+    items = [] if deviations is None else _ellipsoid(view, frame, factor * deviations, factor)
+    if view.truth is not None:
+        items += [*_offset(view, frame, factor), *_angle(view, frame)]
+    return items
+
+
+def _half_axes(view: RunView, frame: Frame) -> FloatArray | None:
+    """Half axes (3, 3), as rows in the aligned map frame, of the ellipsoid of camera positions, if the frame's pose is
+    the refined one and its covariance is known."""
+    stage = view.trace.stage(RefinementStage)
+    if stage is None or not np.isfinite(stage.covariance).all():
+        return None
+    if not np.allclose(frame.cam_from_map, view.aligned_pose(stage.cam_from_map[-1]), rtol=0.0, atol=1e-9):
+        return None
+    turn = view.trace.problem.aligned.map_turn
+    variances, axes = np.linalg.eigh(turn @ stage.covariance[3:, 3:] @ turn.T)
+    return SIGMAS * np.sqrt(np.maximum(variances, 0.0))[:, None] * axes.T
+
+
+def _factor(length_m: float, sphere_m: float) -> int:
+    """The least round factor by which a length can be seen."""
+    return next((factor for factor in FACTORS if factor * length_m >= VISIBLE * sphere_m), FACTORS[-1])
+
+
+def _ellipsoid(view: RunView, frame: Frame, half_axes: FloatArray, factor: int) -> list[SceneItem]:
+    """Its three principal ellipses: lines hide nothing of what is inside."""
+    centre, turns = camera_centre(frame.cam_from_map), np.linspace(0.0, 2.0 * np.pi, CORNERS + 1)
+    circle = np.column_stack([np.cos(turns), np.sin(turns)])
+    lines = np.concatenate([centre + circle @ np.delete(half_axes, k, axis=0) for k in range(3)])
+    ends = np.stack([lines[:-1], lines[1:]], axis=1)
+    ends = np.delete(ends, [CORNERS, 2 * CORNERS + 1], axis=0)
+    top = centre - np.array([0.0, np.linalg.norm(half_axes[:, 1]) + 0.1 * view.sphere_m, 0.0])
+    text = f"{SIGMAS:.0f} σ" if factor == 1 else f"{SIGMAS:.0f} σ × {factor}"
+    return [
+        Segments("uncertainty/ellipsoid", LAYER, ends, one_color(style.ESTIMATE, len(ends)), 1.5),
+        Label("uncertainty/sigmas", LAYER, top, text, 0.08 * view.sphere_m),
+    ]
+
+
+def _offset(view: RunView, frame: Frame, factor: int) -> list[SceneItem]:
+    """From the estimated to the true position, magnified like the ellipsoid."""
+    assert view.truth is not None
+    centre = camera_centre(frame.cam_from_map)
+    offset = camera_centre(view.truth) - centre
+    length_m = float(np.linalg.norm(offset))
+    factor = factor if factor * length_m <= ROOM * view.sphere_m else 1
+    end = centre + factor * offset
+    text = length_text(length_m) if factor == 1 else f"{length_text(length_m)} × {factor}"
+    below = 0.5 * (centre + end) + np.array([0.0, BESIDE * view.sphere_m, 0.0])
+    return [
+        Segments("uncertainty/offset", LAYER, np.array([[centre, end]]), one_color(style.OUTLIER, 1), 3.0),
+        Points("uncertainty/truth", LAYER, end[None], one_color(style.TRUTH, 1), 0.05 * view.sphere_m),
+        Label("uncertainty/distance", LAYER, below, text),
+    ]
+
+
+def _angle(view: RunView, frame: Frame) -> list[SceneItem]:
+    """The estimated and the true viewing direction from the estimated position, and the arc between them.
+
+    The word beside it is the whole rotation's error, of which a roll is no part of the arc.
+    """
+    assert view.truth is not None
+    centre, estimated, true = camera_centre(frame.cam_from_map), frame.cam_from_map[2, :3], view.truth[2, :3]
+    between = float(np.arctan2(np.linalg.norm(np.cross(estimated, true)), estimated @ true))
+    across = true - (true @ estimated) * estimated
+    if np.linalg.norm(across) < 1e-12:
+        across = frame.cam_from_map[0, :3]
+    across /= np.linalg.norm(across)
+    turns = np.linspace(0.0, between, 2 + int(between / ARC_STEP_RAD))[:, None]
+    arc = centre + AHEAD * view.sphere_m * (np.cos(turns) * estimated + np.sin(turns) * across)
+    lines = [[centre, arc[0]], [centre, arc[-1]], *pairwise(arc)]
+    colors = one_color(style.OUTLIER, len(lines))
+    colors[0], colors[1] = style.ESTIMATE, style.TRUTH
+    beside = centre + BESIDE * (arc[len(arc) // 2] - centre)
+    text = angle_text(rotation_error_deg(view.truth, frame.cam_from_map))
+    return [
+        Segments("uncertainty/angle", LAYER, np.array(lines), colors, 2.0),
+        Label("uncertainty/degrees", LAYER, beside, text),
+    ]
 
 
 def rms(stage: RefinementStage) -> tuple[float, float] | None:

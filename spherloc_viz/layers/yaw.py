@@ -1,104 +1,182 @@
-"""Yaw: the ring of arcs around the sphere, and how many overlap at each yaw."""
+"""Yaw: arcs of pairs gather on the ring around the sphere, a hand sweeps over it, and stops where most overlap."""
+
+from functools import partial
 
 import numpy as np
 
 from spherloc.geometry import camera_centre, yaw_rotation
 from spherloc.trace import YawStage
 from spherloc_viz import style
-from spherloc_viz.layers import ring
-from spherloc_viz.layers.frame import Frame, RunView, even, one_color
-from spherloc_viz.layers.primitives import Chart, FloatArray, SceneItem, Segments, Step
+from spherloc_viz.layers import ring, twins
+from spherloc_viz.layers.arcs import Arcs, IndexArray
+from spherloc_viz.layers.frame import Frame, Plan, RunView, growing
+from spherloc_viz.layers.primitives import Chart, FloatArray, SceneItem, Segments
 
-INNER, OUTER = 1.3, 1.95
-"""Radii of the band of arcs, in sphere radii."""
-STEP_RAD = np.radians(4.0)
+SIZES = (10, 30, 100, 300, 1000, 3000)
+"""How many arcs are shown before all are."""
+STOPS = 8
+"""The hand stops at most at so many peaks before the highest."""
+REACH = 40
+"""A peak is the highest within so many quarters of a degree."""
 
 
-def frames(view: RunView, stage: YawStage) -> list[Frame]:
-    """All arcs, then the deepest overlap."""
-    pairs, arcs = stage.pairs_total, len(stage.lo_rad)
-    members = np.unique(stage.pairs[stage.clique])
-    start, turned = view.standing(np.eye(3)), view.standing(yaw_rotation(stage.yaw_rad))
-    drawn = _drawn(stage)
+def plans(view: RunView, stage: YawStage) -> list[Plan]:
+    """One pair with its arcs, more and more arcs, the stops of the hand, and the deepest overlap."""
+    arcs = Arcs(stage)
+    out = [
+        Plan("yaw-pair", "One pair of matches", lambda: twins.pair(view, arcs)),
+        Plan("yaw-twins", "Two roots: twins", lambda: twins.twins(view, arcs), twins.charts(view, arcs, counts_chart)),
+    ]
+    for size in growing(len(arcs), *SIZES):
+        charts = {"yaw": partial(_growing_chart, view, arcs, size)}
+        out.append(Plan(f"yaw-arcs-{size}", f"{size:,} arcs", partial(_some, view, arcs, size), charts))
+    out.append(Plan("yaw-arcs", "Yaw arcs of all pairs", lambda: _all(view, arcs), {"yaw": lambda: chart(view, stage)}))
+    stops = hand_stops(stage)
+    for number, place in enumerate(stops, 1):
+        yaw = ring.degrees_of(place + 0.5, len(stage.overlap))
+        charts = {"yaw": partial(chart, view, stage, hand_rad=np.radians(yaw))}
+        draw = partial(_hand, view, arcs, stops[:number])
+        out.append(Plan(f"yaw-hand-{number}", f"The hand at {yaw:.1f}°", draw, charts))
+    charts = {"yaw": lambda: chart(view, stage, found=True)}
+    out.append(Plan("yaw-clique", "The yaw most arcs share", lambda: _clique(view, arcs), charts))
+    return out
+
+
+def hand_stops(stage: YawStage) -> IndexArray:
+    """Quarters of a degree at which the hand stops: the highest peaks but the one it ends at, by yaw."""
+    highest = ring.peaks(stage.overlap, REACH, STOPS + 1)
+    places = len(stage.overlap)
+    end = int((stage.yaw_rad + np.pi) / (2 * np.pi) * places)
+    gaps = np.abs(highest - end)
+    return np.sort(highest[np.minimum(gaps, places - gaps) > REACH][:STOPS])
+
+
+def _some(view: RunView, arcs: Arcs, size: int) -> Frame:
+    """The first arcs of those that are spread over all pairs."""
+    chosen, start = arcs.spread(size), view.standing(np.eye(3))
+    found = arcs.overlap_of(chosen)
+    drawn = chosen[: style.MAX_DRAWN_ARCS]
+    note = "The arcs are taken evenly from all pairs. " + arcs.stage.rule
+    if len(drawn) < size:
+        note += f" {len(drawn)} of these {size:,} are drawn."
+    most, off = len(found.clique), ring.off_truth(view, found.yaw_rad)
+    return Frame(
+        f"With {size:,} of {len(arcs):,} arcs on the ring, at most {most:,} overlap, at {np.degrees(found.yaw_rad):.2f}°"
+        f"{off}. Arcs of wrong pairs lie anywhere, while those of right matches all hold the true yaw.",
+        f"max over θ of Σ 1(|f(θ)| ≤ τ) = {most:,}   (Eq. 34)",
+        start,
+        view.colors(style.UNDECIDED),
+        view.nobody(),
+        note=note,
+        items=_ring(view, arcs, start, drawn, found.overlap),
+    )
+
+
+def _all(view: RunView, arcs: Arcs) -> Frame:
+    stage, start = arcs.stage, view.standing(np.eye(3))
+    drawn, count = arcs.spread(style.MAX_DRAWN_ARCS), len(arcs)
     note = stage.rule
-    if len(drawn) < arcs:
-        note += f" An even sample of {len(drawn)} of {arcs:,} arcs is drawn, half of them from the clique."
+    if len(drawn) < count:
+        note += f" {len(drawn)} of {count:,} arcs, taken evenly from all pairs, are drawn."
     width = np.degrees(float(np.median(stage.hi_rad - stage.lo_rad)))
-    yaw = np.degrees(stage.yaw_rad)
+    return Frame(
+        f"Two matches fix the yaw up to their noise: {stage.pairs_total:,} pairs give {count:,} arcs, {width:.1f}° wide "
+        "at the median. The ring shows where the camera would look; the outline counts the arcs.",
+        "|d1 cos θ + d2 sin θ + d3| ≤ τ   (Eq. 22, 33)",
+        start,
+        view.colors(style.UNDECIDED),
+        view.nobody(),
+        note=note,
+        items=_ring(view, arcs, start, drawn, stage.overlap),
+    )
+
+
+def _hand(view: RunView, arcs: Arcs, stops: IndexArray) -> Frame:
+    """The hand at the last of the stops so far."""
+    counts, place = arcs.stage.overlap, int(stops[-1])
+    lo, hi = (ring.degrees_of(place + part, len(counts)) for part in (0, 1))
+    yaw, here = np.radians(0.5 * (lo + hi)), int(counts[place])
+    turned, drawn = view.standing(yaw_rotation(yaw)), arcs.spread(style.MAX_DRAWN_ARCS)
+    met = arcs.over(drawn, np.radians(lo), np.radians(hi))
+    mean = float(np.sum(arcs.stage.hi_rad - arcs.stage.lo_rad)) / (2 * np.pi)
+    items = _ring(view, arcs, turned, drawn, counts, met, style.SAMPLE)
+    return Frame(
+        f"Turned to {lo:.2f}°, the hand meets up to {here:,} of {len(arcs):,} arcs within a quarter of a degree, the "
+        f"most within 10° on either side. {_so_far(counts, stops)}",
+        f"Σ 1(|f(θ)| ≤ τ) = {here:,}   (Eq. 34)",
+        turned,
+        view.colors(style.UNDECIDED),
+        view.nobody(),
+        note=f"A yaw at random lies in {mean:,.0f} arcs on average. {len(drawn)} arcs are drawn; pink ones are met.",
+        items=(*items, ring.spoke("ring/hand", view, camera_centre(turned), yaw, style.SAMPLE)),
+    )
+
+
+def _so_far(counts: np.ndarray, stops: IndexArray) -> str:
+    """How the last stop compares with those before it."""
+    if len(stops) == 1:
+        return "It is the first stop on the way around from −180°, at the highest peaks only."
+    best = stops[:-1][int(np.argmax(counts[stops[:-1]]))]
+    most, here = int(counts[best]), int(counts[stops[-1]])
+    where = f"{ring.degrees_of(best, len(counts)):.2f}°"
+    if here > most:
+        return f"That beats the stops before, of which {where} was the best with {most:,}."
+    return f"The stop at {where} {'has met more' if most > here else 'has met as many'}: {most:,}."
+
+
+def _clique(view: RunView, arcs: Arcs) -> Frame:
+    stage, drawn = arcs.stage, arcs.with_clique()
+    turned, count = view.standing(yaw_rotation(stage.yaw_rad)), len(arcs)
+    note = stage.rule
+    if len(drawn) < count:
+        note += f" An even sample of {len(drawn)} of {count:,} arcs is drawn, half of them from the clique."
     interval = np.degrees(stage.best_rad[1] - stage.best_rad[0])
     off = ring.off_truth(view, stage.yaw_rad)
-    return [
-        Frame(
-            Step(
-                "yaw-arcs",
-                "Yaw arcs of all pairs",
-                f"Two matches fix the yaw up to their noise: {pairs:,} pairs give {arcs:,} arcs, {width:.1f}° wide at "
-                f"the median. The ring shows where the camera would look; the outline counts the arcs.",
-                "|d1 cos θ + d2 sin θ + d3| ≤ τ   (Eq. 22, 33)",
-                note,
-            ),
-            start,
-            view.colors(style.UNDECIDED),
-            view.nobody(),
-            extra=lambda: _ring(view, stage, start, found=False),
-            charts=(chart(view, stage, found=False),),
-        ),
-        Frame(
-            Step(
-                "yaw-clique",
-                "The yaw most arcs share",
-                f"{len(stage.clique):,} arcs overlap at {yaw:.2f}°{off}; no other yaw lies in more. "
-                f"They are a maximum clique of the rotation graph and agree on an interval of {interval:.2g}°.",
-                "max over θ of Σ 1(|f(θ)| ≤ τ)   (Eq. 34, 37)",
-                note,
-            ),
-            turned,
-            view.colors(style.UNDECIDED, (members, style.CLIQUE)),
-            view.nobody(),
-            extra=lambda: _ring(view, stage, turned, found=True),
-            charts=(chart(view, stage, found=True),),
-        ),
-    ]
+    items = _ring(view, arcs, turned, drawn, stage.overlap, arcs.in_clique[drawn], style.CLIQUE)
+    return Frame(
+        f"{len(stage.clique):,} arcs overlap at {np.degrees(stage.yaw_rad):.2f}°{off}; no other yaw lies in more. "
+        f"They are a maximum clique of the rotation graph and agree on an interval of {interval:.2g}°.",
+        "max over θ of Σ 1(|f(θ)| ≤ τ)   (Eq. 34, 37)",
+        turned,
+        view.colors(style.UNDECIDED, (view.mask(stage.pairs[stage.clique]), style.CLIQUE)),
+        view.nobody(),
+        note=note,
+        items=(*items, ring.spoke("ring/estimate", view, camera_centre(turned), stage.yaw_rad, style.ESTIMATE)),
+    )
 
 
-def chart(view: RunView, stage: YawStage, found: bool) -> Chart:
-    """Overlap count over yaw, with the truth and, once found, the estimate."""
-    peak = float(stage.overlap.max(initial=1))
-    curves = [
-        ring.step_curve("arcs that overlap", stage.overlap),
-        *ring.markers(view, peak, stage.yaw_rad if found else None),
-    ]
+def _ring(
+    view: RunView,
+    arcs: Arcs,
+    cam_from_map: FloatArray,
+    drawn: IndexArray,
+    counts: np.ndarray,
+    marked: np.ndarray | None = None,
+    mark: style.RGB = style.UNDECIDED,
+) -> tuple[SceneItem, ...]:
+    """Some arcs, those that are marked in their colour, the outline of the counts, and the true yaw if it is known."""
+    centre = camera_centre(cam_from_map)
+    heights = ring.by_degree(counts)
+    line = ring.circle(view, centre, heights / max(1, int(heights.max())))
+    band: Segments = arcs.drawn(view, centre, drawn, np.zeros(len(drawn), bool) if marked is None else marked, mark)
+    return band, ring.outline("ring/overlap", line, style.SPHERE), *ring.spokes(view, centre, None)
+
+
+def _growing_chart(view: RunView, arcs: Arcs, size: int) -> Chart:
+    return counts_chart(view, arcs.overlap_of(arcs.spread(size)).overlap)
+
+
+def counts_chart(view: RunView, counts: np.ndarray, yaw_rad: float | None = None) -> Chart:
+    """Overlap count over yaw, with the truth and an estimate if there is one."""
+    peak = float(counts.max(initial=1))
+    curves = [ring.step_curve("arcs that overlap", counts), *ring.markers(view, peak, yaw_rad)]
     return Chart("yaw", "Arcs that overlap at each yaw", "yaw (°)", "arcs", tuple(curves))
 
 
-def _drawn(stage: YawStage) -> np.ndarray:
-    """Indices of the arcs to draw: an even sample of the clique's and of the others, ordered by their middles."""
-    middles = 0.5 * (stage.lo_rad + stage.hi_rad)
-    inside = np.zeros(len(middles), dtype=bool)
-    inside[stage.clique] = True
-    order = np.argsort(middles, kind="stable")
-    members, others = order[inside[order]], order[~inside[order]]
-    room = style.MAX_DRAWN_ARCS
-    take = min(len(members), max(room // 2, room - len(others)))
-    return np.concatenate([even(members, take), even(others, room - take)])
-
-
-def _ring(view: RunView, stage: YawStage, cam_from_map: FloatArray, found: bool) -> tuple[SceneItem, ...]:
-    centre, drawn = camera_centre(cam_from_map), _drawn(stage)
-    tracks = INNER + (OUTER - INNER) * (np.arange(len(drawn)) + 0.5) / max(1, len(drawn))
-    steps = np.maximum(1, np.ceil((stage.hi_rad - stage.lo_rad)[drawn] / STEP_RAD)).astype(int)
-    arc = np.repeat(np.arange(len(drawn)), steps)
-    part = np.arange(len(arc)) - np.repeat(np.cumsum(steps) - steps, steps)
-    width = (stage.hi_rad - stage.lo_rad)[drawn][arc] / steps[arc]
-    ends = stage.lo_rad[drawn][arc][:, None] + width[:, None] * (part[:, None] + np.array([0.0, 1.0]))
-    points = centre + view.sphere_m * tracks[arc][:, None, None] * ring.directions(ends.ravel()).reshape(-1, 2, 3)
-    colors = one_color(style.UNDECIDED, len(arc))
-    if found:
-        colors[np.isin(drawn, stage.clique)[arc]] = style.CLIQUE
-    heights = ring.by_degree(stage.overlap)
-    line = ring.circle(view, centre, heights / max(1, int(heights.max())))
-    return (
-        Segments("ring/arcs", "yaw ring", points, colors, 2.0),
-        ring.outline("ring/overlap", line, style.SPHERE),
-        *ring.spokes(view, centre, stage.yaw_rad if found else None),
-    )
+def chart(view: RunView, stage: YawStage, found: bool = False, hand_rad: float | None = None) -> Chart:
+    """Overlap count of all arcs over yaw, with the truth and, once found, the estimate, or where the hand stands."""
+    plain = counts_chart(view, stage.overlap, stage.yaw_rad if found else None)
+    if hand_rad is None:
+        return plain
+    hand = ring.marker("hand", hand_rad, float(stage.overlap.max(initial=1)), style.SAMPLE)
+    return Chart(plain.name, plain.title, plain.x_label, plain.y_label, (*plain.curves, hand))

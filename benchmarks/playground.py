@@ -1,0 +1,44 @@
+"""Starts the playground as its user does, for the programs that measure it."""
+
+import re
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+SCENE = ROOT / "scenes" / "panorama_outliers_90.toml"
+
+
+@contextmanager
+def playground(scene: Path = SCENE) -> Iterator[tuple[str, subprocess.Popen[str]]]:
+    """Address and process of ``spherloc play`` on a free port, which records into a folder that is thrown away."""
+    program = Path(sys.executable).with_name("spherloc")
+    with tempfile.TemporaryDirectory() as folder:
+        words = [program, "play", scene, "--port", "0", "--recordings", folder]
+        server = subprocess.Popen([*map(str, words)], stdout=subprocess.PIPE, text=True)
+        try:
+            assert server.stdout is not None
+            line = server.stdout.readline()
+            match = re.fullmatch(r"spherloc playground: (http://127\.0\.0\.1:\d+)\n", line)
+            if match is None:
+                raise RuntimeError(f"the playground did not start: {line!r}")
+            yield match[1] + "/", server
+        finally:
+            server.terminate()
+            server.wait(20)
+
+
+def memory_mib(process: int) -> float:
+    """Resident memory of a process, MiB (Linux)."""
+    for line in Path(f"/proc/{process}/status").read_text(encoding="utf-8").splitlines():
+        if line.startswith("VmRSS:"):
+            return int(line.split()[1]) / 1024
+    raise RuntimeError(f"process {process} has no resident memory")
+
+
+def thread_count(process: int) -> int:
+    """Threads of a process (Linux)."""
+    return len(list(Path(f"/proc/{process}/task").iterdir()))

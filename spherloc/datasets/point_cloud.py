@@ -1,0 +1,155 @@
+"""Random map points that a camera sees, drawn so that they stay the same for as long as they are seen."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spherloc.cameras.base import Camera, in_image
+from spherloc.errors import InputError
+from spherloc.geometry import camera_centre, transform
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.int64]
+Rngs = tuple[np.random.Generator, np.random.Generator, np.random.Generator]
+
+HALF_SIZE_M = 5.0
+"""Half the side of the paper's cube."""
+WHOLE_SPHERE_DEG = 360.0
+BATCH = 512
+MAX_BATCHES = 400
+AHEAD_M = (1.0, 10.0)
+"""Distance of points that are drawn in front of a camera that sees too few of the cube's, least and most."""
+AHEAD_DRAWS = 60
+
+
+def sees(camera: Camera, pixels: FloatArray, field_of_view_deg: float = WHOLE_SPHERE_DEG) -> BoolArray:
+    """Which pixels (N, 2) are in the image, valid for the model, and within half the field of view from its axis."""
+    bearings, valid = camera.unproject(pixels)
+    visible = in_image(camera, pixels) & valid
+    if field_of_view_deg < WHOLE_SPHERE_DEG:
+        angle = np.arctan2(np.hypot(bearings[:, 0], bearings[:, 1]), bearings[:, 2])
+        visible &= angle <= np.radians(0.5 * field_of_view_deg)
+    return visible
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A camera of which only a part of the field of view is used."""
+
+    camera: Camera
+    """The whole of it."""
+    field_of_view_deg: float = WHOLE_SPHERE_DEG
+    """Whatever is farther than half of it from the optical axis is not seen, degrees."""
+
+    def sees(self, pixels: FloatArray) -> BoolArray:
+        """Which pixels (N, 2) it can give."""
+        return sees(self.camera, pixels, self.field_of_view_deg)
+
+    def project(self, cam_from_map: FloatArray, points: FloatArray) -> tuple[FloatArray, BoolArray]:
+        """Pixels (N, 2) of points (N, 3) from a pose (3, 4), and which of them (N,) it sees."""
+        pixels, visible = self.camera.project(transform(cam_from_map, points))
+        visible = visible & in_image(self.camera, pixels)
+        visible[visible] = self.sees(pixels[visible])
+        return pixels, visible
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """Random points in the paper's cube, or in a flat part of it."""
+
+    name: str
+    """The scene's, for messages."""
+    middle_m: float
+    """Height of the middle of a flat cloud (y of the map)."""
+    height_m: float = 2 * HALF_SIZE_M
+    """How high it is; at most as high as the cube."""
+
+    def draw(self, rng: np.random.Generator, count: int) -> FloatArray:
+        """Points (count, 3) anywhere in the cloud."""
+        return self.flattened(rng.uniform(-HALF_SIZE_M, HALF_SIZE_M, (count, 3)), 0.0)
+
+    def flattened(self, points: FloatArray, middle_m: float) -> FloatArray:
+        """The points (N, 3) of a cube around the height ``middle_m``, moved up and down into the cloud."""
+        if self.height_m < 2 * HALF_SIZE_M:
+            part = np.clip((points[:, 1] - middle_m) / HALF_SIZE_M, -1.0, 1.0)
+            points[:, 1] = self.middle_m + 0.5 * self.height_m * part
+        return points
+
+    def seen_from(
+        self, rngs: Rngs, count: int, lens: Lens, home: FloatArray, poses: Sequence[FloatArray]
+    ) -> tuple[FloatArray, FloatArray]:
+        """Random points (count, 3) that are seen from all ``poses``, and the noise (count, 2) of their pixels, sd 1.
+
+        They are the first that the whole camera sees from ``home``. Those that are not seen from ``poses`` are
+        replaced by others of the cube that are, and if there are too few by points in front of the camera.
+        ``rngs`` draw points, noise, and the points in front. Raises ``InputError`` if too few are seen.
+        """
+        whole = Lens(lens.camera)
+        changed = lens != whole or len(poses) > 1 or poses[0] is not home
+        most = min(MAX_BATCHES, 8 + 6 * count // BATCH) if changed else MAX_BATCHES
+        batches: list[tuple[FloatArray, FloatArray, BoolArray, BoolArray]] = []
+        found = 0
+        while found < count and len(batches) < most:
+            points = self.draw(rngs[0], BATCH)
+            first = whole.project(home, points)[1]
+            seen = np.logical_and.reduce([lens.project(at, points)[1] for at in poses]) if changed else first
+            batches.append((points, rngs[1].standard_normal((BATCH, 2)), first, seen))
+            found += int(np.count_nonzero(first))
+        if found < count and not changed:
+            raise InputError(
+                f"{self.name}: only {found} of {BATCH * MAX_BATCHES:,} random points are visible to the camera; give "
+                "a wider camera, fewer correspondences or another seed."
+            )
+        points, shifts, first, seen = (np.concatenate(parts) for parts in zip(*batches, strict=True))
+        chosen = _keep_or_replace(np.flatnonzero(first)[:count], seen, count)
+        points, shifts, gaps = points[chosen], shifts[chosen], np.flatnonzero(chosen < 0)
+        if len(gaps):
+            more, noise = self._ahead(rngs[2], count, gaps, lens, poses)
+            points[gaps], shifts[gaps] = more[gaps], noise[gaps]
+        return points, shifts
+
+    def _ahead(
+        self, rng: np.random.Generator, count: int, gaps: IntArray, lens: Lens, poses: Sequence[FloatArray]
+    ) -> tuple[FloatArray, FloatArray]:
+        """Points (count, 3) in front of the first of ``poses``, seen from all of them, right in the ``gaps`` only.
+
+        The gaps do not depend on each other, so that a point stays when another one gets lost.
+        """
+        points, shifts = np.zeros((count, 3)), rng.standard_normal((count, 2))
+        rotation, centre = poses[0][:, :3], camera_centre(poses[0])
+        for _ in range(AHEAD_DRAWS):
+            bearings = random_bearings(rng, count, lens.field_of_view_deg)[gaps]
+            distances = rng.uniform(*AHEAD_M, (count, 1))[gaps]
+            points[gaps] = self.flattened(centre + distances * bearings @ rotation, float(centre[1]))
+            gaps = gaps[~np.logical_and.reduce([lens.project(at, points[gaps])[1] for at in poses])]
+            if len(gaps) == 0:
+                return points, shifts
+        raise InputError(
+            f"{self.name}: no points are visible to the camera for {len(gaps)} of the correspondences; give a wider "
+            "camera or field of view, a higher cloud, another true camera or another seed."
+        )
+
+
+def random_bearings(rng: np.random.Generator, count: int, field_of_view_deg: float) -> FloatArray:
+    """Unit vectors (count, 3), uniform within half the field of view from the optical axis."""
+    z = rng.uniform(np.cos(np.radians(0.5 * field_of_view_deg)), 1.0, count)
+    side, radius = rng.uniform(-np.pi, np.pi, count), np.sqrt(1.0 - z * z)
+    return np.column_stack([radius * np.cos(side), radius * np.sin(side), z])
+
+
+def _keep_or_replace(first: IntArray, seen: BoolArray, count: int) -> IntArray:
+    """Numbers (count,) of ``seen`` points: those of ``first`` stay in their places, others fill the gaps in order.
+
+    -1 where there are too few.
+    """
+    chosen = np.full(count, -1)
+    chosen[: len(first)] = np.where(seen[first], first, -1)
+    others = seen.copy()
+    others[first] = False
+    spare, gaps = np.flatnonzero(others), np.flatnonzero(chosen < 0)
+    filled = min(len(spare), len(gaps))
+    chosen[gaps[:filled]] = spare[:filled]
+    return chosen

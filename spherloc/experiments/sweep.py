@@ -1,0 +1,129 @@
+"""Success, errors and time of estimators against the outlier rate, noise, number or gravity error (Figs. 5 to 7).
+
+>>> plan = planned(Path("scenes/mei_outliers_80.toml"), "outlier_rate", [0.5, 0.9], [Entrant("mc")], runs=100)
+>>> rows = list(run_sweep(plan))
+"""
+
+import threading
+from collections import Counter, deque
+from collections.abc import Collection, Iterator, Sequence
+
+from spherloc.errors import InputError
+from spherloc.experiments.sweep_crew import Crew, LocalCrew
+from spherloc.experiments.sweep_plan import AXES, Entrant, Job, SweepPlan, planned
+from spherloc.experiments.sweep_rows import SweepRow
+
+__all__ = ["AXES", "Entrant", "Job", "SweepPlan", "SweepRow", "planned", "run_sweep"]
+
+TASK_S = 0.3
+"""A task is a few runs that take about as long as this: less would be spent on messages, more would look stuck."""
+FIRST_GUESS_MS = 20.0
+OVERHEAD_MS = 2.0
+"""Of a run beside its estimator: drawing the problem, judging the pose."""
+MOST_DEATHS = 3
+LISTEN_S = 0.1
+
+
+def run_sweep(
+    plan: SweepPlan,
+    done: Collection[tuple[str, float, int]] = (),
+    workers: int = 2,
+    scheduler: str | None = None,
+    stop: threading.Event | None = None,
+) -> Iterator[SweepRow]:
+    """The rows of a sweep as they come, all points growing evenly; none is done here, all in other processes.
+
+    ``done`` holds (estimator's label, value, seed) of runs to be left out. ``scheduler`` is the address of a Dask
+    scheduler ("tcp://host:8786"), whose workers then do the runs instead of ``workers`` processes on this machine.
+    The rows do not depend on who does them, but for their times and their order. Setting ``stop``, or closing the
+    iterator, ends it within a fraction of a second and leaves no process behind. Runs of a worker that dies are done
+    again.
+
+    Raises ``InputError`` if a run is impossible or kills its worker every time, or if there are no workers.
+    """
+    backlog = Backlog(plan, done)
+    crew = _crew(plan, workers, scheduler)
+    try:
+        while backlog.left and not (stop is not None and stop.is_set()):
+            for _ in range(crew.room()):
+                if jobs := backlog.take():
+                    crew.submit(jobs)
+            for task in crew.collect(LISTEN_S):
+                yield from backlog.put_back(task.jobs) if task.rows is None else backlog.book(task.jobs, task.rows)
+    finally:
+        crew.close()
+
+
+def _crew(plan: SweepPlan, workers: int, scheduler: str | None) -> Crew:
+    if scheduler is None:
+        return LocalCrew(plan, workers)
+    from spherloc.experiments.sweep_cluster import Cluster
+
+    return Cluster(plan, scheduler)
+
+
+class Backlog:
+    """The runs that are still to be done, handed out in tasks."""
+
+    def __init__(self, plan: SweepPlan, done: Collection[tuple[str, float, int]]) -> None:
+        self._plan = plan
+        known, labels = set(done), plan.labels
+        self._fresh = (
+            job
+            for job in plan.jobs()
+            if (labels[job.entrant], plan.values[job.value], plan.first_seed + job.run) not in known
+        )
+        self._next = next(self._fresh, None)
+        self._suspects: deque[Job] = deque()
+        """Of tasks whose worker died. Each is done alone and with nothing beside it, to tell who kills workers."""
+        self._deaths: Counter[Job] = Counter()
+        self._out: set[tuple[Job, ...]] = set()
+        self._spent_ms: dict[tuple[int, int], tuple[int, float]] = {}
+
+    @property
+    def left(self) -> bool:
+        """Whether anything is not done."""
+        return bool(self._next or self._suspects or self._out)
+
+    def take(self) -> tuple[Job, ...]:
+        """The next task; nothing if there is none now."""
+        if self._suspects and self._out:
+            return ()
+        jobs = (self._suspects.popleft(),) if self._suspects else tuple(self._next_jobs())
+        if jobs:
+            self._out.add(jobs)
+        return jobs
+
+    def book(self, jobs: tuple[Job, ...], rows: Sequence[SweepRow]) -> Sequence[SweepRow]:
+        """A task is done; gives its rows."""
+        self._out.remove(jobs)
+        for job, row in zip(jobs, rows, strict=True):
+            runs, total_ms = self._spent_ms.get((job.value, job.entrant), (0, 0.0))
+            self._spent_ms[job.value, job.entrant] = runs + 1, total_ms + row.time_ms
+        return rows
+
+    def put_back(self, jobs: tuple[Job, ...]) -> Sequence[SweepRow]:
+        """A task's worker died; gives no rows. Raises ``InputError`` if it always does."""
+        alone = len(self._out) == 1 and len(jobs) == 1
+        self._out.remove(jobs)
+        if alone:
+            self._deaths[jobs[0]] += 1
+            if self._deaths[jobs[0]] == MOST_DEATHS:
+                raise InputError(
+                    f"{self._plan.place(jobs[0])}: its worker process was killed {MOST_DEATHS} times; see whether the "
+                    "memory suffices, or sweep without it."
+                )
+        self._suspects.extend(jobs)
+        return ()
+
+    def _next_jobs(self) -> Iterator[Job]:
+        budget_ms = 1e3 * TASK_S
+        while self._next is not None:
+            job = self._next
+            runs, total_ms = self._spent_ms.get((job.value, job.entrant), (1, FIRST_GUESS_MS))
+            cost_ms = total_ms / runs + OVERHEAD_MS
+            if cost_ms > budget_ms and budget_ms < 1e3 * TASK_S:
+                return
+            budget_ms -= cost_ms
+            self._next = next(self._fresh, None)
+            yield job

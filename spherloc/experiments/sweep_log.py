@@ -1,0 +1,198 @@
+"""The CSV of a sweep: every run is in the file before the next one is noted, and a sweep that was stopped goes on."""
+
+import contextlib
+import json
+import os
+import uuid
+from collections.abc import Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from spherloc.errors import InputError, show
+from spherloc.experiments.sweep_plan import SweepPlan
+from spherloc.experiments.sweep_rows import SweepRow, columns, csv_line, row_line, row_of_line
+from spherloc.experiments.sweep_summary import summarize, summary_text
+
+MAX_BYTES = 1_000_000_000
+MAX_PLAN_BYTES = 1_000_000
+MAX_DIFFERENCES = 3
+_UNCOMPARED = {"scene", "runs"}
+"""A scene that was moved is the same scene, and more runs add to those that are done."""
+
+
+class SweepLog:
+    """Appends rows to a CSV. Use it as a context manager; one process at a time may have the file.
+
+    Beside ``NAME.csv`` are ``NAME.plan.json``, by which a sweep knows that the file is its own, and, at the end,
+    ``NAME.summary.csv``.
+    """
+
+    def __init__(self, path: Path, plan: SweepPlan) -> None:
+        """Begin a file or go on with one.
+
+        Raises ``InputError`` if it cannot be written, holds the runs of another plan, is damaged, or if another
+        process writes to it.
+        """
+        self.path, self._plan = Path(path), plan
+        if self.path.suffix != ".csv":
+            raise InputError(f"{self.path}: the table of a sweep ends with .csv; name it so.")
+        self.rows: list[SweepRow] = []
+        """Those of earlier times first."""
+        with contextlib.ExitStack() as stack:
+            try:
+                self.path.parent.mkdir(parents=True, exist_ok=True)
+                self._file = stack.enter_context(self.path.open("ab"))
+            except OSError as error:
+                raise InputError(
+                    f"{self.path}: cannot be written ({error.strerror or error}); give another file."
+                ) from None
+            self._lock()
+            self._compare()
+            self._read()
+            self._open = stack.pop_all()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        with contextlib.suppress(OSError):  # of bytes that found no room: that was said when they were appended
+            self._open.close()
+
+    @property
+    def done(self) -> set[tuple[str, float, int]]:
+        """(estimator's label, value, seed) of the rows."""
+        return {(row.estimator, row.value, row.seed) for row in self.rows}
+
+    def beside(self, ending: str) -> Path:
+        """``NAME.png`` for ".png"."""
+        return self.path.with_suffix(ending)
+
+    def append(self, row: SweepRow) -> None:
+        """Have a row in the file before this returns. Raises ``InputError`` if that fails; other rows are kept."""
+        with self._writing(self.path):
+            self._file.write(row_line(row).encode())
+            self._file.flush()
+        self.rows.append(row)
+
+    def finish(self) -> None:
+        """Put the rows in order, whoever was quicker, and write the summary. Raises ``InputError`` if that fails."""
+        labels = {label: place for place, label in enumerate(self._plan.labels)}
+        self.rows.sort(key=lambda row: (row.seed, row.value, labels[row.estimator]))
+        lines = [csv_line(columns(self._plan.over)), *map(row_line, self.rows)]
+        self.write(self.path, "".join(lines).encode())
+        points = summarize(self._plan.labels, self.rows)
+        self.write(self.beside(".summary.csv"), summary_text(self._plan.over, points).encode())
+
+    def write(self, path: Path, content: bytes) -> None:
+        """Write a file so that no reader sees half of it. Raises ``InputError`` if that fails."""
+        part = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.part")
+        try:
+            with self._writing(path):
+                part.write_bytes(content)
+                part.replace(path)
+        finally:
+            with contextlib.suppress(OSError):
+                part.unlink(missing_ok=True)
+
+    @contextlib.contextmanager
+    def _writing(self, path: Path) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise InputError(
+                f"{path}: cannot be written ({error.strerror or error}); what is done is kept ({len(self.rows)} runs): "
+                "make room there and give the same command to go on."
+            ) from None
+
+    def _lock(self) -> None:
+        """Keep other processes off the file; the system ends the lock whatever ends this process."""
+        try:
+            import fcntl
+        except ImportError:  # Windows has no such lock
+            return
+        try:
+            fcntl.flock(self._file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise InputError(
+                f"{self.path}: another sweep writes to it; wait or give another file."
+            ) from None
+        except OSError:  # a file system without locks
+            return
+
+    def _compare(self) -> None:
+        path, now = self.beside(".plan.json"), self._plan.record()
+        begun = self.path.stat().st_size > 0
+        if begun and not path.exists():
+            raise InputError(f"{self.path}: is no table of a sweep, or has lost its {path.name}; give another file.")
+        if begun:
+            differences = _differences(_read_plan(path), now)
+            if differences:
+                more = len(differences) - MAX_DIFFERENCES
+                listed = "; ".join(differences[:MAX_DIFFERENCES]) + (f"; and {more} more" if more > 0 else "")
+                raise InputError(f"{self.path}: holds the runs of another sweep ({listed}); give another file.")
+        self.write(path, (json.dumps(now, indent=2, allow_nan=False) + "\n").encode())
+
+    def _read(self) -> None:
+        size = self.path.stat().st_size
+        if size > MAX_BYTES:
+            raise InputError(f"{self.path}: larger than {MAX_BYTES:,} bytes; give another file.")
+        content = self.path.read_bytes()
+        whole = content[: content.rfind(b"\n") + 1]
+        header = csv_line(columns(self._plan.over))
+        lines = whole.decode("utf-8", errors="replace").split("\n")[:-1]
+        if lines and lines[0] != header.rstrip("\n"):
+            raise InputError(f"{self.path}, line 1: is not the heading of this sweep's table; give another file.")
+        for number, line in enumerate(lines[1:], start=2):
+            self.rows.append(self._checked(row_of_line(line, place := f"{self.path}, line {number}"), place))
+        if len(self.done) < len(self.rows):
+            raise InputError(f"{self.path}: holds a run twice; delete one of the two lines, or give another file.")
+        with self._writing(self.path):
+            os.truncate(self.path, len(whole))  # a line that a killed process left half written
+            if not lines:
+                self._file.write(header.encode())
+                self._file.flush()
+
+    def _checked(self, row: SweepRow, place: str) -> SweepRow:
+        plan = self._plan
+        if row.estimator not in plan.labels or row.value not in plan.values or row.seed < plan.first_seed:
+            raise InputError(
+                f"{place}: holds {show(row.estimator)} at {row.value:g}, seed {row.seed}, no run of this sweep; delete "
+                "that line."
+            )
+        return row
+
+
+def _read_plan(path: Path) -> dict[str, Any]:
+    try:
+        if path.stat().st_size > MAX_PLAN_BYTES:
+            raise ValueError
+        table = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(table, dict):
+            raise ValueError
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); make it readable.") from None
+    except (ValueError, RecursionError):
+        raise InputError(f"{path}: is damaged; give another file for the sweep.") from None
+    return table
+
+
+def _differences(before: dict[str, Any], now: dict[str, Any]) -> list[str]:
+    """What is not the same, as phrases such as "over is 'noise_px', was 'outlier_rate'"."""
+    a, b = dict(_flat(before)), dict(_flat(json.loads(json.dumps(now))))
+    different = [key for key in {**a, **b} if key not in a or key not in b or a[key] != b[key]]
+    return [f"{key} is {_shown(b, key)}, was {_shown(a, key)}" for key in different]
+
+
+def _flat(table: dict[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in table.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{above}{key}.")
+        elif above or key not in _UNCOMPARED:
+            yield above + key, value
+
+
+def _shown(table: dict[str, Any], key: str) -> str:
+    return show(table[key]) if key in table else "absent"

@@ -1,0 +1,158 @@
+"""The folders that a page may look into. What a page sends is (number of a root, relative path), and it is checked."""
+
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from spherloc.datasets.scene_file import read_table
+from spherloc.errors import InputError
+
+PAGE = 12
+"""Rows that are shown at once."""
+MOST_ENTRIES = 20_000
+"""Of a larger folder only so many are looked at."""
+MOST_PEEK_BYTES = 100_000
+"""Larger TOML files are not read before they are opened."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of a listing."""
+
+    kind: Literal["folder", "scene", "other"]
+    """"other" is a TOML file that is no scene."""
+    name: str
+    """File name."""
+    place: str
+    """What names it to ``Roots.find``."""
+    about: str = ""
+    """Kind and name of a scene, or what is wrong with it."""
+
+
+@dataclass(frozen=True)
+class Listing:
+    """A page of what is in a folder."""
+
+    folder: Path
+    place: str
+    parent: str | None
+    """Place of the folder above, if that may be looked into."""
+    rows: tuple[Row, ...]
+    page: int
+    """From 0."""
+    pages: int
+    remarks: tuple[str, ...]
+    """What is not shown and why, in sentences."""
+
+
+class Roots:
+    """Folders below which a page may look. Symbolic links count as what they point to."""
+
+    def __init__(self, folders: Sequence[Path]) -> None:
+        """Folders that do not exist are left out."""
+        resolved = (Path(os.path.realpath(folder)) for folder in folders)
+        self.folders = tuple(dict.fromkeys(folder for folder in resolved if folder.is_dir()))
+
+    def find(self, place: str) -> Path:
+        """The resolved path of a place "NUMBER:RELATIVE".
+
+        Raises ``InputError`` unless it exists below one of the roots.
+        """
+        number, colon, relative = place.partition(":")
+        if not (colon and number.isascii() and number.isdigit() and len(number) < 4):
+            raise InputError("this is no place in an allowed folder; choose one from the list.")
+        if int(number) >= len(self.folders):
+            raise InputError("this folder is not allowed any more; choose one from the list.")
+        try:
+            path = Path(os.path.realpath(self.folders[int(number)] / relative))
+            known = self.place(path) is not None and path.exists()
+        except (OSError, ValueError):  # names that no file can have
+            known = False
+        if not known:
+            raise InputError("this file is not there or not in an allowed folder; choose one from the list.")
+        return path
+
+    def place(self, path: Path) -> str | None:
+        """What names a resolved path to ``find``; None if it is below none of the roots."""
+        for number, root in enumerate(self.folders):
+            if path.is_relative_to(root):
+                return f"{number}:{path.relative_to(root).as_posix()}"
+        return None
+
+    def look_into(self, place: str, page: int = 0) -> Listing:
+        """A page of the sub-folders and scene files in a folder; pages that there are not become the nearest.
+
+        Raises ``InputError`` if it cannot be read or is not allowed.
+        """
+        folder = self.find(place)
+        try:
+            entries, remarks = self._entries(folder)
+        except OSError as error:
+            reason = error.strerror or error
+            raise InputError(f"the folder {folder.name} cannot be read ({reason}); choose another.") from None
+        pages = max(1, -(-len(entries) // PAGE))
+        page = min(max(page, 0), pages - 1)
+        rows = tuple(describe(path, own) for path, own in entries[PAGE * page : PAGE * (page + 1)])
+        return Listing(folder, self.place(folder) or "", self.place(folder.parent), rows, page, pages, remarks)
+
+    def _entries(self, folder: Path) -> tuple[list[tuple[Path, str]], tuple[str, ...]]:
+        """Folders, then TOML files, by name, each with its place; and what was left out."""
+        found: list[tuple[bool, str, Path, str]] = []
+        hidden = outside = 0
+        whole = True
+        with os.scandir(folder) as scan:
+            for count, entry in enumerate(scan):
+                if count == MOST_ENTRIES:
+                    whole = False
+                    break
+                is_folder = _is_folder(entry)
+                if not (is_folder or entry.name.lower().endswith(".toml")):
+                    continue
+                if entry.name.startswith("."):
+                    hidden += 1
+                    continue
+                path = Path(os.path.realpath(entry.path)) if entry.is_symlink() else folder / entry.name
+                place = self.place(path)
+                if place is None:
+                    outside += 1
+                else:
+                    found.append((not is_folder, entry.name, folder / entry.name, place))
+        found.sort(key=lambda item: (item[0], item[1].casefold(), item[1]))
+        return [(path, place) for _, _, path, place in found], tuple(_remarks(hidden, outside, whole))
+
+
+def _remarks(hidden: int, outside: int, whole: bool) -> Iterator[str]:
+    if hidden:
+        yield f"{hidden} hidden by a leading dot."
+    if outside:
+        yield f"{outside} left out, since they are links to folders that are not allowed."
+    if not whole:
+        yield f"Only the first {MOST_ENTRIES:,} entries of this folder were looked at."
+
+
+def _is_folder(entry: os.DirEntry) -> bool:
+    try:
+        return entry.is_dir()
+    except OSError:
+        return False
+
+
+def describe(path: Path, place: str) -> Row:
+    """A folder or file, and what a scene file says of itself."""
+    try:
+        if path.is_dir():
+            return Row("folder", path.name, place)
+        if not path.is_file():  # reading a pipe would wait for ever
+            return Row("other", path.name, place, "is no file")
+        if path.stat().st_size > MOST_PEEK_BYTES:
+            return Row("scene", path.name, place, "large")
+        table = read_table(path)
+    except (InputError, OSError):
+        return Row("other", path.name, place, "cannot be read")
+    kind, name = table.get("kind"), table.get("name")
+    if not isinstance(kind, str):
+        return Row("other", path.name, place, "is no scene file")
+    about = " ".join(str(table.get("about", "")).split())
+    return Row("scene", path.name, place, ": ".join(filter(None, (f"{name} ({kind})", about))))

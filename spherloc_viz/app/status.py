@@ -1,0 +1,54 @@
+"""What goes on and what went wrong, in one sentence each."""
+
+import logging
+import threading
+
+import viser
+
+from spherloc.errors import SpherlocError
+from spherloc_viz.app.text import status_html
+
+log = logging.getLogger(__name__)
+
+
+class Status:
+    """One client's status line and notification."""
+
+    def __init__(self, client: viser.ClientHandle) -> None:
+        self._client = client
+        self._line = client.gui.add_html(status_html("Solving the first problem …"))
+        self._complaint: tuple[str, viser.NotificationHandle] | None = None
+        self._lock = threading.Lock()
+
+    def say(self, sentence: str) -> None:
+        """Say what goes on."""
+        html = status_html(sentence)
+        if self._line.content != html:
+            self._line.content = html
+
+    def complain(self, sentence: str) -> None:
+        """Say in one sentence what went wrong; the page keeps its last run and stays usable."""
+        sentence = sentence[:1].upper() + sentence[1:]
+        with self._lock:
+            self._line.content = status_html(sentence, wrong=True)
+            if self._complaint is not None:
+                if self._complaint[0] == sentence:
+                    return
+                self._complaint[1].remove()
+            note = self._client.add_notification("Cannot do that", sentence, color="red")
+            self._complaint = (sentence, note)
+
+    def fail(self, error: Exception) -> None:
+        """Complain about an error: a user's mistake by its own sentence, a bug by one that says so."""
+        if isinstance(error, SpherlocError):
+            self.complain(str(error))
+            return
+        log.error("client %s", self._client.client_id, exc_info=error)
+        self.complain(f"This is a bug in the playground ({error!r}); change a setting or reload the page.")
+
+    def withdraw(self) -> None:
+        """What was wrong is wrong no more."""
+        with self._lock:
+            if self._complaint is not None:
+                self._complaint[1].remove()
+                self._complaint = None

@@ -1,0 +1,119 @@
+"""The arcs of a run: which of them are looked at, what they are, and how they are drawn on the ring."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from math import gcd
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spherloc.consensus.yaw_sweep import YawConsensus, deepest_yaw
+from spherloc.trace import YawStage
+from spherloc_viz import style
+from spherloc_viz.layers import ring
+from spherloc_viz.layers.frame import RunView, even, one_color
+from spherloc_viz.layers.primitives import FloatArray, Segments
+
+IndexArray = NDArray[np.int64]
+
+INNER, OUTER = 1.3, 1.95
+"""Radii of the band of arcs, in sphere radii."""
+STEP_RAD = np.radians(4.0)
+GOLDEN = 0.6180339887498949
+
+
+@dataclass(frozen=True, eq=False)
+class Arcs:
+    """A yaw stage and what several of its frames need, computed when it is first asked for. A arcs."""
+
+    stage: YawStage
+
+    def __len__(self) -> int:
+        return len(self.stage.lo_rad)
+
+    @cached_property
+    def in_clique(self) -> NDArray[np.bool_]:
+        """(A,) arcs that cover the estimated yaw."""
+        inside = np.zeros(len(self), dtype=bool)
+        inside[self.stage.clique] = True
+        return inside
+
+    @cached_property
+    def _continues(self) -> NDArray[np.bool_]:
+        """(A,) arcs of the same pair as the arc before them; the arcs of a pair follow one another."""
+        pairs = np.ascontiguousarray(self.stage.pairs, dtype=np.int32).view(np.int64).ravel()
+        same = np.zeros(len(pairs), dtype=bool)
+        same[1:] = pairs[1:] == pairs[:-1]
+        return same
+
+    @cached_property
+    def pair_counts(self) -> tuple[int, int]:
+        """How many pairs have one arc, and how many have more."""
+        same = self._continues
+        pairs = len(same) - int(np.count_nonzero(same))
+        several = int(np.count_nonzero(same[1:] & ~same[:-1]))
+        return pairs - several, several
+
+    @cached_property
+    def example(self) -> IndexArray:
+        """The arcs of one pair: of those with an arc over the estimated yaw the one whose arc there is the shortest,
+        among those with two arcs if there are any."""
+        arcs, same = self.stage.clique.astype(np.int64), self._continues
+        twins = same[arcs] | np.append(same[1:], False)[arcs]
+        if twins.any():
+            arcs = arcs[twins]
+        first = int(arcs[np.argmin((self.stage.hi_rad - self.stage.lo_rad)[arcs])])
+        end = first + 1
+        while same[first]:
+            first -= 1
+        while end < len(same) and same[end]:
+            end += 1
+        return np.arange(first, end)
+
+    def spread(self, count: int) -> IndexArray:
+        """The first ``count`` arcs in an order in which every beginning is spread evenly over all pairs."""
+        total = len(self)
+        stride = max(1, round(GOLDEN * total))
+        while gcd(stride, total) > 1:
+            stride += 1
+        return np.arange(min(count, total), dtype=np.int64) * stride % total
+
+    def overlap_of(self, arcs: IndexArray) -> YawConsensus:
+        """The yaw that most of some arcs share, and their overlap."""
+        found = deepest_yaw(self.stage.lo_rad[arcs], self.stage.hi_rad[arcs])
+        assert found is not None
+        return found
+
+    def over(self, arcs: IndexArray, lo_rad: float, hi_rad: float) -> NDArray[np.bool_]:
+        """Which of some arcs touch an interval of yaw within [-pi, pi]."""
+        lo, hi = self.stage.lo_rad[arcs], self.stage.hi_rad[arcs]
+        return ((lo <= hi_rad) & (hi >= lo_rad)) | (hi >= lo_rad + 2 * np.pi)
+
+    def with_clique(self) -> IndexArray:
+        """Arcs to draw: an even sample of the clique's and of the others, half and half if there are too many."""
+        members, room = self.stage.clique.astype(np.int64), style.MAX_DRAWN_ARCS
+        take = min(len(members), max(room // 2, room - (len(self) - len(members))))
+        others = self.spread(8 * room)
+        others = others[~self.in_clique[others]]
+        if len(others) < room - take:
+            others = np.flatnonzero(~self.in_clique)
+        return np.concatenate([even(members, take), others[: room - take]])
+
+    def drawn(
+        self, view: RunView, centre: FloatArray, arcs: IndexArray, marked: np.ndarray, mark: style.RGB
+    ) -> Segments:
+        """Arcs on the ring, each on a track of its own: the marked ones (mask) first, in their colour, then the others,
+        each by their middles."""
+        lo, hi, pairs = (array[arcs] for array in (self.stage.lo_rad, self.stage.hi_rad, self.stage.pairs))
+        order = np.lexsort((lo + hi, ~marked))
+        lo, width, marked, pairs = lo[order], (hi - lo)[order], marked[order], pairs[order]
+        tracks = INNER + (OUTER - INNER) * (np.arange(len(arcs)) + 0.5) / max(1, len(arcs))
+        steps = np.maximum(1, np.ceil(width / STEP_RAD)).astype(np.int64)
+        arc = np.repeat(np.arange(len(arcs)), steps)
+        part = np.arange(len(arc)) - np.repeat(np.cumsum(steps) - steps, steps)
+        ends = lo[arc, None] + (width / steps)[arc, None] * (part[:, None] + np.array([0.0, 1.0]))
+        directions = ring.directions(ends.ravel()).reshape(-1, 2, 3)
+        points = centre + view.sphere_m * tracks[arc, None, None] * directions
+        colors = one_color(style.UNDECIDED, len(arc))
+        colors[marked[arc]] = mark
+        return Segments("ring/arcs", "yaw ring", points, colors, 2.0, ids=pairs[arc].astype(np.int64))

@@ -1,0 +1,114 @@
+"""The balls of a run: in which order they come, which of them are drawn, and how."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spherloc.geometry import camera_centre
+from spherloc.trace import TranslationStage
+from spherloc_viz import style
+from spherloc_viz.layers.frame import RunView, even, one_color
+from spherloc_viz.layers.primitives import Balls, Points, SceneItem, Segments
+
+IndexArray = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class BallSet:
+    """A translation stage and what several of its frames need, computed when it is first asked for. M balls."""
+
+    stage: TranslationStage
+
+    def __len__(self) -> int:
+        return len(self.stage.radii_m)
+
+    @cached_property
+    def by_radius(self) -> IndexArray:
+        """(M,) the smallest first."""
+        return np.argsort(self.stage.radii_m, kind="stable")
+
+    @cached_property
+    def in_clique(self) -> NDArray[np.bool_]:
+        """(M,) balls of the maximum clique."""
+        return self.mask(self.stage.clique)
+
+    @cached_property
+    def members(self) -> IndexArray:
+        """(S,) balls of the maximum clique, the smallest first."""
+        return self.by_radius[self.in_clique[self.by_radius]]
+
+    @cached_property
+    def _adjacency(self) -> NDArray[np.bool_]:
+        """(M, M) balls that overlap."""
+        overlap = np.zeros((len(self), len(self)), dtype=bool)
+        first, second = self.stage.edges.T
+        overlap[first, second] = overlap[second, first] = True
+        return overlap
+
+    @cached_property
+    def degrees(self) -> IndexArray:
+        """(M,) how many others each ball overlaps."""
+        return np.bincount(self.stage.edges.ravel(), minlength=len(self))
+
+    def mask(self, balls: np.ndarray) -> NDArray[np.bool_]:
+        """Mask (M,) of some balls."""
+        inside = np.zeros(len(self), dtype=bool)
+        inside[balls] = True
+        return inside
+
+    def edges_within(self, inside: NDArray[np.bool_]) -> np.ndarray:
+        """Overlaps (E, 2) between balls of a mask (M,)."""
+        edges = self.stage.edges
+        return edges[inside[edges[:, 0]] & inside[edges[:, 1]]]
+
+    def greedy(self, order: IndexArray) -> IndexArray:
+        """A clique: each ball in the given order that overlaps all that were taken before it."""
+        overlap = self._adjacency[order][:, order]
+        fitting, taken, place = np.ones(len(order), dtype=bool), [], 0
+        while fitting[place]:
+            taken.append(place)
+            fitting[place] = False
+            fitting &= overlap[place]
+            place = int(np.argmax(fitting))
+        return order[taken]
+
+    def drawn(self, shown: IndexArray, inside: NDArray[np.bool_]) -> IndexArray:
+        """Which of some balls, the smallest first, to draw: of those of a mask (M,) and of the others an even sample
+        of the smaller half, if there are too many. Large balls hold the whole picture in them and hide it."""
+        most = style.MAX_DRAWN_BALLS
+        if len(shown) <= most:
+            return shown
+        halves = [group[: max(1, len(group) // 2)] for group in (shown[inside[shown]], shown[~inside[shown]])]
+        take = min(len(halves[0]), max(most // 2, most - len(halves[1])))
+        return np.concatenate([even(halves[0], take), even(halves[1], most - take)])
+
+    def items(
+        self, view: RunView, shown: IndexArray, inside: NDArray[np.bool_], color: style.RGB = style.CLIQUE
+    ) -> tuple[SceneItem, ...]:
+        """Some balls, the smallest first, their centres and their overlaps; those of a mask (M,) in their colour."""
+        stage, drawn = self.stage, self.drawn(shown, inside)
+        items: list[SceneItem] = [self._edges(drawn, inside, color)]
+        dot_m = min(0.02 * view.sphere_m, 0.1 * float(np.median(stage.radii_m)))
+        groups = (("balls/others", ~inside, style.UNDECIDED, 0.10), ("balls/clique", inside, color, 0.16))
+        for name, members, shade, opacity in groups:
+            chosen, centres = drawn[members[drawn]], shown[members[shown]]
+            if len(chosen):
+                places, radii = stage.centres_m[chosen], stage.radii_m[chosen]
+                ids = stage.pairs[chosen].astype(np.int64)
+                items.append(Balls(name, "balls", places, radii, one_color(shade, len(chosen)), opacity, ids=ids))
+            if len(centres):
+                dots = one_color(shade, len(centres))
+                items.append(Points(f"{name}-centres", "balls", stage.centres_m[centres], dots, dot_m))
+        if view.truth is not None:
+            truth = camera_centre(view.truth)[None]
+            items.append(Points("balls/truth", "balls", truth, one_color(style.TRUTH, 1), 2.0 * dot_m))
+        return tuple(items)
+
+    def _edges(self, drawn: IndexArray, inside: NDArray[np.bool_], color: style.RGB) -> Segments:
+        """Overlaps between the drawn balls."""
+        edges = self.edges_within(self.mask(drawn))
+        colors = one_color(style.UNDECIDED, len(edges))
+        colors[inside[edges[:, 0]] & inside[edges[:, 1]]] = color
+        return Segments("balls/edges", "balls", self.stage.centres_m[edges], colors, 1.5)

@@ -1,0 +1,213 @@
+"""Several estimators on one problem: a table, their cameras side by side, and their curves in one chart."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from spherloc import registry
+from spherloc.diagnosis import Diagnosis
+from spherloc.geometry import camera_centre, yaw_of
+from spherloc.metrics import evaluate
+from spherloc.refine import residuals_px
+from spherloc.trace import Certificate, ConsensusStage, Trace, YawStage
+from spherloc_viz import style
+from spherloc_viz.layers.certificate import is_knowable
+from spherloc_viz.layers.frame import RunView, one_color
+from spherloc_viz.layers.primitives import Chart, Curve, FloatArray, Label, SceneItem, Segments, Table
+from spherloc_viz.layers.scene import camera
+
+PALETTE: tuple[style.RGB, ...] = (
+    (150, 205, 20),
+    (180, 85, 255),
+    (255, 135, 60),
+    (140, 95, 55),
+    (20, 105, 115),
+    (255, 205, 170),
+    (75, 60, 215),
+    (155, 15, 75),
+    (160, 240, 190),
+    (135, 30, 150),
+    (70, 120, 20),
+)
+"""Colours of estimators: far from each other and from those of ``style.LEGEND``, which mean something else."""
+FIRST = ("mc-exact", "mc", "ransac-2p", "auto")
+"""Estimators that have the first colours; others follow in alphabetical order."""
+NO_VALUE = "–"
+COLUMNS = (
+    "estimator",
+    "outcome",
+    "rotation",
+    "position",
+    "inliers",
+    "precision",
+    "recall",
+    "F1",
+    "time",
+    "certificate",
+    "diagnosis",
+)
+REACH = 2.0
+"""Residuals are shown up to this many times the largest noise bound."""
+SAMPLES = 120
+"""Corners of a residual curve."""
+SMALLER = 0.09
+"""Cameras at one place are nested: each is smaller by this share of the first."""
+SIZE, TOWER, STOREY = 1.9, 1.75, 0.5
+"""Size of the first camera, and heights of the lowest name and of each name above it, in sphere radii."""
+LOWER = 0.07
+"""Markers at one yaw: each is lower by this share of the first."""
+
+
+@dataclass(frozen=True, eq=False)
+class Entry:
+    """One estimator's run."""
+
+    trace: Trace
+    diagnosis: Diagnosis | None = None
+    """None as long as it is not known."""
+
+    @property
+    def color(self) -> style.RGB:
+        """The estimator's."""
+        return color_of(self.trace.estimator)
+
+
+def color_of(estimator: str) -> style.RGB:
+    """The colour of a registered estimator, whichever others it is compared with."""
+    known = registry.names("estimators")
+    order = [*(name for name in FIRST if name in known), *(name for name in known if name not in FIRST)]
+    return PALETTE[order.index(estimator) % len(PALETTE)]
+
+
+def comparison_table(entries: Sequence[Entry]) -> Table:
+    """A row an estimator, all values as text."""
+    return Table("comparison", COLUMNS, tuple(_row(entry) for entry in entries))
+
+
+def _row(entry: Entry) -> tuple[str, ...]:
+    trace, metrics = entry.trace, evaluate(entry.trace)
+    turn, shift = metrics.rotation_error_deg, metrics.translation_error_m
+    return (
+        trace.estimator,
+        outcome(trace),
+        NO_VALUE if turn is None else f"{turn:.3f}°" if turn < 10 else f"{turn:.0f}°",
+        NO_VALUE if shift is None else _length(shift),
+        f"{np.count_nonzero(trace.inlier_mask)}",
+        *(NO_VALUE if share is None else f"{100 * share:.0f} %" for share in (metrics.precision, metrics.recall)),
+        NO_VALUE if metrics.f1 is None else f"{100 * metrics.f1:.0f} %",
+        _duration(trace.timings_ms["total"]),
+        NO_VALUE if trace.certificate is None else _proof(trace.certificate),
+        "…" if entry.diagnosis is None else str(entry.diagnosis.cause),
+    )
+
+
+def outcome(trace: Trace) -> str:
+    """How a run went, in a word or two."""
+    if trace.cam_from_map is None:
+        return "no pose"
+    return {True: "success", False: "failure", None: "unknown"}[evaluate(trace).success]
+
+
+def _length(metres: float) -> str:
+    return f"{100 * metres:.2f} cm" if metres < 1.0 else f"{metres:.2f} m" if metres < 100 else f"{metres:.0f} m"
+
+
+def _duration(ms: float) -> str:
+    return f"{ms:.1f} ms" if ms < 100 else f"{ms:.0f} ms" if ms < 1e4 else f"{ms / 1e3:.1f} s"
+
+
+def _proof(certificate: Certificate) -> str:
+    proof = "optimal" if certificate.proven else f"gap {certificate.gap}"
+    return proof if is_knowable(certificate) else f"{proof}, not knowable"
+
+
+def comparison_items(entries: Sequence[Entry]) -> tuple[SceneItem, ...]:
+    """Every estimated camera in its estimator's colour, with its name on a mast."""
+    items: list[SceneItem] = []
+    masts: list[FloatArray] = []
+    for entry in entries:
+        if entry.trace.cam_from_map is None:
+            continue
+        view = RunView(entry.trace)
+        pose, name = view.aligned_pose(entry.trace.cam_from_map), entry.trace.estimator
+        centre = camera_centre(pose)
+        # Names at one place stand above one another, as far as cameras are not clearly apart.
+        below = sum(bool(np.linalg.norm(centre - other) < view.sphere_m) for other in masts)
+        masts.append(centre)
+        size_m = SIZE * view.sphere_m * max(0.3, 1.0 - SMALLER * below)
+        top = centre - np.array([0.0, (TOWER + STOREY * below) * view.sphere_m, 0.0])
+        mast = Segments("", "cameras", np.array([[centre, top]]), one_color(entry.color, 1), 0.0)
+        lines = camera(f"comparison/{name}", pose, size_m, entry.color, 2.5)
+        items.append(_joined(lines, mast))
+        items.append(Label(f"names/{name}", "cameras", top, name))
+    return tuple(items)
+
+
+def _joined(one: Segments, other: Segments) -> Segments:
+    """Both as one item, which is named and drawn like the first."""
+    points, colors = np.concatenate([one.points, other.points]), np.concatenate([one.colors, other.colors])
+    return Segments(one.name, one.layer, points, colors, one.width_px)
+
+
+def residual_chart(entries: Sequence[Entry]) -> Chart:
+    """How many matches lie within x px of every estimator's pose, and of the true one where that is known."""
+    bounds = sorted({float(entry.trace.options.bound_px) for entry in entries})
+    x = np.linspace(0.0, REACH * bounds[-1], SAMPLES)
+    problem = entries[0].trace.problem
+    curves = []
+    if problem.truth_cam_from_map is not None:
+        curves.append(Curve("truth", x, _within(entries[0].trace, problem.truth_cam_from_map, x), style.TRUTH))
+    for entry in entries:
+        pose = entry.trace.cam_from_map
+        if pose is not None:
+            curves.append(Curve(entry.trace.estimator, x, _within(entry.trace, pose, x), entry.color))
+    height = max([1.0, *(float(curve.y[-1]) for curve in curves)])
+    for bound in bounds:
+        at = np.array([bound])
+        curves.append(Curve(f"bound {bound:g} px", at, np.array([height]), style.UNDECIDED, "marker"))
+    return Chart("comparison-residuals", "Matches within x px of the pose", "residual (px)", "matches", tuple(curves))
+
+
+def _within(trace: Trace, cam_from_map: FloatArray, x: FloatArray) -> FloatArray:
+    aligned = trace.problem.aligned
+    residuals = np.sort(residuals_px(aligned, aligned.align_pose(cam_from_map)))
+    return np.searchsorted(residuals, x, side="right").astype(np.float64)
+
+
+def yaw_chart(entries: Sequence[Entry]) -> Chart | None:
+    """What one estimator counted over yaw, with the yaw that every one of them found; None if none counted."""
+    counted = next(filter(None, (_counts(entry.trace) for entry in entries)), None)
+    if counted is None:
+        return None
+    label, counts = counted
+    yaws = np.degrees(np.linspace(-np.pi, np.pi, len(counts) + 1)[:-1])
+    curve = Curve(label, yaws, counts.astype(np.float64), style.UNDECIDED, "step")
+    peak = max(1.0, float(counts.max()))
+    return Chart("comparison-yaw", "The yaw that each found", "yaw (°)", label, (curve, *yaw_markers(entries, peak)))
+
+
+def _counts(trace: Trace) -> tuple[str, np.ndarray] | None:
+    arcs, consensus = trace.stage(YawStage), trace.stage(ConsensusStage)
+    if arcs is not None:
+        return "arcs", arcs.overlap
+    return None if consensus is None else ("bound", consensus.bound)
+
+
+def yaw_markers(entries: Sequence[Entry], height: float) -> tuple[Curve, ...]:
+    """The true yaw, if it is known, and every estimator's, each lower than the one before so that all can be seen."""
+    view = RunView(entries[0].trace)
+    poses = [] if view.truth is None else [("truth", view.truth, style.TRUTH)]
+    for entry in entries:
+        if entry.trace.cam_from_map is not None:
+            poses.append((entry.trace.estimator, view.aligned_pose(entry.trace.cam_from_map), entry.color))
+    return tuple(
+        Curve(
+            label,
+            np.array([np.degrees(yaw_of(pose[:, :3]))]),
+            np.array([height * max(0.2, 1.0 - LOWER * place)]),
+            color,
+            "marker",
+        )
+        for place, (label, pose, color) in enumerate(poses)
+    )

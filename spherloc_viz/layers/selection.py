@@ -1,0 +1,161 @@
+"""The selected correspondences in a picture: what shows them lights up, all else dims."""
+
+from dataclasses import replace
+from functools import lru_cache
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spherloc.geometry import tangent_basis
+from spherloc.trace import ConsensusStage, Trace, TranslationStage, YawStage
+from spherloc_viz import style
+from spherloc_viz.layers import ring
+from spherloc_viz.layers.frame import even, one_color
+from spherloc_viz.layers.primitives import Balls, ColorArray, FloatArray, Picture, Points, SceneItem, Segments
+
+IntArray = NDArray[np.int64]
+
+LAYER = "selection"
+DOTS = ("map/points", "sphere/bearings")
+"""What shows single correspondences: the map point and the bearing."""
+HALO = 2.1
+"""Radius of the ring around a dot, in radii of the dot."""
+INNER, OUTER = 1.06, 1.24
+"""Radii of the band of the selected arcs, in sphere radii: between the sphere and the ring of all arcs."""
+STEP_RAD = np.radians(4.0)
+CORNERS = 24
+"""Of each circle around a ball."""
+
+
+def with_selection(picture: Picture, trace: Trace, selected: tuple[int, ...]) -> Picture:
+    """The picture with the selected correspondences (numbers in the problem) lit up and all others dimmed.
+
+    Drawn are a ring around the map point and the bearing, the ray between them, and, where the picture shows pairs,
+    the arcs, the balls and the agreeing pairs of the selected: of one correspondence all pairs with it, of several the
+    pairs among them; those in the clique if there are any; evenly thinned, as the note of the step says. It is for the
+    canvas only: other views tell inliers by the colours of the picture as it was.
+    """
+    if not selected:
+        return picture
+    chosen = np.array(sorted(selected), dtype=np.int64)
+    items = {item.name: item for item in picture.scene}
+    marks: list[SceneItem] = _halos(items, chosen)
+    notes = [picture.step.note] if picture.step.note else []
+    for draw in (_arcs, _balls, _edges):
+        drawn, note = draw(items, trace, tuple(chosen.tolist()))
+        marks += drawn
+        notes += [note] if note else []
+    scene = (*(_dimmed(item, chosen) for item in picture.scene), *marks)
+    return replace(picture, step=replace(picture.step, note=" ".join(notes)), scene=scene)
+
+
+def _dimmed(item: SceneItem, chosen: IntArray) -> SceneItem:
+    """The item with the colours of what it shows of others moved towards grey."""
+    if not isinstance(item, Points | Segments | Balls) or item.layer == "trajectory":
+        return item
+    if item.ids is not None:
+        own = np.isin(item.ids, chosen).reshape(len(item.ids), -1)
+        return replace(item, colors=_dim(item.colors, np.count_nonzero(own, axis=1) > 0))
+    return replace(item, colors=_dim(item.colors, np.zeros(len(item.colors), bool))) if item.layer == "rays" else item
+
+
+def _dim(colors: ColorArray, keep: NDArray[np.bool_]) -> ColorArray:
+    grey = np.array(style.UNDECIDED, dtype=np.float64)
+    dim = np.round((1.0 - style.DIM) * colors + style.DIM * grey).astype(np.uint8)
+    return np.where(keep[:, None], colors, dim)
+
+
+def _halos(items: dict[str, SceneItem], chosen: IntArray) -> list[SceneItem]:
+    """Rings around the dots of the selected, and the rays between."""
+    out: list[SceneItem] = []
+    places: dict[str, dict[int, FloatArray]] = {}
+    shown = even(chosen, style.MAX_SELECTED_DOTS)
+    for name in DOTS:
+        dots = items.get(name)
+        if not isinstance(dots, Points) or dots.ids is None:
+            continue
+        at = np.flatnonzero(np.isin(dots.ids, shown))
+        colors = one_color(style.SELECTED, len(at))
+        out.append(Points(f"selection/{name}", LAYER, dots.positions[at], colors, HALO * dots.radius_m, rim=True))
+        places[name] = dict(zip(dots.ids[at].tolist(), dots.positions[at], strict=True))
+    points, bearings = (places.get(name, {}) for name in DOTS)
+    ends = np.array([[bearings[k], points[k]] for k in bearings if k in points]).reshape(-1, 2, 3)
+    out.append(Segments("selection/rays", LAYER, ends, one_color(style.SELECTED, len(ends)), 3.0))
+    return out
+
+
+@lru_cache(maxsize=8)
+def _pairs(stage: YawStage | TranslationStage, selected: tuple[int, ...]) -> tuple[IntArray, bool]:
+    """Indices of the arcs or balls of the selected, those in the clique if there are any, and whether there are."""
+    inside = np.isin(stage.pairs, selected)
+    own = np.count_nonzero(inside, axis=1) >= min(2, len(selected))
+    members = stage.clique[own[stage.clique]].astype(np.int64)
+    return (np.sort(members), True) if len(members) else (np.flatnonzero(own), False)
+
+
+def _note(what: str, drawn: int, count: int, agreeing: bool) -> str:
+    """What was left out."""
+    if drawn == count:
+        return ""
+    return f"{drawn} of {count:,} {what} of the selection{' in the clique' if agreeing else ''} are highlighted."
+
+
+def _arcs(items: dict[str, SceneItem], trace: Trace, selected: tuple[int, ...]) -> tuple[list[SceneItem], str]:
+    """Yaw arcs, on tracks of their own around the sphere."""
+    stage, dots = trace.stage(YawStage), items.get("sphere/bearings")
+    centre = _sphere_centre(items)
+    if stage is None or "ring/arcs" not in items or centre is None or not isinstance(dots, Points):
+        return [], ""
+    own, agreeing = _pairs(stage, selected)
+    drawn = even(own, style.MAX_SELECTED_ARCS)
+    radius_m = float(np.linalg.norm(dots.positions[0] - centre))
+    tracks = INNER + (OUTER - INNER) * (np.arange(len(drawn)) + 0.5) / max(1, len(drawn))
+    low, width = stage.lo_rad[drawn], (stage.hi_rad - stage.lo_rad)[drawn]
+    lines = []
+    for start, turn, track in zip(low, width, tracks, strict=True):
+        yaws = start + turn * np.linspace(0.0, 1.0, 2 + int(turn / STEP_RAD))
+        line = centre + radius_m * track * ring.directions(yaws)
+        lines.append(np.stack([line[:-1], line[1:]], axis=1))
+    ends = np.concatenate([np.zeros((0, 2, 3)), *lines])
+    arcs = Segments("selection/arcs", LAYER, ends, one_color(style.SELECTED, len(ends)), 2.5)
+    return [arcs], _note("arcs", len(drawn), len(own), agreeing)
+
+
+def _sphere_centre(items: dict[str, SceneItem]) -> FloatArray | None:
+    surface = items.get("sphere/surface")
+    vertices = getattr(surface, "vertices", None)
+    return None if vertices is None else 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
+
+
+def _balls(items: dict[str, SceneItem], trace: Trace, selected: tuple[int, ...]) -> tuple[list[SceneItem], str]:
+    """Balls of camera positions as circles, which are seen through other balls; the smaller half, as all else is."""
+    stage = trace.stage(TranslationStage)
+    if stage is None or not any(isinstance(item, Balls) and item.layer == "balls" for item in items.values()):
+        return [], ""
+    own, agreeing = _pairs(stage, selected)
+    by_size = own[np.argsort(stage.radii_m[own], kind="stable")]
+    small = by_size[: max(1, len(by_size) // 2)] if len(by_size) > style.MAX_SELECTED_BALLS else by_size
+    drawn = even(small, style.MAX_SELECTED_BALLS)
+    turns = np.linspace(0.0, 2.0 * np.pi, CORNERS + 1)
+    across = tangent_basis(np.eye(3))
+    circles = np.stack([np.cos(turns), np.sin(turns)], axis=1) @ across  # (3, CORNERS + 1, 3)
+    lines = stage.centres_m[drawn][:, None, None] + stage.radii_m[drawn][:, None, None, None] * circles
+    ends = np.stack([lines[..., :-1, :], lines[..., 1:, :]], axis=-2).reshape(-1, 2, 3)
+    marks = Segments("selection/balls", LAYER, ends, one_color(style.SELECTED, len(ends)), 2.0)
+    return [marks], _note("balls", len(drawn), len(own), agreeing)
+
+
+def _edges(items: dict[str, SceneItem], trace: Trace, selected: tuple[int, ...]) -> tuple[list[SceneItem], str]:
+    """Pairs of the largest agreeing set, as lines on the map."""
+    stage, points = trace.stage(ConsensusStage), items.get("map/points")
+    if stage is None or "pairs/clique" not in items or not isinstance(points, Points):
+        return [], ""
+    members = [k for k in selected if k in stage.clique]
+    if len(selected) == 1:
+        pairs = [(k, other) for k in members for other in stage.clique.tolist() if other != k]
+    else:
+        pairs = list(combinations(members, 2))
+    drawn = even(np.array(pairs, dtype=np.int64).reshape(-1, 2), style.MAX_DRAWN_PAIRS)
+    lines = Segments("selection/pairs", LAYER, points.positions[drawn], one_color(style.SELECTED, len(drawn)), 2.0)
+    return [lines], _note("pairs", len(drawn), len(pairs), True)

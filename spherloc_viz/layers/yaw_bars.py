@@ -1,0 +1,305 @@
+"""What a run says about yaw: curves over the whole circle, and the arcs of pairs near a yaw, stacked as bars."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spherloc.bounds import bounds_of
+from spherloc.consensus.yaw_arcs import yaw_arcs
+from spherloc.geometry import wrap_angle, yaw_of
+from spherloc.trace import ConsensusStage, RansacStage, Trace, YawStage
+from spherloc_viz import style
+from spherloc_viz.layers import ring
+from spherloc_viz.layers.frame import RunView, even
+from spherloc_viz.layers.primitives import Curve, FloatArray
+
+IntArray = NDArray[np.int64]
+Window = tuple[float, float]
+"""Yaws from the first, in [-180, 180) degrees, to the second, which exceeds 180 where the window crosses the seam."""
+
+ALL: Window = (-180.0, 180.0)
+WIDTHS_DEG = (1.0, 2.0, 4.0, 6.0, 10.0, 20.0, 30.0, 60.0, 120.0)
+"""Of the window around the peak."""
+LEAST_WIDTH_DEG = 0.02
+MOST_BARS = 72
+MOST_CHOSEN = 24
+"""Bars that a selection may take of all."""
+MOST_MATCHES, MOST_INLIERS = 32, 20
+"""Where a run keeps no arcs: matches whose pairs are looked at, and inliers among them."""
+KINDS = ("both right", "one wrong", "both wrong")
+CELLS = 240
+"""Places across the window by which bars are packed into rows."""
+
+
+@dataclass(frozen=True, eq=False)
+class YawStory:
+    """What a run says about yaw, as curves over -180 to 180 degrees."""
+
+    title: str
+    y_label: str
+    curves: tuple[Curve, ...]
+    """Steps and levels over the whole circle; no markers."""
+    hypotheses: tuple[tuple[float, int, str, str], ...]
+    """Yaw (degrees), correspondences explained, name and key of the step (or "") of every pose that was tried."""
+    top: float
+    """The largest value."""
+    estimate_deg: float | None
+    truth_deg: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class Arcs:
+    """A arcs of feasible yaw of pairs of matches, one or more a pair."""
+
+    pairs: NDArray[np.integer]
+    """(A, 2) correspondences of the problem, ascending."""
+    lo_rad: FloatArray
+    """(A,) in [-pi, pi)."""
+    hi_rad: FloatArray
+    """(A,) not below ``lo_rad``."""
+    rule: str
+    """Which arcs these are, as a sentence; empty if they are the run's own."""
+
+
+@dataclass(frozen=True, eq=False)
+class Bars:
+    """P pairs with an arc in a window, and their arcs."""
+
+    pairs: IntArray
+    """(P, 2) correspondences of the problem."""
+    kind: IntArray
+    """(P,) index into ``KINDS``."""
+    chosen: NDArray[np.bool_]
+    """(P,) whether the selection holds the pair."""
+    count: IntArray
+    """(P,) arcs of each pair; those outside of the window too."""
+    owner: IntArray
+    """(B,) place in ``pairs`` of each arc."""
+    lo_deg: FloatArray
+    """(B,) in [-180, 180)."""
+    hi_deg: FloatArray
+    """(B,) not below ``lo_deg``."""
+    row: IntArray
+    """(B,) row of each arc in the window, from the top; -1 outside of it."""
+    total: tuple[int, int, int]
+    """Arcs in the window of each kind, drawn or not."""
+
+    @property
+    def rows(self) -> int:
+        """How many rows there are."""
+        return int(self.row.max(initial=-1)) + 1
+
+
+def yaw_story(trace: Trace) -> YawStory:
+    """The curves of a run."""
+    truth, estimate = _truth_deg(trace), None
+    if trace.cam_from_map is not None:
+        estimate = _yaw_deg(trace, trace.cam_from_map)
+    yaw, exact, ransac = trace.stage(YawStage), trace.stage(ConsensusStage), trace.stage(RansacStage)
+    curves: tuple[Curve, ...] = ()
+    tried: tuple[tuple[float, int, str, str], ...] = ()
+    title, y_label = "No stage of this run looked at the yaw", "matches"
+    if yaw is not None:
+        title, y_label = "Arcs that overlap at each yaw", "arcs"
+        curves = (ring.step_curve("arcs that overlap", yaw.overlap),)
+        estimate = float(np.degrees(yaw.yaw_rad))
+    elif exact is not None:
+        title, best = "No pose with this yaw explains more than", int(exact.support.max(initial=exact.seed_support))
+        ends = np.array(ALL)
+        level = Curve("best pose", ends, np.full(2, float(best)), style.INLIER, "level")
+        curves = (ring.step_curve("bound", exact.bound), level)
+        poses = zip(exact.cam_from_map, exact.support.tolist(), strict=True)
+        tried = tuple((_yaw_deg(trace, pose), support, "verified pose", "") for pose, support in poses)
+    elif ransac is not None:
+        title = "Yaw of each best hypothesis so far"
+        counts = np.count_nonzero(ransac.inlier_masks, axis=1).tolist()
+        rows = zip(ransac.cam_from_map, counts, ransac.improved_at.tolist(), strict=True)
+        tried = tuple(
+            (_yaw_deg(trace, pose), count, f"sample {at + 1:,}", f"sample-{k}")
+            for k, (pose, count, at) in enumerate(rows, 1)
+        )
+    values = [float(curve.y.max(initial=0.0)) for curve in curves] + [float(count) for _, count, *_ in tried]
+    return YawStory(title, y_label, curves, tried, max([1.0, *values]), estimate, truth)
+
+
+def _yaw_deg(trace: Trace, cam_from_map: FloatArray) -> float:
+    return float(np.degrees(yaw_of(trace.problem.aligned.align_pose(cam_from_map)[:, :3])))
+
+
+def _truth_deg(trace: Trace) -> float | None:
+    truth = RunView(trace).truth
+    return None if truth is None else float(np.degrees(yaw_of(truth[:, :3])))
+
+
+def right_ones(trace: Trace) -> tuple[NDArray[np.bool_], str]:
+    """Which matches (N,) are right, by the truth where it is known, else by the run's inliers; and which it was."""
+    if trace.problem.truth_inliers is not None:
+        return trace.problem.truth_inliers, "by the truth"
+    return trace.inlier_mask, "by this run's inliers"
+
+
+def arcs_of(trace: Trace, selected: tuple[int, ...]) -> Arcs:
+    """The run's own arcs; where it keeps none, those of some matches: of its inliers, the selection and others."""
+    stage = trace.stage(YawStage)
+    if stage is not None:
+        return Arcs(stage.pairs, stage.lo_rad, stage.hi_rad, "")
+    aligned = trace.problem.aligned
+    members = _members(trace, selected)
+    places = np.searchsorted(aligned.index, members)
+    bounds = bounds_of(aligned, trace.options.bound_px)
+    some = replace(
+        aligned,
+        index=members,
+        bearings=aligned.bearings[places],
+        points=aligned.points[places],
+        pixel_from_bearing=aligned.pixel_from_bearing[places],
+        radians_per_pixel=aligned.radians_per_pixel[places],
+    )
+    pairs, lo, hi = yaw_arcs(some, bounds.radians[places])
+    whole = f"all {len(members)}" if len(members) == len(trace.problem) else f"{len(members)} of {len(trace.problem):,}"
+    return Arcs(members[pairs], lo, hi, f"{trace.estimator} keeps no arcs; these are of the pairs of {whole} matches.")
+
+
+def _members(trace: Trace, selected: tuple[int, ...]) -> IntArray:
+    """Usable matches whose pairs are looked at, ascending: an even sample of inliers, selection and others."""
+    usable = trace.problem.aligned.index
+    if len(usable) <= MOST_MATCHES:
+        return usable
+    chosen = np.array([number for number in selected if trace.problem.usable[number]][: MOST_MATCHES // 3], np.int64)
+    inliers = even(np.flatnonzero(trace.inlier_mask), MOST_INLIERS)
+    known = np.union1d(chosen, inliers).astype(np.int64)
+    return np.union1d(known, even(np.setdiff1d(usable, known), MOST_MATCHES - len(known))).astype(np.int64)
+
+
+def peak_window(story: YawStory, arcs: Arcs) -> Window:
+    """A window around the estimated yaw, wide enough for most of the arcs over it; the circle without an estimate."""
+    if story.estimate_deg is None:
+        return ALL
+    middle = np.radians(story.estimate_deg)
+    over = _overlapping(arcs, middle, middle)
+    away = wrap_angle(arcs.lo_rad[over] - middle), wrap_angle(arcs.hi_rad[over] - middle)
+    reach = np.maximum(np.abs(away[0]), np.abs(away[1]))
+    need = 3.0 * np.degrees(float(np.median(reach))) if len(reach) else 10.0
+    width = next((width for width in WIDTHS_DEG if width >= need), WIDTHS_DEG[-1])
+    # Rounded, so that the window stands still while a slider moves the estimate by little.
+    step = 0.1 * width
+    return window_around(step * round(story.estimate_deg / step), width)
+
+
+def window_around(middle_deg: float, width_deg: float) -> Window:
+    """The window of that middle and width, at most the circle."""
+    if not width_deg < 359.0:
+        return ALL
+    width = max(width_deg, LEAST_WIDTH_DEG)
+    low = round((middle_deg - 0.5 * width + 180.0) % 360.0 - 180.0, 9)
+    return low, low + width
+
+
+def _overlapping(arcs: Arcs, low_rad: float, high_rad: float) -> IntArray:
+    """Indices of the arcs that reach into a window from -pi <= low < pi to high <= low + 2 pi."""
+    lo, hi, circle = arcs.lo_rad, arcs.hi_rad, 2.0 * np.pi
+    inside = ((lo <= high_rad) & (hi >= low_rad)) | (hi >= low_rad + circle) | (lo <= high_rad - circle)
+    return np.flatnonzero(inside)
+
+
+def bars_in(trace: Trace, arcs: Arcs, window: Window, selected: tuple[int, ...], most: int = MOST_BARS) -> Bars:
+    """The arcs in a window: those of selected pairs first, then an even sample with an equal share of each kind."""
+    right, _ = right_ones(trace)
+    inside = _overlapping(arcs, *np.radians(window).tolist())
+    pairs = arcs.pairs[inside]
+    kind = 2 - right[pairs[:, 0]].astype(np.int64) - right[pairs[:, 1]]
+    of_kind = [np.flatnonzero(kind == k) for k in range(len(KINDS))]
+    chosen = _chosen(pairs, selected)
+    taken = even(np.flatnonzero(chosen), MOST_CHOSEN)
+    drawn = np.union1d(taken, _even_shares([places[~chosen[places]] for places in of_kind], most - len(taken)))
+    drawn = drawn.astype(np.int64)
+    codes = arcs.pairs[:, 0].astype(np.int64) * len(right) + arcs.pairs[:, 1]
+    shown = np.unique(codes[inside[drawn]])
+    first, last = np.searchsorted(codes, shown, "left"), np.searchsorted(codes, shown, "right")
+    owner = np.repeat(np.arange(len(shown)), last - first)
+    mine = np.arange(len(owner)) - np.repeat(np.cumsum(last - first) - (last - first), last - first) + first[owner]
+    those = arcs.pairs[first].astype(np.int64)
+    lo_deg, hi_deg = np.degrees(arcs.lo_rad[mine]), np.degrees(arcs.hi_rad[mine])
+    kinds = 2 - right[those[:, 0]].astype(np.int64) - right[those[:, 1]]
+    return Bars(
+        pairs=those,
+        kind=kinds,
+        chosen=_chosen(those, selected),
+        count=last - first,
+        owner=owner,
+        lo_deg=lo_deg,
+        hi_deg=hi_deg,
+        row=_rows(lo_deg, hi_deg, kinds[owner], window),
+        total=(len(of_kind[0]), len(of_kind[1]), len(of_kind[2])),
+    )
+
+
+def _chosen(pairs: NDArray[np.integer], selected: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Which pairs (P, 2) a selection holds: those among the selected, or with the one that is."""
+    if not selected:
+        return np.zeros(len(pairs), dtype=bool)
+    held = np.isin(pairs, selected)
+    return np.all(held, axis=1) if len(selected) > 1 else np.any(held, axis=1)
+
+
+def _even_shares(groups: list[np.ndarray], room: int) -> np.ndarray:
+    """At most ``room`` of all, an even sample of every group, with equal shares where all do not fit."""
+    out, left = [], room
+    for place, group in enumerate(sorted(groups, key=len)):
+        share = min(len(group), left // (len(groups) - place))
+        left -= share
+        out.append(even(group, share) if share else group[:0])
+    return np.concatenate(out)
+
+
+def places_of(yaw_deg: float, window: Window) -> list[float]:
+    """Where a yaw is in a window: none, one, or two if it is at both ends of the circle."""
+    low, high = window
+    return [yaw for yaw in (yaw_deg - 360.0, yaw_deg, yaw_deg + 360.0) if low <= yaw <= high]
+
+
+def spans_in(lo_deg: FloatArray, hi_deg: FloatArray, window: Window) -> tuple[IntArray, FloatArray, FloatArray]:
+    """What of the arcs (B,) lies in a window: indices (S,) of the arcs, ascending, and ends (S,), (S,) in the window.
+
+    An arc has two parts there if it leaves the window and comes back.
+    """
+    low, high = window
+    turns = np.array([-360.0, 0.0, 360.0])
+    lo, hi = lo_deg[:, None] + turns, hi_deg[:, None] + turns
+    arc, turn = np.nonzero((lo <= high) & (hi >= low))
+    return arc, np.maximum(lo[arc, turn], low), np.minimum(hi[arc, turn], high)
+
+
+def _rows(lo_deg: FloatArray, hi_deg: FloatArray, kind: IntArray, window: Window) -> IntArray:
+    """A row (B,) for every arc in the window such that those in a row do not touch: the kinds one under the other,
+    narrow arcs above wide ones, each in the first row of its kind that has room.
+    """
+    low, high = window
+    cell = (high - low) / CELLS
+    row = np.full(len(lo_deg), -1, dtype=np.int64)
+    arc, left, right = spans_in(lo_deg, hi_deg, window)
+    masks = dict.fromkeys(arc.tolist(), 0)
+    cells = ((left - low) / cell).astype(np.int64).tolist(), ((right - low) / cell).astype(np.int64).tolist()
+    for bar, first, last in zip(arc.tolist(), *cells, strict=True):
+        # A bit a cell, and one more so that neighbours do not touch.
+        masks[bar] |= ((1 << (last - first + 2)) - 1) << first
+    there = np.array(list(masks), dtype=np.int64)
+    taken: list[int] = []
+    start, current = 0, -1
+    for place in np.lexsort(((hi_deg - lo_deg)[there], kind[there])).tolist():
+        bar = int(there[place])
+        if kind[bar] != current:
+            start, current = len(taken), int(kind[bar])
+        row[bar] = _first_free(taken, start, masks[bar])
+    return row
+
+
+def _first_free(taken: list[int], start: int, mask: int) -> int:
+    """The first row from ``start`` on in which no bit of the mask is taken, a new one if there is none; takes them."""
+    for place in range(start, len(taken)):
+        if not taken[place] & mask:
+            taken[place] |= mask
+            return place
+    taken.append(mask)
+    return len(taken) - 1

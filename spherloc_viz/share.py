@@ -1,0 +1,111 @@
+"""What is on screen as a script and as a command: pasting either gives the same pose, to the last bit."""
+
+import math
+import shlex
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from spherloc.datasets import scene_file
+from spherloc.datasets.variation import EDITS, Variation
+from spherloc.datasets.variation_text import settings_of
+from spherloc.errors import InputError
+from spherloc.estimators import options_type
+from spherloc_viz.options import NONE
+
+WORDS = {"spoiled": "--spoil", "mended": "--mend", "hidden": "--hide"}
+
+
+def as_python(
+    scene_path: Path, seed: int, query: str | None, variation: Variation, estimator: str, options: Any
+) -> str:
+    """A script that solves the problem and prints the pose with all its digits; it says what differs from defaults."""
+    changes = _written_changes(variation)
+    given = ", ".join(f"{name}={_code(value)}" for name, value in changes.items())
+    chosen = [str(seed)] if query is None else [str(seed), _code(query)]
+    options_given = ", ".join(f"{name}={_code(value)}" for name, value in _changed(scene_path, estimator, options))
+    lines = [
+        "from pathlib import Path",
+        "",
+        "from spherloc.datasets import load_scene",
+        *(["from spherloc.datasets.variation import Variation"] if changes else []),
+        f"from spherloc.estimators import {'estimate, options_type' if options_given else 'estimate'}",
+        "",
+        f"scene = load_scene(Path({_code(_written(scene_path))}))",
+        f"problem = Variation({given}).problem(scene, {', '.join(chosen)})"
+        if changes
+        else f"problem = scene.problem({', '.join(chosen)})",
+        *([f"options = options_type({_code(estimator)})({options_given})"] if options_given else []),
+        f"trace = estimate(problem, {_code(estimator)}, {'options, ' if options_given else ''}seed={seed})",
+        "print(trace.message)",
+        "print(None if trace.cam_from_map is None else trace.cam_from_map.tolist())",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def as_command(
+    scene_path: Path, seed: int, query: str | None, variation: Variation, estimator: str, options: Any
+) -> str:
+    """A command line that solves the problem, quoted for a shell; it says what differs from defaults."""
+    changes = _written_changes(variation)
+    words = ["spherloc", "run", _written(scene_path)]
+    if words[-1].startswith("-"):
+        words[-1] = f"./{words[-1]}"
+    simulated = Variation(**{name: value for name, value in changes.items() if name not in EDITS})
+    for setting in settings_of(simulated):
+        words += ["--set", setting]
+    for name in EDITS:
+        if name in changes:
+            words += [WORDS[name], ",".join(map(str, changes[name]))]
+    words += ["--seed", str(seed)]
+    if query is not None:
+        words += [f"--query={query}"] if query.startswith("-") else ["--query", query]
+    words += ["--estimator", estimator]
+    for name, value in _changed(scene_path, estimator, options):
+        words += ["--option", f"{name}={_typed(value)}"]
+    return shlex.join(words)
+
+
+def _written_changes(variation: Variation) -> dict[str, Any]:
+    """The fields of a variation that change something, with its camera's path as it is written."""
+    changes = variation.simulation
+    if "camera" in changes:
+        changes["camera"] = _written(Path(changes["camera"]))
+    return changes | {name: getattr(variation, name) for name in EDITS if getattr(variation, name)}
+
+
+def _written(path: Path) -> str:
+    """A path from the current folder if it is inside it, else an absolute one."""
+    path, here = path.resolve(), Path.cwd().resolve()
+    return str(path.relative_to(here) if path.is_relative_to(here) else path)
+
+
+def _changed(scene_path: Path, estimator: str, options: Any) -> list[tuple[str, Any]]:
+    """Options that are not what the estimator would take for the scene."""
+    try:
+        stated = scene_file.bound_px(scene_file.read_table(scene_path), str(scene_path))
+    except InputError:
+        stated = None
+    kind = options_type(estimator)
+    default = kind() if stated is None else kind(bound_px=stated)
+    values = [(item.name, getattr(options, item.name), getattr(default, item.name)) for item in fields(options)]
+    named = [(name, value) for name, value, usual in values if value != usual]
+    if named and stated is not None and "bound_px" not in dict(named):
+        named.insert(0, ("bound_px", options.bound_px))  # a script that names options starts from the estimator's own
+    return named
+
+
+def _code(value: Any) -> str:
+    """A value as Python code."""
+    if isinstance(value, float) and math.isinf(value):
+        return f'float("{value}")'
+    if isinstance(value, str) and value.isprintable() and not set(value) & set('"\\'):
+        return f'"{value}"'
+    return repr(value)
+
+
+def _typed(value: Any) -> str:
+    """A value as ``--option`` takes it."""
+    if value is None:
+        return NONE
+    return str(value).lower() if isinstance(value, bool) else value if isinstance(value, str) else repr(value)

@@ -1,0 +1,149 @@
+"""Undo, redo, and what is done to single matches by hand."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from spherloc.datasets.variation import Variation
+from spherloc.estimators import options_type
+from spherloc_viz.app.catalog import SceneWish
+from spherloc_viz.app.edits import Edits
+from spherloc_viz.app.history import MOST, SAME_MOVE_S, History, changed_fields
+from spherloc_viz.app.wish import Wish
+
+SCENE = SceneWish("a scene", 0, None, Variation())
+
+
+def wish(seed: int = 0, noise_px: float | None = None, estimator: str = "mc", **options: float) -> Wish:
+    scene = replace(SCENE, seed=seed, variation=Variation(noise_px=noise_px))
+    return Wish(scene, estimator, options_type(estimator)(**options))
+
+
+def test_undo_and_redo_walk_through_what_was_asked_for() -> None:
+    history, wishes = History(), [wish(seed=k) for k in range(4)]
+    assert history.ways() == (False, False) and history.step(-1) is None
+    for k, asked in enumerate(wishes):
+        history.note(asked, 10.0 * k)
+    assert history.ways() == (True, False) and history.step(1) is None
+    assert [history.step(-1) for _ in range(4)] == [wishes[2], wishes[1], wishes[0], None]
+    assert history.ways() == (False, True)
+    assert history.step(1) is wishes[1]
+    history.note(wishes[1], 50.0)
+    assert history.ways() == (True, True), "that the page asks for what was gone back to changes nothing"
+    history.note(wish(seed=9), 60.0)
+    assert history.ways() == (True, False) and history.step(-1) is wishes[1], "what was undone is forgotten"
+
+
+def test_dragging_a_slider_is_one_move() -> None:
+    history = History()
+    history.note(wish(), 0.0)
+    for k in range(20):
+        history.note(wish(noise_px=1.0 + 0.1 * k), 5.0 + 0.05 * k)
+    history.note(wish(noise_px=3.0, seed=1), 6.0)
+    assert history.step(-1) == wish(noise_px=1.0 + 0.1 * 19) and history.step(-1) == wish()
+    assert history.step(-1) is None
+
+
+def test_two_moves_of_one_slider_are_two() -> None:
+    history = History()
+    for k in range(3):
+        history.note(wish(noise_px=1.0 + k), (SAME_MOVE_S + 0.1) * k)
+    assert history.step(-1) == wish(noise_px=2.0)
+    # After going back, the next move starts anew, however soon it comes.
+    history.note(wish(noise_px=7.0), 2.0 * (SAME_MOVE_S + 0.1))
+    assert history.step(-1) == wish(noise_px=2.0)
+
+
+def test_it_remembers_so_many() -> None:
+    history = History()
+    for k in range(MOST + 50):
+        history.note(wish(seed=k), 10.0 * k)
+    steps = 0
+    while history.step(-1) is not None:
+        steps += 1
+    assert steps == MOST - 1
+
+
+@pytest.mark.parametrize(
+    "other, names",
+    [
+        (wish(), set()),
+        (wish(seed=1), {"seed"}),
+        (wish(noise_px=2.0), {"noise_px"}),
+        (wish(bound_px=2.0), {"bound_px"}),
+        (wish(estimator="ransac-2p", seed=3), {"estimator"}),
+        (wish(seed=1, noise_px=2.0, bound_px=2.0), {"seed", "noise_px", "bound_px"}),
+    ],
+)
+def test_what_differs(other: Wish, names: set[str]) -> None:
+    assert changed_fields(wish(), other) == names
+
+
+NUMBERS = st.sets(st.integers(0, 30), max_size=8)
+
+
+@settings(max_examples=50)
+@given(first=NUMBERS, second=NUMBERS)
+def test_selection(first: set[int], second: set[int]) -> None:
+    edits = Edits()
+    edits.select(first)
+    assert edits.selected == tuple(sorted(first))
+    edits.select(second, extend=True)
+    expected = first - second if second <= first else first | second
+    assert set(edits.selected) == expected
+    edits.select(())
+    assert edits.selected == ()
+
+
+@settings(max_examples=50)
+@given(moves=st.lists(st.tuples(st.sampled_from(["spoil", "mend", "hide"]), NUMBERS), max_size=8))
+def test_the_last_word_on_a_match_counts(moves: list[tuple[str, set[int]]]) -> None:
+    edits = Edits()
+    edits.apply(SCENE)
+    last: dict[int, str] = {}
+    hidden: set[int] = set()
+    for move, numbers in moves:
+        edits.select(numbers)
+        getattr(edits, move)()
+        if move == "hide":
+            hidden |= numbers
+        else:
+            last |= dict.fromkeys(numbers, move)
+    found = edits.apply(SCENE).variation
+    assert set(found.hidden) == hidden
+    assert set(found.spoiled) == {number for number, move in last.items() if move == "spoil"}
+    assert set(found.mended) == {number for number, move in last.items() if move == "mend"}
+
+
+def test_edits_belong_to_a_problem() -> None:
+    edits = Edits()
+    edits.apply(SCENE)
+    edits.select((3, 40))
+    edits.spoil()
+    assert edits.apply(SCENE).variation.spoiled == (3, 40)
+    fewer = replace(SCENE, variation=Variation(correspondences=20))
+    assert edits.apply(fewer).variation.spoiled == (3,), "there is no match 40 among twenty"
+    assert edits.apply(SCENE).variation.spoiled == (3, 40), "and it is back when there is"
+    assert edits.apply(replace(SCENE, seed=1)).variation.spoiled == ()
+    assert edits.apply(SCENE).variation.spoiled == () and edits.selected == ()
+
+
+def test_opening_a_wish_takes_over_its_edits() -> None:
+    edits = Edits()
+    variation = Variation(spoiled=(1,), mended=(2,), hidden=(5,))
+    opened = replace(SCENE, seed=4, variation=variation)
+    edits.write(opened)
+    assert edits.apply(replace(opened, variation=Variation())).variation == variation
+    edits.show_all()
+    assert edits.apply(replace(opened, variation=Variation())).variation == replace(variation, hidden=())
+    edits.clear()
+    assert edits.apply(replace(opened, variation=Variation())).variation == Variation()
+
+
+def test_places_of_selected_matches() -> None:
+    edits = Edits()
+    edits.select((2, 5, 9))
+    assert edits.places(np.array([0, 2, 3, 9])) == (1, 3)
