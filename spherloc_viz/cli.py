@@ -1,4 +1,4 @@
-"""The command line: run, localize, play, view, scenes."""
+"""The command line: run, localize, sweep, play, view, scenes."""
 
 import os
 import sys
@@ -128,6 +128,59 @@ def localize(
 
 
 @app.command
+def sweep(
+    scene: Positional[Path],
+    /,
+    over: str = "outlier_rate",
+    values: Annotated[tuple[str, ...], arg(metavar="NUMBER|FIRST:LAST:STEP ...")] = ("0.5:0.95:0.05",),
+    estimator: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], arg(metavar="NAME[,OPTION=VALUE...]")] = (),
+    set: Settings = (),
+    runs: int = 100,
+    seed: int = 0,
+    workers: int = 2,
+    scheduler: str | None = None,
+    out: Path | None = None,
+) -> int:
+    """Compare estimators over the outlier rate, noise, number of correspondences or gravity error of a simulation.
+
+    Every run is written at once: stop it when you like, the same command goes on, and with more --runs it adds to
+    what is there. Writes a CSV with a row a run, a summary with a row a point (success with its 95 % Wilson interval,
+    quartiles of errors and time), and a picture. All estimators get the same problems. Times are those of workers
+    side by side; take one worker on an idle machine to compare them.
+
+    For example:
+
+    spherloc sweep scenes/mei_outliers_80.toml --estimator mc --estimator ransac-2p
+
+    spherloc sweep scenes/mei_outliers_80.toml --over outlier_rate --values 0.5:0.98:0.04 --set noise_px=2
+    --estimator ransac-2p,iterations=100 --estimator ransac-2p,iterations=1000 --runs 200
+
+    spherloc sweep scenes/panorama_outliers_80.toml --over noise_px --values 0:10:1 --set outlier_rate=0
+    --estimator mc-exact --estimator ransac-mlpnp --out results/noise.csv
+
+    spherloc sweep scenes/fisheye_outliers_90.toml --estimator mc --scheduler tcp://host:8786
+
+    Args:
+        scene: Scene file (TOML) of a simulation.
+        over: outlier_rate, noise_px, correspondences or gravity_error_deg.
+        values: Values of it: numbers, or FIRST:LAST:STEP, the last one included.
+        estimator: A registered estimator, with options after commas; give it once for each. mc and ransac-2p if not
+            given.
+        set: Changes to the scene at all values, such as noise_px=2; a wrong one lists them all.
+        runs: Problems at each value.
+        seed: Seed of the first problem; the others count up from it.
+        workers: Processes on this machine.
+        scheduler: Address of a Dask scheduler, whose workers do the runs instead.
+        out: CSV to write or go on with; recordings/SCENE_OVER_SEED.csv if not given.
+    """
+    from spherloc_viz.sweep import sweep as do_sweep
+
+    file = out or RECORDINGS / f"{scene.stem}_{over}_{seed}.csv"
+    chosen = estimator or ("mc", "ransac-2p")
+    return do_sweep(scene, over, values, chosen, list(chain(*set)), runs, seed, workers, scheduler, file)
+
+
+@app.command
 def play(
     scene: Positional[Path | None] = None,
     /,
@@ -135,6 +188,7 @@ def play(
     port: int = 8080,
     record: bool = True,
     recordings: Path = RECORDINGS,
+    allow: tyro.conf.UseAppendAction[tuple[Path, ...]] = (),
 ) -> int:
     """Open the playground in a browser and print its address.
 
@@ -144,16 +198,19 @@ def play(
 
     spherloc play scenes/panorama_outliers_90.toml --port 9000
 
+    spherloc play --allow ~/maps
+
     Args:
         scene: Scene file (TOML) to start with; a bundled one if not given.
         host: Address to listen on. Anybody who reaches it can use the playground, so keep it on this machine.
         port: Port to listen on; 0 takes a free one.
         record: Write a recording of each run that is settled on.
         recordings: Folder of the recordings.
+        allow: Another folder that pages may open scenes from; give it once for each.
     """
     from spherloc_viz.app.server import serve
 
-    serve(scene, host, port, recordings, record)
+    serve(scene, host, port, recordings, record, allow)
     return 0
 
 

@@ -14,7 +14,7 @@ RIVAL: RGB = (110, 205, 215)
 SAMPLE: RGB = (230, 90, 190)
 UNDECIDED: RGB = (140, 146, 156)
 SPHERE: RGB = (170, 190, 215)
-SELECTED: RGB = (190, 50, 255)
+SELECTED: RGB = (205, 75, 255)
 SCALE: RGB = (128, 132, 140)
 """Of the scale bar, which means nothing but its length."""
 
@@ -56,7 +56,7 @@ MAX_DRAWN_PAIRS = 200
 MAX_DRAWN_RIVALS = 8
 MAX_SELECTED_DOTS = 500
 MAX_SELECTED_ARCS = 40
-MAX_SELECTED_BALLS = 6
+MAX_SELECTED_BALLS = 8
 
 DIM = 0.6
 """How far the colours of what is not selected move towards grey."""

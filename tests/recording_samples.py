@@ -108,11 +108,11 @@ class Recorded:
                 self.rows.setdefault(chunk.entity_path, []).append((step, row))
 
     def at(self, entity: str, step: int) -> dict[str, Any] | None:
-        """The components of an entity that a viewer shows at a step; None if there are none or all are cleared."""
-        rows = [row for when, row in sorted(self.rows[entity], key=lambda item: item[0]) if when <= step]
-        shown = (
-            {name: value for name, value in rows[-1].items() if ":" in name or name == "correspondence"} if rows else {}
-        )
+        """The components of an entity that a viewer shows at a step, of each the newest; None if all are cleared."""
+        shown: dict[str, Any] = {}
+        for when, row in sorted(self.rows[entity], key=lambda item: item[0]):
+            if when <= step:
+                shown |= {name: value for name, value in row.items() if ":" in name or name == "correspondence"}
         return shown if any(len(value) for value in shown.values() if value.is_valid) else None
 
     def array(self, entity: str, step: int, component: str) -> np.ndarray:

@@ -1,19 +1,22 @@
 """The painter changes what is on the canvas instead of drawing it anew, and hides what a picture does not show."""
 
+import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
 import pytest
+import trimesh
 import viser
 
 from spherloc_viz import style
 from spherloc_viz.app.painter import MOST_BATCHED, SHELLS, Painter
 from spherloc_viz.app.viser_seams import start_viser, stop_viser
 from spherloc_viz.layers.frame import one_color
-from spherloc_viz.layers.primitives import Balls, Mesh, Points, Segments
+from spherloc_viz.layers.primitives import Balls, Label, Mesh, Points, Segments, Textured
 
 ALL = frozenset(style.LAYERS)
 
@@ -65,8 +68,16 @@ def canvas(server: viser.ViserServer) -> Canvas:
 
 
 @pytest.fixture
-def painter(server: viser.ViserServer, canvas: Canvas) -> Painter:
-    return Painter(cast(viser.ClientHandle, Client(canvas, server.atomic)))
+def picks() -> list[tuple[tuple[int, ...], bool]]:
+    """What was picked, and whether it extends the selection."""
+    return []
+
+
+@pytest.fixture
+def painter(server: viser.ViserServer, canvas: Canvas, picks: list[tuple[tuple[int, ...], bool]]) -> Painter:
+    server.scene._scene_pointer_cb.clear()
+    client = cast(viser.ClientHandle, Client(canvas, server.atomic))
+    return Painter(client, lambda ids, extend: picks.append((ids, extend)))
 
 
 def dots(count: int, at: float = 0.0, color: style.RGB = style.INLIER) -> Points:
@@ -159,3 +170,125 @@ def test_a_mesh_moves_but_its_colour_adds_it_anew(painter: Painter, canvas: Canv
     assert canvas.added == ["/sphere/surface"] * 2
     node = canvas.nodes["/sphere/surface"]
     assert node.opacity == 0.2 and not node.cast_shadow
+
+
+def test_words_move_and_change_in_place(painter: Painter, canvas: Canvas) -> None:
+    painter.draw([Label("scale/length", "scale bar", np.zeros(3), "1 m")], ALL)
+    painter.draw([Label("scale/length", "scale bar", np.ones(3), "2 m")], ALL)
+    node = canvas.nodes["/scale/length"]
+    assert canvas.added == ["/scale/length"] and node.text == "2 m" and np.all(node.position == 1.0)
+    assert canvas.calls["/scale/length"][1]["font_size_mode"] == "screen"
+    painter.draw([Label("scale/length", "scale bar", np.ones(3), "2 m", 0.3)], ALL)
+    assert canvas.calls["/scale/length"][1]["font_size_mode"] == "scene"
+    painter.draw([Label("scale/length", "scale bar", np.ones(3), "")], ALL)
+    assert not canvas.shown
+
+
+def test_a_rim_shows_its_back_only(painter: Painter, canvas: Canvas) -> None:
+    """So that the dot inside stays in sight."""
+    for name, rim in (("halo", True), ("dot", False)):
+        painter.draw([Points(name, "map", np.zeros((1, 3)), one_color(style.SELECTED, 1), 0.1, rim=rim)], ALL)
+    assert [canvas.calls[name][1]["side"] for name in ("/halo", "/dot")] == ["back", "front"]
+
+
+def test_nothing_is_sent_for_what_stays(server: viser.ViserServer, painter: Painter, canvas: Canvas) -> None:
+    items = [dots(5), rays(3), Label("scale/length", "scale bar", np.zeros(3), "1 m"), picture(1, np.eye(3))]
+    painter.draw(items, ALL)
+    sent: list[object] = []
+    queue = server._websock_server.queue_message
+    try:
+        server._websock_server.queue_message = sent.append  # type: ignore[method-assign]
+        painter.draw([dots(5), rays(3), Label("scale/length", "scale bar", np.zeros(3), "1 m"), items[3]], ALL)
+        assert not sent
+        painter.draw([dots(5, at=1.0), rays(3), *items[2:]], ALL)
+        assert [type(message).__name__ for message in sent] == ["SceneNodeUpdateMessage"]
+    finally:
+        server._websock_server.queue_message = queue  # type: ignore[method-assign]
+
+
+def picture(key: int, turn: np.ndarray, made: list[int] | None = None, image: Any = "red") -> Textured:
+    def make() -> Any:
+        (made if made is not None else []).append(key)
+        return np.full((4, 8, 3), (200, 30, 40), np.uint8) if isinstance(image, str) else image
+
+    corners, uv = np.eye(3), np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+    placed = np.column_stack([2.0 * turn, [1.0, 2.0, 3.0]])
+    return Textured("sphere/image", "image", corners, np.array([[0, 1, 2]]), uv, placed, make, key)
+
+
+def test_a_picture_is_made_once_and_moves_with_its_mesh(painter: Painter, canvas: Canvas) -> None:
+    made: list[int] = []
+    painter.draw([picture(1, np.eye(3), made)], ALL - {"image"})
+    assert not made and not canvas.added, "what is switched off costs nothing"
+    turn = trimesh.transformations.rotation_matrix(0.7, [0.0, 1.0, 0.0])[:3, :3]
+    for key, turned in ((1, np.eye(3)), (1, turn), (2, turn)):
+        painter.draw([picture(key, turned, made)], ALL)
+    node = canvas.nodes["/sphere/image"]
+    assert made == [1, 2] and canvas.added == ["/sphere/image"] * 2
+    assert np.allclose(node.position, [1.0, 2.0, 3.0]) and node.scale == pytest.approx(2.0)
+    np.testing.assert_allclose(node.wxyz, [np.cos(0.35), 0.0, np.sin(0.35), 0.0], atol=1e-9)
+    painter.draw([picture(2, turn, made)], ALL - {"image"})
+    assert not canvas.shown and made == [1, 2]
+
+
+def test_a_picture_that_is_missing_is_not_drawn(painter: Painter, canvas: Canvas) -> None:
+    painter.draw([picture(1, np.eye(3), image=None)], ALL)
+    assert not canvas.added
+
+
+@pytest.mark.parametrize(("channels", "mode"), [(3, None), (4, "MASK")])
+def test_a_picture_is_unlit_and_seen_from_both_sides(
+    painter: Painter, canvas: Canvas, channels: int, mode: str | None
+) -> None:
+    painter.draw([picture(1, np.eye(3), image=np.full((4, 8, channels), 90, np.uint8))], ALL)
+    glb = canvas.nodes["/sphere/image"].glb_data
+    tree = json.loads(glb[20 : 20 + int.from_bytes(glb[12:16], "little")])
+    (material,) = tree["materials"]
+    assert material["doubleSided"] and material.get("alphaMode", "OPAQUE") == (mode or "OPAQUE")
+    assert "KHR_materials_unlit" in material["extensions"] and "KHR_materials_unlit" in tree["extensionsUsed"]
+
+
+CAMERA = SimpleNamespace(
+    position=np.zeros(3), wxyz=np.array([1.0, 0.0, 0.0, 0.0]), fov=np.pi / 2, image_width=400, image_height=400
+)
+"""Looks along +z; at depth 1 a pixel is 1 / 200."""
+
+
+def click(server: viser.ViserServer, x_px: float, modifier: str | None = None) -> None:
+    """A click that many pixels right of the middle, as the page tells it."""
+    ray = np.array([x_px / 200, 0.0, 1.0]) / np.hypot(x_px / 200, 1.0)
+    client = cast(viser.ClientHandle, SimpleNamespace(camera=CAMERA))
+    place = (0.5 + x_px / 400, 0.5)
+    event = viser.SceneClickEvent(client, 0, (0.0, 0.0, 0.0), tuple(ray), place, cast(Any, modifier))
+    for entry in server.scene._scene_pointer_cb:
+        if entry.event_type == "click" and entry.modifier == modifier:
+            entry.callback(event)
+
+
+def test_a_click_picks_what_is_shown(server: viser.ViserServer, painter: Painter, picks: list) -> None:
+    """Each modifier has its own callback, so that one click is never reported twice."""
+    ids = np.array([[3, 8]])
+    ends = np.array([[[0.5, -1.0, 1.0], [0.5, 1.0, 1.0]]])
+    arc = Segments("ring/arcs", "yaw ring", ends, one_color(style.CLIQUE, 1), 2.0, ids)
+    point = Points("map/points", "map", np.array([[0.0, 0.0, 1.0]]), one_color(style.INLIER, 1), 1e-3, np.array([7]))
+    painter.draw([point, arc], ALL)
+    click(server, 3)
+    click(server, 3, "shift")
+    click(server, 3, "cmd/ctrl")
+    click(server, 103)
+    click(server, 60)
+    assert picks == [((7,), False), ((7,), True), ((7,), True), ((3, 8), False), ((), False)]
+    picks.clear()
+    painter.draw([point, arc], ALL - {"map"})
+    click(server, 3)
+    assert picks == [((), False)], "what is switched off cannot be picked"
+
+
+def test_a_rectangle_picks_all_dots_in_it(server: viser.ViserServer, painter: Painter, picks: list) -> None:
+    places = np.array([[0.1, 0.1, 1.0], [0.1, 0.1, 9.0], [-0.5, 0.1, 1.0], [0.1, 0.1, -1.0]])
+    painter.draw([Points("map/points", "map", places, one_color(style.INLIER, 4), 0.01, np.array([4, 5, 6, 7]))], ALL)
+    client = cast(viser.ClientHandle, SimpleNamespace(camera=CAMERA))
+    event = viser.SceneRectSelectEvent(client, 0, (0.5, 0.5), (0.6, 0.6), "shift")
+    (entry,) = (entry for entry in server.scene._scene_pointer_cb if entry.event_type == "rect-select")
+    entry.callback(event)
+    assert entry.modifier == "shift" and picks == [((4, 5), False)], "hidden ones too, but none behind the viewer"

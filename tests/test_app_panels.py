@@ -30,7 +30,7 @@ from spherloc_viz.app.steps_panel import find_step
 from spherloc_viz.app.text import diagnosis_html, status_html, step_html, table_html
 from spherloc_viz.app.viser_seams import start_viser, stop_viser
 from spherloc_viz.layers import paint, steps
-from spherloc_viz.layers.primitives import Balls, Points, Step, Table
+from spherloc_viz.layers.primitives import Balls, Points, Step, Stop, Table
 from spherloc_viz.options import option_fields
 
 COLORS = np.array([color for color, _ in style.LEGEND] + [style.SPHERE], np.uint8)
@@ -88,7 +88,7 @@ def test_every_text_is_escaped() -> None:
 )
 def test_a_step_is_kept_over_runs_where_it_can(key: str, found: str) -> None:
     keys = ["problem", "bearings", "sample-1", "sample-2", "sample-3", "outcome"]
-    timeline = [Step(name, name, "", "") for name in keys]
+    timeline = [Stop(name, name) for name in keys]
     assert keys[find_step(timeline, key)] == found
 
 

@@ -1,5 +1,6 @@
 """The pictures: what each step shows must be what the trace says."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -23,7 +24,7 @@ from spherloc.trace import (
 )
 from spherloc_viz import style
 from spherloc_viz.layers import paint, steps
-from spherloc_viz.layers.primitives import Balls, Curve, Mesh, Picture, Points, SceneItem, Segments
+from spherloc_viz.layers.primitives import Balls, Curve, Label, Mesh, Picture, Points, SceneItem, Segments, Textured
 
 SCENES = sorted(name for name, path in bundled_scenes().items() if 'kind = "synthetic"' in path.read_text())
 
@@ -72,9 +73,10 @@ def check_drawable(trace: Trace) -> None:
     assert len(set(keys)) == len(keys) and keys[:2] == ["problem", "bearings"] and keys[-1] == "outcome"
     for index, step in enumerate(steps(trace)):
         picture = paint(trace, index)
-        assert picture.step is step
-        sentences = step.caption.count(". ") + 1
-        assert sentences == 2 and step.caption.endswith("."), step.caption
+        said = picture.step
+        assert (said.key, said.title, said.stage) == (step.key, step.title, step.stage) and step.stage
+        sentences = said.caption.count(". ") + 1
+        assert sentences == 2 and said.caption.endswith("."), said.caption
         names = [found.name for found in picture.scene]
         assert len(set(names)) == len(names)
         for found in picture.scene:
@@ -92,14 +94,10 @@ def exact() -> Trace:
 
 
 def test_every_step_of_an_exact_run_is_drawable(exact: Trace) -> None:
-    assert [step.key for step in steps(exact)][2:] == [
-        "decision",
-        "consensus-bound",
-        "consensus-clique",
-        "consensus-poses",
-        "refinement",
-        "outcome",
-    ]
+    stages = list(dict.fromkeys(step.stage for step in steps(exact)))
+    assert stages == ["Matches", "Choice", "Consensus", "Refinement", "Outcome"]
+    main = ["decision", "consensus-bound", "consensus-clique", "consensus-poses", "refinement", "outcome"]
+    assert [step.key for step in steps(exact) if step.key in main] == main
     check_drawable(exact)
 
 
@@ -263,8 +261,10 @@ def check_item(found: SceneItem) -> None:
         assert found.points.shape == (len(found.colors), 2, 3) and np.isfinite(found.points).all()
     elif isinstance(found, Balls):
         assert found.centers.shape == found.colors.shape and (found.radii_m > 0).all() and 0 < found.opacity <= 1
+    elif isinstance(found, Label):
+        assert found.position.shape == (3,) and np.isfinite(found.position).all() and found.text
     else:
-        assert isinstance(found, Mesh) and found.faces.max() < len(found.vertices)
+        assert isinstance(found, Mesh | Textured) and found.faces.max() < len(found.vertices)
 
 
 def test_outcome_colours_say_inlier_and_outlier(mc: Trace) -> None:
@@ -364,14 +364,14 @@ def test_gold_arcs_cover_the_estimated_yaw(mc: Trace) -> None:
 def test_ransac_steps_are_its_improvements(ransac: Trace) -> None:
     stage = ransac.stage(RansacStage)
     assert stage is not None
-    samples = [step for step in steps(ransac) if step.key.startswith("sample-")]
+    samples = [step for step in steps(ransac) if re.fullmatch(r"sample-\d+", step.key)]
     assert len(samples) == len(stage.improved_at)
     for k, step in enumerate(samples):
         picture = at(ransac, step.key)
         points = item(picture, "map/points")
         assert isinstance(points, Points)
         np.testing.assert_array_equal(np.flatnonzero(is_color(points.colors, style.SAMPLE)), np.sort(stage.samples[k]))
-        assert f"{np.count_nonzero(stage.inlier_masks[k])} of 100" in step.caption
+        assert f"{np.count_nonzero(stage.inlier_masks[k])} of 100" in picture.step.caption
 
 
 def test_refinement_chart_is_its_cost(ransac: Trace) -> None:

@@ -23,13 +23,13 @@ from spherloc.metrics import evaluate
 from spherloc.problem import Problem
 from spherloc.trace import Certificate, DecisionStage, RefinementStage, Trace
 from spherloc_viz.layers import paint, steps
-from spherloc_viz.layers.primitives import Balls, Mesh, Points, Segments
+from spherloc_viz.layers.primitives import Balls, Label, Mesh, Points, Segments, Stop, Textured
 from spherloc_viz.recording import data
-from spherloc_viz.recording.drawing import LEVEL_OPACITY
+from spherloc_viz.recording.chart_bars import LEVEL_OPACITY
 from spherloc_viz.recording.layout import APPLICATION_ID
 from spherloc_viz.recording.reader import check_recording, read_recording
 from spherloc_viz.recording.rerun_program import rerun_command, rerun_environment
-from spherloc_viz.recording.writer import write_recording
+from spherloc_viz.recording.writer import recorded_steps, write_recording
 
 
 @pytest.fixture(scope="module", params=[*RUNS, "lost", "by hand"], ids=str)
@@ -196,9 +196,11 @@ def rgba(colors: object, opacity: float = 1.0) -> np.ndarray:
 
 def test_every_step_shows_what_the_layers_paint(trace: Trace, recorded: Recorded) -> None:
     known = {entity for entity in recorded.rows if entity.startswith("/scene/")}
-    for step in range(len(steps(trace))):
+    for step in recorded_steps(steps(trace)):
         shown = set()
         for item in paint(trace, step).scene:
+            if isinstance(item, Textured):
+                continue
             entity = rr.new_entity_path(["scene", *item.name.split("/")])
             shown.add(entity)
             assert_shows(recorded, entity, step, item)
@@ -211,26 +213,34 @@ def assert_shows(recorded: Recorded, entity: str, step: int, item: object) -> No
         case Points() | Segments() | Balls() if not len(item.colors):
             assert recorded.at(entity, step) is None or not len(recorded.array(entity, step, _places(item)))
         case Points():
-            assert np.array_equal(recorded.array(entity, step, "Points3D:positions"), np.float32(item.positions))
+            assert_near(recorded.array(entity, step, "Points3D:positions"), item.positions)
             assert (recorded.array(entity, step, "Points3D:colors") == rgba(item.colors)).all()
             assert recorded.array(entity, step, "Points3D:radii") == np.float32(item.radius_m)
             if item.ids is not None:
                 assert np.array_equal(recorded.array(entity, step, "correspondence"), item.ids)
         case Segments():
-            assert np.array_equal(recorded.array(entity, step, "LineStrips3D:strips"), np.float32(item.points))
+            assert_near(recorded.array(entity, step, "LineStrips3D:strips"), item.points)
             assert (recorded.array(entity, step, "LineStrips3D:colors") == rgba(item.colors)).all()
             assert recorded.array(entity, step, "LineStrips3D:radii") == np.float32(-item.width_px / 2)
         case Balls():
             sizes = np.repeat(np.asarray(item.radii_m, np.float32)[:, None], 3, axis=1)
-            assert np.array_equal(recorded.array(entity, step, "Ellipsoids3D:centers"), np.float32(item.centers))
-            assert np.array_equal(recorded.array(entity, step, "Ellipsoids3D:half_sizes"), sizes)
+            assert_near(recorded.array(entity, step, "Ellipsoids3D:centers"), item.centers)
+            assert_near(recorded.array(entity, step, "Ellipsoids3D:half_sizes"), sizes)
             assert (recorded.array(entity, step, "Ellipsoids3D:colors") == rgba(item.colors, item.opacity)).all()
         case Mesh():
-            assert np.array_equal(recorded.array(entity, step, "Mesh3D:vertex_positions"), np.float32(item.vertices))
+            assert_near(recorded.array(entity, step, "Mesh3D:vertex_positions"), item.vertices)
             assert np.array_equal(recorded.array(entity, step, "Mesh3D:triangle_indices"), item.faces)
             assert recorded.array(entity, step, "Mesh3D:albedo_factor") == rgba(item.color, item.opacity)
+        case Label():
+            assert_near(recorded.array(entity, step, "Points3D:positions"), item.position[None])
+            assert recorded.array(entity, step, "Points3D:labels").tolist() == [item.text]
         case _:
             raise AssertionError(f"the test knows no {type(item).__name__}")
+
+
+def assert_near(recorded: np.ndarray, painted: np.ndarray) -> None:
+    """Equal but for rounding to 24 bits."""
+    assert recorded.shape == painted.shape and np.abs(recorded - painted).max() <= 2e-6 * np.abs(painted).max()
 
 
 def _places(item: object) -> str:
@@ -244,7 +254,7 @@ def _places(item: object) -> str:
 
 def test_every_step_shows_the_charts(trace: Trace, recorded: Recorded) -> None:
     known = {entity for entity in recorded.rows if entity.startswith("/charts/")}
-    for step in range(len(steps(trace))):
+    for step in recorded_steps(steps(trace)):
         shown = set()
         for chart in paint(trace, step).charts:
             for curve in chart.curves:
@@ -269,8 +279,8 @@ def test_every_step_shows_the_charts(trace: Trace, recorded: Recorded) -> None:
 
 
 def test_every_step_shows_its_words(trace: Trace, recorded: Recorded) -> None:
-    for index, step in enumerate(steps(trace)):
-        text = unescaped(recorded.array("/step", index, "TextDocument:text")[0])
+    for index in recorded_steps(steps(trace)):
+        text, step = unescaped(recorded.array("/step", index, "TextDocument:text")[0]), paint(trace, index).step
         for part in (step.title, step.caption, *step.equation.splitlines(), step.note):
             assert " ".join(part.split()) in text
     outcome = unescaped(recorded.array("/outcome", -1, "TextDocument:text")[0])
@@ -294,8 +304,23 @@ def test_words_cannot_become_markup(tmp_path: Path) -> None:
     assert unescaped(line) == evil
 
 
+def test_of_a_series_the_first_the_middle_and_the_last_are_recorded() -> None:
+    keys = ["problem", *(f"yaw-arcs-{k}" for k in (10, 30, 100, 300)), "yaw-arcs"]
+    keys += [name for k in range(1, 9) for name in (f"sample-{k}-pose", f"sample-{k}")] + ["outcome"]
+    kept = [keys[index] for index in recorded_steps([Stop(key, key) for key in keys])]
+    assert kept == [key for key in keys if key != "yaw-arcs-30"]
+
+
+def test_colours_change_without_their_places(trace: Trace, recorded: Recorded) -> None:
+    rows = recorded.rows["/scene/map/points"]
+    moved = [when for when, row in rows if "Points3D:positions" in row]
+    colored = [when for when, row in rows if "Points3D:colors" in row]
+    assert moved == [0] and len(colored) > 2
+
+
 def test_identical_primitives_are_written_once(trace: Trace, recorded: Recorded) -> None:
-    truth = [when for when, _ in recorded.rows.get("/scene/cameras/truth", [])]
+    rows = recorded.rows.get("/scene/cameras/truth", [])
+    truth = [when for when, row in rows if "LineStrips3D:strips" in row]
     assert truth == ([] if trace.problem.truth_cam_from_map is None else [0])
 
 
@@ -320,8 +345,9 @@ def test_the_file_opens_at_the_steps_with_its_own_layout(trace: Trace, path: Pat
         for _, batch in rows
         if "ViewBlueprint:space_origin" in batch.schema.names
     }
-    charts = {f"/charts/{chart.name}" for step in range(len(steps(trace))) for chart in paint(trace, step).charts}
-    tables = {table.name for step in range(len(steps(trace)) - 1) for table in paint(trace, step).tables}
+    *before, last = [paint(trace, step) for step in recorded_steps(steps(trace))]
+    charts = {f"/charts/{chart.name}" for picture in (*before, last) for chart in picture.charts}
+    tables = {table.name for picture in before for table in picture.tables}
     paths = {rr.new_entity_path(["tables", name]) for name in tables}
     assert origins == {"/", "/step", "/outcome"} | charts | paths
 
@@ -404,7 +430,7 @@ from pathlib import Path
 from recording_samples import scene_problem
 from spherloc.errors import RecordingError
 from spherloc.estimators import estimate
-from spherloc_viz.recording.writer import write_recording
+from spherloc_viz.recording.writer import recorded_steps, write_recording
 
 path, limit = Path(sys.argv[1]), int(sys.argv[2])
 trace = estimate(scene_problem("mei_outliers_80"), "mc")

@@ -26,10 +26,11 @@ FLOORS = (
     ("spherloc.trace", "spherloc.refine", "spherloc.metrics", "spherloc.datasets", "spherloc.frontend"),
     ("spherloc.estimators", "spherloc.diagnosis", "spherloc.experiments"),
     ("spherloc_viz.style", "spherloc_viz.layers", "spherloc_viz.options", "spherloc_viz"),
-    ("spherloc_viz.recording", "spherloc_viz.app", "spherloc_viz.lessons"),
+    ("spherloc_viz.recording", "spherloc_viz.app", "spherloc_viz.lessons", "spherloc_viz.sweep_plot"),
     (
         "spherloc_viz.batch",
         "spherloc_viz.localize",
+        "spherloc_viz.sweep",
         "spherloc_viz.trajectory_plot",
         "spherloc_viz.scene_list",
         "spherloc_viz.progress",

@@ -4,7 +4,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from spherloc.datasets.point_cloud import HALF_SIZE_M, FloatArray, Lens, random_bearings
+from spherloc.datasets.point_cloud import HALF_SIZE_M, WHOLE_SPHERE_DEG, FloatArray, Lens, random_bearings
 from spherloc.errors import InputError
 from spherloc.geometry import camera_centre, pose, wrap_angle, yaw_of, yaw_rotation
 
@@ -20,6 +20,8 @@ REPEATS = np.array([1, -1, 2, -2])
 """How many steps away a match may land; the nearer copies twice as often."""
 POSE_DRAWS = 60
 """Wrong poses that are drawn for each point before its wrong pixel is drawn itself."""
+NARROW_POSE_DRAWS = 8
+"""As many where the field of view is not the camera's whole one, where most poses do not see the point."""
 PIXEL_DRAWS = 400
 
 
@@ -42,11 +44,12 @@ def random_pixels(rng: np.random.Generator, lens: Lens, points: FloatArray, name
     the scene's ``name``, if the camera sees next to nothing.
     """
     pixels = np.full((len(points), 2), np.nan)
-    for draw in range(POSE_DRAWS + PIXEL_DRAWS):
+    pose_draws = POSE_DRAWS if lens.field_of_view_deg == WHOLE_SPHERE_DEG else NARROW_POSE_DRAWS
+    for draw in range(pose_draws + PIXEL_DRAWS):
         missing = np.flatnonzero(np.isnan(pixels[:, 0]))
         if len(missing) == 0:
             return pixels
-        if draw < POSE_DRAWS:
+        if draw < pose_draws:
             poses = random_poses(rng, len(points))[missing]
             rays = np.einsum("nij,nj->ni", poses[:, :, :3], points[missing]) + poses[:, :, 3]
         else:

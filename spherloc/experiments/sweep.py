@@ -17,7 +17,6 @@ __all__ = ["AXES", "Entrant", "Job", "SweepPlan", "SweepRow", "planned", "run_sw
 
 TASK_S = 0.3
 """A task is a few runs that take about as long as this: less would be spent on messages, more would look stuck."""
-FIRST_GUESS_MS = 20.0
 OVERHEAD_MS = 2.0
 """Of a run beside its estimator: drawing the problem, judging the pose."""
 MOST_DEATHS = 3
@@ -117,13 +116,14 @@ class Backlog:
         return ()
 
     def _next_jobs(self) -> Iterator[Job]:
-        budget_ms = 1e3 * TASK_S
+        spent_ms = 0.0
         while self._next is not None:
             job = self._next
-            runs, total_ms = self._spent_ms.get((job.value, job.entrant), (1, FIRST_GUESS_MS))
+            # A point that nobody has seen yet may take any time, so its first run goes alone.
+            runs, total_ms = self._spent_ms.get((job.value, job.entrant), (1, 1e3 * TASK_S))
             cost_ms = total_ms / runs + OVERHEAD_MS
-            if cost_ms > budget_ms and budget_ms < 1e3 * TASK_S:
+            if spent_ms and spent_ms + cost_ms > 1e3 * TASK_S:
                 return
-            budget_ms -= cost_ms
+            spent_ms += cost_ms
             self._next = next(self._fresh, None)
             yield job

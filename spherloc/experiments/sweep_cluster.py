@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import logging
 import queue
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -17,7 +18,7 @@ COUNT_EVERY_S = 2.0
 """Workers come and go; they are counted this often."""
 PATIENCE_S = 60.0
 """A cluster may be without any worker for this long."""
-GATHER_S = 20.0
+GATHER_S = 2.0
 
 
 class Cluster:
@@ -27,6 +28,8 @@ class Cluster:
         """Raises ``InputError`` if ``dask.distributed`` is missing, or no scheduler with workers is at ``address``."""
         self._dask = require("distributed", "cluster", "a sweep on a Dask cluster")
         self._plan, self._address = plan, address
+        # What is said here in a sentence, it would log with tracebacks.
+        logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
         try:
             # A client that never reached its scheduler takes 20 s to be deleted, so knock before.
             with ThreadPoolExecutor(1) as knocking:

@@ -20,7 +20,7 @@ from spherloc.experiments.sweep_rows import SweepRow
 MOST_WORKERS = 64
 AHEAD = 1
 """Tasks that wait beside those that are being done, so that no worker waits for us."""
-MOST_FAILED_STARTS = 3
+MOST_FAILED_STARTS = 2
 NICENESS = 10
 """Whoever waits for an answer of this machine goes before a sweep in the background."""
 

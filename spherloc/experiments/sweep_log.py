@@ -12,7 +12,7 @@ from typing import Any, Self
 from spherloc.errors import InputError, show
 from spherloc.experiments.sweep_plan import SweepPlan
 from spherloc.experiments.sweep_rows import SweepRow, columns, csv_line, row_line, row_of_line
-from spherloc.experiments.sweep_summary import summarize, summary_text
+from spherloc.experiments.sweep_summary import rows_text, summarize, summary_text
 
 MAX_BYTES = 1_000_000_000
 MAX_PLAN_BYTES = 1_000_000
@@ -66,6 +66,11 @@ class SweepLog:
         """(estimator's label, value, seed) of the rows."""
         return {(row.estimator, row.value, row.seed) for row in self.rows}
 
+    def done_of_plan(self) -> int:
+        """How many of the plan's runs are done; the file may hold more."""
+        last = self._plan.first_seed + self._plan.runs
+        return sum(row.seed < last for row in self.rows)
+
     def beside(self, ending: str) -> Path:
         """``NAME.png`` for ".png"."""
         return self.path.with_suffix(ending)
@@ -79,10 +84,7 @@ class SweepLog:
 
     def finish(self) -> None:
         """Put the rows in order, whoever was quicker, and write the summary. Raises ``InputError`` if that fails."""
-        labels = {label: place for place, label in enumerate(self._plan.labels)}
-        self.rows.sort(key=lambda row: (row.seed, row.value, labels[row.estimator]))
-        lines = [csv_line(columns(self._plan.over)), *map(row_line, self.rows)]
-        self.write(self.path, "".join(lines).encode())
+        self.write(self.path, rows_text(self._plan.over, self._plan.labels, self.rows).encode())
         points = summarize(self._plan.labels, self.rows)
         self.write(self.beside(".summary.csv"), summary_text(self._plan.over, points).encode())
 
@@ -116,9 +118,7 @@ class SweepLog:
         try:
             fcntl.flock(self._file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise InputError(
-                f"{self.path}: another sweep writes to it; wait or give another file."
-            ) from None
+            raise InputError(f"{self.path}: another sweep writes to it; wait or give another file.") from None
         except OSError:  # a file system without locks
             return
 

@@ -171,7 +171,8 @@ class SweepPlan:
         """With nothing but what JSON has; infinity is the text "inf"."""
         table = asdict(self)
         table["entrants"] = [{"estimator": item.estimator, "options": dict(item.changes)} for item in self.entrants]
-        return {"format": FORMAT} | _plain(table | {"versions": dict(self.versions)})
+        table |= {"variation": self.variation.simulation, "versions": dict(self.versions)}
+        return {"format": FORMAT} | _plain(table)
 
 
 def planned(
@@ -193,6 +194,8 @@ def planned(
         variation = replace(variation, camera=str(Path(variation.camera).resolve()))
     if over not in AXES:
         raise InputError(f"a sweep cannot go over {show(over)}; choose one of {', '.join(AXES)}.")
+    if getattr(variation, over) is not None:
+        raise InputError(f"{over} is set, and the sweep goes over it; leave one of the two out.")
     if variation.edited:
         raise InputError(
             "a sweep draws new problems for every run, so single matches cannot be edited; leave that out."

@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from spherloc.experiments.summary import wilson
-from spherloc.experiments.sweep_rows import SweepRow, csv_line
+from spherloc.experiments.sweep_rows import SweepRow, columns, csv_line, row_line
 
 
 @dataclass(frozen=True)
@@ -105,6 +105,13 @@ def _quartiles(values: Iterable[float | None]) -> Quartiles:
 def _mean(values: Iterable[float | None]) -> float | None:
     known = [value for value in values if value is not None]
     return float(np.mean(known)) if known else None
+
+
+def rows_text(over: str, labels: Sequence[str], rows: Iterable[SweepRow]) -> str:
+    """The rows as CSV, ordered by seed, value and estimator, whoever was quicker."""
+    place = {label: number for number, label in enumerate(labels)}
+    ordered = sorted(rows, key=lambda row: (row.seed, row.value, place[row.estimator]))
+    return "".join([csv_line(columns(over)), *map(row_line, ordered)])
 
 
 def summary_text(over: str, points: Iterable[Point]) -> str:

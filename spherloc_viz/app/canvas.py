@@ -81,4 +81,3 @@ def panel_widths_px(window_px: int) -> tuple[int, int]:
 
 PANELS_PX: tuple[tuple[int, tuple[int, int]], ...] = ((1600, (480, 400)), (0, (380, 340)))
 """From this width of the window on: widths of the panels left and right."""
-

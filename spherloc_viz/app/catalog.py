@@ -1,7 +1,9 @@
 """The scenes and cameras that the page offers, and the problems that they give."""
 
-from dataclasses import dataclass, field, replace
+import copy
+from dataclasses import dataclass, field
 from functools import lru_cache
+from itertools import chain, count
 from pathlib import Path
 
 from spherloc.cameras.base import Camera
@@ -34,26 +36,49 @@ class Catalog:
         self.scenes: dict[str, Scene] = {}
         self._paths: dict[str, Path] = {}
         if given is not None:
-            self._add(load_scene(given), given)
+            self.add(load_scene(given), given)
         others = [path for path in bundled_scenes().values() if given is None or path.resolve() != given.resolve()]
         loaded = [(load_scene(path), path) for path in others]
         # A simulation shows its first picture at once, images take seconds.
         for scene, path in sorted(loaded, key=lambda pair: not isinstance(pair[0], SyntheticScene)):
-            self._add(scene, path)
+            self.add(scene, path)
         self.cameras: dict[str, str] = {}
         """Paths of scene files, by a label of their camera: what a variation takes as its camera."""
         for label, scene in self.scenes.items():
             if isinstance(scene, SyntheticScene):
                 self.cameras.setdefault(camera_label(scene.camera), str(self.path(label)))
-        self._unedited = lru_cache(maxsize=16)(self._draw)
-        self.problem = lru_cache(maxsize=16)(self._problem)
-        """The problem (cached) that a wish describes; raises ``InputError`` if there is none."""
-        self.mesh = lru_cache(maxsize=4)(self._mesh)
-        """Binary glTF (cached) of a scene's map, in the map frame, by its label; None if it has none."""
+        self._caches = _Caches()
+
+    def branch(self) -> "Catalog":
+        """A catalog with the same scenes and caches, to which one page can add scenes that others do not see."""
+        twin = copy.copy(self)
+        twin.scenes, twin._paths, twin.cameras = dict(self.scenes), dict(self._paths), dict(self.cameras)
+        return twin
+
+    def add(self, scene: Scene, path: Path, label: str | None = None) -> str:
+        """Add a scene, or load it anew if its file is known already; returns its label, by default its name.
+
+        The label is made longer if another scene has it already.
+        """
+        path, label = path.resolve(), label or scene.name
+        known = next((known for known, file in self._paths.items() if file == path), None)
+        names = chain([label, f"{label} ({path.name})"], (f"{label} {number}" for number in count(2)))
+        free = known or next(name for name in names if name not in self.scenes)
+        self.scenes[free], self._paths[free] = scene, path
+        return free
 
     def path(self, label: str) -> Path:
         """The scene file of that label, absolute."""
         return self._paths[label]
+
+    def problem(self, wish: SceneWish) -> Problem:
+        """The problem (cached) that a wish describes; raises ``InputError`` if there is none."""
+        return self._caches.problem(self.scenes[wish.scene], wish.seed, wish.query, wish.variation)
+
+    def mesh(self, label: str) -> bytes | None:
+        """Binary glTF (cached) of a scene's map, in the map frame; None if it has none."""
+        scene = self.map_scene(label)
+        return None if scene is None or scene.mesh is None else self._caches.mesh(scene)
 
     def synthetic(self, label: str) -> SyntheticScene | None:
         """The scene of that label if it is a random one, whose parameters can be changed."""
@@ -65,21 +90,24 @@ class Catalog:
         scene = self.scenes[label]
         return scene if isinstance(scene, MapScene) else None
 
-    def _add(self, scene: Scene, path: Path) -> None:
-        label = scene.name if scene.name not in self.scenes else f"{scene.name} ({path.name})"
-        self.scenes[label], self._paths[label] = scene, path.resolve()
 
-    def _problem(self, wish: SceneWish) -> Problem:
+class _Caches:
+    """What was computed last, by the scenes themselves: their labels may mean other scenes on other pages."""
+
+    def __init__(self) -> None:
+        self.problem = lru_cache(maxsize=16)(self._problem)
+        self._unedited = lru_cache(maxsize=16)(self._draw)
+        self.mesh = lru_cache(maxsize=4)(self._mesh)
+
+    def _problem(self, scene: Scene, seed: int, query: str | None, variation: Variation) -> Problem:
         # Images take long to match: one more spoiled match must not have them matched again.
-        unedited = self._unedited(replace(wish, variation=wish.variation.without_edits()))
-        return wish.variation.edit(unedited, wish.seed)
+        return variation.edit(self._unedited(scene, seed, query, variation.without_edits()), seed)
 
-    def _draw(self, wish: SceneWish) -> Problem:
-        return wish.variation.unedited(self.scenes[wish.scene], wish.seed, wish.query)
+    def _draw(self, scene: Scene, seed: int, query: str | None, variation: Variation) -> Problem:
+        return variation.unedited(scene, seed, query)
 
-    def _mesh(self, label: str) -> bytes | None:
-        scene = self.map_scene(label)
-        return None if scene is None or scene.mesh is None else scene.mesh()
+    def _mesh(self, scene: MapScene) -> bytes | None:
+        return None if scene.mesh is None else scene.mesh()
 
 
 def camera_label(camera: Camera) -> str:

@@ -16,6 +16,11 @@ _INTO = np.array([[0.59719, 0.35458, 0.04823], [0.07600, 0.90834, 0.01566], [0.0
 _OUT = np.array([[1.60475, -0.53108, -0.07367], [-0.10208, 1.10813, -0.00605], [-0.00327, -0.07276, 1.07602]])
 _A, _B, _C, _D, _E = 0.0245786, 0.000090537, 0.983729, 0.4329510, 0.238081
 _EXPOSURE = 1.0 / 0.6
+_UNDO_OUT, _UNDO_INTO = np.linalg.inv(_OUT).T, np.linalg.inv(_INTO).T / _EXPOSURE
+
+_SRGB = np.arange(256) / 255.0
+_LINEAR = np.where(_SRGB <= 0.04045, _SRGB / 12.92, ((_SRGB + 0.055) / 1.055) ** 2.4)
+"""Linear light of every sRGB byte."""
 
 
 def light_bytes(colors: ByteArray) -> ByteArray:
@@ -31,12 +36,10 @@ def surface_bytes(colors: ByteArray) -> ByteArray:
 
 def _before_filmic(colors: ByteArray) -> FloatArray:
     """Linear light (..., 3) in [0, 1] which the filmic curve turns into the sRGB bytes ``colors``."""
-    srgb = np.asarray(colors, dtype=np.float64) / 255.0
-    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
-    y = linear @ np.linalg.inv(_OUT).T
+    y = _LINEAR[np.asarray(colors, dtype=np.uint8)] @ _UNDO_OUT
     square, slope, rest = 1.0 - _C * y, _A - _D * y, -_B - _E * y
     v = (np.sqrt(np.maximum(slope**2 - 4.0 * square * rest, 0.0)) - slope) / (2.0 * square)
-    return np.clip(v @ np.linalg.inv(_INTO).T / _EXPOSURE, 0.0, 1.0)
+    return np.clip(v @ _UNDO_INTO, 0.0, 1.0)
 
 
 def _bytes(values: FloatArray) -> ByteArray:

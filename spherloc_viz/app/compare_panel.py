@@ -3,6 +3,7 @@
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from html import escape
 
 import numpy as np
@@ -10,11 +11,12 @@ import viser
 
 from spherloc import registry
 from spherloc.diagnosis import Cause, diagnose
-from spherloc.errors import SpherlocError
+from spherloc.errors import InputError
 from spherloc.estimators import default_options, estimate
 from spherloc.problem import Problem
 from spherloc.trace import Trace
 from spherloc_viz import style
+from spherloc_viz.app.errand import Errand
 from spherloc_viz.app.svg import chart_svg
 from spherloc_viz.app.text import DIM, WORDS, box, status_html
 from spherloc_viz.app.touch import Touch, Touches
@@ -22,6 +24,7 @@ from spherloc_viz.layers.comparison import (
     FIRST,
     NO_VALUE,
     Entry,
+    coinciding,
     color_of,
     comparison_items,
     comparison_table,
@@ -31,6 +34,8 @@ from spherloc_viz.layers.comparison import (
 from spherloc_viz.layers.primitives import Chart, SceneItem, Table
 
 START, STOP = "Compare", "Cancel"
+LIVE_AFTER_S = 0.25
+"""A live comparison waits until the problem has stood still for this long."""
 TICKED = ("mc-exact", "mc", "ransac-2p", "ransac-epnp")
 """Estimators that are compared at first: exact, the paper's, two points, and a baseline."""
 MEASURED = ("rotation", "position", "inliers", "F1", "time")
@@ -78,8 +83,9 @@ class ComparePanel:
         self._trace: Trace | None = None
         self._done: Comparison | None = None
         self._shown: tuple[Comparison | None, bool] = (None, False)
-        self._stop: threading.Event | None = None
-        self._again = self._closed = False
+        self._stop = threading.Event()
+        self._closed = False
+        self._errand = Errand("spherloc-compare", self._complain)
         self._button.on_click(self._press)
         self._live.on_update(self._switch)
         touches.on("compare", self._tick)
@@ -95,7 +101,7 @@ class ComparePanel:
         with self._lock:
             before, self._trace = self._trace, trace
         if self._live.value and (before is None or not is_same(before.problem, trace.problem)):
-            self._start()
+            self._start(LIVE_AFTER_S)
         self._show()
 
     def items(self, trace: Trace) -> tuple[SceneItem, ...]:
@@ -105,18 +111,16 @@ class ComparePanel:
 
     def close(self) -> None:
         """End the comparison at hand; does not wait."""
-        with self._lock:
-            self._closed, self._again = True, False
-            if self._stop is not None:
-                self._stop.set()
+        self._closed = True
+        self._errand.close()
+        self._stop.set()
 
     def _press(self, event: viser.GuiEvent) -> None:
-        with self._lock:
-            if self._stop is not None:
-                self._again = False
-                self._stop.set()
-                return
-        self._start()
+        if self._button.label == STOP:
+            self._errand.forget()
+            self._stop.set()
+        else:
+            self._start()
 
     def _switch(self, event: viser.GuiEvent) -> None:
         if self._live.value:
@@ -127,67 +131,57 @@ class ComparePanel:
             with self._lock:
                 self._ticked ^= {touch.argument}
                 self._choice.content = self._chips()
-            self._switch(None)  # type: ignore[arg-type]
+            if self._live.value:
+                self._start()
 
     def _choose(self, touch: Touch) -> None:
         if touch.argument in self._names:
             self._use(touch.argument)
 
-    def _start(self) -> None:
-        """Compare; what is being compared gives way."""
-        with self._lock:
-            if self._closed:
-                return
-            if self._stop is not None:
-                self._again = True
-                self._stop.set()
-                return
-            self._stop = threading.Event()
-        threading.Thread(target=self._work, name="spherloc-compare", daemon=True).start()
+    def _start(self, after_s: float = 0.0) -> None:
+        """Compare after a while; what is being compared gives way."""
+        self._stop.set()
+        self._errand.ask(partial(self._work, after_s))
 
-    def _work(self) -> None:
+    def _work(self, after_s: float) -> None:
+        stop = self._stop = threading.Event()
+        if stop.wait(after_s) or self._closed:
+            return
         self._button.label, self._bar.visible = STOP, True
-        while True:
-            stop, sentence = self._stop, ""
-            assert stop is not None
-            try:
-                sentence = self._compare(stop)
-            except SpherlocError as error:
-                sentence = str(error)
-            with self._lock:
-                self._stop = threading.Event() if self._again else None
-                if not self._again:
-                    break
-                self._again = False
-        self._status.content, self._status.visible = status_html(sentence, wrong=True), bool(sentence)
-        self._button.label, self._bar.visible = START, False
+        try:
+            self._compare(stop)
+        finally:
+            self._button.label, self._bar.visible, self._status.visible = START, False, False
 
-    def _compare(self, stop: threading.Event) -> str:
-        """Run all and diagnose all, showing each as it comes; a sentence if that was in vain."""
+    def _compare(self, stop: threading.Event) -> None:
+        """Run all and diagnose all, showing each as it comes. Raises ``InputError`` if there is nothing to compare."""
         with self._lock:
             trace, names = self._trace, [name for name in self._names if name in self._ticked]
         if trace is None:
-            return "There is no run to compare with yet; wait for the first picture."
+            raise InputError("there is no run to compare with yet; wait for the first picture.")
         if not names:
-            return "No estimator is ticked; tick one or more."
+            raise InputError("no estimator is ticked; tick one or more.")
         entries: tuple[Entry, ...] = ()
         for place, name in enumerate(names):
             self._progress(place / len(names), f"{name}, {place + 1} of {len(names)} …")
-            if stop.is_set():
-                return ""
+            if stop.is_set() or self._closed:
+                return
             entries = (*entries, Entry(_run(trace, name)))
             self._publish(entries)
         for place, entry in enumerate(entries):
             self._progress(place / len(names), f"Diagnosing {entry.trace.estimator} …")
-            if stop.is_set():
-                return ""
+            if stop.is_set() or self._closed:
+                return
             entries = (*entries[:place], replace(entry, diagnosis=diagnose(entry.trace)), *entries[place + 1 :])
             self._publish(entries)
-        return ""
 
     def _progress(self, share: float, words: str) -> None:
         self._bar.value = 100.0 * share
         self._status.content, self._status.visible = status_html(words), True
+
+    def _complain(self, sentence: str) -> None:
+        self._status.content = status_html(sentence[:1].upper() + sentence[1:], wrong=True)
+        self._status.visible = True
 
     def _publish(self, entries: tuple[Entry, ...]) -> None:
         charts = (residual_chart(entries), yaw_chart(entries))
@@ -244,7 +238,7 @@ def comparison_html(entries: Sequence[Entry], charts: Sequence[Chart], fits: boo
     body = box(f'<table style="{style_css}"><tr><td></td>{head}</tr>{rows}</table>')
     body += "".join(
         f'<div style="padding:0 .8em .2em;font-size:12.5px;font-weight:600">{escape(chart.title)}</div>'
-        f"{box(chart_svg(chart))}"
+        + box(chart_svg(chart) + f'<div style="font-size:11.5px;{DIM}">{escape(coinciding(chart))}</div>')
         for chart in charts
     )
     body += box(f'<div style="{DIM}">{escape(NOTE)}</div>', "font-size:11.5px")

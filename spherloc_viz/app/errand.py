@@ -30,6 +30,11 @@ class Errand:
             self._busy = True
         threading.Thread(target=self._work, name=self._name, daemon=True).start()
 
+    def forget(self) -> None:
+        """Drop the job that waits, if any."""
+        with self._lock:
+            self._next = None
+
     def close(self) -> None:
         """Do nothing more after the job at hand; does not wait."""
         with self._lock:

@@ -7,6 +7,7 @@ from typing import Any
 import viser
 
 from spherloc import registry
+from spherloc.errors import InputError, show
 from spherloc.estimators import default_options, options_type
 from spherloc.problem import Problem
 from spherloc_viz.options import NONE, OptionField, option_fields
@@ -77,6 +78,19 @@ class Option:
             return self._values[value]
         return self.field.parse(value or NONE) if isinstance(value, str) else value
 
+    def write(self, value: Any) -> None:
+        """Show a value; a dropdown or a slider is widened for one that it does not offer."""
+        if self._values is not None:
+            if value not in self._values.values():
+                self._values = {_typed(value): value, **self._values}
+                self.widget.options = tuple(self._values)
+            value = _name(self._values, value)
+        elif isinstance(self.widget, viser.GuiSliderHandle):
+            self.widget.min, self.widget.max = min(self.widget.min, value), max(self.widget.max, value)
+        elif isinstance(self.widget.value, str):
+            value = _typed(value)
+        self.widget.value = value
+
 
 class EstimatorControls:
     """A choice of estimators, and the options of the chosen one."""
@@ -109,15 +123,32 @@ class EstimatorControls:
         Raises ``InputError`` for options that cannot be.
         """
         chosen = self._names[self._estimator.value]
-        for name, folder in self._folders.items():
-            folder.visible = name == chosen
+        self._show(chosen)
         values = {name: option.read() for name, option in self._options[chosen].items()}
         return chosen, options_type(chosen)(**values)
+
+    def write(self, name: str, options: Any) -> None:
+        """Choose an estimator and show its options.
+
+        Raises ``InputError`` if there is none of that name.
+        """
+        if name not in self._folders:
+            raise InputError(f"unknown estimator {show(name)}: choose one of {', '.join(self._folders)}.")
+        for key, option in self._options[name].items():
+            option.write(getattr(options, key))
+        self._estimator.value = _name(self._names, name)
+        self._show(name)
+
+    def _show(self, chosen: str) -> None:
+        """Show the options of that estimator only."""
+        for name, folder in self._folders.items():
+            if folder.visible != (name == chosen):
+                folder.visible = name == chosen
 
     def follow_problem(self, problem: Problem) -> None:
         """Set every estimator's pixel bound to what the problem states, or to the estimator's default."""
         for name, options in self._options.items():
-            options["bound_px"].widget.value = default_options(name, problem).bound_px
+            options["bound_px"].write(default_options(name, problem).bound_px)
 
 
 def estimator_labels(names: tuple[str, ...]) -> dict[str, str]:
@@ -132,7 +163,10 @@ def _name(values: Mapping[str, Any], wanted: Any) -> str:
 
 
 def _typed(value: Any) -> str:
-    return NONE if value is None else f"{value:g}"
+    """A number as it is typed, with all its digits."""
+    if value is None or isinstance(value, str):
+        return NONE if value is None else value
+    return f"{value:g}" if float(f"{value:g}") == value else repr(value)
 
 
 def _range(field: OptionField) -> str:

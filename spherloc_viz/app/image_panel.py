@@ -38,6 +38,7 @@ class ImagePanel:
         self._wanted: int | None = None
         self._followed: tuple = ()
         self._shown: Overlay | None = None
+        self._drawn: tuple[Trace, tuple] | None = None
         touches.on("image-pick", self._pick)
         touches.on("image-reference", self._want)
 
@@ -48,6 +49,10 @@ class ImagePanel:
         if followed != self._followed:
             self._followed, self._wanted = followed, None
         colors = _colors(picture, len(problem))
+        drawn = (selected, self._wanted, colors.tobytes(), kept.tobytes())
+        if self._drawn is not None and self._drawn[0] is trace and self._drawn[1] == drawn:
+            return
+        self._drawn = (trace, drawn)
         view = match_view(problem, colors, trace.inlier_mask, selected, self._wanted)
         paths = [problem.image] + ([] if view.reference is None else [problem.reference_images[view.reference]])
         places, height = drawing.arrange([(problem.camera.width, problem.camera.height), *_sizes(problem, view)])

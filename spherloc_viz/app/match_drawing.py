@@ -9,7 +9,7 @@ from html import escape
 
 import numpy as np
 
-from spherloc.cameras.base import FloatArray
+from spherloc.cameras.base import BoolArray, FloatArray
 from spherloc.problem import IntArray
 from spherloc_viz import style
 from spherloc_viz.app import shapes
@@ -21,7 +21,10 @@ WIDTH, GAP = 1000.0, 14.0
 WIDE = 2.6
 """Up to this sum of widths over heights, two images stand side by side."""
 MOST_DOTS = 600
-DOT_PX, LINE_PX, RING = 5.5, 1.2, 20.0
+LINE_PX, RING = 1.2, 20.0
+DOT_PX = ((500, 3.0), (200, 4.0), (0, 5.5))
+"""From this many dots on: their width."""
+MOST_LABELS = 8
 NAMES = ("query", "reference")
 
 
@@ -89,16 +92,20 @@ def frame_html(places: Sequence[Place], height: float, photos: Sequence[bool], p
     )
 
 
-def thinned(own: IntArray, first: IntArray) -> IntArray:
-    """At most ``MOST_DOTS`` of the matches: ``first``, and of the others an even sample."""
-    rest = own[~np.isin(own, first)]
-    first = even(first, MOST_DOTS)
-    return np.concatenate([even(rest, MOST_DOTS - len(first)), first]) if len(rest) else first
+def thinned(own: IntArray, inlier: BoolArray, chosen: IntArray) -> IntArray:
+    """About ``MOST_DOTS`` of the matches ``own``, inliers last: an even sample of the inliers among all (N,), half if
+    others fill the rest, one of the others, and all that are ``chosen``."""
+    if len(own) <= MOST_DOTS:
+        return np.concatenate([own[~inlier[own]], own[inlier[own]]])
+    inliers, others = own[inlier[own]], own[~inlier[own]]
+    take = min(len(inliers), max(MOST_DOTS // 2, MOST_DOTS - len(others)))
+    return np.concatenate([even(others, MOST_DOTS - take), np.union1d(even(inliers, take), chosen)])
 
 
 def dots(places: FloatArray, colors: ColorArray) -> list[str]:
     """Dots (N, 2), one path a colour; the last colours lie on top."""
-    look = f'fill="none" stroke-linecap="round" stroke-width="{DOT_PX}" vector-effect="non-scaling-stroke"'
+    width_px = next(width for least, width in DOT_PX if len(places) >= least)
+    look = f'fill="none" stroke-linecap="round" stroke-width="{width_px}" vector-effect="non-scaling-stroke"'
     parts = []
     for color, own in _by_color(places, colors):
         flat = own.ravel().tolist()
@@ -134,13 +141,23 @@ def crosses(places: FloatArray, color: style.RGB, size: float, width_px: float) 
 
 
 def rings(places: FloatArray, numbers: Sequence[int]) -> list[str]:
-    """A ring around each place (N, 2) of a selected match, with its number as a tooltip; it can be pressed."""
+    """A ring around each place (N, 2) of a selected match and, unless they are many, its number beside it."""
     parts = []
+    color = style.css(style.SELECTED)
     for (x, y), number in zip(places.tolist(), numbers, strict=True):
-        if np.isfinite(x) and np.isfinite(y):
-            for color, width_px in (("#ffffff", 4.5), (style.css(style.SELECTED), 2.5)):
-                look = f'fill="none" stroke="{color}" stroke-width="{width_px}" vector-effect="non-scaling-stroke"'
-                parts.append(shapes.dot(x, y, RING, look, shapes.tooltip(f"match {number}")))
+        if not (np.isfinite(x) and np.isfinite(y)):
+            continue
+        for paint, width_px in (("#ffffff", 4.5), (color, 2.5)):
+            look = f'fill="none" stroke="{paint}" stroke-width="{width_px}" vector-effect="non-scaling-stroke"'
+            parts.append(shapes.dot(x, y, RING, look))
+        if len(numbers) <= MOST_LABELS:
+            # Beside the ring, on the side where there is more room, and within the drawing.
+            left = x > 0.5 * WIDTH
+            parts.append(
+                f'<text x="{x + (-1.4 if left else 1.4) * RING:.0f}" y="{max(y + 11.0, 30.0):.0f}" font-size="32" '
+                f'text-anchor="{"end" if left else "start"}" font-weight="600" fill="{color}" stroke="#ffffff" '
+                f'stroke-width="5" paint-order="stroke">{number}</text>'
+            )
     return parts
 
 
@@ -148,7 +165,7 @@ def _by_color(rows: FloatArray, colors: ColorArray) -> list[tuple[str, FloatArra
     """Rows without gaps in their numbers, by colour, the most frequent colours first."""
     known = np.isfinite(rows).all(axis=1)
     rows, colors = rows[known], colors[known]
-    kinds, kind, counts = np.unique(colors, axis=0, return_inverse=True, return_counts=True)
+    packed = colors.astype(np.int64) @ [1 << 16, 1 << 8, 1]
+    kinds, counts = np.unique(packed, return_counts=True)
     order = np.argsort(-counts, kind="stable")
-    shades = [style.css(tuple(color)) for color in kinds.tolist()]
-    return [(shades[k], rows[kind.ravel() == k]) for k in order]
+    return [(f"#{color:06x}", rows[packed == color]) for color in kinds[order].tolist()]

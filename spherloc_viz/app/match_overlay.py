@@ -1,13 +1,14 @@
 """What is drawn above the images of a problem, and what a press there means."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spherloc.cameras.base import FloatArray
+from spherloc.cameras.base import Camera, FloatArray
 from spherloc.geometry import transform
-from spherloc.problem import IntArray, Problem
+from spherloc.problem import IntArray
 from spherloc.trace import Trace
 from spherloc_viz import style
 from spherloc_viz.app import match_drawing as drawing
@@ -16,6 +17,7 @@ from spherloc_viz.layers.frame import even, one_color
 from spherloc_viz.layers.match_view import MatchView, inlier_colored, valid_outlines
 from spherloc_viz.layers.primitives import ColorArray
 
+MOST_RINGS = 100
 REACH = 32.0
 """How near to a match a press on an image must be, in units of the drawing: about 12 px."""
 
@@ -64,24 +66,26 @@ def overlay(
     problem, own = trace.problem, view.own
     inlier = inlier_colored(colors)
     chosen = np.intersect1d(np.array(selected, dtype=np.int64), own)
-    drawn = drawing.thinned(own, np.union1d(own[inlier[own]], chosen))
+    drawn = drawing.thinned(own, inlier, even(chosen, MOST_RINGS))
     ends = [places[0].at(problem.pixels)]
     if len(places) > 1 and problem.reference_pixels is not None:
         ends.append(places[1].at(problem.reference_pixels))
-    parts: list[str] = [] if photo else _outlines(problem, places[0])
+    parts: list[str] = [] if photo else [*_outlines(problem.camera, places[0])]
     if len(ends) > 1:
         parts += drawing.lines(ends[0][view.lines], ends[1][view.lines], colors[view.lines], drawing.LINE_PX, 0.7)
     predicted, caption = _predicted(trace, places[0], ends[0]), view.caption
     if not photo and predicted is not None and inlier.any():
         some = even(drawn, style.MAX_DRAWN_MATCHES)
         parts += drawing.lines(ends[0][some], predicted[some], colors[some], 1.0, 0.45)
-        parts += drawing.crosses(predicted[inlier], style.ESTIMATE, 9.0, 1.3)
+        parts += drawing.crosses(predicted[drawn[inlier[drawn]]], style.ESTIMATE, 9.0, 1.3)
         caption += " Lines lead to where the estimated pose puts the points; crosses mark that for inliers."
         if len(some) < len(drawn):
             caption += f" {len(some)} of {len(drawn)} lines are drawn."
     for end in ends:
         parts += drawing.dots(end[drawn], colors[drawn])
-    parts += _selected_parts(chosen, ends, predicted, kept)
+    parts += _selected_parts(even(chosen, MOST_RINGS), ends, predicted, kept)
+    if len(chosen) > MOST_RINGS:
+        caption += f" {MOST_RINGS} of {len(chosen):,} selected matches have rings."
     if len(drawn) < len(own):
         caption += f" {len(drawn)} of {len(own):,} dots are drawn; every match can be pressed."
     return Overlay(places, parts, caption, [end[own] for end in ends], kept[own])
@@ -113,10 +117,11 @@ def _predicted(trace: Trace, place: Place, query: FloatArray) -> FloatArray | No
     return found
 
 
-def _outlines(problem: Problem, place: Place) -> list[str]:
+@lru_cache(maxsize=16)
+def _outlines(camera: Camera, place: Place) -> list[str]:
     """The border of what the camera sees."""
     parts = []
-    for outline in valid_outlines(problem.camera):
+    for outline in valid_outlines(camera):
         flat = place.at(outline).ravel().tolist()
         data = "M" + ("%.0f %.0fL" * (len(flat) // 2) % tuple(flat))[:-1] + "Z"
         parts.append(f'<path d="{data}" fill="none" stroke="currentColor" opacity=".45" stroke-width="2"/>')

@@ -56,9 +56,9 @@ class OpenPanel:
         self._files: dict[str, File] = {}
         self._bundled: list[Row] = []
         self._status = gui.add_html("", visible=False)
-        self._list = gui.add_html("")
         with gui.add_folder("Upload matches", expand_by_default=False):
             self._build_form(gui)
+        self._list = gui.add_html("")
         # Larger files are turned away before they fill this process's memory.
         limit_uploads(client, MOST_BYTES, self._complain)
         touches.on("open-scene", lambda touch: self._errand.ask(lambda: self._open(touch.argument)))
@@ -77,7 +77,8 @@ class OpenPanel:
 
     def _build_form(self, gui: viser.GuiApi) -> None:
         about = (
-            "A CSV whose first line names u, v (px), X, Y, Z (m) and maybe inlier (0 or 1). It stays on this machine."
+            "A CSV whose first line names u, v (px), X, Y, Z (m) and maybe inlier (0 or 1). "
+            "Only this page has it, and it is removed when the page is closed."
         )
         gui.add_html(box(f'<div style="{DIM}">{escape(about)}</div>', "font-size:12px"))
         matches = gui.add_upload_button("Matches (CSV)", mime_type=".csv,text/csv,text/plain")
@@ -182,5 +183,6 @@ class OpenPanel:
         self._status.content, self._status.visible = status_html(words), bool(words)
 
     def _complain(self, sentence: str) -> None:
-        sentence = sentence[:1].upper() + sentence[1:]
+        if sentence.partition(" ")[0].isalpha():  # file names stay as they are
+            sentence = sentence[:1].upper() + sentence[1:]
         self._status.content, self._status.visible = status_html(sentence, wrong=True), True

@@ -1,6 +1,6 @@
 """Draws a picture's primitives into one client's canvas, changing what is there rather than drawing anew."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Hashable, Iterable
 from functools import cache, partial
 from typing import Any, Literal
 
@@ -12,7 +12,7 @@ import viser.transforms as vtf
 from spherloc_viz.app.colors import light_bytes, surface_bytes
 from spherloc_viz.app.picking import inside, nearest, viewer_of
 from spherloc_viz.app.texture import textured_glb
-from spherloc_viz.layers.primitives import Balls, ColorArray, Label, Mesh, Points, SceneItem, Segments, Textured
+from spherloc_viz.layers.primitives import Balls, Label, Mesh, Points, SceneItem, Segments, Textured
 
 OnPick = Callable[[tuple[int, ...], bool], None]
 """Gets the correspondences (numbers in the problem) that were picked, and whether they extend the selection."""
@@ -34,8 +34,8 @@ class Painter:
     def __init__(self, client: viser.ClientHandle, on_pick: OnPick = lambda ids, extend: None) -> None:
         """``on_pick`` is called on viser's threads; a click on nothing picks ()."""
         self._client, self._on_pick = client, on_pick
-        self._drawn: dict[str, tuple[Any, tuple, str]] = {}
-        self._pictures: dict[str, ColorArray] = {}
+        self._drawn: dict[str, tuple[Any, tuple, SceneItem]] = {}
+        self._textured: dict[str, tuple[Hashable, bytes | None]] = {}
         self._shown: tuple[SceneItem, ...] = ()
         self._backdrop: tuple[bytes, Any] | None = None
         scene, extend = client.scene, partial(self._clicked, extend=True)
@@ -51,14 +51,16 @@ class Painter:
             for item in items:
                 if item.layer in layers:
                     shown.append(item)
-                elif isinstance(item, Textured):
+                if isinstance(item, Textured) and (item.layer not in layers or self._glb(item) is None):
                     continue
-                look = self._look(item)
-                for part in _parts(item, look):
+                look = _look(item)
+                for part in _parts(item):
                     self._put(part, look)
                     names.add(part.name)
-            for name, (handle, _, layer) in self._drawn.items():
-                handle.visible = name in names and layer in layers
+            for name, (handle, _, item) in self._drawn.items():
+                visible = name in names and item.layer in layers
+                if handle.visible != visible:
+                    handle.visible = visible
         self._shown = tuple(shown)
 
     def draw_backdrop(self, glb: bytes | None, aligned_from_map: np.ndarray, visible: bool) -> None:
@@ -79,40 +81,22 @@ class Painter:
         handle.visible = visible
 
     def _put(self, item: SceneItem, look: tuple) -> None:
-        handle, known, _ = self._drawn.get(item.name, (None, None, ""))
+        handle, known, last = self._drawn.get(item.name, (None, None, None))
         if handle is None or known != look:
-            handle = _add(self._client.scene, item, self._pictures.get(item.name))
-        else:
+            handle = _add(self._client.scene, item, self._glb(item) if isinstance(item, Textured) else None)
+        elif not _same(item, last):
             for name, value in _changing(item).items():
                 setattr(handle, name, value)
-        self._drawn[item.name] = (handle, look, item.layer)
+        self._drawn[item.name] = (handle, look, item)
 
-    def _look(self, item: SceneItem) -> tuple:
-        """What cannot change without adding the node anew: its kind, its size, and what viser sets once."""
-        extra: tuple = ()
-        match item:
-            case Points():
-                extra = (item.rim,)
-            case Mesh():
-                extra = (len(item.vertices), item.color, item.opacity)
-            case Balls():
-                extra = (item.opacity,)
-            case Segments():
-                extra = (item.width_px,)
-            case Label():
-                extra = (item.height_m is None,)
-            case Textured():
-                extra = (id(self._picture(item)), item.vertices.tobytes(), item.uv.tobytes())
-        return (type(item), _size(item), *extra)
-
-    def _picture(self, item: Textured) -> ColorArray | None:
-        """The item's picture: the very array that was drawn before if it shows the same."""
-        image, known = item.image(), self._pictures.get(item.name)
-        if image is None:
-            return None
-        if known is None or not (known is image or np.array_equal(known, image)):
-            self._pictures[item.name] = image
-        return self._pictures[item.name]
+    def _glb(self, item: Textured) -> bytes | None:
+        """The item as a binary glTF; None if it has no picture."""
+        known = self._textured.get(item.name)
+        if known is None or known[0] != item.key:
+            image = item.image()
+            glb = None if image is None else textured_glb(item.vertices, item.faces, item.uv, image)
+            self._textured[item.name] = known = (item.key, glb)
+        return known[1]
 
     def _clicked(self, event: viser.SceneClickEvent, extend: bool) -> None:
         viewer = viewer_of(event.client.camera)
@@ -123,14 +107,14 @@ class Painter:
         self._on_pick(inside(self._shown, viewer_of(event.client.camera), event.screen_min, event.screen_max), False)
 
 
-def _parts(item: SceneItem, look: tuple) -> list[SceneItem]:
+def _parts(item: SceneItem) -> list[SceneItem]:
     """The item as nodes that are drawn one after another; none if there is nothing to draw.
 
     Balls within balls: a translucent surface hides what is drawn after it and lies behind. Within a node viser draws
     by distance of the centres, which says nothing about balls around one spot; but nodes are drawn in the order in
     which they were added. So balls are drawn in shells, the smallest first.
     """
-    if not _size(item) or (isinstance(item, Textured) and look[2] == id(None)):
+    if not _size(item):
         return []
     if not isinstance(item, Balls):
         return [item]
@@ -154,6 +138,42 @@ def _size(item: SceneItem) -> int:
             return len(item.faces)
         case Label():
             return int(item.text != "")
+
+
+def _look(item: SceneItem) -> tuple:
+    """What cannot change without adding the node anew: its kind, its size, and what viser sets once."""
+    extra: tuple = ()
+    match item:
+        case Points():
+            extra = (item.rim,)
+        case Mesh():
+            extra = (len(item.vertices), item.color, item.opacity)
+        case Balls():
+            extra = (item.opacity,)
+        case Segments():
+            extra = (item.width_px,)
+        case Label():
+            extra = (item.height_m is None,)
+        case Textured():
+            extra = (item.key,)
+    return (type(item), _size(item), *extra)
+
+
+def _same(item: SceneItem, other: SceneItem | None) -> bool:
+    """Whether a node that shows the one shows the other; viser compares too, but slowly."""
+    seen, known = vars(item), vars(other)
+    return all(seen[name] is known[name] or np.array_equal(seen[name], known[name]) for name in _SHOWN[type(item)])
+
+
+_SHOWN: dict[type[SceneItem], tuple[str, ...]] = {
+    Points: ("positions", "colors", "radius_m"),
+    Segments: ("points", "colors"),
+    Balls: ("centers", "radii_m", "colors"),
+    Mesh: ("vertices", "faces"),
+    Textured: ("map_from_mesh",),
+    Label: ("position", "text", "height_m"),
+}
+"""Fields that a node follows."""
 
 
 def _changing(item: SceneItem) -> dict[str, Any]:
@@ -194,7 +214,7 @@ def _unit_ball(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(mesh.vertices), np.asarray(mesh.faces)
 
 
-def _add(scene: viser.SceneApi, item: SceneItem, picture: ColorArray | None) -> Any:
+def _add(scene: viser.SceneApi, item: SceneItem, glb: bytes | None) -> Any:
     name, props = f"/{item.name}", _changing(item)
     match item:
         case Points() if "points" in props:
@@ -216,8 +236,7 @@ def _add(scene: viser.SceneApi, item: SceneItem, picture: ColorArray | None) -> 
                 **props,
             )
         case Textured():
-            assert picture is not None
-            glb = textured_glb(item.vertices, item.faces, item.uv, picture)
+            assert glb is not None
             return scene.add_glb(name, glb, cast_shadow=False, receive_shadow=False, **props)
         case Label():
             mode = "screen" if item.height_m is None else "scene"

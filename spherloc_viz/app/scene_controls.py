@@ -1,108 +1,154 @@
 """The widgets that choose a scene and change it."""
 
 from collections.abc import Callable
+from typing import Any
 
 import viser
 
+from spherloc.datasets.map_scene import MapScene
+from spherloc.datasets.synthetic import TrueCamera
 from spherloc.datasets.variation import Variation
 from spherloc.errors import InputError
 from spherloc_viz.app.catalog import Catalog, SceneWish
+from spherloc_viz.app.simulation_controls import SimulationControls
+from spherloc_viz.app.text import box
 
-OWN_CAMERA = "the scene's own"
-MOST_POINTS, MOST_NOISE_PX, MOST_OUTLIERS, MOST_GRAVITY_DEG = 500, 10.0, 99.0, 2.0
+LISTED_QUERIES = 50
+"""A page with thousands of entries in a dropdown is slow; of more, those that fit a filter are listed."""
+
+Changed = Callable[[Any], None]
 
 
 class SceneControls:
-    """Scene, query image, camera, number of points, noise, outliers, gravity error and seed."""
+    """Scene, query image, what is changed about a simulation, and seed. Changes to single matches are kept elsewhere.
 
-    def __init__(self, gui: viser.GuiApi, catalog: Catalog, changed: Callable[[object], None]) -> None:
-        self._catalog = catalog
-        self._scene = gui.add_dropdown("Scene", tuple(catalog.scenes))
-        queries: list[str] = ["-"]
-        self._query = gui.add_dropdown("Query", queries, visible=False, hint="The image to localize in the map.")
-        self._camera = gui.add_dropdown(
-            "Camera", (OWN_CAMERA, *catalog.cameras), hint="Sees the same simulation through another lens."
-        )
-        self._points = gui.add_slider("Points", 10, MOST_POINTS, 1, 100, hint="Correspondences, N.")
-        self._noise = gui.add_slider("Noise (px)", 0.0, MOST_NOISE_PX, 0.1, 1.0, hint="Standard deviation of a pixel.")
-        self._outliers = gui.add_slider("Outliers (%)", 0.0, MOST_OUTLIERS, 1.0, 80.0, hint="Share of wrong matches.")
-        self._gravity = gui.add_slider(
-            "Gravity error (deg)",
-            0.0,
-            MOST_GRAVITY_DEG,
-            0.05,
-            0.0,
-            hint="Standard deviation of the error of the known roll and pitch; the problem states it.",
-        )
-        self._seed = gui.add_text("Seed", "0", hint="Of the simulation and of the estimator's random draws.")
-        self._simulated = (self._camera, self._points, self._noise, self._outliers, self._gravity)
+    Everything can be read and written as a ``SceneWish``. ``changed`` is called with viser's event.
+    """
+
+    def __init__(self, gui: viser.GuiApi, catalog: Catalog, changed: Changed) -> None:
+        self._catalog, self._changed = catalog, changed
         self._followed = ""
-        for widget in self.widgets:
+        self._scene = gui.add_dropdown("Scene", tuple(catalog.scenes))
+        self._find = gui.add_text("Find query", "", visible=False, hint="Part of the name of a query image.")
+        self._found = gui.add_html("", visible=False)
+        nothing: list[str] = ["-"]
+        self._query = gui.add_dropdown("Query", nothing, visible=False, hint="The image to localize in the map.")
+        self._simulation = SimulationControls(gui, catalog.cameras, changed)
+        self._seed = gui.add_text("Seed", "0", hint="Of the simulation and of the estimator's random draws.")
+        self._find.on_update(self._filter)
+        for widget in (self._scene, self._query, self._seed):
             widget.on_update(changed)
+        self.reset.on_click(self._reset)
 
     @property
     def widgets(self) -> tuple:
-        """All of them."""
-        return (self._scene, self._query, *self._simulated, self._seed)
+        """All that hold a value."""
+        return (self._scene, self._query, self._find, *self._simulation.widgets, self._seed)
+
+    @property
+    def reset(self) -> viser.GuiButtonHandle:
+        """The button that sets everything to what the scene says."""
+        return self._simulation.reset
 
     def follow_scene(self) -> bool:
         """If another scene was chosen, set the other widgets to what it says, and tell so."""
         label = self._scene.value
         if label == self._followed:
             return False
-        self._followed = label
-        scene = self._catalog.synthetic(label)
-        for widget in self._simulated:
-            widget.visible = scene is not None
-        images = self._catalog.map_scene(label)
-        self._query.visible = images is not None
-        if images is not None:
-            self._query.options = tuple(view.name for view in images.queries)
-            self._query.value = self._query.options[0]
-        if scene is None:
-            return True
-        self._camera.value = OWN_CAMERA
-        self._points.min, self._points.max = min(10, scene.correspondences), max(MOST_POINTS, scene.correspondences)
-        self._points.value = scene.correspondences
-        self._noise.max = max(MOST_NOISE_PX, scene.noise_px)
-        self._noise.value = float(scene.noise_px)
-        percent = round(100.0 * scene.outlier_rate, 6)
-        self._outliers.max = max(MOST_OUTLIERS, percent)
-        self._outliers.value = percent
-        self._gravity.max = max(MOST_GRAVITY_DEG, scene.gravity_error_deg)
-        self._gravity.value = float(scene.gravity_error_deg)
-        self._seed.value = str(scene.seed)
+        self.write(SceneWish(label, getattr(self._catalog.scenes[label], "seed", self._read_seed(0))))
         return True
 
     def read(self) -> SceneWish:
-        """What the widgets say now.
+        """What the widgets say now, with all matches as they are.
 
         Raises ``InputError`` if the seed is no seed.
         """
         label, seed = self._scene.value, self._read_seed()
         if self._catalog.map_scene(label) is not None:
             return SceneWish(label, seed, self._query.value)
-        if self._catalog.synthetic(label) is None:
-            return SceneWish(label, seed)
-        changes = {
-            "correspondences": int(self._points.value),
-            "noise_px": float(self._noise.value),
-            "outlier_rate": round(self._outliers.value / 100.0, 8),
-            "gravity_error_deg": float(self._gravity.value),
-        }
-        scene = self._catalog.synthetic(label)
-        changed: dict = {name: value for name, value in changes.items() if value != getattr(scene, name)}
-        return SceneWish(label, seed, None, Variation(camera=self._catalog.cameras.get(self._camera.value), **changed))
+        return SceneWish(label, seed, None, self._variation(label))
+
+    def write(self, wish: SceneWish) -> bool:
+        """Set the widgets to what a wish says but for changes to single matches; tells whether the scene is another.
+
+        Raises ``InputError`` if the catalog does not have the scene, or the scene not the query.
+        """
+        if wish.scene not in self._catalog.scenes:
+            raise InputError(f"the scene '{wish.scene}' is not open on this page; open it first.")
+        another = wish.scene != self._followed
+        self._followed = wish.scene
+        self.list_scenes()
+        self._scene.value = wish.scene
+        images = self._catalog.map_scene(wish.scene)
+        if images is not None:
+            self._write_query(images, wish.query)
+        self._query.visible = images is not None
+        many = images is not None and len(images.queries) > LISTED_QUERIES
+        self._find.visible = self._found.visible = many
+        self._simulation.write(self._catalog.synthetic(wish.scene), wish.variation)
+        self._seed.value = str(wish.seed)
+        return another
+
+    def list_scenes(self) -> None:
+        """Offer what the catalog has now."""
+        labels = tuple(self._catalog.scenes)
+        if labels != tuple(self._scene.options):
+            self._scene.options = labels
+
+    @property
+    def true_camera(self) -> TrueCamera | None:
+        """Where the true camera was moved to: yaw (deg) and position (m) in the map frame; None if it was not."""
+        return self._simulation.true_camera
+
+    @true_camera.setter
+    def true_camera(self, placed: TrueCamera | None) -> None:
+        self._simulation.true_camera = placed
 
     def next_seed(self) -> None:
         """The next seed; 0 after what is no seed."""
-        try:
-            self._seed.value = str((self._read_seed() + 1) % 2**63)
-        except InputError:
-            self._seed.value = "0"
+        self._seed.value = str((self._read_seed(-1) + 1) % 2**63)
 
-    def _read_seed(self) -> int:
+    def _variation(self, label: str) -> Variation:
+        scene = self._catalog.synthetic(label)
+        # A scene that was just chosen is still shown with the numbers of the one before.
+        return Variation() if scene is None or label != self._followed else self._simulation.read(scene)
+
+    def _write_query(self, images: MapScene, query: str | None) -> None:
+        name = images.query(query).name
+        self._find.value = ""
+        self._list_queries(images, name)
+        self._query.value = name
+
+    def _list_queries(self, images: MapScene, chosen: str) -> None:
+        """Offer the queries that fit the filter, and the chosen one."""
+        wanted = self._find.value.strip().lower()
+        names = [view.name for view in images.queries if wanted in view.name.lower()]
+        listed = names[:LISTED_QUERIES]
+        if chosen not in listed:
+            listed = [chosen, *listed]
+        if tuple(listed) != tuple(self._query.options):
+            self._query.options = tuple(listed)
+        self._found.content = box(
+            f"{min(len(names), LISTED_QUERIES):,} of {len(images.queries):,} queries are listed"
+            + (f"; {len(names):,} fit." if wanted else "; type part of a name to find others."),
+            "font-size:12px;opacity:.65",
+        )
+
+    def _filter(self, event: Any) -> None:
+        images = self._catalog.map_scene(self._scene.value)
+        if images is not None and event.client is not None:
+            self._list_queries(images, self._query.value)
+
+    def _reset(self, event: Any) -> None:
+        label = self._scene.value
+        query = None if self._catalog.map_scene(label) is None else self._query.value
+        self.write(SceneWish(label, getattr(self._catalog.scenes[label], "seed", 0), query))
+        self._changed(event)
+
+    def _read_seed(self, otherwise: int | None = None) -> int:
         text = self._seed.value.strip()
-        if not (text.isascii() and text.isdigit() and len(text) <= 19 and int(text) < 2**63):
-            raise InputError(f"the seed '{text[:30]}' is no whole number from 0 to 2^63 - 1; type one.")
-        return int(text)
+        if text.isascii() and text.isdigit() and len(text) <= 19 and int(text) < 2**63:
+            return int(text)
+        if otherwise is not None:
+            return otherwise
+        raise InputError(f"the seed '{text[:30]}' is no whole number from 0 to 2^63 - 1; type one.")

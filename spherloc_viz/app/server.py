@@ -8,51 +8,62 @@ import signal
 import socket
 import sys
 import threading
+from collections.abc import Sequence
 from pathlib import Path
 
 import viser
 
-from spherloc.errors import RecordingError
+from spherloc.datasets import bundled_scenes
+from spherloc.errors import InputError, RecordingError
 from spherloc.estimators import warm_up
 from spherloc_viz.app import views
 from spherloc_viz.app.catalog import Catalog
 from spherloc_viz.app.front_door import FrontDoor, open_socket
+from spherloc_viz.app.services import Services
 from spherloc_viz.app.session import Session
-from spherloc_viz.app.touch import TouchDesk
-from spherloc_viz.app.viser_seams import start_viser, stop_viser
+from spherloc_viz.app.viser_seams import set_theme, start_viser, stop_viser
 from spherloc_viz.recording.background import Recorder
 
 
-def serve(scene: Path | None, host: str, port: int, recordings: Path, record: bool = True) -> None:
+def serve(
+    scene: Path | None, host: str, port: int, recordings: Path, record: bool = True, allow: Sequence[Path] = ()
+) -> None:
     """Run the playground until Ctrl-C or a termination signal.
 
     ``scene`` is offered first, before those that come with the project; port 0 takes any free port. Runs that a
-    page settles on are recorded into ``recordings`` unless ``record`` is false. Raises ``InputError`` if the
-    scene cannot be used or the port cannot be had.
+    page settles on are recorded into ``recordings`` unless ``record`` is false. Pages may open scenes from the folder
+    of ``scene``, from that of the bundled ones and from ``allow``. Raises ``InputError`` if the scene or one of these
+    folders cannot be used or the port cannot be had.
     """
     catalog = Catalog(scene)
     with open_socket(host, port) as listener, contextlib.ExitStack() as stack:
         warm_up(lambda sentence: print(f"spherloc: {sentence}", file=sys.stderr, flush=True))
-        sessions = Sessions(catalog)
+        services = Services(catalog, allowed_roots(scene, allow))
+        sessions = Sessions(services)
         if record:
-            sessions.recorder = stack.enter_context(Recorder(recordings, on_error=sessions.report))
+            services.recorder = stack.enter_context(Recorder(recordings, on_error=sessions.report))
         key = secrets.token_urlsafe(32)
         server = start_viser(key)
         stack.callback(stop_viser, server)
         stack.callback(sessions.close)
         sessions.attend(server)
-        asyncio.run(_serve_until_told(FrontDoor(host, server.get_port(), key, sessions.desk), listener))
+        asyncio.run(_serve_until_told(FrontDoor(host, server.get_port(), key, services.desk), listener))
+
+
+def allowed_roots(scene: Path | None, allow: Sequence[Path]) -> tuple[Path, ...]:
+    """Folders from which pages may open scenes; raises ``InputError`` for one that is no folder."""
+    for folder in allow:
+        if not folder.is_dir():
+            raise InputError(f"{folder}: is no folder; give --allow one that exists.")
+    bundled = {path.parent for path in bundled_scenes().values()}
+    return (*allow, *(() if scene is None else (scene.parent,)), *sorted(bundled))
 
 
 class Sessions:
     """The sessions of all connected clients."""
 
-    def __init__(self, catalog: Catalog) -> None:
-        self._catalog = catalog
-        self.recorder: Recorder | None = None
-        """Where settled runs go; None if they are not recorded."""
-        self.desk = TouchDesk()
-        """Where presses on the pages arrive."""
+    def __init__(self, services: Services) -> None:
+        self._services = services
         self._open: dict[int, Session] = {}
         self._lock = threading.Lock()
 
@@ -62,7 +73,7 @@ class Sessions:
         # A page that opens with another up would turn over after its first view is set.
         server.initial_camera.up = tuple(views.UP)
         server.initial_camera.position = views.START
-        server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
+        set_theme(server.gui, "dark")
         server.on_client_connect(lambda client: self._welcome(server, client))
         server.on_client_disconnect(lambda client: self._dismiss(client.client_id))
 
@@ -79,7 +90,7 @@ class Sessions:
             self._dismiss(number)
 
     def _welcome(self, server: viser.ViserServer, client: viser.ClientHandle) -> None:
-        session = Session(client, self._catalog, self.recorder)
+        session = Session(client, self._services)
         with self._lock:
             self._open[client.client_id] = session
         session.start()

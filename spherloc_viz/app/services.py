@@ -1,6 +1,7 @@
 """What all pages of one server share."""
 
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from spherloc_viz.app.catalog import Catalog
 from spherloc_viz.app.touch import TouchDesk
@@ -12,6 +13,8 @@ class Services:
     """Made before the first page connects."""
 
     catalog: Catalog
+    roots: tuple[Path, ...] = ()
+    """Folders that pages may open scenes from."""
     recorder: Recorder | None = None
     """Where settled runs go; None if they are not recorded."""
     desk: TouchDesk = field(default_factory=TouchDesk)

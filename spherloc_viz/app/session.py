@@ -1,195 +1,243 @@
 """One browser client: its own widgets, canvas, run and threads."""
 
-import logging
-import threading
-from dataclasses import dataclass, replace
-from typing import Any
+import time
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
 
+import numpy as np
 import viser
+from numpy.typing import NDArray
+from spherloc.watch import Cancelled
 
-from spherloc.datasets.map_scene import MapScene
+from spherloc.datasets.synthetic import TrueCamera
 from spherloc.diagnosis import Diagnosis, diagnose
-from spherloc.errors import InputError, SpherlocError
-from spherloc.estimators import estimate
+from spherloc.errors import SpherlocError
+from spherloc.estimators import default_options, estimate
 from spherloc.problem import Problem
 from spherloc.trace import Trace
-from spherloc_viz.app import views
-from spherloc_viz.app.catalog import Catalog, SceneWish
-from spherloc_viz.app.charts import ChartPanel
-from spherloc_viz.app.display_controls import DisplayControls
-from spherloc_viz.app.estimator_controls import EstimatorControls
-from spherloc_viz.app.image_panel import ImagePanel
+from spherloc_viz.app.canvas import Canvas, panel_widths_px
+from spherloc_viz.app.catalog import SceneWish
+from spherloc_viz.app.controls import Controls
+from spherloc_viz.app.edits import Edits
+from spherloc_viz.app.export_panel import Shown
+from spherloc_viz.app.history import History
+from spherloc_viz.app.match_card import MatchCard
 from spherloc_viz.app.newest import Job, Newest
-from spherloc_viz.app.painter import Painter
-from spherloc_viz.app.scene_controls import SceneControls
-from spherloc_viz.app.sequence_panel import SequencePanel
-from spherloc_viz.app.steps_panel import StepsPanel
-from spherloc_viz.app.text import diagnosis_html, legend_html, status_html, table_html
-from spherloc_viz.app.viser_seams import put_back
+from spherloc_viz.app.services import Services
+from spherloc_viz.app.status import Status
+from spherloc_viz.app.story import Story
+from spherloc_viz.app.text import diagnosis_html, status_html
+from spherloc_viz.app.touch import Touch, Touches
+from spherloc_viz.app.viser_seams import guard_callbacks, put_back, set_theme
+from spherloc_viz.app.wish import Run, Wish
 from spherloc_viz.layers import paint, steps, with_rival
 from spherloc_viz.layers.primitives import Picture, SceneItem
+from spherloc_viz.layers.selection import with_selection
 from spherloc_viz.layers.tables import outcome_table
 from spherloc_viz.layers.trajectory import trajectory_items
-from spherloc_viz.recording.background import Recorder
 
 QUIET_S = 0.7
 """Runs count as settled, and are recorded, when nothing has changed for this long."""
 DIAGNOSE_AFTER_S = 0.2
 """A diagnosis costs more than many a run, so it waits until the picture has stood still for this long."""
-PANELS_PX = ((1600, 460, 380), (0, 360, 340))
-"""From this width of the window on: widths of the panels left and right of the canvas."""
-
-FIRST_CHECKS, CHECK_S = 8, 0.4
-"""A page that is still building itself drops its first view and reports that its viewer has not moved."""
-
-log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class Wish:
-    """All that a run depends on."""
-
-    scene: SceneWish
-    estimator: str
-    options: Any
-
-
-@dataclass(frozen=True, eq=False)
-class Run:
-    """A wish fulfilled."""
-
-    wish: Wish
-    trace: Trace
 
 
 class Session:
     """Lives as long as the tab's connection.
 
-    Three threads, so that steps can be walked while the next run is being solved: one solves the newest wish,
-    one shows the newest run, one diagnoses it. All leave the interpreter while they compute or wait.
+    Threads of its own, so that steps can be walked while the next run is being solved: one solves the newest wish,
+    one shows the newest run, one diagnoses it, one looks after slow runs. All leave the interpreter while they compute
+    or wait.
     """
 
-    def __init__(self, client: viser.ClientHandle, catalog: Catalog, recorder: Recorder | None) -> None:
-        self._client, self._catalog, self._recorder = client, catalog, recorder
-        self._solver = Newest(f"spherloc-solver-{client.client_id}", self._guarded(self._solve))
-        self._page = Newest(f"spherloc-page-{client.client_id}", self._guarded(self._show))
-        self._doctor = Newest(f"spherloc-doctor-{client.client_id}", self._guarded(self._examine))
+    def __init__(self, client: viser.ClientHandle, services: Services) -> None:
+        self._client, self._services, self._catalog = client, services, services.catalog.branch()
+        self._status = Status(client)
+        self._touches = Touches(self._status.fail)
+        guard_callbacks(client, self._status.fail)
+        number = client.client_id
+        self._solver = Newest(f"spherloc-solver-{number}", self._guarded(self._solve))
+        self._page = Newest(f"spherloc-page-{number}", self._guarded(self._show))
+        self._doctor = Newest(f"spherloc-doctor-{number}", self._guarded(self._examine))
+        self._edits, self._history = Edits(), History()
+        self._opened: Wish | None = None
         self._run: Run | None = None
         self._diagnosed: tuple[Trace, Diagnosis] | None = None
-        self._recorded: tuple[Trace, str] | None = None
-        self._viewed: tuple[str, str, str] | None = None
-        self._checks = FIRST_CHECKS
-        self._complaint: tuple[str, viser.NotificationHandle] | None = None
-        self._complaining = threading.Lock()
-        self._full_width = client.camera.image_width
-        self._panels_px = next(widths for least, *widths in PANELS_PX if self._full_width >= least)
-        self._build()
-        self._painter = Painter(client)
+        self._recorded: tuple[Trace, Path] | None = None
+        self._shown: tuple[Run, Picture] | None = None
+        self._theme = "dark"
+        left_px, right_px = panel_widths_px(client.camera.image_width)
+        self._controls = Controls(client, self._catalog, services.roots, self._touches, self, right_px)
+        self._story = Story(client.gui, self._touches, self.redraw, self.select, left_px)
+        self._card = MatchCard(client.gui)
+        self._canvas = Canvas(client, self._controls.display, self.select, self._move_camera, left_px + right_px)
+        self._listen()
 
     def start(self) -> None:
         """Solve and show the first problem."""
-        self._page.start()
-        self._doctor.start()
-        self._solver.start()
+        self._services.desk.add(self._touches)
+        for worker in (self._page, self._doctor, self._controls.slow, self._solver):
+            worker.start()
         self._solver.ask()
 
     def close(self) -> None:
         """End the threads; does not wait."""
-        for worker in (self._solver, self._page, self._doctor, self._sequence):
+        self._services.desk.remove(self._touches)
+        for worker in (self._solver, self._page, self._doctor, self._controls):
             worker.close()
 
-    def _build(self) -> None:
-        gui = self._client.gui
-        self._client.scene.set_up_direction("-y")
-        self._outcome = gui.add_html("")
-        self._scene = SceneControls(gui, self._catalog, self._changed)
-        gui.add_button_group("", ("New seed",)).on_click(self._next_seed)
-        self._estimator = EstimatorControls(gui, self._changed)
-        self._sequence = SequencePanel(gui, self._chosen_sequence, self._localized)
-        self._display = DisplayControls(gui, self._redraw)
-        self._status = gui.add_html(status_html("Solving the first problem …"))
-        story = gui.add_panel()
-        with story.add_tab("Steps"):
-            self._steps = StepsPanel(gui, self._redraw)
-            gui.add_html(legend_html())
-            self._diagnosis = gui.add_html("")
-            self._images = ImagePanel(gui)
-            self._charts = ChartPanel(gui)
-        story.dock_left()
-        story.set_width(self._panels_px[0])
-        gui.main_panel.dock_right()
-        gui.main_panel.set_width(self._panels_px[1])
+    def complain(self, sentence: str) -> None:
+        """Say in one sentence what went wrong; the page keeps its last run and stays usable."""
+        self._status.complain(sentence)
 
-    def _changed(self, event: Any) -> None:
+    # What a person does. All of this comes on threads of viser's or of the front door's, and only notes wishes.
+
+    def changed(self, event: object = None) -> None:
+        """A widget that a run depends on was changed by a hand on the page."""
         # Widgets that Python itself sets have no client; what they mean is known already.
-        if event.client is not None:
+        if event is None or getattr(event, "client", None) is not None:
+            self._controls.slow.outdate()
             self._solver.ask()
 
-    def _redraw(self, event: Any) -> None:
+    def redraw(self, event: object = None) -> None:
+        """The page is to be drawn anew."""
         self._page.ask()
 
-    def _chosen_sequence(self) -> tuple[str, MapScene, str, Any, int]:
-        """What the sequence panel localizes; raises ``InputError`` if the page says nothing that can be."""
-        wish = self._scene.read()
-        scene = self._catalog.map_scene(wish.scene)
-        if scene is None:
-            raise InputError("this scene has no query images; choose one that has.")
-        return wish.scene, scene, *self._estimator.read(), wish.seed
+    def open(self, wish: Wish) -> None:
+        """Have the page ask for this."""
+        self._opened = wish
+        self.changed()
 
-    def _localized(self, trace: Trace | None) -> None:
-        """One more query of a sequence is done."""
-        if trace is not None and self._recorder is not None:
-            try:
-                self._recorder.submit(trace)
-            except SpherlocError as error:
-                self.complain(str(error))
-        self._page.ask()
+    def step_history(self, by: int) -> None:
+        """Undo (-1) or redo (+1)."""
+        wish = self._history.step(by)
+        if wish is not None:
+            self.open(wish)
 
-    def _next_seed(self, event: Any) -> None:
-        self._scene.next_seed()
-        self._solver.ask()
+    def select(self, places: Iterable[int], extend: bool = False) -> None:
+        """Select matches by their numbers in the problem."""
+        run = self._run
+        if run is not None:
+            self._edits.select(run.kept[list(places)].tolist(), extend)
+            self._page.ask()
+
+    def _listen(self) -> None:
+        on = self._touches.on
+        on("select", self._select_numbers)
+        on("deselect", lambda touch: (self._edits.select(()), self._page.ask()))
+        for action, edit in (("spoil", self._edits.spoil), ("mend", self._edits.mend), ("hide", self._edits.hide)):
+            on(action, lambda touch, edit=edit: (edit(), self.changed()))
+        for action, edit in (("unhide", self._edits.show_all), ("unedit", self._edits.clear)):
+            on(action, lambda touch, edit=edit: (edit(), self.changed()))
+
+    def _select_numbers(self, touch: Touch) -> None:
+        run, words = self._run, touch.argument.split(",")
+        if run is None or not all(word.isascii() and word.isdigit() and len(word) < 10 for word in words):
+            return
+        numbers = set(map(int, words))
+        if numbers <= set(run.kept.tolist()):
+            self._edits.select(numbers, touch.extend)
+            self._page.ask()
+
+    def use_estimator(self, name: str) -> None:
+        """Go on with another estimator and its default options."""
+        run = self._run
+        if run is not None:
+            self.open(Wish(run.wish.scene, name, None))
+
+    def _move_camera(self, true_camera: TrueCamera) -> None:
+        self._controls.scene.true_camera = true_camera
+        self.changed()
+
+    def shown(self) -> Shown | None:
+        """What is on the page, to be exported."""
+        if self._shown is None:
+            return None
+        (run, picture), display = self._shown, self._controls.display
+        trace, layers, recorded = run.trace, display.layers(), self._recorded
+        return Shown(
+            trace=trace,
+            items=tuple(item for item in picture.scene if item.layer in layers),
+            backdrop=self._catalog.mesh(run.wish.scene.scene) if "mesh" in layers else None,
+            title=run.wish.scene.scene,
+            note=f"{trace.estimator}, seed {trace.seed}. {trace.message}",
+            recorded=recorded[1] if recorded is not None and recorded[0] is trace else None,
+            dark=display.theme == "dark",
+        )
+
+    # What the threads do.
+
+    def _wish(self) -> Wish:
+        """What the page asks for now."""
+        controls, opened = self._controls, self._opened
+        if opened is not None:
+            self._opened = None
+            problem = self._problem(opened.scene)
+            options = opened.options or default_options(opened.estimator, problem)
+            controls.write(replace(opened, options=options))
+            self._edits.write(opened.scene)
+        elif controls.follow_scene():
+            controls.estimator.follow_problem(self._problem(controls.scene.read()))
+        return Wish(self._edits.apply(controls.scene.read()), *controls.estimator.read())
 
     def _solve(self, asked: bool) -> float | None:
         """The solver thread's job: solve what the page asks for now, or record what it has settled on."""
         if not asked:
             self._settle()
             return None
-        if self._scene.follow_scene():
-            self._sequence.show(self._catalog.map_scene(self._scene.read().scene))
-            self._estimator.follow_problem(self._problem(self._scene.read()))
-        wish = Wish(self._scene.read(), *self._estimator.read())
+        wish = self._wish()
+        self._history.note(wish, time.monotonic())
         if self._run is None or wish != self._run.wish:
             problem = self._problem(wish.scene)
-            self._status.content = status_html(f"Solving with {wish.estimator} …")
-            self._run = Run(wish, estimate(problem, wish.estimator, wish.options, wish.scene.seed))
+            self._status.say(f"Solving with {wish.estimator} …")
+            watch = self._controls.slow.begin()
+            try:
+                trace = estimate(problem, wish.estimator, wish.options, wish.scene.seed)  # WATCH
+            except Cancelled:
+                if self._controls.slow.stopped:
+                    self._status.say("Cancelled; the page still shows the run before.")
+                return None
+            finally:
+                self._controls.slow.end()
+            self._run = Run(wish, trace, _kept(wish, problem))
             self._page.ask()
-        self._status.content = status_html(
-            "Runs are not recorded." if self._recorder is None else "Will be recorded when nothing changes any more."
+        self._status.say(
+            "Runs are not recorded."
+            if self._services.recorder is None
+            else "Will be recorded when nothing changes any more."
         )
-        self._withdraw()
+        self._status.withdraw()
         return QUIET_S
 
     def _problem(self, wish: SceneWish) -> Problem:
         """The problem that the page asks for; of images, with word of how far they are."""
         scene = self._catalog.map_scene(wish.scene)
         if scene is not None:
-
-            def report(done: int, count: int) -> None:
-                self._status.content = status_html(f"Describing the map: {done} of {count} reference images …")
-
-            scene.prepare(report)
-            self._status.content = status_html("Reading and matching images …")
+            scene.prepare(lambda done, count: self._status.say(f"Describing the map: {done} of {count} images …"))
+            self._status.say("Reading and matching images …")
         return self._catalog.problem(wish)
 
     def _settle(self) -> None:
-        for widget in (*self._scene.widgets, *self._estimator.widgets, *self._display.widgets, *self._steps.widgets):
+        for widget in self._controls.widgets + self._story.steps.widgets:
             put_back(widget)
-        if self._recorder is None or self._run is None:
+        run, recorder = self._run, self._services.recorder
+        if run is None:
             return
-        trace = self._run.trace
-        if self._recorded is None or self._recorded[0] is not trace:
-            self._recorded = trace, self._recorder.submit(trace).name
-        self._status.content = status_html(f"Recorded as {self._recorded[1]}")
+        self._controls.settle(run)
+        if recorder is None:
+            return
+        if self._recorded is None or self._recorded[0] is not run.trace:
+            self._recorded = run.trace, recorder.submit(run.trace)
+        self._status.say(f"Recorded as {self._recorded[1].name}")
+
+    def record(self, trace: Trace) -> None:
+        """Record a run that a panel made, if runs are recorded."""
+        if self._services.recorder is not None:
+            try:
+                self._services.recorder.submit(trace)
+            except SpherlocError as error:
+                self.complain(str(error))
 
     def _show(self, asked: bool) -> float | None:
         """The page thread's job: show the step at hand of the newest run."""
@@ -197,10 +245,9 @@ class Session:
         if run is None:
             return None
         trace = run.trace
-        timeline, outcome = steps(trace), outcome_table(trace)
-        index, pause = self._steps.settle(timeline, asked)
-        picture = paint(trace, index)
-        tables = [table for table in picture.tables if table.name != outcome.name]
+        timeline = steps(trace)
+        index, pause = self._story.steps.settle(timeline, asked)
+        picture, selected = paint(trace, index), self._edits.places(run.kept)
         last = index == len(timeline) - 1
         diagnosis, remark = None, status_html("Diagnosing …")
         if self._diagnosed is not None and self._diagnosed[0] is trace:
@@ -208,30 +255,32 @@ class Session:
             remark = diagnosis_html(diagnosis, whole=last)
             if last and diagnosis.rival_cam_from_map is not None:
                 picture = with_rival(picture, trace, diagnosis.rival_cam_from_map)
-        picture = replace(picture, scene=picture.scene + self._trajectory(run))
-        mesh = self._catalog.mesh(run.wish.scene.scene)
-        layers = self._display.layers()
+        drawn = with_selection(picture, trace, selected)
+        drawn = replace(drawn, scene=drawn.scene + self._controls.compare.items(trace) + self._trajectory(run))
+        self._shown = run, drawn
         with self._client.atomic():
-            self._painter.draw(picture.scene, layers)
-            self._painter.draw_backdrop(mesh, trace.problem.aligned.map_turn, "mesh" in layers)
-            self._images.draw(trace, picture)
-            self._steps.show(playing=pause is not None, tables=tables)
-            self._charts.draw(picture.charts)
-            self._outcome.content = table_html(outcome)
-            self._diagnosis.content = remark
-            self._move_viewer(trace, picture)
+            self._follow_theme()
+            mesh = self._catalog.mesh(run.wish.scene.scene)
+            self._canvas.draw(run, drawn, mesh, self._controls.camera_movable)
+            self._story.draw(run, picture, pause is not None, outcome_table(trace), selected)
+            self._story.diagnose(remark)
+            self._card.draw(trace, selected, run.kept, None if diagnosis is None else diagnosis.rival_cam_from_map)
+            self._controls.draw(run)
         self._client.flush()
         if diagnosis is None:
             self._doctor.ask()
-        if pause is None and self._checks > 0:
-            self._checks -= 1
-            return CHECK_S
-        return pause
+        return self._canvas.check() if pause is None else pause
+
+    def _follow_theme(self) -> None:
+        theme = self._controls.display.theme
+        if theme != self._theme:
+            self._theme = theme
+            set_theme(self._client.gui, theme)
 
     def _trajectory(self, run: Run) -> tuple[SceneItem, ...]:
         """The sequence that was localized in the scene at hand, if any."""
         label = run.wish.scene.scene
-        scene, rows = self._catalog.map_scene(label), self._sequence.rows(label)
+        scene, rows = self._catalog.map_scene(label), self._controls.sequence.rows(label)
         if scene is None or not rows:
             return ()
         return trajectory_items(rows, run.trace.problem.aligned.map_turn, scene.thresholds[-1][1])
@@ -247,53 +296,20 @@ class Session:
         self._page.ask()
         return None
 
-    def _move_viewer(self, trace: Trace, picture: Picture) -> None:
-        """Go where the person wants, or, if that is to follow the steps, where the step's subject reads best."""
-        wanted = self._display.take_view()
-        name, subject = views.fitting(picture)
-        fitting = (trace.problem.name, name, subject)
-        if wanted is None and (views.is_unmoved(self._client) or (self._display.follow and fitting != self._viewed)):
-            wanted = name
-        self._viewed = fitting
-        if wanted is not None:
-            views.look(self._client, views.find(wanted, picture, self._aspect()))
-
-    def _aspect(self) -> float:
-        """Width over height of the canvas."""
-        camera = self._client.camera
-        # The page tells its size before it docks the panels, and again some frames later.
-        docked = sum(self._panels_px) if camera.image_width == self._full_width else 0
-        return max(0.3, (camera.image_width - docked) / max(1, camera.image_height))
-
-    def complain(self, sentence: str) -> None:
-        """Say in one sentence what went wrong; the page keeps its last run and stays usable."""
-        sentence = sentence[:1].upper() + sentence[1:]
-        with self._complaining:
-            self._status.content = status_html(sentence, wrong=True)
-            if self._complaint is not None:
-                if self._complaint[0] == sentence:
-                    return
-                self._complaint[1].remove()
-            note = self._client.add_notification("Cannot do that", sentence, color="red")
-            self._complaint = (sentence, note)
-
-    def _withdraw(self) -> None:
-        with self._complaining:
-            if self._complaint is not None:
-                self._complaint[1].remove()
-                self._complaint = None
-
     def _guarded(self, job: Job) -> Job:
         """The job with its errors turned into sentences on the page."""
 
         def run(asked: bool) -> float | None:
             try:
                 return job(asked)
-            except SpherlocError as error:
-                self.complain(str(error))
             except Exception as error:
-                log.exception("session %s", self._client.client_id)
-                self.complain(f"This is a bug in the playground ({error!r}); change a setting or reload the page.")
+                self._status.fail(error)
             return None
 
         return run
+
+
+def _kept(wish: Wish, problem: Problem) -> NDArray[np.int64]:
+    """The original numbers (N,) of a problem's correspondences."""
+    variation = wish.scene.variation
+    return variation.kept(len(problem) + len(variation.hidden))

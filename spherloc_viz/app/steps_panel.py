@@ -1,18 +1,32 @@
-"""The timeline of a run: previous, next, play, a list of the steps, and what the step at hand says."""
+"""The timeline of a run: a slider, its stages, a list of the steps, previous, next, play, and what a step says."""
 
 import threading
 from collections.abc import Callable, Sequence
+from html import escape
 from typing import Any
 
 import viser
 
-from spherloc_viz.app.text import step_html, table_html
-from spherloc_viz.layers.primitives import Step, Table
+from spherloc_viz import style
+from spherloc_viz.app.text import box, step_html, table_html
+from spherloc_viz.layers.primitives import Step, Stop, Table
 
 PLAY_S = 3.0
 """How long a step stays while playing: time to read its two sentences."""
+SHORT = 0.4
+"""Share of that time that the steps of a long stage stay, but for the last, which says what came of them."""
+LONG_STAGE = 6
+"""From this many steps on a stage is long."""
+PACES = {"1×": 1.0, "2×": 2.0, "4×": 4.0, "½×": 0.5}
 PREVIOUS, NEXT, PLAY, PAUSE = "Previous", "Next", "Play", "Pause"
-HOTKEYS = ((PREVIOUS, "Previous step", "B"), (NEXT, "Next step", "N"), (PLAY, "Play or pause", "P"))
+BACK, ON = "Previous stage", "Next stage"
+HOTKEYS = (
+    (PREVIOUS, "Previous step", "B", None),
+    (NEXT, "Next step", "N", None),
+    (PLAY, "Play or pause", "P", None),
+    (BACK, "Previous stage", "B", "shift"),
+    (ON, "Next stage", "N", "shift"),
+)
 """viser's canvas takes the arrows and W, A, S, D, Q, E."""
 
 
@@ -22,62 +36,102 @@ class StepsPanel:
     def __init__(self, gui: viser.GuiApi, changed: Callable[[object], None]) -> None:
         self._changed = changed
         self._lock = threading.Lock()
-        self._moves = 0
-        self._picked: str | None = None
+        self._moves: list[str] = []
+        self._goal: str | int | None = None
+        """Key, or number of a step from 1 on, that was asked for."""
         self._playing = False
-        self._steps: tuple[Step, ...] = ()
+        self._steps: tuple[Stop, ...] = ()
+        self._titles: tuple[str, ...] = ()
         self._index = 0
         titles: list[str] = ["-"]
+        self._stages = gui.add_html("")
+        self._slider = gui.add_slider("Timeline", 1, 2, 1, 1, marks=())
         self._choice = gui.add_dropdown("Step", titles)
         self._buttons = gui.add_button_group("Keys B, N, P", (PREVIOUS, NEXT, PLAY))
+        self._pace = gui.add_dropdown("Pace", tuple(PACES), hint="How fast the steps play.")
         self._text = gui.add_html("")
+        self._slider.on_update(self._slide)
         self._choice.on_update(self._pick)
         self._buttons.on_click(self._click)
-        for button, label, hotkey in HOTKEYS:
-            command: Any = gui.add_command(label, hotkey=hotkey)  # type: ignore[arg-type]
+        for button, label, hotkey, modifier in HOTKEYS:
+            command: Any = gui.add_command(label, hotkey=hotkey, modifier=modifier)  # type: ignore[arg-type]
             command.on_trigger(lambda event, button=button: self._press(button))
 
     @property
     def widgets(self) -> tuple:
         """Those that hold a value."""
-        return (self._choice,)
+        return (self._slider, self._choice, self._pace)
 
-    def settle(self, steps: tuple[Step, ...], asked: bool) -> tuple[int, float | None]:
+    def settle(self, steps: tuple[Stop, ...], asked: bool) -> tuple[int, float | None]:
         """Index of the step to show, and seconds to the next one if playing; ``asked`` is false for its alarm."""
         if steps != self._steps:
             key = self._steps[self._index].key if self._steps else ""
             self._steps, self._index = steps, find_step(steps, key)
+            self._titles = tuple(f"{k}/{len(steps)}  {step.title}" for k, step in enumerate(steps, 1))
         with self._lock:
-            moves, self._moves = self._moves, 0
-            picked, self._picked = self._picked, None
+            moves, self._moves = self._moves, []
+            goal, self._goal = self._goal, None
             last = len(steps) - 1
-            if picked in self._choice.options:
-                self._index = self._choice.options.index(picked)
+            if goal is not None:
+                self._index = min(goal - 1, last) if isinstance(goal, int) else find_step(steps, goal)
             if self._playing and not asked:
-                moves += 1
-            self._index = min(max(0, min(self._index, last) + moves), last)
+                moves.append(NEXT)
+            for move in moves:
+                self._index = moved(steps, self._index, move)
             if self._index == last and not asked:
                 self._playing = False
             playing = self._playing
-        return self._index, PLAY_S if playing else None
+        return self._index, self._stay() if playing else None
 
-    def show(self, playing: bool, tables: Sequence[Table]) -> None:
-        """Put the step at hand and its tables on the page."""
-        titles = tuple(f"{k}/{len(self._steps)}  {step.title}" for k, step in enumerate(self._steps, 1))
-        if self._choice.options != titles:
-            self._choice.options = titles
-        self._choice.value = titles[self._index]
-        self._buttons.options = (PREVIOUS, NEXT, PAUSE if playing else PLAY)
-        self._text.content = step_html(self._steps[self._index]) + "".join(table_html(table) for table in tables)
+    def _stay(self) -> float:
+        """Seconds that the step at hand stays."""
+        stages = [step.stage for step in self._steps]
+        stage = stages[self._index]
+        short = stages.count(stage) >= LONG_STAGE and stages[self._index + 1 : self._index + 2] == [stage]
+        return PLAY_S * (SHORT if short else 1.0) / PACES[self._pace.value]
+
+    def show(self, step: Step, playing: bool, tables: Sequence[Table]) -> None:
+        """Put the step at hand, as it was painted, and its tables on the page."""
+        if self._choice.options != self._titles:
+            self._choice.options = self._titles
+            self._slider.max = max(2, len(self._titles))
+        with self._lock:
+            # What the person has meanwhile asked for must not be taken out of their hands.
+            if self._goal is None:
+                self._choice.value = self._titles[self._index]
+                self._slider.value = self._index + 1
+        buttons = (PREVIOUS, NEXT, PAUSE if playing else PLAY)
+        if self._buttons.options != buttons:
+            self._buttons.options = buttons
+        texts = (
+            (self._stages, stages_html(self._steps, self._index)),
+            (self._text, step_html(step) + "".join(table_html(table) for table in tables)),
+        )
+        for widget, html in texts:
+            if widget.content != html:
+                widget.content = html
+
+    def go(self, key: str) -> None:
+        """Go to the step of that key, or to the nearest there is."""
+        self._ask_for(key)
+        self._changed(None)
+
+    def _ask_for(self, goal: str | int) -> None:
+        with self._lock:
+            self._goal, self._moves, self._playing = goal, [], False
 
     # viser runs a coroutine as soon as the message is there, a plain function later on some thread: by then the next
-    # click, or the next step that is shown, may have changed the widget's value.
+    # click, or the next step that is shown, may have changed the widget's value. Showing a step sets the list and the
+    # slider too; only a choice made on the page counts.
 
     async def _pick(self, event: viser.GuiEvent) -> None:
-        # Showing a step sets the list too; only a choice made on the page counts.
+        if event.client is not None and event.target.value in self._choice.options:
+            self._ask_for(self._choice.options.index(event.target.value) + 1)
+            self._changed(event)
+
+    async def _slide(self, event: viser.GuiEvent) -> None:
         if event.client is not None:
-            with self._lock:
-                self._picked, self._moves, self._playing = event.target.value, 0, False
+            self._ask_for(max(1, int(event.target.value)))
             self._changed(event)
 
     async def _click(self, event: viser.GuiEvent) -> None:
@@ -88,18 +142,67 @@ class StepsPanel:
             if button in (PLAY, PAUSE):
                 self._playing = not self._playing
                 if self._playing and self._index == len(self._steps) - 1:
-                    self._moves = -self._index
+                    self._goal = 1
             else:
                 self._playing = False
-                self._moves += 1 if button == NEXT else -1
+                self._moves.append(button)
         self._changed(None)
 
 
-def find_step(steps: Sequence[Step], key: str) -> int:
-    """The step of that key; else the last of its kind ("sample-9" of "sample-12"); else the outcome."""
+def moved(steps: Sequence[Stop], index: int, move: str) -> int:
+    """Where a button leads from a step."""
+    starts = [k for k, step in enumerate(steps) if k == 0 or step.stage != steps[k - 1].stage]
+    if move == BACK:
+        return max((start for start in starts if start < index), default=0)
+    if move == ON:
+        return min((start for start in starts if start > index), default=len(steps) - 1)
+    return min(max(0, index + (1 if move == NEXT else -1)), len(steps) - 1)
+
+
+def find_step(steps: Sequence[Stop], key: str) -> int:
+    """The step of that key; else the nearest of its kind; else the outcome.
+
+    "sample-12" is of the kind of "sample-9", and "yaw-arcs-100" of that of "yaw-arcs-30" and "yaw-arcs", and rather
+    than that of "yaw-clique". Of a kind, the last whose number is not above the one asked for is the nearest.
+    """
     keys = [step.key for step in steps]
     if key in keys:
         return keys.index(key)
-    kind = key.split("-")[0]
-    same = [k for k, other in enumerate(keys) if "-" in key and other.split("-")[0] == kind]
-    return same[-1] if same else len(keys) - 1
+    parts = key.split("-")
+    for length in range(len(parts) - 1, 0, -1):
+        kind = [k for k, other in enumerate(keys) if other.split("-")[:length] == parts[:length]]
+        if kind:
+            wanted = _number(parts[length])
+            below = [k for k in kind if _number(keys[k].split("-")[length : length + 1]) <= wanted]
+            return below[-1] if below else kind[-1]
+    return len(keys) - 1
+
+
+def _number(parts: str | list[str]) -> float:
+    """The number that a part of a key is; infinite if it is none."""
+    text = parts if isinstance(parts, str) else "".join(parts)
+    return float(text) if text.isdecimal() else float("inf")
+
+
+def stages_html(steps: Sequence[Stop], index: int) -> str:
+    """The stages as bars, each as long as it has steps and filled as far as the step at hand; a press goes there."""
+    stages = list(dict.fromkeys(step.stage for step in steps))
+    bars = []
+    for stage in stages:
+        own = [k for k, step in enumerate(steps) if step.stage == stage]
+        share = min(max((index - own[0] + 1) / len(own), 0.0), 1.0)
+        here = own[0] <= index <= own[-1]
+        color = style.css(style.ESTIMATE)
+        bar = (
+            '<div style="height:5px;border-radius:3px;overflow:hidden;background:color-mix(in srgb, currentColor 18%, '
+            f'transparent)"><div style="height:100%;width:{100 * share:.1f}%;background:{color}"></div></div>'
+        )
+        css = "font-weight:600" if here else "opacity:.65"
+        where = f"{index - own[0] + 1} of {len(own)}" if here else f"{len(own)} step{'s' if len(own) > 1 else ''}"
+        bars.append(
+            f'<div data-touch="step:{escape(steps[own[0]].key)}" role="button" tabindex="0" title="{escape(stage)}: '
+            f'{where}" style="flex:{len(own)} 1 auto;cursor:pointer;{css}">{bar}'
+            f'<div style="padding-top:.15em;white-space:nowrap">{escape(stage)}</div></div>'
+        )
+    row = f'<div style="display:flex;gap:5px">{"".join(bars)}</div>'
+    return box(row, "font-size:11px;padding-top:.4em;padding-bottom:.2em")

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from spherloc_viz import style
+from spherloc_viz.app.page import QUIET
 from spherloc_viz.app.painter import Painter
 from spherloc_viz.app.viser_seams import start_viser, stop_viser
 from spherloc_viz.layers.primitives import FloatArray, SceneItem
@@ -76,7 +77,9 @@ def _replay(still: Still) -> str:
 def _embed(page: str, still: Still) -> str:
     """The page with its title and legend, which lie over the canvas."""
     color = "#e8e8ea" if still.dark else "#1a1b1e"
-    place = "position:fixed;left:16px;z-index:10;pointer-events:none;font-family:system-ui,sans-serif"
+    # At the bottom, since viser's own notes come down from the top.
+    where = "position:fixed;left:16px;right:16px;bottom:12px;z-index:10;pointer-events:none"
+    place = f"{where};font-family:system-ui,sans-serif;font-size:13px;color:{color}"
     dot = "display:inline-block;width:.75em;height:.75em;border-radius:50%;margin-right:.4em"
     legend = "".join(
         f'<span style="margin-right:1.1em;white-space:nowrap"><span style="{dot};background:{style.css(paint)}"></span>'
@@ -84,11 +87,11 @@ def _embed(page: str, still: Still) -> str:
         for paint, meaning in style.LEGEND
     )
     over = (
-        f'<div style="{place};top:12px;color:{color}"><div style="font-size:17px;font-weight:600">'
-        f'{escape(still.title)}</div><div style="font-size:13px;opacity:.75">{escape(still.note)}</div></div>'
-        f'<div style="{place};bottom:12px;right:16px;color:{color};font-size:12.5px;line-height:1.6">{legend}</div>'
+        f'<div style="{place}"><div style="font-size:17px;font-weight:600">{escape(still.title)}</div>'
+        f'<div style="opacity:.75">{escape(still.note)}</div>'
+        f'<div style="font-size:12.5px;line-height:1.6;padding-top:.3em">{legend}</div></div>'
     )
-    head = f"<title>{escape(still.title)}</title>"
+    head = f"<title>{escape(still.title)}</title>{QUIET}"
     page = re.sub(r"<title>[^<]*</title>", lambda match: head, page, count=1)
     at = page.rindex("</body>")
     return page[:at] + over + page[at:]

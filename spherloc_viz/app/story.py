@@ -25,7 +25,7 @@ class Story:
         gui: viser.GuiApi,
         touches: Touches,
         changed: Callable[[object], None],
-        select: Callable[[Iterable[int], bool], None],
+        select: Callable[[Iterable[int]], None],
         width_px: int,
     ) -> None:
         """``changed`` has the page drawn anew; ``select`` selects matches by their numbers in the problem."""
@@ -54,7 +54,7 @@ class Story:
         """Show a step of a run. ``selected`` are numbers in the problem."""
         kept: NDArray = run.kept
         tables = [table for table in picture.tables if table.name != outcome.name]
-        self.steps.show(playing=playing, tables=tables)
+        self.steps.show(picture.step, playing, tables)
         self._charts.draw(picture.charts)
         self._yaw.draw(run.trace, picture.step.key, selected, kept)
         self._residuals.draw(run.trace, selected, kept)

@@ -34,7 +34,7 @@ class Touch:
     """Whether Shift, Ctrl or Cmd was held."""
 
 
-Handler = Callable[[Touch], None]
+Handler = Callable[[Touch], object]
 
 
 class Touches:

@@ -93,7 +93,7 @@ def place_of(cam_from_map: FloatArray) -> Place:
     return float(np.degrees(yaw_of(cam_from_map[:, :3]))), float(x), float(y), float(z)
 
 
-def pose_of(wxyz: FloatArray, position: FloatArray) -> FloatArray:
+def pose_of(wxyz: np.ndarray, position: np.ndarray) -> FloatArray:
     """The pose (3, 4) of a handle with that orientation, map from camera, and position."""
     turn = np.asarray(vtf.SO3(np.asarray(wxyz, dtype=np.float64)).as_matrix().T, np.float64)
     return pose(turn, -turn @ np.asarray(position, dtype=np.float64))

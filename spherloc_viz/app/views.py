@@ -161,11 +161,13 @@ def _subject(name: str, picture: Picture) -> FloatArray:
                 return _balls(balls)
     points, surface = items["map/points"], items["sphere/surface"]
     assert isinstance(points, Points) and isinstance(surface, Mesh)
-    cameras = [
-        item.points.reshape(-1, 3) for item in picture.scene if isinstance(item, Segments) and item.layer == "cameras"
+    lines = [
+        item.points.reshape(-1, 3)
+        for item in picture.scene
+        if isinstance(item, Segments) and item.layer in ("cameras", "scale bar")
     ]
     route = [item.positions for item in picture.scene if isinstance(item, Points) and item.layer == "trajectory"]
-    return np.vstack([_dense(points.positions), surface.vertices, *cameras, *route])
+    return np.vstack([_dense(points.positions), surface.vertices, *lines, *route])
 
 
 def _sphere(surface: object, ring: bool) -> FloatArray:

@@ -32,6 +32,11 @@ def start_viser(key: str) -> viser.ViserServer:
     return server
 
 
+def set_theme(gui: viser.GuiApi, theme: str) -> None:
+    """Make a page, or the pages to come, "dark" or "light"."""
+    gui.configure_theme(dark_mode=theme == "dark", show_logo=False, show_share_button=False)
+
+
 def stop_viser(server: viser.ViserServer) -> None:
     """Stop it without its farewell."""
     with contextlib.redirect_stdout(io.StringIO()):

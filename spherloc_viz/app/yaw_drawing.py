@@ -1,7 +1,5 @@
 """The yaw view's drawing: the whole circle above, a window of it below, and under that the arcs in the window."""
 
-from itertools import pairwise
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,7 +8,8 @@ from spherloc_viz.app import shapes
 from spherloc_viz.app.axes import MINUS, Scale, round_ticks, tick_texts, wrapped_deg
 from spherloc_viz.app.svg import curve_parts
 from spherloc_viz.layers.primitives import Curve
-from spherloc_viz.layers.yaw_bars import ALL, KINDS, Bars, Window, YawStory, places_of, spans_in
+from spherloc_viz.layers.yaw_bars import KINDS, Bars, spans_in
+from spherloc_viz.layers.yaw_story import ALL, Window, YawStory, places_of
 
 ZOOM = "yaw-zoom"
 WIDTH_PX = 380.0
@@ -26,6 +25,7 @@ LOOKS = (
     shapes.fill(style.OUTLIER),
 )
 """Of the kinds of pairs."""
+LINK = shapes.stroke(style.CLIQUE, 1.5)
 HOVER = (
     "<style>.yaw-twin{display:none;pointer-events:none}.yaw-arc:hover+.yaw-twin,.yaw-twin.chosen{display:inline}"
     ".yaw-arc:hover{stroke:currentColor;stroke-width:1.2}</style>"
@@ -62,7 +62,7 @@ def zoom(window: Window) -> str:
 def _legend(story: YawStory) -> list[str]:
     """Samples of the lines, from the right."""
     names = [(curve.label, curve.color, curve.kind == "level") for curve in story.curves]
-    names += [("hypotheses" if story.hypotheses[0][3] else "poses", style.INLIER, False)] if story.hypotheses else []
+    names += [("hypotheses", style.INLIER, False)] if story.hypotheses and not story.curves else []
     names += [("truth", style.TRUTH, False)] if story.truth_deg is not None else []
     names += [("estimate", style.ESTIMATE, True)] if story.estimate_deg is not None else []
     parts, end = [], WIDTH_PX - RIGHT_PX
@@ -160,62 +160,66 @@ def _hypotheses(story: YawStory, x: Scale, y: Scale, window: Window, now: str) -
 
 def _bars(bars: Bars, whole: Scale, part: Scale, pitch: float, window: Window, kept: NDArray[np.int64]) -> list[str]:
     """A bar an arc in the window; behind it, shown when the pair is pointed at or chosen, what joins it to its twin."""
-    data = _bar_data(bars, part, pitch, window)
-    names, tips = kept[bars.pairs].tolist(), _tips(bars)
+    data, twins = _bar_data(bars, whole, part, pitch, window)
+    rows = zip(
+        kept[bars.pairs].tolist(), bars.kind.tolist(), bars.chosen.tolist(), data, twins, _tips(bars), strict=True
+    )
     out: list[str] = []
-    rows = zip(names, bars.kind.tolist(), bars.chosen.tolist(), bars.count.tolist(), data, tips, strict=True)
-    for pair, ((a, b), kind, chosen, count, path, tip) in enumerate(rows):
+    for (a, b), kind, chosen, path, twin, tip in rows:
         edge = ' stroke="currentColor"' if chosen else ""
-        out.append(
-            f'<path class="yaw-arc" data-touch="select:{a},{b}" d="{path}" {LOOKS[kind]}{edge}>'
-            f"<title>{a} and {b}, {KINDS[kind]}: {tip}</title></path>"
-        )
-        if count > 1 or chosen:
-            out.append(_twins(bars, pair, whole, part, pitch, window))
+        tag = f'class="yaw-arc" data-touch="select:{a},{b}" d="{path}" {LOOKS[kind]}{edge}'
+        if path:
+            out.append(f"<path {tag}><title>{a} and {b}, {KINDS[kind]}: {tip}</title></path>")
+        if twin:
+            out.append(f'<path class="yaw-twin{" chosen" if chosen else ""}" d="{twin}" {LINK}/>')
     return out
 
 
-def _bar_data(bars: Bars, x: Scale, pitch: float, window: Window) -> list[str]:
-    """The data of a path for every pair: its arcs in the window."""
+def _bar_data(bars: Bars, whole: Scale, part: Scale, pitch: float, window: Window) -> tuple[list[str], list[str]]:
+    """The data of two paths for every pair: of its arcs in the window; and, if it has a twin or is chosen, of ticks at
+    all of its arcs over the whole circle and of what joins them, there and in the window.
+    """
     arc, low, high = spans_in(bars.lo_deg, bars.hi_deg, window)
-    left = x.px(low)
-    width = np.maximum(1.5, x.px(high) - left)
+    left = part.px(low)
+    width = np.maximum(1.5, part.px(high) - left)
     top = WINDOW_FOOT_PX + 6.0 + pitch * bars.row[arc]
-    flat = np.column_stack([left, top, width, width]).ravel().tolist()
-    texts = (f"M%.1f %.1fh%.1fv{0.78 * pitch:.1f}h-%.1fz\n" * len(arc) % tuple(flat)).split("\n")
-    data = [""] * len(bars.pairs)
-    for pair, text in zip(bars.owner[arc].tolist(), texts, strict=False):
+    data, twins = [""] * len(bars.pairs), [""] * len(bars.pairs)
+    linked = ((bars.count > 1) | bars.chosen)[bars.owner]
+    boxes = _each(f"M%.1f %.1fh%.1fv{0.78 * pitch:.1f}h-%.1fz", left, top, width, width)
+    spots = _each("%.1f %.1f", left + 0.5 * width, top + 0.39 * pitch)
+    for pair, link, text, spot in zip(bars.owner[arc].tolist(), linked[arc].tolist(), boxes, spots, strict=True):
         data[pair] += text
-    return data
+        if link:
+            twins[pair] += f"{'L' if twins[pair] else 'M'}{spot}"
+    middles = whole.px(wrapped_deg(0.5 * (bars.lo_deg + bars.hi_deg)))
+    ends = whole.px(np.maximum(bars.lo_deg, -180.0)), whole.px(np.minimum(bars.hi_deg, 180.0))
+    ticks = _each(f"M%.1f {CIRCLE_FOOT_PX - 2:g}H%.1f", ends[0], np.maximum(ends[1], ends[0] + 1.5))
+    before: dict[int, float] = {}
+    for k in np.flatnonzero(linked).tolist():
+        pair, middle = int(bars.owner[k]), float(middles[k])
+        twins[pair] += ticks[k]
+        if pair in before:
+            twins[pair] += _arch(before[pair], middle)
+        before[pair] = middle
+    return data, twins
+
+
+def _arch(a: float, b: float) -> str:
+    foot, top = CIRCLE_FOOT_PX - 4, CIRCLE_TOP_PX - 12
+    return f"M{a:.1f} {foot:g}Q{0.5 * (a + b):.1f} {top:g} {b:.1f} {foot:g}"
+
+
+def _each(template: str, *columns: NDArray[np.floating]) -> list[str]:
+    """The template filled in with each row of the columns (K,): one formatting is much faster than K."""
+    flat = np.column_stack(columns).ravel().tolist()
+    return (f"{template}\n" * len(columns[0]) % tuple(flat)).split("\n")[:-1]
 
 
 def _tips(bars: Bars) -> list[str]:
     """The ends of every pair's arcs to read, those in the window first."""
     order = np.lexsort((bars.row < 0, bars.owner))
-    ends = np.column_stack([bars.lo_deg[order], wrapped_deg(bars.hi_deg[order])]).ravel().tolist()
-    texts = ("%.2f° to %.2f°\n" * len(order) % tuple(ends)).replace("-", MINUS).split("\n")
+    texts = _each("%.2f° to %.2f°", bars.lo_deg[order], wrapped_deg(bars.hi_deg[order]))
     tips = [""] * len(bars.pairs)
-    for pair, text in zip(bars.owner[order].tolist(), texts, strict=False):
+    for pair, text in zip(bars.owner[order].tolist(), texts, strict=True):
         tips[pair] += f", twin {text}" if tips[pair] else text
-    return tips
-
-
-def _twins(bars: Bars, pair: int, whole: Scale, part: Scale, pitch: float, window: Window) -> str:
-    """The arcs of a pair over the whole circle, and what joins them, there and in the window."""
-    own = np.flatnonzero(bars.owner == pair)
-    _, low, high = spans_in(bars.lo_deg[own], bars.hi_deg[own], ALL)
-    left, right = whole.px(low).tolist(), np.maximum(whole.px(high), whole.px(low) + 1.5).tolist()
-    foot = CIRCLE_FOOT_PX
-    data = "".join(f"M{a:.1f} {foot:g}v-5H{b:.1f}v5z" for a, b in zip(left, right, strict=True))
-    middles = sorted(whole.px(wrapped_deg(0.5 * (bars.lo_deg[own] + bars.hi_deg[own]))).tolist())
-    arch = "".join(
-        f"M{a:.1f} {foot - 6:g}Q{0.5 * (a + b):.1f} {CIRCLE_TOP_PX - 12:g} {b:.1f} {foot - 6:g}"
-        for a, b in pairwise(middles)
-    )
-    arc, low, high = spans_in(bars.lo_deg[own], bars.hi_deg[own], window)
-    if len(arc) > 1:
-        arch += shapes.corners(part.px(0.5 * (low + high)), WINDOW_FOOT_PX + 6.0 + pitch * (bars.row[own][arc] + 0.39))
-    return (
-        f'<g class="yaw-twin{" chosen" if bars.chosen[pair] else ""}"><path d="{data}" {shapes.fill(style.CLIQUE)}/>'
-        f'<path d="{arch}" {shapes.stroke(style.CLIQUE, 1.25)}/></g>'
-    )
+    return [tip.replace("-", MINUS) for tip in tips]

@@ -3,29 +3,26 @@
 import math
 import threading
 from collections.abc import Callable
+from html import escape
 
 import numpy as np
 import viser
 from numpy.typing import NDArray
 
 from spherloc.trace import Trace
-from spherloc_viz.app.text import box, escape
+from spherloc_viz.app.text import box
 from spherloc_viz.app.touch import Touch, Touches
 from spherloc_viz.app.yaw_drawing import ZOOM, yaw_svg
 from spherloc_viz.layers.yaw_bars import (
-    ALL,
     KINDS,
     Arcs,
     Bars,
-    Window,
-    YawStory,
     arcs_of,
     bars_in,
     peak_window,
     right_ones,
-    window_around,
-    yaw_story,
 )
+from spherloc_viz.layers.yaw_story import ALL, Window, YawStory, window_around, yaw_story
 
 PEAK, WHOLE = "Zoom to the peak", "All yaws"
 LEAST_DRAG = 0.012
@@ -56,7 +53,8 @@ class YawView:
         with self._lock:
             wanted = self._wanted
         story = self._story(trace)
-        shown_key = step_key if any(step_key == key for *_, key in story.hypotheses) else ""
+        hypothesis = step_key.removesuffix("-pose")
+        shown_key = hypothesis if any(hypothesis == key for *_, key in story.hypotheses) else ""
         drawn = (trace, shown_key, selected, wanted)
         if self._drawn is not None and self._drawn[1:] == drawn[1:] and self._drawn[0] is trace:
             return
@@ -66,10 +64,11 @@ class YawView:
         with self._lock:
             self._peak = peak
         bars = bars_in(trace, arcs, window, selected)
+        note = escape(caption(trace, story, arcs, bars))
         content = box(
             f'<div style="font-weight:600;padding-bottom:.3em">{escape(story.title)}</div>'
             f"{yaw_svg(story, bars, window, kept, shown_key)}"
-            f'<div style="font-size:11.5px;opacity:.7;padding-top:.3em">{escape(caption(trace, arcs, bars))}</div>'
+            f'<div style="font-size:11.5px;opacity:.7;padding-top:.3em">{note}</div>'
         )
         if content != self._html.content:
             self._html.content = content
@@ -119,11 +118,11 @@ def _window_of(argument: str) -> Window | None:
     return (low, high) if sensible else None
 
 
-def caption(trace: Trace, arcs: Arcs, bars: Bars) -> str:
+def caption(trace: Trace, story: YawStory, arcs: Arcs, bars: Bars) -> str:
     """Which arcs are shown, by which rule, and what their colours mean."""
     total = sum(bars.total)
     if total == 0:
-        return " ".join(filter(None, (arcs.rule, "No pair has an arc in this window.")))
+        return " ".join(filter(None, (story.note, arcs.rule, "No pair has an arc in this window.")))
     in_window = bars.row >= 0
     shown = int(np.count_nonzero(in_window))
     if shown < total:
@@ -135,4 +134,4 @@ def caption(trace: Trace, arcs: Arcs, bars: Bars) -> str:
         rule = f"All {total:,} arcs in this window shown: {counts}."
     judged = right_ones(trace)[1]
     colors = f"Green: both matches right {judged}; red: both wrong; pale red: one wrong."
-    return " ".join(filter(None, (arcs.rule, rule, colors)))
+    return " ".join(filter(None, (story.note, arcs.rule, rule, colors)))

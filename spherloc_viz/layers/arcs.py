@@ -12,14 +12,13 @@ from spherloc.trace import YawStage
 from spherloc_viz import style
 from spherloc_viz.layers import ring
 from spherloc_viz.layers.frame import RunView, even, one_color
-from spherloc_viz.layers.primitives import FloatArray, Segments
+from spherloc_viz.layers.primitives import Segments
 
 IndexArray = NDArray[np.int64]
 
 INNER, OUTER = 1.3, 1.95
 """Radii of the band of arcs, in sphere radii."""
 STEP_RAD = np.radians(4.0)
-GOLDEN = 0.6180339887498949
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,6 +29,11 @@ class Arcs:
 
     def __len__(self) -> int:
         return len(self.stage.lo_rad)
+
+    @property
+    def median_width_rad(self) -> float:
+        """Of all arcs; numpy's own median is ten times slower."""
+        return float(np.partition(self.stage.hi_rad - self.stage.lo_rad, len(self) // 2)[len(self) // 2])
 
     @cached_property
     def in_clique(self) -> NDArray[np.bool_]:
@@ -73,7 +77,7 @@ class Arcs:
     def spread(self, count: int) -> IndexArray:
         """The first ``count`` arcs in an order in which every beginning is spread evenly over all pairs."""
         total = len(self)
-        stride = max(1, round(GOLDEN * total))
+        stride = max(1, round(ring.GOLDEN * total))
         while gcd(stride, total) > 1:
             stride += 1
         return np.arange(min(count, total), dtype=np.int64) * stride % total
@@ -100,12 +104,12 @@ class Arcs:
         return np.concatenate([even(members, take), others[: room - take]])
 
     def drawn(
-        self, view: RunView, centre: FloatArray, arcs: IndexArray, marked: np.ndarray, mark: style.RGB
+        self, view: RunView, arcs: IndexArray, marked: np.ndarray, mark: style.RGB, marked_first: bool = False
     ) -> Segments:
-        """Arcs on the ring, each on a track of its own: the marked ones (mask) first, in their colour, then the others,
-        each by their middles."""
+        """Arcs on the ring around the middle of the map, each on a track of its own, by their middles; the marked ones
+        (mask) in their colour, and on the inner tracks if they come first."""
         lo, hi, pairs = (array[arcs] for array in (self.stage.lo_rad, self.stage.hi_rad, self.stage.pairs))
-        order = np.lexsort((lo + hi, ~marked))
+        order = np.lexsort((lo + hi, ~marked & marked_first))
         lo, width, marked, pairs = lo[order], (hi - lo)[order], marked[order], pairs[order]
         tracks = INNER + (OUTER - INNER) * (np.arange(len(arcs)) + 0.5) / max(1, len(arcs))
         steps = np.maximum(1, np.ceil(width / STEP_RAD)).astype(np.int64)
@@ -113,7 +117,7 @@ class Arcs:
         part = np.arange(len(arc)) - np.repeat(np.cumsum(steps) - steps, steps)
         ends = lo[arc, None] + (width / steps)[arc, None] * (part[:, None] + np.array([0.0, 1.0]))
         directions = ring.directions(ends.ravel()).reshape(-1, 2, 3)
-        points = centre + view.sphere_m * tracks[arc, None, None] * directions
+        points = view.middle + view.sphere_m * tracks[arc, None, None] * directions
         colors = one_color(style.UNDECIDED, len(arc))
         colors[marked[arc]] = mark
         return Segments("ring/arcs", "yaw ring", points, colors, 2.0, ids=pairs[arc].astype(np.int64))

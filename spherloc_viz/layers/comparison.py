@@ -19,15 +19,14 @@ from spherloc_viz.layers.scene import camera
 
 PALETTE: tuple[style.RGB, ...] = (
     (150, 205, 20),
-    (180, 85, 255),
     (255, 135, 60),
-    (140, 95, 55),
-    (20, 105, 115),
+    (90, 75, 235),
+    (20, 120, 130),
+    (150, 100, 60),
     (255, 205, 170),
-    (75, 60, 215),
     (155, 15, 75),
     (160, 240, 190),
-    (135, 30, 150),
+    (120, 20, 140),
     (70, 120, 20),
 )
 """Colours of estimators: far from each other and from those of ``style.LEGEND``, which mean something else."""
@@ -94,8 +93,10 @@ def _row(entry: Entry) -> tuple[str, ...]:
         NO_VALUE if turn is None else f"{turn:.3f}°" if turn < 10 else f"{turn:.0f}°",
         NO_VALUE if shift is None else _length(shift),
         f"{np.count_nonzero(trace.inlier_mask)}",
-        *(NO_VALUE if share is None else f"{100 * share:.0f} %" for share in (metrics.precision, metrics.recall)),
-        NO_VALUE if metrics.f1 is None else f"{100 * metrics.f1:.0f} %",
+        *(
+            NO_VALUE if share is None or trace.cam_from_map is None else f"{100 * share:.0f} %"
+            for share in (metrics.precision, metrics.recall, metrics.f1)
+        ),
         _duration(trace.timings_ms["total"]),
         NO_VALUE if trace.certificate is None else _proof(trace.certificate),
         "…" if entry.diagnosis is None else str(entry.diagnosis.cause),
@@ -169,6 +170,18 @@ def residual_chart(entries: Sequence[Entry]) -> Chart:
     return Chart("comparison-residuals", "Matches within x px of the pose", "residual (px)", "matches", tuple(curves))
 
 
+def coinciding(chart: Chart) -> str:
+    """A sentence for each set of curves that are the same, of which only the last can be seen; empty if all differ."""
+    groups: dict[bytes, list[str]] = {}
+    for curve in chart.curves:
+        groups.setdefault(curve.x.tobytes() + curve.y.tobytes(), []).append(curve.label)
+    return " ".join(
+        f"{', '.join(labels[:-1])} and {labels[-1]} have the same curve."
+        for labels in groups.values()
+        if len(labels) > 1
+    )
+
+
 def _within(trace: Trace, cam_from_map: FloatArray, x: FloatArray) -> FloatArray:
     aligned = trace.problem.aligned
     residuals = np.sort(residuals_px(aligned, aligned.align_pose(cam_from_map)))
@@ -190,8 +203,8 @@ def yaw_chart(entries: Sequence[Entry]) -> Chart | None:
 def _counts(trace: Trace) -> tuple[str, np.ndarray] | None:
     arcs, consensus = trace.stage(YawStage), trace.stage(ConsensusStage)
     if arcs is not None:
-        return "arcs", arcs.overlap
-    return None if consensus is None else ("bound", consensus.bound)
+        return "arcs that overlap", arcs.overlap
+    return None if consensus is None else ("matches at most", consensus.bound)
 
 
 def yaw_markers(entries: Sequence[Entry], height: float) -> tuple[Curve, ...]:

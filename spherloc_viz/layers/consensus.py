@@ -15,7 +15,7 @@ from spherloc_viz.layers.primitives import FloatArray, SceneItem, Segments, Tabl
 from spherloc_viz.layers.scene import camera
 from spherloc_viz.layers.yaw_bound import best_support, highest_bound
 
-CLIQUE_SIZES = (2, 3, 5, 10, 20, 50, 100)
+CLIQUE_SIZES = (3, 5, 10, 20, 50, 100)
 """How many members of the largest set are shown before all are."""
 
 

@@ -169,10 +169,7 @@ def growing(total: int, *sizes: int) -> list[int]:
 
 def length(metres: float) -> str:
     """A length to read: metres, or centimetres where it is short."""
-    return (
-        f"{metres:.2f} m"
-        if metres >= 1.0
-        else f"{100.0 * metres:.2g} cm"
-        if metres < 0.1
-        else f"{100.0 * metres:.0f} cm"
-    )
+    if metres >= 1.0:
+        return f"{metres:.2f} m"
+    digits = 0 if metres >= 0.1 else 1 if metres >= 0.01 else 2
+    return f"{100.0 * metres:.{digits}f} cm" if metres >= 1e-4 else "less than 0.1 mm"

@@ -51,7 +51,7 @@ def match_view(
     if shown is None or index is None or pixels is None:
         return MatchView(None, np.arange(len(problem)), np.empty(0, np.int64), int(is_inlier.sum()), _alone(problem))
     own = np.flatnonzero(index == shown)
-    known = np.isfinite(pixels).all(axis=1)
+    known: BoolArray = np.isfinite(pixels[:, 0]) & np.isfinite(pixels[:, 1])
     inliers = own[is_inlier[own]]
     joined = even(inliers[known[inliers]], style.MAX_DRAWN_MATCHES)
     chosen = np.array([k for k in selected if index[k] == shown and known[k]], dtype=np.int64)

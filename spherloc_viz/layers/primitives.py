@@ -3,7 +3,7 @@
 Scene positions are metres in the gravity-aligned map frame: y points down. Colours are sRGB bytes.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -96,8 +96,9 @@ class Textured(Primitive):
     map_from_mesh: FloatArray
     """(3, 4) rotation times scale, and shift, so that a mesh that moves keeps its vertices and its picture."""
     image: Callable[[], ColorArray | None]
-    """Makes the picture, (H, W, 3) sRGB or (H, W, 4) with holes where the last is below 128; None if there is none.
-    It is large, so it is made only where it is drawn; equal pictures are sent once."""
+    """Makes the picture, (H, W, 3) sRGB or (H, W, 4) with holes where the last is below 128; None if there is none."""
+    key: Hashable
+    """Equal keys mean equal meshes with equal pictures: a picture is large, so it is made and sent once."""
 
 
 @dataclass(frozen=True, eq=False)

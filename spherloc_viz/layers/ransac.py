@@ -139,10 +139,11 @@ def _expected(view: RunView, stage: RansacStage) -> Frame:
         met = f"the first to improve on those before was sample {first:,}"
     else:
         met = "no improvement came from one"
-    mean = f"one in {1.0 / share**size:,.0f} samples" if share else "no sample"
+    mean = f"one sample in {1.0 / share**size:,.0f}" if share else "no sample"
     return Frame(
-        f"With {100 * share:.3g} % inliers, {mean} holds only inliers of the best pose, and {met}. "
-        f"The best pose came with sample {best:,}, by which Eq. 28 expects a clean one with probability {by_then:.3g}.",
+        f"With {100 * share:.3g} % inliers, {mean} should hold only inliers of the best pose, and {met}. "
+        f"The best pose came with sample {best:,}, by which a clean one was to be expected with probability "
+        f"{by_then:.3g}.",
         f"P = 1 − (1 − wⁿ)ᵏ,  n = {size},  w = {share:.3g},  k = {best:,}   (Eq. 28)",
         view.aligned_pose(stage.cam_from_map[-1]),
         view.colors(style.UNDECIDED, (mask, style.INLIER)),
@@ -179,7 +180,7 @@ def chance_chart(stage: RansacStage) -> Chart:
     drawn = np.unique(np.geomspace(1, max(stage.iterations, 1), CURVE_POINTS).round())
     chances = np.array([ransac_success_probability(share, size, int(k)) for k in drawn])
     curves = (
-        Curve("a clean sample, by Eq. 28", drawn, chances, style.UNDECIDED),
+        Curve("clean sample", drawn, chances, style.UNDECIDED),
         Curve("best pose found", np.array([best]), np.array([1.0]), style.INLIER, "marker"),
     )
-    return Chart("chance", "Chance that a sample was clean", "samples drawn", "probability", curves)
+    return Chart("chance", "Chance that a sample was clean, by Eq. 28", "samples drawn", "probability", curves)

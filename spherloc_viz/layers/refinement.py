@@ -39,11 +39,12 @@ def _state(view: RunView, stage: RefinementStage, k: int) -> Frame:
     rms, inliers = np.sqrt(stage.cost_px2), stage.inlier_counts
     off = "" if view.truth is None else f", {length(translation_error_m(view.truth, state))} from the true one"
     if k == 0:
-        moved = f"{count - 1} Gauss-Newton steps follow, each a linear problem in {stage.dof} unknowns."
+        moved = f"{_steps(count - 1)} follow{'s' if count == 2 else ''}, each a linear problem in {stage.dof} unknowns."
     else:
         before = view.aligned_pose(stage.cam_from_map[k - 1])
         away, turned = translation_error_m(before, state), rotation_error_deg(before, state)
-        moved = f"The step moved the camera by {length(away)} and turned it by {turned:.2g}°."
+        angle = f"{turned:.3f}°" if turned >= 5e-4 else "less than 0.001°"
+        moved = f"The step moved the camera by {length(away)} and turned it by {angle}."
     note = "" if count <= MOST_STATES else f"{MOST_STATES} of {count} states are shown, evenly."
     mask = _explained(view, stage, k, state)
     return Frame(
@@ -137,7 +138,7 @@ def _error(view: RunView, stage: RefinementStage) -> Frame:
     expected = (
         "The inliers leave the pose open, so that its error is unknown."
         if known is None
-        else f"By its covariance the pose is off by {known[0]:.3f}° and {known[1]:.2f} cm RMS, if its inliers are right."
+        else f"By its covariance the pose is {known[0]:.3f}° and {known[1]:.2f} cm off, RMS, if its inliers are right."
     )
     if view.truth is None:
         happened = "The truth is not known here, so that nobody can check."
@@ -160,8 +161,8 @@ def _summary(view: RunView, stage: RefinementStage) -> Frame:
     rms, counts = np.sqrt(stage.cost_px2), stage.inlier_counts
     state, mask = _last(view, stage)
     return Frame(
-        f"{len(rms) - 1} Gauss-Newton steps in {stage.dof} degrees of freedom take the inliers from "
-        f"{rms[0]:.2f} to {rms[-1]:.2f} px RMS, and their number from {counts[0]} to {counts[-1]}. "
+        f"{_steps(len(rms) - 1)} in {stage.dof} degrees of freedom {'takes' if len(rms) == 2 else 'take'} the inliers "
+        f"from {rms[0]:.2f} to {rms[-1]:.2f} px RMS, and their number from {counts[0]} to {counts[-1]}. "
         f"The camera ends at {view.position(state)}, and its error is {uncertainty.spread(stage)}.",
         _objective(stage),
         state,
@@ -171,6 +172,10 @@ def _summary(view: RunView, stage: RefinementStage) -> Frame:
         located=True,
         tables=(uncertainty.table(stage),),
     )
+
+
+def _steps(count: int) -> str:
+    return "1 Gauss-Newton step" if count == 1 else f"{count} Gauss-Newton steps"
 
 
 def _objective(stage: RefinementStage) -> str:

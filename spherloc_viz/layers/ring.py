@@ -16,6 +16,8 @@ HEIGHT = 0.9
 """Height of the outline at its peak, in sphere radii."""
 DEGREES = 360
 """Corners of the outline."""
+GOLDEN = 0.6180339887498949
+"""Multiples of it, less their whole parts, are spread evenly however many are taken."""
 
 
 def directions(yaw_rad: FloatArray) -> FloatArray:
@@ -105,18 +107,18 @@ def off_truth(view: RunView, yaw_rad: float) -> str:
 def peaks(counts: np.ndarray, reach: int, most: int) -> np.ndarray:
     """Places of the ``most`` highest peaks of counts (K,) around the circle, highest first.
 
-    At a peak no count within ``reach`` places is larger, and no higher peak, or earlier one as high, is that close.
+    At a peak no count within ``reach`` places is larger, and no other peak is that close. Equal ones come in an order
+    that jumps around the circle, so that a few of many do not lie side by side.
     """
     around = np.concatenate([counts[-reach:], counts, counts[:reach]])
     highest = np.lib.stride_tricks.sliding_window_view(around, 2 * reach + 1).max(axis=1)
-    found: list[int] = []
     candidates = np.flatnonzero((counts == highest) & (counts > 0))
-    for place in candidates[np.argsort(-counts[candidates], kind="stable")]:
-        away = [abs(int(place) - other) for other in found]
-        if all(min(gap, len(counts) - gap) > reach for gap in away):
-            found.append(int(place))
-        if len(found) == most:
-            break
+    candidates = candidates[np.lexsort((candidates * GOLDEN % 1.0, -counts[candidates]))]
+    found: list[int] = []
+    while len(candidates) and len(found) < most:
+        found.append(int(candidates[0]))
+        gaps = np.abs(candidates - candidates[0])
+        candidates = candidates[np.minimum(gaps, len(counts) - gaps) > reach]
     return np.array(found, dtype=np.int64)
 
 

@@ -1,7 +1,7 @@
 """What every picture shows: map points, the unit sphere with its bearings and the query image, matches, true and
 estimated camera with the error, and a scale bar."""
 
-from functools import cache, lru_cache, partial
+from functools import cache, partial
 
 import cv2
 import numpy as np
@@ -18,6 +18,8 @@ from spherloc_viz.layers.scale_bar import scale_bar
 from spherloc_viz.layers.sphere_image import sphere_texture
 from spherloc_viz.layers.uncertainty import error_items
 
+CAMERA = 1.9
+"""Size of a camera, in sphere radii."""
 UNDER_IMAGE = 0.98
 """Radius of the bare sphere where the query image is around it, in sphere radii."""
 COLUMNS, ROWS = 96, 48
@@ -35,14 +37,16 @@ def _icosphere() -> tuple[np.ndarray, np.ndarray]:
 def base_items(view: RunView, frame: Frame) -> tuple[SceneItem, ...]:
     """The primitives that do not depend on the stage."""
     centre = camera_centre(frame.cam_from_map)
+    # Translucent surfaces hide what is drawn after them and lies behind: the ghost comes before the sphere around it.
     items: list[SceneItem] = [
+        *([] if view.truth is None else [_ghost(view.truth, CAMERA * view.sphere_m)]),
         Points("map/points", "map", view.points, frame.colors, 0.07 * view.dot_m, np.arange(len(view.points))),
         *_sphere(view, frame),
     ]
     if frame.located:
-        items.append(camera("cameras/estimate", frame.cam_from_map, 1.9 * view.sphere_m, style.ESTIMATE, 2.5))
+        items.append(camera("cameras/estimate", frame.cam_from_map, CAMERA * view.sphere_m, style.ESTIMATE, 2.5))
     if view.truth is not None:
-        items.append(camera("cameras/truth", view.truth, 1.9 * view.sphere_m, style.TRUTH, 2.5))
+        items.append(camera("cameras/truth", view.truth, CAMERA * view.sphere_m, style.TRUTH, 2.5))
         if frame.located:
             ends = np.array([[camera_centre(view.truth), centre]])
             items.append(Segments("cameras/error", "cameras", ends, one_color(style.OUTLIER, 1), 3.0))
@@ -73,7 +77,8 @@ def _image(problem: Problem, centre: FloatArray, map_from_sphere: FloatArray) ->
     """The query image on the sphere. Vertices are bearings of the aligned camera frame."""
     vertices, faces, uv = _panorama()
     placed = np.column_stack([map_from_sphere, centre])
-    return Textured("sphere/image", "image", vertices, faces, uv, placed, partial(_sphere_image, problem))
+    key = (problem.image, problem.camera, problem.aligned.camera_turn.tobytes())
+    return Textured("sphere/image", "image", vertices, faces, uv, placed, partial(_sphere_image, problem), key)
 
 
 @cache
@@ -95,7 +100,7 @@ def _sphere_image(problem: Problem) -> ColorArray | None:
     texture = sphere_texture(problem)
     if texture is None:
         return None
-    seen = _seen(problem.camera, problem.aligned.camera_turn.tobytes())
+    seen = _seen(problem.camera, problem.aligned.camera_turn)
     if seen.all():
         return texture
     height, width = texture.shape[:2]
@@ -103,22 +108,32 @@ def _sphere_image(problem: Problem) -> ColorArray | None:
     return np.asarray(np.dstack([texture, alpha]), np.uint8)
 
 
-@lru_cache(maxsize=4)
-def _seen(camera: Camera, camera_turn: bytes) -> ColorArray:
+def _seen(camera: Camera, camera_turn: FloatArray) -> ColorArray:
     """255 where the camera sees what lies behind a pixel of ``COVERAGE``, else 0."""
     columns, rows = np.meshgrid(np.arange(COVERAGE.width) + 0.5, np.arange(COVERAGE.height) + 0.5)
     bearings, _ = COVERAGE.unproject(np.column_stack([columns.ravel(), rows.ravel()]).astype(np.float64))
-    pixels, valid = camera.project(bearings @ np.frombuffer(camera_turn).reshape(3, 3))
+    pixels, valid = camera.project(bearings @ camera_turn)
     return np.where(valid & in_image(camera, pixels), 255, 0).astype(np.uint8).reshape(rows.shape)
+
+
+_CORNERS = np.array([[-0.5, -0.4, 0.7], [0.5, -0.4, 0.7], [0.5, 0.4, 0.7], [-0.5, 0.4, 0.7]])
+"""Of the opening of a camera of size 1."""
+
+
+def _ghost(cam_from_map: FloatArray, size_m: float) -> Mesh:
+    """The true camera's body, to be seen through."""
+    corners = size_m * np.vstack([np.zeros(3), _CORNERS]) @ cam_from_map[:, :3]
+    faces = np.array([[0, k, k % 4 + 1] for k in range(1, 5)])
+    faces = np.concatenate([faces, faces[:, ::-1]])
+    return Mesh("cameras/ghost", "cameras", camera_centre(cam_from_map) + corners, faces, style.TRUTH, 0.16)
 
 
 def camera(name: str, cam_from_map: FloatArray, size_m: float, color: style.RGB, width_px: float) -> Segments:
     """An open pyramid around the viewing direction, its upper edge marked by a roof."""
     centre, rotation = camera_centre(cam_from_map), cam_from_map[:, :3]
-    corners = np.array([[-0.5, -0.4, 0.7], [0.5, -0.4, 0.7], [0.5, 0.4, 0.7], [-0.5, 0.4, 0.7]])
     roof = np.array([0.0, -0.62, 0.7])
-    lines = [(np.zeros(3), corner) for corner in corners]
-    lines += [(corners[k], corners[(k + 1) % 4]) for k in range(4)]
-    lines += [(corners[0], roof), (roof, corners[1])]
+    lines = [(np.zeros(3), corner) for corner in _CORNERS]
+    lines += [(_CORNERS[k], _CORNERS[(k + 1) % 4]) for k in range(4)]
+    lines += [(_CORNERS[0], roof), (roof, _CORNERS[1])]
     ends = centre + size_m * np.array(lines) @ rotation
     return Segments(name, "cameras", ends, one_color(color, len(lines)), width_px)

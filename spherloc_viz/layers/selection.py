@@ -7,7 +7,6 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from spherloc.geometry import tangent_basis
 from spherloc.trace import ConsensusStage, Trace, TranslationStage, YawStage
 from spherloc_viz import style
 from spherloc_viz.layers import ring
@@ -19,13 +18,13 @@ IntArray = NDArray[np.int64]
 LAYER = "selection"
 DOTS = ("map/points", "sphere/bearings")
 """What shows single correspondences: the map point and the bearing."""
-HALO = 2.1
+HALO = 1.8
 """Radius of the ring around a dot, in radii of the dot."""
 INNER, OUTER = 1.06, 1.24
 """Radii of the band of the selected arcs, in sphere radii: between the sphere and the ring of all arcs."""
 STEP_RAD = np.radians(4.0)
-CORNERS = 24
-"""Of each circle around a ball."""
+CORNERS = 48
+"""Of the level circle around a ball."""
 
 
 def with_selection(picture: Picture, trace: Trace, selected: tuple[int, ...]) -> Picture:
@@ -129,7 +128,7 @@ def _sphere_centre(items: dict[str, SceneItem]) -> FloatArray | None:
 
 
 def _balls(items: dict[str, SceneItem], trace: Trace, selected: tuple[int, ...]) -> tuple[list[SceneItem], str]:
-    """Balls of camera positions as circles, which are seen through other balls; the smaller half, as all else is."""
+    """Balls of camera positions by their level circles, seen through other balls; of many the smaller half."""
     stage = trace.stage(TranslationStage)
     if stage is None or not any(isinstance(item, Balls) and item.layer == "balls" for item in items.values()):
         return [], ""
@@ -138,10 +137,9 @@ def _balls(items: dict[str, SceneItem], trace: Trace, selected: tuple[int, ...])
     small = by_size[: max(1, len(by_size) // 2)] if len(by_size) > style.MAX_SELECTED_BALLS else by_size
     drawn = even(small, style.MAX_SELECTED_BALLS)
     turns = np.linspace(0.0, 2.0 * np.pi, CORNERS + 1)
-    across = tangent_basis(np.eye(3))
-    circles = np.stack([np.cos(turns), np.sin(turns)], axis=1) @ across  # (3, CORNERS + 1, 3)
-    lines = stage.centres_m[drawn][:, None, None] + stage.radii_m[drawn][:, None, None, None] * circles
-    ends = np.stack([lines[..., :-1, :], lines[..., 1:, :]], axis=-2).reshape(-1, 2, 3)
+    level = np.column_stack([np.cos(turns), 0.0 * turns, np.sin(turns)])
+    lines = stage.centres_m[drawn][:, None] + stage.radii_m[drawn][:, None, None] * level
+    ends = np.stack([lines[:, :-1], lines[:, 1:]], axis=2).reshape(-1, 2, 3)
     marks = Segments("selection/balls", LAYER, ends, one_color(style.SELECTED, len(ends)), 2.0)
     return [marks], _note("balls", len(drawn), len(own), agreeing)
 

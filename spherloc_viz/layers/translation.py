@@ -13,7 +13,7 @@ from spherloc_viz.layers.primitives import FloatArray, Segments
 
 SIZES = (3, 10, 30, 100, 300)
 """How many balls are shown before all are."""
-CLIQUE_SIZES = (2, 5, 10, 30, 100)
+CLIQUE_SIZES = (3, 10, 30, 100)
 """How many members of the maximum clique are shown before all are."""
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spherloc.geometry import camera_centre, wrap_angle, yaw_rotation
+from spherloc.geometry import wrap_angle, yaw_rotation
 from spherloc_viz import style
 from spherloc_viz.layers import ring
 from spherloc_viz.layers.arcs import Arcs
@@ -34,11 +34,12 @@ def pair_roots(view: RunView, first: int, second: int) -> PairRoots:
     rho = float(np.hypot(wave[0], wave[1]))
     if rho == 0.0 or abs(wave[2]) > rho:
         return PairRoots(wave, np.zeros(0), np.zeros(0, dtype=bool))
-    yaws = wrap_angle(np.arctan2(wave[1], wave[0]) + np.arccos(-wave[2] / rho) * np.array([1.0, -1.0]))
+    half = float(np.arccos(-wave[2] / rho))
+    yaws = np.asarray(wrap_angle(np.arctan2(wave[1], wave[0]) + half * np.array([1.0, -1.0])))
     # R d = s_i v_i - s_j v_j has both depths positive if both points are in front.
     rays = np.column_stack([vi, -vj])
     depths = np.array([np.linalg.lstsq(rays, yaw_rotation(yaw) @ d, rcond=None)[0] for yaw in yaws])
-    return PairRoots(wave, yaws, (depths > 0.0).all(axis=1))
+    return PairRoots(wave, yaws, np.all(depths > 0.0, axis=1))
 
 
 def charts(view: RunView, arcs: Arcs, chart: Callable[[RunView, np.ndarray], Chart]) -> dict[str, Callable[[], Chart]]:
@@ -75,7 +76,7 @@ def twins(view: RunView, arcs: Arcs) -> Frame:
     other = example[np.argmin(arcs.in_clique[example])]
     return Frame(
         f"{_why(roots, len(example))} Of all {stage.pairs_total:,} pairs, {several:,} have two arcs or more, {one:,} "
-        f"have one, and {none:,} have none, since no yaw puts both points in front.",
+        f"have one, and {none:,} have none.",
         "θ = atan2(d2, d1) ± arccos(−d3 / √(d1² + d2²))   (Eq. 22-23)",
         *_shown(view, (first, second), 0.5 * float(stage.lo_rad[other] + stage.hi_rad[other])),
         note=stage.rule,
@@ -109,16 +110,15 @@ def _shown(view: RunView, numbers: tuple[int, int], yaw_rad: float) -> tuple[Flo
 
 def _items(view: RunView, arcs: Arcs, shown: np.ndarray, numbers: tuple[int, int]) -> tuple[SceneItem, ...]:
     """Some arcs of the pair with a spoke through each, and the line between its points."""
-    centre = camera_centre(view.standing(np.eye(3)))
     middles = 0.5 * (arcs.stage.lo_rad + arcs.stage.hi_rad)[shown]
-    hands = [ring.spoke("ring/hand", view, centre, float(yaw), style.SAMPLE).points for yaw in middles]
+    hands = [ring.spoke("ring/hand", view, view.middle, float(yaw), style.SAMPLE).points for yaw in middles]
     marked = np.ones(len(shown), dtype=bool)
     ends = view.points[list(numbers)][None]
     ids = np.array([numbers], dtype=np.int64)
     return (
-        arcs.drawn(view, centre, shown, marked, style.SAMPLE),
-        ring.outline("ring/overlap", ring.circle(view, centre, np.zeros(())), style.SPHERE),
+        arcs.drawn(view, shown, marked, style.SAMPLE),
+        ring.outline("ring/overlap", ring.circle(view, view.middle, np.zeros(())), style.SPHERE),
         Segments("ring/hand", "yaw ring", np.concatenate(hands), one_color(style.SAMPLE, len(hands)), 4.0),
-        *ring.spokes(view, centre, None),
+        *ring.spokes(view, view.middle, None),
         Segments("pairs/sample", "pairs", ends, one_color(style.SAMPLE, 1), 3.0, ids=ids),
     )

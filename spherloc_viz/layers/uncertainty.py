@@ -70,7 +70,7 @@ def _ellipsoid(view: RunView, frame: Frame, half_axes: FloatArray, factor: int) 
     text = f"{SIGMAS:.0f} σ" if factor == 1 else f"{SIGMAS:.0f} σ × {factor}"
     return [
         Segments("uncertainty/ellipsoid", LAYER, ends, one_color(style.ESTIMATE, len(ends)), 1.5),
-        Label("uncertainty/sigmas", LAYER, top, text, 0.08 * view.sphere_m),
+        Label("uncertainty/sigmas", LAYER, top, text, 0.055 * view.sphere_m),
     ]
 
 

@@ -4,13 +4,13 @@ from functools import partial
 
 import numpy as np
 
-from spherloc.geometry import camera_centre, yaw_rotation
+from spherloc.geometry import yaw_rotation
 from spherloc.trace import YawStage
 from spherloc_viz import style
 from spherloc_viz.layers import ring, twins
 from spherloc_viz.layers.arcs import Arcs, IndexArray
 from spherloc_viz.layers.frame import Frame, Plan, RunView, growing
-from spherloc_viz.layers.primitives import Chart, FloatArray, SceneItem, Segments
+from spherloc_viz.layers.primitives import Chart, SceneItem
 
 SIZES = (10, 30, 100, 300, 1000, 3000)
 """How many arcs are shown before all are."""
@@ -61,14 +61,15 @@ def _some(view: RunView, arcs: Arcs, size: int) -> Frame:
         note += f" {len(drawn)} of these {size:,} are drawn."
     most, off = len(found.clique), ring.off_truth(view, found.yaw_rad)
     return Frame(
-        f"With {size:,} of {len(arcs):,} arcs on the ring, at most {most:,} overlap, at {np.degrees(found.yaw_rad):.2f}°"
-        f"{off}. Arcs of wrong pairs lie anywhere, while those of right matches all hold the true yaw.",
+        f"With {size:,} of {len(arcs):,} arcs on the ring, at most {most:,} overlap, at "
+        f"{np.degrees(found.yaw_rad):.2f}°{off}. "
+        "Arcs of wrong pairs lie anywhere, while those of right matches all hold the true yaw.",
         f"max over θ of Σ 1(|f(θ)| ≤ τ) = {most:,}   (Eq. 34)",
         start,
         view.colors(style.UNDECIDED),
         view.nobody(),
         note=note,
-        items=_ring(view, arcs, start, drawn, found.overlap),
+        items=_ring(view, arcs, drawn, found.overlap),
     )
 
 
@@ -78,16 +79,16 @@ def _all(view: RunView, arcs: Arcs) -> Frame:
     note = stage.rule
     if len(drawn) < count:
         note += f" {len(drawn)} of {count:,} arcs, taken evenly from all pairs, are drawn."
-    width = np.degrees(float(np.median(stage.hi_rad - stage.lo_rad)))
+    width = np.degrees(arcs.median_width_rad)
     return Frame(
-        f"Two matches fix the yaw up to their noise: {stage.pairs_total:,} pairs give {count:,} arcs, {width:.1f}° wide "
-        "at the median. The ring shows where the camera would look; the outline counts the arcs.",
+        f"Two matches fix the yaw up to their noise: {stage.pairs_total:,} pairs give {count:,} arcs, {width:.1f}° "
+        "wide at the median. The ring shows where the camera would look; the outline counts the arcs.",
         "|d1 cos θ + d2 sin θ + d3| ≤ τ   (Eq. 22, 33)",
         start,
         view.colors(style.UNDECIDED),
         view.nobody(),
         note=note,
-        items=_ring(view, arcs, start, drawn, stage.overlap),
+        items=_ring(view, arcs, drawn, stage.overlap),
     )
 
 
@@ -99,7 +100,7 @@ def _hand(view: RunView, arcs: Arcs, stops: IndexArray) -> Frame:
     turned, drawn = view.standing(yaw_rotation(yaw)), arcs.spread(style.MAX_DRAWN_ARCS)
     met = arcs.over(drawn, np.radians(lo), np.radians(hi))
     mean = float(np.sum(arcs.stage.hi_rad - arcs.stage.lo_rad)) / (2 * np.pi)
-    items = _ring(view, arcs, turned, drawn, counts, met, style.SAMPLE)
+    items = _ring(view, arcs, drawn, counts, met, style.SAMPLE)
     return Frame(
         f"Turned to {lo:.2f}°, the hand meets up to {here:,} of {len(arcs):,} arcs within a quarter of a degree, the "
         f"most within 10° on either side. {_so_far(counts, stops)}",
@@ -108,7 +109,7 @@ def _hand(view: RunView, arcs: Arcs, stops: IndexArray) -> Frame:
         view.colors(style.UNDECIDED),
         view.nobody(),
         note=f"A yaw at random lies in {mean:,.0f} arcs on average. {len(drawn)} arcs are drawn; pink ones are met.",
-        items=(*items, ring.spoke("ring/hand", view, camera_centre(turned), yaw, style.SAMPLE)),
+        items=(*items, ring.spoke("ring/hand", view, view.middle, yaw, style.SAMPLE)),
     )
 
 
@@ -132,7 +133,7 @@ def _clique(view: RunView, arcs: Arcs) -> Frame:
         note += f" An even sample of {len(drawn)} of {count:,} arcs is drawn, half of them from the clique."
     interval = np.degrees(stage.best_rad[1] - stage.best_rad[0])
     off = ring.off_truth(view, stage.yaw_rad)
-    items = _ring(view, arcs, turned, drawn, stage.overlap, arcs.in_clique[drawn], style.CLIQUE)
+    items = _ring(view, arcs, drawn, stage.overlap, arcs.in_clique[drawn], style.CLIQUE, marked_first=True)
     return Frame(
         f"{len(stage.clique):,} arcs overlap at {np.degrees(stage.yaw_rad):.2f}°{off}; no other yaw lies in more. "
         f"They are a maximum clique of the rotation graph and agree on an interval of {interval:.2g}°.",
@@ -141,25 +142,25 @@ def _clique(view: RunView, arcs: Arcs) -> Frame:
         view.colors(style.UNDECIDED, (view.mask(stage.pairs[stage.clique]), style.CLIQUE)),
         view.nobody(),
         note=note,
-        items=(*items, ring.spoke("ring/estimate", view, camera_centre(turned), stage.yaw_rad, style.ESTIMATE)),
+        items=(*items, ring.spoke("ring/estimate", view, view.middle, stage.yaw_rad, style.ESTIMATE)),
     )
 
 
 def _ring(
     view: RunView,
     arcs: Arcs,
-    cam_from_map: FloatArray,
     drawn: IndexArray,
     counts: np.ndarray,
     marked: np.ndarray | None = None,
     mark: style.RGB = style.UNDECIDED,
+    marked_first: bool = False,
 ) -> tuple[SceneItem, ...]:
     """Some arcs, those that are marked in their colour, the outline of the counts, and the true yaw if it is known."""
-    centre = camera_centre(cam_from_map)
     heights = ring.by_degree(counts)
-    line = ring.circle(view, centre, heights / max(1, int(heights.max())))
-    band: Segments = arcs.drawn(view, centre, drawn, np.zeros(len(drawn), bool) if marked is None else marked, mark)
-    return band, ring.outline("ring/overlap", line, style.SPHERE), *ring.spokes(view, centre, None)
+    line = ring.circle(view, view.middle, heights / max(1, int(heights.max())))
+    mask = np.zeros(len(drawn), dtype=bool) if marked is None else marked
+    band = arcs.drawn(view, drawn, mask, mark, marked_first)
+    return band, ring.outline("ring/overlap", line, style.SPHERE), *ring.spokes(view, view.middle, None)
 
 
 def _growing_chart(view: RunView, arcs: Arcs, size: int) -> Chart:

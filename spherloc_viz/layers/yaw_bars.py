@@ -1,4 +1,4 @@
-"""What a run says about yaw: curves over the whole circle, and the arcs of pairs near a yaw, stacked as bars."""
+"""The arcs of feasible yaw of pairs of matches that lie in a window of the circle, stacked as bars."""
 
 from dataclasses import dataclass, replace
 
@@ -7,22 +7,15 @@ from numpy.typing import NDArray
 
 from spherloc.bounds import bounds_of
 from spherloc.consensus.yaw_arcs import yaw_arcs
-from spherloc.geometry import wrap_angle, yaw_of
-from spherloc.trace import ConsensusStage, RansacStage, Trace, YawStage
-from spherloc_viz import style
-from spherloc_viz.layers import ring
-from spherloc_viz.layers.frame import RunView, even
-from spherloc_viz.layers.primitives import Curve, FloatArray
+from spherloc.geometry import wrap_angle
+from spherloc.trace import Trace, YawStage
+from spherloc_viz.layers.primitives import FloatArray
+from spherloc_viz.layers.yaw_story import ALL, Window, YawStory, window_around
 
 IntArray = NDArray[np.int64]
-Window = tuple[float, float]
-"""Yaws from the first, in [-180, 180) degrees, to the second, which exceeds 180 where the window crosses the seam."""
-
-ALL: Window = (-180.0, 180.0)
 WIDTHS_DEG = (1.0, 2.0, 4.0, 6.0, 10.0, 20.0, 30.0, 60.0, 120.0)
 """Of the window around the peak."""
-LEAST_WIDTH_DEG = 0.02
-MOST_BARS = 72
+MOST_BARS = 60
 MOST_CHOSEN = 24
 """Bars that a selection may take of all."""
 MOST_MATCHES, MOST_INLIERS = 32, 20
@@ -30,22 +23,6 @@ MOST_MATCHES, MOST_INLIERS = 32, 20
 KINDS = ("both right", "one wrong", "both wrong")
 CELLS = 240
 """Places across the window by which bars are packed into rows."""
-
-
-@dataclass(frozen=True, eq=False)
-class YawStory:
-    """What a run says about yaw, as curves over -180 to 180 degrees."""
-
-    title: str
-    y_label: str
-    curves: tuple[Curve, ...]
-    """Steps and levels over the whole circle; no markers."""
-    hypotheses: tuple[tuple[float, int, str, str], ...]
-    """Yaw (degrees), correspondences explained, name and key of the step (or "") of every pose that was tried."""
-    top: float
-    """The largest value."""
-    estimate_deg: float | None
-    truth_deg: float | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +41,7 @@ class Arcs:
 
 @dataclass(frozen=True, eq=False)
 class Bars:
-    """P pairs with an arc in a window, and their arcs."""
+    """P pairs, with an arc in a window or selected, and all of their arcs."""
 
     pairs: IntArray
     """(P, 2) correspondences of the problem."""
@@ -89,47 +66,6 @@ class Bars:
     def rows(self) -> int:
         """How many rows there are."""
         return int(self.row.max(initial=-1)) + 1
-
-
-def yaw_story(trace: Trace) -> YawStory:
-    """The curves of a run."""
-    truth, estimate = _truth_deg(trace), None
-    if trace.cam_from_map is not None:
-        estimate = _yaw_deg(trace, trace.cam_from_map)
-    yaw, exact, ransac = trace.stage(YawStage), trace.stage(ConsensusStage), trace.stage(RansacStage)
-    curves: tuple[Curve, ...] = ()
-    tried: tuple[tuple[float, int, str, str], ...] = ()
-    title, y_label = "No stage of this run looked at the yaw", "matches"
-    if yaw is not None:
-        title, y_label = "Arcs that overlap at each yaw", "arcs"
-        curves = (ring.step_curve("arcs that overlap", yaw.overlap),)
-        estimate = float(np.degrees(yaw.yaw_rad))
-    elif exact is not None:
-        title, best = "No pose with this yaw explains more than", int(exact.support.max(initial=exact.seed_support))
-        ends = np.array(ALL)
-        level = Curve("best pose", ends, np.full(2, float(best)), style.INLIER, "level")
-        curves = (ring.step_curve("bound", exact.bound), level)
-        poses = zip(exact.cam_from_map, exact.support.tolist(), strict=True)
-        tried = tuple((_yaw_deg(trace, pose), support, "verified pose", "") for pose, support in poses)
-    elif ransac is not None:
-        title = "Yaw of each best hypothesis so far"
-        counts = np.count_nonzero(ransac.inlier_masks, axis=1).tolist()
-        rows = zip(ransac.cam_from_map, counts, ransac.improved_at.tolist(), strict=True)
-        tried = tuple(
-            (_yaw_deg(trace, pose), count, f"sample {at + 1:,}", f"sample-{k}")
-            for k, (pose, count, at) in enumerate(rows, 1)
-        )
-    values = [float(curve.y.max(initial=0.0)) for curve in curves] + [float(count) for _, count, *_ in tried]
-    return YawStory(title, y_label, curves, tried, max([1.0, *values]), estimate, truth)
-
-
-def _yaw_deg(trace: Trace, cam_from_map: FloatArray) -> float:
-    return float(np.degrees(yaw_of(trace.problem.aligned.align_pose(cam_from_map)[:, :3])))
-
-
-def _truth_deg(trace: Trace) -> float | None:
-    truth = RunView(trace).truth
-    return None if truth is None else float(np.degrees(yaw_of(truth[:, :3])))
 
 
 def right_ones(trace: Trace) -> tuple[NDArray[np.bool_], str]:
@@ -166,10 +102,18 @@ def _members(trace: Trace, selected: tuple[int, ...]) -> IntArray:
     usable = trace.problem.aligned.index
     if len(usable) <= MOST_MATCHES:
         return usable
-    chosen = np.array([number for number in selected if trace.problem.usable[number]][: MOST_MATCHES // 3], np.int64)
-    inliers = even(np.flatnonzero(trace.inlier_mask), MOST_INLIERS)
-    known = np.union1d(chosen, inliers).astype(np.int64)
-    return np.union1d(known, even(np.setdiff1d(usable, known), MOST_MATCHES - len(known))).astype(np.int64)
+    wanted = np.zeros(len(trace.problem), dtype=bool)
+    wanted[[number for number in selected if trace.problem.usable[number]][: MOST_MATCHES // 3]] = True
+    wanted[sample(np.flatnonzero(trace.inlier_mask), MOST_INLIERS)] = True
+    others = usable[~wanted[usable]]
+    wanted[sample(others, MOST_MATCHES - int(np.count_nonzero(wanted)))] = True
+    return np.flatnonzero(wanted)
+
+
+def sample(indices: IntArray, count: int) -> IntArray:
+    """At most ``count`` of the indices, evenly spaced."""
+    count = min(count, len(indices))
+    return indices[np.arange(count) * len(indices) // max(1, count)]
 
 
 def peak_window(story: YawStory, arcs: Arcs) -> Window:
@@ -187,15 +131,6 @@ def peak_window(story: YawStory, arcs: Arcs) -> Window:
     return window_around(step * round(story.estimate_deg / step), width)
 
 
-def window_around(middle_deg: float, width_deg: float) -> Window:
-    """The window of that middle and width, at most the circle."""
-    if not width_deg < 359.0:
-        return ALL
-    width = max(width_deg, LEAST_WIDTH_DEG)
-    low = round((middle_deg - 0.5 * width + 180.0) % 360.0 - 180.0, 9)
-    return low, low + width
-
-
 def _overlapping(arcs: Arcs, low_rad: float, high_rad: float) -> IntArray:
     """Indices of the arcs that reach into a window from -pi <= low < pi to high <= low + 2 pi."""
     lo, hi, circle = arcs.lo_rad, arcs.hi_rad, 2.0 * np.pi
@@ -204,18 +139,25 @@ def _overlapping(arcs: Arcs, low_rad: float, high_rad: float) -> IntArray:
 
 
 def bars_in(trace: Trace, arcs: Arcs, window: Window, selected: tuple[int, ...], most: int = MOST_BARS) -> Bars:
-    """The arcs in a window: those of selected pairs first, then an even sample with an equal share of each kind."""
+    """Selected pairs, wherever their arcs are, and pairs with an arc in a window: an even sample with an equal share of
+    each kind.
+    """
     right, _ = right_ones(trace)
     inside = _overlapping(arcs, *np.radians(window).tolist())
     pairs = arcs.pairs[inside]
     kind = 2 - right[pairs[:, 0]].astype(np.int64) - right[pairs[:, 1]]
-    of_kind = [np.flatnonzero(kind == k) for k in range(len(KINDS))]
-    chosen = _chosen(pairs, selected)
-    taken = even(np.flatnonzero(chosen), MOST_CHOSEN)
-    drawn = np.union1d(taken, _even_shares([places[~chosen[places]] for places in of_kind], most - len(taken)))
-    drawn = drawn.astype(np.int64)
+    of_kind = [inside[kind == k] for k in range(len(KINDS))]
+    drawn = np.zeros(len(arcs.pairs), dtype=bool)
+    if selected:
+        drawn[sample(np.flatnonzero(_chosen(arcs.pairs, selected)), MOST_CHOSEN)] = True
+    room = most - int(np.count_nonzero(drawn[inside]))
+    for place, group in enumerate(sorted(of_kind, key=len)):
+        some = sample(group[~drawn[group]], room // (len(KINDS) - place))
+        drawn[some] = True
+        room -= len(some)
     codes = arcs.pairs[:, 0].astype(np.int64) * len(right) + arcs.pairs[:, 1]
-    shown = np.unique(codes[inside[drawn]])
+    shown = codes[drawn]
+    shown = shown[np.diff(shown, prepend=-1) > 0]
     first, last = np.searchsorted(codes, shown, "left"), np.searchsorted(codes, shown, "right")
     owner = np.repeat(np.arange(len(shown)), last - first)
     mine = np.arange(len(owner)) - np.repeat(np.cumsum(last - first) - (last - first), last - first) + first[owner]
@@ -241,22 +183,6 @@ def _chosen(pairs: NDArray[np.integer], selected: tuple[int, ...]) -> NDArray[np
         return np.zeros(len(pairs), dtype=bool)
     held = np.isin(pairs, selected)
     return np.all(held, axis=1) if len(selected) > 1 else np.any(held, axis=1)
-
-
-def _even_shares(groups: list[np.ndarray], room: int) -> np.ndarray:
-    """At most ``room`` of all, an even sample of every group, with equal shares where all do not fit."""
-    out, left = [], room
-    for place, group in enumerate(sorted(groups, key=len)):
-        share = min(len(group), left // (len(groups) - place))
-        left -= share
-        out.append(even(group, share) if share else group[:0])
-    return np.concatenate(out)
-
-
-def places_of(yaw_deg: float, window: Window) -> list[float]:
-    """Where a yaw is in a window: none, one, or two if it is at both ends of the circle."""
-    low, high = window
-    return [yaw for yaw in (yaw_deg - 360.0, yaw_deg, yaw_deg + 360.0) if low <= yaw <= high]
 
 
 def spans_in(lo_deg: FloatArray, hi_deg: FloatArray, window: Window) -> tuple[IntArray, FloatArray, FloatArray]:

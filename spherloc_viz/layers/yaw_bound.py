@@ -4,14 +4,14 @@ from functools import partial
 
 import numpy as np
 
-from spherloc.geometry import camera_centre, yaw_rotation
+from spherloc.geometry import yaw_rotation
 from spherloc.trace import ConsensusStage
 from spherloc_viz import style
 from spherloc_viz.layers import ring
 from spherloc_viz.layers.frame import Frame, Plan, RunView, one_color
-from spherloc_viz.layers.primitives import Chart, Curve, FloatArray, SceneItem
+from spherloc_viz.layers.primitives import Chart, Curve, SceneItem
 
-PEAKS = 20
+PEAKS = 16
 """At most so many peaks of the bound are visited."""
 REACH = 10
 """A peak is the highest within so many quarters of a degree."""
@@ -69,7 +69,7 @@ def _bound(view: RunView, stage: ConsensusStage) -> Frame:
         view.colors(style.UNDECIDED),
         view.nobody(),
         note=_effort(stage),
-        items=_ring(view, stage, start),
+        items=_ring(view, stage),
     )
 
 
@@ -103,8 +103,8 @@ def _peak(view: RunView, stage: ConsensusStage, rank: int, place: int, peaks: in
         view.nobody(),
         note=f"Yaws are searched by falling bound until none could hide a better pose.{rest}",
         items=(
-            *_ring(view, stage, turned, place),
-            ring.spoke("ring/hand", view, camera_centre(turned), yaw, style.SAMPLE),
+            *_ring(view, stage, place),
+            ring.spoke("ring/hand", view, view.middle, yaw, style.SAMPLE),
         ),
     )
 
@@ -128,12 +128,10 @@ def _yaw(stage: ConsensusStage) -> float | None:
     return stage.yaw_rad if len(stage.support) else None
 
 
-def _ring(
-    view: RunView, stage: ConsensusStage, cam_from_map: FloatArray, place: int | None = None
-) -> tuple[SceneItem, ...]:
+def _ring(view: RunView, stage: ConsensusStage, place: int | None = None) -> tuple[SceneItem, ...]:
     """The bound around the sphere, where it is largest in the colour of the clique, or in that of a sample at one
     place, and the best pose's support as a circle: what pokes out of it could hide a better pose."""
-    centre, heights, most = camera_centre(cam_from_map), ring.by_degree(stage.bound), max(1, highest_bound(stage))
+    centre, heights, most = view.middle, ring.by_degree(stage.bound), max(1, highest_bound(stage))
     feet, tops = ring.circle(view, centre, np.zeros(())), ring.circle(view, centre, heights / most)
     colors = one_color(style.UNDECIDED, len(feet))
     if place is None:

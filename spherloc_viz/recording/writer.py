@@ -6,7 +6,7 @@ import subprocess
 import tempfile
 import time
 import uuid
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -17,7 +17,7 @@ from spherloc.errors import RecordingError
 from spherloc.metrics import evaluate
 from spherloc.trace import Trace
 from spherloc_viz.layers import paint, steps
-from spherloc_viz.layers.primitives import Picture
+from spherloc_viz.layers.primitives import Picture, Stop
 from spherloc_viz.recording.data import data_chunks
 from spherloc_viz.recording.drawing import drawing_chunks
 from spherloc_viz.recording.layout import APPLICATION_ID, chart_labels, layout_file, table_names, with_layout
@@ -38,7 +38,7 @@ def write_recording(trace: Trace, path: Path) -> Path:
     """
     path = Path(path)
     part = path.with_name(f"{path.name}.{uuid.uuid4().hex[:8]}.part")
-    pictures = [paint(trace, index) for index in range(len(steps(trace)))]
+    pictures = {index: paint(trace, index) for index in recorded_steps(steps(trace))}
     try:
         content = _content(trace, pictures)
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -57,20 +57,35 @@ def write_recording(trace: Trace, path: Path) -> Path:
     return path
 
 
-def _content(trace: Trace, pictures: list[Picture]) -> bytes:
+def recorded_steps(stops: Sequence[Stop]) -> list[int]:
+    """The steps that a recording shows: all but those of a series, of which it has three.
+
+    Series are steps whose keys differ in a number only, as "yaw-arcs-10" and "yaw-arcs-30" do. Of more and more arcs,
+    balls or members of a clique, and of one peak after another, the first, the middle and the last say it all. The
+    samples of RANSAC have no such order and are all there. Between two steps a viewer shows the earlier one.
+    """
+    series: dict[str, list[int]] = {}
+    for index, stop in enumerate(stops):
+        name = stop.key if stop.key.startswith("sample-") else re.sub(r"\d+$", "#", stop.key)
+        series.setdefault(name, []).append(index)
+    return sorted({own[k] for own in series.values() for k in (0, len(own) // 2, -1)})
+
+
+def _content(trace: Trace, pictures: Mapping[int, Picture]) -> bytes:
     with tempfile.TemporaryDirectory(prefix="spherloc-") as folder:
         path = Path(folder) / "run.rrd"
+        shown = list(pictures.values())
         stream = LazyChunkStream.from_iter(_chunks(trace, pictures))
         stream.write_rrd(path, application_id=APPLICATION_ID, recording_id=str(uuid.uuid4()))
-        return with_layout(path, layout_file(chart_labels(pictures), table_names(pictures)))
+        return with_layout(path, layout_file(chart_labels(shown), table_names(shown)))
 
 
-def _chunks(trace: Trace, pictures: list[Picture]) -> Iterator[Chunk]:
+def _chunks(trace: Trace, pictures: Mapping[int, Picture]) -> Iterator[Chunk]:
     metrics = evaluate(trace)
     yield from property_chunks(trace, metrics, datetime.now(UTC))
     yield from data_chunks(trace)
     yield from drawing_chunks(pictures)
-    text = outcome_text(trace.message, outcome(metrics), pictures[-1].tables)
+    text = outcome_text(trace.message, outcome(metrics), pictures[max(pictures)].tables)
     document = rr.TextDocument.columns(text=[text], media_type=[rr.MediaType.MARKDOWN])
     yield Chunk.from_columns("/outcome", [], document)
 

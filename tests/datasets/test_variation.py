@@ -164,7 +164,7 @@ def test_what_belongs_to_a_match_goes_with_it(scene, tmp_path):
         ({"true_camera": (0.0, 1e9, 0.0, 0.0)}, "true_camera is .* give its yaw"),
         ({"true_camera": (0.0, float("nan"), 0.0, 0.0)}, "true_camera is .* give its yaw"),
         ({"true_camera": (0.0, 1.0)}, "true_camera is .* give its yaw"),
-        ({"true_camera": (0.0, 90.0, 0.0, 0.0)}, "random points are visible"),
+        ({"true_camera": (0.0, 0.0, 90.0, 0.0), "cloud_height_m": 0.1}, "no points are visible to the camera for 40"),
     ],
 )
 def test_what_cannot_be_is_a_sentence(scene, variation, sentence):

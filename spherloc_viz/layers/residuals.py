@@ -1,0 +1,175 @@
+"""How far matches are from a run's pose, how well its inliers are chosen, and how RANSAC came to its best sample."""
+
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import pairwise
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spherloc.bounds import bounds_of
+from spherloc.geometry import transform
+from spherloc.metrics import precision_recall_f1
+from spherloc.refine import residuals_px
+from spherloc.trace import RansacStage, Trace
+from spherloc_viz.layers.primitives import FloatArray, Table
+from spherloc_viz.layers.yaw_bars import right_ones
+
+IntArray = NDArray[np.int64]
+Unit = Literal["px", "deg"]
+
+BINS_A_DECADE = 6
+DECADES: dict[Unit, tuple[int, int]] = {"px": (-1, 3), "deg": (-2, 2)}
+"""Powers of ten between which residuals have bins of their own."""
+
+
+@dataclass(frozen=True, eq=False)
+class Histogram:
+    """Residuals of N matches in B bins: the first holds all below its upper edge, the last all from its lower edge on,
+    and the matches without a residual.
+    """
+
+    unit: Unit
+    edges: FloatArray
+    """(B - 1,) edges between the bins."""
+    bin: IntArray
+    """(N,) bin of every match."""
+    right: IntArray
+    """(B,) right matches."""
+    wrong: IntArray
+    """(B,) wrong ones."""
+    bound: tuple[float, float, float]
+    """The smallest, the median and the largest bound of a match: one number where the image stretches alike and gravity
+    is exact."""
+
+
+@lru_cache(maxsize=4)
+def bin_words(unit: Unit) -> tuple[str, ...]:
+    """What each bin holds, in words."""
+    edges = [f"{float(f'{edge:.2g}'):g}" for edge in edges_of(unit)]
+    sign, lost = ("°", "without a bearing") if unit == "deg" else (" px", "more than 90° off")
+    inner = (f"{low} to {high}{sign}" for low, high in pairwise(edges))
+    return f"less than {edges[0]}{sign}", *inner, f"{edges[-1]}{sign} or more, or {lost}"
+
+
+def edges_of(unit: Unit) -> FloatArray:
+    """The edges (B - 1,) between the bins."""
+    low, high = DECADES[unit]
+    return 10.0 ** (low + np.arange((high - low) * BINS_A_DECADE + 1) / BINS_A_DECADE)
+
+
+@dataclass(frozen=True, eq=False)
+class Residuals:
+    """The matches of a run at its pose."""
+
+    px: FloatArray
+    """(N,) reprojection errors, px to first order; inf more than 90 degrees off and where the pixel has no bearing."""
+    deg: FloatArray
+    """(N,) angles between the bearing and the direction to the point, degrees; inf where there is no bearing."""
+    histograms: tuple[Histogram, Histogram]
+    """In px and in degrees."""
+    judged: str
+    """Who says which matches are right: "by the truth" or "by this run's inliers"."""
+    blind: int
+    """Matches whose pixel has no bearing."""
+
+
+@dataclass(frozen=True, eq=False)
+class History:
+    """How RANSAC came to its best hypothesis, and Eq. 28's prediction."""
+
+    drawn: FloatArray
+    """(J,) samples drawn until each improvement."""
+    inliers: FloatArray
+    """(J,)."""
+    iterations: int
+    """Samples drawn in all."""
+    share: float
+    """w, the share of inliers of the last hypothesis."""
+    size: int
+    """n, correspondences in a sample."""
+    clean_at: int | None
+    """Samples drawn until the first improvement by right matches only; None without one, and without the truth."""
+
+    def probability(self, drawn: FloatArray) -> FloatArray:
+        """Eq. 28 for numbers of samples (K,): P = 1 - (1 - w^n)^k."""
+        if self.share >= 1.0:
+            return np.ones_like(drawn)
+        return -np.expm1(drawn * np.log1p(-(self.share**self.size)))
+
+    @property
+    def half_at(self) -> float:
+        """Samples within which half of all runs draw one of inliers only."""
+        if self.share >= 1.0:
+            return 1.0
+        return float(np.log(0.5) / np.log1p(-(self.share**self.size))) if self.share > 0.0 else np.inf
+
+
+def residuals_of(trace: Trace) -> Residuals | None:
+    """The residuals of a run; None if it found no pose."""
+    if trace.cam_from_map is None:
+        return None
+    aligned, problem = trace.problem.aligned, trace.problem
+    px, deg = np.full(len(problem), np.inf), np.full(len(problem), np.inf)
+    px[aligned.index] = residuals_px(aligned, aligned.align_pose(trace.cam_from_map))
+    deg[aligned.index] = _angles_deg(problem.bearings, transform(trace.cam_from_map, problem.points))[aligned.index]
+    right, judged = right_ones(trace)
+    bounds = bounds_of(aligned, trace.options.bound_px)
+    histograms = (
+        histogram("px", px, right, _middle(bounds.pixels)),
+        histogram("deg", deg, right, _middle(np.degrees(bounds.radians))),
+    )
+    return Residuals(px, deg, histograms, judged, int(np.count_nonzero(~problem.usable)))
+
+
+def _middle(values: FloatArray) -> tuple[float, float, float]:
+    """Smallest, median and largest of some values."""
+    ordered = np.sort(values)
+    return float(ordered[0]), float(ordered[len(ordered) // 2]), float(ordered[-1])
+
+
+def _angles_deg(bearings: FloatArray, points: FloatArray) -> FloatArray:
+    """Angles (N,) between unit bearings (N, 3) and the directions to points (N, 3), accurate near 0 and 180."""
+    directions = points / np.sqrt(np.einsum("ni,ni->n", points, points))[:, None]
+    apart, along = bearings - directions, bearings + directions
+    squares = np.einsum("ni,ni->n", apart, apart), np.einsum("ni,ni->n", along, along)
+    return np.degrees(2.0 * np.arctan2(np.sqrt(squares[0]), np.sqrt(squares[1])))
+
+
+def histogram(unit: Unit, values: FloatArray, right: NDArray[np.bool_], bound: tuple[float, float, float]) -> Histogram:
+    """The values (N,), not below 0, in bins of equal factors; what is no finite number is in the last bin."""
+    edges = edges_of(unit)
+    place = np.searchsorted(edges, np.nan_to_num(values, nan=np.inf), "right").astype(np.int64)
+    count = len(edges) + 1
+    of_right = np.bincount(place[right], minlength=count)
+    return Histogram(unit, edges, place, of_right, np.bincount(place, minlength=count) - of_right, bound)
+
+
+def scores_table(trace: Trace) -> Table:
+    """Precision, recall and F1 with their counts, or what is known without the truth."""
+    truth, reported = trace.problem.truth_inliers, trace.inlier_mask
+    found = int(np.count_nonzero(reported))
+    if truth is None:
+        return Table("scores", ("", "matches", ""), (("reported inliers", f"{found:,} of {len(reported):,}", ""),))
+    hits, all_right = int(np.count_nonzero(truth & reported)), int(np.count_nonzero(truth))
+    precision, recall, f1 = (f"{100.0 * value:.1f} %" for value in precision_recall_f1(truth, reported))
+    rows = (
+        ("precision", f"{hits:,} right of {found:,} reported", precision),
+        ("recall", f"{hits:,} reported of {all_right:,} right", recall),
+        ("F1", f"2 × {hits:,} of {found + all_right:,}", f1),
+    )
+    return Table("scores", ("", "matches", ""), rows)
+
+
+def history_of(trace: Trace) -> History | None:
+    """How RANSAC went; None for other runs and where no sample gave a pose."""
+    stage = trace.stage(RansacStage)
+    if stage is None or not len(stage.improved_at):
+        return None
+    inliers = np.count_nonzero(stage.inlier_masks, axis=1).astype(np.float64)
+    drawn, truth = stage.improved_at.astype(np.float64) + 1.0, trace.problem.truth_inliers
+    clean = np.zeros(0, dtype=np.int64) if truth is None else np.flatnonzero(truth[stage.samples].all(axis=1))
+    share = float(inliers[-1]) / len(trace.problem)
+    at = int(drawn[clean[0]]) if len(clean) else None
+    return History(drawn, inliers, max(1, stage.iterations), share, stage.samples.shape[1], at)

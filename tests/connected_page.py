@@ -1,0 +1,111 @@
+"""A page connected to a real viser server, without a browser: it sends what it is told and notes what it gets."""
+
+import asyncio
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import aiohttp
+import msgspec
+import viser
+import zstandard
+
+from spherloc_viz.app.viser_seams import KEY_HEADER
+
+HELLO = {
+    "type": "ViewerCameraMessage",
+    "wxyz": (1.0, 0.0, 0.0, 0.0),
+    "position": (0.0, 0.0, -3.0),
+    "fov": 1.0,
+    "near": 0.01,
+    "far": 100.0,
+    "image_height": 72,
+    "image_width": 128,
+    "look_at": (0.0, 0.0, 0.0),
+    "up_direction": (0.0, -1.0, 0.0),
+}
+
+
+def until(condition: Callable[[], Any]) -> None:
+    """Wait until something is so."""
+    end = time.monotonic() + 60
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+class ConnectedPage:
+    """One client; ``handle`` is viser's of it."""
+
+    def __init__(self, server: viser.ViserServer, key: str) -> None:
+        self._port, self._key = server.get_port(), key
+        self._loop = asyncio.new_event_loop()
+        self._socket: aiohttp.ClientWebSocketResponse | None = None
+        self.answer: Callable[[dict[str, Any]], dict[str, Any] | None] = lambda message: None
+        """Called with every message; what it returns is sent."""
+        self.files: dict[str, bytes] = {}
+        """What was downloaded, by name."""
+        self._names: dict[str, str] = {}
+        known = set(server.get_clients())
+        self._thread = threading.Thread(target=self._loop.run_until_complete, args=(self._live(),), daemon=True)
+        self._thread.start()
+        until(lambda: self._socket is not None)
+        self.send(HELLO)
+        until(lambda: set(server.get_clients()) - known)
+        (number,) = set(server.get_clients()) - known
+        self.handle = server.get_clients()[number]
+
+    async def _live(self) -> None:
+        async with aiohttp.ClientSession() as client:
+            self._socket = await client.ws_connect(
+                f"http://127.0.0.1:{self._port}/",
+                headers={KEY_HEADER: self._key},
+                protocols=[f"viser-v{viser.__version__}"],
+                max_msg_size=0,
+            )
+            async for message in self._socket:
+                for content in _messages(message.data):
+                    self._note(content)
+                    reply = self.answer(content)
+                    if reply is not None:
+                        await self._socket.send_bytes(msgspec.msgpack.encode(reply))
+
+    def _note(self, message: dict[str, Any]) -> None:
+        if message["type"] == "FileTransferStartDownload":
+            self._names[message["transfer_uuid"]] = message["filename"]
+        elif message["type"] == "FileTransferPart":
+            name = self._names[message["transfer_uuid"]]
+            self.files[name] = self.files.get(name, b"") + message["content"]
+
+    def send(self, message: dict[str, Any]) -> None:
+        """Send a message as the page's script would."""
+        assert self._socket is not None
+        sending = self._socket.send_bytes(msgspec.msgpack.encode(message))
+        asyncio.run_coroutine_threadsafe(sending, self._loop).result(60)
+
+    def press(self, button: Any) -> None:
+        """Press a button."""
+        self.send({"type": "GuiUpdateMessage", "uuid": button._impl.uuid, "updates": {"value": True}})
+
+    def upload(self, button: Any, name: str, content: bytes, said: int | None = None, part: int = 100_000) -> None:
+        """Upload a file; ``said`` is the size that is announced."""
+        parts = [content[at : at + part] for at in range(0, len(content), part)]
+        start = {"type": "FileTransferStartUpload", "source_component_uuid": button._impl.uuid, "transfer_uuid": name}
+        size = len(content) if said is None else said
+        self.send(start | {"filename": name, "mime_type": "", "part_count": len(parts), "size_bytes": size})
+        for number, piece in enumerate(parts):
+            message = {"type": "FileTransferPart", "source_component_uuid": button._impl.uuid, "transfer_uuid": name}
+            self.send(message | {"part_index": number, "content": piece})
+
+    def close(self) -> None:
+        """Leave."""
+        if self._socket is not None and not self._socket.closed:
+            asyncio.run_coroutine_threadsafe(self._socket.close(), self._loop).result(60)
+        self._thread.join(60)
+
+
+def _messages(data: bytes) -> list[dict[str, Any]]:
+    """The messages of a packet, without their arrays: two lengths, then msgpack in zstd, then arrays."""
+    length = int.from_bytes(data[8:16], "little")
+    return msgspec.msgpack.decode(zstandard.ZstdDecompressor().decompress(data[16 : 16 + length]))["messages"]

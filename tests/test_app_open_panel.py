@@ -1,0 +1,256 @@
+"""Opening scenes as a page does it: rows are pressed, files are uploaded, and each page keeps to itself."""
+
+import html
+import json
+import re
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import viser
+
+from spherloc_viz.app.open_panel import Opened, OpenPanel
+from spherloc_viz.app.recent import RecentScenes
+from spherloc_viz.app.touch import Touch, Touches
+from spherloc_viz.app.uploads import MOST_BYTES
+from spherloc_viz.app.viser_seams import start_viser, stop_viser
+from tests.connected_page import ConnectedPage, until
+
+ROOT = Path(__file__).resolve().parents[1]
+KEY = "a key of this test"
+CAMERA = '[camera]\nmodel = "equirectangular"\nwidth = 512\nheight = 256\n'
+CSV = "u,v,X,Y,Z\n" + "".join(f"{20 * k + 5},{90 + 7 * k},{k - 5},{k % 3},{4 + k % 5}\n" for k in range(12))
+SCENE = f"""
+kind = "correspondences"
+name = "NAME"
+correspondences = "m.csv"
+{CAMERA}
+[gravity]
+camera = [0, 1, 0]
+map = [0, 0, -1]
+"""
+EVIL = "<img src=x onerror='alert(1)'>.toml"
+
+
+class Visitor:
+    """A connected page with the panel on it."""
+
+    def __init__(self, server: viser.ViserServer, folder: Path, recent: Path) -> None:
+        self.page = ConnectedPage(server, KEY)
+        self.opened: list[Opened] = []
+        self.touches = Touches(self._failed)
+        client = self.page.handle
+        self.panel = OpenPanel(
+            client.gui,
+            client,
+            self.touches,
+            (folder, ROOT / "scenes"),
+            self.opened.append,
+            RecentScenes(recent),
+        )
+        buttons = [widget for widget in client.gui._gui_input_handle_from_uuid.values()]
+        self.matches, self.calibration = (b for b in buttons if isinstance(b, viser.GuiUploadButtonHandle))
+        self.go = next(b for b in buttons if getattr(b, "label", "") == "Open upload")
+        self.settle()
+
+    def _failed(self, error: Exception) -> None:
+        raise error
+
+    def settle(self) -> None:
+        until(lambda: not self.panel._errand._busy)
+
+    def touch(self, words: str) -> None:
+        action, _, argument = words.partition(":")
+        self.touches.deliver(Touch(action, argument, 0.5, 0.5, 0.5, 0.5, False))
+        self.settle()
+
+    @property
+    def rows(self) -> list[str]:
+        """What can be pressed."""
+        return [html.unescape(words) for words in re.findall(r'data-touch="([^"]+)"', self.panel._list.content)]
+
+    @property
+    def said(self) -> str:
+        return self.panel._status.content if self.panel._status.visible else ""
+
+    def close(self) -> None:
+        self.panel.close()
+        self.page.close()
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[viser.ViserServer]:
+    server = start_viser(KEY)
+    yield server
+    stop_viser(server)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    folder = tmp_path / "open"
+    (folder / "sub").mkdir(parents=True)
+    (folder / "m.csv").write_text(CSV)
+    (folder / "a.toml").write_text(SCENE.replace("NAME", "mine"))
+    (folder / EVIL).write_text(SCENE.replace("NAME", EVIL))
+    (folder / "sub" / "bad.toml").write_text('kind = "nonsense"\n')
+    (tmp_path / "secret.toml").write_text(SCENE)
+    return folder
+
+
+@pytest.fixture
+def visitor(server: viser.ViserServer, folder: Path, tmp_path: Path) -> Iterator[Visitor]:
+    visitor = Visitor(server, folder, tmp_path / "recent.json")
+    yield visitor
+    visitor.close()
+
+
+def test_a_scene_is_found_by_its_folder_and_opened(visitor: Visitor, folder: Path) -> None:
+    assert "open-folder:0:0:" in visitor.rows and "open-scene:1:mei_outliers_80.toml" in visitor.rows
+    visitor.touch("open-folder:0:0:")
+    assert {"open-folder:", "open-folder:0:0:sub", "open-scene:0:a.toml"} <= set(visitor.rows)
+    visitor.touch("open-scene:0:a.toml")
+    (opened,) = visitor.opened
+    assert (opened.label, opened.path) == ("mine", folder / "a.toml") and len(opened.scene.problem()) == 12
+    assert visitor.said == ""
+    visitor.touch("open-scene:1:mei_outliers_80.toml")
+    assert visitor.opened[1].label == "MEI fisheye, 80 % outliers"
+
+
+def test_what_was_opened_is_recent_for_all(visitor: Visitor, server: viser.ViserServer, folder: Path) -> None:
+    visitor.touch("open-scene:0:a.toml")
+    recent = visitor.panel._recent._path
+    assert json.loads(recent.read_text()) == [str(folder / "a.toml")]
+    other = Visitor(server, folder, recent)
+    assert other.rows.count("open-scene:0:a.toml") == 1
+    # Elsewhere that folder is not allowed, so what is in it is not offered.
+    stranger = Visitor(server, ROOT / "docs", recent)
+    assert not any(row.endswith(":a.toml") for row in stranger.rows)
+    (folder / "a.toml").unlink()
+    other.touch("open-folder:")
+    assert other.rows.count("open-scene:0:a.toml") == 0
+    other.close()
+    stranger.close()
+
+
+@pytest.mark.parametrize(
+    "words, sentence",
+    [
+        ("open-scene:0:../secret.toml", "not there or not in an allowed folder"),
+        ("open-scene:0:/etc/passwd", "not there or not in an allowed folder"),
+        ("open-scene:7:a.toml", "not allowed any more"),
+        ("open-scene:", "no place in an allowed folder"),
+        ("open-folder:0:0:..", "not there or not in an allowed folder"),
+        ("open-folder:0:0:a.toml", "cannot be read"),
+        ("open-scene:0:sub/bad.toml", "unknown dataset"),
+        ("open-scene:0:sub", "cannot be read"),
+    ],
+)
+def test_what_cannot_be_opened_is_said_and_nothing_more(visitor: Visitor, words: str, sentence: str) -> None:
+    visitor.touch(words)
+    assert sentence in visitor.said and not visitor.opened
+    assert "open-scene:1:mei_outliers_80.toml" in visitor.rows, "the list is still there"
+
+
+def test_names_of_files_are_escaped(visitor: Visitor) -> None:
+    visitor.touch("open-folder:0:0:")
+    assert "<img" not in visitor.panel._list.content and f"open-scene:0:{EVIL}" in visitor.rows
+    visitor.touch(f"open-scene:0:{EVIL}")
+    assert [opened.label for opened in visitor.opened] == [EVIL]
+
+
+def upload(visitor: Visitor, matches: bytes, calibration: bytes | None) -> None:
+    visitor.page.upload(visitor.matches, "my <b>matches</b>.csv", matches, part=200)
+    until(lambda: "matches" in visitor.panel._files)
+    if calibration is not None:
+        visitor.page.upload(visitor.calibration, "camera.toml", calibration)
+        until(lambda: "calibration" in visitor.panel._files)
+    visitor.page.press(visitor.go)
+    until(lambda: visitor.opened or visitor.panel._status.visible)
+    visitor.settle()
+
+
+def test_uploaded_matches_are_opened_on_this_page_only(
+    visitor: Visitor, server: viser.ViserServer, folder: Path
+) -> None:
+    other = Visitor(server, folder, visitor.panel._recent._path)
+    upload(visitor, CSV.encode(), CAMERA.encode())
+    (opened,) = visitor.opened
+    # What stands before a slash is a folder to us.
+    assert opened.label == "uploaded: b>.csv" and len(opened.scene.problem()) == 12 and not other.opened
+    assert "<b>" not in visitor.panel._files_text.content and "12 matches" not in other.panel._list.content
+    assert not opened.path.is_relative_to(folder) and opened.path.is_file()
+    assert RecentScenes(visitor.panel._recent._path).read()[0] == (), "it will be gone, so it is not remembered"
+    visitor.panel.close()
+    assert not opened.path.parent.parent.exists(), "the session's folder goes with it"
+    other.close()
+
+
+def test_a_pasted_calibration_goes_before_an_uploaded_one(visitor: Visitor) -> None:
+    visitor.panel._pasted.value = CAMERA.replace("512", "1024").replace("256", "512")
+    upload(visitor, CSV.encode(), CAMERA.encode())
+    assert visitor.opened[0].scene.problem().camera.width == 1024
+
+
+@pytest.mark.parametrize(
+    "matches, calibration, sentence",
+    [
+        (CSV.encode(), None, "A calibration is missing; upload one."),
+        (b"u,v\n", CAMERA.encode(), "column &#x27;X&#x27; is missing"),
+        (CSV.encode(), b'image = "/etc/passwd"\n' + CAMERA.encode(), "cannot name other files"),
+        (
+            CSV.encode() + b"<script>,1,2,3,4\n",
+            CAMERA.encode(),
+            "line 14: u is &#x27;&lt;script&gt;&#x27;, not a number",
+        ),
+    ],
+)
+def test_a_bad_upload_is_said_in_one_sentence(
+    visitor: Visitor, matches: bytes, calibration: bytes | None, sentence: str
+) -> None:
+    upload(visitor, matches, calibration)
+    assert sentence in visitor.said and not visitor.opened and "<b>" not in visitor.said
+
+
+def test_a_file_too_large_is_turned_away_while_it_arrives(visitor: Visitor) -> None:
+    under_way = visitor.page.handle.gui._current_file_upload_states
+    visitor.page.upload(visitor.matches, "big.csv", b"x" * 300_000, said=MOST_BYTES + 1)
+    until(lambda: "larger than 10 MB" in visitor.said)
+    assert not under_way, "nothing of it is kept"
+    visitor.panel._status.visible = False
+    visitor.page.upload(visitor.matches, "liar.csv", b"x" * 300_000, said=1000)
+    until(lambda: "larger than it said" in visitor.said)
+    time.sleep(0.05)
+    assert not under_way and "matches" not in visitor.panel._files
+    visitor.page.upload(visitor.calibration, "big.yaml", b"#" * 300_000)
+    until(lambda: "big.yaml: larger than 0.26 MB" in visitor.said)
+    assert "calibration" not in visitor.panel._files
+
+
+def test_files_that_never_end_do_not_pile_up(visitor: Visitor) -> None:
+    gui = visitor.page.handle.gui
+    start: dict[str, Any] = {
+        "type": "FileTransferStartUpload",
+        "source_component_uuid": visitor.matches._impl.uuid,
+        "filename": "x",
+        "mime_type": "",
+        "part_count": 5,
+        "size_bytes": 5000,
+    }
+    for number in range(6):
+        visitor.page.send(start | {"transfer_uuid": f"slow-{number}"})
+    until(lambda: "two files are on their way already" in visitor.said.lower())
+    assert len(gui._current_file_upload_states) <= 2
+
+
+def test_real_matches_can_be_uploaded(visitor: Visitor, aria: Path) -> None:
+    table = (aria / "rgb.toml").read_text()
+    visitor.panel._gravity[0].value = "0.878193611531, -0.0180378573705, 0.477965078607"
+    visitor.panel._gravity[1].value = "0 -1 0"
+    visitor.panel._truth.value = " ".join(re.findall(r"-?\d+\.\d+", table[table.index("[truth]") :]))
+    matches = next((aria / "correspondences").glob("camera-rgb*.csv"))
+    upload(visitor, matches.read_bytes(), table[table.index("[camera]") : table.index("[gravity]")].encode())
+    problem = visitor.opened[0].scene.problem()
+    assert problem.truth_cam_from_map is not None and np.isclose(problem.truth_cam_from_map[0, 3], 1.3800606943)
