@@ -3,6 +3,7 @@
 import io
 from collections.abc import Sequence
 
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -11,11 +12,13 @@ from matplotlib.ticker import FuncFormatter, NullFormatter
 from spherloc.experiments.sweep_plan import AXES
 from spherloc.experiments.sweep_summary import Point
 from spherloc_viz.layers.sweep import SweepChart, sweep_charts
-from spherloc_viz.style import css
+from spherloc_viz.style import RGB, css
 
 SIZE_INCHES, DPI = (10.7, 7.6), 120
 """1280 pixels wide."""
 CURVE_MARKERS = "os^Dv<>Phd"
+LIGHTEST = 165.0
+"""Lighter colours, made for the dark page too, are darkened to this luminance on white paper."""
 
 
 def sweep_png(name: str, over: str, labels: Sequence[str], points: Sequence[Point]) -> bytes:
@@ -28,7 +31,7 @@ def sweep_png(name: str, over: str, labels: Sequence[str], points: Sequence[Poin
     charts = sweep_charts(over, labels, points)
     for axes, chart in zip(figure.subplots(2, 2, sharex=True).flat, charts, strict=True):
         _draw(axes, chart, labels)
-    handles, names = charts_legend(figure)
+    handles, names = _legend(figure)
     if names:
         figure.legend(handles, names, loc="outside lower center", ncols=min(4, len(names)), fontsize=10, frameon=False)
     runs = sorted({point.runs for point in points})
@@ -39,7 +42,7 @@ def sweep_png(name: str, over: str, labels: Sequence[str], points: Sequence[Poin
     return file.getvalue()
 
 
-def charts_legend(figure: Figure) -> tuple[list, list[str]]:
+def _legend(figure: Figure) -> tuple[list, list[str]]:
     """Handles and names of all curves of a figure, each name once."""
     found = {}
     for axes in figure.axes:
@@ -59,17 +62,27 @@ def _draw(axes: Axes, drawn: SweepChart, labels: Sequence[str]) -> None:
             axes.axhline(curve.y[0], color=css(curve.color), linewidth=1.2, linestyle=(0, (4, 3)), label=curve.label)
             continue
         marker = CURVE_MARKERS[labels.index(curve.label) % len(CURVE_MARKERS)]
-        axes.fill_between(curve.x, *drawn.bands[curve.label], color=css(curve.color), alpha=0.16, linewidth=0)
+        color = css(_on_paper(curve.color))
+        axes.fill_between(curve.x, *drawn.bands[curve.label], color=color, alpha=0.16, linewidth=0)
         axes.plot(
-            curve.x, curve.y, color=css(curve.color), linewidth=1.8, marker=marker, markersize=5,
+            curve.x, curve.y, color=color, linewidth=1.8, marker=marker, markersize=5,
             markeredgecolor="0.25", markeredgewidth=0.5, label=curve.label,
         )  # fmt: skip
+    if any(np.isnan(curve.y).any() for curve in drawn.chart.curves):
+        axes.text(0.015, 0.97, "gaps: half of the runs have no pose", transform=axes.transAxes, va="top", fontsize=9)
     if drawn.log:
         axes.set_yscale("log")
         axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         axes.yaxis.set_minor_formatter(NullFormatter())
     else:
         axes.set_ylim(-3.0, 103.0)
+
+
+def _on_paper(color: RGB) -> RGB:
+    luminance = 0.299 * color[0] + 0.587 * color[1] + 0.114 * color[2]
+    share = min(1.0, LIGHTEST / max(1.0, luminance))
+    red, green, blue = (round(share * part) for part in color)
+    return red, green, blue
 
 
 QUARTILES = ": median and quartiles of all runs"

@@ -20,6 +20,7 @@ from spherloc.trace import Trace
 from spherloc_viz.app import session as session_module
 from spherloc_viz.app.catalog import Catalog
 from spherloc_viz.app.server import Sessions
+from spherloc_viz.app.services import Services
 from spherloc_viz.app.session import Session
 from spherloc_viz.app.viser_seams import KEY_HEADER, start_viser, stop_viser
 
@@ -120,8 +121,8 @@ class House:
 
     def __init__(self, catalog: Catalog) -> None:
         self.notes = Notes()
-        self.sessions = Sessions(catalog)
-        self.sessions.recorder = self.notes  # type: ignore[assignment]
+        self.services = Services(catalog, recorder=self.notes)  # type: ignore[arg-type]
+        self.sessions = Sessions(self.services)
         self.server = start_viser(KEY)
         self.sessions.attend(self.server)
         self.pages: list[Page] = []
@@ -152,12 +153,12 @@ def house(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[House]:
 
 def shown(session: Session) -> str:
     """The step at hand, the outcome and the status, as HTML."""
-    return session._steps._text.content + session._outcome.content + session._status.content
+    return session._story.steps._text.content + session._story._outcome.content + session._status._line.content
 
 
 def test_only_the_run_that_is_settled_on_is_recorded(house: House) -> None:
     page, session = house.visit()
-    slider = session._scene._outliers
+    slider = session._controls.scene._simulation._outliers
     for percent in range(60, -1, -1):
         page.set(slider, float(percent))
     until(lambda: len(house.notes.traces) == 2)
@@ -182,29 +183,29 @@ def test_steps_can_be_walked_while_a_run_is_solved(house: House, monkeypatch: py
         return estimate(*words)
 
     monkeypatch.setattr(session_module, "estimate", slow)
-    page.set(session._scene._noise, 1.0)
+    page.set(session._controls.scene._simulation._noise, 1.0)
     assert entered.wait(60)
     for noise in np.linspace(1.1, 3.0, 15):
-        page.set(session._scene._noise, float(noise))
-    page.set(session._steps._buttons, "Previous")
+        page.set(session._controls.scene._simulation._noise, float(noise))
+    page.set(session._story.steps._buttons, "Previous")
     until(lambda: "Refinement" in shown(session))
     assert not solved, "and it is still being solved"
     gate.set()
     until(lambda: len(house.notes.traces) == 2)
     assert len(solved) == 2, "of fifteen changes meanwhile only the newest was run"
-    assert session._steps._choice.value.endswith("Refinement"), "the stage is kept"
+    assert session._story.steps._choice.value.endswith("Refinement"), "the stage is kept"
 
 
 def test_stepping_solves_nothing(house: House, monkeypatch: pytest.MonkeyPatch) -> None:
     page, session = house.visit()
     monkeypatch.setattr(session_module, "estimate", lambda *_: pytest.fail("solved again"))
     for button, title in (("Previous", "Refinement"), ("Next", "Outcome"), ("Next", "Outcome")):
-        page.set(session._steps._buttons, button)
-        until(lambda title=title: title in session._steps._choice.value)
-    page.set(session._steps._choice, session._steps._choice.options[0])
-    until(lambda: "The matches" in session._steps._text.content)
-    page.set(session._display._layers["map"], False)
-    until(lambda: not session._painter._drawn["map/points"][0].visible)
+        page.set(session._story.steps._buttons, button)
+        until(lambda title=title: title in session._story.steps._choice.value)
+    page.set(session._story.steps._choice, session._story.steps._choice.options[0])
+    until(lambda: "The matches" in session._story.steps._text.content)
+    page.set(session._controls.display._layers["map"], False)
+    until(lambda: not session._canvas._painter._drawn["map/points"][0].visible)
     assert len(house.notes.traces) == 1
 
 
@@ -213,38 +214,38 @@ def test_play_goes_to_the_end_and_stops(house: House, monkeypatch: pytest.Monkey
 
     monkeypatch.setattr(steps_panel, "PLAY_S", 0.05)
     page, session = house.visit()
-    page.set(session._steps._buttons, "Play")
-    until(lambda: session._steps._playing)
-    until(lambda: not session._steps._playing)
-    until(lambda: session._steps._choice.value.endswith("Outcome"))
-    until(lambda: "Play" in session._steps._buttons.options)
+    page.set(session._story.steps._buttons, "Play")
+    until(lambda: session._story.steps._playing)
+    until(lambda: not session._story.steps._playing)
+    until(lambda: session._story.steps._choice.value.endswith("Outcome"))
+    until(lambda: "Play" in session._story.steps._buttons.options)
 
 
 @pytest.mark.parametrize("seed", ["", "x", "-1", "1.5", "9223372036854775808", "٣", "1" * 400])
 def test_a_wrong_seed_is_a_sentence_and_the_page_goes_on(house: House, seed: str) -> None:
     page, session = house.visit()
     before = session._run.trace
-    page.set(session._scene._seed, seed)
-    until(lambda: session._complaint is not None)
-    assert session._complaint is not None and session._complaint[0].endswith("type one.")
+    page.set(session._controls.scene._seed, seed)
+    until(lambda: session._status._complaint is not None)
+    assert session._status._complaint is not None and session._status._complaint[0].endswith("type one.")
     assert "no whole number" in shown(session) and session._run.trace is before
-    page.set(session._scene._seed, "7")
-    until(lambda: session._complaint is None and len(house.notes.traces) == 2)
+    page.set(session._controls.scene._seed, "7")
+    until(lambda: session._status._complaint is None and len(house.notes.traces) == 2)
     assert house.notes.traces[-1].seed == 7
 
 
 def test_a_wrong_option_is_a_sentence(house: House) -> None:
     page, session = house.visit()
-    page.set(session._estimator._estimator, "ransac-2p (two points)")
+    page.set(session._controls.estimator._estimator, "ransac-2p (two points)")
     until(lambda: session._run is not None and session._run.trace.estimator == "ransac-2p")
-    assert [name for name, folder in session._estimator._folders.items() if folder.visible] == ["ransac-2p"]
-    page.set(session._estimator._options["ransac-2p"]["iterations"].widget, 10**9)
+    assert [name for name, folder in session._controls.estimator._folders.items() if folder.visible] == ["ransac-2p"]
+    page.set(session._controls.estimator._options["ransac-2p"]["iterations"].widget, 10**9)
     until(lambda: "give a whole number up to" in shown(session))
 
 
 def test_unknown_gravity_reaches_the_estimator(house: House) -> None:
     page, session = house.visit()
-    page.set(session._estimator._options["mc"]["gravity_sd_deg"].widget, "unknown (6 DoF)")
+    page.set(session._controls.estimator._options["mc"]["gravity_sd_deg"].widget, "unknown (6 DoF)")
     until(lambda: session._run is not None and session._run.trace.options.gravity_sd_deg == np.inf)
     until(lambda: len(house.notes.traces) == 2)
 
@@ -263,49 +264,49 @@ def test_diagnosis_comes_after_the_picture_and_only_for_the_newest_run(
         return Diagnosis(Cause.AMBIGUOUS, True, "Two poses.", ("Both explain 9.",), "Look twice.", True, RIVAL)
 
     monkeypatch.setattr(session_module, "diagnose", slow)
-    page.set(session._scene._noise, 1.0)
+    page.set(session._controls.scene._simulation._noise, 1.0)
     assert entered.wait(60)
-    until(lambda: "Diagnosing" in session._diagnosis.content)
+    until(lambda: "Diagnosing" in session._story._diagnosis.content)
     for noise in np.linspace(1.1, 3.0, 15):
-        page.set(session._scene._noise, float(noise))
+        page.set(session._controls.scene._simulation._noise, float(noise))
     until(lambda: session._run.trace is not seen[0] and len(house.notes.traces) == 2)
-    page.set(session._steps._buttons, "Previous")
+    page.set(session._story.steps._buttons, "Previous")
     until(lambda: "Refinement" in shown(session))
-    assert len(seen) == 1 and "cameras/rival" not in session._painter._drawn, "the page goes on meanwhile"
+    assert len(seen) == 1 and "cameras/rival" not in session._canvas._painter._drawn, "the page goes on meanwhile"
     gate.set()
-    until(lambda: "Two poses." in session._diagnosis.content)
+    until(lambda: "Two poses." in session._story._diagnosis.content)
     assert len(seen) == 2 and seen[1] is session._run.trace, "of fifteen runs meanwhile only the newest was diagnosed"
-    page.set(session._steps._buttons, "Next")
-    until(lambda: "cameras/rival" in session._painter._drawn)
-    page.set(session._steps._buttons, "Previous")
-    until(lambda: not session._painter._drawn["cameras/rival"][0].visible)
+    page.set(session._story.steps._buttons, "Next")
+    until(lambda: "cameras/rival" in session._canvas._painter._drawn)
+    page.set(session._story.steps._buttons, "Previous")
+    until(lambda: not session._canvas._painter._drawn["cameras/rival"][0].visible)
 
 
 def test_a_full_disk_and_a_bug_are_sentences(house: House, monkeypatch: pytest.MonkeyPatch) -> None:
     page, session = house.visit()
     house.notes.full = True
-    page.set(session._scene._seed, "5")
+    page.set(session._controls.scene._seed, "5")
     until(lambda: "the disk is full; make room." in shown(session))
     house.notes.full = False
     monkeypatch.setattr(session_module, "estimate", lambda *_: 1 / 0)
-    page.set(session._scene._seed, "6")
+    page.set(session._controls.scene._seed, "6")
     until(lambda: "a bug in the playground (ZeroDivisionError" in shown(session))
     monkeypatch.undo()
-    page.set(session._scene._seed, "8")
-    until(lambda: session._complaint is None and session._run is not None and session._run.trace.seed == 8)
+    page.set(session._controls.scene._seed, "8")
+    until(lambda: session._status._complaint is None and session._run is not None and session._run.trace.seed == 8)
 
 
 def test_pages_share_nothing_and_leave_nothing(house: House) -> None:
     before = threads()
     (first, one), (second, two) = house.visit(), house.visit()
-    assert threads() == before + 6
+    assert threads() == before + 8
     kept = two._run.trace
-    first.set(one._scene._points, 33)
+    first.set(one._controls.scene._simulation._points, 33)
     until(lambda: one._run is not None and len(one._run.trace.problem) == 33)
-    first.set(one._steps._buttons, "Previous")
-    until(lambda: one._steps._choice.value.endswith("Refinement"))
-    assert two._run.trace is kept and two._scene._points.value == 20 and two._steps._choice.value.endswith("Outcome")
+    first.set(one._story.steps._buttons, "Previous")
+    until(lambda: one._story.steps._choice.value.endswith("Refinement"))
+    assert two._run.trace is kept and two._controls.scene._simulation._points.value == 20 and two._story.steps._choice.value.endswith("Outcome")
     first.close()
-    until(lambda: threads() == before + 3 and len(house.sessions._open) == 1)
+    until(lambda: threads() == before + 4 and len(house.sessions._open) == 1)
     second.close()
     until(lambda: threads() == before and not house.sessions._open)

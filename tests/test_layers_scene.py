@@ -1,4 +1,4 @@
-"""What every picture shows: errors at their true size or said factor, lengths that are true, the image on its sphere."""
+"""What every picture shows: errors by the factor that is said, lengths that are true, the image on its sphere."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -78,8 +78,8 @@ def test_the_ellipsoid_is_that_of_the_covariance_by_the_factor_it_states(
     offset = lines.points.reshape(-1, 3) @ turn - camera_centre(turned.cam_from_map)
     distance = np.sqrt(np.einsum("ni,ij,nj->n", offset, np.linalg.inv(covariance[3:, 3:]), offset))
     np.testing.assert_allclose(distance, SIGMAS * factor, rtol=1e-6)
-    joints = lines.points[:-1, 1] - lines.points[1:, 0]
-    assert np.count_nonzero(np.linalg.norm(joints, axis=1) > 1e-9) == 2, "three closed ellipses"
+    ellipses = lines.points.reshape(3, -1, 2, 3)
+    np.testing.assert_allclose(ellipses[:, :, 1], np.roll(ellipses[:, :, 0], -1, axis=1), atol=1e-9 * size)
 
 
 @pytest.mark.parametrize("broken", [np.full((6, 6), np.nan), np.diag([1.0] * 5 + [np.inf])])
@@ -94,11 +94,13 @@ def test_the_ellipsoid_belongs_to_the_refined_pose_only(turned: Trace) -> None:
     for index, step in enumerate(steps(turned)):
         items = items_of(paint(turned, index))
         camera = items.get("cameras/estimate")
-        refined = False
         if isinstance(camera, Segments):
             known = camera_centre(turned.problem.aligned.align_pose(stage.cam_from_map[-1]))
-            refined = bool(np.allclose(camera.points[0, 0], known, atol=1e-9))
-        assert ("uncertainty/ellipsoid" in items) == refined, step.key
+            away = float(np.linalg.norm(camera.points[0, 0] - known))
+            if not 1e-9 < away < 1e-5:  # a step of the refinement that has all but arrived
+                assert ("uncertainty/ellipsoid" in items) == (away <= 1e-9), step.key
+        else:
+            assert "uncertainty/ellipsoid" not in items
         assert ("uncertainty/degrees" in items) == ("cameras/estimate" in items), step.key
 
 
@@ -265,7 +267,7 @@ def test_there_is_a_hole_where_the_camera_sees_nothing(tmp_path: Path, scene_of:
         return
     model = Equirectangular(picture.shape[1], picture.shape[0])
     rows, columns = (axis.ravel()[::7] for axis in np.indices(picture.shape[:2]))
-    bearings, _ = model.unproject(np.column_stack([columns + 0.5, rows + 0.5]))
+    bearings, _ = model.unproject(np.column_stack([columns + 0.5, rows + 0.5]).astype(np.float64))
     pixels, valid = problem.camera.project(bearings @ problem.aligned.camera_turn)
     visible = valid & in_image(problem.camera, pixels)
     agree = (picture[rows, columns, 3] >= 128) == visible

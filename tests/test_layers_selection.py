@@ -50,6 +50,7 @@ def test_every_step_can_be_selected_in(mc: Trace) -> None:
             names = [item.name for item in picture.scene]
             assert len(set(names)) == len(names) and names[: len(plain.scene)] == [item.name for item in plain.scene]
             for item in picture.scene[len(plain.scene) :]:
+                assert isinstance(item, Segments | Points)
                 places = item.points if isinstance(item, Segments) else item.positions
                 assert item.layer == "selection" and np.isfinite(places).all()
             assert picture.step.note.startswith(plain.step.note) and picture.charts == plain.charts
@@ -72,7 +73,8 @@ def test_rings_and_rays_are_around_the_selected(mc: Trace) -> None:
 
 def test_all_else_dims_towards_grey_and_the_selected_keep_their_colours(mc: Trace) -> None:
     for key in ("outcome", "yaw-clique", "clique"):
-        plain, picture = at(mc, key), with_selection(at(mc, key), mc, (4,))
+        plain = at(mc, key)
+        picture = with_selection(plain, mc, (4,))
         for before, after in zip(plain.scene, picture.scene, strict=False):
             if not isinstance(before, Points | Segments | Balls):
                 assert after is before

@@ -146,15 +146,26 @@ def spherloc(*words: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
     )
 
 
-def test_every_scene_of_a_command_is_changed_and_a_wrong_one_is_a_sentence(tmp_path: Path) -> None:
-    changes = ["--set", "outlier_rate=0.5", "correspondences=40", "--set", "noise_px=0.25", "--hide", "0,1"]
+def test_every_scene_is_changed_and_a_wrong_one_is_a_sentence(capsys: pytest.CaptureFixture[str]) -> None:
     street = ROOT / "scenes" / "street_fisheye.toml"
-    result = spherloc("run", MEI, street, PANORAMA, *changes, "--json", "--no-record", cwd=tmp_path)
-    assert result.returncode == 2
-    records = [json.loads(line) for line in result.stdout.splitlines()]
+    changes = Variation(outlier_rate=0.5, correspondences=40, hidden=(0, 1))
+    assert run_scenes([MEI, street, PANORAMA], "ransac-2p", None, [], True, None, None, changes) == 2
+    printed = capsys.readouterr()
+    records = [json.loads(line) for line in printed.out.splitlines()]
     assert [record["correspondences"] for record in records] == [38, 38] and all(r["success"] for r in records)
-    lines = [line for line in result.stderr.splitlines() if "only" in line]
-    assert len(lines) == 1 and "correspondences can be changed in synthetic scenes only" in lines[0]
+    lines = [line for line in printed.err.splitlines() if "only" in line]
+    assert len(lines) == 1 and "street_fisheye.toml: " in lines[0]
+    assert "correspondences can be changed in synthetic scenes only" in lines[0]
+
+
+def test_settings_after_one_flag_or_after_several(tmp_path: Path) -> None:
+    words = ["--set", "outlier_rate=0.5", "correspondences=40", "--set", "noise_px=0.25", "--hide", "0,1"]
+    options = ["--option", "bound_px=2", "--option", "max_balls=30", "robust=huber"]
+    result = spherloc("run", PANORAMA, *words, *options, "--json", "--no-record", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    record = json.loads(result.stdout)
+    assert record["correspondences"] == 38 and record["rotation_error_deg"] < 0.2
+    assert [record["options"][name] for name in ("bound_px", "max_balls", "robust")] == [2.0, 30, "huber"]
 
 
 def test_a_mistyped_setting_is_one_line(tmp_path: Path) -> None:

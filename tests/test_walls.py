@@ -25,7 +25,7 @@ FLOORS = (
     ("spherloc.problem", "spherloc.bounds", "spherloc.consensus"),
     ("spherloc.trace", "spherloc.refine", "spherloc.metrics", "spherloc.datasets", "spherloc.frontend"),
     ("spherloc.estimators", "spherloc.diagnosis", "spherloc.experiments"),
-    ("spherloc_viz.style", "spherloc_viz.layers", "spherloc_viz.options", "spherloc_viz"),
+    ("spherloc_viz.style", "spherloc_viz.layers", "spherloc_viz.options", "spherloc_viz.share", "spherloc_viz"),
     ("spherloc_viz.recording", "spherloc_viz.app", "spherloc_viz.lessons", "spherloc_viz.sweep_plot"),
     (
         "spherloc_viz.batch",

@@ -75,6 +75,8 @@ class Backlog:
         self._next = next(self._fresh, None)
         self._suspects: deque[Job] = deque()
         """Of tasks whose worker died. Each is done alone and with nothing beside it, to tell who kills workers."""
+        self._trial: tuple[Job, ...] = ()
+        """The suspect that is being done."""
         self._deaths: Counter[Job] = Counter()
         self._out: set[tuple[Job, ...]] = set()
         self._spent_ms: dict[tuple[int, int], tuple[int, float]] = {}
@@ -86,16 +88,17 @@ class Backlog:
 
     def take(self) -> tuple[Job, ...]:
         """The next task; nothing if there is none now."""
-        if self._suspects and self._out:
+        if self._trial or (self._suspects and self._out):
             return ()
-        jobs = (self._suspects.popleft(),) if self._suspects else tuple(self._next_jobs())
+        jobs = self._trial = (self._suspects.popleft(),) if self._suspects else ()
+        jobs = jobs or tuple(self._next_jobs())
         if jobs:
             self._out.add(jobs)
         return jobs
 
     def book(self, jobs: tuple[Job, ...], rows: Sequence[SweepRow]) -> Sequence[SweepRow]:
         """A task is done; gives its rows."""
-        self._out.remove(jobs)
+        self._leave(jobs)
         for job, row in zip(jobs, rows, strict=True):
             runs, total_ms = self._spent_ms.get((job.value, job.entrant), (0, 0.0))
             self._spent_ms[job.value, job.entrant] = runs + 1, total_ms + row.time_ms
@@ -103,17 +106,21 @@ class Backlog:
 
     def put_back(self, jobs: tuple[Job, ...]) -> Sequence[SweepRow]:
         """A task's worker died; gives no rows. Raises ``InputError`` if it always does."""
-        alone = len(self._out) == 1 and len(jobs) == 1
-        self._out.remove(jobs)
-        if alone:
+        if jobs == self._trial:
             self._deaths[jobs[0]] += 1
             if self._deaths[jobs[0]] == MOST_DEATHS:
                 raise InputError(
                     f"{self._plan.place(jobs[0])}: its worker process was killed {MOST_DEATHS} times; see whether the "
                     "memory suffices, or sweep without it."
                 )
+        self._leave(jobs)
         self._suspects.extend(jobs)
         return ()
+
+    def _leave(self, jobs: tuple[Job, ...]) -> None:
+        self._out.remove(jobs)
+        if jobs == self._trial:
+            self._trial = ()
 
     def _next_jobs(self) -> Iterator[Job]:
         spent_ms = 0.0

@@ -12,8 +12,8 @@ FloatArray = NDArray[np.float64]
 MINUS = "\N{MINUS SIGN}"
 ROUND = (1.0, 2.0, 5.0, 10.0)
 """Steps between ticks, times a power of ten."""
-ROUND_DEGREES = (10.0, 15.0, 30.0, 45.0, 90.0, 180.0)
-"""Steps between ticks of angles from 10 degrees up."""
+ROUND_DEGREES = (15.0, 30.0, 45.0, 90.0, 180.0)
+"""Steps between ticks of angles above 10 degrees; above these, they are round numbers again."""
 SMALLEST = 1e-300
 """Below this, a logarithm is not taken."""
 SHOWN_SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -52,7 +52,7 @@ class Scale:
 def round_ticks(low: float, high: float, most: int, degrees: bool = False) -> tuple[float, ...]:
     """At most ``most`` (2 or more) numbers from ``low`` to ``high``: multiples of 1, 2 or 5 times a power of ten.
 
-    ``degrees`` takes 15, 30, 45 or 90 for steps above 10. Empty if the range is.
+    ``degrees`` takes 15, 30, 45, 90 or 180 for steps between 10 and 180. Empty if the range is.
     """
     span = high - low
     if not (math.isfinite(span) and span > 0.0):
@@ -68,8 +68,8 @@ def round_ticks(low: float, high: float, most: int, degrees: bool = False) -> tu
 
 def _round_step(least: float, degrees: bool) -> float:
     """The smallest round step that is not below ``least``."""
-    if degrees and least > ROUND[-1]:
-        return next((step for step in ROUND_DEGREES if step >= least), 360.0)
+    if degrees and ROUND[-1] < least <= ROUND_DEGREES[-1]:
+        return next(step for step in ROUND_DEGREES if step >= least)
     power = 10.0 ** math.floor(math.log10(least))
     return next(step * power for step in (*ROUND, 20.0) if step * power >= least * (1.0 - 1e-12))
 

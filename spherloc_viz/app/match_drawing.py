@@ -156,7 +156,7 @@ def rings(places: FloatArray, numbers: Sequence[int]) -> list[str]:
             parts.append(
                 f'<text x="{x + (-1.4 if left else 1.4) * RING:.0f}" y="{max(y + 11.0, 30.0):.0f}" font-size="32" '
                 f'text-anchor="{"end" if left else "start"}" font-weight="600" fill="{color}" stroke="#ffffff" '
-                f'stroke-width="5" paint-order="stroke">{number}</text>'
+                f'stroke-width="3" paint-order="stroke">{number}</text>'
             )
     return parts
 

@@ -46,7 +46,7 @@ class SceneControls:
         return (self._scene, self._query, self._find, *self._simulation.widgets, self._seed)
 
     @property
-    def reset(self) -> viser.GuiButtonHandle:
+    def reset(self) -> viser.GuiButtonGroupHandle:
         """The button that sets everything to what the scene says."""
         return self._simulation.reset
 

@@ -54,17 +54,17 @@ class SimulationControls:
                 "Camera", (OWN_CAMERA, *self._cameras), hint="Sees the same simulation through another lens."
             )
             self._view = gui.add_slider(
-                "Field of view (deg)", *LIMITS["field_of_view_deg"], 5.0, 360.0, hint="Matches outside it are replaced."
+                "Field of view (°)", *LIMITS["field_of_view_deg"], 5.0, 360.0, hint="Matches outside it are replaced."
             )
             self._height = gui.add_slider(
-                "Cloud height (m)",
+                "Height (m)",
                 *LIMITS["cloud_height_m"],
                 0.1,
                 10.0,
-                hint="Near 0 all points are as high as the camera was drawn, and bearings are horizontal.",
+                hint="Of the cloud of points. Near 0 all are as high as the camera was drawn, and bearings are horizontal.",
             )
             self._gravity = gui.add_slider(
-                "Gravity error (deg)",
+                "Gravity error (°)",
                 0.0,
                 MOST_GRAVITY_DEG,
                 0.05,
@@ -73,8 +73,8 @@ class SimulationControls:
             )
             self._range = gui.add_dropdown("Points slider", tuple(RANGES), hint="How far the slider of points goes.")
             self._moved = gui.add_html("", visible=False)
-            self._home = gui.add_button("Put the camera back", visible=False)
-            self.reset = gui.add_button("Reset to the scene", hint="All settings as the scene file has them.")
+            self._home = gui.add_button_group("", ("Put the camera back",), visible=False)
+            self.reset = gui.add_button_group("", ("Reset to the scene",), hint="As its file has it.")
         for widget in self.widgets:
             widget.on_update(changed)
         self._range.on_update(self._rescale)

@@ -10,7 +10,7 @@ from spherloc_viz.app.image_panel import ImagePanel
 from spherloc_viz.app.match_table import MatchTable
 from spherloc_viz.app.residual_view import ResidualView
 from spherloc_viz.app.steps_panel import StepsPanel
-from spherloc_viz.app.text import legend_html, table_html
+from spherloc_viz.app.text import legend_html, summary_html, table_html
 from spherloc_viz.app.touch import Touches
 from spherloc_viz.app.wish import Run
 from spherloc_viz.app.yaw_view import YawView
@@ -31,11 +31,12 @@ class Story:
         """``changed`` has the page drawn anew; ``select`` selects matches by their numbers in the problem."""
         steps, views = gui.add_panel(), gui.add_panel()
         with steps.add_tab("Steps"):
-            self._outcome = gui.add_html("")
+            self._summary = gui.add_html("")
             self.steps = StepsPanel(gui, changed)
             touches.on("step", lambda touch: self.steps.go(touch.argument))
             self._diagnosis = gui.add_html("")
             gui.add_html(legend_html())
+            self._outcome = gui.add_html("")
         with views.add_tab("Yaw"):
             self._yaw = YawView(gui, touches, changed)
         with views.add_tab("Charts"):
@@ -60,9 +61,9 @@ class Story:
         self._residuals.draw(run.trace, selected, kept)
         self._images.draw(run.trace, picture, selected, kept)
         self._matches.draw(run.trace, selected, kept)
-        html = table_html(outcome)
-        if self._outcome.content != html:
-            self._outcome.content = html
+        for widget, html in ((self._summary, summary_html(run.trace)), (self._outcome, table_html(outcome))):
+            if widget.content != html:
+                widget.content = html
 
     def diagnose(self, html: str) -> None:
         """Show what the diagnosis says by now."""

@@ -2,10 +2,16 @@
 
 from html import escape
 
+import numpy as np
+
 from spherloc.diagnosis import Diagnosis
+from spherloc.metrics import evaluate
+from spherloc.trace import Trace
 from spherloc_viz import style
 from spherloc_viz.layers.certificate import UNKNOWABLE
+from spherloc_viz.layers.frame import length
 from spherloc_viz.layers.primitives import Step, Table
+from spherloc_viz.layers.tables import verdict
 
 DIM = "opacity:.65"
 WORDS = {"success": style.INLIER, "failure": style.OUTLIER, "no pose": style.OUTLIER, UNKNOWABLE: style.OUTLIER}
@@ -64,6 +70,18 @@ def diagnosis_html(diagnosis: Diagnosis, whole: bool) -> str:
             f'<div style="font-size:11.5px;padding-top:.35em;{DIM}">{known}</div>',
         ]
     return box("".join(parts))
+
+
+def summary_html(trace: Trace) -> str:
+    """A run in one line: verdict, errors, inliers and time."""
+    metrics = evaluate(trace)
+    words = verdict(trace, metrics.success)
+    inliers = int(np.count_nonzero(trace.inlier_mask))
+    facts = [f"{inliers} of {len(trace.problem)} inliers", f"{trace.timings_ms['total']:.3g} ms"]
+    if metrics.rotation_error_deg is not None and metrics.translation_error_m is not None:
+        facts = [f"{metrics.rotation_error_deg:.3g}°", length(metrics.translation_error_m), *facts]
+    line = f'<b style="{_value_css(words)}">{escape(words.capitalize())}</b> · ' + " · ".join(map(escape, facts))
+    return box(line, "font-size:13px;padding-top:.2em")
 
 
 def _value_css(value: object) -> str:

@@ -11,10 +11,10 @@ from spherloc_viz.layers.frame import Frame, Plan, RunView
 
 def plans(view: RunView) -> list[Plan]:
     """One stop."""
-    if view.trace.cam_from_map is None:
+    cam_from_map = view.trace.cam_from_map
+    if cam_from_map is None:
         return [Plan("outcome", "No pose", lambda: _no_pose(view))]
-    cam_from_map = view.aligned_pose(view.trace.cam_from_map)
-    return [Plan("outcome", "Outcome", lambda: _pose(view, cam_from_map))]
+    return [Plan("outcome", "Outcome", lambda: _pose(view, view.aligned_pose(cam_from_map)))]
 
 
 def _no_pose(view: RunView) -> Frame:

@@ -7,18 +7,19 @@ from spherloc.metrics import evaluate
 from spherloc.trace import Certificate, RefinementStage, Trace
 from spherloc_viz.layers import uncertainty
 from spherloc_viz.layers.certificate import UNKNOWABLE, chance, is_knowable, proof
+from spherloc_viz.layers.frame import length
 from spherloc_viz.layers.primitives import Table
 
 
 def outcome_table(trace: Trace) -> Table:
     """Pose, errors, scores and times of a run."""
     metrics = evaluate(trace)
-    rows: list[tuple[str, str]] = [("estimator", trace.estimator), ("outcome", _verdict(trace, metrics.success))]
+    rows: list[tuple[str, str]] = [("estimator", trace.estimator), ("outcome", verdict(trace, metrics.success))]
     if trace.cam_from_map is not None:
         rows.append(("camera position", " ".join(f"{value:.3f}" for value in camera_centre(trace.cam_from_map)) + " m"))
     if metrics.rotation_error_deg is not None and metrics.translation_error_m is not None:
         rows.append(("rotation error", f"{metrics.rotation_error_deg:.3f}°"))
-        rows.append(("position error", f"{100 * metrics.translation_error_m:.2f} cm"))
+        rows.append(("position error", length(metrics.translation_error_m)))
     refinement = trace.stage(RefinementStage)
     if refinement is not None and trace.cam_from_map is not None:
         rows.append(("expected error", uncertainty.spread(refinement)))
@@ -41,7 +42,8 @@ def _certificate_rows(certificate: Certificate) -> list[tuple[str, str]]:
     return rows
 
 
-def _verdict(trace: Trace, success: bool | None) -> str:
+def verdict(trace: Trace, success: bool | None) -> str:
+    """What became of a run, in a few words; ``success`` is None if the truth is unknown."""
     if trace.cam_from_map is None:
         return "no pose"
     return {True: "success", False: "failure", None: "pose found, truth unknown"}[success]

@@ -1,0 +1,185 @@
+"""The timeline's panel: where buttons, keys, slider, list and stages lead, and how long a step plays."""
+
+import asyncio
+from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import viser
+
+from spherloc_viz.app.steps_panel import (
+    BACK,
+    NEXT,
+    ON,
+    PLAY,
+    PLAY_S,
+    PREVIOUS,
+    SHORT,
+    StepsPanel,
+    find_step,
+    moved,
+    stages_html,
+)
+from spherloc_viz.app.viser_seams import start_viser, stop_viser
+from spherloc_viz.layers.primitives import Step, Stop
+
+TIMELINE = (
+    Stop("problem", "The matches", "Matches"),
+    Stop("bearings", "Bearings", "Matches"),
+    Stop("yaw-pair", "One pair", "Yaw"),
+    *(Stop(f"yaw-arcs-{k}", f"{k} arcs", "Yaw") for k in (10, 30, 100, 300)),
+    Stop("yaw-arcs", "All arcs", "Yaw"),
+    Stop("yaw-clique", "The yaw", "Yaw"),
+    Stop("outcome", "Outcome", "Outcome"),
+)
+KEYS = [stop.key for stop in TIMELINE]
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[viser.ViserServer]:
+    server = start_viser("a key")
+    yield server
+    stop_viser(server)
+
+
+def event(widget: Any, client: object | None = object()) -> Any:
+    """What viser tells of a widget; without a client it was Python that set it."""
+    return SimpleNamespace(client=client, target=widget)
+
+
+class Panel:
+    """A panel with a page that presses its widgets."""
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        self.asked = 0
+        self.panel = StepsPanel(server.gui, self._changed)
+        self.settle()
+
+    def _changed(self, event: object) -> None:
+        self.asked += 1
+
+    def settle(self, steps: tuple[Stop, ...] = TIMELINE, asked: bool = True) -> str:
+        """Key of the step at hand, after it was shown."""
+        index, self.pause = self.panel.settle(steps, asked)
+        stop = steps[index]
+        self.panel.show(Step(stop.key, stop.title, "One. Two.", ""), self.pause is not None, ())
+        return stop.key
+
+    def page(self, callback: Any, widget: Any, value: Any) -> str:
+        """The page sets a widget."""
+        widget._impl.value = value
+        asyncio.run(callback(event(widget)))
+        return self.settle()
+
+    def press(self, button: str) -> str:
+        self.panel._press(button)
+        return self.settle()
+
+
+@pytest.fixture
+def panel(server: viser.ViserServer) -> Panel:
+    return Panel(server)
+
+
+def test_a_run_begins_at_its_outcome(panel: Panel) -> None:
+    assert panel.settle() == "outcome"
+    assert panel.panel._slider.max == len(TIMELINE) and panel.panel._slider.value == len(TIMELINE)
+
+
+def test_buttons_step_and_jump_between_stages(panel: Panel) -> None:
+    assert [panel.press(button) for button in (PREVIOUS, PREVIOUS, NEXT)] == ["yaw-clique", "yaw-arcs", "yaw-clique"]
+    assert [panel.press(BACK) for _ in range(4)] == ["yaw-pair", "problem", "problem", "problem"]
+    assert [panel.press(ON) for _ in range(3)] == ["yaw-pair", "outcome", "outcome"]
+    assert moved(TIMELINE, 0, PREVIOUS) == 0 and moved(TIMELINE, len(TIMELINE) - 1, NEXT) == len(TIMELINE) - 1
+
+
+def test_presses_before_a_picture_all_count(panel: Panel) -> None:
+    for button in (BACK, NEXT, NEXT):
+        panel.panel._press(button)
+    assert panel.settle() == "yaw-arcs-30"
+
+
+def test_slider_list_and_stage_bars_go_to_their_step_and_agree(panel: Panel) -> None:
+    inner = panel.panel
+    assert panel.page(inner._slide, inner._slider, 3) == "yaw-pair"
+    assert inner._choice.value == "3/10  One pair" and "One pair" in inner._text.content
+    assert panel.page(inner._pick, inner._choice, inner._choice.options[5]) == "yaw-arcs-100"
+    assert inner._slider.value == 6
+    inner.go("problem")
+    assert panel.settle() == "problem" and panel.asked == 3
+    for key in ("yaw-pair", "problem", "outcome"):
+        assert f'data-touch="step:{key}"' in inner._stages.content
+
+
+def test_what_python_sets_is_no_wish(panel: Panel) -> None:
+    inner = panel.panel
+    for callback, widget in ((inner._slide, inner._slider), (inner._pick, inner._choice)):
+        asyncio.run(callback(event(widget, None)))
+    assert panel.asked == 0 and panel.settle() == "outcome"
+
+
+def test_a_thumb_that_moves_on_is_not_pulled_back(panel: Panel) -> None:
+    inner = panel.panel
+    inner._slider._impl.value = 3
+    asyncio.run(inner._slide(event(inner._slider)))
+    index, _ = inner.settle(TIMELINE, True)
+    inner._slider._impl.value = 7
+    asyncio.run(inner._slide(event(inner._slider)))
+    inner.show(Step(KEYS[index], "", "", ""), False, ())
+    assert inner._slider.value == 7
+    assert panel.settle() == KEYS[6] and inner._slider.value == 7
+
+
+@pytest.mark.parametrize("wish", ["4711", "", "no-such-step", "yaw-arcs-9999999999999999999", "../../etc"])
+def test_any_wish_of_a_page_leads_somewhere(panel: Panel, wish: str) -> None:
+    panel.panel.go(wish)
+    assert panel.settle() in KEYS
+
+
+def test_play_walks_all_steps_once_and_stays_longer_where_more_is_said(panel: Panel) -> None:
+    assert panel.press(PLAY) == "problem"
+    walked, pauses = ["problem"], [panel.pause]
+    while panel.pause is not None and len(walked) < 30:
+        walked.append(panel.settle(asked=False))
+        pauses.append(panel.pause)
+    assert walked == KEYS and pauses[-1] is None
+    short, long = PLAY_S * SHORT, PLAY_S
+    assert pauses[:-1] == [long, long, *[short] * 6, long]
+
+
+def test_the_pace_is_chosen_and_a_press_pauses(panel: Panel) -> None:
+    panel.panel._pace.value = "4×"
+    panel.press(PLAY)
+    assert panel.pause == PLAY_S / 4
+    panel.press(NEXT)
+    assert panel.pause is None
+    panel.panel._pace.value = "1×"
+
+
+def test_another_run_stays_at_the_same_kind_of_step(panel: Panel) -> None:
+    panel.panel.go("yaw-arcs-300")
+    assert panel.settle() == "yaw-arcs-300"
+    fewer = tuple(stop for stop in TIMELINE if stop.key not in ("yaw-arcs-300", "yaw-arcs-100"))
+    assert panel.settle(fewer) == "yaw-arcs-30"
+    assert panel.panel._slider.max == len(fewer) and panel.panel._slider.value == 5
+
+
+@pytest.mark.parametrize(
+    "key, found",
+    [
+        ("yaw-arcs-1000", "yaw-arcs-300"),
+        ("yaw-arcs-50", "yaw-arcs-30"),
+        ("yaw-arcs-3", "yaw-arcs"),
+        ("yaw-hand-4", "yaw-clique"),
+        ("balls-10", "outcome"),
+    ],
+)
+def test_the_nearest_of_a_kind(key: str, found: str) -> None:
+    assert KEYS[find_step(TIMELINE, key)] == found
+
+
+def test_stage_bars_are_escaped_and_filled(panel: Panel) -> None:
+    evil = (Stop('"><img src=x>', "t", "<b>"), Stop("b", "t", "<b>"), Stop("c", "t", "End"))
+    html = stages_html(evil, 0)
+    assert "<img" not in html and "<b>" not in html and "width:50.0%" in html and "width:0.0%" in html

@@ -1,0 +1,167 @@
+"""``spherloc sweep`` as a user calls it, and the picture that it leaves."""
+
+import csv
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from spherloc.errors import InputError
+from spherloc.experiments.sweep_rows import SweepRow
+from spherloc.experiments.sweep_summary import point_of
+from spherloc_viz.layers.sweep import LIMIT, sweep_charts, sweep_colors, sweep_table
+from spherloc_viz.sweep import parse_entrant, sweep
+from spherloc_viz.sweep_plot import sweep_png
+
+PROGRAM = [sys.executable, "-c", "import signal\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n"
+           "from spherloc_viz.cli import main\nmain()", "sweep"]  # fmt: skip
+"""A shell's background job, and what it starts, ignores SIGINT."""
+SCENE = """
+kind = "synthetic"
+name = "tiny $\\\\frac$"
+[camera]
+model = "equirectangular"
+width = 512
+height = 256
+[simulation]
+correspondences = 20
+outlier_rate = 0.25
+noise_px = 0.5
+seed = 1
+"""
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    path = tmp_path / "tiny.toml"
+    path.write_text(SCENE)
+    return path
+
+
+def lines(path: Path) -> int:
+    return path.read_bytes().count(b"\n") if path.exists() else 0
+
+
+def test_ctrl_c_keeps_what_is_done_and_the_same_command_goes_on(scene: Path, tmp_path: Path) -> None:
+    out = tmp_path / "results" / "sweep.csv"
+    words = ["--values", "0.5:0.9:0.2", "--estimator", "mc", "--estimator", "ransac-2p,iterations=50"]
+    words += ["--set", "noise_px=1", "correspondences=30", "--runs", "3000", "--out", str(out)]
+    process = subprocess.Popen([*PROGRAM, scene, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    while lines(out) < 20:
+        assert process.poll() is None, process.communicate()
+    process.send_signal(signal.SIGINT)
+    output, errors = process.communicate(timeout=100)
+    assert (process.returncode, output) == (130, "")
+    done = lines(out) - 1
+    (sentence,) = errors.splitlines()
+    stopped = re.search(r"stopped; ([\d,]+) runs are in (.*), and the same command goes on from there\.$", sentence)
+    assert stopped is not None and 0 <= done - int(stopped[1].replace(",", "")) <= 1 and stopped[2] == str(out)
+    assert done < 18_000 and not out.with_suffix(".png").exists()
+    words[words.index("3000")] = str(-(-done // 6) + 1)
+    finished = subprocess.run(
+        [*PROGRAM, scene, *words],
+        capture_output=True,
+        text=True,
+        timeout=200,
+        check=False,
+    )
+    assert finished.returncode == 0, finished.stderr
+    assert "runs are done already" in finished.stderr
+    with out.open(newline="") as file:
+        table = list(csv.DictReader(file))
+    assert len({(row["estimator"], row["outlier_rate"], row["seed"]) for row in table}) == len(table)
+    assert {row["correspondences"] for row in table} == {"30"}
+    with out.with_suffix(".summary.csv").open(newline="") as file:
+        points = list(csv.DictReader(file))
+    assert [point["estimator"] for point in points] == ["mc"] * 3 + ["ransac-2p iterations=50"] * 3
+    assert sum(int(point["runs"]) for point in points) == len(table) >= 6 * int(words[words.index("--runs") + 1])
+    assert finished.stdout.splitlines()[-1].startswith(f"written to {out}, sweep.summary.csv and sweep.png")
+    image = cv2.imread(str(out.with_suffix(".png")))
+    assert image is not None and image.shape[1] >= 1280
+
+
+def test_wrong_words_are_one_sentence(scene: Path, tmp_path: Path) -> None:
+    def call(**changes: object) -> int:
+        given = {"over": "noise_px", "values": ["1"], "estimators": ["mc"], "settings": [], "runs": 1, "seed": 0}
+        more = {"workers": 1, "scheduler": None, "out": tmp_path / "out.csv"}
+        return sweep(scene, **(given | more | changes))  # type: ignore[arg-type]
+
+    for changes, said in (
+        ({"values": ["1:2"]}, "give numbers, or FIRST:LAST:STEP"),
+        ({"estimators": ["magic"]}, "'magic': choose one of"),
+        ({"estimators": ["mc,magic=1"]}, "option 'magic=1' is unknown to mc; give KEY=VALUE with"),
+        ({"settings": ["magic=1"]}, "setting 'magic=1' is unknown"),
+        ({"settings": ["noise_px=1"]}, "noise_px is set, and the sweep goes over it"),
+        ({"workers": 65}, "65 workers; give a number from 1 to 64"),
+        ({"out": tmp_path}, r"ends with \.csv"),
+    ):
+        with pytest.raises(InputError, match=said):
+            call(**changes)
+    with pytest.raises(InputError, match="is no simulation"):
+        matches = Path(__file__).resolve().parents[1] / "scenes" / "street_fisheye.toml"
+        sweep(matches, "noise_px", ["1"], ["mc"], [], 1, 0, 1, None, tmp_path / "a.csv")
+
+
+def test_entrants_as_people_type_them() -> None:
+    assert parse_entrant("ransac-2p,iterations=50,gravity_sd_deg=inf").changes == (
+        ("iterations", 50),
+        ("gravity_sd_deg", float("inf")),
+    )
+    assert parse_entrant("mc").label == "mc"
+
+
+def row(label: str, value: float, seed: int, error: float | None) -> SweepRow:
+    good = error is not None and error < 0.1
+    return SweepRow(label, value, seed, good, error, error, 2.0 + seed, 5, 20, 1.0, 0.5, 0.6, None, None, None)
+
+
+LABELS = ("mc", "ransac-2p iterations=50", "ransac-2p iterations=500")
+POINTS = tuple(
+    point_of([row(label, value, seed, None if seed < lost else 0.01 * (seed + 1)) for seed in range(5)])
+    for label, losses in zip(LABELS, ((0, 0, 1), (0, 3, 5), (0, 0, 0)), strict=True)
+    for value, lost in zip((0.5, 0.7, 0.9), losses, strict=True)
+)
+
+
+def test_the_charts_show_the_points() -> None:
+    success, position, rotation, time = sweep_charts("outlier_rate", LABELS, POINTS)
+    assert [chart.log for chart in (success, position, rotation, time)] == [False, True, True, True]
+    curves = {curve.label: curve for curve in success.chart.curves}
+    assert curves[LABELS[1]].y.tolist() == [100.0, 40.0, 0.0] and LIMIT not in curves
+    low, high = success.bands[LABELS[1]]
+    assert low[2] == 0.0 and high[2] == pytest.approx(43.4, abs=0.1)  # Wilson, 0 of 5
+    errors = {curve.label: curve for curve in position.chart.curves}
+    np.testing.assert_array_equal(errors[LABELS[1]].y, [0.03, np.nan, np.nan])
+    assert errors[LIMIT].kind == "level" and errors[LIMIT].y[0] == 0.1
+    for chart in (position, rotation, time):
+        assert all(np.isfinite(side).all() and (side > 0).all() for band in chart.bands.values() for side in band)
+    table = sweep_table("outlier_rate", POINTS)
+    assert table.rows[4][:3] == (LABELS[1], "0.7", "2 of 5") and table.rows[4][4] == "no pose"
+
+
+def test_no_runs_and_perfect_runs_have_charts_too() -> None:
+    assert all(not chart.chart.curves for chart in sweep_charts("noise_px", LABELS, ()))
+    assert sweep_png("empty", "noise_px", LABELS, ())[:4] == b"\x89PNG"
+    exact = (point_of([row("mc", 0.0, 0, 0.0)]),)
+    for chart in sweep_charts("noise_px", ("mc",), exact):
+        assert all(np.isfinite(curve.y).all() for curve in chart.chart.curves)
+    assert sweep_png("exact", "noise_px", ("mc",), exact)[:4] == b"\x89PNG"
+
+
+def test_colours_tell_estimators_apart() -> None:
+    colors = sweep_colors(LABELS)
+    assert len(set(colors.values())) == 3 and sweep_colors(("mc",))["mc"] == colors["mc"]
+
+
+def test_the_picture_has_every_curve() -> None:
+    png = sweep_png("tiny $\\frac$", "outlier_rate", LABELS, POINTS)
+    assert png == sweep_png("tiny $\\frac$", "outlier_rate", LABELS, POINTS)
+    image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
+    assert image is not None
+    for color in sweep_colors(LABELS).values():
+        assert (np.abs(image[..., ::-1].astype(int) - color).max(axis=2) < 8).sum() > 300
