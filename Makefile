@@ -9,7 +9,7 @@ export PYTHON
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help play test lint bench clean
+.PHONY: help play test lint bench screenshots clean
 
 help: ## Show this
 	@printf 'spherloc: see why visual localization works, and why it fails\n\n'
@@ -40,6 +40,10 @@ lint: ## Check style, format and types
 bench: ## Measure spherloc beside its peers, some 25 minutes; a stopped run goes on
 	@scripts/setup.sh bench
 	@exec $(BIN)/python -m benchmarks.run $(ARGS)
+
+screenshots: ## Photograph every view, dark and light, into build/screenshots and docs
+	@SPHERLOC_CHROMIUM="$$(scripts/setup.sh test)" && export SPHERLOC_CHROMIUM && \
+	  exec $(BIN)/python scripts/screenshots.py $(ARGS)
 
 clean: ## Remove what make installed and built here: .venv and caches
 	rm -rf .venv build *.egg-info .pytest_cache .hypothesis .ruff_cache

@@ -63,7 +63,7 @@ async def answers_ms(case: Case, moves: int) -> tuple[np.ndarray, float]:
             found = []
             for k in range(WARM + moves):
                 if case.step:
-                    found.append(await page.answer("Step", 1 + k % 20))
+                    found.append(await page.answer("Timeline", 1 + (7 * k) % 20))
                 else:
                     found.append(await page.answer("Noise (px)", round(0.8 + 0.01 * k, 2), quiet_s=0.1))
             found = found[WARM:]

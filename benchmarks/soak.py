@@ -55,7 +55,7 @@ def _move(rng: np.random.Generator) -> tuple[str, object]:
         return "Outliers (%)", float(rng.integers(0, 95))
     if kind == 2:
         return "Estimator", str(rng.choice(ESTIMATORS))
-    return "Step", int(rng.integers(1, 8))
+    return "Timeline", int(rng.integers(1, 20))
 
 
 def _mistakes(page: PageClient, number: int, points: int, seed: str) -> list[str]:

@@ -5,6 +5,7 @@ import re
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import cv2
@@ -54,6 +55,7 @@ def test_ctrl_c_keeps_what_is_done_and_the_same_command_goes_on(scene: Path, tmp
     process = subprocess.Popen([*PROGRAM, scene, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     while lines(out) < 20:
         assert process.poll() is None, process.communicate()
+        time.sleep(0.02)
     process.send_signal(signal.SIGINT)
     output, errors = process.communicate(timeout=100)
     assert (process.returncode, output) == (130, "")
@@ -129,8 +131,8 @@ POINTS = tuple(
 
 
 def test_the_charts_show_the_points() -> None:
-    success, position, rotation, time = sweep_charts("outlier_rate", LABELS, POINTS)
-    assert [chart.log for chart in (success, position, rotation, time)] == [False, True, True, True]
+    success, position, rotation, times = sweep_charts("outlier_rate", LABELS, POINTS)
+    assert [chart.log for chart in (success, position, rotation, times)] == [False, True, True, True]
     curves = {curve.label: curve for curve in success.chart.curves}
     assert curves[LABELS[1]].y.tolist() == [100.0, 40.0, 0.0] and LIMIT not in curves
     low, high = success.bands[LABELS[1]]
@@ -138,7 +140,7 @@ def test_the_charts_show_the_points() -> None:
     errors = {curve.label: curve for curve in position.chart.curves}
     np.testing.assert_array_equal(errors[LABELS[1]].y, [0.03, np.nan, np.nan])
     assert errors[LIMIT].kind == "level" and errors[LIMIT].y[0] == 0.1
-    for chart in (position, rotation, time):
+    for chart in (position, rotation, times):
         assert all(np.isfinite(side).all() and (side > 0).all() for band in chart.bands.values() for side in band)
     table = sweep_table("outlier_rate", POINTS)
     assert table.rows[4][:3] == (LABELS[1], "0.7", "2 of 5") and table.rows[4][4] == "no pose"

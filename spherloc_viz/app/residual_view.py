@@ -43,7 +43,7 @@ class ResidualView:
         _, residuals, scores, history_html = self._known
         bins = {} if residuals is None else {one.unit: (one, kept) for one in residuals.histograms}
         content = _residuals_html(residuals, selected) + scores + history_html
-        # Presses that come in between are about what was on the page; numbers outlive the run that they are of.
+        # A press on what was on the page a moment ago selects what is in that bin now.
         self._bins = bins
         if content != self._html.content:
             self._html.content = content

@@ -122,10 +122,10 @@ class SweepPanel:
             if self._closed:
                 return
             self._stop = stop = threading.Event()
+        self._button.label, self._bar.value, self._bar.visible = CANCEL, 0.0, True
         threading.Thread(target=self._run, args=(stop,), name="spherloc-sweep", daemon=True).start()
 
     def _run(self, stop: threading.Event) -> None:
-        self._button.label, self._bar.value, self._bar.visible = CANCEL, 0.0, True
         sentence, wrong = "", True
         try:
             results = self._begin()

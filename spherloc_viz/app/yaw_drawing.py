@@ -219,6 +219,8 @@ def _tips(bars: Bars) -> list[str]:
     """The ends of every pair's arcs to read, those in the window first."""
     order = np.lexsort((bars.row < 0, bars.owner))
     texts = _each("%.2f° to %.2f°", bars.lo_deg[order], wrapped_deg(bars.hi_deg[order]))
+    for k in np.flatnonzero((bars.hi_deg - bars.lo_deg)[order] >= 360.0).tolist():
+        texts[k] = "every yaw"
     tips = [""] * len(bars.pairs)
     for pair, text in zip(bars.owner[order].tolist(), texts, strict=True):
         tips[pair] += f", twin {text}" if tips[pair] else text

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from heapq import heappop, heappush
 from math import gcd
 
 import numpy as np
@@ -12,13 +13,15 @@ from spherloc.trace import YawStage
 from spherloc_viz import style
 from spherloc_viz.layers import ring
 from spherloc_viz.layers.frame import RunView, even, one_color
-from spherloc_viz.layers.primitives import Segments
+from spherloc_viz.layers.primitives import FloatArray, Segments
 
 IndexArray = NDArray[np.int64]
 
 INNER, OUTER = 1.3, 1.95
 """Radii of the band of arcs, in sphere radii."""
 STEP_RAD = np.radians(4.0)
+FEWEST_TRACKS = 24
+"""The band has room for so many arcs over one yaw, or more if more are drawn there."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,21 +106,36 @@ class Arcs:
             others = np.flatnonzero(~self.in_clique)
         return np.concatenate([even(members, take), others[: room - take]])
 
-    def drawn(
-        self, view: RunView, arcs: IndexArray, marked: np.ndarray, mark: style.RGB, marked_first: bool = False
-    ) -> Segments:
-        """Arcs on the ring around the middle of the map, each on a track of its own, by their middles; the marked ones
-        (mask) in their colour, and on the inner tracks if they come first."""
-        lo, hi, pairs = (array[arcs] for array in (self.stage.lo_rad, self.stage.hi_rad, self.stage.pairs))
-        order = np.lexsort((lo + hi, ~marked & marked_first))
-        lo, width, marked, pairs = lo[order], (hi - lo)[order], marked[order], pairs[order]
-        tracks = INNER + (OUTER - INNER) * (np.arange(len(arcs)) + 0.5) / max(1, len(arcs))
-        steps = np.maximum(1, np.ceil(width / STEP_RAD)).astype(np.int64)
+    def drawn(self, view: RunView, arcs: IndexArray, marked: np.ndarray, mark: style.RGB) -> Segments:
+        """Arcs on the ring around the middle of the map, the marked ones (mask) in their colour. Arcs that overlap lie
+        side by side, so that the band is as broad as they are many."""
+        order = np.argsort(self.stage.lo_rad[arcs], kind="stable")
+        arcs, marked = arcs[order], marked[order]
+        lo, hi = self.stage.lo_rad[arcs], self.stage.hi_rad[arcs]
+        tracks = _tracks(lo, hi)
+        radii = INNER + (OUTER - INNER) * (tracks + 0.5) / max(FEWEST_TRACKS, int(tracks.max(initial=0)) + 1)
+        steps = np.maximum(1, np.ceil((hi - lo) / STEP_RAD)).astype(np.int64)
         arc = np.repeat(np.arange(len(arcs)), steps)
         part = np.arange(len(arc)) - np.repeat(np.cumsum(steps) - steps, steps)
-        ends = lo[arc, None] + (width / steps)[arc, None] * (part[:, None] + np.array([0.0, 1.0]))
+        ends = lo[arc, None] + ((hi - lo) / steps)[arc, None] * (part[:, None] + np.array([0.0, 1.0]))
         directions = ring.directions(ends.ravel()).reshape(-1, 2, 3)
-        points = view.middle + view.sphere_m * tracks[arc, None, None] * directions
+        points = view.middle + view.sphere_m * radii[arc, None, None] * directions
         colors = one_color(style.UNDECIDED, len(arc))
         colors[marked[arc]] = mark
-        return Segments("ring/arcs", "yaw ring", points, colors, 2.0, ids=pairs[arc].astype(np.int64))
+        ids = self.stage.pairs[arcs[arc]].astype(np.int64)
+        return Segments("ring/arcs", "yaw ring", points, colors, 2.0, ids=ids)
+
+
+def _tracks(lo_rad: FloatArray, hi_rad: FloatArray) -> IndexArray:
+    """The innermost track (A,) that is free for each of the arcs, which begin one after another."""
+    free: list[int] = []
+    busy: list[tuple[float, int]] = []
+    tracks = np.empty(len(lo_rad), dtype=np.int64)
+    for k, (lo, hi) in enumerate(zip(lo_rad.tolist(), hi_rad.tolist(), strict=True)):
+        while busy and busy[0][0] < lo:
+            heappush(free, heappop(busy)[1])
+        # Each track is either free or busy.
+        track = heappop(free) if free else len(busy)
+        heappush(busy, (hi, track))
+        tracks[k] = track
+    return tracks

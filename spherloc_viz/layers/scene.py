@@ -121,10 +121,9 @@ _CORNERS = np.array([[-0.5, -0.4, 0.7], [0.5, -0.4, 0.7], [0.5, 0.4, 0.7], [-0.5
 
 
 def _ghost(cam_from_map: FloatArray, size_m: float) -> Mesh:
-    """The true camera's body, to be seen through."""
+    """The true camera's body, to be seen through from outside and not seen from inside."""
     corners = size_m * np.vstack([np.zeros(3), _CORNERS]) @ cam_from_map[:, :3]
-    faces = np.array([[0, k, k % 4 + 1] for k in range(1, 5)])
-    faces = np.concatenate([faces, faces[:, ::-1]])
+    faces = np.array([[k % 4 + 1, k, 0] for k in range(1, 5)])
     return Mesh("cameras/ghost", "cameras", camera_centre(cam_from_map) + corners, faces, style.TRUTH, 0.16)
 
 

@@ -114,12 +114,12 @@ def _gravity(view: RunView) -> Frame:
 
 def _upright(view: RunView) -> tuple[SceneItem, ...]:
     """The horizon of the sphere, and down."""
-    down = view.middle + view.sphere_m * np.array([[0.0, 0.0, 0.0], [0.0, 1.9, 0.0]])
-    heads = [[[0.0, 1.9, 0.0], [x, 1.6, z]] for x, z in ((0.12, 0.0), (-0.12, 0.0), (0.0, 0.12), (0.0, -0.12))]
+    down = view.middle + view.sphere_m * np.array([[0.0, 0.0, 0.0], [0.0, 1.5, 0.0]])
+    heads = [[[0.0, 1.5, 0.0], [x, 1.25, z]] for x, z in ((0.12, 0.0), (-0.12, 0.0), (0.0, 0.12), (0.0, -0.12))]
     arrow = np.concatenate([down[None], view.middle + view.sphere_m * np.array(heads)])
     return (
-        Segments("sphere/gravity", "sphere", arrow, one_color(style.ESTIMATE, len(arrow)), 4.0),
-        ring.loop("sphere/horizon", "sphere", ring.circle_of(view, view.middle, 1.02), style.ESTIMATE),
+        Segments("sphere/gravity", "sphere", arrow, one_color(style.SPHERE, len(arrow)), 4.0),
+        ring.loop("sphere/horizon", "sphere", ring.circle_of(view, view.middle, 1.02), style.SPHERE),
     )
 
 

@@ -83,7 +83,9 @@ def _offset(view: RunView, frame: Frame, factor: int) -> list[SceneItem]:
     factor = factor if factor * length_m <= ROOM * view.sphere_m else 1
     end = centre + factor * offset
     text = length_text(length_m) if factor == 1 else f"{length_text(length_m)} × {factor}"
-    below = 0.5 * (centre + end) + np.array([0.0, BESIDE * view.sphere_m, 0.0])
+    # Below the sphere if the error is within it, else just below the line.
+    away = BESIDE if factor * length_m < 2.0 * view.sphere_m else 0.3
+    below = 0.5 * (centre + end) + np.array([0.0, away * view.sphere_m, 0.0])
     return [
         Segments("uncertainty/offset", LAYER, np.array([[centre, end]]), one_color(style.OUTLIER, 1), 3.0),
         Points("uncertainty/truth", LAYER, end[None], one_color(style.TRUTH, 1), 0.05 * view.sphere_m),

@@ -133,7 +133,7 @@ def _clique(view: RunView, arcs: Arcs) -> Frame:
         note += f" An even sample of {len(drawn)} of {count:,} arcs is drawn, half of them from the clique."
     interval = np.degrees(stage.best_rad[1] - stage.best_rad[0])
     off = ring.off_truth(view, stage.yaw_rad)
-    items = _ring(view, arcs, drawn, stage.overlap, arcs.in_clique[drawn], style.CLIQUE, marked_first=True)
+    items = _ring(view, arcs, drawn, stage.overlap, arcs.in_clique[drawn], style.CLIQUE)
     return Frame(
         f"{len(stage.clique):,} arcs overlap at {np.degrees(stage.yaw_rad):.2f}°{off}; no other yaw lies in more. "
         f"They are a maximum clique of the rotation graph and agree on an interval of {interval:.2g}°.",
@@ -153,13 +153,12 @@ def _ring(
     counts: np.ndarray,
     marked: np.ndarray | None = None,
     mark: style.RGB = style.UNDECIDED,
-    marked_first: bool = False,
 ) -> tuple[SceneItem, ...]:
     """Some arcs, those that are marked in their colour, the outline of the counts, and the true yaw if it is known."""
     heights = ring.by_degree(counts)
     line = ring.circle(view, view.middle, heights / max(1, int(heights.max())))
     mask = np.zeros(len(drawn), dtype=bool) if marked is None else marked
-    band = arcs.drawn(view, drawn, mask, mark, marked_first)
+    band = arcs.drawn(view, drawn, mask, mark)
     return band, ring.outline("ring/overlap", line, style.SPHERE), *ring.spokes(view, view.middle, None)
 
 

@@ -1,0 +1,178 @@
+"""Pictures of every view, dark and light, at 1280 x 720 and 1920 x 1080: ``make screenshots``.
+
+They go to build/screenshots. Those that the documentation shows are written to docs/ as well.
+"""
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import cv2
+from playwright.sync_api import Page, sync_playwright
+
+ROOT = Path(__file__).resolve().parents[1]
+FOLDER = ROOT / "build" / "screenshots"
+SIZES = ((1280, 720), (1920, 1080))
+FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
+SYNTHETIC, IMAGES = "scenes/panorama_outliers_80.toml", "scenes/street_fisheye.toml"
+PATIENCE_MS = 120_000
+DOCS = {
+    "playground": ("arcs", "dark", 0),
+    "selection": ("selection", "dark", 0),
+    "sphere": ("from_the_camera", "dark", 0),
+    "compare": ("compare", "light", 0),
+    "sweep": ("sweep", "light", 0),
+}
+"""Names in docs/ of a view in a theme at the size of that number."""
+
+
+def tab(page: Page, name: str) -> None:
+    """Open a tab."""
+    page.get_by_role("tab", name=name, exact=True).click()
+
+
+def press(page: Page, name: str) -> None:
+    """Press a button."""
+    page.get_by_role("button", name=name, exact=True).click()
+
+
+def step(page: Page, title: str) -> None:
+    """Go to the first step whose title holds these words."""
+    name = page.locator("label", has_text=re.compile("^Step$"))
+    page.locator(f"[id='{name.get_attribute('for')}']").click()
+    page.get_by_role("option").filter(has_text=title).first.click()
+    page.wait_for_timeout(1500)
+
+
+def estimator(page: Page, name: str) -> None:
+    """Choose an estimator."""
+    label = page.locator("label", has_text=re.compile("^Estimator$"))
+    page.locator(f"[id='{label.get_attribute('for')}']").click()
+    page.get_by_role("option").filter(has_text=name).first.click()
+    page.wait_for_timeout(2500)
+
+
+def select_a_match(page: Page) -> None:
+    """Select a match in the table."""
+    tab(page, "Matches")
+    page.locator("tr[data-touch^='select:']").nth(3).click()
+    page.wait_for_timeout(1500)
+
+
+def compare(page: Page) -> None:
+    """Compare the estimators that are ticked."""
+    tab(page, "Compare")
+    press(page, "Compare")
+    page.locator("tr[data-touch='use:ransac-2p']").wait_for()
+    page.wait_for_timeout(6000)
+
+
+def sweep(page: Page) -> None:
+    """A small sweep."""
+    tab(page, "Sweep")
+    label = page.locator("label", has_text=re.compile("^Runs$"))
+    entry = label.locator("xpath=ancestor::*[contains(@class, 'Flex-root')][1]").locator("input")
+    entry.fill("8")
+    entry.press("Enter")
+    press(page, "Start")
+    page.get_by_role("button", name="CSV", exact=True).wait_for(timeout=PATIENCE_MS)
+    page.wait_for_timeout(1500)
+
+
+SYNTHETIC_VIEWS: dict[str, Callable[[Page], object]] = {
+    "outcome": lambda page: page.wait_for_timeout(500),
+    "arcs": lambda page: step(page, "The yaw most arcs share"),
+    "twins": lambda page: step(page, "twin"),
+    "balls": lambda page: step(page, "The maximum clique of balls"),
+    "residuals": lambda page: tab(page, "Residuals"),
+    "charts": lambda page: tab(page, "Charts"),
+    "pixels": lambda page: tab(page, "Images"),
+    "selection": select_a_match,
+    "exact": lambda page: (estimator(page, "mc-exact"), tab(page, "Yaw"), step(page, "What no pose can beat")),
+    "ransac": lambda page: (estimator(page, "ransac-2p"), tab(page, "Residuals")),
+    "compare": compare,
+    "sweep": sweep,
+    "open": lambda page: tab(page, "Open"),
+    "share": lambda page: tab(page, "Share"),
+}
+IMAGE_VIEWS: dict[str, Callable[[Page], object]] = {
+    "map": lambda page: page.wait_for_timeout(500),
+    "images": lambda page: tab(page, "Images"),
+    "from_the_camera": lambda page: (press(page, "From the camera"), page.wait_for_timeout(2000)),
+}
+
+
+@contextmanager
+def served(scene: str) -> Iterator[str]:
+    """Address of a playground."""
+    program = Path(sys.executable).with_name("spherloc")
+    words = [str(program), "play", scene, "--port", "0", "--no-record"]
+    server = subprocess.Popen(words, stdout=subprocess.PIPE, text=True, cwd=ROOT)
+    try:
+        assert server.stdout is not None
+        yield server.stdout.readline().split()[-1]
+    finally:
+        server.send_signal(signal.SIGINT)
+        server.wait(30)
+
+
+def take(page: Page, address: str, dark: bool) -> None:
+    """Open the playground and wait for its first picture."""
+    page.goto(address)
+    page.locator("//tr[td[1][normalize-space()='outcome']]/td[2]").first.wait_for(timeout=PATIENCE_MS)
+    page.wait_for_timeout(4000)
+    # viser says that it draws in software, which a person's browser does not.
+    for close in page.locator("[class*=Notification-closeButton]").all():
+        close.click()
+    if not dark:
+        page.get_by_text("Dark", exact=True).click()
+        page.wait_for_timeout(1000)
+
+
+def main() -> None:
+    """Take all pictures, or those whose names are given."""
+    wanted = set(sys.argv[1:])
+    path = os.environ.get("SPHERLOC_CHROMIUM") or shutil.which("chromium") or shutil.which("google-chrome")
+    if path is None:
+        raise SystemExit("no Chromium found; install one or set SPHERLOC_CHROMIUM to its path.")
+    FOLDER.mkdir(parents=True, exist_ok=True)
+    with sync_playwright() as playwright:
+        for scene, views in ((SYNTHETIC, SYNTHETIC_VIEWS), (IMAGES, IMAGE_VIEWS)):
+            chosen = {name: view for name, view in views.items() if not wanted or name in wanted}
+            if chosen:
+                with served(scene) as address:
+                    for number, size in enumerate(SIZES):
+                        for theme in ("dark", "light"):
+                            browser = playwright.chromium.launch(executable_path=path, args=FLAGS)
+                            page = browser.new_page(viewport={"width": size[0], "height": size[1]})
+                            page.set_default_timeout(PATIENCE_MS)
+                            take(page, address, theme == "dark")
+                            for name, view in chosen.items():
+                                picture(page, name, view, theme, number)
+                            browser.close()
+
+
+def picture(page: Page, name: str, view: Callable[[Page], object], theme: str, size: int) -> None:
+    """Bring the page to a view and photograph it."""
+    start = time.monotonic()
+    view(page)
+    width, height = SIZES[size]
+    path = FOLDER / f"{name}_{theme}_{width}x{height}.png"
+    page.screenshot(path=path, timeout=PATIENCE_MS)
+    for title, shown in DOCS.items():
+        if shown == (name, theme, size):
+            image = cv2.imread(str(path))
+            assert image is not None
+            cv2.imwrite(str(ROOT / "docs" / f"{title}.jpg"), image, [cv2.IMWRITE_JPEG_QUALITY, 88])
+    print(f"{path.relative_to(ROOT)}, {time.monotonic() - start:.0f} s", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,54 @@
+"""Standing in the camera: at its place, along its axis, with a wide view."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from spherloc.datasets.synthetic import SyntheticScene
+from spherloc.estimators import estimate
+from spherloc.geometry import camera_centre, so3_exp
+from spherloc.problem import Problem
+from spherloc.trace import Trace
+from spherloc_viz.app import views
+from spherloc_viz.layers import paint, steps
+from spherloc_viz.layers.primitives import Mesh
+
+
+@pytest.fixture(scope="module")
+def trace(scene_of: Callable[..., SyntheticScene]) -> Trace:
+    problem = scene_of("panorama", correspondences=40, outlier_rate=0.3).problem()
+    lean = so3_exp(np.array([0.2, 0.0, 0.3]))
+    assert problem.truth_cam_from_map is not None
+    leaning = Problem(
+        "leaning", problem.camera, problem.camera.project(problem.bearings @ lean.T)[0], problem.points,
+        lean @ problem.gravity_camera, problem.gravity_map, truth_cam_from_map=lean @ problem.truth_cam_from_map,
+    )  # fmt: skip
+    return estimate(leaning, "ransac-2p")
+
+
+def test_one_stands_in_the_estimated_camera_and_looks_along_its_axis(trace: Trace) -> None:
+    view = views.find(views.INSIDE, paint(trace, len(steps(trace)) - 1), 1.5)
+    assert trace.cam_from_map is not None
+    aligned = trace.problem.aligned.align_pose(trace.cam_from_map)
+    np.testing.assert_allclose(view.position, camera_centre(aligned), atol=1e-9)
+    axis = (view.target - view.position) / np.linalg.norm(view.target - view.position)
+    np.testing.assert_allclose(axis, aligned[2, :3], atol=1e-9)
+    assert view.field_of_view_rad > np.radians(80)
+
+
+def test_without_an_estimate_one_stands_in_the_sphere(trace: Trace) -> None:
+    picture = paint(trace, 0)
+    view = views.find(views.INSIDE, picture, 1.5)
+    (surface,) = (item for item in picture.scene if item.name == "sphere/surface")
+    assert isinstance(surface, Mesh)
+    reach = np.linalg.norm(surface.vertices - view.position, axis=1)
+    np.testing.assert_allclose(reach, reach[0], rtol=1e-6)
+    assert 0 < np.linalg.norm(view.target - view.position) < 0.1 * reach[0], "so that the mouse turns the head"
+
+
+def test_every_view_is_found_at_every_step(trace: Trace) -> None:
+    for index in range(len(steps(trace))):
+        for name in views.NAMES:
+            view = views.find(name, paint(trace, index), 1.5)
+            assert np.isfinite(view.position).all() and np.linalg.norm(view.target - view.position) > 1e-6
