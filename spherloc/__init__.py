@@ -9,7 +9,7 @@ from pathlib import Path
 
 __version__ = version("spherloc")
 
-KERNEL_SOURCES = ("geometry.py", "gauss_newton.py", "refine.py", "solvers", "consensus", "estimators")
+KERNEL_SOURCES = ("watch.py", "geometry.py", "gauss_newton.py", "refine.py", "solvers", "consensus", "estimators")
 """Files and folders of this package that hold compiled kernels and whatever their values come from."""
 
 KEPT_KERNELS = 4

@@ -14,7 +14,7 @@ from spherloc.trace import ConsensusStage, Trace, TranslationStage, YawStage
 from spherloc_viz import style
 from spherloc_viz.layers import paint, steps
 from spherloc_viz.layers.primitives import Balls, Picture, Points, SceneItem, Segments
-from spherloc_viz.layers.selection import with_selection
+from spherloc_viz.layers.selection import HALO, with_selection
 
 
 @pytest.fixture(scope="module")
@@ -66,6 +66,18 @@ def test_rings_and_rays_are_around_the_selected(mc: Trace) -> None:
         assert isinstance(halo, Points) and halo.rim and halo.radius_m > dots.radius_m and dots.ids is not None
         np.testing.assert_array_equal(halo.positions, dots.positions[np.isin(dots.ids, (4, 9))])
         assert halo.ids is None, "a ring is not picked instead of what it surrounds"
+    circles = segments(picture, "selection/circles").reshape(2, 3, -1, 3)
+    surface = items_of(plain)["sphere/surface"]
+    centre = surface.vertices.mean(axis=0)  # pyright: ignore[reportAttributeAccessIssue]
+    for k, (around_point, inner, outer) in zip((4, 9), circles, strict=True):
+        (bearing,) = bearings.positions[bearings.ids == k]
+        np.testing.assert_allclose(np.linalg.norm(around_point - points.positions[k], axis=1), HALO * points.radius_m)
+        outward = (bearing - centre) / np.linalg.norm(bearing - centre)
+        np.testing.assert_allclose((around_point - points.positions[k]) @ outward, 0.0, atol=1e-9)
+        radius = np.linalg.norm(bearing - centre)
+        assert np.linalg.norm(inner - centre, axis=1).max() < radius < np.linalg.norm(outer - centre, axis=1).min()
+    many = with_selection(plain, mc, tuple(range(40)))
+    assert "selection/circles" not in items_of(many), "many circles would cost much and show little"
     ends = segments(picture, "selection/rays")
     np.testing.assert_array_equal(ends[:, 1], points.positions[[4, 9]])
     np.testing.assert_array_equal(ends[:, 0], bearings.positions[np.isin(bearings.ids, (4, 9))])

@@ -19,7 +19,14 @@ SCREENS = {"viser", "rerun", "rerun_sdk", "rerun_bindings", "plotly", "aiohttp",
 
 FLOORS = (
     ("spherloc.errors", "spherloc"),
-    ("spherloc.registry", "spherloc.geometry", "spherloc.extras", "spherloc.disk_cache", "spherloc.images"),
+    (
+        "spherloc.registry",
+        "spherloc.geometry",
+        "spherloc.watch",
+        "spherloc.extras",
+        "spherloc.disk_cache",
+        "spherloc.images",
+    ),
     ("spherloc.cameras", "spherloc.solvers", "spherloc.trajectory"),
     ("spherloc.gauss_newton", "spherloc.worlds", "spherloc.formats"),
     ("spherloc.problem", "spherloc.bounds", "spherloc.consensus"),

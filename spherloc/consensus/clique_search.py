@@ -8,6 +8,8 @@ that a limit means about the same time for every graph and the same result on ev
 import numba
 import numpy as np
 
+from spherloc.watch import stopped
+
 ONE = np.uint64(1)
 
 
@@ -93,10 +95,11 @@ def colour_bound(rows):
 
 
 @numba.njit(cache=True, nogil=True)
-def larger_clique(rows, floor, effort_limit):
+def larger_clique(rows, floor, effort_limit, board=None):
     """A largest clique if it has more than ``floor`` nodes, else an empty array; the effort; whether it is exact.
 
-    Nodes are numbered so that those of high degree come first. With an explicit stack, not recursion.
+    Nodes are numbered so that those of high degree come first. With an explicit stack, not recursion. A watch's
+    ``board`` can end it as its limit does.
     """
     count, words = rows.shape
     best = np.empty(0, np.int64)
@@ -115,7 +118,7 @@ def larger_clique(rows, floor, effort_limit):
         if place[depth] < 0 or depth + bound[depth, place[depth]] <= largest:
             depth -= 1
             continue
-        if effort >= effort_limit:
+        if effort >= effort_limit or stopped(board):
             return best, effort, False
         node = order[depth, place[depth]]
         place[depth] -= 1

@@ -10,9 +10,11 @@ import numpy as np
 from spherloc.consensus.balls_of_pairs import may_be_seen, pair_ball, star_balls, view_between
 from spherloc.consensus.clique_search import ONE, clear_edge, colour_bound, larger_clique, popcount, set_edge, subgraph
 from spherloc.consensus.dual_proof import FOUND, IMPOSSIBLE, UNKNOWN, prove_none
+from spherloc.consensus.long_sort import order_of
 from spherloc.consensus.pair_arcs import CIRCLE
 from spherloc.consensus.region import search_region
 from spherloc.consensus.support import improve, verify
+from spherloc.watch import DONE, SELDOM, TOTAL, stopped
 
 MOST_TRIALS = 16
 """Cliques of a bin that may stay without pose or proof before only larger ones are searched for."""
@@ -28,7 +30,7 @@ CELL_EFFORT, ROUND_EFFORT, VERIFY_EFFORT = 200, 40, 200
 
 
 @numba.njit(cache=True, nogil=True)
-def _pieces(pairs, lo, hi, nodes, count, start, end):
+def _pieces(pairs, lo, hi, nodes, count, start, end, board):
     """Arcs among ``nodes`` that touch the bin, clipped to it: their places (E, 2) in ``nodes`` and their ends (E,),
     (E,).
     """
@@ -39,6 +41,8 @@ def _pieces(pairs, lo, hi, nodes, count, start, end):
     edges, first, last = np.empty((0, 2), np.int64), np.empty(0), np.empty(0)
     for counting in (True, False):
         for arc in range(len(lo)):
+            if arc & SELDOM == 0 and stopped(board):
+                return np.empty((0, 2), np.int64), np.empty(0), np.empty(0)
             for turns in (0.0, CIRCLE):
                 if lo[arc] - turns > end or hi[arc] - turns < start:
                     continue
@@ -94,10 +98,10 @@ def _candidates(view, limits, ball, nodes, common, shared):
 
 
 @numba.njit(cache=True, nogil=True)
-def _completed(rows, a, b, candidates, floor, effort_limit):
+def _completed(rows, a, b, candidates, floor, effort_limit, board):
     """A clique with both nodes and more than ``floor`` nodes in all, or nothing; the effort; whether it is exact."""
     small, old = subgraph(rows, candidates)
-    inside, effort, exact = larger_clique(small, floor - 2, effort_limit)
+    inside, effort, exact = larger_clique(small, floor - 2, effort_limit, board)
     effort += len(candidates) * len(candidates)
     if len(inside) == 0 and floor >= 2:
         return inside, effort, exact
@@ -109,20 +113,20 @@ def _completed(rows, a, b, candidates, floor, effort_limit):
 
 
 @numba.njit(cache=True, nogil=True)
-def settle(data, limits, view, everybody, balls, poses, supports, masks, known):
+def settle(data, limits, view, everybody, balls, poses, supports, masks, known, board):
     """Prove that no pose explains more of ``everybody`` than the best known one does; ``balls`` (B, 4) hold all that
     might.
 
     Better poses that are met become known, and the proof goes on against them. Returns how many are known, whether
-    it is proven, and the effort.
+    it is proven, and the effort. A watch's ``board`` can end it unproven.
     """
     found = np.empty(5)
     effort, b = 0, 0
     while b < len(balls):
-        if not balls[b, 3] < np.inf:
+        if not balls[b, 3] < np.inf or stopped(board):
             return known, False, effort
         best = supports[0]
-        answer, work = prove_none(view, limits, everybody, balls[b], best, found)
+        answer, work = prove_none(view, limits, everybody, balls[b], best, found, board)
         effort += work * ROUND_EFFORT
         if answer == UNKNOWN and len(everybody) <= MOST_IN_CELLS:
             answer, work = search_region(view, limits, everybody, balls[b], best, MOST_CELLS, found)
@@ -139,7 +143,7 @@ def settle(data, limits, view, everybody, balls, poses, supports, masks, known):
 
 
 @numba.njit(cache=True, nogil=True)
-def sweep_bin(data, limits, trig, pairs, lo, hi, nodes, rows, span, poses, supports, masks, known, effort_limit):
+def sweep_bin(data, limits, trig, pairs, lo, hi, nodes, rows, span, poses, supports, masks, known, effort_limit, board):
     """Search the bin between the turns ``span``.
 
     ``data`` is what ``verify`` takes, ``limits`` what ``search_region`` takes, ``trig`` the chords and sines of the
@@ -147,20 +151,23 @@ def sweep_bin(data, limits, trig, pairs, lo, hi, nodes, rows, span, poses, suppo
     ``supports`` (K,) and ``masks`` (K, M) hold ``known`` verified poses, the first one with the largest support; better
     ones are added in place. Returns how many are known, the bound for the bin, its largest clique that may have a pose
     (nodes; empty if none is larger than the support), the effort, and whether the bin was searched to its end.
+    A watch's ``board`` can end it, and learns how much of the effort is left.
     """
     nothing = np.empty(0, np.int64)
     whole = colour_bound(rows)
-    edges, first, last = _pieces(pairs, lo, hi, nodes, masks.shape[1], span[0], span[1])
+    edges, first, last = _pieces(pairs, lo, hi, nodes, masks.shape[1], span[0], span[1], board)
     effort = len(lo) + SORT_EFFORT * len(edges)
     if effort > effort_limit:
         return known, whole, nothing, len(lo), False
     rows[:] = 0
     owned = np.zeros((len(nodes), len(nodes)), np.uint8)
     common = np.empty(rows.shape[1], np.uint64)
-    opening, closing = np.argsort(first), np.argsort(last)
+    opening, closing = order_of(first, board), order_of(last, board)
     largest, trials, closed, floor = nothing, 0, 0, supports[0]
     exact = True
     for edge in opening:
+        if stopped(board):
+            return known, whole, largest, effort, False
         while last[closing[closed]] < first[edge]:
             a, b = edges[closing[closed], 0], edges[closing[closed], 1]
             owned[a, b] -= 1
@@ -176,11 +183,12 @@ def sweep_bin(data, limits, trig, pairs, lo, hi, nodes, rows, span, poses, suppo
             continue
         if effort >= effort_limit:
             return known, whole, largest, effort, False
+        board[DONE] = max(board[DONE], board[TOTAL] - effort_limit + effort)
         # Who completes a clique with this edge is seen from its ball, at a yaw of its arc.
         view = view_between(data, first[edge], last[edge])
         ball = pair_ball(view, trig, nodes[a], nodes[b])
         candidates = _candidates(view, limits, ball, nodes, common, shared)
-        clique, work, done = _completed(rows, a, b, candidates, floor, effort_limit - effort)
+        clique, work, done = _completed(rows, a, b, candidates, floor, effort_limit - effort, board)
         effort += work
         exact = exact and done
         if len(clique) == 0:
@@ -192,7 +200,7 @@ def sweep_bin(data, limits, trig, pairs, lo, hi, nodes, rows, span, poses, suppo
             continue
         everybody = np.append(nodes[candidates], nodes[np.array([a, b])])
         balls = star_balls(view, trig, everybody, len(everybody) - supports[0], ball)
-        known, proven, work = settle(data, limits, view, everybody, balls, poses, supports, masks, known)
+        known, proven, work = settle(data, limits, view, everybody, balls, poses, supports, masks, known, board)
         effort += work
         if not proven and len(clique) > len(largest):
             largest = nodes[clique]

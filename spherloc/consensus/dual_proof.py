@@ -16,6 +16,7 @@ import numba
 import numpy as np
 
 from spherloc.consensus.level_fit import accumulate, move, ray, slope_of, solve_step
+from spherloc.watch import stopped
 
 ROUNDS = 24
 """Of Lawson's iteration."""
@@ -33,13 +34,13 @@ UNKNOWN, FOUND, IMPOSSIBLE = 0, 1, 2
 
 
 @numba.njit(cache=True, nogil=True)
-def prove_none(view, limits, everybody, ball, floor, found):
+def prove_none(view, limits, everybody, ball, floor, found, board=None):
     """Whether no level pose of the region explains more than ``floor`` of ``everybody``.
 
     ``view`` is (bearings, points, cos, sin and half width of the yaw interval); ``limits`` are the weights (M, 2, 3),
     the bounds (M,) px, the angular bounds (M,) rad and the px/rad (M,); ``ball`` (4,) centre and radius of camera
     positions. Returns FOUND, with such a pose in ``found`` (5,), see ``level_fit``, IMPOSSIBLE if there is none, or
-    UNKNOWN; and the effort.
+    UNKNOWN; and the effort. A watch's ``board`` can end it as UNKNOWN.
     """
     count = len(everybody)
     spare = count - floor
@@ -51,6 +52,8 @@ def prove_none(view, limits, everybody, ball, floor, found):
     weight, residual = np.empty(count), np.empty(count)
     here = np.empty(5)
     while waiting > 0:
+        if stopped(board):
+            return UNKNOWN, effort
         waiting -= 1
         nodes += 1
         gone, stay, here[:] = removed[waiting].copy(), kept[waiting].copy(), places[waiting]

@@ -25,6 +25,7 @@ from spherloc.consensus.support import improve
 from spherloc.consensus.yaw_bins import BIN_TURN, BINS, degree_bounds, sort_into_bins
 from spherloc.geometry import yaw_rotation
 from spherloc.problem import AlignedProblem
+from spherloc.watch import Watch
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -38,6 +39,8 @@ MOST_SPARE = 8
 """Nodes of a bin more than the best support up to which the whole bin is tried to be settled at once."""
 MOST_POSES = 8
 """Clearly different poses that are remembered."""
+PAIRS_UNTIL, BINS_UNTIL, SCOUT_UNTIL, SEARCH_UNTIL = 0.5, 0.7, 0.75, 0.98
+"""How far the run of an estimator is by ``Watch.fraction`` at the ends of the parts of this search."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,15 +83,18 @@ def exact_consensus(
     guesses: list[tuple[float, FloatArray]],
     effort_limit: int,
     time_budget_s: float,
+    watch: Watch | None = None,
 ) -> ExactConsensus:
     """Search all yaws.
 
     ``wrong_rate`` is the probability that a wrong pose explains a correspondence. ``guesses`` are level poses
     (yaw, rad, and translation (3,)) to start from: the more the best of them explains, the less is left to be
     searched. After ``effort_limit`` words or ``time_budget_s`` seconds the search stops, and the bounds say how far
-    it came.
+    it came. ``watch`` counts pairs, steps and then the share of the bins or of the effort, whichever is the larger;
+    raises ``Cancelled``.
     """
     deadline = time.perf_counter() + time_budget_s
+    watch = watch or Watch()
     count = len(aligned.bearings)
     # Rounding must not exclude what the pixel bound allows.
     least_cos = np.cos(np.minimum(bounds.radians + 1e-9, np.pi / 2))
@@ -102,36 +108,50 @@ def exact_consensus(
         here = np.empty(5)
         place(yaw, translation, here)
         known = improve(data, np.empty(0, np.int64), here, poses, supports, masks, known)
-    pairs, lo, hi = pair_arcs(aligned, bounds.radians)
-    starts, edges = sort_into_bins(pairs, lo, hi)
-    bound = degree_bounds(count, starts, edges)
+    watch.begin("pairs", PAIRS_UNTIL)
+    pairs, lo, hi = pair_arcs(aligned, bounds.radians, watch)
+    watch.begin("bins", BINS_UNTIL)
+    watch.expect(4)
+    starts, edges = sort_into_bins(pairs, lo, hi, watch.board)
+    watch.reach(3)
+    bound = degree_bounds(count, starts, edges, watch.board)
+    watch.begin("scout", SCOUT_UNTIL)
     # What chance explains too often to be told apart is looked for last.
     for expected in (HOPELESS, np.inf) if len(edges) < effort_limit else ():
         if chance_sets(count, int(supports[0]), wrong_rate) > DOUBTFUL:
             floor = least_size(count, wrong_rate, expected) - 1
-            known = scout(data, starts, edges, bound, floor, poses, supports, masks, known)
+            known = scout(data, starts, edges, bound, floor, poses, supports, masks, known, watch.board)
+    watch.begin("search", SEARCH_UNTIL)
+    watch.expect(effort_limit)
     effort, finished = len(edges), True
     clique = np.empty(0, np.int64)
-    for b in np.argsort(-bound, kind="stable"):
+    promising = np.count_nonzero(bound > supports[0])
+    for passed, b in enumerate(np.argsort(-bound, kind="stable")):
         if bound[b] <= supports[0]:
             break
+        watch.reach(int(max(effort, effort_limit * passed // promising)))
         if effort >= effort_limit or time.perf_counter() >= deadline:
             finished = False
             break
-        nodes, rows = core_graph(count, edges[starts[b] : starts[b + 1]], supports[0])
+        nodes, rows = core_graph(count, edges[starts[b] : starts[b + 1]], supports[0], watch.board)
+        watch.check()
         span = (b * BIN_TURN, (b + 1) * BIN_TURN)
-        known, most, work = _settle_bin(data, limits, trig, nodes, rows, span, poses, supports, masks, known)
+        known, most, work = _settle_bin(
+            data, limits, trig, nodes, rows, span, poses, supports, masks, known, watch.board
+        )
         effort += work
         bound[b] = min(bound[b], most)
         if bound[b] <= supports[0]:
             continue
+        left = effort_limit - effort
         known, most, found, work, exact = sweep_bin(
-            data, limits, trig, pairs, lo, hi, nodes, rows, span, poses, supports, masks, known, effort_limit - effort
+            data, limits, trig, pairs, lo, hi, nodes, rows, span, poses, supports, masks, known, left, watch.board
         )
         effort += work
         finished = finished and exact
         bound[b] = min(bound[b], most)
         clique = found if len(found) > len(clique) else clique
+    watch.check()
     # A bin that was left out explains no more than the best pose.
     if len(clique) <= supports[0]:
         clique = np.flatnonzero(masks[0])
@@ -147,7 +167,7 @@ def exact_consensus(
     )
 
 
-def _settle_bin(data, limits, trig, nodes, rows, span, poses, supports, masks, known) -> tuple[int, int, int]:
+def _settle_bin(data, limits, trig, nodes, rows, span, poses, supports, masks, known, board) -> tuple[int, int, int]:
     """Bound a bin without walking its arcs: by colours, and by proof where few nodes more than the best support are
     left.
 
@@ -158,7 +178,7 @@ def _settle_bin(data, limits, trig, nodes, rows, span, poses, supports, masks, k
     if most > best and len(nodes) - best <= MOST_SPARE:
         view = view_between(data, *span)
         balls = apart_balls(view, trig, nodes, len(nodes) - best)
-        known, proven, work = settle(data, limits, view, nodes, balls, poses, supports, masks, known)
+        known, proven, work = settle(data, limits, view, nodes, balls, poses, supports, masks, known, board)
         effort += work
         most = 0 if proven else most
     return int(known), int(max(most, supports[0])), int(effort)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spherloc.consensus.clique_search import all_nodes, larger_clique, lowest_bit
+from spherloc.watch import Watch
 
 EFFORT_LIMIT = 200_000_000
 """Words touched, see ``clique_search``, before the search returns the best clique so far as not proven: about 0.2 s."""
@@ -26,14 +27,19 @@ class Clique:
     """False if the search reached its limit first."""
 
 
-def max_clique(adjacency: NDArray[np.bool_], effort_limit: int = EFFORT_LIMIT) -> Clique:
-    """A maximum clique of the graph with the symmetric adjacency matrix (M, M); its diagonal is ignored."""
+def max_clique(adjacency: NDArray[np.bool_], effort_limit: int = EFFORT_LIMIT, watch: Watch | None = None) -> Clique:
+    """A maximum clique of the graph with the symmetric adjacency matrix (M, M); its diagonal is ignored.
+
+    ``watch`` can end the search; raises ``Cancelled``.
+    """
+    watch = watch or Watch()
     count = len(adjacency)
     if count == 0:
         return Clique(np.empty(0, np.int32), True)
     rows, order = _pack(adjacency)
     members = _greedy(rows)
-    larger, _, proven = larger_clique(rows, len(members), effort_limit)
+    larger, _, proven = larger_clique(rows, len(members), effort_limit, watch.board)
+    watch.check()
     members = larger if len(larger) else members
     nodes = np.sort(order[members]).astype(np.int32)
     if not _all_adjacent(adjacency, nodes):

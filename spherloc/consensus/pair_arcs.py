@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from spherloc.consensus.depth_bounds import chord, pair_sinusoids
 from spherloc.problem import AlignedProblem
+from spherloc.watch import DONE, Watch, stopped
 
 FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int32]
@@ -31,16 +32,22 @@ def turn_of(yaw_rad: FloatArray) -> FloatArray:
     return np.where(turn < CIRCLE, turn, 0.0)
 
 
-def pair_arcs(aligned: AlignedProblem, bound_rad: FloatArray) -> tuple[IndexArray, FloatArray, FloatArray]:
+def pair_arcs(
+    aligned: AlignedProblem, bound_rad: FloatArray, watch: Watch | None = None
+) -> tuple[IndexArray, FloatArray, FloatArray]:
     """Arcs of all pairs: pairs (A, 2) of places in ``aligned``, first ends (A,) in [0, 4) and second ends (A,), turns.
 
     The second end is up to a circle larger than the first. ``bound_rad`` (M,) bounds each bearing's angular error.
+    ``watch`` counts the pairs; raises ``Cancelled``.
     """
+    watch = watch or Watch()
     count = len(aligned.bearings)
+    watch.expect(count * (count - 1) // 2)
     room = 2 * (count * (count - 1) // 2)
     # Memory that is never touched is never used, so room for the worst case costs nothing.
     pairs, ends = np.empty((room, 2), np.int32), np.empty((room, 2))
-    used = _fill(aligned.bearings, aligned.points, bound_rad, pairs, ends)
+    used = _fill(aligned.bearings, aligned.points, bound_rad, pairs, ends, watch.board)
+    watch.check()
     return pairs[:used], ends[:used, 0], ends[:used, 1]
 
 
@@ -86,10 +93,12 @@ def _behind(a, b, c, u0, v0, u1, v1):
 
 
 @numba.njit(cache=True, nogil=True)
-def _fill(bearings, points, eps, pairs, ends):
+def _fill(bearings, points, eps, pairs, ends, board):
     used = 0
     chords, sines = chord(eps), np.sin(eps)
     for i in range(len(bearings)):
+        if stopped(board):
+            break
         for j in range(i + 1, len(bearings)):
             sin_alpha, f, _, _, most_i, most_j, tau = pair_sinusoids(
                 bearings[i], bearings[j], points[i], points[j], chords[i], chords[j], sines[i], sines[j]
@@ -163,4 +172,5 @@ def _fill(bearings, points, eps, pairs, ends):
                 pairs[used, 0], pairs[used, 1] = i, j
                 ends[used, 0], ends[used, 1] = lo, hi
                 used += 1
+        board[DONE] += len(bearings) - 1 - i
     return used

@@ -9,6 +9,7 @@ import numpy as np
 
 from spherloc.consensus.clique_search import colour_bound, larger_clique, set_edge, subgraph, thin
 from spherloc.consensus.support import verify
+from spherloc.watch import stopped
 
 EFFORT_LIMIT = 200_000
 """Words touched in one bin."""
@@ -19,21 +20,22 @@ RUMOUR = 3
 
 
 @numba.njit(cache=True, nogil=True)
-def scout(data, starts, edges, bound, least, poses, supports, masks, known):
+def scout(data, starts, edges, bound, least, poses, supports, masks, known, board=None):
     """Verify the largest clique of each bin; better poses become known, and the bound of each bin is lowered in place.
 
     A clique must be larger than the best support. While that is not above ``least`` it must be larger than this, and
     not much smaller than the largest clique that had no pose. Returns how many poses are known.
+    A watch's ``board`` can end it.
     """
     floor = max(least, supports[0])
     for b in np.argsort(-bound, kind="mergesort"):
-        if bound[b] <= floor:
+        if bound[b] <= floor or stopped(board):
             break
-        nodes, rows = core_graph(masks.shape[1], edges[starts[b] : starts[b + 1]], floor)
+        nodes, rows = core_graph(masks.shape[1], edges[starts[b] : starts[b + 1]], floor, board)
         if len(nodes) <= floor or colour_bound(rows) <= floor:
             bound[b] = floor
             continue
-        clique, _, exact = larger_clique(rows, floor, EFFORT_LIMIT)
+        clique, _, exact = larger_clique(rows, floor, EFFORT_LIMIT, board)
         if exact:
             bound[b] = max(floor, len(clique))
         if len(clique):
@@ -43,16 +45,17 @@ def scout(data, starts, edges, bound, least, poses, supports, masks, known):
 
 
 @numba.njit(cache=True, nogil=True)
-def core_graph(count, edges, least):
+def core_graph(count, edges, least, board=None):
     """Nodes that may belong to a clique of more than ``least``, by falling degree, and their graph.
 
     Nodes have ``least`` edges among themselves or more (two between the same nodes count as two, but are one in the
     graph), and in a graph that is not too large the ends of every edge have ``least`` - 1 neighbours in common.
+    Stopped by a watch's ``board``, it has no edges.
     """
     degree, alive = np.empty(count, np.int64), np.ones(count, np.bool_)
     left = edges.copy()
     changed = True
-    while changed:
+    while changed and not stopped(board):
         changed = False
         degree[:] = 0
         used = 0
@@ -74,6 +77,8 @@ def core_graph(count, edges, least):
     for k in range(len(nodes)):
         places[nodes[k]] = k
     rows = np.zeros((len(nodes), (len(nodes) + 63) // 64), np.uint64)
+    if stopped(board):
+        return nodes, rows
     for k in range(len(left)):
         set_edge(rows, places[left[k, 0]], places[left[k, 1]])
     if len(left) * rows.shape[1] > MOST_THINNED or len(nodes) <= least:

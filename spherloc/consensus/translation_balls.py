@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from spherloc.consensus.depth_bounds import chord, pair_sinusoids
 from spherloc.problem import AlignedProblem
+from spherloc.watch import DONE, Watch, stopped
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -25,6 +26,12 @@ IndexArray = NDArray[np.int32]
 
 ROUNDING = 1e-9
 """Part by which a lower bound is lowered, so that rounding never turns away a ball."""
+FIRST_SORTED, MORE_SORTED = 32_000, 8
+"""Smallest balls that are sorted to spread them, and how many times as many where these are too few."""
+MOST_SORTED = 500_000
+"""Numbers whose order is found at once: some hundredths of a second."""
+FEW = 1023
+"""Where these bits of the number of arcs are 0, the watch is looked at."""
 
 
 def translation_balls(
@@ -47,16 +54,31 @@ def smallest_balls(
     covering: IndexArray,
     yaw_rad: float,
     most: int,
+    watch: Watch | None = None,
 ) -> tuple[IndexArray, FloatArray, FloatArray]:
     """The ``most`` smallest balls of the pairs whose arcs cover a yaw, smallest first: pairs (S, 2), centres, radii.
 
     ``arcs`` are those of ``yaw_arcs``, ``covering`` (K,) the indices of those that cover ``yaw_rad``; the slack of each
     reaches to its arc's farther end. Pairs that bound nothing are left out. Of equal balls the first counts as smaller.
+    ``watch`` counts the arcs; raises ``Cancelled``.
     """
+    watch = watch or Watch()
+    watch.expect(len(covering))
     data = (aligned.bearings, aligned.points, bound_rad)
-    pairs, centres, radii = _smallest(*data, *arcs, covering, yaw_rad, most)
-    kept = np.argsort(radii, kind="stable")[:most]
+    pairs, centres, radii = _smallest(*data, *arcs, covering, yaw_rad, most, watch.board)
+    kept = _order(radii, watch)[:most]
     return pairs[kept], centres[kept], radii[kept]
+
+
+def _order(values: FloatArray, watch: Watch) -> NDArray[np.int64]:
+    """The stable order of values, by halves where one sort would take long: numpy's cannot be stopped."""
+    watch.check()
+    if len(values) > MOST_SORTED:
+        middle = np.partition(values, len(values) // 2)[len(values) // 2]
+        low, high = np.flatnonzero(values < middle), np.flatnonzero(values >= middle)
+        if len(low):
+            return np.concatenate((low[_order(values[low], watch)], high[_order(values[high], watch)]))
+    return np.argsort(values, kind="stable")
 
 
 def share_of_each(count: int, most: int) -> int:
@@ -75,18 +97,22 @@ def spread_balls(
     covering: IndexArray,
     yaw_rad: float,
     most: int,
+    watch: Watch | None = None,
 ) -> tuple[IndexArray, FloatArray, FloatArray, int]:
     """Pairs (S, 2), centres and radii as of ``smallest_balls``, and how many pairs bound a position.
 
-    If these are more than ``most``, the smallest are taken, no correspondence having more than ``share_of_each``.
+    If these are more than ``most``, the smallest are taken, no correspondence having more than ``share_of_each``; then
+    the number is that of the pairs that were sorted for it, which may not be all.
     """
-    pairs, centres, radii = smallest_balls(aligned, bound_rad, arcs, covering, yaw_rad, max(1, len(covering)))
-    bounded = len(pairs)
-    if bounded <= most:
-        return pairs, centres, radii, bounded
-    count = len(aligned.bearings)
-    kept = _spread(pairs, share_of_each(count, most), most, count)
-    return pairs[kept], centres[kept], radii[kept], bounded
+    count, sorted_ones = len(aligned.bearings), max(FIRST_SORTED, most + 1)
+    while True:
+        pairs, centres, radii = smallest_balls(aligned, bound_rad, arcs, covering, yaw_rad, sorted_ones, watch)
+        if len(pairs) <= most:
+            return pairs, centres, radii, len(pairs)
+        kept = _spread(pairs, share_of_each(count, most), most, count)
+        if len(kept) == most or len(pairs) < sorted_ones:
+            return pairs[kept], centres[kept], radii[kept], len(pairs)
+        sorted_ones *= MORE_SORTED
 
 
 def overlapping(centres: FloatArray, radii: FloatArray) -> BoolArray:
@@ -137,14 +163,19 @@ def _spread(pairs, share, most, count):
 
 
 @numba.njit(cache=True, nogil=True)
-def _smallest(bearings, points, eps, pairs, lo, hi, covering, yaw, most):
+def _smallest(bearings, points, eps, pairs, lo, hi, covering, yaw, most, board):
     """Pairs (S, 2) in their order, centres and radii: the ``most`` smallest balls and some more."""
     chords, sines = chord(eps), np.sin(eps)
     c, s = np.cos(yaw), np.sin(yaw)
     room = min(2 * most, len(covering) + 1)
     near, centres, radii = np.empty((room, 2), np.int32), np.empty((room, 3)), np.empty(room)
     count, limit = 0, np.inf
-    for arc in covering:
+    for place in range(len(covering)):
+        if place & FEW == 0:
+            board[DONE] = place
+            if stopped(board):
+                break
+        arc = covering[place]
         i, j = pairs[arc, 0], pairs[arc, 1]
         if not _least_squared_radius(i, j, bearings, points, chords, sines, c, s) < limit * limit:
             continue
@@ -158,10 +189,10 @@ def _smallest(bearings, points, eps, pairs, lo, hi, covering, yaw, most):
         # Keep the smallest, of equal ones the first, and look for smaller ones only.
         limit = np.partition(radii, most - 1)[most - 1]
         ties, count = most - np.count_nonzero(radii < limit), 0
-        for place in range(room):
-            if radii[place] < limit or (radii[place] == limit and ties > 0):
-                ties -= radii[place] == limit
-                near[count], centres[count], radii[count] = near[place], centres[place], radii[place]
+        for old in range(room):
+            if radii[old] < limit or (radii[old] == limit and ties > 0):
+                ties -= radii[old] == limit
+                near[count], centres[count], radii[count] = near[old], centres[old], radii[old]
                 count += 1
     return near[:count].copy(), centres[:count].copy(), radii[:count].copy()
 

@@ -21,6 +21,7 @@ from spherloc.consensus.inliers import BLOCK, pack_blocks, reaches, score_inlier
 from spherloc.consensus.level_fit import fit, place, translation_of
 from spherloc.problem import AlignedProblem
 from spherloc.solvers.two_point import solve_pair
+from spherloc.watch import DONE, TOTAL, Watch, stopped
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -33,6 +34,10 @@ TURNED_AWAY = 1e-3
 
 OPTIMIZATION_ROUNDS, OPTIMIZATION_STEPS = 3, 2
 """Choices of inliers, and Gauss-Newton steps on each; more steps change nothing (measured)."""
+
+
+FEW = 15
+"""The search looks at its watch where these bits of the number of samples are 0."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,12 +75,17 @@ def search_two_point(
     confidence: float | None = None,
     scoring: Scoring = "count",
     local_optimization: bool = False,
+    watch: Watch | None = None,
 ) -> TwoPointSearch:
     """Draw up to ``iterations`` pairs of the M >= 2 correspondences, until ``confidence`` (None: all of them).
 
     ``bound_px`` (M,) is each one's pixel bound. ``scoring`` "count" takes the hypothesis with most inliers, "msac" the
     one with the least MSAC cost. ``local_optimization`` fits yaw and translation to the inliers of each improvement.
+    ``watch`` counts the samples, and expects all or, with a confidence, as many as the best hypothesis asks for; raises
+    ``Cancelled``.
     """
+    watch = watch or Watch()
+    watch.expect(iterations)
     log, drawn, reached = _search(
         aligned.bearings,
         aligned.points,
@@ -86,7 +96,9 @@ def search_two_point(
         np.nan if confidence is None else 1.0 - confidence,
         scoring == "msac",
         local_optimization,
+        watch.board,
     )
+    watch.check()
     return TwoPointSearch(
         drawn=drawn,
         confidence_reached=reached,
@@ -188,7 +200,7 @@ def _optimize(yaw, translation, bearings, points, weights, bound_px, mask):
 
 
 @numba.njit(cache=True, nogil=True)
-def _search(bearings, points, weights, bound_px, seed, iterations, miss, msac, local):
+def _search(bearings, points, weights, bound_px, seed, iterations, miss, msac, local, board):
     """Rows (sample, i, j, yaw, translation, inliers, optimized) of all improvements, samples drawn, confidence reached.
 
     ``miss`` is 1 - confidence, or NaN to draw all samples.
@@ -203,6 +215,10 @@ def _search(bearings, points, weights, bound_px, seed, iterations, miss, msac, l
     log, rows, best, drawn = np.empty((32, 9)), 0, 0.0, 0
     log_unclean = 0.0  # logarithm of the chance that one sample is not of the best hypothesis's inliers only
     while drawn < iterations and not (bounded and rows > 0 and drawn * log_unclean <= np.log(miss - turned_away)):
+        if drawn & FEW == 0:
+            board[DONE] = drawn
+            if stopped(board):
+                break
         i, j = sample_pair(seed, drawn, count)
         for root in range(solve_pair(bearings[i], bearings[j], points[i], points[j], yaws, translations)):
             yaw, translation = yaws[root], translations[root]
@@ -222,6 +238,10 @@ def _search(bearings, points, weights, bound_px, seed, iterations, miss, msac, l
                 rows, best = rows + 1, score
                 log_unclean = np.log1p(-((inliers / count) ** 2))
                 _set_floors(floors, int(np.floor(best)) + 1, count, turned_away)
+                if bounded and log_unclean < 0.0:
+                    needed = np.ceil(np.log(miss - turned_away) / log_unclean)
+                    board[TOTAL] = np.int64(min(float(iterations), max(needed, 1.0)))
         drawn += 1
+    board[DONE] = drawn
     reached = -np.expm1(drawn * log_unclean) - turned_away if rows > 0 else 0.0
     return log[:rows].copy(), drawn, max(0.0, reached)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from spherloc.consensus.depth_bounds import chord, pair_sinusoids
 from spherloc.problem import AlignedProblem
+from spherloc.watch import DONE, Watch, stopped
 
 FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int32]
@@ -29,19 +30,22 @@ SAME = 1e-9
 
 
 def yaw_arcs(
-    aligned: AlignedProblem, bound_rad: FloatArray, widest_rad: float = FULL
+    aligned: AlignedProblem, bound_rad: FloatArray, widest_rad: float = FULL, watch: Watch | None = None
 ) -> tuple[IndexArray, FloatArray, FloatArray]:
     """All arcs: pairs (A, 2) of places in ``aligned``, lower ends (A,) in [-pi, pi), upper ends (A,) >= lower.
 
     ``bound_rad`` (M,) bounds the angular error of each bearing. Arcs wider than ``widest_rad`` are left out, and so is
-    a pair that bounds nothing: it would cover every yaw alike.
+    a pair that bounds nothing: it would cover every yaw alike. ``watch`` counts the pairs; raises ``Cancelled``.
     """
+    watch = watch or Watch()
     count = len(aligned.bearings)
+    watch.expect(count * (count - 1) // 2)
     room = MOST_ARCS * (count * (count - 1) // 2)
     # Memory that is never touched is never used, so room for the worst case costs nothing.
     pairs = np.empty((room, 2), np.int32)
     lo, hi = np.empty(room), np.empty(room)
-    used = _fill(aligned.bearings, aligned.points, bound_rad, widest_rad, pairs, lo, hi)
+    used = _fill(aligned.bearings, aligned.points, bound_rad, widest_rad, pairs, lo, hi, watch.board)
+    watch.check()
     return pairs[:used], lo[:used], hi[:used]
 
 
@@ -161,12 +165,14 @@ def _arcs_at_roots(f, tau, most_i, most_j, arcs):
 
 
 @numba.njit(cache=True, nogil=True)
-def _fill(bearings, points, eps, widest, pairs, lo, hi):
+def _fill(bearings, points, eps, widest, pairs, lo, hi, board):
     used = 0
     chords, sines = chord(eps), np.sin(eps)
     least_cosine = np.cos(widest) - SAME if widest < np.pi else -2.0
     arcs = np.empty((2 * MOST_ARCS, 4))
     for i in range(len(bearings)):
+        if stopped(board):
+            break
         for j in range(i + 1, len(bearings)):
             sin_alpha, f, _, _, most_i, most_j, tau = pair_sinusoids(
                 bearings[i], bearings[j], points[i], points[j], chords[i], chords[j], sines[i], sines[j]
@@ -194,4 +200,5 @@ def _fill(bearings, points, eps, widest, pairs, lo, hi):
                     pairs[used, 0], pairs[used, 1] = i, j
                     lo[used], hi[used] = start, start + width
                     used += 1
+        board[DONE] += len(bearings) - 1 - i
     return used

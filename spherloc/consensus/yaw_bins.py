@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spherloc.consensus.pair_arcs import CIRCLE
+from spherloc.watch import SELDOM, stopped
 
 FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int32]
@@ -20,13 +21,18 @@ BIN_TURN = CIRCLE / BINS
 
 
 @numba.njit(cache=True, nogil=True)
-def sort_into_bins(pairs: IndexArray, lo: FloatArray, hi: FloatArray) -> tuple[NDArray[np.int64], EdgeArray]:
+def sort_into_bins(
+    pairs: IndexArray, lo: FloatArray, hi: FloatArray, board: NDArray[np.int64] | None = None
+) -> tuple[NDArray[np.int64], EdgeArray]:
     """Places (BINS + 1,) where each bin's edges start in a list of edges (E, 2), and the list: nodes below 65,536.
 
-    An arc is an edge of every bin that it touches. Nodes are copied, so that a bin is read from one place.
+    An arc is an edge of every bin that it touches. Nodes are copied, so that a bin is read from one place. A
+    watch's ``board`` can end it, after which the edges are none.
     """
     starts = np.zeros(BINS + 1, np.int64)
     for arc in range(len(lo)):
+        if arc & SELDOM == 0 and stopped(board):
+            return np.zeros(BINS + 1, np.int64), np.empty((0, 2), np.uint16)
         first, last = _bins(lo[arc], hi[arc])
         for b in range(first, last + 1):
             starts[b % BINS + 1] += 1
@@ -35,6 +41,8 @@ def sort_into_bins(pairs: IndexArray, lo: FloatArray, hi: FloatArray) -> tuple[N
     edges = np.empty((starts[BINS], 2), np.uint16)
     place = starts[:BINS].copy()
     for arc in range(len(lo)):
+        if arc & SELDOM == 0 and stopped(board):
+            return np.zeros(BINS + 1, np.int64), np.empty((0, 2), np.uint16)
         first, last = _bins(lo[arc], hi[arc])
         for b in range(first, last + 1):
             edges[place[b % BINS], 0], edges[place[b % BINS], 1] = pairs[arc, 0], pairs[arc, 1]
@@ -50,11 +58,18 @@ def _bins(lo, hi):
 
 
 @numba.njit(cache=True, nogil=True)
-def degree_bounds(count: int, starts: NDArray[np.int64], edges: EdgeArray) -> IndexArray:
-    """(BINS,) bound on the clique number of each bin's graph of ``count`` nodes."""
-    bound = np.empty(BINS, np.int32)
+def degree_bounds(
+    count: int, starts: NDArray[np.int64], edges: EdgeArray, board: NDArray[np.int64] | None = None
+) -> IndexArray:
+    """(BINS,) bound on the clique number of each bin's graph of ``count`` nodes.
+
+    A watch's ``board`` can end it, after which the other bounds are ``count``.
+    """
+    bound = np.full(BINS, count, np.int32)
     degree, tally = np.empty(count, np.int64), np.empty(count + 1, np.int64)
     for b in range(BINS):
+        if stopped(board):
+            break
         degree[:] = 0
         for place in range(starts[b], starts[b + 1]):
             degree[edges[place, 0]] += 1

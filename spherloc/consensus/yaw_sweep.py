@@ -11,11 +11,15 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from spherloc.watch import SELDOM, Watch, stopped
+
 FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int32]
 
 BINS = 1440
 """Bins of the overlap curve kept for display, a quarter of a degree each."""
+MOST_SORTED = 2_000_000
+"""Numbers that are sorted at once: some hundredths of a second."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,21 +36,41 @@ class YawConsensus:
     """(BINS,) the most arcs over any one yaw of each bin, from -pi upwards."""
 
 
-def deepest_yaw(lo_rad: FloatArray, hi_rad: FloatArray) -> YawConsensus | None:
+def deepest_yaw(lo_rad: FloatArray, hi_rad: FloatArray, watch: Watch | None = None) -> YawConsensus | None:
     """The yaw that most of the closed arcs [lo, hi] cover (-pi <= lo < pi, hi <= lo + 2 pi); None without arcs.
 
-    -pi and pi are one yaw.
+    -pi and pi are one yaw. ``watch`` counts the steps below; raises ``Cancelled``.
     """
     if len(lo_rad) == 0:
         return None
-    starts, ends, depth = _ends(lo_rad, hi_rad)
-    starts.sort()
-    ends.sort()
+    watch = watch or Watch()
+    watch.expect(5)
+    starts, ends, depth = _ends(lo_rad, hi_rad, watch.board)
+    watch.reach(1)
+    _sort(starts, watch)
+    watch.reach(2)
+    _sort(ends, watch)
+    watch.reach(3)
     overlap = np.zeros(BINS, np.int32)
-    start, end = _sweep(starts, ends, depth, overlap)
+    start, end = _sweep(starts, ends, depth, overlap, watch.board)
+    watch.reach(4)
     yaw = 0.5 * (start + end)
     yaw -= 2 * np.pi if yaw >= np.pi else 0.0
-    return YawConsensus((start, end), yaw, _covering(lo_rad, hi_rad, yaw), overlap)
+    clique = _covering(lo_rad, hi_rad, yaw, watch.board)
+    watch.reach(5)
+    return YawConsensus((start, end), yaw, clique, overlap)
+
+
+def _sort(values: FloatArray, watch: Watch) -> None:
+    """Sort in place, by halves where one sort would take long: numpy's cannot be stopped."""
+    watch.check()
+    if len(values) <= MOST_SORTED:
+        values.sort()
+        return
+    half = len(values) // 2
+    values.partition(half)
+    _sort(values[:half], watch)
+    _sort(values[half:], watch)
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
@@ -58,11 +82,13 @@ def _kind(lo, hi):
 
 
 @numba.njit(cache=True, nogil=True)
-def _ends(lo, hi):
+def _ends(lo, hi, board):
     """Lower and upper ends of the arcs but whole circles, in any order, and how many arcs cover -pi from before."""
     starts, ends = np.empty(len(lo)), np.empty(len(lo))
     count, depth = 0, 0
     for k in range(len(lo)):
+        if k & SELDOM == 0 and stopped(board):
+            break
         full, wraps, end = _kind(lo[k], hi[k])
         starts[count], ends[count] = lo[k], end
         count += not full
@@ -71,11 +97,13 @@ def _ends(lo, hi):
 
 
 @numba.njit(cache=True, nogil=True)
-def _covering(lo, hi, yaw):
+def _covering(lo, hi, yaw, board):
     """Indices of the arcs that cover a yaw of [-pi, pi)."""
     covering = np.empty(len(lo), np.int32)
     count = 0
     for k in range(len(lo)):
+        if k & SELDOM == 0 and stopped(board):
+            break
         full, wraps, end = _kind(lo[k], hi[k])
         above, below = lo[k] <= yaw, yaw <= end
         covering[count] = k
@@ -89,7 +117,7 @@ def _bin(yaw):
 
 
 @numba.njit(cache=True, nogil=True)
-def _sweep(starts, ends, depth, overlap):
+def _sweep(starts, ends, depth, overlap, board):
     """Walk the sorted ends from -pi to pi, starting with ``depth`` arcs that cover -pi; fill ``overlap``.
 
     Returns the longest interval of greatest depth. Where an arc ends and another starts at the same yaw, both
@@ -112,7 +140,7 @@ def _sweep(starts, ends, depth, overlap):
         far = there + (seam_end + np.pi if there == np.pi and depth == seam_depth and here > -np.pi else 0.0)
         if depth > best or (depth == best and far - here > best_hi - best_lo):
             best, best_lo, best_hi = depth, here, far
-        if there == np.pi:
+        if there == np.pi or ((opened + closed) & SELDOM == 0 and stopped(board)):
             return best_lo, best_hi
         # Which one comes next is as good as random: arithmetic instead of a branch.
         opens = np.int64(next_open <= next_close)

@@ -47,7 +47,13 @@ class Auto:
         """Probe, choose, run what was chosen; its stages follow the decision."""
         with clock.stage("decision"):
             probe = search_two_point(
-                aligned, bounds.pixels, seed, _probe_samples(aligned), PROBE_CONFIDENCE, local_optimization=True
+                aligned,
+                bounds.pixels,
+                seed,
+                _probe_samples(aligned),
+                PROBE_CONFIDENCE,
+                local_optimization=True,
+                watch=clock.watch,
             )
             decision = _decide(aligned, bounds, probe)
         shared = {item.name: getattr(options, item.name) for item in fields(options)}

@@ -18,6 +18,7 @@ from spherloc.errors import InputError, show
 from spherloc.problem import AlignedProblem, Problem
 from spherloc.refine import RefinementOptions
 from spherloc.trace import Certificate, Stage, Trace
+from spherloc.watch import Cancelled, Watch
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -51,19 +52,27 @@ class Estimator(Protocol):
 
     @staticmethod
     def run(aligned: AlignedProblem, options: Any, bounds: Bounds, seed: int, clock: "Clock") -> Outcome:
-        """Solve; take every random draw from ``seed`` and report each stage's time to ``clock``."""
+        """Solve; take every random draw from ``seed`` and report each stage's time to ``clock``.
+
+        What may take longer than some hundredths of a second looks at ``clock.watch`` so often.
+        """
         ...
 
 
 class Clock:
-    """Collects the wall time of named stages, ms."""
+    """Collects the wall time of named stages, ms, and carries the run's watch."""
 
-    def __init__(self) -> None:
+    def __init__(self, watch: Watch | None = None) -> None:
         self.timings_ms: dict[str, float] = {}
+        self.watch = watch or Watch()
 
     @contextmanager
-    def stage(self, name: str):
-        """Time the body as ``name``."""
+    def stage(self, name: str, until: float | None = None):
+        """Time the body as ``name``, at whose end the watch's fraction is ``until`` (None: as it was).
+
+        Raises ``Cancelled`` if the run shall end.
+        """
+        self.watch.begin(name, until)
         start = time.perf_counter()
         yield
         self.timings_ms[name] = (time.perf_counter() - start) * 1e3
@@ -101,11 +110,15 @@ def check_positive(options: Any) -> None:
             raise InputError(f"option {item.name} is {show(value)}; give a positive number.")
 
 
-def estimate(problem: Problem, estimator: str = "mc", options: Any = None, seed: int = 0) -> Trace:
+def estimate(
+    problem: Problem, estimator: str = "mc", options: Any = None, seed: int = 0, watch: Watch | None = None
+) -> Trace:
     """Solve a problem and return the record of the run.
 
     ``options`` is an instance of ``options_type(estimator)``; None takes the defaults. The same arguments give the
-    same trace but for its timings. Raises ``InputError`` for an unknown estimator, options of another estimator, or a
+    same trace but for its timings. ``watch``, a new one, follows the run and can cancel it from any thread.
+
+    Raises ``Cancelled`` if it did, ``InputError`` for an unknown estimator, options of another estimator, or a
     seed outside 0 to 2^63 - 1.
     """
     kind = registry.lookup("estimators", estimator)
@@ -116,9 +129,14 @@ def estimate(problem: Problem, estimator: str = "mc", options: Any = None, seed:
         raise InputError(f"seed is {seed}; give a number from 0 to 2^63 - 1.")
     aligned = problem.aligned
     bounds = bounds_of(aligned, options.bound_px)
-    clock = Clock()
+    clock = Clock(watch)
     start = time.perf_counter()
-    outcome = kind.run(aligned, options, bounds, seed, clock)
+    try:
+        clock.watch.check()
+        outcome = kind.run(aligned, options, bounds, seed, clock)
+        clock.watch.finish()
+    except Cancelled as cancelled:
+        raise cancelled.with_traceback(None) from None  # whose frames would keep the gigabytes of the run alive
     clock.timings_ms["total"] = (time.perf_counter() - start) * 1e3
     pose = None if outcome.cam_from_map is None else aligned.unalign_pose(outcome.cam_from_map)
     mask = aligned.full_mask(outcome.inlier_mask)

@@ -21,6 +21,7 @@ from spherloc.problem import AlignedProblem
 from spherloc.refine import RefinementOptions, refine
 from spherloc.solvers.two_point import two_point
 from spherloc.trace import Stage, TranslationStage, YawStage
+from spherloc.watch import SELDOM, Watch, stopped
 
 FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int32]
@@ -67,32 +68,41 @@ class MaximumConsensus:
                 "thin them or use ransac-2p."
             )
         nobody = np.zeros(count, dtype=bool)
-        with clock.stage("yaw"):
-            pairs, lo, hi = yaw_arcs(aligned, bounds.radians, WIDEST_RAD)
-            consensus = deepest_yaw(lo, hi)
+        with clock.stage("yaw", until=0.75):
+            pairs, lo, hi = yaw_arcs(aligned, bounds.radians, WIDEST_RAD, clock.watch)
+            clock.watch.begin("sweep", until=0.9)
+            consensus = deepest_yaw(lo, hi, clock.watch)
         if consensus is None:
             reason = f"No pose: none of {count * (count - 1) // 2} pairs fixes the yaw to within 60 degrees."
             return Outcome((), None, nobody, reason)
-        yaw = _yaw_stage(aligned, pairs, lo, hi, consensus)
-        with clock.stage("translation"):
-            translation, start = _locate(aligned, options, bounds, pairs, lo, hi, consensus)
+        yaw = _yaw_stage(aligned, pairs, lo, hi, consensus, clock.watch)
+        with clock.stage("translation", until=0.99):
+            translation, start = _locate(aligned, options, bounds, pairs, lo, hi, consensus, clock.watch)
         if translation is None or start is None:
             reason = "No pose: no pair in the rotation clique bounds the camera's position."
             return Outcome((yaw,), None, nobody, reason)
-        with clock.stage("refinement"):
+        with clock.stage("refinement", until=1.0):
             refined, inliers, refinement = refine(aligned, start, bounds, options)
         stages: tuple[Stage, ...] = (yaw, translation, refinement)
         return Outcome(stages, refined, inliers)
 
 
 def _yaw_stage(
-    aligned: AlignedProblem, pairs: IndexArray, lo: FloatArray, hi: FloatArray, consensus: YawConsensus
+    aligned: AlignedProblem,
+    pairs: IndexArray,
+    lo: FloatArray,
+    hi: FloatArray,
+    consensus: YawConsensus,
+    watch: Watch,
 ) -> YawStage:
     count = len(aligned.bearings)
+    named = np.empty_like(pairs)
+    _rename(pairs, aligned.index, named, watch.board)
+    watch.check()
     return YawStage(
         pairs_total=count * (count - 1) // 2,
         rule="Arcs wider than 60° say too little and are left out.",
-        pairs=aligned.index.astype(np.int32)[pairs],
+        pairs=named,
         lo_rad=lo,
         hi_rad=hi,
         overlap=consensus.overlap,
@@ -100,6 +110,15 @@ def _yaw_stage(
         yaw_rad=consensus.yaw_rad,
         clique=consensus.clique,
     )
+
+
+@numba.njit(cache=True, nogil=True)
+def _rename(pairs, index, named, board):
+    """Write the numbers in the problem of ``pairs`` (A, 2), whose places are those of ``index`` (M,)."""
+    for k in range(len(pairs)):
+        if k & SELDOM == 0 and stopped(board):
+            break
+        named[k, 0], named[k, 1] = index[pairs[k, 0]], index[pairs[k, 1]]
 
 
 def _locate(
@@ -110,15 +129,16 @@ def _locate(
     lo: FloatArray,
     hi: FloatArray,
     consensus: YawConsensus,
+    watch: Watch,
 ) -> tuple[TranslationStage | None, FloatArray | None]:
     """Balls of the rotation clique, their maximum clique, and the aligned pose (3, 4) that it proposes."""
     yaw, arcs = consensus.yaw_rad, consensus.clique
     most = int(options.max_balls)
-    pairs, centres, radii, bounded = spread_balls(aligned, bounds.radians, (pairs, lo, hi), arcs, yaw, most)
+    pairs, centres, radii, bounded = spread_balls(aligned, bounds.radians, (pairs, lo, hi), arcs, yaw, most, watch)
     if len(pairs) == 0:
         return None, None
     overlap = overlapping(centres, radii)
-    clique = max_clique(overlap)
+    clique = max_clique(overlap, watch=watch)
     start = _best_start(aligned, bounds, pairs[clique.nodes], yaw, centres[clique.nodes], radii[clique.nodes])
     stage = TranslationStage(
         candidates=len(arcs),

@@ -63,8 +63,10 @@ class ExactMaximumConsensus:
                 "thin them or use ransac-2p."
             )
         samples = max(LEAST_SAMPLES, round(min(1.0, options.effort) * SEED_SAMPLES))
-        with clock.stage("guess"):
-            guess = search_two_point(aligned, bounds.pixels, seed, samples, SEED_CONFIDENCE, local_optimization=True)
+        with clock.stage("guess", until=0.1):
+            guess = search_two_point(
+                aligned, bounds.pixels, seed, samples, SEED_CONFIDENCE, local_optimization=True, watch=clock.watch
+            )
         with clock.stage("consensus"):
             rate = chance_rate(aligned.bearings, bounds.radians)
             found = exact_consensus(
@@ -74,6 +76,7 @@ class ExactMaximumConsensus:
                 _poses(guess),
                 int(options.effort * EFFORT),
                 options.time_budget_s,
+                clock.watch,
             )
         stage = _stage(aligned, guess, found)
         upper = int(found.bound.max(initial=1))
@@ -81,7 +84,7 @@ class ExactMaximumConsensus:
             certificate = Certificate(upper, 1, chance_sets(count, 1, rate))
             reason = "No pose: no pair of correspondences has a solution in front of the camera."
             return Outcome((stage,), None, np.zeros(count, dtype=bool), reason, certificate=certificate)
-        with clock.stage("refinement"):
+        with clock.stage("refinement", until=1.0):
             refined, inliers, refinement = refine(aligned, found.poses[0], bounds, options)
         lower = _lower_bound(aligned, bounds, found, refined, refinement.tilt_rad)
         certificate = Certificate(max(upper, lower), lower, chance_sets(count, lower, rate))

@@ -56,7 +56,7 @@ class TwoPointRansac:
     @staticmethod
     def run(aligned: AlignedProblem, options: RansacOptions, bounds: Bounds, seed: int, clock: Clock) -> Outcome:
         """Algorithm 1."""
-        with clock.stage("ransac"):
+        with clock.stage("ransac", until=0.99):
             search = search_two_point(
                 aligned,
                 bounds.pixels,
@@ -65,12 +65,13 @@ class TwoPointRansac:
                 options.confidence,
                 options.scoring,
                 options.local_optimization,
+                clock.watch,
             )
             stage = _stage(aligned, bounds, search)
         if not search.found:
             reason = f"No pose: none of {search.drawn} sampled pairs has a solution in front of the camera."
             return Outcome((stage,), None, np.zeros(len(aligned.bearings), dtype=bool), reason)
-        with clock.stage("refinement"):
+        with clock.stage("refinement", until=1.0):
             start = pose(yaw_rotation(search.yaws_rad[-1]), search.translations[-1])
             refined, inliers, refinement = refine(aligned, start, bounds, options)
         return Outcome((stage, refinement), refined, inliers)

@@ -9,6 +9,7 @@ them" (Sec. VI-C): EPnP solves the samples, as in OpenCV's RANSAC, and the solve
 Residuals and bounds stay those of the original pixels.
 """
 
+import math
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -29,6 +30,7 @@ from spherloc.solvers.odlt import Odlt
 from spherloc.solvers.svd import Svd
 from spherloc.solvers.virtual_pinhole import VirtualPinhole
 from spherloc.trace import RansacStage
+from spherloc.watch import Watch
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -106,8 +108,8 @@ class SolverRansac:
     ) -> Outcome:
         """Algorithm 1."""
         view = _view(aligned, bounds, self.sampler.pinhole)
-        with clock.stage("ransac"):
-            drawn, found = self._search(view, options, np.random.default_rng(seed))
+        with clock.stage("ransac", until=0.99):
+            drawn, found = self._search(view, options, np.random.default_rng(seed), clock.watch)
             reason = self._no_pose(view, drawn, found)
             if not reason and self.fitter is not None:
                 fit = self._fit(view, found[-1])
@@ -117,13 +119,13 @@ class SolverRansac:
         inlier_mask = np.zeros(len(aligned.bearings), dtype=bool)
         if reason:
             return Outcome((stage,), None, inlier_mask, " ".join(filter(None, (reason, _lost(view)))))
-        with clock.stage("refinement"):
+        with clock.stage("refinement", until=1.0):
             refined, inliers, refinement = refine(view.aligned, found[-1].cam_from_map, view.bounds, options)
         inlier_mask[view.seen] = inliers
         return Outcome((stage, refinement), refined, inlier_mask, note=_lost(view))
 
     def _search(
-        self, view: _View, options: SolverRansacOptions, rng: np.random.Generator
+        self, view: _View, options: SolverRansacOptions, rng: np.random.Generator, watch: Watch
     ) -> tuple[int, list[_Hypothesis]]:
         """Samples drawn, and every hypothesis that explains more than all before it."""
         count, size = len(view.bearings), self.sampler.sample_size
@@ -132,7 +134,9 @@ class SolverRansac:
             return 0, found
         samples = draw_samples(rng, count, size, int(options.iterations))
         best, drawn, needed = 0, 0, float(len(samples))
+        watch.expect(len(samples))
         while drawn < len(samples) and drawn < needed:
+            watch.reach(drawn)
             sample = samples[drawn]
             for solution in self.sampler.solve(view.bearings[sample], view.points[sample]):
                 state = view.aligned.align_pose(solution)
@@ -143,6 +147,7 @@ class SolverRansac:
                 found.append(_Hypothesis(drawn, sample, state, mask))
                 if options.confidence is not None:
                     needed = _samples_needed(options.confidence, inliers / count, size)
+                    watch.expect(max(1, min(len(samples), math.ceil(needed))))
             drawn += 1
         return drawn, found
 

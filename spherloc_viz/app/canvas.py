@@ -11,8 +11,9 @@ from spherloc_viz.app.true_camera import TrueCamera
 from spherloc_viz.app.wish import Run
 from spherloc_viz.layers.primitives import Picture
 
-FIRST_CHECKS, CHECK_S = 8, 0.4
-"""A page that is still building itself drops its first view and reports that its viewer has not moved."""
+FIRST_CHECKS, MOST_CHECKS, CHECK_S = 8, 40, 0.4
+"""A page that is still building itself drops its first view and reports that its viewer has not moved; a slow one for
+many checks."""
 
 
 class Canvas:
@@ -36,7 +37,7 @@ class Canvas:
         self._camera = TrueCamera(client, moved)
         self._docked_px, self._full_width = docked_px, client.camera.image_width
         self._viewed: tuple[str, str, str] | None = None
-        self._checks = FIRST_CHECKS
+        self._checks = 0
 
     def draw(self, run: Run, picture: Picture, mesh: bytes | None, movable: bool) -> None:
         """Show a picture of a run; ``mesh`` is the map's, and ``movable`` whether the true camera may be dragged."""
@@ -49,10 +50,9 @@ class Canvas:
 
     def check(self) -> float | None:
         """Seconds to the next look at whether the page dropped its first view; None once it has had time enough."""
-        if self._checks == 0:
-            return None
-        self._checks -= 1
-        return CHECK_S
+        self._checks += 1
+        most = MOST_CHECKS if views.is_unmoved(self._client) else FIRST_CHECKS
+        return CHECK_S if self._checks <= most else None
 
     def _move_viewer(self, run: Run, picture: Picture) -> None:
         """Go where the person wants, or, if that is to follow the steps, where the step's subject reads best."""

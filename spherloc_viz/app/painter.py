@@ -31,18 +31,20 @@ class Painter:
     """The canvas of one client. What is picked there is found here, by the ray of the click: so lines, dots of a
     point cloud and balls within balls can be picked too, and a small dot within some pixels."""
 
-    def __init__(self, client: viser.ClientHandle, on_pick: OnPick = lambda ids, extend: None) -> None:
-        """``on_pick`` is called on viser's threads; a click on nothing picks ()."""
-        self._client, self._on_pick = client, on_pick
+    def __init__(self, client: viser.ClientHandle | viser.ViserServer, on_pick: OnPick | None = None) -> None:
+        """``on_pick`` is called on viser's threads, and a click on nothing picks (); None for a page that cannot answer,
+        such as a still one, for which ``client`` is a server."""
+        self._client = client
         self._drawn: dict[str, tuple[Any, tuple, SceneItem]] = {}
         self._textured: dict[str, tuple[Hashable, bytes | None]] = {}
         self._shown: tuple[SceneItem, ...] = ()
         self._backdrop: tuple[bytes, Any] | None = None
-        scene, extend = client.scene, partial(self._clicked, extend=True)
-        scene.on_click()(partial(self._clicked, extend=False))
-        scene.on_click(modifier="shift")(extend)
-        scene.on_click(modifier="cmd/ctrl")(extend)
-        scene.on_rect_select(modifier="shift")(self._framed)
+        if on_pick is not None:
+            scene, extend = client.scene, partial(self._clicked, on_pick, True)
+            scene.on_click()(partial(self._clicked, on_pick, False))
+            scene.on_click(modifier="shift")(extend)
+            scene.on_click(modifier="cmd/ctrl")(extend)
+            scene.on_rect_select(modifier="shift")(partial(self._framed, on_pick))
 
     def draw(self, items: Iterable[SceneItem], layers: frozenset[str]) -> None:
         """Show these primitives, those of ``layers`` only, and hide all others."""
@@ -98,13 +100,13 @@ class Painter:
             self._textured[item.name] = known = (item.key, glb)
         return known[1]
 
-    def _clicked(self, event: viser.SceneClickEvent, extend: bool) -> None:
+    def _clicked(self, on_pick: OnPick, extend: bool, event: viser.SceneClickEvent) -> None:
         viewer = viewer_of(event.client.camera)
         origin, direction = np.array(event.ray_origin), np.array(event.ray_direction)
-        self._on_pick(nearest(self._shown, origin, direction, viewer.radians_per_pixel), extend)
+        on_pick(nearest(self._shown, origin, direction, viewer.radians_per_pixel), extend)
 
-    def _framed(self, event: viser.SceneRectSelectEvent) -> None:
-        self._on_pick(inside(self._shown, viewer_of(event.client.camera), event.screen_min, event.screen_max), False)
+    def _framed(self, on_pick: OnPick, event: viser.SceneRectSelectEvent) -> None:
+        on_pick(inside(self._shown, viewer_of(event.client.camera), event.screen_min, event.screen_max), False)
 
 
 def _parts(item: SceneItem) -> list[SceneItem]:

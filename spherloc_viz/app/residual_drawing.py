@@ -55,7 +55,7 @@ def _bars(histogram: Histogram, chosen: NDArray[np.int64], across: list[float], 
     parts = [
         _boxes(across, width, feet, middle, "right", shapes.fill(style.INLIER)),
         _boxes(across, width, middle, top, "wrong", shapes.fill(style.OUTLIER)),
-        _boxes(across, width, feet, y.px(chosen), "chosen", shapes.stroke(None, 1.5)),
+        _boxes(across, width, feet, y.px(chosen), "chosen", shapes.stroke(style.SELECTED, 2.0)),
     ]
     press, words = (
         f'class="bin" fill="transparent" data-touch="{SELECT_BIN}:{histogram.unit}:',

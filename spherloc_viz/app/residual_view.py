@@ -21,41 +21,38 @@ class ResidualView:
     """Pressing a bin of a histogram selects its matches."""
 
     def __init__(self, gui: viser.GuiApi, touches: Touches, changed: Callable[[object], None], select: Select) -> None:
-        """``select`` is called with the numbers that matches are known by on the page, then ``changed``."""
+        """``select`` is called with the matches of a bin that was pressed, by their numbers in the problem."""
         self._changed, self._select = changed, select
         self._known: tuple[Trace, Residuals | None, str, str] | None = None
-        self._drawn: tuple[tuple[int, ...], bytes] | None = None
-        self._bins: dict[str, tuple[Histogram, NDArray[np.int64]]] = {}
+        self._drawn: tuple[int, ...] | None = None
+        self._bins: dict[str, Histogram] = {}
         self._html = gui.add_html("")
         touches.on(SELECT_BIN, self._press)
 
     def draw(self, trace: Trace, selected: tuple[int, ...], kept: NDArray[np.int64]) -> None:
-        """Show a run with the ``selected`` matches (numbers of the problem) marked.
-
-        ``kept`` (N,) are the numbers by which the matches are known on the page. Sends nothing if nothing changed.
+        """Show a run with the ``selected`` matches (numbers of the problem) marked; nothing here needs ``kept``, the
+        numbers (N,) by which matches are known on the page. Sends nothing if nothing changed.
         """
-        drawn = selected, kept.tobytes()
         if self._known is None or self._known[0] is not trace:
             residuals, history = residuals_of(trace), history_of(trace)
             self._known = trace, residuals, table_html(scores_table(trace)), _history_html(history)
-        elif self._drawn == drawn:
+        elif self._drawn == selected:
             return
         _, residuals, scores, history_html = self._known
-        bins = {} if residuals is None else {one.unit: (one, kept) for one in residuals.histograms}
+        bins: dict[str, Histogram] = {} if residuals is None else {one.unit: one for one in residuals.histograms}
         content = _residuals_html(residuals, selected) + scores + history_html
         # A press on what was on the page a moment ago selects what is in that bin now.
         self._bins = bins
         if content != self._html.content:
             self._html.content = content
-        self._drawn = drawn
+        self._drawn = selected
 
     def _press(self, touch: Touch) -> None:
         unit, _, place = touch.argument.partition(":")
         found = self._bins.get(unit)
         if found is None or not (place.isascii() and place.isdigit()):
             return
-        histogram, kept = found
-        self._select(tuple(kept[histogram.bin == int(place)].tolist()))
+        self._select(tuple(np.flatnonzero(found.bin == int(place)).tolist()))
         self._changed(None)
 
 

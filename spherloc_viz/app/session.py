@@ -55,6 +55,7 @@ class Session:
         self._client, self._services, self._catalog = client, services, services.catalog.branch()
         self._status = Status(client)
         self._touches = Touches(self._status.fail)
+        client.gui.add_html(self._touches.html())
         guard_callbacks(client, self._status.fail)
         number = client.client_id
         self._solver = Newest(f"spherloc-solver-{number}", self._guarded(self._solve))
@@ -193,7 +194,7 @@ class Session:
             self._status.say(f"Solving with {wish.estimator} …")
             watch = self._controls.slow.begin()
             try:
-                trace = estimate(problem, wish.estimator, wish.options, wish.scene.seed)  # WATCH
+                trace = estimate(problem, wish.estimator, wish.options, wish.scene.seed, watch)
             except Cancelled:
                 if self._controls.slow.stopped:
                     self._status.say("Cancelled; the page still shows the run before.")

@@ -41,7 +41,7 @@ def text(x: float, y: float, words: str, anchor: str = "start", more: str = "") 
 
 def text_width_px(words: str) -> float:
     """About how wide words are."""
-    return 0.56 * FONT_PX * len(words)
+    return 0.6 * FONT_PX * len(words)
 
 
 def tooltip(words: str) -> str:

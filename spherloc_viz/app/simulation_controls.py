@@ -54,17 +54,17 @@ class SimulationControls:
                 "Camera", (OWN_CAMERA, *self._cameras), hint="Sees the same simulation through another lens."
             )
             self._view = gui.add_slider(
-                "Field of view (°)", *LIMITS["field_of_view_deg"], 5.0, 360.0, hint="Matches outside it are replaced."
+                "Field of view (deg)", *LIMITS["field_of_view_deg"], 5.0, 360.0, hint="Matches outside it are replaced."
             )
             self._height = gui.add_slider(
                 "Height (m)",
                 *LIMITS["cloud_height_m"],
                 0.1,
                 10.0,
-                hint="Of the cloud of points. Near 0 all are as high as the camera was drawn, and bearings are horizontal.",
+                hint="Of the cloud of points. Near 0 all are as high as the drawn camera.",
             )
             self._gravity = gui.add_slider(
-                "Gravity error (°)",
+                "Gravity error (deg)",
                 0.0,
                 MOST_GRAVITY_DEG,
                 0.05,

@@ -20,8 +20,8 @@ MOST_DECADES, MOST_TICKS = 5, 6
 TABLE_PX = 260
 IN_TABLE = ("success", "position error", "time")
 NOTE = (
-    "Bands: 95 % Wilson interval of the success, quartiles of the others, all of all runs; a run without a pose has an "
-    "infinite error. Times are of workers side by side, beside this page."
+    "Bands: the success's 95 % Wilson interval, and the quartiles of all runs' errors and times. A run without a pose "
+    "has an infinite error. Times are of workers side by side, beside this page."
 )
 
 
@@ -33,8 +33,7 @@ def charts_html(over: str, labels: Sequence[str], points: Sequence[Point]) -> st
         for label in labels
     )
     drawn = "".join(
-        f'<div style="font-size:12.5px;font-weight:600;padding-top:.5em">{escape(item.chart.title)}</div>'
-        + sweep_svg(item)
+        f'<div style="padding-top:.7em">{sweep_svg(item)}</div>'
         for item in sweep_charts(over, labels, points)
         if item.chart.name in SHOWN
     )
@@ -84,8 +83,10 @@ def table_html(over: str, labels: Sequence[str], points: Sequence[Point]) -> str
     """A row a point, with a bar to scroll if there are many."""
     colors, table = sweep_colors(labels), sweep_table(over, points)
     places = [table.columns.index(name) for name in IN_TABLE]
-    cell = "padding:.12em 0 .12em .6em;text-align:right;white-space:nowrap"
-    head = "".join(f'<td style="{cell};{DIM}">{escape(table.columns[k])}</td>' for k in (1, *places))
+    name = "padding:.12em 0 .12em .6em;text-align:right"
+    cell = f"{name};white-space:nowrap"
+    name += f";vertical-align:bottom;{DIM}"
+    head = "".join(f'<td style="{name}">{escape(table.columns[k])}</td>' for k in (1, *places))
     rows = "".join(
         f'<tr><td style="white-space:nowrap">{dot_html(colors[row[0]])}{escape(row[0])}</td>'
         + "".join(f'<td style="{cell}">{escape(row[k])}</td>' for k in (1, *places))

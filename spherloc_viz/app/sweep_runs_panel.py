@@ -77,9 +77,9 @@ class SweepPanel:
         self._button = gui.add_button(START)
         self._bar = gui.add_progress_bar(0.0, visible=False)
         self._status = gui.add_html(status_html("The scene is the page's, with all that is changed about it."))
+        self._files = gui.add_button_group("Download", ("CSV", "Summary", "PNG"), visible=False)
         self._charts = gui.add_html("", visible=False)
         self._table = gui.add_html("", visible=False)
-        self._files = gui.add_button_group("Download", ("CSV", "Summary", "PNG"), visible=False)
         self._lock = threading.Lock()
         self._stop: threading.Event | None = None
         self._results: _Results | None = None

@@ -21,12 +21,18 @@ def limit_uploads(client: viser.ClientHandle, most_bytes: int, complain: Callabl
     begin, add = gui._handle_file_transfer_start, gui._handle_file_transfer_part
     under_way = gui._current_file_upload_states
 
+    def refuse(message: Any, sentence: str) -> None:
+        # Else the page would wait for ever, with its button disabled.
+        ack = _messages.FileTransferPartAck(message.source_component_uuid, message.transfer_uuid, 1, 1)
+        connection.queue_message(ack)
+        complain(sentence)
+
     def checked_begin(client_id: Any, message: Any) -> None:
         parts = max(1, most_bytes // LEAST_PART_BYTES)
         if not (0 <= message.size_bytes <= most_bytes and 0 <= message.part_count <= parts):
-            complain(f"the file is larger than {most_bytes / 1e6:.2g} MB; upload a smaller one.")
+            refuse(message, f"the file is larger than {most_bytes / 1e6:.2g} MB; upload a smaller one.")
         elif len(under_way) >= MOST_AT_ONCE:
-            complain("two files are on their way already; wait for them.")
+            refuse(message, "two files are on their way already; wait for them.")
         else:
             begin(client_id, message)
 
@@ -34,7 +40,7 @@ def limit_uploads(client: viser.ClientHandle, most_bytes: int, complain: Callabl
         state = under_way.get(message.transfer_uuid)
         if state is not None and state["transferred_bytes"] + len(message.content) > state["total_bytes"]:
             under_way.pop(message.transfer_uuid, None)
-            complain("the file is larger than it said; upload it again.")
+            refuse(message, "the file is larger than it said; upload it again.")
             return
         add(client_id, message)
 

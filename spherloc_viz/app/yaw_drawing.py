@@ -1,5 +1,7 @@
 """The yaw view's drawing: the whole circle above, a window of it below, and under that the arcs in the window."""
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,6 +15,7 @@ from spherloc_viz.layers.yaw_story import ALL, Window, YawStory, places_of
 
 ZOOM = "yaw-zoom"
 WIDTH_PX = 380.0
+CIRCLE_STEPS = 180
 CIRCLE_TOP_PX, CIRCLE_FOOT_PX = 21.0, 77.0
 WINDOW_TOP_PX, WINDOW_FOOT_PX = 116.0, 176.0
 RIGHT_PX = 12.0
@@ -25,7 +28,8 @@ LOOKS = (
     shapes.fill(style.OUTLIER),
 )
 """Of the kinds of pairs."""
-LINK = shapes.stroke(style.CLIQUE, 1.5)
+LINK = shapes.stroke(style.SELECTED, 1.5)
+EDGE = f' stroke="{style.css(style.SELECTED)}" stroke-width="1.5"'
 HOVER = (
     "<style>.yaw-twin{display:none;pointer-events:none}.yaw-arc:hover+.yaw-twin,.yaw-twin.chosen{display:inline}"
     ".yaw-arc:hover{stroke:currentColor;stroke-width:1.2}</style>"
@@ -79,7 +83,7 @@ def _circle(story: YawStory, x: Scale, y: Scale, window: Window, part: Scale) ->
     """The whole circle, with the window marked and led down to where it is drawn wide."""
     ticks = round_ticks(*ALL, 5, degrees=True)
     parts = shapes.x_axis(x, CIRCLE_FOOT_PX, ticks, tick_texts(ticks))
-    parts += curve_parts(story.curves, x, y)
+    parts += curve_parts(tuple(map(_coarse, story.curves)), x, y)
     parts += _markers(story, x, CIRCLE_TOP_PX, CIRCLE_FOOT_PX, ALL)
     parts += _hypotheses(story, x, y, ALL, "")
     size = (x.high_px - x.low_px, CIRCLE_FOOT_PX - CIRCLE_TOP_PX + 2)
@@ -114,6 +118,13 @@ def _window(story: YawStory, x: Scale, y: Scale, foot: float, now: str) -> list[
     size = (x.high_px - x.low_px, foot - WINDOW_TOP_PX)
     parts.append(shapes.rect(x.low_px, WINDOW_TOP_PX, *size, 'fill="transparent"' + zoom((low, high)), tip))
     return parts + _hypotheses(story, x, y, (low, high), now)
+
+
+def _coarse(curve: Curve) -> Curve:
+    """The curve as the small drawing of the circle needs it."""
+    if curve.kind != "step":
+        return curve
+    return replace(curve, **dict(zip("xy", shapes.thin_steps(curve.x, curve.y, CIRCLE_STEPS), strict=True)))
 
 
 def _beyond(curve: Curve, high: float) -> Curve:
@@ -166,8 +177,7 @@ def _bars(bars: Bars, whole: Scale, part: Scale, pitch: float, window: Window, k
     )
     out: list[str] = []
     for (a, b), kind, chosen, path, twin, tip in rows:
-        edge = ' stroke="currentColor"' if chosen else ""
-        tag = f'class="yaw-arc" data-touch="select:{a},{b}" d="{path}" {LOOKS[kind]}{edge}'
+        tag = f'class="yaw-arc" data-touch="select:{a},{b}" d="{path}" {LOOKS[kind]}{EDGE if chosen else ""}'
         if path:
             out.append(f"<path {tag}><title>{a} and {b}, {KINDS[kind]}: {tip}</title></path>")
         if twin:

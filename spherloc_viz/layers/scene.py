@@ -20,6 +20,8 @@ from spherloc_viz.layers.uncertainty import error_items
 
 CAMERA = 1.9
 """Size of a camera, in sphere radii."""
+GHOST_AWAY = 0.3
+"""From this distance to the estimated camera on, in sphere radii, the true one has a body."""
 UNDER_IMAGE = 0.98
 """Radius of the bare sphere where the query image is around it, in sphere radii."""
 COLUMNS, ROWS = 96, 48
@@ -39,7 +41,7 @@ def base_items(view: RunView, frame: Frame) -> tuple[SceneItem, ...]:
     centre = camera_centre(frame.cam_from_map)
     # Translucent surfaces hide what is drawn after them and lies behind: the ghost comes before the sphere around it.
     items: list[SceneItem] = [
-        *([] if view.truth is None else [_ghost(view.truth, CAMERA * view.sphere_m)]),
+        *_ghost(view, frame),
         Points("map/points", "map", view.points, frame.colors, 0.07 * view.dot_m, np.arange(len(view.points))),
         *_sphere(view, frame),
     ]
@@ -120,11 +122,16 @@ _CORNERS = np.array([[-0.5, -0.4, 0.7], [0.5, -0.4, 0.7], [0.5, 0.4, 0.7], [-0.5
 """Of the opening of a camera of size 1."""
 
 
-def _ghost(cam_from_map: FloatArray, size_m: float) -> Mesh:
-    """The true camera's body, to be seen through from outside and not seen from inside."""
-    corners = size_m * np.vstack([np.zeros(3), _CORNERS]) @ cam_from_map[:, :3]
+def _ghost(view: RunView, frame: Frame) -> list[Mesh]:
+    """The true camera's body, to be seen through; not where the estimated camera is in its way."""
+    if view.truth is None:
+        return []
+    centre, away = camera_centre(view.truth), camera_centre(frame.cam_from_map)
+    if frame.located and np.linalg.norm(centre - away) < GHOST_AWAY * view.sphere_m:
+        return []
+    corners = CAMERA * view.sphere_m * np.vstack([np.zeros(3), _CORNERS]) @ view.truth[:, :3]
     faces = np.array([[k % 4 + 1, k, 0] for k in range(1, 5)])
-    return Mesh("cameras/ghost", "cameras", camera_centre(cam_from_map) + corners, faces, style.TRUTH, 0.16)
+    return [Mesh("cameras/ghost", "cameras", centre + corners, np.vstack([faces, faces[:, ::-1]]), style.TRUTH, 0.16)]
 
 
 def camera(name: str, cam_from_map: FloatArray, size_m: float, color: style.RGB, width_px: float) -> Segments:

@@ -7,6 +7,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from spherloc.geometry import tangent_basis
 from spherloc.trace import ConsensusStage, Trace, TranslationStage, YawStage
 from spherloc_viz import style
 from spherloc_viz.layers import ring
@@ -25,6 +26,10 @@ INNER, OUTER = 1.06, 1.24
 STEP_RAD = np.radians(4.0)
 CORNERS = 48
 """Of the level circle around a ball."""
+DOT_CORNERS = 20
+"""Of each circle around a dot."""
+LIFT = 0.3
+"""From the sphere, that wears the image, to the circles inside and outside, in radii of the circle."""
 
 
 def with_selection(picture: Picture, trace: Trace, selected: tuple[int, ...]) -> Picture:
@@ -66,9 +71,11 @@ def _dim(colors: ColorArray, keep: NDArray[np.bool_]) -> ColorArray:
 
 
 def _halos(items: dict[str, SceneItem], chosen: IntArray) -> list[SceneItem]:
-    """Rings around the dots of the selected, and the rays between."""
+    """Rims around the dots of the selected, and the rays between. Of a dot on a wall or on the image only half is seen,
+    and nothing of its rim: if a few are selected, they get circles too."""
     out: list[SceneItem] = []
     places: dict[str, dict[int, FloatArray]] = {}
+    radii_m: list[float] = []
     shown = even(chosen, style.MAX_SELECTED_DOTS)
     for name in DOTS:
         dots = items.get(name)
@@ -77,11 +84,30 @@ def _halos(items: dict[str, SceneItem], chosen: IntArray) -> list[SceneItem]:
         at = np.flatnonzero(np.isin(dots.ids, shown))
         colors = one_color(style.SELECTED, len(at))
         out.append(Points(f"selection/{name}", LAYER, dots.positions[at], colors, HALO * dots.radius_m, rim=True))
+        radii_m.append(HALO * dots.radius_m)
         places[name] = dict(zip(dots.ids[at].tolist(), dots.positions[at], strict=True))
     points, bearings = (places.get(name, {}) for name in DOTS)
     ends = np.array([[bearings[k], points[k]] for k in bearings if k in points]).reshape(-1, 2, 3)
     out.append(Segments("selection/rays", LAYER, ends, one_color(style.SELECTED, len(ends)), 3.0))
+    centre = _sphere_centre(items)
+    if centre is not None and len(chosen) <= style.MAX_SELECTED_CIRCLES:
+        out.append(_circles(ends, centre, radii_m))
     return out
+
+
+def _circles(ends: FloatArray, centre: FloatArray, radii_m: list[float]) -> Segments:
+    """Circles across the rays (K, 2, 3): around each point, and around its bearing on both sides of the sphere."""
+    turns = np.linspace(0.0, 2.0 * np.pi, DOT_CORNERS + 1)
+    lines = [np.zeros((0, 2, 3))]
+    for bearing, point in ends:
+        outward = (bearing - centre) / np.linalg.norm(bearing - centre)
+        circle = np.column_stack([np.cos(turns), np.sin(turns)]) @ tangent_basis(outward[None])[0]
+        lift = LIFT * radii_m[1] * outward
+        for place, radius_m in ((point, radii_m[0]), (bearing - lift, radii_m[1]), (bearing + lift, radii_m[1])):
+            line = place + radius_m * circle
+            lines.append(np.stack([line[:-1], line[1:]], axis=1))
+    joined = np.concatenate(lines)
+    return Segments("selection/circles", LAYER, joined, one_color(style.SELECTED, len(joined)), 2.5)
 
 
 @lru_cache(maxsize=8)

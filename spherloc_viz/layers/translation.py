@@ -9,7 +9,7 @@ from spherloc.trace import TranslationStage
 from spherloc_viz import style
 from spherloc_viz.layers.balls import BallSet, IndexArray
 from spherloc_viz.layers.frame import Frame, Plan, RunView, growing, length, one_color
-from spherloc_viz.layers.primitives import FloatArray, Segments
+from spherloc_viz.layers.primitives import Balls, FloatArray, Segments
 
 SIZES = (3, 10, 30, 100, 300)
 """How many balls are shown before all are."""
@@ -62,7 +62,7 @@ def _pair(view: RunView, balls: BallSet) -> Frame:
     first, second = (int(number) for number in stage.pairs[ball[0]])
     centre, mask = stage.centres_m[ball[0]], view.mask(stage.pairs[ball[0]])
     ends = np.stack([view.points[[first, second]], np.tile(centre, (2, 1))], axis=1)
-    nobody = np.zeros(len(balls), dtype=bool)
+    ids = stage.pairs[ball].astype(np.int64)
     return Frame(
         f"With the yaw known, matches {first} and {second} have rays of known directions, which come nearest to each "
         f"other at {view.place(centre)}{_from_truth(view, centre)}. If both are right, noise can move the camera by "
@@ -70,10 +70,11 @@ def _pair(view: RunView, balls: BallSet) -> Frame:
         "H t = b,  |t_k − t| ≤ r_k   (Eq. 24-27)",
         _turned(view, balls),
         view.colors(style.UNDECIDED, (mask, style.SAMPLE)),
-        view.nobody(),
+        mask,
         note=stage.rule,
         items=(
-            *balls.items(view, ball, nobody),
+            # By a name of its own, so that the view keeps the rays and does not go close to this one ball.
+            Balls("balls/one", "balls", centre[None], stage.radii_m[ball], one_color(style.SAMPLE, 1), 0.3, ids=ids),
             Segments("pairs/rays", "pairs", ends, one_color(style.SAMPLE, 2), 2.0),
         ),
     )

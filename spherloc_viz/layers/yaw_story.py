@@ -52,7 +52,7 @@ def yaw_story(trace: Trace) -> YawStory:
         estimate = float(np.degrees(yaw.yaw_rad))
     elif exact is not None:
         title, best = (
-            "Most matches that a pose with this yaw could explain",
+            "What a pose can explain at each yaw",
             int(exact.support.max(initial=exact.seed_support)),
         )
         ends = np.array(ALL)

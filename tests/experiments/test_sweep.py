@@ -18,7 +18,7 @@ from sweep_samples import QUICK, SCENE, small_plan, write_scene
 from spherloc.datasets import load_scene
 from spherloc.datasets.variation import Variation
 from spherloc.errors import InputError
-from spherloc.estimators import estimate, options_type
+from spherloc.estimators import estimate, options_type, warm_up
 from spherloc.experiments import sweep_cluster
 from spherloc.experiments.sweep import (
     MOST_DEATHS,
@@ -33,6 +33,12 @@ from spherloc.experiments.sweep import (
 )
 from spherloc.experiments.sweep_crew import NICENESS
 from spherloc.metrics import evaluate
+
+
+@pytest.fixture(autouse=True, scope="module")
+def compiled() -> None:
+    """Workers side by side would each compile the kernels, where none are cached yet."""
+    warm_up()
 
 
 def untimed(rows: list[SweepRow]) -> dict[tuple[str, float, int], SweepRow]:
