@@ -69,7 +69,9 @@ def _draw(axes: Axes, drawn: SweepChart, labels: Sequence[str]) -> None:
             markeredgecolor="0.25", markeredgewidth=0.5, label=curve.label,
         )  # fmt: skip
     if any(np.isnan(curve.y).any() for curve in drawn.chart.curves):
-        axes.text(0.015, 0.97, "gaps: half of the runs have no pose", transform=axes.transAxes, va="top", fontsize=9)
+        words = "gaps: half of the runs have no pose"
+        paper = {"facecolor": "white", "alpha": 0.8, "linewidth": 0}
+        axes.text(0.985, 0.03, words, transform=axes.transAxes, ha="right", fontsize=9, bbox=paper)
     if drawn.log:
         axes.set_yscale("log")
         axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))

@@ -246,4 +246,3 @@ def test_the_same_problem_is_known_again(scene_of: Callable[..., SyntheticScene]
     pixels[7, 1] += 1e-9
     for change in ({"pixels": pixels}, {"truth_inliers": None}, {"bound_px": 2.0}, {"gravity_bound_rad": 0.01}):
         assert not is_same(one, replace(one, **change))
-

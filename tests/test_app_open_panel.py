@@ -216,8 +216,16 @@ def test_a_bad_upload_is_said_in_one_sentence(
 
 def test_a_file_too_large_is_turned_away_while_it_arrives(visitor: Visitor) -> None:
     under_way = visitor.page.handle.gui._current_file_upload_states
+    ended: list[str] = []
+
+    def note(message: dict[str, Any]) -> None:
+        if message["type"] == "FileTransferPartAck" and message["transferred_bytes"] == message["total_bytes"]:
+            ended.append(message["transfer_uuid"])
+
+    visitor.page.answer = note
     visitor.page.upload(visitor.matches, "big.csv", b"x" * 300_000, said=MOST_BYTES + 1)
     until(lambda: "larger than 10 MB" in visitor.said)
+    until(lambda: ended == ["big.csv"])  # else the page keeps its button disabled
     assert not under_way, "nothing of it is kept"
     visitor.panel._status.visible = False
     visitor.page.upload(visitor.matches, "liar.csv", b"x" * 300_000, said=1000)

@@ -19,6 +19,7 @@ import viser
 
 from spherloc.datasets.variation import Variation
 from spherloc.errors import InputError
+from spherloc.estimators import warm_up
 from spherloc_viz.app import sweep_runs_panel
 from spherloc_viz.app.catalog import SceneWish
 from spherloc_viz.app.sweep_charts import charts_html, chips_html, sweep_svg, table_html
@@ -41,6 +42,12 @@ outlier_rate = 0.25
 noise_px = 0.5
 seed = 1
 """
+
+
+@pytest.fixture(autouse=True, scope="module")
+def compiled() -> None:
+    """As the server does before it opens."""
+    warm_up()
 
 
 class Desk:

@@ -73,10 +73,10 @@ def second_pose(rng: np.random.Generator, truth: FloatArray, field_of_view_deg: 
     return pose(turn @ truth[:, :3], turn @ truth[:, 3] + shift)
 
 
-def clearly_apart(one: FloatArray, other: FloatArray, least_m: float = 1.0, least_deg: float = 10.0) -> bool:
-    """Whether two level poses (3, 4) differ by so much in position and in yaw that none passes for the other."""
+def clearly_apart(one: FloatArray, other: FloatArray) -> bool:
+    """Whether two level poses (3, 4) are at least 1 m and 10 degrees of yaw apart: none passes for the other."""
     apart_m = np.linalg.norm(camera_centre(one) - camera_centre(other))
-    return bool(apart_m >= least_m and abs(wrap_angle(yaw_of(one[:, :3] @ other[:, :3].T))) >= np.radians(least_deg))
+    return bool(apart_m >= 1.0 and abs(wrap_angle(yaw_of(one[:, :3] @ other[:, :3].T))) >= np.radians(10.0))
 
 
 def copies(rng: np.random.Generator, lens: Lens, truth: FloatArray, points: FloatArray) -> FloatArray:

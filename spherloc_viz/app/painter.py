@@ -32,8 +32,8 @@ class Painter:
     point cloud and balls within balls can be picked too, and a small dot within some pixels."""
 
     def __init__(self, client: viser.ClientHandle | viser.ViserServer, on_pick: OnPick | None = None) -> None:
-        """``on_pick`` is called on viser's threads, and a click on nothing picks (); None for a page that cannot answer,
-        such as a still one, for which ``client`` is a server."""
+        """``on_pick`` is called on viser's threads, and a click on nothing picks (). None is for a page that cannot
+        answer: a still one, which is drawn on a server."""
         self._client = client
         self._drawn: dict[str, tuple[Any, tuple, SceneItem]] = {}
         self._textured: dict[str, tuple[Hashable, bytes | None]] = {}

@@ -2,7 +2,7 @@
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from spherloc.trace import (
@@ -40,6 +40,14 @@ class _Timeline:
     view: RunView
     plans: tuple[Plan, ...]
     stops: tuple[Stop, ...]
+    charts: dict[Callable[[], Chart], Chart] = field(default_factory=dict)
+    """Those that were drawn already: they stay for all later steps."""
+
+    def chart(self, draw: Callable[[], Chart]) -> Chart:
+        """The chart that ``draw`` makes, made once."""
+        if draw not in self.charts:
+            self.charts[draw] = draw()
+        return self.charts[draw]
 
 
 class _Kept(threading.local):
@@ -84,7 +92,7 @@ def paint(trace: Trace, index: int) -> Picture:
     tables = (*frame.tables, outcome_table(trace)) if index == len(timeline.plans) - 1 else frame.tables
     step = Step(stop.key, stop.title, frame.caption, frame.equation, frame.note, stop.stage)
     scene = base_items(timeline.view, frame) + frame.items
-    return Picture(step, scene, tuple(chart() for chart in charts.values()), tables)
+    return Picture(step, scene, tuple(timeline.chart(draw) for draw in charts.values()), tables)
 
 
 def with_rival(picture: Picture, trace: Trace, cam_from_map: FloatArray) -> Picture:
