@@ -15,6 +15,7 @@ from spherloc.errors import InputError
 from spherloc.estimators import default_options, estimate
 from spherloc.problem import Problem
 from spherloc.trace import Trace
+from spherloc.watch import Cancelled, Watch
 from spherloc_viz import style
 from spherloc_viz.app.errand import Errand
 from spherloc_viz.app.svg import chart_svg
@@ -83,7 +84,7 @@ class ComparePanel:
         self._trace: Trace | None = None
         self._done: Comparison | None = None
         self._shown: tuple[Comparison | None, bool] = (None, False)
-        self._stop = threading.Event()
+        self._stop, self._watch = threading.Event(), Watch()
         self._closed = False
         self._errand = Errand("spherloc-compare", self._complain)
         self._button.on_click(self._press)
@@ -113,12 +114,12 @@ class ComparePanel:
         """End the comparison at hand; does not wait."""
         self._closed = True
         self._errand.close()
-        self._stop.set()
+        self._halt()
 
     def _press(self, event: viser.GuiEvent) -> None:
         if self._button.label == STOP:
             self._errand.forget()
-            self._stop.set()
+            self._halt()
         else:
             self._start()
 
@@ -140,8 +141,13 @@ class ComparePanel:
 
     def _start(self, after_s: float = 0.0) -> None:
         """Compare after a while; what is being compared gives way."""
-        self._stop.set()
+        self._halt()
         self._errand.ask(partial(self._work, after_s))
+
+    def _halt(self) -> None:
+        """End the comparison at hand, also within a run."""
+        self._stop.set()
+        self._watch.cancel()
 
     def _work(self, after_s: float) -> None:
         stop = self._stop = threading.Event()
@@ -164,9 +170,13 @@ class ComparePanel:
         entries: tuple[Entry, ...] = ()
         for place, name in enumerate(names):
             self._progress(place / len(names), f"{name}, {place + 1} of {len(names)} …")
+            watch = self._watch = Watch()
             if stop.is_set() or self._closed:
                 return
-            entries = (*entries, Entry(_run(trace, name)))
+            try:
+                entries = (*entries, Entry(_run(trace, name, watch)))
+            except Cancelled:
+                return
             self._publish(entries)
         for place, entry in enumerate(entries):
             self._progress(place / len(names), f"Diagnosing {entry.trace.estimator} …")
@@ -208,13 +218,16 @@ class ComparePanel:
         return box(f'<div style="display:flex;flex-wrap:wrap;gap:.35em">{chips}</div>', "font-size:12px")
 
 
-def _run(trace: Trace, name: str) -> Trace:
-    """An estimator on the problem of a run; its own first run in this process goes before, unseen."""
+def _run(trace: Trace, name: str, watch: Watch) -> Trace:
+    """An estimator on the problem of a run; its own first run in this process goes before, unseen.
+
+    Raises ``Cancelled`` if ``watch`` ends either.
+    """
     options = trace.options if name == trace.estimator else default_options(name, trace.problem)
     if name not in _warm:
-        estimate(trace.problem, name, options, trace.seed)
+        estimate(trace.problem, name, options, trace.seed, watch)
         _warm.add(name)
-    return estimate(trace.problem, name, options, trace.seed)
+    return estimate(trace.problem, name, options, trace.seed, watch)
 
 
 def is_same(one: Problem, other: Problem) -> bool:
