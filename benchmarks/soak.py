@@ -88,7 +88,9 @@ async def soak(pages: int, minutes: float) -> None:
     if answers:
         median, high = np.percentile(answers, [50, 95])
         print(f"from a change to its recording being named, 0.7 s of quiet included: {median:.2f} s, 95 % {high:.2f} s")
-    print("memory MiB, threads:", ", ".join(f"{mib:.0f} {count}" for mib, count in memory[:: max(1, len(memory) // 12)]))
+    print(
+        "memory MiB, threads:", ", ".join(f"{mib:.0f} {count}" for mib, count in memory[:: max(1, len(memory) // 12)])
+    )
     print(f"after all pages have left: {left[0]:.0f} MiB, {left[1]} threads")
     for mistake in mistakes[:20]:
         print(mistake)

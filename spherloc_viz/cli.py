@@ -83,7 +83,7 @@ def localize(
     /,
     estimator: str = "mc",
     seed: int = 0,
-    option: Annotated[tuple[str, ...], arg(metavar="KEY=VALUE ...")] = (),
+    option: Settings = (),
     queries: Annotated[tuple[str, ...], arg(metavar="NAME|FIRST:LAST:STEP ...")] = (),
     output: Path | None = None,
     record: bool = True,
@@ -121,7 +121,7 @@ def localize(
     folder = output or RECORDINGS / f"{scene.stem}_{estimator}_{seed}"
     kept = (recordings or folder / "recordings") if record else None
     try:
-        return localize_sequence(scene, estimator, seed, option, queries, folder, kept, retry_failed)
+        return localize_sequence(scene, estimator, seed, list(chain(*option)), queries, folder, kept, retry_failed)
     except KeyboardInterrupt:
         # Without waiting for the thread that matches the next query; all that is done is on the disk.
         os._exit(INTERRUPTED)

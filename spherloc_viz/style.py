@@ -22,7 +22,7 @@ LEGEND: tuple[tuple[RGB, str], ...] = (
     (INLIER, "inlier"),
     (OUTLIER, "outlier"),
     (CLIQUE, "maximum clique"),
-    (SAMPLE, "sample"),
+    (SAMPLE, "tried"),
     (ESTIMATE, "estimate"),
     (TRUTH, "truth"),
     (RIVAL, "rival pose"),

@@ -13,7 +13,10 @@ from spherloc import registry
 from spherloc.datasets.synthetic import SyntheticScene
 from spherloc.errors import InputError
 from spherloc.estimators import estimate, options_type
+from spherloc.estimators.ransac import MOST_ITERATIONS, RansacOptions
+from spherloc.problem import Problem
 from spherloc.trace import Trace
+from spherloc.watch import Cancelled, Watch
 from spherloc_viz.app import compare_panel
 from spherloc_viz.app.compare_panel import START, STOP, TICKED, ComparePanel, is_same
 from spherloc_viz.app.touch import Touch, Touches
@@ -180,26 +183,30 @@ def test_live_follows_the_problem(stage: Stage, runs: tuple[Trace, Trace], monke
     assert stage.panel._done is shown and stage.redraws == redraws, "another run of the same problem changes nothing"
 
 
-def test_cancel_ends_it_after_the_run_at_hand(
-    stage: Stage, runs: tuple[Trace, Trace], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    begun, go, real = threading.Event(), threading.Event(), compare_panel.estimate
+def test_cancel_ends_it_within_a_run(stage: Stage, runs: tuple[Trace, Trace], monkeypatch: pytest.MonkeyPatch) -> None:
+    begun, real = threading.Event(), compare_panel.estimate
+    ended: list[Watch] = []
 
-    def slow(*parts: Any) -> Trace:
+    def endless(problem: Problem, name: str, options: Any, seed: int, watch: Watch) -> Trace:
+        if name != "ransac-2p":
+            return real(problem, name, options, seed, watch)
         begun.set()
-        assert go.wait(60)
-        return real(*parts)
+        try:
+            return real(problem, name, RansacOptions(iterations=MOST_ITERATIONS), seed, watch)
+        except Cancelled:
+            ended.append(watch)
+            raise
 
-    monkeypatch.setattr(compare_panel, "estimate", slow)
+    monkeypatch.setattr(compare_panel, "estimate", endless)
+    stage.tick_only("mc-exact", "ransac-2p")
     stage.panel.draw(runs[0])
     stage.press()
     assert begun.wait(60)
-    until(lambda: stage.panel._button.label == STOP)
-    assert stage.panel._bar.visible and "1 of 4" in stage.panel._status.content
+    assert stage.panel._button.label == STOP and stage.panel._bar.visible
     stage.press()
-    go.set()
     stage.settle()
     assert row_names(stage.html) == ["mc-exact"] and stage.panel._button.label == START
+    assert len(ended) == 1 and ended[0].fraction < 1.0
 
 
 def test_what_cannot_be_compared_is_said(stage: Stage, runs: tuple[Trace, Trace]) -> None:

@@ -305,7 +305,11 @@ def test_pages_share_nothing_and_leave_nothing(house: House) -> None:
     until(lambda: one._run is not None and len(one._run.trace.problem) == 33)
     first.set(one._story.steps._buttons, "Previous")
     until(lambda: one._story.steps._choice.value.endswith("Refinement"))
-    assert two._run.trace is kept and two._controls.scene._simulation._points.value == 20 and two._story.steps._choice.value.endswith("Outcome")
+    assert (
+        two._run.trace is kept
+        and two._controls.scene._simulation._points.value == 20
+        and two._story.steps._choice.value.endswith("Outcome")
+    )
     first.close()
     until(lambda: threads() == before + 4 and len(house.sessions._open) == 1)
     second.close()

@@ -124,6 +124,7 @@ class Session:
             self._page.ask()
 
     def _listen(self) -> None:
+        self._controls.scene.reset.on_click(lambda event: (self._edits.clear(), self.changed()))
         on = self._touches.on
         on("select", self._select_numbers)
         on("deselect", lambda touch: (self._edits.select(()), self._page.ask()))

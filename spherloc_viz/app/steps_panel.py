@@ -46,10 +46,10 @@ class StepsPanel:
         titles: list[str] = ["-"]
         self._stages = gui.add_html("")
         self._slider = gui.add_slider("Timeline", 1, 2, 1, 1, marks=())
-        self._choice = gui.add_dropdown("Step", titles)
         self._buttons = gui.add_button_group("Keys B, N, P", (PREVIOUS, NEXT, PLAY))
-        self._pace = gui.add_dropdown("Pace", tuple(PACES), hint="How fast the steps play.")
         self._text = gui.add_html("")
+        self._choice = gui.add_dropdown("Step", titles)
+        self._pace = gui.add_dropdown("Pace", tuple(PACES), hint="How fast the steps play.")
         self._slider.on_update(self._slide)
         self._choice.on_update(self._pick)
         self._buttons.on_click(self._click)

@@ -45,6 +45,12 @@ SIZE = {"width": 1200, "height": 700}
 SHARPNESS = 0.4
 """Pixels of the screen by those of the page: what is read is the same, and software draws a sixth of the pixels."""
 PATIENCE_MS = 60_000
+BLIND = """for (const kind of [WebGLRenderingContext, WebGL2RenderingContext])
+    for (const call of ["drawArrays", "drawElements", "drawArraysInstanced", "drawElementsInstanced"])
+        if (kind.prototype[call]) kind.prototype[call] = () => undefined;"""
+"""Makes the canvas draw nothing. What tests read is in the page and in the scene's nodes, and a frame in software takes
+most of a second, for which every click waits."""
+SELECTED = "#b024e4"
 expect.set_options(timeout=PATIENCE_MS)
 
 
@@ -84,8 +90,12 @@ def served(*words: str | Path) -> Iterator[tuple[str, subprocess.Popen[str]]]:
 class Playground:
     """One tab."""
 
-    def __init__(self, browser: Browser, address: str) -> None:
-        self.page: Page = browser.new_context(viewport=SIZE, device_scale_factor=SHARPNESS).new_page()  # pyright: ignore[reportArgumentType]
+    def __init__(self, browser: Browser, address: str, drawn: bool = False) -> None:
+        """Open the page and wait for its first run; ``drawn`` has the canvas really drawn, which is slow."""
+        context = browser.new_context(viewport=SIZE, device_scale_factor=SHARPNESS)  # pyright: ignore[reportArgumentType]
+        if not drawn:
+            context.add_init_script(BLIND)
+        self.page: Page = context.new_page()
         self.page.set_default_timeout(PATIENCE_MS)
         self.errors: list[str] = []
         self.hosts: set[str] = set()
@@ -94,6 +104,11 @@ class Playground:
         self.page.on("request", lambda request: self.hosts.add(request.url.split("/")[2]))
         self.page.goto(address)
         expect(self.value("outcome")).not_to_be_empty()
+
+    def expect_quiet(self, address: str) -> None:
+        """No errors on the console, and no word to any other server."""
+        assert self.errors == []
+        assert self.hosts - {""} == {address.removeprefix("http://")}
 
     def close(self) -> None:
         """Close the tab."""
