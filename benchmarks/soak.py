@@ -11,6 +11,7 @@ import argparse
 import asyncio
 import re
 import time
+from functools import partial
 
 import numpy as np
 
@@ -38,13 +39,18 @@ async def visit(address: str, number: int, end_s: float, mistakes: list[str], an
             await page.set("Seed", seed)
             runs += 1
             try:
-                await page.until(lambda: page.says("Recorded as") and page.says(f"_{seed}_"), 60.0)
+                await page.until(partial(_recorded, page, seed), 60.0)
             except TimeoutError:
                 mistakes.append(f"page {number}: the run with seed {seed} never came")
                 continue
             answers.append(time.perf_counter() - start)
             mistakes += _mistakes(page, number, points, seed)
     return runs
+
+
+def _recorded(page: PageClient, seed: str) -> bool:
+    """Whether the page names the recording of a run with that seed."""
+    return page.says("Recorded as") and page.says(f"_{seed}_")
 
 
 def _move(rng: np.random.Generator) -> tuple[str, object]:
@@ -87,7 +93,7 @@ async def soak(pages: int, minutes: float) -> None:
     print(f"{pages} pages, {minutes:g} minutes: {runs} changes, {len(answers)} read back, {len(mistakes)} mistakes")
     if answers:
         median, high = np.percentile(answers, [50, 95])
-        print(f"from a change to its recording being named, 0.7 s of quiet included: {median:.2f} s, 95 % {high:.2f} s")
+        print(f"from a change to its recording, 0.7 s of quiet included: {median:.2f} s, 95 % {high:.2f} s")
     print(
         "memory MiB, threads:", ", ".join(f"{mib:.0f} {count}" for mib, count in memory[:: max(1, len(memory) // 12)])
     )

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import viser
 from numpy.typing import NDArray
-from spherloc.watch import Cancelled
 
 from spherloc.datasets.synthetic import TrueCamera
 from spherloc.diagnosis import Diagnosis, diagnose
@@ -16,6 +15,7 @@ from spherloc.errors import SpherlocError
 from spherloc.estimators import default_options, estimate
 from spherloc.problem import Problem
 from spherloc.trace import Trace
+from spherloc.watch import Cancelled
 from spherloc_viz.app.canvas import Canvas, panel_widths_px
 from spherloc_viz.app.catalog import SceneWish
 from spherloc_viz.app.controls import Controls

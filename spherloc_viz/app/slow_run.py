@@ -3,8 +3,8 @@
 import threading
 
 import viser
-from spherloc.watch import Watch
 
+from spherloc.watch import Watch
 from spherloc_viz.app.newest import Newest
 
 AFTER_S = 0.4
