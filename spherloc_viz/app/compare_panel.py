@@ -39,7 +39,7 @@ LIVE_AFTER_S = 0.25
 """A live comparison waits until the problem has stood still for this long."""
 TICKED = ("mc-exact", "mc", "ransac-2p", "ransac-epnp")
 """Estimators that are compared at first: exact, the paper's, two points, and a baseline."""
-MEASURED = ("rotation", "position", "inliers", "F1", "time")
+MEASURED = ("rotation", "position", "F1", "time")
 """Columns that have one in the table; the others are in the line below."""
 NOTE = (
     "One run each, one after another, with default options; the estimator that is chosen on the page has the page's. "
@@ -268,7 +268,8 @@ def _row_html(table: Table, row: tuple) -> str:
     cell = 'style="padding:.35em 0 0 .5em;text-align:right;white-space:nowrap"'
     numbers = "".join(f"<td {cell}>{escape(value[column])}</td>" for column in MEASURED)
     head = f'<td style="padding-top:.35em;white-space:nowrap;font-weight:600">{_swatch(name)}{escape(name)}</td>'
-    words = [f"{value[share]} {share}" for share in ("precision", "recall") if value[share] != NO_VALUE]
+    shares = ("inliers", "precision", "recall")
+    words = [f"{value[share]} {share}" for share in shares if value[share] not in (NO_VALUE, "0")]
     words += [value[column] for column in ("certificate", "diagnosis") if value[column] not in (NO_VALUE, Cause.OK)]
     color = WORDS.get(value["outcome"])
     verdict = f'<span style="{f"color:{style.css(color)};font-weight:600" if color else ""}">{value["outcome"]}</span>'

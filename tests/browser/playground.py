@@ -101,14 +101,19 @@ class Playground:
         self.hosts: set[str] = set()
         self.page.on("console", lambda message: self.errors.append(message.text) if message.type == "error" else None)
         self.page.on("pageerror", lambda error: self.errors.append(str(error)))
-        self.page.on("request", lambda request: self.hosts.add(request.url.split("/")[2]))
+        self.page.on("request", lambda request: self._note_host(request.url))
+        self.page.on("websocket", lambda socket: self._note_host(socket.url))
         self.page.goto(address)
         expect(self.value("outcome")).not_to_be_empty()
 
     def expect_quiet(self, address: str) -> None:
         """No errors on the console, and no word to any other server."""
         assert self.errors == []
-        assert self.hosts - {""} == {address.removeprefix("http://")}
+        assert self.hosts == {address.removeprefix("http://")}
+
+    def _note_host(self, url: str) -> None:
+        if not url.startswith("data:"):
+            self.hosts.add(url.split("/")[2])
 
     def close(self) -> None:
         """Close the tab."""
@@ -137,9 +142,28 @@ class Playground:
         self.widget(label).click()
         self.page.get_by_role("option", name=option, exact=True).click()
 
+    def type(self, label: str, text: str) -> None:
+        """Type into a box and press Enter."""
+        box = self.entry(label)
+        box.fill(text)
+        box.press("Enter")
+
+    def slide(self, label: str, key: str) -> None:
+        """Press a key on a slider: Home, End or an arrow."""
+        self.thumb(label).focus()
+        self.page.keyboard.press(key)
+
     def press(self, button: str) -> None:
         """Click a button."""
         self.page.get_by_role("button", name=button, exact=True).click()
+
+    def tab(self, name: str) -> None:
+        """Open a tab."""
+        self.page.get_by_role("tab", name=name, exact=True).click()
+
+    def touch(self, action: str) -> Locator:
+        """What reports this ("ACTION:ARGUMENT") when it is pressed."""
+        return self.page.locator(f"[data-touch='{action}']")
 
     @property
     def step(self) -> Locator:
@@ -164,6 +188,52 @@ class Playground:
             .filter(([path, node]) => (path === name || path.startsWith(name + '/')) && node.effectiveVisibility)
             .reduce((sum, [path, node]) => sum + (node.message?.props?.batched_positions?.byteLength ?? 0) / 12, 0)"""
         return round(self.page.evaluate(script, name))
+
+    def dot(self, name: str, index: int) -> tuple[float, float]:
+        """Where on the page the middle of a batched node's ball or dot of that number is seen."""
+        script = """([name, index]) => {
+            const {camera, canvas, nodeRefFromName} = window.__viserMutable, box = canvas.getBoundingClientRect();
+            const all = window.__viserSceneTree.getState()[name].message.props.batched_positions;
+            const node = nodeRefFromName[name];
+            node.updateWorldMatrix(true, false);
+            camera.updateMatrixWorld();
+            const at = camera.position.clone().set(...all.slice(3 * index, 3 * index + 3));
+            at.applyMatrix4(node.matrixWorld).project(camera);
+            return [box.left + 0.5 * (1 + at.x) * box.width, box.top + 0.5 * (1 - at.y) * box.height];
+        }"""
+        x, y = self.page.evaluate(script, [name, index])
+        return x, y
+
+    @property
+    def viewer(self) -> tuple[float, ...]:
+        """Where the viewer stands and looks: a place and a direction, to compare with others."""
+        script = "() => { const c = window.__viserMutable.camera; return [...c.position.toArray(), ...c.quaternion] }"
+        return tuple(round(number, 3) for number in self.page.evaluate(script))
+
+    def carded(self) -> list[int]:
+        """Numbers of the matches that the selection card is about; empty if there is no card."""
+        one = self.page.get_by_text(re.compile(r"^Match \d+$"))
+        if one.count() and one.is_visible():
+            return [int(one.inner_text().split()[1])]
+        many = self.value("numbers")
+        return list(map(int, many.inner_text().split(", "))) if many.count() and many.is_visible() else []
+
+    def expect_card(self, *numbers: int) -> None:
+        """Wait until the card is about these matches, or gone."""
+        self.until(lambda: self.carded() == list(numbers), f"the card is about {numbers or 'nothing'}")
+
+    def lit(self) -> list[int]:
+        """Numbers of the matches whose dots have a rim on the canvas, if none is hidden."""
+        script = """() => {
+            const nodes = window.__viserSceneTree.getState(), rims = nodes["/selection/map/points"];
+            if (!rims?.effectiveVisibility) return [];
+            const key = (all, k) => all.slice(3 * k, 3 * k + 3).join();
+            const dots = nodes["/map/points"].message.props.batched_positions, found = new Map();
+            for (let k = 0; k < dots.length / 3; k++) found.set(key(dots, k), k);
+            const marked = rims.message.props.batched_positions;
+            return Array.from({length: marked.length / 3}, (_, k) => found.get(key(marked, k)) ?? -1);
+        }"""
+        return sorted(self.page.evaluate(script))
 
     def until(self, condition: Callable[[], bool], what: str) -> None:
         """Wait until something is so on the page."""
