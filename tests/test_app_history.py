@@ -47,6 +47,13 @@ def test_dragging_a_slider_is_one_move() -> None:
     assert history.step(-1) is None
 
 
+def test_single_changes_are_never_one_move() -> None:
+    history, wishes = History(), [wish(), *(wish(seed=k) for k in (1, 2, 3))]
+    for k, asked in enumerate(wishes):
+        history.note(asked, 0.01 * k)
+    assert [history.step(-1) for _ in range(3)] == wishes[2::-1]
+
+
 def test_two_moves_of_one_slider_are_two() -> None:
     history = History()
     for k in range(3):

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import viser
 
+from spherloc.datasets.variation import Variation
 from spherloc.diagnosis import Cause, Diagnosis
 from spherloc.errors import RecordingError
 from spherloc.estimators import estimate
@@ -22,6 +23,7 @@ from spherloc_viz.app.catalog import Catalog
 from spherloc_viz.app.server import Sessions
 from spherloc_viz.app.services import Services
 from spherloc_viz.app.session import Session
+from spherloc_viz.app.touch import Touch
 from spherloc_viz.app.viser_seams import KEY_HEADER, start_viser, stop_viser
 
 KEY = "a key of this test"
@@ -314,3 +316,95 @@ def test_pages_share_nothing_and_leave_nothing(house: House) -> None:
     until(lambda: threads() == before + 4 and len(house.sessions._open) == 1)
     second.close()
     until(lambda: threads() == before and not house.sessions._open)
+
+
+def test_only_views_that_are_seen_are_drawn(house: House) -> None:
+    _, session = house.visit()
+    table, residuals = session._story._matches._html, session._story._residuals._html
+    assert table.content == "" and residuals.content == "", "another tab is open"
+
+    def see(names: str) -> None:
+        session._touches.deliver(Touch("views", names, 0.0, 0.0, 0.0, 0.0, False))
+
+    see("Matches")
+    until(lambda: 'data-touch="select:3"' in table.content)
+    session._controls.scene._simulation._points.value = 30
+    session.changed()
+    until(lambda: session._run is not None and len(session._run.trace.problem) == 30)
+    until(lambda: "all 30" in table.content)
+    assert residuals.content == ""
+    see("Residuals,Yaw")
+    until(lambda: "select-bin" in residuals.content)
+
+
+def test_matches_are_selected_and_changed_by_hand(house: House) -> None:
+    _, session = house.visit()
+
+    def press(action: str, extend: bool = False) -> None:
+        name, _, argument = action.partition(":")
+        session._touches.deliver(Touch(name, argument, 0.5, 0.5, 0.5, 0.5, extend))
+
+    def variation() -> Variation:
+        assert session._run is not None
+        return session._run.wish.scene.variation
+
+    press("select:3")
+    until(lambda: session._card._panel.visible and "Match 3" in session._card._html.content)
+    press("select:7,5", extend=True)
+    assert session._edits.selected == (3, 5, 7)
+    for wrong in ("select:99", "select:-1", "select:x", "select:", "select:1e3", "nothing:1"):
+        press(wrong)
+    assert session._edits.selected == (3, 5, 7)
+    before = session._run
+    press("spoil:")
+    until(lambda: session._run is not before and variation().spoiled == (3, 5, 7))
+    until(lambda: "3 spoiled" in session._controls._edits.content)
+    press("select:5")
+    press("hide:")
+    until(lambda: variation().hidden == (5,) and session._run is not None and len(session._run.trace.problem) == 19)
+    assert 5 not in session._run.kept and session._edits.selected == ()  # type: ignore[union-attr]
+    press("unhide:")
+    until(lambda: variation().hidden == ())
+    session.step_history(-1)
+    until(lambda: variation().hidden == (5,))
+    for _ in range(2):
+        session.step_history(-1)
+    until(lambda: variation() == before.wish.scene.variation)  # type: ignore[union-attr]
+    assert session._run is not None and before is not None
+    assert np.array_equal(session._run.trace.cam_from_map, before.trace.cam_from_map), "to the last bit"
+
+
+def test_a_slow_run_gives_way_and_can_be_cancelled(house: House) -> None:
+    page, session = house.visit()
+    controls = session._controls.estimator
+    page.set(controls._estimator, "ransac-2p (two points)")
+    until(lambda: session._run is not None and session._run.trace.estimator == "ransac-2p")
+    quick = session._run
+    page.set(controls._options["ransac-2p"]["iterations"].widget, 10_000_000)
+    bar, button = session._controls.slow._bar, session._controls.slow._button
+    until(lambda: bar.visible and button.visible)
+    until(lambda: 0.0 < bar.value < 100.0)
+    page.set(session._story.steps._buttons, "Previous")
+    until(lambda: "Refinement" in shown(session))
+    page.send({"type": "GuiUpdateMessage", "uuid": button._impl.uuid, "updates": {"value": True}})
+    until(lambda: "Cancelled" in shown(session) and not bar.visible)
+    assert session._run is quick
+    page.set(session._controls.scene._seed, "5")
+    until(lambda: bar.visible)
+    page.set(controls._options["ransac-2p"]["iterations"].widget, 100)
+    until(lambda: session._run is not quick and session._run.trace.options.iterations == 100)
+    assert session._run is not None and session._run.trace.seed == 5
+    until(lambda: not bar.visible)
+
+
+def test_what_a_callback_raises_is_a_sentence(house: House) -> None:
+    page, session = house.visit()
+    button = session._client.gui.add_button("Break")
+    button.on_click(lambda event: 1 / 0)
+    page.send({"type": "GuiUpdateMessage", "uuid": button._impl.uuid, "updates": {"value": True}})
+    until(lambda: "a bug in the playground (ZeroDivisionError" in shown(session))
+    session._touches.on("break", lambda touch: [][1])
+    session._touches.deliver(Touch("break", "", 0.0, 0.0, 0.0, 0.0, False))
+    until(lambda: "IndexError" in shown(session))
+    page.set(session._controls.scene._seed, "8")
+    until(lambda: session._status._complaint is None and session._run is not None and session._run.trace.seed == 8)

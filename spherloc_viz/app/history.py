@@ -9,6 +9,8 @@ MOST = 200
 """Wishes that are remembered."""
 SAME_MOVE_S = 1.0
 """Changes of the same things within this time, such as those of a slider that is dragged, count as one."""
+SINGLE = frozenset({"scene", "query", "seed", "camera", "outlier_kind", "spoiled", "mended", "hidden", "estimator"})
+"""What is not dragged: each change counts."""
 
 
 class History:
@@ -28,6 +30,7 @@ class History:
                 return
             moved = changed_fields(self._wishes[self._at], wish) if self._at >= 0 else frozenset()
             same_move = self._at > 0 and moved == self._moved and now_s - self._noted_s < SAME_MOVE_S
+            same_move = same_move and not moved & SINGLE
             del self._wishes[self._at + (0 if same_move else 1) :]
             self._wishes.append(wish)
             del self._wishes[:-MOST]

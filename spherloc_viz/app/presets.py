@@ -76,7 +76,7 @@ RECIPES = (
         "the outliers to 60 %.",
         "panorama_outliers_80",
         0,
-        Variation(outlier_rate=0.8, outlier_kind="repeated"),
+        Variation(outlier_kind="repeated"),
     ),
     _Recipe(
         "Horizontal bearings",
@@ -84,7 +84,7 @@ RECIPES = (
         "pairs fails: choose mc-exact, which counts matches.",
         "panorama_outliers_80",
         0,
-        Variation(outlier_rate=0.8, cloud_height_m=0.1),
+        Variation(cloud_height_m=0.1),
         estimator="mc",
     ),
     _Recipe(

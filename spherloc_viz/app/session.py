@@ -55,7 +55,6 @@ class Session:
         self._client, self._services, self._catalog = client, services, services.catalog.branch()
         self._status = Status(client)
         self._touches = Touches(self._status.fail)
-        client.gui.add_html(self._touches.html())
         guard_callbacks(client, self._status.fail)
         number = client.client_id
         self._solver = Newest(f"spherloc-solver-{number}", self._guarded(self._solve))
@@ -74,10 +73,12 @@ class Session:
         self._card = MatchCard(client.gui)
         self._canvas = Canvas(client, self._controls.display, self.select, self._move_camera, left_px + right_px)
         self._listen()
+        # Only now may the page tell what is pressed: everything that listens is there.
+        services.desk.add(self._touches)
+        client.gui.add_html(self._touches.html())
 
     def start(self) -> None:
         """Solve and show the first problem."""
-        self._services.desk.add(self._touches)
         for worker in (self._page, self._doctor, self._controls.slow, self._solver):
             worker.start()
         self._solver.ask()

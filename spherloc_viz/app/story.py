@@ -1,6 +1,7 @@
 """The panels left of the canvas: the steps and what they say, and views of the run in two dimensions."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 
 import viser
 from numpy.typing import NDArray
@@ -11,7 +12,7 @@ from spherloc_viz.app.match_table import MatchTable
 from spherloc_viz.app.residual_view import ResidualView
 from spherloc_viz.app.steps_panel import StepsPanel
 from spherloc_viz.app.text import legend_html, summary_html, table_html
-from spherloc_viz.app.touch import Touches
+from spherloc_viz.app.touch import Touch, Touches
 from spherloc_viz.app.wish import Run
 from spherloc_viz.app.yaw_view import YawView
 from spherloc_viz.layers.primitives import Picture, Table
@@ -37,35 +38,56 @@ class Story:
             self._diagnosis = gui.add_html("")
             gui.add_html(legend_html())
             self._outcome = gui.add_html("")
-        with views.add_tab("Yaw"):
+        self._seen, self._changed = frozenset({"Yaw"}), changed
+        touches.on("views", self._see)
+        with _view(gui, views, "Yaw"):
             self._yaw = YawView(gui, touches, changed)
-        with views.add_tab("Charts"):
+        with _view(gui, views, "Charts"):
             self._charts = ChartPanel(gui)
-        with views.add_tab("Residuals"):
+        with _view(gui, views, "Residuals"):
             self._residuals = ResidualView(gui, touches, changed, select)
-        with views.add_tab("Images"):
+        with _view(gui, views, "Images"):
             self._images = ImagePanel(gui, touches, changed)
-        with views.add_tab("Matches"):
+        with _view(gui, views, "Matches"):
             self._matches = MatchTable(gui, touches, changed)
         steps.dock_left()
         views.dock_below(steps)
         steps.set_width(width_px)
 
     def draw(self, run: Run, picture: Picture, playing: bool, outcome: Table, selected: tuple[int, ...]) -> None:
-        """Show a step of a run. ``selected`` are numbers in the problem."""
+        """Show a step of a run, in the views that are to be seen. ``selected`` are numbers in the problem."""
         kept: NDArray = run.kept
         tables = [table for table in picture.tables if table.name != outcome.name]
         self.steps.show(picture.step, playing, tables)
-        self._charts.draw(picture.charts)
-        self._yaw.draw(run.trace, picture.step.key, selected, kept)
-        self._residuals.draw(run.trace, selected, kept)
-        self._images.draw(run.trace, picture, selected, kept)
-        self._matches.draw(run.trace, selected, kept)
+        seen = self._seen
+        if "Yaw" in seen:
+            self._yaw.draw(run.trace, picture.step.key, selected, kept)
+        if "Charts" in seen:
+            self._charts.draw(picture.charts)
+        if "Residuals" in seen:
+            self._residuals.draw(run.trace, selected, kept)
+        if "Images" in seen:
+            self._images.draw(run.trace, picture, selected, kept)
+        if "Matches" in seen:
+            self._matches.draw(run.trace, selected, kept)
         for widget, html in ((self._summary, summary_html(run.trace)), (self._outcome, table_html(outcome))):
             if widget.content != html:
                 widget.content = html
+
+    def _see(self, touch: Touch) -> None:
+        """Other tabs are open now."""
+        self._seen = frozenset(touch.argument.split(","))
+        self._changed(None)
 
     def diagnose(self, html: str) -> None:
         """Show what the diagnosis says by now."""
         if self._diagnosis.content != html:
             self._diagnosis.content = html
+
+
+@contextmanager
+def _view(gui: viser.GuiApi, panel: viser.PanelHandle, name: str) -> Iterator[None]:
+    """A tab of which the page tells whether it is to be seen."""
+    with panel.add_tab(name):
+        gui.add_html(f'<div data-view="{name}"></div>')
+        yield

@@ -82,7 +82,7 @@ def summary_html(trace: Trace) -> str:
     if metrics.rotation_error_deg is not None and metrics.translation_error_m is not None:
         facts = [angle_text(metrics.rotation_error_deg), length(metrics.translation_error_m), *facts]
     line = f'<b style="{_value_css(words)}">{escape(words.capitalize())}</b> · ' + " · ".join(map(escape, facts))
-    return box(line, "font-size:13px;padding-top:.2em")
+    return box(line, "font-size:12.5px;padding-top:.2em")
 
 
 def _value_css(value: object) -> str:

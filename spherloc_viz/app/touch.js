@@ -1,8 +1,9 @@
 // Tells the server what a person presses in the HTML and SVG that it sent: elements with data-touch="ACTION:ARGUMENT".
-// With data-drag a drag across the element is told too; data-copy="TEXT" puts TEXT on the clipboard.
+// With data-drag a drag across the element is told too; data-copy="TEXT" puts TEXT on the clipboard. And it tells which
+// elements with data-view="NAME" are to be seen, so that what stands on a hidden tab need not be drawn.
 (() => {
-  const TOUCHABLE = "[data-touch],[data-copy]", LEAST_DRAG_PX = 6;
-  let sent = Promise.resolve(), press = null, shade = null;
+  const TOUCHABLE = "[data-touch],[data-copy]", LEAST_DRAG_PX = 6, LOOK_EVERY_MS = 150;
+  let sent = Promise.resolve(), press = null, shade = null, seen = null;
 
   const found = (event) => (event.target instanceof Element ? event.target.closest(TOUCHABLE) : null);
   const fraction = (value, start, size) => Math.min(1, Math.max(0, (value - start) / Math.max(size, 1)));
@@ -16,12 +17,22 @@
       action,
       at: at(event.clientX, event.clientY),
       from: at(from.x, from.y),
-      extend: event.shiftKey || event.ctrlKey || event.metaKey,
+      extend: Boolean(event.shiftKey || event.ctrlKey || event.metaKey),
     });
     // One after another, so that presses arrive in their order.
     sent = sent
       .then(() => fetch("/touch", { method: "POST", headers: { "Content-Type": "application/json" }, body }))
       .catch(() => undefined);
+  }
+
+  function look() {
+    if (!document.querySelector("[data-session]")) return;
+    const views = [...document.querySelectorAll("[data-view]")].filter((view) => view.getClientRects().length > 0);
+    const names = views.map((view) => view.dataset.view).sort().join(",");
+    if (names === seen) return;
+    seen = names;
+    const nowhere = { left: 0, top: 0, width: 1, height: 1 };
+    tell(`views:${names}`, nowhere, { clientX: 0, clientY: 0, shiftKey: false }, { x: 0, y: 0 });
   }
 
   async function copy(element) {
@@ -91,6 +102,7 @@
   }, true);
 
   addEventListener("pointercancel", end, true);
+  setInterval(look, LOOK_EVERY_MS);
 
   addEventListener("keydown", (event) => {
     if ((event.key !== "Enter" && event.key !== " ") || !(event.target instanceof Element)) return;

@@ -1,7 +1,8 @@
 """What a person presses in HTML and SVG that Python put on the page; viser's own HTML, plots and images are one-way.
 
 The page carries a small script (``touch.js``). Any element with ``data-touch="ACTION:ARGUMENT"`` reports a press of the
-mouse, or Enter where the element has the focus. With ``data-drag`` as well, dragging across it is reported too.
+mouse, or Enter where the element has the focus. With ``data-drag`` as well, dragging across it is reported too. Which
+elements with ``data-view="NAME"`` are to be seen is reported as the action "views" with the names as its argument.
 """
 
 import json

@@ -13,7 +13,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 from playwright.sync_api import Browser, Locator, Page, expect
 
 SCENE = """
@@ -157,6 +159,11 @@ class Playground:
         """Click a button."""
         self.page.get_by_role("button", name=button, exact=True).click()
 
+    def unfold(self, folder: str) -> None:
+        """Open a folder."""
+        title = self.page.locator("[class*=Paper-root] > [class*=Paper-root]")
+        title.filter(has_text=re.compile(rf"^{re.escape(folder)}$")).locator("visible=true").click()
+
     def tab(self, name: str) -> None:
         """Open a tab."""
         self.page.get_by_role("tab", name=name, exact=True).click()
@@ -189,20 +196,48 @@ class Playground:
             .reduce((sum, [path, node]) => sum + (node.message?.props?.batched_positions?.byteLength ?? 0) / 12, 0)"""
         return round(self.page.evaluate(script, name))
 
-    def dot(self, name: str, index: int) -> tuple[float, float]:
-        """Where on the page the middle of a batched node's ball or dot of that number is seen."""
-        script = """([name, index]) => {
+    def dots(self, name: str) -> NDArray[np.float64]:
+        """Where on the page (N, 2) the balls or dots of a batched node are seen."""
+        script = """name => {
             const {camera, canvas, nodeRefFromName} = window.__viserMutable, box = canvas.getBoundingClientRect();
             const all = window.__viserSceneTree.getState()[name].message.props.batched_positions;
             const node = nodeRefFromName[name];
             node.updateWorldMatrix(true, false);
             camera.updateMatrixWorld();
-            const at = camera.position.clone().set(...all.slice(3 * index, 3 * index + 3));
-            at.applyMatrix4(node.matrixWorld).project(camera);
-            return [box.left + 0.5 * (1 + at.x) * box.width, box.top + 0.5 * (1 - at.y) * box.height];
+            return Array.from({length: all.length / 3}, (_, k) => {
+                const at = camera.position.clone().set(...all.slice(3 * k, 3 * k + 3));
+                at.applyMatrix4(node.matrixWorld).project(camera);
+                return [box.left + 0.5 * (1 + at.x) * box.width, box.top + 0.5 * (1 - at.y) * box.height];
+            });
         }"""
-        x, y = self.page.evaluate(script, [name, index])
-        return x, y
+        return np.array(self.page.evaluate(script, name))
+
+    def lonely_dots(self, *others: str) -> list[tuple[int, float, float]]:
+        """Numbers and places of the map's dots that can be clicked: nothing lies above them, no other dot is near.
+
+        ``others`` are more nodes whose dots must not be near.
+        """
+        self.settle()
+        places = self.dots("/map/points")
+        all_places = np.vstack([places, *(self.dots(name) for name in ("/sphere/bearings", *others))])
+        apart = np.linalg.norm(places[:, None] - all_places[None], axis=2)
+        apart[np.arange(len(places)), np.arange(len(places))] = np.inf
+        free = "at => at.map(([x, y]) => document.elementFromPoint(x, y)?.tagName === 'CANVAS')"
+        on_canvas = np.array(self.page.evaluate(free, places.tolist()))
+        found = np.flatnonzero(on_canvas & (apart.min(axis=1) > 20.0))
+        return [(int(k), float(places[k, 0]), float(places[k, 1])) for k in found]
+
+    def settle(self) -> None:
+        """Close what lies above the canvas, and wait until the viewer stands still."""
+        for close in self.page.locator("[class*=Notification-closeButton]").all():
+            close.click()
+        last: list[tuple[float, ...]] = []
+
+        def still() -> bool:
+            last.append(self.viewer)
+            return len(last) > 2 and last[-1] == last[-2] == last[-3]
+
+        self.until(still, "the viewer stands still")
 
     @property
     def viewer(self) -> tuple[float, ...]:
@@ -234,6 +269,23 @@ class Playground:
             return Array.from({length: marked.length / 3}, (_, k) => found.get(key(marked, k)) ?? -1);
         }"""
         return sorted(self.page.evaluate(script))
+
+    def drawn(self) -> dict[str, int]:
+        """How many dots, balls or lines each visible node of the canvas shows; balls in shells count together."""
+        script = """() => Object.entries(window.__viserSceneTree.getState())
+            .filter(([path, node]) => node.effectiveVisibility)
+            .map(([path, node]) => [path, node.message?.props ?? {}])
+            .map(([path, {batched_positions, points, colors}]) => [path.replace(/^\\/(.*?)(\\/\\d+)?$/, "$1"),
+                (batched_positions?.length ?? 0) / 3 + (points && colors ? points.length / 6 : 0)])
+            .filter(([path, count]) => count > 0)"""
+        counts: dict[str, int] = {}
+        for name, count in self.page.evaluate(script):
+            counts[name] = counts.get(name, 0) + round(count)
+        return counts
+
+    def step_count(self) -> int:
+        """How many steps there are."""
+        return int(self.step.input_value().split("/")[1].split()[0])
 
     def until(self, condition: Callable[[], bool], what: str) -> None:
         """Wait until something is so on the page."""

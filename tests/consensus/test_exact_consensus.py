@@ -83,7 +83,7 @@ def check(problem, found):
 @pytest.mark.parametrize("bound_px", [0.5, 3.0, 10.0, 30.0])
 def test_nothing_explains_more_than_the_bound(rng, bound_px, gravity_bound_rad):
     """Residuals on the edge of their bounds, points seen twice, level bearings, near points, only outliers."""
-    proven, missed, trials = 0, 0, 20
+    proven, missed, trials = 0, 0, 12
     for k in range(trials):
         count = int(rng.integers(3, 15))
         outliers = int(rng.integers(0, count + 1)) if k % 4 else count
@@ -101,7 +101,7 @@ def test_nothing_explains_more_than_the_bound(rng, bound_px, gravity_bound_rad):
 @pytest.mark.parametrize("camera", ["mei", "fisheye", "panorama"])
 def test_cameras(rng, scene_of, camera):
     closed = 0
-    for seed in range(12):
+    for seed in range(8):
         tilt = rng.choice([0.0, 0.2])
         rate = rng.choice([0.5, 0.8, 1.0])
         scene = scene_of(camera, correspondences=14, outlier_rate=rate, noise_px=1.0, gravity_error_deg=tilt)
@@ -109,7 +109,7 @@ def test_cameras(rng, scene_of, camera):
         found = search(problem)
         check(problem, found)
         closed += found.bound.max() <= found.supports.max(initial=1)
-    assert closed >= 8
+    assert closed >= 5
 
 
 def test_repeated_structure(rng):

@@ -259,7 +259,7 @@ def test_one_query_of_a_scene_can_be_run_alone(tmp_path: Path, drawn: dict[str, 
     few = alone(scene, "--query", "image1.png")
     assert few.returncode == 2 and "image1.png: few matches." in few.stderr and "1 usable of 1" in few.stderr
     other = alone(ROOT / "scenes" / "mei_outliers_80.toml", "--query", "image1.png")
-    assert other.returncode == 2 and "has no query images to choose from; leave out --query." in other.stderr
+    assert other.returncode == 2 and "has no query images to choose from; leave out the query." in other.stderr
 
 
 @pytest.mark.usefixtures("drawn")
