@@ -37,15 +37,17 @@ class Canvas:
         self._camera = TrueCamera(client, moved)
         self._docked_px, self._full_width = docked_px, client.camera.image_width
         self._viewed: tuple[str, str, str] | None = None
-        self._checks = 0
+        self._checks, self._movable = 0, False
 
     def draw(self, run: Run, picture: Picture, mesh: bytes | None, movable: bool) -> None:
         """Show a picture of a run; ``mesh`` is the map's, and ``movable`` whether the true camera may be dragged."""
         problem, layers = run.trace.problem, self._display.layers()
         self._painter.draw(picture.scene, layers)
         self._painter.draw_backdrop(mesh, problem.aligned.map_turn, "mesh" in layers)
-        truth = problem.truth_cam_from_map
-        self._camera.show(None if truth is None else problem.aligned.align_pose(truth), movable)
+        if movable or self._movable:
+            truth = problem.truth_cam_from_map
+            self._camera.show(None if truth is None else problem.aligned.align_pose(truth), movable)
+            self._movable = movable
         self._move_viewer(run, picture)
 
     def check(self) -> float | None:

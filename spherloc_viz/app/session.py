@@ -125,14 +125,19 @@ class Session:
             self._page.ask()
 
     def _listen(self) -> None:
-        self._controls.scene.reset.on_click(lambda event: (self._edits.clear(), self.changed()))
+        self._controls.scene.reset.on_click(self._take_back)
         on = self._touches.on
         on("select", self._select_numbers)
         on("deselect", lambda touch: (self._edits.select(()), self._page.ask()))
         for action, edit in (("spoil", self._edits.spoil), ("mend", self._edits.mend), ("hide", self._edits.hide)):
             on(action, lambda touch, edit=edit: (edit(), self.changed()))
-        for action, edit in (("unhide", self._edits.show_all), ("unedit", self._edits.clear)):
-            on(action, lambda touch, edit=edit: (edit(), self.changed()))
+        on("unhide", lambda touch: (self._edits.show_all(), self.changed()))
+        on("unedit", self._take_back)
+
+    def _take_back(self, event: object) -> None:
+        """All changes to single matches."""
+        self._edits.clear()
+        self.changed()
 
     def _select_numbers(self, touch: Touch) -> None:
         run, words = self._run, touch.argument.split(",")
@@ -193,7 +198,6 @@ class Session:
         self._history.note(wish, time.monotonic())
         if self._run is None or wish != self._run.wish:
             problem = self._problem(wish.scene)
-            self._status.say(f"Solving with {wish.estimator} …")
             watch = self._controls.slow.begin()
             try:
                 trace = estimate(problem, wish.estimator, wish.options, wish.scene.seed, watch)

@@ -169,8 +169,12 @@ class Playground:
         self.page.get_by_role("tab", name=name, exact=True).click()
 
     def touch(self, action: str) -> Locator:
-        """What reports this ("ACTION:ARGUMENT") when it is pressed."""
-        return self.page.locator(f"[data-touch='{action}']")
+        """What can be seen and reports this ("ACTION:ARGUMENT") when it is pressed."""
+        return self.page.locator(f"[data-touch='{action}']").locator("visible=true")
+
+    def row(self, number: int) -> Locator:
+        """The row of a match in the table, if the page of the table that is open has it."""
+        return self.page.locator(f"tr[data-touch='select:{number}']")
 
     @property
     def step(self) -> Locator:
