@@ -155,7 +155,9 @@ def house(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[House]:
 
 def shown(session: Session) -> str:
     """The step at hand, the outcome and the status, as HTML."""
-    return session._story.steps._text.content + session._story._outcome.content + session._status._line.content
+    return (
+        session._face.story.steps._text.content + session._face.story._outcome.content + session._status._line.content
+    )
 
 
 def test_only_the_run_that_is_settled_on_is_recorded(house: House) -> None:
@@ -189,25 +191,25 @@ def test_steps_can_be_walked_while_a_run_is_solved(house: House, monkeypatch: py
     assert entered.wait(60)
     for noise in np.linspace(1.1, 3.0, 15):
         page.set(session._controls.scene._simulation._noise, float(noise))
-    page.set(session._story.steps._buttons, "Previous")
+    page.set(session._face.story.steps._buttons, "Previous")
     until(lambda: "Refinement" in shown(session))
     assert not solved, "and it is still being solved"
     gate.set()
     until(lambda: len(house.notes.traces) == 2)
     assert len(solved) == 2, "of fifteen changes meanwhile only the newest was run"
-    assert session._story.steps._choice.value.endswith("Refinement"), "the stage is kept"
+    assert session._face.story.steps._choice.value.endswith("Refinement"), "the stage is kept"
 
 
 def test_stepping_solves_nothing(house: House, monkeypatch: pytest.MonkeyPatch) -> None:
     page, session = house.visit()
     monkeypatch.setattr(session_module, "estimate", lambda *_: pytest.fail("solved again"))
     for button, title in (("Previous", "Refinement"), ("Next", "Outcome"), ("Next", "Outcome")):
-        page.set(session._story.steps._buttons, button)
-        until(lambda title=title: title in session._story.steps._choice.value)
-    page.set(session._story.steps._choice, session._story.steps._choice.options[0])
-    until(lambda: "The matches" in session._story.steps._text.content)
+        page.set(session._face.story.steps._buttons, button)
+        until(lambda title=title: title in session._face.story.steps._choice.value)
+    page.set(session._face.story.steps._choice, session._face.story.steps._choice.options[0])
+    until(lambda: "The matches" in session._face.story.steps._text.content)
     page.set(session._controls.display._layers["map"], False)
-    until(lambda: not session._canvas._painter._drawn["map/points"][0].visible)
+    until(lambda: not session._face.canvas._painter._drawn["map/points"][0].visible)
     assert len(house.notes.traces) == 1
 
 
@@ -216,11 +218,11 @@ def test_play_goes_to_the_end_and_stops(house: House, monkeypatch: pytest.Monkey
 
     monkeypatch.setattr(steps_panel, "PLAY_S", 0.05)
     page, session = house.visit()
-    page.set(session._story.steps._buttons, "Play")
-    until(lambda: session._story.steps._playing)
-    until(lambda: not session._story.steps._playing)
-    until(lambda: session._story.steps._choice.value.endswith("Outcome"))
-    until(lambda: "Play" in session._story.steps._buttons.options)
+    page.set(session._face.story.steps._buttons, "Play")
+    until(lambda: session._face.story.steps._playing)
+    until(lambda: not session._face.story.steps._playing)
+    until(lambda: session._face.story.steps._choice.value.endswith("Outcome"))
+    until(lambda: "Play" in session._face.story.steps._buttons.options)
 
 
 @pytest.mark.parametrize("seed", ["", "x", "-1", "1.5", "9223372036854775808", "٣", "1" * 400])
@@ -268,20 +270,20 @@ def test_diagnosis_comes_after_the_picture_and_only_for_the_newest_run(
     monkeypatch.setattr(session_module, "diagnose", slow)
     page.set(session._controls.scene._simulation._noise, 1.0)
     assert entered.wait(60)
-    until(lambda: "Diagnosing" in session._story._diagnosis.content)
+    until(lambda: "Diagnosing" in session._face.story._diagnosis.content)
     for noise in np.linspace(1.1, 3.0, 15):
         page.set(session._controls.scene._simulation._noise, float(noise))
     until(lambda: session._run.trace is not seen[0] and len(house.notes.traces) == 2)
-    page.set(session._story.steps._buttons, "Previous")
+    page.set(session._face.story.steps._buttons, "Previous")
     until(lambda: "Refinement" in shown(session))
-    assert len(seen) == 1 and "cameras/rival" not in session._canvas._painter._drawn, "the page goes on meanwhile"
+    assert len(seen) == 1 and "cameras/rival" not in session._face.canvas._painter._drawn, "the page goes on meanwhile"
     gate.set()
-    until(lambda: "Two poses." in session._story._diagnosis.content)
+    until(lambda: "Two poses." in session._face.story._diagnosis.content)
     assert len(seen) == 2 and seen[1] is session._run.trace, "of fifteen runs meanwhile only the newest was diagnosed"
-    page.set(session._story.steps._buttons, "Next")
-    until(lambda: "cameras/rival" in session._canvas._painter._drawn)
-    page.set(session._story.steps._buttons, "Previous")
-    until(lambda: not session._canvas._painter._drawn["cameras/rival"][0].visible)
+    page.set(session._face.story.steps._buttons, "Next")
+    until(lambda: "cameras/rival" in session._face.canvas._painter._drawn)
+    page.set(session._face.story.steps._buttons, "Previous")
+    until(lambda: not session._face.canvas._painter._drawn["cameras/rival"][0].visible)
 
 
 def test_a_full_disk_and_a_bug_are_sentences(house: House, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -305,12 +307,12 @@ def test_pages_share_nothing_and_leave_nothing(house: House) -> None:
     kept = two._run.trace
     first.set(one._controls.scene._simulation._points, 33)
     until(lambda: one._run is not None and len(one._run.trace.problem) == 33)
-    first.set(one._story.steps._buttons, "Previous")
-    until(lambda: one._story.steps._choice.value.endswith("Refinement"))
+    first.set(one._face.story.steps._buttons, "Previous")
+    until(lambda: one._face.story.steps._choice.value.endswith("Refinement"))
     assert (
         two._run.trace is kept
         and two._controls.scene._simulation._points.value == 20
-        and two._story.steps._choice.value.endswith("Outcome")
+        and two._face.story.steps._choice.value.endswith("Outcome")
     )
     first.close()
     until(lambda: threads() == before + 4 and len(house.sessions._open) == 1)
@@ -320,7 +322,7 @@ def test_pages_share_nothing_and_leave_nothing(house: House) -> None:
 
 def test_only_views_that_are_seen_are_drawn(house: House) -> None:
     _, session = house.visit()
-    table, residuals = session._story._matches._html, session._story._residuals._html
+    table, residuals = session._face.story._matches._html, session._face.story._residuals._html
     assert table.content == "" and residuals.content == "", "another tab is open"
 
     def see(names: str) -> None:
@@ -349,7 +351,7 @@ def test_matches_are_selected_and_changed_by_hand(house: House) -> None:
         return session._run.wish.scene.variation
 
     press("select:3")
-    until(lambda: session._card._panel.visible and "Match 3" in session._card._html.content)
+    until(lambda: session._face.card._panel.visible and "Match 3" in session._face.card._html.content)
     press("select:7,5", extend=True)
     assert session._edits.selected == (3, 5, 7)
     for wrong in ("select:99", "select:-1", "select:x", "select:", "select:1e3", "nothing:1"):
@@ -384,7 +386,7 @@ def test_a_slow_run_gives_way_and_can_be_cancelled(house: House) -> None:
     bar, button = session._controls.slow._bar, session._controls.slow._button
     until(lambda: bar.visible and button.visible)
     until(lambda: 0.0 < bar.value < 100.0)
-    page.set(session._story.steps._buttons, "Previous")
+    page.set(session._face.story.steps._buttons, "Previous")
     until(lambda: "Refinement" in shown(session))
     page.send({"type": "GuiUpdateMessage", "uuid": button._impl.uuid, "updates": {"value": True}})
     until(lambda: "Cancelled" in shown(session) and not bar.visible)

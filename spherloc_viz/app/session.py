@@ -16,26 +16,17 @@ from spherloc.estimators import default_options, estimate
 from spherloc.problem import Problem
 from spherloc.trace import Trace
 from spherloc.watch import Cancelled
-from spherloc_viz.app.canvas import Canvas, panel_widths_px
 from spherloc_viz.app.catalog import SceneWish
-from spherloc_viz.app.controls import Controls
 from spherloc_viz.app.edits import Edits
 from spherloc_viz.app.export_panel import Shown
+from spherloc_viz.app.face import Face
 from spherloc_viz.app.history import History
-from spherloc_viz.app.match_card import MatchCard
 from spherloc_viz.app.newest import Job, Newest
 from spherloc_viz.app.services import Services
 from spherloc_viz.app.status import Status
-from spherloc_viz.app.story import Story
-from spherloc_viz.app.text import diagnosis_html, status_html
 from spherloc_viz.app.touch import Touch, Touches
-from spherloc_viz.app.viser_seams import guard_callbacks, put_back, set_theme
+from spherloc_viz.app.viser_seams import guard_callbacks, put_back
 from spherloc_viz.app.wish import Run, Wish
-from spherloc_viz.layers import paint, steps, with_rival
-from spherloc_viz.layers.primitives import Picture, SceneItem
-from spherloc_viz.layers.selection import with_selection
-from spherloc_viz.layers.tables import outcome_table
-from spherloc_viz.layers.trajectory import trajectory_items
 
 QUIET_S = 0.7
 """Runs count as settled, and are recorded, when nothing has changed for this long."""
@@ -65,13 +56,8 @@ class Session:
         self._run: Run | None = None
         self._diagnosed: tuple[Trace, Diagnosis] | None = None
         self._recorded: tuple[Trace, Path] | None = None
-        self._shown: tuple[Run, Picture] | None = None
-        self._theme = "dark"
-        left_px, right_px = panel_widths_px(client.camera.image_width)
-        self._controls = Controls(client, self._catalog, services.roots, self._touches, self, right_px)
-        self._story = Story(client.gui, self._touches, self.redraw, self.select, left_px)
-        self._card = MatchCard(client.gui)
-        self._canvas = Canvas(client, self._controls.display, self.select, self._move_camera, left_px + right_px)
+        self._face = Face(client, self._catalog, self._touches, self, services.roots, self.select, self._move_camera)
+        self._controls = self._face.controls
         self._listen()
         # Only now may the page tell what is pressed: everything that listens is there.
         services.desk.add(self._touches)
@@ -160,19 +146,9 @@ class Session:
 
     def shown(self) -> Shown | None:
         """What is on the page, to be exported."""
-        if self._shown is None:
-            return None
-        (run, picture), display = self._shown, self._controls.display
-        trace, layers, recorded = run.trace, display.layers(), self._recorded
-        return Shown(
-            trace=trace,
-            items=tuple(item for item in picture.scene if item.layer in layers),
-            backdrop=self._catalog.mesh(run.wish.scene.scene) if "mesh" in layers else None,
-            title=run.wish.scene.scene,
-            note=f"{trace.estimator}, seed {trace.seed}. {trace.message}",
-            recorded=recorded[1] if recorded is not None and recorded[0] is trace else None,
-            dark=display.theme == "dark",
-        )
+        run, recorded = self._run, self._recorded
+        known = run is not None and recorded is not None and recorded[0] is run.trace
+        return self._face.shown(recorded[1] if known and recorded is not None else None)
 
     # What the threads do.
 
@@ -226,7 +202,7 @@ class Session:
         return self._catalog.problem(wish)
 
     def _settle(self) -> None:
-        for widget in self._controls.widgets + self._story.steps.widgets:
+        for widget in self._controls.widgets + self._face.story.steps.widgets:
             put_back(widget)
         run, recorder = self._run, self._services.recorder
         if run is None:
@@ -251,46 +227,12 @@ class Session:
         run = self._run
         if run is None:
             return None
-        trace = run.trace
-        timeline = steps(trace)
-        index, pause = self._story.steps.settle(timeline, asked)
-        picture, selected = paint(trace, index), self._edits.places(run.kept)
-        last = index == len(timeline) - 1
-        diagnosis, remark = None, status_html("Diagnosing …")
-        if self._diagnosed is not None and self._diagnosed[0] is trace:
-            diagnosis = self._diagnosed[1]
-            remark = diagnosis_html(diagnosis, whole=last)
-            if last and diagnosis.rival_cam_from_map is not None:
-                picture = with_rival(picture, trace, diagnosis.rival_cam_from_map)
-        drawn = with_selection(picture, trace, selected)
-        drawn = replace(drawn, scene=drawn.scene + self._controls.compare.items(trace) + self._trajectory(run))
-        self._shown = run, drawn
-        with self._client.atomic():
-            self._follow_theme()
-            mesh = self._catalog.mesh(run.wish.scene.scene)
-            self._canvas.draw(run, drawn, mesh, self._controls.camera_movable)
-            self._story.draw(run, picture, pause is not None, outcome_table(trace), selected)
-            self._story.diagnose(remark)
-            self._card.draw(trace, selected, run.kept, None if diagnosis is None else diagnosis.rival_cam_from_map)
-            self._controls.draw(run)
-        self._client.flush()
+        known = self._diagnosed
+        diagnosis = known[1] if known is not None and known[0] is run.trace else None
+        pause = self._face.draw(run, diagnosis, self._edits.places(run.kept), asked)
         if diagnosis is None:
             self._doctor.ask()
-        return self._canvas.check() if pause is None else pause
-
-    def _follow_theme(self) -> None:
-        theme = self._controls.display.theme
-        if theme != self._theme:
-            self._theme = theme
-            set_theme(self._client.gui, theme)
-
-    def _trajectory(self, run: Run) -> tuple[SceneItem, ...]:
-        """The sequence that was localized in the scene at hand, if any."""
-        label = run.wish.scene.scene
-        scene, rows = self._catalog.map_scene(label), self._controls.sequence.rows(label)
-        if scene is None or not rows:
-            return ()
-        return trajectory_items(rows, run.trace.problem.aligned.map_turn, scene.thresholds[-1][1])
+        return pause
 
     def _examine(self, asked: bool) -> float | None:
         """The doctor thread's job: once nothing has changed for a while, diagnose the newest run and show it."""

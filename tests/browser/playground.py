@@ -216,6 +216,16 @@ class Playground:
         }"""
         return np.array(self.page.evaluate(script, name))
 
+    def centre(self, name: str) -> tuple[float, ...]:
+        """The first end of the first of a node's lines, where ``viewer`` is measured."""
+        script = """name => {
+            const {camera, nodeRefFromName} = window.__viserMutable, node = nodeRefFromName[name];
+            const all = window.__viserSceneTree.getState()[name].message.props.points;
+            node.updateWorldMatrix(true, false);
+            return camera.position.clone().set(...all.slice(0, 3)).applyMatrix4(node.matrixWorld).toArray();
+        }"""
+        return tuple(self.page.evaluate(script, name))
+
     def lonely_dots(self, *others: str) -> list[tuple[int, float, float]]:
         """Numbers and places of the map's dots that can be clicked: nothing lies above them, no other dot is near.
 

@@ -1,0 +1,232 @@
+"""What is seen of a run: steps, layers, views, themes; and what happens when things go wrong."""
+
+import re
+from collections.abc import Callable
+
+import pytest
+from playground import Playground
+from playwright.sync_api import expect
+
+pytestmark = [pytest.mark.browser, pytest.mark.timeout(280)]
+
+EXACT = "mc-exact (exact, certified)"
+LEAST_CONTRAST = 4.5
+TABS = ("Yaw", "Charts", "Residuals", "Images", "Matches", "Play", "Compare", "Sweep", "Open", "Share")
+
+READ_CONTRASTS = r"""() => {
+    const channels = (text) => {
+        const all = text.match(/-?[\d.]+(e-?\d+)?/g).map(Number), unit = text.startsWith("color(srgb") ? 1 : 255;
+        return [all[0] / unit, all[1] / unit, all[2] / unit, all[3] ?? 1];
+    };
+    const over = (top, share, below) => below.map((value, k) => share * top[k] + (1 - share) * value);
+    const light = (rgb) => rgb.map((v) => (v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4))
+        .reduce((sum, v, k) => sum + [0.2126, 0.7152, 0.0722][k] * v, 0);
+    const found = [];
+    for (const element of document.querySelectorAll("[data-ours] *, svg text")) {
+        const words = [...element.childNodes].filter((n) => n.nodeType === 3).map((n) => n.data).join(" ").trim();
+        const seen = element.checkVisibility({opacityProperty: true, visibilityProperty: true});
+        if (!words || !seen || element.closest("title,style,[inert],[aria-disabled=true]")) continue;
+        const line = [];
+        for (let e = element; e; e = e.parentElement) line.unshift(e);
+        let below = [1, 1, 1], share = 1;
+        for (const e of line) {
+            const css = getComputedStyle(e), color = channels(css.backgroundColor);
+            share *= Number(css.opacity);
+            below = over(color, color[3] * share, below);
+        }
+        const css = getComputedStyle(element), drawn = element instanceof SVGElement;
+        // Words with an outline stand on the outline.
+        if (drawn && css.paintOrder.startsWith("stroke")) below = channels(css.stroke).slice(0, 3);
+        const own = channels(drawn ? css.fill : css.color);
+        const both = [light(over(own, own[3] * share, below)), light(below)].sort((a, b) => b - a);
+        found.push([words.slice(0, 60), (both[0] + 0.05) / (both[1] + 0.05)]);
+    }
+    return found;
+}"""
+MARK_OURS = """() => document.querySelectorAll("[style*='padding: 0px 0.8em'],[style*='padding:0 .8em']")
+    .forEach((box) => box.setAttribute("data-ours", ""))"""
+
+
+def at(number: int | str = r"\d+", title: str = "") -> re.Pattern[str]:
+    """What the list of steps says at a step."""
+    return re.compile(rf"^{number}/\d+  .*{title}")
+
+
+def test_slider_stages_buttons_and_keys_step(tab: Playground, address: str) -> None:
+    outcome = tab.drawn()
+    expect(tab.step).to_have_value(at(title="Outcome"))
+    tab.touch("step:balls-pair").click()
+    expect(tab.step).to_have_value(at(title="One pair, one ball"))
+    tab.until(lambda: tab.drawn() != outcome, "another step draws something else")
+    assert tab.instances("/balls") > 0 and tab.instances("/uncertainty") == 0
+    number = int(tab.step.input_value().split("/")[0])
+
+    tab.thumb("Timeline").focus()
+    tab.page.keyboard.press("ArrowRight")
+    expect(tab.step).to_have_value(at(number + 1))
+    tab.page.keyboard.press("Home")
+    expect(tab.step).to_have_value(at(1, "The matches"))
+    tab.until(lambda: tab.drawn().get("sphere/bearings", 0) == 0 or tab.instances("/balls") == 0, "no balls are left")
+
+    tab.page.mouse.click(420, 650)
+    tab.page.keyboard.press("n")
+    expect(tab.step).to_have_value(at(2))
+    expect(tab.thumb("Timeline")).to_have_attribute("aria-valuenow", "2")
+    tab.page.keyboard.press("b")
+    expect(tab.step).to_have_value(at(1))
+    tab.page.keyboard.press("Shift+N")
+    expect(tab.step).to_have_value(at(title="One pair of matches"))
+    tab.page.keyboard.press("Shift+B")
+    expect(tab.step).to_have_value(at(1))
+
+    tab.choose("Pace", "4×")
+    tab.press("Play")
+    expect(tab.step).to_have_value(at(2))
+    expect(tab.step).to_have_value(at(3))
+    tab.press("Pause")
+    expect(tab.page.get_by_role("button", name="Play", exact=True)).to_be_visible()
+    tab.slide("Timeline", "End")
+    expect(tab.step).to_have_value(at(title="Outcome"))
+    tab.until(lambda: tab.drawn() == outcome, "the outcome is drawn as before")
+    tab.expect_quiet(address)
+
+
+def test_layers_and_views(tab: Playground, address: str) -> None:
+    tab.settle()
+    seen = [tab.viewer]
+    for name in ("Above", "Sphere", "Balls", "From the camera", "Overview"):
+        tab.press(name)
+        tab.until(lambda: tab.viewer != seen[-1], f"the viewer moves to {name}")
+        tab.settle()
+        seen.append(tab.viewer)
+    assert len(set(seen[1:])) == 5
+    centre = tab.centre("/cameras/estimate")
+    away = [sum((a - b) ** 2 for a, b in zip(place[:3], centre, strict=True)) ** 0.5 for place in seen]
+    assert away[4] < 0.05 < min(away[1:4] + away[5:])
+
+    tab.unfold("Layers")
+    for label, node in (("Map", "map/points"), ("Rays", "rays"), ("Cameras", "cameras/estimate")):
+        before = tab.drawn()
+        tab.widget(label).uncheck()
+        tab.until(lambda node=node: node not in tab.drawn(), f"{label} is hidden")
+        assert tab.drawn()["sphere/bearings"] == 40
+        tab.widget(label).check()
+        tab.until(lambda before=before: tab.drawn() == before, f"{label} is back")
+    tab.expect_quiet(address)
+
+
+def agree(tab: Playground, shown: dict[str, str]) -> bool:
+    """Whether each layer's box is ticked if and only if its node is visible."""
+    return all(tab.widget(label).is_checked() == (node in tab.drawn()) for label, node in shown.items())
+
+
+def test_what_the_page_shows_is_what_python_has(tab: Playground, address: str) -> None:
+    """Several widgets changed at once: the page sends only the last of them, and must not show what was lost."""
+    names = {name: tab.thumb(name) for name in ("Outliers (%)", "Points", "Noise (px)")}
+    script = """thumbs => thumbs.forEach(
+        thumb => thumb.dispatchEvent(new KeyboardEvent("keydown", {key: "End", bubbles: true})))"""
+    tab.page.evaluate(script, [thumb.element_handle() for thumb in names.values()])
+    numbers = re.compile(r"^Recorded as ")
+    tab.until(lambda: tab.value("inliers").inner_text().endswith(f" of {names['Points'].get_attribute('aria-valuenow')}"), "x")
+    print({name: thumb.get_attribute("aria-valuenow") for name, thumb in names.items()}, numbers)
+
+
+def test_a_dragged_slider_ends_where_it_was_let_go(tab: Playground, address: str) -> None:
+    thumb = tab.thumb("Points")
+    start, track = thumb.bounding_box(), tab.widget("Points").bounding_box()
+    assert start is not None and track is not None
+    tab.page.mouse.move(start["x"] + start["width"] / 2, start["y"] + start["height"] / 2)
+    tab.page.mouse.down()
+    for share in (0.1, 0.6, 0.2, 0.5, 0.15, 0.31):
+        tab.page.mouse.move(track["x"] + share * track["width"], start["y"], steps=4)
+    tab.page.mouse.up()
+    shown = int(thumb.get_attribute("aria-valuenow") or 0)
+    assert 100 < shown < 220
+    expect(tab.value("inliers")).to_have_text(re.compile(rf" of {shown}$"))
+    tab.until(lambda: tab.instances("/map/points") == shown, "the canvas has as many points")
+    expect(tab.entry("Points")).to_have_value(str(shown))
+    expect(thumb).to_have_attribute("aria-valuenow", str(shown))
+    tab.expect_quiet(address)
+
+
+def test_the_true_camera_can_be_dragged(tab: Playground, address: str) -> None:
+    tab.settle()
+    place = tab.value("camera position").inner_text()
+    assert not (tab.node("/true camera level") or {"visible": True})["visible"]
+    tab.page.get_by_text("Drag the camera", exact=True).click()
+    tab.until(lambda: bool((tab.node("/true camera level") or {}).get("visible")), "the handle is there")
+    tab.press("Overview")
+    tab.settle()
+    script = """name => {
+        const {camera, canvas, nodeRefFromName} = window.__viserMutable, box = canvas.getBoundingClientRect();
+        const node = nodeRefFromName[name], found = [];
+        node.updateWorldMatrix(true, true);
+        node.traverse(({geometry, matrixWorld}) => {
+            if (geometry?.type !== "ConeGeometry") return;
+            geometry.computeBoundingSphere();
+            const tip = geometry.boundingSphere.center.clone().applyMatrix4(matrixWorld).project(camera);
+            found.push([box.left + 0.5 * (1 + tip.x) * box.width, box.top + 0.5 * (1 - tip.y) * box.height]);
+        });
+        return found;
+    }"""
+    x, y = tab.page.evaluate(script, "/true camera level")[-1]
+    tab.page.mouse.move(x, y)
+    tab.page.mouse.down()
+    tab.page.mouse.move(x + 15, y + 20, steps=5)
+    tab.page.mouse.up()
+    expect(tab.page.get_by_text(re.compile("^The true camera was moved: yaw"))).to_be_visible()
+    expect(tab.value("camera position")).not_to_have_text(place)
+    expect(tab.value("outcome")).to_have_text("success")
+    tab.press("Undo")
+    expect(tab.value("camera position")).to_have_text(place)
+    expect(tab.page.get_by_text(re.compile("^The true camera was moved: yaw"))).to_have_count(0)
+    tab.expect_quiet(address)
+
+
+def test_mistakes_are_sentences_and_the_page_stays_usable(tab: Playground, address: str) -> None:
+    def mistake(label: str, wrong: str, sentence: str, right: str, mended: Callable[[], None]) -> None:
+        tab.type(label, wrong)
+        note = tab.page.locator("[class*=Notification-root]").filter(has_text=sentence)
+        expect(note).to_be_visible()
+        assert (note.inner_text().count(".") == 1) and note.inner_text().endswith(".")
+        expect(tab.value("outcome")).to_have_text("success")
+        tab.type(label, right)
+        mended()
+        expect(note).to_have_count(0)
+
+    error = tab.value("rotation error").inner_text()
+    changed = lambda: expect(tab.value("rotation error")).not_to_have_text(error)  # noqa: E731
+    mistake("Seed", "soon", "The seed 'soon' is no whole number", "8", changed)
+    tab.choose("Estimator", EXACT)
+    expect(tab.value("estimator")).to_have_text("mc-exact")
+    mistake("Time budget (s)", "later", "later", "20", lambda: None)
+    tab.expect_quiet(address)
+
+
+def test_dark_and_light_can_be_read(tab: Playground, address: str) -> None:
+    """All words of ours, not those of viser's own widgets, stand out from what is behind them."""
+    tab.tab("Matches")
+    tab.row(3).click()
+    tab.expect_card(3)
+    backgrounds = []
+    for theme in ("dark", "light"):
+        if theme == "light":
+            tab.page.get_by_text("Dark", exact=True).click()
+            tab.until(lambda: background(tab) != backgrounds[0], "the page turns light")
+        backgrounds.append(background(tab))
+        faint: dict[str, float] = {}
+        for name in TABS:
+            tab.tab(name)
+            tab.page.evaluate(MARK_OURS)
+            contrasts = tab.page.evaluate(READ_CONTRASTS)
+            assert len(contrasts) > 30
+            faint |= {f"{name}: {words}": round(ratio, 2) for words, ratio in contrasts if ratio < LEAST_CONTRAST}
+        assert not faint, theme
+        tab.tab("Play")
+    assert sum(backgrounds[0]) < 200 and sum(backgrounds[1]) > 700
+    tab.expect_quiet(address)
+
+
+def background(tab: Playground) -> tuple[int, ...]:
+    text = tab.page.evaluate("() => getComputedStyle(document.body).backgroundColor")
+    return tuple(map(int, re.findall(r"\d+", text)[:3]))
