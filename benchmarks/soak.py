@@ -41,7 +41,8 @@ async def visit(address: str, number: int, end_s: float, mistakes: list[str], an
             try:
                 await page.until(partial(_recorded, page, seed), 60.0)
             except TimeoutError:
-                mistakes.append(f"page {number}: the run with seed {seed} never came")
+                status = next((html for html in page.html.values() if "ecorded" in html), "")
+                mistakes.append(f"page {number}: the run with seed {seed} never came; {re.sub('<[^>]*>', '', status)}")
                 continue
             answers.append(time.perf_counter() - start)
             mistakes += _mistakes(page, number, points, seed)

@@ -292,6 +292,8 @@ def test_a_full_disk_and_a_bug_are_sentences(house: House, monkeypatch: pytest.M
     page.set(session._controls.scene._seed, "5")
     until(lambda: "the disk is full; make room." in shown(session))
     house.notes.full = False
+    until(lambda: len(house.notes.traces) == 2 and "Recorded as run-2.rrd" in shown(session))
+    assert house.notes.traces[-1].seed == 5, "tried again by itself"
     monkeypatch.setattr(session_module, "estimate", lambda *_: 1 / 0)
     page.set(session._controls.scene._seed, "6")
     until(lambda: "a bug in the playground (ZeroDivisionError" in shown(session))

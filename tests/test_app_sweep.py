@@ -130,7 +130,7 @@ def test_a_sweep_is_drawn_as_it_goes_cancelled_and_gone_on_with(desk: Desk) -> N
     plan = panel._results.plan
     assert plan.variation == Variation(noise_px=1.0), "what the sweep goes over and edits of matches are not the page's"
     sent: list[tuple[str, bytes]] = []
-    client = SimpleNamespace(send_file_download=lambda *file: sent.append(file))
+    client = SimpleNamespace(send_file_download=lambda *file, **how: sent.append(file))
     for kind in ("CSV", "Summary", "PNG"):
         panel._files.value = kind
         panel._download(SimpleNamespace(client=client))

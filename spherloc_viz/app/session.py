@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from spherloc.datasets.synthetic import TrueCamera
 from spherloc.diagnosis import Diagnosis, diagnose
-from spherloc.errors import SpherlocError
+from spherloc.errors import RecordingError, SpherlocError
 from spherloc.estimators import default_options, estimate
 from spherloc.problem import Problem
 from spherloc.trace import Trace
@@ -30,6 +30,8 @@ from spherloc_viz.app.wish import Run, Wish
 
 QUIET_S = 0.7
 """Runs count as settled, and are recorded, when nothing has changed for this long."""
+RETRY_S = 1.0
+"""After this long a run is recorded that could not be before."""
 DIAGNOSE_AFTER_S = 0.2
 """A diagnosis costs more than many a run, so it waits until the picture has stood still for this long."""
 
@@ -168,8 +170,7 @@ class Session:
     def _solve(self, asked: bool) -> float | None:
         """The solver thread's job: solve what the page asks for now, or record what it has settled on."""
         if not asked:
-            self._settle()
-            return None
+            return self._settle()
         wish = self._wish()
         self._history.note(wish, time.monotonic())
         if self._run is None or wish != self._run.wish:
@@ -201,18 +202,24 @@ class Session:
             self._status.say("Reading and matching images …")
         return self._catalog.problem(wish)
 
-    def _settle(self) -> None:
+    def _settle(self) -> float | None:
+        """Put the page's widgets right, and record its run; returns seconds to the next attempt if that must wait."""
         for widget in self._controls.widgets + self._face.story.steps.widgets:
             put_back(widget)
         run, recorder = self._run, self._services.recorder
         if run is None:
-            return
+            return None
         self._controls.settle(run)
         if recorder is None:
-            return
+            return None
         if self._recorded is None or self._recorded[0] is not run.trace:
-            self._recorded = run.trace, recorder.submit(run.trace)
+            try:
+                self._recorded = run.trace, recorder.submit(run.trace)
+            except RecordingError as error:
+                self._status.say(f"{error} It is tried again.")
+                return RETRY_S
         self._status.say(f"Recorded as {self._recorded[1].name}")
+        return None
 
     def record(self, trace: Trace) -> None:
         """Record a run that a panel made, if runs are recorded."""

@@ -210,7 +210,7 @@ class SweepPanel:
         if results is None or event.client is None:
             return
         name, content = download_of(results.plan, results.name, results.rows, self._files.value)
-        event.client.send_file_download(name, content)
+        event.client.send_file_download(name, content, save_immediately=True)
 
 
 def download_of(plan: SweepPlan, scene: str, rows: tuple[SweepRow, ...], kind: str) -> tuple[str, bytes]:

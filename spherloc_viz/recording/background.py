@@ -43,7 +43,7 @@ class Recorder:
             self._queue.put_nowait((trace, path))
         except queue.Full:
             waiting = f"{QUEUE_LENGTH} runs wait to be recorded"
-            raise RecordingError(f"{path.name}: not recorded, since {waiting}; run it again in a moment.") from None
+            raise RecordingError(f"{path.name}: not recorded, since {waiting}.") from None
         return path
 
     def close(self) -> None:

@@ -133,7 +133,7 @@ class Playground:
     def entry(self, label: str) -> Locator:
         """The box that is typed into."""
         name = self.page.locator("label", has_text=re.compile(rf"^{re.escape(label)}$"))
-        return name.locator("xpath=ancestor::*[contains(@class, 'Flex-root')][1]").locator("input")
+        return name.locator("xpath=ancestor::*[contains(@class, 'Flex-root')][1]").locator("input:not([type='hidden'])")
 
     def thumb(self, label: str) -> Locator:
         """The part of a slider that is dragged."""
@@ -301,9 +301,9 @@ class Playground:
         """How many steps there are."""
         return int(self.step.input_value().split("/")[1].split()[0])
 
-    def until(self, condition: Callable[[], bool], what: str) -> None:
+    def until(self, condition: Callable[[], bool], what: str, patience_s: float = PATIENCE_MS / 1000) -> None:
         """Wait until something is so on the page."""
-        end = time.monotonic() + PATIENCE_MS / 1000
+        end = time.monotonic() + patience_s
         while not condition():
             assert time.monotonic() < end, f"waited in vain until {what}"
             self.page.wait_for_timeout(50)

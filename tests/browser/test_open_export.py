@@ -1,0 +1,246 @@
+"""Scenes from elsewhere and uploads come onto the page, and what is seen leaves it as files."""
+
+import re
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from playground import SCENE, Playground, served
+from playwright.sync_api import Browser, Locator, Page, expect
+
+from spherloc.estimators import estimate
+from spherloc.problem import Problem
+from spherloc_viz.app.catalog import Catalog, SceneWish
+from spherloc_viz.layers.tables import outcome_table
+from spherloc_viz.recording.reader import read_recording
+
+CAMERA = '[camera]\nmodel = "equirectangular"\nwidth = 2048\nheight = 1024\n'
+
+pytestmark = [pytest.mark.browser, pytest.mark.timeout(280)]
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with one that pages may look into, ``maps``, one that they may not, and one for scratch files."""
+    base = tmp_path_factory.mktemp("open")
+    for name in ("start", "maps/north", "secret", "scratch"):
+        (base / name).mkdir(parents=True)
+    (base / "start" / "small.toml").write_text(SCENE)
+    north = SCENE.replace("small street", "northern street").replace("= 40", "= 33").replace("seed = 3", "seed = 8")
+    (base / "maps" / "north" / "street.toml").write_text(north)
+    (base / "maps" / "broken.toml").write_text(SCENE.replace("0.5", "5.0"))
+    (base / "secret" / "hidden.toml").write_text(SCENE)
+    return base
+
+
+@pytest.fixture(scope="module")
+def own_address(folders: Path) -> Iterator[str]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("TMPDIR", str(folders / "scratch"))
+        patch.setenv("SPHERLOC_CACHE", str(folders / "cache"))
+        words = ("--allow", folders / "maps", "--recordings", folders / "recordings")
+        with served(folders / "start" / "small.toml", *words) as (address, _):
+            yield address
+
+
+@pytest.fixture
+def open_page(browser: Browser, own_address: str) -> Iterator[Callable[..., Playground]]:
+    """Opens pages of this file's own server and closes them after the test."""
+    pages: list[Playground] = []
+
+    def opened(drawn: bool = False) -> Playground:
+        pages.append(Playground(browser, own_address, drawn))
+        return pages[-1]
+
+    yield opened
+    for page in pages:
+        page.close()
+
+
+def row(tab: Playground, kind: str, name: str) -> Locator:
+    """A row of the list of scenes."""
+    pressed = tab.page.locator(f"tr[data-touch^='open-{kind}:']")
+    return pressed.filter(has_text=re.compile(rf"^{re.escape(name)}")).last
+
+
+def test_scenes_are_opened_from_allowed_folders(open_page: Callable[..., Playground], folders: Path) -> None:
+    tab = open_page()
+    tab.tab("Open")
+    row(tab, "scene", "fisheye_outliers_80.toml").click()
+    expect(tab.value("inliers")).to_have_text(re.compile(" of 100$"))
+    tab.tab("Play")
+    expect(tab.widget("Scene")).to_have_value("Kannala-Brandt fisheye, 80 % outliers")
+
+    tab.tab("Open")
+    row(tab, "folder", "maps/").click()
+    row(tab, "scene", "broken.toml").click()
+    wrong = tab.page.get_by_text(re.compile("outlier_rate"))
+    expect(wrong).to_be_visible()
+    assert "broken.toml" in wrong.inner_text() and str(folders) in wrong.inner_text()
+    expect(tab.value("inliers")).to_have_text(re.compile(" of 100$"))
+    row(tab, "folder", "north/").click()
+    row(tab, "scene", "street.toml").click()
+    expect(tab.value("inliers")).to_have_text(re.compile(" of 33$"))
+    expect(wrong).to_have_count(0)
+    tab.tab("Play")
+    expect(tab.widget("Scene")).to_have_value("northern street")
+    expect(tab.entry("Seed")).to_have_value("8")
+    tab.tab("Open")
+    expect(tab.page.get_by_text("Recent", exact=True)).to_be_visible()
+    expect(tab.page.get_by_text("hidden.toml")).to_have_count(0)
+    assert tab.errors == []
+
+    other = open_page()
+    other.widget("Scene").click()
+    expect(other.page.get_by_role("option", name="small street", exact=True)).to_be_visible()
+    expect(other.page.get_by_role("option", name="northern street")).to_have_count(0)
+
+
+def matches_csv(problem: Problem) -> str:
+    rows = np.hstack([problem.pixels, problem.points])
+    return "u,v,X,Y,Z\n" + "".join(",".join(map(repr, map(float, values))) + "\n" for values in rows)
+
+
+def upload(tab: Playground, button: str, name: str, content: str) -> None:
+    """Give a file to a button, and wait until the page says that it has it."""
+    with tab.page.expect_file_chooser() as chooser:
+        tab.press(button)
+    data = content.encode()
+    chooser.value.set_files({"name": name, "mimeType": "text/plain", "buffer": data})
+    expect(tab.page.get_by_text(re.compile(rf"{re.escape(name)}, {len(data):,} bytes"))).to_be_visible()
+
+
+def words(values: np.ndarray) -> str:
+    return " ".join(map(repr, map(float, np.ravel(values))))
+
+
+def scratch_files(folders: Path) -> list[Path]:
+    return [path for path in (folders / "scratch").rglob("*") if path.name == "matches.csv"]
+
+
+def test_an_upload_is_solved_and_stays_with_its_page(
+    open_page: Callable[..., Playground], own_address: str, folders: Path
+) -> None:
+    catalog = Catalog(folders / "start" / "small.toml")
+    problem = catalog.problem(SceneWish("small street", 77))
+    assert problem.truth_cam_from_map is not None
+    tab, text = open_page(), matches_csv(problem)
+    tab.tab("Open")
+    tab.unfold("Upload matches")
+    tab.press("Open upload")
+    expect(tab.page.get_by_text("A CSV of matches is missing; upload one.")).to_be_visible()
+
+    lines = text.splitlines(keepends=True)
+    upload(tab, "Matches (CSV)", "bad.csv", "".join([*lines[:4], "12,left,1,2,3\n", *lines[4:]]))
+    upload(tab, "Calibration", "camera.toml", CAMERA)
+    tab.press("Open upload")
+    wrong = tab.page.get_by_text(re.compile(r"^bad\.csv"))
+    expect(wrong).to_be_visible()
+    assert re.search(r"line 5\b", wrong.inner_text()) and wrong.inner_text().count("\n") == 0
+    assert str(folders) not in wrong.inner_text()
+    expect(tab.value("inliers")).to_have_text(re.compile(" of 40$"))
+
+    upload(tab, "Matches (CSV)", "mine.csv", text)
+    tab.type("Gravity, camera", words(problem.gravity_camera))
+    tab.type("Gravity, map", words(problem.gravity_map))
+    tab.type("True pose", words(problem.truth_cam_from_map))
+    tab.press("Open upload")
+    tab.tab("Play")
+    expect(tab.widget("Scene")).to_have_value("uploaded: mine.csv")
+    expected = dict(outcome_table(estimate(problem, "mc", seed=0)).rows)
+    assert expected["outcome"] == "success"
+    for name in ("outcome", "inliers", "rotation error", "position error"):
+        expect(tab.value(name)).to_have_text(expected[name])
+    expect(wrong).to_have_count(0)
+    assert scratch_files(folders)
+    assert tab.errors == []
+
+    other = open_page()
+    other.widget("Scene").click()
+    expect(other.page.get_by_role("option", name="small street", exact=True)).to_be_visible()
+    expect(other.page.get_by_role("option", name=re.compile("uploaded"))).to_have_count(0)
+    other.tab("Open")
+    expect(row(other, "scene", "fisheye_outliers_80.toml")).to_be_visible()
+    expect(other.page.get_by_text(re.compile(r"mine\.csv"))).to_have_count(0)
+
+    tab.page.close()
+    end = time.monotonic() + 30.0
+    while scratch_files(folders):
+        assert time.monotonic() < end, "the upload outlives its page"
+        time.sleep(0.05)
+    assert not any(folders.joinpath("scratch").glob("spherloc-*"))
+
+
+def downloaded(tab: Playground, button: str, folder: Path) -> Path:
+    """Press a button; the file that comes of it."""
+    with tab.page.expect_download() as found:
+        tab.press(button)
+    path = folder / found.value.suggested_filename
+    found.value.save_as(path)
+    return path
+
+
+def test_what_is_seen_leaves_as_files(
+    browser: Browser, open_page: Callable[..., Playground], folders: Path, tmp_path: Path
+) -> None:
+    tab = open_page(drawn=True)
+    expect(tab.page.get_by_text(re.compile(r"^Recorded as "))).to_be_visible()
+    inliers = tab.value("inliers").inner_text()
+    tab.tab("Share")
+
+    picture = downloaded(tab, "Picture (PNG)", tmp_path)
+    assert picture.name == "spherloc-small-street-mc.png"
+    pixels = np.asarray(Image.open(picture).convert("RGB"))
+    box = tab.page.locator("canvas").first.bounding_box()
+    assert box is not None
+    assert pixels.shape[1] / pixels.shape[0] == pytest.approx(box["width"] / box["height"], rel=0.02)
+    colors, counts = np.unique(pixels.reshape(-1, 3), axis=0, return_counts=True)
+    assert len(colors) > 50 and counts.max() < 0.995 * counts.sum()
+    assert (np.abs(pixels.astype(int) - pixels[0, 0]).max(axis=2) > 30).mean() > 0.002
+
+    recording = downloaded(tab, "Recording (.rrd)", tmp_path)
+    run = read_recording(recording)
+    assert f"{int(run.inlier_mask.sum())} of {len(run.problem)}" == inliers
+    expected = estimate(Catalog(folders / "start" / "small.toml").problem(SceneWish("small street", 3)), "mc", seed=3)
+    np.testing.assert_array_equal(run.cam_from_map, expected.cam_from_map)
+
+    page = downloaded(tab, "Scene (HTML)", tmp_path)
+    shown = visible_nodes(tab.page)
+    assert "/map/points" in shown and "/cameras/estimate" in shown
+    assert tab.errors == []
+    tab.close()
+    check_page(browser, page, shown)
+
+
+def visible_nodes(page: Page) -> dict[str, int]:
+    """What is visible on a canvas: by node the bytes of its arrays."""
+    script = """() => Object.entries(window.__viserSceneTree?.getState() ?? {})
+        .filter(([name, node]) => node.effectiveVisibility && node.message?.props)
+        .map(([name, {message}]) => [name, Object.values(message.props).reduce((n, x) => n + (x?.byteLength ?? 0), 0)])
+        .filter(([name, bytes]) => bytes > 0)"""
+    return dict(page.evaluate(script))
+
+
+def check_page(browser: Browser, path: Path, shown: dict[str, int]) -> None:
+    """The file opens from the disk, asks for nothing, and has what the canvas had."""
+    page = browser.new_context().new_page()
+    asked: list[str] = []
+    errors: list[str] = []
+    page.on("request", lambda request: asked.append(request.url))
+    page.on("websocket", lambda socket: asked.append(socket.url))
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
+    page.goto(path.as_uri())
+    expect(page).to_have_title("small street")
+    expect(page.get_by_text("maximum clique", exact=True)).to_be_visible()
+    end = time.monotonic() + 60.0
+    while (found := visible_nodes(page)) != shown:
+        assert time.monotonic() < end, f"the file shows {found}, not {shown}"
+        page.wait_for_timeout(100)
+    own = path.as_uri()
+    assert [url for url in asked if url != own and not url.startswith(("data:", "blob:"))] == []
+    assert errors == []
+    page.context.close()
