@@ -61,6 +61,7 @@ def estimator(page: Page, name: str) -> None:
 
 def select_a_match(page: Page) -> None:
     """Select a match in the table."""
+    step(page, "The yaw most arcs share")
     tab(page, "Matches")
     page.locator("tr[data-touch^='select:']").nth(3).click()
     page.wait_for_timeout(1500)
@@ -70,7 +71,7 @@ def compare(page: Page) -> None:
     """Compare the estimators that are ticked."""
     tab(page, "Compare")
     press(page, "Compare")
-    page.locator("tr[data-touch='use:ransac-2p']").wait_for()
+    page.locator("tr[data-touch='use:ransac-2p']").first.wait_for()
     page.wait_for_timeout(6000)
 
 
@@ -166,6 +167,8 @@ def picture(page: Page, name: str, view: Callable[[Page], object], theme: str, s
     width, height = SIZES[size]
     path = FOLDER / f"{name}_{theme}_{width}x{height}.png"
     page.screenshot(path=path, timeout=PATIENCE_MS)
+    for deselect in page.locator("[data-touch='deselect:']").all():
+        deselect.click()
     for title, shown in DOCS.items():
         if shown == (name, theme, size):
             image = cv2.imread(str(path))

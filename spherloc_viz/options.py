@@ -9,10 +9,12 @@ import inspect
 import json
 import math
 import textwrap
+import threading
 import types
 import typing
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, Literal
 
 import numpy as np
@@ -22,6 +24,9 @@ from spherloc.refine import RefinementOptions
 
 NONE = "none"
 """What is typed for None."""
+
+_parsing = threading.Lock()
+"""Python's parser fails when several threads use it at once (3.11: "AST constructor recursion depth mismatch")."""
 
 
 @dataclass(frozen=True)
@@ -72,6 +77,7 @@ class OptionField:
         return ", ".join(words[:-1]) + (" or " if words[1:] else "") + words[-1]
 
 
+@cache
 def option_fields(kind: type) -> tuple[OptionField, ...]:
     """The fields of an options dataclass: the estimator's own first, then those that all estimators share."""
     hints, docs = typing.get_type_hints(kind), field_docs(kind)
@@ -104,7 +110,8 @@ def field_docs(kind: type) -> dict[str, str]:
     """The docstring under each field of a dataclass, inherited ones too, which Python itself does not keep."""
     docs: dict[str, str] = {}
     for owner in reversed(kind.__mro__[:-1]):
-        body = ast.parse(textwrap.dedent(inspect.getsource(owner))).body[0]
+        with _parsing:
+            body = ast.parse(textwrap.dedent(inspect.getsource(owner))).body[0]
         assert isinstance(body, ast.ClassDef)
         for field, text in zip(body.body, body.body[1:], strict=False):
             if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and isinstance(text, ast.Expr):

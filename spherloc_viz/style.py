@@ -68,6 +68,11 @@ def css(color: RGB) -> str:
     return "#{:02x}{:02x}{:02x}".format(*color)
 
 
+def css_text(color: RGB) -> str:
+    """The colour for words: nearer to that of the words around, so that it reads on dark and on light."""
+    return f"color-mix(in srgb, {css(color)} 60%, currentColor)"
+
+
 ERROR_RAMP: tuple[RGB, ...] = ((48, 96, 214), (60, 190, 180), (245, 205, 70))
 """Colours of errors from zero to the largest success: the bluer, the smaller (as in Fig. 10). Failures are red."""
 

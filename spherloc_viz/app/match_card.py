@@ -60,7 +60,7 @@ def one_html(trace: Trace, what: Explanation, kept: NDArray) -> str:
     """The card of one match."""
     title = f'<span style="font-size:15px;font-weight:600">Match {kept[what.number]}</span>'
     color = style.OUTLIER if "wrongly" in what.verdict else style.INLIER if what.kept else None
-    look = f"color:{style.css(color)};font-weight:600" if color else "font-weight:600"
+    look = f"color:{style.css_text(color)};font-weight:600" if color else "font-weight:600"
     head = f'<div>{_walk(what.number, kept)}{title} <span style="{look}">{escape(what.verdict)}</span></div>'
     body = f'<div style="padding-top:.3em">{escape(what.reason)}</div>{crops_html(trace.problem, what.number)}'
     return box(head + body) + _measures(what) + _notes(what, kept) + _actions(trace, 1)

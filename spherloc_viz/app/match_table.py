@@ -146,7 +146,7 @@ def _row(rows: MatchRows, k: int, chosen: bool, number: int) -> str:
 
 def _word(inlier: bool) -> str:
     color, word = (style.INLIER, "inlier") if inlier else (style.OUTLIER, "outlier")
-    return f'<span style="color:{style.css(color)}">{word}</span>'
+    return f'<span style="color:{style.css_text(color)}">{word}</span>'
 
 
 def _number(value: float) -> str:

@@ -22,6 +22,7 @@ from spherloc_viz.app.catalog import Catalog
 from spherloc_viz.app.front_door import FrontDoor, open_socket
 from spherloc_viz.app.services import Services
 from spherloc_viz.app.session import Session
+from spherloc_viz.app.status import Status
 from spherloc_viz.app.viser_seams import set_theme, start_viser, stop_viser
 from spherloc_viz.recording.background import Recorder
 
@@ -102,7 +103,11 @@ class Sessions:
             self._dismiss(number)
 
     def _welcome(self, server: viser.ViserServer, client: viser.ClientHandle) -> None:
-        session = Session(client, self._services)
+        try:
+            session = Session(client, self._services)
+        except Exception as error:  # else the page would wait for its first picture for ever
+            Status(client).fail(error)
+            return
         with self._lock:
             self._open[client.client_id] = session
         session.start()

@@ -1,14 +1,30 @@
 """A scene made of images, as a user meets it: queries, matches on the photographs, the map's mesh, a whole sequence."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
-from playground import Playground, served
+from playground import SELECTED, Playground, served
 from playwright.sync_api import Browser, expect
 
 from spherloc_viz.recording.reader import read_recording
 
+PANORAMA = """
+model = "equirectangular"
+width = 512
+height = 256
+"""
+FISHEYE = """
+model = "kannala_brandt"
+width = 384
+height = 384
+fx = 120.0
+fy = 120.0
+cx = 192.0
+cy = 192.0
+distortion = [0.0, 0.0, 0.0, 0.0]
+"""
 SCENE = """
 kind = "rendered"
 name = "small apartment"
@@ -33,6 +49,7 @@ def images_address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[s
     """Address of a playground with a small rendered scene, and where it records."""
     folder = tmp_path_factory.mktemp("images")
     (folder / "small.toml").write_text(SCENE)
+    (folder / "fisheye.toml").write_text(SCENE.replace(PANORAMA, FISHEYE).replace("small", "fisheye"))
     with served(folder / "small.toml", "--recordings", folder / "recordings") as (found, _):
         yield found, folder / "recordings"
 
@@ -44,26 +61,82 @@ def images_tab(browser: Browser, images_address: tuple[str, Path]) -> Iterator[P
     tab.close()
 
 
-def test_queries_their_photographs_and_the_mesh(images_tab: Playground) -> None:
+READ_PHOTO = """async ([place]) => {
+    const image = new Image();
+    image.src = getComputedStyle(place).backgroundImage.slice(5, -2);
+    await image.decode();
+    return [image.naturalWidth, image.naturalHeight];
+}"""
+
+
+def photo(tab: Playground, name: str) -> list[int]:
+    """Width and height of the photograph behind the query's or the reference's matches."""
+    place = tab.page.locator(f".match-{name}")
+    tab.until(lambda: place.evaluate("place => getComputedStyle(place).backgroundImage") != "none", "a photograph")
+    return tab.page.evaluate(READ_PHOTO, [place.element_handle()])
+
+
+def ringed(tab: Playground) -> list[str]:
+    """What stands beside the rings on both images."""
+    return tab.page.locator(f"svg text[fill='{SELECTED}']").all_text_contents()
+
+
+def test_queries_their_photographs_and_the_mesh(images_tab: Playground, images_address: tuple[str, Path]) -> None:
     tab = images_tab
     expect(tab.value("outcome")).to_have_text("success")
-    caption = tab.page.get_by_text("one of 4 references")
-    expect(caption).to_contain_text("above")
-    picture = tab.page.locator("img[src^='blob:'], img[src^='data:image']").first
-    expect(picture).to_be_visible()
-    tab.until(lambda: picture.evaluate("image => image.naturalWidth") == 900, "the photographs are there")
+    tab.tab("Images")
+    expect(tab.page.get_by_text("one of 4 references")).to_contain_text("matches")
+    assert photo(tab, "query") == photo(tab, "reference") == [900, 450]
 
-    shown = tab.node("/backdrop")
-    assert shown is not None and shown["visible"]
-    tab.page.get_by_text("Layers", exact=True).click()
-    tab.widget("Mesh").uncheck()
-    tab.until(lambda: not (tab.node("/backdrop") or {"visible": True})["visible"], "the mesh is hidden")
+    sheet = tab.touch("image-pick:query")
+    box = sheet.bounding_box()
+    assert box is not None
+    matches = iter([(0.1 * column, 0.1 * row) for row in (5, 6, 4, 7, 3) for column in range(1, 10)])
+    while not tab.carded():
+        x, y = next(matches)
+        tab.page.mouse.click(box["x"] + x * box["width"], box["y"] + y * box["height"])
+        tab.page.wait_for_timeout(100)
+    (number,) = tab.carded()
+    tab.until(lambda: ringed(tab) == [str(number)] * 2, "both of its ends have rings")
+    tab.until(lambda: tab.lit() == [number], "its point is lit")
+    assert tab.page.locator(".match-query").is_visible()
 
     position = tab.value("camera position").inner_text()
     tab.choose("Query", "query_002")
     expect(tab.value("camera position")).not_to_have_text(position)
     expect(tab.value("outcome")).to_have_text("success")
-    assert tab.errors == []
+    tab.expect_card()
+    tab.expect_quiet(images_address[0])
+
+
+def test_the_query_on_the_sphere_and_the_mesh_around_it(
+    images_tab: Playground, images_address: tuple[str, Path]
+) -> None:
+    """A panorama and, opened from its folder, a fisheye, whose image leaves a hole."""
+    tab = images_tab
+    visible: Callable[[str], bool] = lambda name: bool((tab.node(name) or {}).get("visible"))  # noqa: E731
+    tab.until(lambda: visible("/sphere/image") and visible("/backdrop"), "the image and the mesh are there")
+    tab.unfold("Layers")
+    for label, name in (("Image", "/sphere/image"), ("Mesh", "/backdrop")):
+        tab.widget(label).uncheck()
+        tab.until(lambda name=name: not visible(name), f"{label} is hidden")
+        tab.widget(label).check()
+        tab.until(lambda name=name: visible(name), f"{label} is back")
+    tab.settle()
+    tab.press("From the camera")
+    centre = tab.centre("/cameras/estimate")
+    tab.until(lambda: np.allclose(tab.viewer[:3], centre, atol=0.02), "the viewer stands in the camera")
+    assert round(tab.page.evaluate("() => window.__viserMutable.camera.fov")) == 85
+
+    panorama = tab.node("/sphere/image")
+    tab.tab("Open")
+    tab.touch("open-folder:0:0:").click()
+    tab.page.get_by_text("fisheye apartment").click()
+    expect(tab.value("inliers")).to_be_visible()
+    tab.until(lambda: visible("/sphere/image") and tab.node("/sphere/image") != panorama, "another image")
+    tab.tab("Images")
+    tab.until(lambda: photo(tab, "query")[0] == photo(tab, "query")[1], "a square photograph")
+    tab.expect_quiet(images_address[0])
 
 
 def recorded_queries(folder: Path) -> set[str]:
