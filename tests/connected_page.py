@@ -11,7 +11,7 @@ import msgspec
 import viser
 import zstandard
 
-from spherloc_viz.app.viser_seams import KEY_HEADER
+from spherloc_viz.app.web.viser_seams import KEY_HEADER
 
 HELLO = {
     "type": "ViewerCameraMessage",

@@ -1,6 +1,6 @@
 """Stands in for a page: presses elements, and notes what came of it."""
 
-from spherloc_viz.app.touch import Touch, Touches
+from spherloc_viz.app.web.touch import Touch, Touches
 
 
 class Page:

@@ -17,10 +17,10 @@ from spherloc.estimators.ransac import MOST_ITERATIONS, RansacOptions
 from spherloc.problem import Problem
 from spherloc.trace import Trace
 from spherloc.watch import Cancelled, Watch
-from spherloc_viz.app import compare_panel
-from spherloc_viz.app.compare_panel import START, STOP, TICKED, ComparePanel, is_same
-from spherloc_viz.app.touch import Touch, Touches
-from spherloc_viz.app.viser_seams import start_viser, stop_viser
+from spherloc_viz.app.panels import compare_panel
+from spherloc_viz.app.panels.compare_panel import START, STOP, TICKED, ComparePanel, is_same
+from spherloc_viz.app.web.touch import Touch, Touches
+from spherloc_viz.app.web.viser_seams import start_viser, stop_viser
 from spherloc_viz.layers.primitives import Label
 from tests.connected_page import until
 

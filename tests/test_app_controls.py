@@ -20,11 +20,11 @@ from spherloc.datasets.variation import Variation
 from spherloc.errors import InputError
 from spherloc.estimators import options_type
 from spherloc_viz.app.catalog import Catalog, SceneWish
-from spherloc_viz.app.estimator_controls import EstimatorControls
-from spherloc_viz.app.presets import presets
-from spherloc_viz.app.scene_controls import LISTED_QUERIES, SceneControls
-from spherloc_viz.app.simulation_controls import KINDS, SIMULATED
-from spherloc_viz.app.viser_seams import start_viser, stop_viser
+from spherloc_viz.app.controls.estimator_controls import EstimatorControls
+from spherloc_viz.app.controls.presets import presets
+from spherloc_viz.app.controls.scene_controls import LISTED_QUERIES, SceneControls
+from spherloc_viz.app.controls.simulation_controls import KINDS, SIMULATED
+from spherloc_viz.app.web.viser_seams import start_viser, stop_viser
 from tests.datasets.test_rendered import SMALL
 
 CATALOG = Catalog(None)

@@ -17,10 +17,10 @@ from PIL import Image
 
 from spherloc.datasets.synthetic import SyntheticScene
 from spherloc.estimators import estimate
-from spherloc_viz.app import export_panel
-from spherloc_viz.app.export_panel import CANVAS, ExportPanel, Shown, code_html, file_stem, on_canvas
-from spherloc_viz.app.still_page import Still, still_html
-from spherloc_viz.app.viser_seams import start_viser, stop_viser
+from spherloc_viz.app.panels import export_panel
+from spherloc_viz.app.panels.export_panel import CANVAS, ExportPanel, Shown, code_html, file_stem, on_canvas
+from spherloc_viz.app.stage.still_page import Still, still_html
+from spherloc_viz.app.web.viser_seams import start_viser, stop_viser
 from spherloc_viz.layers import paint, steps
 from spherloc_viz.recording.reader import read_recording
 from tests.connected_page import ConnectedPage, until

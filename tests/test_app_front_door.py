@@ -19,11 +19,11 @@ from multidict import CIMultiDict, CIMultiDictProxy
 from viser import _messages
 
 from spherloc.errors import InputError
-from spherloc_viz.app import viser_seams
-from spherloc_viz.app.front_door import FrontDoor, is_own_name, open_socket, refusal
-from spherloc_viz.app.page import load_page
 from spherloc_viz.app.server import serve
-from spherloc_viz.app.touch import MOST_BYTES, Touch, TouchDesk, Touches
+from spherloc_viz.app.web import viser_seams
+from spherloc_viz.app.web.front_door import FrontDoor, is_own_name, open_socket, refusal
+from spherloc_viz.app.web.page import load_page
+from spherloc_viz.app.web.touch import MOST_BYTES, Touch, TouchDesk, Touches
 
 KEY = "a key of this test"
 VERSION = f"viser-v{viser.__version__}"

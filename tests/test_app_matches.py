@@ -13,10 +13,10 @@ from spherloc.datasets.synthetic import SyntheticScene
 from spherloc.estimators import estimate
 from spherloc.trace import Trace
 from spherloc_viz import style
-from spherloc_viz.app.image_panel import ImagePanel
-from spherloc_viz.app.match_card import MatchCard
-from spherloc_viz.app.match_table import PAGE, MatchTable
-from spherloc_viz.app.viser_seams import start_viser, stop_viser
+from spherloc_viz.app.matches.image_panel import ImagePanel
+from spherloc_viz.app.matches.match_card import MatchCard
+from spherloc_viz.app.matches.match_table import PAGE, MatchTable
+from spherloc_viz.app.web.viser_seams import start_viser, stop_viser
 from spherloc_viz.layers import paint
 
 SceneOf = Callable[..., SyntheticScene]

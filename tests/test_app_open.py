@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from spherloc.datasets import bundled_scenes
 from spherloc.datasets.correspondences import CorrespondencesScene
 from spherloc.errors import InputError
-from spherloc_viz.app.folders import MOST_ENTRIES, PAGE, Roots
-from spherloc_viz.app.recent import MOST, RecentScenes
-from spherloc_viz.app.uploads import MOST_BYTES, MOST_ROWS, File, Form, Scratch, numbers, open_upload
+from spherloc_viz.app.panels.folders import MOST_ENTRIES, PAGE, Roots
+from spherloc_viz.app.panels.recent import MOST, RecentScenes
+from spherloc_viz.app.panels.uploads import MOST_BYTES, MOST_ROWS, File, Form, Scratch, numbers, open_upload
 
 ROOT = Path(__file__).resolve().parents[1]
 CAMERA = '[camera]\nmodel = "equirectangular"\nwidth = 512\nheight = 256\n'
@@ -161,7 +161,7 @@ def test_a_folder_that_cannot_be_read_says_so(house: Path, monkeypatch: pytest.M
 
 
 def test_an_endless_folder_is_looked_at_in_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("spherloc_viz.app.folders.MOST_ENTRIES", 5)
+    monkeypatch.setattr("spherloc_viz.app.panels.folders.MOST_ENTRIES", 5)
     for number in range(8):
         (tmp_path / f"{number}.toml").write_text(SCENE)
     listing = Roots([tmp_path]).look_into("0:")

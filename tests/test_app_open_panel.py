@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 import viser
 
-from spherloc_viz.app.open_panel import Opened, OpenPanel
-from spherloc_viz.app.recent import RecentScenes
-from spherloc_viz.app.touch import Touch, Touches
-from spherloc_viz.app.uploads import MOST_BYTES
-from spherloc_viz.app.viser_seams import start_viser, stop_viser
+from spherloc_viz.app.panels.open_panel import Opened, OpenPanel
+from spherloc_viz.app.panels.recent import RecentScenes
+from spherloc_viz.app.panels.uploads import MOST_BYTES
+from spherloc_viz.app.web.touch import Touch, Touches
+from spherloc_viz.app.web.viser_seams import start_viser, stop_viser
 from tests.connected_page import ConnectedPage, until
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from spherloc_viz import style
-from spherloc_viz.app.picking import DOT_PX, LINE_PX, Viewer, inside, nearest, viewer_of
+from spherloc_viz.app.stage.picking import DOT_PX, LINE_PX, Viewer, inside, nearest, viewer_of
 from spherloc_viz.layers.frame import one_color
 from spherloc_viz.layers.primitives import Balls, Points, Segments
 

@@ -11,7 +11,7 @@ from spherloc.geometry import camera_centre, rotation_angle
 from spherloc.metrics import evaluate
 from spherloc.trace import Trace
 from spherloc_viz.app.catalog import Catalog, SceneWish
-from spherloc_viz.app.presets import RECIPES, Preset, presets
+from spherloc_viz.app.controls.presets import RECIPES, Preset, presets
 from spherloc_viz.app.wish import Wish
 
 CATALOG = Catalog(None)

@@ -13,11 +13,11 @@ import viser
 from spherloc.datasets.synthetic import SyntheticScene
 from spherloc.estimators import estimate
 from spherloc.trace import Trace
-from spherloc_viz.app.axes import Scale
-from spherloc_viz.app.residual_drawing import FOOT_PX, histogram_svg, history_svg
-from spherloc_viz.app.residual_view import ResidualView, history_caption, residuals_caption
+from spherloc_viz.app.plots.axes import Scale
+from spherloc_viz.app.plots.residual_drawing import FOOT_PX, histogram_svg, history_svg
+from spherloc_viz.app.plots.residual_view import ResidualView, history_caption, residuals_caption
 from spherloc_viz.app.server import start_viser, stop_viser
-from spherloc_viz.app.touch import Touch, Touches
+from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.layers.residuals import history_of, residuals_of
 
 SVG = "{http://www.w3.org/2000/svg}"

@@ -23,8 +23,8 @@ from spherloc_viz.app.catalog import Catalog
 from spherloc_viz.app.server import Sessions
 from spherloc_viz.app.services import Services
 from spherloc_viz.app.session import Session
-from spherloc_viz.app.touch import Touch
-from spherloc_viz.app.viser_seams import KEY_HEADER, start_viser, stop_viser
+from spherloc_viz.app.web.touch import Touch
+from spherloc_viz.app.web.viser_seams import KEY_HEADER, start_viser, stop_viser
 
 KEY = "a key of this test"
 SCENE = """
@@ -214,7 +214,7 @@ def test_stepping_solves_nothing(house: House, monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_play_goes_to_the_end_and_stops(house: House, monkeypatch: pytest.MonkeyPatch) -> None:
-    from spherloc_viz.app import steps_panel
+    from spherloc_viz.app.controls import steps_panel
 
     monkeypatch.setattr(steps_panel, "PLAY_S", 0.05)
     page, session = house.visit()

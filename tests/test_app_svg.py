@@ -12,11 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from spherloc_viz import style
-from spherloc_viz.app import shapes
-from spherloc_viz.app.axes import MINUS, Scale, decade_ticks, round_ticks, tick_texts, wrapped_deg
-from spherloc_viz.app.charts import ChartPanel, chart_html
+from spherloc_viz.app.plots import shapes
+from spherloc_viz.app.plots.axes import MINUS, Scale, decade_ticks, round_ticks, tick_texts, wrapped_deg
+from spherloc_viz.app.plots.charts import ChartPanel, chart_html
+from spherloc_viz.app.plots.svg import MOST_STEPS, chart_svg, curve_parts
 from spherloc_viz.app.server import start_viser, stop_viser
-from spherloc_viz.app.svg import MOST_STEPS, chart_svg, curve_parts
 from spherloc_viz.layers.primitives import Chart, Curve
 
 EVIL = '<img src=x onerror="alert(1)">&\'"'

@@ -13,9 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from spherloc.geometry import pose, yaw_rotation
-from spherloc_viz.app import true_camera
-from spherloc_viz.app.true_camera import Place, TrueCamera, place_of, pose_of
-from spherloc_viz.app.viser_seams import start_viser, stop_viser
+from spherloc_viz.app.stage import true_camera
+from spherloc_viz.app.stage.true_camera import Place, TrueCamera, place_of, pose_of
+from spherloc_viz.app.web.viser_seams import start_viser, stop_viser
 
 metres = st.floats(-1e3, 1e3)
 

@@ -10,7 +10,7 @@ from spherloc.estimators import estimate
 from spherloc.geometry import camera_centre, so3_exp
 from spherloc.problem import Problem
 from spherloc.trace import Trace
-from spherloc_viz.app import views
+from spherloc_viz.app.stage import views
 from spherloc_viz.layers import paint, steps
 from spherloc_viz.layers.primitives import Mesh
 

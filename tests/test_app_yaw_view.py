@@ -21,10 +21,10 @@ from spherloc.estimators import estimate
 from spherloc.estimators.mc import WIDEST_RAD
 from spherloc.problem import Problem
 from spherloc.trace import RansacStage, Trace, YawStage
+from spherloc_viz.app.plots.yaw_drawing import yaw_svg
+from spherloc_viz.app.plots.yaw_view import PEAK, WHOLE, YawView
 from spherloc_viz.app.server import start_viser, stop_viser
-from spherloc_viz.app.touch import Touch, Touches
-from spherloc_viz.app.yaw_drawing import yaw_svg
-from spherloc_viz.app.yaw_view import PEAK, WHOLE, YawView
+from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.layers.yaw_bars import (
     KINDS,
     MOST_BARS,

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import viser
 
-from spherloc_viz.app.steps_panel import (
+from spherloc_viz.app.controls.steps_panel import (
     BACK,
     NEXT,
     ON,
@@ -21,7 +21,7 @@ from spherloc_viz.app.steps_panel import (
     moved,
     stages_html,
 )
-from spherloc_viz.app.viser_seams import start_viser, stop_viser
+from spherloc_viz.app.web.viser_seams import start_viser, stop_viser
 from spherloc_viz.layers.primitives import Step, Stop
 
 TIMELINE = (

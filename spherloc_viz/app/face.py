@@ -8,15 +8,15 @@ import viser
 
 from spherloc.datasets.synthetic import TrueCamera
 from spherloc.diagnosis import Diagnosis
-from spherloc_viz.app.canvas import Canvas, panel_widths_px
 from spherloc_viz.app.catalog import Catalog
-from spherloc_viz.app.controls import Controls, Owner
-from spherloc_viz.app.export_panel import Shown
-from spherloc_viz.app.match_card import MatchCard
+from spherloc_viz.app.controls.controls import Controls, Owner
+from spherloc_viz.app.matches.match_card import MatchCard
+from spherloc_viz.app.panels.export_panel import Shown
+from spherloc_viz.app.stage.canvas import Canvas, panel_widths_px
 from spherloc_viz.app.story import Story
 from spherloc_viz.app.text import diagnosis_html, status_html
-from spherloc_viz.app.touch import Touches
-from spherloc_viz.app.viser_seams import set_theme
+from spherloc_viz.app.web.touch import Touches
+from spherloc_viz.app.web.viser_seams import set_theme
 from spherloc_viz.app.wish import Run
 from spherloc_viz.layers import paint, steps, with_rival
 from spherloc_viz.layers.primitives import Picture, SceneItem

@@ -17,13 +17,13 @@ import viser
 from spherloc.datasets import bundled_scenes
 from spherloc.errors import InputError, RecordingError
 from spherloc.estimators import warm_up
-from spherloc_viz.app import views
 from spherloc_viz.app.catalog import Catalog
-from spherloc_viz.app.front_door import FrontDoor, open_socket
 from spherloc_viz.app.services import Services
 from spherloc_viz.app.session import Session
+from spherloc_viz.app.stage import views
 from spherloc_viz.app.status import Status
-from spherloc_viz.app.viser_seams import set_theme, start_viser, stop_viser
+from spherloc_viz.app.web.front_door import FrontDoor, open_socket
+from spherloc_viz.app.web.viser_seams import set_theme, start_viser, stop_viser
 from spherloc_viz.recording.background import Recorder
 
 SWITCH_S = 0.001

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from spherloc_viz.app.catalog import Catalog
-from spherloc_viz.app.touch import TouchDesk
+from spherloc_viz.app.web.touch import TouchDesk
 from spherloc_viz.recording.background import Recorder
 
 

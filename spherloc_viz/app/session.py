@@ -18,14 +18,14 @@ from spherloc.trace import Trace
 from spherloc.watch import Cancelled
 from spherloc_viz.app.catalog import SceneWish
 from spherloc_viz.app.edits import Edits
-from spherloc_viz.app.export_panel import Shown
 from spherloc_viz.app.face import Face
 from spherloc_viz.app.history import History
 from spherloc_viz.app.newest import Job, Newest
+from spherloc_viz.app.panels.export_panel import Shown
 from spherloc_viz.app.services import Services
 from spherloc_viz.app.status import Status
-from spherloc_viz.app.touch import Touch, Touches
-from spherloc_viz.app.viser_seams import guard_callbacks, put_back
+from spherloc_viz.app.web.touch import Touch, Touches
+from spherloc_viz.app.web.viser_seams import guard_callbacks, put_back
 from spherloc_viz.app.wish import Run, Wish
 
 QUIET_S = 0.7

@@ -6,15 +6,15 @@ from contextlib import contextmanager
 import viser
 from numpy.typing import NDArray
 
-from spherloc_viz.app.charts import ChartPanel
-from spherloc_viz.app.image_panel import ImagePanel
-from spherloc_viz.app.match_table import MatchTable
-from spherloc_viz.app.residual_view import ResidualView
-from spherloc_viz.app.steps_panel import StepsPanel
+from spherloc_viz.app.controls.steps_panel import StepsPanel
+from spherloc_viz.app.matches.image_panel import ImagePanel
+from spherloc_viz.app.matches.match_table import MatchTable
+from spherloc_viz.app.plots.charts import ChartPanel
+from spherloc_viz.app.plots.residual_view import ResidualView
+from spherloc_viz.app.plots.yaw_view import YawView
 from spherloc_viz.app.text import legend_html, summary_html, table_html
-from spherloc_viz.app.touch import Touch, Touches
+from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.wish import Run
-from spherloc_viz.app.yaw_view import YawView
 from spherloc_viz.layers.primitives import Picture, Table
 
 

@@ -16,7 +16,7 @@ from benchmarks.playground import memory_mib, thread_count
 from spherloc.datasets.variation import Variation
 from spherloc.estimators import estimate
 from spherloc_viz.app.catalog import Catalog, SceneWish
-from spherloc_viz.app.estimator_controls import ABOUT
+from spherloc_viz.app.controls.estimator_controls import ABOUT
 from spherloc_viz.layers.tables import outcome_table
 
 PAGES = 8

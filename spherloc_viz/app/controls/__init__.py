@@ -1,0 +1,1 @@
+"""What is solved and how: the widgets of the tab Play, and the steps."""

@@ -1,0 +1,214 @@
+"""The panel right of the canvas: what is solved and how, comparisons, sweeps, other scenes, and what to take away."""
+
+from html import escape
+from pathlib import Path
+from typing import Any, Protocol
+
+import viser
+
+from spherloc.datasets.map_scene import MapScene
+from spherloc.datasets.variation import EDITS, Variation
+from spherloc.errors import InputError
+from spherloc.trace import Trace
+from spherloc_viz import share
+from spherloc_viz.app.catalog import Catalog, SceneWish
+from spherloc_viz.app.controls.display_controls import DisplayControls
+from spherloc_viz.app.controls.estimator_controls import EstimatorControls
+from spherloc_viz.app.controls.presets import presets
+from spherloc_viz.app.controls.scene_controls import SceneControls
+from spherloc_viz.app.controls.sequence_panel import SequencePanel
+from spherloc_viz.app.controls.slow_run import SlowRun
+from spherloc_viz.app.panels.compare_panel import ComparePanel
+from spherloc_viz.app.panels.export_panel import ExportPanel, Shown
+from spherloc_viz.app.panels.open_panel import Opened, OpenPanel
+from spherloc_viz.app.panels.sweep_runs_panel import SweepPanel
+from spherloc_viz.app.text import DIM, box
+from spherloc_viz.app.web.touch import Touches
+from spherloc_viz.app.wish import Run, Wish
+
+UNDO, REDO, NEW_SEED = "Undo", "Redo", "New seed"
+NO_PRESET = "choose …"
+
+
+class Owner(Protocol):
+    """What the controls ask of their session."""
+
+    def changed(self, event: object = None) -> None:
+        """Something that a run depends on was changed."""
+
+    def redraw(self, event: object = None) -> None:
+        """Something that is shown was changed."""
+
+    def open(self, wish: Wish) -> None:
+        """Ask for this."""
+
+    def use_estimator(self, name: str) -> None:
+        """Go on with another estimator."""
+
+    def step_history(self, by: int) -> None:
+        """Undo (-1) or redo (+1)."""
+
+    def record(self, trace: Trace) -> None:
+        """Record a run that a panel made."""
+
+    def shown(self) -> Shown | None:
+        """What is on the page."""
+
+
+class Controls:
+    """One client's controls. Widgets only note wishes; the session's threads act on them."""
+
+    def __init__(
+        self,
+        client: viser.ClientHandle,
+        catalog: Catalog,
+        roots: tuple[Path, ...],
+        touches: Touches,
+        owner: Owner,
+        width_px: int,
+    ) -> None:
+        gui = client.gui
+        self._catalog, self._owner = catalog, owner
+        self._presets = {preset.title: preset for preset in presets(catalog)}
+        self.slow = SlowRun(gui, f"spherloc-clock-{client.client_id}")
+        self._moves = gui.add_button_group("", (UNDO, REDO, NEW_SEED))
+        self._moves.on_click(self._move)
+        tabs = gui.add_tab_group()
+        with tabs.add_tab("Play"):
+            self._build_play(gui)
+        with tabs.add_tab("Compare"):
+            self.compare = ComparePanel(gui, touches, owner.use_estimator, owner.redraw)
+        with tabs.add_tab("Sweep"):
+            self._sweep = SweepPanel(gui, touches, self._chosen_sweep)
+        with tabs.add_tab("Open"):
+            self._open = OpenPanel(gui, client, touches, roots, self._open_scene)
+        with tabs.add_tab("Share"):
+            self._export = ExportPanel(gui, client, owner.shown)
+        for label, key, modifier, by in ((UNDO, "Z", "cmd/ctrl", -1), (REDO, "Z", "cmd/ctrl+shift", 1)):
+            command: Any = gui.add_command(label, hotkey=key, modifier=modifier)  # type: ignore[arg-type]
+            command.on_trigger(lambda event, by=by: owner.step_history(by))
+        gui.main_panel.dock_right()
+        gui.main_panel.set_width(width_px)
+
+    def _build_play(self, gui: viser.GuiApi) -> None:
+        self._preset = gui.add_dropdown("Preset", (NO_PRESET, *self._presets), hint="Each of them shows one thing.")
+        self._preset.on_update(self._choose_preset)
+        self._story = gui.add_html("", visible=False)
+        self.scene = SceneControls(gui, self._catalog, self._owner.changed)
+        self._movable = gui.add_checkbox("Drag the camera", False, hint="Handles on the true camera move and turn it.")
+        self._movable.on_update(self._owner.redraw)
+        self._edits = gui.add_html("", visible=False)
+        self.estimator = EstimatorControls(gui, self._owner.changed)
+        self.sequence = SequencePanel(gui, self._chosen_sequence, self._localized)
+        self.display = DisplayControls(gui, self._owner.redraw)
+
+    @property
+    def widgets(self) -> tuple:
+        """All that hold a value."""
+        parts = (self.scene, self.estimator, self.display, self.compare, self._sweep, self._open)
+        return (self._preset, self._movable, *(widget for part in parts for widget in part.widgets))
+
+    @property
+    def camera_movable(self) -> bool:
+        """Whether the true camera can be dragged."""
+        return self._movable.value and self._movable.visible
+
+    def close(self) -> None:
+        """End what runs; does not wait."""
+        for part in (self.slow, self.sequence, self.compare, self._sweep, self._open, self._export):
+            part.close()
+
+    def follow_scene(self) -> bool:
+        """If another scene was chosen, show what it offers, and tell so."""
+        another = self.scene.follow_scene()
+        if another:
+            self._show_scene(self.scene.read().scene)
+        return another
+
+    def write(self, wish: Wish) -> None:
+        """Show this; raises ``InputError`` if it cannot be."""
+        self.scene.write(wish.scene)
+        self.estimator.write(wish.estimator, wish.options)
+        self._show_scene(wish.scene.scene)
+
+    def draw(self, run: Run) -> None:
+        """Follow the run at hand."""
+        self._follow_preset(run.wish)
+        html = _edits_html(run.wish.scene.variation)
+        if self._edits.content != html:
+            self._edits.content, self._edits.visible = html, bool(html)
+        self.compare.draw(run.trace)
+
+    def settle(self, run: Run) -> None:
+        """Say how to repeat a run that the page has settled on."""
+        wish, scene = run.wish, run.wish.scene
+        words = (scene.seed, scene.query, scene.variation, wish.estimator, wish.options)
+        path = self._catalog.path(scene.scene)
+        self._export.draw(share.as_python(path, *words), share.as_command(path, *words))
+
+    def _show_scene(self, label: str) -> None:
+        self.sequence.show(self._catalog.map_scene(label))
+        self._movable.visible = self._catalog.synthetic(label) is not None
+
+    def _follow_preset(self, wish: Wish) -> None:
+        """Show the preset's name and story for as long as the page is as it says."""
+        title = next(
+            (
+                title
+                for title, preset in self._presets.items()
+                if wish == Wish(preset.scene, preset.estimator, preset.options)
+            ),
+            NO_PRESET,
+        )
+        if self._preset.value != title:
+            self._preset.value = title
+        html = box(escape(self._presets[title].story), f"font-size:12px;{DIM}") if title in self._presets else ""
+        if self._story.content != html:
+            self._story.content, self._story.visible = html, bool(html)
+
+    async def _choose_preset(self, event: viser.GuiEvent) -> None:
+        preset = self._presets.get(event.target.value)
+        if event.client is not None and preset is not None:
+            self._owner.open(Wish(preset.scene, preset.estimator, preset.options))
+
+    async def _move(self, event: viser.GuiEvent) -> None:
+        button = event.target.value
+        if button == NEW_SEED:
+            self.scene.next_seed()
+            self._owner.changed()
+        else:
+            self._owner.step_history(-1 if button == UNDO else 1)
+
+    def _open_scene(self, opened: Opened) -> None:
+        label = self._catalog.add(opened.scene, opened.path, opened.label)
+        seed = getattr(opened.scene, "seed", 0)
+        estimator, _ = self.estimator.read()
+        self._owner.open(Wish(SceneWish(label, seed), estimator, None))
+
+    def _chosen_sequence(self) -> tuple[str, MapScene, str, Any, int]:
+        """What the sequence panel localizes; raises ``InputError`` if the page says nothing that can be."""
+        wish = self.scene.read()
+        scene = self._catalog.map_scene(wish.scene)
+        if scene is None:
+            raise InputError("this scene has no query images; choose one that has.")
+        return wish.scene, scene, *self.estimator.read(), wish.seed
+
+    def _localized(self, trace: Trace | None) -> None:
+        """One more query of a sequence is done."""
+        if trace is not None:
+            self._owner.record(trace)
+        self._owner.redraw()
+
+    def _chosen_sweep(self) -> tuple[Path, SceneWish]:
+        wish = self.scene.read()
+        return self._catalog.path(wish.scene), wish
+
+
+def _edits_html(variation: Variation) -> str:
+    """What was done to single matches, and how to take it back; empty if nothing was."""
+    done = [f"{len(getattr(variation, name))} {name}" for name in EDITS if getattr(variation, name)]
+    if not done:
+        return ""
+    links = [("unedit:", "take back")] + [("unhide:", "show hidden")] * bool(variation.hidden)
+    ways = " · ".join(f'<u data-touch="{action}" role="button" tabindex="0">{words}</u>' for action, words in links)
+    return box(f"Matches by hand: {', '.join(done)}. {ways}", "font-size:12px")

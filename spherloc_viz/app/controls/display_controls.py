@@ -1,0 +1,53 @@
+"""What of the canvas is shown, and from where."""
+
+from collections.abc import Callable
+from typing import Literal
+
+import viser
+
+from spherloc_viz import style
+from spherloc_viz.app.stage import views
+
+
+class DisplayControls:
+    """View buttons, whether the view follows the steps, dark or light, and a switch for each layer."""
+
+    def __init__(self, gui: viser.GuiApi, changed: Callable[[object], None]) -> None:
+        self._changed = changed
+        self._wanted: str | None = None
+        self._views = gui.add_button_group("View", views.NAMES)
+        self._dark = gui.add_checkbox("Dark", True, hint="Dark for a screen, light for a projector and for print.")
+        with gui.add_folder("Layers", expand_by_default=False):
+            self._follow = gui.add_checkbox("Follow steps", True, hint="Move to where the step's subject reads best.")
+            self._layers = {name: gui.add_checkbox(name.capitalize(), True) for name in style.LAYERS}
+        self._views.on_click(self._press)
+        for widget in (self._dark, *self._layers.values()):
+            widget.on_update(changed)
+
+    @property
+    def widgets(self) -> tuple:
+        """Those that hold a value."""
+        return (self._dark, self._follow, *self._layers.values())
+
+    @property
+    def theme(self) -> Literal["dark", "light"]:
+        """How the page shall look."""
+        return "dark" if self._dark.value else "light"
+
+    @property
+    def follow(self) -> bool:
+        """Whether the view follows the steps."""
+        return self._follow.value
+
+    def layers(self) -> frozenset[str]:
+        """Layers that are switched on."""
+        return frozenset(name for name, widget in self._layers.items() if widget.value)
+
+    def take_view(self) -> str | None:
+        """The view that was asked for since the last call, if any."""
+        wanted, self._wanted = self._wanted, None
+        return wanted
+
+    async def _press(self, event: viser.GuiEvent) -> None:
+        self._wanted = event.target.value
+        self._changed(event)

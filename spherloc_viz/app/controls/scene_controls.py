@@ -1,0 +1,154 @@
+"""The widgets that choose a scene and change it."""
+
+from collections.abc import Callable
+from typing import Any
+
+import viser
+
+from spherloc.datasets.map_scene import MapScene
+from spherloc.datasets.synthetic import TrueCamera
+from spherloc.datasets.variation import Variation
+from spherloc.errors import InputError
+from spherloc_viz.app.catalog import Catalog, SceneWish
+from spherloc_viz.app.controls.simulation_controls import SimulationControls
+from spherloc_viz.app.text import box
+
+LISTED_QUERIES = 50
+"""A page with thousands of entries in a dropdown is slow; of more, those that fit a filter are listed."""
+
+Changed = Callable[[Any], None]
+
+
+class SceneControls:
+    """Scene, query image, what is changed about a simulation, and seed. Changes to single matches are kept elsewhere.
+
+    Everything can be read and written as a ``SceneWish``. ``changed`` is called with viser's event.
+    """
+
+    def __init__(self, gui: viser.GuiApi, catalog: Catalog, changed: Changed) -> None:
+        self._catalog, self._changed = catalog, changed
+        self._followed = ""
+        self._scene = gui.add_dropdown("Scene", tuple(catalog.scenes))
+        self._find = gui.add_text("Find query", "", visible=False, hint="Part of the name of a query image.")
+        self._found = gui.add_html("", visible=False)
+        nothing: list[str] = ["-"]
+        self._query = gui.add_dropdown("Query", nothing, visible=False, hint="The image to localize in the map.")
+        self._simulation = SimulationControls(gui, catalog.cameras, changed)
+        self._seed = gui.add_text("Seed", "0", hint="Of the simulation and of the estimator's random draws.")
+        self._find.on_update(self._filter)
+        for widget in (self._scene, self._query, self._seed):
+            widget.on_update(changed)
+        self.reset.on_click(self._reset)
+
+    @property
+    def widgets(self) -> tuple:
+        """All that hold a value."""
+        return (self._scene, self._query, self._find, *self._simulation.widgets, self._seed)
+
+    @property
+    def reset(self) -> viser.GuiButtonGroupHandle:
+        """The button that sets everything to what the scene says."""
+        return self._simulation.reset
+
+    def follow_scene(self) -> bool:
+        """If another scene was chosen, set the other widgets to what it says, and tell so."""
+        label = self._scene.value
+        if label == self._followed:
+            return False
+        self.write(SceneWish(label, getattr(self._catalog.scenes[label], "seed", self._read_seed(0))))
+        return True
+
+    def read(self) -> SceneWish:
+        """What the widgets say now, with all matches as they are.
+
+        Raises ``InputError`` if the seed is no seed.
+        """
+        label, seed = self._scene.value, self._read_seed()
+        if self._catalog.map_scene(label) is not None:
+            return SceneWish(label, seed, self._query.value)
+        return SceneWish(label, seed, None, self._variation(label))
+
+    def write(self, wish: SceneWish) -> bool:
+        """Set the widgets to what a wish says but for changes to single matches; tells whether the scene is another.
+
+        Raises ``InputError`` if the catalog does not have the scene, or the scene not the query.
+        """
+        if wish.scene not in self._catalog.scenes:
+            raise InputError(f"the scene '{wish.scene}' is not open on this page; open it first.")
+        another = wish.scene != self._followed
+        self._followed = wish.scene
+        self.list_scenes()
+        self._scene.value = wish.scene
+        images = self._catalog.map_scene(wish.scene)
+        if images is not None:
+            self._write_query(images, wish.query)
+        self._query.visible = images is not None
+        many = images is not None and len(images.queries) > LISTED_QUERIES
+        self._find.visible = self._found.visible = many
+        self._simulation.write(self._catalog.synthetic(wish.scene), wish.variation)
+        self._seed.value = str(wish.seed)
+        return another
+
+    def list_scenes(self) -> None:
+        """Offer what the catalog has now."""
+        labels = tuple(self._catalog.scenes)
+        if labels != tuple(self._scene.options):
+            self._scene.options = labels
+
+    @property
+    def true_camera(self) -> TrueCamera | None:
+        """Where the true camera was moved to: yaw (deg) and position (m) in the map frame; None if it was not."""
+        return self._simulation.true_camera
+
+    @true_camera.setter
+    def true_camera(self, placed: TrueCamera | None) -> None:
+        self._simulation.true_camera = placed
+
+    def next_seed(self) -> None:
+        """The next seed; 0 after what is no seed."""
+        self._seed.value = str((self._read_seed(-1) + 1) % 2**63)
+
+    def _variation(self, label: str) -> Variation:
+        scene = self._catalog.synthetic(label)
+        # A scene that was just chosen is still shown with the numbers of the one before.
+        return Variation() if scene is None or label != self._followed else self._simulation.read(scene)
+
+    def _write_query(self, images: MapScene, query: str | None) -> None:
+        name = images.query(query).name
+        self._find.value = ""
+        self._list_queries(images, name)
+        self._query.value = name
+
+    def _list_queries(self, images: MapScene, chosen: str) -> None:
+        """Offer the queries that fit the filter, and the chosen one."""
+        wanted = self._find.value.strip().lower()
+        names = [view.name for view in images.queries if wanted in view.name.lower()]
+        listed = names[:LISTED_QUERIES]
+        if chosen not in listed:
+            listed = [chosen, *listed]
+        if tuple(listed) != tuple(self._query.options):
+            self._query.options = tuple(listed)
+        self._found.content = box(
+            f"{min(len(names), LISTED_QUERIES):,} of {len(images.queries):,} queries are listed"
+            + (f"; {len(names):,} fit." if wanted else "; type part of a name to find others."),
+            "font-size:12px;opacity:.65",
+        )
+
+    def _filter(self, event: Any) -> None:
+        images = self._catalog.map_scene(self._scene.value)
+        if images is not None and event.client is not None:
+            self._list_queries(images, self._query.value)
+
+    def _reset(self, event: Any) -> None:
+        label = self._scene.value
+        query = None if self._catalog.map_scene(label) is None else self._query.value
+        self.write(SceneWish(label, getattr(self._catalog.scenes[label], "seed", 0), query))
+        self._changed(event)
+
+    def _read_seed(self, otherwise: int | None = None) -> int:
+        text = self._seed.value.strip()
+        if text.isascii() and text.isdigit() and len(text) <= 19 and int(text) < 2**63:
+            return int(text)
+        if otherwise is not None:
+            return otherwise
+        raise InputError(f"the seed '{text[:30]}' is no whole number from 0 to 2^63 - 1; type one.")

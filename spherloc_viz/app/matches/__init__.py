@@ -1,0 +1,1 @@
+"""Single matches: the card, the table and the images."""

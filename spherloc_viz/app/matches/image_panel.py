@@ -1,0 +1,104 @@
+"""The images of the problem with their matches, or where the camera sees them if there are no images."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from spherloc.problem import Problem
+from spherloc.trace import Trace
+from spherloc_viz import style
+from spherloc_viz.app.matches import match_drawing as drawing
+from spherloc_viz.app.matches.match_chips import chips_html
+from spherloc_viz.app.matches.match_overlay import Overlay, overlay
+from spherloc_viz.app.matches.photos import photo_uri
+from spherloc_viz.app.text import box, status_html
+from spherloc_viz.app.web.touch import Touch, Touches
+from spherloc_viz.layers.frame import one_color
+from spherloc_viz.layers.match_view import MatchView, match_view
+from spherloc_viz.layers.photograph import photograph
+from spherloc_viz.layers.primitives import ColorArray, Picture, Points
+
+PHOTO_PX = 900
+"""Width of a photograph that fills the panel."""
+
+
+class ImagePanel:
+    """Query and reference with the matches in the colours of the step at hand.
+
+    Without images it shows the camera's view: measured pixels, and crosses where the estimated pose puts the points.
+    """
+
+    def __init__(self, gui: viser.GuiApi, touches: Touches, changed: Callable[[object], None]) -> None:
+        self._backgrounds = gui.add_html("")
+        self._drawing = gui.add_html("")
+        self._touches, self._changed = touches, changed
+        self._wanted: int | None = None
+        self._followed: tuple = ()
+        self._shown: Overlay | None = None
+        self._drawn: tuple[Trace, tuple] | None = None
+        touches.on("image-pick", self._pick)
+        touches.on("image-reference", self._want)
+
+    def draw(self, trace: Trace, picture: Picture, selected: tuple[int, ...], kept: NDArray) -> None:
+        """Show the images of a run at a step. ``selected`` are numbers in the problem, ``kept`` (N,) original ones."""
+        problem = trace.problem
+        followed = (problem.name, problem.reference_images, kept[list(selected)].tolist())
+        if followed != self._followed:
+            self._followed, self._wanted = followed, None
+        colors = _colors(picture, len(problem))
+        drawn = (selected, self._wanted, colors.tobytes(), kept.tobytes())
+        if self._drawn is not None and self._drawn[0] is trace and self._drawn[1] == drawn:
+            return
+        self._drawn = (trace, drawn)
+        view = match_view(problem, colors, trace.inlier_mask, selected, self._wanted)
+        paths = [problem.image] + ([] if view.reference is None else [problem.reference_images[view.reference]])
+        places, height = drawing.arrange([(problem.camera.width, problem.camera.height), *_sizes(problem, view)])
+        shares = [place.width / drawing.WIDTH for place in places]
+        uris = [photo_uri(path, round(PHOTO_PX * share)) for path, share in zip(paths, shares, strict=True)]
+        self._shown = shown = overlay(trace, view, colors, places, selected, kept, uris[0] is not None)
+        gone = [path.name for path, uri in zip(paths, uris, strict=True) if path is not None and uri is None]
+        caption = " ".join([shown.caption, *(f"{name} cannot be read any more." for name in gone)])
+        html = drawing.frame_html(places, height, [uri is not None for uri in uris], shown.parts, caption)
+        html = box(html) + status_html(caption) + chips_html(problem, trace.inlier_mask, view.reference)
+        _assign(self._backgrounds, drawing.backgrounds_html(uris))
+        _assign(self._drawing, html)
+
+    def _want(self, touch: Touch) -> None:
+        self._wanted = int(touch.argument) if touch.argument.isdecimal() else None
+        self._changed(touch)
+
+    def _pick(self, touch: Touch) -> None:
+        """Select the match nearest to a press, if one is near."""
+        number = None if self._shown is None else self._shown.nearest(touch.argument, touch.x, touch.y)
+        if number is not None:
+            self._touches.deliver(replace(touch, action="select", argument=str(number)))
+
+
+def _assign(handle: viser.GuiHtmlHandle, html: str) -> None:
+    if handle.content != html:
+        handle.content = html
+
+
+def _colors(picture: Picture, count: int) -> ColorArray:
+    """Colours (N, 3) of the matches at a step: those of the map's points."""
+    colors = one_color(style.UNDECIDED, count)
+    for item in picture.scene:
+        if isinstance(item, Points) and item.name == "map/points" and item.ids is not None:
+            colors[item.ids] = item.colors
+    return colors
+
+
+def _sizes(problem: Problem, view: MatchView) -> list[tuple[float, float]]:
+    """Width and height of the reference image, px."""
+    if view.reference is None or problem.reference_pixels is None:
+        return []
+    photo = photograph(problem.reference_images[view.reference])
+    if photo is not None:
+        height, width = photo.image.shape[:2]
+        return [(width / photo.scale, height / photo.scale)]
+    # The image has gone: a frame that holds its keypoints.
+    most = np.nanmax(np.append(problem.reference_pixels[view.own], [[1.0, 1.0]], axis=0), axis=0)
+    return [(float(most[0]), float(most[1]))]

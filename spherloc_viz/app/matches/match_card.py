@@ -1,0 +1,166 @@
+"""A card about what is selected: what a run made of it and why, and what can be done to it."""
+
+from html import escape
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from spherloc.cameras.base import FloatArray
+from spherloc.trace import Trace
+from spherloc_viz import style
+from spherloc_viz.app.matches.match_chips import chip
+from spherloc_viz.app.matches.match_crops import crops_html
+from spherloc_viz.app.text import DIM, box, table_html
+from spherloc_viz.layers.explanation import Explanation, Pairs, explain
+from spherloc_viz.layers.primitives import Table
+from spherloc_viz.layers.selection_traits import Traits, explain_many
+
+WIDTH_PX = 330.0
+MARGIN_PX = 14.0
+
+
+class MatchCard:
+    """A floating panel that is there while something is selected. Its buttons are touches that the session handles."""
+
+    def __init__(self, gui: viser.GuiApi) -> None:
+        self._panel = gui.add_panel(visible=False)
+        with self._panel.add_tab("Selection"):
+            self._html = gui.add_html("")
+        self._panel.float(x=MARGIN_PX, y=MARGIN_PX, width=WIDTH_PX)
+        self._drawn: tuple | None = None
+
+    def draw(
+        self,
+        trace: Trace,
+        selected: tuple[int, ...],
+        kept: NDArray,
+        rival_cam_from_map: FloatArray | None = None,
+    ) -> None:
+        """Show what is selected, numbers in the problem; ``kept`` (N,) are the original ones.
+
+        ``rival_cam_from_map`` (3, 4) is another pose that a diagnosis knows, to hold a match against.
+        """
+        if self._panel.visible != bool(selected):
+            self._panel.visible = bool(selected)
+        drawn = (trace, selected, kept.tobytes(), None if rival_cam_from_map is None else rival_cam_from_map.tobytes())
+        if not selected or (self._drawn is not None and self._drawn[0] is trace and self._drawn[1:] == drawn[1:]):
+            return
+        self._drawn = drawn
+        html = (
+            one_html(trace, explain(trace, selected[0], rival_cam_from_map), kept)
+            if len(selected) == 1
+            else many_html(trace, explain_many(trace, np.array(selected)), kept[list(selected)])
+        )
+        if self._html.content != html:
+            self._html.content = html
+
+
+def one_html(trace: Trace, what: Explanation, kept: NDArray) -> str:
+    """The card of one match."""
+    title = f'<span style="font-size:15px;font-weight:600">Match {kept[what.number]}</span>'
+    color = style.OUTLIER if "wrongly" in what.verdict else style.INLIER if what.kept else None
+    look = f"color:{style.css_text(color)};font-weight:600" if color else "font-weight:600"
+    head = f'<div>{_walk(what.number, kept)}{title} <span style="{look}">{escape(what.verdict)}</span></div>'
+    body = f'<div style="padding-top:.3em">{escape(what.reason)}</div>{crops_html(trace.problem, what.number)}'
+    return box(head + body) + _measures(what) + _notes(what, kept) + _actions(trace, 1)
+
+
+def many_html(trace: Trace, what: Traits, numbers: NDArray) -> str:
+    """The card of several matches with these original numbers."""
+    shown = ", ".join(map(str, numbers[:12].tolist())) + (" …" if len(numbers) > 12 else "")
+    head = f'<div style="font-size:15px;font-weight:600">{what.count:,} matches</div>'
+    body = "".join(f"<div>{escape(sentence)}</div>" for sentence in what.sentences)
+    rows = [("numbers", shown), ("kept by the run", f"{what.kept:,} of {what.count:,}")]
+    if what.right is not None:
+        rows.append(("truly inliers", f"{what.right:,} of {what.count:,}"))
+    if what.median_px is not None:
+        rows.append(("median residual", _px(what.median_px)))
+    if trace.cam_from_map is not None and what.pairs:
+        rows.append(("pairs that agree", f"{what.agree:,} of {what.pairs:,} at the estimated yaw"))
+    table = Table("selection", ("", "these"), tuple(rows))
+    return box(head + body) + table_html(table) + _actions(trace, what.count)
+
+
+def _walk(number: int, kept: NDArray) -> str:
+    """Buttons to the match before and after this one."""
+    before, after = (int(kept[(number + step) % len(kept)]) for step in (-1, 1))
+    back, on = chip("‹", f"select:{before}", False, "Previous match"), chip("›", f"select:{after}", False, "Next match")
+    return f'<span style="float:right;white-space:nowrap">{back}{on}</span>'
+
+
+def _actions(trace: Trace, count: int) -> str:
+    it = "this match" if count == 1 else "these matches"
+    mend = (
+        chip("Mend", "mend:", False, f"Put {it} where the true pose sees the point")
+        if trace.problem.truth_cam_from_map is not None
+        else _disabled("Mend", "The true pose is unknown, so nobody knows the right pixel")
+    )
+    spoil = chip("Spoil", "spoil:", False, f"Give {it} a wrong pixel at random")
+    hide = chip("Hide", "hide:", False, f"Leave {it} out of the problem")
+    return box(f"{spoil}{mend}{hide}{chip('Deselect', 'deselect:', False)}")
+
+
+def _disabled(words: str, why: str) -> str:
+    return (
+        f'<span aria-disabled="true" title="{escape(why)}" style="display:inline-block;margin:0 .35em .35em 0;'
+        f'padding:.12em .6em;border-radius:1em;opacity:.4;background:rgba(128,136,150,.16)">{escape(words)}</span>'
+    )
+
+
+def _measures(what: Explanation) -> str:
+    """Numbers at the estimated and at the true pose, side by side."""
+    sides = [
+        (name, residual, pairs)
+        for name, residual, pairs in (
+            ("at the estimate", what.estimate, what.at_estimate),
+            ("at the truth", what.truth, what.at_truth),
+        )
+        if residual is not None and pairs is not None
+    ]
+    if not sides:
+        return ""
+    rows: list[tuple[str, ...]] = [
+        ("residual", *(_px(residual.px) for _, residual, _ in sides)),
+        ("angle", *(f"{residual.deg:.3g}°" for _, residual, _ in sides)),
+        ("yaw", *(f"{pairs.yaw_deg:.2f}°" for _, _, pairs in sides)),
+        ("pairs that agree", *(f"{pairs.agree:,} of {what.others:,}" for _, _, pairs in sides)),
+        ("with inliers", *(f"{pairs.agree_inliers:,} of {what.inliers:,}" for _, _, pairs in sides)),
+    ]
+    # A heading is shown for three columns and more.
+    columns = ("", *(name for name, _, _ in sides), *([] if len(sides) > 1 else [""]))
+    return table_html(Table("measures", columns, tuple(rows)))
+
+
+def _notes(what: Explanation, kept: NDArray) -> str:
+    """Its bound and label, the pairs that exclude the true yaw, and its part in the stages, in small type."""
+    notes = []
+    if what.usable:
+        notes.append(f"Its bound is {_px(what.bound_px)}, or {what.bound_deg:.2f}° for its bearing.")
+    if what.right is not None and what.labelled:
+        notes.append(f"Its label says {'inlier' if what.right else 'outlier'}.")
+    if what.silent:
+        notes.append(f"{what.silent:,} pairs are too close to say anything, and count as agreeing.")
+    notes = [escape(note) for note in notes]
+    if what.at_truth is not None:
+        notes.append(_excluding(what.number, what.at_truth, kept))
+    if what.stages:
+        part = "; ".join(what.stages)
+        notes.append(escape(f"{part[:1].upper()}{part[1:]}."))
+    return box(f'<div style="{DIM}">{" ".join(notes)}</div>', "font-size:12px")
+
+
+def _excluding(number: int, pairs: Pairs, kept: NDArray) -> str:
+    words = f"{pairs.excluded:,} pairs exclude the true yaw, and {pairs.impossible:,} agree at none."
+    if not pairs.worst:
+        return words
+    worst = ", ".join(
+        f'{degrees:.0f}° with <span data-touch="select:{kept[number]},{kept[other]}" role="button" tabindex="0" '
+        f'style="text-decoration:underline dotted">{kept[other]}</span>'
+        for other, degrees in pairs.worst
+    )
+    return f"{words} Farthest off: {worst}."
+
+
+def _px(value: float) -> str:
+    return "behind" if np.isinf(value) else f"{value:.3g} px" if value < 1000 else f"{value:,.0f} px"

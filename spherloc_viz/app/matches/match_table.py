@@ -1,0 +1,166 @@
+"""All matches as a table: sorted by a press on a heading, filtered, a page at a time."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from html import escape
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from spherloc.problem import IntArray
+from spherloc.trace import Trace
+from spherloc_viz import style
+from spherloc_viz.app.matches.match_chips import chip
+from spherloc_viz.app.text import DIM, box
+from spherloc_viz.app.web.touch import Touch, Touches
+from spherloc_viz.layers.match_rows import FILTERS, SORTS, MatchRows, match_rows, order
+
+PAGE = 25
+COLUMNS = (
+    ("number", "match", "Its number"),
+    ("run", "run", "Whether the run calls it an inlier"),
+    ("truth", "truth", "Whether it truly is one"),
+    ("px", "px", "Reprojection error at the estimated pose, px"),
+    ("deg", "deg", "Angle between its bearing and its point at the estimated pose, degrees"),
+    ("agrees", "agrees", "With how many inliers it makes a pair that agrees at the estimated yaw"),
+)
+"""Name, heading and hint."""
+
+
+@dataclass(frozen=True)
+class Look:
+    """What of the table is shown."""
+
+    shown: str = "all"
+    by: str = "number"
+    down: bool = False
+    page: int = 0
+
+
+class MatchTable:
+    """The table of one page."""
+
+    def __init__(self, gui: viser.GuiApi, touches: Touches, changed: Callable[[object], None]) -> None:
+        self._html = gui.add_html("")
+        self._changed = changed
+        self._look = Look()
+        self._followed: tuple[int, ...] = ()
+        self._drawn: tuple | None = None
+        for action, handler in (
+            ("match-sort", self._sort),
+            ("match-filter", self._filter),
+            ("match-page", self._turn),
+        ):
+            touches.on(action, handler)
+
+    def draw(self, trace: Trace, selected: tuple[int, ...], kept: NDArray) -> None:
+        """Show the matches of a run. ``selected`` are numbers in the problem, ``kept`` (N,) the original ones.
+
+        A match that was just selected elsewhere brings its page up.
+        """
+        drawn = (trace, selected, kept.tobytes(), self._look)
+        if self._drawn is not None and self._drawn[0] is trace and self._drawn[1:] == drawn[1:]:
+            return
+        rows, look = match_rows(trace), self._look
+        listed = order(rows, look.shown, look.by, look.down)
+        pages = max(1, -(-len(listed) // PAGE))
+        page = min(look.page, pages - 1)
+        if selected != self._followed:
+            self._followed = selected
+            page = _page_of(listed, selected, page)
+        self._look = look = replace(look, page=page)
+        self._drawn = (*drawn[:3], look)
+        html = table_html(rows, listed, look, frozenset(selected), kept)
+        if self._html.content != html:
+            self._html.content = html
+
+    def _sort(self, touch: Touch) -> None:
+        if touch.argument in SORTS:
+            down = not self._look.down if self._look.by == touch.argument else False
+            self._show(replace(self._look, by=touch.argument, down=down, page=0))
+
+    def _filter(self, touch: Touch) -> None:
+        if touch.argument in FILTERS:
+            self._show(replace(self._look, shown=touch.argument, page=0))
+
+    def _turn(self, touch: Touch) -> None:
+        if touch.argument.isdecimal():
+            self._show(replace(self._look, page=min(int(touch.argument), 10**6)))
+
+    def _show(self, look: Look) -> None:
+        self._look = look
+        self._changed(look)
+
+
+def _page_of(listed: IntArray, selected: tuple[int, ...], page: int) -> int:
+    """The page at hand if it holds one of the selected matches, else that of the first of them that is listed."""
+    places = np.flatnonzero(np.isin(listed, selected))
+    if not len(places) or (places // PAGE == page).any():
+        return page
+    return int(places[0]) // PAGE
+
+
+def table_html(rows: MatchRows, listed: IntArray, look: Look, selected: frozenset[int], kept: NDArray) -> str:
+    """The page at hand of the matches ``listed``, with what can be pressed above and below it."""
+    shown = listed[look.page * PAGE : (look.page + 1) * PAGE]
+    body = "".join(_row(rows, int(k), int(k) in selected, int(kept[k])) for k in shown)
+    table = (
+        '<table style="border-collapse:collapse;width:100%;font-variant-numeric:tabular-nums;margin-top:.3em">'
+        f"<tr>{_headings(look)}</tr>{body}</table>"
+    )
+    return box(_filters(rows, look) + table + _pages(rows, listed, look), "font-size:12.5px")
+
+
+def _filters(rows: MatchRows, look: Look) -> str:
+    chips = []
+    for name, choose in FILTERS.items():
+        if name.startswith("wrongly") and rows.right is None:
+            continue
+        chips.append(chip(f"{name} {np.count_nonzero(choose(rows)):,}", f"match-filter:{name}", name == look.shown))
+    return "".join(chips)
+
+
+def _headings(look: Look) -> str:
+    cells = []
+    for place, (name, heading, hint) in enumerate(COLUMNS):
+        arrow = "" if name != look.by else " ▾" if look.down else " ▴"
+        align = "left" if place < 3 else "right"
+        cells.append(
+            f'<th data-touch="match-sort:{name}" role="button" tabindex="0" title="{escape(hint)}" '
+            f'style="text-align:{align};font-weight:600;padding:.15em .3em;white-space:nowrap">{heading}{arrow}</th>'
+        )
+    return "".join(cells)
+
+
+def _row(rows: MatchRows, k: int, chosen: bool, number: int) -> str:
+    cell, right = '<td style="padding:.08em .3em">', '<td style="padding:.08em .3em;text-align:right">'
+    mark = f"background:{style.css(style.SELECTED)}40" if chosen else ""
+    truth = "–" if rows.right is None else _word(bool(rows.right[k]))
+    agree = "–" if rows.agree[k] < 0 else f"{rows.agree[k]}"
+    return (
+        f'<tr data-touch="select:{number}" style="{mark}">{cell}{number}</td>{cell}{_word(bool(rows.kept[k]))}</td>'
+        f"{cell}{truth}</td>{right}{_number(rows.px[k])}</td>{right}{_number(rows.deg[k])}</td>{right}{agree}</td></tr>"
+    )
+
+
+def _word(inlier: bool) -> str:
+    color, word = (style.INLIER, "inlier") if inlier else (style.OUTLIER, "outlier")
+    return f'<span style="color:{style.css_text(color)}">{word}</span>'
+
+
+def _number(value: float) -> str:
+    if np.isnan(value):
+        return "–"
+    return "behind" if np.isinf(value) else f"{value:.2f}" if value < 100 else f"{value:,.0f}"
+
+
+def _pages(rows: MatchRows, listed: IntArray, look: Look) -> str:
+    first, last = look.page * PAGE + 1, min((look.page + 1) * PAGE, len(listed))
+    some = f"{first}–{last} of {len(listed):,}" if len(listed) else "none"
+    back = chip("‹", f"match-page:{look.page - 1}", False, "Previous page") if look.page > 0 else ""
+    on = chip("›", f"match-page:{look.page + 1}", False, "Next page") if last < len(listed) else ""
+    inliers = np.count_nonzero(rows.kept)
+    asked = f"; agrees: of {'an even sample of ' if rows.partners < inliers else ''}{rows.partners} inliers"
+    note = f'<span style="{DIM}">{some}{asked if rows.partners else ""}</span>'
+    return f'<div style="padding-top:.4em">{back}{on}{note}</div>'

@@ -1,0 +1,1 @@
+"""Comparing, sweeping, opening and exporting."""

@@ -1,0 +1,301 @@
+"""Runs several estimators on the problem at hand, one after another, and shows them side by side."""
+
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from html import escape
+
+import numpy as np
+import viser
+
+from spherloc import registry
+from spherloc.diagnosis import Cause, diagnose
+from spherloc.errors import InputError
+from spherloc.estimators import default_options, estimate
+from spherloc.problem import Problem
+from spherloc.trace import Trace
+from spherloc.watch import Cancelled, Watch
+from spherloc_viz import style
+from spherloc_viz.app.panels.errand import Errand
+from spherloc_viz.app.plots.svg import chart_svg
+from spherloc_viz.app.text import DIM, WORDS, box, status_html
+from spherloc_viz.app.web.touch import Touch, Touches
+from spherloc_viz.layers.comparison import (
+    FIRST,
+    NO_VALUE,
+    Entry,
+    coinciding,
+    color_of,
+    comparison_items,
+    comparison_table,
+    residual_chart,
+    yaw_chart,
+)
+from spherloc_viz.layers.primitives import Chart, SceneItem, Table
+
+START, STOP = "Compare", "Cancel"
+LIVE_AFTER_S = 0.25
+"""A live comparison waits until the problem has stood still for this long."""
+TICKED = ("mc-exact", "mc", "ransac-2p", "ransac-epnp")
+"""Estimators that are compared at first: exact, the paper's, two points, and a baseline."""
+MEASURED = ("rotation", "position", "F1", "time")
+"""Columns that have one in the table; the others are in the line below."""
+NOTE = (
+    "One run each, one after another, with default options; the estimator that is chosen on the page has the page's. "
+    "Times are of this one run on this machine, busy with this page too. Press a row to use its estimator."
+)
+
+_warm: set[str] = set()
+"""Estimators that have run in this process: the first run of each also loads its compiled code."""
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """What is known by now about one problem."""
+
+    problem: Problem
+    entries: tuple[Entry, ...] = ()
+    charts: tuple[Chart, ...] = ()
+    items: tuple[SceneItem, ...] = ()
+
+
+class ComparePanel:
+    """Which estimators, a button, a table and charts; ``items`` are what the canvas shows of it."""
+
+    def __init__(
+        self,
+        gui: viser.GuiApi,
+        touches: Touches,
+        use: Callable[[str], None],
+        changed: Callable[[object], None],
+    ) -> None:
+        """``use`` is called with the estimator of a row that is pressed, ``changed`` when there is more to show."""
+        self._use, self._changed = use, changed
+        self._names = _ordered(registry.names("estimators"))
+        self._ticked = {name for name in self._names if name in TICKED}
+        self._choice = gui.add_html(self._chips())
+        self._button = gui.add_button(START, hint="Run the ticked estimators on the problem at hand.")
+        self._live = gui.add_checkbox("Live", False, hint="Compare again whenever the problem changes.")
+        self._bar = gui.add_progress_bar(0.0, visible=False)
+        self._status = gui.add_html("", visible=False)
+        self._table = gui.add_html(box(f'<div style="{DIM}">{escape(NOTE)}</div>', "font-size:11.5px"))
+        self._lock = threading.Lock()
+        self._trace: Trace | None = None
+        self._done: Comparison | None = None
+        self._shown: tuple[Comparison | None, bool] = (None, False)
+        self._stop, self._watch = threading.Event(), Watch()
+        self._closed = False
+        self._errand = Errand("spherloc-compare", self._complain)
+        self._button.on_click(self._press)
+        self._live.on_update(self._switch)
+        touches.on("compare", self._tick)
+        touches.on("use", self._choose)
+
+    @property
+    def widgets(self) -> tuple:
+        """Those that hold a value."""
+        return (self._live,)
+
+    def draw(self, trace: Trace) -> None:
+        """Follow the run at hand, whose problem, seed and options are those to compare with."""
+        with self._lock:
+            before, self._trace = self._trace, trace
+        if self._live.value and (before is None or not is_same(before.problem, trace.problem)):
+            self._start(LIVE_AFTER_S)
+        self._show()
+
+    def items(self, trace: Trace) -> tuple[SceneItem, ...]:
+        """What the canvas shows beside a run; nothing if the comparison is of another problem."""
+        done = self._done
+        return done.items if done is not None and is_same(done.problem, trace.problem) else ()
+
+    def close(self) -> None:
+        """End the comparison at hand; does not wait."""
+        self._closed = True
+        self._errand.close()
+        self._halt()
+
+    def _press(self, event: viser.GuiEvent) -> None:
+        if self._button.label == STOP:
+            self._errand.forget()
+            self._halt()
+        else:
+            self._start()
+
+    def _switch(self, event: viser.GuiEvent) -> None:
+        if self._live.value:
+            self._start()
+
+    def _tick(self, touch: Touch) -> None:
+        if touch.argument in self._names:
+            with self._lock:
+                self._ticked ^= {touch.argument}
+                self._choice.content = self._chips()
+            if self._live.value:
+                self._start()
+
+    def _choose(self, touch: Touch) -> None:
+        if touch.argument in self._names:
+            self._use(touch.argument)
+
+    def _start(self, after_s: float = 0.0) -> None:
+        """Compare after a while; what is being compared gives way."""
+        self._halt()
+        self._errand.ask(partial(self._work, after_s))
+
+    def _halt(self) -> None:
+        """End the comparison at hand, also within a run."""
+        self._stop.set()
+        self._watch.cancel()
+
+    def _work(self, after_s: float) -> None:
+        stop = self._stop = threading.Event()
+        if stop.wait(after_s) or self._closed:
+            return
+        self._button.label, self._bar.visible = STOP, True
+        try:
+            self._compare(stop)
+        finally:
+            self._button.label, self._bar.visible, self._status.visible = START, False, False
+
+    def _compare(self, stop: threading.Event) -> None:
+        """Run all and diagnose all, showing each as it comes. Raises ``InputError`` if there is nothing to compare."""
+        with self._lock:
+            trace, names = self._trace, [name for name in self._names if name in self._ticked]
+        if trace is None:
+            raise InputError("there is no run to compare with yet; wait for the first picture.")
+        if not names:
+            raise InputError("no estimator is ticked; tick one or more.")
+        entries: tuple[Entry, ...] = ()
+        for place, name in enumerate(names):
+            self._progress(place / len(names), f"{name}, {place + 1} of {len(names)} …")
+            watch = self._watch = Watch()
+            if stop.is_set() or self._closed:
+                return
+            try:
+                entries = (*entries, Entry(_run(trace, name, watch)))
+            except Cancelled:
+                return
+            self._publish(entries)
+        for place, entry in enumerate(entries):
+            self._progress(place / len(names), f"Diagnosing {entry.trace.estimator} …")
+            if stop.is_set() or self._closed:
+                return
+            entries = (*entries[:place], replace(entry, diagnosis=diagnose(entry.trace)), *entries[place + 1 :])
+            self._publish(entries)
+
+    def _progress(self, share: float, words: str) -> None:
+        self._bar.value = 100.0 * share
+        self._status.content, self._status.visible = status_html(words), True
+
+    def _complain(self, sentence: str) -> None:
+        self._status.content = status_html(sentence[:1].upper() + sentence[1:], wrong=True)
+        self._status.visible = True
+
+    def _publish(self, entries: tuple[Entry, ...]) -> None:
+        charts = (residual_chart(entries), yaw_chart(entries))
+        known = tuple(chart for chart in charts if chart is not None)
+        with self._lock:
+            self._done = Comparison(entries[0].trace.problem, entries, known, comparison_items(entries))
+        self._changed(None)
+        self._show()
+
+    def _show(self) -> None:
+        """Put the comparison on the page, paler if it is of an earlier problem."""
+        with self._lock:
+            done, trace = self._done, self._trace
+            if done is None or trace is None:
+                return
+            fits = is_same(done.problem, trace.problem)
+            if self._shown == (done, fits):
+                return
+            self._shown = (done, fits)
+            self._table.content = comparison_html(done.entries, done.charts, fits)
+
+    def _chips(self) -> str:
+        chips = "".join(_chip(name, name in self._ticked) for name in self._names)
+        return box(f'<div style="display:flex;flex-wrap:wrap;gap:.35em">{chips}</div>', "font-size:12px")
+
+
+def _run(trace: Trace, name: str, watch: Watch) -> Trace:
+    """An estimator on the problem of a run; its own first run in this process goes before, unseen.
+
+    Raises ``Cancelled`` if ``watch`` ends either.
+    """
+    options = trace.options if name == trace.estimator else default_options(name, trace.problem)
+    if name not in _warm:
+        estimate(trace.problem, name, options, trace.seed, watch)
+        _warm.add(name)
+    return estimate(trace.problem, name, options, trace.seed, watch)
+
+
+def is_same(one: Problem, other: Problem) -> bool:
+    """Whether both are the same problem, though maybe made twice."""
+    if one is other:
+        return True
+    arrays = ("pixels", "points", "gravity_camera", "gravity_map", "truth_cam_from_map", "truth_inliers")
+    plain = ("name", "camera", "bound_px", "gravity_bound_rad", "gravity_sd_rad")
+    return all(getattr(one, name) == getattr(other, name) for name in plain) and all(
+        np.array_equal(getattr(one, name), getattr(other, name))  # type: ignore[arg-type]
+        for name in arrays
+    )
+
+
+def comparison_html(entries: Sequence[Entry], charts: Sequence[Chart], fits: bool) -> str:
+    """Table and charts; paler, with a remark, if they do not fit the problem at hand."""
+    table = comparison_table(entries)
+    rows = "".join(_row_html(table, row) for row in table.rows)
+    head = "".join(f'<td style="text-align:right;{DIM}">{escape(name)}</td>' for name in MEASURED)
+    style_css = "border-collapse:collapse;width:100%;font-size:11.5px;font-variant-numeric:tabular-nums"
+    body = box(f'<table style="{style_css}"><tr><td></td>{head}</tr>{rows}</table>')
+    body += "".join(
+        f'<div style="padding:0 .8em .2em;font-size:12.5px;font-weight:600">{escape(chart.title)}</div>'
+        + box(chart_svg(chart) + f'<div style="font-size:11.5px;{DIM}">{escape(coinciding(chart))}</div>')
+        for chart in charts
+    )
+    body += box(f'<div style="{DIM}">{escape(NOTE)}</div>', "font-size:11.5px")
+    if fits:
+        return body
+    return status_html(f"The problem has changed since; press {START}.") + f'<div style="opacity:.45">{body}</div>'
+
+
+def _row_html(table: Table, row: tuple) -> str:
+    """A row of numbers and a line of words; both are pressed to use the estimator."""
+    value = dict(zip(table.columns, map(str, row), strict=True))
+    name = value["estimator"]
+    touch = f'data-touch="use:{escape(name)}" title="Use {escape(name)}"'
+    cell = 'style="padding:.35em 0 0 .5em;text-align:right;white-space:nowrap"'
+    numbers = "".join(f"<td {cell}>{escape(value[column])}</td>" for column in MEASURED)
+    head = f'<td style="padding-top:.35em;white-space:nowrap;font-weight:600">{_swatch(name)}{escape(name)}</td>'
+    shares = ("inliers", "precision", "recall")
+    words = [f"{value[share]} {share}" for share in shares if value[share] not in (NO_VALUE, "0")]
+    words += [value[column] for column in ("certificate", "diagnosis") if value[column] not in (NO_VALUE, Cause.OK)]
+    color = WORDS.get(value["outcome"])
+    verdict = f'<span style="{f"color:{style.css(color)};font-weight:600" if color else ""}">{value["outcome"]}</span>'
+    line = f'{verdict}<span style="{DIM}"> · {escape(" · ".join(words))}</span>' if words else verdict
+    below = f'<td colspan="{1 + len(MEASURED)}" style="padding:0 0 .35em 1.15em">{line}</td>'
+    rule = 'style="border-top:1px solid rgba(128,140,160,.25)"'
+    return f"<tr {touch} {rule}>{head}{numbers}</tr><tr {touch}>{below}</tr>"
+
+
+def _chip(name: str, ticked: bool) -> str:
+    look = f"border:1px solid rgba(128,140,160,{0.8 if ticked else 0.3});opacity:{1 if ticked else 0.55}"
+    return (
+        f'<span role="checkbox" aria-checked="{str(ticked).lower()}" aria-label="{escape(name)}" tabindex="0" '
+        f'data-touch="compare:{escape(name)}" style="white-space:nowrap;border-radius:1em;padding:.1em .6em;{look}">'
+        f"{_swatch(name)}{escape(name)}</span>"
+    )
+
+
+def _swatch(estimator: str) -> str:
+    return _dot(color_of(estimator))
+
+
+def _dot(color: style.RGB) -> str:
+    look = "display:inline-block;width:.7em;height:.7em;border-radius:50%;margin-right:.4em"
+    return f'<span style="{look};background:{style.css(color)}"></span>'
+
+
+def _ordered(names: Sequence[str]) -> tuple[str, ...]:
+    return tuple(sorted(names, key=lambda name: (FIRST.index(name) if name in FIRST else len(FIRST), name)))

@@ -1,0 +1,158 @@
+"""Takes what is on the page elsewhere: a picture, a page with the 3-D scene, the recording, and code to repeat it."""
+
+import io
+import re
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+
+import numpy as np
+import viser
+from PIL import Image
+
+from spherloc.errors import InputError
+from spherloc.trace import Trace
+from spherloc_viz.app.panels.errand import Errand
+from spherloc_viz.app.stage.still_page import Still, still_html, viewpoint
+from spherloc_viz.app.text import DIM, box, status_html
+from spherloc_viz.layers.primitives import SceneItem
+from spherloc_viz.recording.writer import write_recording
+
+PATIENCE_S = 60.0
+"""A page that draws in software takes some ten seconds for a picture of its canvas."""
+CANVAS = {True: (26, 27, 30), False: (255, 255, 255)}
+"""What the canvas has behind everything, by whether the page is dark."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """What is on the page."""
+
+    trace: Trace
+    items: Sequence[SceneItem]
+    """What the canvas shows, without the layers that are switched off."""
+    backdrop: bytes | None
+    """The map's mesh, if it is shown."""
+    title: str
+    """The scene's label; a stranger's if it was uploaded."""
+    note: str
+    """A line about the run."""
+    recorded: Path | None
+    """The run's recording, if there is one already."""
+    dark: bool
+
+
+class ExportPanel:
+    """Three buttons and two pieces of code."""
+
+    def __init__(self, gui: viser.GuiApi, client: viser.ClientHandle, shown: Callable[[], Shown | None]) -> None:
+        """``shown`` tells what is on the page, on a thread of this panel; None before the first picture."""
+        self._client, self._shown = client, shown
+        self._errand = Errand(f"spherloc-export-{client.client_id}", self._complain)
+        self._code: tuple[str, str] | None = None
+        buttons = (
+            ("Picture (PNG)", "The canvas as it is seen now.", self._picture),
+            ("Scene (HTML)", "The canvas as a file that opens in any browser, with no network.", self._page),
+            ("Recording (.rrd)", "The run with all of its steps, for a Rerun viewer.", self._recording),
+        )
+        for label, hint, job in buttons:
+            gui.add_button(label, hint=hint).on_click(lambda event, job=job: self._errand.ask(job))
+        self._status = gui.add_html("", visible=False)
+        self._text = gui.add_html("")
+
+    def draw(self, python: str, command: str) -> None:
+        """Show the code that repeats the run at hand."""
+        if self._code != (python, command):
+            self._code = (python, command)
+            self._text.content = code_html("Python", python) + code_html("Command", command)
+
+    def close(self) -> None:
+        """Export nothing more; does not wait."""
+        self._errand.close()
+
+    def _now(self) -> Shown:
+        shown = self._shown()
+        if shown is None:
+            raise InputError("there is nothing to export yet; wait for the first picture.")
+        return shown
+
+    def _picture(self) -> None:
+        shown, camera = self._now(), self._client.camera
+        self._say("Taking the picture … a browser without a graphics card needs some ten seconds.")
+        try:
+            pixels = self._client.get_render(
+                camera.image_height, camera.image_width, transport_format="png", timeout=PATIENCE_S
+            )
+        except (TimeoutError, RuntimeError):
+            raise InputError(
+                "the browser gave no picture of the canvas; keep its tab in front and try again."
+            ) from None
+        self._send(f"{file_stem(shown)}.png", on_canvas(pixels, CANVAS[shown.dark]))
+
+    def _page(self) -> None:
+        shown = self._now()
+        self._say("Making the page …")
+        still = Still(
+            title=shown.title,
+            note=shown.note,
+            items=shown.items,
+            backdrop=shown.backdrop,
+            aligned_from_map=shown.trace.problem.aligned.map_turn,
+            dark=shown.dark,
+            **viewpoint(self._client.camera),
+        )
+        self._send(f"{file_stem(shown)}.html", still_html(still).encode())
+
+    def _recording(self) -> None:
+        shown = self._now()
+        name = f"{file_stem(shown)}.rrd"
+        if shown.recorded is not None and shown.recorded.is_file():
+            self._send(name, shown.recorded.read_bytes())
+            return
+        self._say("Writing the recording …")
+        with tempfile.TemporaryDirectory(prefix="spherloc-") as folder:
+            self._send(name, write_recording(shown.trace, Path(folder) / "run.rrd").read_bytes())
+
+    def _send(self, name: str, content: bytes) -> None:
+        self._client.send_file_download(name, content, save_immediately=True)
+        self._say(f"{name}, {len(content) / 1e6:.2g} MB")
+
+    def _say(self, words: str) -> None:
+        self._status.content, self._status.visible = status_html(words), True
+
+    def _complain(self, sentence: str) -> None:
+        self._status.content = status_html(sentence[:1].upper() + sentence[1:], wrong=True)
+        self._status.visible = True
+
+
+def on_canvas(pixels: np.ndarray, color: tuple[int, int, int]) -> bytes:
+    """RGBA pixels (H, W, 4) on a colour, as a PNG."""
+    picture = Image.fromarray(pixels, "RGBA")
+    ground = Image.new("RGBA", picture.size, (*color, 255))
+    out = io.BytesIO()
+    Image.alpha_composite(ground, picture).convert("RGB").save(out, "PNG")
+    return out.getvalue()
+
+
+def file_stem(shown: Shown) -> str:
+    """A file name of letters, digits and dashes, whatever the scene is called."""
+    words = re.findall(r"[a-z0-9]+", f"spherloc {shown.title} {shown.trace.estimator}".lower())
+    return "-".join(words)[:80].strip("-")
+
+
+def code_html(title: str, code: str) -> str:
+    """Code with a button that copies it."""
+    link = "text-decoration:underline;font-size:12px;margin-left:.8em"
+    face = "font-family:ui-monospace,Menlo,Consolas,monospace;font-size:11px;line-height:1.45"
+    look = "white-space:pre-wrap;overflow-wrap:anywhere;max-height:14em;overflow-y:auto;padding:.5em .7em"
+    ground = "background:rgba(128,140,160,.12);border-radius:.4em;margin:.25em 0 0"
+    copy = (
+        f'<span role="button" tabindex="0" aria-label="Copy as {escape(title)}" data-copy="{escape(code)}" '
+        f'style="{link};{DIM}">copy</span>'
+    )
+    return box(
+        f'<span style="font-weight:600">{escape(title)}</span>{copy}<pre style="{face};{look};{ground}">'
+        f"{escape(code)}</pre>"
+    )

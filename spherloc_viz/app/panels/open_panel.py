@@ -1,0 +1,188 @@
+"""Opens scenes from the page: bundled ones, recent ones, files in allowed folders, and uploaded matches."""
+
+import threading
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+
+import viser
+
+from spherloc.datasets import Scene, bundled_scenes, load_scene
+from spherloc.errors import InputError
+from spherloc_viz.app.panels.errand import Errand
+from spherloc_viz.app.panels.folders import Listing, Roots, Row, describe
+from spherloc_viz.app.panels.open_list import list_html
+from spherloc_viz.app.panels.recent import RecentScenes
+from spherloc_viz.app.panels.uploads import MOST_BYTES, MOST_CALIBRATION_BYTES, File, Form, Scratch, open_upload
+from spherloc_viz.app.text import DIM, box, status_html
+from spherloc_viz.app.web.touch import Touch, Touches
+from spherloc_viz.app.web.upload_limit import limit_uploads
+
+UPLOADED = "uploaded: "
+PASTED = "the pasted calibration"
+
+
+@dataclass(frozen=True, eq=False)
+class Opened:
+    """A scene to go to."""
+
+    label: str
+    """What to call it; text of a stranger if it was uploaded."""
+    path: Path
+    """Its scene file."""
+    scene: Scene
+
+
+class OpenPanel:
+    """A list whose rows are pressed, and a form for uploads."""
+
+    def __init__(
+        self,
+        gui: viser.GuiApi,
+        client: viser.ClientHandle,
+        touches: Touches,
+        roots: Sequence[Path],
+        open_scene: Callable[[Opened], None],
+        recent: RecentScenes | None = None,
+    ) -> None:
+        """``roots`` are the folders that may be looked into; ``open_scene`` is called on a thread of this panel."""
+        self._open_scene = open_scene
+        self._roots, self._recent = Roots(roots), recent or RecentScenes()
+        self._scratch = Scratch()
+        self._errand = Errand(f"spherloc-open-{client.client_id}", self._complain)
+        self._lock = threading.Lock()
+        self._at: tuple[str, int] | None = None
+        self._files: dict[str, File] = {}
+        self._bundled: list[Row] = []
+        self._status = gui.add_html("", visible=False)
+        with gui.add_folder("Upload matches", expand_by_default=False):
+            self._build_form(gui)
+        self._list = gui.add_html("")
+        # Larger files are turned away before they fill this process's memory.
+        limit_uploads(client, MOST_BYTES, self._complain)
+        touches.on("open-scene", lambda touch: self._errand.ask(lambda: self._open(touch.argument)))
+        touches.on("open-folder", self._walk)
+        self._errand.ask(self._refresh)
+
+    def close(self) -> None:
+        """Forget what was uploaded; does not wait for what is being opened."""
+        self._errand.close()
+        self._scratch.close()
+
+    @property
+    def widgets(self) -> tuple:
+        """Those that hold a value."""
+        return self._fields
+
+    def _build_form(self, gui: viser.GuiApi) -> None:
+        about = (
+            "A CSV whose first line names u, v (px), X, Y, Z (m) and maybe inlier (0 or 1). "
+            "Only this page has it, and it is removed when the page is closed."
+        )
+        gui.add_html(box(f'<div style="{DIM}">{escape(about)}</div>', "font-size:12px"))
+        matches = gui.add_upload_button("Matches (CSV)", mime_type=".csv,text/csv,text/plain")
+        calibration = gui.add_upload_button(
+            "Calibration", hint="KITTI-360, Kalibr, stella or 360Loc YAML, Basalt JSON, or TOML with [camera]."
+        )
+        self._pasted = gui.add_text("or paste [camera]", "", multiline=True, hint="TOML; goes before an uploaded one.")
+        down = "Unit vector that points down."
+        self._gravity = (
+            gui.add_text("Gravity, camera", "0 1 0", hint=f"{down} +x is right, +y down, +z forward."),
+            gui.add_text("Gravity, map", "0 0 -1", hint=down),
+            gui.add_text("Gravity bound (deg)", "", hint="How far the camera's may be off; empty for 0."),
+        )
+        self._truth = gui.add_text(
+            "True pose", "", hint="Twelve numbers: the rows of [R | t], camera from map; optional."
+        )
+        self._fields = (self._pasted, *self._gravity, self._truth)
+        self._files_text = gui.add_html("", visible=False)
+        go = gui.add_button("Open upload")
+        matches.on_upload(lambda event: self._take("matches", event.target.value))
+        calibration.on_upload(lambda event: self._take("calibration", event.target.value))
+        go.on_click(lambda event: self._errand.ask(self._open_upload))
+
+    def _take(self, what: str, given: viser.UploadedFile) -> None:
+        """Keep an uploaded file until the form is sent."""
+        file = File(given.name, given.content)
+        most = MOST_BYTES if what == "matches" else MOST_CALIBRATION_BYTES
+        if len(file.content) > most:
+            self._complain(f"{file.title}: larger than {most / 1e6:.2g} MB; upload a smaller file.")
+            return
+        with self._lock:
+            self._files[what] = file
+            lines = [f"{kind}: {kept.title}, {len(kept.content):,} bytes" for kind, kept in self._files.items()]
+            self._files_text.content = box("<br>".join(map(escape, lines)), "font-size:12px;overflow-wrap:anywhere")
+            self._files_text.visible = True
+
+    def _open_upload(self) -> None:
+        with self._lock:
+            files = dict(self._files)
+        if self._pasted.value.strip():
+            files["calibration"] = File(PASTED, self._pasted.value.encode("utf-8", "replace"))
+        for what, kind in (("matches", "a CSV of matches"), ("calibration", "a calibration")):
+            if what not in files:
+                raise InputError(f"{kind} is missing; upload one.")
+        in_camera, in_map, bound = (field.value for field in self._gravity)
+        form = Form(files["matches"], files["calibration"], in_camera, in_map, bound, self._truth.value)
+        self._say("Reading the upload …")
+        path, scene = open_upload(form, self._scratch.new())
+        self._open_scene(Opened(UPLOADED + form.matches.title, path, scene))
+        self._say("")
+
+    def _open(self, place: str) -> None:
+        path = self._roots.find(place)
+        self._say(f"Opening {path.name} …")
+        scene = load_scene(path)
+        self._open_scene(Opened(scene.name, path, scene))
+        self._recent.note(path)
+        self._say("")
+        self._refresh()
+
+    def _walk(self, touch: Touch) -> None:
+        """Note which folder to show: "PAGE:PLACE", or nothing for none."""
+        page, _, place = touch.argument.partition(":")
+        with self._lock:
+            self._at = (place, int(page)) if page.isascii() and page.isdigit() and len(page) < 6 else None
+        self._errand.ask(self._refresh)
+
+    def _refresh(self) -> None:
+        """Show the list anew."""
+        with self._lock:
+            at = self._at
+        try:
+            listing = None if at is None else self._roots.look_into(*at)
+        except InputError:
+            with self._lock:
+                self._at = None
+            self._list.content = self._list_html(None)
+            raise
+        html = self._list_html(listing)
+        if self._list.content != html:
+            self._list.content = html
+
+    def _list_html(self, listing: Listing | None) -> str:
+        recent, remark = self._recent.read()
+        if not self._bundled:
+            self._bundled = self._described(bundled_scenes().values())
+        return list_html(listing, self._roots.folders, self._described(recent), self._bundled, remark)
+
+    def _described(self, paths: Iterable[Path]) -> list[Row]:
+        """Those of the files that are there and allowed."""
+        return [describe(path, place) for path in paths if (place := self._place(path)) is not None]
+
+    def _place(self, path: Path) -> str | None:
+        """What names a scene file to ``Roots.find``; None if it is gone or not allowed."""
+        try:
+            real = path.resolve()
+            return self._roots.place(real) if real.is_file() else None
+        except (OSError, ValueError, RuntimeError):
+            return None
+
+    def _say(self, words: str) -> None:
+        self._status.content, self._status.visible = status_html(words), bool(words)
+
+    def _complain(self, sentence: str) -> None:
+        if sentence.partition(" ")[0].isalpha():  # file names stay as they are
+            sentence = sentence[:1].upper() + sentence[1:]
+        self._status.content, self._status.visible = status_html(sentence, wrong=True), True

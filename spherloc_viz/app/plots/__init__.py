@@ -1,0 +1,1 @@
+"""Charts and views in two dimensions, as SVG."""

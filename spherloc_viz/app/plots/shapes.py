@@ -1,0 +1,150 @@
+"""Drawings as SVG, small and quick to make. Text and axes take the page's own colour, so they suit dark and light.
+
+Numbers are pixels of the drawing, which the page scales to the panel's width. Every text is escaped here.
+"""
+
+from collections.abc import Sequence
+from html import escape
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from spherloc_viz import style
+from spherloc_viz.app.plots.axes import FloatArray, Scale
+
+FONT_PX = 11.0
+MOST_CORNERS = 400
+"""Corners that a line keeps: about one a pixel."""
+TEXT_OPACITY, GRID_OPACITY, AXIS_OPACITY = 0.7, 0.12, 0.4
+
+
+def number(value: float) -> str:
+    """A coordinate, to 0.1 px."""
+    text = f"{value:.1f}"
+    return text[:-2] if text.endswith(".0") else text
+
+
+def svg(width_px: float, height_px: float, parts: Sequence[str], label: str) -> str:
+    """A drawing as wide as what it stands in; ``label`` is what a screen reader says."""
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {number(width_px)} {number(height_px)}" role="img" '
+        f'aria-label="{escape(label)}" font-size="{FONT_PX:g}" fill="currentColor" '
+        f'style="display:block;width:100%;height:auto;overflow:visible">{"".join(parts)}</svg>'
+    )
+
+
+def text(x: float, y: float, words: str, anchor: str = "start", more: str = "") -> str:
+    """Words whose baseline begins, ends ("end") or is centred ("middle") at a place; ``more`` are other attributes."""
+    at = "" if anchor == "start" else f' text-anchor="{anchor}"'
+    return f'<text x="{number(x)}" y="{number(y)}"{at} opacity="{TEXT_OPACITY}"{more}>{escape(words)}</text>'
+
+
+def text_width_px(words: str) -> float:
+    """About how wide words are."""
+    return 0.6 * FONT_PX * len(words)
+
+
+def tooltip(words: str) -> str:
+    """What the page shows while the pointer rests on the element that this stands in."""
+    return f"<title>{escape(words)}</title>"
+
+
+def rect(x: float, y: float, width: float, height: float, look: str, inside: str = "") -> str:
+    """A box; ``look`` are its other attributes, ``inside`` a tooltip."""
+    place = f'x="{number(x)}" y="{number(y)}" width="{number(max(width, 0.0))}" height="{number(max(height, 0.0))}"'
+    return f"<rect {place} {look}>{inside}</rect>" if inside else f"<rect {place} {look}/>"
+
+
+def line(x0: float, y0: float, x1: float, y1: float, look: str) -> str:
+    """A straight line."""
+    return f'<path d="M{number(x0)} {number(y0)}L{number(x1)} {number(y1)}" {look}/>'
+
+
+def dot(x: float, y: float, radius: float, look: str, inside: str = "") -> str:
+    """A circle; ``inside`` may be a tooltip."""
+    place = f'cx="{number(x)}" cy="{number(y)}" r="{number(radius)}"'
+    return f"<circle {place} {look}>{inside}</circle>" if inside else f"<circle {place} {look}/>"
+
+
+def stroke(color: style.RGB | None, width_px: float, more: str = "", fill: str = 'fill="none"') -> str:
+    """Attributes of an outline in a colour, or in the page's own."""
+    paint = "currentColor" if color is None else style.css(color)
+    return f'{fill} stroke="{paint}" stroke-width="{width_px:g}" stroke-linejoin="round"{more}'
+
+
+def fill(color: style.RGB, opacity: float = 1.0) -> str:
+    """Attributes of a surface."""
+    return f'fill="{style.css(color)}"' + (f' fill-opacity="{opacity:g}"' if opacity < 1.0 else "")
+
+
+def touch(action: str, drag: bool = False) -> str:
+    """Attributes of what can be pressed or, with ``drag``, dragged across."""
+    return f' data-touch="{escape(action)}"' + (" data-drag=''" if drag else "")
+
+
+def corners(x: ArrayLike, y: ArrayLike) -> str:
+    """Places as the data of a path, joined by straight lines; empty if there are none."""
+    flat = np.column_stack([np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)]).ravel().tolist()
+    return "M" + ("%.1f %.1fL" * (len(flat) // 2) % tuple(flat))[:-1] if flat else ""
+
+
+def thin(x: FloatArray, y: FloatArray, most: int = MOST_CORNERS) -> tuple[FloatArray, FloatArray]:
+    """At most ``most`` (4 or more) of a line's corners (K,): both ends, and the lowest and highest of each stretch."""
+    if len(x) <= most:
+        return x, y
+    inner = y[1:-1]
+    stretches = (most - 2) // 2
+    bounds = np.linspace(0, len(inner), stretches + 1).astype(np.int64)
+    keep = {0, len(x) - 1}
+    for start, end in zip(bounds[:-1].tolist(), bounds[1:].tolist(), strict=True):
+        if end > start:
+            part = inner[start:end]
+            keep |= {1 + start + int(np.argmin(part)), 1 + start + int(np.argmax(part))}
+    places = np.array(sorted(keep))
+    return x[places], y[places]
+
+
+def thin_steps(x: FloatArray, y: FloatArray, most: int = MOST_CORNERS) -> tuple[FloatArray, FloatArray]:
+    """At most ``most`` steps (K,), each the highest of those that it stands for."""
+    stride = -(-len(x) // most)
+    if stride <= 1:
+        return x, y
+    starts = np.arange(0, len(x), stride)
+    return x[starts], np.maximum.reduceat(y, starts)
+
+
+def steps(x_px: FloatArray, y_px: FloatArray, end_px: float, foot_px: float) -> str:
+    """The data of a path from the ground up, over steps that hold y[k] from x[k] to x[k + 1], the last until
+    ``end_px``, and down to the ground. Steps of equal height are joined.
+    """
+    if len(x_px) == 0:
+        return ""
+    x, y = np.round(x_px, 1), np.round(y_px, 1)
+    turns = np.flatnonzero(np.diff(y)) + 1
+    flat = np.column_stack([x[turns], y[turns]]).ravel().tolist()
+    return (
+        f"M{x[0]:.1f} {foot_px:.1f}V{y[0]:.1f}"
+        + "H%.1fV%.1f" * len(turns) % tuple(flat)
+        + f"H{end_px:.1f}V{foot_px:.1f}"
+    )
+
+
+def x_axis(scale: Scale, foot_px: float, ticks: Sequence[float], texts: Sequence[str], label: str = "") -> list[str]:
+    """The line under a plot, its ticks and their numbers, and what is measured, under the middle."""
+    faint = stroke(None, 1, f' opacity="{AXIS_OPACITY}"')
+    places = scale.px(ticks).tolist()
+    data = "".join(f"M{number(x)} {number(foot_px)}v4" for x in places)
+    parts = [f'<path d="M{number(scale.low_px)} {number(foot_px)}H{number(scale.high_px)}{data}" {faint}/>']
+    parts += [text(x, foot_px + 15, words, "middle") for x, words in zip(places, texts, strict=True)]
+    if label:
+        parts.append(text(0.5 * (scale.low_px + scale.high_px), foot_px + 29, label, "middle"))
+    return parts
+
+
+def y_axis(scale: Scale, left_px: float, right_px: float, ticks: Sequence[float], texts: Sequence[str]) -> list[str]:
+    """Faint lines across a plot at its ticks, and their numbers to the left."""
+    places = scale.px(ticks).tolist()
+    data = "".join(f"M{number(left_px)} {number(y)}H{number(right_px)}" for y in places)
+    faint = stroke(None, 1, f' opacity="{GRID_OPACITY}"')
+    grid = [f'<path d="{data}" {faint}/>'] if data else []
+    return grid + [text(left_px - 5, y + 4, words, "end") for y, words in zip(places, texts, strict=True)]

@@ -1,0 +1,1 @@
+"""The canvas: painting primitives, picking, the viewer's places."""

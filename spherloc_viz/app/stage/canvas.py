@@ -1,0 +1,85 @@
+"""One client's canvas: draws pictures, moves the viewer, and tells what is picked and dragged."""
+
+from collections.abc import Callable
+
+import viser
+
+from spherloc_viz.app.controls.display_controls import DisplayControls
+from spherloc_viz.app.stage import views
+from spherloc_viz.app.stage.painter import Painter
+from spherloc_viz.app.stage.true_camera import TrueCamera
+from spherloc_viz.app.wish import Run
+from spherloc_viz.layers.primitives import Picture
+
+FIRST_CHECKS, MOST_CHECKS, CHECK_S = 8, 40, 0.4
+"""A page that is still building itself drops its first view and reports that its viewer has not moved; a slow one for
+many checks."""
+
+
+class Canvas:
+    """What one client sees in three dimensions."""
+
+    def __init__(
+        self,
+        client: viser.ClientHandle,
+        display: DisplayControls,
+        picked: Callable[[tuple[int, ...], bool], None],
+        moved: Callable[[tuple[float, float, float, float]], None],
+        docked_px: int,
+    ) -> None:
+        """``picked`` gets numbers of correspondences in the problem, ``moved`` the true camera's new place.
+
+        ``docked_px`` is the width of the panels beside the canvas.
+        """
+        client.scene.set_up_direction("-y")
+        self._client, self._display = client, display
+        self._painter = Painter(client, picked)
+        self._camera = TrueCamera(client, moved)
+        self._docked_px, self._full_width = docked_px, client.camera.image_width
+        self._viewed: tuple[str, str, str] | None = None
+        self._checks, self._movable = 0, False
+
+    def draw(self, run: Run, picture: Picture, mesh: bytes | None, movable: bool) -> None:
+        """Show a picture of a run; ``mesh`` is the map's, and ``movable`` whether the true camera may be dragged."""
+        problem, layers = run.trace.problem, self._display.layers()
+        self._painter.draw(picture.scene, layers)
+        self._painter.draw_backdrop(mesh, problem.aligned.map_turn, "mesh" in layers)
+        if movable or self._movable:
+            truth = problem.truth_cam_from_map
+            self._camera.show(None if truth is None else problem.aligned.align_pose(truth), movable)
+            self._movable = movable
+        self._move_viewer(run, picture)
+
+    def check(self) -> float | None:
+        """Seconds to the next look at whether the page dropped its first view; None once it has had time enough."""
+        self._checks += 1
+        most = MOST_CHECKS if views.is_unmoved(self._client) else FIRST_CHECKS
+        return CHECK_S if self._checks <= most else None
+
+    def _move_viewer(self, run: Run, picture: Picture) -> None:
+        """Go where the person wants, or, if that is to follow the steps, where the step's subject reads best."""
+        wanted = self._display.take_view()
+        name, subject = views.fitting(picture)
+        fitting = (run.trace.problem.name, name, subject)
+        follows = self._display.follow and fitting != self._viewed
+        if wanted is None and (views.is_unmoved(self._client) or follows):
+            wanted = name
+        self._viewed = fitting
+        if wanted is not None:
+            views.look(self._client, views.find(wanted, picture, self._aspect()))
+
+    def _aspect(self) -> float:
+        """Width over height of the canvas."""
+        camera = self._client.camera
+        # The page tells its size before it docks the panels, and again some frames later.
+        docked = self._docked_px if camera.image_width == self._full_width else 0
+        return max(0.3, (camera.image_width - docked) / max(1, camera.image_height))
+
+
+def panel_widths_px(window_px: int) -> tuple[int, int]:
+    """Widths of the panels left and right of the canvas."""
+    return next(widths for least, widths in PANELS_PX if window_px >= least)
+
+
+PANELS_PX: tuple[tuple[int, tuple[int, int]], ...] = ((1600, (480, 400)), (0, (380, 340)))
+"""From this width of the window on: widths of the panels left and right."""

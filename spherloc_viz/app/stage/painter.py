@@ -1,0 +1,271 @@
+"""Draws a picture's primitives into one client's canvas, changing what is there rather than drawing anew."""
+
+from collections.abc import Callable, Hashable, Iterable
+from functools import cache, partial
+from typing import Any, Literal
+
+import numpy as np
+import trimesh
+import viser
+import viser.transforms as vtf
+
+from spherloc_viz.app.stage.colors import light_bytes, surface_bytes
+from spherloc_viz.app.stage.picking import inside, nearest, viewer_of
+from spherloc_viz.app.stage.texture import textured_glb
+from spherloc_viz.layers.primitives import Balls, Label, Mesh, Points, SceneItem, Segments, Textured
+
+OnPick = Callable[[tuple[int, ...], bool], None]
+"""Gets the correspondences (numbers in the problem) that were picked, and whether they extend the selection."""
+
+SHELLS = 12
+"""Nodes that share the balls of one primitive."""
+MOST_ROUND = 400
+"""Above this many, dots get fewer faces."""
+MOST_BATCHED = 3000
+"""Above this many, dots become a point cloud, which costs less."""
+LABEL_SCALE = 0.9
+"""Size of words, by viser's own."""
+
+
+class Painter:
+    """The canvas of one client. What is picked there is found here, by the ray of the click: so lines, dots of a
+    point cloud and balls within balls can be picked too, and a small dot within some pixels."""
+
+    def __init__(self, client: viser.ClientHandle | viser.ViserServer, on_pick: OnPick | None = None) -> None:
+        """``on_pick`` is called on viser's threads, and a click on nothing picks (). None is for a page that cannot
+        answer: a still one, which is drawn on a server."""
+        self._client = client
+        self._drawn: dict[str, tuple[Any, tuple, SceneItem]] = {}
+        self._textured: dict[str, tuple[Hashable, bytes | None]] = {}
+        self._shown: tuple[SceneItem, ...] = ()
+        self._backdrop: tuple[bytes, Any] | None = None
+        if on_pick is not None:
+            scene, extend = client.scene, partial(self._clicked, on_pick, True)
+            scene.on_click()(partial(self._clicked, on_pick, False))
+            scene.on_click(modifier="shift")(extend)
+            scene.on_click(modifier="cmd/ctrl")(extend)
+            scene.on_rect_select(modifier="shift")(partial(self._framed, on_pick))
+
+    def draw(self, items: Iterable[SceneItem], layers: frozenset[str]) -> None:
+        """Show these primitives, those of ``layers`` only, and hide all others."""
+        names, shown = set(), []
+        with self._client.atomic():
+            for item in items:
+                if item.layer in layers:
+                    shown.append(item)
+                if isinstance(item, Textured) and (item.layer not in layers or self._glb(item) is None):
+                    continue
+                look = _look(item)
+                for part in _parts(item):
+                    self._put(part, look)
+                    names.add(part.name)
+            for name, (handle, _, item) in self._drawn.items():
+                visible = name in names and item.layer in layers
+                if handle.visible != visible:
+                    handle.visible = visible
+        self._shown = tuple(shown)
+
+    def draw_backdrop(self, glb: bytes | None, aligned_from_map: np.ndarray, visible: bool) -> None:
+        """Show the map's mesh, a binary glTF in the map frame, behind the pictures of a run; None for none.
+
+        It belongs to the scene and not to the run, so that recordings, which must be small, do without it.
+        """
+        if self._backdrop is not None and self._backdrop[0] is not glb:
+            self._backdrop[1].remove()
+            self._backdrop = None
+        if glb is None:
+            return
+        if self._backdrop is None:
+            handle = self._client.scene.add_glb("/backdrop", glb, cast_shadow=False, receive_shadow=False)
+            self._backdrop = (glb, handle)
+        handle = self._backdrop[1]
+        handle.wxyz = vtf.SO3.from_matrix(aligned_from_map).wxyz
+        handle.visible = visible
+
+    def _put(self, item: SceneItem, look: tuple) -> None:
+        handle, known, last = self._drawn.get(item.name, (None, None, None))
+        if handle is None or known != look:
+            handle = _add(self._client.scene, item, self._glb(item) if isinstance(item, Textured) else None)
+        elif not _same(item, last):
+            for name, value in _changing(item).items():
+                setattr(handle, name, value)
+        self._drawn[item.name] = (handle, look, item)
+
+    def _glb(self, item: Textured) -> bytes | None:
+        """The item as a binary glTF; None if it has no picture."""
+        known = self._textured.get(item.name)
+        if known is None or known[0] != item.key:
+            image = item.image()
+            glb = None if image is None else textured_glb(item.vertices, item.faces, item.uv, image)
+            self._textured[item.name] = known = (item.key, glb)
+        return known[1]
+
+    def _clicked(self, on_pick: OnPick, extend: bool, event: viser.SceneClickEvent) -> None:
+        viewer = viewer_of(event.client.camera)
+        origin, direction = np.array(event.ray_origin), np.array(event.ray_direction)
+        on_pick(nearest(self._shown, origin, direction, viewer.radians_per_pixel), extend)
+
+    def _framed(self, on_pick: OnPick, event: viser.SceneRectSelectEvent) -> None:
+        on_pick(inside(self._shown, viewer_of(event.client.camera), event.screen_min, event.screen_max), False)
+
+
+def _parts(item: SceneItem) -> list[SceneItem]:
+    """The item as nodes that are drawn one after another; none if there is nothing to draw.
+
+    Balls within balls: a translucent surface hides what is drawn after it and lies behind. Within a node viser draws
+    by distance of the centres, which says nothing about balls around one spot; but nodes are drawn in the order in
+    which they were added. So balls are drawn in shells, the smallest first.
+    """
+    if not _size(item):
+        return []
+    if not isinstance(item, Balls):
+        return [item]
+    shells = np.array_split(np.argsort(item.radii_m, kind="stable"), min(SHELLS, len(item.radii_m)))
+    return [
+        Balls(f"{item.name}/{k}", item.layer, item.centers[at], item.radii_m[at], item.colors[at], item.opacity)
+        for k, at in enumerate(shells)
+    ]
+
+
+def _size(item: SceneItem) -> int:
+    """How many things it draws; viser cannot draw none."""
+    match item:
+        case Points():
+            return len(item.positions)
+        case Segments():
+            return len(item.points)
+        case Balls():
+            return len(item.centers)
+        case Mesh() | Textured():
+            return len(item.faces)
+        case Label():
+            return int(item.text != "")
+
+
+def _look(item: SceneItem) -> tuple:
+    """What cannot change without adding the node anew: its kind, its size, and what viser sets once."""
+    extra: tuple = ()
+    match item:
+        case Points():
+            extra = (item.rim,)
+        case Mesh():
+            extra = (len(item.vertices), item.color, item.opacity)
+        case Balls():
+            extra = (item.opacity,)
+        case Segments():
+            extra = (item.width_px,)
+        case Label():
+            extra = (item.height_m is None,)
+        case Textured():
+            extra = (item.key,)
+    return (type(item), _size(item), *extra)
+
+
+def _same(item: SceneItem, other: SceneItem | None) -> bool:
+    """Whether a node that shows the one shows the other; viser compares too, but slowly."""
+    seen, known = vars(item), vars(other)
+    return all(seen[name] is known[name] or np.array_equal(seen[name], known[name]) for name in _SHOWN[type(item)])
+
+
+_SHOWN: dict[type[SceneItem], tuple[str, ...]] = {
+    Points: ("positions", "colors", "radius_m"),
+    Segments: ("points", "colors"),
+    Balls: ("centers", "radii_m", "colors"),
+    Mesh: ("vertices", "faces"),
+    Textured: ("map_from_mesh",),
+    Label: ("position", "text", "height_m"),
+}
+"""Fields that a node follows."""
+
+
+def _changing(item: SceneItem) -> dict[str, Any]:
+    """The properties of a node that follow the item."""
+    match item:
+        case Points() if len(item.positions) > MOST_BATCHED:
+            return {"points": np.float32(item.positions), "colors": item.colors, "point_size": 2.0 * item.radius_m}
+        case Points():
+            return _instances(item.positions, np.full(len(item.positions), item.radius_m), item.colors)
+        case Segments():
+            colors = np.repeat(light_bytes(item.colors)[:, None], 2, axis=1)
+            return {"points": np.float32(item.points), "colors": colors}
+        case Balls():
+            return _instances(item.centers, item.radii_m, item.colors)
+        case Mesh():
+            return {"vertices": np.float32(item.vertices), "faces": np.uint32(item.faces)}
+        case Textured():
+            turn = item.map_from_mesh[:, :3]
+            scale = float(np.cbrt(np.linalg.det(turn)))
+            wxyz = vtf.SO3.from_matrix(turn / scale).wxyz
+            return {"wxyz": wxyz, "position": item.map_from_mesh[:, 3], "scale": scale}
+        case Label():
+            height = {} if item.height_m is None else {"font_scene_height": item.height_m}
+            return {"text": item.text, "position": item.position, **height}
+
+
+def _instances(positions: np.ndarray, radii_m: np.ndarray, colors: np.ndarray) -> dict[str, Any]:
+    return {
+        "batched_positions": np.float32(positions),
+        "batched_scales": np.float32(radii_m),
+        "batched_colors": light_bytes(colors),
+    }
+
+
+@cache
+def _unit_ball(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
+    mesh = trimesh.creation.icosphere(subdivisions=subdivisions)
+    return np.asarray(mesh.vertices), np.asarray(mesh.faces)
+
+
+def _add(scene: viser.SceneApi, item: SceneItem, glb: bytes | None) -> Any:
+    name, props = f"/{item.name}", _changing(item)
+    match item:
+        case Points() if "points" in props:
+            return scene.add_point_cloud(name, point_shape="circle", precision="float32", **props)
+        case Points():
+            fine = len(item.positions) <= MOST_ROUND
+            return _add_batch(scene, name, 2 if fine else 1, None, props, "back" if item.rim else "front")
+        case Segments():
+            return scene.add_line_segments(name, thickness=item.width_px, thickness_units="screen", **props)
+        case Balls():
+            return _add_batch(scene, name, 3, item.opacity, props)
+        case Mesh():
+            return scene.add_mesh_simple(
+                name,
+                color=surface_bytes(np.array(item.color, np.uint8)),
+                opacity=item.opacity,
+                cast_shadow=False,
+                receive_shadow=False,
+                **props,
+            )
+        case Textured():
+            assert glb is not None
+            return scene.add_glb(name, glb, cast_shadow=False, receive_shadow=False, **props)
+        case Label():
+            mode = "screen" if item.height_m is None else "scene"
+            return scene.add_label(
+                name, font_size_mode=mode, font_screen_scale=LABEL_SCALE, anchor="center-center", **props
+            )
+
+
+def _add_batch(
+    scene: viser.SceneApi,
+    name: str,
+    subdivisions: int,
+    opacity: float | None,
+    props: dict[str, Any],
+    side: Literal["front", "back"] = "front",
+) -> Any:
+    vertices, faces = _unit_ball(subdivisions)
+    upright = np.tile(np.array([1.0, 0.0, 0.0, 0.0], np.float32), (len(props["batched_positions"]), 1))
+    return scene.add_batched_meshes_simple(
+        name,
+        vertices,
+        faces,
+        batched_wxyzs=upright,
+        opacity=opacity,
+        lod="off",
+        cast_shadow=False,
+        receive_shadow=False,
+        side=side,
+        **props,
+    )

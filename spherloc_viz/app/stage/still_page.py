@@ -1,0 +1,119 @@
+"""A scene as one HTML file that opens from the disk: viser's page with the scene, a title and a legend inside."""
+
+import base64
+import hashlib
+import re
+import secrets
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+from typing import Any
+
+import numpy as np
+
+from spherloc_viz import style
+from spherloc_viz.app.stage.painter import Painter
+from spherloc_viz.app.web.page import QUIET
+from spherloc_viz.app.web.viser_seams import start_viser, stop_viser
+from spherloc_viz.layers.primitives import FloatArray, SceneItem
+
+_one_at_a_time = threading.Lock()
+"""Starting and stopping a viser server changes what belongs to the whole process for a moment."""
+
+
+@dataclass(frozen=True, eq=False)
+class Still:
+    """What the file shows."""
+
+    title: str
+    note: str
+    """A line under the title."""
+    items: Sequence[SceneItem]
+    backdrop: bytes | None
+    """The map's mesh, a binary glTF in the map frame, if it is shown."""
+    aligned_from_map: FloatArray
+    """Rotation (3, 3) of that mesh."""
+    position: FloatArray
+    """(3,) where the viewer stands."""
+    target: FloatArray
+    """(3,) where it looks."""
+    up: FloatArray
+    """(3,)."""
+    field_of_view_rad: float
+    """From top to bottom."""
+    dark: bool
+
+
+def still_html(still: Still) -> str:
+    """The file. Takes about a second."""
+    page = _embed(_replay(still), still)
+    return page.replace("<head>", f'<head><meta http-equiv="Content-Security-Policy" content="{_policy(page)}">', 1)
+
+
+def _replay(still: Still) -> str:
+    """Viser's page with the scene in it.
+
+    What one client is shown cannot be saved; only what a server shows to all can be. So a server is started for this.
+    """
+    layers = frozenset(item.layer for item in still.items)
+    with _one_at_a_time:
+        server: Any = start_viser(secrets.token_urlsafe(32))
+        try:
+            server.scene.world_axes.visible = False
+            server.scene.set_up_direction("-y")
+            camera = server.initial_camera
+            camera.up, camera.fov = tuple(still.up), still.field_of_view_rad
+            camera.position, camera.look_at = tuple(still.position), tuple(still.target)
+            server.gui.configure_theme(dark_mode=still.dark, show_logo=False, show_share_button=False)
+            painter = Painter(server)
+            painter.draw(still.items, layers)
+            painter.draw_backdrop(still.backdrop, still.aligned_from_map, True)
+            return server.get_scene_serializer().as_html(dark_mode=still.dark)
+        finally:
+            stop_viser(server)
+
+
+def _embed(page: str, still: Still) -> str:
+    """The page with its title and legend, which lie over the canvas."""
+    color = "#e8e8ea" if still.dark else "#1a1b1e"
+    # At the bottom, since viser's own notes come down from the top.
+    where = "position:fixed;left:16px;right:16px;bottom:12px;z-index:10;pointer-events:none"
+    place = f"{where};font-family:system-ui,sans-serif;font-size:13px;color:{color}"
+    dot = "display:inline-block;width:.75em;height:.75em;border-radius:50%;margin-right:.4em"
+    legend = "".join(
+        f'<span style="margin-right:1.1em;white-space:nowrap"><span style="{dot};background:{style.css(paint)}"></span>'
+        f"{escape(meaning)}</span>"
+        for paint, meaning in style.LEGEND
+    )
+    over = (
+        f'<div style="{place}"><div style="font-size:17px;font-weight:600">{escape(still.title)}</div>'
+        f'<div style="opacity:.75">{escape(still.note)}</div>'
+        f'<div style="font-size:12.5px;line-height:1.6;padding-top:.3em">{legend}</div></div>'
+    )
+    head = f"<title>{escape(still.title)}</title>{QUIET}"
+    page = re.sub(r"<title>[^<]*</title>", lambda match: head, page, count=1)
+    at = page.rindex("</body>")
+    return page[:at] + over + page[at:]
+
+
+def _policy(page: str) -> str:
+    """A policy under which nothing is fetched and no other script runs, so that the file needs and uses no network."""
+    scripts = re.findall(r"<script\b[^>]*>(.*?)</script>", page, flags=re.DOTALL)
+    hashes = [base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in scripts]
+    allowed = " ".join(f"'sha256-{digest}'" for digest in hashes)
+    return (
+        f"default-src 'none'; script-src {allowed} 'strict-dynamic' 'wasm-unsafe-eval'; style-src 'unsafe-inline'; "
+        "img-src data: blob:; font-src data:; worker-src blob: data:; connect-src data: blob:; base-uri 'none'; "
+        "form-action 'none'"
+    )
+
+
+def viewpoint(camera: Any) -> dict[str, Any]:
+    """Position, target, up and field of view of a client's camera."""
+    return {
+        "position": np.array(camera.position),
+        "target": np.array(camera.look_at),
+        "up": np.array(camera.up_direction),
+        "field_of_view_rad": float(camera.fov),
+    }

@@ -1,0 +1,68 @@
+"""viser's one-file page as the front door serves it: own title, and a content security policy that fits it."""
+
+import base64
+import gzip
+import hashlib
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import viser
+
+QUIET = (
+    "<script>addEventListener('unhandledrejection',e=>{if(e.reason instanceof EvalError)e.preventDefault()})</script>"
+)
+"""viser loads a sorter for Gaussian splats that wants ``eval``. The policy denies it, nobody here draws splats,
+and the console stays clean for errors that matter."""
+TOUCH = "<style>{css}</style><script>{script}</script>"
+"""What reports presses, see ``spherloc_viz.app.web.touch``."""
+
+
+@dataclass(frozen=True)
+class Page:
+    """The page and what may run in it."""
+
+    html: bytes
+    zipped: bytes
+    """The same, gzip compressed."""
+    policy: str
+    """The content security policy."""
+
+
+def load_page() -> Page:
+    """The page of the installed viser."""
+    path = Path(viser.__file__).parent / "client" / "build" / "index.html"
+    html = path.read_text(encoding="utf-8")
+    own = Path(__file__).parent
+    css, script = (own.joinpath(name).read_text(encoding="utf-8") for name in ("touch.css", "touch.js"))
+    ours = QUIET + TOUCH.format(css=css, script=script)
+    html = html.replace("<title>Viser</title>", f"<title>spherloc</title>{ours}", 1)
+    data = html.encode()
+    return Page(html=data, zipped=gzip.compress(data, mtime=0), policy=content_policy(html))
+
+
+def content_policy(html: str) -> str:
+    """A policy under which the page runs with no network but this server, and nothing else runs in it.
+
+    - Scripts: the page's own inline loader by its hash, and what that loader inserts; so neither text from a
+      scene file nor viser's "run this JavaScript" message can execute anything.
+    - Connections: this server only; a link with ``?websocket=`` or ``?playbackPath=`` cannot point elsewhere.
+    - No frames: another site cannot lay this page under its own buttons.
+    """
+    scripts = re.findall(r"<script\b[^>]*>(.*?)</script>", html, flags=re.DOTALL)
+    hashes = [base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in scripts]
+    rules = {
+        "default-src": "'none'",
+        "script-src": " ".join(
+            [f"'sha256-{digest}'" for digest in hashes] + ["'strict-dynamic'", "'wasm-unsafe-eval'"]
+        ),
+        "style-src": "'unsafe-inline'",
+        "img-src": "'self' data: blob:",
+        "font-src": "data:",
+        "worker-src": "blob: data:",
+        "connect-src": "'self' data: blob:",
+        "base-uri": "'none'",
+        "form-action": "'none'",
+        "frame-ancestors": "'none'",
+    }
+    return "; ".join(f"{name} {value}" for name, value in rules.items())
