@@ -22,8 +22,9 @@ from spherloc.errors import InputError
 from spherloc.estimators import warm_up
 from spherloc_viz.app.catalog import SceneWish
 from spherloc_viz.app.panels import sweep_runs_panel
+from spherloc_viz.app.panels.estimator_chips import chips_html
 from spherloc_viz.app.panels.sweep_runs_panel import CANCEL, START, SweepPanel
-from spherloc_viz.app.plots.sweep_charts import charts_html, chips_html, sweep_svg, table_html
+from spherloc_viz.app.plots.sweep_charts import charts_html, sweep_svg, table_html
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.web.viser_seams import start_viser, stop_viser
 from spherloc_viz.layers.primitives import Chart, Curve

@@ -93,6 +93,9 @@ class Session:
     def redraw(self, event: object = None) -> None:
         """The page is to be drawn anew."""
         self._page.ask()
+        # Once a hand has rested, the page is told what its widgets are: it may have lost a change on its way here.
+        if getattr(event, "client", None) is not None:
+            self._solver.ask()
 
     def open(self, wish: Wish) -> None:
         """Have the page ask for this."""

@@ -58,8 +58,9 @@ def diagnosis_html(diagnosis: Diagnosis, whole: bool) -> str:
     """Cause and summary and, if ``whole``, evidence and advice; of a run that looks right, the summary alone."""
     if not diagnosis.doubtful:
         return box(f'<div style="{DIM}">{escape(diagnosis.summary)}</div>', "font-size:12px")
+    color = style.css_text(style.OUTLIER)
     parts = [
-        f'<div style="font-weight:600;color:{style.css(style.OUTLIER)}">{escape(diagnosis.cause.capitalize())}</div>',
+        f'<div style="font-weight:600;color:{color}">{escape(diagnosis.cause.capitalize())}</div>',
         f"<div>{escape(diagnosis.summary)}</div>",
     ]
     if whole:
@@ -87,18 +88,23 @@ def summary_html(trace: Trace) -> str:
 
 def _value_css(value: object) -> str:
     color = WORDS.get(str(value))
-    return f"color:{style.css(color)};font-weight:600" if color else "font-variant-numeric:tabular-nums"
+    return f"color:{style.css_text(color)};font-weight:600" if color else "font-variant-numeric:tabular-nums"
 
 
 def legend_html() -> str:
     """What each colour means."""
     items = "".join(
         '<span style="white-space:nowrap;margin-right:.9em;display:inline-block">'
-        '<span style="display:inline-block;width:.75em;height:.75em;border-radius:50%;margin-right:.35em;'
-        f'background:{style.css(color)}"></span>{escape(meaning)}</span>'
+        f"{dot_html(color)}{escape(meaning)}</span>"
         for color, meaning in style.LEGEND
     )
     return box(items, "font-size:12px")
+
+
+def dot_html(color: style.RGB) -> str:
+    """A dot of a colour before a name."""
+    look = "display:inline-block;width:.7em;height:.7em;border-radius:50%;margin-right:.4em"
+    return f'<span style="{look};background:{style.css(color)}"></span>'
 
 
 def ramp_html(best: str, worst: str) -> str:
@@ -111,5 +117,5 @@ def ramp_html(best: str, worst: str) -> str:
 
 def status_html(sentence: str, wrong: bool = False) -> str:
     """A line about what is going on; red if something went wrong."""
-    color = f"color:{style.css(style.OUTLIER)}" if wrong else DIM
+    color = f"color:{style.css_text(style.OUTLIER)}" if wrong else DIM
     return box(f'<div style="{color};overflow-wrap:anywhere">{escape(sentence)}</div>', "font-size:12px")

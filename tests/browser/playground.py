@@ -261,11 +261,9 @@ class Playground:
 
     def carded(self) -> list[int]:
         """Numbers of the matches that the selection card is about; empty if there is no card."""
-        one = self.page.get_by_text(re.compile(r"^Match \d+$"))
-        if one.count() and one.is_visible():
-            return [int(one.inner_text().split()[1])]
-        many = self.value("numbers")
-        return list(map(int, many.inner_text().split(", "))) if many.count() and many.is_visible() else []
+        one = self.page.get_by_text(re.compile(r"^Match \d+$")).locator("visible=true").all_inner_texts()
+        many = self.value("numbers").locator("visible=true").all_inner_texts()
+        return [int(number) for number in re.findall(r"\d+", " ".join(one + many))]
 
     def expect_card(self, *numbers: int) -> None:
         """Wait until the card is about these matches, or gone."""

@@ -18,11 +18,11 @@ from spherloc.trace import Trace
 from spherloc.watch import Cancelled, Watch
 from spherloc_viz import style
 from spherloc_viz.app.panels.errand import Errand
+from spherloc_viz.app.panels.estimator_chips import chips_html, ordered
 from spherloc_viz.app.plots.svg import chart_svg
-from spherloc_viz.app.text import DIM, WORDS, box, status_html
+from spherloc_viz.app.text import DIM, WORDS, box, dot_html, status_html
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.layers.comparison import (
-    FIRST,
     NO_VALUE,
     Entry,
     coinciding,
@@ -72,9 +72,9 @@ class ComparePanel:
     ) -> None:
         """``use`` is called with the estimator of a row that is pressed, ``changed`` when there is more to show."""
         self._use, self._changed = use, changed
-        self._names = _ordered(registry.names("estimators"))
+        self._names = ordered(registry.names("estimators"))
         self._ticked = {name for name in self._names if name in TICKED}
-        self._choice = gui.add_html(self._chips())
+        self._choice = gui.add_html(chips_html("compare", self._names, self._ticked))
         self._button = gui.add_button(START, hint="Run the ticked estimators on the problem at hand.")
         self._live = gui.add_checkbox("Live", False, hint="Compare again whenever the problem changes.")
         self._bar = gui.add_progress_bar(0.0, visible=False)
@@ -131,7 +131,7 @@ class ComparePanel:
         if touch.argument in self._names:
             with self._lock:
                 self._ticked ^= {touch.argument}
-                self._choice.content = self._chips()
+                self._choice.content = chips_html("compare", self._names, self._ticked)
             if self._live.value:
                 self._start()
 
@@ -213,10 +213,6 @@ class ComparePanel:
             self._shown = (done, fits)
             self._table.content = comparison_html(done.entries, done.charts, fits)
 
-    def _chips(self) -> str:
-        chips = "".join(_chip(name, name in self._ticked) for name in self._names)
-        return box(f'<div style="display:flex;flex-wrap:wrap;gap:.35em">{chips}</div>', "font-size:12px")
-
 
 def _run(trace: Trace, name: str, watch: Watch) -> Trace:
     """An estimator on the problem of a run; its own first run in this process goes before, unseen.
@@ -267,7 +263,8 @@ def _row_html(table: Table, row: tuple) -> str:
     touch = f'data-touch="use:{escape(name)}" title="Use {escape(name)}"'
     cell = 'style="padding:.35em 0 0 .5em;text-align:right;white-space:nowrap"'
     numbers = "".join(f"<td {cell}>{escape(value[column])}</td>" for column in MEASURED)
-    head = f'<td style="padding-top:.35em;white-space:nowrap;font-weight:600">{_swatch(name)}{escape(name)}</td>'
+    title = dot_html(color_of(name)) + escape(name)
+    head = f'<td style="padding-top:.35em;white-space:nowrap;font-weight:600">{title}</td>'
     shares = ("inliers", "precision", "recall")
     words = [f"{value[share]} {share}" for share in shares if value[share] not in (NO_VALUE, "0")]
     words += [value[column] for column in ("certificate", "diagnosis") if value[column] not in (NO_VALUE, Cause.OK)]
@@ -277,25 +274,3 @@ def _row_html(table: Table, row: tuple) -> str:
     below = f'<td colspan="{1 + len(MEASURED)}" style="padding:0 0 .35em 1.15em">{line}</td>'
     rule = 'style="border-top:1px solid rgba(128,140,160,.25)"'
     return f"<tr {touch} {rule}>{head}{numbers}</tr><tr {touch}>{below}</tr>"
-
-
-def _chip(name: str, ticked: bool) -> str:
-    look = f"border:1px solid rgba(128,140,160,{0.8 if ticked else 0.3});opacity:{1 if ticked else 0.55}"
-    return (
-        f'<span role="checkbox" aria-checked="{str(ticked).lower()}" aria-label="{escape(name)}" tabindex="0" '
-        f'data-touch="compare:{escape(name)}" style="white-space:nowrap;border-radius:1em;padding:.1em .6em;{look}">'
-        f"{_swatch(name)}{escape(name)}</span>"
-    )
-
-
-def _swatch(estimator: str) -> str:
-    return _dot(color_of(estimator))
-
-
-def _dot(color: style.RGB) -> str:
-    look = "display:inline-block;width:.7em;height:.7em;border-radius:50%;margin-right:.4em"
-    return f'<span style="{look};background:{style.css(color)}"></span>'
-
-
-def _ordered(names: Sequence[str]) -> tuple[str, ...]:
-    return tuple(sorted(names, key=lambda name: (FIRST.index(name) if name in FIRST else len(FIRST), name)))

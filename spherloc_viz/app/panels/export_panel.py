@@ -22,7 +22,7 @@ from spherloc_viz.recording.writer import write_recording
 
 PATIENCE_S = 60.0
 """A page that draws in software takes some ten seconds for a picture of its canvas."""
-CANVAS = {True: (26, 27, 30), False: (255, 255, 255)}
+CANVAS = {True: (20, 20, 20), False: (255, 255, 255)}
 """What the canvas has behind everything, by whether the page is dark."""
 
 

@@ -16,10 +16,10 @@ from spherloc.experiments.sweep import AXES, Entrant, SweepPlan, SweepRow, plann
 from spherloc.experiments.sweep_summary import rows_text, summarize, summary_text
 from spherloc.experiments.sweep_text import parse_values
 from spherloc_viz.app.catalog import SceneWish
-from spherloc_viz.app.plots.sweep_charts import charts_html, chips_html, table_html
+from spherloc_viz.app.panels.estimator_chips import chips_html, ordered
+from spherloc_viz.app.plots.sweep_charts import charts_html, table_html
 from spherloc_viz.app.text import status_html
 from spherloc_viz.app.web.touch import Touch, Touches
-from spherloc_viz.layers.comparison import FIRST
 
 START, CANCEL = "Start sweep", "Cancel"
 VALUES = {
@@ -62,7 +62,7 @@ class SweepPanel:
         """``chosen`` tells the file of the page's scene and what is changed about it; it may raise ``InputError``."""
         self._chosen = chosen
         names = registry.names("estimators")
-        self._names = tuple(sorted(names, key=lambda name: (FIRST.index(name) if name in FIRST else len(FIRST), name)))
+        self._names = ordered(names)
         self._ticked = {name for name in self._names if name in TICKED}
         self._chips = gui.add_html(chips_html("sweep", self._names, self._ticked))
         self._over = gui.add_dropdown("Over", tuple(AXES.values()), hint="What takes several values.")

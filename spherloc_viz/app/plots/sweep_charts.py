@@ -6,11 +6,10 @@ from html import escape
 import numpy as np
 
 from spherloc.experiments.sweep_summary import Point
-from spherloc_viz import style
 from spherloc_viz.app.plots import shapes
 from spherloc_viz.app.plots.axes import Scale, decade_ticks, round_ticks, tick_texts
 from spherloc_viz.app.plots.svg import curve_parts
-from spherloc_viz.app.text import DIM, box
+from spherloc_viz.app.text import DIM, box, dot_html
 from spherloc_viz.layers.sweep import LIMIT, SweepChart, sweep_charts, sweep_colors, sweep_table
 
 SHOWN = ("sweep success", "sweep position", "sweep time")
@@ -96,25 +95,3 @@ def table_html(over: str, labels: Sequence[str], points: Sequence[Point]) -> str
     body = f'<table style="border-collapse:collapse;width:100%"><tr><td></td>{head}</tr>{rows}</table>'
     css = "font-size:11.5px;font-variant-numeric:tabular-nums"
     return box(f'<div style="max-height:{TABLE_PX}px;overflow:auto">{body}</div>', css)
-
-
-def chips_html(action: str, names: Sequence[str], ticked: set[str]) -> str:
-    """Names to be ticked; a press is reported as ``action`` with the name."""
-    chips = "".join(_chip(action, name, name in ticked) for name in names)
-    return box(f'<div style="display:flex;flex-wrap:wrap;gap:.35em">{chips}</div>', "font-size:12px")
-
-
-def _chip(action: str, name: str, ticked: bool) -> str:
-    look = f"border:1px solid rgba(128,140,160,{0.8 if ticked else 0.3});opacity:{1 if ticked else 0.55}"
-    return (
-        f'<span role="checkbox" aria-checked="{str(ticked).lower()}" aria-label="{escape(name)}" tabindex="0" '
-        f'data-touch="{escape(action)}:{escape(name)}" '
-        f'style="white-space:nowrap;border-radius:1em;padding:.1em .6em;{look}">'
-        f"{dot_html(sweep_colors([name])[name])}{escape(name)}</span>"
-    )
-
-
-def dot_html(color: style.RGB) -> str:
-    """A dot of a colour before a name."""
-    look = "display:inline-block;width:.7em;height:.7em;border-radius:50%;margin-right:.4em"
-    return f'<span style="{look};background:{style.css(color)}"></span>'

@@ -105,6 +105,12 @@
   setInterval(look, LOOK_EVERY_MS);
 
   addEventListener("keydown", (event) => {
+    const writing = event.target instanceof Element && event.target.closest("input,textarea,[role=listbox]");
+    if (event.key === "Escape" && !writing) {
+      const corner = { left: 0, top: 0, width: 1, height: 1 };
+      tell("deselect:", corner, { clientX: 0, clientY: 0 }, { x: 0, y: 0 });
+      return;
+    }
     if ((event.key !== "Enter" && event.key !== " ") || !(event.target instanceof Element)) return;
     if (!event.target.matches(TOUCHABLE)) return;
     event.preventDefault();
