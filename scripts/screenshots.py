@@ -82,7 +82,7 @@ def sweep(page: Page) -> None:
     entry = label.locator("xpath=ancestor::*[contains(@class, 'Flex-root')][1]").locator("input")
     entry.fill("8")
     entry.press("Enter")
-    press(page, "Start")
+    press(page, "Start sweep")
     page.get_by_role("button", name="CSV", exact=True).wait_for(timeout=PATIENCE_MS)
     page.wait_for_timeout(1500)
 

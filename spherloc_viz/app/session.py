@@ -17,6 +17,7 @@ from spherloc.problem import Problem
 from spherloc.trace import Trace
 from spherloc.watch import Cancelled
 from spherloc_viz.app.catalog import SceneWish
+from spherloc_viz.app.echo import Echo
 from spherloc_viz.app.edits import Edits
 from spherloc_viz.app.face import Face
 from spherloc_viz.app.history import History
@@ -53,7 +54,7 @@ class Session:
         self._solver = Newest(f"spherloc-solver-{number}", self._guarded(self._solve))
         self._page = Newest(f"spherloc-page-{number}", self._guarded(self._show))
         self._doctor = Newest(f"spherloc-doctor-{number}", self._guarded(self._examine))
-        self._edits, self._history = Edits(), History()
+        self._edits, self._history, self._echo = Edits(), History(), Echo()
         self._opened: Wish | None = None
         self._run: Run | None = None
         self._diagnosed: tuple[Trace, Diagnosis] | None = None
@@ -86,16 +87,19 @@ class Session:
     def changed(self, event: object = None) -> None:
         """A widget that a run depends on was changed by a hand on the page."""
         # Widgets that Python itself sets have no client; what they mean is known already.
-        if event is None or getattr(event, "client", None) is not None:
+        touched = getattr(event, "client", None) is not None
+        if touched:
+            self._echo.hear(time.monotonic())
+        if event is None or touched:
             self._controls.slow.outdate()
             self._solver.ask()
 
     def redraw(self, event: object = None) -> None:
         """The page is to be drawn anew."""
         self._page.ask()
-        # Once a hand has rested, the page is told what its widgets are: it may have lost a change on its way here.
         if getattr(event, "client", None) is not None:
-            self._solver.ask()
+            self._echo.hear(time.monotonic())
+            self._solver.ask()  # which puts the page right once the hand has rested
 
     def open(self, wish: Wish) -> None:
         """Have the page ask for this."""
@@ -207,8 +211,9 @@ class Session:
 
     def _settle(self) -> float | None:
         """Put the page's widgets right, and record its run; returns seconds to the next attempt if that must wait."""
-        for widget in self._controls.widgets + self._face.story.steps.widgets:
-            put_back(widget)
+        if self._echo.take(time.monotonic()):
+            for widget in self._controls.widgets + self._face.story.steps.widgets:
+                put_back(widget)
         run, recorder = self._run, self._services.recorder
         if run is None:
             return None

@@ -16,13 +16,13 @@ class Status:
 
     def __init__(self, client: viser.ClientHandle) -> None:
         self._client = client
-        self._line = client.gui.add_html(status_html("Solving the first problem …"))
+        self._line = client.gui.add_html(_line_html("Solving the first problem …"))
         self._complaint: tuple[str, viser.NotificationHandle] | None = None
         self._lock = threading.Lock()
 
     def say(self, sentence: str) -> None:
         """Say what goes on."""
-        html = status_html(sentence)
+        html = _line_html(sentence)
         if self._line.content != html:
             self._line.content = html
 
@@ -30,7 +30,7 @@ class Status:
         """Say in one sentence what went wrong; the page keeps its last run and stays usable."""
         sentence = sentence[:1].upper() + sentence[1:]
         with self._lock:
-            self._line.content = status_html(sentence, wrong=True)
+            self._line.content = _line_html(sentence, wrong=True)
             if self._complaint is not None:
                 if self._complaint[0] == sentence:
                     return
@@ -52,3 +52,8 @@ class Status:
             if self._complaint is not None:
                 self._complaint[1].remove()
                 self._complaint = None
+
+
+def _line_html(sentence: str, wrong: bool = False) -> str:
+    """As high as two lines, so that widgets below do not jump under a hand when the sentence gets longer."""
+    return f'<div style="font-size:12px;min-height:3.4em">{status_html(sentence, wrong)}</div>'

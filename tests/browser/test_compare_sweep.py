@@ -27,6 +27,7 @@ RANSAC = "ransac-2p (two points)"
 COMPARED = ("mc-exact", "mc", "ransac-2p")
 ITERATIONS = "10000000"
 """With 5000 matches these take half a minute."""
+CELLS = "rows => rows.map(row => [...row.cells].map(cell => cell.innerText))"
 
 pytestmark = [pytest.mark.browser, pytest.mark.timeout(280)]
 
@@ -64,7 +65,7 @@ def tick_only(tab: Playground, kind: str, wanted: tuple[str, ...]) -> None:
 
 def compared_rows(tab: Playground) -> dict[str, tuple[str, ...]]:
     """The comparison's table: by estimator rotation, position and F1, and what is said below."""
-    texts = [row.locator("td").all_inner_texts() for row in tab.page.locator("tr[data-touch^='use:']").all()]
+    texts = tab.page.locator("tr[data-touch^='use:']").evaluate_all(CELLS)
     pairs = zip(texts[::2], texts[1::2], strict=True)
     return {numbers[0].strip(): (*numbers[1:4], below[0].strip()) for numbers, below in pairs}
 
@@ -256,8 +257,7 @@ def test_a_sweep_to_its_end(page: Playground, server: tuple[str, int], scene: Pa
     rows = list(csv.DictReader(io.StringIO(content.decode())))
     found = {(row["estimator"], row["outlier_rate"], row["seed"]) for row in rows}
     assert found == set(itertools.product(("mc-exact", "ransac-2p"), ("0.3", "0.9"), "345"))
-    table = tab.page.locator("tr", has_text=re.compile("^(mc-exact|ransac-2p)0\\.")).all()
-    cells = [row.locator("td").all_inner_texts() for row in table]
+    cells = tab.page.locator("tr", has_text=re.compile("^(mc-exact|ransac-2p)0\\.")).evaluate_all(CELLS)
     assert {(row[0].strip(), row[1]): tuple(row[2:]) for row in cells} == said_of(rows)
     # The rows are what the core computes.
     for row in rows:

@@ -1,5 +1,6 @@
 """Scenes from elsewhere and uploads come onto the page, and what is seen leaves it as files."""
 
+import io
 import re
 import time
 from collections.abc import Callable, Iterator
