@@ -46,7 +46,7 @@ def painted_frames(address: str, moves: int) -> np.ndarray:
 
         def entry(label: str):
             name = page.locator("label", has_text=label).first
-            return name.locator("xpath=ancestor::*[contains(@class, 'Flex-root')][1]").locator("input")
+            return name.locator("xpath=ancestor::*[contains(@class, 'Flex-root')][1]").locator("input[type=text]")
 
         for label, value in (("Points", "200"), ("Outliers (%)", "95"), ("Noise (px)", "0.5")):
             entry(label).fill(value)

@@ -26,9 +26,7 @@ PATIENCE_MS = 120_000
 DOCS = {
     "playground": ("arcs", "dark", 0),
     "selection": ("selection", "dark", 0),
-    "sphere": ("from_the_camera", "dark", 0),
-    "compare": ("compare", "light", 0),
-    "sweep": ("sweep", "light", 0),
+    "sweep": ("sweep", "dark", 0),
 }
 """Names in docs/ of a view in a theme at the size of that number."""
 
