@@ -332,6 +332,7 @@ def test_an_alarm_rings_once_and_a_request_puts_it_off() -> None:
     until(lambda: calls == [True, False, True, False])
     worker.close()
     worker.join(60)
+    assert calls == [True, False, True, False]
 
 
 def test_close_ends_a_waiting_thread() -> None:

@@ -223,6 +223,7 @@ def test_play_goes_to_the_end_and_stops(house: House, monkeypatch: pytest.Monkey
     until(lambda: not session._face.story.steps._playing)
     until(lambda: session._face.story.steps._choice.value.endswith("Outcome"))
     until(lambda: "Play" in session._face.story.steps._buttons.options)
+    assert not session._face.story.steps._playing
 
 
 @pytest.mark.parametrize("seed", ["", "x", "-1", "1.5", "9223372036854775808", "٣", "1" * 400])
@@ -252,6 +253,7 @@ def test_unknown_gravity_reaches_the_estimator(house: House) -> None:
     page.set(session._controls.estimator._options["mc"]["gravity_sd_deg"].widget, "unknown (6 DoF)")
     until(lambda: session._run is not None and session._run.trace.options.gravity_sd_deg == np.inf)
     until(lambda: len(house.notes.traces) == 2)
+    assert house.notes.traces[1].options.gravity_sd_deg == np.inf
 
 
 def test_diagnosis_comes_after_the_picture_and_only_for_the_newest_run(
@@ -412,3 +414,4 @@ def test_what_a_callback_raises_is_a_sentence(house: House) -> None:
     until(lambda: "IndexError" in shown(session))
     page.set(session._controls.scene._seed, "8")
     until(lambda: session._status._complaint is None and session._run is not None and session._run.trace.seed == 8)
+    assert session._status._complaint is None
