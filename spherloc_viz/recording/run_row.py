@@ -1,0 +1,71 @@
+"""What a list of runs shows about a run: a row of the run index, and the properties of its recording."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class RunRow:
+    """One recorded run. None stands for what is unknown."""
+
+    file: str
+    """Name of its file in the folder of recordings; it names the run."""
+    run_id: str
+    """Id of the recording in Rerun, which stays the same when the file is renamed."""
+    created: str
+    """When, ISO 8601 in UTC with milliseconds, so that texts sort by time."""
+    source: str
+    """Who ran it: page, command, sweep, sequence, gallery or unknown."""
+    scene: str
+    """Scene file or description."""
+    name: str
+    """Name of the problem."""
+    query: str | None
+    """Name of the query image, if there is one."""
+    estimator: str
+    """Registered name."""
+    seed: int
+    """Of the estimator."""
+    options: str
+    """Its options as JSON; infinity is the text "inf"."""
+    problem_key: str
+    """Hash of the problem's numbers: two runs with the same one solved the same problem."""
+    outcome: str
+    """ "success", "failure" or "unknown" (no truth)."""
+    diagnosis: str
+    """Value of ``spherloc.diagnosis.Cause``; empty if the run was not diagnosed."""
+    doubtful: bool | None
+    """Whether the diagnosis speaks against the pose."""
+    summary: str
+    """The diagnosis in one sentence."""
+    message: str
+    """The outcome in one sentence."""
+    correspondences: int
+    """N."""
+    inliers: int
+    """Correspondences within the bound of the estimated pose."""
+    outlier_rate: float | None
+    """Share of wrong correspondences, 0 to 1: the true one where labels are known, else the front end's estimate."""
+    rotation_error_deg: float | None
+    """None if there is no truth or no pose."""
+    translation_error_m: float | None
+    """Between the camera positions, metres."""
+    time_ms: float
+    """Wall time of the estimator."""
+    proven: bool | None
+    """Whether the consensus is proven to be the largest; None without a certificate."""
+    steps: int
+    """Steps on the timeline."""
+    decisive_step: int
+    """The step at which the run was decided, or went wrong."""
+    title: str = ""
+    """Of a curated case."""
+    labels: tuple[str, ...] = ()
+    """Words that a reviewer gave it."""
+    note: str = ""
+    """What a reviewer wrote about it."""
+    size_bytes: int = 0
+    """Of the file."""
+    thumbnail: bytes = b""
+    """A small PNG; empty if there is none."""
+    format_version: int = 0
+    """Of the recording."""
