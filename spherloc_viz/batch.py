@@ -114,7 +114,9 @@ def _finish(path: Path, trace: Trace, as_json: bool, recordings: Path | None) ->
         from spherloc_viz.recording.writer import write_recording
 
         try:
-            recording = write_recording(trace, recordings / file_name(trace, datetime.now(UTC)))
+            target = recordings / file_name(trace, datetime.now(UTC))
+            write_recording(trace, target)
+            recording = target
         except SpherlocError as error:
             code = _report(error)
     diagnosis = diagnose(trace)

@@ -110,7 +110,8 @@ def _record(trace: Trace, folder: Path, log: ResultsLog) -> str | None:
     from spherloc_viz.recording.writer import write_recording
 
     try:
-        path = write_recording(trace, folder / file_name(trace, datetime.now(UTC)))
+        path = folder / file_name(trace, datetime.now(UTC))
+        write_recording(trace, path)
     except RecordingError as error:
         if isinstance(error.__cause__, OSError):  # no room: the next ones would be lost too
             raise InputError(

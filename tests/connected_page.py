@@ -1,6 +1,7 @@
 """A page connected to a real viser server, without a browser: it sends what it is told and notes what it gets."""
 
 import asyncio
+import contextlib
 import threading
 import time
 from collections.abc import Callable
@@ -41,6 +42,7 @@ class ConnectedPage:
     def __init__(self, server: viser.ViserServer, key: str) -> None:
         self._port, self._key = server.get_port(), key
         self._loop = asyncio.new_event_loop()
+        self._leaving = asyncio.Event()
         self._socket: aiohttp.ClientWebSocketResponse | None = None
         self.answer: Callable[[dict[str, Any]], dict[str, Any] | None] = lambda message: None
         """Called with every message; what it returns is sent."""
@@ -48,7 +50,7 @@ class ConnectedPage:
         """What was downloaded, by name."""
         self._names: dict[str, str] = {}
         known = set(server.get_clients())
-        self._thread = threading.Thread(target=self._loop.run_until_complete, args=(self._live(),), daemon=True)
+        self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
         until(lambda: self._socket is not None)
         self.send(HELLO)
@@ -56,7 +58,12 @@ class ConnectedPage:
         (number,) = set(server.get_clients()) - known
         self.handle = server.get_clients()[number]
 
+    def _run(self) -> None:
+        with contextlib.closing(self._loop):
+            self._loop.run_until_complete(self._live())
+
     async def _live(self) -> None:
+        """Read until the server or the page leaves."""
         async with aiohttp.ClientSession() as client:
             self._socket = await client.ws_connect(
                 f"http://127.0.0.1:{self._port}/",
@@ -64,12 +71,22 @@ class ConnectedPage:
                 protocols=[f"viser-v{viser.__version__}"],
                 max_msg_size=0,
             )
-            async for message in self._socket:
-                for content in _messages(message.data):
-                    self._note(content)
-                    reply = self.answer(content)
-                    if reply is not None:
-                        await self._socket.send_bytes(msgspec.msgpack.encode(reply))
+            ends = {asyncio.create_task(self._read(self._socket)), asyncio.create_task(self._leaving.wait())}
+            done, rest = await asyncio.wait(ends, return_when=asyncio.FIRST_COMPLETED)
+            for task in rest:
+                task.cancel()
+            await asyncio.gather(*rest, return_exceptions=True)
+            await self._socket.close()
+            for task in done:
+                task.result()
+
+    async def _read(self, socket: aiohttp.ClientWebSocketResponse) -> None:
+        async for message in socket:
+            for content in _messages(message.data):
+                self._note(content)
+                reply = self.answer(content)
+                if reply is not None:
+                    await socket.send_bytes(msgspec.msgpack.encode(reply))
 
     def _note(self, message: dict[str, Any]) -> None:
         if message["type"] == "FileTransferStartDownload":
@@ -100,9 +117,11 @@ class ConnectedPage:
 
     def close(self) -> None:
         """Leave."""
-        if self._socket is not None and not self._socket.closed:
-            asyncio.run_coroutine_threadsafe(self._socket.close(), self._loop).result(60)
+        # The loop is closed already where the server went first.
+        with contextlib.suppress(RuntimeError):
+            self._loop.call_soon_threadsafe(self._leaving.set)
         self._thread.join(60)
+        assert not self._thread.is_alive()
 
 
 def _messages(data: bytes) -> list[dict[str, Any]]:

@@ -32,7 +32,9 @@ PROGRAM = (
 @pytest.fixture(scope="module")
 def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     trace = estimate(scene_problem("mei_outliers_80"), "mc")
-    return write_recording(trace, tmp_path_factory.mktemp("view") / "a run #1 ü.rrd")
+    path = tmp_path_factory.mktemp("view") / "a run #1 ü.rrd"
+    write_recording(trace, path)
+    return path
 
 
 @pytest.fixture(scope="module")

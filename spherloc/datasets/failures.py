@@ -144,6 +144,26 @@ def _far(make: CaseMaker) -> Cloud:
     return cloud
 
 
+def _below(make: CaseMaker) -> Cloud:
+    """A piece of floor straight below the camera, 6 cm wide: a panorama's lower pole."""
+
+    def cloud(rng: np.random.Generator, count: int) -> FloatArray:
+        return foot + rng.uniform(-0.03, 0.03, (count, 3)) * np.array([1.0, 0.1, 1.0])
+
+    foot = camera_centre(make.truth) + np.array([0.0, 1.5, 0.0])
+    return cloud
+
+
+def _behind(make: CaseMaker) -> Cloud:
+    """A wall behind the camera, left and right of the seam of a panorama."""
+
+    def cloud(rng: np.random.Generator, count: int) -> FloatArray:
+        seen = rng.uniform(-1.0, 1.0, (count, 3)) * np.array([3.0, 2.0, 1.0]) - np.array([0.0, 0.0, 4.0])
+        return camera_centre(make.truth) + seen @ make.truth[:, :3]
+
+    return cloud
+
+
 def _facing(cam_from_map: FloatArray, point: FloatArray) -> FloatArray:
     """The level pose at the same place with ``point`` in the middle of the image."""
     centre = camera_centre(cam_from_map)
@@ -193,6 +213,16 @@ MAKERS: Mapping[str, Callable[[CaseMaker], FailureCase]] = {
     "iterations ran out": _iterations_ran_out,
     "ambiguous": _ambiguous,
 }
+
+
+PLACES: Mapping[str, Callable[[CaseMaker], Cloud]] = {
+    "line": _pole,
+    "spot": _spot,
+    "far": _far,
+    "below": _below,
+    "behind": _behind,
+}
+"""Where right matches may lie, other than all over the cube. Some turn the camera towards them."""
 
 
 def failure_case(cause: str, seed: int) -> FailureCase:

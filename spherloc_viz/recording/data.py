@@ -16,12 +16,17 @@ from numpy.typing import NDArray
 from rerun.chunk import Chunk
 
 from spherloc.cameras.calibration import camera_from_table
+from spherloc.datasets.variation import Variation
+from spherloc.diagnosis import Cause, Diagnosis
 from spherloc.problem import Problem
 from spherloc.trace import Trace
 from spherloc_viz.options import plain
+from spherloc_viz.recording.origin import Origin
 
 MAX_ARRAY_BYTES = 65_536
-"""Stage arrays above this are left out: they follow from the problem, the options and the seed."""
+"""Stage arrays above this are left out of a lean recording: they follow from the problem, the options and the seed."""
+MAX_SCENE_BYTES = 65_536
+"""The text of a larger scene file is not recorded."""
 
 NOT_FINITE = "number"
 """Key of the table that stands for infinity or NaN."""
@@ -29,14 +34,31 @@ NOT_FINITE = "number"
 Row = dict[str, Any]
 
 
-def data_chunks(trace: Trace) -> Iterator[Chunk]:
-    """Static chunks with the problem, the result and the small arrays of every stage."""
+def data_chunks(trace: Trace, origin: Origin, diagnosis: Diagnosis, full: bool) -> Iterator[Chunk]:
+    """Static chunks with the problem, the result, where it came from, what is wrong with it, and every stage.
+
+    Of a stage it is the small arrays or, with ``full``, all of them.
+    """
     yield _chunk("/data/problem", _problem_row(trace.problem))
     yield _chunk("/data/run", _run_row(trace))
+    yield _chunk("/data/origin", asdict(origin) | {"scene_text": scene_text(origin.scene_path)})
+    yield _chunk("/data/diagnosis", {item.name: getattr(diagnosis, item.name) for item in fields(diagnosis)})
     for stage in trace.stages:
         row = {item.name: getattr(stage, item.name) for item in fields(stage)}
-        small = {name: value for name, value in row.items() if getattr(value, "nbytes", 0) <= MAX_ARRAY_BYTES}
-        yield _chunk(f"/data/stages/{stage.kind}", small)
+        kept = {name: value for name, value in row.items() if full or getattr(value, "nbytes", 0) <= MAX_ARRAY_BYTES}
+        yield _chunk(f"/data/stages/{stage.kind}", kept)
+
+
+def scene_text(path: str | None) -> str | None:
+    """The text of a scene file; None if it is no TOML of moderate size, or cannot be read."""
+    if path is None or not path.endswith(".toml"):
+        return None
+    try:
+        with Path(path).open("rb") as file:
+            content = file.read(MAX_SCENE_BYTES + 1)
+        return content.decode() if len(content) <= MAX_SCENE_BYTES else None
+    except (OSError, ValueError):
+        return None
 
 
 def _problem_row(problem: Problem) -> Row:
@@ -74,6 +96,27 @@ def problem_from_row(row: Row, where: str) -> Problem:
         # Problem scales directions to unit length, and doing so twice can change the last bit.
         object.__setattr__(problem, name, row[name])
     return problem
+
+
+def origin_from_row(row: Row) -> tuple[Origin, str | None]:
+    """Where the run came from, and the text of its scene file.
+
+    Raises ``SpherlocError``, ``KeyError`` or ``TypeError`` if the row says no such thing.
+    """
+    text, variation = row.pop("scene_text"), dict(row.pop("variation"))
+    for name in ("true_camera", "spoiled", "mended", "hidden"):
+        variation[name] = None if variation[name] is None else tuple(variation[name])
+    return Origin(variation=Variation(**variation), **row), text
+
+
+def diagnosis_from_row(row: Row) -> Diagnosis:
+    """What was wrong with the run.
+
+    Raises ``KeyError``, ``TypeError`` or ``ValueError`` if the row says no such thing.
+    """
+    rival = row.pop("rival_cam_from_map", None)
+    cause, evidence = Cause(row.pop("cause")), tuple(row.pop("evidence"))
+    return Diagnosis(cause=cause, evidence=evidence, rival_cam_from_map=rival, **row)
 
 
 def _chunk(path: str, row: Row) -> Chunk:

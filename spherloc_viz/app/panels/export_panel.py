@@ -113,7 +113,9 @@ class ExportPanel:
             return
         self._say("Writing the recording …")
         with tempfile.TemporaryDirectory(prefix="spherloc-") as folder:
-            self._send(name, write_recording(shown.trace, Path(folder) / "run.rrd").read_bytes())
+            path = Path(folder) / "run.rrd"
+            write_recording(shown.trace, path)
+            self._send(name, path.read_bytes())
 
     def _send(self, name: str, content: bytes) -> None:
         self._client.send_file_download(name, content, save_immediately=True)

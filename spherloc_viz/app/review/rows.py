@@ -1,0 +1,134 @@
+"""The list of recordings as HTML: a row a run, with its picture, what came out, and why."""
+
+import base64
+from collections.abc import Sequence
+from datetime import datetime
+from html import escape
+
+from spherloc.diagnosis import Cause
+from spherloc_viz import style
+from spherloc_viz.app.review import words
+from spherloc_viz.app.review.filters import pill
+from spherloc_viz.app.review.look import PAGE, Look
+from spherloc_viz.app.text import DIM, box, dot_html
+from spherloc_viz.app.web.viewer_room import viewer_link
+from spherloc_viz.recording.run_row import RunRow
+
+PNG = b"\x89PNG\r\n\x1a\n"
+MOST_PICTURE_BYTES = 100_000
+"""Of a row's picture; larger ones are not shown."""
+WIDTH_PX, HEIGHT_PX = 76, 52
+"""Of a row's picture."""
+RULE = "border-top:1px solid rgba(128,140,160,.18)"
+CUT = "white-space:nowrap;overflow:hidden;text-overflow:ellipsis"
+OPENED = "rgba(60,130,230,.2)"
+"""Behind the row of the run that is open."""
+
+
+def rows_html(
+    rows: Sequence[RunRow], marked: frozenset[str], opened: str | None, total: int, look: Look, now: datetime
+) -> str:
+    """A page of the list and what turns it. ``opened`` is the file of the run that is open."""
+    if not rows:
+        what = "No recorded run fits these filters." if look.filtered else "No run is recorded yet."
+        return box(f'<div style="{DIM}">{what}</div>', "font-size:12.5px")
+    body = "".join(row_html(row, row.file in marked, row.file == opened, now) for row in rows)
+    pages = pages_html(look.page, total)
+    return box(f"{pages}{body}{pages if len(rows) > 5 else ''}", "font-size:11.5px;line-height:1.35")
+
+
+def row_html(row: RunRow, marked: bool, opened: bool, now: datetime) -> str:
+    """One run."""
+    file = escape(row.file)
+    ground = f"background:{OPENED};box-shadow:inset 2px 0 0 {style.css(style.ESTIMATE)}" if opened else ""
+    mark = (
+        f'<span role="checkbox" aria-checked="{str(marked).lower()}" aria-label="Mark" tabindex="0" '
+        f'data-touch="run-mark:{file}" title="Mark, to compare or export" style="align-self:stretch;display:flex;'
+        f'align-items:center;padding:0 .35em 0 .25em;font-size:13px">{"☑" if marked else "☐"}</span>'
+    )
+    link = (
+        f'<a href="{escape(viewer_link(row.file, row.decisive_step))}" target="_blank" rel="noopener" '
+        f'title="Open in the Rerun viewer, at step {row.decisive_step + 1} of {row.steps}" '
+        'style="color:inherit;text-decoration:none;padding:0 .35em;align-self:center;opacity:.75;font-size:13px">↗</a>'
+    )
+    about = f'<div style="flex:1;min-width:0;padding:.15em 0">{_lines(row, now)}</div>'
+    return (
+        f'<div style="{RULE};display:flex;align-items:center;{ground}">{mark}'
+        f'<div role="button" tabindex="0" class="touch-row" data-touch="run-open:{file}" title="{_hint(row)}" '
+        f'style="flex:1;min-width:0;display:flex;gap:.6em;align-items:center">{picture_html(row.thumbnail)}{about}</div>'
+        f"{link}</div>"
+    )
+
+
+def _lines(row: RunRow, now: datetime) -> str:
+    """What the run is, what came out, and numbers; below, what a reviewer wrote."""
+    name = (
+        f'<div style="display:flex;gap:.5em"><span style="flex:1;font-weight:600;{CUT}">'
+        f"{escape(words.title_of(row))}</span>"
+        f'<span style="{DIM};white-space:nowrap">{escape(words.moment(row.created, now))}</span></div>'
+    )
+    cause = f' <span style="white-space:nowrap">{escape(row.diagnosis)}</span>' if _told(row) else ""
+    how = (
+        f'<div style="{CUT}">{badge_html(row.outcome)}{cause}'
+        f'<span style="{DIM}"> · {escape(row.estimator)} · seed {row.seed}</span></div>'
+    )
+    errors = (words.angle(row.rotation_error_deg), words.distance(row.translation_error_m))
+    facts = [f"{row.inliers}/{row.correspondences}"]
+    facts += [] if row.outlier_rate is None else [f"{words.percent(row.outlier_rate)} out"]
+    facts += [fact for fact in errors if fact != words.UNKNOWN]
+    facts.append(words.duration(row.time_ms))
+    numbers = f'<div style="{DIM};{CUT};font-variant-numeric:tabular-nums">{escape(" · ".join(facts))}</div>'
+    return name + how + numbers + _review(row)
+
+
+def _told(row: RunRow) -> bool:
+    """Whether the diagnosis says more than the outcome does."""
+    return bool(row.diagnosis) and row.diagnosis != Cause.OK
+
+
+def _review(row: RunRow) -> str:
+    if not row.labels and not row.note:
+        return ""
+    labels = "".join(label_html(label) for label in row.labels)
+    note = f'<span style="font-style:italic">{escape(row.note)}</span>' if row.note else ""
+    return f'<div style="{CUT}">{labels}{note}</div>'
+
+
+def label_html(label: str) -> str:
+    """A word that a reviewer gave."""
+    color = style.css(style.CLIQUE)
+    return (
+        f'<span style="border:1px solid {color};border-radius:.3em;padding:0 .35em;margin-right:.35em">'
+        f"{escape(label)}</span>"
+    )
+
+
+def badge_html(outcome: str) -> str:
+    """The outcome with its colour."""
+    color = words.COLORS.get(outcome, style.UNDECIDED)
+    return f'{dot_html(color)}<b style="font-weight:600;color:{style.css_text(color)}">{escape(outcome)}</b>'
+
+
+def picture_html(png: bytes, width_px: int = WIDTH_PX, height_px: int = HEIGHT_PX) -> str:
+    """A run's picture, or its place if it has none."""
+    box_css = f"width:{width_px}px;height:{height_px}px;border-radius:3px;flex:none;background:rgba(128,140,160,.14)"
+    if not png.startswith(PNG) or len(png) > MOST_PICTURE_BYTES:
+        return f'<div style="{box_css}"></div>'
+    data = base64.b64encode(png).decode()
+    return f'<img alt="" src="data:image/png;base64,{data}" style="{box_css};object-fit:cover;display:block">'
+
+
+def _hint(row: RunRow) -> str:
+    return escape(" ".join(filter(None, (row.summary or row.message, f"({row.file})"))))
+
+
+def pages_html(page: int, total: int) -> str:
+    """Where in the list one is, and what turns it."""
+    first, last = page * PAGE + 1, min((page + 1) * PAGE, total)
+    back = pill("‹", f"runs-page:{page - 1}", False, "Previous page") if page > 0 else ""
+    on = pill("›", f"runs-page:{page + 1}", False, "Next page") if last < total else ""
+    where = f"{first:,}–{last:,} of {total:,}" if total > PAGE else f"{total:,} run{'s' if total != 1 else ''}"
+    return (
+        f'<div style="display:flex;gap:.5em;align-items:center;padding:.3em 0"><span style="{DIM}">{where}</span>'
+        f"{back}{on}</div>"
+    )

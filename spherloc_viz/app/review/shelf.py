@@ -1,0 +1,100 @@
+"""The recordings that all pages of a server review: the folder, its index, and single runs read safely."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+from spherloc.errors import RecordingError
+from spherloc_viz.app.review.filters import Counts
+from spherloc_viz.app.review.look import EXACT, PAGE, Look
+from spherloc_viz.recording.index import Found, RunIndex
+from spherloc_viz.recording.query import RunQuery
+from spherloc_viz.recording.reader import RecordedRun, read_recording
+from spherloc_viz.recording.run_row import RunRow
+from spherloc_viz.recording.strangers import examine, examine_all, resolve_inside
+
+NEAR = 50
+"""A run that was at some place of the list is looked for among so many around it."""
+MOST_LABELS = 12
+"""Labels that are offered, those used most."""
+
+
+class Shelf:
+    """Thread-safe, and slow now and then: asked on the threads of errands only."""
+
+    def __init__(self, index: RunIndex) -> None:
+        self._index = index
+
+    @property
+    def folder(self) -> Path:
+        """Where the recordings are."""
+        return self._index.folder
+
+    def refresh(self) -> bool:
+        """Take in recordings that the index does not know, once; tells whether there was anything to be read."""
+        if not self._index.stale:
+            return False
+        done = self._index.refresh(examine_all)
+        return bool(done.read or done.removed)
+
+    def page(self, look: Look) -> tuple[Found, Look]:
+        """The rows of a page, and the look with a page that exists."""
+        query = _query(look)
+        found = self._index.find(query, PAGE, PAGE * look.page)
+        if found.rows or not look.page:
+            return found, look
+        look = replace(look, page=max(0, -(-found.total // PAGE) - 1))
+        return self._index.find(query, PAGE, PAGE * look.page), look
+
+    def counts(self, look: Look, total: int) -> Counts:
+        """What each filter would leave."""
+        by = (name for name in ("outcome", "diagnosis"))
+        outcome, diagnosis = (self._groups(look, name) for name in by)
+        unfolded = self._groups(look, look.unfolded) if look.unfolded in EXACT else ()
+        return Counts(total, outcome, diagnosis, unfolded)
+
+    def _groups(self, look: Look, name: str) -> Sequence[tuple[str, int]]:
+        """How many runs there are of each value, if this filter were not set."""
+        return self._index.groups(_query(replace(look, **{name: None})), name)
+
+    def labels(self) -> tuple[str, ...]:
+        """Those that were given to any run, the most used first."""
+        return tuple(label for label, _ in self._index.groups(RunQuery(), "label") if label)[:MOST_LABELS]
+
+    def row(self, file: str) -> RunRow:
+        """The run of a file; raises ``RecordingError`` if the list does not have it."""
+        row = self._index.get(file)
+        if row is None:
+            raise RecordingError(f"{file}: is not in the list any more; choose another run.")
+        return row
+
+    def read(self, file: str) -> tuple[RecordedRun, Path]:
+        """A recording that another process has found safe to be read; raises ``RecordingError`` if it is not."""
+        path = resolve_inside(self.folder, file)
+        examine(path)
+        return read_recording(path), path
+
+    def place(self, look: Look, file: str, near: int) -> tuple[int | None, int]:
+        """Where a run is in the list, counted from 0, if it is near that place, and how long the list is."""
+        first = max(0, near - NEAR)
+        found = self._index.find(_query(look), 2 * NEAR + 1, first)
+        at = next((place for place, row in enumerate(found.rows, first) if row.file == file), None)
+        return at, found.total
+
+    def at(self, look: Look, place: int) -> RunRow | None:
+        """The run at a place of the list, if there is one."""
+        return next(iter(self._index.find(_query(look), 1, place).rows), None) if place >= 0 else None
+
+    def all(self, look: Look, most: int) -> Found:
+        """The first ``most`` runs of the list, from all pages."""
+        return self._index.find(_query(look), most)
+
+    def review(self, file: str, labels: Sequence[str], note: str) -> RunRow:
+        """Store what a reviewer says of a run; returns its row as it is then."""
+        self._index.set_review(file, labels, note)
+        return self.row(file)
+
+
+def _query(look: Look) -> RunQuery:
+    return look.query(datetime.now(UTC))

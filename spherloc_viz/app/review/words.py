@@ -1,0 +1,64 @@
+"""A recorded run's numbers in short words."""
+
+import json
+from datetime import datetime
+
+from spherloc_viz import style
+from spherloc_viz.layers.frame import length
+from spherloc_viz.layers.scale_bar import angle_text
+from spherloc_viz.recording.run_row import RunRow
+
+UNKNOWN = "–"
+COLORS = {"success": style.INLIER, "failure": style.OUTLIER, "unknown": style.UNDECIDED}
+"""Of outcomes."""
+
+
+def title_of(row: RunRow) -> str:
+    """What the run is called: a curated case's title, else the problem and its query image."""
+    name = row.title or row.name or row.file
+    return f"{name}, {row.query}" if row.query and row.query not in name else name
+
+
+def percent(share: float | None) -> str:
+    """A share of wrong matches."""
+    return UNKNOWN if share is None else f"{100.0 * share:.3g} %"
+
+
+def angle(degrees: float | None) -> str:
+    """A rotation error."""
+    return UNKNOWN if degrees is None else angle_text(degrees)
+
+
+def distance(metres: float | None) -> str:
+    """A position error."""
+    return UNKNOWN if metres is None else length(metres)
+
+
+def duration(ms: float) -> str:
+    """A run's time."""
+    return f"{ms:.3g} ms" if ms < 1000.0 else f"{ms / 1000.0:.3g} s"
+
+
+def size(count: int) -> str:
+    """A number of bytes."""
+    return f"{count / 1e6:.3g} MB" if count >= 1e5 else f"{count / 1e3:.3g} kB"
+
+
+def moment(created: str, now: datetime) -> str:
+    """When a run was made, on this machine's clock: the time of today's, the day of others; ``now`` has a zone."""
+    try:
+        when = datetime.fromisoformat(created).astimezone(now.tzinfo)
+    except ValueError:
+        return ""
+    if when.date() == now.date():
+        return f"{when:%H:%M:%S}"
+    return f"{when:%d %b}" if when.year == now.year else f"{when:%d %b %Y}"
+
+
+def options_of(row: RunRow) -> dict[str, str]:
+    """The run's options as texts; none if they cannot be read."""
+    try:
+        values = json.loads(row.options)
+    except (ValueError, RecursionError):
+        return {}
+    return {str(name): str(value) for name, value in values.items()} if isinstance(values, dict) else {}

@@ -1,0 +1,142 @@
+"""The child that reads recordings which may be hostile: ``python -m spherloc_viz.recording.examine``.
+
+It reads paths as JSON, one a line, and answers each with a line of JSON: ``{"row": {...}}`` or ``{"error": "..."}``. Its
+memory, its processor time a file and what it may write are limited where the system can do that; it may die of a file.
+"""
+
+import json
+import os
+import signal
+import stat
+import sys
+import tempfile
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from rerun.chunk import Chunk, LazyChunkStream, RrdReader
+
+from spherloc.errors import RecordingError, SpherlocError
+from spherloc_viz.recording.checked_row import COUNT_LIMIT, row_from_table, table_from_row
+from spherloc_viz.recording.layout import APPLICATION_ID
+from spherloc_viz.recording.reader import RecordedRun, read_recording, read_run_row
+
+try:
+    import resource
+except ImportError:  # Windows
+    resource = None
+
+FILE_LIMIT_BYTES = 512 << 20
+MEMORY_LIMIT_BYTES = 1 << 30
+"""Beyond what the child takes before the first file."""
+TIME_LIMIT_S = 20
+"""Processor time a file; a good one takes a hundredth of a second."""
+IDLE_LIMIT_S = 60
+"""After so long without a question it ends."""
+
+
+def main() -> None:
+    """Answer questions until there are no more."""
+    answers = _own_answers()
+    _warm_up()
+    _limit_process()
+    _say(answers, {"ready": True})
+    _wait_for_questions(True)
+    for line in sys.stdin.buffer:
+        _wait_for_questions(False)
+        _limit_time()
+        _say(answers, _answer(Path(json.loads(line))))
+        _wait_for_questions(True)
+
+
+def _own_answers() -> IO[str]:
+    """A stream for answers; what libraries print goes elsewhere."""
+    answers = os.fdopen(os.dup(1), "w", encoding="ascii")
+    os.dup2(2, 1)
+    return answers
+
+
+def _say(answers: IO[str], answer: dict[str, Any]) -> None:
+    answers.write(json.dumps(answer) + "\n")
+    answers.flush()
+
+
+def _answer(path: Path) -> dict[str, Any]:
+    try:
+        return {"row": _examined(path)}
+    except SpherlocError as error:
+        return {"error": str(error)}
+    except MemoryError:
+        return {"error": f"{path}: takes too much memory to read; delete it or record the run again."}
+    except Exception as error:
+        # Whatever a file can make a library raise is the file's fault here, and must not cost the others.
+        reason = f"{type(error).__name__}: {error}"[:200]
+        return {"error": str(RecordingError(f"{path}: not a whole recording ({reason}); record the run again."))}
+
+
+def _examined(path: Path) -> dict[str, Any]:
+    _check_file(path)
+    _check_run(read_recording(path), path)
+    table = table_from_row(read_run_row(path))
+    row_from_table(table, path)
+    return table
+
+
+def _check_file(path: Path) -> None:
+    try:
+        status = path.stat()
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be opened ({error.strerror or error}); check its path.") from error
+    if not stat.S_ISREG(status.st_mode):
+        raise RecordingError(f"{path}: not a file; give the path of a recording (.rrd).")
+    if status.st_size > FILE_LIMIT_BYTES:
+        raise RecordingError(f"{path}: larger than {FILE_LIMIT_BYTES:,} bytes, which no recording is; delete it.")
+    if not os.access(path, os.R_OK):
+        raise RecordingError(f"{path}: may not be read; change its permissions.")
+
+
+def _check_run(run: RecordedRun, path: Path) -> None:
+    """What ``read_recording`` leaves open."""
+    count = len(run.problem)
+    if count > COUNT_LIMIT:
+        raise RecordingError(f"{path}: claims {count:,} correspondences; {COUNT_LIMIT:,} are the most.")
+    pose, mask = run.cam_from_map, run.inlier_mask
+    good_pose = pose is None or (pose.shape == (3, 4) and pose.dtype == np.float64 and np.isfinite(pose).all())
+    if not good_pose or mask.shape != (count,) or mask.dtype != np.bool_:
+        raise RecordingError(f"{path}: its pose or its inliers have a wrong form; record the run again.")
+
+
+def _warm_up() -> None:
+    """Read a recording, after which rerun's threads and memory are there and can be told from what a file takes."""
+    with tempfile.TemporaryDirectory(prefix="spherloc-") as folder:
+        path = Path(folder) / "small.rrd"
+        chunk = Chunk.from_columns("/a", [], [])
+        LazyChunkStream.from_iter([chunk]).write_rrd(path, application_id=APPLICATION_ID, recording_id="1")
+        RrdReader(path).stream().to_chunks()
+
+
+def _limit_process() -> None:
+    if resource is None:
+        return
+    for name in (resource.RLIMIT_CORE, resource.RLIMIT_FSIZE):
+        resource.setrlimit(name, (0, 0))
+    memory = Path("/proc/self/statm")
+    if memory.exists():  # other systems count memory in ways of their own
+        taken = int(memory.read_text().split()[0]) * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_AS, (taken + MEMORY_LIMIT_BYTES, taken + MEMORY_LIMIT_BYTES))
+
+
+def _limit_time() -> None:
+    if resource is not None:
+        used = resource.getrusage(resource.RUSAGE_SELF)
+        limit = int(used.ru_utime + used.ru_stime) + TIME_LIMIT_S
+        resource.setrlimit(resource.RLIMIT_CPU, (limit, resource.RLIM_INFINITY))
+
+
+def _wait_for_questions(begin: bool) -> None:
+    if hasattr(signal, "alarm"):
+        signal.alarm(IDLE_LIMIT_S if begin else 0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,139 @@
+"""The file of the run index: opened, checked, and set aside where it is not ours or damaged."""
+
+import contextlib
+import sqlite3
+from datetime import UTC, datetime
+from pathlib import Path
+
+from spherloc.errors import RecordingError
+from spherloc_viz.recording.index_rows import SCHEMA
+
+FILE_NAME = "runs.sqlite"
+"""In the folder of the recordings."""
+APPLICATION = 0x53504852
+"""SQLite's mark for whose file it is: "SPHR"."""
+VERSION = 1
+"""Of the schema."""
+BUSY_S = 15.0
+"""How long one waits for other writers, each of which takes milliseconds."""
+
+_CANNOT_WRITE = {sqlite3.SQLITE_READONLY, sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_PERM}
+_DAMAGED = {sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB}
+_BUSY = {sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED}
+
+
+class UnfitError(Exception):
+    """The file cannot serve as the index; the message is the end of a sentence that starts with its name."""
+
+
+def primary_code(error: sqlite3.Error) -> int:
+    """SQLite's code of the error; its upper bits only refine it. 0 if it has none."""
+    return getattr(error, "sqlite_errorcode", 0) & 0xFF
+
+
+def is_damage(error: sqlite3.Error) -> bool:
+    """Whether the file's content is broken."""
+    return primary_code(error) in _DAMAGED
+
+
+def connect(path: Path) -> sqlite3.Connection:
+    """Open the index at ``path``, made if it is missing.
+
+    Raises ``UnfitError`` if there is another file or a damaged one, ``PermissionError`` if it cannot be written, and
+    ``sqlite3.Error`` if it is locked or the disk is full.
+    """
+    connection: sqlite3.Connection | None = None
+    try:
+        connection = sqlite3.connect(path, timeout=BUSY_S, isolation_level=None, check_same_thread=False)
+        connection.execute("PRAGMA trusted_schema = OFF")
+        connection.execute("PRAGMA foreign_keys = ON")
+        connection.execute("PRAGMA synchronous = NORMAL")
+        _check_or_create(connection)
+        return connection
+    except (sqlite3.Error, UnfitError) as error:
+        if connection is not None:
+            connection.close()
+        if isinstance(error, sqlite3.Error) and primary_code(error) in _CANNOT_WRITE:
+            raise PermissionError(str(error)) from error
+        if isinstance(error, sqlite3.Error) and is_damage(error):
+            raise UnfitError("is damaged") from error
+        raise
+
+
+def identity(path: Path) -> tuple[int, int] | None:
+    """Which file lies at the path, if there is one: it stays the same when its content changes."""
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return status.st_dev, status.st_ino
+
+
+def memory() -> sqlite3.Connection:
+    """An index that is in no file."""
+    connection = sqlite3.connect(":memory:", isolation_level=None, check_same_thread=False)
+    connection.execute("PRAGMA foreign_keys = ON")
+    _check_or_create(connection)
+    return connection
+
+
+def _check_or_create(connection: sqlite3.Connection) -> None:
+    """Empty files get the tables; others must have exactly ours, since a foreign trigger or view would be run."""
+    if not _schema(connection):
+        # Readers then don't wait for writers. Where the file system cannot do it, SQLite keeps to what it can.
+        connection.execute("PRAGMA journal_mode = WAL")
+        connection.execute("BEGIN IMMEDIATE")
+        if not _schema(connection):
+            for statement in SCHEMA:
+                connection.execute(statement)
+            connection.execute(f"PRAGMA application_id = {APPLICATION}")
+            connection.execute(f"PRAGMA user_version = {VERSION}")
+        connection.execute("COMMIT")
+    (application,) = connection.execute("PRAGMA application_id").fetchone()
+    (version,) = connection.execute("PRAGMA user_version").fetchone()
+    if application != APPLICATION:
+        raise UnfitError("is a database of another program")
+    if version != VERSION or _schema(connection) != set(SCHEMA):
+        raise UnfitError("was made by another version of spherloc")
+
+
+def _schema(connection: sqlite3.Connection) -> set[str | None]:
+    # SQLite keeps a statement as it was given; what it makes by itself has no SQL.
+    rows = connection.execute("SELECT sql FROM sqlite_schema WHERE name NOT LIKE 'sqlite\\_%' ESCAPE '\\'").fetchall()
+    return {sql for (sql,) in rows}
+
+
+def set_aside(path: Path) -> Path:
+    """Rename the file, and what SQLite keeps beside it, and return its new name. Nothing is deleted.
+
+    Raises ``RecordingError`` if that cannot be done.
+    """
+    when = datetime.now(UTC).strftime("%Y%m%dT%H%M%S%f")
+    aside = path.with_name(f"{path.name}.{when}.aside")
+    # The file itself last: whoever finds no file makes a new one, and must not find the old one's log beside it.
+    moves = [(path.with_name(path.name + end), aside.with_name(aside.name + end)) for end in ("-wal", "-shm", "")]
+    done: list[tuple[Path, Path]] = []
+    try:
+        for old, new in moves:
+            if old == path or old.exists():
+                old.rename(new)
+                done.append((old, new))
+    except OSError as error:
+        for old, new in done:
+            with contextlib.suppress(OSError):
+                new.rename(old)
+        reason = error.strerror or error
+        raise RecordingError(f"{path}: cannot be used nor renamed ({reason}); move it away.") from error
+    return aside
+
+
+def sentence(path: Path, error: Exception) -> str:
+    """Why the index cannot be used, and what to do."""
+    code = primary_code(error) if isinstance(error, sqlite3.Error) else 0
+    if code in _BUSY:
+        return f"{path}: another program has locked the list of runs for {BUSY_S:.0f} s; end it and try again."
+    if code == sqlite3.SQLITE_FULL:
+        return f"{path}: the disk is full; make room, then run spherloc reindex."
+    if code in _CANNOT_WRITE or isinstance(error, PermissionError):
+        return f"{path}: the list of runs cannot be written; give its folder write access or choose another one."
+    return f"{path}: the list of runs cannot be used ({error}); run spherloc reindex."

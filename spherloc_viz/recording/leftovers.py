@@ -1,0 +1,148 @@
+"""Unfinished files: their names tell who writes them, so that what a killed process left is recovered or swept."""
+
+import contextlib
+import hashlib
+import os
+import re
+import secrets
+import socket
+import subprocess
+import time
+from functools import cache
+from pathlib import Path
+
+from spherloc.errors import RecordingError
+from spherloc_viz.recording.rerun_program import rerun_command, rerun_environment
+
+STALE_AFTER_S = 600.0
+"""An unfinished file this old is nobody's, whatever its name says: a file takes less than a second."""
+MERGE_LIMIT_S = 60.0
+
+_PART = re.compile(
+    r"(?P<name>.+\.rrd)\.(?:(?P<machine>[0-9a-f]{8})-(?P<boot>[0-9a-f]{8})-(?P<pid>\d{1,10})-(?P<start>\d{1,20})-)?"
+    r"[0-9a-f]{8}\.part"
+)
+
+
+def unfinished(path: Path) -> Path:
+    """The name under which this process writes the file ``path`` before it is moved to its own; new in every call."""
+    machine, boot = _here()
+    pid = os.getpid()
+    owner = f"{machine}-{boot}-{pid}-{_start_of(pid) or 0}"
+    return path.with_name(f"{path.name}.{owner}-{secrets.token_hex(4)}.part")
+
+
+def leftovers(folder: Path) -> list[Path]:
+    """Unfinished recordings in ``folder`` that nobody will finish, because their process has ended or they are old.
+
+    A process of another machine may still be alive, so its files count only when they are old. Raises ``OSError`` if
+    the folder cannot be read.
+    """
+    found: list[Path] = []
+    with os.scandir(folder) as entries:
+        for entry in entries:
+            match = _PART.fullmatch(entry.name)
+            with contextlib.suppress(FileNotFoundError):  # finished meanwhile
+                if match is not None and entry.is_file(follow_symlinks=False):
+                    old = time.time() - entry.stat().st_mtime > STALE_AFTER_S
+                    if old or _ended(match):
+                        found.append(Path(entry.path))
+    return sorted(found)
+
+
+def rescue(part: Path) -> Path | None:
+    """Make a recording of what is left of one, if there is enough; returns its path, or None.
+
+    The problem and the result come first in a file, so that even a fifth of it has all that repeats the run. The
+    leftover is gone afterwards, in either case. Raises ``OSError`` if the folder cannot be written.
+    """
+    # Here, since reading needs all of rerun, and names of unfinished files are needed without it.
+    from spherloc_viz.recording.reader import check_recording, read_recording
+
+    match = _PART.fullmatch(part.name)
+    target = None if match is None else part.with_name(match["name"])
+    mended = unfinished(part.with_name(match["name"] if match else part.name))
+    try:
+        if target is None or target.exists() or target.name.endswith(".review.rrd"):
+            return None
+        with contextlib.suppress(RecordingError):
+            check_recording(part)
+            read_recording(part)
+            part.replace(target)
+            return target
+        if not _merged(part, mended):
+            return None
+        with contextlib.suppress(RecordingError):
+            read_recording(mended)
+            mended.replace(target)
+            return target
+        return None
+    finally:
+        mended.unlink(missing_ok=True)
+        part.unlink(missing_ok=True)
+
+
+def _merged(part: Path, mended: Path) -> bool:
+    """Whether rerun could save what is whole at the start of ``part``."""
+    if not part.stat().st_size:
+        return False
+    command = [*rerun_command(), "rrd", "merge", "--continue-on-error", str(part), "-o", str(mended)]
+    try:
+        done = subprocess.run(command, capture_output=True, check=False, timeout=MERGE_LIMIT_S, env=rerun_environment())
+    except subprocess.SubprocessError:
+        return False
+    return done.returncode == 0 and mended.is_file()
+
+
+def _ended(part: re.Match[str]) -> bool:
+    """Whether the process that a name tells of has surely ended."""
+    if part["machine"] is None:
+        return False
+    machine, boot = _here()
+    if part["machine"] != machine:
+        return False
+    if part["boot"] != boot:
+        return True
+    start = _start_of(int(part["pid"]))
+    return start is None or str(start) != part["start"]
+
+
+@cache
+def _here() -> tuple[str, str]:
+    """Hashes of this machine, with its space of process numbers, and of the time since which it runs."""
+    try:
+        space = str(Path("/proc/self/ns/pid").readlink())
+        boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+    except OSError:
+        space = boot = ""
+    return _hash(f"{socket.gethostname()} {space}"), _hash(boot)
+
+
+def _hash(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:8]
+
+
+def _start_of(pid: int) -> int | None:
+    """When a process began, in ticks since the machine did (0 where that is not known); None if it has ended."""
+    if not Path("/proc/self/stat").exists():
+        return 0 if _exists(pid) else None
+    try:
+        # The name of the program, in parentheses, may hold anything.
+        words = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        return None if words[0] in "ZX" else int(words[19])  # dead, though its parent has not heard of it yet
+    except (FileNotFoundError, ProcessLookupError):
+        return None
+    except (OSError, ValueError, IndexError):
+        return 0
+
+
+def _exists(pid: int) -> bool:
+    if os.name == "nt":
+        return True  # sending a signal there would end it
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:
+        return True
+    return True

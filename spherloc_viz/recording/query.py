@@ -1,0 +1,152 @@
+"""What a reviewer asks of the list of runs: filters, ranges, dates, and the order of the answer."""
+
+import math
+import re
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+
+from spherloc.errors import InputError, show
+
+SORT_KEYS = (
+    "created",
+    "file",
+    "scene",
+    "name",
+    "estimator",
+    "outcome",
+    "diagnosis",
+    "source",
+    "correspondences",
+    "inliers",
+    "outlier_rate",
+    "rotation_error_deg",
+    "translation_error_m",
+    "time_ms",
+    "steps",
+    "size_bytes",
+)
+"""By what runs can be sorted; those without a value come last in both directions."""
+GROUP_KEYS = ("diagnosis", "outcome", "estimator", "scene", "source", "label", "problem_key")
+"""By what runs can be counted."""
+OUTCOMES = ("success", "failure", "unknown")
+SOURCES = ("page", "command", "sweep", "sequence", "gallery", "unknown")
+MAX_TEXT = 200
+"""Characters of a text that is searched for."""
+
+_NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?"
+_ONE_SIDED = re.compile(rf"(<=|>=|<|>)\s*({_NUMBER})")
+_BETWEEN = re.compile(rf"({_NUMBER})\s*\.\.\s*({_NUMBER})")
+_AGO = re.compile(r"(\d{1,5})\s*(min|h|d|w)")
+_UNITS = {"min": "minutes", "h": "hours", "d": "days", "w": "weeks"}
+EQUAL = 1e-6
+"""A number alone means itself, up to this share of it: 0.9 also finds 90 of 100 as a computer divides it."""
+
+
+@dataclass(frozen=True)
+class Range:
+    """Numbers from ``low`` to ``high``. A run whose number is unknown is in no range."""
+
+    low: float = -math.inf
+    """The least."""
+    high: float = math.inf
+    """The largest."""
+    low_open: bool = False
+    """Without ``low`` itself."""
+    high_open: bool = False
+    """Without ``high`` itself."""
+
+
+@dataclass(frozen=True)
+class RunQuery:
+    """Which runs, and in what order. None asks for nothing; all that is asked must be true."""
+
+    text: str | None = None
+    """Words that must all occur in scene, name, query image, message, summary, note, labels, file or title, in any
+    case and also inside of words."""
+    scene: str | None = None
+    """The scene, whole, or its last part with or without ``.toml``."""
+    estimator: str | None = None
+    """Registered name."""
+    outcome: str | None = None
+    """ "success", "failure" or "unknown"."""
+    diagnosis: str | None = None
+    """Value of ``spherloc.diagnosis.Cause``; empty for runs that were not diagnosed."""
+    doubtful: bool | None = None
+    """Whether the diagnosis speaks against the pose."""
+    label: str | None = None
+    """One of the labels, whole."""
+    source: str | None = None
+    """Who ran it."""
+    problem_key: str | None = None
+    """Runs of this very problem."""
+    outlier_rate: Range | None = None
+    """0 to 1."""
+    rotation_error_deg: Range | None = None
+    translation_error_m: Range | None = None
+    inliers: Range | None = None
+    correspondences: Range | None = None
+    time_ms: Range | None = None
+    since: str | None = None
+    """Created at this time or later, ISO 8601 in UTC as ``parse_when`` gives it."""
+    until: str | None = None
+    """Created before this time."""
+    sort: str = "created"
+    """One of ``SORT_KEYS``."""
+    descending: bool = True
+
+    def __post_init__(self) -> None:
+        """Raises ``InputError`` for an unknown sort key or a text that is too long."""
+        if self.sort not in SORT_KEYS:
+            raise InputError(f"runs cannot be sorted by {show(self.sort)}: choose one of {', '.join(SORT_KEYS)}.")
+        if self.text is not None and len(self.text) > MAX_TEXT:
+            raise InputError(f"a text of {len(self.text)} characters cannot be searched for: give at most {MAX_TEXT}.")
+
+
+def parse_range(text: str) -> Range:
+    """A range from ``">0.9"``, ``"<=3"``, ``"0.5..0.9"`` (both included) or ``"0.9"``.
+
+    Raises ``InputError`` for anything else.
+    """
+    text = text.strip()
+    if found := _ONE_SIDED.fullmatch(text):
+        sign, number = found[1], _finite(found[2])
+        is_open = len(sign) == 1
+        return Range(high=number, high_open=is_open) if sign[0] == "<" else Range(low=number, low_open=is_open)
+    if found := _BETWEEN.fullmatch(text):
+        low, high = _finite(found[1]), _finite(found[2])
+        if low <= high:
+            return Range(low, high)
+        raise InputError(f"the range {show(text)} is empty: give the smaller number first.")
+    if re.fullmatch(_NUMBER, text):
+        number = _finite(text)
+        return Range(number - EQUAL * abs(number), number + EQUAL * abs(number))
+    raise InputError(f"{show(text)} is no range: give one such as '>0.9', '<=3', '0.5..0.9' or '0.9'.")
+
+
+def _finite(text: str) -> float:
+    number = float(text)
+    if not math.isfinite(number):
+        raise InputError(f"{text} is too large a number for a range: leave that side open, as in '>0.9'.")
+    return number
+
+
+def parse_when(text: str, now: datetime, end: bool = False) -> str:
+    """A time from a date (``2026-01-31``), a date and time (``2026-01-31T08:30``), both UTC, or an age (``90min``,
+    ``2h``, ``3d``, ``1w``) before ``now``, as ``RunQuery`` takes it.
+
+    With ``end``, a date alone means the end of that day. Raises ``InputError`` for anything else.
+    """
+    text = text.strip()
+    try:
+        if found := _AGO.fullmatch(text):
+            return _iso(now - timedelta(**{_UNITS[found[2]]: int(found[1])}))
+        when = datetime.fromisoformat(text)
+        when = when.replace(tzinfo=UTC) if when.tzinfo is None else when
+        return _iso(when + timedelta(days=1) if end and re.fullmatch(r"\d{4}-\d\d-\d\d", text) else when)
+    except (ValueError, OverflowError):
+        pass
+    raise InputError(f"{show(text)} is no time: give a date such as 2026-01-31, 2026-01-31T08:30, or 2h, 3d or 1w ago.")
+
+
+def _iso(when: datetime) -> str:
+    return when.astimezone(UTC).isoformat(timespec="milliseconds")

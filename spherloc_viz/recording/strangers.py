@@ -1,0 +1,206 @@
+"""Recordings from strangers: their names, and their content, which another process reads first.
+
+A recording may be hostile: made so that reading it takes gigabytes, minutes, or down the process that reads it. So what
+comes from elsewhere is read by a child first (``spherloc_viz.recording.examine``) whose memory and time are limited.
+What has passed is safe to be read here.
+"""
+
+import atexit
+import json
+import queue
+import re
+import subprocess
+import sys
+import threading
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import IO, Any, Self
+
+from spherloc.errors import RecordingError, SpherlocError, show
+from spherloc_viz.recording.checked_row import row_from_table
+from spherloc_viz.recording.rerun_program import rerun_environment
+from spherloc_viz.recording.run_row import RunRow
+
+FILE_LIMIT_S = 60.0
+"""A good file takes a hundredth of a second; the child gives up sooner, by the processor time that it used."""
+START_LIMIT_S = 120.0
+"""The child starts in two seconds."""
+LINE_LIMIT_BYTES = 1 << 21
+"""Of an answer: a row has a thumbnail of some kilobytes."""
+
+_NAME = re.compile(r"(gallery/)?[A-Za-z0-9._-]+\.rrd", re.ASCII)
+_NAME_LIMIT = 255
+
+
+def check_name(name: str) -> str:
+    """The name of a recording in its folder, such as a page, an index or an archive tells it, if it is one.
+
+    It has letters, digits, ".", "_" and "-", ends with ".rrd", and may be in the folder "gallery".
+    Raises ``RecordingError`` otherwise.
+    """
+    if len(name) > _NAME_LIMIT or not _NAME.fullmatch(name):
+        raise RecordingError(
+            f"{show(name)}: not the name of a recording; it has letters, digits, '.', '_' and '-' and ends with .rrd."
+        )
+    return name
+
+
+def resolve_inside(folder: Path, name: str) -> Path:
+    """The path of the recording ``name`` in ``folder``.
+
+    Raises ``RecordingError`` if it is no such name, if there is no such file, or if it is a link that leads out.
+    """
+    path = folder / check_name(name)
+    try:
+        inside = path.resolve().is_relative_to(folder.resolve()) and path.is_file()
+    except (OSError, RuntimeError):  # a loop of links
+        inside = False
+    if not inside:
+        raise RecordingError(f"{name}: no such recording in {folder}; list what is there with 'spherloc runs'.")
+    return path
+
+
+class Examiner:
+    """Reads recordings in a child process and replaces it when a file kills or stalls it. Thread-safe."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._child: _Child | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the child; it starts again when it is needed."""
+        with self._lock:
+            self._end()
+
+    def examine(self, path: Path) -> RunRow:
+        """The row of a recording that can be read wholly and is safe to be read in this process.
+
+        Raises ``RecordingError``, in one sentence, if it cannot or is not.
+        """
+        with self._lock:
+            used = self._child is not None and self._child.answered > 0
+            answer = self._ask(path)
+            if answer is None and used:
+                # It may be that the child had ended before it saw the file, or was worn out by those before.
+                answer = self._ask(path)
+        if answer is None:
+            raise RecordingError(
+                f"{path}: cannot be read, since reading it takes too long or too much memory or ends the reader; "
+                "delete it or record the run again."
+            )
+        if "error" in answer:
+            raise RecordingError(str(answer["error"]))
+        return row_from_table(answer["row"], path)
+
+    def _ask(self, path: Path) -> dict[str, Any] | None:
+        if self._child is None:
+            self._child = _Child()
+        answer = self._child.ask(path)
+        if answer is None:
+            self._end()
+        return answer
+
+    def _end(self) -> None:
+        child, self._child = self._child, None
+        if child is not None:
+            child.end()
+
+
+class _Child:
+    """One child process."""
+
+    def __init__(self) -> None:
+        """Raises ``RecordingError`` if it does not start."""
+        self.answered = 0
+        try:
+            self._process = subprocess.Popen(
+                [sys.executable, "-P", "-m", "spherloc_viz.recording.examine"],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+                # In a session of its own, so that a Ctrl-C meant for us does not look like a bad file.
+                start_new_session=True,
+                env=rerun_environment() | _ONE_THREAD,
+            )
+        except OSError as error:
+            raise RecordingError(f"recordings cannot be examined: {error.strerror or error}; try again.") from error
+        assert self._process.stdin is not None and self._process.stdout is not None
+        self._questions: IO[bytes] = self._process.stdin
+        self._answers: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+        self._listener = threading.Thread(target=self._listen, args=(self._process.stdout,), daemon=True)
+        self._listener.start()
+        if self._answer(START_LIMIT_S) != {"ready": True}:
+            self.end()
+            raise RecordingError(
+                "recordings cannot be examined: the process that does it does not start; "
+                "'python -m spherloc_viz.recording.examine' says why."
+            )
+
+    def ask(self, path: Path) -> dict[str, Any] | None:
+        """What it says about a file; None if it died, hangs or talks nonsense."""
+        try:
+            self._questions.write(json.dumps(str(path)).encode() + b"\n")
+            self._questions.flush()
+        except OSError:
+            return None
+        answer = self._answer(FILE_LIMIT_S)
+        self.answered += 1
+        return answer if answer is not None and answer.keys() <= {"row", "error"} and len(answer) == 1 else None
+
+    def end(self) -> None:
+        """Kill it and wait until it is gone."""
+        self._process.kill()
+        self._process.wait()
+        self._listener.join()
+        try:
+            self._questions.close()
+        except OSError:  # what it did not read
+            pass
+
+    def _listen(self, answers: IO[bytes]) -> None:
+        with answers:
+            while line := answers.readline(LINE_LIMIT_BYTES):
+                self._answers.put(line)
+        self._answers.put(b"")
+
+    def _answer(self, limit_s: float) -> dict[str, Any] | None:
+        try:
+            answer = json.loads(self._answers.get(timeout=limit_s))
+        except (queue.Empty, ValueError, RecursionError):
+            return None
+        return answer if isinstance(answer, dict) else None
+
+
+_ONE_THREAD = {name: "1" for name in ("OPENBLAS_NUM_THREADS", "RAYON_NUM_THREADS", "TOKIO_WORKER_THREADS")}
+"""Threads reserve address space, which the child has little of."""
+
+_shared = Examiner()
+atexit.register(_shared.close)
+
+
+def examine(path: Path) -> RunRow:
+    """The row of a recording that can be read wholly and is safe to be read in this process.
+
+    The first call takes two seconds and leaves a child behind for those to come, which ends a minute after the last.
+    Raises ``RecordingError``, in one sentence, if the file cannot be read or is not safe.
+    """
+    return _shared.examine(Path(path))
+
+
+def examine_all(paths: Iterable[Path]) -> Iterator[tuple[Path, RunRow | RecordingError]]:
+    """Examine many recordings one after another: their rows, or what is wrong with them.
+
+    Raises ``RecordingError`` only if the child that reads them cannot be started.
+    """
+    with Examiner() as examiner:
+        for path in paths:
+            try:
+                yield path, examiner.examine(path)
+            except SpherlocError as error:
+                yield path, error if isinstance(error, RecordingError) else RecordingError(str(error))
