@@ -57,8 +57,5 @@ def groups(query: RunQuery, by: str) -> Condition:
     """A whole statement that counts runs by the value of ``by``, most of them first."""
     assert by in GROUP_KEYS
     where, values = condition(query)
-    if by == "label":
-        table = f"labels WHERE id IN (SELECT id FROM runs WHERE {where})"
-    else:
-        table = f"runs WHERE {where}"
+    table = f"labels WHERE id IN (SELECT id FROM runs WHERE {where})" if by == "label" else f"runs WHERE {where}"
     return f"SELECT {by}, count(*) FROM {table} GROUP BY {by} ORDER BY count(*) DESC, {by}", values

@@ -84,6 +84,7 @@ def rows_of(connection: sqlite3.Connection, ids: Sequence[int]) -> tuple[RunRow,
 
 
 def _row(values: Sequence[Any]) -> RunRow:
-    row = dict(zip((*MAIN, *DETAILS), values, strict=True))
+    row: dict[str, Any] = dict(zip((*MAIN, *DETAILS), values, strict=True))
     row["labels"] = tuple(json.loads(row["labels"]))
-    return RunRow(**row | {name: None if row[name] is None else bool(row[name]) for name in _BOOLEANS})
+    row |= {name: bool(row[name]) for name in _BOOLEANS if row[name] is not None}
+    return RunRow(**row)
