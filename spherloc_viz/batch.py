@@ -1,11 +1,11 @@
 """``spherloc run``: solve scenes one after another, print and record each."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import asdict, replace
-from datetime import UTC, datetime
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,6 +21,25 @@ from spherloc.trace import Trace
 from spherloc_viz.layers.certificate import chance, proof, warning
 from spherloc_viz.options import json_text, option_fields
 from spherloc_viz.progress import prepare, say
+from spherloc_viz.recording.origin import Origin
+from spherloc_viz.recording.room import KEEP_GIGABYTES, kept_bytes
+
+if TYPE_CHECKING:
+    from spherloc_viz.recording.keeper import Keeper
+
+RECORDING = ".rrd"
+
+
+@dataclass(frozen=True)
+class Records:
+    """How runs are recorded."""
+
+    folder: Path
+    """Of the recordings."""
+    full: bool = False
+    """Whether every arc and edge is kept."""
+    keep_gigabytes: float = KEEP_GIGABYTES
+    """Size beyond which old successes are deleted."""
 
 
 def run_scenes(
@@ -29,39 +48,70 @@ def run_scenes(
     seed: int | None,
     settings: Sequence[str],
     as_json: bool,
-    recordings: Path | None,
+    records: Records | None,
     query: str | None = None,
     variation: Variation | None = None,
 ) -> int:
     """Solve every scene; returns the exit code. A wrong input is reported and the others are still solved.
 
     ``query`` chooses a query image of scenes made of images, by default their first; ``variation`` changes every
-    scene.
+    scene. A recording (.rrd) is a scene too, whose problem is the recorded one. Without ``records`` nothing is
+    recorded.
     """
     if not paths:
         raise InputError("no scene given; name one or more scene files, such as scenes/mei_outliers_80.toml.")
-    changes = parse_settings(estimator, settings)
-    warm = False
+    changes, variation = parse_settings(estimator, settings), variation or Variation()
     jobs: list[Future[int]] = []
-    worst = 0
     # One thread writes and prints, in order, while the next scene is being solved.
-    with ThreadPoolExecutor(1) as finisher:
+    with keeper_of(records) as keeper, ThreadPoolExecutor(1) as finisher:
         for path in paths:
             try:
-                scene = load_scene(path)
-                problem = _problem(path, scene, seed, query, variation or Variation())
-                if not warm:
+                scene = open_scene(path)
+                problem = _problem(path, scene, seed, query, variation)
+                if not jobs:
                     warm_up(say)
-                    warm = True
                 options = resolved_options(estimator, problem, changes)
                 trace = estimate(problem, estimator, options, used_seed(scene, seed))
+                origin = None if keeper is None else _origin(path, scene, seed, query, variation)
             except SpherlocError as error:
                 jobs.append(finisher.submit(_report, error))
                 continue
-            jobs.append(finisher.submit(_finish, path, trace, as_json, recordings))
-        for job in jobs:
-            worst = max(worst, job.result())
-    return worst
+            jobs.append(finisher.submit(_finish, path, trace, origin, as_json, keeper))
+        return max(job.result() for job in jobs)
+
+
+def open_scene(path: Path) -> Scene:
+    """The scene of a scene file or of a recording; raises ``SpherlocError`` if it is neither."""
+    if path.suffix.lower() != RECORDING:
+        return load_scene(path)
+    from spherloc_viz.recording.scene import load_recorded_scene
+
+    return load_recorded_scene(path)
+
+
+def _origin(path: Path, scene: Scene, seed: int | None, query: str | None, variation: Variation) -> Origin:
+    from spherloc_viz.recording.scene import origin_of
+
+    return origin_of("command", path, scene, seed, query, variation)
+
+
+@contextmanager
+def keeper_of(records: Records | None) -> "Iterator[Keeper | None]":
+    """Who records runs, in a folder from which the leftovers of killed processes are gone.
+
+    Raises ``InputError`` for a wrong size to be kept.
+    """
+    if records is None:
+        yield None
+        return
+    keep_bytes = kept_bytes(records.keep_gigabytes)
+    # Only now, since it takes most of a second.
+    from spherloc_viz.recording.keeper import Keeper
+
+    with Keeper(records.folder, say, records.full, keep_bytes) as keeper:
+        with suppress(OSError):  # whoever cannot read the folder is told when a run cannot be written
+            keeper.tidy()
+        yield keeper
 
 
 def _problem(path: Path, scene: Scene, seed: int | None, query: str | None, variation: Variation) -> Problem:
@@ -105,21 +155,15 @@ def _report(error: SpherlocError) -> int:
     return 2
 
 
-def _finish(path: Path, trace: Trace, as_json: bool, recordings: Path | None) -> int:
+def _finish(path: Path, trace: Trace, origin: Origin | None, as_json: bool, keeper: "Keeper | None") -> int:
     """Record and print one run; returns its exit code."""
     code = 0 if trace.cam_from_map is not None else 1
-    recording = None
-    if recordings is not None:
-        from spherloc_viz.recording.background import file_name
-        from spherloc_viz.recording.writer import write_recording
-
+    recording, diagnosis = None, diagnose(trace)
+    if keeper is not None:
         try:
-            target = recordings / file_name(trace, datetime.now(UTC))
-            write_recording(trace, target)
-            recording = target
+            recording = keeper.record(trace, origin, diagnosis)
         except SpherlocError as error:
             code = _report(error)
-    diagnosis = diagnose(trace)
     if as_json:
         print(json_text(as_record(path, trace, diagnosis, recording)), flush=True)
     else:

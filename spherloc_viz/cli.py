@@ -12,6 +12,7 @@ from tyro.extras import SubcommandApp
 
 from spherloc.errors import SpherlocError
 from spherloc_viz import recording_commands
+from spherloc_viz.recording.room import KEEP_GIGABYTES
 
 RECORDINGS = Path("recordings")
 Settings = Annotated[tyro.conf.UseAppendAction[tuple[tuple[str, ...], ...]], arg(metavar="KEY=VALUE ...")]
@@ -35,7 +36,9 @@ def run(
     hide: str | None = None,
     json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
     record: bool = True,
+    full: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
     recordings: Path = RECORDINGS,
+    keep_gigabytes: float = KEEP_GIGABYTES,
     query: str | None = None,
 ) -> int:
     """Solve localization problems and record each run.
@@ -57,7 +60,7 @@ def run(
     spherloc run scenes/mei_outliers_90.toml --set outlier_rate=0.5 outlier_kind=coherent --spoil 3,5 --hide 1
 
     Args:
-        scenes: Scene files (TOML), one or more.
+        scenes: Scene files (TOML) or recordings (.rrd), whose problem is solved; one or more.
         estimator: mc (deterministic maximum consensus), ransac-2p or another one; a wrong name lists them all.
         seed: Seed of the estimator and, in synthetic scenes, of the simulation; the scene's own if not given.
         option: Options of the estimator, such as bound_px=4; none and inf are values where they make sense.
@@ -67,14 +70,16 @@ def run(
         hide: Numbers of matches that are left out.
         json: Print one JSON object a scene, on one line; infinity is the text "inf".
         record: Write a recording of each run.
+        full: Keep every arc and edge in the recordings, which makes them larger.
         recordings: Folder of the recordings.
+        keep_gigabytes: What the recordings may take; beyond it the oldest successes that nobody labelled are deleted.
         query: Name of the query image, in scenes made of images; the first one if not given.
     """
     from spherloc.datasets.variation_text import parse_variation
     from spherloc_viz import batch
 
     variation = parse_variation(list(chain(*set)), spoil, mend, hide)
-    kept = recordings if record else None
+    kept = batch.Records(recordings, full, keep_gigabytes) if record else None
     return batch.run_scenes(scenes, estimator, seed, list(chain(*option)), json, kept, query, variation)
 
 
@@ -89,6 +94,7 @@ def localize(
     output: Path | None = None,
     record: bool = True,
     recordings: Path | None = None,
+    keep_gigabytes: float = KEEP_GIGABYTES,
     retry_failed: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
 ) -> int:
     """Localize a sequence of query images against a map.
@@ -115,12 +121,14 @@ def localize(
         output: Folder of the results; recordings/SCENE_ESTIMATOR_SEED if not given.
         record: Write a recording of each query.
         recordings: Folder of the recordings; a folder of that name in the output folder if not given.
+        keep_gigabytes: What the recordings may take; beyond it the oldest successes that nobody labelled are deleted.
         retry_failed: Do queries again that have no pose yet.
     """
+    from spherloc_viz.batch import Records
     from spherloc_viz.localize import localize_sequence
 
     folder = output or RECORDINGS / f"{scene.stem}_{estimator}_{seed}"
-    kept = (recordings or folder / "recordings") if record else None
+    kept = Records(recordings or folder / "recordings", keep_gigabytes=keep_gigabytes) if record else None
     try:
         return localize_sequence(scene, estimator, seed, list(chain(*option)), queries, folder, kept, retry_failed)
     except KeyboardInterrupt:
@@ -141,6 +149,9 @@ def sweep(
     workers: int = 2,
     scheduler: str | None = None,
     out: Path | None = None,
+    record: bool = True,
+    recordings: Path = RECORDINGS,
+    keep_gigabytes: float = KEEP_GIGABYTES,
 ) -> int:
     """Compare estimators over the outlier rate, noise, number of correspondences or gravity error of a simulation.
 
@@ -173,12 +184,18 @@ def sweep(
         workers: Processes on this machine.
         scheduler: Address of a Dask scheduler, whose workers do the runs instead.
         out: CSV to write or go on with; recordings/SCENE_OVER_SEED.csv if not given.
+        record: Write a recording of each run, which takes several times as long as many a run; of a cluster's workers
+            those on this machine do.
+        recordings: Folder of the recordings.
+        keep_gigabytes: What the recordings may take; beyond it the oldest successes that nobody labelled are deleted.
     """
+    from spherloc_viz.batch import Records
     from spherloc_viz.sweep import sweep as do_sweep
 
     file = out or RECORDINGS / f"{scene.stem}_{over}_{seed}.csv"
     chosen = estimator or ("mc", "ransac-2p")
-    return do_sweep(scene, over, values, chosen, list(chain(*set)), runs, seed, workers, scheduler, file)
+    kept = Records(recordings, keep_gigabytes=keep_gigabytes) if record else None
+    return do_sweep(scene, over, values, chosen, list(chain(*set)), runs, seed, workers, scheduler, file, kept)
 
 
 @app.command
@@ -216,6 +233,7 @@ def play(
 
 
 app.command(recording_commands.view)
+app.command(recording_commands.repeat)
 
 
 @app.command

@@ -1,10 +1,9 @@
 """``spherloc localize``: a query sequence against a map, with a progress bar, resumable, into one folder."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, replace
-from datetime import UTC, datetime
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from spherloc.datasets import load_scene
 from spherloc.datasets.map_scene import MapScene
@@ -19,9 +18,13 @@ from spherloc.experiments.trajectories import estimated_trajectory, timed, true_
 from spherloc.frontend.view import View
 from spherloc.trace import Trace
 from spherloc.trajectory import write_tum
-from spherloc_viz.batch import parse_settings
+from spherloc_viz.batch import Records, keeper_of, parse_settings
 from spherloc_viz.options import json_text
 from spherloc_viz.progress import prepare, progress, say
+from spherloc_viz.recording.origin import Origin
+
+if TYPE_CHECKING:
+    from spherloc_viz.recording.keeper import Keeper
 
 TRAJECTORY, TRUE_TRAJECTORY, PICTURE, SUMMARY = "trajectory.tum", "truth.tum", "trajectory.png", "summary.json"
 MAX_TOLD = 5
@@ -34,12 +37,13 @@ def localize_sequence(
     settings: Sequence[str],
     queries: Sequence[str],
     output: Path,
-    recordings: Path | None,
+    records: Records | None,
     retry_failed: bool,
 ) -> int:
     """Localize the chosen queries that ``output`` has no result of; returns the exit code.
 
-    0 if every chosen query has a pose, else 1. Raises ``InputError`` for whatever makes all of it impossible.
+    0 if every chosen query has a pose, else 1. Without ``records`` nothing is recorded.
+    Raises ``InputError`` for whatever makes all of it impossible.
     """
     scene = load_scene(path)
     if not isinstance(scene, MapScene):
@@ -54,7 +58,9 @@ def localize_sequence(
         todo = _todo(scene, chosen, log, retry_failed)
         if todo:
             warm_up(say)
-            _work(scene, todo, log, (estimator, options, seed), recordings)
+            with keeper_of(records) as keeper:
+                recorder = None if keeper is None else _Recorder(keeper, path.resolve(), log)
+                _work(scene, todo, log, (estimator, options, seed), recorder)
         results = log.results()
         _finish(log, results)
     print(_text(results, summarize(results)), flush=True)
@@ -86,15 +92,15 @@ def _todo(scene: MapScene, chosen: Sequence[View], log: ResultsLog, retry_failed
 
 
 def _work(
-    scene: MapScene, todo: list[View], log: ResultsLog, how: tuple[str, Any, int], recordings: Path | None
+    scene: MapScene, todo: list[View], log: ResultsLog, how: tuple[str, Any, int], recorder: "_Recorder | None"
 ) -> None:
     failed = 0
     try:
         prepare(scene)
         with progress(len(todo), "queries") as advance:
             for row, trace in localize(scene, todo, *how):
-                if recordings is not None and trace is not None:
-                    row = replace(row, recording=_record(trace, recordings, log))
+                if recorder is not None and trace is not None:
+                    row = replace(row, recording=recorder.record(trace, row.query))
                 # Its recording is complete by now, so a row never names one that a killed process left unwritten.
                 log.append(row)
                 failed += row.status != LOCALIZED
@@ -105,25 +111,37 @@ def _work(
         raise
 
 
-def _record(trace: Trace, folder: Path, log: ResultsLog) -> str | None:
-    from spherloc_viz.recording.background import file_name
-    from spherloc_viz.recording.writer import write_recording
+@dataclass(frozen=True)
+class _Recorder:
+    """Records the queries of a sequence."""
 
-    try:
-        path = folder / file_name(trace, datetime.now(UTC))
-        write_recording(trace, path)
-    except RecordingError as error:
-        if isinstance(error.__cause__, OSError):  # no room: the next ones would be lost too
-            raise InputError(
-                f"{error} What is done is kept ({len(log.rows)} of {log.configuration.queries} queries), and the same "
-                "command goes on from there."
-            ) from None
-        say(str(error))
-        return None
-    try:
-        return path.resolve().relative_to(log.folder.resolve()).as_posix()
-    except ValueError:
-        return str(path.resolve())
+    keeper: "Keeper"
+    """Of the folder of the recordings."""
+    scene_path: Path
+    """Absolute."""
+    log: ResultsLog
+    """Of the sequence."""
+
+    def record(self, trace: Trace, query: str) -> str | None:
+        """Record a query and return the path as the results name it; None if that one run cannot be drawn.
+
+        Raises ``InputError`` where there is no room, since the next ones would be lost too.
+        """
+        log = self.log
+        try:
+            path = self.keeper.record(trace, Origin("sequence", str(self.scene_path), trace.seed, query))
+        except RecordingError as error:
+            if isinstance(error.__cause__, OSError):
+                raise InputError(
+                    f"{error} What is done is kept ({len(log.rows)} of {log.configuration.queries} queries), and the "
+                    "same command goes on from there."
+                ) from None
+            say(str(error))
+            return None
+        try:
+            return path.resolve().relative_to(log.folder.resolve()).as_posix()
+        except ValueError:
+            return str(path.resolve())
 
 
 def _finish(log: ResultsLog, results: SequenceResults) -> None:

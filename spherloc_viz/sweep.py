@@ -2,18 +2,26 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from spherloc.datasets import load_scene
 from spherloc.datasets.variation_text import parse_variation
+from spherloc.errors import RecordingError
 from spherloc.estimators import warm_up
-from spherloc.experiments.sweep import Entrant, SweepPlan, planned, run_sweep
+from spherloc.experiments.sweep import Entrant, Keep, SweepPlan, planned, run_sweep
 from spherloc.experiments.sweep_log import SweepLog
 from spherloc.experiments.sweep_summary import summarize
 from spherloc.experiments.sweep_text import parse_values
-from spherloc_viz.batch import parse_settings
+from spherloc_viz.batch import Records, keeper_of, parse_settings
 from spherloc_viz.layers.primitives import Table
 from spherloc_viz.layers.sweep import sweep_table
 from spherloc_viz.progress import progress, say
+
+if TYPE_CHECKING:
+    from spherloc_viz.recording.keeper import Keeper
+
+PRUNE_EVERY = 100
+"""Runs of a sweep, of which the workers record some in a second."""
 
 
 def sweep(
@@ -27,10 +35,11 @@ def sweep(
     workers: int,
     scheduler: str | None,
     out: Path,
+    records: Records | None = None,
 ) -> int:
     """Do the runs that ``out`` has not got; returns the exit code, which is 0.
 
-    Raises ``InputError`` for whatever makes the sweep impossible.
+    Without ``records`` they are not recorded. Raises ``InputError`` for whatever makes the sweep impossible.
     """
     entrants = [parse_entrant(text) for text in estimators]
     plan = planned(scene, over, parse_values(values), entrants, runs, parse_variation(settings), seed)
@@ -40,7 +49,8 @@ def sweep(
             say(f"{out}: {plan.rows - left:,} of {plan.rows:,} runs are done already.")
         try:
             if left:
-                _work(plan, log, left, workers, scheduler)
+                with keeper_of(records) as keeper:
+                    _work(plan, log, left, workers, scheduler, keeper)
         except KeyboardInterrupt:
             say(f"stopped; {len(log.rows):,} runs are in {out}, and the same command goes on from there.")
             raise
@@ -54,13 +64,57 @@ def sweep(
     return 0
 
 
-def _work(plan: SweepPlan, log: SweepLog, left: int, workers: int, scheduler: str | None) -> None:
+def _work(
+    plan: SweepPlan, log: SweepLog, left: int, workers: int, scheduler: str | None, keeper: "Keeper | None"
+) -> None:
     if scheduler is None:
         warm_up(say)  # once, before all workers do it
+    recorded = None if keeper is None else _Recorded(keeper)
+    keep = None if recorded is None else recorded.keep(scheduler is not None)
+    complain = say if recorded is None else recorded.complain
     with progress(left, "runs") as advance:
-        for row in run_sweep(plan, log.done, workers, scheduler):
+        for count, row in enumerate(run_sweep(plan, log.done, workers, scheduler, keep=keep, complain=complain)):
             log.append(row)
             advance("")
+            if recorded is not None and count % PRUNE_EVERY == 0:
+                recorded.prune()
+    if recorded is not None:
+        recorded.finish()
+
+
+class _Recorded:
+    """The recordings of a sweep, which its workers write: makes room for them, and says once what fails."""
+
+    def __init__(self, keeper: "Keeper") -> None:
+        self._keeper, self._lost = keeper, 0
+
+    def keep(self, cluster: bool) -> Keep:
+        """What records a run where it is done."""
+        from spherloc_viz.recording.sweep_keeper import SweepKeeper
+
+        folder = self._keeper.folder.resolve()
+        if cluster:
+            say(f"runs of the cluster's workers on this machine are recorded in {folder}, those of others are not.")
+        return SweepKeeper(folder)
+
+    def complain(self, sentence: str) -> None:
+        """A run could not be recorded: of many, the first one says why."""
+        self._lost += 1
+        if self._lost == 1:
+            say(f"{sentence} The sweep goes on.")
+
+    def prune(self) -> None:
+        """Delete old successes where there are too many."""
+        try:
+            self._keeper.prune()
+        except RecordingError as error:
+            self.complain(str(error))
+
+    def finish(self) -> None:
+        """Make room for the last time, and say how many runs are missing."""
+        self.prune()
+        if self._lost > 1:
+            say(f"{self._lost:,} times something could not be recorded or listed, the first of which was said.")
 
 
 def parse_entrant(text: str) -> Entrant:

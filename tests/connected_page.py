@@ -4,7 +4,7 @@ import asyncio
 import contextlib
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import aiohttp
@@ -36,27 +36,18 @@ def until(condition: Callable[[], Any]) -> None:
         time.sleep(0.01)
 
 
-class ConnectedPage:
-    """One client; ``handle`` is viser's of it."""
+class Wire:
+    """A connection to viser on a thread and an event loop of its own, which end with it."""
 
-    def __init__(self, server: viser.ViserServer, key: str) -> None:
-        self._port, self._key = server.get_port(), key
-        self._loop = asyncio.new_event_loop()
-        self._leaving = asyncio.Event()
+    def __init__(self, port: int, key: str) -> None:
+        """Connect, and say what a page says first."""
+        self._port, self._key = port, key
+        self._loop, self._leaving = asyncio.new_event_loop(), asyncio.Event()
         self._socket: aiohttp.ClientWebSocketResponse | None = None
-        self.answer: Callable[[dict[str, Any]], dict[str, Any] | None] = lambda message: None
-        """Called with every message; what it returns is sent."""
-        self.files: dict[str, bytes] = {}
-        """What was downloaded, by name."""
-        self._names: dict[str, str] = {}
-        known = set(server.get_clients())
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
         until(lambda: self._socket is not None)
         self.send(HELLO)
-        until(lambda: set(server.get_clients()) - known)
-        (number,) = set(server.get_clients()) - known
-        self.handle = server.get_clients()[number]
 
     def _run(self) -> None:
         with contextlib.closing(self._loop):
@@ -82,24 +73,54 @@ class ConnectedPage:
 
     async def _read(self, socket: aiohttp.ClientWebSocketResponse) -> None:
         async for message in socket:
-            for content in _messages(message.data):
-                self._note(content)
-                reply = self.answer(content)
-                if reply is not None:
-                    await socket.send_bytes(msgspec.msgpack.encode(reply))
+            for reply in self.heard(message.data):
+                await socket.send_bytes(msgspec.msgpack.encode(reply))
 
-    def _note(self, message: dict[str, Any]) -> None:
-        if message["type"] == "FileTransferStartDownload":
-            self._names[message["transfer_uuid"]] = message["filename"]
-        elif message["type"] == "FileTransferPart":
-            name = self._names[message["transfer_uuid"]]
-            self.files[name] = self.files.get(name, b"") + message["content"]
+    def heard(self, data: bytes) -> Iterator[dict[str, Any]]:
+        """What is answered to a packet of messages: nothing."""
+        return iter(())
 
     def send(self, message: dict[str, Any]) -> None:
         """Send a message as the page's script would."""
         assert self._socket is not None
         sending = self._socket.send_bytes(msgspec.msgpack.encode(message))
         asyncio.run_coroutine_threadsafe(sending, self._loop).result(60)
+
+    def close(self) -> None:
+        """Leave."""
+        # The loop is closed already where the server went first.
+        with contextlib.suppress(RuntimeError):
+            self._loop.call_soon_threadsafe(self._leaving.set)
+        self._thread.join(60)
+        assert not self._thread.is_alive()
+
+
+class ConnectedPage(Wire):
+    """One client; ``handle`` is viser's of it."""
+
+    def __init__(self, server: viser.ViserServer, key: str) -> None:
+        self.answer: Callable[[dict[str, Any]], dict[str, Any] | None] = lambda message: None
+        """Called with every message; what it returns is sent."""
+        self.files: dict[str, bytes] = {}
+        """What was downloaded, by name."""
+        self._names: dict[str, str] = {}
+        known = set(server.get_clients())
+        super().__init__(server.get_port(), key)
+        until(lambda: set(server.get_clients()) - known)
+        (number,) = set(server.get_clients()) - known
+        self.handle = server.get_clients()[number]
+
+    def heard(self, data: bytes) -> Iterator[dict[str, Any]]:
+        """Notes files, and asks ``answer`` what to say."""
+        for message in _messages(data):
+            if message["type"] == "FileTransferStartDownload":
+                self._names[message["transfer_uuid"]] = message["filename"]
+            elif message["type"] == "FileTransferPart":
+                name = self._names[message["transfer_uuid"]]
+                self.files[name] = self.files.get(name, b"") + message["content"]
+            reply = self.answer(message)
+            if reply is not None:
+                yield reply
 
     def press(self, button: Any) -> None:
         """Press a button."""
@@ -114,14 +135,6 @@ class ConnectedPage:
         for number, piece in enumerate(parts):
             message = {"type": "FileTransferPart", "source_component_uuid": button._impl.uuid, "transfer_uuid": name}
             self.send(message | {"part_index": number, "content": piece})
-
-    def close(self) -> None:
-        """Leave."""
-        # The loop is closed already where the server went first.
-        with contextlib.suppress(RuntimeError):
-            self._loop.call_soon_threadsafe(self._leaving.set)
-        self._thread.join(60)
-        assert not self._thread.is_alive()
 
 
 def _messages(data: bytes) -> list[dict[str, Any]]:

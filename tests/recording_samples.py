@@ -104,6 +104,8 @@ class Recorded:
             batch = chunk.to_record_batch()
             for index in range(batch.num_rows):
                 row = {name: batch.column(name)[index] for name in batch.schema.names}
+                # A component that a row does not change is null in it.
+                row = {name: value for name, value in row.items() if value.is_valid}
                 step = row["step"].as_py() if "step" in row else -1
                 self.rows.setdefault(chunk.entity_path, []).append((step, row))
 
@@ -113,7 +115,7 @@ class Recorded:
         for when, row in sorted(self.rows[entity], key=lambda item: item[0]):
             if when <= step:
                 shown |= {name: value for name, value in row.items() if ":" in name or name == "correspondence"}
-        return shown if any(len(value) for value in shown.values() if value.is_valid) else None
+        return shown if any(len(value) for value in shown.values()) else None
 
     def array(self, entity: str, step: int, component: str) -> np.ndarray:
         """A component at a step as an array."""

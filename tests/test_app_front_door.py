@@ -21,7 +21,8 @@ from viser import _messages
 from spherloc.errors import InputError
 from spherloc_viz.app.server import serve
 from spherloc_viz.app.web import viser_seams
-from spherloc_viz.app.web.front_door import FrontDoor, is_own_name, open_socket, refusal
+from spherloc_viz.app.web.front_door import FrontDoor
+from spherloc_viz.app.web.guard import is_own_name, open_socket, refusal
 from spherloc_viz.app.web.page import load_page
 from spherloc_viz.app.web.touch import MOST_BYTES, Touch, TouchDesk, Touches
 

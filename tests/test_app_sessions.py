@@ -1,17 +1,12 @@
 """A session from connect to disconnect, driven by the messages that a page would send; no browser needed."""
 
-import asyncio
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import aiohttp
-import msgspec
 import numpy as np
 import pytest
-import viser
 
 from spherloc.datasets.variation import Variation
 from spherloc.diagnosis import Cause, Diagnosis
@@ -24,7 +19,8 @@ from spherloc_viz.app.server import Sessions
 from spherloc_viz.app.services import Services
 from spherloc_viz.app.session import Session
 from spherloc_viz.app.web.touch import Touch
-from spherloc_viz.app.web.viser_seams import KEY_HEADER, start_viser, stop_viser
+from spherloc_viz.app.web.viser_seams import start_viser, stop_viser
+from tests.connected_page import Wire, until
 
 KEY = "a key of this test"
 SCENE = """
@@ -41,18 +37,6 @@ noise_px = 0.5
 seed = 1
 """
 RIVAL = np.column_stack([np.eye(3), [1.0, 2.0, 3.0]])
-HELLO = {
-    "type": "ViewerCameraMessage",
-    "wxyz": (1.0, 0.0, 0.0, 0.0),
-    "position": (0.0, 0.0, -3.0),
-    "fov": 1.0,
-    "near": 0.01,
-    "far": 100.0,
-    "image_height": 720,
-    "image_width": 1280,
-    "look_at": (0.0, 0.0, 0.0),
-    "up_direction": (0.0, -1.0, 0.0),
-}
 
 
 class Notes:
@@ -69,49 +53,12 @@ class Notes:
         return Path(f"run-{len(self.traces)}.rrd")
 
 
-class Page:
-    """One connected page on a thread of its own, which reads and drops whatever it is sent."""
-
-    def __init__(self, port: int) -> None:
-        self._port = port
-        self._loop = asyncio.new_event_loop()
-        self._socket: aiohttp.ClientWebSocketResponse | None = None
-        self._thread = threading.Thread(target=self._loop.run_until_complete, args=(self._live(),), daemon=True)
-        self._thread.start()
-        until(lambda: self._socket is not None)
-        self.send(HELLO)
-
-    async def _live(self) -> None:
-        async with aiohttp.ClientSession() as client:
-            self._socket = await client.ws_connect(
-                f"http://127.0.0.1:{self._port}/",
-                headers={KEY_HEADER: KEY},
-                protocols=[f"viser-v{viser.__version__}"],
-                max_msg_size=0,
-            )
-            async for _ in self._socket:
-                pass
-
-    def send(self, message: dict[str, Any]) -> None:
-        assert self._socket is not None
-        sending = self._socket.send_bytes(msgspec.msgpack.encode(message))
-        asyncio.run_coroutine_threadsafe(sending, self._loop).result(60)
+class Page(Wire):
+    """One connected page, which drops whatever it is sent."""
 
     def set(self, widget: Any, value: Any) -> None:
         """Change a widget, as the page tells it."""
         self.send({"type": "GuiUpdateMessage", "uuid": widget._impl.uuid, "updates": {"value": value}})
-
-    def close(self) -> None:
-        if self._socket is not None and not self._socket.closed:
-            asyncio.run_coroutine_threadsafe(self._socket.close(), self._loop).result(60)
-        self._thread.join(60)
-
-
-def until(condition: Callable[[], bool]) -> None:
-    end = time.monotonic() + 60
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.01)
 
 
 def threads() -> int:
@@ -132,7 +79,7 @@ class House:
     def visit(self) -> tuple[Page, Session]:
         """A new page, once its first run is recorded."""
         known, recorded = set(self.sessions._open), len(self.notes.traces)
-        self.pages.append(Page(self.server.get_port()))
+        self.pages.append(Page(self.server.get_port(), KEY))
         until(lambda: len(self.notes.traces) > recorded)
         (number,) = set(self.sessions._open) - known
         return self.pages[-1], self.sessions._open[number]

@@ -42,7 +42,12 @@ def trace(request: pytest.FixtureRequest) -> Trace:
 
 @pytest.fixture(scope="module")
 def path(trace: Trace, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_recording(trace, tmp_path_factory.mktemp("recordings") / "new folder" / "run.rrd")
+    return written(trace, tmp_path_factory.mktemp("recordings") / "new folder" / "run.rrd")
+
+
+def written(trace: Trace, path: Path) -> Path:
+    write_recording(trace, path)
+    return path
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +78,7 @@ def test_the_problem_comes_back_bit_for_bit(trace: Trace, path: Path) -> None:
 @pytest.mark.parametrize("turn", range(6))
 def test_odd_problems_come_back_bit_for_bit(tmp_path: Path, rng: np.random.Generator, turn: int) -> None:
     problem = odd_problem(rng, turn)
-    again = read_recording(write_recording(estimate(problem, "ransac-2p"), tmp_path / "odd.rrd"))
+    again = read_recording(written(estimate(problem, "ransac-2p"), tmp_path / "odd.rrd"))
     assert_same_bits(problem, again.problem)
     assert again.properties["name"] == problem.name and again.properties["scene"] == problem.scene
 
@@ -152,7 +157,7 @@ def test_infinity_comes_back_and_is_never_written_as_what_json_does_not_know(tmp
     problem = replace(scene_problem("mei_outliers_80"), gravity_sd_rad=np.inf)
     certificate = Certificate(20, 20, np.inf)
     trace = replace(estimate(problem, "mc", options), certificate=certificate)
-    path = write_recording(trace, tmp_path / "run.rrd")
+    path = written(trace, tmp_path / "run.rrd")
     run = read_recording(path)
     assert run.options == asdict(options) and run.problem.gravity_sd_rad == np.inf and run.certificate == certificate
     assert run.properties["chance_sets"] == np.inf
@@ -172,7 +177,7 @@ def test_recordings_older_than_certificates_are_read(tmp_path: Path, monkeypatch
     monkeypatch.setattr(data, "_problem_row", lambda problem: without(problem_row(problem), "gravity_sd_rad"))
     monkeypatch.setattr(data, "_run_row", lambda trace: without(run_row(trace), "certificate"))
     trace = estimate(scene_problem("mei_outliers_80"), "mc")
-    run = read_recording(write_recording(trace, tmp_path / "old.rrd"))
+    run = read_recording(written(trace, tmp_path / "old.rrd"))
     assert run.certificate is None
     assert_same_bits(run.problem, trace.problem)
 
@@ -181,7 +186,7 @@ def test_a_wrong_pose_is_a_failure(tmp_path: Path) -> None:
     trace = estimate(scene_problem("mei_outliers_80"), "mc")
     assert trace.cam_from_map is not None
     moved = replace(trace, cam_from_map=trace.cam_from_map + np.eye(3, 4, 3))
-    properties = read_recording(write_recording(moved, tmp_path / "run.rrd")).properties
+    properties = read_recording(written(moved, tmp_path / "run.rrd")).properties
     assert properties["outcome"] == "failure"
     assert properties["translation_error_m"] == pytest.approx(1.0, abs=0.1)
 
@@ -297,7 +302,7 @@ def unescaped(markdown: str) -> str:
 def test_words_cannot_become_markup(tmp_path: Path) -> None:
     trace = estimate(scene_problem("mei_outliers_80"), "mc")
     evil = "![x](http://example.org/a.png) <b>| # `code` | $x$"
-    path = write_recording(replace(trace, message=evil), tmp_path / "run.rrd")
+    path = written(replace(trace, message=evil), tmp_path / "run.rrd")
     text = Recorded(path).array("/outcome", -1, "TextDocument:text")[0]
     line = next(line for line in text.splitlines() if "example" in line)
     assert not re.search(r"(?<!\\)[][`<>|#$!]", line)

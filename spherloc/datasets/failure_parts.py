@@ -125,6 +125,12 @@ class CaseMaker:
         if twins:
             self.parts.append((right[:twins], points[:twins], True))
 
+    def agreeing(self, count: int, wrong: FloatArray) -> None:
+        """Add wrong correspondences that agree with that pose (3, 4), and are seen from the true one too."""
+        while (found := self.visible(count, self.cube, self.truth, wrong)) is None:
+            continue
+        self.parts.append((found[1][1], found[0], False))
+
     def case(self, cause: str, **changes: Any) -> FailureCase:
         """The parts in random order as a case; ``options`` and fields of the problem can be given."""
         options = changes.pop("options", {})

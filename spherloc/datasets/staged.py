@@ -10,15 +10,19 @@ from typing import Literal, get_args
 import numpy as np
 
 from spherloc.cameras.base import Camera
-from spherloc.datasets.failure_parts import CaseMaker, Cloud
+from spherloc.datasets.failure_parts import CaseMaker, Cloud, FloatArray
 from spherloc.datasets.failures import PLACES
 from spherloc.errors import InputError, show
+from spherloc.geometry import pose, yaw_rotation
 from spherloc.problem import Problem
 
-GroupKind = Literal["right", "agreeing", "twins", "random"]
+GroupKind = Literal["right", "agreeing", "near", "twins", "random"]
 GROUP_KINDS: tuple[str, ...] = get_args(GroupKind)
 CUBE = "cube"
 MOST_MATCHES = 2_000
+NEAR_M = 0.5
+NEAR_YAW_DEG = 3.0
+"""How far a pose that passes for the true one is from it."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +30,8 @@ class Group:
     """Correspondences of one sort."""
 
     kind: GroupKind
-    """"right"; "agreeing": all with one wrong pose, a new one for each group; "twins": each point is matched twice,
+    """"right"; "agreeing": all with one wrong pose, a new one for each group; "near": all with one pose half a metre
+    beside the true one, as where a fence's bars are mistaken for the next ones; "twins": each point is matched twice,
     right and by one wrong pose; "random": any pixel with any point."""
     count: int
     """How many; twins are twice as many."""
@@ -99,8 +104,18 @@ def _add(make: CaseMaker, group: Group) -> None:
         make.right(group.count, cloud)
     elif group.kind == "random":
         make.random(group.count, cloud)
+    elif group.kind == "near":
+        make.agreeing(group.count, _beside(make))
     else:
         make.coherent(group.count, twins=group.count if group.kind == "twins" else 0)
+
+
+def _beside(make: CaseMaker) -> FloatArray:
+    """A level pose (3, 4) near the true one."""
+    side = make.between(-np.pi, np.pi)
+    shift = NEAR_M * np.array([np.cos(side), 0.0, np.sin(side)])
+    turn = yaw_rotation(float(np.radians(NEAR_YAW_DEG)) * make.rng.choice([-1.0, 1.0]))
+    return pose(turn @ make.truth[:, :3], turn @ (make.truth[:, 3] + shift))
 
 
 def _words(groups: Sequence[Group]) -> str:

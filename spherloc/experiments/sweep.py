@@ -6,19 +6,21 @@
 
 import threading
 from collections import Counter, deque
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 
 from spherloc.errors import InputError
-from spherloc.experiments.sweep_crew import Crew, LocalCrew
+from spherloc.experiments.sweep_crew import Crew, Keep, LocalCrew
 from spherloc.experiments.sweep_plan import AXES, Entrant, Job, SweepPlan, planned
 from spherloc.experiments.sweep_rows import SweepRow
 
-__all__ = ["AXES", "Entrant", "Job", "SweepPlan", "SweepRow", "planned", "run_sweep"]
+__all__ = ["AXES", "Entrant", "Job", "Keep", "SweepPlan", "SweepRow", "planned", "run_sweep"]
 
 TASK_S = 0.3
 """A task is a few runs that take about as long as this: less would be spent on messages, more would look stuck."""
 OVERHEAD_MS = 2.0
 """Of a run beside its estimator: drawing the problem, judging the pose."""
+KEEPING_MS = 50.0
+"""Of a run that is kept, beside that."""
 MOST_DEATHS = 3
 LISTEN_S = 0.1
 
@@ -29,6 +31,8 @@ def run_sweep(
     workers: int = 2,
     scheduler: str | None = None,
     stop: threading.Event | None = None,
+    keep: Keep | None = None,
+    complain: Callable[[str], None] = lambda sentence: None,
 ) -> Iterator[SweepRow]:
     """The rows of a sweep as they come, all points growing evenly; none is done here, all in other processes.
 
@@ -38,34 +42,45 @@ def run_sweep(
     iterator, ends it within a fraction of a second and leaves no process behind. Runs of a worker that dies are done
     again.
 
+    ``keep`` is given every run where it is done, before its row comes here and between the times that are measured;
+    ``complain`` gets a sentence for each that could not be kept.
+
     Raises ``InputError`` if a run is impossible or kills its worker every time, or if there are no workers.
     """
-    backlog = Backlog(plan, done)
-    crew = _crew(plan, workers, scheduler)
+    backlog = Backlog(plan, done, OVERHEAD_MS + (0.0 if keep is None else KEEPING_MS))
+    crew = _crew(plan, workers, scheduler, keep)
     try:
         while backlog.left and not (stop is not None and stop.is_set()):
             for _ in range(crew.room()):
                 if jobs := backlog.take():
                     crew.submit(jobs)
             for task in crew.collect(LISTEN_S):
-                yield from backlog.put_back(task.jobs) if task.rows is None else backlog.book(task.jobs, task.rows)
+                if task.solved is None:
+                    backlog.put_back(task.jobs)
+                    continue
+                for sentence in task.solved.complaints:
+                    complain(sentence)
+                yield from backlog.book(task.jobs, task.solved.rows)
     finally:
         crew.close()
 
 
-def _crew(plan: SweepPlan, workers: int, scheduler: str | None) -> Crew:
+def _crew(plan: SweepPlan, workers: int, scheduler: str | None, keep: Keep | None) -> Crew:
     if scheduler is None:
-        return LocalCrew(plan, workers)
+        return LocalCrew(plan, workers, keep)
     from spherloc.experiments.sweep_cluster import Cluster
 
-    return Cluster(plan, scheduler)
+    return Cluster(plan, scheduler, keep)
 
 
 class Backlog:
     """The runs that are still to be done, handed out in tasks."""
 
-    def __init__(self, plan: SweepPlan, done: Collection[tuple[str, float, int]]) -> None:
-        self._plan = plan
+    def __init__(
+        self, plan: SweepPlan, done: Collection[tuple[str, float, int]], overhead_ms: float = OVERHEAD_MS
+    ) -> None:
+        """``overhead_ms`` is what a run takes beside its estimator."""
+        self._plan, self._overhead_ms = plan, overhead_ms
         known, labels = set(done), plan.labels
         self._fresh = (
             job
@@ -104,8 +119,8 @@ class Backlog:
             self._spent_ms[job.value, job.entrant] = runs + 1, total_ms + row.time_ms
         return rows
 
-    def put_back(self, jobs: tuple[Job, ...]) -> Sequence[SweepRow]:
-        """A task's worker died; gives no rows. Raises ``InputError`` if it always does."""
+    def put_back(self, jobs: tuple[Job, ...]) -> None:
+        """A task's worker died. Raises ``InputError`` if it always does."""
         if jobs == self._trial:
             self._deaths[jobs[0]] += 1
             if self._deaths[jobs[0]] == MOST_DEATHS:
@@ -115,7 +130,6 @@ class Backlog:
                 )
         self._leave(jobs)
         self._suspects.extend(jobs)
-        return ()
 
     def _leave(self, jobs: tuple[Job, ...]) -> None:
         self._out.remove(jobs)
@@ -128,7 +142,7 @@ class Backlog:
             job = self._next
             # A point that nobody has seen yet may take any time, so its first run goes alone.
             runs, total_ms = self._spent_ms.get((job.value, job.entrant), (1, 1e3 * TASK_S))
-            cost_ms = total_ms / runs + OVERHEAD_MS
+            cost_ms = total_ms / runs + self._overhead_ms
             if spent_ms and spent_ms + cost_ms > 1e3 * TASK_S:
                 return
             spent_ms += cost_ms

@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 from spherloc.errors import InputError
-from spherloc.experiments.sweep_crew import AHEAD, Done, solve
+from spherloc.experiments.sweep_crew import AHEAD, Done, Keep, solve
 from spherloc.experiments.sweep_plan import Job, SweepPlan
 from spherloc.extras import require
 
@@ -24,10 +24,10 @@ GATHER_S = 2.0
 class Cluster:
     """Workers behind a Dask scheduler. Dask does the tasks of a lost worker again, also those with a result."""
 
-    def __init__(self, plan: SweepPlan, address: str) -> None:
+    def __init__(self, plan: SweepPlan, address: str, keep: Keep | None) -> None:
         """Raises ``InputError`` if ``dask.distributed`` is missing, or no scheduler with workers is at ``address``."""
         self._dask = require("distributed", "cluster", "a sweep on a Dask cluster")
-        self._plan, self._address = plan, address
+        self._plan, self._address, self._keep = plan, address, keep
         # What is said here in a sentence, it would log with tracebacks.
         logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
         try:
@@ -59,7 +59,7 @@ class Cluster:
         return self._threads + AHEAD - len(self._tasks)
 
     def submit(self, jobs: tuple[Job, ...]) -> None:
-        future = self._client.submit(solve, self._plan, jobs, pure=False)
+        future = self._client.submit(solve, self._plan, jobs, self._keep, pure=False)
         self._tasks[future] = jobs
         future.add_done_callback(self._ended.put)
 
@@ -85,15 +85,15 @@ class Cluster:
     def _gather(self, future: Any) -> Done | None:
         """The task of a future; None if its result was lost with its worker and is being computed again."""
         try:
-            rows = future.result(timeout=GATHER_S)
+            solved = future.result(timeout=GATHER_S)
         except self._dask.KilledWorker:
-            rows = None
+            solved = None
         except TimeoutError:
             future.add_done_callback(self._ended.put)
             return None
         except self._dask.CancelledError:
             raise self._lost() from None
-        return Done(self._tasks.pop(future), rows)
+        return Done(self._tasks.pop(future), solved)
 
     def _check(self) -> None:
         if self._client.status != "running":

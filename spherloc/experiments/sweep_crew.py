@@ -16,6 +16,7 @@ from spherloc.errors import InputError
 from spherloc.estimators import warm_up
 from spherloc.experiments.sweep_plan import Job, SweepPlan
 from spherloc.experiments.sweep_rows import SweepRow
+from spherloc.trace import Trace
 
 MOST_WORKERS = 64
 AHEAD = 1
@@ -25,13 +26,31 @@ NICENESS = 10
 """Whoever waits for an answer of this machine goes before a sweep in the background."""
 
 
+class Keep(Protocol):
+    """Keeps whole runs where they are done. It is sent to the workers, so it is plain data."""
+
+    def __call__(self, plan: SweepPlan, job: Job, trace: Trace) -> str:
+        """Keep a run; returns why it could not be kept, in a sentence, or nothing if it was."""
+        ...
+
+
+@dataclass(frozen=True)
+class Solved:
+    """What a worker has done."""
+
+    rows: list[SweepRow]
+    """A row a run."""
+    complaints: tuple[str, ...] = ()
+    """Why runs could not be kept, a sentence each."""
+
+
 @dataclass(frozen=True)
 class Done:
     """A task that has ended."""
 
     jobs: tuple[Job, ...]
     """What it was."""
-    rows: list[SweepRow] | None
+    solved: Solved | None
     """Its results; None if its worker died."""
 
 
@@ -58,10 +77,14 @@ class Crew(Protocol):
         ...
 
 
-def solve(plan: SweepPlan, jobs: Sequence[Job]) -> list[SweepRow]:
+def solve(plan: SweepPlan, jobs: Sequence[Job], keep: Keep | None) -> Solved:
     """What a worker does."""
     _warm()
-    return plan.solve(jobs)
+    if keep is None:
+        return Solved(plan.solve(jobs))
+    complaints: list[str] = []
+    rows = plan.solve(jobs, lambda job, trace: complaints.append(keep(plan, job, trace)))
+    return Solved(rows, tuple(filter(None, complaints)))
 
 
 @cache
@@ -77,12 +100,12 @@ class LocalCrew:
     process has ended, whatever ended it. A pool with a dead process is replaced, and its tasks are reported as lost.
     """
 
-    def __init__(self, plan: SweepPlan, workers: int) -> None:
+    def __init__(self, plan: SweepPlan, workers: int, keep: Keep | None) -> None:
         """Raises ``InputError`` for a wrong number of workers."""
         if not 1 <= workers <= MOST_WORKERS:
             raise InputError(f"the sweep has {workers} workers; give a number from 1 to {MOST_WORKERS}.")
-        self._plan, self._workers = plan, workers
-        self._tasks: dict[Future[list[SweepRow]], tuple[Job, ...]] = {}
+        self._plan, self._workers, self._keep = plan, workers, keep
+        self._tasks: dict[Future[Solved], tuple[Job, ...]] = {}
         self._failed_starts = 0
         self._start()
 
@@ -92,7 +115,7 @@ class LocalCrew:
     def submit(self, jobs: tuple[Job, ...]) -> None:
         try:
             with _deaf_to_ctrl_c():
-                future = self._pool.submit(solve, self._plan, jobs)
+                future = self._pool.submit(solve, self._plan, jobs, self._keep)
         except BrokenExecutor as error:  # found out before we collected
             future = Future()
             future.set_exception(error)
@@ -141,7 +164,7 @@ def _end_with(lifeline: Connection) -> None:
     os._exit(0)
 
 
-def _is_broken(future: Future[list[SweepRow]]) -> bool:
+def _is_broken(future: Future[Solved]) -> bool:
     return not future.cancelled() and isinstance(future.exception(), BrokenExecutor)
 
 

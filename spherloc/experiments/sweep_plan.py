@@ -5,7 +5,7 @@ Figs. 5 to 7 are sweeps: errors against pixel noise, success and time against th
 
 import dataclasses
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -21,6 +21,7 @@ from spherloc.estimators import default_options, estimate, options_type
 from spherloc.estimators.base import versions
 from spherloc.experiments.sweep_rows import SweepRow, row_of
 from spherloc.problem import Problem
+from spherloc.trace import Trace
 
 AXES: Mapping[str, str] = {
     "outlier_rate": "outlier rate",
@@ -121,8 +122,8 @@ class SweepPlan:
         number = self.values[value]
         return replace(self.variation, **{self.over: int(number) if self.over == "correspondences" else number})
 
-    def solve(self, jobs: Sequence[Job]) -> list[SweepRow]:
-        """Do some of the runs, here and now.
+    def solve(self, jobs: Sequence[Job], done: Callable[[Job, Trace], None] | None = None) -> list[SweepRow]:
+        """Do some of the runs, here and now; ``done`` is given each of them, between the times that are measured.
 
         Raises ``InputError`` if the scene file or the software is not what the plan was made with, or a run is
         impossible.
@@ -145,6 +146,8 @@ class SweepPlan:
             except InputError as error:
                 raise InputError(f"{self.place(job)}: {error}") from None
             rows.append(row_of(trace, entrant.label, self.values[job.value]))
+            if done is not None:
+                done(job, trace)
         return rows
 
     def check(self) -> None:

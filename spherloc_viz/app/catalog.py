@@ -13,6 +13,9 @@ from spherloc.datasets.synthetic import SyntheticScene
 from spherloc.datasets.variation import Variation
 from spherloc.problem import Problem
 
+MOST_BRIEF = 8
+"""Recorded problems that a page offers beside its scenes."""
+
 
 @dataclass(frozen=True)
 class SceneWish:
@@ -47,12 +50,14 @@ class Catalog:
         for label, scene in self.scenes.items():
             if isinstance(scene, SyntheticScene):
                 self.cameras.setdefault(camera_label(scene.camera), str(self.path(label)))
+        self._brief: list[str] = []
         self._caches = _Caches()
 
     def branch(self) -> "Catalog":
         """A catalog with the same scenes and caches, to which one page can add scenes that others do not see."""
         twin = copy.copy(self)
         twin.scenes, twin._paths, twin.cameras = dict(self.scenes), dict(self._paths), dict(self.cameras)
+        twin._brief = list(self._brief)
         return twin
 
     def add(self, scene: Scene, path: Path, label: str | None = None) -> str:
@@ -66,6 +71,17 @@ class Catalog:
         free = known or next(name for name in names if name not in self.scenes)
         self.scenes[free], self._paths[free] = scene, path
         return free
+
+    def enter(self, scene: Scene, path: Path, label: str, brief: bool) -> str:
+        """``add`` for a scene that is reopened; of the brief ones, of which a reviewer goes through hundreds, only
+        the newest stay."""
+        entered = self.add(scene, path, label)
+        if brief:
+            self._brief = [*(other for other in self._brief if other != entered), entered]
+            for old in self._brief[:-MOST_BRIEF]:
+                del self.scenes[old], self._paths[old]
+            self._brief = self._brief[-MOST_BRIEF:]
+        return entered
 
     def path(self, label: str) -> Path:
         """The scene file of that label, absolute."""

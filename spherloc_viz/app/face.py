@@ -12,6 +12,7 @@ from spherloc_viz.app.catalog import Catalog
 from spherloc_viz.app.controls.controls import Controls, Owner
 from spherloc_viz.app.matches.match_card import MatchCard
 from spherloc_viz.app.panels.export_panel import Shown
+from spherloc_viz.app.services import Services
 from spherloc_viz.app.stage.canvas import Canvas, panel_widths_px
 from spherloc_viz.app.story import Story
 from spherloc_viz.app.text import diagnosis_html, status_html
@@ -36,14 +37,14 @@ class Face:
         catalog: Catalog,
         touches: Touches,
         owner: Owner,
-        roots: tuple[Path, ...],
+        services: Services,
         select: Callable[[Iterable[int], bool], None],
         moved: Callable[[TrueCamera], None],
     ) -> None:
         """``select`` gets numbers of correspondences in the problem, ``moved`` the true camera's new place."""
         self._client, self._catalog = client, catalog
         left_px, right_px = panel_widths_px(client.camera.image_width)
-        self.controls = Controls(client, catalog, roots, touches, owner, right_px)
+        self.controls = Controls(client, catalog, services, touches, owner, right_px)
         self.story = Story(client.gui, touches, owner.redraw, lambda places: select(places, False), left_px)
         self.card = MatchCard(client.gui)
         self.canvas = Canvas(client, self.controls.display, select, moved, left_px + right_px)
@@ -64,7 +65,7 @@ class Face:
         if last and rival is not None:
             picture = with_rival(picture, trace, rival)
         drawn = with_selection(picture, trace, selected)
-        drawn = replace(drawn, scene=drawn.scene + controls.compare.items(trace) + self._trajectory(run))
+        drawn = replace(drawn, scene=drawn.scene + controls.items(run) + self._trajectory(run))
         self._shown = run, drawn
         with self._client.atomic():
             self._follow_theme()
@@ -75,7 +76,7 @@ class Face:
             waiting = status_html("Diagnosing …")
             self.story.diagnose(waiting if diagnosis is None else diagnosis_html(diagnosis, whole=last))
             self.card.draw(trace, selected, run.kept, rival)
-            controls.draw(run)
+            controls.draw(run, diagnosis)
         self._client.flush()
         return self.canvas.check() if pause is None else pause
 

@@ -18,41 +18,72 @@ from spherloc.datasets import bundled_scenes
 from spherloc.errors import InputError, RecordingError
 from spherloc.estimators import warm_up
 from spherloc_viz.app.catalog import Catalog
+from spherloc_viz.app.review.shelf import Shelf
 from spherloc_viz.app.services import Services
 from spherloc_viz.app.session import Session
 from spherloc_viz.app.stage import views
 from spherloc_viz.app.status import Status
-from spherloc_viz.app.web.front_door import FrontDoor, open_socket
+from spherloc_viz.app.web.front_door import FrontDoor
+from spherloc_viz.app.web.guard import open_socket
+from spherloc_viz.app.web.viewer_room import ViewerRoom, of_folder
 from spherloc_viz.app.web.viser_seams import set_theme, start_viser, stop_viser
 from spherloc_viz.recording.background import Recorder
+from spherloc_viz.recording.index import RunIndex
+from spherloc_viz.recording.room import KEEP_GIGABYTES, kept_bytes
 
 SWITCH_S = 0.001
+MOST_UNHEARD = 3
+"""Notices that are kept for a page that opens later."""
 
 
 def serve(
-    scene: Path | None, host: str, port: int, recordings: Path, record: bool = True, allow: Sequence[Path] = ()
+    scene: Path | None,
+    host: str,
+    port: int,
+    recordings: Path,
+    record: bool = True,
+    allow: Sequence[Path] = (),
+    keep_gigabytes: float = KEEP_GIGABYTES,
 ) -> None:
     """Run the playground until Ctrl-C or a termination signal.
 
     ``scene`` is offered first, before those that come with the project; port 0 takes any free port. Runs that a
-    page settles on are recorded into ``recordings`` unless ``record`` is false. Pages may open scenes from the folder
-    of ``scene``, from that of the bundled ones and from ``allow``. Raises ``InputError`` if the scene or one of these
-    folders cannot be used or the port cannot be had.
+    page settles on are recorded into ``recordings`` unless ``record`` is false; beyond ``keep_gigabytes`` the oldest
+    successes are deleted. Pages may open scenes from the folder of ``scene``, from that of the bundled ones and from
+    ``allow``. Raises ``InputError`` if the scene, one of these folders or the size cannot be used or the port cannot
+    be had.
     """
-    catalog = Catalog(scene)
+    catalog, keep_bytes = Catalog(scene), kept_bytes(keep_gigabytes)
     with open_socket(host, port) as listener, contextlib.ExitStack() as stack:
         _answer_quickly()
         warm_up(lambda sentence: print(f"spherloc: {sentence}", file=sys.stderr, flush=True))
         services = Services(catalog, allowed_roots(scene, allow))
         sessions = Sessions(services)
         if record:
-            services.recorder = stack.enter_context(Recorder(recordings, on_error=sessions.report))
+            services.recorder = stack.enter_context(
+                Recorder(recordings, sessions.report, sessions.notice, keep_bytes=keep_bytes)
+            )
+        index = _open_index(services.recorder, recordings, stack)
+        services.shelf = None if index is None else Shelf(index)
+        viewer = None if index is None else ViewerRoom(of_folder(recordings, lambda: index))
         key = secrets.token_urlsafe(32)
         server = start_viser(key)
         stack.callback(stop_viser, server)
         stack.callback(sessions.close)
         sessions.attend(server)
-        asyncio.run(_serve_until_told(FrontDoor(host, server.get_port(), key, services.desk), listener))
+        door = FrontDoor(host, server.get_port(), key, services.desk, viewer)
+        asyncio.run(_serve_until_told(door, listener))
+
+
+def _open_index(recorder: Recorder | None, folder: Path, stack: contextlib.ExitStack) -> RunIndex | None:
+    """The list of what was recorded; None, with a sentence, if there is none: the playground goes on without it."""
+    try:
+        if recorder is not None:
+            return recorder.index
+        return stack.enter_context(RunIndex(folder)) if folder.is_dir() else None
+    except RecordingError as error:
+        print(f"warning: {error}", file=sys.stderr, flush=True)
+        return None
 
 
 def _answer_quickly() -> None:
@@ -79,6 +110,8 @@ class Sessions:
         self._services = services
         self._open: dict[int, Session] = {}
         self._lock = threading.Lock()
+        self._unheard: list[str] = []
+        """Notices that came when no page was open, for the next one."""
 
     def attend(self, server: viser.ViserServer) -> None:
         """Open a session for every client that connects and close it when the client leaves."""
@@ -97,6 +130,15 @@ class Sessions:
         for session in sessions:
             session.complain(str(error))
 
+    def notice(self, sentence: str) -> None:
+        """Tell every page what became of recordings."""
+        with self._lock:
+            sessions = tuple(self._open.values())
+            if not sessions:
+                self._unheard = [*self._unheard[1 - MOST_UNHEARD :], sentence]
+        for session in sessions:
+            session.notice(sentence)
+
     def close(self) -> None:
         """Close them all."""
         for number in tuple(self._open):
@@ -110,7 +152,10 @@ class Sessions:
             return
         with self._lock:
             self._open[client.client_id] = session
+            unheard, self._unheard = self._unheard, []
         session.start()
+        if unheard:
+            session.notice(" ".join(unheard))
         # viser runs these callbacks side by side: the client may have left before it was welcomed.
         if client.client_id not in server.get_clients():
             self._dismiss(client.client_id)

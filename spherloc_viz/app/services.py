@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from spherloc_viz.app.catalog import Catalog
+from spherloc_viz.app.review.shelf import Shelf
 from spherloc_viz.app.web.touch import TouchDesk
 from spherloc_viz.recording.background import Recorder
 
@@ -17,5 +18,7 @@ class Services:
     """Folders that pages may open scenes from."""
     recorder: Recorder | None = None
     """Where settled runs go; None if they are not recorded."""
+    shelf: Shelf | None = None
+    """The recordings that pages review; None if there is no folder of them."""
     desk: TouchDesk = field(default_factory=TouchDesk)
     """Where presses on the pages arrive."""

@@ -9,9 +9,10 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from spherloc.cameras.base import FloatArray
 from spherloc.datasets.synthetic import TrueCamera
 from spherloc.diagnosis import Diagnosis, diagnose
-from spherloc.errors import RecordingError, SpherlocError
+from spherloc.errors import SpherlocError
 from spherloc.estimators import default_options, estimate
 from spherloc.problem import Problem
 from spherloc.trace import Trace
@@ -22,6 +23,8 @@ from spherloc_viz.app.edits import Edits
 from spherloc_viz.app.face import Face
 from spherloc_viz.app.history import History
 from spherloc_viz.app.newest import Job, Newest
+from spherloc_viz.app.notices import Notices
+from spherloc_viz.app.page_runs import Known, PageRuns
 from spherloc_viz.app.panels.export_panel import Shown
 from spherloc_viz.app.services import Services
 from spherloc_viz.app.status import Status
@@ -31,8 +34,6 @@ from spherloc_viz.app.wish import Run, Wish
 
 QUIET_S = 0.7
 """Runs count as settled, and are recorded, when nothing has changed for this long."""
-RETRY_S = 1.0
-"""After this long a run is recorded that could not be before."""
 DIAGNOSE_AFTER_S = 0.2
 """A diagnosis costs more than many a run, so it waits until the picture has stood still for this long."""
 
@@ -58,8 +59,9 @@ class Session:
         self._opened: Wish | None = None
         self._run: Run | None = None
         self._diagnosed: tuple[Trace, Diagnosis] | None = None
-        self._recorded: tuple[Trace, Path] | None = None
-        self._face = Face(client, self._catalog, self._touches, self, services.roots, self.select, self._move_camera)
+        self._runs = PageRuns(services.recorder, self._catalog)
+        self._notices = Notices(client)
+        self._face = Face(client, self._catalog, self._touches, self, services, self.select, self._move_camera)
         self._controls = self._face.controls
         self._listen()
         # Only now may the page tell what is pressed: everything that listens is there.
@@ -81,6 +83,10 @@ class Session:
     def complain(self, sentence: str) -> None:
         """Say in one sentence what went wrong; the page keeps its last run and stays usable."""
         self._status.complain(sentence)
+
+    def notice(self, sentence: str) -> None:
+        """Tell what became of recordings, such as those that were deleted to make room."""
+        self._notices.show(sentence)
 
     # What a person does. All of this comes on threads of viser's or of the front door's, and only notes wishes.
 
@@ -105,6 +111,11 @@ class Session:
         """Have the page ask for this."""
         self._opened = wish
         self.changed()
+
+    def open_recorded(self, wish: Wish, path: Path, cam_from_map: FloatArray | None) -> None:
+        """Have the page ask for a run that is recorded as ``path``, with this pose (3, 4)."""
+        self._runs.expect(Known(wish, path, cam_from_map))
+        self.open(wish)
 
     def step_history(self, by: int) -> None:
         """Undo (-1) or redo (+1)."""
@@ -155,9 +166,8 @@ class Session:
 
     def shown(self) -> Shown | None:
         """What is on the page, to be exported."""
-        run, recorded = self._run, self._recorded
-        known = run is not None and recorded is not None and recorded[0] is run.trace
-        return self._face.shown(recorded[1] if known and recorded is not None else None)
+        run = self._run
+        return self._face.shown(None if run is None else self._runs.path(run.trace))
 
     # What the threads do.
 
@@ -193,11 +203,7 @@ class Session:
                 self._controls.slow.end()
             self._run = Run(wish, trace, _kept(wish, problem))
             self._page.ask()
-        self._status.say(
-            "Runs are not recorded."
-            if self._services.recorder is None
-            else "Will be recorded when nothing changes any more."
-        )
+        self._status.say(self._runs.announce(self._run))
         self._status.withdraw()
         return QUIET_S
 
@@ -214,36 +220,32 @@ class Session:
         if self._echo.take(time.monotonic()):
             for widget in self._controls.widgets + self._face.story.steps.widgets:
                 put_back(widget)
-        run, recorder = self._run, self._services.recorder
+        run = self._run
         if run is None:
             return None
         self._controls.settle(run)
-        if recorder is None:
-            return None
-        if self._recorded is None or self._recorded[0] is not run.trace:
-            try:
-                self._recorded = run.trace, recorder.submit(run.trace)
-            except RecordingError as error:
-                self._status.say(f"{error} It is tried again.")
-                return RETRY_S
-        self._status.say(f"Recorded as {self._recorded[1].name}")
-        return None
+        sentence, pause = self._runs.settle(run, self._diagnosis(run))
+        self._status.say(sentence)
+        return pause
 
-    def record(self, trace: Trace) -> None:
+    def record(self, trace: Trace, scene: SceneWish) -> None:
         """Record a run that a panel made, if runs are recorded."""
-        if self._services.recorder is not None:
-            try:
-                self._services.recorder.submit(trace)
-            except SpherlocError as error:
-                self.complain(str(error))
+        try:
+            self._runs.record(trace, scene)
+        except SpherlocError as error:
+            self.complain(str(error))
+
+    def _diagnosis(self, run: Run) -> Diagnosis | None:
+        """The run's diagnosis, if it is known by now."""
+        known = self._diagnosed
+        return known[1] if known is not None and known[0] is run.trace else None
 
     def _show(self, asked: bool) -> float | None:
         """The page thread's job: show the step at hand of the newest run."""
         run = self._run
         if run is None:
             return None
-        known = self._diagnosed
-        diagnosis = known[1] if known is not None and known[0] is run.trace else None
+        diagnosis = self._diagnosis(run)
         pause = self._face.draw(run, diagnosis, self._edits.places(run.kept), asked)
         if diagnosis is None:
             self._doctor.ask()
@@ -252,7 +254,7 @@ class Session:
     def _examine(self, asked: bool) -> float | None:
         """The doctor thread's job: once nothing has changed for a while, diagnose the newest run and show it."""
         run = self._run
-        if run is None or (self._diagnosed is not None and self._diagnosed[0] is run.trace):
+        if run is None or self._diagnosis(run) is not None:
             return None
         if asked:
             return DIAGNOSE_AFTER_S

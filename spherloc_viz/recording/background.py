@@ -1,57 +1,111 @@
 """Records runs beside the work: one thread, a bounded queue, and errors as sentences."""
 
+import contextlib
 import queue
-import re
 import threading
-import unicodedata
-import uuid
 from collections.abc import Callable
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Self
 
+from spherloc.diagnosis import Diagnosis
 from spherloc.errors import RecordingError
 from spherloc.trace import Trace
-from spherloc_viz.recording.writer import sweep, write_recording
+from spherloc_viz.recording.index import RunIndex
+from spherloc_viz.recording.keeper import Keeper
+from spherloc_viz.recording.origin import Origin
+from spherloc_viz.recording.room import KEEP_BYTES
 
 QUEUE_LENGTH = 16
 """Runs that may wait; at about 50 ms each they take less than a second."""
+UPKEEP_LIMIT_S = 5.0
+"""How long closing waits for a file that is being looked at."""
+
+_Job = tuple[Trace, Path, Origin | None, Diagnosis | None]
+
+
+class _StoppedError(Exception):
+    """The upkeep is told to end."""
 
 
 class Recorder:
-    """Writes the runs that it is given into ``folder``, one after another, in the background."""
+    """Writes the runs that it is given into ``folder``, one after another, in the background.
 
-    def __init__(self, folder: Path, on_error: Callable[[RecordingError], None]) -> None:
-        """``on_error`` is called in the recorder's thread, once for every run that could not be written."""
-        self._folder = Path(folder)
-        self._on_error = on_error
-        self._queue: queue.Queue[tuple[Trace, Path] | None] = queue.Queue(QUEUE_LENGTH)
+    At its start a second thread, which ends when it is done, puts the folder right: what killed processes left is
+    recovered or deleted, the list of runs is made to agree with the files, and old successes make room.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        on_error: Callable[[RecordingError], None],
+        on_notice: Callable[[str], None] = lambda sentence: None,
+        full: bool = False,
+        keep_bytes: int = KEEP_BYTES,
+    ) -> None:
+        """``on_error`` is told when runs can no longer be written, and not again until one was written; ``on_notice``
+        of recovered and deleted recordings, and that runs are recorded again. Both are called in threads of the
+        recorder."""
+        self._on_error, self._on_notice = on_error, on_notice
+        self._keeper = Keeper(folder, on_notice, full, keep_bytes)
+        self._queue: queue.Queue[_Job | None] = queue.Queue(QUEUE_LENGTH)
+        self._lock = threading.Lock()
+        self._waiting = self._lost = 0
         self._closed = False
-        sweep(self._folder)
         self._thread = threading.Thread(target=self._work, name="spherloc-recorder", daemon=True)
+        self._upkeep = threading.Thread(target=self._put_right, name="spherloc-upkeep", daemon=True)
         self._thread.start()
+        self._upkeep.start()
 
-    def submit(self, trace: Trace) -> Path:
+    @property
+    def folder(self) -> Path:
+        """Where the recordings are."""
+        return self._keeper.folder
+
+    @property
+    def index(self) -> RunIndex:
+        """The list of the folder's runs. Raises ``RecordingError`` if it cannot be opened."""
+        return self._keeper.index
+
+    @property
+    def waiting(self) -> int:
+        """Runs that are not on the disk yet, with the one that is being written."""
+        return self._waiting
+
+    @property
+    def overload(self) -> str:
+        """How many runs wait, in a sentence; empty if it is none but the one that is being written."""
+        count = self._waiting
+        return f"{count} runs wait to be recorded." if count > 1 else ""
+
+    def submit(self, trace: Trace, origin: Origin | None = None, diagnosis: Diagnosis | None = None) -> Path:
         """Have a run recorded and return the path that its file will have. Never waits.
 
-        Raises ``RecordingError`` if too many runs wait already, or after ``close``.
+        A run without ``diagnosis`` is diagnosed in the background. Raises ``RecordingError`` if too many runs wait
+        already, or after ``close``.
         """
-        path = self._folder / file_name(trace, datetime.now(UTC))
-        if self._closed:
-            raise RecordingError(f"{path.name}: not recorded, since recording has ended.")
-        try:
-            self._queue.put_nowait((trace, path))
-        except queue.Full:
-            waiting = f"{QUEUE_LENGTH} runs wait to be recorded"
-            raise RecordingError(f"{path.name}: not recorded, since {waiting}.") from None
+        path = self._keeper.path_of(trace)
+        with self._lock:
+            if self._closed:
+                raise RecordingError(f"{path.name}: not recorded, since recording has ended.")
+            try:
+                self._queue.put_nowait((trace, path, origin, diagnosis))
+            except queue.Full:
+                raise RecordingError(
+                    f"{path.name}: not recorded, since {QUEUE_LENGTH} runs wait to be recorded."
+                ) from None
+            self._waiting += 1
         return path
 
     def close(self) -> None:
-        """Finish what waits, then end the thread."""
-        if not self._closed:
+        """Finish what waits, then end the threads."""
+        with self._lock:
+            if self._closed:
+                return
             self._closed = True
-            self._queue.put(None)
-            self._thread.join()
+        self._queue.put(None)
+        self._thread.join()
+        self._upkeep.join(UPKEEP_LIMIT_S)
+        self._keeper.close()
 
     def __enter__(self) -> Self:
         return self
@@ -61,22 +115,40 @@ class Recorder:
 
     def _work(self) -> None:
         while (job := self._queue.get()) is not None:
-            trace, path = job
+            self._record(*job)
+            del job
+            with self._lock:
+                self._waiting -= 1
+
+    def _record(self, trace: Trace, path: Path, origin: Origin | None, diagnosis: Diagnosis | None) -> None:
+        try:
+            self._keeper.record(trace, origin, diagnosis, path)
+        except RecordingError as error:
+            self._lose(error)
+        except Exception as error:  # a bug in drawing one run must not end the recording of the others
+            self._lose(RecordingError(f"{path}: the run cannot be recorded: {error!r}."))
+        else:
+            lost, self._lost = self._lost, 0
+            if lost:
+                self._on_notice(f"Runs are recorded again; {lost} {'was' if lost == 1 else 'were'} not.")
+
+    def _lose(self, error: RecordingError) -> None:
+        self._lost += 1
+        if self._lost == 1:
+            self._on_error(error)
+
+    def _put_right(self) -> None:
+        with contextlib.suppress(_StoppedError):
             try:
-                write_recording(trace, path)
-            except RecordingError as error:
-                self._on_error(error)
-            except Exception as error:  # a bug in drawing one run must not end the recording of the others
-                self._on_error(RecordingError(f"{path}: the run cannot be recorded: {error!r}."))
-            del job, trace
+                self._keeper.tidy()
+                if self.folder.is_dir():
+                    self._go_on()
+                    self.index.refresh(progress=self._go_on)
+                    self._keeper.prune()
+            except (RecordingError, OSError) as error:
+                if not self._closed:
+                    self._on_notice(f"The list of runs may not be complete: {error}")
 
-
-def file_name(trace: Trace, now: datetime) -> str:
-    """``<UTC time>_<scene>_<estimator>_<seed>_<id>.rrd``: sorts by time, is unique, and is safe in any file system."""
-    when = now.strftime("%Y%m%dT%H%M%SZ")
-    return f"{when}_{_slug(trace.problem.name)}_{_slug(trace.estimator)}_{trace.seed}_{uuid.uuid4().hex[:8]}.rrd"
-
-
-def _slug(text: str) -> str:
-    ascii_text = unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode()
-    return re.sub(r"[^a-z0-9]+", "-", ascii_text.lower()).strip("-")[:60] or "run"
+    def _go_on(self, *progress: int) -> None:
+        if self._closed:
+            raise _StoppedError

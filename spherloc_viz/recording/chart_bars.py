@@ -1,6 +1,7 @@
 """Curves as the only chart with an x axis that rerun has: bars."""
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import pyarrow as pa
@@ -49,15 +50,21 @@ def bars(chart: Chart, curve: Curve) -> Bars:
     return Bars(x - width / 2, curve.y, np.full(len(x), width), curve.color)
 
 
-def tensors(arrays: list[FloatArray]) -> rr.components.TensorDataBatch:
-    """One-dimensional arrays as a batch, with 32 bits where these hold all numbers exactly, as they do counts.
+@cache
+def _one_tensor(short: bool) -> pa.StructArray:
+    """A tensor as rerun writes it, with numbers of 32 or of 64 bits."""
+    return rr.components.TensorDataBatch(np.zeros(1, np.float32 if short else np.float64)).as_arrow_array()
+
+
+def tensors(arrays: list[FloatArray]) -> pa.StructArray:
+    """One-dimensional arrays as tensors, with 32 bits where these hold all numbers exactly, as they do counts.
 
     Put together here, since rerun takes 0.3 ms for each.
     """
     values = np.concatenate([np.zeros(0), *arrays])
     short = values.astype(np.float32)
-    values = short if np.array_equal(short, values) else values
-    one = rr.components.TensorDataBatch(values[:1]).as_arrow_array()
+    exact = np.array_equal(short, values)
+    values, one = short if exact else values, _one_tensor(exact)
     buffer: pa.UnionArray = one.field("buffer")
     ends = np.cumsum([0, *map(len, arrays)], dtype=np.int32)
     code, count = buffer.type_codes[0].as_py(), len(arrays)
@@ -72,4 +79,4 @@ def tensors(arrays: list[FloatArray]) -> rr.components.TensorDataBatch:
     lengths = pa.array(np.diff(ends).astype(np.uint64))
     shape = pa.ListArray.from_arrays(every, lengths, type=one.type.field("shape").type)
     labels = pa.nulls(count, one.type.field("names").type)
-    return rr.components.TensorDataBatch(pa.StructArray.from_arrays([shape, labels, union], fields=list(one.type)))
+    return pa.StructArray.from_arrays([shape, labels, union], fields=list(one.type))

@@ -56,7 +56,7 @@ def row_from_table(table: Any, path: Path) -> RunRow:
     """
     if not isinstance(table, dict) or table.keys() != _TYPES.keys():
         raise _bad(path, "the row", table)
-    values = table | {"file": path.name}
+    values: dict[str, Any] = {**table, "file": path.name}
     try:
         values["labels"] = tuple(values["labels"])
         values["thumbnail"] = base64.b64decode(values["thumbnail"], validate=True)

@@ -1,7 +1,8 @@
 """The child that reads recordings which may be hostile: ``python -m spherloc_viz.recording.examine``.
 
-It reads paths as JSON, one a line, and answers each with a line of JSON: ``{"row": {...}}`` or ``{"error": "..."}``. Its
-memory, its processor time a file and what it may write are limited where the system can do that; it may die of a file.
+It reads questions, one a line, ``{"path": "...", "review": true}`` (whether to read its labels and note too), and
+answers each with a line of JSON: ``{"row": {...}}`` or ``{"error": "..."}``. Its memory, its processor time a file and
+what it may write are limited where the system can do that; it may die of a file.
 """
 
 import json
@@ -10,16 +11,21 @@ import signal
 import stat
 import sys
 import tempfile
+import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any
 
-import numpy as np
 from rerun.chunk import Chunk, LazyChunkStream, RrdReader
+from rerun.error_utils import RerunWarning
 
 from spherloc.errors import RecordingError, SpherlocError
-from spherloc_viz.recording.checked_row import COUNT_LIMIT, row_from_table, table_from_row
+from spherloc_viz.recording.checked_row import row_from_table, table_from_row
+from spherloc_viz.recording.content_check import check_content, check_run
 from spherloc_viz.recording.layout import APPLICATION_ID
-from spherloc_viz.recording.reader import RecordedRun, read_recording, read_run_row
+from spherloc_viz.recording.reader import check_recording, read_recording
+from spherloc_viz.recording.review import read_review
+from spherloc_viz.recording.run_row import RunRow
 
 try:
     import resource
@@ -27,7 +33,7 @@ except ImportError:  # Windows
     resource = None
 
 FILE_LIMIT_BYTES = 512 << 20
-MEMORY_LIMIT_BYTES = 1 << 30
+MEMORY_LIMIT_BYTES = 640 << 20
 """Beyond what the child takes before the first file."""
 TIME_LIMIT_S = 20
 """Processor time a file; a good one takes a hundredth of a second."""
@@ -45,7 +51,7 @@ def main() -> None:
     for line in sys.stdin.buffer:
         _wait_for_questions(False)
         _limit_time()
-        _say(answers, _answer(Path(json.loads(line))))
+        _say(answers, _answer(json.loads(line)))
         _wait_for_questions(True)
 
 
@@ -61,9 +67,10 @@ def _say(answers: IO[str], answer: dict[str, Any]) -> None:
     answers.flush()
 
 
-def _answer(path: Path) -> dict[str, Any]:
+def _answer(question: dict[str, Any]) -> dict[str, Any]:
+    path = Path(question["path"])
     try:
-        return {"row": _examined(path)}
+        return {"row": _examined(path, question["review"])}
     except SpherlocError as error:
         return {"error": str(error)}
     except MemoryError:
@@ -74,12 +81,27 @@ def _answer(path: Path) -> dict[str, Any]:
         return {"error": str(RecordingError(f"{path}: not a whole recording ({reason}); record the run again."))}
 
 
-def _examined(path: Path) -> dict[str, Any]:
+def _examined(path: Path, with_review: bool) -> dict[str, Any]:
     _check_file(path)
-    _check_run(read_recording(path), path)
-    table = table_from_row(read_run_row(path))
+    with warnings.catch_warnings():
+        # rerun only warns where a file has no index at its end.
+        warnings.simplefilter("error", RerunWarning)
+        check_recording(path)
+        check_content(path)
+        run = read_recording(path)
+    check_run(run, path)
+    table = table_from_row(_reviewed(run.row, path) if with_review else run.row)
     row_from_table(table, path)
     return table
+
+
+def _reviewed(row: RunRow, path: Path) -> RunRow:
+    """The row with its labels and note, if they can be read: without them a run is still a run."""
+    try:
+        review = read_review(path)
+    except RecordingError:
+        return row
+    return replace(row, labels=review.labels, note=review.note)
 
 
 def _check_file(path: Path) -> None:
@@ -93,17 +115,6 @@ def _check_file(path: Path) -> None:
         raise RecordingError(f"{path}: larger than {FILE_LIMIT_BYTES:,} bytes, which no recording is; delete it.")
     if not os.access(path, os.R_OK):
         raise RecordingError(f"{path}: may not be read; change its permissions.")
-
-
-def _check_run(run: RecordedRun, path: Path) -> None:
-    """What ``read_recording`` leaves open."""
-    count = len(run.problem)
-    if count > COUNT_LIMIT:
-        raise RecordingError(f"{path}: claims {count:,} correspondences; {COUNT_LIMIT:,} are the most.")
-    pose, mask = run.cam_from_map, run.inlier_mask
-    good_pose = pose is None or (pose.shape == (3, 4) and pose.dtype == np.float64 and np.isfinite(pose).all())
-    if not good_pose or mask.shape != (count,) or mask.dtype != np.bool_:
-        raise RecordingError(f"{path}: its pose or its inliers have a wrong form; record the run again.")
 
 
 def _warm_up() -> None:

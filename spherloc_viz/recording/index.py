@@ -54,6 +54,9 @@ class RunIndex:
         self._connection: sqlite3.Connection | None = None
         self._file: tuple[int, int] | None = None
         self._closed = False
+        self._opened = 0
+        """How often; rises when the database has become another one."""
+        self._refreshing = threading.Lock()
         with contextlib.suppress(OSError):
             self.folder.mkdir(parents=True, exist_ok=True)
         self._read(lambda connection: None)
@@ -167,12 +170,14 @@ class RunIndex:
 
     def _refresh(self, everything: bool, progress: Progress | None, examine: Examine) -> Refreshed:
         refresher = Refresher(self.folder, self._write, examine)
-        for _ in range(MOST_REFRESHES):
-            self.stale = False
-            refreshed = refresher.refresh(everything, progress or (lambda done, total: None))
-            if not self.stale:  # a database that was set aside meanwhile took some of the rows with it
-                return refreshed
-            everything = False
+        with self._refreshing:
+            for _ in range(MOST_REFRESHES):
+                reopened = self._opened
+                refreshed = refresher.refresh(everything, progress or (lambda done, total: None))
+                if self._opened == reopened:  # a database that is set aside takes the rows with it
+                    self.stale = False
+                    return refreshed
+                everything = False
         raise RecordingError(f"{self.path}: the list of runs is damaged again and again; check the disk.")
 
     def close(self) -> None:
@@ -229,6 +234,7 @@ class RunIndex:
             return self._connection
         self._drop()
         self.stale = True
+        self._opened += 1
         try:
             self._connection = index_file.connect(self.path)
         except index_file.UnfitError as error:

@@ -16,6 +16,8 @@ VERSION = 1
 """Of the schema."""
 BUSY_S = 15.0
 """How long one waits for other writers, each of which takes milliseconds."""
+CACHE_KB = 16_384
+"""Of the database in memory: all that filters look at in 10,000 runs."""
 
 _CANNOT_WRITE = {sqlite3.SQLITE_READONLY, sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_PERM}
 _DAMAGED = {sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB}
@@ -48,6 +50,7 @@ def connect(path: Path) -> sqlite3.Connection:
         connection.execute("PRAGMA trusted_schema = OFF")
         connection.execute("PRAGMA foreign_keys = ON")
         connection.execute("PRAGMA synchronous = NORMAL")
+        connection.execute(f"PRAGMA cache_size = -{CACHE_KB}")
         _check_or_create(connection)
         return connection
     except (sqlite3.Error, UnfitError) as error:

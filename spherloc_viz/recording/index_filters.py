@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from spherloc_viz.recording.index_rows import NULLABLE
 from spherloc_viz.recording.query import GROUP_KEYS, SORT_KEYS, Range, RunQuery
 
 _EXACT = ("estimator", "outcome", "diagnosis", "source", "problem_key", "doubtful")
@@ -50,7 +51,9 @@ def order(query: RunQuery) -> str:
     """The order of the answer; the file's name, which sorts by time, makes it the same every time."""
     assert query.sort in SORT_KEYS
     direction = "DESC" if query.descending else "ASC"
-    return f"{query.sort} IS NULL, {query.sort} {direction}, file {direction}"
+    # Only where it can be null, since an index cannot sort by more than columns.
+    nulls_last = f"{query.sort} IS NULL, " if query.sort in NULLABLE else ""
+    return f"{nulls_last}{query.sort} {direction}, file {direction}"
 
 
 def groups(query: RunQuery, by: str) -> Condition:

@@ -1,7 +1,7 @@
 """Keeps the list of runs true to the files: reads those that are new or have changed, and says which it skipped."""
 
 import sqlite3
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -91,11 +91,15 @@ class Refresher:
         wanted = sorted(file for file, stamp in files.items() if everything or known.get(file) != stamp)
         read = done = 0
         progress(done, len(wanted))
-        answers = zip(wanted, self._examine(self._folder / file for file in wanted), strict=True)
-        for batch in _batches((file, result) for file, (_, result) in answers):
-            read += self._write(lambda connection, batch=batch: self._store(connection, batch, files))
-            done += len(batch)
-            progress(done, len(wanted))
+        results = self._examine([self._folder / file for file in wanted])
+        try:
+            for batch in _batches(zip(wanted, (result for _, result in results), strict=True)):
+                read += self._write(lambda connection, batch=batch: self._store(connection, batch, files))
+                done += len(batch)
+                progress(done, len(wanted))
+        finally:
+            if isinstance(results, Generator):
+                results.close()  # now, since it holds a process
         return Refreshed(read, removed, self._write(_skipped))
 
     def _forget(self, connection: sqlite3.Connection, files: Iterable[str]) -> int:

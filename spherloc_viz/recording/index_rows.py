@@ -24,6 +24,8 @@ _TYPES = get_type_hints(RunRow)
 _COLUMNS = {name: _column(kind) for name, kind in _TYPES.items()}
 MAIN = tuple(name for name in _COLUMNS if name not in DETAILS)
 """Columns of the table that filters scan."""
+NULLABLE = {name for name, definition in _COLUMNS.items() if not definition.endswith("NOT NULL")}
+"""Columns that may be unknown."""
 _BOOLEANS = {name for name, kind in _TYPES.items() if bool in getattr(kind, "__args__", (kind,))}
 
 
@@ -39,7 +41,7 @@ SCHEMA = (
     "PRIMARY KEY (label, id)) STRICT, WITHOUT ROWID",
     "CREATE TABLE skipped (file TEXT PRIMARY KEY, stamp TEXT NOT NULL, sentence TEXT NOT NULL) STRICT",
     "CREATE INDEX labels_of_run ON labels (id)",
-    "CREATE INDEX runs_by_time ON runs (created)",
+    "CREATE INDEX runs_by_time ON runs (created, file)",
     "CREATE INDEX runs_by_problem ON runs (problem_key)",
 )
 """``stamp`` says which version of its files a row was read from; files that could not be read are ``skipped``."""

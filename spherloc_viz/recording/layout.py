@@ -10,7 +10,8 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from spherloc_viz.layers.primitives import Chart, Picture
-from spherloc_viz.recording.drawing import TIMELINE, chart_path
+from spherloc_viz.recording.columns import TIMELINE
+from spherloc_viz.recording.drawing import chart_path
 from spherloc_viz.recording.rerun_program import rerun_command, rerun_environment
 
 APPLICATION_ID = "spherloc"

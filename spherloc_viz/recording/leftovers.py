@@ -107,6 +107,11 @@ def _ended(part: re.Match[str]) -> bool:
     return start is None or str(start) != part["start"]
 
 
+def here() -> str:
+    """What tells this machine, since it was started, from others."""
+    return "-".join(_here())
+
+
 @cache
 def _here() -> tuple[str, str]:
     """Hashes of this machine, with its space of process numbers, and of the time since which it runs."""

@@ -109,17 +109,18 @@ def read_review(recording: Path) -> Review:
         if not path.is_file() or path.stat().st_size > MOST_BYTES:
             raise damaged
         found = RrdReader(path).stream().filter(content=[f"/__properties/{REVIEW_PROPERTY}"]).to_chunks()
-        batch = found[0].to_record_batch()
-        labels, notes = batch.column("labels")[0].as_py(), batch.column("note")[0].as_py()
-        return checked_review(_texts(labels), *_texts(notes))
+        (batch,) = (chunk.to_record_batch() for chunk in found)
+        batch.validate(full=True)
+        return checked_review(_texts(batch.column("labels")), *_texts(batch.column("note")))
     except (OSError, RuntimeError, ValueError, TypeError, LookupError, AttributeError, InputError) as error:
         raise damaged from error
 
 
-def _texts(values: Any) -> list[str]:
-    if not isinstance(values, list) or not all(isinstance(value, str) for value in values):
-        raise TypeError("no list of texts")
-    return values
+def _texts(column: pa.Array) -> list[str]:
+    """The only cell of a column of lists of texts; looked at before it becomes Python's, which could take gigabytes."""
+    if len(column) != 1 or column.type != pa.list_(pa.string()) or len(column[0].values or ()) > MOST_LABELS:
+        raise TypeError("not one list of texts")
+    return [value for value in column[0].as_py() if value is not None]
 
 
 def _chunks(review: Review) -> list[Chunk]:

@@ -1,16 +1,18 @@
 """A recorded run as a scene: its problem can be solved again, or otherwise, without the scene that it came from."""
 
-import dataclasses
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
+from spherloc.datasets import Scene
+from spherloc.datasets.variation import Variation, used_seed
 from spherloc.errors import InputError, RecordingError, show
 from spherloc.estimators import options_type
 from spherloc.problem import Problem
 from spherloc_viz.options import OptionField, option_fields
+from spherloc_viz.recording.origin import Origin, Source
 from spherloc_viz.recording.reader import RecordedRun, read_recording
 from spherloc_viz.recording.strangers import examine
 
@@ -53,6 +55,17 @@ def load_recorded_scene(path: Path) -> RecordedScene:
     return RecordedScene(read_recording(path), path)
 
 
+def origin_of(
+    source: Source, path: Path, scene: Scene, seed: int | None, query: str | None, variation: Variation
+) -> Origin:
+    """Where a run of this scene comes from. That of an unchanged recorded problem comes from where the problem does."""
+    if isinstance(scene, RecordedScene) and variation == Variation() and scene.run.origin is not None:
+        return replace(scene.run.origin, source=source, title="", story="")
+    if variation.camera is not None:
+        variation = replace(variation, camera=str(Path(variation.camera).resolve()))
+    return Origin(source, str(Path(path).resolve()), used_seed(scene, seed), query, variation)
+
+
 def recorded_options(run: RecordedRun, where: Path) -> Any:
     """The options that a run was solved with, as its estimator takes them.
 
@@ -79,7 +92,7 @@ def recorded_options(run: RecordedRun, where: Path) -> Any:
 
 def missing_options(run: RecordedRun) -> tuple[str, ...]:
     """Options of its estimator that a recording knows nothing of, since it is older than they are."""
-    return tuple(item.name for item in dataclasses.fields(options_type(run.estimator)) if item.name not in run.options)
+    return tuple(item.name for item in fields(options_type(run.estimator)) if item.name not in run.options)
 
 
 def _takes(option: OptionField, value: Any) -> bool:
@@ -90,4 +103,5 @@ def _takes(option: OptionField, value: Any) -> bool:
         return isinstance(value, str) and value in option.choices
     if option.kind is float:
         return isinstance(value, int | float) and not isinstance(value, bool) and not math.isnan(value)
-    return type(value) is option.kind
+    whole = isinstance(value, float) and value.is_integer()
+    return type(value) is option.kind or (option.kind is int and whole)

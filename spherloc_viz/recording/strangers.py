@@ -6,6 +6,7 @@ What has passed is safe to be read here.
 """
 
 import atexit
+import contextlib
 import json
 import queue
 import re
@@ -19,6 +20,7 @@ from typing import IO, Any, Self
 from spherloc.errors import RecordingError, SpherlocError, show
 from spherloc_viz.recording.checked_row import row_from_table
 from spherloc_viz.recording.rerun_program import rerun_environment
+from spherloc_viz.recording.review import review_path
 from spherloc_viz.recording.run_row import RunRow
 
 FILE_LIMIT_S = 60.0
@@ -85,10 +87,10 @@ class Examiner:
         """
         with self._lock:
             used = self._child is not None and self._child.answered > 0
-            answer = self._ask(path)
-            if answer is None and used:
-                # It may be that the child had ended before it saw the file, or was worn out by those before.
-                answer = self._ask(path)
+            answer = self._ask(path, review=True)
+            if answer is None and (used or review_path(path).exists()):
+                # The child may have ended before it saw the file, or died of the labels beside it.
+                answer = self._ask(path, review=False)
         if answer is None:
             raise RecordingError(
                 f"{path}: cannot be read, since reading it takes too long or too much memory or ends the reader; "
@@ -98,10 +100,10 @@ class Examiner:
             raise RecordingError(str(answer["error"]))
         return row_from_table(answer["row"], path)
 
-    def _ask(self, path: Path) -> dict[str, Any] | None:
+    def _ask(self, path: Path, review: bool) -> dict[str, Any] | None:
         if self._child is None:
             self._child = _Child()
-        answer = self._child.ask(path)
+        answer = self._child.ask({"path": str(path), "review": review})
         if answer is None:
             self._end()
         return answer
@@ -142,10 +144,10 @@ class _Child:
                 "'python -m spherloc_viz.recording.examine' says why."
             )
 
-    def ask(self, path: Path) -> dict[str, Any] | None:
+    def ask(self, question: dict[str, Any]) -> dict[str, Any] | None:
         """What it says about a file; None if it died, hangs or talks nonsense."""
         try:
-            self._questions.write(json.dumps(str(path)).encode() + b"\n")
+            self._questions.write(json.dumps(question).encode() + b"\n")
             self._questions.flush()
         except OSError:
             return None
@@ -158,10 +160,8 @@ class _Child:
         self._process.kill()
         self._process.wait()
         self._listener.join()
-        try:
+        with contextlib.suppress(OSError):  # what it did not read
             self._questions.close()
-        except OSError:  # what it did not read
-            pass
 
     def _listen(self, answers: IO[bytes]) -> None:
         with answers:

@@ -11,12 +11,14 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from playwright.sync_api import Browser, Locator, Page, expect
+
+from spherloc_viz.app.stage.views import START
 
 SCENE = """
 kind = "synthetic"
@@ -52,7 +54,10 @@ BLIND = """for (const kind of [WebGLRenderingContext, WebGL2RenderingContext])
         if (kind.prototype[call]) kind.prototype[call] = () => undefined;"""
 """Makes the canvas draw nothing. What tests read is in the page and in the scene's nodes, and a frame in software takes
 most of a second, for which every click waits."""
+PAINT = "() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(null))))"
+"""Returns when the page has painted, which a busy machine does seldom."""
 SELECTED = "#b024e4"
+T = TypeVar("T")
 expect.set_options(timeout=PATIENCE_MS)
 
 
@@ -83,7 +88,7 @@ def served(*words: str | Path) -> Iterator[tuple[str, subprocess.Popen[str]]]:
     finally:
         server.send_signal(signal.SIGINT)
         try:
-            server.communicate(timeout=20)
+            server.communicate(timeout=60)
         except subprocess.TimeoutExpired:
             server.kill()
             raise
@@ -202,6 +207,7 @@ class Playground:
 
     def dots(self, name: str) -> NDArray[np.float64]:
         """Where on the page (N, 2) the balls or dots of a batched node are seen."""
+        self._until_built(name)
         script = """name => {
             const {camera, canvas, nodeRefFromName} = window.__viserMutable, box = canvas.getBoundingClientRect();
             const all = window.__viserSceneTree.getState()[name].message.props.batched_positions;
@@ -218,6 +224,7 @@ class Playground:
 
     def centre(self, name: str) -> tuple[float, ...]:
         """The first end of the first of a node's lines, where ``viewer`` is measured."""
+        self._until_built(name)
         script = """name => {
             const {camera, nodeRefFromName} = window.__viserMutable, node = nodeRefFromName[name];
             const all = window.__viserSceneTree.getState()[name].message.props.points;
@@ -242,16 +249,28 @@ class Playground:
         return [(int(k), float(places[k, 0]), float(places[k, 1])) for k in found]
 
     def settle(self) -> None:
-        """Close what lies above the canvas, and wait until the viewer stands still."""
-        for close in self.page.locator("[class*=Notification-closeButton]").all():
-            close.click()
-        last: list[tuple[float, ...]] = []
+        """Close what lies above the canvas, and wait until the viewer stands still, at a view of ours."""
+        close = "() => document.querySelectorAll('[class*=Notification-closeButton]').forEach(button => button.click())"
+        self.page.evaluate(close)
+        self.until(lambda: abs(np.linalg.norm(self.viewer[:3]) - np.linalg.norm(START)) > 0.01, "the first view is set")
+        self.still(lambda: self.viewer, "the viewer stands still")
 
-        def still() -> bool:
-            last.append(self.viewer)
-            return len(last) > 2 and last[-1] == last[-2] == last[-3]
+    def still(self, read: Callable[[], T], what: str) -> T:
+        """Wait until something stays the same while the page paints several frames; returns it."""
+        seen: list[T] = []
 
-        self.until(still, "the viewer stands still")
+        def same() -> bool:
+            self.page.evaluate(PAINT)
+            seen.append(read())
+            return len(seen) > 3 and all(one == seen[-1] for one in seen[-4:-1])
+
+        self.until(same, what)
+        return seen[-1]
+
+    def _until_built(self, name: str) -> None:
+        """Wait until a node that the page has heard of stands on the canvas."""
+        there = "name => Boolean(window.__viserMutable.nodeRefFromName[name])"
+        self.until(lambda: self.page.evaluate(there, name), f"{name} is built")
 
     @property
     def viewer(self) -> tuple[float, ...]:

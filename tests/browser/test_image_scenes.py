@@ -94,7 +94,8 @@ def test_queries_their_photographs_and_the_mesh(images_tab: Playground, images_a
     tab.expect_card(number)
     tab.tab("Images")
     tab.until(lambda: ringed(tab) == [str(number)] * 2, "both of its ends have rings")
-    ring = tab.page.locator(f"svg circle[stroke='{SELECTED}']").first.bounding_box()
+    circle = tab.page.locator(f"svg circle[stroke='{SELECTED}']").first
+    ring = tab.still(circle.bounding_box, "the ring stands still")
     assert ring is not None
     tab.touch("deselect:").click()
     tab.expect_card()
@@ -102,7 +103,7 @@ def test_queries_their_photographs_and_the_mesh(images_tab: Playground, images_a
     tab.expect_card(number)
     tab.until(lambda: ringed(tab) == [str(number)] * 2, "both of its ends have rings")
     tab.until(lambda: tab.lit() == [number], "its point is lit")
-    assert tab.page.locator(".match-query").is_visible()
+    expect(tab.page.locator(".match-query")).to_be_visible()
 
     position = tab.value("camera position").inner_text()
     tab.choose("Query", "query_002")
@@ -129,7 +130,8 @@ def test_the_query_on_the_sphere_and_the_mesh_around_it(
     tab.press("From the camera")
     centre = tab.centre("/cameras/estimate")
     tab.until(lambda: np.allclose(tab.viewer[:3], centre, atol=0.02), "the viewer stands in the camera")
-    assert round(tab.page.evaluate("() => window.__viserMutable.camera.fov")) == 85
+    fov = "() => window.__viserMutable.camera.fov"
+    tab.until(lambda: round(tab.page.evaluate(fov)) == 85, "the viewer sees wide")
 
     panorama = tab.node("/sphere/image")
     tab.tab("Open")

@@ -168,7 +168,7 @@ def test_an_upload_is_solved_and_stays_with_its_page(
     expect(other.page.get_by_text(re.compile(r"mine\.csv"))).to_have_count(0)
 
     tab.page.close()
-    end = time.monotonic() + 30.0
+    end = time.monotonic() + 60.0
     while scratch_files(folders):
         assert time.monotonic() < end, "the upload outlives its page"
         time.sleep(0.05)

@@ -28,17 +28,23 @@ def test_page_shows_a_localization_and_talks_to_nobody_else(browser: Browser, ad
     expect(tab.value("outcome")).to_have_text("success")
     expect(tab.value("inliers")).to_have_text(re.compile(r"^(1[89]|2[0-2]) of 40$"))
     expect(tab.page.get_by_text("maximum clique", exact=True)).to_be_visible()
-    assert tab.instances("/map/points") == 40 and tab.instances("/sphere/bearings") == 40
+    for name in ("/map/points", "/sphere/bearings"):
+        tab.until(lambda name=name: tab.instances(name) == 40, f"{name} are drawn")
     for name in ("/sphere/surface", "/rays", "/cameras/estimate", "/cameras/truth"):
         tab.until(lambda name=name: bool((tab.node(name) or {}).get("visible")), f"{name} is shown")
     tab.settle()
+    tab.until(lambda: green_pixels(tab) > 50, "rays of inliers are seen")
+    tab.expect_quiet(address)
+    tab.close()
+
+
+def green_pixels(tab: Playground) -> int:
+    """How many pixels of the canvas have the colour of inliers."""
     picture = np.frombuffer(tab.page.locator("canvas").first.screenshot(), np.uint8)
     image = cv2.imdecode(picture, cv2.IMREAD_COLOR)
     assert image is not None
     green = (image[..., 1] > 90) & (image[..., 1] > 1.5 * image[..., 2]) & (image[..., 1] > 1.2 * image[..., 0])
-    assert np.count_nonzero(green) > 50, "rays of inliers are seen"
-    tab.expect_quiet(address)
-    tab.close()
+    return int(np.count_nonzero(green))
 
 
 def test_outlier_slider_changes_the_numbers(tab: Playground) -> None:
@@ -65,7 +71,7 @@ def drawn_by(picture: Picture) -> dict[str, int]:
 def expect_step(tab: Playground, step: Step, picture: Picture, number: int, count: int) -> None:
     """The page says and draws what the core computes for this step."""
     expect(tab.step).to_have_value(f"{number}/{count}  {step.title}")
-    assert tab.page.locator("div").get_by_text(step.title, exact=True).locator("visible=true").count()
+    expect(tab.page.locator("div").get_by_text(step.title, exact=True).locator("visible=true").first).to_be_visible()
     # How long a run took is in the last caption, and differs.
     if number < count:
         expect(tab.page.get_by_text(step.caption, exact=True)).to_be_visible()
@@ -160,6 +166,7 @@ def test_scene_and_camera_can_be_changed(tab: Playground) -> None:
     tab.unfold("More of the scene")
     tab.choose("Camera", "kannala brandt, 512 × 512")
     tab.slide("Timeline", "Home")
+    expect(tab.step).to_have_value(re.compile("^1/"))
     tab.press("Next")
     expect(tab.page.get_by_text(re.compile("The kannala brandt camera turns each of its"))).to_be_visible()
 

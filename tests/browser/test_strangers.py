@@ -1,5 +1,6 @@
 """What a page of another site can do to the playground: nothing."""
 
+import re
 import threading
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -59,8 +60,8 @@ def test_another_site_cannot_frame_the_playground(stranger: Page, address: str) 
     """So it cannot lay its own buttons over the page's either."""
     stranger.evaluate(FRAME, address)
     # A frame that is refused shows an error page of the browser, in which nothing of ours runs.
-    inner = stranger.frames[1]
-    assert inner.url.startswith("chrome-error:")
+    (inner,) = stranger.main_frame.child_frames
+    inner.wait_for_url(re.compile("^chrome-error:"), wait_until="commit")
 
 
 def test_a_name_that_was_made_to_point_here_is_refused(browser: Browser, address: str) -> None:

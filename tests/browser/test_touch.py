@@ -79,7 +79,7 @@ def test_a_match_that_is_selected_anywhere_lights_up_everywhere(tab: Playground,
     assert number not in (3, 4)
 
     tab.tab("Images")
-    sheet = tab.touch("image-pick:query").bounding_box()
+    sheet = tab.still(lambda: tab.touch("image-pick:query").bounding_box(), "the image stands still")
     assert sheet is not None
     shares = trace.problem.pixels / [trace.problem.camera.width, trace.problem.camera.height]
     places = shares * [sheet["width"], sheet["height"]] + [sheet["x"], sheet["y"]]

@@ -22,6 +22,7 @@ from spherloc.errors import SpherlocError
 from spherloc.estimators import warm_up
 from spherloc.experiments import read_results
 from spherloc.trajectory import read_tum
+from spherloc_viz.batch import Records
 from spherloc_viz.localize import localize_sequence
 from spherloc_viz.recording.reader import read_recording
 from spherloc_viz.scene_list import all_scenes, one_kind
@@ -40,7 +41,7 @@ def command(*words: str | Path, environment: dict[str, str], **more) -> subproce
 
 
 def run(scene: Path, output: Path, **changes: Any) -> int:
-    words = {"estimator": "mc", "seed": 0, "settings": (), "queries": (), "retry_failed": False, "recordings": None}
+    words = {"estimator": "mc", "seed": 0, "settings": (), "queries": (), "retry_failed": False, "records": None}
     return localize_sequence(scene, output=output, **(words | changes))
 
 
@@ -61,7 +62,7 @@ def wait_for(reached, process: subprocess.Popen[str]) -> None:
 
 def test_everything_is_written(tmp_path: Path, drawn: dict[str, str], capsys: pytest.CaptureFixture[str]) -> None:
     scene, out = write_scene(tmp_path, queries=5, few=[1], broken=[3], timed=True), tmp_path / "out"
-    assert run(scene, out, recordings=out / "recordings") == 1
+    assert run(scene, out, records=Records(out / "recordings")) == 1
     rows = table(out)
     assert [row["query"] for row in rows] == [f"image{place}.png" for place in range(5)]
     assert [row["status"] for row in rows] == ["localized", "failed", "localized", "unreadable", "localized"]
@@ -70,7 +71,7 @@ def test_everything_is_written(tmp_path: Path, drawn: dict[str, str], capsys: py
     assert [None if path is None else path.parent for path in results.recordings] == [
         out / "recordings", None, out / "recordings", None, out / "recordings"
     ]  # fmt: skip
-    assert len(list((out / "recordings").iterdir())) == 3
+    assert len(list((out / "recordings").glob("*.rrd"))) == 3
     assert results.recordings[2] is not None
     recorded = read_recording(results.recordings[2])
     np.testing.assert_array_equal(recorded.cam_from_map, results.rows[2].cam_from_map)
@@ -157,10 +158,10 @@ def test_a_recording_that_finds_no_room_ends_the_run(tmp_path: Path) -> None:
     out.mkdir()
     (out / "recordings").write_text("in the way")
     with pytest.raises(SpherlocError, match=r"recordings.*the run cannot be recorded.* is kept \(0 of 2 queries\)"):
-        run(scene, out, recordings=out / "recordings")
+        run(scene, out, records=Records(out / "recordings"))
     assert lines(out / "results.jsonl") == 0
     (out / "recordings").unlink()
-    assert run(scene, out, recordings=out / "recordings") == 0 and None not in read_results(out).recordings
+    assert run(scene, out, records=Records(out / "recordings")) == 0 and None not in read_results(out).recordings
 
 
 @pytest.mark.usefixtures("drawn")

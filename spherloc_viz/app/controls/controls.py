@@ -1,13 +1,16 @@
 """The panel right of the canvas: what is solved and how, comparisons, sweeps, other scenes, and what to take away."""
 
+from dataclasses import replace
 from html import escape
 from pathlib import Path
 from typing import Any, Protocol
 
 import viser
 
+from spherloc.cameras.base import FloatArray
 from spherloc.datasets.map_scene import MapScene
 from spherloc.datasets.variation import EDITS, Variation
+from spherloc.diagnosis import Diagnosis
 from spherloc.errors import InputError
 from spherloc.trace import Trace
 from spherloc_viz import share
@@ -21,10 +24,15 @@ from spherloc_viz.app.controls.slow_run import SlowRun
 from spherloc_viz.app.panels.compare_panel import ComparePanel
 from spherloc_viz.app.panels.export_panel import ExportPanel, Shown
 from spherloc_viz.app.panels.open_panel import Opened, OpenPanel
+from spherloc_viz.app.panels.recordings_panel import Page, RecordingsPanel
 from spherloc_viz.app.panels.sweep_runs_panel import SweepPanel
+from spherloc_viz.app.review.review_card import ReviewCard
+from spherloc_viz.app.services import Services
 from spherloc_viz.app.text import DIM, box
 from spherloc_viz.app.web.touch import Touches
 from spherloc_viz.app.wish import Run, Wish
+from spherloc_viz.layers.primitives import SceneItem
+from spherloc_viz.recording.reopen import Reopened
 
 UNDO, REDO, NEW_SEED = "Undo", "Redo", "New seed"
 NO_PRESET = "choose …"
@@ -48,8 +56,11 @@ class Owner(Protocol):
     def step_history(self, by: int) -> None:
         """Undo (-1) or redo (+1)."""
 
-    def record(self, trace: Trace) -> None:
-        """Record a run that a panel made."""
+    def open_recorded(self, wish: Wish, path: Path, cam_from_map: FloatArray | None) -> None:
+        """Ask for a run that is recorded already, as ``path`` and with this pose (3, 4)."""
+
+    def record(self, trace: Trace, scene: SceneWish) -> None:
+        """Record a run that a panel made of a scene."""
 
     def shown(self) -> Shown | None:
         """What is on the page."""
@@ -62,17 +73,20 @@ class Controls:
         self,
         client: viser.ClientHandle,
         catalog: Catalog,
-        roots: tuple[Path, ...],
+        services: Services,
         touches: Touches,
         owner: Owner,
         width_px: int,
     ) -> None:
         gui = client.gui
         self._catalog, self._owner = catalog, owner
+        self._sequence: SceneWish | None = None
+        """What the sequence that was started last is of."""
         self._presets = {preset.title: preset for preset in presets(catalog)}
         self.slow = SlowRun(gui, f"spherloc-clock-{client.client_id}")
         self._moves = gui.add_button_group("", (UNDO, REDO, NEW_SEED))
         self._moves.on_click(self._move)
+        self.review = ReviewCard(gui, owner.redraw)
         tabs = gui.add_tab_group()
         with tabs.add_tab("Play"):
             self._build_play(gui)
@@ -81,7 +95,10 @@ class Controls:
         with tabs.add_tab("Sweep"):
             self._sweep = SweepPanel(gui, touches, self._chosen_sweep)
         with tabs.add_tab("Open"):
-            self._open = OpenPanel(gui, client, touches, roots, self._open_scene)
+            self._open = OpenPanel(gui, client, touches, services.roots, self._open_scene)
+        with tabs.add_tab("Recordings"):
+            page = Page(services.roots, self._enter, owner.open, owner.open_recorded)
+            self._recordings = RecordingsPanel(gui, client, touches, services.shelf, self.review, page)
         with tabs.add_tab("Share"):
             self._export = ExportPanel(gui, client, owner.shown)
         for label, key, modifier, by in ((UNDO, "Z", "cmd/ctrl", -1), (REDO, "Z", "cmd/ctrl+shift", 1)):
@@ -105,7 +122,7 @@ class Controls:
     @property
     def widgets(self) -> tuple:
         """All that hold a value."""
-        parts = (self.scene, self.estimator, self.display, self.compare, self._sweep, self._open)
+        parts = (self.scene, self.estimator, self.display, self.compare, self._sweep, self._open, self._recordings)
         return (self._preset, self._movable, *(widget for part in parts for widget in part.widgets))
 
     @property
@@ -115,7 +132,7 @@ class Controls:
 
     def close(self) -> None:
         """End what runs; does not wait."""
-        for part in (self.slow, self.sequence, self.compare, self._sweep, self._open, self._export):
+        for part in (self.slow, self.sequence, self.compare, self._sweep, self._open, self._recordings, self._export):
             part.close()
 
     def follow_scene(self) -> bool:
@@ -131,13 +148,18 @@ class Controls:
         self.estimator.write(wish.estimator, wish.options)
         self._show_scene(wish.scene.scene)
 
-    def draw(self, run: Run) -> None:
-        """Follow the run at hand."""
+    def items(self, run: Run) -> tuple[SceneItem, ...]:
+        """What the canvas shows beside a run: cameras of other estimators, and recorded ones."""
+        return self.compare.items(run.trace) + self.review.items(run)
+
+    def draw(self, run: Run, diagnosis: Diagnosis | None) -> None:
+        """Follow the run at hand; ``diagnosis`` is None for as long as there is none."""
         self._follow_preset(run.wish)
         html = _edits_html(run.wish.scene.variation)
         if self._edits.content != html:
             self._edits.content, self._edits.visible = html, bool(html)
         self.compare.draw(run.trace)
+        self.review.draw(run, diagnosis)
 
     def settle(self, run: Run) -> None:
         """Say how to repeat a run that the page has settled on."""
@@ -185,18 +207,28 @@ class Controls:
         estimator, _ = self.estimator.read()
         self._owner.open(Wish(SceneWish(label, seed), estimator, None))
 
+    def _enter(self, got: Reopened) -> Wish:
+        """Offer a reopened scene, and wish for its run."""
+        label = self._catalog.enter(got.scene, got.path, got.label, brief=not got.live)
+        return Wish(SceneWish(label, got.seed, got.query, got.variation), got.estimator, got.options)
+
     def _chosen_sequence(self) -> tuple[str, MapScene, str, Any, int]:
         """What the sequence panel localizes; raises ``InputError`` if the page says nothing that can be."""
         wish = self.scene.read()
         scene = self._catalog.map_scene(wish.scene)
         if scene is None:
             raise InputError("this scene has no query images; choose one that has.")
+        self._sequence = wish
         return wish.scene, scene, *self.estimator.read(), wish.seed
 
     def _localized(self, trace: Trace | None) -> None:
         """One more query of a sequence is done."""
-        if trace is not None:
-            self._owner.record(trace)
+        wish = self._sequence
+        if trace is not None and wish is not None:
+            images = self._catalog.map_scene(wish.scene)
+            views = () if images is None else images.queries
+            query = next((view.name for view in views if view.path == trace.problem.image), None)
+            self._owner.record(trace, replace(wish, query=query))
         self._owner.redraw()
 
     def _chosen_sweep(self) -> tuple[Path, SceneWish]:

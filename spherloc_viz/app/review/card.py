@@ -10,9 +10,9 @@ from spherloc.metrics import evaluate
 from spherloc_viz import style
 from spherloc_viz.app.history import changed_fields
 from spherloc_viz.app.review import words
-from spherloc_viz.app.review.filters import pill
+from spherloc_viz.app.review.filters import key_html, keyed, pill
 from spherloc_viz.app.review.opened import Opened, is_same_pose
-from spherloc_viz.app.review.rows import badge_html
+from spherloc_viz.app.review.rows import NEXT_KEY, PREVIOUS_KEY, badge_html
 from spherloc_viz.app.text import DIM, box
 from spherloc_viz.app.web.viewer_room import viewer_link
 from spherloc_viz.app.wish import Run
@@ -20,8 +20,6 @@ from spherloc_viz.layers import steps
 from spherloc_viz.recording.properties import outcome
 from spherloc_viz.recording.run_row import RunRow
 
-BEFORE, AFTER = "[", "]"
-"""Keys that open the run before and the next one: viser's canvas has letters and arrows."""
 GROUND = "margin:0 .6em .4em;border:1px solid rgba(80,150,250,.45);border-radius:.4em"
 
 Line = tuple[str, str, str]
@@ -31,22 +29,19 @@ Line = tuple[str, str, str]
 def bar_html(place: int | None, total: int) -> str:
     """What opens the next run and the one before, and where in the list the open one is (from 0)."""
     where = f"{total:,} runs" if place is None else f"{place + 1:,} of {total:,}"
-    back = pill(f"‹ previous {_key(BEFORE)}", "run-step:-1", False, f"Previous run, key {BEFORE}", _keyed(BEFORE))
-    on = pill(f"next {_key(AFTER)} ›", "run-step:1", False, f"Next run, key {AFTER}", _keyed(AFTER))
+    back = pill(
+        f"‹ previous {key_html(PREVIOUS_KEY)}",
+        "run-step:-1",
+        False,
+        f"Previous run, key {PREVIOUS_KEY}",
+        keyed(PREVIOUS_KEY),
+    )
+    on = pill(f"next {key_html(NEXT_KEY)} ›", "run-step:1", False, f"Next run, key {NEXT_KEY}", keyed(NEXT_KEY))
     close = pill("✕", "run-close:", False, "Take the recorded run away; the page stays as it is")
     return (
         f'<div style="display:flex;align-items:center;gap:.4em">{back}{on}'
         f'<span style="flex:1;text-align:center;{DIM}">{where}</span>{close}</div>'
     )
-
-
-def _key(key: str) -> str:
-    look = "border:1px solid currentColor;border-radius:.25em;padding:0 .3em;opacity:.6;font:inherit;font-size:10px"
-    return f'<kbd style="{look}">{escape(key)}</kbd>'
-
-
-def _keyed(key: str) -> str:
-    return f'data-key="{escape(key)}"'
 
 
 def card_html(opened: Opened, run: Run | None, diagnosis: Diagnosis | None, bar: str) -> str:
@@ -75,16 +70,13 @@ def lines_of(row: RunRow, run: Run, diagnosis: Diagnosis | None) -> list[Line]:
     """The recorded run beside the one on the page."""
     trace, metrics = run.trace, evaluate(run.trace)
     cause = "…" if diagnosis is None else str(diagnosis.cause)
-    now = (
-        (metrics.rotation_error_deg, metrics.translation_error_m),
-        (int(np.count_nonzero(trace.inlier_mask)), len(trace.problem)),
-    )
-    recorded = ((row.rotation_error_deg, row.translation_error_m), (row.inliers, row.correspondences))
+    turn, shift = metrics.rotation_error_deg, metrics.translation_error_m
+    inliers = int(np.count_nonzero(trace.inlier_mask))
     return [
         ("outcome", badge_html(row.outcome), badge_html(outcome(metrics))),
         ("diagnosis", escape(row.diagnosis or words.UNKNOWN), escape(cause)),
-        ("errors", *(errors_text(*errors) for errors, _ in (recorded, now))),
-        ("inliers", *(f"{count} of {of}" for _, (count, of) in (recorded, now))),
+        ("errors", errors_text(row.rotation_error_deg, row.translation_error_m), errors_text(turn, shift)),
+        ("inliers", f"{row.inliers} of {row.correspondences}", f"{inliers} of {len(trace.problem)}"),
         ("time", words.duration(row.time_ms), words.duration(trace.timings_ms["total"])),
     ]
 

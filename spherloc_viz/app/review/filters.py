@@ -77,6 +77,17 @@ def pill(content: str, touch: str, on: bool, hint: str, extra: str = "") -> str:
     )
 
 
+def key_html(key: str) -> str:
+    """The sign of a key on a button."""
+    look = "border:1px solid currentColor;border-radius:.25em;padding:0 .3em;opacity:.6;font:inherit;font-size:10px"
+    return f'<kbd style="{look}">{escape(key)}</kbd>'
+
+
+def keyed(key: str) -> str:
+    """The attribute of an element that is pressed by a key too."""
+    return f'data-key="{escape(key)}"'
+
+
 def _handles(look: Look) -> str:
     """What else can be chosen, with what is chosen now."""
     parts = []

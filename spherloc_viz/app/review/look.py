@@ -98,6 +98,10 @@ class Look:
         fits = page.isascii() and page.isdigit() and int(page) < MOST_PAGES if len(page) < 8 else False
         return replace(self, page=int(page)) if fits else self
 
+    def at(self, place: int) -> "Look":
+        """The page that has the run at that place of the list."""
+        return replace(self, page=place // PAGE)
+
     def cleared(self) -> "Look":
         """The list with no filters."""
         return Look(sort=self.sort, descending=self.descending)

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -39,6 +40,8 @@ class Opened:
     """The run that is open, and what asks for it."""
 
     recorded: Recorded
+    path: Path
+    """Its file."""
     wish: Wish
     """Gives the same run again."""
     truth_cam_from_map: FloatArray | None = None

@@ -8,7 +8,7 @@ from html import escape
 from spherloc.diagnosis import Cause
 from spherloc_viz import style
 from spherloc_viz.app.review import words
-from spherloc_viz.app.review.filters import pill
+from spherloc_viz.app.review.filters import key_html, keyed, pill
 from spherloc_viz.app.review.look import PAGE, Look
 from spherloc_viz.app.text import DIM, box, dot_html
 from spherloc_viz.app.web.viewer_room import viewer_link
@@ -19,6 +19,8 @@ MOST_PICTURE_BYTES = 100_000
 """Of a row's picture; larger ones are not shown."""
 WIDTH_PX, HEIGHT_PX = 76, 52
 """Of a row's picture."""
+PREVIOUS_KEY, NEXT_KEY = "[", "]"
+"""Open the run before and the next one: viser's canvas has letters and arrows."""
 RULE = "border-top:1px solid rgba(128,140,160,.18)"
 CUT = "white-space:nowrap;overflow:hidden;text-overflow:ellipsis"
 OPENED = "rgba(60,130,230,.2)"
@@ -33,8 +35,8 @@ def rows_html(
         what = "No recorded run fits these filters." if look.filtered else "No run is recorded yet."
         return box(f'<div style="{DIM}">{what}</div>', "font-size:12.5px")
     body = "".join(row_html(row, row.file in marked, row.file == opened, now) for row in rows)
-    pages = pages_html(look.page, total)
-    return box(f"{pages}{body}{pages if len(rows) > 5 else ''}", "font-size:11.5px;line-height:1.35")
+    top, below = pages_html(look.page, total, opened is None), pages_html(look.page, total, False)
+    return box(f"{top}{body}{below if total > PAGE else ''}", "font-size:11.5px;line-height:1.35")
 
 
 def row_html(row: RunRow, marked: bool, opened: bool, now: datetime) -> str:
@@ -122,13 +124,15 @@ def _hint(row: RunRow) -> str:
     return escape(" ".join(filter(None, (row.summary or row.message, f"({row.file})"))))
 
 
-def pages_html(page: int, total: int) -> str:
-    """Where in the list one is, and what turns it."""
+def pages_html(page: int, total: int, ways: bool) -> str:
+    """Where in the list one is, and what turns it; with ``ways`` also what goes through all of it or exports it."""
     first, last = page * PAGE + 1, min((page + 1) * PAGE, total)
     back = pill("‹", f"runs-page:{page - 1}", False, "Previous page") if page > 0 else ""
     on = pill("›", f"runs-page:{page + 1}", False, "Next page") if last < total else ""
     where = f"{first:,}–{last:,} of {total:,}" if total > PAGE else f"{total:,} run{'s' if total != 1 else ''}"
-    return (
-        f'<div style="display:flex;gap:.5em;align-items:center;padding:.3em 0"><span style="{DIM}">{where}</span>'
-        f"{back}{on}</div>"
-    )
+    parts = [f'<span style="{DIM}">{where}</span>{back}{on}<span style="flex:1"></span>']
+    if ways:
+        words_ = f"go through them {key_html(NEXT_KEY)}"
+        parts.append(pill(words_, "run-step:1", False, f"Open one after another, key {NEXT_KEY}", keyed(NEXT_KEY)))
+        parts.append(pill("zip", "runs-export:", False, f"Export all {total:,} runs of this list"))
+    return f'<div style="display:flex;gap:.5em;align-items:center;padding:.2em 0 .35em">{"".join(parts)}</div>'

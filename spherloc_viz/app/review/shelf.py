@@ -1,5 +1,6 @@
 """The recordings that all pages of a server review: the folder, its index, and single runs read safely."""
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -12,7 +13,7 @@ from spherloc_viz.recording.index import Found, RunIndex
 from spherloc_viz.recording.query import RunQuery
 from spherloc_viz.recording.reader import RecordedRun, read_recording
 from spherloc_viz.recording.run_row import RunRow
-from spherloc_viz.recording.strangers import examine, examine_all, resolve_inside
+from spherloc_viz.recording.strangers import examine, resolve_inside
 
 NEAR = 50
 """A run that was at some place of the list is looked for among so many around it."""
@@ -35,8 +36,17 @@ class Shelf:
         """Take in recordings that the index does not know, once; tells whether there was anything to be read."""
         if not self._index.stale:
             return False
-        done = self._index.refresh(examine_all)
+        done = self._index.refresh()
         return bool(done.read or done.removed)
+
+    def version(self) -> tuple[int, ...]:
+        """Another one whenever runs have come or changed, whichever process did it; costs next to nothing."""
+        state: list[int] = []
+        for path in (self._index.path, self._index.path.with_name(f"{self._index.path.name}-wal")):
+            with contextlib.suppress(OSError):
+                status = path.stat()
+                state += (status.st_mtime_ns, status.st_size)
+        return tuple(state)
 
     def page(self, look: Look) -> tuple[Found, Look]:
         """The rows of a page, and the look with a page that exists."""
@@ -49,8 +59,7 @@ class Shelf:
 
     def counts(self, look: Look, total: int) -> Counts:
         """What each filter would leave."""
-        by = (name for name in ("outcome", "diagnosis"))
-        outcome, diagnosis = (self._groups(look, name) for name in by)
+        outcome, diagnosis = self._groups(look, "outcome"), self._groups(look, "diagnosis")
         unfolded = self._groups(look, look.unfolded) if look.unfolded in EXACT else ()
         return Counts(total, outcome, diagnosis, unfolded)
 
@@ -68,6 +77,10 @@ class Shelf:
         if row is None:
             raise RecordingError(f"{file}: is not in the list any more; choose another run.")
         return row
+
+    def rows(self, files: Sequence[str]) -> tuple[RunRow, ...]:
+        """The runs of these files, in their order, without those that the list does not have any more."""
+        return tuple(row for row in map(self._index.get, files) if row is not None)
 
     def read(self, file: str) -> tuple[RecordedRun, Path]:
         """A recording that another process has found safe to be read; raises ``RecordingError`` if it is not."""

@@ -1,7 +1,7 @@
 """A recorded run's numbers in short words."""
 
 import json
-from datetime import datetime
+from datetime import UTC, datetime
 
 from spherloc_viz import style
 from spherloc_viz.layers.frame import length
@@ -53,6 +53,14 @@ def moment(created: str, now: datetime) -> str:
     if when.date() == now.date():
         return f"{when:%H:%M:%S}"
     return f"{when:%d %b}" if when.year == now.year else f"{when:%d %b %Y}"
+
+
+def clock(created: str) -> str:
+    """When a run was made, to the second."""
+    try:
+        return f"{datetime.fromisoformat(created).astimezone(UTC):%Y-%m-%d %H:%M:%S} UTC"
+    except ValueError:
+        return ""
 
 
 def options_of(row: RunRow) -> dict[str, str]:

@@ -2,19 +2,16 @@
 
 import asyncio
 import contextlib
-import ipaddress
-import os
 import re
 import socket
-from urllib.parse import urlsplit
 
 import aiohttp
 from aiohttp import web
-from multidict import CIMultiDictProxy
 
-from spherloc.errors import InputError
+from spherloc_viz.app.web.guard import SAFE, refusal
 from spherloc_viz.app.web.page import Page, load_page
 from spherloc_viz.app.web.touch import MOST_BYTES, TouchDesk
+from spherloc_viz.app.web.viewer_room import NOT_RECORDED, PAGE, ViewerRoom
 from spherloc_viz.app.web.viser_seams import KEY_HEADER
 
 MAX_MESSAGE_BYTES = 50 * 1024 * 1024
@@ -30,63 +27,16 @@ PARAMETERS = frozenset(f"initialCamera{part}" for part in ("Position", "LookAt",
 """What a link may ask of viser's page. Others are dropped: they make it play a stranger's file or server."""
 
 
-def open_socket(host: str, port: int) -> socket.socket:
-    """A listening socket.
-
-    Raises ``InputError`` if the address cannot be had.
-    """
-    if not 0 <= port < 2**16:
-        raise InputError(f"port {port} does not exist; give --port a number up to 65535, or 0 for any free one.")
-    where = f"{host}:{port}"
-    try:
-        family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-        return socket.create_server(address[:2], family=family)
-    except socket.gaierror:
-        raise InputError(f"'{host}' is no address of this machine; use --host 127.0.0.1.") from None
-    except OSError as error:
-        # Python adds its own words to the system's.
-        reason = os.strerror(error.errno) if error.errno else str(error)
-        raise InputError(f"cannot listen on {where} ({reason}); choose another port with --port.") from None
-
-
-def is_own_name(netloc: str, host: str) -> bool:
-    """Whether a Host header names this server: an IP literal, localhost, or the name that --host gave.
-
-    Only a name can be made to point here by a foreign site (DNS rebinding); an address cannot.
-    """
-    try:
-        name = urlsplit(f"//{netloc}").hostname or ""
-    except ValueError:
-        return False
-    if name in ("localhost", host.lower()):
-        return True
-    with contextlib.suppress(ValueError):
-        ipaddress.ip_address(name)
-        return True
-    return False
-
-
-def refusal(headers: CIMultiDictProxy[str], host: str, upgrade: bool) -> str | None:
-    """Why a request with these headers is refused, or None if it is welcome."""
-    own = headers.getall("Host", [])
-    if len(own) != 1 or not is_own_name(own[0], host):
-        return "This address is not the playground's: open the address that the command printed."
-    origins = headers.getall("Origin", [])
-    # A browser sends Origin with every websocket; none at all is no browser, and no business of this server.
-    if (upgrade and not origins) or any(origin not in _same_origins(own[0]) for origin in origins):
-        return "Another site may not use the playground."
-    return None
-
-
-def _same_origins(netloc: str) -> tuple[str, str]:
-    return f"http://{netloc}", f"https://{netloc}"
-
-
 class FrontDoor:
-    """Serves one page and one websocket, and takes reports of presses on the page; everything else is refused."""
+    """Serves one page, one websocket and the viewer of recordings, and takes reports of presses on the page.
 
-    def __init__(self, host: str, viser_port: int, key: str, desk: TouchDesk) -> None:
+    Everything else is refused.
+    """
+
+    def __init__(self, host: str, viser_port: int, key: str, desk: TouchDesk, viewer: ViewerRoom | None = None) -> None:
+        """``viewer`` is None where nothing is recorded."""
         self._host = host
+        self._viewer = viewer
         self._desk = desk
         self._upstream = f"http://127.0.0.1:{viser_port}/"
         self._key = key
@@ -121,6 +71,10 @@ class FrontDoor:
             return await self._touch(request)
         if request.method not in ("GET", "HEAD"):
             return web.Response(status=405, text="Only GET is served.\n", headers={"Allow": "GET, HEAD"})
+        if request.path.startswith(PAGE):
+            if self._viewer is None:
+                return web.Response(status=404, text=f"{NOT_RECORDED}\n")
+            return await self._viewer.answer(request)
         if not request.query.keys() <= PARAMETERS:
             raise web.HTTPFound("/")
         if request.path != "/":
@@ -137,12 +91,8 @@ class FrontDoor:
         return web.Response(status=204) if known else web.Response(status=400, text="No page of this playground.\n")
 
     def _page_response(self, request: web.Request) -> web.Response:
-        headers = {
+        headers = SAFE | {
             "Content-Security-Policy": self._page.policy,
-            "X-Content-Type-Options": "nosniff",
-            "Referrer-Policy": "no-referrer",
-            "Cross-Origin-Resource-Policy": "same-origin",
-            "Cross-Origin-Opener-Policy": "same-origin",
             "Cache-Control": "no-cache",
             "Vary": "Accept-Encoding",
         }

@@ -1,11 +1,17 @@
 // Tells the server what a person presses in the HTML and SVG that it sent: elements with data-touch="ACTION:ARGUMENT".
 // With data-drag a drag across the element is told too; data-copy="TEXT" puts TEXT on the clipboard. And it tells which
-// elements with data-view="NAME" are to be seen, so that what stands on a hidden tab need not be drawn.
+// elements with data-view="NAME" are to be seen, so that what stands on a hidden tab need not be drawn. A key presses the
+// element with data-key="KEY". Links within an element are followed, and do not press it.
 (() => {
   const TOUCHABLE = "[data-touch],[data-copy]", LEAST_DRAG_PX = 6, LOOK_EVERY_MS = 150;
   let sent = Promise.resolve(), press = null, shade = null, seen = null;
 
-  const found = (event) => (event.target instanceof Element ? event.target.closest(TOUCHABLE) : null);
+  function found(event) {
+    const element = event.target instanceof Element ? event.target.closest(`${TOUCHABLE},a[href]`) : null;
+    return element?.matches(TOUCHABLE) ? element : null;
+  }
+
+  const seenElements = (selector) => [...document.querySelectorAll(selector)].filter((one) => one.getClientRects().length > 0);
   const fraction = (value, start, size) => Math.min(1, Math.max(0, (value - start) / Math.max(size, 1)));
 
   function tell(action, box, event, from) {
@@ -27,8 +33,7 @@
 
   function look() {
     if (!document.querySelector("[data-session]")) return;
-    const views = [...document.querySelectorAll("[data-view]")].filter((view) => view.getClientRects().length > 0);
-    const names = views.map((view) => view.dataset.view).sort().join(",");
+    const names = seenElements("[data-view]").map((view) => view.dataset.view).sort().join(",");
     if (names === seen) return;
     seen = names;
     const nowhere = { left: 0, top: 0, width: 1, height: 1 };
@@ -49,6 +54,12 @@
     }
     element.classList.add("copied");
     setTimeout(() => element.classList.remove("copied"), 1200);
+  }
+
+  function pressMiddle(element, event) {
+    const box = element.getBoundingClientRect(), middle = { x: box.left + box.width / 2, y: box.top + box.height / 2 };
+    if (element.dataset.copy !== undefined) copy(element);
+    else tell(element.dataset.touch, box, { clientX: middle.x, clientY: middle.y, shiftKey: event.shiftKey }, middle);
   }
 
   function drawShade(event) {
@@ -105,18 +116,27 @@
   setInterval(look, LOOK_EVERY_MS);
 
   addEventListener("keydown", (event) => {
-    const writing = event.target instanceof Element && event.target.closest("input,textarea,[role=listbox]");
+    const writing = event.target instanceof Element
+      && event.target.closest("input:not([type=checkbox]):not([type=radio]),textarea,select,[contenteditable=true],[role=listbox]");
     if (event.key === "Escape" && !writing) {
       const corner = { left: 0, top: 0, width: 1, height: 1 };
       tell("deselect:", corner, { clientX: 0, clientY: 0 }, { x: 0, y: 0 });
+      return;
+    }
+    // Many keyboards have brackets behind AltGr, which some systems call Ctrl and Alt.
+    const held = (event.ctrlKey || event.metaKey) && !event.getModifierState("AltGraph");
+    const keyed = writing || held || event.key.length > 1
+      ? undefined
+      : seenElements(`[data-key="${CSS.escape(event.key)}"]`)[0];
+    if (keyed) {
+      event.preventDefault();
+      pressMiddle(keyed, event);
       return;
     }
     if ((event.key !== "Enter" && event.key !== " ") || !(event.target instanceof Element)) return;
     if (!event.target.matches(TOUCHABLE)) return;
     event.preventDefault();
     event.stopPropagation();
-    const box = event.target.getBoundingClientRect(), middle = { x: box.left + box.width / 2, y: box.top + box.height / 2 };
-    if (event.target.dataset.copy !== undefined) copy(event.target);
-    else tell(event.target.dataset.touch, box, { clientX: middle.x, clientY: middle.y, shiftKey: event.shiftKey }, middle);
+    pressMiddle(event.target, event);
   }, true);
 })();

@@ -2,7 +2,9 @@
 
 The page carries a small script (``touch.js``). Any element with ``data-touch="ACTION:ARGUMENT"`` reports a press of the
 mouse, or Enter where the element has the focus. With ``data-drag`` as well, dragging across it is reported too. Which
-elements with ``data-view="NAME"`` are to be seen is reported as the action "views" with the names as its argument.
+elements with ``data-view="NAME"`` are to be seen is reported as the action "views" with the names as its argument. A key
+presses the element with ``data-key="KEY"`` that can be seen, unless something is being written. A link is never part of
+what is pressed around it.
 """
 
 import json
@@ -46,25 +48,23 @@ class Touches:
         self.token = secrets.token_urlsafe(24)
         """Tells this page from others; no other page can know it."""
         self._failed = failed
-        self._handlers: dict[str, Handler] = {}
+        self._handlers: dict[str, tuple[Handler, ...]] = {}
 
     def on(self, action: str, handler: Handler) -> None:
-        """Call ``handler`` for every press on an element of that action."""
-        self._handlers[action] = handler
+        """Call ``handler`` too for every press on an element of that action."""
+        self._handlers[action] = (*self._handlers.get(action, ()), handler)
 
     def html(self) -> str:
         """What must stand somewhere on the page for its presses to find their way here."""
         return f'<div data-session="{escape(self.token)}"></div>'
 
     def deliver(self, touch: Touch) -> None:
-        """Hand a press to its handler; an unknown action is ignored, since the page may show what is gone by now."""
-        handler = self._handlers.get(touch.action)
-        if handler is None:
-            return
-        try:
-            handler(touch)
-        except Exception as error:
-            self._failed(error)
+        """Hand a press to its handlers; an unknown action is ignored, since the page may show what is gone by now."""
+        for handler in self._handlers.get(touch.action, ()):
+            try:
+                handler(touch)
+            except Exception as error:
+                self._failed(error)
 
 
 class TouchDesk:

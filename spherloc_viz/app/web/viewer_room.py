@@ -1,8 +1,120 @@
-"""The Rerun viewer behind the front door: a page that opens one recording at one step, and all that it loads."""
+"""The Rerun viewer behind a front door: the page that opens a run at a step, and all that it loads."""
 
+import asyncio
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
 from urllib.parse import urlencode
+
+from aiohttp import web
+
+from spherloc.errors import InputError, SpherlocError, show
+from spherloc_viz.app.web.guard import SAFE
+from spherloc_viz.app.web.viewer_page import DATA, PROGRAM, SORRY_POLICY, sorry_page, viewer_page, viewer_policy
+from spherloc_viz.recording.columns import TIMELINE
+from spherloc_viz.recording.index import RunIndex
+from spherloc_viz.recording.review import REVIEW_SUFFIX, read_review, review_path
+from spherloc_viz.recording.run_row import RunRow
+from spherloc_viz.recording.strangers import examine, resolve_inside
+from spherloc_viz.recording.view import step_of
+from spherloc_viz.recording.viewer_files import NAMES, viewer_folder, viewer_version
+
+PAGE = "/viewer/"
+NOT_RECORDED = "There are no recordings to view: start the playground without --no-record."
+FOREVER = "private, max-age=31536000, immutable"
+"""Its address says which version of the program it is."""
 
 
 def viewer_link(file: str, step: int) -> str:
     """The path and query that open a recording of the folder of recordings at a step, unescaped for HTML."""
-    return "/viewer/?" + urlencode({"run": file, "step": step})
+    return PAGE + "?" + urlencode({"run": file, "step": step})
+
+
+@dataclass(frozen=True)
+class Viewable:
+    """A run that may be viewed."""
+
+    path: Path
+    """Of its recording."""
+    row: RunRow
+    """What is known about it."""
+
+
+def of_folder(folder: Path, index: Callable[[], RunIndex]) -> Callable[[str], Viewable]:
+    """Finds runs by the names of their files in a folder: those of its index, and others that pass examination.
+
+    What it returns raises ``RecordingError`` for what is no recording there, or none of ours.
+    """
+
+    def find(file: str) -> Viewable:
+        path = resolve_inside(folder, file)
+        return Viewable(path, index().get(file) or examine(path))
+
+    return find
+
+
+class ViewerRoom:
+    """Answers requests for ``/viewer/...``; who asks has been checked at the door."""
+
+    def __init__(self, find: Callable[[str], Viewable]) -> None:
+        """``find`` gives the run of a file, or raises ``RecordingError``; it is called in threads and may take long."""
+        self._find = find
+
+    async def answer(self, request: web.Request) -> web.StreamResponse:
+        """The page, a file of the viewer's program, or a recording."""
+        path = request.path
+        answer, argument = next(
+            (answer, path[len(start) :])
+            for start, answer in ((PROGRAM, self._program), (DATA, self._data), (PAGE, self._page))
+            if path.startswith(start)
+        )
+        try:
+            return await asyncio.get_running_loop().run_in_executor(None, answer, argument, request)
+        except SpherlocError as error:
+            if answer == self._page:
+                return _html(sorry_page(str(error)), SORRY_POLICY, status=404)
+            return web.Response(status=404, text=f"{error}\n", headers=SAFE)
+
+    def _page(self, rest: str, request: web.Request) -> web.StreamResponse:
+        if rest:
+            raise InputError("There is nothing here; open the viewer from the list of recordings.")
+        file = request.query.get("run", "")
+        found = self._find(file)
+        step = step_of(found.row, _number(request.query.get("step")))
+        return _html(viewer_page(file, found.row, step, viewer_version(), TIMELINE), viewer_policy())
+
+    def _program(self, rest: str, request: web.Request) -> web.StreamResponse:
+        version, _, name = rest.partition("/")
+        if version != viewer_version() or name not in NAMES:
+            raise InputError("There is no such file of the viewer: reload the page.")
+        headers = SAFE | {"Content-Type": NAMES[name], "Cache-Control": FOREVER}
+        return web.FileResponse(viewer_folder() / name, headers=headers)
+
+    def _data(self, rest: str, request: web.Request) -> web.StreamResponse:
+        is_review = rest.endswith(REVIEW_SUFFIX)
+        run = self._find(rest.removesuffix(REVIEW_SUFFIX) + ".rrd" if is_review else rest).path
+        path = review_path(run) if is_review else run
+        if is_review:
+            read_review(run)  # raises an error for one that is none of ours
+            if not path.is_file():
+                return web.Response(status=204, headers=SAFE)
+        headers = SAFE | {
+            "Content-Type": "application/octet-stream",
+            "Content-Security-Policy": "default-src 'none'; sandbox",
+            "Cache-Control": "no-cache",
+        }
+        return web.FileResponse(path, headers=headers)
+
+
+def _number(text: str | None) -> int | None:
+    if text is None:
+        return None
+    if not re.fullmatch(r"\d{1,9}", text, re.ASCII):
+        raise InputError(f"{show(text)}: not the number of a step; give one such as step=0.")
+    return int(text)
+
+
+def _html(text: str, policy: str, status: int = 200) -> web.Response:
+    headers = SAFE | {"Content-Security-Policy": policy, "Cache-Control": "no-cache"}
+    return web.Response(status=status, text=text, content_type="text/html", charset="utf-8", headers=headers)

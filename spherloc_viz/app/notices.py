@@ -1,0 +1,25 @@
+"""What a page is told about the recordings, though nobody asked: one notification, whose newest word replaces the last."""
+
+import threading
+
+import viser
+
+SHOWN_S = 15.0
+
+
+class Notices:
+    """One client's."""
+
+    def __init__(self, client: viser.ClientHandle) -> None:
+        self._client = client
+        self._shown: viser.NotificationHandle | None = None
+        self._lock = threading.Lock()
+
+    def show(self, sentence: str) -> None:
+        """Show a sentence for a while."""
+        with self._lock:
+            if self._shown is not None:
+                self._shown.remove()
+            self._shown = self._client.add_notification(
+                "Recordings", sentence, color="blue", auto_close_seconds=SHOWN_S
+            )

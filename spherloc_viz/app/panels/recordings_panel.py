@@ -1,0 +1,164 @@
+"""The tab for reviewing: the list of recordings, the gallery, what is said of the open run, and what is compared."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import viser
+
+from spherloc.cameras.base import FloatArray
+from spherloc_viz.app.panels.errand import Errand
+from spherloc_viz.app.review.differences import comparison_html
+from spherloc_viz.app.review.exporter import Exporter
+from spherloc_viz.app.review.filters import pill
+from spherloc_viz.app.review.gallery_list import GalleryList
+from spherloc_viz.app.review.notes import Notes
+from spherloc_viz.app.review.review_card import ReviewCard
+from spherloc_viz.app.review.reviewer import Reviewer, Reviewing
+from spherloc_viz.app.review.run_list import RunList
+from spherloc_viz.app.review.shelf import Shelf
+from spherloc_viz.app.text import box, status_html
+from spherloc_viz.app.web.touch import Touch, Touches
+from spherloc_viz.app.wish import Wish
+from spherloc_viz.recording.reopen import Reopened
+from spherloc_viz.recording.run_row import RunRow
+
+RUNS, GALLERY = "runs", "gallery"
+VIEW = "Recordings"
+"""By this name the page tells whether the tab is to be seen."""
+
+
+@dataclass(frozen=True)
+class Page:
+    """What the panel asks of its page."""
+
+    roots: tuple[Path, ...]
+    """Folders that scenes may be opened from."""
+    enter: Callable[[Reopened], Wish]
+    """Makes a reopened scene known to the page, and gives the wish for its run."""
+    open: Callable[[Wish], None]
+    """Asks for a run."""
+    open_recorded: Callable[[Wish, Path, FloatArray | None], None]
+    """Asks for a run that is recorded already, as this file and with this pose (3, 4)."""
+
+
+class RecordingsPanel:
+    """One page's. Without a folder of recordings it has the gallery only."""
+
+    def __init__(
+        self,
+        gui: viser.GuiApi,
+        client: viser.ClientHandle,
+        touches: Touches,
+        shelf: Shelf | None,
+        card: ReviewCard,
+        page: Page,
+    ) -> None:
+        name = str(client.client_id)
+        self._shelf, self._page = shelf, page
+        gui.add_html(f'<div data-view="{VIEW}"></div>')
+        self._switch = gui.add_html(_switch_html(RUNS if shelf is not None else GALLERY))
+        self._status = gui.add_html("", visible=False)
+        self._parts: list[RunList | Notes | Reviewer | Exporter | GalleryList] = []
+        self._runs: RunList | None = None
+        if shelf is None:
+            self._say("Runs are not recorded: start the playground without --no-record to review them here.")
+        else:
+            self._build(gui, client, touches, shelf, card)
+        self._gallery = GalleryList(gui, touches, shelf, name, self._open_file, self._open_scene)
+        self._parts.append(self._gallery)
+        self._shown, self._seen = RUNS if shelf is not None else GALLERY, False
+        touches.on("recordings", self._choose)
+        touches.on("views", self._see)
+
+    def _build(
+        self, gui: viser.GuiApi, client: viser.ClientHandle, touches: Touches, shelf: Shelf, card: ReviewCard
+    ) -> None:
+        name, page = str(client.client_id), self._page
+        self._notes = Notes(gui, touches, shelf, name, self._stored, self._complain)
+        self._comparison = gui.add_html("", visible=False)
+        self._runs = RunList(gui, touches, shelf, name)
+        reviewing = Reviewing(
+            shelf, page.roots, card, page.enter, page.open_recorded, self._say, self._complain, self._follow
+        )
+        self._reviewer = Reviewer(touches, self._runs, reviewing, name)
+        exporter = Exporter(client, touches, shelf, self._runs, self._say, self._complain)
+        self._parts += [self._notes, self._runs, self._reviewer, exporter]
+        self._aside = Errand(f"spherloc-compare-runs-{name}", self._complain)
+        touches.on("runs-compare", lambda touch: self._aside.ask(self._compare))
+        touches.on("runs-uncompare", lambda touch: self._uncompare())
+
+    @property
+    def widgets(self) -> tuple:
+        """All that hold a value."""
+        return () if self._runs is None else (*self._notes.widgets, *self._runs.widgets)
+
+    def close(self) -> None:
+        """End what goes on; does not wait."""
+        for part in self._parts:
+            part.close()
+
+    def _see(self, touch: Touch) -> None:
+        """Other tabs are open now."""
+        self._seen = VIEW in touch.argument.split(",")
+        self._show()
+
+    def _choose(self, touch: Touch) -> None:
+        if touch.argument in (RUNS, GALLERY):
+            self._shown = touch.argument
+            self._switch.content = _switch_html(self._shown)
+            self._say("")
+            self._show()
+
+    def _show(self) -> None:
+        """Show the runs or the gallery, and draw them if they can be seen."""
+        gallery = self._shown == GALLERY
+        if self._runs is not None:
+            self._runs.hide(gallery)
+            self._runs.see(self._seen and not gallery)
+        self._gallery.show(gallery and self._seen)
+
+    def _compare(self) -> None:
+        """Put the two marked runs side by side."""
+        assert self._shelf is not None and self._runs is not None
+        rows = self._shelf.rows(self._runs.marked)
+        if len(rows) == 2:
+            self._comparison.content, self._comparison.visible = comparison_html(*rows), True
+            self._reviewer.compare(*rows)
+
+    def _uncompare(self) -> None:
+        self._comparison.visible = False
+        self._reviewer.uncompare()
+
+    def _follow(self, row: RunRow | None) -> None:
+        """Another run is open, or none."""
+        assert self._shelf is not None
+        self._notes.show(row, () if row is None else self._shelf.labels())
+
+    def _stored(self, row: RunRow) -> None:
+        """A run was labelled."""
+        assert self._shelf is not None and self._runs is not None
+        self._reviewer.relabelled(row)
+        self._notes.refresh(row, self._shelf.labels())
+        self._runs.ask()
+
+    def _open_file(self, file: str) -> None:
+        self._reviewer.ask(file)
+
+    def _open_scene(self, got: Reopened) -> None:
+        self._page.open(self._page.enter(got))
+
+    def _say(self, words: str) -> None:
+        self._status.content, self._status.visible = status_html(words), bool(words)
+
+    def _complain(self, sentence: str) -> None:
+        if sentence.partition(" ")[0].isalpha():  # file names stay as they are
+            sentence = sentence[:1].upper() + sentence[1:]
+        self._status.content, self._status.visible = status_html(sentence, wrong=True), True
+
+
+def _switch_html(shown: str) -> str:
+    """Whether the runs or the gallery are shown."""
+    words = ((RUNS, "Runs", "All recorded runs"), (GALLERY, "Gallery", "Failures worth seeing, with their stories"))
+    chips = "".join(pill(word, f"recordings:{name}", name == shown, hint) for name, word, hint in words)
+    return box(f'<div style="display:flex;gap:.4em">{chips}</div>', "font-size:12px;padding-bottom:.2em")

@@ -1,0 +1,111 @@
+"""A selection of recordings as one zip file: the recordings, what a reviewer said, a table, and a page to read."""
+
+import contextlib
+import csv
+import io
+import zipfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from datetime import datetime
+from pathlib import Path
+
+from spherloc.errors import RecordingError
+from spherloc_viz.app.review import words
+from spherloc_viz.app.review.summary_page import summary_html
+from spherloc_viz.recording.review import review_path
+from spherloc_viz.recording.run_row import RunRow
+from spherloc_viz.recording.strangers import resolve_inside
+
+MOST_RUNS = 500
+MOST_BYTES = 200_000_000
+"""Of all files together; a page gets them through its browser's memory."""
+SEPARATE = ("thumbnail", "labels")
+"""Fields of a row that the table has in another form, or not at all."""
+FORMULA = ("=", "+", "-", "@", "\t", "\r")
+"""What a spreadsheet would compute, if it began a text."""
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """A zip file."""
+
+    content: bytes
+    runs: int
+    """How many it has."""
+    sentence: str
+    """What it has, and what was left out."""
+
+
+def bundle(folder: Path, rows: Sequence[RunRow], total: int, now: datetime, closed: Callable[[], bool]) -> Bundle:
+    """Pack recordings of a folder; ``total`` is how many were asked for, of which ``rows`` are the first.
+
+    Files that are gone are left out, and so is what goes beyond ``MOST_RUNS`` and ``MOST_BYTES``. Raises
+    ``RecordingError`` if nothing is left, or if ``closed`` says that nobody waits for it any more.
+    """
+    packed: list[RunRow] = []
+    out = io.BytesIO()
+    size, gone = 0, 0
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_STORED) as archive:  # recordings are compressed inside
+        for row in rows[:MOST_RUNS]:
+            if closed():
+                raise RecordingError("the export was given up, since its page was closed.")
+            files = _files(folder, row.file)
+            size += sum(map(len, files.values()))
+            if size > MOST_BYTES:
+                break
+            gone += not files
+            packed += [row] if files else []
+            for name, content in files.items():
+                archive.writestr(f"recordings/{name}", content)
+        left = total - len(packed) - gone
+        remark = _remark(left, gone)
+        page = summary_html(packed, remark, now)
+        archive.writestr("index.html", page, compress_type=zipfile.ZIP_DEFLATED)
+        archive.writestr("runs.csv", table_csv(packed), compress_type=zipfile.ZIP_DEFLATED)
+    if not packed:
+        raise RecordingError("there is nothing to export: the recordings are gone or too large.")
+    plural = "s" if len(packed) != 1 else ""
+    content = out.getvalue()
+    return Bundle(content, len(packed), f"{len(packed):,} run{plural}, {words.size(len(content))}. {remark}".strip())
+
+
+def _files(folder: Path, name: str) -> dict[str, bytes]:
+    """A recording and its review by their names; empty if the recording is gone."""
+    try:
+        path = resolve_inside(folder, name)
+        files = {name: path.read_bytes()}
+    except (RecordingError, OSError):
+        return {}
+    review = review_path(path)
+    with contextlib.suppress(OSError):
+        if review.is_file() and not review.is_symlink():
+            files[review_path(Path(name)).as_posix()] = review.read_bytes()
+    return files
+
+
+def _remark(left: int, gone: int) -> str:
+    """What is not there, in sentences."""
+    parts = []
+    if left:
+        parts.append(
+            f"{left:,} more were left out: an export has at most {MOST_RUNS} runs and {words.size(MOST_BYTES)}."
+        )
+    if gone:
+        parts.append(f"{gone:,} were left out, since their files are gone.")
+    return " ".join(parts)
+
+
+def table_csv(rows: Sequence[RunRow]) -> str:
+    """The runs as CSV: a column a field, labels with semicolons between them."""
+    names = [field.name for field in fields(RunRow) if field.name not in SEPARATE]
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow([*names, "labels"])
+    for row in rows:
+        writer.writerow([_cell(getattr(row, name)) for name in names] + [_cell("; ".join(row.labels))])
+    return out.getvalue()
+
+
+def _cell(value: object) -> object:
+    """A value that no spreadsheet takes for a formula."""
+    return f"'{value}" if isinstance(value, str) and value.startswith(FORMULA) else value

@@ -1,0 +1,137 @@
+"""The gallery of failures on the page: a press opens a case in the playground and tells its story."""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from html import escape
+from pathlib import Path
+
+import viser
+
+from spherloc_viz import style
+from spherloc_viz.app.panels.errand import Errand
+from spherloc_viz.app.review.filters import pill
+from spherloc_viz.app.review.rows import RULE, picture_html
+from spherloc_viz.app.review.shelf import Shelf
+from spherloc_viz.app.text import DIM, box, status_html
+from spherloc_viz.app.web.touch import Touch, Touches
+from spherloc_viz.gallery import GALLERY, GalleryCase, Play, gallery_cases
+from spherloc_viz.recording.reopen import Reopened
+from spherloc_viz.recording.run_row import RunRow
+
+FOLDER = "gallery"
+"""In the folder of recordings: where the cases' recordings are, once they were made."""
+
+
+class GalleryList:
+    """The cases as rows; the one that is open shows its story, and the runs that it is compared with."""
+
+    def __init__(
+        self,
+        gui: viser.GuiApi,
+        touches: Touches,
+        shelf: Shelf | None,
+        name: str,
+        open_file: Callable[[str], None],
+        open_scene: Callable[[Reopened], None],
+    ) -> None:
+        """``open_file`` opens a recording, ``open_scene`` what has none; both are called on a thread of this part."""
+        self._shelf, self._open_file, self._open_scene = shelf, open_file, open_scene
+        self._errand = Errand(f"spherloc-gallery-{name}", self._fail)
+        self._html = gui.add_html("", visible=False)
+        self._opened: str | None = None
+        touches.on("gallery-open", self._press)
+        touches.on("gallery-beside", self._press_beside)
+
+    def show(self, shown: bool) -> None:
+        """Show the list, or make room."""
+        self._html.visible = shown
+        if shown:
+            self._errand.ask(self._draw)
+
+    def close(self) -> None:
+        """Open nothing more; does not wait."""
+        self._errand.close()
+
+    def _press(self, touch: Touch) -> None:
+        self._errand.ask(partial(self._open, touch.argument))
+
+    def _press_beside(self, touch: Touch) -> None:
+        key, _, number = touch.argument.rpartition(":")
+        if number.isascii() and number.isdigit() and len(number) < 4:
+            self._errand.ask(partial(self._open_beside, key, int(number)))
+
+    def _open(self, key: str) -> None:
+        case = next((case for case in gallery_cases() if case.key == key), None)
+        if case is None:
+            return
+        self._opened = key
+        self._draw()
+        if file_of(case) in self._rows():
+            self._open_file(file_of(case))
+        else:
+            self._open_scene(reopened(case, case))
+
+    def _open_beside(self, key: str, number: int) -> None:
+        case = next((case for case in gallery_cases() if case.key == key), None)
+        if case is not None and number < len(case.beside):
+            self._open_scene(reopened(case, case.beside[number]))
+
+    def _rows(self) -> dict[str, RunRow]:
+        """The recordings of the cases that have one."""
+        files = [file_of(case) for case in gallery_cases()]
+        return {} if self._shelf is None else {row.file: row for row in self._shelf.rows(files)}
+
+    def _draw(self) -> None:
+        html = gallery_html(gallery_cases(), self._rows(), self._opened)
+        if self._html.content != html:
+            self._html.content = html
+
+    def _fail(self, sentence: str) -> None:
+        self._html.content = status_html(sentence[:1].upper() + sentence[1:], wrong=True)
+
+
+def file_of(case: GalleryCase) -> str:
+    """The name of its recording in the folder of recordings."""
+    return f"{FOLDER}/{case.key}.rrd"
+
+
+def reopened(case: GalleryCase, play: Play) -> Reopened:
+    """A case, or a run beside it, as a scene to open."""
+    path = play.scene_path or Path(GALLERY).with_name(FOLDER) / f"{case.key}.rrd"
+    label = case.title if play.scene_path is None else play.scene.name
+    return Reopened(play.scene, path, label, play.seed, play.query, play.variation, play.estimator, play.options)
+
+
+def gallery_html(cases: Sequence[GalleryCase], rows: dict[str, RunRow], opened: str | None) -> str:
+    """All cases, and the story of the one that is open."""
+    about = "Failures worth seeing, and why they happen. A press opens one in the playground."
+    body = "".join(_case_html(case, rows.get(file_of(case)), case.key == opened) for case in cases)
+    return box(f'<div style="{DIM};padding-bottom:.4em">{about}</div>{body}', "font-size:11.5px;line-height:1.4")
+
+
+def _case_html(case: GalleryCase, row: RunRow | None, opened: bool) -> str:
+    picture = picture_html(b"" if row is None else row.thumbnail)
+    color = style.css_text(style.OUTLIER)
+    head = (
+        f'<div style="font-weight:600;overflow-wrap:anywhere">{escape(case.title)}</div>'
+        f'<div><span style="color:{color}">{escape(case.cause)}</span>'
+        f'<span style="{DIM}"> · {escape(case.estimator)}</span></div>'
+    )
+    line = (
+        f'<div role="button" tabindex="0" class="touch-row" data-touch="gallery-open:{escape(case.key)}" '
+        f'style="{RULE};display:flex;gap:.6em;align-items:center;padding:.2em .25em">{picture}'
+        f'<div style="flex:1;min-width:0">{head}</div></div>'
+    )
+    if not opened:
+        return line
+    beside = "".join(
+        pill(
+            f"{escape(play.name)}: {'succeeds' if play.succeeds else 'fails'}",
+            f"gallery-beside:{case.key}:{number}",
+            False,
+            "Run this instead",
+        )
+        for number, play in enumerate(case.beside)
+    )
+    ways = f'<div style="display:flex;flex-wrap:wrap;gap:.3em;padding-top:.4em">{beside}</div>' if beside else ""
+    return f'{line}<div style="padding:.2em .25em .7em">{escape(case.story)}{ways}</div>'

@@ -1,0 +1,132 @@
+"""Labels and a note of the run that is open: stored a moment after the last letter, and at the press of a label."""
+
+import threading
+from collections.abc import Callable
+from functools import partial
+from html import escape
+
+import viser
+
+from spherloc_viz.app.panels.errand import Errand
+from spherloc_viz.app.review.filters import pill
+from spherloc_viz.app.review.shelf import Shelf
+from spherloc_viz.app.text import box
+from spherloc_viz.app.web.touch import Touch, Touches
+from spherloc_viz.recording.run_row import RunRow
+
+PAUSE_S = 0.7
+"""What is typed is stored when no letter has come for this long."""
+SEPARATOR = ","
+
+
+class Notes:
+    """Two fields, and the labels that were used before."""
+
+    def __init__(
+        self,
+        gui: viser.GuiApi,
+        touches: Touches,
+        shelf: Shelf,
+        name: str,
+        stored: Callable[[RunRow], None],
+        failed: Callable[[str], None],
+    ) -> None:
+        """``stored`` is called, on a thread of this part, with the row as it is by then."""
+        self._shelf, self._stored = shelf, stored
+        self._chips = gui.add_html("", visible=False)
+        hint = "Words that tell what kind of run it is, with commas between them."
+        self._labels = gui.add_text("Labels", "", visible=False, hint=hint)
+        self._note = gui.add_text("Note", "", visible=False, multiline=True, hint="Stored with the run.")
+        self._lock = threading.Lock()
+        self._file: str | None = None
+        self._known: tuple[tuple[str, ...], str] = ((), "")
+        """What the fields were last set to, or was stored from them."""
+        self._pending: dict[str, tuple[tuple[str, ...], str]] = {}
+        self._typed, self._closed = threading.Event(), False
+        self._errand = Errand(f"spherloc-notes-{name}", failed)
+        for widget in self.widgets:
+            widget.on_update(self._type)
+        touches.on("run-label", self._toggle)
+
+    @property
+    def widgets(self) -> tuple[viser.GuiTextHandle, viser.GuiTextHandle]:
+        """All that hold a value."""
+        return (self._labels, self._note)
+
+    def show(self, row: RunRow | None, used: tuple[str, ...]) -> None:
+        """Show what was said of a run, or nothing; ``used`` are labels that are offered.
+
+        What is being typed is left alone, unless another page has meanwhile said something else of the run.
+        """
+        with self._lock:
+            file = None if row is None else row.file
+            if row is not None:
+                review = row.labels, row.note
+                if file != self._file or (review != self._known and file not in self._pending):
+                    self._known = review
+                    self._labels.value, self._note.value = f"{SEPARATOR} ".join(row.labels), row.note
+            self._file = file
+            own = () if row is None else row.labels
+            self._draw(tuple(dict.fromkeys((*own, *used))) if row is not None else (), own)
+            for widget in self.widgets:
+                widget.visible = row is not None
+
+    def refresh(self, row: RunRow, used: tuple[str, ...]) -> None:
+        """The run's row has changed; shown if it is still open."""
+        if row.file == self._file:
+            self.show(row, used)
+
+    def close(self) -> None:
+        """Store what waits; does not wait for it."""
+        with self._lock:
+            self._closed = True
+            self._typed.set()
+
+    def _draw(self, offered: tuple[str, ...], own: tuple[str, ...]) -> None:
+        chips = "".join(pill(escape(label), f"run-label:{label}", label in own, label) for label in offered)
+        html = box(f'<div style="display:flex;flex-wrap:wrap;gap:.3em">{chips}</div>', "font-size:11.5px")
+        if self._chips.content != html:
+            self._chips.content = html
+        self._chips.visible = bool(offered)
+
+    def _type(self, event: viser.GuiEvent) -> None:
+        if event.client is not None:
+            self._note_down(PAUSE_S)
+
+    def _toggle(self, touch: Touch) -> None:
+        label = touch.argument.strip()
+        with self._lock:
+            labels = _split(self._labels.value)
+            rest = tuple(other for other in labels if other != label)
+            self._labels.value = f"{SEPARATOR} ".join(rest if label in labels else (*labels, label))
+        self._note_down(0.0)
+
+    def _note_down(self, pause_s: float) -> None:
+        with self._lock:
+            if self._file is None:
+                return
+            self._pending[self._file] = (_split(self._labels.value), self._note.value)
+            before, self._typed = self._typed, threading.Event()
+        before.set()
+        self._errand.ask(partial(self._store, self._typed, pause_s))
+
+    def _store(self, typed: threading.Event, pause_s: float) -> None:
+        """Store all that waits, unless more is typed meanwhile: what comes then is stored by the next job."""
+        if typed.wait(pause_s) and not self._closed:
+            return
+        while True:
+            with self._lock:
+                if not self._pending:
+                    return
+                file, (labels, note) = next(iter(self._pending.items()))
+                del self._pending[file]
+            row = self._shelf.review(file, labels, note)
+            with self._lock:
+                if file == self._file:
+                    self._known = row.labels, row.note
+            self._stored(row)
+
+
+def _split(text: str) -> tuple[str, ...]:
+    """The labels in a text."""
+    return tuple(dict.fromkeys(word for word in (" ".join(part.split()) for part in text.split(SEPARATOR)) if word))

@@ -1,0 +1,50 @@
+"""The run that is open, above the tabs, so that it stays in sight while something is changed and run again."""
+
+from collections.abc import Callable
+
+import viser
+
+from spherloc.diagnosis import Diagnosis
+from spherloc_viz.app.review.card import bar_html, card_html
+from spherloc_viz.app.review.opened import Opened, reference_items
+from spherloc_viz.app.wish import Run
+from spherloc_viz.layers.primitives import SceneItem
+
+
+class ReviewCard:
+    """Shows nothing until a recorded run is opened."""
+
+    def __init__(self, gui: viser.GuiApi, redraw: Callable[[], None]) -> None:
+        """``redraw`` has the page drawn anew."""
+        self._redraw = redraw
+        self._html = gui.add_html("", visible=False)
+        self._opened: Opened | None = None
+        self._where: tuple[int | None, int] = (None, 0)
+
+    @property
+    def opened(self) -> Opened | None:
+        """The recorded run that is open."""
+        return self._opened
+
+    def show(self, opened: Opened | None) -> None:
+        """Show another run, or none."""
+        self._opened = opened
+        self._redraw()
+
+    def place(self, place: int | None, total: int) -> None:
+        """Say where in the list the run is."""
+        self._where = (place, total)
+        self._redraw()
+
+    def draw(self, run: Run, diagnosis: Diagnosis | None) -> None:
+        """Show what was recorded beside the run on the page."""
+        opened = self._opened
+        html = "" if opened is None else card_html(opened, run, diagnosis, bar_html(*self._where))
+        if self._html.content != html:
+            self._html.content = html
+        self._html.visible = bool(html)
+
+    def items(self, run: Run) -> tuple[SceneItem, ...]:
+        """What the canvas shows beside a run."""
+        opened = self._opened
+        return () if opened is None else reference_items(opened, run)

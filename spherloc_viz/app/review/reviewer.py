@@ -1,0 +1,149 @@
+"""Opens recorded runs in the playground, one after another, and two of them side by side."""
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+from spherloc.cameras.base import FloatArray
+from spherloc_viz.app.panels.errand import Errand
+from spherloc_viz.app.review.differences import NAMES, same_problem
+from spherloc_viz.app.review.look import PAGE
+from spherloc_viz.app.review.opened import AS_RECORDED, Opened, Recorded
+from spherloc_viz.app.review.review_card import ReviewCard
+from spherloc_viz.app.review.run_list import RunList
+from spherloc_viz.app.review.shelf import Shelf
+from spherloc_viz.app.web.touch import Touch, Touches
+from spherloc_viz.app.wish import Wish
+from spherloc_viz.recording.reopen import Reopened, reopen
+from spherloc_viz.recording.run_row import RunRow
+
+
+@dataclass(frozen=True)
+class Reviewing:
+    """What a reviewer needs of the page."""
+
+    shelf: Shelf
+    roots: tuple[Path, ...]
+    """Folders that scenes may be opened from."""
+    card: ReviewCard
+    enter: Callable[[Reopened], Wish]
+    """Makes a reopened scene known to the page, and gives the wish for the run."""
+    open: Callable[[Wish, Path, FloatArray | None], None]
+    """Asks for a run that is recorded already, as this file and with this pose (3, 4)."""
+    say: Callable[[str], None]
+    """Shows a sentence about what goes on; an empty one for nothing."""
+    complain: Callable[[str], None]
+    """Shows what went wrong."""
+    changed: Callable[[RunRow | None], None]
+    """Another run is open, or none, or it was labelled."""
+
+
+class Reviewer:
+    """One page's. Presses only note what is to be opened; a thread of an errand does it."""
+
+    def __init__(self, touches: Touches, runs: RunList, reviewing: Reviewing, name: str) -> None:
+        self._runs, self._has = runs, reviewing
+        self._errand = Errand(f"spherloc-reviewer-{name}", reviewing.complain)
+        self._lock = threading.Lock()
+        self._steps, self._place = 0, 0
+        touches.on("run-open", lambda touch: self.ask(touch.argument))
+        touches.on("run-step", self._step)
+        touches.on("run-close", lambda touch: self._close())
+        touches.on("run-return", lambda touch: self._return())
+
+    def ask(self, file: str) -> None:
+        """Have a recording opened."""
+        with self._lock:
+            self._steps = 0
+        self._errand.ask(partial(self._open_file, file))
+
+    def compare(self, one: RunRow, other: RunRow) -> None:
+        """Have the first opened and, if both are of one problem, the second one drawn beside it."""
+        if same_problem(one, other):
+            self._errand.ask(partial(self._open_both, one.file, other.file))
+
+    def uncompare(self) -> None:
+        """Take the second camera away."""
+        opened = self._has.card.opened
+        if opened is not None and opened.other is not None:
+            self._has.card.show(replace(opened, recorded=replace(opened.recorded, name=AS_RECORDED), other=None))
+
+    def relabelled(self, row: RunRow) -> None:
+        """Take over what was said of the run that is open."""
+        opened = self._has.card.opened
+        if opened is not None and opened.recorded.row.file == row.file:
+            self._has.card.show(replace(opened, recorded=replace(opened.recorded, row=row)))
+
+    def close(self) -> None:
+        """Open nothing more; does not wait."""
+        self._errand.close()
+
+    def _step(self, touch: Touch) -> None:
+        by = {"1": 1, "-1": -1}.get(touch.argument, 0)
+        with self._lock:
+            self._steps += by
+        self._errand.ask(self._walk)
+
+    def _walk(self) -> None:
+        """Go on by as many runs as was asked for meanwhile: what is passed quickly is not opened."""
+        with self._lock:
+            by, self._steps = self._steps, 0
+        look, opened = self._runs.look, self._has.card.opened
+        if by == 0:
+            return
+        if opened is None:
+            goal = look.page * PAGE + by - 1
+        else:
+            at, _ = self._has.shelf.place(look, opened.recorded.row.file, self._place)
+            # A run that no longer fits the filter has left its place to the next one.
+            goal = at + by if at is not None else self._place + by - (by > 0)
+        row = self._has.shelf.at(look, goal)
+        if row is None:
+            self._has.say("This is the last run of the list." if by > 0 else "This is the first run of the list.")
+            return
+        self._place = goal
+        self._open_file(row.file)
+
+    def _open_file(self, file: str) -> None:
+        self._show(self._read(file))
+
+    def _open_both(self, one: str, other: str) -> None:
+        opened = self._read(one)
+        run, _ = self._has.shelf.read(other)
+        beside = Recorded(self._has.shelf.row(other), run.cam_from_map, NAMES[1])
+        self._show(replace(opened, recorded=replace(opened.recorded, name=NAMES[0]), other=beside))
+
+    def _read(self, file: str) -> Opened:
+        """Read a recording and open its scene."""
+        row = self._has.shelf.row(file)
+        self._has.say(f"Opening {row.file} …")
+        run, path = self._has.shelf.read(file)
+        got = reopen(run, path, self._has.roots)
+        story = "" if run.origin is None else run.origin.story
+        recorded = Recorded(row, run.cam_from_map)
+        wish = self._has.enter(got)
+        return Opened(recorded, path, wish, run.problem.truth_cam_from_map, got.sentence, story)
+
+    def _show(self, opened: Opened) -> None:
+        row = opened.recorded.row
+        self._has.card.show(opened)
+        self._has.open(opened.wish, opened.path, opened.recorded.cam_from_map)
+        at, total = self._has.shelf.place(self._runs.look, row.file, self._place)
+        if at is not None:
+            self._place = at
+        self._has.card.place(at, total)
+        self._runs.show(row.file, at)
+        self._has.changed(row)
+        self._has.say("")
+
+    def _return(self) -> None:
+        opened = self._has.card.opened
+        if opened is not None:
+            self._has.open(opened.wish, opened.path, opened.recorded.cam_from_map)
+
+    def _close(self) -> None:
+        self._has.card.show(None)
+        self._runs.show(None)
+        self._has.changed(None)

@@ -1,0 +1,103 @@
+// Opens a recording in Rerun's viewer and has it stand at a step, paused. The body's data say which files and step.
+(() => {
+  const { program, files, timeline, step } = document.body.dataset;
+  const said = document.getElementById("said");
+  const TRIES = 600, PAUSE_MS = 100, LOOK_MS = 1000, PAUSED = 1;
+
+  // It writes tens of thousands of lines about its shaders.
+  console.debug = () => undefined;
+
+  // It asks for its newest version and sends statistics. The page's policy forbids both; here they do not even start.
+  const ask = window.fetch.bind(window);
+  window.fetch = (what, how) =>
+    new URL(what instanceof Request ? what.url : what, location.href).origin === location.origin
+      ? ask(what, how)
+      : Promise.reject(new TypeError("This page stays on its own server."));
+
+  // An operation of the viewer's control service (viewer_control.proto of rerun 0.41): set_time_cursor is its number 6,
+  // of which 2 is the timeline, 3 the time and 5 the play state.
+  const number = (value) => (value < 128 ? [value] : [(value % 128) + 128, ...number(Math.floor(value / 128))]);
+  const part = (field, bytes) => [field * 8 + 2, ...number(bytes.length), ...bytes];
+  const count = (field, value) => [field * 8, ...number(value)];
+  const name = part(1, [...new TextEncoder().encode(timeline)]);
+  const standStill = new Uint8Array(part(6, [...part(2, name), ...part(3, count(1, Number(step))), ...count(5, PAUSED)]));
+
+  const pause = (ms) => new Promise((done) => setTimeout(done, ms));
+  const frame = () => new Promise((done) => requestAnimationFrame(done));
+
+  // The bytes of a file; null if there is none. A sentence of the server's is an error.
+  async function bytes(url) {
+    const answer = await ask(url);
+    if (!answer.ok) throw new Error((await answer.text()).trim());
+    return answer.status === 204 ? null : new Uint8Array(await answer.arrayBuffer());
+  }
+
+  function load(url) {
+    return new Promise((done, failed) => {
+      const script = document.createElement("script");
+      script.src = url;
+      script.onload = done;
+      script.onerror = () => failed(new Error("The viewer's program cannot be loaded: reload the page."));
+      document.head.append(script);
+    });
+  }
+
+  // The viewer answers at its next frame, and with an error as long as the recording has not arrived.
+  async function stand(viewer) {
+    for (let turn = 1; ; turn++) {
+      try {
+        return await viewer.viewer_control(standStill);
+      } catch (error) {
+        if (turn === TRIES) throw error;
+        await pause(PAUSE_MS);
+      }
+    }
+  }
+
+  function fail(error) {
+    document.body.dataset.state = "failed";
+    said.textContent = error instanceof Error && error.message ? error.message : String(error);
+  }
+
+  async function watch(viewer) {
+    while (!viewer.has_panicked()) await pause(LOOK_MS);
+    fail(`Rerun's viewer has crashed (${viewer.panic_message()}): reload the page.`);
+  }
+
+  async function open() {
+    const [run, ...others] = files.split(" ").map(bytes);
+    // What comes late must not be an error that nobody has heard of.
+    for (const other of others) other.catch(() => undefined);
+    const wasm = ask(`${program}re_viewer_bg.wasm`);
+    await load(`${program}re_viewer.js`);
+    const first = await run;
+    await wasm_bindgen({ module_or_path: wasm });
+    const viewer = new wasm_bindgen.WebHandle({
+      url: [], hide_welcome_screen: true, enable_history: false, persist: false, notebook: false,
+    });
+    window.spherlocViewer = viewer;
+    await viewer.start(document.getElementById("viewer"));
+    watch(viewer);
+    const complaints = [];
+    const show = (id, content) => {
+      viewer.open_channel(id, id);
+      viewer.send_rrd_to_channel(id, content);
+      viewer.close_channel(id);
+    };
+    show("run", first);
+    for (const [place, other] of others.entries()) {
+      const content = await other.catch((error) => void complaints.push(error.message));
+      if (content) show(`layer ${place + 1}`, content);
+    }
+    await stand(viewer);
+    // A layout that was read after that may have moved the time.
+    await frame();
+    await stand(viewer);
+    await frame();
+    said.textContent = complaints.join(" ");
+    said.addEventListener("click", () => (said.textContent = ""));
+    document.body.dataset.state = "open";
+  }
+
+  open().catch(fail);
+})();

@@ -1,0 +1,142 @@
+"""Columns of components as arrow arrays, put together here since rerun's own batches take many times as long."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import rerun as rr
+from numpy.typing import NDArray
+from rerun.chunk import Chunk
+
+TIMELINE = "step"
+"""The sequence timeline of every recording: the index of the step in ``layers.steps``."""
+
+MARKDOWN = "text/markdown"
+"""Media type of texts."""
+
+VECTOR_3D: pa.DataType = rr.components.Position3DBatch._ARROW_DATATYPE
+VECTOR_2D: pa.DataType = rr.components.Position2DBatch._ARROW_DATATYPE
+TRIANGLE: pa.DataType = rr.components.TriangleIndicesBatch._ARROW_DATATYPE
+STRIP_3D: pa.DataType = rr.components.LineStrip3DBatch._ARROW_DATATYPE
+STRIP_2D: pa.DataType = rr.components.LineStrip2DBatch._ARROW_DATATYPE
+BLOB: pa.DataType = rr.components.BlobBatch._ARROW_DATATYPE
+
+
+@dataclass(frozen=True, eq=False)
+class Values:
+    """A component in R rows, one behind the other."""
+
+    descriptor: rr.ComponentDescriptor
+    values: pa.Array
+    """Of all rows."""
+    lengths: Sequence[int] | NDArray[np.int32]
+    """(R,) how many of them each row has."""
+
+    def among(self, places: NDArray[np.int64] | None, count: int) -> "Column":
+        """A column of ``count`` rows that has these rows at ``places`` and says nothing in the others."""
+        lengths = np.asarray(self.lengths, np.int32)
+        if places is None:
+            return Column(self.descriptor, _lists(lengths, self.values))
+        every, absent = np.zeros(count, np.int32), np.ones(count, bool)
+        every[places], absent[places] = lengths, False
+        return Column(self.descriptor, _lists(every, self.values, pa.array(absent)))
+
+
+@dataclass(frozen=True, eq=False)
+class Column:
+    """What ``Chunk.from_columns`` takes."""
+
+    descriptor: rr.ComponentDescriptor
+    rows: pa.ListArray
+    """Null where a row says nothing about the component."""
+
+    def component_descriptor(self) -> rr.ComponentDescriptor:
+        """What the column holds."""
+        return self.descriptor
+
+    def as_arrow_array(self) -> pa.ListArray:
+        """Its rows."""
+        return self.rows
+
+
+@dataclass(frozen=True, eq=False)
+class Times:
+    """The steps of the rows of a chunk, which ``Chunk.from_columns`` takes too."""
+
+    steps: pa.Int64Array
+
+    def timeline_name(self) -> str:
+        """Their timeline."""
+        return TIMELINE
+
+    def as_arrow_array(self) -> pa.Int64Array:
+        """The steps."""
+        return self.steps
+
+
+def _lists(lengths: NDArray[np.int32], values: pa.Array, absent: pa.Array | None = None) -> pa.ListArray:
+    offsets = np.zeros(len(lengths) + 1, np.int32)
+    np.cumsum(lengths, out=offsets[1:])
+    return pa.ListArray.from_arrays(pa.array(offsets), values, mask=absent)
+
+
+def vectors(array: NDArray[Any], kind: pa.DataType) -> pa.Array:
+    """(N, 2) or (N, 3) numbers as vectors of a type such as ``VECTOR_3D``."""
+    dtype = kind.value_type.to_pandas_dtype()
+    return pa.FixedSizeListArray.from_arrays(pa.array(np.ascontiguousarray(array, dtype).ravel()), type=kind)
+
+
+def strips(points: NDArray[Any], lengths: Sequence[int] | NDArray[np.int64], kind: pa.DataType) -> pa.Array:
+    """Points (P, 2) or (P, 3) as strips of these lengths."""
+    offsets = np.zeros(len(lengths) + 1, np.int32)
+    np.cumsum(lengths, out=offsets[1:])
+    return pa.ListArray.from_arrays(pa.array(offsets), vectors(points, kind.value_type), type=kind)
+
+
+def numbers(array: Any, dtype: type = np.float32) -> pa.Array:
+    """Numbers (N,)."""
+    return pa.array(np.asarray(array, dtype))
+
+
+def packed(colors: NDArray[Any], opacity: float = 1.0) -> NDArray[np.uint32]:
+    """sRGB bytes (N, 3) as rerun's colours (N,)."""
+    rgba = np.empty((len(colors), 4), np.uint8)
+    rgba[:, :3], rgba[:, 3] = colors, round(255 * opacity)
+    return rgba.view(">u4").ravel().astype(np.uint32)
+
+
+def static_chunk(entity: str, columns: Iterable[Values]) -> Chunk:
+    """A chunk that holds at every step; every column has one row."""
+    return Chunk.from_columns(entity, [], [column.among(None, 1) for column in columns])
+
+
+def named_values(values: dict[str, Any]) -> list[Values]:
+    """Numbers and texts by name, as one row; what is None is left out. Tuples of texts are lists."""
+    known = {name: list(value) if isinstance(value, tuple) else [value] for name, value in values.items()}
+    return [
+        Values(rr.ComponentDescriptor(name), pa.array(value), [len(value)])
+        for name, value in known.items()
+        if value != [None]
+    ]
+
+
+def markdown(texts: Sequence[str]) -> list[Values]:
+    """The components of text documents in Markdown, one text a row."""
+    one = [1] * len(texts)
+    media = pa.array([MARKDOWN] * len(texts))
+    return [
+        Values(rr.TextDocument.descriptor_text(), pa.array(texts, pa.utf8()), one),
+        Values(rr.TextDocument.descriptor_media_type(), media, one),
+    ]
+
+
+def encoded_image(content: bytes, media_type: str) -> list[Values]:
+    """The components of an image file."""
+    bytes_ = pa.array(np.frombuffer(content, np.uint8))
+    blob = pa.ListArray.from_arrays(pa.array([0, len(content)], pa.int32()), bytes_, type=BLOB)
+    return [
+        Values(rr.EncodedImage.descriptor_blob(), blob, [1]),
+        Values(rr.EncodedImage.descriptor_media_type(), pa.array([media_type]), [1]),
+    ]

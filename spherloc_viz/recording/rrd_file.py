@@ -1,0 +1,167 @@
+"""Two stores in one ``.rrd`` file: a layout and the recording that it lays out, without a second program.
+
+An ``.rrd`` file is a header of 12 bytes, messages of 16 bytes (kind, length) and a payload, and a message with an index
+of all chunks by their places in the file (https://rerun.io/docs, "RRD format"). So files cannot be put end to end: the
+places in the second one's index move. They are the column ``chunk_byte_offset`` of an arrow table, which is moved here.
+"""
+
+import struct
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+HEADER_BYTES = 12
+END = 0
+"""Kind of the last message, which holds the index."""
+TAIL = struct.Struct("<QQI8sI")
+"""At the end of a file: place and length of the index, its checksum, ``RRF2FOOT``, and how many of them there are."""
+MARK = b"RRF2FOOT"
+MESSAGE = struct.Struct("<QQ")
+CHECKSUM_SEED = 7_850_921
+MOVED = "chunk_byte_offset"
+LZ4 = 2
+"""Code of a compressed table."""
+
+
+@dataclass(frozen=True, eq=False)
+class RrdFile:
+    """The parts of a file with one store."""
+
+    header: bytes
+    messages: bytes
+    """Without the index."""
+    index: bytes
+    """Payload of the last message."""
+
+
+def split(content: bytes) -> RrdFile:
+    """The parts of a file that rerun wrote.
+
+    Raises ``ValueError`` if it has no index, or one of a form that is not known here.
+    """
+    start, length, checksum, mark, count = TAIL.unpack_from(content, len(content) - TAIL.size)
+    index = content[start : start + length]
+    if mark != MARK or count != 1 or checksum != xxh32(np.frombuffer(index, np.uint8), CHECKSUM_SEED):
+        raise ValueError("rerun wrote a file whose index is not where it was expected")
+    return RrdFile(content[:HEADER_BYTES], content[HEADER_BYTES : start - MESSAGE.size], index)
+
+
+def joined(first: RrdFile, second: RrdFile) -> bytes:
+    """One file with the stores of both.
+
+    Raises ``ValueError`` if an index has a form that is not known here.
+    """
+    # Indices are protobuf messages with one repeated field, of which one behind the other are both.
+    index = first.index + _moved(second.index, len(first.messages))
+    start = HEADER_BYTES + len(first.messages) + len(second.messages) + MESSAGE.size
+    checksum = xxh32(np.frombuffer(index, np.uint8), CHECKSUM_SEED)
+    tail = TAIL.pack(start, len(index), checksum, MARK, 1)
+    return b"".join([first.header, first.messages, second.messages, MESSAGE.pack(END, len(index)), index, tail])
+
+
+def _moved(index: bytes, by: int) -> bytes:
+    """The index with all places in the file larger by ``by`` bytes."""
+    (manifest,) = _fields(index).values()
+    parts = _fields(manifest)
+    table = _fields(parts[4])
+    if table[3] != LZ4 or set(parts) != {1, 2, 3, 4}:
+        raise ValueError("rerun wrote an index of an unknown form")
+    content = bytearray(pa.decompress(table[2], table[4], codec="lz4_raw", asbytes=True))
+    places = _places(content)
+    places += np.uint64(by)
+    table[2] = pa.compress(bytes(content), codec="lz4_raw", asbytes=True)
+    parts[4] = _message(table)
+    return _message({1: _message(parts)})
+
+
+def _places(table: bytearray) -> NDArray[np.uint64]:
+    """The numbers of the column, as they lie in the bytes of an arrow table."""
+    whole = pa.py_buffer(table)
+    column = pa.ipc.open_stream(whole).read_next_batch().column(MOVED)
+    values = column.buffers()[1]
+    start = values.address - whole.address
+    if column.type != pa.uint64() or column.offset or not 0 <= start < whole.size:
+        raise ValueError("rerun wrote an index of an unknown form")
+    return np.frombuffer(table, np.uint64, len(column), start)
+
+
+def _fields(message: bytes) -> dict[int, bytes | int]:
+    """Fields of a protobuf message by number: bytes, or whole numbers."""
+    fields: dict[int, bytes | int] = {}
+    at = 0
+    while at < len(message):
+        key, at = _varint(message, at)
+        value, at = _varint(message, at)
+        if key & 7 == 2:
+            value, at = message[at : at + value], at + value
+        elif key & 7:
+            raise ValueError("rerun wrote an index of an unknown form")
+        fields[key >> 3] = value
+    return fields
+
+
+def _message(fields: dict[int, bytes | int]) -> bytes:
+    out = bytearray()
+    for number, value in fields.items():
+        out += _coded(number << 3 | (0 if isinstance(value, int) else 2))
+        out += _coded(value) if isinstance(value, int) else _coded(len(value)) + value
+    return bytes(out)
+
+
+def _varint(message: bytes, at: int) -> tuple[int, int]:
+    value = shift = 0
+    while True:
+        byte = message[at]
+        value |= (byte & 0x7F) << shift
+        at, shift = at + 1, shift + 7
+        if byte < 0x80:
+            return value, at
+
+
+def _coded(value: int) -> bytes:
+    out = bytearray()
+    while value >= 0x80:
+        out.append(value & 0x7F | 0x80)
+        value >>= 7
+    out.append(value)
+    return bytes(out)
+
+
+@numba.njit("uint32(uint32, uint32)", cache=True, nogil=True, inline="always")
+def _rotated(value, by):
+    return np.uint32((value << by) | (value >> np.uint32(np.uint32(32) - by)))
+
+
+@numba.njit("uint32(Array(uint8, 1, 'C', readonly=True), uint32)", cache=True, nogil=True)
+def xxh32(data, seed):
+    """The hash XXH32 of bytes, by which rerun checks an index."""
+    p1, p2, p3 = np.uint32(2654435761), np.uint32(2246822519), np.uint32(3266489917)
+    p4, p5 = np.uint32(668265263), np.uint32(374761393)
+    size, at = len(data), 0
+    if size >= 16:
+        lanes = np.array([seed + p1 + p2, seed + p2, seed, seed - p1], np.uint32)
+        while at + 16 <= size:
+            for k in range(4):
+                word = np.uint32(data[at]) | np.uint32(data[at + 1]) << np.uint32(8)
+                word |= np.uint32(data[at + 2]) << np.uint32(16) | np.uint32(data[at + 3]) << np.uint32(24)
+                lanes[k] = np.uint32(_rotated(np.uint32(lanes[k] + np.uint32(word) * p2), np.uint32(13)) * p1)
+                at += 4
+        out = _rotated(lanes[0], np.uint32(1)) + _rotated(lanes[1], np.uint32(7))
+        out = np.uint32(out + _rotated(lanes[2], np.uint32(12)) + _rotated(lanes[3], np.uint32(18)))
+    else:
+        out = np.uint32(seed + p5)
+    out = np.uint32(out + np.uint32(size))
+    while at + 4 <= size:
+        word = np.uint32(data[at]) | np.uint32(data[at + 1]) << np.uint32(8)
+        word |= np.uint32(data[at + 2]) << np.uint32(16) | np.uint32(data[at + 3]) << np.uint32(24)
+        out = np.uint32(_rotated(np.uint32(out + np.uint32(word) * p3), np.uint32(17)) * p4)
+        at += 4
+    while at < size:
+        out = np.uint32(_rotated(np.uint32(out + np.uint32(data[at]) * p5), np.uint32(11)) * p1)
+        at += 1
+    out = np.uint32((out ^ (out >> np.uint32(15))) * p2)
+    out = np.uint32((out ^ (out >> np.uint32(13))) * p3)
+    return np.uint32(out ^ (out >> np.uint32(16)))

@@ -1,0 +1,81 @@
+"""A small picture of a run for lists: the map from above, which matches agree, and where the camera is and was found."""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from spherloc.geometry import camera_centre
+from spherloc.problem import AlignedProblem
+from spherloc.trace import Trace
+from spherloc_viz import style
+
+WIDTH_PX, HEIGHT_PX = 96, 64
+MARGIN_PX = 9.0
+BACKGROUND = (30, 33, 39)
+MOST_DOTS = 160
+"""More matches are thinned evenly: a PNG of single dots grows with them."""
+CAMERA_PX = 7.0
+COMPRESSION = 6
+INNER_SHARE = 90.0
+"""Percentage of the map points that set the scale; wrong ones may lie far away."""
+
+FloatArray = NDArray[np.float64]
+
+
+def thumbnail(trace: Trace) -> bytes:
+    """A PNG of 96 x 64 pixels, about 2 kB. Forward (+z of the aligned map) is up, +x is right."""
+    aligned, problem = trace.problem.aligned, trace.problem
+    flat: FloatArray = (problem.points @ aligned.map_turn.T)[:, [0, 2]]
+    cameras = [(pose, color) for pose, color in _cameras(trace) if pose is not None]
+    middle = np.median(flat, axis=0)
+    reach = float(np.percentile(np.abs(flat - middle) / (WIDTH_PX, HEIGHT_PX), INNER_SHARE))
+    reach = max([reach, *(_reach(aligned, pose, middle) for pose, _ in cameras), 1e-9])
+    scale = (0.5 - MARGIN_PX / WIDTH_PX) / reach
+    image = np.empty((HEIGHT_PX, WIDTH_PX, 3), np.uint8)
+    image[:] = BACKGROUND
+    dots = _pixels(flat, middle, scale)
+    shown = np.linspace(0, len(dots) - 1, min(MOST_DOTS, len(dots))).round().astype(int)
+    # Those that agree lie on top.
+    for k in shown[np.argsort(trace.inlier_mask[shown], kind="stable")].tolist():
+        color = style.INLIER if trace.inlier_mask[k] else style.OUTLIER
+        x, y = dots[k].tolist()
+        image[max(0, y) : max(0, y + 2), max(0, x) : max(0, x + 2)] = color
+    for pose, color in cameras:
+        _draw_camera(image, aligned, pose, (middle, scale), color)
+    done, png = cv2.imencode(".png", image[:, :, ::-1], [cv2.IMWRITE_PNG_COMPRESSION, COMPRESSION])
+    return png.tobytes() if done else b""
+
+
+def _cameras(trace: Trace) -> list[tuple[FloatArray | None, style.RGB]]:
+    return [(trace.problem.truth_cam_from_map, style.TRUTH), (trace.cam_from_map, style.ESTIMATE)]
+
+
+def _reach(aligned: AlignedProblem, pose: FloatArray, middle: FloatArray) -> float:
+    """How much room the place of a camera needs, as ``thumbnail`` measures it; little if it is absurdly far away."""
+    place = np.abs(camera_centre(aligned.align_pose(pose))[[0, 2]] - middle) / (WIDTH_PX, HEIGHT_PX)
+    spread = np.percentile(np.abs((aligned.points[:, [0, 2]] - middle) / (WIDTH_PX, HEIGHT_PX)), INNER_SHARE)
+    return float(min(place.max(), 2.0 * spread))
+
+
+def _pixels(flat: FloatArray, middle: FloatArray, scale: float) -> NDArray[np.int64]:
+    """Pixels (K, 2) of places (K, 2) x, z of the aligned map."""
+    away = np.clip((flat - middle) * scale, -10.0 * WIDTH_PX, 10.0 * WIDTH_PX) * (1.0, -1.0)
+    return np.round(away + (WIDTH_PX / 2, HEIGHT_PX / 2)).astype(np.int64)
+
+
+def _draw_camera(
+    image: NDArray[np.uint8],
+    aligned: AlignedProblem,
+    cam_from_map: FloatArray,
+    window: tuple[FloatArray, float],
+    color: style.RGB,
+) -> None:
+    """A wedge that opens where the camera looks."""
+    pose = aligned.align_pose(cam_from_map)
+    place = _pixels(camera_centre(pose)[None, [0, 2]], *window)[0]
+    ahead = np.array([pose[2, 0], -pose[2, 2]])
+    ahead = CAMERA_PX * ahead / max(float(np.linalg.norm(ahead)), 1e-9)
+    aside = 0.6 * np.array([-ahead[1], ahead[0]])
+    corners = np.round([place, place + ahead + aside, place + ahead - aside]).astype(np.int32)
+    cv2.polylines(image, [corners], True, color, 1, cv2.LINE_AA)
+    cv2.circle(image, tuple(place.tolist()), 2, color, -1)
