@@ -234,6 +234,9 @@ def play(
 
 app.command(recording_commands.view)
 app.command(recording_commands.repeat)
+app.command(recording_commands.runs)
+app.command(recording_commands.label)
+app.command(recording_commands.reindex)
 
 
 @app.command

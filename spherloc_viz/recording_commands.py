@@ -1,10 +1,14 @@
 """The commands about recordings; ``spherloc_viz.cli`` registers them."""
 
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated
 
 import tyro
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
+
+RECORDINGS = Path("recordings")
+RangeText = Annotated[str | None, arg(metavar="RANGE")]
 
 
 def view(
@@ -67,3 +71,146 @@ def repeat(
     from spherloc_viz.recording.repeat_text import repeat_all
 
     return repeat_all(recordings, json)
+
+
+def runs(
+    folder: Positional[Path] = RECORDINGS,
+    /,
+    failed: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
+    doubtful: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
+    outcome: str | None = None,
+    diagnosis: str | None = None,
+    estimator: str | None = None,
+    scene: str | None = None,
+    source: str | None = None,
+    label: str | None = None,
+    text: str | None = None,
+    outliers: RangeText = None,
+    rotation_error: RangeText = None,
+    position_error: RangeText = None,
+    inliers: RangeText = None,
+    correspondences: RangeText = None,
+    time: RangeText = None,
+    since: Annotated[str | None, arg(metavar="DATE|AGE")] = None,
+    until: Annotated[str | None, arg(metavar="DATE|AGE")] = None,
+    sort: str = "created",
+    ascending: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
+    group: str | None = None,
+    limit: int | None = None,
+    format: str = "table",
+) -> int:
+    """List recorded runs: which failed, and of what.
+
+    All that is asked must be true of a run. A range is '>0.9', '<=3', '0.5..0.9' or one number; a run whose number is
+    unknown is in none. A new recording is read first, and its row kept in the folder's runs.sqlite.
+
+    For example:
+
+    spherloc runs --failed --outliers '>0.9' --estimator mc
+
+    spherloc runs --group diagnosis --since 3d
+
+    spherloc runs --diagnosis false-consensus --sort position-error --format csv
+
+    spherloc runs recordings --text "facade night" --label wrong-map --format json
+
+    Args:
+        folder: Folder of the recordings.
+        failed: Only runs that are known to have failed.
+        doubtful: Only runs whose diagnosis speaks against their pose, also where the truth is not known.
+        outcome: success, failure or unknown (there is no truth).
+        diagnosis: A diagnosis or a part of its name, such as false-consensus; a wrong one lists them all.
+        estimator: An estimator, such as mc.
+        scene: A scene file, or its name, such as mei_outliers_80.
+        source: Who ran it: page, command, sweep, sequence, gallery or unknown.
+        label: A label that a reviewer gave, the whole of it.
+        text: Words that all occur in scene, name, query image, message, diagnosis, note, labels, title or file.
+        outliers: Share of wrong correspondences, 0 to 1.
+        rotation_error: Degrees.
+        position_error: Metres.
+        inliers: Correspondences that agree with the pose.
+        correspondences: All of them.
+        time: Milliseconds.
+        since: A date (2026-01-31), a time (2026-01-31T08:30), both UTC, or an age (90min, 2h, 3d, 1w).
+        until: The same; a date is included.
+        sort: created, outliers, rotation-error, position-error, time, inliers or another; a wrong one lists them all.
+        ascending: The smallest or oldest first.
+        group: Count the runs by diagnosis, outcome, estimator, scene, source, label or problem-key instead.
+        limit: How many to list; 0 for all. A table has 50 if it is not given, JSON and CSV have all.
+        format: table, json or csv.
+    """
+    from spherloc_viz import runs as listing
+    from spherloc_viz.recording.query import RunQuery, parse_range, parse_when
+
+    def within(text: str | None):
+        return None if text is None else parse_range(text)
+
+    now = datetime.now(UTC)
+    query = RunQuery(
+        text=text,
+        scene=scene,
+        estimator=estimator,
+        outcome=listing.outcome_of(outcome, failed),
+        diagnosis=None if diagnosis is None else listing.diagnosis_of(diagnosis),
+        doubtful=doubtful or None,
+        label=label,
+        source=listing.source_of(source),
+        outlier_rate=within(outliers),
+        rotation_error_deg=within(rotation_error),
+        translation_error_m=within(position_error),
+        inliers=within(inliers),
+        correspondences=within(correspondences),
+        time_ms=within(time),
+        since=None if since is None else parse_when(since, now),
+        until=None if until is None else parse_when(until, now, end=True),
+        sort=listing.sort_key(sort),
+        descending=not ascending,
+    )
+    return listing.print_runs(folder, query, group, limit, format)
+
+
+def label(
+    recordings: Positional[tuple[Path, ...]],
+    /,
+    add: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
+    remove: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
+    note: str | None = None,
+) -> int:
+    """Give recordings labels and a note, which lists and the Rerun viewer show; print what they are then.
+
+    They lie beside the recording, in a file that ends with .review.rrd. Ends with 2 if a file is no recording.
+
+    For example:
+
+    spherloc label recordings/20260101T120000Z_street_mc_0_1a2b3c4d.rrd --add wrong-map --note "See step 4."
+
+    spherloc label recordings/*_mc_*.rrd --remove wrong-map --add "look again" --note ""
+
+    Args:
+        recordings: Recordings (.rrd), one or more.
+        add: A label; give it once for each.
+        remove: A label to take away; give it once for each.
+        note: The note, in place of the one before; an empty one takes it away.
+    """
+    from spherloc_viz.runs import label_runs
+
+    return label_runs(recordings, add, remove, note)
+
+
+def reindex(folder: Positional[Path] = RECORDINGS, /) -> int:
+    """Read all recordings of a folder again and make its list of runs anew, with labels and notes.
+
+    Says which files it leaves out and why. Ends with 0 if all are runs, 1 if some are left out.
+
+    For example:
+
+    spherloc reindex
+
+    spherloc reindex results/night/recordings
+
+    Args:
+        folder: Folder of the recordings.
+    """
+    from spherloc_viz.runs import reindex as read_all
+
+    return read_all(folder)

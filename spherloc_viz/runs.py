@@ -1,19 +1,21 @@
 """``spherloc runs``, ``label`` and ``reindex``: the list of recorded runs on the command line."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 
 from spherloc import registry
 from spherloc.diagnosis import Cause
-from spherloc.errors import InputError, show
+from spherloc.errors import InputError, RecordingError, show
 from spherloc_viz.progress import progress, say
 from spherloc_viz.recording.index import RunIndex
 from spherloc_viz.recording.index_refresh import Refreshed
 from spherloc_viz.recording.query import GROUP_KEYS, OUTCOMES, SORT_KEYS, SOURCES, RunQuery
-from spherloc_viz.recording.review import read_review
+from spherloc_viz.recording.review import Review, checked_review, read_review
+from spherloc_viz.recording.run_text import FORMS, counts_text, rows_text
 from spherloc_viz.recording.strangers import examine
-from spherloc_viz.run_table import counts_text, rows_text
 
 SORT_WORDS = {
     "outliers": "outlier_rate",
@@ -30,66 +32,153 @@ GALLERY = "gallery"
 """A folder of recordings that is listed with the folder that it is in."""
 
 
-def open_index(folder: Path) -> RunIndex:
-    """The index of a folder; raises ``InputError`` if there is no such folder."""
+def print_runs(folder: Path, query: RunQuery, group: str | None, limit: int | None, form: str) -> int:
+    """List the runs of a folder; returns the exit code. Recordings that are new or have changed are read first.
+
+    Raises ``InputError`` for a folder, group or form that there is not, and for values that no run can have.
+    """
+    form = one_of("format", form, FORMS)
+    key = None if group is None else one_of("group", group.replace("-", "_"), GROUP_KEYS)
+    if limit is not None and limit < 0:
+        raise InputError(f"--limit {limit} is negative: give how many runs to show, or 0 for all.")
+    with _open(folder) as index:
+        skipped = _read_files(index, everything=False).skipped
+        if skipped:
+            say(f"{_count(len(skipped), 'file')} left out, such as {skipped[0][0]}; spherloc reindex says why.")
+        _check_estimator(index, query)
+        if key is not None:
+            print(counts_text(key, index.groups(query, key), form), end="", flush=True)
+            return 0
+        most = (TABLE_LIMIT if form == "table" else None) if limit is None else limit or None
+        found = index.find(query, most)
+        print(rows_text(folder, found.rows, form), end="", flush=True)
+        if not found.total:
+            say(f"no run matches; there are {_count(index.find(RunQuery(), 1).total, 'run')} in {folder}.")
+        elif len(found.rows) < found.total:
+            say(f"{len(found.rows):,} of {found.total:,} runs; --limit 0 shows all.")
+    return 0
+
+
+def label_runs(paths: Sequence[Path], add: Sequence[str], remove: Sequence[str], note: str | None) -> int:
+    """Change labels and note of recordings, and print what they are then; returns the exit code.
+
+    A wrong file is reported and the others are still labelled.
+    """
+    if not paths:
+        raise InputError("no recording given; name one or more (.rrd), as spherloc runs lists them.")
+    checked_review(add, note or "")
+    code = 0
+    for path in paths:
+        try:
+            review = _label(path, add, remove, note)
+        except RecordingError as error:
+            say(str(error))
+            code = 2
+        else:
+            labels = ", ".join(review.labels) or "no labels"
+            print(f"{path}: {labels}" + (f"; note: {' '.join(review.note.split())}" if review.note else ""))
+    return code
+
+
+def _label(path: Path, add: Sequence[str], remove: Sequence[str], note: str | None) -> Review:
+    if not path.exists():
+        raise RecordingError(f"{path}: no such file; spherloc runs lists the recordings.")
+    before = read_review(path)
+    added, gone = checked_review(add, "").labels, checked_review(remove, "").labels
+    for label in gone:
+        if label not in (*before.labels, *added):
+            raise RecordingError(f"{path}: has no label {show(label)}; it has {', '.join(before.labels) or 'none'}.")
+    labels = [label for label in (*before.labels, *added) if label not in gone]
+    row = examine(path)
+    in_gallery = path.parent.name == GALLERY
+    with RunIndex(path.parent.parent if in_gallery else path.parent, say) as index:
+        file = f"{GALLERY}/{path.name}" if in_gallery else path.name
+        index.add(replace(row, file=file))
+        return index.set_review(file, labels, before.note if note is None else note)
+
+
+def reindex(folder: Path) -> int:
+    """Read all recordings of a folder again; returns 1 if files had to be left out."""
+    began = time.monotonic()
+    with _open(folder) as index:
+        done = _read_files(index, everything=True)
+    for _, sentence in done.skipped:
+        say(sentence)
+    left_out = f", {_count(len(done.skipped), 'file')} left out" if done.skipped else ""
+    gone = f", {_count(done.removed, 'run')} gone" if done.removed else ""
+    print(f"{_count(done.read, 'run')} in {folder}, read in {time.monotonic() - began:.1f} s{left_out}{gone}.")
+    return 1 if done.skipped else 0
+
+
+def sort_key(word: str) -> str:
+    """The sort key that a word of the command line means; raises ``InputError``, with all words, if it means none."""
+    words = {next((name for name, own in SORT_WORDS.items() if own == key), key): key for key in SORT_KEYS}
+    return words[one_of("sort", word, tuple(words))]
+
+
+def diagnosis_of(text: str) -> str:
+    """The diagnosis that a text means: any part of it that no other has, also with dashes for spaces.
+
+    Raises ``InputError``, which names all, if it means none or several.
+    """
+    wanted = text.strip().casefold().replace("-", " ").replace("_", " ")
+    if wanted == UNDIAGNOSED:
+        return ""
+    found = [cause.value for cause in Cause if wanted and wanted in cause.value]
+    if wanted in found:
+        return wanted
+    if len(found) == 1:
+        return found[0]
+    return one_of("diagnosis", text, (*(cause.value for cause in Cause), UNDIAGNOSED))
+
+
+def one_of(what: str, value: str, known: Sequence[str]) -> str:
+    """``value`` if it is known; raises ``InputError``, which names those that are, if it is not."""
+    if value in known:
+        return value
+    raise InputError(f"unknown {what} {show(value)}: choose one of {', '.join(known)}.")
+
+
+def outcome_of(outcome: str | None, failed: bool) -> str | None:
+    """The outcome that is asked for; raises ``InputError`` for an unknown one, or for two."""
+    if failed and outcome not in (None, "failure"):
+        raise InputError(f"--failed and --outcome {outcome} exclude each other: leave one out.")
+    return "failure" if failed else None if outcome is None else one_of("outcome", outcome, OUTCOMES)
+
+
+def source_of(source: str | None) -> str | None:
+    """The source that is asked for; raises ``InputError`` for an unknown one."""
+    return None if source is None else one_of("source", source, SOURCES)
+
+
+def _check_estimator(index: RunIndex, query: RunQuery) -> None:
+    """An estimator that neither is registered nor has any run is a mistake."""
+    if query.estimator is not None:
+        recorded = (name for name, _ in index.groups(RunQuery(), "estimator"))
+        one_of("estimator", query.estimator, tuple(dict.fromkeys((*registry.names("estimators"), *recorded))))
+
+
+def _open(folder: Path) -> RunIndex:
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder of recordings; run a scene first, or name another folder.")
     return RunIndex(folder, say)
 
 
-def print_runs(folder: Path, query: RunQuery, group: str | None, limit: int | None, form: str) -> int:
-    """List the runs of a folder; returns the exit code. Recordings that are new or have changed are read first."""
-    with open_index(folder) as index:
-        refreshed = _read_files(index, everything=False)
-        if refreshed.skipped:
-            file, sentence = refreshed.skipped[0]
-            say(f"{_count(len(refreshed.skipped), 'file')} left out, such as {file}; spherloc reindex names all.")
-        _check_known(index, query)
-        if group is not None:
-            key = _one_of("group", group, tuple(name.replace("_", "-") for name in GROUP_KEYS)).replace("-", "_")
-            print(counts_text(group, index.groups(query, key), form), end="")
-            return 0
-        most = (TABLE_LIMIT if form == "table" else None) if limit is None else limit or None
-        found = index.find(query, most)
-        print(rows_text(folder, found.rows, form), end="", flush=True)
-        if form == "table":
-            _say_total(index, len(found.rows), found.total)
-    return 0
-
-
-def _say_total(index: RunIndex, shown: int, total: int) -> None:
-    if not total:
-        known = index.find(RunQuery(), 1).total
-        say(f"no run matches; {index.folder} has {_count(known, 'run')}.")
-    elif shown < total:
-        say(f"{shown:,} of {total:,} runs; --limit 0 shows all.")
-
-
 def _read_files(index: RunIndex, everything: bool) -> Refreshed:
     """Bring the index up to date, and show how far it is."""
-    with _Bar() as bar:
-        return index.rebuild(bar.advance) if everything else index.refresh(bar.advance)
+    with ExitStack() as stack:
+        advance: Callable[[str], None] | None = None
+        shown = 0
 
+        def tell(done: int, total: int) -> None:
+            nonlocal advance, shown
+            if advance is None:  # only now it is known how many there are
+                advance = stack.enter_context(progress(total, "recordings"))
+            for _ in range(done - shown):
+                advance("")
+            shown = done
 
-class _Bar:
-    """A progress line that learns from its first call how much there is to do."""
-
-    def __enter__(self) -> "_Bar":
-        self._lines = None
-        self._done = 0
-        return self
-
-    def advance(self, done: int, total: int) -> None:
-        if self._lines is None and total:
-            self._lines = progress(total, "recordings")
-            self._step = self._lines.__enter__()
-        for _ in range(done - self._done):
-            self._step("")
-        self._done = done
-
-    def __exit__(self, *exception: object) -> None:
-        if self._lines is not None:
-            self._lines.__exit__(None, None, None)
+        return index.rebuild(tell) if everything else index.refresh(tell)
 
 
 def _count(count: int, noun: str) -> str:

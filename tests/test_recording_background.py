@@ -1,8 +1,8 @@
 """The recorder: beside the work, one after another, and never the end of the program."""
 
-import os
 import threading
-import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -10,12 +10,19 @@ from pathlib import Path
 import pytest
 from recording_samples import scene_problem
 
+from spherloc.datasets.synthetic import SyntheticScene
+from spherloc.datasets.variation import Variation
+from spherloc.diagnosis import diagnose
 from spherloc.errors import RecordingError
 from spherloc.estimators import estimate
 from spherloc.trace import Stage, Trace
-from spherloc_viz.recording.background import QUEUE_LENGTH, Recorder, file_name
+from spherloc_viz.recording import background
+from spherloc_viz.recording.background import Recorder
+from spherloc_viz.recording.keeper import Keeper, file_name
+from spherloc_viz.recording.origin import Origin
+from spherloc_viz.recording.query import RunQuery
 from spherloc_viz.recording.reader import read_recording
-from spherloc_viz.recording.writer import STALE_AFTER_S, write_recording
+from spherloc_viz.recording.writer import write_recording
 
 
 @pytest.fixture(scope="module")
@@ -23,20 +30,55 @@ def trace() -> Trace:
     return estimate(scene_problem("mei_outliers_80"), "ransac-2p", seed=11)
 
 
-class Errors(list[RecordingError]):
+class Told(list[str]):
     """What a recorder reports."""
 
-    def __call__(self, error: RecordingError) -> None:
-        self.append(error)
+    def hear(self, sentence: object) -> None:
+        self.append(str(sentence))
 
 
-def test_what_is_submitted_is_there_after_closing(trace: Trace, tmp_path: Path) -> None:
-    errors, folder = Errors(), tmp_path / "new" / "recordings"
-    with Recorder(folder, errors) as recorder:
-        paths = [recorder.submit(replace(trace, seed=seed)) for seed in range(5)]
-    assert not errors
-    assert sorted(paths) == sorted(folder.iterdir())
-    assert [read_recording(path).seed for path in paths] == [0, 1, 2, 3, 4]
+class Unknown(Stage):
+    """Nobody can draw it."""
+
+    kind = "unknown"
+
+
+@contextmanager
+def held(folder: Path, trace: Trace, told: Callable[[object], None]) -> Iterator[Recorder]:
+    """A recorder that is busy with a run until the context ends; ``folder`` must be one where none can be written."""
+    stuck, go_on = threading.Event(), threading.Event()
+
+    def hold(error: RecordingError) -> None:
+        stuck.set()
+        go_on.wait(60)
+        told(error)
+
+    with Recorder(folder, hold) as recorder:
+        recorder.submit(trace)
+        assert stuck.wait(60)
+        try:
+            yield recorder
+        finally:
+            go_on.set()
+
+
+def test_what_is_submitted_is_there_and_listed_after_closing(trace: Trace, tmp_path: Path) -> None:
+    errors, notices, folder = Told(), Told(), tmp_path / "new" / "recordings"
+    origin = Origin("page", "/scenes/street.toml", 3, "a.jpg", Variation(hidden=(1, 2)))
+    with Recorder(folder, errors.hear, notices.hear) as recorder:
+        paths = [recorder.submit(replace(trace, seed=seed), origin) for seed in range(5)]
+        paths.append(recorder.submit(trace, diagnosis=replace(diagnose(trace), summary="Told before.")))
+        assert recorder.folder == folder
+    assert not errors and not notices and recorder.waiting == 0
+    runs = [read_recording(path) for path in paths]
+    assert [run.seed for run in runs] == [0, 1, 2, 3, 4, 11]
+    assert [run.origin for run in runs[:5]] == [origin] * 5
+    assert runs[5].row.summary == "Told before." and runs[5].row.source == "unknown"
+    with Keeper(folder, notices.hear) as keeper:
+        found = keeper.index.find(RunQuery(sort="file", descending=False)).rows
+        refreshed = keeper.index.refresh()
+    assert [row.file for row in found] == sorted(path.name for path in paths) and {row.steps for row in found} != {0}
+    assert (refreshed.read, refreshed.removed, refreshed.skipped) == (0, 0, ())
 
 
 @pytest.mark.parametrize("name", ["Straße / ../*?: 80 %", "街道", "", "a" * 500, "..", "CON\n\0"])
@@ -50,68 +92,96 @@ def test_names_of_files_are_safe_and_unique(trace: Trace, tmp_path: Path, name: 
         assert "_ransac-2p_11_" in file
         assert all(letter.isascii() and (letter.isalnum() or letter in "-_.") for letter in file)
         assert (tmp_path / file).parent == tmp_path
-    with Recorder(tmp_path, Errors()) as recorder:
-        path = recorder.submit(run)
-    assert read_recording(path).problem.name == name
+    with Keeper(tmp_path, Told().hear) as keeper:
+        assert read_recording(keeper.record(run)).problem.name == name
 
 
-def test_a_run_that_cannot_be_written_is_reported_and_the_next_one_is_recorded(trace: Trace, tmp_path: Path) -> None:
-    class Unknown(Stage):
-        kind = "unknown"
-
-    errors, folder = Errors(), tmp_path / "recordings"
+def test_while_nothing_can_be_written_there_is_one_notification(trace: Trace, tmp_path: Path) -> None:
+    errors, notices, folder = Told(), Told(), tmp_path / "recordings"
     folder.write_text("in the way")
-    with Recorder(folder, errors) as recorder:
-        recorder.submit(trace)
-        recorder.submit(replace(trace, stages=(Unknown(),)))
-    folder.unlink()
-    with Recorder(folder, errors) as recorder:
-        recorder.submit(replace(trace, stages=(Unknown(),)))
+    with Recorder(folder, errors.hear, notices.hear) as recorder:
+        for _ in range(3):
+            recorder.submit(trace)
+        wait_until_idle(recorder)
+        assert len(errors) == 1 and "the run cannot be recorded" in errors[0] and "\n" not in errors[0]
+        folder.unlink()
         path = recorder.submit(trace)
-    assert len(errors) == 3
-    assert all("cannot be recorded" in str(error) and "\n" not in str(error) for error in errors)
-    assert list(folder.iterdir()) == [path]
+        wait_until_idle(recorder)
+        assert notices == ["Runs are recorded again; 3 were not."] and read_recording(path).seed == trace.seed
+        recorder.submit(replace(trace, stages=(Unknown(),)))
+        last = recorder.submit(trace)
+    assert len(errors) == 2 and "Unknown" in errors[1] and "cannot be recorded" in errors[1]
+    assert notices[1:] == ["Runs are recorded again; 1 was not."]
+    assert sorted(folder.glob("*.rrd")) == sorted([path, last]) and not list(folder.glob("*.part"))
 
 
-def test_a_full_queue_says_so_and_does_not_wait(trace: Trace, tmp_path: Path) -> None:
+def wait_until_idle(recorder: Recorder) -> None:
+    done = threading.Event()
+    for _ in range(1200):
+        if not recorder.waiting:
+            return
+        done.wait(0.05)
+    raise AssertionError(recorder.overload)
+
+
+def test_a_full_queue_says_how_many_wait_and_does_not_wait(
+    trace: Trace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    errors = Told()
+    monkeypatch.setattr(background, "QUEUE_LENGTH", 4)
     (tmp_path / "file").write_text("in the way")
-    stuck, go_on, errors = threading.Event(), threading.Event(), Errors()
-
-    def hold(error: RecordingError) -> None:
-        stuck.set()
-        go_on.wait(60)
-        errors(error)
-
-    with Recorder(tmp_path / "file", hold) as recorder:
-        recorder.submit(trace)
-        assert stuck.wait(60)
-        for _ in range(QUEUE_LENGTH):
+    with held(tmp_path / "file", trace, errors.hear) as recorder:
+        assert recorder.waiting == 1 and recorder.overload == ""
+        for _ in range(4):
             recorder.submit(trace)
-        with pytest.raises(RecordingError, match=f"{QUEUE_LENGTH} runs wait"):
+        assert recorder.overload == "5 runs wait to be recorded."
+        with pytest.raises(RecordingError, match="not recorded, since 4 runs wait to be recorded"):
             recorder.submit(trace)
-        go_on.set()
-    assert len(errors) == QUEUE_LENGTH + 1
+    assert len(errors) == 1 and recorder.waiting == 0
 
 
 def test_nothing_is_recorded_after_closing(trace: Trace, tmp_path: Path) -> None:
-    recorder = Recorder(tmp_path, Errors())
+    recorder = Recorder(tmp_path / "recordings", Told().hear)
     recorder.close()
     recorder.close()
     with pytest.raises(RecordingError, match="has ended"):
         recorder.submit(trace)
+    with pytest.raises(RecordingError, match="closed"):
+        _ = recorder.index
     assert not list(tmp_path.iterdir())
 
 
-def test_what_killed_processes_left_is_swept(tmp_path: Path) -> None:
-    old, new = f"a.rrd.{'0' * 8}.part", f"b.rrd.{'1' * 8}.part"
-    others = [new, "a.rrd", "notes.part", f"a.txt.{'0' * 8}.part", "a.rrd.zzzzzzzz.part"]
-    for name in [old, *others]:
-        (tmp_path / name).write_text("x")
-        if name != new:
-            age = time.time() - STALE_AFTER_S - 60
-            os.utime(tmp_path / name, (age, age))
-    Recorder(tmp_path, Errors()).close()
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(others)
+def test_a_full_recording_keeps_what_a_lean_one_leaves_out(
+    scene_of: Callable[..., SyntheticScene], tmp_path: Path
+) -> None:
+    run = estimate(scene_of("mei", correspondences=200).problem(), "mc")
+    sizes = []
+    for full in (False, True):
+        with Recorder(tmp_path / str(full), Told().hear, full=full) as recorder:
+            path = recorder.submit(run)
+        stage = read_recording(path).stages["yaw"]
+        assert ("pairs" in stage) == full
+        sizes.append(path.stat().st_size)
+    assert sizes[1] > sizes[0]
+
+
+def test_without_a_usable_list_runs_are_recorded_too(trace: Trace, tmp_path: Path) -> None:
+    errors, notices = Told(), Told()
+    (tmp_path / "runs.sqlite").mkdir()
+    (tmp_path / "runs.sqlite" / "file").touch()
+    with Recorder(tmp_path, errors.hear, notices.hear) as recorder:
+        paths = [recorder.submit(trace) for _ in range(3)]
+    assert not errors and all(path.is_file() for path in paths)
+    assert len(notices) == 1 and "runs.sqlite" in notices[0]
+
+
+def test_a_run_that_cannot_be_listed_is_told_once(trace: Trace, tmp_path: Path) -> None:
+    told = Told()
+    with Keeper(tmp_path, told.hear) as keeper:
+        keeper.index.close()
+        paths = [keeper.record(trace) for _ in range(3)]
+    assert all(path.is_file() for path in paths)
+    assert len(told) == 1 and told[0].startswith("A run is recorded, but not listed: ")
 
 
 def test_threads_and_files_stay_few(trace: Trace, tmp_path: Path) -> None:
@@ -120,11 +190,12 @@ def test_threads_and_files_stay_few(trace: Trace, tmp_path: Path) -> None:
         return (len(list(tasks.iterdir())), len(list(files.iterdir()))) if tasks.exists() else (0, 0)
 
     write_recording(trace, tmp_path / "first.rrd")
+    Recorder(tmp_path, Told().hear).close()
     before = count()
     for _ in range(3):
-        with Recorder(tmp_path, Errors()) as recorder:
+        with Recorder(tmp_path, Told().hear) as recorder:
             for _ in range(10):
                 recorder.submit(trace)
     threads, files = count()
     assert threads <= before[0] + 2 and files <= before[1] + 2
-    assert len(list(tmp_path.iterdir())) == 31
+    assert len(list(tmp_path.glob("*.rrd"))) == 31

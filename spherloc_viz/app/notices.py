@@ -1,4 +1,4 @@
-"""What a page is told about the recordings, though nobody asked: one notification, whose newest word replaces the last."""
+"""What a page is told of the recordings, though nobody asked: one notification, the newest word instead of the last."""
 
 import threading
 

@@ -1,6 +1,6 @@
 """What becomes of one page's runs: those that it settles on are recorded, with where they came from."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from spherloc.cameras.base import FloatArray
@@ -39,6 +39,11 @@ class PageRuns:
     def expect(self, known: Known) -> None:
         """The page is about to repeat a recorded run, which is not to be recorded once more."""
         self._known = known
+
+    def became(self, asked: Wish, wish: Wish) -> None:
+        """The page says in its own words what it was asked for, such as nothing for what the scene says already."""
+        if self._known is not None and self._known.wish is asked:
+            self._known = replace(self._known, wish=wish)
 
     def announce(self, run: Run) -> str:
         """What will become of a run, in a sentence."""

@@ -182,7 +182,11 @@ class Session:
             self._edits.write(opened.scene)
         elif controls.follow_scene():
             controls.estimator.follow_problem(self._problem(controls.scene.read()))
-        return Wish(self._edits.apply(controls.scene.read()), *controls.estimator.read())
+        wish = Wish(self._edits.apply(controls.scene.read()), *controls.estimator.read())
+        if opened is not None:
+            self._runs.became(opened, wish)
+            controls.review.became(opened, wish)
+        return wish
 
     def _solve(self, asked: bool) -> float | None:
         """The solver thread's job: solve what the page asks for now, or record what it has settled on."""

@@ -35,7 +35,7 @@ class Play:
     options: Any
     """The estimator's options dataclass."""
     facts: Mapping[str, float] = field(default_factory=dict)
-    """Numbers of its run that the story tells, by what they measure: see ``check.MEASURES``."""
+    """Numbers of its run that the story tells, by what they measure: see ``measures.MEASURES``."""
 
     @cached_property
     def scene(self) -> Scene:
@@ -75,11 +75,15 @@ class GalleryCase(Play):
     title: str
     """A few words."""
     story: str
-    """What one sees, why it fails, what would help: a few sentences. Its numbers are facts or settings."""
+    """What one sees, why it fails, what would help: a few sentences. Its numbers are facts, settings or quoted."""
     cause: Cause
     """What the diagnosis says, knowing the truth."""
+    without_truth: Cause | None
+    """What it says without, if that is told."""
     fails: tuple[str, ...]
     """How: "position", "rotation" (each worse than a success may be) or "no pose"."""
+    quoted: tuple[float, ...]
+    """Numbers that the story has from elsewhere: from the paper, or from how the problem is made."""
     beside: tuple[Beside, ...]
     """Runs to compare with."""
 

@@ -1,15 +1,18 @@
-"""Runs a case and compares what happens with what is told."""
+"""Runs a case and holds what happens against what is told."""
 
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
-
-import numpy as np
+import re
+from collections.abc import Iterator
+from dataclasses import astuple, dataclass
+from typing import Any
 
 from spherloc.diagnosis import Diagnosis, diagnose
 from spherloc.metrics import SUCCESS_DEG, SUCCESS_M, evaluate
-from spherloc.refine import residuals_px
-from spherloc.trace import RansacStage, Trace
+from spherloc.trace import Trace
 from spherloc_viz.gallery.case import Beside, GalleryCase, Play
+from spherloc_viz.gallery.measures import MEASURES
+
+_CITATION = re.compile(r"Fig\. \d+[a-z]?|Table VI|experiment \d+|Eq\. \d+( and \d+)?|\b2P(\d+k)?\b")
+_NUMBER = re.compile(r"\d[\d,]*(?:\.\d+)?")
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +40,8 @@ def faults(played: Played) -> Iterator[str]:
     case, trace = played.case, played.trace
     if played.diagnosis.cause != case.cause:
         yield f"{case.key}: the diagnosis is {played.diagnosis.cause}, and not {case.cause}."
+    if case.without_truth is not None and (blind := diagnose(trace, use_truth=False).cause) != case.without_truth:
+        yield f"{case.key}: without the truth the diagnosis is {blind}, and not {case.without_truth}."
     if sorted(happened := failures(trace)) != sorted(case.fails):
         yield f"{case.key}: what fails is {', '.join(happened) or 'nothing'}, and not {', '.join(case.fails)}."
     yield from _wrong_facts(case.key, case, trace)
@@ -58,9 +63,7 @@ def failures(trace: Trace) -> list[str]:
 
 def _wrong_facts(where: str, told: Play, trace: Trace) -> Iterator[str]:
     for name, value in told.facts.items():
-        if name not in MEASURES:
-            yield f"{where}: there is no fact called {name}; there are {', '.join(MEASURES)}."
-        elif not agrees(value, measured := MEASURES[name](trace)):
+        if not agrees(value, measured := MEASURES[name](trace)):
             yield f"{where}: {name} is {measured:.6g}, and not {value}."
 
 
@@ -72,48 +75,24 @@ def agrees(told: float, measured: float) -> bool:
     return bool(abs(told - measured) <= 10.0**-decimals)
 
 
-def _count(mask: np.ndarray | None) -> int:
-    return 0 if mask is None else int(np.count_nonzero(mask))
+def loose_numbers(case: GalleryCase) -> tuple[str, ...]:
+    """Numbers of the story that are no fact, no setting and not quoted, and facts that it does not tell."""
+    plays = (case, *case.beside)
+    facts = {float(value) for item in plays for value in item.facts.values()}
+    known = facts | {float(value) for value in case.quoted} | {float(value) for value in _numbers(plays)}
+    told = {float(text.replace(",", "")): text for text in _NUMBER.findall(_CITATION.sub("", case.story))}
+    return tuple(
+        [f"{text} is told, but is no fact" for value, text in told.items() if value not in known]
+        + [f"{value:g} is a fact, but is not told" for value in sorted(facts - told.keys()) if value]
+    )
 
 
-def _agree_with_truth(trace: Trace) -> int:
-    aligned, truth = trace.problem.aligned, trace.problem.truth_cam_from_map
-    return 0 if truth is None else _count(residuals_px(aligned, aligned.align_pose(truth)) <= trace.options.bound_px)
-
-
-def _right_inliers(trace: Trace) -> int:
-    labels = trace.problem.truth_inliers
-    return 0 if labels is None else _count(trace.inlier_mask & labels)
-
-
-def _tilt_deg(trace: Trace) -> float:
-    truth, problem = trace.problem.truth_cam_from_map, trace.problem
-    if truth is None:
-        return np.nan
-    cosine = problem.gravity_camera @ (truth[:, :3] @ problem.gravity_map)
-    return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
-
-
-def _samples(trace: Trace) -> int:
-    stage = trace.stage(RansacStage)
-    return 0 if stage is None else stage.iterations
-
-
-def _or_nan(value: float | None) -> float:
-    return np.nan if value is None else value
-
-
-MEASURES: Mapping[str, Callable[[Trace], float]] = {
-    "matches": lambda trace: len(trace.problem),
-    "right": lambda trace: _count(trace.problem.truth_inliers),
-    "inliers": lambda trace: _count(trace.inlier_mask),
-    "right_inliers": _right_inliers,
-    "agree_with_truth": _agree_with_truth,
-    "off_m": lambda trace: _or_nan(evaluate(trace).translation_error_m),
-    "off_deg": lambda trace: _or_nan(evaluate(trace).rotation_error_deg),
-    "samples": _samples,
-    "gravity_off_deg": _tilt_deg,
-    "at_most": lambda trace: -1 if trace.certificate is None else trace.certificate.upper_bound,
-    "chance_sets": lambda trace: np.nan if trace.certificate is None else trace.certificate.chance_sets,
-}
-"""What a fact can be about: counts of matches, errors of the pose against the truth, and what is proven."""
+def _numbers(plays: tuple[Play, ...]) -> Iterator[float]:
+    """The settings of runs, shares in percent too."""
+    for item in plays:
+        groups = () if item.staged is None else item.staged.groups
+        staged = () if item.staged is None else (item.staged.gravity_bound_deg, item.staged.focal_off)
+        values: list[Any] = [item.seed, *staged, *astuple(item.options), *item.variation.simulation.values()]
+        for value in [*values, *(group.count for group in groups)]:
+            if isinstance(value, int | float):
+                yield from (value, round(100 * value, 6))

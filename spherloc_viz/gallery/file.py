@@ -16,6 +16,7 @@ from spherloc.diagnosis import Cause
 from spherloc.errors import InputError, show
 from spherloc.estimators import options_type
 from spherloc_viz.gallery.case import Beside, GalleryCase, Play
+from spherloc_viz.gallery.measures import MEASURES
 from spherloc_viz.options import option_fields
 
 GALLERY = Path(__file__).resolve().parents[2] / "recordings" / "gallery.toml"
@@ -54,11 +55,8 @@ def gallery_cases(path: Path = GALLERY) -> tuple[GalleryCase, ...]:
 
 def _case(table: dict[str, Any], where: str) -> GalleryCase:
     required = {"key", "title", "story", "cause", "fails", "estimator"}
-    check_keys(table, required, PLAY_KEYS | {"beside"}, where)
+    check_keys(table, required, PLAY_KEYS | {"beside", "quoted", "without_truth"}, where)
     play = _play(table, None, where)
-    cause = text(table, "cause", where)
-    if cause not in list(Cause):
-        raise InputError(f"{where}: cause is {show(cause)}; give one of {', '.join(Cause)}.")
     fails = table["fails"]
     if not isinstance(fails, list) or not fails or not all(word in FAILURES for word in fails):
         raise InputError(f"{where}: fails is {show(fails)}; give a list of {', '.join(FAILURES)}.")
@@ -73,10 +71,19 @@ def _case(table: dict[str, Any], where: str) -> GalleryCase:
         key=text(table, "key", where),
         title=text(table, "title", where),
         story=" ".join(text(table, "story", where).split()),
-        cause=Cause(cause),
+        cause=_cause(table, "cause", where),
+        without_truth=_cause(table, "without_truth", where) if "without_truth" in table else None,
         fails=tuple(fails),
+        quoted=_quoted(table.get("quoted", []), where),
         beside=found,
     )
+
+
+def _cause(table: Mapping[str, Any], key: str, where: str) -> Cause:
+    cause = text(table, key, where)
+    if cause not in list(Cause):
+        raise InputError(f"{where}: {key} is {show(cause)}; give one of {', '.join(Cause)}.")
+    return Cause(cause)
 
 
 def _beside(table: dict[str, Any], of: Play, where: str) -> Beside:
@@ -192,8 +199,16 @@ def _groups(value: Any, where: str) -> tuple[Group, ...]:
     return tuple(Group(row[1], row[0], row[2] if len(row) > 2 else CUBE) for row in rows)
 
 
+def _quoted(value: Any, where: str) -> tuple[float, ...]:
+    if not isinstance(value, list):
+        raise InputError(f"{where}: quoted is {show(value)}; give a list of numbers.")
+    return tuple(scene_file.numbers(value, (len(value),), "quoted", where).tolist())
+
+
 def _facts(table: Mapping[str, Any], where: str) -> dict[str, float]:
     for key, value in table.items():
+        if key not in MEASURES:
+            raise InputError(f"{where}: there is no fact {show(key)}; there are {', '.join(MEASURES)}.")
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise InputError(f"{where}: fact {show(key)} is {show(value)}; give a number.")
     return dict(table)

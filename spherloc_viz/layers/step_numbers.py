@@ -88,4 +88,3 @@ def _parted(key: str) -> tuple[str, int | None]:
 def _at(poses: FloatArray, index: int | None) -> FloatArray | None:
     """One of some poses (K, 3, 4), the last one for None."""
     return poses[-1 if index is None else index] if len(poses) else None
-

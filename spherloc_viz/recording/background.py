@@ -1,11 +1,12 @@
 """Records runs beside the work: one thread, a bounded queue, and errors as sentences."""
 
 import contextlib
+import logging
 import queue
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import Self
+from typing import Self, TypeVar
 
 from spherloc.diagnosis import Diagnosis
 from spherloc.errors import RecordingError
@@ -15,11 +16,14 @@ from spherloc_viz.recording.keeper import Keeper
 from spherloc_viz.recording.origin import Origin
 from spherloc_viz.recording.room import KEEP_BYTES
 
+log = logging.getLogger(__name__)
+
 QUEUE_LENGTH = 16
 """Runs that may wait; at about 50 ms each they take less than a second."""
 UPKEEP_LIMIT_S = 5.0
 """How long closing waits for a file that is being looked at."""
 
+T = TypeVar("T")
 _Job = tuple[Trace, Path, Origin | None, Diagnosis | None]
 
 
@@ -45,8 +49,8 @@ class Recorder:
         """``on_error`` is told when runs can no longer be written, and not again until one was written; ``on_notice``
         of recovered and deleted recordings, and that runs are recorded again. Both are called in threads of the
         recorder."""
-        self._on_error, self._on_notice = on_error, on_notice
-        self._keeper = Keeper(folder, on_notice, full, keep_bytes)
+        self._on_error, self._on_notice = _safe(on_error), _safe(on_notice)
+        self._keeper = Keeper(folder, self._on_notice, full, keep_bytes)
         self._queue: queue.Queue[_Job | None] = queue.Queue(QUEUE_LENGTH)
         self._lock = threading.Lock()
         self._waiting = self._lost = 0
@@ -152,3 +156,15 @@ class Recorder:
     def _go_on(self, *progress: int) -> None:
         if self._closed:
             raise _StoppedError
+
+
+def _safe(tell: Callable[[T], None]) -> Callable[[T], None]:
+    """``tell`` for threads that must go on whatever happens to whoever is told."""
+
+    def safe(what: T) -> None:
+        try:
+            tell(what)
+        except Exception:
+            log.exception("nobody hears that %s", what)
+
+    return safe

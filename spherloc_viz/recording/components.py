@@ -11,8 +11,20 @@ from numpy.typing import NDArray
 
 from spherloc_viz.layers.primitives import Balls, Label, Mesh, Points, Segments, Step, Table
 from spherloc_viz.recording.chart_bars import Bars, tensors
-from spherloc_viz.recording.columns import MARKDOWN, STRIP_3D, TRIANGLE, VECTOR_3D, Values, numbers, packed, strips, vectors
+from spherloc_viz.recording.columns import (
+    MARKDOWN,
+    STRIP_3D,
+    TRIANGLE,
+    VECTOR_2D,
+    VECTOR_3D,
+    Values,
+    numbers,
+    packed,
+    strips,
+    vectors,
+)
 from spherloc_viz.recording.markdown import step_text, table_text
+from spherloc_viz.recording.query_image import DOT_PX, Keypoints
 
 # Without it, a value that rerun cannot convert is dropped with a warning and the recording lacks it.
 rr.set_strict_mode(True)
@@ -76,6 +88,12 @@ def _ids(rows: Rows) -> list[Values]:
     ids = [np.zeros(0, np.int64) if row is None or row.ids is None else row.ids for row in rows]
     batch = numbers(np.concatenate(ids), np.int64)
     return [Values(rr.ComponentDescriptor("correspondence"), batch, [len(row) for row in ids])]
+
+
+def _pixels(rows: Rows) -> list[Values]:
+    pixels, lengths = _joined(rows, "pixels", (2,))
+    radii = _single(rows, rr.Points2D.descriptor_radii(), pa.float32(), lambda row: -DOT_PX)
+    return [Values(rr.Points2D.descriptor_positions(), vectors(pixels, VECTOR_2D), lengths), radii]
 
 
 def _strips(rows: Rows) -> list[Values]:
@@ -158,6 +176,10 @@ PARTS: dict[type, tuple[Part, ...]] = {
         Part(("colors",), _colored(rr.Points3D.descriptor_colors())),
         Part(("radius_m",), _point_radius),
         Part(("ids",), _ids),
+    ),
+    Keypoints: (
+        Part(("pixels",), _pixels),
+        Part(("colors",), _colored(rr.Points2D.descriptor_colors())),
     ),
     Segments: (
         Part(("points",), _strips),

@@ -9,18 +9,22 @@ import pyarrow as pa
 import rerun as rr
 from rerun.chunk import Chunk
 
-from spherloc_viz.layers.primitives import Picture, Points, Textured
+from spherloc_viz.layers.primitives import FloatArray, Picture, Points, Textured
+from spherloc_viz.layers.step_numbers import match_colors
 from spherloc_viz.recording.chart_bars import Bars, bars
 from spherloc_viz.recording.columns import VECTOR_3D, Times, Values, static_chunk, vectors
 from spherloc_viz.recording.components import PARTS, Part, Rows
+from spherloc_viz.recording.query_image import MATCHES, Keypoints
 
 NEAR = 1e-6
 """Numbers that differ by no more, relative to the largest of them, are equal: they are written with 24 bits."""
 _AXES = list(rr.ViewCoordinates.columns(xyz=[rr.ViewCoordinates.RDF]))
 
 
-def drawing_chunks(pictures: Mapping[int, Picture]) -> Iterator[Chunk]:
+def drawing_chunks(pictures: Mapping[int, Picture], pixels: FloatArray) -> Iterator[Chunk]:
     """Everything that the pictures of a run show, by the index of their step, in ascending order.
+
+    ``pixels`` (N, 2) are those of its matches in the recorded query image, whose dots change colour with the map's.
 
     Between two rows of a component rerun shows the earlier one, so that only changes are written: a primitive that
     changes its colours has no new positions, and one that has gone has empty rows. Pictures on meshes are left out:
@@ -29,16 +33,19 @@ def drawing_chunks(pictures: Mapping[int, Picture]) -> Iterator[Chunk]:
     yield Chunk.from_columns("/", [], _AXES)
     yield _framing(next(iter(pictures.values())))
     when = pa.array(list(pictures), pa.int64())
-    for (path, kind), track in _tracks(list(pictures.values())).items():
+    for (path, kind), track in _tracks(list(pictures.values()), pixels).items():
         yield _chunk(path, [(_changes(track, part.look), part) for part in PARTS[kind]], track, when)
 
 
-def _tracks(pictures: Sequence[Picture]) -> dict[tuple[str, type], Rows]:
+def _tracks(pictures: Sequence[Picture], pixels: FloatArray) -> dict[tuple[str, type], Rows]:
     """Every primitive by its entity and type: what it is in each of the pictures, None where it is not there."""
     tracks: dict[tuple[str, type], Rows] = {}
     drawn: dict[tuple[int, int], Bars] = {}
     for index, picture in enumerate(pictures):
-        items: list[tuple[str, Any]] = [("/step", picture.step)]
+        items: list[tuple[str, Any]] = [
+            ("/step", picture.step),
+            (MATCHES, Keypoints(pixels, match_colors(picture))),
+        ]
         items += [(_scene_path(item.name), item) for item in picture.scene if not isinstance(item, Textured)]
         for chart in picture.charts:
             for curve in (curve for curve in chart.curves if len(curve.x)):

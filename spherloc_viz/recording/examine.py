@@ -1,8 +1,8 @@
 """The child that reads recordings which may be hostile: ``python -m spherloc_viz.recording.examine``.
 
 It reads questions, one a line, ``{"path": "...", "review": true}`` (whether to read its labels and note too), and
-answers each with a line of JSON: ``{"row": {...}}`` or ``{"error": "..."}``. Its memory, its processor time a file and
-what it may write are limited where the system can do that; it may die of a file.
+answers each with two lines of JSON: ``{"begun": true}``, then ``{"row": {...}}`` or ``{"error": "..."}``. Its memory,
+its processor time a file and what it may write are limited where the system can do that; it may die of a file.
 """
 
 import json
@@ -50,6 +50,7 @@ def main() -> None:
     _wait_for_questions(True)
     for line in sys.stdin.buffer:
         _wait_for_questions(False)
+        _say(answers, {"begun": True})
         _limit_time()
         _say(answers, _answer(json.loads(line)))
         _wait_for_questions(True)

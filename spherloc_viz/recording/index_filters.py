@@ -43,8 +43,8 @@ def _within(name: str, limits: Range) -> Condition:
 
 def _scene(scene: str) -> Condition:
     endings = [f"/{scene}", f"/{scene}.toml"]
-    sql = " OR ".join(["scene IN (?, ?)", *["substr(scene, -length(?)) = ?"] * len(endings)])
-    return f"({sql})", [scene, f"{scene}.toml", *(ending for ending in endings for _ in range(2))]
+    sql = " OR ".join(["name = ?", "scene IN (?, ?)", *["substr(scene, -length(?)) = ?"] * len(endings)])
+    return f"({sql})", [scene, scene, f"{scene}.toml", *(ending for ending in endings for _ in range(2))]
 
 
 def order(query: RunQuery) -> str:

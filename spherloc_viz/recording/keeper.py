@@ -14,7 +14,7 @@ from spherloc.diagnosis import Diagnosis
 from spherloc.errors import RecordingError
 from spherloc.trace import Trace
 from spherloc_viz.recording.index import RunIndex
-from spherloc_viz.recording.leftovers import leftovers, rescue
+from spherloc_viz.recording.leftovers import leftovers, rescue, sweep_scratch
 from spherloc_viz.recording.origin import Origin
 from spherloc_viz.recording.retention import Pruned, prune
 from spherloc_viz.recording.room import KEEP_BYTES, size_words
@@ -103,6 +103,7 @@ class Keeper:
 
     def tidy(self) -> None:
         """Recover what killed processes left unfinished, or delete it, and say so. Raises ``OSError``."""
+        sweep_scratch()
         if not self.folder.is_dir():
             return
         found = leftovers(self.folder)

@@ -5,8 +5,10 @@ import hashlib
 import os
 import re
 import secrets
+import shutil
 import socket
 import subprocess
+import tempfile
 import time
 from functools import cache
 from pathlib import Path
@@ -18,18 +20,28 @@ STALE_AFTER_S = 600.0
 """An unfinished file this old is nobody's, whatever its name says: a file takes less than a second."""
 MERGE_LIMIT_S = 60.0
 
-_PART = re.compile(
-    r"(?P<name>.+\.rrd)\.(?:(?P<machine>[0-9a-f]{8})-(?P<boot>[0-9a-f]{8})-(?P<pid>\d{1,10})-(?P<start>\d{1,20})-)?"
-    r"[0-9a-f]{8}\.part"
-)
+_OWNER = r"(?P<machine>[0-9a-f]{8})-(?P<boot>[0-9a-f]{8})-(?P<pid>\d{1,10})-(?P<start>\d{1,20})-"
+_PART = re.compile(rf"(?P<name>.+\.rrd)\.(?:{_OWNER})?[0-9a-f]{{8}}\.part")
+_SCRATCH = re.compile(rf"spherloc-{_OWNER}\w+")
 
 
 def unfinished(path: Path) -> Path:
     """The name under which this process writes the file ``path`` before it is moved to its own; new in every call."""
-    machine, boot = _here()
-    pid = os.getpid()
-    owner = f"{machine}-{boot}-{pid}-{_start_of(pid) or 0}"
-    return path.with_name(f"{path.name}.{owner}-{secrets.token_hex(4)}.part")
+    return path.with_name(f"{path.name}.{_owner()}-{secrets.token_hex(4)}.part")
+
+
+def scratch() -> "tempfile.TemporaryDirectory[str]":
+    """A folder for files that are needed for a moment only. Raises ``OSError``."""
+    return tempfile.TemporaryDirectory(prefix=f"spherloc-{_owner()}-")
+
+
+def sweep_scratch() -> None:
+    """Delete such folders that killed processes left."""
+    with contextlib.suppress(OSError), os.scandir(tempfile.gettempdir()) as entries:
+        for entry in entries:
+            match = _SCRATCH.fullmatch(entry.name)
+            if match is not None and entry.is_dir(follow_symlinks=False) and _ended(match):
+                shutil.rmtree(entry.path, ignore_errors=True)
 
 
 def leftovers(folder: Path) -> list[Path]:
@@ -92,6 +104,12 @@ def _merged(part: Path, mended: Path) -> bool:
     except subprocess.SubprocessError:
         return False
     return done.returncode == 0 and mended.is_file()
+
+
+def _owner() -> str:
+    """This process."""
+    pid = os.getpid()
+    return f"{here()}-{pid}-{_start_of(pid) or 0}"
 
 
 def _ended(part: re.Match[str]) -> bool:

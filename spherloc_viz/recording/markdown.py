@@ -4,7 +4,9 @@ import re
 from collections.abc import Sequence
 from typing import Any
 
+from spherloc.diagnosis import Cause, Diagnosis
 from spherloc_viz.layers.primitives import Step, Table
+from spherloc_viz.recording.run_row import RunRow
 
 _MARKUP = re.compile(r"([\\`*_{}\[\]<>#+\-!|~$&])")
 
@@ -27,10 +29,16 @@ def table_text(table: Table) -> str:
     return f"### {plain(table.name)}\n\n{_rows(table.columns, table.rows)}"
 
 
-def outcome_text(message: str, outcome: str, tables: Sequence[Table]) -> str:
-    """How a run ended: its message and the tables of its last step."""
-    parts = (f"## {outcome.capitalize()}", plain(message), *(_rows(table.columns, table.rows) for table in tables))
-    return "\n\n".join(parts)
+def outcome_text(row: RunRow, diagnosis: Diagnosis, story: str, remark: str, tables: Sequence[Table]) -> str:
+    """How a run ended and why: its story, verdict and message, the diagnosis, and the tables of its last step."""
+    title = f"# {plain(row.title)}" if row.title else ""
+    cause = f"## {plain(diagnosis.cause.value.capitalize())}" if diagnosis.cause is not Cause.OK else ""
+    evidence = "\n".join(f"- {plain(sentence)}" for sentence in diagnosis.evidence)
+    advice = f"**{plain(diagnosis.advice)}**" if diagnosis.advice else ""
+    parts = [title, plain(story), f"## {row.outcome.capitalize()}", plain(row.message)]
+    parts += [cause, plain(diagnosis.summary), evidence, advice, plain(remark)]
+    parts += [_rows(table.columns, table.rows) for table in tables]
+    return "\n\n".join(part for part in parts if part)
 
 
 def _rows(columns: tuple[str, ...], rows: tuple[tuple[Any, ...], ...]) -> str:

@@ -20,6 +20,7 @@ from spherloc.metrics import Metrics
 from spherloc.problem import Problem
 from spherloc.trace import Trace
 from spherloc_viz.options import json_text
+from spherloc_viz.recording.columns import encoded_image, named_values, static_chunk
 from spherloc_viz.recording.origin import Origin
 from spherloc_viz.recording.run_row import RunRow
 
@@ -115,10 +116,9 @@ def property_chunks(trace: Trace, row: RunRow, created: datetime) -> Iterator[Ch
         values["lower_bound"] = certificate.lower_bound
         values["chance_sets"] = certificate.chance_sets
     values["versions"] = json.dumps(dict(trace.versions))
-    known = {name: value for name, value in values.items() if value is not None}
-    yield Chunk.from_property(RUN_PROPERTY, rr.AnyValues(**known))
+    yield static_chunk(f"/__properties/{RUN_PROPERTY}", named_values(values))
     if row.thumbnail:
-        yield Chunk.from_property(THUMBNAIL_PROPERTY, rr.EncodedImage(contents=row.thumbnail, media_type="image/png"))
+        yield static_chunk(f"/__properties/{THUMBNAIL_PROPERTY}", encoded_image(row.thumbnail, "image/png"))
     name = f"{row.name}, {trace.estimator}, seed {trace.seed}"
     info = rr.archetypes.RecordingInfo.columns(name=[name], start_time=[int(created.timestamp() * 1e9)])
     yield Chunk.from_columns("/__properties", [], info)

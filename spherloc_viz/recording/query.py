@@ -64,7 +64,7 @@ class RunQuery:
     """Words that must all occur in scene, name, query image, message, summary, note, labels, file or title, in any
     case and also inside of words."""
     scene: str | None = None
-    """The scene, whole, or its last part with or without ``.toml``."""
+    """The scene or the name of the problem, whole; of a path also the last part, with or without ``.toml``."""
     estimator: str | None = None
     """Registered name."""
     outcome: str | None = None

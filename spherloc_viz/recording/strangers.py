@@ -17,7 +17,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import IO, Any, Self
 
-from spherloc.errors import RecordingError, SpherlocError, show
+from spherloc.errors import RecordingError, show
 from spherloc_viz.recording.checked_row import row_from_table
 from spherloc_viz.recording.rerun_program import rerun_environment
 from spherloc_viz.recording.review import review_path
@@ -25,6 +25,8 @@ from spherloc_viz.recording.run_row import RunRow
 
 FILE_LIMIT_S = 60.0
 """A good file takes a hundredth of a second; the child gives up sooner, by the processor time that it used."""
+BEGIN_LIMIT_S = 10.0
+"""A child that has nothing to do begins in a millisecond."""
 START_LIMIT_S = 120.0
 """The child starts in two seconds."""
 LINE_LIMIT_BYTES = 1 << 21
@@ -86,10 +88,9 @@ class Examiner:
         Raises ``RecordingError``, in one sentence, if it cannot or is not.
         """
         with self._lock:
-            used = self._child is not None and self._child.answered > 0
             answer = self._ask(path, review=True)
-            if answer is None and (used or review_path(path).exists()):
-                # The child may have ended before it saw the file, or died of the labels beside it.
+            if answer is None and review_path(path).exists():
+                # It may be the labels beside it that the child died of.
                 answer = self._ask(path, review=False)
         if answer is None:
             raise RecordingError(
@@ -101,11 +102,18 @@ class Examiner:
         return row_from_table(answer["row"], path)
 
     def _ask(self, path: Path, review: bool) -> dict[str, Any] | None:
+        question = {"path": str(path), "review": review}
+        if self._child is not None and not self._child.begin(question):
+            self._end()  # it had nothing to do for a minute
         if self._child is None:
             self._child = _Child()
-        answer = self._child.ask({"path": str(path), "review": review})
-        if answer is None:
+            if not self._child.begin(question):
+                self._end()
+                raise _cannot_start("it ended at once")
+        answer = self._child.answer(FILE_LIMIT_S)
+        if answer is None or len(answer) != 1 or not answer.keys() <= {"row", "error"}:
             self._end()
+            return None
         return answer
 
     def _end(self) -> None:
@@ -119,7 +127,6 @@ class _Child:
 
     def __init__(self) -> None:
         """Raises ``RecordingError`` if it does not start."""
-        self.answered = 0
         try:
             self._process = subprocess.Popen(
                 [sys.executable, "-P", "-m", "spherloc_viz.recording.examine"],
@@ -131,29 +138,32 @@ class _Child:
                 env=rerun_environment() | _ONE_THREAD,
             )
         except OSError as error:
-            raise RecordingError(f"recordings cannot be examined: {error.strerror or error}; try again.") from error
+            raise _cannot_start(error.strerror or str(error)) from error
         assert self._process.stdin is not None and self._process.stdout is not None
         self._questions: IO[bytes] = self._process.stdin
         self._answers: queue.SimpleQueue[bytes] = queue.SimpleQueue()
         self._listener = threading.Thread(target=self._listen, args=(self._process.stdout,), daemon=True)
         self._listener.start()
-        if self._answer(START_LIMIT_S) != {"ready": True}:
+        if self.answer(START_LIMIT_S) != {"ready": True}:
             self.end()
-            raise RecordingError(
-                "recordings cannot be examined: the process that does it does not start; "
-                "'python -m spherloc_viz.recording.examine' says why."
-            )
+            raise _cannot_start("it does not get ready")
 
-    def ask(self, question: dict[str, Any]) -> dict[str, Any] | None:
-        """What it says about a file; None if it died, hangs or talks nonsense."""
+    def begin(self, question: dict[str, Any]) -> bool:
+        """Ask for a file; whether it is being read."""
         try:
             self._questions.write(json.dumps(question).encode() + b"\n")
             self._questions.flush()
         except OSError:
+            return False
+        return self.answer(BEGIN_LIMIT_S) == {"begun": True}
+
+    def answer(self, limit_s: float) -> dict[str, Any] | None:
+        """The next thing that it says; None if it died, hangs or talks nonsense."""
+        try:
+            answer = json.loads(self._answers.get(timeout=limit_s))
+        except (queue.Empty, ValueError, RecursionError):
             return None
-        answer = self._answer(FILE_LIMIT_S)
-        self.answered += 1
-        return answer if answer is not None and answer.keys() <= {"row", "error"} and len(answer) == 1 else None
+        return answer if isinstance(answer, dict) else None
 
     def end(self) -> None:
         """Kill it and wait until it is gone."""
@@ -169,12 +179,16 @@ class _Child:
                 self._answers.put(line)
         self._answers.put(b"")
 
-    def _answer(self, limit_s: float) -> dict[str, Any] | None:
-        try:
-            answer = json.loads(self._answers.get(timeout=limit_s))
-        except (queue.Empty, ValueError, RecursionError):
-            return None
-        return answer if isinstance(answer, dict) else None
+
+def _cannot_start(reason: str) -> "_NotStartedError":
+    return _NotStartedError(
+        f"recordings cannot be examined: the process that reads them does not start ({reason}); "
+        "'python -m spherloc_viz.recording.examine' says more."
+    )
+
+
+class _NotStartedError(RecordingError):
+    """No fault of a file."""
 
 
 _ONE_THREAD = {name: "1" for name in ("OPENBLAS_NUM_THREADS", "RAYON_NUM_THREADS", "TOKIO_WORKER_THREADS")}
@@ -202,5 +216,7 @@ def examine_all(paths: Iterable[Path]) -> Iterator[tuple[Path, RunRow | Recordin
         for path in paths:
             try:
                 yield path, examiner.examine(path)
-            except SpherlocError as error:
-                yield path, error if isinstance(error, RecordingError) else RecordingError(str(error))
+            except _NotStartedError:
+                raise
+            except RecordingError as error:
+                yield path, error

@@ -1,4 +1,4 @@
-"""A small picture of a run for lists: the map from above, which matches agree, and where the camera is and was found."""
+"""A small picture of a run for lists: the map from above, which matches agree, and where the camera is and was."""
 
 import cv2
 import numpy as np
@@ -16,8 +16,8 @@ MOST_DOTS = 160
 """More matches are thinned evenly: a PNG of single dots grows with them."""
 CAMERA_PX = 7.0
 COMPRESSION = 6
-INNER_SHARE = 90.0
-"""Percentage of the map points that set the scale; wrong ones may lie far away."""
+OUTSIDE_PERCENT = 4.0
+"""Of the map points on every side do not set the scale; some may lie far away."""
 
 FloatArray = NDArray[np.float64]
 
@@ -27,13 +27,10 @@ def thumbnail(trace: Trace) -> bytes:
     aligned, problem = trace.problem.aligned, trace.problem
     flat: FloatArray = (problem.points @ aligned.map_turn.T)[:, [0, 2]]
     cameras = [(pose, color) for pose, color in _cameras(trace) if pose is not None]
-    middle = np.median(flat, axis=0)
-    reach = float(np.percentile(np.abs(flat - middle) / (WIDTH_PX, HEIGHT_PX), INNER_SHARE))
-    reach = max([reach, *(_reach(aligned, pose, middle) for pose, _ in cameras), 1e-9])
-    scale = (0.5 - MARGIN_PX / WIDTH_PX) / reach
+    window = _window(flat, [camera_centre(aligned.align_pose(pose))[[0, 2]] for pose, _ in cameras])
     image = np.empty((HEIGHT_PX, WIDTH_PX, 3), np.uint8)
     image[:] = BACKGROUND
-    dots = _pixels(flat, middle, scale)
+    dots = _pixels(flat, *window)
     shown = np.linspace(0, len(dots) - 1, min(MOST_DOTS, len(dots))).round().astype(int)
     # Those that agree lie on top.
     for k in shown[np.argsort(trace.inlier_mask[shown], kind="stable")].tolist():
@@ -41,7 +38,7 @@ def thumbnail(trace: Trace) -> bytes:
         x, y = dots[k].tolist()
         image[max(0, y) : max(0, y + 2), max(0, x) : max(0, x + 2)] = color
     for pose, color in cameras:
-        _draw_camera(image, aligned, pose, (middle, scale), color)
+        _draw_camera(image, aligned, pose, window, color)
     done, png = cv2.imencode(".png", image[:, :, ::-1], [cv2.IMWRITE_PNG_COMPRESSION, COMPRESSION])
     return png.tobytes() if done else b""
 
@@ -50,11 +47,14 @@ def _cameras(trace: Trace) -> list[tuple[FloatArray | None, style.RGB]]:
     return [(trace.problem.truth_cam_from_map, style.TRUTH), (trace.cam_from_map, style.ESTIMATE)]
 
 
-def _reach(aligned: AlignedProblem, pose: FloatArray, middle: FloatArray) -> float:
-    """How much room the place of a camera needs, as ``thumbnail`` measures it; little if it is absurdly far away."""
-    place = np.abs(camera_centre(aligned.align_pose(pose))[[0, 2]] - middle) / (WIDTH_PX, HEIGHT_PX)
-    spread = np.percentile(np.abs((aligned.points[:, [0, 2]] - middle) / (WIDTH_PX, HEIGHT_PX)), INNER_SHARE)
-    return float(min(place.max(), 2.0 * spread))
+def _window(flat: FloatArray, cameras: list[FloatArray]) -> tuple[FloatArray, float]:
+    """The middle (2,) of what is seen and its scale in pixels a metre: most points, and cameras not absurdly far."""
+    low, high = np.percentile(flat, OUTSIDE_PERCENT, axis=0), np.percentile(flat, 100.0 - OUTSIDE_PERCENT, axis=0)
+    room = float(np.max(high - low))
+    near = [np.clip(place, low - room, high + room) for place in cameras]
+    low, high = np.min([low, *near], axis=0), np.max([high, *near], axis=0)
+    size = np.array([WIDTH_PX, HEIGHT_PX]) - 2.0 * MARGIN_PX
+    return 0.5 * (low + high), 1.0 / max(float(np.max((high - low) / size)), 1e-9)
 
 
 def _pixels(flat: FloatArray, middle: FloatArray, scale: float) -> NDArray[np.int64]:

@@ -2,16 +2,12 @@
 
 import contextlib
 import re
-import subprocess
-import tempfile
-import time
 import uuid
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
-import rerun as rr
 from rerun.chunk import Chunk, LazyChunkStream
 
 from spherloc.diagnosis import Diagnosis, diagnose
@@ -21,18 +17,21 @@ from spherloc.trace import Trace
 from spherloc_viz.layers import paint, steps
 from spherloc_viz.layers.decisive import decisive_step
 from spherloc_viz.layers.primitives import Picture, Stop
+from spherloc_viz.layers.step_numbers import step_numbers
+from spherloc_viz.recording.columns import markdown, static_chunk
 from spherloc_viz.recording.data import data_chunks
 from spherloc_viz.recording.drawing import drawing_chunks
-from spherloc_viz.recording.layout import APPLICATION_ID, chart_labels, layout_file, table_names, with_layout
+from spherloc_viz.recording.layout import APPLICATION_ID, layout_file, shown_in
+from spherloc_viz.recording.leftovers import scratch, unfinished
 from spherloc_viz.recording.markdown import outcome_text
+from spherloc_viz.recording.numbers import numbers_chunk
 from spherloc_viz.recording.origin import Origin
+from spherloc_viz.recording.panels import Panels, panel_chunks, panels_of
 from spherloc_viz.recording.properties import property_chunks, run_row
+from spherloc_viz.recording.query_image import image_chunks, query_image
+from spherloc_viz.recording.rrd_file import joined, split
 from spherloc_viz.recording.run_row import RunRow
-
-STALE_AFTER_S = 600.0
-"""An unfinished file this old belongs to a process that was killed."""
-
-_PART = re.compile(r".+\.rrd\.[0-9a-f]{8}\.part")
+from spherloc_viz.recording.thumbnail import thumbnail
 
 
 def write_recording(
@@ -45,7 +44,7 @@ def write_recording(
     Raises ``RecordingError`` if that fails, and then leaves nothing behind.
     """
     path = Path(path)
-    part = path.with_name(f"{path.name}.{uuid.uuid4().hex[:8]}.part")
+    part = unfinished(path)
     run = _Run(trace, origin or Origin(), diagnosis or diagnose(trace), full, datetime.now(UTC), str(uuid.uuid4()))
     try:
         row, content = _content(run, path.name)
@@ -57,7 +56,7 @@ def write_recording(
         raise RecordingError(
             f"{path}: the run cannot be recorded ({reason}); make room or choose another folder."
         ) from error
-    except (RuntimeError, ValueError, subprocess.SubprocessError) as error:
+    except (RuntimeError, ValueError) as error:
         raise RecordingError(f"{path}: the run cannot be recorded, since rerun failed: {error}.") from error
     finally:
         with contextlib.suppress(OSError):
@@ -77,18 +76,18 @@ class _Run:
     recording_id: str
 
 
-def recorded_steps(stops: Sequence[Stop]) -> list[int]:
-    """The steps that a recording shows: all but those of a series, of which it has three.
+def recorded_steps(stops: Sequence[Stop], decisive: int) -> list[int]:
+    """The steps that a lean recording shows: the decisive one, and all but the middle of every series.
 
     Series are steps whose keys differ in a number only, as "yaw-arcs-10" and "yaw-arcs-30" do. Of more and more arcs,
-    balls or members of a clique, and of one peak after another, the first, the middle and the last say it all. The
-    samples of RANSAC have no such order and are all there. Between two steps a viewer shows the earlier one.
+    balls or members of a clique, and of one peak after another, the first and the last say it all. The samples of
+    RANSAC have no such order and are all there. Between two steps a viewer shows the earlier one.
     """
     series: dict[str, list[int]] = {}
     for index, stop in enumerate(stops):
         name = stop.key if stop.key.startswith("sample-") else re.sub(r"\d+$", "#", stop.key)
         series.setdefault(name, []).append(index)
-    return sorted({own[k] for own in series.values() for k in (0, len(own) // 2, -1)})
+    return sorted({decisive} | {own[k] for own in series.values() for k in (0, -1)})
 
 
 def _content(run: _Run, file: str) -> tuple[RunRow, bytes]:
@@ -105,28 +104,27 @@ def _content(run: _Run, file: str) -> tuple[RunRow, bytes]:
         run_id=run.recording_id,
         steps=len(stops),
         decisive_step=decisive,
+        thumbnail=thumbnail(trace),
     )
-    pictures = {index: paint(trace, index) for index in recorded_steps(stops)}
-    with tempfile.TemporaryDirectory(prefix="spherloc-") as folder:
+    chosen = list(range(len(stops))) if run.full else recorded_steps(stops, decisive)
+    pictures = {index: paint(trace, index) for index in chosen}
+    panels = panels_of(trace)
+    with scratch() as folder:
         path = Path(folder) / "run.rrd"
-        shown = list(pictures.values())
-        stream = LazyChunkStream.from_iter(_chunks(run, row, pictures))
+        stream = LazyChunkStream.from_iter(list(_chunks(run, row, pictures, panels)))
         stream.write_rrd(path, application_id=APPLICATION_ID, recording_id=run.recording_id)
-        return row, with_layout(path, layout_file(chart_labels(shown), table_names(shown)))
+        recording = split(path.read_bytes())
+    return row, joined(layout_file(shown_in(list(pictures.values()), panels)), recording)
 
 
-def _chunks(run: _Run, row: RunRow, pictures: Mapping[int, Picture]) -> Iterator[Chunk]:
-    yield from property_chunks(run.trace, row, run.created)
-    yield from data_chunks(run.trace, run.origin, run.diagnosis, run.full)
-    yield from drawing_chunks(pictures)
-    text = outcome_text(run.trace.message, row.outcome, pictures[max(pictures)].tables)
-    document = rr.TextDocument.columns(text=[text], media_type=[rr.MediaType.MARKDOWN])
-    yield Chunk.from_columns("/outcome", [], document)
-
-
-def sweep(folder: Path) -> None:
-    """Delete unfinished recordings that killed processes left in ``folder``."""
-    with contextlib.suppress(OSError):
-        for path in folder.iterdir():
-            if _PART.fullmatch(path.name) and time.time() - path.stat().st_mtime > STALE_AFTER_S:
-                path.unlink()
+def _chunks(run: _Run, row: RunRow, pictures: Mapping[int, Picture], panels: Panels) -> Iterator[Chunk]:
+    trace, image = run.trace, query_image(run.trace.problem)
+    yield from property_chunks(trace, row, run.created)
+    yield from data_chunks(trace, run.origin, run.diagnosis, run.full)
+    yield numbers_chunk(step_numbers(trace, pictures))
+    yield from drawing_chunks(pictures, image.scale * trace.problem.pixels)
+    yield from image_chunks(trace.problem, image)
+    yield from panel_chunks(trace, panels)
+    tables = pictures[max(pictures)].tables
+    text = outcome_text(row, run.diagnosis, run.origin.story, image.remark, tables)
+    yield static_chunk("/outcome", markdown([text]))

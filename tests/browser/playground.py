@@ -144,6 +144,13 @@ class Playground:
         """The part of a slider that is dragged."""
         return self.widget(label).get_by_role("slider")
 
+    def tick(self, label: str, on: bool) -> None:
+        """Set a checkbox, which shows its new state some frames after the click."""
+        box = self.widget(label)
+        if box.is_checked() != on:
+            box.click()
+        expect(box).to_be_checked(checked=on)
+
     def choose(self, label: str, option: str) -> None:
         """Choose from a list."""
         self.widget(label).click()

@@ -120,7 +120,7 @@ def test_compare(page: Playground, scene: Path) -> None:
     expect(old).to_be_visible()
     tab.until(lambda: not is_shown(tab, "/comparison/mc-exact"), "cameras of another problem are gone")
     assert compared_rows(tab) == first
-    tab.widget("Live").check()
+    tab.tick("Live", True)
     until_compared(tab, second)
     expect(old).to_have_count(0)
     tab.press("New seed")

@@ -122,9 +122,9 @@ def test_the_query_on_the_sphere_and_the_mesh_around_it(
     tab.until(lambda: visible("/sphere/image") and visible("/backdrop"), "the image and the mesh are there")
     tab.unfold("Layers")
     for label, name in (("Image", "/sphere/image"), ("Mesh", "/backdrop")):
-        tab.widget(label).uncheck()
+        tab.tick(label, False)
         tab.until(lambda name=name: not visible(name), f"{label} is hidden")
-        tab.widget(label).check()
+        tab.tick(label, True)
         tab.until(lambda name=name: visible(name), f"{label} is back")
     tab.settle()
     tab.press("From the camera")

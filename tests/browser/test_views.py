@@ -127,10 +127,10 @@ def test_layers_and_views(tab: Playground, address: str) -> None:
     tab.unfold("Layers")
     for label, node in (("Map", "map/points"), ("Rays", "rays"), ("Cameras", "cameras/estimate")):
         before = tab.still(tab.drawn, "the picture is drawn")
-        tab.widget(label).uncheck()
+        tab.tick(label, False)
         tab.until(lambda node=node: node not in tab.drawn(), f"{label} is hidden")
         assert tab.drawn()["sphere/bearings"] == 40
-        tab.widget(label).check()
+        tab.tick(label, True)
         tab.until(lambda before=before: tab.drawn() == before, f"{label} is back")
     tab.expect_quiet(address)
 

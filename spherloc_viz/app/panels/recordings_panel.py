@@ -100,7 +100,9 @@ class RecordingsPanel:
 
     def _see(self, touch: Touch) -> None:
         """Other tabs are open now."""
-        self._seen = VIEW in touch.argument.split(",")
+        before, self._seen = self._seen, VIEW in touch.argument.split(",")
+        if self._seen and not before and self._shelf is not None:
+            self._aside.ask(self._shelf.warm)
         self._show()
 
     def _choose(self, touch: Touch) -> None:

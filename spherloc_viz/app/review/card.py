@@ -5,7 +5,7 @@ from html import escape
 
 import numpy as np
 
-from spherloc.diagnosis import Diagnosis
+from spherloc.diagnosis import Cause, Diagnosis
 from spherloc.metrics import evaluate
 from spherloc_viz import style
 from spherloc_viz.app.history import changed_fields
@@ -44,26 +44,31 @@ def bar_html(place: int | None, total: int) -> str:
     )
 
 
-def card_html(opened: Opened, run: Run | None, diagnosis: Diagnosis | None, bar: str) -> str:
-    """The whole card; ``run`` is None until the page has one."""
+def card_html(opened: Opened, run: Run, diagnosis: Diagnosis | None, bar: str) -> str:
+    """The whole card: the run as it was recorded, and as soon as it is changed, a table of both."""
     row = opened.recorded.row
-    is_it = run is not None and run.wish == opened.wish
+    is_it = run.wish == opened.wish
     title = (
-        f'<div style="font-weight:600;padding:.35em 0 .1em;overflow-wrap:anywhere" title="{escape(row.file)}">'
-        f"{escape(words.title_of(row))}</div>"
+        f'<div style="font-weight:600;padding-top:.3em;white-space:nowrap;overflow:hidden;text-overflow:ellipsis" '
+        f'title="{escape(row.file)}">{escape(words.title_of(row))}'
+        f'<span style="font-weight:400;{DIM}"> · {escape(row.estimator)} #{row.seed}</span></div>'
     )
-    parts = [bar, title]
-    if run is not None:
-        lines = lines_of(row, run, diagnosis)
-        parts += [_summary(row), _table(lines, "now"), _remark(opened, run, is_it)]
+    body = _result(row) if is_it else two_columns_html(lines_of(row, run, diagnosis), "as recorded", "now")
+    remark = _remark(opened, run, is_it)
+    parts = [bar, title, body, remark]
     if opened.sentence:
-        parts.append(f'<div style="{DIM};padding-top:.2em">{escape(opened.sentence)}</div>')
+        parts.append(f'<div style="{DIM}">{escape(opened.sentence)}</div>')
     parts.append(_ways(row, run if is_it else None))
-    return f'<div style="{GROUND}">{box("".join(parts), "font-size:11.5px;padding:.45em .7em")}</div>'
+    return f'<div style="{GROUND}">{box("".join(parts), "font-size:11.5px;line-height:1.38;padding:.4em .7em")}</div>'
 
 
-def _summary(row: RunRow) -> str:
-    return f'<div style="{DIM};padding-bottom:.2em">{escape(row.summary)}</div>' if row.summary else ""
+def _result(row: RunRow) -> str:
+    """What came out of the recorded run, in a line, and what the diagnosis says."""
+    errors = errors_text(row.rotation_error_deg, row.translation_error_m)
+    facts = [f"{row.inliers}/{row.correspondences}", *([errors] if errors != words.UNKNOWN else [])]
+    cause = f" {escape(row.diagnosis)}" if row.diagnosis != Cause.OK else ""
+    line = f'{badge_html(row.outcome)}{cause}<span style="{DIM}"> · {" · ".join(facts)}</span>'
+    return f'<div>{line}</div><div style="{DIM}">{escape(row.summary)}</div>'
 
 
 def lines_of(row: RunRow, run: Run, diagnosis: Diagnosis | None) -> list[Line]:
@@ -88,10 +93,6 @@ def errors_text(rotation_deg: float | None, translation_m: float | None) -> str:
     return escape(f"{words.angle(rotation_deg)} · {words.distance(translation_m)}")
 
 
-def _table(lines: Sequence[Line], heading: str) -> str:
-    return two_columns_html(lines, "as recorded", heading)
-
-
 def two_columns_html(lines: Sequence[Line], left: str, right: str) -> str:
     """Two runs side by side; values that differ stand out. All of it is HTML."""
     cell = "text-align:left;vertical-align:top;padding:.05em .8em .05em 0;overflow-wrap:anywhere"
@@ -99,7 +100,7 @@ def two_columns_html(lines: Sequence[Line], left: str, right: str) -> str:
     body = "".join(
         f'<tr><th scope="row" style="{cell};font-weight:400;white-space:nowrap;{DIM}">{name}</th>'
         f'<td style="{cell};width:45%">{one}</td>'
-        f'<td style="{cell};width:45%;{"font-weight:600" if one != other else ""}">{other}</td></tr>'
+        f'<td style="{cell};width:45%;{"font-weight:600" if one != other and name != "time" else ""}">{other}</td></tr>'
         for name, one, other in lines
     )
     css = "border-collapse:collapse;width:100%;font-variant-numeric:tabular-nums"
@@ -107,27 +108,32 @@ def two_columns_html(lines: Sequence[Line], left: str, right: str) -> str:
 
 
 def _remark(opened: Opened, run: Run, is_it: bool) -> str:
-    """Whether the page repeats the run, or what was changed."""
+    """What was changed, or that the run cannot be repeated here; nothing where it was."""
     same = is_same_pose(opened.recorded.cam_from_map, run.trace.cam_from_map)
-    if is_it:
-        words_ = "This is the run as it was recorded." if same else "Repeated here, it finds another pose."
-    else:
+    if is_it and same:
+        return ""
+    sentence = "Repeated here, it finds another pose."
+    if not is_it:
         fields = sorted(name.replace("_", " ") for name in changed_fields(opened.wish, run.wish))
-        words_ = f"Changed: {', '.join(fields)}." if fields else "The page shows the run as it was recorded."
-        words_ += " The pose is the same." if same else ""
-    return f'<div style="{DIM};padding-top:.2em">{escape(words_)}</div>'
+        sentence = f"Changed: {', '.join(fields)}.{' The pose is the same.' if same else ''}"
+    return f'<div style="{DIM}">{escape(sentence)}</div>'
 
 
 def _ways(row: RunRow, run: Run | None) -> str:
     """Where one can go from here: the step that decided, the run itself, the Rerun viewer."""
     ways = []
     if run is None:
-        ways.append(_way("run-return:", "back to it"))
+        ways.append(_way("run-return:", "back to the recorded run"))
     elif 0 <= row.decisive_step < len(stops := steps(run.trace)):
-        ways.append(_way(f"step:{stops[row.decisive_step].key}", f"decided at “{stops[row.decisive_step].title}”"))
+        stop = stops[row.decisive_step]
+        ways.append(_way(f"step:{stop.key}", f"step {row.decisive_step + 1}: {stop.title}"))
     link = escape(viewer_link(row.file, row.decisive_step))
-    ways.append(f'<a href="{link}" target="_blank" rel="noopener" style="color:inherit">Rerun viewer there ↗</a>')
-    return f'<div style="padding-top:.3em;display:flex;flex-wrap:wrap;gap:.1em 1em">{"".join(ways)}</div>'
+    ways.append(
+        f'<a href="{link}" target="_blank" rel="noopener" title="Open in the Rerun viewer at the step where it was '
+        'decided" style="color:inherit;white-space:nowrap">Rerun ↗</a>'
+    )
+    row_css = "padding-top:.25em;display:flex;justify-content:space-between;gap:1em"
+    return f'<div style="{row_css}">{"".join(ways)}</div>'
 
 
 def _way(touch: str, words_: str) -> str:

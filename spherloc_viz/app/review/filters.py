@@ -91,9 +91,9 @@ def keyed(key: str) -> str:
 def _handles(look: Look) -> str:
     """What else can be chosen, with what is chosen now."""
     parts = []
-    for name in UNFOLDED:
-        chosen = _sorting(look) if name == "sort" else getattr(look, name)
-        bold = "font-weight:600" if chosen is not None and name != "sort" else DIM
+    for name in UNFOLDED[:-1]:  # the last one, how the list is sorted, stands above the list
+        chosen = getattr(look, name)
+        bold = "font-weight:600" if chosen is not None else DIM
         words = name if chosen is None else f"{name}: {chosen or NOTHING}"
         arrow = "▴" if look.unfolded == name else "▾"
         parts.append(
@@ -105,11 +105,13 @@ def _handles(look: Look) -> str:
         parts.append(
             '<span role="button" tabindex="0" data-touch="runs-clear:" style="text-decoration:underline">clear</span>'
         )
-    return f'<div style="display:flex;flex-wrap:wrap;gap:.1em .9em;padding-bottom:.4em">{"".join(parts)}</div>'
+    return f'<div style="display:flex;flex-wrap:wrap;gap:.1em .8em;padding-bottom:.4em">{"".join(parts)}</div>'
 
 
-def _sorting(look: Look) -> str:
-    return f"{SORTS[look.sort]} {'↓' if look.descending else '↑'}"
+def sorting_html(look: Look) -> str:
+    """How the list is sorted; a press offers other ways."""
+    words = f"{SORTS[look.sort]} {'↓' if look.descending else '↑'}"
+    return pill(f"{words} ▾", "runs-unfold:sort", look.unfolded == "sort", "How the list is sorted")
 
 
 def _values(look: Look, groups: Groups) -> list[str]:

@@ -1,13 +1,14 @@
 """The run that is open, above the tabs, so that it stays in sight while something is changed and run again."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import viser
 
 from spherloc.diagnosis import Diagnosis
 from spherloc_viz.app.review.card import bar_html, card_html
 from spherloc_viz.app.review.opened import Opened, reference_items
-from spherloc_viz.app.wish import Run
+from spherloc_viz.app.wish import Run, Wish
 from spherloc_viz.layers.primitives import SceneItem
 
 
@@ -30,6 +31,12 @@ class ReviewCard:
         """Show another run, or none."""
         self._opened = opened
         self._redraw()
+
+    def became(self, asked: Wish, wish: Wish) -> None:
+        """The page says in its own words what it was asked for."""
+        opened = self._opened
+        if opened is not None and opened.wish is asked:
+            self._opened = replace(opened, wish=wish)
 
     def place(self, place: int | None, total: int) -> None:
         """Say where in the list the run is."""

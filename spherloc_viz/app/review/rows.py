@@ -8,7 +8,7 @@ from html import escape
 from spherloc.diagnosis import Cause
 from spherloc_viz import style
 from spherloc_viz.app.review import words
-from spherloc_viz.app.review.filters import key_html, keyed, pill
+from spherloc_viz.app.review.filters import key_html, keyed, pill, sorting_html
 from spherloc_viz.app.review.look import PAGE, Look
 from spherloc_viz.app.text import DIM, box, dot_html
 from spherloc_viz.app.web.viewer_room import viewer_link
@@ -17,7 +17,7 @@ from spherloc_viz.recording.run_row import RunRow
 PNG = b"\x89PNG\r\n\x1a\n"
 MOST_PICTURE_BYTES = 100_000
 """Of a row's picture; larger ones are not shown."""
-WIDTH_PX, HEIGHT_PX = 76, 52
+WIDTH_PX, HEIGHT_PX = 64, 46
 """Of a row's picture."""
 PREVIOUS_KEY, NEXT_KEY = "[", "]"
 """Open the run before and the next one: viser's canvas has letters and arrows."""
@@ -35,8 +35,8 @@ def rows_html(
         what = "No recorded run fits these filters." if look.filtered else "No run is recorded yet."
         return box(f'<div style="{DIM}">{what}</div>', "font-size:12.5px")
     body = "".join(row_html(row, row.file in marked, row.file == opened, now) for row in rows)
-    top, below = pages_html(look.page, total, opened is None), pages_html(look.page, total, False)
-    return box(f"{top}{body}{below if total > PAGE else ''}", "font-size:11.5px;line-height:1.35")
+    top, below = pages_html(look, total, opened is None), pages_html(look, total, None)
+    return box(f"{top}{body}{below if total > PAGE else ''}", "font-size:11px;line-height:1.35")
 
 
 def row_html(row: RunRow, marked: bool, opened: bool, now: datetime) -> str:
@@ -46,12 +46,13 @@ def row_html(row: RunRow, marked: bool, opened: bool, now: datetime) -> str:
     mark = (
         f'<span role="checkbox" aria-checked="{str(marked).lower()}" aria-label="Mark" tabindex="0" '
         f'data-touch="run-mark:{file}" title="Mark, to compare or export" style="align-self:stretch;display:flex;'
-        f'align-items:center;padding:0 .35em 0 .25em;font-size:13px">{"☑" if marked else "☐"}</span>'
+        f'align-items:center;padding:0 .35em 0 .1em;font-size:13px">{"☑" if marked else "☐"}</span>'
     )
+    address = escape(viewer_link(row.file, row.decisive_step))
     link = (
-        f'<a href="{escape(viewer_link(row.file, row.decisive_step))}" target="_blank" rel="noopener" '
+        f'<a href="{address}" target="_blank" rel="noopener" '
         f'title="Open in the Rerun viewer, at step {row.decisive_step + 1} of {row.steps}" '
-        'style="color:inherit;text-decoration:none;padding:0 .35em;align-self:center;opacity:.75;font-size:13px">↗</a>'
+        'style="color:inherit;text-decoration:none;padding:.4em .1em .4em .4em;opacity:.75;font-size:13px">↗</a>'
     )
     about = f'<div style="flex:1;min-width:0;padding:.15em 0">{_lines(row, now)}</div>'
     return (
@@ -69,14 +70,14 @@ def _lines(row: RunRow, now: datetime) -> str:
         f"{escape(words.title_of(row))}</span>"
         f'<span style="{DIM};white-space:nowrap">{escape(words.moment(row.created, now))}</span></div>'
     )
-    cause = f' <span style="white-space:nowrap">{escape(row.diagnosis)}</span>' if _told(row) else ""
+    cause = f" {escape(row.diagnosis)}" if _told(row) else ""
     how = (
         f'<div style="{CUT}">{badge_html(row.outcome)}{cause}'
-        f'<span style="{DIM}"> · {escape(row.estimator)} · seed {row.seed}</span></div>'
+        f'<span style="{DIM}"> · {escape(row.estimator)} #{row.seed}</span></div>'
     )
-    errors = (words.angle(row.rotation_error_deg), words.distance(row.translation_error_m))
     facts = [f"{row.inliers}/{row.correspondences}"]
-    facts += [] if row.outlier_rate is None else [f"{words.percent(row.outlier_rate)} out"]
+    facts += [] if row.outlier_rate is None else [f"{100.0 * row.outlier_rate:.0f} % out"]
+    errors = (words.angle(row.rotation_error_deg), words.distance(row.translation_error_m))
     facts += [fact for fact in errors if fact != words.UNKNOWN]
     facts.append(words.duration(row.time_ms))
     numbers = f'<div style="{DIM};{CUT};font-variant-numeric:tabular-nums">{escape(" · ".join(facts))}</div>'
@@ -121,18 +122,25 @@ def picture_html(png: bytes, width_px: int = WIDTH_PX, height_px: int = HEIGHT_P
 
 
 def _hint(row: RunRow) -> str:
-    return escape(" ".join(filter(None, (row.summary or row.message, f"({row.file})"))))
+    return escape(" ".join(filter(None, (row.summary or row.message, f"Seed {row.seed}, {row.file}."))))
 
 
-def pages_html(page: int, total: int, ways: bool) -> str:
-    """Where in the list one is, and what turns it; with ``ways`` also what goes through all of it or exports it."""
-    first, last = page * PAGE + 1, min((page + 1) * PAGE, total)
-    back = pill("‹", f"runs-page:{page - 1}", False, "Previous page") if page > 0 else ""
-    on = pill("›", f"runs-page:{page + 1}", False, "Next page") if last < total else ""
+def pages_html(look: Look, total: int, start: bool | None) -> str:
+    """Where in the list one is, and what turns it.
+
+    Above the list also how it is sorted, what exports it and, with ``start``, what opens one run after another; below
+    it (``start`` is None) nothing more.
+    """
+    first, last = look.page * PAGE + 1, min((look.page + 1) * PAGE, total)
+    back = pill("‹", f"runs-page:{look.page - 1}", False, "Previous page") if look.page > 0 else ""
+    on = pill("›", f"runs-page:{look.page + 1}", False, "Next page") if last < total else ""
     where = f"{first:,}–{last:,} of {total:,}" if total > PAGE else f"{total:,} run{'s' if total != 1 else ''}"
-    parts = [f'<span style="{DIM}">{where}</span>{back}{on}<span style="flex:1"></span>']
-    if ways:
-        words_ = f"go through them {key_html(NEXT_KEY)}"
-        parts.append(pill(words_, "run-step:1", False, f"Open one after another, key {NEXT_KEY}", keyed(NEXT_KEY)))
-        parts.append(pill("zip", "runs-export:", False, f"Export all {total:,} runs of this list"))
-    return f'<div style="display:flex;gap:.5em;align-items:center;padding:.2em 0 .35em">{"".join(parts)}</div>'
+    parts = [f'<span style="{DIM}">{where}</span>{back}{on}']
+    if start is not None:
+        parts += ['<span style="flex:1"></span>', sorting_html(look)]
+        parts.append(pill("zip", "runs-export:", False, f"Export all {total:,} runs of this list, as far as they fit"))
+    if start:
+        hint = f"Open one after another, key {NEXT_KEY}"
+        parts.append(pill(f"review {key_html(NEXT_KEY)}", "run-step:1", False, hint, keyed(NEXT_KEY)))
+    row_css = "display:flex;flex-wrap:wrap;gap:.4em;align-items:center;padding:.1em 0 .4em"
+    return f'<div style="{row_css}">{"".join(parts)}</div>'

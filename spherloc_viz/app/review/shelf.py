@@ -88,6 +88,13 @@ class Shelf:
         examine(path)
         return read_recording(path), path
 
+    def warm(self) -> None:
+        """Have the process that reads recordings first started before it is needed: it takes seconds."""
+        newest = self._index.find(RunQuery(), 1).rows
+        if newest:
+            with contextlib.suppress(RecordingError):
+                examine(resolve_inside(self.folder, newest[0].file))
+
     def place(self, look: Look, file: str, near: int) -> tuple[int | None, int]:
         """Where a run is in the list, counted from 0, if it is near that place, and how long the list is."""
         first = max(0, near - NEAR)

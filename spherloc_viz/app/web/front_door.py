@@ -50,6 +50,8 @@ class FrontDoor:
         app.router.add_route("*", "/{path:.*}", self._answer)
         app.cleanup_ctx.append(self._connections)
         app.on_shutdown.append(self._hang_up)
+        if self._viewer is not None:
+            app.on_cleanup.append(self._viewer.close)
         runner = web.AppRunner(app, access_log=None, handle_signals=False, shutdown_timeout=1.0)
         await runner.setup()
         await web.SockSite(runner, listener).start()

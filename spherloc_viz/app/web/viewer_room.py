@@ -3,7 +3,9 @@
 import asyncio
 import re
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from urllib.parse import urlencode
 
@@ -49,9 +51,16 @@ def of_folder(folder: Path, index: Callable[[], RunIndex]) -> Callable[[str], Vi
 
     def find(file: str) -> Viewable:
         path = resolve_inside(folder, file)
-        return Viewable(path, index().get(file) or examine(path))
+        state = path.stat()
+        return Viewable(path, index().get(file) or _examined(path, state.st_mtime_ns, state.st_size))
 
     return find
+
+
+@lru_cache(maxsize=64)
+def _examined(path: Path, mtime_ns: int, size_bytes: int) -> RunRow:
+    """Once for each state of a file: a page that opens asks three times."""
+    return examine(path)
 
 
 class ViewerRoom:
@@ -60,6 +69,12 @@ class ViewerRoom:
     def __init__(self, find: Callable[[str], Viewable]) -> None:
         """``find`` gives the run of a file, or raises ``RecordingError``; it is called in threads and may take long."""
         self._find = find
+        # Of its own, as a file that takes long to examine must not keep presses on the playground's pages waiting.
+        self._threads = ThreadPoolExecutor(2, "spherloc-viewer")
+
+    async def close(self, app: web.Application) -> None:
+        """End its threads; for an application's ``on_cleanup``."""
+        self._threads.shutdown(wait=False, cancel_futures=True)
 
     async def answer(self, request: web.Request) -> web.StreamResponse:
         """The page, a file of the viewer's program, or a recording."""
@@ -70,7 +85,7 @@ class ViewerRoom:
             if path.startswith(start)
         )
         try:
-            return await asyncio.get_running_loop().run_in_executor(None, answer, argument, request)
+            return await asyncio.get_running_loop().run_in_executor(self._threads, answer, argument, request)
         except SpherlocError as error:
             if answer == self._page:
                 return _html(sorry_page(str(error)), SORRY_POLICY, status=404)

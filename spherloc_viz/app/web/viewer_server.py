@@ -23,14 +23,13 @@ def serve_recording(path: Path, row: RunRow, step: int, port: int) -> None:
     """
     with open_socket(HOST, port) as listener, contextlib.suppress(KeyboardInterrupt):
         viewer_folder()
-        app = web.Application()
-        app.router.add_get("/{path:.*}", _answers(path, row, step))
+        app = _app(path, row, step)
         link = f"http://{HOST}:{listener.getsockname()[1]}/"
         print(f"{path.name} is open at {link} ; Ctrl-C ends it.", flush=True)
         web.run_app(app, sock=listener, print=None, access_log=None, shutdown_timeout=1.0)
 
 
-def _answers(path: Path, row: RunRow, step: int):
+def _app(path: Path, row: RunRow, step: int) -> web.Application:
     def find(file: str) -> Viewable:
         if file != NAME:
             raise RecordingError("There is no such recording here; open / instead.")
@@ -48,4 +47,7 @@ def _answers(path: Path, row: RunRow, step: int):
             raise web.HTTPFound(viewer_link(NAME, step))
         return web.Response(status=404, text="There is nothing here; open / instead.\n")
 
-    return answer
+    app = web.Application()
+    app.router.add_get("/{path:.*}", answer)
+    app.on_cleanup.append(room.close)
+    return app

@@ -1,5 +1,6 @@
 """Everything that leans on viser's insides, so that a new version of viser is checked against one file."""
 
+import asyncio
 import contextlib
 import hmac
 import io
@@ -27,6 +28,7 @@ def start_viser(key: str) -> viser.ViserServer:
     with _demand(key), contextlib.redirect_stdout(io.StringIO()):
         server = viser.ViserServer(host="127.0.0.1", port=0, label="spherloc", verbose=False)
     _disable_sharing(server)
+    _wake_on_loop(server)
     # A page that leaves while it is being drawn is no news for the terminal.
     warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
     return server
@@ -113,3 +115,38 @@ def _disable_sharing(server: viser.ViserServer) -> None:
     for message in (_messages.ShareUrlRequest, _messages.ShareUrlDisconnect):
         connection.unregister_handler(message)
         connection.register_handler(message, lambda client, message: None)
+
+
+class _LoopEvent(asyncio.Event):
+    """An event that only its own loop sets; elsewhere ``set`` does nothing."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+        super().__init__()
+        self._home = loop
+
+    def set(self) -> None:
+        """As ``asyncio.Event.set``, on the loop's thread."""
+        try:
+            at_home = asyncio.get_running_loop() is self._home
+        except RuntimeError:
+            at_home = False
+        if at_home:
+            super().set()
+
+
+def _wake_on_loop(server: viser.ViserServer) -> None:
+    """Have those who wait for messages woken on the event loop only.
+
+    viser sets their event on the thread that queues a message and then, safely, on the loop; the former raises now and
+    then, since the loop may change the event's waiters meanwhile. The latter alone suffices: a message is in its buffer
+    before, so whoever waits, or is about to, finds it.
+    """
+    sockets: Any = server._websock_server
+    loop = sockets._background_event_loop
+    sockets._broadcast_buffer.message_event = _LoopEvent(loop)
+
+    def connected(client: Any) -> None:
+        client.get_message_buffer().message_event = _LoopEvent(loop)
+
+    # Before viser's own callback, from which on messages are queued, and before anybody waits for one.
+    sockets._client_connect_cb.insert(0, connected)

@@ -1,0 +1,135 @@
+"""What a story can tell of a run in numbers."""
+
+from collections.abc import Callable, Mapping
+from math import comb
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spherloc.geometry import yaw_of
+from spherloc.metrics import evaluate, ransac_success_probability
+from spherloc.refine import residuals_px
+from spherloc.trace import RansacStage, Trace, YawStage
+
+BoolArray = NDArray[np.bool_]
+FloatArray = NDArray[np.float64]
+
+
+def _count(mask: BoolArray) -> int:
+    return int(np.count_nonzero(mask))
+
+
+def _right(trace: Trace) -> BoolArray:
+    """(N,) labels; of the gallery's problems they are known."""
+    labels = trace.problem.truth_inliers
+    return np.zeros(len(trace.problem), dtype=bool) if labels is None else labels
+
+
+def _true_errors_px(trace: Trace) -> FloatArray:
+    """(N,) reprojection errors at the true pose; inf where the camera cannot see the pixel."""
+    problem, truth = trace.problem, trace.problem.truth_cam_from_map
+    errors = np.full(len(problem), np.inf)
+    if truth is not None:
+        errors[problem.aligned.index] = residuals_px(problem.aligned, problem.aligned.align_pose(truth))
+    return errors
+
+
+def _agree_with_truth(trace: Trace, wider: float = 1.0) -> int:
+    return _count(_true_errors_px(trace) <= wider * trace.options.bound_px)
+
+
+def _median_error_px(trace: Trace, rim: bool) -> float:
+    """Of the right matches in the outer or the inner half of the view, at the true pose."""
+    right, errors = _right(trace), _true_errors_px(trace)
+    forward = trace.problem.bearings[:, 2]
+    outer = forward < np.median(forward[right])
+    return float(np.median(errors[right & (outer if rim else ~outer)]))
+
+
+def _gravity_off_deg(trace: Trace) -> float:
+    problem, truth = trace.problem, trace.problem.truth_cam_from_map
+    if truth is None:
+        return np.nan
+    cosine = problem.gravity_camera @ (truth[:, :3] @ problem.gravity_map)
+    return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
+
+
+def _from_axis_deg(trace: Trace) -> float:
+    """Largest angle between gravity and the bearing of a right match."""
+    cosines = trace.problem.bearings[_right(trace)] @ trace.problem.gravity_camera
+    return float(np.degrees(np.arccos(np.clip(cosines.min(initial=1.0), -1.0, 1.0))))
+
+
+def _stage(trace: Trace) -> RansacStage:
+    stage = trace.stage(RansacStage)
+    if stage is None:
+        raise ValueError(f"{trace.estimator} draws no samples that a story could tell of")
+    return stage
+
+
+def _samples_per_right_one(trace: Trace) -> float:
+    """How many samples it takes on average until one has right matches only."""
+    size = _stage(trace).samples.shape[1]
+    return comb(len(trace.problem), size) / comb(_count(_right(trace)), size)
+
+
+def _hit_percent(trace: Trace) -> float:
+    """Eq. 28, with a sample of different matches."""
+    rate = 1.0 / _samples_per_right_one(trace)
+    return 100.0 * ransac_success_probability(rate, 1, _stage(trace).iterations)
+
+
+def _yaw(trace: Trace) -> YawStage:
+    stage = trace.stage(YawStage)
+    if stage is None:
+        raise ValueError(f"{trace.estimator} votes for no yaw that a story could tell of")
+    return stage
+
+
+def _right_pairs_chosen(trace: Trace) -> int:
+    """Pairs of two right matches in the rotation clique."""
+    stage = _yaw(trace)
+    return _count(_right(trace)[stage.pairs[stage.clique]].all(axis=1))
+
+
+def _pairs_at_truth(trace: Trace) -> int:
+    """Arcs that cover the true yaw."""
+    stage, truth = _yaw(trace), trace.problem.truth_cam_from_map
+    if truth is None:
+        return 0
+    yaw = yaw_of(trace.problem.aligned.align_pose(truth)[:, :3])
+    turns = np.stack([yaw + turn * 2.0 * np.pi for turn in (-1.0, 0.0, 1.0)])[:, None]
+    return _count(((stage.lo_rad <= turns) & (turns <= stage.hi_rad)).any(axis=0))
+
+
+def _known(value: float | None) -> float:
+    return np.nan if value is None else value
+
+
+MEASURES: Mapping[str, Callable[[Trace], float]] = {
+    "matches": lambda trace: len(trace.problem),
+    "right": lambda trace: _count(_right(trace)),
+    "inliers": lambda trace: _count(trace.inlier_mask),
+    "right_inliers": lambda trace: _count(trace.inlier_mask & _right(trace)),
+    "wrong_inliers": lambda trace: _count(trace.inlier_mask & ~_right(trace)),
+    "agree_with_truth": _agree_with_truth,
+    "agree_within_twice": lambda trace: _agree_with_truth(trace, 2.0),
+    "rim_px": lambda trace: _median_error_px(trace, rim=True),
+    "middle_px": lambda trace: _median_error_px(trace, rim=False),
+    "off_m": lambda trace: _known(evaluate(trace).translation_error_m),
+    "off_deg": lambda trace: _known(evaluate(trace).rotation_error_deg),
+    "gravity_off_deg": _gravity_off_deg,
+    "from_axis_deg": _from_axis_deg,
+    "samples": lambda trace: _stage(trace).iterations,
+    "sample_size": lambda trace: _stage(trace).samples.shape[1],
+    "samples_per_right_one": _samples_per_right_one,
+    "hit_percent": _hit_percent,
+    "pairs": lambda trace: comb(len(trace.problem), 2),
+    "right_pairs": lambda trace: comb(_count(_right(trace)), 2),
+    "pairs_at_yaw": lambda trace: len(_yaw(trace).clique),
+    "right_pairs_at_yaw": _right_pairs_chosen,
+    "pairs_at_true_yaw": _pairs_at_truth,
+    "at_most": lambda trace: _known(None if trace.certificate is None else trace.certificate.upper_bound),
+    "chance_sets": lambda trace: _known(None if trace.certificate is None else trace.certificate.chance_sets),
+}
+"""By name: counts of matches, pairs and samples, errors against the truth, and what is proven."""

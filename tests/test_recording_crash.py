@@ -1,0 +1,265 @@
+"""Killed at any moment, or without room: at most the run in flight is lost, and the next start puts all right."""
+
+import contextlib
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from recording_samples import scene_problem
+
+from spherloc.estimators import estimate
+from spherloc.trace import Trace
+from spherloc_viz.recording.background import Recorder
+from spherloc_viz.recording.keeper import Keeper
+from spherloc_viz.recording.leftovers import STALE_AFTER_S, here, leftovers, rescue, scratch, unfinished
+from spherloc_viz.recording.query import RunQuery
+from spherloc_viz.recording.reader import read_recording, read_run_row
+from spherloc_viz.recording.repeat import compare
+from spherloc_viz.recording.review import write_review
+from spherloc_viz.recording.writer import write_recording
+
+ROOT = Path(__file__).resolve().parents[1]
+
+KILLER = """
+import os, pathlib, random, signal, sys, time
+from spherloc.datasets import load_scene
+from spherloc.estimators import estimate
+from spherloc_viz.recording.keeper import Keeper
+
+folder, scene, seed, kills = pathlib.Path(sys.argv[1]), pathlib.Path(sys.argv[2]), *map(int, sys.argv[3:])
+trace, draws = estimate(load_scene(scene).problem(), "ransac-2p"), random.Random(seed)
+for number in range(kills):
+    reader, writer = os.pipe()
+    pid = os.fork()
+    if not pid:
+        with Keeper(folder, print) as keeper:
+            while True:
+                keeper.record(trace)
+                os.write(writer, b"1")
+    os.read(reader, 1)  # it has recorded once: what takes long the first time is over
+    time.sleep(draws.uniform(0.0, 0.06))
+    os.kill(pid, 9)
+    os.waitpid(pid, 0)
+    os.close(writer)
+    recorded = 1
+    while got := os.read(reader, 4096):
+        recorded += len(got)
+    os.close(reader)
+    print(recorded, sum(name.endswith(".part") for name in os.listdir(folder)), flush=True)
+"""
+
+
+@pytest.fixture(scope="module")
+def trace() -> Trace:
+    return estimate(scene_problem("mei_outliers_80"), "ransac-2p", seed=11)
+
+
+@pytest.fixture(scope="module")
+def recorded(trace: Trace, tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    path = tmp_path_factory.mktemp("whole") / "run.rrd"
+    write_recording(trace, path)
+    return path.read_bytes()
+
+
+@pytest.fixture(scope="module")
+def dead() -> str:
+    """How names of unfinished files tell of a process of this machine that has ended."""
+    code = "import pathlib\nfrom spherloc_viz.recording.leftovers import unfinished\nprint(unfinished(pathlib.Path('')/'a'))"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    return done.stdout.strip().removeprefix("a.").rpartition("-")[0]
+
+
+def part_of(folder: Path, name: str, owner: str, content: bytes = b"") -> Path:
+    path = folder / f"{name}.{owner}-{'0' * 8}.part"
+    path.write_bytes(content)
+    return path
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are forked, so that each kill takes no second")
+def test_whoever_is_killed_at_any_moment_loses_the_run_in_flight_only(
+    tmp_path: Path, rng, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, scratches = tmp_path / "recordings", tmp_path / "scratch"
+    folder.mkdir()
+    scratches.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(scratches))
+    kills, seed = 25, int(rng.integers(2**31))
+    done = subprocess.run(
+        [sys.executable, "-c", KILLER, folder, ROOT / "scenes" / "mei_outliers_80.toml", str(seed), str(kills)],
+        cwd=ROOT,
+        env=os.environ | {"TMPDIR": str(scratches), "OPENBLAS_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        timeout=200,
+        check=True,
+    )
+    counts = [tuple(map(int, line.split())) for line in done.stdout.splitlines()]
+    assert len(counts) == kills
+    before = 0
+    for _, parts in counts:
+        assert parts <= before + 1
+        before = parts
+    finished = sum(count for count, _ in counts)
+    files = sorted(folder.glob("*.rrd"))
+    # A kill may come between the last byte of a run and the word that it is done.
+    assert finished <= len(files) <= finished + kills
+    assert all(read_recording(path).message for path in files)
+    notices: list[str] = []
+    with Recorder(folder, lambda error: notices.append(str(error)), notices.append) as recorder:
+        recorder.submit(estimate(scene_problem("mei_outliers_80"), "mc"))
+        wait_for_upkeep(recorder)
+        listed = recorder.index.find(RunQuery(sort="file", descending=False), limit=None).rows
+    now = sorted(folder.glob("*.rrd"))
+    assert [row.file for row in listed] == [path.name for path in now]
+    assert not list(folder.glob("*.part")) and not list(scratches.iterdir())
+    assert len(now) - 1 - len(files) <= before and all("Recovered" in sentence for sentence in notices)
+
+
+def wait_for_upkeep(recorder: Recorder) -> None:
+    recorder._upkeep.join(120)
+    assert not recorder._upkeep.is_alive()
+
+
+@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(share=st.floats(0.0, 1.0), garbage=st.binary(max_size=40))
+def test_what_is_left_of_a_file_becomes_the_run_again_or_nothing(
+    recorded: bytes, trace: Trace, dead: str, share: float, garbage: bytes
+) -> None:
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        part = part_of(folder, "a.rrd", dead, recorded[: round(share * len(recorded))] + garbage)
+        assert leftovers(folder) == [part]
+        path = rescue(part)
+        left = [file.name for file in folder.iterdir()]
+        if path is None:
+            assert left == [] and share < 0.6
+        else:
+            assert left == ["a.rrd"] and path == folder / "a.rrd"
+            assert compare(read_recording(path), trace) == [] and read_run_row(path).outcome == "success"
+
+
+def test_a_finished_file_without_its_name_is_moved_and_never_onto_another(
+    recorded: bytes, dead: str, tmp_path: Path
+) -> None:
+    path = rescue(part_of(tmp_path, "a.rrd", dead, recorded))
+    assert path == tmp_path / "a.rrd" and path.read_bytes() == recorded
+    assert rescue(part_of(tmp_path, "a.rrd", dead, recorded[:1000])) is None
+    assert path.read_bytes() == recorded and len(list(tmp_path.iterdir())) == 1
+
+
+def test_only_what_nobody_will_finish_is_a_leftover(dead: str, tmp_path: Path) -> None:
+    _, boot, pid, start = dead.split("-")
+    machine = here().split("-")[0]
+    gone = [
+        part_of(tmp_path, "dead.rrd", dead),
+        part_of(tmp_path, "dead.review.rrd", dead),
+        part_of(tmp_path, "boot.rrd", f"{machine}-{'0' * 8}-{os.getpid()}-{start}"),
+        part_of(tmp_path, "again.rrd", f"{machine}-{boot}-{os.getpid()}-1"),  # another process has its number now
+    ]
+    old = [tmp_path / f"old.rrd.{'0' * 8}.part", part_of(tmp_path, "far.rrd", f"{'0' * 8}-{boot}-{pid}-{start}")]
+    young = [tmp_path / f"young.rrd.{'1' * 8}.part", unfinished(tmp_path / "alive.rrd")]
+    others = [tmp_path / name for name in ("a.rrd", "notes.part", f"a.txt.{'0' * 8}.part", "a.rrd.zzzzzzzz.part")]
+    for path in (*old, *young, *others):
+        path.touch()
+    for path in (*old, *others):
+        os.utime(path, (0, 0))
+    (tmp_path / f"folder.rrd.{dead}-{'0' * 8}.part").mkdir()
+    assert leftovers(tmp_path) == sorted(gone + old)
+    assert young[1].stat().st_mtime > STALE_AFTER_S
+
+
+def test_the_next_start_tells_what_it_recovered(recorded: bytes, dead: str, tmp_path: Path) -> None:
+    part_of(tmp_path, "a.rrd", dead, recorded[: len(recorded) * 9 // 10])
+    part_of(tmp_path, "b.rrd", dead, recorded[:100])
+    (tmp_path / "c.rrd").write_bytes(recorded)
+    write_review(tmp_path / "c.rrd", ["street"], "was not listed")
+    notices: list[str] = []
+    with Keeper(tmp_path, notices.append) as keeper:
+        keeper.index.add(read_run_row(tmp_path / "c.rrd"))
+        (tmp_path / "c.rrd").rename(tmp_path / "d.rrd")
+        (tmp_path / "c.review.rrd").rename(tmp_path / "d.review.rrd")
+    with scratch() as mine:
+        stranger = Path(mine).with_name(f"spherloc-{dead}-abc")
+        stranger.mkdir()
+        (stranger / "run.rrd").touch()
+        with Recorder(tmp_path, lambda error: notices.append(str(error)), notices.append) as recorder:
+            wait_for_upkeep(recorder)
+            rows = recorder.index.find(RunQuery(sort="file", descending=False), limit=None).rows
+        assert Path(mine).is_dir() and not stranger.exists()
+    assert notices == ["Recovered the recording of a run that was not finished: a.rrd."]
+    assert [(row.file, row.labels) for row in rows] == [("a.rrd", ()), ("d.rrd", ("street",))]
+
+
+@contextlib.contextmanager
+def small_disk(folder: Path, size_bytes: int) -> Iterator[None]:
+    """A file system of its own in ``folder``; the test is skipped where none can be had."""
+    words = ["mount", "-t", "tmpfs", "-o", f"size={size_bytes}", "tmpfs", str(folder)]
+    try:
+        subprocess.run(words, check=True, capture_output=True)
+    except (OSError, subprocess.CalledProcessError):
+        pytest.skip("no file system can be mounted here")
+    try:
+        yield
+    finally:
+        subprocess.run(["umount", "--lazy", str(folder)], check=True, capture_output=True)
+
+
+def drain(recorder: Recorder) -> None:
+    wait = __import__("threading").Event()
+    for _ in range(2400):
+        if not recorder.waiting:
+            return
+        wait.wait(0.05)
+    raise AssertionError(recorder.overload)
+
+
+def test_a_full_disk_gives_one_notification_and_is_survived(trace: Trace, recorded: bytes, tmp_path: Path) -> None:
+    errors: list[str] = []
+    notices: list[str] = []
+    with small_disk(tmp_path, 4 * len(recorded) + 400_000):
+        with Recorder(tmp_path, lambda error: errors.append(str(error)), notices.append) as recorder:
+            paths = []
+            for _ in range(10):
+                paths.append(recorder.submit(trace))
+                drain(recorder)
+            written = [path for path in paths if path.exists()]
+            assert 2 <= len(written) <= 5 and all(read_recording(path) for path in written)
+            assert len(errors) == 1 and "No space left on device" in errors[0] and "make room" in errors[0]
+            assert not list(tmp_path.glob("*.part"))
+            for path in written:
+                path.unlink()
+            paths = [recorder.submit(trace) for _ in range(2)]
+            drain(recorder)
+            assert all(read_recording(path) for path in paths) and len(errors) == 1
+            assert f"Runs are recorded again; {10 - len(written)} were not." in notices
+            listed = {row.file for row in recorder.index.find(RunQuery(), limit=None).rows}
+            assert listed >= {path.name for path in paths}
+
+
+def test_where_no_large_file_can_be_written_it_is_the_same(trace: Trace, tmp_path: Path) -> None:
+    errors: list[str] = []
+    notices: list[str] = []
+    with Recorder(tmp_path, lambda error: errors.append(str(error)), notices.append) as recorder:
+        first = recorder.submit(trace)
+        drain(recorder)
+        wait_for_upkeep(recorder)
+        before = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, before[1]))
+        try:
+            for _ in range(4):
+                recorder.submit(trace)
+            drain(recorder)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        assert len(errors) == 1 and "cannot be recorded" in errors[0] and "\n" not in errors[0]
+        assert not list(tmp_path.glob("*.part"))
+        last = recorder.submit(trace)
+    assert sorted(tmp_path.glob("*.rrd")) == sorted([first, last]) and all(map(read_recording, (first, last)))
+    assert notices == ["Runs are recorded again; 4 were not."]

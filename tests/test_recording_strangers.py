@@ -1,0 +1,431 @@
+"""A recording from a stranger costs one sentence at worst: no process, no memory, and not the other recordings."""
+
+import json
+import os
+import re
+import signal
+import struct
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+import rerun as rr
+from hostile_recordings import APPLICATION_ID, Change, changed, listed, message, places, with_index, with_message
+from recording_samples import scene_problem
+from rerun.chunk import Chunk, LazyChunkStream
+
+from spherloc.errors import RecordingError
+from spherloc.estimators import estimate
+from spherloc_viz.recording import strangers
+from spherloc_viz.recording.examine import FILE_LIMIT_BYTES
+from spherloc_viz.recording.reader import read_recording
+from spherloc_viz.recording.review import review_path, write_review
+from spherloc_viz.recording.run_row import RunRow
+from spherloc_viz.recording.strangers import Examiner, check_name, examine, examine_all, resolve_inside
+from spherloc_viz.recording.writer import write_recording
+
+PROBLEM, RUN, RUN_PROPERTY, YAW = "/data/problem", "/data/run", "/__properties/run", "/data/stages/yaw"
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("good") / "good.rrd"
+    write_recording(estimate(scene_problem("mei_outliers_80"), "mc"), path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def examiner() -> Iterator[Examiner]:
+    with Examiner() as examiner:
+        yield examiner
+
+
+def sentence(examiner: Examiner, path: Path) -> str:
+    """What is said about a bad file: one sentence that begins with its path."""
+    with pytest.raises(RecordingError) as error:
+        examiner.examine(path)
+    text = str(error.value)
+    assert text.startswith(f"{path}: ") and text.endswith(".") and text.isprintable() and len(text) < 700
+    return text.removeprefix(f"{path}: ")
+
+
+def test_a_good_recording_passes_and_its_row_comes_back_whole(good: Path, examiner: Examiner) -> None:
+    row = examiner.examine(good)
+    assert row == read_recording(good).row
+    assert row.file == good.name and row.correspondences == 100 and row.thumbnail.startswith(b"\x89PNG")
+
+
+def test_labels_and_note_come_with_the_row(good: Path, examiner: Examiner, tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+    path.write_bytes(good.read_bytes())
+    write_review(path, ["look again", "ü & <b>"], "One line.\nAnother one.")
+    row = examiner.examine(path)
+    assert row.labels == ("look again", "ü & <b>") and row.note == "One line.\nAnother one."
+
+
+def test_a_run_is_still_a_run_when_its_labels_cannot_be_read(good: Path, examiner: Examiner, tmp_path: Path) -> None:
+    path, deadly = tmp_path / "run.rrd", tmp_path / "deadly.rrd"
+    path.write_bytes(good.read_bytes())
+    deadly.write_bytes(ends_the_reader(good))
+    write_review(path, ["seen"], "")
+    review = review_path(path)
+    for content in (b"", review.read_bytes()[:-40], deadly.read_bytes(), good.read_bytes()):
+        review.write_bytes(content)
+        assert examiner.examine(path).labels == ()
+
+
+# ---------------------------------------------------------------------------------------------- no recordings
+
+
+def test_what_is_no_recording_is_one_sentence(tmp_path: Path, examiner: Examiner) -> None:
+    for content in (b"", b"RRF2", b"hello\n" * 100, b"\x89PNG\r\n\x1a\n", bytes(100_000), b"PK\x03\x04" + bytes(100)):
+        path = tmp_path / "other.rrd"
+        path.write_bytes(content)
+        assert "not a whole recording" in sentence(examiner, path)
+
+
+def test_what_is_no_file_is_one_sentence_at_once(tmp_path: Path, examiner: Examiner) -> None:
+    assert "cannot be opened" in sentence(examiner, tmp_path / "missing.rrd")
+    assert "not a file" in sentence(examiner, tmp_path)
+    pipe, loop = tmp_path / "pipe.rrd", tmp_path / "loop.rrd"
+    os.mkfifo(pipe)
+    loop.symlink_to(loop)
+    assert "not a file" in sentence(examiner, pipe)
+    assert "cannot be opened" in sentence(examiner, loop)
+    assert "not a file" in sentence(examiner, Path("/dev/zero"))
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="the superuser may read everything")
+def test_a_file_that_may_not_be_read_is_one_sentence(good: Path, tmp_path: Path, examiner: Examiner) -> None:
+    path = tmp_path / "secret.rrd"
+    path.write_bytes(good.read_bytes())
+    path.chmod(0)
+    assert "may not be read" in sentence(examiner, path)
+
+
+def test_a_huge_file_is_not_read(good: Path, tmp_path: Path, examiner: Examiner) -> None:
+    path = tmp_path / "sparse.rrd"
+    path.write_bytes(good.read_bytes())
+    os.truncate(path, 10 * FILE_LIMIT_BYTES)
+    assert "which no recording is" in sentence(examiner, path)
+
+
+def test_recordings_of_other_programs_are_told_apart(tmp_path: Path, examiner: Examiner) -> None:
+    dot = Chunk.from_columns("/dot", [], rr.Points3D.columns(positions=[[1, 2, 3]]))
+    for application, said in (("other", "another program"), (APPLICATION_ID, "a part of the run is missing")):
+        path = tmp_path / "foreign.rrd"
+        LazyChunkStream.from_iter([dot]).write_rrd(path, application_id=application, recording_id="1")
+        assert said in sentence(examiner, path)
+
+
+# ---------------------------------------------------------------------------------------------- lies about sizes
+
+
+def unpacks_to_much(good: Path) -> bytes:
+    """A file of 3 MB with a chunk of 700 MB."""
+    return packed(PROBLEM, change=lambda arrow: arrow + bytes(700_000_000))(good)
+
+
+def ends_the_reader(good: Path) -> bytes:
+    """A file of which rerun's reader dies: the arrays of a chunk claim -1 numbers."""
+    nodes = struct.pack("<qq", 100, 0), struct.pack("<qq", -1, 0)
+    return with_message(good, PROBLEM, lambda m: message(m, change=lambda arrow: arrow.replace(*nodes)))
+
+
+def packed(entity: str, claim: int | None = None, change: Callable[[bytes], bytes] | None = None) -> Any:
+    return lambda good: with_message(good, entity, lambda m: message(m, claim, change))
+
+
+def replaced(old: bytes, new: bytes) -> Any:
+    def change(arrow: bytes) -> bytes:
+        assert old in arrow
+        return arrow.replace(old, new)
+
+    return packed(PROBLEM, change=change)
+
+
+LIES: dict[str, Callable[[Path], bytes]] = {
+    "a chunk unpacks to 1 GB": packed(PROBLEM, claim=1 << 30),
+    "a chunk unpacks to 2^64 - 1 bytes": packed(PROBLEM, claim=(1 << 64) - 1),
+    "a chunk unpacks to nothing": packed(PROBLEM, claim=0),
+    "arrays of 10^9 numbers": replaced(struct.pack("<qq", 100, 0), struct.pack("<qq", 10**9, 0)),
+    "10^9 rows": replaced(struct.pack("<qq", 1, 0), struct.pack("<qq", 10**9, 0)),
+    "lists end beyond their values": replaced(struct.pack("<ii", 0, 100), struct.pack("<ii", 0, 10**9)),
+    "lists begin before their values": replaced(struct.pack("<ii", 0, 100), struct.pack("<ii", -5, 95)),
+    "the index claims a chunk of 2^40 bytes": lambda good: with_index(
+        good, (struct.pack("<Q", places(good)[PROBLEM][1]), struct.pack("<Q", 1 << 40))
+    ),
+    "the index claims a chunk beyond the end": lambda good: with_index(
+        good, (struct.pack("<Q", places(good)[PROBLEM][0]), struct.pack("<Q", (1 << 64) - 8))
+    ),
+}
+
+
+@pytest.mark.parametrize("lie", LIES)
+def test_lies_about_sizes_are_one_sentence(good: Path, examiner: Examiner, tmp_path: Path, lie: str) -> None:
+    path = tmp_path / "lie.rrd"
+    path.write_bytes(LIES[lie](good))
+    sentence(examiner, path)
+
+
+def test_the_tools_of_these_tests_tell_the_truth_where_they_change_nothing(
+    good: Path, examiner: Examiner, tmp_path: Path
+) -> None:
+    same = {
+        "message": with_message(good, PROBLEM, lambda content: content),
+        "packed again": packed(PROBLEM, change=lambda arrow: arrow)(good),
+        "index": with_index(good),
+        "chunks": changed(good, tmp_path / "same.rrd", {PROBLEM: lambda columns: columns}).read_bytes(),
+    }
+    for content in same.values():
+        path = tmp_path / "same.rrd"
+        path.write_bytes(content)
+        assert replace(examiner.examine(path), file=good.name, size_bytes=good.stat().st_size) == examiner.examine(good)
+
+
+# ---------------------------------------------------------------------------------------------- impossible values
+
+
+def scalars(**values: Any) -> Change:
+    """The scalars of a row with some of them changed."""
+
+    def change(columns: dict[str, Any]) -> dict[str, Any]:
+        row = json.loads(columns["scalars"][0].values[0].as_py())
+        assert values.keys() <= row.keys()
+        return columns | {"scalars": pa.array([[json.dumps(row | values)]])}
+
+    return change
+
+
+def text(content: str) -> Change:
+    return lambda columns: columns | {"scalars": pa.array([[content]])}
+
+
+def array(name: str, values: Any) -> Change:
+    return lambda columns: columns | {name: listed(values)}
+
+
+def properties(**values: Any) -> Change:
+    return lambda columns: columns | {name: pa.array([[value]]) for name, value in values.items()}
+
+
+def camera(**values: Any) -> Change:
+    return scalars(camera={"model": "equirectangular", "width": 100, "height": 50} | values)
+
+
+RANDOM = np.random.default_rng(0)
+RUNS_ENDED = pa.RunEndEncodedArray.from_arrays(pa.array([10**9], pa.int32()), pa.array([1.0]))
+
+IMPOSSIBLE: dict[str, dict[str, Change]] = {
+    "no problem": {PROBLEM: lambda columns: None},
+    "no properties": {RUN_PROPERTY: lambda columns: None},
+    "no pixels": {PROBLEM: lambda columns: {name: column for name, column in columns.items() if name != "pixels"}},
+    "pixels (N, 3)": {PROBLEM: array("pixels", np.zeros((100, 3)))},
+    "no pixel": {PROBLEM: array("pixels", np.zeros((0, 2)))},
+    "pixels that are not finite": {PROBLEM: array("pixels", np.full((100, 2), np.nan))},
+    "points that are not finite": {PROBLEM: array("points", np.full((100, 3), np.inf))},
+    "pixels that are words": {PROBLEM: lambda columns: columns | {"pixels": pa.array([["a"] * 100])}},
+    "pixels that are nothing, 50 million times": {PROBLEM: array("pixels", pa.nulls(50_000_000))},
+    "a stage of nothing, 50 million times": {YAW: array("pairs", pa.nulls(50_000_000))},
+    "a stage of one number, 10^9 times": {YAW: array("pairs", RUNS_ENDED)},
+    "more than a million correspondences": {
+        PROBLEM: lambda columns: (
+            columns | {"pixels": listed(np.ones((1_000_001, 2))), "points": listed(np.ones((1_000_001, 3)))}
+        )
+    },
+    "gravity of length 7": {PROBLEM: array("gravity_camera", np.array([7.0, 0.0, 0.0]))},
+    "a pose that is no rotation": {RUN: array("cam_from_map", np.ones((3, 4)))},
+    "a pose that is not finite": {RUN: array("cam_from_map", np.full((3, 4), np.nan))},
+    "a pose of a wrong shape": {RUN: array("cam_from_map", np.ones(12))},
+    "inliers of a wrong shape": {RUN: array("inlier_mask", np.ones(7, bool))},
+    "inliers of a wrong type": {RUN: array("inlier_mask", np.ones(100))},
+    "a camera with absurd sides": {PROBLEM: camera(width=10**9, height=10**9)},
+    "a camera with endless sides": {PROBLEM: camera(width={"number": "inf"})},
+    "a camera of no kind": {PROBLEM: camera(model="__import__('os')")},
+    "a camera that is a word": {PROBLEM: scalars(camera="mei")},
+    "an endless bound": {PROBLEM: scalars(bound_px={"number": "inf"})},
+    "a bound that is a word": {PROBLEM: scalars(bound_px="3")},
+    "a name of 10 MB": {PROBLEM: scalars(name="x" * 10_000_000)},
+    "a name of 100 kB": {PROBLEM: scalars(name="x" * 100_000)},
+    "a name with half a character": {PROBLEM: scalars(name="\ud800")},
+    "a million reference images": {PROBLEM: scalars(reference_images=["a"] * 500_000)},
+    "lists nested a million times": {PROBLEM: text("[" * 1_000_000 + "]" * 1_000_000)},
+    "tables nested ten times": {PROBLEM: scalars(remarks=[[[[[[[[[["deep"]]]]]]]]]])},
+    "a number of 100,000 digits": {PROBLEM: text('{"name": ' + "9" * 100_000 + "}")},
+    "JSON with NaN": {PROBLEM: text('{"name": NaN}')},
+    "no JSON": {PROBLEM: text("hello")},
+    "JSON of a list": {PROBLEM: text("[]")},
+    "a seed that is a word": {RUN: scalars(seed="one")},
+    "an option that is a table": {RUN: scalars(options={"bound_px": {"a": 1}})},
+    "options that are a list": {RUN: scalars(options=[1, 2])},
+    "another estimator than the row": {RUN: scalars(estimator="ransac-2p")},
+    "a field that no run has": {RUN: lambda columns: text('{"__class__": "Path"}')(columns)},
+    "a later format": {RUN_PROPERTY: properties(format_version=99)},
+    "a format that is a word": {RUN_PROPERTY: properties(format_version="2")},
+    "-1 inliers": {RUN_PROPERTY: properties(inliers=-1)},
+    "more inliers than correspondences": {RUN_PROPERTY: properties(inliers=101)},
+    "other correspondences than the problem": {RUN_PROPERTY: properties(correspondences=10**9)},
+    "a time that is not finite": {RUN_PROPERTY: properties(time_ms=float("nan"))},
+    "an error below nothing": {RUN_PROPERTY: properties(rotation_error_deg=-1.0)},
+    "150 % outliers": {RUN_PROPERTY: properties(outlier_rate=1.5)},
+    "a decisive step that there is not": {RUN_PROPERTY: properties(decisive_step=10**6)},
+    "a cause that there is not": {RUN_PROPERTY: properties(diagnosis="<script>alert(1)</script>")},
+    "an outcome that there is not": {RUN_PROPERTY: properties(outcome="' OR 1=1 --")},
+    "a date that is none": {RUN_PROPERTY: properties(created="<b>today</b>")},
+    "a date in another order": {RUN_PROPERTY: properties(created="20260101T120000Z")},
+    "an estimator with a path": {RUN_PROPERTY: properties(estimator="../../etc")},
+    "options that are no JSON": {RUN_PROPERTY: properties(options="{")},
+    "a thumbnail that claims 60,000 pixels a side": {
+        "/__properties/thumbnail": lambda columns: columns | {"EncodedImage:blob": huge_png(columns)}
+    },
+}
+
+
+def huge_png(columns: dict[str, Any]) -> pa.Array:
+    content = np.array(columns["EncodedImage:blob"][0].values[0].as_py(), np.uint8)
+    content[16:24] = np.frombuffer(struct.pack(">II", 60_000, 60_000), np.uint8)
+    return pa.array([[content]], pa.list_(pa.list_(pa.uint8())))
+
+
+@pytest.mark.parametrize("what", IMPOSSIBLE)
+def test_impossible_values_are_one_sentence(good: Path, examiner: Examiner, tmp_path: Path, what: str) -> None:
+    sentence(examiner, changed(good, tmp_path / "bad.rrd", IMPOSSIBLE[what]))
+
+
+# ---------------------------------------------------------------------------------------------- one file's fault
+
+
+def test_a_bad_file_costs_the_others_nothing(good: Path, tmp_path: Path) -> None:
+    deadly, huge = tmp_path / "deadly.rrd", tmp_path / "huge.rrd"
+    deadly.write_bytes(ends_the_reader(good))
+    huge.write_bytes(unpacks_to_much(good))
+    paths = [good, deadly, good, huge, tmp_path, good]
+    results = list(examine_all(paths))
+    assert [path for path, _ in results] == paths
+    assert [isinstance(result, RunRow) for _, result in results] == [True, False, True, False, False, True]
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="the system does not tell")
+def test_a_huge_recording_fills_no_memory(good: Path, tmp_path: Path, examiner: Examiner) -> None:
+    path = tmp_path / "huge.rrd"
+    path.write_bytes(unpacks_to_much(good))
+    row = examiner.examine(good)
+    assert "allocat" in sentence(examiner, path)
+    assert examiner._child is not None
+    status = Path(f"/proc/{examiner._child._process.pid}/status").read_text()
+    (most_kb,) = re.findall(r"VmHWM:\s+(\d+) kB", status)
+    assert int(most_kb) < 700_000
+    assert examiner.examine(good) == row, "by the same child"
+
+
+@pytest.mark.parametrize("sign", [signal.SIGSTOP, signal.SIGALRM])
+def test_a_child_that_hangs_or_has_ended_is_replaced(
+    good: Path, examiner: Examiner, monkeypatch: pytest.MonkeyPatch, sign: signal.Signals
+) -> None:
+    monkeypatch.setattr(strangers, "BEGIN_LIMIT_S", 0.5)
+    row = examiner.examine(good)
+    before = examiner._child
+    assert before is not None
+    before._process.send_signal(sign)
+    assert examiner.examine(good) == row
+    assert examiner._child is not before and before._process.returncode is not None
+
+
+def test_the_child_is_limited_in_time_and_what_it_writes(tmp_path: Path) -> None:
+    program = f"""
+from spherloc_viz.recording import examine
+examine.TIME_LIMIT_S = 1
+examine._limit_process()
+try:
+    examine.Path({str(tmp_path / "made")!r}).write_text("x")
+except OSError as error:
+    print(error.strerror, flush=True)
+examine._limit_time()
+while True:
+    pass
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == -signal.SIGXCPU and done.stdout == "File too large\n", done.stderr
+
+
+def test_many_threads_may_examine(good: Path, examiner: Examiner) -> None:
+    rows: list[RunRow] = []
+    threads = [threading.Thread(target=lambda: rows.append(examiner.examine(good))) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(rows) == 4 and len(set(rows)) == 1
+
+
+def test_one_file_is_examined_by_a_child_that_stays(
+    good: Path, examiner: Examiner, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(strangers, "_shared", examiner)
+    row, child = examine(good), examiner._child
+    assert examine(good) == row and child is not None
+    assert examiner._child is child and child._process.poll() is None
+
+
+def test_a_child_that_cannot_be_started_is_no_fault_of_a_file(good: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "executable", "/nowhere/python")
+    with pytest.raises(RecordingError, match="does not start"):
+        list(examine_all([good]))
+
+
+# ---------------------------------------------------------------------------------------------- names
+
+
+def test_names_of_recordings(tmp_path: Path) -> None:
+    for name in ("run.rrd", "20260101T120000Z_a-b.c_mc_0_1a2b3c4d.rrd", "gallery/seam.rrd"):
+        assert check_name(name) == name
+
+
+NO_NAMES = r"""
+../run.rrd /etc/run.rrd gallery/../run.rrd other/run.rrd gallery//run.rrd gallery/gallery/run.rrd run.RRD run .rrd
+run.rrd/ ./run.rrd C:\run.rrd gallery\run.rrd run.rrd;ls $(ls).rrd %2e%2e%2frun.rrd ünicode.rrd run.rrd?x ~/run.rrd
+<b>.rrd runs.sqlite run.rrd.part
+"""
+
+
+@pytest.mark.parametrize("name", [*NO_NAMES.split(), "", "a b.rrd", "run.rrd\n", "run\0.rrd", "x" * 300 + ".rrd"])
+def test_names_that_lead_elsewhere_are_refused(tmp_path: Path, name: str) -> None:
+    with pytest.raises(RecordingError) as error:
+        resolve_inside(tmp_path, name)
+    assert str(error.value).isprintable() and len(str(error.value)) < 300
+
+
+def test_names_are_found_in_their_folder_only(tmp_path: Path) -> None:
+    folder, outside = tmp_path / "recordings", tmp_path / "secret.rrd"
+    (folder / "gallery").mkdir(parents=True)
+    outside.touch()
+    inside = [folder / "run.rrd", folder / "gallery" / "seam.rrd"]
+    for path in inside:
+        path.touch()
+        assert resolve_inside(folder, str(path.relative_to(folder))) == path
+    (folder / "link.rrd").symlink_to("run.rrd")
+    assert resolve_inside(folder, "link.rrd").samefile(inside[0])
+    (folder / "out.rrd").symlink_to(outside)
+    (folder / "loop.rrd").symlink_to("loop.rrd")
+    (folder / "folder.rrd").mkdir()
+    os.mkfifo(folder / "pipe.rrd")
+    for name in ("out.rrd", "loop.rrd", "folder.rrd", "pipe.rrd", "missing.rrd"):
+        with pytest.raises(RecordingError, match="no such recording"):
+            resolve_inside(folder, name)
+
+
+def test_a_gallery_elsewhere_is_not_followed(tmp_path: Path) -> None:
+    folder, outside = tmp_path / "recordings", tmp_path / "outside"
+    folder.mkdir()
+    outside.mkdir()
+    (outside / "run.rrd").touch()
+    (folder / "gallery").symlink_to(outside)
+    with pytest.raises(RecordingError, match="no such recording"):
+        resolve_inside(folder, "gallery/run.rrd")

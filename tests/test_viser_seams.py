@@ -1,0 +1,81 @@
+"""What is changed about viser itself."""
+
+import sys
+import threading
+from collections.abc import Iterator
+
+import pytest
+import viser
+from viser import _messages
+
+from spherloc_viz.app.web.viser_seams import start_viser, stop_viser
+from tests.connected_page import ConnectedPage, until
+
+KEY = "a key of this test"
+THREADS, ROUNDS, MESSAGES = 4, 30, 20
+
+
+@pytest.fixture
+def server() -> Iterator[viser.ViserServer]:
+    server = start_viser(KEY)
+    yield server
+    stop_viser(server)
+
+
+@pytest.fixture
+def pages(server: viser.ViserServer) -> Iterator[list[ConnectedPage]]:
+    """Two pages that wait for messages."""
+    pages = [ConnectedPage(server, KEY) for _ in range(2)]
+    yield pages
+    for page in pages:
+        page.close()
+
+
+@pytest.fixture
+def hasty() -> Iterator[None]:
+    """Threads take turns as often as can be."""
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    yield
+    sys.setswitchinterval(before)
+
+
+def test_threads_that_queue_messages_at_once_neither_fail_nor_lose_one(
+    server: viser.ViserServer, pages: list[ConnectedPage], hasty: None
+) -> None:
+    """After every round all messages arrive without another that would wake whoever sends them."""
+    heard: list[set[str]] = [set(), set()]
+    for page, names in zip(pages, heard, strict=True):
+        page.answer = lambda message, names=names: names.add(message.get("uuid", ""))
+    ways = [server._websock_server, *(page.handle._websock_connection for page in pages)]
+    failures: list[Exception] = []
+
+    def queue(number: int, turn: int) -> None:
+        try:
+            for k in range(MESSAGES):
+                for way, name in zip(ways, ("all", "0", "1"), strict=True):
+                    message = _messages.GuiUpdateMessage(f"{name}.{turn}.{number}.{k}", {"value": k})
+                    way.queue_message(message)
+        except Exception as error:
+            failures.append(error)
+
+    for turn in range(ROUNDS):
+        threads = [threading.Thread(target=queue, args=(number, turn)) for number in range(THREADS)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert not failures
+        for page, names in enumerate(heard):
+            marks = [f"{turn}.{number}.{k}" for number in range(THREADS) for k in range(MESSAGES)]
+            wanted = {f"{way}.{mark}" for way in ("all", page) for mark in marks}
+            until(lambda wanted=wanted, names=names: wanted <= names)
+
+
+def test_nobody_is_woken_on_a_thread_of_ours(server: viser.ViserServer, pages: list[ConnectedPage]) -> None:
+    ways = [server._websock_server, *(page.handle._websock_connection for page in pages)]
+    for way in ways:
+        event = way.get_message_buffer().message_event
+        until(lambda event=event: len(event._waiters) > 0 and not event.is_set())
+        event.set()
+        assert not event.is_set()
