@@ -23,11 +23,10 @@ from spherloc_viz.options import json_text, option_fields
 from spherloc_viz.progress import prepare, say
 from spherloc_viz.recording.origin import Origin
 from spherloc_viz.recording.room import KEEP_GIGABYTES, kept_bytes
+from spherloc_viz.share import is_recording
 
 if TYPE_CHECKING:
     from spherloc_viz.recording.keeper import Keeper
-
-RECORDING = ".rrd"
 
 
 @dataclass(frozen=True)
@@ -82,7 +81,7 @@ def run_scenes(
 
 def open_scene(path: Path) -> Scene:
     """The scene of a scene file or of a recording; raises ``SpherlocError`` if it is neither."""
-    if path.suffix.lower() != RECORDING:
+    if not is_recording(path):
         return load_scene(path)
     from spherloc_viz.recording.scene import load_recorded_scene
 

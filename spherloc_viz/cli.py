@@ -235,8 +235,10 @@ def play(
 app.command(recording_commands.view)
 app.command(recording_commands.repeat)
 app.command(recording_commands.runs)
+app.command(recording_commands.steps)
 app.command(recording_commands.label)
 app.command(recording_commands.reindex)
+app.command(recording_commands.gallery)
 
 
 @app.command

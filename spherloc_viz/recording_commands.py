@@ -169,6 +169,38 @@ def runs(
     return listing.print_runs(folder, query, group, limit, format)
 
 
+def steps(
+    condition: Positional[str],
+    folder: Positional[Path] = RECORDINGS,
+    /,
+    limit: int | None = None,
+    format: str = "table",
+) -> int:
+    """List the steps of recorded runs for which a condition holds, such as those that had the right pose and lost it.
+
+    The condition is SQL of columns, numbers, texts, comparisons, AND, OR, NOT, IN, BETWEEN, LIKE, IS NULL and
+    arithmetic. Columns of a step: step (its index), stage, key (its name), agreeing (matches), rotation_error_deg,
+    position_error_m (of its pose). Columns of its run: created, source, scene, name, estimator, seed, outcome,
+    diagnosis, doubtful, correspondences, inliers, outlier_rate, steps, decisive_step, time_ms. What is unknown is NULL.
+    Needs the extra "catalog".
+
+    For example:
+
+    spherloc steps "position_error_m < 0.1 AND outcome = 'failure'"
+
+    spherloc steps "stage = 'Refinement' AND agreeing < 0.2 * correspondences" recordings --format csv
+
+    Args:
+        condition: What must be true of a step.
+        folder: Folder of the recordings.
+        limit: How many steps to list; 0 for all. A table has 50 if it is not given, JSON and CSV have all.
+        format: table, json or csv.
+    """
+    from spherloc_viz.runs import print_steps
+
+    return print_steps(folder, condition, limit, format)
+
+
 def label(
     recordings: Positional[tuple[Path, ...]],
     /,
@@ -214,3 +246,37 @@ def reindex(folder: Positional[Path] = RECORDINGS, /) -> int:
     from spherloc_viz.runs import reindex as read_all
 
     return read_all(folder)
+
+
+def gallery(
+    keys: Positional[tuple[str, ...]] = (),
+    /,
+    output: Path = RECORDINGS / "gallery",
+    list: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
+) -> int:
+    """Run and record the gallery: failures worth seeing, each with its story.
+
+    Prints a line for each, and says what is not as its story tells; ends with 1 if there is such a case.
+
+    For example:
+
+    spherloc gallery
+
+    spherloc gallery --list
+
+    spherloc gallery table-vi-1 pairs-outvote --output my_gallery
+
+    Args:
+        keys: Cases by their keys; all if none is given.
+        output: Folder of the recordings; those that it has of the same cases are replaced.
+        list: Print keys, titles and stories, and run nothing.
+    """
+    from spherloc_viz.gallery import gallery_cases
+    from spherloc_viz.gallery.regenerate import chosen, regenerate, stories
+    from spherloc_viz.progress import say
+
+    cases = chosen(gallery_cases(), keys)
+    if list:
+        print(stories(cases))
+        return 0
+    return 1 if regenerate(cases, output, say) else 0

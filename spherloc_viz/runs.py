@@ -37,25 +37,43 @@ def print_runs(folder: Path, query: RunQuery, group: str | None, limit: int | No
 
     Raises ``InputError`` for a folder, group or form that there is not, and for values that no run can have.
     """
-    form = one_of("format", form, FORMS)
+    form, most = one_of("format", form, FORMS), _limit(limit, form)
     key = None if group is None else one_of("group", group.replace("-", "_"), GROUP_KEYS)
-    if limit is not None and limit < 0:
-        raise InputError(f"--limit {limit} is negative: give how many runs to show, or 0 for all.")
     with _open(folder) as index:
-        skipped = _read_files(index, everything=False).skipped
-        if skipped:
-            say(f"{_count(len(skipped), 'file')} left out, such as {skipped[0][0]}; spherloc reindex says why.")
+        _refresh(index)
         _check_estimator(index, query)
         if key is not None:
             print(counts_text(key, index.groups(query, key), form), end="", flush=True)
             return 0
-        most = (TABLE_LIMIT if form == "table" else None) if limit is None else limit or None
         found = index.find(query, most)
         print(rows_text(folder, found.rows, form), end="", flush=True)
         if not found.total:
             say(f"no run matches; there are {_count(index.find(RunQuery(), 1).total, 'run')} in {folder}.")
         elif len(found.rows) < found.total:
             say(f"{len(found.rows):,} of {found.total:,} runs; --limit 0 shows all.")
+    return 0
+
+
+def print_steps(folder: Path, condition: str, limit: int | None, form: str) -> int:
+    """List the steps of a folder's runs for which a condition holds; returns the exit code.
+
+    Raises ``InputError`` for a condition that cannot be understood, and as ``print_runs`` does.
+    """
+    from spherloc_viz.recording.catalog import find_steps
+    from spherloc_viz.recording.step_condition import checked_condition
+    from spherloc_viz.recording.step_text import steps_text
+
+    form, most = one_of("format", form, FORMS), _limit(limit, form)
+    checked_condition(condition)
+    with _open(folder) as index:
+        _refresh(index)
+        rows = index.find(RunQuery(), None).rows
+    found = find_steps(folder, rows, condition, None if most is None else most + 1)
+    print(steps_text(folder, found[:most], form), end="", flush=True)
+    if not found:
+        say(f"no step matches in {_count(len(rows), 'run')} of {folder}.")
+    elif most is not None and len(found) > most:
+        say(f"the first {_count(most, 'step')}; --limit 0 shows all.")
     return 0
 
 
@@ -162,6 +180,21 @@ def _open(folder: Path) -> RunIndex:
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder of recordings; run a scene first, or name another folder.")
     return RunIndex(folder, say)
+
+
+def _limit(limit: int | None, form: str) -> int | None:
+    """How many to list, None for all; raises ``InputError`` for a negative number."""
+    if limit is None:
+        return TABLE_LIMIT if form == "table" else None
+    if limit < 0:
+        raise InputError(f"--limit {limit} is negative: give how many to list, or 0 for all.")
+    return limit or None
+
+
+def _refresh(index: RunIndex) -> None:
+    """Read what is new; files that are no runs are a line."""
+    if skipped := _read_files(index, everything=False).skipped:
+        say(f"{_count(len(skipped), 'file')} left out, such as {skipped[0][0]}; spherloc reindex says why.")
 
 
 def _read_files(index: RunIndex, everything: bool) -> Refreshed:

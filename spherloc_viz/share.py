@@ -13,25 +13,30 @@ from spherloc.errors import InputError
 from spherloc.estimators import options_type
 from spherloc_viz.options import NONE
 
+RECORDING = ".rrd"
 WORDS = {"spoiled": "--spoil", "mended": "--mend", "hidden": "--hide"}
 
 
 def as_python(
     scene_path: Path, seed: int, query: str | None, variation: Variation, estimator: str, options: Any
 ) -> str:
-    """A script that solves the problem and prints the pose with all its digits; it says what differs from defaults."""
-    changes = _written_changes(variation)
+    """A script that solves the problem and prints the pose with all its digits; it says what differs from defaults.
+
+    ``scene_path`` is a scene file or a recording.
+    """
+    changes, recorded = _written_changes(variation), is_recording(scene_path)
     given = ", ".join(f"{name}={_code(value)}" for name, value in changes.items())
     chosen = [str(seed)] if query is None else [str(seed), _code(query)]
     options_given = ", ".join(f"{name}={_code(value)}" for name, value in _changed(scene_path, estimator, options))
     lines = [
         "from pathlib import Path",
         "",
-        "from spherloc.datasets import load_scene",
+        *([] if recorded else ["from spherloc.datasets import load_scene"]),
         *(["from spherloc.datasets.variation import Variation"] if changes else []),
         f"from spherloc.estimators import {'estimate, options_type' if options_given else 'estimate'}",
+        *(["from spherloc_viz.recording.scene import load_recorded_scene"] if recorded else []),
         "",
-        f"scene = load_scene(Path({_code(_written(scene_path))}))",
+        f"scene = {'load_recorded_scene' if recorded else 'load_scene'}(Path({_code(_written(scene_path))}))",
         f"problem = Variation({given}).problem(scene, {', '.join(chosen)})"
         if changes
         else f"problem = scene.problem({', '.join(chosen)})",
@@ -46,7 +51,10 @@ def as_python(
 def as_command(
     scene_path: Path, seed: int, query: str | None, variation: Variation, estimator: str, options: Any
 ) -> str:
-    """A command line that solves the problem, quoted for a shell; it says what differs from defaults."""
+    """A command line that solves the problem, quoted for a shell; it says what differs from defaults.
+
+    ``scene_path`` is a scene file or a recording.
+    """
     changes = _written_changes(variation)
     words = ["spherloc", "run", _written(scene_path)]
     if words[-1].startswith("-"):
@@ -66,6 +74,11 @@ def as_command(
     return shlex.join(words)
 
 
+def is_recording(path: Path) -> bool:
+    """Whether a path that is given as a scene is that of a recording."""
+    return path.suffix.lower() == RECORDING
+
+
 def _written_changes(variation: Variation) -> dict[str, Any]:
     """The fields of a variation that change something, with its camera's path as it is written."""
     changes = variation.simulation
@@ -82,11 +95,15 @@ def _written(path: Path) -> str:
 
 def _changed(scene_path: Path, estimator: str, options: Any) -> list[tuple[str, Any]]:
     """Options that are not what the estimator would take for the scene."""
+    kind = options_type(estimator)
+    if is_recording(scene_path):
+        # Its problem may state a bound, which is not known here: what is named is right in either case.
+        pairs = [(item.name, getattr(options, item.name)) for item in fields(options)]
+        return [(name, value) for name, value in pairs if name == "bound_px" or value != getattr(kind(), name)]
     try:
         stated = scene_file.bound_px(scene_file.read_table(scene_path), str(scene_path))
     except InputError:
         stated = None
-    kind = options_type(estimator)
     default = kind() if stated is None else kind(bound_px=stated)
     values = [(item.name, getattr(options, item.name), getattr(default, item.name)) for item in fields(options)]
     named = [(name, value) for name, value, usual in values if value != usual]

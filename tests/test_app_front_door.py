@@ -25,6 +25,7 @@ from spherloc_viz.app.web.front_door import FrontDoor
 from spherloc_viz.app.web.guard import is_own_name, open_socket, refusal
 from spherloc_viz.app.web.page import load_page
 from spherloc_viz.app.web.touch import MOST_BYTES, Touch, TouchDesk, Touches
+from spherloc_viz.app.web.viewer_room import ViewerRoom
 
 KEY = "a key of this test"
 VERSION = f"viser-v{viser.__version__}"
@@ -123,9 +124,9 @@ class Door:
 
 
 @asynccontextmanager
-async def door_to(port: int, desk: TouchDesk | None = None) -> AsyncIterator[Door]:
+async def door_to(port: int, desk: TouchDesk | None = None, viewer: ViewerRoom | None = None) -> AsyncIterator[Door]:
     listener = open_socket("127.0.0.1", 0)
-    runner = await FrontDoor("127.0.0.1", port, KEY, desk or TouchDesk()).start(listener)
+    runner = await FrontDoor("127.0.0.1", port, KEY, desk or TouchDesk(), viewer).start(listener)
     try:
         async with aiohttp.ClientSession() as client:
             yield Door(listener.getsockname()[1], client)

@@ -20,6 +20,7 @@ from spherloc_viz.app.services import Services
 from spherloc_viz.app.session import Session
 from spherloc_viz.app.web.touch import Touch
 from spherloc_viz.app.web.viser_seams import start_viser, stop_viser
+from spherloc_viz.recording.origin import Origin
 from tests.connected_page import Wire, until
 
 KEY = "a key of this test"
@@ -44,12 +45,15 @@ class Notes:
 
     def __init__(self) -> None:
         self.traces: list[Trace] = []
+        self.origins: list[Origin | None] = []
         self.full = False
+        self.overload = ""
 
-    def submit(self, trace: Trace) -> Path:
+    def submit(self, trace: Trace, origin: Origin | None = None, diagnosis: Diagnosis | None = None) -> Path:
         if self.full:
             raise RecordingError("run.rrd: the disk is full; make room.")
         self.traces.append(trace)
+        self.origins.append(origin)
         return Path(f"run-{len(self.traces)}.rrd")
 
 

@@ -26,7 +26,7 @@ from spherloc.estimators import estimate
 from spherloc_viz.recording import strangers
 from spherloc_viz.recording.examine import FILE_LIMIT_BYTES
 from spherloc_viz.recording.reader import read_recording
-from spherloc_viz.recording.review import review_path, write_review
+from spherloc_viz.recording.review import Review, review_path, write_review
 from spherloc_viz.recording.run_row import RunRow
 from spherloc_viz.recording.strangers import Examiner, check_name, examine, examine_all, resolve_inside
 from spherloc_viz.recording.writer import write_recording
@@ -68,6 +68,9 @@ def test_labels_and_note_come_with_the_row(good: Path, examiner: Examiner, tmp_p
     write_review(path, ["look again", "ü & <b>"], "One line.\nAnother one.")
     row = examiner.examine(path)
     assert row.labels == ("look again", "ü & <b>") and row.note == "One line.\nAnother one."
+    review = examiner.examine_review(path)
+    assert (review.labels, review.note) == (row.labels, row.note)
+    assert examiner.examine_review(good) == Review()
 
 
 def test_a_run_is_still_a_run_when_its_labels_cannot_be_read(good: Path, examiner: Examiner, tmp_path: Path) -> None:
@@ -79,6 +82,9 @@ def test_a_run_is_still_a_run_when_its_labels_cannot_be_read(good: Path, examine
     for content in (b"", review.read_bytes()[:-40], deadly.read_bytes(), good.read_bytes()):
         review.write_bytes(content)
         assert examiner.examine(path).labels == ()
+        with pytest.raises(RecordingError) as error:
+            examiner.examine_review(path)
+        assert str(error.value).startswith(f"{review}: ")
 
 
 # ---------------------------------------------------------------------------------------------- no recordings
@@ -220,7 +226,14 @@ def camera(**values: Any) -> Change:
     return scalars(camera={"model": "equirectangular", "width": 100, "height": 50} | values)
 
 
-RANDOM = np.random.default_rng(0)
+def variation(**values: Any) -> Change:
+    def change(columns: dict[str, Any]) -> dict[str, Any]:
+        before = json.loads(columns["scalars"][0].values[0].as_py())["variation"]
+        return scalars(variation=before | values)(columns)
+
+    return change
+
+
 RUNS_ENDED = pa.RunEndEncodedArray.from_arrays(pa.array([10**9], pa.int32()), pa.array([1.0]))
 
 IMPOSSIBLE: dict[str, dict[str, Change]] = {
@@ -266,6 +279,15 @@ IMPOSSIBLE: dict[str, dict[str, Change]] = {
     "an option that is a table": {RUN: scalars(options={"bound_px": {"a": 1}})},
     "options that are a list": {RUN: scalars(options=[1, 2])},
     "another estimator than the row": {RUN: scalars(estimator="ransac-2p")},
+    "a source that there is not": {"/data/origin": scalars(source="evil")},
+    "a title that is a list": {"/data/origin": scalars(title=["<b>"])},
+    "a query that is a number": {"/data/origin": scalars(query=7)},
+    "a change of the noise to a word": {"/data/origin": variation(noise_px="much")},
+    "a change of match 'a'": {"/data/origin": variation(spoiled=["a"])},
+    "a true camera of three numbers": {"/data/origin": variation(true_camera=[1.0, 2.0, 3.0])},
+    "a kind of outliers that there is not": {"/data/origin": variation(outlier_kind="evil")},
+    "another cause than there is": {"/data/diagnosis": scalars(cause="<script>")},
+    "evidence that is no text": {"/data/diagnosis": scalars(evidence=[1, 2])},
     "a field that no run has": {RUN: lambda columns: text('{"__class__": "Path"}')(columns)},
     "a later format": {RUN_PROPERTY: properties(format_version=99)},
     "a format that is a word": {RUN_PROPERTY: properties(format_version="2")},

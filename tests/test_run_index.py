@@ -231,12 +231,13 @@ from pathlib import Path
 sys.path.insert(0, {tests!r})
 from run_rows import some_row
 from spherloc_viz.recording.index import RunIndex
+from spherloc_viz.recording.query import RunQuery
 print("ready", flush=True)
 sys.stdin.readline()
 with RunIndex(Path({folder!r})) as index:
     for number in range(200):
         index.add(some_row({name!r} + "-" + str(number) + ".rrd"))
-        index.find(index_query := __import__("spherloc_viz.recording.query", fromlist=["RunQuery"]).RunQuery(), 5)
+        index.find(RunQuery(), 5)
 """
 
 

@@ -21,7 +21,7 @@ GROUP_KINDS: tuple[str, ...] = get_args(GroupKind)
 CUBE = "cube"
 MOST_MATCHES = 2_000
 NEAR_M = 0.5
-NEAR_YAW_DEG = 3.0
+NEAR_YAW_DEG = 5.0
 """How far a pose that passes for the true one is from it."""
 
 

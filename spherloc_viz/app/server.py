@@ -25,7 +25,7 @@ from spherloc_viz.app.stage import views
 from spherloc_viz.app.status import Status
 from spherloc_viz.app.web.front_door import FrontDoor
 from spherloc_viz.app.web.guard import open_socket
-from spherloc_viz.app.web.viewer_room import ViewerRoom, of_folder
+from spherloc_viz.app.web.viewer_room import ViewerRoom, of_index
 from spherloc_viz.app.web.viser_seams import set_theme, start_viser, stop_viser
 from spherloc_viz.recording.background import Recorder
 from spherloc_viz.recording.index import RunIndex
@@ -65,7 +65,7 @@ def serve(
             )
         index = _open_index(services.recorder, recordings, stack)
         services.shelf = None if index is None else Shelf(index)
-        viewer = None if index is None else ViewerRoom(of_folder(recordings, lambda: index))
+        viewer = None if index is None else ViewerRoom(of_index(index))
         key = secrets.token_urlsafe(32)
         server = start_viser(key)
         stack.callback(stop_viser, server)

@@ -16,7 +16,7 @@ from spherloc.trace import Trace
 from spherloc_viz.recording.origin import Origin
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Play:
     """All that a run depends on. It has a scene file or a staged scene, not both."""
 
@@ -54,7 +54,7 @@ class Play:
         return estimate(self.problem(), self.estimator, self.options, self.seed)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Beside(Play):
     """Another run that shows what the case's depends on: another method, or the cause taken away."""
 
@@ -66,7 +66,7 @@ class Beside(Play):
     """Whether it is worth a recording of its own."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class GalleryCase(Play):
     """A run that fails, why, and how one can tell."""
 

@@ -5,6 +5,8 @@ from collections.abc import Iterator
 from dataclasses import astuple, dataclass
 from typing import Any
 
+import numpy as np
+
 from spherloc.diagnosis import Diagnosis, diagnose
 from spherloc.metrics import SUCCESS_DEG, SUCCESS_M, evaluate
 from spherloc.trace import Trace
@@ -68,9 +70,9 @@ def _wrong_facts(where: str, told: Play, trace: Trace) -> Iterator[str]:
 
 
 def agrees(told: float, measured: float) -> bool:
-    """Whether a number was measured as it is told: whole ones exactly, others up to one in their last digit."""
+    """Whether a number was measured as it is told: whole ones when rounded, others up to one in their last digit."""
     if isinstance(told, int):
-        return told == measured
+        return bool(told == np.round(measured))
     decimals = len(repr(told).partition(".")[2])
     return bool(abs(told - measured) <= 10.0**-decimals)
 

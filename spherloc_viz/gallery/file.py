@@ -34,7 +34,11 @@ def gallery_cases(path: Path = GALLERY) -> tuple[GalleryCase, ...]:
 
     Raises ``InputError``, in one sentence, for a file that is missing or says something that is not understood.
     """
-    table = scene_file.read_table(path)
+    return parse_gallery(scene_file.read_table(path), path)
+
+
+def parse_gallery(table: Mapping[str, Any], path: Path) -> tuple[GalleryCase, ...]:
+    """The cases that the keys of a gallery's file describe; raises as ``gallery_cases`` does."""
     check_keys(table, {"case"}, set(), str(path))
     tables = table["case"]
     if not isinstance(tables, list) or not all(isinstance(item, dict) for item in tables):

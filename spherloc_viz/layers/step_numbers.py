@@ -58,7 +58,11 @@ def match_colors(picture: Picture) -> ColorArray:
 
 def agreeing(colors: ColorArray) -> np.ndarray:
     """Which of the colours (N, 3) say that a match agrees, (N,)."""
-    return np.any([(colors == np.array(color, np.uint8)).all(axis=1) for color in AGREEING], axis=0)
+    red, green, blue = colors.T
+    marked = np.zeros(len(colors), dtype=bool)
+    for r, g, b in AGREEING:
+        marked |= (red == r) & (green == g) & (blue == b)
+    return marked
 
 
 def step_pose(trace: Trace, key: str) -> FloatArray | None:

@@ -85,7 +85,7 @@ def _fits(name: str, value: Any) -> bool:
     if isinstance(value, str):
         return str in (kind, *get_args(kind)) and _text_fits(name, value)
     if isinstance(value, bytes):
-        return kind is bytes and _thumbnail_fits(value)
+        return kind is bytes and is_thumbnail(value)
     if isinstance(value, tuple):
         texts = [isinstance(item, str) and _text_fits(name, item) for item in value]
         return name == "labels" and len(value) <= LABELS_LIMIT and all(texts)
@@ -128,7 +128,8 @@ def _number_fits(name: str, value: float) -> bool:
     return name != "outlier_rate" or value <= 1.0
 
 
-def _thumbnail_fits(picture: bytes) -> bool:
+def is_thumbnail(picture: bytes) -> bool:
+    """Whether it is a small PNG, or nothing; its pixels are not decoded."""
     if not picture:
         return True
     sides = (int.from_bytes(picture[start : start + 4], "big") for start in (16, 20))

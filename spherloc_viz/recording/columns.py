@@ -39,9 +39,9 @@ class Values:
         lengths = np.asarray(self.lengths, np.int32)
         if places is None:
             return Column(self.descriptor, _lists(lengths, self.values))
-        every, absent = np.zeros(count, np.int32), np.ones(count, bool)
-        every[places], absent[places] = lengths, False
-        return Column(self.descriptor, _lists(every, self.values, pa.array(absent)))
+        every, present = np.zeros(count, np.int32), np.zeros(count, bool)
+        every[places], present[places] = lengths, True
+        return Column(self.descriptor, _lists(every, self.values, present))
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,10 +76,17 @@ class Times:
         return self.steps
 
 
-def _lists(lengths: NDArray[np.int32], values: pa.Array, absent: pa.Array | None = None) -> pa.ListArray:
+def _lists(lengths: NDArray[np.int32], values: pa.Array, present: NDArray[np.bool_] | None = None) -> pa.ListArray:
+    """Lists of these lengths (R,), null where they are not present."""
+    bits = None if present is None else pa.py_buffer(np.packbits(present, bitorder="little"))
+    parts = [bits, pa.py_buffer(_offsets(lengths))]
+    return pa.Array.from_buffers(pa.list_(values.type), len(lengths), parts, -1, 0, [values])
+
+
+def _offsets(lengths: Sequence[int] | NDArray[Any]) -> NDArray[np.int32]:
     offsets = np.zeros(len(lengths) + 1, np.int32)
     np.cumsum(lengths, out=offsets[1:])
-    return pa.ListArray.from_arrays(pa.array(offsets), values, mask=absent)
+    return offsets
 
 
 def vectors(array: NDArray[Any], kind: pa.DataType) -> pa.Array:
@@ -90,9 +97,7 @@ def vectors(array: NDArray[Any], kind: pa.DataType) -> pa.Array:
 
 def strips(points: NDArray[Any], lengths: Sequence[int] | NDArray[np.int64], kind: pa.DataType) -> pa.Array:
     """Points (P, 2) or (P, 3) as strips of these lengths."""
-    offsets = np.zeros(len(lengths) + 1, np.int32)
-    np.cumsum(lengths, out=offsets[1:])
-    return pa.ListArray.from_arrays(pa.array(offsets), vectors(points, kind.value_type), type=kind)
+    return pa.ListArray.from_arrays(pa.array(_offsets(lengths)), vectors(points, kind.value_type), type=kind)
 
 
 def numbers(array: Any, dtype: type = np.float32) -> pa.Array:

@@ -7,10 +7,11 @@ import io
 import json
 import warnings
 from collections.abc import Mapping
+from dataclasses import is_dataclass
 from math import isfinite
-from numbers import Real
 from pathlib import Path
-from typing import Any
+from types import UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 import pyarrow as pa
@@ -120,7 +121,7 @@ def check_run(run: RecordedRun, path: Path) -> None:
     count, row = len(run.problem), run.row
     pose, mask = run.cam_from_map, run.inlier_mask
     good = {
-        "the pose": pose is None or _is_pose(pose),
+        "the pose": _is_pose_or_none(pose),
         "the inliers": isinstance(mask, np.ndarray) and mask.shape == (count,) and mask.dtype == np.bool_,
         "the message": isinstance(run.message, str),
         "the estimator": run.estimator == row.estimator,
@@ -130,8 +131,11 @@ def check_run(run: RecordedRun, path: Path) -> None:
         "the versions": _is_table(run.versions, (str,)),
         "the timings": _is_table(run.timings_ms, (int, float)) and all(map(isfinite, run.timings_ms.values())),
         "the number of correspondences": row.correspondences == count,
-        "the certificate": run.certificate is None
-        or all(isinstance(value, Real) for value in vars(run.certificate).values()),
+        "the certificate": run.certificate is None or _fits(run.certificate, type(run.certificate)),
+        "the origin": run.origin is None or _fits(run.origin, type(run.origin)),
+        "the scene's text": run.scene_text is None or isinstance(run.scene_text, str),
+        "the diagnosis": run.diagnosis is None or _fits(run.diagnosis, type(run.diagnosis)),
+        "the other pose": run.diagnosis is None or _is_pose_or_none(run.diagnosis.rival_cam_from_map),
         "the query image": run.query_image is None or _is_moderate_image(run.query_image),
     }
     wrong = [name for name, is_good in good.items() if not is_good]
@@ -139,7 +143,27 @@ def check_run(run: RecordedRun, path: Path) -> None:
         raise RecordingError(f"{path}: has a wrong form in {', '.join(wrong)}; record the run again.")
 
 
-def _is_pose(pose: Any) -> bool:
+def _fits(value: Any, hint: Any) -> bool:
+    """Whether a value has a type such as fields of recorded dataclasses have, to the last item of it."""
+    kind, parts = get_origin(hint), get_args(hint)
+    if kind in (Union, UnionType):
+        return any(_fits(value, part) for part in parts)
+    if kind is Literal:
+        return isinstance(value, str) and value in parts
+    if kind is tuple:
+        items = parts[:1] * len(value) if isinstance(value, tuple) and parts[-1] is Ellipsis else parts
+        return isinstance(value, tuple) and len(value) == len(items) and all(map(_fits, value, items))
+    if isinstance(hint, type) and is_dataclass(hint):
+        hints = get_type_hints(hint)
+        return isinstance(value, hint) and all(_fits(getattr(value, name), own) for name, own in hints.items())
+    if hint is float:
+        return isinstance(value, int | float) and not isinstance(value, bool)
+    return type(value) is int if hint is int else isinstance(value, kind or hint)
+
+
+def _is_pose_or_none(pose: Any) -> bool:
+    if pose is None:
+        return True
     if not isinstance(pose, np.ndarray) or pose.shape != (3, 4) or pose.dtype != np.float64:
         return False
     return bool(np.isfinite(pose).all()) and np.allclose(pose[:, :3] @ pose[:, :3].T, np.eye(3), atol=1e-3)

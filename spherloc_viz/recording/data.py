@@ -1,10 +1,11 @@
-"""The numbers behind the pictures: the trace as raw arrow rows under ``/data``, and back, bit for bit.
+"""The numbers behind the pictures: the trace as rows under ``/data``, and back, bit for bit.
 
-A row has one column an array, typed by its dtype and shape, and a column ``scalars`` with all the rest as JSON, in
-which a number that JSON has no word for is ``{"number": "inf"}`` (or "-inf", "nan").
+A row has a column ``arrays`` with the bytes of all arrays, and a column ``scalars``, JSON with their types and shapes and
+all other values. A number that JSON has no word for is ``{"number": "inf"}`` (or "-inf", "nan").
 """
 
 import json
+import math
 from collections.abc import Iterator
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import rerun as rr
 from numpy.typing import NDArray
 from rerun.chunk import Chunk
 
@@ -21,6 +23,7 @@ from spherloc.diagnosis import Cause, Diagnosis
 from spherloc.problem import Problem
 from spherloc.trace import Trace
 from spherloc_viz.options import plain
+from spherloc_viz.recording.columns import Values, static_chunk
 from spherloc_viz.recording.origin import Origin
 
 MAX_ARRAY_BYTES = 65_536
@@ -28,6 +31,7 @@ MAX_ARRAY_BYTES = 65_536
 MAX_SCENE_BYTES = 65_536
 """The text of a larger scene file is not recorded."""
 
+ARRAYS = "arrays"
 NOT_FINITE = "number"
 """Key of the table that stands for infinity or NaN."""
 
@@ -120,11 +124,40 @@ def diagnosis_from_row(row: Row) -> Diagnosis:
 
 
 def _chunk(path: str, row: Row) -> Chunk:
-    arrays = {name: value for name, value in row.items() if isinstance(value, np.ndarray)}
+    """A row: the bytes of all arrays in one column, since every column costs more room in the file's index than most
+    arrays have; their types and shapes are with the scalars."""
+    arrays = {name: np.ascontiguousarray(value) for name, value in row.items() if isinstance(value, np.ndarray)}
     others = {name: value for name, value in row.items() if name not in arrays}
-    scalars = json.dumps(plain(others, lambda number: {NOT_FINITE: str(number)}), allow_nan=False)
-    columns = {name: _arrow(value) for name, value in arrays.items()} | {"scalars": pa.array([[scalars]])}
-    return Chunk.from_record_batch(pa.RecordBatch.from_pydict(columns), index=None, entity_path=path)[0]
+    forms = [[name, array.dtype.str, list(array.shape)] for name, array in arrays.items()]
+    told = {ARRAYS: forms, "values": plain(others, lambda number: {NOT_FINITE: str(number)})}
+    content = b"".join(array.tobytes() for array in arrays.values())
+    columns = [
+        Values(rr.ComponentDescriptor("scalars"), pa.array([json.dumps(told, allow_nan=False)]), [1]),
+        Values(rr.ComponentDescriptor(ARRAYS), pa.array(np.frombuffer(content, np.uint8)), [len(content)]),
+    ]
+    return static_chunk(path, columns)
+
+
+def read_row(chunk: Chunk) -> Row:
+    """Arrays and scalars of a chunk that ``data_chunks`` made, in this format or the first; the arrays are read-only.
+
+    Raises ``KeyError``, ``TypeError`` or ``ValueError`` if it is none.
+    """
+    batch = chunk.to_record_batch()
+    columns = {name: batch.column(name) for name in batch.schema.names if pa.types.is_list(batch.column(name).type)}
+    told: Row = json.loads(columns.pop("scalars")[0].values[0].as_py(), object_hook=_number)
+    if ARRAYS not in told:
+        return told | {name: _numpy(column[0].values) for name, column in columns.items()}
+    content = columns[ARRAYS][0].values.to_numpy(zero_copy_only=False)
+    row, at = dict(told["values"]), 0
+    for name, kind, shape in told[ARRAYS]:
+        dtype, end = np.dtype(kind), at
+        if dtype.kind not in "biuf" or any(size < 0 for size in shape):
+            raise ValueError(f"{name} is no array of numbers")
+        end += dtype.itemsize * math.prod(shape)
+        row[name], at = content[at:end].view(dtype).reshape(shape), end
+        row[name].setflags(write=False)
+    return row
 
 
 def _number(table: dict[str, Any]) -> Any:
@@ -132,23 +165,8 @@ def _number(table: dict[str, Any]) -> Any:
     return float(table[NOT_FINITE]) if set(table) == {NOT_FINITE} else table
 
 
-def _arrow(array: NDArray[Any]) -> pa.Array:
-    """One row that holds ``array``; all axes but the first become fixed-size lists, which keeps the shape."""
-    values = pa.array(array.ravel())
-    for size in reversed(array.shape[1:]):
-        values = pa.FixedSizeListArray.from_arrays(values, size)
-    return pa.ListArray.from_arrays(pa.array([0, len(array)], pa.int32()), values)
-
-
-def read_row(chunk: Chunk) -> Row:
-    """Arrays and scalars of a chunk that ``data_chunks`` made; the arrays are read-only."""
-    batch = chunk.to_record_batch()
-    columns = {name: batch.column(name) for name in batch.schema.names if pa.types.is_list(batch.column(name).type)}
-    row: Row = json.loads(columns.pop("scalars")[0].values[0].as_py(), object_hook=_number)
-    return row | {name: _numpy(column[0].values) for name, column in columns.items()}
-
-
 def _numpy(values: pa.Array) -> NDArray[Any]:
+    """An array of format 1, whose axes but the first are fixed-size lists."""
     shape = [len(values)]
     while isinstance(values, pa.FixedSizeListArray):
         shape.append(values.type.list_size)

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import rerun as rr
+from numpy.typing import NDArray
 from rerun.chunk import Chunk
 
 from spherloc_viz.layers.primitives import FloatArray, Picture, Points, Textured
@@ -32,7 +33,7 @@ def drawing_chunks(pictures: Mapping[int, Picture], pixels: FloatArray) -> Itera
     """
     yield Chunk.from_columns("/", [], _AXES)
     yield _framing(next(iter(pictures.values())))
-    when = pa.array(list(pictures), pa.int64())
+    when = np.array(list(pictures), np.int64)
     for (path, kind), track in _tracks(list(pictures.values()), pixels).items():
         yield _chunk(path, [(_changes(track, part.look), part) for part in PARTS[kind]], track, when)
 
@@ -59,14 +60,14 @@ def _tracks(pictures: Sequence[Picture], pixels: FloatArray) -> dict[tuple[str, 
     return tracks
 
 
-def _chunk(path: str, parts: list[tuple[list[int], Part]], track: Rows, when: pa.Int64Array) -> Chunk:
+def _chunk(path: str, parts: list[tuple[list[int], Part]], track: Rows, when: NDArray[np.int64]) -> Chunk:
     """A chunk with a row for every step at which any part of a primitive changes, and in it only what does."""
     steps = sorted({index for changes, _ in parts for index in changes})
     columns = []
     for changes, part in parts:
         places = None if len(changes) == len(steps) else np.searchsorted(steps, changes)
         columns += [values.among(places, len(steps)) for values in part.encode([track[index] for index in changes])]
-    return Chunk.from_columns(path, [Times(when.take(pa.array(steps)))], columns)
+    return Chunk.from_columns(path, [Times(pa.array(when[steps]))], columns)
 
 
 def _changes(track: Rows, look: tuple[str, ...]) -> list[int]:

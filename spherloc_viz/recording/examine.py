@@ -1,8 +1,9 @@
 """The child that reads recordings which may be hostile: ``python -m spherloc_viz.recording.examine``.
 
-It reads questions, one a line, ``{"path": "...", "review": true}`` (whether to read its labels and note too), and
-answers each with two lines of JSON: ``{"begun": true}``, then ``{"row": {...}}`` or ``{"error": "..."}``. Its memory,
-its processor time a file and what it may write are limited where the system can do that; it may die of a file.
+It reads questions, one a line, ``{"path": "...", "want": "row"}``, and answers each with two lines of JSON:
+``{"begun": true}``, then ``{"row": {...}}`` or ``{"error": "..."}``. What can be wanted is a row with labels and note, a
+``bare row`` without, or only the ``review``. Its memory, its processor time a file and what it may write are limited
+where the system can do that; it may die of a file.
 """
 
 import json
@@ -12,7 +13,7 @@ import stat
 import sys
 import tempfile
 import warnings
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import IO, Any
 
@@ -71,7 +72,9 @@ def _say(answers: IO[str], answer: dict[str, Any]) -> None:
 def _answer(question: dict[str, Any]) -> dict[str, Any]:
     path = Path(question["path"])
     try:
-        return {"row": _examined(path, question["review"])}
+        if question["want"] == "review":
+            return {"review": asdict(read_review(path))}
+        return {"row": _examined(path, with_review=question["want"] == "row")}
     except SpherlocError as error:
         return {"error": str(error)}
     except MemoryError:

@@ -172,9 +172,10 @@ class RunIndex:
         refresher = Refresher(self.folder, self._write, examine)
         with self._refreshing:
             for _ in range(MOST_REFRESHES):
-                reopened = self._opened
+                self._read(lambda connection: None)
+                opened = self._opened
                 refreshed = refresher.refresh(everything, progress or (lambda done, total: None))
-                if self._opened == reopened:  # a database that is set aside takes the rows with it
+                if self._opened == opened:  # a database that is set aside takes the rows with it
                     self.stale = False
                     return refreshed
                 everything = False

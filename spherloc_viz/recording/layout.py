@@ -17,7 +17,7 @@ from spherloc_viz.recording.properties import REVIEW_ENTITY
 from spherloc_viz.recording.rrd_file import RrdFile, split
 
 APPLICATION_ID = "spherloc"
-EYE = (1.3, -1.4, -1.8)
+EYE = (1.15, -1.2, -1.55)
 """Where one looks from, in the frame in which the scene has radius 1: from the same side as the page's overview."""
 LAYOUT_ROOM = 1 << 20
 """Bytes, many more than a layout takes."""
@@ -55,7 +55,8 @@ def blueprint(shown: Shown) -> rrb.Blueprint:
     """
     plots = [rrb.BarChartView(origin=chart_path(name), name=label) for name, label in shown.charts]
     if shown.panels.residuals:
-        plots.append(rrb.BarChartView(origin=RESIDUALS, name="Residuals: matches over log10 of px"))
+        # Second, since the chart of refinement is empty at most steps.
+        plots.insert(1, rrb.BarChartView(origin=RESIDUALS, name="Residuals: matches over log10 of px"))
     texts = [
         rrb.TextDocumentView(origin="/outcome", name="Verdict"),
         rrb.TextDocumentView(origin=REVIEW_ENTITY, name="Review"),
@@ -74,7 +75,8 @@ def blueprint(shown: Shown) -> rrb.Blueprint:
 
 def _scene() -> rrb.Spatial3DView:
     eye = rrb.EyeControls3D(position=EYE, look_target=(0.0, 0.0, 0.0), eye_up=(0.0, -1.0, 0.0))
-    return rrb.Spatial3DView(origin="/", contents="/scene/**", name="Scene", eye_controls=eye)
+    grid = archetypes.LineGrid3D(visible=False)
+    return rrb.Spatial3DView(origin="/", contents="/scene/**", name="Scene", eye_controls=eye, line_grid=grid)
 
 
 def _flat_views(panels: Panels) -> list[rrb.View]:

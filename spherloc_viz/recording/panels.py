@@ -70,21 +70,19 @@ def panel_chunks(trace: Trace, panels: Panels) -> Iterator[Chunk]:
 
 def _arcs(trace: Trace, stage: YawStage) -> Iterator[Chunk]:
     """Arcs as bars over degrees of yaw, from the widest below to the narrowest above, and the yaws to compare."""
-    estimate = float(np.degrees(stage.yaw_rad))
-    middles = _near(np.degrees(0.5 * (stage.lo_rad + stage.hi_rad)), estimate)
-    half_widths = np.degrees(0.5 * (stage.hi_rad - stage.lo_rad))
-    in_clique = np.zeros(len(middles), dtype=bool)
+    estimate, reach = float(np.degrees(stage.yaw_rad)), np.radians(REACH_DEG)
+    half_widths = 0.5 * (stage.hi_rad - stage.lo_rad)
+    away = stage.lo_rad + half_widths - stage.yaw_rad
+    away -= 2.0 * np.pi * np.round(away / (2.0 * np.pi))
+    in_clique = np.zeros(len(away), dtype=bool)
     in_clique[stage.clique] = True
-    near = np.flatnonzero(np.maximum(np.abs(middles - estimate) - half_widths, 0.0) <= REACH_DEG)
+    near = np.flatnonzero(np.abs(away) - half_widths <= reach)
     inside, outside = near[in_clique[near]], near[~in_clique[near]]
     take = min(len(inside), max(MOST_ARCS // 2, MOST_ARCS - len(outside)))
     chosen = np.concatenate([even(inside, take), even(outside, MOST_ARCS - take)])
     chosen = chosen[np.lexsort((-half_widths[chosen], in_clique[chosen]))]
-    ends = np.clip(
-        np.stack([middles[chosen] - half_widths[chosen], middles[chosen] + half_widths[chosen]], axis=1),
-        estimate - REACH_DEG,
-        estimate + REACH_DEG,
-    )
+    ends = away[chosen, None] + half_widths[chosen, None] * np.array([-1.0, 1.0])
+    ends = estimate + np.degrees(np.clip(ends, -reach, reach))
     height = 2.0 * REACH_DEG * ASPECT
     rows = height * (np.arange(len(chosen)) + 0.5) / max(1, len(chosen))
     points = np.stack([ends, np.repeat(rows[:, None], 2, axis=1)], axis=2)
@@ -92,27 +90,33 @@ def _arcs(trace: Trace, stage: YawStage) -> Iterator[Chunk]:
         in_clique[chosen], packed(np.array([style.CLIQUE])), packed(np.array([style.UNDECIDED]), 2.0 * GREY)
     )
     yield _lines_2d(f"{ARCS}/arcs", points, colors.astype(np.uint32), 1.5)
-    yield _upright(f"{ARCS}/estimate", estimate, height, style.ESTIMATE)
+    yield from _marker("estimate", estimate, -0.04 * height, style.ESTIMATE)
     truth = trace.problem.truth_cam_from_map
     if truth is not None:
-        true_deg = np.degrees(yaw_of(trace.problem.aligned.align_pose(truth)[:, :3]))
-        at = float(_near(np.array([true_deg]), estimate)[0])
+        true_deg = float(np.degrees(yaw_of(trace.problem.aligned.align_pose(truth)[:, :3])))
+        at = estimate + (true_deg - estimate + 180.0) % 360.0 - 180.0
         if abs(at - estimate) <= REACH_DEG:
-            yield _upright(f"{ARCS}/truth", at, height, style.TRUTH)
+            yield from _marker("truth", at, 1.04 * height, style.TRUTH)
 
 
-def _near(degrees: FloatArray, centre: float) -> FloatArray:
-    """The same angles within half a turn of a centre."""
-    return centre + (degrees - centre + 180.0) % 360.0 - 180.0
+def _marker(name: str, at: float, end: float, color: style.RGB) -> Iterator[Chunk]:
+    """An upright line over the stack of arcs, from its other end to a word at ``end``."""
+    height, color_ = 2.0 * REACH_DEG * ASPECT, packed(np.array([color]))
+    points = np.array([[[at, 0.0], [at, height]]])
+    yield _lines_2d(f"{ARCS}/{name}", points, color_, 2.0)
+    label = pa.array([f"{name} {at:.2f}°"])
+    yield static_chunk(
+        f"{ARCS}/{name}/label",
+        [
+            Values(rr.Points2D.descriptor_positions(), vectors(np.array([[at, end]]), VECTOR_2D), [1]),
+            Values(rr.Points2D.descriptor_labels(), label, [1]),
+            Values(rr.Points2D.descriptor_colors(), pa.array(color_), [1]),
+            Values(rr.Points2D.descriptor_radii(), numbers([0.0]), [1]),
+        ],
+    )
 
 
-def _upright(entity: str, at: float, height: float, color: style.RGB) -> Chunk:
-    points = np.array([[[at, -0.03 * height], [at, 1.03 * height]]])
-    label = Values(rr.LineStrips2D.descriptor_labels(), pa.array([f"{entity.rpartition('/')[2]} {at:.2f}°"]), [1])
-    return _lines_2d(entity, points, packed(np.array([color])), 2.0, label)
-
-
-def _lines_2d(entity: str, points: FloatArray, colors: NDArray[np.uint32], width_px: float, *more: Values) -> Chunk:
+def _lines_2d(entity: str, points: FloatArray, colors: NDArray[np.uint32], width_px: float) -> Chunk:
     """Lines (K, 2, 2)."""
     lines = strips(points.reshape(-1, 2), np.full(len(points), 2), STRIP_2D)
     return static_chunk(
@@ -121,7 +125,6 @@ def _lines_2d(entity: str, points: FloatArray, colors: NDArray[np.uint32], width
             Values(rr.LineStrips2D.descriptor_strips(), lines, [len(points)]),
             Values(rr.LineStrips2D.descriptor_colors(), pa.array(colors), [len(colors)]),
             Values(rr.LineStrips2D.descriptor_radii(), numbers([-width_px / 2]), [1]),
-            *more,
         ],
     )
 

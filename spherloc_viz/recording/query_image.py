@@ -15,7 +15,7 @@ from spherloc_viz import style
 from spherloc_viz.layers.match_view import valid_outlines
 from spherloc_viz.layers.photograph import photograph, shrunk
 from spherloc_viz.layers.primitives import ColorArray, FloatArray
-from spherloc_viz.recording.columns import STRIP_2D, Values, encoded_image, packed, static_chunk, strips
+from spherloc_viz.recording.columns import STRIP_2D, Values, encoded_image, numbers, packed, static_chunk, strips
 from spherloc_viz.recording.properties import QUERY_IMAGE
 
 MATCHES = "/query/matches"
@@ -28,6 +28,7 @@ MOST_BYTES = 400_000
 """Of the recorded image: with more, it is pressed harder."""
 QUALITIES = (80, 60, 40, 20)
 DOT_PX = 2.5
+FRAME_PX = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +83,7 @@ def image_chunks(problem: Problem, image: QueryImage) -> Iterator[Chunk]:
         [
             Values(rr.LineStrips2D.descriptor_strips(), lines, [len(outlines)]),
             Values(rr.LineStrips2D.descriptor_colors(), pa.array(packed(np.array([style.UNDECIDED]))), [1]),
+            Values(rr.LineStrips2D.descriptor_radii(), numbers([-FRAME_PX / 2]), [1]),
         ],
     )
 

@@ -1,22 +1,11 @@
 """Labels and a note that a reviewer gives a run: a small recording beside it, which Rerun shows together with it."""
 
 import contextlib
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-
-import pyarrow as pa
-import rerun as rr
-from rerun.chunk import Chunk, LazyChunkStream, RrdReader
-from rerun.error_utils import RerunWarning
 
 from spherloc.errors import InputError, RecordingError, show
-from spherloc_viz.recording.layout import APPLICATION_ID
-from spherloc_viz.recording.leftovers import unfinished
-from spherloc_viz.recording.markdown import plain
-from spherloc_viz.recording.properties import REVIEW_ENTITY, REVIEW_PROPERTY
 
 REVIEW_SUFFIX = ".review.rrd"
 """Ends the name of a review file, which otherwise is that of its run."""
@@ -74,6 +63,10 @@ def write_review(recording: Path, labels: Sequence[str], note: str, run_id: str 
     Without any, the file is removed. ``run_id`` is that of the recording, which is read if it is not given. A reader
     never sees half a file. Raises ``InputError`` if they are too long, ``RecordingError`` if they cannot be written.
     """
+    # Here, as lists of runs need only names and limits of this file, and rerun takes a second to load.
+    from spherloc_viz.recording.leftovers import unfinished
+    from spherloc_viz.recording.review_file import recording_id, write_file
+
     review = checked_review(labels, note)
     path = review_path(Path(recording))
     part = unfinished(path)
@@ -81,9 +74,7 @@ def write_review(recording: Path, labels: Sequence[str], note: str, run_id: str 
         if review == Review():
             path.unlink(missing_ok=True)
             return review
-        identity = run_id or _recording_id(Path(recording))
-        stream = LazyChunkStream.from_iter(_chunks(review))
-        stream.write_rrd(part, application_id=APPLICATION_ID, recording_id=identity)
+        write_file(part, review.labels, review.note, run_id or recording_id(Path(recording)))
         part.replace(path)
     except (OSError, RuntimeError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
@@ -104,45 +95,12 @@ def read_review(recording: Path) -> Review:
     path = review_path(Path(recording))
     if not path.exists():
         return Review()
+    from spherloc_viz.recording.review_file import read_file
+
     damaged = RecordingError(f"{path}: {UNREADABLE}")
     try:
         if not path.is_file() or path.stat().st_size > MOST_BYTES:
             raise damaged
-        found = RrdReader(path).stream().filter(content=[f"/__properties/{REVIEW_PROPERTY}"]).to_chunks()
-        (batch,) = (chunk.to_record_batch() for chunk in found)
-        batch.validate(full=True)
-        return checked_review(_texts(batch.column("labels")), *_texts(batch.column("note")))
+        return checked_review(*read_file(path, MOST_LABELS))
     except (OSError, RuntimeError, ValueError, TypeError, LookupError, AttributeError, InputError) as error:
         raise damaged from error
-
-
-def _texts(column: pa.Array) -> list[str]:
-    """The only cell of a column of lists of texts; looked at before it becomes Python's, which could take gigabytes."""
-    if len(column) != 1 or column.type != pa.list_(pa.string()) or len(column[0].values or ()) > MOST_LABELS:
-        raise TypeError("not one list of texts")
-    return [value for value in column[0].as_py() if value is not None]
-
-
-def _chunks(review: Review) -> list[Chunk]:
-    values: dict[str, Any] = {
-        "labels": pa.array(review.labels, pa.string()),
-        "note": pa.array([review.note], pa.string()),
-    }
-    lines = [" ".join(f"**{plain(label)}**" for label in review.labels), *map(plain, review.note.splitlines())]
-    document = rr.TextDocument.columns(text=["\n\n".join(lines).strip()], media_type=[rr.MediaType.MARKDOWN])
-    return [
-        Chunk.from_property(REVIEW_PROPERTY, rr.AnyValues(**values)),
-        Chunk.from_columns(REVIEW_ENTITY, [], document),
-    ]
-
-
-def _recording_id(recording: Path) -> str:
-    """The recording's id. Raises ``RecordingError`` if it is none of ours."""
-    if not recording.is_file():
-        raise RecordingError(f"{recording}: no such file; give the path of a recording (.rrd).")
-    with warnings.catch_warnings(), contextlib.suppress(OSError, RuntimeError, ValueError, RerunWarning):
-        warnings.simplefilter("error", RerunWarning)
-        for entry in RrdReader(recording).recordings():
-            if entry.application_id == APPLICATION_ID:
-                return entry.recording_id
-    raise RecordingError(f"{recording}: not a whole recording (.rrd); give one that spherloc wrote.")

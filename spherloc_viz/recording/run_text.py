@@ -26,13 +26,13 @@ FORMS = ("table", "json", "csv")
 def rows_text(folder: Path, rows: Sequence[RunRow], form: str) -> str:
     """Runs in one of ``FORMS``; each line ends with a newline, and without runs a table is empty."""
     if form == "json":
-        return _json([_plain(row) for row in rows])
+        return json_lines([_plain(row) for row in rows])
     if form == "csv":
         names = [item.name for item in fields(RunRow) if item.name != "thumbnail"]
-        return _csv([_plain(row) for row in rows], names)
+        return csv_text([_plain(row) for row in rows], names)
     if not rows:
         return ""
-    lines = _table(_COLUMNS, [{name: _one_line(cell(row)) for name, (cell, _) in _COLUMNS.items()} for row in rows])
+    lines = _table(_COLUMNS, [{name: one_line(cell(row)) for name, (cell, _) in _COLUMNS.items()} for row in rows])
     return "".join(f"{line}\n" for line in [lines[0], *_with_files(folder, rows, lines[1:])])
 
 
@@ -40,23 +40,24 @@ def counts_text(by: str, counts: Sequence[tuple[str, int]], form: str) -> str:
     """How many runs have each value, in one of ``FORMS``."""
     tables = [{by: value, "runs": count} for value, count in counts]
     if form == "json":
-        return _json(tables)
+        return json_lines(tables)
     if form == "csv":
-        return _csv(tables, [by, "runs"])
-    width = max((len(_one_line(value)) for value, _ in counts), default=0)
+        return csv_text(tables, [by, "runs"])
+    width = max((len(one_line(value)) for value, _ in counts), default=0)
     total = sum(count for _, count in counts)
     return "".join(
-        f"{_one_line(value) or '(none)':<{max(width, 6)}}{GAP}{count:>7,}{GAP}{count / total:>6.1%}\n"
+        f"{one_line(value) or '(none)':<{max(width, 6)}}{GAP}{count:>7,}{GAP}{count / total:>6.1%}\n"
         for value, count in counts
     )
 
 
-def _json(tables: Sequence[Mapping[str, Any]]) -> str:
+def json_lines(tables: Sequence[Mapping[str, Any]]) -> str:
     """An array with one object a line."""
     return "[\n" + ",\n".join(json.dumps(table, allow_nan=False) for table in tables) + "\n]\n"
 
 
-def _csv(tables: Sequence[Mapping[str, Any]], names: Sequence[str]) -> str:
+def csv_text(tables: Sequence[Mapping[str, Any]], names: Sequence[str]) -> str:
+    """Columns of these names; no text is a formula to a spreadsheet."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(names)
@@ -71,7 +72,7 @@ def _cell(value: Any) -> Any:
         value = "; ".join(value)
     if not isinstance(value, str):
         return "" if value is None else value
-    text = _one_line(value)
+    text = one_line(value)
     # A spreadsheet would run it as a formula.
     return f"'{text}" if text.startswith(_FORMULA) else text
 
@@ -88,12 +89,13 @@ def _plain(row: RunRow) -> dict[str, Any]:
     return table
 
 
-def _one_line(text: str) -> str:
+def one_line(text: str) -> str:
     """Without what would move a terminal's cursor or fool the eye."""
     return " ".join("".join(character if character.isprintable() else " " for character in text).split())
 
 
-def _number(value: float | None) -> str:
+def number_text(value: float | None) -> str:
+    """An error as people read it; "-" if it is unknown."""
     if value is None:
         return "-"
     return f"{value:.3f}" if value < 10.0 else f"{value:.1f}" if value < 1e5 else f"{value:.0e}"
@@ -106,8 +108,8 @@ _COLUMNS: dict[str, tuple[Callable[[RunRow], str], str]] = {
     "Diagnosis": (lambda row: row.diagnosis or "-", "<"),
     "Inliers": (lambda row: f"{row.inliers}/{row.correspondences}", ">"),
     "Outliers": (lambda row: "-" if row.outlier_rate is None else f"{100 * row.outlier_rate:.0f} %", ">"),
-    "deg off": (lambda row: _number(row.rotation_error_deg), ">"),
-    "m off": (lambda row: _number(row.translation_error_m), ">"),
+    "deg off": (lambda row: number_text(row.rotation_error_deg), ">"),
+    "m off": (lambda row: number_text(row.translation_error_m), ">"),
     "ms": (lambda row: f"{row.time_ms:.0f}", ">"),
 }
 
@@ -135,9 +137,9 @@ def _with_files(folder: Path, rows: Sequence[RunRow], lines: Sequence[str]) -> l
     """Below each line the file, as the other commands take it, its labels, and the start of its note."""
     told: list[str] = []
     for row, line in zip(rows, lines, strict=True):
-        labels = "".join(f" [{_one_line(label)}]" for label in row.labels)
-        note = f" {_one_line(row.note)}" if row.note else ""
-        path = f"    {_one_line(str(folder / row.file))}"
+        labels = "".join(f" [{one_line(label)}]" for label in row.labels)
+        note = f" {one_line(row.note)}" if row.note else ""
+        path = f"    {one_line(str(folder / row.file))}"
         rest = _cut(labels + note, max(0, WIDTH - len(path))) if len(path) < WIDTH - LEAST else ""
         told += [line, path + rest]
         if labels and not rest:

@@ -16,8 +16,6 @@ from spherloc_viz.recording.origin import Origin, Source
 from spherloc_viz.recording.reader import RecordedRun, read_recording
 from spherloc_viz.recording.strangers import examine
 
-SUFFIX = ".rrd"
-
 
 @dataclass(frozen=True, eq=False)
 class RecordedScene:
@@ -50,7 +48,7 @@ def load_recorded_scene(path: Path) -> RecordedScene:
     """
     path = Path(path)
     if not path.is_file():
-        raise RecordingError(f"{path}: no such file; give the path of a recording ({SUFFIX}).")
+        raise RecordingError(f"{path}: no such file; give the path of a recording (.rrd).")
     examine(path)
     return RecordedScene(read_recording(path), path)
 

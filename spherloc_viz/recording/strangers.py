@@ -17,10 +17,10 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import IO, Any, Self
 
-from spherloc.errors import RecordingError, show
+from spherloc.errors import InputError, RecordingError, show
 from spherloc_viz.recording.checked_row import row_from_table
 from spherloc_viz.recording.rerun_program import rerun_environment
-from spherloc_viz.recording.review import review_path
+from spherloc_viz.recording.review import UNREADABLE, Review, checked_review, review_path
 from spherloc_viz.recording.run_row import RunRow
 
 FILE_LIMIT_S = 60.0
@@ -44,7 +44,8 @@ def check_name(name: str) -> str:
     """
     if len(name) > _NAME_LIMIT or not _NAME.fullmatch(name):
         raise RecordingError(
-            f"{show(name)}: not the name of a recording; it has letters, digits, '.', '_' and '-' and ends with .rrd."
+            f"{show(name)}: not the name of a recording, which has letters, digits, '.', '_' and '-' and ends with .rrd; "
+            "rename the file."
         )
     return name
 
@@ -88,21 +89,28 @@ class Examiner:
         Raises ``RecordingError``, in one sentence, if it cannot or is not.
         """
         with self._lock:
-            answer = self._ask(path, review=True)
+            answer = self._ask(path, "row")
             if answer is None and review_path(path).exists():
                 # It may be the labels beside it that the child died of.
-                answer = self._ask(path, review=False)
-        if answer is None:
-            raise RecordingError(
-                f"{path}: cannot be read, since reading it takes too long or too much memory or ends the reader; "
-                "delete it or record the run again."
-            )
-        if "error" in answer:
-            raise RecordingError(str(answer["error"]))
-        return row_from_table(answer["row"], path)
+                answer = self._ask(path, "bare row")
+        return row_from_table(_wanted(answer, path, "row"), path)
 
-    def _ask(self, path: Path, review: bool) -> dict[str, Any] | None:
-        question = {"path": str(path), "review": review}
+    def examine_review(self, path: Path) -> Review:
+        """Labels and note of a recording, whose file is safe to be read in this process.
+
+        Raises ``RecordingError``, in one sentence, if it is not.
+        """
+        with self._lock:
+            answer = self._ask(path, "review")
+        table = _wanted(answer, review_path(path), "review")
+        try:
+            return checked_review(table["labels"], table["note"])
+        except (InputError, TypeError, LookupError, AttributeError):
+            raise RecordingError(f"{review_path(path)}: {UNREADABLE}") from None
+
+    def _ask(self, path: Path, want: str) -> dict[str, Any] | None:
+        """What the child says; None if it dies or hangs of the file."""
+        question = {"path": str(path), "want": want}
         if self._child is not None and not self._child.begin(question):
             self._end()  # it had nothing to do for a minute
         if self._child is None:
@@ -111,9 +119,8 @@ class Examiner:
                 self._end()
                 raise _cannot_start("it ended at once")
         answer = self._child.answer(FILE_LIMIT_S)
-        if answer is None or len(answer) != 1 or not answer.keys() <= {"row", "error"}:
+        if answer is None:
             self._end()
-            return None
         return answer
 
     def _end(self) -> None:
@@ -180,6 +187,18 @@ class _Child:
         self._answers.put(b"")
 
 
+def _wanted(answer: dict[str, Any] | None, path: Path, want: str) -> Any:
+    """What was wanted of a file; raises ``RecordingError`` if it is not in the answer."""
+    if answer is None or not answer.keys() & {want, "error"}:
+        raise RecordingError(
+            f"{path}: cannot be read, since reading it takes too long or too much memory or ends the reader; "
+            "delete it or make it again."
+        )
+    if "error" in answer:
+        raise RecordingError(str(answer["error"]))
+    return answer[want]
+
+
 def _cannot_start(reason: str) -> "_NotStartedError":
     return _NotStartedError(
         f"recordings cannot be examined: the process that reads them does not start ({reason}); "
@@ -205,6 +224,14 @@ def examine(path: Path) -> RunRow:
     Raises ``RecordingError``, in one sentence, if the file cannot be read or is not safe.
     """
     return _shared.examine(Path(path))
+
+
+def examine_review(path: Path) -> Review:
+    """Labels and note of a recording, whose file is then safe to be read in this process; empty if it has none.
+
+    Raises ``RecordingError``, in one sentence, if the file cannot be read or is not safe.
+    """
+    return _shared.examine_review(Path(path))
 
 
 def examine_all(paths: Iterable[Path]) -> Iterator[tuple[Path, RunRow | RecordingError]]:

@@ -16,8 +16,8 @@ MOST_DOTS = 160
 """More matches are thinned evenly: a PNG of single dots grows with them."""
 CAMERA_PX = 7.0
 COMPRESSION = 6
-OUTSIDE_PERCENT = 4.0
-"""Of the map points on every side do not set the scale; some may lie far away."""
+OUTSIDE_SHARE = 0.04
+"""Share of the map points on every side that do not set the scale; some may lie far away."""
 
 FloatArray = NDArray[np.float64]
 
@@ -49,7 +49,8 @@ def _cameras(trace: Trace) -> list[tuple[FloatArray | None, style.RGB]]:
 
 def _window(flat: FloatArray, cameras: list[FloatArray]) -> tuple[FloatArray, float]:
     """The middle (2,) of what is seen and its scale in pixels a metre: most points, and cameras not absurdly far."""
-    low, high = np.percentile(flat, OUTSIDE_PERCENT, axis=0), np.percentile(flat, 100.0 - OUTSIDE_PERCENT, axis=0)
+    ordered, aside = np.sort(flat, axis=0), int(OUTSIDE_SHARE * len(flat))
+    low, high = ordered[aside], ordered[-1 - aside]
     room = float(np.max(high - low))
     near = [np.clip(place, low - room, high + room) for place in cameras]
     low, high = np.min([low, *near], axis=0), np.max([high, *near], axis=0)

@@ -77,17 +77,16 @@ class _Run:
 
 
 def recorded_steps(stops: Sequence[Stop], decisive: int) -> list[int]:
-    """The steps that a lean recording shows: the decisive one, and all but the middle of every series.
+    """The steps that a lean recording shows: the decisive one, and of every series the first.
 
-    Series are steps whose keys differ in a number only, as "yaw-arcs-10" and "yaw-arcs-30" do. Of more and more arcs,
-    balls or members of a clique, and of one peak after another, the first and the last say it all. The samples of
-    RANSAC have no such order and are all there. Between two steps a viewer shows the earlier one.
+    Series are steps whose keys differ in a number only, as "yaw-arcs-10" and "yaw-arcs-30" do: more and more arcs, balls
+    or members of a clique, one peak after another. A step with all of them follows. The samples of RANSAC have no such
+    step and are all there. Between two steps a viewer shows the earlier one.
     """
-    series: dict[str, list[int]] = {}
+    first: dict[str, int] = {}
     for index, stop in enumerate(stops):
-        name = stop.key if stop.key.startswith("sample-") else re.sub(r"\d+$", "#", stop.key)
-        series.setdefault(name, []).append(index)
-    return sorted({decisive} | {own[k] for own in series.values() for k in (0, -1)})
+        first.setdefault(stop.key if stop.key.startswith("sample-") else re.sub(r"\d+$", "#", stop.key), index)
+    return sorted({decisive, *first.values()})
 
 
 def _content(run: _Run, file: str) -> tuple[RunRow, bytes]:

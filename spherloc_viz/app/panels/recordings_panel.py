@@ -102,7 +102,7 @@ class RecordingsPanel:
         """Other tabs are open now."""
         before, self._seen = self._seen, VIEW in touch.argument.split(",")
         if self._seen and not before and self._shelf is not None:
-            self._aside.ask(self._shelf.warm)
+            self._aside.ask(self._shelf.prepare)
         self._show()
 
     def _choose(self, touch: Touch) -> None:

@@ -61,6 +61,8 @@ def lines(one: RunRow, other: RunRow) -> list[Line]:
 def _options(one: RunRow, other: RunRow) -> list[Line]:
     """Options that differ; those that only one estimator has are no difference of the runs but of the estimators."""
     a, b = words.options_of(one), words.options_of(other)
+    if not (a and b):
+        return []
     known = [name for name in a if name in b] if one.estimator != other.estimator else dict.fromkeys((*a, *b))
     return [
         (escape(name.replace("_", " ")), escape(a.get(name, words.UNKNOWN)), escape(b.get(name, words.UNKNOWN)))

@@ -33,9 +33,9 @@ class Notes:
     ) -> None:
         """``stored`` is called, on a thread of this part, with the row as it is by then."""
         self._shelf, self._stored = shelf, stored
-        self._chips = gui.add_html("", visible=False)
         hint = "Words that tell what kind of run it is, with commas between them."
         self._labels = gui.add_text("Labels", "", visible=False, hint=hint)
+        self._chips = gui.add_html("", visible=False)
         self._note = gui.add_text("Note", "", visible=False, multiline=True, hint="Stored with the run.")
         self._lock = threading.Lock()
         self._file: str | None = None

@@ -43,10 +43,11 @@ def row_html(row: RunRow, marked: bool, opened: bool, now: datetime) -> str:
     """One run."""
     file = escape(row.file)
     ground = f"background:{OPENED};box-shadow:inset 2px 0 0 {style.css(style.ESTIMATE)}" if opened else ""
+    look = "background:rgba(20,24,32,.55);color:#fff;border-radius:3px;padding:0 .2em;font-size:12px;line-height:1.25"
     mark = (
         f'<span role="checkbox" aria-checked="{str(marked).lower()}" aria-label="Mark" tabindex="0" '
-        f'data-touch="run-mark:{file}" title="Mark, to compare or export" style="align-self:stretch;display:flex;'
-        f'align-items:center;padding:0 .35em 0 .1em;font-size:13px">{"☑" if marked else "☐"}</span>'
+        f'data-touch="run-mark:{file}" title="Mark, to compare or export" '
+        f'style="position:absolute;left:4px;top:4px;{look}">{"☑" if marked else "☐"}</span>'
     )
     address = escape(viewer_link(row.file, row.decisive_step))
     link = (
@@ -54,12 +55,12 @@ def row_html(row: RunRow, marked: bool, opened: bool, now: datetime) -> str:
         f'title="Open in the Rerun viewer, at step {row.decisive_step + 1} of {row.steps}" '
         'style="color:inherit;text-decoration:none;padding:.4em .1em .4em .4em;opacity:.75;font-size:13px">↗</a>'
     )
-    about = f'<div style="flex:1;min-width:0;padding:.15em 0">{_lines(row, now)}</div>'
+    about = f'<div style="flex:1;min-width:0">{_lines(row, now)}</div>'
     return (
-        f'<div style="{RULE};display:flex;align-items:center;{ground}">{mark}'
+        f'<div style="{RULE};position:relative;display:flex;align-items:flex-start;padding:2px 0;{ground}">'
         f'<div role="button" tabindex="0" class="touch-row" data-touch="run-open:{file}" title="{_hint(row)}" '
-        f'style="flex:1;min-width:0;display:flex;gap:.6em;align-items:center">{picture_html(row.thumbnail)}{about}</div>'
-        f"{link}</div>"
+        f'style="flex:1;min-width:0;display:flex;gap:.6em;padding-left:2px">{picture_html(row.thumbnail)}{about}</div>'
+        f"{mark}{link}</div>"
     )
 
 

@@ -32,13 +32,6 @@ class Shelf:
         """Where the recordings are."""
         return self._index.folder
 
-    def refresh(self) -> bool:
-        """Take in recordings that the index does not know, once; tells whether there was anything to be read."""
-        if not self._index.stale:
-            return False
-        done = self._index.refresh()
-        return bool(done.read or done.removed)
-
     def version(self) -> tuple[int, ...]:
         """Another one whenever runs have come or changed, whichever process did it; costs next to nothing."""
         state: list[int] = []
@@ -88,8 +81,11 @@ class Shelf:
         examine(path)
         return read_recording(path), path
 
-    def warm(self) -> None:
-        """Have the process that reads recordings first started before it is needed: it takes seconds."""
+    def prepare(self) -> None:
+        """Take in recordings that the index does not know, and start the process that reads them first: both take
+        seconds, and are better done before they are needed."""
+        if self._index.stale:
+            self._index.refresh()
         newest = self._index.find(RunQuery(), 1).rows
         if newest:
             with contextlib.suppress(RecordingError):

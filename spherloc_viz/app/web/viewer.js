@@ -2,7 +2,7 @@
 (() => {
   const { program, files, timeline, step } = document.body.dataset;
   const said = document.getElementById("said");
-  const TRIES = 600, PAUSE_MS = 100, LOOK_MS = 1000, PAUSED = 1;
+  const TRIES = 600, STILL_FRAMES = 3, PAUSE_MS = 100, LOOK_MS = 1000, PAUSED = 1;
 
   // It writes tens of thousands of lines about its shaders.
   console.debug = () => undefined;
@@ -15,13 +15,46 @@
       ? ask(what, how)
       : new Promise(() => undefined);
 
-  // An operation of the viewer's control service (viewer_control.proto of rerun 0.41): set_time_cursor is its number 6,
-  // of which 2 is the timeline, 3 the time and 5 the play state.
+  // The viewer is told and asked in protobuf (viewer_control.proto of rerun 0.41). Of what it can be told,
+  // set_time_cursor is number 6, in which 2 is the timeline, 3 the time and 5 the play state.
   const number = (value) => (value < 128 ? [value] : [(value % 128) + 128, ...number(Math.floor(value / 128))]);
   const part = (field, bytes) => [field * 8 + 2, ...number(bytes.length), ...bytes];
   const count = (field, value) => [field * 8, ...number(value)];
   const name = part(1, [...new TextEncoder().encode(timeline)]);
   const standStill = new Uint8Array(part(6, [...part(2, name), ...part(3, count(1, Number(step))), ...count(5, PAUSED)]));
+
+  // The fields of a message by their numbers: integers, and bytes of all that has a length.
+  function fields(bytes = []) {
+    const found = {};
+    let at = 0;
+    const next = () => {
+      let value = 0;
+      for (let scale = 1; ; scale *= 128) {
+        const byte = bytes[at++];
+        value += (byte % 128) * scale;
+        if (byte < 128) return value;
+      }
+    };
+    while (at < bytes.length) {
+      const key = next(), value = next(), length = key % 8 ? value : 0;
+      (found[Math.floor(key / 8)] ??= []).push(length ? bytes.subarray(at, at + length) : value);
+      at += length;
+    }
+    return found;
+  }
+
+  // Whether the recording's timeline has arrived, and whether it stands still at the step: of the state, 3 is the list
+  // of recordings; of a recording 2 its timelines, 3 the place on one of them and 5 the play state.
+  function look(viewer) {
+    const recording = fields(fields(viewer.viewer_state())[3]?.[0]);
+    const called = (bytes) => new TextDecoder().decode(fields(fields(bytes)[1]?.[0])[1]?.[0]);
+    const place = recording[3]?.[0];
+    const time = fields(fields(place)[3]?.[0])[1]?.[0] ?? 0;
+    return {
+      arrived: (recording[2] ?? []).some((each) => called(each) === timeline),
+      stands: Boolean(place) && called(place) === timeline && time === Number(step) && recording[5]?.[0] === PAUSED,
+    };
+  }
 
   const pause = (ms) => new Promise((done) => setTimeout(done, ms));
   const frame = () => new Promise((done) => requestAnimationFrame(done));
@@ -43,15 +76,14 @@
     });
   }
 
-  // The viewer answers at its next frame, and with an error as long as the recording has not arrived.
+  // Once is not enough: the layout, when it arrives, moves the time to the first step.
   async function stand(viewer) {
-    for (let turn = 1; ; turn++) {
-      try {
-        return await viewer.viewer_control(standStill);
-      } catch (error) {
-        if (turn === TRIES) throw error;
-        await pause(PAUSE_MS);
-      }
+    for (let turn = 0, still = 0; still < STILL_FRAMES; turn++) {
+      if (turn === TRIES) throw new Error("The viewer does not open this recording: reload the page.");
+      const { arrived, stands } = look(viewer);
+      still = stands ? still + 1 : 0;
+      if (arrived && !stands) await viewer.viewer_control(standStill);
+      await (arrived ? frame() : pause(PAUSE_MS));
     }
   }
 
@@ -91,10 +123,6 @@
       if (content) show(`layer ${place + 1}`, content);
     }
     await stand(viewer);
-    // A layout that was read after that may have moved the time.
-    await frame();
-    await stand(viewer);
-    await frame();
     said.textContent = complaints.join(" ");
     said.addEventListener("click", () => (said.textContent = ""));
     document.body.dataset.state = "open";

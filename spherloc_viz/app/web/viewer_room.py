@@ -43,16 +43,16 @@ class Viewable:
     """What is known about it."""
 
 
-def of_folder(folder: Path, index: Callable[[], RunIndex]) -> Callable[[str], Viewable]:
-    """Finds runs by the names of their files in a folder: those of its index, and others that pass examination.
+def of_index(index: RunIndex) -> Callable[[str], Viewable]:
+    """Finds runs by the names of their files in an index's folder: those that it knows, and what passes examination.
 
     What it returns raises ``RecordingError`` for what is no recording there, or none of ours.
     """
 
     def find(file: str) -> Viewable:
-        path = resolve_inside(folder, file)
+        path = resolve_inside(index.folder, file)
         state = path.stat()
-        return Viewable(path, index().get(file) or _examined(path, state.st_mtime_ns, state.st_size))
+        return Viewable(path, index.get(file) or _examined(path, state.st_mtime_ns, state.st_size))
 
     return find
 

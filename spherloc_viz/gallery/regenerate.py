@@ -1,0 +1,85 @@
+"""``spherloc gallery``: runs the cases, records them, and says whether each fails as it is told."""
+
+import re
+import textwrap
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from spherloc.datasets.map_scene import MapScene
+from spherloc.errors import InputError, show
+from spherloc.estimators import warm_up
+from spherloc.metrics import evaluate
+from spherloc.trace import Trace
+from spherloc_viz.gallery.case import Beside, GalleryCase, origin_of
+from spherloc_viz.gallery.check import Played, faults, play
+from spherloc_viz.recording.writer import write_recording
+
+WIDTH = 100
+"""Of stories on a terminal, characters."""
+
+
+def chosen(cases: Sequence[GalleryCase], keys: Sequence[str]) -> tuple[GalleryCase, ...]:
+    """The cases of these keys, or all if there are none. Raises ``InputError`` for an unknown key."""
+    by_key = {case.key: case for case in cases}
+    for key in keys:
+        if key not in by_key:
+            raise InputError(f"no case {show(key)} in the gallery; there are {', '.join(by_key)}.")
+    return tuple(by_key[key] for key in keys) or tuple(cases)
+
+
+def stories(cases: Sequence[GalleryCase]) -> str:
+    """Key, title, cause and story of each case."""
+    indent = {"initial_indent": "  ", "subsequent_indent": "  "}
+    parts = [
+        f"{case.key}: {case.title} ({case.cause}, {case.estimator})\n{textwrap.fill(case.story, WIDTH, **indent)}"
+        for case in cases
+    ]
+    return "\n\n".join(parts)
+
+
+def regenerate(cases: Sequence[GalleryCase], folder: Path, say: Callable[[str], None]) -> int:
+    """Run and record the cases and print a line for each; returns how many fail otherwise than they are told.
+
+    ``say`` is told what takes a while, and what is not as it is told. Raises ``RecordingError`` if a recording cannot
+    be written.
+    """
+    warm_up(say)
+    width = max(len(case.key) for case in cases)
+    untrue = 0
+    for case in cases:
+        if isinstance(case.scene, MapScene):
+            say(f"{case.key}: drawing and matching images; what is new to this machine takes a while")
+        played = play(case)
+        files = record(played, folder)
+        wrong = list(faults(played))
+        for sentence in wrong:
+            say(sentence)
+        untrue += bool(wrong)
+        more = f"  (+{len(files) - 1})" if len(files) > 1 else ""
+        line = f"{case.key:<{width}}  {case.cause:<22}  {outcome(played.trace):<22}  {files[0].name}{more}"
+        print(line, flush=True)
+    return untrue
+
+
+def record(played: Played, folder: Path) -> list[Path]:
+    """Write the recordings of a case, its own first; returns their paths."""
+    case = played.case
+    files = [folder / f"{case.key}.rrd"]
+    write_recording(played.trace, files[0], case.origin, played.diagnosis)
+    for item, trace in played.beside:
+        if item.recorded:
+            files.append(folder / f"{case.key}_{_file_part(item)}.rrd")
+            write_recording(trace, files[-1], origin_of(item, f"{case.title}: {item.name}", case.story))
+    return files
+
+
+def outcome(trace: Trace) -> str:
+    """How far the pose of a run is from the truth."""
+    metrics = evaluate(trace)
+    if metrics.translation_error_m is None or metrics.rotation_error_deg is None:
+        return "no pose"
+    return f"{metrics.translation_error_m:.2f} m, {metrics.rotation_error_deg:.2f}° off"
+
+
+def _file_part(item: Beside) -> str:
+    return re.sub(r"[^A-Za-z0-9]+", "-", item.name)

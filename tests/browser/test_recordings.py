@@ -1,0 +1,150 @@
+"""Reviewing as a person does it: look for runs, open them exactly as they were, label them, go on by key, take them away."""
+
+import csv
+import io
+import re
+import urllib.request
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from playground import PATIENCE_MS, SCENE, Playground, served
+from playwright.sync_api import Browser, Locator, expect
+
+from spherloc_viz.recording.reader import read_run_row
+from spherloc_viz.recording.review import read_review
+
+pytestmark = [pytest.mark.browser, pytest.mark.timeout(280)]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("review")
+
+
+@pytest.fixture(scope="module")
+def own_address(folder: Path) -> Iterator[str]:
+    """A server of its own, which records into a folder that is empty at first."""
+    (folder / "small.toml").write_text(SCENE)
+    with served(folder / "small.toml", "--recordings", folder / "recordings") as (address, _):
+        yield address
+
+
+@pytest.fixture
+def tab(browser: Browser, own_address: str) -> Iterator[Playground]:
+    page = Playground(browser, own_address)
+    yield page
+    page.close()
+
+
+def rows(tab: Playground) -> Locator:
+    """The rows of the list."""
+    return tab.page.locator("[data-touch^='run-open:']").locator("visible=true")
+
+
+def said(tab: Playground, words: str) -> Locator:
+    """A line that has these words."""
+    return tab.page.get_by_text(re.compile(words)).locator("visible=true").first
+
+
+def recorded(tab: Playground) -> str:
+    """The file that the run on the page was recorded as, once the line says so."""
+    line = said(tab, r"^Recorded as .+\.rrd")
+    expect(line).to_be_visible()
+    found = re.search(r"Recorded as (\S+\.rrd)", line.inner_text())
+    assert found is not None
+    return found[1]
+
+
+def test_failures_are_gone_through(tab: Playground, own_address: str, folder: Path) -> None:
+    recordings = folder / "recordings"
+    first = recorded(tab)
+    tab.slide("Outliers (%)", "End")
+    expect(said(tab, "^Will be recorded")).to_be_visible()
+    second = recorded(tab)
+    assert first != second
+    tab.until(lambda: (recordings / second).exists(), "the second run is on the disk")
+    inliers = {file: read_run_row(recordings / file).inliers for file in (first, second)}
+    assert inliers[first] != inliers[second]
+
+    tab.tab("Recordings")
+    expect(rows(tab)).to_have_count(2)
+    tab.touch("runs-filter:outcome:failure").click()
+    expect(rows(tab)).to_have_count(1)
+    expect(rows(tab)).to_have_attribute("data-touch", f"run-open:{second}")
+    tab.touch("runs-filter:outcome:failure").click()
+    tab.entry("Search").fill("no such run")
+    expect(said(tab, "No recorded run fits")).to_be_visible()
+    tab.entry("Search").fill("small STREET")
+    expect(rows(tab)).to_have_count(2)
+
+    # One is opened exactly as it was.
+    rows(tab).nth(1).click()
+    expect(said(tab, f"^Opened {re.escape(first)}")).to_be_visible()
+    expect(tab.value("inliers")).to_have_text(f"{inliers[first]} of 40")
+    expect(said(tab, "2 of 2")).to_be_visible()
+    tab.tab("Play")
+    expect(tab.entry("Seed")).to_have_value("3")
+    expect(tab.thumb("Outliers (%)")).to_have_attribute("aria-valuenow", "50")
+
+    # Something is changed, and both are seen.
+    tab.slide("Noise (px)", "Home")
+    expect(said(tab, "^Changed: noise px")).to_be_visible()
+    expect(tab.page.locator("table.runs-beside")).to_contain_text("as recorded")
+    tab.until(lambda: tab.node("/recorded/0") is not None, "the recorded camera is drawn")
+    third = recorded(tab)
+    tab.until(lambda: (recordings / third).exists(), "the changed run is on the disk")
+    tab.touch("run-return:").click()
+    expect(said(tab, f"^Opened {re.escape(first)}")).to_be_visible()
+
+    # It is labelled; keys that are typed into a field do nothing else.
+    tab.tab("Recordings")
+    expect(rows(tab)).to_have_count(3)
+    tab.entry("Labels").fill("[odd], seam]")
+    tab.entry("Labels").press("]")
+    expect(rows(tab).last).to_contain_text("seam]]")
+    tab.until(lambda: read_review(recordings / first).labels == ("[odd]", "seam]]"), "the labels are stored")
+    expect(said(tab, "3 of 3")).to_be_visible()
+
+    # On by key, whichever tab is in front.
+    tab.tab("Play")
+    tab.page.locator("canvas").first.focus()
+    tab.page.keyboard.press("[")
+    expect(said(tab, f"^Opened {re.escape(second)}")).to_be_visible()
+    expect(tab.value("inliers")).to_have_text(f"{inliers[second]} of 40")
+    tab.page.keyboard.press("]")
+    expect(said(tab, f"^Opened {re.escape(first)}")).to_be_visible()
+    tab.touch("run-close:").click()
+    expect(tab.touch("run-close:")).to_have_count(0)
+    assert len([path for path in recordings.glob("*.rrd") if ".review." not in path.name]) == 3, "none was made twice"
+    assert tab.errors == []
+
+
+def test_runs_are_viewed_and_taken_away(tab: Playground, own_address: str, folder: Path) -> None:
+    recorded(tab)
+    tab.tab("Recordings")
+    expect(rows(tab).first).to_be_visible()
+    link = tab.page.locator("a[href^='/viewer/?run=']").locator("visible=true").first
+    assert link.get_attribute("target") == "_blank" and link.get_attribute("rel") == "noopener"
+    with urllib.request.urlopen(own_address + str(link.get_attribute("href")), timeout=PATIENCE_MS / 1e3) as answer:
+        assert answer.status == 200 and "default-src 'none'" in answer.headers["Content-Security-Policy"]
+    # The link opens the viewer and not the run around it.
+    with tab.page.expect_popup() as popup:
+        link.click()
+    popup.value.close()
+    expect(tab.touch("run-close:")).to_have_count(0)
+
+    file = str(rows(tab).first.get_attribute("data-touch")).removeprefix("run-open:")
+    tab.touch(f"run-mark:{file}").click()
+    expect(said(tab, "^1 marked")).to_be_visible()
+    with tab.page.expect_download() as download:
+        tab.touch("runs-export:").first.click()
+    with zipfile.ZipFile(download.value.path()) as archive:
+        assert archive.read(f"recordings/{file}") == (folder / "recordings" / file).read_bytes()
+        (row,) = csv.DictReader(io.StringIO(archive.read("runs.csv").decode()))
+        page = archive.read("index.html").decode()
+    assert row["file"] == file and "<script" not in page and "small street" in page
+    tab.page.set_content(page)
+    expect(tab.page.locator("h1")).to_have_text("1 recorded run")
+    assert tab.page.locator("img").first.evaluate("image => image.naturalWidth") > 0

@@ -1,0 +1,133 @@
+"""Recordings cut and changed at random: each one is read rightly or refused in a sentence, and nothing else happens."""
+
+import os
+import struct
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rerun as rr
+from hostile_recordings import message, places, with_index, with_message
+from recording_samples import scene_problem
+from rerun.chunk import Chunk, LazyChunkStream
+
+from spherloc.errors import RecordingError
+from spherloc.estimators import estimate
+from spherloc_viz.recording.index import RunIndex
+from spherloc_viz.recording.query import RunQuery
+from spherloc_viz.recording.reader import read_recording
+from spherloc_viz.recording.run_row import RunRow
+from spherloc_viz.recording.strangers import examine_all
+from spherloc_viz.recording.writer import write_recording
+
+Noise = Callable[[bytes, np.random.Generator], bytes]
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("good") / "good.rrd"
+    write_recording(estimate(scene_problem("mei_outliers_80"), "mc"), path)
+    return path
+
+
+def flipped(content: bytes, rng: np.random.Generator) -> bytes:
+    """One to three bits, anywhere."""
+    changed = bytearray(content)
+    for place in rng.integers(len(changed), size=rng.integers(1, 4)):
+        changed[place] ^= 1 << rng.integers(8)
+    return bytes(changed)
+
+
+def lied(content: bytes, rng: np.random.Generator) -> bytes:
+    """A number of 8 bytes replaced by one that is too small or too large."""
+    place = 8 * rng.integers(len(content) // 8)
+    number = rng.choice([-1, 0, 1 << 31, 10**9, 1 << 40, (1 << 63) - 1])
+    return content[:place] + struct.pack("<q", number) + content[place + 8 :]
+
+
+def cut(content: bytes, rng: np.random.Generator) -> bytes:
+    return content[: rng.integers(len(content))]
+
+
+def hostile_files(good: Path, rng: np.random.Generator, count: int) -> Iterator[bytes]:
+    """Files with noise outside, within a chunk that is packed again, or in the index with a checksum that fits."""
+    content = good.read_bytes()
+    own = [entity for entity in places(good) if entity.startswith(("/data", "/__properties"))]
+    for turn in range(count):
+        noise: Noise = (flipped, lied)[rng.integers(2)]
+        entity = str(rng.choice(own))
+        match turn % 6:
+            case 0:
+                yield cut(content, rng)
+            case 1:
+                yield flipped(content, rng)
+            case 2:
+                yield with_message(good, entity, lambda m, noise=noise: noise(m, rng))
+            case 3:
+                offset, size = (struct.pack("<Q", number) for number in places(good)[entity])
+                yield with_index(good, (offset, noise(offset, rng)), (size, noise(size, rng)))
+            case _:
+                yield with_message(good, entity, lambda m, noise=noise: message(m, change=lambda a: noise(a, rng)))
+
+
+def test_whatever_passes_can_be_read_and_the_rest_is_one_sentence(
+    good: Path, tmp_path: Path, rng: np.random.Generator
+) -> None:
+    paths = []
+    for number, content in enumerate(hostile_files(good, rng, 120)):
+        paths.append(tmp_path / f"{number}.rrd")
+        paths[-1].write_bytes(content)
+    passed = 0
+    for path, result in examine_all(paths):
+        if isinstance(result, RunRow):
+            assert read_recording(path).row == result
+            passed += 1
+        else:
+            text = str(result)
+            assert text.startswith(f"{path}: ") and text.endswith(".") and text.isprintable() and len(text) < 700
+    assert 0 < passed < 60
+
+
+def test_cut_at_any_byte_it_is_no_whole_recording(good: Path, tmp_path: Path, rng: np.random.Generator) -> None:
+    content = good.read_bytes()
+    lengths = [*range(0, 40, 8), *sorted(rng.integers(len(content), size=40)), *range(len(content) - 40, len(content))]
+    paths = []
+    for length in lengths:
+        paths.append(tmp_path / f"{length}.rrd")
+        paths[-1].write_bytes(content[:length])
+    for path, result in examine_all(paths):
+        assert isinstance(result, RecordingError) and "not a whole recording" in str(result), path.name
+
+
+def foreign(path: Path) -> None:
+    dot = Chunk.from_columns("/dot", [], rr.Points3D.columns(positions=[[1, 2, 3]]))
+    LazyChunkStream.from_iter([dot]).write_rrd(path, application_id="other", recording_id="1")
+
+
+def test_a_list_of_good_and_bad_files_has_the_good_ones(good: Path, tmp_path: Path, rng: np.random.Generator) -> None:
+    folder, content = tmp_path / "recordings", good.read_bytes()
+    folder.mkdir()
+    names = {f"good-{number}.rrd" for number in range(20)}
+    for name in names:
+        (folder / name).write_bytes(content)
+    bad: list[Path] = []
+    for number in range(50):
+        bad.append(folder / f"bad-{number}.rrd")
+        bad[-1].write_bytes(cut(content, rng) if number % 2 else lied(content[:-32], rng) + content[-32:][::-1])
+    for name in ("foreign", "folder", "pipe", "loop", "sparse", "a b", "<img src=x>", "-rf", "\udcff", "\u202egnp"):
+        bad.append(folder / f"{name}.rrd")
+    foreign(bad[50])
+    bad[51].mkdir()
+    os.mkfifo(bad[52])
+    bad[53].symlink_to(bad[53])
+    bad[54].write_bytes(content)
+    os.truncate(bad[54], 5_000_000_000)
+    for path in bad[55:]:
+        path.write_bytes(content)
+    notices: list[str] = []
+    with RunIndex(folder, notices.append) as index:
+        refreshed = index.rebuild()
+        found = index.find(RunQuery(), limit=None)
+    assert names <= {row.file for row in found.rows}
+    print(sorted({row.file for row in found.rows}-names)); print(len(refreshed.skipped), refreshed.skipped[-12:])

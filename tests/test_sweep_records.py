@@ -1,0 +1,71 @@
+"""Every run of a sweep is recorded where it is done, by several processes into one folder."""
+
+import csv
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from spherloc.datasets.variation import Variation
+from spherloc.experiments.sweep import Entrant, Job, planned
+from spherloc.trace import Trace
+from spherloc_viz.batch import Records
+from spherloc_viz.recording.index import RunIndex
+from spherloc_viz.recording.query import RunQuery
+from spherloc_viz.recording.reader import read_recording
+from spherloc_viz.recording.reopen import reopen
+from spherloc_viz.recording.sweep_keeper import SweepKeeper
+from spherloc_viz.sweep import sweep
+
+ROOT = Path(__file__).resolve().parents[1]
+SCENE = ROOT / "scenes" / "mei_outliers_80.toml"
+
+
+def swept(out: Path, recordings: Path, **changes: object) -> int:
+    words = {"values": ["0.2", "0.5"], "estimators": ["mc", "ransac-2p,iterations=50"], "runs": 3, "seed": 4}
+    more = {"workers": 2, "scheduler": None, "out": out, "records": Records(recordings)}
+    settings = ["correspondences=30"]
+    return sweep(SCENE, "outlier_rate", settings=settings, **(words | more | changes))  # type: ignore[arg-type]
+
+
+def test_the_runs_of_all_workers_are_recorded_and_listed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder, out = tmp_path / "recordings", tmp_path / "sweep.csv"
+    assert swept(out, folder) == 0
+    assert "recorded" not in capsys.readouterr().err
+    with out.open(newline="") as file:
+        rows = {(row["estimator"].split()[0], row["outlier_rate"], int(row["seed"])) for row in csv.DictReader(file)}
+    with RunIndex(folder) as index:
+        listed = index.find(RunQuery(source="sweep"), limit=None).rows
+        assert index.refresh().read == 0
+    assert len(rows) == len(listed) == len(list(folder.glob("*.rrd"))) == 12 and not list(folder.glob("*.part"))
+    runs = {row.file: read_recording(folder / row.file) for row in listed}
+    origins = [run.origin for run in runs.values()]
+    assert all(origin is not None and origin.scene_path == str(SCENE) for origin in origins)
+    assert rows == {
+        (run.estimator, str(run.origin.variation.outlier_rate), run.seed) for run in runs.values() if run.origin
+    }
+    name = next(name for name, run in runs.items() if run.estimator == "ransac-2p")
+    opened = reopen(runs[name], folder / name, [SCENE.parent])
+    assert opened.live and opened.variation.correspondences == 30 and opened.options.iterations == 50
+
+
+def test_where_nothing_can_be_recorded_the_sweep_goes_on_and_says_it_once(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").write_text("in the way")
+    assert swept(tmp_path / "sweep.csv", tmp_path / "file", values=["0.2"], workers=1) == 0
+    errors = capsys.readouterr().err.splitlines()
+    assert len([line for line in errors if "the run cannot be recorded" in line and "The sweep goes on." in line]) == 1
+    assert [line for line in errors if "times something could not be recorded" in line]
+    assert len((tmp_path / "sweep.csv").read_text().splitlines()) == 1 + 6
+
+
+def test_workers_of_other_machines_record_nothing(tmp_path: Path) -> None:
+    plan = planned(SCENE, "noise_px", [1.0], [Entrant("ransac-2p")], 1, Variation(correspondences=20))
+    done: list[tuple[Job, Trace]] = []
+    plan.solve(list(plan.jobs()), lambda job, trace: done.append((job, trace)))
+    keeper = SweepKeeper(tmp_path / "recordings")
+    assert replace(keeper, machine="another")(plan, *done[0]) == "" and not list(tmp_path.iterdir())
+    assert keeper(plan, *done[0]) == ""
+    (path,) = (tmp_path / "recordings").glob("*.rrd")
+    assert read_recording(path).row.source == "sweep" and read_recording(path).problem.pixels.shape == (20, 2)
