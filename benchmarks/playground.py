@@ -13,11 +13,11 @@ SCENE = ROOT / "scenes" / "panorama_outliers_90.toml"
 
 
 @contextmanager
-def playground(scene: Path = SCENE) -> Iterator[tuple[str, subprocess.Popen[str]]]:
-    """Address and process of ``spherloc play`` on a free port, which records into a folder that is thrown away."""
+def playground(scene: Path = SCENE, recordings: Path | None = None) -> Iterator[tuple[str, subprocess.Popen[str]]]:
+    """Address and process of ``spherloc play`` on a free port, which records into a folder, or one that is thrown away."""
     program = Path(sys.executable).with_name("spherloc")
     with tempfile.TemporaryDirectory() as folder:
-        words = [program, "play", scene, "--port", "0", "--recordings", folder]
+        words = [program, "play", scene, "--port", "0", "--recordings", recordings or folder]
         server = subprocess.Popen([*map(str, words)], stdout=subprocess.PIPE, text=True)
         try:
             assert server.stdout is not None

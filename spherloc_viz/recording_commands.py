@@ -34,16 +34,17 @@ def view(
         step: The step to open at; 0 is the first, and the decisive one is taken if it is not given.
         port: Port of the web viewer; 0 takes a free one.
     """
-    from spherloc_viz.app.web.viewer_server import serve_recording
     from spherloc_viz.recording.strangers import examine
     from spherloc_viz.recording.view import step_of, view_in_window
 
     row = examine(recording)
     place = step_of(row, step)
     if web:
+        from spherloc_viz.app.web.viewer_server import serve_recording
+
         serve_recording(recording, row, place, port)
     else:
-        view_in_window(recording, place)
+        view_in_window(recording, row, place)
     return 0
 
 

@@ -13,9 +13,9 @@ from spherloc_viz.progress import progress, say
 from spherloc_viz.recording.index import RunIndex
 from spherloc_viz.recording.index_refresh import Refreshed
 from spherloc_viz.recording.query import GROUP_KEYS, OUTCOMES, SORT_KEYS, SOURCES, RunQuery
-from spherloc_viz.recording.review import Review, checked_review, read_review
+from spherloc_viz.recording.review import Review, checked_review
 from spherloc_viz.recording.run_text import FORMS, counts_text, rows_text
-from spherloc_viz.recording.strangers import examine
+from spherloc_viz.recording.strangers import examine, examine_review
 
 SORT_WORDS = {
     "outliers": "outlier_rate",
@@ -101,13 +101,12 @@ def label_runs(paths: Sequence[Path], add: Sequence[str], remove: Sequence[str],
 def _label(path: Path, add: Sequence[str], remove: Sequence[str], note: str | None) -> Review:
     if not path.exists():
         raise RecordingError(f"{path}: no such file; spherloc runs lists the recordings.")
-    before = read_review(path)
+    row, before = examine(path), examine_review(path)
     added, gone = checked_review(add, "").labels, checked_review(remove, "").labels
     for label in gone:
         if label not in (*before.labels, *added):
             raise RecordingError(f"{path}: has no label {show(label)}; it has {', '.join(before.labels) or 'none'}.")
     labels = [label for label in (*before.labels, *added) if label not in gone]
-    row = examine(path)
     in_gallery = path.parent.name == GALLERY
     with RunIndex(path.parent.parent if in_gallery else path.parent, say) as index:
         file = f"{GALLERY}/{path.name}" if in_gallery else path.name

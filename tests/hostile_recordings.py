@@ -4,11 +4,14 @@ A file is a header of 12 bytes, frames (16 bytes of kind and length, then a prot
 all chunks, and a foot of 32 bytes: where the index is, how long, and its checksum.
 """
 
+import json
+import math
 import struct
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 from rerun.chunk import Chunk, LazyChunkStream, RrdReader
 
@@ -16,7 +19,7 @@ APPLICATION_ID = "spherloc"
 FOOT_BYTES = 32
 LZ4 = pa.Codec("lz4_raw")
 
-Change = Callable[[dict[str, Any]], dict[str, Any] | None]
+Change = Callable[[dict[str, Any]], Mapping[str, Any] | None]
 """Of the columns of a chunk; None drops the chunk."""
 
 
@@ -40,6 +43,29 @@ def _changed_chunk(chunk: Chunk, change: Change) -> Iterator[Chunk]:
     if columns is not None:
         rows = pa.RecordBatch.from_pydict(columns)
         yield from Chunk.from_record_batch(rows, index=None, entity_path=chunk.entity_path)
+
+
+def unpacked(columns: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """The values and the arrays of a row of ``/data``."""
+    told = json.loads(columns["scalars"][0].values[0].as_py())
+    content, at = columns["arrays"][0].values.to_numpy(), 0
+    arrays: dict[str, np.ndarray] = {}
+    for name, kind, shape in told["arrays"]:
+        size = np.dtype(kind).itemsize * math.prod(shape)
+        arrays[name], at = content[at : at + size].view(kind).reshape(shape), at + size
+    return told["values"], arrays
+
+
+def packed(values: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """The row of values and arrays, in the format of today."""
+    forms = [[name, array.dtype.str, list(array.shape)] for name, array in arrays.items()]
+    content = np.frombuffer(b"".join(array.tobytes() for array in arrays.values()), np.uint8)
+    return {"scalars": pa.array([[json.dumps({"arrays": forms, "values": values})]]), "arrays": listed(content)}
+
+
+def packed_as_format_1(values: Mapping[str, Any], columns: Mapping[str, Any]) -> dict[str, Any]:
+    """The row of values and of an arrow column for each array, in the format of old, which can still be read."""
+    return {name: listed(array) for name, array in columns.items()} | {"scalars": pa.array([[json.dumps(values)]])}
 
 
 def listed(array: Any) -> pa.Array:

@@ -53,8 +53,9 @@ def test_the_card_is_there_while_something_is_selected(server: viser.ViserServer
     for action in ("spoil:", "mend:", "hide:", "deselect:", f"select:{number + 41}"):
         assert f'data-touch="{action}"' in content
     assert "<img" not in content, "there is no image to cut from"
+    assert card._more.visible and "pairs that agree" in card._details.content
     card.draw(trace, (number, number + 1), kept)
-    assert "2 matches" in card._html.content
+    assert "2 matches" in card._html.content and not card._more.visible
     card.draw(trace, (), kept)
     assert not card._panel.visible
 
@@ -72,7 +73,7 @@ def test_the_card_names_pairs_that_can_be_selected(server: viser.ViserServer, tr
     card = MatchCard(server.gui)
     number = int(np.argmin(trace.inlier_mask))
     card.draw(trace, (number,), np.arange(60) + 5)
-    others = re.findall(rf'data-touch="select:{number + 5},(\d+)"[^>]*>(\d+)<', card._html.content)
+    others = re.findall(rf'data-touch="select:{number + 5},(\d+)"[^>]*>(\d+)<', card._details.content)
     assert others and all(one == other and 5 <= int(one) < 65 for one, other in others)
 
 
@@ -81,7 +82,8 @@ def test_what_cannot_be_mended_says_why(server: viser.ViserServer, trace: Trace)
     blind = replace(trace, problem=replace(trace.problem, truth_cam_from_map=None, truth_inliers=None))
     card.draw(blind, (4,), np.arange(60))
     assert 'data-touch="mend:"' not in card._html.content and "The true pose is unknown" in card._html.content
-    assert "at the truth" not in card._html.content
+    assert "at the estimate" in card._details.content or "residual" in card._details.content
+    assert "at the truth" not in card._details.content
 
 
 def test_the_card_follows_run_and_rival(server: viser.ViserServer, trace: Trace) -> None:

@@ -120,6 +120,20 @@ def test_layers_switch_off(painter: Painter, canvas: Canvas) -> None:
         assert canvas.shown == expected
 
 
+def test_what_is_hidden_stays_so_until_it_is_shown_again(painter: Painter, canvas: Canvas) -> None:
+    painter.draw([dots(5), rays(3)], ALL)
+    painter.hide(frozenset({"rays", "nothing"}))
+    assert canvas.shown == {"/map/points"}
+    painter.draw([dots(5), rays(4)], ALL)
+    assert canvas.shown == {"/map/points"}
+    painter.hide(frozenset())
+    assert canvas.shown == {"/map/points", "/rays"}
+    painter.draw([dots(5), rays(4)], ALL - {"rays"})
+    painter.hide(frozenset({"map/points"}))
+    painter.hide(frozenset())
+    assert canvas.shown == {"/map/points"}, "a layer that is off stays off"
+
+
 def test_many_dots_become_a_cloud_of_full_precision(painter: Painter, canvas: Canvas) -> None:
     painter.draw([dots(MOST_BATCHED)], ALL)
     assert canvas.calls["/map/points"][0] == "add_batched_meshes_simple"

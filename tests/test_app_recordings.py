@@ -151,8 +151,14 @@ def test_the_list_is_sorted_and_turned(shelf: Shelf) -> None:
         shelf.page(worst)[0].rows[0].seed == 49 and shelf.page(worst.sorted("rotation_error_deg"))[0].rows[0].seed == 0
     )
     assert shelf.place(worst, "run-0040.rrd", 0) == (9, 50) and shelf.place(worst, "gone.rrd", 0) == (None, 50)
-    row = shelf.at(worst, 10)
-    assert row is not None and row.seed == 39 and shelf.at(worst, 50) is None and shelf.at(worst, -1) is None
+    far = made_row(999, file="far.rrd", rotation_error_deg=-1.0)
+    shelf._index.add_all([far, *(made_row(number) for number in range(50, 300))])
+    assert shelf.place(worst, "far.rrd", 0) == (300, 301), "however far it is"
+    assert shelf.place(worst.choose("outcome", "success"), "far.rrd", 200)[0] is not None
+    assert shelf.place(worst.choose("outcome", "failure"), "far.rrd", 0)[0] is None
+    shelf._index.remove("far.rrd")
+    row = shelf.at(worst, 260)
+    assert row is not None and row.seed == 39 and shelf.at(worst, 300) is None and shelf.at(worst, -1) is None
 
 
 @pytest.mark.parametrize(

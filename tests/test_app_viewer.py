@@ -44,6 +44,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Folder:
     for copy in ("plain.rrd", "gallery/case.rrd", "damaged.rrd"):
         (runs / copy).write_bytes((runs / "good.rrd").read_bytes())
     review_path(runs / "damaged.rrd").write_bytes(b"no review")
+    write_review(runs / "plain.rrd", ["another's"], "", run_id="another")
     (runs / "noise.rrd").write_bytes(bytes(range(256)) * 40)
     (runs / "way-out.rrd").symlink_to(home / "secret.rrd")
     chunk = Chunk.from_columns("/text", [], rr.TextDocument.columns(text=["secret"]))
@@ -117,11 +118,10 @@ def test_without_a_step_it_is_the_decisive_one(folder: Folder) -> None:
 
 def test_runs_that_the_index_does_not_know_are_examined(folder: Folder) -> None:
     async def calls(door: Door) -> None:
-        for file in ("plain.rrd", "gallery/case.rrd"):
-            page = Parsed(await (await door.get(viewer_link(file, 1).lstrip("/"))).text())
-            run, review = page.body["data-files"].split()
-            assert await (await door.get(run.lstrip("/"))).read() == (runs / file).read_bytes()
-            assert (await door.get(review.lstrip("/"))).status == 204, "there are no labels"
+        page = Parsed(await (await door.get(viewer_link("gallery/case.rrd", 1).lstrip("/"))).text())
+        run, review = page.body["data-files"].split()
+        assert await (await door.get(run.lstrip("/"))).read() == (runs / "gallery/case.rrd").read_bytes()
+        assert (await door.get(review.lstrip("/"))).status == 204, "there are no labels"
 
     runs, row = folder
     visit(runs, row, calls)
@@ -212,13 +212,14 @@ def test_a_step_that_is_none_is_one_sentence(folder: Folder, step: str) -> None:
     visit(*folder, calls)
 
 
-def test_damaged_labels_are_told(folder: Folder) -> None:
+@pytest.mark.parametrize("run, words", [("damaged", "cannot be read"), ("plain", "of another run")])
+def test_labels_that_cannot_be_shown_are_told(folder: Folder, run: str, words: str) -> None:
     """The run opens all the same: its page shows the sentence that it gets in place of the labels."""
 
     async def calls(door: Door) -> None:
-        assert (await door.get("viewer/?run=damaged.rrd")).status == 200
-        response = await door.get("viewer/data/damaged.review.rrd")
-        assert response.status == 404 and "labels" in await response.text()
+        assert (await door.get(f"viewer/?run={run}.rrd")).status == 200
+        response = await door.get(f"viewer/data/{run}.review.rrd")
+        assert response.status == 404 and f"labels and note {words}" in await response.text()
 
     visit(*folder, calls)
 

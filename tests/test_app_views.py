@@ -1,6 +1,7 @@
 """Standing in the camera: at its place, along its axis, with a wide view."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from spherloc.problem import Problem
 from spherloc.trace import Trace
 from spherloc_viz.app.stage import views
 from spherloc_viz.layers import paint, steps
-from spherloc_viz.layers.primitives import Mesh
+from spherloc_viz.layers.primitives import Mesh, Segments
 
 
 @pytest.fixture(scope="module")
@@ -45,6 +46,20 @@ def test_without_an_estimate_one_stands_in_the_sphere(trace: Trace) -> None:
     reach = np.linalg.norm(surface.vertices - view.position, axis=1)
     np.testing.assert_allclose(reach, reach[0], rtol=1e-6)
     assert 0 < np.linalg.norm(view.target - view.position) < 0.1 * reach[0], "so that the mouse turns the head"
+
+
+def test_who_stands_in_a_camera_does_not_see_its_lines(trace: Trace) -> None:
+    picture = paint(trace, len(steps(trace)) - 1)
+    inside, outside = (views.find(name, picture, 1.5).position for name in (views.INSIDE, "Overview"))
+    around = {item.name for item in picture.scene if item.layer == "uncertainty"}
+    assert around and views.before_the_eyes(picture, outside) == frozenset()
+    hidden = views.before_the_eyes(picture, inside)
+    assert hidden == around | {"cameras/estimate", "cameras/truth", "cameras/error"}
+    truth = next(item for item in picture.scene if item.name == "cameras/truth")
+    assert isinstance(truth, Segments)
+    far = replace(truth, points=truth.points + 1e3)
+    apart = replace(picture, scene=tuple(far if item is truth else item for item in picture.scene))
+    assert "cameras/truth" not in views.before_the_eyes(apart, inside), "it may be seen if it is elsewhere"
 
 
 def test_every_view_is_found_at_every_step(trace: Trace) -> None:

@@ -81,7 +81,7 @@ def test_run_prints_one_json_object_a_scene_and_records_each(tmp_path: Path, est
         assert record["rotation_error_deg"] < 1 and record["translation_error_m"] < 0.1
         assert (tmp_path / record["recording"]).is_file()
         assert Path(record["recording"]).parent == Path("recordings")
-    assert len(list((tmp_path / "recordings").iterdir())) == len(scenes)
+    assert len(list((tmp_path / "recordings").glob("*.rrd"))) == len(scenes)
 
 
 def test_same_seed_same_pose_and_other_seed_other_problem(tmp_path: Path) -> None:

@@ -85,7 +85,7 @@ def test_the_ellipsoid_is_that_of_the_covariance_by_the_factor_it_states(
 @pytest.mark.parametrize("broken", [np.full((6, 6), np.nan), np.diag([1.0] * 5 + [np.inf])])
 def test_a_spread_that_is_unknown_is_not_drawn(turned: Trace, broken: np.ndarray) -> None:
     items = last(with_covariance(turned, broken))
-    assert "uncertainty/ellipsoid" not in items and "×" not in text(items["uncertainty/distance"])
+    assert "uncertainty/ellipsoid" not in items and "×" not in text(items["uncertainty/error"])
 
 
 def test_the_ellipsoid_belongs_to_the_refined_pose_only(turned: Trace) -> None:
@@ -101,7 +101,7 @@ def test_the_ellipsoid_belongs_to_the_refined_pose_only(turned: Trace) -> None:
                 assert ("uncertainty/ellipsoid" in items) == (away <= 1e-9), step.key
         else:
             assert "uncertainty/ellipsoid" not in items
-        assert ("uncertainty/degrees" in items) == ("cameras/estimate" in items), step.key
+        assert ("uncertainty/error" in items) == ("cameras/estimate" in items), step.key
 
 
 def test_errors_are_drawn_and_said_as_the_metrics_have_them(turned: Trace) -> None:
@@ -112,10 +112,11 @@ def test_errors_are_drawn_and_said_as_the_metrics_have_them(turned: Trace) -> No
     offset, angle = items["uncertainty/offset"], items["uncertainty/angle"]
     assert isinstance(offset, Segments) and isinstance(angle, Segments)
     drawn, error = offset.points[0, 1] - offset.points[0, 0], camera_centre(truth) - camera_centre(estimated)
-    length, _, factor = text(items["uncertainty/distance"]).partition(" × ")
+    degrees, _, rest = text(items["uncertainty/error"]).partition(" · ")
+    length, _, factor = rest.partition(" × ")
     assert length == length_text(float(np.linalg.norm(error)))
     np.testing.assert_allclose(drawn, int(factor or 1) * error, atol=1e-9)
-    assert text(items["uncertainty/degrees"]) == angle_text(rotation_error_deg(truth, estimated))
+    assert degrees == angle_text(rotation_error_deg(truth, estimated))
     ways = angle.points[:2, 1] - angle.points[:2, 0]
     ways /= np.linalg.norm(ways, axis=1)[:, None]
     np.testing.assert_allclose(ways, [estimated[2, :3], truth[2, :3]], atol=1e-9)
@@ -129,7 +130,7 @@ def test_a_large_error_has_its_true_size(turned: Trace) -> None:
     away = replace(turned.problem, truth_cam_from_map=pose(truth[:, :3], truth[:, 3] + [0.0, 0.0, 40.0]))
     items = last(replace(turned, problem=away))
     offset = items["uncertainty/offset"]
-    assert isinstance(offset, Segments) and text(items["uncertainty/distance"]) == "40 m"
+    assert isinstance(offset, Segments) and text(items["uncertainty/error"]).endswith(" · 40 m")
     assert np.linalg.norm(offset.points[0, 1] - offset.points[0, 0]) == pytest.approx(40.0, rel=0.01)
 
 

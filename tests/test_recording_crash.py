@@ -19,10 +19,11 @@ from spherloc.estimators import estimate
 from spherloc.trace import Trace
 from spherloc_viz.recording.background import Recorder
 from spherloc_viz.recording.keeper import Keeper
-from spherloc_viz.recording.leftovers import STALE_AFTER_S, here, leftovers, rescue, scratch, unfinished
+from spherloc_viz.recording.leftovers import STALE_AFTER_S, here, leftovers, scratch, unfinished
 from spherloc_viz.recording.query import RunQuery
 from spherloc_viz.recording.reader import read_recording, read_run_row
 from spherloc_viz.recording.repeat import compare
+from spherloc_viz.recording.rescue import rescue
 from spherloc_viz.recording.review import write_review
 from spherloc_viz.recording.writer import write_recording
 

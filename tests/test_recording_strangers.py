@@ -8,7 +8,7 @@ import struct
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,18 @@ import numpy as np
 import pyarrow as pa
 import pytest
 import rerun as rr
-from hostile_recordings import APPLICATION_ID, Change, changed, listed, message, places, with_index, with_message
+from hostile_recordings import (
+    APPLICATION_ID,
+    Change,
+    changed,
+    message,
+    packed,
+    packed_as_format_1,
+    places,
+    unpacked,
+    with_index,
+    with_message,
+)
 from recording_samples import scene_problem
 from rerun.chunk import Chunk, LazyChunkStream
 
@@ -31,6 +42,8 @@ from spherloc_viz.recording.run_row import RunRow
 from spherloc_viz.recording.strangers import Examiner, check_name, examine, examine_all, resolve_inside
 from spherloc_viz.recording.writer import write_recording
 
+Lie = Callable[[Path], bytes]
+"""A bad file from a good one."""
 PROBLEM, RUN, RUN_PROPERTY, YAW = "/data/problem", "/data/run", "/__properties/run", "/data/stages/yaw"
 
 
@@ -82,9 +95,9 @@ def test_a_run_is_still_a_run_when_its_labels_cannot_be_read(good: Path, examine
     for content in (b"", review.read_bytes()[:-40], deadly.read_bytes(), good.read_bytes()):
         review.write_bytes(content)
         assert examiner.examine(path).labels == ()
-        with pytest.raises(RecordingError) as error:
-            examiner.examine_review(path)
-        assert str(error.value).startswith(f"{review}: ")
+    with pytest.raises(RecordingError) as error:
+        examiner.examine_review(path)
+    assert str(error.value).startswith(f"{review}: ")
 
 
 # ---------------------------------------------------------------------------------------------- no recordings
@@ -136,35 +149,44 @@ def test_recordings_of_other_programs_are_told_apart(tmp_path: Path, examiner: E
 
 def unpacks_to_much(good: Path) -> bytes:
     """A file of 3 MB with a chunk of 700 MB."""
-    return packed(PROBLEM, change=lambda arrow: arrow + bytes(700_000_000))(good)
+    return repacked(change=lambda arrow: arrow + bytes(700_000_000))(good)
 
 
 def ends_the_reader(good: Path) -> bytes:
-    """A file of which rerun's reader dies: the arrays of a chunk claim -1 numbers."""
-    nodes = struct.pack("<qq", 100, 0), struct.pack("<qq", -1, 0)
-    return with_message(good, PROBLEM, lambda m: message(m, change=lambda arrow: arrow.replace(*nodes)))
+    """A file of which rerun's reader dies: the array of a chunk claims -1 numbers."""
+    return relabelled(-1)(good)
 
 
-def packed(entity: str, claim: int | None = None, change: Callable[[bytes], bytes] | None = None) -> Any:
-    return lambda good: with_message(good, entity, lambda m: message(m, claim, change))
+def repacked(claim: int | None = None, change: Callable[[bytes], bytes] | None = None) -> Lie:
+    return lambda good: with_message(good, PROBLEM, lambda m: message(m, claim, change))
 
 
-def replaced(old: bytes, new: bytes) -> Any:
-    def change(arrow: bytes) -> bytes:
+def relabelled(count: int) -> Lie:
+    """Whose array claims to have so many numbers."""
+    return recounted(lambda size: (struct.pack("<qq", size, 0), struct.pack("<qq", count, 0)))
+
+
+def recounted(change: Callable[[int], tuple[bytes, bytes]]) -> Lie:
+    """With bytes of an arrow message replaced, by the size of its array."""
+
+    def replace_in(arrow: bytes) -> bytes:
+        batch = pa.ipc.open_stream(arrow).read_next_batch()
+        old, new = change(len(batch.column("arrays").flatten()))
         assert old in arrow
         return arrow.replace(old, new)
 
-    return packed(PROBLEM, change=change)
+    return repacked(change=replace_in)
 
 
-LIES: dict[str, Callable[[Path], bytes]] = {
-    "a chunk unpacks to 1 GB": packed(PROBLEM, claim=1 << 30),
-    "a chunk unpacks to 2^64 - 1 bytes": packed(PROBLEM, claim=(1 << 64) - 1),
-    "a chunk unpacks to nothing": packed(PROBLEM, claim=0),
-    "arrays of 10^9 numbers": replaced(struct.pack("<qq", 100, 0), struct.pack("<qq", 10**9, 0)),
-    "10^9 rows": replaced(struct.pack("<qq", 1, 0), struct.pack("<qq", 10**9, 0)),
-    "lists end beyond their values": replaced(struct.pack("<ii", 0, 100), struct.pack("<ii", 0, 10**9)),
-    "lists begin before their values": replaced(struct.pack("<ii", 0, 100), struct.pack("<ii", -5, 95)),
+LIES: dict[str, Lie] = {
+    "a chunk unpacks to 1 GB": repacked(claim=1 << 30),
+    "a chunk unpacks to 2^64 - 1 bytes": repacked(claim=(1 << 64) - 1),
+    "a chunk unpacks to nothing": repacked(claim=0),
+    "an array of 10^9 numbers": relabelled(10**9),
+    "10^9 rows": recounted(lambda size: (struct.pack("<qq", 1, 0), struct.pack("<qq", 10**9, 0))),
+    "a list ends beyond its values": recounted(
+        lambda size: (struct.pack("<ii", 0, size), struct.pack("<ii", 0, 10**9))
+    ),
     "the index claims a chunk of 2^40 bytes": lambda good: with_index(
         good, (struct.pack("<Q", places(good)[PROBLEM][1]), struct.pack("<Q", 1 << 40))
     ),
@@ -186,9 +208,12 @@ def test_the_tools_of_these_tests_tell_the_truth_where_they_change_nothing(
 ) -> None:
     same = {
         "message": with_message(good, PROBLEM, lambda content: content),
-        "packed again": packed(PROBLEM, change=lambda arrow: arrow)(good),
+        "packed again": repacked(change=lambda arrow: arrow)(good),
         "index": with_index(good),
-        "chunks": changed(good, tmp_path / "same.rrd", {PROBLEM: lambda columns: columns}).read_bytes(),
+        "rows": changed(good, tmp_path / "same.rrd", {PROBLEM: lambda row: packed(*unpacked(row))}).read_bytes(),
+        "old rows": changed(
+            good, tmp_path / "same.rrd", {PROBLEM: lambda row: packed_as_format_1(*unpacked(row))}
+        ).read_bytes(),
     }
     for content in same.values():
         path = tmp_path / "same.rrd"
@@ -199,96 +224,129 @@ def test_the_tools_of_these_tests_tell_the_truth_where_they_change_nothing(
 # ---------------------------------------------------------------------------------------------- impossible values
 
 
-def scalars(**values: Any) -> Change:
-    """The scalars of a row with some of them changed."""
+def values(**own: Any) -> Change:
+    """A row with some of its values changed."""
 
-    def change(columns: dict[str, Any]) -> dict[str, Any]:
-        row = json.loads(columns["scalars"][0].values[0].as_py())
-        assert values.keys() <= row.keys()
-        return columns | {"scalars": pa.array([[json.dumps(row | values)]])}
+    def change(row: Mapping[str, Any]) -> Mapping[str, Any]:
+        before, arrays = unpacked(row)
+        assert own.keys() <= before.keys()
+        return packed(before | own, arrays)
+
+    return change
+
+
+def arrays(**own: Any) -> Change:
+    """A row with some of its arrays changed."""
+
+    def change(row: Mapping[str, Any]) -> Mapping[str, Any]:
+        before, all_arrays = unpacked(row)
+        assert own.keys() <= all_arrays.keys()
+        return packed(before, all_arrays | own)
+
+    return change
+
+
+def old_arrays(**own: Any) -> Change:
+    """The same in format 1, where an array has a column and a type of its own."""
+
+    def change(row: Mapping[str, Any]) -> Mapping[str, Any]:
+        before, all_arrays = unpacked(row)
+        return packed_as_format_1(before, all_arrays | own)
+
+    return change
+
+
+def form(name: Any, kind: Any, shape: Any) -> Change:
+    """A row that says this of its first array."""
+
+    def change(row: Mapping[str, Any]) -> Mapping[str, Any]:
+        told = json.loads(row["scalars"][0].values[0].as_py())
+        told["arrays"][0] = [name, kind, shape]
+        return {**row, "scalars": pa.array([[json.dumps(told)]])}
 
     return change
 
 
 def text(content: str) -> Change:
-    return lambda columns: columns | {"scalars": pa.array([[content]])}
+    return lambda row: {**row, "scalars": pa.array([[content]])}
 
 
-def array(name: str, values: Any) -> Change:
-    return lambda columns: columns | {name: listed(values)}
+def properties(**own: Any) -> Change:
+    return lambda row: {**row, **{name: pa.array([[value]]) for name, value in own.items()}}
 
 
-def properties(**values: Any) -> Change:
-    return lambda columns: columns | {name: pa.array([[value]]) for name, value in values.items()}
+def camera(**own: Any) -> Change:
+    return values(camera={"model": "equirectangular", "width": 100, "height": 50} | own)
 
 
-def camera(**values: Any) -> Change:
-    return scalars(camera={"model": "equirectangular", "width": 100, "height": 50} | values)
-
-
-def variation(**values: Any) -> Change:
-    def change(columns: dict[str, Any]) -> dict[str, Any]:
-        before = json.loads(columns["scalars"][0].values[0].as_py())["variation"]
-        return scalars(variation=before | values)(columns)
-
-    return change
+def variation(**own: Any) -> Change:
+    return lambda row: values(variation=unpacked(row)[0]["variation"] | own)(row)
 
 
 RUNS_ENDED = pa.RunEndEncodedArray.from_arrays(pa.array([10**9], pa.int32()), pa.array([1.0]))
 
 IMPOSSIBLE: dict[str, dict[str, Change]] = {
-    "no problem": {PROBLEM: lambda columns: None},
-    "no properties": {RUN_PROPERTY: lambda columns: None},
-    "no pixels": {PROBLEM: lambda columns: {name: column for name, column in columns.items() if name != "pixels"}},
-    "pixels (N, 3)": {PROBLEM: array("pixels", np.zeros((100, 3)))},
-    "no pixel": {PROBLEM: array("pixels", np.zeros((0, 2)))},
-    "pixels that are not finite": {PROBLEM: array("pixels", np.full((100, 2), np.nan))},
-    "points that are not finite": {PROBLEM: array("points", np.full((100, 3), np.inf))},
-    "pixels that are words": {PROBLEM: lambda columns: columns | {"pixels": pa.array([["a"] * 100])}},
-    "pixels that are nothing, 50 million times": {PROBLEM: array("pixels", pa.nulls(50_000_000))},
-    "a stage of nothing, 50 million times": {YAW: array("pairs", pa.nulls(50_000_000))},
-    "a stage of one number, 10^9 times": {YAW: array("pairs", RUNS_ENDED)},
+    "no problem": {PROBLEM: lambda row: None},
+    "no properties": {RUN_PROPERTY: lambda row: None},
+    "no pixels": {PROBLEM: form("other", "<f8", [100, 2])},
+    "no arrays": {PROBLEM: lambda row: {"scalars": row["scalars"]}},
+    "pixels that are objects": {PROBLEM: form("pixels", "|O8", [100, 2])},
+    "pixels of no type": {PROBLEM: form("pixels", "__import__('os')", [100, 2])},
+    "pixels of a type that is a table": {PROBLEM: form("pixels", {"names": ["a"], "formats": ["O"]}, [100, 2])},
+    "pixels of 10^9 rows": {PROBLEM: form("pixels", "<f8", [10**9, 2])},
+    "pixels of 10^30 rows": {PROBLEM: form("pixels", "<f8", [10**30, 2])},
+    "pixels of -1 rows": {PROBLEM: form("pixels", "<f8", [-1, 2])},
+    "pixels of half a row": {PROBLEM: form("pixels", "<f8", [0.5, 2])},
+    "pixels of a shape that is a word": {PROBLEM: form("pixels", "<f8", "100")},
+    "pixels whose name is a list": {PROBLEM: form(["pixels"], "<f8", [100, 2])},
+    "pixels (N, 3)": {PROBLEM: arrays(pixels=np.zeros((100, 3)))},
+    "no pixel": {PROBLEM: arrays(pixels=np.zeros((0, 2)))},
+    "pixels that are not finite": {PROBLEM: arrays(pixels=np.full((100, 2), np.nan))},
+    "points that are not finite": {PROBLEM: arrays(points=np.full((100, 3), np.inf))},
+    "pixels that are words": {PROBLEM: old_arrays(pixels=pa.array(["a"] * 100))},
+    "pixels that are nothing, 50 million times": {PROBLEM: old_arrays(pixels=pa.nulls(50_000_000))},
+    "a stage of nothing, 50 million times": {YAW: old_arrays(overlap=pa.nulls(50_000_000))},
+    "a stage of one number, 10^9 times": {YAW: old_arrays(overlap=RUNS_ENDED)},
     "more than a million correspondences": {
-        PROBLEM: lambda columns: (
-            columns | {"pixels": listed(np.ones((1_000_001, 2))), "points": listed(np.ones((1_000_001, 3)))}
-        )
+        PROBLEM: arrays(pixels=np.ones((1_000_001, 2)), points=np.ones((1_000_001, 3)))
     },
-    "gravity of length 7": {PROBLEM: array("gravity_camera", np.array([7.0, 0.0, 0.0]))},
-    "a pose that is no rotation": {RUN: array("cam_from_map", np.ones((3, 4)))},
-    "a pose that is not finite": {RUN: array("cam_from_map", np.full((3, 4), np.nan))},
-    "a pose of a wrong shape": {RUN: array("cam_from_map", np.ones(12))},
-    "inliers of a wrong shape": {RUN: array("inlier_mask", np.ones(7, bool))},
-    "inliers of a wrong type": {RUN: array("inlier_mask", np.ones(100))},
+    "inliers that are neither true nor false": {RUN: arrays(inlier_mask=np.full(100, 2, np.uint8).view(bool))},
+    "gravity of length 7": {PROBLEM: arrays(gravity_camera=np.array([7.0, 0.0, 0.0]))},
+    "a pose that is no rotation": {RUN: arrays(cam_from_map=np.ones((3, 4)))},
+    "a pose that is not finite": {RUN: arrays(cam_from_map=np.full((3, 4), np.nan))},
+    "a pose of a wrong shape": {RUN: arrays(cam_from_map=np.ones(12))},
+    "inliers of a wrong shape": {RUN: arrays(inlier_mask=np.ones(7, bool))},
+    "inliers of a wrong type": {RUN: arrays(inlier_mask=np.ones(100))},
     "a camera with absurd sides": {PROBLEM: camera(width=10**9, height=10**9)},
     "a camera with endless sides": {PROBLEM: camera(width={"number": "inf"})},
     "a camera of no kind": {PROBLEM: camera(model="__import__('os')")},
-    "a camera that is a word": {PROBLEM: scalars(camera="mei")},
-    "an endless bound": {PROBLEM: scalars(bound_px={"number": "inf"})},
-    "a bound that is a word": {PROBLEM: scalars(bound_px="3")},
-    "a name of 10 MB": {PROBLEM: scalars(name="x" * 10_000_000)},
-    "a name of 100 kB": {PROBLEM: scalars(name="x" * 100_000)},
-    "a name with half a character": {PROBLEM: scalars(name="\ud800")},
-    "a million reference images": {PROBLEM: scalars(reference_images=["a"] * 500_000)},
+    "a camera that is a word": {PROBLEM: values(camera="mei")},
+    "an endless bound": {PROBLEM: values(bound_px={"number": "inf"})},
+    "a bound that is a word": {PROBLEM: values(bound_px="3")},
+    "a name of 10 MB": {PROBLEM: values(name="x" * 10_000_000)},
+    "a name of 100 kB": {PROBLEM: values(name="x" * 100_000)},
+    "a name with half a character": {PROBLEM: values(name="\ud800")},
+    "a million reference images": {PROBLEM: values(reference_images=["a"] * 500_000)},
     "lists nested a million times": {PROBLEM: text("[" * 1_000_000 + "]" * 1_000_000)},
-    "tables nested ten times": {PROBLEM: scalars(remarks=[[[[[[[[[["deep"]]]]]]]]]])},
+    "tables nested ten times": {PROBLEM: values(remarks=[[[[[[[[[["deep"]]]]]]]]]])},
     "a number of 100,000 digits": {PROBLEM: text('{"name": ' + "9" * 100_000 + "}")},
     "JSON with NaN": {PROBLEM: text('{"name": NaN}')},
     "no JSON": {PROBLEM: text("hello")},
     "JSON of a list": {PROBLEM: text("[]")},
-    "a seed that is a word": {RUN: scalars(seed="one")},
-    "an option that is a table": {RUN: scalars(options={"bound_px": {"a": 1}})},
-    "options that are a list": {RUN: scalars(options=[1, 2])},
-    "another estimator than the row": {RUN: scalars(estimator="ransac-2p")},
-    "a source that there is not": {"/data/origin": scalars(source="evil")},
-    "a title that is a list": {"/data/origin": scalars(title=["<b>"])},
-    "a query that is a number": {"/data/origin": scalars(query=7)},
+    "a seed that is a word": {RUN: values(seed="one")},
+    "an option that is a table": {RUN: values(options={"bound_px": {"a": 1}})},
+    "options that are a list": {RUN: values(options=[1, 2])},
+    "another estimator than the row": {RUN: values(estimator="ransac-2p")},
+    "a source that there is not": {"/data/origin": values(source="evil")},
+    "a title that is a list": {"/data/origin": values(title=["<b>"])},
+    "a query that is a number": {"/data/origin": values(query=7)},
     "a change of the noise to a word": {"/data/origin": variation(noise_px="much")},
     "a change of match 'a'": {"/data/origin": variation(spoiled=["a"])},
     "a true camera of three numbers": {"/data/origin": variation(true_camera=[1.0, 2.0, 3.0])},
     "a kind of outliers that there is not": {"/data/origin": variation(outlier_kind="evil")},
-    "another cause than there is": {"/data/diagnosis": scalars(cause="<script>")},
-    "evidence that is no text": {"/data/diagnosis": scalars(evidence=[1, 2])},
-    "a field that no run has": {RUN: lambda columns: text('{"__class__": "Path"}')(columns)},
+    "another cause than there is": {"/data/diagnosis": values(cause="<script>")},
+    "evidence that is no text": {"/data/diagnosis": values(evidence=[1, 2])},
+    "a field that no run has": {RUN: text('{"arrays": [], "values": {"__class__": "Path"}}')},
     "a later format": {RUN_PROPERTY: properties(format_version=99)},
     "a format that is a word": {RUN_PROPERTY: properties(format_version="2")},
     "-1 inliers": {RUN_PROPERTY: properties(inliers=-1)},
@@ -305,13 +363,13 @@ IMPOSSIBLE: dict[str, dict[str, Change]] = {
     "an estimator with a path": {RUN_PROPERTY: properties(estimator="../../etc")},
     "options that are no JSON": {RUN_PROPERTY: properties(options="{")},
     "a thumbnail that claims 60,000 pixels a side": {
-        "/__properties/thumbnail": lambda columns: columns | {"EncodedImage:blob": huge_png(columns)}
+        "/__properties/thumbnail": lambda row: {**row, "EncodedImage:blob": huge_png(row)}
     },
 }
 
 
-def huge_png(columns: dict[str, Any]) -> pa.Array:
-    content = np.array(columns["EncodedImage:blob"][0].values[0].as_py(), np.uint8)
+def huge_png(row: Mapping[str, Any]) -> pa.Array:
+    content = np.array(row["EncodedImage:blob"][0].values[0].as_py(), np.uint8)
     content[16:24] = np.frombuffer(struct.pack(">II", 60_000, 60_000), np.uint8)
     return pa.array([[content]], pa.list_(pa.list_(pa.uint8())))
 

@@ -56,7 +56,7 @@ def test_a_run_repeated_is_the_same_to_the_last_bit(scene: str, estimator: str, 
     repeated = repeat(tmp_path / "run.rrd")
     assert repeated.same and not repeated.rounding and repeated.assumed == ()
     assert repeated.trace.seed == 5 and repeated.trace.options == trace.options
-    assert [item for item in repeated.versions if item.recorded is not None] == []
+    assert repeated.versions == ()
     assert as_text(repeated).splitlines()[0].endswith("run.rrd: the same to the last bit")
     assert len(as_text(repeated).splitlines()) == 2
 
@@ -76,7 +76,8 @@ def test_a_difference_by_rounding_is_told_as_one(path: Path, trace: Trace, monke
     repeated = repeat(path)
     assert not repeated.same and repeated.rounding and [item.what for item in repeated.differences] == ["pose"]
     assert "differs by rounding only" in as_text(repeated)
-    pose = pose + [[0, 0, 0, 1e-3], [0] * 4, [0] * 4]
+    pose = pose.copy()
+    pose[0, 3] += 1e-3
     pretend(monkeypatch, cam_from_map=pose)
     repeated = repeat(path)
     assert not repeated.rounding and "moved by 0.001 m" in as_text(repeated)

@@ -59,7 +59,10 @@ def failures(trace: Trace) -> list[str]:
     metrics = evaluate(trace)
     if metrics.rotation_error_deg is None or metrics.translation_error_m is None:
         return ["no pose"]
-    found = {"position": metrics.translation_error_m >= SUCCESS_M, "rotation": metrics.rotation_error_deg >= SUCCESS_DEG}
+    found = {
+        "position": metrics.translation_error_m >= SUCCESS_M,
+        "rotation": metrics.rotation_error_deg >= SUCCESS_DEG,
+    }
     return [name for name, so in found.items() if so]
 
 

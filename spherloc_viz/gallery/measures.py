@@ -89,7 +89,7 @@ def _yaw(trace: Trace) -> YawStage:
 def _right_pairs_chosen(trace: Trace) -> int:
     """Pairs of two right matches in the rotation clique."""
     stage = _yaw(trace)
-    return _count(_right(trace)[stage.pairs[stage.clique]].all(axis=1))
+    return _count(np.all(_right(trace)[stage.pairs[stage.clique]], axis=1))
 
 
 def _pairs_at_truth(trace: Trace) -> int:
@@ -99,7 +99,7 @@ def _pairs_at_truth(trace: Trace) -> int:
         return 0
     yaw = yaw_of(trace.problem.aligned.align_pose(truth)[:, :3])
     turns = np.stack([yaw + turn * 2.0 * np.pi for turn in (-1.0, 0.0, 1.0)])[:, None]
-    return _count(((stage.lo_rad <= turns) & (turns <= stage.hi_rad)).any(axis=0))
+    return _count(np.any((stage.lo_rad <= turns) & (turns <= stage.hi_rad), axis=0))
 
 
 def _known(value: float | None) -> float:

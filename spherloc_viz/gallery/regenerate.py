@@ -29,9 +29,9 @@ def chosen(cases: Sequence[GalleryCase], keys: Sequence[str]) -> tuple[GalleryCa
 
 def stories(cases: Sequence[GalleryCase]) -> str:
     """Key, title, cause and story of each case."""
-    indent = {"initial_indent": "  ", "subsequent_indent": "  "}
     parts = [
-        f"{case.key}: {case.title} ({case.cause}, {case.estimator})\n{textwrap.fill(case.story, WIDTH, **indent)}"
+        f"{case.key}: {case.title} ({case.cause}, {case.estimator})\n"
+        + textwrap.fill(case.story, WIDTH, initial_indent="  ", subsequent_indent="  ")
         for case in cases
     ]
     return "\n\n".join(parts)

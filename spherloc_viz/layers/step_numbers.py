@@ -40,8 +40,9 @@ def step_numbers(trace: Trace, pictures: Mapping[int, Picture]) -> tuple[StepNum
     truth, found = trace.problem.truth_cam_from_map, []
     for index, picture in pictures.items():
         pose = step_pose(trace, picture.step.key)
-        known = pose is not None and truth is not None
-        off = (rotation_error_deg(truth, pose), translation_error_m(truth, pose)) if known else (None, None)
+        off: tuple[float | None, float | None] = (None, None)
+        if pose is not None and truth is not None:
+            off = rotation_error_deg(truth, pose), translation_error_m(truth, pose)
         found.append(StepNumbers(index, picture.step.stage, picture.step.key, _agreeing(picture), *off))
     return tuple(found)
 

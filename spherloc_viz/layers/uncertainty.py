@@ -25,7 +25,7 @@ CORNERS = 40
 AHEAD = 2.2
 """Length of the viewing directions, in sphere radii."""
 BESIDE = 1.2
-"""Where words stand, so that they hide nothing from afar either: so many sphere radii below, or beyond an arc."""
+"""Where words stand, so that they hide nothing from afar either: so many sphere radii below."""
 ARC_STEP_RAD = np.radians(3.0)
 
 
@@ -75,29 +75,30 @@ def _ellipsoid(view: RunView, frame: Frame, half_axes: FloatArray, factor: int) 
 
 
 def _offset(view: RunView, frame: Frame, factor: int) -> list[SceneItem]:
-    """From the estimated to the true position, magnified like the ellipsoid."""
+    """From the estimated to the true position, magnified like the ellipsoid.
+
+    The words tell the angle too: two labels would lie over each other wherever the viewer looks along them.
+    """
     assert view.truth is not None
     centre = camera_centre(frame.cam_from_map)
     offset = camera_centre(view.truth) - centre
     length_m = float(np.linalg.norm(offset))
     factor = factor if factor * length_m <= ROOM * view.sphere_m else 1
     end = centre + factor * offset
-    text = length_text(length_m) if factor == 1 else f"{length_text(length_m)} × {factor}"
+    length = length_text(length_m) if factor == 1 else f"{length_text(length_m)} × {factor}"
+    text = f"{angle_text(rotation_error_deg(view.truth, frame.cam_from_map))} · {length}"
     # Below the sphere if the error is within it, else just below the line.
     away = BESIDE if factor * length_m < 2.0 * view.sphere_m else 0.3
     below = 0.5 * (centre + end) + np.array([0.0, away * view.sphere_m, 0.0])
     return [
         Segments("uncertainty/offset", LAYER, np.array([[centre, end]]), one_color(style.OUTLIER, 1), 3.0),
         Points("uncertainty/truth", LAYER, end[None], one_color(style.TRUTH, 1), 0.05 * view.sphere_m),
-        Label("uncertainty/distance", LAYER, below, text),
+        Label("uncertainty/error", LAYER, below, text),
     ]
 
 
 def _angle(view: RunView, frame: Frame) -> list[SceneItem]:
-    """The estimated and the true viewing direction from the estimated position, and the arc between them.
-
-    The word beside it is the whole rotation's error, of which a roll is no part of the arc.
-    """
+    """The estimated and the true viewing direction from the estimated position, and the arc between them."""
     assert view.truth is not None
     centre, estimated, true = camera_centre(frame.cam_from_map), frame.cam_from_map[2, :3], view.truth[2, :3]
     between = float(np.arctan2(np.linalg.norm(np.cross(estimated, true)), estimated @ true))
@@ -110,12 +111,7 @@ def _angle(view: RunView, frame: Frame) -> list[SceneItem]:
     lines = [[centre, arc[0]], [centre, arc[-1]], *pairwise(arc)]
     colors = one_color(style.OUTLIER, len(lines))
     colors[0], colors[1] = style.ESTIMATE, style.TRUTH
-    beside = centre + BESIDE * (arc[len(arc) // 2] - centre)
-    text = angle_text(rotation_error_deg(view.truth, frame.cam_from_map))
-    return [
-        Segments("uncertainty/angle", LAYER, np.array(lines), colors, 2.0),
-        Label("uncertainty/degrees", LAYER, beside, text),
-    ]
+    return [Segments("uncertainty/angle", LAYER, np.array(lines), colors, 2.0)]
 
 
 def rms(stage: RefinementStage) -> tuple[float, float] | None:

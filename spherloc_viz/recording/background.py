@@ -15,6 +15,7 @@ from spherloc_viz.recording.index import RunIndex
 from spherloc_viz.recording.keeper import Keeper
 from spherloc_viz.recording.origin import Origin
 from spherloc_viz.recording.room import KEEP_BYTES
+from spherloc_viz.recording.sweep_keeper import SweepKeeper
 
 log = logging.getLogger(__name__)
 
@@ -56,9 +57,8 @@ class Recorder:
         self._waiting = self._lost = 0
         self._closed = False
         self._thread = threading.Thread(target=self._work, name="spherloc-recorder", daemon=True)
-        self._upkeep = threading.Thread(target=self._put_right, name="spherloc-upkeep", daemon=True)
         self._thread.start()
-        self._upkeep.start()
+        self._upkeep = self._start(self._put_right)
 
     @property
     def folder(self) -> Path:
@@ -99,6 +99,16 @@ class Recorder:
                 ) from None
             self._waiting += 1
         return path
+
+    def sweep_keeper(self) -> SweepKeeper:
+        """What records the runs of a sweep into this folder, in the processes that do them."""
+        return SweepKeeper(self.folder.resolve())
+
+    def make_room(self) -> None:
+        """Have old successes deleted if other processes have written too much. Never waits."""
+        with self._lock:
+            if not self._closed and not self._upkeep.is_alive():
+                self._upkeep = self._start(self._prune)
 
     def close(self) -> None:
         """Finish what waits, then end the threads."""
@@ -141,6 +151,11 @@ class Recorder:
         if self._lost == 1:
             self._on_error(error)
 
+    def _start(self, upkeep: Callable[[], None]) -> threading.Thread:
+        thread = threading.Thread(target=upkeep, name="spherloc-upkeep", daemon=True)
+        thread.start()
+        return thread
+
     def _put_right(self) -> None:
         with contextlib.suppress(_StoppedError):
             try:
@@ -148,10 +163,22 @@ class Recorder:
                 if self.folder.is_dir():
                     self._go_on()
                     self.index.refresh(progress=self._go_on)
-                    self._keeper.prune()
             except (RecordingError, OSError) as error:
-                if not self._closed:
-                    self._on_notice(f"The list of runs may not be complete: {error}")
+                self._complain(f"The list of runs may not be complete: {error}")
+                return
+            self._prune()
+
+    def _prune(self) -> None:
+        if not self.folder.is_dir():
+            return
+        try:
+            self._keeper.prune()
+        except RecordingError as error:
+            self._complain(f"Old successes cannot be deleted: {error}")
+
+    def _complain(self, sentence: str) -> None:
+        if not self._closed:
+            self._on_notice(sentence)
 
     def _go_on(self, *progress: int) -> None:
         if self._closed:

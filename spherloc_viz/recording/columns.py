@@ -44,19 +44,18 @@ class Values:
         return Column(self.descriptor, _lists(every, self.values, present))
 
 
-@dataclass(frozen=True, eq=False)
-class Column:
-    """What ``Chunk.from_columns`` takes."""
+class Column(rr.ComponentColumn):
+    """What ``Chunk.from_columns`` takes; null where a row says nothing about the component."""
 
-    descriptor: rr.ComponentDescriptor
-    rows: pa.ListArray
-    """Null where a row says nothing about the component."""
+    def __init__(self, descriptor: rr.ComponentDescriptor, rows: pa.ListArray) -> None:
+        """Takes rows as they are, where its base would put them together anew."""
+        self.descriptor, self.rows = descriptor, rows
 
     def component_descriptor(self) -> rr.ComponentDescriptor:
         """What the column holds."""
         return self.descriptor
 
-    def as_arrow_array(self) -> pa.ListArray:
+    def as_arrow_array(self) -> pa.Array:
         """Its rows."""
         return self.rows
 

@@ -9,6 +9,7 @@ import pyarrow as pa
 import rerun as rr
 from numpy.typing import NDArray
 
+from spherloc_viz import style
 from spherloc_viz.layers.primitives import Balls, Label, Mesh, Points, Segments, Step, Table
 from spherloc_viz.recording.chart_bars import Bars, tensors
 from spherloc_viz.recording.columns import (
@@ -31,6 +32,8 @@ rr.set_strict_mode(True)
 
 Rows = list[Any]
 """One primitive per row, or None where it is absent and the row clears it."""
+WORDS = int(packed(np.array([style.SCALE]))[0])
+"""Colour of words in the scene."""
 SOLID: int = rr.components.FillModeBatch(["solid"]).as_arrow_array()[0].as_py()
 
 
@@ -148,6 +151,8 @@ def _label(rows: Rows) -> list[Values]:
     return [
         Values(rr.Points3D.descriptor_positions(), batch, [len(place) for place in places]),
         _single(rows, rr.Points3D.descriptor_labels(), pa.utf8(), lambda row: row.text),
+        # Without a colour, rerun makes one up.
+        _single(rows, rr.Points3D.descriptor_colors(), pa.uint32(), lambda row: WORDS),
         # The word is what is shown, not the dot that rerun hangs it on.
         _single(rows, rr.Points3D.descriptor_radii(), pa.float32(), lambda row: 0.0),
     ]

@@ -20,6 +20,7 @@ from rerun.chunk import Chunk, RrdReader
 
 from spherloc.errors import RecordingError, show
 from spherloc_viz.recording.checked_row import COUNT_LIMIT
+from spherloc_viz.recording.data import ARRAYS
 from spherloc_viz.recording.reader import RecordedRun
 
 STORES_LIMIT = 16
@@ -79,24 +80,36 @@ def _check_row(chunk: Chunk, batch: pa.RecordBatch, path: Path) -> None:
             continue
         values = column.flatten()
         if name == "scalars":
-            _check_scalars(values, what)
+            told = _scalars(values, what)
+            if chunk.entity_path == "/data/problem" and _most_rows(told) > COUNT_LIMIT:
+                raise _too_many(path, "correspondences", _most_rows(told), COUNT_LIMIT)
             continue
         leaf = column.type.value_type
         while pa.types.is_fixed_size_list(leaf):
             leaf = leaf.value_type
         if not (pa.types.is_floating(leaf) or pa.types.is_integer(leaf) or pa.types.is_boolean(leaf)):
             raise RecordingError(f"{what} has {name[:100]!r} of type {str(leaf)[:100]}; give numbers.")
-        if chunk.entity_path == "/data/problem" and len(values) > COUNT_LIMIT:
+        # In format 1 an array has a column of its own.
+        if chunk.entity_path == "/data/problem" and name != ARRAYS and len(values) > COUNT_LIMIT:
             raise _too_many(path, "correspondences", len(values), COUNT_LIMIT)
 
 
-def _check_scalars(values: pa.Array, what: str) -> None:
+def _most_rows(told: Any) -> int:
+    """Of all arrays of a row, by their shapes."""
+    forms = told.get(ARRAYS, ()) if isinstance(told, dict) else ()
+    return max((int(shape[0]) for _, _, shape in forms if shape), default=0)
+
+
+def _scalars(values: pa.Array, what: str) -> Any:
+    """The JSON of a row; raises ``RecordingError`` or ``ValueError`` if it is too much, or none."""
     if not pa.types.is_string(values.type) or len(values) != 1:
         raise RecordingError(f"{what} has no text where its scalars belong; record the run again.")
     if values.nbytes > SCALARS_LIMIT_BYTES:
         raise RecordingError(f"{what} has {values.nbytes:,} bytes of text; {SCALARS_LIMIT_BYTES:,} are the most.")
-    if _items(json.loads(values[0].as_py()), 0) > ITEMS_LIMIT:
+    told = json.loads(values[0].as_py())
+    if _items(told, 0) > ITEMS_LIMIT:
         raise RecordingError(f"{what} has more than {ITEMS_LIMIT:,} values; record the run again.")
+    return told
 
 
 def _items(value: Any, depth: int) -> int:
@@ -119,10 +132,11 @@ def _items(value: Any, depth: int) -> int:
 def check_run(run: RecordedRun, path: Path) -> None:
     """What ``read_recording`` leaves open. Raises ``RecordingError``, in one sentence, for what cannot be."""
     count, row = len(run.problem), run.row
-    pose, mask = run.cam_from_map, run.inlier_mask
+    truth = run.problem.truth_inliers
     good = {
-        "the pose": _is_pose_or_none(pose),
-        "the inliers": isinstance(mask, np.ndarray) and mask.shape == (count,) and mask.dtype == np.bool_,
+        "the pose": _is_pose_or_none(run.cam_from_map),
+        "the inliers": _is_mask(run.inlier_mask, count),
+        "the true inliers": truth is None or _is_mask(truth, count),
         "the message": isinstance(run.message, str),
         "the estimator": run.estimator == row.estimator,
         "the seed": type(run.seed) is int and run.seed == row.seed,
@@ -159,6 +173,12 @@ def _fits(value: Any, hint: Any) -> bool:
     if hint is float:
         return isinstance(value, int | float) and not isinstance(value, bool)
     return type(value) is int if hint is int else isinstance(value, kind or hint)
+
+
+def _is_mask(mask: Any, count: int) -> bool:
+    if not isinstance(mask, np.ndarray) or mask.shape != (count,) or mask.dtype != np.bool_:
+        return False
+    return int(mask.view(np.uint8).max(initial=0)) <= 1  # a byte of 2 would count twice
 
 
 def _is_pose_or_none(pose: Any) -> bool:

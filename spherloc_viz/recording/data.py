@@ -1,7 +1,7 @@
 """The numbers behind the pictures: the trace as rows under ``/data``, and back, bit for bit.
 
-A row has a column ``arrays`` with the bytes of all arrays, and a column ``scalars``, JSON with their types and shapes and
-all other values. A number that JSON has no word for is ``{"number": "inf"}`` (or "-inf", "nan").
+A row has a column ``arrays`` with the bytes of all arrays, and a column ``scalars``, JSON with their types and shapes
+and all other values. A number that JSON has no word for is ``{"number": "inf"}`` (or "-inf", "nan").
 """
 
 import json
@@ -24,6 +24,7 @@ from spherloc.problem import Problem
 from spherloc.trace import Trace
 from spherloc_viz.options import plain
 from spherloc_viz.recording.columns import Values, static_chunk
+from spherloc_viz.recording.machine import machine
 from spherloc_viz.recording.origin import Origin
 
 MAX_ARRAY_BYTES = 65_536
@@ -77,7 +78,7 @@ def _run_row(trace: Trace) -> Row:
         "estimator": trace.estimator,
         "options": asdict(trace.options),
         "seed": trace.seed,
-        "versions": dict(trace.versions),
+        "versions": {**trace.versions, "machine": machine()},
         "timings_ms": dict(trace.timings_ms),
         "cam_from_map": trace.cam_from_map,
         "inlier_mask": trace.inlier_mask,

@@ -1,8 +1,8 @@
 """The child that reads recordings which may be hostile: ``python -m spherloc_viz.recording.examine``.
 
 It reads questions, one a line, ``{"path": "...", "want": "row"}``, and answers each with two lines of JSON:
-``{"begun": true}``, then ``{"row": {...}}`` or ``{"error": "..."}``. What can be wanted is a row with labels and note, a
-``bare row`` without, or only the ``review``. Its memory, its processor time a file and what it may write are limited
+``{"begun": true}``, then ``{"row": {...}}`` or ``{"error": "..."}``. What can be wanted is a row with labels and note,
+a ``bare row`` without, or only the ``review``. Its memory, its processor time a file and what it may write are limited
 where the system can do that; it may die of a file.
 """
 
@@ -81,7 +81,7 @@ def _answer(question: dict[str, Any]) -> dict[str, Any]:
         return {"error": f"{path}: takes too much memory to read; delete it or record the run again."}
     except Exception as error:
         # Whatever a file can make a library raise is the file's fault here, and must not cost the others.
-        reason = f"{type(error).__name__}: {error}"[:200]
+        reason = str(error).replace(str(path), "the file")[:160]
         return {"error": str(RecordingError(f"{path}: not a whole recording ({reason}); record the run again."))}
 
 

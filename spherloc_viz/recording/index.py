@@ -11,12 +11,12 @@ from typing import Self, TypeVar
 from spherloc.errors import InputError, RecordingError, show
 from spherloc_viz.recording import index_file
 from spherloc_viz.recording.index_filters import condition, groups, order
-from spherloc_viz.recording.index_refresh import Examine, Progress, Refreshed, Refresher, stamp_of
+from spherloc_viz.recording.index_refresh import Examine, Progress, Refreshed, Refresher, examine_side_by_side, stamp_of
 from spherloc_viz.recording.index_rows import put, rows_of
 from spherloc_viz.recording.query import GROUP_KEYS, RunQuery
 from spherloc_viz.recording.review import Review, write_review
 from spherloc_viz.recording.run_row import RunRow
-from spherloc_viz.recording.strangers import check_name, examine_all
+from spherloc_viz.recording.strangers import check_name
 
 T = TypeVar("T")
 MOST_REFRESHES = 3
@@ -154,14 +154,14 @@ class RunIndex:
 
         return self._write(work)
 
-    def refresh(self, progress: Progress | None = None, examine: Examine = examine_all) -> Refreshed:
+    def refresh(self, progress: Progress | None = None, examine: Examine = examine_side_by_side) -> Refreshed:
         """Read new and changed recordings of the folder, and forget those that are gone.
 
         ``progress`` is told how many of how many are read. Files that are no runs are skipped and named in the answer.
         """
         return self._refresh(False, progress, examine)
 
-    def rebuild(self, progress: Progress | None = None, examine: Examine = examine_all) -> Refreshed:
+    def rebuild(self, progress: Progress | None = None, examine: Examine = examine_side_by_side) -> Refreshed:
         """Read all recordings of the folder again, after a check of the database."""
         with self._lock:
             if self._read(lambda connection: connection.execute("PRAGMA quick_check(1)").fetchone()) != ("ok",):

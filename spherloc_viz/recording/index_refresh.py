@@ -1,7 +1,10 @@
 """Keeps the list of runs true to the files: reads those that are new or have changed, and says which it skipped."""
 
+import contextlib
+import os
 import sqlite3
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -11,8 +14,9 @@ from spherloc.errors import RecordingError
 from spherloc_viz.recording.index_rows import put
 from spherloc_viz.recording.review import REVIEW_SUFFIX, UNREADABLE, review_path
 from spherloc_viz.recording.run_row import RunRow
+from spherloc_viz.recording.strangers import examine_all
 
-Examine = Callable[[Iterable[Path]], Iterable[tuple[Path, RunRow | RecordingError]]]
+Examine = Callable[[Sequence[Path]], Iterable[tuple[Path, RunRow | RecordingError]]]
 """Reads recordings one after another: the row of each, or what is wrong with it."""
 Progress = Callable[[int, int], None]
 """Is told how many of how many files are read."""
@@ -21,6 +25,30 @@ T = TypeVar("T")
 
 BATCH = 20
 """Rows that are written at once: others wait a few milliseconds."""
+MOST_WORKERS = 4
+"""Processes that read recordings, at 20 ms each."""
+WORTH_A_WORKER = 50
+"""Recordings for which it pays to start another process, which takes a second."""
+
+
+def examine_side_by_side(paths: Sequence[Path]) -> Generator[tuple[Path, RunRow | RecordingError], None, None]:
+    """``examine_all`` by several processes at once, in the order of the paths; by one where there are few paths."""
+    workers = max(1, min(MOST_WORKERS, os.cpu_count() or 1, len(paths) // WORTH_A_WORKER))
+    readers = [examine_all(paths[k::workers]) for k in range(workers)]
+    with ThreadPoolExecutor(workers) as threads:
+        answers = [threads.submit(next, reader, None) for reader in readers]
+        try:
+            for number in range(len(paths)):
+                k = number % workers
+                answer = answers[k].result()
+                assert answer is not None
+                answers[k] = threads.submit(next, readers[k], None)
+                yield answer
+        finally:
+            wait(answers)
+            for reader in readers:
+                if isinstance(reader, Generator):
+                    reader.close()  # now, since it holds a process
 
 
 @dataclass(frozen=True)
@@ -92,14 +120,11 @@ class Refresher:
         read = done = 0
         progress(done, len(wanted))
         results = self._examine([self._folder / file for file in wanted])
-        try:
+        with contextlib.closing(results) if isinstance(results, Generator) else contextlib.nullcontext():
             for batch in _batches(zip(wanted, (result for _, result in results), strict=True)):
                 read += self._write(lambda connection, batch=batch: self._store(connection, batch, files))
                 done += len(batch)
                 progress(done, len(wanted))
-        finally:
-            if isinstance(results, Generator):
-                results.close()  # now, since it holds a process
         return Refreshed(read, removed, self._write(_skipped))
 
     def _forget(self, connection: sqlite3.Connection, files: Iterable[str]) -> int:

@@ -14,12 +14,15 @@ from spherloc.diagnosis import Diagnosis
 from spherloc.errors import RecordingError
 from spherloc.trace import Trace
 from spherloc_viz.recording.index import RunIndex
-from spherloc_viz.recording.leftovers import leftovers, rescue, sweep_scratch
+from spherloc_viz.recording.leftovers import leftovers, sweep_scratch
 from spherloc_viz.recording.origin import Origin
+from spherloc_viz.recording.rescue import rescue
 from spherloc_viz.recording.retention import Pruned, prune
 from spherloc_viz.recording.room import KEEP_BYTES, size_words
 from spherloc_viz.recording.writer import write_recording
 
+GALLERY = "gallery"
+"""The folder inside that has the curated cases."""
 CHECKS = 50
 """The size of all recordings is looked at when a new part of it, one of so many, was written."""
 
@@ -104,9 +107,8 @@ class Keeper:
     def tidy(self) -> None:
         """Recover what killed processes left unfinished, or delete it, and say so. Raises ``OSError``."""
         sweep_scratch()
-        if not self.folder.is_dir():
-            return
-        found = leftovers(self.folder)
+        folders = [folder for folder in (self.folder, self.folder / GALLERY) if folder.is_dir()]
+        found = [part for folder in folders for part in leftovers(folder)]
         saved = [path for path in map(rescue, found) if path is not None]
         if saved:
             runs = "a run" if len(saved) == 1 else f"{len(saved)} runs"

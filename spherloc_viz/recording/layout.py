@@ -85,15 +85,16 @@ def _flat_views(panels: Panels) -> list[rrb.View]:
         views.append(rrb.Spatial2DView(origin=ARCS, name="Yaw arcs near the estimate (degrees)"))
     name = "Overlaps of balls"
     if panels.graph:
-        still = {"force_link": archetypes.ForceLink(enabled=False), "force_many_body": archetypes.ForceManyBody(enabled=False)}
+        # The balls have places of their own, and forces would only move them about.
         views.append(
             rrb.GraphView(
                 origin=GRAPH,
                 name=name,
+                force_link=archetypes.ForceLink(enabled=False),
+                force_many_body=archetypes.ForceManyBody(enabled=False),
                 force_position=archetypes.ForcePosition(enabled=True),
                 force_collision_radius=archetypes.ForceCollisionRadius(enabled=False),
                 force_center=archetypes.ForceCenter(enabled=False),
-                **still,
             )
         )
     elif panels.large_graph:

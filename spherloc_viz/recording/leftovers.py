@@ -7,18 +7,13 @@ import re
 import secrets
 import shutil
 import socket
-import subprocess
 import tempfile
 import time
 from functools import cache
 from pathlib import Path
 
-from spherloc.errors import RecordingError
-from spherloc_viz.recording.rerun_program import rerun_command, rerun_environment
-
 STALE_AFTER_S = 600.0
 """An unfinished file this old is nobody's, whatever its name says: a file takes less than a second."""
-MERGE_LIMIT_S = 60.0
 
 _OWNER = r"(?P<machine>[0-9a-f]{8})-(?P<boot>[0-9a-f]{8})-(?P<pid>\d{1,10})-(?P<start>\d{1,20})-"
 _PART = re.compile(rf"(?P<name>.+\.rrd)\.(?:{_OWNER})?[0-9a-f]{{8}}\.part")
@@ -44,6 +39,12 @@ def sweep_scratch() -> None:
                 shutil.rmtree(entry.path, ignore_errors=True)
 
 
+def target_of(part: Path) -> Path | None:
+    """The file that an unfinished recording was to become; None if it is none."""
+    match = _PART.fullmatch(part.name)
+    return None if match is None else part.with_name(match["name"])
+
+
 def leftovers(folder: Path) -> list[Path]:
     """Unfinished recordings in ``folder`` that nobody will finish, because their process has ended or they are old.
 
@@ -60,50 +61,6 @@ def leftovers(folder: Path) -> list[Path]:
                     if old or _ended(match):
                         found.append(Path(entry.path))
     return sorted(found)
-
-
-def rescue(part: Path) -> Path | None:
-    """Make a recording of what is left of one, if there is enough; returns its path, or None.
-
-    The problem and the result come first in a file, so that even a fifth of it has all that repeats the run. The
-    leftover is gone afterwards, in either case. Raises ``OSError`` if the folder cannot be written.
-    """
-    # Here, since reading needs all of rerun, and names of unfinished files are needed without it.
-    from spherloc_viz.recording.reader import check_recording, read_recording
-
-    match = _PART.fullmatch(part.name)
-    target = None if match is None else part.with_name(match["name"])
-    mended = unfinished(part.with_name(match["name"] if match else part.name))
-    try:
-        if target is None or target.exists() or target.name.endswith(".review.rrd"):
-            return None
-        with contextlib.suppress(RecordingError):
-            check_recording(part)
-            read_recording(part)
-            part.replace(target)
-            return target
-        if not _merged(part, mended):
-            return None
-        with contextlib.suppress(RecordingError):
-            read_recording(mended)
-            mended.replace(target)
-            return target
-        return None
-    finally:
-        mended.unlink(missing_ok=True)
-        part.unlink(missing_ok=True)
-
-
-def _merged(part: Path, mended: Path) -> bool:
-    """Whether rerun could save what is whole at the start of ``part``."""
-    if not part.stat().st_size:
-        return False
-    command = [*rerun_command(), "rrd", "merge", "--continue-on-error", str(part), "-o", str(mended)]
-    try:
-        done = subprocess.run(command, capture_output=True, check=False, timeout=MERGE_LIMIT_S, env=rerun_environment())
-    except subprocess.SubprocessError:
-        return False
-    return done.returncode == 0 and mended.is_file()
 
 
 def _owner() -> str:

@@ -28,6 +28,7 @@ ASPECT = 0.6
 """Height of the stack of arcs by its width."""
 MOST_NODES, MOST_EDGES = 200, 2_000
 """The viewer's own graph is fluent up to these; larger ones are lines and dots, of which no more edges are drawn."""
+EDGE: pa.StructType = rr.components.GraphEdgeBatch._ARROW_DATATYPE
 GREY = 0.35
 """Opacity of what is not in the clique."""
 
@@ -135,10 +136,10 @@ def _placed(stage: TranslationStage) -> tuple[FloatArray, NDArray[np.bool_]]:
     inside[stage.clique] = True
     places, start = np.empty((len(inside), 2)), 0.0
     for members in (np.flatnonzero(inside), np.flatnonzero(~inside)):
-        radius = 6.0 * np.sqrt(max(1, len(members)))
+        radius = 1.6 * len(members) + 10.0
         angles = 2.0 * np.pi * np.arange(len(members)) / max(1, len(members))
         places[members] = np.column_stack([np.cos(angles), np.sin(angles)]) * radius + (start + radius, 0.0)
-        start += 2.0 * radius + 20.0
+        start += 2.0 * radius + 40.0
     return places, inside
 
 
@@ -157,7 +158,7 @@ def _graph(stage: TranslationStage) -> Iterator[Chunk]:
     places, inside = _placed(stage)
     names = pa.array([f"{a}-{b}" for a, b in stage.pairs.tolist()])
     names = names if len(names.unique()) == len(names) else pa.array([str(k) for k in range(len(names))])
-    count, kind = len(inside), rr.components.GraphEdgeBatch._ARROW_DATATYPE
+    count, kind = len(inside), EDGE
     edges = pa.StructArray.from_arrays([names.take(pa.array(stage.edges[:, k])) for k in (0, 1)], fields=list(kind))
     nodes = rr.GraphNodes
     columns = [

@@ -9,7 +9,7 @@ import json
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, fields
 from datetime import datetime
-from typing import Any, get_args
+from typing import Any, cast, get_args
 
 import pyarrow as pa
 import rerun as rr
@@ -146,10 +146,11 @@ def row_from_properties(values: Mapping[str, Any], **known: Any) -> RunRow:
     Raises ``TypeError`` for a value of a wrong type.
     """
     row: dict[str, Any] = dict(known)
+    values = {"source": "unknown", **values}
     for item in fields(RunRow):
         if item.name in known or item.name in NOT_RECORDED:
             continue
-        kinds = get_args(item.type) or (item.type,)
+        kinds: tuple[type, ...] = get_args(item.type) or (cast(type, item.type),)
         value = values.get(item.name)
         if value is None:
             row[item.name] = None if type(None) in kinds else _EMPTY[kinds[0]]

@@ -34,9 +34,10 @@ MAX_TEXT = 200
 """Characters of a text that is searched for."""
 
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?"
-_ONE_SIDED = re.compile(rf"(<=|>=|<|>)\s*({_NUMBER})")
-_BETWEEN = re.compile(rf"({_NUMBER})\s*\.\.\s*({_NUMBER})")
-_AGO = re.compile(r"(\d{1,5})\s*(min|h|d|w)")
+_ONE_SIDED = re.compile(rf"(<=|>=|<|>)\s*({_NUMBER})", re.ASCII)
+_BETWEEN = re.compile(rf"({_NUMBER})\s*\.\.\s*({_NUMBER})", re.ASCII)
+_ALONE = re.compile(_NUMBER, re.ASCII)
+_AGO = re.compile(r"(\d{1,5})\s*(min|h|d|w)", re.ASCII)
 _UNITS = {"min": "minutes", "h": "hours", "d": "days", "w": "weeks"}
 EQUAL = 1e-6
 """A number alone means itself, up to this share of it: 0.9 also finds 90 of 100 as a computer divides it."""
@@ -117,7 +118,7 @@ def parse_range(text: str) -> Range:
         if low <= high:
             return Range(low, high)
         raise InputError(f"the range {show(text)} is empty: give the smaller number first.")
-    if re.fullmatch(_NUMBER, text):
+    if _ALONE.fullmatch(text):
         number = _finite(text)
         return Range(number - EQUAL * abs(number), number + EQUAL * abs(number))
     raise InputError(f"{show(text)} is no range: give one such as '>0.9', '<=3', '0.5..0.9' or '0.9'.")

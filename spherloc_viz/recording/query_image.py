@@ -29,6 +29,8 @@ MOST_BYTES = 400_000
 QUALITIES = (80, 60, 40, 20)
 DOT_PX = 2.5
 FRAME_PX = 1.0
+MARGIN = 0.03
+"""Around the image, as a share of its width."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +78,11 @@ def image_chunks(problem: Problem, image: QueryImage) -> Iterator[Chunk]:
         yield static_chunk(QUERY_IMAGE, encoded_image(image.jpeg, "image/jpeg"))
     width, height = image.scale * problem.camera.width, image.scale * problem.camera.height
     border = np.array([[0, 0], [width, 0], [width, height], [0, height], [0, 0]], np.float64)
-    outlines = [border] if image.jpeg else [border, *(_closed(outline) for outline in valid_outlines(problem.camera))]
+    # Lines of no length, so that the view leaves a margin around the image.
+    corners = [np.array([corner, corner]) for corner in (border[0] - MARGIN * width, border[2] + MARGIN * width)]
+    outlines = [border, *corners]
+    if not image.jpeg:
+        outlines += [image.scale * np.vstack([outline, outline[:1]]) for outline in valid_outlines(problem.camera)]
     lines = strips(np.concatenate(outlines), [len(outline) for outline in outlines], STRIP_2D)
     yield static_chunk(
         FRAME,
@@ -86,7 +92,3 @@ def image_chunks(problem: Problem, image: QueryImage) -> Iterator[Chunk]:
             Values(rr.LineStrips2D.descriptor_radii(), numbers([-FRAME_PX / 2]), [1]),
         ],
     )
-
-
-def _closed(outline: FloatArray) -> FloatArray:
-    return np.vstack([outline, outline[:1]])

@@ -3,7 +3,7 @@
 import contextlib
 import warnings
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,7 @@ from spherloc_viz.recording.properties import (
     read_properties,
     row_from_properties,
 )
+from spherloc_viz.recording.review import read_review
 from spherloc_viz.recording.run_row import RunRow
 
 STAGES = "/data/stages/"
@@ -53,7 +54,7 @@ class RecordedRun:
     seed: int
     """Seed of every random draw."""
     versions: Mapping[str, str]
-    """Versions of spherloc, python and the numeric libraries that computed it."""
+    """Versions of spherloc, python and the numeric libraries that computed it, and the machine."""
     timings_ms: Mapping[str, float]
     """Wall time a stage, and ``total``."""
     cam_from_map: FloatArray | None
@@ -95,7 +96,11 @@ def read_run_row(path: Path) -> RunRow:
     path = Path(path)
     with _sentences(path):
         entry, chunks = _load(path, [PROPERTIES, THUMBNAIL])
-        return _row(path, entry, chunks)
+        row = _row(path, entry, chunks)
+    with contextlib.suppress(RecordingError):  # without labels a run is still a run
+        review = read_review(path)
+        row = replace(row, labels=review.labels, note=review.note)
+    return row
 
 
 def check_recording(path: Path) -> None:

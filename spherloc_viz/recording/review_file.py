@@ -31,7 +31,7 @@ def write_file(path: Path, labels: Sequence[str], note: str, run_id: str) -> Non
 
 def read_file(path: Path, most_labels: int) -> tuple[list[str], str]:
     """Labels and note of a file. Raises ``TypeError``, ``ValueError`` and what rerun raises if it is damaged."""
-    found = RrdReader(path).stream().filter(content=[f"/__properties/{REVIEW_PROPERTY}"]).to_chunks()
+    found = _reader(path).stream().filter(content=[f"/__properties/{REVIEW_PROPERTY}"]).to_chunks()
     (batch,) = (chunk.to_record_batch() for chunk in found)
     batch.validate(full=True)
     (note,) = _texts(batch.column("note"), 1)
@@ -49,9 +49,18 @@ def recording_id(recording: Path) -> str:
     """The recording's id. Raises ``RecordingError`` if it is none of ours."""
     if not recording.is_file():
         raise RecordingError(f"{recording}: no such file; give the path of a recording (.rrd).")
-    with warnings.catch_warnings(), contextlib.suppress(OSError, RuntimeError, ValueError, RerunWarning):
-        warnings.simplefilter("error", RerunWarning)
-        for entry in RrdReader(recording).recordings():
+    with contextlib.suppress(OSError, RuntimeError, ValueError):
+        for entry in _reader(recording).recordings():
             if entry.application_id == APPLICATION_ID:
                 return entry.recording_id
     raise RecordingError(f"{recording}: not a whole recording (.rrd); give one that spherloc wrote.")
+
+
+def _reader(path: Path) -> RrdReader:
+    """Raises ``ValueError`` for a file without its end, of which rerun only warns."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RerunWarning)
+        try:
+            return RrdReader(path)
+        except RerunWarning as warning:
+            raise ValueError(str(warning)) from warning

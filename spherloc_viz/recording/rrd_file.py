@@ -88,8 +88,10 @@ def _places(table: bytearray) -> NDArray[np.uint64]:
     return np.frombuffer(table, np.uint64, len(column), start)
 
 
-def _fields(message: bytes) -> dict[int, bytes | int]:
+def _fields(message: bytes | int) -> dict[int, bytes | int]:
     """Fields of a protobuf message by number: bytes, or whole numbers."""
+    if isinstance(message, int):
+        raise ValueError("rerun wrote an index of an unknown form")
     fields: dict[int, bytes | int] = {}
     at = 0
     while at < len(message):

@@ -44,8 +44,8 @@ def check_name(name: str) -> str:
     """
     if len(name) > _NAME_LIMIT or not _NAME.fullmatch(name):
         raise RecordingError(
-            f"{show(name)}: not the name of a recording, which has letters, digits, '.', '_' and '-' and ends with .rrd; "
-            "rename the file."
+            f"{show(name)}: not the name of a recording, which has letters, digits, '.', '_' and '-' and ends with "
+            ".rrd; rename the file."
         )
     return name
 

@@ -60,8 +60,8 @@ def _window(flat: FloatArray, cameras: list[FloatArray]) -> tuple[FloatArray, fl
 
 def _pixels(flat: FloatArray, middle: FloatArray, scale: float) -> NDArray[np.int64]:
     """Pixels (K, 2) of places (K, 2) x, z of the aligned map."""
-    away = np.clip((flat - middle) * scale, -10.0 * WIDTH_PX, 10.0 * WIDTH_PX) * (1.0, -1.0)
-    return np.round(away + (WIDTH_PX / 2, HEIGHT_PX / 2)).astype(np.int64)
+    away = np.clip((flat - middle) * scale, -10.0 * WIDTH_PX, 10.0 * WIDTH_PX) * np.array([1.0, -1.0])
+    return np.round(away + 0.5 * np.array([WIDTH_PX, HEIGHT_PX])).astype(np.int64)
 
 
 def _draw_camera(

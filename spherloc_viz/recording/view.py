@@ -8,12 +8,13 @@ import sys
 import time
 from pathlib import Path
 
+from rerun.chunk import RrdReader
 from rerun.experimental import ViewerClient
 
 from spherloc.errors import InputError, RecordingError
 from spherloc_viz.recording.columns import TIMELINE
 from spherloc_viz.recording.rerun_program import rerun_command, rerun_environment
-from spherloc_viz.recording.review import review_path
+from spherloc_viz.recording.review import Review, read_review, review_path
 from spherloc_viz.recording.run_row import RunRow
 
 HOST = "127.0.0.1"
@@ -35,14 +36,27 @@ def step_of(row: RunRow, wish: int | None) -> int:
     return wish
 
 
-def view_in_window(path: Path, step: int) -> None:
+def labels_of(recording: Path, run_id: str) -> Path | None:
+    """The file with the labels and the note of a run, which a viewer shows as a part of its recording; None without.
+
+    Raises ``RecordingError`` if the file is damaged, or belongs to another run, which would cover this one.
+    """
+    path = review_path(recording)
+    if read_review(recording) == Review():
+        return None
+    if {entry.recording_id for entry in RrdReader(path).recordings()} != {run_id}:
+        raise RecordingError(f"{path}: labels and note of another run; delete the file and label this one.")
+    return path
+
+
+def view_in_window(path: Path, row: RunRow, step: int) -> None:
     """Open a recording, with its labels and note, paused at a step, and return when the window is closed.
 
-    Raises ``RecordingError`` if the viewer cannot open.
+    Raises ``RecordingError`` if the viewer cannot open, or cannot show the labels.
     """
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise RecordingError(f"{path.name}: there is no display to open a window on; add --web to use a browser.")
-    files = [str(file.resolve()) for file in (path, review_path(path)) if file.is_file()]
+    files = [str(file.resolve()) for file in (path, labels_of(path, row.run_id)) if file is not None]
     with socket.create_server((HOST, 0)) as free:
         port = free.getsockname()[1]
     # The port is for programs that control the viewer, as we do: nobody else on the network should.

@@ -79,9 +79,9 @@ class _Run:
 def recorded_steps(stops: Sequence[Stop], decisive: int) -> list[int]:
     """The steps that a lean recording shows: the decisive one, and of every series the first.
 
-    Series are steps whose keys differ in a number only, as "yaw-arcs-10" and "yaw-arcs-30" do: more and more arcs, balls
-    or members of a clique, one peak after another. A step with all of them follows. The samples of RANSAC have no such
-    step and are all there. Between two steps a viewer shows the earlier one.
+    Series are steps whose keys differ in a number only, as "yaw-arcs-10" and "yaw-arcs-30" do: more and more arcs,
+    balls or members of a clique, one peak after another. A step with all of them follows. The samples of RANSAC have
+    no such step and are all there. Between two steps a viewer shows the earlier one.
     """
     first: dict[str, int] = {}
     for index, stop in enumerate(stops):

@@ -132,6 +132,9 @@ def test_the_query_on_the_sphere_and_the_mesh_around_it(
     tab.until(lambda: np.allclose(tab.viewer[:3], centre, atol=0.02), "the viewer stands in the camera")
     fov = "() => window.__viserMutable.camera.fov"
     tab.until(lambda: round(tab.page.evaluate(fov)) == 85, "the viewer sees wide")
+    for name, seen in (("From the camera", False), ("Overview", True)):
+        tab.press(name)
+        tab.until(lambda seen=seen: visible("/cameras/estimate") == seen, "one does not see the camera from inside")
 
     panorama = tab.node("/sphere/image")
     tab.tab("Open")

@@ -15,6 +15,7 @@ from spherloc.datasets import load_scene
 from spherloc.estimators import estimate
 from spherloc_viz import style
 from spherloc_viz.app.web.viewer_room import viewer_link
+from spherloc_viz.recording.reader import read_run_row
 from spherloc_viz.recording.review import write_review
 from spherloc_viz.recording.run_row import RunRow
 from spherloc_viz.recording.writer import write_recording
@@ -35,7 +36,7 @@ REACH_OUT = """() => new Promise(done => {
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run with labels and a note, and one whose labels are damaged."""
+    """With a run that has labels and a note."""
     scene = tmp_path_factory.mktemp("scene") / "small.toml"
     scene.write_text(SCENE)
     folder = tmp_path_factory.mktemp("recordings")
@@ -48,8 +49,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def row(folder: Path) -> RunRow:
     """What a list knows of the run."""
-    from spherloc_viz.recording.reader import read_run_row
-
     return read_run_row(folder / "good.rrd")
 
 

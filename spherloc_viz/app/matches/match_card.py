@@ -16,17 +16,23 @@ from spherloc_viz.layers.explanation import Explanation, Pairs, explain
 from spherloc_viz.layers.primitives import Table
 from spherloc_viz.layers.selection_traits import Traits, explain_many
 
-WIDTH_PX = 330.0
-MARGIN_PX = 14.0
+WIDTH_PX = 310.0
+MARGIN_PX = 8.0
 
 
 class MatchCard:
-    """A floating panel that is there while something is selected. Its buttons are touches that the session handles."""
+    """A floating panel that is there while something is selected. Its buttons are touches that the session handles.
+
+    It lies over the canvas, so what is longer than a glance is folded until it is asked for.
+    """
 
     def __init__(self, gui: viser.GuiApi) -> None:
         self._panel = gui.add_panel(visible=False)
         with self._panel.add_tab("Selection"):
             self._html = gui.add_html("")
+            self._more = gui.add_folder("Numbers and pairs", expand_by_default=False)
+            with self._more:
+                self._details = gui.add_html("")
         self._panel.float(x=MARGIN_PX, y=MARGIN_PX, width=WIDTH_PX)
         self._drawn: tuple | None = None
 
@@ -47,23 +53,31 @@ class MatchCard:
         if not selected or (self._drawn is not None and self._drawn[0] is trace and self._drawn[1:] == drawn[1:]):
             return
         self._drawn = drawn
-        html = (
-            one_html(trace, explain(trace, selected[0], rival_cam_from_map), kept)
-            if len(selected) == 1
-            else many_html(trace, explain_many(trace, np.array(selected)), kept[list(selected)])
-        )
-        if self._html.content != html:
-            self._html.content = html
+        if len(selected) == 1:
+            what = explain(trace, selected[0], rival_cam_from_map)
+            html, details = one_html(trace, what, kept), details_html(what, kept)
+        else:
+            html, details = many_html(trace, explain_many(trace, np.array(selected)), kept[list(selected)]), ""
+        if self._more.visible != bool(details):
+            self._more.visible = bool(details)
+        for element, content in ((self._html, html), (self._details, details)):
+            if element.content != content:
+                element.content = content
 
 
 def one_html(trace: Trace, what: Explanation, kept: NDArray) -> str:
-    """The card of one match."""
+    """The card of one match: what became of it and why, and what can be done."""
     title = f'<span style="font-size:15px;font-weight:600">Match {kept[what.number]}</span>'
     color = style.OUTLIER if "wrongly" in what.verdict else style.INLIER if what.kept else None
     look = f"color:{style.css_text(color)};font-weight:600" if color else "font-weight:600"
     head = f'<div>{_walk(what.number, kept)}{title} <span style="{look}">{escape(what.verdict)}</span></div>'
     body = f'<div style="padding-top:.3em">{escape(what.reason)}</div>{crops_html(trace.problem, what.number)}'
-    return box(head + body) + _measures(what) + _notes(what, kept) + _actions(trace, 1)
+    return box(head + body) + _actions(trace, 1)
+
+
+def details_html(what: Explanation, kept: NDArray) -> str:
+    """What is told of one match on demand."""
+    return _measures(what) + _notes(what, kept)
 
 
 def many_html(trace: Trace, what: Traits, numbers: NDArray) -> str:

@@ -267,7 +267,9 @@ def _row_html(table: Table, row: tuple) -> str:
     head = f'<td style="padding-top:.35em;white-space:nowrap;font-weight:600">{title}</td>'
     shares = ("inliers", "precision", "recall")
     words = [f"{value[share]} {share}" for share in shares if value[share] not in (NO_VALUE, "0")]
-    words += [value[column] for column in ("certificate", "diagnosis") if value[column] not in (NO_VALUE, Cause.OK)]
+    words += [value["certificate"]] if value["certificate"] != NO_VALUE else []
+    # Named as what it is: beside "no pose" a cause alone reads as if it were about a pose.
+    words += [f"diagnosis: {value['diagnosis']}"] if value["diagnosis"] not in (NO_VALUE, Cause.OK) else []
     color = WORDS.get(value["outcome"])
     verdict = f'<span style="{f"color:{style.css(color)};font-weight:600" if color else ""}">{value["outcome"]}</span>'
     line = f'{verdict}<span style="{DIM}"> · {escape(" · ".join(words))}</span>' if words else verdict

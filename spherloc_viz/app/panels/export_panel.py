@@ -22,6 +22,7 @@ from spherloc_viz.recording.writer import write_recording
 
 PATIENCE_S = 60.0
 """A page that draws in software takes some ten seconds for a picture of its canvas."""
+WHERE = "Paths in the code are relative to the folder in which the playground was started; run it there."
 CANVAS = {True: (20, 20, 20), False: (255, 255, 255)}
 """What the canvas has behind everything, by whether the page is dark."""
 
@@ -66,7 +67,11 @@ class ExportPanel:
         """Show the code that repeats the run at hand."""
         if self._code != (python, command):
             self._code = (python, command)
-            self._text.content = code_html("Python", python) + code_html("Command", command)
+            self._text.content = (
+                code_html("Python", python)
+                + code_html("Command", command)
+                + box(f'<div style="{DIM}">{WHERE}</div>', "font-size:12px")
+            )
 
     def close(self) -> None:
         """Export nothing more; does not wait."""

@@ -77,7 +77,7 @@ class RecordingsPanel:
         name, page = str(client.client_id), self._page
         self._notes = Notes(gui, touches, shelf, name, self._stored, self._complain)
         self._comparison = gui.add_html("", visible=False)
-        self._runs = RunList(gui, touches, shelf, name)
+        self._runs = RunList(gui, touches, shelf, name, lambda: self._reviewer.locate())
         reviewing = Reviewing(
             shelf, page.roots, card, page.enter, page.open_recorded, self._say, self._complain, self._follow
         )
@@ -147,7 +147,9 @@ class RecordingsPanel:
     def _open_file(self, file: str) -> None:
         self._reviewer.ask(file)
 
-    def _open_scene(self, got: Reopened) -> None:
+    def _open_scene(self, got: Reopened, beside: bool) -> None:
+        if not beside and self._runs is not None:
+            self._reviewer.leave()
         self._page.open(self._page.enter(got))
 
     def _say(self, words: str) -> None:

@@ -28,7 +28,7 @@ Line = tuple[str, str, str]
 
 def bar_html(place: int | None, total: int) -> str:
     """What opens the next run and the one before, and where in the list the open one is (from 0)."""
-    where = f"{total:,} runs" if place is None else f"{place + 1:,} of {total:,}"
+    where = "not in the list" if place is None else f"{place + 1:,} of {total:,}"
     back = pill(
         f"‹ previous {key_html(PREVIOUS_KEY)}",
         "run-step:-1",

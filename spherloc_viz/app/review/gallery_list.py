@@ -32,9 +32,10 @@ class GalleryList:
         shelf: Shelf | None,
         name: str,
         open_file: Callable[[str], None],
-        open_scene: Callable[[Reopened], None],
+        open_scene: Callable[[Reopened, bool], None],
     ) -> None:
-        """``open_file`` opens a recording, ``open_scene`` what has none; both are called on a thread of this part."""
+        """``open_file`` opens a recording, ``open_scene`` what has none, beside the open recording or instead of it;
+        both are called on a thread of this part."""
         self._shelf, self._open_file, self._open_scene = shelf, open_file, open_scene
         self._errand = Errand(f"spherloc-gallery-{name}", self._fail)
         self._html = gui.add_html("", visible=False)
@@ -69,12 +70,14 @@ class GalleryList:
         if file_of(case) in self._rows():
             self._open_file(file_of(case))
         else:
-            self._open_scene(reopened(case, case))
+            self._open_scene(reopened(case, case, case.key), False)
 
     def _open_beside(self, key: str, number: int) -> None:
         case = next((case for case in gallery_cases() if case.key == key), None)
         if case is not None and number < len(case.beside):
-            self._open_scene(reopened(case, case.beside[number]))
+            play = case.beside[number]
+            stem = case.key if play.staged == case.staged else f"{case.key}_{number}"
+            self._open_scene(reopened(case, play, stem), True)
 
     def _rows(self) -> dict[str, RunRow]:
         """The recordings of the cases that have one."""
@@ -95,9 +98,9 @@ def file_of(case: GalleryCase) -> str:
     return f"{FOLDER}/{case.key}.rrd"
 
 
-def reopened(case: GalleryCase, play: Play) -> Reopened:
-    """A case, or a run beside it, as a scene to open."""
-    path = play.scene_path or Path(GALLERY).with_name(FOLDER) / f"{case.key}.rrd"
+def reopened(case: GalleryCase, play: Play, stem: str) -> Reopened:
+    """A case, or a run beside it, as a scene to open; ``stem`` names those that have no scene file."""
+    path = play.scene_path or Path(GALLERY).with_name(FOLDER) / f"{stem}.rrd"
     label = case.title if play.scene_path is None else play.scene.name
     return Reopened(play.scene, path, label, play.seed, play.query, play.variation, play.estimator, play.options)
 

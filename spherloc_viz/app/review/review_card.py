@@ -40,8 +40,9 @@ class ReviewCard:
 
     def place(self, place: int | None, total: int) -> None:
         """Say where in the list the run is."""
-        self._where = (place, total)
-        self._redraw()
+        before, self._where = self._where, (place, total)
+        if before != self._where:
+            self._redraw()
 
     def draw(self, run: Run, diagnosis: Diagnosis | None) -> None:
         """Show what was recorded beside the run on the page."""

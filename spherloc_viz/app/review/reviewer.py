@@ -50,19 +50,25 @@ class Reviewer:
         self._steps, self._place = 0, 0
         touches.on("run-open", lambda touch: self.ask(touch.argument))
         touches.on("run-step", self._step)
-        touches.on("run-close", lambda touch: self._close())
+        touches.on("run-close", lambda touch: self.leave())
         touches.on("run-return", lambda touch: self._return())
 
     def ask(self, file: str) -> None:
         """Have a recording opened."""
         with self._lock:
-            self._steps = 0
+            self._steps, self._place = 0, PAGE * self._runs.look.page
         self._errand.ask(partial(self._open_file, file))
 
     def compare(self, one: RunRow, other: RunRow) -> None:
         """Have the first opened and, if both are of one problem, the second one drawn beside it."""
         if same_problem(one, other):
             self._errand.ask(partial(self._open_both, one.file, other.file))
+
+    def leave(self) -> None:
+        """Take the recorded run away; the page stays as it is."""
+        self._has.card.show(None)
+        self._runs.show(None)
+        self._has.changed(None)
 
     def uncompare(self) -> None:
         """Take the second camera away."""
@@ -75,6 +81,16 @@ class Reviewer:
         opened = self._has.card.opened
         if opened is not None and opened.recorded.row.file == row.file:
             self._has.card.show(replace(opened, recorded=replace(opened.recorded, row=row)))
+
+    def locate(self) -> int | None:
+        """Find, and say, where in the list the run that is open is by now: None if it is not there."""
+        opened = self._has.card.opened
+        if opened is None:
+            return None
+        at, total = self._has.shelf.place(self._runs.look, opened.recorded.row.file, self._place)
+        self._place = self._place if at is None else at
+        self._has.card.place(at, total)
+        return at
 
     def close(self) -> None:
         """Open nothing more; does not wait."""
@@ -130,11 +146,7 @@ class Reviewer:
         row = opened.recorded.row
         self._has.card.show(opened)
         self._has.open(opened.wish, opened.path, opened.recorded.cam_from_map)
-        at, total = self._has.shelf.place(self._runs.look, row.file, self._place)
-        if at is not None:
-            self._place = at
-        self._has.card.place(at, total)
-        self._runs.show(row.file, at)
+        self._runs.show(row.file, self.locate())
         self._has.changed(row)
         self._has.say("")
 
@@ -142,8 +154,3 @@ class Reviewer:
         opened = self._has.card.opened
         if opened is not None:
             self._has.open(opened.wish, opened.path, opened.recorded.cam_from_map)
-
-    def _close(self) -> None:
-        self._has.card.show(None)
-        self._runs.show(None)
-        self._has.changed(None)

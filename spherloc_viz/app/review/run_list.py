@@ -28,7 +28,11 @@ MOST_MARKED = 1000
 class RunList:
     """Draws on a thread that lives only while the list is seen or asked for something."""
 
-    def __init__(self, gui: viser.GuiApi, touches: Touches, shelf: Shelf, name: str) -> None:
+    def __init__(
+        self, gui: viser.GuiApi, touches: Touches, shelf: Shelf, name: str, drawn: Callable[[], object]
+    ) -> None:
+        """``drawn`` is called, on a thread of the list, whenever it may have become another one."""
+        self._drawn = drawn
         self._shelf = shelf
         self._lock = threading.Lock()
         self._look = Look()
@@ -174,6 +178,7 @@ class RunList:
         self._problem.visible = False
         self._bar.visible = bool(marked)
         self._range.visible = look.unfolded == "outliers"
+        self._drawn()
 
     def _fail(self, sentence: str) -> None:
         self._problem.content = status_html(sentence[:1].upper() + sentence[1:], wrong=True)

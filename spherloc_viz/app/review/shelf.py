@@ -10,13 +10,15 @@ from spherloc.errors import RecordingError
 from spherloc_viz.app.review.filters import Counts
 from spherloc_viz.app.review.look import EXACT, PAGE, Look
 from spherloc_viz.recording.index import Found, RunIndex
-from spherloc_viz.recording.query import RunQuery
+from spherloc_viz.recording.query import MAX_TEXT, RunQuery
 from spherloc_viz.recording.reader import RecordedRun, read_recording
 from spherloc_viz.recording.run_row import RunRow
 from spherloc_viz.recording.strangers import examine, resolve_inside
 
 NEAR = 50
 """A run that was at some place of the list is looked for among so many around it."""
+STRETCH = 500
+"""Runs that are looked through at once where it is elsewhere."""
 MOST_LABELS = 12
 """Labels that are offered, those used most."""
 
@@ -92,11 +94,25 @@ class Shelf:
                 examine(resolve_inside(self.folder, newest[0].file))
 
     def place(self, look: Look, file: str, near: int) -> tuple[int | None, int]:
-        """Where a run is in the list, counted from 0, if it is near that place, and how long the list is."""
-        first = max(0, near - NEAR)
-        found = self._index.find(_query(look), 2 * NEAR + 1, first)
-        at = next((place for place, row in enumerate(found.rows, first) if row.file == file), None)
+        """Where a run is in the list, counted from 0, and how long the list is; looked for around ``near`` first."""
+        query = _query(look)
+        found, at = self._search(query, file, max(0, near - NEAR), 2 * NEAR + 1)
+        if at is not None or len(found.rows) == found.total:
+            return at, found.total
+        # Most runs that are not near are not in the list at all.
+        words = f"{query.text or ''} {file}".strip()
+        if len(words) <= MAX_TEXT and not self._index.find(replace(query, text=words), 0).total:
+            return None, found.total
+        for first in range(0, found.total, STRETCH):
+            _, at = self._search(query, file, first, STRETCH)
+            if at is not None:
+                break
         return at, found.total
+
+    def _search(self, query: RunQuery, file: str, first: int, count: int) -> tuple[Found, int | None]:
+        """A stretch of the list, and where in the list a run is if it is there."""
+        found = self._index.find(query, count, first)
+        return found, next((place for place, row in enumerate(found.rows, first) if row.file == file), None)
 
     def at(self, look: Look, place: int) -> RunRow | None:
         """The run at a place of the list, if there is one."""

@@ -1,7 +1,9 @@
 """One client's canvas: draws pictures, moves the viewer, and tells what is picked and dragged."""
 
+import threading
 from collections.abc import Callable
 
+import numpy as np
 import viser
 
 from spherloc_viz.app.controls.display_controls import DisplayControls
@@ -38,17 +40,35 @@ class Canvas:
         self._docked_px, self._full_width = docked_px, client.camera.image_width
         self._viewed: tuple[str, str, str] | None = None
         self._checks, self._movable = 0, False
+        self._lock = threading.Lock()
+        self._picture: Picture | None = None
+        client.camera.on_update(lambda camera: self._make_room())
 
     def draw(self, run: Run, picture: Picture, mesh: bytes | None, movable: bool) -> None:
         """Show a picture of a run; ``mesh`` is the map's, and ``movable`` whether the true camera may be dragged."""
         problem, layers = run.trace.problem, self._display.layers()
-        self._painter.draw(picture.scene, layers)
-        self._painter.draw_backdrop(mesh, problem.aligned.map_turn, "mesh" in layers)
+        with self._lock:
+            self._painter.draw(picture.scene, layers)
+            self._painter.draw_backdrop(mesh, problem.aligned.map_turn, "mesh" in layers)
+            self._picture = picture
         if movable or self._movable:
             truth = problem.truth_cam_from_map
             self._camera.show(None if truth is None else problem.aligned.align_pose(truth), movable)
             self._movable = movable
         self._move_viewer(run, picture)
+        self._make_room()
+
+    def _make_room(self) -> None:
+        """Hide what would be before the eyes of who stands in a camera; on threads of viser's and of the page's."""
+        # Not to wait for a picture that is being drawn each time that the viewer moves.
+        if self._in_the_way() != self._painter.hidden:
+            with self._lock:
+                self._painter.hide(self._in_the_way())
+
+    def _in_the_way(self) -> frozenset[str]:
+        picture = self._picture
+        position = np.array(self._client.camera.position)
+        return frozenset() if picture is None else views.before_the_eyes(picture, position)
 
     def check(self) -> float | None:
         """Seconds to the next look at whether the page dropped its first view; None once it has had time enough."""

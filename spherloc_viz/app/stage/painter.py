@@ -38,6 +38,9 @@ class Painter:
         self._drawn: dict[str, tuple[Any, tuple, SceneItem]] = {}
         self._textured: dict[str, tuple[Hashable, bytes | None]] = {}
         self._shown: tuple[SceneItem, ...] = ()
+        self._names: frozenset[str] = frozenset()
+        self.hidden: frozenset[str] = frozenset()
+        """Nodes that are left out of what is shown."""
         self._backdrop: tuple[bytes, Any] | None = None
         if on_pick is not None:
             scene, extend = client.scene, partial(self._clicked, on_pick, True)
@@ -59,11 +62,23 @@ class Painter:
                 for part in _parts(item):
                     self._put(part, look)
                     names.add(part.name)
-            for name, (handle, _, item) in self._drawn.items():
-                visible = name in names and item.layer in layers
-                if handle.visible != visible:
-                    handle.visible = visible
+            self._names = frozenset(name for name in names if self._drawn[name][2].layer in layers)
+            self._follow()
         self._shown = tuple(shown)
+
+    def hide(self, names: frozenset[str]) -> None:
+        """Leave these nodes out of what is shown, from now on; an empty set shows all again."""
+        if names != self.hidden:
+            self.hidden = names
+            with self._client.atomic():
+                self._follow()
+
+    def _follow(self) -> None:
+        """Have nodes visible that are to be seen."""
+        for name, (handle, _, _) in self._drawn.items():
+            visible = name in self._names and name not in self.hidden
+            if handle.visible != visible:
+                handle.visible = visible
 
     def draw_backdrop(self, glb: bytes | None, aligned_from_map: np.ndarray, visible: bool) -> None:
         """Show the map's mesh, a binary glTF in the map frame, behind the pictures of a run; None for none.

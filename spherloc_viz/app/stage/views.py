@@ -34,6 +34,8 @@ NAMES = (*DIRECTIONS, INSIDE)
 """All views."""
 TURNING = 0.02
 """How far before the eye of who stands in the camera the point lies around which the mouse turns, in sphere radii."""
+CLOSE = 0.15
+"""Who is this close to a camera's centre stands in it, in sphere radii."""
 SUBJECTS = (
     ("Balls", "balls/clique"),
     ("Balls", "balls/others"),
@@ -79,6 +81,26 @@ def fitting(picture: Picture) -> tuple[str, str]:
         if subject in drawn:
             return name, subject
     return "Overview", "map/points"
+
+
+def before_the_eyes(picture: Picture, position: FloatArray) -> frozenset[str]:
+    """Names of the cameras in which a viewer at that position (3,) stands, and of what is drawn around them: their
+    lines would cross all that is seen."""
+    items = {item.name: item for item in picture.scene}
+    surface = items.get("sphere/surface")
+    if not isinstance(surface, Mesh):
+        return frozenset()
+    close = CLOSE * float(np.max(surface.vertices[:, 0] - _centre(surface)[0]))
+    cameras = [item for item in picture.scene if isinstance(item, Segments) and item.layer == "cameras"]
+    names = {item.name for item in cameras if len(item.points) and _apart(item, position) < close}
+    if "cameras/estimate" in names:
+        names |= {item.name for item in picture.scene if item.layer == "uncertainty"} | {"cameras/error"}
+    return frozenset(names)
+
+
+def _apart(camera: Segments, position: FloatArray) -> float:
+    """From a camera's centre, where its first line begins."""
+    return float(np.linalg.norm(camera.points[0, 0] - position))
 
 
 def find(name: str, picture: Picture, aspect: float) -> View:

@@ -16,12 +16,13 @@
       : new Promise(() => undefined);
 
   // The viewer is told and asked in protobuf (viewer_control.proto of rerun 0.41). Of what it can be told,
-  // set_time_cursor is number 6, in which 2 is the timeline, 3 the time and 5 the play state.
+  // set_time_cursor is number 6, in which 1 is the recording, 2 the timeline, 3 the time and 5 the play state.
   const number = (value) => (value < 128 ? [value] : [(value % 128) + 128, ...number(Math.floor(value / 128))]);
   const part = (field, bytes) => [field * 8 + 2, ...number(bytes.length), ...bytes];
   const count = (field, value) => [field * 8, ...number(value)];
   const name = part(1, [...new TextEncoder().encode(timeline)]);
-  const standStill = new Uint8Array(part(6, [...part(2, name), ...part(3, count(1, Number(step))), ...count(5, PAUSED)]));
+  const place = [...part(2, name), ...part(3, count(1, Number(step))), ...count(5, PAUSED)];
+  const standStill = (recording) => new Uint8Array(part(6, [...part(1, [...recording]), ...place]));
 
   // The fields of a message by their numbers: integers, and bytes of all that has a length.
   function fields(bytes = []) {
@@ -43,17 +44,16 @@
     return found;
   }
 
-  // Whether the recording's timeline has arrived, and whether it stands still at the step: of the state, 3 is the list
-  // of recordings; of a recording 2 its timelines, 3 the place on one of them and 5 the play state.
+  // The id of the recording as soon as its timeline has arrived, and whether it stands still at the step: of the state,
+  // 3 is the list of recordings; of a recording 2 its timelines, 3 the place on one of them and 5 the play state.
   function look(viewer) {
-    const recording = fields(fields(viewer.viewer_state())[3]?.[0]);
     const called = (bytes) => new TextDecoder().decode(fields(fields(bytes)[1]?.[0])[1]?.[0]);
-    const place = recording[3]?.[0];
-    const time = fields(fields(place)[3]?.[0])[1]?.[0] ?? 0;
-    return {
-      arrived: (recording[2] ?? []).some((each) => called(each) === timeline),
-      stands: Boolean(place) && called(place) === timeline && time === Number(step) && recording[5]?.[0] === PAUSED,
-    };
+    const recordings = (fields(viewer.viewer_state())[3] ?? []).map((each) => fields(each));
+    const found = recordings.find((each) => (each[2] ?? []).some((line) => called(line) === timeline));
+    const cursor = found?.[3]?.[0];
+    const time = fields(fields(cursor)[3]?.[0])[1]?.[0] ?? 0;
+    const stands = cursor && called(cursor) === timeline && time === Number(step) && found[5]?.[0] === PAUSED;
+    return { recording: found?.[1]?.[0], stands };
   }
 
   const pause = (ms) => new Promise((done) => setTimeout(done, ms));
@@ -80,10 +80,10 @@
   async function stand(viewer) {
     for (let turn = 0, still = 0; still < STILL_FRAMES; turn++) {
       if (turn === TRIES) throw new Error("The viewer does not open this recording: reload the page.");
-      const { arrived, stands } = look(viewer);
+      const { recording, stands } = look(viewer);
       still = stands ? still + 1 : 0;
-      if (arrived && !stands) await viewer.viewer_control(standStill);
-      await (arrived ? frame() : pause(PAUSE_MS));
+      if (recording && !stands) await viewer.viewer_control(standStill(recording));
+      await (recording ? frame() : pause(PAUSE_MS));
     }
   }
 

@@ -16,10 +16,10 @@ from spherloc_viz.app.web.guard import SAFE
 from spherloc_viz.app.web.viewer_page import DATA, PROGRAM, SORRY_POLICY, sorry_page, viewer_page, viewer_policy
 from spherloc_viz.recording.columns import TIMELINE
 from spherloc_viz.recording.index import RunIndex
-from spherloc_viz.recording.review import REVIEW_SUFFIX, read_review, review_path
+from spherloc_viz.recording.review import REVIEW_SUFFIX
 from spherloc_viz.recording.run_row import RunRow
 from spherloc_viz.recording.strangers import examine, resolve_inside
-from spherloc_viz.recording.view import step_of
+from spherloc_viz.recording.view import labels_of, step_of
 from spherloc_viz.recording.viewer_files import NAMES, viewer_folder, viewer_version
 
 PAGE = "/viewer/"
@@ -108,12 +108,10 @@ class ViewerRoom:
 
     def _data(self, rest: str, request: web.Request) -> web.StreamResponse:
         is_review = rest.endswith(REVIEW_SUFFIX)
-        run = self._find(rest.removesuffix(REVIEW_SUFFIX) + ".rrd" if is_review else rest).path
-        path = review_path(run) if is_review else run
-        if is_review:
-            read_review(run)  # raises an error for one that is none of ours
-            if not path.is_file():
-                return web.Response(status=204, headers=SAFE)
+        found = self._find(rest.removesuffix(REVIEW_SUFFIX) + ".rrd" if is_review else rest)
+        path = labels_of(found.path, found.row.run_id) if is_review else found.path
+        if path is None:
+            return web.Response(status=204, headers=SAFE)
         headers = SAFE | {
             "Content-Type": "application/octet-stream",
             "Content-Security-Policy": "default-src 'none'; sandbox",

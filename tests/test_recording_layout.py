@@ -1,0 +1,233 @@
+"""How a recording opens: its layout lies in its own file, and the real viewer has no fault to find with it."""
+
+import os
+import socket
+import struct
+import subprocess
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import rerun as rr
+from recording_samples import exact_run, lost_run, scene_problem
+from rerun.chunk import Chunk, LazyChunkStream, RrdReader
+from rerun.experimental import ViewerClient
+
+from spherloc.estimators import estimate
+from spherloc.trace import Trace, TranslationStage, YawStage
+from spherloc_viz.layers import paint, steps
+from spherloc_viz.layers.primitives import Picture
+from spherloc_viz.recording.columns import Values, static_chunk
+from spherloc_viz.recording.layout import APPLICATION_ID, layout_file, shown_in
+from spherloc_viz.recording.panels import MOST_EDGES, MOST_NODES, panel_chunks, panels_of
+from spherloc_viz.recording.properties import REVIEW_ENTITY
+from spherloc_viz.recording.rerun_program import rerun_command, rerun_environment
+from spherloc_viz.recording.rrd_file import joined, split, xxh32
+from spherloc_viz.recording.writer import write_recording
+
+CHROMIUM_VULKAN = Path("/usr/lib/chromium/vk_swiftshader_icd.json")
+"""Software graphics, which Debian's Chromium brings."""
+
+
+@pytest.fixture(scope="module")
+def clique_run() -> Trace:
+    """Its graph is small enough for the viewer's own."""
+    return estimate(scene_problem("panorama_outliers_90"), "mc", seed=3)
+
+
+@pytest.fixture(scope="module")
+def sample_run() -> Trace:
+    return estimate(scene_problem("fisheye_outliers_80"), "ransac-2p", seed=3)
+
+
+def layout_of(path: Path) -> tuple[dict[str, Any], dict[str, str]]:
+    """Components of the time panel, and the class of the view at every origin."""
+    reader = RrdReader(path)
+    (recording,), (layout,) = reader.recordings(), reader.blueprints()
+    assert recording.application_id == layout.application_id == APPLICATION_ID
+    panel: dict[str, Any] = {}
+    views: dict[str, str] = {}
+    for chunk in reader.store(store=layout).stream().to_chunks():
+        batch = chunk.to_record_batch()
+        row = {name: batch.column(name)[0].as_py() for name in batch.schema.names}
+        if chunk.entity_path == "/time_panel":
+            panel |= row
+        if "ViewBlueprint:space_origin" in row:
+            views[row["ViewBlueprint:space_origin"][0]] = row["ViewBlueprint:class_identifier"][0]
+    return panel, views
+
+
+@pytest.mark.parametrize("name", ["clique_run", "sample_run", "lost", "exact"])
+def test_a_file_opens_paused_at_the_steps_with_a_view_of_everything(
+    name: str, request: pytest.FixtureRequest, tmp_path: Path
+) -> None:
+    trace = {"lost": lost_run, "exact": exact_run}.get(name, lambda: request.getfixturevalue(name))()
+    path = tmp_path / "run.rrd"
+    write_recording(trace, path)
+    panel, views = layout_of(path)
+    assert panel["TimePanelBlueprint:timeline"] == ["step"]
+    assert panel["TimePanelBlueprint:play_state"] == [1], "paused"
+    pictures = [paint(trace, step) for step in range(len(steps(trace)))]
+    charts = {f"/charts/{chart.name}" for picture in pictures for chart in picture.charts}
+    tables = {rr.new_entity_path(["tables", t.name]) for picture in pictures[:-1] for t in picture.tables}
+    expected = {"/", "/step", "/outcome", "/query", REVIEW_ENTITY} | charts | tables
+    expected |= {"/charts/residuals"} if trace.cam_from_map is not None else set()
+    yaw, translation = trace.stage(YawStage), trace.stage(TranslationStage)
+    expected |= {"/arcs"} if yaw is not None and len(yaw.pairs) else set()
+    expected |= {"/graph"} if translation is not None and len(translation.pairs) else set()
+    assert set(views) == expected
+    if name == "clique_run":
+        assert views["/graph"] == "Graph"
+    reader = RrdReader(path)
+    entities = {chunk.entity_path for chunk in reader.store(store=reader.recordings()[0]).stream().to_chunks()}
+    for origin in expected - {"/", REVIEW_ENTITY}:
+        assert any(entity == origin or entity.startswith(f"{origin}/") for entity in entities), f"{origin} is empty"
+
+
+def test_a_graph_beyond_the_viewers_limits_is_lines(clique_run: Trace) -> None:
+    stage = clique_run.stage(TranslationStage)
+    assert stage is not None
+    small = panels_of(clique_run)
+    count = len(stage.pairs)
+    assert count <= MOST_NODES and len(stage.edges) <= MOST_EDGES and small.graph and not small.large_graph
+    first, second = np.triu_indices(count, 1)
+    dense = replace(stage, edges=np.column_stack([first, second]).astype(np.int32))
+    stages = tuple(dense if item is stage else item for item in clique_run.stages)
+    trace = replace(clique_run, stages=stages)
+    panels = panels_of(trace)
+    assert len(first) > MOST_EDGES and panels.large_graph and not panels.graph
+    chunks = {chunk.entity_path: chunk.to_record_batch() for chunk in panel_chunks(trace, panels)}
+    assert len(chunks["/graph/overlaps"].column("LineStrips2D:strips")[0]) == MOST_EDGES
+    assert len(chunks["/graph/balls"].column("Points2D:positions")[0]) == count
+
+
+# ---------------------------------------------------------------------------------------------- two stores in a file
+
+
+def test_checksums_are_those_of_the_hash() -> None:
+    seen = {
+        b"": 0x02CC5D05,
+        b"a": 0x550D7456,
+        b"abc": 0x32D153FF,
+        b"Nobody inspects the spammish repetition": 0xE2293B2F,
+    }
+    for content, value in seen.items():
+        assert xxh32(np.frombuffer(content, np.uint8), 0) == value
+
+
+@pytest.mark.parametrize("count", [1, 40])
+def test_stores_that_are_joined_are_whole(tmp_path: Path, clique_run: Trace, count: int) -> None:
+    layout = layout_file(shown_in([paint(clique_run, 0)], panels_of(clique_run)))
+    path = tmp_path / "run.rrd"
+    numbers = [Values(rr.ComponentDescriptor("number"), rr.components.ScalarBatch([7.0]).as_arrow_array(), [1])]
+    chunks = [static_chunk(f"/at/{k}", numbers) for k in range(count)]
+    LazyChunkStream.from_iter(chunks).write_rrd(path, application_id=APPLICATION_ID, recording_id="id")
+    path.write_bytes(joined(layout, split(path.read_bytes())))
+    reader = RrdReader(path)
+    (recording,), (view,) = reader.recordings(), reader.blueprints()
+    found = reader.store(store=recording).stream().filter(content=["/at/**"]).to_chunks()
+    assert {chunk.entity_path for chunk in found} == {f"/at/{k}" for k in range(count)}
+    assert all(chunk.to_record_batch().column("number")[0].as_py() == [7.0] for chunk in found)
+    assert len(reader.store(store=view).stream().to_chunks()) > 5
+    command = [*rerun_command(), "rrd", "verify", str(path)]
+    done = subprocess.run(command, capture_output=True, text=True, env=rerun_environment(), timeout=60, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_file_in_another_form_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+    dot = Chunk.from_columns("/dot", [], rr.Points3D.columns(positions=[[1, 2, 3]]))
+    LazyChunkStream.from_iter([dot]).write_rrd(path, application_id=APPLICATION_ID, recording_id="id")
+    content = path.read_bytes()
+    start = struct.unpack_from("<Q", content, len(content) - 32)[0]
+    spoiled = content[: start + 5] + bytes([content[start + 5] ^ 1]) + content[start + 6 :]
+    for wrong in (content[:-1], spoiled):
+        with pytest.raises(ValueError, match="not where it was expected"):
+            split(wrong)
+
+
+# ---------------------------------------------------------------------------------------------- the viewer
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def wait_for(what: Any, limit_s: float = 60.0) -> Any:
+    """What it returns as soon as that is something."""
+    end = time.monotonic() + limit_s
+    while not (found := what()):
+        assert time.monotonic() < end, "the viewer takes too long"
+        time.sleep(0.1)
+    return found
+
+
+@pytest.fixture
+def viewer(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[ViewerClient]:
+    """rerun's viewer without a window."""
+    monkeypatch.setenv("CI", "true")
+    monkeypatch.setenv("TELEMETRY_ENABLED", "false")
+    if CHROMIUM_VULKAN.exists():
+        (tmp_path / "libvulkan.so.1").symlink_to(CHROMIUM_VULKAN.with_name("libvulkan.so.1"))
+        paths = [str(tmp_path), *os.environ.get("LD_LIBRARY_PATH", "").split(os.pathsep)]
+        monkeypatch.setenv("LD_LIBRARY_PATH", os.pathsep.join(path for path in paths if path))
+        monkeypatch.setenv("VK_ICD_FILENAMES", str(CHROMIUM_VULKAN))
+    try:
+        client = ViewerClient.spawn(headless=True, port=free_port(), executable_path=rerun_command()[0])
+    except (ConnectionError, RuntimeError, OSError) as error:
+        pytest.skip(f"rerun's viewer does not start here: {error}")
+    try:
+        client.get_state()
+    except (ConnectionError, RuntimeError) as error:
+        client.quit()
+        pytest.skip(f"rerun's viewer has no graphics here: {error}")
+    yield client
+    client.quit()
+
+
+def image_run(trace: Trace, folder: Path) -> Trace:
+    """The run with an image in which every match has a grey patch."""
+    camera, path = trace.problem.camera, folder / "query ü.jpg"
+    image = np.zeros((camera.height, camera.width, 3), np.uint8)
+    for x, y in trace.problem.pixels.astype(int).tolist():
+        cv2.circle(image, (x, y), 9, (128, 128, 128), -1)
+    cv2.imwrite(str(path), image)
+    return replace(trace, problem=replace(trace.problem, image=path))
+
+
+@pytest.mark.parametrize("name", ["clique_run", "sample_run", "lost", "exact", "image"])
+def test_the_viewer_has_no_fault_to_find(
+    name: str, request: pytest.FixtureRequest, tmp_path: Path, viewer: ViewerClient
+) -> None:
+    made = {"lost": lost_run, "exact": exact_run}
+    if name == "image":
+        trace = image_run(request.getfixturevalue("clique_run"), tmp_path)
+    else:
+        trace = made[name]() if name in made else request.getfixturevalue(name)
+    path = tmp_path / "run.rrd"
+    row = write_recording(trace, path)
+    viewer.open(str(path))
+    state = wait_for(lambda: state if (state := viewer.get_state()).views else None)
+    recording = next(found for found in state.recordings if found.store_id == state.active_recording)
+    assert recording.current_timeline == "step"
+    _, views = layout_of(path)
+    assert {view.origin for view in state.views} == set(views)
+    for step in (row.decisive_step, row.steps - 1):
+        viewer.set_time(timeline="step", sequence=step)
+        picture = cv2.imdecode(np.frombuffer(viewer.take_screenshot(max_size=480), np.uint8), cv2.IMREAD_COLOR)
+        assert picture is not None and len(np.unique(picture.reshape(-1, 3), axis=0)) > 100, "a picture, not a blank"
+        faults = [(view.name, report) for view in viewer.get_state().views for report in view.reports]
+        assert faults == []
+
+
+def test_layouts_are_shared(clique_run: Trace) -> None:
+    pictures: list[Picture] = [paint(clique_run, index) for index in (0, 8)]
+    panels = panels_of(clique_run)
+    assert layout_file(shown_in(pictures, panels)) is layout_file(shown_in(list(pictures), panels))
