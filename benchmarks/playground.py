@@ -14,7 +14,8 @@ SCENE = ROOT / "scenes" / "panorama_outliers_90.toml"
 
 @contextmanager
 def playground(scene: Path = SCENE, recordings: Path | None = None) -> Iterator[tuple[str, subprocess.Popen[str]]]:
-    """Address and process of ``spherloc play`` on a free port, which records into a folder, or one that is thrown away."""
+    """Address and process of ``spherloc play`` on a free port; the folder that it records into is thrown away if it is
+    not given."""
     program = Path(sys.executable).with_name("spherloc")
     with tempfile.TemporaryDirectory() as folder:
         words = [program, "play", scene, "--port", "0", "--recordings", recordings or folder]

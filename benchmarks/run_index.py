@@ -3,7 +3,8 @@
     python -m benchmarks.run_index [--runs 10000] [--repeats 3]
 
 The peer keeps a row a run as JSON, one a line, and reads, filters and sorts them for every question, as a program
-without an index would. Prints the slowest question of every kind and writes ``results/run_index.json``.
+without an index would. Times are processor time of the one thread that asks, medians of the repeats, so that a busy
+machine does not count. Prints the slowest question of every kind and writes ``results/run_index.json``.
 """
 
 import argparse
@@ -123,6 +124,7 @@ def main() -> None:
 
 
 def _seconds(work: Callable[[], Any]) -> float:
+    """Processor time of ``work``."""
     start = time.thread_time()
     work()
     return time.thread_time() - start

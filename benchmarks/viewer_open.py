@@ -1,9 +1,9 @@
-"""From the click to the recording: how long a browser takes to show a run in the Rerun viewer, with ours and without.
+"""From the click to the recording: how long a browser takes to show a run in the Rerun viewer, ours and the peer's way.
 
     python -m benchmarks.viewer_open [--openings 5]
 
-Ours is the link of a running playground, which opens at the decisive step, paused. The peer is rerun's own way to show a
-file in a browser, ``rerun --serve-web FILE``, which opens at the first step. Both show the same file in the same
+Ours is the link of a running playground, which opens at the decisive step, paused. The peer is rerun's own way to show
+a file in a browser, ``rerun --serve-web FILE``, which opens at the first step. Both show the same file in the same
 Chromium, in turn, each in a profile of its own: the first opening has empty caches (and ours unpacks the viewer's
 program then), the others do not. The time ends with the third frame after the viewer has recording and layout, and for
 ours stands at the step; drawing in software is a large part of it where there is no graphics card. Prints the medians
@@ -49,7 +49,7 @@ SHOWN = """() => {
 
 def main() -> None:
     """Measure, print and store."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description="Time the opening of a recording in the web viewer.")
     parser.add_argument("--openings", type=int, default=5, help="openings with full caches, after the one without")
     arguments = parser.parse_args()
     with ExitStack() as stack:

@@ -15,14 +15,16 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
-from playwright.sync_api import Page, sync_playwright
+from playwright.sync_api import Page, expect, sync_playwright
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "build" / "screenshots"
 SIZES = ((1280, 720), (1920, 1080))
 FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
 SYNTHETIC, IMAGES = "scenes/panorama_outliers_80.toml", "scenes/street_fisheye.toml"
-PATIENCE_MS = 120_000
+PATIENCE_MS = 240_000
+STILL_S = 90.0
+"""How long the page may go on changing before it is photographed all the same."""
 DOCS = {
     "playground": ("arcs", "dark", 0),
     "selection": ("selection", "dark", 0),
@@ -41,20 +43,25 @@ def press(page: Page, name: str) -> None:
     page.get_by_role("button", name=name, exact=True).click()
 
 
+def choose(page: Page, label: str, option: str) -> None:
+    """Choose the first option that holds these words."""
+    name = page.locator("label", has_text=re.compile(f"^{label}$"))
+    widget = page.locator(f"[id='{name.get_attribute('for')}']")
+    widget.click()
+    page.get_by_role("option").filter(has_text=option).first.click()
+    expect(widget).to_have_value(re.compile(re.escape(option)))
+
+
 def step(page: Page, title: str) -> None:
     """Go to the first step whose title holds these words."""
-    name = page.locator("label", has_text=re.compile("^Step$"))
-    page.locator(f"[id='{name.get_attribute('for')}']").click()
-    page.get_by_role("option").filter(has_text=title).first.click()
-    page.wait_for_timeout(1500)
+    choose(page, "Step", title)
 
 
 def estimator(page: Page, name: str) -> None:
     """Choose an estimator."""
-    label = page.locator("label", has_text=re.compile("^Estimator$"))
-    page.locator(f"[id='{label.get_attribute('for')}']").click()
-    page.get_by_role("option").filter(has_text=name).first.click()
-    page.wait_for_timeout(2500)
+    choose(page, "Estimator", name)
+    said = page.locator("//tr[td[1][normalize-space()='estimator']]/td[2]")
+    expect(said).to_have_text(name)
 
 
 def select_a_match(page: Page) -> None:
@@ -62,7 +69,7 @@ def select_a_match(page: Page) -> None:
     step(page, "The yaw most arcs share")
     tab(page, "Matches")
     page.locator("tr[data-touch^='select:']").nth(3).click()
-    page.wait_for_timeout(1500)
+    page.locator("[data-touch='deselect:']").wait_for()
 
 
 def compare(page: Page) -> None:
@@ -70,7 +77,7 @@ def compare(page: Page) -> None:
     tab(page, "Compare")
     press(page, "Compare")
     page.locator("tr[data-touch='use:ransac-2p']").first.wait_for()
-    page.wait_for_timeout(6000)
+    page.get_by_role("button", name="Compare", exact=True).wait_for()
 
 
 def sweep(page: Page) -> None:
@@ -81,12 +88,12 @@ def sweep(page: Page) -> None:
     entry.fill("8")
     entry.press("Enter")
     press(page, "Start sweep")
-    page.get_by_role("button", name="CSV", exact=True).wait_for(timeout=PATIENCE_MS)
-    page.wait_for_timeout(1500)
+    page.get_by_role("button", name="CSV", exact=True).wait_for()
+    page.get_by_role("button", name="Start sweep", exact=True).wait_for()
 
 
 SYNTHETIC_VIEWS: dict[str, Callable[[Page], object]] = {
-    "outcome": lambda page: page.wait_for_timeout(500),
+    "outcome": lambda page: tab(page, "Yaw"),
     "arcs": lambda page: step(page, "The yaw most arcs share"),
     "twins": lambda page: step(page, "twin"),
     "balls": lambda page: step(page, "The maximum clique of balls"),
@@ -102,9 +109,9 @@ SYNTHETIC_VIEWS: dict[str, Callable[[Page], object]] = {
     "share": lambda page: tab(page, "Share"),
 }
 IMAGE_VIEWS: dict[str, Callable[[Page], object]] = {
-    "map": lambda page: page.wait_for_timeout(500),
+    "map": lambda page: tab(page, "Yaw"),
     "images": lambda page: tab(page, "Images"),
-    "from_the_camera": lambda page: (press(page, "From the camera"), page.wait_for_timeout(2000)),
+    "from_the_camera": lambda page: press(page, "From the camera"),
 }
 
 
@@ -126,13 +133,24 @@ def take(page: Page, address: str, dark: bool) -> None:
     """Open the playground and wait for its first picture."""
     page.goto(address)
     page.locator("//tr[td[1][normalize-space()='outcome']]/td[2]").first.wait_for(timeout=PATIENCE_MS)
-    page.wait_for_timeout(4000)
+    seen = "() => window.__viserSceneTree?.getState()['/map/points']?.effectiveVisibility"
+    page.wait_for_function(seen)
+    still(page)
     # viser says that it draws in software, which a person's browser does not.
     for close in page.locator("[class*=Notification-closeButton]").all():
         close.click()
     if not dark:
         page.get_by_text("Dark", exact=True).click()
-        page.wait_for_timeout(1000)
+
+
+def still(page: Page) -> bytes:
+    """The picture of the page once it stays the same for three photographs."""
+    last, same, end = b"", 0, time.monotonic() + STILL_S
+    while same < 2 and time.monotonic() < end:
+        page.wait_for_timeout(400)
+        now = page.screenshot(timeout=PATIENCE_MS)
+        same, last = (same + 1 if now == last else 0), now
+    return last
 
 
 def main() -> None:
@@ -142,6 +160,7 @@ def main() -> None:
     if path is None:
         raise SystemExit("no Chromium found; install one or set SPHERLOC_CHROMIUM to its path.")
     FOLDER.mkdir(parents=True, exist_ok=True)
+    expect.set_options(timeout=PATIENCE_MS)
     with sync_playwright() as playwright:
         for scene, views in ((SYNTHETIC, SYNTHETIC_VIEWS), (IMAGES, IMAGE_VIEWS)):
             chosen = {name: view for name, view in views.items() if not wanted or name in wanted}
@@ -164,7 +183,7 @@ def picture(page: Page, name: str, view: Callable[[Page], object], theme: str, s
     view(page)
     width, height = SIZES[size]
     path = FOLDER / f"{name}_{theme}_{width}x{height}.png"
-    page.screenshot(path=path, timeout=PATIENCE_MS)
+    path.write_bytes(still(page))
     for deselect in page.locator("[data-touch='deselect:']").all():
         deselect.click()
     for title, shown in DOCS.items():

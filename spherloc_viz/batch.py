@@ -195,7 +195,9 @@ def as_record(path: Path, trace: Trace, diagnosis: Diagnosis, recording: Path | 
 def as_text(path: Path, trace: Trace, diagnosis: Diagnosis, recording: Path | None) -> str:
     """A run as a few lines for people."""
     metrics, pose = evaluate(trace), trace.cam_from_map
-    lines = [f"{trace.problem.name} ({path}), {trace.estimator}, seed {trace.seed}"]
+    # What a stranger's recording says must not steer the terminal.
+    name = "".join(letter if letter.isprintable() else " " for letter in trace.problem.name)
+    lines = [f"{name} ({path}), {trace.estimator}, seed {trace.seed}"]
     if pose is None:
         lines.append(f"  {trace.message}")
     else:

@@ -206,6 +206,7 @@ def play(
     port: int = 8080,
     record: bool = True,
     recordings: Path = RECORDINGS,
+    keep_gigabytes: float = KEEP_GIGABYTES,
     allow: tyro.conf.UseAppendAction[tuple[Path, ...]] = (),
 ) -> int:
     """Open the playground in a browser and print its address.
@@ -224,11 +225,12 @@ def play(
         port: Port to listen on; 0 takes a free one.
         record: Write a recording of each run that is settled on.
         recordings: Folder of the recordings.
+        keep_gigabytes: What the recordings may take; beyond it the oldest successes that nobody labelled are deleted.
         allow: Another folder that pages may open scenes from; give it once for each.
     """
     from spherloc_viz.app.server import serve
 
-    serve(scene, host, port, recordings, record, allow)
+    serve(scene, host, port, recordings, record, allow, keep_gigabytes)
     return 0
 
 

@@ -122,7 +122,7 @@ def runs(
         outcome: success, failure or unknown (there is no truth).
         diagnosis: A diagnosis or a part of its name, such as false-consensus; a wrong one lists them all.
         estimator: An estimator, such as mc.
-        scene: A scene file, or its name, such as mei_outliers_80.
+        scene: A scene as it is recorded, or a problem's name; a wrong one lists some.
         source: Who ran it: page, command, sweep, sequence, gallery or unknown.
         label: A label that a reviewer gave, the whole of it.
         text: Words that all occur in scene, name, query image, message, diagnosis, note, labels, title or file.

@@ -28,6 +28,9 @@ SORT_WORDS = {
 UNDIAGNOSED = "none"
 """What is typed for runs that were not diagnosed."""
 TABLE_LIMIT = 50
+SCENES_NAMED = 8
+MANY = 500
+"""Recordings whose steps take more than some seconds to be read."""
 GALLERY = "gallery"
 """A folder of recordings that is listed with the folder that it is in."""
 
@@ -41,7 +44,7 @@ def print_runs(folder: Path, query: RunQuery, group: str | None, limit: int | No
     key = None if group is None else one_of("group", group.replace("-", "_"), GROUP_KEYS)
     with _open(folder) as index:
         _refresh(index)
-        _check_estimator(index, query)
+        _check_known(index, query)
         if key is not None:
             print(counts_text(key, index.groups(query, key), form), end="", flush=True)
             return 0
@@ -68,6 +71,8 @@ def print_steps(folder: Path, condition: str, limit: int | None, form: str) -> i
     with _open(folder) as index:
         _refresh(index)
         rows = index.find(RunQuery(), None).rows
+    if len(rows) > MANY:
+        say(f"reading the steps of {len(rows):,} recordings.")
     found = find_steps(folder, rows, condition, None if most is None else most + 1)
     print(steps_text(folder, found[:most], form), end="", flush=True)
     if not found:
@@ -168,8 +173,12 @@ def source_of(source: str | None) -> str | None:
     return None if source is None else one_of("source", source, SOURCES)
 
 
-def _check_estimator(index: RunIndex, query: RunQuery) -> None:
-    """An estimator that neither is registered nor has any run is a mistake."""
+def _check_known(index: RunIndex, query: RunQuery) -> None:
+    """Raises ``InputError`` for a scene without runs, or an estimator that neither is registered nor has any."""
+    if query.scene is not None and not index.find(RunQuery(scene=query.scene), 1).total:
+        scenes = [name for name, _ in index.groups(RunQuery(), "scene")]
+        known = "; ".join(scenes[:SCENES_NAMED]) + ("; and others" if len(scenes) > SCENES_NAMED else "")
+        raise InputError(f"no run of scene {show(query.scene)}: there are {known or 'no runs at all'}.")
     if query.estimator is not None:
         recorded = (name for name, _ in index.groups(RunQuery(), "estimator"))
         one_of("estimator", query.estimator, tuple(dict.fromkeys((*registry.names("estimators"), *recorded))))

@@ -69,7 +69,7 @@ def _work(
 ) -> None:
     if scheduler is None:
         warm_up(say)  # once, before all workers do it
-    recorded = None if keeper is None else _Recorded(keeper)
+    recorded = None if keeper is None else Recorded(keeper)
     keep = None if recorded is None else recorded.keep(scheduler is not None)
     complain = say if recorded is None else recorded.complain
     with progress(left, "runs") as advance:
@@ -82,7 +82,7 @@ def _work(
         recorded.finish()
 
 
-class _Recorded:
+class Recorded:
     """The recordings of a sweep, which its workers write: makes room for them, and says once what fails."""
 
     def __init__(self, keeper: "Keeper") -> None:

@@ -33,7 +33,7 @@ from spherloc_viz.app.review.summary_page import summary_html
 from spherloc_viz.app.server import Sessions
 from spherloc_viz.app.services import Services
 from spherloc_viz.app.session import Session
-from spherloc_viz.app.web.touch import Touch
+from spherloc_viz.app.web.touch import Touch, TouchDesk, Touches
 from spherloc_viz.app.web.viser_seams import start_viser, stop_viser
 from spherloc_viz.gallery import gallery_cases
 from spherloc_viz.recording.background import Recorder
@@ -403,6 +403,7 @@ def test_a_run_is_recorded_with_its_origin_and_opened_exactly(office: Office) ->
     until(lambda: session._run is not None and session._run.wish.scene.variation == origin.variation)
     visitor.touch("run-step:-1")
     until(lambda: "first run of the list" in visitor.panel._status.content)
+    until(lambda: "first run of the list" in visitor.card._html.content)
     until(lambda: f"Opened {second}" in session._status._line.content)
     visitor.set(session._controls.scene._simulation._noise, 2.5)
     until(lambda: "Changed: noise px" in visitor.card._html.content)
@@ -544,6 +545,19 @@ def test_pages_hear_of_the_recordings(office: Office) -> None:
     office.sessions.notice("2 recordings were recovered.")
     assert notices._shown is not None and notices._shown is not first
     assert notices._shown.body == "2 recordings were recovered."
+
+
+def test_a_press_is_heard_by_all_who_listen() -> None:
+    heard: list[str] = []
+    touches = Touches(lambda error: heard.append(type(error).__name__))
+    touches.on("views", lambda touch: 1 / 0)
+    touches.on("views", lambda touch: heard.append(touch.argument))
+    touches.deliver(Touch("views", "Yaw", 0.0, 0.0, 0.0, 0.0, False))
+    assert heard == ["ZeroDivisionError", "Yaw"]
+    desk = TouchDesk()
+    desk.add(touches)
+    report = {"session": touches.token, "action": "views:\ud800", "at": [0, 0], "from": [0, 0], "extend": False}
+    assert not desk.deliver(json.dumps(report).encode()) and len(heard) == 2
 
 
 def test_a_waiting_queue_is_told(tmp_path: Path) -> None:

@@ -117,6 +117,7 @@ def test_a_false_story_is_found_out():
     assert "what fails is position, rotation, and not rotation" in said(fails=("rotation",))
     assert "what fails is nothing" in said(trace=replace(run.trace, cam_from_map=truth.copy()))
     assert "what fails is no pose" in said(trace=replace(run.trace, cam_from_map=None))
+    assert "it goes wrong at the step yaw-clique, and not at outcome" in said(step="outcome")
     assert "right is 10, and not 11" in said(facts={"right": 11})
     (item, trace) = run.beside[0]
     assert "it succeeds, against what is told" in said(beside=((replace(item, succeeds=False), trace),))
@@ -184,6 +185,7 @@ scene = "mei_outliers_80"
 estimator = "mc"
 cause = "ok"
 fails = ["position"]
+step = "outcome"
 """
 STAGED = SMALL.replace('scene = "mei_outliers_80"', 'staged = { camera = "mei_outliers_80", groups = [[5, "right"]] }')
 BESIDE = '\n[[case.beside]]\nname = "other"\nsucceeds = true\n'
@@ -279,3 +281,13 @@ def test_any_other_value_is_read_or_refused(data):
         assert len(parse_gallery(table, GALLERY)) == 1
     except InputError as error:
         assert "\n" not in str(error)
+
+
+def test_the_guide_knows_the_cases():
+    """Every case stands in the row of its cause."""
+    guide = (GALLERY.parents[1] / "docs" / "failures.md").read_text()
+    rows = dict(re.findall(r"^\| ([a-z ]+) \| .* \| (`.*) \|$", guide, re.MULTILINE))
+    assert set(rows) == set(Cause) - {Cause.OK}
+    for case in gallery_cases():
+        assert f"`{case.key}`" in rows[case.cause]
+    assert {key for row in rows.values() for key in re.findall(r"`(.+?)`", row)} == set(KEYS)

@@ -438,8 +438,7 @@ for attempt in range(2):
 
 
 @pytest.mark.skipif(not hasattr(resource, "RLIMIT_FSIZE"), reason="no limit on file sizes")
-@pytest.mark.parametrize("before", ["cold", "warm"])
-@pytest.mark.parametrize("limit", [1_000, 100_000])
+@pytest.mark.parametrize(("limit", "before"), [(1_000, "cold"), (100_000, "warm")])
 def test_a_full_disk_is_one_sentence_and_leaves_what_was_there(tmp_path: Path, limit: int, before: str) -> None:
     path = tmp_path / "run.rrd"
     done = subprocess.run(

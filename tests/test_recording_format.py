@@ -301,7 +301,7 @@ def test_a_missing_image_is_said(trace: Trace, tmp_path: Path) -> None:
     recorded = Recorded(tmp_path / "run.rrd")
     text = recorded.array("/outcome", -1, "TextDocument:text")[0]
     assert "cannot be read any more" in text and "gone \\<i\\>.jpg" in text
-    assert len(recorded.array("/query/frame", -1, "LineStrips2D:strips")) >= 1
+    assert recorded.at("/query/frame", -1) is not None
 
 
 # ---------------------------------------------------------------------------------------------- size, versions, memory
@@ -332,13 +332,8 @@ def test_a_file_of_format_1_still_opens() -> None:
     run, row = read_recording(FORMAT_1), read_run_row(FORMAT_1)
     assert (run.origin, run.scene_text, run.diagnosis, run.query_image) == (None, None, None, None)
     assert row == run.row and (row.format_version, row.source, row.diagnosis, row.thumbnail) == (1, "unknown", "", b"")
-    assert (row.estimator, row.seed, row.correspondences, row.inliers, row.outcome) == (
-        "ransac-2p",
-        5,
-        24,
-        5,
-        "success",
-    )
+    assert (row.estimator, row.seed, row.outcome) == ("ransac-2p", 5, "success")
+    assert (row.correspondences, row.inliers) == (24, 5)
     problem = Variation(correspondences=24).problem(_scene("mei_outliers_80"))
     assert run.problem.pixels.tobytes() == problem.pixels.tobytes()
     assert problem_key(run.problem) == problem_key(problem)
@@ -379,9 +374,9 @@ def test_many_runs_take_no_more_threads_or_memory(tmp_path: Path) -> None:
         for _ in range(count):
             write_recording(trace, tmp_path / "run.rrd", diagnosis=told)
 
-    write(40)  # after which layouts, pools of memory and threads are there
+    write(20)  # after which layouts, pools of memory and threads are there
     threads, memory = used()
-    write(150)
+    write(100)
     more_threads, more_memory = used()
     assert more_threads <= threads + 1
-    assert more_memory - memory < 30e6, "150 runs of 0.2 MB each"
+    assert more_memory - memory < 20e6, "100 runs of 0.3 MB each"

@@ -65,6 +65,7 @@ def test_the_scenes_own_seed_is_the_one_that_was_used(tmp_path: Path) -> None:
     [
         (None, "The recording does not say which scene file it came from"),
         ({"scene_path": None}, "The recording does not say which scene file it came from"),
+        ({"scene_path": str(SCENES / "run.rrd")}, "The run was of the problem of another recording"),
         ({"scene_seed": 8}, "was drawn with the seed 8 and solved with 9"),
         ({"scene_path": "/etc/passwd"}, "passwd lies outside the folders that pages may open scenes from"),
         ({"scene_path": str(SCENES / ".." / "pyproject.toml")}, "pyproject.toml lies outside"),

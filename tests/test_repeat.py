@@ -1,10 +1,8 @@
 """A recorded run solved again: the same to the last bit, or what differs is said; and as a scene like any other."""
 
 import json
-import os
+import runpy
 import shlex
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -65,7 +63,9 @@ def test_odd_problems_are_repeated_too(rng: np.random.Generator, tmp_path: Path)
     for turn in range(4):
         write_recording(estimate(odd_problem(rng, turn), "mc", seed=turn), tmp_path / f"{turn}.rrd")
         repeated = repeat(tmp_path / f"{turn}.rrd")
-        assert repeated.same and "\n" not in as_text(repeated).splitlines()[1]
+        named = replace(repeated.run.problem, name="a\n\x1b[31mred")
+        text = as_text(replace(repeated, run=replace(repeated.run, problem=named)))
+        assert repeated.same and len(text.splitlines()) == 2 and "a  [31mred, mc" in text
         json.loads(json.dumps(as_record(repeated)))
 
 
@@ -222,7 +222,9 @@ def test_the_command_run_solves_recordings(path: Path, tmp_path: Path, capsys: p
     assert record["correspondences"] == 98 and kept.origin == Origin("command", str(path), 3, None, hidden)
 
 
-def test_pasted_code_solves_the_recorded_problem(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pasted_code_solves_the_recorded_problem(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.chdir(tmp_path)
     problem = replace(scene_problem("mei_outliers_80"), bound_px=2.5)
     options = options_type("mc")(bound_px=3.0, max_balls=300)
@@ -231,11 +233,9 @@ def test_pasted_code_solves_the_recorded_problem(tmp_path: Path, monkeypatch: py
     write_recording(trace, path)
     words = (path, 6, None, Variation(hidden=()), "mc", options)
     (tmp_path / "pasted.py").write_text(as_python(*words))
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    done = subprocess.run(
-        [sys.executable, "pasted.py"], capture_output=True, text=True, timeout=100, check=True, env=environment
-    )
-    assert json.loads(done.stdout.splitlines()[-1]) == np.array(trace.cam_from_map).tolist()
+    capsys.readouterr()
+    runpy.run_path("pasted.py")
+    assert json.loads(capsys.readouterr().out.splitlines()[-1]) == np.array(trace.cam_from_map).tolist()
     command = shlex.split(as_command(*words))
     assert command[:3] == ["spherloc", "run", "a run.rrd"]
     settings = [command[k + 1] for k, word in enumerate(command) if word == "--option"]

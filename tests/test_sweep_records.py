@@ -8,14 +8,17 @@ import pytest
 
 from spherloc.datasets.variation import Variation
 from spherloc.experiments.sweep import Entrant, Job, planned
+from spherloc.experiments.sweep_crew import solve
 from spherloc.trace import Trace
 from spherloc_viz.batch import Records
+from spherloc_viz.recording import sweep_keeper
 from spherloc_viz.recording.index import RunIndex
+from spherloc_viz.recording.keeper import Keeper
 from spherloc_viz.recording.query import RunQuery
 from spherloc_viz.recording.reader import read_recording
 from spherloc_viz.recording.reopen import reopen
 from spherloc_viz.recording.sweep_keeper import SweepKeeper
-from spherloc_viz.sweep import sweep
+from spherloc_viz.sweep import Recorded, sweep
 
 ROOT = Path(__file__).resolve().parents[1]
 SCENE = ROOT / "scenes" / "mei_outliers_80.toml"
@@ -53,11 +56,17 @@ def test_where_nothing_can_be_recorded_the_sweep_goes_on_and_says_it_once(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "file").write_text("in the way")
-    assert swept(tmp_path / "sweep.csv", tmp_path / "file", values=["0.2"], workers=1) == 0
-    errors = capsys.readouterr().err.splitlines()
-    assert len([line for line in errors if "the run cannot be recorded" in line and "The sweep goes on." in line]) == 1
-    assert [line for line in errors if "times something could not be recorded" in line]
-    assert len((tmp_path / "sweep.csv").read_text().splitlines()) == 1 + 6
+    plan = planned(SCENE, "noise_px", [1.0], [Entrant("ransac-2p")], 3, Variation(correspondences=20))
+    with Keeper(tmp_path / "file", print) as keeper:
+        recorded = Recorded(keeper)
+        solved = solve(plan, list(plan.jobs()), recorded.keep(cluster=False))
+        assert len(solved.rows) == len(solved.complaints) == 3
+        for sentence in solved.complaints:
+            recorded.complain(sentence)
+        recorded.finish()
+    first, last = capsys.readouterr().err.splitlines()
+    assert "the run cannot be recorded" in first and first.endswith("The sweep goes on.")
+    assert "times something could not be recorded" in last
 
 
 def test_workers_of_other_machines_record_nothing(tmp_path: Path) -> None:
@@ -67,5 +76,7 @@ def test_workers_of_other_machines_record_nothing(tmp_path: Path) -> None:
     keeper = SweepKeeper(tmp_path / "recordings")
     assert replace(keeper, machine="another")(plan, *done[0]) == "" and not list(tmp_path.iterdir())
     assert keeper(plan, *done[0]) == ""
+    sweep_keeper._keeper(keeper.folder)[0].close()
+    sweep_keeper._keeper.cache_clear()
     (path,) = (tmp_path / "recordings").glob("*.rrd")
     assert read_recording(path).row.source == "sweep" and read_recording(path).problem.pixels.shape == (20, 2)

@@ -9,6 +9,7 @@ from spherloc.metrics import evaluate
 from spherloc.trace import Trace
 from spherloc_viz import style
 from spherloc_viz.layers.certificate import UNKNOWABLE
+from spherloc_viz.layers.comparison import duration_text
 from spherloc_viz.layers.frame import length
 from spherloc_viz.layers.primitives import Step, Table
 from spherloc_viz.layers.scale_bar import angle_text
@@ -79,7 +80,7 @@ def summary_html(trace: Trace) -> str:
     metrics = evaluate(trace)
     words = verdict(trace, metrics.success)
     inliers = int(np.count_nonzero(trace.inlier_mask))
-    facts = [f"{inliers} of {len(trace.problem)} inliers", f"{trace.timings_ms['total']:.3g} ms"]
+    facts = [f"{inliers} of {len(trace.problem)} inliers", duration_text(trace.timings_ms["total"])]
     if metrics.rotation_error_deg is not None and metrics.translation_error_m is not None:
         facts = [angle_text(metrics.rotation_error_deg), length(metrics.translation_error_m), *facts]
     line = f'<b style="{_value_css(words)}">{escape(words.capitalize())}</b> · ' + " · ".join(map(escape, facts))

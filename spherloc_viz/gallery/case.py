@@ -82,6 +82,8 @@ class GalleryCase(Play):
     """What it says without, if that is told."""
     fails: tuple[str, ...]
     """How: "position", "rotation" (each worse than a success may be) or "no pose"."""
+    step: str
+    """Key of the step at which it goes wrong, see ``layers.decisive``."""
     quoted: tuple[float, ...]
     """Numbers that the story has from elsewhere: from the paper, or from how the problem is made."""
     beside: tuple[Beside, ...]

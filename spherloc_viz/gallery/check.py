@@ -12,8 +12,10 @@ from spherloc.metrics import SUCCESS_DEG, SUCCESS_M, evaluate
 from spherloc.trace import Trace
 from spherloc_viz.gallery.case import Beside, GalleryCase, Play
 from spherloc_viz.gallery.measures import MEASURES
+from spherloc_viz.layers import steps
+from spherloc_viz.layers.decisive import decisive_step
 
-_CITATION = re.compile(r"Fig\. \d+[a-z]?|Table VI|experiment \d+|Eq\. \d+( and \d+)?|\b2P(\d+k)?\b")
+_CITATION = re.compile(r"Fig\. \d+[a-z]?( and \d+[a-z])?|Table VI|experiment \d+|Eq\. \d+( and \d+)?|\b2P(\d+k)?\b")
 _NUMBER = re.compile(r"\d[\d,]*(?:\.\d+)?")
 
 
@@ -46,6 +48,8 @@ def faults(played: Played) -> Iterator[str]:
         yield f"{case.key}: without the truth the diagnosis is {blind}, and not {case.without_truth}."
     if sorted(happened := failures(trace)) != sorted(case.fails):
         yield f"{case.key}: what fails is {', '.join(happened) or 'nothing'}, and not {', '.join(case.fails)}."
+    if (key := steps(trace)[decisive_step(trace, played.diagnosis)].key) != case.step:
+        yield f"{case.key}: it goes wrong at the step {key}, and not at {case.step}."
     yield from _wrong_facts(case.key, case, trace)
     for item, other in played.beside:
         where = f"{case.key}, beside {item.name}"

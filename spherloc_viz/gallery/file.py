@@ -58,7 +58,7 @@ def parse_gallery(table: Mapping[str, Any], path: Path) -> tuple[GalleryCase, ..
 
 
 def _case(table: dict[str, Any], where: str) -> GalleryCase:
-    required = {"key", "title", "story", "cause", "fails", "estimator"}
+    required = {"key", "title", "story", "cause", "fails", "step", "estimator"}
     check_keys(table, required, PLAY_KEYS | {"beside", "quoted", "without_truth"}, where)
     play = _play(table, None, where)
     fails = table["fails"]
@@ -78,6 +78,7 @@ def _case(table: dict[str, Any], where: str) -> GalleryCase:
         cause=_cause(table, "cause", where),
         without_truth=_cause(table, "without_truth", where) if "without_truth" in table else None,
         fails=tuple(fails),
+        step=text(table, "step", where),
         quoted=_quoted(table.get("quoted", []), where),
         beside=found,
     )

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from spherloc.geometry import yaw_of
 from spherloc.metrics import evaluate, ransac_success_probability
 from spherloc.refine import residuals_px
-from spherloc.trace import RansacStage, Trace, YawStage
+from spherloc.trace import ConsensusStage, RansacStage, Trace, YawStage
 
 BoolArray = NDArray[np.bool_]
 FloatArray = NDArray[np.float64]
@@ -102,6 +102,14 @@ def _pairs_at_truth(trace: Trace) -> int:
     return _count(np.any((stage.lo_rad <= turns) & (turns <= stage.hi_rad), axis=0))
 
 
+def _least_bound(trace: Trace) -> int:
+    """What some pose may explain at the yaw where that is least."""
+    stage = trace.stage(ConsensusStage)
+    if stage is None:
+        raise ValueError(f"{trace.estimator} bounds nothing that a story could tell of")
+    return int(stage.bound.min())
+
+
 def _known(value: float | None) -> float:
     return np.nan if value is None else value
 
@@ -129,6 +137,7 @@ MEASURES: Mapping[str, Callable[[Trace], float]] = {
     "pairs_at_yaw": lambda trace: len(_yaw(trace).clique),
     "right_pairs_at_yaw": _right_pairs_chosen,
     "pairs_at_true_yaw": _pairs_at_truth,
+    "least_bound": _least_bound,
     "at_most": lambda trace: _known(None if trace.certificate is None else trace.certificate.upper_bound),
     "chance_sets": lambda trace: _known(None if trace.certificate is None else trace.certificate.chance_sets),
 }

@@ -97,7 +97,7 @@ def _row(entry: Entry) -> tuple[str, ...]:
             NO_VALUE if share is None or trace.cam_from_map is None else f"{100 * share:.0f} %"
             for share in (metrics.precision, metrics.recall, metrics.f1)
         ),
-        _duration(trace.timings_ms["total"]),
+        duration_text(trace.timings_ms["total"]),
         NO_VALUE if trace.certificate is None else _proof(trace.certificate),
         "…" if entry.diagnosis is None else str(entry.diagnosis.cause),
     )
@@ -114,7 +114,8 @@ def _length(metres: float) -> str:
     return f"{100 * metres:.2f} cm" if metres < 1.0 else f"{metres:.2f} m" if metres < 100 else f"{metres:.0f} m"
 
 
-def _duration(ms: float) -> str:
+def duration_text(ms: float) -> str:
+    """A duration in the unit that suits it."""
     return f"{ms:.1f} ms" if ms < 100 else f"{ms:.0f} ms" if ms < 1e4 else f"{ms / 1e3:.1f} s"
 
 

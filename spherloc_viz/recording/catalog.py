@@ -66,7 +66,8 @@ def _frame(dataset: Any) -> Any:
     """A table with a row a step, and what is known of its run beside it."""
     from datafusion import col
 
-    steps = dataset.filter_contents([NUMBERS]).reader(index="step")
+    # A column that is empty in one recording would else be missing for all.
+    steps = dataset.filter_contents([NUMBERS]).reader(index="step", include_semantically_empty_columns=True)
     runs = dataset.segment_table()
     of_step = [_first(steps, f"{NUMBERS}:{_RENAMED.get(name, name)}", name) for name in STEP_COLUMNS if name != "step"]
     of_run = [_first(runs, f"property:run:{name}", name) for name in RUN_COLUMNS]

@@ -32,7 +32,7 @@ rr.set_strict_mode(True)
 
 Rows = list[Any]
 """One primitive per row, or None where it is absent and the row clears it."""
-WORDS = int(packed(np.array([style.SCALE]))[0])
+WORDS = int(packed(np.array([style.SPHERE]))[0])
 """Colour of words in the scene."""
 SOLID: int = rr.components.FillModeBatch(["solid"]).as_arrow_array()[0].as_py()
 

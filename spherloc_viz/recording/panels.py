@@ -91,27 +91,29 @@ def _arcs(trace: Trace, stage: YawStage) -> Iterator[Chunk]:
         in_clique[chosen], packed(np.array([style.CLIQUE])), packed(np.array([style.UNDECIDED]), 2.0 * GREY)
     )
     yield _lines_2d(f"{ARCS}/arcs", points, colors.astype(np.uint32), 1.5)
-    yield from _marker("estimate", estimate, -0.04 * height, style.ESTIMATE)
+    yield from _yaws(trace, estimate, height)
+
+
+def _yaws(trace: Trace, estimate: float, height: float) -> Iterator[Chunk]:
+    """Upright lines over the stack of arcs with a word each: the estimated yaw and, if it is near, the true one."""
+    marks = [("estimate", estimate, -0.04 * height, style.ESTIMATE)]
     truth = trace.problem.truth_cam_from_map
     if truth is not None:
         true_deg = float(np.degrees(yaw_of(trace.problem.aligned.align_pose(truth)[:, :3])))
         at = estimate + (true_deg - estimate + 180.0) % 360.0 - 180.0
         if abs(at - estimate) <= REACH_DEG:
-            yield from _marker("truth", at, 1.04 * height, style.TRUTH)
-
-
-def _marker(name: str, at: float, end: float, color: style.RGB) -> Iterator[Chunk]:
-    """An upright line over the stack of arcs, from its other end to a word at ``end``."""
-    height, color_ = 2.0 * REACH_DEG * ASPECT, packed(np.array([color]))
-    points = np.array([[[at, 0.0], [at, height]]])
-    yield _lines_2d(f"{ARCS}/{name}", points, color_, 2.0)
-    label = pa.array([f"{name} {at:.2f}°"])
+            marks.append(("truth", at, 1.04 * height, style.TRUTH))
+    colors = packed(np.array([color for *_, color in marks]))
+    lines = np.array([[[at, 0.0], [at, height]] for _, at, _, _ in marks])
+    yield _lines_2d(f"{ARCS}/yaws", lines, colors, 2.0)
+    words = pa.array([f"{name} {(at + 180.0) % 360.0 - 180.0:.2f}°" for name, at, *_ in marks])
+    places = vectors(np.array([[at, end] for _, at, end, _ in marks]), VECTOR_2D)
     yield static_chunk(
-        f"{ARCS}/{name}/label",
+        f"{ARCS}/words",
         [
-            Values(rr.Points2D.descriptor_positions(), vectors(np.array([[at, end]]), VECTOR_2D), [1]),
-            Values(rr.Points2D.descriptor_labels(), label, [1]),
-            Values(rr.Points2D.descriptor_colors(), pa.array(color_), [1]),
+            Values(rr.Points2D.descriptor_positions(), places, [len(marks)]),
+            Values(rr.Points2D.descriptor_labels(), words, [len(marks)]),
+            Values(rr.Points2D.descriptor_colors(), pa.array(colors), [len(marks)]),
             Values(rr.Points2D.descriptor_radii(), numbers([0.0]), [1]),
         ],
     )

@@ -20,7 +20,7 @@ from spherloc.metrics import Metrics
 from spherloc.problem import Problem
 from spherloc.trace import Trace
 from spherloc_viz.options import json_text
-from spherloc_viz.recording.columns import encoded_image, named_values, static_chunk
+from spherloc_viz.recording.columns import Values, encoded_image, named_values, static_chunk
 from spherloc_viz.recording.origin import Origin
 from spherloc_viz.recording.run_row import RunRow
 
@@ -120,8 +120,10 @@ def property_chunks(trace: Trace, row: RunRow, created: datetime) -> Iterator[Ch
     if row.thumbnail:
         yield static_chunk(f"/__properties/{THUMBNAIL_PROPERTY}", encoded_image(row.thumbnail, "image/png"))
     name = f"{row.name}, {trace.estimator}, seed {trace.seed}"
-    info = rr.archetypes.RecordingInfo.columns(name=[name], start_time=[int(created.timestamp() * 1e9)])
-    yield Chunk.from_columns("/__properties", [], info)
+    info = rr.archetypes.RecordingInfo
+    start_ns = pa.array([int(created.timestamp() * 1e9)], pa.int64())
+    columns = [Values(info.descriptor_name(), pa.array([name]), [1])]
+    yield static_chunk("/__properties", [*columns, Values(info.descriptor_start_time(), start_ns, [1])])
 
 
 def read_properties(chunk: Chunk) -> dict[str, Any]:

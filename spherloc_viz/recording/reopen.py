@@ -13,6 +13,7 @@ from spherloc_viz.recording.origin import Origin
 from spherloc_viz.recording.reader import RecordedRun
 from spherloc_viz.recording.same import different_fields
 from spherloc_viz.recording.scene import RecordedScene, recorded_options
+from spherloc_viz.share import is_recording
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +71,8 @@ def _live(run: RecordedRun, roots: Sequence[Path]) -> tuple[Scene, Origin] | str
     origin = run.origin
     if origin is None or origin.scene_path is None:
         return f"The recording does not say which scene file it came from, {instead}."
+    if is_recording(Path(origin.scene_path)):
+        return f"The run was of the problem of another recording, {instead}."
     if origin.scene_seed not in (None, run.seed):
         return (
             f"The scene was drawn with the seed {origin.scene_seed} and solved with {run.seed}, which a page cannot, "

@@ -50,7 +50,8 @@ def as_text(repeated: Repeated) -> str:
         if repeated.same and item.recorded is None:
             continue  # what an older recording does not say has changed nothing
         lines.append(f"  {item.name}: {item.recorded or 'not recorded'} then, {item.here or 'none'} now")
-    return "\n".join(" ".join(line.splitlines()) for line in lines)
+    # What a stranger's file says must not steer the terminal.
+    return "\n".join("".join(letter if letter.isprintable() else " " for letter in line) for line in lines)
 
 
 def verdict(repeated: Repeated) -> str:

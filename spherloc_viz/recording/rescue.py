@@ -21,12 +21,16 @@ def rescue(part: Path) -> Path | None:
     leftover is gone afterwards, in either case. Raises ``OSError`` if the folder cannot be written.
     """
     target = target_of(part)
-    mended = unfinished(part.with_suffix(".rrd"))
+    if target is None:
+        return None
+    mended = unfinished(target)
     try:
-        if target is None or target.exists() or target.name.endswith(REVIEW_SUFFIX):
+        if target.exists() or target.name.endswith(REVIEW_SUFFIX):
             return None
         whole = part if _readable(part) else mended if _merged(part, mended) and _readable(mended) else None
         return None if whole is None else whole.replace(target)
+    except FileNotFoundError:
+        return None  # another process has done it meanwhile
     finally:
         mended.unlink(missing_ok=True)
         part.unlink(missing_ok=True)

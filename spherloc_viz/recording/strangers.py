@@ -111,11 +111,11 @@ class Examiner:
     def _ask(self, path: Path, want: str) -> dict[str, Any] | None:
         """What the child says; None if it dies or hangs of the file."""
         question = {"path": str(path), "want": want}
-        if self._child is not None and not self._child.begin(question):
+        if self._child is not None and not self._child.begin(question, BEGIN_LIMIT_S):
             self._end()  # it had nothing to do for a minute
         if self._child is None:
             self._child = _Child()
-            if not self._child.begin(question):
+            if not self._child.begin(question, START_LIMIT_S):
                 self._end()
                 raise _cannot_start("it ended at once")
         answer = self._child.answer(FILE_LIMIT_S)
@@ -142,7 +142,7 @@ class _Child:
                 stderr=subprocess.DEVNULL,
                 # In a session of its own, so that a Ctrl-C meant for us does not look like a bad file.
                 start_new_session=True,
-                env=rerun_environment() | _ONE_THREAD,
+                env=rerun_environment() | dict.fromkeys(_FRUGAL, "1"),
             )
         except OSError as error:
             raise _cannot_start(error.strerror or str(error)) from error
@@ -155,14 +155,14 @@ class _Child:
             self.end()
             raise _cannot_start("it does not get ready")
 
-    def begin(self, question: dict[str, Any]) -> bool:
+    def begin(self, question: dict[str, Any], limit_s: float) -> bool:
         """Ask for a file; whether it is being read."""
         try:
             self._questions.write(json.dumps(question).encode() + b"\n")
             self._questions.flush()
         except OSError:
             return False
-        return self.answer(BEGIN_LIMIT_S) == {"begun": True}
+        return self.answer(limit_s) == {"begun": True}
 
     def answer(self, limit_s: float) -> dict[str, Any] | None:
         """The next thing that it says; None if it died, hangs or talks nonsense."""
@@ -210,8 +210,8 @@ class _NotStartedError(RecordingError):
     """No fault of a file."""
 
 
-_ONE_THREAD = {name: "1" for name in ("OPENBLAS_NUM_THREADS", "RAYON_NUM_THREADS", "TOKIO_WORKER_THREADS")}
-"""Threads reserve address space, which the child has little of."""
+_FRUGAL = ("OPENBLAS_NUM_THREADS", "RAYON_NUM_THREADS", "TOKIO_WORKER_THREADS", "MALLOC_ARENA_MAX")
+"""How many threads there are; they reserve address space, which the child has little of."""
 
 _shared = Examiner()
 atexit.register(_shared.close)

@@ -7,6 +7,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -49,6 +50,8 @@ SIZE = {"width": 1200, "height": 700}
 SHARPNESS = 0.4
 """Pixels of the screen by those of the page: what is read is the same, and software draws a sixth of the pixels."""
 PATIENCE_MS = 60_000
+START_S = 600.0
+"""How long a server may take to say where it is."""
 BLIND = """for (const kind of [WebGLRenderingContext, WebGL2RenderingContext])
     for (const call of ["drawArrays", "drawElements", "drawArraysInstanced", "drawElementsInstanced"])
         if (kind.prototype[call]) kind.prototype[call] = () => undefined;"""
@@ -80,12 +83,17 @@ def served(*words: str | Path) -> Iterator[tuple[str, subprocess.Popen[str]]]:
         [program, "play", *map(str, words), "--port", "0"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
     assert server.stdout is not None
+    # Its first start on a machine compiles the solvers, which is no test's time.
+    too_late = threading.Timer(START_S, server.kill)
+    too_late.start()
     try:
         line = server.stdout.readline()
+        too_late.cancel()
         match = re.fullmatch(r"spherloc playground: (http://127\.0\.0\.1:\d+)\n", line)
         assert match, line or server.communicate(timeout=10)
         yield match[1], server
     finally:
+        too_late.cancel()
         server.send_signal(signal.SIGINT)
         try:
             server.communicate(timeout=60)

@@ -43,6 +43,8 @@ start = 0.05
 stop = 0.25
 """
 
+pytestmark = [pytest.mark.browser, pytest.mark.timeout(280, func_only=True)]
+
 
 @pytest.fixture(scope="module")
 def images_address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, Path]]:

@@ -30,7 +30,7 @@ OUTCOMES = {
 }
 """What the story of each preset promises."""
 
-pytestmark = [pytest.mark.browser, pytest.mark.timeout(280)]
+pytestmark = [pytest.mark.browser, pytest.mark.timeout(280, func_only=True)]
 
 
 def go_to(tab: Playground, name: str) -> None:

@@ -24,6 +24,8 @@ pytestmark = [pytest.mark.browser, pytest.mark.timeout(280)]
 
 SIZE = {"width": 1000, "height": 600}
 PAUSED = 1
+OPENING_MS = 200_000
+"""The viewer compiles 43 MB and then its shaders, in software."""
 VIOLATIONS = "addEventListener('securitypolicyviolation', e => (window.refused ??= []).push(e.blockedURI))"
 REACH_OUT = """() => new Promise(done => {
     const request = new XMLHttpRequest();
@@ -114,7 +116,7 @@ def test_it_opens_at_the_step_and_stays_at_home(tab: Tab, home: str, row: RunRow
     step = row.decisive_step or 1
     tab.page.goto(home + viewer_link("good.rrd", step))
     expect(tab.page).to_have_title(f"small street, mc, seed 0: step {step} - spherloc")
-    expect(tab.page.locator("body")).to_have_attribute("data-state", "open")
+    expect(tab.page.locator("body")).to_have_attribute("data-state", "open", timeout=OPENING_MS)
     state = tab.state()
 
     (recording,) = [message(each) for each in state[3]]
@@ -171,4 +173,14 @@ def test_a_recording_that_has_gone_is_one_sentence(tab: Tab, home: str, folder: 
     tab.page.route("**/viewer/data/good.rrd", lambda route: route.fulfill(status=404, body="good.rrd: it is gone."))
     tab.page.goto(home + viewer_link("good.rrd", 0))
     expect(tab.page.locator("#said")).to_have_text("good.rrd: it is gone.")
+    expect(tab.page.locator("canvas")).to_be_hidden()
+    tab.page.route("**/viewer/data/good.rrd", lambda route: route.abort())
+    tab.page.reload()
+    expect(tab.page.locator("#said")).to_contain_text("The server does not answer")
+
+
+def test_a_browser_that_cannot_draw_is_told(tab: Tab, home: str) -> None:
+    tab.page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
+    tab.page.goto(home + viewer_link("good.rrd", 0))
+    expect(tab.page.locator("#said")).to_contain_text("cannot start in this browser")
     expect(tab.page.locator("canvas")).to_be_hidden()

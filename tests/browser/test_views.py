@@ -10,7 +10,7 @@ from playwright.sync_api import expect
 
 from spherloc_viz.recording.reader import read_recording
 
-pytestmark = [pytest.mark.browser, pytest.mark.timeout(280)]
+pytestmark = [pytest.mark.browser, pytest.mark.timeout(280, func_only=True)]
 
 EXACT = "mc-exact (exact, certified)"
 LEAST_CONTRAST = 4.5

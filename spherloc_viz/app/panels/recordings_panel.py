@@ -61,6 +61,7 @@ class RecordingsPanel:
         self._status = gui.add_html("", visible=False)
         self._parts: list[RunList | Notes | Reviewer | Exporter | GalleryList] = []
         self._runs: RunList | None = None
+        self._aside = Errand(f"spherloc-runs-aside-{name}", self._complain)
         if shelf is None:
             self._say("Runs are not recorded: start the playground without --no-record to review them here.")
         else:
@@ -78,13 +79,19 @@ class RecordingsPanel:
         self._notes = Notes(gui, touches, shelf, name, self._stored, self._complain)
         self._comparison = gui.add_html("", visible=False)
         self._runs = RunList(gui, touches, shelf, name, lambda: self._reviewer.locate())
-        reviewing = Reviewing(
-            shelf, page.roots, card, page.enter, page.open_recorded, self._say, self._complain, self._follow
-        )
+
+        def say(words: str) -> None:
+            self._say(words)
+            card.say(words)
+
+        def complain(sentence: str) -> None:
+            self._complain(sentence)
+            card.say(_begun(sentence), wrong=True)
+
+        reviewing = Reviewing(shelf, page.roots, card, page.enter, page.open_recorded, say, complain, self._follow)
         self._reviewer = Reviewer(touches, self._runs, reviewing, name)
         exporter = Exporter(client, touches, shelf, self._runs, self._say, self._complain)
         self._parts += [self._notes, self._runs, self._reviewer, exporter]
-        self._aside = Errand(f"spherloc-compare-runs-{name}", self._complain)
         touches.on("runs-compare", lambda touch: self._aside.ask(self._compare))
         touches.on("runs-uncompare", lambda touch: self._uncompare())
 
@@ -97,6 +104,7 @@ class RecordingsPanel:
         """End what goes on; does not wait."""
         for part in self._parts:
             part.close()
+        self._aside.close()
 
     def _see(self, touch: Touch) -> None:
         """Other tabs are open now."""
@@ -156,9 +164,12 @@ class RecordingsPanel:
         self._status.content, self._status.visible = status_html(words), bool(words)
 
     def _complain(self, sentence: str) -> None:
-        if sentence.partition(" ")[0].isalpha():  # file names stay as they are
-            sentence = sentence[:1].upper() + sentence[1:]
-        self._status.content, self._status.visible = status_html(sentence, wrong=True), True
+        self._status.content, self._status.visible = status_html(_begun(sentence), wrong=True), True
+
+
+def _begun(sentence: str) -> str:
+    """With a capital letter, unless it begins with the name of a file."""
+    return sentence[:1].upper() + sentence[1:] if sentence.partition(" ")[0].isalpha() else sentence
 
 
 def _switch_html(shown: str) -> str:

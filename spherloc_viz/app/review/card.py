@@ -44,6 +44,12 @@ def bar_html(place: int | None, total: int) -> str:
     )
 
 
+def said_html(sentence: str, wrong: bool) -> str:
+    """A line about what goes on, or went wrong."""
+    look = f"color:{style.css_text(style.OUTLIER)}" if wrong else DIM
+    return f'<div style="{look};padding-top:.2em;overflow-wrap:anywhere">{escape(sentence)}</div>' if sentence else ""
+
+
 def card_html(opened: Opened, run: Run, diagnosis: Diagnosis | None, bar: str) -> str:
     """The whole card: the run as it was recorded, and as soon as it is changed, a table of both."""
     row = opened.recorded.row
@@ -59,7 +65,8 @@ def card_html(opened: Opened, run: Run, diagnosis: Diagnosis | None, bar: str) -
     if opened.sentence:
         parts.append(f'<div style="{DIM}">{escape(opened.sentence)}</div>')
     parts.append(_ways(row, run if is_it else None))
-    return f'<div style="{GROUND}">{box("".join(parts), "font-size:11.5px;line-height:1.38;padding:.4em .7em")}</div>'
+    content = box("".join(parts), "font-size:11.5px;line-height:1.38;padding:.4em .7em")
+    return f'<div class="review-card" style="{GROUND}">{content}</div>'
 
 
 def _result(row: RunRow) -> str:

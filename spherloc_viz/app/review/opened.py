@@ -56,11 +56,13 @@ class Opened:
 
 def is_its_world(opened: Opened, run: Run) -> bool:
     """Whether places of the run that was opened mean something in the run on the page: another seed of a simulation
-    draws another map."""
+    draws another map, and with it another true camera."""
     one, other = opened.wish.scene, run.wish.scene
-    if (one.scene, one.query) != (other.scene, other.query):
-        return False
-    return one.seed == other.seed or is_same_pose(opened.truth_cam_from_map, run.trace.problem.truth_cam_from_map)
+    truth, now = opened.truth_cam_from_map, run.trace.problem.truth_cam_from_map
+    if truth is not None and is_same_pose(truth, now):
+        return True
+    same_scene = (one.scene, one.query) == (other.scene, other.query)
+    return same_scene and (one.seed == other.seed or (truth is None and now is None))
 
 
 def is_same_pose(one: FloatArray | None, other: FloatArray | None) -> bool:

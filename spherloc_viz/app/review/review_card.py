@@ -6,7 +6,7 @@ from dataclasses import replace
 import viser
 
 from spherloc.diagnosis import Diagnosis
-from spherloc_viz.app.review.card import bar_html, card_html
+from spherloc_viz.app.review.card import bar_html, card_html, said_html
 from spherloc_viz.app.review.opened import Opened, reference_items
 from spherloc_viz.app.wish import Run, Wish
 from spherloc_viz.layers.primitives import SceneItem
@@ -21,6 +21,7 @@ class ReviewCard:
         self._html = gui.add_html("", visible=False)
         self._opened: Opened | None = None
         self._where: tuple[int | None, int] = (None, 0)
+        self._said = ("", False)
 
     @property
     def opened(self) -> Opened | None:
@@ -31,6 +32,12 @@ class ReviewCard:
         """Show another run, or none."""
         self._opened = opened
         self._redraw()
+
+    def say(self, sentence: str, wrong: bool = False) -> None:
+        """Show what goes on, or what went wrong, where it is seen whichever tab is in front; empty for nothing."""
+        before, self._said = self._said, (sentence, wrong)
+        if before != self._said:
+            self._redraw()
 
     def became(self, asked: Wish, wish: Wish) -> None:
         """The page says in its own words what it was asked for."""
@@ -47,7 +54,9 @@ class ReviewCard:
     def draw(self, run: Run, diagnosis: Diagnosis | None) -> None:
         """Show what was recorded beside the run on the page."""
         opened = self._opened
-        html = "" if opened is None else card_html(opened, run, diagnosis, bar_html(*self._where))
+        html = (
+            "" if opened is None else card_html(opened, run, diagnosis, bar_html(*self._where) + said_html(*self._said))
+        )
         if self._html.content != html:
             self._html.content = html
         self._html.visible = bool(html)

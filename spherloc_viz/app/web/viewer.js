@@ -33,7 +33,7 @@
       for (let scale = 1; ; scale *= 128) {
         const byte = bytes[at++];
         value += (byte % 128) * scale;
-        if (byte < 128) return value;
+        if (!(byte >= 128)) return value;
       }
     };
     while (at < bytes.length) {
@@ -59,10 +59,18 @@
   const pause = (ms) => new Promise((done) => setTimeout(done, ms));
   const frame = () => new Promise((done) => requestAnimationFrame(done));
 
-  // The bytes of a file; null if there is none. A sentence of the server's is an error.
-  async function bytes(url) {
-    const answer = await ask(url);
+  // What the server has; if it refuses, it says why in a sentence.
+  async function fetched(url) {
+    const answer = await ask(url).catch(() => {
+      throw new Error("The server does not answer: start it again, then reload the page.");
+    });
     if (!answer.ok) throw new Error((await answer.text()).trim());
+    return answer;
+  }
+
+  // The bytes of a file; null if there is none.
+  async function bytes(url) {
+    const answer = await fetched(url);
     return answer.status === 204 ? null : new Uint8Array(await answer.arrayBuffer());
   }
 
@@ -82,14 +90,30 @@
       if (turn === TRIES) throw new Error("The viewer does not open this recording: reload the page.");
       const { recording, stands } = look(viewer);
       still = stands ? still + 1 : 0;
-      if (recording && !stands) await viewer.viewer_control(standStill(recording));
+      if (recording && !stands) await viewer.viewer_control(standStill(recording)).catch(() => undefined);
       await (recording ? frame() : pause(PAUSE_MS));
     }
   }
 
+  // The first failure tells why; those that it brings about do not.
   function fail(error) {
+    if (document.body.dataset.state === "failed") return;
     document.body.dataset.state = "failed";
     said.textContent = error instanceof Error && error.message ? error.message : String(error);
+  }
+
+  async function started(wasm) {
+    try {
+      await wasm_bindgen({ module_or_path: wasm });
+      const viewer = new wasm_bindgen.WebHandle({
+        url: [], hide_welcome_screen: true, enable_history: false, persist: false, notebook: false,
+      });
+      window.spherlocViewer = viewer;
+      await viewer.start(document.getElementById("viewer"));
+      return viewer;
+    } catch (error) {
+      throw new Error(`Rerun's viewer cannot start in this browser (${error.message ?? error}): try another one.`);
+    }
   }
 
   async function watch(viewer) {
@@ -101,15 +125,9 @@
     const [run, ...others] = files.split(" ").map(bytes);
     // What comes late must not be an error that nobody has heard of.
     for (const other of others) other.catch(() => undefined);
-    const wasm = ask(`${program}re_viewer_bg.wasm`);
+    const [first, wasm] = await Promise.all([run, fetched(`${program}re_viewer_bg.wasm`)]);
     await load(`${program}re_viewer.js`);
-    const first = await run;
-    await wasm_bindgen({ module_or_path: wasm });
-    const viewer = new wasm_bindgen.WebHandle({
-      url: [], hide_welcome_screen: true, enable_history: false, persist: false, notebook: false,
-    });
-    window.spherlocViewer = viewer;
-    await viewer.start(document.getElementById("viewer"));
+    const viewer = await started(wasm);
     watch(viewer);
     const complaints = [];
     const show = (id, content) => {
@@ -123,6 +141,7 @@
       if (content) show(`layer ${place + 1}`, content);
     }
     await stand(viewer);
+    if (document.body.dataset.state === "failed") return;
     said.textContent = complaints.join(" ");
     said.addEventListener("click", () => (said.textContent = ""));
     document.body.dataset.state = "open";
