@@ -94,7 +94,7 @@ def plain_item(item: SceneItem) -> rr.AsComponents | None:
         case Points():
             return rr.Points3D(item.positions, colors=item.colors, radii=item.radius_m)
         case Segments():
-            return rr.LineStrips3D(item.points, colors=item.colors, radii=-item.width_px / 2)
+            return rr.LineStrips3D(list(item.points), colors=item.colors, radii=-item.width_px / 2)
         case Balls():
             radii = np.repeat(item.radii_m[:, None], 3, axis=1)
             return rr.Ellipsoids3D(half_sizes=radii, centers=item.centers, colors=item.colors, fill_mode="solid")

@@ -29,6 +29,8 @@ from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.web.viser_seams import start_viser, stop_viser
 from spherloc_viz.layers.primitives import Chart, Curve
 from spherloc_viz.layers.sweep import SweepChart
+from spherloc_viz.recording.background import Recorder
+from spherloc_viz.recording.query import RunQuery
 
 SCENE = """
 kind = "synthetic"
@@ -54,11 +56,11 @@ def compiled() -> None:
 class Desk:
     """A panel, and the page around it."""
 
-    def __init__(self, server: viser.ViserServer, scene: Path) -> None:
+    def __init__(self, server: viser.ViserServer, scene: Path, recorder: Recorder | None = None) -> None:
         self.wish = SceneWish("tiny <b>", 5, None, Variation(noise_px=1.0, outlier_rate=0.4, hidden=(3,)))
         self.scene = scene
         self.touches = Touches(lambda error: None)
-        self.panel: Any = SweepPanel(server.gui, self.touches, lambda: (self.scene, self.wish))
+        self.panel: Any = SweepPanel(server.gui, self.touches, lambda: (self.scene, self.wish), recorder)
 
     def tick(self, *names: str) -> None:
         """Have just these estimators ticked."""
@@ -103,6 +105,26 @@ def desk(server: viser.ViserServer, tmp_path: Path) -> Iterator[Desk]:
     yield opened
     opened.panel.close()
     until(lambda: not any(thread.name == "spherloc-sweep" for thread in threading.enumerate()))
+    assert not multiprocessing.active_children()
+
+
+def test_runs_are_recorded_unless_that_is_unticked(server: viser.ViserServer, tmp_path: Path) -> None:
+    (tmp_path / "tiny.toml").write_text(SCENE)
+    with Recorder(tmp_path / "recordings", print) as recorder:
+        desk = Desk(server, tmp_path / "tiny.toml", recorder)
+        desk.tick("ransac-2p")
+        panel = desk.panel
+        panel._values.value, panel._runs.value, panel._workers.value = "0.2", 2, 1
+        desk.press()
+        desk.finish()
+        assert desk.status == "2 runs on 2 problems at each value, from seed 5 on."
+        listed = recorder.index.find(RunQuery(source="sweep")).rows
+        assert sorted(row.seed for row in listed) == [5, 6]
+        panel._runs.value, panel._record.value = 3, False
+        desk.press()
+        desk.finish()
+        assert desk.rows == 3 and len(list(recorder.folder.glob("*.rrd"))) == 2
+        panel.close()
     assert not multiprocessing.active_children()
 
 

@@ -60,7 +60,7 @@ def test_every_number_of_a_story_is_accounted_for(key):
     case = chosen(gallery_cases(), [key])[0]
     assert loose_numbers(case) == ()
     sentences = re.findall(r"[^.]\.(?= [A-Z0-9]|$)", case.story)
-    assert 3 <= len(sentences) <= 8, case.story
+    assert 3 <= len(sentences) <= 7, case.story
     assert len(case.title) < 50 and "  " not in case.story
 
 
@@ -134,6 +134,11 @@ def test_a_false_story_is_found_out():
 def test_agrees(told, measured, true):
     assert agrees(told, measured) is true
     assert not agrees(told, np.nan)
+
+
+def test_pictures_may_differ_a_little_between_machines():
+    assert agrees(616, 600, 0.15) and agrees(0, 1, 0.15) and agrees(0.26, 0.29, 0.15)
+    assert not agrees(616, 500, 0.15) and not agrees(0, 2, 0.15) and not agrees(0.26, 0.4, 0.15)
 
 
 def test_recordings_tell_the_story(tmp_path):
@@ -246,7 +251,7 @@ def test_what_is_wrong_is_said_in_a_sentence(message, tmp_path):
 
 
 def test_a_missing_file_is_said():
-    with pytest.raises(InputError, match="no such file"):
+    with pytest.raises(InputError, match="the file of the gallery is missing"):
         gallery_cases(Path("nowhere.toml"))
 
 

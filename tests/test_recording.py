@@ -24,8 +24,8 @@ from spherloc.metrics import evaluate
 from spherloc.problem import Problem
 from spherloc.trace import Certificate, DecisionStage, RefinementStage, Trace
 from spherloc_viz.layers import paint, steps
-from spherloc_viz.layers.primitives import Balls, Label, Mesh, Points, Segments, Stop, Textured
 from spherloc_viz.layers.decisive import decisive_step
+from spherloc_viz.layers.primitives import Balls, Label, Mesh, Points, Segments, Stop, Textured
 from spherloc_viz.recording import data
 from spherloc_viz.recording.chart_bars import LEVEL_OPACITY
 from spherloc_viz.recording.layout import APPLICATION_ID
@@ -399,7 +399,7 @@ def test_recordings_of_other_programs_and_versions_are_refused(tmp_path: Path) -
     with pytest.raises(RecordingError, match="part of the run is missing"):
         read_recording(bare)
     later = Chunk.from_property("run", rr.AnyValues(format_version=3))
-    with pytest.raises(RecordingError, match="format 3.*install the one that wrote it"):
+    with pytest.raises(RecordingError, match=r"format 3.*install the one that wrote it"):
         read_recording(write_foreign(tmp_path / "later.rrd", APPLICATION_ID, later))
 
 

@@ -259,6 +259,7 @@ def test_a_thumbnail_shows_matches_and_cameras(trace: Trace) -> None:
         assert (style.INLIER in colors) == bool(run.inlier_mask.any())
         assert (style.ESTIMATE in colors) == (run.cam_from_map is not None)
     both = cv2.imdecode(np.frombuffer(thumbnail(failed(trace)), np.uint8), cv2.IMREAD_COLOR)
+    assert both is not None
     assert style.TRUTH in {tuple(color) for color in both[:, :, ::-1].reshape(-1, 3).tolist()}
 
 

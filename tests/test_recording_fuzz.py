@@ -111,15 +111,15 @@ def test_a_list_of_good_and_bad_files_has_the_good_ones(good: Path, tmp_path: Pa
     for number in range(50):
         bad.append(folder / f"bad-{number}.rrd")
         bad[-1].write_bytes(cut(content, rng) if number % 2 else lied(content[:-32], rng) + content[-32:][::-1])
-    for name in ("foreign", "folder", "pipe", "loop", "sparse", "a b", "<img src=x>", "-rf", "\udcff", "\u202egnp"):
+    for name in ("foreign", "folder", "pipe", "sparse", "a b", "b\nc", "<img src=x>", "c;d", "\udcff", "\u202egnp"):
         bad.append(folder / f"{name}.rrd")
     foreign(bad[50])
     bad[51].mkdir()
     os.mkfifo(bad[52])
-    bad[53].symlink_to(bad[53])
-    bad[54].write_bytes(content)
-    os.truncate(bad[54], 5_000_000_000)
-    for path in bad[55:]:
+    bad[53].write_bytes(content)
+    os.truncate(bad[53], 5_000_000_000)
+    (folder / "loop.rrd").symlink_to("loop.rrd")
+    for path in bad[54:]:
         path.write_bytes(content)
     notices: list[str] = []
     with RunIndex(folder, notices.append) as index:

@@ -1,6 +1,7 @@
 """The list of runs: every filter against plain Python, several writers at once, and files that go bad."""
 
 import contextlib
+import os
 import sqlite3
 import subprocess
 import sys
@@ -388,6 +389,21 @@ def test_a_folder_that_cannot_be_written_is_listed_from_memory(tmp_path: Path):
     assert len(said) == 1 and "cannot be written" in said[0]
 
 
+def test_a_list_that_may_only_be_read_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """As in a folder of somebody else: changes stay in memory, and the file as it is."""
+    with RunIndex(tmp_path) as index:
+        index.add(some_row())
+    before = index.path.read_bytes()
+    monkeypatch.setattr(index_file.os, "access", lambda path, mode: False)
+    said: list[str] = []
+    with RunIndex(tmp_path, said.append) as index:
+        assert index.find(RunQuery()).rows == (some_row(),)
+        index.add(some_row("b.rrd"))
+        assert index.find(RunQuery()).total == 2
+    assert len(said) == 1 and "cannot be written" in said[0]
+    assert index.path.read_bytes() == before and len(list(tmp_path.iterdir())) == 1
+
+
 def test_a_closed_index_says_so(tmp_path: Path):
     with RunIndex(tmp_path) as index:
         pass
@@ -446,6 +462,22 @@ def test_refresh_reads_only_what_is_new_or_has_changed(index: RunIndex):
     files.write("b.rrd", content="bad now")
     index.refresh(examine=files.examine)
     assert index.get("b.rrd") is None, "it was a run once"
+
+
+def test_files_whose_names_no_recording_has_are_left_out(index: RunIndex):
+    """They would be links on a page, and paths in commands."""
+    files = Files(index.folder)
+    names = ["my run.rrd", "<img src=x>.rrd", "a;b.rrd", "é.rrd"]
+    files.write("good.rrd", *names)
+    with contextlib.suppress(OSError):  # some systems have Unicode names only
+        (Path(os.fsdecode(bytes(index.folder) + b"/\xff.rrd"))).write_text("run")
+        names.append("\\udcff.rrd")
+    for _ in range(2):
+        done = index.refresh(examine=files.examine)
+        assert {file for file, _ in done.skipped} == set(names)
+        assert all("not the name of a recording" in sentence for _, sentence in done.skipped)
+    assert files.read == ["good.rrd"]
+    assert [row.file for row in index.find(RunQuery()).rows] == ["good.rrd"]
 
 
 def test_rebuild_reads_all_and_says_how_far_it_is(index: RunIndex):
@@ -511,6 +543,7 @@ def test_a_refresh_can_be_stopped(index: RunIndex):
 
 def test_review_is_stored_with_the_run_and_found(index: RunIndex):
     index.add(some_row(run_id="the-id"))
+    (index.folder / "a.rrd").write_text("a run")
     assert index.set_review("a.rrd", [" wrong  map ", "x"], "Über\nalles\n") == Review(
         ("wrong map", "x"), "Über\nalles"
     )
@@ -519,12 +552,13 @@ def test_review_is_stored_with_the_run_and_found(index: RunIndex):
     index.set_review("a.rrd", [], " ")
     assert not review_path(index.folder / "a.rrd").exists()
     assert index.get("a.rrd") == some_row(run_id="the-id")
-    with pytest.raises(RecordingError, match="no such run in the list"):
+    with pytest.raises(RecordingError, match="there is no such run"):
         index.set_review("b.rrd", ["x"], "")
 
 
 def test_two_pages_that_review_a_run_agree_in_the_end(tmp_path: Path):
     with RunIndex(tmp_path) as one, RunIndex(tmp_path) as other:
+        (tmp_path / "a.rrd").write_text("a run")
         one.add(some_row())
         begin = threading.Barrier(2)
 
@@ -539,7 +573,7 @@ def test_two_pages_that_review_a_run_agree_in_the_end(tmp_path: Path):
         row, stored = one.get("a.rrd"), read_review(tmp_path / "a.rrd")
         assert row is not None and (row.labels, row.note) == (stored.labels, stored.note)
         assert stored in (Review(("one 14",), "one" * 100), Review(("other 14",), "other" * 100))
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.review.rrd", "runs.sqlite"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.review.rrd", "a.rrd", "runs.sqlite"]
 
 
 def test_causes_fit_the_filter(index: RunIndex):
@@ -547,3 +581,13 @@ def test_causes_fit_the_filter(index: RunIndex):
     index.add_all([some_row(f"{number}.rrd", diagnosis=cause.value) for number, cause in enumerate(Cause)])
     for cause in Cause:
         assert [row.diagnosis for row in index.find(RunQuery(diagnosis=cause.value)).rows] == [cause.value]
+
+
+def test_the_benchmark_runs(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    """Its peer finds the same; no time is asserted."""
+    from benchmarks import run_index
+
+    monkeypatch.setattr(sys, "argv", ["run_index", "--runs", "40", "--repeats", "1"])
+    run_index.main()
+    out = capsys.readouterr().out
+    assert out.startswith("40 runs, ") and "the slowest takes" in out and "by reading JSON" in out

@@ -34,6 +34,8 @@ def gallery_cases(path: Path = GALLERY) -> tuple[GalleryCase, ...]:
 
     Raises ``InputError``, in one sentence, for a file that is missing or says something that is not understood.
     """
+    if not path.is_file():
+        raise InputError(f"{path}: the file of the gallery is missing; install spherloc again, or restore the file.")
     return parse_gallery(scene_file.read_table(path), path)
 
 

@@ -144,8 +144,8 @@ class RunIndex:
 
         def work(connection: sqlite3.Connection) -> Review:
             found = connection.execute("SELECT id, run_id FROM runs WHERE file = ?", (file,)).fetchone()
-            if found is None:
-                raise RecordingError(f"{path}: no such run in the list; run spherloc reindex.")
+            if found is None or not path.is_file():
+                raise RecordingError(f"{path}: there is no such run; spherloc runs lists those that there are.")
             # Written while we alone may write, so that file and database agree on who was last.
             review = write_review(path, labels, note, run_id=found[1])
             (before,) = rows_of(connection, [found[0]])
@@ -242,8 +242,8 @@ class RunIndex:
             self._set_aside(str(error))
             self._connection = index_file.connect(self.path)
         except PermissionError:
-            self._connection = index_file.memory()
-            self._notice(f"{self.path}: cannot be written; the list of runs is kept in memory and made anew each time.")
+            self._connection = index_file.memory(self.path)
+            self._notice(f"{self.path}: cannot be written, so changes of the list of runs are kept in memory only.")
             return self._connection
         self._file = index_file.identity(self.path)
         return self._connection

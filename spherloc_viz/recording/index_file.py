@@ -1,6 +1,7 @@
 """The file of the run index: opened, checked, and set aside where it is not ours or damaged."""
 
 import contextlib
+import os
 import sqlite3
 from datetime import UTC, datetime
 from pathlib import Path
@@ -44,6 +45,8 @@ def connect(path: Path) -> sqlite3.Connection:
     Raises ``UnfitError`` if there is another file or a damaged one, ``PermissionError`` if it cannot be written, and
     ``sqlite3.Error`` if it is locked or the disk is full.
     """
+    if not all(os.access(place, os.W_OK) for place in (path, path.parent) if place.exists()):
+        raise PermissionError(f"no write access to {path}")
     connection: sqlite3.Connection | None = None
     try:
         connection = sqlite3.connect(path, timeout=BUSY_S, isolation_level=None, check_same_thread=False)
@@ -72,11 +75,26 @@ def identity(path: Path) -> tuple[int, int] | None:
     return status.st_dev, status.st_ino
 
 
-def memory() -> sqlite3.Connection:
-    """An index that is in no file."""
+def memory(path: Path) -> sqlite3.Connection:
+    """An index that is in no file, with what the one at ``path`` has, if that can be read."""
+    with contextlib.suppress(sqlite3.Error, UnfitError):
+        address = f"{path.absolute().as_uri()}?mode=ro&immutable=1"
+        with contextlib.closing(sqlite3.connect(address, uri=True)) as file:
+            return _in_memory(file)
+    return _in_memory(None)
+
+
+def _in_memory(copied: sqlite3.Connection | None) -> sqlite3.Connection:
     connection = sqlite3.connect(":memory:", isolation_level=None, check_same_thread=False)
-    connection.execute("PRAGMA foreign_keys = ON")
-    _check_or_create(connection)
+    try:
+        if copied is not None:
+            copied.backup(connection)
+        connection.execute("PRAGMA trusted_schema = OFF")
+        connection.execute("PRAGMA foreign_keys = ON")
+        _check_or_create(connection)
+    except (sqlite3.Error, UnfitError):
+        connection.close()
+        raise
     return connection
 
 

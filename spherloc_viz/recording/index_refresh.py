@@ -14,7 +14,7 @@ from spherloc.errors import RecordingError
 from spherloc_viz.recording.index_rows import put
 from spherloc_viz.recording.review import REVIEW_SUFFIX, UNREADABLE, review_path
 from spherloc_viz.recording.run_row import RunRow
-from spherloc_viz.recording.strangers import examine_all
+from spherloc_viz.recording.strangers import check_name, examine_all
 
 Examine = Callable[[Sequence[Path]], Iterable[tuple[Path, RunRow | RecordingError]]]
 """Reads recordings one after another: the row of each, or what is wrong with it."""
@@ -116,7 +116,10 @@ class Refresher:
             raise RecordingError(f"{self._folder}: the folder cannot be read ({reason}); check it.") from error
         known = self._write(_known)
         removed = self._write(lambda connection: self._forget(connection, known.keys() - files.keys()))
-        wanted = sorted(file for file, stamp in files.items() if everything or known.get(file) != stamp)
+        new = sorted(file for file, stamp in files.items() if everything or known.get(file) != stamp)
+        wanted = [file for file in new if _misnamed(file) is None]
+        misnamed = [(file, error) for file in new if (error := _misnamed(file)) is not None]
+        self._write(lambda connection: self._store(connection, misnamed, files))
         read = done = 0
         progress(done, len(wanted))
         results = self._examine([self._folder / file for file in wanted])
@@ -147,14 +150,24 @@ class Refresher:
             if stamp_of(path) != stamp:
                 continue  # rewritten, labelled or deleted meanwhile, by somebody who has listed that
             if isinstance(result, RecordingError):
-                connection.execute("DELETE FROM runs WHERE file = ?", (file,))
-                _skip(connection, file, stamp, str(result))
+                name = file.encode(errors="backslashreplace").decode()  # on a disk it need not be Unicode
+                connection.execute("DELETE FROM runs WHERE file = ?", (name,))
+                _skip(connection, name, stamp, str(result))
                 continue
             put(connection, replace(result, file=file), stamp)
             runs += 1
             if review_path(path).exists() and not result.labels and not result.note:
                 _skip(connection, file, stamp, f"{review_path(path)}: {UNREADABLE}")
         return runs
+
+
+def _misnamed(file: str) -> RecordingError | None:
+    """What is wrong with the name of a file, if it cannot be that of a recording."""
+    try:
+        check_name(file)
+    except RecordingError as error:
+        return error
+    return None
 
 
 def _known(connection: sqlite3.Connection) -> dict[str, str]:

@@ -57,6 +57,12 @@ BLIND = """for (const kind of [WebGLRenderingContext, WebGL2RenderingContext])
         if (kind.prototype[call]) kind.prototype[call] = () => undefined;"""
 """Makes the canvas draw nothing. What tests read is in the page and in the scene's nodes, and a frame in software takes
 most of a second, for which every click waits."""
+ASIDE = """addEventListener("DOMContentLoaded", () => {
+    const look = document.createElement("style");
+    look.textContent = "[class*=Notifications-root], [class*=Notifications-root] * {pointer-events: none !important}";
+    document.head.append(look);
+})"""
+"""Has clicks go through notes, of which viser's about drawing in software lies over a panel until it is closed."""
 PAINT = "() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(null))))"
 """Returns when the page has painted, which a busy machine does seldom."""
 SELECTED = "#b024e4"
@@ -108,6 +114,7 @@ class Playground:
     def __init__(self, browser: Browser, address: str, drawn: bool = False) -> None:
         """Open the page and wait for its first run; ``drawn`` has the canvas really drawn, which is slow."""
         context = browser.new_context(viewport=SIZE, device_scale_factor=SHARPNESS)  # pyright: ignore[reportArgumentType]
+        context.add_init_script(ASIDE)
         if not drawn:
             context.add_init_script(BLIND)
         self.page: Page = context.new_page()

@@ -93,7 +93,7 @@ class Controls:
         with tabs.add_tab("Compare"):
             self.compare = ComparePanel(gui, touches, owner.use_estimator, owner.redraw)
         with tabs.add_tab("Sweep"):
-            self._sweep = SweepPanel(gui, touches, self._chosen_sweep)
+            self._sweep = SweepPanel(gui, touches, self._chosen_sweep, services.recorder)
         with tabs.add_tab("Open"):
             self._open = OpenPanel(gui, client, touches, services.roots, self._open_scene)
         with tabs.add_tab("Recordings"):

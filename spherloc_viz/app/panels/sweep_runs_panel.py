@@ -20,6 +20,7 @@ from spherloc_viz.app.panels.estimator_chips import chips_html, ordered
 from spherloc_viz.app.plots.sweep_charts import charts_html, table_html
 from spherloc_viz.app.text import status_html
 from spherloc_viz.app.web.touch import Touch, Touches
+from spherloc_viz.recording.background import Recorder
 
 START, CANCEL = "Start sweep", "Cancel"
 VALUES = {
@@ -33,6 +34,8 @@ HINT = "FIRST:LAST:STEP, or numbers with commas between them."
 TICKED = ("mc-exact", "mc", "ransac-2p")
 MOST_PAGE_ROWS = 20_000
 """Larger sweeps are for the command line, which keeps them on disk."""
+ROOM_EVERY = 100
+"""Recorded runs after which old ones may have to make room."""
 DRAW_EVERY_S = 0.25
 DRAW_SHARE = 0.05
 """Of the time, at most, goes into drawing; the page has more to do."""
@@ -58,9 +61,18 @@ class _Results:
 class SweepPanel:
     """What to sweep, a button, charts, a table, and files to download."""
 
-    def __init__(self, gui: viser.GuiApi, touches: Touches, chosen: Callable[[], tuple[Path, SceneWish]]) -> None:
-        """``chosen`` tells the file of the page's scene and what is changed about it; it may raise ``InputError``."""
-        self._chosen = chosen
+    def __init__(
+        self,
+        gui: viser.GuiApi,
+        touches: Touches,
+        chosen: Callable[[], tuple[Path, SceneWish]],
+        recorder: Recorder | None = None,
+    ) -> None:
+        """``chosen`` tells the file of the page's scene and what is changed about it; it may raise ``InputError``.
+
+        ``recorder`` is that of the page's runs; without one those of sweeps are not recorded either.
+        """
+        self._chosen, self._recorder = chosen, recorder
         names = registry.names("estimators")
         self._names = ordered(names)
         self._ticked = {name for name in self._names if name in TICKED}
@@ -74,6 +86,8 @@ class SweepPanel:
         self._workers = gui.add_number(
             "Workers", min(2, most), min=1, max=most, step=1, hint="Processes beside this page."
         )
+        hint = "Keep a recording of each run, which takes longer than solving it."
+        self._record = gui.add_checkbox("Record runs", recorder is not None, visible=recorder is not None, hint=hint)
         self._button = gui.add_button(START)
         self._bar = gui.add_progress_bar(0.0, visible=False)
         self._status = gui.add_html(status_html("The scene is the page's, with all that is changed about it."))
@@ -83,6 +97,8 @@ class SweepPanel:
         self._lock = threading.Lock()
         self._stop: threading.Event | None = None
         self._results: _Results | None = None
+        self._complaints: list[str] = []
+        """Why runs of the last sweep could not be recorded."""
         self._closed = False
         self._button.on_click(self._press)
         self._over.on_update(self._follow)
@@ -92,7 +108,7 @@ class SweepPanel:
     @property
     def widgets(self) -> tuple:
         """Those that hold a value."""
-        return self._over, self._values, self._runs, self._workers
+        return self._over, self._values, self._runs, self._workers, self._record
 
     def close(self) -> None:
         """End the sweep and its processes; does not wait."""
@@ -171,8 +187,13 @@ class SweepPanel:
         self._say("Starting the workers …" if not rows else "Going on …")
         done = {(row.estimator, row.value, row.seed) for row in rows}
         began, before, due = time.monotonic(), len(rows), 0.0
-        for row in run_sweep(plan, done, int(self._workers.value), stop=stop):
+        recorder, self._complaints = self._recorder if self._record.value else None, []
+        keep = None if recorder is None else recorder.sweep_keeper()
+        workers, complain = int(self._workers.value), self._complaints.append
+        for row in run_sweep(plan, done, workers, stop=stop, keep=keep, complain=complain):
             rows.append(row)
+            if recorder is not None and len(rows) % ROOM_EVERY == 0:
+                recorder.make_room()
             if self._closed or time.monotonic() < due:
                 continue
             start = time.monotonic()
@@ -187,10 +208,11 @@ class SweepPanel:
             self._draw()
 
     def _outcome(self, plan: SweepPlan) -> str:
-        done = 0 if self._results is None else len(self._results.rows)
+        done, lost = 0 if self._results is None else len(self._results.rows), self._complaints
+        said = f" {len(lost):,} could not be recorded, the first since: {lost[0]}" if lost else ""
         if done == plan.rows:
-            return f"{done:,} runs on {plan.runs} problems at each value, from seed {plan.first_seed} on."
-        return f"Stopped at {done:,} of {plan.rows:,} runs; {START} goes on while nothing is changed."
+            return f"{done:,} runs on {plan.runs} problems at each value, from seed {plan.first_seed} on.{said}"
+        return f"Stopped at {done:,} of {plan.rows:,} runs; {START} goes on while nothing is changed.{said}"
 
     def _draw(self) -> None:
         results = self._results
