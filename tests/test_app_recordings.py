@@ -366,7 +366,6 @@ def recorded_twice(office: Office) -> tuple[Visitor, str, str]:
     (first,) = office.files
     simulation = visitor.session._controls.scene._simulation
     visitor.set(simulation._outliers, 60.0)
-    visitor.set(simulation._noise, 1.3)
     until(lambda: len(office.files) == 2)
     visitor.settle()
     until(lambda: office.recorder.waiting == 0)
@@ -378,7 +377,7 @@ def test_a_run_is_recorded_with_its_origin_and_opened_exactly(office: Office) ->
     visitor, first, second = recorded_twice(office)
     origin = read_recording(office.folder / second).origin
     assert origin is not None and (origin.source, origin.scene_seed) == ("page", 1)
-    assert origin.variation == Variation(noise_px=1.3, outlier_rate=0.6)
+    assert origin.variation == Variation(outlier_rate=0.6)
     assert visitor.rows == "", "nobody sees the list yet"
     visitor.see()
     until(lambda: f"run-open:{first}" in visitor.rows and f"run-open:{second}" in visitor.rows)

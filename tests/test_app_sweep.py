@@ -164,7 +164,7 @@ def test_a_sweep_is_drawn_as_it_goes_cancelled_and_gone_on_with(desk: Desk) -> N
 
 
 def test_one_sweep_at_a_time_on_a_server(desk: Desk) -> None:
-    assert sweep_runs_panel._turn.acquire(timeout=5)
+    assert sweep_runs_panel._turn.acquire(timeout=60)
     try:
         desk.press()
         until(lambda: "waits for it" in desk.status)

@@ -3,12 +3,14 @@
 import contextlib
 import os
 import resource
+import shutil
 import subprocess
 import sys
 import tempfile
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -41,7 +43,7 @@ for number in range(kills):
     reader, writer = os.pipe()
     pid = os.fork()
     if not pid:
-        with Keeper(folder, print) as keeper:
+        with Keeper(folder, sys.stderr.write) as keeper:
             while True:
                 keeper.record(trace)
                 os.write(writer, b"1")
@@ -156,6 +158,16 @@ def test_a_finished_file_without_its_name_is_moved_and_never_onto_another(
     assert path == tmp_path / "a.rrd" and path.read_bytes() == recorded
     assert rescue(part_of(tmp_path, "a.rrd", dead, recorded[:1000])) is None
     assert path.read_bytes() == recorded and len(list(tmp_path.iterdir())) == 1
+
+
+def test_without_room_a_leftover_waits(
+    recorded: bytes, dead: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    part = part_of(tmp_path, "a.rrd", dead, recorded[: len(recorded) * 9 // 10])
+    with monkeypatch.context() as patch:
+        patch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=1000))
+        assert rescue(part) is None and part.exists()
+    assert rescue(part) == tmp_path / "a.rrd" and not part.exists()
 
 
 def test_only_what_nobody_will_finish_is_a_leftover(dead: str, tmp_path: Path) -> None:

@@ -24,6 +24,7 @@ from spherloc_viz.layers import paint, steps
 from spherloc_viz.layers.primitives import Picture
 from spherloc_viz.recording.columns import Values, static_chunk
 from spherloc_viz.recording.layout import APPLICATION_ID, layout_file, shown_in
+from spherloc_viz.recording.letters import legible
 from spherloc_viz.recording.panels import MOST_EDGES, MOST_NODES, panel_chunks, panels_of
 from spherloc_viz.recording.properties import REVIEW_ENTITY
 from spherloc_viz.recording.rerun_program import rerun_command, rerun_environment
@@ -212,6 +213,7 @@ def test_the_viewer_has_no_fault_to_find(
     else:
         trace = made[name]() if name in made else request.getfixturevalue(name)
     path = tmp_path / "run.rrd"
+    trace = replace(trace, message="A message: 新しい ᵀ ∈ \U0001f4f7", problem=replace(trace.problem, name="地図"))
     row = write_recording(trace, path)
     viewer.open(str(path))
     state = wait_for(lambda: state if (state := viewer.get_state()).views else None)
@@ -219,12 +221,41 @@ def test_the_viewer_has_no_fault_to_find(
     assert recording.current_timeline == "step"
     _, views = layout_of(path)
     assert {view.origin for view in state.views} == set(views)
-    for step in (row.decisive_step, row.steps - 1):
+    # The third step has a letter that the viewer's font lacks, and the name of the problem has others.
+    for step in (3, row.decisive_step, row.steps - 1):
         viewer.set_time(timeline="step", sequence=step)
         picture = cv2.imdecode(np.frombuffer(viewer.take_screenshot(max_size=480), np.uint8), cv2.IMREAD_COLOR)
         assert picture is not None and len(np.unique(picture.reshape(-1, 3), axis=0)) > 100, "a picture, not a blank"
         faults = [(view.name, report) for view in viewer.get_state().views for report in view.reports]
         assert faults == []
+
+
+@pytest.mark.parametrize("estimator", ["mc", "mc-exact", "ransac-2p"])
+def test_every_word_can_be_drawn(estimator: str, tmp_path: Path) -> None:
+    trace = estimate(scene_problem("mei_outliers_90"), estimator)
+    path = tmp_path / "run.rrd"
+    write_recording(replace(trace, message="新 ᵀ \u202e"), path, full=True)
+    words = [text for row in texts_of(path) for text in row]
+    assert len(words) > len(steps(trace))
+    for text in words:
+        assert legible(text) == text
+    assert any("A_cam^T" in text.replace("\\", "") for text in words) and any("? ^T ?" in text for text in words)
+
+
+def texts_of(path: Path) -> Iterator[list[str]]:
+    """Everything that the viewer writes, with the names of its views."""
+    reader = RrdReader(path)
+    for entry in (*reader.recordings(), *reader.blueprints()):
+        for chunk in reader.store(store=entry).stream().to_chunks():
+            batch = chunk.to_record_batch()
+            for name in batch.schema.names:
+                if name.endswith((":text", ":labels", ":display_name", "RecordingInfo:name")):
+                    yield from (row for row in batch.column(name).to_pylist() if row)
+
+
+def test_letters_that_the_viewer_lacks_are_replaced() -> None:
+    assert legible("θ ≤ 3°, R^T, naïve, Жук ±½ ‖x‖²") == "θ ≤ 3°, R^T, naïve, Жук ±½ ‖x‖²"
+    assert legible("新\t\ud800\x00") == "????"
 
 
 def test_layouts_are_shared(clique_run: Trace) -> None:

@@ -1,6 +1,5 @@
 """A recording from a stranger costs one sentence at worst: no process, no memory, and not the other recordings."""
 
-import json
 import os
 import re
 import signal
@@ -29,6 +28,7 @@ from hostile_recordings import (
     with_index,
     with_message,
 )
+from impossible_recordings import IMPOSSIBLE, PROBLEM, RUN, RUN_PROPERTY
 from recording_samples import exact_run, lost_run, odd_problem, scene_problem
 from rerun.chunk import Chunk, LazyChunkStream
 
@@ -39,12 +39,11 @@ from spherloc_viz.recording.examine import FILE_LIMIT_BYTES
 from spherloc_viz.recording.reader import read_recording
 from spherloc_viz.recording.review import Review, review_path, write_review
 from spherloc_viz.recording.run_row import RunRow
-from spherloc_viz.recording.strangers import Examiner, check_name, examine, examine_all, resolve_inside
+from spherloc_viz.recording.strangers import Examiner, examine, examine_all
 from spherloc_viz.recording.writer import write_recording
 
 Lie = Callable[[Path], bytes]
 """A bad file from a good one."""
-PROBLEM, RUN, RUN_PROPERTY, YAW = "/data/problem", "/data/run", "/__properties/run", "/data/stages/yaw"
 
 
 @pytest.fixture(scope="module")
@@ -252,156 +251,6 @@ def test_the_tools_of_these_tests_tell_the_truth_where_they_change_nothing(
 # ---------------------------------------------------------------------------------------------- impossible values
 
 
-def values(**own: Any) -> Change:
-    """A row with some of its values changed."""
-
-    def change(row: Mapping[str, Any]) -> Mapping[str, Any]:
-        before, arrays = unpacked(row)
-        assert own.keys() <= before.keys()
-        return packed(before | own, arrays)
-
-    return change
-
-
-def arrays(**own: Any) -> Change:
-    """A row with some of its arrays changed."""
-
-    def change(row: Mapping[str, Any]) -> Mapping[str, Any]:
-        before, all_arrays = unpacked(row)
-        assert own.keys() <= all_arrays.keys()
-        return packed(before, all_arrays | own)
-
-    return change
-
-
-def old_arrays(**own: Any) -> Change:
-    """The same in format 1, where an array has a column and a type of its own."""
-
-    def change(row: Mapping[str, Any]) -> Mapping[str, Any]:
-        before, all_arrays = unpacked(row)
-        return packed_as_format_1(before, all_arrays | own)
-
-    return change
-
-
-def form(name: Any, kind: Any, shape: Any) -> Change:
-    """A row that says this of its first array."""
-
-    def change(row: Mapping[str, Any]) -> Mapping[str, Any]:
-        told = json.loads(row["scalars"][0].values[0].as_py())
-        told["arrays"][0] = [name, kind, shape]
-        return {**row, "scalars": pa.array([[json.dumps(told)]])}
-
-    return change
-
-
-def text(content: str) -> Change:
-    return lambda row: {**row, "scalars": pa.array([[content]])}
-
-
-def properties(**own: Any) -> Change:
-    return lambda row: {**row, **{name: pa.array([[value]]) for name, value in own.items()}}
-
-
-def camera(**own: Any) -> Change:
-    return values(camera={"model": "equirectangular", "width": 100, "height": 50} | own)
-
-
-def variation(**own: Any) -> Change:
-    return lambda row: values(variation=unpacked(row)[0]["variation"] | own)(row)
-
-
-RUNS_ENDED = pa.RunEndEncodedArray.from_arrays(pa.array([10**9], pa.int32()), pa.array([1.0]))
-
-IMPOSSIBLE: dict[str, dict[str, Change]] = {
-    "no problem": {PROBLEM: lambda row: None},
-    "no properties": {RUN_PROPERTY: lambda row: None},
-    "no pixels": {PROBLEM: form("other", "<f8", [100, 2])},
-    "no arrays": {PROBLEM: lambda row: {"scalars": row["scalars"]}},
-    "pixels that are objects": {PROBLEM: form("pixels", "|O8", [100, 2])},
-    "pixels of no type": {PROBLEM: form("pixels", "__import__('os')", [100, 2])},
-    "pixels of a type that is a table": {PROBLEM: form("pixels", {"names": ["a"], "formats": ["O"]}, [100, 2])},
-    "pixels of 10^9 rows": {PROBLEM: form("pixels", "<f8", [10**9, 2])},
-    "pixels of 10^30 rows": {PROBLEM: form("pixels", "<f8", [10**30, 2])},
-    "pixels of -1 rows": {PROBLEM: form("pixels", "<f8", [-1, 2])},
-    "pixels of half a row": {PROBLEM: form("pixels", "<f8", [0.5, 2])},
-    "pixels of a shape that is a word": {PROBLEM: form("pixels", "<f8", "100")},
-    "pixels whose name is a list": {PROBLEM: form(["pixels"], "<f8", [100, 2])},
-    "pixels (N, 3)": {PROBLEM: arrays(pixels=np.zeros((100, 3)))},
-    "no pixel": {PROBLEM: arrays(pixels=np.zeros((0, 2)))},
-    "pixels that are not finite": {PROBLEM: arrays(pixels=np.full((100, 2), np.nan))},
-    "points that are not finite": {PROBLEM: arrays(points=np.full((100, 3), np.inf))},
-    "pixels that are words": {PROBLEM: old_arrays(pixels=pa.array(["a"] * 100))},
-    "pixels that are nothing, 50 million times": {PROBLEM: old_arrays(pixels=pa.nulls(50_000_000))},
-    "a stage of nothing, 50 million times": {YAW: old_arrays(overlap=pa.nulls(50_000_000))},
-    "a stage of one number, 10^9 times": {YAW: old_arrays(overlap=RUNS_ENDED)},
-    "more than a million correspondences": {
-        PROBLEM: arrays(pixels=np.ones((1_000_001, 2)), points=np.ones((1_000_001, 3)))
-    },
-    "inliers that are neither true nor false": {RUN: arrays(inlier_mask=np.full(100, 2, np.uint8).view(bool))},
-    "gravity of length 7": {PROBLEM: arrays(gravity_camera=np.array([7.0, 0.0, 0.0]))},
-    "a pose that is no rotation": {RUN: arrays(cam_from_map=np.ones((3, 4)))},
-    "a pose that is not finite": {RUN: arrays(cam_from_map=np.full((3, 4), np.nan))},
-    "a pose of a wrong shape": {RUN: arrays(cam_from_map=np.ones(12))},
-    "inliers of a wrong shape": {RUN: arrays(inlier_mask=np.ones(7, bool))},
-    "inliers of a wrong type": {RUN: arrays(inlier_mask=np.ones(100))},
-    "a camera with absurd sides": {PROBLEM: camera(width=10**9, height=10**9)},
-    "a camera with endless sides": {PROBLEM: camera(width={"number": "inf"})},
-    "a camera of no kind": {PROBLEM: camera(model="__import__('os')")},
-    "a camera that is a word": {PROBLEM: values(camera="mei")},
-    "an endless bound": {PROBLEM: values(bound_px={"number": "inf"})},
-    "a bound that is a word": {PROBLEM: values(bound_px="3")},
-    "a name of 10 MB": {PROBLEM: values(name="x" * 10_000_000)},
-    "a name of 100 kB": {PROBLEM: values(name="x" * 100_000)},
-    "a name with half a character": {PROBLEM: values(name="\ud800")},
-    "a million reference images": {PROBLEM: values(reference_images=["a"] * 500_000)},
-    "lists nested a million times": {PROBLEM: text("[" * 1_000_000 + "]" * 1_000_000)},
-    "tables nested ten times": {PROBLEM: values(remarks=[[[[[[[[[["deep"]]]]]]]]]])},
-    "a number of 100,000 digits": {PROBLEM: text('{"name": ' + "9" * 100_000 + "}")},
-    "JSON with NaN": {PROBLEM: text('{"name": NaN}')},
-    "no JSON": {PROBLEM: text("hello")},
-    "JSON of a list": {PROBLEM: text("[]")},
-    "a seed that is a word": {RUN: values(seed="one")},
-    "an option that is a table": {RUN: values(options={"bound_px": {"a": 1}})},
-    "options that are a list": {RUN: values(options=[1, 2])},
-    "another estimator than the row": {RUN: values(estimator="ransac-2p")},
-    "a source that there is not": {"/data/origin": values(source="evil")},
-    "a title that is a list": {"/data/origin": values(title=["<b>"])},
-    "a query that is a number": {"/data/origin": values(query=7)},
-    "a change of the noise to a word": {"/data/origin": variation(noise_px="much")},
-    "a change of match 'a'": {"/data/origin": variation(spoiled=["a"])},
-    "a true camera of three numbers": {"/data/origin": variation(true_camera=[1.0, 2.0, 3.0])},
-    "a kind of outliers that there is not": {"/data/origin": variation(outlier_kind="evil")},
-    "another cause than there is": {"/data/diagnosis": values(cause="<script>")},
-    "evidence that is no text": {"/data/diagnosis": values(evidence=[1, 2])},
-    "a field that no run has": {RUN: text('{"arrays": [], "values": {"__class__": "Path"}}')},
-    "a later format": {RUN_PROPERTY: properties(format_version=99)},
-    "a format that is a word": {RUN_PROPERTY: properties(format_version="2")},
-    "-1 inliers": {RUN_PROPERTY: properties(inliers=-1)},
-    "more inliers than correspondences": {RUN_PROPERTY: properties(inliers=101)},
-    "other correspondences than the problem": {RUN_PROPERTY: properties(correspondences=10**9)},
-    "a time that is not finite": {RUN_PROPERTY: properties(time_ms=float("nan"))},
-    "an error below nothing": {RUN_PROPERTY: properties(rotation_error_deg=-1.0)},
-    "150 % outliers": {RUN_PROPERTY: properties(outlier_rate=1.5)},
-    "a decisive step that there is not": {RUN_PROPERTY: properties(decisive_step=10**6)},
-    "a cause that there is not": {RUN_PROPERTY: properties(diagnosis="<script>alert(1)</script>")},
-    "an outcome that there is not": {RUN_PROPERTY: properties(outcome="' OR 1=1 --")},
-    "a date that is none": {RUN_PROPERTY: properties(created="<b>today</b>")},
-    "a date in another order": {RUN_PROPERTY: properties(created="20260101T120000Z")},
-    "an estimator with a path": {RUN_PROPERTY: properties(estimator="../../etc")},
-    "options that are no JSON": {RUN_PROPERTY: properties(options="{")},
-    "a thumbnail that claims 60,000 pixels a side": {
-        "/__properties/thumbnail": lambda row: {**row, "EncodedImage:blob": huge_png(row)}
-    },
-}
-
-
-def huge_png(row: Mapping[str, Any]) -> pa.Array:
-    content = np.array(row["EncodedImage:blob"][0].values[0].as_py(), np.uint8)
-    content[16:24] = np.frombuffer(struct.pack(">II", 60_000, 60_000), np.uint8)
-    return pa.array([[content]], pa.list_(pa.list_(pa.uint8())))
-
-
 @pytest.mark.parametrize("what", IMPOSSIBLE)
 def test_impossible_values_are_one_sentence(good: Path, examiner: Examiner, tmp_path: Path, what: str) -> None:
     sentence(examiner, changed(good, tmp_path / "bad.rrd", IMPOSSIBLE[what]))
@@ -486,54 +335,3 @@ def test_a_child_that_cannot_be_started_is_no_fault_of_a_file(good: Path, monkey
     monkeypatch.setattr(sys, "executable", "/nowhere/python")
     with pytest.raises(RecordingError, match="does not start"):
         list(examine_all([good]))
-
-
-# ---------------------------------------------------------------------------------------------- names
-
-
-def test_names_of_recordings(tmp_path: Path) -> None:
-    for name in ("run.rrd", "20260101T120000Z_a-b.c_mc_0_1a2b3c4d.rrd", "gallery/seam.rrd"):
-        assert check_name(name) == name
-
-
-NO_NAMES = r"""
-../run.rrd /etc/run.rrd gallery/../run.rrd other/run.rrd gallery//run.rrd gallery/gallery/run.rrd run.RRD run .rrd
-run.rrd/ ./run.rrd C:\run.rrd gallery\run.rrd run.rrd;ls $(ls).rrd %2e%2e%2frun.rrd ünicode.rrd run.rrd?x ~/run.rrd
-<b>.rrd runs.sqlite run.rrd.part
-"""
-
-
-@pytest.mark.parametrize("name", [*NO_NAMES.split(), "", "a b.rrd", "run.rrd\n", "run\0.rrd", "x" * 300 + ".rrd"])
-def test_names_that_lead_elsewhere_are_refused(tmp_path: Path, name: str) -> None:
-    with pytest.raises(RecordingError) as error:
-        resolve_inside(tmp_path, name)
-    assert str(error.value).isprintable() and len(str(error.value)) < 300
-
-
-def test_names_are_found_in_their_folder_only(tmp_path: Path) -> None:
-    folder, outside = tmp_path / "recordings", tmp_path / "secret.rrd"
-    (folder / "gallery").mkdir(parents=True)
-    outside.touch()
-    inside = [folder / "run.rrd", folder / "gallery" / "seam.rrd"]
-    for path in inside:
-        path.touch()
-        assert resolve_inside(folder, str(path.relative_to(folder))) == path
-    (folder / "link.rrd").symlink_to("run.rrd")
-    assert resolve_inside(folder, "link.rrd").samefile(inside[0])
-    (folder / "out.rrd").symlink_to(outside)
-    (folder / "loop.rrd").symlink_to("loop.rrd")
-    (folder / "folder.rrd").mkdir()
-    os.mkfifo(folder / "pipe.rrd")
-    for name in ("out.rrd", "loop.rrd", "folder.rrd", "pipe.rrd", "missing.rrd"):
-        with pytest.raises(RecordingError, match="no such recording"):
-            resolve_inside(folder, name)
-
-
-def test_a_gallery_elsewhere_is_not_followed(tmp_path: Path) -> None:
-    folder, outside = tmp_path / "recordings", tmp_path / "outside"
-    folder.mkdir()
-    outside.mkdir()
-    (outside / "run.rrd").touch()
-    (folder / "gallery").symlink_to(outside)
-    with pytest.raises(RecordingError, match="no such recording"):
-        resolve_inside(folder, "gallery/run.rrd")

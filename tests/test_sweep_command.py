@@ -51,7 +51,18 @@ def lines(path: Path) -> int:
 def test_ctrl_c_keeps_what_is_done_and_the_same_command_goes_on(scene: Path, tmp_path: Path) -> None:
     out = tmp_path / "results" / "sweep.csv"
     words = ["--values", "0.5:0.9:0.2", "--estimator", "mc", "--estimator", "ransac-2p,iterations=50"]
-    words += ["--set", "noise_px=1", "correspondences=30", "--runs", "3000", "--workers", "1", "--out", str(out), "--no-record"]
+    words += [
+        "--set",
+        "noise_px=1",
+        "correspondences=30",
+        "--runs",
+        "3000",
+        "--workers",
+        "1",
+        "--out",
+        str(out),
+        "--no-record",
+    ]
     process = subprocess.Popen([*PROGRAM, scene, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     while lines(out) < 20:
         assert process.poll() is None, process.communicate()

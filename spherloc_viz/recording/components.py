@@ -24,6 +24,7 @@ from spherloc_viz.recording.columns import (
     strips,
     vectors,
 )
+from spherloc_viz.recording.letters import legible
 from spherloc_viz.recording.markdown import step_text, table_text
 from spherloc_viz.recording.query_image import DOT_PX, Keypoints
 
@@ -32,8 +33,8 @@ rr.set_strict_mode(True)
 
 Rows = list[Any]
 """One primitive per row, or None where it is absent and the row clears it."""
-WORDS = int(packed(np.array([style.SPHERE]))[0])
-"""Colour of words in the scene."""
+WORDS = int(packed(np.array([style.SCALE]))[0])
+"""Colour of words in the scene, which reads on dark and on light."""
 SOLID: int = rr.components.FillModeBatch(["solid"]).as_arrow_array()[0].as_py()
 
 
@@ -150,7 +151,7 @@ def _label(rows: Rows) -> list[Values]:
     batch = vectors(np.concatenate(places), VECTOR_3D)
     return [
         Values(rr.Points3D.descriptor_positions(), batch, [len(place) for place in places]),
-        _single(rows, rr.Points3D.descriptor_labels(), pa.utf8(), lambda row: row.text),
+        _single(rows, rr.Points3D.descriptor_labels(), pa.utf8(), lambda row: legible(row.text)),
         # Without a colour, rerun makes one up.
         _single(rows, rr.Points3D.descriptor_colors(), pa.uint32(), lambda row: WORDS),
         # The word is what is shown, not the dot that rerun hangs it on.

@@ -3,6 +3,7 @@
 import contextlib
 import sqlite3
 import threading
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,8 +20,10 @@ from spherloc_viz.recording.run_row import RunRow
 from spherloc_viz.recording.strangers import check_name
 
 T = TypeVar("T")
-MOST_REFRESHES = 3
-"""Tries to read the files into a database that gets damaged meanwhile."""
+MOST_TRIES = 4
+"""With a database that gets damaged or set aside meanwhile."""
+PAUSE_S = 0.02
+"""Another process needs less to rename a database."""
 
 
 @dataclass(frozen=True)
@@ -165,13 +168,13 @@ class RunIndex:
         """Read all recordings of the folder again, after a check of the database."""
         with self._lock:
             if self._read(lambda connection: connection.execute("PRAGMA quick_check(1)").fetchone()) != ("ok",):
-                self._set_aside("is damaged")
+                self._set_aside("is damaged", self._file)
         return self._refresh(True, progress, examine)
 
     def _refresh(self, everything: bool, progress: Progress | None, examine: Examine) -> Refreshed:
         refresher = Refresher(self.folder, self._write, examine)
         with self._refreshing:
-            for _ in range(MOST_REFRESHES):
+            for _ in range(MOST_TRIES):
                 self._read(lambda connection: None)
                 opened = self._opened
                 refreshed = refresher.refresh(everything, progress or (lambda done, total: None))
@@ -179,7 +182,7 @@ class RunIndex:
                     self.stale = False
                     return refreshed
                 everything = False
-        raise RecordingError(f"{self.path}: the list of runs is damaged again and again; check the disk.")
+        raise self._damaged_again()
 
     def close(self) -> None:
         """Close the database; nothing else works after that."""
@@ -203,16 +206,25 @@ class RunIndex:
 
     def _do(self, begin: str, work: Callable[[sqlite3.Connection], T]) -> T:
         with self._lock:
-            try:
-                return self._transact(begin, work)
-            except sqlite3.DatabaseError as error:
-                if not index_file.is_damage(error):
-                    raise RecordingError(index_file.sentence(self.path, error)) from error
-                self._set_aside("is damaged")
-            try:
-                return self._transact(begin, work)
-            except sqlite3.DatabaseError as error:
-                raise RecordingError(index_file.sentence(self.path, error)) from error
+            for tries_left in reversed(range(MOST_TRIES)):
+                try:
+                    result = self._transact(begin, work)
+                except sqlite3.DatabaseError as error:
+                    if index_file.is_damage(error):
+                        self._set_aside("is damaged", self._file)
+                    elif tries_left and index_file.may_pass(error):
+                        self._drop()
+                        time.sleep(PAUSE_S)
+                    else:
+                        raise RecordingError(index_file.sentence(self.path, error)) from error
+                    continue
+                # What was written to a file that another process has just set aside must be written again.
+                if self._file is None or self._file == index_file.identity(self.path):
+                    return result
+        raise self._damaged_again()
+
+    def _damaged_again(self) -> RecordingError:
+        return RecordingError(f"{self.path}: the list of runs gets damaged again and again; check the disk.")
 
     def _transact(self, begin: str, work: Callable[[sqlite3.Connection], T]) -> T:
         connection = self._connected()
@@ -236,25 +248,30 @@ class RunIndex:
         self._drop()
         self.stale = True
         self._opened += 1
-        try:
-            self._connection = index_file.connect(self.path)
-        except index_file.UnfitError as error:
-            self._set_aside(str(error))
-            self._connection = index_file.connect(self.path)
-        except PermissionError:
-            self._connection = index_file.memory(self.path)
-            self._notice(f"{self.path}: cannot be written, so changes of the list of runs are kept in memory only.")
-            return self._connection
-        self._file = index_file.identity(self.path)
-        return self._connection
+        for _ in range(MOST_TRIES):
+            before = index_file.identity(self.path)
+            try:
+                connection = index_file.connect(self.path)
+            except index_file.UnfitError as error:
+                self._set_aside(str(error), before)
+                continue
+            except PermissionError:
+                self._connection = index_file.memory(self.path)
+                self._notice(f"{self.path}: cannot be written, so changes of the list of runs are kept in memory only.")
+                return self._connection
+            self._connection, self._file = connection, index_file.identity(self.path)
+            if before in (None, self._file):
+                return connection
+            self._drop()  # it was set aside while it was opened
+        raise self._damaged_again()
 
-    def _set_aside(self, reason: str) -> None:
-        """Rename the database, unless another process has done so."""
-        file = self._file or index_file.identity(self.path)
+    def _set_aside(self, reason: str, file: tuple[int, int] | None) -> None:
+        """Rename the database, unless another process has done so: it must still be that file."""
         self._drop()
-        if file is not None and file == index_file.identity(self.path):
-            aside = index_file.set_aside(self.path)
-            self._notice(f"{self.path} {reason}; it is kept as {aside.name} and the list is made anew from the files.")
+        if aside := index_file.set_aside(self.path, file):
+            self._notice(
+                f"{self.path} {reason}; it is kept as {aside.name} and the list is made anew from the recordings."
+            )
 
     def _drop(self) -> None:
         connection, self._connection, self._file = self._connection, None, None

@@ -3,11 +3,17 @@
 import contextlib
 import os
 import sqlite3
+from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 
 from spherloc.errors import RecordingError
 from spherloc_viz.recording.index_rows import SCHEMA
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None
 
 FILE_NAME = "runs.sqlite"
 """In the folder of the recordings."""
@@ -37,6 +43,11 @@ def primary_code(error: sqlite3.Error) -> int:
 def is_damage(error: sqlite3.Error) -> bool:
     """Whether the file's content is broken."""
     return primary_code(error) in _DAMAGED
+
+
+def may_pass(error: sqlite3.Error) -> bool:
+    """Whether it may be that another process is just renaming the file."""
+    return primary_code(error) == sqlite3.SQLITE_IOERR
 
 
 def connect(path: Path) -> sqlite3.Connection:
@@ -124,28 +135,40 @@ def _schema(connection: sqlite3.Connection) -> set[str | None]:
     return {sql for (sql,) in rows}
 
 
-def set_aside(path: Path) -> Path:
-    """Rename the file, and what SQLite keeps beside it, and return its new name. Nothing is deleted.
+def set_aside(path: Path, file: tuple[int, int] | None) -> Path | None:
+    """Rename the database, and what SQLite keeps beside it, and return its new name. Nothing is deleted.
 
-    Raises ``RecordingError`` if that cannot be done.
+    None if it is not that ``file`` any more: another process has renamed it and made a new one. Raises
+    ``RecordingError`` if it cannot be renamed.
     """
     when = datetime.now(UTC).strftime("%Y%m%dT%H%M%S%f")
     aside = path.with_name(f"{path.name}.{when}.aside")
-    # The file itself last: whoever finds no file makes a new one, and must not find the old one's log beside it.
-    moves = [(path.with_name(path.name + end), aside.with_name(aside.name + end)) for end in ("-wal", "-shm", "")]
-    done: list[tuple[Path, Path]] = []
     try:
-        for old, new in moves:
-            if old == path or old.exists():
-                old.rename(new)
-                done.append((old, new))
+        with _alone(path.parent):
+            if file is None or file != identity(path):
+                return None
+            # The file itself last: whoever finds none makes a new one, and must not find the old one's log beside it.
+            for end in ("-wal", "-shm", ""):
+                with contextlib.suppress(FileNotFoundError):
+                    path.with_name(path.name + end).rename(aside.with_name(aside.name + end))
     except OSError as error:
-        for old, new in done:
-            with contextlib.suppress(OSError):
-                new.rename(old)
         reason = error.strerror or error
         raise RecordingError(f"{path}: cannot be used nor renamed ({reason}); move it away.") from error
     return aside
+
+
+@contextlib.contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """While no other process sets a database of the folder aside, where the system can see to that."""
+    if fcntl is None:
+        yield
+        return
+    place = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(place, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(place)
 
 
 def sentence(path: Path, error: Exception) -> str:

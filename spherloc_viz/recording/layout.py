@@ -12,6 +12,7 @@ from rerun.blueprint import archetypes
 from spherloc_viz.layers.primitives import Chart, Picture
 from spherloc_viz.recording.columns import TIMELINE
 from spherloc_viz.recording.drawing import chart_path, table_path
+from spherloc_viz.recording.letters import legible
 from spherloc_viz.recording.panels import ARCS, GRAPH, RESIDUALS, Panels
 from spherloc_viz.recording.properties import REVIEW_ENTITY
 from spherloc_viz.recording.rrd_file import RrdFile, split
@@ -42,7 +43,9 @@ def shown_in(pictures: Sequence[Picture], panels: Panels) -> Shown:
     for picture in pictures:
         for chart in picture.charts:
             charts.setdefault(chart.name, chart)
-    named = tuple((name, f"{chart.title}: {chart.y_label} over {chart.x_label}") for name, chart in charts.items())
+    named = tuple(
+        (name, legible(f"{chart.title}: {chart.y_label} over {chart.x_label}")) for name, chart in charts.items()
+    )
     tables = tuple(dict.fromkeys(table.name for picture in pictures[:-1] for table in picture.tables))
     return Shown(named, tables, panels)
 

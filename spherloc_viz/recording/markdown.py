@@ -6,14 +6,15 @@ from typing import Any
 
 from spherloc.diagnosis import Cause, Diagnosis
 from spherloc_viz.layers.primitives import Step, Table
+from spherloc_viz.recording.letters import legible
 from spherloc_viz.recording.run_row import RunRow
 
 _MARKUP = re.compile(r"([\\`*_{}\[\]<>#+\-!|~$&])")
 
 
 def plain(text: str) -> str:
-    """``text`` on one line, shown as it is."""
-    return _MARKUP.sub(r"\\\1", " ".join(text.split()))
+    """``text`` on one line, shown as it is, as far as the viewer has letters for it."""
+    return _MARKUP.sub(r"\\\1", legible(" ".join(text.split())))
 
 
 def step_text(step: Step) -> str:

@@ -21,6 +21,7 @@ from spherloc.problem import Problem
 from spherloc.trace import Trace
 from spherloc_viz.options import json_text
 from spherloc_viz.recording.columns import Values, encoded_image, named_values, static_chunk
+from spherloc_viz.recording.letters import legible
 from spherloc_viz.recording.origin import Origin
 from spherloc_viz.recording.run_row import RunRow
 
@@ -119,7 +120,7 @@ def property_chunks(trace: Trace, row: RunRow, created: datetime) -> Iterator[Ch
     yield static_chunk(f"/__properties/{RUN_PROPERTY}", named_values(values))
     if row.thumbnail:
         yield static_chunk(f"/__properties/{THUMBNAIL_PROPERTY}", encoded_image(row.thumbnail, "image/png"))
-    name = f"{row.name}, {trace.estimator}, seed {trace.seed}"
+    name = legible(" ".join(f"{row.name}, {trace.estimator}, seed {trace.seed}".split()))
     info = rr.archetypes.RecordingInfo
     start_ns = pa.array([int(created.timestamp() * 1e9)], pa.int64())
     columns = [Values(info.descriptor_name(), pa.array([name]), [1])]

@@ -1,6 +1,7 @@
 """Makes recordings of what killed processes left unfinished."""
 
 import contextlib
+import shutil
 import subprocess
 from pathlib import Path
 
@@ -10,6 +11,8 @@ from spherloc_viz.recording.reader import read_recording
 from spherloc_viz.recording.rerun_program import rerun_command, rerun_environment
 from spherloc_viz.recording.review import REVIEW_SUFFIX
 
+ROOM = 4
+"""A recovered recording takes up to twice the room of what it is made of, since it is packed less tightly."""
 MERGE_LIMIT_S = 60.0
 """rerun takes a twentieth of a second; one that takes this long has got stuck."""
 
@@ -18,22 +21,29 @@ def rescue(part: Path) -> Path | None:
     """Make a recording of what is left of one, if there is enough; returns its path, or None.
 
     The problem and the result come first in a file, so that even a fifth of it has all that repeats the run. The
-    leftover is gone afterwards, in either case. Raises ``OSError`` if the folder cannot be written.
+    leftover is gone afterwards, unless the disk has no room to recover it. Raises ``OSError`` if the folder cannot be
+    written.
     """
     target = target_of(part)
     if target is None:
         return None
     mended = unfinished(target)
     try:
-        if target.exists() or target.name.endswith(REVIEW_SUFFIX):
-            return None
-        whole = part if _readable(part) else mended if _merged(part, mended) and _readable(mended) else None
-        return None if whole is None else whole.replace(target)
+        if not target.exists() and not target.name.endswith(REVIEW_SUFFIX):
+            if _readable(part):
+                return part.replace(target)
+            if shutil.disk_usage(part.parent).free < ROOM * part.stat().st_size:
+                return None
+            if _merged(part, mended) and _readable(mended):
+                mended.replace(target)
+                part.unlink()
+                return target
+        part.unlink()
+        return None
     except FileNotFoundError:
         return None  # another process has done it meanwhile
     finally:
         mended.unlink(missing_ok=True)
-        part.unlink(missing_ok=True)
 
 
 def _readable(path: Path) -> bool:

@@ -79,11 +79,15 @@ def prunable(row: RunRow) -> bool:
 
 
 def _candidates(index: RunIndex) -> Iterator[RunRow]:
-    """Runs that may be deleted, the oldest first, each once."""
-    seen = {row.file for row in index.find(RunQuery(), limit=NEWEST_KEPT).rows}
-    while rows := [row for row in index.oldest_successes(AT_ONCE + len(seen)) if row.file not in seen]:
-        seen.update(row.file for row in rows)
-        yield from filter(prunable, rows)
+    """Runs that may be deleted, the oldest first, each once. Those that are must leave the index too."""
+    spared = {row.file for row in index.find(RunQuery(), limit=NEWEST_KEPT).rows}
+    while rows := [row for row in index.oldest_successes(AT_ONCE + len(spared)) if row.file not in spared]:
+        for row in rows:
+            fit = prunable(row)
+            if fit:
+                yield row
+            if not fit or (index.folder / row.file).exists():
+                spared.add(row.file)
 
 
 def _delete(path: Path, row: RunRow) -> bool:

@@ -19,7 +19,7 @@ h1{font-size:1.5em;margin:0 0 .2em}h2{font-size:1.05em;margin:1.4em 0 .3em}
 th,td{text-align:left;vertical-align:top;padding:.45em .7em .45em 0;border-top:1px solid rgba(128,140,160,.25)}
 th{font-weight:600;white-space:nowrap;border-top:0}code{font:12px ui-monospace,Menlo,Consolas,monospace}
 td code{overflow-wrap:anywhere}.name{font-weight:600}.wide{min-width:15em}.num{white-space:nowrap}
-.counts span{display:inline-block;margin:0 1.4em .3em 0}
+.counts>span{display:inline-block;margin:0 1.4em .3em 0}
 .bar{display:inline-block;height:.6em;border-radius:.3em;margin-right:.5em;vertical-align:.02em}
 """
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
