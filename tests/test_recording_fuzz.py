@@ -75,7 +75,7 @@ def test_whatever_passes_can_be_read_and_the_rest_is_one_sentence(
     good: Path, tmp_path: Path, rng: np.random.Generator
 ) -> None:
     paths = []
-    for number, content in enumerate(hostile_files(good, rng, 90)):
+    for number, content in enumerate(hostile_files(good, rng, 60)):
         paths.append(tmp_path / f"{number}.rrd")
         paths[-1].write_bytes(content)
     content = good.read_bytes()
@@ -93,7 +93,7 @@ def test_whatever_passes_can_be_read_and_the_rest_is_one_sentence(
             assert text.startswith(f"{path}: ") and text.endswith(".") and text.isprintable() and len(text) < 700
         if path.name.startswith("cut"):
             assert isinstance(result, RecordingError) and "not a whole recording" in str(result)
-    assert 0 < passed < 40
+    assert 0 < passed < 30
 
 
 def foreign(path: Path) -> None:

@@ -71,7 +71,7 @@ rows = st.builds(
 
 
 @given(rows)
-@settings(max_examples=100)
+@settings(max_examples=40)
 def test_a_row_passes_between_processes_unchanged(row: RunRow) -> None:
     assert row_from_table(json.loads(json.dumps(table_from_row(row))), Path("recordings/run.rrd")) == row
 
@@ -81,7 +81,7 @@ def test_a_row_passes_through_the_index_unchanged(tmp_path: Path) -> None:
     with RunIndex(tmp_path) as index:
 
         @given(rows)
-        @settings(max_examples=60)
+        @settings(max_examples=25)
         def check(row: RunRow) -> None:
             index.add(row)
             assert index.get(row.file) == row
@@ -97,7 +97,7 @@ def test_texts_pass_through_a_file_unchanged(tmp_path: Path) -> None:
     path = tmp_path / "run.rrd"
 
     @given(name=anything, scene=anything, message=anything, title=anything, label=anything, note=anything)
-    @settings(max_examples=8)
+    @settings(max_examples=5)
     def check(name: str, scene: str, message: str, title: str, label: str, note: str) -> None:
         run = replace(trace, problem=replace(trace.problem, name=name, scene=scene), message=message)
         written = write_recording(run, path, Origin("page", title=title))

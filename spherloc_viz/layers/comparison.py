@@ -52,7 +52,7 @@ SAMPLES = 120
 """Corners of a residual curve."""
 SMALLER = 0.09
 """Cameras at one place are nested: each is smaller by this share of the first."""
-SIZE, TOWER, STOREY = 1.9, 1.75, 0.5
+SIZE, TOWER, STOREY = 1.9, 1.75, 0.7
 """Size of the first camera, and heights of the lowest name and of each name above it, in sphere radii."""
 LOWER = 0.07
 """Markers at one yaw: each is lower by this share of the first."""

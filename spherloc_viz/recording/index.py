@@ -207,12 +207,13 @@ class RunIndex:
     def _do(self, begin: str, work: Callable[[sqlite3.Connection], T]) -> T:
         with self._lock:
             for tries_left in reversed(range(MOST_TRIES)):
+                began = time.monotonic()
                 try:
                     result = self._transact(begin, work)
                 except sqlite3.DatabaseError as error:
                     if index_file.is_damage(error):
                         self._set_aside("is damaged", self._file)
-                    elif tries_left and index_file.may_pass(error):
+                    elif tries_left and index_file.may_pass(error, time.monotonic() - began):
                         self._drop()
                         time.sleep(PAUSE_S)
                     else:

@@ -45,9 +45,13 @@ def is_damage(error: sqlite3.Error) -> bool:
     return primary_code(error) in _DAMAGED
 
 
-def may_pass(error: sqlite3.Error) -> bool:
-    """Whether it may be that another process is just renaming the file."""
-    return primary_code(error) == sqlite3.SQLITE_IOERR
+def may_pass(error: sqlite3.Error, after_s: float) -> bool:
+    """Whether it may be that another process is just making or renaming the file.
+
+    SQLite does not wait for everything: an error of a locked file may come at once.
+    """
+    code = primary_code(error)
+    return code == sqlite3.SQLITE_IOERR or (code in _BUSY and after_s < BUSY_S / 2)
 
 
 def connect(path: Path) -> sqlite3.Connection:

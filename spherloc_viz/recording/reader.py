@@ -64,7 +64,7 @@ class RecordedRun:
     message: str
     """The outcome in one sentence."""
     stages: Mapping[str, Mapping[str, Any]]
-    """Fields of each stage by its kind; large arrays are left out, as they follow from the rest."""
+    """Fields of each stage by its kind; a lean recording has no large arrays, which follow from the rest."""
     certificate: Certificate | None
     """What is proven about the consensus; None if nothing is, as in recordings older than certificates."""
     origin: Origin | None

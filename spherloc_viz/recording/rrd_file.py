@@ -132,19 +132,19 @@ def _coded(value: int) -> bytes:
     return bytes(out)
 
 
-@numba.njit("uint32(uint32, uint32)", cache=True, nogil=True, inline="always")
+@numba.njit(cache=True, nogil=True, inline="always")
 def _rotated(value, by):
     return np.uint32((value << by) | (value >> np.uint32(np.uint32(32) - by)))
 
 
-@numba.njit("uint32(Array(uint8, 1, 'C', readonly=True), uint32)", cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True)
 def xxh32(data, seed):
     """The hash XXH32 of bytes, by which rerun checks an index."""
     p1, p2, p3 = np.uint32(2654435761), np.uint32(2246822519), np.uint32(3266489917)
     p4, p5 = np.uint32(668265263), np.uint32(374761393)
-    size, at = len(data), 0
+    seed, size, at = np.uint32(seed), len(data), 0
     if size >= 16:
-        lanes = np.array([seed + p1 + p2, seed + p2, seed, seed - p1], np.uint32)
+        lanes = np.array([np.uint32(seed + p1 + p2), np.uint32(seed + p2), seed, np.uint32(seed - p1)], np.uint32)
         while at + 16 <= size:
             for k in range(4):
                 word = np.uint32(data[at]) | np.uint32(data[at + 1]) << np.uint32(8)

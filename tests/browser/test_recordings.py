@@ -1,4 +1,4 @@
-"""Reviewing as a person does it: find runs, open them exactly as they were, label them, go on by key, take them away."""
+"""Reviewing as a person does it: find runs, open them just as they were, label them, go on by key, take them away."""
 
 import csv
 import io

@@ -16,8 +16,8 @@ DATA = "/viewer/data/"
 _SORRY = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><title>spherloc</title><link rel="icon" href="data:,">
 <style>html{{color-scheme:light dark}}
-body{{font:16px/1.5 system-ui,sans-serif;max-width:40rem;margin:18vh auto;padding:0 1rem;overflow-wrap:anywhere}}</style>
-</head>
+body{{font:16px/1.5 system-ui,sans-serif;max-width:40rem;margin:18vh auto;padding:0 1rem;overflow-wrap:anywhere}}
+</style></head>
 <body><p>{sentence}</p></body></html>
 """
 SORRY_POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; frame-ancestors 'none'"
