@@ -202,7 +202,7 @@ def _limit(limit: int | None, form: str) -> int | None:
 def _refresh(index: RunIndex) -> None:
     """Read what is new; files that are no runs are a line."""
     if skipped := _read_files(index, everything=False).skipped:
-        say(f"{_count(len(skipped), 'file')} left out, such as {skipped[0][0]}; spherloc reindex says why.")
+        say(f"{_count(len(skipped), 'file')} left out, such as {show(skipped[0][0])}; spherloc reindex says why.")
 
 
 def _read_files(index: RunIndex, everything: bool) -> Refreshed:

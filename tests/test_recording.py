@@ -28,9 +28,9 @@ from spherloc_viz.layers.decisive import decisive_step
 from spherloc_viz.layers.primitives import Balls, Label, Mesh, Points, Segments, Stop, Textured
 from spherloc_viz.recording import data
 from spherloc_viz.recording.chart_bars import LEVEL_OPACITY
-from spherloc_viz.recording.layout import APPLICATION_ID
 from spherloc_viz.recording.letters import legible
 from spherloc_viz.recording.machine import machine
+from spherloc_viz.recording.properties import APPLICATION_ID
 from spherloc_viz.recording.reader import check_recording, read_recording
 from spherloc_viz.recording.rerun_program import rerun_command, rerun_environment
 from spherloc_viz.recording.writer import recorded_steps, write_recording

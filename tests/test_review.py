@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from rerun.chunk import RrdReader
 
 from spherloc.errors import InputError, RecordingError
-from spherloc_viz.recording.layout import APPLICATION_ID
+from spherloc_viz.recording.properties import APPLICATION_ID
 from spherloc_viz.recording.review import (
     MOST_BYTES,
     MOST_LABEL_CHARACTERS,

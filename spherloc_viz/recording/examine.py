@@ -23,7 +23,7 @@ from rerun.error_utils import RerunWarning
 from spherloc.errors import RecordingError, SpherlocError
 from spherloc_viz.recording.checked_row import row_from_table, table_from_row
 from spherloc_viz.recording.content_check import check_content, check_run
-from spherloc_viz.recording.layout import APPLICATION_ID
+from spherloc_viz.recording.properties import APPLICATION_ID
 from spherloc_viz.recording.reader import check_recording, read_recording
 from spherloc_viz.recording.review import read_review
 from spherloc_viz.recording.run_row import RunRow

@@ -10,14 +10,12 @@ import rerun.blueprint as rrb
 from rerun.blueprint import archetypes
 
 from spherloc_viz.layers.primitives import Chart, Picture
-from spherloc_viz.recording.columns import TIMELINE
 from spherloc_viz.recording.drawing import chart_path, table_path
 from spherloc_viz.recording.letters import legible
 from spherloc_viz.recording.panels import ARCS, GRAPH, RESIDUALS, Panels
-from spherloc_viz.recording.properties import REVIEW_ENTITY
+from spherloc_viz.recording.properties import APPLICATION_ID, REVIEW_ENTITY
 from spherloc_viz.recording.rrd_file import RrdFile, split
 
-APPLICATION_ID = "spherloc"
 EYE = (1.15, -1.2, -1.55)
 """Where one looks from, in the frame in which the scene has radius 1: from the same side as the page's overview."""
 LAYOUT_ROOM = 1 << 20
@@ -70,7 +68,8 @@ def blueprint(shown: Shown) -> rrb.Blueprint:
     left = rrb.Vertical(_scene(), rrb.Horizontal(*_flat_views(shown.panels)), row_shares=[2.2, 1])
     return rrb.Blueprint(
         rrb.Horizontal(left, rrb.Vertical(*side, row_shares=[1.3, *[1] * (len(side) - 2), 1.5]), column_shares=[3, 2]),
-        rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="paused"),
+        # Without its timeline: rerun chooses the only one, and says that a named one is missing while it still loads.
+        rrb.TimePanel(state="collapsed", play_state="paused"),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
     )

@@ -9,6 +9,7 @@ import json
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, fields
 from datetime import datetime
+from pathlib import Path
 from typing import Any, cast, get_args
 
 import pyarrow as pa
@@ -25,6 +26,8 @@ from spherloc_viz.recording.letters import legible
 from spherloc_viz.recording.origin import Origin
 from spherloc_viz.recording.run_row import RunRow
 
+APPLICATION_ID = "spherloc"
+"""What Rerun keeps our recordings, and their layout, apart from others by."""
 FORMAT_VERSION = 2
 """Of what is recorded and how. A reader opens this one and older ones."""
 OLDEST_VERSION = 1
@@ -76,7 +79,7 @@ def run_row(
     return RunRow(
         created=created.isoformat(timespec="milliseconds"),
         source=origin.source,
-        scene=_cut(problem.scene),
+        scene=_cut(problem.scene if origin.scene_path is None else Path(origin.scene_path).name),
         name=_cut(problem.name),
         query=_cut(problem.image.name) if origin.query is None and problem.image is not None else origin.query,
         estimator=trace.estimator,

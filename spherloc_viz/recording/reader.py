@@ -16,9 +16,9 @@ from spherloc.errors import InputError, RecordingError, show
 from spherloc.problem import Problem
 from spherloc.trace import Certificate
 from spherloc_viz.recording.data import diagnosis_from_row, origin_from_row, problem_from_row, read_row
-from spherloc_viz.recording.layout import APPLICATION_ID
 from spherloc_viz.recording.origin import Origin
 from spherloc_viz.recording.properties import (
+    APPLICATION_ID,
     FORMAT_VERSION,
     OLDEST_VERSION,
     QUERY_IMAGE,

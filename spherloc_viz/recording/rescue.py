@@ -7,9 +7,9 @@ from pathlib import Path
 
 from spherloc.errors import RecordingError
 from spherloc_viz.recording.leftovers import target_of, unfinished
-from spherloc_viz.recording.reader import read_recording
 from spherloc_viz.recording.rerun_program import rerun_command, rerun_environment
 from spherloc_viz.recording.review import REVIEW_SUFFIX
+from spherloc_viz.recording.strangers import examine
 
 ROOM = 4
 """A recovered recording takes up to twice the room of what it is made of, since it is packed less tightly."""
@@ -47,8 +47,9 @@ def rescue(part: Path) -> Path | None:
 
 
 def _readable(path: Path) -> bool:
+    """Whether it is whole. What a power cut leaves can end the process that reads it, so another one does."""
     with contextlib.suppress(RecordingError):
-        read_recording(path)
+        examine(path)
         return True
     return False
 

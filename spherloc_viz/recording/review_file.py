@@ -12,9 +12,8 @@ from rerun.chunk import Chunk, LazyChunkStream, RrdReader
 from rerun.error_utils import RerunWarning
 
 from spherloc.errors import RecordingError
-from spherloc_viz.recording.layout import APPLICATION_ID
 from spherloc_viz.recording.markdown import plain
-from spherloc_viz.recording.properties import REVIEW_ENTITY, REVIEW_PROPERTY
+from spherloc_viz.recording.properties import APPLICATION_ID, REVIEW_ENTITY, REVIEW_PROPERTY
 
 
 def write_file(path: Path, labels: Sequence[str], note: str, run_id: str) -> None:

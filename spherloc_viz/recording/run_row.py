@@ -16,7 +16,7 @@ class RunRow:
     source: str
     """Who ran it: page, command, sweep, sequence, gallery or unknown."""
     scene: str
-    """Scene file or description."""
+    """Name of its scene file, or a description."""
     name: str
     """Name of the problem."""
     query: str | None

@@ -21,13 +21,13 @@ from spherloc_viz.layers.step_numbers import step_numbers
 from spherloc_viz.recording.columns import markdown, static_chunk
 from spherloc_viz.recording.data import data_chunks
 from spherloc_viz.recording.drawing import drawing_chunks
-from spherloc_viz.recording.layout import APPLICATION_ID, layout_file, shown_in
+from spherloc_viz.recording.layout import layout_file, shown_in
 from spherloc_viz.recording.leftovers import scratch, unfinished
 from spherloc_viz.recording.markdown import outcome_text
 from spherloc_viz.recording.numbers import numbers_chunk
 from spherloc_viz.recording.origin import Origin
 from spherloc_viz.recording.panels import Panels, panel_chunks, panels_of
-from spherloc_viz.recording.properties import property_chunks, run_row
+from spherloc_viz.recording.properties import APPLICATION_ID, property_chunks, run_row
 from spherloc_viz.recording.query_image import image_chunks, query_image
 from spherloc_viz.recording.rrd_file import joined, split
 from spherloc_viz.recording.run_row import RunRow
