@@ -28,13 +28,13 @@ from spherloc.trace import Trace
 from spherloc_viz.layers import paint, steps
 from spherloc_viz.layers.decisive import decisive_step
 from spherloc_viz.layers.primitives import Balls, Label, Mesh, Picture, Points, SceneItem, Segments
-from spherloc_viz.recording.chart_bars import bars
-from spherloc_viz.recording.drawing import chart_path
-from spherloc_viz.recording.layout import blueprint, shown_in
-from spherloc_viz.recording.markdown import step_text
-from spherloc_viz.recording.panels import panels_of
-from spherloc_viz.recording.properties import APPLICATION_ID
-from spherloc_viz.recording.writer import recorded_steps, write_recording
+from spherloc_viz.recording.content.chart_bars import bars
+from spherloc_viz.recording.content.drawing import chart_path
+from spherloc_viz.recording.content.layout import blueprint, shown_in
+from spherloc_viz.recording.content.markdown import step_text
+from spherloc_viz.recording.content.panels import panels_of
+from spherloc_viz.recording.content.properties import APPLICATION_ID
+from spherloc_viz.recording.content.writer import recorded_steps, write_recording
 
 RUNS = (("mei_outliers_80", "mc"), ("mei_outliers_90", "mc-exact"), ("fisheye_outliers_80", "ransac-2p"))
 

@@ -21,8 +21,8 @@ import numpy as np
 
 from benchmarks.machine import describe
 from spherloc.diagnosis import Cause
-from spherloc_viz.recording.index import RunIndex
-from spherloc_viz.recording.query import GROUP_KEYS, OUTCOMES, SORT_KEYS, Range, RunQuery
+from spherloc_viz.recording.index.query import GROUP_KEYS, OUTCOMES, SORT_KEYS, Range, RunQuery
+from spherloc_viz.recording.index.run_index import RunIndex
 from spherloc_viz.recording.run_row import RunRow
 
 RESULTS = Path(__file__).parent / "results" / "run_index.json"

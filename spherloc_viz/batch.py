@@ -21,12 +21,12 @@ from spherloc.trace import Trace
 from spherloc_viz.layers.certificate import chance, proof, warning
 from spherloc_viz.options import json_text, option_fields
 from spherloc_viz.progress import prepare, say
+from spherloc_viz.recording.keeping.room import KEEP_GIGABYTES, kept_bytes
 from spherloc_viz.recording.origin import Origin
-from spherloc_viz.recording.room import KEEP_GIGABYTES, kept_bytes
 from spherloc_viz.share import is_recording
 
 if TYPE_CHECKING:
-    from spherloc_viz.recording.keeper import Keeper
+    from spherloc_viz.recording.keeping.keeper import Keeper
 
 
 @dataclass(frozen=True)
@@ -83,13 +83,13 @@ def open_scene(path: Path) -> Scene:
     """The scene of a scene file or of a recording; raises ``SpherlocError`` if it is neither."""
     if not is_recording(path):
         return load_scene(path)
-    from spherloc_viz.recording.scene import load_recorded_scene
+    from spherloc_viz.recording.again.scene import load_recorded_scene
 
     return load_recorded_scene(path)
 
 
 def _origin(path: Path, scene: Scene, seed: int | None, query: str | None, variation: Variation) -> Origin:
-    from spherloc_viz.recording.scene import origin_of
+    from spherloc_viz.recording.again.scene import origin_of
 
     return origin_of("command", path, scene, seed, query, variation)
 
@@ -105,7 +105,7 @@ def keeper_of(records: Records | None) -> "Iterator[Keeper | None]":
         return
     keep_bytes = kept_bytes(records.keep_gigabytes)
     # Only now, since it takes most of a second.
-    from spherloc_viz.recording.keeper import Keeper
+    from spherloc_viz.recording.keeping.keeper import Keeper
 
     with Keeper(records.folder, say, records.full, keep_bytes) as keeper:
         with suppress(OSError):  # whoever cannot read the folder is told when a run cannot be written

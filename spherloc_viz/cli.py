@@ -12,7 +12,7 @@ from tyro.extras import SubcommandApp
 
 from spherloc.errors import SpherlocError
 from spherloc_viz import recording_commands
-from spherloc_viz.recording.room import KEEP_GIGABYTES
+from spherloc_viz.recording.keeping.room import KEEP_GIGABYTES
 
 RECORDINGS = Path("recordings")
 Settings = Annotated[tyro.conf.UseAppendAction[tuple[tuple[str, ...], ...]], arg(metavar="KEY=VALUE ...")]

@@ -24,7 +24,7 @@ from spherloc_viz.progress import prepare, progress, say
 from spherloc_viz.recording.origin import Origin
 
 if TYPE_CHECKING:
-    from spherloc_viz.recording.keeper import Keeper
+    from spherloc_viz.recording.keeping.keeper import Keeper
 
 TRAJECTORY, TRUE_TRAJECTORY, PICTURE, SUMMARY = "trajectory.tum", "truth.tum", "trajectory.png", "summary.json"
 MAX_TOLD = 5

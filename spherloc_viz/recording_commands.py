@@ -34,8 +34,8 @@ def view(
         step: The step to open at; 0 is the first, and the decisive one is taken if it is not given.
         port: Port of the web viewer; 0 takes a free one.
     """
-    from spherloc_viz.recording.strangers import examine
-    from spherloc_viz.recording.view import step_of, view_in_window
+    from spherloc_viz.recording.strangers.examiner import examine
+    from spherloc_viz.recording.viewing.view import step_of, view_in_window
 
     row = examine(recording)
     place = step_of(row, step)
@@ -69,7 +69,7 @@ def repeat(
         recordings: Recordings (.rrd), one or more.
         json: Print one JSON object a recording, on one line; infinity is the text "inf".
     """
-    from spherloc_viz.recording.repeat_text import repeat_all
+    from spherloc_viz.recording.again.repeat_text import repeat_all
 
     return repeat_all(recordings, json)
 
@@ -141,7 +141,7 @@ def runs(
         format: table, json or csv.
     """
     from spherloc_viz import runs as listing
-    from spherloc_viz.recording.query import RunQuery, parse_range, parse_when
+    from spherloc_viz.recording.index.query import RunQuery, parse_range, parse_when
 
     def within(text: str | None):
         return None if text is None else parse_range(text)

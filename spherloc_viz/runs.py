@@ -10,12 +10,12 @@ from spherloc import registry
 from spherloc.diagnosis import Cause
 from spherloc.errors import InputError, RecordingError, show
 from spherloc_viz.progress import progress, say
-from spherloc_viz.recording.index import RunIndex
-from spherloc_viz.recording.index_refresh import Refreshed
-from spherloc_viz.recording.query import GROUP_KEYS, OUTCOMES, SORT_KEYS, SOURCES, RunQuery
-from spherloc_viz.recording.review import Review, checked_review
-from spherloc_viz.recording.run_text import FORMS, counts_text, rows_text
-from spherloc_viz.recording.strangers import examine, examine_review
+from spherloc_viz.recording.index.query import GROUP_KEYS, OUTCOMES, SORT_KEYS, SOURCES, RunQuery
+from spherloc_viz.recording.index.refresh import Refreshed
+from spherloc_viz.recording.index.run_index import RunIndex
+from spherloc_viz.recording.index.run_text import FORMS, counts_text, rows_text
+from spherloc_viz.recording.review.notes import Review, checked_review
+from spherloc_viz.recording.strangers.examiner import examine, examine_review
 
 SORT_WORDS = {
     "outliers": "outlier_rate",
@@ -62,9 +62,9 @@ def print_steps(folder: Path, condition: str, limit: int | None, form: str) -> i
 
     Raises ``InputError`` for a condition that cannot be understood, and as ``print_runs`` does.
     """
-    from spherloc_viz.recording.catalog import find_steps
-    from spherloc_viz.recording.step_condition import checked_condition
-    from spherloc_viz.recording.step_text import steps_text
+    from spherloc_viz.recording.index.catalog import find_steps
+    from spherloc_viz.recording.index.step_condition import checked_condition
+    from spherloc_viz.recording.index.step_text import steps_text
 
     form, most = one_of("format", form, FORMS), _limit(limit, form)
     checked_condition(condition)

@@ -18,7 +18,7 @@ from spherloc_viz.layers.sweep import sweep_table
 from spherloc_viz.progress import progress, say
 
 if TYPE_CHECKING:
-    from spherloc_viz.recording.keeper import Keeper
+    from spherloc_viz.recording.keeping.keeper import Keeper
 
 PRUNE_EVERY = 100
 """Runs of a sweep, of which the workers record some in a second."""
@@ -90,7 +90,7 @@ class Recorded:
 
     def keep(self, cluster: bool) -> Keep:
         """What records a run where it is done."""
-        from spherloc_viz.recording.sweep_keeper import SweepKeeper
+        from spherloc_viz.recording.keeping.sweep_keeper import SweepKeeper
 
         folder = self._keeper.folder.resolve()
         if cluster:

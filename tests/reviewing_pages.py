@@ -13,7 +13,7 @@ from spherloc_viz.app.services import Services
 from spherloc_viz.app.session import Session
 from spherloc_viz.app.web.touch import Touch
 from spherloc_viz.app.web.viser_seams import start_viser, stop_viser
-from spherloc_viz.recording.background import Recorder
+from spherloc_viz.recording.keeping.recorder import Recorder
 from tests.connected_page import ConnectedPage, until
 
 KEY = "a key of this test"

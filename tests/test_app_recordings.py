@@ -15,8 +15,8 @@ from spherloc_viz.app.catalog import MOST_BRIEF, Catalog
 from spherloc_viz.app.page_runs import PageRuns
 from spherloc_viz.app.review import notes as notes_module
 from spherloc_viz.gallery import gallery_cases
-from spherloc_viz.recording.reader import read_recording
-from spherloc_viz.recording.review import read_review
+from spherloc_viz.recording.content.reader import read_recording
+from spherloc_viz.recording.review.notes import read_review
 from tests.connected_page import until
 from tests.reviewing_pages import SCENE, Office, recorded_twice
 

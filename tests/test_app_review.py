@@ -23,8 +23,8 @@ from spherloc_viz.app.review.rows import rows_html
 from spherloc_viz.app.review.shelf import Shelf
 from spherloc_viz.app.review.summary_page import summary_html
 from spherloc_viz.app.web.touch import Touch, TouchDesk, Touches
-from spherloc_viz.recording.index import RunIndex
-from spherloc_viz.recording.query import Range
+from spherloc_viz.recording.index.query import Range
+from spherloc_viz.recording.index.run_index import RunIndex
 from spherloc_viz.recording.run_row import RunRow
 
 NOW = datetime(2026, 5, 1, 12, tzinfo=UTC)

@@ -29,8 +29,8 @@ from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.web.viser_seams import start_viser, stop_viser
 from spherloc_viz.layers.primitives import Chart, Curve
 from spherloc_viz.layers.sweep import SweepChart
-from spherloc_viz.recording.background import Recorder
-from spherloc_viz.recording.query import RunQuery
+from spherloc_viz.recording.index.query import RunQuery
+from spherloc_viz.recording.keeping.recorder import Recorder
 
 SCENE = """
 kind = "synthetic"

@@ -22,12 +22,12 @@ from spherloc.errors import InputError
 from spherloc.estimators import estimate
 from spherloc_viz.app.web.viewer_page import sorry_page, viewer_page, viewer_policy
 from spherloc_viz.app.web.viewer_room import Viewable, ViewerRoom, of_index, viewer_link
-from spherloc_viz.recording.index import RunIndex
-from spherloc_viz.recording.review import review_path, write_review
+from spherloc_viz.recording.content.writer import write_recording
+from spherloc_viz.recording.index.run_index import RunIndex
+from spherloc_viz.recording.review.notes import review_path, write_review
 from spherloc_viz.recording.run_row import RunRow
-from spherloc_viz.recording.view import step_of
-from spherloc_viz.recording.viewer_files import viewer_version
-from spherloc_viz.recording.writer import write_recording
+from spherloc_viz.recording.viewing.view import step_of
+from spherloc_viz.recording.viewing.viewer_files import viewer_version
 
 Folder = tuple[Path, RunRow]
 

@@ -21,7 +21,7 @@ from spherloc_viz.gallery import GALLERY, gallery_cases
 from spherloc_viz.gallery.check import Played, agrees, faults, loose_numbers, play
 from spherloc_viz.gallery.file import parse_gallery
 from spherloc_viz.gallery.regenerate import chosen, outcome, record, stories
-from spherloc_viz.recording.reader import read_recording
+from spherloc_viz.recording.content.reader import read_recording
 
 KEYS = [case.key for case in gallery_cases()]
 ASKED_FOR = {

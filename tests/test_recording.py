@@ -26,14 +26,14 @@ from spherloc.trace import Certificate, DecisionStage, RefinementStage, Trace
 from spherloc_viz.layers import paint, steps
 from spherloc_viz.layers.decisive import decisive_step
 from spherloc_viz.layers.primitives import Balls, Label, Mesh, Points, Segments, Stop, Textured
-from spherloc_viz.recording import data
-from spherloc_viz.recording.chart_bars import LEVEL_OPACITY
-from spherloc_viz.recording.letters import legible
-from spherloc_viz.recording.machine import machine
-from spherloc_viz.recording.properties import APPLICATION_ID
-from spherloc_viz.recording.reader import check_recording, read_recording
-from spherloc_viz.recording.rerun_program import rerun_command, rerun_environment
-from spherloc_viz.recording.writer import recorded_steps, write_recording
+from spherloc_viz.recording.content import data
+from spherloc_viz.recording.content.chart_bars import LEVEL_OPACITY
+from spherloc_viz.recording.content.letters import legible
+from spherloc_viz.recording.content.properties import APPLICATION_ID
+from spherloc_viz.recording.content.reader import check_recording, read_recording
+from spherloc_viz.recording.content.writer import recorded_steps, write_recording
+from spherloc_viz.recording.keeping.machine import machine
+from spherloc_viz.recording.viewing.rerun_program import rerun_command, rerun_environment
 
 
 @pytest.fixture(scope="module", params=[*RUNS, "lost", "by hand"], ids=str)
@@ -420,7 +420,7 @@ from recording_samples import scene_problem
 from spherloc.diagnosis import diagnose
 from spherloc.errors import RecordingError
 from spherloc.estimators import estimate
-from spherloc_viz.recording.writer import recorded_steps, write_recording
+from spherloc_viz.recording.content.writer import recorded_steps, write_recording
 
 path, limit = Path(sys.argv[1]), int(sys.argv[2])
 trace = estimate(scene_problem("mei_outliers_80"), "mc")

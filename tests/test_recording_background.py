@@ -16,13 +16,13 @@ from spherloc.diagnosis import diagnose
 from spherloc.errors import RecordingError
 from spherloc.estimators import estimate
 from spherloc.trace import Stage, Trace
-from spherloc_viz.recording import background
-from spherloc_viz.recording.background import Recorder
-from spherloc_viz.recording.keeper import Keeper, file_name
+from spherloc_viz.recording.content.reader import read_recording
+from spherloc_viz.recording.content.writer import write_recording
+from spherloc_viz.recording.index.query import RunQuery
+from spherloc_viz.recording.keeping import recorder as background
+from spherloc_viz.recording.keeping.keeper import Keeper, file_name
+from spherloc_viz.recording.keeping.recorder import Recorder
 from spherloc_viz.recording.origin import Origin
-from spherloc_viz.recording.query import RunQuery
-from spherloc_viz.recording.reader import read_recording
-from spherloc_viz.recording.writer import write_recording
 
 
 @pytest.fixture(scope="module")

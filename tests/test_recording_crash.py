@@ -19,15 +19,15 @@ from recording_samples import scene_problem
 
 from spherloc.estimators import estimate
 from spherloc.trace import Trace
-from spherloc_viz.recording.background import Recorder
-from spherloc_viz.recording.keeper import Keeper
-from spherloc_viz.recording.leftovers import STALE_AFTER_S, here, leftovers, scratch, unfinished
-from spherloc_viz.recording.query import RunQuery
-from spherloc_viz.recording.reader import read_recording, read_run_row
-from spherloc_viz.recording.repeat import compare
-from spherloc_viz.recording.rescue import rescue
-from spherloc_viz.recording.review import write_review
-from spherloc_viz.recording.writer import write_recording
+from spherloc_viz.recording.again.repeat import compare
+from spherloc_viz.recording.content.reader import read_recording, read_run_row
+from spherloc_viz.recording.content.writer import write_recording
+from spherloc_viz.recording.index.query import RunQuery
+from spherloc_viz.recording.keeping.keeper import Keeper
+from spherloc_viz.recording.keeping.leftovers import STALE_AFTER_S, here, leftovers, scratch, unfinished
+from spherloc_viz.recording.keeping.recorder import Recorder
+from spherloc_viz.recording.keeping.rescue import rescue
+from spherloc_viz.recording.review.notes import write_review
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -35,7 +35,7 @@ KILLER = """
 import os, pathlib, random, signal, sys, time
 from spherloc.datasets import load_scene
 from spherloc.estimators import estimate
-from spherloc_viz.recording.keeper import Keeper
+from spherloc_viz.recording.keeping.keeper import Keeper
 
 folder, scene, seed, kills = pathlib.Path(sys.argv[1]), pathlib.Path(sys.argv[2]), *map(int, sys.argv[3:])
 trace, draws = estimate(load_scene(scene).problem(), "ransac-2p"), random.Random(seed)
@@ -75,7 +75,7 @@ def recorded(trace: Trace, tmp_path_factory: pytest.TempPathFactory) -> bytes:
 @pytest.fixture(scope="module")
 def dead() -> str:
     """How names of unfinished files tell of a process of this machine that has ended."""
-    lines = ("import pathlib", "from spherloc_viz.recording.leftovers import unfinished")
+    lines = ("import pathlib", "from spherloc_viz.recording.keeping.leftovers import unfinished")
     code = "\n".join((*lines, "print(unfinished(pathlib.Path('a')))"))
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     return done.stdout.strip().removeprefix("a.").rpartition("-")[0]

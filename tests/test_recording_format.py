@@ -22,15 +22,15 @@ from spherloc_viz import style
 from spherloc_viz.layers import paint, steps
 from spherloc_viz.layers.decisive import decisive_step
 from spherloc_viz.layers.step_numbers import step_pose
-from spherloc_viz.recording.data import MAX_SCENE_BYTES, scene_text
-from spherloc_viz.recording.numbers import NUMBERS
+from spherloc_viz.recording.content.data import MAX_SCENE_BYTES, scene_text
+from spherloc_viz.recording.content.numbers import NUMBERS
+from spherloc_viz.recording.content.properties import MOST_CHARACTERS, problem_key
+from spherloc_viz.recording.content.query_image import LONGEST_PX, MATCHES
+from spherloc_viz.recording.content.reader import read_recording, read_run_row
+from spherloc_viz.recording.content.thumbnail import HEIGHT_PX, WIDTH_PX, thumbnail
+from spherloc_viz.recording.content.writer import recorded_steps, write_recording
 from spherloc_viz.recording.origin import Origin
-from spherloc_viz.recording.properties import MOST_CHARACTERS, problem_key
-from spherloc_viz.recording.query_image import LONGEST_PX, MATCHES
-from spherloc_viz.recording.reader import read_recording, read_run_row
-from spherloc_viz.recording.review import write_review
-from spherloc_viz.recording.thumbnail import HEIGHT_PX, WIDTH_PX, thumbnail
-from spherloc_viz.recording.writer import recorded_steps, write_recording
+from spherloc_viz.recording.review.notes import write_review
 
 FORMAT_1 = Path(__file__).parent / "data" / "format_1.rrd"
 """Written by the first version of the format: 24 matches, ransac-2p, seed 5."""

@@ -14,12 +14,12 @@ from rerun.chunk import Chunk, LazyChunkStream
 
 from spherloc.errors import RecordingError
 from spherloc.estimators import estimate
-from spherloc_viz.recording.index import RunIndex
-from spherloc_viz.recording.query import RunQuery
-from spherloc_viz.recording.reader import read_recording
+from spherloc_viz.recording.content.reader import read_recording
+from spherloc_viz.recording.content.writer import write_recording
+from spherloc_viz.recording.index.query import RunQuery
+from spherloc_viz.recording.index.run_index import RunIndex
 from spherloc_viz.recording.run_row import RunRow
-from spherloc_viz.recording.strangers import examine_all
-from spherloc_viz.recording.writer import write_recording
+from spherloc_viz.recording.strangers.examiner import examine_all
 
 Noise = Callable[[bytes, np.random.Generator], bytes]
 

@@ -24,15 +24,15 @@ from spherloc_viz.app.review.look import Look
 from spherloc_viz.app.review.rows import rows_html
 from spherloc_viz.app.review.summary_page import summary_html
 from spherloc_viz.app.web.viewer_page import sorry_page, viewer_page
-from spherloc_viz.recording import strangers
-from spherloc_viz.recording.index import RunIndex
+from spherloc_viz.recording.content.writer import write_recording
+from spherloc_viz.recording.index.query import RunQuery
+from spherloc_viz.recording.index.run_index import RunIndex
+from spherloc_viz.recording.index.run_text import counts_text, rows_text
 from spherloc_viz.recording.origin import Origin
-from spherloc_viz.recording.query import RunQuery
-from spherloc_viz.recording.review import review_path, write_review
+from spherloc_viz.recording.review.notes import review_path, write_review
 from spherloc_viz.recording.run_row import RunRow
-from spherloc_viz.recording.run_text import counts_text, rows_text
-from spherloc_viz.recording.strangers import examine
-from spherloc_viz.recording.writer import write_recording
+from spherloc_viz.recording.strangers import examiner as strangers
+from spherloc_viz.recording.strangers.examiner import examine
 
 
 @pytest.fixture(scope="module", autouse=True)

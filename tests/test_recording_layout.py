@@ -22,14 +22,14 @@ from spherloc.estimators import estimate
 from spherloc.trace import Trace, TranslationStage, YawStage
 from spherloc_viz.layers import paint, steps
 from spherloc_viz.layers.primitives import Picture
-from spherloc_viz.recording.columns import Values, static_chunk
-from spherloc_viz.recording.layout import layout_file, shown_in
-from spherloc_viz.recording.letters import legible
-from spherloc_viz.recording.panels import MOST_EDGES, MOST_NODES, panel_chunks, panels_of
-from spherloc_viz.recording.properties import APPLICATION_ID, REVIEW_ENTITY
-from spherloc_viz.recording.rerun_program import rerun_command, rerun_environment
-from spherloc_viz.recording.rrd_file import joined, split, xxh32
-from spherloc_viz.recording.writer import write_recording
+from spherloc_viz.recording.content.columns import Values, static_chunk
+from spherloc_viz.recording.content.layout import layout_file, shown_in
+from spherloc_viz.recording.content.letters import legible
+from spherloc_viz.recording.content.panels import MOST_EDGES, MOST_NODES, panel_chunks, panels_of
+from spherloc_viz.recording.content.properties import APPLICATION_ID, REVIEW_ENTITY
+from spherloc_viz.recording.content.rrd_file import joined, split, xxh32
+from spherloc_viz.recording.content.writer import write_recording
+from spherloc_viz.recording.viewing.rerun_program import rerun_command, rerun_environment
 
 CHROMIUM_VULKAN = Path("/usr/lib/chromium/vk_swiftshader_icd.json")
 """Software graphics, which Debian's Chromium brings."""

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from spherloc.errors import RecordingError
-from spherloc_viz.recording.strangers import check_name, resolve_inside
+from spherloc_viz.recording.strangers.examiner import check_name, resolve_inside
 
 
 def test_names_of_recordings(tmp_path: Path) -> None:

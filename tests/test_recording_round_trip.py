@@ -12,15 +12,15 @@ from hypothesis import strategies as st
 from recording_samples import scene_problem
 
 from spherloc.estimators import estimate
-from spherloc_viz.recording import strangers
-from spherloc_viz.recording.checked_row import row_from_table, table_from_row
-from spherloc_viz.recording.index import RunIndex
+from spherloc_viz.recording.content.writer import write_recording
+from spherloc_viz.recording.index.query import RunQuery
+from spherloc_viz.recording.index.run_index import RunIndex
 from spherloc_viz.recording.origin import Origin
-from spherloc_viz.recording.query import RunQuery
-from spherloc_viz.recording.review import checked_review, write_review
+from spherloc_viz.recording.review.notes import checked_review, write_review
 from spherloc_viz.recording.run_row import RunRow
-from spherloc_viz.recording.strangers import examine
-from spherloc_viz.recording.writer import write_recording
+from spherloc_viz.recording.strangers import examiner as strangers
+from spherloc_viz.recording.strangers.checked_row import row_from_table, table_from_row
+from spherloc_viz.recording.strangers.examiner import examine
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -13,12 +13,12 @@ from spherloc.errors import RecordingError
 from spherloc.estimators import estimate, options_type
 from spherloc.trace import Trace
 from spherloc_viz.app.catalog import Catalog, SceneWish
+from spherloc_viz.recording.again.reopen import Reopened, reopen
+from spherloc_viz.recording.again.repeat import compare
+from spherloc_viz.recording.again.scene import RecordedScene
+from spherloc_viz.recording.content.reader import RecordedRun, read_recording
+from spherloc_viz.recording.content.writer import write_recording
 from spherloc_viz.recording.origin import Origin
-from spherloc_viz.recording.reader import RecordedRun, read_recording
-from spherloc_viz.recording.reopen import Reopened, reopen
-from spherloc_viz.recording.repeat import compare
-from spherloc_viz.recording.scene import RecordedScene
-from spherloc_viz.recording.writer import write_recording
 from tests.datasets.test_rendered import SMALL
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -16,14 +16,14 @@ from spherloc.errors import InputError, RecordingError
 from spherloc.estimators import estimate, options_type
 from spherloc.trace import Certificate, Trace
 from spherloc_viz.batch import Records, run_scenes
-from spherloc_viz.recording import repeat as repeating
+from spherloc_viz.recording.again import repeat as repeating
+from spherloc_viz.recording.again.repeat import compare, other_versions, repeat
+from spherloc_viz.recording.again.repeat_text import as_record, as_text, repeat_all
+from spherloc_viz.recording.again.same import different_fields
+from spherloc_viz.recording.again.scene import load_recorded_scene, missing_options, recorded_options
+from spherloc_viz.recording.content.reader import RecordedRun, read_recording
+from spherloc_viz.recording.content.writer import write_recording
 from spherloc_viz.recording.origin import Origin
-from spherloc_viz.recording.reader import RecordedRun, read_recording
-from spherloc_viz.recording.repeat import compare, other_versions, repeat
-from spherloc_viz.recording.repeat_text import as_record, as_text, repeat_all
-from spherloc_viz.recording.same import different_fields
-from spherloc_viz.recording.scene import load_recorded_scene, missing_options, recorded_options
-from spherloc_viz.recording.writer import write_recording
 from spherloc_viz.share import as_command, as_python
 
 ROOT = Path(__file__).resolve().parents[1]

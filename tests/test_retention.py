@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from spherloc.errors import InputError, RecordingError
-from spherloc_viz.recording.index import RunIndex
-from spherloc_viz.recording.query import RunQuery
-from spherloc_viz.recording.retention import LOG_NAME, NEWEST_KEPT, prunable, prune
-from spherloc_viz.recording.review import review_path
-from spherloc_viz.recording.room import KEEP_BYTES, kept_bytes
+from spherloc_viz.recording.index.query import RunQuery
+from spherloc_viz.recording.index.run_index import RunIndex
+from spherloc_viz.recording.keeping.retention import LOG_NAME, NEWEST_KEPT, prunable, prune
+from spherloc_viz.recording.keeping.room import KEEP_BYTES, kept_bytes
+from spherloc_viz.recording.review.notes import review_path
 from spherloc_viz.recording.run_row import RunRow
 
 SIZE = 1000

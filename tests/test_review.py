@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from rerun.chunk import RrdReader
 
 from spherloc.errors import InputError, RecordingError
-from spherloc_viz.recording.properties import APPLICATION_ID
-from spherloc_viz.recording.review import (
+from spherloc_viz.recording.content.properties import APPLICATION_ID
+from spherloc_viz.recording.review.notes import (
     MOST_BYTES,
     MOST_LABEL_CHARACTERS,
     MOST_LABELS,

@@ -18,10 +18,10 @@ from run_rows import random_row, some_row
 
 from spherloc.diagnosis import Cause
 from spherloc.errors import InputError, RecordingError
-from spherloc_viz.recording import index_file
-from spherloc_viz.recording.index import RunIndex
-from spherloc_viz.recording.query import GROUP_KEYS, SORT_KEYS, Range, RunQuery
-from spherloc_viz.recording.review import Review, read_review, review_path, write_review
+from spherloc_viz.recording.index import file as index_file
+from spherloc_viz.recording.index.query import GROUP_KEYS, SORT_KEYS, Range, RunQuery
+from spherloc_viz.recording.index.run_index import RunIndex
+from spherloc_viz.recording.review.notes import Review, read_review, review_path, write_review
 from spherloc_viz.recording.run_row import RunRow
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -231,8 +231,8 @@ import sys
 from pathlib import Path
 sys.path.insert(0, {tests!r})
 from run_rows import some_row
-from spherloc_viz.recording.index import RunIndex
-from spherloc_viz.recording.query import RunQuery
+from spherloc_viz.recording.index.run_index import RunIndex
+from spherloc_viz.recording.index.query import RunQuery
 print("ready", flush=True)
 sys.stdin.readline()
 with RunIndex(Path({folder!r})) as index:

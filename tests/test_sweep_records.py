@@ -11,13 +11,13 @@ from spherloc.experiments.sweep import Entrant, Job, planned
 from spherloc.experiments.sweep_crew import solve
 from spherloc.trace import Trace
 from spherloc_viz.batch import Records
-from spherloc_viz.recording import sweep_keeper
-from spherloc_viz.recording.index import RunIndex
-from spherloc_viz.recording.keeper import Keeper
-from spherloc_viz.recording.query import RunQuery
-from spherloc_viz.recording.reader import read_recording
-from spherloc_viz.recording.reopen import reopen
-from spherloc_viz.recording.sweep_keeper import SweepKeeper
+from spherloc_viz.recording.again.reopen import reopen
+from spherloc_viz.recording.content.reader import read_recording
+from spherloc_viz.recording.index.query import RunQuery
+from spherloc_viz.recording.index.run_index import RunIndex
+from spherloc_viz.recording.keeping import sweep_keeper
+from spherloc_viz.recording.keeping.keeper import Keeper
+from spherloc_viz.recording.keeping.sweep_keeper import SweepKeeper
 from spherloc_viz.sweep import Recorded, sweep
 
 ROOT = Path(__file__).resolve().parents[1]

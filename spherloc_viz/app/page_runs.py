@@ -10,7 +10,7 @@ from spherloc.trace import Trace
 from spherloc_viz.app.catalog import Catalog, SceneWish
 from spherloc_viz.app.review.opened import is_same_pose
 from spherloc_viz.app.wish import Run, Wish
-from spherloc_viz.recording.background import Recorder
+from spherloc_viz.recording.keeping.recorder import Recorder
 from spherloc_viz.recording.origin import Origin, Source
 
 RETRY_S = 1.0

@@ -27,9 +27,9 @@ from spherloc_viz.app.web.front_door import FrontDoor
 from spherloc_viz.app.web.guard import open_socket
 from spherloc_viz.app.web.viewer_room import ViewerRoom, of_index
 from spherloc_viz.app.web.viser_seams import set_theme, start_viser, stop_viser
-from spherloc_viz.recording.background import Recorder
-from spherloc_viz.recording.index import RunIndex
-from spherloc_viz.recording.room import KEEP_GIGABYTES, kept_bytes
+from spherloc_viz.recording.index.run_index import RunIndex
+from spherloc_viz.recording.keeping.recorder import Recorder
+from spherloc_viz.recording.keeping.room import KEEP_GIGABYTES, kept_bytes
 
 SWITCH_S = 0.001
 MOST_UNHEARD = 3

@@ -6,7 +6,7 @@ from pathlib import Path
 from spherloc_viz.app.catalog import Catalog
 from spherloc_viz.app.review.shelf import Shelf
 from spherloc_viz.app.web.touch import TouchDesk
-from spherloc_viz.recording.background import Recorder
+from spherloc_viz.recording.keeping.recorder import Recorder
 
 
 @dataclass

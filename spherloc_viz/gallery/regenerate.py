@@ -12,7 +12,7 @@ from spherloc.metrics import evaluate
 from spherloc.trace import Trace
 from spherloc_viz.gallery.case import Beside, GalleryCase, origin_of
 from spherloc_viz.gallery.check import Played, faults, play
-from spherloc_viz.recording.writer import write_recording
+from spherloc_viz.recording.content.writer import write_recording
 
 WIDTH = 100
 """Of stories on a terminal, characters."""

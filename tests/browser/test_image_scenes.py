@@ -8,7 +8,7 @@ import pytest
 from playground import SELECTED, Playground, served
 from playwright.sync_api import Browser, expect
 
-from spherloc_viz.recording.reader import read_recording
+from spherloc_viz.recording.content.reader import read_recording
 
 PANORAMA = """
 model = "equirectangular"

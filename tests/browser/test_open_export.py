@@ -16,7 +16,7 @@ from spherloc.estimators import estimate
 from spherloc.problem import Problem
 from spherloc_viz.app.catalog import Catalog, SceneWish
 from spherloc_viz.layers.tables import outcome_table
-from spherloc_viz.recording.reader import read_recording
+from spherloc_viz.recording.content.reader import read_recording
 
 CAMERA = '[camera]\nmodel = "equirectangular"\nwidth = 2048\nheight = 1024\n'
 

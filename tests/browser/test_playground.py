@@ -14,7 +14,7 @@ from spherloc.estimators import estimate
 from spherloc_viz.app.catalog import Catalog
 from spherloc_viz.layers import paint, steps
 from spherloc_viz.layers.primitives import Balls, Picture, Points, Segments, Step
-from spherloc_viz.recording.reader import read_recording
+from spherloc_viz.recording.content.reader import read_recording
 
 EXACT, MC, RANSAC = "mc-exact (exact, certified)", "mc (the paper's)", "ransac-2p (two points)"
 

@@ -15,10 +15,10 @@ from spherloc.datasets import load_scene
 from spherloc.estimators import estimate
 from spherloc_viz import style
 from spherloc_viz.app.web.viewer_room import viewer_link
-from spherloc_viz.recording.reader import read_run_row
-from spherloc_viz.recording.review import write_review
+from spherloc_viz.recording.content.reader import read_run_row
+from spherloc_viz.recording.content.writer import write_recording
+from spherloc_viz.recording.review.notes import write_review
 from spherloc_viz.recording.run_row import RunRow
-from spherloc_viz.recording.writer import write_recording
 
 pytestmark = [pytest.mark.browser, pytest.mark.timeout(280)]
 

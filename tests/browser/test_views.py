@@ -8,7 +8,7 @@ import pytest
 from playground import PAINT, Playground
 from playwright.sync_api import expect
 
-from spherloc_viz.recording.reader import read_recording
+from spherloc_viz.recording.content.reader import read_recording
 
 pytestmark = [pytest.mark.browser, pytest.mark.timeout(280, func_only=True)]
 

@@ -24,7 +24,7 @@ from spherloc.experiments import read_results
 from spherloc.trajectory import read_tum
 from spherloc_viz.batch import Records
 from spherloc_viz.localize import localize_sequence
-from spherloc_viz.recording.reader import read_recording
+from spherloc_viz.recording.content.reader import read_recording
 from spherloc_viz.scene_list import all_scenes, one_kind
 from spherloc_viz.trajectory_plot import trajectory_png
 

@@ -32,7 +32,7 @@ from spherloc_viz.app.text import DIM, box
 from spherloc_viz.app.web.touch import Touches
 from spherloc_viz.app.wish import Run, Wish
 from spherloc_viz.layers.primitives import SceneItem
-from spherloc_viz.recording.reopen import Reopened
+from spherloc_viz.recording.again.reopen import Reopened
 
 UNDO, REDO, NEW_SEED = "Undo", "Redo", "New seed"
 NO_PRESET = "choose …"

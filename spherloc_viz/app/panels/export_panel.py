@@ -18,7 +18,7 @@ from spherloc_viz.app.panels.errand import Errand
 from spherloc_viz.app.stage.still_page import Still, still_html, viewpoint
 from spherloc_viz.app.text import DIM, box, status_html
 from spherloc_viz.layers.primitives import SceneItem
-from spherloc_viz.recording.writer import write_recording
+from spherloc_viz.recording.content.writer import write_recording
 
 PATIENCE_S = 60.0
 """A page that draws in software takes some ten seconds for a picture of its canvas."""

@@ -20,7 +20,7 @@ from spherloc_viz.app.review.shelf import Shelf
 from spherloc_viz.app.text import box, status_html
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.wish import Wish
-from spherloc_viz.recording.reopen import Reopened
+from spherloc_viz.recording.again.reopen import Reopened
 from spherloc_viz.recording.run_row import RunRow
 
 RUNS, GALLERY = "runs", "gallery"

@@ -20,7 +20,7 @@ from spherloc_viz.app.panels.estimator_chips import chips_html, ordered
 from spherloc_viz.app.plots.sweep_charts import charts_html, table_html
 from spherloc_viz.app.text import status_html
 from spherloc_viz.app.web.touch import Touch, Touches
-from spherloc_viz.recording.background import Recorder
+from spherloc_viz.recording.keeping.recorder import Recorder
 
 START, CANCEL = "Start sweep", "Cancel"
 VALUES = {

@@ -12,9 +12,9 @@ from pathlib import Path
 from spherloc.errors import RecordingError
 from spherloc_viz.app.review import words
 from spherloc_viz.app.review.summary_page import summary_html
-from spherloc_viz.recording.review import review_path
+from spherloc_viz.recording.review.notes import review_path
 from spherloc_viz.recording.run_row import RunRow
-from spherloc_viz.recording.strangers import resolve_inside
+from spherloc_viz.recording.strangers.examiner import resolve_inside
 
 MOST_RUNS = 500
 MOST_BYTES = 200_000_000

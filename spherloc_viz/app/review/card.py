@@ -17,7 +17,7 @@ from spherloc_viz.app.text import DIM, box
 from spherloc_viz.app.web.viewer_room import viewer_link
 from spherloc_viz.app.wish import Run
 from spherloc_viz.layers import steps
-from spherloc_viz.recording.properties import outcome
+from spherloc_viz.recording.content.properties import outcome
 from spherloc_viz.recording.run_row import RunRow
 
 GROUND = "margin:0 .6em .4em;border:1px solid rgba(80,150,250,.45);border-radius:.4em"

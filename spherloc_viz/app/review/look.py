@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from datetime import datetime
 
-from spherloc_viz.recording.query import MAX_TEXT, OUTCOMES, Range, RunQuery, parse_range, parse_when
+from spherloc_viz.recording.index.query import MAX_TEXT, OUTCOMES, Range, RunQuery, parse_range, parse_when
 
 PAGE = 20
 """Rows that are shown at once."""

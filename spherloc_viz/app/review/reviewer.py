@@ -16,7 +16,7 @@ from spherloc_viz.app.review.run_list import RunList
 from spherloc_viz.app.review.shelf import Shelf
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.wish import Wish
-from spherloc_viz.recording.reopen import Reopened, reopen
+from spherloc_viz.recording.again.reopen import Reopened, reopen
 from spherloc_viz.recording.run_row import RunRow
 
 

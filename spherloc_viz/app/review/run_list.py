@@ -16,7 +16,7 @@ from spherloc_viz.app.review.rows import rows_html
 from spherloc_viz.app.review.shelf import Shelf
 from spherloc_viz.app.text import DIM, box, status_html
 from spherloc_viz.app.web.touch import Touch, Touches
-from spherloc_viz.recording.query import MAX_TEXT
+from spherloc_viz.recording.index.query import MAX_TEXT
 
 FOLLOW_S = 1.5
 """While the list is seen, new runs are looked for this often."""

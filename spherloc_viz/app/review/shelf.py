@@ -9,11 +9,11 @@ from pathlib import Path
 from spherloc.errors import RecordingError
 from spherloc_viz.app.review.filters import Counts
 from spherloc_viz.app.review.look import EXACT, PAGE, Look
-from spherloc_viz.recording.index import Found, RunIndex
-from spherloc_viz.recording.query import MAX_TEXT, RunQuery
-from spherloc_viz.recording.reader import RecordedRun, read_recording
+from spherloc_viz.recording.content.reader import RecordedRun, read_recording
+from spherloc_viz.recording.index.query import MAX_TEXT, RunQuery
+from spherloc_viz.recording.index.run_index import Found, RunIndex
 from spherloc_viz.recording.run_row import RunRow
-from spherloc_viz.recording.strangers import examine, resolve_inside
+from spherloc_viz.recording.strangers.examiner import examine, resolve_inside
 
 NEAR = 50
 """A run that was at some place of the list is looked for among so many around it."""

@@ -14,13 +14,13 @@ from aiohttp import web
 from spherloc.errors import InputError, SpherlocError, show
 from spherloc_viz.app.web.guard import SAFE
 from spherloc_viz.app.web.viewer_page import DATA, PROGRAM, SORRY_POLICY, sorry_page, viewer_page, viewer_policy
-from spherloc_viz.recording.columns import TIMELINE
-from spherloc_viz.recording.index import RunIndex
-from spherloc_viz.recording.review import REVIEW_SUFFIX
+from spherloc_viz.recording.content.columns import TIMELINE
+from spherloc_viz.recording.index.run_index import RunIndex
+from spherloc_viz.recording.review.notes import REVIEW_SUFFIX
 from spherloc_viz.recording.run_row import RunRow
-from spherloc_viz.recording.strangers import examine, resolve_inside
-from spherloc_viz.recording.view import labels_of, step_of
-from spherloc_viz.recording.viewer_files import NAMES, viewer_folder, viewer_version
+from spherloc_viz.recording.strangers.examiner import examine, resolve_inside
+from spherloc_viz.recording.viewing.view import labels_of, step_of
+from spherloc_viz.recording.viewing.viewer_files import NAMES, viewer_folder, viewer_version
 
 PAGE = "/viewer/"
 NOT_RECORDED = "There are no recordings to view: start the playground without --no-record."

@@ -9,7 +9,7 @@ from spherloc.errors import RecordingError
 from spherloc_viz.app.web.guard import open_socket, refusal
 from spherloc_viz.app.web.viewer_room import PAGE, Viewable, ViewerRoom, viewer_link
 from spherloc_viz.recording.run_row import RunRow
-from spherloc_viz.recording.viewer_files import viewer_folder
+from spherloc_viz.recording.viewing.viewer_files import viewer_folder
 
 HOST = "127.0.0.1"
 NAME = "run.rrd"

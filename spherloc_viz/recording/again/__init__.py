@@ -1,0 +1,1 @@
+"""A recorded run as a scene that can be opened, changed and repeated."""

@@ -1,0 +1,142 @@
+"""Repeats a recorded run and compares: the same to the last bit, or what differs and what may be why."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from spherloc.cameras.base import FloatArray
+from spherloc.errors import InputError, RecordingError
+from spherloc.estimators import estimate
+from spherloc.metrics import rotation_error_deg, translation_error_m
+from spherloc.trace import Certificate, Trace
+from spherloc_viz.recording.again.same import same_bits
+from spherloc_viz.recording.again.scene import load_recorded_scene, missing_options, recorded_options
+from spherloc_viz.recording.content.reader import RecordedRun
+from spherloc_viz.recording.keeping.machine import machine
+
+ROUNDING = 1e-9
+"""Numbers that differ by no more, relative to the largest of a pose's, differ by rounding."""
+MACHINE = "machine"
+
+
+@dataclass(frozen=True)
+class Difference:
+    """One thing in which a run and its repetition differ."""
+
+    what: str
+    """Pose, inliers, certificate or message."""
+    sentence: str
+    """How, in numbers."""
+    rounding: bool = False
+    """Whether it is in the last digits only."""
+
+
+@dataclass(frozen=True)
+class OtherVersion:
+    """Something that can change a number and is not what it was."""
+
+    name: str
+    """Package, "python" or "machine"."""
+    recorded: str | None
+    """None if the recording does not say."""
+    here: str | None
+    """None if it is not here."""
+
+
+@dataclass(frozen=True, eq=False)
+class Repeated:
+    """A recorded run and what it gives here."""
+
+    path: Path
+    """The recording."""
+    run: RecordedRun
+    """What was recorded."""
+    trace: Trace
+    """What the same problem, options and seed give here."""
+    differences: tuple[Difference, ...]
+    """Nothing if it is the same run to the last bit."""
+    rounding: bool
+    """Whether the runs differ, but only in the last digits of numbers."""
+    versions: tuple[OtherVersion, ...]
+    """What is not what it was."""
+    assumed: tuple[str, ...]
+    """Options that the recording does not know; they have their defaults."""
+
+    @property
+    def same(self) -> bool:
+        """Whether pose, inliers, certificate and message are the same, the pose in every bit."""
+        return not self.differences
+
+
+def repeat(path: Path) -> Repeated:
+    """Solve the problem of a recording again with its estimator, options and seed, and compare.
+
+    Raises ``RecordingError`` if there is no such recording, or this spherloc has no such estimator or option.
+    """
+    scene = load_recorded_scene(path)
+    run, options = scene.run, recorded_options(scene.run, path)
+    try:
+        trace = estimate(run.problem, run.estimator, options, run.seed)
+    except InputError as error:
+        raise RecordingError(f"{path}: cannot be repeated: {error}") from None
+    differences = tuple(compare(run, trace))
+    return Repeated(
+        path=Path(path),
+        run=run,
+        trace=trace,
+        differences=differences,
+        rounding=bool(differences) and all(item.rounding for item in differences),
+        versions=other_versions(run.versions, {**trace.versions, MACHINE: machine()}),
+        assumed=missing_options(run),
+    )
+
+
+def compare(run: RecordedRun, trace: Trace) -> list[Difference]:
+    """In what a run and its repetition differ."""
+    found: list[Difference] = []
+    if not same_bits(run.cam_from_map, trace.cam_from_map):
+        found.append(_poses(run.cam_from_map, trace.cam_from_map))
+    before, now = run.inlier_mask, trace.inlier_mask
+    if not np.array_equal(before, now):
+        gained, lost = (int(np.count_nonzero(mask)) for mask in (now & ~before, before & ~now))
+        counts = f"{np.count_nonzero(before)} were recorded, {np.count_nonzero(now)} are found now"
+        found.append(Difference("inliers", f"{counts}: {gained} more, {lost} no longer."))
+    if run.certificate != trace.certificate:
+        found.append(_certificates(run.certificate, trace.certificate))
+    if run.message != trace.message:
+        found.append(Difference("message", f"it was “{run.message}” and is “{trace.message}”"))
+    return found
+
+
+def other_versions(recorded: Any, here: Any) -> tuple[OtherVersion, ...]:
+    """What is not what it was, by two tables of versions."""
+    names = dict.fromkeys([*here, *recorded])
+    pairs = [OtherVersion(name, recorded.get(name), here.get(name)) for name in names]
+    return tuple(pair for pair in pairs if pair.recorded != pair.here)
+
+
+def _poses(before: FloatArray | None, now: FloatArray | None) -> Difference:
+    if before is None or now is None:
+        some = ["no pose" if pose is None else "a pose" for pose in (before, now)]
+        return Difference("pose", f"{some[0]} was recorded, {some[1]} is found now.")
+    turn_deg, shift_m = rotation_error_deg(before, now), translation_error_m(before, now)
+    near = bool(np.abs(before - now).max() <= ROUNDING * max(1.0, float(np.abs(before).max())))
+    return Difference("pose", f"turned by {turn_deg:.3g} deg and moved by {shift_m:.3g} m.", near)
+
+
+def _certificates(before: Certificate | None, now: Certificate | None) -> Difference:
+    said = [
+        "none"
+        if item is None
+        else f"{item.lower_bound} to {item.upper_bound} inliers and {item.chance_sets:.6g} sets by chance"
+        for item in (before, now)
+    ]
+    near = (
+        before is not None
+        and now is not None
+        and (before.lower_bound, before.upper_bound) == (now.lower_bound, now.upper_bound)
+        and bool(np.isclose(before.chance_sets, now.chance_sets, rtol=ROUNDING, atol=0.0, equal_nan=True))
+    )
+    return Difference("certificate", f"{said[0]} was recorded, {said[1]} is found now.", near)

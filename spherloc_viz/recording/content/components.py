@@ -1,0 +1,212 @@
+"""What rerun calls components: the parts of every primitive, and how each of them is written."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import rerun as rr
+from numpy.typing import NDArray
+
+from spherloc_viz import style
+from spherloc_viz.layers.primitives import Balls, Label, Mesh, Points, Segments, Step, Table
+from spherloc_viz.recording.content.chart_bars import Bars, tensors
+from spherloc_viz.recording.content.columns import (
+    MARKDOWN,
+    STRIP_3D,
+    TRIANGLE,
+    VECTOR_2D,
+    VECTOR_3D,
+    Values,
+    numbers,
+    packed,
+    strips,
+    vectors,
+)
+from spherloc_viz.recording.content.letters import legible
+from spherloc_viz.recording.content.markdown import step_text, table_text
+from spherloc_viz.recording.content.query_image import DOT_PX, Keypoints
+
+# Without it, a value that rerun cannot convert is dropped with a warning and the recording lacks it.
+rr.set_strict_mode(True)
+
+Rows = list[Any]
+"""One primitive per row, or None where it is absent and the row clears it."""
+WORDS = int(packed(np.array([style.SCALE]))[0])
+"""Colour of words in the scene, which reads on dark and on light."""
+SOLID: int = rr.components.FillModeBatch(["solid"]).as_arrow_array()[0].as_py()
+
+
+@dataclass(frozen=True)
+class Part:
+    """Components of a primitive that are written together."""
+
+    look: tuple[str, ...]
+    """Fields of the primitive that they show."""
+    encode: Callable[[Rows], list[Values]]
+
+
+def _joined(rows: Rows, name: str, shape: tuple[int, ...]) -> tuple[NDArray[Any], list[int]]:
+    """The arrays called ``name`` of all rows as one, and how many entries each row has."""
+    arrays = [np.zeros((0, *shape)) if row is None else getattr(row, name) for row in rows]
+    return arrays[0] if len(arrays) == 1 else np.concatenate(arrays), [len(array) for array in arrays]
+
+
+def _rgba(colors: NDArray[np.uint8], opacity: float) -> NDArray[np.uint32]:
+    # rerun repeats a single colour over all instances of the row.
+    return packed(colors[:1] if len(colors) and (colors == colors[0]).all() else colors, opacity)
+
+
+def _colors(rows: Rows, descriptor: rr.ComponentDescriptor) -> Values:
+    none = np.zeros(0, np.uint32)
+    each = [none if row is None else _rgba(row.colors, getattr(row, "opacity", 1.0)) for row in rows]
+    return Values(descriptor, pa.array(np.concatenate(each)), [len(row) for row in each])
+
+
+def _single(rows: Rows, descriptor: rr.ComponentDescriptor, kind: pa.DataType, value: Callable[[Any], Any]) -> Values:
+    """A column with one value in every row that shows something."""
+    present = [value(row) for row in rows if row is not None]
+    return Values(descriptor, pa.array(present, kind), [row is not None for row in rows])
+
+
+def _one_color(rows: Rows, descriptor: rr.ComponentDescriptor) -> Values:
+    """A column with the colour of every row that shows something."""
+    shown = [row for row in rows if row is not None]
+    each = [packed(np.array([row.color]), getattr(row, "opacity", 1.0)) for row in shown]
+    return Values(descriptor, pa.array(np.concatenate(each)), [row is not None for row in rows])
+
+
+def _positions(rows: Rows) -> list[Values]:
+    positions, lengths = _joined(rows, "positions", (3,))
+    return [Values(rr.Points3D.descriptor_positions(), vectors(positions, VECTOR_3D), lengths)]
+
+
+def _point_radius(rows: Rows) -> list[Values]:
+    return [_single(rows, rr.Points3D.descriptor_radii(), pa.float32(), lambda row: row.radius_m)]
+
+
+def _ids(rows: Rows) -> list[Values]:
+    if not any(row is not None and row.ids is not None for row in rows):
+        return []
+    ids = [np.zeros(0, np.int64) if row is None or row.ids is None else row.ids for row in rows]
+    batch = numbers(np.concatenate(ids), np.int64)
+    return [Values(rr.ComponentDescriptor("correspondence"), batch, [len(row) for row in ids])]
+
+
+def _pixels(rows: Rows) -> list[Values]:
+    pixels, lengths = _joined(rows, "pixels", (2,))
+    radii = _single(rows, rr.Points2D.descriptor_radii(), pa.float32(), lambda row: -DOT_PX)
+    return [Values(rr.Points2D.descriptor_positions(), vectors(pixels, VECTOR_2D), lengths), radii]
+
+
+def _strips(rows: Rows) -> list[Values]:
+    points, lengths = _joined(rows, "points", (2, 3))
+    lines = strips(points.reshape(-1, 3), np.full(len(points), 2), STRIP_3D)
+    return [Values(rr.LineStrips3D.descriptor_strips(), lines, lengths)]
+
+
+def _strip_radius(rows: Rows) -> list[Values]:
+    # rerun reads a negative radius as points on the screen.
+    return [_single(rows, rr.LineStrips3D.descriptor_radii(), pa.float32(), lambda row: -row.width_px / 2)]
+
+
+def _balls(rows: Rows) -> list[Values]:
+    centers, lengths = _joined(rows, "centers", (3,))
+    radii, _ = _joined(rows, "radii_m", ())
+    sizes = vectors(np.repeat(radii[:, None], 3, axis=1), VECTOR_3D)
+    return [
+        Values(rr.Ellipsoids3D.descriptor_half_sizes(), sizes, lengths),
+        Values(rr.Ellipsoids3D.descriptor_centers(), vectors(centers, VECTOR_3D), lengths),
+        _single(rows, rr.Ellipsoids3D.descriptor_fill_mode(), pa.uint8(), lambda row: SOLID),
+    ]
+
+
+def _vertices(rows: Rows) -> list[Values]:
+    vertices, counts = _joined(rows, "vertices", (3,))
+    return [Values(rr.Mesh3D.descriptor_vertex_positions(), vectors(vertices, VECTOR_3D), counts)]
+
+
+def _faces(rows: Rows) -> list[Values]:
+    faces, counts = _joined(rows, "faces", (3,))
+    return [Values(rr.Mesh3D.descriptor_triangle_indices(), vectors(faces, TRIANGLE), counts)]
+
+
+def _heights(rows: Rows) -> list[Values]:
+    heights = tensors([row.heights for row in rows if row is not None])
+    return [Values(rr.BarChart.descriptor_values(), heights, [row is not None for row in rows])]
+
+
+def _abscissa(rows: Rows) -> list[Values]:
+    left = tensors([row.left for row in rows if row is not None])
+    widths, counts = _joined(rows, "widths", ())
+    return [
+        Values(rr.BarChart.descriptor_abscissa(), left, [row is not None for row in rows]),
+        Values(rr.BarChart.descriptor_widths(), numbers(widths), counts),
+    ]
+
+
+def _label(rows: Rows) -> list[Values]:
+    places = [np.zeros((0, 3)) if row is None else row.position[None] for row in rows]
+    batch = vectors(np.concatenate(places), VECTOR_3D)
+    return [
+        Values(rr.Points3D.descriptor_positions(), batch, [len(place) for place in places]),
+        _single(rows, rr.Points3D.descriptor_labels(), pa.utf8(), lambda row: legible(row.text)),
+        # Without a colour, rerun makes one up.
+        _single(rows, rr.Points3D.descriptor_colors(), pa.uint32(), lambda row: WORDS),
+        # The word is what is shown, not the dot that rerun hangs it on.
+        _single(rows, rr.Points3D.descriptor_radii(), pa.float32(), lambda row: 0.0),
+    ]
+
+
+def _text(write: Callable[[Any], str]) -> Callable[[Rows], list[Values]]:
+    """Encoder of a primitive that ``write`` turns into Markdown."""
+    return lambda rows: [_single(rows, rr.TextDocument.descriptor_text(), pa.utf8(), write)]
+
+
+def _media(rows: Rows) -> list[Values]:
+    return [_single(rows, rr.TextDocument.descriptor_media_type(), pa.utf8(), lambda row: MARKDOWN)]
+
+
+def _colored(descriptor: rr.ComponentDescriptor) -> Callable[[Rows], list[Values]]:
+    return lambda rows: [_colors(rows, descriptor)]
+
+
+def _plain(descriptor: rr.ComponentDescriptor) -> Callable[[Rows], list[Values]]:
+    return lambda rows: [_one_color(rows, descriptor)]
+
+
+PARTS: dict[type, tuple[Part, ...]] = {
+    Points: (
+        Part(("positions",), _positions),
+        Part(("colors",), _colored(rr.Points3D.descriptor_colors())),
+        Part(("radius_m",), _point_radius),
+        Part(("ids",), _ids),
+    ),
+    Keypoints: (
+        Part(("pixels",), _pixels),
+        Part(("colors",), _colored(rr.Points2D.descriptor_colors())),
+    ),
+    Segments: (
+        Part(("points",), _strips),
+        Part(("colors",), _colored(rr.LineStrips3D.descriptor_colors())),
+        Part(("width_px",), _strip_radius),
+    ),
+    Balls: (
+        Part(("centers", "radii_m"), _balls),
+        Part(("colors", "opacity"), _colored(rr.Ellipsoids3D.descriptor_colors())),
+    ),
+    Mesh: (
+        Part(("vertices",), _vertices),
+        Part(("faces",), _faces),
+        Part(("color", "opacity"), _plain(rr.Mesh3D.descriptor_albedo_factor())),
+    ),
+    Label: (Part(("position", "text"), _label),),
+    Bars: (
+        Part(("heights",), _heights),
+        Part(("left", "widths"), _abscissa),
+        Part(("color", "opacity"), _plain(rr.BarChart.descriptor_color())),
+    ),
+    Step: (Part(("title", "caption", "equation", "note"), _text(step_text)), Part((), _media)),
+    Table: (Part(("name", "columns", "rows"), _text(table_text)), Part((), _media)),
+}

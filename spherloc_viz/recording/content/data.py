@@ -1,0 +1,177 @@
+"""The numbers behind the pictures: the trace as rows under ``/data``, and back, bit for bit.
+
+A row has a column ``arrays`` with the bytes of all arrays, and a column ``scalars``, JSON with their types and shapes
+and all other values. A number that JSON has no word for is ``{"number": "inf"}`` (or "-inf", "nan").
+"""
+
+import json
+import math
+from collections.abc import Iterator
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import rerun as rr
+from numpy.typing import NDArray
+from rerun.chunk import Chunk
+
+from spherloc.cameras.calibration import camera_from_table
+from spherloc.datasets.variation import Variation
+from spherloc.diagnosis import Cause, Diagnosis
+from spherloc.problem import Problem
+from spherloc.trace import Trace
+from spherloc_viz.options import plain
+from spherloc_viz.recording.content.columns import Values, static_chunk
+from spherloc_viz.recording.keeping.machine import machine
+from spherloc_viz.recording.origin import Origin
+
+MAX_ARRAY_BYTES = 65_536
+"""Stage arrays above this are left out of a lean recording: they follow from the problem, the options and the seed."""
+MAX_SCENE_BYTES = 65_536
+"""The text of a larger scene file is not recorded."""
+
+ARRAYS = "arrays"
+NOT_FINITE = "number"
+"""Key of the table that stands for infinity or NaN."""
+
+Row = dict[str, Any]
+
+
+def data_chunks(trace: Trace, origin: Origin, diagnosis: Diagnosis, full: bool) -> Iterator[Chunk]:
+    """Static chunks with the problem, the result, where it came from, what is wrong with it, and every stage.
+
+    Of a stage it is the small arrays or, with ``full``, all of them.
+    """
+    yield _chunk("/data/problem", _problem_row(trace.problem))
+    yield _chunk("/data/run", _run_row(trace))
+    yield _chunk("/data/origin", asdict(origin) | {"scene_text": scene_text(origin.scene_path)})
+    yield _chunk("/data/diagnosis", {item.name: getattr(diagnosis, item.name) for item in fields(diagnosis)})
+    for stage in trace.stages:
+        row = {item.name: getattr(stage, item.name) for item in fields(stage)}
+        kept = {name: value for name, value in row.items() if full or getattr(value, "nbytes", 0) <= MAX_ARRAY_BYTES}
+        yield _chunk(f"/data/stages/{stage.kind}", kept)
+
+
+def scene_text(path: str | None) -> str | None:
+    """The text of a scene file; None if it is no TOML of moderate size, or cannot be read."""
+    if path is None or not path.endswith(".toml"):
+        return None
+    try:
+        with Path(path).open("rb") as file:
+            content = file.read(MAX_SCENE_BYTES + 1)
+        return content.decode() if len(content) <= MAX_SCENE_BYTES else None
+    except (OSError, ValueError):
+        return None
+
+
+def _problem_row(problem: Problem) -> Row:
+    row = {item.name: getattr(problem, item.name) for item in fields(problem)}
+    image = None if problem.image is None else str(problem.image)
+    references = [str(path) for path in problem.reference_images]
+    return row | {"camera": problem.camera.to_dict(), "image": image, "reference_images": references}
+
+
+def _run_row(trace: Trace) -> Row:
+    return {
+        "estimator": trace.estimator,
+        "options": asdict(trace.options),
+        "seed": trace.seed,
+        "versions": {**trace.versions, "machine": machine()},
+        "timings_ms": dict(trace.timings_ms),
+        "cam_from_map": trace.cam_from_map,
+        "inlier_mask": trace.inlier_mask,
+        "message": trace.message,
+        "certificate": None if trace.certificate is None else asdict(trace.certificate),
+    }
+
+
+def problem_from_row(row: Row, where: str) -> Problem:
+    """The recorded problem, bit for bit.
+
+    Raises ``SpherlocError`` if the row describes none, and ``KeyError`` or ``TypeError`` if it is no problem's row.
+    """
+    image = None if row["image"] is None else Path(row["image"])
+    references = tuple(Path(text) for text in row.get("reference_images", ()))
+    changed = {"camera": camera_from_table(row["camera"], where), "image": image, "reference_images": references}
+    changed["remarks"] = tuple(row.get("remarks", ()))
+    problem = Problem(**row | changed)
+    for name in ("gravity_camera", "gravity_map"):
+        # Problem scales directions to unit length, and doing so twice can change the last bit.
+        object.__setattr__(problem, name, row[name])
+    return problem
+
+
+def origin_from_row(row: Row) -> tuple[Origin, str | None]:
+    """Where the run came from, and the text of its scene file.
+
+    Raises ``SpherlocError``, ``KeyError`` or ``TypeError`` if the row says no such thing.
+    """
+    text, variation = row.pop("scene_text"), dict(row.pop("variation"))
+    for name in ("true_camera", "spoiled", "mended", "hidden"):
+        variation[name] = None if variation[name] is None else tuple(variation[name])
+    return Origin(variation=Variation(**variation), **row), text
+
+
+def diagnosis_from_row(row: Row) -> Diagnosis:
+    """What was wrong with the run.
+
+    Raises ``KeyError``, ``TypeError`` or ``ValueError`` if the row says no such thing.
+    """
+    rival = row.pop("rival_cam_from_map", None)
+    cause, evidence = Cause(row.pop("cause")), tuple(row.pop("evidence"))
+    return Diagnosis(cause=cause, evidence=evidence, rival_cam_from_map=rival, **row)
+
+
+def _chunk(path: str, row: Row) -> Chunk:
+    """A row: the bytes of all arrays in one column, since every column costs more room in the file's index than most
+    arrays have; their types and shapes are with the scalars."""
+    arrays = {name: np.ascontiguousarray(value) for name, value in row.items() if isinstance(value, np.ndarray)}
+    others = {name: value for name, value in row.items() if name not in arrays}
+    forms = [[name, array.dtype.str, list(array.shape)] for name, array in arrays.items()]
+    told = {ARRAYS: forms, "values": plain(others, lambda number: {NOT_FINITE: str(number)})}
+    content = b"".join(array.tobytes() for array in arrays.values())
+    columns = [
+        Values(rr.ComponentDescriptor("scalars"), pa.array([json.dumps(told, allow_nan=False)]), [1]),
+        Values(rr.ComponentDescriptor(ARRAYS), pa.array(np.frombuffer(content, np.uint8)), [len(content)]),
+    ]
+    return static_chunk(path, columns)
+
+
+def read_row(chunk: Chunk) -> Row:
+    """Arrays and scalars of a chunk that ``data_chunks`` made, in this format or the first; the arrays are read-only.
+
+    Raises ``KeyError``, ``TypeError`` or ``ValueError`` if it is none.
+    """
+    batch = chunk.to_record_batch()
+    columns = {name: batch.column(name) for name in batch.schema.names if pa.types.is_list(batch.column(name).type)}
+    told: Row = json.loads(columns.pop("scalars")[0].values[0].as_py(), object_hook=_number)
+    if ARRAYS not in told:
+        return told | {name: _numpy(column[0].values) for name, column in columns.items()}
+    content = columns[ARRAYS][0].values.to_numpy(zero_copy_only=False)
+    row, at = dict(told["values"]), 0
+    for name, kind, shape in told[ARRAYS]:
+        dtype, end = np.dtype(kind), at
+        if dtype.kind not in "biuf" or any(size < 0 for size in shape):
+            raise ValueError(f"{name} is no array of numbers")
+        end += dtype.itemsize * math.prod(shape)
+        row[name], at = content[at:end].view(dtype).reshape(shape), end
+        row[name].setflags(write=False)
+    return row
+
+
+def _number(table: dict[str, Any]) -> Any:
+    """A table of JSON, or the number that it stands for."""
+    return float(table[NOT_FINITE]) if set(table) == {NOT_FINITE} else table
+
+
+def _numpy(values: pa.Array) -> NDArray[Any]:
+    """An array of format 1, whose axes but the first are fixed-size lists."""
+    shape = [len(values)]
+    while isinstance(values, pa.FixedSizeListArray):
+        shape.append(values.type.list_size)
+        values = values.flatten()
+    array = values.to_numpy(zero_copy_only=False).reshape(shape)
+    array.setflags(write=False)
+    return array

@@ -1,0 +1,167 @@
+"""What a list of runs shows about a run without opening its pictures: the properties of its recording.
+
+Labels and a note lie in a second file beside it, ``<stem>.review.rrd``, with the same recording id: a chunk of the
+property ``REVIEW_PROPERTY`` and, for people, a text document at ``REVIEW_ENTITY``. The layout has a view for it.
+"""
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, fields
+from datetime import datetime
+from pathlib import Path
+from typing import Any, cast, get_args
+
+import pyarrow as pa
+import rerun as rr
+from rerun.chunk import Chunk
+
+from spherloc.diagnosis import Diagnosis
+from spherloc.metrics import Metrics
+from spherloc.problem import Problem
+from spherloc.trace import Trace
+from spherloc_viz.options import json_text
+from spherloc_viz.recording.content.columns import Values, encoded_image, named_values, static_chunk
+from spherloc_viz.recording.content.letters import legible
+from spherloc_viz.recording.origin import Origin
+from spherloc_viz.recording.run_row import RunRow
+
+APPLICATION_ID = "spherloc"
+"""What Rerun keeps our recordings, and their layout, apart from others by."""
+FORMAT_VERSION = 2
+"""Of what is recorded and how. A reader opens this one and older ones."""
+OLDEST_VERSION = 1
+
+RUN_PROPERTY = "run"
+"""Its row: see ``RunRow``."""
+THUMBNAIL_PROPERTY = "thumbnail"
+"""A small PNG."""
+QUERY_IMAGE = "/query/image"
+"""The query image, a JPEG."""
+REVIEW_ENTITY = "/review"
+"""Text document, Markdown, of labels and note, in the review file."""
+REVIEW_PROPERTY = "review"
+"""Property of the review file: ``labels``, a list of texts, and ``note``, a text."""
+
+MOST_CHARACTERS = 2_000
+"""Of a text in a row; longer ones are cut."""
+NOT_RECORDED = {"file", "run_id", "labels", "note", "size_bytes", "thumbnail"}
+"""Fields of a row that are no part of the property ``run``: they belong to the file or the review, or are a picture."""
+
+
+def outcome(metrics: Metrics) -> str:
+    """Success or failure by the limits of Sec. VI, or unknown where there is no truth to compare with."""
+    return {True: "success", False: "failure", None: "unknown"}[metrics.success]
+
+
+def problem_key(problem: Problem) -> str:
+    """A hash of the numbers that an estimator sees: equal keys mean the same problem, whatever it is called."""
+    told = hashlib.blake2b(digest_size=16)
+    for array in (problem.pixels, problem.points, problem.gravity_camera, problem.gravity_map):
+        told.update(array.tobytes())
+    rest = [problem.gravity_bound_rad, problem.gravity_sd_rad, problem.bound_px, problem.estimated_outlier_rate]
+    told.update(json_text([len(problem), problem.camera.to_dict(), *rest]).encode())
+    return told.hexdigest()
+
+
+def outlier_rate(problem: Problem) -> float | None:
+    """Share of wrong correspondences: by their labels, else what the front end expects."""
+    if problem.truth_inliers is None:
+        return problem.estimated_outlier_rate
+    return 1.0 - float(problem.truth_inliers.mean())
+
+
+def run_row(
+    trace: Trace, metrics: Metrics, diagnosis: Diagnosis, origin: Origin, created: datetime, **known: Any
+) -> RunRow:
+    """The row of a run; ``known`` are the fields that do not follow from it."""
+    problem, certificate = trace.problem, trace.certificate
+    return RunRow(
+        created=created.isoformat(timespec="milliseconds"),
+        source=origin.source,
+        scene=_cut(problem.scene if origin.scene_path is None else Path(origin.scene_path).name),
+        name=_cut(problem.name),
+        query=_cut(problem.image.name) if origin.query is None and problem.image is not None else origin.query,
+        estimator=trace.estimator,
+        seed=trace.seed,
+        options=json_text(asdict(trace.options)),
+        problem_key=problem_key(problem),
+        outcome=outcome(metrics),
+        diagnosis=diagnosis.cause.value,
+        doubtful=diagnosis.doubtful,
+        summary=_cut(diagnosis.summary),
+        message=_cut(trace.message),
+        correspondences=len(problem),
+        inliers=int(trace.inlier_mask.sum()),
+        outlier_rate=outlier_rate(problem),
+        rotation_error_deg=metrics.rotation_error_deg,
+        translation_error_m=metrics.translation_error_m,
+        time_ms=trace.timings_ms.get("total", 0.0),
+        proven=None if certificate is None else certificate.proven,
+        title=_cut(origin.title),
+        format_version=FORMAT_VERSION,
+        **known,
+    )
+
+
+def _cut(text: str) -> str:
+    return text if len(text) <= MOST_CHARACTERS else text[: MOST_CHARACTERS - 1] + "…"
+
+
+def property_chunks(trace: Trace, row: RunRow, created: datetime) -> Iterator[Chunk]:
+    """The properties ``run`` and ``thumbnail``, and the name and time that the Rerun viewer shows for the recording.
+
+    Unknown values are absent, so that a query finds nulls. In ``options``, which is JSON, infinity is the text "inf".
+    """
+    values = {item.name: getattr(row, item.name) for item in fields(row) if item.name not in NOT_RECORDED}
+    certificate = trace.certificate
+    if certificate is not None:
+        values["upper_bound"] = certificate.upper_bound
+        values["lower_bound"] = certificate.lower_bound
+        values["chance_sets"] = certificate.chance_sets
+    values["versions"] = json.dumps(dict(trace.versions))
+    yield static_chunk(f"/__properties/{RUN_PROPERTY}", named_values(values))
+    if row.thumbnail:
+        yield static_chunk(f"/__properties/{THUMBNAIL_PROPERTY}", encoded_image(row.thumbnail, "image/png"))
+    name = legible(" ".join(f"{row.name}, {trace.estimator}, seed {trace.seed}".split()))
+    info = rr.archetypes.RecordingInfo
+    start_ns = pa.array([int(created.timestamp() * 1e9)], pa.int64())
+    columns = [Values(info.descriptor_name(), pa.array([name]), [1])]
+    yield static_chunk("/__properties", [*columns, Values(info.descriptor_start_time(), start_ns, [1])])
+
+
+def read_properties(chunk: Chunk) -> dict[str, Any]:
+    """The values of a chunk of ``property_chunks`` by name."""
+    batch = chunk.to_record_batch()
+    names = [name for name in batch.schema.names if pa.types.is_list(batch.column(name).type)]
+    return {name: batch.column(name)[0].values[0].as_py() for name in names if len(batch.column(name)[0].values)}
+
+
+def read_image(chunk: Chunk) -> bytes:
+    """The file in a chunk with an encoded image."""
+    column = chunk.to_record_batch().column("EncodedImage:blob")
+    return column[0].values[0].values.to_numpy(zero_copy_only=False).tobytes()
+
+
+_EMPTY: Mapping[type, Any] = {str: "", int: 0, float: 0.0}
+
+
+def row_from_properties(values: Mapping[str, Any], **known: Any) -> RunRow:
+    """The row that a recording's properties say; what older ones lack is unknown.
+
+    Raises ``TypeError`` for a value of a wrong type.
+    """
+    row: dict[str, Any] = dict(known)
+    values = {"source": "unknown", **values}
+    for item in fields(RunRow):
+        if item.name in known or item.name in NOT_RECORDED:
+            continue
+        kinds: tuple[type, ...] = get_args(item.type) or (cast(type, item.type),)
+        value = values.get(item.name)
+        if value is None:
+            row[item.name] = None if type(None) in kinds else _EMPTY[kinds[0]]
+        elif isinstance(value, kinds) or (float in kinds and isinstance(value, int)):
+            row[item.name] = _cut(value) if isinstance(value, str) else value
+        else:
+            raise TypeError(f"{item.name} is of type {type(value).__name__}")
+    return RunRow(**row)

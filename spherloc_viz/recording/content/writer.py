@@ -1,0 +1,129 @@
+"""Writes a run as one ``.rrd`` file that any Rerun viewer opens."""
+
+import contextlib
+import re
+import uuid
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+from rerun.chunk import Chunk, LazyChunkStream
+
+from spherloc.diagnosis import Diagnosis, diagnose
+from spherloc.errors import RecordingError
+from spherloc.metrics import evaluate
+from spherloc.trace import Trace
+from spherloc_viz.layers import paint, steps
+from spherloc_viz.layers.decisive import decisive_step
+from spherloc_viz.layers.primitives import Picture, Stop
+from spherloc_viz.layers.step_numbers import step_numbers
+from spherloc_viz.recording.content.columns import markdown, static_chunk
+from spherloc_viz.recording.content.data import data_chunks
+from spherloc_viz.recording.content.drawing import drawing_chunks
+from spherloc_viz.recording.content.layout import layout_file, shown_in
+from spherloc_viz.recording.content.markdown import outcome_text
+from spherloc_viz.recording.content.numbers import numbers_chunk
+from spherloc_viz.recording.content.panels import Panels, panel_chunks, panels_of
+from spherloc_viz.recording.content.properties import APPLICATION_ID, property_chunks, run_row
+from spherloc_viz.recording.content.query_image import image_chunks, query_image
+from spherloc_viz.recording.content.rrd_file import joined, split
+from spherloc_viz.recording.content.thumbnail import thumbnail
+from spherloc_viz.recording.keeping.leftovers import scratch, unfinished
+from spherloc_viz.recording.origin import Origin
+from spherloc_viz.recording.run_row import RunRow
+
+
+def write_recording(
+    trace: Trace, path: Path, origin: Origin | None = None, diagnosis: Diagnosis | None = None, full: bool = False
+) -> RunRow:
+    """Write the recording of a run to ``path``, whose folder is made if it is missing, and return its row.
+
+    A run that was not diagnosed is diagnosed here. ``full`` keeps every array of the stages, arcs and edges too.
+    A reader never sees half a file: it is written under another name and then moved.
+    Raises ``RecordingError`` if that fails, and then leaves nothing behind.
+    """
+    path = Path(path)
+    part = unfinished(path)
+    run = _Run(trace, origin or Origin(), diagnosis or diagnose(trace), full, datetime.now(UTC), str(uuid.uuid4()))
+    try:
+        row, content = _content(run, path.name)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part.write_bytes(content)
+        part.replace(path)
+    except OSError as error:
+        reason = error.strerror or error
+        raise RecordingError(
+            f"{path}: the run cannot be recorded ({reason}); make room or choose another folder."
+        ) from error
+    except (RuntimeError, ValueError) as error:
+        raise RecordingError(f"{path}: the run cannot be recorded, since rerun failed: {error}.") from error
+    finally:
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
+    return replace(row, size_bytes=len(content))
+
+
+@dataclass(frozen=True, eq=False)
+class _Run:
+    """What is recorded."""
+
+    trace: Trace
+    origin: Origin
+    diagnosis: Diagnosis
+    full: bool
+    created: datetime
+    recording_id: str
+
+
+def recorded_steps(stops: Sequence[Stop], decisive: int) -> list[int]:
+    """The steps that a lean recording shows: the decisive one, and of every series the first.
+
+    Series are steps whose keys differ in a number only, as "yaw-arcs-10" and "yaw-arcs-30" do: more and more arcs,
+    balls or members of a clique, one peak after another. A step with all of them follows. The samples of RANSAC have
+    no such step and are all there. Between two steps a viewer shows the earlier one.
+    """
+    first: dict[str, int] = {}
+    for index, stop in enumerate(stops):
+        first.setdefault(stop.key if stop.key.startswith("sample-") else re.sub(r"\d+$", "#", stop.key), index)
+    return sorted({decisive, *first.values()})
+
+
+def _content(run: _Run, file: str) -> tuple[RunRow, bytes]:
+    """The row and the bytes of the file."""
+    trace, metrics = run.trace, evaluate(run.trace)
+    stops, decisive = steps(trace), decisive_step(trace, run.diagnosis)
+    row = run_row(
+        trace,
+        metrics,
+        run.diagnosis,
+        run.origin,
+        run.created,
+        file=file,
+        run_id=run.recording_id,
+        steps=len(stops),
+        decisive_step=decisive,
+        thumbnail=thumbnail(trace),
+    )
+    chosen = list(range(len(stops))) if run.full else recorded_steps(stops, decisive)
+    pictures = {index: paint(trace, index) for index in chosen}
+    panels = panels_of(trace)
+    with scratch() as folder:
+        path = Path(folder) / "run.rrd"
+        stream = LazyChunkStream.from_iter(list(_chunks(run, row, pictures, panels)))
+        stream.write_rrd(path, application_id=APPLICATION_ID, recording_id=run.recording_id)
+        recording = split(path.read_bytes())
+    return row, joined(layout_file(shown_in(list(pictures.values()), panels)), recording)
+
+
+def _chunks(run: _Run, row: RunRow, pictures: Mapping[int, Picture], panels: Panels) -> Iterator[Chunk]:
+    trace, image = run.trace, query_image(run.trace.problem)
+    yield from property_chunks(trace, row, run.created)
+    yield from data_chunks(trace, run.origin, run.diagnosis, run.full)
+    yield numbers_chunk(step_numbers(trace, pictures))
+    yield from drawing_chunks(pictures, image.scale * trace.problem.pixels)
+    yield from image_chunks(trace.problem, image)
+    yield from panel_chunks(trace, panels)
+    tables = pictures[max(pictures)].tables
+    text = outcome_text(row, run.diagnosis, run.origin.story, image.remark, tables)
+    yield static_chunk("/outcome", markdown([text]))

@@ -1,0 +1,100 @@
+"""Questions about single steps over many runs, answered by rerun's catalog of the recordings themselves."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from spherloc.errors import InputError, RecordingError
+from spherloc.extras import require
+from spherloc_viz.recording.content.numbers import NUMBERS
+from spherloc_viz.recording.index.step_condition import COLUMNS, RUN_COLUMNS, STEP_COLUMNS, checked_condition
+from spherloc_viz.recording.run_row import RunRow
+
+FIRST_VERSION = 2
+"""Recordings of this format and later have numbers for every step."""
+_RENAMED = {"position_error_m": "translation_error_m"}
+"""What a condition calls differently than a recording."""
+_RUN = "rerun_segment_id"
+
+
+@dataclass(frozen=True)
+class StepFound:
+    """A step that a condition holds for."""
+
+    run: RunRow
+    step: int
+    """Index on the timeline."""
+    stage: str
+    """Named stage."""
+    key: str
+    """Which step of it."""
+    agreeing: int
+    """Matches that it shows as agreeing."""
+    rotation_error_deg: float | None
+    """Of the step's pose; None if it has none or the truth is unknown."""
+    position_error_m: float | None
+    """Likewise, metres."""
+
+
+def find_steps(folder: Path, rows: Sequence[RunRow], condition: str, limit: int | None = None) -> tuple[StepFound, ...]:
+    """The steps of some runs of a folder for which a condition in SQL holds, the newest run first.
+
+    ``rows`` are runs as the index of the folder lists them, so that their files are known to be sound. The condition
+    is one of ``checked_condition``; nothing else of SQL is run. Raises ``InputError`` if it cannot be understood or
+    the catalog is not installed, ``RecordingError`` if the recordings cannot be read.
+    """
+    checked = checked_condition(condition)
+    known = {row.run_id: row for row in reversed(rows) if row.format_version >= FIRST_VERSION}
+    require("datafusion", "catalog", "asking about steps")
+    from rerun.server import Server
+
+    if not known:
+        return ()
+    files = [str(folder / row.file) for row in known.values()]
+    try:
+        # Only for this machine; by default others could read the recordings.
+        with Server(host="127.0.0.1", datasets={"runs": files}) as server:
+            client = server.client()  # kept, since tables know their catalog only as long as it lives
+            found = _filtered(_frame(client.get_dataset("runs")), checked, limit)
+    except (OSError, ValueError, RuntimeError, ConnectionError) as error:
+        raise RecordingError(f"{folder}: rerun's catalog cannot read the recordings ({_first_line(error)}).") from error
+    return tuple(StepFound(known[row.pop(_RUN)], **{name: row[name] for name in STEP_COLUMNS}) for row in found)
+
+
+def _frame(dataset: Any) -> Any:
+    """A table with a row a step, and what is known of its run beside it."""
+    from datafusion import col
+
+    # A column that is empty in one recording would else be missing for all.
+    steps = dataset.filter_contents([NUMBERS]).reader(index="step", include_semantically_empty_columns=True)
+    runs = dataset.segment_table()
+    of_step = [_first(steps, f"{NUMBERS}:{_RENAMED.get(name, name)}", name) for name in STEP_COLUMNS if name != "step"]
+    of_run = [_first(runs, f"property:run:{name}", name) for name in RUN_COLUMNS]
+    steps = steps.select(col(_RUN), col("step"), *of_step)
+    return steps.join(runs.select(col(_RUN).alias("run"), *of_run), left_on=_RUN, right_on="run")
+
+
+def _first(frame: Any, column: str, name: str) -> Any:
+    """The single value in each cell; unknown where no recording has the column."""
+    from datafusion import col, functions, lit
+
+    if column not in frame.schema().names:
+        return lit(None).cast(COLUMNS[name]).alias(name)
+    return functions.array_element(col(f'"{column}"'), lit(1)).alias(name)
+
+
+def _filtered(frame: Any, condition: str, limit: int | None) -> list[dict[str, Any]]:
+    from datafusion import col
+
+    try:
+        found = frame.filter(frame.parse_sql_expr(condition))
+        found = found.sort(col("created").sort(ascending=False), col(_RUN).sort(), col("step").sort())
+        return (found if limit is None else found.limit(limit)).to_pylist()
+    except Exception as error:  # DataFusion has no class of its own for errors in a condition
+        raise InputError(f"the condition cannot be answered: {_first_line(error)}.") from error
+
+
+def _first_line(error: Exception) -> str:
+    text = str(error).removeprefix("DataFusion error: ").strip()
+    return text.splitlines()[0][:200].rstrip(".") if text else type(error).__name__

@@ -1,0 +1,1 @@
+"""Runs on their way to the disk: beside the work, safe from crashes, and pruned."""

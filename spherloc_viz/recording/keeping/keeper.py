@@ -1,0 +1,148 @@
+"""A folder of recordings as its writers see it: a run becomes a file and a row, and old successes make room."""
+
+import contextlib
+import re
+import threading
+import unicodedata
+import uuid
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Self
+
+from spherloc.diagnosis import Diagnosis
+from spherloc.errors import RecordingError
+from spherloc.trace import Trace
+from spherloc_viz.recording.content.writer import write_recording
+from spherloc_viz.recording.index.run_index import RunIndex
+from spherloc_viz.recording.keeping.leftovers import leftovers, sweep_scratch
+from spherloc_viz.recording.keeping.rescue import rescue
+from spherloc_viz.recording.keeping.retention import Pruned, prune
+from spherloc_viz.recording.keeping.room import KEEP_BYTES, size_words
+from spherloc_viz.recording.origin import Origin
+
+GALLERY = "gallery"
+"""The folder inside that has the curated cases."""
+CHECKS = 50
+"""The size of all recordings is looked at when a new part of it, one of so many, was written."""
+
+
+class Keeper:
+    """Writes runs into a folder, here and now. Any number of threads and processes may write into the same one."""
+
+    def __init__(
+        self,
+        folder: Path,
+        on_notice: Callable[[str], None],
+        full: bool = False,
+        keep_bytes: int | None = KEEP_BYTES,
+    ) -> None:
+        """``on_notice`` gets a sentence for people now and then; ``full`` keeps every arc and edge.
+
+        ``keep_bytes`` is what the recordings may take; None leaves that to somebody else. Nothing is opened yet.
+        """
+        self.folder = Path(folder)
+        self._notice, self._full, self._keep_bytes = on_notice, full, keep_bytes
+        self._lock = threading.Lock()
+        self._index: RunIndex | None = None
+        self._closed = False
+        self._unlisted = 0
+        """Recordings whose rows could not be stored; the next refresh finds them."""
+        self._unchecked_bytes: float = float("inf")
+        self._told_over = False
+
+    @property
+    def index(self) -> RunIndex:
+        """The list of the folder's runs. Raises ``RecordingError`` if it cannot be opened."""
+        with self._lock:
+            if self._closed:
+                raise RecordingError(f"{self.folder}: the list of runs is closed.")
+            if self._index is None:
+                self._index = RunIndex(self.folder, self._notice)
+            return self._index
+
+    def path_of(self, trace: Trace) -> Path:
+        """A new path for the recording of a run."""
+        return self.folder / file_name(trace, datetime.now(UTC))
+
+    def record(
+        self,
+        trace: Trace,
+        origin: Origin | None = None,
+        diagnosis: Diagnosis | None = None,
+        path: Path | None = None,
+    ) -> Path:
+        """Write a run, list it, and make room if it is time to; returns the recording's path.
+
+        Raises ``RecordingError`` if it cannot be written. What else fails is a notice: the recording is there.
+        """
+        path = self.path_of(trace) if path is None else path
+        row = write_recording(trace, path, origin, diagnosis, self._full)
+        try:
+            self.index.add(row)
+            self._unlisted = 0
+        except RecordingError as error:
+            self._unlisted += 1
+            if self._unlisted == 1:
+                self._notice(f"A run is recorded, but not listed: {error}")
+        self._unchecked_bytes += row.size_bytes
+        if self._keep_bytes is not None and self._unchecked_bytes > self._keep_bytes / CHECKS:
+            with contextlib.suppress(RecordingError):  # it is tried again, and the failing index was spoken of
+                self.prune()
+        return path
+
+    def prune(self) -> None:
+        """Delete the oldest successes beyond the size that may be kept, and say so.
+
+        Raises ``RecordingError`` if the index or the log of deletions cannot be used.
+        """
+        if self._keep_bytes is None:
+            return
+        self._unchecked_bytes = 0.0
+        done = prune(self.folder, self.index, self._keep_bytes)
+        if done.sentence:
+            self._notice(done.sentence)
+        self._tell_over(done)
+
+    def tidy(self) -> None:
+        """Recover what killed processes left unfinished, or delete it, and say so. Raises ``OSError``."""
+        sweep_scratch()
+        folders = [folder for folder in (self.folder, self.folder / GALLERY) if folder.is_dir()]
+        found = [part for folder in folders for part in leftovers(folder)]
+        saved = [path for path in map(rescue, found) if path is not None]
+        if saved:
+            runs = "a run" if len(saved) == 1 else f"{len(saved)} runs"
+            names = ", ".join(path.name for path in saved[:3]) + (" and more" if len(saved) > 3 else "")
+            self._notice(f"Recovered the recording of {runs} that was not finished: {names}.")
+
+    def close(self) -> None:
+        """Close the list of runs; nothing else can be recorded after that."""
+        with self._lock:
+            self._closed = True
+            if self._index is not None:
+                self._index.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def _tell_over(self, done: Pruned) -> None:
+        if done.over and not self._told_over:
+            self._notice(
+                f"The recordings take {size_words(done.left_bytes)}, more than {size_words(done.keep_bytes)}, and only "
+                "failures, labelled and new ones are left; delete some, or keep more gigabytes."
+            )
+        self._told_over = done.over
+
+
+def file_name(trace: Trace, now: datetime) -> str:
+    """``<UTC time>_<scene>_<estimator>_<seed>_<id>.rrd``: sorts by time, is unique, and is safe in any file system."""
+    when = now.strftime("%Y%m%dT%H%M%SZ")
+    return f"{when}_{_slug(trace.problem.name)}_{_slug(trace.estimator)}_{trace.seed}_{uuid.uuid4().hex[:8]}.rrd"
+
+
+def _slug(text: str) -> str:
+    ascii_text = unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode()
+    return re.sub(r"[^a-z0-9]+", "-", ascii_text.lower()).strip("-")[:60] or "run"

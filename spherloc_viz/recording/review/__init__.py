@@ -1,0 +1,1 @@
+"""Labels and notes, in a file beside the run."""

@@ -1,0 +1,1 @@
+"""Recordings that may be damaged or hostile are read by another process."""

@@ -1,0 +1,249 @@
+"""Recordings from strangers: their names, and their content, which another process reads first.
+
+A recording may be hostile: made so that reading it takes gigabytes, minutes, or down the process that reads it. So what
+comes from elsewhere is read by a child first (``spherloc_viz.recording.strangers.child``) whose memory and time are
+limited. What has passed is safe to be read here.
+"""
+
+import atexit
+import contextlib
+import json
+import queue
+import re
+import subprocess
+import sys
+import threading
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import IO, Any, Self
+
+from spherloc.errors import InputError, RecordingError, show
+from spherloc_viz.recording.review.notes import UNREADABLE, Review, checked_review, review_path
+from spherloc_viz.recording.run_row import RunRow
+from spherloc_viz.recording.strangers.checked_row import row_from_table
+from spherloc_viz.recording.viewing.rerun_program import rerun_environment
+
+FILE_LIMIT_S = 60.0
+"""A good file takes a hundredth of a second; the child gives up sooner, by the processor time that it used."""
+BEGIN_LIMIT_S = 10.0
+"""A child that has nothing to do begins in a millisecond."""
+START_LIMIT_S = 120.0
+"""The child starts in two seconds."""
+LINE_LIMIT_BYTES = 1 << 21
+"""Of an answer: a row has a thumbnail of some kilobytes."""
+
+_NAME = re.compile(r"(gallery/)?[A-Za-z0-9._-]+\.rrd", re.ASCII)
+_NAME_LIMIT = 255
+
+
+def check_name(name: str) -> str:
+    """The name of a recording in its folder, such as a page, an index or an archive tells it, if it is one.
+
+    It has letters, digits, ".", "_" and "-", ends with ".rrd", and may be in the folder "gallery".
+    Raises ``RecordingError`` otherwise.
+    """
+    if len(name) > _NAME_LIMIT or not _NAME.fullmatch(name):
+        raise RecordingError(
+            f"{show(name)}: not the name of a recording, which has letters, digits, '.', '_' and '-' and ends with "
+            ".rrd; rename the file."
+        )
+    return name
+
+
+def resolve_inside(folder: Path, name: str) -> Path:
+    """The path of the recording ``name`` in ``folder``.
+
+    Raises ``RecordingError`` if it is no such name, if there is no such file, or if it is a link that leads out.
+    """
+    path = folder / check_name(name)
+    try:
+        inside = path.resolve().is_relative_to(folder.resolve()) and path.is_file()
+    except (OSError, RuntimeError):  # a loop of links
+        inside = False
+    if not inside:
+        raise RecordingError(f"{name}: no such recording in {folder}; list what is there with 'spherloc runs'.")
+    return path
+
+
+class Examiner:
+    """Reads recordings in a child process and replaces it when a file kills or stalls it. Thread-safe."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._child: _Child | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the child; it starts again when it is needed."""
+        with self._lock:
+            self._end()
+
+    def examine(self, path: Path) -> RunRow:
+        """The row of a recording that can be read wholly and is safe to be read in this process.
+
+        Raises ``RecordingError``, in one sentence, if it cannot or is not.
+        """
+        with self._lock:
+            answer = self._ask(path, "row")
+            if answer is None and review_path(path).exists():
+                # It may be the labels beside it that the child died of.
+                answer = self._ask(path, "bare row")
+        return row_from_table(_wanted(answer, path, "row"), path)
+
+    def examine_review(self, path: Path) -> Review:
+        """Labels and note of a recording, whose file is safe to be read in this process.
+
+        Raises ``RecordingError``, in one sentence, if it is not.
+        """
+        with self._lock:
+            answer = self._ask(path, "review")
+        table = _wanted(answer, review_path(path), "review")
+        try:
+            return checked_review(table["labels"], table["note"])
+        except (InputError, TypeError, LookupError, AttributeError):
+            raise RecordingError(f"{review_path(path)}: {UNREADABLE}") from None
+
+    def _ask(self, path: Path, want: str) -> dict[str, Any] | None:
+        """What the child says; None if it dies or hangs of the file."""
+        question = {"path": str(path), "want": want}
+        if self._child is not None and not self._child.begin(question, BEGIN_LIMIT_S):
+            self._end()  # it had nothing to do for a minute
+        if self._child is None:
+            self._child = _Child()
+            if not self._child.begin(question, START_LIMIT_S):
+                self._end()
+                raise _cannot_start("it ended at once")
+        answer = self._child.answer(FILE_LIMIT_S)
+        if answer is None:
+            self._end()
+        return answer
+
+    def _end(self) -> None:
+        child, self._child = self._child, None
+        if child is not None:
+            child.end()
+
+
+class _Child:
+    """One child process."""
+
+    def __init__(self) -> None:
+        """Raises ``RecordingError`` if it does not start."""
+        try:
+            self._process = subprocess.Popen(
+                [sys.executable, "-P", "-m", "spherloc_viz.recording.strangers.child"],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+                # In a session of its own, so that a Ctrl-C meant for us does not look like a bad file.
+                start_new_session=True,
+                env=rerun_environment() | dict.fromkeys(_FRUGAL, "1"),
+            )
+        except OSError as error:
+            raise _cannot_start(error.strerror or str(error)) from error
+        assert self._process.stdin is not None and self._process.stdout is not None
+        self._questions: IO[bytes] = self._process.stdin
+        self._answers: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+        self._listener = threading.Thread(target=self._listen, args=(self._process.stdout,), daemon=True)
+        self._listener.start()
+        if self.answer(START_LIMIT_S) != {"ready": True}:
+            self.end()
+            raise _cannot_start("it does not get ready")
+
+    def begin(self, question: dict[str, Any], limit_s: float) -> bool:
+        """Ask for a file; whether it is being read."""
+        try:
+            self._questions.write(json.dumps(question).encode() + b"\n")
+            self._questions.flush()
+        except OSError:
+            return False
+        return self.answer(limit_s) == {"begun": True}
+
+    def answer(self, limit_s: float) -> dict[str, Any] | None:
+        """The next thing that it says; None if it died, hangs or talks nonsense."""
+        try:
+            answer = json.loads(self._answers.get(timeout=limit_s))
+        except (queue.Empty, ValueError, RecursionError):
+            return None
+        return answer if isinstance(answer, dict) else None
+
+    def end(self) -> None:
+        """Kill it and wait until it is gone."""
+        self._process.kill()
+        self._process.wait()
+        self._listener.join()
+        with contextlib.suppress(OSError):  # what it did not read
+            self._questions.close()
+
+    def _listen(self, answers: IO[bytes]) -> None:
+        with answers:
+            while line := answers.readline(LINE_LIMIT_BYTES):
+                self._answers.put(line)
+        self._answers.put(b"")
+
+
+def _wanted(answer: dict[str, Any] | None, path: Path, want: str) -> Any:
+    """What was wanted of a file; raises ``RecordingError`` if it is not in the answer."""
+    if answer is None or not answer.keys() & {want, "error"}:
+        raise RecordingError(
+            f"{path}: cannot be read, since reading it takes too long or too much memory or ends the reader; "
+            "delete it or make it again."
+        )
+    if "error" in answer:
+        raise RecordingError(str(answer["error"]))
+    return answer[want]
+
+
+def _cannot_start(reason: str) -> "_NotStartedError":
+    return _NotStartedError(
+        f"recordings cannot be examined: the process that reads them does not start ({reason}); "
+        "'python -m spherloc_viz.recording.strangers.child' says more."
+    )
+
+
+class _NotStartedError(RecordingError):
+    """No fault of a file."""
+
+
+_FRUGAL = ("OPENBLAS_NUM_THREADS", "RAYON_NUM_THREADS", "TOKIO_WORKER_THREADS", "MALLOC_ARENA_MAX")
+"""How many threads there are; they reserve address space, which the child has little of."""
+
+_shared = Examiner()
+atexit.register(_shared.close)
+
+
+def examine(path: Path) -> RunRow:
+    """The row of a recording that can be read wholly and is safe to be read in this process.
+
+    The first call takes two seconds and leaves a child behind for those to come, which ends a minute after the last.
+    Raises ``RecordingError``, in one sentence, if the file cannot be read or is not safe.
+    """
+    return _shared.examine(Path(path))
+
+
+def examine_review(path: Path) -> Review:
+    """Labels and note of a recording, whose file is then safe to be read in this process; empty if it has none.
+
+    Raises ``RecordingError``, in one sentence, if the file cannot be read or is not safe.
+    """
+    return _shared.examine_review(Path(path))
+
+
+def examine_all(paths: Iterable[Path]) -> Iterator[tuple[Path, RunRow | RecordingError]]:
+    """Examine many recordings one after another: their rows, or what is wrong with them.
+
+    Raises ``RecordingError`` only if the child that reads them cannot be started.
+    """
+    with Examiner() as examiner:
+        for path in paths:
+            try:
+                yield path, examiner.examine(path)
+            except _NotStartedError:
+                raise
+            except RecordingError as error:
+                yield path, error

@@ -1,0 +1,1 @@
+"""The Rerun viewer, in a window or a browser."""
