@@ -25,6 +25,8 @@ SYNTHETIC, IMAGES = "scenes/panorama_outliers_80.toml", "scenes/street_fisheye.t
 PATIENCE_MS = 240_000
 STILL_S = 90.0
 """How long the page may go on changing before it is photographed all the same."""
+TO_TOP = "() => document.querySelectorAll('*').forEach(box => { if (box.scrollTop > 0) box.scrollTop = 0; })"
+"""A panel that was scrolled to press something shows its beginning again."""
 DOCS = {
     "playground": ("arcs", "dark", 0),
     "selection": ("selection", "dark", 0),
@@ -183,6 +185,7 @@ def picture(page: Page, name: str, view: Callable[[Page], object], theme: str, s
     view(page)
     width, height = SIZES[size]
     path = FOLDER / f"{name}_{theme}_{width}x{height}.png"
+    page.evaluate(TO_TOP)
     path.write_bytes(still(page))
     for deselect in page.locator("[data-touch='deselect:']").all():
         deselect.click()
