@@ -71,7 +71,7 @@ def test_a_file_opens_paused_at_the_steps_with_a_view_of_everything(
     path = tmp_path / "run.rrd"
     write_recording(trace, path)
     panel, views = layout_of(path)
-    assert panel["TimePanelBlueprint:timeline"] == ["step"]
+    assert "TimePanelBlueprint:timeline" not in panel, "a named one is reported as missing while the file loads"
     assert panel["TimePanelBlueprint:play_state"] == [1], "paused"
     pictures = [paint(trace, step) for step in range(len(steps(trace)))]
     charts = {f"/charts/{chart.name}" for picture in pictures for chart in picture.charts}

@@ -13,8 +13,9 @@ from rerun.experimental import ViewerClient
 
 from spherloc.errors import InputError, RecordingError
 from spherloc_viz.recording.content.columns import TIMELINE
-from spherloc_viz.recording.review.notes import Review, read_review, review_path
+from spherloc_viz.recording.review.notes import Review, review_path
 from spherloc_viz.recording.run_row import RunRow
+from spherloc_viz.recording.strangers.examiner import examine_review
 from spherloc_viz.recording.viewing.rerun_program import rerun_command, rerun_environment
 
 HOST = "127.0.0.1"
@@ -42,7 +43,7 @@ def labels_of(recording: Path, run_id: str) -> Path | None:
     Raises ``RecordingError`` if the file is damaged, or belongs to another run, which would cover this one.
     """
     path = review_path(recording)
-    if read_review(recording) == Review():
+    if examine_review(recording) == Review():
         return None
     if {entry.recording_id for entry in RrdReader(path).recordings()} != {run_id}:
         raise RecordingError(f"{path}: labels and note of another run; delete the file and label this one.")
@@ -69,12 +70,11 @@ def view_in_window(path: Path, row: RunRow, step: int) -> None:
 
 def stand_at(viewer: subprocess.Popen[bytes], address: str, step: int) -> bool:
     """Tell a viewer that is starting to pause at a step as soon as it has its recording; False if it never takes it."""
-    client = ViewerClient.connect(address)
     for _ in range(TRIES):
         if viewer.poll() is not None:
             return False
         with contextlib.suppress(Exception):  # of many kinds, and all mean: not yet
-            client.set_time(TIMELINE, sequence=step, play_state="paused")
+            ViewerClient.connect(address).set_time(TIMELINE, sequence=step, play_state="paused")
             return True
         time.sleep(PAUSE_S)
     return False
