@@ -10,6 +10,7 @@ from spherloc.trace import Trace
 from spherloc_viz.app.catalog import Catalog, SceneWish
 from spherloc_viz.app.review.opened import is_same_pose
 from spherloc_viz.app.wish import Run, Wish
+from spherloc_viz.recording.again.scene import origin_of
 from spherloc_viz.recording.keeping.recorder import Recorder
 from spherloc_viz.recording.origin import Origin, Source
 
@@ -88,5 +89,5 @@ class PageRuns:
         return same and known is not None and is_same_pose(known.cam_from_map, run.trace.cam_from_map)
 
     def _origin(self, source: Source, scene: SceneWish) -> Origin:
-        path = str(self._catalog.path(scene.scene))
-        return Origin(source, path, scene.seed, scene.query, scene.variation)
+        catalog, label = self._catalog, scene.scene
+        return origin_of(source, catalog.path(label), catalog.scenes[label], scene.seed, scene.query, scene.variation)

@@ -22,6 +22,8 @@ BoolArray = NDArray[np.bool_]
 
 SPHERE_SHARE = 0.17
 """Radius at which the unit sphere is drawn, as a share of the map's typical extent."""
+DENSE = (0.05, 0.95)
+"""Between these shares of the points, by each coordinate, lies the map; the others are strays."""
 FEW_DOTS = 200
 """Up to this many, dots have their full size."""
 
@@ -77,6 +79,12 @@ class RunView:
     def middle(self) -> FloatArray:
         """Component-wise median (3,) of the map points."""
         return np.median(self.points, axis=0)
+
+    @cached_property
+    def dense_box(self) -> FloatArray:
+        """Lower and upper corner (2, 3) of the map without its strays."""
+        ends = [round(share * (len(self.points) - 1)) for share in DENSE]
+        return np.partition(self.points, ends, axis=0)[ends]
 
     @cached_property
     def sphere_m(self) -> float:

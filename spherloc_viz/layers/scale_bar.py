@@ -8,16 +8,15 @@ from spherloc_viz.layers.primitives import Label, SceneItem, Segments
 
 SHARE = 0.25
 """Length of the bar as a share of the map's width, at most."""
-DENSE = (0.05, 0.95)
-"""Between these shares of the points, by each coordinate, lies the map; the others are strays."""
+LEAST_M = 1e-4
+"""Nobody cares for less."""
 TICK = 0.04
 """Height of the marks, as a share of the bar."""
 
 
 def scale_bar(view: RunView) -> list[SceneItem]:
     """The bar, before the front of the map as the overview shows it, with its length."""
-    ends = [round(share * (len(view.points) - 1)) for share in DENSE]
-    low, high = np.partition(view.points, ends, axis=0)[ends]
+    low, high = view.dense_box
     length = round_length(SHARE * max(float((high - low)[[0, 2]].max()), 1e-3))
     start = np.array([0.5 * (low + high)[0] - 0.5 * length, high[1], low[2] - TICK * length])
     along, tick = np.array([length, 0.0, 0.0]), np.array([0.0, -TICK * length, 0.0])
@@ -39,6 +38,8 @@ def round_length(most: float) -> float:
 
 def length_text(length_m: float) -> str:
     """A length in the unit that suits its size, with two digits."""
+    if 0.0 < length_m < LEAST_M:
+        return "< 0.1 mm"
     for unit, metres in (("km", 1000.0), ("m", 1.0), ("cm", 0.01)):
         if length_m >= 0.995 * metres:
             return f"{_digits(length_m / metres)} {unit}"

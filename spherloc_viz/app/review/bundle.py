@@ -1,6 +1,5 @@
 """A selection of recordings as one zip file: the recordings, what a reviewer said, a table, and a page to read."""
 
-import contextlib
 import csv
 import io
 import zipfile
@@ -49,10 +48,10 @@ def bundle(folder: Path, rows: Sequence[RunRow], total: int, now: datetime, clos
         for row in rows[:MOST_RUNS]:
             if closed():
                 raise RecordingError("the export was given up, since its page was closed.")
-            files = _files(folder, row.file)
-            size += sum(map(len, files.values()))
-            if size > MOST_BYTES:
+            files = _files(folder, row.file, MOST_BYTES - size)
+            if files is None:
                 break
+            size += sum(map(len, files.values()))
             gone += not files
             packed += [row] if files else []
             for name, content in files.items():
@@ -69,18 +68,20 @@ def bundle(folder: Path, rows: Sequence[RunRow], total: int, now: datetime, clos
     return Bundle(content, len(packed), f"{len(packed):,} run{plural}, {words.size(len(content))}. {remark}".strip())
 
 
-def _files(folder: Path, name: str) -> dict[str, bytes]:
-    """A recording and its review by their names; empty if the recording is gone."""
+def _files(folder: Path, name: str, most_bytes: int) -> dict[str, bytes] | None:
+    """A recording and its review by their names; empty if the recording is gone, None if they are larger than that."""
     try:
         path = resolve_inside(folder, name)
-        files = {name: path.read_bytes()}
+        sources = {name: path}
+        review = review_path(path)
+        if review.is_file() and not review.is_symlink():
+            sources[review_path(Path(name)).as_posix()] = review
+        # Asked before anything is read: a file may have become a huge one since it was listed.
+        if sum(source.stat().st_size for source in sources.values()) > most_bytes:
+            return None
+        return {name: source.read_bytes() for name, source in sources.items()}
     except (RecordingError, OSError):
         return {}
-    review = review_path(path)
-    with contextlib.suppress(OSError):
-        if review.is_file() and not review.is_symlink():
-            files[review_path(Path(name)).as_posix()] = review.read_bytes()
-    return files
 
 
 def _remark(left: int, gone: int) -> str:

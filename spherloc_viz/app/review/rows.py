@@ -13,10 +13,8 @@ from spherloc_viz.app.review.look import PAGE, Look
 from spherloc_viz.app.text import DIM, box, dot_html
 from spherloc_viz.app.web.viewer_room import viewer_link
 from spherloc_viz.recording.run_row import RunRow
+from spherloc_viz.recording.strangers.checked_row import is_thumbnail
 
-PNG = b"\x89PNG\r\n\x1a\n"
-MOST_PICTURE_BYTES = 100_000
-"""Of a row's picture; larger ones are not shown."""
 WIDTH_PX, HEIGHT_PX = 64, 46
 """Of a row's picture."""
 PREVIOUS_KEY, NEXT_KEY = "[", "]"
@@ -116,7 +114,7 @@ def badge_html(outcome: str) -> str:
 def picture_html(png: bytes, width_px: int = WIDTH_PX, height_px: int = HEIGHT_PX) -> str:
     """A run's picture, or its place if it has none."""
     box_css = f"width:{width_px}px;height:{height_px}px;border-radius:3px;flex:none;background:rgba(128,140,160,.14)"
-    if not png.startswith(PNG) or len(png) > MOST_PICTURE_BYTES:
+    if not png or not is_thumbnail(png):
         return f'<div style="{box_css}"></div>'
     data = base64.b64encode(png).decode()
     return f'<img alt="" src="data:image/png;base64,{data}" style="{box_css};object-fit:cover;display:block">'

@@ -69,6 +69,8 @@ def _live(run: RecordedRun, roots: Sequence[Path]) -> tuple[Scene, Origin] | str
     """The scene that a run came from, or why it cannot be opened, in a sentence."""
     instead = "so the recorded problem is opened instead"
     origin = run.origin
+    if origin is not None and origin.scene_path is None and origin.source == "gallery":
+        return "The case was put together match by match: what is opened is the recorded problem."
     if origin is None or origin.scene_path is None:
         return f"The recording does not say which scene file it came from, {instead}."
     if is_recording(Path(origin.scene_path)):
