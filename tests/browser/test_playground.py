@@ -194,7 +194,7 @@ def test_a_settled_run_is_recorded(tab: Playground, recordings: Path) -> None:
     path = recordings / said.inner_text().split()[-1]
     tab.until(path.is_file, "the recording is written")
     run = read_recording(path)
-    assert run.problem.name == "small street" and "seed 4711" in str(run.properties["scene"])
+    assert run.problem.name == "small street" and "seed 4711" in run.problem.scene
     inliers = tab.value("inliers").inner_text()
     assert inliers == f"{int(run.inlier_mask.sum())} of {len(run.problem)}"
 

@@ -162,7 +162,7 @@ def test_widgets_that_change_at_once_show_what_was_solved(tab: Playground, addre
         path = next((recordings / text.split()[-1] for text in said.all_inner_texts()), None)
         noise, outliers, points = (float(tab.entry(name).input_value()) for name in names)
         scene = f"synthetic: N {points:g}, outliers {outliers / 100:g}, noise {noise:g} px, seed 3"
-        return path is not None and path.is_file() and read_recording(path).properties["scene"] == scene
+        return path is not None and path.is_file() and read_recording(path).problem.scene == scene
 
     tab.until(recorded_as_shown, "what is recorded is what the boxes say")
     tab.expect_quiet(address)

@@ -39,6 +39,7 @@ class Canvas:
         self._camera = TrueCamera(client, moved)
         self._docked_px, self._full_width = docked_px, client.camera.image_width
         self._viewed: tuple[str, str, str] | None = None
+        self._scene: str | None = None
         self._checks, self._movable = 0, False
         self._lock = threading.Lock()
         self._picture: Picture | None = None
@@ -77,14 +78,17 @@ class Canvas:
         return CHECK_S if self._checks <= most else None
 
     def _move_viewer(self, run: Run, picture: Picture) -> None:
-        """Go where the person wants, or, if that is to follow the steps, where the step's subject reads best."""
+        """Go where the person wants; or, if that is to follow the steps, where the step's subject reads best, and so too
+        where another scene is opened, of which the viewer may see nothing."""
         wanted = self._display.take_view()
         name, subject = views.fitting(picture)
         fitting = (run.trace.problem.name, name, subject)
         follows = self._display.follow and fitting != self._viewed
-        if wanted is None and (views.is_unmoved(self._client) or follows):
+        scene = run.wish.scene.scene
+        elsewhere = self._scene not in (None, scene)
+        if wanted is None and (views.is_unmoved(self._client) or follows or elsewhere):
             wanted = name
-        self._viewed = fitting
+        self._viewed, self._scene = fitting, scene
         if wanted is not None:
             views.look(self._client, views.find(wanted, picture, self._aspect()))
 

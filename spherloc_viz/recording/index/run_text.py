@@ -11,7 +11,7 @@ from typing import Any
 
 from spherloc_viz.recording.run_row import RunRow
 
-WIDTH = 100
+WIDTH = 112
 """Characters of a line of the table; only the name of a file may be longer."""
 GAP = "  "
 LEAST = 8
