@@ -15,7 +15,7 @@ import pytest
 
 from spherloc.errors import InputError, RecordingError
 from spherloc_viz.app.review import bundle as bundle_module
-from spherloc_viz.app.review.bundle import bundle, table_csv
+from spherloc_viz.app.review.bundle import bundle
 from spherloc_viz.app.review.differences import comparison_html
 from spherloc_viz.app.review.filters import Counts, filters_html
 from spherloc_viz.app.review.look import PAGE, Look
@@ -25,6 +25,7 @@ from spherloc_viz.app.review.summary_page import summary_html
 from spherloc_viz.app.web.touch import Touch, TouchDesk, Touches
 from spherloc_viz.recording.index.query import Range
 from spherloc_viz.recording.index.run_index import RunIndex
+from spherloc_viz.recording.index.run_text import rows_text
 from spherloc_viz.recording.run_row import RunRow
 
 NOW = datetime(2026, 5, 1, 12, tzinfo=UTC)
@@ -229,7 +230,7 @@ def test_an_export_is_whole_readable_and_bounded(shelf: Shelf, tmp_path: Path, m
 
 
 def test_a_table_has_every_number() -> None:
-    found = next(csv.DictReader(io.StringIO(table_csv([made_row(7)]))))
+    found = next(csv.DictReader(io.StringIO(rows_text(Path("recordings"), [made_row(7)], "csv"))))
     assert set(found) == {field.name for field in fields(RunRow)} - {"thumbnail"}
     assert float(found["outlier_rate"]) == 0.7 and found["seed"] == "7"
 

@@ -1,16 +1,16 @@
 """A selection of recordings as one zip file: the recordings, what a reviewer said, a table, and a page to read."""
 
-import csv
 import io
 import zipfile
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
 from spherloc.errors import RecordingError
 from spherloc_viz.app.review import words
 from spherloc_viz.app.review.summary_page import summary_html
+from spherloc_viz.recording.index.run_text import rows_text
 from spherloc_viz.recording.review.notes import review_path
 from spherloc_viz.recording.run_row import RunRow
 from spherloc_viz.recording.strangers.examiner import resolve_inside
@@ -18,10 +18,6 @@ from spherloc_viz.recording.strangers.examiner import resolve_inside
 MOST_RUNS = 500
 MOST_BYTES = 200_000_000
 """Of all files together; a page gets them through its browser's memory."""
-SEPARATE = ("thumbnail", "labels")
-"""Fields of a row that the table has in another form, or not at all."""
-FORMULA = ("=", "+", "-", "@", "\t", "\r")
-"""What a spreadsheet would compute, if it began a text."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +56,7 @@ def bundle(folder: Path, rows: Sequence[RunRow], total: int, now: datetime, clos
         remark = _remark(left, gone)
         page = summary_html(packed, remark, now)
         archive.writestr("index.html", page, compress_type=zipfile.ZIP_DEFLATED)
-        archive.writestr("runs.csv", table_csv(packed), compress_type=zipfile.ZIP_DEFLATED)
+        archive.writestr("runs.csv", rows_text(folder, packed, "csv"), compress_type=zipfile.ZIP_DEFLATED)
     if not packed:
         raise RecordingError("there is nothing to export: the recordings are gone or too large.")
     plural = "s" if len(packed) != 1 else ""
@@ -94,19 +90,3 @@ def _remark(left: int, gone: int) -> str:
     if gone:
         parts.append(f"{gone:,} were left out, since their files are gone.")
     return " ".join(parts)
-
-
-def table_csv(rows: Sequence[RunRow]) -> str:
-    """The runs as CSV: a column a field, labels with semicolons between them."""
-    names = [field.name for field in fields(RunRow) if field.name not in SEPARATE]
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow([*names, "labels"])
-    for row in rows:
-        writer.writerow([_cell(getattr(row, name)) for name in names] + [_cell("; ".join(row.labels))])
-    return out.getvalue()
-
-
-def _cell(value: object) -> object:
-    """A value that no spreadsheet takes for a formula."""
-    return f"'{value}" if isinstance(value, str) and value.startswith(FORMULA) else value

@@ -78,8 +78,10 @@ class Canvas:
         return CHECK_S if self._checks <= most else None
 
     def _move_viewer(self, run: Run, picture: Picture) -> None:
-        """Go where the person wants; or, if that is to follow the steps, where the step's subject reads best, and so too
-        where another scene is opened, of which the viewer may see nothing."""
+        """Go where the person wants, or, if that is to follow the steps, where the step's subject reads best.
+
+        There too if another scene has been opened, since nothing of it may be in sight.
+        """
         wanted = self._display.take_view()
         name, subject = views.fitting(picture)
         fitting = (run.trace.problem.name, name, subject)
