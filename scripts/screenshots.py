@@ -9,6 +9,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -27,7 +28,17 @@ STILL_S = 90.0
 """How long the page may go on changing before it is photographed all the same."""
 TO_TOP = "() => document.querySelectorAll('*').forEach(box => { if (box.scrollTop > 0) box.scrollTop = 0; })"
 """A panel that was scrolled to press something shows its beginning again."""
+CASES = (
+    "too-few-inliers",
+    "larger-false-consensus",
+    "pairs-outvote",
+    "moving-object",
+    "ransac-bad-luck",
+    "gravity-off",
+)
+"""Of the gallery: what there is to be reviewed."""
 DOCS = {
+    "recordings": ("recordings", "dark", 0),
     "playground": ("arcs", "dark", 0),
     "selection": ("selection", "dark", 0),
     "sweep": ("sweep", "dark", 0),
@@ -94,6 +105,21 @@ def sweep(page: Page) -> None:
     page.get_by_role("button", name="Start sweep", exact=True).wait_for()
 
 
+def review(page: Page) -> None:
+    """Open a failure from the list of runs."""
+    tab(page, "Recordings")
+    page.locator("[data-touch^='run-open:gallery/larger-false-consensus']").first.click()
+    page.locator("[data-touch='run-close:']").first.wait_for()
+
+
+def gallery(page: Page) -> None:
+    """Open a case of the gallery."""
+    tab(page, "Recordings")
+    page.get_by_text("Gallery", exact=True).first.click()
+    page.locator("[data-touch='gallery-open:moving-object']").first.click()
+    page.locator("[data-touch^='gallery-beside:moving-object']").first.wait_for()
+
+
 SYNTHETIC_VIEWS: dict[str, Callable[[Page], object]] = {
     "outcome": lambda page: tab(page, "Yaw"),
     "arcs": lambda page: step(page, "The yaw most arcs share"),
@@ -109,6 +135,8 @@ SYNTHETIC_VIEWS: dict[str, Callable[[Page], object]] = {
     "sweep": sweep,
     "open": lambda page: tab(page, "Open"),
     "share": lambda page: tab(page, "Share"),
+    "recordings": review,
+    "gallery": gallery,
 }
 IMAGE_VIEWS: dict[str, Callable[[Page], object]] = {
     "map": lambda page: tab(page, "Yaw"),
@@ -117,11 +145,13 @@ IMAGE_VIEWS: dict[str, Callable[[Page], object]] = {
 }
 
 
+PROGRAM = str(Path(sys.executable).with_name("spherloc"))
+
+
 @contextmanager
-def served(scene: str) -> Iterator[str]:
+def served(scene: str, recordings: Path) -> Iterator[str]:
     """Address of a playground."""
-    program = Path(sys.executable).with_name("spherloc")
-    words = [str(program), "play", scene, "--port", "0", "--no-record"]
+    words = [PROGRAM, "play", scene, "--port", "0", "--recordings", str(recordings)]
     server = subprocess.Popen(words, stdout=subprocess.PIPE, text=True, cwd=ROOT)
     try:
         assert server.stdout is not None
@@ -163,11 +193,13 @@ def main() -> None:
         raise SystemExit("no Chromium found; install one or set SPHERLOC_CHROMIUM to its path.")
     FOLDER.mkdir(parents=True, exist_ok=True)
     expect.set_options(timeout=PATIENCE_MS)
-    with sync_playwright() as playwright:
+    with sync_playwright() as playwright, tempfile.TemporaryDirectory() as folder:
+        recordings = Path(folder)
+        subprocess.run([PROGRAM, "gallery", *CASES, "--output", str(recordings / "gallery")], cwd=ROOT, check=True)
         for scene, views in ((SYNTHETIC, SYNTHETIC_VIEWS), (IMAGES, IMAGE_VIEWS)):
             chosen = {name: view for name, view in views.items() if not wanted or name in wanted}
             if chosen:
-                with served(scene) as address:
+                with served(scene, recordings) as address:
                     for number, size in enumerate(SIZES):
                         for theme in ("dark", "light"):
                             browser = playwright.chromium.launch(executable_path=path, args=FLAGS)
