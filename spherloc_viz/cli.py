@@ -70,7 +70,7 @@ def run(
         hide: Numbers of matches that are left out.
         json: Print one JSON object a scene, on one line; infinity is the text "inf".
         record: Write a recording of each run.
-        full: Keep every arc and edge in the recordings, which makes them larger.
+        full: Keep every step, arc and edge in the recordings, which makes them larger.
         recordings: Folder of the recordings.
         keep_gigabytes: What the recordings may take; beyond it the oldest successes that nobody labelled are deleted.
         query: Name of the query image, in scenes made of images; the first one if not given.

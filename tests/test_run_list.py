@@ -236,9 +236,9 @@ def test_steps_are_asked_for_over_all_runs(folder: Path, capsys: pytest.CaptureF
     assert {row["file"] for row in near} == {"right.rrd", "sampled.rrd"}
     last = [row for row in near if row["file"] == "right.rrd"][-1]
     assert last["position_error_m"] == pytest.approx(rows["right.rrd"].translation_error_m)
-    assert steps("position_error_m IS NULL AND name = 'blind' AND step < 2", folder) == 0
+    assert steps("position_error_m IS NULL AND name = 'blind'", folder) == 0
     out = capsys.readouterr().out
-    assert "blind, mc: unknown" in out and "step   0 of" in out and "step   1 of" in out
+    assert "blind, mc: unknown" in out and "step   0 of" in out and out.count("    step ") > 2
     assert steps("step >= 0", folder, limit=3) == 0
     captured = capsys.readouterr()
     assert captured.out.count("    step ") == 3 and "--limit 0 shows all" in captured.err

@@ -33,13 +33,22 @@ from spherloc_viz.recording.keeping.leftovers import scratch, unfinished
 from spherloc_viz.recording.origin import Origin
 from spherloc_viz.recording.run_row import RunRow
 
+EXPLAINING = frozenset(
+    {
+        *("bearings", "match", "gravity", "unknowns", "yaw-pair", "yaw-twins", "balls-pair"),
+        *("clique-greedy-smallest", "clique-greedy-degree"),
+        *("refinement-inliers", "refinement-outliers", "refinement-error"),
+    }
+)
+"""Keys of steps that explain the method: the page shows them, and a full recording."""
+
 
 def write_recording(
     trace: Trace, path: Path, origin: Origin | None = None, diagnosis: Diagnosis | None = None, full: bool = False
 ) -> RunRow:
     """Write the recording of a run to ``path``, whose folder is made if it is missing, and return its row.
 
-    A run that was not diagnosed is diagnosed here. ``full`` keeps every array of the stages, arcs and edges too.
+    A run that was not diagnosed is diagnosed here. ``full`` keeps every step, and every array of the stages.
     A reader never sees half a file: it is written under another name and then moved.
     Raises ``RecordingError`` if that fails, and then leaves nothing behind.
     """
@@ -77,16 +86,20 @@ class _Run:
 
 
 def recorded_steps(stops: Sequence[Stop], decisive: int) -> list[int]:
-    """The steps that a lean recording shows: the decisive one, and of every series the first.
+    """The steps that a lean recording shows: what each stage came to, and the decisive one.
 
-    Series are steps whose keys differ in a number only, as "yaw-arcs-10" and "yaw-arcs-30" do: more and more arcs,
-    balls or members of a clique, one peak after another. A step with all of them follows. The samples of RANSAC have
-    no such step and are all there. Between two steps a viewer shows the earlier one.
+    Left out is what explains the method, alike in every run, and series: steps whose keys differ in a number only, as
+    "yaw-arcs-10" and "yaw-arcs-30" do, more and more arcs until the step "yaw-arcs" has them all. Of a series without
+    such a step there is the last. The samples of RANSAC are all there. Between two steps a viewer shows the earlier.
     """
-    first: dict[str, int] = {}
+    keys = {stop.key for stop in stops}
+    last: dict[str, int] = {}
     for index, stop in enumerate(stops):
-        first.setdefault(stop.key if stop.key.startswith("sample-") else re.sub(r"\d+$", "#", stop.key), index)
-    return sorted({decisive, *first.values()})
+        series = stop.key if stop.key.startswith("sample-") else re.sub(r"-\d+$", "", stop.key)
+        explains = stop.key in EXPLAINING or stop.key.endswith("-pose")
+        if not explains and (series == stop.key or series not in keys):
+            last[series] = index
+    return sorted({decisive, *last.values()})
 
 
 def _content(run: _Run, file: str) -> tuple[RunRow, bytes]:
