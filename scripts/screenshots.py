@@ -106,8 +106,10 @@ def sweep(page: Page) -> None:
 
 
 def review(page: Page) -> None:
-    """Open a failure from the list of runs."""
+    """Look for a failure in the list of runs, which may have many by now, and open it."""
     tab(page, "Recordings")
+    label = page.locator("label", has_text=re.compile("^Search$"))
+    label.locator("xpath=ancestor::*[contains(@class, 'Flex-root')][1]").locator("input").fill("false consensus")
     page.locator("[data-touch^='run-open:gallery/larger-false-consensus']").first.click()
     page.locator("[data-touch='run-close:']").first.wait_for()
 
