@@ -202,13 +202,12 @@ def test_the_next_start_tells_what_it_recovered(recorded: bytes, dead: str, tmp_
         (tmp_path / "c.rrd").rename(tmp_path / "d.rrd")
         (tmp_path / "c.review.rrd").rename(tmp_path / "d.review.rrd")
     with scratch() as mine:
-        stranger = Path(mine).with_name(f"spherloc-{dead}-abc")
-        stranger.mkdir()
-        (stranger / "run.rrd").touch()
+        stranger = mine.with_name(f"spherloc-{dead}-abc.rrd")
+        stranger.touch()
         with Recorder(tmp_path, lambda error: notices.append(str(error)), notices.append) as recorder:
             wait_for_upkeep(recorder)
             rows = recorder.index.find(RunQuery(sort="file", descending=False), limit=None).rows
-        assert Path(mine).is_dir() and not stranger.exists()
+        assert mine.is_file() and not stranger.exists()
     assert notices == ["Recovered the recording of a run that was not finished: a.rrd."]
     assert [(row.file, row.labels) for row in rows] == [("a.rrd", ()), ("d.rrd", ("street",))]
 

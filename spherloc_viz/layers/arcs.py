@@ -109,8 +109,16 @@ class Arcs:
     def drawn(self, view: RunView, arcs: IndexArray, marked: np.ndarray, mark: style.RGB) -> Segments:
         """Arcs on the ring around the middle of the map, the marked ones (mask) in their colour. Arcs that overlap lie
         side by side, so that the band is as broad as they are many."""
+        order, arc, points = view.kept("arcs", arcs.tobytes(), lambda: self._band(view, arcs))
+        colors = one_color(style.UNDECIDED, len(arc))
+        colors[marked[order][arc]] = mark
+        ids = self.stage.pairs[arcs[order][arc]].astype(np.int64)
+        return Segments("ring/arcs", "yaw ring", points, colors, 2.0, ids=ids)
+
+    def _band(self, view: RunView, arcs: IndexArray) -> tuple[IndexArray, IndexArray, FloatArray]:
+        """Some arcs as S straight lines (S, 2, 3), which arc each line is of (S,), and the order of these arcs."""
         order = np.argsort(self.stage.lo_rad[arcs], kind="stable")
-        arcs, marked = arcs[order], marked[order]
+        arcs = arcs[order]
         lo, hi = self.stage.lo_rad[arcs], self.stage.hi_rad[arcs]
         tracks = _tracks(lo, hi)
         radii = INNER + (OUTER - INNER) * (tracks + 0.5) / max(FEWEST_TRACKS, int(tracks.max(initial=0)) + 1)
@@ -119,11 +127,7 @@ class Arcs:
         part = np.arange(len(arc)) - np.repeat(np.cumsum(steps) - steps, steps)
         ends = lo[arc, None] + ((hi - lo) / steps)[arc, None] * (part[:, None] + np.array([0.0, 1.0]))
         directions = ring.directions(ends.ravel()).reshape(-1, 2, 3)
-        points = view.middle + view.sphere_m * radii[arc, None, None] * directions
-        colors = one_color(style.UNDECIDED, len(arc))
-        colors[marked[arc]] = mark
-        ids = self.stage.pairs[arcs[arc]].astype(np.int64)
-        return Segments("ring/arcs", "yaw ring", points, colors, 2.0, ids=ids)
+        return order, arc, view.middle + view.sphere_m * radii[arc, None, None] * directions
 
 
 def _tracks(lo_rad: FloatArray, hi_rad: FloatArray) -> IndexArray:

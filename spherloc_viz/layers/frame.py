@@ -4,9 +4,10 @@ A run has up to 200 stops and a page shows one at a time, so a stop is planned f
 drawn when it is looked at.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,7 @@ from spherloc_viz import style
 from spherloc_viz.layers.primitives import Chart, ColorArray, FloatArray, SceneItem, Table
 
 BoolArray = NDArray[np.bool_]
+T = TypeVar("T")
 
 SPHERE_SHARE = 0.17
 """Radius at which the unit sphere is drawn, as a share of the map's typical extent."""
@@ -69,11 +71,27 @@ class RunView:
     """A trace and what all of its frames share."""
 
     trace: Trace
+    _kept: dict[str, tuple[Hashable, Any]] = field(default_factory=dict, init=False)
+
+    def kept(self, name: str, key: Hashable, make: Callable[[], T]) -> T:
+        """What ``make`` gives; made anew only if it was made for another ``key`` last time.
+
+        Most steps of a run show what the step before them shows. What is the same object, nobody has to compare.
+        """
+        known = self._kept.get(name)
+        if known is None or known[0] != key:
+            known = self._kept[name] = key, make()
+        return known[1]
 
     @cached_property
     def points(self) -> FloatArray:
         """Map points (N, 3) in the aligned map frame, metres."""
         return self.trace.problem.points @ self.trace.problem.aligned.map_turn.T
+
+    @cached_property
+    def numbers(self) -> NDArray[np.int64]:
+        """(N,) indices of the correspondences."""
+        return np.arange(len(self.points))
 
     @cached_property
     def middle(self) -> FloatArray:
@@ -166,8 +184,10 @@ def one_color(color: style.RGB, count: int) -> ColorArray:
 
 def even(indices: np.ndarray, count: int) -> np.ndarray:
     """At most ``count`` of the indices, evenly spaced."""
-    places = np.unique(np.linspace(0, len(indices) - 1, min(count, len(indices))).round().astype(int))
-    return indices[places]
+    if len(indices) <= count:
+        return indices
+    # No two are equal, since they are more than 1 apart before they are rounded.
+    return indices[np.linspace(0, len(indices) - 1, count).round().astype(int)]
 
 
 def growing(total: int, *sizes: int) -> list[int]:

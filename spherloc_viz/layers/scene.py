@@ -38,41 +38,58 @@ def _icosphere() -> tuple[np.ndarray, np.ndarray]:
 
 def base_items(view: RunView, frame: Frame) -> tuple[SceneItem, ...]:
     """The primitives that do not depend on the stage."""
-    centre = camera_centre(frame.cam_from_map)
+    pose = frame.cam_from_map.tobytes()
     # Translucent surfaces hide what is drawn after them and lies behind: the ghost comes before the sphere around it.
-    items: list[SceneItem] = [
+    return (
         *_ghost(view, frame),
-        Points("map/points", "map", view.points, frame.colors, 0.07 * view.dot_m, np.arange(len(view.points))),
+        Points("map/points", "map", view.points, frame.colors, 0.07 * view.dot_m, view.numbers),
         *_sphere(view, frame),
-    ]
+        *view.kept("located", (pose, frame.located), lambda: _located(view, frame)),
+        *view.kept("scale bar", None, lambda: scale_bar(view)),
+    )
+
+
+def _located(view: RunView, frame: Frame) -> list[SceneItem]:
+    """The estimated and the true camera, as far as they are known, and the error."""
+    items: list[SceneItem] = []
     if frame.located:
         items.append(camera("cameras/estimate", frame.cam_from_map, CAMERA * view.sphere_m, style.ESTIMATE, 2.5))
     if view.truth is not None:
-        items.append(camera("cameras/truth", view.truth, CAMERA * view.sphere_m, style.TRUTH, 2.5))
+        truth = view.truth
+        items.append(view.kept("truth", None, lambda: _true_camera(view, truth)))
         if frame.located:
-            ends = np.array([[camera_centre(view.truth), centre]])
+            ends = np.array([[camera_centre(truth), camera_centre(frame.cam_from_map)]])
             items.append(Segments("cameras/error", "cameras", ends, one_color(style.OUTLIER, 1), 3.0))
-    return (*items, *error_items(view, frame), *scale_bar(view))
+    return [*items, *error_items(view, frame)]
+
+
+def _true_camera(view: RunView, truth: FloatArray) -> Segments:
+    return camera("cameras/truth", truth, CAMERA * view.sphere_m, style.TRUTH, 2.5)
 
 
 def _sphere(view: RunView, frame: Frame) -> list[SceneItem]:
-    rotation = frame.cam_from_map[:, :3]
-    centre = camera_centre(view.standing(rotation) if frame.sphere_aside else frame.cam_from_map)
-    vertices, faces = _icosphere()
     aligned = view.trace.problem.aligned
-    dots = centre + view.sphere_m * aligned.bearings @ rotation
+    key = frame.cam_from_map.tobytes(), frame.sphere_aside
+    surfaces, dots = view.kept("sphere", key, lambda: _placed_sphere(view, frame))
     drawn = np.flatnonzero(frame.rays[aligned.index])[: style.MAX_DRAWN_RAYS]
     ends = np.stack([dots[drawn], view.points[aligned.index[drawn]]], axis=1)
     colors = frame.colors[aligned.index]
-    problem = view.trace.problem
-    radius_m = view.sphere_m if problem.image is None else UNDER_IMAGE * view.sphere_m
-    image = [] if problem.image is None else [_image(problem, centre, view.sphere_m * rotation.T)]
     return [
-        Mesh("sphere/surface", "sphere", centre + radius_m * vertices, faces, style.SPHERE, 0.25),
-        *image,
+        *surfaces,
         Points("sphere/bearings", "sphere", dots, colors, 0.04 * view.dot_m, aligned.index),
         Segments("rays", "rays", ends, colors[drawn], 1.5),
     ]
+
+
+def _placed_sphere(view: RunView, frame: Frame) -> tuple[list[SceneItem], FloatArray]:
+    """The sphere with the query image, and the places (A, 3) of the bearings on it."""
+    rotation, problem = frame.cam_from_map[:, :3], view.trace.problem
+    centre = camera_centre(view.standing(rotation) if frame.sphere_aside else frame.cam_from_map)
+    vertices, faces = _icosphere()
+    radius_m = view.sphere_m if problem.image is None else UNDER_IMAGE * view.sphere_m
+    surface = Mesh("sphere/surface", "sphere", centre + radius_m * vertices, faces, style.SPHERE, 0.25)
+    image = [] if problem.image is None else [_image(problem, centre, view.sphere_m * rotation.T)]
+    return [surface, *image], centre + view.sphere_m * problem.aligned.bearings @ rotation
 
 
 def _image(problem: Problem, centre: FloatArray, map_from_sphere: FloatArray) -> Textured:
@@ -126,12 +143,16 @@ def _ghost(view: RunView, frame: Frame) -> list[Mesh]:
     """The true camera's body, to be seen through; not where the estimated camera is in its way."""
     if view.truth is None:
         return []
-    centre, away = camera_centre(view.truth), camera_centre(frame.cam_from_map)
-    if frame.located and np.linalg.norm(centre - away) < GHOST_AWAY * view.sphere_m:
+    truth, away = view.truth, camera_centre(frame.cam_from_map)
+    if frame.located and np.linalg.norm(camera_centre(truth) - away) < GHOST_AWAY * view.sphere_m:
         return []
-    corners = CAMERA * view.sphere_m * np.vstack([np.zeros(3), _CORNERS]) @ view.truth[:, :3]
+    return [view.kept("ghost", None, lambda: _body(truth, CAMERA * view.sphere_m))]
+
+
+def _body(cam_from_map: FloatArray, size_m: float) -> Mesh:
+    corners = camera_centre(cam_from_map) + size_m * np.vstack([np.zeros(3), _CORNERS]) @ cam_from_map[:, :3]
     faces = np.array([[k % 4 + 1, k, 0] for k in range(1, 5)])
-    return [Mesh("cameras/ghost", "cameras", centre + corners, np.vstack([faces, faces[:, ::-1]]), style.TRUTH, 0.16)]
+    return Mesh("cameras/ghost", "cameras", corners, np.vstack([faces, faces[:, ::-1]]), style.TRUTH, 0.16)
 
 
 def camera(name: str, cam_from_map: FloatArray, size_m: float, color: style.RGB, width_px: float) -> Segments:

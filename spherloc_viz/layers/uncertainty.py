@@ -1,7 +1,5 @@
 """How far a pose is off, and how far it may be off by its covariance: in words, as a table and on the canvas."""
 
-from itertools import pairwise
-
 import numpy as np
 
 from spherloc.geometry import camera_centre
@@ -108,10 +106,10 @@ def _angle(view: RunView, frame: Frame) -> list[SceneItem]:
     across /= np.linalg.norm(across)
     turns = np.linspace(0.0, between, 2 + int(between / ARC_STEP_RAD))[:, None]
     arc = centre + AHEAD * view.sphere_m * (np.cos(turns) * estimated + np.sin(turns) * across)
-    lines = [[centre, arc[0]], [centre, arc[-1]], *pairwise(arc)]
-    colors = one_color(style.OUTLIER, len(lines))
+    starts, ends = np.vstack([centre, centre, arc[:-1]]), np.vstack([arc[0], arc[-1], arc[1:]])
+    colors = one_color(style.OUTLIER, len(starts))
     colors[0], colors[1] = style.ESTIMATE, style.TRUTH
-    return [Segments("uncertainty/angle", LAYER, np.array(lines), colors, 2.0)]
+    return [Segments("uncertainty/angle", LAYER, np.stack([starts, ends], axis=1), colors, 2.0)]
 
 
 def rms(stage: RefinementStage) -> tuple[float, float] | None:

@@ -1,7 +1,9 @@
 """Columns of components as arrow arrays, put together here since rerun's own batches take many times as long."""
 
+from array import array
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import Any
 
 import numpy as np
@@ -31,17 +33,19 @@ class Values:
     descriptor: rr.ComponentDescriptor
     values: pa.Array
     """Of all rows."""
-    lengths: Sequence[int] | NDArray[np.int32]
+    lengths: Sequence[int]
     """(R,) how many of them each row has."""
 
-    def among(self, places: NDArray[np.int64] | None, count: int) -> "Column":
+    def whole(self) -> "Column":
+        """A column of these rows."""
+        return Column(self.descriptor, _lists(self.lengths, self.values))
+
+    def among(self, places: Sequence[int], count: int) -> "Column":
         """A column of ``count`` rows that has these rows at ``places`` and says nothing in the others."""
-        lengths = np.asarray(self.lengths, np.int32)
-        if places is None:
-            return Column(self.descriptor, _lists(lengths, self.values))
-        every, present = np.zeros(count, np.int32), np.zeros(count, bool)
-        every[places], present[places] = lengths, True
-        return Column(self.descriptor, _lists(every, self.values, present))
+        every = [0] * count
+        for place, length in zip(places, self.lengths, strict=True):
+            every[place] = length
+        return Column(self.descriptor, _lists(every, self.values, places))
 
 
 class Column(rr.ComponentColumn):
@@ -75,33 +79,37 @@ class Times:
         return self.steps
 
 
-def _lists(lengths: NDArray[np.int32], values: pa.Array, present: NDArray[np.bool_] | None = None) -> pa.ListArray:
-    """Lists of these lengths (R,), null where they are not present."""
-    bits = None if present is None else pa.py_buffer(np.packbits(present, bitorder="little"))
-    parts = [bits, pa.py_buffer(_offsets(lengths))]
-    return pa.Array.from_buffers(pa.list_(values.type), len(lengths), parts, -1, 0, [values])
+def _lists(lengths: Sequence[int], values: pa.Array, present: Sequence[int] | None = None) -> pa.ListArray:
+    """Lists of these lengths (R,); those that are not among the ``present`` are null."""
+    # A run has some two hundred columns of a few rows each, for which numpy would take most of the time.
+    offsets = pa.py_buffer(array("i", accumulate(lengths, initial=0)))
+    bits = None
+    if present is not None:
+        bits = pa.py_buffer(sum(1 << place for place in present).to_bytes(len(lengths) // 8 + 1, "little"))
+    return pa.Array.from_buffers(pa.list_(values.type), len(lengths), [bits, offsets], -1, 0, [values])
 
 
-def _offsets(lengths: Sequence[int] | NDArray[Any]) -> NDArray[np.int32]:
-    offsets = np.zeros(len(lengths) + 1, np.int32)
-    np.cumsum(lengths, out=offsets[1:])
-    return offsets
-
-
-def vectors(array: NDArray[Any], kind: pa.DataType) -> pa.Array:
+def vectors(rows: NDArray[Any], kind: pa.DataType) -> pa.Array:
     """(N, 2) or (N, 3) numbers as vectors of a type such as ``VECTOR_3D``."""
     dtype = kind.value_type.to_pandas_dtype()
-    return pa.FixedSizeListArray.from_arrays(pa.array(np.ascontiguousarray(array, dtype).ravel()), type=kind)
+    return pa.FixedSizeListArray.from_arrays(pa.array(np.ascontiguousarray(rows, dtype).ravel()), type=kind)
 
 
-def strips(points: NDArray[Any], lengths: Sequence[int] | NDArray[np.int64], kind: pa.DataType) -> pa.Array:
-    """Points (P, 2) or (P, 3) as strips of these lengths."""
-    return pa.ListArray.from_arrays(pa.array(_offsets(lengths)), vectors(points, kind.value_type), type=kind)
+def strips(outlines: Sequence[NDArray[Any]], kind: pa.DataType) -> pa.Array:
+    """Lines of (K, 2) or (K, 3) points, each of its own length, as strips."""
+    ends = list(accumulate(map(len, outlines), initial=0))
+    return pa.ListArray.from_arrays(pa.array(ends, pa.int32()), vectors(np.concatenate(outlines), kind.value_type), type=kind)
 
 
-def numbers(array: Any, dtype: type = np.float32) -> pa.Array:
+def segments(ends: NDArray[Any], kind: pa.DataType) -> pa.Array:
+    """Lines from one point to another, (L, 2, 2) or (L, 2, 3), as strips."""
+    places = pa.array(np.arange(0, 2 * len(ends) + 1, 2, dtype=np.int32))
+    return pa.ListArray.from_arrays(places, vectors(ends.reshape(-1, ends.shape[-1]), kind.value_type), type=kind)
+
+
+def numbers(values: Any, dtype: type = np.float32) -> pa.Array:
     """Numbers (N,)."""
-    return pa.array(np.asarray(array, dtype))
+    return pa.array(np.asarray(values, dtype))
 
 
 def packed(colors: NDArray[Any], opacity: float = 1.0) -> NDArray[np.uint32]:
@@ -113,7 +121,7 @@ def packed(colors: NDArray[Any], opacity: float = 1.0) -> NDArray[np.uint32]:
 
 def static_chunk(entity: str, columns: Iterable[Values]) -> Chunk:
     """A chunk that holds at every step; every column has one row."""
-    return Chunk.from_columns(entity, [], [column.among(None, 1) for column in columns])
+    return Chunk.from_columns(entity, [], [column.whole() for column in columns])
 
 
 def named_values(values: dict[str, Any]) -> list[Values]:

@@ -21,7 +21,7 @@ from spherloc_viz.recording.content.columns import (
     Values,
     numbers,
     packed,
-    strips,
+    segments,
     vectors,
 )
 from spherloc_viz.recording.content.letters import legible
@@ -102,8 +102,7 @@ def _pixels(rows: Rows) -> list[Values]:
 
 def _strips(rows: Rows) -> list[Values]:
     points, lengths = _joined(rows, "points", (2, 3))
-    lines = strips(points.reshape(-1, 3), np.full(len(points), 2), STRIP_3D)
-    return [Values(rr.LineStrips3D.descriptor_strips(), lines, lengths)]
+    return [Values(rr.LineStrips3D.descriptor_strips(), segments(points, STRIP_3D), lengths)]
 
 
 def _strip_radius(rows: Rows) -> list[Values]:

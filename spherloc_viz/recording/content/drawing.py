@@ -63,10 +63,12 @@ def _tracks(pictures: Sequence[Picture], pixels: FloatArray) -> dict[tuple[str, 
 def _chunk(path: str, parts: list[tuple[list[int], Part]], track: Rows, when: NDArray[np.int64]) -> Chunk:
     """A chunk with a row for every step at which any part of a primitive changes, and in it only what does."""
     steps = sorted({index for changes, _ in parts for index in changes})
+    place_of = {index: place for place, index in enumerate(steps)}
     columns = []
     for changes, part in parts:
-        places = None if len(changes) == len(steps) else np.searchsorted(steps, changes)
-        columns += [values.among(places, len(steps)) for values in part.encode([track[index] for index in changes])]
+        places = [place_of[index] for index in changes]
+        for values in part.encode([track[index] for index in changes]):
+            columns.append(values.whole() if len(places) == len(steps) else values.among(places, len(steps)))
     return Chunk.from_columns(path, [Times(pa.array(when[steps]))], columns)
 
 
@@ -106,8 +108,12 @@ def _framing(picture: Picture) -> Chunk:
     So one fixed eye suits every scene. Without an eye, rerun's own follows the largest ball from step to step.
     """
     dots = np.concatenate([np.zeros((0, 3)), *(item.positions for item in picture.scene if isinstance(item, Points))])
-    middle = np.median(dots, axis=0) if len(dots) else np.zeros(3)
-    extent = float(np.percentile(np.linalg.norm(dots - middle, axis=1), 90)) if len(dots) else 1.0
+    middle, extent = np.zeros(3), 1.0
+    if len(dots):
+        half, most = len(dots) // 2, 9 * len(dots) // 10
+        middle = np.partition(dots, half, axis=0)[half]
+        away = dots - middle
+        extent = float(np.sqrt(np.partition(np.einsum("ni,ni->n", away, away), most)[most]))
     scale = 1.0 / max(extent, 1e-6)
     place, size = (vectors(row, VECTOR_3D) for row in (-scale * middle[None], np.full((1, 3), scale)))
     columns = [Values(rr.Transform3D.descriptor_translation(), place, [1])]

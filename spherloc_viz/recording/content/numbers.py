@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 
-import numpy as np
 import pyarrow as pa
 import rerun as rr
 from rerun.chunk import Chunk
@@ -26,7 +25,7 @@ def numbers_chunk(numbers: Sequence[StepNumbers]) -> Chunk:
     columns = []
     for name, kind in TYPES.items():
         values = [getattr(row, name) for row in numbers]
-        known = np.flatnonzero([value is not None for value in values])
+        known = [k for k, value in enumerate(values) if value is not None]
         column = Values(rr.ComponentDescriptor(name), pa.array([values[k] for k in known], kind), [1] * len(known))
         columns.append(column.among(known, len(values)))
     return Chunk.from_columns(NUMBERS, [Times(pa.array([row.step for row in numbers], pa.int64()))], columns)

@@ -22,8 +22,8 @@ from spherloc_viz.recording.content.columns import (
     Values,
     numbers,
     packed,
+    segments,
     static_chunk,
-    strips,
     vectors,
 )
 from spherloc_viz.recording.content.components import PARTS
@@ -130,11 +130,10 @@ def _yaws(trace: Trace, estimate: float, height: float) -> Iterator[Chunk]:
 
 def _lines_2d(entity: str, points: FloatArray, colors: NDArray[np.uint32], width_px: float) -> Chunk:
     """Lines (K, 2, 2)."""
-    lines = strips(points.reshape(-1, 2), np.full(len(points), 2), STRIP_2D)
     return static_chunk(
         entity,
         [
-            Values(rr.LineStrips2D.descriptor_strips(), lines, [len(points)]),
+            Values(rr.LineStrips2D.descriptor_strips(), segments(points, STRIP_2D), [len(points)]),
             Values(rr.LineStrips2D.descriptor_colors(), pa.array(colors), [len(colors)]),
             Values(rr.LineStrips2D.descriptor_radii(), numbers([-width_px / 2]), [1]),
         ],

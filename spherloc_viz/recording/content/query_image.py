@@ -91,11 +91,10 @@ def image_chunks(problem: Problem, image: QueryImage) -> Iterator[Chunk]:
     outlines = [border, *corners]
     if not image.jpeg:
         outlines += [image.scale * np.vstack([outline, outline[:1]]) for outline in valid_outlines(problem.camera)]
-    lines = strips(np.concatenate(outlines), [len(outline) for outline in outlines], STRIP_2D)
     yield static_chunk(
         FRAME,
         [
-            Values(rr.LineStrips2D.descriptor_strips(), lines, [len(outlines)]),
+            Values(rr.LineStrips2D.descriptor_strips(), strips(outlines, STRIP_2D), [len(outlines)]),
             Values(rr.LineStrips2D.descriptor_colors(), pa.array(packed(np.array([style.UNDECIDED]))), [1]),
             Values(rr.LineStrips2D.descriptor_radii(), numbers([-FRAME_PX / 2]), [1]),
         ],

@@ -2,7 +2,7 @@
 
 An ``.rrd`` file is a header of 12 bytes, messages of 16 bytes (kind, length) and a payload, and a message with an index
 of all chunks by their places in the file (https://rerun.io/docs, "RRD format"). So files cannot be put end to end: the
-places in the second one's index move. They are the column ``chunk_byte_offset`` of an arrow table, which is moved here.
+places in the second one's index move. They are a column of an arrow table, ``chunk_byte_offset``, which is moved here.
 """
 
 import struct
@@ -14,14 +14,13 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 HEADER_BYTES = 12
-END = 0
-"""Kind of the last message, which holds the index."""
+END, CHUNK = 0, 2
+"""Kinds of messages: the last one, which holds the index, and one that is in it."""
 TAIL = struct.Struct("<QQI8sI")
 """At the end of a file: place and length of the index, its checksum, ``RRF2FOOT``, and how many of them there are."""
 MARK = b"RRF2FOOT"
 MESSAGE = struct.Struct("<QQ")
 CHECKSUM_SEED = 7_850_921
-MOVED = "chunk_byte_offset"
 LZ4 = 2
 """Code of a compressed table."""
 
@@ -55,37 +54,43 @@ def joined(first: RrdFile, second: RrdFile) -> bytes:
     Raises ``ValueError`` if an index has a form that is not known here.
     """
     # Indices are protobuf messages with one repeated field, of which one behind the other are both.
-    index = first.index + _moved(second.index, len(first.messages))
+    index = first.index + _moved(second, len(first.messages))
     start = HEADER_BYTES + len(first.messages) + len(second.messages) + MESSAGE.size
     checksum = xxh32(np.frombuffer(index, np.uint8), CHECKSUM_SEED)
     tail = TAIL.pack(start, len(index), checksum, MARK, 1)
     return b"".join([first.header, first.messages, second.messages, MESSAGE.pack(END, len(index)), index, tail])
 
 
-def _moved(index: bytes, by: int) -> bytes:
-    """The index with all places in the file larger by ``by`` bytes."""
-    (manifest,) = _fields(index).values()
+def _moved(file: RrdFile, by: int) -> bytes:
+    """The index of a file with all places in it larger by ``by`` bytes."""
+    (manifest,) = _fields(file.index).values()
     parts = _fields(manifest)
     table = _fields(parts[4])
     if table[3] != LZ4 or set(parts) != {1, 2, 3, 4}:
         raise ValueError("rerun wrote an index of an unknown form")
     content = bytearray(pa.decompress(table[2], table[4], codec="lz4_raw", asbytes=True))
-    places = _places(content)
-    places += np.uint64(by)
+    # Looked for by what it must be: to have arrow read a table of some hundred columns takes far longer.
+    known = _places(file.messages)
+    column = known.tobytes()
+    if not len(known) or content.count(column) != 1:
+        raise ValueError("rerun wrote an index of an unknown form")
+    start = content.index(column)
+    content[start : start + len(column)] = (known + np.uint64(by)).tobytes()
     table[2] = pa.compress(bytes(content), codec="lz4_raw", asbytes=True)
     parts[4] = _message(table)
     return _message({1: _message(parts)})
 
 
-def _places(table: bytearray) -> NDArray[np.uint64]:
-    """The numbers of the column, as they lie in the bytes of an arrow table."""
-    whole = pa.py_buffer(table)
-    column = pa.ipc.open_stream(whole).read_next_batch().column(MOVED)
-    values = column.buffers()[1]
-    start = values.address - whole.address
-    if column.type != pa.uint64() or column.offset or not 0 <= start < whole.size:
-        raise ValueError("rerun wrote an index of an unknown form")
-    return np.frombuffer(table, np.uint64, len(column), start)
+def _places(messages: bytes) -> NDArray[np.uint64]:
+    """Where in the file the payloads of chunks begin, in order."""
+    places, at = [], 0
+    while at + MESSAGE.size <= len(messages):
+        kind, length = MESSAGE.unpack_from(messages, at)
+        at += MESSAGE.size
+        if kind == CHUNK:
+            places.append(HEADER_BYTES + at)
+        at += length
+    return np.array(places, "<u8")
 
 
 def _fields(message: bytes | int) -> dict[int, bytes | int]:

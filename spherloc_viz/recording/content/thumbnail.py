@@ -14,8 +14,10 @@ MARGIN_PX = 9.0
 BACKGROUND = (30, 33, 39)
 MOST_DOTS = 160
 """More matches are thinned evenly: a PNG of single dots grows with them."""
+SQUARE = np.array([[0, 0], [1, 0], [0, 1], [1, 1]])
+"""Pixels of a dot."""
 CAMERA_PX = 7.0
-COMPRESSION = 6
+COMPRESSION = 3
 OUTSIDE_SHARE = 0.04
 """Share of the map points on every side that do not set the scale; some may lie far away."""
 
@@ -32,11 +34,12 @@ def thumbnail(trace: Trace) -> bytes:
     image[:] = BACKGROUND
     dots = _pixels(flat, *window)
     shown = np.linspace(0, len(dots) - 1, min(MOST_DOTS, len(dots))).round().astype(int)
+    agrees = trace.inlier_mask[shown]
     # Those that agree lie on top.
-    for k in shown[np.argsort(trace.inlier_mask[shown], kind="stable")].tolist():
-        color = style.INLIER if trace.inlier_mask[k] else style.OUTLIER
-        x, y = dots[k].tolist()
-        image[max(0, y) : max(0, y + 2), max(0, x) : max(0, x + 2)] = color
+    for mask, color in ((~agrees, style.OUTLIER), (agrees, style.INLIER)):
+        squares = (dots[shown[mask], None, :] + SQUARE).reshape(-1, 2)
+        x, y = squares[((squares >= 0) & (squares < (WIDTH_PX, HEIGHT_PX))).all(axis=1)].T
+        image[y, x] = color
     for pose, color in cameras:
         _draw_camera(image, aligned, pose, window, color)
     done, png = cv2.imencode(".png", image[:, :, ::-1], [cv2.IMWRITE_PNG_COMPRESSION, COMPRESSION])

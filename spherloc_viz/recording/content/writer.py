@@ -40,7 +40,7 @@ EXPLAINING = frozenset(
         *("refinement-inliers", "refinement-outliers", "refinement-error"),
     }
 )
-"""Keys of steps that explain the method: the page shows them, and a full recording."""
+"""Keys of steps that explain the method, as the stops of the hand do: the page shows them, and a full recording."""
 
 
 def write_recording(
@@ -96,7 +96,7 @@ def recorded_steps(stops: Sequence[Stop], decisive: int) -> list[int]:
     last: dict[str, int] = {}
     for index, stop in enumerate(stops):
         series = stop.key if stop.key.startswith("sample-") else re.sub(r"-\d+$", "", stop.key)
-        explains = stop.key in EXPLAINING or stop.key.endswith("-pose")
+        explains = stop.key in EXPLAINING or stop.key.endswith("-pose") or stop.key.startswith("yaw-hand-")
         if not explains and (series == stop.key or series not in keys):
             last[series] = index
     return sorted({decisive, *last.values()})
@@ -121,8 +121,7 @@ def _content(run: _Run, file: str) -> tuple[RunRow, bytes]:
     chosen = list(range(len(stops))) if run.full else recorded_steps(stops, decisive)
     pictures = {index: paint(trace, index) for index in chosen}
     panels = panels_of(trace)
-    with scratch() as folder:
-        path = Path(folder) / "run.rrd"
+    with scratch() as path:
         stream = LazyChunkStream.from_iter(list(_chunks(run, row, pictures, panels)))
         stream.write_rrd(path, application_id=APPLICATION_ID, recording_id=run.recording_id)
         recording = split(path.read_bytes())

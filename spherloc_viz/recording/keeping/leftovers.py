@@ -5,11 +5,11 @@ import hashlib
 import os
 import re
 import secrets
-import shutil
 import socket
 import tempfile
 import time
-from functools import cache
+from collections.abc import Iterator
+from functools import cache, lru_cache
 from pathlib import Path
 
 STALE_AFTER_S = 600.0
@@ -17,7 +17,7 @@ STALE_AFTER_S = 600.0
 
 _OWNER = r"(?P<machine>[0-9a-f]{8})-(?P<boot>[0-9a-f]{8})-(?P<pid>\d{1,10})-(?P<start>\d{1,20})-"
 _PART = re.compile(rf"(?P<name>.+\.rrd)\.(?:{_OWNER})?[0-9a-f]{{8}}\.part")
-_SCRATCH = re.compile(rf"spherloc-{_OWNER}\w+")
+_SCRATCH = re.compile(rf"spherloc-{_OWNER}\w+\.rrd")
 
 
 def unfinished(path: Path) -> Path:
@@ -25,18 +25,26 @@ def unfinished(path: Path) -> Path:
     return path.with_name(f"{path.name}.{_owner()}-{secrets.token_hex(4)}.part")
 
 
-def scratch() -> "tempfile.TemporaryDirectory[str]":
-    """A folder for files that are needed for a moment only. Raises ``OSError``."""
-    return tempfile.TemporaryDirectory(prefix=f"spherloc-{_owner()}-")
+@contextlib.contextmanager
+def scratch() -> Iterator[Path]:
+    """An empty file that is needed for a moment only. Raises ``OSError``."""
+    handle, name = tempfile.mkstemp(prefix=f"spherloc-{_owner()}-", suffix=".rrd")
+    os.close(handle)
+    try:
+        yield Path(name)
+    finally:
+        with contextlib.suppress(OSError):
+            os.unlink(name)
 
 
 def sweep_scratch() -> None:
-    """Delete such folders that killed processes left."""
+    """Delete such files that killed processes left."""
     with contextlib.suppress(OSError), os.scandir(tempfile.gettempdir()) as entries:
         for entry in entries:
             match = _SCRATCH.fullmatch(entry.name)
-            if match is not None and entry.is_dir(follow_symlinks=False) and _ended(match):
-                shutil.rmtree(entry.path, ignore_errors=True)
+            if match is not None and entry.is_file(follow_symlinks=False) and _ended(match):
+                with contextlib.suppress(OSError):
+                    os.unlink(entry.path)
 
 
 def target_of(part: Path) -> Path | None:
@@ -65,7 +73,12 @@ def leftovers(folder: Path) -> list[Path]:
 
 def _owner() -> str:
     """This process."""
-    pid = os.getpid()
+    return _named(os.getpid())
+
+
+@lru_cache(maxsize=1)
+def _named(pid: int) -> str:
+    """This process, which has another number once it is forked."""
     return f"{here()}-{pid}-{_start_of(pid) or 0}"
 
 
