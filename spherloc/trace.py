@@ -99,7 +99,7 @@ class TranslationStage(Stage):
     radii_m: FloatArray
     """(M,) radii."""
     edges: IndexArray
-    """(E, 2) overlapping balls (Eq. 38)."""
+    """(E, 2) overlapping balls (Eq. 38), each pair in ascending order and the pairs sorted."""
     clique: IndexArray
     """Indices of the balls in the maximum clique."""
     proven: bool

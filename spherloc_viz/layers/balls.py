@@ -52,10 +52,17 @@ class BallSet:
 
     def edges_within(self, inside: NDArray[np.bool_]) -> np.ndarray:
         """Overlaps (E, 2) between balls of a mask (M,)."""
-        # There may be 100,000 edges: ``take`` is four times faster than indexing.
-        edges = self.stage.edges
-        ends = inside.take(edges)
-        return edges.take(np.flatnonzero(ends[:, 0] & ends[:, 1]), axis=0)
+        # There may be 100,000 edges, so only those of these balls are looked at.
+        members = np.flatnonzero(inside)
+        counts = self._starts[members + 1] - self._starts[members]
+        rows = np.arange(int(counts.sum())) + np.repeat(self._starts[members] - np.cumsum(counts) + counts, counts)
+        edges = self.stage.edges.take(rows, axis=0)
+        return edges[inside[edges[:, 1]]]
+
+    @cached_property
+    def _starts(self) -> IndexArray:
+        """(M + 1,) where each ball's edges to later ones begin: edges are sorted."""
+        return np.searchsorted(self.stage.edges[:, 0], np.arange(len(self) + 1))
 
     def greedy(self, order: IndexArray) -> IndexArray:
         """A clique: each ball in the given order that overlaps all that were taken before it."""

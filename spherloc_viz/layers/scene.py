@@ -137,6 +137,16 @@ def _seen(camera: Camera, camera_turn: FloatArray) -> ColorArray:
 
 _CORNERS = np.array([[-0.5, -0.4, 0.7], [0.5, -0.4, 0.7], [0.5, 0.4, 0.7], [-0.5, 0.4, 0.7]])
 """Of the opening of a camera of size 1."""
+_ROOF = np.array([0.0, -0.62, 0.7])
+"""Above its upper edge."""
+_EDGES = np.concatenate(
+    [
+        np.stack([np.zeros((4, 3)), _CORNERS], axis=1),
+        np.stack([_CORNERS, np.roll(_CORNERS, -1, axis=0)], axis=1),
+        [[_CORNERS[0], _ROOF], [_ROOF, _CORNERS[1]]],
+    ]
+)
+"""(10, 2, 3)."""
 
 
 def _ghost(view: RunView, frame: Frame) -> list[Mesh]:
@@ -158,9 +168,5 @@ def _body(cam_from_map: FloatArray, size_m: float) -> Mesh:
 def camera(name: str, cam_from_map: FloatArray, size_m: float, color: style.RGB, width_px: float) -> Segments:
     """An open pyramid around the viewing direction, its upper edge marked by a roof."""
     centre, rotation = camera_centre(cam_from_map), cam_from_map[:, :3]
-    roof = np.array([0.0, -0.62, 0.7])
-    lines = [(np.zeros(3), corner) for corner in _CORNERS]
-    lines += [(_CORNERS[k], _CORNERS[(k + 1) % 4]) for k in range(4)]
-    lines += [(_CORNERS[0], roof), (roof, _CORNERS[1])]
-    ends = centre + size_m * np.array(lines) @ rotation
-    return Segments(name, "cameras", ends, one_color(color, len(lines)), width_px)
+    ends = centre + size_m * _EDGES @ rotation
+    return Segments(name, "cameras", ends, one_color(color, len(ends)), width_px)

@@ -45,7 +45,7 @@ def _half_axes(view: RunView, frame: Frame) -> FloatArray | None:
     stage = view.trace.stage(RefinementStage)
     if stage is None or not np.isfinite(stage.covariance).all():
         return None
-    if not np.allclose(frame.cam_from_map, view.aligned_pose(stage.cam_from_map[-1]), rtol=0.0, atol=1e-7):
+    if not np.abs(frame.cam_from_map - view.aligned_pose(stage.cam_from_map[-1])).max() <= 1e-7:
         return None
     turn = view.trace.problem.aligned.map_turn
     variances, axes = np.linalg.eigh(turn @ stage.covariance[3:, 3:] @ turn.T)

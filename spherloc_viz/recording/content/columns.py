@@ -4,7 +4,7 @@ from array import array
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import accumulate
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -26,8 +26,7 @@ STRIP_2D: pa.DataType = rr.components.LineStrip2DBatch._ARROW_DATATYPE
 BLOB: pa.DataType = rr.components.BlobBatch._ARROW_DATATYPE
 
 
-@dataclass(frozen=True, eq=False)
-class Values:
+class Values(NamedTuple):
     """A component in R rows, one behind the other."""
 
     descriptor: rr.ComponentDescriptor
@@ -98,7 +97,9 @@ def vectors(rows: NDArray[Any], kind: pa.DataType) -> pa.Array:
 def strips(outlines: Sequence[NDArray[Any]], kind: pa.DataType) -> pa.Array:
     """Lines of (K, 2) or (K, 3) points, each of its own length, as strips."""
     ends = list(accumulate(map(len, outlines), initial=0))
-    return pa.ListArray.from_arrays(pa.array(ends, pa.int32()), vectors(np.concatenate(outlines), kind.value_type), type=kind)
+    return pa.ListArray.from_arrays(
+        pa.array(ends, pa.int32()), vectors(np.concatenate(outlines), kind.value_type), type=kind
+    )
 
 
 def segments(ends: NDArray[Any], kind: pa.DataType) -> pa.Array:

@@ -10,7 +10,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from spherloc_viz import style
-from spherloc_viz.layers.primitives import Balls, Label, Mesh, Points, Segments, Step, Table
+from spherloc_viz.layers.primitives import Balls, FloatArray, Mesh, Points, Segments, Step, Table
 from spherloc_viz.recording.content.chart_bars import Bars, tensors
 from spherloc_viz.recording.content.columns import (
     MARKDOWN,
@@ -38,6 +38,16 @@ WORDS = int(packed(np.array([style.SCALE]))[0])
 SOLID: int = rr.components.FillModeBatch(["solid"]).as_arrow_array()[0].as_py()
 
 
+@dataclass(frozen=True, eq=False)
+class Words:
+    """All labels of a picture, a primitive of recordings: an entity for each would cost more than the words do."""
+
+    texts: tuple[str, ...]
+    """K words."""
+    positions: FloatArray
+    """(K, 3) of their middles."""
+
+
 @dataclass(frozen=True)
 class Part:
     """Components of a primitive that are written together."""
@@ -55,7 +65,8 @@ def _joined(rows: Rows, name: str, shape: tuple[int, ...]) -> tuple[NDArray[Any]
 
 def _rgba(colors: NDArray[np.uint8], opacity: float) -> NDArray[np.uint32]:
     # rerun repeats a single colour over all instances of the row.
-    return packed(colors[:1] if len(colors) and (colors == colors[0]).all() else colors, opacity)
+    same = colors.tobytes() == len(colors) * colors[:1].tobytes()
+    return packed(colors[:1] if same else colors, opacity)
 
 
 def _colors(rows: Rows, descriptor: rr.ComponentDescriptor) -> Values:
@@ -145,12 +156,12 @@ def _abscissa(rows: Rows) -> list[Values]:
     ]
 
 
-def _label(rows: Rows) -> list[Values]:
-    places = [np.zeros((0, 3)) if row is None else row.position[None] for row in rows]
-    batch = vectors(np.concatenate(places), VECTOR_3D)
+def _words(rows: Rows) -> list[Values]:
+    texts = [legible(text) for row in rows if row is not None for text in row.texts]
+    positions = _positions(rows)
     return [
-        Values(rr.Points3D.descriptor_positions(), batch, [len(place) for place in places]),
-        _single(rows, rr.Points3D.descriptor_labels(), pa.utf8(), lambda row: legible(row.text)),
+        *positions,
+        Values(rr.Points3D.descriptor_labels(), pa.array(texts, pa.utf8()), positions[0].lengths),
         # Without a colour, rerun makes one up.
         _single(rows, rr.Points3D.descriptor_colors(), pa.uint32(), lambda row: WORDS),
         # The word is what is shown, not the dot that rerun hangs it on.
@@ -200,7 +211,7 @@ PARTS: dict[type, tuple[Part, ...]] = {
         Part(("faces",), _faces),
         Part(("color", "opacity"), _plain(rr.Mesh3D.descriptor_albedo_factor())),
     ),
-    Label: (Part(("position", "text"), _label),),
+    Words: (Part(("positions", "texts"), _words),),
     Bars: (
         Part(("heights",), _heights),
         Part(("left", "widths"), _abscissa),

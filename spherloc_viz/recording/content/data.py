@@ -27,7 +27,7 @@ from spherloc_viz.recording.content.columns import Values, static_chunk
 from spherloc_viz.recording.keeping.machine import machine
 from spherloc_viz.recording.origin import Origin
 
-MAX_ARRAY_BYTES = 65_536
+MAX_ARRAY_BYTES = 16_384
 """Stage arrays above this are left out of a lean recording: they follow from the problem, the options and the seed."""
 MAX_SCENE_BYTES = 65_536
 """The text of a larger scene file is not recorded."""

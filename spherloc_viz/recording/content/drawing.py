@@ -10,15 +10,17 @@ import rerun as rr
 from numpy.typing import NDArray
 from rerun.chunk import Chunk
 
-from spherloc_viz.layers.primitives import FloatArray, Picture, Points, Textured
+from spherloc_viz.layers.primitives import FloatArray, Label, Picture, Points, Textured
 from spherloc_viz.layers.step_numbers import match_colors
 from spherloc_viz.recording.content.chart_bars import Bars, bars
 from spherloc_viz.recording.content.columns import VECTOR_3D, Times, Values, static_chunk, vectors
-from spherloc_viz.recording.content.components import PARTS, Part, Rows
+from spherloc_viz.recording.content.components import PARTS, Part, Rows, Words
 from spherloc_viz.recording.content.query_image import MATCHES, Keypoints
 
 NEAR = 1e-6
 """Numbers that differ by no more, relative to the largest of them, are equal: they are written with 24 bits."""
+WORDS = "/scene/words"
+"""All labels."""
 _AXES = list(rr.ViewCoordinates.columns(xyz=[rr.ViewCoordinates.RDF]))
 
 
@@ -47,7 +49,11 @@ def _tracks(pictures: Sequence[Picture], pixels: FloatArray) -> dict[tuple[str, 
             ("/step", picture.step),
             (MATCHES, Keypoints(pixels, match_colors(picture))),
         ]
-        items += [(_scene_path(item.name), item) for item in picture.scene if not isinstance(item, Textured)]
+        items += [(_scene_path(item.name), item) for item in picture.scene if not isinstance(item, Textured | Label)]
+        labels = [item for item in picture.scene if isinstance(item, Label)]
+        if labels:
+            positions = np.stack([label.position for label in labels])
+            items.append((WORDS, Words(tuple(label.text for label in labels), positions)))
         for chart in picture.charts:
             for curve in (curve for curve in chart.curves if len(curve.x)):
                 # Charts stay for all later steps, and are the same objects there.

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any
 
 from spherloc.diagnosis import Cause, Diagnosis
@@ -12,6 +13,7 @@ from spherloc_viz.recording.run_row import RunRow
 _MARKUP = re.compile(r"([\\`*_{}\[\]<>#+\-!|~$&])")
 
 
+@lru_cache(maxsize=2048)
 def plain(text: str) -> str:
     """``text`` on one line, shown as it is, as far as the viewer has letters for it."""
     return _MARKUP.sub(r"\\\1", legible(" ".join(text.split())))

@@ -99,11 +99,11 @@ def _arcs(trace: Trace, stage: YawStage) -> Iterator[Chunk]:
     colors = np.where(
         in_clique[chosen], packed(np.array([style.CLIQUE])), packed(np.array([style.UNDECIDED]), 2.0 * GREY)
     )
-    yield _lines_2d(f"{ARCS}/arcs", points, colors.astype(np.uint32), 1.5)
-    yield from _yaws(trace, estimate, height)
+    yield static_chunk(f"{ARCS}/arcs", _lines(points, colors.astype(np.uint32), 1.5))
+    yield _yaws(trace, estimate, height)
 
 
-def _yaws(trace: Trace, estimate: float, height: float) -> Iterator[Chunk]:
+def _yaws(trace: Trace, estimate: float, height: float) -> Chunk:
     """Upright lines over the stack of arcs with a word each: the estimated yaw and, if it is near, the true one."""
     marks = [("estimate", estimate, -0.04 * height, style.ESTIMATE)]
     truth = trace.problem.truth_cam_from_map
@@ -114,12 +114,12 @@ def _yaws(trace: Trace, estimate: float, height: float) -> Iterator[Chunk]:
             marks.append(("truth", at, 1.04 * height, style.TRUTH))
     colors = packed(np.array([color for *_, color in marks]))
     lines = np.array([[[at, 0.0], [at, height]] for _, at, _, _ in marks])
-    yield _lines_2d(f"{ARCS}/yaws", lines, colors, 2.0)
     words = pa.array([f"{name} {(at + 180.0) % 360.0 - 180.0:.2f}°" for name, at, *_ in marks])
     places = vectors(np.array([[at, end] for _, at, end, _ in marks]), VECTOR_2D)
-    yield static_chunk(
-        f"{ARCS}/words",
+    return static_chunk(
+        f"{ARCS}/yaws",
         [
+            *_lines(lines, colors, 2.0),
             Values(rr.Points2D.descriptor_positions(), places, [len(marks)]),
             Values(rr.Points2D.descriptor_labels(), words, [len(marks)]),
             Values(rr.Points2D.descriptor_colors(), pa.array(colors), [len(marks)]),
@@ -128,16 +128,13 @@ def _yaws(trace: Trace, estimate: float, height: float) -> Iterator[Chunk]:
     )
 
 
-def _lines_2d(entity: str, points: FloatArray, colors: NDArray[np.uint32], width_px: float) -> Chunk:
-    """Lines (K, 2, 2)."""
-    return static_chunk(
-        entity,
-        [
-            Values(rr.LineStrips2D.descriptor_strips(), segments(points, STRIP_2D), [len(points)]),
-            Values(rr.LineStrips2D.descriptor_colors(), pa.array(colors), [len(colors)]),
-            Values(rr.LineStrips2D.descriptor_radii(), numbers([-width_px / 2]), [1]),
-        ],
-    )
+def _lines(points: FloatArray, colors: NDArray[np.uint32], width_px: float) -> list[Values]:
+    """The components of lines (K, 2, 2) with a colour each."""
+    return [
+        Values(rr.LineStrips2D.descriptor_strips(), segments(points, STRIP_2D), [len(points)]),
+        Values(rr.LineStrips2D.descriptor_colors(), pa.array(colors), [len(colors)]),
+        Values(rr.LineStrips2D.descriptor_radii(), numbers([-width_px / 2]), [1]),
+    ]
 
 
 def _placed(stage: TranslationStage) -> tuple[FloatArray, NDArray[np.bool_]]:
@@ -188,7 +185,7 @@ def _large_graph(stage: TranslationStage) -> Iterator[Chunk]:
     places, inside = _placed(stage)
     edges = stage.edges[even(np.arange(len(stage.edges)), MOST_EDGES)]
     if len(edges):
-        yield _lines_2d(f"{GRAPH}/overlaps", places[edges], _edge_colors(edges, inside), 1.0)
+        yield static_chunk(f"{GRAPH}/overlaps", _lines(places[edges], _edge_colors(edges, inside), 1.0))
     yield static_chunk(
         f"{GRAPH}/balls",
         [

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -13,7 +14,7 @@ from spherloc.errors import show
 from spherloc.problem import Problem
 from spherloc_viz import style
 from spherloc_viz.layers.match_view import valid_outlines
-from spherloc_viz.layers.photograph import photograph, shrunk
+from spherloc_viz.layers.photograph import Photograph, photograph, shrunk
 from spherloc_viz.layers.primitives import ColorArray, FloatArray
 from spherloc_viz.recording.content.columns import (
     STRIP_2D,
@@ -70,6 +71,15 @@ def query_image(problem: Problem) -> QueryImage:
     photo = photograph(problem.image)
     if photo is None:
         return QueryImage(b"", 1.0, f"The query image {show(problem.image.name)} cannot be read any more.")
+    known = _pressed(photo)
+    if known is None:
+        return QueryImage(b"", 1.0, f"The query image {show(problem.image.name)} is too large to be recorded.")
+    return known
+
+
+@lru_cache(maxsize=8)
+def _pressed(photo: Photograph) -> QueryImage | None:
+    """A photograph as it is recorded; kept, since most runs are of the same few images."""
     small = shrunk(photo.image, LONGEST_PX / max(photo.image.shape[:2]))
     scale = photo.scale * small.shape[1] / photo.image.shape[1]
     image = cv2.cvtColor(small, cv2.COLOR_RGB2BGR)
@@ -77,7 +87,7 @@ def query_image(problem: Problem) -> QueryImage:
         done, content = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
         if done and len(content) <= MOST_BYTES:
             return QueryImage(content.tobytes(), scale, "")
-    return QueryImage(b"", 1.0, f"The query image {show(problem.image.name)} is too large to be recorded.")
+    return None
 
 
 def image_chunks(problem: Problem, image: QueryImage) -> Iterator[Chunk]:

@@ -34,7 +34,7 @@ def scratch() -> Iterator[Path]:
         yield Path(name)
     finally:
         with contextlib.suppress(OSError):
-            os.unlink(name)
+            Path(name).unlink()
 
 
 def sweep_scratch() -> None:
@@ -44,7 +44,7 @@ def sweep_scratch() -> None:
             match = _SCRATCH.fullmatch(entry.name)
             if match is not None and entry.is_file(follow_symlinks=False) and _ended(match):
                 with contextlib.suppress(OSError):
-                    os.unlink(entry.path)
+                    Path(entry.path).unlink()
 
 
 def target_of(part: Path) -> Path | None:
