@@ -18,20 +18,28 @@ from rerun.chunk import Chunk, LazyChunkStream, RrdReader
 from spherloc_viz.recording.content.properties import APPLICATION_ID
 
 FOOT_BYTES = 32
+ALONE = "in a chunk of its own"
+"""Key of a row that is."""
 LZ4 = pa.Codec("lz4_raw")
 
+DATA = "/data"
+
 Change = Callable[[dict[str, Any]], Mapping[str, Any] | None]
-"""Of the columns of a chunk; None drops the chunk."""
+"""Of the columns of a chunk, or of a row of the chunk of data; None drops it."""
 
 
 def changed(good: Path, path: Path, changes: Mapping[str, Change], *more: Chunk) -> Path:
-    """Write the recording ``good`` to ``path`` with some of its chunks, named by their entities, changed."""
+    """Write the recording ``good`` to ``path`` with some of its chunks changed, named by their entities, or with rows
+    of its data, as "/data/run". A row may be put into a chunk of its own, as older formats have it: ``alone``."""
     reader = RrdReader(good)
     (entry,) = reader.recordings()
     chunks = []
     for chunk in reader.stream(store=entry):
         change = changes.get(chunk.entity_path)
-        chunks += [chunk] if change is None else list(_changed_chunk(chunk, change))
+        if chunk.entity_path == DATA and any(name.startswith(f"{DATA}/") for name in changes):
+            chunks += _changed_data(chunk, changes)
+        else:
+            chunks += [chunk] if change is None else list(_changed_chunk(chunk, change))
     stream = LazyChunkStream.from_iter([*chunks, *more])
     stream.write_rrd(path, application_id=APPLICATION_ID, recording_id=entry.recording_id)
     return path
@@ -46,10 +54,45 @@ def _changed_chunk(chunk: Chunk, change: Change) -> Iterator[Chunk]:
         yield from Chunk.from_record_batch(rows, index=None, entity_path=chunk.entity_path)
 
 
+def _changed_data(chunk: Chunk, changes: Mapping[str, Change]) -> Iterator[Chunk]:
+    """The rows of the data one behind the other, in one chunk but for those that stand alone."""
+    batch = chunk.to_record_batch()
+    told, content, at = json.loads(batch.column("scalars")[0].values[0].as_py()), _content(batch), 0
+    texts, arrays = [], []
+    for name, part in told.items():
+        size = sum(np.dtype(kind).itemsize * math.prod(shape) for _, kind, shape in part["arrays"])
+        row: Mapping[str, Any] | None = {
+            "scalars": pa.array([[json.dumps(part)]]),
+            "arrays": listed(content[at : at + size]),
+        }
+        at += size
+        change = changes.get(f"{DATA}/{name}")
+        row = row if change is None else change(dict(row))
+        if row is not None and row.get(ALONE):
+            columns = pa.RecordBatch.from_pydict({key: value for key, value in row.items() if key != ALONE})
+            yield from Chunk.from_record_batch(columns, index=None, entity_path=f"{DATA}/{name}")
+        elif row is not None:
+            texts.append(f"{json.dumps(name)}: {row['scalars'][0].values[0].as_py()}")
+            arrays.append(_content(row) if "arrays" in row else np.zeros(0, np.uint8))
+    if texts:
+        scalars = pa.array([["{" + ", ".join(texts) + "}"]])
+        columns = pa.RecordBatch.from_pydict({"scalars": scalars, "arrays": listed(np.concatenate(arrays))})
+        yield from Chunk.from_record_batch(columns, index=None, entity_path=DATA)
+
+
+def _content(columns: Any) -> np.ndarray:
+    return columns["arrays"][0].values.to_numpy(zero_copy_only=False)
+
+
+def alone(row: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The row in a chunk of its own, as format 2 has it."""
+    return {**row, ALONE: True}
+
+
 def unpacked(columns: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """The values and the arrays of a row of ``/data``."""
     told = json.loads(columns["scalars"][0].values[0].as_py())
-    content, at = columns["arrays"][0].values.to_numpy(), 0
+    content, at = _content(columns), 0
     arrays: dict[str, np.ndarray] = {}
     for name, kind, shape in told["arrays"]:
         size = np.dtype(kind).itemsize * math.prod(shape)
@@ -65,8 +108,9 @@ def packed(values: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> dict[
 
 
 def packed_as_format_1(values: Mapping[str, Any], columns: Mapping[str, Any]) -> dict[str, Any]:
-    """The row of values and of an arrow column for each array, in the format of old, which can still be read."""
-    return {name: listed(array) for name, array in columns.items()} | {"scalars": pa.array([[json.dumps(values)]])}
+    """The row of values and of an arrow column for each array, in the oldest format, which can still be read."""
+    row = {name: listed(array) for name, array in columns.items()} | {"scalars": pa.array([[json.dumps(values)]])}
+    return dict(alone(row))
 
 
 def listed(array: Any) -> pa.Array:

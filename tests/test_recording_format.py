@@ -32,7 +32,7 @@ from spherloc_viz.recording.content.writer import recorded_steps, write_recordin
 from spherloc_viz.recording.origin import Origin
 from spherloc_viz.recording.review.notes import write_review
 
-FORMAT_1 = Path(__file__).parent / "data" / "format_1.rrd"
+FORMAT_1, FORMAT_2 = (Path(__file__).parent / "data" / f"format_{version}.rrd" for version in (1, 2))
 """Written by the first version of the format: 24 matches, ransac-2p, seed 5."""
 
 
@@ -116,7 +116,7 @@ def test_the_row_that_is_returned_is_the_row_that_is_read(run: object, tmp_path:
     path = tmp_path / "a run.rrd"
     row = write_recording(trace, path, Origin("sweep"))
     assert read_run_row(path) == read_recording(path).row == row
-    assert (row.file, row.size_bytes, row.format_version) == ("a run.rrd", path.stat().st_size, 2)
+    assert (row.file, row.size_bytes, row.format_version) == ("a run.rrd", path.stat().st_size, 3)
     assert row.steps == len(steps(trace)) and 0 <= row.decisive_step < row.steps
     labels = trace.problem.truth_inliers
     assert row.outlier_rate == (None if labels is None else 1.0 - labels.mean())
@@ -343,6 +343,18 @@ def test_a_file_of_format_1_still_opens() -> None:
     assert np.allclose(again.cam_from_map, run.cam_from_map, atol=1e-6)
     assert set(run.stages) == {"ransac", "refinement"}
     assert run.stages["ransac"]["cam_from_map"].shape[1:] == (3, 4)
+
+
+def test_a_file_of_format_2_still_opens() -> None:
+    run, row = read_recording(FORMAT_2), read_run_row(FORMAT_2)
+    variation = Variation(correspondences=24)
+    assert row == run.row and (row.format_version, row.source, row.title) == (2, "command", "As in format 2")
+    assert run.origin == Origin("command", variation=variation, title="As in format 2")
+    assert run.diagnosis is not None and run.diagnosis.cause is Cause.OK and run.diagnosis.evidence
+    problem = variation.problem(_scene("mei_outliers_80"))
+    assert run.problem.pixels.tobytes() == problem.pixels.tobytes() and problem_key(run.problem) == row.problem_key
+    assert set(run.stages) == {"ransac", "refinement"} and run.stages["refinement"]["covariance"].shape == (6, 6)
+    assert row.thumbnail.startswith(b"\x89PNG") and run.inlier_mask.sum() == row.inliers == 5
 
 
 def test_a_changed_byte_is_noticed_or_harmless(trace: Trace, tmp_path: Path, rng: np.random.Generator) -> None:

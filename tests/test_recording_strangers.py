@@ -18,7 +18,9 @@ import pytest
 import rerun as rr
 from hostile_recordings import (
     APPLICATION_ID,
+    DATA,
     Change,
+    alone,
     changed,
     message,
     packed,
@@ -188,7 +190,7 @@ def has_a_list_that_ends_beyond_its_values(good: Path) -> bytes:
 
 
 def repacked(claim: int | None = None, change: Callable[[bytes], bytes] | None = None) -> Lie:
-    return lambda good: with_message(good, PROBLEM, lambda m: message(m, claim, change))
+    return lambda good: with_message(good, DATA, lambda m: message(m, claim, change))
 
 
 def relabelled(count: int) -> Lie:
@@ -215,10 +217,10 @@ LIES: dict[str, Lie] = {
     "an array of 10^9 numbers": relabelled(10**9),
     "10^9 rows": recounted(lambda size: (struct.pack("<qq", 1, 0), struct.pack("<qq", 10**9, 0))),
     "the index claims a chunk of 2^40 bytes": lambda good: with_index(
-        good, (struct.pack("<Q", places(good)[PROBLEM][1]), struct.pack("<Q", 1 << 40))
+        good, (struct.pack("<Q", places(good)[DATA][1]), struct.pack("<Q", 1 << 40))
     ),
     "the index claims a chunk beyond the end": lambda good: with_index(
-        good, (struct.pack("<Q", places(good)[PROBLEM][0]), struct.pack("<Q", (1 << 64) - 8))
+        good, (struct.pack("<Q", places(good)[DATA][0]), struct.pack("<Q", (1 << 64) - 8))
     ),
 }
 
@@ -234,11 +236,12 @@ def test_the_tools_of_these_tests_tell_the_truth_where_they_change_nothing(
     good: Path, examiner: Examiner, tmp_path: Path
 ) -> None:
     same = {
-        "message": with_message(good, PROBLEM, lambda content: content),
+        "message": with_message(good, DATA, lambda content: content),
         "packed again": repacked(change=lambda arrow: arrow)(good),
         "index": with_index(good),
         "rows": changed(good, tmp_path / "same.rrd", {PROBLEM: lambda row: packed(*unpacked(row))}).read_bytes(),
-        "old rows": changed(
+        "rows of format 2": changed(good, tmp_path / "same.rrd", {PROBLEM: alone, RUN: alone}).read_bytes(),
+        "rows of format 1": changed(
             good, tmp_path / "same.rrd", {PROBLEM: lambda row: packed_as_format_1(*unpacked(row))}
         ).read_bytes(),
     }

@@ -13,7 +13,9 @@ from spherloc.errors import InputError, show
 from spherloc.problem import Problem
 
 MAX_BYTES = 1_000_000
-BUNDLED = Path(__file__).resolve().parents[2] / "scenes"
+_INSTALLED = Path(__file__).resolve().parent / "scenes"
+BUNDLED = _INSTALLED if _INSTALLED.is_dir() else Path(__file__).resolve().parents[2] / "scenes"
+"""An installation has them inside of this package, a checkout beside its packages."""
 
 
 class Scene(Protocol):

@@ -1,4 +1,4 @@
-"""Reads ``recordings/gallery.toml``: strictly, since a misspelt key would tell a story that nobody checks."""
+"""Reads ``gallery.toml``: strictly, since a misspelt key would tell a story that nobody checks."""
 
 import re
 from collections.abc import Mapping
@@ -19,8 +19,9 @@ from spherloc_viz.gallery.case import Beside, GalleryCase, Play
 from spherloc_viz.gallery.measures import MEASURES
 from spherloc_viz.options import option_fields
 
-GALLERY = Path(__file__).resolve().parents[2] / "recordings" / "gallery.toml"
-"""Beside the packages, as the scenes are."""
+_INSTALLED = Path(__file__).resolve().parent / "gallery.toml"
+GALLERY = _INSTALLED if _INSTALLED.is_file() else Path(__file__).resolve().parents[2] / "recordings" / "gallery.toml"
+"""An installation has it inside of this package, a checkout in its folder of recordings."""
 FAILURES = ("position", "rotation", "no pose")
 MOST_SEED = 2**63 - 1
 PLAY_KEYS = {"scene", "query", "variation", "staged", "seed", "estimator", "options", "facts"}

@@ -62,7 +62,12 @@ def _residuals_html(residuals: Residuals | None, selected: tuple[int, ...]) -> s
     marked = np.zeros(len(residuals.px), dtype=bool)
     marked[list(selected)] = True
     drawings = "".join(histogram_svg(one, marked) for one in residuals.histograms)
-    return box(_title("Residuals at the estimated pose") + drawings + _note(residuals_caption(residuals)))
+    legend = "".join(
+        f'<span style="margin-right:1.2em;white-space:nowrap">{dot_html(color)}{words}</span>'
+        for color, words in ((style.INLIER, "right"), (style.OUTLIER, "wrong"))
+    )
+    colors = f'<div style="font-size:12px;padding-bottom:.2em">{legend}<span style="{DIM}">{escape(residuals.judged)}</span></div>'
+    return box(_title("Residuals at the estimated pose") + colors + drawings + _note(residuals_caption(residuals)))
 
 
 def residuals_caption(residuals: Residuals) -> str:

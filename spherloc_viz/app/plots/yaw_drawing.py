@@ -73,7 +73,7 @@ def _legend(story: YawStory) -> list[str]:
     for name, color, dashed in reversed(names):
         start = end - shapes.text_width_px(name)
         dashes = ' stroke-dasharray="3 2"' if dashed else ""
-        parts += [shapes.text(end, 10.0, name, "end")]
+        parts += [shapes.text(start, 10.0, name)]
         parts.append(shapes.line(start - 16, 6.0, start - 4, 6.0, shapes.stroke(color, 2.5, dashes)))
         end = start - 26.0
     return parts

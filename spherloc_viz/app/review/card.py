@@ -5,14 +5,14 @@ from html import escape
 
 import numpy as np
 
-from spherloc.diagnosis import Cause, Diagnosis
+from spherloc.diagnosis import Diagnosis
 from spherloc.metrics import evaluate
 from spherloc_viz import style
 from spherloc_viz.app.history import changed_fields
 from spherloc_viz.app.review import words
 from spherloc_viz.app.review.filters import key_html, keyed, pill
 from spherloc_viz.app.review.opened import Opened, is_same_pose
-from spherloc_viz.app.review.rows import NEXT_KEY, PREVIOUS_KEY, badge_html
+from spherloc_viz.app.review.rows import NEXT_KEY, PREVIOUS_KEY, badge_html, verdict_html
 from spherloc_viz.app.text import DIM, box
 from spherloc_viz.app.web.viewer_room import viewer_link
 from spherloc_viz.app.wish import Run
@@ -72,9 +72,9 @@ def card_html(opened: Opened, run: Run, diagnosis: Diagnosis | None, bar: str) -
 def _result(row: RunRow) -> str:
     """What came out of the recorded run, in a line, and what the diagnosis says."""
     errors = errors_text(row.rotation_error_deg, row.translation_error_m)
-    facts = [f"{row.inliers}/{row.correspondences}", *([errors] if errors != words.UNKNOWN else [])]
-    cause = f" {escape(row.diagnosis)}" if row.diagnosis != Cause.OK else ""
-    line = f'{badge_html(row.outcome)}{cause}<span style="{DIM}"> · {" · ".join(facts)}</span>'
+    facts = [f"{row.inliers} of {row.correspondences}", *([errors] if errors != words.UNKNOWN else [])]
+    told = "".join(f' · <span style="white-space:nowrap">{fact}</span>' for fact in facts)
+    line = f'{verdict_html(row)}<span style="{DIM}">{told}</span>'
     return f'<div>{line}</div><div style="{DIM}">{escape(row.summary)}</div>'
 
 

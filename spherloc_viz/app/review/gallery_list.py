@@ -10,7 +10,7 @@ import viser
 from spherloc_viz import style
 from spherloc_viz.app.panels.errand import Errand
 from spherloc_viz.app.review.filters import pill
-from spherloc_viz.app.review.rows import RULE, picture_html
+from spherloc_viz.app.review.rows import OPENED, RULE, picture_html
 from spherloc_viz.app.review.shelf import Shelf
 from spherloc_viz.app.text import DIM, box, status_html
 from spherloc_viz.app.web.touch import Touch, Touches
@@ -108,21 +108,31 @@ def reopened(case: GalleryCase, play: Play, stem: str) -> Reopened:
 def gallery_html(cases: Sequence[GalleryCase], rows: dict[str, RunRow], opened: str | None) -> str:
     """All cases, and the story of the one that is open."""
     about = "Failures worth seeing, and why they happen. A press opens one in the playground."
-    body = "".join(_case_html(case, rows.get(file_of(case)), case.key == opened) for case in cases)
+    pictures = [_thumbnail(rows.get(file_of(case))) for case in cases]
+    # Before "spherloc gallery" has recorded them, no case has one, and a column of empty frames says nothing.
+    shown = [picture_html(png) if any(pictures) else "" for png in pictures]
+    body = "".join(
+        _case_html(case, picture, case.key == opened) for case, picture in zip(cases, shown, strict=True)
+    )
     return box(f'<div style="{DIM};padding-bottom:.4em">{about}</div>{body}', "font-size:11.5px;line-height:1.4")
 
 
-def _case_html(case: GalleryCase, row: RunRow | None, opened: bool) -> str:
-    picture = picture_html(b"" if row is None else row.thumbnail)
+def _thumbnail(row: RunRow | None) -> bytes:
+    return b"" if row is None else row.thumbnail
+
+
+def _case_html(case: GalleryCase, picture: str, opened: bool) -> str:
+    """A case; ``picture`` is HTML."""
     color = style.css_text(style.OUTLIER)
     head = (
         f'<div style="font-weight:600;overflow-wrap:anywhere">{escape(case.title)}</div>'
         f'<div><span style="color:{color}">{escape(case.cause)}</span>'
         f'<span style="{DIM}"> · {escape(case.estimator)}</span></div>'
     )
+    ground = f"background:{OPENED};box-shadow:inset 2px 0 0 {style.css(style.ESTIMATE)};" if opened else ""
     line = (
         f'<div role="button" tabindex="0" class="touch-row" data-touch="gallery-open:{escape(case.key)}" '
-        f'style="{RULE};display:flex;gap:.6em;align-items:center;padding:.2em .25em">{picture}'
+        f'style="{RULE};{ground}display:flex;gap:.6em;align-items:center;padding:.2em .25em">{picture}'
         f'<div style="flex:1;min-width:0">{head}</div></div>'
     )
     if not opened:
@@ -137,4 +147,4 @@ def _case_html(case: GalleryCase, row: RunRow | None, opened: bool) -> str:
         for number, play in enumerate(case.beside)
     )
     ways = f'<div style="display:flex;flex-wrap:wrap;gap:.3em;padding-top:.4em">{beside}</div>' if beside else ""
-    return f'{line}<div style="padding:.2em .25em .7em">{escape(case.story)}{ways}</div>'
+    return f'<div data-reveal="{escape(case.key)}">{line}<div style="padding:.4em .25em .7em">{escape(case.story)}{ways}</div></div>'

@@ -69,9 +69,8 @@ def _lines(row: RunRow, now: datetime) -> str:
         f"{escape(words.title_of(row))}</span>"
         f'<span style="{DIM};white-space:nowrap">{escape(words.moment(row.created, now))}</span></div>'
     )
-    cause = f" {escape(row.diagnosis)}" if _told(row) else ""
     how = (
-        f'<div style="{CUT}">{badge_html(row.outcome)}{cause}'
+        f'<div style="{CUT}">{verdict_html(row)}'
         f'<span style="{DIM}"> · {escape(row.estimator)} #{row.seed}</span></div>'
     )
     facts = [f"{row.inliers}/{row.correspondences}"]
@@ -79,13 +78,23 @@ def _lines(row: RunRow, now: datetime) -> str:
     errors = (words.angle(row.rotation_error_deg), words.distance(row.translation_error_m))
     facts += [fact for fact in errors if fact != words.UNKNOWN]
     facts.append(words.duration(row.time_ms))
-    numbers = f'<div style="{DIM};{CUT};font-variant-numeric:tabular-nums">{escape(" · ".join(facts))}</div>'
-    return name + how + numbers + _review(row)
+    return name + how + facts_html(facts) + _review(row)
 
 
-def _told(row: RunRow) -> bool:
-    """Whether the diagnosis says more than the outcome does."""
-    return bool(row.diagnosis) and row.diagnosis != Cause.OK
+def facts_html(facts: Sequence[str]) -> str:
+    """Numbers in one line; those that do not fit are left out whole."""
+    parts = "".join(
+        f'<span style="white-space:pre">{"" if place == 0 else " · "}{escape(fact)}</span>'
+        for place, fact in enumerate(facts)
+    )
+    css = f"{DIM};display:flex;flex-wrap:wrap;height:1.35em;overflow:hidden;font-variant-numeric:tabular-nums"
+    return f'<div style="{css}">{parts}</div>'
+
+
+def verdict_html(row: RunRow) -> str:
+    """What came out in the outcome's colour: the diagnosis if it says more than the outcome does."""
+    told = row.diagnosis and row.diagnosis != Cause.OK
+    return badge_html(row.outcome, row.diagnosis if told else row.outcome)
 
 
 def _review(row: RunRow) -> str:
@@ -105,10 +114,11 @@ def label_html(label: str) -> str:
     )
 
 
-def badge_html(outcome: str) -> str:
-    """The outcome with its colour."""
+def badge_html(outcome: str, said: str = "") -> str:
+    """The outcome with its colour, or what is ``said`` of it instead."""
     color = words.COLORS.get(outcome, style.UNDECIDED)
-    return f'{dot_html(color)}<b style="font-weight:600;color:{style.css_text(color)}">{escape(outcome)}</b>'
+    look = f"font-weight:600;color:{style.css_text(color)}"
+    return f'{dot_html(color)}<b title="{escape(outcome)}" style="{look}">{escape(said or outcome)}</b>'
 
 
 def picture_html(png: bytes, width_px: int = WIDTH_PX, height_px: int = HEIGHT_PX) -> str:

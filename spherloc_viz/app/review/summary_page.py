@@ -90,7 +90,7 @@ def _note(note: str) -> str:
 def _how() -> str:
     ways = (
         ("spherloc view FILE.rrd", "opens a run in the Rerun viewer, at the step where it was decided"),
-        ("spherloc rerun-recording FILE.rrd", "repeats a run and says whether it comes out the same"),
+        ("spherloc repeat FILE.rrd", "repeats a run and says whether it comes out the same"),
         ("spherloc run FILE.rrd", "solves the recorded problem again, with other options if you like"),
         ("spherloc play --recordings recordings", "reviews all of them on the playground's page"),
     )

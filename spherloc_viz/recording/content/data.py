@@ -1,12 +1,14 @@
-"""The numbers behind the pictures: the trace as rows under ``/data``, and back, bit for bit.
+"""The numbers behind the pictures: the trace as rows at ``/data``, and back, bit for bit.
 
-A row has a column ``arrays`` with the bytes of all arrays, and a column ``scalars``, JSON with their types and shapes
-and all other values. A number that JSON has no word for is ``{"number": "inf"}`` (or "-inf", "nan").
+There are the rows "problem", "run", "origin", "diagnosis" and one "stages/KIND" for every stage. The column ``arrays``
+has the bytes of all of their arrays, one behind the other; the column ``scalars`` is JSON: by the name of each row the
+names, types and shapes of its ``arrays`` and all of its other ``values``. A number that JSON has no word for is
+``{"number": "inf"}`` (or "-inf", "nan"). In format 2 each row has an entity of its own, such as ``/data/problem``, and
+in format 1 each array a column.
 """
 
 import json
 import math
-from collections.abc import Iterator
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
@@ -32,6 +34,7 @@ MAX_ARRAY_BYTES = 16_384
 MAX_SCENE_BYTES = 65_536
 """The text of a larger scene file is not recorded."""
 
+DATA = "/data"
 ARRAYS = "arrays"
 NOT_FINITE = "number"
 """Key of the table that stands for infinity or NaN."""
@@ -39,19 +42,22 @@ NOT_FINITE = "number"
 Row = dict[str, Any]
 
 
-def data_chunks(trace: Trace, origin: Origin, diagnosis: Diagnosis, full: bool) -> Iterator[Chunk]:
-    """Static chunks with the problem, the result, where it came from, what is wrong with it, and every stage.
+def data_chunk(trace: Trace, origin: Origin, diagnosis: Diagnosis, full: bool) -> Chunk:
+    """A static chunk with the problem, the result, where it came from, what is wrong with it, and every stage.
 
     Of a stage it is the small arrays or, with ``full``, all of them.
     """
-    yield _chunk("/data/problem", _problem_row(trace.problem))
-    yield _chunk("/data/run", _run_row(trace))
-    yield _chunk("/data/origin", asdict(origin) | {"scene_text": scene_text(origin.scene_path)})
-    yield _chunk("/data/diagnosis", {item.name: getattr(diagnosis, item.name) for item in fields(diagnosis)})
+    rows = {
+        "problem": _problem_row(trace.problem),
+        "run": _run_row(trace),
+        "origin": asdict(origin) | {"scene_text": scene_text(origin.scene_path)},
+        "diagnosis": {item.name: getattr(diagnosis, item.name) for item in fields(diagnosis)},
+    }
     for stage in trace.stages:
         row = {item.name: getattr(stage, item.name) for item in fields(stage)}
         kept = {name: value for name, value in row.items() if full or getattr(value, "nbytes", 0) <= MAX_ARRAY_BYTES}
-        yield _chunk(f"/data/stages/{stage.kind}", kept)
+        rows[f"stages/{stage.kind}"] = kept
+    return _chunk(rows)
 
 
 def scene_text(path: str | None) -> str | None:
@@ -124,41 +130,54 @@ def diagnosis_from_row(row: Row) -> Diagnosis:
     return Diagnosis(cause=cause, evidence=evidence, rival_cam_from_map=rival, **row)
 
 
-def _chunk(path: str, row: Row) -> Chunk:
-    """A row: the bytes of all arrays in one column, since every column costs more room in the file's index than most
-    arrays have; their types and shapes are with the scalars."""
-    arrays = {name: np.ascontiguousarray(value) for name, value in row.items() if isinstance(value, np.ndarray)}
-    others = {name: value for name, value in row.items() if name not in arrays}
-    forms = [[name, array.dtype.str, list(array.shape)] for name, array in arrays.items()]
-    told = {ARRAYS: forms, "values": plain(others, lambda number: {NOT_FINITE: str(number)})}
-    content = b"".join(array.tobytes() for array in arrays.values())
+def _chunk(rows: dict[str, Row]) -> Chunk:
+    """One chunk, since every column costs more room in the file's index than most arrays have."""
+    told, content = {}, []
+    for name, row in rows.items():
+        arrays = {key: np.ascontiguousarray(value) for key, value in row.items() if isinstance(value, np.ndarray)}
+        others = {key: value for key, value in row.items() if key not in arrays}
+        forms = [[key, array.dtype.str, list(array.shape)] for key, array in arrays.items()]
+        told[name] = {ARRAYS: forms, "values": plain(others, lambda number: {NOT_FINITE: str(number)})}
+        content += [array.tobytes() for array in arrays.values()]
+    joined = np.frombuffer(b"".join(content), np.uint8)
     columns = [
         Values(rr.ComponentDescriptor("scalars"), pa.array([json.dumps(told, allow_nan=False)]), [1]),
-        Values(rr.ComponentDescriptor(ARRAYS), pa.array(np.frombuffer(content, np.uint8)), [len(content)]),
+        Values(rr.ComponentDescriptor(ARRAYS), pa.array(joined), [len(joined)]),
     ]
-    return static_chunk(path, columns)
+    return static_chunk(DATA, columns)
 
 
-def read_row(chunk: Chunk) -> Row:
-    """Arrays and scalars of a chunk that ``data_chunks`` made, in this format or the first; the arrays are read-only.
+def read_rows(chunk: Chunk) -> dict[str, Row]:
+    """The rows of a chunk of ``data_chunk`` by name, or the one row of a chunk of an older format; arrays are
+    read-only.
 
     Raises ``KeyError``, ``TypeError`` or ``ValueError`` if it is none.
     """
     batch = chunk.to_record_batch()
     columns = {name: batch.column(name) for name in batch.schema.names if pa.types.is_list(batch.column(name).type)}
-    told: Row = json.loads(columns.pop("scalars")[0].values[0].as_py(), object_hook=_number)
+    told = json.loads(columns.pop("scalars")[0].values[0].as_py(), object_hook=_number)
+    if chunk.entity_path == DATA:
+        return _unpacked(told, columns[ARRAYS])
+    name = chunk.entity_path.removeprefix(f"{DATA}/")
     if ARRAYS not in told:
-        return told | {name: _numpy(column[0].values) for name, column in columns.items()}
-    content = columns[ARRAYS][0].values.to_numpy(zero_copy_only=False)
-    row, at = dict(told["values"]), 0
-    for name, kind, shape in told[ARRAYS]:
-        dtype, end = np.dtype(kind), at
-        if dtype.kind not in "biuf" or any(size < 0 for size in shape):
-            raise ValueError(f"{name} is no array of numbers")
-        end += dtype.itemsize * math.prod(shape)
-        row[name], at = content[at:end].view(dtype).reshape(shape), end
-        row[name].setflags(write=False)
-    return row
+        return {name: told | {key: _numpy(column[0].values) for key, column in columns.items()}}
+    return _unpacked({name: told}, columns[ARRAYS])
+
+
+def _unpacked(told: dict[str, Any], arrays: pa.ListArray) -> dict[str, Row]:
+    """Rows from what is told of them and the bytes of their arrays."""
+    content = arrays[0].values.to_numpy(zero_copy_only=False)
+    rows, at = {}, 0
+    for name, part in told.items():
+        row = rows[name] = dict(part["values"])
+        for key, kind, shape in part[ARRAYS]:
+            dtype, end = np.dtype(kind), at
+            if dtype.kind not in "biuf" or any(size < 0 for size in shape):
+                raise ValueError(f"{key} is no array of numbers")
+            end += dtype.itemsize * math.prod(shape)
+            row[key], at = content[at:end].view(dtype).reshape(shape), end
+            row[key].setflags(write=False)
+    return rows
 
 
 def _number(table: dict[str, Any]) -> Any:

@@ -15,7 +15,14 @@ from spherloc.diagnosis import Diagnosis
 from spherloc.errors import InputError, RecordingError, show
 from spherloc.problem import Problem
 from spherloc.trace import Certificate
-from spherloc_viz.recording.content.data import diagnosis_from_row, origin_from_row, problem_from_row, read_row
+from spherloc_viz.recording.content.data import (
+    DATA,
+    Row,
+    diagnosis_from_row,
+    origin_from_row,
+    problem_from_row,
+    read_rows,
+)
 from spherloc_viz.recording.content.properties import (
     APPLICATION_ID,
     FORMAT_VERSION,
@@ -31,7 +38,7 @@ from spherloc_viz.recording.origin import Origin
 from spherloc_viz.recording.review.notes import read_review
 from spherloc_viz.recording.run_row import RunRow
 
-STAGES = "/data/stages/"
+STAGES = "stages/"
 PROPERTIES = f"/__properties/{RUN_PROPERTY}"
 THUMBNAIL = f"/__properties/{THUMBNAIL_PROPERTY}"
 
@@ -84,7 +91,7 @@ def read_recording(path: Path) -> RecordedRun:
     """
     path = Path(path)
     with _sentences(path):
-        entry, chunks = _load(path, [PROPERTIES, THUMBNAIL, "/data/**", QUERY_IMAGE])
+        entry, chunks = _load(path, [PROPERTIES, THUMBNAIL, f"{DATA}/**", QUERY_IMAGE])
         return _run(path, entry, chunks)
 
 
@@ -160,20 +167,22 @@ def _row(path: Path, entry: StoreEntry, chunks: Mapping[str, Chunk]) -> RunRow:
 
 
 def _run(path: Path, entry: StoreEntry, chunks: Mapping[str, Chunk]) -> RecordedRun:
-    run = read_row(chunks["/data/run"])
-    stages = {name[len(STAGES) :]: read_row(chunk) for name, chunk in chunks.items() if name.startswith(STAGES)}
+    rows: dict[str, Row] = {}
+    for name, chunk in chunks.items():
+        if name == DATA or name.startswith(f"{DATA}/"):
+            rows |= read_rows(chunk)
+    run, told = rows["run"], rows.get("diagnosis")
     found = run.pop("certificate", None)
-    origin, scene = origin_from_row(read_row(chunks["/data/origin"])) if "/data/origin" in chunks else (None, None)
-    told = chunks.get("/data/diagnosis")
+    origin, scene = origin_from_row(rows["origin"]) if "origin" in rows else (None, None)
     return RecordedRun(
         row=_row(path, entry, chunks),
         properties=read_properties(chunks[PROPERTIES]),
-        problem=problem_from_row(read_row(chunks["/data/problem"]), str(path)),
-        stages=stages,
+        problem=problem_from_row(rows["problem"], str(path)),
+        stages={name[len(STAGES) :]: row for name, row in rows.items() if name.startswith(STAGES)},
         certificate=None if found is None else Certificate(**found),
         origin=origin,
         scene_text=scene,
-        diagnosis=None if told is None else diagnosis_from_row(read_row(told)),
+        diagnosis=None if told is None else diagnosis_from_row(told),
         query_image=read_image(chunks[QUERY_IMAGE]) if QUERY_IMAGE in chunks else None,
         **run,
     )

@@ -19,7 +19,7 @@ from spherloc_viz.layers.decisive import decisive_step
 from spherloc_viz.layers.primitives import Picture, Stop
 from spherloc_viz.layers.step_numbers import step_numbers
 from spherloc_viz.recording.content.columns import markdown, static_chunk
-from spherloc_viz.recording.content.data import data_chunks
+from spherloc_viz.recording.content.data import data_chunk
 from spherloc_viz.recording.content.drawing import drawing_chunks
 from spherloc_viz.recording.content.layout import layout_file, shown_in
 from spherloc_viz.recording.content.markdown import outcome_text
@@ -131,7 +131,7 @@ def _content(run: _Run, file: str) -> tuple[RunRow, bytes]:
 def _chunks(run: _Run, row: RunRow, pictures: Mapping[int, Picture], panels: Panels) -> Iterator[Chunk]:
     trace, image = run.trace, query_image(run.trace.problem)
     yield from property_chunks(trace, row, run.created)
-    yield from data_chunks(trace, run.origin, run.diagnosis, run.full)
+    yield data_chunk(trace, run.origin, run.diagnosis, run.full)
     yield numbers_chunk(step_numbers(trace, pictures))
     yield from drawing_chunks(pictures, image.scale * trace.problem.pixels)
     yield from image_chunks(trace.problem, image)

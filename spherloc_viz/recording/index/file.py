@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from spherloc.errors import RecordingError
-from spherloc_viz.recording.index.rows import SCHEMA
+from spherloc_viz.recording.index.rows import SCHEMA, DamagedError
 
 try:
     import fcntl
@@ -42,7 +42,9 @@ def primary_code(error: sqlite3.Error) -> int:
 
 def is_damage(error: sqlite3.Error) -> bool:
     """Whether the file's content is broken."""
-    return primary_code(error) in _DAMAGED
+    # Python has no class and no code of its own for bytes that are no text.
+    no_text = isinstance(error, sqlite3.OperationalError) and "decode to UTF-8" in str(error)
+    return no_text or isinstance(error, DamagedError) or primary_code(error) in _DAMAGED
 
 
 def may_pass(error: sqlite3.Error, after_s: float) -> bool:

@@ -131,11 +131,11 @@ class Refresher:
         return Refreshed(read, removed, self._write(_skipped))
 
     def _forget(self, connection: sqlite3.Connection, files: Iterable[str]) -> int:
+        """Forget files that are gone, and return how many of them were runs."""
         # A file may have come since the folder was looked at, and its writer has listed it.
-        gone = [(file,) for file in files if not (self._folder / file).exists()]
-        connection.executemany("DELETE FROM runs WHERE file = ?", gone)
+        gone = [(file,) for file in files if _misnamed(file) is not None or not (self._folder / file).exists()]
         connection.executemany("DELETE FROM skipped WHERE file = ?", gone)
-        return len(gone)
+        return connection.executemany("DELETE FROM runs WHERE file = ?", gone).rowcount if gone else 0
 
     def _store(
         self,

@@ -20,6 +20,12 @@ def _column(kind: Any) -> str:
     return _SQL_TYPES[options[0]] + ("" if type(None) in getattr(kind, "__args__", ()) else " NOT NULL")
 
 
+
+
+class DamagedError(sqlite3.DatabaseError):
+    """The tables hold what is never put there: somebody else has changed them."""
+
+
 _TYPES = get_type_hints(RunRow)
 _COLUMNS = {name: _column(kind) for name, kind in _TYPES.items()}
 MAIN = tuple(name for name in _COLUMNS if name not in DETAILS)
@@ -75,18 +81,30 @@ def words(row: RunRow) -> str:
 
 
 def rows_of(connection: sqlite3.Connection, ids: Sequence[int]) -> tuple[RunRow, ...]:
-    """The runs with these ids, in their order."""
+    """The runs with these ids, in their order. Raises ``DamagedError`` if a row is none that ``put`` stores."""
     found: dict[int, RunRow] = {}
     for start in range(0, len(ids), AT_ONCE):
         some = ids[start : start + AT_ONCE]
         places = ", ".join("?" * len(some))
         for values in connection.execute(f"{_SELECT} WHERE runs.id IN ({places})", some):
             found[values[0]] = _row(values[1:])
+    if len(found) < len(set(ids)):
+        raise DamagedError("a run has no details")
     return tuple(found[run] for run in ids)
 
 
 def _row(values: Sequence[Any]) -> RunRow:
     row: dict[str, Any] = dict(zip((*MAIN, *DETAILS), values, strict=True))
-    row["labels"] = tuple(json.loads(row["labels"]))
+    row["labels"] = _labels(row["labels"])
     row |= {name: bool(row[name]) for name in _BOOLEANS if row[name] is not None}
     return RunRow(**row)
+
+
+def _labels(told: str) -> tuple[str, ...]:
+    try:
+        labels = json.loads(told)
+    except (ValueError, RecursionError):
+        labels = None
+    if not isinstance(labels, list) or not all(isinstance(label, str) for label in labels):
+        raise DamagedError("labels are no list of texts")
+    return tuple(labels)

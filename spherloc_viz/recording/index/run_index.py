@@ -17,7 +17,7 @@ from spherloc_viz.recording.index.refresh import Examine, Progress, Refreshed, R
 from spherloc_viz.recording.index.rows import put, rows_of
 from spherloc_viz.recording.review.notes import Review, write_review
 from spherloc_viz.recording.run_row import RunRow
-from spherloc_viz.recording.strangers.examiner import check_name
+from spherloc_viz.recording.strangers.examiner import check_name, examine
 
 T = TypeVar("T")
 MOST_TRIES = 4
@@ -144,6 +144,8 @@ class RunIndex:
         review cannot be written, ``InputError`` if it is too long.
         """
         path = self.folder / check_name(file)
+        if self._replaced(file, path):
+            self.add(replace(examine(path), file=file))
 
         def work(connection: sqlite3.Connection) -> Review:
             found = connection.execute("SELECT id, run_id FROM runs WHERE file = ?", (file,)).fetchone()
@@ -156,6 +158,12 @@ class RunIndex:
             return review
 
         return self._write(work)
+
+    def _replaced(self, file: str, path: Path) -> bool:
+        """Whether a run is known, and its files are not those that were read."""
+        sql = "SELECT stamp FROM runs WHERE file = ?"
+        read = self._read(lambda connection: connection.execute(sql, (file,)).fetchone())
+        return read is not None and path.is_file() and read[0] != stamp_of(path)
 
     def refresh(self, progress: Progress | None = None, examine: Examine = examine_side_by_side) -> Refreshed:
         """Read new and changed recordings of the folder, and forget those that are gone.

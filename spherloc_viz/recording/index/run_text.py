@@ -9,6 +9,7 @@ from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
+from spherloc_viz.options import json_text
 from spherloc_viz.recording.run_row import RunRow
 
 WIDTH = 112
@@ -52,8 +53,8 @@ def counts_text(by: str, counts: Sequence[tuple[str, int]], form: str) -> str:
 
 
 def json_lines(tables: Sequence[Mapping[str, Any]]) -> str:
-    """An array with one object a line."""
-    return "[\n" + ",\n".join(json.dumps(table, allow_nan=False) for table in tables) + "\n]\n"
+    """An array with one object a line; infinity is the text "inf"."""
+    return "[\n" + ",\n".join(map(json_text, tables)) + "\n]\n"
 
 
 def csv_text(tables: Sequence[Mapping[str, Any]], names: Sequence[str]) -> str:
@@ -67,7 +68,7 @@ def csv_text(tables: Sequence[Mapping[str, Any]], names: Sequence[str]) -> str:
 
 def _cell(value: Any) -> Any:
     if isinstance(value, dict):
-        return json.dumps(value)
+        return json_text(value)
     if isinstance(value, list):
         value = "; ".join(value)
     if not isinstance(value, str):

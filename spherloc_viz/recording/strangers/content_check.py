@@ -19,10 +19,12 @@ from PIL import Image
 from rerun.chunk import Chunk, RrdReader
 
 from spherloc.errors import RecordingError, show
-from spherloc_viz.recording.content.data import ARRAYS
+from spherloc_viz.recording.content.data import ARRAYS, DATA
 from spherloc_viz.recording.content.reader import RecordedRun
 from spherloc_viz.recording.strangers.checked_row import COUNT_LIMIT
 
+PROBLEM = f"{DATA}/problem"
+"""The row of the problem in formats 1 and 2."""
 STORES_LIMIT = 16
 CHUNKS_LIMIT = 100_000
 CONTENT_LIMIT_BYTES = 256 << 20
@@ -33,7 +35,7 @@ TEXT_LIMIT = 65_536
 """Characters of one text in it."""
 ITEMS_LIMIT = 100_000
 """Values in it, all together."""
-DEPTH_LIMIT = 8
+DEPTH_LIMIT = 9
 IMAGE_LIMIT_BYTES = 16 << 20
 IMAGE_LIMIT_PX = 8_192
 """A side; a small file can claim an image that fills the memory."""
@@ -61,16 +63,16 @@ def check_content(path: Path) -> None:
             content_bytes += batch.nbytes
             if content_bytes > CONTENT_LIMIT_BYTES:
                 raise _too_many(path, "bytes", content_bytes, CONTENT_LIMIT_BYTES)
-            if chunk.entity_path.startswith("/data/"):
-                _check_row(chunk, batch, path)
+            if chunk.entity_path == DATA or chunk.entity_path.startswith(f"{DATA}/"):
+                _check_rows(chunk, batch, path)
 
 
 def _too_many(path: Path, what: str, count: int, limit: int) -> RecordingError:
     return RecordingError(f"{path}: has {count:,} {what}, of which {limit:,} are the most; record the run again.")
 
 
-def _check_row(chunk: Chunk, batch: pa.RecordBatch, path: Path) -> None:
-    """A row of arrays and of ``scalars``, see ``recording.data``."""
+def _check_rows(chunk: Chunk, batch: pa.RecordBatch, path: Path) -> None:
+    """Rows of arrays and of ``scalars``, see ``recording.content.data``."""
     what = f"{path}: {chunk.entity_path[:100]}"
     if batch.num_rows != 1:
         raise RecordingError(f"{what} has {batch.num_rows:,} rows instead of one; record the run again.")
@@ -81,8 +83,9 @@ def _check_row(chunk: Chunk, batch: pa.RecordBatch, path: Path) -> None:
         values = column.flatten()
         if name == "scalars":
             told = _scalars(values, what)
-            if chunk.entity_path == "/data/problem" and _most_rows(told) > COUNT_LIMIT:
-                raise _too_many(path, "correspondences", _most_rows(told), COUNT_LIMIT)
+            problem = told if chunk.entity_path == PROBLEM else told.get("problem") if isinstance(told, dict) else None
+            if _most_rows(problem) > COUNT_LIMIT:
+                raise _too_many(path, "correspondences", _most_rows(problem), COUNT_LIMIT)
             continue
         leaf = column.type.value_type
         while pa.types.is_fixed_size_list(leaf):
@@ -90,12 +93,12 @@ def _check_row(chunk: Chunk, batch: pa.RecordBatch, path: Path) -> None:
         if not (pa.types.is_floating(leaf) or pa.types.is_integer(leaf) or pa.types.is_boolean(leaf)):
             raise RecordingError(f"{what} has {name[:100]!r} of type {str(leaf)[:100]}; give numbers.")
         # In format 1 an array has a column of its own.
-        if chunk.entity_path == "/data/problem" and name != ARRAYS and len(values) > COUNT_LIMIT:
+        if chunk.entity_path == PROBLEM and name != ARRAYS and len(values) > COUNT_LIMIT:
             raise _too_many(path, "correspondences", len(values), COUNT_LIMIT)
 
 
 def _most_rows(told: Any) -> int:
-    """Of all arrays of a row, by their shapes."""
+    """Of all arrays of a row, by their shapes; 0 if it is none."""
     forms = told.get(ARRAYS, ()) if isinstance(told, dict) else ()
     return max((int(shape[0]) for _, _, shape in forms if shape), default=0)
 
