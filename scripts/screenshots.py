@@ -22,12 +22,17 @@ ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "build" / "screenshots"
 SIZES = ((1280, 720), (1920, 1080))
 FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
-SYNTHETIC, IMAGES = "scenes/panorama_outliers_80.toml", "scenes/street_fisheye.toml"
+SYNTHETIC, STREET = "scenes/panorama_outliers_80.toml", "scenes/street_fisheye.toml"
+APARTMENT, CAMPUS = "scenes/apartment_night_panorama.toml", "scenes/campus_panorama.toml"
 PATIENCE_MS = 240_000
+JPEG = (cv2.IMWRITE_JPEG_QUALITY, 80, cv2.IMWRITE_JPEG_OPTIMIZE, 1)
+"""With less quality small words get fringes."""
 STILL_S = 90.0
 """How long the page may go on changing before it is photographed all the same."""
 TO_TOP = "() => document.querySelectorAll('*').forEach(box => { if (box.scrollTop > 0) box.scrollTop = 0; })"
 """A panel that was scrolled to press something shows its beginning again."""
+SCROLLED = ("gallery",)
+"""Views that the page itself scrolls to what matters."""
 CASES = (
     "too-few-inliers",
     "larger-false-consensus",
@@ -42,6 +47,7 @@ DOCS = {
     "playground": ("arcs", "dark", 0),
     "selection": ("selection", "dark", 0),
     "sweep": ("sweep", "dark", 0),
+    "street": ("sequence", "dark", 0),
 }
 """Names in docs/ of a view in a theme at the size of that number."""
 
@@ -114,6 +120,15 @@ def review(page: Page) -> None:
     page.locator("[data-touch='run-close:']").first.wait_for()
 
 
+def sequence(page: Page) -> None:
+    """Localize all queries of the scene."""
+    tab(page, "Images")
+    press(page, "Overview")
+    press(page, "Localize all queries")
+    page.get_by_role("button", name="Stop", exact=True).wait_for()
+    page.get_by_role("button", name="Localize all queries", exact=True).wait_for()
+
+
 def gallery(page: Page) -> None:
     """Open a case of the gallery."""
     tab(page, "Recordings")
@@ -126,9 +141,9 @@ SYNTHETIC_VIEWS: dict[str, Callable[[Page], object]] = {
     "outcome": lambda page: tab(page, "Yaw"),
     "arcs": lambda page: step(page, "The yaw most arcs share"),
     "twins": lambda page: step(page, "twin"),
-    "balls": lambda page: step(page, "The maximum clique of balls"),
-    "residuals": lambda page: tab(page, "Residuals"),
-    "charts": lambda page: tab(page, "Charts"),
+    "charts": lambda page: (step(page, "The yaw most arcs share"), tab(page, "Charts")),
+    "balls": lambda page: (tab(page, "Yaw"), step(page, "The maximum clique of balls")),
+    "residuals": lambda page: (step(page, "Outcome"), tab(page, "Residuals")),
     "pixels": lambda page: tab(page, "Images"),
     "selection": select_a_match,
     "exact": lambda page: (estimator(page, "mc-exact"), tab(page, "Yaw"), step(page, "What no pose can beat")),
@@ -140,11 +155,18 @@ SYNTHETIC_VIEWS: dict[str, Callable[[Page], object]] = {
     "recordings": review,
     "gallery": gallery,
 }
-IMAGE_VIEWS: dict[str, Callable[[Page], object]] = {
+STREET_VIEWS: dict[str, Callable[[Page], object]] = {
     "map": lambda page: tab(page, "Yaw"),
     "images": lambda page: tab(page, "Images"),
     "from_the_camera": lambda page: press(page, "From the camera"),
+    "sequence": sequence,
 }
+SCENES: tuple[tuple[str, dict[str, Callable[[Page], object]]], ...] = (
+    (SYNTHETIC, SYNTHETIC_VIEWS),
+    (STREET, STREET_VIEWS),
+    (APARTMENT, {"apartment": lambda page: tab(page, "Images")}),
+    (CAMPUS, {"campus": lambda page: tab(page, "Images")}),
+)
 
 
 PROGRAM = str(Path(sys.executable).with_name("spherloc"))
@@ -198,7 +220,7 @@ def main() -> None:
     with sync_playwright() as playwright, tempfile.TemporaryDirectory() as folder:
         recordings = Path(folder)
         subprocess.run([PROGRAM, "gallery", *CASES, "--output", str(recordings / "gallery")], cwd=ROOT, check=True)
-        for scene, views in ((SYNTHETIC, SYNTHETIC_VIEWS), (IMAGES, IMAGE_VIEWS)):
+        for scene, views in SCENES:
             chosen = {name: view for name, view in views.items() if not wanted or name in wanted}
             if chosen:
                 with served(scene, recordings) as address:
@@ -219,7 +241,9 @@ def picture(page: Page, name: str, view: Callable[[Page], object], theme: str, s
     view(page)
     width, height = SIZES[size]
     path = FOLDER / f"{name}_{theme}_{width}x{height}.png"
-    page.evaluate(TO_TOP)
+    page.mouse.move(width // 2, 2)  # away from what was pressed, and what it tells of itself
+    if name not in SCROLLED:
+        page.evaluate(TO_TOP)
     path.write_bytes(still(page))
     for deselect in page.locator("[data-touch='deselect:']").all():
         deselect.click()
@@ -227,7 +251,7 @@ def picture(page: Page, name: str, view: Callable[[Page], object], theme: str, s
         if shown == (name, theme, size):
             image = cv2.imread(str(path))
             assert image is not None
-            cv2.imwrite(str(ROOT / "docs" / f"{title}.jpg"), image, [cv2.IMWRITE_JPEG_QUALITY, 88])
+            cv2.imwrite(str(ROOT / "docs" / f"{title}.jpg"), image, JPEG)
     print(f"{path.relative_to(ROOT)}, {time.monotonic() - start:.0f} s", flush=True)
 
 

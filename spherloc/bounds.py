@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from spherloc.problem import AlignedProblem
+from spherloc.problem import AlignedProblem, check_bound_px
 
 FloatArray = NDArray[np.float64]
 
@@ -26,7 +26,9 @@ def bounds_of(aligned: AlignedProblem, bound_px: float) -> Bounds:
     """Bounds of every bearing from one pixel bound, through the largest stretch of its unprojection, plus gravity.
 
     Residuals are measured in the tangent plane, so that ``bound_px`` reaches as far as the angle whose sine it is.
+    Raises ``ProblemError`` for a bound that no estimator can reckon with.
     """
+    check_bound_px(bound_px)
     gravity_rad = aligned.gravity_bound_rad
     radians = np.arcsin(np.minimum(1.0, bound_px * aligned.radians_per_pixel)) + gravity_rad
     pixels = bound_px + gravity_rad * aligned.pixels_per_radian

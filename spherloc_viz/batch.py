@@ -58,7 +58,7 @@ def run_scenes(
     recorded.
     """
     if not paths:
-        raise InputError("no scene given; name one or more scene files, such as scenes/mei_outliers_80.toml.")
+        raise InputError("no scene given; name one or more scene files or bundled scenes, such as mei_outliers_80.")
     changes, variation = parse_settings(estimator, settings), variation or Variation()
     jobs: list[Future[int]] = []
     # One thread writes and prints, in order, while the next scene is being solved.

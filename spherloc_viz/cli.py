@@ -49,7 +49,7 @@ def run(
 
     For example:
 
-    spherloc run scenes/mei_outliers_80.toml
+    spherloc run mei_outliers_80
 
     spherloc run scenes/*.toml --estimator ransac-2p --seed 7 --json
 
@@ -60,7 +60,7 @@ def run(
     spherloc run scenes/mei_outliers_90.toml --set outlier_rate=0.5 outlier_kind=coherent --spoil 3,5 --hide 1
 
     Args:
-        scenes: Scene files (TOML) or recordings (.rrd), whose problem is solved; one or more.
+        scenes: Scene files (TOML), names of bundled scenes, or recordings (.rrd), whose problem is solved.
         estimator: mc (deterministic maximum consensus), ransac-2p or another one; a wrong name lists them all.
         seed: Seed of the estimator and, in synthetic scenes, of the simulation; the scene's own if not given.
         option: Options of the estimator, such as bound_px=4; none and inf are values where they make sense.
@@ -75,12 +75,14 @@ def run(
         keep_gigabytes: What the recordings may take; beyond it the oldest successes that nobody labelled are deleted.
         query: Name of the query image, in scenes made of images; the first one if not given.
     """
+    from spherloc.datasets import scene_path
     from spherloc.datasets.variation_text import parse_variation
     from spherloc_viz import batch
 
     variation = parse_variation(list(chain(*set)), spoil, mend, hide)
     kept = batch.Records(recordings, full, keep_gigabytes) if record else None
-    return batch.run_scenes(scenes, estimator, seed, list(chain(*option)), json, kept, query, variation)
+    paths = [scene_path(scene) for scene in scenes]
+    return batch.run_scenes(paths, estimator, seed, list(chain(*option)), json, kept, query, variation)
 
 
 @app.command
@@ -106,14 +108,15 @@ def localize(
 
     For example:
 
-    spherloc localize scenes/street.toml
+    spherloc localize street_fisheye
 
     spherloc localize my_scene.toml --estimator mc-exact --queries 0:100:5 --output results/every_fifth
 
     spherloc localize my_scene.toml --queries left/0001.png left/0002.png --no-record
 
     Args:
-        scene: Scene file (TOML) with query and reference images; spherloc scenes lists what kinds there are.
+        scene: Scene file (TOML) with query and reference images, or a bundled scene's name; spherloc scenes lists
+            them and the kinds.
         estimator: mc (deterministic maximum consensus), mc-exact or another one; a wrong name lists them all.
         seed: Seed of the estimator, the same for every query.
         option: Options of the estimator, such as bound_px=4; none and inf are values where they make sense.
@@ -124,9 +127,11 @@ def localize(
         keep_gigabytes: What the recordings may take; beyond it the oldest successes that nobody labelled are deleted.
         retry_failed: Do queries again that have no pose yet.
     """
+    from spherloc.datasets import scene_path
     from spherloc_viz.batch import Records
     from spherloc_viz.localize import localize_sequence
 
+    scene = scene_path(scene)
     folder = output or RECORDINGS / f"{scene.stem}_{estimator}_{seed}"
     kept = Records(recordings or folder / "recordings", keep_gigabytes=keep_gigabytes) if record else None
     try:
@@ -162,7 +167,7 @@ def sweep(
 
     For example:
 
-    spherloc sweep scenes/mei_outliers_80.toml --estimator mc --estimator ransac-2p
+    spherloc sweep mei_outliers_80 --estimator mc --estimator ransac-2p
 
     spherloc sweep scenes/mei_outliers_80.toml --over outlier_rate --values 0.5:0.98:0.04 --set noise_px=2
     --estimator ransac-2p,iterations=100 --estimator ransac-2p,iterations=1000 --runs 200
@@ -173,7 +178,7 @@ def sweep(
     spherloc sweep scenes/fisheye_outliers_90.toml --estimator mc --scheduler tcp://host:8786
 
     Args:
-        scene: Scene file (TOML) of a simulation.
+        scene: Scene file (TOML) of a simulation, or a bundled scene's name.
         over: outlier_rate, noise_px, correspondences or gravity_error_deg.
         values: Values of it: numbers, or FIRST:LAST:STEP, the last one included.
         estimator: A registered estimator, with options after commas; give it once for each. mc and ransac-2p if not
@@ -189,9 +194,11 @@ def sweep(
         recordings: Folder of the recordings.
         keep_gigabytes: What the recordings may take; beyond it the oldest successes that nobody labelled are deleted.
     """
+    from spherloc.datasets import scene_path
     from spherloc_viz.batch import Records
     from spherloc_viz.sweep import sweep as do_sweep
 
+    scene = scene_path(scene)
     file = out or RECORDINGS / f"{scene.stem}_{over}_{seed}.csv"
     chosen = estimator or ("mc", "ransac-2p")
     kept = Records(recordings, keep_gigabytes=keep_gigabytes) if record else None
@@ -215,12 +222,12 @@ def play(
 
     spherloc play
 
-    spherloc play scenes/panorama_outliers_90.toml --port 9000
+    spherloc play panorama_outliers_90 --port 9000
 
     spherloc play --allow ~/maps
 
     Args:
-        scene: Scene file (TOML) to start with; a bundled one if not given.
+        scene: Scene file (TOML) or bundled scene's name to start with; a bundled one if not given.
         host: Address to listen on. Anybody who reaches it can use the playground, so keep it on this machine.
         port: Port to listen on; 0 takes a free one.
         record: Write a recording of each run that is settled on.
@@ -228,9 +235,10 @@ def play(
         keep_gigabytes: What the recordings may take; beyond it the oldest successes that nobody labelled are deleted.
         allow: Another folder that pages may open scenes from; give it once for each.
     """
+    from spherloc.datasets import scene_path
     from spherloc_viz.app.server import serve
 
-    serve(scene, host, port, recordings, record, allow, keep_gigabytes)
+    serve(None if scene is None else scene_path(scene), host, port, recordings, record, allow, keep_gigabytes)
     return 0
 
 

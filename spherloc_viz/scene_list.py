@@ -9,8 +9,9 @@ from spherloc.errors import InputError
 
 
 def all_scenes() -> str:
-    """File, kind and name of every bundled scene, what it is about, and a line a kind. Renders and reads no image."""
-    lines = [_scene(path) for path in bundled_scenes().values()]
+    """Name, kind and title of every bundled scene, what it is about, and a line a kind. Renders and reads no image."""
+    lines = ["Bundled scenes; play, run, localize and sweep take their names in any folder:"]
+    lines += [_scene(path) for path in bundled_scenes().values()]
     kinds = scene_kinds()
     width = max((len(kind.name) for kind in kinds), default=0)
     lines += ["", "Kinds of scene files, for your own data; spherloc scenes KIND shows how one is written:"]
@@ -34,9 +35,9 @@ def _scene(path: Path) -> str:
     try:
         table = read_table(path)
     except InputError as error:
-        return f"{path}  cannot be used: {error}"
+        return f"  {path.stem}  cannot be used: {error}"
     about = " ".join(str(table.get("about", "")).split())
-    return f"{path}  {table.get('kind')}  {table.get('name')}" + (f"\n    {about}" if about else "")
+    return f"  {path.stem}  {table.get('kind')}  {table.get('name')}" + (f"\n    {about}" if about else "")
 
 
 def _kind(path: Path) -> object:

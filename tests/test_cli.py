@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 import pytest
 
-from spherloc.datasets import load_scene
+from spherloc.datasets import bundled_scenes, load_scene
 from spherloc.diagnosis import Cause, Diagnosis
 from spherloc.errors import InputError
 from spherloc.estimators import estimate
@@ -312,11 +312,11 @@ def test_help_has_examples(tmp_path: Path, command: str) -> None:
 
 def test_scenes_lists_what_play_and_run_accept(tmp_path: Path) -> None:
     bundled, kinds = spherloc("scenes", cwd=tmp_path).stdout.split("\n\n")
-    rows = [line.split("  ") for line in bundled.splitlines() if not line.startswith(" ")]
-    assert len(rows) >= 9 and all(Path(path).is_file() for path, _, _ in rows)
-    by_stem = {Path(path).stem: (kind, name) for path, kind, name in rows}
-    assert by_stem["mei_outliers_80"] == ("synthetic", "MEI fisheye, 80 % outliers")
-    assert "rendered" in {kind for kind, _ in by_stem.values()}
+    rows = [line.split("  ")[1:] for line in bundled.splitlines()[1:] if not line.startswith("    ")]
+    by_name = {name: (kind, title) for name, kind, title in rows}
+    assert by_name.keys() == bundled_scenes().keys() and len(rows) >= 9
+    assert by_name["mei_outliers_80"] == ("synthetic", "MEI fisheye, 80 % outliers")
+    assert "rendered" in {kind for kind, _ in by_name.values()}
     listed = [line.split()[0] for line in kinds.splitlines()[1:]]
     assert listed == sorted(listed) and {"correspondences", "kitti360", "colmap", "rendered"} <= set(listed)
     assert "cannot be read" not in kinds

@@ -22,6 +22,8 @@ from spherloc_viz.gallery.check import Played, agrees, faults, loose_numbers, pl
 from spherloc_viz.gallery.file import parse_gallery
 from spherloc_viz.gallery.regenerate import chosen, outcome, record, stories
 from spherloc_viz.recording.content.reader import read_recording
+from spherloc_viz.recording.review.notes import Review, read_review, review_path, write_review
+from spherloc_viz.recording.viewing.view import labels_of
 
 KEYS = [case.key for case in gallery_cases()]
 ASKED_FOR = {
@@ -156,6 +158,19 @@ def test_recordings_tell_the_story(tmp_path):
     assert own.problem.points.tobytes() == run.trace.problem.points.tobytes()
     assert own.cam_from_map is not None and run.trace.cam_from_map is not None
     assert own.cam_from_map.tobytes() == run.trace.cam_from_map.tobytes()
+
+
+def test_labels_stay_with_a_case_that_is_made_anew(tmp_path):
+    """Rerun shows them only with the recording that has their id."""
+    run = played("pairs-outvote")
+    path = record(run, tmp_path)[0]
+    write_review(path, ["for the lecture"], "Start here.")
+    record(run, tmp_path)
+    assert read_review(path) == Review(("for the lecture",), "Start here.")
+    assert labels_of(path, read_recording(path).row.run_id) == review_path(path)
+    review_path(path).write_text("no review")
+    record(run, tmp_path)
+    assert review_path(path).read_text() == "no review"
 
 
 def test_the_command(tmp_path, capsys):

@@ -28,8 +28,9 @@ from spherloc_viz.layers.decisive import decisive_step
 from spherloc_viz.layers.primitives import Balls, Label, Mesh, Points, Segments, Stop, Textured
 from spherloc_viz.recording.content import data
 from spherloc_viz.recording.content.chart_bars import LEVEL_OPACITY
+from spherloc_viz.recording.content.drawing import WORDS
 from spherloc_viz.recording.content.letters import legible
-from spherloc_viz.recording.content.properties import APPLICATION_ID
+from spherloc_viz.recording.content.properties import APPLICATION_ID, FORMAT_VERSION
 from spherloc_viz.recording.content.reader import check_recording, read_recording
 from spherloc_viz.recording.content.writer import recorded_steps, write_recording
 from spherloc_viz.recording.keeping.machine import machine
@@ -172,9 +173,8 @@ def test_infinity_comes_back_and_is_never_written_as_what_json_does_not_know(tmp
     assert run.properties["chance_sets"] == np.inf
     assert json.loads(run.properties["options"], parse_constant=refuse)["gravity_sd_deg"] == "inf"
     texts = [row["scalars"].as_py()[0] for rows in Recorded(path).rows.values() for _, row in rows if "scalars" in row]
-    assert len(texts) == 4 + len(trace.stages)
-    for text in texts:
-        json.loads(text, parse_constant=refuse)
+    (text,) = texts
+    assert len(json.loads(text, parse_constant=refuse)) == 4 + len(trace.stages)
 
 
 def test_recordings_older_than_certificates_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -211,15 +211,26 @@ def rgba(colors: object, opacity: float = 1.0) -> np.ndarray:
 def test_every_step_shows_what_the_layers_paint(trace: Trace, recorded: Recorded) -> None:
     known = {entity for entity in recorded.rows if entity.startswith("/scene/")}
     for step in shown_steps(trace):
-        shown = set()
-        for item in paint(trace, step).scene:
-            if isinstance(item, Textured):
+        scene = paint(trace, step).scene
+        assert_words(recorded, step, [item for item in scene if isinstance(item, Label)])
+        shown = {WORDS}
+        for item in scene:
+            if isinstance(item, Textured | Label):
                 continue
             entity = rr.new_entity_path(["scene", *item.name.split("/")])
             shown.add(entity)
             assert_shows(recorded, entity, step, item)
         for entity in known - shown:
             assert recorded.at(entity, step) is None, f"{entity} is still there at step {step}"
+
+
+def assert_words(recorded: Recorded, step: int, labels: list[Label]) -> None:
+    """All labels are one entity."""
+    if not labels:
+        assert recorded.at(WORDS, step) is None
+        return
+    assert_near(recorded.array(WORDS, step, "Points3D:positions"), np.stack([label.position for label in labels]))
+    assert recorded.array(WORDS, step, "Points3D:labels").tolist() == [label.text for label in labels]
 
 
 def assert_shows(recorded: Recorded, entity: str, step: int, item: object) -> None:
@@ -245,9 +256,6 @@ def assert_shows(recorded: Recorded, entity: str, step: int, item: object) -> No
             assert_near(recorded.array(entity, step, "Mesh3D:vertex_positions"), item.vertices)
             assert np.array_equal(recorded.array(entity, step, "Mesh3D:triangle_indices"), item.faces)
             assert recorded.array(entity, step, "Mesh3D:albedo_factor") == rgba(item.color, item.opacity)
-        case Label():
-            assert_near(recorded.array(entity, step, "Points3D:positions"), item.position[None])
-            assert recorded.array(entity, step, "Points3D:labels").tolist() == [item.text]
         case _:
             raise AssertionError(f"the test knows no {type(item).__name__}")
 
@@ -330,7 +338,7 @@ def test_what_a_stage_came_to_and_the_decisive_step_are_recorded() -> None:
     keys += [name for k in range(1, 9) for name in (f"sample-{k}-pose", f"sample-{k}")] + ["outcome"]
     kept = [keys[index] for index in recorded_steps([Stop(key, key) for key in keys], keys.index("yaw-arcs-100"))]
     samples = [f"sample-{k}" for k in range(1, 9)]
-    assert kept == ["problem", "yaw-arcs-100", "yaw-arcs", "yaw-hand-2", *samples, "outcome"]
+    assert kept == ["problem", "yaw-arcs-100", "yaw-arcs", *samples, "outcome"]
 
 
 def test_colours_change_without_their_places(trace: Trace, recorded: Recorded) -> None:
@@ -407,8 +415,8 @@ def test_recordings_of_other_programs_and_versions_are_refused(tmp_path: Path) -
     bare = write_foreign(tmp_path / "bare.rrd", APPLICATION_ID)
     with pytest.raises(RecordingError, match="part of the run is missing"):
         read_recording(bare)
-    later = Chunk.from_property("run", rr.AnyValues(format_version=3))
-    with pytest.raises(RecordingError, match=r"format 3.*install the one that wrote it"):
+    later = Chunk.from_property("run", rr.AnyValues(format_version=FORMAT_VERSION + 1))
+    with pytest.raises(RecordingError, match=rf"format {FORMAT_VERSION + 1}.*install the one that wrote it"):
         read_recording(write_foreign(tmp_path / "later.rrd", APPLICATION_ID, later))
 
 

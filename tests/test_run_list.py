@@ -273,14 +273,14 @@ def hostile_row() -> RunRow:
 @pytest.mark.parametrize("form", FORMS)
 def test_strings_of_strangers_cannot_act(form: str):
     """No control character, no formula, one line a row."""
-    text = rows_text(Path("recordings"), [hostile_row(), some_row("b.rrd", options='{"a": NaN}')], form)
+    text = rows_text(Path("recordings"), [hostile_row(), some_row("b.rrd", options='{"a": NaN, "b": 1e999}')], form)
     assert "\x1b" not in text and "\u202e" not in text
     if form == "csv":
         rows = list(csv.DictReader(io.StringIO(text)))
         assert len(rows) == 2
         assert rows[0]["name"].startswith("'=") and rows[0]["scene"] == "'@x" and rows[0]["labels"].startswith("'=")
     elif form == "json":
-        assert [row["options"] for row in json.loads(text)] == ["[" * 3000, {"a": "NaN"}]
+        assert [row["options"] for row in json.loads(text)] == ["[" * 3000, {"a": "NaN", "b": "inf"}]
     else:
         assert all(len(line) <= WIDTH for line in text.splitlines())
     assert "\x1b" not in counts_text("scene", [("\x1b[2J", 2), ("", 1)], form)

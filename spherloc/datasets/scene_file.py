@@ -56,7 +56,9 @@ def read_table(path: Path) -> dict[str, Any]:
             raise InputError(f"{path}: larger than {MAX_BYTES:,} bytes, so it is no scene file; give a TOML scene.")
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise InputError(f"{path}: no such file; give the path of a scene file (TOML).") from None
+        raise InputError(
+            f"{path}: no such file; give the path of a scene file (TOML) or a bundled scene's name."
+        ) from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); give the path of a scene file (TOML).") from None
     except UnicodeDecodeError:
@@ -70,6 +72,11 @@ def read_table(path: Path) -> dict[str, Any]:
 def bundled_scenes() -> dict[str, Path]:
     """Scene files that come with the project, by stem."""
     return {path.stem: path for path in sorted(BUNDLED.glob("*.toml"))}
+
+
+def scene_path(given: Path) -> Path:
+    """The scene file that is meant: ``given``, unless there is no such file and it is the name of a bundled scene."""
+    return given if given.exists() else bundled_scenes().get(str(given), given)
 
 
 def check_keys(table: Mapping[str, Any], required: set[str], optional: set[str], where: str) -> None:

@@ -21,8 +21,8 @@ WORDS = {"success": style.INLIER, "failure": style.OUTLIER, "no pose": style.OUT
 
 
 def box(content: str, css: str = "") -> str:
-    """A block with the page's margins and type size."""
-    return f'<div style="padding:0 .8em .6em;font-size:13px;line-height:1.4;{css}">{content}</div>'
+    """A block with the page's margins and type size, which grows on a wide screen (``touch.css``)."""
+    return f'<div class="words" style="padding:0 .8em .6em;font-size:13px;line-height:1.4;{css}">{content}</div>'
 
 
 def step_html(step: Step) -> str:

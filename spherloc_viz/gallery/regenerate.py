@@ -6,13 +6,17 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from spherloc.datasets.map_scene import MapScene
-from spherloc.errors import InputError, show
+from spherloc.diagnosis import Diagnosis
+from spherloc.errors import InputError, RecordingError, show
 from spherloc.estimators import warm_up
 from spherloc.metrics import evaluate
 from spherloc.trace import Trace
 from spherloc_viz.gallery.case import Beside, GalleryCase, origin_of
 from spherloc_viz.gallery.check import Played, faults, play
 from spherloc_viz.recording.content.writer import write_recording
+from spherloc_viz.recording.origin import Origin
+from spherloc_viz.recording.review.notes import review_path, write_review
+from spherloc_viz.recording.strangers.examiner import examine_review
 
 WIDTH = 100
 """Of stories on a terminal, characters."""
@@ -62,15 +66,27 @@ def regenerate(cases: Sequence[GalleryCase], folder: Path, say: Callable[[str], 
 
 
 def record(played: Played, folder: Path) -> list[Path]:
-    """Write the recordings of a case, its own first; returns their paths."""
+    """Write the recordings of a case, its own first; returns their paths. What a reviewer said of them stays."""
     case = played.case
     files = [folder / f"{case.key}.rrd"]
-    write_recording(played.trace, files[0], case.origin, played.diagnosis)
+    _record(files[0], played.trace, case.origin, played.diagnosis)
     for item, trace in played.beside:
         if item.recorded:
             files.append(folder / f"{case.key}_{_file_part(item)}.rrd")
-            write_recording(trace, files[-1], origin_of(item, f"{case.title}: {item.name}", case.story))
+            _record(files[-1], trace, origin_of(item, f"{case.title}: {item.name}", case.story))
     return files
+
+
+def _record(path: Path, trace: Trace, origin: Origin, diagnosis: Diagnosis | None = None) -> None:
+    row = write_recording(trace, path, origin, diagnosis)
+    if not review_path(path).exists():
+        return
+    try:
+        review = examine_review(path)
+    except RecordingError:
+        return  # of labels that cannot be read, lists speak
+    # They name the recording by its id, which is another one now.
+    write_review(path, review.labels, review.note, row.run_id)
 
 
 def outcome(trace: Trace) -> str:

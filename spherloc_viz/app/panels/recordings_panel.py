@@ -7,6 +7,7 @@ from pathlib import Path
 import viser
 
 from spherloc.cameras.base import FloatArray
+from spherloc.errors import RecordingError
 from spherloc_viz.app.panels.errand import Errand
 from spherloc_viz.app.review.differences import comparison_html
 from spherloc_viz.app.review.exporter import Exporter
@@ -78,7 +79,8 @@ class RecordingsPanel:
         name, page = str(client.client_id), self._page
         self._notes = Notes(gui, touches, shelf, name, self._stored, self._complain)
         self._comparison = gui.add_html("", visible=False)
-        self._runs = RunList(gui, touches, shelf, name, lambda: self._reviewer.locate())
+        self._compared: tuple[str, ...] = ()
+        self._runs = RunList(gui, touches, shelf, name, self._renew)
 
         def say(words: str) -> None:
             self._say(words)
@@ -125,6 +127,8 @@ class RecordingsPanel:
         gallery = self._shown == GALLERY
         if self._runs is not None:
             self._runs.hide(gallery)
+            self._notes.hide(gallery)
+            self._comparison.visible = bool(self._compared) and not gallery
             self._runs.see(self._seen and not gallery)
         self._gallery.show(gallery and self._seen)
 
@@ -132,18 +136,30 @@ class RecordingsPanel:
         """Put the two marked runs side by side."""
         assert self._shelf is not None and self._runs is not None
         rows = self._shelf.rows(self._runs.marked)
-        if len(rows) == 2:
-            self._comparison.content, self._comparison.visible = comparison_html(*rows), True
-            self._reviewer.compare(*rows)
+        if len(rows) != 2:
+            raise RecordingError("one of the marked runs is not in the list any more; mark two others.")
+        self._compared = rows[0].file, rows[1].file
+        self._comparison.content, self._comparison.visible = comparison_html(*rows), True
+        self._reviewer.compare(*rows)
 
     def _uncompare(self) -> None:
-        self._comparison.visible = False
+        self._compared, self._comparison.visible = (), False
         self._reviewer.uncompare()
 
     def _follow(self, row: RunRow | None) -> None:
         """Another run is open, or none."""
         assert self._shelf is not None
         self._notes.show(row, () if row is None else self._shelf.labels())
+        if row is not None and row.file not in self._compared:
+            self._compared, self._comparison.visible = (), False
+
+    def _renew(self) -> None:
+        """The list may have become another one: where in it the open run is, and what other pages say of that run."""
+        assert self._shelf is not None
+        self._reviewer.locate()
+        row = self._reviewer.news()
+        if row is not None:
+            self._notes.refresh(row, self._shelf.labels())
 
     def _stored(self, row: RunRow) -> None:
         """A run was labelled."""

@@ -9,8 +9,9 @@ import viser
 from numpy.typing import NDArray
 
 from spherloc.trace import Trace
+from spherloc_viz import style
 from spherloc_viz.app.plots.residual_drawing import SELECT_BIN, histogram_svg, history_svg
-from spherloc_viz.app.text import box, table_html
+from spherloc_viz.app.text import DIM, box, dot_html, table_html
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.layers.residuals import Histogram, History, Residuals, history_of, residuals_of, scores_table
 
@@ -62,20 +63,22 @@ def _residuals_html(residuals: Residuals | None, selected: tuple[int, ...]) -> s
     marked = np.zeros(len(residuals.px), dtype=bool)
     marked[list(selected)] = True
     drawings = "".join(histogram_svg(one, marked) for one in residuals.histograms)
-    legend = "".join(
-        f'<span style="margin-right:1.2em;white-space:nowrap">{dot_html(color)}{words}</span>'
+    note = _note(residuals_caption(residuals))
+    return box(_title("Residuals at the estimated pose") + _legend_html(residuals.judged) + drawings + note)
+
+
+def _legend_html(judged: str) -> str:
+    """What the colours mean: not what the run made of a match, as elsewhere, but what is known of it."""
+    dots = "".join(
+        f'<span style="margin-right:1.1em">{dot_html(color)}{words}</span>'
         for color, words in ((style.INLIER, "right"), (style.OUTLIER, "wrong"))
     )
-    colors = f'<div style="font-size:12px;padding-bottom:.2em">{legend}<span style="{DIM}">{escape(residuals.judged)}</span></div>'
-    return box(_title("Residuals at the estimated pose") + colors + drawings + _note(residuals_caption(residuals)))
+    return f'<div style="font-size:12px;padding-bottom:.3em">{dots}<span style="{DIM}">{escape(judged)}</span></div>'
 
 
 def residuals_caption(residuals: Residuals) -> str:
-    """What the colours and the axes mean, and what the last bins hold."""
-    words = [
-        f"Green: right matches {residuals.judged}; red: wrong ones. Bins grow by equal factors; the first and the last "
-        "hold all that is smaller or larger."
-    ]
+    """What the axes mean, and what the last bins hold."""
+    words = ["Bins grow by equal factors; the first and the last hold all that is smaller or larger."]
     behind = int(np.count_nonzero(np.isinf(residuals.px))) - residuals.blind
     if behind:
         words.append(f"In px, the last one holds {behind:,} matches more than 90° off.")

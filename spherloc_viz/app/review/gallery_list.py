@@ -111,9 +111,7 @@ def gallery_html(cases: Sequence[GalleryCase], rows: dict[str, RunRow], opened: 
     pictures = [_thumbnail(rows.get(file_of(case))) for case in cases]
     # Before "spherloc gallery" has recorded them, no case has one, and a column of empty frames says nothing.
     shown = [picture_html(png) if any(pictures) else "" for png in pictures]
-    body = "".join(
-        _case_html(case, picture, case.key == opened) for case, picture in zip(cases, shown, strict=True)
-    )
+    body = "".join(_case_html(case, picture, case.key == opened) for case, picture in zip(cases, shown, strict=True))
     return box(f'<div style="{DIM};padding-bottom:.4em">{about}</div>{body}', "font-size:11.5px;line-height:1.4")
 
 
@@ -147,4 +145,5 @@ def _case_html(case: GalleryCase, picture: str, opened: bool) -> str:
         for number, play in enumerate(case.beside)
     )
     ways = f'<div style="display:flex;flex-wrap:wrap;gap:.3em;padding-top:.4em">{beside}</div>' if beside else ""
-    return f'<div data-reveal="{escape(case.key)}">{line}<div style="padding:.4em .25em .7em">{escape(case.story)}{ways}</div></div>'
+    story = f'<div style="padding:.4em .25em .7em">{escape(case.story)}{ways}</div>'
+    return f'<div data-reveal="{escape(case.key)}">{line}{story}</div>'

@@ -7,11 +7,13 @@ from html import escape
 
 import viser
 
+from spherloc.errors import SpherlocError
 from spherloc_viz.app.panels.errand import Errand
 from spherloc_viz.app.review.filters import pill
 from spherloc_viz.app.review.shelf import Shelf
 from spherloc_viz.app.text import box
 from spherloc_viz.app.web.touch import Touch, Touches
+from spherloc_viz.recording.review.notes import Review, checked_review
 from spherloc_viz.recording.run_row import RunRow
 
 PAUSE_S = 0.7
@@ -32,16 +34,19 @@ class Notes:
         failed: Callable[[str], None],
     ) -> None:
         """``stored`` is called, on a thread of this part, with the row as it is by then."""
-        self._shelf, self._stored = shelf, stored
+        self._shelf, self._stored, self._failed = shelf, stored, failed
         hint = "Words that tell what kind of run it is, with commas between them."
         self._labels = gui.add_text("Labels", "", visible=False, hint=hint)
         self._chips = gui.add_html("", visible=False)
         self._note = gui.add_text("Note", "", visible=False, multiline=True, hint="Stored with the run.")
         self._lock = threading.Lock()
         self._file: str | None = None
-        self._known: tuple[tuple[str, ...], str] = ((), "")
+        self._hidden = self._offers = False
+        self._known = Review()
         """What the fields were last set to, or was stored from them."""
-        self._pending: dict[str, tuple[tuple[str, ...], str]] = {}
+        self._pending: dict[str, tuple[Review, Review]] = {}
+        """What the fields said before, and what they say now."""
+        self._storing: str | None = None
         self._typed, self._closed = threading.Event(), False
         self._errand = Errand(f"spherloc-notes-{name}", failed)
         for widget in self.widgets:
@@ -56,20 +61,28 @@ class Notes:
     def show(self, row: RunRow | None, used: tuple[str, ...]) -> None:
         """Show what was said of a run, or nothing; ``used`` are labels that are offered.
 
-        What is being typed is left alone, unless another page has meanwhile said something else of the run.
+        What is being typed is left alone; else the fields follow what other pages say of the run.
         """
         with self._lock:
             file = None if row is None else row.file
             if row is not None:
-                review = row.labels, row.note
-                if file != self._file or (review != self._known and file not in self._pending):
+                review = Review(row.labels, row.note)
+                if file != self._file or (review != self._known and not self._is_typed(file)):
                     self._known = review
                     self._labels.value, self._note.value = f"{SEPARATOR} ".join(row.labels), row.note
             self._file = file
             own = () if row is None else row.labels
             self._draw(tuple(dict.fromkeys((*own, *used))) if row is not None else (), own)
             for widget in self.widgets:
-                widget.visible = row is not None
+                widget.visible = row is not None and not self._hidden
+
+    def hide(self, hidden: bool) -> None:
+        """Make room for something else, or show again what is said of the run."""
+        with self._lock:
+            self._hidden = hidden
+            for widget in self.widgets:
+                widget.visible = self._file is not None and not hidden
+            self._chips.visible = self._offers and not hidden
 
     def refresh(self, row: RunRow, used: tuple[str, ...]) -> None:
         """The run's row has changed; shown if it is still open."""
@@ -87,7 +100,8 @@ class Notes:
         html = box(f'<div style="display:flex;flex-wrap:wrap;gap:.3em">{chips}</div>', "font-size:11.5px")
         if self._chips.content != html:
             self._chips.content = html
-        self._chips.visible = bool(offered)
+        self._offers = bool(offered)
+        self._chips.visible = self._offers and not self._hidden
 
     def _type(self, event: viser.GuiEvent) -> None:
         if event.client is not None:
@@ -105,7 +119,8 @@ class Notes:
         with self._lock:
             if self._file is None:
                 return
-            self._pending[self._file] = (_split(self._labels.value), self._note.value)
+            base, _ = self._pending.get(self._file, (self._known, None))
+            self._pending[self._file] = base, Review(_split(self._labels.value), self._note.value)
             before, self._typed = self._typed, threading.Event()
         before.set()
         self._errand.ask(partial(self._store, self._typed, pause_s))
@@ -118,13 +133,28 @@ class Notes:
             with self._lock:
                 if not self._pending:
                     return
-                file, (labels, note) = next(iter(self._pending.items()))
+                file, (before, now) = next(iter(self._pending.items()))
                 del self._pending[file]
-            row = self._shelf.review(file, labels, note)
-            with self._lock:
+                self._storing, known = file, before
                 if file == self._file:
-                    self._known = row.labels, row.note
-            self._stored(row)
+                    self._known = now
+            try:
+                row = self._shelf.review(file, before, now)
+                stored = Review(row.labels, row.note)
+                known = stored if stored == checked_review(now.labels, now.note) else now
+            except SpherlocError as error:  # what was said of other runs is stored all the same
+                self._failed(str(error))
+            finally:
+                with self._lock:
+                    self._storing = None
+                    if self._known is now:
+                        self._known = known
+            if known is not before:
+                self._stored(row)
+
+    def _is_typed(self, file: str | None) -> bool:
+        """Whether the fields say of a run what is not stored yet."""
+        return file in self._pending or file == self._storing
 
 
 def _split(text: str) -> tuple[str, ...]:

@@ -1,5 +1,6 @@
 """The run that is open, above the tabs, so that it stays in sight while something is changed and run again."""
 
+import threading
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -20,6 +21,7 @@ class ReviewCard:
         self._redraw = redraw
         self._html = gui.add_html("", visible=False)
         self._opened: Opened | None = None
+        self._lock = threading.Lock()
         self._where: tuple[int | None, int] = (None, 0)
         self._said = ("", False)
 
@@ -30,8 +32,17 @@ class ReviewCard:
 
     def show(self, opened: Opened | None) -> None:
         """Show another run, or none."""
-        self._opened = opened
+        with self._lock:
+            self._opened = opened
         self._redraw()
+
+    def amend(self, change: Callable[[Opened], Opened]) -> None:
+        """Have the run that is open, if any, become what ``change`` makes of it."""
+        with self._lock:
+            before = self._opened
+            self._opened = None if before is None else change(before)
+        if self._opened is not before:
+            self._redraw()
 
     def say(self, sentence: str, wrong: bool = False) -> None:
         """Show what goes on, or what went wrong, where it is seen whichever tab is in front; empty for nothing."""
@@ -41,9 +52,7 @@ class ReviewCard:
 
     def became(self, asked: Wish, wish: Wish) -> None:
         """The page says in its own words what it was asked for."""
-        opened = self._opened
-        if opened is not None and opened.wish is asked:
-            self._opened = replace(opened, wish=wish)
+        self.amend(lambda opened: replace(opened, wish=wish) if opened.wish is asked else opened)
 
     def place(self, place: int | None, total: int) -> None:
         """Say where in the list the run is."""

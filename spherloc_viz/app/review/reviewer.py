@@ -72,15 +72,27 @@ class Reviewer:
 
     def uncompare(self) -> None:
         """Take the second camera away."""
-        opened = self._has.card.opened
-        if opened is not None and opened.other is not None:
-            self._has.card.show(replace(opened, recorded=replace(opened.recorded, name=AS_RECORDED), other=None))
+        self._has.card.amend(_alone)
 
     def relabelled(self, row: RunRow) -> None:
         """Take over what was said of the run that is open."""
+
+        def change(opened: Opened) -> Opened:
+            is_it = opened.recorded.row.file == row.file
+            return replace(opened, recorded=replace(opened.recorded, row=row)) if is_it else opened
+
+        self._has.card.amend(change)
+
+    def news(self) -> RunRow | None:
+        """Take over what others have said of the run that is open; its row, or None if there is nothing new."""
         opened = self._has.card.opened
-        if opened is not None and opened.recorded.row.file == row.file:
-            self._has.card.show(replace(opened, recorded=replace(opened.recorded, row=row)))
+        if opened is None:
+            return None
+        row = next(iter(self._has.shelf.rows([opened.recorded.row.file])), None)
+        if row is None or row == opened.recorded.row:
+            return None
+        self.relabelled(row)
+        return row
 
     def locate(self) -> int | None:
         """Find, and say, where in the list the run that is open is by now: None if it is not there."""
@@ -154,3 +166,10 @@ class Reviewer:
         opened = self._has.card.opened
         if opened is not None:
             self._has.open(opened.wish, opened.path, opened.recorded.cam_from_map)
+
+
+def _alone(opened: Opened) -> Opened:
+    """The run without the one that it is compared with."""
+    if opened.other is None:
+        return opened
+    return replace(opened, recorded=replace(opened.recorded, name=AS_RECORDED), other=None)

@@ -70,8 +70,7 @@ def _lines(row: RunRow, now: datetime) -> str:
         f'<span style="{DIM};white-space:nowrap">{escape(words.moment(row.created, now))}</span></div>'
     )
     how = (
-        f'<div style="{CUT}">{verdict_html(row)}'
-        f'<span style="{DIM}"> · {escape(row.estimator)} #{row.seed}</span></div>'
+        f'<div style="{CUT}">{verdict_html(row)}<span style="{DIM}"> · {escape(row.estimator)} #{row.seed}</span></div>'
     )
     facts = [f"{row.inliers}/{row.correspondences}"]
     facts += [] if row.outlier_rate is None else [f"{100.0 * row.outlier_rate:.0f} % out"]

@@ -9,6 +9,7 @@ from html import escape
 
 import viser
 
+from spherloc.errors import SpherlocError
 from spherloc_viz.app.panels.errand import Errand
 from spherloc_viz.app.review.filters import filters_html, pill
 from spherloc_viz.app.review.look import EXACT, OUTLIERS, Look
@@ -38,7 +39,7 @@ class RunList:
         self._look = Look()
         self._marked: tuple[str, ...] = ()
         self._opened: str | None = None
-        self._seen = False
+        self._seen = self._hidden = False
         self._due = threading.Event()
         self._errand = Errand(f"spherloc-runs-{name}", self._fail)
         self._search = gui.add_text("Search", "", hint="Words in the name, the message, the note, labels …")
@@ -93,10 +94,10 @@ class RunList:
 
     def hide(self, hidden: bool) -> None:
         """Make room for something else, or show the list again."""
+        self._hidden = hidden
         for widget in (self._search, self._filters, self._rows):
             widget.visible = not hidden
-        self._range.visible = not hidden and self._look.unfolded == "outliers"
-        self._bar.visible = not hidden and bool(self._marked)
+        self._show_parts()
         self._problem.visible = False
 
     def close(self) -> None:
@@ -153,13 +154,17 @@ class RunList:
         """Draw the list, and again whenever runs have come, until something else is asked."""
         if due.wait(after_s):
             return
-        version = self._shelf.version()
-        self._draw()
-        while not due.wait(FOLLOW_S) and self._seen:
+        version: tuple[int, ...] | None = None
+        while self._seen:
             newest = self._shelf.version()
             if newest != version:
                 version = newest
-                self._draw()
+                try:
+                    self._draw()
+                except SpherlocError as error:  # what is wrong may pass
+                    self._fail(str(error))
+            if due.wait(FOLLOW_S):
+                return
 
     def _draw(self) -> None:
         with self._lock:
@@ -176,13 +181,17 @@ class RunList:
             if widget.content != html:
                 widget.content = html
         self._problem.visible = False
-        self._bar.visible = bool(marked)
-        self._range.visible = look.unfolded == "outliers"
+        self._show_parts()
         self._drawn()
+
+    def _show_parts(self) -> None:
+        """Show what is needed now and then, if the list is not hidden."""
+        self._range.visible = not self._hidden and self._look.unfolded == "outliers"
+        self._bar.visible = not self._hidden and bool(self._marked)
 
     def _fail(self, sentence: str) -> None:
         self._problem.content = status_html(sentence[:1].upper() + sentence[1:], wrong=True)
-        self._problem.visible = True
+        self._problem.visible = not self._hidden
 
 
 def bar_html(marked: tuple[str, ...]) -> str:

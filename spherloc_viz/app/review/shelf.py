@@ -1,6 +1,7 @@
 """The recordings that all pages of a server review: the folder, its index, and single runs read safely."""
 
 import contextlib
+import threading
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -12,6 +13,7 @@ from spherloc_viz.app.review.look import EXACT, PAGE, Look
 from spherloc_viz.recording.content.reader import RecordedRun, read_recording
 from spherloc_viz.recording.index.query import MAX_TEXT, RunQuery
 from spherloc_viz.recording.index.run_index import Found, RunIndex
+from spherloc_viz.recording.review.notes import Review
 from spherloc_viz.recording.run_row import RunRow
 from spherloc_viz.recording.strangers.examiner import examine, resolve_inside
 
@@ -28,6 +30,7 @@ class Shelf:
 
     def __init__(self, index: RunIndex) -> None:
         self._index = index
+        self._reviewing = threading.Lock()
 
     @property
     def folder(self) -> Path:
@@ -122,10 +125,25 @@ class Shelf:
         """The first ``most`` runs of the list, from all pages."""
         return self._index.find(_query(look), most)
 
-    def review(self, file: str, labels: Sequence[str], note: str) -> RunRow:
-        """Store what a reviewer says of a run; returns its row as it is then."""
-        self._index.set_review(file, labels, note)
-        return self.row(file)
+    def review(self, file: str, before: Review, now: Review) -> RunRow:
+        """Store what a reviewer changed of what is said of a run; returns its row as it is then.
+
+        What another page has said since ``before`` was read stays, unless it is the note and both have changed it.
+        """
+        with self._reviewing:
+            row = self.row(file)
+            new = merged(Review(row.labels, row.note), before, now)
+            self._index.set_review(file, new.labels, new.note)
+            return self.row(file)
+
+
+def merged(stored: Review, before: Review, now: Review) -> Review:
+    """What is stored, with what was changed between ``before`` and ``now``."""
+    if stored == before:
+        return now
+    kept = (label for label in stored.labels if label in now.labels or label not in before.labels)
+    added = (label for label in now.labels if label not in before.labels)
+    return Review(tuple(dict.fromkeys((*kept, *added))), stored.note if now.note == before.note else now.note)
 
 
 def _query(look: Look) -> RunQuery:

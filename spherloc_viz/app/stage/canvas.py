@@ -107,5 +107,9 @@ def panel_widths_px(window_px: int) -> tuple[int, int]:
     return next(widths for least, widths in PANELS_PX if window_px >= least)
 
 
-PANELS_PX: tuple[tuple[int, tuple[int, int]], ...] = ((1600, (480, 400)), (0, (380, 340)))
+PANELS_PX: tuple[tuple[int, tuple[int, int]], ...] = (
+    (1800, (500, 450)),
+    (1600, (480, 400)),
+    (0, (380, 340)),
+)
 """From this width of the window on: widths of the panels left and right."""

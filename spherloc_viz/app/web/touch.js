@@ -1,10 +1,11 @@
 // Tells the server what a person presses in the HTML and SVG that it sent: elements with data-touch="ACTION:ARGUMENT".
 // With data-drag a drag across the element is told too; data-copy="TEXT" puts TEXT on the clipboard. And it tells which
 // elements with data-view="NAME" are to be seen, so that what stands on a hidden tab need not be drawn. A key presses the
-// element with data-key="KEY". Links within an element are followed, and do not press it.
+// element with data-key="KEY". Links within an element are followed, and do not press it. An element that gets another
+// data-reveal="NAME" is scrolled to, also while what stands above it grows, until a person scrolls or presses.
 (() => {
-  const TOUCHABLE = "[data-touch],[data-copy]", LEAST_DRAG_PX = 6, LOOK_EVERY_MS = 150;
-  let sent = Promise.resolve(), press = null, shade = null, seen = null;
+  const TOUCHABLE = "[data-touch],[data-copy]", LEAST_DRAG_PX = 6, LOOK_EVERY_MS = 150, REVEAL_MS = 3000;
+  let sent = Promise.resolve(), press = null, shade = null, seen = null, revealed = null, revealUntil = 0;
 
   function found(event) {
     const element = event.target instanceof Element ? event.target.closest(`${TOUCHABLE},a[href]`) : null;
@@ -38,6 +39,13 @@
     seen = names;
     const nowhere = { left: 0, top: 0, width: 1, height: 1 };
     tell(`views:${names}`, nowhere, { clientX: 0, clientY: 0, shiftKey: false }, { x: 0, y: 0 });
+  }
+
+  function reveal() {
+    const element = seenElements("[data-reveal]")[0], name = element?.dataset.reveal ?? null;
+    if (name !== revealed) revealUntil = Date.now() + REVEAL_MS;
+    revealed = name;
+    if (element && Date.now() < revealUntil) element.scrollIntoView({ block: "nearest" });
   }
 
   async function copy(element) {
@@ -84,6 +92,9 @@
     shade = null;
   }
 
+  for (const kind of ["wheel", "touchmove", "pointerdown"])
+    addEventListener(kind, () => { revealUntil = 0; }, { capture: true, passive: true });
+
   addEventListener("pointerdown", (event) => {
     const element = event.button === 0 ? found(event) : null;
     if (!element) return;
@@ -113,7 +124,7 @@
   }, true);
 
   addEventListener("pointercancel", end, true);
-  setInterval(look, LOOK_EVERY_MS);
+  setInterval(() => { look(); reveal(); }, LOOK_EVERY_MS);
 
   addEventListener("keydown", (event) => {
     const writing = event.target instanceof Element

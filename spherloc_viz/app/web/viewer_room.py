@@ -11,7 +11,7 @@ from urllib.parse import urlencode
 
 from aiohttp import web
 
-from spherloc.errors import InputError, SpherlocError, show
+from spherloc.errors import InputError, RecordingError, SpherlocError, show
 from spherloc_viz.app.web.guard import SAFE
 from spherloc_viz.app.web.viewer_page import DATA, PROGRAM, SORRY_POLICY, sorry_page, viewer_page, viewer_policy
 from spherloc_viz.recording.content.columns import TIMELINE
@@ -51,7 +51,10 @@ def of_index(index: RunIndex) -> Callable[[str], Viewable]:
 
     def find(file: str) -> Viewable:
         path = resolve_inside(index.folder, file)
-        state = path.stat()
+        try:
+            state = path.stat()
+        except OSError as error:  # it has gone since
+            raise RecordingError(f"{file}: the recording cannot be read ({error.strerror}).") from None
         return Viewable(path, index.get(file) or _examined(path, state.st_mtime_ns, state.st_size))
 
     return find

@@ -20,8 +20,6 @@ def _column(kind: Any) -> str:
     return _SQL_TYPES[options[0]] + ("" if type(None) in getattr(kind, "__args__", ()) else " NOT NULL")
 
 
-
-
 class DamagedError(sqlite3.DatabaseError):
     """The tables hold what is never put there: somebody else has changed them."""
 

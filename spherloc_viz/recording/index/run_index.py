@@ -144,26 +144,25 @@ class RunIndex:
         review cannot be written, ``InputError`` if it is too long.
         """
         path = self.folder / check_name(file)
-        if self._replaced(file, path):
-            self.add(replace(examine(path), file=file))
 
-        def work(connection: sqlite3.Connection) -> Review:
-            found = connection.execute("SELECT id, run_id FROM runs WHERE file = ?", (file,)).fetchone()
+        def work(connection: sqlite3.Connection) -> Review | None:
+            found = connection.execute("SELECT id, run_id, stamp FROM runs WHERE file = ?", (file,)).fetchone()
             if found is None or not path.is_file():
                 raise RecordingError(f"{path}: there is no such run; spherloc runs lists those that there are.")
+            if found[2].partition(" ")[0] != stamp_of(path).partition(" ")[0]:
+                return None
             # Written while we alone may write, so that file and database agree on who was last.
             review = write_review(path, labels, note, run_id=found[1])
             (before,) = rows_of(connection, [found[0]])
             put(connection, replace(before, labels=review.labels, note=review.note), stamp_of(path))
             return review
 
-        return self._write(work)
-
-    def _replaced(self, file: str, path: Path) -> bool:
-        """Whether a run is known, and its files are not those that were read."""
-        sql = "SELECT stamp FROM runs WHERE file = ?"
-        read = self._read(lambda connection: connection.execute(sql, (file,)).fetchone())
-        return read is not None and path.is_file() and read[0] != stamp_of(path)
+        for _ in range(MOST_TRIES):
+            if (review := self._write(work)) is not None:
+                return review
+            # Another run lies there than the one that is listed.
+            self.add(replace(examine(path), file=file))
+        raise RecordingError(f"{path}: another program keeps changing the file; end it and try again.")
 
     def refresh(self, progress: Progress | None = None, examine: Examine = examine_side_by_side) -> Refreshed:
         """Read new and changed recordings of the folder, and forget those that are gone.
