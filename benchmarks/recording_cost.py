@@ -2,15 +2,16 @@
 
     python benchmarks/recording_cost.py [--sizes 100 200 1000] [--runs 20]
 
-Times are of the processor, of this process and of those it starts, as the median over runs. "work" is all that writing
-a run takes: painting, encoding, and the file; of that "paint" is what the layers take. "diagnose" comes on top where a
-run was not diagnosed yet. The peer logs the same pictures with ``RecordingStream.log``, a call a primitive and step,
-and saves the same layout, but neither the problem nor the result. "left" and "ours" are the threads that all runs of
-the peer and all of ours have left behind.
+Times are of the processor, of this process and of those it starts, as the median over runs. "work" is all that keeping
+a run takes: painting, encoding, the file, and its row in the list; of that "paint" is what the layers take. "diagnose"
+comes on top where a run was not diagnosed yet. The last line is of a rendered scene, with a query image. The peer logs
+the same pictures with ``RecordingStream.log``, a call a primitive and step, and saves the same layout, but neither the
+problem nor the result. "left" and "ours" are the threads that all runs of the peer and all of ours have left behind.
 """
 
 import argparse
 import resource
+import shutil
 import statistics
 import tempfile
 import uuid
@@ -34,9 +35,13 @@ from spherloc_viz.recording.content.layout import blueprint, shown_in
 from spherloc_viz.recording.content.markdown import step_text
 from spherloc_viz.recording.content.panels import panels_of
 from spherloc_viz.recording.content.properties import APPLICATION_ID
-from spherloc_viz.recording.content.writer import recorded_steps, write_recording
+from spherloc_viz.recording.content.writer import recorded_steps
+from spherloc_viz.recording.keeping.keeper import Keeper
+from spherloc_viz.recording.origin import Origin
 
 RUNS = (("mei_outliers_80", "mc"), ("mei_outliers_90", "mc-exact"), ("fisheye_outliers_80", "ransac-2p"))
+RENDERED = "apartment_night_panorama", "mc"
+"""A run with an image, whose number of matches is given."""
 
 
 def cpu_s() -> float:
@@ -55,6 +60,13 @@ def cost_ms(work: Callable[[Trace], object], traces: list[Trace]) -> float:
         work(trace)
         costs.append(1e3 * (cpu_s() - start))
     return statistics.median(costs[1:])
+
+
+def largest_mb(folder: Path) -> float:
+    """Size of the largest recording in a folder, which is deleted."""
+    size = max(path.stat().st_size for path in folder.glob("*.rrd"))
+    shutil.rmtree(folder)
+    return size / 1e6
 
 
 def thread_count() -> int:
@@ -108,9 +120,10 @@ def plain_item(item: SceneItem) -> rr.AsComponents | None:
     return None
 
 
-def measure(scene: str, estimator: str, size: int, runs: int, folder: Path) -> None:
+def measure(scene: str, estimator: str, size: int | None, runs: int, folder: Path) -> None:
     """Print one line."""
     problem = Variation(correspondences=size).problem(load_scene(bundled_scenes()[scene]))
+    origin = Origin("command")
 
     def traces() -> list[Trace]:
         # New ones for every measurement, since the layers keep what they have planned of a run.
@@ -121,15 +134,16 @@ def measure(scene: str, estimator: str, size: int, runs: int, folder: Path) -> N
     threads = thread_count()
     diagnosing = cost_ms(diagnose, traces())
     painting = cost_ms(lambda trace: [paint(trace, index) for index in recorded_steps(steps(trace), 0)], traces())
-    lean = cost_ms(lambda trace: write_recording(trace, path, diagnosis=told), traces())
-    lean_mb = path.stat().st_size / 1e6
-    full = cost_ms(lambda trace: write_recording(trace, path, diagnosis=told, full=True), traces())
-    full_mb = path.stat().st_size / 1e6
+    with Keeper(folder / "lean", print, keep_bytes=None) as keeper:
+        lean = cost_ms(lambda trace: keeper.record(trace, origin, told), traces())
+    with Keeper(folder / "full", print, full=True, keep_bytes=None) as keeper:
+        full = cost_ms(lambda trace: keeper.record(trace, origin, told), traces())
+    lean_mb, full_mb = (largest_mb(folder / name) for name in ("lean", "full"))
     before = thread_count()
     peer = cost_ms(lambda trace: plainly(trace, path), traces()) - diagnosing
     left = thread_count() - before
     print(
-        f"{estimator:10} {size:5} {lean:7.1f} {painting:7.1f} {lean_mb:6.2f} {full:8.1f} {full_mb:6.2f} "
+        f"{estimator:10} {len(problem):5} {lean:7.1f} {painting:7.1f} {lean_mb:6.2f} {full:8.1f} {full_mb:6.2f} "
         f"{peer:8.1f} {path.stat().st_size / 1e6:6.2f} {peer / lean:6.1f} {left:5} {before - threads:5} "
         f"{diagnosing:9.1f}",
         flush=True,
@@ -151,6 +165,7 @@ def main() -> None:
         for scene, estimator in RUNS:
             for size in given.sizes:
                 measure(scene, estimator, size, given.runs, Path(folder))
+        measure(*RENDERED, None, given.runs, Path(folder))
 
 
 if __name__ == "__main__":

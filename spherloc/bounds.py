@@ -5,9 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from spherloc.problem import AlignedProblem, check_bound_px
+from spherloc.errors import InputError, show
+from spherloc.problem import LEAST_PX, MOST_PX, AlignedProblem
 
 FloatArray = NDArray[np.float64]
+
+LEAST_BOUND_PX, MOST_BOUND_PX = LEAST_PX / 100, 100 * MOST_PX
+"""What a diagnosis asks for may be some times wider or tighter than what people may give."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,9 +30,10 @@ def bounds_of(aligned: AlignedProblem, bound_px: float) -> Bounds:
     """Bounds of every bearing from one pixel bound, through the largest stretch of its unprojection, plus gravity.
 
     Residuals are measured in the tangent plane, so that ``bound_px`` reaches as far as the angle whose sine it is.
-    Raises ``ProblemError`` for a bound that no estimator can reckon with.
+    Raises ``InputError`` for a bound that no estimator can reckon with.
     """
-    check_bound_px(bound_px)
+    if not LEAST_BOUND_PX <= bound_px <= MOST_BOUND_PX:
+        raise InputError(f"bound_px is {show(bound_px)}; give a number of pixels from {LEAST_PX:g} to {MOST_PX:,.0f}.")
     gravity_rad = aligned.gravity_bound_rad
     radians = np.arcsin(np.minimum(1.0, bound_px * aligned.radians_per_pixel)) + gravity_rad
     pixels = bound_px + gravity_rad * aligned.pixels_per_radian

@@ -17,7 +17,7 @@ IntArray = NDArray[np.int64]
 LEAST_STRETCH = 0.01
 """Smallest ratio of the two singular values of an unprojection's Jacobian that residuals believe in."""
 LEAST_PX, MOST_PX = 1e-6, 1e6
-"""Between which a pixel bound lies: squares of much smaller or larger ones under- or overflow in the estimators."""
+"""Between which a pixel bound lies: powers of much smaller or larger ones under- or overflow in the estimators."""
 LEAST_M, MOST_M = 1e-12, 1e12
 """The same of the farthest point from the origin; a map may also be all in the origin."""
 
@@ -74,13 +74,13 @@ class Problem:
         sd = self.gravity_sd_rad
         if sd is not None and not sd >= 0.0:
             raise ProblemError(f"{self.name}: gravity_sd_rad is {sd}; give 0 or more, or inf if nothing is known.")
-        if self.bound_px is not None:
-            check_bound_px(self.bound_px, f"{self.name}: ")
-        _check_reach(self.name, "points", points)
+        if self.bound_px is not None and not LEAST_PX <= self.bound_px <= MOST_PX:
+            raise ProblemError(f"{self.name}: bound_px is {self.bound_px}; give {LEAST_PX:g} to {MOST_PX:,.0f} pixels.")
+        _check_reach(self.name, "points reach", points)
         if self.truth_cam_from_map is not None:
             truth = _array(self, "truth_cam_from_map", (3, 4))
             _check_rotation(self.name, truth)
-            _check_reach(self.name, "the true position", truth[:, 3:], least_m=0.0)
+            _check_reach(self.name, "the true position reaches", truth[:, 3:], least_m=0.0)
         if self.truth_inliers is not None:
             mask = np.array(self.truth_inliers, dtype=bool)
             if mask.shape != (len(pixels),):
@@ -225,19 +225,11 @@ class AlignedProblem:
         return full
 
 
-def check_bound_px(bound_px: float, where: str = "") -> None:
-    """Raise ``ProblemError`` if a bound on the pixel error is not from ``LEAST_PX`` to ``MOST_PX``."""
-    if not LEAST_PX <= bound_px <= MOST_PX:
-        raise ProblemError(f"{where}bound_px is {bound_px}; give a number of pixels from {LEAST_PX:g} to {MOST_PX:,.0f}.")
-
-
 def _check_reach(name: str, what: str, places_m: FloatArray, least_m: float = LEAST_M) -> None:
     reach_m = float(np.abs(places_m).max(initial=0.0))
     if reach_m and not least_m <= reach_m <= MOST_M:
-        raise ProblemError(
-            f"{name}: {what} reach {reach_m:.3g} m from the origin, but must reach {least_m:g} to {MOST_M:g} m; "
-            "give metres."
-        )
+        limits = f"{least_m:g} to {MOST_M:g} m"
+        raise ProblemError(f"{name}: {what} {reach_m:.3g} m from the origin; give metres, {limits}.")
 
 
 def _frozen(array: Any) -> Any:

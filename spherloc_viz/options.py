@@ -20,10 +20,14 @@ from typing import Any, Literal
 import numpy as np
 
 from spherloc.errors import InputError, show
+from spherloc.problem import LEAST_PX, MOST_PX
 from spherloc.refine import RefinementOptions
 
 NONE = "none"
 """What is typed for None."""
+
+LEAST, MOST = 1e-12, 1e12
+"""Numbers that are not 0 or infinite lie between: powers of others under- or overflow in the solvers."""
 
 _parsing = threading.Lock()
 """Python's parser fails when several threads use it at once (3.11: "AST constructor recursion depth mismatch")."""
@@ -64,7 +68,14 @@ class OptionField:
             value = math.nan
         if isinstance(value, float) and math.isnan(value):
             raise InputError(f"option {self.name} is {show(text)}; give {self._accepted()}.")
+        self.check_size(value)
         return value
+
+    def check_size(self, value: Any) -> None:
+        """Raise ``InputError`` for a number that is so small or large that solvers cannot reckon with it."""
+        least, most = (LEAST_PX, MOST_PX) if self.name.endswith("_px") else (LEAST, MOST)
+        if isinstance(value, float) and math.isfinite(value) and value and not least <= abs(value) <= most:
+            raise InputError(f"option {self.name} is {value}; give a number from {least:g} to {most:g}.")
 
     def _accepted(self) -> str:
         if self.choices:

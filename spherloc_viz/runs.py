@@ -46,7 +46,10 @@ def print_runs(folder: Path, query: RunQuery, group: str | None, limit: int | No
         _refresh(index)
         _check_known(index, query)
         if key is not None:
-            print(counts_text(key, index.groups(query, key), form), end="", flush=True)
+            counts = index.groups(query, key)
+            print(counts_text(key, counts, form), end="", flush=True)
+            if not counts:
+                say(f"no run of those that are asked for has a {show(group)}.")
             return 0
         found = index.find(query, most)
         print(rows_text(folder, found.rows, form), end="", flush=True)

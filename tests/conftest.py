@@ -15,6 +15,7 @@ from hypothesis import settings
 
 from spherloc.datasets import load_scene
 from spherloc.datasets.synthetic import SyntheticScene
+from spherloc_viz.recording.index.run_index import RunIndex
 
 ROOT = Path(__file__).resolve().parents[1]
 SUITE_SEED = int(os.environ.get("SPHERLOC_TEST_SEED", "0"))
@@ -53,6 +54,13 @@ def own_disk_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 def rng(request: pytest.FixtureRequest) -> np.random.Generator:
     """Randomness of one test: the same in every run and whatever tests run beside it."""
     return np.random.default_rng([SUITE_SEED, zlib.crc32(request.node.nodeid.encode())])
+
+
+@pytest.fixture
+def index(tmp_path: Path) -> Iterator[RunIndex]:
+    """An empty list of runs, in a folder where there was none."""
+    with RunIndex(tmp_path / "recordings") as index:
+        yield index
 
 
 @pytest.fixture(scope="session")

@@ -15,32 +15,19 @@ from spherloc_viz.app.web.touch import Touch
 from spherloc_viz.app.web.viser_seams import start_viser, stop_viser
 from spherloc_viz.recording.keeping.recorder import Recorder
 from tests.connected_page import ConnectedPage, until
+from tests.tiny_scene import write_tiny_scene
 
 KEY = "a key of this test"
-SCENE = """
-kind = "synthetic"
-name = "tiny"
-[camera]
-model = "equirectangular"
-width = 512
-height = 256
-[simulation]
-correspondences = 20
-outlier_rate = 0.25
-noise_px = 0.5
-seed = 1
-"""
 
 
 class Office:
     """A server whose pages record into a folder and review what is there."""
 
     def __init__(self, folder: Path) -> None:
-        (folder / "tiny.toml").write_text(SCENE)
         self.folder = folder / "recordings"
         self.errors: list[RecordingError] = []
         self.recorder = Recorder(self.folder, self.errors.append)
-        catalog = Catalog(folder / "tiny.toml")
+        catalog = Catalog(write_tiny_scene(folder))
         self.services = Services(catalog, (folder,), self.recorder, Shelf(self.recorder.index))
         self.sessions = Sessions(self.services)
         self.server: viser.ViserServer = start_viser(KEY)

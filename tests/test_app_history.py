@@ -48,6 +48,57 @@ def test_dragging_a_slider_is_one_move() -> None:
     assert history.step(-1) is None
 
 
+def test_a_hand_that_rests_on_a_slider_has_not_let_go() -> None:
+    history = History()
+    history.note(wish(), 0.0)
+    for k, now_s in enumerate((10.0, 10.1, 13.0, 16.5, 20.0)):
+        history.note(wish(noise_px=1.0 + k), now_s)
+    assert history.step(-1) == wish() and history.ways() == (False, True)
+    assert history.step(1) == wish(noise_px=5.0)
+
+
+def test_another_control_ends_a_move_though_it_has_the_same_name() -> None:
+    """There is the noise of the scene, and the noise that the estimator expects."""
+    history, wishes = History(), [wish()]
+    for scene_px, option_px in ((2.0, 1.0), (2.0, 3.0), (4.0, 3.0)):
+        scene = replace(SCENE, variation=Variation(noise_px=scene_px))
+        wishes.append(Wish(scene, "mc", options_type("mc")(noise_px=option_px)))
+    for k, asked in enumerate(wishes):
+        history.note(asked, 0.1 * k)
+    assert [history.step(-1) for _ in range(3)] == wishes[2::-1]
+
+
+def test_a_move_that_leads_back_is_none() -> None:
+    history = History()
+    history.note(wish(seed=1), 0.0)
+    history.note(wish(), 10.0)
+    for k, bound_px in enumerate((4.0, 5.0, 3.0)):
+        history.note(wish(bound_px=bound_px), 20.0 + k)
+    assert wish(bound_px=3.0) == wish() and history.step(-1) == wish(seed=1)
+    assert history.step(1) == wish() and history.ways() == (True, False)
+    history.note(wish(bound_px=4.0), 30.0)
+    history.note(wish(bound_px=3.0), 31.0)
+    history.note(wish(bound_px=6.0), 32.0)
+    assert history.step(-1) == wish() and history.step(-1) == wish(seed=1)
+
+
+def test_what_is_switched_to_and_fro_is_no_drag() -> None:
+    history = History()
+    wishes = [wish(estimator="ransac-2p", local_optimization=value) for value in (False, True, False)]
+    for k, asked in enumerate(wishes):
+        history.note(asked, 0.1 * k)
+    assert [history.step(-1) for _ in range(3)] == [wishes[1], wishes[0], None]
+
+
+def test_the_oldest_moves_are_forgotten_in_the_middle_of_one_too() -> None:
+    history = History()
+    for k in range(MOST + 7):
+        history.note(wish(seed=k), 10.0 * k)
+    for k in range(30):
+        history.note(wish(seed=MOST + 6, noise_px=1.0 + k), 10.0 * (MOST + 8) + 0.1 * k)
+    assert history.step(-1) == wish(seed=MOST + 6) and history.step(-1) == wish(seed=MOST + 5)
+
+
 def test_single_changes_are_never_one_move() -> None:
     history, wishes = History(), [wish(), *(wish(seed=k) for k in (1, 2, 3))]
     for k, asked in enumerate(wishes):
@@ -81,9 +132,9 @@ def test_it_remembers_so_many() -> None:
         (wish(), set()),
         (wish(seed=1), {"seed"}),
         (wish(noise_px=2.0), {"noise_px"}),
-        (wish(bound_px=2.0), {"bound_px"}),
+        (wish(bound_px=2.0), {"options.bound_px"}),
         (wish(estimator="ransac-2p", seed=3), {"estimator"}),
-        (wish(seed=1, noise_px=2.0, bound_px=2.0), {"seed", "noise_px", "bound_px"}),
+        (wish(seed=1, noise_px=2.0, bound_px=2.0), {"seed", "noise_px", "options.bound_px"}),
     ],
 )
 def test_what_differs(other: Wish, names: set[str]) -> None:

@@ -4,6 +4,7 @@ import io
 import re
 import zipfile
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,14 +17,14 @@ from spherloc_viz.app.page_runs import PageRuns
 from spherloc_viz.app.review import notes as notes_module
 from spherloc_viz.gallery import gallery_cases
 from spherloc_viz.recording.content.reader import read_recording
-from spherloc_viz.recording.review.notes import read_review
+from spherloc_viz.recording.review.notes import Review, read_review
 from tests.connected_page import until
-from tests.reviewing_pages import SCENE, Office, recorded_twice
+from tests.reviewing_pages import Office, recorded_twice
+from tests.tiny_scene import write_tiny_scene
 
 
 def test_recorded_problems_do_not_pile_up(tmp_path: Path) -> None:
-    (tmp_path / "tiny.toml").write_text(SCENE)
-    catalog = Catalog(tmp_path / "tiny.toml")
+    catalog = Catalog(write_tiny_scene(tmp_path))
     page, before = catalog.branch(), len(catalog.scenes)
     scene = catalog.scenes["tiny"]
     labels = [page.enter(scene, tmp_path / f"{k}.rrd", "tiny (recorded)", brief=True) for k in range(20)]
@@ -120,6 +121,94 @@ def test_labels_are_stored_and_seen_by_others(office: Office) -> None:
     until(lambda: read_review(office.folder / first).labels == ("last word",))
 
 
+def test_two_pages_review_one_run_without_losing_words(office: Office) -> None:
+    visitor, _, second = recorded_twice(office)
+    other = office.visit()
+    path = office.folder / second
+    for page in (visitor, other):
+        page.see()
+        page.touch(f"run-open:{second}")
+        until(lambda page=page: page.panel._notes._file == second)
+    one, two = visitor.panel._notes, other.panel._notes
+    # Neither has seen the other's words yet: the second page does not even look at its list.
+    other.touch("views:")
+    visitor.set(one._note, "a note")
+    until(lambda: read_review(path).note == "a note")
+    assert two._note.value == ""
+    other.set(two._labels, "seam")
+    until(lambda: read_review(path).labels == ("seam",))
+    assert read_review(path).note == "a note"
+    for page in (visitor, other):
+        until(lambda page=page: page.panel._notes._note.value == "a note")
+        until(lambda page=page: page.panel._notes._labels.value == "seam")
+        until(lambda page=page: page.card.opened.recorded.row.labels == ("seam",))  # type: ignore[union-attr]
+    other.touch("run-label:seam")
+    until(lambda: read_review(path).labels == ())
+    until(lambda: one._labels.value == "")
+    assert read_review(path).note == "a note"
+
+
+def test_words_for_a_run_that_is_gone_do_not_cost_those_for_another(office: Office) -> None:
+    visitor, first, second = recorded_twice(office)
+    visitor.see()
+    visitor.touch(f"run-open:{first}")
+    notes = visitor.panel._notes
+    until(lambda: notes._file == first)
+    (office.folder / first).unlink()
+    with notes._lock:
+        notes._pending = {file: (Review(), Review(("seam",))) for file in (first, second)}
+    visitor.touch("run-label:late")
+    until(lambda: "there is no such run" in visitor.panel._status.content)
+    until(lambda: read_review(office.folder / second).labels == ("seam",))
+    until(lambda: not notes._pending and notes._storing is None)
+    assert notes._labels.value == "late", "what was typed stays where it can be copied"
+
+
+def test_a_list_goes_on_when_its_folder_is_back(office: Office) -> None:
+    visitor, first, _ = recorded_twice(office)
+    visitor.see()
+    until(lambda: "2 runs" in visitor.rows)
+    away = office.folder.with_name("away")
+    office.folder.rename(away)
+    until(lambda: "No run is recorded" in visitor.rows)
+    away.rename(office.folder)
+    until(lambda: "2 runs" in visitor.rows)
+    visitor.touch(f"run-open:{first}")
+    until(lambda: visitor.card.opened is not None)
+
+
+def test_a_comparison_ends_with_its_runs(office: Office) -> None:
+    visitor, first, second = recorded_twice(office)
+    visitor.see()
+    until(lambda: f"run-open:{second}" in visitor.rows)
+    other = made_anew(office, second)
+    for file in (first, second):
+        visitor.touch(f"run-mark:{file}")
+    visitor.touch("runs-compare:")
+    until(lambda: "two problems" in visitor.panel._comparison.content and visitor.panel._comparison.visible)
+    visitor.touch(f"run-open:{second}")
+    until(lambda: visitor.card.opened is not None)
+    assert visitor.panel._comparison.visible, "one of the two is opened"
+    visitor.touch("recordings:gallery")
+    until(lambda: not visitor.panel._comparison.visible)
+    visitor.touch("recordings:runs")
+    until(lambda: visitor.panel._comparison.visible)
+    visitor.touch(f"run-open:{other}")
+    until(lambda: not visitor.panel._comparison.visible)
+    office.recorder.index.remove(second)
+    visitor.touch("runs-compare:")
+    until(lambda: "not in the list any more" in visitor.panel._status.content)
+
+
+def made_anew(office: Office, file: str) -> str:
+    """The same run as another recording, which the list has too."""
+    (office.folder / "again.rrd").write_bytes((office.folder / file).read_bytes())
+    row = office.recorder.index.get(file)
+    assert row is not None
+    office.recorder.index.add(replace(row, file="again.rrd"))
+    return "again.rrd"
+
+
 def test_the_list_is_searched_marked_compared_and_exported(office: Office) -> None:
     visitor, first, second = recorded_twice(office)
     session = visitor.session
@@ -147,7 +236,7 @@ def test_the_list_is_searched_marked_compared_and_exported(office: Office) -> No
 
     for file in (third, second):
         visitor.touch(f"run-mark:{file}")
-    until(lambda: "compare the two" in runs._bar.content and runs._bar.visible)
+    until(lambda: "runs-compare:" in runs._bar.content and runs._bar.visible)
     visitor.touch("runs-compare:")
     until(lambda: "the same problem" in visitor.panel._comparison.content)
     until(lambda: session._run is not None and session._run.trace.estimator == "ransac-2p")
@@ -222,8 +311,7 @@ def test_a_waiting_queue_is_told(tmp_path: Path) -> None:
         def submit(self, *words: object) -> Path:
             return tmp_path / "run.rrd"
 
-    (tmp_path / "tiny.toml").write_text(SCENE)
-    catalog = Catalog(tmp_path / "tiny.toml")
+    catalog = Catalog(write_tiny_scene(tmp_path))
     runs = PageRuns(Slow(), catalog)  # type: ignore[arg-type]
     from spherloc.estimators import default_options, estimate
     from spherloc_viz.app.catalog import SceneWish

@@ -20,12 +20,13 @@ from spherloc_viz.app.review.differences import comparison_html
 from spherloc_viz.app.review.filters import Counts, filters_html
 from spherloc_viz.app.review.look import PAGE, Look
 from spherloc_viz.app.review.rows import rows_html
-from spherloc_viz.app.review.shelf import Shelf
+from spherloc_viz.app.review.shelf import Shelf, merged
 from spherloc_viz.app.review.summary_page import summary_html
 from spherloc_viz.app.web.touch import Touch, TouchDesk, Touches
 from spherloc_viz.recording.index.query import Range
 from spherloc_viz.recording.index.run_index import RunIndex
 from spherloc_viz.recording.index.run_text import rows_text
+from spherloc_viz.recording.review.notes import Review
 from spherloc_viz.recording.run_row import RunRow
 
 NOW = datetime(2026, 5, 1, 12, tzinfo=UTC)
@@ -157,6 +158,14 @@ def test_ranges_are_chosen_or_typed() -> None:
     with pytest.raises(InputError, match="is no range"):
         Look(outliers="many").query(NOW)
     assert len(Look(text="x" * 5000).query(NOW).text or "") == 200
+
+
+def test_what_others_said_meanwhile_stays() -> None:
+    before = Review(("a", "b"), "note")
+    assert merged(before, before, Review(("c",), "")) == Review(("c",), "")
+    theirs = Review(("a", "d"), "their note")
+    assert merged(theirs, before, Review(("a", "b", "c"), "note")) == Review(("a", "d", "c"), "their note")
+    assert merged(theirs, before, Review(("b",), "my note")) == Review(("d",), "my note"), "of two notes the last"
 
 
 def evil_row() -> RunRow:

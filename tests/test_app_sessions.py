@@ -22,21 +22,9 @@ from spherloc_viz.app.web.touch import Touch
 from spherloc_viz.app.web.viser_seams import start_viser, stop_viser
 from spherloc_viz.recording.origin import Origin
 from tests.connected_page import Wire, until
+from tests.tiny_scene import write_tiny_scene
 
 KEY = "a key of this test"
-SCENE = """
-kind = "synthetic"
-name = "tiny"
-[camera]
-model = "equirectangular"
-width = 512
-height = 256
-[simulation]
-correspondences = 20
-outlier_rate = 0.25
-noise_px = 0.5
-seed = 1
-"""
 RIVAL = np.column_stack([np.eye(3), [1.0, 2.0, 3.0]])
 
 
@@ -98,8 +86,7 @@ class House:
 @pytest.fixture
 def house(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[House]:
     monkeypatch.setattr(session_module, "QUIET_S", 0.3)
-    (tmp_path / "tiny.toml").write_text(SCENE)
-    opened = House(Catalog(tmp_path / "tiny.toml"))
+    opened = House(Catalog(write_tiny_scene(tmp_path)))
     yield opened
     opened.close()
 

@@ -31,20 +31,10 @@ from spherloc_viz.layers.primitives import Chart, Curve
 from spherloc_viz.layers.sweep import SweepChart
 from spherloc_viz.recording.index.query import RunQuery
 from spherloc_viz.recording.keeping.recorder import Recorder
+from tests.tiny_scene import write_tiny_scene
 
-SCENE = """
-kind = "synthetic"
-name = "tiny <b>"
-[camera]
-model = "equirectangular"
-width = 512
-height = 256
-[simulation]
-correspondences = 20
-outlier_rate = 0.25
-noise_px = 0.5
-seed = 1
-"""
+NAME = "tiny <b>"
+"""What a page must escape."""
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -57,7 +47,7 @@ class Desk:
     """A panel, and the page around it."""
 
     def __init__(self, server: viser.ViserServer, scene: Path, recorder: Recorder | None = None) -> None:
-        self.wish = SceneWish("tiny <b>", 5, None, Variation(noise_px=1.0, outlier_rate=0.4, hidden=(3,)))
+        self.wish = SceneWish(NAME, 5, None, Variation(noise_px=1.0, outlier_rate=0.4, hidden=(3,)))
         self.scene = scene
         self.touches = Touches(lambda error: None)
         self.panel: Any = SweepPanel(server.gui, self.touches, lambda: (self.scene, self.wish), recorder)
@@ -99,8 +89,7 @@ def server() -> Iterator[viser.ViserServer]:
 
 @pytest.fixture
 def desk(server: viser.ViserServer, tmp_path: Path) -> Iterator[Desk]:
-    (tmp_path / "tiny.toml").write_text(SCENE)
-    opened = Desk(server, tmp_path / "tiny.toml")
+    opened = Desk(server, write_tiny_scene(tmp_path, NAME))
     opened.tick("ransac-2p")
     yield opened
     opened.panel.close()
@@ -109,9 +98,8 @@ def desk(server: viser.ViserServer, tmp_path: Path) -> Iterator[Desk]:
 
 
 def test_runs_are_recorded_unless_that_is_unticked(server: viser.ViserServer, tmp_path: Path) -> None:
-    (tmp_path / "tiny.toml").write_text(SCENE)
     with Recorder(tmp_path / "recordings", print) as recorder:
-        desk = Desk(server, tmp_path / "tiny.toml", recorder)
+        desk = Desk(server, write_tiny_scene(tmp_path, NAME), recorder)
         desk.tick("ransac-2p")
         panel = desk.panel
         panel._values.value, panel._runs.value, panel._workers.value = "0.2", 2, 1
@@ -137,7 +125,7 @@ def test_a_sweep_is_drawn_as_it_goes_cancelled_and_gone_on_with(desk: Desk) -> N
     until(lambda: len(drawn) >= 3)
     assert panel._button.label == CANCEL and 0.0 < panel._bar.value < 100.0
     assert re.fullmatch(r"[\d,]+ of 2,000 runs, about \d+ (s|min) left\.", desk.status)
-    assert panel._charts.content.count("<svg") == 3 and "tiny <b>" not in panel._charts.content
+    assert panel._charts.content.count("<svg") == 3 and NAME not in panel._charts.content
     desk.press()
     desk.finish()
     assert np.diff(drawn[:-1]).min() >= sweep_runs_panel.DRAW_EVERY_S

@@ -49,6 +49,12 @@ BAD = {
     "right-angle gravity bound": ({"gravity_bound_rad": np.pi / 2}, "gravity bound"),
     "zero bound": ({"bound_px": 0.0}, "bound_px"),
     "NaN bound": ({"bound_px": np.nan}, "bound_px"),
+    "tiny bound": ({"bound_px": 1e-300}, "bound_px is 1e-300; give 1e-06 to 1,000,000 pixels"),
+    "huge bound": ({"bound_px": 1e300}, "bound_px is 1e.300; give"),
+    "infinite bound": ({"bound_px": np.inf}, "bound_px is inf; give"),
+    "tiny map": ({"points": 1e-300 * POINTS}, r"points reach \S+e-300 m from the origin"),
+    "huge map": ({"points": 1e300 * POINTS}, r"points reach \S+e.300 m from the origin; give metres, 1e-12 to 1e.12 m"),
+    "truth beyond": ({"truth_cam_from_map": pose(np.eye(3), 1e300 * DOWN)}, "true position reaches 1e.300 m"),
     "3 x 3 truth": ({"truth_cam_from_map": np.eye(3)}, "truth_cam_from_map has shape"),
     "scaled truth": ({"truth_cam_from_map": pose(2 * np.eye(3), DOWN)}, "no rotation matrix"),
     "mirrored truth": ({"truth_cam_from_map": pose(np.diag([1.0, 1.0, -1.0]), DOWN)}, "no rotation matrix"),
@@ -152,3 +158,10 @@ def test_alignment_turns_gravity_down_and_poses_back(rng):
         camera = problem.points @ cam_from_map[:, :3].T + cam_from_map[:, 3]
         aligned_camera = aligned.points @ there[:, :3].T + there[:, 3]
         np.testing.assert_allclose(aligned_camera, camera @ aligned.camera_turn.T, atol=1e-13)
+
+
+@pytest.mark.parametrize("metres", [0.0, 1e-9, 1e9])
+def test_maps_of_all_sizes_are_problems(metres):
+    """Zero too: all points in the origin are told by the solvers, and single points may lie there."""
+    assert len(make(points=metres * POINTS)) == 4
+    assert len(make(points=np.vstack([1e-300 * POINTS[:1], POINTS[1:]]))) == 4

@@ -1,8 +1,6 @@
 """The list of runs: every filter against plain Python, and what may be in a row."""
 
 import sys
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,12 +13,6 @@ from spherloc.errors import InputError, RecordingError
 from spherloc_viz.recording.index.query import GROUP_KEYS, SORT_KEYS, RunQuery
 from spherloc_viz.recording.index.run_index import RunIndex
 from spherloc_viz.recording.run_row import RunRow
-
-
-@pytest.fixture
-def index(tmp_path: Path) -> Iterator[RunIndex]:
-    with RunIndex(tmp_path / "recordings") as index:
-        yield index
 
 
 @pytest.fixture

@@ -17,12 +17,6 @@ from spherloc_viz.recording.review.notes import read_review, write_review
 from spherloc_viz.recording.run_row import RunRow
 
 
-@pytest.fixture
-def index(tmp_path: Path) -> Iterator[RunIndex]:
-    with RunIndex(tmp_path / "recordings") as index:
-        yield index
-
-
 class Files:
     """A folder of files that stand for recordings, and a reader that counts what it is asked for."""
 

@@ -4,7 +4,6 @@ import contextlib
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -24,12 +23,6 @@ from spherloc_viz.recording.strangers import examiner as strangers
 from spherloc_viz.recording.viewing.view import labels_of
 
 ROOT = Path(__file__).resolve().parents[1]
-
-
-@pytest.fixture
-def index(tmp_path: Path) -> Iterator[RunIndex]:
-    with RunIndex(tmp_path / "recordings") as index:
-        yield index
 
 
 WRITER = """

@@ -2,7 +2,7 @@
 
 import contextlib
 import sqlite3
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -12,12 +12,6 @@ from spherloc.errors import RecordingError
 from spherloc_viz.recording.index import file as index_file
 from spherloc_viz.recording.index.query import RunQuery
 from spherloc_viz.recording.index.run_index import RunIndex
-
-
-@pytest.fixture
-def index(tmp_path: Path) -> Iterator[RunIndex]:
-    with RunIndex(tmp_path / "recordings") as index:
-        yield index
 
 
 def foreign(path: Path) -> None:
@@ -146,6 +140,16 @@ def test_a_deleted_database_is_made_anew(index: RunIndex):
     index.add(some_row("b.rrd"))
     assert [row.file for row in index.find(RunQuery()).rows] == ["b.rrd"]
     assert index.stale
+
+
+def test_a_folder_that_was_away_is_listed_again(tmp_path: Path):
+    folder, away = tmp_path / "recordings", tmp_path / "away"
+    with RunIndex(folder) as index:
+        index.add(some_row())
+        folder.rename(away)
+        assert index.find(RunQuery()).total == 0 and not folder.exists()
+        away.rename(folder)
+        assert index.find(RunQuery()).rows == (some_row(),)
 
 
 def test_a_locked_database_is_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

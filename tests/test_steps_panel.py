@@ -1,6 +1,7 @@
 """The timeline's panel: where buttons, keys, slider, list and stages lead, and how long a step plays."""
 
-import asyncio
+import gc
+import warnings
 from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
@@ -69,7 +70,7 @@ class Panel:
     def page(self, callback: Any, widget: Any, value: Any) -> str:
         """The page sets a widget."""
         widget._impl.value = value
-        asyncio.run(callback(event(widget)))
+        callback(event(widget))
         return self.settle()
 
     def press(self, button: str) -> str:
@@ -115,17 +116,30 @@ def test_slider_list_and_stage_bars_go_to_their_step_and_agree(panel: Panel) -> 
 def test_what_python_sets_is_no_wish(panel: Panel) -> None:
     inner = panel.panel
     for callback, widget in ((inner._slide, inner._slider), (inner._pick, inner._choice)):
-        asyncio.run(callback(event(widget, None)))
+        callback(event(widget, None))
     assert panel.asked == 0 and panel.settle() == "outcome"
+
+
+def test_showing_a_step_leaves_nothing_to_a_loop_that_has_ended() -> None:
+    """A page is still drawn while its server goes: what nobody awaits any more was a warning now and then."""
+    server = start_viser("a key")
+    panel = Panel(server)
+    stop_viser(server)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        for button in (PREVIOUS, BACK):
+            panel.press(button)
+        gc.collect()
+    assert not [warning for warning in said if "never awaited" in str(warning.message)]
 
 
 def test_a_thumb_that_moves_on_is_not_pulled_back(panel: Panel) -> None:
     inner = panel.panel
     inner._slider._impl.value = 3
-    asyncio.run(inner._slide(event(inner._slider)))
+    inner._slide(event(inner._slider))
     index, _ = inner.settle(TIMELINE, True)
     inner._slider._impl.value = 7
-    asyncio.run(inner._slide(event(inner._slider)))
+    inner._slide(event(inner._slider))
     inner.show(Step(KEYS[index], "", "", ""), False, ())
     assert inner._slider.value == 7
     assert panel.settle() == KEYS[6] and inner._slider.value == 7

@@ -18,30 +18,18 @@ from spherloc.experiments.sweep_summary import point_of
 from spherloc_viz.layers.sweep import LIMIT, sweep_charts, sweep_colors, sweep_table
 from spherloc_viz.sweep import parse_entrant, sweep
 from spherloc_viz.sweep_plot import sweep_png
+from tests.tiny_scene import write_tiny_scene
 
 PROGRAM = [sys.executable, "-c", "import signal\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n"
            "from spherloc_viz.cli import main\nmain()", "sweep"]  # fmt: skip
 """A shell's background job, and what it starts, ignores SIGINT."""
-SCENE = """
-kind = "synthetic"
-name = "tiny $\\\\frac$"
-[camera]
-model = "equirectangular"
-width = 512
-height = 256
-[simulation]
-correspondences = 20
-outlier_rate = 0.25
-noise_px = 0.5
-seed = 1
-"""
+NAME = "tiny $\\frac$"
+"""Matplotlib would set it as mathematics."""
 
 
 @pytest.fixture
 def scene(tmp_path: Path) -> Path:
-    path = tmp_path / "tiny.toml"
-    path.write_text(SCENE)
-    return path
+    return write_tiny_scene(tmp_path, NAME)
 
 
 def lines(path: Path) -> int:
@@ -172,8 +160,8 @@ def test_colours_tell_estimators_apart() -> None:
 
 
 def test_the_picture_has_every_curve() -> None:
-    png = sweep_png("tiny $\\frac$", "outlier_rate", LABELS, POINTS)
-    assert png == sweep_png("tiny $\\frac$", "outlier_rate", LABELS, POINTS)
+    png = sweep_png(NAME, "outlier_rate", LABELS, POINTS)
+    assert png == sweep_png(NAME, "outlier_rate", LABELS, POINTS)
     image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
     assert image is not None
     for color in sweep_colors(LABELS).values():

@@ -8,7 +8,7 @@ import pytest
 import viser
 from viser import _messages
 
-from spherloc_viz.app.web.viser_seams import start_viser, stop_viser
+from spherloc_viz.app.web.viser_seams import at_once, guard_callbacks, start_viser, stop_viser
 from tests.connected_page import ConnectedPage, until
 
 KEY = "a key of this test"
@@ -79,3 +79,29 @@ def test_nobody_is_woken_on_a_thread_of_ours(server: viser.ViserServer, pages: l
         until(lambda event=event: len(event._waiters) > 0 and not event.is_set())
         event.set()
         assert not event.is_set()
+
+
+def test_what_is_to_be_done_at_once_is_done_on_the_loop_in_order_and_its_failures_are_told(
+    server: viser.ViserServer, pages: list[ConnectedPage]
+) -> None:
+    """Each message is dealt with before the next one, which changes the widget's value, is read."""
+    failures: list[Exception] = []
+    client = pages[0].handle
+    guard_callbacks(client, failures.append)
+    field = client.gui.add_number("Number", 0)
+    heard: list[tuple[object, float, str]] = []
+
+    @at_once
+    def hear(event: viser.GuiEvent) -> None:
+        heard.append((event.client_id, event.target.value, threading.current_thread().name))
+        if event.target.value == ROUNDS:
+            raise ValueError("the last")
+
+    field.on_update(hear)
+    for value in range(1, ROUNDS + 1):
+        pages[0].send({"type": "GuiUpdateMessage", "uuid": field._impl.uuid, "updates": {"value": value}})
+    until(lambda: failures)
+    assert [(number, value) for number, value, _ in heard] == [(client.client_id, k + 1) for k in range(ROUNDS)]
+    assert len({thread for _, _, thread in heard}) == 1 and str(failures[0]) == "the last"
+    field.value = 0
+    assert heard[-1] == (None, 0, threading.current_thread().name), "and where Python sets it, right there"

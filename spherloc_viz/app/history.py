@@ -1,16 +1,23 @@
 """Undo and redo."""
 
 import dataclasses
+import math
 import threading
+from typing import Any
 
+from spherloc.datasets.synthetic import TrueCamera
 from spherloc_viz.app.wish import Wish
 
 MOST = 200
 """Wishes that are remembered."""
-SAME_MOVE_S = 1.0
-"""Changes of the same things within this time, such as those of a slider that is dragged, count as one."""
-SINGLE = frozenset({"scene", "query", "seed", "camera", "outlier_kind", "spoiled", "mended", "hidden", "estimator"})
-"""What is not dragged: each change counts."""
+SAME_MOVE_S = 5.0
+"""Changes of the same things within this time count as one. The server hears values and not the pointer: a hand rests
+some seconds on a slider to look at the picture, and what it does to the same slider right after it, it hardly wants to
+take back alone. Another control, or an undo, in between ends the move at once."""
+PRESSED = frozenset({"seed"})
+"""Numbers that are not dragged: each change counts."""
+DRAGGED = (int, float, TrueCamera)
+"""Types of what can be dragged; each change of others counts too."""
 
 
 class History:
@@ -20,8 +27,10 @@ class History:
         self._lock = threading.Lock()
         self._wishes: list[Wish] = []
         self._at = -1
-        self._noted_s = -SAME_MOVE_S
+        self._noted_s = -math.inf
         self._moved: frozenset[str] = frozenset()
+        self._start = -1
+        """Place of the wish from which the last move began."""
 
     def note(self, wish: Wish, now_s: float) -> None:
         """The page asks for this now; what was undone before is forgotten unless it is this very wish."""
@@ -29,19 +38,29 @@ class History:
             if self._at >= 0 and wish == self._wishes[self._at]:
                 return
             moved = changed_fields(self._wishes[self._at], wish) if self._at >= 0 else frozenset()
-            same_move = self._at > 0 and moved == self._moved and now_s - self._noted_s < SAME_MOVE_S
-            same_move = same_move and not moved & SINGLE
-            del self._wishes[self._at + (0 if same_move else 1) :]
-            self._wishes.append(wish)
-            del self._wishes[:-MOST]
+            if not self._goes_on(moved, wish, now_s):
+                self._start = self._at
+            del self._wishes[self._start + 1 :]
+            if self._start < 0 or wish != self._wishes[self._start]:  # else the move has led back
+                self._wishes.append(wish)
+            forgotten = max(0, len(self._wishes) - MOST)
+            del self._wishes[:forgotten]
+            self._start -= forgotten
             self._at, self._noted_s, self._moved = len(self._wishes) - 1, now_s, moved
+
+    def _goes_on(self, moved: frozenset[str], wish: Wish, now_s: float) -> bool:
+        """Whether a change belongs to the same move as the last one."""
+        if moved != self._moved or now_s - self._noted_s >= SAME_MOVE_S or self._start < 0:
+            return False
+        values = [_values(one)[name] for one in (self._wishes[self._at], wish) for name in moved]
+        return not moved & PRESSED and all(type(value) in DRAGGED for value in values)
 
     def step(self, by: int) -> Wish | None:
         """The wish before (-1) or after (+1), which is then the one that the page is at; None if there is none."""
         with self._lock:
             if not 0 <= self._at + by < len(self._wishes):
                 return None
-            self._at, self._noted_s = self._at + by, -SAME_MOVE_S
+            self._at, self._noted_s = self._at + by, -math.inf
             return self._wishes[self._at]
 
     def ways(self) -> tuple[bool, bool]:
@@ -51,17 +70,18 @@ class History:
 
 
 def changed_fields(one: Wish, other: Wish) -> frozenset[str]:
-    """Names of what differs."""
+    """Names of what differs; those of options begin with "options."."""
     if one.estimator != other.estimator:
         return frozenset({"estimator"})
-    parts = (
-        (one.scene, other.scene),
-        (one.scene.variation, other.scene.variation),
-        (one.options, other.options),
-    )
-    return frozenset(
-        item.name
-        for before, after in parts
-        for item in dataclasses.fields(before)
-        if item.name != "variation" and getattr(before, item.name) != getattr(after, item.name, None)
-    )
+    before, after = _values(one), _values(other)
+    return frozenset(name for name in before if before[name] != after[name])
+
+
+def _values(wish: Wish) -> dict[str, Any]:
+    """All that a wish says, by names."""
+    parts = (("", wish.scene), ("", wish.scene.variation), ("options.", wish.options))
+    values = {
+        prefix + item.name: getattr(part, item.name) for prefix, part in parts for item in dataclasses.fields(part)
+    }
+    del values["variation"]
+    return values

@@ -9,8 +9,11 @@ import pytest
 
 from spherloc.bounds import bounds_of
 from spherloc.cameras.equirectangular import Equirectangular
+from spherloc.diagnosis import diagnose
+from spherloc.errors import InputError
+from spherloc.estimators import estimate, options_type
 from spherloc.geometry import DOWN, pose, so3_exp
-from spherloc.problem import Problem
+from spherloc.problem import LEAST_PX, MOST_PX, Problem
 from spherloc.refine import residuals_px
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
@@ -54,6 +57,23 @@ def test_gravity_error_within_its_bound_keeps_the_inliers(rng, scene_of, camera)
     assert lost == 0, f"{lost} of 1000 lie outside, the worst by a factor of {np.max(error / bounds.pixels):.1f}"
 
 
+@pytest.mark.parametrize("bound_px", [1e-300, 1e300, np.inf])
+@pytest.mark.parametrize("estimator", ["mc", "mc-exact", "ransac-2p", "auto"])
+def test_a_bound_that_no_solver_can_reckon_with_is_one_sentence(scene_of, estimator, bound_px):
+    """It was a division by zero, or an overflow."""
+    problem = scene_of("mei").problem()
+    with pytest.raises(InputError, match=r"bound_px is .*; give"):
+        estimate(problem, estimator, options_type(estimator)(bound_px=bound_px))
+
+
+@pytest.mark.parametrize("bound_px", [LEAST_PX, MOST_PX])
+@pytest.mark.parametrize("estimator", ["mc", "mc-exact", "ransac-2p", "auto"])
+def test_the_tightest_and_widest_bounds_give_an_answer_and_a_diagnosis(scene_of, estimator, bound_px):
+    trace = estimate(scene_of("mei").problem(), estimator, options_type(estimator)(bound_px=bound_px))
+    assert trace.cam_from_map is None or np.isfinite(trace.cam_from_map).all()
+    assert diagnose(trace).summary
+
+
 def test_bounds_add_up(scene_of):
     aligned = scene_of("fisheye").problem().aligned
     bare, with_gravity = bounds_of(aligned, 3.0), bounds_of(replace(aligned, gravity_bound_rad=0.01), 3.0)
@@ -84,8 +104,11 @@ resource.setrlimit(resource.RLIMIT_AS, (8 << 30, 8 << 30))
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.errors import InputError
 from spherloc.estimators import estimate
+from spherloc.diagnosis import diagnose
+from spherloc.errors import InputError
+from spherloc.estimators import estimate, options_type
 from spherloc.geometry import DOWN
-from spherloc.problem import Problem
+from spherloc.problem import LEAST_PX, MOST_PX, Problem
 rng = np.random.default_rng(0)
 pixels, points = rng.uniform(1, 99, (200_000, 2)), rng.uniform(-5, 5, (200_000, 3))
 try:

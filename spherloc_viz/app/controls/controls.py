@@ -30,6 +30,7 @@ from spherloc_viz.app.review.review_card import ReviewCard
 from spherloc_viz.app.services import Services
 from spherloc_viz.app.text import DIM, box
 from spherloc_viz.app.web.touch import Touches
+from spherloc_viz.app.web.viser_seams import at_once
 from spherloc_viz.app.wish import Run, Wish
 from spherloc_viz.layers.primitives import SceneItem
 from spherloc_viz.recording.again.reopen import Reopened
@@ -188,7 +189,8 @@ class Controls:
         if self._story.content != html:
             self._story.content, self._story.visible = html, bool(html)
 
-    async def _choose_preset(self, event: viser.GuiEvent) -> None:
+    @at_once
+    def _choose_preset(self, event: viser.GuiEvent) -> None:
         preset = self._presets.get(event.target.value)
         if event.client is not None and preset is not None:
             self._owner.open(Wish(preset.scene, preset.estimator, preset.options))

@@ -9,6 +9,7 @@ import viser
 
 from spherloc_viz import style
 from spherloc_viz.app.text import box, step_html, table_html
+from spherloc_viz.app.web.viser_seams import at_once
 from spherloc_viz.layers.primitives import Step, Stop, Table
 
 PLAY_S = 3.0
@@ -120,21 +121,22 @@ class StepsPanel:
         with self._lock:
             self._goal, self._moves, self._playing = goal, [], False
 
-    # viser runs a coroutine as soon as the message is there, a plain function later on some thread: by then the next
-    # click, or the next step that is shown, may have changed the widget's value. Showing a step sets the list and the
-    # slider too; only a choice made on the page counts.
+    # Showing a step sets the list and the slider too; only a choice made on the page counts.
 
-    async def _pick(self, event: viser.GuiEvent) -> None:
+    @at_once
+    def _pick(self, event: viser.GuiEvent) -> None:
         if event.client is not None and event.target.value in self._choice.options:
             self._ask_for(self._choice.options.index(event.target.value) + 1)
             self._changed(event)
 
-    async def _slide(self, event: viser.GuiEvent) -> None:
+    @at_once
+    def _slide(self, event: viser.GuiEvent) -> None:
         if event.client is not None:
             self._ask_for(max(1, int(event.target.value)))
             self._changed(event)
 
-    async def _click(self, event: viser.GuiEvent) -> None:
+    @at_once
+    def _click(self, event: viser.GuiEvent) -> None:
         self._press(event.target.value)
 
     def _press(self, button: str) -> None:

@@ -110,8 +110,8 @@ def _handles(look: Look) -> str:
 
 def sorting_html(look: Look) -> str:
     """How the list is sorted; a press offers other ways."""
-    words = f"{SORTS[look.sort]} {'↓' if look.descending else '↑'}"
-    return pill(f"{words} ▾", "runs-unfold:sort", look.unfolded == "sort", "How the list is sorted")
+    words = f"by {SORTS[look.sort]} {'↓' if look.descending else '↑'}"
+    return pill(words, "runs-unfold:sort", look.unfolded == "sort", "How the list is sorted")
 
 
 def _values(look: Look, groups: Groups) -> list[str]:

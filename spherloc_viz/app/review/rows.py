@@ -91,9 +91,14 @@ def facts_html(facts: Sequence[str]) -> str:
 
 
 def verdict_html(row: RunRow) -> str:
-    """What came out in the outcome's colour: the diagnosis if it says more than the outcome does."""
-    told = row.diagnosis and row.diagnosis != Cause.OK
-    return badge_html(row.outcome, row.diagnosis if told else row.outcome)
+    """What came out, and why: of a failure the cause alone, in its colour; a doubtful success is a success first."""
+    if not row.diagnosis or row.diagnosis == Cause.OK:
+        return badge_html(row.outcome)
+    return (
+        badge_html(row.outcome, row.diagnosis)
+        if row.outcome == "failure"
+        else (f"{badge_html(row.outcome)}, {escape(row.diagnosis)}?")
+    )
 
 
 def _review(row: RunRow) -> str:

@@ -46,8 +46,8 @@ class RunList:
         self._range = gui.add_text("Outliers", "", visible=False, hint="A range of shares: >0.9, 0.5..0.9 or <=0.3.")
         self._filters = gui.add_html("")
         self._problem = gui.add_html("", visible=False)
-        self._bar = gui.add_html("", visible=False)
         self._rows = gui.add_html("")
+        self._bar = gui.add_html("", visible=False)
         for widget in self.widgets:
             widget.on_update(self._type)
         self._listen(touches)
@@ -195,13 +195,14 @@ class RunList:
 
 
 def bar_html(marked: tuple[str, ...]) -> str:
-    """What can be done with the marked runs."""
+    """What can be done with the marked runs; it stays in sight (``touch.css``) while more are looked for."""
     ways = []
     if len(marked) == 2:
-        ways.append(pill("compare the two", "runs-compare:", False, "Side by side, and both cameras on the canvas"))
-    ways.append(pill("export as zip", "runs-export:", False, "The recordings, a table and a page to read"))
+        ways.append(pill("compare", "runs-compare:", False, "Side by side, and both cameras on the canvas"))
+    ways.append(pill("zip", "runs-export:", False, "The recordings, a table and a page to read"))
     ways.append(pill("unmark", "runs-unmark:", False, "Mark none"))
     hint = "" if len(marked) != 1 else f'<span style="{DIM}">mark another to compare</span>'
     words = f'<b style="font-weight:600">{escape(f"{len(marked):,} marked")}</b>'
-    row = f'<div style="display:flex;flex-wrap:wrap;gap:.5em;align-items:center">{words}{"".join(ways)}{hint}</div>'
-    return box(row, "font-size:11.5px;padding-bottom:.2em")
+    css = "display:flex;flex-wrap:wrap;gap:.5em;align-items:center"
+    row = f'<div class="marked-bar" style="{css}">{words}{"".join(ways)}{hint}</div>'
+    return box(row, "font-size:11.5px;padding-top:.5em")

@@ -7,7 +7,7 @@ import io
 import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future
-from typing import Any
+from typing import Any, TypeVar
 
 import viser
 import websockets.asyncio.server
@@ -15,6 +15,9 @@ from viser import _messages
 
 KEY_HEADER = "X-Spherloc-Key"
 """Request header that carries the key; a web page cannot set headers on a websocket, a program can."""
+
+
+Callback = TypeVar("Callback", bound=Callable[..., None])
 
 
 def start_viser(key: str) -> viser.ViserServer:
@@ -56,6 +59,17 @@ def put_back(handle: Any) -> None:
     state.gui_api._websock_interface.queue_message(message)
 
 
+def at_once(callback: Callback) -> Callback:
+    """Mark a widget's callback to be called on viser's event loop as soon as a page's message is there.
+
+    viser would call it later, on some thread: by then the next message may have changed the widget's value. So it
+    must not take long. A coroutine is called in time too, but viser makes one also of what Python itself sets, and
+    where the loop ends before its turn nobody awaits it.
+    """
+    callback.__dict__["at_once"] = True
+    return callback
+
+
 class _GuardedExecutor:
     """An executor whose tasks report what they raise, instead of a traceback on the server's terminal."""
 
@@ -63,7 +77,12 @@ class _GuardedExecutor:
         self._executor, self._failed = executor, failed
 
     def submit(self, task: Callable[..., Any], *words: Any) -> Future[None]:
-        """As ``Executor.submit``."""
+        """As ``Executor.submit``, but for tasks that are to be done at once."""
+        if getattr(task, "at_once", False):
+            self._run(task, words)
+            done: Future[None] = Future()
+            done.set_result(None)
+            return done
         return self._executor.submit(self._run, task, words)
 
     def _run(self, task: Callable[..., Any], words: tuple[Any, ...]) -> None:

@@ -83,6 +83,8 @@ def recorded_options(run: RecordedRun, where: Path) -> Any:
         if not _takes(known[name], value):
             raise RecordingError(f"{where}: option {name} is {show(value)}, which it cannot be; record the run again.")
     try:
+        for name, value in run.options.items():
+            known[name].check_size(value)
         return kind(**run.options)
     except (InputError, TypeError, ValueError) as error:
         raise RecordingError(f"{where}: has options that cannot be: {error}") from None

@@ -105,7 +105,8 @@ def _arcs(trace: Trace, stage: YawStage) -> Iterator[Chunk]:
 
 def _yaws(trace: Trace, estimate: float, height: float) -> Chunk:
     """Upright lines over the stack of arcs with a word each: the estimated yaw and, if it is near, the true one."""
-    marks = [("estimate", estimate, -0.04 * height, style.ESTIMATE)]
+    # Above the arcs, although the viewer hangs a word below its place.
+    marks = [("estimate", estimate, -0.22 * height, style.ESTIMATE)]
     truth = trace.problem.truth_cam_from_map
     if truth is not None:
         true_deg = float(np.degrees(yaw_of(trace.problem.aligned.align_pose(truth)[:, :3])))

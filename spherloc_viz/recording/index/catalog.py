@@ -92,9 +92,13 @@ def _filtered(frame: Any, condition: str, limit: int | None) -> list[dict[str, A
         found = found.sort(col("created").sort(ascending=False), col(_RUN).sort(), col("step").sort())
         return (found if limit is None else found.limit(limit)).to_pylist()
     except Exception as error:  # DataFusion has no class of its own for errors in a condition
-        raise InputError(f"the condition cannot be answered: {_first_line(error)}.") from error
+        raise InputError(
+            f"the condition cannot be answered ({_first_line(error)}): compare columns with numbers, or with texts in "
+            "single quotes."
+        ) from error
 
 
 def _first_line(error: Exception) -> str:
-    text = str(error).removeprefix("DataFusion error: ").strip()
+    # What has caused it comes last.
+    text = str(error).rpartition("\ncaused by\n")[2].removeprefix("DataFusion error: ").strip()
     return text.splitlines()[0][:200].rstrip(".") if text else type(error).__name__

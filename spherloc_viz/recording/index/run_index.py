@@ -56,6 +56,8 @@ class RunIndex:
         self._lock = threading.RLock()
         self._connection: sqlite3.Connection | None = None
         self._file: tuple[int, int] | None = None
+        self._place: tuple[int, int] | None = None
+        """Which folder cannot be written, while the list is in memory; None if there was none."""
         self._closed = False
         self._opened = 0
         """How often; rises when the database has become another one."""
@@ -251,7 +253,7 @@ class RunIndex:
         """The database, opened again where its file is another one now: somebody has set ours aside."""
         if self._closed:
             raise RecordingError(f"{self.path}: the list of runs has been closed.")
-        if self._connection is not None and (self._file is None or self._file == index_file.identity(self.path)):
+        if self._connection is not None and self._is_current():
             return self._connection
         self._drop()
         self.stale = True
@@ -264,6 +266,7 @@ class RunIndex:
                 self._set_aside(str(error), before)
                 continue
             except PermissionError:
+                self._place = index_file.identity(self.folder)
                 self._connection = index_file.memory(self.path)
                 self._notice(f"{self.path}: cannot be written, so changes of the list of runs are kept in memory only.")
                 return self._connection
@@ -272,6 +275,12 @@ class RunIndex:
                 return connection
             self._drop()  # it was set aside while it was opened
         raise self._damaged_again()
+
+    def _is_current(self) -> bool:
+        """Whether nobody has replaced the database, or, where it is in memory only, the folder."""
+        if self._file is None:
+            return self._place == index_file.identity(self.folder)
+        return self._file == index_file.identity(self.path)
 
     def _set_aside(self, reason: str, file: tuple[int, int] | None) -> None:
         """Rename the database, unless another process has done so: it must still be that file."""
