@@ -3,11 +3,19 @@
 import contextlib
 import hashlib
 import os
+import time
 import uuid
+from functools import cache
 from pathlib import Path
 
 VARIABLE = "SPHERLOC_CACHE"
 """Environment variable that moves the cache."""
+KEEP_BYTES = 2 << 30
+"""What one kind of things may take once it was not used for a while."""
+UNUSED_S = 7 * 86_400.0
+"""What was used within this time stays: somebody may be looking at it."""
+TOUCH_S = 3_600.0
+"""A use is not noted again within this time."""
 
 
 def cache_folder(kind: str) -> Path:
@@ -39,3 +47,40 @@ def store(path: Path, content: bytes) -> bool:
         with contextlib.suppress(OSError):
             part.unlink(missing_ok=True)
     return True
+
+
+def used(path: Path) -> None:
+    """Note that a file of the cache is still wanted."""
+    with contextlib.suppress(OSError):
+        if time.time() - path.stat().st_mtime > TOUCH_S:
+            os.utime(path)
+
+
+@cache
+def make_room_once(folder: Path) -> None:
+    """``make_room``, the first time in this process."""
+    make_room(folder)
+
+
+def make_room(folder: Path, keep_bytes: int = KEEP_BYTES) -> int:
+    """Delete the longest unused files of a kind until it takes no more than ``keep_bytes``; returns how many went.
+
+    Files that were used within a week stay, whatever they take. What cannot be deleted stays too.
+    """
+    found = []
+    for path in folder.rglob("*"):
+        with contextlib.suppress(OSError):  # deleted by another process meanwhile
+            if path.is_file():
+                told = path.stat()
+                found.append((told.st_mtime, told.st_size, path))
+    total, gone = sum(size for _, size, _ in found), 0
+    for when, size, path in sorted(found):
+        if total <= keep_bytes or time.time() - when <= UNUSED_S:
+            break
+        with contextlib.suppress(OSError):
+            path.unlink()
+            total, gone = total - size, gone + 1
+        if path.parent != folder:
+            with contextlib.suppress(OSError):  # it holds other files
+                path.parent.rmdir()
+    return gone

@@ -3,7 +3,7 @@
 import hashlib
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from spherloc.datasets.map_scene import MapScene, Thresholds
 from spherloc.datasets.scene_file import numbers
 from spherloc.errors import InputError, show
 from spherloc.estimators.base import versions
+from spherloc.experiments.differences import differences
 
 FORMAT = 1
 MAX_BYTES = 1_000_000
@@ -57,11 +58,9 @@ class Configuration:
 
     def differences(self, now: "Configuration") -> list[str]:
         """What is not the same in ``now``, as phrases such as "seed is 1, was 0"."""
-        before, after = (dict(_flat(_plain(item))) for item in (self, now))
-        different = [key for key in {**before, **after} if before.get(key) != after.get(key)]
-        if "estimator" in different:  # another one has other options
-            different = [key for key in different if not key.startswith("options.")]
-        return [f"{key} is {_shown(after, key)}, was {_shown(before, key)}" for key in different]
+        found = differences(_plain(self), _plain(now), _UNCOMPARED)
+        # Another estimator has other options.
+        return [said for key, said in found.items() if "estimator" not in found or not key.startswith("options.")]
 
 
 def configuration_of(scene: MapScene, path: Path, estimator: str, options: Any, seed: int) -> Configuration:
@@ -147,16 +146,3 @@ def _plain(configuration: Configuration) -> dict[str, Any]:
     if configuration.registration_thresholds_m is not None:
         values["registration_thresholds_m"] = list(configuration.registration_thresholds_m)
     return values
-
-
-def _shown(table: Mapping[str, Any], key: str) -> str:
-    return show(table[key]) if key in table else "absent"
-
-
-def _flat(table: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
-    """Values by dotted keys, such as "options.bound_px"."""
-    for key, value in table.items():
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{above}{key}.")
-        elif key not in _UNCOMPARED:
-            yield above + key, value

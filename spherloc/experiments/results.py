@@ -14,11 +14,11 @@ import numpy as np
 from spherloc.cameras.base import FloatArray
 from spherloc.errors import InputError
 from spherloc.experiments.configuration import Configuration, read_configuration
+from spherloc.experiments.differences import in_short
 from spherloc.experiments.rows import LOCALIZED, QueryResult, csv_text, json_line, row_of_json
 
 CONFIGURATION, ROWS, TABLE = "configuration.json", "results.jsonl", "results.csv"
 MAX_BYTES = 2_000_000_000
-MAX_DIFFERENCES = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,10 +227,9 @@ class ResultsLog:
         if path.exists():
             differences = read_configuration(path).differences(configuration)
             if differences:
-                more = len(differences) - MAX_DIFFERENCES
-                listed = "; ".join(differences[:MAX_DIFFERENCES]) + (f"; and {more} more" if more > 0 else "")
                 raise InputError(
-                    f"{self.folder}: holds results of another configuration ({listed}); give another folder."
+                    f"{self.folder}: holds results of another configuration ({in_short(differences)}); give another "
+                    "folder."
                 )
         elif (self.folder / ROWS).exists():
             raise InputError(f"{self.folder}: holds results without their {CONFIGURATION}; give another folder.")

@@ -10,13 +10,13 @@ from types import TracebackType
 from typing import Any, Self
 
 from spherloc.errors import InputError, show
+from spherloc.experiments.differences import differences, in_short
 from spherloc.experiments.sweep_plan import SweepPlan
 from spherloc.experiments.sweep_rows import SweepRow, columns, csv_line, row_line, row_of_line
 from spherloc.experiments.sweep_summary import rows_text, summarize, summary_text
 
 MAX_BYTES = 1_000_000_000
 MAX_PLAN_BYTES = 1_000_000
-MAX_DIFFERENCES = 3
 _UNCOMPARED = {"scene", "runs"}
 """A scene that was moved is the same scene, and more runs add to those that are done."""
 
@@ -128,10 +128,9 @@ class SweepLog:
         if begun and not path.exists():
             raise InputError(f"{self.path}: is no table of a sweep, or has lost its {path.name}; give another file.")
         if begun:
-            differences = _differences(_read_plan(path), now)
-            if differences:
-                more = len(differences) - MAX_DIFFERENCES
-                listed = "; ".join(differences[:MAX_DIFFERENCES]) + (f"; and {more} more" if more > 0 else "")
+            found = differences(_read_plan(path), json.loads(json.dumps(now)), _UNCOMPARED)
+            if found:
+                listed = in_short(list(found.values()))
                 raise InputError(f"{self.path}: holds the runs of another sweep ({listed}); give another file.")
         self.write(path, (json.dumps(now, indent=2, allow_nan=False) + "\n").encode())
 
@@ -177,22 +176,3 @@ def _read_plan(path: Path) -> dict[str, Any]:
     except (ValueError, RecursionError):
         raise InputError(f"{path}: is damaged; give another file for the sweep.") from None
     return table
-
-
-def _differences(before: dict[str, Any], now: dict[str, Any]) -> list[str]:
-    """What is not the same, as phrases such as "over is 'noise_px', was 'outlier_rate'"."""
-    a, b = dict(_flat(before)), dict(_flat(json.loads(json.dumps(now))))
-    different = [key for key in {**a, **b} if key not in a or key not in b or a[key] != b[key]]
-    return [f"{key} is {_shown(b, key)}, was {_shown(a, key)}" for key in different]
-
-
-def _flat(table: dict[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
-    for key, value in table.items():
-        if isinstance(value, dict):
-            yield from _flat(value, f"{above}{key}.")
-        elif above or key not in _UNCOMPARED:
-            yield above + key, value
-
-
-def _shown(table: dict[str, Any], key: str) -> str:
-    return show(table[key]) if key in table else "absent"

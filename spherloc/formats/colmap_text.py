@@ -24,7 +24,6 @@ from spherloc.formats.colmap_walk import (
 
 _MAX_LINE = 64_000_000
 """Characters of a line: the observations of a million keypoints."""
-_MAX_WORD = 64
 _PARAMETERS = dict(MODELS)
 
 

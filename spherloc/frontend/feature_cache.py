@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from spherloc.cameras.base import BoolArray, FloatArray
-from spherloc.disk_cache import cache_folder, key_of, store
+from spherloc.disk_cache import cache_folder, key_of, make_room_once, store, used
 from spherloc.frontend.feature_kinds import Descriptors
 from spherloc.images import MAX_BYTES
 
@@ -34,6 +34,7 @@ def feature_file(image: Path, usable: BoolArray, options: Any, seam: bool) -> Pa
 
 def keep(path: Path, table: FloatArray, descriptors: Descriptors) -> None:
     """Store keypoints (N, 5) and descriptors (N, D)."""
+    make_room_once(path.parent)
     content = io.BytesIO()
     np.savez(content, table=table, descriptors=descriptors)
     store(path, content.getvalue())
@@ -53,7 +54,10 @@ def fetch(path: Path) -> tuple[FloatArray, Descriptors] | None:
     except _DAMAGED:
         return None
     whole = table.dtype == np.float64 and descriptors.dtype in (np.float32, np.uint8) and descriptors.ndim == 2
-    return (table, descriptors) if whole and table.shape == (len(descriptors), 5) else None
+    if not whole or table.shape != (len(descriptors), 5):
+        return None
+    used(path)
+    return table, descriptors
 
 
 def _content(path: Path) -> bytes | None:

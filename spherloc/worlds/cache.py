@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spherloc.cameras.base import Camera
-from spherloc.disk_cache import cache_folder, key_of, store
+from spherloc.disk_cache import cache_folder, key_of, make_room_once, store, used
 from spherloc.errors import InputError
 from spherloc.images import read_image
 from spherloc.worlds.conditions import CLEAR, Conditions
@@ -61,7 +61,10 @@ def render(
     path = image_path(world, camera, cam_from_world, conditions, seed, name)
     image, range_m = _stored_image(path, camera), stored_range(path, camera)
     if image is not None and range_m is not None:
+        used(path)
+        used(path.with_suffix(".npz"))
         return Render(image, range_m)
+    make_room_once(cache_folder("renders"))
     picture = draw(world, camera, cam_from_world, conditions, seed)
     done, png = cv2.imencode(".png", picture.image, [cv2.IMWRITE_PNG_COMPRESSION, 3])
     if done:
