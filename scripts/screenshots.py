@@ -43,13 +43,16 @@ CASES = (
 )
 """Of the gallery: what there is to be reviewed."""
 DOCS = {
-    "recordings": ("recordings", "dark", 0),
-    "playground": ("arcs", "dark", 0),
-    "selection": ("selection", "dark", 0),
-    "sweep": ("sweep", "dark", 0),
-    "street": ("sequence", "dark", 0),
+    "recordings": "recordings_dark_1280x720",
+    "playground": "arcs_dark_1280x720",
+    "selection": "selection_dark_1280x720",
+    "sweep": "sweep_dark_1280x720",
+    "street": "images_dark_1280x720",
 }
-"""Names in docs/ of a view in a theme at the size of that number."""
+"""Names in docs/ of pictures."""
+View = Callable[[Page], object]
+"""Brings the page to what is to be seen."""
+Views = dict[str, View]
 
 
 def tab(page: Page, name: str) -> None:
@@ -113,6 +116,7 @@ def sweep(page: Page) -> None:
 
 def review(page: Page) -> None:
     """Look for a failure in the list of runs, which may have many by now, and open it."""
+    tab(page, "Residuals")
     tab(page, "Recordings")
     label = page.locator("label", has_text=re.compile("^Search$"))
     label.locator("xpath=ancestor::*[contains(@class, 'Flex-root')][1]").locator("input").fill("false consensus")
@@ -121,12 +125,11 @@ def review(page: Page) -> None:
 
 
 def sequence(page: Page) -> None:
-    """Localize all queries of the scene."""
-    tab(page, "Images")
-    press(page, "Overview")
+    """Localize all queries of the scene, and look at the route from above."""
     press(page, "Localize all queries")
     page.get_by_role("button", name="Stop", exact=True).wait_for()
     page.get_by_role("button", name="Localize all queries", exact=True).wait_for()
+    press(page, "Above")
 
 
 def gallery(page: Page) -> None:
@@ -137,7 +140,7 @@ def gallery(page: Page) -> None:
     page.locator("[data-touch^='gallery-beside:moving-object']").first.wait_for()
 
 
-SYNTHETIC_VIEWS: dict[str, Callable[[Page], object]] = {
+SYNTHETIC_VIEWS: Views = {
     "outcome": lambda page: tab(page, "Yaw"),
     "arcs": lambda page: step(page, "The yaw most arcs share"),
     "twins": lambda page: step(page, "twin"),
@@ -155,13 +158,13 @@ SYNTHETIC_VIEWS: dict[str, Callable[[Page], object]] = {
     "recordings": review,
     "gallery": gallery,
 }
-STREET_VIEWS: dict[str, Callable[[Page], object]] = {
+STREET_VIEWS: Views = {
     "map": lambda page: tab(page, "Yaw"),
     "images": lambda page: tab(page, "Images"),
     "from_the_camera": lambda page: press(page, "From the camera"),
     "sequence": sequence,
 }
-SCENES: tuple[tuple[str, dict[str, Callable[[Page], object]]], ...] = (
+SCENES: tuple[tuple[str, Views], ...] = (
     (SYNTHETIC, SYNTHETIC_VIEWS),
     (STREET, STREET_VIEWS),
     (APARTMENT, {"apartment": lambda page: tab(page, "Images")}),
@@ -210,8 +213,7 @@ def still(page: Page) -> bytes:
 
 
 def main() -> None:
-    """Take all pictures, or those whose names are given."""
-    wanted = set(sys.argv[1:])
+    """Take all pictures, or those that are given: "arcs", "arcs_dark" or "arcs_dark_1280x720"."""
     path = os.environ.get("SPHERLOC_CHROMIUM") or shutil.which("chromium") or shutil.which("google-chrome")
     if path is None:
         raise SystemExit("no Chromium found; install one or set SPHERLOC_CHROMIUM to its path.")
@@ -221,34 +223,49 @@ def main() -> None:
         recordings = Path(folder)
         subprocess.run([PROGRAM, "gallery", *CASES, "--output", str(recordings / "gallery")], cwd=ROOT, check=True)
         for scene, views in SCENES:
-            chosen = {name: view for name, view in views.items() if not wanted or name in wanted}
-            if chosen:
+            rounds = [(size, theme, _chosen(views, size, theme)) for size in SIZES for theme in ("dark", "light")]
+            if any(chosen for _, _, chosen in rounds):
                 with served(scene, recordings) as address:
-                    for number, size in enumerate(SIZES):
-                        for theme in ("dark", "light"):
+                    for size, theme, chosen in rounds:
+                        if chosen:
                             browser = playwright.chromium.launch(executable_path=path, args=FLAGS)
                             page = browser.new_page(viewport={"width": size[0], "height": size[1]})
                             page.set_default_timeout(PATIENCE_MS)
                             take(page, address, theme == "dark")
                             for name, view in chosen.items():
-                                picture(page, name, view, theme, number)
+                                picture(page, name, view, theme, size)
                             browser.close()
 
 
-def picture(page: Page, name: str, view: Callable[[Page], object], theme: str, size: int) -> None:
+def _chosen(views: Views, size: tuple[int, int], theme: str) -> Views:
+    """Those of the views that are to be taken in that size and theme."""
+    wanted = sys.argv[1:]
+    stems = {name: stem(name, theme, size) for name in views}
+    return {
+        name: view
+        for name, view in views.items()
+        if not wanted or any(f"{stems[name]}_".startswith(f"{word}_") for word in wanted)
+    }
+
+
+def stem(name: str, theme: str, size: tuple[int, int]) -> str:
+    """What a picture is called."""
+    return f"{name}_{theme}_{size[0]}x{size[1]}"
+
+
+def picture(page: Page, name: str, view: View, theme: str, size: tuple[int, int]) -> None:
     """Bring the page to a view and photograph it."""
     start = time.monotonic()
     view(page)
-    width, height = SIZES[size]
-    path = FOLDER / f"{name}_{theme}_{width}x{height}.png"
-    page.mouse.move(width // 2, 2)  # away from what was pressed, and what it tells of itself
+    path = FOLDER / f"{stem(name, theme, size)}.png"
+    page.mouse.move(size[0] // 2, 2)  # away from what was pressed, and what it tells of itself
     if name not in SCROLLED:
         page.evaluate(TO_TOP)
     path.write_bytes(still(page))
     for deselect in page.locator("[data-touch='deselect:']").all():
         deselect.click()
     for title, shown in DOCS.items():
-        if shown == (name, theme, size):
+        if shown == path.stem:
             image = cv2.imread(str(path))
             assert image is not None
             cv2.imwrite(str(ROOT / "docs" / f"{title}.jpg"), image, JPEG)

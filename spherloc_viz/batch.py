@@ -13,14 +13,14 @@ from spherloc.datasets import Scene, load_scene
 from spherloc.datasets.map_scene import MapScene
 from spherloc.datasets.variation import Variation, used_seed
 from spherloc.diagnosis import Diagnosis, diagnose
-from spherloc.errors import InputError, SpherlocError
-from spherloc.estimators import default_options, estimate, options_type, warm_up
+from spherloc.errors import InputError, RecordingError, SpherlocError
+from spherloc.estimators import default_options, options_type, warm_up
 from spherloc.metrics import evaluate
 from spherloc.problem import Problem
 from spherloc.trace import Trace
 from spherloc_viz.layers.certificate import chance, proof, warning
 from spherloc_viz.options import json_text, option_fields
-from spherloc_viz.progress import prepare, say
+from spherloc_viz.progress import prepare, say, solve
 from spherloc_viz.recording.keeping.room import KEEP_GIGABYTES, kept_bytes
 from spherloc_viz.recording.origin import Origin
 from spherloc_viz.share import is_recording
@@ -70,8 +70,11 @@ def run_scenes(
                 if not jobs:
                     warm_up(say)
                 options = resolved_options(estimator, problem, changes)
-                trace = estimate(problem, estimator, options, used_seed(scene, seed))
+                trace = solve(problem, estimator, options, used_seed(scene, seed))
                 origin = None if keeper is None else _origin(path, scene, seed, query, variation)
+            except KeyboardInterrupt:
+                say(f"stopped in {path}; {len(jobs)} of {len(paths)} scenes were solved.")
+                raise
             except SpherlocError as error:
                 jobs.append(finisher.submit(_report, error))
                 continue
@@ -109,7 +112,10 @@ def keeper_of(records: Records | None) -> "Iterator[Keeper | None]":
 
     with Keeper(records.folder, say, records.full, keep_bytes) as keeper:
         with suppress(OSError):  # whoever cannot read the folder is told when a run cannot be written
-            keeper.tidy()
+            try:
+                keeper.tidy()
+            except RecordingError as error:
+                say(f"what killed processes left is not recovered: {error}")
         yield keeper
 
 

@@ -1,4 +1,4 @@
-"""The command line: run, localize, sweep, play, view, scenes."""
+"""The command line: what each command takes; the work is done elsewhere."""
 
 import os
 import sys
@@ -81,7 +81,7 @@ def run(
 
     variation = parse_variation(list(chain(*set)), spoil, mend, hide)
     kept = batch.Records(recordings, full, keep_gigabytes) if record else None
-    paths = [scene_path(scene) for scene in scenes]
+    paths = [scene_path(scene) for scene in recording_commands.without_reviews(scenes)]
     return batch.run_scenes(paths, estimator, seed, list(chain(*option)), json, kept, query, variation)
 
 

@@ -1,13 +1,22 @@
-"""How far a long job is, on stderr."""
+"""How far a long job is, on stderr, and jobs that Ctrl-C ends at once."""
 
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
+from typing import Any, TypeVar
 
 from tqdm import tqdm
 
 from spherloc.datasets.map_scene import MapScene
+from spherloc.estimators import estimate
+from spherloc.problem import Problem
+from spherloc.trace import Trace
+from spherloc.watch import Watch
+
+T = TypeVar("T")
 
 LINE_EVERY_S = 30.0
 """Where the output is no terminal, progress is a line now and then."""
@@ -47,6 +56,37 @@ def progress(count: int, plural: str) -> Iterator[Callable[[str], None]]:
             said = time.monotonic()
 
     yield line
+
+
+def solve(problem: Problem, estimator: str, options: Any, seed: int) -> Trace:
+    """``estimate`` for whoever may press Ctrl-C, who is told now and then how far a long run is.
+
+    The main thread could not hear of Ctrl-C while a kernel computes, which can take hours.
+    """
+    watch = Watch()
+    with ThreadPoolExecutor(1) as thread:
+        run = thread.submit(estimate, problem, estimator, options, seed, watch)
+        try:
+            while not wait([run], LINE_EVERY_S).done:
+                say(f"{estimator} is at {100 * watch.fraction:.0f} % of its search; Ctrl-C stops it.")
+        except KeyboardInterrupt:
+            watch.cancel()
+            raise
+        return run.result()
+
+
+def aside(work: Callable[[], T]) -> T:
+    """Do ``work`` on a thread that Ctrl-C leaves to itself; only for who ends the process then."""
+    done: Future[T] = Future()
+
+    def run() -> None:
+        try:
+            done.set_result(work())
+        except BaseException as error:
+            done.set_exception(error)
+
+    threading.Thread(target=run, daemon=True).start()
+    return done.result()
 
 
 def prepare(scene: MapScene) -> None:

@@ -1,5 +1,6 @@
 """The commands about recordings; ``spherloc_viz.cli`` registers them."""
 
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated
@@ -9,6 +10,13 @@ from tyro.conf import Positional, arg
 
 RECORDINGS = Path("recordings")
 RangeText = Annotated[str | None, arg(metavar="RANGE")]
+
+
+def without_reviews(files: Sequence[Path]) -> tuple[Path, ...]:
+    """What a shell's pattern such as ``*.rrd`` is meant to find; all if there is nothing but labels and notes."""
+    from spherloc_viz.recording.review.notes import REVIEW_SUFFIX
+
+    return tuple(file for file in files if not file.name.endswith(REVIEW_SUFFIX)) or tuple(files)
 
 
 def view(
@@ -69,9 +77,10 @@ def repeat(
         recordings: Recordings (.rrd), one or more.
         json: Print one JSON object a recording, on one line; infinity is the text "inf".
     """
+    from spherloc_viz.progress import solve
     from spherloc_viz.recording.again.repeat_text import repeat_all
 
-    return repeat_all(recordings, json)
+    return repeat_all(without_reviews(recordings), json, solve)
 
 
 def runs(
@@ -227,7 +236,7 @@ def label(
     """
     from spherloc_viz.runs import label_runs
 
-    return label_runs(recordings, add, remove, note)
+    return label_runs(without_reviews(recordings), add, remove, note)
 
 
 def reindex(folder: Positional[Path] = RECORDINGS, /) -> int:

@@ -76,8 +76,12 @@ def print_steps(folder: Path, condition: str, limit: int | None, form: str) -> i
         rows = index.find(RunQuery(), None).rows
     if len(rows) > MANY:
         say(f"reading the steps of {len(rows):,} recordings.")
-    found = find_steps(folder, rows, condition, None if most is None else most + 1)
+    steps = find_steps(folder, rows, condition, None if most is None else most + 1)
+    found = steps.found
     print(steps_text(folder, found[:most], form), end="", flush=True)
+    if steps.refused:
+        files = _count(len(steps.refused), "recording")
+        say(f"{files} left out, such as {show(steps.refused[0])}: rerun cannot read it beside the others.")
     if not found:
         say(f"no step matches in {_count(len(rows), 'run')} of {folder}.")
     elif most is not None and len(found) > most:

@@ -81,6 +81,11 @@ class Visitor:
         until(lambda: session._diagnosed is not None and session._diagnosed[0] is session._run.trace)  # type: ignore[union-attr]
 
     @property
+    def opening(self) -> bool:
+        """Whether a run is still being opened; what is said of it in the end is empty."""
+        return self.panel._reviewer._errand._busy
+
+    @property
     def rows(self) -> str:
         assert self.panel._runs is not None
         return self.panel._runs._rows.content

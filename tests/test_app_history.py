@@ -132,9 +132,9 @@ def test_it_remembers_so_many() -> None:
         (wish(), set()),
         (wish(seed=1), {"seed"}),
         (wish(noise_px=2.0), {"noise_px"}),
-        (wish(bound_px=2.0), {"options.bound_px"}),
+        (wish(bound_px=2.0), {"bound_px"}),
         (wish(estimator="ransac-2p", seed=3), {"estimator"}),
-        (wish(seed=1, noise_px=2.0, bound_px=2.0), {"seed", "noise_px", "options.bound_px"}),
+        (wish(seed=1, noise_px=2.0, bound_px=2.0), {"seed", "noise_px", "bound_px"}),
     ],
 )
 def test_what_differs(other: Wish, names: set[str]) -> None:

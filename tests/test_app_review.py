@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+import re
 import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import fields, replace
@@ -18,11 +19,14 @@ from spherloc_viz.app.review import bundle as bundle_module
 from spherloc_viz.app.review.bundle import bundle
 from spherloc_viz.app.review.differences import comparison_html
 from spherloc_viz.app.review.filters import Counts, filters_html
+from spherloc_viz.app.review.gallery_list import file_of, gallery_html
 from spherloc_viz.app.review.look import PAGE, Look
-from spherloc_viz.app.review.rows import rows_html
+from spherloc_viz.app.review.rows import WIDTH_PX, rows_html, verdict_html
 from spherloc_viz.app.review.shelf import Shelf, merged
 from spherloc_viz.app.review.summary_page import summary_html
 from spherloc_viz.app.web.touch import Touch, TouchDesk, Touches
+from spherloc_viz.cli import app
+from spherloc_viz.gallery import gallery_cases
 from spherloc_viz.recording.index.query import Range
 from spherloc_viz.recording.index.run_index import RunIndex
 from spherloc_viz.recording.index.run_text import rows_text
@@ -204,6 +208,24 @@ def test_a_row_says_what_came_out_and_where_to_go() -> None:
     assert "No recorded run fits" in rows_html([], frozenset(), None, 0, Look(text="x"), NOW)
 
 
+def test_a_verdict_names_the_cause_and_a_doubtful_success_stays_one() -> None:
+    failed, sure, doubtful = made_row(1), made_row(3), made_row(3, diagnosis="too few inliers")
+    assert verdict_html(failed).endswith(">too few inliers</b>") and 'title="failure"' in verdict_html(failed)
+    assert verdict_html(sure).endswith(">success</b>")
+    assert verdict_html(doubtful).endswith(">success</b>, too few inliers?")
+
+
+def test_the_gallery_has_room_for_pictures_once_there_are_some() -> None:
+    cases = gallery_cases()
+    shown = cases[3].key
+    without = gallery_html(cases, {}, shown)
+    row = replace(made_row(1), file=file_of(cases[0]))
+    assert f"width:{WIDTH_PX}px" not in without
+    assert gallery_html(cases, {row.file: row}, None).count(f"width:{WIDTH_PX}px") == len(cases)
+    assert without.count("data-reveal") == 1 and f'data-reveal="{shown}"' in without
+    assert "data-reveal" not in gallery_html(cases, {}, None)
+
+
 def test_two_runs_differ_in_what_differs() -> None:
     one = made_row(1, options='{"bound_px": 3.0, "samples": 10}')
     other = made_row(3, options='{"bound_px": 4.0, "samples": 10}')
@@ -236,6 +258,11 @@ def test_an_export_is_whole_readable_and_bounded(shelf: Shelf, tmp_path: Path, m
         bundle(shelf.folder, rows[2:], 2, NOW, lambda: False)
     with pytest.raises(RecordingError, match="page was closed"):
         bundle(shelf.folder, rows, 4, NOW, lambda: True)
+
+
+def test_an_export_names_commands_that_there_are() -> None:
+    named = set(re.findall("<code>spherloc ([a-z-]+)", summary_html([made_row(1)], "", NOW)))
+    assert "repeat" in named and named <= set(app._subcommands)
 
 
 def test_a_table_has_every_number() -> None:

@@ -18,8 +18,9 @@ from recording_samples import scene_problem
 from rerun.chunk import Chunk, LazyChunkStream
 from test_app_front_door import Door, door_to
 
-from spherloc.errors import InputError
+from spherloc.errors import InputError, RecordingError
 from spherloc.estimators import estimate
+from spherloc_viz.app.web import viewer_room
 from spherloc_viz.app.web.viewer_page import sorry_page, viewer_page, viewer_policy
 from spherloc_viz.app.web.viewer_room import Viewable, ViewerRoom, of_index, viewer_link
 from spherloc_viz.recording.content.writer import write_recording
@@ -235,6 +236,12 @@ def test_strangers_are_refused_here_too(folder: Folder) -> None:
             assert found.headers["X-Content-Type-Options"] == "nosniff"
 
     visit(*folder, calls)
+
+
+def test_a_run_that_goes_meanwhile_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(viewer_room, "resolve_inside", lambda folder, file: folder / file)
+    with RunIndex(tmp_path) as index, pytest.raises(RecordingError, match=r"gone\.rrd: the recording cannot be read"):
+        of_index(index)("gone.rrd")
 
 
 def test_where_nothing_is_recorded_it_says_so() -> None:

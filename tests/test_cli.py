@@ -1,17 +1,15 @@
 """The command line as a user calls it: a process, its exit code, what it prints."""
 
 import json
-import os
-import subprocess
-import sys
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 import pytest
+from cli_process import ROOT, SCENE, one_sentence, spherloc
 
-from spherloc.datasets import bundled_scenes, load_scene
+from spherloc.datasets import load_scene
 from spherloc.diagnosis import Cause, Diagnosis
 from spherloc.errors import InputError
 from spherloc.estimators import estimate
@@ -19,8 +17,6 @@ from spherloc.trace import Certificate
 from spherloc_viz import batch
 from spherloc_viz.options import json_text
 
-ROOT = Path(__file__).resolve().parents[1]
-SCENE = ROOT / "scenes" / "mei_outliers_80.toml"
 ARIA = ROOT / ".." / "shared" / "data" / "aria_adt_fisheye"
 
 CAMERA = """
@@ -38,25 +34,6 @@ HEAD = 'kind = "correspondences"\nname = "tiny"\ncorrespondences = "matches.csv"
 ROWS = "u,v,X,Y,Z\n100,50,0,0,5\n150,40,4,-1,0\n60,70,-3,2,1\n"
 
 
-def spherloc(*words: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
-    """Run the installed console command."""
-    program = Path(sys.executable).with_name("spherloc")
-    environment = os.environ | {"COLUMNS": "100"}
-    return subprocess.run(
-        [program, *map(str, words)], cwd=cwd, capture_output=True, text=True, timeout=240, env=environment, check=False
-    )
-
-
-def one_sentence(result: subprocess.CompletedProcess[str]) -> str:
-    """The error of a run that failed as a user's mistake should: exit code 2, one line, nothing on stdout."""
-    assert result.returncode == 2, result
-    assert result.stdout == ""
-    lines = result.stderr.strip().splitlines()
-    assert len(lines) == 1, result.stderr
-    assert lines[0].startswith("spherloc: ") and "Traceback" not in lines[0]
-    return lines[0]
-
-
 def tiny(folder: Path, toml: str = HEAD + CAMERA + GRAVITY, rows: str | bytes = ROWS) -> Path:
     """A measured scene of three matches."""
     (folder / "matches.csv").write_bytes(rows if isinstance(rows, bytes) else rows.encode())
@@ -67,7 +44,8 @@ def tiny(folder: Path, toml: str = HEAD + CAMERA + GRAVITY, rows: str | bytes = 
 @pytest.mark.parametrize("estimator", ["mc", "mc-exact", "ransac-2p"])
 def test_run_prints_one_json_object_a_scene_and_records_each(tmp_path: Path, estimator: str) -> None:
     scenes = [SCENE, ROOT / "scenes" / "panorama_outliers_90.toml"]
-    result = spherloc("run", *scenes, "--estimator", estimator, "--seed", "5", "--json", cwd=tmp_path)
+    given = (SCENE, "panorama_outliers_90")
+    result = spherloc("run", *given, "--estimator", estimator, "--seed", "5", "--json", cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     records = [json.loads(line) for line in result.stdout.splitlines()]
     assert [record["scene"] for record in records] == [str(scene) for scene in scenes]
@@ -311,25 +289,6 @@ def test_help_has_examples(tmp_path: Path, command: str) -> None:
     result = spherloc(command, "--help", cwd=tmp_path)
     assert result.returncode == 0
     assert "For example:" in result.stdout and f"spherloc {command}" in result.stdout
-
-
-def test_scenes_lists_what_play_and_run_accept(tmp_path: Path) -> None:
-    bundled, kinds = spherloc("scenes", cwd=tmp_path).stdout.split("\n\n")
-    rows = [line.split("  ")[1:] for line in bundled.splitlines()[1:] if not line.startswith("    ")]
-    by_name = {name: (kind, title) for name, kind, title in rows}
-    assert by_name.keys() == bundled_scenes().keys() and len(rows) >= 9
-    assert by_name["mei_outliers_80"] == ("synthetic", "MEI fisheye, 80 % outliers")
-    assert "rendered" in {kind for kind, _ in by_name.values()}
-    listed = [line.split()[0] for line in kinds.splitlines()[1:]]
-    assert listed == sorted(listed) and {"correspondences", "kitti360", "colmap", "rendered"} <= set(listed)
-    assert "cannot be read" not in kinds
-
-
-def test_scenes_shows_how_a_kind_is_written(tmp_path: Path) -> None:
-    shown = spherloc("scenes", "colmap", cwd=tmp_path).stdout
-    assert 'kind = "colmap"' in shown and "``" not in shown and "code-block" not in shown
-    assert str(SCENE) in spherloc("scenes", "synthetic", cwd=tmp_path).stdout
-    assert "'magic'" in one_sentence(spherloc("scenes", "magic", cwd=tmp_path))
 
 
 @pytest.mark.skipif(not ARIA.is_dir(), reason="the shared Aria data are not beside the project")

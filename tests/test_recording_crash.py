@@ -28,6 +28,8 @@ from spherloc_viz.recording.keeping.leftovers import STALE_AFTER_S, here, leftov
 from spherloc_viz.recording.keeping.recorder import Recorder
 from spherloc_viz.recording.keeping.rescue import rescue
 from spherloc_viz.recording.review.notes import write_review
+from spherloc_viz.recording.strangers.child_process import ExaminerError
+from spherloc_viz.recording.strangers.examiner import Examiner
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -128,6 +130,12 @@ def test_whoever_is_killed_at_any_moment_loses_the_run_in_flight_only(
     assert len(now) - 1 - len(files) <= before and all("Recovered" in sentence for sentence in notices)
 
 
+@pytest.fixture(scope="module")
+def examiner() -> Iterator[Examiner]:
+    with Examiner() as examiner:
+        yield examiner
+
+
 def wait_for_upkeep(recorder: Recorder) -> None:
     recorder._upkeep.join(120)
     assert not recorder._upkeep.is_alive()
@@ -136,13 +144,13 @@ def wait_for_upkeep(recorder: Recorder) -> None:
 @settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(share=st.floats(0.0, 1.0), garbage=st.binary(max_size=40))
 def test_what_is_left_of_a_file_becomes_the_run_again_or_nothing(
-    recorded: bytes, trace: Trace, dead: str, share: float, garbage: bytes
+    recorded: bytes, trace: Trace, dead: str, examiner: Examiner, share: float, garbage: bytes
 ) -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         part = part_of(folder, "a.rrd", dead, recorded[: round(share * len(recorded))] + garbage)
         assert leftovers(folder) == [part]
-        path = rescue(part)
+        path = rescue(part, examiner)
         left = [file.name for file in folder.iterdir()]
         if path is None:
             assert left == [] and share < 0.6
@@ -152,22 +160,31 @@ def test_what_is_left_of_a_file_becomes_the_run_again_or_nothing(
 
 
 def test_a_finished_file_without_its_name_is_moved_and_never_onto_another(
-    recorded: bytes, dead: str, tmp_path: Path
+    recorded: bytes, dead: str, examiner: Examiner, tmp_path: Path
 ) -> None:
-    path = rescue(part_of(tmp_path, "a.rrd", dead, recorded))
+    path = rescue(part_of(tmp_path, "a.rrd", dead, recorded), examiner)
     assert path == tmp_path / "a.rrd" and path.read_bytes() == recorded
-    assert rescue(part_of(tmp_path, "a.rrd", dead, recorded[:1000])) is None
+    assert rescue(part_of(tmp_path, "a.rrd", dead, recorded[:1000]), examiner) is None
     assert path.read_bytes() == recorded and len(list(tmp_path.iterdir())) == 1
 
 
 def test_without_room_a_leftover_waits(
-    recorded: bytes, dead: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    recorded: bytes, dead: str, examiner: Examiner, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     part = part_of(tmp_path, "a.rrd", dead, recorded[: len(recorded) * 9 // 10])
     with monkeypatch.context() as patch:
         patch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=1000))
-        assert rescue(part) is None and part.exists()
-    assert rescue(part) == tmp_path / "a.rrd" and not part.exists()
+        assert rescue(part, examiner) is None and part.exists()
+    assert rescue(part, examiner) == tmp_path / "a.rrd" and not part.exists()
+
+
+def test_a_leftover_that_cannot_be_read_since_nothing_can_be_stays(recorded: bytes, dead: str, tmp_path: Path) -> None:
+    """It was taken for a broken one, and deleted, where the process that reads it did not start or was ended."""
+    part, ended = part_of(tmp_path, "a.rrd", dead, recorded), Examiner()
+    ended.close()
+    with pytest.raises(ExaminerError):
+        rescue(part, ended)
+    assert part.read_bytes() == recorded and [path.name for path in tmp_path.iterdir()] == [part.name]
 
 
 def test_only_what_nobody_will_finish_is_a_leftover(dead: str, tmp_path: Path) -> None:

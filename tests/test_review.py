@@ -111,6 +111,15 @@ def test_a_recording_that_is_no_review_is_a_sentence(tmp_path: Path):
         read_review(tmp_path / "run.rrd")
 
 
+def test_a_name_that_leaves_no_room_for_a_review(tmp_path: Path):
+    """The run is a run; that it cannot be labelled is a sentence."""
+    recording = tmp_path / ("r" * 250 + ".rrd")
+    recording.write_text("a run")
+    assert read_review(recording) == Review()
+    with pytest.raises(RecordingError, match="labels and note cannot be stored"):
+        write_review(recording, ["x"], "", run_id="1")
+
+
 def test_the_run_must_be_one(tmp_path: Path):
     (tmp_path / "bad.rrd").write_bytes(b"no recording")
     with pytest.raises(RecordingError, match="not a whole recording"):

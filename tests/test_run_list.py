@@ -17,6 +17,7 @@ from run_rows import random_row, some_row
 from spherloc.errors import InputError
 from spherloc.estimators import default_options, estimate
 from spherloc_viz.recording.content.writer import write_recording
+from spherloc_viz.recording.index.catalog import find_steps
 from spherloc_viz.recording.index.query import RunQuery
 from spherloc_viz.recording.index.run_index import RunIndex
 from spherloc_viz.recording.index.run_text import FORMS, WIDTH, counts_text, rows_text
@@ -245,7 +246,7 @@ def test_steps_are_asked_for_over_all_runs(folder: Path, capsys: pytest.CaptureF
     assert steps("agreeing > 1000", folder) == 0
     assert "no step matches in 4 runs" in capsys.readouterr().err
     for condition in ("stage > 3", "step", "step = ", "step = 1 1", "step / 0 = 1", "not " * 240 + "true"):
-        with pytest.raises(InputError, match="the condition cannot be answered: ") as caught:
+        with pytest.raises(InputError, match=r"the condition cannot be answered \(.+\): compare columns") as caught:
             steps(condition, folder)
         assert "\n" not in str(caught.value)
 
@@ -256,8 +257,15 @@ def test_steps_of_runs_that_cannot_be_asked(folder: Path, capsys: pytest.Capture
     shutil.copy(folder / "right.rrd", folder / "copy.rrd")
     assert steps("step = 0 AND estimator = 'mc' AND outcome = 'success'", folder, format="csv") == 0
     assert len(listed(capsys)) == 1
+    assert "left out" not in capsys.readouterr().err
     with RunIndex(folder) as index:
-        for row in index.find(RunQuery()).rows:
+        rows = index.find(RunQuery()).rows
+        (folder / "vanished.rrd").write_text("no run")
+        vanished = replace(rows[0], run_id="0", file="vanished.rrd")
+        steps_found = find_steps(folder, [vanished, *rows], "step = 0")
+        assert steps_found.refused == ("vanished.rrd",)
+        assert {step.run.run_id for step in steps_found.found} == {row.run_id for row in rows}
+        for row in rows:
             index.add(replace(row, format_version=1))
     assert steps("step = 0", folder, format="csv") == 0
     assert listed(capsys) == []

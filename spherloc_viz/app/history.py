@@ -16,6 +16,7 @@ some seconds on a slider to look at the picture, and what it does to the same sl
 take back alone. Another control, or an undo, in between ends the move at once."""
 PRESSED = frozenset({"seed"})
 """Numbers that are not dragged: each change counts."""
+OPTIONS = "options."
 DRAGGED = (int, float, TrueCamera)
 """Types of what can be dragged; each change of others counts too."""
 
@@ -37,7 +38,7 @@ class History:
         with self._lock:
             if self._at >= 0 and wish == self._wishes[self._at]:
                 return
-            moved = changed_fields(self._wishes[self._at], wish) if self._at >= 0 else frozenset()
+            moved = _changed(self._wishes[self._at], wish) if self._at >= 0 else frozenset()
             if not self._goes_on(moved, wish, now_s):
                 self._start = self._at
             del self._wishes[self._start + 1 :]
@@ -70,7 +71,12 @@ class History:
 
 
 def changed_fields(one: Wish, other: Wish) -> frozenset[str]:
-    """Names of what differs; those of options begin with "options."."""
+    """Names of what differs."""
+    return frozenset(name.removeprefix(OPTIONS) for name in _changed(one, other))
+
+
+def _changed(one: Wish, other: Wish) -> frozenset[str]:
+    """The same, but those of options begin with ``OPTIONS``: a scene may have a number of the same name."""
     if one.estimator != other.estimator:
         return frozenset({"estimator"})
     before, after = _values(one), _values(other)
@@ -79,7 +85,7 @@ def changed_fields(one: Wish, other: Wish) -> frozenset[str]:
 
 def _values(wish: Wish) -> dict[str, Any]:
     """All that a wish says, by names."""
-    parts = (("", wish.scene), ("", wish.scene.variation), ("options.", wish.options))
+    parts = (("", wish.scene), ("", wish.scene.variation), (OPTIONS, wish.options))
     values = {
         prefix + item.name: getattr(part, item.name) for prefix, part in parts for item in dataclasses.fields(part)
     }

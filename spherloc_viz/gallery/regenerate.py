@@ -15,7 +15,7 @@ from spherloc_viz.gallery.case import Beside, GalleryCase, origin_of
 from spherloc_viz.gallery.check import Played, faults, play
 from spherloc_viz.recording.content.writer import write_recording
 from spherloc_viz.recording.origin import Origin
-from spherloc_viz.recording.review.notes import review_path, write_review
+from spherloc_viz.recording.review.notes import has_review, write_review
 from spherloc_viz.recording.strangers.examiner import examine_review
 
 WIDTH = 100
@@ -79,7 +79,7 @@ def record(played: Played, folder: Path) -> list[Path]:
 
 def _record(path: Path, trace: Trace, origin: Origin, diagnosis: Diagnosis | None = None) -> None:
     row = write_recording(trace, path, origin, diagnosis)
-    if not review_path(path).exists():
+    if not has_review(path):
         return
     try:
         review = examine_review(path)

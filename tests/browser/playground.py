@@ -1,6 +1,7 @@
 """The playground as a user meets it: a real server, a real Chromium, and what is on the page."""
 
 import json
+import math
 import os
 import re
 import shutil
@@ -274,7 +275,8 @@ class Playground:
         """Close what lies above the canvas, and wait until the viewer stands still, at a view of ours."""
         close = "() => document.querySelectorAll('[class*=Notification-closeButton]').forEach(button => button.click())"
         self.page.evaluate(close)
-        self.until(lambda: abs(np.linalg.norm(self.viewer[:3]) - np.linalg.norm(START)) > 0.01, "the first view is set")
+        away = float(np.linalg.norm(START))
+        self.until(lambda: abs(math.hypot(*self.viewer[:3]) - away) > 0.01, "the first view is set")
         self.still(lambda: self.viewer, "the viewer stands still")
 
     def still(self, read: Callable[[], T], what: str) -> T:
@@ -336,9 +338,25 @@ class Playground:
             counts[name] = counts.get(name, 0) + round(count)
         return counts
 
+    def step_number(self) -> int:
+        """Which step is at hand, from 1."""
+        return self._steps()[0]
+
     def step_count(self) -> int:
         """How many steps there are."""
-        return int(self.step.input_value().split("/")[1].split()[0])
+        return self._steps()[1]
+
+    def _steps(self) -> tuple[int, int]:
+        """The step at hand and the number of steps, as soon as the list of steps says so: while it changes it is empty
+        for a moment."""
+        found: list[tuple[str, str]] = []
+
+        def is_said() -> bool:
+            found[:] = re.findall(r"^(\d+)/(\d+)  ", self.step.input_value())
+            return bool(found)
+
+        self.until(is_said, "the list of steps has a value")
+        return int(found[0][0]), int(found[0][1])
 
     def until(self, condition: Callable[[], bool], what: str, patience_s: float = PATIENCE_MS / 1000) -> None:
         """Wait until something is so on the page."""

@@ -62,7 +62,9 @@ class RecordingsPanel:
         self._status = gui.add_html("", visible=False)
         self._parts: list[RunList | Notes | Reviewer | Exporter | GalleryList] = []
         self._runs: RunList | None = None
-        self._aside = Errand(f"spherloc-runs-aside-{name}", self._complain)
+        # Apart, as it may take minutes to take in a thousand new recordings.
+        self._preparing = Errand(f"spherloc-runs-preparing-{name}", self._complain)
+        self._comparing = Errand(f"spherloc-runs-comparing-{name}", self._complain)
         if shelf is None:
             self._say("Runs are not recorded: start the playground without --no-record to review them here.")
         else:
@@ -94,7 +96,7 @@ class RecordingsPanel:
         self._reviewer = Reviewer(touches, self._runs, reviewing, name)
         exporter = Exporter(client, touches, shelf, self._runs, self._say, self._complain)
         self._parts += [self._notes, self._runs, self._reviewer, exporter]
-        touches.on("runs-compare", lambda touch: self._aside.ask(self._compare))
+        touches.on("runs-compare", lambda touch: self._comparing.ask(self._compare))
         touches.on("runs-uncompare", lambda touch: self._uncompare())
 
     @property
@@ -106,13 +108,14 @@ class RecordingsPanel:
         """End what goes on; does not wait."""
         for part in self._parts:
             part.close()
-        self._aside.close()
+        self._preparing.close()
+        self._comparing.close()
 
     def _see(self, touch: Touch) -> None:
         """Other tabs are open now."""
         before, self._seen = self._seen, VIEW in touch.argument.split(",")
         if self._seen and not before and self._shelf is not None:
-            self._aside.ask(self._shelf.prepare)
+            self._preparing.ask(self._shelf.prepare)
         self._show()
 
     def _choose(self, touch: Touch) -> None:

@@ -72,7 +72,7 @@ def card_html(opened: Opened, run: Run, diagnosis: Diagnosis | None, bar: str) -
 def _result(row: RunRow) -> str:
     """What came out of the recorded run, in a line, and what the diagnosis says."""
     errors = errors_text(row.rotation_error_deg, row.translation_error_m)
-    facts = [f"{row.inliers} of {row.correspondences}", *([errors] if errors != words.UNKNOWN else [])]
+    facts = [f"{row.inliers}/{row.correspondences}", *([errors] if errors != words.UNKNOWN else [])]
     told = "".join(f' · <span style="white-space:nowrap">{fact}</span>' for fact in facts)
     line = f'{verdict_html(row)}<span style="{DIM}">{told}</span>'
     return f'<div>{line}</div><div style="{DIM}">{escape(row.summary)}</div>'

@@ -14,8 +14,8 @@ WIDE_RAD = np.radians(85.0)
 UP = np.array([0.0, -1.0, 0.0])
 START = (3.0, -3.0, 3.0)
 """Where a page's viewer stands until its first view is set."""
-MARGIN = 0.06
-"""Share of the canvas that stays free on every side."""
+MARGINS = np.array([0.13, 0.06])
+"""Shares of the canvas' half width and half height that stay free on every side: labels are wide."""
 ROUNDS = 4
 """Perspective shifts the middle of what is seen, so the target is moved there a few times."""
 ROOM = 1.35
@@ -149,7 +149,7 @@ def _fit(subject: FloatArray, direction: FloatArray, aspect: float) -> View:
     right = np.cross(UP, backward)
     right /= np.linalg.norm(right)
     sideways = np.column_stack([right, np.cross(backward, right)])
-    slopes = np.tan(FIELD_OF_VIEW_RAD / 2) * (1.0 - MARGIN) * np.array([aspect, 1.0])
+    slopes = np.tan(FIELD_OF_VIEW_RAD / 2) * (1.0 - MARGINS) * np.array([aspect, 1.0])
     target, distance = (np.min(subject, axis=0) + np.max(subject, axis=0)) / 2, 1.0
     for _ in range(ROUNDS):
         offset = subject - target

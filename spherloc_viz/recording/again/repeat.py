@@ -1,5 +1,6 @@
 """Repeats a recorded run and compares: the same to the last bit, or what differs and what may be why."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ from spherloc.cameras.base import FloatArray
 from spherloc.errors import InputError, RecordingError
 from spherloc.estimators import estimate
 from spherloc.metrics import rotation_error_deg, translation_error_m
+from spherloc.problem import Problem
 from spherloc.trace import Certificate, Trace
 from spherloc_viz.recording.again.same import same_bits
 from spherloc_viz.recording.again.scene import load_recorded_scene, missing_options, recorded_options
@@ -19,6 +21,7 @@ from spherloc_viz.recording.keeping.machine import machine
 ROUNDING = 1e-9
 """Numbers that differ by no more, relative to the largest of a pose's, differ by rounding."""
 MACHINE = "machine"
+Solve = Callable[[Problem, str, Any, int], Trace]
 
 
 @dataclass(frozen=True)
@@ -70,15 +73,17 @@ class Repeated:
         return not self.differences
 
 
-def repeat(path: Path) -> Repeated:
+def repeat(path: Path, solve: Solve | None = None) -> Repeated:
     """Solve the problem of a recording again with its estimator, options and seed, and compare.
+
+    ``solve`` does it in the place of ``estimate``: of a stranger's options that may take hours.
 
     Raises ``RecordingError`` if there is no such recording, or this spherloc has no such estimator or option.
     """
     scene = load_recorded_scene(path)
     run, options = scene.run, recorded_options(scene.run, path)
     try:
-        trace = estimate(run.problem, run.estimator, options, run.seed)
+        trace = (solve or estimate)(run.problem, run.estimator, options, run.seed)
     except InputError as error:
         raise RecordingError(f"{path}: cannot be repeated: {error}") from None
     differences = tuple(compare(run, trace))

@@ -9,22 +9,25 @@ from typing import Any
 from spherloc.errors import InputError, SpherlocError
 from spherloc.estimators import warm_up
 from spherloc_viz.options import json_text
-from spherloc_viz.recording.again.repeat import Repeated, repeat
+from spherloc_viz.recording.again.repeat import Repeated, Solve, repeat
 
 
-def repeat_all(paths: Sequence[Path], as_json: bool) -> int:
+def repeat_all(paths: Sequence[Path], as_json: bool, solve: Solve | None = None) -> int:
     """Repeat recordings and print the outcome of each; returns the exit code.
 
     0 if all are the same, 1 if one differs, 2 if one cannot be repeated, which is reported while the others still are.
-    Raises ``InputError`` if there is none.
+    ``solve`` does it in the place of ``estimate``. Raises ``InputError`` if there is none.
     """
     if not paths:
         raise InputError("no recording given; name one or more files (.rrd).")
     warm_up(_say)
     worst = 0
-    for path in paths:
+    for done, path in enumerate(paths):
         try:
-            repeated = repeat(path)
+            repeated = repeat(path, solve)
+        except KeyboardInterrupt:
+            _say(f"stopped in {path}; {done} of {len(paths)} recordings were repeated.")
+            raise
         except SpherlocError as error:
             _say(str(error))
             worst = 2

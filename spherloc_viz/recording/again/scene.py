@@ -49,7 +49,7 @@ def load_recorded_scene(path: Path) -> RecordedScene:
     path = Path(path)
     if not path.is_file():
         raise RecordingError(f"{path}: no such file; give the path of a recording (.rrd).")
-    examine(path.absolute())  # the process that reads it may be in another folder
+    examine(path)
     return RecordedScene(read_recording(path), path)
 
 

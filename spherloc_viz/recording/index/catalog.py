@@ -37,8 +37,18 @@ class StepFound:
     """Likewise, metres."""
 
 
-def find_steps(folder: Path, rows: Sequence[RunRow], condition: str, limit: int | None = None) -> tuple[StepFound, ...]:
-    """The steps of some runs of a folder for which a condition in SQL holds, the newest run first.
+@dataclass(frozen=True)
+class Steps:
+    """What was found."""
+
+    found: tuple[StepFound, ...]
+    """The newest run first."""
+    refused: tuple[str, ...]
+    """Files that the catalog cannot have beside the others."""
+
+
+def find_steps(folder: Path, rows: Sequence[RunRow], condition: str, limit: int | None = None) -> Steps:
+    """The steps of some runs of a folder for which a condition in SQL holds.
 
     ``rows`` are runs as the index of the folder lists them, so that their files are known to be sound. The condition
     is one of ``checked_condition``; nothing else of SQL is run. Raises ``InputError`` if it cannot be understood or
@@ -50,16 +60,19 @@ def find_steps(folder: Path, rows: Sequence[RunRow], condition: str, limit: int 
     from rerun.server import Server
 
     if not known:
-        return ()
+        return Steps((), ())
     files = [str(folder / row.file) for row in known.values()]
     try:
         # Only for this machine; by default others could read the recordings.
         with Server(host="127.0.0.1", datasets={"runs": files}) as server:
             client = server.client()  # kept, since tables know their catalog only as long as it lives
-            found = _filtered(_frame(client.get_dataset("runs")), checked, limit)
+            runs = client.get_dataset("runs")
+            taken = set(runs.segment_ids())
+            found = _filtered(_frame(runs), checked, limit) if taken else []
     except (OSError, ValueError, RuntimeError, ConnectionError) as error:
         raise RecordingError(f"{folder}: rerun's catalog cannot read the recordings ({_first_line(error)}).") from error
-    return tuple(StepFound(known[row.pop(_RUN)], **{name: row[name] for name in STEP_COLUMNS}) for row in found)
+    steps = tuple(StepFound(known[row.pop(_RUN)], **{name: row[name] for name in STEP_COLUMNS}) for row in found)
+    return Steps(steps, tuple(row.file for row in known.values() if row.run_id not in taken))
 
 
 def _frame(dataset: Any) -> Any:

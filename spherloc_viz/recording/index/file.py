@@ -184,6 +184,8 @@ def sentence(path: Path, error: Exception) -> str:
         return f"{path}: another program has locked the list of runs for {BUSY_S:.0f} s; end it and try again."
     if code == sqlite3.SQLITE_FULL:
         return f"{path}: the disk is full; make room, then run spherloc reindex."
+    if code == sqlite3.SQLITE_IOERR:
+        return f"{path}: the list of runs cannot be read or written ({error}); make room on its disk, or check that."
     if code in _CANNOT_WRITE or isinstance(error, PermissionError):
         return f"{path}: the list of runs cannot be written; give its folder write access or choose another one."
     return f"{path}: the list of runs cannot be used ({error}); run spherloc reindex."

@@ -4,7 +4,7 @@ import contextlib
 import os
 import sqlite3
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -12,9 +12,9 @@ from typing import Protocol, TypeVar
 
 from spherloc.errors import RecordingError
 from spherloc_viz.recording.index.rows import put
-from spherloc_viz.recording.review.notes import REVIEW_SUFFIX, UNREADABLE, review_path
+from spherloc_viz.recording.review.notes import REVIEW_SUFFIX, UNREADABLE, has_review, review_path
 from spherloc_viz.recording.run_row import RunRow
-from spherloc_viz.recording.strangers.examiner import check_name, examine_all
+from spherloc_viz.recording.strangers.examiner import Examiners, check_name, examine_all
 
 Examine = Callable[[Sequence[Path]], Iterable[tuple[Path, RunRow | RecordingError]]]
 """Reads recordings one after another: the row of each, or what is wrong with it."""
@@ -31,24 +31,24 @@ WORTH_A_WORKER = 50
 """Recordings for which it pays to start another process, which takes a second."""
 
 
-def examine_side_by_side(paths: Sequence[Path]) -> Generator[tuple[Path, RunRow | RecordingError], None, None]:
-    """``examine_all`` by several processes at once, in the order of the paths; by one where there are few paths."""
+def examine_side_by_side(
+    paths: Sequence[Path], examiners: Examiners | None = None
+) -> Generator[tuple[Path, RunRow | RecordingError], None, None]:
+    """``examine_all`` by several processes at once, in the order of the paths; by one where there are few paths.
+
+    They end with this, or with their owner ``examiners``, which raises ``ExaminerError``.
+    """
     workers = max(1, min(MOST_WORKERS, os.cpu_count() or 1, len(paths) // WORTH_A_WORKER))
-    readers = [examine_all(paths[k::workers]) for k in range(workers)]
-    with ThreadPoolExecutor(workers) as threads:
+    with ThreadPoolExecutor(workers) as threads, (examiners or Examiners()).crew(workers) as crew:
+        readers = [examine_all(paths[k::workers], crew[k]) for k in range(workers)]
+        # Whoever leaves early, as by Ctrl-C, ends the crew first and waits for no file.
         answers = [threads.submit(next, reader, None) for reader in readers]
-        try:
-            for number in range(len(paths)):
-                k = number % workers
-                answer = answers[k].result()
-                assert answer is not None
-                answers[k] = threads.submit(next, readers[k], None)
-                yield answer
-        finally:
-            wait(answers)
-            for reader in readers:
-                if isinstance(reader, Generator):
-                    reader.close()  # now, since it holds a process
+        for number in range(len(paths)):
+            k = number % workers
+            answer = answers[k].result()
+            assert answer is not None
+            answers[k] = threads.submit(next, readers[k], None)
+            yield answer
 
 
 @dataclass(frozen=True)
@@ -156,7 +156,7 @@ class Refresher:
                 continue
             put(connection, replace(result, file=file), stamp)
             runs += 1
-            if review_path(path).exists() and not result.labels and not result.note:
+            if has_review(path) and not result.labels and not result.note:
                 _skip(connection, file, stamp, f"{review_path(path)}: {UNREADABLE}")
         return runs
 

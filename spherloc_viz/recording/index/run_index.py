@@ -17,7 +17,7 @@ from spherloc_viz.recording.index.refresh import Examine, Progress, Refreshed, R
 from spherloc_viz.recording.index.rows import put, rows_of
 from spherloc_viz.recording.review.notes import Review, write_review
 from spherloc_viz.recording.run_row import RunRow
-from spherloc_viz.recording.strangers.examiner import check_name, examine
+from spherloc_viz.recording.strangers.examiner import Examiners, check_name, examine
 
 T = TypeVar("T")
 MOST_TRIES = 4
@@ -53,7 +53,7 @@ class RunIndex:
         self.stale = True
         """Whether there may be recordings that it does not know: ``refresh`` has not looked for them yet."""
         self._notice = on_notice or (lambda sentence: None)
-        self._lock = threading.RLock()
+        self._lock, self._refreshing = threading.RLock(), threading.Lock()
         self._connection: sqlite3.Connection | None = None
         self._file: tuple[int, int] | None = None
         self._place: tuple[int, int] | None = None
@@ -61,7 +61,8 @@ class RunIndex:
         self._closed = False
         self._opened = 0
         """How often; rises when the database has become another one."""
-        self._refreshing = threading.Lock()
+        self.examiners = Examiners()
+        """Once they are closed, whoever refreshes gets a ``RecordingError``."""
         with contextlib.suppress(OSError):
             self.folder.mkdir(parents=True, exist_ok=True)
         self._read(lambda connection: None)
@@ -166,22 +167,24 @@ class RunIndex:
             self.add(replace(examine(path), file=file))
         raise RecordingError(f"{path}: another program keeps changing the file; end it and try again.")
 
-    def refresh(self, progress: Progress | None = None, examine: Examine = examine_side_by_side) -> Refreshed:
+    def refresh(self, progress: Progress | None = None, examine: Examine | None = None) -> Refreshed:
         """Read new and changed recordings of the folder, and forget those that are gone.
 
         ``progress`` is told how many of how many are read. Files that are no runs are skipped and named in the answer.
         """
         return self._refresh(False, progress, examine)
 
-    def rebuild(self, progress: Progress | None = None, examine: Examine = examine_side_by_side) -> Refreshed:
+    def rebuild(self, progress: Progress | None = None, examine: Examine | None = None) -> Refreshed:
         """Read all recordings of the folder again, after a check of the database."""
         with self._lock:
             if self._read(lambda connection: connection.execute("PRAGMA quick_check(1)").fetchone()) != ("ok",):
                 self._set_aside("is damaged", self._file)
         return self._refresh(True, progress, examine)
 
-    def _refresh(self, everything: bool, progress: Progress | None, examine: Examine) -> Refreshed:
-        refresher = Refresher(self.folder, self._write, examine)
+    def _refresh(self, everything: bool, progress: Progress | None, examine: Examine | None) -> Refreshed:
+        refresher = Refresher(
+            self.folder, self._write, examine or (lambda paths: examine_side_by_side(paths, self.examiners))
+        )
         with self._refreshing:
             for _ in range(MOST_TRIES):
                 self._read(lambda connection: None)
@@ -195,6 +198,7 @@ class RunIndex:
 
     def close(self) -> None:
         """Close the database; nothing else works after that."""
+        self.examiners.close()
         with self._lock:
             self._closed = True
             self._drop()
@@ -244,7 +248,7 @@ class RunIndex:
             connection.execute("COMMIT")
             return result
         except (OverflowError, UnicodeError) as error:
-            raise RecordingError(f"{self.path}: a run has a value that cannot be listed ({error}).") from error
+            raise RecordingError(f"{self.path}: cannot list or find a text or number ({error}).") from error
         finally:
             if connection.in_transaction:
                 connection.rollback()

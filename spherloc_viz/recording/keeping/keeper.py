@@ -20,6 +20,7 @@ from spherloc_viz.recording.keeping.rescue import rescue
 from spherloc_viz.recording.keeping.retention import Pruned, prune
 from spherloc_viz.recording.keeping.room import KEEP_BYTES, size_words
 from spherloc_viz.recording.origin import Origin
+from spherloc_viz.recording.strangers.examiner import Examiners
 
 GALLERY = "gallery"
 """The folder inside that has the curated cases."""
@@ -45,6 +46,7 @@ class Keeper:
         self._notice, self._full, self._keep_bytes = on_notice, full, keep_bytes
         self._lock = threading.Lock()
         self._index: RunIndex | None = None
+        self._examiners = Examiners()
         self._closed = False
         self._unlisted = 0
         """Recordings whose rows could not be stored; the next refresh finds them."""
@@ -105,18 +107,31 @@ class Keeper:
         self._tell_over(done)
 
     def tidy(self) -> None:
-        """Recover what killed processes left unfinished, or delete it, and say so. Raises ``OSError``."""
+        """Recover what killed processes left unfinished, or delete it, and say so.
+
+        Raises ``OSError``, or ``ExaminerError`` if nothing can be read or this is ended meanwhile.
+        """
         sweep_scratch()
         folders = [folder for folder in (self.folder, self.folder / GALLERY) if folder.is_dir()]
         found = [part for folder in folders for part in leftovers(folder)]
-        saved = [path for path in map(rescue, found) if path is not None]
+        with self._examiners.crew(1) as (examiner,):
+            saved = [path for part in found if (path := rescue(part, examiner)) is not None]
         if saved:
             runs = "a run" if len(saved) == 1 else f"{len(saved)} runs"
             names = ", ".join(path.name for path in saved[:3]) + (" and more" if len(saved) > 3 else "")
             self._notice(f"Recovered the recording of {runs} that was not finished: {names}.")
 
+    def end_reading(self) -> None:
+        """Read no more recordings, in whatever thread that happens; runs can still be recorded."""
+        self._examiners.close()
+        with self._lock:
+            index = self._index
+        if index is not None:
+            index.examiners.close()
+
     def close(self) -> None:
         """Close the list of runs; nothing else can be recorded after that."""
+        self._examiners.close()
         with self._lock:
             self._closed = True
             if self._index is not None:

@@ -22,7 +22,7 @@ log = logging.getLogger(__name__)
 QUEUE_LENGTH = 16
 """Runs that may wait; at about 50 ms each they take less than a second."""
 UPKEEP_LIMIT_S = 5.0
-"""How long closing waits for a file that is being looked at."""
+"""How long closing waits for files that are being deleted or recovered."""
 
 T = TypeVar("T")
 _Job = tuple[Trace, Path, Origin | None, Diagnosis | None]
@@ -116,6 +116,7 @@ class Recorder:
             if self._closed:
                 return
             self._closed = True
+        self._keeper.end_reading()  # which a hostile file can keep up for a minute
         self._queue.put(None)
         self._thread.join()
         self._upkeep.join(UPKEEP_LIMIT_S)

@@ -57,6 +57,15 @@ def review_path(recording: Path) -> Path:
     return recording.with_name(recording.name.removesuffix(".rrd") + REVIEW_SUFFIX)
 
 
+def has_review(recording: Path) -> bool:
+    """Whether there is a review file; none has a name that is too long for the disk."""
+    try:
+        review_path(recording).stat()
+    except OSError:
+        return False
+    return True
+
+
 def write_review(recording: Path, labels: Sequence[str], note: str, run_id: str | None = None) -> Review:
     """Store labels and a note beside a recording, in place of those before, and return them as they are stored.
 
@@ -93,7 +102,7 @@ def read_review(recording: Path) -> Review:
     Raises ``RecordingError``, in one sentence, if the file that has them is damaged.
     """
     path = review_path(Path(recording))
-    if not path.exists():
+    if not has_review(Path(recording)):
         return Review()
     from spherloc_viz.recording.review.file import read_file
 

@@ -7,21 +7,17 @@ limited. What has passed is safe to be read here.
 
 import atexit
 import contextlib
-import json
-import queue
 import re
-import subprocess
-import sys
 import threading
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import IO, Any, Self
+from typing import Any, Self
 
 from spherloc.errors import InputError, RecordingError, show
 from spherloc_viz.recording.review.notes import UNREADABLE, Review, checked_review, review_path
 from spherloc_viz.recording.run_row import RunRow
 from spherloc_viz.recording.strangers.checked_row import row_from_table
-from spherloc_viz.recording.viewing.rerun_program import rerun_environment
+from spherloc_viz.recording.strangers.child_process import Child, ExaminerError, cannot_start
 
 FILE_LIMIT_S = 60.0
 """A good file takes a hundredth of a second; the child gives up sooner, by the processor time that it used."""
@@ -29,8 +25,7 @@ BEGIN_LIMIT_S = 10.0
 """A child that has nothing to do begins in a millisecond."""
 START_LIMIT_S = 120.0
 """The child starts in two seconds."""
-LINE_LIMIT_BYTES = 1 << 21
-"""Of an answer: a row has a thumbnail of some kilobytes."""
+ENDED = "recordings are examined no more, since the program ends."
 
 _NAME = re.compile(r"(gallery/)?[A-Za-z0-9._-]+\.rrd", re.ASCII)
 _NAME_LIMIT = 255
@@ -70,7 +65,8 @@ class Examiner:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._child: _Child | None = None
+        self._child: Child | None = None
+        self._closed = False
 
     def __enter__(self) -> Self:
         return self
@@ -79,7 +75,11 @@ class Examiner:
         self.close()
 
     def close(self) -> None:
-        """End the child; it starts again when it is needed."""
+        """End the child for good, also in the middle of a file: whoever waits for that gets an ``ExaminerError``."""
+        self._closed = True  # first, since a child that is just being started is not there yet, but looks at this
+        child = self._child
+        if child is not None:
+            child.kill()
         with self._lock:
             self._end()
 
@@ -88,6 +88,7 @@ class Examiner:
 
         Raises ``RecordingError``, in one sentence, if it cannot or is not.
         """
+        path = path.absolute()  # the child stays in the folder in which it was started
         with self._lock:
             answer = self._ask(path, "row")
             if answer is None and review_path(path).exists():
@@ -100,6 +101,7 @@ class Examiner:
 
         Raises ``RecordingError``, in one sentence, if it is not.
         """
+        path = path.absolute()
         with self._lock:
             answer = self._ask(path, "review")
         table = _wanted(answer, review_path(path), "review")
@@ -114,77 +116,33 @@ class Examiner:
         if self._child is not None and not self._child.begin(question, BEGIN_LIMIT_S):
             self._end()  # it had nothing to do for a minute
         if self._child is None:
-            self._child = _Child()
-            if not self._child.begin(question, START_LIMIT_S):
+            self._start()
+            if self._child is None or not self._child.begin(question, START_LIMIT_S):
                 self._end()
-                raise _cannot_start("it ended at once")
+                raise self._ended() or cannot_start("it ended at once")
         answer = self._child.answer(FILE_LIMIT_S)
         if answer is None:
             self._end()
+            if (ended := self._ended()) is not None:
+                raise ended
         return answer
+
+    def _start(self) -> None:
+        if (ended := self._ended()) is not None:
+            raise ended
+        self._child = Child()
+        if self._closed or self._child.answer(START_LIMIT_S) != {"ready": True}:
+            self._end()
+            raise self._ended() or cannot_start("it does not get ready")
+
+    def _ended(self) -> "ExaminerError | None":
+        """What to raise once this is closed."""
+        return ExaminerError(ENDED) if self._closed else None
 
     def _end(self) -> None:
         child, self._child = self._child, None
         if child is not None:
             child.end()
-
-
-class _Child:
-    """One child process."""
-
-    def __init__(self) -> None:
-        """Raises ``RecordingError`` if it does not start."""
-        try:
-            self._process = subprocess.Popen(
-                [sys.executable, "-P", "-m", "spherloc_viz.recording.strangers.child"],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.DEVNULL,
-                # In a session of its own, so that a Ctrl-C meant for us does not look like a bad file.
-                start_new_session=True,
-                env=rerun_environment() | dict.fromkeys(_FRUGAL, "1"),
-            )
-        except OSError as error:
-            raise _cannot_start(error.strerror or str(error)) from error
-        assert self._process.stdin is not None and self._process.stdout is not None
-        self._questions: IO[bytes] = self._process.stdin
-        self._answers: queue.SimpleQueue[bytes] = queue.SimpleQueue()
-        self._listener = threading.Thread(target=self._listen, args=(self._process.stdout,), daemon=True)
-        self._listener.start()
-        if self.answer(START_LIMIT_S) != {"ready": True}:
-            self.end()
-            raise _cannot_start("it does not get ready")
-
-    def begin(self, question: dict[str, Any], limit_s: float) -> bool:
-        """Ask for a file; whether it is being read."""
-        try:
-            self._questions.write(json.dumps(question).encode() + b"\n")
-            self._questions.flush()
-        except OSError:
-            return False
-        return self.answer(limit_s) == {"begun": True}
-
-    def answer(self, limit_s: float) -> dict[str, Any] | None:
-        """The next thing that it says; None if it died, hangs or talks nonsense."""
-        try:
-            answer = json.loads(self._answers.get(timeout=limit_s))
-        except (queue.Empty, ValueError, RecursionError):
-            return None
-        return answer if isinstance(answer, dict) else None
-
-    def end(self) -> None:
-        """Kill it and wait until it is gone."""
-        self._process.kill()
-        self._process.wait()
-        self._listener.join()
-        with contextlib.suppress(OSError):  # what it did not read
-            self._questions.close()
-
-    def _listen(self, answers: IO[bytes]) -> None:
-        with answers:
-            while line := answers.readline(LINE_LIMIT_BYTES):
-                self._answers.put(line)
-        self._answers.put(b"")
 
 
 def _wanted(answer: dict[str, Any] | None, path: Path, want: str) -> Any:
@@ -198,20 +156,6 @@ def _wanted(answer: dict[str, Any] | None, path: Path, want: str) -> Any:
         raise RecordingError(str(answer["error"]))
     return answer[want]
 
-
-def _cannot_start(reason: str) -> "_NotStartedError":
-    return _NotStartedError(
-        f"recordings cannot be examined: the process that reads them does not start ({reason}); "
-        "'python -m spherloc_viz.recording.strangers.child' says more."
-    )
-
-
-class _NotStartedError(RecordingError):
-    """No fault of a file."""
-
-
-_FRUGAL = ("OPENBLAS_NUM_THREADS", "RAYON_NUM_THREADS", "TOKIO_WORKER_THREADS", "MALLOC_ARENA_MAX")
-"""How many threads there are; they reserve address space, which the child has little of."""
 
 _shared = Examiner()
 atexit.register(_shared.close)
@@ -234,16 +178,50 @@ def examine_review(path: Path) -> Review:
     return _shared.examine_review(Path(path))
 
 
-def examine_all(paths: Iterable[Path]) -> Iterator[tuple[Path, RunRow | RecordingError]]:
+def examine_all(
+    paths: Iterable[Path], examiner: Examiner | None = None
+) -> Iterator[tuple[Path, RunRow | RecordingError]]:
     """Examine many recordings one after another: their rows, or what is wrong with them.
 
-    Raises ``RecordingError`` only if the child that reads them cannot be started.
+    By ``examiner``, or one that ends with this. Raises ``ExaminerError`` only.
     """
-    with Examiner() as examiner:
+    with Examiner() if examiner is None else contextlib.nullcontext(examiner) as reader:
         for path in paths:
             try:
-                yield path, examiner.examine(path)
-            except _NotStartedError:
+                yield path, reader.examine(path)
+            except ExaminerError:
                 raise
             except RecordingError as error:
                 yield path, error
+
+
+class Examiners:
+    """All that read for one owner, who can end them together. Thread-safe."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._open: set[Examiner] = set()
+        self._closed = False
+
+    @contextlib.contextmanager
+    def crew(self, count: int) -> Iterator[list[Examiner]]:
+        """So many examiners, which end with the context. Raises ``ExaminerError`` after ``close``."""
+        crew = [Examiner() for _ in range(count)]
+        with self._lock:
+            if self._closed:
+                raise ExaminerError(ENDED)
+            self._open.update(crew)
+        try:
+            yield crew
+        finally:
+            for examiner in crew:
+                examiner.close()
+            with self._lock:
+                self._open.difference_update(crew)
+
+    def close(self) -> None:
+        """End them for good, also in the middle of a file."""
+        with self._lock:
+            self._closed, crew = True, tuple(self._open)
+        for examiner in crew:
+            examiner.close()

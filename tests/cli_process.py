@@ -1,0 +1,28 @@
+"""The installed command as a process."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+SCENE = ROOT / "scenes" / "mei_outliers_80.toml"
+
+
+def spherloc(*words: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
+    """Run the installed console command."""
+    program = Path(sys.executable).with_name("spherloc")
+    environment = os.environ | {"COLUMNS": "100"}
+    return subprocess.run(
+        [program, *map(str, words)], cwd=cwd, capture_output=True, text=True, timeout=240, env=environment, check=False
+    )
+
+
+def one_sentence(result: subprocess.CompletedProcess[str]) -> str:
+    """The error of a run that failed as a user's mistake should: exit code 2, one line, nothing on stdout."""
+    assert result.returncode == 2, result
+    assert result.stdout == ""
+    lines = result.stderr.strip().splitlines()
+    assert len(lines) == 1, result.stderr
+    assert lines[0].startswith("spherloc: ") and "Traceback" not in lines[0]
+    return lines[0]

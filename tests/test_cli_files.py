@@ -1,0 +1,50 @@
+"""What the command line takes for a scene or a recording: names, patterns, and what it lists."""
+
+from pathlib import Path
+
+import pytest
+from cli_process import SCENE, one_sentence, spherloc
+
+from spherloc.datasets import bundled_scenes, load_scene, scene_path
+from spherloc.estimators import estimate
+from spherloc_viz.recording.content.writer import write_recording
+from spherloc_viz.recording.review.notes import write_review
+from spherloc_viz.recording_commands import without_reviews
+
+
+def test_labels_that_a_pattern_finds_too_are_no_recordings(tmp_path: Path) -> None:
+    row = write_recording(estimate(load_scene(SCENE).problem(1), "ransac-2p", seed=1), tmp_path / "run.rrd")
+    write_review(tmp_path / "run.rrd", ["seen"], "", row.run_id)
+    files = sorted(path.name for path in tmp_path.glob("*.rrd"))
+    assert files == ["run.review.rrd", "run.rrd"]
+    result = spherloc("label", *files, "--add", "twice", cwd=tmp_path)
+    assert (result.returncode, result.stdout, result.stderr) == (0, "run.rrd: seen, twice\n", "")
+    assert without_reviews([*map(Path, files)]) == (Path("run.rrd"),)
+    assert without_reviews([Path("a.review.rrd")]) == (Path("a.review.rrd"),), "said to be no recording"
+
+
+def test_scenes_lists_what_play_and_run_accept(tmp_path: Path) -> None:
+    bundled, kinds = spherloc("scenes", cwd=tmp_path).stdout.split("\n\n")
+    rows = [line.split("  ")[1:] for line in bundled.splitlines()[1:] if not line.startswith("    ")]
+    by_name = {name: (kind, title) for name, kind, title in rows}
+    assert by_name.keys() == bundled_scenes().keys() and len(rows) >= 9
+    assert by_name["mei_outliers_80"] == ("synthetic", "MEI fisheye, 80 % outliers")
+    assert "rendered" in {kind for kind, _ in by_name.values()}
+    listed = [line.split()[0] for line in kinds.splitlines()[1:]]
+    assert listed == sorted(listed) and {"correspondences", "kitti360", "colmap", "rendered"} <= set(listed)
+    assert "cannot be read" not in kinds
+
+
+def test_a_file_goes_before_the_bundled_scene_of_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    name = Path("mei_outliers_80")
+    assert scene_path(name) == SCENE and scene_path(Path("no_such")) == Path("no_such")
+    name.write_text(SCENE.read_text())
+    assert scene_path(name) == name
+
+
+def test_scenes_shows_how_a_kind_is_written(tmp_path: Path) -> None:
+    shown = spherloc("scenes", "colmap", cwd=tmp_path).stdout
+    assert 'kind = "colmap"' in shown and "``" not in shown and "code-block" not in shown
+    assert str(SCENE) in spherloc("scenes", "synthetic", cwd=tmp_path).stdout
+    assert "'magic'" in one_sentence(spherloc("scenes", "magic", cwd=tmp_path))

@@ -1,0 +1,72 @@
+"""Ctrl-C ends a long search at once, with a sentence, and a long search says how far it is."""
+
+import signal
+import subprocess
+import sys
+import threading
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from recording_samples import scene_problem
+
+from spherloc.datasets import load_scene
+from spherloc.datasets.variation import Variation
+from spherloc.estimators import estimate, options_type
+from spherloc_viz.progress import aside, solve
+from spherloc_viz.recording.content.writer import write_recording
+
+ROOT = Path(__file__).resolve().parents[1]
+MOST_ITERATIONS = 10_000_000
+LIMIT_S = 240.0
+
+PROGRAM = """
+import sys
+from spherloc_viz import progress
+from spherloc_viz.cli import main
+progress.LINE_EVERY_S = 0.05
+main()
+"""
+
+
+@pytest.fixture(scope="module")
+def endless(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording whose options ask for as much work as can be, which takes many minutes."""
+    problem = Variation(correspondences=5000).problem(load_scene(ROOT / "scenes" / "mei_outliers_90.toml"), 7)
+    kind = options_type("ransac-2p")
+    trace = estimate(problem, "ransac-2p", kind(iterations=10))
+    path = tmp_path_factory.mktemp("endless") / "a.rrd"
+    write_recording(replace(trace, options=kind(iterations=MOST_ITERATIONS)), path)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("repeat",), "0 of 1 recordings were repeated."),
+        (
+            ("run", "--no-record", "--estimator", "ransac-2p", "--option", f"iterations={MOST_ITERATIONS}"),
+            "0 of 1 scenes were solved.",
+        ),
+    ],
+)
+def test_ctrl_c_ends_a_search_that_says_how_far_it_is(endless: Path, words: tuple[str, ...], said: str) -> None:
+    command = [sys.executable, "-c", PROGRAM, *words, str(endless)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as program:
+        assert program.stderr is not None
+        while "ransac-2p is at" not in (line := program.stderr.readline()):
+            assert line, "it ended by itself"
+        program.send_signal(signal.SIGINT)
+        out, rest = program.communicate(timeout=LIMIT_S)
+    assert program.returncode == 130 and out == ""
+    assert rest.splitlines()[-1] == f"spherloc: stopped in {endless}; {said}"
+    assert "Traceback" not in rest
+
+
+def test_who_is_not_interrupted_gets_the_run_and_its_errors() -> None:
+    problem = scene_problem("mei_outliers_80")
+    options = options_type("mc")()
+    assert solve(problem, "mc", options, 3).message == estimate(problem, "mc", options, 3).message
+    assert aside(lambda: threading.current_thread().daemon) is True
+    with pytest.raises(ZeroDivisionError):
+        aside(lambda: 1 // 0)
