@@ -10,7 +10,7 @@ import tyro
 from tyro.conf import Positional, arg
 from tyro.extras import SubcommandApp
 
-from spherloc.errors import SpherlocError
+from spherloc.errors import SpherlocError, show
 from spherloc_viz import recording_commands
 from spherloc_viz.recording.keeping.room import KEEP_GIGABYTES
 
@@ -278,12 +278,24 @@ def main() -> None:
             description="See why visual localization with fisheye and 360-degree cameras succeeds or fails.",
             sort_subcommands=False,
         )
+        sys.stdout.flush()
     except SpherlocError as error:
         print(f"spherloc: {error}", file=sys.stderr)
         code = 2
     except KeyboardInterrupt:
         code = INTERRUPTED
     except BrokenPipeError:
-        sys.stderr.close()
+        _drop_output()
         code = 141
+    except OSError as error:
+        # What no command has foreseen of a disk or a path, such as a name that is too long.
+        _drop_output()
+        what = "the output" if error.filename is None else show(error.filename)
+        print(f"spherloc: {what}: {error.strerror or error}; check the path and the disk.", file=sys.stderr)
+        code = 2
     sys.exit(code)
+
+
+def _drop_output() -> None:
+    """Python would complain again at its end about what it cannot print."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -148,6 +148,8 @@ IMPOSSIBLE: dict[str, dict[str, Change]] = {
     "an outcome that there is not": {RUN_PROPERTY: properties(outcome="' OR 1=1 --")},
     "a date that is none": {RUN_PROPERTY: properties(created="<b>today</b>")},
     "a date in another order": {RUN_PROPERTY: properties(created="20260101T120000Z")},
+    "an outlier rate that is a whole number": {RUN_PROPERTY: properties(outlier_rate=1)},
+    "steps whose numbers are texts": {"/numbers": lambda row: {"agreeing": pa.array([["3"]])}},
     "an estimator with a path": {RUN_PROPERTY: properties(estimator="../../etc")},
     "options that are no JSON": {RUN_PROPERTY: properties(options="{")},
     "a thumbnail that claims 60,000 pixels a side": {

@@ -275,6 +275,27 @@ def test_bad_words_are_one_sentence(tmp_path: Path, words: tuple[str | Path, ...
     assert part in one_sentence(spherloc(*words, cwd=tmp_path))
 
 
+@pytest.mark.parametrize("command", ["run", "runs"])
+def test_a_path_that_no_disk_takes_is_one_sentence(tmp_path: Path, command: str) -> None:
+    message = one_sentence(spherloc(command, "x" * 5000, cwd=tmp_path))
+    assert "too long" in message and len(message) < 300
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="the system has no full disk to try")
+def test_output_that_cannot_be_written_is_one_sentence_and_a_closed_pipe_none(tmp_path: Path) -> None:
+    program = [str(Path(sys.executable).with_name("spherloc")), "scenes"]
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(program, stdout=full, stderr=subprocess.PIPE, text=True, cwd=tmp_path, check=False)
+    assert done.returncode == 2 and len(done.stderr.splitlines()) == 1 and "No space left" in done.stderr
+    reader, writer = os.pipe()
+    os.close(reader)
+    try:
+        done = subprocess.run(program, stdout=writer, stderr=subprocess.PIPE, text=True, cwd=tmp_path, check=False)
+    finally:
+        os.close(writer)
+    assert done.returncode == 141 and done.stderr == ""
+
+
 def test_a_folder_that_cannot_be_written_keeps_the_result(tmp_path: Path) -> None:
     (tmp_path / "recordings").write_text("in the way")
     result = spherloc("run", SCENE, "--json", cwd=tmp_path)

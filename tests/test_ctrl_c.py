@@ -51,7 +51,7 @@ def endless(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ],
 )
 def test_ctrl_c_ends_a_search_that_says_how_far_it_is(endless: Path, words: tuple[str, ...], said: str) -> None:
-    command = [sys.executable, "-c", PROGRAM, *words, str(endless)]
+    command = [sys.executable, "-c", PROGRAM, words[0], str(endless), *words[1:]]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as program:
         assert program.stderr is not None
         while "ransac-2p is at" not in (line := program.stderr.readline()):

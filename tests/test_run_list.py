@@ -138,6 +138,12 @@ def test_wrong_words_are_sentences(tmp_path: Path, words: dict, told: str):
     assert told in str(caught.value)
 
 
+def test_groups_of_no_runs_are_a_sentence(folder: Path, capsys: pytest.CaptureFixture[str]):
+    assert runs(folder, estimator="ransac-odlt", group="diagnosis") == 0
+    captured = capsys.readouterr()
+    assert not captured.out and "no run of those that are asked for has a 'diagnosis'" in captured.err
+
+
 def test_an_unknown_scene_names_those_that_there_are(folder: Path, capsys: pytest.CaptureFixture[str]):
     with pytest.raises(InputError, match="no run of scene 'moon': there are synthetic: N 100, "):
         runs(folder, scene="moon")

@@ -71,7 +71,7 @@ def drawn_by(picture: Picture) -> dict[str, int]:
 def expect_step(tab: Playground, step: Step, picture: Picture, number: int, count: int) -> None:
     """The page says and draws what the core computes for this step."""
     expect(tab.step).to_have_value(f"{number}/{count}  {step.title}")
-    # It may have been put back to the step before while a key was on its way; an arrow key goes on from where it stands.
+    # It may have been put back to the step before while a key was on its way, and the next key goes on from there.
     expect(tab.thumb("Timeline")).to_have_attribute("aria-valuenow", str(number))
     expect(tab.page.locator("div").get_by_text(step.title, exact=True).locator("visible=true").first).to_be_visible()
     # How long a run took is in the last caption, and differs.

@@ -125,16 +125,6 @@ def static_chunk(entity: str, columns: Iterable[Values]) -> Chunk:
     return Chunk.from_columns(entity, [], [column.whole() for column in columns])
 
 
-def named_values(values: dict[str, Any]) -> list[Values]:
-    """Numbers and texts by name, as one row; what is None is left out. Tuples of texts are lists."""
-    known = {name: list(value) if isinstance(value, tuple) else [value] for name, value in values.items()}
-    return [
-        Values(rr.ComponentDescriptor(name), pa.array(value), [len(value)])
-        for name, value in known.items()
-        if value != [None]
-    ]
-
-
 def markdown(texts: Sequence[str]) -> list[Values]:
     """The components of text documents in Markdown, one text a row."""
     one = [1] * len(texts)

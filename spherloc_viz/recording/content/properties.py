@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import asdict, fields
 from datetime import datetime
 from pathlib import Path
-from typing import Any, cast, get_args
+from typing import Any, cast, get_args, get_type_hints
 
 import pyarrow as pa
 import rerun as rr
@@ -21,7 +21,7 @@ from spherloc.metrics import Metrics
 from spherloc.problem import Problem
 from spherloc.trace import Trace
 from spherloc_viz.options import json_text
-from spherloc_viz.recording.content.columns import Values, encoded_image, named_values, static_chunk
+from spherloc_viz.recording.content.columns import Values, encoded_image, static_chunk
 from spherloc_viz.recording.content.letters import legible
 from spherloc_viz.recording.origin import Origin
 from spherloc_viz.recording.run_row import RunRow
@@ -47,6 +47,14 @@ MOST_CHARACTERS = 2_000
 """Of a text in a row; longer ones are cut."""
 NOT_RECORDED = {"file", "run_id", "labels", "note", "size_bytes", "thumbnail"}
 """Fields of a row that are no part of the property ``run``: they belong to the file or the review, or are a picture."""
+
+_KINDS: dict[type, pa.DataType] = {str: pa.utf8(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
+RUN_TYPES: dict[str, pa.DataType] = {
+    name: _KINDS[(get_args(hint) or (hint,))[0]]
+    for name, hint in get_type_hints(RunRow).items()
+    if name not in NOT_RECORDED
+} | {"upper_bound": pa.int64(), "lower_bound": pa.int64(), "chance_sets": pa.float64(), "versions": pa.utf8()}
+"""Columns of the property ``run`` and their types; the last four are the certificate's and JSON."""
 
 
 def outcome(metrics: Metrics) -> str:
@@ -120,7 +128,7 @@ def property_chunks(trace: Trace, row: RunRow, created: datetime) -> Iterator[Ch
         values["lower_bound"] = certificate.lower_bound
         values["chance_sets"] = certificate.chance_sets
     values["versions"] = json.dumps(dict(trace.versions))
-    yield static_chunk(f"/__properties/{RUN_PROPERTY}", named_values(values))
+    yield static_chunk(f"/__properties/{RUN_PROPERTY}", _named(values))
     if row.thumbnail:
         yield static_chunk(f"/__properties/{THUMBNAIL_PROPERTY}", encoded_image(row.thumbnail, "image/png"))
     name = legible(" ".join(f"{row.name}, {trace.estimator}, seed {trace.seed}".split()))
@@ -128,6 +136,15 @@ def property_chunks(trace: Trace, row: RunRow, created: datetime) -> Iterator[Ch
     start_ns = pa.array([int(created.timestamp() * 1e9)], pa.int64())
     columns = [Values(info.descriptor_name(), pa.array([name]), [1])]
     yield static_chunk("/__properties", [*columns, Values(info.descriptor_start_time(), start_ns, [1])])
+
+
+def _named(values: Mapping[str, Any]) -> list[Values]:
+    """Numbers and texts by name, as one row; what is None is left out."""
+    return [
+        Values(rr.ComponentDescriptor(name), pa.array([value], RUN_TYPES[name]), [1])
+        for name, value in values.items()
+        if value is not None
+    ]
 
 
 def read_properties(chunk: Chunk) -> dict[str, Any]:

@@ -20,11 +20,15 @@ from rerun.chunk import Chunk, RrdReader
 
 from spherloc.errors import RecordingError, show
 from spherloc_viz.recording.content.data import ARRAYS, DATA
-from spherloc_viz.recording.content.reader import RecordedRun
+from spherloc_viz.recording.content.numbers import NUMBERS, TYPES
+from spherloc_viz.recording.content.properties import RUN_TYPES
+from spherloc_viz.recording.content.reader import PROPERTIES, RecordedRun
 from spherloc_viz.recording.strangers.checked_row import COUNT_LIMIT
 
 PROBLEM = f"{DATA}/problem"
 """The row of the problem in formats 1 and 2."""
+CATALOG = {NUMBERS: TYPES, PROPERTIES: RUN_TYPES}
+"""Columns over which rerun's catalog asks questions: one file with other types would shut out the others."""
 STORES_LIMIT = 16
 CHUNKS_LIMIT = 100_000
 CONTENT_LIMIT_BYTES = 256 << 20
@@ -63,12 +67,23 @@ def check_content(path: Path) -> None:
             content_bytes += batch.nbytes
             if content_bytes > CONTENT_LIMIT_BYTES:
                 raise _too_many(path, "bytes", content_bytes, CONTENT_LIMIT_BYTES)
+            _check_columns(chunk, batch, path)
             if chunk.entity_path == DATA or chunk.entity_path.startswith(f"{DATA}/"):
                 _check_rows(chunk, batch, path)
 
 
 def _too_many(path: Path, what: str, count: int, limit: int) -> RecordingError:
     return RecordingError(f"{path}: has {count:,} {what}, of which {limit:,} are the most; record the run again.")
+
+
+def _check_columns(chunk: Chunk, batch: pa.RecordBatch, path: Path) -> None:
+    """Refuse columns of the catalog that have another type than ours."""
+    known = CATALOG.get(chunk.entity_path, {})
+    for name in known.keys() & set(batch.schema.names):
+        found = batch.schema.field(name).type
+        if not pa.types.is_list(found) or found.value_type != known[name]:
+            what = f"{chunk.entity_path} has {name} of type {str(found)[:100]}"
+            raise RecordingError(f"{path}: {what} instead of {known[name]}; record the run again.")
 
 
 def _check_rows(chunk: Chunk, batch: pa.RecordBatch, path: Path) -> None:
