@@ -1,6 +1,9 @@
 """The command line as a user calls it: a process, its exit code, what it prints."""
 
 import json
+import os
+import subprocess
+import sys
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Literal

@@ -152,6 +152,14 @@ def test_a_folder_that_was_away_is_listed_again(tmp_path: Path):
         assert index.find(RunQuery()).rows == (some_row(),)
 
 
+def test_a_failing_disk_is_a_sentence(tmp_path: Path):
+    """What a full one says of the file that SQLite keeps beside the list."""
+    error = sqlite3.OperationalError("disk I/O error")
+    error.sqlite_errorcode = sqlite3.SQLITE_IOERR_SHMSIZE  # its upper bits only refine it
+    told = index_file.sentence(tmp_path, error)
+    assert "cannot be read or written (disk I/O error); make room" in told
+
+
 def test_a_locked_database_is_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(index_file, "BUSY_S", 0.05)
     with RunIndex(tmp_path) as index, contextlib.closing(sqlite3.connect(index.path)) as other:

@@ -282,9 +282,8 @@ class RunIndex:
 
     def _is_current(self) -> bool:
         """Whether nobody has replaced the database, or, where it is in memory only, the folder."""
-        if self._file is None:
-            return self._place == index_file.identity(self.folder)
-        return self._file == index_file.identity(self.path)
+        place, known = (self.folder, self._place) if self._file is None else (self.path, self._file)
+        return known == index_file.identity(place)
 
     def _set_aside(self, reason: str, file: tuple[int, int] | None) -> None:
         """Rename the database, unless another process has done so: it must still be that file."""
