@@ -287,7 +287,7 @@ def test_a_path_that_no_disk_takes_is_one_sentence(tmp_path: Path, command: str)
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="the system has no full disk to try")
 def test_output_that_cannot_be_written_is_one_sentence_and_a_closed_pipe_none(tmp_path: Path) -> None:
     program = [str(Path(sys.executable).with_name("spherloc")), "scenes"]
-    with open("/dev/full", "w") as full:
+    with Path("/dev/full").open("w") as full:
         done = subprocess.run(program, stdout=full, stderr=subprocess.PIPE, text=True, cwd=tmp_path, check=False)
     assert done.returncode == 2 and len(done.stderr.splitlines()) == 1 and "No space left" in done.stderr
     reader, writer = os.pipe()
