@@ -288,10 +288,8 @@ def main() -> None:
         _drop_output()
         code = 141
     except OSError as error:
-        # What no command has foreseen of a disk or a path, such as a name that is too long.
         _drop_output()
-        what = "the output" if error.filename is None else show(error.filename)
-        print(f"spherloc: {what}: {error.strerror or error}; check the path and the disk.", file=sys.stderr)
+        print(f"spherloc: {show(error.filename or 'output')}: {error.strerror}; check path and disk.", file=sys.stderr)
         code = 2
     sys.exit(code)
 

@@ -166,8 +166,7 @@ class RunView:
 
     def place(self, position: FloatArray) -> str:
         """A place (3,) of the aligned map frame in the problem's own map frame, as text."""
-        x, y, z = self.trace.problem.aligned.map_turn.T @ position
-        return f"({x:.2f}, {y:.2f}, {z:.2f}) m"
+        return place_text(self.trace.problem.aligned.map_turn.T @ position, 2)
 
     def right_ones(self, indices: np.ndarray) -> str:
         """How many of these correspondences are right, as part of a sentence; empty if that is unknown."""
@@ -193,6 +192,11 @@ def even(indices: np.ndarray, count: int) -> np.ndarray:
 def growing(total: int, *sizes: int) -> list[int]:
     """The sizes below ``total``: how something of that size is put together."""
     return [size for size in sizes if size < total]
+
+
+def place_text(position: FloatArray, digits: int) -> str:
+    """A place (3,) to read, metres."""
+    return f"({', '.join(f'{value:.{digits}f}' for value in position)}) m".replace("-", "−")
 
 
 def length(metres: float) -> str:

@@ -7,6 +7,7 @@ from spherloc.trace import Certificate
 from spherloc_viz import style
 from spherloc_viz.layers.certificate import chance, proof, warning
 from spherloc_viz.layers.frame import Frame, Plan, RunView
+from spherloc_viz.layers.scale_bar import angle_text, length_text
 
 
 def plans(view: RunView) -> list[Plan]:
@@ -40,10 +41,8 @@ def _pose(view: RunView, cam_from_map: np.ndarray) -> Frame:
         caption += "The truth is unknown, so the share of agreeing matches is all there is to judge it by."
     else:
         verdict = "a success" if metrics.success else "a failure"
-        caption += (
-            f"It is {metrics.rotation_error_deg:.3f}° and {100 * metrics.translation_error_m:.1f} cm off the truth: "
-            f"{verdict} by the limits of 1° and 10 cm."
-        )
+        angle, length = angle_text(metrics.rotation_error_deg), length_text(metrics.translation_error_m)
+        caption += f"It is {angle} and {length} off the truth: {verdict} by the limits of 1° and 10 cm."
     return Frame(
         caption,
         "success: error < 1° and < 0.1 m   (Sec. VI-A)",

@@ -11,6 +11,7 @@ from spherloc_viz import style
 from spherloc_viz.layers import uncertainty
 from spherloc_viz.layers.frame import BoolArray, Frame, Plan, RunView, even, length, one_color
 from spherloc_viz.layers.primitives import Chart, Curve, FloatArray, SceneItem, Segments
+from spherloc_viz.layers.scale_bar import angle_text, length_text
 
 MOST_STATES = 20
 """More states are thinned evenly; the first and the last stay."""
@@ -144,7 +145,7 @@ def _error(view: RunView, stage: RefinementStage) -> Frame:
         happened = "The truth is not known here, so that nobody can check."
     else:
         turned, away = rotation_error_deg(view.truth, state), translation_error_m(view.truth, state)
-        happened = f"In truth it is off by {turned:.3f}° and {100 * away:.2f} cm."
+        happened = f"In truth it is off by {angle_text(turned)} and {length_text(away)}."
     return Frame(
         f"{expected} {happened}",
         "Σ = σ² (JᵀWJ)⁻¹",

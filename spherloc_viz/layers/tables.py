@@ -7,7 +7,7 @@ from spherloc.metrics import evaluate
 from spherloc.trace import Certificate, RefinementStage, Trace
 from spherloc_viz.layers import uncertainty
 from spherloc_viz.layers.certificate import UNKNOWABLE, chance, is_knowable, proof
-from spherloc_viz.layers.frame import length
+from spherloc_viz.layers.frame import length, place_text
 from spherloc_viz.layers.primitives import Table
 
 
@@ -16,7 +16,7 @@ def outcome_table(trace: Trace) -> Table:
     metrics = evaluate(trace)
     rows: list[tuple[str, str]] = [("estimator", trace.estimator), ("outcome", verdict(trace, metrics.success))]
     if trace.cam_from_map is not None:
-        rows.append(("camera position", " ".join(f"{value:.3f}" for value in camera_centre(trace.cam_from_map)) + " m"))
+        rows.append(("camera position", place_text(camera_centre(trace.cam_from_map), 3)))
     if metrics.rotation_error_deg is not None and metrics.translation_error_m is not None:
         rows.append(("rotation error", f"{metrics.rotation_error_deg:.3f}°"))
         rows.append(("position error", length(metrics.translation_error_m)))

@@ -54,10 +54,13 @@ def blueprint(shown: Shown) -> rrb.Blueprint:
     The layout pauses on the timeline of steps; at which step is up to who opens the recording, since a blueprint has
     no word for it. A viewer in a page is told by its address.
     """
-    plots = [rrb.BarChartView(origin=chart_path(name), name=label) for name, label in shown.charts]
+    # Where bars are low in most charts.
+    legend = rrb.PlotLegend("LeftTop")
+    plots = [rrb.BarChartView(origin=chart_path(name), name=label, plot_legend=legend) for name, label in shown.charts]
     if shown.panels.residuals:
         # Second, since the chart of refinement is empty at most steps.
-        plots.insert(1, rrb.BarChartView(origin=RESIDUALS, name="Residuals: matches over log10 of px"))
+        name = "Residuals: matches over log10 of px"
+        plots.insert(1, rrb.BarChartView(origin=RESIDUALS, name=name, plot_legend=legend))
     texts = [
         rrb.TextDocumentView(origin="/outcome", name="Verdict"),
         rrb.TextDocumentView(origin=REVIEW_ENTITY, name="Review"),

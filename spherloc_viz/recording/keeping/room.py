@@ -20,4 +20,4 @@ def kept_bytes(gigabytes: float) -> int:
 
 def size_words(count: int) -> str:
     """A number of bytes for people."""
-    return f"{count / GIGABYTE:.3g} GB" if count >= GIGABYTE / 100 else f"{count / 1e6:.3g} MB"
+    return f"{count / GIGABYTE:.3g} GB" if count >= GIGABYTE / 10 else f"{count / 1e6:.3g} MB"
