@@ -253,7 +253,7 @@ BAD = [
     ({"matches": File("f.csv", (CSV + "=1+1,2,3,4,5\n").encode())}, r"^f\.csv, line 14: u is '=1\+1', not a number"),
     ({"matches": File("s.csv", (CSV + "1,2,3\n").encode())}, r"^s\.csv, line 14: 3 values under 5 columns"),
     ({"matches": File("n.csv", (CSV + "nan,2,3,4,5\n").encode())}, r"^n\.csv, line 14: u is nan"),
-    ({"matches": File("h.csv", (CSV + "1,2,1e300,4,5\n").encode())}, r"^h\.csv: match 13 has X, Y, Z beyond 1e\+09"),
+    ({"matches": File("h.csv", (CSV + "1,2,1e300,4,5\n").encode())}, r"^h\.csv, line 14: X is 1e\+300, beyond 1e\+09"),
     ({"matches": File("one.csv", b"u,v,X,Y,Z\n9,9,3,4,5\n")}, r"one\.csv: 1 usable of 1 correspondences"),
     ({"matches": File(EVIL, b"u,v\n")}, r"^<img src=x onerror=\"alert\(1\)\">\.csv: column 'X'"),
     ({"calibration": File("k.yaml", b"cam0:\n  camera_model: nope\n")}, r"^k\.yaml: "),

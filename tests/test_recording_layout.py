@@ -27,7 +27,7 @@ from spherloc_viz.recording.content.layout import layout_file, shown_in
 from spherloc_viz.recording.content.letters import legible
 from spherloc_viz.recording.content.panels import MOST_EDGES, MOST_NODES, panel_chunks, panels_of
 from spherloc_viz.recording.content.properties import APPLICATION_ID, REVIEW_ENTITY
-from spherloc_viz.recording.content.rrd_file import joined, split, xxh32
+from spherloc_viz.recording.content.rrd_file import append, split, xxh32
 from spherloc_viz.recording.content.writer import write_recording
 from spherloc_viz.recording.viewing.rerun_program import rerun_command, rerun_environment
 
@@ -128,7 +128,7 @@ def test_stores_that_are_joined_are_whole(tmp_path: Path, clique_run: Trace, cou
     numbers = [Values(rr.ComponentDescriptor("number"), rr.components.ScalarBatch([7.0]).as_arrow_array(), [1])]
     chunks = [static_chunk(f"/at/{k}", numbers) for k in range(count)]
     LazyChunkStream.from_iter(chunks).write_rrd(path, application_id=APPLICATION_ID, recording_id="id")
-    path.write_bytes(joined(layout, split(path.read_bytes())))
+    assert append(path, layout) == path.stat().st_size
     reader = RrdReader(path)
     (recording,), (view,) = reader.recordings(), reader.blueprints()
     found = reader.store(store=recording).stream().filter(content=["/at/**"]).to_chunks()
@@ -140,16 +140,21 @@ def test_stores_that_are_joined_are_whole(tmp_path: Path, clique_run: Trace, cou
     assert done.returncode == 0, done.stderr
 
 
-def test_a_file_in_another_form_is_refused(tmp_path: Path) -> None:
+def test_a_file_in_another_form_is_refused(tmp_path: Path, clique_run: Trace) -> None:
     path = tmp_path / "run.rrd"
     dot = Chunk.from_columns("/dot", [], rr.Points3D.columns(positions=[[1, 2, 3]]))
     LazyChunkStream.from_iter([dot]).write_rrd(path, application_id=APPLICATION_ID, recording_id="id")
     content = path.read_bytes()
     start = struct.unpack_from("<Q", content, len(content) - 32)[0]
     spoiled = content[: start + 5] + bytes([content[start + 5] ^ 1]) + content[start + 6 :]
-    for wrong in (content[:-1], spoiled):
-        with pytest.raises(ValueError, match="not where it was expected"):
+    layout = layout_file(shown_in([paint(clique_run, 0)], panels_of(clique_run)))
+    for wrong in (content[:-1], spoiled, content[:50], b""):
+        path.write_bytes(wrong)
+        with pytest.raises(ValueError, match="rerun wrote"):
             split(wrong)
+        with pytest.raises(ValueError, match="rerun wrote"):
+            append(path, layout)
+        assert path.read_bytes() == wrong
 
 
 # ---------------------------------------------------------------------------------------------- the viewer

@@ -44,6 +44,8 @@ bound_px = 4
 
 COLUMNS = ("u", "v", "X", "Y", "Z")
 MAX_CSV_BYTES = 200_000_000
+LARGEST = 1e9
+"""Of any number, px or m: with larger ones nobody can calculate."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,6 +164,8 @@ def _number(value: str, column: str, place: str) -> float:
         raise InputError(f"{place}: {column} is {show(value)}, not a number; correct or remove it.") from None
     if not np.isfinite(number):
         raise InputError(f"{place}: {column} is {number}, not a finite number; correct or remove the line.")
+    if abs(number) > LARGEST:
+        raise InputError(f"{place}: {column} is {number:g}, beyond {LARGEST:.0e}; correct or remove the line.")
     return number
 
 

@@ -26,7 +26,6 @@ MOST_BYTES = 10_000_000
 MOST_CALIBRATION_BYTES = 256 * 1024
 MOST_ROWS = 200_000
 MOST_NAME = 60
-LARGEST = 1e9
 """Beyond any pixel and any map, so that squares and products of it are numbers."""
 
 
@@ -111,7 +110,6 @@ def open_upload(form: Form, folder: Path) -> tuple[Path, Scene]:
         camera = read_calibration(form.calibration, folder / "calibration")
         path.write_text(scene_text(form, camera), encoding="utf-8")
         scene = load_scene(path)
-        _check_numbers(scene)
     except InputError as error:
         sentence = str(error)
         for own, shown in names.items():
@@ -200,13 +198,3 @@ def numbers(text: str, count: int, what: str) -> list[float]:
         numeral = "a number" if count == 1 else f"{count} numbers"
         raise InputError(f"{what} is {show(text[:80])}; give {numeral}.")
     return values
-
-
-def _check_numbers(scene: Scene) -> None:
-    """Raise ``InputError`` for matches that no estimator could calculate with."""
-    problem = scene.problem()
-    for name, values in (("u, v", problem.pixels), ("X, Y, Z", problem.points)):
-        far = np.abs(values).max(axis=1) > LARGEST
-        if far.any():
-            row = int(np.argmax(far)) + 1
-            raise InputError(f"{problem.name}: match {row} has {name} beyond {LARGEST:.0e}; correct or remove it.")

@@ -1,12 +1,17 @@
-"""Two stores in one ``.rrd`` file: a layout and the recording that it lays out, without a second program.
+"""Two stores in one ``.rrd`` file: a recording and the layout for it, without a second program.
 
 An ``.rrd`` file is a header of 12 bytes, messages of 16 bytes (kind, length) and a payload, and a message with an index
 of all chunks by their places in the file (https://rerun.io/docs, "RRD format"). So files cannot be put end to end: the
 places in the second one's index move. They are a column of an arrow table, ``chunk_byte_offset``, which is moved here.
+The layout comes second, since it is the same for many runs: what it takes to move it is little and known.
 """
 
+import io
+import os
 import struct
 from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
 
 import numba
 import numpy as np
@@ -30,6 +35,7 @@ class RrdFile:
     """The parts of a file with one store."""
 
     header: bytes
+    """Version and packing."""
     messages: bytes
     """Without the index."""
     index: bytes
@@ -41,24 +47,48 @@ def split(content: bytes) -> RrdFile:
 
     Raises ``ValueError`` if it has no index, or one of a form that is not known here.
     """
-    start, length, checksum, mark, count = TAIL.unpack_from(content, len(content) - TAIL.size)
-    index = content[start : start + length]
-    if mark != MARK or count != 1 or checksum != xxh32(np.frombuffer(index, np.uint8), CHECKSUM_SEED):
-        raise ValueError("rerun wrote a file whose index is not where it was expected")
+    start, index = _index_of(io.BytesIO(content))
     return RrdFile(content[:HEADER_BYTES], content[HEADER_BYTES : start - MESSAGE.size], index)
 
 
-def joined(first: RrdFile, second: RrdFile) -> bytes:
-    """One file with the stores of both.
+def append(path: Path, second: RrdFile) -> int:
+    """Put the store of ``second`` behind the one in a file that rerun has just written; returns the size in bytes.
 
-    Raises ``ValueError`` if an index has a form that is not known here.
+    Raises ``OSError``, and ``ValueError`` if an index has a form that is not known here.
     """
-    # Indices are protobuf messages with one repeated field, of which one behind the other are both.
-    index = first.index + _moved(second, len(first.messages))
-    start = HEADER_BYTES + len(first.messages) + len(second.messages) + MESSAGE.size
-    checksum = xxh32(np.frombuffer(index, np.uint8), CHECKSUM_SEED)
-    tail = TAIL.pack(start, len(index), checksum, MARK, 1)
-    return b"".join([first.header, first.messages, second.messages, MESSAGE.pack(END, len(index)), index, tail])
+    with path.open("r+b") as file:
+        if file.read(HEADER_BYTES) != second.header:
+            raise ValueError("rerun wrote two files of different forms")
+        start, index = _index_of(file)
+        end = start - MESSAGE.size
+        # Indices are protobuf messages with one repeated field, of which one behind the other are both.
+        index += _moved(second, end - HEADER_BYTES)
+        start = end + len(second.messages) + MESSAGE.size
+        tail = TAIL.pack(start, len(index), _checksum(index), MARK, 1)
+        file.seek(end)
+        file.write(b"".join([second.messages, MESSAGE.pack(END, len(index)), index, tail]))
+        file.truncate()
+        return file.tell()
+
+
+def _index_of(file: BinaryIO) -> tuple[int, bytes]:
+    """Where in a file the index is, and the index. Raises ``OSError``, and ``ValueError`` if there is none."""
+    size = file.seek(0, os.SEEK_END)
+    if size < HEADER_BYTES + MESSAGE.size + TAIL.size:
+        raise ValueError("rerun wrote a file without an index")
+    file.seek(size - TAIL.size)
+    start, length, checksum, mark, count = TAIL.unpack(file.read(TAIL.size))
+    if mark != MARK or count != 1 or not HEADER_BYTES + MESSAGE.size <= start <= start + length <= size - TAIL.size:
+        raise ValueError("rerun wrote a file whose index is not where it was expected")
+    file.seek(start)
+    index = file.read(length)
+    if checksum != _checksum(index):
+        raise ValueError("rerun wrote a file whose index is damaged")
+    return start, index
+
+
+def _checksum(index: bytes) -> int:
+    return int(xxh32(np.frombuffer(index, np.uint8), CHECKSUM_SEED))
 
 
 def _moved(file: RrdFile, by: int) -> bytes:

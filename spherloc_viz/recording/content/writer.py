@@ -27,9 +27,9 @@ from spherloc_viz.recording.content.numbers import numbers_chunk
 from spherloc_viz.recording.content.panels import Panels, panel_chunks, panels_of
 from spherloc_viz.recording.content.properties import APPLICATION_ID, property_chunks, run_row
 from spherloc_viz.recording.content.query_image import image_chunks, query_image
-from spherloc_viz.recording.content.rrd_file import joined, split
+from spherloc_viz.recording.content.rrd_file import append
 from spherloc_viz.recording.content.thumbnail import thumbnail
-from spherloc_viz.recording.keeping.leftovers import scratch, unfinished
+from spherloc_viz.recording.keeping.leftovers import unfinished
 from spherloc_viz.recording.origin import Origin
 from spherloc_viz.recording.run_row import RunRow
 
@@ -41,6 +41,9 @@ EXPLAINING = frozenset(
     }
 )
 """Keys of steps that explain the method, as the stops of the hand do: the page shows them, and a full recording."""
+
+_DISK = re.compile(r"([^:(]+) \(os error \d+\)")
+"""How rerun tells of what a disk cannot do."""
 
 
 def write_recording(
@@ -56,21 +59,24 @@ def write_recording(
     part = unfinished(path)
     run = _Run(trace, origin or Origin(), diagnosis or diagnose(trace), full, datetime.now(UTC), str(uuid.uuid4()))
     try:
-        row, content = _content(run, path.name)
         path.parent.mkdir(parents=True, exist_ok=True)
-        part.write_bytes(content)
+        row = _write(run, part, path.name)
         part.replace(path)
     except OSError as error:
-        reason = error.strerror or error
-        raise RecordingError(
-            f"{path}: the run cannot be recorded ({reason}); make room or choose another folder."
-        ) from error
+        raise _no_room(path, error.strerror or str(error)) from error
     except (RuntimeError, ValueError) as error:
+        reason = _DISK.search(str(error))
+        if reason is not None:
+            raise _no_room(path, reason[1]) from error
         raise RecordingError(f"{path}: the run cannot be recorded, since rerun failed: {error}.") from error
     finally:
         with contextlib.suppress(OSError):
             part.unlink(missing_ok=True)
-    return replace(row, size_bytes=len(content))
+    return row
+
+
+def _no_room(path: Path, reason: str) -> RecordingError:
+    return RecordingError(f"{path}: the run cannot be recorded ({reason}); make room or choose another folder.")
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,8 +108,8 @@ def recorded_steps(stops: Sequence[Stop], decisive: int) -> list[int]:
     return sorted({decisive, *last.values()})
 
 
-def _content(run: _Run, file: str) -> tuple[RunRow, bytes]:
-    """The row and the bytes of the file."""
+def _write(run: _Run, part: Path, file: str) -> RunRow:
+    """Write the recording to ``part`` and return its row, for the name that the ``file`` is to have."""
     trace, metrics = run.trace, evaluate(run.trace)
     stops, decisive = steps(trace), decisive_step(trace, run.diagnosis)
     row = run_row(
@@ -121,11 +127,10 @@ def _content(run: _Run, file: str) -> tuple[RunRow, bytes]:
     chosen = list(range(len(stops))) if run.full else recorded_steps(stops, decisive)
     pictures = {index: paint(trace, index) for index in chosen}
     panels = panels_of(trace)
-    with scratch() as path:
-        stream = LazyChunkStream.from_iter(list(_chunks(run, row, pictures, panels)))
-        stream.write_rrd(path, application_id=APPLICATION_ID, recording_id=run.recording_id)
-        recording = split(path.read_bytes())
-    return row, joined(layout_file(shown_in(list(pictures.values()), panels)), recording)
+    layout = layout_file(shown_in(list(pictures.values()), panels))
+    stream = LazyChunkStream.from_iter(list(_chunks(run, row, pictures, panels)))
+    stream.write_rrd(part, application_id=APPLICATION_ID, recording_id=run.recording_id)
+    return replace(row, size_bytes=append(part, layout))
 
 
 def _chunks(run: _Run, row: RunRow, pictures: Mapping[int, Picture], panels: Panels) -> Iterator[Chunk]:

@@ -15,7 +15,7 @@ from spherloc.errors import RecordingError
 from spherloc.trace import Trace
 from spherloc_viz.recording.content.writer import write_recording
 from spherloc_viz.recording.index.run_index import RunIndex
-from spherloc_viz.recording.keeping.leftovers import leftovers, sweep_scratch
+from spherloc_viz.recording.keeping.leftovers import leftovers
 from spherloc_viz.recording.keeping.rescue import rescue
 from spherloc_viz.recording.keeping.retention import Pruned, prune
 from spherloc_viz.recording.keeping.room import KEEP_BYTES, size_words
@@ -111,7 +111,6 @@ class Keeper:
 
         Raises ``OSError``, or ``ExaminerError`` if nothing can be read or this is ended meanwhile.
         """
-        sweep_scratch()
         folders = [folder for folder in (self.folder, self.folder / GALLERY) if folder.is_dir()]
         found = [part for folder in folders for part in leftovers(folder)]
         with self._examiners.crew(1) as (examiner,):

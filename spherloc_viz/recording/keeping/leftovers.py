@@ -6,9 +6,7 @@ import os
 import re
 import secrets
 import socket
-import tempfile
 import time
-from collections.abc import Iterator
 from functools import cache, lru_cache
 from pathlib import Path
 
@@ -17,34 +15,11 @@ STALE_AFTER_S = 600.0
 
 _OWNER = r"(?P<machine>[0-9a-f]{8})-(?P<boot>[0-9a-f]{8})-(?P<pid>\d{1,10})-(?P<start>\d{1,20})-"
 _PART = re.compile(rf"(?P<name>.+\.rrd)\.(?:{_OWNER})?[0-9a-f]{{8}}\.part")
-_SCRATCH = re.compile(rf"spherloc-{_OWNER}\w+\.rrd")
 
 
 def unfinished(path: Path) -> Path:
     """The name under which this process writes the file ``path`` before it is moved to its own; new in every call."""
     return path.with_name(f"{path.name}.{_owner()}-{secrets.token_hex(4)}.part")
-
-
-@contextlib.contextmanager
-def scratch() -> Iterator[Path]:
-    """An empty file that is needed for a moment only. Raises ``OSError``."""
-    handle, name = tempfile.mkstemp(prefix=f"spherloc-{_owner()}-", suffix=".rrd")
-    os.close(handle)
-    try:
-        yield Path(name)
-    finally:
-        with contextlib.suppress(OSError):
-            Path(name).unlink()
-
-
-def sweep_scratch() -> None:
-    """Delete such files that killed processes left."""
-    with contextlib.suppress(OSError), os.scandir(tempfile.gettempdir()) as entries:
-        for entry in entries:
-            match = _SCRATCH.fullmatch(entry.name)
-            if match is not None and entry.is_file(follow_symlinks=False) and _ended(match):
-                with contextlib.suppress(OSError):
-                    Path(entry.path).unlink()
 
 
 def target_of(part: Path) -> Path | None:
