@@ -269,3 +269,15 @@ def test_estimator_controls_show_what_they_are_told(server: viser.ViserServer) -
         assert [other for other, folder in controls._folders.items() if folder.visible] == [name]
     with pytest.raises(InputError, match="unknown estimator 'magic': choose one of"):
         controls.write("magic", None)
+
+
+def test_a_typed_number_that_no_solver_can_reckon_with_is_refused(server: viser.ViserServer) -> None:
+    controls = EstimatorControls(server.gui, lambda event: None)
+    controls.write("mc", options_type("mc")())
+    box = controls._options["mc"]["noise_px"].widget
+    for value in (1e-300, 1e200):
+        box.value = value
+        with pytest.raises(InputError, match=r"option noise_px is 1e.*give a number from 1e-06 to 1e\+06"):
+            controls.read()
+    box.value = 0.5
+    assert controls.read()[1].noise_px == 0.5

@@ -100,8 +100,8 @@ def test_the_oldest_successes_make_room_and_are_written_down(tmp_path: Path, rng
         assert files(tmp_path) == sorted(set(names) - set(done.files))
         assert index.find(RunQuery(), limit=None).total == len(names) - 6
         assert done.sentence == (
-            "6 old successes were deleted (0.006 MB), so that the recordings take no more than 0.0745 MB; "
-            "pruned.log names what was deleted."
+            "6 old successes were deleted (0.006 MB), since the recordings took more than 0.0745 MB; "
+            "pruned.log names them."
         )
         assert [cells[1] for cells in log_of(tmp_path)] == may_go[:6]
         assert {tuple(cells[2:5]) for cells in log_of(tmp_path)} == {("a street with a tab", "mc", "seed 7")}

@@ -72,11 +72,14 @@ class Option:
             self.widget = gui.add_dropdown(label, tuple(self._values), initial_value=start, hint=hint)
 
     def read(self) -> Any:
-        """The option's value; raises ``InputError`` if what is typed is none."""
+        """The option's value; raises ``InputError`` if what is typed is none that solvers can reckon with."""
         value = self.widget.value
         if self._values is not None:
             return self._values[value]
-        return self.field.parse(value or NONE) if isinstance(value, str) else value
+        if isinstance(value, str):
+            return self.field.parse(value or NONE)
+        self.field.check_size(value)
+        return value
 
     def write(self, value: Any) -> None:
         """Show a value; a dropdown or a slider is widened for one that it does not offer."""

@@ -50,7 +50,7 @@ def row_html(row: RunRow, marked: bool, opened: bool, now: datetime) -> str:
     address = escape(viewer_link(row.file, row.decisive_step))
     link = (
         f'<a href="{address}" target="_blank" rel="noopener" '
-        f'title="Open in the Rerun viewer, at step {row.decisive_step + 1} of {row.steps}" '
+        f'title="Open in Rerun\'s viewer at step {row.decisive_step + 1} of {row.steps}, #{row.decisive_step} there" '
         'style="color:inherit;text-decoration:none;padding:.4em .1em .4em .4em;opacity:.75;font-size:13px">↗</a>'
     )
     about = f'<div style="flex:1;min-width:0">{_lines(row, now)}</div>'

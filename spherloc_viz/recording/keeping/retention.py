@@ -9,7 +9,7 @@ from spherloc.errors import RecordingError
 from spherloc_viz.recording.index.query import RunQuery
 from spherloc_viz.recording.index.run_index import RunIndex
 from spherloc_viz.recording.keeping.room import size_words
-from spherloc_viz.recording.review.notes import review_path
+from spherloc_viz.recording.review.notes import has_review
 from spherloc_viz.recording.run_row import RunRow
 
 NEWEST_KEPT = 20
@@ -43,10 +43,8 @@ class Pruned:
         if not self.files:
             return ""
         runs = "1 old success was" if len(self.files) == 1 else f"{len(self.files):,} old successes were"
-        return (
-            f"{runs} deleted ({size_words(self.freed_bytes)}), so that the recordings take no more than "
-            f"{size_words(self.keep_bytes)}; {LOG_NAME} names what was deleted."
-        )
+        freed, most = size_words(self.freed_bytes), size_words(self.keep_bytes)
+        return f"{runs} deleted ({freed}), since the recordings took more than {most}; {LOG_NAME} names them."
 
 
 def prune(folder: Path, index: RunIndex, keep_bytes: int) -> Pruned:
@@ -92,7 +90,7 @@ def _candidates(index: RunIndex) -> Iterator[RunRow]:
 
 def _delete(path: Path, row: RunRow) -> bool:
     """Delete a recording; whether that was done, and here."""
-    if not path.exists() or review_path(path).exists():  # deleted or labelled since it was listed
+    if not path.exists() or has_review(path):  # deleted or labelled since it was listed
         return False
     _log(path.parent / LOG_NAME, row)
     try:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from spherloc.errors import InputError, RecordingError, show
-from spherloc_viz.recording.review.notes import UNREADABLE, Review, checked_review, review_path
+from spherloc_viz.recording.review.notes import UNREADABLE, Review, checked_review, has_review, review_path
 from spherloc_viz.recording.run_row import RunRow
 from spherloc_viz.recording.strangers.checked_row import row_from_table
 from spherloc_viz.recording.strangers.child_process import Child, ExaminerError, cannot_start
@@ -91,7 +91,7 @@ class Examiner:
         path = path.absolute()  # the child stays in the folder in which it was started
         with self._lock:
             answer = self._ask(path, "row")
-            if answer is None and review_path(path).exists():
+            if answer is None and has_review(path):
                 # It may be the labels beside it that the child died of.
                 answer = self._ask(path, "bare row")
         return row_from_table(_wanted(answer, path, "row"), path)
