@@ -16,6 +16,8 @@ from hypothesis import settings
 from spherloc.datasets import load_scene
 from spherloc.datasets.synthetic import SyntheticScene
 from spherloc_viz.recording.index.run_index import RunIndex
+from spherloc_viz.recording.strangers import examiner as strangers
+from spherloc_viz.recording.strangers.examiner import Examiner
 
 ROOT = Path(__file__).resolve().parents[1]
 SUITE_SEED = int(os.environ.get("SPHERLOC_TEST_SEED", "0"))
@@ -54,6 +56,14 @@ def own_disk_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 def rng(request: pytest.FixtureRequest) -> np.random.Generator:
     """Randomness of one test: the same in every run and whatever tests run beside it."""
     return np.random.default_rng([SUITE_SEED, zlib.crc32(request.node.nodeid.encode())])
+
+
+@pytest.fixture(scope="module")
+def own_examiner() -> Iterator[None]:
+    """What the tests of a file have examined, a process of their own reads, which ends with them."""
+    with pytest.MonkeyPatch.context() as patch, Examiner() as examiner:
+        patch.setattr(strangers, "_shared", examiner)
+        yield
 
 
 @pytest.fixture

@@ -106,6 +106,13 @@ def test_single_changes_are_never_one_move() -> None:
     assert [history.step(-1) for _ in range(3)] == wishes[2::-1]
 
 
+def test_estimators_that_are_chosen_one_after_another_are_single_changes() -> None:
+    history, wishes = History(), [wish(estimator=name) for name in ("mc", "mc-exact", "ransac-2p", "mc")]
+    for k, asked in enumerate(wishes):
+        history.note(asked, 0.1 * k)
+    assert [history.step(-1) for _ in range(3)] == wishes[2::-1]
+
+
 def test_two_moves_of_one_slider_are_two() -> None:
     history = History()
     for k in range(3):

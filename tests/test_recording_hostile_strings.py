@@ -5,7 +5,6 @@ import io
 import json
 import re
 import zipfile
-from collections.abc import Iterator
 from dataclasses import replace
 from datetime import UTC, datetime
 from html.parser import HTMLParser
@@ -31,15 +30,9 @@ from spherloc_viz.recording.index.run_text import counts_text, rows_text
 from spherloc_viz.recording.origin import Origin
 from spherloc_viz.recording.review.notes import review_path, write_review
 from spherloc_viz.recording.run_row import RunRow
-from spherloc_viz.recording.strangers import examiner as strangers
 from spherloc_viz.recording.strangers.examiner import examine
 
-
-@pytest.fixture(scope="module", autouse=True)
-def no_child_stays() -> Iterator[None]:
-    yield
-    strangers._shared.close()
-
+pytestmark = pytest.mark.usefixtures("own_examiner")
 
 NOW = datetime(2026, 1, 2, tzinfo=UTC)
 CALM = RunRow(

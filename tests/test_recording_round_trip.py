@@ -1,7 +1,6 @@
 """A run's row is the same after its way through a file, another process and the list, whatever its texts are."""
 
 import json
-from collections.abc import Iterator
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -18,16 +17,10 @@ from spherloc_viz.recording.index.run_index import RunIndex
 from spherloc_viz.recording.origin import Origin
 from spherloc_viz.recording.review.notes import checked_review, write_review
 from spherloc_viz.recording.run_row import RunRow
-from spherloc_viz.recording.strangers import examiner as strangers
 from spherloc_viz.recording.strangers.checked_row import row_from_table, table_from_row
 from spherloc_viz.recording.strangers.examiner import examine
 
-
-@pytest.fixture(scope="module", autouse=True)
-def no_child_stays() -> Iterator[None]:
-    yield
-    strangers._shared.close()
-
+pytestmark = pytest.mark.usefixtures("own_examiner")
 
 anything = st.text(st.characters(exclude_categories=["Cs"]), max_size=60)
 """Any text but halves of characters, which no file can hold."""

@@ -19,9 +19,9 @@ from spherloc_viz.recording.content.writer import write_recording
 from spherloc_viz.recording.index.query import RunQuery
 from spherloc_viz.recording.index.run_index import RunIndex
 from spherloc_viz.recording.review.notes import Review, read_review, review_path
-from spherloc_viz.recording.strangers import examiner as strangers
 from spherloc_viz.recording.viewing.view import labels_of
 
+pytestmark = pytest.mark.usefixtures("own_examiner")
 ROOT = Path(__file__).resolve().parents[1]
 
 
@@ -126,4 +126,3 @@ def test_a_label_is_for_the_run_that_lies_there(tmp_path: Path):
         path.write_text("no run")
         with pytest.raises(RecordingError, match="not a whole recording"):
             index.set_review("a.rrd", ["right map"], "")
-    strangers._shared.close()

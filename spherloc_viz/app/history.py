@@ -14,8 +14,8 @@ SAME_MOVE_S = 5.0
 """Changes of the same things within this time count as one. The server hears values and not the pointer: a hand rests
 some seconds on a slider to look at the picture, and what it does to the same slider right after it, it hardly wants to
 take back alone. Another control, or an undo, in between ends the move at once."""
-PRESSED = frozenset({"seed"})
-"""Numbers that are not dragged: each change counts."""
+PRESSED = frozenset({"seed", "estimator"})
+"""What is not dragged: each change counts."""
 OPTIONS = "options."
 DRAGGED = (int, float, TrueCamera)
 """Types of what can be dragged; each change of others counts too."""
@@ -51,10 +51,10 @@ class History:
 
     def _goes_on(self, moved: frozenset[str], wish: Wish, now_s: float) -> bool:
         """Whether a change belongs to the same move as the last one."""
-        if moved != self._moved or now_s - self._noted_s >= SAME_MOVE_S or self._start < 0:
+        if moved != self._moved or moved & PRESSED or now_s - self._noted_s >= SAME_MOVE_S or self._start < 0:
             return False
         values = [_values(one)[name] for one in (self._wishes[self._at], wish) for name in moved]
-        return not moved & PRESSED and all(type(value) in DRAGGED for value in values)
+        return all(type(value) in DRAGGED for value in values)
 
     def step(self, by: int) -> Wish | None:
         """The wish before (-1) or after (+1), which is then the one that the page is at; None if there is none."""
