@@ -20,7 +20,7 @@ from spherloc.trace import Trace
 from spherloc.trajectory import write_tum
 from spherloc_viz.batch import Records, keeper_of, parse_settings
 from spherloc_viz.options import json_text
-from spherloc_viz.progress import aside, prepare, progress, say
+from spherloc_viz.progress import prepare, progress, say
 from spherloc_viz.recording.origin import Origin
 
 if TYPE_CHECKING:
@@ -98,9 +98,7 @@ def _work(
     try:
         prepare(scene)
         with progress(len(todo), "queries") as advance:
-            queries = localize(scene, todo, *how)
-            while (done := aside(lambda: next(queries, None))) is not None:
-                row, trace = done
+            for row, trace in localize(scene, todo, *how):
                 if recorder is not None and trace is not None:
                     row = replace(row, recording=recorder.record(trace, row.query))
                 # Its recording is complete by now, so a row never names one that a killed process left unwritten.

@@ -1,12 +1,11 @@
 """How far a long job is, on stderr, and jobs that Ctrl-C ends at once."""
 
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
-from typing import Any, TypeVar
+from typing import Any
 
 from tqdm import tqdm
 
@@ -15,8 +14,6 @@ from spherloc.estimators import estimate
 from spherloc.problem import Problem
 from spherloc.trace import Trace
 from spherloc.watch import Watch
-
-T = TypeVar("T")
 
 LINE_EVERY_S = 30.0
 """Where the output is no terminal, progress is a line now and then."""
@@ -73,20 +70,6 @@ def solve(problem: Problem, estimator: str, options: Any, seed: int) -> Trace:
             watch.cancel()
             raise
         return run.result()
-
-
-def aside(work: Callable[[], T]) -> T:
-    """Do ``work`` on a thread that Ctrl-C leaves to itself; only for who ends the process then."""
-    done: Future[T] = Future()
-
-    def run() -> None:
-        try:
-            done.set_result(work())
-        except BaseException as error:
-            done.set_exception(error)
-
-    threading.Thread(target=run, daemon=True).start()
-    return done.result()
 
 
 def prepare(scene: MapScene) -> None:

@@ -3,7 +3,6 @@
 import signal
 import subprocess
 import sys
-import threading
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,8 +11,9 @@ from recording_samples import scene_problem
 
 from spherloc.datasets import load_scene
 from spherloc.datasets.variation import Variation
+from spherloc.errors import InputError
 from spherloc.estimators import estimate, options_type
-from spherloc_viz.progress import aside, solve
+from spherloc_viz.progress import solve
 from spherloc_viz.recording.content.writer import write_recording
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -67,6 +67,5 @@ def test_who_is_not_interrupted_gets_the_run_and_its_errors() -> None:
     problem = scene_problem("mei_outliers_80")
     options = options_type("mc")()
     assert solve(problem, "mc", options, 3).message == estimate(problem, "mc", options, 3).message
-    assert aside(lambda: threading.current_thread().daemon) is True
-    with pytest.raises(ZeroDivisionError):
-        aside(lambda: 1 // 0)
+    with pytest.raises(InputError, match="unknown estimator"):
+        solve(problem, "magic", options, 3)
