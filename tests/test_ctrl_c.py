@@ -21,7 +21,8 @@ MOST_ITERATIONS = 10_000_000
 LIMIT_S = 240.0
 
 PROGRAM = """
-import sys
+import signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)  # programs in the background begin without it
 from spherloc_viz import progress
 from spherloc_viz.cli import main
 progress.LINE_EVERY_S = 0.05

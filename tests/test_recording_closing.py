@@ -31,7 +31,8 @@ for line in sys.stdin:
 """
 
 PROGRAM = """
-import contextlib, sys, threading, time
+import contextlib, signal, sys, threading, time
+signal.signal(signal.SIGINT, signal.default_int_handler)  # programs in the background begin without it
 from pathlib import Path
 from spherloc_viz.cli import main
 from spherloc_viz.recording.strangers import examiner
