@@ -179,6 +179,7 @@ def test_a_list_goes_on_when_its_folder_is_back(office: Office) -> None:
     until(lambda: "2 runs" in visitor.rows)
     visitor.touch(f"run-open:{first}")
     until(lambda: visitor.card.opened is not None)
+    assert visitor.card.opened.recorded.row.file == first
 
 
 def test_a_comparison_ends_with_its_runs(office: Office) -> None:

@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 from recording_samples import scene_problem
 from rerun.chunk import RrdReader
+from run_rows import some_row
 
 from spherloc.estimators import estimate
 from spherloc_viz.app.review.bundle import bundle
@@ -35,36 +36,19 @@ from spherloc_viz.recording.strangers.examiner import examine
 pytestmark = pytest.mark.usefixtures("own_examiner")
 
 NOW = datetime(2026, 1, 2, tzinfo=UTC)
-CALM = RunRow(
-    file="run.rrd",
-    run_id="1a2b",
+CALM = some_row(
+    "run.rrd",
     created="2026-01-01T12:00:00.000+00:00",
-    source="page",
     scene="scene",
     name="name",
     query="query",
-    estimator="mc",
-    seed=0,
     options='{"a": 1, "b": "x"}',
-    problem_key="1a2b",
-    outcome="failure",
-    diagnosis="ambiguous",
-    doubtful=True,
     summary="summary",
     message="message",
-    correspondences=100,
-    inliers=20,
-    outlier_rate=0.8,
-    rotation_error_deg=1.0,
-    translation_error_m=2.0,
-    time_ms=3.0,
-    proven=None,
-    steps=9,
-    decisive_step=3,
     title="title",
     labels=("label",),
     note="note",
-    size_bytes=1_000,
+    thumbnail=b"",
 )
 FREE = ("scene", "name", "query", "summary", "message", "title", "note")
 """Texts in which anything may stand."""

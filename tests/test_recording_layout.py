@@ -21,7 +21,7 @@ from rerun.experimental import ViewerClient
 from spherloc.estimators import estimate
 from spherloc.trace import Trace, TranslationStage, YawStage
 from spherloc_viz.layers import paint, steps
-from spherloc_viz.layers.primitives import Picture
+from spherloc_viz.layers.primitives import Chart, Curve, Picture
 from spherloc_viz.recording.content.columns import Values, static_chunk
 from spherloc_viz.recording.content.layout import layout_file, shown_in
 from spherloc_viz.recording.content.letters import legible
@@ -267,3 +267,14 @@ def test_layouts_are_shared(clique_run: Trace) -> None:
     pictures: list[Picture] = [paint(clique_run, index) for index in (0, 8)]
     panels = panels_of(clique_run)
     assert layout_file(shown_in(pictures, panels)) is layout_file(shown_in(list(pictures), panels))
+
+
+@pytest.mark.parametrize("peak", [10.0, 90.0])
+def test_a_legend_does_not_stand_before_the_peak(clique_run: Trace, peak: float) -> None:
+    x = np.arange(100.0)
+    curves = (
+        Curve("arcs", x, np.exp(-np.abs(x - peak)), (1, 2, 3), "step"),
+        Curve("truth", np.array([100.0 - peak]), np.array([2.0]), (1, 2, 3), "marker"),
+    )
+    picture = replace(paint(clique_run, 0), charts=(Chart("yaw", "Arcs", "yaw", "arcs", curves),))
+    assert shown_in([picture], panels_of(clique_run)).charts == (("yaw", "Arcs: arcs over yaw", peak > 50.0),)

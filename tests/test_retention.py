@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from run_rows import some_row
 
 from spherloc.errors import InputError, RecordingError
 from spherloc_viz.recording.index.query import RunQuery
@@ -19,33 +20,14 @@ from spherloc_viz.recording.run_row import RunRow
 
 SIZE = 1000
 
-SUCCESS = RunRow(
-    file="",
-    run_id="id",
+SUCCESS = some_row(
     created="",
-    source="page",
-    scene="street.toml",
     name="a street\twith a tab",
-    query=None,
-    estimator="mc",
-    seed=7,
-    options="{}",
-    problem_key="key",
     outcome="success",
     diagnosis="ok",
     doubtful=False,
-    summary="",
-    message="",
-    correspondences=100,
-    inliers=20,
-    outlier_rate=0.8,
-    rotation_error_deg=0.1,
-    translation_error_m=0.01,
-    time_ms=2.0,
-    proven=None,
-    steps=10,
-    decisive_step=9,
     size_bytes=SIZE,
+    thumbnail=b"",
 )
 FAILURE = replace(SUCCESS, outcome="failure", doubtful=True, diagnosis="too few inliers")
 UNKNOWN = replace(SUCCESS, outcome="unknown")

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
+import numpy as np
 import rerun.blueprint as rrb
 from rerun.blueprint import archetypes
 
@@ -28,8 +29,8 @@ MOST_LAYOUTS = 64
 class Shown:
     """What a layout has views for. Hashable, so that runs can share layouts."""
 
-    charts: tuple[tuple[str, str], ...]
-    """Name and heading of every chart."""
+    charts: tuple[tuple[str, str, bool], ...]
+    """Name and heading of every chart, and whether its legend stands on the left, where nothing high is behind it."""
     tables: tuple[str, ...]
     """Tables that a run shows before its last step; those of the last one are part of the outcome."""
     panels: Panels
@@ -42,10 +43,20 @@ def shown_in(pictures: Sequence[Picture], panels: Panels) -> Shown:
         for chart in picture.charts:
             charts.setdefault(chart.name, chart)
     named = tuple(
-        (name, legible(f"{chart.title}: {chart.y_label} over {chart.x_label}")) for name, chart in charts.items()
+        (name, legible(f"{chart.title}: {chart.y_label} over {chart.x_label}"), _low_on_the_left(chart))
+        for name, chart in charts.items()
     )
     tables = tuple(dict.fromkeys(table.name for picture in pictures[:-1] for table in picture.tables))
     return Shown(named, tables, panels)
+
+
+def _low_on_the_left(chart: Chart) -> bool:
+    curves = [curve for curve in chart.curves if curve.kind != "marker" and len(curve.x)]
+    if not curves:
+        return True
+    x, y = (np.concatenate([getattr(curve, name) for curve in curves]) for name in ("x", "y"))
+    left = x < 0.5 * (x.min() + x.max())
+    return float(y[left].max(initial=0.0)) <= float(y[~left].max(initial=0.0))
 
 
 def blueprint(shown: Shown) -> rrb.Blueprint:
@@ -54,12 +65,16 @@ def blueprint(shown: Shown) -> rrb.Blueprint:
     The layout pauses on the timeline of steps; at which step is up to who opens the recording, since a blueprint has
     no word for it. A viewer in a page is told by its address.
     """
-    # Where bars are low in most charts.
-    legend = rrb.PlotLegend("LeftTop")
-    plots = [rrb.BarChartView(origin=chart_path(name), name=label, plot_legend=legend) for name, label in shown.charts]
+    plots = [
+        rrb.BarChartView(
+            origin=chart_path(name), name=label, plot_legend=rrb.PlotLegend("LeftTop" if left else "RightTop")
+        )
+        for name, label, left in shown.charts
+    ]
     if shown.panels.residuals:
         # Second, since the chart of refinement is empty at most steps.
-        name = "Residuals: matches over log10 of px"
+        # There are bars everywhere, so the heading says what a legend would hide.
+        name, legend = "Residuals over log10 of px: right green, wrong red", rrb.PlotLegend(visible=False)
         plots.insert(1, rrb.BarChartView(origin=RESIDUALS, name=name, plot_legend=legend))
     texts = [
         rrb.TextDocumentView(origin="/outcome", name="Verdict"),
