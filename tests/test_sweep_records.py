@@ -52,30 +52,6 @@ def test_the_runs_of_all_workers_are_recorded_and_listed(tmp_path: Path, capsys:
     assert opened.live and opened.variation.correspondences == 30 and opened.options.iterations == 50
 
 
-def test_a_clusters_workers_on_this_machine_record_the_same_runs(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    distributed = pytest.importorskip("distributed", reason="Dask is missing: pip install 'spherloc[cluster]'")
-    here, cluster = tmp_path / "here", tmp_path / "cluster"
-    swept(tmp_path / "here.csv", here, workers=1)
-    with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, silence_logs=50
-    ) as workers:
-        swept(tmp_path / "cluster.csv", cluster, scheduler=workers.scheduler_address)
-    assert f"workers on this machine are recorded in {cluster}" in capsys.readouterr().err
-    assert poses(cluster) == poses(here) and len(poses(here)) == 12
-    assert sorted({path.suffix for path in cluster.iterdir()}) == [".rrd", ".sqlite"]
-
-
-def poses(folder: Path) -> dict[tuple[object, ...], bytes | None]:
-    """The pose of every run that the folder's list has, by its estimator and what it solved."""
-    with RunIndex(folder) as index:
-        rows = index.find(RunQuery(source="sweep"), limit=None).rows
-    found = {(row.estimator, row.problem_key, row.seed): read_recording(folder / row.file).cam_from_map for row in rows}
-    assert len(found) == len(rows) == len(list(folder.glob("*.rrd")))
-    return {key: None if pose is None else pose.tobytes() for key, pose in found.items()}
-
-
 def test_where_nothing_can_be_recorded_the_sweep_goes_on_and_says_it_once(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
