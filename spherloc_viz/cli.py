@@ -215,6 +215,7 @@ def play(
     recordings: Path = RECORDINGS,
     keep_gigabytes: float = KEEP_GIGABYTES,
     allow: tyro.conf.UseAppendAction[tuple[Path, ...]] = (),
+    token: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
 ) -> int:
     """Open the playground in a browser and print its address.
 
@@ -226,19 +227,23 @@ def play(
 
     spherloc play --allow ~/maps
 
+    spherloc play --host 0.0.0.0
+
     Args:
         scene: Scene file (TOML) or bundled scene's name to start with; a bundled one if not given.
-        host: Address to listen on. Anybody who reaches it can use the playground, so keep it on this machine.
+        host: Address to listen on. Beyond this machine the printed link carries a token, without which nobody gets in.
         port: Port to listen on; 0 takes a free one.
         record: Write a recording of each run that is settled on.
         recordings: Folder of the recordings.
         keep_gigabytes: What the recordings may take; beyond it the oldest successes that nobody labelled are deleted.
         allow: Another folder that pages may open scenes from; give it once for each.
+        token: Demand a token on this machine too, where others have accounts on it.
     """
     from spherloc.datasets import scene_path
     from spherloc_viz.app.server import serve
 
-    serve(None if scene is None else scene_path(scene), host, port, recordings, record, allow, keep_gigabytes)
+    start = None if scene is None else scene_path(scene)
+    serve(start, host, port, recordings, record, allow, keep_gigabytes, token)
     return 0
 
 

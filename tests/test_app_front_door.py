@@ -20,7 +20,9 @@ from viser import _messages
 
 from spherloc.errors import InputError
 from spherloc_viz.app.server import serve
+from spherloc_viz.app.web import access as access_module
 from spherloc_viz.app.web import viser_seams
+from spherloc_viz.app.web.access import Access, Role
 from spherloc_viz.app.web.front_door import FrontDoor
 from spherloc_viz.app.web.guard import is_own_name, open_socket, refusal
 from spherloc_viz.app.web.page import load_page
@@ -105,8 +107,9 @@ def test_policy_fits_the_page() -> None:
 class Door:
     """A running front door and a client that knocks on it."""
 
-    def __init__(self, port: int, client: aiohttp.ClientSession) -> None:
+    def __init__(self, port: int, client: aiohttp.ClientSession, access: Access) -> None:
         self.url = f"http://127.0.0.1:{port}/"
+        self.access = access
         self._client = client
 
     async def touch(self, body: bytes, origin: str | None = "own") -> aiohttp.ClientResponse:
@@ -118,18 +121,21 @@ class Door:
         await response.read()
         return response
 
-    def knock(self, origin: str | None = "own", **options: object):
+    def knock(self, origin: str | None = "own", path: str = "", cookie: str = "", **options: object):
         sent = {} if origin is None else {"Origin": self.url.rstrip("/") if origin == "own" else origin}
-        return self._client.ws_connect(self.url, headers=sent, protocols=[VERSION], max_msg_size=0, **options)  # type: ignore[arg-type]
+        sent |= {"Cookie": cookie} if cookie else {}
+        return self._client.ws_connect(self.url + path, headers=sent, protocols=[VERSION], max_msg_size=0, **options)  # type: ignore[arg-type]
 
 
 @asynccontextmanager
-async def door_to(port: int, desk: TouchDesk | None = None, viewer: ViewerRoom | None = None) -> AsyncIterator[Door]:
-    listener = open_socket("127.0.0.1", 0)
-    runner = await FrontDoor("127.0.0.1", port, KEY, desk or TouchDesk(), viewer).start(listener)
+async def door_to(
+    port: int, desk: TouchDesk | None = None, viewer: ViewerRoom | None = None, token: bool = False
+) -> AsyncIterator[Door]:
+    listener, access = open_socket("127.0.0.1", 0), Access(token)
+    runner = await FrontDoor("127.0.0.1", port, KEY, access, desk or TouchDesk(), viewer).start(listener)
     try:
-        async with aiohttp.ClientSession() as client:
-            yield Door(listener.getsockname()[1], client)
+        async with aiohttp.ClientSession(cookie_jar=aiohttp.DummyCookieJar()) as client:
+            yield Door(listener.getsockname()[1], client, access)
     finally:
         await runner.cleanup()
 
@@ -344,3 +350,128 @@ def test_presses_from_elsewhere_are_refused() -> None:
             assert (await door.touch(b" " * MOST_BYTES + report(touches.token))).status == 413
 
     asyncio.run(press())
+
+
+ROUTES = (
+    ("GET", ""),
+    ("HEAD", ""),
+    ("GET", "?darkMode"),
+    ("GET", "viewer/?run=a.rrd&step=0"),
+    ("GET", "viewer/program/0.41.0/re_viewer.js"),
+    ("GET", "viewer/data/a.rrd"),
+    ("GET", "viewer/data/a.review.rrd"),
+    ("GET", "nothing"),
+    ("POST", "touch"),
+    ("POST", ""),
+    ("PUT", "viewer/data/a.rrd"),
+)
+"""One of each kind that the door knows, and some that it does not."""
+
+
+def test_without_the_token_nothing_passes() -> None:
+    """On any route and any websocket, whatever is given instead."""
+    asked: list[str] = []
+    viewer = ViewerRoom(lambda file: asked.append(file) or pytest.fail("reached"))
+
+    async def visit() -> None:
+        desk, touches = TouchDesk(), Touches(failed=lambda error: None)
+        touches.on("select", lambda touch: pytest.fail("let in"))
+        desk.add(touches)
+        async with echoing() as (port, keys), door_to(port, desk, viewer, token=True) as door:
+            right = door.access._tokens[Role.PRESENTER]
+            name, another = door.access._cookie, Access(True)
+            wrong = (
+                "",
+                "x",
+                right[:-1],
+                right + "x",
+                right.swapcase(),
+                another._tokens[Role.PRESENTER],
+                "\u00e9",
+                "None",
+            )
+            for token in wrong:
+                for cookie in (f"{name}={token}", f"{another._cookie}={right}", f"token={right}"):
+                    for method, path in ROUTES:
+                        response = await door.get(path, method, Cookie=cookie, Origin=door.url.rstrip("/"))
+                        assert response.status == 403, (method, path, cookie)
+                        assert method == "HEAD" or "link" in await response.text()
+                    for path in ("", "viewer/", "touch", f"?token={right}"):
+                        with pytest.raises(aiohttp.WSServerHandshakeError, match="403"):
+                            await door.knock(path=path, cookie=cookie)
+                response = await door.get(f"?token={token}", Cookie=f"{name}={right}")
+                assert response.status == 403 and "Set-Cookie" not in response.headers
+            assert (await door.get(f"?token={right}&token={right}")).status == 403
+            assert (await door.get(f"touch?token={right}", "POST")).status == 403, "a link opens the page alone"
+            page = await door.get(Accept="text/html,*/*")
+            assert page.content_type == "text/html" and page.headers["Content-Security-Policy"]
+            assert "<script" not in await page.text()
+            assert keys == [] and asked == []
+
+    asyncio.run(asyncio.wait_for(visit(), 60))
+
+
+def test_a_link_becomes_a_cookie_and_the_token_leaves_the_address() -> None:
+    async def visit() -> None:
+        desk, touches = TouchDesk(), Touches(failed=lambda error: None)
+        desk.add(touches)
+        async with echoing() as (port, _), door_to(port, desk, token=True) as door:
+            origin = door.url.rstrip("/")
+            link = door.access.link(origin, Role.PRESENTER).removeprefix(door.url)
+            for path in (link, f"{link}&darkMode=", f"/evil.example/{link}", f"viewer/{link}"):
+                response = await door.get(path)
+                text = await response.text()
+                target = re.findall(r'content="0;url=([^"]*)"', text)
+                assert response.status == 200 and target == ["/?darkMode=" if "dark" in path else "/"]
+                assert "token" not in text and response.headers["Cache-Control"] == "no-store"
+                cookie, *rest = response.headers["Set-Cookie"].split("; ")
+                assert sorted(rest) == ["HttpOnly", "Path=/", "SameSite=Strict"]
+            assert (await door.get(Cookie=cookie)).status == 200
+            assert (await door.get("viewer/", Cookie=cookie)).status == 404
+            response = await door._client.post(
+                door.url + "touch", data=report(touches.token), headers={"Origin": origin, "Cookie": cookie}
+            )
+            assert response.status == 204
+            async with door.knock(cookie=cookie) as socket:
+                await socket.send_bytes(b"in")
+                assert await socket.receive_bytes() == b"in"
+            assert (await door.get(Cookie=cookie, Origin="http://evil.example")).status == 403
+            assert (await door.get(Cookie=cookie, Host="rebound.example")).status == 403
+
+    asyncio.run(asyncio.wait_for(visit(), 60))
+
+
+def test_tokens_are_compared_in_constant_time_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The right one gets nobody in where the comparison says no, and all are compared."""
+    compared: list[bytes] = []
+
+    def never(given: bytes, token: bytes) -> bool:
+        compared.append(token)
+        return False
+
+    async def visit() -> None:
+        async with door_to(1, token=True) as door:
+            tokens = door.access._tokens
+            assert len(set(tokens.values())) == len(Role) and min(map(len, tokens.values())) >= 43
+            with monkeypatch.context() as patch:
+                patch.setattr(access_module.hmac, "compare_digest", never)
+                right = tokens[Role.PRESENTER]
+                assert (await door.get(f"?token={right}")).status == 403
+                assert (await door.get(Cookie=f"{door.access._cookie}={right}")).status == 403
+            assert compared == [token.encode() for token in tokens.values()] * 2
+
+    asyncio.run(visit())
+
+
+def test_an_audience_opens_no_recordings() -> None:
+    viewer = ViewerRoom(lambda file: pytest.fail("reached"))
+
+    async def visit() -> None:
+        async with echoing() as (port, _), door_to(port, viewer=viewer, token=True) as door:
+            cookie = f"{door.access._cookie}={door.access._tokens[Role.AUDIENCE]}"
+            for path in ("viewer/?run=a.rrd&step=0", "viewer/data/a.rrd", "viewer/program/0.41.0/re_viewer.js"):
+                response = await door.get(path, Cookie=cookie)
+                assert response.status == 403 and "presenter" in await response.text()
+            assert (await door.get(Cookie=cookie)).status == 200
+
+    asyncio.run(asyncio.wait_for(visit(), 60))

@@ -23,6 +23,7 @@ from spherloc_viz.app.services import Services
 from spherloc_viz.app.session import Session
 from spherloc_viz.app.stage import views
 from spherloc_viz.app.status import Status
+from spherloc_viz.app.web.access import Access, Role
 from spherloc_viz.app.web.front_door import FrontDoor
 from spherloc_viz.app.web.guard import open_socket
 from spherloc_viz.app.web.viewer_room import ViewerRoom, of_index
@@ -32,6 +33,10 @@ from spherloc_viz.recording.keeping.recorder import Recorder
 from spherloc_viz.recording.keeping.room import KEEP_GIGABYTES, kept_bytes
 
 SWITCH_S = 0.001
+NOT_ENCRYPTED = (
+    "warning: the connection is not encrypted, so whoever can listen on the network can use the links as well; on one "
+    "that you do not trust keep to 127.0.0.1 and an SSH tunnel."
+)
 MOST_UNHEARD = 3
 """Notices that are kept for a page that opens later."""
 
@@ -44,13 +49,15 @@ def serve(
     record: bool = True,
     allow: Sequence[Path] = (),
     keep_gigabytes: float = KEEP_GIGABYTES,
+    token: bool = False,
 ) -> None:
     """Run the playground until Ctrl-C or a termination signal.
 
     ``scene`` is offered first, before those that come with the project; port 0 takes any free port. Runs that a
     page settles on are recorded into ``recordings`` unless ``record`` is false; beyond ``keep_gigabytes`` the oldest
     successes are deleted. Pages may open scenes from the folder of ``scene``, from that of the bundled ones and from
-    ``allow``. Raises ``InputError`` if the scene, one of these folders or the size cannot be used or the port cannot
+    ``allow``. A token is demanded if ``token`` says so, and always where the address is not this machine's alone.
+    Raises ``InputError`` if the scene, one of these folders or the size cannot be used or the port cannot
     be had.
     """
     catalog, keep_bytes = Catalog(scene), kept_bytes(keep_gigabytes)
@@ -71,8 +78,9 @@ def serve(
         stack.callback(stop_viser, server)
         stack.callback(sessions.close)
         sessions.attend(server)
-        door = FrontDoor(host, server.get_port(), key, services.desk, viewer)
-        asyncio.run(_serve_until_told(door, listener))
+        access = Access(demanded=token or not _is_loopback(listener))
+        door = FrontDoor(host, server.get_port(), key, access, services.desk, viewer)
+        asyncio.run(_serve_until_told(door, access, listener))
 
 
 def _open_index(recorder: Recorder | None, folder: Path, stack: contextlib.ExitStack) -> RunIndex | None:
@@ -167,7 +175,7 @@ class Sessions:
             session.close()
 
 
-async def _serve_until_told(door: FrontDoor, listener: socket.socket) -> None:
+async def _serve_until_told(door: FrontDoor, access: Access, listener: socket.socket) -> None:
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -176,15 +184,32 @@ async def _serve_until_told(door: FrontDoor, listener: socket.socket) -> None:
         except NotImplementedError:  # Windows: asyncio.run ends on Ctrl-C by itself
             break
     runner = await door.start(listener)
-    print(f"spherloc playground: {_address(listener)}", flush=True)
-    if not ipaddress.ip_address(listener.getsockname()[0]).is_loopback:
-        print("warning: whoever reaches this address can use the playground.", file=sys.stderr, flush=True)
+    address = _address(listener)
+    print(f"spherloc playground: {access.link(address, Role.PRESENTER)}", flush=True)
+    if not _is_loopback(listener):
+        print(NOT_ENCRYPTED, file=sys.stderr, flush=True)
     try:
         await stop.wait()
     finally:
         await runner.cleanup()
 
 
+def _is_loopback(listener: socket.socket) -> bool:
+    return ipaddress.ip_address(listener.getsockname()[0]).is_loopback
+
+
 def _address(listener: socket.socket) -> str:
+    """Where a browser finds a server; of one that listens on all addresses, at the one that others see."""
     host, port = listener.getsockname()[:2]
+    if ipaddress.ip_address(host).is_unspecified:
+        host = _outward_address(listener.family) or host
     return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
+
+
+def _outward_address(family: int) -> str | None:
+    """This machine's address on the way to others, if there is one; nothing is sent to find out."""
+    elsewhere = "2001:db8::1" if family == socket.AF_INET6 else "192.0.2.1"  # addresses for documentation
+    with socket.socket(family, socket.SOCK_DGRAM) as probe, contextlib.suppress(OSError):
+        probe.connect((elsewhere, 9))
+        return probe.getsockname()[0]
+    return None

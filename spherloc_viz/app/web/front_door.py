@@ -8,11 +8,12 @@ import socket
 import aiohttp
 from aiohttp import web
 
+from spherloc_viz.app.web.access import NO_TOKEN, Access, Role, refused
 from spherloc_viz.app.web.guard import SAFE, refusal
 from spherloc_viz.app.web.page import Page, load_page
 from spherloc_viz.app.web.touch import MOST_BYTES, TouchDesk
 from spherloc_viz.app.web.viewer_room import NOT_RECORDED, PAGE, ViewerRoom
-from spherloc_viz.app.web.viser_seams import KEY_HEADER
+from spherloc_viz.app.web.viser_seams import KEY_HEADER, ROLE_HEADER
 
 MAX_MESSAGE_BYTES = 50 * 1024 * 1024
 """What viser accepts from a page."""
@@ -25,6 +26,7 @@ PARAMETERS = frozenset(f"initialCamera{part}" for part in ("Position", "LookAt",
     "hideViserLogo",
 }
 """What a link may ask of viser's page. Others are dropped: they make it play a stranger's file or server."""
+NOT_FOR_AUDIENCE = "Recordings are the presenter's to open: the link for an audience shows what the presenter shows."
 
 
 class FrontDoor:
@@ -33,9 +35,11 @@ class FrontDoor:
     Everything else is refused.
     """
 
-    def __init__(self, host: str, viser_port: int, key: str, desk: TouchDesk, viewer: ViewerRoom | None = None) -> None:
+    def __init__(
+        self, host: str, viser_port: int, key: str, access: Access, desk: TouchDesk, viewer: ViewerRoom | None = None
+    ) -> None:
         """``viewer`` is None where nothing is recorded."""
-        self._host = host
+        self._host, self._access = host, access
         self._viewer = viewer
         self._desk = desk
         self._upstream = f"http://127.0.0.1:{viser_port}/"
@@ -69,11 +73,19 @@ class FrontDoor:
         reason = refusal(request.headers, self._host, upgrade)
         if reason is not None:
             return web.Response(status=403, text=reason + "\n")
+        entry = None if upgrade else self._access.enter(request)
+        if entry is not None:
+            return entry
+        role = self._access.role(request)
+        if role is None:
+            return refused(request, NO_TOKEN)
         if request.method == "POST" and request.path == "/touch":
             return await self._touch(request)
         if request.method not in ("GET", "HEAD"):
             return web.Response(status=405, text="Only GET is served.\n", headers={"Allow": "GET, HEAD"})
         if request.path.startswith(PAGE):
+            if role is not Role.PRESENTER:
+                return refused(request, NOT_FOR_AUDIENCE)
             if self._viewer is None:
                 return web.Response(status=404, text=f"{NOT_RECORDED}\n")
             return await self._viewer.answer(request)
@@ -81,7 +93,7 @@ class FrontDoor:
             raise web.HTTPFound("/")
         if request.path != "/":
             return web.Response(status=404, text="There is nothing here; open /.\n")
-        return await self._pass_on(request) if upgrade else self._page_response(request)
+        return await self._pass_on(request, role) if upgrade else self._page_response(request)
 
     async def _touch(self, request: web.Request) -> web.Response:
         """Only a page of this server can send one: others do not know its token, and are told apart by their Origin."""
@@ -103,15 +115,19 @@ class FrontDoor:
             body, headers["Content-Encoding"] = self._page.zipped, "gzip"
         return web.Response(body=body, content_type="text/html", charset="utf-8", headers=headers)
 
-    async def _pass_on(self, request: web.Request) -> web.StreamResponse:
-        """Join the page's websocket to one of viser's, for as long as both live."""
+    async def _pass_on(self, request: web.Request, role: Role) -> web.StreamResponse:
+        """Join the page's websocket to one of viser's, which learns whose it is, for as long as both live."""
         assert self._client is not None
         offered = [name for name in re.split(r"[,\s]+", request.headers.get("Sec-WebSocket-Protocol", "")) if name]
         # The client's name and version travel as a subprotocol. Compression would cost more than it saves:
         # viser's messages are compressed already, and its arrays do not compress.
         try:
             upstream = await self._client.ws_connect(
-                self._upstream, protocols=offered, headers={KEY_HEADER: self._key}, max_msg_size=0, compress=0
+                self._upstream,
+                protocols=offered,
+                headers={KEY_HEADER: self._key, ROLE_HEADER: role},
+                max_msg_size=0,
+                compress=0,
             )
         except aiohttp.ClientError:
             return web.Response(status=502, text="The playground is shutting down.\n")

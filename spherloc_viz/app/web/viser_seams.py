@@ -15,6 +15,8 @@ from viser import _messages
 
 KEY_HEADER = "X-Spherloc-Key"
 """Request header that carries the key; a web page cannot set headers on a websocket, a program can."""
+ROLE_HEADER = "X-Spherloc-Role"
+"""Request header that says what the page may do, next to the key."""
 
 
 Callback = TypeVar("Callback", bound=Callable[..., None])
@@ -40,6 +42,11 @@ def start_viser(key: str) -> viser.ViserServer:
 def set_theme(gui: viser.GuiApi, theme: str) -> None:
     """Make a page, or the pages to come, "dark" or "light"."""
     gui.configure_theme(dark_mode=theme == "dark", show_logo=False, show_share_button=False)
+
+
+def role_header(client: viser.ClientHandle) -> str:
+    """What the header of a client's connection said of its role; empty if nothing."""
+    return client._websock_connection.__dict__.get("role_header", "")
 
 
 def stop_viser(server: viser.ViserServer) -> None:
@@ -165,6 +172,8 @@ def _wake_on_loop(server: viser.ViserServer) -> None:
     sockets._broadcast_buffer.message_event = _LoopEvent(loop)
 
     def connected(client: Any) -> None:
+        request = sockets._live_connections[client.client_id].request
+        client.role_header = request.headers.get(ROLE_HEADER, "")
         client.get_message_buffer().message_event = _LoopEvent(loop)
 
     # Before viser's own callback, from which on messages are queued, and before anybody waits for one.
