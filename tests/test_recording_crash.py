@@ -26,7 +26,7 @@ from spherloc_viz.recording.index.query import RunQuery
 from spherloc_viz.recording.keeping.keeper import Keeper
 from spherloc_viz.recording.keeping.leftovers import STALE_AFTER_S, here, leftovers, unfinished
 from spherloc_viz.recording.keeping.recorder import Recorder
-from spherloc_viz.recording.keeping.rescue import rescue
+from spherloc_viz.recording.keeping.rescue import Rescued, rescue
 from spherloc_viz.recording.review.notes import write_review
 from spherloc_viz.recording.strangers.child_process import ExaminerError
 from spherloc_viz.recording.strangers.examiner import Examiner
@@ -127,7 +127,8 @@ def test_whoever_is_killed_at_any_moment_loses_the_run_in_flight_only(
     now = sorted(folder.glob("*.rrd"))
     assert [row.file for row in listed] == [path.name for path in now]
     assert not list(folder.glob("*.part")) and not list(scratches.iterdir())
-    assert len(now) - 1 - len(files) <= before and all("Recovered" in sentence for sentence in notices)
+    assert len(now) - 1 - len(files) + len(list(folder.glob("*.unreadable"))) <= before
+    assert all("Recovered" in sentence or "cannot be recovered" in sentence for sentence in notices)
 
 
 @pytest.fixture(scope="module")
@@ -150,22 +151,36 @@ def test_what_is_left_of_a_file_becomes_the_run_again_or_nothing(
         folder = Path(name)
         part = part_of(folder, "a.rrd", dead, recorded[: round(share * len(recorded))] + garbage)
         assert leftovers(folder) == [part]
-        path = rescue(part, examiner)
+        content = part.read_bytes()
+        done = rescue(part, examiner)
         left = [file.name for file in folder.iterdir()]
-        if path is None:
-            assert left == [] and share < 0.6
+        if done.recording is None:
+            assert share < 0.6
+            assert done.kept is None if not content else done.kept is not None and done.kept.read_bytes() == content
+            assert left == ([] if done.kept is None else ["a.rrd.00000000.unreadable"])
         else:
-            assert left == ["a.rrd"] and path == folder / "a.rrd"
-            assert compare(read_recording(path), trace) == [] and read_run_row(path).outcome == "success"
+            assert left == ["a.rrd"] and done == Rescued(folder / "a.rrd")
+            assert compare(read_recording(done.recording), trace) == []
+            assert read_run_row(done.recording).outcome == "success"
 
 
 def test_a_finished_file_without_its_name_is_moved_and_never_onto_another(
     recorded: bytes, dead: str, examiner: Examiner, tmp_path: Path
 ) -> None:
-    path = rescue(part_of(tmp_path, "a.rrd", dead, recorded), examiner)
+    path = rescue(part_of(tmp_path, "a.rrd", dead, recorded), examiner).recording
     assert path == tmp_path / "a.rrd" and path.read_bytes() == recorded
-    assert rescue(part_of(tmp_path, "a.rrd", dead, recorded[:1000]), examiner) is None
-    assert path.read_bytes() == recorded and len(list(tmp_path.iterdir())) == 1
+    kept = rescue(part_of(tmp_path, "a.rrd", dead, recorded[:1000]), examiner).kept
+    assert kept is not None and kept.read_bytes() == recorded[:1000]
+    assert path.read_bytes() == recorded and sorted(tmp_path.iterdir()) == [path, kept]
+
+
+def test_what_a_reviewer_said_last_is_kept_if_its_file_was_not_finished(
+    dead: str, examiner: Examiner, tmp_path: Path
+) -> None:
+    (tmp_path / "a.review.rrd").write_bytes(b"before")
+    kept = rescue(part_of(tmp_path, "a.review.rrd", dead, b"after"), examiner).kept
+    assert kept == tmp_path / "a.review.rrd.00000000.unreadable" and kept.read_bytes() == b"after"
+    assert (tmp_path / "a.review.rrd").read_bytes() == b"before"
 
 
 def test_without_room_a_leftover_waits(
@@ -174,8 +189,8 @@ def test_without_room_a_leftover_waits(
     part = part_of(tmp_path, "a.rrd", dead, recorded[: len(recorded) * 9 // 10])
     with monkeypatch.context() as patch:
         patch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=1000))
-        assert rescue(part, examiner) is None and part.exists()
-    assert rescue(part, examiner) == tmp_path / "a.rrd" and not part.exists()
+        assert rescue(part, examiner) == Rescued() and part.exists()
+    assert rescue(part, examiner) == Rescued(tmp_path / "a.rrd") and not part.exists()
 
 
 def test_a_leftover_that_cannot_be_read_since_nothing_can_be_stays(recorded: bytes, dead: str, tmp_path: Path) -> None:
@@ -198,10 +213,12 @@ def test_only_what_nobody_will_finish_is_a_leftover(dead: str, tmp_path: Path) -
     ]
     old = [tmp_path / f"old.rrd.{'0' * 8}.part", part_of(tmp_path, "far.rrd", f"{'0' * 8}-{boot}-{pid}-{start}")]
     young = [tmp_path / f"young.rrd.{'1' * 8}.part", unfinished(tmp_path / "alive.rrd")]
+    # Its process was stopped for an hour, say, and will go on.
+    living = unfinished(tmp_path / "stopped.rrd")
     others = [tmp_path / name for name in ("a.rrd", "notes.part", f"a.txt.{'0' * 8}.part", "a.rrd.zzzzzzzz.part")]
-    for path in (*old, *young, *others):
+    for path in (*old, *young, living, *others):
         path.touch()
-    for path in (*old, *others):
+    for path in (*old, living, *others):
         os.utime(path, (0, 0))
     (tmp_path / f"folder.rrd.{dead}-{'0' * 8}.part").mkdir()
     assert leftovers(tmp_path) == sorted(gone + old)
@@ -221,7 +238,11 @@ def test_the_next_start_tells_what_it_recovered(recorded: bytes, dead: str, tmp_
     with Recorder(tmp_path, lambda error: notices.append(str(error)), notices.append) as recorder:
         wait_for_upkeep(recorder)
         rows = recorder.index.find(RunQuery(sort="file", descending=False), limit=None).rows
-    assert notices == ["Recovered the recording of a run that was not finished: a.rrd."]
+    assert notices == [
+        "Recovered the recording of a run that was not finished: a.rrd.",
+        "An unfinished file of a killed process cannot be recovered, kept as b.rrd.00000000.unreadable in "
+        f"{tmp_path}: delete what you do not need.",
+    ]
     assert [(row.file, row.labels) for row in rows] == [("a.rrd", ()), ("d.rrd", ("street",))]
 
 

@@ -4,6 +4,8 @@ import os
 import socket
 import struct
 import subprocess
+import sys
+import threading
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -61,6 +63,28 @@ def layout_of(path: Path) -> tuple[dict[str, Any], dict[str, str]]:
         if "ViewBlueprint:space_origin" in row:
             views[row["ViewBlueprint:space_origin"][0]] = row["ViewBlueprint:class_identifier"][0]
     return panel, views
+
+
+def test_a_layout_is_whole_though_somebody_holds_the_frames_of_this_thread(sample_run: Trace) -> None:
+    """As profilers and debuggers do: rerun's own way to save it completes the file when its stream is deleted."""
+    shown = shown_in([paint(sample_run, step) for step in range(len(steps(sample_run)))], panels_of(sample_run))
+    done = threading.Event()
+
+    def hold_frames() -> None:
+        while not done.is_set():
+            frames = sys._current_frames()
+            done.wait(0.01)
+            del frames
+
+    holder = threading.Thread(target=hold_frames)
+    holder.start()
+    try:
+        for _ in range(12):
+            layout_file.cache_clear()
+            assert layout_file(shown).index
+    finally:
+        done.set()
+        holder.join()
 
 
 @pytest.mark.parametrize("name", ["clique_run", "sample_run", "lost", "exact"])

@@ -10,7 +10,7 @@ import threading
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pyarrow as pa
@@ -33,11 +33,13 @@ from hostile_recordings import (
 from impossible_recordings import IMPOSSIBLE, PROBLEM, RUN, RUN_PROPERTY
 from recording_samples import exact_run, lost_run, odd_problem, scene_problem
 from rerun.chunk import Chunk, LazyChunkStream
+from typing_extensions import TypeAliasType
 
 from spherloc.errors import RecordingError
 from spherloc.estimators import estimate
 from spherloc_viz.recording.content.reader import read_recording
 from spherloc_viz.recording.content.writer import write_recording
+from spherloc_viz.recording.strangers import content_check
 from spherloc_viz.recording.review.notes import Review, review_path, write_review
 from spherloc_viz.recording.run_row import RunRow
 from spherloc_viz.recording.strangers import examiner as strangers
@@ -338,3 +340,13 @@ def test_a_child_that_cannot_be_started_is_no_fault_of_a_file(good: Path, monkey
     monkeypatch.setattr(sys, "executable", "/nowhere/python")
     with pytest.raises(RecordingError, match="does not start"):
         list(examine_all([good]))
+
+
+def test_fields_whose_types_are_aliases_are_checked_too() -> None:
+    """As ``NDArray`` is from numpy 2.5 on."""
+    item = TypeVar("item", bound=np.generic)
+    array = TypeAliasType("array", np.ndarray[Any, np.dtype[item]], type_params=(item,))  # type: ignore[misc]
+    whole = TypeAliasType("whole", int)
+    for hint in (array, array[np.float64], array[np.float64] | None):
+        assert content_check._fits(np.zeros(3), hint) and not content_check._fits([0.0], hint)
+    assert content_check._fits(3, whole) and not content_check._fits(3.0, whole)

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import rerun.blueprint as rrb
+import rerun_bindings
+from rerun import RecordingStream
 from rerun.blueprint import archetypes
 
 from spherloc_viz.layers.primitives import Chart, Picture
@@ -134,5 +136,23 @@ def layout_file(shown: Shown) -> RrdFile:
         # On a full disk, saving a blueprint would wait for ever: find that out first.
         path.write_bytes(bytes(LAYOUT_ROOM))
         path.unlink()
-        blueprint(shown).save(APPLICATION_ID, path)
+        _save(blueprint(shown), path)
         return split(path.read_bytes())
+
+
+def _save(layout: rrb.Blueprint, path: Path) -> None:
+    """Write a blueprint to a file that is complete when this returns.
+
+    ``Blueprint.save`` leaves the end of the file to the deletion of its stream, which a profiler or debugger that
+    holds the frame of this thread delays. So the stream is ours here, and disconnected.
+    """
+    native = rerun_bindings.new_blueprint(
+        application_id=APPLICATION_ID, make_default=False, make_thread_default=False, default_enabled=True
+    )
+    stream = RecordingStream._from_native(native)
+    try:
+        stream.set_time("blueprint", sequence=0)
+        layout._log_to_stream(stream)
+        rerun_bindings.save_blueprint(str(path), native)
+    finally:
+        stream.disconnect()

@@ -5,7 +5,7 @@ import re
 import threading
 import unicodedata
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Self
@@ -107,18 +107,25 @@ class Keeper:
         self._tell_over(done)
 
     def tidy(self) -> None:
-        """Recover what killed processes left unfinished, or delete it, and say so.
+        """Recover what killed processes left unfinished, or rename it, and say so.
 
         Raises ``OSError``, or ``ExaminerError`` if nothing can be read or this is ended meanwhile.
         """
         folders = [folder for folder in (self.folder, self.folder / GALLERY) if folder.is_dir()]
         found = [part for folder in folders for part in leftovers(folder)]
         with self._examiners.crew(1) as (examiner,):
-            saved = [path for part in found if (path := rescue(part, examiner)) is not None]
+            rescued = [rescue(part, examiner) for part in found]
+        saved = [done.recording for done in rescued if done.recording is not None]
+        kept = [done.kept for done in rescued if done.kept is not None]
         if saved:
             runs = "a run" if len(saved) == 1 else f"{len(saved)} runs"
-            names = ", ".join(path.name for path in saved[:3]) + (" and more" if len(saved) > 3 else "")
-            self._notice(f"Recovered the recording of {runs} that was not finished: {names}.")
+            self._notice(f"Recovered the recording of {runs} that was not finished: {_names(saved)}.")
+        if kept:
+            files = "An unfinished file" if len(kept) == 1 else f"{len(kept)} unfinished files"
+            self._notice(
+                f"{files} of a killed process cannot be recovered, kept as {_names(kept)} in {kept[0].parent}: "
+                "delete what you do not need."
+            )
 
     def end_reading(self) -> None:
         """Read no more recordings, in whatever thread that happens; runs can still be recorded."""
@@ -155,6 +162,10 @@ def file_name(trace: Trace, now: datetime) -> str:
     """``<UTC time>_<scene>_<estimator>_<seed>_<id>.rrd``: sorts by time, is unique, and is safe in any file system."""
     when = now.strftime("%Y%m%dT%H%M%SZ")
     return f"{when}_{_slug(trace.problem.name)}_{_slug(trace.estimator)}_{trace.seed}_{uuid.uuid4().hex[:8]}.rrd"
+
+
+def _names(paths: Sequence[Path]) -> str:
+    return ", ".join(path.name for path in paths[:3]) + (" and more" if len(paths) > 3 else "")
 
 
 def _slug(text: str) -> str:

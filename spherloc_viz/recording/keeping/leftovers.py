@@ -11,7 +11,7 @@ from functools import cache, lru_cache
 from pathlib import Path
 
 STALE_AFTER_S = 600.0
-"""An unfinished file this old is nobody's, whatever its name says: a file takes less than a second."""
+"""An unfinished file this old is nobody's if nothing tells whether its owner lives: a file takes less than a second."""
 
 _OWNER = r"(?P<machine>[0-9a-f]{8})-(?P<boot>[0-9a-f]{8})-(?P<pid>\d{1,10})-(?P<start>\d{1,20})-"
 _PART = re.compile(rf"(?P<name>.+\.rrd)\.(?:{_OWNER})?[0-9a-f]{{8}}\.part")
@@ -31,8 +31,8 @@ def target_of(part: Path) -> Path | None:
 def leftovers(folder: Path) -> list[Path]:
     """Unfinished recordings in ``folder`` that nobody will finish, because their process has ended or they are old.
 
-    A process of another machine may still be alive, so its files count only when they are old. Raises ``OSError`` if
-    the folder cannot be read.
+    Age counts only where it cannot be known whether the process is alive, as on another machine. Raises ``OSError``
+    if the folder cannot be read.
     """
     found: list[Path] = []
     with os.scandir(folder) as entries:
@@ -40,8 +40,10 @@ def leftovers(folder: Path) -> list[Path]:
             match = _PART.fullmatch(entry.name)
             with contextlib.suppress(FileNotFoundError):  # finished meanwhile
                 if match is not None and entry.is_file(follow_symlinks=False):
-                    old = time.time() - entry.stat().st_mtime > STALE_AFTER_S
-                    if old or _ended(match):
+                    alive = _alive(match)
+                    if alive is None:
+                        alive = time.time() - entry.stat().st_mtime <= STALE_AFTER_S
+                    if not alive:
                         found.append(Path(entry.path))
     return sorted(found)
 
@@ -57,17 +59,19 @@ def _named(pid: int) -> str:
     return f"{here()}-{pid}-{_start_of(pid) or 0}"
 
 
-def _ended(part: re.Match[str]) -> bool:
-    """Whether the process that a name tells of has surely ended."""
+def _alive(part: re.Match[str]) -> bool | None:
+    """Whether the process that a name tells of is alive; None if that cannot be known here."""
     if part["machine"] is None:
-        return False
+        return None
     machine, boot = _here()
     if part["machine"] != machine:
-        return False
+        return None
     if part["boot"] != boot:
-        return True
+        return False
     start = _start_of(int(part["pid"]))
-    return start is None or str(start) != part["start"]
+    if not start:
+        return None if start == 0 else False
+    return str(start) == part["start"] if part["start"] != "0" else None
 
 
 def here() -> str:
@@ -99,7 +103,7 @@ def _start_of(pid: int) -> int | None:
         words = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
         return None if words[0] in "ZX" else int(words[19])  # dead, though its parent has not heard of it yet
     except (FileNotFoundError, ProcessLookupError):
-        return None
+        return 0 if _exists(pid) else None  # processes of other users may be hidden
     except (OSError, ValueError, IndexError):
         return 0
 
@@ -109,7 +113,7 @@ def _exists(pid: int) -> bool:
         return True  # sending a signal there would end it
     try:
         os.kill(pid, 0)
-    except ProcessLookupError:
+    except (ProcessLookupError, OverflowError):
         return False
     except OSError:
         return True

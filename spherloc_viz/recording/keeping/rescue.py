@@ -2,6 +2,7 @@
 
 import shutil
 import subprocess
+from dataclasses import dataclass
 from pathlib import Path
 
 from spherloc.errors import RecordingError
@@ -11,37 +12,52 @@ from spherloc_viz.recording.strangers.child_process import ExaminerError
 from spherloc_viz.recording.strangers.examiner import Examiner
 from spherloc_viz.recording.viewing.rerun_program import rerun_command, rerun_environment
 
+UNREADABLE_SUFFIX = ".unreadable"
+"""Ends the name of what was left unfinished and cannot be read; it began with the name that the file was to have."""
 ROOM = 4
 """A recovered recording takes up to twice the room of what it is made of, since it is packed less tightly."""
 MERGE_LIMIT_S = 60.0
 """rerun takes a twentieth of a second; one that takes this long has got stuck."""
 
 
-def rescue(part: Path, examiner: Examiner) -> Path | None:
-    """Make a recording of what is left of one, if there is enough; returns its path, or None.
+@dataclass(frozen=True)
+class Rescued:
+    """What became of a leftover."""
+
+    recording: Path | None = None
+    """The recording that was made of it."""
+    kept: Path | None = None
+    """Where it lies now if none could be made of it."""
+
+
+def rescue(part: Path, examiner: Examiner) -> Rescued:
+    """Make a recording of what is left of one, if there is enough; otherwise rename it, so that a person can decide.
 
     The problem and the result come first in a file, so that even a fifth of it has all that repeats the run. The
-    leftover is gone afterwards, unless the disk has no room to recover it. Raises ``OSError`` if the folder cannot be
-    written, ``ExaminerError`` if ``examiner`` has ended: the leftover stays then.
+    leftover stays as it is if the disk has no room to recover it; only an empty one is deleted. Raises ``OSError`` if
+    the folder cannot be written, ``ExaminerError`` if ``examiner`` has ended: the leftover stays then too.
     """
     target = target_of(part)
     if target is None:
-        return None
+        return Rescued()
     mended = unfinished(target)
     try:
+        if not part.stat().st_size:
+            part.unlink()
+            return Rescued()
         if not target.exists() and not target.name.endswith(REVIEW_SUFFIX):
             if _readable(part, examiner):
-                return part.replace(target)
+                return Rescued(part.replace(target))
             if shutil.disk_usage(part.parent).free < ROOM * part.stat().st_size:
-                return None
+                return Rescued()
             if _merged(part, mended) and _readable(mended, examiner):
                 mended.replace(target)
                 part.unlink()
-                return target
-        part.unlink()
-        return None
+                return Rescued(target)
+        number = part.name.removesuffix(".part")[-8:]  # tells leftovers of one file apart
+        return Rescued(kept=part.replace(part.with_name(f"{target.name}.{number}{UNREADABLE_SUFFIX}")))
     except FileNotFoundError:
-        return None  # another process has done it meanwhile
+        return Rescued()  # another process has done it meanwhile
     finally:
         mended.unlink(missing_ok=True)
 
@@ -59,8 +75,6 @@ def _readable(path: Path, examiner: Examiner) -> bool:
 
 def _merged(part: Path, mended: Path) -> bool:
     """Whether rerun could save what is whole at the start of ``part``."""
-    if not part.stat().st_size:
-        return False
     command = [*rerun_command(), "rrd", "merge", "--continue-on-error", str(part), "-o", str(mended)]
     try:
         done = subprocess.run(command, capture_output=True, check=False, timeout=MERGE_LIMIT_S, env=rerun_environment())

@@ -177,6 +177,8 @@ def check_run(run: RecordedRun, path: Path) -> None:
 
 def _fits(value: Any, hint: Any) -> bool:
     """Whether a value has a type such as fields of recorded dataclasses have, to the last item of it."""
+    # Of a type alias, such as NDArray is from numpy 2.5 on, this is what it stands for.
+    hint = getattr(get_origin(hint) or hint, "__value__", hint)
     kind, parts = get_origin(hint), get_args(hint)
     if kind in (Union, UnionType):
         return any(_fits(value, part) for part in parts)
