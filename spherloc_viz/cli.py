@@ -231,7 +231,8 @@ def play(
 
     Args:
         scene: Scene file (TOML) or bundled scene's name to start with; a bundled one if not given.
-        host: Address to listen on. Beyond this machine the printed link carries a token, without which nobody gets in.
+        host: Address to listen on. Beyond this machine the printed links carry tokens: one link is yours, the other is
+            for an audience, which can only look.
         port: Port to listen on; 0 takes a free one.
         record: Write a recording of each run that is settled on.
         recordings: Folder of the recordings.

@@ -12,7 +12,8 @@ import msgspec
 import viser
 import zstandard
 
-from spherloc_viz.app.web.viser_seams import KEY_HEADER
+from spherloc_viz.app.web.access import Role
+from spherloc_viz.app.web.viser_seams import KEY_HEADER, ROLE_HEADER
 
 HELLO = {
     "type": "ViewerCameraMessage",
@@ -39,9 +40,9 @@ def until(condition: Callable[[], Any]) -> None:
 class Wire:
     """A connection to viser on a thread and an event loop of its own, which end with it."""
 
-    def __init__(self, port: int, key: str) -> None:
+    def __init__(self, port: int, key: str, role: str = Role.PRESENTER) -> None:
         """Connect, and say what a page says first."""
-        self._port, self._key = port, key
+        self._port, self._key, self._role = port, key, role
         self._loop, self._leaving = asyncio.new_event_loop(), asyncio.Event()
         self._socket: aiohttp.ClientWebSocketResponse | None = None
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -58,7 +59,7 @@ class Wire:
         async with aiohttp.ClientSession() as client:
             self._socket = await client.ws_connect(
                 f"http://127.0.0.1:{self._port}/",
-                headers={KEY_HEADER: self._key},
+                headers={KEY_HEADER: self._key, ROLE_HEADER: self._role},
                 protocols=[f"viser-v{viser.__version__}"],
                 max_msg_size=0,
             )

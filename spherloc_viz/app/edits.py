@@ -44,6 +44,17 @@ class Edits:
                 chosen = known - chosen if chosen <= known else known | chosen
             self._selected = tuple(sorted(chosen))
 
+    def select_words(self, words: str, extend: bool, kept: NDArray[np.int64]) -> bool:
+        """Select the matches whose numbers a page names, such as "3,17"; false if they are not among ``kept`` (N,)."""
+        named = words.split(",")
+        if not all(word.isascii() and word.isdigit() and len(word) < 10 for word in named):
+            return False
+        numbers = set(map(int, named))
+        if not numbers <= set(kept.tolist()):
+            return False
+        self.select(numbers, extend)
+        return True
+
     def spoil(self) -> None:
         """Make the selected matches wrong."""
         with self._lock:

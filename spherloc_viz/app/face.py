@@ -1,19 +1,18 @@
 """All that a page shows of a run: the canvas, the story beside it, and the card of what is selected."""
 
 from collections.abc import Callable, Iterable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Protocol
 
 import viser
 
 from spherloc.datasets.synthetic import TrueCamera
 from spherloc.diagnosis import Diagnosis
-from spherloc_viz.app.catalog import Catalog
-from spherloc_viz.app.controls.controls import Controls, Owner
+from spherloc_viz.app.controls.display_controls import DisplayControls
 from spherloc_viz.app.matches.match_card import MatchCard
 from spherloc_viz.app.panels.export_panel import Shown
-from spherloc_viz.app.services import Services
-from spherloc_viz.app.stage.canvas import Canvas, panel_widths_px
+from spherloc_viz.app.stage.canvas import Canvas
 from spherloc_viz.app.story import Story
 from spherloc_viz.app.text import diagnosis_html, status_html
 from spherloc_viz.app.web.touch import Touches
@@ -23,36 +22,64 @@ from spherloc_viz.layers import paint, steps, with_rival
 from spherloc_viz.layers.primitives import Picture, SceneItem
 from spherloc_viz.layers.selection import with_selection
 from spherloc_viz.layers.tables import outcome_table
-from spherloc_viz.layers.trajectory import trajectory_items
 
 START_THEME = "dark"
+
+
+class Panel(Protocol):
+    """What the face needs of the panel right of the canvas."""
+
+    @property
+    def display(self) -> DisplayControls:
+        """What of the canvas is shown."""
+        ...
+
+    @property
+    def camera_movable(self) -> bool:
+        """Whether the true camera can be dragged."""
+        ...
+
+    def items(self, run: Run) -> tuple[SceneItem, ...]:
+        """What the canvas shows beside a run."""
+        ...
+
+    def draw(self, run: Run, diagnosis: Diagnosis | None) -> None:
+        """Follow the run at hand."""
+        ...
+
+
+@dataclass(frozen=True)
+class Places:
+    """Where the face tells what is done on it."""
+
+    redraw: Callable[[object], None]
+    """The page is to be drawn anew."""
+    select: Callable[[Iterable[int], bool], None]
+    """Matches were selected, by their numbers in the problem; or, if true, are to be added to what is."""
+    move: Callable[[TrueCamera], None] | None
+    """The true camera was dragged to a new place; None where it may not be."""
 
 
 class Face:
     """One client's page. Everything is drawn on the session's page thread."""
 
     def __init__(
-        self,
-        client: viser.ClientHandle,
-        catalog: Catalog,
-        touches: Touches,
-        owner: Owner,
-        services: Services,
-        select: Callable[[Iterable[int], bool], None],
-        moved: Callable[[TrueCamera], None],
+        self, client: viser.ClientHandle, touches: Touches, controls: Panel, places: Places, widths_px: tuple[int, int]
     ) -> None:
-        """``select`` gets numbers of correspondences in the problem, ``moved`` the true camera's new place."""
-        self._client, self._catalog = client, catalog
-        left_px, right_px = panel_widths_px(client.camera.image_width)
-        self.controls = Controls(client, catalog, services, touches, owner, right_px)
-        self.story = Story(client.gui, touches, owner.redraw, lambda places: select(places, False), left_px)
-        self.card = MatchCard(client.gui)
-        self.canvas = Canvas(client, self.controls.display, select, moved, left_px + right_px)
-        self._shown: tuple[Run, Picture] | None = None
+        """``widths_px`` are those of the panels left and right of the canvas."""
+        self._client, self.controls = client, controls
+        select, movable = places.select, places.move is not None
+        self.story = Story(client.gui, touches, places.redraw, lambda chosen: select(chosen, False), widths_px[0])
+        self.card = MatchCard(client.gui, editable=movable)
+        moved = places.move or (lambda place: None)
+        self.canvas = Canvas(client, self.controls.display, select, moved, sum(widths_px))
+        self._shown: tuple[Run, bytes | None, Picture] | None = None
         self._theme = START_THEME
 
-    def draw(self, run: Run, diagnosis: Diagnosis | None, selected: tuple[int, ...], asked: bool) -> float | None:
-        """Show the step at hand of a run; returns seconds to the next step if they play.
+    def draw(
+        self, run: Run, mesh: bytes | None, diagnosis: Diagnosis | None, selected: tuple[int, ...], asked: bool
+    ) -> float | None:
+        """Show the step at hand of a run, whose map has that mesh; returns seconds to the next step if they play.
 
         ``selected`` are numbers in the problem, and ``diagnosis`` is None for as long as there is none. ``asked`` is
         false if only time has passed.
@@ -65,11 +92,11 @@ class Face:
         if last and rival is not None:
             picture = with_rival(picture, trace, rival)
         drawn = with_selection(picture, trace, selected)
-        drawn = replace(drawn, scene=drawn.scene + controls.items(run) + self._trajectory(run))
-        self._shown = run, drawn
+        drawn = replace(drawn, scene=drawn.scene + controls.items(run))
+        self._shown = run, mesh, drawn
         with self._client.atomic():
             self._follow_theme()
-            self.canvas.draw(run, drawn, self._catalog.mesh(run.wish.scene.scene), controls.camera_movable)
+            self.canvas.draw(run, drawn, mesh, controls.camera_movable)
             # The other views tell inliers by the colours of the picture as it was.
             told = replace(picture, step=drawn.step)
             self.story.draw(run, told, pause is not None, outcome_table(trace), selected)
@@ -84,12 +111,12 @@ class Face:
         """What is on the page, to be exported; ``recorded`` is the run's recording, if there is one."""
         if self._shown is None:
             return None
-        (run, picture), display = self._shown, self.controls.display
+        (run, mesh, picture), display = self._shown, self.controls.display
         trace, layers = run.trace, display.layers()
         return Shown(
             trace=trace,
             items=tuple(item for item in picture.scene if item.layer in layers),
-            backdrop=self._catalog.mesh(run.wish.scene.scene) if "mesh" in layers else None,
+            backdrop=mesh if "mesh" in layers else None,
             title=run.wish.scene.scene,
             note=f"{trace.estimator}, seed {trace.seed}. {trace.message}",
             recorded=recorded,
@@ -101,11 +128,3 @@ class Face:
         if theme != self._theme:
             self._theme = theme
             set_theme(self._client.gui, theme)
-
-    def _trajectory(self, run: Run) -> tuple[SceneItem, ...]:
-        """The sequence that was localized in the scene at hand, if any."""
-        label = run.wish.scene.scene
-        scene, rows = self._catalog.map_scene(label), self.controls.sequence.rows(label)
-        if scene is None or not rows:
-            return ()
-        return trajectory_items(rows, run.trace.problem.aligned.map_turn, scene.thresholds[-1][1])

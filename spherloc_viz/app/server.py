@@ -17,6 +17,7 @@ import viser
 from spherloc.datasets import bundled_scenes
 from spherloc.errors import InputError, RecordingError
 from spherloc.estimators import warm_up
+from spherloc_viz.app.audience import Audience
 from spherloc_viz.app.catalog import Catalog
 from spherloc_viz.app.review.shelf import Shelf
 from spherloc_viz.app.services import Services
@@ -27,7 +28,7 @@ from spherloc_viz.app.web.access import Access, Role
 from spherloc_viz.app.web.front_door import FrontDoor
 from spherloc_viz.app.web.guard import open_socket
 from spherloc_viz.app.web.viewer_room import ViewerRoom, of_index
-from spherloc_viz.app.web.viser_seams import set_theme, start_viser, stop_viser
+from spherloc_viz.app.web.viser_seams import role_header, set_theme, start_viser, stop_viser
 from spherloc_viz.recording.index.run_index import RunIndex
 from spherloc_viz.recording.keeping.recorder import Recorder
 from spherloc_viz.recording.keeping.room import KEEP_GIGABYTES, kept_bytes
@@ -116,7 +117,7 @@ class Sessions:
 
     def __init__(self, services: Services) -> None:
         self._services = services
-        self._open: dict[int, Session] = {}
+        self._open: dict[int, Session | Audience] = {}
         self._lock = threading.Lock()
         self._unheard: list[str] = []
         """Notices that came when no page was open, for the next one."""
@@ -132,20 +133,22 @@ class Sessions:
         server.on_client_disconnect(lambda client: self._dismiss(client.client_id))
 
     def report(self, error: RecordingError) -> None:
-        """Tell every page that a run could not be recorded."""
-        with self._lock:
-            sessions = tuple(self._open.values())
-        for session in sessions:
+        """Tell every presenter's page that a run could not be recorded."""
+        for session in self._presenters():
             session.complain(str(error))
 
     def notice(self, sentence: str) -> None:
-        """Tell every page what became of recordings."""
-        with self._lock:
-            sessions = tuple(self._open.values())
-            if not sessions:
+        """Tell every presenter's page what became of recordings."""
+        sessions = self._presenters()
+        if not sessions:
+            with self._lock:
                 self._unheard = [*self._unheard[1 - MOST_UNHEARD :], sentence]
         for session in sessions:
             session.notice(sentence)
+
+    def _presenters(self) -> tuple[Session, ...]:
+        with self._lock:
+            return tuple(session for session in self._open.values() if isinstance(session, Session))
 
     def close(self) -> None:
         """Close them all."""
@@ -154,15 +157,18 @@ class Sessions:
 
     def _welcome(self, server: viser.ViserServer, client: viser.ClientHandle) -> None:
         try:
-            session = Session(client, self._services)
+            kind = Session if role_header(client) == Role.PRESENTER else Audience
+            session = kind(client, self._services)
         except Exception as error:  # else the page would wait for its first picture for ever
             Status(client).fail(error)
             return
         with self._lock:
             self._open[client.client_id] = session
-            unheard, self._unheard = self._unheard, []
+            unheard = self._unheard if isinstance(session, Session) else []
+            if unheard:
+                self._unheard = []
         session.start()
-        if unheard:
+        if unheard and isinstance(session, Session):
             session.notice(" ".join(unheard))
         # viser runs these callbacks side by side: the client may have left before it was welcomed.
         if client.client_id not in server.get_clients():
@@ -186,6 +192,8 @@ async def _serve_until_told(door: FrontDoor, access: Access, listener: socket.so
     runner = await door.start(listener)
     address = _address(listener)
     print(f"spherloc playground: {access.link(address, Role.PRESENTER)}", flush=True)
+    if access.demanded:
+        print(f"for an audience, which can only look: {access.link(address, Role.AUDIENCE)}", flush=True)
     if not _is_loopback(listener):
         print(NOT_ENCRYPTED, file=sys.stderr, flush=True)
     try:

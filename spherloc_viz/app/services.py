@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from spherloc_viz.app.catalog import Catalog
+from spherloc_viz.app.presented import Presented
 from spherloc_viz.app.review.shelf import Shelf
 from spherloc_viz.app.web.touch import TouchDesk
 from spherloc_viz.recording.keeping.recorder import Recorder
@@ -22,3 +23,5 @@ class Services:
     """The recordings that pages review; None if there is no folder of them."""
     desk: TouchDesk = field(default_factory=TouchDesk)
     """Where presses on the pages arrive."""
+    presented: Presented = field(default_factory=Presented)
+    """What pages of an audience show."""

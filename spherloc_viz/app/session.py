@@ -18,15 +18,17 @@ from spherloc.problem import Problem
 from spherloc.trace import Trace
 from spherloc.watch import Cancelled
 from spherloc_viz.app.catalog import SceneWish
+from spherloc_viz.app.controls.controls import Controls
 from spherloc_viz.app.echo import Echo
 from spherloc_viz.app.edits import Edits
-from spherloc_viz.app.face import Face
+from spherloc_viz.app.face import Face, Places
 from spherloc_viz.app.history import History
 from spherloc_viz.app.newest import Job, Newest
 from spherloc_viz.app.notices import Notices
 from spherloc_viz.app.page_runs import Known, PageRuns
 from spherloc_viz.app.panels.export_panel import Shown
 from spherloc_viz.app.services import Services
+from spherloc_viz.app.stage.canvas import panel_widths_px
 from spherloc_viz.app.status import Status
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.web.viser_seams import guard_callbacks, put_back
@@ -61,8 +63,10 @@ class Session:
         self._diagnosed: tuple[Trace, Diagnosis] | None = None
         self._runs = PageRuns(services.recorder, self._catalog)
         self._notices = Notices(client)
-        self._face = Face(client, self._catalog, self._touches, self, services, self.select, self._move_camera)
-        self._controls = self._face.controls
+        left_px, right_px = panel_widths_px(client.camera.image_width)
+        self._controls = Controls(client, self._catalog, services, self._touches, self, right_px)
+        places = Places(self.redraw, self.select, self._move_camera)
+        self._face = Face(client, self._touches, self._controls, places, (left_px, right_px))
         self._listen()
         # Only now may the page tell what is pressed: everything that listens is there.
         services.desk.add(self._touches)
@@ -146,12 +150,8 @@ class Session:
         self.changed()
 
     def _select_numbers(self, touch: Touch) -> None:
-        run, words = self._run, touch.argument.split(",")
-        if run is None or not all(word.isascii() and word.isdigit() and len(word) < 10 for word in words):
-            return
-        numbers = set(map(int, words))
-        if numbers <= set(run.kept.tolist()):
-            self._edits.select(numbers, touch.extend)
+        run = self._run
+        if run is not None and self._edits.select_words(touch.argument, touch.extend, run.kept):
             self._page.ask()
 
     def use_estimator(self, name: str) -> None:
@@ -228,6 +228,7 @@ class Session:
         if run is None:
             return None
         self._controls.settle(run)
+        self._services.presented.show(run, self._mesh(run), self._diagnosis(run))
         sentence, pause = self._runs.settle(run, self._diagnosis(run))
         self._status.say(sentence)
         return pause
@@ -244,13 +245,17 @@ class Session:
         known = self._diagnosed
         return known[1] if known is not None and known[0] is run.trace else None
 
+    def _mesh(self, run: Run) -> bytes | None:
+        """Of the run's map, if it has one."""
+        return self._catalog.mesh(run.wish.scene.scene)
+
     def _show(self, asked: bool) -> float | None:
         """The page thread's job: show the step at hand of the newest run."""
         run = self._run
         if run is None:
             return None
         diagnosis = self._diagnosis(run)
-        pause = self._face.draw(run, diagnosis, self._edits.places(run.kept), asked)
+        pause = self._face.draw(run, self._mesh(run), diagnosis, self._edits.places(run.kept), asked)
         if diagnosis is None:
             self._doctor.ask()
         return pause
@@ -263,6 +268,7 @@ class Session:
         if asked:
             return DIAGNOSE_AFTER_S
         self._diagnosed = run.trace, diagnose(run.trace)
+        self._services.presented.diagnose(*self._diagnosed)
         self._page.ask()
         return None
 

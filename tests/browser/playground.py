@@ -96,7 +96,7 @@ def served(*words: str | Path) -> Iterator[tuple[str, subprocess.Popen[str]]]:
     try:
         line = server.stdout.readline()
         too_late.cancel()
-        match = re.fullmatch(r"spherloc playground: (http://127\.0\.0\.1:\d+)\n", line)
+        match = re.fullmatch(r"spherloc playground: (http://127\.0\.0\.1:\d+(/\?token=[\w-]+)?)\n", line)
         assert match, line or server.communicate(timeout=10)
         yield match[1], server
     finally:

@@ -33,6 +33,7 @@ from spherloc_viz.app.web.touch import Touches
 from spherloc_viz.app.web.viser_seams import at_once
 from spherloc_viz.app.wish import Run, Wish
 from spherloc_viz.layers.primitives import SceneItem
+from spherloc_viz.layers.trajectory import trajectory_items
 from spherloc_viz.recording.again.reopen import Reopened
 
 UNDO, REDO, NEW_SEED = "Undo", "Redo", "New seed"
@@ -150,8 +151,8 @@ class Controls:
         self._show_scene(wish.scene.scene)
 
     def items(self, run: Run) -> tuple[SceneItem, ...]:
-        """What the canvas shows beside a run: cameras of other estimators, and recorded ones."""
-        return self.compare.items(run.trace) + self.review.items(run)
+        """What the canvas shows beside a run: cameras of other estimators, recorded ones, and those of a sequence."""
+        return self.compare.items(run.trace) + self.review.items(run) + self._trajectory(run)
 
     def draw(self, run: Run, diagnosis: Diagnosis | None) -> None:
         """Follow the run at hand; ``diagnosis`` is None for as long as there is none."""
@@ -168,6 +169,14 @@ class Controls:
         words = (scene.seed, scene.query, scene.variation, wish.estimator, wish.options)
         path = self._catalog.path(scene.scene)
         self._export.draw(share.as_python(path, *words), share.as_command(path, *words))
+
+    def _trajectory(self, run: Run) -> tuple[SceneItem, ...]:
+        """The sequence that was localized in the scene at hand, if any."""
+        label = run.wish.scene.scene
+        scene, rows = self._catalog.map_scene(label), self.sequence.rows(label)
+        if scene is None or not rows:
+            return ()
+        return trajectory_items(rows, run.trace.problem.aligned.map_turn, scene.thresholds[-1][1])
 
     def _show_scene(self, label: str) -> None:
         self.sequence.show(self._catalog.map_scene(label))

@@ -26,7 +26,9 @@ class MatchCard:
     It lies over the canvas, so what is longer than a glance is folded until it is asked for.
     """
 
-    def __init__(self, gui: viser.GuiApi) -> None:
+    def __init__(self, gui: viser.GuiApi, editable: bool = True) -> None:
+        """``editable`` says whether the page may change matches."""
+        self._editable = editable
         self._panel = gui.add_panel(visible=False)
         with self._panel.add_tab("Selection"):
             self._html = gui.add_html("")
@@ -55,9 +57,10 @@ class MatchCard:
         self._drawn = drawn
         if len(selected) == 1:
             what = explain(trace, selected[0], rival_cam_from_map)
-            html, details = one_html(trace, what, kept), details_html(what, kept)
+            html, details = one_html(trace, what, kept, self._editable), details_html(what, kept)
         else:
-            html, details = many_html(trace, explain_many(trace, np.array(selected)), kept[list(selected)]), ""
+            numbers, traits = kept[list(selected)], explain_many(trace, np.array(selected))
+            html, details = many_html(trace, traits, numbers, self._editable), ""
         if self._more.visible != bool(details):
             self._more.visible = bool(details)
         for element, content in ((self._html, html), (self._details, details)):
@@ -65,14 +68,14 @@ class MatchCard:
                 element.content = content
 
 
-def one_html(trace: Trace, what: Explanation, kept: NDArray) -> str:
+def one_html(trace: Trace, what: Explanation, kept: NDArray, editable: bool) -> str:
     """The card of one match: what became of it and why, and what can be done."""
     title = f'<span style="font-size:15px;font-weight:600">Match {kept[what.number]}</span>'
     color = style.OUTLIER if "wrongly" in what.verdict else style.INLIER if what.kept else None
     look = f"color:{style.css_text(color)};font-weight:600" if color else "font-weight:600"
     head = f'<div>{_walk(what.number, kept)}{title} <span style="{look}">{escape(what.verdict)}</span></div>'
     body = f'<div style="padding-top:.3em">{escape(what.reason)}</div>{crops_html(trace.problem, what.number)}'
-    return box(head + body) + _actions(trace, 1)
+    return box(head + body) + _actions(trace, 1, editable)
 
 
 def details_html(what: Explanation, kept: NDArray) -> str:
@@ -80,7 +83,7 @@ def details_html(what: Explanation, kept: NDArray) -> str:
     return _measures(what) + _notes(what, kept)
 
 
-def many_html(trace: Trace, what: Traits, numbers: NDArray) -> str:
+def many_html(trace: Trace, what: Traits, numbers: NDArray, editable: bool) -> str:
     """The card of several matches with these original numbers."""
     shown = ", ".join(map(str, numbers[:12].tolist())) + (" …" if len(numbers) > 12 else "")
     head = f'<div style="font-size:15px;font-weight:600">{what.count:,} matches</div>'
@@ -93,7 +96,7 @@ def many_html(trace: Trace, what: Traits, numbers: NDArray) -> str:
     if trace.cam_from_map is not None and what.pairs:
         rows.append(("pairs that agree", f"{what.agree:,} of {what.pairs:,} at the estimated yaw"))
     table = Table("selection", ("", "these"), tuple(rows))
-    return box(head + body) + table_html(table) + _actions(trace, what.count)
+    return box(head + body) + table_html(table) + _actions(trace, what.count, editable)
 
 
 def _walk(number: int, kept: NDArray) -> str:
@@ -103,7 +106,11 @@ def _walk(number: int, kept: NDArray) -> str:
     return f'<span style="float:right;white-space:nowrap">{back}{on}</span>'
 
 
-def _actions(trace: Trace, count: int) -> str:
+def _actions(trace: Trace, count: int, editable: bool) -> str:
+    deselect = chip("Deselect", "deselect:", False)
+    if not editable:
+        changes = (_disabled(words, "Only the presenter changes matches") for words in ("Spoil", "Mend", "Hide"))
+        return box("".join(changes) + deselect)
     it = "this match" if count == 1 else "these matches"
     mend = (
         chip("Mend", "mend:", False, f"Put {it} where the true pose sees the point")
@@ -112,7 +119,7 @@ def _actions(trace: Trace, count: int) -> str:
     )
     spoil = chip("Spoil", "spoil:", False, f"Give {it} a wrong pixel at random")
     hide = chip("Hide", "hide:", False, f"Leave {it} out of the problem")
-    return box(f"{spoil}{mend}{hide}{chip('Deselect', 'deselect:', False)}")
+    return box(f"{spoil}{mend}{hide}{deselect}")
 
 
 def _disabled(words: str, why: str) -> str:

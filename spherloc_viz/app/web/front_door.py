@@ -20,6 +20,10 @@ MAX_MESSAGE_BYTES = 50 * 1024 * 1024
 HEARTBEAT_S = 20.0
 """A page that answers no ping for this long is gone, and its session ends."""
 
+MOST_AUDIENCE = 200
+"""Pages of an audience at once; each takes a thread and some megabytes."""
+FULL = f"The audience is full: {MOST_AUDIENCE} pages are open. Close one, or ask the presenter.\n"
+
 PARAMETERS = frozenset(f"initialCamera{part}" for part in ("Position", "LookAt", "Up", "Fov", "Near", "Far")) | {
     "darkMode",
     "fixedDpr",
@@ -47,6 +51,8 @@ class FrontDoor:
         self._page: Page = load_page()
         self._client: aiohttp.ClientSession | None = None
         self._open: set[web.WebSocketResponse] = set()
+        self._audience = 0
+        """How many pages of an audience are open, or about to be."""
 
     async def start(self, listener: socket.socket) -> web.AppRunner:
         """Start serving on a listening socket."""
@@ -93,7 +99,19 @@ class FrontDoor:
             raise web.HTTPFound("/")
         if request.path != "/":
             return web.Response(status=404, text="There is nothing here; open /.\n")
-        return await self._pass_on(request, role) if upgrade else self._page_response(request)
+        if not upgrade:
+            return self._page_response(request)
+        return await (self._pass_on(request, role) if role is Role.PRESENTER else self._seat(request))
+
+    async def _seat(self, request: web.Request) -> web.StreamResponse:
+        """One more page of an audience, if there is room."""
+        if self._audience >= MOST_AUDIENCE:
+            return web.Response(status=503, text=FULL)
+        self._audience += 1
+        try:
+            return await self._pass_on(request, Role.AUDIENCE)
+        finally:
+            self._audience -= 1
 
     async def _touch(self, request: web.Request) -> web.Response:
         """Only a page of this server can send one: others do not know its token, and are told apart by their Origin."""

@@ -1,0 +1,113 @@
+"""A page of an audience: it shows the presenter's run, with steps, selection and view of its own.
+
+What could compute, read or write on the server is not forbidden here but absent: the page has no widget for it, and no
+handler for what a changed page might send instead.
+"""
+
+from collections.abc import Callable, Iterable
+from html import escape
+
+import viser
+
+from spherloc.diagnosis import Diagnosis
+from spherloc_viz.app.controls.display_controls import DisplayControls
+from spherloc_viz.app.edits import Edits
+from spherloc_viz.app.face import Face, Places
+from spherloc_viz.app.newest import Newest
+from spherloc_viz.app.services import Services
+from spherloc_viz.app.stage.canvas import panel_widths_px
+from spherloc_viz.app.status import Status
+from spherloc_viz.app.text import DIM, box
+from spherloc_viz.app.web.touch import Touch, Touches
+from spherloc_viz.app.web.upload_limit import limit_uploads
+from spherloc_viz.app.web.viser_seams import guard_callbacks
+from spherloc_viz.app.wish import Run
+from spherloc_viz.layers.primitives import SceneItem
+
+WAITING = "The presenter has not shown anything yet."
+ABOUT = (
+    "This is the audience's page: it shows the presenter's run and follows when that changes. Steps, selection and "
+    "view are your own. Scenes, estimators, matches, recordings and files are for the presenter to change and open."
+)
+
+
+class AudienceControls:
+    """The panel right of the canvas: what this page is for, and what of the canvas is shown."""
+
+    camera_movable = False
+
+    def __init__(self, gui: viser.GuiApi, width_px: int, changed: Callable[[object], None]) -> None:
+        gui.add_html(box(f'<div style="{DIM}">{escape(ABOUT)}</div>', "font-size:12px"))
+        self.display = DisplayControls(gui, changed)
+        gui.main_panel.dock_right()
+        gui.main_panel.set_width(width_px)
+
+    def items(self, run: Run) -> tuple[SceneItem, ...]:
+        """Nothing beside the run."""
+        return ()
+
+    def draw(self, run: Run, diagnosis: Diagnosis | None) -> None:
+        """Nothing here depends on the run."""
+
+
+class Audience:
+    """Lives as long as the tab's connection; one thread of its own draws what is new."""
+
+    def __init__(self, client: viser.ClientHandle, services: Services) -> None:
+        self._services = services
+        self._status = Status(client)
+        self._touches = Touches(self._status.fail)
+        guard_callbacks(client, self._status.fail)
+        limit_uploads(client, 0, self._status.complain)
+        self._edits = Edits()
+        self._page = Newest(f"spherloc-page-{client.client_id}", self._draw)
+        left_px, right_px = panel_widths_px(client.camera.image_width)
+        controls = AudienceControls(client.gui, right_px, self._redraw)
+        places = Places(self._redraw, self._select, None)
+        self._face = Face(client, self._touches, controls, places, (left_px, right_px))
+        self._touches.on("select", self._select_numbers)
+        self._touches.on("deselect", lambda touch: self._select(()))
+        # Only now may the page tell what is pressed: everything that listens is there.
+        services.desk.add(self._touches)
+        client.gui.add_html(self._touches.html())
+
+    def start(self) -> None:
+        """Show what the presenter shows."""
+        self._page.start()
+        self._services.presented.follow(self._page.ask)
+        self._page.ask()
+
+    def close(self) -> None:
+        """End the thread; does not wait."""
+        self._services.presented.leave(self._page.ask)
+        self._services.desk.remove(self._touches)
+        self._page.close()
+
+    def _redraw(self, event: object = None) -> None:
+        self._page.ask()
+
+    def _select(self, places: Iterable[int], extend: bool = False) -> None:
+        """Select matches by their numbers in the problem."""
+        shown = self._services.presented.newest
+        if shown is not None:
+            self._edits.select(shown.run.kept[list(places)].tolist(), extend)
+            self._page.ask()
+
+    def _select_numbers(self, touch: Touch) -> None:
+        shown = self._services.presented.newest
+        if shown is not None and self._edits.select_words(touch.argument, touch.extend, shown.run.kept):
+            self._page.ask()
+
+    def _draw(self, asked: bool) -> float | None:
+        shown = self._services.presented.newest
+        try:
+            if shown is None:
+                self._status.say(WAITING)
+                return None
+            wish = shown.run.wish
+            self._status.say(f"The presenter shows {wish.scene.scene}, {wish.estimator}, seed {wish.scene.seed}.")
+            selected = self._edits.places(shown.run.kept)
+            return self._face.draw(shown.run, shown.mesh, shown.diagnosis, selected, asked)
+        except Exception as error:
+            self._status.fail(error)
+            return None
