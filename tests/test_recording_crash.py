@@ -169,9 +169,12 @@ def test_a_finished_file_without_its_name_is_moved_and_never_onto_another(
 ) -> None:
     path = rescue(part_of(tmp_path, "a.rrd", dead, recorded), examiner).recording
     assert path == tmp_path / "a.rrd" and path.read_bytes() == recorded
+    assert rescue(part_of(tmp_path, "a.rrd", dead, recorded[:1000]), examiner) == Rescued()
+    assert path.read_bytes() == recorded and list(tmp_path.iterdir()) == [path]
+    path.write_bytes(b"damaged")
     kept = rescue(part_of(tmp_path, "a.rrd", dead, recorded[:1000]), examiner).kept
     assert kept is not None and kept.read_bytes() == recorded[:1000]
-    assert path.read_bytes() == recorded and sorted(tmp_path.iterdir()) == [path, kept]
+    assert path.read_bytes() == b"damaged" and sorted(tmp_path.iterdir()) == [path, kept]
 
 
 def test_what_a_reviewer_said_last_is_kept_if_its_file_was_not_finished(

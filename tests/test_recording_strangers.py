@@ -39,9 +39,9 @@ from spherloc.errors import RecordingError
 from spherloc.estimators import estimate
 from spherloc_viz.recording.content.reader import read_recording
 from spherloc_viz.recording.content.writer import write_recording
-from spherloc_viz.recording.strangers import content_check
 from spherloc_viz.recording.review.notes import Review, review_path, write_review
 from spherloc_viz.recording.run_row import RunRow
+from spherloc_viz.recording.strangers import content_check
 from spherloc_viz.recording.strangers import examiner as strangers
 from spherloc_viz.recording.strangers.child import FILE_LIMIT_BYTES
 from spherloc_viz.recording.strangers.examiner import Examiner, examine, examine_all

@@ -5,9 +5,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from sweep_deaths import DeadlyKeeper
 
 from spherloc.datasets.variation import Variation
-from spherloc.experiments.sweep import Entrant, Job, planned
+from spherloc.experiments.sweep import Entrant, Job, planned, run_sweep
 from spherloc.experiments.sweep_crew import solve
 from spherloc.trace import Trace
 from spherloc_viz.batch import Records
@@ -17,7 +18,7 @@ from spherloc_viz.recording.index.query import RunQuery
 from spherloc_viz.recording.index.run_index import RunIndex
 from spherloc_viz.recording.keeping import sweep_keeper
 from spherloc_viz.recording.keeping.keeper import Keeper
-from spherloc_viz.recording.keeping.sweep_keeper import SweepKeeper
+from spherloc_viz.recording.keeping.sweep_keeper import SweepKeeper, sweep_run_id
 from spherloc_viz.sweep import Recorded, sweep
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -50,6 +51,65 @@ def test_the_runs_of_all_workers_are_recorded_and_listed(tmp_path: Path, capsys:
     name = next(name for name, run in runs.items() if run.estimator == "ransac-2p")
     opened = reopen(runs[name], folder / name, [SCENE.parent])
     assert opened.live and opened.variation.correspondences == 30 and opened.options.iterations == 50
+
+
+def test_a_clusters_workers_on_this_machine_record_the_same_runs(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    distributed = pytest.importorskip("distributed", reason="Dask is missing: pip install 'spherloc[cluster]'")
+    here, cluster = tmp_path / "here", tmp_path / "cluster"
+    swept(tmp_path / "here.csv", here, workers=1)
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, silence_logs=50
+    ) as workers:
+        swept(tmp_path / "cluster.csv", cluster, scheduler=workers.scheduler_address)
+    assert f"workers on this machine are recorded in {cluster}" in capsys.readouterr().err
+    assert poses(cluster) == poses(here) and len(poses(here)) == 12
+    assert sorted({path.suffix for path in cluster.iterdir()}) == [".rrd", ".sqlite"]
+
+
+def poses(folder: Path) -> dict[tuple[object, ...], bytes | None]:
+    """The pose of every run that the folder's list has, by its estimator and what it solved."""
+    with RunIndex(folder) as index:
+        rows = index.find(RunQuery(source="sweep"), limit=None).rows
+    found = {(row.estimator, row.problem_key, row.seed): read_recording(folder / row.file).cam_from_map for row in rows}
+    assert len(found) == len(rows) == len(list(folder.glob("*.rrd")))
+    return {key: None if pose is None else pose.tobytes() for key, pose in found.items()}
+
+
+def test_a_run_of_a_killed_worker_is_done_again_and_listed_once(tmp_path: Path) -> None:
+    folder, marks = tmp_path / "recordings", tmp_path / "marks"
+    marks.mkdir()
+    entrants = [Entrant("ransac-2p", (("iterations", 20),))]
+    plan = planned(SCENE, "outlier_rate", [0.2, 0.5], entrants, 4, Variation(correspondences=30), 7)
+    rows = list(run_sweep(plan, workers=2, keep=DeadlyKeeper(SweepKeeper(folder), marks, deaths=2)))
+    assert len(list(marks.iterdir())) == 2
+    with RunIndex(folder) as index:
+        index.refresh()
+        listed = index.find(RunQuery(), limit=None).rows
+    assert len(rows) == len(listed) == len(list(folder.glob("*.rrd"))) == plan.rows
+
+
+def test_a_run_that_is_recorded_anew_replaces_itself_and_keeps_what_a_reviewer_said(tmp_path: Path) -> None:
+    plan = planned(SCENE, "noise_px", [1.0, 2.0], [Entrant("ransac-2p")], 2, Variation(correspondences=20))
+    jobs, keeper = list(plan.jobs()), SweepKeeper(tmp_path)
+    assert len({sweep_run_id(plan, job) for job in jobs}) == 4
+    assert sweep_run_id(replace(plan, runs=50, values=(0.5, 1.0, 2.0)), Job(0, 1, 0)) == sweep_run_id(plan, jobs[0])
+    try:
+        plan.solve(jobs, lambda job, trace: keeper(plan, job, trace))
+        with RunIndex(tmp_path) as index:
+            before = {row.file: row for row in index.find(RunQuery(), limit=None).rows}
+            chosen = min(before)
+            index.set_review(chosen, ["street"], "wet road")
+            plan.solve(jobs, lambda job, trace: keeper(plan, job, trace))
+            after = {row.file: row for row in index.find(RunQuery(), limit=None).rows}
+            assert after.keys() == before.keys() and len(after) == 4
+            assert all(row.run_id == before[file].run_id != "" for file, row in after.items())
+            assert after[chosen].labels == ("street",) and after[chosen].note == "wet road"
+            assert index.refresh().read == 0
+    finally:
+        sweep_keeper._keeper(keeper.folder)[0].close()
+        sweep_keeper._keeper.cache_clear()
 
 
 def test_where_nothing_can_be_recorded_the_sweep_goes_on_and_says_it_once(

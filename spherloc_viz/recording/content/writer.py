@@ -47,17 +47,25 @@ _DISK = re.compile(r"([^:(]+) \(os error \d+\)")
 
 
 def write_recording(
-    trace: Trace, path: Path, origin: Origin | None = None, diagnosis: Diagnosis | None = None, full: bool = False
+    trace: Trace,
+    path: Path,
+    origin: Origin | None = None,
+    diagnosis: Diagnosis | None = None,
+    full: bool = False,
+    run_id: str | None = None,
 ) -> RunRow:
     """Write the recording of a run to ``path``, whose folder is made if it is missing, and return its row.
 
-    A run that was not diagnosed is diagnosed here. ``full`` keeps every step, and every array of the stages.
+    A run that was not diagnosed is diagnosed here. ``full`` keeps every step, and every array of the stages; ``run_id``
+    is the recording's id in Rerun, a new one if it is not given.
     A reader never sees half a file: it is written under another name and then moved.
     Raises ``RecordingError`` if that fails, and then leaves nothing behind.
     """
     path = Path(path)
     part = unfinished(path)
-    run = _Run(trace, origin or Origin(), diagnosis or diagnose(trace), full, datetime.now(UTC), str(uuid.uuid4()))
+    run = _Run(
+        trace, origin or Origin(), diagnosis or diagnose(trace), full, datetime.now(UTC), run_id or str(uuid.uuid4())
+    )
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         row = _write(run, part, path.name)

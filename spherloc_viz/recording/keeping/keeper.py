@@ -6,6 +6,7 @@ import threading
 import unicodedata
 import uuid
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Self
@@ -20,7 +21,8 @@ from spherloc_viz.recording.keeping.rescue import rescue
 from spherloc_viz.recording.keeping.retention import Pruned, prune
 from spherloc_viz.recording.keeping.room import KEEP_BYTES, size_words
 from spherloc_viz.recording.origin import Origin
-from spherloc_viz.recording.strangers.examiner import Examiners
+from spherloc_viz.recording.review.notes import has_review
+from spherloc_viz.recording.strangers.examiner import Examiners, examine_review
 
 GALLERY = "gallery"
 """The folder inside that has the curated cases."""
@@ -73,13 +75,19 @@ class Keeper:
         origin: Origin | None = None,
         diagnosis: Diagnosis | None = None,
         path: Path | None = None,
+        run_id: str | None = None,
     ) -> Path:
         """Write a run, list it, and make room if it is time to; returns the recording's path.
 
+        A run that is recorded anew, to the same ``path`` and with the same ``run_id``, keeps its labels and note.
         Raises ``RecordingError`` if it cannot be written. What else fails is a notice: the recording is there.
         """
         path = self.path_of(trace) if path is None else path
-        row = write_recording(trace, path, origin, diagnosis, self._full)
+        row = write_recording(trace, path, origin, diagnosis, self._full, run_id)
+        if has_review(path):
+            with contextlib.suppress(RecordingError):  # a refresh of the list tells of it
+                review = examine_review(path)
+                row = replace(row, labels=review.labels, note=review.note)
         try:
             self.index.add(row)
             self._unlisted = 0
@@ -161,7 +169,16 @@ class Keeper:
 def file_name(trace: Trace, now: datetime) -> str:
     """``<UTC time>_<scene>_<estimator>_<seed>_<id>.rrd``: sorts by time, is unique, and is safe in any file system."""
     when = now.strftime("%Y%m%dT%H%M%SZ")
-    return f"{when}_{_slug(trace.problem.name)}_{_slug(trace.estimator)}_{trace.seed}_{uuid.uuid4().hex[:8]}.rrd"
+    return _name_of(trace, when, uuid.uuid4().hex[:8])
+
+
+def sweep_file_name(trace: Trace, run_id: uuid.UUID) -> str:
+    """``sweep_<scene>_<estimator>_<seed>_<id>.rrd``: the same name for the same run, whenever it is done."""
+    return _name_of(trace, "sweep", run_id.hex[:16])
+
+
+def _name_of(trace: Trace, first: str, last: str) -> str:
+    return f"{first}_{_slug(trace.problem.name)}_{_slug(trace.estimator)}_{trace.seed}_{last}.rrd"
 
 
 def _names(paths: Sequence[Path]) -> str:

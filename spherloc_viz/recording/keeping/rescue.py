@@ -34,8 +34,9 @@ def rescue(part: Path, examiner: Examiner) -> Rescued:
     """Make a recording of what is left of one, if there is enough; otherwise rename it, so that a person can decide.
 
     The problem and the result come first in a file, so that even a fifth of it has all that repeats the run. The
-    leftover stays as it is if the disk has no room to recover it; only an empty one is deleted. Raises ``OSError`` if
-    the folder cannot be written, ``ExaminerError`` if ``examiner`` has ended: the leftover stays then too.
+    leftover stays as it is if the disk has no room to recover it; deleted are only an empty one, and one of a run whose
+    recording is there and can be read. Raises ``OSError`` if the folder cannot be written, ``ExaminerError`` if
+    ``examiner`` has ended: the leftover stays then too.
     """
     target = target_of(part)
     if target is None:
@@ -45,7 +46,11 @@ def rescue(part: Path, examiner: Examiner) -> Rescued:
         if not part.stat().st_size:
             part.unlink()
             return Rescued()
-        if not target.exists() and not target.name.endswith(REVIEW_SUFFIX):
+        is_run = not target.name.endswith(REVIEW_SUFFIX)
+        if is_run and target.exists() and _readable(target, examiner):
+            part.unlink()
+            return Rescued()
+        if is_run and not target.exists():
             if _readable(part, examiner):
                 return Rescued(part.replace(target))
             if shutil.disk_usage(part.parent).free < ROOM * part.stat().st_size:

@@ -1,5 +1,7 @@
 """Records the runs of a sweep where they are done: in many processes at once, into one folder and its list."""
 
+import json
+import uuid
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -7,7 +9,7 @@ from pathlib import Path
 from spherloc.errors import RecordingError
 from spherloc.experiments.sweep import Job, SweepPlan
 from spherloc.trace import Trace
-from spherloc_viz.recording.keeping.keeper import Keeper
+from spherloc_viz.recording.keeping.keeper import Keeper, sweep_file_name
 from spherloc_viz.recording.keeping.leftovers import here
 from spherloc_viz.recording.origin import Origin
 
@@ -16,6 +18,7 @@ from spherloc_viz.recording.origin import Origin
 class SweepKeeper:
     """Keeps the runs of all workers on the machine where it was made; others cannot reach its folder.
 
+    A run that is done again, because its worker was killed or its sweep interrupted, replaces its own recording.
     Nothing is deleted to make room: that is for one process to do, which has a ``Keeper``.
     """
 
@@ -31,7 +34,8 @@ class SweepKeeper:
         origin = Origin("sweep", plan.scene, plan.first_seed + job.run, None, plan.variation_at(job.value))
         keeper, told = _keeper(self.folder)
         try:
-            keeper.record(trace, origin)
+            run_id = sweep_run_id(plan, job)
+            keeper.record(trace, origin, path=self.folder / sweep_file_name(trace, run_id), run_id=str(run_id))
         except RecordingError as error:
             return str(error)
         except Exception as error:  # a bug in drawing one run must not end the sweep
@@ -39,6 +43,18 @@ class SweepKeeper:
         sentence = " ".join(told)
         told.clear()
         return sentence
+
+
+def sweep_run_id(plan: SweepPlan, job: Job) -> uuid.UUID:
+    """What tells a run of a sweep from others: a hash of all that decides its result."""
+    table = plan.record()
+    shared = {name: table[name] for name in ("scene", "scene_sha256", "camera_sha256", "versions")}
+    own = {
+        "variation": plan.variation_at(job.value).simulation,
+        "estimator": table["entrants"][job.entrant],
+        "seed": plan.first_seed + job.run,
+    }
+    return uuid.uuid5(uuid.NAMESPACE_URL, json.dumps(shared | own, sort_keys=True))
 
 
 @lru_cache(maxsize=1)
