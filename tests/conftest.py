@@ -4,6 +4,7 @@ import gc
 import os
 import warnings
 import zlib
+from collections import Counter
 from collections.abc import Callable, Generator, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +19,7 @@ from spherloc.datasets.synthetic import SyntheticScene
 from spherloc_viz.recording.index.run_index import RunIndex
 from spherloc_viz.recording.strangers import examiner as strangers
 from spherloc_viz.recording.strangers.examiner import Examiner
+from tests.needs import lacking, real_data
 
 ROOT = Path(__file__).resolve().parents[1]
 SUITE_SEED = int(os.environ.get("SPHERLOC_TEST_SEED", "0"))
@@ -26,9 +28,46 @@ settings.register_profile("spherloc", derandomize=True, deadline=None, database=
 settings.load_profile("spherloc")
 
 
-def pytest_report_header() -> str:
-    """A failing random test is repeated by the same seed."""
-    return f"SPHERLOC_TEST_SEED={SUITE_SEED}"
+def pytest_report_header() -> list[str]:
+    """A failing random test is repeated by the same seed; what will be skipped is said before it is."""
+    skips = [f"tests will be skipped: {lack}" for lack in lacking().values()]
+    return [f"SPHERLOC_TEST_SEED={SUITE_SEED}", *(skips or ["no test will be skipped"])]
+
+
+def skip_reason(report: pytest.TestReport | pytest.CollectReport) -> str:
+    """Why a test, or a file of tests, was skipped."""
+    return report.longrepr[2].removeprefix("Skipped: ") if isinstance(report.longrepr, tuple) else str(report.longrepr)
+
+
+def unannounced_fails(report: pytest.TestReport | pytest.CollectReport) -> None:
+    """A test that skips for a reason that the start of the run did not tell has failed."""
+    if report.skipped and not hasattr(report, "wasxfail") and (reason := skip_reason(report)) not in lacking().values():
+        report.outcome = "failed"
+        report.longrepr = f"skipped for a reason that tests/needs.py does not have, or that does not hold: {reason}"
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport() -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    report = yield
+    unannounced_fails(report)
+    return report
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report() -> Generator[None, pytest.CollectReport, pytest.CollectReport]:
+    report = yield
+    unannounced_fails(report)
+    return report
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """How many tests were skipped, for each reason."""
+    reasons = Counter(skip_reason(report) for report in terminalreporter.stats.get("skipped", ()))
+    terminalreporter.section("skipped tests")
+    for reason, count in reasons.most_common():
+        terminalreporter.line(f"{count:5d}  {reason}")
+    if not reasons:
+        terminalreporter.line("none")
 
 
 @pytest.hookimpl(wrapper=True)
@@ -88,7 +127,4 @@ def scene_of() -> Callable[..., SyntheticScene]:
 @pytest.fixture(scope="session")
 def aria() -> Path:
     """Folder of the real fisheye problems beside the project; the test is skipped where it is absent."""
-    folder = ROOT / ".." / "shared" / "data" / "aria_adt_fisheye"
-    if not folder.is_dir():
-        pytest.skip("the real fisheye data (../shared/data/aria_adt_fisheye) is not on this machine")
-    return folder
+    return real_data("aria_adt_fisheye")

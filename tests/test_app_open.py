@@ -16,6 +16,7 @@ from spherloc.errors import InputError
 from spherloc_viz.app.panels.folders import MOST_ENTRIES, PAGE, Roots
 from spherloc_viz.app.panels.recent import MOST, RecentScenes
 from spherloc_viz.app.panels.uploads import MOST_BYTES, MOST_ROWS, File, Form, Scratch, numbers, open_upload
+from tests.needs import real_data
 
 ROOT = Path(__file__).resolve().parents[1]
 CAMERA = '[camera]\nmodel = "equirectangular"\nwidth = 512\nheight = 256\n'
@@ -223,10 +224,8 @@ def test_an_upload_becomes_a_scene(tmp_path: Path) -> None:
     "name", ["basalt_tumvi_512_ds_calib.json", "tumvi_kalibr_imucam_chain.yaml", "adapter_euroc_KB.yml"]
 )
 def test_calibrations_of_other_tools_are_taken(tmp_path: Path, name: str) -> None:
-    path = ROOT / ".." / "shared" / "data" / "formats_real" / name
-    if not path.is_file():
-        pytest.skip("the real calibrations (../shared/data/formats_real) are not on this machine")
-    _, scene = open_upload(form(calibration=File(name, path.read_bytes())), tmp_path)
+    content = (real_data("formats_real") / name).read_bytes()
+    _, scene = open_upload(form(calibration=File(name, content)), tmp_path)
     assert scene.problem().camera.width >= 512
 
 

@@ -4,22 +4,19 @@ import json
 from dataclasses import replace
 
 import numpy as np
+import pycolmap
 import pytest
 
+from benchmarks import certificate, clique, peers, pictures, table
+from benchmarks.brute_force import largest_consensus
+from benchmarks.cases import ADAPTIVE, simulated
+from benchmarks.methods import Answer
+from benchmarks.run import arguments, run
 from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.datasets.synthetic import SyntheticScene
 from spherloc.metrics import rotation_error_deg, translation_error_m
 from spherloc.refine import residuals_px
 from spherloc.trace import Certificate
-
-pycolmap = pytest.importorskip("pycolmap")
-pytest.importorskip("poselib")
-
-from benchmarks import certificate, clique, peers, table  # noqa: E402
-from benchmarks.brute_force import largest_consensus  # noqa: E402
-from benchmarks.cases import ADAPTIVE, simulated  # noqa: E402
-from benchmarks.methods import Answer  # noqa: E402
-from benchmarks.run import arguments, run  # noqa: E402
 
 PEERS = peers.peers()
 
@@ -140,7 +137,6 @@ def test_a_dishonest_certificate_is_noticed(monkeypatch):
 
 
 def test_cliques_have_one_size():
-    pytest.importorskip("networkx")
     graph = clique.ball_graph(80, 0.1, 12, 3)
     assert (graph == graph.T).all()
     sizes = {len(list(clique.LIBRARIES[library](graph)())) for library in ("spherloc", "networkx")}
@@ -160,7 +156,6 @@ def test_slope_of_a_power_law():
 
 
 def test_labels_are_moved_apart_and_no_farther_than_needed():
-    pictures = pytest.importorskip("benchmarks.pictures")
     moved = pictures._apart(np.array([0.1, 0.1, 0.5]), 0.05)
     assert np.allclose(moved, [0.075, 0.125, 0.5])
 

@@ -19,8 +19,7 @@ from spherloc.estimators import estimate
 from spherloc.trace import Certificate
 from spherloc_viz import batch
 from spherloc_viz.options import json_text
-
-ARIA = ROOT / ".." / "shared" / "data" / "aria_adt_fisheye"
+from tests.needs import DATA, needs
 
 CAMERA = """
 [camera]
@@ -284,7 +283,7 @@ def test_a_path_that_no_disk_takes_is_one_sentence(tmp_path: Path, command: str)
     assert "too long" in message and len(message) < 300
 
 
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="the system has no full disk to try")
+@needs("/dev/full")
 def test_output_that_cannot_be_written_is_one_sentence_and_a_closed_pipe_none(tmp_path: Path) -> None:
     program = [str(Path(sys.executable).with_name("spherloc")), "scenes"]
     with Path("/dev/full").open("w") as full:
@@ -315,11 +314,11 @@ def test_help_has_examples(tmp_path: Path, command: str) -> None:
     assert "For example:" in result.stdout and f"spherloc {command}" in result.stdout
 
 
-@pytest.mark.skipif(not ARIA.is_dir(), reason="the shared Aria data are not beside the project")
+@needs("aria_adt_fisheye")
 @pytest.mark.parametrize("estimator", ["mc", "ransac-2p"])
 def test_real_problems_from_the_command_line(tmp_path: Path, estimator: str) -> None:
     limits = {"rgb": (0.3, 0.02), "slam_left": (0.3, 0.02), "slam_right": (1.0, 0.03)}
-    scenes = [ARIA / f"{name}.toml" for name in limits]
+    scenes = [DATA / "aria_adt_fisheye" / f"{name}.toml" for name in limits]
     result = spherloc("run", *scenes, "--estimator", estimator, "--json", "--no-record", cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     for line, (degrees, metres) in zip(result.stdout.splitlines(), limits.values(), strict=True):

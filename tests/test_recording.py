@@ -3,7 +3,6 @@
 import json
 import os
 import re
-import resource
 import subprocess
 import sys
 from dataclasses import asdict, fields, replace
@@ -22,7 +21,7 @@ from spherloc.estimators import estimate
 from spherloc.estimators.mc import McOptions
 from spherloc.metrics import evaluate
 from spherloc.problem import Problem
-from spherloc.trace import Certificate, DecisionStage, RefinementStage, Trace
+from spherloc.trace import Certificate, RefinementStage, Trace
 from spherloc_viz.layers import paint, steps
 from spherloc_viz.layers.decisive import decisive_step
 from spherloc_viz.layers.primitives import Balls, Label, Mesh, Points, Segments, Stop, Textured
@@ -35,6 +34,7 @@ from spherloc_viz.recording.content.reader import check_recording, read_recordin
 from spherloc_viz.recording.content.writer import recorded_steps, write_recording
 from spherloc_viz.recording.keeping.machine import machine
 from spherloc_viz.recording.viewing.rerun_program import rerun_command, rerun_environment
+from tests.needs import needs
 
 
 @pytest.fixture(scope="module", params=[*RUNS, "lost", "by hand"], ids=str)
@@ -93,9 +93,8 @@ def test_odd_problems_come_back_bit_for_bit(tmp_path: Path, rng: np.random.Gener
     assert again.properties["name"] == problem.name and again.properties["scene"] == problem.scene
 
 
+@pytest.mark.parametrize("trace", [*RUNS, "lost"], indirect=True, ids=str, scope="module")
 def test_the_same_run_follows_from_what_is_recorded(trace: Trace, path: Path) -> None:
-    if trace.stage(DecisionStage) is not None:
-        pytest.skip("put together by hand")
     run = read_recording(path)
     again = estimate(run.problem, run.estimator, type(trace.options)(**run.options), run.seed)
     assert np.array_equal(again.inlier_mask, trace.inlier_mask)
@@ -454,7 +453,7 @@ for attempt in range(2):
 """
 
 
-@pytest.mark.skipif(not hasattr(resource, "RLIMIT_FSIZE"), reason="no limit on file sizes")
+@needs("file size limit")
 @pytest.mark.parametrize(("limit", "before"), [(1_000, "cold"), (100_000, "warm")])
 def test_a_full_disk_is_one_sentence_and_leaves_what_was_there(tmp_path: Path, limit: int, before: str) -> None:
     path = tmp_path / "run.rrd"

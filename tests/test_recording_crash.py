@@ -30,6 +30,7 @@ from spherloc_viz.recording.keeping.rescue import Rescued, rescue
 from spherloc_viz.recording.review.notes import write_review
 from spherloc_viz.recording.strangers.child_process import ExaminerError
 from spherloc_viz.recording.strangers.examiner import Examiner
+from tests.needs import needs
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -89,7 +90,7 @@ def part_of(folder: Path, name: str, owner: str, content: bytes = b"") -> Path:
     return path
 
 
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are forked, so that each kill takes no second")
+@needs("fork")
 def test_whoever_is_killed_at_any_moment_loses_the_run_in_flight_only(
     tmp_path: Path, rng, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -251,12 +252,9 @@ def test_the_next_start_tells_what_it_recovered(recorded: bytes, dead: str, tmp_
 
 @contextlib.contextmanager
 def small_disk(folder: Path, size_bytes: int) -> Iterator[None]:
-    """A file system of its own in ``folder``; the test is skipped where none can be had."""
+    """A file system of its own in ``folder``."""
     words = ["mount", "-t", "tmpfs", "-o", f"size={size_bytes}", "tmpfs", str(folder)]
-    try:
-        subprocess.run(words, check=True, capture_output=True)
-    except (OSError, subprocess.CalledProcessError):
-        pytest.skip("no file system can be mounted here")
+    subprocess.run(words, check=True, capture_output=True)
     try:
         yield
     finally:
@@ -273,6 +271,7 @@ def drain(recorder: Recorder) -> None:
     raise AssertionError(recorder.overload)
 
 
+@needs("mount")
 def test_a_full_disk_gives_one_notification_and_is_survived(trace: Trace, recorded: bytes, tmp_path: Path) -> None:
     errors: list[str] = []
     notices: list[str] = []

@@ -31,6 +31,7 @@ from spherloc_viz.recording.content.thumbnail import HEIGHT_PX, WIDTH_PX, thumbn
 from spherloc_viz.recording.content.writer import recorded_steps, write_recording
 from spherloc_viz.recording.origin import Origin
 from spherloc_viz.recording.review.notes import write_review
+from tests.needs import needs
 
 FORMAT_1, FORMAT_2 = (Path(__file__).parent / "data" / f"format_{version}.rrd" for version in (1, 2))
 """Written by the first version of the format: 24 matches, ransac-2p, seed 5."""
@@ -371,10 +372,9 @@ def test_a_changed_byte_is_noticed_or_harmless(trace: Trace, tmp_path: Path, rng
             assert found.estimator == row.estimator
 
 
+@needs("/proc")
 def test_many_runs_take_no_more_threads_or_memory(tmp_path: Path) -> None:
     tasks, status = Path("/proc/self/task"), Path("/proc/self/statm")
-    if not tasks.exists():
-        pytest.skip("no /proc to count threads by")
     problem = Variation(correspondences=12).problem(_scene("mei_outliers_80"))
     trace = estimate(problem, "ransac-2p")
     told = diagnose(trace)

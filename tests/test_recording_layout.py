@@ -1,6 +1,5 @@
 """How a recording opens: its layout lies in its own file, and the real viewer has no fault to find with it."""
 
-import os
 import socket
 import struct
 import subprocess
@@ -32,9 +31,7 @@ from spherloc_viz.recording.content.properties import APPLICATION_ID, REVIEW_ENT
 from spherloc_viz.recording.content.rrd_file import append, split, xxh32
 from spherloc_viz.recording.content.writer import write_recording
 from spherloc_viz.recording.viewing.rerun_program import rerun_command, rerun_environment
-
-CHROMIUM_VULKAN = Path("/usr/lib/chromium/vk_swiftshader_icd.json")
-"""Software graphics, which Debian's Chromium brings."""
+from tests.needs import require, vulkan
 
 
 @pytest.fixture(scope="module")
@@ -204,20 +201,10 @@ def viewer(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[ViewerCl
     """rerun's viewer without a window."""
     monkeypatch.setenv("CI", "true")
     monkeypatch.setenv("TELEMETRY_ENABLED", "false")
-    if CHROMIUM_VULKAN.exists():
-        (tmp_path / "libvulkan.so.1").symlink_to(CHROMIUM_VULKAN.with_name("libvulkan.so.1"))
-        paths = [str(tmp_path), *os.environ.get("LD_LIBRARY_PATH", "").split(os.pathsep)]
-        monkeypatch.setenv("LD_LIBRARY_PATH", os.pathsep.join(path for path in paths if path))
-        monkeypatch.setenv("VK_ICD_FILENAMES", str(CHROMIUM_VULKAN))
-    try:
-        client = ViewerClient.spawn(headless=True, port=free_port(), executable_path=rerun_command()[0])
-    except (ConnectionError, RuntimeError, OSError) as error:
-        pytest.skip(f"rerun's viewer does not start here: {error}")
-    try:
-        client.get_state()
-    except (ConnectionError, RuntimeError) as error:
-        client.quit()
-        pytest.skip(f"rerun's viewer has no graphics here: {error}")
+    require("vulkan")
+    for name, value in (vulkan() or {}).items():
+        monkeypatch.setenv(name, value)
+    client = ViewerClient.spawn(headless=True, port=free_port(), executable_path=rerun_command()[0])
     yield client
     client.quit()
 

@@ -45,6 +45,7 @@ from spherloc_viz.recording.strangers import content_check
 from spherloc_viz.recording.strangers import examiner as strangers
 from spherloc_viz.recording.strangers.child import FILE_LIMIT_BYTES
 from spherloc_viz.recording.strangers.examiner import Examiner, examine, examine_all
+from tests.needs import needs
 
 Lie = Callable[[Path], bytes]
 """A bad file from a good one."""
@@ -150,7 +151,7 @@ def test_what_is_no_file_is_one_sentence_at_once(tmp_path: Path, examiner: Exami
     assert "not a file" in sentence(examiner, Path("/dev/zero"))
 
 
-@pytest.mark.skipif(os.geteuid() == 0, reason="the superuser may read everything")
+@needs("no superuser")
 def test_a_file_that_may_not_be_read_is_one_sentence(good: Path, tmp_path: Path, examiner: Examiner) -> None:
     path = tmp_path / "secret.rrd"
     path.write_bytes(good.read_bytes())
@@ -274,7 +275,7 @@ def test_a_bad_file_costs_the_others_nothing(good: Path, tmp_path: Path) -> None
     assert [isinstance(result, RunRow) for _, result in results] == [True, False, True, False, False, True]
 
 
-@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="the system does not tell")
+@needs("/proc")
 def test_a_huge_recording_fills_no_memory(good: Path, tmp_path: Path, examiner: Examiner) -> None:
     path = tmp_path / "huge.rrd"
     path.write_bytes(unpacks_to_much(good))

@@ -1,7 +1,6 @@
 """What is kept and what makes room: failures for ever, old successes while there is room, and nothing in silence."""
 
 import math
-import os
 import threading
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +16,7 @@ from spherloc_viz.recording.keeping.retention import LOG_NAME, NEWEST_KEPT, prun
 from spherloc_viz.recording.keeping.room import KEEP_BYTES, kept_bytes
 from spherloc_viz.recording.review.notes import review_path
 from spherloc_viz.recording.run_row import RunRow
+from tests.needs import needs
 
 SIZE = 1000
 
@@ -148,7 +148,7 @@ def test_sizes_to_be_kept() -> None:
             kept_bytes(wrong)
 
 
-@pytest.mark.skipif(os.name == "nt" or os.geteuid() == 0, reason="root may delete everything")
+@needs("no superuser")
 def test_what_cannot_be_deleted_stays_listed(tmp_path: Path) -> None:
     with RunIndex(tmp_path) as index:
         names = fill(index, [SUCCESS] * (NEWEST_KEPT + 1))

@@ -232,7 +232,6 @@ def test_as_a_user_calls_it(folder: Path):
 
 
 def test_steps_are_asked_for_over_all_runs(folder: Path, capsys: pytest.CaptureFixture[str]):
-    pytest.importorskip("datafusion")
     with RunIndex(folder) as index:
         rows = {row.file: row for row in index.find(RunQuery()).rows}
     assert steps("step = decisive_step AND correspondences = 100", folder, format="csv") == 0
@@ -259,7 +258,6 @@ def test_steps_are_asked_for_over_all_runs(folder: Path, capsys: pytest.CaptureF
 
 def test_steps_of_runs_that_cannot_be_asked(folder: Path, capsys: pytest.CaptureFixture[str]):
     """Copies have the same id, old formats no numbers, and files vanish: none of them costs the others."""
-    pytest.importorskip("datafusion")
     shutil.copy(folder / "right.rrd", folder / "copy.rrd")
     assert steps("step = 0 AND estimator = 'mc' AND outcome = 'success'", folder, format="csv") == 0
     assert len(listed(capsys)) == 1

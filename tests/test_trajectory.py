@@ -22,6 +22,7 @@ from spherloc.trajectory import (
     write_tum,
     wxyz_from_rotation,
 )
+from tests.needs import real_data
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -53,10 +54,8 @@ def written(tmp_path):
 
 
 def shared(name: str) -> Path:
-    path = ROOT / ".." / "shared" / "data" / name
-    if not path.is_file():
-        pytest.skip(f"no real data: ../shared/data/{name} is absent")
-    return path
+    folder, file = name.split("/", 1)
+    return real_data(folder) / file
 
 
 def random_trajectory(rng: np.random.Generator, count: int, start_ns: int = 1_520_530_308_189_679_351) -> Trajectory:

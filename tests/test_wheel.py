@@ -43,7 +43,6 @@ def run(*words: str | Path, cwd: Path, **environment: str) -> str:
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Built from a source archive, as an index would do it; the checkout is left alone."""
-    pytest.importorskip("setuptools", minversion="77")
     folder = tmp_path_factory.mktemp("wheel")
     source = folder / "source"
     for name in (*SOURCES, *PACKAGES):

@@ -4,7 +4,6 @@ import tomllib
 from pathlib import Path
 
 import numpy as np
-import pytest
 import yaml
 
 from spherloc.cameras.base import Camera
@@ -14,8 +13,7 @@ from spherloc.cameras.eucm import Eucm
 from spherloc.cameras.fisheye624 import Fisheye624
 from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.cameras.mei import Mei
-
-SHARED_DATA = Path(__file__).resolve().parents[2] / ".." / "shared" / "data"
+from tests.needs import DATA, real_data
 
 KITTI360_IMAGE_02 = Mei(
     width=1400,
@@ -86,7 +84,7 @@ INLINE: dict[str, Camera] = {
 
 def _load(name: str) -> Camera:
     """A Kannala-Brandt calibration of the data folder, read without the project's own loader."""
-    path = SHARED_DATA / name
+    path = DATA / name
     if path.suffix == ".toml":
         table = tomllib.loads(path.read_text())["camera"]
         return KannalaBrandt(**{key: value for key, value in table.items() if key != "model"})
@@ -114,7 +112,7 @@ EVERY = (*INLINE, *SHARED)
 
 
 def sample(name: str) -> Camera:
-    """The camera ``name`` of ``EVERY``; skips the test where its file is absent."""
+    """The camera ``name`` of ``EVERY``; skips the test where the data are absent."""
     if name in INLINE:
         return INLINE[name]
     require_shared(name)
@@ -122,11 +120,9 @@ def sample(name: str) -> Camera:
 
 
 def require_shared(name: str) -> Path:
-    """The path of a file of the data folder; skips the test where it is absent."""
-    path = SHARED_DATA / name
-    if not path.is_file():
-        pytest.skip(f"no real data: ../shared/data/{name} is absent")
-    return path
+    """The path of a file of the data folder; skips the test where the data are absent."""
+    folder, file = name.split("/", 1)
+    return real_data(folder) / file
 
 
 def pixel_grid(camera: Camera, step: float = 3.0) -> np.ndarray:

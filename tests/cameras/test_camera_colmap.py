@@ -1,6 +1,7 @@
 """COLMAP's camera models: agreement with pycolmap in both directions, and sentences for what cannot be read."""
 
 import numpy as np
+import pycolmap
 import pytest
 from camera_samples import angle_rad, random_directions
 
@@ -39,7 +40,6 @@ MODELS: dict[str, tuple[list[float], type[Camera], float]] = {
 
 @pytest.mark.parametrize("model", MODELS)
 def test_agrees_with_colmap_in_both_directions(model):
-    pycolmap = pytest.importorskip("pycolmap")
     params, kind, limit_deg = MODELS[model]
     camera = camera_from_colmap(model, 640, 480, params, "cameras.txt")
     colmap = pycolmap.Camera(model=model, width=640, height=480, params=params)
@@ -68,7 +68,6 @@ def test_numpy_parameters_are_as_good_as_lists(model):
 
 
 def test_every_model_of_colmap_is_read_or_refused_by_name():
-    pycolmap = pytest.importorskip("pycolmap")
     refused = set()
     for model in set(pycolmap.CameraModelId.__members__) - {"INVALID"}:
         params = pycolmap.Camera.create_from_model_name(1, model, 300.0, 640, 480).params

@@ -3,6 +3,7 @@
 from math import pi
 
 import numpy as np
+import pycolmap
 import pytest
 from camera_samples import angle_rad, pixel_grid, random_directions
 
@@ -89,7 +90,6 @@ def test_the_papers_equations_follow_from_one_permutation():
 
 @pytest.mark.parametrize("size", [(2048, 1024), (1919, 961)])
 def test_agrees_with_colmap(size):
-    pycolmap = pytest.importorskip("pycolmap")
     camera = Equirectangular(*size)
     colmap = pycolmap.Camera(model="EQUIRECTANGULAR", width=size[0], height=size[1], params=[*map(float, size)])
     points = np.vstack([random_directions(seed=6, count=5000), np.eye(3), -np.eye(3)])

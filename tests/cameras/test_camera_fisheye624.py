@@ -3,6 +3,7 @@
 import json
 
 import numpy as np
+import pycolmap
 import pytest
 from camera_samples import INLINE, angle_rad, pixel_grid, random_directions, require_shared, sample
 from hypothesis import given, settings
@@ -26,7 +27,6 @@ def aria(name: str) -> Fisheye624:
 
 @pytest.mark.parametrize("name", ARIA)
 def test_real_calibrations_agree_with_colmap(name):
-    pycolmap = pytest.importorskip("pycolmap")
     camera = aria(name)
     params = [camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion]
     colmap = pycolmap.Camera(

@@ -4,6 +4,7 @@ from math import pi
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 from camera_samples import BEYOND_180, EVERY, angle_rad, pixel_grid, random_directions, sample
 from hypothesis import given, settings
@@ -56,7 +57,6 @@ def test_unprojection_agrees_with_opencv_half_a_pixel_away(name):
 
 @pytest.mark.parametrize("name", KB)
 def test_agrees_with_colmap(name):
-    pycolmap = pytest.importorskip("pycolmap")
     camera = sample(name)
     params = [camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion]
     colmap = pycolmap.Camera(model="OPENCV_FISHEYE", width=camera.width, height=camera.height, params=params)

@@ -3,6 +3,7 @@
 from math import pi
 
 import numpy as np
+import pycolmap
 import pytest
 from camera_samples import INLINE, angle_rad, pixel_grid, random_directions
 from hypothesis import given, settings
@@ -104,7 +105,6 @@ def test_both_contain_the_unified_model(alpha):
 
 @pytest.mark.parametrize("name", EUCM)
 def test_eucm_agrees_with_colmap(name):
-    pycolmap = pytest.importorskip("pycolmap")
     camera = INLINE[name]
     assert isinstance(camera, Eucm)
     params = [camera.fx, camera.fy, camera.cx, camera.cy, camera.alpha, camera.beta]

@@ -19,11 +19,11 @@ from scipy.spatial.transform import Rotation
 
 from spherloc.errors import CalibrationError, InputError
 from spherloc.formats.colmap_model import _read_by_pycolmap, read_model
+from tests.needs import real_data
 
 ROOT = Path(__file__).resolve().parents[2]
 
 FORMS = pytest.mark.parametrize("files_of", [binary_files, text_files], ids=["binary", "text"])
-SHARED = ROOT / ".." / "shared" / "data"
 
 
 def check_against(model, sample):
@@ -220,17 +220,13 @@ def test_names_with_spaces_and_letters_of_all_kinds(rng, tmp_path):
 
 
 def test_the_commas_of_an_old_kapture_export_are_named():
-    folder = SHARED / "kapture_t265" / "samples" / "t265" / "colmap"
-    if not folder.is_dir():
-        pytest.skip("the real T265 data (../shared/data/kapture_t265) is not on this machine")
+    folder = real_data("kapture_t265") / "samples" / "t265" / "colmap"
     with pytest.raises(InputError, match=r"images.txt, line 5: has commas between its values"):
         read_model(folder)
 
 
 def test_the_real_panorama_pair():
-    folder = SHARED / "stella_equirect_pair" / "colmap_equirect" / "0"
-    if not folder.is_dir():
-        pytest.skip("the real panoramas (../shared/data/stella_equirect_pair) are not on this machine")
+    folder = real_data("stella_equirect_pair") / "colmap_equirect" / "0"
     model = read_model(folder)
     assert len(model.points.ids) == 854 and model.points.track_lengths.tolist() == [2] * 854
     for image in model.images.values():

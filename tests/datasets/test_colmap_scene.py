@@ -11,10 +11,9 @@ from spherloc.datasets import load_scene
 from spherloc.errors import InputError
 from spherloc.estimators.base import estimate
 from spherloc.metrics import rotation_error_deg, translation_error_m
+from tests.needs import real_data
 
 ROOT = Path(__file__).resolve().parents[2]
-
-STELLA = ROOT / ".." / "shared" / "data" / "stella_equirect_pair"
 
 
 def scene_file(folder, queries="2", extra=""):
@@ -139,12 +138,11 @@ def test_wrong_keys_and_values(queries, extra, words, rng, tmp_path):
 @pytest.fixture(scope="module")
 def stella(tmp_path_factory):
     """The real pair: image 002 against the model with image 001 as its only reference."""
-    if not STELLA.is_dir():
-        pytest.skip("the real panoramas (../shared/data/stella_equirect_pair) are not on this machine")
+    folder = real_data("stella_equirect_pair")
     path = tmp_path_factory.mktemp("stella") / "pair.toml"
     path.write_text(
-        f'kind = "colmap"\nname = "pair"\nmodel = "{(STELLA / "colmap_equirect" / "0").resolve()}"\n'
-        f'images = "{STELLA.resolve()}"\nqueries = ["equirectangular_image_002.jpg"]\n'
+        f'kind = "colmap"\nname = "pair"\nmodel = "{folder / "colmap_equirect" / "0"}"\n'
+        f'images = "{folder}"\nqueries = ["equirectangular_image_002.jpg"]\n'
     )
     scene = load_scene(path)
     assert [view.name for view in scene.references] == ["equirectangular_image_001.jpg"]

@@ -11,6 +11,7 @@ from spherloc.datasets import hloc, load_scene
 from spherloc.errors import InputError
 from spherloc.estimators import estimate
 from spherloc.metrics import evaluate
+from tests.needs import real_data
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -197,9 +198,7 @@ max_features = 4000
 @pytest.mark.parametrize("more", ['pairs = "pairs.txt"', 'global_features = "global.h5"'])
 def test_own_matching_of_real_panoramas(tmp_path, tmp_path_factory, monkeypatch, rng, more):
     """Without hloc's matches the project finds its own, of the pairs or of what global descriptors retrieve."""
-    data = (ROOT / ".." / "shared" / "data" / "stella_equirect_pair").resolve()
-    if not data.is_dir():
-        pytest.skip("the real panoramas (../shared/data/stella_equirect_pair) are not on this machine")
+    data = real_data("stella_equirect_pair")
     monkeypatch.setenv("SPHERLOC_CACHE", str(tmp_path_factory.getbasetemp() / "hloc_cache"))
     query, reference = "equirectangular_image_002.jpg", "equirectangular_image_001.jpg"
     rows = (data / "colmap_equirect" / "0" / "images.txt").read_text().splitlines()

@@ -18,10 +18,10 @@ from spherloc.errors import InputError
 from spherloc.estimators.base import estimate
 from spherloc.geometry import so3_exp, transform
 from spherloc.metrics import rotation_error_deg, translation_error_m
+from tests.needs import real_data
 
 ROOT = Path(__file__).resolve().parents[2]
 
-STELLA = ROOT / ".." / "shared" / "data" / "stella_equirect_pair"
 
 CAMERA = """
 [camera]
@@ -275,9 +275,7 @@ def test_real_fisheye_against_the_depth_of_another_camera(query, reference, aria
 
 def test_the_real_panorama_against_its_model(tmp_path):
     """The query has no gravity of its own and no pose, and is in the model itself: it is not matched with itself."""
-    if not STELLA.is_dir():
-        pytest.skip("the real panoramas (../shared/data/stella_equirect_pair) are not on this machine")
-    root = STELLA.resolve()
+    root = real_data("stella_equirect_pair")
     path = tmp_path / "walk.toml"
     path.write_text(
         f'kind = "image-folder"\nname = "walk"\nimages = ["{root}/equirectangular_image_002.jpg"]\n'

@@ -13,6 +13,7 @@ from spherloc.errors import InputError, SpherlocError
 from spherloc.formats.kapture_files import read_kapture
 from spherloc.geometry import pose
 from spherloc.trajectory import rotation_from_wxyz
+from tests.needs import real_data
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -80,9 +81,7 @@ def test_deep_rigs_are_quick(folder):
 
 def test_the_same_places_in_two_forms_of_one_recording():
     """The T265's rig poses, composed, are the poses of its cameras that kapture's own conversion wrote."""
-    samples = ROOT / ".." / "shared" / "data" / "kapture_t265" / "samples" / "t265"
-    if not samples.is_dir():
-        pytest.skip("the real stereo fisheyes (../shared/data/kapture_t265) are not on this machine")
+    samples = real_data("kapture_t265") / "samples" / "t265"
     by_rig = read_kapture(samples / "ros_kapture", "scene.toml")
     by_camera = read_kapture(samples / "kapture", "scene.toml")
     times = sorted({record.timestamp for record in by_rig.records})

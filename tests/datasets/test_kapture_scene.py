@@ -14,6 +14,7 @@ from spherloc.datasets import kapture, load_scene
 from spherloc.errors import InputError
 from spherloc.estimators import estimate
 from spherloc.metrics import evaluate
+from tests.needs import real_data
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -24,10 +25,7 @@ STEP_NS = 100_000_000
 
 @pytest.fixture
 def t265():
-    folder = (ROOT / ".." / "shared" / "data" / "kapture_t265" / "samples" / "t265").resolve()
-    if not folder.is_dir():
-        pytest.skip("the real stereo fisheyes (../shared/data/kapture_t265) are not on this machine")
-    return folder
+    return real_data("kapture_t265") / "samples" / "t265"
 
 
 @pytest.fixture(autouse=True)

@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import distributed
 import pytest
 from sweep_samples import QUICK, SCENE, small_plan, write_scene
 
@@ -242,7 +243,6 @@ def test_an_impossible_run_is_named(tmp_path: Path) -> None:
 
 
 def test_a_cluster_gives_the_same_rows_though_a_worker_is_killed(tmp_path: Path) -> None:
-    distributed = pytest.importorskip("distributed")
     plan = small_plan(tmp_path, runs=40)
     rows: list[SweepRow] = []
     with distributed.LocalCluster(
@@ -264,7 +264,6 @@ def test_a_cluster_gives_the_same_rows_though_a_worker_is_killed(tmp_path: Path)
 
 
 def test_no_cluster_is_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    distributed = pytest.importorskip("distributed")
     monkeypatch.setattr(sweep_cluster, "CONNECT_S", 0.5)
     plan = small_plan(tmp_path)
     for address, said in (("tcp://127.0.0.1:9", "no Dask scheduler answers at"), ("host", "missing port number")):

@@ -1,7 +1,5 @@
 """Features and matches of photographs, judged by poses that others have measured."""
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
@@ -13,8 +11,8 @@ from spherloc.frontend.features import FeatureOptions, extract
 from spherloc.frontend.matching import match
 from spherloc.frontend.view import View
 from tests.frontend.pictures import view_of
+from tests.needs import real_data
 
-DATA = Path(__file__).resolve().parents[2] / ".." / "shared" / "data"
 CAMERA = Equirectangular(1920, 960)
 
 
@@ -26,9 +24,7 @@ def own_cache(tmp_path, monkeypatch):
 @pytest.fixture
 def pair():
     """The two panoramas as views with the poses of COLMAP's model."""
-    folder = DATA / "stella_equirect_pair"
-    if not folder.is_dir():
-        pytest.skip("the real panoramas (../shared/data/stella_equirect_pair) are not on this machine")
+    folder = real_data("stella_equirect_pair")
     views = []
     for line in (folder / "colmap_equirect" / "0" / "images.txt").read_text().splitlines():
         words = line.split()
@@ -78,9 +74,7 @@ def test_panoramas_match_across_any_seam(pair, tmp_path):
 
 def test_a_dim_fisheye_has_features_all_over(tmp_path):
     """An indoor photograph: features in most of the image, none at the black rim of the lens."""
-    path = DATA / "aria_adt_fisheye" / "images" / "camera-rgb_87551237472175.png"
-    if not path.is_file():
-        pytest.skip("the real fisheye data (../shared/data/aria_adt_fisheye) is not on this machine")
+    path = real_data("aria_adt_fisheye") / "images" / "camera-rgb_87551237472175.png"
     distortion = (0.394091358527, -0.548741152556, 0.778500221599, -0.4553790203)
     camera = KannalaBrandt(1408, 1408, 611.8529287, 611.8500556, 715.7118008, 716.4760432, distortion)
     found = extract(View("aria", camera, path))

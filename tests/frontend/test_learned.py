@@ -9,10 +9,10 @@ from spherloc.frontend.features import FeatureOptions, Features, extract
 from spherloc.frontend.matching import MatchOptions, match
 from tests.frontend.pictures import disc, fisheye, texture, view_of
 from tests.frontend.small_networks import described_grid, nearest_place
+from tests.needs import needs
 
 CELLS = 16
 SIDE = {"aliked": 640, "disk": 1024}
-needs_opencv_5 = pytest.mark.skipif(not hasattr(cv2, "ALIKED_create"), reason="this OpenCV has no learned features")
 
 
 @pytest.fixture(autouse=True)
@@ -39,7 +39,7 @@ def colours(rng, size):
     return image, cells.reshape(-1, 3)[:, ::-1] / 255.0
 
 
-@needs_opencv_5
+@needs("opencv 5")
 @pytest.mark.parametrize("method", SIDE)
 @pytest.mark.parametrize("side", [320, 640, 1408])
 def test_keypoints_lie_where_the_network_says(tmp_path, rng, method, side):
@@ -59,7 +59,7 @@ def test_keypoints_lie_where_the_network_says(tmp_path, rng, method, side):
     assert np.allclose(found.descriptors, wanted, atol=0.03)
 
 
-@needs_opencv_5
+@needs("opencv 5")
 @pytest.mark.parametrize("method", SIDE)
 def test_masks_and_grey_images(tmp_path, rng, method):
     """Also for the network that knows no mask; the strongest are kept."""
@@ -72,7 +72,7 @@ def test_masks_and_grey_images(tmp_path, rng, method):
     assert len(some) == 10 and np.array_equal(some.pixels, every.pixels[:10])
 
 
-@needs_opencv_5
+@needs("opencv 5")
 @pytest.mark.parametrize("method", SIDE)
 def test_panoramas_are_wrapped(tmp_path, rng, method):
     """Every feature lies within the image, and none is there twice: a cell is 576 / 16 pixels wide with the wrap."""
@@ -83,7 +83,7 @@ def test_panoramas_are_wrapped(tmp_path, rng, method):
     assert len(np.unique(found.pixels.round(3), axis=0)) == len(found)
 
 
-@needs_opencv_5
+@needs("opencv 5")
 def test_other_weights_are_not_taken_from_the_cache(tmp_path, rng):
     view = view_of(tmp_path, texture(rng, 160, 160), fisheye(160))
     options = FeatureOptions("aliked", weights=network(tmp_path, "aliked"))
@@ -94,7 +94,7 @@ def test_other_weights_are_not_taken_from_the_cache(tmp_path, rng):
     assert np.ptp(first.pixels) > 100 and np.ptp(second.pixels[:, 0]) < 1e-6
 
 
-@needs_opencv_5
+@needs("opencv 5")
 def test_lightglue_gets_places_relative_to_the_images(tmp_path, rng):
     """A network that pairs the nearest places in images of different sizes."""
     places = rng.uniform(-1, 1, (50, 2))
@@ -116,7 +116,7 @@ def aliked_features(pixels, descriptors, size, method="aliked"):
     return Features(pixels, ones.copy(), ones.copy(), ones.copy(), descriptors, method, size)
 
 
-@needs_opencv_5
+@needs("opencv 5")
 @pytest.mark.parametrize("method", SIDE)
 @pytest.mark.parametrize("content", [b"", b"no network", bytes(1000)])
 def test_weights_that_are_none(tmp_path, rng, method, content):
@@ -127,7 +127,7 @@ def test_weights_that_are_none(tmp_path, rng, method, content):
         extract(view, FeatureOptions(method, weights=weights))
 
 
-@needs_opencv_5
+@needs("opencv 5")
 def test_weights_on_which_opencv_crashes(tmp_path, rng):
     """Bits found by trying: with them OpenCV 5.0.0 ends in a segmentation fault. Other versions may refuse the file."""
     weights = network(tmp_path, "aliked")
@@ -139,7 +139,7 @@ def test_weights_on_which_opencv_crashes(tmp_path, rng):
         extract(view_of(tmp_path, texture(rng, 100, 200)), FeatureOptions("aliked", weights=weights))
 
 
-@needs_opencv_5
+@needs("opencv 5")
 def test_weights_of_another_network(tmp_path, rng):
     view = view_of(tmp_path, texture(rng, 100, 200))
     weights = tmp_path / "lightglue.onnx"
@@ -152,7 +152,7 @@ def test_weights_of_another_network(tmp_path, rng):
         match(found, found, MatchOptions("lightglue", weights=network(tmp_path, "aliked")))
 
 
-@needs_opencv_5
+@needs("opencv 5")
 @pytest.mark.parametrize("method", SIDE)
 def test_weights_that_are_missing(tmp_path, rng, method):
     view = view_of(tmp_path, texture(rng, 100, 200))

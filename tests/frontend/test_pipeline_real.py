@@ -19,8 +19,7 @@ from spherloc.frontend.triangulation import TriangulationLift
 from spherloc.frontend.view import View
 from spherloc.geometry import camera_centre, pose, rotation_angle
 from spherloc.images import read_depth_png
-
-DATA = Path(__file__).resolve().parents[2] / ".." / "shared" / "data"
+from tests.needs import DATA, real_data
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -53,9 +52,7 @@ def errors(problem, estimator):
 @pytest.fixture(scope="module")
 def panoramas() -> tuple[View, View]:
     """The two panoramas with the poses and points of their COLMAP model, whose baseline is 10."""
-    folder = DATA / "stella_equirect_pair"
-    if not folder.is_dir():
-        pytest.skip("the real panoramas (../shared/data/stella_equirect_pair) are not on this machine")
+    folder = real_data("stella_equirect_pair")
 
     def lines(name):
         return [line.split() for line in (folder / "colmap_equirect/0" / name).open() if not line.startswith("#")]

@@ -73,8 +73,15 @@ def test_the_frame_of_the_bearings_does_not_matter(solver, rng):
         np.testing.assert_allclose(second, turn @ first, atol=1e-8)
 
 
-@each_solver
-@pytest.mark.parametrize("case", ["one point", "one bearing", "line", "opposite bearings"])
+@pytest.mark.parametrize(
+    ("solver", "case"),
+    [
+        pytest.param(solver, case, id=f"{case}-{solver.name}")
+        for case in ("one point", "one bearing", "line", "opposite bearings")
+        for solver in SOLVERS
+        if not (solver.pinhole and case == "opposite bearings")  # which a pinhole does not see
+    ],
+)
 def test_degenerate_input_is_no_nan(solver, case, rng):
     bearings, points, _ = sample_for(solver, rng, 12)
     if case == "one point":
@@ -83,8 +90,6 @@ def test_degenerate_input_is_no_nan(solver, case, rng):
         bearings = np.repeat(bearings[:1], 12, axis=0)
     elif case == "line":
         points = points[0] + np.arange(12.0)[:, None] * (points[1] - points[0])
-    elif solver.pinhole:
-        pytest.skip("a pinhole sees no opposite bearings")
     else:
         bearings = np.where(np.arange(12)[:, None] % 2, -bearings[:1], bearings[:1])
     solutions = solver.solve(bearings, points)
