@@ -4,6 +4,7 @@ import csv
 from dataclasses import replace
 from pathlib import Path
 
+import distributed
 import pytest
 from sweep_deaths import DeadlyKeeper
 
@@ -56,7 +57,6 @@ def test_the_runs_of_all_workers_are_recorded_and_listed(tmp_path: Path, capsys:
 def test_a_clusters_workers_on_this_machine_record_the_same_runs(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    distributed = pytest.importorskip("distributed", reason="Dask is missing: pip install 'spherloc[cluster]'")
     here, cluster = tmp_path / "here", tmp_path / "cluster"
     swept(tmp_path / "here.csv", here, workers=1)
     with distributed.LocalCluster(
