@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from spherloc.datasets.variation import Variation
 from spherloc.estimators import options_type
 from spherloc_viz.app.catalog import SceneWish
-from spherloc_viz.app.echo import Echo
 from spherloc_viz.app.edits import Edits
 from spherloc_viz.app.history import MOST, SAME_MOVE_S, History, changed_fields
 from spherloc_viz.app.wish import Wish
@@ -213,17 +212,3 @@ def test_places_of_selected_matches() -> None:
     edits = Edits()
     edits.select((2, 5, 9))
     assert edits.places(np.array([0, 2, 3, 9])) == (1, 3)
-
-
-def test_the_page_is_told_only_when_it_may_be_wrong() -> None:
-    echo = Echo()
-    assert not echo.take(0.0), "nothing was changed"
-    echo.hear(10.0)
-    assert not echo.take(10.7), "one change is not lost, and telling could undo the next"
-    echo.hear(20.0)
-    echo.hear(20.1)
-    assert echo.take(20.8) and not echo.take(21.0), "of several at once one may be"
-    echo.hear(21.2)
-    assert echo.take(21.9), "this one may have crossed what the page was told"
-    echo.hear(30.0)
-    assert not echo.take(30.7)

@@ -16,7 +16,7 @@ from spherloc_viz.app.stage.canvas import Canvas
 from spherloc_viz.app.story import Story
 from spherloc_viz.app.text import diagnosis_html, status_html
 from spherloc_viz.app.web.touch import Touches
-from spherloc_viz.app.web.viser_seams import set_theme
+from spherloc_viz.app.web.viser_seams import changes_of, set_theme
 from spherloc_viz.app.wish import Run
 from spherloc_viz.layers import paint, steps, with_rival
 from spherloc_viz.layers.primitives import Picture, SceneItem
@@ -77,12 +77,18 @@ class Face:
         self._theme = START_THEME
 
     def draw(
-        self, run: Run, mesh: bytes | None, diagnosis: Diagnosis | None, selected: tuple[int, ...], asked: bool
+        self,
+        run: Run,
+        mesh: bytes | None,
+        diagnosis: Diagnosis | None,
+        selected: tuple[int, ...],
+        asked: bool,
+        answers: int,
     ) -> float | None:
         """Show the step at hand of a run, whose map has that mesh; returns seconds to the next step if they play.
 
         ``selected`` are numbers in the problem, and ``diagnosis`` is None for as long as there is none. ``asked`` is
-        false if only time has passed.
+        false if only time has passed. The run answers the changes up to the number ``answers``.
         """
         trace, controls = run.trace, self.controls
         timeline = steps(trace)
@@ -96,14 +102,15 @@ class Face:
         self._shown = run, mesh, drawn
         with self._client.atomic():
             self._follow_theme()
-            self.canvas.draw(run, drawn, mesh, controls.camera_movable)
+            with changes_of(self._client.gui).as_of(answers):
+                self.canvas.draw(run, drawn, mesh, controls.camera_movable)
+                controls.draw(run, diagnosis)
             # The other views tell inliers by the colours of the picture as it was.
             told = replace(picture, step=drawn.step)
             self.story.draw(run, told, pause is not None, outcome_table(trace), selected)
             waiting = status_html("Diagnosing …")
             self.story.diagnose(waiting if diagnosis is None else diagnosis_html(diagnosis, whole=last))
             self.card.draw(trace, selected, run.kept, rival)
-            controls.draw(run, diagnosis)
         self._client.flush()
         return self.canvas.check() if pause is None else pause
 

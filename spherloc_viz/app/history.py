@@ -5,20 +5,19 @@ import math
 import threading
 from typing import Any
 
-from spherloc.datasets.synthetic import TrueCamera
 from spherloc_viz.app.wish import Wish
 
 MOST = 200
 """Wishes that are remembered."""
 SAME_MOVE_S = 5.0
-"""Changes of the same things within this time count as one. The server hears values and not the pointer: a hand rests
-some seconds on a slider to look at the picture, and what it does to the same slider right after it, it hardly wants to
-take back alone. Another control, or an undo, in between ends the move at once."""
+"""Changes of the same things count as one while the pointer is held down, and within this time: what a hand does to the
+same slider right after it has looked at the picture, it hardly wants to take back alone. Another control, or an undo,
+in between ends the move at once."""
 PRESSED = frozenset({"seed", "estimator"})
 """What is not dragged: each change counts."""
 OPTIONS = "options."
-DRAGGED = (int, float, TrueCamera)
-"""Types of what can be dragged; each change of others counts too."""
+CAMERA = "true_camera"
+"""A place that can be dragged; None for the scene's own."""
 
 
 class History:
@@ -28,18 +27,22 @@ class History:
         self._lock = threading.Lock()
         self._wishes: list[Wish] = []
         self._at = -1
-        self._noted_s = -math.inf
+        self._noted_s, self._gesture = -math.inf, 0
         self._moved: frozenset[str] = frozenset()
         self._start = -1
         """Place of the wish from which the last move began."""
 
-    def note(self, wish: Wish, now_s: float) -> None:
-        """The page asks for this now; what was undone before is forgotten unless it is this very wish."""
+    def note(self, wish: Wish, now_s: float, gesture: int = 0) -> None:
+        """The page asks for this now; what was undone before is forgotten unless it is this very wish.
+
+        Changes of the same ``gesture``, if it is not 0, were made without a new press of the pointer or of a key.
+        """
         with self._lock:
             if self._at >= 0 and wish == self._wishes[self._at]:
                 return
             moved = _changed(self._wishes[self._at], wish) if self._at >= 0 else frozenset()
-            if not self._goes_on(moved, wish, now_s):
+            held = gesture != 0 and gesture == self._gesture
+            if not (held or now_s - self._noted_s < SAME_MOVE_S) or not self._goes_on(moved, wish):
                 self._start = self._at
             del self._wishes[self._start + 1 :]
             if self._start < 0 or wish != self._wishes[self._start]:  # else the move has led back
@@ -47,21 +50,21 @@ class History:
             forgotten = max(0, len(self._wishes) - MOST)
             del self._wishes[:forgotten]
             self._start -= forgotten
-            self._at, self._noted_s, self._moved = len(self._wishes) - 1, now_s, moved
+            self._at, self._noted_s, self._moved, self._gesture = len(self._wishes) - 1, now_s, moved, gesture
 
-    def _goes_on(self, moved: frozenset[str], wish: Wish, now_s: float) -> bool:
-        """Whether a change belongs to the same move as the last one."""
-        if moved != self._moved or moved & PRESSED or now_s - self._noted_s >= SAME_MOVE_S or self._start < 0:
+    def _goes_on(self, moved: frozenset[str], wish: Wish) -> bool:
+        """Whether a change is of the same things as the last one, and all of them can be dragged."""
+        if moved != self._moved or moved & PRESSED or self._start < 0:
             return False
-        values = [_values(one)[name] for one in (self._wishes[self._at], wish) for name in moved]
-        return all(type(value) in DRAGGED for value in values)
+        parts = [(name, _values(one)[name]) for one in (self._wishes[self._at], wish) for name in moved]
+        return all(type(value) in (int, float) or (name == CAMERA and value is not None) for name, value in parts)
 
     def step(self, by: int) -> Wish | None:
         """The wish before (-1) or after (+1), which is then the one that the page is at; None if there is none."""
         with self._lock:
             if not 0 <= self._at + by < len(self._wishes):
                 return None
-            self._at, self._noted_s = self._at + by, -math.inf
+            self._at, self._noted_s, self._gesture = self._at + by, -math.inf, 0
             return self._wishes[self._at]
 
     def ways(self) -> tuple[bool, bool]:

@@ -19,7 +19,6 @@ from spherloc.trace import Trace
 from spherloc.watch import Cancelled
 from spherloc_viz.app.catalog import SceneWish
 from spherloc_viz.app.controls.controls import Controls
-from spherloc_viz.app.echo import Echo
 from spherloc_viz.app.edits import Edits
 from spherloc_viz.app.face import Face, Places
 from spherloc_viz.app.history import History
@@ -31,7 +30,7 @@ from spherloc_viz.app.services import Services
 from spherloc_viz.app.stage.canvas import panel_widths_px
 from spherloc_viz.app.status import Status
 from spherloc_viz.app.web.touch import Touch, Touches
-from spherloc_viz.app.web.viser_seams import guard_callbacks, put_back
+from spherloc_viz.app.web.viser_seams import follow_changes, guard_callbacks
 from spherloc_viz.app.wish import Run, Wish
 
 QUIET_S = 0.7
@@ -53,13 +52,17 @@ class Session:
         self._status = Status(client)
         self._touches = Touches(self._status.fail)
         guard_callbacks(client, self._status.fail)
+        self._changes = follow_changes(client)
         number = client.client_id
         self._solver = Newest(f"spherloc-solver-{number}", self._guarded(self._solve))
         self._page = Newest(f"spherloc-page-{number}", self._guarded(self._show))
         self._doctor = Newest(f"spherloc-doctor-{number}", self._guarded(self._examine))
-        self._edits, self._history, self._echo = Edits(), History(), Echo()
-        self._opened: Wish | None = None
+        self._edits, self._history = Edits(), History()
+        self._opened: tuple[Wish, int] | None = None
+        """What is to be opened, and the number of the change that asked for it."""
         self._run: Run | None = None
+        self._answers = 0
+        """The number of the newest change that the run knows, or an earlier one."""
         self._diagnosed: tuple[Trace, Diagnosis] | None = None
         self._runs = PageRuns(services.recorder, self._catalog)
         self._notices = Notices(client)
@@ -96,24 +99,16 @@ class Session:
 
     def changed(self, event: object = None) -> None:
         """A widget that a run depends on was changed by a hand on the page."""
-        # Widgets that Python itself sets have no client; what they mean is known already.
-        touched = getattr(event, "client", None) is not None
-        if touched:
-            self._echo.hear(time.monotonic())
-        if event is None or touched:
-            self._controls.slow.outdate()
-            self._solver.ask()
+        self._controls.slow.outdate()
+        self._solver.ask()
 
     def redraw(self, event: object = None) -> None:
         """The page is to be drawn anew."""
         self._page.ask()
-        if getattr(event, "client", None) is not None:
-            self._echo.hear(time.monotonic())
-            self._solver.ask()  # which puts the page right once the hand has rested
 
     def open(self, wish: Wish) -> None:
         """Have the page ask for this."""
-        self._opened = wish
+        self._opened = wish, self._changes.moment()
         self.changed()
 
     def open_recorded(self, wish: Wish, path: Path, cam_from_map: FloatArray | None) -> None:
@@ -176,24 +171,29 @@ class Session:
         controls, opened = self._controls, self._opened
         if opened is not None:
             self._opened = None
-            problem = self._problem(opened.scene)
-            options = opened.options or default_options(opened.estimator, problem)
-            controls.write(replace(opened, options=options))
-            self._edits.write(opened.scene)
-        elif controls.follow_scene():
-            controls.estimator.follow_problem(self._problem(controls.scene.read()))
+            asked, number = opened
+            problem = self._problem(asked.scene)
+            options = asked.options or default_options(asked.estimator, problem)
+            with self._changes.as_of(number):
+                controls.write(replace(asked, options=options))
+            self._edits.write(asked.scene)
+        else:
+            with self._changes.as_of(controls.scene.chosen_at):
+                if controls.follow_scene():
+                    controls.estimator.follow_problem(self._problem(controls.scene.read()))
         wish = Wish(self._edits.apply(controls.scene.read()), *controls.estimator.read())
         if opened is not None:
-            self._runs.became(opened, wish)
-            controls.review.became(opened, wish)
+            self._runs.became(opened[0], wish)
+            controls.review.became(opened[0], wish)
         return wish
 
     def _solve(self, asked: bool) -> float | None:
         """The solver thread's job: solve what the page asks for now, or record what it has settled on."""
         if not asked:
             return self._settle()
+        number, gesture = self._changes.moment(), self._changes.gesture
         wish = self._wish()
-        self._history.note(wish, time.monotonic())
+        self._history.note(wish, time.monotonic(), gesture)
         if self._run is None or wish != self._run.wish:
             problem = self._problem(wish.scene)
             watch = self._controls.slow.begin()
@@ -206,6 +206,8 @@ class Session:
             finally:
                 self._controls.slow.end()
             self._run = Run(wish, trace, _kept(wish, problem))
+        if self._answers != number:
+            self._answers = number
             self._page.ask()
         self._status.say(self._runs.announce(self._run))
         self._status.withdraw()
@@ -220,10 +222,7 @@ class Session:
         return self._catalog.problem(wish)
 
     def _settle(self) -> float | None:
-        """Put the page's widgets right, and record its run; returns seconds to the next attempt if that must wait."""
-        if self._echo.take(time.monotonic()):
-            for widget in self._controls.widgets + self._face.story.steps.widgets:
-                put_back(widget)
+        """Record the page's run; returns seconds to the next attempt if that must wait."""
         run = self._run
         if run is None:
             return None
@@ -251,11 +250,11 @@ class Session:
 
     def _show(self, asked: bool) -> float | None:
         """The page thread's job: show the step at hand of the newest run."""
-        run = self._run
+        answers, run = self._answers, self._run
         if run is None:
             return None
         diagnosis = self._diagnosis(run)
-        pause = self._face.draw(run, self._mesh(run), diagnosis, self._edits.places(run.kept), asked)
+        pause = self._face.draw(run, self._mesh(run), diagnosis, self._edits.places(run.kept), asked, answers)
         if diagnosis is None:
             self._doctor.ask()
         return pause
@@ -273,11 +272,12 @@ class Session:
         return None
 
     def _guarded(self, job: Job) -> Job:
-        """The job with its errors turned into sentences on the page."""
+        """The job with its errors turned into sentences on the page; it knows what was changed when it begins."""
 
         def run(asked: bool) -> float | None:
             try:
-                return job(asked)
+                with self._changes.as_of(self._changes.now()):
+                    return job(asked)
             except Exception as error:
                 self._status.fail(error)
             return None

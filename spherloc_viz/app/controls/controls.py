@@ -30,7 +30,7 @@ from spherloc_viz.app.review.review_card import ReviewCard
 from spherloc_viz.app.services import Services
 from spherloc_viz.app.text import DIM, box
 from spherloc_viz.app.web.touch import Touches
-from spherloc_viz.app.web.viser_seams import at_once
+from spherloc_viz.app.web.viser_seams import at_once, put
 from spherloc_viz.app.wish import Run, Wish
 from spherloc_viz.layers.primitives import SceneItem
 from spherloc_viz.layers.trajectory import trajectory_items
@@ -122,12 +122,6 @@ class Controls:
         self.display = DisplayControls(gui, self._owner.redraw)
 
     @property
-    def widgets(self) -> tuple:
-        """All that hold a value."""
-        parts = (self.scene, self.estimator, self.display, self.compare, self._sweep, self._open, self._recordings)
-        return (self._preset, self._movable, *(widget for part in parts for widget in part.widgets))
-
-    @property
     def camera_movable(self) -> bool:
         """Whether the true camera can be dragged."""
         return self._movable.value and self._movable.visible
@@ -193,7 +187,7 @@ class Controls:
             NO_PRESET,
         )
         if self._preset.value != title:
-            self._preset.value = title
+            put(self._preset, title)
         html = box(escape(self._presets[title].story), f"font-size:12px;{DIM}") if title in self._presets else ""
         if self._story.content != html:
             self._story.content, self._story.visible = html, bool(html)
@@ -204,7 +198,8 @@ class Controls:
         if event.client is not None and preset is not None:
             self._owner.open(Wish(preset.scene, preset.estimator, preset.options))
 
-    async def _move(self, event: viser.GuiEvent) -> None:
+    @at_once
+    def _move(self, event: viser.GuiEvent) -> None:
         button = event.target.value
         if button == NEW_SEED:
             self.scene.next_seed()

@@ -7,6 +7,7 @@ import viser
 
 from spherloc_viz import style
 from spherloc_viz.app.stage import views
+from spherloc_viz.app.web.viser_seams import at_once
 
 
 class DisplayControls:
@@ -23,11 +24,6 @@ class DisplayControls:
         self._views.on_click(self._press)
         for widget in (self._dark, *self._layers.values()):
             widget.on_update(changed)
-
-    @property
-    def widgets(self) -> tuple:
-        """Those that hold a value."""
-        return (self._dark, self._follow, *self._layers.values())
 
     @property
     def theme(self) -> Literal["dark", "light"]:
@@ -48,6 +44,7 @@ class DisplayControls:
         wanted, self._wanted = self._wanted, None
         return wanted
 
-    async def _press(self, event: viser.GuiEvent) -> None:
+    @at_once
+    def _press(self, event: viser.GuiEvent) -> None:
         self._wanted = event.target.value
         self._changed(event)

@@ -10,6 +10,7 @@ from spherloc import registry
 from spherloc.errors import InputError, show
 from spherloc.estimators import default_options, options_type
 from spherloc.problem import Problem
+from spherloc_viz.app.web.viser_seams import put
 from spherloc_viz.options import NONE, OptionField, option_fields
 
 ABOUT: Mapping[str, str] = {
@@ -92,7 +93,7 @@ class Option:
             self.widget.min, self.widget.max = min(self.widget.min, value), max(self.widget.max, value)
         elif isinstance(self.widget.value, str):
             value = _typed(value)
-        self.widget.value = value
+        put(self.widget, value)
 
 
 class EstimatorControls:
@@ -115,11 +116,6 @@ class EstimatorControls:
             for option in options.values():
                 option.widget.on_update(changed)
 
-    @property
-    def widgets(self) -> tuple:
-        """All of them."""
-        return (self._estimator, *(option.widget for group in self._options.values() for option in group.values()))
-
     def read(self) -> tuple[str, Any]:
         """The chosen estimator and its options; shows the widgets of these options only.
 
@@ -139,7 +135,7 @@ class EstimatorControls:
             raise InputError(f"unknown estimator {show(name)}: choose one of {', '.join(self._folders)}.")
         for key, option in self._options[name].items():
             option.write(getattr(options, key))
-        self._estimator.value = _name(self._names, name)
+        put(self._estimator, _name(self._names, name))
         self._show(name)
 
     def _show(self, chosen: str) -> None:

@@ -12,6 +12,7 @@ from spherloc.errors import InputError
 from spherloc_viz.app.catalog import Catalog, SceneWish
 from spherloc_viz.app.controls.simulation_controls import SimulationControls
 from spherloc_viz.app.text import box
+from spherloc_viz.app.web.viser_seams import number_of, put
 
 LISTED_QUERIES = 50
 """A page with thousands of entries in a dropdown is slow; of more, those that fit a filter are listed."""
@@ -41,11 +42,6 @@ class SceneControls:
         self.reset.on_click(self._reset)
 
     @property
-    def widgets(self) -> tuple:
-        """All that hold a value."""
-        return (self._scene, self._query, self._find, *self._simulation.widgets, self._seed)
-
-    @property
     def reset(self) -> viser.GuiButtonGroupHandle:
         """The button that sets everything to what the scene says."""
         return self._simulation.reset
@@ -57,6 +53,11 @@ class SceneControls:
             return False
         self.write(SceneWish(label, getattr(self._catalog.scenes[label], "seed", self._read_seed(0))))
         return True
+
+    @property
+    def chosen_at(self) -> int:
+        """The number of the change that chose the scene."""
+        return number_of(self._scene)
 
     def read(self) -> SceneWish:
         """What the widgets say now, with all matches as they are.
@@ -78,7 +79,7 @@ class SceneControls:
         another = wish.scene != self._followed
         self._followed = wish.scene
         self.list_scenes()
-        self._scene.value = wish.scene
+        put(self._scene, wish.scene)
         images = self._catalog.map_scene(wish.scene)
         if images is not None:
             self._write_query(images, wish.query)
@@ -86,7 +87,7 @@ class SceneControls:
         many = images is not None and len(images.queries) > LISTED_QUERIES
         self._find.visible = self._found.visible = many
         self._simulation.write(self._catalog.synthetic(wish.scene), wish.variation)
-        self._seed.value = str(wish.seed)
+        put(self._seed, str(wish.seed))
         return another
 
     def list_scenes(self) -> None:
@@ -106,7 +107,7 @@ class SceneControls:
 
     def next_seed(self) -> None:
         """The next seed; 0 after what is no seed."""
-        self._seed.value = str((self._read_seed(-1) + 1) % 2**63)
+        put(self._seed, str((self._read_seed(-1) + 1) % 2**63))
 
     def _variation(self, label: str) -> Variation:
         scene = self._catalog.synthetic(label)
@@ -115,9 +116,9 @@ class SceneControls:
 
     def _write_query(self, images: MapScene, query: str | None) -> None:
         name = images.query(query).name
-        self._find.value = ""
+        put(self._find, "")
         self._list_queries(images, name)
-        self._query.value = name
+        put(self._query, name)
 
     def _list_queries(self, images: MapScene, chosen: str) -> None:
         """Offer the queries that fit the filter, and the chosen one."""

@@ -9,6 +9,7 @@ import viser
 from spherloc.datasets.synthetic import LIMITS, SyntheticScene, TrueCamera
 from spherloc.datasets.variation import Variation
 from spherloc_viz.app.text import box
+from spherloc_viz.app.web.viser_seams import changes_of, put
 
 OWN_CAMERA = "the scene's own"
 RANGES: Mapping[str, int] = {"to 500": 500, "to 5,000": 5000}
@@ -20,6 +21,8 @@ KINDS: Mapping[str, str] = {
     "repeated structure": "repeated",
 }
 """What kinds of outliers are called."""
+TRUE_CAMERA = "true camera"
+"""What stands for it among what is changed."""
 SIMULATED = (
     "correspondences",
     "noise_px",
@@ -39,6 +42,7 @@ class SimulationControls:
         """``cameras`` are paths of scene files by a label of their camera."""
         self._cameras = dict(cameras)
         self._changed = changed
+        self._changes = changes_of(gui)
         self._true_camera: TrueCamera | None = None
         self._rate = (80.0, 0.8)
         """What the slider shows, and the rate that it means, which may have more digits."""
@@ -102,6 +106,10 @@ class SimulationControls:
 
     @true_camera.setter
     def true_camera(self, placed: TrueCamera | None) -> None:
+        with self._changes.writing(TRUE_CAMERA):
+            self._show_true_camera(placed)
+
+    def _show_true_camera(self, placed: TrueCamera | None) -> None:
         self._true_camera = placed
         self._moved.visible = self._home.visible = placed is not None
         if placed is not None:
@@ -131,7 +139,9 @@ class SimulationControls:
         self._folder.visible = scene is not None
         for widget in (self._points, self._noise, self._outliers, self._kind):
             widget.visible = scene is not None
-        self.true_camera = variation.true_camera
+        with self._changes.writing(TRUE_CAMERA) as number:
+            if number is not None:
+                self._show_true_camera(variation.true_camera)
         if scene is None:
             return
         values = {name: getattr(scene, name) for name in SIMULATED}
@@ -141,16 +151,17 @@ class SimulationControls:
         _slide(self._noise, values["noise_px"], MOST_NOISE_PX)
         _slide(self._outliers, self._rate[0], MOST_OUTLIERS)
         _slide(self._gravity, values["gravity_error_deg"], MOST_GRAVITY_DEG)
-        self._view.value, self._height.value = values["field_of_view_deg"], values["cloud_height_m"]
-        self._kind.value = next(name for name, kind in KINDS.items() if kind == values["outlier_kind"])
-        self._camera.value = self._camera_label(variation.camera)
+        put(self._view, values["field_of_view_deg"])
+        put(self._height, values["cloud_height_m"])
+        put(self._kind, next(name for name, kind in KINDS.items() if kind == values["outlier_kind"]))
+        put(self._camera, self._camera_label(variation.camera))
 
     def _write_points(self, count: int) -> None:
         if count > RANGES[self._range.value]:
-            self._range.value = max(RANGES, key=lambda name: RANGES[name])
+            put(self._range, max(RANGES, key=lambda name: RANGES[name]))
         self._points.min = min(LEAST_POINTS, count)
         self._points.max = max(RANGES[self._range.value], count)
-        self._points.value = count
+        put(self._points, count)
 
     def _camera_label(self, path: str | None) -> str:
         """The entry of the dropdown for a camera; one that is new is added."""
@@ -168,7 +179,7 @@ class SimulationControls:
             return
         most = RANGES[self._range.value]
         if self._points.value > most:
-            self._points.value = most
+            put(self._points, most)
             self._changed(event)
         self._points.max = most
 
@@ -180,4 +191,4 @@ class SimulationControls:
 def _slide(slider: Any, value: float, usual_most: float) -> None:
     """Set a slider, which goes farther than usual where the value does."""
     slider.max = max(usual_most, float(value))
-    slider.value = float(value)
+    put(slider, float(value))

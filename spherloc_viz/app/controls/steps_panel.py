@@ -9,7 +9,7 @@ import viser
 
 from spherloc_viz import style
 from spherloc_viz.app.text import box, step_html, table_html
-from spherloc_viz.app.web.viser_seams import at_once
+from spherloc_viz.app.web.viser_seams import at_once, put
 from spherloc_viz.layers.primitives import Step, Stop, Table
 
 PLAY_S = 3.0
@@ -58,11 +58,6 @@ class StepsPanel:
             command: Any = gui.add_command(label, hotkey=hotkey, modifier=modifier)  # type: ignore[arg-type]
             command.on_trigger(lambda event, button=button: self._press(button))
 
-    @property
-    def widgets(self) -> tuple:
-        """Those that hold a value."""
-        return (self._slider, self._choice, self._pace)
-
     def settle(self, steps: tuple[Stop, ...], asked: bool) -> tuple[int, float | None]:
         """Index of the step to show, and seconds to the next one if playing; ``asked`` is false for its alarm."""
         if steps != self._steps:
@@ -97,10 +92,8 @@ class StepsPanel:
             self._choice.options = self._titles
             self._slider.max = max(2, len(self._titles))
         with self._lock:
-            # What the person has meanwhile asked for must not be taken out of their hands.
-            if self._goal is None:
-                self._choice.value = self._titles[self._index]
-                self._slider.value = self._index + 1
+            put(self._choice, self._titles[self._index])
+            put(self._slider, self._index + 1)
         buttons = (PREVIOUS, NEXT, PAUSE if playing else PLAY)
         if self._buttons.options != buttons:
             self._buttons.options = buttons

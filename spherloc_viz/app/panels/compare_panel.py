@@ -92,11 +92,6 @@ class ComparePanel:
         touches.on("compare", self._tick)
         touches.on("use", self._choose)
 
-    @property
-    def widgets(self) -> tuple:
-        """Those that hold a value."""
-        return (self._live,)
-
     def draw(self, trace: Trace) -> None:
         """Follow the run at hand, whose problem, seed and options are those to compare with."""
         with self._lock:

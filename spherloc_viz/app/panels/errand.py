@@ -1,8 +1,10 @@
 """Does what takes its time aside from the page, on a thread that lives only while there is something to do."""
 
+import contextvars
 import logging
 import threading
 from collections.abc import Callable
+from functools import partial
 
 from spherloc.errors import SpherlocError
 
@@ -20,11 +22,14 @@ class Errand:
         self._busy = self._closed = False
 
     def ask(self, job: Callable[[], None]) -> None:
-        """Have a job done as soon as the one at hand is. Never waits."""
+        """Have a job done as soon as the one at hand is. Never waits.
+
+        The job knows no more of what was changed on the page (``Changes.as_of``) than who asks for it.
+        """
         with self._lock:
             if self._closed:
                 return
-            self._next = job
+            self._next = partial(contextvars.copy_context().run, job)
             if self._busy:
                 return
             self._busy = True

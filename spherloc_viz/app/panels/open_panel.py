@@ -70,11 +70,6 @@ class OpenPanel:
         self._errand.close()
         self._scratch.close()
 
-    @property
-    def widgets(self) -> tuple:
-        """Those that hold a value."""
-        return self._fields
-
     def _build_form(self, gui: viser.GuiApi) -> None:
         about = (
             "A CSV whose first line names u, v (px), X, Y, Z (m) and maybe inlier (0 or 1). "

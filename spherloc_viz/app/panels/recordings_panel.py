@@ -99,11 +99,6 @@ class RecordingsPanel:
         touches.on("runs-compare", lambda touch: self._comparing.ask(self._compare))
         touches.on("runs-uncompare", lambda touch: self._uncompare())
 
-    @property
-    def widgets(self) -> tuple:
-        """All that hold a value."""
-        return () if self._runs is None else (*self._notes.widgets, *self._runs.widgets)
-
     def close(self) -> None:
         """End what goes on; does not wait."""
         for part in self._parts:

@@ -20,6 +20,7 @@ from spherloc_viz.app.panels.estimator_chips import chips_html, ordered
 from spherloc_viz.app.plots.sweep_charts import charts_html, table_html
 from spherloc_viz.app.text import status_html
 from spherloc_viz.app.web.touch import Touch, Touches
+from spherloc_viz.app.web.viser_seams import put
 from spherloc_viz.recording.keeping.recorder import Recorder
 
 START, CANCEL = "Start sweep", "Cancel"
@@ -105,11 +106,6 @@ class SweepPanel:
         self._files.on_click(self._download)
         touches.on("sweep", self._tick)
 
-    @property
-    def widgets(self) -> tuple:
-        """Those that hold a value."""
-        return self._over, self._values, self._runs, self._workers, self._record
-
     def close(self) -> None:
         """End the sweep and its processes; does not wait."""
         with self._lock:
@@ -125,7 +121,7 @@ class SweepPanel:
 
     def _follow(self, event: viser.GuiEvent) -> None:
         if self._values.value in VALUES.values():  # nobody typed it
-            self._values.value = VALUES[self._axis()]
+            put(self._values, VALUES[self._axis()])
 
     def _axis(self) -> str:
         return next(name for name, title in AXES.items() if title == self._over.value)

@@ -13,6 +13,7 @@ from spherloc.trace import Trace
 from spherloc_viz.app.plots.yaw_drawing import ZOOM, yaw_svg
 from spherloc_viz.app.text import box
 from spherloc_viz.app.web.touch import Touch, Touches
+from spherloc_viz.app.web.viser_seams import at_once
 from spherloc_viz.layers.yaw_bars import (
     KINDS,
     Arcs,
@@ -84,8 +85,8 @@ class YawView:
             self._arcs = trace, selected, arcs_of(trace, selected)
         return self._arcs[2]
 
-    # A coroutine runs as soon as the message is there, before another click changes the widget's value.
-    async def _click(self, event: viser.GuiEvent) -> None:
+    @at_once
+    def _click(self, event: viser.GuiEvent) -> None:
         self._show(None if event.target.value == PEAK else ALL)
 
     def _zoom(self, touch: Touch) -> None:

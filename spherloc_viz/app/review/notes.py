@@ -13,6 +13,7 @@ from spherloc_viz.app.review.filters import pill
 from spherloc_viz.app.review.shelf import Shelf
 from spherloc_viz.app.text import box
 from spherloc_viz.app.web.touch import Touch, Touches
+from spherloc_viz.app.web.viser_seams import at_once, changes_of, put
 from spherloc_viz.recording.review.notes import Review, checked_review
 from spherloc_viz.recording.run_row import RunRow
 
@@ -35,6 +36,7 @@ class Notes:
     ) -> None:
         """``stored`` is called, on a thread of this part, with the row as it is by then."""
         self._shelf, self._stored, self._failed = shelf, stored, failed
+        self._changes = changes_of(gui)
         hint = "Words that tell what kind of run it is, with commas between them."
         self._labels = gui.add_text("Labels", "", visible=False, hint=hint)
         self._chips = gui.add_html("", visible=False)
@@ -63,13 +65,15 @@ class Notes:
 
         What is being typed is left alone; else the fields follow what other pages say of the run.
         """
-        with self._lock:
+        moment = self._changes.now()
+        with self._lock, self._changes.as_of(moment):
             file = None if row is None else row.file
             if row is not None:
                 review = Review(row.labels, row.note)
                 if file != self._file or (review != self._known and not self._is_typed(file)):
                     self._known = review
-                    self._labels.value, self._note.value = f"{SEPARATOR} ".join(row.labels), row.note
+                    put(self._labels, f"{SEPARATOR} ".join(row.labels))
+                    put(self._note, row.note)
             self._file = file
             own = () if row is None else row.labels
             self._draw(tuple(dict.fromkeys((*own, *used))) if row is not None else (), own)
@@ -103,6 +107,7 @@ class Notes:
         self._offers = bool(offered)
         self._chips.visible = self._offers and not self._hidden
 
+    @at_once
     def _type(self, event: viser.GuiEvent) -> None:
         if event.client is not None:
             self._note_down(PAUSE_S)
@@ -112,7 +117,7 @@ class Notes:
         with self._lock:
             labels = _split(self._labels.value)
             rest = tuple(other for other in labels if other != label)
-            self._labels.value = f"{SEPARATOR} ".join(rest if label in labels else (*labels, label))
+            put(self._labels, f"{SEPARATOR} ".join(rest if label in labels else (*labels, label)))
         self._note_down(0.0)
 
     def _note_down(self, pause_s: float) -> None:

@@ -17,6 +17,7 @@ from spherloc_viz.app.review.rows import rows_html
 from spherloc_viz.app.review.shelf import Shelf
 from spherloc_viz.app.text import DIM, box, status_html
 from spherloc_viz.app.web.touch import Touch, Touches
+from spherloc_viz.app.web.viser_seams import put
 from spherloc_viz.recording.index.query import MAX_TEXT
 
 FOLLOW_S = 1.5
@@ -126,10 +127,11 @@ class RunList:
             return
         self._change(lambda look: look.choose(name, value))
         if name == "outliers":
-            self._range.value = OUTLIERS[value] if self._look.outliers == value else ""
+            put(self._range, OUTLIERS[value] if self._look.outliers == value else "")
 
     def _clear(self, touch: Touch) -> None:
-        self._search.value = self._range.value = ""
+        put(self._search, "")
+        put(self._range, "")
         self._change(lambda look: look.cleared())
 
     def _mark(self, touch: Touch) -> None:

@@ -1,7 +1,5 @@
 """A handle on the true camera of a synthetic scene, by which it can be dragged and turned."""
 
-import threading
-import time
 from collections.abc import Callable
 
 import numpy as np
@@ -9,30 +7,25 @@ import viser
 import viser.transforms as vtf
 
 from spherloc.geometry import camera_centre, pose, yaw_of, yaw_rotation
+from spherloc_viz.app.web.viser_seams import at_once, put_handle
 from spherloc_viz.layers.primitives import FloatArray
 
 Place = tuple[float, float, float, float]
 """Yaw in degrees and position in metres, of a level camera."""
 
 SIZE_PX = 90.0
-CATCH_UP_S = 1.0
-"""After a drag, answers to its earlier moves are still on their way for so long, at most."""
 
 
 class TrueCamera:
     """The handle: arrows and a plane move the camera, and a circle around the vertical turns it.
 
-    Dragging and our own updates do not fight: while it is dragged, and until the answer to the last move has arrived,
-    the handle stays where the person put it.
+    Where the person put it, it stays until the answer to that very move, or to a later change, arrives.
     """
 
     def __init__(self, client: viser.ClientHandle, moved: Callable[[Place], None]) -> None:
         """``moved`` gets the camera's new yaw and position in the map frame of a level scene, whenever it is dragged;
         it is called on viser's event loop and must return at once."""
         self._moved = moved
-        self._lock = threading.Lock()
-        self._dragged = False
-        self._awaited: tuple[Place, float] | None = None
         # viser shows a circle where both of its axes are active: two handles have all arrows and no roll or pitch.
         self._level = _handle(client, "level", (True, False, True))
         self._upright = _handle(client, "upright", (False, True, False))
@@ -45,33 +38,18 @@ class TrueCamera:
             handle.visible = visible and cam_from_map is not None
         if cam_from_map is None:
             return
-        place = place_of(cam_from_map)
-        with self._lock:
-            if self._dragged or not self._caught_up(place):
-                return
-            self._awaited = None
-            yaw_deg, *position = place
-            for handle in (self._level, self._upright):
-                handle.wxyz = vtf.SO3.from_matrix(yaw_rotation(np.radians(yaw_deg)).T).wxyz
-                handle.position = np.array(position)
+        yaw_deg, *position = place_of(cam_from_map)
+        wxyz = vtf.SO3.from_matrix(yaw_rotation(np.radians(yaw_deg)).T).wxyz
+        for handle in (self._level, self._upright):
+            put_handle(handle, wxyz, position)
 
-    def _caught_up(self, place: Place) -> bool:
-        """Whether this is no answer to an earlier move than the last."""
-        if self._awaited is None:
-            return True
-        last, until = self._awaited
-        return bool(np.allclose(last, place, rtol=0.0, atol=1e-6)) or time.monotonic() > until
-
-    async def _drag(self, event: viser.TransformControlsEvent) -> None:
-        # On the event loop, since on viser's threads the end of a drag might overtake its last move.
+    @at_once
+    def _drag(self, event: viser.TransformControlsEvent) -> None:
+        # On viser's threads the end of a drag might overtake its last move.
         other = self._upright if event.target is self._level else self._level
-        place = place_of(pose_of(self._level.wxyz, event.target.position))
-        with self._lock:
-            self._dragged = event.phase != "end"
-            self._awaited = place, time.monotonic() + CATCH_UP_S
-            other.position = event.target.position
+        put_handle(other, other.wxyz, event.target.position)
         if event.phase != "start":
-            self._moved(place)
+            self._moved(place_of(pose_of(self._level.wxyz, event.target.position)))
 
 
 def _handle(client: viser.ClientHandle, name: str, axes: tuple[bool, bool, bool]) -> viser.TransformControlsHandle:

@@ -14,8 +14,9 @@ QUIET = (
 )
 """viser loads a sorter for Gaussian splats that wants ``eval``. The policy denies it, nobody here draws splats,
 and the console stays clean for errors that matter."""
-TOUCH = "<style>{css}</style><script>{script}</script>"
-"""What reports presses, see ``spherloc_viz.app.web.touch``."""
+OURS = "<style>{css}</style><script>{changes}</script><script>{touch}</script>"
+"""What numbers the changes of widgets, see ``spherloc_viz.app.web.changes``, and what reports presses, see
+``spherloc_viz.app.web.touch``."""
 
 
 @dataclass(frozen=True)
@@ -34,8 +35,10 @@ def load_page() -> Page:
     path = Path(viser.__file__).parent / "client" / "build" / "index.html"
     html = path.read_text(encoding="utf-8")
     own = Path(__file__).parent
-    css, script = (own.joinpath(name).read_text(encoding="utf-8") for name in ("touch.css", "touch.js"))
-    ours = QUIET + TOUCH.format(css=css, script=script)
+    css, changes, touch = (
+        own.joinpath(name).read_text(encoding="utf-8") for name in ("touch.css", "changes.js", "touch.js")
+    )
+    ours = QUIET + OURS.format(css=css, changes=changes, touch=touch)
     html = html.replace("<title>Viser</title>", f"<title>spherloc</title>{ours}", 1)
     data = html.encode()
     return Page(html=data, zipped=gzip.compress(data, mtime=0), policy=content_policy(html))

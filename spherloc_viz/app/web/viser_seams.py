@@ -2,22 +2,28 @@
 
 import asyncio
 import contextlib
+import contextvars
 import hmac
 import io
+import time
 import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future
 from typing import Any, TypeVar
 
+import numpy as np
 import viser
 import websockets.asyncio.server
 from viser import _messages
+
+from spherloc_viz.app.web.changes import Changes
 
 KEY_HEADER = "X-Spherloc-Key"
 """Request header that carries the key; a web page cannot set headers on a websocket, a program can."""
 ROLE_HEADER = "X-Spherloc-Role"
 """Request header that says what the page may do, next to the key."""
-
+ANSWERS = "answers"
+"""Carries, beside a value for a widget, the number of the change that it answers; ``changes.js`` takes it out."""
 
 Callback = TypeVar("Callback", bound=Callable[..., None])
 
@@ -55,15 +61,104 @@ def stop_viser(server: viser.ViserServer) -> None:
         server.stop()
 
 
-def put_back(handle: Any) -> None:
-    """Show the value that Python holds in the widget, also if the page lost one on its way here.
+def changes_of(part: Any) -> Changes:
+    """The numbers of what a hand changes in a client's ``gui``."""
+    return part.__dict__.setdefault("_spherloc_changes", Changes())
 
-    The page throttles all widgets together and drops messages; assigning ``handle.value`` would not help,
-    since it sends nothing when Python's value stays the same.
+
+def number_of(handle: Any) -> int:
+    """The number of a widget's newest change."""
+    state = handle._impl
+    return changes_of(state.gui_api).of(state.uuid)
+
+
+def put(handle: Any, value: Any) -> None:
+    """Set a widget's value, unless it was changed since what this thread knows (``Changes.as_of``).
+
+    The widget's callbacks are not called: they are for hands.
     """
     state = handle._impl
-    message = _messages.GuiUpdateMessage(state.uuid, {"value": state.value})
-    state.gui_api._websock_interface.queue_message(message)
+    with changes_of(state.gui_api).writing(state.uuid) as number:
+        value = type(state.value)(value)
+        if number is None or state.value == value:
+            return
+        message = _messages.GuiUpdateMessage(state.uuid, {"value": value, ANSWERS: number})
+        state.gui_api._websock_interface.queue_message(message)
+        state.value, state.update_timestamp = value, time.time()
+
+
+def put_handle(handle: Any, wxyz: Any, position: Any) -> None:
+    """Put a handle on the canvas somewhere, unless it was dragged since what this thread knows."""
+    gui = handle._impl.api._owner.gui
+    with changes_of(gui).writing(handle.name) as number:
+        if number is not None:
+            handle.wxyz, handle.position = np.asarray(wxyz), np.asarray(position)
+
+
+def follow_changes(client: viser.ClientHandle) -> Changes:
+    """Number what a hand changes on a client's page, and what is set in answer.
+
+    viser would take a value over and call the callbacks on threads that run ahead of it or behind, and send values
+    without a number. ``changes.js`` is what the page does about them.
+    """
+    changes = changes_of(client.gui)
+    connection: Any = client._websock_connection
+    handle_others, queue = connection._handle_incoming_message, connection.queue_message
+    poses = _messages.SetPositionMessage, _messages.SetOrientationMessage
+
+    async def handle(client_id: Any, message: Any) -> None:
+        if type(message) is _messages.GuiUpdateMessage:
+            _hear(client, changes, message)
+        else:
+            with changes.as_of(changes.now()):
+                await handle_others(client_id, message)
+
+    def send(message: Any) -> None:
+        if type(message) is _messages.GuiUpdateMessage and "value" in message.updates:
+            message.updates.setdefault(ANSWERS, changes.moment())
+        elif isinstance(message, poses) and message.name in client.scene._handle_from_transform_controls_name:
+            queue(_messages.GuiUpdateMessage(message.name, {ANSWERS: changes.moment()}))
+        queue(message)
+
+    connection._handle_incoming_message, connection.queue_message = handle, send
+    return changes
+
+
+def _hear(client: viser.ClientHandle, changes: Changes, message: Any) -> None:
+    """Take over what a hand has changed, and call the callbacks, which are no coroutines."""
+    gui: Any = client.gui
+    handle, number, gesture = (
+        gui._gui_input_handle_from_uuid.get(message.uuid),
+        *(word if type(word := message.updates.get(name)) is int else None for name in ("change", "gesture")),
+    )
+    with changes.hearing(message.uuid, number):
+        changes.gesture = gesture or changes.gesture
+        if handle is None or "value" not in message.updates:
+            return
+        state, sent = handle._impl, message.updates["value"]
+        taken = _taken(handle, sent)
+        same, state.value, state.update_timestamp = taken == state.value, taken, time.time()
+        if not state.is_button and taken != (tuple(sent) if isinstance(sent, list) else sent):
+            # The page shows what it sent.
+            gui._websock_interface.queue_message(_messages.GuiUpdateMessage(message.uuid, {"value": taken}))
+        if same and not state.is_button:
+            return
+        event = viser.GuiEvent(client, client.client_id, handle)
+        for callback in tuple(state.update_cb):
+            gui._thread_executor.submit(callback, event)
+
+
+def _taken(handle: Any, sent: Any) -> Any:
+    """What a widget makes of a value that the page sent; what it had if that cannot be."""
+    value = handle._impl.value
+    if isinstance(handle, viser.GuiDropdownHandle) and sent not in handle.options:
+        return value
+    try:
+        if isinstance(value, tuple):
+            return tuple(type(old)(new) for old, new in zip(value, sent, strict=True))
+        return type(value)(sent)
+    except (TypeError, ValueError, OverflowError):
+        return value
 
 
 def at_once(callback: Callback) -> Callback:
@@ -90,7 +185,7 @@ class _GuardedExecutor:
             done: Future[None] = Future()
             done.set_result(None)
             return done
-        return self._executor.submit(self._run, task, words)
+        return self._executor.submit(contextvars.copy_context().run, self._run, task, words)
 
     def _run(self, task: Callable[..., Any], words: tuple[Any, ...]) -> None:
         try:
