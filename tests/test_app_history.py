@@ -112,6 +112,30 @@ def test_estimators_that_are_chosen_one_after_another_are_single_changes() -> No
     assert [history.step(-1) for _ in range(3)] == wishes[2::-1]
 
 
+def camera(x_m: float | None) -> Wish:
+    place = None if x_m is None else (30.0, x_m, 0.0, 0.0)
+    return replace(wish(), scene=replace(SCENE, variation=Variation(true_camera=place)))
+
+
+@pytest.mark.parametrize("gesture", [0, 7])
+def test_dragging_the_camera_is_one_move_and_putting_it_back_another(gesture: int) -> None:
+    history = History()
+    history.note(camera(None), 0.0)
+    for k in range(20):
+        history.note(camera(0.1 * k), 5.0 + 0.05 * k, gesture)
+    history.note(camera(None), 6.5, gesture + 1)
+    assert history.step(-1) == camera(0.1 * 19) and history.step(-1) == camera(None) and history.step(-1) is None
+
+
+def test_what_is_held_all_the_time_is_one_move_however_long_it_rests() -> None:
+    history = History()
+    history.note(wish(), 0.0, 1)
+    for k in range(4):
+        history.note(wish(noise_px=2.0 + k), 3.0 * SAME_MOVE_S * k, 2)
+    history.note(wish(noise_px=9.0), 12.0 * SAME_MOVE_S, 3)
+    assert history.step(-1) == wish(noise_px=5.0) and history.step(-1) == wish()
+
+
 def test_two_moves_of_one_slider_are_two() -> None:
     history = History()
     for k in range(3):

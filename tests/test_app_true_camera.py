@@ -1,6 +1,5 @@
 """The handle on the true camera: what it tells is the pose that it shows, and dragging wins over our own updates."""
 
-import asyncio
 from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any, Literal, cast
@@ -13,9 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from spherloc.geometry import pose, yaw_rotation
-from spherloc_viz.app.stage import true_camera
 from spherloc_viz.app.stage.true_camera import Place, TrueCamera, place_of, pose_of
-from spherloc_viz.app.web.viser_seams import start_viser, stop_viser
+from spherloc_viz.app.web.viser_seams import changes_of, start_viser, stop_viser
 
 metres = st.floats(-1e3, 1e3)
 
@@ -42,6 +40,7 @@ class Hand:
 
     def __init__(self, scene: viser.SceneApi) -> None:
         self.told: list[Place] = []
+        self.changes = changes_of(scene._owner.gui)
         self.camera = TrueCamera(cast(viser.ClientHandle, SimpleNamespace(scene=scene)), self.told.append)
         self.level, self.upright = (scene._handle_from_transform_controls_name[name] for name in NODES)
 
@@ -49,7 +48,7 @@ class Hand:
         for name, value in where.items():
             setattr(handle, name, value)
         for callback in handle._impl_aux.update_cb:
-            asyncio.run(callback(viser.TransformControlsEvent(None, None, handle, phase)))
+            callback(viser.TransformControlsEvent(None, None, handle, phase))
 
     @property
     def place(self) -> Place:
@@ -114,24 +113,13 @@ def test_dragging_either_part_tells_the_new_place(hand: Hand) -> None:
     np.testing.assert_allclose(hand.told[-1], (-170.0, 4.0, -1.0, 3.0), atol=1e-9)
 
 
-def test_our_updates_wait_until_the_drag_is_over_and_answered(hand: Hand) -> None:
+def test_the_handle_stays_where_it_was_dragged_until_that_is_answered(hand: Hand) -> None:
     hand.camera.show(level_pose(HERE), True)
-    hand.drag("start", hand.level)
-    hand.drag("update", hand.level, position=np.array(THERE[1:]))
+    with hand.changes.hearing(NODES[0], None):
+        hand.drag("update", hand.level, position=np.array(THERE[1:]))
+    before = hand.changes.now() - 1
+    with hand.changes.as_of(before):
+        hand.camera.show(level_pose(HERE), True)
+    np.testing.assert_allclose(hand.place, THERE, atol=1e-9, err_msg="an answer to an earlier change came late")
     hand.camera.show(level_pose(HERE), True)
-    np.testing.assert_allclose(hand.place, THERE, atol=1e-9)
-    hand.drag("end", hand.level)
-    hand.camera.show(level_pose((30.0, 2.5, 2.0, 3.0)), True)
-    np.testing.assert_allclose(hand.place, THERE, atol=1e-9, err_msg="an answer to an earlier move came late")
-    hand.camera.show(level_pose(THERE), True)
-    hand.camera.show(level_pose(HERE), True)
-    np.testing.assert_allclose(hand.place, HERE, atol=1e-9, err_msg="after the answer, an undo is followed")
-
-
-def test_a_move_that_is_never_answered_is_not_waited_for_long(hand: Hand, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Such as one that no problem can be made of."""
-    monkeypatch.setattr(true_camera, "CATCH_UP_S", 0.0)
-    hand.drag("start", hand.level)
-    hand.drag("end", hand.level, position=np.array(THERE[1:]))
-    hand.camera.show(level_pose(HERE), True)
-    np.testing.assert_allclose(hand.place, HERE, atol=1e-9)
+    np.testing.assert_allclose(hand.place, HERE, atol=1e-9, err_msg="what answers it is followed")
