@@ -20,7 +20,7 @@ from spherloc_viz.app.status import Status
 from spherloc_viz.app.text import DIM, box
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.web.upload_limit import limit_uploads
-from spherloc_viz.app.web.viser_seams import guard_callbacks
+from spherloc_viz.app.web.viser_seams import follow_changes, guard_callbacks
 from spherloc_viz.app.wish import Run
 from spherloc_viz.layers.primitives import SceneItem
 
@@ -58,6 +58,7 @@ class Audience:
         self._status = Status(client)
         self._touches = Touches(self._status.fail)
         guard_callbacks(client, self._status.fail)
+        self._changes = follow_changes(client)
         limit_uploads(client, 0, self._status.complain)
         self._edits = Edits()
         self._page = Newest(f"spherloc-page-{client.client_id}", self._draw)
@@ -99,6 +100,11 @@ class Audience:
             self._page.ask()
 
     def _draw(self, asked: bool) -> float | None:
+        now = self._changes.now()
+        with self._changes.as_of(now):
+            return self._draw_presented(asked, now)
+
+    def _draw_presented(self, asked: bool, now: int) -> float | None:
         shown = self._services.presented.newest
         try:
             if shown is None:
@@ -107,7 +113,7 @@ class Audience:
             wish = shown.run.wish
             self._status.say(f"The presenter shows {wish.scene.scene}, {wish.estimator}, seed {wish.scene.seed}.")
             selected = self._edits.places(shown.run.kept)
-            return self._face.draw(shown.run, shown.mesh, shown.diagnosis, selected, asked)
+            return self._face.draw(shown.run, shown.mesh, shown.diagnosis, selected, asked, now)
         except Exception as error:
             self._status.fail(error)
             return None
