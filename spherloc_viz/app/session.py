@@ -205,8 +205,9 @@ class Session:
                 return None
             finally:
                 self._controls.slow.end()
-            self._run = Run(wish, trace, _kept(wish, problem))
-        if self._answers != number:
+            self._run, self._answers = Run(wish, trace, _kept(wish, problem)), number
+            self._page.ask()
+        elif self._answers != number:
             self._answers = number
             self._page.ask()
         self._status.say(self._runs.announce(self._run))
