@@ -1,6 +1,5 @@
 """The yaw view: arcs against Eq. 22 by brute force, rows that do not collide, windows across the seam, and presses."""
 
-import asyncio
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -302,9 +301,9 @@ def window_on(view: YawView) -> tuple[float, float]:
     return float(low), float(high)
 
 
-async def press(view: YawView, button: str) -> None:
+def press(view: YawView, button: str) -> None:
     event: Any = SimpleNamespace(target=SimpleNamespace(value=button))
-    await view._click(event)
+    view._click(event)
 
 
 def test_drags_zoom_clicks_move_and_buttons_go_back(server: viser.ViserServer, runs: dict[str, Trace]) -> None:
@@ -326,10 +325,10 @@ def test_drags_zoom_clicks_move_and_buttons_go_back(server: viser.ViserServer, r
     labels = [item.text for item in root.iter(f"{SVG}text")]
     assert "−176" in labels and "178" in labels, "beyond the seam the numbers start again"
     assert after("175.5,184.5", 0.5, 1.0) == pytest.approx((-180.0, -175.5))
-    asyncio.run(press(view, WHOLE))
+    press(view, WHOLE)
     view.draw(run, "", (), kept)
     assert window_on(view) == ALL
-    asyncio.run(press(view, PEAK))
+    press(view, PEAK)
     view.draw(run, "", (), kept)
     assert window_on(view) == peak and len(asked) == 6
     for argument in ("", "1", "a,b", "nan,3", "0,inf", "5,4", "-181,3", "0,400", "1,2,3"):

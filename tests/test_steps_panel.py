@@ -22,7 +22,7 @@ from spherloc_viz.app.controls.steps_panel import (
     moved,
     stages_html,
 )
-from spherloc_viz.app.web.viser_seams import start_viser, stop_viser
+from spherloc_viz.app.web.viser_seams import changes_of, start_viser, stop_viser
 from spherloc_viz.layers.primitives import Step, Stop
 
 TIMELINE = (
@@ -134,15 +134,21 @@ def test_showing_a_step_leaves_nothing_to_a_loop_that_has_ended() -> None:
 
 
 def test_a_thumb_that_moves_on_is_not_pulled_back(panel: Panel) -> None:
-    inner = panel.panel
-    inner._slider._impl.value = 3
-    inner._slide(event(inner._slider))
-    index, _ = inner.settle(TIMELINE, True)
-    inner._slider._impl.value = 7
-    inner._slide(event(inner._slider))
-    inner.show(Step(KEYS[index], "", "", ""), False, ())
-    assert inner._slider.value == 7
-    assert panel.settle() == KEYS[6] and inner._slider.value == 7
+    inner, slider = panel.panel, panel.panel._slider
+    changes = changes_of(slider._impl.gui_api)
+
+    def slide(place: int) -> None:
+        with changes.hearing(slider._impl.uuid, None):
+            slider._impl.value = place
+            inner._slide(event(slider))
+
+    slide(3)
+    with changes.as_of(changes.now()):
+        index, _ = inner.settle(TIMELINE, True)
+        slide(7)
+        inner.show(Step(KEYS[index], "", "", ""), False, ())
+    assert slider.value == 7
+    assert panel.settle() == KEYS[6] and slider.value == 7
 
 
 @pytest.mark.parametrize("wish", ["4711", "", "no-such-step", "yaw-arcs-9999999999999999999", "../../etc"])
