@@ -61,12 +61,14 @@ class PageClient:
     messages: int = 0
     last_s: float = 0.0
     """When the last bytes came."""
+    cookie: str = ""
+    """What the link with a token gave, where one is needed."""
 
     async def __aenter__(self) -> "PageClient":
         self._session = aiohttp.ClientSession()
         self._socket = await self._session.ws_connect(
             self.address,
-            headers={"Origin": self.address.rstrip("/")},
+            headers={"Origin": self.address.rstrip("/")} | ({"Cookie": self.cookie} if self.cookie else {}),
             protocols=[f"viser-v{viser.__version__}"],
             max_msg_size=0,
             compress=0,

@@ -7,26 +7,29 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import IO
 
 ROOT = Path(__file__).resolve().parents[1]
 SCENE = ROOT / "scenes" / "panorama_outliers_90.toml"
 
 
 @contextmanager
-def playground(scene: Path = SCENE, recordings: Path | None = None) -> Iterator[tuple[str, subprocess.Popen[str]]]:
+def playground(
+    scene: Path = SCENE, recordings: Path | None = None, *more: str, errors: IO[str] | None = None
+) -> Iterator[tuple[str, subprocess.Popen[str]]]:
     """Address and process of ``spherloc play`` on a free port; the folder that it records into is thrown away if it is
-    not given."""
+    not given. ``more`` are further words of the command, and ``errors`` takes what it prints as errors."""
     program = Path(sys.executable).with_name("spherloc")
     with tempfile.TemporaryDirectory() as folder:
-        words = [program, "play", scene, "--port", "0", "--recordings", recordings or folder]
-        server = subprocess.Popen([*map(str, words)], stdout=subprocess.PIPE, text=True)
+        words = [program, "play", scene, "--port", "0", "--recordings", recordings or folder, *more]
+        server = subprocess.Popen([*map(str, words)], stdout=subprocess.PIPE, stderr=errors, text=True)
         try:
             assert server.stdout is not None
             line = server.stdout.readline()
-            match = re.fullmatch(r"spherloc playground: (http://127\.0\.0\.1:\d+)\n", line)
+            match = re.fullmatch(r"spherloc playground: (http://127\.0\.0\.1:\d+(/\?token=[\w-]+)?)\n", line)
             if match is None:
                 raise RuntimeError(f"the playground did not start: {line!r}")
-            yield match[1] + "/", server
+            yield match[1] + ("" if match[2] else "/"), server
         finally:
             server.terminate()
             server.wait(20)

@@ -345,6 +345,7 @@ def test_presses_from_elsewhere_are_refused() -> None:
                 report(touches.token, at=[2.0, 0.5]),
                 report(touches.token, at=[float("nan"), 0.5]),
                 report(touches.token, at="ab"),
+                report(touches.token, at=[10**400, 0.5]),
             ):
                 assert (await door.touch(body)).status == 400, body
             assert (await door.touch(b" " * MOST_BYTES + report(touches.token))).status == 413

@@ -68,7 +68,10 @@ class Canvas:
 
     def _in_the_way(self) -> frozenset[str]:
         picture = self._picture
-        position = np.array(self._client.camera.position)
+        try:
+            position = np.array(self._client.camera.position, dtype=np.float64).reshape(3)
+        except (TypeError, ValueError):  # viser takes whatever a page says of its camera
+            return frozenset()
         return frozenset() if picture is None else views.before_the_eyes(picture, position)
 
     def check(self) -> float | None:

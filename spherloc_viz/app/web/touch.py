@@ -106,7 +106,7 @@ def _parse(body: bytes) -> tuple[str, Touch] | None:
         argument.encode()  # JSON can say halves of characters, which no file and no database takes
         (x, y), (from_x, from_y) = (tuple(map(_share, report[name])) for name in ("at", "from"))
         return str(report["session"]), Touch(action, argument, x, y, from_x, from_y, report["extend"] is True)
-    except (ValueError, TypeError, KeyError, RecursionError):
+    except (ValueError, TypeError, KeyError, OverflowError, RecursionError):
         return None
 
 

@@ -17,6 +17,7 @@ import websockets.asyncio.server
 from viser import _messages
 
 from spherloc_viz.app.web.changes import Changes
+from spherloc_viz.app.web.terminal import keep_tracebacks_short, tell_in_short
 
 KEY_HEADER = "X-Spherloc-Key"
 """Request header that carries the key; a web page cannot set headers on a websocket, a program can."""
@@ -40,6 +41,8 @@ def start_viser(key: str) -> viser.ViserServer:
         server = viser.ViserServer(host="127.0.0.1", port=0, label="spherloc", verbose=False)
     _disable_sharing(server)
     _wake_on_loop(server)
+    keep_tracebacks_short()
+    server.get_event_loop().set_exception_handler(tell_in_short)
     # A page that leaves while it is being drawn is no news for the terminal.
     warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
     return server
