@@ -256,8 +256,7 @@ def test_views_hold_what_they_are_about(scene_of: Callable[..., SyntheticScene],
     trace = estimate(scene_of("panorama", correspondences=60).problem(), estimator)
     for index in range(len(steps(trace))):
         picture = paint(trace, index)
-        name, subject = views.fitting(picture)
-        assert name in views.DIRECTIONS and any(item.name == subject for item in picture.scene)
+        assert picture.focus.view in views.DIRECTIONS
         for button in views.DIRECTIONS:
             view = views.find(button, picture, aspect)
             assert np.isfinite(view.position).all() and np.linalg.norm(view.position - view.target) > 0
@@ -265,29 +264,20 @@ def test_views_hold_what_they_are_about(scene_of: Callable[..., SyntheticScene],
         points, surface = items["map/points"], items["sphere/surface"]
         assert isinstance(points, Points)
         for button, held in (("Overview", points.positions), ("Sphere", surface.vertices)):  # type: ignore[union-attr]
-            across = projected(views.find(button, picture, aspect), held)
+            across = views.projected(views.find(button, picture, aspect), held)
             limit = np.tan(views.FIELD_OF_VIEW_RAD / 2) * np.array([aspect, 1.0])
             share = np.mean(np.all(np.abs(across) <= limit, axis=1))
             assert share >= (0.9 if button == "Overview" else 1.0)
-
-
-def projected(view: views.View, positions: np.ndarray) -> np.ndarray:
-    """Right and up over depth (N, 2) of points as seen from a view."""
-    forward = (view.target - view.position) / np.linalg.norm(view.target - view.position)
-    right = np.cross(forward, views.UP)
-    right /= np.linalg.norm(right)
-    offset = positions - view.position
-    return offset @ np.column_stack([right, np.cross(right, forward)]) / (offset @ forward)[:, None]
 
 
 def test_the_view_of_the_clique_shows_its_balls(scene_of: Callable[..., SyntheticScene]) -> None:
     trace = estimate(scene_of("fisheye").problem(), "mc")
     index = [step.key for step in steps(trace)].index("clique")
     picture = paint(trace, index)
-    assert views.fitting(picture) == ("Balls", "balls/clique")
+    assert picture.focus.view == "Balls"
     balls = next(item for item in picture.scene if item.name == "balls/clique")
     assert isinstance(balls, Balls)
-    across = projected(views.find("Balls", picture, 1.0), balls.centers)
+    across = views.projected(views.find("Balls", picture, 1.0), balls.centers)
     assert np.mean(np.all(np.abs(across) <= np.tan(views.FIELD_OF_VIEW_RAD / 2), axis=1)) >= 0.5
 
 

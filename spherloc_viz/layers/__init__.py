@@ -17,6 +17,7 @@ from spherloc.trace import (
 )
 from spherloc_viz import style
 from spherloc_viz.layers import consensus, decision, outcome, ransac, refinement, start, translation, yaw
+from spherloc_viz.layers.focus import focus_of
 from spherloc_viz.layers.frame import Plan, RunView
 from spherloc_viz.layers.primitives import Chart, FloatArray, Picture, Step, Stop
 from spherloc_viz.layers.scene import base_items, camera
@@ -92,7 +93,8 @@ def paint(trace: Trace, index: int) -> Picture:
     tables = (*frame.tables, outcome_table(trace)) if index == len(timeline.plans) - 1 else frame.tables
     step = Step(stop.key, stop.title, frame.caption, frame.equation, frame.note, stop.stage)
     scene = base_items(timeline.view, frame) + frame.items
-    return Picture(step, scene, tuple(timeline.chart(draw) for draw in charts.values()), tables)
+    focus = focus_of(timeline.view, frame)
+    return Picture(step, scene, tuple(timeline.chart(draw) for draw in charts.values()), tables, focus)
 
 
 def with_rival(picture: Picture, trace: Trace, cam_from_map: FloatArray) -> Picture:

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from math import gcd
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,10 +10,15 @@ from numpy.typing import NDArray
 from spherloc.geometry import camera_centre
 from spherloc.trace import TranslationStage
 from spherloc_viz import style
+from spherloc_viz.layers.focus import ball_boxes
 from spherloc_viz.layers.frame import RunView, even, one_color
-from spherloc_viz.layers.primitives import Balls, Points, SceneItem, Segments
+from spherloc_viz.layers.primitives import Balls, FloatArray, Focus, Points, SceneItem, Segments
+from spherloc_viz.layers.ring import GOLDEN
 
 IndexArray = NDArray[np.int64]
+
+OPACITIES = ((4, 0.3), (12, 0.22), (35, 0.14), (np.inf, 0.1))
+"""Up to how many balls have which opacity: few are seen well, and many do not hide what is behind them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,6 +34,37 @@ class BallSet:
     def by_radius(self) -> IndexArray:
         """(M,) the smallest first."""
         return np.argsort(self.stage.radii_m, kind="stable")
+
+    @cached_property
+    def order(self) -> IndexArray:
+        """(M,) in which order the balls come: two of the maximum clique, the rest of the smaller half so that every
+        beginning is spread evenly over it, and then the others, the smallest first.
+
+        The very smallest would not be telling: they may be of wrong pairs, far from each other.
+        """
+        half = max(1, len(self) // 2)
+        stride = max(1, round(GOLDEN * half))
+        while gcd(stride, half) > 1:
+            stride += 1
+        spread = np.concatenate([self.by_radius[np.arange(half) * stride % half], self.by_radius[half:]])
+        first = spread[self.in_clique[spread]][:2]
+        return np.concatenate([first, spread[~np.isin(spread, first)]])
+
+    @property
+    def example(self) -> int:
+        """A ball to explain balls by."""
+        return int(self.order[0])
+
+    def focus(self, shown: IndexArray) -> Focus:
+        """These balls, or the denser half of many, from the side from which most of the clique is seen."""
+        stage = self.stage
+        points = ball_boxes(stage.centres_m[shown], stage.radii_m[shown])
+        return Focus("Balls", points, self._clique_box)
+
+    @cached_property
+    def _clique_box(self) -> FloatArray:
+        members = self.members if len(self.members) else self.by_radius
+        return ball_boxes(self.stage.centres_m[members], self.stage.radii_m[members])
 
     @cached_property
     def in_clique(self) -> NDArray[np.bool_]:
@@ -98,7 +135,8 @@ class BallSet:
         stage, drawn = self.stage, self.drawn(shown, inside)
         items: list[SceneItem] = [self._edges(drawn, inside, color)]
         dot_m = min(0.02 * view.sphere_m, 0.1 * float(np.median(stage.radii_m)))
-        groups = (("balls/others", ~inside, style.UNDECIDED, 0.10), ("balls/clique", inside, color, 0.16))
+        faint = next(opacity for most, opacity in OPACITIES if len(drawn) <= most)
+        groups = (("balls/others", ~inside, style.UNDECIDED, faint), ("balls/clique", inside, color, 1.6 * faint))
         for name, members, shade, opacity in groups:
             chosen, centres = drawn[members[drawn]], shown[members[shown]]
             if len(chosen):

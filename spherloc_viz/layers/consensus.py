@@ -10,8 +10,9 @@ from spherloc.trace import ConsensusStage
 from spherloc_viz import style
 from spherloc_viz.layers import ring
 from spherloc_viz.layers import yaw_bound as bound
+from spherloc_viz.layers.focus import sphere_box
 from spherloc_viz.layers.frame import Frame, Plan, RunView, even, growing, one_color
-from spherloc_viz.layers.primitives import FloatArray, SceneItem, Segments, Table
+from spherloc_viz.layers.primitives import FloatArray, Focus, SceneItem, Segments, Table
 from spherloc_viz.layers.scene import camera
 from spherloc_viz.layers.yaw_bound import best_support, highest_bound
 
@@ -49,6 +50,7 @@ def _clique(view: RunView, stage: ConsensusStage) -> Frame:
         view.nobody(),
         note=note,
         items=(_edges(view, pairs),),
+        focus=_focus(view, stage.clique),
     )
 
 
@@ -85,6 +87,7 @@ def _members(view: RunView, stage: ConsensusStage, size: int) -> Frame:
         view.nobody(),
         note=note,
         items=(_edges(view, pairs),),
+        focus=_focus(view, chosen),
     )
 
 
@@ -98,6 +101,12 @@ def _pairs(clique: np.ndarray) -> tuple[np.ndarray, str]:
         drawn,
         f"An even sample of {len(drawn):,} of {len(pairs):,} pairs is drawn, as lines on the map.",
     )
+
+
+def _focus(view: RunView, matches: np.ndarray) -> Focus:
+    """The map points of some matches, and the sphere."""
+    sphere = sphere_box(view.middle, view.sphere_m)
+    return Focus("Overview", np.vstack([view.points[matches], sphere]))
 
 
 def _edges(view: RunView, pairs: np.ndarray) -> Segments:

@@ -17,7 +17,7 @@ from spherloc.geometry import camera_centre, pose
 from spherloc.refine import residuals_px
 from spherloc.trace import Trace
 from spherloc_viz import style
-from spherloc_viz.layers.primitives import Chart, ColorArray, FloatArray, SceneItem, Table
+from spherloc_viz.layers.primitives import Chart, ColorArray, FloatArray, Focus, SceneItem, Table
 
 BoolArray = NDArray[np.bool_]
 T = TypeVar("T")
@@ -52,6 +52,8 @@ class Frame:
     items: tuple[SceneItem, ...] = ()
     """What this stage adds to the canvas."""
     tables: tuple[Table, ...] = ()
+    focus: Focus | None = None
+    """What must be on the screen; None for what ``spherloc_viz.layers.focus`` tells from the above."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,6 +6,7 @@ from spherloc.metrics import evaluate
 from spherloc.trace import Certificate
 from spherloc_viz import style
 from spherloc_viz.layers.certificate import chance, proof, warning
+from spherloc_viz.layers.focus import map_focus
 from spherloc_viz.layers.frame import Frame, Plan, RunView
 from spherloc_viz.layers.scale_bar import angle_text, length_text
 
@@ -27,6 +28,7 @@ def _no_pose(view: RunView) -> Frame:
         view.colors(style.OUTLIER),
         view.nobody(),
         note=remark,
+        focus=map_focus(view, view.standing(np.eye(3))),
     )
 
 

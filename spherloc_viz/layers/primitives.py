@@ -116,6 +116,19 @@ SceneItem = Points | Segments | Balls | Mesh | Textured | Label
 
 
 @dataclass(frozen=True, eq=False)
+class Focus:
+    """What a step is about, and from which side that reads well."""
+
+    view: Literal["Overview", "Sphere", "Balls"]
+    """The direction to look from: that of the view of this name."""
+    points: FloatArray
+    """(K, 3) all that must be on the screen."""
+    clear: FloatArray | None = None
+    """(L, 3) what map points should not hide, where that is not ``points``: steps that share it are seen from the
+    same side."""
+
+
+@dataclass(frozen=True, eq=False)
 class Curve:
     """One line of a chart."""
 
@@ -189,3 +202,4 @@ class Picture:
     scene: tuple[SceneItem, ...]
     charts: tuple[Chart, ...]
     tables: tuple[Table, ...]
+    focus: Focus

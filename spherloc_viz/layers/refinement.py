@@ -9,8 +9,9 @@ from spherloc.metrics import rotation_error_deg, translation_error_m
 from spherloc.trace import RefinementStage
 from spherloc_viz import style
 from spherloc_viz.layers import uncertainty
+from spherloc_viz.layers.focus import sphere_box
 from spherloc_viz.layers.frame import BoolArray, Frame, Plan, RunView, even, length, one_color
-from spherloc_viz.layers.primitives import Chart, Curve, FloatArray, SceneItem, Segments
+from spherloc_viz.layers.primitives import Chart, Curve, FloatArray, Focus, SceneItem, Segments
 from spherloc_viz.layers.scale_bar import angle_text, length_text
 
 MOST_STATES = 20
@@ -155,7 +156,16 @@ def _error(view: RunView, stage: RefinementStage) -> Frame:
         note=uncertainty.tilt(stage),
         located=True,
         tables=(uncertainty.table(stage),),
+        focus=_error_focus(view, state),
     )
+
+
+def _error_focus(view: RunView, state: FloatArray) -> Focus:
+    """What is drawn of the error of the refined pose (3, 4), and the sphere."""
+    frame = Frame("", "", state, view.colors(style.UNDECIDED), view.nobody(), located=True)
+    lines = [item.points for item in uncertainty.error_items(view, frame) if isinstance(item, Segments)]
+    sphere = sphere_box(camera_centre(state), 1.1 * view.sphere_m)
+    return Focus("Sphere", np.vstack([sphere, *(line.reshape(-1, 3) for line in lines)]))
 
 
 def _summary(view: RunView, stage: RefinementStage) -> Frame:

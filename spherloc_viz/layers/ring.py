@@ -9,7 +9,7 @@ from scipy.ndimage import maximum_filter1d
 from spherloc.geometry import wrap_angle, yaw_of
 from spherloc_viz import style
 from spherloc_viz.layers.frame import RunView, one_color
-from spherloc_viz.layers.primitives import ColorArray, Curve, FloatArray, Segments
+from spherloc_viz.layers.primitives import ColorArray, Curve, FloatArray, Label, Segments
 
 FOOT = 2.05
 """Radius at which the outline has the height 0, in sphere radii."""
@@ -75,6 +75,13 @@ def spoke(name: str, view: RunView, centre: FloatArray, yaw_rad: float, color: s
     radii = view.sphere_m * np.array([1.0, FOOT + HEIGHT + 0.15])
     ends = centre + radii[:, None] * directions(np.array([yaw_rad]))
     return Segments(name, "yaw ring", ends[None], one_color(color, 1), 4.0)
+
+
+def name(path: str, view: RunView, yaw_rad: float, words: str) -> Label:
+    """Words outside of the ring at a yaw."""
+    radius_m = view.sphere_m * (FOOT + HEIGHT + 0.15)
+    place = view.middle + radius_m * directions(np.array([yaw_rad]))[0]
+    return Label(path, "yaw ring", place - np.array([0.0, 0.25 * view.sphere_m, 0.0]), words)
 
 
 def step_curve(label: str, counts: np.ndarray) -> Curve:

@@ -5,8 +5,9 @@ import numpy as np
 from spherloc.problem import Problem
 from spherloc_viz import style
 from spherloc_viz.layers import ring
+from spherloc_viz.layers.focus import sphere_box
 from spherloc_viz.layers.frame import Frame, Plan, RunView, one_color
-from spherloc_viz.layers.primitives import SceneItem, Segments
+from spherloc_viz.layers.primitives import Focus, Label, SceneItem, Segments
 
 
 def plans(view: RunView) -> list[Plan]:
@@ -63,7 +64,13 @@ def _bearings(view: RunView) -> Frame:
         view.standing(np.eye(3)),
         view.colors(style.UNDECIDED),
         view.nobody(),
+        items=(_name("sphere", view, "unit sphere: a dot is the direction of a pixel"),),
     )
+
+
+def _name(layer: str, view: RunView, words: str) -> Label:
+    """Words above the sphere."""
+    return Label("sphere/name", layer, view.middle - np.array([0.0, 1.2 * view.sphere_m, 0.0]), words)
 
 
 def example(view: RunView) -> int:
@@ -84,6 +91,7 @@ def _match(view: RunView) -> Frame:
         view.colors(style.UNDECIDED, (mask, style.SAMPLE)),
         mask,
         items=(_ray(view, number),),
+        focus=Focus("Overview", np.vstack([sphere_box(view.middle, view.sphere_m), _ray(view, number).points[0]])),
     )
 
 
@@ -132,7 +140,11 @@ def _unknowns(view: RunView) -> Frame:
         view.standing(np.eye(3)),
         view.colors(style.UNDECIDED),
         view.nobody(),
-        items=(*_upright(view), *_compass(view)),
+        items=(
+            *_upright(view),
+            *_compass(view),
+            _name("yaw ring", view, "yaw ring: every direction in which the camera may look"),
+        ),
     )
 
 

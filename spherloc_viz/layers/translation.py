@@ -8,13 +8,16 @@ from spherloc.geometry import camera_centre
 from spherloc.trace import TranslationStage
 from spherloc_viz import style
 from spherloc_viz.layers.balls import BallSet, IndexArray
+from spherloc_viz.layers.focus import ball_boxes
 from spherloc_viz.layers.frame import Frame, Plan, RunView, growing, length, one_color
-from spherloc_viz.layers.primitives import Balls, FloatArray, Segments
+from spherloc_viz.layers.primitives import Balls, FloatArray, Focus, Label, Segments
 
 SIZES = (3, 10, 30, 100, 300)
-"""How many balls are shown before all are."""
+"""How many balls are shown before all are, in the order of ``BallSet.order``."""
 CLIQUE_SIZES = (3, 10, 30, 100)
 """How many members of the maximum clique are shown before all are."""
+NAME_ROOM = 2.5
+"""Half width of what is framed around one ball and its name, in radii."""
 
 
 def plans(view: RunView, stage: TranslationStage) -> list[Plan]:
@@ -22,7 +25,7 @@ def plans(view: RunView, stage: TranslationStage) -> list[Plan]:
     balls = BallSet(stage)
     out = [Plan("balls-pair", "One pair, one ball", lambda: _pair(view, balls))]
     for size in growing(len(balls), *SIZES):
-        out.append(Plan(f"balls-{size}", f"The {size} smallest balls", partial(_some, view, balls, size)))
+        out.append(Plan(f"balls-{size}", f"{size} balls and their graph", partial(_some, view, balls, size)))
     out.append(Plan("balls", "Balls of camera positions", lambda: _all(view, balls)))
     out.append(Plan("clique-greedy-smallest", "A clique from the smallest ball", lambda: _from_smallest(view, balls)))
     out.append(Plan("clique-greedy-degree", "A clique from the busiest ball", lambda: _from_busiest(view, balls)))
@@ -57,44 +60,57 @@ def _from_truth(view: RunView, position: FloatArray) -> str:
 
 
 def _pair(view: RunView, balls: BallSet) -> Frame:
-    """The smallest ball, and the rays of its pair."""
-    stage, ball = balls.stage, balls.by_radius[:1]
+    """One ball, and the rays of its pair."""
+    stage, ball = balls.stage, np.array([balls.example])
     first, second = (int(number) for number in stage.pairs[ball[0]])
-    centre, mask = stage.centres_m[ball[0]], view.mask(stage.pairs[ball[0]])
+    centre, mask, radius_m = stage.centres_m[ball[0]], view.mask(stage.pairs[ball[0]]), float(stage.radii_m[ball[0]])
     ends = np.stack([view.points[[first, second]], np.tile(centre, (2, 1))], axis=1)
     ids = stage.pairs[ball].astype(np.int64)
     return Frame(
         f"With the yaw known, matches {first} and {second} have rays of known directions, which come nearest to each "
         f"other at {view.place(centre)}{_from_truth(view, centre)}. If both are right, noise can move the camera by "
-        f"{length(float(stage.radii_m[ball[0]]))} from there at most: that is the smallest ball.",
+        f"{length(radius_m)} from there at most: a ball that holds every camera position this pair allows.",
         "H t = b,  |t_k − t| ≤ r_k   (Eq. 24-27)",
         _turned(view, balls),
         view.colors(style.UNDECIDED, (mask, style.SAMPLE)),
         mask,
         note=stage.rule,
         items=(
-            # By a name of its own, so that the view keeps the rays and does not go close to this one ball.
             Balls("balls/one", "balls", centre[None], stage.radii_m[ball], one_color(style.SAMPLE, 1), 0.3, ids=ids),
             Segments("pairs/rays", "pairs", ends, one_color(style.SAMPLE, 2), 2.0),
+            _name(centre, radius_m, "ball: all camera positions that this pair allows"),
         ),
+        focus=Focus("Balls", np.vstack([ball_boxes(centre[None], NAME_ROOM * stage.radii_m[ball]), ends[:, 0]])),
     )
 
 
+def _name(centre: FloatArray, radius_m: float, words: str) -> Label:
+    """Words above a ball."""
+    return Label("balls/name", "balls", centre - np.array([0.0, 1.15 * radius_m, 0.0]), words)
+
+
 def _some(view: RunView, balls: BallSet, size: int) -> Frame:
-    """The smallest balls."""
-    stage, shown, inside = balls.stage, balls.by_radius[:size], np.zeros(len(balls), dtype=bool)
-    mask = balls.mask(shown)
+    """The first balls."""
+    stage, inside = balls.stage, np.zeros(len(balls), dtype=bool)
+    mask = balls.mask(balls.order[:size])
+    shown = balls.by_radius[mask[balls.by_radius]]
     edges, possible = len(balls.edges_within(mask)), size * (size - 1) // 2
+    low, high = (length(float(stage.radii_m[ball])) for ball in shown[[0, -1]])
+    items = balls.items(view, shown, inside)
+    if size == SIZES[0] and edges:
+        middle = np.mean(stage.centres_m[balls.edges_within(mask)[0]], axis=0)
+        items += (_name(middle, float(stage.radii_m[shown[-1]]), "edge: these two balls overlap"),)
     return Frame(
-        f"The {size} smallest of {len(balls):,} balls reach {length(float(stage.radii_m[shown[-1]]))}, and {edges:,} "
-        f"of their {possible:,} pairs overlap. An overlap means that one position of the camera can suit both pairs of "
-        "matches.",
+        f"{size} of {len(balls):,} balls, with radii from {low} to {high}; {edges:,} of their {possible:,} pairs "
+        "overlap. An overlap means that one position of the camera can suit both pairs of matches, and makes an edge "
+        "of the graph.",
         "‖t_k1 − t_k2‖ ≤ r_k1 + r_k2   (Eq. 38)",
         _turned(view, balls),
         view.colors(style.UNDECIDED, (view.mask(stage.pairs[shown]), style.CLIQUE)),
         view.nobody(),
-        note=_note(balls, shown, inside),
-        items=balls.items(view, shown, inside),
+        note=f"Smaller balls come first, spread evenly over them. {_note(balls, shown, inside)}",
+        items=items,
+        focus=balls.focus(shown),
     )
 
 
@@ -109,6 +125,7 @@ def _all(view: RunView, balls: BallSet) -> Frame:
         view.nobody(),
         note=_note(balls, balls.by_radius, inside),
         items=balls.items(view, balls.by_radius, inside),
+        focus=balls.focus(balls.by_radius),
     )
 
 
@@ -137,6 +154,7 @@ def _greedy(view: RunView, balls: BallSet, found: IndexArray, first: str, then: 
         view.nobody(),
         note=_note(balls, balls.by_radius, inside),
         items=balls.items(view, balls.by_radius, inside, style.SAMPLE),
+        focus=balls.focus(found),
     )
 
 
@@ -156,6 +174,7 @@ def _members(view: RunView, balls: BallSet, size: int) -> Frame:
         view.nobody(),
         note=_note(balls, balls.by_radius, inside),
         items=balls.items(view, balls.by_radius, inside),
+        focus=balls.focus(chosen),
     )
 
 
@@ -173,5 +192,14 @@ def _clique(view: RunView, balls: BallSet) -> Frame:
         note=_note(balls, balls.by_radius, balls.in_clique),
         located=True,
         sphere_aside=True,
-        items=balls.items(view, balls.by_radius, balls.in_clique),
+        items=(*balls.items(view, balls.by_radius, balls.in_clique), _clique_name(balls)),
+        focus=balls.focus(balls.members),
     )
+
+
+def _clique_name(balls: BallSet) -> Label:
+    """Words above the clique."""
+    points = balls.focus(balls.members).points
+    place = np.mean(points, axis=0)
+    place[1] = np.min(points[:, 1])
+    return Label("balls/name", "balls", place, "maximum clique: most balls that all overlap each other")

@@ -9,6 +9,7 @@ from spherloc.geometry import wrap_angle, yaw_rotation
 from spherloc_viz import style
 from spherloc_viz.layers import ring
 from spherloc_viz.layers.arcs import Arcs
+from spherloc_viz.layers.focus import ring_focus
 from spherloc_viz.layers.frame import Frame, RunView, one_color
 from spherloc_viz.layers.primitives import Chart, FloatArray, SceneItem, Segments
 
@@ -62,7 +63,13 @@ def pair(view: RunView, arcs: Arcs) -> Frame:
         f"{d1:.3g} cos θ {_signed(d2)} sin θ {_signed(d3)} = 0   (Eq. 22)",
         *_shown(view, (first, second), 0.5 * float(stage.lo_rad[k] + stage.hi_rad[k])),
         note=stage.rule,
-        items=_items(view, arcs, np.array([k]), (first, second)),
+        items=(
+            *_items(view, arcs, np.array([k]), (first, second)),
+            ring.name(
+                "ring/name", view, 0.5 * float(stage.lo_rad[k] + stage.hi_rad[k]), "arc: the yaws this pair allows"
+            ),
+        ),
+        focus=ring_focus(view, view.points[[first, second]]),
     )
 
 
@@ -81,6 +88,7 @@ def twins(view: RunView, arcs: Arcs) -> Frame:
         *_shown(view, (first, second), 0.5 * float(stage.lo_rad[other] + stage.hi_rad[other])),
         note=stage.rule,
         items=_items(view, arcs, example, (first, second)),
+        focus=ring_focus(view, view.points[[first, second]]),
     )
 
 

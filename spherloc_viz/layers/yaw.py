@@ -142,7 +142,12 @@ def _clique(view: RunView, arcs: Arcs) -> Frame:
         view.colors(style.UNDECIDED, (view.mask(stage.pairs[stage.clique]), style.CLIQUE)),
         view.nobody(),
         note=note,
-        items=(*items, ring.spoke("ring/estimate", view, view.middle, stage.yaw_rad, style.ESTIMATE)),
+        items=(
+            *items,
+            ring.spoke("ring/estimate", view, view.middle, stage.yaw_rad, style.ESTIMATE),
+            ring.name("ring/name", view, stage.yaw_rad, "maximum clique: most arcs over one yaw"),
+            ring.name("ring/ring", view, stage.yaw_rad + np.pi, "yaw ring"),
+        ),
     )
 
 

@@ -69,7 +69,10 @@ def _bound(view: RunView, stage: ConsensusStage) -> Frame:
         view.colors(style.UNDECIDED),
         view.nobody(),
         note=_effort(stage),
-        items=_ring(view, stage),
+        items=(
+            *_ring(view, stage),
+            ring.name("ring/name", view, stage.yaw_rad + np.pi, "bound: most matches at each yaw"),
+        ),
     )
 
 

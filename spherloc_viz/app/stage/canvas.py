@@ -16,6 +16,8 @@ from spherloc_viz.layers.primitives import Picture
 FIRST_CHECKS, MOST_CHECKS, CHECK_S = 8, 40, 0.4
 """A page that is still building itself drops its first view and reports that its viewer has not moved; a slow one for
 many checks."""
+RESHAPED = 0.02
+"""From this change of the canvas' width over height on, as a share, its view is fitted anew."""
 
 
 class Canvas:
@@ -38,12 +40,16 @@ class Canvas:
         self._painter = Painter(client, picked)
         self._camera = TrueCamera(client, moved)
         self._docked_px, self._full_width = docked_px, client.camera.image_width
-        self._viewed: tuple[str, str, str] | None = None
+        self._step: tuple[str, str] | None = None
+        self._followed: views.View | None = None
+        """The view that showed the subject of the last step that moved the viewer."""
+        self._looked: tuple[str | None, views.View, float] | None = None
+        """The last view that was taken: its name, or None for that of the step, and for which canvas."""
         self._scene: str | None = None
         self._checks, self._movable = 0, False
         self._lock = threading.Lock()
         self._picture: Picture | None = None
-        client.camera.on_update(lambda camera: self._make_room())
+        client.camera.on_update(lambda camera: self._follow_page())
 
     def draw(self, run: Run, picture: Picture, mesh: bytes | None, movable: bool) -> None:
         """Show a picture of a run; ``mesh`` is the map's, and ``movable`` whether the true camera may be dragged."""
@@ -77,7 +83,7 @@ class Canvas:
     def check(self) -> float | None:
         """Seconds to the next look at whether the page dropped its first view; None once it has had time enough."""
         self._checks += 1
-        most = MOST_CHECKS if views.is_unmoved(self._client) else FIRST_CHECKS
+        most = MOST_CHECKS if views.stands_at(self._client, views.START) else FIRST_CHECKS
         return CHECK_S if self._checks <= most else None
 
     def _move_viewer(self, run: Run, picture: Picture) -> None:
@@ -85,24 +91,62 @@ class Canvas:
 
         There too if another scene has been opened, since nothing of it may be in sight.
         """
-        wanted = self._display.take_view()
-        name, subject = views.fitting(picture)
-        fitting = (run.trace.problem.name, name, subject)
-        follows = self._display.follow and fitting != self._viewed
-        scene = run.wish.scene.scene
-        elsewhere = self._scene not in (None, scene)
-        if wanted is None and (views.is_unmoved(self._client) or follows or elsewhere):
-            wanted = name
-        self._viewed, self._scene = fitting, scene
+        wanted, step, scene = (
+            self._display.take_view(),
+            (run.trace.problem.name, picture.step.key),
+            run.wish.scene.scene,
+        )
+        other_step, elsewhere = step != self._step, self._scene not in (None, scene)
+        self._step, self._scene = step, scene
         if wanted is not None:
-            views.look(self._client, views.find(wanted, picture, self._aspect()))
+            self._look(wanted, picture)
+        elif elsewhere or views.stands_at(self._client, views.START):
+            self._look(None, picture)
+        elif self._display.follow and (other_step or self._untouched()):
+            self._follow_step(picture, other_step)
+
+    def _follow_step(self, picture: Picture, other_step: bool) -> None:
+        """Go to the step's view unless the viewer is there, or, at the same step, sees its subject well enough."""
+        aspect = self._aspect()
+        if other_step:
+            view = views.follow(picture, aspect)
+            if self._followed is None or not views.same(view, self._followed):
+                self._take(None, view, aspect)
+        elif self._looked is not None and not views.shows(self._looked[1], picture.focus.points, aspect):
+            self._look(None, picture)
+
+    def _look(self, name: str | None, picture: Picture) -> None:
+        """Take the view of that name, or the one of the step."""
+        aspect = self._aspect()
+        self._take(name, views.follow(picture, aspect) if name is None else views.find(name, picture, aspect), aspect)
+
+    def _take(self, name: str | None, view: views.View, aspect: float) -> None:
+        if name is None:
+            self._followed = view
+        self._looked = name, view, aspect
+        views.look(self._client, view)
+
+    def _untouched(self) -> bool:
+        """Whether the viewer still stands where it was put."""
+        return self._looked is not None and views.stands_at(self._client, self._looked[1])
+
+    def _follow_page(self) -> None:
+        """The page's viewer has moved, or its canvas has another shape; on threads of viser's."""
+        self._make_room()
+        looked, picture = self._looked, self._picture
+        if looked is None or picture is None:
+            return
+        if abs(np.log(self._aspect() / looked[2])) > RESHAPED and self._untouched():
+            with self._lock:
+                self._look(looked[0], picture)
 
     def _aspect(self) -> float:
         """Width over height of the canvas."""
         camera = self._client.camera
         # The page tells its size before it docks the panels, and again some frames later.
-        docked = self._docked_px if camera.image_width == self._full_width else 0
-        return max(0.3, (camera.image_width - docked) / max(1, camera.image_height))
+        if camera.image_width != self._full_width:
+            self._docked_px = 0
+        return max(0.3, (camera.image_width - self._docked_px) / max(1, camera.image_height))
 
 
 def panel_widths_px(window_px: int) -> tuple[int, int]:

@@ -6,6 +6,7 @@ import numpy as np
 import viser
 
 from spherloc.geometry import yaw_rotation
+from spherloc_viz.layers.focus import RING_ROOM, SPHERE_ROOM, ball_boxes, circle, dense_points, sphere_box
 from spherloc_viz.layers.primitives import Balls, FloatArray, Mesh, Picture, Points, SceneItem, Segments, Textured
 
 FIELD_OF_VIEW_RAD = np.radians(45.0)
@@ -18,10 +19,10 @@ MARGINS = np.array([0.13, 0.06])
 """Shares of the canvas' half width and half height that stay free on every side: labels are wide."""
 ROUNDS = 4
 """Perspective shifts the middle of what is seen, so the target is moved there a few times."""
-ROOM = 1.35
-"""Radius of what the view of the sphere holds, in sphere radii."""
-RING = 3.0
-"""Radius of the yaw ring with its outline, in sphere radii."""
+STILL = 1e-3
+"""Views whose places differ by less, as a share of their distance to what they show, are the same."""
+LEAST_SHARE = 0.5
+"""A subject that covers less of the canvas' width and height is shown small."""
 DIRECTIONS = {
     "Overview": (0.55, -0.6, -0.75),
     "Above": (0.0, -1.0, -0.02),
@@ -36,16 +37,6 @@ TURNING = 0.02
 """How far before the eye of who stands in the camera the point lies around which the mouse turns, in sphere radii."""
 CLOSE = 0.15
 """Who is this close to a camera's centre stands in it, in sphere radii."""
-SUBJECTS = (
-    ("Balls", "balls/clique"),
-    ("Balls", "balls/others"),
-    ("Overview", "pairs/clique"),
-    ("Sphere", "ring/arcs"),
-    ("Sphere", "ring/bound"),
-    ("Overview", "rays"),
-    ("Sphere", "sphere/surface"),
-)
-"""What a step is about: the first of these primitives that it draws, and the view that shows it."""
 TURNS_RAD = np.radians([0, 30, -30, 60, -60, 90, -90, 120, -120, 150, -150, 180])
 """Turns of a view about the vertical, the least first."""
 
@@ -59,9 +50,19 @@ class View:
     field_of_view_rad: float = FIELD_OF_VIEW_RAD
 
 
-def is_unmoved(client: viser.ClientHandle) -> bool:
-    """Whether the page says that its viewer still stands where it started."""
-    return bool(np.allclose(client.camera.position, START))
+def stands_at(client: viser.ClientHandle, place: View | tuple[float, float, float]) -> bool:
+    """Whether the page says that its viewer stands in a view, or at a place, as far as it tells numbers."""
+    camera = client.camera
+    if not isinstance(place, View):
+        return bool(np.allclose(camera.position, place))
+    return same(View(np.array(camera.position), np.array(camera.look_at), place.field_of_view_rad), place)
+
+
+def same(view: View, other: View) -> bool:
+    """Whether two views show the same."""
+    near = STILL * float(np.linalg.norm(other.target - other.position))
+    places = np.stack([view.position - other.position, view.target - other.target])
+    return bool(np.all(np.linalg.norm(places, axis=1) <= near)) and view.field_of_view_rad == other.field_of_view_rad
 
 
 def look(client: viser.ClientHandle, view: View) -> None:
@@ -74,13 +75,30 @@ def look(client: viser.ClientHandle, view: View) -> None:
         camera.look_at = view.target
 
 
-def fitting(picture: Picture) -> tuple[str, str]:
-    """The name of the view that shows what this step is about, and the primitive that it is about."""
-    drawn = {item.name: item for item in picture.scene if not isinstance(item, Segments) or len(item.points)}
-    for name, subject in SUBJECTS:
-        if subject in drawn:
-            return name, subject
-    return "Overview", "map/points"
+def follow(picture: Picture, aspect: float) -> View:
+    """The view that shows what the step is about, on a canvas of that width over height."""
+    focus = picture.focus
+    route = [item.positions for item in picture.scene if isinstance(item, Points) and item.layer == "trajectory"]
+    subject = np.vstack([focus.points, *route]) if focus.view == "Overview" else focus.points
+    return _clear(focus.view, picture, subject, subject if focus.clear is None else focus.clear, aspect)
+
+
+def shows(view: View, subject: FloatArray, aspect: float) -> bool:
+    """Whether a view holds a subject (K, 3) and does not show it small."""
+    seen = projected(view, subject) / (np.tan(view.field_of_view_rad / 2) * np.array([aspect, 1.0]))
+    reach = float(np.max(np.max(seen, axis=0) - np.min(seen, axis=0))) / 2
+    return bool(np.all(np.abs(seen) <= 1.0)) and reach >= LEAST_SHARE
+
+
+def projected(view: View, positions: FloatArray) -> FloatArray:
+    """Where positions (K, 3) are seen (K, 2), right and up, as slopes; infinite behind the viewer."""
+    backward, sideways = _axes(view.position - view.target)
+    offset = positions - view.position
+    depth = -(offset @ backward)
+    slopes = np.full((len(positions), 2), np.inf)
+    ahead = depth > 0
+    slopes[ahead] = (offset @ sideways)[ahead] / depth[ahead, None]
+    return slopes
 
 
 def before_the_eyes(picture: Picture, position: FloatArray) -> frozenset[str]:
@@ -111,12 +129,17 @@ def find(name: str, picture: Picture, aspect: float) -> View:
     if name == INSIDE:
         return _inside(picture)
     subject = _subject(name, picture)
-    turns = TURNS_RAD if name in ("Sphere", "Balls") else TURNS_RAD[:1]
-    directions = [yaw_rotation(turn) @ np.array(DIRECTIONS[name]) for turn in turns]
-    views = [_fit(subject, direction, aspect) for direction in directions]
+    return _clear(name, picture, subject, subject, aspect)
+
+
+def _clear(name: str, picture: Picture, subject: FloatArray, clear: FloatArray, aspect: float) -> View:
+    """A view of a subject (K, 3) from the side of a named view, turned so that few map points hide ``clear`` (L, 3)."""
+    if name not in ("Sphere", "Balls"):
+        return _fit(subject, np.array(DIRECTIONS[name]), aspect)
+    directions = [yaw_rotation(turn) @ np.array(DIRECTIONS[name]) for turn in TURNS_RAD]
     points = next(item for item in picture.scene if isinstance(item, Points) and item.name == "map/points")
-    hidden = [_in_the_way(view, points.positions) + 0.5 * k for k, view in enumerate(views)]
-    return views[int(np.argmin(hidden))]
+    hidden = [_in_the_way(_fit(clear, one, aspect), points.positions) + 0.5 * k for k, one in enumerate(directions)]
+    return _fit(subject, directions[int(np.argmin(hidden))], aspect)
 
 
 def _inside(picture: Picture) -> View:
@@ -145,19 +168,30 @@ def _axis(items: dict[str, SceneItem]) -> FloatArray:
 
 def _fit(subject: FloatArray, direction: FloatArray, aspect: float) -> View:
     """The nearest place in that direction from which the canvas holds all of the subject (K, 3)."""
-    backward = direction / np.linalg.norm(direction)
-    right = np.cross(UP, backward)
-    right /= np.linalg.norm(right)
-    sideways = np.column_stack([right, np.cross(backward, right)])
+    backward, sideways = _axes(direction)
     slopes = np.tan(FIELD_OF_VIEW_RAD / 2) * (1.0 - MARGINS) * np.array([aspect, 1.0])
-    target, distance = (np.min(subject, axis=0) + np.max(subject, axis=0)) / 2, 1.0
+    target = (np.min(subject, axis=0) + np.max(subject, axis=0)) / 2
     for _ in range(ROUNDS):
         offset = subject - target
         depth, across = offset @ backward, offset @ sideways
-        distance = max(1e-3, float(np.max(np.max(np.abs(across) / slopes, axis=1) + depth)))
+        distance = _least_distance(across, depth, slopes)
         seen = across / np.maximum(distance - depth, 1e-3)[:, None]
         target = target + distance * sideways @ ((np.min(seen, axis=0) + np.max(seen, axis=0)) / 2)
-    return View(target + distance * backward, target)
+    offset = subject - target
+    return View(target + _least_distance(offset @ sideways, offset @ backward, slopes) * backward, target)
+
+
+def _least_distance(across: FloatArray, depth: FloatArray, slopes: FloatArray) -> float:
+    """From how far points (K, 2) across and (K,) nearer than the target are all seen within the slopes (2,)."""
+    return max(1e-3, float(np.max(np.max(np.abs(across) / slopes, axis=1) + depth)))
+
+
+def _axes(direction: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Unit vectors towards a viewer in that direction (3,), and to the viewer's right and up (3, 2)."""
+    backward = direction / np.linalg.norm(direction)
+    right = np.cross(UP, backward)
+    right /= np.linalg.norm(right)
+    return backward, np.column_stack([right, np.cross(backward, right)])
 
 
 def _in_the_way(view: View, positions: FloatArray) -> float:
@@ -180,7 +214,7 @@ def _subject(name: str, picture: Picture) -> FloatArray:
         for key in ("balls/clique", "balls/others"):
             balls = items.get(key)
             if isinstance(balls, Balls):
-                return _balls(balls)
+                return ball_boxes(balls.centers, balls.radii_m)
     points, surface = items["map/points"], items["sphere/surface"]
     assert isinstance(points, Points) and isinstance(surface, Mesh)
     lines = [
@@ -189,37 +223,16 @@ def _subject(name: str, picture: Picture) -> FloatArray:
         if isinstance(item, Segments) and item.layer in ("cameras", "scale bar")
     ]
     route = [item.positions for item in picture.scene if isinstance(item, Points) and item.layer == "trajectory"]
-    return np.vstack([_dense(points.positions), surface.vertices, *lines, *route])
+    return np.vstack([dense_points(points.positions), surface.vertices, *lines, *route])
 
 
 def _sphere(surface: object, ring: bool) -> FloatArray:
     """The sphere with some room, or the ring around it."""
     assert isinstance(surface, Mesh)
     centre = _centre(surface)
-    if not ring:
-        return centre + ROOM * (surface.vertices - centre)
-    angle = np.linspace(0, 2 * np.pi, 36)
-    circle = np.column_stack([np.cos(angle), 0 * angle, np.sin(angle)])
-    return centre + RING * np.max(surface.vertices[:, 0] - centre[0]) * circle
+    radius_m = float(np.max(surface.vertices[:, 0] - centre[0]))
+    return circle(centre, RING_ROOM * radius_m) if ring else sphere_box(centre, SPHERE_ROOM * radius_m)
 
 
 def _centre(surface: Mesh) -> FloatArray:
     return (np.min(surface.vertices, axis=0) + np.max(surface.vertices, axis=0)) / 2
-
-
-def _balls(balls: Balls) -> FloatArray:
-    """Boxes around the denser half of the balls, and as much again around these.
-
-    These are the balls nearest to the median of the smaller half.
-    """
-    small = np.argsort(balls.radii_m)[: max(1, len(balls.radii_m) // 2)]
-    away = np.linalg.norm(balls.centers - np.median(balls.centers[small], axis=0), axis=1)
-    near = np.argsort(away)[: max(1, len(away) // 2)]
-    reach = 2.0 * balls.radii_m[near, None]
-    return np.vstack([balls.centers[near] - reach, balls.centers[near] + reach])
-
-
-def _dense(positions: FloatArray) -> FloatArray:
-    """Without stray points, which would make all others small."""
-    away = np.linalg.norm(positions - np.median(positions, axis=0), axis=1)
-    return positions[away <= 4.0 * np.median(away)]

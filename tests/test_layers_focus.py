@@ -1,0 +1,146 @@
+"""Every step shows what its caption speaks of: on the screen, and at a size that can be read."""
+
+import re
+
+import numpy as np
+import pytest
+from recording_samples import scene_problem
+
+from spherloc.estimators import estimate
+from spherloc.geometry import camera_centre
+from spherloc.registry import names
+from spherloc.trace import Trace
+from spherloc_viz.app.stage import views
+from spherloc_viz.layers import paint, steps
+from spherloc_viz.layers.primitives import Balls, FloatArray, Label, Picture, Points, Segments
+
+ASPECTS = (0.83, 1.2)
+"""Width over height of the canvas of a page of 1366 x 768 and 1920 x 1080."""
+
+ABOUT: tuple[tuple[str, tuple[str, ...], float], ...] = (
+    # (steps, what their captions speak of, the least share of the screen's width or height that it covers)
+    (r"problem|sample-\d+|samples-drawn|consensus-poses?.*|refinement-(\d+|inliers|outliers)|refinement|outcome",
+     ("map/points",), 0.5),
+    (r"bearings|gravity|decision|samples-needed|consensus-guess", ("sphere/bearings",), 0.5),
+    (r"match", ("pairs/ray", "sphere/bearings"), 0.5),
+    (r"unknowns", ("ring/circle",), 0.5),
+    (r"yaw-pair|yaw-twins", ("ring/hand", "ring/overlap", "pairs/sample"), 0.5),
+    (r"yaw-arcs.*|yaw-hand-.*|yaw-clique", ("ring/arcs", "ring/overlap"), 0.5),
+    (r"consensus-bound|consensus-yaw-.*", ("ring/bound", "ring/bars"), 0.5),
+    (r"consensus-clique.*", ("pairs/clique",), 0.4),
+    (r"balls-pair", ("pairs/rays", "balls/one"), 0.5),
+    (r"balls.*", ("balls/others",), 0.5),
+    (r"clique.*", ("balls/clique",), 0.5),
+    (r"sample-\d+-pose", ("cameras/estimate",), 0.05),
+    (r"refinement-error", ("uncertainty/ellipsoid", "uncertainty/angle"), 0.4),
+)  # fmt: skip
+BALL_SHARE = 0.04
+"""A ball that can be read covers this share of the canvas' height."""
+
+
+@pytest.fixture(scope="module", params=names("estimators"))
+def trace(request: pytest.FixtureRequest) -> Trace:
+    return estimate(scene_problem("mei_outliers_80"), request.param)
+
+
+def about(key: str) -> tuple[tuple[str, ...], float]:
+    return next((items, share) for keys, items, share in ABOUT if re.fullmatch(keys, key))
+
+
+def ends(picture: Picture, name: str) -> FloatArray:
+    """Places (K, 3) of a picture's item; of balls, those of their denser half, which are framed, and their reach."""
+    item = next(item for item in picture.scene if item.name == name)
+    match item:
+        case Points():
+            return item.positions
+        case Segments():
+            return item.points.reshape(-1, 3)
+        case Balls():
+            return item.centers
+    raise AssertionError(name)
+
+
+def on_screen(view: views.View, places: FloatArray, aspect: float) -> FloatArray:
+    """Where places are seen: (K, 2), -1 to 1 within the canvas."""
+    return views.projected(view, places) / (np.tan(view.field_of_view_rad / 2) * np.array([aspect, 1.0]))
+
+
+def is_on(seen: FloatArray) -> np.ndarray:
+    return np.all(np.abs(seen) <= 1.0, axis=1)
+
+
+@pytest.mark.parametrize("aspect", ASPECTS)
+def test_every_step_shows_what_it_is_about(trace: Trace, aspect: float) -> None:
+    for index, stop in enumerate(steps(trace)):
+        picture = paint(trace, index)
+        view = views.follow(picture, aspect)
+        framed = on_screen(view, picture.focus.points, aspect)
+        assert is_on(framed).all(), f"{stop.key}: its focus is on the screen"
+        assert np.ptp(framed, axis=0).max() >= 1.0, f"{stop.key}: its focus covers half of the screen"
+        assert views.shows(view, picture.focus.points, aspect)
+        items, share = about(stop.key)
+        drawn = {item.name for item in picture.scene} & set(items)
+        assert drawn, stop.key
+        seen = np.vstack([on_screen(view, ends(picture, name), aspect) for name in sorted(drawn)])
+        on = is_on(seen)
+        assert np.mean(on) >= (0.5 if "balls" in items[0] else 0.85), f"{stop.key}: {items} are on the screen"
+        assert np.ptp(seen[on], axis=0).max() / 2 >= share or "balls" in items[0], f"{stop.key}: {items} can be seen"
+
+
+@pytest.mark.parametrize("aspect", ASPECTS)
+def test_balls_are_large_enough_to_be_seen(aspect: float) -> None:
+    """Also the first few, and whatever was looked at before."""
+    trace = estimate(scene_problem("mei_outliers_80"), "mc")
+    for index, stop in enumerate(steps(trace)):
+        picture = paint(trace, index)
+        balls = [item for item in picture.scene if isinstance(item, Balls)]
+        if not balls:
+            continue
+        view = views.follow(picture, aspect)
+        shown = balls[-1]
+        depth = np.linalg.norm(shown.centers - view.position, axis=1)
+        heights = shown.radii_m / depth / np.tan(view.field_of_view_rad / 2)
+        seen = is_on(on_screen(view, shown.centers, aspect))
+        assert seen.any() and np.median(heights[seen]) >= BALL_SHARE, f"{stop.key}: {np.median(heights[seen]):.3f}"
+        if (size := re.fullmatch(r"balls-(\d+)", stop.key)) and int(size[1]) <= 3:
+            assert seen.all() and len(seen) == int(size[1])
+
+
+def test_steps_about_one_thing_are_seen_from_one_side(trace: Trace) -> None:
+    """So that what grows from step to step does not turn as well."""
+    sides: dict[str, list[FloatArray]] = {}
+    for index, stop in enumerate(steps(trace)):
+        view = views.follow(paint(trace, index), ASPECTS[0])
+        kind = next((kind for kind in ("yaw-arcs", "yaw-hand", "balls-", "clique") if stop.key.startswith(kind)), None)
+        if kind is not None and stop.key != "balls-pair":
+            away = view.position - view.target
+            sides.setdefault(kind, []).append(away / np.linalg.norm(away))
+    for kind, found in sides.items():
+        assert all(np.allclose(side, found[0], atol=1e-6) for side in found), kind
+
+
+def test_new_things_are_named_in_the_canvas_where_they_first_appear() -> None:
+    trace = estimate(scene_problem("mei_outliers_80"), "mc")
+    words = ("unit sphere", "yaw ring", "arc:", "ball:", "edge", "clique")
+    named: dict[str, str] = {}
+    for index, stop in enumerate(steps(trace)):
+        picture = paint(trace, index)
+        for label in (item for item in picture.scene if isinstance(item, Label)):
+            for word in words:
+                if word in label.text:
+                    named.setdefault(word, stop.key)
+            if label.name.endswith("/name"):
+                place = on_screen(views.follow(picture, ASPECTS[0]), label.position[None], ASPECTS[0])
+                assert is_on(place).all(), f"{stop.key}: {label.text}"
+    assert named == {
+        "unit sphere": "bearings", "yaw ring": "unknowns", "arc:": "yaw-pair", "ball:": "balls-pair",
+        "edge": "balls-3", "clique": "yaw-clique",
+    }  # fmt: skip
+
+
+def test_an_estimate_far_away_is_on_the_screen_too(trace: Trace) -> None:
+    if trace.cam_from_map is None:
+        return
+    picture = paint(trace, len(steps(trace)) - 1)
+    centre = camera_centre(trace.problem.aligned.align_pose(trace.cam_from_map))
+    assert is_on(on_screen(views.follow(picture, 1.0), centre[None], 1.0)).all()
