@@ -40,6 +40,7 @@ def painted_frames(address: str, moves: int) -> np.ndarray:
         raise SystemExit("no Chromium found; install one or set SPHERLOC_CHROMIUM to its path.")
     with sync_playwright() as playwright, playwright.chromium.launch(executable_path=path, args=FLAGS) as browser:
         page = browser.new_page(viewport={"width": 1280, "height": 720})
+        page.add_init_script("localStorage.setItem('spherloc-introduction', 'seen')")
         page.add_init_script(STUB)
         page.goto(address)
         page.get_by_text("success", exact=True).or_(page.get_by_text("failure", exact=True)).first.wait_for()

@@ -230,6 +230,7 @@ def main() -> None:
                         if chosen:
                             browser = playwright.chromium.launch(executable_path=path, args=FLAGS)
                             page = browser.new_page(viewport={"width": size[0], "height": size[1]})
+                            page.add_init_script("localStorage.setItem('spherloc-introduction', 'seen')")
                             page.set_default_timeout(PATIENCE_MS)
                             take(page, address, theme == "dark")
                             for name, view in chosen.items():

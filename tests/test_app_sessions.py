@@ -74,7 +74,10 @@ class House:
         self.pages.append(Page(self.server.get_port(), KEY))
         until(lambda: len(self.notes.traces) > recorded)
         (number,) = set(self.sessions._open) - known
-        return self.pages[-1], self.sessions._open[number]
+        session = self.sessions._open[number]
+        session._face.story.steps.go("outcome")
+        until(lambda: session._face.story.steps._choice.value.endswith("Outcome"))
+        return self.pages[-1], session
 
     def close(self) -> None:
         for page in self.pages:

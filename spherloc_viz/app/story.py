@@ -7,6 +7,8 @@ import viser
 from numpy.typing import NDArray
 
 from spherloc_viz.app.controls.steps_panel import StepsPanel
+from spherloc_viz.app.glossary import Glossary
+from spherloc_viz.app.introduction import introduction_html
 from spherloc_viz.app.matches.image_panel import ImagePanel
 from spherloc_viz.app.matches.match_table import MatchTable
 from spherloc_viz.app.plots.charts import ChartPanel
@@ -15,6 +17,7 @@ from spherloc_viz.app.plots.yaw_view import YawView
 from spherloc_viz.app.text import legend_html, summary_html, table_html
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.wish import Run
+from spherloc_viz.layers import steps
 from spherloc_viz.layers.primitives import Picture, Table
 
 
@@ -38,6 +41,8 @@ class Story:
             self._diagnosis = gui.add_html("")
             gui.add_html(legend_html())
             self._outcome = gui.add_html("")
+            self._introduction = gui.add_html("")
+        Glossary(gui, touches)
         self._seen, self._changed = frozenset({"Yaw"}), changed
         touches.on("views", self._see)
         with _view(gui, views, "Yaw"):
@@ -73,6 +78,8 @@ class Story:
         for widget, html in ((self._summary, summary_html(run.trace)), (self._outcome, table_html(outcome))):
             if widget.content != html:
                 widget.content = html
+        if not self._introduction.content:
+            self._introduction.content = introduction_html(steps(run.trace))
 
     def _see(self, touch: Touch) -> None:
         """Other tabs are open now."""

@@ -1,5 +1,6 @@
 """Text and tables as HTML. viser puts HTML into the page as it is, so every string is escaped here."""
 
+from collections.abc import Callable
 from html import escape
 
 import numpy as np
@@ -25,11 +26,11 @@ def box(content: str, css: str = "") -> str:
     return f'<div class="words" style="padding:0 .8em .6em;font-size:13px;line-height:1.4;{css}">{content}</div>'
 
 
-def step_html(step: Step) -> str:
-    """Title, caption, equation and note of a step."""
+def step_html(step: Step, caption_html: Callable[[str], str] = escape) -> str:
+    """Title, caption, equation and note of a step; ``caption_html`` makes HTML of the words of the caption."""
     parts = [
         f'<div style="font-size:15px;font-weight:600;padding-bottom:.25em">{escape(step.title)}</div>',
-        f"<div>{escape(step.caption)}</div>",
+        f"<div>{caption_html(step.caption)}</div>",
     ]
     if step.equation:
         face = "font-family:Cambria,Georgia,serif;font-style:italic;font-size:14px"

@@ -56,15 +56,16 @@ class BallSet:
         return int(self.order[0])
 
     def focus(self, shown: IndexArray) -> Focus:
-        """These balls, or the denser half of many, from the side from which most of the clique is seen."""
-        stage = self.stage
-        points = ball_boxes(stage.centres_m[shown], stage.radii_m[shown])
-        return Focus("Balls", points, self._clique_box)
+        """These balls, the smallest first, as far as they are drawn, or the denser half of many, from the side from
+        which most of the clique is seen."""
+        drawn = self.drawn(shown, self.mask(shown))
+        return Focus("Balls", ball_boxes(self.stage.centres_m[drawn], self.stage.radii_m[drawn]), self._clique_box)
 
     @cached_property
     def _clique_box(self) -> FloatArray:
         members = self.members if len(self.members) else self.by_radius
-        return ball_boxes(self.stage.centres_m[members], self.stage.radii_m[members])
+        drawn = self.drawn(members, self.mask(members))
+        return ball_boxes(self.stage.centres_m[drawn], self.stage.radii_m[drawn])
 
     @cached_property
     def in_clique(self) -> NDArray[np.bool_]:

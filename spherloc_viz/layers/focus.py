@@ -83,7 +83,6 @@ def ball_boxes(centers: FloatArray, radii_m: FloatArray) -> FloatArray:
         small = np.argsort(radii_m, kind="stable")[: max(1, len(radii_m) // 2)]
         away = np.linalg.norm(centers - np.median(centers[small], axis=0), axis=1)
         near = np.argsort(away, kind="stable")[: max(FEW_BALLS, len(away) // 2)]
-        near = near[np.argsort(radii_m[near], kind="stable")][: max(FEW_BALLS, 3 * len(near) // 4)]
     else:
         near = np.arange(len(radii_m))
     reach = radii_m[near, None]

@@ -154,7 +154,7 @@ def _greedy(view: RunView, balls: BallSet, found: IndexArray, first: str, then: 
         view.nobody(),
         note=_note(balls, balls.by_radius, inside),
         items=balls.items(view, balls.by_radius, inside, style.SAMPLE),
-        focus=balls.focus(found),
+        focus=balls.focus(balls.by_radius[inside[balls.by_radius]]),
     )
 
 

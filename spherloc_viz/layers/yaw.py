@@ -145,7 +145,7 @@ def _clique(view: RunView, arcs: Arcs) -> Frame:
         items=(
             *items,
             ring.spoke("ring/estimate", view, view.middle, stage.yaw_rad, style.ESTIMATE),
-            ring.name("ring/name", view, stage.yaw_rad, "maximum clique: most arcs over one yaw"),
+            ring.name("ring/name", view, stage.yaw_rad, "maximum clique: these arcs overlap"),
             ring.name("ring/ring", view, stage.yaw_rad + np.pi, "yaw ring"),
         ),
     )

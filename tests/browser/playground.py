@@ -64,6 +64,8 @@ ASIDE = """addEventListener("DOMContentLoaded", () => {
     document.head.append(look);
 })"""
 """Has clicks go through notes, of which viser's about drawing in software lies over a panel until it is closed."""
+KNOWN = "localStorage.setItem('spherloc-introduction', 'seen')"
+"""Makes the page believe that it was visited before: no introduction."""
 PAINT = "() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(null))))"
 """Returns when the page has painted, which a busy machine does seldom."""
 SELECTED = "#b024e4"
@@ -112,10 +114,13 @@ def served(*words: str | Path) -> Iterator[tuple[str, subprocess.Popen[str]]]:
 class Playground:
     """One tab."""
 
-    def __init__(self, browser: Browser, address: str, drawn: bool = False) -> None:
-        """Open the page and wait for its first run; ``drawn`` has the canvas really drawn, which is slow."""
+    def __init__(self, browser: Browser, address: str, drawn: bool = False, new: bool = False) -> None:
+        """Open the page and wait for its first run; ``drawn`` has the canvas really drawn, which is slow, and ``new``
+        is a browser that has never been here."""
         context = browser.new_context(viewport=SIZE, device_scale_factor=SHARPNESS)  # pyright: ignore[reportArgumentType]
         context.add_init_script(ASIDE)
+        if not new:
+            context.add_init_script(KNOWN)
         if not drawn:
             context.add_init_script(BLIND)
         self.page: Page = context.new_page()

@@ -4,6 +4,7 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 from playground import PAINT, Playground
 from playwright.sync_api import expect
@@ -73,6 +74,8 @@ def at(number: int | str = r"\d+", title: str = "") -> re.Pattern[str]:
 
 
 def test_slider_stages_buttons_and_keys_step(tab: Playground, address: str) -> None:
+    expect(tab.step).to_have_value(at(title="The yaw most arcs share"))
+    tab.slide("Timeline", "End")
     expect(tab.step).to_have_value(at(title="Outcome"))
     outcome = tab.still(tab.drawn, "the outcome is drawn")
     tab.touch("step:balls-pair").click()
@@ -108,6 +111,28 @@ def test_slider_stages_buttons_and_keys_step(tab: Playground, address: str) -> N
     tab.slide("Timeline", "End")
     expect(tab.step).to_have_value(at(title="Outcome"))
     tab.until(lambda: tab.drawn() == outcome, "the outcome is drawn as before")
+    tab.expect_quiet(address)
+
+
+def test_balls_are_on_the_screen_at_every_step_that_one_walks_to(tab: Playground, address: str) -> None:
+    """With Next, from a step that shows something else from somewhere else."""
+    tab.touch("step:balls-pair").click()
+    expect(tab.step).to_have_value(at(title="One pair, one ball"))
+    box = tab.page.locator("canvas").first.bounding_box()
+    assert box is not None
+    for _ in range(4):
+        number = tab.step_number()
+        tab.press("Next")
+        expect(tab.step).to_have_value(at(number + 1))
+
+        def framed() -> bool:
+            """Most of the balls' centres are within the canvas, and not all of them in one spot of it."""
+            places = tab.dots("/balls/others-centres")
+            low, high = np.array([box["x"], box["y"]]), np.array([box["x"] + box["width"], box["y"] + box["height"]])
+            inside = np.all((places > low) & (places < high), axis=1)
+            return bool(np.mean(inside) >= 0.4 and np.ptp(places[inside], axis=0).max() > 0.02 * box["height"])
+
+        tab.until(framed, f"the balls of step {number + 1} are framed")
     tab.expect_quiet(address)
 
 

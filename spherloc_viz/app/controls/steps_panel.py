@@ -8,6 +8,8 @@ from typing import Any
 import viser
 
 from spherloc_viz import style
+from spherloc_viz.app.glossary import linked
+from spherloc_viz.app.introduction import opening_step
 from spherloc_viz.app.text import box, step_html, table_html
 from spherloc_viz.app.web.viser_seams import at_once, put
 from spherloc_viz.layers.primitives import Step, Stop, Table
@@ -61,8 +63,9 @@ class StepsPanel:
     def settle(self, steps: tuple[Stop, ...], asked: bool) -> tuple[int, float | None]:
         """Index of the step to show, and seconds to the next one if playing; ``asked`` is false for its alarm."""
         if steps != self._steps:
-            key = self._steps[self._index].key if self._steps else ""
-            self._steps, self._index = steps, find_step(steps, key)
+            known = self._steps
+            self._index = find_step(steps, known[self._index].key) if known else opening_step(steps)
+            self._steps = steps
             self._titles = tuple(f"{k}/{len(steps)}  {step.title}" for k, step in enumerate(steps, 1))
         with self._lock:
             moves, self._moves = self._moves, []
@@ -99,7 +102,7 @@ class StepsPanel:
             self._buttons.options = buttons
         texts = (
             (self._stages, stages_html(self._steps, self._index)),
-            (self._text, step_html(step) + "".join(table_html(table) for table in tables)),
+            (self._text, step_html(step, linked) + "".join(table_html(table) for table in tables)),
         )
         for widget, html in texts:
             if widget.content != html:

@@ -124,6 +124,12 @@
   }, true);
 
   addEventListener("pointercancel", end, true);
+
+  // What our other scripts on the page have to tell.
+  addEventListener("spherloc-touch", ({ detail }) => {
+    const nowhere = { left: 0, top: 0, width: 1, height: 1 };
+    tell(detail, nowhere, { clientX: 0, clientY: 0 }, { x: 0, y: 0 });
+  });
   setInterval(() => { look(); reveal(); }, LOOK_EVERY_MS);
 
   addEventListener("keydown", (event) => {

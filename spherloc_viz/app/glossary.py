@@ -1,0 +1,102 @@
+"""What the words on the page mean, each in a sentence or two, one press away from where it stands."""
+
+import re
+from html import escape
+
+import viser
+
+from spherloc_viz.app.text import box
+from spherloc_viz.app.web.touch import Touch, Touches
+
+DEFINE = "define"
+TERMS: dict[str, str] = {
+    "match": "A pixel of the query image and the map point that it is said to show. Many are wrong.",
+    "bearing": "The direction in which a pixel looks: a dot on the unit sphere, whatever the lens.",
+    "gravity": "Which way is down, in the camera and in the map. It settles roll and pitch, so that only the yaw and "
+    "the position are open: 4 numbers instead of 6.",
+    "yaw": "The angle by which the camera is turned about the vertical.",
+    "yaw ring": "The circle around the unit sphere: a place on it is the direction in which the camera looks with some "
+    "yaw. Its outline is as high as arcs overlap there.",
+    "arc": "The yaws at which two matches can both be right, up to their noise: a piece of the yaw ring. Most pairs "
+    "have two, of which at most one is right.",
+    "twin": "The second arc of a pair: a wave crosses zero twice in a turn.",
+    "ball": "All camera positions that two matches allow, once the yaw is known: around the point where their rays "
+    "come nearest to each other, as far as noise can move it.",
+    "edge": "Two nodes of a graph that agree: two balls that overlap, or two matches that can both be right.",
+    "graph": "Nodes and the edges between those that agree. For the position, nodes are balls.",
+    "clique": "Nodes that all agree with each other: balls of which any two overlap.",
+    "maximum clique": "The largest clique there is. Balls of right pairs all hold the true position, so that they form "
+    "one; those of wrong pairs lie anywhere.",
+    "bound": "How far a match may be off, in pixels, to count as an inlier.",
+    "inlier": "A match within the bound of the pose at hand.",
+    "outlier": "A match beyond the bound of the pose at hand.",
+    "residual": "How far the map point is seen from the pixel of its match, with the pose at hand.",
+    "refinement": "Gauss-Newton steps that move the pose until the residuals of its inliers are least.",
+    "RANSAC": "Draws the smallest sample that fixes a pose, counts who agrees, and keeps the best of many such poses.",
+    "sample": "The matches that RANSAC draws to fix one pose.",
+    "certificate": "A bound that no pose can beat; where the pose at hand reaches it, it is proven to be the best.",
+    "covariance": "How sure the pose is by its inliers: drawn as an ellipsoid of three standard deviations.",
+}
+"""By the word that stands on the page."""
+_PLURALS = {"match": "matches", "maximum clique": "maximum cliques"}
+_FORMS = {form: term for term in TERMS for form in (term, _PLURALS.get(term, f"{term}s"))}
+_WORDS = re.compile(rf"\b({'|'.join(sorted(map(re.escape, _FORMS), key=len, reverse=True))})\b")
+
+
+def linked(words: str) -> str:
+    """Words as HTML, in which every term is marked where it first stands: pressing it tells what it means."""
+    seen: set[str] = set()
+
+    def mark(found: re.Match[str]) -> str:
+        term = _FORMS[found[0]]
+        if term in seen:
+            return found[0]
+        seen.add(term)
+        return _mark(term, found[0], "term")
+
+    # Escaped text has no such words in what stands for a character.
+    return _WORDS.sub(mark, escape(words))
+
+
+def help_html(term: str) -> str:
+    """A question mark that tells what a term means."""
+    return _mark(term, "?", "help")
+
+
+def _mark(term: str, words: str, look: str) -> str:
+    tip = escape(f"{term}: {TERMS[term]}")
+    name = f' aria-label="What is {escape(term)}?"' if words == "?" else ""
+    return (
+        f'<span class="{look}" role="button" tabindex="0" data-touch="{DEFINE}:{escape(term)}" title="{tip}"{name}>'
+        f"{words}</span>"
+    )
+
+
+class Glossary:
+    """One client's: a window with all terms, the one that was asked for first."""
+
+    def __init__(self, gui: viser.GuiApi, touches: Touches) -> None:
+        self._gui = gui
+        self._open: viser.GuiModalHandle | None = None
+        touches.on(DEFINE, self._define)
+
+    def _define(self, touch: Touch) -> None:
+        if touch.argument not in TERMS:
+            return
+        if self._open is not None:
+            self._open.close()
+        self._open = self._gui.add_modal("What the words mean")
+        with self._open:
+            self._gui.add_html(glossary_html(touch.argument))
+
+
+def glossary_html(first: str) -> str:
+    """All terms, the given one before the others."""
+    others = [term for term in TERMS if term != first]
+    look = "padding:.5em .7em;border-radius:.4em;background:color-mix(in srgb, currentColor 10%, transparent)"
+    top = f'<div style="{look};font-size:14px"><b>{escape(first)}</b>: {escape(TERMS[first])}</div>'
+    rows = "".join(
+        f'<div style="padding-top:.45em"><b>{escape(term)}</b>: {escape(TERMS[term])}</div>' for term in others
+    )
+    again = '<div style="padding-top:.8em"><button class="introduce">Show the introduction again</button></div>'
+    return box(top + rows + again, "max-height:60vh;overflow:auto")

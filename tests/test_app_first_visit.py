@@ -1,0 +1,62 @@
+"""What a newcomer is told: the glossary, the introduction, and where a page opens."""
+
+import json
+import re
+from html import unescape
+
+import pytest
+from recording_samples import scene_problem
+
+from spherloc.estimators import estimate
+from spherloc.registry import names
+from spherloc_viz.app.glossary import TERMS, glossary_html, help_html, linked
+from spherloc_viz.app.introduction import MOMENTS, introduction_html, opening_step
+from spherloc_viz.layers import paint, steps
+
+
+def test_terms_are_marked_where_they_first_stand() -> None:
+    html = linked("Two arcs and an arc; a maximum clique of balls <b>, & the yaw ring of bearings.")
+    marked = re.findall(r'data-touch="define:([^"]+)"[^>]*>([^<]+)</span>', html)
+    assert marked == [
+        ("arc", "arcs"), ("maximum clique", "maximum clique"), ("ball", "balls"), ("yaw ring", "yaw ring"),
+        ("bearing", "bearings"),
+    ]  # fmt: skip
+    assert "&lt;b&gt;, &amp; the" in html and "<b>" not in html
+    assert unescape(re.sub(r"<[^>]+>", "", html)) == unescape(html_text(html))
+
+
+def html_text(html: str) -> str:
+    return re.sub(r"<[^>]+>", "", html)
+
+
+def test_the_glossary_begins_with_what_was_asked_for_and_has_every_term() -> None:
+    html = glossary_html("ball")
+    assert html.index("<b>ball</b>") < min(html.index(f"<b>{term}</b>") for term in TERMS if term != "ball")
+    assert all(html.count(f"<b>{term}</b>") == 1 for term in TERMS)
+    assert 'aria-label="What is ball?"' in help_html("ball")
+
+
+@pytest.mark.parametrize("estimator", names("estimators"))
+def test_every_run_opens_at_its_ring_and_has_four_moments(estimator: str) -> None:
+    trace = estimate(scene_problem("mei_outliers_80"), estimator)
+    stops = steps(trace)
+    key = stops[opening_step(stops)].key
+    has_ring = any(item.layer == "yaw ring" for item in paint(trace, opening_step(stops)).scene)
+    assert has_ring == any(stop.key in ("yaw-clique", "consensus-bound") for stop in stops)
+    assert has_ring or key == "outcome"
+    found = re.fullmatch(r'<div hidden data-introduction="([^"]*)"></div>', introduction_html(stops))
+    assert found is not None
+    told = json.loads(unescape(found[1]))
+    shown = [moment["step"] for moment in told["moments"]]
+    assert len(shown) == len(MOMENTS) == len(set(shown)) and told["end"] == key
+    assert set(shown) <= {stop.key for stop in stops}
+
+
+def test_captions_define_the_great_words() -> None:
+    """Arc, ball and clique are marked in the captions that first use them."""
+    trace = estimate(scene_problem("mei_outliers_80"), "mc")
+    marked = [
+        set(re.findall(r"define:([^\"]+)", linked(paint(trace, k).step.caption))) for k in range(len(steps(trace)))
+    ]
+    for term in ("arc", "ball", "maximum clique", "edge", "inlier"):
+        assert any(term in here for here in marked), term
