@@ -18,8 +18,9 @@ from benchmarks.attack.kinds import KINDS
 from benchmarks.machine import ROOT
 
 SLOW_S = 10.0
-HANG_S = 15.0
-"""After this long a process is ended; that file counts as slow too."""
+"""Of processor time."""
+HANG_S = 60.0
+"""A process that has not answered for this long is ended; that file counts as slow too."""
 LARGE_MB = 1024.0
 START_S = 300.0
 """What a process may take until its first answer, with all that it loads."""

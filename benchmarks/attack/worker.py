@@ -9,7 +9,6 @@ import os
 import resource
 import shutil
 import sys
-import time
 import traceback
 import warnings
 import zlib
@@ -56,20 +55,18 @@ def _read(kind: Kind, folder: Path, path: Path) -> dict[str, Any]:
 
     _forget_peak()
     children_mb = _children_mb()
-    start, said, wrong = time.perf_counter(), "", ""
+    start, said, wrong = _busy_s(), "", ""
     try:
         kind.read(folder, path)
         outcome = "accepted"
     except SpherlocError as error:
         outcome, said = "sentence", str(error)
-        if not (
-            said.isprintable() and said.rstrip().endswith((".", "!", "?")) and len(said) <= LONGEST + len(str(path))
-        ):
+        if not (said.isprintable() and said.endswith(".") and len(said) <= LONGEST + len(str(path))):
             outcome, wrong = "bad sentence", said[:LONGEST]
     except Exception as error:
         outcome, said = "traceback", f"{type(error).__name__}: {str(error)[:200]}"
         wrong = "".join(traceback.format_exception(error)[-6:])[-3000:]
-    seconds = time.perf_counter() - start
+    seconds = _busy_s() - start
     return {
         "outcome": outcome,
         "said": said[:200],
@@ -77,6 +74,11 @@ def _read(kind: Kind, folder: Path, path: Path) -> dict[str, Any]:
         "seconds": seconds,
         "peak_mb": _peak_mb(children_mb),
     }
+
+
+def _busy_s() -> float:
+    """Processor time of this process and of its children that have ended: a busy machine makes nothing slow."""
+    return sum(os.times()[:4])
 
 
 def _forget_peak() -> None:
