@@ -3,7 +3,6 @@
 import asyncio
 import base64
 import hashlib
-import json
 import re
 import socket
 from collections.abc import AsyncIterator, Awaitable, Callable
@@ -26,7 +25,6 @@ from spherloc_viz.app.web.access import Access, Role
 from spherloc_viz.app.web.front_door import FrontDoor
 from spherloc_viz.app.web.guard import is_own_name, open_socket, refusal
 from spherloc_viz.app.web.page import load_page
-from spherloc_viz.app.web.touch import MOST_BYTES, Touch, TouchDesk, Touches
 from spherloc_viz.app.web.viewer_room import ViewerRoom
 
 KEY = "a key of this test"
@@ -112,10 +110,6 @@ class Door:
         self.access = access
         self._client = client
 
-    async def touch(self, body: bytes, origin: str | None = "own") -> aiohttp.ClientResponse:
-        sent = {} if origin is None else {"Origin": self.url.rstrip("/") if origin == "own" else origin}
-        return await self._client.post(self.url + "touch", data=body, headers=sent)
-
     async def get(self, path: str = "", method: str = "GET", **sent: str) -> aiohttp.ClientResponse:
         response = await self._client.request(method, self.url + path, headers=sent, allow_redirects=False)
         await response.read()
@@ -128,11 +122,9 @@ class Door:
 
 
 @asynccontextmanager
-async def door_to(
-    port: int, desk: TouchDesk | None = None, viewer: ViewerRoom | None = None, token: bool = False
-) -> AsyncIterator[Door]:
+async def door_to(port: int, viewer: ViewerRoom | None = None, token: bool = False) -> AsyncIterator[Door]:
     listener, access = open_socket("127.0.0.1", 0), Access(token)
-    runner = await FrontDoor("127.0.0.1", port, KEY, access, desk or TouchDesk(), viewer).start(listener)
+    runner = await FrontDoor("127.0.0.1", port, KEY, access, viewer).start(listener)
     try:
         async with aiohttp.ClientSession(cookie_jar=aiohttp.DummyCookieJar()) as client:
             yield Door(listener.getsockname()[1], client, access)
@@ -296,63 +288,6 @@ def test_another_viser_fails_closed(monkeypatch: pytest.MonkeyPatch) -> None:
         viser_seams.start_viser(KEY)
 
 
-def report(token: str, action: str = "select:12", **changes: object) -> bytes:
-    return json.dumps(
-        {"session": token, "action": action, "at": [0.75, 0.5], "from": [0.25, 0.5], "extend": True} | changes
-    ).encode()
-
-
-def test_a_press_on_the_page_reaches_its_own_session_only() -> None:
-    async def press() -> None:
-        heard: list[tuple[str, Touch]] = []
-        desk, one, two = TouchDesk(), Touches(failed=errors.append), Touches(failed=errors.append)
-        for name, touches in (("one", one), ("two", two)):
-            touches.on("select", lambda touch, name=name: heard.append((name, touch)))
-            desk.add(touches)
-        two.on("break", lambda touch: 1 / 0)
-        async with door_to(1, desk) as door:
-            assert (await door.touch(report(two.token))).status == 204
-            assert heard == [("two", Touch("select", "12", 0.75, 0.5, 0.25, 0.5, True))]
-            assert (await door.touch(report(one.token, "select:a:b", extend=1))).status == 204
-            assert heard[-1] == ("one", Touch("select", "a:b", 0.75, 0.5, 0.25, 0.5, False))
-            assert (await door.touch(report(one.token, "gone:1"))).status == 204, "the page may be older than Python"
-            assert (await door.touch(report(two.token, "break:"))).status == 204
-            assert [type(error) for error in errors] == [ZeroDivisionError]
-            desk.remove(one)
-            assert (await door.touch(report(one.token))).status == 400
-            assert len(heard) == 2
-
-    errors: list[Exception] = []
-    asyncio.run(press())
-
-
-def test_presses_from_elsewhere_are_refused() -> None:
-    async def press() -> None:
-        desk, touches = TouchDesk(), Touches(failed=lambda error: None)
-        touches.on("select", lambda touch: pytest.fail("let in"))
-        desk.add(touches)
-        async with door_to(1, desk) as door:
-            for origin in (None, "null", "http://evil.example", "http://127.0.0.1:1"):
-                assert (await door.touch(report(touches.token), origin)).status == 403
-            for body in (
-                b"",
-                b"[]",
-                b"{}",
-                b"\xff",
-                b"[" * 2000,
-                report("another"),
-                report(touches.token, at=[0.5]),
-                report(touches.token, at=[2.0, 0.5]),
-                report(touches.token, at=[float("nan"), 0.5]),
-                report(touches.token, at="ab"),
-                report(touches.token, at=[10**400, 0.5]),
-            ):
-                assert (await door.touch(body)).status == 400, body
-            assert (await door.touch(b" " * MOST_BYTES + report(touches.token))).status == 413
-
-    asyncio.run(press())
-
-
 ROUTES = (
     ("GET", ""),
     ("HEAD", ""),
@@ -362,7 +297,6 @@ ROUTES = (
     ("GET", "viewer/data/a.rrd"),
     ("GET", "viewer/data/a.review.rrd"),
     ("GET", "nothing"),
-    ("POST", "touch"),
     ("POST", ""),
     ("PUT", "viewer/data/a.rrd"),
 )
@@ -375,10 +309,7 @@ def test_without_the_token_nothing_passes() -> None:
     viewer = ViewerRoom(lambda file: asked.append(file) or pytest.fail("reached"))
 
     async def visit() -> None:
-        desk, touches = TouchDesk(), Touches(failed=lambda error: None)
-        touches.on("select", lambda touch: pytest.fail("let in"))
-        desk.add(touches)
-        async with echoing() as (port, keys), door_to(port, desk, viewer, token=True) as door:
+        async with echoing() as (port, keys), door_to(port, viewer, token=True) as door:
             right = door.access._tokens[Role.PRESENTER]
             name, another = door.access._cookie, Access(True)
             wrong = (
@@ -397,13 +328,13 @@ def test_without_the_token_nothing_passes() -> None:
                         response = await door.get(path, method, Cookie=cookie, Origin=door.url.rstrip("/"))
                         assert response.status == 403, (method, path, cookie)
                         assert method == "HEAD" or "link" in await response.text()
-                    for path in ("", "viewer/", "touch", f"?token={right}"):
+                    for path in ("", "viewer/", f"?token={right}"):
                         with pytest.raises(aiohttp.WSServerHandshakeError, match="403"):
                             await door.knock(path=path, cookie=cookie)
                 response = await door.get(f"?token={token}", Cookie=f"{name}={right}")
                 assert response.status == 403 and "Set-Cookie" not in response.headers
             assert (await door.get(f"?token={right}&token={right}")).status == 403
-            assert (await door.get(f"touch?token={right}", "POST")).status == 403, "a link opens the page alone"
+            assert (await door.get(f"?token={right}", "POST")).status == 403, "a link opens the page alone"
             page = await door.get(Accept="text/html,*/*")
             assert page.content_type == "text/html" and page.headers["Content-Security-Policy"]
             assert "<script" not in await page.text()
@@ -414,9 +345,7 @@ def test_without_the_token_nothing_passes() -> None:
 
 def test_a_link_becomes_a_cookie_and_the_token_leaves_the_address() -> None:
     async def visit() -> None:
-        desk, touches = TouchDesk(), Touches(failed=lambda error: None)
-        desk.add(touches)
-        async with echoing() as (port, _), door_to(port, desk, token=True) as door:
+        async with echoing() as (port, _), door_to(port, token=True) as door:
             origin = door.url.rstrip("/")
             link = door.access.link(origin, Role.PRESENTER).removeprefix(door.url)
             for path in (link, f"{link}&darkMode=", f"/evil.example/{link}", f"viewer/{link}"):
@@ -429,10 +358,6 @@ def test_a_link_becomes_a_cookie_and_the_token_leaves_the_address() -> None:
                 assert sorted(rest) == ["HttpOnly", "Path=/", "SameSite=Strict"]
             assert (await door.get(Cookie=cookie)).status == 200
             assert (await door.get("viewer/", Cookie=cookie)).status == 404
-            response = await door._client.post(
-                door.url + "touch", data=report(touches.token), headers={"Origin": origin, "Cookie": cookie}
-            )
-            assert response.status == 204
             async with door.knock(cookie=cookie) as socket:
                 await socket.send_bytes(b"in")
                 assert await socket.receive_bytes() == b"in"

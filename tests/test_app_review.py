@@ -24,7 +24,7 @@ from spherloc_viz.app.review.look import PAGE, Look
 from spherloc_viz.app.review.rows import WIDTH_PX, rows_html, verdict_html
 from spherloc_viz.app.review.shelf import Shelf, merged
 from spherloc_viz.app.review.summary_page import summary_html
-from spherloc_viz.app.web.touch import Touch, TouchDesk, Touches
+from spherloc_viz.app.web.touch import MOST_LETTERS, Touch, Touches, parse
 from spherloc_viz.cli import app
 from spherloc_viz.gallery import gallery_cases
 from spherloc_viz.recording.index.query import Range
@@ -278,7 +278,22 @@ def test_a_press_is_heard_by_all_who_listen() -> None:
     touches.on("views", lambda touch: heard.append(touch.argument))
     touches.deliver(Touch("views", "Yaw", 0.0, 0.0, 0.0, 0.0, False))
     assert heard == ["ZeroDivisionError", "Yaw"]
-    desk = TouchDesk()
-    desk.add(touches)
-    report = {"session": touches.token, "action": "views:\ud800", "at": [0, 0], "from": [0, 0], "extend": False}
-    assert not desk.deliver(json.dumps(report).encode()) and len(heard) == 2
+    touches.hear(report("views:Charts"))
+    assert heard[2:] == ["ZeroDivisionError", "Charts"]
+
+
+def report(action: str = "select:12", **changes: object) -> str:
+    return json.dumps({"action": action, "at": [0.75, 0.5], "from": [0.25, 0.5], "extend": True} | changes)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        *(None, 7, "", "[]", "{}", b"\xff", "[" * 2000, report("views:\ud800"), report(" " * MOST_LETTERS)),
+        *(report(at=place) for place in ([0.5], [2.0, 0.5], [float("nan"), 0.5], [10**400, 0.5], "ab", None)),
+    ],
+)
+def test_what_is_no_report_is_no_press(wrong: object) -> None:
+    assert parse(wrong) is None
+    assert parse(report()) == Touch("select", "12", 0.75, 0.5, 0.25, 0.5, True)
+    assert parse(report("select:a:b", extend=1)) == Touch("select", "a:b", 0.75, 0.5, 0.25, 0.5, False)

@@ -18,7 +18,7 @@ from spherloc_viz.app.services import Services
 from spherloc_viz.app.stage.canvas import panel_widths_px
 from spherloc_viz.app.status import Status
 from spherloc_viz.app.text import DIM, box
-from spherloc_viz.app.web.touch import Touch, Touches
+from spherloc_viz.app.web.touch import READY, Touch, Touches
 from spherloc_viz.app.web.upload_limit import limit_uploads
 from spherloc_viz.app.web.viser_seams import follow_changes, guard_callbacks
 from spherloc_viz.app.wish import Run
@@ -56,9 +56,9 @@ class Audience:
     def __init__(self, client: viser.ClientHandle, services: Services) -> None:
         self._services = services
         self._status = Status(client)
-        self._touches = Touches(self._status.fail)
         guard_callbacks(client, self._status.fail)
-        self._changes = follow_changes(client)
+        self._touches = Touches(self._status.fail)
+        self._changes = follow_changes(client, self._touches.hear)
         limit_uploads(client, 0, self._status.complain)
         self._edits = Edits()
         self._page = Newest(f"spherloc-page-{client.client_id}", self._draw)
@@ -69,8 +69,7 @@ class Audience:
         self._touches.on("select", self._select_numbers)
         self._touches.on("deselect", lambda touch: self._select(()))
         # Only now may the page tell what is pressed: everything that listens is there.
-        services.desk.add(self._touches)
-        client.gui.add_html(self._touches.html())
+        client.gui.add_html(READY)
 
     def start(self) -> None:
         """Show what the presenter shows."""
@@ -81,7 +80,6 @@ class Audience:
     def close(self) -> None:
         """End the thread; does not wait."""
         self._services.presented.leave(self._page.ask)
-        self._services.desk.remove(self._touches)
         self._page.close()
 
     def _redraw(self, event: object = None) -> None:

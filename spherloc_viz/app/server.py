@@ -80,7 +80,7 @@ def serve(
         stack.callback(sessions.close)
         sessions.attend(server)
         access = Access(demanded=token or not _is_loopback(listener))
-        door = FrontDoor(host, server.get_port(), key, access, services.desk, viewer)
+        door = FrontDoor(host, server.get_port(), key, access, viewer)
         asyncio.run(_serve_until_told(door, access, listener))
 
 

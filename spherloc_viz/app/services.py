@@ -6,7 +6,6 @@ from pathlib import Path
 from spherloc_viz.app.catalog import Catalog
 from spherloc_viz.app.presented import Presented
 from spherloc_viz.app.review.shelf import Shelf
-from spherloc_viz.app.web.touch import TouchDesk
 from spherloc_viz.recording.keeping.recorder import Recorder
 
 
@@ -21,7 +20,5 @@ class Services:
     """Where settled runs go; None if they are not recorded."""
     shelf: Shelf | None = None
     """The recordings that pages review; None if there is no folder of them."""
-    desk: TouchDesk = field(default_factory=TouchDesk)
-    """Where presses on the pages arrive."""
     presented: Presented = field(default_factory=Presented)
     """What pages of an audience show."""

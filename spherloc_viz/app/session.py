@@ -29,7 +29,7 @@ from spherloc_viz.app.panels.export_panel import Shown
 from spherloc_viz.app.services import Services
 from spherloc_viz.app.stage.canvas import panel_widths_px
 from spherloc_viz.app.status import Status
-from spherloc_viz.app.web.touch import Touch, Touches
+from spherloc_viz.app.web.touch import READY, Touch, Touches
 from spherloc_viz.app.web.viser_seams import follow_changes, guard_callbacks
 from spherloc_viz.app.wish import Run, Wish
 
@@ -50,9 +50,9 @@ class Session:
     def __init__(self, client: viser.ClientHandle, services: Services) -> None:
         self._client, self._services, self._catalog = client, services, services.catalog.branch()
         self._status = Status(client)
-        self._touches = Touches(self._status.fail)
         guard_callbacks(client, self._status.fail)
-        self._changes = follow_changes(client)
+        self._touches = Touches(self._status.fail)
+        self._changes = follow_changes(client, self._touches.hear)
         number = client.client_id
         self._solver = Newest(f"spherloc-solver-{number}", self._guarded(self._solve))
         self._page = Newest(f"spherloc-page-{number}", self._guarded(self._show))
@@ -72,8 +72,7 @@ class Session:
         self._face = Face(client, self._touches, self._controls, places, (left_px, right_px))
         self._listen()
         # Only now may the page tell what is pressed: everything that listens is there.
-        services.desk.add(self._touches)
-        client.gui.add_html(self._touches.html())
+        client.gui.add_html(READY)
 
     def start(self) -> None:
         """Solve and show the first problem."""
@@ -83,7 +82,6 @@ class Session:
 
     def close(self) -> None:
         """End the threads; does not wait."""
-        self._services.desk.remove(self._touches)
         for worker in (self._solver, self._page, self._doctor, self._controls):
             worker.close()
 

@@ -17,7 +17,6 @@ from viser import _messages
 from spherloc_viz.app.web.access import Access
 from spherloc_viz.app.web.front_door import FrontDoor
 from spherloc_viz.app.web.guard import open_socket
-from spherloc_viz.app.web.touch import TouchDesk
 from spherloc_viz.app.web.viser_seams import (
     ANSWERS,
     at_once,
@@ -40,7 +39,7 @@ class Desk:
     def __init__(self, client: viser.ClientHandle) -> None:
         self.failures: list[Exception] = []
         guard_callbacks(client, self.failures.append)
-        self.client, self.changes = client, follow_changes(client)
+        self.client, self.changes = client, follow_changes(client, self._touch)
         gui = client.gui
         self.pressed: list[str] = []
         self.boxes = [gui.add_checkbox(f"Box {k}", False) for k in range(3)]
@@ -53,6 +52,9 @@ class Desk:
         self.handle = client.scene.add_transform_controls(HANDLE)
         self._mark = gui.add_html("mark 0")
         self._marks = 0
+
+    def _touch(self, report: Any) -> None:
+        self.pressed.append(f"{report} {self.number.value}")
 
     def mark(self, page: Page) -> None:
         """Wait until the page shows whatever was sent before."""
@@ -77,7 +79,7 @@ class Stage:
     async def _serve(self) -> None:
         with open_socket("127.0.0.1", 0) as listener:
             self.address = f"http://127.0.0.1:{listener.getsockname()[1]}"
-            door = FrontDoor("127.0.0.1", self._server.get_port(), KEY, Access(False), TouchDesk())
+            door = FrontDoor("127.0.0.1", self._server.get_port(), KEY, Access(False))
             runner = await door.start(listener)
             self._open.set()
             await self._leaving.wait()
@@ -140,9 +142,9 @@ def test_nothing_is_lost_that_is_changed_at_once(page: Page, stage: Stage) -> No
     assert desk.pressed == ["A 1000", "A 1000", "B 1000"]
     assert [box.value for box in desk.boxes] == [False, True, True]
     field(page, desk.number).fill("5")
-    page.evaluate("one => one.click()", buttons[1])
-    until(page, lambda: len(desk.pressed) == 4, "the press arrives")
-    assert desk.pressed[-1] == "B 5", "what was typed before arrives before"
+    page.evaluate("one => { one.click(); window.spherlocReport('touch'); }", buttons[1])
+    until(page, lambda: len(desk.pressed) == 5, "the presses arrive")
+    assert desk.pressed[-2:] == ["B 5", "touch 5"], "what was typed before arrives before"
     assert not desk.failures
 
 

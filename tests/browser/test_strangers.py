@@ -85,21 +85,3 @@ def test_a_link_cannot_bring_a_foreign_scene(browser: Browser, address: str) -> 
     page.goto(f"{address}/?playbackPath=data:application/octet-stream;base64,AAAA&websocket=ws://127.0.0.1:9")
     assert page.url == f"{address}/"
     page.context.close()
-
-
-def test_another_site_cannot_press_anything(stranger: Page, tab: Playground, address: str) -> None:
-    """Not even if it knew the page's secret, and no page can without it."""
-    token = tab.page.locator("[data-session]").get_attribute("data-session")
-    report = {"session": token, "action": "select:5", "at": [0.5, 0.5], "from": [0.5, 0.5], "extend": True}
-    send = """([address, report, type]) => fetch(`${address}/touch`,
-        {method: "POST", mode: type ? "cors" : "no-cors", body: JSON.stringify(report),
-        headers: type ? {"Content-Type": type} : {}}).then(answer => answer.status, () => "refused")"""
-    assert stranger.evaluate(send, [address, report, "application/json"]) == "refused"
-    # This one is sent, but the answer cannot be read.
-    assert stranger.evaluate(send, [address, report, ""]) == 0
-    unknown = {**report, "session": "A" * 32, "action": "select:7"}
-    assert tab.page.evaluate(send, [address, unknown, "application/json"]) >= 400
-    # Had one of these been heard, its match would be selected beside this one.
-    own = {**report, "action": "select:3"}
-    assert tab.page.evaluate(send, [address, own, "application/json"]) < 300
-    tab.expect_card(3)

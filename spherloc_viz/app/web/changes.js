@@ -41,13 +41,28 @@
       if (data?.type !== "send") super.postMessage(data, ...words);
       else if (data.message.type === "GuiUpdateMessage") this.#change(data.message);
       else {
-        if (data.message.type === "TransformControlsUpdateMessage") {
-          this.#note(data.message.name);
-          this.#waiting.push(this.#numbered({ type: "GuiUpdateMessage", uuid: data.message.name, updates: {} }));
-        }
-        this.#flush();
+        // All but the place of the viewer, which is told many times a second, has a number too.
+        const { type, name } = data.message;
+        if (type === "TransformControlsUpdateMessage") this.report(name, {});
+        else if (type !== "ViewerCameraMessage") this.report("", {});
         super.postMessage(data, ...words);
       }
+    }
+
+    // Sends a message that goes by no widget, after all changes before it.
+    report(name, updates) {
+      this.#note(name);
+      this.#waiting.push(this.#numbered({ type: "GuiUpdateMessage", uuid: name, updates }));
+      this.flush();
+    }
+
+    // Sends what is not sent yet.
+    flush() {
+      clearTimeout(this.#timer);
+      this.#timer = null;
+      if (this.#waiting.length === 0) return;
+      this.#sent = performance.now();
+      for (const message of this.#waiting.splice(0)) super.postMessage({ type: "send", message });
     }
 
     // The widget that a field belongs to: the field itself, or what stands near it, has its name.
@@ -99,16 +114,8 @@
       if (place >= 0) this.#waiting.splice(place, 1);
       this.#waiting.push(this.#numbered(message));
       const wait = this.#sent + EVERY_MS - performance.now();
-      if (isButton || wait <= 0) this.#flush();
-      else this.#timer ??= later(() => this.#flush(), wait);
-    }
-
-    #flush() {
-      clearTimeout(this.#timer);
-      this.#timer = null;
-      if (this.#waiting.length === 0) return;
-      this.#sent = performance.now();
-      for (const message of this.#waiting.splice(0)) super.postMessage({ type: "send", message });
+      if (isButton || wait <= 0) this.flush();
+      else this.#timer ??= later(() => this.flush(), wait);
     }
 
     // Whether viser's page is to see a message.
@@ -142,6 +149,8 @@
   }
 
   window.Worker = Line;
+  // What is pressed goes the same way, so that nothing overtakes it.
+  window.spherlocReport = (touch) => line?.report("", { touch });
 
   // Before viser's page hears of it: if it tells the server of it, that ends the state of not being told.
   addEventListener("input", ({ target: field }) => {

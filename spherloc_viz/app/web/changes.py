@@ -50,8 +50,10 @@ class Changes:
 
     @contextmanager
     def hearing(self, name: str, number: int | None) -> Iterator[None]:
-        """A change arrives, with its number if the page gave one. The widget gets its value within, and what is done
-        at once is done within: only then does the change count as known."""
+        """A change arrives, with its number if the page gave one; ``name`` is empty for a press that is no widget's.
+
+        The widget gets its value within, and what is done at once is done within: only then is the change known.
+        """
         with self._hearing:
             following = self._newest + 1
             number = following if number is None else max(number, following)

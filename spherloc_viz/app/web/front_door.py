@@ -11,7 +11,6 @@ from aiohttp import web
 from spherloc_viz.app.web.access import NO_TOKEN, Access, Role, refused
 from spherloc_viz.app.web.guard import SAFE, refusal
 from spherloc_viz.app.web.page import Page, load_page
-from spherloc_viz.app.web.touch import MOST_BYTES, TouchDesk
 from spherloc_viz.app.web.viewer_room import NOT_RECORDED, PAGE, ViewerRoom
 from spherloc_viz.app.web.viser_seams import KEY_HEADER, ROLE_HEADER
 
@@ -34,18 +33,12 @@ NOT_FOR_AUDIENCE = "Recordings are the presenter's to open: the link for an audi
 
 
 class FrontDoor:
-    """Serves one page, one websocket and the viewer of recordings, and takes reports of presses on the page.
+    """Serves one page, one websocket and the viewer of recordings; everything else is refused."""
 
-    Everything else is refused.
-    """
-
-    def __init__(
-        self, host: str, viser_port: int, key: str, access: Access, desk: TouchDesk, viewer: ViewerRoom | None = None
-    ) -> None:
+    def __init__(self, host: str, viser_port: int, key: str, access: Access, viewer: ViewerRoom | None = None) -> None:
         """``viewer`` is None where nothing is recorded."""
         self._host, self._access = host, access
         self._viewer = viewer
-        self._desk = desk
         self._upstream = f"http://127.0.0.1:{viser_port}/"
         self._key = key
         self._page: Page = load_page()
@@ -56,7 +49,7 @@ class FrontDoor:
 
     async def start(self, listener: socket.socket) -> web.AppRunner:
         """Start serving on a listening socket."""
-        app = web.Application(client_max_size=MOST_BYTES)
+        app = web.Application()
         app.router.add_route("*", "/{path:.*}", self._answer)
         app.cleanup_ctx.append(self._connections)
         app.on_shutdown.append(self._hang_up)
@@ -85,8 +78,6 @@ class FrontDoor:
         role = self._access.role(request)
         if role is None:
             return refused(request, NO_TOKEN)
-        if request.method == "POST" and request.path == "/touch":
-            return await self._touch(request)
         if request.method not in ("GET", "HEAD"):
             return web.Response(status=405, text="Only GET is served.\n", headers={"Allow": "GET, HEAD"})
         if request.path.startswith(PAGE):
@@ -112,15 +103,6 @@ class FrontDoor:
             return await self._pass_on(request, Role.AUDIENCE)
         finally:
             self._audience -= 1
-
-    async def _touch(self, request: web.Request) -> web.Response:
-        """Only a page of this server can send one: others do not know its token, and are told apart by their Origin."""
-        if "Origin" not in request.headers:
-            return web.Response(status=403, text="Only the playground's page may report presses.\n")
-        body = await request.read()
-        loop = asyncio.get_running_loop()
-        known = await loop.run_in_executor(None, self._desk.deliver, body)
-        return web.Response(status=204) if known else web.Response(status=400, text="No page of this playground.\n")
 
     def _page_response(self, request: web.Request) -> web.Response:
         headers = SAFE | {

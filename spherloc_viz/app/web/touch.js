@@ -5,7 +5,7 @@
 // data-reveal="NAME" is scrolled to, also while what stands above it grows, until a person scrolls or presses.
 (() => {
   const TOUCHABLE = "[data-touch],[data-copy]", LEAST_DRAG_PX = 6, LOOK_EVERY_MS = 150, REVEAL_MS = 3000;
-  let sent = Promise.resolve(), press = null, shade = null, seen = null, revealed = null, revealUntil = 0;
+  let press = null, shade = null, seen = null, revealed = null, revealUntil = 0;
 
   function found(event) {
     const element = event.target instanceof Element ? event.target.closest(`${TOUCHABLE},a[href]`) : null;
@@ -16,24 +16,18 @@
   const fraction = (value, start, size) => Math.min(1, Math.max(0, (value - start) / Math.max(size, 1)));
 
   function tell(action, box, event, from) {
-    const session = document.querySelector("[data-session]")?.dataset.session;
-    if (!session) return;
+    if (!document.querySelector("[data-ready]")) return;
     const at = (x, y) => [fraction(x, box.left, box.width), fraction(y, box.top, box.height)];
-    const body = JSON.stringify({
-      session,
+    window.spherlocReport(JSON.stringify({
       action,
       at: at(event.clientX, event.clientY),
       from: at(from.x, from.y),
       extend: Boolean(event.shiftKey || event.ctrlKey || event.metaKey),
-    });
-    // One after another, so that presses arrive in their order.
-    sent = sent
-      .then(() => fetch("/touch", { method: "POST", headers: { "Content-Type": "application/json" }, body }))
-      .catch(() => undefined);
+    }));
   }
 
   function look() {
-    if (!document.querySelector("[data-session]")) return;
+    if (!document.querySelector("[data-ready]")) return;
     const names = seenElements("[data-view]").map((view) => view.dataset.view).sort().join(",");
     if (names === seen) return;
     seen = names;

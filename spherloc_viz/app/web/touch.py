@@ -8,15 +8,14 @@ part of what is pressed around it.
 """
 
 import json
-import secrets
-import threading
 from collections.abc import Callable
 from dataclasses import dataclass
-from html import escape
 from typing import Any
 
-MOST_BYTES = 4096
-"""A report is some hundred bytes."""
+MOST_LETTERS = 4096
+"""A report has some hundred."""
+READY = "<div data-ready></div>"
+"""Once this is on the page, it tells what is pressed."""
 
 
 @dataclass(frozen=True)
@@ -41,12 +40,10 @@ Handler = Callable[[Touch], object]
 
 
 class Touches:
-    """The presses on one page. Handlers are called on some thread, maybe several at once; they only note wishes."""
+    """The presses on one page. Handlers are called one after another, on viser's event loop: they only note wishes."""
 
     def __init__(self, failed: Callable[[Exception], None]) -> None:
         """``failed`` is called with what a handler raises."""
-        self.token = secrets.token_urlsafe(24)
-        """Tells this page from others; no other page can know it."""
         self._failed = failed
         self._handlers: dict[str, tuple[Handler, ...]] = {}
 
@@ -54,9 +51,11 @@ class Touches:
         """Call ``handler`` too for every press on an element of that action."""
         self._handlers[action] = (*self._handlers.get(action, ()), handler)
 
-    def html(self) -> str:
-        """What must stand somewhere on the page for its presses to find their way here."""
-        return f'<div data-session="{escape(self.token)}"></div>'
+    def hear(self, report: Any) -> None:
+        """Hand on what the page reports, whatever it is; nothing is done about what is no report."""
+        touch = parse(report)
+        if touch is not None:
+            self.deliver(touch)
 
     def deliver(self, touch: Touch) -> None:
         """Hand a press to its handlers; an unknown action is ignored, since the page may show what is gone by now."""
@@ -67,45 +66,16 @@ class Touches:
                 self._failed(error)
 
 
-class TouchDesk:
-    """Hands reports to the page's own ``Touches``."""
-
-    def __init__(self) -> None:
-        self._open: dict[str, Touches] = {}
-        self._lock = threading.Lock()
-
-    def add(self, touches: Touches) -> None:
-        """Begin to hand over what this page reports."""
-        with self._lock:
-            self._open[touches.token] = touches
-
-    def remove(self, touches: Touches) -> None:
-        """End it."""
-        with self._lock:
-            self._open.pop(touches.token, None)
-
-    def deliver(self, body: bytes) -> bool:
-        """Whether the report is well formed and its page is known; if so, it has been handled."""
-        report = _parse(body)
-        if report is None:
-            return False
-        token, touch = report
-        with self._lock:
-            touches = self._open.get(token)
-        if touches is None:
-            return False
-        touches.deliver(touch)
-        return True
-
-
-def _parse(body: bytes) -> tuple[str, Touch] | None:
-    """Token and press of a report, or None if it is none."""
+def parse(report: Any) -> Touch | None:
+    """The press that a report tells of, or None if it is none."""
     try:
-        report: Any = json.loads(body)
-        action, _, argument = str(report["action"]).partition(":")
+        if len(report) > MOST_LETTERS:
+            return None
+        said: Any = json.loads(report)
+        action, _, argument = str(said["action"]).partition(":")
         argument.encode()  # JSON can say halves of characters, which no file and no database takes
-        (x, y), (from_x, from_y) = (tuple(map(_share, report[name])) for name in ("at", "from"))
-        return str(report["session"]), Touch(action, argument, x, y, from_x, from_y, report["extend"] is True)
+        (x, y), (from_x, from_y) = (tuple(map(_share, said[name])) for name in ("at", "from"))
+        return Touch(action, argument, x, y, from_x, from_y, said["extend"] is True)
     except (ValueError, TypeError, KeyError, OverflowError, RecursionError):
         return None
 

@@ -98,8 +98,10 @@ def put_handle(handle: Any, wxyz: Any, position: Any) -> None:
             handle.wxyz, handle.position = np.asarray(wxyz), np.asarray(position)
 
 
-def follow_changes(client: viser.ClientHandle) -> Changes:
+def follow_changes(client: viser.ClientHandle, pressed: Callable[[Any], None]) -> Changes:
     """Number what a hand changes on a client's page, and what is set in answer.
+
+    ``pressed`` is called at once with what the page reports of other presses.
 
     viser would take a value over and call the callbacks on threads that run ahead of it or behind, and send values
     without a number. ``changes.js`` is what the page does about them.
@@ -111,7 +113,7 @@ def follow_changes(client: viser.ClientHandle) -> Changes:
 
     async def handle(client_id: Any, message: Any) -> None:
         if type(message) is _messages.GuiUpdateMessage:
-            _hear(client, changes, message)
+            _hear(client, changes, message, pressed)
         else:
             with changes.as_of(changes.now()):
                 await handle_others(client_id, message)
@@ -127,8 +129,10 @@ def follow_changes(client: viser.ClientHandle) -> Changes:
     return changes
 
 
-def _hear(client: viser.ClientHandle, changes: Changes, message: Any) -> None:
+def _hear(client: viser.ClientHandle, changes: Changes, message: Any, pressed: Callable[[Any], None]) -> None:
     """Take over what a hand has changed, and call the callbacks, which are no coroutines."""
+    if not (isinstance(message.uuid, str) and isinstance(message.updates, dict)):
+        return
     gui: Any = client.gui
     handle, number, gesture = (
         gui._gui_input_handle_from_uuid.get(message.uuid),
@@ -136,6 +140,8 @@ def _hear(client: viser.ClientHandle, changes: Changes, message: Any) -> None:
     )
     with changes.hearing(message.uuid, number):
         changes.gesture = gesture or changes.gesture
+        if "touch" in message.updates:
+            pressed(message.updates["touch"])
         if handle is None or "value" not in message.updates:
             return
         state, sent = handle._impl, message.updates["value"]
