@@ -97,13 +97,13 @@ def _decide(aligned: AlignedProblem, bounds: Bounds, probe: TwoPointSearch) -> D
         f"{100 * support / count:.0f} % of {count:,} matches agree with the best of {probe.drawn} sampled pairs{guess}"
     )
     if count > MOST_CORRESPONDENCES:
-        chosen, reason = "ransac-2p", f"{count:,} matches have too many pairs to compare them all."
+        chosen, reason = "ransac-2p", f"{count:,} matches are too many for an exact search."
     elif count <= CHEAP:
         chosen, reason = "mc-exact", f"{count:,} matches are few enough to prove the answer in a moment."
     elif chance < CERTAIN:
         chosen, reason = "ransac-2p", f"{share}, which is no chance: sampling finds the pose and is faster."
     else:
-        chosen, reason = "mc-exact", f"only {share}, which may be chance: all pairs must be compared."
+        chosen, reason = "mc-exact", f"only {share}, which may be chance: all poses must be searched."
     return DecisionStage(
         chosen=chosen,
         reason=reason[0].upper() + reason[1:],

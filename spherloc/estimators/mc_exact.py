@@ -1,5 +1,12 @@
-"""mc-exact: exact consensus over yaw with a certificate. Correspondences are the nodes, not pairs as in ``mc``."""
+"""mc-exact: the largest consensus of all poses within the gravity bound, with a certificate.
 
+Two exact searches share what they find: one over yaw that compares pairs of correspondences
+(``consensus.exact``; gravity exact, few correspondences or few inliers), and one over camera positions, yaw and tilt
+(``consensus.positions``), which needs memory for the correspondences only. Each starts from the other's best pose and
+leaves out the yaws that the other has settled.
+"""
+
+import time
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,9 +15,13 @@ from numpy.typing import NDArray
 from spherloc.bounds import Bounds
 from spherloc.consensus.chance import chance_rate, chance_sets
 from spherloc.consensus.exact import ExactConsensus, exact_consensus
+from spherloc.consensus.pose_cells import Matches, matches_of
+from spherloc.consensus.positions import search_positions
+from spherloc.consensus.support import SAME_CONSENSUS
 from spherloc.consensus.two_point_search import TwoPointSearch, search_two_point
 from spherloc.errors import InputError
 from spherloc.estimators.base import Clock, Outcome, check_positive
+from spherloc.estimators.first_poses import first_pose, supported
 from spherloc.geometry import yaw_of
 from spherloc.problem import AlignedProblem
 from spherloc.refine import RefinementOptions, refine, residuals_px
@@ -18,8 +29,12 @@ from spherloc.trace import Certificate, ConsensusStage
 
 FloatArray = NDArray[np.float64]
 
-MOST_CORRESPONDENCES = 10_000
-"""Their 50 million pairs take some 10 s and 3 GB."""
+MOST_CORRESPONDENCES = 200_000
+"""Some ten seconds and 1 GB."""
+MOST_FOR_PAIRS = 200
+"""Correspondences up to which pairs are compared first: they decide in milliseconds where most matches are wrong."""
+FEW_INLIERS, MOST_FOR_FEW = 0.04, 3000
+"""Share of inliers below which pairs come first for up to so many correspondences."""
 SEED_SAMPLES = 20_000
 """Most samples of the 2P-RANSAC that finds the first lower bound: enough at 1.5 % inliers, and some milliseconds."""
 LEAST_SAMPLES = 100
@@ -34,8 +49,8 @@ class McExactOptions(RefinementOptions):
     bound_px: float = 3.0
     """Bound on the noise of an inlier, px."""
     effort: float = 1.0
-    """Share of the usual effort after which the search stops and reports the gap that is left; usual is some tenths of
-    a second, and more than all but very dense or repetitive problems need."""
+    """Share of the usual effort after which the search stops and reports the gap that is left; usual is some seconds,
+    and more than all but very repetitive problems, or those with hardly an inlier, need."""
     time_budget_s: float = 60.0
     """Seconds after which it stops too. Runs that do not reach it give the same result on every machine."""
 
@@ -44,8 +59,10 @@ class McExactOptions(RefinementOptions):
         check_positive(self)
 
 
-EFFORT = 100_000_000
-"""Words touched by an ``effort`` of 1."""
+PAIR_EFFORT = 20_000_000
+"""Words touched by the search over pairs for an ``effort`` of 1."""
+POSITION_EFFORT = 150_000_000
+"""Matches tested by the search over positions for an ``effort`` of 1."""
 
 
 class ExactMaximumConsensus:
@@ -55,40 +72,94 @@ class ExactMaximumConsensus:
 
     @staticmethod
     def run(aligned: AlignedProblem, options: McExactOptions, bounds: Bounds, seed: int, clock: Clock) -> Outcome:
-        """Guess by 2P-RANSAC, search all yaws, refine, certify. ``seed`` is that of the RANSAC."""
+        """Guess by 2P-RANSAC, search all poses, refine, certify. ``seed`` is that of the RANSAC."""
         count = len(aligned.bearings)
         if count > MOST_CORRESPONDENCES:
             raise InputError(
-                f"mc-exact compares all pairs and takes up to {MOST_CORRESPONDENCES:,} correspondences, not {count:,}; "
-                "thin them or use ransac-2p."
+                f"mc-exact takes up to {MOST_CORRESPONDENCES:,} correspondences, not {count:,}; thin them or use "
+                "ransac-2p."
             )
         samples = max(LEAST_SAMPLES, round(min(1.0, options.effort) * SEED_SAMPLES))
         with clock.stage("guess", until=0.1):
             guess = search_two_point(
                 aligned, bounds.pixels, seed, samples, SEED_CONFIDENCE, local_optimization=True, watch=clock.watch
             )
+            matches = matches_of(aligned, bounds.noise_px)
+            start = first_pose(aligned, bounds, matches, guess)
+        rate = chance_rate(aligned.bearings, bounds.radians)
         with clock.stage("consensus"):
-            rate = chance_rate(aligned.bearings, bounds.radians)
-            found = exact_consensus(
-                aligned,
-                bounds,
-                rate,
-                _poses(guess),
-                int(options.effort * EFFORT),
-                options.time_budget_s,
-                clock.watch,
-            )
-        stage = _stage(aligned, guess, found)
-        upper = int(found.bound.max(initial=1))
-        if len(found.poses) == 0:
-            certificate = Certificate(upper, 1, chance_sets(count, 1, rate))
+            found = _search(aligned, bounds, rate, guess, matches, start, options, clock)
+        stage = _stage(aligned, bounds, start, found)
+        if found.pose is None:
+            certificate = Certificate(found.upper, 1, chance_sets(count, 1, rate))
             reason = "No pose: no pair of correspondences has a solution in front of the camera."
             return Outcome((stage,), None, np.zeros(count, dtype=bool), reason, certificate=certificate)
         with clock.stage("refinement", until=1.0):
-            refined, inliers, refinement = refine(aligned, found.poses[0], bounds, options)
-        lower = _lower_bound(aligned, bounds, found, refined, refinement.tilt_rad)
-        certificate = Certificate(max(upper, lower), lower, chance_sets(count, lower, rate))
+            refined, inliers, refinement = refine(aligned, found.pose, bounds, options)
+        lower = _lower_bound(aligned, bounds, found.pose, refined, refinement.tilt_rad)
+        certificate = Certificate(max(found.upper, lower), lower, chance_sets(count, lower, rate))
         return Outcome((stage, refinement), refined, inliers, certificate=certificate)
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """What both searches found together."""
+
+    pose: FloatArray | None
+    """(3, 4) between the aligned frames, within the gravity bound."""
+    upper: int
+    """No pose explains more."""
+    pairs: ExactConsensus | None
+    """Of the search over pairs, if it ran."""
+    effort: int
+    """Of both."""
+
+
+def _search(
+    aligned: AlignedProblem,
+    bounds: Bounds,
+    rate: float,
+    guess: TwoPointSearch,
+    matches: Matches,
+    start: tuple[FloatArray, int] | None,
+    options: McExactOptions,
+    clock: Clock,
+) -> _Found:
+    """Pairs where they are faster, then positions unless all is proven."""
+    deadline = time.perf_counter() + options.time_budget_s
+    count, known = len(aligned.bearings), 1 if start is None else start[1]
+    few = known <= FEW_INLIERS * count and count <= MOST_FOR_FEW
+    pairs, effort, yaw_bound = None, 0, None
+    if aligned.gravity_bound_rad == 0.0 and (count <= MOST_FOR_PAIRS or few):
+        pairs = exact_consensus(
+            aligned,
+            bounds,
+            rate,
+            _poses(guess),
+            int(options.effort * PAIR_EFFORT),
+            options.time_budget_s,
+            clock.watch,
+        )
+        effort, yaw_bound = pairs.effort, pairs.bound
+        if len(pairs.poses):
+            support = supported(aligned, pairs.poses[0], bounds.noise_px)
+            if support > known:
+                start = pairs.poses[0], support
+        upper = int(pairs.bound.max(initial=1))
+        if upper <= (1 if start is None else start[1]):
+            return _Found(None if start is None else start[0], upper, pairs, effort)
+    clock.watch.begin("search", 0.98)
+    found = search_positions(
+        aligned,
+        matches,
+        start,
+        int(options.effort * POSITION_EFFORT),
+        deadline,
+        yaw_bound,
+        clock.watch,
+    )
+    upper = found.upper if pairs is None else min(found.upper, int(pairs.bound.max(initial=1)))
+    return _Found(found.pose, upper, pairs, effort + found.effort)
 
 
 def _poses(guess: TwoPointSearch) -> list[tuple[float, FloatArray]]:
@@ -100,25 +171,50 @@ def _poses(guess: TwoPointSearch) -> list[tuple[float, FloatArray]]:
 
 
 def _lower_bound(
-    aligned: AlignedProblem, bounds: Bounds, found: ExactConsensus, refined: FloatArray, tilt_rad: float
+    aligned: AlignedProblem, bounds: Bounds, found: FloatArray, refined: FloatArray, tilt_rad: float
 ) -> int:
-    """What a pose within the gravity bound surely explains: the best verified one, or the refined one."""
-    lower = np.count_nonzero(residuals_px(aligned, found.poses[0]) <= bounds.noise_px)
+    """What a pose within the gravity bound surely explains: the best found one, or the refined one."""
+    lower = supported(aligned, found, bounds.noise_px)
     if tilt_rad <= aligned.gravity_bound_rad + 1e-12:
-        lower = max(lower, np.count_nonzero(residuals_px(aligned, refined) <= bounds.noise_px))
-    return int(lower)
+        lower = max(lower, supported(aligned, refined, bounds.noise_px))
+    return lower
 
 
-def _stage(aligned: AlignedProblem, guess: TwoPointSearch, found: ExactConsensus) -> ConsensusStage:
-    places = aligned.index.astype(np.int32)
+def _stage(
+    aligned: AlignedProblem, bounds: Bounds, start: tuple[FloatArray, int] | None, found: _Found
+) -> ConsensusStage:
+    pairs, best = found.pairs, 1 if start is None else start[1]
+    poses = [] if found.pose is None else [found.pose]
+    poses += [] if pairs is None else list(pairs.poses)
+    poses, masks = _different(aligned, bounds, poses)
+    supports = np.array([np.count_nonzero(mask) for mask in masks], dtype=np.int32)
+    most = int(supports.max(initial=1))
+    bound = np.full(YAW_BINS, found.upper, np.int32)
+    clique = np.flatnonzero(masks[0]) if masks else np.empty(0, np.int64)
+    if pairs is not None:
+        bound = np.minimum(pairs.bound_over_yaw(YAW_BINS), found.upper)
+        clique = pairs.clique if len(pairs.clique) > len(clique) else clique
     return ConsensusStage(
-        arcs=found.arcs,
-        seed_support=int(guess.support.max(initial=0)),
-        bound=found.bound_over_yaw(YAW_BINS),
+        arcs=0 if pairs is None else pairs.arcs,
+        seed_support=best if start is not None else 0,
+        bound=bound,
         effort=found.effort,
-        finished=found.finished,
-        yaw_rad=yaw_of(found.poses[0][:, :3]) if len(found.poses) else 0.0,
-        clique=places[found.clique],
-        cam_from_map=np.array([aligned.unalign_pose(pose) for pose in found.poses]).reshape(-1, 3, 4),
-        support=found.supports.astype(np.int32),
+        finished=found.upper <= most,
+        yaw_rad=yaw_of(poses[0][:, :3]) if poses else 0.0,
+        clique=aligned.index.astype(np.int32)[clique],
+        cam_from_map=np.array([aligned.unalign_pose(pose) for pose in poses]).reshape(-1, 3, 4),
+        support=supports,
     )
+
+
+def _different(
+    aligned: AlignedProblem, bounds: Bounds, poses: list[FloatArray]
+) -> tuple[list[FloatArray], list[NDArray[np.bool_]]]:
+    """Poses that explain mostly other matches than better ones do, best first, and masks (M,) of what they explain."""
+    masks = [residuals_px(aligned, pose) <= bounds.noise_px for pose in poses]
+    kept: list[int] = []
+    for k in sorted(range(len(poses)), key=lambda k: -np.count_nonzero(masks[k])):
+        fewest = SAME_CONSENSUS * np.count_nonzero(masks[k])
+        if all(np.count_nonzero(masks[k] & masks[other]) < fewest for other in kept):
+            kept.append(k)
+    return [poses[k] for k in kept], [masks[k] for k in kept]

@@ -119,7 +119,7 @@ def _pose(view: RunView, stage: ConsensusStage, rank: int) -> Frame:
     state, support = view.aligned_pose(stage.cam_from_map[rank]), int(stage.support[rank])
     explained = np.zeros(len(view.points), dtype=bool)
     aligned = view.trace.problem.aligned
-    explained[aligned.index] = view.residuals_px(state)[aligned.index] <= view.bounds.pixels
+    explained[aligned.index] = view.residuals_px(state)[aligned.index] <= view.bounds.noise_px
     off = "" if view.truth is None else f", {translation_error_m(view.truth, state):.3f} m from the true one"
     if rank == 0:
         then = "No other pose that was tried explains more, so it is what refinement starts from."

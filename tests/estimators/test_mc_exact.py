@@ -118,7 +118,7 @@ def crowd(count):
 
 
 def test_too_many_correspondences():
-    with pytest.raises(InputError, match=r"10,000.*10,001.*ransac-2p"):
+    with pytest.raises(InputError, match=r"200,000.*200,001.*ransac-2p"):
         solve(crowd(MOST_CORRESPONDENCES + 1))
 
 

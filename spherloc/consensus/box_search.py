@@ -1,0 +1,151 @@
+"""Branch and bound over boxes of camera positions and tilts, with ``stabbing`` for a bound; ``pose_search`` ends it."""
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from spherloc.consensus.pair_arcs import CIRCLE, direction_of_turn
+from spherloc.consensus.pose_cells import has_tilt, place_cell
+from spherloc.consensus.pose_search import BEST, CELL_EFFORT, CELLS, EFFORT, HALT, put_off, search_poses
+from spherloc.consensus.stabbing import EVERYWHERE, deepest, keep_possible
+from spherloc.watch import stopped
+
+FloatArray = NDArray[np.float64]
+
+MOST_BOXES = 1024
+"""Boxes that wait; the deepest is split first."""
+
+
+class Boxes(NamedTuple):
+    """Memory of one search."""
+
+    lower: FloatArray
+    """(MOST_BOXES, 6)."""
+    upper: FloatArray
+    """(MOST_BOXES, 6)."""
+    spans: NDArray[np.int64]
+    """(MOST_BOXES, 4): where its matches begin and end in ``lists``, its chart, its bound."""
+    lists: NDArray[np.int32]
+    """Matches that waiting boxes may explain."""
+
+
+def boxes_for(count: int) -> Boxes:
+    """Memory for ``count`` matches."""
+    return Boxes(
+        np.empty((MOST_BOXES, 6)),
+        np.empty((MOST_BOXES, 6)),
+        np.empty((MOST_BOXES, 4), np.int64),
+        np.empty(24 * count + 4096, np.int32),
+    )
+
+
+@numba.njit(cache=True, nogil=True)
+def _yaw_of_turn(turn):
+    c, s = direction_of_turn(turn)
+    return np.arctan2(s, c)
+
+
+@numba.njit(cache=True, nogil=True)
+def _in_window(scratch, kept, count, start, end, out):
+    """Those of the kept whose interval meets the window, into ``out``; returns how many."""
+    used = 0
+    for k in range(count):
+        first, last = scratch.starts[k], scratch.ends[k]
+        if last < EVERYWHERE:
+            if last < first:
+                last += CIRCLE
+            if not (
+                (first <= end and last >= start)
+                or (first - CIRCLE <= end and last - CIRCLE >= start)
+                or (first + CIRCLE <= end and last + CIRCLE >= start)
+            ):
+                continue
+        out[used] = kept[k]
+        used += 1
+    return used
+
+
+@numba.njit(cache=True, nogil=True)
+def search_boxes(matches, tasks, yaw_bound, memory, limits, found, board):
+    """Search the boxes ``tasks`` = (charts (K,), lower (K, 6), upper (K, 6), bounds (K,)) at all yaws.
+
+    ``yaw_bound`` (B,) is what is known of the bins of turn, ``memory`` is (Boxes, Scratch, Room); the others are as in
+    ``search_poses``.
+    """
+    boxes, scratch, room = memory
+    charts, lowers, uppers, bounds = tasks
+    _, state, left = found
+    count = len(matches.rows)
+    lists, spans, lo, up = boxes.lists, boxes.spans, boxes.lower, boxes.upper
+    for k in range(count):
+        lists[k] = k
+    waiting = len(charts)
+    for k in range(waiting):
+        lo[k], up[k] = lowers[k], uppers[k]
+        spans[k, 0], spans[k, 1], spans[k, 2], spans[k, 3] = 0, count, charts[k], bounds[k]
+    cell, spread, move = np.empty(16), np.empty(2), np.empty(6)
+    overflow, inside = np.empty(0, np.int32), np.empty(count, np.int32)
+    at_lower, at_upper = np.empty(6), np.empty(6)
+    while waiting > 0:
+        if state[EFFORT] >= limits.effort or state[HALT] != 0 or stopped(board):
+            for k in range(waiting):
+                put_off(left, state, (spans[k, 2], lo[k], up[k]), spans[k, 3], 0)
+            return
+        waiting -= 1
+        first, last, chart = spans[waiting, 0], spans[waiting, 1], spans[waiting, 2]
+        cutoff = state[BEST] + limits.gap
+        if spans[waiting, 3] <= cutoff or not has_tilt(matches, lo[waiting], up[waiting]):
+            continue
+        state[EFFORT] += CELL_EFFORT + last - first
+        state[CELLS] += 1
+        place_cell(chart, lo[waiting], up[waiting], cell)
+        fits = len(lists) - last >= last - first
+        if not fits and len(overflow) == 0:
+            overflow = np.empty(count, np.int32)
+        target = lists[last:] if fits else overflow
+        kept, free = keep_possible(matches, cell, lists[first:last], target, scratch, cutoff, spread)
+        if kept < 0:
+            continue
+        bound, windows = deepest(scratch, kept, free, cutoff, yaw_bound)
+        if bound <= cutoff:
+            continue
+        axis = (chart - 1) // 2 if chart > 0 else -1
+        split, total = 0, 0.0
+        for a in range(6):
+            if a < 3:
+                move[a] = cell[4] * spread[1] if a == axis else cell[5 + a] * spread[0]
+            else:
+                move[a] = cell[10 + a] if a > 3 else 0.0
+            total += move[a]
+            if move[a] > move[split]:
+                split = a
+        middle = 0.5 * (lo[waiting, split] + up[waiting, split])
+        if total > limits.switch_rad and waiting + 2 <= len(spans) and lo[waiting, split] < middle < up[waiting, split]:
+            if fits:
+                first, last = last, last + kept
+            for side in range(2):
+                spans[waiting, 0], spans[waiting, 1], spans[waiting, 2], spans[waiting, 3] = first, last, chart, bound
+                if side == 1:
+                    lo[waiting], up[waiting] = lo[waiting - 1], up[waiting - 1]
+                    up[waiting - 1, split] = middle
+                    lo[waiting, split] = middle
+                waiting += 1
+            continue
+        at_lower[:], at_upper[:] = lo[waiting], up[waiting]
+        for w in range(windows):
+            start, end = scratch.windows[w, 0], scratch.windows[w, 1]
+            at_lower[3] = _yaw_of_turn(start) - 1e-12
+            at_upper[3] = _yaw_of_turn(end) + 1e-12
+            if end - start >= CIRCLE - 1e-9:
+                at_lower[3], at_upper[3] = -np.pi, np.pi
+            elif at_upper[3] < at_lower[3]:
+                at_upper[3] += 2.0 * np.pi
+            cell_of = (chart, at_lower, at_upper)
+            if state[EFFORT] >= limits.effort:
+                put_off(left, state, cell_of, bound, 1)
+                continue
+            size = _in_window(scratch, target, kept, start, end, inside)
+            if size > state[BEST] + limits.gap:
+                search_poses(matches, cell_of, inside[:size], room, limits, found, board)

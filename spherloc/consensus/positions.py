@@ -1,0 +1,277 @@
+"""The largest consensus of all poses within the gravity bound, by branch and bound over cells (``pose_cells``).
+
+Boxes of positions (and tilts) come first, ``box_search``, small cells with yaw after them, ``pose_search``. The work is
+cut into tasks: cells that wait, those that might explain most first. In a round several tasks are searched at the same
+time, each for a limited effort, against what was best before the round; what they leave becomes tasks again. So the
+result does not depend on how many threads there are or how fast each of them is, and whenever the search is stopped,
+the largest bound among its tasks is what is proven.
+"""
+
+import os
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import repeat
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spherloc.consensus.box_search import MOST_BOXES, boxes_for, search_boxes
+from spherloc.consensus.pose_cells import AXES, TILT_A, YAW, Matches, parameters_of, pose_of, whole_domain
+from spherloc.consensus.pose_search import (
+    BEST,
+    EFFORT,
+    HALT,
+    LEFT,
+    MOST_WAITING,
+    OPEN,
+    STATE,
+    Left,
+    Limits,
+    room_for,
+    search_poses,
+)
+from spherloc.consensus.stabbing import scratch_for
+from spherloc.consensus.yaw_bins import BINS
+from spherloc.problem import AlignedProblem
+from spherloc.watch import DONE, Watch
+
+FloatArray = NDArray[np.float64]
+
+SWITCH_RAD = 0.06
+"""Mean movement of directions in a box below which it is searched with derivatives."""
+LEAST_PX = 1e-5
+"""Smaller cells differ by rounding."""
+FIRST_EFFORT = 400_000
+"""Tests of a match before threads are started: some hundredths of a second."""
+TASK_EFFORT, TASK_ROUNDS = 400_000, 400
+"""Least effort of a task, and its effort for each match: starting one again costs a test of every match."""
+TASKS_A_ROUND = 8
+NEAR_TURN_RAD, NEAR_SHARE, NEAR_GAP, NEAR_EFFORT = 2e-3, 4e-3, 0.01, 60
+"""The cell around the first guess: half sides of its turns, rad, and of its position, of the median distance; what may
+be missed there, of all matches; tests for each match."""
+
+
+@dataclass(frozen=True, eq=False)
+class PositionSearch:
+    """What the search found and proved."""
+
+    pose: FloatArray | None
+    """(3, 4) between the aligned frames, within the gravity bound; None if nothing explains two matches."""
+    support: int
+    """Matches that it explains, by the search's arithmetic; 1 without a pose."""
+    upper: int
+    """No pose within the gravity bound explains more."""
+    effort: int
+    """Matches tested."""
+
+    @property
+    def finished(self) -> bool:
+        """Whether nothing is left to be searched."""
+        return self.upper <= self.support
+
+
+def search_positions(
+    aligned: AlignedProblem,
+    matches: Matches,
+    start: tuple[FloatArray, int] | None,
+    effort: int,
+    deadline: float,
+    yaw_bound: NDArray[np.int32] | None = None,
+    watch: Watch | None = None,
+) -> PositionSearch:
+    """Search all poses within the gravity bound for one that explains more matches than ``start`` does.
+
+    ``matches`` is that of ``matches_of``. ``start`` is a pose (3, 4) between the aligned frames, within the gravity
+    bound, and what it explains. After ``effort`` tests or at ``deadline`` (``time.perf_counter``) the search stops.
+    ``yaw_bound`` (BINS,) bounds what poses explain by bin of turn, if anything is known. ``watch`` counts the tests; raises ``Cancelled``.
+    """
+    watch = watch or Watch()
+    watch.expect(effort)
+    search = _Search(aligned, matches, start, yaw_bound, watch)
+    if time.perf_counter() < deadline:
+        search.around_start(effort)
+        search.first(min(FIRST_EFFORT, effort))
+        search.rounds(effort, deadline)
+    watch.check()
+    return PositionSearch(search.pose(), search.best, search.upper(), search.effort)
+
+
+class _Worker:
+    """Memory of one thread."""
+
+    def __init__(self, count: int) -> None:
+        self.memory = (boxes_for(count), scratch_for(count), room_for(count))
+        most = MOST_BOXES + MOST_WAITING + 64
+        self.left = Left(np.empty((most, AXES)), np.empty((most, AXES)), np.empty((most, 3), np.int64))
+        self.state = np.zeros(STATE, np.int64)
+        self.best_at = np.zeros(1 + AXES)
+
+
+class _Search:
+    """The waiting tasks and the best pose of one search."""
+
+    def __init__(
+        self,
+        aligned: AlignedProblem,
+        matches: Matches,
+        start: tuple[FloatArray, int] | None,
+        yaw_bound: NDArray[np.int32] | None,
+        watch: Watch,
+    ) -> None:
+        self.matches = matches
+        self.watch = watch
+        self.count = len(aligned.points)
+        self.gravity_bound_rad = aligned.gravity_bound_rad
+        self.yaw_bound = np.full(BINS, self.count, np.int32) if yaw_bound is None else yaw_bound
+        self.best, self.open, self.effort = 1, 1, 0
+        self.best_at: FloatArray | None = None
+        self._halted = False
+        if start is not None:
+            chart, at = parameters_of(self.matches, start[0])
+            self.best_at, self.best = np.array([chart, *at]), start[1]
+        lower, upper = whole_domain(self.gravity_bound_rad)
+        about = np.array([[chart, self.count, 0] for chart in range(len(lower))], np.int64)
+        self.lower, self.upper_ends, self.about = lower, upper, about
+        self._workers = [_Worker(self.count)]
+
+    def halt(self) -> None:
+        """Let the search leave off; from any thread."""
+        self._halted = True
+        for worker in self._workers:
+            worker.state[HALT] = 1
+
+    def pose(self) -> FloatArray | None:
+        """The best pose (3, 4)."""
+        return None if self.best_at is None else pose_of(self.matches, int(self.best_at[0]), self.best_at[1:])
+
+    def upper(self) -> int:
+        """What is proven so far."""
+        return max(self.best, self.open, int(self.about[:, 1].max(initial=0)))
+
+    def around_start(self, effort: int) -> None:
+        """Look for better poses near the start."""
+        if self.best_at is None:
+            return
+        chart, at = int(self.best_at[0]), self.best_at[1:]
+        seen = pose_distances(self.matches, chart, at)
+        half = np.full(AXES, NEAR_TURN_RAD)
+        half[:YAW] = NEAR_SHARE * float(np.median(seen))
+        half[TILT_A:] = np.minimum(half[TILT_A:], self.gravity_bound_rad)
+        worker = self._workers[0]
+        limits = Limits(int(NEAR_GAP * self.count), min(effort, NEAR_EFFORT * self.count), LEAST_PX, SWITCH_RAD)
+        self._prepare(worker)
+        everybody = np.arange(self.count, dtype=np.int32)
+        search_poses(
+            self.matches,
+            (chart, at - half, at + half),
+            everybody,
+            worker.memory[2],
+            limits,
+            (worker.best_at, worker.state, worker.left),
+            self.watch.board,
+        )
+        self._take_best(worker)
+        self.effort += int(worker.state[EFFORT])
+
+    def first(self, effort: int) -> None:
+        """Search everything, in this thread."""
+        charts, bounds = self.about[:, 0].copy(), self.about[:, 1].copy()
+        worker = self._workers[0]
+        self._prepare(worker)
+        tasks = (charts, self.lower.copy(), self.upper_ends.copy(), bounds)
+        search_boxes(
+            self.matches,
+            tasks,
+            self.yaw_bound,
+            worker.memory,
+            Limits(0, effort, LEAST_PX, SWITCH_RAD),
+            (worker.best_at, worker.state, worker.left),
+            self.watch.board,
+        )
+        self._take_best(worker)
+        self.about = np.empty((0, 3), np.int64)
+        self.lower = self.upper_ends = np.empty((0, AXES))
+        self._take_left([worker])
+
+    def rounds(self, effort: int, deadline: float) -> None:
+        """Search tasks, round by round, until none is left, as many tests are done, or it is as late."""
+        if len(self.about) == 0 or self.effort >= effort:
+            return
+        threads = max(1, min(TASKS_A_ROUND, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 2))
+        self._workers += [_Worker(self.count) for _ in range(TASKS_A_ROUND - 1)]
+        each = max(TASK_EFFORT, TASK_ROUNDS * self.count)
+        timer = threading.Timer(min(max(0.0, deadline - time.perf_counter()), threading.TIMEOUT_MAX), self.halt)
+        timer.daemon = True
+        timer.start()
+        try:
+            with ThreadPoolExecutor(threads) as pool:
+                while len(self.about) and self.effort < effort and not self._halted:
+                    self.watch.board[DONE] = self.effort
+                    self.watch.check()
+                    order = np.argsort(-self.about[:, 1], kind="stable")
+                    now, later = order[:TASKS_A_ROUND], order[TASKS_A_ROUND:]
+                    workers = self._workers[: len(now)]
+                    left = max(1, effort - self.effort)
+                    limits = Limits(0, min(each, left), LEAST_PX, SWITCH_RAD)
+                    for worker in workers:
+                        self._prepare(worker)
+                    list(pool.map(self._work, workers, now, repeat(limits)))
+                    self.lower, self.upper_ends, self.about = (
+                        self.lower[later],
+                        self.upper_ends[later],
+                        self.about[later],
+                    )
+                    for worker in workers:
+                        self._take_best(worker)
+                    self._take_left(workers)
+        finally:
+            timer.cancel()
+
+    def _work(self, worker: _Worker, task: Any, limits: Limits) -> None:
+        """Search one task."""
+        chart, bound, narrow = self.about[task]
+        lower, upper = self.lower[task].copy(), self.upper_ends[task].copy()
+        found = (worker.best_at, worker.state, worker.left)
+        if narrow:
+            everybody = np.arange(self.count, dtype=np.int32)
+            cell = (chart, lower, upper)
+            search_poses(self.matches, cell, everybody, worker.memory[2], limits, found, self.watch.board)
+            return
+        tasks = (np.array([chart]), lower[None], upper[None], np.array([bound]))
+        search_boxes(self.matches, tasks, self.yaw_bound, worker.memory, limits, found, self.watch.board)
+
+    def _prepare(self, worker: _Worker) -> None:
+        worker.state[:HALT] = 0
+        worker.state[HALT] = self._halted
+        worker.state[BEST] = self.best
+
+    def _take_best(self, worker: _Worker) -> None:
+        if worker.state[BEST] > self.best:
+            self.best, self.best_at = int(worker.state[BEST]), worker.best_at.copy()
+
+    def _take_left(self, workers: list[_Worker]) -> None:
+        """Make what workers left tasks, unless it cannot explain more than the best pose."""
+        lower, upper, about = [self.lower], [self.upper_ends], [self.about]
+        for worker in workers:
+            many = int(worker.state[LEFT])
+            lower.append(worker.left.lower[:many].copy())
+            upper.append(worker.left.upper[:many].copy())
+            about.append(worker.left.about[:many].copy())
+            self.open = max(self.open, int(worker.state[OPEN]))
+            self.effort += int(worker.state[EFFORT])
+        self.lower, self.upper_ends, self.about = np.concatenate(lower), np.concatenate(upper), np.concatenate(about)
+        more = self.about[:, 1] > self.best
+        self.lower, self.upper_ends, self.about = self.lower[more], self.upper_ends[more], self.about[more]
+
+
+def pose_distances(matches: Matches, chart: int, at: FloatArray) -> FloatArray:
+    """|w| (M,) of a chart's parameters."""
+    scale, c = 1.0, at[:3].copy()
+    if chart:
+        axis = (chart - 1) // 2
+        scale = float(c[axis])
+        c[axis] = 1.0 if chart % 2 else -1.0
+    return np.linalg.norm(scale * matches.rows[:, :3] - c, axis=1)

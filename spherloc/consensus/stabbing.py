@@ -1,0 +1,232 @@
+"""The bound of a box of positions and tilts at all yaws at once: the deepest of the intervals of yaw left to matches.
+
+The cell is that of ``pose_cells`` with the whole circle of yaw. A match is explained only if R_y(yaw) u is within
+e = (its own angle) + psi of v' = T^T v, T being the tilt in the middle and u the direction of w. R_y keeps elevations,
+and lowers azimuths atan2(z, x) by yaw. So:
+
+- the elevation of some w in the cell must be within e of that of v': w's height is within delta of its middle's, and
+  its horizontal length within delta' (the horizontal part of delta), so that ends of that rectangle decide;
+- yaw lies within asin(delta' / rho) + asin(sin e / rho_v) of az(w) - az(v'), rho and rho_v being horizontal lengths of
+  w in the middle and of v': a cap of radius e around v' spans asin(sin e / rho_v) of azimuth if it holds no pole.
+
+Every pose of the cell explains at most those whose interval holds its yaw, so the most intervals over one yaw bound
+the cell. They are counted in bins, both ends rounded outwards, and exactly where bins do not decide. Yaw is measured in
+turns of ``pair_arcs``, from 0 to 4, which need no trigonometry.
+"""
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from spherloc.consensus.pair_arcs import CIRCLE
+from spherloc.consensus.pose_cells import SLACK
+
+FloatArray = NDArray[np.float64]
+
+FEW_BINS, MANY_BINS = 256, 1024
+"""Multiples of the bins of ``yaw_bins``."""
+MANY = 400
+"""Matches from which the larger number of bins is used."""
+MOST_SORTED = 1500
+"""Intervals up to which the exact depth is found where bins do not decide."""
+MOST_WINDOWS = 64
+JOINED = 0.004
+"""Turns between two windows of yaw up to which they are one."""
+EVERYWHERE = 8.0
+"""End of an interval that is the whole circle."""
+
+
+class Scratch(NamedTuple):
+    """Room for one cell, M matches."""
+
+    starts: FloatArray
+    """(M,) first ends of the intervals, turns."""
+    ends: FloatArray
+    """(M,) last ends; smaller than the first where the interval holds turn 0; ``EVERYWHERE``."""
+    steps: NDArray[np.int32]
+    """(MANY_BINS + 2,) changes of depth from bin to bin."""
+    windows: FloatArray
+    """(MOST_WINDOWS, 2) where the depth exceeds the cutoff, turns; the last may end above 4."""
+
+
+def scratch_for(count: int) -> Scratch:
+    """Room for cells of ``count`` matches."""
+    return Scratch(np.empty(count), np.empty(count), np.zeros(MANY_BINS + 2, np.int32), np.empty((MOST_WINDOWS, 2)))
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _turn(c, s):
+    """Turn in [0, 4] of a direction of any length."""
+    quarter = s / (abs(c) + abs(s))
+    if c < 0.0:
+        return 2.0 - quarter
+    return quarter if quarter >= 0.0 else 4.0 + quarter
+
+
+@numba.njit(cache=True, nogil=True)
+def keep_possible(matches, cell, members, kept, scratch, cutoff, spread):
+    """Write to ``kept`` those of ``members`` that some pose of the cell may explain, their intervals to ``scratch``.
+
+    Returns how many, and how many of them have the whole circle; -1 and 0 as soon as no more than ``cutoff`` can be
+    left. ``spread`` (2,) gets the mean of 1 / |w| and of |q| / |w| over those kept.
+    """
+    rows = matches.rows
+    s0, c0, c1, c2, half_s, half_c, half_flat = cell[0], cell[1], cell[2], cell[3], cell[4], cell[8], cell[9]
+    ca, sa, cc, sc = np.cos(cell[11]), np.sin(cell[11]), np.cos(cell[12]), np.sin(cell[12])
+    psi = min(np.sqrt(cell[14] * cell[14] + cell[15] * cell[15]), matches.widest_turn + abs(cell[11]) + abs(cell[12]))
+    cos_psi, sin_psi = np.cos(psi), np.sin(psi)
+    half_y = cell[6]
+    used, free = 0, 0
+    near, far = 0.0, 0.0
+    starts, ends = scratch.starts, scratch.ends
+    spare = len(members) - cutoff
+    for place in range(len(members)):
+        if place - used >= spare:
+            return -1, 0
+        k = members[place]
+        row = rows[k]
+        x, y, z = s0 * row[0] - c0, s0 * row[1] - c1, s0 * row[2] - c2
+        flat2 = x * x + z * z
+        flat = np.sqrt(flat2)
+        more = half_s * row[3] + matches.rounding * (1.0 + row[3])
+        delta_flat = half_flat + more
+        delta_y = half_y + more
+        distance = max(np.sqrt(flat2 + y * y), half_c + more)
+        # v' = T^T v
+        b1 = ca * row[5] + sa * row[6]
+        vx, vy, vz = cc * row[4] + sc * b1, cc * b1 - sc * row[4], ca * row[6] - sa * row[5]
+        level = np.sqrt(vx * vx + vz * vz)
+        sin_e = row[16] * cos_psi + row[17] * sin_psi
+        cos_e = row[17] * cos_psi - row[16] * sin_psi
+        pole = True
+        if cos_e > 0.0:
+            low, high = max(flat - delta_flat, 0.0), flat + delta_flat
+            # tan of the highest and the lowest elevation in the cap, as quotients.
+            top, below = vy * cos_e + level * sin_e, level * cos_e - vy * sin_e
+            if below > 0.0 and (y - delta_y) * below > top * (high if top > 0.0 else low):
+                continue
+            bottom, above = vy * cos_e - level * sin_e, level * cos_e + vy * sin_e
+            if above > 0.0 and (y + delta_y) * above < bottom * (low if bottom > 0.0 else high):
+                continue
+            pole = below <= 0.0 or above <= 0.0
+        kept[used] = k
+        near += 1.0 / distance
+        far += row[3] / distance
+        if pole or delta_flat >= flat:
+            starts[used], ends[used] = 0.0, EVERYWHERE
+            free += 1
+        else:
+            sin1, sin2 = delta_flat / flat, min(sin_e / level, 1.0)
+            cos1, cos2 = np.sqrt(1.0 - sin1 * sin1), np.sqrt(1.0 - sin2 * sin2)
+            sin_half = sin1 * cos2 + cos1 * sin2
+            cos_half = cos1 * cos2 - sin1 * sin2
+            sin_half, cos_half = sin_half + SLACK * cos_half, cos_half - SLACK * sin_half
+            ex, ez = x * vx + z * vz, z * vx - x * vz
+            starts[used] = _turn(ex * cos_half + ez * sin_half, ez * cos_half - ex * sin_half)
+            ends[used] = _turn(ex * cos_half - ez * sin_half, ez * cos_half + ex * sin_half)
+        used += 1
+    if used <= cutoff:
+        return -1, 0
+    spread[0], spread[1] = near / used, far / used
+    return used, free
+
+
+@numba.njit(cache=True, nogil=True)
+def deepest(scratch, count, free, cutoff, yaw_bound):
+    """Most of ``count`` intervals over one yaw, and how many windows hold all yaws where that exceeds ``cutoff``.
+
+    Yaws where ``yaw_bound`` (B,), for bins of turn, does not exceed ``cutoff`` are left out.
+    """
+    starts, ends, windows = scratch.starts, scratch.ends, scratch.windows
+    bins = MANY_BINS if count >= MANY else FEW_BINS
+    per_turn = bins / CIRCLE
+    steps = scratch.steps
+    steps[: bins + 1] = 0
+    for k in range(count):
+        if ends[k] >= EVERYWHERE:
+            continue
+        first, last = min(int(starts[k] * per_turn), bins - 1), min(int(ends[k] * per_turn), bins - 1)
+        steps[first] += 1
+        steps[last + 1] -= 1
+        if ends[k] < starts[k]:
+            steps[0] += 1
+    most, depth = 0, free
+    wider = bins // len(yaw_bound)
+    for b in range(bins):
+        depth += steps[b]
+        if depth > most and yaw_bound[b // wider] > cutoff:
+            most = depth
+    if most <= cutoff:
+        return most, 0
+    if count - free <= MOST_SORTED:
+        exact, used = _exactly(scratch, count, free, cutoff)
+        return min(exact, most), _clip_windows(windows, used, cutoff, yaw_bound) if exact > cutoff else 0
+    used, depth, inside = 0, free, False
+    for b in range(bins):
+        depth += steps[b]
+        hot = depth > cutoff and yaw_bound[b // wider] > cutoff
+        if hot:
+            if not inside:
+                used = _open_window(windows, used, b / per_turn)
+            windows[used - 1, 1] = (b + 1) / per_turn
+        inside = hot
+    return most, used
+
+
+@numba.njit(cache=True, nogil=True)
+def _clip_windows(windows, used, cutoff, yaw_bound):
+    """Leave out windows all of whose bins are bounded by ``cutoff``; returns how many are left."""
+    per_turn = len(yaw_bound) / CIRCLE
+    kept = 0
+    for w in range(used):
+        first, last = int(windows[w, 0] * per_turn), int(windows[w, 1] * per_turn)
+        for b in range(first, last + 1):
+            if yaw_bound[min(b, len(yaw_bound) - 1)] > cutoff:
+                windows[kept] = windows[w]
+                kept += 1
+                break
+    return kept
+
+
+@numba.njit(cache=True, nogil=True)
+def _open_window(windows, used, start):
+    """A window that starts there, or the last one if that is near or there is no room for more; returns how many."""
+    if used > 0 and (start - windows[used - 1, 1] <= JOINED or used == len(windows)):
+        return used
+    windows[used, 0] = windows[used, 1] = start
+    return used + 1
+
+
+@numba.njit(cache=True, nogil=True)
+def _exactly(scratch, count, free, cutoff):
+    """``deepest`` by sorting all ends."""
+    windows = scratch.windows
+    opening, closing = np.empty(count - free), np.empty(count - free)
+    used, depth = 0, free
+    for k in range(count):
+        if scratch.ends[k] < EVERYWHERE:
+            opening[used], closing[used] = scratch.starts[k], scratch.ends[k]
+            depth += scratch.ends[k] < scratch.starts[k]
+            used += 1
+    opening.sort()
+    closing.sort()
+    most, here, there, found = depth, 0, 0, 0
+    if depth > cutoff:
+        found = _open_window(windows, 0, 0.0)
+    while here < used or there < used:
+        if here < used and (there == used or opening[here] <= closing[there]):
+            depth += 1
+            if depth == cutoff + 1:
+                found = _open_window(windows, found, opening[here])
+            here += 1
+            most = max(most, depth)
+        else:
+            if depth == cutoff + 1:
+                windows[found - 1, 1] = closing[there]
+            depth -= 1
+            there += 1
+    if depth > cutoff:
+        windows[found - 1, 1] = CIRCLE
+    return most, found
