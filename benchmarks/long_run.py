@@ -112,7 +112,7 @@ async def visits(count: int) -> bool:
             await asyncio.gather(*(_greet(address) for _ in range(min(AT_ONCE, count - done))))
             await _quiet(lambda: thread_count(server.pid))
             watched.note(done + AT_ONCE, server.pid)
-    return watched.verdict("visits", "visits", 100.0)
+        return watched.verdict("visits", "visits", 100.0)
 
 
 async def _quiet(read: Callable[[], int]) -> None:
@@ -139,11 +139,11 @@ async def soak(pages: int, minutes: float) -> bool:
         changes = sum(await asyncio.gather(*tasks))
         await _quiet(lambda: thread_count(server.pid))
         left = memory_mib(server.pid), thread_count(server.pid)
-    flat = watched.verdict(f"soak of {pages} pages", "seconds", 600.0)
-    print(f"  {changes:,} changes, {len(answers):,} read back, {len(mistakes)} mistakes")
-    print(f"  after all pages have left: {left[0]:.0f} MiB, {left[1]} threads")
-    for mistake in mistakes[:20]:
-        print(f"  {mistake}")
+        flat = watched.verdict(f"soak of {pages} pages", "seconds", 600.0)
+        print(f"  {changes:,} changes, {len(answers):,} read back, {len(mistakes)} mistakes")
+        print(f"  after all pages have left: {left[0]:.0f} MiB, {left[1]} threads")
+        for mistake in mistakes[:20]:
+            print(f"  {mistake}")
     return flat and not mistakes
 
 

@@ -10,6 +10,8 @@ from pathlib import Path
 from typing import IO
 
 ROOT = Path(__file__).resolve().parents[1]
+STOP_S = 120.0
+"""What it may take to store what waits, on a busy machine too."""
 SCENE = ROOT / "scenes" / "panorama_outliers_90.toml"
 
 
@@ -32,7 +34,7 @@ def playground(
             yield match[1] + ("" if match[2] else "/"), server
         finally:
             server.terminate()
-            server.wait(20)
+            server.wait(STOP_S)
 
 
 def memory_mib(process: int) -> float:
