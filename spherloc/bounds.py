@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spherloc.errors import InputError, show
-from spherloc.problem import LEAST_PX, MOST_PX, AlignedProblem
+from spherloc.problem import AlignedProblem
+from spherloc.ranges import LEAST_PX, MOST_PX
 
 FloatArray = NDArray[np.float64]
 

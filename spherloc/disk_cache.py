@@ -1,12 +1,17 @@
 """What can be computed again is kept on disk: rendered images and features, by a key of all that they depend on."""
 
+import atexit
 import contextlib
 import hashlib
 import os
+import shutil
+import tempfile
 import time
 import uuid
 from functools import cache
 from pathlib import Path
+
+from spherloc import user_cache
 
 VARIABLE = "SPHERLOC_CACHE"
 """Environment variable that moves the cache."""
@@ -19,10 +24,19 @@ TOUCH_S = 3_600.0
 
 
 def cache_folder(kind: str) -> Path:
-    """Folder for one kind of things ("renders", "features"): under $SPHERLOC_CACHE, else in the user's cache."""
+    """Folder for one kind of things ("renders", "features"): under $SPHERLOC_CACHE, else in the user's cache.
+
+    A user without a home has one that ends with the process.
+    """
     own = os.environ.get(VARIABLE)
-    shared = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "spherloc"
-    return (Path(own) if own else shared) / kind
+    return (Path(own) if own else user_cache() or _temporary()) / kind
+
+
+@cache
+def _temporary() -> Path:
+    folder = Path(tempfile.mkdtemp(prefix="spherloc-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder
 
 
 def key_of(*parts: object) -> str:

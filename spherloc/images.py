@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from spherloc.errors import InputError
+from spherloc.files import open_file, read_file, reading
 
 ByteImage = NDArray[np.uint8]
 
@@ -47,14 +48,8 @@ def read_size(path: Path) -> tuple[int, int]:
     Raises ``InputError`` for what is missing, too large or no image.
     """
     path = Path(path)
-    try:
-        with path.open("rb") as file:
-            return _size(file, path)
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; correct the path of the image.") from None
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise InputError(f"{path}: cannot be read ({reason}); correct the path of the image.") from None
+    with reading(path, "correct the path of the image"), open_file(path) as file:
+        return _size(file, path)
 
 
 def grey(image: ByteImage) -> ByteImage:
@@ -64,15 +59,8 @@ def grey(image: ByteImage) -> ByteImage:
 
 def _decode(path: Path, flags: int) -> NDArray:
     path = Path(path)
-    try:
-        if path.stat().st_size > MAX_BYTES:
-            raise InputError(f"{path}: larger than {MAX_BYTES:,} bytes; give a smaller image.")
-        content = path.read_bytes()
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; correct the path of the image.") from None
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise InputError(f"{path}: cannot be read ({reason}); correct the path of the image.") from None
+    with reading(path, "correct the path of the image"):
+        content = read_file(path, MAX_BYTES)
     _size(io.BytesIO(content), path)
     try:
         image = cv2.imdecode(np.frombuffer(content, np.uint8), flags) if content else None

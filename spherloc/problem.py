@@ -9,17 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spherloc.cameras.base import BoolArray, Camera, FloatArray
-from spherloc.errors import ProblemError
+from spherloc.errors import ProblemError, show
 from spherloc.geometry import align_to_down, pose, tangent_basis
+from spherloc.ranges import LEAST_M, LEAST_PX, MOST_M, MOST_PX, is_number
 
 IntArray = NDArray[np.int64]
 
 LEAST_STRETCH = 0.01
 """Smallest ratio of the two singular values of an unprojection's Jacobian that residuals believe in."""
-LEAST_PX, MOST_PX = 1e-6, 1e6
-"""Between which a pixel bound lies: powers of much smaller or larger ones under- or overflow in the estimators."""
-LEAST_M, MOST_M = 1e-12, 1e12
-"""The same of the farthest point from the origin; a map may also be all in the origin."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,22 +66,20 @@ class Problem:
             raise ProblemError(f"{self.name}: {len(pixels)} pixels but {len(points)} points; give one point a pixel.")
         for name in ("gravity_camera", "gravity_map"):
             _unit(self, name)
-        if not (np.isfinite(self.gravity_bound_rad) and 0.0 <= self.gravity_bound_rad < np.pi / 2):
-            raise ProblemError(f"{self.name}: the gravity bound must lie between 0 and 90 degrees.")
-        sd = self.gravity_sd_rad
-        if sd is not None and not sd >= 0.0:
-            raise ProblemError(f"{self.name}: gravity_sd_rad is {sd}; give 0 or more, or inf if nothing is known.")
-        if self.bound_px is not None and not LEAST_PX <= self.bound_px <= MOST_PX:
-            raise ProblemError(f"{self.name}: bound_px is {self.bound_px}; give {LEAST_PX:g} to {MOST_PX:,.0f} pixels.")
+        below_90 = float(np.nextafter(np.pi / 2, 0.0))
+        _scalar(self, "gravity_bound_rad", 0.0, below_90, "an angle from 0 to below pi / 2")
+        _scalar(self, "gravity_sd_rad", 0.0, np.inf, "0 or more, or inf if nothing is known")
+        _scalar(self, "bound_px", LEAST_PX, MOST_PX, f"{LEAST_PX:g} to {MOST_PX:,.0f} pixels")
+        _scalar(self, "estimated_outlier_rate", 0.0, 1.0, "a share from 0 to 1")
         _check_reach(self.name, "points reach", points)
         if self.truth_cam_from_map is not None:
             truth = _array(self, "truth_cam_from_map", (3, 4))
             _check_rotation(self.name, truth)
             _check_reach(self.name, "the true position reaches", truth[:, 3:], least_m=0.0)
         if self.truth_inliers is not None:
-            mask = np.array(self.truth_inliers, dtype=bool)
+            mask = _of_kind(self, "truth_inliers", "biu").astype(bool)
             if mask.shape != (len(pixels),):
-                raise ProblemError(f"{self.name}: {len(mask)} inlier labels for {len(pixels)} correspondences.")
+                raise ProblemError(f"{self.name}: {mask.size} inlier labels for {len(pixels)} correspondences.")
             object.__setattr__(self, "truth_inliers", _frozen(mask))
         _check_references(self)
         usable = int(np.count_nonzero(self.usable))
@@ -239,10 +234,19 @@ def _frozen(array: Any) -> Any:
 
 
 def _numbers(problem: Problem, name: str) -> FloatArray:
+    return _of_kind(problem, name, "fiubO").astype(np.float64)
+
+
+def _of_kind(problem: Problem, name: str, kinds: str) -> NDArray[Any]:
+    """A field as an array of numpy's ``kinds``; raises ``ProblemError`` if it is none."""
     try:
-        return np.array(getattr(problem, name), dtype=np.float64)
-    except (TypeError, ValueError):
-        raise ProblemError(f"{problem.name}: {name} is no array of numbers.") from None
+        array = np.array(getattr(problem, name))
+        array = array.astype(np.float64) if array.dtype.kind == "O" else array
+    except (TypeError, ValueError, OverflowError):
+        array = np.array("")
+    if array.dtype.kind not in kinds and array.size:
+        raise ProblemError(f"{problem.name}: {name} is no array of numbers; give one, with rows of the same length.")
+    return array
 
 
 def _array(problem: Problem, name: str, shape: tuple[int, int]) -> FloatArray:
@@ -260,21 +264,32 @@ def _array(problem: Problem, name: str, shape: tuple[int, int]) -> FloatArray:
 def _check_references(problem: Problem) -> None:
     count, images = len(problem.pixels), len(problem.reference_images)
     if problem.reference_index is not None:
-        index = np.array(problem.reference_index, dtype=np.int64)
-        if index.shape != (count,) or not ((index >= 0) & (index < images)).all():
+        given = _numbers(problem, "reference_index")
+        if given.shape != (count,) or not ((given >= 0) & (given < images) & (given == np.floor(given))).all():
             raise ProblemError(
                 f"{problem.name}: reference_index must name one of {images} reference images for each of {count} "
                 "correspondences."
             )
-        object.__setattr__(problem, "reference_index", _frozen(index))
+        object.__setattr__(problem, "reference_index", _frozen(given.astype(np.int64)))
     if problem.reference_pixels is not None:
         pixels = _numbers(problem, "reference_pixels")
         if pixels.shape != (count, 2):
             raise ProblemError(f"{problem.name}: reference_pixels has shape {pixels.shape}; give ({count}, 2).")
         object.__setattr__(problem, "reference_pixels", _frozen(pixels))
-    rate = problem.estimated_outlier_rate
-    if rate is not None and not 0.0 <= rate <= 1.0:
-        raise ProblemError(f"{problem.name}: estimated_outlier_rate is {rate}; give a share from 0 to 1.")
+
+
+def _scalar(problem: Problem, name: str, least: float, most: float, advice: str) -> None:
+    """Make a field a float within limits; None stays where that is its default."""
+    value = getattr(problem, name)
+    if value is None and name != "gravity_bound_rad":
+        return
+    try:
+        number = float(value) if is_number(value) else np.nan
+    except OverflowError:  # an integer beyond all floats
+        number = np.nan
+    if not least <= number <= most:
+        raise ProblemError(f"{problem.name}: {name} is {show(value)}; give {advice}.")
+    object.__setattr__(problem, name, number)
 
 
 def _unit(problem: Problem, name: str) -> None:

@@ -27,6 +27,7 @@ from spherloc.gauss_newton import (
 )
 from spherloc.geometry import skew
 from spherloc.problem import AlignedProblem
+from spherloc.ranges import check_options, is_number
 from spherloc.trace import RefinementStage
 
 FloatArray = NDArray[np.float64]
@@ -58,9 +59,11 @@ class RefinementOptions:
     usual constants, which cost 5 % efficiency if the noise is normal."""
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.noise_px < np.inf:
+        check_options(self)
+        if not (is_number(self.noise_px) and 0.0 < self.noise_px < np.inf):
             raise InputError(f"option noise_px is {show(self.noise_px)}; give a positive number of pixels.")
-        if self.gravity_sd_deg is not None and not self.gravity_sd_deg >= 0.0:
+        sd = self.gravity_sd_deg
+        if sd is not None and not (is_number(sd) and sd >= 0.0):
             raise InputError(f"option gravity_sd_deg is {show(self.gravity_sd_deg)}; give 0 or more, or inf.")
         if self.robust not in get_args(Robust):
             raise InputError(f"option robust is {show(self.robust)}; give one of {', '.join(get_args(Robust))}.")

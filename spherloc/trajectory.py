@@ -3,6 +3,7 @@
 Times are whole nanoseconds: a double of seconds since 1970 resolves no more than a quarter of a microsecond.
 """
 
+import os
 from array import array
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -14,7 +15,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from spherloc.errors import InputError, show
+from spherloc.errors import InputError, reason, show
+from spherloc.files import open_file, reading
 
 FloatArray = NDArray[np.float64]
 
@@ -216,19 +218,13 @@ def _read(path: Path, layout: _Layout) -> Trajectory:
 
 def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
     """Line numbers and words of the lines that are neither empty nor comments."""
-    try:
-        if path.stat().st_size > MAX_FILE_BYTES:
+    with reading(path, "give the path of a trajectory"), open_file(path) as file:
+        if os.fstat(file.fileno()).st_size > MAX_FILE_BYTES:
             raise InputError(f"{path}: larger than {MAX_FILE_BYTES >> 20} MiB, which no trajectory is; split it.")
-        with path.open("rb") as file:
-            for line, content in enumerate(iter(lambda: file.readline(_MAX_LINE_BYTES), b""), start=1):
-                words = _words(content.removeprefix(b"\xef\xbb\xbf"), f"{path}, line {line}")
-                if words:
-                    yield line, words
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; give the path of a trajectory.") from None
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise InputError(f"{path}: cannot be read ({reason}); give the path of a trajectory.") from None
+        for line, content in enumerate(iter(lambda: file.readline(_MAX_LINE_BYTES), b""), start=1):
+            words = _words(content.removeprefix(b"\xef\xbb\xbf"), f"{path}, line {line}")
+            if words:
+                yield line, words
 
 
 def _words(content: bytes, place: str) -> list[str]:
@@ -248,7 +244,7 @@ def _pose(words: list[str]) -> list[float]:
     try:
         numbers = [float(word) for word in words]
     except ValueError as error:
-        raise InputError(f"{error}; give numbers, and start comments with #.") from None
+        raise InputError(f"{reason(error)}; give numbers, and start comments with #.") from None
     if not all(map(isfinite, numbers)):
         raise InputError("holds a number that is not finite; correct or remove the line.")
     if max(map(abs, numbers[:3])) > _LARGEST_M:

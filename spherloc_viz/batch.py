@@ -61,14 +61,16 @@ def run_scenes(
         raise InputError("no scene given; name one or more scene files or bundled scenes, such as mei_outliers_80.")
     changes, variation = parse_settings(estimator, settings), variation or Variation()
     jobs: list[Future[int]] = []
+    warm = False
     # One thread writes and prints, in order, while the next scene is being solved.
     with keeper_of(records) as keeper, ThreadPoolExecutor(1) as finisher:
         for path in paths:
             try:
                 scene = open_scene(path)
                 problem = _problem(path, scene, seed, query, variation)
-                if not jobs:
+                if not warm:
                     warm_up(say)
+                    warm = True
                 options = resolved_options(estimator, problem, changes)
                 trace = solve(problem, estimator, options, used_seed(scene, seed))
                 origin = None if keeper is None else _origin(path, scene, seed, query, variation)

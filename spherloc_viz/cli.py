@@ -1,5 +1,7 @@
 """The command line: what each command takes; the work is done elsewhere."""
 
+import contextlib
+import io
 import os
 import sys
 from itertools import chain
@@ -10,8 +12,9 @@ import tyro
 from tyro.conf import Positional, arg
 from tyro.extras import SubcommandApp
 
-from spherloc.errors import SpherlocError, show
+from spherloc.errors import SpherlocError, reason, show
 from spherloc_viz import recording_commands
+from spherloc_viz.arguments import refuse_repeated
 from spherloc_viz.recording.keeping.room import KEEP_GIGABYTES
 
 RECORDINGS = Path("recordings")
@@ -19,6 +22,8 @@ Settings = Annotated[tyro.conf.UseAppendAction[tuple[tuple[str, ...], ...]], arg
 """Several after one flag, or the flag several times."""
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
+BROKEN_PIPE = 141
+"""The same where the reader of the output has gone."""
 
 app = SubcommandApp()
 
@@ -248,13 +253,17 @@ def play(
     return 0
 
 
-app.command(recording_commands.view)
-app.command(recording_commands.repeat)
-app.command(recording_commands.runs)
-app.command(recording_commands.steps)
-app.command(recording_commands.label)
-app.command(recording_commands.reindex)
-app.command(recording_commands.gallery)
+_OTHERS = (
+    recording_commands.view,
+    recording_commands.repeat,
+    recording_commands.runs,
+    recording_commands.steps,
+    recording_commands.label,
+    recording_commands.reindex,
+    recording_commands.gallery,
+)
+for _command in _OTHERS:
+    app.command(_command)
 
 
 @app.command
@@ -278,28 +287,47 @@ def scenes(kind: Positional[str | None] = None, /) -> int:
 
 def main() -> None:
     """Entry point: every error that a user can cause is one line on stderr and exit code 2."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # names that are no UTF-8, or a terminal that knows ASCII only
+            stream.reconfigure(errors="backslashreplace")
     try:
-        code = app.cli(
+        refuse_repeated(sys.argv[1:], (run, localize, sweep, play, scenes, *_OTHERS))
+        code: object = app.cli(
             prog="spherloc",
             description="See why visual localization with fisheye and 360-degree cameras succeeds or fails.",
             sort_subcommands=False,
         )
-        sys.stdout.flush()
+        _flush()
+    except SystemExit as ended:
+        code = ended.code
     except SpherlocError as error:
-        print(f"spherloc: {error}", file=sys.stderr)
+        _complain(str(error))
         code = 2
     except KeyboardInterrupt:
         code = INTERRUPTED
     except BrokenPipeError:
-        _drop_output()
-        code = 141
+        code = BROKEN_PIPE
     except OSError as error:
-        _drop_output()
-        print(f"spherloc: {show(error.filename or 'output')}: {error.strerror}; check path and disk.", file=sys.stderr)
+        what = "" if error.filename is None else f" with {show(error.filename)}"
+        _complain(f"the system cannot go on{what} ({reason(error)}); check the path, the output and the disks.")
         code = 2
+    try:
+        _flush()
+    except OSError as error:
+        code = code or (BROKEN_PIPE if isinstance(error, BrokenPipeError) else 2)
     sys.exit(code)
 
 
-def _drop_output() -> None:
-    """Python would complain again at its end about what it cannot print."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+def _flush() -> None:
+    """Raises ``OSError`` where the output cannot take it, after which Python does not try again at its end."""
+    try:
+        if sys.stdout is not None:
+            sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise
+
+
+def _complain(sentence: str) -> None:
+    with contextlib.suppress(OSError):  # there is nobody left to tell
+        print(f"spherloc: {sentence}", file=sys.stderr, flush=True)

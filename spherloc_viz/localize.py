@@ -10,7 +10,14 @@ from spherloc.datasets.map_scene import MapScene
 from spherloc.errors import InputError, RecordingError, show
 from spherloc.estimators import options_type, warm_up
 from spherloc.experiments.configuration import configuration_of
-from spherloc.experiments.results import ResultsLog, SequenceResults
+from spherloc.experiments.results import (
+    PICTURE,
+    SUMMARY,
+    TRAJECTORY,
+    TRUE_TRAJECTORY,
+    ResultsLog,
+    SequenceResults,
+)
 from spherloc.experiments.rows import LOCALIZED, UNREADABLE, QueryResult
 from spherloc.experiments.sequence import chosen_queries, localize
 from spherloc.experiments.summary import SuccessRate, Summary, summarize
@@ -26,7 +33,6 @@ from spherloc_viz.recording.origin import Origin
 if TYPE_CHECKING:
     from spherloc_viz.recording.keeping.keeper import Keeper
 
-TRAJECTORY, TRUE_TRAJECTORY, PICTURE, SUMMARY = "trajectory.tum", "truth.tum", "trajectory.png", "summary.json"
 MAX_TOLD = 5
 
 

@@ -19,15 +19,14 @@ from typing import Any, Literal
 
 import numpy as np
 
+from spherloc import registry
 from spherloc.errors import InputError, show
-from spherloc.problem import LEAST_PX, MOST_PX
+from spherloc.estimators import options_type
+from spherloc.ranges import check_option
 from spherloc.refine import RefinementOptions
 
 NONE = "none"
 """What is typed for None."""
-
-LEAST, MOST = 1e-12, 1e12
-"""Numbers that are not 0 or infinite lie between: powers of others under- or overflow in the solvers."""
 
 _parsing = threading.Lock()
 """Python's parser fails when several threads use it at once (3.11: "AST constructor recursion depth mismatch")."""
@@ -68,14 +67,8 @@ class OptionField:
             value = math.nan
         if isinstance(value, float) and math.isnan(value):
             raise InputError(f"option {self.name} is {show(text)}; give {self._accepted()}.")
-        self.check_size(value)
+        check_option(self.name, value)
         return value
-
-    def check_size(self, value: Any) -> None:
-        """Raise ``InputError`` for a number that is so small or large that solvers cannot reckon with it."""
-        least, most = (LEAST_PX, MOST_PX) if self.name.endswith("_px") else (LEAST, MOST)
-        if isinstance(value, float) and math.isfinite(value) and value and not least <= abs(value) <= most:
-            raise InputError(f"option {self.name} is {value}; give a number from {least:g} to {most:g}.")
 
     def _accepted(self) -> str:
         if self.choices:
@@ -89,8 +82,31 @@ class OptionField:
 
 
 @cache
+def usable_estimators() -> tuple[str, ...]:
+    """Names of the registered estimators without the extensions that cannot be imported or have no form."""
+    return tuple(name for name in registry.names("estimators") if not _why_unusable(name))
+
+
+def unusable_estimators() -> tuple[str, ...]:
+    """A sentence about every extension that ``usable_estimators`` leaves out."""
+    return tuple(filter(None, map(_why_unusable, registry.names("estimators"))))
+
+
+@cache
+def _why_unusable(name: str) -> str:
+    try:
+        option_fields(options_type(name))
+    except InputError as error:
+        return str(error) if show(name) in str(error) else f"{registry.title('estimators', name)} {error}"
+    return ""
+
+
+@cache
 def option_fields(kind: type) -> tuple[OptionField, ...]:
-    """The fields of an options dataclass: the estimator's own first, then those that all estimators share."""
+    """The fields of an options dataclass: the estimator's own first, then those that all estimators share.
+
+    Raises ``InputError`` for a field of a type that cannot be typed or shown.
+    """
     hints, docs = typing.get_type_hints(kind), field_docs(kind)
     shared = {item.name for item in dataclasses.fields(RefinementOptions)}
     found = [
@@ -103,7 +119,7 @@ def option_fields(kind: type) -> tuple[OptionField, ...]:
 def _form(hint: Any) -> tuple[type, tuple[str, ...], bool]:
     """Type, choices and whether None is a value, of a type hint.
 
-    Raises ``TypeError`` for one that neither the page nor the command line has a form for.
+    Raises ``InputError`` for one that neither the page nor the command line has a form for.
     """
     if typing.get_origin(hint) in (typing.Union, types.UnionType):
         inner = [part for part in typing.get_args(hint) if part is not type(None)]
@@ -114,16 +130,20 @@ def _form(hint: Any) -> tuple[type, tuple[str, ...], bool]:
         return str, typing.get_args(hint), False
     if hint in (bool, int, float):
         return hint, (), False
-    raise TypeError(f"options cannot be of type {hint}")
+    raise InputError(f"has an option of type {show(hint)}; options are bool, int, float, Literal of texts, or None.")
 
 
 def field_docs(kind: type) -> dict[str, str]:
     """The docstring under each field of a dataclass, inherited ones too, which Python itself does not keep."""
     docs: dict[str, str] = {}
     for owner in reversed(kind.__mro__[:-1]):
-        with _parsing:
-            body = ast.parse(textwrap.dedent(inspect.getsource(owner))).body[0]
-        assert isinstance(body, ast.ClassDef)
+        try:
+            with _parsing:
+                body = ast.parse(textwrap.dedent(inspect.getsource(owner))).body[0]
+        except (OSError, TypeError, SyntaxError):  # an extension whose source is not there
+            continue
+        if not isinstance(body, ast.ClassDef):
+            continue
         for field, text in zip(body.body, body.body[1:], strict=False):
             if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and isinstance(text, ast.Expr):
                 docs[field.target.id] = " ".join(str(ast.literal_eval(text.value)).split())

@@ -9,7 +9,7 @@ from spherloc.datasets.variation_text import parse_variation
 from spherloc.errors import RecordingError
 from spherloc.estimators import warm_up
 from spherloc.experiments.sweep import Entrant, Keep, SweepPlan, planned, run_sweep
-from spherloc.experiments.sweep_log import SweepLog
+from spherloc.experiments.sweep_log import PICTURE, SUMMARY, SweepLog
 from spherloc.experiments.sweep_summary import summarize
 from spherloc.experiments.sweep_text import parse_values
 from spherloc_viz.batch import Records, keeper_of, parse_settings
@@ -58,9 +58,9 @@ def sweep(
         points = summarize(plan.labels, log.rows)
         from spherloc_viz.sweep_plot import sweep_png
 
-        log.write(log.beside(".png"), sweep_png(load_scene(scene).name, over, plan.labels, points))
+        log.write(log.beside(PICTURE), sweep_png(load_scene(scene).name, over, plan.labels, points))
         print(text_of(sweep_table(over, points)))
-        print(f"written to {out}, {log.beside('.summary.csv').name} and {log.beside('.png').name}", flush=True)
+        print(f"written to {out}, {log.beside(SUMMARY).name} and {log.beside(PICTURE).name}", flush=True)
     return 0
 
 

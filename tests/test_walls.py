@@ -20,6 +20,8 @@ SCREENS = {"viser", "rerun", "rerun_sdk", "rerun_bindings", "plotly", "aiohttp",
 FLOORS = (
     ("spherloc.errors", "spherloc"),
     (
+        "spherloc.files",
+        "spherloc.ranges",
         "spherloc.registry",
         "spherloc.geometry",
         "spherloc.watch",
@@ -37,6 +39,7 @@ FLOORS = (
     ("spherloc_viz.gallery",),
     ("spherloc_viz.app", "spherloc_viz.lessons"),
     (
+        "spherloc_viz.arguments",
         "spherloc_viz.batch",
         "spherloc_viz.runs",
         "spherloc_viz.recording_commands",
@@ -46,6 +49,7 @@ FLOORS = (
         "spherloc_viz.scene_list",
         "spherloc_viz.progress",
         "spherloc_viz.cli",
+        "spherloc_viz.start",
     ),
 )
 """From the ground up; a room is a module or a package with all of its files."""

@@ -1,6 +1,5 @@
 """Checks that every camera model shares: calibration values, ``[camera]`` tables and coordinate arrays."""
 
-import reprlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import fields
@@ -11,7 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from spherloc.cameras.base import FloatArray
-from spherloc.errors import CalibrationError, ProblemError
+from spherloc.errors import CalibrationError, ProblemError, show
 
 MAX_SIDE_PX = 100_000
 """Largest width or height: beyond any panorama, so that a corrupt size cannot exhaust the memory."""
@@ -130,14 +129,6 @@ def camera_to_table(camera: Any) -> dict[str, Any]:
         value = getattr(camera, field.name)
         table[field.name] = list(value) if isinstance(value, tuple) else value
     return table
-
-
-def show(value: Any) -> str:
-    """A value for an error message: shortened and on one line."""
-    try:
-        return " ".join(reprlib.repr(value).split())
-    except ValueError:  # Python refuses to print integers of thousands of digits
-        return "a number of too many digits"
 
 
 def rows(name: str, array: Any, columns: int) -> FloatArray:

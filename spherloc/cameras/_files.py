@@ -6,11 +6,15 @@ from typing import Any
 
 import yaml
 
-from spherloc.cameras._checks import coefficients, finite, located, show
-from spherloc.errors import CalibrationError
+from spherloc.cameras._checks import coefficients, finite, located
+from spherloc.errors import MOST_REASON, CalibrationError, reason, shorten, show
+from spherloc.files import read_file
 
 MAX_FILE_BYTES = 256 * 1024
 """Calibrations take a few kilobytes, and the YAML reader minutes for megabytes."""
+
+MAX_VALUES = 100_000
+"""Values of a YAML file with its aliases written out."""
 
 PIXEL_CENTRE_SHIFT = 0.5
 """Added to a principal point that counts from the centre of the top-left pixel."""
@@ -31,15 +35,11 @@ class _Loader(yaml.SafeLoader):
 def read_text(path: Path) -> str:
     """The text of a calibration file; raises ``CalibrationError`` if there is no readable text of that size."""
     try:
-        if not path.is_file():
-            raise CalibrationError("there is no such file: give the path of a calibration file.")
-        with path.open("rb") as file:
-            content = file.read(MAX_FILE_BYTES + 1)
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise CalibrationError(f"cannot be read ({reason}): check the path and its permissions.") from None
-    if len(content) > MAX_FILE_BYTES:
-        raise CalibrationError(f"is larger than {MAX_FILE_BYTES // 1024} KiB, which no calibration is: {KNOWN}.")
+        content = read_file(path, MAX_FILE_BYTES)
+    except FileNotFoundError:
+        raise CalibrationError("there is no such file: give the path of a calibration file.") from None
+    except OSError as error:
+        raise CalibrationError(f"cannot be read ({reason(error)}): check the path and its permissions.") from None
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -51,15 +51,42 @@ def parse_yaml(text: str) -> Any:
     if text.startswith("%YAML"):
         text = f"#{text}"  # OpenCV's "%YAML:1.0" is no YAML directive; commented out, the lines keep their numbers
     try:
-        return yaml.load(text, _Loader)
+        loader = _Loader(text)
+        root = loader.get_single_node()
+        if root is None:
+            return None
+        _refuse_multiplied(root)
+        return loader.construct_document(root)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         place = f"line {mark.line + 1}" if mark else "the text"
-        reason = getattr(error, "problem", None) or getattr(error, "reason", None) or "syntax error"
-        raise CalibrationError(f"{place} is not valid YAML ({one_line(reason)}): correct it.") from None
+        what = shorten(
+            str(getattr(error, "problem", None) or getattr(error, "reason", None) or "syntax error"), MOST_REASON
+        )
+        raise CalibrationError(f"{place} is not valid YAML ({what}): correct it.") from None
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         # PyYAML lets these through for impossible dates, numbers and tags, and for deep nesting.
-        raise CalibrationError(f"a value is not valid YAML ({one_line(error)}): correct it.") from None
+        raise CalibrationError(f"a value is not valid YAML ({reason(error)}): correct it.") from None
+
+
+def _refuse_multiplied(root: yaml.Node) -> None:
+    """Raise ``CalibrationError`` if the document has more than ``MAX_VALUES`` values with its aliases written out."""
+    counts: dict[int, int | None] = {}
+
+    def count(node: yaml.Node) -> int:
+        """Values of a node; None while they are being counted."""
+        if id(node) not in counts:
+            counts[id(node)] = None
+            inner = [part for pair in node.value for part in pair] if isinstance(node, yaml.MappingNode) else node.value
+            counts[id(node)] = 1 + (sum(map(count, inner)) if isinstance(node, yaml.CollectionNode) else 0)
+        values = counts[id(node)]
+        if values is None or values > MAX_VALUES:
+            line = f"line {node.start_mark.line + 1}" if node.start_mark else "the text"
+            what = "a value that contains itself" if values is None else f"more than {MAX_VALUES:,} values"
+            raise CalibrationError(f"{line} has {what} by its aliases (*name): write the values themselves.")
+        return values
+
+    count(root)
 
 
 def parse_json(text: str) -> Any:
@@ -67,9 +94,9 @@ def parse_json(text: str) -> Any:
     try:
         return json.loads(text)
     except json.JSONDecodeError as error:
-        raise CalibrationError(f"line {error.lineno} is not valid JSON ({one_line(error.msg)}): correct it.") from None
+        raise CalibrationError(f"line {error.lineno} is not valid JSON ({error.msg}): correct it.") from None
     except (ValueError, RecursionError) as error:
-        raise CalibrationError(f"a value is not valid JSON ({one_line(error)}): correct it.") from None
+        raise CalibrationError(f"a value is not valid JSON ({reason(error)}): correct it.") from None
 
 
 def table_of(value: Any) -> dict[Any, Any]:
@@ -110,11 +137,6 @@ def size_of(table: dict[Any, Any], key: str) -> tuple[Any, Any]:
     if not isinstance(size, list) or len(size) != 2:
         raise CalibrationError(f"key '{key}' is {show(size)}: give a list of width and height.")
     return size[0], size[1]
-
-
-def one_line(error: object) -> str:
-    """The text of a library's error, as a part of a sentence."""
-    return " ".join(str(error).split()).rstrip(".")
 
 
 def _number(value: Any) -> Any:

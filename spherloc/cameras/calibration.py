@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from spherloc.cameras import kalibr, tool_files
-from spherloc.cameras._checks import located, show
-from spherloc.cameras._files import KNOWN, one_line, parse_json, parse_yaml, read_text, table_of, value_of
+from spherloc.cameras._checks import located
+from spherloc.cameras._files import KNOWN, parse_json, parse_yaml, read_text, table_of, value_of
 from spherloc.cameras.base import Camera
-from spherloc.errors import CalibrationError, InputError
-from spherloc.registry import lookup
+from spherloc.errors import CalibrationError, InputError, reason, show
+from spherloc.registry import guarded, lookup
 
 _ONE_CAMERA = {"imgw": tool_files.loc360, "parameter": tool_files.adapter, "Camera": tool_files.stella}
 """YAML files of one camera without a name, by the key at their top that gives them away."""
@@ -55,7 +55,13 @@ def camera_from_table(table: Any, where: str) -> Camera:
             camera_class = lookup("cameras", show(model).strip("'"))
         except InputError as error:
             raise CalibrationError(str(error)) from None
-    return camera_class.from_dict(table, where)
+    try:
+        with guarded("cameras", model, where):
+            return camera_class.from_dict(table, where)
+    except CalibrationError:
+        raise
+    except InputError as error:  # of an extension
+        raise CalibrationError(str(error)) from error
 
 
 def _looks_like_yaml(text: str) -> bool:
@@ -94,7 +100,7 @@ def _from_toml(text: str, name: str | None) -> Camera:
     try:
         document = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
-        raise CalibrationError(f"is neither YAML nor valid TOML ({one_line(error)}): {KNOWN}.") from None
+        raise CalibrationError(f"is neither YAML nor valid TOML ({reason(error)}): {KNOWN}.") from None
     _refuse_name(name)
     if "camera" in document:
         return camera_from_table(document["camera"], "[camera]")

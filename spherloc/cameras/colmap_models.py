@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from spherloc.cameras._checks import coefficients, located, show
+from spherloc.cameras._checks import coefficients, located
 from spherloc.cameras.base import Camera
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.cameras.eucm import Eucm
 from spherloc.cameras.fisheye624 import Fisheye624
 from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.cameras.mei import Mei
-from spherloc.errors import CalibrationError
+from spherloc.errors import CalibrationError, show
 
 
 def camera_from_colmap(model: str, width: int, height: int, params: Sequence[float] | np.ndarray, where: str) -> Camera:

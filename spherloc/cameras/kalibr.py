@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from spherloc.cameras._checks import located, show
+from spherloc.cameras._checks import located
 from spherloc.cameras._files import (
     PIXEL_CENTRE_SHIFT,
     list_of,
@@ -27,7 +27,7 @@ from spherloc.cameras.double_sphere import DoubleSphere
 from spherloc.cameras.eucm import Eucm
 from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.cameras.mei import Mei
-from spherloc.errors import CalibrationError
+from spherloc.errors import CalibrationError, show
 
 _ROTATION_TOLERANCE = 1e-3
 """Largest error of R R^T: matrices rounded to four digits pass, a scale or a wrong matrix does not."""

@@ -6,7 +6,7 @@ All but 360Loc put the centre of the top-left pixel at (0, 0): 0.5 is added to t
 from collections.abc import Callable
 from typing import Any
 
-from spherloc.cameras._checks import located, show
+from spherloc.cameras._checks import located
 from spherloc.cameras._files import PIXEL_CENTRE_SHIFT, numbers_of, section_of, size_of, table_of, value_of
 from spherloc.cameras.base import Camera
 from spherloc.cameras.double_sphere import DoubleSphere
@@ -14,7 +14,7 @@ from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.cameras.eucm import Eucm
 from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.cameras.mei import Mei
-from spherloc.errors import CalibrationError
+from spherloc.errors import CalibrationError, show
 
 STELLA_PREFIX = "Camera."
 """In front of OpenVSLAM's keys, where stella_vslam has a section."""

@@ -10,7 +10,8 @@ import numpy as np
 
 from spherloc.cameras.base import BoolArray, FloatArray
 from spherloc.datasets import scene_file
-from spherloc.errors import CalibrationError, InputError
+from spherloc.errors import CalibrationError, InputError, shorten
+from spherloc.files import is_file
 from spherloc.formats.colmap_model import ColmapImage, ColmapModel
 from spherloc.frontend.lifting import SfmLift
 from spherloc.frontend.view import View
@@ -51,7 +52,7 @@ def model_views(model: ColmapModel, images: Path) -> tuple[list[View], list[str]
             unsupported.setdefault(str(error), []).append(image.name)
             continue
         path = images / image.name
-        if not path.is_file():
+        if not is_file(path):
             missing.append(image.name)
             continue
         views.append(View(image.name, camera, path, image.cam_from_map, lift=ObservedLift(model, image)))
@@ -65,7 +66,7 @@ def model_views(model: ColmapModel, images: Path) -> tuple[list[View], list[str]
 def some(names: Sequence[str], what: str) -> str:
     """How many, and the first three by name: "5 images (a, b, c, ...)"."""
     plural = what if len(names) == 1 else f"{what}s"
-    return f"{len(names)} {plural} ({', '.join(names[:3])}{', ...' if len(names) > 3 else ''})"
+    return f"{len(names)} {plural} ({', '.join(map(shorten, names[:3]))}{', ...' if len(names) > 3 else ''})"
 
 
 def split_gravity(table: Mapping[str, Any], where: str) -> tuple[dict[str, Any], dict[str, Any]]:

@@ -1,6 +1,7 @@
 """Measured problems: a CSV of 2D-3D matches beside a TOML with camera, gravity and, where known, the truth."""
 
 import csv
+import io
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,8 @@ import numpy as np
 from spherloc.cameras.base import Camera
 from spherloc.cameras.calibration import camera_from_table
 from spherloc.datasets import scene_file
-from spherloc.errors import InputError, ProblemError, show
+from spherloc.errors import InputError, ProblemError, reason, show
+from spherloc.files import is_file, read_file, reading
 from spherloc.problem import Problem
 
 EXAMPLE = """\
@@ -112,7 +114,7 @@ def _image(table: dict[str, Any], path: Path) -> Path | None:
     if "image" not in table:
         return None
     image = path.parent / scene_file.text(table, "image", str(path))
-    if not image.is_file():
+    if not is_file(image):
         raise InputError(f"{path}: the image {image} does not exist; correct the path or remove the key 'image'.")
     return image
 
@@ -122,17 +124,12 @@ def read_csv(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
 
     Other columns are ignored. Raises ``InputError`` with the file and line of what is wrong.
     """
+    with reading(path, "correct the key 'correspondences'"):
+        content = read_file(path, MAX_CSV_BYTES)
     try:
-        if path.stat().st_size > MAX_CSV_BYTES:
-            raise InputError(f"{path}: larger than {MAX_CSV_BYTES:,} bytes; split it.")
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            return _parse(csv.reader(file), path)
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; correct the key 'correspondences'.") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); correct the key 'correspondences'.") from None
-    except (UnicodeDecodeError, csv.Error, ValueError) as error:
-        raise InputError(f"{path}: not a CSV text file in UTF-8 ({error}).") from None
+        return _parse(csv.reader(io.TextIOWrapper(io.BytesIO(content), encoding="utf-8-sig", newline="")), path)
+    except (csv.Error, ValueError) as error:
+        raise InputError(f"{path}: not a CSV text file in UTF-8 ({reason(error)}); correct or replace it.") from None
 
 
 def _parse(reader: Any, path: Path) -> tuple[np.ndarray, np.ndarray | None]:

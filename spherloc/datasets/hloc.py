@@ -19,7 +19,8 @@ from spherloc.datasets import map_settings, scene_file
 from spherloc.datasets.colmap_views import gravity_of_map, model_views, some, split_gravity
 from spherloc.datasets.hloc_matches import HlocMatcher
 from spherloc.datasets.map_scene import MapScene
-from spherloc.errors import InputError
+from spherloc.errors import InputError, shorten, show
+from spherloc.files import is_file
 from spherloc.formats.colmap_model import ColmapModel, read_model
 from spherloc.formats.hloc_files import open_hdf5, read_global_descriptors, read_pairs, read_queries, read_results
 from spherloc.frontend.frontend_options import MOST_REFERENCES
@@ -95,7 +96,7 @@ def _queries(
     """A view of every query whose image exists, and a remark on the others."""
     views, missing = [], []
     for name, camera in cameras.items():
-        if (images / name).is_file():
+        if is_file(images / name):
             views.append(View(name, camera, images / name, truth.get(name)))
         else:
             missing.append(name)
@@ -114,7 +115,10 @@ def _truth(path: Path, cameras: Mapping[str, Camera]) -> tuple[dict[str, FloatAr
     for named, cam_from_map in results.items():
         meant = [named] if named in cameras else by_tail.get(named, [])
         if len(meant) > 1:
-            raise InputError(f"{path}: {named} may be {meant[0]} or {meant[1]}; name the images with their folders.")
+            raise InputError(
+                f"{path}: {show(named)} may be {show(meant[0])} or {show(meant[1])}; name the images with their "
+                "folders."
+            )
         if meant:
             poses[meant[0]] = cam_from_map
         others += not meant
@@ -143,11 +147,13 @@ def _pairs(
     if absent:
         remarks.append(
             f"{len(absent)} of {len(asked)} pairs in {file} are skipped: their reference is not in the map, the first "
-            f"is {absent[0]}."
+            f"is {shorten(absent[0])}."
         )
     alone = [name for name in in_map if name not in pairs]
     if alone:
-        remarks.append(f"{len(alone)} of {len(queries)} queries have no pair in {file}, the first is {alone[0]}.")
+        remarks.append(
+            f"{len(alone)} of {len(queries)} queries have no pair in {file}, the first is {shorten(alone[0])}."
+        )
     return pairs, remarks
 
 

@@ -1,11 +1,8 @@
 """Image folder: a user's own panoramas or fisheyes, localized in a COLMAP model or among images with pose and depth."""
 
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
-
-from PIL import Image
 
 from spherloc.cameras.base import Camera, FloatArray
 from spherloc.datasets import map_settings, scene_file
@@ -13,8 +10,10 @@ from spherloc.datasets.colmap_views import gravity_of_map, model_views, some, sp
 from spherloc.datasets.map_scene import MapScene
 from spherloc.datasets.posed_images import read_camera, read_pose, read_references
 from spherloc.errors import InputError, show
+from spherloc.files import is_file, names_in
 from spherloc.formats.colmap_model import read_model
 from spherloc.frontend.view import View
+from spherloc.images import read_size
 
 EXAMPLE = """\
 kind = "image-folder"
@@ -110,7 +109,7 @@ def _names(table: dict[str, Any], path: Path) -> tuple[Path, list[str]]:
             raise InputError(f"{path}: images is {show(value)}; give a folder or a list of files.")
         return path.parent, value
     root = map_settings.folder(table, "images", path)
-    names = sorted(file.name for file in root.iterdir() if file.suffix.lower() in _SUFFIXES)
+    names = [name for name in names_in(root) if Path(name).suffix.lower() in _SUFFIXES]
     if not names:
         raise InputError(f"{path}: the folder {root} has no images ({', '.join(sorted(_SUFFIXES))}); correct 'images'.")
     return root, names
@@ -126,12 +125,11 @@ def _truth(table: dict[str, Any], names: list[str], where: str) -> dict[str, Flo
 
 def _unusable(path: Path, camera: Camera) -> str:
     """Why an image cannot be a query, judged by its header alone; empty if it can."""
-    if not path.is_file():
+    if not is_file(path):
         return "no such file"
     try:
-        with warnings.catch_warnings(action="ignore"), Image.open(path) as image:
-            width, height = image.size
-    except (OSError, ValueError, SyntaxError, EOFError, Image.DecompressionBombError):
+        width, height = read_size(path)
+    except InputError:
         return "not an image that can be read"
     if (width, height) != (camera.width, camera.height):
         return f"not {camera.width} x {camera.height} pixels, as the calibration is for"

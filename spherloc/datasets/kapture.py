@@ -19,6 +19,7 @@ from spherloc.datasets import map_settings, scene_file
 from spherloc.datasets.colmap_views import gravity_of_map, some, split_gravity
 from spherloc.datasets.map_scene import MapScene
 from spherloc.errors import InputError, show
+from spherloc.files import is_file
 from spherloc.formats.kapture_files import Kapture, Record, read_kapture
 from spherloc.frontend.frontend_options import FrontendOptions, frontend_options
 from spherloc.frontend.triangulation import TriangulationLift
@@ -90,7 +91,7 @@ def _file(root: Path, record: Record) -> Path:
 def _usable(kapture: Kapture, root: Path) -> tuple[list[Record], list[str]]:
     """Records with a camera and an image, by time, and a remark on those without an image."""
     known = [record for record in kapture.records if record.device in kapture.cameras]
-    missing = [record.image for record in known if not _file(root, record).is_file()]
+    missing = [record.image for record in known if not is_file(_file(root, record))]
     gone = set(missing)
     folder = root / "sensors" / "records_data"
     remarks = [f"{some(missing, 'image')} not found in {folder}: left out."] if missing else []
@@ -115,7 +116,9 @@ def _selected(records: Sequence[Record], table: Mapping[str, Any], key: str, whe
     if "every" in wanted:
         chosen = chosen[:: scene_file.integer(wanted, "every", place, 1, 10**9)]
     if not chosen and records:
-        raise InputError(f"{place}: fits none of the {len(records)} images, such as {records[0].image}; correct it.")
+        raise InputError(
+            f"{place}: fits none of the {len(records)} images, such as {show(records[0].image)}; correct it."
+        )
     return chosen
 
 
@@ -133,8 +136,9 @@ def _fitting(images: Sequence[str], patterns: Sequence[str], place: str) -> set[
     for pattern in patterns:
         fits = {pattern} & known or {image for image in images if fnmatchcase(image, pattern)}
         if images and not fits:
+            first = show(images[0])
             raise InputError(
-                f"{place}: {show(pattern)} fits none of the {len(images)} images, such as {images[0]}; correct it."
+                f"{place}: {show(pattern)} fits none of the {len(images)} images, such as {first}; correct it."
             )
         found |= fits
     return found

@@ -16,6 +16,7 @@ from spherloc.datasets import scene_file
 from spherloc.datasets.map_scene import MapScene
 from spherloc.datasets.map_settings import OPTIONAL, REQUIRED, folder, read_settings
 from spherloc.errors import InputError, show
+from spherloc.files import is_file
 from spherloc.formats.kitti360_files import (
     SIDES,
     Drive,
@@ -170,7 +171,7 @@ def _recorded(role: str, table: dict[str, Any], root: Path, where: str) -> _Reco
         frames=sorted(usable)[::step],
         poses=poses,
         scans=scans,
-        times_s=read_timestamps(times) if times.is_file() else (),
+        times_s=read_timestamps(times) if is_file(times) else (),
         remarks=tuple(filter(None, remarks)),
     )
 

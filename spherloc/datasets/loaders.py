@@ -5,6 +5,7 @@ import inspect
 from dataclasses import dataclass
 
 from spherloc import registry
+from spherloc.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -31,12 +32,16 @@ def scene_kinds() -> tuple[SceneKind, ...]:
 def scene_kind(name: str) -> SceneKind:
     """The kind of that name. Raises ``InputError`` naming the known ones if there is none."""
     try:
-        module = importlib.import_module(registry.lookup("datasets", name).__module__)
-    except (ImportError, AttributeError, SyntaxError) as error:  # a broken plug-in must not hide the others
-        return SceneKind(name, "", problem=f"{type(error).__name__}: {error}")
-    return SceneKind(
-        name=name,
-        documentation=inspect.getdoc(module) or "",
-        extras=tuple(getattr(module, "EXTRAS", ())),
-        example=getattr(module, "EXAMPLE", ""),
-    )
+        loader = registry.lookup("datasets", name)
+        with registry.guarded("datasets", name):
+            module = importlib.import_module(loader.__module__)
+            return SceneKind(
+                name=name,
+                documentation=inspect.getdoc(module) or "",
+                extras=tuple(map(str, getattr(module, "EXTRAS", ()))),
+                example=str(getattr(module, "EXAMPLE", "")),
+            )
+    except InputError as error:
+        if name not in registry.names("datasets"):
+            raise
+        return SceneKind(name, "", problem=str(error))  # an extension that cannot be imported hides no other

@@ -9,7 +9,7 @@ from spherloc.cameras.base import FloatArray
 from spherloc.datasets import scene_file
 from spherloc.datasets.map_scene import DEFAULT_THRESHOLDS, MapScene, Thresholds
 from spherloc.errors import InputError
-from spherloc.formats.layout import is_there
+from spherloc.files import is_folder
 from spherloc.frontend.pipeline import image_matcher
 from spherloc.frontend.view import View
 
@@ -99,6 +99,6 @@ def folder(table: Mapping[str, Any], key: str, path: Path) -> Path:
     Raises ``InputError`` if there is none.
     """
     named = path.parent / scene_file.text(table, key, str(path))
-    if not is_there(named.is_dir):
+    if not is_folder(named):
         raise InputError(f"{path}: {key} names the folder {named}, which does not exist; correct the path.")
     return named

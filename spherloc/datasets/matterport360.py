@@ -17,7 +17,8 @@ from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.datasets import map_settings, scene_file
 from spherloc.datasets.map_scene import MapScene
 from spherloc.datasets.registration import DepthRegistration
-from spherloc.errors import InputError, show
+from spherloc.errors import InputError, shorten, show
+from spherloc.files import is_file, names_in, read_file, reading
 from spherloc.formats.dpt import read_dpt
 from spherloc.frontend.lifting import DepthLift
 from spherloc.frontend.view import Lift, View
@@ -33,6 +34,7 @@ REGISTRATION_M = (0.4, 0.6, 0.8)
 CAMERA_FROM_BLENDER = np.diag([1.0, -1.0, -1.0])
 """Poses have Blender's camera axes: x right, y up, z backward."""
 AT_CAMERA = np.eye(3, 4)
+MAX_POSE_BYTES = 4096
 
 EXAMPLE = """\
 kind = "matterport360"
@@ -81,21 +83,23 @@ def _patterns(value: Any, where: str) -> list[str]:
 
 def _views(root: Path, along: Any, where: str) -> tuple[list[View], tuple[str, ...]]:
     """All panoramas with depth and pose, by name, and what was left out."""
-    images = sorted(root.glob("*_rgb.png"))
+    images = [root / name for name in names_in(root) if name.endswith("_rgb.png")]
     if not images:
         raise InputError(f"{where}: {root} has no file *_rgb.png; give the folder of one building as root.")
     views, remarks = [], []
     for image in images:
         stem = image.name.removesuffix("_rgb.png")
-        missing = [name for end in ("_depth.dpt", "_pose.txt") if not (root / (name := f"{stem}{end}")).is_file()]
+        missing = [name for end in ("_depth.dpt", "_pose.txt") if not is_file(root / (name := f"{stem}{end}"))]
         if missing:
-            remarks.append(f"{image.name} was skipped, since {' and '.join(missing)} is missing.")
+            remarks.append(
+                f"{shorten(image.name)} was skipped, since {' and '.join(map(shorten, missing))} is missing."
+            )
             continue
         try:
             camera = Equirectangular(*read_size(image))
             cam_from_map = read_pose(root / f"{stem}_pose.txt")
         except InputError as error:
-            remarks.append(f"{image.name} was skipped: {error}")
+            remarks.append(f"{shorten(image.name)} was skipped: {error}")
             continue
         lift = DepthLift(partial(read_dpt, _depth_file(image)), camera, cam_from_map, along)
         views.append(View(image.name, camera, image, cam_from_map, lift=lift))
@@ -119,11 +123,11 @@ def read_pose(path: Path) -> FloatArray:
 
     Raises ``InputError`` unless the file holds just seven finite numbers of which four are a rotation.
     """
+    with reading(path, "correct or remove it"):
+        content = read_file(path, MAX_POSE_BYTES)
     try:
-        words = path.read_bytes()[:4096].decode("ascii").split()
+        words = content.decode("ascii").split()
         numbers = np.array([float(word) for word in words])
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); correct or remove it.") from None
     except ValueError:
         raise InputError(f"{path}: holds something else than numbers; replace it.") from None
     if numbers.shape != (7,) or not np.isfinite(numbers).all():

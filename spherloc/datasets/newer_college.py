@@ -19,8 +19,9 @@ from spherloc.datasets.map_scene import MapScene
 from spherloc.datasets.map_settings import OPTIONAL, REQUIRED, folder, read_settings
 from spherloc.datasets.similarity import Similarity, align, similarity_of
 from spherloc.errors import InputError, show
+from spherloc.files import is_file, is_folder
 from spherloc.formats.colmap_model import ColmapImage, ColmapModel, read_model
-from spherloc.formats.layout import is_there, needed_file
+from spherloc.formats.layout import needed_file
 from spherloc.formats.newer_college_files import NAME_RULE, TimedImage, images_in, read_cloud, timestamp_of
 from spherloc.frontend.lifting import PointCloudLift, SfmLift
 from spherloc.frontend.view import Lift, View
@@ -91,7 +92,7 @@ class _Place:
     def folder(self, key: str) -> Path:
         """An existing folder that a key names."""
         named = self.root / scene_file.text(self.table, key, self.where)
-        if not is_there(named.is_dir):
+        if not is_folder(named):
             raise InputError(f"{self.where}: {key} names the folder {named}, which does not exist; correct the path.")
         return named
 
@@ -204,7 +205,7 @@ def _model_references(place: _Place, rig: _Rig) -> tuple[list[View], list[str]]:
     files = place.folder("reference_images")
     similarity, remark = _map_from_model(place, rig, model)
     images = list(model.images.values())[:: place.step("reference_step")]
-    present = [image for image in images if is_there((files / image.name).is_file)]
+    present = [image for image in images if is_file(files / image.name)]
     views = [
         View(
             name=image.name,

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from spherloc.cameras.base import Camera, FloatArray
 from spherloc.cameras.calibration import camera_from_table, load_camera
 from spherloc.datasets import scene_file
-from spherloc.errors import InputError, show
+from spherloc.errors import InputError, shorten, show
+from spherloc.files import is_file, size_of
 from spherloc.frontend.lifting import DepthLift
 from spherloc.frontend.view import View
 from spherloc.images import read_depth_png
@@ -78,12 +79,12 @@ def read_references(entries: Any, shared: Camera | None, path: Path) -> PosedIma
         _check(entry, where)
         pose = _pose(entry, path, where, trajectories)
         if pose is None:
-            without_pose.append(entry["image"])
+            without_pose.append(scene_file.text(entry, "image", where))
             continue
         views.append(_view(entry, pose, shared, path, where))
     remarks = (
         f"{len(without_pose)} of {len(entries)} references were left out, since their trajectory has no pose at their "
-        f"time or none within {MAX_GAP_S:g} s around it; the first is {without_pose[0]}."
+        f"time or none within {MAX_GAP_S:g} s around it; the first is {shorten(without_pose[0])}."
         if without_pose
         else ""
     )
@@ -101,7 +102,7 @@ def _view(entry: Mapping[str, Any], pose: FloatArray, shared: Camera | None, pat
     if camera is None:
         raise InputError(f"{where}: has no camera; add 'calibration' or 'camera', here or for all.")
     image = scene_file.text(entry, "image", where)
-    if not (path.parent / image).is_file():
+    if not is_file(path.parent / image):
         raise InputError(f"{where}: the image {path.parent / image} does not exist; correct the path.")
     return View(image, camera, path.parent / image, pose, lift=_lift(entry, camera, pose, path, where))
 
@@ -137,7 +138,7 @@ def _lift(entry: Mapping[str, Any], camera: Camera, pose: FloatArray, path: Path
             "optical axis."
         )
     depth = path.parent / scene_file.text(entry, "depth", where)
-    if not depth.is_file():
+    if not is_file(depth):
         raise InputError(f"{where}: the depth map {depth} does not exist; correct the path.")
     unit_m = scene_file.number(entry, "depth_unit_m", where, 1e-9, 1e6)
     return DepthLift(partial(read_depth, depth, unit_m), camera, pose, along)
@@ -152,6 +153,7 @@ def read_depth(path: Path, unit_m: float) -> NDArray[np.float32]:
         return read_depth_png(path).astype(np.float32) * np.float32(unit_m)
     try:
         # Mapped, so that a header that announces more than the file holds is refused before anything is allocated.
+        size_of(path)  # refuses a pipe, which numpy would wait for
         with warnings.catch_warnings(action="ignore"):
             depth = np.lib.format.open_memmap(path, mode="r")
         if depth.ndim == 2 and depth.dtype.kind in "fiu":

@@ -18,6 +18,7 @@ from spherloc.cameras.calibration import camera_from_table
 from spherloc.datasets import map_settings, scene_file
 from spherloc.datasets.map_scene import MapScene
 from spherloc.errors import InputError
+from spherloc.files import is_file
 from spherloc.frontend.lifting import DepthLift
 from spherloc.frontend.view import View
 from spherloc.geometry import pose, so3_exp
@@ -101,7 +102,7 @@ class RenderedView(View):
 
     def usable_pixels(self) -> BoolArray:
         """See ``View``. Features are kept by their image's content, and this is asked before they are sought."""
-        if not self.path.is_file():
+        if not is_file(self.path):
             self.picture.image()
         return super().usable_pixels()
 

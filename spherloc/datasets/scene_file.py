@@ -9,7 +9,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from spherloc import registry
-from spherloc.errors import InputError, show
+from spherloc.errors import InputError, reason, show
+from spherloc.files import is_file, read_file, reading
 from spherloc.problem import Problem
 
 MAX_BYTES = 1_000_000
@@ -43,7 +44,8 @@ def load_scene(path: Path) -> Scene:
         load = registry.lookup("datasets", kind)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    return load(table, path)
+    with registry.guarded("datasets", kind, str(path)):
+        return load(table, path)
 
 
 def read_table(path: Path) -> dict[str, Any]:
@@ -51,22 +53,16 @@ def read_table(path: Path) -> dict[str, Any]:
 
     Raises ``InputError`` for a missing file and for one that is no TOML.
     """
+    with reading(path, "give the path of a scene file (TOML) or a bundled scene's name"):
+        content = read_file(path, MAX_BYTES)
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise InputError(f"{path}: larger than {MAX_BYTES:,} bytes, so it is no scene file; give a TOML scene.")
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(
-            f"{path}: no such file; give the path of a scene file (TOML) or a bundled scene's name."
-        ) from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); give the path of a scene file (TOML).") from None
+        return tomllib.loads(content.decode("utf-8"))
     except UnicodeDecodeError:
         raise InputError(f"{path}: not a text file in UTF-8; give the path of a scene file (TOML).") from None
     except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}: not valid TOML: {str(error)[:200]}; correct it there.") from None
+        raise InputError(f"{path}: not valid TOML: {reason(error)}; correct it there.") from None
     except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: no usable scene file ({str(error)[:100]}); correct or replace it.") from None
+        raise InputError(f"{path}: no usable scene file ({reason(error)}); correct or replace it.") from None
 
 
 def bundled_scenes() -> dict[str, Path]:
@@ -76,7 +72,7 @@ def bundled_scenes() -> dict[str, Path]:
 
 def scene_path(given: Path) -> Path:
     """The scene file that is meant: ``given``, unless there is no such file and it is the name of a bundled scene."""
-    return given if given.exists() else bundled_scenes().get(str(given), given)
+    return given if is_file(given) else bundled_scenes().get(str(given), given)
 
 
 def check_keys(table: Mapping[str, Any], required: set[str], optional: set[str], where: str) -> None:

@@ -190,7 +190,7 @@ def _camera(path: Path) -> Camera:
     """The camera of a file, read once for as long as the file does not change."""
     try:
         state = path.stat()
-    except OSError:
+    except (OSError, ValueError):
         return load_camera(path)  # which says what is wrong
     return _camera_of_state(path, state.st_mtime_ns, state.st_size)
 

@@ -16,6 +16,7 @@ from spherloc import registry
 from spherloc.bounds import Bounds, bounds_of
 from spherloc.errors import InputError, show
 from spherloc.problem import AlignedProblem, Problem
+from spherloc.ranges import check_options, check_seed
 from spherloc.refine import RefinementOptions
 from spherloc.trace import Certificate, Stage, Trace
 from spherloc.watch import Cancelled, Watch
@@ -48,7 +49,8 @@ class Estimator(Protocol):
     """A robust pose estimator, registered by entry point."""
 
     Options: ClassVar[type]
-    """A frozen dataclass with a default for every field; ``bound_px`` is one of them."""
+    """A frozen dataclass that derives from ``RefinementOptions``, with a default for every field; ``bound_px`` is one
+    of them."""
 
     @staticmethod
     def run(aligned: AlignedProblem, options: Any, bounds: Bounds, seed: int, clock: "Clock") -> Outcome:
@@ -86,8 +88,27 @@ def versions() -> dict[str, str]:
 
 
 def options_type(estimator: str) -> type:
-    """The options dataclass of a registered estimator; ``InputError`` if there is none of that name."""
-    return registry.lookup("estimators", estimator).Options
+    """The options dataclass of a registered estimator.
+
+    Raises ``InputError`` if there is none of that name, or if it is an extension that cannot be used.
+    """
+    return estimator_of(estimator).Options
+
+
+@lru_cache
+def estimator_of(name: str) -> Any:
+    """A registered estimator. Raises ``InputError`` if there is none of that name or it is no ``Estimator``."""
+    kind = registry.lookup("estimators", name)
+    options = getattr(kind, "Options", None)
+    if not (
+        isinstance(options, type) and issubclass(options, RefinementOptions) and callable(getattr(kind, "run", None))
+    ):
+        what = registry.title("estimators", name)
+        raise InputError(f"{what} has no Options that derive from RefinementOptions, or no run(); tell its authors.")
+    with registry.guarded("estimators", name):
+        if not hasattr(options(), "bound_px"):
+            raise InputError(f"{registry.title('estimators', name)} has no option bound_px; tell its authors.")
+    return kind
 
 
 def default_options(estimator: str, problem: Problem) -> Any:
@@ -110,6 +131,22 @@ def check_positive(options: Any) -> None:
             raise InputError(f"option {item.name} is {show(value)}; give a positive number.")
 
 
+def _check_outcome(estimator: str, outcome: Any, count: int) -> None:
+    """Raise ``InputError`` where an extension returns what cannot become a trace of ``count`` usable matches."""
+    if not registry.extension_of("estimators", estimator):
+        return
+    pose = outcome.cam_from_map
+    good = {
+        "stages": all(isinstance(stage, Stage) and isinstance(stage.kind, str) for stage in outcome.stages),
+        "a pose": pose is None or (np.shape(pose) == (3, 4) and bool(np.isfinite(pose).all())),
+        "an inlier mask": np.shape(outcome.inlier_mask) == (count,) and np.asarray(outcome.inlier_mask).dtype == bool,
+    }
+    wrong = [what for what, fits in good.items() if not fits]
+    if wrong:
+        what = f"{registry.title('estimators', estimator)} returned {' and '.join(wrong)}"
+        raise InputError(f"{what} of a wrong form; tell its authors.")
+
+
 def estimate(
     problem: Problem, estimator: str = "mc", options: Any = None, seed: int = 0, watch: Watch | None = None
 ) -> Trace:
@@ -118,22 +155,24 @@ def estimate(
     ``options`` is an instance of ``options_type(estimator)``; None takes the defaults. The same arguments give the
     same trace but for its timings. ``watch``, a new one, follows the run and can cancel it from any thread.
 
-    Raises ``Cancelled`` if it did, ``InputError`` for an unknown estimator, options of another estimator, or a
-    seed outside 0 to 2^63 - 1.
+    Raises ``Cancelled`` if it did, ``InputError`` for an unknown estimator, options of another estimator or beyond
+    ``spherloc.ranges``, a seed outside 0 to 2^63 - 1, and for whatever an extension raises.
     """
-    kind = registry.lookup("estimators", estimator)
+    kind = estimator_of(estimator)
     options = default_options(estimator, problem) if options is None else options
     if not isinstance(options, kind.Options):
         raise InputError(f"estimator {estimator} takes {kind.Options.__name__}, not {type(options).__name__}.")
-    if not 0 <= seed < 2**63:
-        raise InputError(f"seed is {seed}; give a number from 0 to 2^63 - 1.")
+    check_options(options)
+    check_seed(seed)
     aligned = problem.aligned
     bounds = bounds_of(aligned, options.bound_px)
     clock = Clock(watch)
     start = time.perf_counter()
     try:
         clock.watch.check()
-        outcome = kind.run(aligned, options, bounds, seed, clock)
+        with registry.guarded("estimators", estimator):
+            outcome = kind.run(aligned, options, bounds, seed, clock)
+            _check_outcome(estimator, outcome, len(aligned.index))
         clock.watch.finish()
     except Cancelled as cancelled:
         raise cancelled.with_traceback(None) from None  # whose frames would keep the gigabytes of the run alive

@@ -63,6 +63,8 @@ PAIR_EFFORT = 20_000_000
 """Words touched by the search over pairs for an ``effort`` of 1."""
 POSITION_EFFORT = 150_000_000
 """Matches tested by the search over positions for an ``effort`` of 1."""
+MOST_EFFORT = 1 << 50
+"""Months of work; more does not fit into the kernels' counters."""
 
 
 class ExactMaximumConsensus:
@@ -136,7 +138,7 @@ def _search(
             bounds,
             rate,
             _poses(guess),
-            int(options.effort * PAIR_EFFORT),
+            int(min(options.effort * PAIR_EFFORT, MOST_EFFORT)),
             options.time_budget_s,
             clock.watch,
         )
@@ -153,7 +155,7 @@ def _search(
         aligned,
         matches,
         start,
-        int(options.effort * POSITION_EFFORT),
+        int(min(options.effort * POSITION_EFFORT, MOST_EFFORT)),
         deadline,
         yaw_bound,
         clock.watch,

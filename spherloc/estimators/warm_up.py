@@ -5,23 +5,35 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import spherloc
 from spherloc import registry
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.datasets.synthetic import SyntheticScene
+from spherloc.errors import InputError
 from spherloc.estimators.base import estimate, options_type
 
 
 def warm_up(announce: Callable[[str], None] | None = None) -> None:
     """Run every estimator once on a tiny problem: a minute after an installation, a fraction of a second later.
 
-    ``announce`` is called with a sentence to show if it will be long.
+    ``announce`` is called with a sentence to show if it will be long, and for every extension that fails here, which
+    hinders nothing else.
     """
     if announce is not None and not any(Path(os.environ["NUMBA_CACHE_DIR"]).rglob("*.nbi")):
-        announce("preparing the solvers, once after an installation: about a minute …")
+        how_often = "once after an installation"
+        if spherloc.kernels_are_temporary:
+            how_often = "at every start, since no folder to keep them can be written (NUMBA_CACHE_DIR names another)"
+        announce(f"preparing the solvers, {how_often}: about a minute …")
     camera = Equirectangular(width=2048, height=1024)  # sharp enough for every stage to have something to do
     scene = SyntheticScene("warm-up", camera, correspondences=8, outlier_rate=0.25, noise_px=0.1, seed=0)
     for estimator in registry.names("estimators"):
-        estimate(scene.problem(), estimator)
+        try:
+            estimate(scene.problem(), estimator)
+        except InputError as error:
+            if not registry.extension_of("estimators", estimator):
+                raise
+            if announce is not None:
+                announce(f"{error} The others work.")
     # So murky that the exact search has to use all that it has.
     murky = replace(scene, correspondences=12, outlier_rate=0.6, noise_px=10.0).problem()
     estimate(murky, "mc-exact", options_type("mc-exact")(bound_px=40.0))

@@ -17,6 +17,7 @@ from spherloc.datasets.scene_file import numbers
 from spherloc.errors import InputError, show
 from spherloc.estimators.base import versions
 from spherloc.experiments.differences import differences
+from spherloc.files import read_file, reading
 
 FORMAT = 1
 MAX_BYTES = 1_000_000
@@ -68,10 +69,8 @@ def configuration_of(scene: MapScene, path: Path, estimator: str, options: Any, 
 
     Raises ``InputError`` if the file can no longer be read.
     """
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); keep the scene file where it is.") from None
+    with reading(path, "keep the scene file where it is"):
+        content = read_file(path, MAX_BYTES)
     return Configuration(
         scene=str(path),
         scene_sha256=hashlib.sha256(content).hexdigest(),
@@ -89,14 +88,10 @@ def configuration_of(scene: MapScene, path: Path, estimator: str, options: Any, 
 
 def read_configuration(path: Path) -> Configuration:
     """A ``configuration.json``. Raises ``InputError`` if it is missing, unreadable, damaged or of another version."""
+    with reading(path, "give the folder of a sequence's results"):
+        content = read_file(path, MAX_BYTES)
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise InputError(f"{path}: larger than {MAX_BYTES:,} bytes, so it is no configuration of a run.")
-        table = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; give the folder of a sequence's results.") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); make it readable.") from None
+        table = json.loads(content.decode("utf-8"))
     except (ValueError, RecursionError):
         raise InputError(f"{path}: is damaged; give another folder and localize the sequence again.") from None
     if isinstance(table, dict) and table.get("format") != FORMAT:

@@ -12,12 +12,16 @@ from typing import Self
 import numpy as np
 
 from spherloc.cameras.base import FloatArray
-from spherloc.errors import InputError
+from spherloc.errors import InputError, reason, show
 from spherloc.experiments.configuration import Configuration, read_configuration
 from spherloc.experiments.differences import in_short
 from spherloc.experiments.rows import LOCALIZED, QueryResult, csv_text, json_line, row_of_json
+from spherloc.files import read_file, reading
 
 CONFIGURATION, ROWS, TABLE = "configuration.json", "results.jsonl", "results.csv"
+TRAJECTORY, TRUE_TRAJECTORY, PICTURE, SUMMARY = "trajectory.tum", "truth.tum", "trajectory.png", "summary.json"
+REWRITTEN = (TABLE, TRAJECTORY, TRUE_TRAJECTORY, PICTURE, SUMMARY)
+"""Files of the folder that every run of the sequence writes anew."""
 MAX_BYTES = 2_000_000_000
 
 
@@ -91,21 +95,19 @@ def read_results(folder: Path) -> SequenceResults:
 
 def _read_rows(path: Path) -> tuple[tuple[QueryResult, ...], int]:
     """Rows in the order of the sequence, and how many bytes of the file hold whole lines."""
-    try:
-        if path.stat().st_size > MAX_BYTES:
-            raise InputError(f"{path}: larger than {MAX_BYTES:,} bytes, so it holds no results of a sequence.")
-        content = path.read_bytes()
-    except FileNotFoundError:
+    if not os.path.lexists(path):
         return (), 0
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); make it readable.") from None
+    with reading(path, "give another folder"):
+        content = read_file(path, MAX_BYTES)
     whole = content[: content.rfind(b"\n") + 1]
     rows: dict[str, QueryResult] = {}
     for number, line in enumerate(whole.split(b"\n")[:-1], start=1):
         place = f"{path}, line {number}"
         row = row_of_json(line.decode("utf-8", errors="replace"), place)
         if row.query in rows:
-            raise InputError(f"{place}: the query {row.query} is there a second time; delete one of the two lines.")
+            raise InputError(
+                f"{place}: the query {show(row.query)} is there a second time; delete one of the two lines."
+            )
         rows[row.query] = row
     return tuple(sorted(rows.values(), key=lambda row: row.index)), len(whole)
 
@@ -126,7 +128,7 @@ class ResultsLog:
         """Whether a line that an earlier run left half written was removed."""
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
+        except (OSError, ValueError) as error:
             raise self._unwritable(error) from None
         with contextlib.ExitStack() as stack:
             self._lock(stack)
@@ -195,15 +197,13 @@ class ResultsLog:
         try:
             yield
         except OSError as error:
-            reason = error.strerror or error
             raise InputError(
-                f"{self.folder / name}: cannot be written ({reason}); what is done is kept ({len(self.rows)} queries): "
-                "make room there and give the same command to go on."
+                f"{self.folder / name}: cannot be written ({reason(error)}); what is done is kept "
+                f"({len(self.rows)} queries): make room there and give the same command to go on."
             ) from None
 
-    def _unwritable(self, error: OSError) -> InputError:
-        reason = error.strerror or error
-        return InputError(f"{self.folder}: results cannot be written there ({reason}); give another folder.")
+    def _unwritable(self, error: OSError | ValueError) -> InputError:
+        return InputError(f"{self.folder}: results cannot be written there ({reason(error)}); give another folder.")
 
     def _lock(self, stack: contextlib.ExitStack) -> None:
         """Keep other processes out of the folder; the system ends the lock whatever ends this process."""
@@ -224,16 +224,20 @@ class ResultsLog:
 
     def _configure(self, configuration: Configuration) -> None:
         path = self.folder / CONFIGURATION
-        if path.exists():
+        if os.path.lexists(path):
             differences = read_configuration(path).differences(configuration)
             if differences:
                 raise InputError(
                     f"{self.folder}: holds results of another configuration ({in_short(differences)}); give another "
                     "folder."
                 )
-        elif (self.folder / ROWS).exists():
-            raise InputError(f"{self.folder}: holds results without their {CONFIGURATION}; give another folder.")
         else:
+            others = [name for name in (ROWS, *REWRITTEN) if os.path.lexists(self.folder / name)]
+            if others:
+                raise InputError(
+                    f"{self.folder}: already holds {', '.join(others)}, but no {CONFIGURATION}, so they are not of a "
+                    "sequence that could go on; give another folder."
+                )
             self.write(CONFIGURATION, configuration.json_text().encode())
         self.configuration = configuration
 

@@ -12,7 +12,7 @@ from functools import cache
 from multiprocessing.connection import Connection
 from typing import Any, Protocol
 
-from spherloc.errors import InputError
+from spherloc.errors import InputError, reason
 from spherloc.estimators import warm_up
 from spherloc.experiments.sweep_plan import Job, SweepPlan
 from spherloc.experiments.sweep_rows import SweepRow
@@ -135,9 +135,16 @@ class LocalCrew:
     def _start(self) -> None:
         spawn = multiprocessing.get_context("spawn")  # the page has threads, which a fork would break
         reader, self._lifeline = spawn.Pipe(duplex=False)
-        self._pool = ProcessPoolExecutor(self._workers, spawn, _begin, (reader,))
-        with _deaf_to_ctrl_c():
-            self._begun = self._pool.submit(os.getpid)
+        try:
+            self._pool = ProcessPoolExecutor(self._workers, spawn, _begin, (reader,))
+            with _deaf_to_ctrl_c():
+                self._begun = self._pool.submit(os.getpid)
+        except OSError as error:
+            self._lifeline.close()
+            raise InputError(
+                f"the worker processes cannot be started ({reason(error)}); see whether /dev/shm can be written, how "
+                "many processes are allowed."
+            ) from None
 
     def _replace(self) -> None:
         begun = _result(self._begun) is not None

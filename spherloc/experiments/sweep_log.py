@@ -9,14 +9,17 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from spherloc.errors import InputError, show
+from spherloc.errors import InputError, reason, show
 from spherloc.experiments.differences import differences, in_short
 from spherloc.experiments.sweep_plan import SweepPlan
 from spherloc.experiments.sweep_rows import SweepRow, columns, csv_line, row_line, row_of_line
 from spherloc.experiments.sweep_summary import rows_text, summarize, summary_text
+from spherloc.files import is_file, read_file, reading, size_of
 
 MAX_BYTES = 1_000_000_000
 MAX_PLAN_BYTES = 1_000_000
+PLAN, SUMMARY, PICTURE = ".plan.json", ".summary.csv", ".png"
+"""Endings of the files beside the table."""
 _UNCOMPARED = {"scene", "runs"}
 """A scene that was moved is the same scene, and more runs add to those that are done."""
 
@@ -24,31 +27,32 @@ _UNCOMPARED = {"scene", "runs"}
 class SweepLog:
     """Appends rows to a CSV. Use it as a context manager; one process at a time may have the file.
 
-    Beside ``NAME.csv`` are ``NAME.plan.json``, by which a sweep knows that the file is its own, and, at the end,
-    ``NAME.summary.csv``.
+    Beside ``NAME.csv`` are ``NAME.plan.json``, by which a sweep knows that the files are its own, and, at the end,
+    ``NAME.summary.csv`` and ``NAME.png``.
     """
 
     def __init__(self, path: Path, plan: SweepPlan) -> None:
         """Begin a file or go on with one.
 
-        Raises ``InputError`` if it cannot be written, holds the runs of another plan, is damaged, or if another
-        process writes to it.
+        Raises ``InputError`` if it cannot be written, holds the runs of another plan, is damaged, if another process
+        writes to it, or if a file beside it has a name that the sweep would write to and is not the sweep's own.
         """
         self.path, self._plan = Path(path), plan
         if self.path.suffix != ".csv":
             raise InputError(f"{self.path}: the table of a sweep ends with .csv; name it so.")
         self.rows: list[SweepRow] = []
         """Those of earlier times first."""
+        self._refuse_others()
         with contextlib.ExitStack() as stack:
             try:
                 self.path.parent.mkdir(parents=True, exist_ok=True)
                 self._file = stack.enter_context(self.path.open("ab"))
-            except OSError as error:
-                raise InputError(
-                    f"{self.path}: cannot be written ({error.strerror or error}); give another file."
-                ) from None
+            except (OSError, ValueError) as error:
+                raise InputError(f"{self.path}: cannot be written ({reason(error)}); give another file.") from None
             self._lock()
-            self._compare()
+            if os.path.lexists(self.beside(PLAN)):
+                self._compare()  # another process may have been quicker
+            self.write(self.beside(PLAN), (json.dumps(plan.record(), indent=2, allow_nan=False) + "\n").encode())
             self._read()
             self._open = stack.pop_all()
 
@@ -86,7 +90,7 @@ class SweepLog:
         """Put the rows in order, whoever was quicker, and write the summary. Raises ``InputError`` if that fails."""
         self.write(self.path, rows_text(self._plan.over, self._plan.labels, self.rows).encode())
         points = summarize(self._plan.labels, self.rows)
-        self.write(self.beside(".summary.csv"), summary_text(self._plan.over, points).encode())
+        self.write(self.beside(SUMMARY), summary_text(self._plan.over, points).encode())
 
     def write(self, path: Path, content: bytes) -> None:
         """Write a file so that no reader sees half of it. Raises ``InputError`` if that fails."""
@@ -105,9 +109,22 @@ class SweepLog:
             yield
         except OSError as error:
             raise InputError(
-                f"{path}: cannot be written ({error.strerror or error}); what is done is kept ({len(self.rows)} runs): "
+                f"{path}: cannot be written ({reason(error)}); what is done is kept ({len(self.rows)} runs): "
                 "make room there and give the same command to go on."
             ) from None
+
+    def _refuse_others(self) -> None:
+        """Raise ``InputError`` where a new sweep would write to a file that is not its own; before anything is made."""
+        if os.path.lexists(self.beside(PLAN)):
+            self._compare()
+        elif os.path.lexists(self.path) and not (is_file(self.path) and size_of(self.path) == 0):
+            raise InputError(
+                f"{self.path}: is no table of a sweep, or has lost its {self.beside(PLAN).name}; give another file."
+            )
+        else:
+            for path in map(self.beside, (SUMMARY, PICTURE)):
+                if os.path.lexists(path):
+                    raise InputError(f"{path}: is there already, and the sweep would write to it; give another file.")
 
     def _lock(self) -> None:
         """Keep other processes off the file; the system ends the lock whatever ends this process."""
@@ -123,22 +140,18 @@ class SweepLog:
             return
 
     def _compare(self) -> None:
-        path, now = self.beside(".plan.json"), self._plan.record()
-        begun = self.path.stat().st_size > 0
-        if begun and not path.exists():
-            raise InputError(f"{self.path}: is no table of a sweep, or has lost its {path.name}; give another file.")
-        if begun:
-            found = differences(_read_plan(path), json.loads(json.dumps(now)), _UNCOMPARED)
-            if found:
-                listed = in_short(list(found.values()))
-                raise InputError(f"{self.path}: holds the runs of another sweep ({listed}); give another file.")
-        self.write(path, (json.dumps(now, indent=2, allow_nan=False) + "\n").encode())
+        """Raise ``InputError`` if the plan beside the table is another one."""
+        path = self.beside(PLAN)
+        found = differences(_read_plan(path), json.loads(json.dumps(self._plan.record())), _UNCOMPARED)
+        if found:
+            listed = in_short(list(found.values()))
+            raise InputError(
+                f"{self.path}: holds the runs of another sweep ({listed}, by {path.name}); give another file."
+            )
 
     def _read(self) -> None:
-        size = self.path.stat().st_size
-        if size > MAX_BYTES:
-            raise InputError(f"{self.path}: larger than {MAX_BYTES:,} bytes; give another file.")
-        content = self.path.read_bytes()
+        with reading(self.path, "give another file"):
+            content = read_file(self.path, MAX_BYTES)
         whole = content[: content.rfind(b"\n") + 1]
         header = csv_line(columns(self._plan.over))
         lines = whole.decode("utf-8", errors="replace").split("\n")[:-1]
@@ -165,14 +178,12 @@ class SweepLog:
 
 
 def _read_plan(path: Path) -> dict[str, Any]:
+    with reading(path, "give another file for the sweep"):
+        content = read_file(path, MAX_PLAN_BYTES)
     try:
-        if path.stat().st_size > MAX_PLAN_BYTES:
-            raise ValueError
-        table = json.loads(path.read_text(encoding="utf-8"))
+        table = json.loads(content.decode("utf-8"))
         if not isinstance(table, dict):
             raise ValueError
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); make it readable.") from None
     except (ValueError, RecursionError):
         raise InputError(f"{path}: is damaged; give another file for the sweep.") from None
     return table

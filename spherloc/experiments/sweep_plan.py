@@ -13,13 +13,14 @@ from typing import Any
 
 import numpy as np
 
-from spherloc.datasets import load_scene
+from spherloc.datasets import load_scene, scene_file
 from spherloc.datasets.synthetic import SyntheticScene
 from spherloc.datasets.variation import Variation
 from spherloc.errors import InputError, show
 from spherloc.estimators import default_options, estimate, options_type
 from spherloc.estimators.base import versions
 from spherloc.experiments.sweep_rows import SweepRow, row_of
+from spherloc.files import read_file, reading
 from spherloc.problem import Problem
 from spherloc.trace import Trace
 
@@ -270,12 +271,8 @@ def _scene(path: str, sha256: str) -> SyntheticScene:
 
 def content_hash(path: Path) -> str:
     """SHA-256 of a file's content; raises ``InputError`` if it cannot be read."""
-    try:
-        return hashlib.sha256(path.read_bytes()).hexdigest()
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot be read ({error.strerror}); give a path that all who solve can read."
-        ) from None
+    with reading(path, "give a path that all workers can read"):
+        return hashlib.sha256(read_file(path, scene_file.MAX_BYTES)).hexdigest()
 
 
 def _plain(value: Any) -> Any:

@@ -3,6 +3,7 @@
 Counts are compared with the size of the file before anything is allocated; see ``colmap_walk``.
 """
 
+import os
 import struct
 from functools import partial
 from pathlib import Path
@@ -12,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spherloc.errors import InputError
+from spherloc.files import is_file, open_file, reading
 from spherloc.formats.colmap_walk import (
     LARGEST,
     MODELS,
@@ -39,7 +41,7 @@ class _Reader:
     """Reads records of a file and knows how much is left of it."""
 
     def __init__(self, path: Path, file: BinaryIO) -> None:
-        self.path, self.file, self.at, self.size = path, file, 0, path.stat().st_size
+        self.path, self.file, self.at, self.size = path, file, 0, os.fstat(file.fileno()).st_size
 
     def take(self, layout: str, what: str) -> tuple[Any, ...]:
         """The numbers of a ``struct`` layout."""
@@ -75,15 +77,12 @@ def walk_binary(folder: Path) -> Walked:
     walked = Walked()
     for name, step in zip(ORDER, (_cameras, _rigs, _frames, _images, _points), strict=True):
         path = folder / f"{name}.bin"
-        if name in ("rigs", "frames") and not path.is_file():
+        if name in ("rigs", "frames") and not is_file(path):
             continue
-        try:
-            with path.open("rb") as file:
-                reader = _Reader(path, file)
-                step(reader, walked)
-                reader.end()
-        except OSError as error:
-            raise InputError(f"{path}: cannot be read ({error.strerror}); check the file.") from None
+        with reading(path, "check the file"), open_file(path) as file:
+            reader = _Reader(path, file)
+            step(reader, walked)
+            reader.end()
     return walked
 
 
@@ -148,10 +147,8 @@ def _name(reader: _Reader, number: int) -> str:
 
 def _load(path: Path, offset: int, count: int) -> NDArray[Any]:
     """Observations are read when they are asked for: those of thousands of images would fill the memory."""
-    try:
-        observations = np.fromfile(path, OBSERVATION, count, offset=offset)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read any more ({error.strerror}); load the scene again.") from None
+    with reading(path, "load the scene again"), open_file(path) as file:
+        observations = np.fromfile(file, OBSERVATION, count, offset=offset)
     if len(observations) != count:
         raise InputError(f"{path}: has changed since it was loaded; load the scene again.")
     return observations

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from spherloc.cameras.base import Camera, FloatArray
 from spherloc.cameras.colmap_models import camera_from_colmap
-from spherloc.errors import CalibrationError, InputError, show
+from spherloc.errors import MOST_REASON, CalibrationError, InputError, reason, shorten, show
 from spherloc.extras import require
+from spherloc.files import is_file, is_folder
 from spherloc.formats.colmap_check import walk_binary
 from spherloc.formats.colmap_text import walk_text
 from spherloc.formats.colmap_walk import Points, Walked
@@ -123,17 +124,17 @@ def read_model(folder: Path) -> ColmapModel:
 
 def _form(folder: Path) -> str:
     """Which form is complete; raises ``InputError`` for none."""
-    if not folder.is_dir():
+    if not is_folder(folder):
         raise InputError(f"{folder}: no such folder; give the folder of a COLMAP model.")
-    missing = {form: [name for name in _FILES if not (folder / f"{name}.{form}").is_file()] for form in ("bin", "txt")}
+    missing = {form: [name for name in _FILES if not is_file(folder / f"{name}.{form}")] for form in ("bin", "txt")}
     form = min(missing, key=lambda form: len(missing[form]))
     if len(missing[form]) == len(_FILES):
         models = sorted({path.parent.name for path in folder.glob("*/cameras.*")})
-        hint = f"one of its folders {', '.join(models[:5])}" if models else "the folder that holds one"
+        hint = f"one of its folders {', '.join(map(shorten, models[:5]))}" if models else "the folder that holds one"
         raise InputError(f"{folder}: no COLMAP model (cameras, images and points3D as .bin or .txt); give {hint}.")
     if missing[form]:
         raise InputError(f"{folder / missing[form][0]}.{form} is missing; a COLMAP model needs it, so export it again.")
-    has = [name for name in ("rigs", "frames") if (folder / f"{name}.{form}").is_file()]
+    has = [name for name in ("rigs", "frames") if is_file(folder / f"{name}.{form}")]
     if len(has) == 1:
         other = "frames" if has == ["rigs"] else "rigs"
         raise InputError(f"{folder / other}.{form} is missing beside {has[0]}.{form}; add it, or remove both.")
@@ -154,10 +155,10 @@ def _read_by_pycolmap(folder: Path, form: str) -> dict[str, Any]:
     except subprocess.TimeoutExpired:
         answer = {"error": "it does not come to an end"}
     except (OSError, ValueError) as error:
-        answer = {"error": str(error)}
+        answer = {"error": reason(error)}
     if "error" in answer:
-        reason = show(" ".join(answer["error"].split("Check failed:")[-1].split())[:150])
-        raise InputError(f"{folder}: COLMAP's own reader refuses the model ({reason}); export the model again.")
+        said = shorten(" ".join(str(answer["error"]).split("Check failed:")[-1].split()), MOST_REASON)
+        raise InputError(f"{folder}: COLMAP's own reader refuses the model ({said}); export the model again.")
     return answer
 
 

@@ -1,5 +1,6 @@
 """Walks the files of a COLMAP model in text form before anything else reads them; see ``colmap_walk``."""
 
+import io
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -9,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spherloc.errors import InputError, show
+from spherloc.files import is_file, open_file, reading
 from spherloc.formats.colmap_walk import (
     LARGEST,
     MODELS,
@@ -84,19 +86,18 @@ def walk_text(folder: Path) -> Walked:
     walked = Walked()
     for name, step in zip(ORDER, (_cameras, _rigs, _frames, _images, _points), strict=True):
         path = folder / f"{name}.txt"
-        if name in ("rigs", "frames") and not path.is_file():
+        if name in ("rigs", "frames") and not is_file(path):
             continue
         try:
-            step(_lines(path), walked)
-        except OSError as error:
-            raise InputError(f"{path}: cannot be read ({error.strerror}); check the file.") from None
+            with reading(path, "check the file"):
+                step(_lines(path), walked)
         except UnicodeDecodeError:
             raise InputError(f"{path}: is no text in UTF-8; export the model again.") from None
     return walked
 
 
 def _lines(path: Path) -> Iterator[_Line]:
-    with path.open(encoding="utf-8", newline="\n") as file:
+    with io.TextIOWrapper(open_file(path), encoding="utf-8", newline="\n") as file:
         for number, text in enumerate(iter(lambda: file.readline(_MAX_LINE), ""), start=1):
             line = _Line(path, number, text.strip())
             if len(text) == _MAX_LINE:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from spherloc.cameras.base import Camera, FloatArray
 from spherloc.cameras.colmap_models import camera_from_colmap
-from spherloc.errors import CalibrationError, InputError, show
+from spherloc.errors import CalibrationError, InputError, reason, show
 from spherloc.extras import require
 from spherloc.formats.text_rows import finite_numbers, pose_from_words, refuse_pickle, rows
 
@@ -249,8 +249,7 @@ def _guarded(place: str) -> Iterator[None]:
     except InputError:
         raise
     except Exception as error:
-        reason = " ".join(str(error).split())[:100]
-        raise InputError(f"{place}: no HDF5 data that can be read ({reason}); write the file again.") from None
+        raise InputError(f"{place}: no HDF5 data that can be read ({reason(error)}); write the file again.") from None
 
 
 def _check(dataset: Any, kinds: str, dimensions: int, place: str) -> None:

@@ -14,6 +14,7 @@ import numpy as np
 from spherloc.cameras.base import Camera, FloatArray
 from spherloc.cameras.colmap_models import camera_from_colmap
 from spherloc.errors import CalibrationError, InputError, show
+from spherloc.files import is_file
 from spherloc.formats.layout import needed_file
 from spherloc.formats.text_rows import finite_numbers, pose_from_words, rows
 from spherloc.geometry import pose
@@ -90,7 +91,7 @@ def read_kapture(root: Path, where: str) -> Kapture:
     trajectories_file = needed_file(folder, "trajectories.txt", where, "kapture's poses")
     devices, cameras, remarks = _sensors(sensors_file)
     rigs_file = folder / "rigs.txt"
-    rigs = _rigs(rigs_file, devices) if rigs_file.is_file() else {}
+    rigs = _rigs(rigs_file, devices) if is_file(rigs_file) else {}
     known = devices | {rig for members in rigs.values() for rig in members}
     trajectories, open_poses = _trajectories(trajectories_file, known)
     if open_poses:
@@ -165,7 +166,7 @@ def _trajectories(path: Path, devices: set[str]) -> tuple[dict[tuple[int, str], 
         if device not in devices:
             raise InputError(f"{place}: no sensor or rig is called {show(device)}; add it to sensors.txt or rigs.txt.")
         if key in poses:
-            raise InputError(f"{place}: {show(device)} has two poses at {time}; remove one line.")
+            raise InputError(f"{place}: {show(device)} has two poses at {show(time)}; remove one line.")
         if not any(words[:4]) or not any(words[4:]):
             open_poses += 1
             continue

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from spherloc.cameras.base import BoolArray, Camera, FloatArray
 from spherloc.cameras.calibration import load_camera
 from spherloc.errors import InputError, show
+from spherloc.files import is_file, is_folder, names_in, read_file, reading, size_of
 from spherloc.formats.layout import needed_file
 from spherloc.formats.text_rows import finite_numbers, rows
 
@@ -103,7 +104,7 @@ def read_rig(root: Path, camera: str, where: str) -> Rig:
         camera=load_camera(lens_file),
         imu_from_camera=imu_from[camera],
         imu_from_velodyne=imu_from["image_00"] @ np.linalg.inv(velodyne_from_image_00),
-        car_mask=car_mask if car_mask.is_file() else None,
+        car_mask=car_mask if is_file(car_mask) else None,
     )
 
 
@@ -182,6 +183,7 @@ def without_car(path: Path, camera: Camera) -> BoolArray:
     The mask may be smaller than the image. Raises ``InputError`` for what is no such mask.
     """
     try:
+        size_of(path)  # refuses a pipe, which numpy would wait for
         # Mapped: a header that claims more than the file holds is refused before anything is allocated.
         mask = np.load(path, mmap_mode="r", allow_pickle=False)
     except Exception:  # numpy lets whatever its header's parser stumbles over through
@@ -199,13 +201,10 @@ def frames_in(folder: Path, ending: str, where: str, what: str) -> set[int]:
 
     Raises ``InputError`` if there is no such folder; ``what`` says what it should hold.
     """
-    if not folder.is_dir():
+    if not is_folder(folder):
         raise InputError(f"{where}: the folder {folder} is missing, {what}; check 'root' and the sequence.")
     named = re.compile(r"\d{10}" + re.escape(ending), re.ASCII)
-    try:
-        return {int(entry.name[:10]) for entry in folder.iterdir() if named.fullmatch(entry.name)}
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be read ({error.strerror}); check its permissions.") from None
+    return {int(name[:10]) for name in names_in(folder) if named.fullmatch(name)}
 
 
 def read_scan(path: Path) -> FloatArray:
@@ -214,19 +213,14 @@ def read_scan(path: Path) -> FloatArray:
     Rays without a return, at exactly (0, 0, 0), are no points. Raises ``InputError``, naming the byte, for a damaged
     file, and for one without any point.
     """
-    try:
-        size = path.stat().st_size
-        if size > MAX_SCAN_BYTES or size % _POINT_BYTES:
-            raise InputError(
-                f"{path}: {size} bytes, but a scan has {_POINT_BYTES} for each point and at most {MAX_SCAN_BYTES}; "
-                "the file is damaged or no scan: replace it."
-            )
-        content = path.read_bytes()
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; download the scan or leave out its frame.") from None
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error}); check it.") from None
-    rows = np.frombuffer(content[: len(content) // _POINT_BYTES * _POINT_BYTES], dtype="<f4").reshape(-1, 4)
+    with reading(path, "download the scan or leave out its frame"):
+        content = read_file(path, MAX_SCAN_BYTES)
+    if len(content) % _POINT_BYTES:
+        raise InputError(
+            f"{path}: {len(content)} bytes, but a scan has {_POINT_BYTES} for each point; the file is damaged or no "
+            "scan: replace it."
+        )
+    rows = np.frombuffer(content, dtype="<f4").reshape(-1, 4)
     points = rows[:, :3].astype(np.float64)
     bad = np.flatnonzero(~(np.abs(points) <= FARTHEST_M).all(axis=1))
     if len(bad):

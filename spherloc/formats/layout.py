@@ -1,9 +1,9 @@
 """Files that the layout of a dataset demands."""
 
-from collections.abc import Callable
 from pathlib import Path
 
 from spherloc.errors import InputError
+from spherloc.files import is_file
 
 
 def needed_file(root: Path, name: str, where: str, what: str) -> Path:
@@ -12,14 +12,6 @@ def needed_file(root: Path, name: str, where: str, what: str) -> Path:
     ``what`` says what it holds ("the calibration of image_02").
     """
     named = root / name
-    if not is_there(named.is_file):
+    if not is_file(named):
         raise InputError(f"{where}: {named} is missing, {what}; check that 'root' is the dataset's own folder.")
     return named
-
-
-def is_there(test: Callable[[], bool]) -> bool:
-    """What ``path.is_file`` or ``path.is_dir`` says; False also for a path that the system cannot even look up."""
-    try:
-        return test()
-    except (OSError, ValueError):  # too long, or with a zero byte
-        return False

@@ -1,5 +1,6 @@
 """Files of the Newer College Dataset: images whose names carry their time, and the prior map's point cloud."""
 
+import os
 import re
 from dataclasses import dataclass
 from functools import lru_cache
@@ -10,7 +11,8 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from spherloc.errors import InputError
+from spherloc.errors import InputError, reason, shorten
+from spherloc.files import names_in, open_file, reading
 from spherloc.trajectory import NS_PER_S
 
 ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
@@ -51,10 +53,7 @@ def images_in(folder: Path) -> tuple[list[TimedImage], int]:
 
     Raises ``InputError`` if none carries a time, or if two carry the same one.
     """
-    try:
-        files = [path for path in folder.iterdir() if path.suffix.lower() in ENDINGS]
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be read ({error.strerror}); check its permissions.") from None
+    files = [folder / name for name in names_in(folder) if Path(name).suffix.lower() in ENDINGS]
     timed = [(timestamp_of(path.name), path) for path in files]
     images = sorted(
         (TimedImage(path.name, path, time) for time, path in timed if time is not None),
@@ -64,9 +63,8 @@ def images_in(folder: Path) -> tuple[list[TimedImage], int]:
         raise InputError(f"{folder}: none of its {len(files)} images has a time in its name; give {NAME_RULE}.")
     for one, other in pairwise(images):
         if one.timestamp_ns == other.timestamp_ns:
-            raise InputError(
-                f"{folder}: {one.name} and {other.name} have the same time; keep the images of one camera."
-            )
+            both = f"{shorten(one.name)} and {shorten(other.name)}"
+            raise InputError(f"{folder}: {both} have the same time; keep the images of one camera.")
     return images, len(files) - len(images)
 
 
@@ -81,8 +79,7 @@ def read_cloud(path: Path) -> NDArray[np.float32]:
         cloud = trimesh.load(path, file_type="ply", process=False)
         points = np.asarray(getattr(cloud, "vertices", ()), dtype=np.float32).reshape(-1, 3)
     except Exception as error:  # trimesh lets whatever its parsers stumble over through
-        reason = " ".join(str(error).split())[:100]
-        raise InputError(f"{path}: no readable PLY point cloud ({reason}); export the map again.") from None
+        raise InputError(f"{path}: no readable PLY point cloud ({reason(error)}); export the map again.") from None
     points = points[np.isfinite(points).all(axis=1)]
     if not len(points):
         raise InputError(f"{path}: holds no finite point; export the map again.")
@@ -92,12 +89,9 @@ def read_cloud(path: Path) -> NDArray[np.float32]:
 
 def _check_header(path: Path) -> None:
     """Refuse what claims more than it holds before anything is allocated for it."""
-    try:
-        size = path.stat().st_size
-        with path.open("rb") as file:
-            header, end, _ = file.read(_HEADER_BYTES).partition(b"end_header")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); give the prior map as a PLY file.") from None
+    with reading(path, "give the prior map as a PLY file"), open_file(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        header, end, _ = file.read(_HEADER_BYTES).partition(b"end_header")
     if not header.startswith(b"ply") or not end or size > MAX_CLOUD_BYTES:
         raise InputError(f"{path}: no PLY file of at most {MAX_CLOUD_BYTES >> 30} GiB; give the prior map as one.")
     lines = [line.strip() for line in header.splitlines() if line.startswith(b"element")]

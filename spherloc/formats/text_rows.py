@@ -1,6 +1,7 @@
 """Text files with one record a line, as hloc, COLMAP and kapture write them."""
 
 import math
+import os
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -9,6 +10,7 @@ import numpy as np
 
 from spherloc.cameras.base import FloatArray
 from spherloc.errors import InputError, show
+from spherloc.files import open_file, reading
 from spherloc.geometry import pose
 from spherloc.trajectory import rotation_from_wxyz
 
@@ -28,13 +30,8 @@ def refuse_pickle(path: Path) -> None:
 
     Also for a file that is missing or cannot be read.
     """
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; correct its path.")
-    try:
-        with path.open("rb") as file:
-            start = file.read(256)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); correct its path.") from None
+    with reading(path, "correct its path"), open_file(path) as file:
+        start = file.read(256)
     if path.suffix.lower() in _PICKLES or _PICKLE_START.match(start):
         raise InputError(
             f"{path}: is a Python pickle, and reading one runs whatever code is in it; give hloc's HDF5 and text files "
@@ -48,10 +45,9 @@ def rows(path: Path, what: str) -> Iterator[tuple[str, str]]:
     ``what`` says what the file should be ("a list of pairs"). Raises ``InputError`` for what is no text file.
     """
     refuse_pickle(path)
-    size = path.stat().st_size
-    if size > MAX_BYTES:
-        raise InputError(f"{path}: larger than {MAX_BYTES >> 20} MiB, which is too large for {what}; split it.")
-    with path.open("rb") as file:
+    with reading(path, "correct its path"), open_file(path) as file:
+        if os.fstat(file.fileno()).st_size > MAX_BYTES:
+            raise InputError(f"{path}: larger than {MAX_BYTES >> 20} MiB, which is too large for {what}; split it.")
         for number, content in enumerate(iter(lambda: file.readline(_MAX_LINE_BYTES), b""), start=1):
             place = f"{path}, line {number}"
             if len(content) == _MAX_LINE_BYTES:

@@ -11,6 +11,7 @@ import numpy as np
 
 from spherloc.cameras.base import BoolArray, FloatArray
 from spherloc.disk_cache import cache_folder, key_of, make_room_once, store, used
+from spherloc.files import read_file
 from spherloc.frontend.feature_kinds import Descriptors
 from spherloc.images import MAX_BYTES
 
@@ -62,6 +63,6 @@ def fetch(path: Path) -> tuple[FloatArray, Descriptors] | None:
 
 def _content(path: Path) -> bytes | None:
     try:
-        return path.read_bytes() if path.stat().st_size <= MAX_BYTES else None
-    except (OSError, ValueError):
+        return read_file(path, MAX_BYTES)
+    except OSError:
         return None

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from spherloc.errors import InputError, show
+from spherloc.files import is_file
 from spherloc.frontend.features import FeatureOptions
 from spherloc.frontend.matching import MatchOptions
 
@@ -58,6 +59,6 @@ def _weights(folder: Path, key: str, value: Any, place: str) -> Path:
     if not isinstance(value, str) or not value or "\0" in value:
         raise InputError(f"{place}: {key} is {show(value)}; give the path of an ONNX file.")
     path = folder / value
-    if not path.is_file():
+    if not is_file(path):
         raise InputError(f"{place}: {key} names {path}, which is no file; correct the path.")
     return path

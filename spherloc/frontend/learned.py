@@ -1,5 +1,6 @@
 """Learned features and matching through OpenCV 5, with the weight files (ONNX) that the user gives."""
 
+import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -13,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spherloc.cameras.base import FloatArray
-from spherloc.errors import InputError
+from spherloc.errors import MOST_REASON, InputError, shorten
+from spherloc.files import open_file, reading
 from spherloc.images import ByteImage
 
 ALIKED_INPUT_PX = 640
@@ -96,13 +98,8 @@ def _network(name: str, weights: Path | None) -> Any:
             f"{name} is not in this OpenCV ({cv2.__version__}); install OpenCV 5 (opencv-python-headless>=5), or take "
             "the features 'sift' with the matching 'nearest'."
         )
-    try:
-        status = weights.stat()
-        with weights.open("rb"):
-            pass
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise InputError(f"{weights}: weights of {name} cannot be read ({reason}); give its ONNX file.") from None
+    with reading(weights, f"give the ONNX file of {name}"), open_file(weights) as file:
+        status = os.fstat(file.fileno())
     return _loaded(name, create, weights, status.st_mtime_ns, status.st_size)
 
 
@@ -127,5 +124,5 @@ def _try_in_child(name: str, weights: Path) -> None:
 
 
 def _refusal(name: str, weights: Path | None, error: cv2.error) -> InputError:
-    said = " ".join(str(getattr(error, "err", error)).split())[:120]
+    said = shorten(" ".join(str(getattr(error, "err", error)).split()), MOST_REASON)
     return InputError(f"{weights}: OpenCV cannot use it for {name} ({said}); give an ONNX file of {name}.")

@@ -17,6 +17,7 @@ import viser
 from spherloc.datasets import bundled_scenes
 from spherloc.errors import InputError, RecordingError
 from spherloc.estimators import warm_up
+from spherloc.files import is_folder
 from spherloc_viz.app.audience import Audience
 from spherloc_viz.app.catalog import Catalog
 from spherloc_viz.app.review.shelf import Shelf
@@ -29,6 +30,7 @@ from spherloc_viz.app.web.front_door import FrontDoor
 from spherloc_viz.app.web.guard import open_socket
 from spherloc_viz.app.web.viewer_room import ViewerRoom, of_index
 from spherloc_viz.app.web.viser_seams import role_header, set_theme, start_viser, stop_viser
+from spherloc_viz.options import unusable_estimators
 from spherloc_viz.recording.index.run_index import RunIndex
 from spherloc_viz.recording.keeping.recorder import Recorder
 from spherloc_viz.recording.keeping.room import KEEP_GIGABYTES, kept_bytes
@@ -64,7 +66,7 @@ def serve(
     catalog, keep_bytes = Catalog(scene), kept_bytes(keep_gigabytes)
     with open_socket(host, port) as listener, contextlib.ExitStack() as stack:
         _answer_quickly()
-        warm_up(lambda sentence: print(f"spherloc: {sentence}", file=sys.stderr, flush=True))
+        _prepare()
         services = Services(catalog, allowed_roots(scene, allow))
         sessions = Sessions(services)
         if record:
@@ -84,12 +86,30 @@ def serve(
         asyncio.run(_serve_until_told(door, access, listener))
 
 
+def _prepare() -> None:
+    """Warm up; an extension that cannot be used is named once, and the page goes on without it."""
+    told: list[str] = []
+
+    def tell(sentence: str) -> None:
+        told.append(sentence)
+        _say(sentence)
+
+    warm_up(tell)
+    for sentence in unusable_estimators():
+        if not any(line.startswith(sentence) for line in told):
+            tell(sentence)
+
+
+def _say(sentence: str) -> None:
+    print(f"spherloc: {sentence}", file=sys.stderr, flush=True)
+
+
 def _open_index(recorder: Recorder | None, folder: Path, stack: contextlib.ExitStack) -> RunIndex | None:
     """The list of what was recorded; None, with a sentence, if there is none: the playground goes on without it."""
     try:
         if recorder is not None:
             return recorder.index
-        return stack.enter_context(RunIndex(folder)) if folder.is_dir() else None
+        return stack.enter_context(RunIndex(folder)) if is_folder(folder) else None
     except RecordingError as error:
         print(f"warning: {error}", file=sys.stderr, flush=True)
         return None
@@ -106,7 +126,7 @@ def _answer_quickly() -> None:
 def allowed_roots(scene: Path | None, allow: Sequence[Path]) -> tuple[Path, ...]:
     """Folders from which pages may open scenes; raises ``InputError`` for one that is no folder."""
     for folder in allow:
-        if not folder.is_dir():
+        if not is_folder(folder):
             raise InputError(f"{folder}: is no folder; give --allow one that exists.")
     bundled = {path.parent for path in bundled_scenes().values()}
     return (*allow, *(() if scene is None else (scene.parent,)), *sorted(bundled))

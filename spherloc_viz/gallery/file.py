@@ -15,6 +15,7 @@ from spherloc.datasets.variation_text import parse_variation
 from spherloc.diagnosis import Cause
 from spherloc.errors import InputError, show
 from spherloc.estimators import options_type
+from spherloc.files import is_file
 from spherloc_viz.gallery.case import Beside, GalleryCase, Play
 from spherloc_viz.gallery.measures import MEASURES
 from spherloc_viz.options import option_fields
@@ -35,7 +36,7 @@ def gallery_cases(path: Path = GALLERY) -> tuple[GalleryCase, ...]:
 
     Raises ``InputError``, in one sentence, for a file that is missing or says something that is not understood.
     """
-    if not path.is_file():
+    if not is_file(path):
         raise InputError(f"{path}: the file of the gallery is missing; install spherloc again, or restore the file.")
     return parse_gallery(scene_file.read_table(path), path)
 

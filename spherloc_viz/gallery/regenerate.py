@@ -1,5 +1,6 @@
 """``spherloc gallery``: runs the cases, records them, and says whether each fails as it is told."""
 
+import os
 import re
 import textwrap
 from collections.abc import Callable, Sequence
@@ -16,7 +17,7 @@ from spherloc_viz.gallery.check import Played, faults, play
 from spherloc_viz.recording.content.writer import write_recording
 from spherloc_viz.recording.origin import Origin
 from spherloc_viz.recording.review.notes import has_review, write_review
-from spherloc_viz.recording.strangers.examiner import examine_review
+from spherloc_viz.recording.strangers.examiner import examine, examine_review
 
 WIDTH = 100
 """Of stories on a terminal, characters."""
@@ -45,8 +46,10 @@ def regenerate(cases: Sequence[GalleryCase], folder: Path, say: Callable[[str], 
     """Run and record the cases and print a line for each; returns how many fail otherwise than they are told.
 
     ``say`` is told what takes a while, and what is not as it is told. Raises ``RecordingError`` if a recording cannot
-    be written.
+    be written, or would replace a file that is none of the gallery's.
     """
+    for case in cases:
+        _refuse_other(folder / f"{case.key}.rrd")
     warm_up(say)
     width = max(len(case.key) for case in cases)
     untrue = 0
@@ -63,6 +66,18 @@ def regenerate(cases: Sequence[GalleryCase], folder: Path, say: Callable[[str], 
         line = f"{case.key:<{width}}  {case.cause:<22}  {outcome(played.trace):<22}  {files[0].name}{more}"
         print(line, flush=True)
     return untrue
+
+
+def _refuse_other(path: Path) -> None:
+    """Raise ``RecordingError`` for a file that the gallery has not written."""
+    if not os.path.lexists(path):
+        return
+    try:
+        own = examine(path).source == "gallery"
+    except RecordingError:
+        own = False
+    if not own:
+        raise RecordingError(f"{path}: is there already and is none of the gallery's; give another --output.")
 
 
 def record(played: Played, folder: Path) -> list[Path]:

@@ -3,6 +3,7 @@
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 from spherloc.trace import (
@@ -16,7 +17,7 @@ from spherloc.trace import (
     YawStage,
 )
 from spherloc_viz import style
-from spherloc_viz.layers import consensus, decision, outcome, ransac, refinement, start, translation, yaw
+from spherloc_viz.layers import consensus, decision, extension, outcome, ransac, refinement, start, translation, yaw
 from spherloc_viz.layers.focus import focus_of
 from spherloc_viz.layers.frame import Plan, RunView
 from spherloc_viz.layers.primitives import Chart, FloatArray, Picture, Step, Stop
@@ -41,13 +42,18 @@ class _Timeline:
     view: RunView
     plans: tuple[Plan, ...]
     stops: tuple[Stop, ...]
-    charts: dict[Callable[[], Chart], Chart] = field(default_factory=dict)
+    charts: dict[Callable[[], Chart], Chart | None] = field(default_factory=dict)
     """Those that were drawn already: they stay for all later steps."""
 
-    def chart(self, draw: Callable[[], Chart]) -> Chart:
-        """The chart that ``draw`` makes, made once."""
+    def chart(self, draw: Callable[[], Chart]) -> Chart | None:
+        """The chart that ``draw`` makes, made once; None where that fails on the numbers of an extension."""
         if draw not in self.charts:
-            self.charts[draw] = draw()
+            try:
+                self.charts[draw] = draw()
+            except Exception:
+                if not extension.is_extension(self.view):
+                    raise
+                self.charts[draw] = None
         return self.charts[draw]
 
 
@@ -70,8 +76,8 @@ def _timeline(trace: Trace) -> _Timeline:
 def _planned(view: RunView) -> _Timeline:
     parts = [(FIRST, start.plans(view))]
     for stage in view.trace.stages:
-        name, plans = STAGES[type(stage)]
-        parts.append((name, plans(view, stage)))
+        name, plans = STAGES.get(type(stage), (extension.UNKNOWN, extension.unknown))
+        parts.append((name, extension.guarded_plans(view, stage, partial(plans, view, stage))))
     parts.append((LAST, outcome.plans(view)))
     named = [(name, plan) for name, plans in parts for plan in plans]
     stops = tuple(Stop(plan.key, plan.title, name) for name, plan in named)
@@ -93,8 +99,8 @@ def paint(trace: Trace, index: int) -> Picture:
     tables = (*frame.tables, outcome_table(trace)) if index == len(timeline.plans) - 1 else frame.tables
     step = Step(stop.key, stop.title, frame.caption, frame.equation, frame.note, stop.stage)
     scene = base_items(timeline.view, frame) + frame.items
-    focus = focus_of(timeline.view, frame)
-    return Picture(step, scene, tuple(timeline.chart(draw) for draw in charts.values()), tables, focus)
+    drawn = tuple(chart for chart in map(timeline.chart, charts.values()) if chart is not None)
+    return Picture(step, scene, drawn, tables, focus_of(timeline.view, frame))
 
 
 def with_rival(picture: Picture, trace: Trace, cam_from_map: FloatArray) -> Picture:

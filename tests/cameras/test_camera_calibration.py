@@ -1,7 +1,6 @@
 """``load_camera``: KITTI-360, Kalibr and the project's TOML; a damaged file is one sentence, never a crash."""
 
 import random
-from pathlib import Path
 
 import pytest
 from camera_samples import KITTI360_IMAGE_02, require_shared, sample
@@ -12,7 +11,7 @@ from spherloc.cameras.calibration import load_camera
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.cameras.mei import Mei
-from spherloc.errors import CalibrationError
+from spherloc.errors import CalibrationError, legible
 
 pytestmark = pytest.mark.filterwarnings("error")
 
@@ -212,7 +211,7 @@ def test_each_mistake_has_its_sentence(refused, text, name, parts):
 
 
 def test_a_number_of_too_many_digits_is_refused_without_printing_it(refused):
-    assert "too many digits" in refused(TOML.replace("301", "0x" + "f" * 10_000))
+    assert "too large to print" in refused(TOML.replace("301", "0x" + "f" * 10_000))
 
 
 def test_binary_and_large_files_are_refused(refused):
@@ -224,7 +223,7 @@ def test_missing_files_directories_and_impossible_paths(tmp_path):
     for path in (tmp_path / "absent", tmp_path, tmp_path / "a\0b", tmp_path / ("n" * 5000)):
         with pytest.raises(CalibrationError) as caught:
             load_camera(path)
-        one_sentence(caught.value, str(path).replace("\0", " "))
+        one_sentence(caught.value, legible(f"{path}:")[:-1])
 
 
 def test_an_unreadable_file(tmp_path, monkeypatch):
@@ -234,7 +233,7 @@ def test_an_unreadable_file(tmp_path, monkeypatch):
     def deny(*_args):
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr(Path, "open", deny)
+    monkeypatch.setattr("spherloc.files.open_file", deny)
     with pytest.raises(CalibrationError, match=r"cannot be read \(Permission denied\): check the path"):
         load_camera(path)
 

@@ -159,7 +159,7 @@ def test_observations_are_read_from_a_file_that_is_still_the_same(rng, tmp_path)
     with pytest.raises(InputError, match="has changed since it was loaded"):
         _ = list(model.images.values())[-1].pixels
     images.unlink()
-    with pytest.raises(InputError, match="cannot be read any more"):
+    with pytest.raises(InputError, match="no such file; load the scene again"):
         _ = list(model.images.values())[-1].pixels
 
 

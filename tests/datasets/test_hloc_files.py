@@ -272,7 +272,7 @@ def test_not_hdf5(tmp_path):
         path.write_bytes(content)
         with pytest.raises(InputError, match="no HDF5 data that can be read"):
             keypoints(path)
-    with pytest.raises(InputError, match="no such file"):
+    with pytest.raises(InputError, match="a folder, not a file"):
         keypoints(tmp_path)
 
 

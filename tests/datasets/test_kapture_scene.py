@@ -169,7 +169,7 @@ def test_a_query_needs_no_pose(tmp_path):
 @pytest.mark.parametrize(
     ("rest", "said"),
     [
-        ('queries = ["gone.jpg"]', r"\[queries\]: 'gone.jpg' fits none of the 6 images, such as left/0.jpg"),
+        ('queries = ["gone.jpg"]', r"\[queries\]: 'gone.jpg' fits none of the 6 images, such as 'left/0.jpg'"),
         ("queries = []", r"\[queries\]: images is \[\]; give a list of texts"),
         ("queries = [1]", r"\[queries\]: images is \[1\]; give a list of texts"),
         ("queries = 3", r"\[queries\]: images is 3; give a list of texts"),

@@ -146,7 +146,7 @@ def test_huge_scan_is_not_read(folder):
     path = folder / "huge.bin"
     with path.open("wb") as file:
         file.truncate(1 << 40)
-    with pytest.raises(InputError, match="at most"):
+    with pytest.raises(InputError, match="larger than 256 MiB"):
         read_scan(path)
 
 

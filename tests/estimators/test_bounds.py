@@ -13,7 +13,8 @@ from spherloc.diagnosis import diagnose
 from spherloc.errors import InputError
 from spherloc.estimators import estimate, options_type
 from spherloc.geometry import DOWN, pose, so3_exp
-from spherloc.problem import LEAST_PX, MOST_PX, Problem
+from spherloc.problem import Problem
+from spherloc.ranges import LEAST_PX, MOST_PX
 from spherloc.refine import residuals_px
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
@@ -108,7 +109,8 @@ from spherloc.diagnosis import diagnose
 from spherloc.errors import InputError
 from spherloc.estimators import estimate, options_type
 from spherloc.geometry import DOWN
-from spherloc.problem import LEAST_PX, MOST_PX, Problem
+from spherloc.problem import Problem
+from spherloc.ranges import LEAST_PX, MOST_PX
 rng = np.random.default_rng(0)
 pixels, points = rng.uniform(1, 99, (200_000, 2)), rng.uniform(-5, 5, (200_000, 3))
 try:

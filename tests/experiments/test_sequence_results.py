@@ -166,7 +166,7 @@ def test_damage_elsewhere_is_said_and_nothing_is_overwritten(tmp_path: Path) -> 
     for content, said in (
         (lines[0][:40] + b"\n" + lines[1], r"results.jsonl, line 1: is no result of a query"),
         (lines[0] + b"\0" * 50 + b"\n", r"results.jsonl, line 2: is no result of a query"),
-        (lines[0] + lines[0], r"results.jsonl, line 2: the query image0.png is there a second time"),
+        (lines[0] + lines[0], r"results.jsonl, line 2: the query 'image0.png' is there a second time"),
     ):
         (tmp_path / "results.jsonl").write_bytes(content)
         for read in (read_results, lambda folder: ResultsLog(folder, CONFIGURATION)):
@@ -248,5 +248,19 @@ def test_places_that_cannot_be_used_are_said(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"nowhere/configuration.json: no such file"):
         read_results(tmp_path / "nowhere")
     (tmp_path / "results.jsonl").write_text(json_line(row(0)) + "\n")
-    with pytest.raises(InputError, match=r"holds results without their configuration.json"):
+    with pytest.raises(InputError, match=r"already holds results.jsonl, but no configuration.json"):
         ResultsLog(tmp_path, CONFIGURATION)
+
+
+@pytest.mark.parametrize("name", ["results.csv", "summary.json", "trajectory.tum", "truth.tum", "trajectory.png"])
+def test_files_of_others_are_not_replaced(name: str, tmp_path: Path) -> None:
+    """``--output DIR`` wrote over a summary.json that had nothing to do with it."""
+    (tmp_path / name).write_text("somebody's work")
+    with pytest.raises(InputError, match=rf"already holds {name}, but no configuration.json.*; give another folder"):
+        ResultsLog(tmp_path, CONFIGURATION)
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+    assert (tmp_path / name).read_text() == "somebody's work"
+    (tmp_path / name).unlink()
+    for _ in range(2):  # and a second time among its own
+        with ResultsLog(tmp_path, CONFIGURATION) as log:
+            log.write(name, b"ours")

@@ -220,3 +220,34 @@ def test_other_values_are_one_sentence(text: str) -> None:
 def test_too_many_values_are_one_sentence() -> None:
     with pytest.raises(InputError, match="more than 200; give a larger step"):
         parse_values(["0:1:1e-300"])
+
+
+@pytest.mark.parametrize("other", ["photo.png", "photo.plan.json", "photo.summary.csv", "photo.csv"])
+def test_files_of_others_are_not_replaced(other: str, tmp_path: Path) -> None:
+    """``--out photo.csv`` wrote over the photo beside it."""
+    plan, path, own = small_plan(tmp_path), tmp_path / "photo.csv", tmp_path / other
+    content = b'{"a": 1}' if other.endswith("json") else b"somebody's work"
+    own.write_bytes(content)
+    for link in (False, True):
+        with pytest.raises(InputError, match=r"photo\.(png|plan\.json|summary\.csv|csv).*; give another file"):
+            SweepLog(path, plan)
+        assert sorted(tmp_path.glob("photo*")) == [own], "nothing is left of what was not begun"
+        if link:
+            assert own.is_symlink()
+        else:
+            assert own.read_bytes() == content
+            own.unlink()
+            own.symlink_to(tmp_path / "elsewhere")  # which is not there: writing would make it
+
+
+def test_its_own_files_are_written_again(tmp_path: Path) -> None:
+    plan, path = small_plan(tmp_path), tmp_path / "photo.csv"
+    done(plan, path)
+    with SweepLog(path, plan) as log:
+        log.write(log.beside(".png"), b"a picture")
+        log.finish()
+    with SweepLog(path, plan) as log:
+        log.finish()
+    path.unlink()  # what remains says whose it is
+    with SweepLog(path, plan) as log:
+        assert log.rows == []

@@ -156,8 +156,8 @@ def test_weights_of_another_network(tmp_path, rng):
 @pytest.mark.parametrize("method", SIDE)
 def test_weights_that_are_missing(tmp_path, rng, method):
     view = view_of(tmp_path, texture(rng, 100, 200))
-    for weights, reason in ((tmp_path / "gone.onnx", "No such file"), (tmp_path, "Is a directory")):
-        with pytest.raises(InputError, match=f"weights of {method.upper()} cannot be read .{reason}"):
+    for weights, said in ((tmp_path / "gone.onnx", "no such file"), (tmp_path, "a folder, not a file")):
+        with pytest.raises(InputError, match=rf"{said}.*; give the ONNX file of {method.upper()}"):
             extract(view, FeatureOptions(method, weights=weights))
 
 

@@ -6,12 +6,12 @@ from typing import Any
 
 import viser
 
-from spherloc import registry
 from spherloc.errors import InputError, show
 from spherloc.estimators import default_options, options_type
 from spherloc.problem import Problem
+from spherloc.ranges import check_option
 from spherloc_viz.app.web.viser_seams import put
-from spherloc_viz.options import NONE, OptionField, option_fields
+from spherloc_viz.options import NONE, OptionField, option_fields, usable_estimators
 
 ABOUT: Mapping[str, str] = {
     "mc-exact": "exact, certified",
@@ -79,7 +79,7 @@ class Option:
             return self._values[value]
         if isinstance(value, str):
             return self.field.parse(value or NONE)
-        self.field.check_size(value)
+        check_option(self.field.name, value)
         return value
 
     def write(self, value: Any) -> None:
@@ -100,7 +100,7 @@ class EstimatorControls:
     """A choice of estimators, and the options of the chosen one."""
 
     def __init__(self, gui: viser.GuiApi, changed: Callable[[object], None]) -> None:
-        self._names = estimator_labels(registry.names("estimators"))
+        self._names = estimator_labels(usable_estimators())
         start = _name(self._names, START)
         self._estimator = gui.add_dropdown("Estimator", tuple(self._names), initial_value=start)
         self._estimator.on_update(changed)

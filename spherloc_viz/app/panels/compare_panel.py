@@ -9,7 +9,6 @@ from html import escape
 import numpy as np
 import viser
 
-from spherloc import registry
 from spherloc.diagnosis import Cause, diagnose
 from spherloc.errors import InputError
 from spherloc.estimators import default_options, estimate
@@ -33,6 +32,7 @@ from spherloc_viz.layers.comparison import (
     yaw_chart,
 )
 from spherloc_viz.layers.primitives import Chart, SceneItem, Table
+from spherloc_viz.options import usable_estimators
 
 START, STOP = "Compare", "Cancel"
 LIVE_AFTER_S = 0.25
@@ -72,7 +72,7 @@ class ComparePanel:
     ) -> None:
         """``use`` is called with the estimator of a row that is pressed, ``changed`` when there is more to show."""
         self._use, self._changed = use, changed
-        self._names = ordered(registry.names("estimators"))
+        self._names = ordered(usable_estimators())
         self._ticked = {name for name in self._names if name in TICKED}
         self._choice = gui.add_html(chips_html("compare", self._names, self._ticked))
         self._button = gui.add_button(START, hint="Run the ticked estimators on the problem at hand.")

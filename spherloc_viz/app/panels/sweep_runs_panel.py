@@ -10,7 +10,6 @@ from pathlib import Path
 
 import viser
 
-from spherloc import registry
 from spherloc.errors import InputError, SpherlocError
 from spherloc.experiments.sweep import AXES, Entrant, SweepPlan, SweepRow, planned, run_sweep
 from spherloc.experiments.sweep_summary import rows_text, summarize, summary_text
@@ -21,6 +20,7 @@ from spherloc_viz.app.plots.sweep_charts import charts_html, table_html
 from spherloc_viz.app.text import status_html
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.web.viser_seams import put
+from spherloc_viz.options import usable_estimators
 from spherloc_viz.recording.keeping.recorder import Recorder
 
 START, CANCEL = "Start sweep", "Cancel"
@@ -74,7 +74,7 @@ class SweepPanel:
         ``recorder`` is that of the page's runs; without one those of sweeps are not recorded either.
         """
         self._chosen, self._recorder = chosen, recorder
-        names = registry.names("estimators")
+        names = usable_estimators()
         self._names = ordered(names)
         self._ticked = {name for name in self._names if name in TICKED}
         self._chips = gui.add_html(chips_html("sweep", self._names, self._ticked))

@@ -10,7 +10,9 @@ from spherloc.datasets import Scene
 from spherloc.datasets.variation import Variation, used_seed
 from spherloc.errors import InputError, RecordingError, show
 from spherloc.estimators import options_type
+from spherloc.files import is_file
 from spherloc.problem import Problem
+from spherloc.ranges import check_options
 from spherloc_viz.options import OptionField, option_fields
 from spherloc_viz.recording.content.reader import RecordedRun, read_recording
 from spherloc_viz.recording.origin import Origin, Source
@@ -47,7 +49,7 @@ def load_recorded_scene(path: Path) -> RecordedScene:
     Raises ``RecordingError``, in one sentence, if there is no such file or it is no whole recording of ours.
     """
     path = Path(path)
-    if not path.is_file():
+    if not is_file(path):
         raise RecordingError(f"{path}: no such file; give the path of a recording (.rrd).")
     examine(path)
     return RecordedScene(read_recording(path), path)
@@ -83,9 +85,9 @@ def recorded_options(run: RecordedRun, where: Path) -> Any:
         if not _takes(known[name], value):
             raise RecordingError(f"{where}: option {name} is {show(value)}, which it cannot be; record the run again.")
     try:
-        for name, value in run.options.items():
-            known[name].check_size(value)
-        return kind(**run.options)
+        options = kind(**run.options)
+        check_options(options)
+        return options
     except (InputError, TypeError, ValueError) as error:
         raise RecordingError(f"{where}: has options that cannot be: {error}") from None
 

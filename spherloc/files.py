@@ -1,0 +1,122 @@
+"""Opens files that a user names: regular ones only, and never more of them than a reader asks for.
+
+A link to ``/dev/zero`` has no end and a pipe without a writer keeps whoever opens it waiting for ever. Every refusal is
+an ``OSError`` with a reason in ``strerror``, also for names that no file can have, which Python refuses by ValueError.
+"""
+
+import errno
+import os
+import stat
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import BinaryIO
+
+from spherloc.errors import InputError, reason
+
+_PIECE_BYTES = 1 << 20
+
+
+def is_file(path: Path) -> bool:
+    """True for a regular file, links followed; False also for what cannot be looked up: too long, no permission."""
+    return _mode_is(path, stat.S_ISREG)
+
+
+def is_folder(path: Path) -> bool:
+    """True for a folder, links followed; False also for what cannot be looked up: too long, no permission."""
+    return _mode_is(path, stat.S_ISDIR)
+
+
+def _mode_is(path: Path, kind: Callable[[int], bool]) -> bool:
+    try:
+        return kind(Path(path).stat().st_mode)
+    except (OSError, ValueError):
+        return False
+
+
+def size_of(path: Path) -> int:
+    """Bytes of a regular file; raises ``OSError`` for whatever is none.
+
+    Ask this before a library opens a path by itself.
+    """
+    try:
+        status = Path(path).stat()
+    except ValueError:
+        raise _no_such_name(path) from None
+    _check_regular(status.st_mode, path)
+    return status.st_size
+
+
+def open_file(path: Path) -> BinaryIO:
+    """A regular file, open for reading bytes; raises ``OSError`` for whatever is none, without waiting for it."""
+    size_of(path)  # opening a device may already do something
+    try:
+        file = open(path, "rb", opener=_without_waiting)  # noqa: SIM115 -- Path.open has no opener
+    except ValueError:
+        raise _no_such_name(path) from None
+    try:
+        _check_regular(os.fstat(file.fileno()).st_mode, path)
+    except OSError:
+        file.close()
+        raise
+    return file
+
+
+def read_file(path: Path, most_bytes: int) -> bytes:
+    """The content of a regular file.
+
+    Raises ``OSError`` for whatever is none and for one of more than ``most_bytes``, also where it grows beyond them
+    meanwhile or does not tell its size.
+    """
+    with open_file(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        content = file.read(min(size, most_bytes) + 1)
+        while len(content) <= most_bytes and (more := file.read(_PIECE_BYTES)):
+            content += more
+    if len(content) > most_bytes:
+        raise OSError(errno.EFBIG, f"larger than {_bytes(most_bytes)}", str(path))
+    return content
+
+
+@contextmanager
+def reading(path: Path, advice: str) -> Iterator[None]:
+    """Around reading a file: ``InputError`` for every ``OSError``, with ``advice`` ("correct the key 'image'")."""
+    try:
+        yield
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; {advice}.") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({reason(error)}); {advice}.") from None
+
+
+def names_in(folder: Path) -> list[str]:
+    """Names in a folder, sorted.
+
+    Raises ``InputError``, one sentence that names it, if there is no such folder or it cannot be listed.
+    """
+    try:
+        return sorted(entry.name for entry in Path(folder).iterdir())
+    except (OSError, ValueError) as error:
+        raise InputError(f"{folder}: cannot be read ({reason(error)}); give a folder that can be listed.") from None
+
+
+def _without_waiting(path: str, flags: int) -> int:
+    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0))
+
+
+def _check_regular(mode: int, path: Path) -> None:
+    if stat.S_ISDIR(mode):
+        raise IsADirectoryError(errno.EISDIR, "a folder, not a file", str(path))
+    if not stat.S_ISREG(mode):
+        raise OSError(errno.EINVAL, "not a regular file but a device, a pipe or a socket", str(path))
+
+
+def _bytes(count: int) -> str:
+    for unit, size in (("MiB", 1 << 20), ("KiB", 1 << 10)):
+        if count % size == 0:
+            return f"{count // size:,} {unit}"
+    return f"{count:,} bytes"
+
+
+def _no_such_name(path: Path) -> OSError:
+    return OSError(errno.EINVAL, "no file can have such a name", str(path))

@@ -1,0 +1,47 @@
+"""Between which numbers lie: smaller or larger ones under- or overflow in powers that the estimators take of them."""
+
+import math
+from dataclasses import fields
+from numbers import Integral, Real
+from typing import Any
+
+from spherloc.errors import InputError, show
+
+LEAST_PX, MOST_PX = 1e-6, 1e6
+"""Pixel bounds and noise."""
+LEAST_M, MOST_M = 1e-12, 1e12
+"""The farthest point from the origin; a map may also be all in the origin."""
+LEAST, MOST = 1e-12, 1e12
+"""Other options that are neither 0 nor infinite."""
+MOST_SEED = 2**63 - 1
+
+
+def check_option(name: str, value: Any) -> None:
+    """Raise ``InputError`` for a number of an option that is NaN or so small or large that nobody can calculate with
+    it; what else the option refuses is its own to say."""
+    if isinstance(value, bool) or not isinstance(value, Real):
+        return
+    least, most = (LEAST_PX, MOST_PX) if name.endswith("_px") else (LEAST, MOST)
+    try:
+        size = abs(float(value))
+    except OverflowError:  # an integer beyond all floats
+        size = 2.0 * most
+    if math.isnan(size) or (size and math.isfinite(size) and not least <= size <= most):
+        raise InputError(f"option {name} is {show(value)}; give a number from {least:g} to {most:g}.")
+
+
+def check_options(options: Any) -> None:
+    """``check_option`` for every field of a dataclass of options."""
+    for item in fields(options):
+        check_option(item.name, getattr(options, item.name))
+
+
+def is_number(value: Any) -> bool:
+    """A real number of Python or numpy, and no truth value."""
+    return isinstance(value, Real) and not isinstance(value, bool)
+
+
+def check_seed(seed: Any) -> None:
+    """Raise ``InputError`` for what is no whole number from 0 to ``MOST_SEED``."""
+    if isinstance(seed, bool) or not isinstance(seed, Integral) or not 0 <= seed <= MOST_SEED:
+        raise InputError(f"seed is {show(seed)}; give a whole number from 0 to 2^63 - 1.")

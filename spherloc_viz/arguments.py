@@ -1,0 +1,48 @@
+"""Refuses a flag that is given twice where only its last value would count."""
+
+import typing
+from collections import Counter
+from collections.abc import Callable, Sequence
+from typing import Annotated, Any
+
+import tyro
+
+from spherloc.errors import InputError, show
+
+_APPEND = typing.get_args(tyro.conf.UseAppendAction[int])[1]
+HINTS = {
+    ("run", "--estimator"): "or compare estimators with: spherloc sweep SCENE --estimator A --estimator B",
+}
+"""What else helps, by command and flag."""
+
+
+def refuse_repeated(words: Sequence[str], commands: Sequence[Callable[..., Any]]) -> None:
+    """Raise ``InputError`` for a flag that ``words`` give twice, but for those that gather all that they are given.
+
+    ``words`` are those of the command line; the functions of ``commands`` have the commands' names.
+    """
+    command = next((command for command in commands if words[:1] == [command.__name__]), None)
+    if command is None:
+        return
+    given = list(words[1 : words.index("--") if "--" in words else None])
+    flags = Counter(_flag(word) for word in given if word.startswith("--"))
+    for flag, count in flags.items():
+        if count > 1 and flag not in _gathering(command):
+            hint = HINTS.get((command.__name__, flag), "")
+            raise InputError(f"{show(flag)} is given {count} times; give it once{', ' if hint else ''}{hint}.")
+
+
+def _flag(word: str) -> str:
+    """``--record`` for ``--no-record`` too, which says the opposite."""
+    name = word.partition("=")[0].replace("_", "-")
+    return f"--{name.removeprefix('--no-')}" if name.startswith("--no-") else name
+
+
+def _gathering(command: Callable[..., Any]) -> set[str]:
+    """Flags of a command that may be given several times."""
+    hints = typing.get_type_hints(command, include_extras=True)
+    return {
+        f"--{name.replace('_', '-')}"
+        for name, hint in hints.items()
+        if typing.get_origin(hint) is Annotated and _APPEND in typing.get_args(hint)
+    }
