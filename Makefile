@@ -9,11 +9,11 @@ export PYTHON
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help play test lint bench screenshots clean
+.PHONY: help play test test-python lint bench screenshots clean
 
 help: ## Show this
 	@printf 'spherloc: see why visual localization works, and why it fails\n\n'
-	@sed -n 's/^\([a-z]*\):.*## \(.*\)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 16
+	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 20
 	@printf '\nOptions, with what they are now:\n'
 	@printf '  %-12s  %s\n' 'SCENE=FILE' 'scene to play ($(SCENE))' \
 	  'PORT=NUMBER' 'port of the playground ($(or $(PORT),whatever `spherloc play` chooses))' \
@@ -28,6 +28,9 @@ test: ## Install what the tests need, a Chromium included, and run them all
 	@SPHERLOC_CHROMIUM="$$(scripts/setup.sh test)" && export SPHERLOC_CHROMIUM && \
 	  printf 'spherloc: running the tests; browser: %s\n' "$$SPHERLOC_CHROMIUM" && \
 	  exec $(BIN)/python -m pytest -n 2 --dist loadfile $(ARGS)
+
+test-python: ## Run part of the tests with a newer Python (3.12, 3.13), if one is here
+	@scripts/test_python.sh $(if $(findstring command,$(origin PYTHON)),'$(PYTHON)')
 
 lint: ## Check style, format and types
 	@scripts/setup.sh lint

@@ -5,6 +5,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from tests.waiting import LIMIT_S
+
 ROOT = Path(__file__).resolve().parents[1]
 SCENE = ROOT / "scenes" / "mei_outliers_80.toml"
 
@@ -14,7 +16,13 @@ def spherloc(*words: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
     program = Path(sys.executable).with_name("spherloc")
     environment = os.environ | {"COLUMNS": "100"}
     return subprocess.run(
-        [program, *map(str, words)], cwd=cwd, capture_output=True, text=True, timeout=240, env=environment, check=False
+        [program, *map(str, words)],
+        cwd=cwd,
+        capture_output=True,
+        text=True,
+        timeout=LIMIT_S,
+        env=environment,
+        check=False,
     )
 
 

@@ -60,7 +60,7 @@ def pytest_make_collect_report() -> Generator[None, pytest.CollectReport, pytest
     return report
 
 
-def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+def pytest_terminal_summary(terminalreporter: "pytest.TerminalReporter") -> None:
     """How many tests were skipped, for each reason."""
     reasons = Counter(skip_reason(report) for report in terminalreporter.stats.get("skipped", ()))
     terminalreporter.section("skipped tests")

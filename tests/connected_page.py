@@ -3,7 +3,6 @@
 import asyncio
 import contextlib
 import threading
-import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -14,6 +13,7 @@ import zstandard
 
 from spherloc_viz.app.web.access import Role
 from spherloc_viz.app.web.viser_seams import KEY_HEADER, ROLE_HEADER
+from tests.waiting import LIMIT_S, until
 
 HELLO = {
     "type": "ViewerCameraMessage",
@@ -27,14 +27,6 @@ HELLO = {
     "look_at": (0.0, 0.0, 0.0),
     "up_direction": (0.0, -1.0, 0.0),
 }
-
-
-def until(condition: Callable[[], Any]) -> None:
-    """Wait until something is so."""
-    end = time.monotonic() + 60
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.01)
 
 
 class Wire:
@@ -85,14 +77,14 @@ class Wire:
         """Send a message as the page's script would."""
         assert self._socket is not None
         sending = self._socket.send_bytes(msgspec.msgpack.encode(message))
-        asyncio.run_coroutine_threadsafe(sending, self._loop).result(60)
+        asyncio.run_coroutine_threadsafe(sending, self._loop).result(LIMIT_S)
 
     def close(self) -> None:
         """Leave."""
         # The loop is closed already where the server went first.
         with contextlib.suppress(RuntimeError):
             self._loop.call_soon_threadsafe(self._leaving.set)
-        self._thread.join(60)
+        self._thread.join(LIMIT_S)
         assert not self._thread.is_alive()
 
 

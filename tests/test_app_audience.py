@@ -14,9 +14,9 @@ from spherloc_viz.app.audience import Audience
 from spherloc_viz.app.catalog import Catalog
 from spherloc_viz.app.web.access import Role
 from spherloc_viz.app.web.touch import Touch
-from tests.connected_page import until
 from tests.test_app_sessions import KEY, House, Page
 from tests.tiny_scene import write_tiny_scene
+from tests.waiting import until
 
 MAY_PRESS = {
     "define",

@@ -22,7 +22,7 @@ from spherloc_viz.app.panels.compare_panel import START, STOP, TICKED, ComparePa
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.web.viser_seams import start_viser, stop_viser
 from spherloc_viz.layers.primitives import Label
-from tests.connected_page import until
+from tests.waiting import LIMIT_S, until
 
 
 class Stage:
@@ -201,7 +201,7 @@ def test_cancel_ends_it_within_a_run(stage: Stage, runs: tuple[Trace, Trace], mo
     stage.tick_only("mc-exact", "ransac-2p")
     stage.panel.draw(runs[0])
     stage.press()
-    assert begun.wait(60)
+    assert begun.wait(LIMIT_S)
     assert stage.panel._button.label == STOP and stage.panel._bar.visible
     stage.press()
     stage.settle()

@@ -23,7 +23,8 @@ from spherloc_viz.app.stage.still_page import Still, still_html
 from spherloc_viz.app.web.viser_seams import start_viser, stop_viser
 from spherloc_viz.layers import paint, steps
 from spherloc_viz.recording.content.reader import read_recording
-from tests.connected_page import ConnectedPage, until
+from tests.connected_page import ConnectedPage
+from tests.waiting import until
 
 EVIL = '</script><img src=x onerror="alert(1)">&'
 KEY = "a key of this test"

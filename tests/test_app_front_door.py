@@ -26,6 +26,7 @@ from spherloc_viz.app.web.front_door import FrontDoor
 from spherloc_viz.app.web.guard import is_own_name, open_socket, refusal
 from spherloc_viz.app.web.page import load_page
 from spherloc_viz.app.web.viewer_room import ViewerRoom
+from tests.waiting import LIMIT_S
 
 KEY = "a key of this test"
 VERSION = f"viser-v{viser.__version__}"
@@ -165,7 +166,7 @@ def through_an_echo(visit: Callable[[Door, list[str]], Awaitable[None]]) -> None
         async with echoing() as (port, keys), door_to(port) as door:
             await visit(door, keys)
 
-    asyncio.run(asyncio.wait_for(run(), 60))
+    asyncio.run(asyncio.wait_for(run(), LIMIT_S))
 
 
 def test_page_is_served_with_its_policy() -> None:
@@ -240,7 +241,7 @@ def test_without_a_server_behind_it_says_so() -> None:
             with pytest.raises(aiohttp.WSServerHandshakeError, match="502"):
                 await door.knock()
 
-    asyncio.run(asyncio.wait_for(run(), 60))
+    asyncio.run(asyncio.wait_for(run(), LIMIT_S))
 
 
 def test_viser_itself_answers_the_key_only() -> None:
@@ -259,7 +260,7 @@ def test_viser_itself_answers_the_key_only() -> None:
                 assert page.protocol == VERSION
                 assert (await page.receive()).type is aiohttp.WSMsgType.BINARY
 
-        asyncio.run(asyncio.wait_for(run(), 60))
+        asyncio.run(asyncio.wait_for(run(), LIMIT_S))
         assert server.get_host() == "127.0.0.1"
     finally:
         viser_seams.stop_viser(server)
@@ -340,7 +341,7 @@ def test_without_the_token_nothing_passes() -> None:
             assert "<script" not in await page.text()
             assert keys == [] and asked == []
 
-    asyncio.run(asyncio.wait_for(visit(), 60))
+    asyncio.run(asyncio.wait_for(visit(), LIMIT_S))
 
 
 def test_a_link_becomes_a_cookie_and_the_token_leaves_the_address() -> None:
@@ -364,7 +365,7 @@ def test_a_link_becomes_a_cookie_and_the_token_leaves_the_address() -> None:
             assert (await door.get(Cookie=cookie, Origin="http://evil.example")).status == 403
             assert (await door.get(Cookie=cookie, Host="rebound.example")).status == 403
 
-    asyncio.run(asyncio.wait_for(visit(), 60))
+    asyncio.run(asyncio.wait_for(visit(), LIMIT_S))
 
 
 def test_tokens_are_compared_in_constant_time_only(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -400,4 +401,4 @@ def test_an_audience_opens_no_recordings() -> None:
                 assert response.status == 403 and "presenter" in await response.text()
             assert (await door.get(Cookie=cookie)).status == 200
 
-    asyncio.run(asyncio.wait_for(visit(), 60))
+    asyncio.run(asyncio.wait_for(visit(), LIMIT_S))

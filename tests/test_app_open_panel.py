@@ -16,7 +16,8 @@ from spherloc_viz.app.panels.recent import RecentScenes
 from spherloc_viz.app.panels.uploads import MOST_BYTES
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.web.viser_seams import start_viser, stop_viser
-from tests.connected_page import ConnectedPage, until
+from tests.connected_page import ConnectedPage
+from tests.waiting import until
 
 ROOT = Path(__file__).resolve().parents[1]
 KEY = "a key of this test"

@@ -3,7 +3,6 @@
 import dataclasses
 import math
 import threading
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -32,6 +31,7 @@ from spherloc_viz.app.web.viser_seams import start_viser, stop_viser
 from spherloc_viz.layers import paint, steps
 from spherloc_viz.layers.primitives import Balls, Points, Step, Stop, Table
 from spherloc_viz.options import option_fields
+from tests.waiting import LIMIT_S, until
 
 COLORS = np.array([color for color, _ in style.LEGEND] + [style.SPHERE], np.uint8)
 
@@ -281,13 +281,6 @@ def test_the_view_of_the_clique_shows_its_balls(scene_of: Callable[..., Syntheti
     assert np.mean(np.all(np.abs(across) <= np.tan(views.FIELD_OF_VIEW_RAD / 2), axis=1)) >= 0.5
 
 
-def until(condition: Callable[[], bool]) -> None:
-    end = time.monotonic() + 60
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.005)
-
-
 def test_requests_never_queue() -> None:
     """However often it is asked while it works, the job runs once more, and it runs for the newest state."""
     state, seen = [0], []
@@ -296,19 +289,19 @@ def test_requests_never_queue() -> None:
     def job(asked: bool) -> None:
         seen.append(state[0])
         inside.set()
-        gate.wait(60)
+        gate.wait(LIMIT_S)
 
     worker = Newest("test", job)
     worker.start()
     worker.ask()
-    assert inside.wait(60)
+    assert inside.wait(LIMIT_S)
     for number in range(1, 50):
         state[0] = number
         worker.ask()
     gate.set()
     until(lambda: len(seen) == 2)
     worker.close()
-    worker.join(60)
+    worker.join(LIMIT_S)
     assert seen == [0, 49]
 
 
@@ -321,16 +314,15 @@ def test_an_alarm_rings_once_and_a_request_puts_it_off() -> None:
     worker.ask()
     until(lambda: calls == [True, False, True, False])
     worker.close()
-    worker.join(60)
+    worker.join(LIMIT_S)
     assert calls == [True, False, True, False]
 
 
 def test_close_ends_a_waiting_thread() -> None:
-    before = threading.active_count()
     workers = [Newest("test", lambda asked: 1000.0) for _ in range(3)]
     for worker in workers:
         worker.start()
         worker.ask()
         worker.close()
-        worker.join(60)
-    assert threading.active_count() == before
+        worker.join(LIMIT_S)
+    assert not any(worker.is_alive() for worker in workers)

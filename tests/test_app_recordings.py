@@ -18,9 +18,9 @@ from spherloc_viz.app.review import notes as notes_module
 from spherloc_viz.gallery import gallery_cases
 from spherloc_viz.recording.content.reader import read_recording
 from spherloc_viz.recording.review.notes import Review, read_review
-from tests.connected_page import until
 from tests.reviewing_pages import Office, recorded_twice
 from tests.tiny_scene import write_tiny_scene
+from tests.waiting import until
 
 
 def test_recorded_problems_do_not_pile_up(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ import multiprocessing
 import re
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
 from types import SimpleNamespace
@@ -32,6 +32,7 @@ from spherloc_viz.layers.sweep import SweepChart
 from spherloc_viz.recording.index.query import RunQuery
 from spherloc_viz.recording.keeping.recorder import Recorder
 from tests.tiny_scene import write_tiny_scene
+from tests.waiting import LIMIT_S, until
 
 NAME = "tiny <b>"
 """What a page must escape."""
@@ -73,13 +74,6 @@ class Desk:
         return 0 if self.panel._results is None else len(self.panel._results.rows)
 
 
-def until(condition: Callable[[], bool]) -> None:
-    end = time.monotonic() + 60
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.01)
-
-
 @pytest.fixture
 def server() -> Iterator[viser.ViserServer]:
     started = start_viser("a key of this test")
@@ -118,19 +112,19 @@ def test_runs_are_recorded_unless_that_is_unticked(server: viser.ViserServer, tm
 
 def test_a_sweep_is_drawn_as_it_goes_cancelled_and_gone_on_with(desk: Desk) -> None:
     panel = desk.panel
-    panel._values.value, panel._runs.value, panel._workers.value = "0.2,0.6", 1000, 1
+    panel._values.value, panel._runs.value, panel._workers.value = "0.2,0.6", 10_000, 1
     drawn: list[float] = []
     panel._draw, draw = (lambda: (drawn.append(time.monotonic()), draw())), panel._draw
     desk.press()
     until(lambda: len(drawn) >= 3)
     assert panel._button.label == CANCEL and 0.0 < panel._bar.value < 100.0
-    assert re.fullmatch(r"[\d,]+ of 2,000 runs, about \d+ (s|min) left\.", desk.status)
+    assert re.fullmatch(r"[\d,]+ of 20,000 runs, about \d+ (s|min) left\.", desk.status)
     assert panel._charts.content.count("<svg") == 3 and NAME not in panel._charts.content
     desk.press()
     desk.finish()
     assert np.diff(drawn[:-1]).min() >= sweep_runs_panel.DRAW_EVERY_S
     done = desk.rows
-    assert 0 < done < 2000 and desk.status.startswith(f"Stopped at {done:,} of 2,000 runs")
+    assert 0 < done < 20_000 and desk.status.startswith(f"Stopped at {done:,} of 20,000 runs")
     assert not multiprocessing.active_children()
     most = max(row.seed for row in panel._results.rows) - 4
     panel._runs.value = most
@@ -152,7 +146,7 @@ def test_a_sweep_is_drawn_as_it_goes_cancelled_and_gone_on_with(desk: Desk) -> N
 
 
 def test_one_sweep_at_a_time_on_a_server(desk: Desk) -> None:
-    assert sweep_runs_panel._turn.acquire(timeout=60)
+    assert sweep_runs_panel._turn.acquire(timeout=LIMIT_S)
     try:
         desk.press()
         until(lambda: "waits for it" in desk.status)

@@ -29,6 +29,7 @@ from spherloc_viz.recording.review.notes import review_path, write_review
 from spherloc_viz.recording.run_row import RunRow
 from spherloc_viz.recording.viewing.view import step_of
 from spherloc_viz.recording.viewing.viewer_files import viewer_version
+from tests.waiting import LIMIT_S
 
 Folder = tuple[Path, RunRow]
 
@@ -62,7 +63,7 @@ def visit(folder: Path, row: RunRow, calls: Callable[[Door], Awaitable[None]]) -
             async with door_to(1, viewer=ViewerRoom(of_index(index))) as door:
                 await calls(door)
 
-    asyncio.run(asyncio.wait_for(run(), 120))
+    asyncio.run(asyncio.wait_for(run(), LIMIT_S))
 
 
 class Parsed(HTMLParser):
@@ -260,7 +261,7 @@ def test_a_run_that_takes_long_keeps_nobody_waiting() -> None:
         go_on = threading.Event()
 
         def find(file: str) -> Viewable:
-            assert go_on.wait(60)
+            assert go_on.wait(LIMIT_S)
             raise InputError("Not today.")
 
         async with door_to(1, viewer=ViewerRoom(find)) as door:
@@ -270,7 +271,7 @@ def test_a_run_that_takes_long_keeps_nobody_waiting() -> None:
             go_on.set()
             assert ["Not today." in await (await task).text() for task in slow] == [True] * len(slow)
 
-    asyncio.run(asyncio.wait_for(calls(), 120))
+    asyncio.run(asyncio.wait_for(calls(), LIMIT_S))
 
 
 def test_policy_lets_nothing_out_and_runs_only_our_script(folder: Folder) -> None:

@@ -15,10 +15,10 @@ from spherloc.errors import InputError
 from spherloc.estimators import estimate, options_type
 from spherloc_viz.progress import solve
 from spherloc_viz.recording.content.writer import write_recording
+from tests.waiting import LIMIT_S
 
 ROOT = Path(__file__).resolve().parents[1]
 MOST_ITERATIONS = 10_000_000
-LIMIT_S = 240.0
 
 PROGRAM = """
 import signal, sys

@@ -35,6 +35,7 @@ from spherloc_viz.recording.content.writer import recorded_steps, write_recordin
 from spherloc_viz.recording.keeping.machine import machine
 from spherloc_viz.recording.viewing.rerun_program import rerun_command, rerun_environment
 from tests.needs import needs
+from tests.waiting import LIMIT_S
 
 
 @pytest.fixture(scope="module", params=[*RUNS, "lost", "by hand"], ids=str)
@@ -358,7 +359,9 @@ def test_identical_primitives_are_written_once(trace: Trace, recorded: Recorded)
 
 def test_rerun_finds_no_fault_with_the_file(path: Path) -> None:
     command = [*rerun_command(), "rrd", "verify", str(path)]
-    done = subprocess.run(command, capture_output=True, text=True, env=rerun_environment(), timeout=60, check=False)
+    done = subprocess.run(
+        command, capture_output=True, text=True, env=rerun_environment(), timeout=LIMIT_S, check=False
+    )
     assert done.returncode == 0, done.stderr
 
 
@@ -461,7 +464,7 @@ def test_a_full_disk_is_one_sentence_and_leaves_what_was_there(tmp_path: Path, l
         [sys.executable, "-c", FULL_DISK, str(path), str(limit), before],
         capture_output=True,
         text=True,
-        timeout=200,
+        timeout=LIMIT_S,
         check=False,
         env=os.environ | {"PYTHONPATH": str(Path(__file__).parent)},
     )

@@ -23,6 +23,7 @@ from spherloc_viz.recording.keeping import recorder as background
 from spherloc_viz.recording.keeping.keeper import Keeper, file_name
 from spherloc_viz.recording.keeping.recorder import Recorder
 from spherloc_viz.recording.origin import Origin
+from tests.waiting import LIMIT_S, until
 
 
 @pytest.fixture(scope="module")
@@ -50,12 +51,12 @@ def held(folder: Path, trace: Trace, told: Callable[[object], None]) -> Iterator
 
     def hold(error: RecordingError) -> None:
         stuck.set()
-        go_on.wait(60)
+        go_on.wait(LIMIT_S)
         told(error)
 
     with Recorder(folder, hold) as recorder:
         recorder.submit(trace)
-        assert stuck.wait(60)
+        assert stuck.wait(LIMIT_S)
         try:
             yield recorder
         finally:
@@ -102,26 +103,17 @@ def test_while_nothing_can_be_written_there_is_one_notification(trace: Trace, tm
     with Recorder(folder, errors.hear, notices.hear) as recorder:
         for _ in range(3):
             recorder.submit(trace)
-        wait_until_idle(recorder)
+        until(lambda: not recorder.waiting)
         assert len(errors) == 1 and "the run cannot be recorded" in errors[0] and "\n" not in errors[0]
         folder.unlink()
         path = recorder.submit(trace)
-        wait_until_idle(recorder)
+        until(lambda: not recorder.waiting)
         assert notices == ["Runs are recorded again; 3 were not."] and read_recording(path).seed == trace.seed
         recorder.submit(replace(trace, stages=(Unknown(),)))
         last = recorder.submit(trace)
     assert len(errors) == 2 and "Unknown" in errors[1] and "cannot be recorded" in errors[1]
     assert notices[1:] == ["Runs are recorded again; 1 was not."]
     assert sorted(folder.glob("*.rrd")) == sorted([path, last]) and not list(folder.glob("*.part"))
-
-
-def wait_until_idle(recorder: Recorder) -> None:
-    done = threading.Event()
-    for _ in range(1200):
-        if not recorder.waiting:
-            return
-        done.wait(0.05)
-    raise AssertionError(recorder.overload)
 
 
 def test_a_full_queue_says_how_many_wait_and_does_not_wait(

@@ -5,7 +5,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -18,8 +17,7 @@ from spherloc_viz.recording.keeping.recorder import Recorder
 from spherloc_viz.recording.strangers import examiner as strangers
 from spherloc_viz.recording.strangers.child_process import ExaminerError
 from spherloc_viz.recording.strangers.examiner import Examiner
-
-LIMIT_S = 120.0
+from tests.waiting import LIMIT_S, until
 
 STUCK = """#!{python}
 import os, sys
@@ -48,13 +46,6 @@ ENDS = """def look():
 threading.Thread(target=look, daemon=True).start()
 while not pids.exists():
     time.sleep(0.01)"""
-
-
-def until(condition: Callable[[], object]) -> None:
-    end = time.monotonic() + LIMIT_S
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.01)
 
 
 def alive(pid: int) -> bool:

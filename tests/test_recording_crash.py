@@ -7,7 +7,6 @@ import shutil
 import subprocess
 import sys
 import tempfile
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -31,6 +30,7 @@ from spherloc_viz.recording.review.notes import write_review
 from spherloc_viz.recording.strangers.child_process import ExaminerError
 from spherloc_viz.recording.strangers.examiner import Examiner
 from tests.needs import needs
+from tests.waiting import LIMIT_S, until
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -105,7 +105,7 @@ def test_whoever_is_killed_at_any_moment_loses_the_run_in_flight_only(
         env=os.environ | {"TMPDIR": str(scratches), "OPENBLAS_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"},
         capture_output=True,
         text=True,
-        timeout=200,
+        timeout=LIMIT_S,
         check=True,
     )
     counts = [tuple(map(int, line.split())) for line in done.stdout.splitlines()]
@@ -122,7 +122,7 @@ def test_whoever_is_killed_at_any_moment_loses_the_run_in_flight_only(
     notices: list[str] = []
     with Recorder(folder, lambda error: notices.append(str(error)), notices.append) as recorder:
         recorder.submit(estimate(scene_problem("mei_outliers_80"), "mc"))
-        drain(recorder)
+        until(lambda: not recorder.waiting)
         wait_for_upkeep(recorder)
         listed = recorder.index.find(RunQuery(sort="file", descending=False), limit=None).rows
     now = sorted(folder.glob("*.rrd"))
@@ -139,7 +139,7 @@ def examiner() -> Iterator[Examiner]:
 
 
 def wait_for_upkeep(recorder: Recorder) -> None:
-    recorder._upkeep.join(120)
+    recorder._upkeep.join(LIMIT_S)
     assert not recorder._upkeep.is_alive()
 
 
@@ -261,16 +261,6 @@ def small_disk(folder: Path, size_bytes: int) -> Iterator[None]:
         subprocess.run(["umount", "--lazy", str(folder)], check=True, capture_output=True)
 
 
-def drain(recorder: Recorder) -> None:
-    """Wait until all is recorded."""
-    never = threading.Event()
-    for _ in range(2400):
-        if not recorder.waiting:
-            return
-        never.wait(0.05)
-    raise AssertionError(recorder.overload)
-
-
 @needs("mount")
 def test_a_full_disk_gives_one_notification_and_is_survived(trace: Trace, recorded: bytes, tmp_path: Path) -> None:
     errors: list[str] = []
@@ -282,7 +272,7 @@ def test_a_full_disk_gives_one_notification_and_is_survived(trace: Trace, record
         paths = []
         for _ in range(10):
             paths.append(recorder.submit(trace))
-            drain(recorder)
+            until(lambda: not recorder.waiting)
         written = [path for path in paths if path.exists()]
         assert 2 <= len(written) <= 5 and all(read_recording(path) for path in written)
         assert len(errors) == 1 and "No space left on device" in errors[0] and "make room" in errors[0]
@@ -290,7 +280,7 @@ def test_a_full_disk_gives_one_notification_and_is_survived(trace: Trace, record
         for path in written:
             path.unlink()
         paths = [recorder.submit(trace) for _ in range(2)]
-        drain(recorder)
+        until(lambda: not recorder.waiting)
         assert all(read_recording(path) for path in paths) and len(errors) == 1
         assert f"Runs are recorded again; {10 - len(written)} were not." in notices
         listed = {row.file for row in recorder.index.find(RunQuery(), limit=None).rows}
@@ -302,14 +292,14 @@ def test_where_no_large_file_can_be_written_it_is_the_same(trace: Trace, tmp_pat
     notices: list[str] = []
     with Recorder(tmp_path, lambda error: errors.append(str(error)), notices.append) as recorder:
         first = recorder.submit(trace)
-        drain(recorder)
+        until(lambda: not recorder.waiting)
         wait_for_upkeep(recorder)
         before = resource.getrlimit(resource.RLIMIT_FSIZE)
         resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, before[1]))
         try:
             for _ in range(4):
                 recorder.submit(trace)
-            drain(recorder)
+            until(lambda: not recorder.waiting)
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, before)
         assert len(errors) == 1 and "cannot be recorded" in errors[0] and "\n" not in errors[0]

@@ -1,11 +1,11 @@
 """How a recording opens: its layout lies in its own file, and the real viewer has no fault to find with it."""
 
+import contextlib
 import socket
 import struct
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +17,7 @@ import pytest
 import rerun as rr
 from recording_samples import exact_run, lost_run, scene_problem
 from rerun.chunk import Chunk, LazyChunkStream, RrdReader
-from rerun.experimental import ViewerClient
+from rerun.experimental import ViewerClient, ViewerState
 
 from spherloc.estimators import estimate
 from spherloc.trace import Trace, TranslationStage, YawStage
@@ -30,8 +30,10 @@ from spherloc_viz.recording.content.panels import MOST_EDGES, MOST_NODES, panel_
 from spherloc_viz.recording.content.properties import APPLICATION_ID, REVIEW_ENTITY
 from spherloc_viz.recording.content.rrd_file import append, split, xxh32
 from spherloc_viz.recording.content.writer import write_recording
+from spherloc_viz.recording.run_row import RunRow
 from spherloc_viz.recording.viewing.rerun_program import rerun_command, rerun_environment
 from tests.needs import require, vulkan
+from tests.waiting import LIMIT_S, until
 
 
 @pytest.fixture(scope="module")
@@ -157,7 +159,9 @@ def test_stores_that_are_joined_are_whole(tmp_path: Path, clique_run: Trace, cou
     assert all(chunk.to_record_batch().column("number")[0].as_py() == [7.0] for chunk in found)
     assert len(reader.store(store=view).stream().to_chunks()) > 5
     command = [*rerun_command(), "rrd", "verify", str(path)]
-    done = subprocess.run(command, capture_output=True, text=True, env=rerun_environment(), timeout=60, check=False)
+    done = subprocess.run(
+        command, capture_output=True, text=True, env=rerun_environment(), timeout=LIMIT_S, check=False
+    )
     assert done.returncode == 0, done.stderr
 
 
@@ -187,26 +191,28 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def wait_for(what: Any, limit_s: float = 60.0) -> Any:
-    """What it returns as soon as that is something."""
-    end = time.monotonic() + limit_s
-    while not (found := what()):
-        assert time.monotonic() < end, "the viewer takes too long"
-        time.sleep(0.1)
-    return found
-
-
 @pytest.fixture
-def viewer(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[ViewerClient]:
+def viewer(monkeypatch: pytest.MonkeyPatch) -> Iterator[ViewerClient]:
     """rerun's viewer without a window."""
-    monkeypatch.setenv("CI", "true")
-    monkeypatch.setenv("TELEMETRY_ENABLED", "false")
     require("vulkan")
-    for name, value in (vulkan() or {}).items():
+    for name, value in {"CI": "true", "TELEMETRY_ENABLED": "false", **(vulkan() or {})}.items():
         monkeypatch.setenv(name, value)
     client = ViewerClient.spawn(headless=True, port=free_port(), executable_path=rerun_command()[0])
     yield client
     client.quit()
+
+
+def photograph(viewer: ViewerClient) -> np.ndarray | None:
+    """What the viewer shows; None if that takes it longer than it allows itself."""
+    with contextlib.suppress(TimeoutError):
+        return cv2.imdecode(np.frombuffer(viewer.take_screenshot(max_size=480), np.uint8), cv2.IMREAD_COLOR)
+
+
+def opened(viewer: ViewerClient, row: RunRow) -> ViewerState | None:
+    """What the viewer shows once it has the whole run."""
+    state = viewer.get_state()
+    here = str(state.active_recording).endswith(row.run_id) and not state.loading
+    return state if here and state.views else None
 
 
 def image_run(trace: Trace, folder: Path) -> Trace:
@@ -232,7 +238,8 @@ def test_the_viewer_has_no_fault_to_find(
     trace = replace(trace, message="A message: 新しい ᵀ ∈ \U0001f4f7", problem=replace(trace.problem, name="地図"))
     row = write_recording(trace, path)
     viewer.open(str(path))
-    state = wait_for(lambda: state if (state := viewer.get_state()).views else None)
+    state = until(lambda: opened(viewer, row))
+    assert state is not None
     recording = next(found for found in state.recordings if found.store_id == state.active_recording)
     assert recording.current_timeline == "step"
     _, views = layout_of(path)
@@ -240,8 +247,8 @@ def test_the_viewer_has_no_fault_to_find(
     # The third step has a letter that the viewer's font lacks, and the name of the problem has others.
     for step in (3, row.decisive_step, row.steps - 1):
         viewer.set_time(timeline="step", sequence=step)
-        picture = cv2.imdecode(np.frombuffer(viewer.take_screenshot(max_size=480), np.uint8), cv2.IMREAD_COLOR)
-        assert picture is not None and len(np.unique(picture.reshape(-1, 3), axis=0)) > 100, "a picture, not a blank"
+        (picture,) = until(lambda: () if (taken := photograph(viewer)) is None else (taken,))
+        assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 100, "a picture, not a blank"
         faults = [(view.name, report) for view in viewer.get_state().views for report in view.reports]
         assert faults == []
 

@@ -46,6 +46,7 @@ from spherloc_viz.recording.strangers import examiner as strangers
 from spherloc_viz.recording.strangers.child import FILE_LIMIT_BYTES
 from spherloc_viz.recording.strangers.examiner import Examiner, examine, examine_all
 from tests.needs import needs
+from tests.waiting import LIMIT_S
 
 Lie = Callable[[Path], bytes]
 """A bad file from a good one."""
@@ -314,7 +315,7 @@ examine._limit_time()
 while True:
     pass
 """
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=LIMIT_S, check=False)
     assert done.returncode == -signal.SIGXCPU and done.stdout == "File too large\n", done.stderr
 
 

@@ -23,6 +23,7 @@ from spherloc_viz.recording.run_row import RunRow
 from spherloc_viz.recording.viewing.rerun_program import rerun_command, rerun_environment
 from spherloc_viz.recording.viewing.view import labels_of, stand_at, view_in_window
 from tests.needs import needs, vulkan
+from tests.waiting import LIMIT_S
 
 # A shell's background job, and what it starts, ignores SIGINT.
 PROGRAM = (
@@ -61,7 +62,7 @@ def start(path: Path, *words: str) -> subprocess.Popen[str]:
 def get(url: str, **headers: str) -> tuple[int, bytes, str]:
     opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
     try:
-        with opener.open(urllib.request.Request(url, headers=headers), timeout=60) as answer:
+        with opener.open(urllib.request.Request(url, headers=headers), timeout=LIMIT_S) as answer:
             return answer.status, answer.read(), answer.url
     except urllib.error.HTTPError as error:
         return error.code, error.read(), error.url
@@ -97,7 +98,7 @@ def test_a_taken_port_is_one_sentence(run: Run) -> None:
 )
 def test_what_cannot_be_viewed_is_one_sentence(run: Run, words: list[str], sentence: str) -> None:
     words = [str(run[0]) if word == "RUN" else word for word in words]
-    done = subprocess.run([sys.executable, "-c", PROGRAM, *words], capture_output=True, text=True, timeout=120)
+    done = subprocess.run([sys.executable, "-c", PROGRAM, *words], capture_output=True, text=True, timeout=LIMIT_S)
     assert done.returncode == 2 and done.stdout == ""
     assert done.stderr.count("\n") == 1 and sentence in done.stderr
 

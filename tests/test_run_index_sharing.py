@@ -20,6 +20,7 @@ from spherloc_viz.recording.index.query import RunQuery
 from spherloc_viz.recording.index.run_index import RunIndex
 from spherloc_viz.recording.review.notes import Review, read_review, review_path
 from spherloc_viz.recording.viewing.view import labels_of
+from tests.waiting import LIMIT_S
 
 pytestmark = pytest.mark.usefixtures("own_examiner")
 ROOT = Path(__file__).resolve().parents[1]
@@ -57,7 +58,7 @@ def test_four_processes_that_write_lose_nothing(tmp_path: Path):
             process.stdin.write("\n")
             process.stdin.flush()
         for process in processes:
-            _, errors = process.communicate(timeout=200)
+            _, errors = process.communicate(timeout=LIMIT_S)
             assert (process.returncode, errors) == (0, "")
     with RunIndex(tmp_path / "new") as index:
         assert index.find(RunQuery(), 1).total == 800

@@ -26,6 +26,7 @@ from spherloc_viz.recording.review.notes import Review, read_review, write_revie
 from spherloc_viz.recording.run_row import RunRow
 from spherloc_viz.recording_commands import label, reindex, runs, steps
 from spherloc_viz.runs import diagnosis_of, sort_key
+from tests.waiting import LIMIT_S
 
 
 @pytest.fixture(scope="module")
@@ -220,7 +221,7 @@ def test_as_a_user_calls_it(folder: Path):
     def spherloc(*words: str) -> subprocess.CompletedProcess[str]:
         command = [str(program), *words]
         return subprocess.run(
-            command, cwd=folder.parent, capture_output=True, text=True, timeout=200, env=environment, check=False
+            command, cwd=folder.parent, capture_output=True, text=True, timeout=LIMIT_S, env=environment, check=False
         )
 
     done = spherloc("runs", "--failed", "--outliers", ">0.7", "--sort", "position-error")

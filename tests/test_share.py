@@ -18,6 +18,7 @@ from spherloc.estimators import default_options, estimate, options_type
 from spherloc_viz.batch import run_scenes
 from spherloc_viz.share import as_command, as_python
 from tests.datasets.test_rendered import SMALL
+from tests.waiting import LIMIT_S
 
 ROOT = Path(__file__).resolve().parents[1]
 MEI = ROOT / "scenes" / "mei_outliers_80.toml"
@@ -40,7 +41,7 @@ MANY = Variation(
 
 
 def run(words: list[str], cwd: Path) -> str:
-    done = subprocess.run(words, cwd=cwd, capture_output=True, text=True, timeout=240, check=False)
+    done = subprocess.run(words, cwd=cwd, capture_output=True, text=True, timeout=LIMIT_S, check=False)
     assert done.returncode == 0, done.stderr
     return done.stdout
 
@@ -142,7 +143,13 @@ def spherloc(*words: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
     program = Path(sys.executable).with_name("spherloc")
     environment = os.environ | {"COLUMNS": "100"}
     return subprocess.run(
-        [program, *map(str, words)], cwd=cwd, capture_output=True, text=True, timeout=240, env=environment, check=False
+        [program, *map(str, words)],
+        cwd=cwd,
+        capture_output=True,
+        text=True,
+        timeout=LIMIT_S,
+        env=environment,
+        check=False,
     )
 
 

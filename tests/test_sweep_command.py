@@ -19,6 +19,7 @@ from spherloc_viz.layers.sweep import LIMIT, sweep_charts, sweep_colors, sweep_t
 from spherloc_viz.sweep import parse_entrant, sweep
 from spherloc_viz.sweep_plot import sweep_png
 from tests.tiny_scene import write_tiny_scene
+from tests.waiting import LIMIT_S
 
 PROGRAM = [sys.executable, "-c", "import signal\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n"
            "from spherloc_viz.cli import main\nmain()", "sweep"]  # fmt: skip
@@ -56,7 +57,7 @@ def test_ctrl_c_keeps_what_is_done_and_the_same_command_goes_on(scene: Path, tmp
         assert process.poll() is None, process.communicate()
         time.sleep(0.02)
     process.send_signal(signal.SIGINT)
-    output, errors = process.communicate(timeout=100)
+    output, errors = process.communicate(timeout=LIMIT_S)
     assert (process.returncode, output) == (130, "")
     done = lines(out) - 1
     (sentence,) = errors.splitlines()
@@ -68,7 +69,7 @@ def test_ctrl_c_keeps_what_is_done_and_the_same_command_goes_on(scene: Path, tmp
         [*PROGRAM, scene, *words],
         capture_output=True,
         text=True,
-        timeout=200,
+        timeout=LIMIT_S,
         check=False,
     )
     assert finished.returncode == 0, finished.stderr

@@ -9,7 +9,8 @@ import viser
 from viser import _messages
 
 from spherloc_viz.app.web.viser_seams import at_once, guard_callbacks, start_viser, stop_viser
-from tests.connected_page import ConnectedPage, until
+from tests.connected_page import ConnectedPage
+from tests.waiting import until
 
 KEY = "a key of this test"
 THREADS, ROUNDS, MESSAGES = 4, 30, 20

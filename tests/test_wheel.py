@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.waiting import LIMIT_S
+
 ROOT = Path(__file__).resolve().parents[1]
 SOURCES = ("pyproject.toml", "MANIFEST.in", "README.md", "LICENSE", "scripts", "scenes", "recordings/gallery.toml")
 PACKAGES = ("spherloc", "spherloc_viz")
@@ -32,7 +34,7 @@ def run(*words: str | Path, cwd: Path, **environment: str) -> str:
         cwd=cwd,
         capture_output=True,
         text=True,
-        timeout=200,
+        timeout=LIMIT_S,
         env=os.environ | environment,
         check=False,
     )

@@ -16,6 +16,7 @@ from spherloc.geometry import DOWN, pose, so3_exp
 from spherloc.problem import Problem
 from spherloc.ranges import LEAST_PX, MOST_PX
 from spherloc.refine import residuals_px
+from tests.waiting import LIMIT_S
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
 
@@ -122,6 +123,6 @@ except InputError as error:
 
 def test_too_many_correspondences_for_mc_is_an_input_error():
     """2 * 10^10 pairs fit nowhere: the user needs a sentence, not a MemoryError (or a machine that stops answering)."""
-    done = subprocess.run([sys.executable, "-c", TOO_MANY], capture_output=True, text=True, timeout=120)
+    done = subprocess.run([sys.executable, "-c", TOO_MANY], capture_output=True, text=True, timeout=LIMIT_S)
     assert done.returncode == 0, done.stderr.strip().splitlines()[-1]
     assert "200,000" in done.stdout or "200000" in done.stdout

@@ -5,6 +5,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from tests.waiting import LIMIT_S
+
 SCRIPT = """
 import importlib, pkgutil, numba
 import spherloc
@@ -35,7 +37,7 @@ print(len(after), sorted(name for name in after if after[name] != before[name]))
 
 def test_warm_up_leaves_nothing_to_compile() -> None:
     """A kernel that warm-up does not reach would make the first user wait for it."""
-    done = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=True, timeout=280)
+    done = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=True, timeout=LIMIT_S)
     count, late = done.stdout.split(" ", 1)
     assert int(count) >= 10
     assert late.strip() == "[]"

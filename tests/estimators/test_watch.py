@@ -13,8 +13,8 @@ from spherloc.consensus.long_sort import order_of
 from spherloc.errors import SpherlocError
 from spherloc.estimators import default_options, estimate, options_type
 from spherloc.watch import DONE, Cancelled, Watch
+from tests.waiting import LIMIT_S
 
-PATIENCE_S = 60.0
 """After which a run that does not begin, move or end is taken to be stuck."""
 
 LONG = {
@@ -47,7 +47,7 @@ class Run(threading.Thread):
 
     def until(self, reached):
         """Wait until the watch says so."""
-        deadline = time.monotonic() + PATIENCE_S
+        deadline = time.monotonic() + LIMIT_S
         while not reached(self.watch):
             assert self.is_alive() and time.monotonic() < deadline, (self.watch.stage, self.watch.fraction)
             time.sleep(0.001)
@@ -55,7 +55,7 @@ class Run(threading.Thread):
 
     def ended(self):
         """The error of the run, or None, once it is over."""
-        self.join(PATIENCE_S)
+        self.join(LIMIT_S)
         assert not self.is_alive(), "the run does not end"
         return self.error
 

@@ -26,7 +26,7 @@ STANDING = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 GRAVITY_MAP = np.array([0.0, 0.0, -1.0])
 
 KEYS = {"kind", "name"}
-OPTIONAL = {"queries", "broken", "few", "unknown", "wrong", "seconds", "stuck", "registered", "timed", "folder"}
+OPTIONAL = {"queries", "broken", "few", "unknown", "wrong", "stuck", "registered", "timed", "folder"}
 
 
 def true_pose(place: int) -> np.ndarray:
@@ -38,18 +38,21 @@ def true_pose(place: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class DrawnMatches:
-    """Draws the matches of a query; ``few`` queries get a single one, ``wrong`` ones only wrong ones."""
+    """Draws the matches of a query; ``few`` queries get a single one, ``wrong`` ones only wrong ones.
+
+    ``stuck`` ones wait until there is a file "go on" beside the images.
+    """
 
     references: tuple[View, ...]
     few: tuple[int, ...]
     wrong: tuple[int, ...]
-    seconds: float
     stuck: tuple[int, ...]
 
     def __call__(self, query: View) -> Matches:
         query.read()
         place = int(query.name[5:-4])
-        time.sleep(600.0 if place in self.stuck else self.seconds)
+        while place in self.stuck and not query.path.with_name("go on").exists():
+            time.sleep(0.01)
         rng = np.random.default_rng(place)
         truth = true_pose(place)
         points = rng.uniform(-20.0, 20.0, (1 if place in self.few else 60, 3)) - truth[:, :3].T @ truth[:, 3]
@@ -100,7 +103,7 @@ def load(table: dict[str, Any], path: Path) -> MapScene:
         where=str(path),
         queries=tuple(queries),
         references=(reference,),
-        matcher=DrawnMatches((reference,), few, wrong, table.get("seconds", 0.0), tuple(table.get("stuck", ()))),
+        matcher=DrawnMatches((reference,), few, wrong, tuple(table.get("stuck", ()))),
         gravity_map=GRAVITY_MAP,
         thresholds=((0.5, 0.1), (2.0, 0.5)),
         registration=DistanceRegistration() if table.get("registered", False) else None,

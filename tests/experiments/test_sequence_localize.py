@@ -23,6 +23,7 @@ from spherloc.experiments.rows import QueryResult
 from spherloc.experiments.sequence import chosen_queries, localize
 from spherloc.experiments.summary import summarize, wilson
 from spherloc.experiments.trajectories import estimated_trajectory, timed, true_trajectory
+from tests.waiting import LIMIT_S
 
 
 def scene_of(folder: Path, **keys) -> MapScene:
@@ -127,7 +128,7 @@ def test_the_next_query_is_matched_while_one_is_solved(tmp_path: Path) -> None:
     def watched(view):
         begun.append((view.name, threading.current_thread().name))
         if view.name == "image1.png":
-            assert go_on.wait(60)
+            assert go_on.wait(LIMIT_S)
         return scene.matcher(view)
 
     found = localize(replace(scene, matcher=watched), scene.queries, "mc", options_type("mc")(), 0)

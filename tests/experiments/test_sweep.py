@@ -6,8 +6,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -34,6 +32,7 @@ from spherloc.experiments.sweep import (
 )
 from spherloc.experiments.sweep_crew import NICENESS
 from spherloc.metrics import evaluate
+from tests.waiting import LIMIT_S, until
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -47,13 +46,6 @@ def untimed(rows: list[SweepRow]) -> dict[tuple[str, float, int], SweepRow]:
     found = {(row.estimator, row.value, row.seed): replace(row, time_ms=0.0) for row in rows}
     assert len(found) == len(rows)
     return found
-
-
-def until(condition: Callable[[], bool]) -> None:
-    end = time.monotonic() + 60
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.02)
 
 
 def alive(pid: int) -> bool:
@@ -189,7 +181,7 @@ def test_a_run_that_always_kills_its_worker_is_named(tmp_path: Path) -> None:
 def test_workers_that_cannot_start_end_in_a_sentence(tmp_path: Path) -> None:
     (tmp_path / "bare.py").write_text(PARENT.replace('if __name__ == "__main__":', "if True:"))
     words = [sys.executable, tmp_path / "bare.py", Path(__file__).parent, tmp_path]
-    done = subprocess.run(words, capture_output=True, text=True, timeout=100, check=False)
+    done = subprocess.run(words, capture_output=True, text=True, timeout=LIMIT_S, check=False)
     assert done.returncode == 1
     assert "InputError: the worker processes end while they start: in a script" in done.stderr
 
@@ -264,11 +256,12 @@ def test_a_cluster_gives_the_same_rows_though_a_worker_is_killed(tmp_path: Path)
 
 
 def test_no_cluster_is_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sweep_cluster, "CONNECT_S", 0.5)
     plan = small_plan(tmp_path)
-    for address, said in (("tcp://127.0.0.1:9", "no Dask scheduler answers at"), ("host", "missing port number")):
-        with pytest.raises(InputError, match=said):
-            next(run_sweep(plan, scheduler=address))
+    with monkeypatch.context() as patch:
+        patch.setattr(sweep_cluster, "CONNECT_S", 0.5)
+        for address, said in (("tcp://127.0.0.1:9", "no Dask scheduler answers at"), ("host", "missing port number")):
+            with pytest.raises(InputError, match=said):
+                next(run_sweep(plan, scheduler=address))
     with (
         distributed.LocalCluster(n_workers=0, dashboard_address=None, silence_logs=50) as cluster,
         pytest.raises(InputError, match="has no workers; start some: dask worker tcp://"),
