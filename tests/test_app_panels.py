@@ -325,4 +325,4 @@ def test_close_ends_a_waiting_thread() -> None:
         worker.ask()
         worker.close()
         worker.join(LIMIT_S)
-    assert not any(worker.is_alive() for worker in workers)
+    assert not any(worker._thread.is_alive() for worker in workers)
