@@ -27,7 +27,7 @@ class Office:
     def __init__(self, folder: Path) -> None:
         self.folder = folder / "recordings"
         self.errors: list[RecordingError] = []
-        self.recorder = Recorder(self.folder, self.errors.append)
+        self.recorder = Recorder(self.folder, self.report, on_recovery=lambda words: self.sessions.recover(words))
         catalog = Catalog(write_tiny_scene(folder))
         self.services = Services(catalog, (folder,), self.recorder, Shelf(self.recorder.index))
         self.sessions = Sessions(self.services)
@@ -35,14 +35,19 @@ class Office:
         self.sessions.attend(self.server)
         self.visitors: list[Visitor] = []
 
-    def visit(self) -> "Visitor":
-        """A new page, once its first run is on the disk."""
+    def report(self, error: RecordingError) -> None:
+        self.errors.append(error)
+        self.sessions.report(error)
+
+    def visit(self, recorded: bool = True) -> "Visitor":
+        """A new page, by default once its first run is on the disk."""
         known = set(self.sessions._open)
         page = ConnectedPage(self.server, KEY)
         until(lambda: set(self.sessions._open) - known)
         (number,) = set(self.sessions._open) - known
         self.visitors.append(Visitor(page, self.sessions._open[number]))
-        self.visitors[-1].settle()
+        if recorded:
+            self.visitors[-1].settle()
         return self.visitors[-1]
 
     @property

@@ -22,6 +22,7 @@ from spherloc_viz.app.server import serve
 from spherloc_viz.app.web import access as access_module
 from spherloc_viz.app.web import viser_seams
 from spherloc_viz.app.web.access import Access, Role
+from spherloc_viz.app.web.downloads import Downloads
 from spherloc_viz.app.web.front_door import FrontDoor
 from spherloc_viz.app.web.guard import is_own_name, open_socket, refusal
 from spherloc_viz.app.web.page import load_page
@@ -123,9 +124,11 @@ class Door:
 
 
 @asynccontextmanager
-async def door_to(port: int, viewer: ViewerRoom | None = None, token: bool = False) -> AsyncIterator[Door]:
+async def door_to(
+    port: int, viewer: ViewerRoom | None = None, token: bool = False, downloads: Downloads | None = None
+) -> AsyncIterator[Door]:
     listener, access = open_socket("127.0.0.1", 0), Access(token)
-    runner = await FrontDoor("127.0.0.1", port, KEY, access, viewer).start(listener)
+    runner = await FrontDoor("127.0.0.1", port, KEY, access, downloads or Downloads(), viewer).start(listener)
     try:
         async with aiohttp.ClientSession(cookie_jar=aiohttp.DummyCookieJar()) as client:
             yield Door(listener.getsockname()[1], client, access)
@@ -402,3 +405,30 @@ def test_an_audience_opens_no_recordings() -> None:
             assert (await door.get(Cookie=cookie)).status == 200
 
     asyncio.run(asyncio.wait_for(visit(), LIMIT_S))
+
+
+def test_an_exported_file_is_given_to_who_knows_its_address_until_it_is_withdrawn() -> None:
+    downloads = Downloads()
+    offered, other = downloads.room("runs.zip"), downloads.room("runs.zip")
+    content = b"PK" + bytes(3_000_000)
+    offered.path.write_bytes(content)
+    downloads.offer(offered)
+
+    async def visit() -> None:
+        async with echoing() as (port, _), door_to(port, token=True, downloads=downloads) as door:
+            cookies = {role: f"{door.access._cookie}={token}" for role, token in door.access._tokens.items()}
+            path = offered.address.removeprefix("/")
+            response = await door.get(path, Cookie=cookies[Role.PRESENTER])
+            assert response.status == 200 and await response.read() == content
+            assert response.headers["Content-Disposition"] == 'attachment; filename="runs.zip"'
+            assert (await door.get(path)).status == 403
+            assert (await door.get(path, Cookie=cookies[Role.AUDIENCE])).status == 403
+            for wrong in (other.address, f"{offered.address}x", "/download/", f"/download//{offered.path}"):
+                assert (await door.get(wrong.removeprefix("/"), Cookie=cookies[Role.PRESENTER])).status == 404
+            downloads.withdraw(offered)
+            assert (await door.get(path, Cookie=cookies[Role.PRESENTER])).status == 404
+
+    asyncio.run(asyncio.wait_for(visit(), LIMIT_S))
+    assert not offered.path.exists() and offered.path.parent.is_dir()
+    downloads.close()
+    assert not offered.path.parent.exists()

@@ -1,9 +1,8 @@
 """Reviewing on connected pages: runs opened as they were, labels, comparisons, exports, the gallery, and notices."""
 
-import io
 import re
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,10 +10,14 @@ import numpy as np
 import pytest
 
 from spherloc.datasets.variation import Variation
+from spherloc.errors import RecordingError
+from spherloc.estimators import default_options, estimate
 from spherloc_viz.app import session as session_module
-from spherloc_viz.app.catalog import MOST_BRIEF, Catalog
-from spherloc_viz.app.page_runs import PageRuns
+from spherloc_viz.app.catalog import MOST_BRIEF, Catalog, SceneWish
+from spherloc_viz.app.page_runs import LOOK_S, PageRuns
 from spherloc_viz.app.review import notes as notes_module
+from spherloc_viz.app.review.exporter import Exporter
+from spherloc_viz.app.wish import Run, Wish
 from spherloc_viz.gallery import gallery_cases
 from spherloc_viz.recording.content.reader import read_recording
 from spherloc_viz.recording.review.notes import Review, read_review
@@ -252,13 +255,19 @@ def test_the_list_is_searched_marked_compared_and_exported(office: Office) -> No
 
     visitor.touch("runs-export:")
     until(lambda: "2 runs," in visitor.panel._status.content)
-    until(lambda: visitor.page.files)
-    (name,) = visitor.page.files
-    assert re.fullmatch(r"spherloc-runs-\d{8}T\d{6}Z\.zip", name)
-    until(lambda: len(visitor.page.files[name]) > 0 and zipfile.is_zipfile(io.BytesIO(visitor.page.files[name])))
-    with zipfile.ZipFile(io.BytesIO(visitor.page.files[name])) as archive:
+    parts = visitor.panel._parts
+    exporter = next(part for part in parts if isinstance(part, Exporter))
+    until(lambda: exporter._link.visible)
+    found = re.search(
+        r'data-fetch href="(/download/[\w-]{40,}/spherloc-runs-\d{8}T\d{6}Z\.zip)"', exporter._link.content
+    )
+    assert found is not None
+    offered = office.services.downloads._offered[found[1]]
+    with zipfile.ZipFile(offered.path) as archive:
         assert {f"recordings/{file}" for file in (second, third)} <= set(archive.namelist())
         assert archive.read(f"recordings/{third}") == (office.folder / third).read_bytes()
+    visitor.page.close()
+    until(lambda: not office.services.downloads._offered and not offered.path.exists())
 
 
 def test_what_cannot_be_opened_is_a_sentence(office: Office) -> None:
@@ -300,7 +309,7 @@ def test_the_gallery_opens_in_one_press(office: Office) -> None:
 def test_pages_hear_of_the_recordings(office: Office) -> None:
     office.sessions.notice("3 recordings were deleted to make room.")
     visitor = office.visit()
-    notices = visitor.session._notices
+    notices = visitor.session.notices
     until(lambda: notices._shown is not None)
     first = notices._shown
     assert first is not None and first.body == "3 recordings were deleted to make room."
@@ -309,21 +318,55 @@ def test_pages_hear_of_the_recordings(office: Office) -> None:
     assert notices._shown.body == "2 recordings were recovered."
 
 
-def test_a_waiting_queue_is_told(tmp_path: Path) -> None:
+def test_a_run_is_said_to_be_recorded_when_it_is_and_failures_stand_until_then(office: Office) -> None:
+    visitor, _, _ = recorded_twice(office)
+    session, away = visitor.session, office.folder.with_name("away")
+    line, notices, noise = session._status._line, session.notices, session._controls.scene._simulation._noise
+    office.folder.rename(away)
+    office.folder.write_text("in the way")
+    for count, px in enumerate((1.5, 2.5), start=1):
+        visitor.set(noise, px)
+        until(lambda: session._run is not None and session._run.wish.scene.variation.noise_px == px)  # noqa: B023
+        until(lambda: "the run cannot be recorded" in line.content)
+        until(lambda: notices._failure is not None)
+        if count > 1:
+            until(lambda: notices._failure.body.endswith("2 runs were not recorded."))  # type: ignore[union-attr]
+    late = office.visit(recorded=False).session
+    until(lambda: late.notices._failure is not None and "runs were not" in late.notices._failure.body)
+    until(lambda: len(office.errors) == 3 and office.recorder.waiting == 0)
+    office.folder.unlink()
+    away.rename(office.folder)
+    before = set(office.files)
+    visitor.set(noise, 3.5)
+    until(lambda: "Recorded as" in line.content)
+    (new,) = {name for name in office.files if name in line.content}
+    assert new not in before and read_recording(office.folder / new).origin is not None
+    until(lambda: notices._failure is None and late.notices._failure is None)
+    until(lambda: notices._shown is not None and "Runs are recorded again; 3 were not." in notices._shown.body)
+    visitor.see()
+    until(lambda: "3 runs" in visitor.rows)
+    office.errors.clear()
+
+
+def test_what_becomes_of_a_run_is_told_when_it_is_known(tmp_path: Path) -> None:
     class Slow:
         overload = "7 runs wait to be recorded."
 
-        def submit(self, *words: object) -> Path:
+        def submit(self, trace: object, origin: object, diagnosis: object, ended: Callable[..., None]) -> Path:
+            self.ended = ended
             return tmp_path / "run.rrd"
 
-    catalog = Catalog(write_tiny_scene(tmp_path))
-    runs = PageRuns(Slow(), catalog)  # type: ignore[arg-type]
-    from spherloc.estimators import default_options, estimate
-    from spherloc_viz.app.catalog import SceneWish
-    from spherloc_viz.app.wish import Run, Wish
-
+    catalog, slow = Catalog(write_tiny_scene(tmp_path)), Slow()
+    runs = PageRuns(slow, catalog)  # type: ignore[arg-type]
     problem = catalog.problem(SceneWish("tiny", 1))
     wish = Wish(SceneWish("tiny", 1), "mc", default_options("mc", problem))
     run = Run(wish, estimate(problem, "mc", wish.options, 1), np.arange(len(problem)))
-    assert runs.settle(run, None) == ("Recorded as run.rrd. 7 runs wait to be recorded.", None)
+    assert runs.settle(run, None) == ("Recording as run.rrd … 7 runs wait to be recorded.", LOOK_S)
+    assert runs.path(run.trace) is None
+    slow.ended(None)
+    assert runs.settle(run, None) == ("Recorded as run.rrd", None) and runs.path(run.trace) == tmp_path / "run.rrd"
+    other = replace(run, trace=replace(run.trace))
+    runs.settle(other, None)
+    slow.ended(RecordingError("run.rrd: no room."))
+    assert runs.settle(other, None) == ("run.rrd: no room.", None) and runs.path(other.trace) is None
     assert PageRuns(None, catalog).settle(run, None) == ("Runs are not recorded.", None)

@@ -241,8 +241,9 @@ def test_an_export_is_whole_readable_and_bounded(shelf: Shelf, tmp_path: Path, m
     for row in rows[:2]:
         (shelf.folder / row.file).write_bytes(row.file.encode())
     (shelf.folder / "run-0000.review.rrd").write_bytes(b"review")
-    packed = bundle(shelf.folder, rows, 9, NOW, lambda: False)
-    with zipfile.ZipFile(io.BytesIO(packed.content)) as archive:
+    path = shelf.folder / "runs.zip"
+    packed = bundle(path, shelf.folder, rows, 9, NOW, lambda: False)
+    with zipfile.ZipFile(path) as archive:
         names = {f"recordings/{name}" for name in ("run-0000.rrd", "run-0000.review.rrd", "run-0001.rrd")}
         assert set(archive.namelist()) == names | {"index.html", "runs.csv"} and archive.testzip() is None
         assert archive.read("recordings/run-0001.rrd") == b"run-0001.rrd"
@@ -253,11 +254,13 @@ def test_an_export_is_whole_readable_and_bounded(shelf: Shelf, tmp_path: Path, m
     assert packed.runs == 2 and "2 were left out, since their files are gone" in packed.sentence
     assert "5 more were left out" in packed.sentence
     monkeypatch.setattr(bundle_module, "MOST_BYTES", 20)
-    assert bundle(shelf.folder, rows, 4, NOW, lambda: False).runs == 1
+    assert bundle(path, shelf.folder, rows, 4, NOW, lambda: False).runs == 1
     with pytest.raises(RecordingError, match="nothing to export"):
-        bundle(shelf.folder, rows[2:], 2, NOW, lambda: False)
+        bundle(path, shelf.folder, rows[2:], 2, NOW, lambda: False)
     with pytest.raises(RecordingError, match="page was closed"):
-        bundle(shelf.folder, rows, 4, NOW, lambda: True)
+        bundle(path, shelf.folder, rows, 4, NOW, lambda: True)
+    with pytest.raises(RecordingError, match=r"cannot be written \(.*\); make room"):
+        bundle(shelf.folder / "none" / "runs.zip", shelf.folder, rows, 4, NOW, lambda: False)
 
 
 def test_an_export_names_commands_that_there_are() -> None:

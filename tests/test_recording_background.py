@@ -97,21 +97,24 @@ def test_names_of_files_are_safe_and_unique(trace: Trace, tmp_path: Path, name: 
         assert read_recording(keeper.record(run)).problem.name == name
 
 
-def test_while_nothing_can_be_written_there_is_one_notification(trace: Trace, tmp_path: Path) -> None:
+def test_every_run_that_cannot_be_written_is_told(trace: Trace, tmp_path: Path) -> None:
     errors, notices, folder = Told(), Told(), tmp_path / "recordings"
     folder.write_text("in the way")
+    ends: list[RecordingError | None] = []
     with Recorder(folder, errors.hear, notices.hear) as recorder:
-        for _ in range(3):
-            recorder.submit(trace)
+        missing = [recorder.submit(trace, ended=ends.append) for _ in range(3)]
         until(lambda: not recorder.waiting)
-        assert len(errors) == 1 and "the run cannot be recorded" in errors[0] and "\n" not in errors[0]
+        assert [str(end) for end in ends] == errors and len(errors) == 3
+        for path, error in zip(missing, errors, strict=True):
+            assert error.startswith(f"{path}: the run cannot be recorded") and "\n" not in error
         folder.unlink()
-        path = recorder.submit(trace)
+        path = recorder.submit(trace, ended=lambda error: ends.append(error if path.is_file() else RecordingError("")))
         until(lambda: not recorder.waiting)
+        assert ends[3:] == [None], "it is told when the file is there"
         assert notices == ["Runs are recorded again; 3 were not."] and read_recording(path).seed == trace.seed
         recorder.submit(replace(trace, stages=(Unknown(),)))
         last = recorder.submit(trace)
-    assert len(errors) == 2 and "Unknown" in errors[1] and "cannot be recorded" in errors[1]
+    assert len(errors) == 4 and "Unknown" in errors[3] and "cannot be recorded" in errors[3]
     assert notices[1:] == ["Runs are recorded again; 1 was not."]
     assert sorted(folder.glob("*.rrd")) == sorted([path, last]) and not list(folder.glob("*.part"))
 
@@ -129,7 +132,7 @@ def test_a_full_queue_says_how_many_wait_and_does_not_wait(
         assert recorder.overload == "5 runs wait to be recorded."
         with pytest.raises(RecordingError, match="not recorded, since 4 runs wait to be recorded"):
             recorder.submit(trace)
-    assert len(errors) == 1 and recorder.waiting == 0
+    assert len(errors) == 5 and recorder.waiting == 0
 
 
 def test_nothing_is_recorded_after_closing(trace: Trace, tmp_path: Path) -> None:

@@ -1,10 +1,13 @@
 """Whoever closes does not wait for a hostile file: the process that reads it is killed, and nothing is left alive."""
 
+import contextlib
+import http.client
 import os
 import signal
 import subprocess
 import sys
 import threading
+import urllib.request
 from collections.abc import Callable
 from pathlib import Path
 
@@ -158,6 +161,36 @@ def test_a_program_ends_at_once(stuck: Stuck, monkeypatch: pytest.MonkeyPatch, d
         _, said = program.communicate(timeout=LIMIT_S)
     assert program.returncode == code and "Traceback" not in said, said
     assert not any(map(alive, stuck.readers())) and stuck.readers()
+
+
+PLAYS = """sys.argv[1:] = ["play", "--port", "0", "--recordings", str(folder)]
+main()"""
+
+
+def test_the_playground_ends_at_once_while_a_page_asks_for_a_hostile_file(
+    stuck: Stuck, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.undo()
+    words = [sys.executable, "-c", PROGRAM.format(do=PLAYS), stuck.program, stuck.recordings, stuck.pids]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as program:
+        assert program.stdout is not None
+        address = program.stdout.readline().split()[-1]
+        until(stuck.readers)  # of the list, which is brought up to date
+        asking, _ = ended(lambda: fetch(f"{address}/viewer/data/a.rrd"))
+        until(lambda: len(stuck.readers()) == 2 or program.poll() is not None)
+        program.send_signal(signal.SIGINT)
+        _, said = program.communicate(timeout=LIMIT_S)
+        asking.join(LIMIT_S)
+    assert program.returncode == 0 and "Traceback" not in said, said
+    assert len(stuck.readers()) == 2 and not any(map(alive, stuck.readers()))
+
+
+def fetch(address: str) -> None:
+    with (
+        contextlib.suppress(OSError, http.client.HTTPException),
+        urllib.request.urlopen(address, timeout=LIMIT_S) as answer,
+    ):
+        answer.read()
 
 
 def test_paths_count_from_the_folder_that_one_is_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -224,8 +224,9 @@ def test_a_hostile_run_is_examined_listed_found_and_exported_as_it_is(tmp_path: 
             assert found == ((row,) if text in f"{row.scene}\n{row.name}\n{row.message}" else ())
         assert index.find(RunQuery(scene=row.scene, label=FORMULA)).rows == (row,)
         assert dict(index.groups(RunQuery(), "label")) == {FORMULA: 1, "<b>": 1}
-        content = bundle(folder, [row, replace(row, file="../run.rrd")], 2, NOW, lambda: False).content
-    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        packed = tmp_path / "runs.zip"
+        bundle(packed, folder, [row, replace(row, file="../run.rrd")], 2, NOW, lambda: False)
+    with zipfile.ZipFile(packed) as archive:
         names = archive.namelist()
         assert set(names) == {"recordings/run.rrd", "recordings/run.review.rrd", "index.html", "runs.csv"}
         page = archive.read("index.html").decode()

@@ -6,16 +6,17 @@ from pathlib import Path
 import pytest
 
 from spherloc.errors import RecordingError
+from spherloc_viz.recording.review.notes import review_path, reviewed_name
 from spherloc_viz.recording.strangers.examiner import check_name, resolve_inside
 
 
 def test_names_of_recordings(tmp_path: Path) -> None:
-    for name in ("run.rrd", "20260101T120000Z_a-b.c_mc_0_1a2b3c4d.rrd", "gallery/seam.rrd"):
+    for name in ("run.rrd", "20260101T120000Z_a-b.c_mc_0_1a2b3c4d.rrd", "gallery/seam.rrd", "A.RRD"):
         assert check_name(name) == name
 
 
 NO_NAMES = r"""
-../run.rrd /etc/run.rrd gallery/../run.rrd other/run.rrd gallery//run.rrd gallery/gallery/run.rrd run.RRD run .rrd
+../run.rrd /etc/run.rrd gallery/../run.rrd other/run.rrd gallery//run.rrd gallery/gallery/run.rrd run.rd run .rrd
 run.rrd/ ./run.rrd C:\run.rrd gallery\run.rrd run.rrd;ls $(ls).rrd %2e%2e%2frun.rrd ünicode.rrd run.rrd?x ~/run.rrd
 <b>.rrd runs.sqlite run.rrd.part
 """
@@ -45,6 +46,11 @@ def test_names_are_found_in_their_folder_only(tmp_path: Path) -> None:
     for name in ("out.rrd", "loop.rrd", "folder.rrd", "pipe.rrd", "missing.rrd"):
         with pytest.raises(RecordingError, match="no such recording"):
             resolve_inside(folder, name)
+
+
+def test_the_name_of_a_review_tells_its_recording() -> None:
+    for name in ("run.rrd", "RUN.RRD", "run.Rrd", "a.b.rrd", "gallery/seam.rrd"):
+        assert reviewed_name(review_path(Path(name)).as_posix()) == name
 
 
 def test_a_gallery_elsewhere_is_not_followed(tmp_path: Path) -> None:

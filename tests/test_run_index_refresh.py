@@ -40,6 +40,16 @@ class Files:
                 yield path, some_row(path.name, labels=review.labels, note=review.note, name=text)
 
 
+def test_names_in_capitals_are_listed_too(index: RunIndex):
+    files = Files(index.folder)
+    files.write("a.RRD", "b.Rrd", "c.REVIEW.RRD", "d.rrdx")
+    done = index.refresh(examine=files.examine)
+    assert (done.read, done.skipped) == (2, ()) and sorted(files.read) == ["a.RRD", "b.Rrd"]
+    write_review(index.folder / "a.RRD", ["seen"], "", run_id="1b2c")
+    assert index.refresh(examine=files.examine).read == 1
+    assert {row.file: row.labels for row in index.find(RunQuery()).rows} == {"a.RRD": ("seen",), "b.Rrd": ()}
+
+
 def test_refresh_reads_only_what_is_new_or_has_changed(index: RunIndex):
     files = Files(index.folder)
     files.write("a.rrd", "b.rrd", "gallery/c.rrd", "notes.txt", "d.rrd.part", "e.review.rrd")

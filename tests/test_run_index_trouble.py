@@ -1,7 +1,10 @@
 """The list of runs when its file is damaged, foreign, locked, gone, or may not be written."""
 
 import contextlib
+import signal
 import sqlite3
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,6 +15,7 @@ from spherloc.errors import RecordingError
 from spherloc_viz.recording.index import file as index_file
 from spherloc_viz.recording.index.query import RunQuery
 from spherloc_viz.recording.index.run_index import RunIndex
+from spherloc_viz.runs import reindex
 
 
 def foreign(path: Path) -> None:
@@ -48,6 +52,23 @@ def truncated(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:5000])
 
 
+def schema_without_text(path: Path) -> None:
+    changed(path, lambda content: content.index(b"CREATE TABLE runs") + 20, b"\xff\xfe")
+
+
+def unknown_format(path: Path) -> None:
+    changed(path, lambda content: 44, bytes([0, 0, 0, 99]))
+
+
+def changed(path: Path, place: Callable[[bytes], int], new: bytes) -> None:
+    with RunIndex(path.parent) as index:
+        index.add(some_row())
+    content = bytearray(path.read_bytes())
+    start = place(bytes(content))
+    content[start : start + len(new)] = new
+    path.write_bytes(content)
+
+
 @pytest.mark.parametrize(
     "spoil, what",
     [
@@ -56,6 +77,8 @@ def truncated(path: Path) -> None:
         (newer, "was made by another version"),
         (damaged, "is damaged"),
         (truncated, "is damaged"),
+        (schema_without_text, "is damaged"),
+        (unknown_format, "is damaged"),
         (lambda path: path.write_bytes(b"no database\n" * 1000), "is damaged"),
     ],
 )
@@ -132,6 +155,49 @@ def test_damage_while_open_is_noticed(tmp_path: Path):
         assert "other-2.rrd" in files and "one-2.rrd" in files
         assert one.stale and other.stale
     assert len(list(tmp_path.glob("*.aside"))) == 1 == len(said)
+
+
+@pytest.mark.parametrize("spoil", [schema_without_text, unknown_format])
+def test_a_damaged_list_is_made_anew_by_reindex(
+    tmp_path: Path, spoil: Callable[[Path], None], capsys: pytest.CaptureFixture[str]
+):
+    spoil(tmp_path / index_file.FILE_NAME)
+    assert reindex(tmp_path) == 0
+    said = capsys.readouterr()
+    assert "is damaged; it is kept as" in said.err and said.out.startswith("0 runs in ")
+
+
+KILLED = """
+import os, pathlib, signal, sys
+from run_rows import some_row
+from spherloc_viz.recording.index.run_index import RunIndex
+
+index = RunIndex(pathlib.Path(sys.argv[1]))
+index.add_all([some_row(f"{number}.rrd") for number in range(20)])
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no process can be killed that way here")
+@pytest.mark.parametrize("gone", ["", "-wal", "database"])
+def test_the_log_that_a_killed_process_leaves_behind_does_no_harm(tmp_path: Path, gone: str):
+    """It has what was listed last; whoever opens the list next takes that over, and removes it. Without it, or with
+    nothing else, the runs are read from their files again."""
+    for number in range(20):
+        (tmp_path / f"{number}.rrd").touch()
+    done = subprocess.run([sys.executable, "-c", KILLED, tmp_path], cwd=Path(__file__).parent, check=False)
+    path = tmp_path / index_file.FILE_NAME
+    log = path.with_name(f"{path.name}-wal")
+    assert done.returncode == -signal.SIGKILL and log.stat().st_size > 0
+    if gone:
+        (log if gone == "-wal" else path).unlink()
+    told: list[str] = []
+    with RunIndex(tmp_path, told.append) as index:
+        known = index.find(RunQuery(), None).total
+        assert known == 20 if not gone else known in (0, 20)
+        rows = index.refresh(examine=lambda paths: ((path, some_row(path.name)) for path in paths))
+        assert index.find(RunQuery(), None).total == 20 and not rows.skipped
+    assert not told and not log.exists() and len(list(tmp_path.glob("runs.sqlite*"))) == 1
 
 
 def test_a_deleted_database_is_made_anew(index: RunIndex):

@@ -1,4 +1,4 @@
-"""What a page is told of the recordings, though nobody asked: one notification, the newest word instead of the last."""
+"""What a page is told of the recordings, though nobody asked: one notification with the newest word, one of failure."""
 
 import threading
 
@@ -13,6 +13,7 @@ class Notices:
     def __init__(self, client: viser.ClientHandle) -> None:
         self._client = client
         self._shown: viser.NotificationHandle | None = None
+        self._failure: viser.NotificationHandle | None = None
         self._lock = threading.Lock()
 
     def show(self, sentence: str) -> None:
@@ -23,3 +24,18 @@ class Notices:
             self._shown = self._client.add_notification(
                 "Recordings", sentence, color="blue", auto_close_seconds=SHOWN_S
             )
+
+    def fail(self, sentence: str) -> None:
+        """Say that runs are not recorded, in place of what was said of that before, until somebody closes it."""
+        with self._lock:
+            if self._failure is not None:
+                self._failure.remove()
+            self._failure = self._client.add_notification("Not recorded", sentence, color="red")
+
+    def recover(self, sentence: str) -> None:
+        """Say that runs are recorded again."""
+        with self._lock:
+            if self._failure is not None:
+                self._failure.remove()
+                self._failure = None
+        self.show(sentence)

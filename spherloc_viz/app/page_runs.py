@@ -16,6 +16,8 @@ from spherloc_viz.recording.origin import Origin, Source
 
 RETRY_S = 1.0
 """After this long a run is recorded that could not be before."""
+LOOK_S = 0.1
+"""After this long it is looked whether a run is written."""
 NOT_RECORDED = "Runs are not recorded."
 
 
@@ -29,13 +31,29 @@ class Known:
     """Its pose (3, 4), if it had one."""
 
 
+@dataclass(eq=False)
+class Submitted:
+    """A run that was given to the recorder, or was recorded before."""
+
+    trace: Trace
+    path: Path
+    """Of its recording, which is there once it is written."""
+    written: bool = False
+    error: RecordingError | None = None
+    """Why it could not be written."""
+
+    def end(self, error: RecordingError | None) -> None:
+        """It is written, or not."""
+        self.written, self.error = error is None, error
+
+
 class PageRuns:
     """Used by the session's solver thread; panels record their runs on threads of their own."""
 
     def __init__(self, recorder: Recorder | None, catalog: Catalog) -> None:
         self._recorder, self._catalog = recorder, catalog
         self._known: Known | None = None
-        self._recorded: tuple[Trace, Path] | None = None
+        self._submitted: Submitted | None = None
 
     def expect(self, known: Known) -> None:
         """The page is about to repeat a recorded run, which is not to be recorded once more."""
@@ -55,22 +73,29 @@ class PageRuns:
     def settle(self, run: Run, diagnosis: Diagnosis | None) -> tuple[str, float | None]:
         """Record a run that the page has settled on, unless it is recorded.
 
-        Returns what became of it, in a sentence, and the seconds to the next attempt if that must wait.
+        Returns what became of it, in a sentence, and the seconds after which to ask again if that is not known yet.
         """
         known = self._known
         if known is not None and self._repeats(run):
-            self._recorded = run.trace, known.path
+            self._submitted = Submitted(run.trace, known.path, written=True)
             return f"Opened {known.path.name}", None
         if self._recorder is None:
             return NOT_RECORDED, None
-        if self._recorded is None or self._recorded[0] is not run.trace:
+        submitted = self._submitted
+        if submitted is None or submitted.trace is not run.trace:
+            submitted = Submitted(run.trace, Path())
+            origin = self._origin("page", run.wish.scene)
             try:
-                path = self._recorder.submit(run.trace, self._origin("page", run.wish.scene), diagnosis)
+                submitted.path = self._recorder.submit(run.trace, origin, diagnosis, submitted.end)
             except RecordingError as error:
                 return f"{error} It is tried again.", RETRY_S
-            self._recorded = run.trace, path
+            self._submitted = submitted
+        if submitted.error is not None:
+            return str(submitted.error), None
+        if submitted.written:
+            return f"Recorded as {submitted.path.name}", None
         waiting = self._recorder.overload
-        return f"Recorded as {self._recorded[1].name}{f'. {waiting}' if waiting else ''}", None
+        return f"Recording as {submitted.path.name} …{f' {waiting}' if waiting else ''}", LOOK_S
 
     def record(self, trace: Trace, scene: SceneWish) -> None:
         """Record a query of a sequence that a panel localized, if runs are recorded; raises ``RecordingError``."""
@@ -79,8 +104,8 @@ class PageRuns:
 
     def path(self, trace: Trace) -> Path | None:
         """The recording of a run, if there is one."""
-        recorded = self._recorded
-        return recorded[1] if recorded is not None and recorded[0] is trace else None
+        submitted = self._submitted
+        return submitted.path if submitted is not None and submitted.trace is trace and submitted.written else None
 
     def _repeats(self, run: Run) -> bool:
         """Whether a run is the one that was opened, and finds the same pose."""

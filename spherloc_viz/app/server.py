@@ -34,6 +34,7 @@ from spherloc_viz.options import unusable_estimators
 from spherloc_viz.recording.index.run_index import RunIndex
 from spherloc_viz.recording.keeping.recorder import Recorder
 from spherloc_viz.recording.keeping.room import KEEP_GIGABYTES, kept_bytes
+from spherloc_viz.recording.strangers.examiner import end_examining
 
 SWITCH_S = 0.001
 NOT_ENCRYPTED = (
@@ -69,9 +70,12 @@ def serve(
         _prepare()
         services = Services(catalog, allowed_roots(scene, allow))
         sessions = Sessions(services)
+        stack.callback(services.downloads.close)
         if record:
             services.recorder = stack.enter_context(
-                Recorder(recordings, sessions.report, sessions.notice, keep_bytes=keep_bytes)
+                Recorder(
+                    recordings, sessions.report, sessions.notice, keep_bytes=keep_bytes, on_recovery=sessions.recover
+                )
             )
         index = _open_index(services.recorder, recordings, stack)
         services.shelf = None if index is None else Shelf(index)
@@ -82,7 +86,7 @@ def serve(
         stack.callback(sessions.close)
         sessions.attend(server)
         access = Access(demanded=token or not _is_loopback(listener))
-        door = FrontDoor(host, server.get_port(), key, access, viewer)
+        door = FrontDoor(host, server.get_port(), key, access, services.downloads, viewer)
         asyncio.run(_serve_until_told(door, access, listener))
 
 
@@ -141,6 +145,9 @@ class Sessions:
         self._lock = threading.Lock()
         self._unheard: list[str] = []
         """Notices that came when no page was open, for the next one."""
+        self._lost = 0
+        """Runs that were not recorded since the last one that was."""
+        self._failure = ""
 
     def attend(self, server: viser.ViserServer) -> None:
         """Open a session for every client that connects and close it when the client leaves."""
@@ -153,9 +160,20 @@ class Sessions:
         server.on_client_disconnect(lambda client: self._dismiss(client.client_id))
 
     def report(self, error: RecordingError) -> None:
-        """Tell every presenter's page that a run could not be recorded."""
+        """Tell every presenter's page, and those that open later, that a run could not be recorded."""
+        with self._lock:
+            self._lost += 1
+            counted = f" {self._lost} runs were not recorded." if self._lost > 1 else ""
+            self._failure = failure = f"{error}{counted}"
         for session in self._presenters():
-            session.complain(str(error))
+            session.notices.fail(failure)
+
+    def recover(self, sentence: str) -> None:
+        """Tell every presenter's page that runs are recorded again."""
+        with self._lock:
+            self._lost, self._failure = 0, ""
+        for session in self._presenters():
+            session.notices.recover(sentence)
 
     def notice(self, sentence: str) -> None:
         """Tell every presenter's page what became of recordings."""
@@ -164,7 +182,7 @@ class Sessions:
             with self._lock:
                 self._unheard = [*self._unheard[1 - MOST_UNHEARD :], sentence]
         for session in sessions:
-            session.notice(sentence)
+            session.notices.show(sentence)
 
     def _presenters(self) -> tuple[Session, ...]:
         with self._lock:
@@ -187,9 +205,12 @@ class Sessions:
             unheard = self._unheard if isinstance(session, Session) else []
             if unheard:
                 self._unheard = []
+            failure = self._failure
         session.start()
+        if failure and isinstance(session, Session):
+            session.notices.fail(failure)
         if unheard and isinstance(session, Session):
-            session.notice(" ".join(unheard))
+            session.notices.show(" ".join(unheard))
         # viser runs these callbacks side by side: the client may have left before it was welcomed.
         if client.client_id not in server.get_clients():
             self._dismiss(client.client_id)
@@ -219,6 +240,7 @@ async def _serve_until_told(door: FrontDoor, access: Access, listener: socket.so
     try:
         await stop.wait()
     finally:
+        end_examining()  # a hostile file can keep requests for a minute
         await runner.cleanup()
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from spherloc_viz.app.catalog import Catalog
 from spherloc_viz.app.presented import Presented
 from spherloc_viz.app.review.shelf import Shelf
+from spherloc_viz.app.web.downloads import Downloads
 from spherloc_viz.recording.keeping.recorder import Recorder
 
 
@@ -20,5 +21,7 @@ class Services:
     """Where settled runs go; None if they are not recorded."""
     shelf: Shelf | None = None
     """The recordings that pages review; None if there is no folder of them."""
+    downloads: Downloads = field(default_factory=Downloads)
+    """Files that pages may fetch."""
     presented: Presented = field(default_factory=Presented)
     """What pages of an audience show."""

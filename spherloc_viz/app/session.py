@@ -65,7 +65,7 @@ class Session:
         """The number of the newest change that the run knows, or an earlier one."""
         self._diagnosed: tuple[Trace, Diagnosis] | None = None
         self._runs = PageRuns(services.recorder, self._catalog)
-        self._notices = Notices(client)
+        self.notices = Notices(client)
         left_px, right_px = panel_widths_px(client.camera.image_width)
         self._controls = Controls(client, self._catalog, services, self._touches, self, right_px)
         places = Places(self.redraw, self.select, self._move_camera)
@@ -88,10 +88,6 @@ class Session:
     def complain(self, sentence: str) -> None:
         """Say in one sentence what went wrong; the page keeps its last run and stays usable."""
         self._status.complain(sentence)
-
-    def notice(self, sentence: str) -> None:
-        """Tell what became of recordings, such as those that were deleted to make room."""
-        self._notices.show(sentence)
 
     # What a person does. All of this comes on threads of viser's or of the front door's, and only notes wishes.
 

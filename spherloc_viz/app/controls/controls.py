@@ -99,7 +99,7 @@ class Controls:
         with tabs.add_tab("Open"):
             self._open = OpenPanel(gui, client, touches, services.roots, self._open_scene)
         with tabs.add_tab("Recordings"):
-            page = Page(services.roots, self._enter, owner.open, owner.open_recorded)
+            page = Page(services.roots, self._enter, owner.open, owner.open_recorded, services.downloads)
             self._recordings = RecordingsPanel(gui, client, touches, services.shelf, self.review, page)
         with tabs.add_tab("Share"):
             self._export = ExportPanel(gui, client, owner.shown)

@@ -19,6 +19,7 @@ from spherloc_viz.app.review.reviewer import Reviewer, Reviewing
 from spherloc_viz.app.review.run_list import RunList
 from spherloc_viz.app.review.shelf import Shelf
 from spherloc_viz.app.text import box, status_html
+from spherloc_viz.app.web.downloads import Downloads
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.wish import Wish
 from spherloc_viz.recording.again.reopen import Reopened
@@ -41,6 +42,8 @@ class Page:
     """Asks for a run."""
     open_recorded: Callable[[Wish, Path, FloatArray | None], None]
     """Asks for a run that is recorded already, as this file and with this pose (3, 4)."""
+    downloads: Downloads
+    """Files that pages may fetch."""
 
 
 class RecordingsPanel:
@@ -94,7 +97,7 @@ class RecordingsPanel:
 
         reviewing = Reviewing(shelf, page.roots, card, page.enter, page.open_recorded, say, complain, self._follow)
         self._reviewer = Reviewer(touches, self._runs, reviewing, name)
-        exporter = Exporter(client, touches, shelf, self._runs, self._say, self._complain)
+        exporter = Exporter(gui, name, touches, shelf, page.downloads, self._runs, self._say, self._complain)
         self._parts += [self._notes, self._runs, self._reviewer, exporter]
         touches.on("runs-compare", lambda touch: self._comparing.ask(self._compare))
         touches.on("runs-uncompare", lambda touch: self._uncompare())

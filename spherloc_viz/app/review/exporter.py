@@ -1,15 +1,20 @@
 """Sends a selection of recordings to the browser as a zip file."""
 
+import threading
 from collections.abc import Callable
 from datetime import UTC, datetime
+from html import escape
 
 import viser
 
+from spherloc.errors import RecordingError
 from spherloc_viz.app.panels.errand import Errand
 from spherloc_viz.app.review import words
 from spherloc_viz.app.review.bundle import MOST_RUNS, bundle
 from spherloc_viz.app.review.run_list import RunList
 from spherloc_viz.app.review.shelf import Shelf
+from spherloc_viz.app.text import box
+from spherloc_viz.app.web.downloads import Download, Downloads
 from spherloc_viz.app.web.touch import Touches
 
 
@@ -18,22 +23,29 @@ class Exporter:
 
     def __init__(
         self,
-        client: viser.ClientHandle,
+        gui: viser.GuiApi,
+        name: str,
         touches: Touches,
         shelf: Shelf,
+        downloads: Downloads,
         runs: RunList,
         say: Callable[[str], None],
         complain: Callable[[str], None],
     ) -> None:
-        self._client, self._shelf, self._runs, self._say = client, shelf, runs, say
+        """``name`` tells its thread from those of other pages."""
+        self._shelf, self._downloads, self._runs, self._say = shelf, downloads, runs, say
+        self._link = gui.add_html("", visible=False)
+        self._offered: Download | None = None
+        self._lock = threading.Lock()
         self._closed = False
-        self._errand = Errand(f"spherloc-zip-{client.client_id}", complain)
+        self._errand = Errand(f"spherloc-zip-{name}", complain)
         touches.on("runs-export", lambda touch: self._errand.ask(self._export))
 
     def close(self) -> None:
-        """Export nothing more; does not wait."""
+        """Export nothing more, and offer nothing; does not wait."""
         self._closed = True
         self._errand.close()
+        self._offer(None)
 
     def _export(self) -> None:
         marked = self._runs.marked
@@ -42,10 +54,32 @@ class Exporter:
         else:
             found = self._shelf.all(self._runs.look, MOST_RUNS)
             rows, total = found.rows, found.total
+        self._offer(None)
         about = sum(row.size_bytes for row in rows)
         self._say(f"Packing {len(rows):,} runs, {words.size(about)} …")
         now = datetime.now(UTC)
-        packed = bundle(self._shelf.folder, rows, total, now, lambda: self._closed)
-        name = f"spherloc-runs-{now:%Y%m%dT%H%M%SZ}.zip"
-        self._client.send_file_download(name, packed.content, save_immediately=True)
-        self._say(f"{name}: {packed.sentence}")
+        download = self._downloads.room(f"spherloc-runs-{now:%Y%m%dT%H%M%SZ}.zip")
+        try:
+            packed = bundle(download.path, self._shelf.folder, rows, total, now, lambda: self._closed)
+        except RecordingError:
+            self._downloads.withdraw(download)
+            raise
+        self._offer(download)
+        self._say(f"{download.name}: {packed.sentence}")
+
+    def _offer(self, download: Download | None) -> None:
+        """Serve this file and not the one before; the page fetches it by itself once."""
+        with self._lock:
+            if self._offered is not None:
+                self._downloads.withdraw(self._offered)
+            self._offered = download
+            if download is not None and not self._closed:
+                self._downloads.offer(download)
+            elif download is not None:
+                self._downloads.withdraw(download)
+        if self._closed:
+            return
+        if download is not None:
+            link = f'<a data-fetch href="{escape(download.address)}" download>{escape(download.name)}</a>'
+            self._link.content = box(f"Your browser saves it; if it does not: {link}", "font-size:12px")
+        self._link.visible = download is not None

@@ -9,6 +9,7 @@ import aiohttp
 from aiohttp import web
 
 from spherloc_viz.app.web.access import NO_TOKEN, Access, Role, refused
+from spherloc_viz.app.web.downloads import DOWNLOADS, Downloads
 from spherloc_viz.app.web.guard import SAFE, refusal
 from spherloc_viz.app.web.page import Page, load_page
 from spherloc_viz.app.web.viewer_room import NOT_RECORDED, PAGE, ViewerRoom
@@ -33,12 +34,21 @@ NOT_FOR_AUDIENCE = "Recordings are the presenter's to open: the link for an audi
 
 
 class FrontDoor:
-    """Serves one page, one websocket and the viewer of recordings; everything else is refused."""
+    """Serves one page, one websocket, the viewer of recordings and exported files; everything else is refused."""
 
-    def __init__(self, host: str, viser_port: int, key: str, access: Access, viewer: ViewerRoom | None = None) -> None:
+    def __init__(
+        self,
+        host: str,
+        viser_port: int,
+        key: str,
+        access: Access,
+        downloads: Downloads,
+        viewer: ViewerRoom | None = None,
+    ) -> None:
         """``viewer`` is None where nothing is recorded."""
         self._host, self._access = host, access
         self._viewer = viewer
+        self._downloads = downloads
         self._upstream = f"http://127.0.0.1:{viser_port}/"
         self._key = key
         self._page: Page = load_page()
@@ -86,6 +96,10 @@ class FrontDoor:
             if self._viewer is None:
                 return web.Response(status=404, text=f"{NOT_RECORDED}\n")
             return await self._viewer.answer(request)
+        if request.path.startswith(DOWNLOADS):
+            if role is not Role.PRESENTER:
+                return refused(request, NOT_FOR_AUDIENCE)
+            return self._downloads.answer(request)
         if not request.query.keys() <= PARAMETERS:
             raise web.HTTPFound("/")
         if request.path != "/":

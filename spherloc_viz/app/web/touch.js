@@ -2,10 +2,12 @@
 // With data-drag a drag across the element is told too; data-copy="TEXT" puts TEXT on the clipboard. And it tells which
 // elements with data-view="NAME" are to be seen, so that what stands on a hidden tab need not be drawn. A key presses the
 // element with data-key="KEY". Links within an element are followed, and do not press it. An element that gets another
-// data-reveal="NAME" is scrolled to, also while what stands above it grows, until a person scrolls or presses.
+// data-reveal="NAME" is scrolled to, also while what stands above it grows, until a person scrolls or presses. What a
+// new link with data-fetch leads to is downloaded.
 (() => {
   const TOUCHABLE = "[data-touch],[data-copy]", LEAST_DRAG_PX = 6, LOOK_EVERY_MS = 150, REVEAL_MS = 3000;
   let press = null, shade = null, seen = null, revealed = null, revealUntil = 0;
+  const fetched = new Set();
 
   function found(event) {
     const element = event.target instanceof Element ? event.target.closest(`${TOUCHABLE},a[href]`) : null;
@@ -40,6 +42,14 @@
     if (name !== revealed) revealUntil = Date.now() + REVEAL_MS;
     revealed = name;
     if (element && Date.now() < revealUntil) element.scrollIntoView({ block: "nearest" });
+  }
+
+  function fetchFiles() {
+    for (const link of document.querySelectorAll("a[data-fetch]")) {
+      if (fetched.has(link.href)) continue;
+      fetched.add(link.href);
+      link.click();
+    }
   }
 
   async function copy(element) {
@@ -124,7 +134,7 @@
     const nowhere = { left: 0, top: 0, width: 1, height: 1 };
     tell(detail, nowhere, { clientX: 0, clientY: 0 }, { x: 0, y: 0 });
   });
-  setInterval(() => { look(); reveal(); }, LOOK_EVERY_MS);
+  setInterval(() => { look(); reveal(); fetchFiles(); }, LOOK_EVERY_MS);
 
   addEventListener("keydown", (event) => {
     const writing = event.target instanceof Element

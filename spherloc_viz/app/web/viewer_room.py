@@ -16,7 +16,7 @@ from spherloc_viz.app.web.guard import SAFE
 from spherloc_viz.app.web.viewer_page import DATA, PROGRAM, SORRY_POLICY, sorry_page, viewer_page, viewer_policy
 from spherloc_viz.recording.content.columns import TIMELINE
 from spherloc_viz.recording.index.run_index import RunIndex
-from spherloc_viz.recording.review.notes import REVIEW_SUFFIX
+from spherloc_viz.recording.review.notes import REVIEW_SUFFIX, reviewed_name
 from spherloc_viz.recording.run_row import RunRow
 from spherloc_viz.recording.strangers.examiner import examine, resolve_inside
 from spherloc_viz.recording.viewing.view import labels_of, step_of
@@ -111,7 +111,7 @@ class ViewerRoom:
 
     def _data(self, rest: str, request: web.Request) -> web.StreamResponse:
         is_review = rest.endswith(REVIEW_SUFFIX)
-        found = self._find(rest.removesuffix(REVIEW_SUFFIX) + ".rrd" if is_review else rest)
+        found = self._find(reviewed_name(rest) if is_review else rest)
         path = labels_of(found.path, found.row.run_id) if is_review else found.path
         if path is None:
             return web.Response(status=204, headers=SAFE)

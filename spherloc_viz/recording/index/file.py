@@ -42,9 +42,10 @@ def primary_code(error: sqlite3.Error) -> int:
 
 def is_damage(error: sqlite3.Error) -> bool:
     """Whether the file's content is broken."""
-    # Python has no class and no code of its own for bytes that are no text.
-    no_text = isinstance(error, sqlite3.OperationalError) and "decode to UTF-8" in str(error)
-    return no_text or isinstance(error, DamagedError) or primary_code(error) in _DAMAGED
+    # Neither Python for bytes that are no text nor SQLite for an unknown format has a class or a code of its own.
+    words = ("decode to UTF-8", "unsupported file format")
+    unknown = isinstance(error, sqlite3.OperationalError) and any(part in str(error) for part in words)
+    return unknown or isinstance(error, DamagedError) or primary_code(error) in _DAMAGED
 
 
 def may_pass(error: sqlite3.Error, after_s: float) -> bool:
@@ -73,9 +74,11 @@ def connect(path: Path) -> sqlite3.Connection:
         connection.execute(f"PRAGMA cache_size = -{CACHE_KB}")
         _check_or_create(connection)
         return connection
-    except (sqlite3.Error, UnfitError) as error:
+    except (sqlite3.Error, UnfitError, UnicodeDecodeError) as error:
         if connection is not None:
             connection.close()
+        if isinstance(error, UnicodeDecodeError):  # of SQLite's own words about the file, which quote it
+            raise UnfitError("is damaged") from error
         if isinstance(error, sqlite3.Error) and primary_code(error) in _CANNOT_WRITE:
             raise PermissionError(str(error)) from error
         if isinstance(error, sqlite3.Error) and is_damage(error):
@@ -94,7 +97,7 @@ def identity(path: Path) -> tuple[int, int] | None:
 
 def memory(path: Path) -> sqlite3.Connection:
     """An index that is in no file, with what the one at ``path`` has, if that can be read."""
-    with contextlib.suppress(sqlite3.Error, UnfitError):
+    with contextlib.suppress(sqlite3.Error, UnfitError, UnicodeDecodeError):
         address = f"{path.absolute().as_uri()}?mode=ro&immutable=1"
         with contextlib.closing(sqlite3.connect(address, uri=True)) as file:
             return _in_memory(file)
@@ -109,7 +112,7 @@ def _in_memory(copied: sqlite3.Connection | None) -> sqlite3.Connection:
         connection.execute("PRAGMA trusted_schema = OFF")
         connection.execute("PRAGMA foreign_keys = ON")
         _check_or_create(connection)
-    except (sqlite3.Error, UnfitError):
+    except (sqlite3.Error, UnfitError, UnicodeDecodeError):
         connection.close()
         raise
     return connection

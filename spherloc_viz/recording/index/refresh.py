@@ -85,7 +85,8 @@ def files_of(folder: Path) -> dict[str, str]:
         if place and not inside.is_dir():
             continue
         for path in inside.iterdir():
-            if path.suffix == ".rrd" and not path.name.endswith(REVIEW_SUFFIX) and (stamp := stamp_of(path)):
+            name = path.name.lower()
+            if name.endswith(".rrd") and not name.endswith(REVIEW_SUFFIX) and (stamp := stamp_of(path)):
                 found[place + path.name] = stamp
     return found
 

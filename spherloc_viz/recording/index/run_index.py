@@ -14,7 +14,7 @@ from spherloc_viz.recording.index import file as index_file
 from spherloc_viz.recording.index.filters import condition, groups, order
 from spherloc_viz.recording.index.query import GROUP_KEYS, RunQuery
 from spherloc_viz.recording.index.refresh import Examine, Progress, Refreshed, Refresher, examine_side_by_side, stamp_of
-from spherloc_viz.recording.index.rows import put, rows_of
+from spherloc_viz.recording.index.rows import DamagedError, put, rows_of
 from spherloc_viz.recording.review.notes import Review, write_review
 from spherloc_viz.recording.run_row import RunRow
 from spherloc_viz.recording.strangers.examiner import Examiners, check_name, examine
@@ -247,6 +247,8 @@ class RunIndex:
             result = work(connection)
             connection.execute("COMMIT")
             return result
+        except UnicodeDecodeError as error:
+            raise DamagedError("bytes that are no text") from error
         except (OverflowError, UnicodeError) as error:
             raise RecordingError(f"{self.path}: cannot list or find a text or number ({error}).") from error
         finally:

@@ -25,7 +25,9 @@ UPKEEP_LIMIT_S = 5.0
 """How long closing waits for files that are being deleted or recovered."""
 
 T = TypeVar("T")
-_Job = tuple[Trace, Path, Origin | None, Diagnosis | None]
+Ended = Callable[[RecordingError | None], None]
+"""Is told that a run is written, or why it is not."""
+_Job = tuple[Trace, Path, Origin | None, Diagnosis | None, Ended]
 
 
 class _StoppedError(Exception):
@@ -46,11 +48,13 @@ class Recorder:
         on_notice: Callable[[str], None] = lambda sentence: None,
         full: bool = False,
         keep_bytes: int = KEEP_BYTES,
+        on_recovery: Callable[[str], None] | None = None,
     ) -> None:
-        """``on_error`` is told when runs can no longer be written, and not again until one was written; ``on_notice``
-        of recovered and deleted recordings, and that runs are recorded again. Both are called in threads of the
-        recorder."""
+        """``on_error`` is told of every run that cannot be written; ``on_notice`` of recovered and deleted recordings;
+        ``on_recovery``, or else ``on_notice``, of the first run that is written after some were not. All are called in
+        threads of the recorder."""
         self._on_error, self._on_notice = _safe(on_error), _safe(on_notice)
+        self._on_recovery = _safe(on_recovery or on_notice)
         self._keeper = Keeper(folder, self._on_notice, full, keep_bytes)
         self._queue: queue.Queue[_Job | None] = queue.Queue(QUEUE_LENGTH)
         self._lock = threading.Lock()
@@ -81,10 +85,17 @@ class Recorder:
         count = self._waiting
         return f"{count} runs wait to be recorded." if count > 1 else ""
 
-    def submit(self, trace: Trace, origin: Origin | None = None, diagnosis: Diagnosis | None = None) -> Path:
+    def submit(
+        self,
+        trace: Trace,
+        origin: Origin | None = None,
+        diagnosis: Diagnosis | None = None,
+        ended: Ended = lambda error: None,
+    ) -> Path:
         """Have a run recorded and return the path that its file will have. Never waits.
 
-        A run without ``diagnosis`` is diagnosed in the background. Raises ``RecordingError`` if too many runs wait
+        A run without ``diagnosis`` is diagnosed in the background. ``ended`` is told in a thread of the recorder when
+        the run is written and listed, or why it is not written. Raises ``RecordingError`` if too many runs wait
         already, or after ``close``.
         """
         path = self._keeper.path_of(trace)
@@ -92,7 +103,7 @@ class Recorder:
             if self._closed:
                 raise RecordingError(f"{path.name}: not recorded, since recording has ended.")
             try:
-                self._queue.put_nowait((trace, path, origin, diagnosis))
+                self._queue.put_nowait((trace, path, origin, diagnosis, _safe(ended)))
             except queue.Full:
                 raise RecordingError(
                     f"{path.name}: not recorded, since {QUEUE_LENGTH} runs wait to be recorded."
@@ -135,22 +146,25 @@ class Recorder:
             with self._lock:
                 self._waiting -= 1
 
-    def _record(self, trace: Trace, path: Path, origin: Origin | None, diagnosis: Diagnosis | None) -> None:
+    def _record(
+        self, trace: Trace, path: Path, origin: Origin | None, diagnosis: Diagnosis | None, ended: Ended
+    ) -> None:
         try:
             self._keeper.record(trace, origin, diagnosis, path)
         except RecordingError as error:
-            self._lose(error)
+            self._lose(error, ended)
         except Exception as error:  # a bug in drawing one run must not end the recording of the others
-            self._lose(RecordingError(f"{path}: the run cannot be recorded: {error!r}."))
+            self._lose(RecordingError(f"{path}: the run cannot be recorded: {error!r}."), ended)
         else:
+            ended(None)
             lost, self._lost = self._lost, 0
             if lost:
-                self._on_notice(f"Runs are recorded again; {lost} {'was' if lost == 1 else 'were'} not.")
+                self._on_recovery(f"Runs are recorded again; {lost} {'was' if lost == 1 else 'were'} not.")
 
-    def _lose(self, error: RecordingError) -> None:
+    def _lose(self, error: RecordingError, ended: Ended) -> None:
         self._lost += 1
-        if self._lost == 1:
-            self._on_error(error)
+        ended(error)
+        self._on_error(error)
 
     def _start(self, upkeep: Callable[[], None]) -> threading.Thread:
         thread = threading.Thread(target=upkeep, name="spherloc-upkeep", daemon=True)

@@ -57,6 +57,13 @@ def review_path(recording: Path) -> Path:
     return recording.with_name(recording.name.removesuffix(".rrd") + REVIEW_SUFFIX)
 
 
+def reviewed_name(name: str) -> str:
+    """The name of the recording whose review file has this name."""
+    stem = name.removesuffix(REVIEW_SUFFIX)
+    # "a.RRD" is a recording too, and keeps its ending.
+    return stem if stem.lower().endswith(".rrd") and not stem.endswith(".rrd") else f"{stem}.rrd"
+
+
 def has_review(recording: Path) -> bool:
     """Whether there is a review file; none has a name that is too long for the disk."""
     try:

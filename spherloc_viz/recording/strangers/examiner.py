@@ -27,14 +27,14 @@ START_LIMIT_S = 120.0
 """The child starts in two seconds."""
 ENDED = "recordings are examined no more, since the program ends."
 
-_NAME = re.compile(r"(gallery/)?[A-Za-z0-9._-]+\.rrd", re.ASCII)
+_NAME = re.compile(r"(gallery/)?[A-Za-z0-9._-]+\.[Rr][Rr][Dd]", re.ASCII)
 _NAME_LIMIT = 255
 
 
 def check_name(name: str) -> str:
     """The name of a recording in its folder, such as a page, an index or an archive tells it, if it is one.
 
-    It has letters, digits, ".", "_" and "-", ends with ".rrd", and may be in the folder "gallery".
+    It has letters, digits, ".", "_" and "-", ends with ".rrd" in any case, and may be in the folder "gallery".
     Raises ``RecordingError`` otherwise.
     """
     if len(name) > _NAME_LIMIT or not _NAME.fullmatch(name):
@@ -158,7 +158,19 @@ def _wanted(answer: dict[str, Any] | None, path: Path, want: str) -> Any:
 
 
 _shared = Examiner()
-atexit.register(_shared.close)
+
+
+def end_examining() -> None:
+    """End what ``examine`` and ``examine_review`` are reading: who waits for it gets an ``ExaminerError``.
+
+    For a server that ends, whose threads would be waited for. Another call of them starts another child.
+    """
+    global _shared
+    ending, _shared = _shared, Examiner()
+    ending.close()
+
+
+atexit.register(lambda: _shared.close())
 
 
 def examine(path: Path) -> RunRow:
