@@ -20,6 +20,7 @@ from spherloc_viz.app.services import Services
 from spherloc_viz.app.session import Session
 from spherloc_viz.app.web.touch import Touch
 from spherloc_viz.app.web.viser_seams import start_viser, stop_viser
+from spherloc_viz.recording.keeping.recorder import Ended
 from spherloc_viz.recording.origin import Origin
 from tests.connected_page import Wire
 from tests.tiny_scene import write_tiny_scene
@@ -38,11 +39,18 @@ class Notes:
         self.full = False
         self.overload = ""
 
-    def submit(self, trace: Trace, origin: Origin | None = None, diagnosis: Diagnosis | None = None) -> Path:
+    def submit(
+        self,
+        trace: Trace,
+        origin: Origin | None = None,
+        diagnosis: Diagnosis | None = None,
+        ended: Ended = lambda error: None,
+    ) -> Path:
         if self.full:
             raise RecordingError("run.rrd: the disk is full; make room.")
         self.traces.append(trace)
         self.origins.append(origin)
+        ended(None)
         return Path(f"run-{len(self.traces)}.rrd")
 
 

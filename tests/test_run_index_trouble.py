@@ -178,7 +178,6 @@ os.kill(os.getpid(), signal.SIGKILL)
 """
 
 
-@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no process can be killed that way here")
 @pytest.mark.parametrize("gone", ["", "-wal", "database"])
 def test_the_log_that_a_killed_process_leaves_behind_does_no_harm(tmp_path: Path, gone: str):
     """It has what was listed last; whoever opens the list next takes that over, and removes it. Without it, or with

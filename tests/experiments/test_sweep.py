@@ -1,5 +1,6 @@
 """Sweeps: the rows are those of direct calls, whoever does them, and nothing is lost or left behind."""
 
+import errno
 import multiprocessing
 import os
 import signal
@@ -18,7 +19,7 @@ from spherloc.datasets import load_scene
 from spherloc.datasets.variation import Variation
 from spherloc.errors import InputError
 from spherloc.estimators import estimate, options_type, warm_up
-from spherloc.experiments import sweep_cluster
+from spherloc.experiments import sweep_cluster, sweep_crew
 from spherloc.experiments.sweep import (
     MOST_DEATHS,
     TASK_S,
@@ -157,6 +158,17 @@ def test_points_fill_evenly_in_tasks_of_a_good_size(tmp_path: Path) -> None:
     assert [len(jobs) for jobs in tasks[:4]] == [1, 1, 1, 1], "nobody knows yet how long they take"
     costs_ms = [sum(map(cost_ms, jobs)) for jobs in tasks[4:-1]]
     assert max(costs_ms) <= 1e3 * TASK_S and min(costs_ms) > 1e3 * TASK_S - 260.0
+
+
+def test_a_machine_that_starts_no_workers_is_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A pool needs semaphores, which lie in /dev/shm."""
+
+    def read_only(*words: object) -> None:
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    monkeypatch.setattr(sweep_crew, "ProcessPoolExecutor", read_only)
+    with pytest.raises(InputError, match=r"cannot be started \(Read-only file system\); see whether /dev/shm"):
+        list(run_sweep(small_plan(tmp_path)))
 
 
 def test_a_run_that_always_kills_its_worker_is_named(tmp_path: Path) -> None:

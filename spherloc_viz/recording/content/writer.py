@@ -75,7 +75,7 @@ def write_recording(
     except (RuntimeError, ValueError) as error:
         reason = _DISK.search(str(error))
         if reason is not None:
-            raise _no_room(path, reason[1]) from error
+            raise _no_room(path, reason[1].strip()) from error
         raise RecordingError(f"{path}: the run cannot be recorded, since rerun failed: {error}.") from error
     finally:
         with contextlib.suppress(OSError):
