@@ -15,6 +15,7 @@ from playwright.sync_api import Browser, Locator, Page, expect
 from viser import _messages
 
 from spherloc_viz.app.web.access import Access
+from spherloc_viz.app.web.downloads import Downloads
 from spherloc_viz.app.web.front_door import FrontDoor
 from spherloc_viz.app.web.guard import open_socket
 from spherloc_viz.app.web.viser_seams import (
@@ -79,7 +80,7 @@ class Stage:
     async def _serve(self) -> None:
         with open_socket("127.0.0.1", 0) as listener:
             self.address = f"http://127.0.0.1:{listener.getsockname()[1]}"
-            door = FrontDoor("127.0.0.1", self._server.get_port(), KEY, Access(False))
+            door = FrontDoor("127.0.0.1", self._server.get_port(), KEY, Access(False), Downloads())
             runner = await door.start(listener)
             self._open.set()
             await self._leaving.wait()
