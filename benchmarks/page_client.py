@@ -35,6 +35,8 @@ class Widget:
     kind: str
     props: dict[str, Any]
     value: Any = None
+    change: int = 0
+    """The number of its newest change."""
 
 
 @dataclass
@@ -61,6 +63,8 @@ class PageClient:
     messages: int = 0
     last_s: float = 0.0
     """When the last bytes came."""
+    changes: int = 0
+    """Changes of widgets by now, which number them."""
     cookie: str = ""
     """What the link with a token gave, where one is needed."""
 
@@ -89,8 +93,10 @@ class PageClient:
     async def set(self, label: str, value: Any) -> None:
         """Change the widget of that label, as a hand on the page does."""
         widget = self.widget(label)
-        widget.value = value
-        await self.send({"type": "GuiUpdateMessage", "uuid": widget.uuid, "updates": {"value": value}})
+        self.changes += 1
+        widget.value, widget.change = value, self.changes
+        updates = {"value": value, "change": self.changes}
+        await self.send({"type": "GuiUpdateMessage", "uuid": widget.uuid, "updates": updates})
 
     def widget(self, label: str) -> Widget:
         """The widget of that label; raises ``KeyError`` if there is none."""
@@ -145,7 +151,9 @@ class PageClient:
         elif kind == "GuiUpdateMessage" and uuid in self.widgets:
             updates = message["updates"]
             widget = self.widgets[uuid]
-            widget.value = updates.get("value", widget.value)
+            # As the page's script has it (``changes.js``).
+            if updates.get("answers", widget.change) >= widget.change:
+                widget.value = updates.get("value", widget.value)
             widget.props.update(updates)
             if "content" in updates:
                 self.html[uuid] = updates["content"]

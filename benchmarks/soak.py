@@ -3,7 +3,7 @@
     .venv/bin/python -m benchmarks.soak --pages 20 --minutes 5
 
 Each page turns its widgets at random. From time to time it stands still, and then what it shows must be what it asked
-for: the values that Python put back, the number of matches in its outcome (each page has its own), and the seed. At
+for: the values of its widgets, the number of matches in its outcome (each page has its own), and the seed. At
 the end it prints runs, mistakes, latencies, memory and threads.
 """
 

@@ -23,8 +23,6 @@ PAGES = 8
 BURSTS = 4
 ESTIMATORS = {f"{name} ({ABOUT[name]})": name for name in ("mc", "mc-exact", "ransac-2p")}
 COMPARED = ("estimator", "outcome", "rotation error", "position error", "inliers")
-PUT_BACK_S = 1.0
-"""A page is told all values again when nothing has changed for 0.7 s."""
 OWN_THREADS = 4
 """Of each page: they solve, draw, diagnose, and look after slow runs."""
 SLACK = 3
@@ -103,8 +101,8 @@ async def visit(address: str, number: int, catalog: Catalog, rng: np.random.Gene
                 await page.until(lambda rows=rows: rows.items() <= outcome(page).items(), 120.0)
             except TimeoutError:
                 pytest.fail(f"page {number} was asked for {wanted}, so {rows}, and shows {outcome(page)}")
-            # Once nothing changes any more, the page is told all values that Python has.
-            await page.settle(PUT_BACK_S)
+            # Nor has the server put another value into a widget.
+            await page.settle()
             told = lambda: {name: page.widget(name).value for name in wanted}  # noqa: E731
             try:
                 await page.until(lambda told=told: told() == wanted)
