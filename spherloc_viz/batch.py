@@ -50,13 +50,16 @@ def run_scenes(
     records: Records | None,
     query: str | None = None,
     variation: Variation | None = None,
+    proof: Path | None = None,
 ) -> int:
     """Solve every scene; returns the exit code. A wrong input is reported and the others are still solved.
 
     ``query`` chooses a query image of scenes made of images, by default their first; ``variation`` changes every
     scene. A recording (.rrd) is a scene too, whose problem is the recorded one. Without ``records`` nothing is
-    recorded.
+    recorded. ``proof`` is a file for the proof of the only scene's certificate.
     """
+    if proof is not None and len(paths) > 1:
+        raise InputError(f"--proof takes one scene, not {len(paths)}; write a file for each.")
     if not paths:
         raise InputError("no scene given; name one or more scene files or bundled scenes, such as mei_outliers_80.")
     changes, variation = parse_settings(estimator, settings), variation or Variation()
@@ -74,6 +77,8 @@ def run_scenes(
                 options = resolved_options(estimator, problem, changes)
                 trace = solve(problem, estimator, options, used_seed(scene, seed))
                 origin = None if keeper is None else _origin(path, scene, seed, query, variation)
+                if proof is not None:
+                    _prove(trace, proof)
             except KeyboardInterrupt:
                 say(f"stopped in {path}; {len(jobs)} of {len(paths)} scenes were solved.")
                 raise
@@ -82,6 +87,16 @@ def run_scenes(
                 continue
             jobs.append(finisher.submit(_finish, path, trace, origin, as_json, keeper))
         return max(job.result() for job in jobs)
+
+
+def _prove(trace: Trace, path: Path) -> None:
+    from spherloc.proof import write_proof
+
+    try:
+        cells = write_proof(trace, path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror}); check path and disk.") from None
+    say(f"{path}: {cells:,} cells; check them with python -m spherloc.proof_check {path}")
 
 
 def open_scene(path: Path) -> Scene:

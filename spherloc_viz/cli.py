@@ -45,6 +45,7 @@ def run(
     recordings: Path = RECORDINGS,
     keep_gigabytes: float = KEEP_GIGABYTES,
     query: str | None = None,
+    proof: Path | None = None,
 ) -> int:
     """Solve localization problems and record each run.
 
@@ -79,6 +80,8 @@ def run(
         recordings: Folder of the recordings.
         keep_gigabytes: What the recordings may take; beyond it the oldest successes that nobody labelled are deleted.
         query: Name of the query image, in scenes made of images; the first one if not given.
+        proof: File (.npz) for the proof of what mc-exact says that no pose can explain; of one scene. Anyone can check
+            it: python -m spherloc.proof_check FILE, which needs numpy only.
     """
     from spherloc.datasets import scene_path
     from spherloc.datasets.variation_text import parse_variation
@@ -87,7 +90,7 @@ def run(
     variation = parse_variation(list(chain(*set)), spoil, mend, hide)
     kept = batch.Records(recordings, full, keep_gigabytes) if record else None
     paths = [scene_path(scene) for scene in recording_commands.without_reviews(scenes)]
-    return batch.run_scenes(paths, estimator, seed, list(chain(*option)), json, kept, query, variation)
+    return batch.run_scenes(paths, estimator, seed, list(chain(*option)), json, kept, query, variation, proof)
 
 
 @app.command
@@ -264,6 +267,25 @@ _OTHERS = (
 )
 for _command in _OTHERS:
     app.command(_command)
+
+
+@app.command
+def check_proof(file: Positional[Path], /) -> int:
+    """Check a proof that spherloc run --proof wrote, with numpy alone.
+
+    Says what is proven, and ends with 0; or why the file proves nothing, and ends with 1.
+
+    Args:
+        file: The proof (.npz).
+    """
+    from spherloc.proof_check import Refused, check
+
+    try:
+        print(check(file))
+    except Refused as refused:
+        print(f"refused: {refused}", file=sys.stderr)
+        return 1
+    return 0
 
 
 @app.command

@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[1]
 SCREENS = {"viser", "rerun", "rerun_sdk", "rerun_bindings", "plotly", "aiohttp", "tyro", "spherloc_viz"}
 
 FLOORS = (
-    ("spherloc.errors", "spherloc"),
+    ("spherloc.errors", "spherloc.proof_check", "spherloc"),
     (
         "spherloc.files",
         "spherloc.ranges",
@@ -33,7 +33,7 @@ FLOORS = (
     ("spherloc.gauss_newton", "spherloc.worlds", "spherloc.formats"),
     ("spherloc.problem", "spherloc.bounds", "spherloc.consensus"),
     ("spherloc.trace", "spherloc.refine", "spherloc.metrics", "spherloc.datasets", "spherloc.frontend"),
-    ("spherloc.estimators", "spherloc.diagnosis", "spherloc.experiments"),
+    ("spherloc.estimators", "spherloc.proof", "spherloc.diagnosis", "spherloc.experiments"),
     ("spherloc_viz.style", "spherloc_viz.layers", "spherloc_viz.options", "spherloc_viz.share", "spherloc_viz"),
     ("spherloc_viz.recording", "spherloc_viz.sweep_plot"),
     ("spherloc_viz.gallery",),

@@ -73,7 +73,7 @@ def room_for(count: int) -> Room:
     )
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def sort_matches(matches, cell, axis, members, kept, cutoff, reach):
     """Sort the matches ``members`` of a cell; write the undecided to ``kept``.
 

@@ -86,7 +86,8 @@ def search_positions(
 
     ``matches`` is that of ``matches_of``. ``start`` is a pose (3, 4) between the aligned frames, within the gravity
     bound, and what it explains. After ``effort`` tests or at ``deadline`` (``time.perf_counter``) the search stops.
-    ``yaw_bound`` (BINS,) bounds what poses explain by bin of turn, if anything is known. ``watch`` counts the tests; raises ``Cancelled``.
+    ``yaw_bound`` (BINS,) bounds what poses explain by bin of turn, if anything is known. ``watch`` counts the tests;
+    raises ``Cancelled``.
     """
     watch = watch or Watch()
     watch.expect(effort)
@@ -97,6 +98,12 @@ def search_positions(
         search.rounds(effort, deadline)
     watch.check()
     return PositionSearch(search.pose(), search.best, search.upper(), search.effort)
+
+
+def threads_to_use() -> int:
+    """Threads for the tasks of a round."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return min(TASKS_A_ROUND, cores)
 
 
 class _Worker:
@@ -200,14 +207,13 @@ class _Search:
         """Search tasks, round by round, until none is left, as many tests are done, or it is as late."""
         if len(self.about) == 0 or self.effort >= effort:
             return
-        threads = max(1, min(TASKS_A_ROUND, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 2))
         self._workers += [_Worker(self.count) for _ in range(TASKS_A_ROUND - 1)]
         each = max(TASK_EFFORT, TASK_ROUNDS * self.count)
         timer = threading.Timer(min(max(0.0, deadline - time.perf_counter()), threading.TIMEOUT_MAX), self.halt)
         timer.daemon = True
         timer.start()
         try:
-            with ThreadPoolExecutor(threads) as pool:
+            with ThreadPoolExecutor(threads_to_use()) as pool:
                 while len(self.about) and self.effort < effort and not self._halted:
                     self.watch.board[DONE] = self.effort
                     self.watch.check()

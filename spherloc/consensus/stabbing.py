@@ -65,7 +65,7 @@ def _turn(c, s):
     return quarter if quarter >= 0.0 else 4.0 + quarter
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def keep_possible(matches, cell, members, kept, scratch, cutoff, spread):
     """Write to ``kept`` those of ``members`` that some pose of the cell may explain, their intervals to ``scratch``.
 
@@ -129,7 +129,7 @@ def keep_possible(matches, cell, members, kept, scratch, cutoff, spread):
         used += 1
     if used <= cutoff:
         return -1, 0
-    spread[0], spread[1] = near / used, far / used
+    spread[0], spread[1] = near / max(used, 1), far / max(used, 1)
     return used, free
 
 
