@@ -16,6 +16,8 @@ from spherloc.bounds import Bounds
 from spherloc.errors import InputError, show
 from spherloc.gauss_newton import (
     LEAST_GRAVITY_SD_RAD,
+    ROBUST_CAUCHY,
+    ROBUST_HUBER,
     ROBUST_NONE,
     degrees_of_freedom,
     levelled,
@@ -26,6 +28,7 @@ from spherloc.gauss_newton import (
     tilt_of,
 )
 from spherloc.geometry import skew
+from spherloc.narrowing import ADAPTIVE_STEPS, errors_of, fit_to_noise
 from spherloc.problem import AlignedProblem
 from spherloc.ranges import check_options, is_number
 from spherloc.trace import RefinementStage
@@ -42,7 +45,7 @@ RESCUE_REACH = 16.8
 """How much a rescue may raise the cost, in variances of the noise: 99 % of chi-square with 6 degrees of freedom, so
 that the pose stays where the true one may be. Without it, one outlier near a loose bound bends the pose by degrees."""
 
-Robust = Literal["none", "huber", "cauchy"]
+Robust = Literal["none", "huber", "cauchy", "adaptive"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,9 +57,10 @@ class RefinementOptions:
     gravity_sd_deg: float | None = None
     """Standard deviation of the known roll and pitch, degrees: 0 keeps them (4 DoF), inf ignores them (the paper's
     6 DoF). None takes the problem's."""
-    robust: Robust = "none"
-    """Kernel that weighs down large residuals: beyond 1.345 (huber) or around 2.385 (cauchy) times ``noise_px``, the
-    usual constants, which cost 5 % efficiency if the noise is normal."""
+    robust: Robust = "adaptive"
+    """How residuals are weighed: "adaptive", by the likelihood under a mixture of ``noise_px`` and a third of it, whose
+    shares are estimated; "none", all alike; or by a kernel that weighs down those beyond 1.345 ("huber") or around
+    2.385 ("cauchy") times ``noise_px``, the usual constants, which cost 5 % efficiency if the noise is normal."""
 
     def __post_init__(self) -> None:
         check_options(self)
@@ -69,8 +73,13 @@ class RefinementOptions:
             raise InputError(f"option robust is {show(self.robust)}; give one of {', '.join(get_args(Robust))}.")
 
 
-ROBUST_CODES = {name: code for code, name in enumerate(get_args(Robust))}
-"""In the order of ``gauss_newton.ROBUST_*``."""
+ROBUST_CODES = {"none": ROBUST_NONE, "huber": ROBUST_HUBER, "cauchy": ROBUST_CAUCHY, "adaptive": ROBUST_NONE}
+"""Kernels of ``gauss_newton``; "adaptive" is the last step's, after least squares."""
+
+
+def gravity_sd_rad(aligned: AlignedProblem, options: RefinementOptions) -> float:
+    """Standard deviation (rad) of each tilt of the given gravity that the options ask for."""
+    return aligned.gravity_sd_rad if options.gravity_sd_deg is None else float(np.radians(options.gravity_sd_deg))
 
 
 def residuals_px(aligned: AlignedProblem, cam_from_map: FloatArray) -> FloatArray:
@@ -93,14 +102,48 @@ def refine(
     Returns the pose, its inlier mask (M,), and the stage, whose poses and covariance are those of the problem's own
     frames.
     """
-    sd = aligned.gravity_sd_rad if options.gravity_sd_deg is None else float(np.radians(options.gravity_sd_deg))
+    path, limit_px = refined_path(aligned, cam_from_map, bounds, options)
+    return record(aligned, path, np.minimum(bounds.pixels, limit_px), options)
+
+
+def refined_path(
+    aligned: AlignedProblem, cam_from_map: FloatArray, bounds: Bounds, options: RefinementOptions
+) -> tuple[FloatArray, float]:
+    """The poses (I + 1, 3, 4) of ``refine`` between the aligned frames, and its inliers' bound where it is below
+    ``bounds.pixels`` (else inf)."""
     # A copy may be written to: one type of array, so that the kernels below are compiled once.
-    data = (aligned.points, aligned.pixel_from_bearing.copy())
-    model = (options.noise_px, sd, ROBUST_CODES[options.robust])
-    path, limit_px = _alternate(aligned.bearings, *data, bounds.pixels, bounds.noise_px, cam_from_map.copy(), *model)
-    inliers, costs, counts = _account(aligned.bearings, *data, np.minimum(bounds.pixels, limit_px), path)
+    data = (aligned.bearings, aligned.points, aligned.pixel_from_bearing.copy())
+    model = (options.noise_px, gravity_sd_rad(aligned, options), ROBUST_CODES[options.robust])
+    return _alternate(*data, bounds.pixels, bounds.noise_px, cam_from_map.copy(), *model)
+
+
+def fitted_path(
+    aligned: AlignedProblem, cam_from_map: FloatArray, limits_px: FloatArray, options: RefinementOptions
+) -> FloatArray:
+    """The poses (I, 3, 4) after each step of a fit to what a pose explains within ``limits_px`` (M,), weighed as the
+    options ask for. Aligned frames."""
+    weights, state = aligned.pixel_from_bearing.copy(), cam_from_map.copy()
+    model = (options.noise_px, gravity_sd_rad(aligned, options))
+    path = np.empty((max(MAX_STEPS, ADAPTIVE_STEPS), 3, 4))
+    if options.robust == "adaptive":
+        return path[: fit_to_noise(aligned.bearings, aligned.points, weights, limits_px, state, *model, path)]
+    mask = _residuals(aligned.bearings, aligned.points, weights, state) <= limits_px
+    rotation, translation = state[:, :3].copy(), state[:, 3].copy()
+    steps = (*model, ROBUST_CODES[options.robust], MAX_STEPS, path)
+    return path[: polish_path(aligned.points, weights, mask, rotation, translation, *steps)]
+
+
+def record(
+    aligned: AlignedProblem, path: FloatArray, limits_px: FloatArray, options: RefinementOptions
+) -> tuple[FloatArray, BoolArray, RefinementStage]:
+    """What ``refine`` returns of a path of poses (I + 1, 3, 4) between the aligned frames, whose last is the result.
+
+    Its inliers are the correspondences within ``limits_px`` (M,).
+    """
+    data, sd = (aligned.points, aligned.pixel_from_bearing.copy()), gravity_sd_rad(aligned, options)
+    inliers, costs, counts = _account(aligned.bearings, *data, limits_px, path)
     last = path[-1].copy()
-    dof, centre, steps = _step_covariance(*data, inliers, last, *model)
+    dof, centre, steps = _step_covariance(*data, inliers, last, options.noise_px, sd, ROBUST_CODES[options.robust])
     stage = RefinementStage(
         dof=dof,
         cam_from_map=_unaligned(aligned, path),
@@ -137,17 +180,7 @@ def _covariance(aligned: AlignedProblem, cam_from_map: FloatArray, centre: Float
 def _residuals(bearings, points, weights, cam_from_map):
     """See ``residuals_px``."""
     errors = np.empty(len(points))
-    p = cam_from_map
-    for k in range(len(points)):
-        x = p[0, 0] * points[k, 0] + p[0, 1] * points[k, 1] + p[0, 2] * points[k, 2] + p[0, 3]
-        y = p[1, 0] * points[k, 0] + p[1, 1] * points[k, 1] + p[1, 2] * points[k, 2] + p[1, 3]
-        z = p[2, 0] * points[k, 0] + p[2, 1] * points[k, 1] + p[2, 2] * points[k, 2] + p[2, 3]
-        if bearings[k, 0] * x + bearings[k, 1] * y + bearings[k, 2] * z > 0.0:
-            du = weights[k, 0, 0] * x + weights[k, 0, 1] * y + weights[k, 0, 2] * z
-            dv = weights[k, 1, 0] * x + weights[k, 1, 1] * y + weights[k, 1, 2] * z
-            errors[k] = np.sqrt((du * du + dv * dv) / (x * x + y * y + z * z))
-        else:
-            errors[k] = np.inf
+    errors_of(bearings, points, weights, cam_from_map, errors)
     return errors
 
 

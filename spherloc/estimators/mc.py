@@ -17,8 +17,9 @@ from spherloc.consensus.yaw_sweep import YawConsensus, deepest_yaw
 from spherloc.errors import InputError
 from spherloc.estimators.base import Clock, Outcome, check_positive
 from spherloc.geometry import pose, yaw_rotation
+from spherloc.last_step import conclude
 from spherloc.problem import AlignedProblem
-from spherloc.refine import RefinementOptions, refine
+from spherloc.refine import RefinementOptions
 from spherloc.solvers.two_point import two_point
 from spherloc.trace import Stage, TranslationStage, YawStage
 from spherloc.watch import SELDOM, Watch, stopped
@@ -82,7 +83,7 @@ class MaximumConsensus:
             reason = "No pose: no pair in the rotation clique bounds the camera's position."
             return Outcome((yaw,), None, nobody, reason)
         with clock.stage("refinement", until=1.0):
-            refined, inliers, refinement = refine(aligned, start, bounds, options)
+            refined, inliers, refinement = conclude(aligned, [start], bounds, options)
         stages: tuple[Stage, ...] = (yaw, translation, refinement)
         return Outcome(stages, refined, inliers)
 

@@ -22,9 +22,10 @@ from spherloc.consensus.two_point_search import TwoPointSearch, search_two_point
 from spherloc.errors import InputError
 from spherloc.estimators.base import Clock, Outcome, check_positive
 from spherloc.estimators.first_poses import first_pose, supported
-from spherloc.geometry import yaw_of
+from spherloc.geometry import pose, yaw_of, yaw_rotation
+from spherloc.last_step import conclude
 from spherloc.problem import AlignedProblem
-from spherloc.refine import RefinementOptions, refine, residuals_px
+from spherloc.refine import RefinementOptions, residuals_px
 from spherloc.trace import Certificate, ConsensusStage
 
 FloatArray = NDArray[np.float64]
@@ -97,7 +98,8 @@ class ExactMaximumConsensus:
             reason = "No pose: no pair of correspondences has a solution in front of the camera."
             return Outcome((stage,), None, np.zeros(count, dtype=bool), reason, certificate=certificate)
         with clock.stage("refinement", until=1.0):
-            refined, inliers, refinement = refine(aligned, found.pose, bounds, options)
+            starts = [found.pose, *_rivals(found.pairs), *(pose(yaw_rotation(yaw), at) for yaw, at in _poses(guess))]
+            refined, inliers, refinement = conclude(aligned, starts, bounds, options)
         lower = _lower_bound(aligned, bounds, found.pose, refined, refinement.tilt_rad)
         certificate = Certificate(max(found.upper, lower), lower, chance_sets(count, lower, rate))
         return Outcome((stage, refinement), refined, inliers, certificate=certificate)
@@ -162,6 +164,11 @@ def _search(
     )
     upper = found.upper if pairs is None else min(found.upper, int(pairs.bound.max(initial=1)))
     return _Found(found.pose, upper, pairs, effort + found.effort)
+
+
+def _rivals(pairs: ExactConsensus | None) -> list[FloatArray]:
+    """The clearly different poses (3, 4) that the search over pairs verified beside the best one."""
+    return [] if pairs is None else list(pairs.poses[1:])
 
 
 def _poses(guess: TwoPointSearch) -> list[tuple[float, FloatArray]]:

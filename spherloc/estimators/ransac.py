@@ -11,8 +11,9 @@ from spherloc.consensus.two_point_search import Scoring, TwoPointSearch, search_
 from spherloc.errors import InputError, show
 from spherloc.estimators.base import Clock, Outcome, check_positive
 from spherloc.geometry import pose, yaw_rotation
+from spherloc.last_step import conclude
 from spherloc.problem import AlignedProblem
-from spherloc.refine import RefinementOptions, refine
+from spherloc.refine import RefinementOptions
 from spherloc.trace import RansacStage
 
 MOST_ITERATIONS = 10_000_000
@@ -73,7 +74,7 @@ class TwoPointRansac:
             return Outcome((stage,), None, np.zeros(len(aligned.bearings), dtype=bool), reason)
         with clock.stage("refinement", until=1.0):
             start = pose(yaw_rotation(search.yaws_rad[-1]), search.translations[-1])
-            refined, inliers, refinement = refine(aligned, start, bounds, options)
+            refined, inliers, refinement = conclude(aligned, [start], bounds, options)
         return Outcome((stage, refinement), refined, inliers)
 
 

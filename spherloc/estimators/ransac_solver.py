@@ -19,9 +19,10 @@ from numpy.typing import NDArray
 from spherloc.bounds import Bounds
 from spherloc.errors import InputError
 from spherloc.estimators.base import Clock, Outcome, check_positive
+from spherloc.last_step import conclude
 from spherloc.metrics import ransac_success_probability
 from spherloc.problem import AlignedProblem
-from spherloc.refine import RefinementOptions, refine, residuals_px
+from spherloc.refine import RefinementOptions, residuals_px
 from spherloc.solvers.base import Solver
 from spherloc.solvers.epnp import Epnp
 from spherloc.solvers.epropnp import EproPnp
@@ -120,7 +121,7 @@ class SolverRansac:
         if reason:
             return Outcome((stage,), None, inlier_mask, " ".join(filter(None, (reason, _lost(view)))))
         with clock.stage("refinement", until=1.0):
-            refined, inliers, refinement = refine(view.aligned, found[-1].cam_from_map, view.bounds, options)
+            refined, inliers, refinement = conclude(view.aligned, [found[-1].cam_from_map], view.bounds, options)
         inlier_mask[view.seen] = inliers
         return Outcome((stage, refinement), refined, inlier_mask, note=_lost(view))
 

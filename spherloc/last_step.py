@@ -1,0 +1,96 @@
+"""The last step of every estimator: from the poses that a search found to the one that is reported.
+
+The pose with the most inliers is not the best one: where gravity is uncertain, many explain as many. So the candidates
+are compared by their truncated squares (``narrowing``) at the bound on the noise, and the reported inliers are those of
+the winner.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spherloc.bounds import Bounds
+from spherloc.gauss_newton import LEAST_GRAVITY_SD_RAD
+from spherloc.narrowing import MOST_DESCENTS, NARROWINGS, descend, narrow, search_nearby, truncated_squares
+from spherloc.problem import AlignedProblem
+from spherloc.refine import (
+    RESCUE_REACH,
+    RefinementOptions,
+    fitted_path,
+    gravity_sd_rad,
+    record,
+    refined_path,
+    residuals_px,
+)
+from spherloc.trace import RefinementStage
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+MOST_STARTS = 4
+RIVAL_SHARE = 0.6
+"""Share of the most inliers that a start must have: what has less never wins."""
+
+
+def conclude(
+    aligned: AlignedProblem, starts: Sequence[FloatArray], bounds: Bounds, options: RefinementOptions
+) -> tuple[FloatArray, BoolArray, RefinementStage]:
+    """The pose of least truncated squares that is found from the ``starts`` (3, 4) of a search, best first.
+
+    The first four of them that explain enough are refined by ``refine`` and, where gravity is uncertain, by a fit at
+    bounds that narrow from one that allows for gravity's error to that of the noise; random fits nearby follow. The
+    truncated squares are those at the bound on the noise; where gravity is kept, at one that allows for its error.
+    Every candidate moves downhill in them to the end. The inliers of the best one are fitted once more, weighed as
+    ``options.robust`` says, and that is taken unless it is farther off than noise explains.
+
+    Returns what ``refine`` does. All poses are between the aligned frames.
+    """
+    sd = gravity_sd_rad(aligned, options)
+    data = (aligned.bearings, aligned.points, aligned.pixel_from_bearing.copy())
+    model = (options.noise_px, sd)
+    kept = sd < LEAST_GRAVITY_SD_RAD
+    limits = bounds.pixels.copy() if kept else np.full(len(aligned.points), bounds.noise_px)
+    wide = bounds.pixels.copy()
+    least, best = np.inf, np.empty((0, 3, 4))
+    for start in _promising(aligned, starts, bounds):
+        plain, reach = refined_path(aligned, start, bounds, options)
+        if not kept and reach == np.inf:
+            # Too few for a tilt: there is nothing to choose from.
+            return record(aligned, plain, bounds.pixels, options)
+        for path in [plain] if kept else [plain, _narrowed(data, wide, limits, start, model)]:
+            path, cost = _descended(data, limits, path, model)
+            if cost < least:
+                least, best = cost, path
+    if not kept:
+        for start in (best[-1], starts[0]):
+            at = best[-1].copy()
+            cost = search_nearby(*data, wide, limits, start.copy(), *model, at, least)
+            if cost < least:
+                best, least = _descended(data, limits, np.array([best[0], at]), model)
+    if options.robust != "none":
+        fit = fitted_path(aligned, best[-1], limits, options)
+        if len(fit) and truncated_squares(*data, limits, fit[-1].copy(), *model, np.inf) <= least + RESCUE_REACH:
+            best = np.concatenate([best, fit])
+    return record(aligned, best, limits, options)
+
+
+def _promising(aligned: AlignedProblem, starts: Sequence[FloatArray], bounds: Bounds) -> list[FloatArray]:
+    """The first start and those of the next ones that explain enough beside it."""
+    counts = [int(np.count_nonzero(residuals_px(aligned, start) <= bounds.pixels)) for start in starts[:MOST_STARTS]]
+    enough = RIVAL_SHARE * max(counts)
+    return [start for k, (start, count) in enumerate(zip(starts, counts, strict=False)) if k == 0 or count >= enough]
+
+
+def _narrowed(data, wide, limits, start: FloatArray, model) -> FloatArray:
+    path = np.empty((1 + len(NARROWINGS), 3, 4))
+    path[0] = start
+    narrow(*data, wide, limits, path[0].copy(), *model, path[1:])
+    return path
+
+
+def _descended(data, limits, path: FloatArray, model) -> tuple[FloatArray, float]:
+    """The path (I, 3, 4) and how it goes on downhill, and the truncated squares of its end."""
+    more, at = np.empty((MOST_DESCENTS, 3, 4)), path[-1].copy()
+    states, cost = descend(*data, limits, at, *model, more)
+    return np.concatenate([path, more[:states]]), float(cost)
