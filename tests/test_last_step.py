@@ -27,9 +27,7 @@ def data_of(aligned):
 
 def squares(aligned, state):
     limits = np.full(len(aligned.points), BOUND_PX)
-    return truncated_squares(
-        *data_of(aligned), limits, state, 1.0, aligned.gravity_sd_rad if sd is None else sd, np.inf
-    )
+    return truncated_squares(*data_of(aligned), limits, state, 1.0, aligned.gravity_sd_rad, np.inf)
 
 
 def errors(problem, state):
