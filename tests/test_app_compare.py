@@ -33,6 +33,7 @@ class Stage:
         self.redraws = 0
         self.touches = Touches(self._failed)
         self.panel = ComparePanel(gui, self.touches, self.used.append, self._redraw)
+        self.touch("views:Compare,Yaw")
 
     def _failed(self, error: Exception) -> None:
         raise error
@@ -130,7 +131,7 @@ def test_it_repeats_the_run_of_the_page(stage: Stage, runs: tuple[Trace, Trace])
     assert mc.options == options and (mc.seed, two_point.seed) == (9, 9)
     assert mc.cam_from_map is not None and chosen.cam_from_map is not None
     assert np.array_equal(mc.cam_from_map, chosen.cam_from_map)
-    assert two_point.options == options_type("ransac-2p")()
+    assert two_point.options == options_type("ransac-2p")(bound_px=5.0), "by the same bound"
 
 
 def test_a_pressed_row_asks_for_its_estimator(stage: Stage) -> None:

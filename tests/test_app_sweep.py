@@ -119,7 +119,7 @@ def test_a_sweep_is_drawn_as_it_goes_cancelled_and_gone_on_with(desk: Desk) -> N
     until(lambda: len(drawn) >= 3)
     assert panel._button.label == CANCEL and 0.0 < panel._bar.value < 100.0
     assert re.fullmatch(r"[\d,]+ of 20,000 runs, about \d+ (s|min) left\.", desk.status)
-    assert panel._charts.content.count("<svg") == 3 and NAME not in panel._charts.content
+    assert panel._charts.content.count("<svg") == 4 and NAME not in panel._charts.content
     desk.press()
     desk.finish()
     assert np.diff(drawn[:-1]).min() >= sweep_runs_panel.DRAW_EVERY_S

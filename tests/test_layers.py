@@ -394,13 +394,13 @@ def test_standard_deviations_are_those_of_the_covariance(mc: Trace) -> None:
     picture = at(trace, "refinement")
     assert dict(picture.tables[0].rows) == {
         "rotation about x, y, z": "0.100°, 0.200°, 0.200°",
-        "position x, y, z": "1.00 cm, 2.00 cm, 2.00 cm",
+        "position x, y, z": "1.0 cm, 2.0 cm, 2.0 cm",
         "tilt": "0.250°",
     }
-    assert "its error is 0.300° and 3.00 cm RMS." in picture.step.caption
+    assert "its error is 0.30° and 3.0 cm RMS." in picture.step.caption
     assert "leans 0.250° from the given gravity, which was trusted to 0.5°" in picture.step.note
     assert "tilt / σ_g" in picture.step.equation
-    assert dict(at(trace, "outcome").tables[-1].rows)["expected error"] == "0.300° and 3.00 cm RMS"
+    assert dict(at(trace, "outcome").tables[-1].rows)["expected error"] == "0.30° and 3.0 cm RMS"
 
 
 @pytest.mark.parametrize(("sd", "said"), [(0.0, "is kept"), (np.inf, "was not used")])

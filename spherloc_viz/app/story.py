@@ -12,12 +12,13 @@ from spherloc_viz.app.introduction import introduction_html
 from spherloc_viz.app.matches.image_panel import ImagePanel
 from spherloc_viz.app.matches.match_table import MatchTable
 from spherloc_viz.app.plots.charts import ChartPanel
+from spherloc_viz.app.plots.graph_view import GraphView
 from spherloc_viz.app.plots.residual_view import ResidualView
 from spherloc_viz.app.plots.yaw_view import YawView
 from spherloc_viz.app.text import legend_html, summary_html, table_html
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.wish import Run
-from spherloc_viz.layers import steps
+from spherloc_viz.layers import graph_begins, steps
 from spherloc_viz.layers.primitives import Picture, Table
 
 
@@ -41,12 +42,14 @@ class Story:
             self._diagnosis = gui.add_html("")
             gui.add_html(legend_html())
             self._outcome = gui.add_html("")
-            self._introduction = gui.add_html("")
+            self._introduction, self._front = gui.add_html(""), gui.add_html("")
         Glossary(gui, touches)
         self._seen, self._changed = frozenset({"Yaw"}), changed
         touches.on("views", self._see)
         with _view(gui, views, "Yaw"):
             self._yaw = YawView(gui, touches, changed)
+        with _view(gui, views, "Graph"):
+            self._graph = GraphView(gui, touches, select)
         with _view(gui, views, "Charts"):
             self._charts = ChartPanel(gui)
         with _view(gui, views, "Residuals"):
@@ -67,15 +70,23 @@ class Story:
         seen = self._seen
         if "Yaw" in seen:
             self._yaw.draw(run.trace, picture.step.key, selected, kept)
+        if "Graph" in seen:
+            self._graph.draw(picture.graph, graph_begins(run.trace), selected, kept)
         if "Charts" in seen:
             self._charts.draw(picture.charts)
         if "Residuals" in seen:
-            self._residuals.draw(run.trace, selected, kept)
+            cost = next((chart for chart in picture.charts if chart.name == "refinement"), None)
+            self._residuals.draw(run.trace, selected, kept, cost)
         if "Images" in seen:
             self._images.draw(run.trace, picture, selected, kept)
         if "Matches" in seen:
             self._matches.draw(run.trace, selected, kept)
-        for widget, html in ((self._summary, summary_html(run.trace)), (self._outcome, table_html(outcome))):
+        front = front_html(picture.step.stage, picture.step.key)
+        for widget, html in (
+            (self._front, front),
+            (self._summary, summary_html(run.trace)),
+            (self._outcome, table_html(outcome)),
+        ):
             if widget.content != html:
                 widget.content = html
         if not self._introduction.content:
@@ -90,6 +101,24 @@ class Story:
         """Show what the diagnosis says by now."""
         if self._diagnosis.content != html:
             self._diagnosis.content = html
+
+
+FRONTS = {
+    "Matches": "Images",
+    "Samples": "Yaw",
+    "Yaw": "Yaw",
+    "Translation": "Graph",
+    "Consensus": "Yaw",
+    "Refinement": "Residuals",
+    "Outcome": "Residuals",
+}
+"""The view that goes with the steps of a stage."""
+
+
+def front_html(stage: str, key: str) -> str:
+    """Tells the page's script which view goes with a step."""
+    name = "Graph" if key.startswith("consensus-clique") else FRONTS.get(stage, "")
+    return f'<div hidden data-front="{name}"></div>'
 
 
 @contextmanager

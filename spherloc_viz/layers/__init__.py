@@ -20,7 +20,7 @@ from spherloc_viz import style
 from spherloc_viz.layers import consensus, decision, extension, outcome, ransac, refinement, start, translation, yaw
 from spherloc_viz.layers.focus import focus_of
 from spherloc_viz.layers.frame import Plan, RunView
-from spherloc_viz.layers.primitives import Chart, FloatArray, Picture, Step, Stop
+from spherloc_viz.layers.primitives import Chart, FloatArray, Graph, Picture, Step, Stop
 from spherloc_viz.layers.scene import base_items, camera
 from spherloc_viz.layers.tables import outcome_table
 
@@ -44,6 +44,22 @@ class _Timeline:
     stops: tuple[Stop, ...]
     charts: dict[Callable[[], Chart], Chart | None] = field(default_factory=dict)
     """Those that were drawn already: they stay for all later steps."""
+
+    graphs: dict[Callable[[], Graph], Graph | None] = field(default_factory=dict)
+
+    def graph(self, index: int) -> Graph | None:
+        """The graph as of a step, made once; None where that fails on the numbers of an extension."""
+        draw = next((plan.graph for plan in reversed(self.plans[: index + 1]) if plan.graph is not None), None)
+        if draw is None:
+            return None
+        if draw not in self.graphs:
+            try:
+                self.graphs[draw] = draw()
+            except Exception:
+                if not extension.is_extension(self.view):
+                    raise
+                self.graphs[draw] = None
+        return self.graphs[draw]
 
     def chart(self, draw: Callable[[], Chart]) -> Chart | None:
         """The chart that ``draw`` makes, made once; None where that fails on the numbers of an extension."""
@@ -89,6 +105,11 @@ def steps(trace: Trace) -> tuple[Stop, ...]:
     return _timeline(trace).stops
 
 
+def graph_begins(trace: Trace) -> str:
+    """The key of the first step that has a graph; empty if none has."""
+    return next((plan.key for plan in _timeline(trace).plans if plan.graph is not None), "")
+
+
 def paint(trace: Trace, index: int) -> Picture:
     """What the step at ``index`` looks like. Charts of earlier steps stay."""
     timeline = _timeline(trace)
@@ -100,7 +121,7 @@ def paint(trace: Trace, index: int) -> Picture:
     step = Step(stop.key, stop.title, frame.caption, frame.equation, frame.note, stop.stage)
     scene = base_items(timeline.view, frame) + frame.items
     drawn = tuple(chart for chart in map(timeline.chart, charts.values()) if chart is not None)
-    return Picture(step, scene, drawn, tables, focus_of(timeline.view, frame))
+    return Picture(step, scene, drawn, tables, focus_of(timeline.view, frame), timeline.graph(index))
 
 
 def with_rival(picture: Picture, trace: Trace, cam_from_map: FloatArray) -> Picture:

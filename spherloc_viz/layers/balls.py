@@ -46,7 +46,7 @@ class BallSet:
         stride = max(1, round(GOLDEN * half))
         while gcd(stride, half) > 1:
             stride += 1
-        spread = np.concatenate([self.by_radius[np.arange(half) * stride % half], self.by_radius[half:]])
+        spread = np.concatenate([self.by_radius[(half // 2 + np.arange(half) * stride) % half], self.by_radius[half:]])
         first = spread[self.in_clique[spread]][:2]
         return np.concatenate([first, spread[~np.isin(spread, first)]])
 
@@ -81,6 +81,11 @@ class BallSet:
     def degrees(self) -> IndexArray:
         """(M,) how many others each ball overlaps."""
         return np.bincount(self.stage.edges.ravel(), minlength=len(self))
+
+    @cached_property
+    def busiest(self) -> IndexArray:
+        """(M,) those that overlap most others first."""
+        return np.argsort(-self.degrees, kind="stable")
 
     def mask(self, balls: np.ndarray) -> NDArray[np.bool_]:
         """Mask (M,) of some balls."""

@@ -1,6 +1,7 @@
 """Exact consensus: the bound over yaw, the largest set of matches that agrees, and the poses that were verified."""
 
-from functools import partial
+from collections.abc import Callable
+from functools import cache, partial
 
 import numpy as np
 
@@ -12,7 +13,8 @@ from spherloc_viz.layers import ring
 from spherloc_viz.layers import yaw_bound as bound
 from spherloc_viz.layers.focus import sphere_box
 from spherloc_viz.layers.frame import Frame, Plan, RunView, even, growing, one_color
-from spherloc_viz.layers.primitives import FloatArray, Focus, SceneItem, Segments, Table
+from spherloc_viz.layers.graph import graph_at, match_nodes
+from spherloc_viz.layers.primitives import FloatArray, Focus, Graph, Nodes, SceneItem, Segments, Table
 from spherloc_viz.layers.scene import camera
 from spherloc_viz.layers.yaw_bound import best_support, highest_bound
 
@@ -24,12 +26,15 @@ def plans(view: RunView, stage: ConsensusStage) -> list[Plan]:
     """The first guess and the bound; then the set and the poses, where the search has found any."""
     charts = {"consensus": partial(bound.chart, view, stage)}
     out = bound.plans(view, stage)
-    for size in growing(len(stage.clique), *CLIQUE_SIZES):
+    nodes, whole = cache(partial(match_nodes, view, stage)), len(stage.clique)
+    for size in growing(whole, *CLIQUE_SIZES):
         title, draw = f"{size} matches that agree", partial(_members, view, stage, size)
-        out.append(Plan(f"consensus-clique-{size}", title, draw, charts))
-    if len(stage.clique):
-        title = "The largest set that agrees"
-        out.append(Plan("consensus-clique", title, lambda: _clique(view, stage), charts))
+        graph = partial(_graph, view, nodes, stage.clique[:size], f"{size} of {whole} matches that all agree.")
+        out.append(Plan(f"consensus-clique-{size}", title, draw, charts, graph))
+    if whole:
+        title, words = "The largest set that agrees", f"{whole} matches that all agree, a full block of the matrix."
+        graph = partial(_graph, view, nodes, stage.clique, words)
+        out.append(Plan("consensus-clique", title, lambda: _clique(view, stage), charts, graph))
     shown = min(len(stage.support), 1 + style.MAX_DRAWN_RIVALS)
     for rank in range(shown if shown > 1 else 0):
         title = "The best pose" if rank == 0 else f"Rival pose {rank}"
@@ -37,6 +42,11 @@ def plans(view: RunView, stage: ConsensusStage) -> list[Plan]:
     if len(stage.support):
         out.append(Plan("consensus-poses", "The poses that were verified", lambda: _poses(view, stage), charts))
     return out
+
+
+def _graph(view: RunView, nodes: Callable[[], Nodes], marked: np.ndarray, words: str) -> Graph:
+    """The graph at the best pose's yaw, with some matches (numbers in the problem) marked."""
+    return graph_at(nodes, None, np.searchsorted(view.trace.problem.aligned.index, marked), style.CLIQUE, words)
 
 
 def _clique(view: RunView, stage: ConsensusStage) -> Frame:

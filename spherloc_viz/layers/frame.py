@@ -17,7 +17,7 @@ from spherloc.geometry import camera_centre, pose
 from spherloc.refine import residuals_px
 from spherloc.trace import Trace
 from spherloc_viz import style
-from spherloc_viz.layers.primitives import Chart, ColorArray, FloatArray, Focus, SceneItem, Table
+from spherloc_viz.layers.primitives import Chart, ColorArray, FloatArray, Focus, Graph, SceneItem, Table
 
 BoolArray = NDArray[np.bool_]
 T = TypeVar("T")
@@ -66,6 +66,8 @@ class Plan:
     draw: Callable[[], Frame]
     charts: Mapping[str, Callable[[], Chart]] = field(default_factory=dict)
     """Charts by name. They stay until a later stop has one of the same name."""
+    graph: Callable[[], Graph] | None = None
+    """What it shows of the run's graph. It stays until a later stop has one."""
 
 
 @dataclass(frozen=True, eq=False)

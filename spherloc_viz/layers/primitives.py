@@ -5,6 +5,7 @@ Scene positions are metres in the gravity-aligned map frame: y points down. Colo
 
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -156,6 +157,52 @@ class Chart:
 
 
 @dataclass(frozen=True, eq=False)
+class Nodes:
+    """The nodes of a run's graph that are drawn, K of them, in the order of the matrix: the maximum clique first, then
+    those that agree with most of it."""
+
+    name: str
+    """What a node is, such as "ball"."""
+    number: NDArray[np.int64]
+    """(K,) index of each node in its stage."""
+    total: int
+    """How many nodes there are, drawn or not."""
+    places: FloatArray
+    """(K, 2) from -1 to 1: nodes near the middle of the clique in space stand near the middle, in their directions."""
+    matches: NDArray[np.int64]
+    """(K, P) the correspondences that each node is of: two of a ball, one of a match."""
+    agrees: NDArray[np.bool_]
+    """(K, K) symmetric; false on the diagonal."""
+    clique: int
+    """The first so many form the maximum clique."""
+
+    @cached_property
+    def edges(self) -> NDArray[np.int64]:
+        """(E, 2) nodes that agree, the first of each pair being the smaller."""
+        return np.argwhere(np.triu(self.agrees))
+
+    def lit(self, selected: tuple[int, ...]) -> NDArray[np.int64]:
+        """Nodes of the selected correspondences: of one all with it, of several those among them."""
+        inside = np.isin(self.matches, selected).sum(axis=1)
+        return np.flatnonzero(inside >= max(1, min(self.matches.shape[1], len(selected))))
+
+
+@dataclass(frozen=True, eq=False)
+class Graph:
+    """What a step shows of the graph."""
+
+    nodes: Nodes
+    shown: NDArray[np.bool_]
+    """(K,) nodes that are there by now."""
+    marked: NDArray[np.bool_]
+    """(K,) nodes that the step is about."""
+    color: tuple[int, int, int]
+    """Of those."""
+    words: str
+    """What is marked, in a sentence."""
+
+
+@dataclass(frozen=True, eq=False)
 class Table:
     """Rows of text and numbers."""
 
@@ -203,3 +250,5 @@ class Picture:
     charts: tuple[Chart, ...]
     tables: tuple[Table, ...]
     focus: Focus
+    graph: Graph | None = None
+    """What is known of the run's graph by this step; None before there is one."""

@@ -140,7 +140,8 @@ def _error(view: RunView, stage: RefinementStage) -> Frame:
     expected = (
         "The inliers leave the pose open, so that its error is unknown."
         if known is None
-        else f"By its covariance the pose is {known[0]:.3f}° and {known[1]:.2f} cm off, RMS, if its inliers are right."
+        else f"By its covariance the pose is {angle_text(known[0])} and {length(known[1])} off, RMS, if its inliers "
+        "are right."
     )
     if view.truth is None:
         happened = "The truth is not known here, so that nobody can check."

@@ -1,6 +1,7 @@
 """Translation: the balls of feasible camera positions gather, their overlaps, and their maximum clique."""
 
-from functools import partial
+from collections.abc import Callable
+from functools import cache, partial
 
 import numpy as np
 
@@ -10,7 +11,8 @@ from spherloc_viz import style
 from spherloc_viz.layers.balls import BallSet, IndexArray
 from spherloc_viz.layers.focus import ball_boxes
 from spherloc_viz.layers.frame import Frame, Plan, RunView, growing, length, one_color
-from spherloc_viz.layers.primitives import Balls, FloatArray, Focus, Label, Segments
+from spherloc_viz.layers.graph import ball_nodes, graph_at
+from spherloc_viz.layers.primitives import Balls, FloatArray, Focus, Graph, Label, Segments
 
 SIZES = (3, 10, 30, 100, 300)
 """How many balls are shown before all are, in the order of ``BallSet.order``."""
@@ -22,18 +24,53 @@ NAME_ROOM = 2.5
 
 def plans(view: RunView, stage: TranslationStage) -> list[Plan]:
     """One ball, more and more of them, two greedy cliques, and the maximum one."""
-    balls = BallSet(stage)
-    out = [Plan("balls-pair", "One pair, one ball", lambda: _pair(view, balls))]
+    balls, nobody = BallSet(stage), np.zeros(0, dtype=np.int64)
+    nodes = cache(partial(ball_nodes, stage))
+
+    def graph(shown: IndexArray | None, marked: IndexArray, words: str, color: style.RGB = style.CLIQUE) -> Graph:
+        return graph_at(nodes, shown, marked, color, words)
+
+    one = np.array([balls.example])
+    out = [
+        Plan(
+            "balls-pair",
+            "One pair, one ball",
+            lambda: _pair(view, balls),
+            graph=lambda: graph(one, one, "The first node.", style.SAMPLE),
+        )
+    ]
     for size in growing(len(balls), *SIZES):
-        out.append(Plan(f"balls-{size}", f"{size} balls and their graph", partial(_some, view, balls, size)))
-    out.append(Plan("balls", "Balls of camera positions", lambda: _all(view, balls)))
-    out.append(Plan("clique-greedy-smallest", "A clique from the smallest ball", lambda: _from_smallest(view, balls)))
-    out.append(Plan("clique-greedy-degree", "A clique from the busiest ball", lambda: _from_busiest(view, balls)))
+        title, draw, words = f"{size} balls and their graph", partial(_some, view, balls, size), f"{size} nodes."
+        out.append(Plan(f"balls-{size}", title, draw, graph=partial(graph, balls.order[:size], nobody, words)))
+    words = f"All {len(balls):,} nodes."
+    out.append(
+        Plan("balls", "Balls of camera positions", lambda: _all(view, balls), graph=partial(graph, None, nobody, words))
+    )
+    for key, title, draw, order in (
+        ("clique-greedy-smallest", "A clique from the smallest ball", _from_smallest, lambda: balls.by_radius),
+        ("clique-greedy-degree", "A clique from the busiest ball", _from_busiest, lambda: balls.busiest),
+    ):
+        out.append(Plan(key, title, partial(draw, view, balls), graph=partial(_greedy_graph, balls, graph, order)))
     for size in growing(len(stage.clique), *CLIQUE_SIZES):
-        title = f"{size} balls of the maximum clique"
-        out.append(Plan(f"clique-{size}", title, partial(_members, view, balls, size)))
-    out.append(Plan("clique", "The maximum clique of balls", lambda: _clique(view, balls)))
+        title, draw = f"{size} balls of the maximum clique", partial(_members, view, balls, size)
+        words = f"{size} of the {len(stage.clique):,} nodes of the maximum clique."
+        out.append(Plan(f"clique-{size}", title, draw, graph=partial(graph, None, balls.members[:size], words)))
+    words = f"The maximum clique: {len(stage.clique):,} nodes that all agree, a full block of the matrix."
+    out.append(
+        Plan(
+            "clique",
+            "The maximum clique of balls",
+            lambda: _clique(view, balls),
+            graph=partial(graph, None, stage.clique, words),
+        )
+    )
     return out
+
+
+def _greedy_graph(balls: BallSet, graph: Callable[..., Graph], order: Callable[[], IndexArray]) -> Graph:
+    found, most = balls.greedy(order()), len(balls.stage.clique)
+    bound = f"≤ ω(G) = {most:,}" if balls.stage.proven else "≤ ω(G)"
+    return graph(None, found, f"A clique of {len(found):,} nodes: a lower bound, {len(found):,} {bound}.", style.SAMPLE)
 
 
 def _turned(view: RunView, balls: BallSet) -> FloatArray:
@@ -135,7 +172,7 @@ def _from_smallest(view: RunView, balls: BallSet) -> Frame:
 
 
 def _from_busiest(view: RunView, balls: BallSet) -> Frame:
-    found = balls.greedy(np.argsort(-balls.degrees, kind="stable"))
+    found = balls.greedy(balls.busiest)
     most = int(balls.degrees[found[0]])
     return _greedy(view, balls, found, f"the ball that overlaps most others, {most:,}", "the next busiest one")
 

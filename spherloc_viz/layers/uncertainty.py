@@ -6,7 +6,7 @@ from spherloc.geometry import camera_centre
 from spherloc.metrics import rotation_error_deg
 from spherloc.trace import RefinementStage
 from spherloc_viz import style
-from spherloc_viz.layers.frame import Frame, RunView, one_color
+from spherloc_viz.layers.frame import Frame, RunView, length, one_color
 from spherloc_viz.layers.primitives import FloatArray, Label, Points, SceneItem, Segments, Table
 from spherloc_viz.layers.scale_bar import angle_text, length_text
 
@@ -113,17 +113,19 @@ def _angle(view: RunView, frame: Frame) -> list[SceneItem]:
 
 
 def rms(stage: RefinementStage) -> tuple[float, float] | None:
-    """Root mean square of the angle (degrees) and the distance (cm) by which the pose is off; None if unknown."""
+    """Root mean square of the angle (degrees) and the distance (m) by which the pose is off; None if unknown."""
     variance = np.diagonal(stage.covariance)
     if not np.isfinite(variance).all():
         return None
-    return float(np.degrees(np.sqrt(variance[:3].sum()))), float(100.0 * np.sqrt(variance[3:].sum()))
+    return float(np.degrees(np.sqrt(variance[:3].sum()))), float(np.sqrt(variance[3:].sum()))
 
 
 def spread(stage: RefinementStage) -> str:
     """The same in words."""
     known = rms(stage)
-    return "unknown: the inliers leave it open" if known is None else f"{known[0]:.3f}° and {known[1]:.2f} cm RMS"
+    return (
+        "unknown: the inliers leave it open" if known is None else f"{angle_text(known[0])} and {length(known[1])} RMS"
+    )
 
 
 def tilt(stage: RefinementStage) -> str:
@@ -141,7 +143,7 @@ def table(stage: RefinementStage) -> Table:
     deviations = np.sqrt(np.diagonal(stage.covariance))
     rows = (
         ("rotation about x, y, z", _listed(np.degrees(deviations[:3]), "{:.3f}°")),
-        ("position x, y, z", _listed(100.0 * deviations[3:], "{:.2f} cm")),
+        ("position x, y, z", ", ".join(length(value) if np.isfinite(value) else "open" for value in deviations[3:])),
         ("tilt", f"{np.degrees(stage.tilt_rad):.3f}°"),
     )
     return Table("standard deviations", ("", "camera, map frame"), rows)

@@ -133,6 +133,22 @@ def test_balls_are_on_the_screen_at_every_step_that_one_walks_to(tab: Playground
             return bool(np.mean(inside) >= 0.4 and np.ptp(places[inside], axis=0).max() > 0.02 * box["height"])
 
         tab.until(framed, f"the balls of step {number + 1} are framed")
+
+    graph = tab.page.get_by_text("Graph and matrix")
+    expect(graph).to_be_visible()
+    node = tab.page.locator("circle[data-touch^='select:']").first
+    numbers = sorted(map(int, str(node.get_attribute("data-touch")).removeprefix("select:").split(",")))
+    node.click()
+    tab.expect_card(*numbers)
+    tab.until(lambda: sorted(tab.lit()) == numbers, "the matches of the node are lit on the map")
+    tab.page.keyboard.press("Escape")
+    tab.expect_card()
+    tab.touch("step:refinement-0").click()
+    expect(tab.page.get_by_text("Residuals at the estimated pose")).to_be_visible()
+    tab.tab("Matches")
+    tab.touch("step:yaw-pair").click()
+    expect(tab.step).to_have_value(at(title="One pair of matches"))
+    expect(tab.row(0)).to_be_visible()
     tab.expect_quiet(address)
 
 

@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from html import escape
+from typing import Any
 
 import numpy as np
 import viser
@@ -35,6 +36,8 @@ from spherloc_viz.layers.primitives import Chart, SceneItem, Table
 from spherloc_viz.options import usable_estimators
 
 START, STOP = "Compare", "Cancel"
+VIEW = "Compare"
+"""By this name the page tells whether the panel is seen."""
 LIVE_AFTER_S = 0.25
 """A live comparison waits until the problem has stood still for this long."""
 TICKED = ("mc-exact", "mc", "ransac-2p", "ransac-epnp")
@@ -42,8 +45,9 @@ TICKED = ("mc-exact", "mc", "ransac-2p", "ransac-epnp")
 MEASURED = ("rotation", "position", "F1", "time")
 """Columns that have one in the table; the others are in the line below."""
 NOTE = (
-    "One run each, one after another, with default options; the estimator that is chosen on the page has the page's. "
-    "Times are of this one run on this machine, busy with this page too. Press a row to use its estimator."
+    "One run each, one after another, all with the page's bound; the estimator that is chosen on the page has all of "
+    "the page's options, the others have default ones. Times are of this one run on this machine, busy with this page "
+    "too. Press a row to use its estimator."
 )
 
 _warm: set[str] = set()
@@ -74,6 +78,7 @@ class ComparePanel:
         self._use, self._changed = use, changed
         self._names = ordered(usable_estimators())
         self._ticked = {name for name in self._names if name in TICKED}
+        gui.add_html(f'<div data-view="{VIEW}"></div>')
         self._choice = gui.add_html(chips_html("compare", self._names, self._ticked))
         self._button = gui.add_button(START, hint="Run the ticked estimators on the problem at hand.")
         self._live = gui.add_checkbox("Live", False, hint="Compare again whenever the problem changes.")
@@ -85,12 +90,13 @@ class ComparePanel:
         self._done: Comparison | None = None
         self._shown: tuple[Comparison | None, bool] = (None, False)
         self._stop, self._watch = threading.Event(), Watch()
-        self._closed = False
+        self._closed, self._seen = False, False
         self._errand = Errand("spherloc-compare", self._complain)
         self._button.on_click(self._press)
         self._live.on_update(self._switch)
         touches.on("compare", self._tick)
         touches.on("use", self._choose)
+        touches.on("views", self._see)
 
     def draw(self, trace: Trace) -> None:
         """Follow the run at hand, whose problem, seed and options are those to compare with."""
@@ -101,8 +107,8 @@ class ComparePanel:
         self._show()
 
     def items(self, trace: Trace) -> tuple[SceneItem, ...]:
-        """What the canvas shows beside a run; nothing if the comparison is of another problem."""
-        done = self._done
+        """What the canvas shows beside a run while this panel is seen; nothing if another problem was compared."""
+        done = self._done if self._seen else None
         return done.items if done is not None and is_same(done.problem, trace.problem) else ()
 
     def close(self) -> None:
@@ -110,6 +116,13 @@ class ComparePanel:
         self._closed = True
         self._errand.close()
         self._halt()
+
+    def _see(self, touch: Touch) -> None:
+        """Other tabs are open now."""
+        seen = VIEW in touch.argument.split(",")
+        if seen != self._seen:
+            self._seen = seen
+            self._changed(None)
 
     def _press(self, event: viser.GuiEvent) -> None:
         if self._button.label == STOP:
@@ -214,11 +227,19 @@ def _run(trace: Trace, name: str, watch: Watch) -> Trace:
 
     Raises ``Cancelled`` if ``watch`` ends either.
     """
-    options = trace.options if name == trace.estimator else default_options(name, trace.problem)
+    options = options_like(trace, name)
     if name not in _warm:
         estimate(trace.problem, name, options, trace.seed, watch)
         _warm.add(name)
     return estimate(trace.problem, name, options, trace.seed, watch)
+
+
+def options_like(trace: Trace, name: str) -> Any:
+    """The run's own options; of another estimator its default ones, but with the run's bound, which decides who is an
+    inlier: else two estimators would be asked two questions."""
+    if name == trace.estimator:
+        return trace.options
+    return replace(default_options(name, trace.problem), bound_px=trace.options.bound_px)
 
 
 def is_same(one: Problem, other: Problem) -> bool:

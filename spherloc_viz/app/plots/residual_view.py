@@ -10,9 +10,11 @@ from numpy.typing import NDArray
 
 from spherloc.trace import Trace
 from spherloc_viz import style
+from spherloc_viz.app.plots.charts import chart_html
 from spherloc_viz.app.plots.residual_drawing import SELECT_BIN, histogram_svg, history_svg
 from spherloc_viz.app.text import DIM, box, dot_html, table_html
 from spherloc_viz.app.web.touch import Touch, Touches
+from spherloc_viz.layers.primitives import Chart
 from spherloc_viz.layers.residuals import Histogram, History, Residuals, history_of, residuals_of, scores_table
 
 Select = Callable[[tuple[int, ...]], None]
@@ -25,28 +27,30 @@ class ResidualView:
         """``select`` is called with the matches of a bin that was pressed, by their numbers in the problem."""
         self._changed, self._select = changed, select
         self._known: tuple[Trace, Residuals | None, str, str] | None = None
-        self._drawn: tuple[int, ...] | None = None
+        self._drawn: tuple[tuple[int, ...], Chart | None] | None = None
         self._bins: dict[str, Histogram] = {}
         self._html = gui.add_html("")
         touches.on(SELECT_BIN, self._press)
 
-    def draw(self, trace: Trace, selected: tuple[int, ...], kept: NDArray[np.int64]) -> None:
+    def draw(self, trace: Trace, selected: tuple[int, ...], kept: NDArray[np.int64], cost: Chart | None = None) -> None:
         """Show a run with the ``selected`` matches (numbers of the problem) marked; nothing here needs ``kept``, the
-        numbers (N,) by which matches are known on the page. Sends nothing if nothing changed.
+        numbers (N,) by which matches are known on the page. ``cost`` is how the residuals fell so far, to stand above.
+        Sends nothing if nothing changed.
         """
         if self._known is None or self._known[0] is not trace:
             residuals, history = residuals_of(trace), history_of(trace)
             self._known = trace, residuals, table_html(scores_table(trace)), _history_html(history)
-        elif self._drawn == selected:
+        elif self._drawn is not None and self._drawn[0] == selected and self._drawn[1] is cost:
             return
         _, residuals, scores, history_html = self._known
         bins: dict[str, Histogram] = {} if residuals is None else {one.unit: one for one in residuals.histograms}
-        content = _residuals_html(residuals, selected) + scores + history_html
+        fall = "" if cost is None else chart_html(cost)
+        content = fall + _residuals_html(residuals, selected) + scores + history_html
         # A press on what was on the page a moment ago selects what is in that bin now.
         self._bins = bins
         if content != self._html.content:
             self._html.content = content
-        self._drawn = selected
+        self._drawn = selected, cost
 
     def _press(self, touch: Touch) -> None:
         unit, _, place = touch.argument.partition(":")

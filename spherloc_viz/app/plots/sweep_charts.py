@@ -12,8 +12,8 @@ from spherloc_viz.app.plots.svg import curve_parts
 from spherloc_viz.app.text import DIM, box, dot_html
 from spherloc_viz.layers.sweep import LIMIT, SweepChart, sweep_charts, sweep_colors, sweep_table
 
-SHOWN = ("sweep success", "sweep position", "sweep time")
-"""Charts on the page; the rotation error is in the files."""
+SHOWN = ("sweep success", "sweep rotation", "sweep position", "sweep time")
+"""Charts on the page."""
 WIDTH_PX, HEIGHT_PX, RIGHT_PX, TOP_PX, FOOT_PX = 380.0, 165.0, 12.0, 20.0, 33.0
 MOST_DECADES, MOST_TICKS = 5, 6
 TABLE_PX = 260

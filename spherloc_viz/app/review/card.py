@@ -138,7 +138,7 @@ def _ways(row: RunRow, run: Run | None) -> str:
     ways.append(
         f'<a href="{link}" target="_blank" rel="noopener" title="Open in the Rerun viewer at the step where it was '
         f'decided: #{row.decisive_step} on its timeline, which counts from 0" '
-        'style="color:inherit;white-space:nowrap">Rerun ↗</a>'
+        'style="color:inherit;white-space:nowrap">Open in Rerun ↗</a>'
     )
     row_css = "padding-top:.25em;display:flex;justify-content:space-between;gap:1em"
     return f'<div style="{row_css}">{"".join(ways)}</div>'

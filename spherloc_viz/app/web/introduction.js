@@ -88,10 +88,10 @@
   }, EVERY_MS);
 
   addEventListener("pointerdown", (event) => {
-    if (card && !(event.target instanceof Element && event.target.closest(".introduction"))) paused = true;
+    if (card && event.isTrusted && !(event.target instanceof Element && event.target.closest(".introduction"))) paused = true;
   }, true);
   addEventListener("keydown", (event) => {
-    if (!card) return;
+    if (!card || !event.isTrusted) return;
     if (event.key === "Escape") end();
     else if (!(event.target instanceof Element && event.target.closest(".introduction"))) paused = true;
   }, true);

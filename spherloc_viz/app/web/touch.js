@@ -6,7 +6,7 @@
 // new link with data-fetch leads to is downloaded.
 (() => {
   const TOUCHABLE = "[data-touch],[data-copy]", LEAST_DRAG_PX = 6, LOOK_EVERY_MS = 150, REVEAL_MS = 3000;
-  let press = null, shade = null, seen = null, revealed = null, revealUntil = 0;
+  let press = null, shade = null, seen = null, revealed = null, revealUntil = 0, front = "";
   const fetched = new Set();
 
   function found(event) {
@@ -35,6 +35,20 @@
     seen = names;
     const nowhere = { left: 0, top: 0, width: 1, height: 1 };
     tell(`views:${names}`, nowhere, { clientX: 0, clientY: 0, shiftKey: false }, { x: 0, y: 0 });
+  }
+
+  // Brings the tab to the front that goes with the step, unless a person has left the one that went with the last.
+  function followStep() {
+    const wanted = document.querySelector("[data-front]")?.dataset.front ?? "", views = (seen ?? "").split(",");
+    if (!wanted || wanted === front || seen === null) return;
+    if (front === "" || views.includes(front)) {
+      if (!views.includes(wanted)) {
+        const tab = [...document.querySelectorAll("[role=tab]")].find((one) => one.textContent.trim() === wanted);
+        // Tabs can be dragged, so that a click does nothing; Enter is what their own keys know.
+        tab?.dispatchEvent(new KeyboardEvent("keydown", { key: "Enter", bubbles: true, cancelable: true }));
+      }
+    }
+    front = wanted;
   }
 
   function reveal() {
@@ -129,12 +143,18 @@
 
   addEventListener("pointercancel", end, true);
 
+  // Who has chosen from a list goes on with keys, which must not be written into its box.
+  addEventListener("click", (event) => {
+    if (!(event.target instanceof Element) || !event.target.closest("[role=option]")) return;
+    setTimeout(() => { if (document.activeElement instanceof HTMLInputElement) document.activeElement.blur(); }, 50);
+  }, true);
+
   // What our other scripts on the page have to tell.
   addEventListener("spherloc-touch", ({ detail }) => {
     const nowhere = { left: 0, top: 0, width: 1, height: 1 };
     tell(detail, nowhere, { clientX: 0, clientY: 0 }, { x: 0, y: 0 });
   });
-  setInterval(() => { look(); reveal(); fetchFiles(); }, LOOK_EVERY_MS);
+  setInterval(() => { look(); followStep(); reveal(); fetchFiles(); }, LOOK_EVERY_MS);
 
   addEventListener("keydown", (event) => {
     const writing = event.target instanceof Element

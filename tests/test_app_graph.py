@@ -1,0 +1,125 @@
+"""The graph: its nodes and edges are the run's own, they stay where they are, and a clique is a block of the matrix."""
+
+import base64
+import re
+from xml.etree import ElementTree
+
+import cv2
+import numpy as np
+import pytest
+from recording_samples import scene_problem
+
+from spherloc.bounds import bounds_of
+from spherloc.consensus.yaw_arcs import yaw_arcs
+from spherloc.estimators import estimate
+from spherloc.trace import ConsensusStage, Trace, TranslationStage
+from spherloc_viz import style
+from spherloc_viz.app.plots.graph_drawing import MOST_EDGES, cell_nodes, edges_of, matrix_png
+from spherloc_viz.app.plots.graph_view import graph_html
+from spherloc_viz.layers import graph_begins, paint, steps
+from spherloc_viz.layers.graph import MOST_NODES, ball_nodes
+from spherloc_viz.layers.primitives import Graph
+
+
+@pytest.fixture(scope="module")
+def mc() -> Trace:
+    return estimate(scene_problem("mei_outliers_80"), "mc")
+
+
+@pytest.fixture(scope="module")
+def exact() -> Trace:
+    return estimate(scene_problem("mei_outliers_80"), "mc-exact")
+
+
+def graphs(trace: Trace) -> dict[str, Graph]:
+    found = {stop.key: paint(trace, index).graph for index, stop in enumerate(steps(trace))}
+    return {key: graph for key, graph in found.items() if graph is not None}
+
+
+def test_the_graph_grows_and_its_nodes_stay(mc: Trace) -> None:
+    found = graphs(mc)
+    assert next(iter(found)) == graph_begins(mc) == "balls-pair" and "outcome" in found
+    assert len({id(graph.nodes) for graph in found.values()}) == 1, "one layout a run"
+    counts = [int(graph.shown.sum()) for graph in found.values()]
+    assert counts[0] == 1 and counts == sorted(counts)
+    stage = mc.stage(TranslationStage)
+    assert stage is not None and counts[-1] == len(stage.radii_m)
+    places = found["clique"].nodes.places
+    assert (np.linalg.norm(places, axis=1) <= 1.0).all() and len(np.unique(places.round(6), axis=0)) == len(places)
+
+
+def test_edges_are_the_overlaps_and_the_clique_is_a_block(mc: Trace) -> None:
+    stage, graph = mc.stage(TranslationStage), graphs(mc)["clique"]
+    assert stage is not None
+    nodes = graph.nodes
+    apart = np.linalg.norm(stage.centres_m[nodes.number][:, None] - stage.centres_m[nodes.number], axis=2)
+    reach = stage.radii_m[nodes.number][:, None] + stage.radii_m[nodes.number]
+    brute = (apart <= reach + 1e-12) & ~np.eye(len(reach), dtype=bool)
+    np.testing.assert_array_equal(nodes.agrees, brute)
+    assert nodes.clique == len(stage.clique) and graph.marked.sum() == nodes.clique
+    assert set(nodes.number[: nodes.clique]) == set(stage.clique)
+    assert (nodes.agrees | np.eye(len(brute), dtype=bool))[: nodes.clique, : nodes.clique].all()
+    assert edges_of(graph).total == len(stage.edges)
+    pixels = cv2.imdecode(np.frombuffer(base64.b64decode(matrix_png(graph)), np.uint8), cv2.IMREAD_UNCHANGED)
+    gold = (pixels[..., :3] == np.array(style.CLIQUE[::-1])).all(axis=2)
+    assert gold[: nodes.clique, : nodes.clique].all() and gold.sum() == nodes.clique**2
+
+
+def test_matches_that_agree_have_an_arc_over_the_yaw(exact: Trace) -> None:
+    stage, graph = exact.stage(ConsensusStage), graphs(exact)["consensus-clique"]
+    assert stage is not None
+    aligned, nodes = exact.problem.aligned, graph.nodes
+    pairs, lo, hi = yaw_arcs(aligned, bounds_of(aligned, exact.options.bound_px).radians)
+    over = (lo <= stage.yaw_rad) & (stage.yaw_rad <= hi) | (stage.yaw_rad + 2 * np.pi <= hi)
+    place = np.argsort(np.searchsorted(aligned.index, nodes.matches[:, 0]))
+    for a, b in pairs[over]:
+        assert nodes.agrees[place[a], place[b]]
+    assert set(nodes.matches[: nodes.clique, 0]) == set(stage.clique.tolist())
+
+
+def test_a_match_a_ball_and_a_node_light_up_together(mc: Trace) -> None:
+    graph = graphs(mc)["clique"]
+    pair = tuple(graph.nodes.matches[5].tolist())
+    assert 5 in graph.nodes.lit(pair) and all(set(graph.nodes.matches[k]) == set(pair) for k in graph.nodes.lit(pair))
+    with_one = graph.nodes.lit(pair[:1])
+    assert len(with_one) > 1 and all(pair[0] in graph.nodes.matches[k] for k in with_one)
+    assert not len(graph.nodes.lit(()))
+    kept = np.arange(len(mc.problem)) + 1000
+    html = graph_html(graph, pair, kept)
+    assert f'data-touch="select:{pair[0] + 1000},{pair[1] + 1000}"' in html
+    assert (
+        style.css(style.SELECTED) in html
+        and style.css(style.SELECTED) not in graph_html(graph, (), kept).split("<image")[1]
+    )
+    cell = (5.5 / len(graph.shown), 7.5 / len(graph.shown))
+    assert cell_nodes(graph, *cell).tolist() == [5, 7]
+    assert (
+        cell_nodes(graphs(mc)["balls-pair"], 0.99, 0.0).tolist()
+        == np.flatnonzero(graphs(mc)["balls-pair"].shown).tolist()
+    )
+
+
+def test_drawings_are_small_and_well_formed(mc: Trace, exact: Trace) -> None:
+    for trace in (mc, exact):
+        for key, graph in graphs(trace).items():
+            edges, html = edges_of(graph), graph_html(graph, (0,), np.arange(len(trace.problem)))
+            assert max(len(edges.marked), len(edges.others)) <= MOST_EDGES and len(html) < 60_000, key
+            assert ElementTree.fromstring(html).tag == "div"
+            assert len(re.findall("<circle", html)) == graph.shown.sum()
+
+
+def test_more_nodes_are_thinned_evenly(mc: Trace) -> None:
+    stage = mc.stage(TranslationStage)
+    assert stage is not None
+    rng = np.random.default_rng(4)
+    count = 900
+    centres, radii = rng.normal(size=(count, 3)), rng.uniform(0.1, 0.4, count)
+    apart = np.linalg.norm(centres[:, None] - centres, axis=2) <= radii[:, None] + radii
+    edges = np.argwhere(np.triu(apart, 1)).astype(np.int32)
+    pairs = np.column_stack([np.arange(count), np.arange(count) + 1]).astype(np.int32)
+    large = TranslationStage(**{**vars(stage), "pairs": pairs, "centres_m": centres, "radii_m": radii, "edges": edges})
+    nodes = ball_nodes(large)
+    assert len(nodes.number) == MOST_NODES == len(set(nodes.number.tolist())) and nodes.total == count
+    np.testing.assert_array_equal(
+        nodes.agrees, apart[np.ix_(nodes.number, nodes.number)] & ~np.eye(MOST_NODES, dtype=bool)
+    )
