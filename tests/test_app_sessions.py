@@ -159,6 +159,17 @@ def test_steps_can_be_walked_while_a_run_is_solved(house: House, monkeypatch: py
     assert session._face.story.steps._choice.value.endswith("Refinement"), "the stage is kept"
 
 
+def test_while_another_scene_opens_nothing_stands_under_its_name(house: House) -> None:
+    _, session = house.visit()
+    story = session._face.story
+    shown = story._summary.content
+    story.begin_opening("<elsewhere>")
+    until(lambda: "Opening &lt;elsewhere&gt;" in story._summary.content)
+    assert "opacity:.35" in story._outcome.content and shown not in story._summary.content
+    story.end_opening()
+    until(lambda: story._summary.content == shown and "opacity:.35" not in story._outcome.content)
+
+
 def test_stepping_solves_nothing(house: House, monkeypatch: pytest.MonkeyPatch) -> None:
     page, session = house.visit()
     monkeypatch.setattr(session_module, "estimate", lambda *_: pytest.fail("solved again"))

@@ -110,7 +110,7 @@ class Face:
             self.story.draw(run, told, pause is not None, outcome_table(trace), selected)
             waiting = status_html("Diagnosing …")
             self.story.diagnose(waiting if diagnosis is None else diagnosis_html(diagnosis, whole=last))
-            self.card.draw(trace, selected, run.kept, rival)
+            self.card.draw(trace, selected, run.kept, rival, self.canvas.clicked_left)
         self._client.flush()
         return self.canvas.check() if pause is None else pause
 

@@ -185,6 +185,19 @@ class Session:
         """The solver thread's job: solve what the page asks for now, or record what it has settled on."""
         if not asked:
             return self._settle()
+        try:
+            return self._solve_newest()
+        except Cancelled:
+            if self._controls.slow.stopped:
+                self._status.say("Cancelled; the page still shows the run before.")
+            self._face.story.end_opening()
+            return None
+        except Exception:
+            self._face.story.end_opening()
+            raise
+
+    def _solve_newest(self) -> float | None:
+        """Solve what the page asks for now, if that is not shown. Raises ``Cancelled`` if that was ended."""
         number, gesture = self._changes.moment(), self._changes.gesture
         wish = self._wish()
         self._history.note(wish, time.monotonic(), gesture)
@@ -193,10 +206,6 @@ class Session:
             watch = self._controls.slow.begin()
             try:
                 trace = estimate(problem, wish.estimator, wish.options, wish.scene.seed, watch)
-            except Cancelled:
-                if self._controls.slow.stopped:
-                    self._status.say("Cancelled; the page still shows the run before.")
-                return None
             finally:
                 self._controls.slow.end()
             self._run, self._answers = Run(wish, trace, _kept(wish, problem)), number
@@ -209,12 +218,29 @@ class Session:
         return QUIET_S
 
     def _problem(self, wish: SceneWish) -> Problem:
-        """The problem that the page asks for; of images, with word of how far they are."""
+        """The problem that the page asks for; of images, with word of how far they are.
+
+        Raises ``Cancelled`` if a person ends it while the map is described.
+        """
         scene = self._catalog.map_scene(wish.scene)
-        if scene is not None:
-            scene.prepare(lambda done, count: self._status.say(f"Describing the map: {done} of {count} images …"))
+        if scene is None:
+            return self._catalog.problem(wish)
+        if self._run is not None and wish.scene != self._run.wish.scene.scene:
+            self._face.story.begin_opening(wish.scene)
+        watch = self._controls.slow.begin(lasting=True)
+        try:
+            watch.begin("map", 1.0)
+
+            def report(done: int, count: int) -> None:
+                self._status.say(f"Describing the map: {done} of {count} images …")
+                watch.expect(count)
+                watch.reach(done)
+
+            scene.prepare(report)
             self._status.say("Reading and matching images …")
-        return self._catalog.problem(wish)
+            return self._catalog.problem(wish)
+        finally:
+            self._controls.slow.end()
 
     def _settle(self) -> float | None:
         """Record the page's run; returns seconds to the next attempt if that must wait."""

@@ -15,7 +15,7 @@ from spherloc_viz.app.plots.charts import ChartPanel
 from spherloc_viz.app.plots.graph_view import GraphView
 from spherloc_viz.app.plots.residual_view import ResidualView
 from spherloc_viz.app.plots.yaw_view import YawView
-from spherloc_viz.app.text import legend_html, summary_html, table_html
+from spherloc_viz.app.text import legend_html, opening_html, summary_html, table_html
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.wish import Run
 from spherloc_viz.layers import graph_begins, steps
@@ -44,6 +44,7 @@ class Story:
             self._outcome = gui.add_html("")
             self._introduction, self._front = gui.add_html(""), gui.add_html("")
         Glossary(gui, touches)
+        self._opening = ""
         self._seen, self._changed = frozenset({"Yaw"}), changed
         touches.on("views", self._see)
         with _view(gui, views, "Yaw"):
@@ -81,16 +82,28 @@ class Story:
             self._images.draw(run.trace, picture, selected, kept)
         if "Matches" in seen:
             self._matches.draw(run.trace, selected, kept)
+        summary, ending = summary_html(run.trace), table_html(outcome)
+        if self._opening == run.wish.scene.scene:
+            self._opening = ""
+        elif self._opening:
+            summary, ending = opening_html(self._opening), f'<div style="opacity:.35">{ending}</div>'
         front = front_html(picture.step.stage, picture.step.key)
-        for widget, html in (
-            (self._front, front),
-            (self._summary, summary_html(run.trace)),
-            (self._outcome, table_html(outcome)),
-        ):
+        for widget, html in ((self._front, front), (self._summary, summary), (self._outcome, ending)):
             if widget.content != html:
                 widget.content = html
         if not self._introduction.content:
             self._introduction.content = introduction_html(steps(run.trace))
+
+    def begin_opening(self, label: str) -> None:
+        """Until a run of the scene of this label is shown, say that what is shown is of the scene before."""
+        self._opening = label
+        self._changed(None)
+
+    def end_opening(self) -> None:
+        """The scene before stays."""
+        if self._opening:
+            self._opening = ""
+            self._changed(None)
 
     def _see(self, touch: Touch) -> None:
         """Other tabs are open now."""

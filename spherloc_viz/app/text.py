@@ -76,6 +76,12 @@ def diagnosis_html(diagnosis: Diagnosis, whole: bool) -> str:
     return box("".join(parts))
 
 
+def opening_html(label: str) -> str:
+    """In place of a run's summary, while another scene is opened."""
+    words = f"<b>Opening {escape(label)} …</b> What is shown is still the scene before."
+    return box(words, "font-size:12.5px;padding-top:.2em")
+
+
 def summary_html(trace: Trace) -> str:
     """A run in one line: verdict, errors, inliers and time."""
     metrics = evaluate(trace)

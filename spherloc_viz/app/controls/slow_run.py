@@ -23,7 +23,7 @@ class SlowRun:
         self._lock = threading.Lock()
         self._watch: Watch | None = None
         self._outdated = False
-        self._stopped = False
+        self._stopped = self._lasting = False
         self._clock = Newest(name, self._tick)
 
     def start(self) -> None:
@@ -37,10 +37,10 @@ class SlowRun:
             if self._watch is not None:
                 self._watch.cancel()
 
-    def begin(self) -> Watch:
-        """A run begins; what it must look at."""
+    def begin(self, lasting: bool = False) -> Watch:
+        """A run begins; what it must look at. One that is ``lasting`` does not give way to what is asked for later."""
         with self._lock:
-            self._watch, self._outdated, self._stopped = Watch(), False, False
+            self._watch, self._outdated, self._stopped, self._lasting = Watch(), False, False, lasting
             watch = self._watch
         self._clock.ask()
         return watch
@@ -72,7 +72,7 @@ class SlowRun:
             watch = self._watch
         slow = watch is not None and not asked
         if watch is not None and slow:
-            if self._outdated:
+            if self._outdated and not self._lasting:
                 watch.cancel()
             self._bar.value = 100.0 * watch.fraction
         if self._bar.visible != slow and (slow or watch is None):

@@ -80,6 +80,11 @@ class Canvas:
             return frozenset()
         return frozenset() if picture is None else views.before_the_eyes(picture, position)
 
+    @property
+    def clicked_left(self) -> bool:
+        """Whether the canvas was clicked last in its left half."""
+        return self._painter.clicked_x < 0.5
+
     def check(self) -> float | None:
         """Seconds to the next look at whether the page dropped its first view; None once it has had time enough."""
         self._checks += 1

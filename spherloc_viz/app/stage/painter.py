@@ -41,6 +41,8 @@ class Painter:
         self._names: frozenset[str] = frozenset()
         self.hidden: frozenset[str] = frozenset()
         """Nodes that are left out of what is shown."""
+        self.clicked_x = 0.5
+        """Where the canvas was clicked last: share of its width."""
         self._backdrop: tuple[bytes, Any] | None = None
         if on_pick is not None:
             scene, extend = client.scene, partial(self._clicked, on_pick, True)
@@ -116,6 +118,7 @@ class Painter:
         return known[1]
 
     def _clicked(self, on_pick: OnPick, extend: bool, event: viser.SceneClickEvent) -> None:
+        self.clicked_x = float(event.screen_pos[0])
         viewer = viewer_of(event.client.camera)
         origin, direction = np.array(event.ray_origin), np.array(event.ray_direction)
         on_pick(nearest(self._shown, origin, direction, viewer.radians_per_pixel), extend)
