@@ -142,8 +142,8 @@ class LocalCrew:
         except OSError as error:
             self._lifeline.close()
             raise InputError(
-                f"the worker processes cannot be started ({reason(error)}); see whether /dev/shm can be written, how "
-                "many processes are allowed."
+                f"the worker processes cannot be started ({reason(error)}); see whether /dev/shm can be written and "
+                "how many processes are allowed."
             ) from None
 
     def _replace(self) -> None:
