@@ -16,6 +16,7 @@ from spherloc.diagnosis import diagnose
 from spherloc.errors import RecordingError
 from spherloc.estimators import estimate
 from spherloc.trace import Stage, Trace
+from spherloc_viz.recording.content import writer
 from spherloc_viz.recording.content.reader import read_recording
 from spherloc_viz.recording.content.writer import write_recording
 from spherloc_viz.recording.index.query import RunQuery
@@ -97,7 +98,9 @@ def test_names_of_files_are_safe_and_unique(trace: Trace, tmp_path: Path, name: 
         assert read_recording(keeper.record(run)).problem.name == name
 
 
-def test_every_run_that_cannot_be_written_is_told(trace: Trace, tmp_path: Path) -> None:
+def test_every_run_that_cannot_be_written_is_told(
+    trace: Trace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     errors, notices, folder = Told(), Told(), tmp_path / "recordings"
     folder.write_text("in the way")
     ends: list[RecordingError | None] = []
@@ -113,8 +116,15 @@ def test_every_run_that_cannot_be_written_is_told(trace: Trace, tmp_path: Path) 
         assert ends[3:] == [None], "it is told when the file is there"
         assert notices == ["Runs are recorded again; 3 were not."] and read_recording(path).seed == trace.seed
         unknown = recorder.submit(replace(trace, stages=(Unknown(),)))
+        until(lambda: not recorder.waiting)
+        assert len(errors) == 3 and unknown.is_file(), "a stage that has no drawing is recorded too"
+        with monkeypatch.context() as patch:
+            patch.setattr(writer, "thumbnail", lambda trace: 1 / 0)  # a bug in drawing
+            recorder.submit(trace)
+            until(lambda: not recorder.waiting)
         last = recorder.submit(trace)
-    assert len(errors) == 3 and len(notices) == 1, "a stage that has no drawing is recorded too"
+    assert len(errors) == 4 and "ZeroDivisionError" in errors[3] and "cannot be recorded" in errors[3]
+    assert notices[1:] == ["Runs are recorded again; 1 was not."]
     assert sorted(folder.glob("*.rrd")) == sorted([path, unknown, last]) and not list(folder.glob("*.part"))
 
 
