@@ -57,7 +57,7 @@ def conclude(
         plain, reach = refined_path(aligned, start, bounds, options)
         if not kept and reach == np.inf:
             # Too few for a tilt: there is nothing to choose from.
-            return record(aligned, plain, bounds.pixels, options)
+            return record(aligned, plain, bounds.pixels, options, measured=True)
         for path in [plain] if kept else [plain, _narrowed(data, wide, limits, start, model)]:
             path, cost = _descended(data, limits, path, model)
             if cost < least:
@@ -72,7 +72,7 @@ def conclude(
         fit = fitted_path(aligned, best[-1], limits, options)
         if len(fit) and truncated_squares(*data, limits, fit[-1].copy(), *model, np.inf) <= least + RESCUE_REACH:
             best = np.concatenate([best, fit])
-    return record(aligned, best, limits, options)
+    return record(aligned, best, limits, options, measured=True)
 
 
 def _promising(aligned: AlignedProblem, starts: Sequence[FloatArray], bounds: Bounds) -> list[FloatArray]:

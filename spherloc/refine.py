@@ -29,6 +29,7 @@ from spherloc.gauss_newton import (
 )
 from spherloc.geometry import skew
 from spherloc.narrowing import ADAPTIVE_STEPS, errors_of, fit_to_noise
+from spherloc.noise_scale import variance_factor
 from spherloc.problem import AlignedProblem
 from spherloc.ranges import check_options, is_number
 from spherloc.trace import RefinementStage
@@ -134,16 +135,26 @@ def fitted_path(
 
 
 def record(
-    aligned: AlignedProblem, path: FloatArray, limits_px: FloatArray, options: RefinementOptions
+    aligned: AlignedProblem,
+    path: FloatArray,
+    limits_px: FloatArray,
+    options: RefinementOptions,
+    measured: bool = False,
 ) -> tuple[FloatArray, BoolArray, RefinementStage]:
     """What ``refine`` returns of a path of poses (I + 1, 3, 4) between the aligned frames, whose last is the result.
 
-    Its inliers are the correspondences within ``limits_px`` (M,).
+    Its inliers are the correspondences within ``limits_px`` (M,). ``measured`` has the covariance be that of the noise
+    that the residuals show (``noise_scale``), not that of the stated noise.
     """
     data, sd = (aligned.points, aligned.pixel_from_bearing.copy()), gravity_sd_rad(aligned, options)
     inliers, costs, counts = _account(aligned.bearings, *data, limits_px, path)
     last = path[-1].copy()
-    dof, centre, steps = _step_covariance(*data, inliers, last, options.noise_px, sd, ROBUST_CODES[options.robust])
+    model = (options.noise_px, sd, ROBUST_CODES[options.robust])
+    dof, centre, steps = _step_covariance(*data, inliers, last, *model)
+    if measured and np.isfinite(steps).all():
+        factor = variance_factor(aligned, last, inliers, options.noise_px, dof)
+        model = (options.noise_px * np.sqrt(factor), sd, ROBUST_NONE)
+        dof, centre, steps = _step_covariance(*data, inliers, last, *model)
     stage = RefinementStage(
         dof=dof,
         cam_from_map=_unaligned(aligned, path),

@@ -34,6 +34,7 @@ FLOORS = (
     ("spherloc.problem", "spherloc.bounds", "spherloc.consensus"),
     (
         "spherloc.trace",
+        "spherloc.noise_scale",
         "spherloc.refine",
         "spherloc.last_step",
         "spherloc.metrics",

@@ -1,0 +1,73 @@
+"""How much larger or smaller than stated the noise of a pose is: for a covariance that holds on real matches.
+
+Least squares with residuals r_k and Jacobians J_k has the covariance (sum J' J)^-1 if the noise has unit variance and
+no two residuals are related. Matches that share a map point or a pixel are, so their scores J' r are added up first:
+with B the sum of the outer products of these sums over G groups, trace((sum J' J)^-1 B) / d estimates the variance of
+the noise times the share by which repeated matches count too often (the cluster-robust covariance as one number,
+which is steadier than the matrix where there are few matches).
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from spherloc.problem import AlignedProblem
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.int64]
+
+PRIOR_GROUPS = 10.0
+"""Groups of matches with the stated noise that are believed in beforehand."""
+SHARED_PX = 0.15
+"""Error that all matches share, px: no calibration and no map is better, however many matches there are."""
+_KEY = np.array([0.7390851332151607, 0.5671432904097838, 0.9159655941772190])
+"""A direction in which no two different points have the same coordinate, for practical purposes."""
+
+
+def variance_factor(
+    aligned: AlignedProblem, cam_from_map: FloatArray, inliers: BoolArray, noise_px: float, dof: int
+) -> float:
+    """By what the covariance for a noise of ``noise_px`` must be multiplied at an aligned pose (3, 4).
+
+    ``inliers`` (M,) are what was fitted, with ``dof`` degrees of freedom. 1 where they are too few to tell.
+    """
+    if np.count_nonzero(inliers) <= dof:
+        return 1.0
+    points, weights = aligned.points[inliers], aligned.pixel_from_bearing[inliers]
+    ray = points @ cam_from_map[:, :3].T + cam_from_map[:, 3]
+    length = np.linalg.norm(ray, axis=1)[:, None]
+    ray = ray / length
+    residual = np.einsum("nij,nj->ni", weights, ray) / noise_px
+    by_ray = (weights - residual[:, :, None] * noise_px * ray[:, None, :]) / noise_px
+    # A turn moves the ray by w x ray, whatever the distance; a shift by d / length.
+    by_turn = np.cross(ray[:, None, :], by_ray)
+    jacobian = np.concatenate([by_turn, by_ray / length[..., None]], axis=2)
+    if dof == 4:
+        jacobian = jacobian[:, :, [1, 3, 4, 5]]
+    scale = 1.0 / np.maximum(np.sqrt(np.einsum("nia,nia->a", jacobian, jacobian)), 1e-300)
+    jacobian = jacobian * scale
+    groups = _groups(points, aligned.bearings[inliers])
+    count = int(groups.max()) + 1
+    scores = np.zeros((count, dof))
+    np.add.at(scores, groups, np.einsum("nia,ni->na", jacobian, residual))
+    information = np.einsum("nia,nib->ab", jacobian, jacobian) + 1e-12 * np.eye(dof)
+    factor = np.trace(np.linalg.solve(information, scores.T @ scores)) / dof
+    # The pose takes half of its freedom from each row of a residual.
+    factor *= count / max(count - 0.5 * dof, 1.0)
+    factor = (PRIOR_GROUPS + count * factor) / (PRIOR_GROUPS + count)
+    shared = (SHARED_PX / noise_px) ** 2 * np.count_nonzero(inliers) / dof
+    return float(factor + shared)
+
+
+def _groups(points: FloatArray, bearings: FloatArray) -> IntArray:
+    """(K,) number of each match's group: those with the same point, or the same bearing, are together."""
+    by_point = np.unique(points @ _KEY, return_inverse=True)[1]
+    by_bearing = np.unique(bearings @ _KEY, return_inverse=True)[1]
+    count = len(points)
+    if by_point.max() == count - 1 and by_bearing.max() == count - 1:
+        return np.arange(count)
+    shape = (int(by_point.max()) + int(by_bearing.max()) + 2,) * 2
+    edges = coo_array((np.ones(count), (by_point, by_point.max() + 1 + by_bearing)), shape=shape)
+    return connected_components(edges, directed=False)[1][by_point].astype(np.int64)
