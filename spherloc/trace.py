@@ -138,6 +138,28 @@ class ConsensusStage(Stage):
 
 
 @dataclass(frozen=True, eq=False)
+class PositionStage(Stage):
+    """The search over camera positions: boxes that could hold a better pose than the best one, and so were split.
+
+    B boxes, by level; corners in the gravity-aligned map frame.
+    """
+
+    kind = "positions"
+    boxes_m: NDArray[np.float32]
+    """(B, 2, 3) lower and upper corners, metres. Of a level with many boxes those that might explain most."""
+    level: IndexArray
+    """(B,) how often the first box, which holds the map, was halved to get each; ascending."""
+    bound: IndexArray
+    """(B,) no camera in that box explains more, at any yaw and any tilt within the gravity bound."""
+    left: IndexArray
+    """(B,) boxes of the same level that were split."""
+    support: int
+    """What the best pose explains."""
+    upper_bound: int
+    """What no pose explains more than, after the search."""
+
+
+@dataclass(frozen=True, eq=False)
 class DecisionStage(Stage):
     """Which estimator was chosen for this problem, and why."""
 

@@ -43,6 +43,7 @@ LAYERS: tuple[str, ...] = (
     "yaw ring",
     "balls",
     "pairs",
+    "boxes",
     "selection",
     "scale bar",
 )

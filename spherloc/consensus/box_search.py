@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from spherloc.consensus.pair_arcs import CIRCLE, direction_of_turn
 from spherloc.consensus.pose_cells import has_tilt, place_cell
-from spherloc.consensus.pose_search import BEST, CELL_EFFORT, CELLS, EFFORT, HALT, put_off, search_poses
+from spherloc.consensus.pose_search import BEST, CELL_EFFORT, CELLS, EFFORT, HALT, SPLITS, put_off, search_poses
 from spherloc.consensus.stabbing import EVERYWHERE, deepest, keep_possible
 from spherloc.watch import stopped
 
@@ -29,6 +29,22 @@ class Boxes(NamedTuple):
     """(MOST_BOXES, 4): where its matches begin and end in ``lists``, its chart, its bound."""
     lists: NDArray[np.int32]
     """Matches that waiting boxes may explain."""
+
+
+class Splits(NamedTuple):
+    """Boxes that had to be split, ``state[SPLITS]`` of them, for the picture; later ones are not kept."""
+
+    lower: FloatArray
+    """(K, 3)."""
+    upper: FloatArray
+    """(K, 3)."""
+    about: NDArray[np.int32]
+    """(K, 2): chart and bound."""
+
+
+def splits_for(count: int) -> Splits:
+    """Room for so many boxes."""
+    return Splits(np.empty((count, 3)), np.empty((count, 3)), np.empty((count, 2), np.int32))
 
 
 def boxes_for(count: int) -> Boxes:
@@ -71,10 +87,10 @@ def _in_window(scratch, kept, count, start, end, out):
 def search_boxes(matches, tasks, yaw_bound, memory, limits, found, board):
     """Search the boxes ``tasks`` = (charts (K,), lower (K, 6), upper (K, 6), bounds (K,)) at all yaws.
 
-    ``yaw_bound`` (B,) is what is known of the bins of turn, ``memory`` is (Boxes, Scratch, Room); the others are as in
-    ``search_poses``.
+    ``yaw_bound`` (B,) is what is known of the bins of turn, ``memory`` is (Boxes, Scratch, Room, Splits); the others
+    are as in ``search_poses``.
     """
-    boxes, scratch, room = memory
+    boxes, scratch, room, splits = memory
     charts, lowers, uppers, bounds = tasks
     _, state, left = found
     count = len(matches.rows)
@@ -111,6 +127,11 @@ def search_boxes(matches, tasks, yaw_bound, memory, limits, found, board):
         bound, windows = deepest(scratch, kept, free, cutoff, yaw_bound)
         if bound <= cutoff:
             continue
+        place = state[SPLITS]
+        if place < len(splits.about):
+            splits.lower[place], splits.upper[place] = lo[waiting, :3], up[waiting, :3]
+            splits.about[place, 0], splits.about[place, 1] = chart, bound
+            state[SPLITS] = place + 1
         axis = (chart - 1) // 2 if chart > 0 else -1
         split, total = 0, 0.0
         for a in range(6):

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spherloc.consensus.box_search import MOST_BOXES, boxes_for, search_boxes
+from spherloc.consensus.box_search import MOST_BOXES, boxes_for, search_boxes, splits_for
 from spherloc.consensus.pose_cells import AXES, TILT_A, YAW, Matches, parameters_of, pose_of, whole_domain
 from spherloc.consensus.pose_search import (
     BEST,
@@ -27,6 +27,7 @@ from spherloc.consensus.pose_search import (
     LEFT,
     MOST_WAITING,
     OPEN,
+    SPLITS,
     STATE,
     Left,
     Limits,
@@ -49,6 +50,10 @@ FIRST_EFFORT = 400_000
 TASK_EFFORT, TASK_ROUNDS = 400_000, 400
 """Least effort of a task, and its effort for each match: starting one again costs a test of every match."""
 TASKS_A_ROUND = 8
+MOST_SPLITS = 2000
+"""Boxes that each task keeps for the picture, ..."""
+MOST_KEPT = 20_000
+"""... and all of them together."""
 NEAR_TURN_RAD, NEAR_SHARE, NEAR_GAP, NEAR_EFFORT = 2e-3, 4e-3, 0.01, 60
 """The cell around the first guess: half sides of its turns, rad, and of its position, of the median distance; what may
 be missed there, of all matches; tests for each match."""
@@ -66,6 +71,13 @@ class PositionSearch:
     """No pose within the gravity bound explains more."""
     effort: int
     """Matches tested."""
+    boxes_m: FloatArray
+    """(B, 2, 3) lower and upper corners, aligned map frame, of the boxes of positions that had to be split, the cube of
+    all near ones first; those far away are left out."""
+    level: NDArray[np.int32]
+    """(B,) how often the cube was halved to get each."""
+    box_bound: NDArray[np.int32]
+    """(B,) what poses in each box explain at most."""
 
     @property
     def finished(self) -> bool:
@@ -97,7 +109,7 @@ def search_positions(
         search.first(min(FIRST_EFFORT, effort))
         search.rounds(effort, deadline)
     watch.check()
-    return PositionSearch(search.pose(), search.best, search.upper(), search.effort)
+    return PositionSearch(search.pose(), search.best, search.upper(), search.effort, *search.boxes())
 
 
 def threads_to_use() -> int:
@@ -110,7 +122,7 @@ class _Worker:
     """Memory of one thread."""
 
     def __init__(self, count: int) -> None:
-        self.memory = (boxes_for(count), scratch_for(count), room_for(count))
+        self.memory = (boxes_for(count), scratch_for(count), room_for(count), splits_for(MOST_SPLITS))
         most = MOST_BOXES + MOST_WAITING + 64
         self.left = Left(np.empty((most, AXES)), np.empty((most, AXES)), np.empty((most, 3), np.int64))
         self.state = np.zeros(STATE, np.int64)
@@ -136,6 +148,8 @@ class _Search:
         self.best, self.open, self.effort = 1, 1, 0
         self.best_at: FloatArray | None = None
         self._halted = False
+        self._splits: list[tuple[FloatArray, FloatArray, NDArray[np.int32]]] = []
+        self._kept = 0
         if start is not None:
             chart, at = parameters_of(self.matches, start[0])
             self.best_at, self.best = np.array([chart, *at]), start[1]
@@ -153,6 +167,21 @@ class _Search:
     def pose(self) -> FloatArray | None:
         """The best pose (3, 4)."""
         return None if self.best_at is None else pose_of(self.matches, int(self.best_at[0]), self.best_at[1:])
+
+    def boxes(self) -> tuple[FloatArray, NDArray[np.int32], NDArray[np.int32]]:
+        """Boxes near the map that had to be split, as in ``PositionSearch``: those that could hold a better pose than
+        the best one, each once, by level."""
+        if not self._splits:
+            return np.empty((0, 2, 3)), np.empty(0, np.int32), np.empty(0, np.int32)
+        lower, upper, about = (np.concatenate(parts) for parts in zip(*self._splits, strict=True))
+        near = (about[:, 0] == 0) & (about[:, 1] > self.best)
+        corners, bound = np.stack([lower, upper], axis=1)[near], about[near, 1]
+        level = np.round(np.log2(2.0 / (corners[:, 1] - corners[:, 0])).sum(axis=1)).astype(np.int32)
+        # One position may be in several boxes, of other tilts: the largest bound counts.
+        order = np.lexsort((-bound, *corners.reshape(-1, 6).T, level))
+        _, first = np.unique(corners[order], axis=0, return_index=True)
+        order = order[np.sort(first)]
+        return self.matches.middle + self.matches.scale * corners[order], level[order], bound[order]
 
     def upper(self) -> int:
         """What is proven so far."""
@@ -262,6 +291,10 @@ class _Search:
         """Make what workers left tasks, unless it cannot explain more than the best pose."""
         lower, upper, about = [self.lower], [self.upper_ends], [self.about]
         for worker in workers:
+            many, splits = int(worker.state[SPLITS]), worker.memory[3]
+            if self._kept < MOST_KEPT:
+                self._splits.append(tuple(part[:many].copy() for part in splits))
+                self._kept += many
             many = int(worker.state[LEFT])
             lower.append(worker.left.lower[:many].copy())
             upper.append(worker.left.upper[:many].copy())

@@ -16,7 +16,7 @@ from spherloc.bounds import Bounds
 from spherloc.consensus.chance import chance_rate, chance_sets
 from spherloc.consensus.exact import ExactConsensus, exact_consensus
 from spherloc.consensus.pose_cells import Matches, matches_of
-from spherloc.consensus.positions import search_positions
+from spherloc.consensus.positions import PositionSearch, search_positions
 from spherloc.consensus.support import SAME_CONSENSUS
 from spherloc.consensus.two_point_search import TwoPointSearch, search_two_point
 from spherloc.errors import InputError
@@ -26,7 +26,7 @@ from spherloc.geometry import pose, yaw_of, yaw_rotation
 from spherloc.last_step import conclude
 from spherloc.problem import AlignedProblem
 from spherloc.refine import RefinementOptions, residuals_px
-from spherloc.trace import Certificate, ConsensusStage
+from spherloc.trace import Certificate, ConsensusStage, PositionStage, Stage
 
 FloatArray = NDArray[np.float64]
 
@@ -41,6 +41,8 @@ SEED_SAMPLES = 20_000
 LEAST_SAMPLES = 100
 SEED_CONFIDENCE = 0.99
 YAW_BINS = 1440
+MOST_LEVELS, MOST_BOXES = 12, 200
+"""Of the boxes that are kept for the picture."""
 
 
 @dataclass(frozen=True)
@@ -93,16 +95,17 @@ class ExactMaximumConsensus:
         with clock.stage("consensus"):
             found = _search(aligned, bounds, rate, guess, matches, start, options, clock)
         stage = _stage(aligned, bounds, start, found)
+        stages: tuple[Stage, ...] = (stage,) if found.positions is None else (stage, found.positions)
         if found.pose is None:
             certificate = Certificate(found.upper, 1, chance_sets(count, 1, rate))
             reason = "No pose: no pair of correspondences has a solution in front of the camera."
-            return Outcome((stage,), None, np.zeros(count, dtype=bool), reason, certificate=certificate)
+            return Outcome(stages, None, np.zeros(count, dtype=bool), reason, certificate=certificate)
         with clock.stage("refinement", until=1.0):
             starts = [found.pose, *_rivals(found.pairs), *(pose(yaw_rotation(yaw), at) for yaw, at in _poses(guess))]
             refined, inliers, refinement = conclude(aligned, starts, bounds, options)
         lower = _lower_bound(aligned, bounds, found.pose, refined, refinement.tilt_rad)
         certificate = Certificate(max(found.upper, lower), lower, chance_sets(count, lower, rate))
-        return Outcome((stage, refinement), refined, inliers, certificate=certificate)
+        return Outcome((*stages, refinement), refined, inliers, certificate=certificate)
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,6 +120,8 @@ class _Found:
     """Of the search over pairs, if it ran."""
     effort: int
     """Of both."""
+    positions: PositionStage | None = None
+    """Boxes of the search over positions, if it ran and split any."""
 
 
 def _search(
@@ -163,7 +168,29 @@ def _search(
         clock.watch,
     )
     upper = found.upper if pairs is None else min(found.upper, int(pairs.bound.max(initial=1)))
-    return _Found(found.pose, upper, pairs, effort + found.effort)
+    return _Found(found.pose, upper, pairs, effort + found.effort, _boxes(found))
+
+
+def _boxes(found: PositionSearch) -> PositionStage | None:
+    """Some levels of the search's boxes, of each those that might explain most."""
+    levels, left = np.unique(found.level, return_counts=True)
+    if not len(levels):
+        return None
+    rows, counts = [], []
+    for k in np.unique(np.linspace(0, len(levels) - 1, MOST_LEVELS).round().astype(int)):
+        mine = np.flatnonzero(found.level == levels[k])
+        mine = mine[np.argsort(-found.box_bound[mine], kind="stable")][:MOST_BOXES]
+        rows.append(mine)
+        counts.append(np.full(len(mine), left[k], np.int32))
+    chosen = np.concatenate(rows)
+    return PositionStage(
+        boxes_m=found.boxes_m[chosen].astype(np.float32),
+        level=found.level[chosen],
+        bound=found.box_bound[chosen],
+        left=np.concatenate(counts),
+        support=found.support,
+        upper_bound=found.upper,
+    )
 
 
 def _rivals(pairs: ExactConsensus | None) -> list[FloatArray]:

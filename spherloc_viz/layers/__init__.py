@@ -9,6 +9,7 @@ from typing import Any
 from spherloc.trace import (
     ConsensusStage,
     DecisionStage,
+    PositionStage,
     RansacStage,
     RefinementStage,
     Stage,
@@ -17,7 +18,18 @@ from spherloc.trace import (
     YawStage,
 )
 from spherloc_viz import style
-from spherloc_viz.layers import consensus, decision, extension, outcome, ransac, refinement, start, translation, yaw
+from spherloc_viz.layers import (
+    consensus,
+    decision,
+    extension,
+    outcome,
+    positions,
+    ransac,
+    refinement,
+    start,
+    translation,
+    yaw,
+)
 from spherloc_viz.layers.focus import focus_of
 from spherloc_viz.layers.frame import Plan, RunView
 from spherloc_viz.layers.primitives import Chart, FloatArray, Graph, Picture, Step, Stop
@@ -30,6 +42,7 @@ STAGES: dict[type[Stage], tuple[str, Callable[[RunView, Any], list[Plan]]]] = {
     YawStage: ("Yaw", yaw.plans),
     TranslationStage: ("Translation", translation.plans),
     ConsensusStage: ("Consensus", consensus.plans),
+    PositionStage: ("Positions", positions.plans),
     RefinementStage: ("Refinement", refinement.plans),
 }
 """What each kind of stage is called, and what draws it."""

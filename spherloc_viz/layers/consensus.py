@@ -75,6 +75,12 @@ def _agreement(view: RunView, stage: ConsensusStage) -> str:
             "But pairs that agree need not share one position, and no pose that was tried explains them all."
         )
     yaw, pairs = np.degrees(stage.yaw_rad), size * (size - 1) // 2
+    if not stage.arcs:
+        return (
+            f"The best pose explains {size} matches{right} at a yaw of {yaw:.2f}°"
+            f"{ring.off_truth(view, stage.yaw_rad)}. All camera positions were searched: no pose explains more than "
+            f"{most}."
+        )
     larger = "No larger set agrees at any yaw" if size >= most else f"A larger set, of up to {most}, is not excluded"
     return (
         f"The {size} matches{right} that the best pose explains agree at its yaw of {yaw:.2f}°"

@@ -60,11 +60,19 @@ def _bound(view: RunView, stage: ConsensusStage) -> Frame:
     most, best, start = highest_bound(stage), best_support(stage), view.standing(np.eye(3))
     open_share = 100.0 * np.count_nonzero(stage.bound > best) / len(stage.bound)
     left = f"{open_share:.3g} % of all yaws could hide a better one" if open_share else "no yaw could hide a better one"
+    if stage.arcs:
+        why = (
+            f"Matches that one pose explains agree in pairs at its yaw, as {stage.arcs:,} arcs tell, so the largest "
+            "set that agrees at a yaw is a bound"
+        )
+        formula = f"max over θ of ω(G(θ)) = {most},  ij ∈ G(θ) ⇔ |f_ij(θ)| ≤ τ_ij"
+    else:
+        why = "All camera positions were searched, at every yaw and every tilt that gravity allows"
+        formula = f"max over R, t of Σ 1(‖π(R p + t) − u‖ ≤ ε) ≤ {most}"
     return Frame(
-        f"Matches that one pose explains agree in pairs at its yaw, as {stage.arcs:,} arcs tell, so the largest "
-        f"set that agrees at a yaw is a bound: no pose explains more than {most} of {len(view.points)} matches. "
+        f"{why}: no pose explains more than {most} of {len(view.points)} matches. "
         f"The first guess explains {stage.seed_support} and the best pose {best}, and {left}.",
-        f"max over θ of ω(G(θ)) = {most},  ij ∈ G(θ) ⇔ |f_ij(θ)| ≤ τ_ij",
+        formula,
         start,
         view.colors(style.UNDECIDED),
         view.nobody(),
@@ -82,7 +90,8 @@ def _effort(stage: ConsensusStage) -> str:
         if stage.finished
         else "the budget ran out before every yaw was searched, so that the bound is larger than it might be."
     )
-    return f"Effort: {stage.effort:,} words of bitsets; {end}"
+    what = "words of bitsets and tests of a match" if stage.arcs else "tests of a match"
+    return f"Effort: {stage.effort:,} {what}; {end}"
 
 
 def _peak(view: RunView, stage: ConsensusStage, rank: int, place: int, peaks: int) -> Frame:
