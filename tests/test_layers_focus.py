@@ -22,6 +22,7 @@ ABOUT: tuple[tuple[str, tuple[str, ...], float], ...] = (
     (r"problem|sample-\d+|samples-drawn|consensus-poses?.*|refinement-(\d+|inliers|outliers)|refinement|outcome",
      ("map/points",), 0.5),
     (r"bearings|gravity|decision|samples-needed|consensus-guess", ("sphere/bearings",), 0.5),
+    (r"positions-\d+", ("boxes/positions",), 0.4),
     (r"match", ("pairs/ray", "sphere/bearings"), 0.5),
     (r"unknowns", ("ring/circle",), 0.5),
     (r"yaw-pair|yaw-twins", ("ring/hand", "ring/overlap", "pairs/sample"), 0.5),

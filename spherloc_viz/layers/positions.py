@@ -8,7 +8,7 @@ from spherloc.geometry import camera_centre
 from spherloc.trace import ConsensusStage, PositionStage
 from spherloc_viz import style
 from spherloc_viz.layers.frame import ColorArray, Frame, Plan, RunView, length
-from spherloc_viz.layers.primitives import FloatArray, Segments
+from spherloc_viz.layers.primitives import FloatArray, Focus, Segments
 
 EDGES = np.array([(a, a | 1 << axis) for axis in range(3) for a in range(8) if not a >> axis & 1])
 """(12, 2) corners that the edges of a box join; bit k of a corner's number says at which end of axis k it is."""
@@ -50,6 +50,7 @@ def _level(view: RunView, stage: PositionStage, level: int) -> Frame:
         note=f"Colour: from grey, one match more than the best pose, to gold, {most}.{inside}{drawn}",
         located=pose is not None,
         items=(_edges(boxes, _shades(bound, stage.support)),),
+        focus=Focus("Overview", boxes.reshape(-1, 3)),
     )
 
 
