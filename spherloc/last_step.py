@@ -27,6 +27,10 @@ from spherloc.trace import RefinementStage
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
+Data = tuple[FloatArray, FloatArray, FloatArray]
+"""Bearings, points, and the tangent planes' pixels, as the kernels of ``narrowing`` take them."""
+Model = tuple[float, float]
+"""Noise in px, and the standard deviation of gravity in rad."""
 
 MOST_STARTS = 4
 RIVAL_SHARE = 0.6
@@ -82,14 +86,14 @@ def _promising(aligned: AlignedProblem, starts: Sequence[FloatArray], bounds: Bo
     return [start for k, (start, count) in enumerate(zip(starts, counts, strict=False)) if k == 0 or count >= enough]
 
 
-def _narrowed(data, wide, limits, start: FloatArray, model) -> FloatArray:
+def _narrowed(data: Data, wide: FloatArray, limits: FloatArray, start: FloatArray, model: Model) -> FloatArray:
     path = np.empty((1 + len(NARROWINGS), 3, 4))
     path[0] = start
     narrow(*data, wide, limits, path[0].copy(), *model, path[1:])
     return path
 
 
-def _descended(data, limits, path: FloatArray, model) -> tuple[FloatArray, float]:
+def _descended(data: Data, limits: FloatArray, path: FloatArray, model: Model) -> tuple[FloatArray, float]:
     """The path (I, 3, 4) and how it goes on downhill, and the truncated squares of its end."""
     more, at = np.empty((MOST_DESCENTS, 3, 4)), path[-1].copy()
     states, cost = descend(*data, limits, at, *model, more)

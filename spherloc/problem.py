@@ -284,7 +284,7 @@ def _scalar(problem: Problem, name: str, least: float, most: float, advice: str)
     if value is None and name != "gravity_bound_rad":
         return
     try:
-        number = float(value) if is_number(value) else np.nan
+        number = float(value) if value is not None and is_number(value) else np.nan
     except OverflowError:  # an integer beyond all floats
         number = np.nan
     if not least <= number <= most:

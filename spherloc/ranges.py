@@ -43,5 +43,5 @@ def is_number(value: Any) -> bool:
 
 def check_seed(seed: Any) -> None:
     """Raise ``InputError`` for what is no whole number from 0 to ``MOST_SEED``."""
-    if isinstance(seed, bool) or not isinstance(seed, Integral) or not 0 <= seed <= MOST_SEED:
+    if isinstance(seed, bool) or not isinstance(seed, Integral) or not 0 <= int(seed) <= MOST_SEED:
         raise InputError(f"seed is {show(seed)}; give a whole number from 0 to 2^63 - 1.")

@@ -6,7 +6,7 @@ import os
 import sys
 from itertools import chain
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 from tyro.conf import Positional, arg
@@ -314,7 +314,7 @@ def main() -> None:
             stream.reconfigure(errors="backslashreplace")
     try:
         refuse_repeated(sys.argv[1:], (run, localize, sweep, play, scenes, *_OTHERS))
-        code: object = app.cli(
+        code: Any = app.cli(
             prog="spherloc",
             description="See why visual localization with fisheye and 360-degree cameras succeeds or fails.",
             sort_subcommands=False,
@@ -342,11 +342,13 @@ def main() -> None:
 
 def _flush() -> None:
     """Raises ``OSError`` where the output cannot take it, after which Python does not try again at its end."""
+    output = sys.stdout
+    if output is None:
+        return
     try:
-        if sys.stdout is not None:
-            sys.stdout.flush()
+        output.flush()
     except OSError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        os.dup2(os.open(os.devnull, os.O_WRONLY), output.fileno())
         raise
 
 

@@ -293,7 +293,8 @@ class _Search:
         for worker in workers:
             many, splits = int(worker.state[SPLITS]), worker.memory[3]
             if self._kept < MOST_KEPT:
-                self._splits.append(tuple(part[:many].copy() for part in splits))
+                left_ends, right_ends, bounds = splits
+                self._splits.append((left_ends[:many].copy(), right_ends[:many].copy(), bounds[:many].copy()))
                 self._kept += many
             many = int(worker.state[LEFT])
             lower.append(worker.left.lower[:many].copy())

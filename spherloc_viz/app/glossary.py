@@ -2,6 +2,7 @@
 
 import re
 from html import escape
+from typing import Any
 
 import viser
 
@@ -77,7 +78,8 @@ class Glossary:
 
     def __init__(self, gui: viser.GuiApi, touches: Touches) -> None:
         self._gui = gui
-        self._open: viser.GuiModalHandle | None = None
+        self._open: Any = None
+        """viser's window, whose type it does not export; None before the first."""
         touches.on(DEFINE, self._define)
 
     def _define(self, touch: Touch) -> None:

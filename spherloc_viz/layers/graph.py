@@ -38,7 +38,9 @@ def ball_nodes(stage: TranslationStage) -> Nodes:
         np.median(stage.centres_m[stage.clique], axis=0) if len(stage.clique) else np.median(stage.centres_m, axis=0)
     )
     offsets = stage.centres_m[chosen] - middle
-    return _nodes("ball", chosen, total, offsets, stage.pairs[chosen].astype(np.int64), agrees, stage.clique)
+    return _nodes(
+        "ball", chosen, total, offsets, stage.pairs[chosen].astype(np.int64), agrees, stage.clique.astype(np.int64)
+    )
 
 
 def match_nodes(view: RunView, stage: ConsensusStage) -> Nodes:

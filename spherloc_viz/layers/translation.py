@@ -61,7 +61,7 @@ def plans(view: RunView, stage: TranslationStage) -> list[Plan]:
             "clique",
             "The maximum clique of balls",
             lambda: _clique(view, balls),
-            graph=partial(graph, None, stage.clique, words),
+            graph=partial(graph, None, stage.clique.astype(np.int64), words),
         )
     )
     return out
