@@ -249,6 +249,9 @@ def drag(tab: Playground, handle: str) -> None:
 
 
 def test_the_true_camera_can_be_dragged(tab: Playground, address: str) -> None:
+    tab.slide("Timeline", "End")
+    expect(tab.step).to_have_value(at(title="Outcome"))
+    tab.press("Overview")
     tab.settle()
     place = tab.value("camera position").inner_text()
     assert not (tab.node("/true camera level") or {"visible": True})["visible"]
