@@ -117,7 +117,7 @@ class Impatient(Watch):
 def test_cancelled_in_a_stage(scene_of, estimator, stage, outlier_rate):
     """No later stage begins, and kernels that are told to stop at once leave nothing that breaks what follows."""
     watch = Impatient(stage)
-    problem = scene_of("panorama", correspondences=300, outlier_rate=outlier_rate).problem()
+    problem = scene_of("panorama", correspondences=200, outlier_rate=outlier_rate).problem()
     with pytest.raises(Cancelled):
         estimate(problem, estimator, watch=watch)
     assert watch.stage == stage and watch.fraction < 1.0
