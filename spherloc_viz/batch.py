@@ -16,6 +16,7 @@ from spherloc.diagnosis import Diagnosis, diagnose
 from spherloc.errors import InputError, RecordingError, SpherlocError
 from spherloc.estimators import default_options, options_type, warm_up
 from spherloc.metrics import evaluate
+from spherloc.outcome import Outcome, judge
 from spherloc.problem import Problem
 from spherloc.trace import Trace
 from spherloc_viz.layers.certificate import chance, proof, warning
@@ -179,7 +180,7 @@ def _report(error: SpherlocError) -> int:
 
 def _finish(path: Path, trace: Trace, origin: Origin | None, as_json: bool, keeper: "Keeper | None") -> int:
     """Record and print one run; returns its exit code."""
-    code = 0 if trace.cam_from_map is not None else 1
+    code = 0 if judge(trace).outcome is Outcome.LOCALIZED else 1
     recording, diagnosis = None, diagnose(trace)
     if keeper is not None:
         try:
@@ -196,6 +197,7 @@ def _finish(path: Path, trace: Trace, origin: Origin | None, as_json: bool, keep
 def as_record(path: Path, trace: Trace, diagnosis: Diagnosis, recording: Path | None) -> dict[str, Any]:
     """A run as what ``json_text`` writes."""
     pose, certificate = trace.cam_from_map, trace.certificate
+    judged = judge(trace)
     proven = {} if certificate is None else {"gap": certificate.gap, "proven": certificate.proven}
     return {
         "scene": str(path),
@@ -209,6 +211,8 @@ def as_record(path: Path, trace: Trace, diagnosis: Diagnosis, recording: Path | 
         "time_ms": trace.timings_ms["total"],
         **asdict(evaluate(trace)),
         "message": trace.message,
+        "outcome": judged.outcome,
+        "doubts": judged.reasons if pose is not None else (),
         "certificate": None if certificate is None else asdict(certificate) | proven,
         "diagnosis": asdict(diagnosis),
         "recording": None if recording is None else str(recording),
@@ -230,6 +234,9 @@ def as_text(path: Path, trace: Trace, diagnosis: Diagnosis, recording: Path | No
         f"  {np.count_nonzero(trace.inlier_mask)} of {len(trace.problem)} correspondences are inliers, "
         f"{trace.timings_ms['total']:.1f} ms"
     )
+    judged = judge(trace)
+    if judged.outcome is Outcome.DOUBTFUL:
+        lines.append(f"  doubtful: {' '.join(judged.reasons)}")
     if metrics.rotation_error_deg is not None and metrics.translation_error_m is not None:
         verdict = "success" if metrics.success else "failure"
         lines.append(

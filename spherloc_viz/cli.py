@@ -50,8 +50,8 @@ def run(
     """Solve localization problems and record each run.
 
     Prints pose, inliers and time of every scene; where the truth is known, the errors; what is proven; and what is
-    wrong with a run that failed or is doubtful. Ends with 0 if every scene has a pose, 1 if one has none, 2 if an
-    input is wrong.
+    wrong with a run that failed or is doubtful. Ends with 0 if every scene is localized, 1 if one is doubtful or
+    has no pose, 2 if an input is wrong.
 
     For example:
 
@@ -112,7 +112,8 @@ def localize(
     Every finished query is safe in the output folder at once: stop it when you like, the same command goes on. The
     folder gets results.csv and results.jsonl (a row a query), trajectory.tum and truth.tum (camera poses in the map),
     trajectory.png (coloured by error), summary.json (success rates at the scene's limits), configuration.json, and
-    a recording of each query. Ends with 0 if every query has a pose, 1 if one has none, 2 if an input is wrong.
+    a recording of each query. Ends with 0 if every query is localized, 1 if one is doubtful or has no pose, 2 if an
+    input is wrong.
 
     For example:
 

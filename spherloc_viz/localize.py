@@ -18,7 +18,7 @@ from spherloc.experiments.results import (
     ResultsLog,
     SequenceResults,
 )
-from spherloc.experiments.rows import LOCALIZED, UNREADABLE, QueryResult
+from spherloc.experiments.rows import LOCALIZED, POSED, UNREADABLE, QueryResult
 from spherloc.experiments.sequence import chosen_queries, localize
 from spherloc.experiments.summary import SuccessRate, Summary, summarize
 from spherloc.experiments.trajectories import estimated_trajectory, timed, true_trajectory
@@ -48,7 +48,7 @@ def localize_sequence(
 ) -> int:
     """Localize the chosen queries that ``output`` has no result of; returns the exit code.
 
-    0 if every chosen query has a pose, else 1. Without ``records`` nothing is recorded.
+    0 if every chosen query is localized, 1 if one is doubtful or has no pose. Without ``records`` nothing is recorded.
     Raises ``InputError`` for whatever makes all of it impossible.
     """
     scene = load_scene(path)
@@ -109,7 +109,7 @@ def _work(
                     row = replace(row, recording=recorder.record(trace, row.query))
                 # Its recording is complete by now, so a row never names one that a killed process left unwritten.
                 log.append(row)
-                failed += row.status != LOCALIZED
+                failed += row.status not in POSED
                 advance(f"{failed} without a pose")
     except KeyboardInterrupt:
         so_far = f"{len(log.rows)} of {log.configuration.queries} queries are done"
@@ -167,7 +167,7 @@ def _text(results: SequenceResults, summary: Summary) -> str:
     setting = results.configuration
     lines = [
         f"{setting.name} ({setting.scene}), {setting.estimator}, seed {setting.seed}",
-        f"  {summary.localized} of {summary.done} queries have a pose"
+        f"  {summary.localized} of {summary.done} queries are localized, {summary.doubtful} more have a doubtful pose"
         + (f", of {summary.queries} in the scene" if summary.done < summary.queries else ""),
     ]
     lines += [f"  success {_rate(rate)}" for rate in (*summary.success, *summary.registration_success)]
@@ -213,7 +213,7 @@ def _skipped(summary: Summary) -> Iterator[str]:
 
 
 def _without_pose(rows: Sequence[QueryResult]) -> Iterator[str]:
-    lost = [row for row in rows if row.status != LOCALIZED]
+    lost = [row for row in rows if row.status not in POSED]
     for row in lost[:MAX_TOLD]:
         what = row.message if row.query in row.message else f"{row.query}: {row.message}"
         yield f"{'unreadable' if row.status == UNREADABLE else 'no pose'}: {what}"

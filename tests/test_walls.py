@@ -41,7 +41,7 @@ FLOORS = (
         "spherloc.datasets",
         "spherloc.frontend",
     ),
-    ("spherloc.estimators", "spherloc.proof", "spherloc.diagnosis", "spherloc.experiments"),
+    ("spherloc.estimators", "spherloc.proof", "spherloc.diagnosis", "spherloc.outcome", "spherloc.experiments"),
     ("spherloc_viz.style", "spherloc_viz.layers", "spherloc_viz.options", "spherloc_viz.share", "spherloc_viz"),
     ("spherloc_viz.recording", "spherloc_viz.sweep_plot"),
     ("spherloc_viz.gallery",),

@@ -173,12 +173,19 @@ def _facing(cam_from_map: FloatArray, point: FloatArray) -> FloatArray:
 
 
 def _iterations_ran_out(make: CaseMaker) -> FailureCase:
-    """3 to 12 % right matches, at least nine, and no two of them are sampled together before the search has to end.
+    """RANSAC is given too few iterations: see ``_unlucky``."""
+    make.estimator = "ransac-2p"
+    return _unlucky(make, make.between(0.03, 0.12))
 
-    RANSAC is given too few iterations; mc-exact is given no effort, so that only its first guess is left.
-    """
-    make.estimator = str(make.rng.choice(["mc-exact", "ransac-2p"]))
-    rate = make.between(0.03, 0.12 if make.estimator == "ransac-2p" else 0.05)
+
+def _search_missed(make: CaseMaker) -> FailureCase:
+    """mc-exact is given no effort, so that only its first guess is left: see ``_unlucky``."""
+    make.estimator = "mc-exact"
+    return _unlucky(make, make.between(0.03, 0.05))
+
+
+def _unlucky(make: CaseMaker, rate: float) -> FailureCase:
+    """3 to 12 % right matches, at least nine, and no two of them are sampled together before the search has to end."""
     count = max(make.whole(80, 300), int(np.ceil(9 / rate)))
     inliers = round(rate * count)
     make.right(inliers)
@@ -188,7 +195,7 @@ def _iterations_ran_out(make: CaseMaker) -> FailureCase:
         case = make.case("iterations ran out", options={"iterations": samples})
     else:
         samples = GUESSES
-        case = make.case("iterations ran out", options={"effort": 1e-9})
+        case = make.case("search missed the best pose", options={"effort": 1e-9})
     return replace(case, seed=_unlucky_seed(make.rng, case.problem.truth_inliers, samples))
 
 
@@ -212,6 +219,7 @@ MAKERS: Mapping[str, Callable[[CaseMaker], FailureCase]] = {
     "degenerate geometry": _degenerate,
     "iterations ran out": _iterations_ran_out,
     "ambiguous": _ambiguous,
+    "search missed the best pose": _search_missed,
 }
 
 

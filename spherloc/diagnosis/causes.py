@@ -26,9 +26,13 @@ class Cause(StrEnum):
     DEGENERATE = "degenerate geometry"
     """Enough matches agree, but they leave the pose open by more than the error of a success."""
     ITERATIONS_RAN_OUT = "iterations ran out"
-    """The search ended before it found the best pose; another run would find it."""
+    """RANSAC drew too few samples to find the best pose; another run would find it."""
     AMBIGUOUS = "ambiguous"
     """Two clearly different poses explain (nearly) as many matches."""
+    SEARCH_MISSED = "search missed the best pose"
+    """A search without random samples ended at a pose that explains clearly fewer matches than another one."""
+    UNKNOWN = "unknown"
+    """The pose is wrong, and nothing that was measured says why."""
 
 
 @dataclass(frozen=True, eq=False)

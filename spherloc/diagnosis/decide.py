@@ -7,7 +7,7 @@ from spherloc.diagnosis.evidence import Evidence, Truth, different, gather, gath
 from spherloc.diagnosis.experiments import WIDER, Fit, certify
 from spherloc.diagnosis.words import describe
 from spherloc.metrics import SUCCESS_DEG, SUCCESS_M
-from spherloc.trace import Trace
+from spherloc.trace import RansacStage, Trace
 
 CHANCE = 0.01
 """A consensus is believed if fewer sets of its size are expected by chance."""
@@ -32,7 +32,9 @@ STRONG = 0.45
 """A second pose with this share of the best one's support is no coincidence: structure repeats itself."""
 MISSED = 0.85
 """A run whose pose has less than this share of the best pose's support has missed it."""
-TO_BE_PROVEN = (Cause.FALSE_CONSENSUS, Cause.AMBIGUOUS, Cause.ITERATIONS_RAN_OUT)
+TILT_RAD = np.radians(0.05)
+"""A true gravity that is beyond its bound by more explains a pose that is wrong and otherwise well supported."""
+TO_BE_PROVEN = (Cause.FALSE_CONSENSUS, Cause.AMBIGUOUS, Cause.ITERATIONS_RAN_OUT, Cause.SEARCH_MISSED)
 """Causes whose evidence is complete only with a bound on every pose's support."""
 
 
@@ -45,6 +47,8 @@ def diagnose(trace: Trace, use_truth: bool = True) -> Diagnosis:
     evidence = gather(trace)
     truth = gather_truth(trace, evidence.bound_px) if use_truth else None
     cause = without_truth(evidence) if truth is None else with_truth(evidence, truth)
+    if cause is Cause.ITERATIONS_RAN_OUT and trace.stage(RansacStage) is None:
+        cause = Cause.SEARCH_MISSED
     certificate = certify(trace) if cause in TO_BE_PROVEN else trace.certificate
     return describe(trace, evidence, truth, cause, certificate)
 
@@ -92,7 +96,11 @@ def with_truth(e: Evidence, t: Truth) -> Cause:
         return Cause.FALSE_CONSENSUS if true < EQUAL * other else Cause.AMBIGUOUS
     if t.success:
         return Cause.OK
-    return Cause.ITERATIONS_RAN_OUT if missed(e, true) else Cause.DEGENERATE
+    if missed(e, true):
+        return Cause.ITERATIONS_RAN_OUT
+    if t.tilt_rad > e.aligned.gravity_bound_rad + TILT_RAD:
+        return Cause.GRAVITY_OFF
+    return Cause.DEGENERATE if undetermined(e.rotation_sd_rad, e.position_sd_m) else Cause.UNKNOWN
 
 
 def stands_out(e: Evidence, size: int) -> bool:

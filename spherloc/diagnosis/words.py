@@ -9,7 +9,7 @@ from spherloc.diagnosis.evidence import Evidence, Truth, different
 from spherloc.diagnosis.experiments import Fit
 from spherloc.diagnosis.measures import apart
 from spherloc.metrics import evaluate
-from spherloc.trace import Certificate, RansacStage, Trace
+from spherloc.trace import Certificate, ConsensusStage, RansacStage, Trace
 
 ADVICE = {
     Cause.OK: "Nothing to do.",
@@ -19,7 +19,9 @@ ADVICE = {
     Cause.GRAVITY_OFF: "Correct the known roll and pitch, or state a larger gravity bound and standard deviation.",
     Cause.BOUND_TOO_SMALL: "Raise bound_px to about three standard deviations of the noise, or calibrate better.",
     Cause.DEGENERATE: "Add matches elsewhere in the image and at other depths; until then do not trust the pose.",
-    Cause.ITERATIONS_RAN_OUT: "Raise the iterations or the effort, set a confidence, or use mc-exact.",
+    Cause.ITERATIONS_RAN_OUT: "Raise the iterations, set a confidence, or use mc-exact.",
+    Cause.SEARCH_MISSED: "Use mc-exact, which looks at all poses.",
+    Cause.UNKNOWN: "Look at the matches from the true pose: calibration, map and truth may disagree beyond noise.",
     Cause.AMBIGUOUS: "Look at both poses and decide by something else: a prior, a second image, other matches.",
 }
 
@@ -34,10 +36,17 @@ def describe(
         doubtful=cause is not Cause.OK,
         summary=_summary(e, truth, cause, other),
         evidence=tuple(_sentences(trace, e, truth, certificate)),
-        advice=ADVICE[cause],
+        advice=_advice(trace, cause),
         used_truth=truth is not None,
         rival_cam_from_map=None if other is None else e.aligned.unalign_pose(other.cam_from_map),
     )
+
+
+def _advice(trace: Trace, cause: Cause) -> str:
+    """What to do; never to use what was used."""
+    if cause is Cause.SEARCH_MISSED and trace.stage(ConsensusStage) is not None:
+        return "Raise the effort and the time budget."
+    return ADVICE[cause]
 
 
 def _other(e: Evidence, truth: Truth | None, cause: Cause) -> Fit | None:
@@ -48,7 +57,7 @@ def _other(e: Evidence, truth: Truth | None, cause: Cause) -> Fit | None:
         candidates = [e.rival, e.best] if truth is None else [truth.fit, e.rival, e.best]
     elif truth is not None:
         candidates = [truth.fit]
-    elif cause is Cause.ITERATIONS_RAN_OUT:
+    elif cause in (Cause.ITERATIONS_RAN_OUT, Cause.SEARCH_MISSED):
         candidates = [e.best]
     elif cause in (Cause.GRAVITY_OFF, Cause.BOUND_TOO_SMALL):
         return e.free
@@ -78,9 +87,11 @@ def _summary(e: Evidence, truth: Truth | None, cause: Cause, other: Fit | None) 
             return f"Two different poses stand out, with {best} and {second} of {total} matches: either may be false."
         case Cause.AMBIGUOUS:
             return f"Two clearly different poses are supported alike: by {run} and by {second} of {total} matches."
-        case Cause.ITERATIONS_RAN_OUT:
+        case Cause.ITERATIONS_RAN_OUT | Cause.SEARCH_MISSED:
             better = max(best, second)
             return f"The search missed the best pose: one with {better} of {total} matches exists, the run's has {run}."
+        case Cause.UNKNOWN:
+            return f"The pose is off the true one, though {run} of {total} matches agree with it and fix it well."
     return _measured_summary(e, truth, cause)
 
 
@@ -135,9 +146,12 @@ def _proofs(trace: Trace, certificate: Certificate | None) -> Iterator[str]:
         reached = 100.0 * ransac.confidence_reached
         yield f"RANSAC drew {ransac.iterations:,} samples and reached a confidence of {reached:.3g} % (Eq. 28)."
     if certificate is not None and certificate.proven:
-        yield f"Proven: no pose explains more than {certificate.upper_bound}."
+        yield f"Proven: no pose within the gravity bound explains more than {certificate.upper_bound}."
     elif certificate is not None:
-        yield f"No pose explains more than {certificate.upper_bound}; one with {certificate.lower_bound} is known."
+        yield (
+            f"Before refinement, no pose within the gravity bound explains more than {certificate.upper_bound}; one "
+            f"with {certificate.lower_bound} is known."
+        )
 
 
 def _truths(trace: Trace, e: Evidence, truth: Truth) -> Iterator[str]:

@@ -15,7 +15,7 @@ from spherloc.cameras.base import FloatArray
 from spherloc.errors import InputError, reason, show
 from spherloc.experiments.configuration import Configuration, read_configuration
 from spherloc.experiments.differences import in_short
-from spherloc.experiments.rows import LOCALIZED, QueryResult, csv_text, json_line, row_of_json
+from spherloc.experiments.rows import POSED, QueryResult, csv_text, json_line, row_of_json
 from spherloc.files import read_file, reading
 
 CONFIGURATION, ROWS, TABLE = "configuration.json", "results.jsonl", "results.csv"
@@ -43,7 +43,7 @@ class SequenceResults:
 
     @property
     def status(self) -> tuple[str, ...]:
-        """(Q,) "localized", "failed" or "unreadable"."""
+        """(Q,) "localized", "doubtful", "failed" or "unreadable"."""
         return tuple(row.status for row in self.rows)
 
     @cached_property
@@ -162,7 +162,7 @@ class ResultsLog:
 
         Raises ``InputError`` if the files cannot be written.
         """
-        kept = {name: row for name, row in self.rows.items() if row.status == LOCALIZED}
+        kept = {name: row for name, row in self.rows.items() if row.status in POSED}
         removed = len(self.rows) - len(kept)
         if removed:
             content = "".join(f"{json_line(row)}\n" for row in kept.values())

@@ -14,9 +14,12 @@ from spherloc.cameras.base import FloatArray
 from spherloc.datasets.scene_file import numbers
 from spherloc.errors import InputError, show
 from spherloc.geometry import camera_centre
+from spherloc.outcome import Outcome
 
-LOCALIZED, FAILED, UNREADABLE = "localized", "failed", "unreadable"
-STATUSES = (LOCALIZED, FAILED, UNREADABLE)
+LOCALIZED, DOUBTFUL, FAILED = (str(outcome) for outcome in (Outcome.LOCALIZED, Outcome.DOUBTFUL, Outcome.FAILED))
+UNREADABLE = "unreadable"
+POSED = (LOCALIZED, DOUBTFUL)
+STATUSES = (*POSED, FAILED, UNREADABLE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,8 +31,8 @@ class QueryResult:
     query: str
     """Name of the query image."""
     status: str
-    """"localized"; "failed": a usable image got no pose; or "unreadable": the image cannot be used, so no method is
-    judged by it."""
+    """"localized"; "doubtful": a pose that is not to be believed, see ``spherloc.outcome``; "failed": a usable image got
+    no pose; or "unreadable": the image cannot be used, so no method is judged by it."""
     timestamp_s: float | None = None
     """When the image was taken, seconds."""
     references: int | None = None
@@ -63,7 +66,7 @@ class QueryResult:
     recording: str | None = None
     """The recording's file, relative to the folder of the results if it is inside."""
     message: str = ""
-    """The outcome in a sentence."""
+    """The outcome in a sentence, and of a doubtful one what speaks against it."""
     remarks: tuple[str, ...] = ()
     """What the front end skipped and why, in sentences."""
     cam_from_map: FloatArray | None = None
@@ -118,7 +121,7 @@ def row_of_json(line: str, place: str) -> QueryResult:
         if values[name] is None and name not in _NEEDED:
             continue
         values[name] = _value(name, values[name], place)
-    if (values["status"] == LOCALIZED) != (values["cam_from_map"] is not None) or values["status"] not in STATUSES:
+    if (values["status"] in POSED) != (values["cam_from_map"] is not None) or values["status"] not in STATUSES:
         raise _damaged(place, f"has the status {show(values['status'])}, which does not fit its pose")
     return QueryResult(**values)
 

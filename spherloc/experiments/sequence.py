@@ -14,9 +14,10 @@ from spherloc.datasets.map_scene import MapScene
 from spherloc.diagnosis import diagnose
 from spherloc.errors import InputError, SpherlocError, show
 from spherloc.estimators import estimate
-from spherloc.experiments.rows import FAILED, LOCALIZED, UNREADABLE, QueryResult
+from spherloc.experiments.rows import FAILED, UNREADABLE, QueryResult
 from spherloc.frontend.view import Matches, View
 from spherloc.metrics import evaluate
+from spherloc.outcome import judge
 from spherloc.trace import Trace
 
 T = TypeVar("T")
@@ -101,7 +102,7 @@ def _status_without_matches(view: View) -> str:
 def _judged(scene: MapScene, view: View, references: tuple[View, ...], trace: Trace, row: QueryResult) -> QueryResult:
     """The row with all that the trace tells."""
     problem, metrics, pose = trace.problem, evaluate(trace), trace.cam_from_map
-    registration_error_m, remarks = None, row.remarks
+    judged, registration_error_m, remarks = judge(trace), None, row.remarks
     if scene.registration is not None and pose is not None:
         try:
             registration_error_m = float(scene.registration(view, pose, references))
@@ -109,7 +110,7 @@ def _judged(scene: MapScene, view: View, references: tuple[View, ...], trace: Tr
             remarks = (*remarks, f"Not registered: {error}")
     return replace(
         row,
-        status=FAILED if pose is None else LOCALIZED,
+        status=str(judged.outcome),
         inliers=int(np.count_nonzero(trace.inlier_mask)),
         estimated_outlier_rate=problem.estimated_outlier_rate,
         true_outlier_rate=None if problem.truth_inliers is None else float(np.mean(~problem.truth_inliers)),
@@ -121,7 +122,7 @@ def _judged(scene: MapScene, view: View, references: tuple[View, ...], trace: Tr
         f1=metrics.f1,
         estimating_ms=trace.timings_ms["total"],
         diagnosis=str(diagnose(trace).cause),
-        message=trace.message,
+        message=trace.message if pose is None else " ".join((trace.message, *judged.reasons)),
         remarks=remarks,
         cam_from_map=pose,
     )

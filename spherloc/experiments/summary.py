@@ -8,7 +8,7 @@ import numpy as np
 
 from spherloc.datasets.map_scene import Thresholds
 from spherloc.experiments.results import SequenceResults
-from spherloc.experiments.rows import FAILED, LOCALIZED, UNREADABLE, QueryResult
+from spherloc.experiments.rows import DOUBTFUL, FAILED, LOCALIZED, UNREADABLE, QueryResult
 
 Z_95 = 1.959963984540054
 """Standard normal quantile of a two-sided interval of 95 %."""
@@ -43,7 +43,9 @@ class Summary:
     done: int
     """With a result."""
     localized: int
-    """With a pose."""
+    """With a pose that is believed."""
+    doubtful: int
+    """With a pose that is not."""
     failed: int
     """Usable images without a pose; they count as failures."""
     unreadable: int
@@ -103,6 +105,7 @@ def summarize(results: SequenceResults) -> Summary:
         queries=setting.queries,
         done=len(rows),
         localized=sum(row.status == LOCALIZED for row in rows),
+        doubtful=sum(row.status == DOUBTFUL for row in rows),
         failed=sum(row.status == FAILED for row in rows),
         unreadable=len(rows) - len(usable),
         without_truth=len(usable) - len(with_truth),

@@ -4,6 +4,7 @@ import numpy as np
 
 from spherloc.geometry import camera_centre
 from spherloc.metrics import evaluate
+from spherloc.outcome import judge
 from spherloc.trace import Certificate, RefinementStage, Trace
 from spherloc_viz.layers import uncertainty
 from spherloc_viz.layers.certificate import UNKNOWABLE, chance, is_knowable, proof
@@ -16,6 +17,8 @@ def outcome_table(trace: Trace) -> Table:
     metrics = evaluate(trace)
     rows: list[tuple[str, str]] = [("estimator", trace.estimator), ("outcome", verdict(trace, metrics.success))]
     if trace.cam_from_map is not None:
+        judged = judge(trace)
+        rows.append(("without the truth", " ".join((f"{judged.outcome}{':' * bool(judged.reasons)}", *judged.reasons))))
         rows.append(("camera position", place_text(camera_centre(trace.cam_from_map), 3)))
     if metrics.rotation_error_deg is not None and metrics.translation_error_m is not None:
         rows.append(("rotation error", f"{metrics.rotation_error_deg:.3f}°"))

@@ -33,10 +33,10 @@ def without(problem, mask):
 
 
 def test_there_is_a_maker_for_every_cause():
-    assert set(MAKERS) == set(Cause)
+    assert set(MAKERS) == set(Cause) - {Cause.UNKNOWN}
 
 
-@pytest.mark.parametrize("cause", Cause)
+@pytest.mark.parametrize("cause", MAKERS)
 def test_a_seed_gives_one_case(cause):
     one, two, other = failure_case(cause, 3), failure_case(cause, 3), failure_case(cause, 4)
     assert one.cause == cause and (one.estimator, one.options, one.seed) == (two.estimator, two.options, two.seed)
@@ -45,7 +45,7 @@ def test_a_seed_gives_one_case(cause):
     assert len(other.problem) != len(one.problem) or (other.problem.points != one.problem.points).any()
 
 
-@pytest.mark.parametrize("cause", Cause)
+@pytest.mark.parametrize("cause", MAKERS)
 def test_labels_are_true(cause):
     """Right matches are the true pose's projections but for noise, and wrong ones are elsewhere."""
     for seed in SEEDS:

@@ -171,7 +171,7 @@ def test_chosen_queries_first_then_the_others(tmp_path: Path, capsys: pytest.Cap
     scene, out = write_scene(tmp_path, queries=5, few=[3]), tmp_path / "out"
     assert run(scene, out, queries=["0:5:4"]) == 0
     assert [row["query"] for row in table(out)] == ["image0.png", "image4.png"]
-    assert "2 of 2 queries have a pose, of 5 in the scene" in capsys.readouterr().out
+    assert "2 of 2 queries are localized, 0 more have a doubtful pose, of 5 in the scene" in capsys.readouterr().out
     assert run(scene, out, queries=["image4.png", "image2.png"]) == 0
     assert [row["index"] for row in table(out)] == ["0", "2", "4"]
     assert run(scene, out) == 1

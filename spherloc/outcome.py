@@ -1,0 +1,144 @@
+"""What became of a run without looking at the truth: localized, doubtful or failed, by one rule.
+
+A pose is believed if its inliers are more than chance gives, if no clearly different pose is supported about as well,
+and if they fix it to within the error of a success. Each of the three is a margin, 0 where belief begins; the least of
+them is the run's score.
+"""
+
+from dataclasses import dataclass, replace
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spherloc.bounds import bounds_of
+from spherloc.consensus.chance import chance_rate, chance_sets
+from spherloc.consensus.inliers import mark_each
+from spherloc.consensus.two_point_search import search_two_point
+from spherloc.diagnosis.evidence import FEW, LOOSE_ENDS, different
+from spherloc.diagnosis.measures import pose_sd
+from spherloc.metrics import SUCCESS_DEG, SUCCESS_M
+from spherloc.problem import AlignedProblem
+from spherloc.refine import gravity_sd_rad, residuals_px
+from spherloc.trace import ConsensusStage, RefinementStage, Trace
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+MOST_CHANCE_SETS = 1e-3
+"""Expected number of chance sets of the size of the inliers below which they are believed."""
+LEAST_LEAD = 2.0
+"""By how many standard deviations of counting a pose must lead a rival that stands out from chance itself."""
+LEAST_SDS = 2.0
+"""Standard deviations that must lie within the error of a success."""
+SAMPLES, CONFIDENCE = 2000, 0.99
+"""Of the search for a rival among what the pose does not explain."""
+FAR = 3.0
+"""A correspondence farther off than so many bounds is not explained by the pose."""
+
+
+class Outcome(StrEnum):
+    """What became of a run."""
+
+    LOCALIZED = "localized"
+    """The pose is believed."""
+    DOUBTFUL = "doubtful"
+    """There is a pose, but chance, a rival, or what its inliers leave open speaks against it."""
+    FAILED = "failed"
+    """There is no pose."""
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """An outcome and what it rests on."""
+
+    outcome: Outcome
+    """What became of the run."""
+    score: float
+    """The least margin; a pose is believed from 0 on, -inf if there is none."""
+    reasons: tuple[str, ...]
+    """Sentences: what speaks against the pose, or why there is none; empty if it is believed."""
+
+
+def judge(trace: Trace) -> Judgement:
+    """Judge a run by its pose, its inliers and their covariance; some milliseconds, the same in every call."""
+    if trace.cam_from_map is None:
+        return Judgement(Outcome.FAILED, -np.inf, (trace.message,))
+    aligned, bound_px = trace.problem.aligned, float(trace.options.bound_px)
+    state, bounds = aligned.align_pose(trace.cam_from_map), bounds_of(aligned, bound_px)
+    stage = trace.stage(RefinementStage)
+    limits = bounds.pixels if stage is not None and stage.dof == 4 else np.full(len(aligned.points), bound_px)
+    errors = residuals_px(aligned, state)
+    inliers, fixed_by = errors <= limits, 3 if stage is not None and stage.dof == 6 else 2
+    size, rate = _different(aligned, inliers), chance_rate(aligned.bearings, np.minimum(bounds.radians, np.pi / 2))
+    if fixed_by == 3:
+        rate = chance_rate(aligned.bearings, bounds_of(replace(aligned, gravity_bound_rad=0.0), bound_px).radians)
+    found = [
+        _chance_margin(len(aligned.points), size, rate, fixed_by),
+        _rival_margin(trace, aligned, state, errors, size, rate, fixed_by),
+        _error_margin(trace, aligned, state, inliers),
+    ]
+    score = min(margin for margin, _ in found)
+    reasons = tuple(reason for margin, reason in found if margin < 0.0)
+    return Judgement(Outcome.DOUBTFUL if reasons else Outcome.LOCALIZED, float(score), reasons)
+
+
+def _different(aligned: AlignedProblem, mask: BoolArray) -> int:
+    """Masked correspondences, those that share a point or a bearing counted once."""
+    if not mask.any():
+        return 0
+    points, bearings = np.unique(aligned.points[mask], axis=0), np.unique(aligned.bearings[mask], axis=0)
+    return min(len(points), len(bearings))
+
+
+def _expected(count: int, size: int, rate: float, fixed_by: int) -> float:
+    """Chance sets of that size, where so many correspondences fix a pose."""
+    return chance_sets(count, size, rate) * rate ** (2 - fixed_by) if size > fixed_by else np.inf
+
+
+def _chance_margin(count: int, size: int, rate: float, fixed_by: int) -> tuple[float, str]:
+    expected = max(_expected(count, size, rate, fixed_by), 1e-300)
+    margin = np.log10(MOST_CHANCE_SETS) - np.log10(min(expected, 1e300))
+    many = f"{expected:.1g}" if expected < 1e6 else "millions"
+    return margin, f"Only {size} different matches agree with it; {many} such sets are expected by chance."
+
+
+def _rival_margin(
+    trace: Trace, aligned: AlignedProblem, state: FloatArray, errors: FloatArray, size: int, rate: float, fixed_by: int
+) -> tuple[float, str]:
+    """The lead over the best clearly different pose that is itself no chance."""
+    bound_px, most = float(trace.options.bound_px), 0
+    poses = (
+        [] if (stage := trace.stage(ConsensusStage)) is None else [aligned.align_pose(p) for p in stage.cam_from_map]
+    )
+    for other in poses:
+        if different(state, other):
+            most = max(most, _different(aligned, (residuals_px(aligned, other) <= bound_px) & (errors > bound_px)))
+    rest = np.flatnonzero(errors > FAR * bound_px)
+    if len(rest) > 2:
+        names = ("index", "bearings", "points", "pixel_from_bearing", "radians_per_pixel")
+        part = replace(aligned, **{name: np.ascontiguousarray(getattr(aligned, name)[rest]) for name in names})
+        limits = bounds_of(part, bound_px).pixels
+        found = search_two_point(part, limits, 0, SAMPLES, CONFIDENCE, local_optimization=True)
+        if found.found:
+            best = int(np.argmax(found.support))
+            yaws, places = found.yaws_rad[best : best + 1], found.translations[best : best + 1]
+            mask = mark_each(yaws, places, part.bearings, part.points, part.pixel_from_bearing, limits)[0]
+            most = max(most, _different(part, mask))
+    if _expected(len(aligned.points), most, rate, fixed_by) > MOST_CHANCE_SETS:
+        return np.inf, ""
+    lead = (size - most) / np.sqrt(max(size + most, 1))
+    return lead - LEAST_LEAD, f"Another pose explains {most} different matches, this one {size}."
+
+
+def _error_margin(trace: Trace, aligned: AlignedProblem, state: FloatArray, inliers: BoolArray) -> tuple[float, str]:
+    """How much smaller the stated error is than that of a success, in powers of e."""
+    size, options = int(np.count_nonzero(inliers)), trace.options
+    if size < 2:
+        return -np.inf, "Its inliers do not fix it."
+    drop, sd = LOOSE_ENDS if size >= FEW else 0, gravity_sd_rad(aligned, options)
+    rotation, position, _ = pose_sd(aligned, state, inliers, options.noise_px, sd, drop)
+    worst = LEAST_SDS * max(np.degrees(rotation) / SUCCESS_DEG, position / SUCCESS_M, 1e-300)
+    return -np.log(
+        worst
+    ), f"Its inliers fix it to no better than {np.degrees(rotation):.2g}° and {position:.2g} m (1 sd)."

@@ -1,0 +1,83 @@
+"""Localized, doubtful or failed: what speaks against a pose, and how often believed poses are wrong."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from spherloc.datasets.failures import failure_case
+from spherloc.diagnosis import Cause
+from spherloc.estimators import default_options, estimate
+from spherloc.estimators.base import options_type
+from spherloc.metrics import evaluate
+from spherloc.outcome import Outcome, judge
+
+
+def solved(problem, estimator="ransac-2p", **options):
+    return estimate(problem, estimator, options_type(estimator)(bound_px=problem.bound_px or 3.0, **options))
+
+
+def test_believed_poses_are_right(scene_of):
+    """From easy to hopeless, on held-out seeds: believed ones are right, and most of what can be known is believed."""
+    believed, wrong, easy = 0, 0, 0
+    for seed in range(60_000, 60_060):
+        rate = (0.5, 0.8, 0.9, 0.95, 0.98, 1.0)[seed % 6]
+        scene = scene_of("mei", correspondences=100, outlier_rate=rate, gravity_error_deg=0.5 * (seed % 2))
+        trace = solved(scene.problem(seed))
+        accepted, right = judge(trace).outcome is Outcome.LOCALIZED, bool(evaluate(trace).success)
+        believed, wrong = believed + accepted, wrong + (accepted and not right)
+        easy += accepted and rate <= 0.8
+    assert wrong == 0 and easy >= 19 and believed >= 27
+
+
+@pytest.mark.parametrize(
+    "cause, words",
+    [
+        (Cause.TOO_FEW_INLIERS, "expected by chance"),
+        (Cause.WRONG_REFERENCE, "expected by chance"),
+        (Cause.AMBIGUOUS, "Another pose explains"),
+    ],
+)
+def test_what_speaks_against_a_pose(cause, words):
+    judged = [judge(solved(failure_case(cause, seed).problem)) for seed in range(4000, 4006)]
+    doubts = [one for one in judged if one.outcome is not Outcome.LOCALIZED]
+    assert len(doubts) >= 5
+    assert sum(words in " ".join(one.reasons) for one in doubts) >= 4
+    assert all((one.score < 0.0) == bool(one.reasons) for one in judged)
+
+
+def test_degenerate_poses_are_doubtful():
+    outcomes = []
+    for seed in range(4000, 4010):
+        trace = solved(failure_case(Cause.DEGENERATE, seed).problem)
+        outcomes.append(judge(trace).outcome is Outcome.LOCALIZED and not evaluate(trace).success)
+    assert sum(outcomes) <= 1
+
+
+@pytest.mark.parametrize("estimator", ["mc", "mc-exact", "ransac-2p"])
+def test_two_matches_and_repeated_ones_are_no_evidence(scene_of, estimator):
+    """Two matches agree with a pose whatever they are, and so do two that are each there ten times."""
+    two = scene_of("panorama", correspondences=2, outlier_rate=0.0).problem(1)
+    repeated = replace(
+        two,
+        pixels=np.repeat(two.pixels, 10, axis=0),
+        points=np.repeat(two.points, 10, axis=0),
+        truth_inliers=np.ones(20, dtype=bool),
+    )
+    for problem in (two, repeated):
+        judged = judge(solved(problem, estimator))
+        assert judged.outcome is not Outcome.LOCALIZED and judged.reasons
+
+
+def test_no_pose_has_failed_and_a_judgement_is_repeatable(scene_of):
+    trace = solved(scene_of("fisheye", outlier_rate=0.9).problem(2))
+    assert judge(trace) == judge(trace)
+    lost = replace(trace, cam_from_map=None, inlier_mask=np.zeros(len(trace.problem), bool), message="No pose: none.")
+    assert judge(lost).outcome is Outcome.FAILED and judge(lost).reasons == ("No pose: none.",)
+
+
+def test_truth_is_not_looked_at(scene_of):
+    problem = scene_of("mei", outlier_rate=0.5).problem(3)
+    blind = replace(problem, truth_cam_from_map=None, truth_inliers=None)
+    options = default_options("mc", problem)
+    assert judge(estimate(problem, "mc", options)) == judge(estimate(blind, "mc", options))
