@@ -31,8 +31,8 @@ class QueryResult:
     query: str
     """Name of the query image."""
     status: str
-    """"localized"; "doubtful": a pose that is not to be believed, see ``spherloc.outcome``; "failed": a usable image got
-    no pose; or "unreadable": the image cannot be used, so no method is judged by it."""
+    """"localized"; "doubtful": a pose that is not to be believed, see ``spherloc.outcome``; "failed": a usable image
+    got no pose; or "unreadable": the image cannot be used, so no method is judged by it."""
     timestamp_s: float | None = None
     """When the image was taken, seconds."""
     references: int | None = None

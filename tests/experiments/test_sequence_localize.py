@@ -77,14 +77,15 @@ def test_a_bad_query_is_one_row_and_the_others_go_on(tmp_path: Path) -> None:
     scene = scene_of(tmp_path, queries=6, few=[1], broken=[2], unknown=[3], wrong=[4])
     rows = [row for row, _ in solve(scene)]
     assert [row.index for row in rows] == list(range(6))
-    assert [row.status for row in rows] == ["localized", "failed", "unreadable", "localized", "localized", "localized"]
+    assert [row.status for row in rows] == ["localized", "failed", "unreadable", "localized", "doubtful", "localized"]
     assert "1 usable of 1 correspondences" in rows[1].message and rows[1].remarks == ("image1.png: few matches.",)
     assert rows[1].matches == 1 and rows[1].estimated_outlier_rate == 0.4 and rows[1].inliers is None
     assert "image2.png" in rows[2].message and rows[2].matches is None
     assert rows[3].rotation_error_deg is None and rows[3].precision is None and rows[3].inliers
     assert rows[4].diagnosis == "wrong reference image" and rows[4].translation_error_m > 0.5
     summary = summarize(results_of(scene, rows))
-    assert (summary.localized, summary.failed, summary.unreadable, summary.without_truth) == (4, 1, 1, 1)
+    assert (summary.localized, summary.doubtful, summary.failed, summary.unreadable) == (3, 1, 1, 1)
+    assert summary.without_truth == 1 and "expected by chance" in rows[4].message
     # Judged: all but the unreadable one and the one without truth; the one with too few matches is a failure.
     assert [(rate.successes, rate.judged) for rate in summary.success] == [(2, 4), (2, 4)]
     assert summary.scored == 3 and summary.registration_success == ()
