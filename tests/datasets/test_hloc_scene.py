@@ -131,7 +131,7 @@ def test_truth_names(world, rng):
     (world.folder / "images" / other).parent.mkdir()
     (world.folder / "images" / other).write_bytes(b"")
     (world.folder / "queries.txt").write_text(f"{QUERY} {panorama}\n{other} {panorama}\n")
-    with pytest.raises(InputError, match=r"may be query/night/IMG_1.jpg or query/day/IMG_1.jpg"):
+    with pytest.raises(InputError, match=r"may be 'query/night/IMG_1.jpg' or 'query/day/IMG_1.jpg'"):
         load_scene(world.scene)
     (world.outputs / "truth.txt").write_text("day/IMG_1.jpg 1 0 0 0 1 2 3\nnobody.jpg 1 0 0 0 1 2 3\n")
     scene = load_scene(world.scene)

@@ -107,7 +107,7 @@ def test_the_same_places_in_two_forms_of_one_recording():
         ("rigs", "head, left, 1, 0, 0, 0, 0, 0,\n", 1, "'' is not a finite number"),
         ("rigs", "head, left, 1, 1, 1, 1, 0, 0, 0\n", 1, "the length 2 instead of 1"),
         ("trajectories", f"{TRAJECTORIES}1, nobody, 1, 0, 0, 0, 0, 0, 0\n", 7, "is called 'nobody'"),
-        ("trajectories", f"{TRAJECTORIES}{TRAJECTORIES.splitlines()[2]}\n", 7, "'car' has two poses at 15531802240"),
+        ("trajectories", f"{TRAJECTORIES}{TRAJECTORIES.splitlines()[2]}\n", 7, "'car' has two poses at '15531802240"),
         ("trajectories", "1.5, left, 1, 0, 0, 0, 0, 0, 0\n", 1, "the timestamp '1.5' is no whole number"),
         ("trajectories", f"{2**63}, left, 1, 0, 0, 0, 0, 0, 0\n", 1, "is no whole number of 64 bits"),
         ("trajectories", "1, left, 1, 0, 0, 0, nan, 0, 0\n", 1, "'nan' is not a finite number"),

@@ -216,7 +216,7 @@ def test_workers_that_cannot_start_end_in_a_sentence(tmp_path: Path) -> None:
         ({"runs": 100_000, "values": [k / 100 for k in range(99)]}, "runs in all; ask for 2,000,000 or fewer"),
         ({"first_seed": -1}, "first seed is -1"),
         ({"variation": Variation(hidden=(3,))}, "single matches cannot be edited"),
-        ({"variation": Variation(camera="nowhere.yaml")}, "nowhere.yaml: cannot be read"),
+        ({"variation": Variation(camera="nowhere.yaml")}, "nowhere.yaml: no such file"),
     ],
 )  # fmt: skip
 def test_wrong_plans_are_one_sentence(tmp_path: Path, changes: dict[str, Any], said: str) -> None:
@@ -231,7 +231,7 @@ def test_what_changes_under_a_sweep_is_noticed(tmp_path: Path) -> None:
     write_scene(tmp_path).write_text(SCENE.replace("30", "31"))
     with pytest.raises(InputError, match="has changed since the sweep was planned"):
         replace(plan, scene_sha256="0").solve([Job(0, 0, 0)])
-    with pytest.raises(InputError, match=r"gone.toml: cannot be read"):
+    with pytest.raises(InputError, match=r"gone.toml: no such file"):
         planned(tmp_path / "gone.toml", "noise_px", [1], QUICK, 1)
     with pytest.raises(InputError, match="has 0 workers"):
         next(run_sweep(plan, workers=0))
