@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 
 from spherloc.datasets import load_scene
 from spherloc.datasets.synthetic import SyntheticScene
@@ -24,7 +24,10 @@ from tests.needs import lacking, real_data
 ROOT = Path(__file__).resolve().parents[1]
 SUITE_SEED = int(os.environ.get("SPHERLOC_TEST_SEED", "0"))
 
-settings.register_profile("spherloc", derandomize=True, deadline=None, database=None)
+# A busy machine is no reason to fail: neither a limit a case nor one on drawing the cases.
+settings.register_profile(
+    "spherloc", derandomize=True, deadline=None, database=None, suppress_health_check=[HealthCheck.too_slow]
+)
 settings.load_profile("spherloc")
 
 
