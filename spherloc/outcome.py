@@ -1,8 +1,8 @@
 """What became of a run without looking at the truth: localized, doubtful or failed, by one rule.
 
-A pose is believed if its inliers are more than chance gives, if no clearly different pose is supported about as well,
-and if they fix it to within the error of a success. Each of the three is a margin, 0 where belief begins; the least of
-them is the run's score.
+A pose is believed if its inliers are more than chance gives, if no clearly different pose is supported about as well
+and no pose with another gravity much better, and if they fix it to within the error of a success. Each of these is a
+margin, 0 where belief begins; the least of them is the run's score.
 """
 
 from dataclasses import dataclass, replace
@@ -18,8 +18,9 @@ from spherloc.consensus.two_point_search import search_two_point
 from spherloc.diagnosis.evidence import FEW, LOOSE_ENDS, different
 from spherloc.diagnosis.measures import pose_sd
 from spherloc.metrics import SUCCESS_DEG, SUCCESS_M
+from spherloc.narrowing import NARROWINGS, narrow
 from spherloc.problem import AlignedProblem
-from spherloc.refine import gravity_sd_rad, residuals_px
+from spherloc.refine import RefinementOptions, gravity_sd_rad, residuals_px
 from spherloc.trace import ConsensusStage, RefinementStage, Trace
 
 FloatArray = NDArray[np.float64]
@@ -31,6 +32,8 @@ LEAST_LEAD = 2.0
 """By how many standard deviations of counting a pose must lead a rival that stands out from chance itself."""
 LEAST_SDS = 2.0
 """Standard deviations that must lie within the error of a success."""
+TILT_RAD = np.radians(6.0)
+"""Gravity errors up to about this are looked for."""
 SAMPLES, CONFIDENCE = 2000, 0.99
 """Of the search for a rival among what the pose does not explain."""
 FAR = 3.0
@@ -76,6 +79,7 @@ def judge(trace: Trace) -> Judgement:
     found = [
         _chance_margin(len(aligned.points), size, rate, fixed_by),
         _rival_margin(trace, aligned, state, errors, size, rate, fixed_by),
+        _gravity_margin(aligned, state, bound_px, inliers, trace.options),
         _error_margin(trace, aligned, state, inliers),
     ]
     score = min(margin for margin, _ in found)
@@ -129,6 +133,19 @@ def _rival_margin(
         return np.inf, ""
     lead = (size - most) / np.sqrt(max(size + most, 1))
     return lead - LEAST_LEAD, f"Another pose explains {most} different matches, this one {size}."
+
+
+def _gravity_margin(
+    aligned: AlignedProblem, state: FloatArray, bound_px: float, inliers: BoolArray, options: RefinementOptions
+) -> tuple[float, str]:
+    """By how little a pose nearby explains more if gravity is not believed."""
+    wide = np.maximum(bounds_of(aligned, bound_px).pixels, bound_px + TILT_RAD * aligned.pixels_per_radian)
+    tight, path = np.full(len(wide), bound_px), np.empty((len(NARROWINGS), 3, 4))
+    data = (aligned.bearings, aligned.points, aligned.pixel_from_bearing.copy())
+    narrow(*data, wide, tight, state.copy(), options.noise_px, np.inf, path)
+    size, free = _different(aligned, inliers), _different(aligned, residuals_px(aligned, path[-1]) <= tight)
+    lead = (free - size) / np.sqrt(max(free + size, 1))
+    return LEAST_LEAD - lead, f"Without the known gravity, {free} different matches agree instead of {size}."
 
 
 def _error_margin(trace: Trace, aligned: AlignedProblem, state: FloatArray, inliers: BoolArray) -> tuple[float, str]:

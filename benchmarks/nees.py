@@ -1,6 +1,6 @@
 """Whether the stated errors are true: NEES and the share of true poses within 1, 2 and 3 sigma, as a Markdown table.
 
-.venv/bin/python -m benchmarks.coverage [ESTIMATOR]
+.venv/bin/python -m benchmarks.nees [ESTIMATOR]
 
 NEES is e' C^-1 e over the degrees of freedom, 1 if the covariance C is that of the errors. Real sets are judged twice:
 by their truth as it is, and with the errors that the truth itself has (odometry, calibration) added to C.
