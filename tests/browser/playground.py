@@ -115,8 +115,8 @@ class Playground:
     """One tab."""
 
     def __init__(self, browser: Browser, address: str, drawn: bool = False, new: bool = False) -> None:
-        """Open the page and wait for its first run; ``drawn`` has the canvas really drawn, which is slow, and ``new``
-        is a browser that has never been here."""
+        """Open the page, wait for its first run and go to the run's last step; ``drawn`` has the canvas really drawn,
+        which is slow, and ``new`` is a browser that has never been here: it stays where the page opens."""
         context = browser.new_context(viewport=SIZE, device_scale_factor=SHARPNESS)  # pyright: ignore[reportArgumentType]
         context.add_init_script(ASIDE)
         if not new:
@@ -133,6 +133,10 @@ class Playground:
         self.page.on("websocket", lambda socket: self._note_host(socket.url))
         self.page.goto(address)
         expect(self.value("outcome")).not_to_be_empty()
+        if not new:
+            self.slide("Timeline", "End")
+            expect(self.step).to_have_value(re.compile("Outcome$"))
+            self.page.evaluate("document.activeElement.blur()")
 
     def expect_quiet(self, address: str) -> None:
         """No errors on the console, and no word to any other server."""
