@@ -59,6 +59,9 @@ def check(trace, bound_px):
     verified = [aligned.align_pose(p) for p in stage.cam_from_map]
     assert len(verified) == len(stage.support) and (np.diff(stage.support) <= 0).all()
     for p, support in zip(verified, stage.support, strict=True):
+        if aligned.gravity_bound_rad > 0.0:
+            assert tilt_of(p[:, :3]) <= aligned.gravity_bound_rad + 1e-9
+            continue
         assert tilt_of(p[:, :3]) < 1e-9
         mine = explained(aligned, bounds, np.array([yaw_of(p[:, :3])]), (-p[:, :3].T @ p[:, 3])[None])
         assert mine.sum() == support
