@@ -10,7 +10,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import viser
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from spherloc.bounds import bounds_of
@@ -148,6 +148,8 @@ arcs_strategy = st.lists(st.tuples(st.floats(-180, 179.99), st.floats(0, 360)), 
 
 @settings(max_examples=60)
 @given(arcs_strategy, st.floats(-180, 179.99), st.floats(0.05, 360))
+@example([(0.0, 360.0)], 0.0, 1.0)
+@example([(0.0, 360.0), (10.0, 5.0)], -1.0, 360.0)
 def test_bars_of_a_row_never_touch(arcs: list[tuple[float, float]], low: float, width: float) -> None:
     window = (low, low + width)
     lo, span = np.array(arcs).T

@@ -188,12 +188,15 @@ def _chosen(pairs: NDArray[np.integer], selected: tuple[int, ...]) -> NDArray[np
 def spans_in(lo_deg: FloatArray, hi_deg: FloatArray, window: Window) -> tuple[IntArray, FloatArray, FloatArray]:
     """What of the arcs (B,) lies in a window: indices (S,) of the arcs, ascending, and ends (S,), (S,) in the window.
 
-    An arc has two parts there if it leaves the window and comes back.
+    An arc has two parts there if it leaves the window and comes back; one of a whole turn or more does not leave it.
     """
     low, high = window
     turns = np.array([-360.0, 0.0, 360.0])
     lo, hi = lo_deg[:, None] + turns, hi_deg[:, None] + turns
-    arc, turn = np.nonzero((lo <= high) & (hi >= low))
+    inside = (lo <= high) & (hi >= low)
+    whole = hi_deg - lo_deg >= 360.0
+    lo[whole], hi[whole], inside[whole] = low, high, turns == 0.0
+    arc, turn = np.nonzero(inside)
     return arc, np.maximum(lo[arc, turn], low), np.minimum(hi[arc, turn], high)
 
 

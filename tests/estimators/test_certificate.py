@@ -39,10 +39,10 @@ def check(trace, bound_px):
     assert certificate.proven == (certificate.gap == 0)
     rate = chance_rate(aligned.bearings, bounds.radians)
     assert certificate.chance_sets == pytest.approx(chance_sets(len(aligned.bearings), certificate.lower_bound, rate))
-    # Level poses, at the widened bounds; with exact gravity these are the noise's.
+    # Level poses of pairs and of fits at the widened bounds, counted at the noise's.
     yaws, centres = good_poses(aligned, bounds)
     level = level_poses(yaws, centres)
-    counts = explained(aligned, bounds, yaws, centres).sum(axis=1)
+    counts = explained(aligned, replace(bounds, pixels=np.full(len(bounds.pixels), bound_px)), yaws, centres).sum(axis=1)
     assert counts.max(initial=0) <= certificate.upper_bound
     # Tilted ones within the bound on gravity, at the noise's bound.
     truth = aligned.align_pose(trace.problem.truth_cam_from_map)

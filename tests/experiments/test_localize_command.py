@@ -276,6 +276,6 @@ def test_scenes_names_kinds_that_others_install(tmp_path: Path, monkeypatch: pyt
     (tmp_path / "plug-in" / "drawn_matches.py").write_text("import nothing_of_that_name\n")
     importlib.invalidate_caches()
     (line,) = [line for line in all_scenes().splitlines() if line.split()[:1] == ["drawn"]]
-    assert "cannot be read: ModuleNotFoundError: No module named 'nothing_of_that_name'" in line
+    assert "cannot be imported (ModuleNotFoundError: No module named 'nothing_of_that_name')" in line
     with pytest.raises(SpherlocError, match="scenes of kind drawn cannot be read"):
         one_kind("drawn")
