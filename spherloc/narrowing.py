@@ -142,7 +142,7 @@ def narrow(bearings, points, weights, wide_px, tight_px, start, noise_px, gravit
     at = start.copy()
     for k, share in enumerate(NARROWINGS):
         limits = tight_px + share * (wide_px - tight_px)
-        robust_steps(bearings, points, weights, limits, at, noise_px, gravity_sd_rad, MOST_STEPS)
+        robust_steps(bearings, points, weights, limits, at, noise_px, gravity_sd_rad, np.int64(MOST_STEPS))
         path[k] = at
 
 
@@ -163,7 +163,8 @@ def descend(bearings, points, weights, limits_px, cam_from_map, noise_px, gravit
         if np.array_equal(mask, before):
             break
         rotation, translation = cam_from_map[:, :3].copy(), cam_from_map[:, 3].copy()
-        polish(points, weights, mask, rotation, translation, noise_px, gravity_sd_rad, ROBUST_NONE, MOST_STEPS)
+        model = (noise_px, gravity_sd_rad, np.int64(ROBUST_NONE))
+        polish(points, weights, mask, rotation, translation, *model, np.int64(MOST_STEPS))
         at = np.empty((3, 4))
         at[:, :3], at[:, 3] = rotation, translation
         cost = truncated_squares(*data, limits_px, at, noise_px, gravity_sd_rad, np.inf)
@@ -204,7 +205,7 @@ def search_nearby(bearings, points, weights, wide_px, limits_px, start, noise_px
             _step(points[sample], weights[sample], chosen, at, noise_px, gravity_sd_rad, SAMPLE_DAMPING)
         if truncated_squares(*data, limits_px, at, noise_px, gravity_sd_rad, least) >= least:
             continue
-        robust_steps(*data, limits_px, at, noise_px, gravity_sd_rad, PROMISING_STEPS)
+        robust_steps(*data, limits_px, at, noise_px, gravity_sd_rad, np.int64(PROMISING_STEPS))
         cost = truncated_squares(*data, limits_px, at, noise_px, gravity_sd_rad, least)
         if cost >= least:
             continue

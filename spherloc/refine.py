@@ -211,11 +211,12 @@ def _alternate(bearings, points, weights, wide_px, tight_px, start, noise_px, gr
     first_errors, limit_px = errors, np.inf
     kept, most, least_cost = states, -1, np.inf
     rotation, translation = path[states - 1, :, :3].copy(), path[states - 1, :, 3].copy()
+    most_steps = np.int64(MAX_STEPS)
     for _ in range(MAX_ROUNDS):
         if limit_px == np.inf and degrees_of_freedom(np.count_nonzero(mask), gravity_sd_rad) == 6:
             limit_px, most = tight_px, -1
         states += polish_path(
-            points, weights, mask, rotation, translation, noise_px, gravity_sd_rad, robust, MAX_STEPS, path[states:]
+            points, weights, mask, rotation, translation, noise_px, gravity_sd_rad, robust, most_steps, path[states:]
         )
         errors = _residuals(bearings, points, weights, path[states - 1])
         before, mask = mask, errors <= np.minimum(wide_px, limit_px)
@@ -247,8 +248,8 @@ def _rescue(bearings, points, weights, limits_px, explained, path, states, noise
     rotation, translation = path[states - 1, :, :3].copy(), path[states - 1, :, 3].copy()
     for _ in range(MAX_RESCUES):
         rest = path[states + steps :]
-        model = (noise_px, gravity_sd_rad, ROBUST_NONE)
-        steps += polish_path(points, heavy, explained, rotation, translation, *model, MAX_STEPS, rest)
+        model = (noise_px, gravity_sd_rad, np.int64(ROBUST_NONE), np.int64(MAX_STEPS))
+        steps += polish_path(points, heavy, explained, rotation, translation, *model, rest)
         errors = _residuals(bearings, points, weights, path[states + steps - 1])
         if np.sum(errors[fitted] ** 2) - cost > RESCUE_REACH * variance:
             return 0

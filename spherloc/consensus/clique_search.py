@@ -90,7 +90,7 @@ def colour_bound(rows):
     if count == 0:
         return 0
     order, bound = np.empty(count, np.int32), np.empty(count, np.int32)
-    listed = colour(all_nodes(count), rows, 0, order, bound)
+    listed = colour(all_nodes(count), rows, np.int64(0), order, bound)
     return np.int64(bound[listed - 1])
 
 

@@ -24,9 +24,8 @@ MOST_IN_CELLS = 16
 """Correspondences up to which cells are tried where duality proves nothing."""
 SORT_EFFORT = 70
 """Words that take as long as sorting an arc in."""
-CELL_EFFORT, ROUND_EFFORT, VERIFY_EFFORT = 200, 40, 200
-"""Words that take as long as a cell, as one correspondence in a round of a proof, and as one when a pose is verified.
-"""
+ROUND_EFFORT, VERIFY_EFFORT = 40, 200
+"""Words that take as long as one correspondence in a round of a proof, and as one when a pose is verified."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -125,7 +124,7 @@ def settle(data, limits, view, everybody, balls, poses, supports, masks, known, 
     while b < len(balls):
         if not balls[b, 3] < np.inf or stopped(board):
             return known, False, effort
-        best = supports[0]
+        best = np.int64(supports[0])
         answer, work = prove_none(view, limits, everybody, balls[b], best, found, board)
         effort += work * ROUND_EFFORT
         if answer == UNKNOWN and len(everybody) <= MOST_IN_CELLS:
@@ -163,7 +162,7 @@ def sweep_bin(data, limits, trig, pairs, lo, hi, nodes, rows, span, poses, suppo
     owned = np.zeros((len(nodes), len(nodes)), np.uint8)
     common = np.empty(rows.shape[1], np.uint64)
     opening, closing = order_of(first, board), order_of(last, board)
-    largest, trials, closed, floor = nothing, 0, 0, supports[0]
+    largest, trials, closed, floor = nothing, 0, 0, np.int64(supports[0])
     exact = True
     for edge in opening:
         if stopped(board):
@@ -205,5 +204,5 @@ def sweep_bin(data, limits, trig, pairs, lo, hi, nodes, rows, span, poses, suppo
         if not proven and len(clique) > len(largest):
             largest = nodes[clique]
         trials += not proven
-        floor = supports[0] if trials < MOST_TRIALS else max(supports[0], len(largest))
+        floor = np.int64(supports[0] if trials < MOST_TRIALS else max(supports[0], len(largest)))
     return known, max(floor, len(largest)) if exact else whole, largest, effort, exact

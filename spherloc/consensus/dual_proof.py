@@ -58,7 +58,7 @@ def prove_none(view, limits, everybody, ball, floor, found, board=None):
         nodes += 1
         gone, stay, here[:] = removed[waiting].copy(), kept[waiting].copy(), places[waiting]
         weight[:] = np.where(gone, 0.0, 1.0)
-        answer, rounds = _lawson(view, limits, everybody, gone, ball, floor, here, weight, residual, ROUNDS)
+        answer, rounds = _lawson(view, limits, everybody, gone, ball, floor, here, weight, residual, np.int64(ROUNDS))
         effort += rounds * count
         if answer == FOUND:
             found[:] = here
@@ -91,7 +91,9 @@ def _basis(view, limits, everybody, gone, ball, here, weight, residual):
         others[order[:size]] = False
         here[:] = start
         alone[:] = np.where(others, 0.0, weight)
-        answer, _ = _lawson(view, limits, everybody, others, ball, len(everybody), here, alone, residual, BASIS_ROUNDS)
+        answer, _ = _lawson(
+            view, limits, everybody, others, ball, len(everybody), here, alone, residual, np.int64(BASIS_ROUNDS)
+        )
         here[:] = start
         if answer == IMPOSSIBLE:
             return order[:size]

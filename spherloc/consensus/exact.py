@@ -6,7 +6,6 @@ bound does not exceed the best verified support cannot hold a better pose and ar
 promising first.
 """
 
-import time
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,6 +25,7 @@ from spherloc.consensus.yaw_bins import BIN_TURN, BINS, degree_bounds, sort_into
 from spherloc.geometry import yaw_rotation
 from spherloc.problem import AlignedProblem
 from spherloc.watch import Watch
+from spherloc.working_time import working_s
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -93,7 +93,7 @@ def exact_consensus(
     it came. ``watch`` counts pairs, steps and then the share of the bins or of the effort, whichever is the larger;
     raises ``Cancelled``.
     """
-    deadline = time.perf_counter() + time_budget_s
+    deadline = working_s() + time_budget_s
     watch = watch or Watch()
     count = len(aligned.bearings)
     # Rounding must not exclude what the pixel bound allows.
@@ -130,10 +130,10 @@ def exact_consensus(
         if bound[b] <= supports[0]:
             break
         watch.reach(int(max(effort, effort_limit * passed // promising)))
-        if effort >= effort_limit or time.perf_counter() >= deadline:
+        if effort >= effort_limit or working_s() >= deadline:
             finished = False
             break
-        nodes, rows = core_graph(count, edges[starts[b] : starts[b + 1]], supports[0], watch.board)
+        nodes, rows = core_graph(count, edges[starts[b] : starts[b + 1]], int(supports[0]), watch.board)
         watch.check()
         span = (b * BIN_TURN, (b + 1) * BIN_TURN)
         known, most, work = _settle_bin(

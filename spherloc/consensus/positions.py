@@ -9,7 +9,6 @@ the largest bound among its tasks is what is proven.
 
 import os
 import threading
-import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import repeat
@@ -38,6 +37,7 @@ from spherloc.consensus.stabbing import scratch_for
 from spherloc.consensus.yaw_bins import BINS
 from spherloc.problem import AlignedProblem
 from spherloc.watch import DONE, Watch
+from spherloc.working_time import working_s
 
 FloatArray = NDArray[np.float64]
 
@@ -97,14 +97,14 @@ def search_positions(
     """Search all poses within the gravity bound for one that explains more matches than ``start`` does.
 
     ``matches`` is that of ``matches_of``. ``start`` is a pose (3, 4) between the aligned frames, within the gravity
-    bound, and what it explains. After ``effort`` tests or at ``deadline`` (``time.perf_counter``) the search stops.
+    bound, and what it explains. After ``effort`` tests or at ``deadline`` (``working_s``) the search stops.
     ``yaw_bound`` (BINS,) bounds what poses explain by bin of turn, if anything is known. ``watch`` counts the tests;
     raises ``Cancelled``.
     """
     watch = watch or Watch()
     watch.expect(effort)
     search = _Search(aligned, matches, start, yaw_bound, watch)
-    if time.perf_counter() < deadline:
+    if working_s() < deadline:
         search.around_start(effort)
         search.first(min(FIRST_EFFORT, effort))
         search.rounds(effort, deadline)
@@ -238,7 +238,7 @@ class _Search:
             return
         self._workers += [_Worker(self.count) for _ in range(TASKS_A_ROUND - 1)]
         each = max(TASK_EFFORT, TASK_ROUNDS * self.count)
-        timer = threading.Timer(min(max(0.0, deadline - time.perf_counter()), threading.TIMEOUT_MAX), self.halt)
+        timer = threading.Timer(min(max(0.0, deadline - working_s()), threading.TIMEOUT_MAX), self.halt)
         timer.daemon = True
         timer.start()
         try:

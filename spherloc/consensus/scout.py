@@ -35,7 +35,7 @@ def scout(data, starts, edges, bound, least, poses, supports, masks, known, boar
         if len(nodes) <= floor or colour_bound(rows) <= floor:
             bound[b] = floor
             continue
-        clique, _, exact = larger_clique(rows, floor, EFFORT_LIMIT, board)
+        clique, _, exact = larger_clique(rows, floor, np.int64(EFFORT_LIMIT), board)
         if exact:
             bound[b] = max(floor, len(clique))
         if len(clique):

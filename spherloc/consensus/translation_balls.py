@@ -176,7 +176,7 @@ def _smallest(bearings, points, eps, pairs, lo, hi, covering, yaw, most, board):
             if stopped(board):
                 break
         arc = covering[place]
-        i, j = pairs[arc, 0], pairs[arc, 1]
+        i, j = np.int64(pairs[arc, 0]), np.int64(pairs[arc, 1])
         if not _least_squared_radius(i, j, bearings, points, chords, sines, c, s) < limit * limit:
             continue
         at = yaw if lo[arc] <= yaw else yaw + 2.0 * np.pi
@@ -221,7 +221,7 @@ def _fill(bearings, points, eps, pairs, yaw, slack, centres, radii):
     chords, sines = chord(eps), np.sin(eps)
     c, s = np.cos(yaw), np.sin(yaw)
     for k in range(len(pairs)):
-        i, j = pairs[k]
+        i, j = np.int64(pairs[k, 0]), np.int64(pairs[k, 1])
         radii[k] = ball_of_pair(i, j, bearings, points, chords, sines, c, s, slack[k], centres[k])
 
 

@@ -193,7 +193,7 @@ def _optimize(yaw, translation, bearings, points, weights, bound_px, mask):
     for _ in range(OPTIMIZATION_ROUNDS):
         score_inliers(yaw, translation, bearings, points, weights, bound_px, mask)
         heavy[:] = mask
-        fit(points, weights, heavy, here, OPTIMIZATION_STEPS)
+        fit(points, weights, heavy, here, np.int64(OPTIMIZATION_STEPS))
         yaw = np.arctan2(here[1], here[0])
         translation_of(here, translation)
     return yaw
@@ -210,7 +210,7 @@ def _search(bearings, points, weights, bound_px, seed, iterations, miss, msac, l
     turned_away = TURNED_AWAY * miss if bounded else 0.0
     blocks = pack_blocks(points, weights, bound_px, _shuffled(seed, count))
     floors = np.empty((count + BLOCK - 1) // BLOCK, np.int64)
-    _set_floors(floors, 1, count, turned_away)
+    _set_floors(floors, np.int64(1), count, turned_away)
     yaws, translations, mask = np.empty(2), np.empty((2, 3)), np.empty(count, np.bool_)
     log, rows, best, drawn = np.empty((32, 9)), 0, 0.0, 0
     log_unclean = 0.0  # logarithm of the chance that one sample is not of the best hypothesis's inliers only

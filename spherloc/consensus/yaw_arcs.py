@@ -182,7 +182,7 @@ def _fill(bearings, points, eps, widest, pairs, lo, hi, board):
             count = _arcs_at_roots(f, tau, most_i, most_j, arcs)
             if count < 0:
                 arcs[0] = 0.0
-                count = _cut(arcs, 1, tau[0] - f[0], tau[1] - f[1], tau[2] - f[2])
+                count = _cut(arcs, np.int64(1), tau[0] - f[0], tau[1] - f[1], tau[2] - f[2])
                 count = _cut(arcs, count, tau[0] + f[0], tau[1] + f[1], tau[2] + f[2])
                 count = _cut(arcs, count, most_i[0], most_i[1], most_i[2])
                 count = _cut(arcs, count, most_j[0], most_j[1], most_j[2])

@@ -6,7 +6,6 @@ Two exact searches share what they find: one over yaw that compares pairs of cor
 leaves out the yaws that the other has settled.
 """
 
-import time
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,6 +26,7 @@ from spherloc.last_step import conclude
 from spherloc.problem import AlignedProblem
 from spherloc.refine import RefinementOptions, residuals_px
 from spherloc.trace import Certificate, ConsensusStage, PositionStage, Stage
+from spherloc.working_time import working_s
 
 FloatArray = NDArray[np.float64]
 
@@ -55,7 +55,8 @@ class McExactOptions(RefinementOptions):
     """Share of the usual effort after which the search stops and reports the gap that is left; usual is some seconds,
     and more than all but very repetitive problems, or those with hardly an inlier, need."""
     time_budget_s: float = 60.0
-    """Seconds after which it stops too. Runs that do not reach it give the same result on every machine."""
+    """Seconds after which it stops too, compiling not counted. Runs that do not reach it give the same result on every
+    machine."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -135,7 +136,7 @@ def _search(
     clock: Clock,
 ) -> _Found:
     """Pairs where they are faster, then positions unless all is proven."""
-    deadline = time.perf_counter() + options.time_budget_s
+    deadline = working_s() + options.time_budget_s
     count, known = len(aligned.bearings), 1 if start is None else start[1]
     few = known <= FEW_INLIERS * count and count <= MOST_FOR_FEW
     pairs, effort, yaw_bound = None, 0, None

@@ -1,0 +1,24 @@
+"""A time budget that a cold cache of kernels does not use up."""
+
+import time
+
+import numba
+
+from spherloc.working_time import working_s
+
+
+def stood_still_s() -> float:
+    """Seconds that were not counted so far; the largest of many, since this thread may wait between two clocks."""
+    return max(time.perf_counter() - working_s() for _ in range(100))
+
+
+def test_compiling_is_not_working() -> None:
+    @numba.njit
+    def kernel(x: float) -> float:
+        return x + 1.0
+
+    before = stood_still_s()
+    assert kernel(1.0) == 2.0
+    compiled = stood_still_s()
+    assert kernel(2.0) == 3.0
+    assert compiled - before > 0.005 and abs(stood_still_s() - compiled) < 0.001 * (compiled - before)
