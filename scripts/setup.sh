@@ -144,7 +144,7 @@ install_python() {
   watch "$venv" -m pip install --disable-pip-version-check -e ".$extras" ||
     die "pip could not install the packages, for the reason above; mend that and try again."
   if [ "$target" != lint ]; then
-    say "preparing the solvers, once: about a minute"
+    say "preparing the solvers, once: some two minutes"
     "$venv" -c 'from spherloc.estimators import warm_up; warm_up()' ||
       die "the solvers could not be prepared, for the reason above; mend that and try again."
   fi

@@ -25,6 +25,7 @@ MAY_PRESS = {
     "step",
     "views",
     "yaw-zoom",
+    "graph-cell",
     "select-bin",
     "image-pick",
     "image-reference",

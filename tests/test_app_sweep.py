@@ -177,7 +177,7 @@ def test_wrong_wishes_are_one_sentence(desk: Desk) -> None:
     assert "has 0 estimators" in said()
     desk.tick("mc")
     desk.scene = Path("nowhere.toml")
-    assert "nowhere.toml: cannot be read" in said()
+    assert "nowhere.toml: no such file" in said()
     panel._chosen = lambda: (_ for _ in ()).throw(InputError("the seed 'x' is no whole number; type one."))
     assert said() == "The seed 'x' is no whole number; type one."
     panel._chosen = lambda: 1 / 0

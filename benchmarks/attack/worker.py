@@ -54,7 +54,7 @@ def _read(kind: Kind, folder: Path, path: Path) -> dict[str, Any]:
     from spherloc.errors import SpherlocError
 
     _forget_peak()
-    children_mb = _children_mb()
+    before_mb, children_mb = _own_peak_mb(), _children_mb()
     start, said, wrong = _busy_s(), "", ""
     try:
         kind.read(folder, path)
@@ -72,7 +72,7 @@ def _read(kind: Kind, folder: Path, path: Path) -> dict[str, Any]:
         "said": said[:200],
         "wrong": wrong,
         "seconds": seconds,
-        "peak_mb": _peak_mb(children_mb),
+        "peak_mb": _peak_mb(before_mb, children_mb),
     }
 
 
@@ -91,12 +91,17 @@ def _children_mb() -> float:
     return resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024.0
 
 
-def _peak_mb(children_mb: float) -> float:
-    """Of this process since then, or of a child that has ended since and had more than those before."""
+def _own_peak_mb() -> float:
+    """The most memory of this process since it was forgotten."""
     status = Path("/proc/self/status").read_text(encoding="utf-8")
-    own = next(int(line.split()[1]) for line in status.splitlines() if line.startswith("VmHWM"))
+    return next(int(line.split()[1]) for line in status.splitlines() if line.startswith("VmHWM")) / 1024.0
+
+
+def _peak_mb(before_mb: float, children_mb: float) -> float:
+    """What this process had at most beyond ``before_mb``, or a child that has ended since and had more than those
+    before."""
     now_mb = _children_mb()
-    return max(own / 1024.0, now_mb if now_mb > children_mb else 0.0)
+    return max(_own_peak_mb() - before_mb, now_mb if now_mb > children_mb else 0.0)
 
 
 def main() -> None:

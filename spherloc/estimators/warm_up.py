@@ -14,7 +14,7 @@ from spherloc.estimators.base import estimate, options_type
 
 
 def warm_up(announce: Callable[[str], None] | None = None) -> None:
-    """Run every estimator once on a tiny problem: a minute after an installation, a fraction of a second later.
+    """Run every estimator once on a tiny problem: two minutes after an installation, a fraction of a second later.
 
     ``announce`` is called with a sentence to show if it will be long, and for every extension that fails here, which
     hinders nothing else.
@@ -23,7 +23,7 @@ def warm_up(announce: Callable[[str], None] | None = None) -> None:
         how_often = "once after an installation"
         if spherloc.kernels_are_temporary:
             how_often = "at every start, since no folder to keep them can be written (NUMBA_CACHE_DIR names another)"
-        announce(f"preparing the solvers, {how_often}: about a minute …")
+        announce(f"preparing the solvers, {how_often}: some two minutes …")
     camera = Equirectangular(width=2048, height=1024)  # sharp enough for every stage to have something to do
     scene = SyntheticScene("warm-up", camera, correspondences=8, outlier_rate=0.25, noise_px=0.1, seed=0)
     for estimator in registry.names("estimators"):
@@ -37,3 +37,5 @@ def warm_up(announce: Callable[[str], None] | None = None) -> None:
     # So murky that the exact search has to use all that it has.
     murky = replace(scene, correspondences=12, outlier_rate=0.6, noise_px=10.0).problem()
     estimate(murky, "mc-exact", options_type("mc-exact")(bound_px=40.0))
+    # With uncertain gravity it searches positions and tilts.
+    estimate(replace(scene, gravity_error_deg=0.5).problem(), "mc-exact")

@@ -50,7 +50,8 @@ FLAGS = (
 SIZE = {"width": 1200, "height": 700}
 SHARPNESS = 0.4
 """Pixels of the screen by those of the page: what is read is the same, and software draws a sixth of the pixels."""
-PATIENCE_MS = 60_000
+PATIENCE_MS = 300_000
+"""How long a page may take to show something, however busy the machine is."""
 START_S = 600.0
 """How long a server may take to say where it is."""
 BLIND = """for (const kind of [WebGLRenderingContext, WebGL2RenderingContext])

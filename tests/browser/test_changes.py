@@ -29,7 +29,7 @@ from spherloc_viz.app.web.viser_seams import (
     stop_viser,
 )
 
-pytestmark = [pytest.mark.browser, pytest.mark.timeout(280, func_only=True)]
+pytestmark = pytest.mark.browser
 KEY = "a key of this test"
 HANDLE = "/handle"
 

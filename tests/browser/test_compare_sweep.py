@@ -34,7 +34,7 @@ SWEEP_MS = 200_000
 """How long a sweep may take to start its processes and to do its first runs."""
 CELLS = "rows => rows.map(row => [...row.cells].map(cell => cell.innerText))"
 
-pytestmark = [pytest.mark.browser, pytest.mark.timeout(280, func_only=True)]
+pytestmark = pytest.mark.browser
 
 
 @pytest.fixture(scope="module")

@@ -43,7 +43,7 @@ start = 0.05
 stop = 0.25
 """
 
-pytestmark = [pytest.mark.browser, pytest.mark.timeout(280, func_only=True)]
+pytestmark = pytest.mark.browser
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ from playwright.sync_api import Browser, expect
 from spherloc_viz.app.audience import ABOUT
 from spherloc_viz.app.web.access import NO_TOKEN
 
-pytestmark = [pytest.mark.browser, pytest.mark.timeout(280, func_only=True)]
+pytestmark = pytest.mark.browser
 
 
 def test_each_link_opens_its_own_page(browser: Browser, tmp_path: Path) -> None:

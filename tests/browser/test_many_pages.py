@@ -30,7 +30,7 @@ SLACK = 3
 MEMORY_MIB = 80.0
 """What the server may keep of pages that have left: caches, and what the allocator does not give back."""
 
-pytestmark = [pytest.mark.timeout(280, func_only=True)]
+
 
 
 @pytest.fixture(scope="module")

@@ -20,7 +20,7 @@ from spherloc_viz.recording.content.reader import read_recording
 
 CAMERA = '[camera]\nmodel = "equirectangular"\nwidth = 2048\nheight = 1024\n'
 
-pytestmark = [pytest.mark.browser, pytest.mark.timeout(280, func_only=True)]
+pytestmark = pytest.mark.browser
 
 
 @pytest.fixture(scope="module")

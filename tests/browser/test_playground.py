@@ -18,7 +18,7 @@ from spherloc_viz.recording.content.reader import read_recording
 
 EXACT, MC, RANSAC = "mc-exact (exact, certified)", "mc (the paper's)", "ransac-2p (two points)"
 
-pytestmark = [pytest.mark.browser, pytest.mark.timeout(280, func_only=True)]
+pytestmark = pytest.mark.browser
 
 
 def test_page_shows_a_localization_and_talks_to_nobody_else(browser: Browser, address: str) -> None:

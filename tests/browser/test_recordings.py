@@ -15,7 +15,7 @@ from playwright.sync_api import Browser, Locator, expect
 from spherloc_viz.recording.content.reader import read_run_row
 from spherloc_viz.recording.review.notes import read_review
 
-pytestmark = [pytest.mark.browser, pytest.mark.timeout(280)]
+pytestmark = pytest.mark.browser
 
 
 @pytest.fixture(scope="module")

@@ -30,7 +30,7 @@ OUTCOMES = {
 }
 """What the story of each preset promises."""
 
-pytestmark = [pytest.mark.browser, pytest.mark.timeout(280, func_only=True)]
+pytestmark = pytest.mark.browser
 
 
 def go_to(tab: Playground, name: str) -> None:

@@ -9,7 +9,7 @@ import pytest
 from playground import Playground
 from playwright.sync_api import Browser, Page
 
-pytestmark = [pytest.mark.browser, pytest.mark.timeout(280, func_only=True)]
+pytestmark = pytest.mark.browser
 
 OPEN_SOCKET = """address => new Promise(done => {
     const socket = new WebSocket(address, ["viser-v1.1.1"]);

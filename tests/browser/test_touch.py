@@ -13,7 +13,7 @@ from spherloc.trace import Trace
 from spherloc_viz.app.catalog import Catalog
 from spherloc_viz.layers.match_rows import match_rows
 
-pytestmark = [pytest.mark.browser, pytest.mark.timeout(280, func_only=True)]
+pytestmark = pytest.mark.browser
 
 
 @pytest.fixture(scope="module")

@@ -42,7 +42,8 @@ def check(trace, bound_px):
     # Level poses of pairs and of fits at the widened bounds, counted at the noise's.
     yaws, centres = good_poses(aligned, bounds)
     level = level_poses(yaws, centres)
-    counts = explained(aligned, replace(bounds, pixels=np.full(len(bounds.pixels), bound_px)), yaws, centres).sum(axis=1)
+    noise = replace(bounds, pixels=np.full(len(bounds.pixels), bound_px))
+    counts = explained(aligned, noise, yaws, centres).sum(axis=1)
     assert counts.max(initial=0) <= certificate.upper_bound
     # Tilted ones within the bound on gravity, at the noise's bound.
     truth = aligned.align_pose(trace.problem.truth_cam_from_map)
