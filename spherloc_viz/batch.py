@@ -19,7 +19,6 @@ from spherloc.metrics import evaluate
 from spherloc.outcome import Outcome, judge
 from spherloc.problem import Problem
 from spherloc.trace import Trace
-from spherloc_viz.layers.certificate import chance, proof, warning
 from spherloc_viz.options import json_text, option_fields
 from spherloc_viz.progress import prepare, say, solve
 from spherloc_viz.recording.keeping.room import KEEP_GIGABYTES, kept_bytes
@@ -73,7 +72,7 @@ def run_scenes(
                 scene = open_scene(path)
                 problem = _problem(path, scene, seed, query, variation)
                 if not warm:
-                    warm_up(say)
+                    warm_up(say, [estimator])
                     warm = True
                 options = resolved_options(estimator, problem, changes)
                 trace = solve(problem, estimator, options, used_seed(scene, seed))
@@ -246,6 +245,9 @@ def as_text(path: Path, trace: Trace, diagnosis: Diagnosis, recording: Path | No
     if metrics.precision is not None and metrics.recall is not None and metrics.f1 is not None:
         lines.append(f"  precision {metrics.precision:.3f}, recall {metrics.recall:.3f}, F1 {metrics.f1:.3f}")
     if trace.certificate is not None:
+        # Only now: the layers take half a second.
+        from spherloc_viz.layers.certificate import chance, proof, warning
+
         lines.append(f"  {proof(trace.certificate)}; expected false sets of this size: {chance(trace.certificate)}")
         lines += [f"  {sentence}" for sentence in (warning(trace.certificate),) if sentence]
     if diagnosis.doubtful:

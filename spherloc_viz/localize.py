@@ -63,7 +63,7 @@ def localize_sequence(
     with ResultsLog(output, configuration_of(scene, path, estimator, options, seed)) as log:
         todo = _todo(scene, chosen, log, retry_failed)
         if todo:
-            warm_up(say)
+            warm_up(say, [estimator])
             with keeper_of(records) as keeper:
                 recorder = None if keeper is None else _Recorder(keeper, path.resolve(), log)
                 _work(scene, todo, log, (estimator, options, seed), recorder)

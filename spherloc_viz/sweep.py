@@ -68,7 +68,7 @@ def _work(
     plan: SweepPlan, log: SweepLog, left: int, workers: int, scheduler: str | None, keeper: "Keeper | None"
 ) -> None:
     if scheduler is None:
-        warm_up(say)  # once, before all workers do it
+        warm_up(say, {entrant.estimator for entrant in plan.entrants})  # once, before all workers do it
     recorded = None if keeper is None else Recorded(keeper)
     keep = None if recorded is None else recorded.keep(scheduler is not None)
     complain = say if recorded is None else recorded.complain

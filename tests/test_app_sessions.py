@@ -355,7 +355,7 @@ def test_a_slow_run_gives_way_and_can_be_cancelled(house: House) -> None:
     page.set(controls._estimator, "ransac-2p (two points)")
     until(lambda: session._run is not None and session._run.trace.estimator == "ransac-2p")
     quick = session._run
-    page.set(controls._options["ransac-2p"]["iterations"].widget, 10_000_000)
+    page.set(controls._options["ransac-2p"]["iterations"].widget, 100_000_000)
     bar, button = session._controls.slow._bar, session._controls.slow._button
     until(lambda: bar.visible and button.visible)
     until(lambda: 0.0 < bar.value < 100.0)

@@ -25,6 +25,7 @@ FLOORS = (
         "spherloc.registry",
         "spherloc.geometry",
         "spherloc.watch",
+        "spherloc.working_time",
         "spherloc.extras",
         "spherloc.disk_cache",
         "spherloc.images",

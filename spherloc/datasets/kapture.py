@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial import KDTree
 
 from spherloc.datasets import map_settings, scene_file
 from spherloc.datasets.colmap_views import gravity_of_map, some, split_gravity
@@ -198,6 +197,8 @@ def _neighbours(kapture: Kapture, records: Sequence[Record], views: Sequence[Vie
     """For each of R posed records, which others show the same things from elsewhere, its rig's own first."""
     if len(records) < 2:
         return [[] for _ in records]
+    from scipy.spatial import KDTree  # takes half a second
+
     poses = np.array([view.cam_from_map for view in views])
     centres, axes = np.stack([camera_centre(pose) for pose in poses]), poses[:, 2, :3]
     count = min(_NEIGHBOURS, len(records))

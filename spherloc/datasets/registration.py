@@ -11,7 +11,6 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from spherloc.cameras.base import Camera, FloatArray, in_image
 from spherloc.errors import InputError
@@ -99,6 +98,8 @@ def surfaces(camera: Camera, lift: Lift) -> Surfaces:
 
 def registration_error_m(start: Surfaces, fixed: Surfaces, down: FloatArray) -> float:
     """RMS distance (metres) by which ICP moves ``start`` until it fits ``fixed``; inf if it does not fit."""
+    from scipy.spatial import KDTree  # takes half a second
+
     tree = KDTree(fixed.points)
     points, normals = start.points, start.normals
     for gate in np.geomspace(*GATES_M, ROUNDS):

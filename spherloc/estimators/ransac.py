@@ -16,7 +16,7 @@ from spherloc.problem import AlignedProblem
 from spherloc.refine import RefinementOptions
 from spherloc.trace import RansacStage
 
-MOST_ITERATIONS = 10_000_000
+MOST_ITERATIONS = 100_000_000
 
 
 @dataclass(frozen=True)

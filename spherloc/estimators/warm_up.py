@@ -1,7 +1,7 @@
 """Loads or compiles the numeric kernels before somebody waits for an answer."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,20 +13,23 @@ from spherloc.errors import InputError
 from spherloc.estimators.base import estimate, options_type
 
 
-def warm_up(announce: Callable[[str], None] | None = None) -> None:
-    """Run every estimator once on a tiny problem: two minutes after an installation, a fraction of a second later.
+def warm_up(announce: Callable[[str], None] | None = None, estimators: Iterable[str] | None = None) -> None:
+    """Run estimators once on a tiny problem: two minutes after an installation, a fraction of a second later.
 
+    ``estimators`` are the names of those that will be needed; all if it is None, and after an installation.
     ``announce`` is called with a sentence to show if it will be long, and for every extension that fails here, which
     hinders nothing else.
     """
-    if announce is not None and not any(Path(os.environ["NUMBA_CACHE_DIR"]).rglob("*.nbi")):
+    cold = not any(Path(os.environ["NUMBA_CACHE_DIR"]).rglob("*.nbi"))
+    if announce is not None and cold:
         how_often = "once after an installation"
         if spherloc.kernels_are_temporary:
             how_often = "at every start, since no folder to keep them can be written (NUMBA_CACHE_DIR names another)"
         announce(f"preparing the solvers, {how_often}: some two minutes …")
     camera = Equirectangular(width=2048, height=1024)  # sharp enough for every stage to have something to do
     scene = SyntheticScene("warm-up", camera, correspondences=8, outlier_rate=0.25, noise_px=0.1, seed=0)
-    for estimator in registry.names("estimators"):
+    names = set(registry.names("estimators") if cold or estimators is None else estimators)
+    for estimator in names:
         try:
             estimate(scene.problem(), estimator)
         except InputError as error:
@@ -34,8 +37,13 @@ def warm_up(announce: Callable[[str], None] | None = None) -> None:
                 raise
             if announce is not None:
                 announce(f"{error} The others work.")
+    # With uncertain gravity, and enough matches to weigh them: the last step of all.
+    uncertain = replace(scene, correspondences=40, noise_px=0.5, gravity_error_deg=0.5).problem()
+    estimate(uncertain, "ransac-2p")
+    if names.isdisjoint(("auto", "mc-exact")):
+        return
     # So murky that the exact search has to use all that it has.
     murky = replace(scene, correspondences=12, outlier_rate=0.6, noise_px=10.0).problem()
     estimate(murky, "mc-exact", options_type("mc-exact")(bound_px=40.0))
     # With uncertain gravity it searches positions and tilts.
-    estimate(replace(scene, gravity_error_deg=0.5).problem(), "mc-exact")
+    estimate(uncertain, "mc-exact")

@@ -79,7 +79,7 @@ class Crew(Protocol):
 
 def solve(plan: SweepPlan, jobs: Sequence[Job], keep: Keep | None) -> Solved:
     """What a worker does."""
-    _warm()
+    _warm(frozenset(entrant.estimator for entrant in plan.entrants))
     if keep is None:
         return Solved(plan.solve(jobs))
     complaints: list[str] = []
@@ -88,9 +88,9 @@ def solve(plan: SweepPlan, jobs: Sequence[Job], keep: Keep | None) -> Solved:
 
 
 @cache
-def _warm() -> None:
+def _warm(estimators: frozenset[str]) -> None:
     """So that no run's time includes the loading of the kernels."""
-    warm_up()
+    warm_up(estimators=estimators)
 
 
 class LocalCrew:

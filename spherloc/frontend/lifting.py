@@ -8,16 +8,18 @@ of references would fill the memory.
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from spherloc.cameras.base import BoolArray, Camera, FloatArray, in_image
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.errors import InputError
 from spherloc.geometry import camera_centre, transform
+
+if TYPE_CHECKING:
+    from scipy.spatial import KDTree
 
 SAME_SURFACE = 0.05
 """Ranges that differ by less than this share of themselves belong to one surface."""
@@ -128,7 +130,7 @@ class PointCloudLift:
 class _DepthBuffer:
     """The nearest of a cloud's points in every cell of the image that holds any."""
 
-    tree: KDTree
+    tree: "KDTree"
     """Of their pixels; round the seam of a panorama."""
     bearings: FloatArray
     """(K + 1, 3) in the camera frame; the last one, NaN, is what the tree calls no neighbour."""
@@ -154,6 +156,8 @@ def _depth_buffer(lift: PointCloudLift) -> _DepthBuffer | None:
         return None
     ranges = np.linalg.norm(points, axis=1)
     wraps = isinstance(camera, Equirectangular)
+    from scipy.spatial import KDTree  # takes half a second
+
     tree = KDTree(camera.project(points)[0], boxsize=[camera.width, 0] if wraps else None)
     nothing = np.full((1, 3), np.nan)
     return _DepthBuffer(tree, np.vstack([points / ranges[:, None], nothing]), np.append(1.0 / ranges, np.nan))
@@ -210,8 +214,10 @@ class SfmLift:
     """A pixel takes the point of the nearest keypoint within this distance."""
 
     @cached_property
-    def _known(self) -> tuple[KDTree, FloatArray]:
+    def _known(self) -> "tuple[KDTree, FloatArray]":
         finite = np.isfinite(self.pixels).all(axis=1) & np.isfinite(self.points).all(axis=1)
+        from scipy.spatial import KDTree
+
         return KDTree(self.pixels[finite]), np.vstack([self.points[finite], np.full((1, 3), np.nan)])
 
     def __call__(self, pixels: FloatArray) -> tuple[FloatArray, BoolArray]:

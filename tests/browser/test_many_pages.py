@@ -31,8 +31,6 @@ MEMORY_MIB = 80.0
 """What the server may keep of pages that have left: caches, and what the allocator does not give back."""
 
 
-
-
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("scene") / "small.toml"

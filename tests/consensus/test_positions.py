@@ -1,6 +1,5 @@
 """The search over positions: no pose of a cell beats what is said of the cell, and none at all beats the result."""
 
-import time
 from dataclasses import replace
 
 import networkx as nx
@@ -24,6 +23,7 @@ from spherloc.consensus.positions import search_positions
 from spherloc.consensus.stabbing import EVERYWHERE, deepest, keep_possible, scratch_for
 from spherloc.geometry import pose
 from spherloc.refine import residuals_px
+from spherloc.working_time import working_s
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
 
@@ -121,7 +121,7 @@ def test_against_brute_force(seed):
 
 
 def everything(aligned, start=None, effort=10**9):
-    return search_positions(aligned, matches_of(aligned, BOUND_PX), start, effort, time.perf_counter() + 600.0)
+    return search_positions(aligned, matches_of(aligned, BOUND_PX), start, effort, working_s() + 600.0)
 
 
 def test_no_larger_than_the_largest_clique_of_pairs(scene_of):
@@ -170,5 +170,5 @@ def test_a_search_that_stops_says_what_is_left(scene_of):
         assert part.pose is None or np.count_nonzero(residuals_px(aligned, part.pose) <= BOUND_PX) == part.support
         uppers.append(part.upper)
     assert uppers[0] == len(aligned.points)
-    late = search_positions(aligned, matches_of(aligned, BOUND_PX), None, 10**9, time.perf_counter() - 1.0)
+    late = search_positions(aligned, matches_of(aligned, BOUND_PX), None, 10**9, working_s() - 1.0)
     assert late.upper == len(aligned.points) and late.pose is None
