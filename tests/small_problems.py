@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from spherloc.bounds import Bounds, bounds_of
-from spherloc.geometry import pose, tangent_basis, yaw_rotation
+from spherloc.geometry import tangent_basis, yaw_rotation
 from spherloc.problem import AlignedProblem
 from spherloc.solvers.two_point import two_point
 
@@ -61,8 +61,8 @@ def tight_problem(rng, count, outliers, bound_px, gravity_bound_rad=0.0, share=1
 
 def level_poses(yaws, centres):
     """Poses (K, 3, 4) of yaws (K,) and camera positions (K, 3)."""
-    rotations = np.array([yaw_rotation(yaw) for yaw in yaws]).reshape(-1, 3, 3)
-    return np.array([pose(r, -r @ c) for r, c in zip(rotations, centres, strict=True)]).reshape(-1, 3, 4)
+    rotations = _rotations(yaws)
+    return np.concatenate([rotations, -rotations @ centres[:, :, None]], axis=2)
 
 
 def explained(aligned, bounds, yaws, centres):
@@ -82,7 +82,7 @@ def good_poses(aligned, bounds):
     yaws, translations = yaws[exists], translations[exists]
     if not len(yaws):
         return np.empty(0), np.empty((0, 3))
-    centres = np.array([-yaw_rotation(y).T @ t for y, t in zip(yaws, translations, strict=True)])
+    centres = -_unturned(yaws, translations)
     for _ in range(2):
         masks = explained(aligned, bounds, yaws, centres)
         _, first = np.unique(masks, axis=0, return_index=True)
@@ -101,21 +101,16 @@ def fit(aligned, bounds, yaws, centres, chosen, rounds=LAWSON_ROUNDS):
         ray, distance = _rays(aligned, yaws, centres)
         scaled = aligned.pixel_from_bearing / bounds.pixels[:, None, None]
         residual = np.einsum("mij,kmj->kmi", scaled, ray)
-        by_yaw = np.stack([ray[..., 2], np.zeros(ray.shape[:2]), -ray[..., 0]], axis=-1)
-        across = scaled - residual[..., None] * ray[..., None, :]
-        rows = np.concatenate(
-            [
-                np.einsum("mij,kmj->kmi", scaled, by_yaw)[..., None],
-                -across / np.maximum(distance, 1e-3)[..., None, None],
-            ],
-            axis=-1,
-        )
-        normal = np.einsum("km,kmia,kmib->kab", heavy, rows, rows)
+        rows = np.empty((*residual.shape, 4))
+        rows[..., 0] = scaled[..., 0] * ray[..., None, 2] - scaled[..., 2] * ray[..., None, 0]
+        rows[..., 1:] = residual[..., None] * ray[..., None, :] - scaled
+        rows[..., 1:] /= np.maximum(distance, 1e-3)[..., None, None]
+        weighed = (heavy[..., None, None] * rows).reshape(len(yaws), -1, 4).transpose(0, 2, 1)
+        normal = weighed @ rows.reshape(len(yaws), -1, 4)
         normal += 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(4) + 1e-12 * np.eye(4)
-        step = -np.linalg.solve(normal, np.einsum("km,kmia,kmi->ka", heavy, rows, residual)[..., None])[..., 0]
+        step = -np.linalg.solve(normal, weighed @ residual.reshape(len(yaws), -1, 1))[..., 0]
         step *= np.minimum(1.0, 0.5 / np.maximum(np.abs(step[:, :1]), 1e-12))
-        turn = np.array([yaw_rotation(yaw) for yaw in yaws])
-        centres, yaws = centres + np.einsum("kji,kj->ki", turn, step[:, 1:]), yaws + step[:, 0]
+        centres, yaws = centres + _unturned(yaws, step[:, 1:]), yaws + step[:, 0]
         heavy = heavy * np.clip(np.linalg.norm(residual, axis=2), 1e-3, 10.0)
         heavy /= np.maximum(heavy.sum(axis=1, keepdims=True), 1e-300)
         visited[0].append(yaws)
@@ -145,10 +140,24 @@ def _topped_up(aligned, bounds, yaws, centres):
 
 def _rays(aligned, yaws, centres):
     """Unit vectors (K, M, 3) from level poses to the points, camera axes, and distances (K, M)."""
-    turn = np.array([yaw_rotation(yaw) for yaw in yaws]).reshape(-1, 3, 3)
-    ray = np.einsum("kij,kmj->kmi", turn, aligned.points - centres[:, None])
+    ray = (aligned.points - centres[:, None]) @ _rotations(yaws).transpose(0, 2, 1)
     distance = np.maximum(np.linalg.norm(ray, axis=2), 1e-12)
     return ray / distance[..., None], distance
+
+
+def _rotations(yaws):
+    """``yaw_rotation`` of each yaw, (K, 3, 3)."""
+    turn = np.zeros((len(yaws), 3, 3))
+    turn[:, 0, 0] = turn[:, 2, 2] = np.cos(yaws)
+    turn[:, 0, 2] = np.sin(yaws)
+    turn[:, 2, 0] = -turn[:, 0, 2]
+    turn[:, 1, 1] = 1.0
+    return turn
+
+
+def _unturned(yaws, vectors):
+    """Vectors (K, 3) of level cameras in the map's axes."""
+    return (vectors[:, None, :] @ _rotations(yaws))[:, 0]
 
 
 def _unit(vectors):

@@ -39,7 +39,9 @@ def aligned_problem(bearings, points):
     """An ``AlignedProblem`` of exactly these bearings and points; arcs and balls use nothing else of it."""
     count = len(points)
     given = {"index": np.arange(count), "count": count, "camera_turn": np.eye(3), "map_turn": np.eye(3)}
-    given |= {"bearings": np.ascontiguousarray(bearings), "points": np.ascontiguousarray(points)}
+    given |= {"bearings": np.array(bearings, order="C"), "points": np.array(points, order="C")}
+    for name in ("bearings", "points"):
+        given[name].setflags(write=False)
     unused = {item.name: np.full(count, np.nan) for item in fields(AlignedProblem)}
     return AlignedProblem(**(unused | given))
 

@@ -15,10 +15,12 @@ from spherloc.consensus.clique_search import (
     set_edge,
     subgraph,
 )
+from spherloc.watch import Watch
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
 
 NO_LIMIT = 10**9
+BOARD = Watch().board
 
 
 def random_graph(rng, count, density):
@@ -54,11 +56,11 @@ def check_floors(adjacency, number):
     assert colour_bound(rows) >= number
     for floor in {0, 1, number // 2, number - 2, number - 1}:
         if 0 <= floor < number:
-            nodes, _, exact = larger_clique(rows, floor, NO_LIMIT)
+            nodes, _, exact = larger_clique(rows, floor, NO_LIMIT, BOARD)
             assert exact and len(nodes) == number
             check_clique(adjacency, nodes)
     for floor in (number, number + 1, len(adjacency), len(adjacency) + 1):
-        nodes, _, exact = larger_clique(rows, floor, NO_LIMIT)
+        nodes, _, exact = larger_clique(rows, floor, NO_LIMIT, BOARD)
         assert exact and len(nodes) == 0
     np.testing.assert_array_equal(rows, rows_of(adjacency))
 
@@ -100,7 +102,7 @@ def test_limit_is_kept_and_confessed(rng):
     sizes, stopped = [], 0
     for limit in (1, 300, 3000, 30_000, 300_000):
         for floor in (0, 10):
-            nodes, effort, exact = larger_clique(rows, floor, limit)
+            nodes, effort, exact = larger_clique(rows, floor, limit, BOARD)
             check_clique(adjacency, nodes)
             assert len(nodes) == 0 or len(nodes) > floor
             assert exact or effort >= limit
@@ -118,14 +120,14 @@ def test_an_answer_that_is_exact_does_not_depend_on_the_limit(rng):
         adjacency = random_graph(rng, 25, 0.6)
         rows, number = rows_of(adjacency), clique_number(adjacency)
         for limit in (1, 20, 50, 100, 200, 400, NO_LIMIT):
-            nodes, _, exact = larger_clique(rows, 2, limit)
+            nodes, _, exact = larger_clique(rows, 2, limit, BOARD)
             assert not exact or len(nodes) == number
 
 
 def test_empty_graph():
     rows = np.zeros((0, 0), np.uint64)
     assert colour_bound(rows) == 0
-    nodes, _, exact = larger_clique(rows, 0, NO_LIMIT)
+    nodes, _, exact = larger_clique(rows, 0, NO_LIMIT, BOARD)
     assert exact and len(nodes) == 0
 
 

@@ -8,6 +8,7 @@ from small_problems import explained, good_poses, tight_problem
 from spherloc.consensus.pair_arcs import pair_arcs, turn_of
 from spherloc.consensus.scout import core_graph, scout
 from spherloc.consensus.yaw_bins import BIN_TURN, BINS, degree_bounds, sort_into_bins
+from spherloc.watch import Watch
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
 
@@ -29,7 +30,7 @@ def test_core_graph_keeps_every_larger_clique(rng, count, densities):
         given = nx.to_numpy_array(graph).astype(bool)
         before = edges.copy()
         for least in (1, 2, 3, 4, 6, count):
-            nodes, rows = core_graph(count, edges, least)
+            nodes, rows = core_graph(count, edges, least, Watch().board)
             assert rows.shape == (len(nodes), (len(nodes) + 63) // 64)
             left = np.zeros((count, count), dtype=bool)
             if len(nodes):
@@ -48,7 +49,7 @@ def test_core_graph_keeps_every_larger_clique(rng, count, densities):
 def test_two_arcs_of_a_pair_are_one_edge(rng):
     """They may keep a node that has too few edges, which costs time; the edge itself is there once."""
     edges = np.array([[0, 1], [0, 1], [1, 2]], np.uint16)
-    nodes, rows = core_graph(3, edges, 1)
+    nodes, rows = core_graph(3, edges, 1, Watch().board)
     inside = adjacency_of(rows)[np.ix_(np.argsort(nodes), np.argsort(nodes))]
     np.testing.assert_array_equal(inside, [[0, 1, 0], [1, 0, 1], [0, 1, 0]])
 
@@ -56,15 +57,15 @@ def test_two_arcs_of_a_pair_are_one_edge(rng):
 def run(problem, floor):
     """Bounds of the bins before and after a scout that knows nothing, and what it found."""
     aligned, bounds = problem.aligned, problem.bounds
-    count = len(aligned.bearings)
+    count, board = len(aligned.bearings), Watch().board
     least_cos = np.cos(np.minimum(bounds.radians + 1e-9, np.pi / 2))
     data = (aligned.bearings, aligned.points, aligned.pixel_from_bearing, bounds.pixels, least_cos)
     pairs, lo, hi = pair_arcs(aligned, bounds.radians)
-    starts, edges = sort_into_bins(pairs, lo, hi)
-    before = degree_bounds(count, starts, edges)
+    starts, edges = sort_into_bins(pairs, lo, hi, board)
+    before = degree_bounds(count, starts, edges, board)
     bound = before.copy()
     poses, supports, masks = np.empty((8, 5)), np.zeros(8, np.int32), np.zeros((8, count), np.bool_)
-    known = scout(data, starts, edges, bound, floor, poses, supports, masks, 0)
+    known = scout(data, starts, edges, bound, floor, poses, supports, masks, 0, board)
     return before, bound, poses[:known], supports[:known], masks[:known]
 
 

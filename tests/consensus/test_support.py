@@ -51,6 +51,7 @@ def test_opposite_points_are_not_explained(rng):
     """The residual of a ray just behind the camera is as small as that of one in front."""
     problem = tight_problem(rng, 12, 0, 2.0, share=0.5)
     behind = 2 * problem.centre - problem.aligned.points
+    behind.setflags(write=False)
     data = (data_of(problem)[0], behind, *data_of(problem)[2:])
     mask = np.ones(12, np.bool_)
     assert mark_support(data, here_of(problem.yaw, problem.centre), mask) == 0 and not mask.any()
@@ -112,6 +113,8 @@ def test_clique_without_a_pose_adds_nothing(rng):
     problem = tight_problem(rng, 12, 0, 2.0)
     bearings = np.tile([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0]], (6, 1))
     points = np.tile([[0.0, -1.0, 0.0], [0.0, 1.0, 0.0]], (6, 1))
+    for array in (bearings, points):
+        array.setflags(write=False)
     poses, supports, masks = empty_list(12)
     data = (bearings, points, *data_of(problem)[2:])
     assert verify(data, np.array([0, 1]), poses, supports, masks, 0) == 0

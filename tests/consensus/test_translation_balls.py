@@ -53,16 +53,18 @@ def test_each_pair_has_its_own_slack(rng):
 def test_balls_are_not_needlessly_large(rng, slack):
     """Median radius against the largest error that noise on the bound and a yaw at the end of the slack produce."""
     ratios = []
+    pairs, times = np.array([[0, 1]], np.int32), 100
+    apart = np.arange(2 * times, dtype=np.int32).reshape(-1, 2)
     for _ in range(200):
         v, depths = unit(rng.normal(size=(2, 3))), rng.uniform(1, 10, (2, 1))
         p, bounds = depths * v, np.full(2, 1e-3)
-        centres = []
-        for _ in range(200):
-            away = unit(np.cross(v, rng.normal(size=(2, 3))))
-            moved = aligned_problem(unit(np.cos(1e-3) * v + np.sin(1e-3) * away), p)
-            yaw = slack * rng.choice([-1.0, 1.0])
-            centres.append(translation_balls(moved, bounds, np.array([[0, 1]], np.int32), yaw, np.zeros(1))[0][0])
-        pairs = np.array([[0, 1]], np.int32)
+        centres = np.empty((0, 3))
+        for yaw in (-slack, slack):
+            away = unit(np.cross(np.tile(v, (times, 1)), rng.normal(size=(2 * times, 3))))
+            moved = unit(np.cos(1e-3) * np.tile(v, (times, 1)) + np.sin(1e-3) * away)
+            moved = aligned_problem(moved, np.tile(p, (times, 1)))
+            found, _ = translation_balls(moved, np.full(2 * times, 1e-3), apart, yaw, np.zeros(times))
+            centres = np.vstack([centres, found])
         radius = translation_balls(aligned_problem(v, p), bounds, pairs, 0.0, np.full(1, slack))[1][0]
         ratios.append(radius / np.linalg.norm(centres, axis=1).max())
     assert min(ratios) > 0.98  # smaller: noise of twice the bound was needed to leave the ball
@@ -120,6 +122,8 @@ def test_smallest_balls_are_the_first_of_all_balls_sorted(rng, bound, most):
     covering, yaw = found.clique, found.yaw_rad
     at = np.where(lo[covering] <= yaw, yaw, yaw + 2 * np.pi)
     slack = np.maximum(at - lo[covering], hi[covering] - at)
+    for array in (lo, hi, covering):
+        array.setflags(write=False)
     centres, radii = translation_balls(twice, bounds, pairs[covering], yaw, slack)
     first = np.argsort(radii, kind="stable")[:most]
     small, small_centres, small_radii = smallest_balls(twice, bounds, (pairs, lo, hi), covering, yaw, most)
@@ -136,6 +140,8 @@ def test_spread_balls_are_the_smallest_that_leave_room_for_others(rng, most):
     found = deepest_yaw(lo, hi)
     assert found is not None
     arcs, data = (pairs, lo, hi), (s.aligned, s.bound_rad)
+    for array in (lo, hi, found.clique):
+        array.setflags(write=False)
     every, centres, radii = smallest_balls(*data, arcs, found.clique, found.yaw_rad, 10**6)
     kept, kept_centres, kept_radii, bounded = spread_balls(*data, arcs, found.clique, found.yaw_rad, most)
     share, used, expected = share_of_each(60, most), np.zeros(60, int), []
@@ -158,8 +164,9 @@ def test_smallest_balls_leave_out_pairs_that_bound_nothing(rng):
     v, p = unit(rng.normal(size=(3, 3))), rng.uniform(-5, 5, (3, 3))
     v[1] = v[0]
     pairs = np.array([[0, 1], [0, 2], [1, 2]], np.int32)
-    arcs = pairs, np.full(3, -0.1), np.full(3, 0.1)
-    every = np.arange(3, dtype=np.int32)
+    arcs, every = (pairs, np.full(3, -0.1), np.full(3, 0.1)), np.arange(3, dtype=np.int32)
+    for array in (*arcs[1:], every):
+        array.setflags(write=False)
     small, _, radii = smallest_balls(aligned_problem(v, p), np.full(3, 1e-3), arcs, every, 0.0, 10)
     assert sorted(map(tuple, small.tolist())) == [(0, 2), (1, 2)] and np.isfinite(radii).all()
     none = smallest_balls(aligned_problem(v, p), np.full(3, 1e-3), arcs, every[:1], 0.0, 10)

@@ -49,6 +49,7 @@ def test_depth_bounds_hold(rng, bound):
         v, p, eps = s.aligned.bearings, s.aligned.points, s.bound_rad
         at = np.array([np.cos(s.yaw), np.sin(s.yaw), 1.0])
         pairs = s.pairs
+        pairs = pairs[rng.choice(len(pairs), 150, replace=False)]
         for (i, j), hopeless in zip(pairs, s.bounds_nothing(pairs), strict=True):
             chords, sines = chord(eps[[i, j]]), np.sin(eps[[i, j]])
             sine, *waves = pair_sinusoids(v[i], v[j], p[i], p[j], *chords, *sines)

@@ -7,8 +7,11 @@ from pair_samples import sample
 
 from spherloc.consensus.pair_arcs import CIRCLE, pair_arcs
 from spherloc.consensus.yaw_bins import BIN_TURN, BINS, degree_bounds, sort_into_bins
+from spherloc.watch import Watch
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
+
+BOARD = Watch().board
 
 
 def touched(lo, hi):
@@ -21,7 +24,7 @@ def touched(lo, hi):
 def numbered(lo, hi):
     """The bins' arcs by number: arc k is the only one of the pair (k, k + 1)."""
     number = np.arange(len(lo), dtype=np.int32)
-    starts, edges = sort_into_bins(np.column_stack([number, number + 1]), lo, hi)
+    starts, edges = sort_into_bins(np.column_stack([number, number + 1]), lo, hi, BOARD)
     assert edges.shape == (starts[-1], 2)
     np.testing.assert_array_equal(edges[:, 1], edges[:, 0] + 1)
     return starts, edges[:, 0]
@@ -70,8 +73,8 @@ def test_bounds_are_none_below_the_clique_number(rng, count, bound):
     """Every bin's whole graph, against an exact solver; two arcs of a pair in a bin are one edge."""
     s = sample(rng, bound, count)
     pairs, lo, hi = pair_arcs(s.aligned, s.bound_rad)
-    starts, edges = sort_into_bins(pairs, lo, hi)
-    bounds = degree_bounds(count, starts, edges)
+    starts, edges = sort_into_bins(pairs, lo, hi, BOARD)
+    bounds = degree_bounds(count, starts, edges, BOARD)
     slack = []
     for b in range(0, BINS, 4):
         graph = nx.empty_graph(count)
@@ -88,5 +91,5 @@ def test_bounds_of_known_graphs():
     every = np.column_stack(np.triu_indices(count, 1)).astype(np.int32)
     star = every[every[:, 0] == 0]
     for pairs, expected in ((every, count), (every[:0], 1), (every[:1], 2), (star, 2)):
-        starts, edges = sort_into_bins(pairs, np.zeros(len(pairs)), np.full(len(pairs), CIRCLE))
-        assert (degree_bounds(count, starts, edges) == expected).all()
+        starts, edges = sort_into_bins(pairs, np.zeros(len(pairs)), np.full(len(pairs), CIRCLE), BOARD)
+        assert (degree_bounds(count, starts, edges, BOARD) == expected).all()

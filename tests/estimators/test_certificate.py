@@ -87,7 +87,7 @@ def horizontal(generator):
 def test_small_problems(rng, scene_of, camera, gravity_error_deg):
     """Of every kind: few inliers or none, wide bounds, points and pixels used several times."""
     plain, proven, missed = 0, 0, 0
-    for seed in range(25):
+    for seed in range(16):
         count, rate = int(rng.integers(4, 15)), rng.choice([0.0, 0.4, 0.7, 1.0])
         scene = scene_of(
             camera, correspondences=count, outlier_rate=rate, noise_px=0.5, gravity_error_deg=gravity_error_deg
@@ -103,14 +103,15 @@ def test_small_problems(rng, scene_of, camera, gravity_error_deg):
             points[:2], pixels[:2] = points[-1], pixels[-1]
         problem = replace(problem, points=points, pixels=pixels, truth_inliers=None)
         bound_px = float(rng.choice([0.5, 2.0, 8.0, 30.0]))
-        trace = solve(problem, Options(bound_px=bound_px), seed)
+        # With points at one place the search ends at its limit, whatever that is.
+        trace = solve(problem, Options(bound_px=bound_px, effort=0.05 if kind == 1 else 1.0), seed)
         known = check(trace, bound_px)
         # Of what lies at one point or in one pixel often nothing is proven, and nothing is said to be.
         if kind in (0, 3) and gravity_error_deg == 0.0:
             plain += 1
             proven += trace.certificate.proven
             missed += known > trace.certificate.lower_bound
-    assert proven >= plain - 2 and missed <= 1, f"{proven} proven and {missed} missed of {plain}"
+    assert proven >= plain - 1 and missed == 0, f"{proven} proven and {missed} missed of {plain}"
 
 
 def test_tilt_from_the_options_is_no_level_pose(scene_of):

@@ -191,7 +191,7 @@ def test_smallest_problems(scene_of, count):
         {"iterations": -5},
         {"iterations": 2.5},
         {"iterations": None},
-        {"iterations": 10**8},
+        {"iterations": 10**8 + 1},
         {"confidence": 0.0},
         {"confidence": 1.0},
         {"confidence": np.nan},
