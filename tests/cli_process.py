@@ -1,10 +1,15 @@
-"""The installed command as a process."""
+"""The installed command: as a process, and within this one."""
 
+import io
 import os
 import subprocess
 import sys
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
+import pytest
+
+from spherloc_viz.cli import main
 from tests.waiting import LIMIT_S
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -24,6 +29,20 @@ def spherloc(*words: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
         env=environment,
         check=False,
     )
+
+
+def spherloc_here(*words: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
+    """The same within this process, for what it says and its exit code; a start would take seconds."""
+    output, errors = io.StringIO(), io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(output), redirect_stderr(errors):
+        patch.chdir(cwd)
+        patch.setenv("COLUMNS", "100")
+        patch.setattr(sys, "argv", ["spherloc", *map(str, words)])
+        with pytest.raises(SystemExit) as ended:
+            main()
+    code = ended.value.code or 0
+    assert isinstance(code, int)
+    return subprocess.CompletedProcess(sys.argv, code, output.getvalue(), errors.getvalue())
 
 
 def one_sentence(result: subprocess.CompletedProcess[str]) -> str:

@@ -10,7 +10,7 @@ from typing import Literal
 
 import numpy as np
 import pytest
-from cli_process import ROOT, SCENE, one_sentence, spherloc
+from cli_process import ROOT, SCENE, one_sentence, spherloc, spherloc_here
 
 from spherloc.datasets import load_scene
 from spherloc.diagnosis import Cause, Diagnosis
@@ -47,7 +47,8 @@ def tiny(folder: Path, toml: str = HEAD + CAMERA + GRAVITY, rows: str | bytes = 
 def test_run_prints_one_json_object_a_scene_and_records_each(tmp_path: Path, estimator: str) -> None:
     scenes = [SCENE, ROOT / "scenes" / "panorama_outliers_90.toml"]
     given = (SCENE, "panorama_outliers_90")
-    result = spherloc("run", *given, "--estimator", estimator, "--seed", "5", "--json", cwd=tmp_path)
+    call = spherloc if estimator == "mc" else spherloc_here
+    result = call("run", *given, "--estimator", estimator, "--seed", "5", "--json", cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     records = [json.loads(line) for line in result.stdout.splitlines()]
     assert [record["scene"] for record in records] == [str(scene) for scene in scenes]
@@ -65,20 +66,20 @@ def test_run_prints_one_json_object_a_scene_and_records_each(tmp_path: Path, est
 
 
 def test_same_seed_same_pose_and_other_seed_other_problem(tmp_path: Path) -> None:
-    def solve(seed: int) -> list[list[float]]:
-        result = spherloc("run", SCENE, "--seed", str(seed), "--json", "--no-record", cwd=tmp_path)
+    def solve(seed: int, call=spherloc_here) -> list[list[float]]:
+        result = call("run", SCENE, "--seed", str(seed), "--json", "--no-record", cwd=tmp_path)
         record = json.loads(result.stdout)
         assert record["recording"] is None
         return record["cam_from_map"]
 
-    assert solve(3) == solve(3)
+    assert solve(3) == solve(3, spherloc), "in another process too"
     assert solve(3) != solve(4)
     assert not (tmp_path / "recordings").exists()
 
 
 def test_options_reach_the_estimator(tmp_path: Path) -> None:
     words = ("--estimator", "ransac-2p", "--option", "iterations=50", "confidence=0.9", "--json", "--no-record")
-    record = json.loads(spherloc("run", SCENE, *words, cwd=tmp_path).stdout)
+    record = json.loads(spherloc_here("run", SCENE, *words, cwd=tmp_path).stdout)
     options = record["options"]
     assert (options["bound_px"], options["iterations"], options["confidence"]) == (8.0, 50, 0.9)
 
@@ -89,7 +90,7 @@ def refuse(word: str) -> None:
 
 def test_options_of_every_form_reach_the_estimator_and_json(tmp_path: Path) -> None:
     words = ("gravity_sd_deg=inf", "robust=huber", "confidence=none", "local_optimization=true")
-    result = spherloc(
+    result = spherloc_here(
         "run", SCENE, "--estimator", "ransac-2p", "--json", "--no-record", "--option", *words, cwd=tmp_path
     )
     (line,) = result.stdout.splitlines()
@@ -101,7 +102,7 @@ def test_options_of_every_form_reach_the_estimator_and_json(tmp_path: Path) -> N
 @pytest.mark.parametrize("estimator", ["mc", "mc-exact"])
 def test_json_has_certificate_and_diagnosis(tmp_path: Path, estimator: str) -> None:
     scene = ROOT / "scenes" / "mei_outliers_90.toml"
-    result = spherloc("run", scene, "--estimator", estimator, "--json", "--no-record", cwd=tmp_path)
+    result = spherloc_here("run", scene, "--estimator", estimator, "--json", "--no-record", cwd=tmp_path)
     record = json.loads(result.stdout, parse_constant=refuse)
     if estimator == "mc":
         assert record["certificate"] is None
@@ -115,7 +116,7 @@ def test_json_has_certificate_and_diagnosis(tmp_path: Path, estimator: str) -> N
 
 def test_text_tells_what_is_proven(tmp_path: Path) -> None:
     scene = ROOT / "scenes" / "mei_outliers_90.toml"
-    result = spherloc("run", scene, "--estimator", "mc-exact", "--no-record", cwd=tmp_path)
+    result = spherloc_here("run", scene, "--estimator", "mc-exact", "--no-record", cwd=tmp_path)
     assert "proven optimal: no pose explains more than" in result.stdout
     assert "expected false sets of this size:" in result.stdout and "diagnosis" not in result.stdout
 
@@ -206,7 +207,7 @@ def test_wrong_option_values_name_what_may_be_given(monkeypatch: pytest.MonkeyPa
 
 def test_bound_of_the_scene_is_used_and_truth_may_be_unknown(tmp_path: Path) -> None:
     scene = tiny(tmp_path, HEAD + CAMERA + GRAVITY + "\n[options]\nbound_px = 5\n")
-    result = spherloc("run", scene, "--json", "--no-record", cwd=tmp_path)
+    result = spherloc_here("run", scene, "--json", "--no-record", cwd=tmp_path)
     record = json.loads(result.stdout)
     assert record["options"]["bound_px"] == 5
     assert record["success"] is None and record["rotation_error_deg"] is None
@@ -220,7 +221,7 @@ def test_a_wrong_scene_does_not_stop_the_others(tmp_path: Path) -> None:
 
 
 def test_text_output_tells_pose_inliers_time_and_errors(tmp_path: Path) -> None:
-    result = spherloc("run", SCENE, "--no-record", cwd=tmp_path)
+    result = spherloc_here("run", SCENE, "--no-record", cwd=tmp_path)
     for part in ("cam_from_map", "20 of 100 correspondences are inliers", " ms", "success:", "precision 0.950"):
         assert part in result.stdout, result.stdout
 
@@ -253,7 +254,7 @@ def test_text_output_tells_pose_inliers_time_and_errors(tmp_path: Path) -> None:
 def test_bad_input_is_one_sentence_and_exit_code_2(
     tmp_path: Path, toml: str, rows: str | bytes, parts: list[str]
 ) -> None:
-    message = one_sentence(spherloc("run", tiny(tmp_path, toml, rows), "--no-record", cwd=tmp_path))
+    message = one_sentence(spherloc_here("run", tiny(tmp_path, toml, rows), "--no-record", cwd=tmp_path))
     for part in parts:
         assert part in message
 
@@ -269,26 +270,21 @@ def test_bad_input_is_one_sentence_and_exit_code_2(
         (("run", SCENE, "--option", "bound_px=-1"), "bound_px"),
         (("run", SCENE, "--option", "robust=tukey"), "none, huber, cauchy or adaptive"),
         (("run", SCENE, "--seed", "-4"), "seed"),
-        (("view", "missing.rrd"), "missing.rrd"),
         (("play", "missing.toml"), "missing.toml"),
     ],
 )
 def test_bad_words_are_one_sentence(tmp_path: Path, words: tuple[str | Path, ...], part: str) -> None:
-    assert part in one_sentence(spherloc(*words, cwd=tmp_path))
+    assert part in one_sentence(spherloc_here(*words, cwd=tmp_path))
 
 
 @pytest.mark.parametrize("command", ["run", "runs"])
 def test_a_path_that_no_disk_takes_is_one_sentence(tmp_path: Path, command: str) -> None:
-    message = one_sentence(spherloc(command, "x" * 5000, cwd=tmp_path))
+    message = one_sentence(spherloc_here(command, "x" * 5000, cwd=tmp_path))
     assert ("too long" in message or "no such folder" in message) and len(message) < 500
 
 
-@needs("/dev/full")
-def test_output_that_cannot_be_written_is_one_sentence_and_a_closed_pipe_none(tmp_path: Path) -> None:
+def test_a_closed_pipe_ends_it_without_a_word(tmp_path: Path) -> None:
     program = [str(Path(sys.executable).with_name("spherloc")), "scenes"]
-    with Path("/dev/full").open("w") as full:
-        done = subprocess.run(program, stdout=full, stderr=subprocess.PIPE, text=True, cwd=tmp_path, check=False)
-    assert done.returncode == 2 and len(done.stderr.splitlines()) == 1 and "No space left" in done.stderr
     reader, writer = os.pipe()
     os.close(reader)
     try:
@@ -300,7 +296,7 @@ def test_output_that_cannot_be_written_is_one_sentence_and_a_closed_pipe_none(tm
 
 def test_a_folder_that_cannot_be_written_keeps_the_result(tmp_path: Path) -> None:
     (tmp_path / "recordings").write_text("in the way")
-    result = spherloc("run", SCENE, "--json", cwd=tmp_path)
+    result = spherloc_here("run", SCENE, "--json", cwd=tmp_path)
     assert result.returncode == 2
     assert len(result.stderr.strip().splitlines()) == 1 and "recordings" in result.stderr
     record = json.loads(result.stdout)
@@ -309,7 +305,7 @@ def test_a_folder_that_cannot_be_written_keeps_the_result(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("command", ["run", "localize", "play", "view", "scenes"])
 def test_help_has_examples(tmp_path: Path, command: str) -> None:
-    result = spherloc(command, "--help", cwd=tmp_path)
+    result = spherloc_here(command, "--help", cwd=tmp_path)
     assert result.returncode == 0
     assert "For example:" in result.stdout and f"spherloc {command}" in result.stdout
 
@@ -319,7 +315,7 @@ def test_help_has_examples(tmp_path: Path, command: str) -> None:
 def test_real_problems_from_the_command_line(tmp_path: Path, estimator: str) -> None:
     limits = {"rgb": (0.3, 0.02), "slam_left": (0.3, 0.02), "slam_right": (1.0, 0.03)}
     scenes = [DATA / "aria_adt_fisheye" / f"{name}.toml" for name in limits]
-    result = spherloc("run", *scenes, "--estimator", estimator, "--json", "--no-record", cwd=tmp_path)
+    result = spherloc_here("run", *scenes, "--estimator", estimator, "--json", "--no-record", cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     for line, (degrees, metres) in zip(result.stdout.splitlines(), limits.values(), strict=True):
         record = json.loads(line)

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from cli_process import SCENE, one_sentence, spherloc
+from cli_process import SCENE, one_sentence, spherloc, spherloc_here
 
 from spherloc.datasets import bundled_scenes, load_scene, scene_path
 from spherloc.estimators import estimate
@@ -12,12 +12,13 @@ from spherloc_viz.recording.review.notes import write_review
 from spherloc_viz.recording_commands import without_reviews
 
 
+@pytest.mark.usefixtures("own_examiner")
 def test_labels_that_a_pattern_finds_too_are_no_recordings(tmp_path: Path) -> None:
     row = write_recording(estimate(load_scene(SCENE).problem(1), "ransac-2p", seed=1), tmp_path / "run.rrd")
     write_review(tmp_path / "run.rrd", ["seen"], "", row.run_id)
     files = sorted(path.name for path in tmp_path.glob("*.rrd"))
     assert files == ["run.review.rrd", "run.rrd"]
-    result = spherloc("label", *files, "--add", "twice", cwd=tmp_path)
+    result = spherloc_here("label", *files, "--add", "twice", cwd=tmp_path)
     assert (result.returncode, result.stdout, result.stderr) == (0, "run.rrd: seen, twice\n", "")
     assert without_reviews([*map(Path, files)]) == (Path("run.rrd"),)
     assert without_reviews([Path("a.review.rrd")]) == (Path("a.review.rrd"),), "said to be no recording"
@@ -44,7 +45,7 @@ def test_a_file_goes_before_the_bundled_scene_of_its_name(tmp_path: Path, monkey
 
 
 def test_scenes_shows_how_a_kind_is_written(tmp_path: Path) -> None:
-    shown = spherloc("scenes", "colmap", cwd=tmp_path).stdout
+    shown = spherloc_here("scenes", "colmap", cwd=tmp_path).stdout
     assert 'kind = "colmap"' in shown and "``" not in shown and "code-block" not in shown
-    assert str(SCENE) in spherloc("scenes", "synthetic", cwd=tmp_path).stdout
-    assert "'magic'" in one_sentence(spherloc("scenes", "magic", cwd=tmp_path))
+    assert str(SCENE) in spherloc_here("scenes", "synthetic", cwd=tmp_path).stdout
+    assert "'magic'" in one_sentence(spherloc_here("scenes", "magic", cwd=tmp_path))

@@ -98,7 +98,7 @@ def test_whoever_is_killed_at_any_moment_loses_the_run_in_flight_only(
     folder.mkdir()
     scratches.mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(scratches))
-    kills, seed = 12, int(rng.integers(2**31))
+    kills, seed = 6, int(rng.integers(2**31))
     done = subprocess.run(
         [sys.executable, "-c", KILLER, folder, ROOT / "scenes" / "mei_outliers_80.toml", str(seed), str(kills)],
         cwd=ROOT,
@@ -143,7 +143,7 @@ def wait_for_upkeep(recorder: Recorder) -> None:
     assert not recorder._upkeep.is_alive()
 
 
-@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=12, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(share=st.floats(0.0, 1.0), garbage=st.binary(max_size=40))
 def test_what_is_left_of_a_file_becomes_the_run_again_or_nothing(
     recorded: bytes, trace: Trace, dead: str, examiner: Examiner, share: float, garbage: bytes

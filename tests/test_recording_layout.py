@@ -225,7 +225,7 @@ def image_run(trace: Trace, folder: Path) -> Trace:
     return replace(trace, problem=replace(trace.problem, image=path))
 
 
-@pytest.mark.parametrize("name", ["clique_run", "sample_run", "lost", "exact", "image"])
+@pytest.mark.parametrize("name", ["sample_run", "lost", "exact", "image"])
 def test_the_viewer_has_no_fault_to_find(
     name: str, request: pytest.FixtureRequest, tmp_path: Path, viewer: ViewerClient
 ) -> None:

@@ -32,7 +32,7 @@ MEI = ROOT / "scenes" / "mei_outliers_80.toml"
 
 @pytest.fixture(scope="module")
 def trace() -> Trace:
-    options = options_type("ransac-2p")(iterations=40, gravity_sd_deg=float("inf"), bound_px=3)
+    options = options_type("ransac-2p")(iterations=40, gravity_sd_deg=float("inf"), bound_px=3.0)
     return estimate(scene_problem("mei_outliers_80"), "ransac-2p", options, seed=11)
 
 

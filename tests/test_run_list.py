@@ -3,14 +3,12 @@
 import csv
 import io
 import json
-import os
 import shutil
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from cli_process import one_sentence, spherloc, spherloc_here
 from recording_samples import scene_problem
 from run_rows import random_row, some_row
 
@@ -26,7 +24,6 @@ from spherloc_viz.recording.review.notes import Review, read_review, write_revie
 from spherloc_viz.recording.run_row import RunRow
 from spherloc_viz.recording_commands import label, reindex, runs, steps
 from spherloc_viz.runs import diagnosis_of, sort_key
-from tests.waiting import LIMIT_S
 
 
 @pytest.fixture(scope="module")
@@ -192,7 +189,7 @@ def test_labels_are_given_found_and_taken_away(folder: Path, capsys: pytest.Capt
 
 def test_reindex_brings_all_back(folder: Path, capsys: pytest.CaptureFixture[str]):
     """Without the database: rows, labels and notes; what is no run is named, and the others are listed."""
-    label((folder / "hurried.rrd",), add=("look",), note="note")
+    write_review(folder / "hurried.rrd", ["look"], "note")
     (folder / "gallery").mkdir()
     shutil.copy(folder / "blind.rrd", folder / "gallery" / "case.rrd")
     write_review(folder / "gallery" / "case.rrd", ["of the gallery"], "")
@@ -215,21 +212,11 @@ def test_reindex_brings_all_back(folder: Path, capsys: pytest.CaptureFixture[str
 
 
 def test_as_a_user_calls_it(folder: Path):
-    program = Path(sys.executable).with_name("spherloc")
-    environment = os.environ | {"COLUMNS": "100"}
-
-    def spherloc(*words: str) -> subprocess.CompletedProcess[str]:
-        command = [str(program), *words]
-        return subprocess.run(
-            command, cwd=folder.parent, capture_output=True, text=True, timeout=LIMIT_S, env=environment, check=False
-        )
-
-    done = spherloc("runs", "--failed", "--outliers", ">0.7", "--sort", "position-error")
+    done = spherloc("runs", "--failed", "--outliers", ">0.7", "--sort", "position-error", cwd=folder.parent)
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.splitlines()[0].split()[:4] == ["Run", "Estimator", "Outcome", "Diagnosis"]
     assert done.stdout.splitlines()[2].strip() == "recordings/hurried.rrd"
-    done = spherloc("runs", "--outliers", "x")
-    assert (done.returncode, done.stdout) == (2, "") and done.stderr.count("\n") == 1
+    assert "'x' is no range" in one_sentence(spherloc_here("runs", "--outliers", "x", cwd=folder.parent))
 
 
 def test_steps_are_asked_for_over_all_runs(folder: Path, capsys: pytest.CaptureFixture[str]):
@@ -269,6 +256,7 @@ def test_steps_of_runs_that_cannot_be_asked(folder: Path, capsys: pytest.Capture
         vanished = replace(rows[0], run_id="0", file="vanished.rrd")
         steps_found = find_steps(folder, [vanished, *rows], "step = 0")
         assert steps_found.refused == ("vanished.rrd",)
+        (folder / "vanished.rrd").unlink()
         assert {step.run.run_id for step in steps_found.found} == {row.run_id for row in rows}
         for row in rows:
             index.add(replace(row, format_version=1))

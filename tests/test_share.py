@@ -2,7 +2,6 @@
 
 import json
 import math
-import os
 import shlex
 import subprocess
 import sys
@@ -11,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from cli_process import spherloc_here
 
 from spherloc.datasets import load_scene
 from spherloc.datasets.variation import Variation
@@ -40,19 +40,15 @@ MANY = Variation(
 )
 
 
-def run(words: list[str], cwd: Path) -> str:
-    done = subprocess.run(words, cwd=cwd, capture_output=True, text=True, timeout=LIMIT_S, check=False)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
-
-
 def pasted(script: str, command: str, cwd: Path) -> tuple[Any, Any]:
-    """The poses that the script and the command print, run in a folder."""
-    (cwd / "pasted.py").write_text(script)
-    from_script = run([sys.executable, "pasted.py"], cwd).splitlines()[-1]
+    """The poses that the script and, in a shell, the command find in a folder."""
+    names: dict[str, Any] = {}
+    exec(script.replace("print", "str"), names)
     program = shlex.quote(str(Path(sys.executable).with_name("spherloc")))
     shell = f"{program} {command.removeprefix('spherloc ')} --json --no-record"
-    return json.loads(from_script), json.loads(run(["sh", "-c", shell], cwd))["cam_from_map"]
+    done = subprocess.run(["sh", "-c", shell], cwd=cwd, capture_output=True, text=True, timeout=LIMIT_S, check=False)
+    assert done.returncode == 0, done.stderr
+    return names["trace"].cam_from_map.tolist(), json.loads(done.stdout)["cam_from_map"]
 
 
 def test_many_changes_of_a_simulation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -61,8 +57,14 @@ def test_many_changes_of_a_simulation(tmp_path: Path, monkeypatch: pytest.Monkey
     wish = (MEI, 7, None, MANY, "mc-exact", options)
     expected = estimate(MANY.problem(load_scene(MEI), 7), "mc-exact", options, 7)
     assert expected.cam_from_map is not None
-    script, command = as_python(*wish), as_command(*wish)
-    assert pasted(script, command, tmp_path) == (expected.cam_from_map.tolist(), expected.cam_from_map.tolist())
+    (tmp_path / "pasted.py").write_text(as_python(*wish))
+    words = [sys.executable, "pasted.py"]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=LIMIT_S, check=False)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout.splitlines()[-1]) == expected.cam_from_map.tolist()
+    words = shlex.split(as_command(*wish).removeprefix("spherloc "))
+    result = spherloc_here(*words, "--json", "--no-record", cwd=tmp_path)
+    assert json.loads(result.stdout)["cam_from_map"] == expected.cam_from_map.tolist(), result.stderr
 
 
 def test_a_query_image(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -139,20 +141,6 @@ def test_names_that_look_like_flags_or_code(tmp_path: Path, monkeypatch: pytest.
         assert repr(query) in as_python(*wish) or f'"{query}"' in as_python(*wish)
 
 
-def spherloc(*words: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
-    program = Path(sys.executable).with_name("spherloc")
-    environment = os.environ | {"COLUMNS": "100"}
-    return subprocess.run(
-        [program, *map(str, words)],
-        cwd=cwd,
-        capture_output=True,
-        text=True,
-        timeout=LIMIT_S,
-        env=environment,
-        check=False,
-    )
-
-
 def test_every_scene_is_changed_and_a_wrong_one_is_a_sentence(capsys: pytest.CaptureFixture[str]) -> None:
     street = ROOT / "scenes" / "street_fisheye.toml"
     changes = Variation(outlier_rate=0.5, correspondences=40, hidden=(0, 1))
@@ -168,7 +156,7 @@ def test_every_scene_is_changed_and_a_wrong_one_is_a_sentence(capsys: pytest.Cap
 def test_settings_after_one_flag_or_after_several(tmp_path: Path) -> None:
     words = ["--set", "outlier_rate=0.5", "correspondences=40", "--set", "noise_px=0.25", "--hide", "0,1"]
     options = ["--option", "bound_px=2", "--option", "max_balls=30", "robust=huber"]
-    result = spherloc("run", PANORAMA, *words, *options, "--json", "--no-record", cwd=tmp_path)
+    result = spherloc_here("run", PANORAMA, *words, *options, "--json", "--no-record", cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     record = json.loads(result.stdout)
     assert record["correspondences"] == 38 and record["rotation_error_deg"] < 0.2
@@ -176,7 +164,7 @@ def test_settings_after_one_flag_or_after_several(tmp_path: Path) -> None:
 
 
 def test_a_mistyped_setting_is_one_line(tmp_path: Path) -> None:
-    result = spherloc("run", PANORAMA, "--set", "noise_px=1", "loud=1", cwd=tmp_path)
+    result = spherloc_here("run", PANORAMA, "--set", "noise_px=1", "loud=1", cwd=tmp_path)
     assert result.returncode == 2 and result.stdout == "" and len(result.stderr.splitlines()) == 1
     assert "setting 'loud=1' is unknown; give KEY=VALUE with camera, correspondences, noise_px" in result.stderr
 

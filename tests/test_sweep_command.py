@@ -11,6 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from cli_process import spherloc_here
 
 from spherloc.errors import InputError
 from spherloc.experiments.sweep_rows import SweepRow
@@ -65,13 +66,7 @@ def test_ctrl_c_keeps_what_is_done_and_the_same_command_goes_on(scene: Path, tmp
     assert stopped is not None and 0 <= done - int(stopped[1].replace(",", "")) <= 1 and stopped[2] == str(out)
     assert done < 18_000 and not out.with_suffix(".png").exists()
     words[words.index("3000")] = str(-(-done // 6) + 1)
-    finished = subprocess.run(
-        [*PROGRAM, scene, *words],
-        capture_output=True,
-        text=True,
-        timeout=LIMIT_S,
-        check=False,
-    )
+    finished = spherloc_here("sweep", scene, *words, cwd=tmp_path)
     assert finished.returncode == 0, finished.stderr
     assert "runs are done already" in finished.stderr
     with out.open(newline="") as file:

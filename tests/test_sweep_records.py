@@ -1,6 +1,8 @@
 """Every run of a sweep is recorded where it is done, by several processes into one folder."""
 
 import csv
+import io
+from contextlib import redirect_stderr
 from dataclasses import replace
 from pathlib import Path
 
@@ -33,10 +35,18 @@ def swept(out: Path, recordings: Path, **changes: object) -> int:
     return sweep(SCENE, "outlier_rate", settings=settings, **(words | more | changes))  # type: ignore[arg-type]
 
 
-def test_the_runs_of_all_workers_are_recorded_and_listed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folder, out = tmp_path / "recordings", tmp_path / "sweep.csv"
-    assert swept(out, folder) == 0
-    assert "recorded" not in capsys.readouterr().err
+@pytest.fixture(scope="module")
+def here(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, str]:
+    """The CSV of a sweep by two workers, the folder of its recordings, and what was said."""
+    folder, said = tmp_path_factory.mktemp("here"), io.StringIO()
+    with redirect_stderr(said):
+        assert swept(folder / "sweep.csv", folder / "recordings") == 0
+    return folder / "sweep.csv", folder / "recordings", said.getvalue()
+
+
+def test_the_runs_of_all_workers_are_recorded_and_listed(here: tuple[Path, Path, str]) -> None:
+    out, folder, said = here
+    assert "recorded" not in said
     with out.open(newline="") as file:
         rows = {(row["estimator"].split()[0], row["outlier_rate"], int(row["seed"])) for row in csv.DictReader(file)}
     with RunIndex(folder) as index:
@@ -55,16 +65,15 @@ def test_the_runs_of_all_workers_are_recorded_and_listed(tmp_path: Path, capsys:
 
 
 def test_a_clusters_workers_on_this_machine_record_the_same_runs(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    here: tuple[Path, Path, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    here, cluster = tmp_path / "here", tmp_path / "cluster"
-    swept(tmp_path / "here.csv", here, workers=1)
+    cluster = tmp_path / "cluster"
     with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, silence_logs=50
+        n_workers=1, threads_per_worker=1, processes=True, dashboard_address=None, silence_logs=50
     ) as workers:
         swept(tmp_path / "cluster.csv", cluster, scheduler=workers.scheduler_address)
     assert f"workers on this machine are recorded in {cluster}" in capsys.readouterr().err
-    assert poses(cluster) == poses(here) and len(poses(here)) == 12
+    assert poses(cluster) == poses(here[1]) and len(poses(cluster)) == 12
     assert sorted({path.suffix for path in cluster.iterdir()}) == [".rrd", ".sqlite"]
 
 
@@ -82,8 +91,8 @@ def test_a_run_of_a_killed_worker_is_done_again_and_listed_once(tmp_path: Path) 
     marks.mkdir()
     entrants = [Entrant("ransac-2p", (("iterations", 20),))]
     plan = planned(SCENE, "outlier_rate", [0.2, 0.5], entrants, 4, Variation(correspondences=30), 7)
-    rows = list(run_sweep(plan, workers=2, keep=DeadlyKeeper(SweepKeeper(folder), marks, deaths=2)))
-    assert len(list(marks.iterdir())) == 2
+    rows = list(run_sweep(plan, workers=1, keep=DeadlyKeeper(SweepKeeper(folder), marks, deaths=1)))
+    assert len(list(marks.iterdir())) == 1
     with RunIndex(folder) as index:
         index.refresh()
         listed = index.find(RunQuery(), limit=None).rows

@@ -27,6 +27,7 @@ from spherloc_viz.localize import localize_sequence
 from spherloc_viz.recording.content.reader import read_recording
 from spherloc_viz.scene_list import all_scenes, one_kind
 from spherloc_viz.trajectory_plot import trajectory_png
+from tests.cli_process import spherloc_here
 from tests.waiting import LIMIT_S
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -94,7 +95,9 @@ def test_everything_is_written(tmp_path: Path, drawn: dict[str, str], capsys: py
     assert "The loader skipped nothing of note." in told.err
 
 
-def test_a_killed_run_goes_on_and_ends_as_if_nothing_had_happened(tmp_path: Path, drawn: dict[str, str]) -> None:
+def test_a_killed_run_goes_on_and_ends_as_if_nothing_had_happened(
+    tmp_path: Path, drawn: dict[str, str], capsys: pytest.CaptureFixture[str]
+) -> None:
     scene, out, whole = write_scene(tmp_path, queries=6, stuck=[3]), tmp_path / "out", tmp_path / "whole"
     words = (scene, "--output", out, "--estimator", "ransac-2p", "--seed", "3")
     process = command(*words, environment=drawn)
@@ -108,9 +111,8 @@ def test_a_killed_run_goes_on_and_ends_as_if_nothing_had_happened(tmp_path: Path
     assert done <= len([path for path in (out / "recordings").iterdir() if path.suffix == ".rrd"]) <= done + 1
     half = (out / "results.jsonl").read_bytes() + b'{"index": 5, "query": "ima'
     (out / "results.jsonl").write_bytes(half)
-    process = command(*words, environment=drawn)
-    _, errors = process.communicate(timeout=LIMIT_S)
-    assert process.returncode == 0, errors
+    assert run(scene, out, estimator="ransac-2p", seed=3, records=Records(out / "recordings")) == 0
+    errors = capsys.readouterr().err
     assert "removed a half written line" in errors and f"{done} of 6 queries are done already" in errors
     assert run(scene, whole, estimator="ransac-2p", seed=3) == 0
     resumed, at_once = read_results(out), read_results(whole)
@@ -137,7 +139,7 @@ def test_ctrl_c_ends_at_once_and_says_how_to_go_on(tmp_path: Path, drawn: dict[s
 
 
 def test_a_full_disk_keeps_what_is_done(tmp_path: Path, drawn: dict[str, str]) -> None:
-    warm_up()  # whose cache the limit below would otherwise hit
+    warm_up(estimators=["mc"])  # whose cache the limit below would otherwise hit
     scene, out = write_scene(tmp_path, queries=9), tmp_path / "out"
 
     def limit() -> None:
@@ -248,12 +250,12 @@ def test_the_picture_shows_truth_errors_and_failures(tmp_path: Path) -> None:
     assert run(write_scene(tmp_path / "none", queries=2, few=[0, 1]), tmp_path / "none" / "out") == 1
 
 
-def test_one_query_of_a_scene_can_be_run_alone(tmp_path: Path, drawn: dict[str, str]) -> None:
+@pytest.mark.usefixtures("drawn")
+def test_one_query_of_a_scene_can_be_run_alone(tmp_path: Path) -> None:
     scene = write_scene(tmp_path, queries=3, few=[1], timed=True)
 
     def alone(*words: str | Path) -> subprocess.CompletedProcess[str]:
-        program = [Path(sys.executable).with_name("spherloc"), "run", "--no-record", "--json", *map(str, words)]
-        return subprocess.run(program, env=drawn, capture_output=True, text=True, timeout=LIMIT_S, check=False)
+        return spherloc_here("run", "--no-record", "--json", *words, cwd=tmp_path)
 
     found = alone(scene, "--query", "image2.png")
     assert found.returncode == 0 and "The loader skipped nothing of note." in found.stderr
