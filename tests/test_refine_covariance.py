@@ -15,7 +15,7 @@ pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
 
 CAMERAS = ("mei", "fisheye", "panorama")
 GRAVITY_SD_RAD = np.radians(0.5)
-RUNS = 300
+RUNS = 120
 
 
 def with_gravity_error(problem, rng, sd_rad):
@@ -106,7 +106,7 @@ def test_perfect_gravity_halves_the_error(scene_of, camera):
     """With few matches, roll and pitch are what the pixels fix worst."""
     scene = scene_of(camera, outlier_rate=0.0, correspondences=10)
     four, six = [], []
-    for seed in range(150):
+    for seed in range(80):
         problem = scene.problem(seed)
         for errors, sd in ((four, 0.0), (six, np.inf)):
             errors.append(pose_error(problem, refined(problem, 50.0, gravity_sd_deg=sd).cam_from_map[-1]))
@@ -119,7 +119,7 @@ def test_weighted_gravity_beats_both_of_its_limits(rng, scene_of, camera):
     """Gravity off by 0.5 degrees (1 sigma) and pixels that know as little: to weigh them beats to choose."""
     scene = scene_of(camera, outlier_rate=0.0, correspondences=10, noise_px=4.0)
     errors = {None: [], 0.0: [], np.inf: []}
-    for seed in range(150):
+    for seed in range(80):
         problem = with_gravity_error(scene.problem(seed), rng, GRAVITY_SD_RAD)
         for sd, found in errors.items():
             stage = refined(problem, 80.0, noise_px=4.0, gravity_sd_deg=sd)
@@ -132,7 +132,7 @@ def test_each_bearing_counts_by_its_own_noise(scene_of):
     """Towards a panorama's poles a column is a small angle: one weight for the whole image would waste that."""
     scene = scene_of("panorama", outlier_rate=0.0, correspondences=30, noise_px=3.0)
     weighed, alike = [], []
-    for seed in range(150):
+    for seed in range(80):
         problem = scene.problem(seed)
         weighed.append(pose_error(problem, refined(problem, 200.0, gravity_sd_deg=np.inf).cam_from_map[-1]))
         aligned = problem.aligned
