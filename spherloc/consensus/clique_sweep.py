@@ -128,7 +128,7 @@ def settle(data, limits, view, everybody, balls, poses, supports, masks, known, 
         answer, work = prove_none(view, limits, everybody, balls[b], best, found, board)
         effort += work * ROUND_EFFORT
         if answer == UNKNOWN and len(everybody) <= MOST_IN_CELLS:
-            answer, work = search_region(view, limits, everybody, balls[b], best, MOST_CELLS, found)
+            answer, work = search_region(view, limits, everybody, balls[b], best, np.int64(MOST_CELLS), found)
             effort += work
         if answer == FOUND:
             known = improve(data, everybody, found, poses, supports, masks, known)

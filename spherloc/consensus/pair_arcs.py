@@ -48,7 +48,8 @@ def pair_arcs(
     pairs, ends = np.empty((room, 2), np.int32), np.empty((room, 2))
     used = _fill(aligned.bearings, aligned.points, bound_rad, pairs, ends, watch.board)
     watch.check()
-    return pairs[:used], ends[:used, 0], ends[:used, 1]
+    # Of one layout, however many there are: kernels are compiled for it.
+    return pairs[:used], np.ascontiguousarray(ends[:used, 0]), np.ascontiguousarray(ends[:used, 1])
 
 
 @numba.njit(cache=True, nogil=True, inline="always")

@@ -165,7 +165,7 @@ def estimate(
     check_options(options)
     check_seed(seed)
     aligned = problem.aligned
-    bounds = bounds_of(aligned, options.bound_px)
+    bounds = bounds_of(aligned, float(options.bound_px))
     clock = Clock(watch)
     start = time.perf_counter()
     try:

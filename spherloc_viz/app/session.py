@@ -124,7 +124,7 @@ class Session:
             self._page.ask()
 
     def _listen(self) -> None:
-        self._controls.scene.reset.on_click(self._take_back)
+        self._controls.scene.reset.on_click(self._reset)
         on = self._touches.on
         on("select", self._select_numbers)
         on("deselect", lambda touch: (self._edits.select(()), self._page.ask()))
@@ -132,6 +132,10 @@ class Session:
             on(action, lambda touch, edit=edit: (edit(), self.changed()))
         on("unhide", lambda touch: (self._edits.show_all(), self.changed()))
         on("unedit", self._take_back)
+
+    def _reset(self, event: object) -> None:
+        """All changes to the scene, at once: it is one step of the history."""
+        self.open(Wish(self._controls.scene.read_unchanged(), *self._controls.estimator.read()))
 
     def _take_back(self, event: object) -> None:
         """All changes to single matches."""

@@ -199,7 +199,7 @@ def test_what_is_seen_leaves_as_files(
     assert box is not None
     assert pixels.shape[1] / pixels.shape[0] == pytest.approx(box["width"] / box["height"], rel=0.02)
     seen = np.asarray(Image.open(io.BytesIO(tab.page.screenshot(clip=box))).convert("RGB"))  # pyright: ignore
-    assert pixels[-4, 4].tolist() == seen[-4, 4].tolist(), "the background is the page's"
+    assert np.abs(pixels[-4, 4].astype(int) - seen[-4, 4]).max() <= 2, "the background is the page's"
     colors, counts = np.unique(pixels.reshape(-1, 3), axis=0, return_counts=True)
     assert len(colors) > 50 and counts.max() < 0.995 * counts.sum()
     assert (np.abs(pixels.astype(int) - pixels[0, 0]).max(axis=2) > 30).mean() > 0.002

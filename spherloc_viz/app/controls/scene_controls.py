@@ -27,7 +27,7 @@ class SceneControls:
     """
 
     def __init__(self, gui: viser.GuiApi, catalog: Catalog, changed: Changed) -> None:
-        self._catalog, self._changed = catalog, changed
+        self._catalog = catalog
         self._followed = ""
         self._scene = gui.add_dropdown("Scene", tuple(catalog.scenes))
         self._find = gui.add_text("Find query", "", visible=False, hint="Part of the name of a query image.")
@@ -39,7 +39,6 @@ class SceneControls:
         self._find.on_update(self._filter)
         for widget in (self._scene, self._query, self._seed):
             widget.on_update(changed)
-        self.reset.on_click(self._reset)
 
     @property
     def reset(self) -> viser.GuiButtonGroupHandle:
@@ -68,6 +67,12 @@ class SceneControls:
         if self._catalog.map_scene(label) is not None:
             return SceneWish(label, seed, self._query.value)
         return SceneWish(label, seed, None, self._variation(label))
+
+    def read_unchanged(self) -> SceneWish:
+        """The scene and the query that the widgets say, with everything else as the scene has it."""
+        label = self._scene.value
+        query = None if self._catalog.map_scene(label) is None else self._query.value
+        return SceneWish(label, getattr(self._catalog.scenes[label], "seed", 0), query)
 
     def write(self, wish: SceneWish) -> bool:
         """Set the widgets to what a wish says but for changes to single matches; tells whether the scene is another.
@@ -139,12 +144,6 @@ class SceneControls:
         images = self._catalog.map_scene(self._scene.value)
         if images is not None and event.client is not None:
             self._list_queries(images, self._query.value)
-
-    def _reset(self, event: Any) -> None:
-        label = self._scene.value
-        query = None if self._catalog.map_scene(label) is None else self._query.value
-        self.write(SceneWish(label, getattr(self._catalog.scenes[label], "seed", 0), query))
-        self._changed(event)
 
     def _read_seed(self, otherwise: int | None = None) -> int:
         text = self._seed.value.strip()

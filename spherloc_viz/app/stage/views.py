@@ -86,8 +86,8 @@ def follow(picture: Picture, aspect: float) -> View:
 def shows(view: View, subject: FloatArray, aspect: float) -> bool:
     """Whether a view holds a subject (K, 3) and does not show it small."""
     seen = projected(view, subject) / (np.tan(view.field_of_view_rad / 2) * np.array([aspect, 1.0]))
-    reach = float(np.max(np.max(seen, axis=0) - np.min(seen, axis=0))) / 2
-    return bool(np.all(np.abs(seen) <= 1.0)) and reach >= LEAST_SHARE
+    inside = bool(np.all(np.abs(seen) <= 1.0))
+    return inside and float(np.max(np.ptp(seen, axis=0))) / 2 >= LEAST_SHARE
 
 
 def projected(view: View, positions: FloatArray) -> FloatArray:
