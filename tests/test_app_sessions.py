@@ -349,6 +349,40 @@ def test_matches_are_selected_and_changed_by_hand(house: House) -> None:
     assert np.array_equal(session._run.trace.cam_from_map, before.trace.cam_from_map), "to the last bit"
 
 
+def test_undo_takes_back_what_was_not_solved_yet(house: House, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A change that waits for a slow run is taken back by itself, not together with the one before."""
+    page, session = house.visit()
+    until(lambda: session._run is not None)
+    at_work, go_on = threading.Event(), threading.Event()
+
+    def slow(*words: Any) -> Trace:
+        at_work.set()
+        go_on.wait(LIMIT_S)
+        return estimate(*words)
+
+    monkeypatch.setattr(session_module, "estimate", slow)
+    scene = session._controls.scene
+    page.set(scene._simulation._noise, 4.0)
+    until(at_work.is_set)
+    page.set(scene._seed, "77")
+    until(lambda: scene._seed.value == "77")
+    session.step_history(-1)
+    go_on.set()
+
+    def shown_now() -> tuple[int, float | None]:
+        assert session._run is not None
+        wish = session._run.wish.scene
+        return wish.seed, wish.variation.noise_px
+
+    start = session._run.wish.scene.seed  # type: ignore[union-attr]
+    until(lambda: shown_now() == (start, 4.0) and scene._seed.value == str(start))
+    session.step_history(1)
+    until(lambda: shown_now() == (77, 4.0))
+    session.step_history(-1)
+    session.step_history(-1)
+    until(lambda: shown_now() == (start, None))
+
+
 def test_a_slow_run_gives_way_and_can_be_cancelled(house: House) -> None:
     page, session = house.visit()
     controls = session._controls.estimator

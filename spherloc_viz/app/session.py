@@ -1,7 +1,9 @@
 """One browser client: its own widgets, canvas, run and threads."""
 
 import time
+from collections import deque
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +14,7 @@ from numpy.typing import NDArray
 from spherloc.cameras.base import FloatArray
 from spherloc.datasets.synthetic import TrueCamera
 from spherloc.diagnosis import Diagnosis, diagnose
-from spherloc.errors import SpherlocError
+from spherloc.errors import InputError, SpherlocError
 from spherloc.estimators import default_options, estimate
 from spherloc.problem import Problem
 from spherloc.trace import Trace
@@ -60,6 +62,8 @@ class Session:
         self._edits, self._history = Edits(), History()
         self._opened: tuple[Wish, int] | None = None
         """What is to be opened, and the number of the change that asked for it."""
+        self._steps: deque[tuple[int, int]] = deque()
+        """Steps through the history that are to be made, each with the number of the change that asked for it."""
         self._run: Run | None = None
         self._answers = 0
         """The number of the newest change that the run knows, or an earlier one."""
@@ -112,9 +116,8 @@ class Session:
 
     def step_history(self, by: int) -> None:
         """Undo (-1) or redo (+1)."""
-        wish = self._history.step(by)
-        if wish is not None:
-            self.open(wish)
+        self._steps.append((by, self._changes.moment()))
+        self.changed()
 
     def select(self, places: Iterable[int], extend: bool = False) -> None:
         """Select matches by their numbers in the problem."""
@@ -203,6 +206,7 @@ class Session:
     def _solve_newest(self) -> float | None:
         """Solve what the page asks for now, if that is not shown. Raises ``Cancelled`` if that was ended."""
         number, gesture = self._changes.moment(), self._changes.gesture
+        self._walk_history(gesture)
         wish = self._wish()
         self._history.note(wish, time.monotonic(), gesture)
         if self._run is None or wish != self._run.wish:
@@ -220,6 +224,16 @@ class Session:
         self._status.say(self._runs.announce(self._run))
         self._status.withdraw()
         return QUIET_S
+
+    def _walk_history(self, gesture: int) -> None:
+        """Make the steps that were asked for; what was changed before is noted first, and so is what they take back."""
+        while self._steps:
+            by, number = self._steps.popleft()
+            with suppress(InputError):  # of a change that cannot be, which the step takes back too
+                self._history.note(self._wish(), time.monotonic(), gesture)
+            wish = self._history.step(by)
+            if wish is not None:
+                self._opened = wish, number
 
     def _problem(self, wish: SceneWish) -> Problem:
         """The problem that the page asks for; of images, with word of how far they are.
