@@ -87,11 +87,18 @@ def find_chromium() -> str:
 
 
 @contextmanager
-def served(*words: str | Path) -> Iterator[tuple[str, subprocess.Popen[str]]]:
-    """``spherloc play`` with these words on a free port: its address and process, ended with Ctrl-C."""
+def served(*words: str | Path, packages: Path | None = None) -> Iterator[tuple[str, subprocess.Popen[str]]]:
+    """``spherloc play`` with these words on a free port: its address and process, ended with Ctrl-C.
+
+    ``packages`` is a folder with installed packages that it finds besides its own.
+    """
     program = Path(sys.executable).with_name("spherloc")
     server = subprocess.Popen(
-        [program, "play", *map(str, words), "--port", "0"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [program, "play", *map(str, words), "--port", "0"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | ({"PYTHONPATH": str(packages)} if packages else {}),
     )
     assert server.stdout is not None
     # Its first start on a machine compiles the solvers, which is no test's time.
