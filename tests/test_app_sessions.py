@@ -383,6 +383,21 @@ def test_undo_takes_back_what_was_not_solved_yet(house: House, monkeypatch: pyte
     until(lambda: shown_now() == (start, None))
 
 
+def test_undo_takes_back_a_change_that_cannot_be_and_nothing_before_it(house: House) -> None:
+    page, session = house.visit()
+    until(lambda: session._run is not None)
+    scene = session._controls.scene
+    page.set(scene._seed, "77")
+    until(lambda: session._run.wish.scene.seed == 77)  # type: ignore[union-attr]
+    page.set(scene._seed, "seven")
+    until(lambda: session._status._complaint is not None)
+    session.step_history(-1)
+    until(lambda: scene._seed.value == "77")
+    assert session._run is not None and session._run.wish.scene.seed == 77
+    session.step_history(-1)
+    until(lambda: session._run.wish.scene.seed != 77)  # type: ignore[union-attr]
+
+
 def test_a_slow_run_gives_way_and_can_be_cancelled(house: House) -> None:
     page, session = house.visit()
     controls = session._controls.estimator

@@ -3,7 +3,6 @@
 import time
 from collections import deque
 from collections.abc import Iterable
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -229,8 +228,11 @@ class Session:
         """Make the steps that were asked for; what was changed before is noted first, and so is what they take back."""
         while self._steps:
             by, number = self._steps.popleft()
-            with suppress(InputError):  # of a change that cannot be, which the step takes back too
+            try:
                 self._history.note(self._wish(), time.monotonic(), gesture)
+            except InputError:
+                # A change that cannot be is in no history: Undo takes it back, and nothing before it.
+                by = max(by, 0)
             wish = self._history.step(by)
             if wish is not None:
                 self._opened = wish, number
