@@ -66,21 +66,14 @@ def _data(folder: str, what: str) -> Need:
 
 
 NEEDS = {
+    "aria_gen2": _data("aria_gen2", "the real problems with uncertain gravity"),
     "aria_adt_fisheye": _data("aria_adt_fisheye", "the real fisheye problems"),
     "formats_real": _data("formats_real", "the real calibrations"),
     "kapture_t265": _data("kapture_t265", "the real stereo fisheyes"),
     "stella_equirect_pair": _data("stella_equirect_pair", "the real panoramas"),
     "opencv 5": Need(lambda: hasattr(cv2, "ALIKED_create"), "this OpenCV has no learned features (OpenCV 5 has)"),
     "chromium": Need(
-        lambda: bool(
-            os.environ.get("SPHERLOC_CHROMIUM")
-            or any(
-                map(
-                    shutil.which,
-                    ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "microsoft-edge"),
-                )
-            )
-        ),
+        lambda: bool(os.environ.get("SPHERLOC_CHROMIUM") or any(map(shutil.which, BROWSERS))),
         "no Chromium found: install Debian's chromium or set SPHERLOC_CHROMIUM to the path of one",
     ),
     "vulkan": Need(lambda: vulkan() is not None, "no Vulkan driver, which rerun's viewer needs without a screen"),

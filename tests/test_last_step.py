@@ -16,8 +16,8 @@ from spherloc.metrics import rotation_error_deg, translation_error_m
 from spherloc.narrowing import PRIOR, search_nearby, share_of_fine, truncated_squares
 from spherloc.problem import Problem
 from spherloc.refine import RefinementOptions, refine, residuals_px
+from tests.needs import real_data
 
-GEN2 = Path(__file__).resolve().parents[1] / ".." / "shared" / "data" / "aria_gen2"
 BOUND_PX = 3.0
 
 
@@ -185,12 +185,11 @@ def test_strange_data_give_finite_poses(rng, scale):
             np.testing.assert_allclose(found[:, :3] @ found[:, :3].T, np.eye(3), atol=1e-9)
 
 
-@pytest.mark.skipif(not GEN2.is_dir(), reason="the shared Aria Gen 2 problems are not beside the project")
 @pytest.mark.parametrize("estimator", ["mc", "ransac-2p"])
 def test_real_images_with_gravity_known_to_three_degrees(estimator):
     """All within 1 degree and 10 cm; the median is that of the best 6-DoF peer on the same matches, or less."""
     rows = []
-    for path in sorted(GEN2.glob("*.toml")):
+    for path in sorted(real_data("aria_gen2").glob("*.toml")):
         problem = load_scene(path).problem()
         found = estimate(problem, estimator).cam_from_map
         truth = problem.truth_cam_from_map

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 from playwright.sync_api import Browser, Locator, Page, expect
 
 from spherloc_viz.app.stage.views import START
+from tests.needs import BROWSERS, NEEDS
 
 SCENE = """
 kind = "synthetic"
@@ -36,7 +38,6 @@ noise_px = 1.0
 seed = 3
 """
 
-BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "microsoft-edge")
 FLAGS = (
     "--no-sandbox",
     "--use-angle=swiftshader",
@@ -79,7 +80,7 @@ def find_chromium() -> str:
     """Path of a Chromium; skips the test without one, but fails where one is required."""
     path = os.environ.get("SPHERLOC_CHROMIUM") or next(filter(None, map(shutil.which, BROWSERS)), None)
     if path is None:
-        reason = "no Chromium found: install Debian's chromium or set SPHERLOC_CHROMIUM to the path of one"
+        reason = NEEDS["chromium"].lack
         if os.environ.get("CI") or os.environ.get("SPHERLOC_REQUIRE_BROWSER"):
             pytest.fail(reason)
         pytest.skip(reason)
@@ -120,26 +121,38 @@ def served(*words: str | Path, packages: Path | None = None) -> Iterator[tuple[s
             raise
 
 
+_spare_pages: WeakKeyDictionary[Browser, list[Page]] = WeakKeyDictionary()
+"""Pages of each browser that no test uses, all with the usual scripts."""
+
+
 class Playground:
     """One tab."""
 
     def __init__(self, browser: Browser, address: str, drawn: bool = False, new: bool = False) -> None:
         """Open the page, wait for its first run and go to the run's last step; ``drawn`` has the canvas really drawn,
         which is slow, and ``new`` is a browser that has never been here: it stays where the page opens."""
-        context = browser.new_context(viewport=SIZE, device_scale_factor=SHARPNESS)  # pyright: ignore[reportArgumentType]
-        context.add_init_script(ASIDE)
-        if not new:
-            context.add_init_script(KNOWN)
-        if not drawn:
-            context.add_init_script(BLIND)
-        self.page: Page = context.new_page()
-        self.page.set_default_timeout(PATIENCE_MS)
+        self._spare = None if drawn or new else _spare_pages.setdefault(browser, [])
+        if self._spare:
+            self.page = self._spare.pop()
+        else:
+            context = browser.new_context(viewport=SIZE, device_scale_factor=SHARPNESS)  # pyright: ignore[reportArgumentType]
+            context.add_init_script(ASIDE)
+            if not new:
+                context.add_init_script(KNOWN)
+            if not drawn:
+                context.add_init_script(BLIND)
+            self.page = context.new_page()
+            self.page.set_default_timeout(PATIENCE_MS)
         self.errors: list[str] = []
         self.hosts: set[str] = set()
-        self.page.on("console", lambda message: self.errors.append(message.text) if message.type == "error" else None)
-        self.page.on("pageerror", lambda error: self.errors.append(str(error)))
-        self.page.on("request", lambda request: self._note_host(request.url))
-        self.page.on("websocket", lambda socket: self._note_host(socket.url))
+        self._listeners: tuple[tuple[Any, Callable[[Any], None]], ...] = (
+            ("console", lambda message: self.errors.append(message.text) if message.type == "error" else None),
+            ("pageerror", lambda error: self.errors.append(str(error))),
+            ("request", lambda request: self._note_host(request.url)),
+            ("websocket", lambda socket: self._note_host(socket.url)),
+        )
+        for event, listener in self._listeners:
+            self.page.on(event, listener)
         self.page.goto(address)
         expect(self.value("outcome")).not_to_be_empty()
         if not new:
@@ -157,8 +170,18 @@ class Playground:
             self.hosts.add(url.split("/")[2])
 
     def close(self) -> None:
-        """Close the tab."""
-        self.page.context.close()
+        """Leave the page, as closing it does. Another test may go on with the tab: a new one costs twice the time."""
+        if self._spare is None or self.page.is_closed():
+            self.page.context.close()
+            return
+        self.page.evaluate("() => { localStorage.clear(); sessionStorage.clear() }")
+        self.page.goto("about:blank")
+        for event, listener in self._listeners:
+            self.page.remove_listener(event, listener)
+        self.page.context.clear_cookies()
+        self.page.context.clear_permissions()
+        self.page.mouse.move(0, 0)
+        self._spare.append(self.page)
 
     def value(self, name: str) -> Locator:
         """The cell of the outcome table beside a name."""
