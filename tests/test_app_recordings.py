@@ -96,9 +96,9 @@ def test_labels_are_stored_and_seen_by_others(office: Office) -> None:
         until(lambda page=page: f"run-open:{second}" in page.rows)
     visitor.touch(f"run-open:{second}")
     notes = visitor.panel._notes
-    until(lambda: notes._labels.visible)
-    visitor.set(notes._labels, "seam, look twice")
-    visitor.set(notes._note, "<b>a</b> note\nof two lines")
+    until(lambda: notes._fields.labels.visible)
+    visitor.set(notes._fields.labels, "seam, look twice")
+    visitor.set(notes._fields.note, "<b>a</b> note\nof two lines")
     path = office.folder / second
     until(lambda: read_review(path).note != "" and read_review(path).labels == ("seam", "look twice"))
     assert read_review(path).note == "<b>a</b> note\nof two lines"
@@ -110,7 +110,7 @@ def test_labels_are_stored_and_seen_by_others(office: Office) -> None:
     # Another run has the labels that were used as chips, and none of its own.
     visitor.touch(f"run-open:{first}")
     until(lambda: notes._file == first and not visitor.opening)
-    assert (notes._labels.value, notes._note.value) == ("", "")
+    assert (notes._fields.labels.value, notes._fields.note.value) == ("", "")
     # The gallery has no room for what is said of a run.
     visitor.touch("recordings:gallery")
     until(lambda: not any(part.visible for part in (*notes.widgets, notes._chips)))
@@ -119,11 +119,11 @@ def test_labels_are_stored_and_seen_by_others(office: Office) -> None:
     until(lambda: "run-label:look twice" in notes._chips.content)
     visitor.touch("run-label:look twice")
     until(lambda: read_review(office.folder / first).labels == ("look twice",))
-    visitor.set(notes._labels, ", ".join(f"label {k}" for k in range(50)))
+    visitor.set(notes._fields.labels, ", ".join(f"label {k}" for k in range(50)))
     until(lambda: "too many for a run" in visitor.panel._status.content)
     # What was typed is stored even if the page goes at once.
-    visitor.set(notes._labels, "last word")
-    until(lambda: notes._labels.value == "last word")
+    visitor.set(notes._fields.labels, "last word")
+    until(lambda: notes._fields.labels.value == "last word")
     until(lambda: bool(notes._pending) or read_review(office.folder / first).labels == ("last word",))
     visitor.page.close()
     until(lambda: read_review(office.folder / first).labels == ("last word",))
@@ -140,19 +140,35 @@ def test_two_pages_review_one_run_without_losing_words(office: Office) -> None:
     one, two = visitor.panel._notes, other.panel._notes
     # The second page does not look at its list, and so does not hear of the first one's words.
     other.touch("views:")
-    visitor.set(one._note, "a note")
+    visitor.set(one._fields.note, "a note")
     until(lambda: read_review(path).note == "a note")
-    other.set(two._labels, "seam")
+    other.set(two._fields.labels, "seam")
     until(lambda: read_review(path).labels == ("seam",))
     assert read_review(path).note == "a note"
     for page in (visitor, other):
-        until(lambda page=page: page.panel._notes._note.value == "a note")
-        until(lambda page=page: page.panel._notes._labels.value == "seam")
+        until(lambda page=page: page.panel._notes._fields.note.value == "a note")
+        until(lambda page=page: page.panel._notes._fields.labels.value == "seam")
         until(lambda page=page: page.card.opened.recorded.row.labels == ("seam",))  # type: ignore[union-attr]
     other.touch("run-label:seam")
     until(lambda: read_review(path).labels == ())
-    until(lambda: one._labels.value == "")
+    until(lambda: one._fields.labels.value == "")
     assert read_review(path).note == "a note"
+
+
+def test_what_arrives_when_another_run_is_open_is_of_the_run_it_was_typed_for(office: Office) -> None:
+    visitor, first, second = recorded_twice(office)
+    visitor.see()
+    notes = visitor.panel._notes
+    for file in (first, second):
+        visitor.touch(f"run-open:{file}")
+        until(lambda file=file: notes._file == file and not visitor.opening)
+    visitor.set(notes._others.note, "of the first")
+    visitor.set(notes._fields.note, "of the second")
+    for file, words in ((first, "of the first"), (second, "of the second")):
+        until(lambda file=file, words=words: read_review(office.folder / file).note == words)
+    visitor.touch(f"run-open:{first}")
+    until(lambda: notes._file == first and notes._fields.note.value == "of the first")
+    assert notes._others.note.value == "of the second" and not notes._others.note.visible
 
 
 def test_words_for_a_run_that_is_gone_do_not_cost_those_for_another(office: Office) -> None:
@@ -168,7 +184,7 @@ def test_words_for_a_run_that_is_gone_do_not_cost_those_for_another(office: Offi
     until(lambda: "there is no such run" in visitor.panel._status.content)
     until(lambda: read_review(office.folder / second).labels == ("seam",))
     until(lambda: not notes._pending and notes._storing is None)
-    assert notes._labels.value == "late", "what was typed stays where it can be copied"
+    assert notes._fields.labels.value == "late", "what was typed stays where it can be copied"
 
 
 def test_a_list_goes_on_when_its_folder_is_back(office: Office) -> None:

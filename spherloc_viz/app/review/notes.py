@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from functools import partial
 from html import escape
 
@@ -22,8 +23,31 @@ PAUSE_S = 0.7
 SEPARATOR = ","
 
 
+@dataclass(eq=False)
+class _Fields:
+    """What is typed into, and the run that it is about."""
+
+    labels: viser.GuiTextHandle
+    note: viser.GuiTextHandle
+    file: str | None = None
+    known: Review = field(default_factory=Review)
+    """What the fields were last set to, or was stored from them."""
+
+    def read(self) -> Review:
+        return Review(_split(self.labels.value), self.note.value)
+
+    def write(self, review: Review) -> None:
+        self.known = review
+        put(self.labels, f"{SEPARATOR} ".join(review.labels))
+        put(self.note, review.note)
+
+
 class Notes:
-    """Two fields, and the labels that were used before."""
+    """Two fields, and the labels that were used before.
+
+    There are two pairs of them, which take turns: what is typed while another run opens, and arrives when that run is
+    open, is about the run that it was typed for.
+    """
 
     def __init__(
         self,
@@ -38,27 +62,26 @@ class Notes:
         self._shelf, self._stored, self._failed = shelf, stored, failed
         self._changes = changes_of(gui)
         hint = "Words that tell what kind of run it is, with commas between them."
-        self._labels = gui.add_text("Labels", "", visible=False, hint=hint)
+        labels = [gui.add_text("Labels", "", visible=False, hint=hint) for _ in range(2)]
         self._chips = gui.add_html("", visible=False)
-        self._note = gui.add_text("Note", "", visible=False, multiline=True, hint="Stored with the run.")
+        notes = [gui.add_text("Note", "", visible=False, multiline=True, hint="Stored with the run.") for _ in range(2)]
+        self._fields, self._others = map(_Fields, labels, notes)
         self._lock = threading.Lock()
         self._file: str | None = None
         self._hidden = self._offers = False
-        self._known = Review()
-        """What the fields were last set to, or was stored from them."""
         self._pending: dict[str, tuple[Review, Review]] = {}
         """What the fields said before, and what they say now."""
         self._storing: str | None = None
         self._typed, self._closed = threading.Event(), False
         self._errand = Errand(f"spherloc-notes-{name}", failed)
-        for widget in self.widgets:
+        for widget in (*labels, *notes):
             widget.on_update(self._type)
         touches.on("run-label", self._toggle)
 
     @property
     def widgets(self) -> tuple[viser.GuiTextHandle, viser.GuiTextHandle]:
-        """All that hold a value."""
-        return (self._labels, self._note)
+        """The fields of the run that is open."""
+        return (self._fields.labels, self._fields.note)
 
     def show(self, row: RunRow | None, used: tuple[str, ...]) -> None:
         """Show what was said of a run, or nothing; ``used`` are labels that are offered.
@@ -70,15 +93,24 @@ class Notes:
             file = None if row is None else row.file
             if row is not None:
                 review = Review(row.labels, row.note)
-                if file != self._file or (review != self._known and not self._is_typed(file)):
-                    self._known = review
-                    put(self._labels, f"{SEPARATOR} ".join(row.labels))
-                    put(self._note, row.note)
+                if file != self._fields.file:
+                    self._turn()
+                if file != self._fields.file:
+                    self._fields.file = file
+                    self._fields.write(review)
+                elif review != self._fields.known and not self._is_typed(file):
+                    self._fields.write(review)
             self._file = file
             own = () if row is None else row.labels
             self._draw(tuple(dict.fromkeys((*own, *used))) if row is not None else (), own)
             for widget in self.widgets:
                 widget.visible = row is not None and not self._hidden
+
+    def _turn(self) -> None:
+        """Take the other fields, for another run."""
+        for widget in self.widgets:
+            widget.visible = False
+        self._fields, self._others = self._others, self._fields
 
     def hide(self, hidden: bool) -> None:
         """Make room for something else, or show again what is said of the run."""
@@ -109,25 +141,30 @@ class Notes:
 
     @at_once
     def _type(self, event: viser.GuiEvent) -> None:
-        if event.client is not None:
-            self._note_down(PAUSE_S)
+        if event.client is None:
+            return
+        with self._lock:
+            about = self._fields if event.target in self.widgets else self._others
+            self._note_down(about, PAUSE_S)
 
     def _toggle(self, touch: Touch) -> None:
         label = touch.argument.strip()
         with self._lock:
-            labels = _split(self._labels.value)
-            rest = tuple(other for other in labels if other != label)
-            put(self._labels, f"{SEPARATOR} ".join(rest if label in labels else (*labels, label)))
-        self._note_down(0.0)
-
-    def _note_down(self, pause_s: float) -> None:
-        with self._lock:
             if self._file is None:
                 return
-            base, _ = self._pending.get(self._file, (self._known, None))
-            self._pending[self._file] = base, Review(_split(self._labels.value), self._note.value)
-            before, self._typed = self._typed, threading.Event()
-        before.set()
+            labels = self._fields.read().labels
+            rest = tuple(other for other in labels if other != label)
+            put(self._fields.labels, f"{SEPARATOR} ".join(rest if label in labels else (*labels, label)))
+            self._note_down(self._fields, 0.0)
+
+    def _note_down(self, fields: _Fields, pause_s: float) -> None:
+        """Have what fields say stored; the lock is held."""
+        if fields.file is None:
+            return
+        base, _ = self._pending.get(fields.file, (fields.known, None))
+        self._pending[fields.file] = base, fields.read()
+        self._typed.set()
+        self._typed = threading.Event()
         self._errand.ask(partial(self._store, self._typed, pause_s))
 
     def _store(self, typed: threading.Event, pause_s: float) -> None:
@@ -141,8 +178,9 @@ class Notes:
                 file, (before, now) = next(iter(self._pending.items()))
                 del self._pending[file]
                 self._storing, known = file, before
-                if file == self._file:
-                    self._known = now
+                about = next((one for one in (self._fields, self._others) if one.file == file), None)
+                if about is not None:
+                    about.known = now
             try:
                 row = self._shelf.review(file, before, now)
                 stored = Review(row.labels, row.note)
@@ -152,8 +190,8 @@ class Notes:
             finally:
                 with self._lock:
                     self._storing = None
-                    if self._known is now:
-                        self._known = known
+                    if about is not None and about.known is now:
+                        about.known = known
             if known is not before:
                 self._stored(row)
 
