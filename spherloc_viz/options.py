@@ -81,6 +81,13 @@ class OptionField:
         return ", ".join(words[:-1]) + (" or " if words[1:] else "") + words[-1]
 
 
+def typed(value: Any) -> str:
+    """A value as people type it: ``OptionField.parse`` gives it back, to the last bit."""
+    if value is None:
+        return NONE
+    return str(value).lower() if isinstance(value, bool) else value if isinstance(value, str) else repr(value)
+
+
 @cache
 def usable_estimators() -> tuple[str, ...]:
     """Names of the registered estimators without the extensions that cannot be imported or have no form."""

@@ -11,7 +11,7 @@ from spherloc.datasets.variation import EDITS, Variation
 from spherloc.datasets.variation_text import settings_of
 from spherloc.errors import InputError
 from spherloc.estimators import options_type
-from spherloc_viz.options import NONE
+from spherloc_viz.options import typed
 
 RECORDING = ".rrd"
 WORDS = {"spoiled": "--spoil", "mended": "--mend", "hidden": "--hide"}
@@ -70,7 +70,7 @@ def as_command(
         words += [f"--query={query}"] if query.startswith("-") else ["--query", query]
     words += ["--estimator", estimator]
     for name, value in _changed(scene_path, estimator, options):
-        words += ["--option", f"{name}={_typed(value)}"]
+        words += ["--option", f"{name}={typed(value)}"]
     return shlex.join(words)
 
 
@@ -119,10 +119,3 @@ def _code(value: Any) -> str:
     if isinstance(value, str) and value.isprintable() and not set(value) & set('"\\'):
         return f'"{value}"'
     return repr(value)
-
-
-def _typed(value: Any) -> str:
-    """A value as ``--option`` takes it."""
-    if value is None:
-        return NONE
-    return str(value).lower() if isinstance(value, bool) else value if isinstance(value, str) else repr(value)

@@ -1,10 +1,12 @@
 """Reviewing on connected pages: runs opened as they were, labels, comparisons, exports, the gallery, and notices."""
 
 import re
+import threading
 import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,13 +19,15 @@ from spherloc_viz.app.catalog import MOST_BRIEF, Catalog, SceneWish
 from spherloc_viz.app.page_runs import LOOK_S, PageRuns
 from spherloc_viz.app.review import notes as notes_module
 from spherloc_viz.app.review.exporter import Exporter
+from spherloc_viz.app.review.shelf import Shelf
 from spherloc_viz.app.wish import Run, Wish
 from spherloc_viz.gallery import gallery_cases
 from spherloc_viz.recording.content.reader import read_recording
 from spherloc_viz.recording.review.notes import Review, read_review
+from spherloc_viz.recording.run_row import RunRow
 from tests.reviewing_pages import Office, recorded_twice
 from tests.tiny_scene import write_tiny_scene
-from tests.waiting import until
+from tests.waiting import LIMIT_S, until
 
 
 def test_recorded_problems_do_not_pile_up(tmp_path: Path) -> None:
@@ -169,6 +173,35 @@ def test_what_arrives_when_another_run_is_open_is_of_the_run_it_was_typed_for(of
     visitor.touch(f"run-open:{first}")
     until(lambda: notes._file == first and notes._fields.note.value == "of the first")
     assert notes._others.note.value == "of the second" and not notes._others.note.visible
+
+
+def test_words_that_are_refused_leave_nothing_in_those_typed_meanwhile(
+    office: Office, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    visitor, first, _ = recorded_twice(office)
+    visitor.see()
+    visitor.touch(f"run-open:{first}")
+    notes = visitor.panel._notes
+    until(lambda: notes._file == first and not visitor.opening)
+    visitor.touch("run-label:seam")
+    until(lambda: read_review(office.folder / first).labels == ("seam",))
+    until(lambda: notes._storing is None)
+    review, at_work, go_on = Shelf.review, threading.Event(), threading.Event()
+
+    def refused(*words: Any) -> RunRow:
+        at_work.set()
+        go_on.wait(LIMIT_S)
+        monkeypatch.setattr(Shelf, "review", review)
+        raise RecordingError("these words are refused.")
+
+    monkeypatch.setattr(Shelf, "review", refused)
+    visitor.set(notes._fields.labels, "refused")
+    until(at_work.is_set)
+    visitor.set(notes._fields.labels, "taken")
+    until(lambda: first in notes._pending)
+    go_on.set()
+    until(lambda: "taken" in read_review(office.folder / first).labels)
+    assert read_review(office.folder / first).labels == ("taken",)
 
 
 def test_words_for_a_run_that_is_gone_do_not_cost_those_for_another(office: Office) -> None:

@@ -114,6 +114,11 @@ class Face:
         self._client.flush()
         return self.canvas.check() if pause is None else pause
 
+    @property
+    def step_key(self) -> str:
+        """Key of the step at hand; empty before the first picture."""
+        return "" if self._shown is None else self._shown[2].step.key
+
     def shown(self, recorded: Path | None) -> Shown | None:
         """What is on the page, to be exported; ``recorded`` is the run's recording, if there is one."""
         if self._shown is None:

@@ -1,5 +1,6 @@
 """One browser client: its own widgets, canvas, run and threads."""
 
+import secrets
 import time
 from collections import deque
 from collections.abc import Iterable
@@ -23,10 +24,12 @@ from spherloc_viz.app.controls.controls import Controls
 from spherloc_viz.app.edits import Edits
 from spherloc_viz.app.face import Face, Places
 from spherloc_viz.app.history import History
+from spherloc_viz.app.link import Followed, Follower, View, address_html, link_of
 from spherloc_viz.app.newest import Job, Newest
 from spherloc_viz.app.notices import Notices
 from spherloc_viz.app.page_runs import Known, PageRuns
 from spherloc_viz.app.panels.export_panel import Shown
+from spherloc_viz.app.panels.folders import Roots
 from spherloc_viz.app.services import Services
 from spherloc_viz.app.stage.canvas import panel_widths_px
 from spherloc_viz.app.status import Status
@@ -63,6 +66,12 @@ class Session:
         """What is to be opened, and the number of the change that asked for it."""
         self._steps: deque[tuple[int, int]] = deque()
         """Steps through the history that are to be made, each with the number of the change that asked for it."""
+        self._roots = Roots(services.roots)
+        self._follower = Follower(self._catalog, self._roots, self._problem)
+        self._link: tuple[str, int] | None = None
+        """A link that is to be followed, and the number of the change before it."""
+        self._followed = 0
+        """How many links were followed."""
         self._run: Run | None = None
         self._answers = 0
         """The number of the newest change that the run knows, or an earlier one."""
@@ -74,6 +83,7 @@ class Session:
         places = Places(self.redraw, self.select, self._move_camera)
         self._face = Face(client, self._touches, self._controls, places, (left_px, right_px))
         self._listen()
+        self._name, self._address = secrets.token_hex(8), client.gui.add_html("")
         # Only now may the page tell what is pressed: everything that listens is there.
         client.gui.add_html(READY)
 
@@ -134,6 +144,12 @@ class Session:
             on(action, lambda touch, edit=edit: (edit(), self.changed()))
         on("unhide", lambda touch: (self._edits.show_all(), self.changed()))
         on("unedit", self._take_back)
+        on("link", self._note_link)
+
+    def _note_link(self, touch: Touch) -> None:
+        """The page's address is that of a link."""
+        self._link = touch.argument, self._changes.moment()
+        self.changed()
 
     def _reset(self, event: object) -> None:
         """All changes to the scene, at once: it is one step of the history."""
@@ -204,6 +220,35 @@ class Session:
 
     def _solve_newest(self) -> float | None:
         """Solve what the page asks for now, if that is not shown. Raises ``Cancelled`` if that was ended."""
+        link, run = self._link, self._run
+        if link is None or run is None:
+            return self._solve_wish()
+        self._link = None
+        try:
+            followed = self._follower.follow(link[0], run.wish, self._view())
+            self._opened = followed.wish, link[1]
+            pause = self._solve_wish()
+            self._arrive(followed, link[1])
+            return pause
+        finally:
+            self._followed += 1
+            self._page.ask()
+
+    def _arrive(self, followed: Followed, number: int) -> None:
+        """A link was followed: look at its run as it says. ``number`` is that of the change before it."""
+        with self._changes.as_of(number):
+            self._controls.display.theme = followed.view.theme
+        if self._run is not None:
+            self._edits.select(set(followed.view.selected) & set(self._run.kept.tolist()))
+        self._face.story.steps.go(followed.view.step)
+        if followed.remarks:
+            self.complain(" ".join(remark[:1].upper() + remark[1:] for remark in followed.remarks))
+
+    def _view(self) -> View:
+        """How the page looks at its run."""
+        return View(self._face.step_key, self._edits.selected, self._controls.display.theme)
+
+    def _solve_wish(self) -> float | None:
         number, gesture = self._changes.moment(), self._changes.gesture
         self._walk_history(gesture)
         wish = self._wish()
@@ -296,6 +341,10 @@ class Session:
             return None
         diagnosis = self._diagnosis(run)
         pause = self._face.draw(run, self._mesh(run), diagnosis, self._edits.places(run.kept), asked, answers)
+        link = link_of(run, self._view(), self._catalog, self._services.catalog.scenes, self._roots)
+        html = address_html(link, self._name, self._followed)
+        if self._address.content != html:
+            self._address.content = html
         if diagnosis is None:
             self._doctor.ask()
         return pause

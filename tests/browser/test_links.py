@@ -1,6 +1,7 @@
-"""The links with a token, in a browser: the presenter's, the audience's, and none."""
+"""Links in a browser: those with a token, and those that bring back what a page shows."""
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -28,7 +29,7 @@ def test_each_link_opens_its_own_page(browser: Browser, tmp_path: Path) -> None:
         expect(stranger.locator("body")).to_have_text(NO_TOKEN)
 
         presenter = Playground(browser, link)
-        assert presenter.page.url == address + "/", "the token has left the address"
+        assert presenter.page.url.split("#")[0] == address + "/", "the token has left the address"
         presenter.choose("Estimator", "ransac-2p (two points)")
         expect(presenter.value("estimator")).to_have_text("ransac-2p")
         audience = Playground(browser, said[1])
@@ -41,3 +42,45 @@ def test_each_link_opens_its_own_page(browser: Browser, tmp_path: Path) -> None:
         for tab in (presenter, audience):
             tab.expect_quiet(address)
             tab.close()
+
+
+SHOWN = ("estimator", "outcome", "inliers", "rotation error", "position error")
+
+
+def shown(tab: Playground) -> tuple[str, ...]:
+    return (*(tab.value(name).inner_text() for name in SHOWN), tab.step.input_value(), str(tab.carded()))
+
+
+def test_a_reload_and_a_link_bring_back_what_is_shown(
+    tab: Playground, open_tab: Callable[[], Playground], browser: Browser, address: str
+) -> None:
+    expect(tab.page).to_have_url(re.compile("#v=1&scene=small.street&seed=3&.*step=outcome$"))
+    tab.slide("Outliers (%)", "ArrowLeft")
+    tab.choose("Estimator", "ransac-2p (two points)")
+    expect(tab.value("estimator")).to_have_text("ransac-2p")
+    tab.type("Iterations", "321")
+    tab.press("New seed")
+    tab.slide("Timeline", "Home")
+    tab.press("Next")
+    expect(tab.step).to_have_value(re.compile("^2/"))
+    tab.tab("Matches")
+    tab.row(7).click()
+    tab.expect_card(7)
+    wanted = "set=outlier_rate%3D0.49&estimator=ransac-2p&option=iterations%3D321&step=bearings&select=7$"
+    expect(tab.page).to_have_url(re.compile("&seed=4&" + wanted))
+    link, before = tab.page.url, shown(tab)
+    tab.page.reload()
+    tab.expect_card(7)
+    expect(tab.value("estimator")).to_have_text("ransac-2p")
+    assert shown(tab) == before and tab.page.url == link
+
+    # In another browser, and in a page that shows something else; what is wrong is said, and the rest is opened.
+    other = open_tab()
+    other.page.goto(link.replace("v=1", "v=2") + "&theme=light&colour=red")
+    other.expect_card(7)
+    assert shown(other) == before
+    expect(other.page).to_have_url(re.compile(wanted[:-1] + "&theme=light$"))
+    said = other.page.get_by_text(re.compile("The link is of version '2'.* says 'colour', which this version"))
+    expect(said.first).to_be_visible()
+    for page in (tab, other):
+        page.expect_quiet(address)

@@ -7,7 +7,7 @@ import viser
 
 from spherloc_viz import style
 from spherloc_viz.app.stage import views
-from spherloc_viz.app.web.viser_seams import at_once
+from spherloc_viz.app.web.viser_seams import at_once, put
 
 
 class DisplayControls:
@@ -29,6 +29,10 @@ class DisplayControls:
     def theme(self) -> Literal["dark", "light"]:
         """How the page shall look."""
         return "dark" if self._dark.value else "light"
+
+    @theme.setter
+    def theme(self, theme: str) -> None:
+        put(self._dark, theme == "dark")
 
     @property
     def follow(self) -> bool:

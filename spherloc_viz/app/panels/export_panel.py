@@ -23,6 +23,13 @@ from spherloc_viz.recording.content.writer import write_recording
 PATIENCE_S = 60.0
 """A page that draws in software takes some ten seconds for a picture of its canvas."""
 WHERE = "Paths in the code are relative to the folder in which the playground was started; run it there."
+LINK = box(
+    '<span role="button" tabindex="0" aria-label="Copy the link" data-copy="" style="text-decoration:underline">'
+    f'Copy the link</span><div style="{DIM}">The page\'s address holds all that is set and the step that is shown. '
+    "It leads back to it, here and on any playground that has the scene.</div>",
+    "font-size:12px",
+)
+"""The page's script knows the address, see ``touch.js``."""
 CANVAS = {True: (20, 20, 20), False: (255, 255, 255)}
 """What the canvas has behind everything, by whether the page is dark."""
 
@@ -60,6 +67,7 @@ class ExportPanel:
         )
         for label, hint, job in buttons:
             gui.add_button(label, hint=hint).on_click(lambda event, job=job: self._errand.ask(job))
+        gui.add_html(LINK)
         self._status = gui.add_html("", visible=False)
         self._text = gui.add_html("")
 

@@ -192,6 +192,8 @@ class Notes:
                     self._storing = None
                     if about is not None and about.known is now:
                         about.known = known
+                    if file in self._pending and self._pending[file][0] is now:  # typed while this was being stored
+                        self._pending[file] = known, self._pending[file][1]
             if known is not before:
                 self._stored(row)
 

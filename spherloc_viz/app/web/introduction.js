@@ -1,8 +1,9 @@
 // Shows the introduction that Python put on the page (data-introduction) on the first visit: a card over the canvas with
 // a few moments, each of which takes the page to a step. It goes on by itself until somebody presses elsewhere, can be
-// skipped, and is not shown again: the browser remembers it. An element of the class "introduce" shows it again.
+// skipped, and is not shown again: the browser remembers it. Nor is it shown to whoever comes by a link. An element of the class "introduce" shows it again.
 (() => {
   const SEEN = "spherloc-introduction", EVERY_MS = 250, MOMENT_MS = 8000;
+  const linked = location.hash.length > 1;
   let card = null, told = null, index = 0, left = 0, paused = false;
 
   const remembered = () => {
@@ -76,7 +77,7 @@
 
   setInterval(() => {
     if (!card) {
-      if (!remembered() && !document.hidden) begin();
+      if (!remembered() && !linked && !document.hidden) begin();
       return;
     }
     place();

@@ -14,9 +14,10 @@ QUIET = (
 )
 """viser loads a sorter for Gaussian splats that wants ``eval``. The policy denies it, nobody here draws splats,
 and the console stays clean for errors that matter."""
-OURS = "<style>{css}</style><script>{changes}</script><script>{touch}</script><script>{introduction}</script>"
-"""What numbers the changes of widgets, see ``spherloc_viz.app.web.changes``, what reports presses, see
-``spherloc_viz.app.web.touch``, and what shows the introduction."""
+STYLE = "touch.css"
+SCRIPTS = ("changes.js", "touch.js", "introduction.js", "link.js")
+"""What numbers the changes of widgets (``app/web/changes.py``), reports presses (``app/web/touch.py``),
+shows the introduction, and keeps the address (``app/link.py``)."""
 
 
 @dataclass(frozen=True)
@@ -35,9 +36,8 @@ def load_page() -> Page:
     path = Path(viser.__file__).parent / "client" / "build" / "index.html"
     html = path.read_text(encoding="utf-8")
     own = Path(__file__).parent
-    names = ("touch.css", "changes.js", "touch.js", "introduction.js")
-    css, changes, touch, introduction = (own.joinpath(name).read_text(encoding="utf-8") for name in names)
-    ours = QUIET + OURS.format(css=css, changes=changes, touch=touch, introduction=introduction)
+    scripts = "".join(f"<script>{own.joinpath(name).read_text(encoding='utf-8')}</script>" for name in SCRIPTS)
+    ours = f"{QUIET}<style>{own.joinpath(STYLE).read_text(encoding='utf-8')}</style>{scripts}"
     html = html.replace("<title>Viser</title>", f"<title>spherloc</title>{ours}", 1)
     data = html.encode()
     return Page(html=data, zipped=gzip.compress(data, mtime=0), policy=content_policy(html))

@@ -1,5 +1,5 @@
 // Tells the server what a person presses in the HTML and SVG that it sent: elements with data-touch="ACTION:ARGUMENT".
-// With data-drag a drag across the element is told too; data-copy="TEXT" puts TEXT on the clipboard. And it tells which
+// With data-drag a drag across the element is told too; data-copy="TEXT" puts TEXT on the clipboard, or the page's address if TEXT is empty. And it tells which
 // elements with data-view="NAME" are to be seen, so that what stands on a hidden tab need not be drawn. A key presses the
 // element with data-key="KEY". Links within an element are followed, and do not press it. An element that gets another
 // data-reveal="NAME" is scrolled to, also while what stands above it grows, until a person scrolls or presses. What a
@@ -67,7 +67,7 @@
   }
 
   async function copy(element) {
-    const text = element.dataset.copy;
+    const text = element.dataset.copy || location.href;
     try {
       await navigator.clipboard.writeText(text);
     } catch {

@@ -12,8 +12,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-MOST_LETTERS = 4096
-"""A report has some hundred."""
+MOST_LETTERS = 20_000
+"""A report has some hundred, but for a link."""
 READY = "<div data-ready></div>"
 """Once this is on the page, it tells what is pressed."""
 

@@ -1,0 +1,222 @@
+"""What a page shows as a text, which the page keeps behind the "#" of its address: a reload or a link brings it back.
+
+The text is a query string, such as ``v=1&scene=street&seed=3&set=outlier_rate%3D0.4&estimator=mc&step=outcome``. It
+says what differs from what the scene and the estimator say. Anybody may have made it, so scenes are named by their
+label or by a place in an allowed folder, cameras by their label, and nothing else is read from the disk.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, fields, replace
+from html import escape
+from typing import Any
+from urllib.parse import parse_qsl, urlencode
+
+from spherloc.datasets import load_scene
+from spherloc.datasets.variation import EDITS, Variation
+from spherloc.datasets.variation_text import parse_variation, settings_of
+from spherloc.errors import InputError, SpherlocError, show
+from spherloc.estimators import default_options, options_type
+from spherloc.problem import Problem
+from spherloc_viz.app.catalog import Catalog, SceneWish
+from spherloc_viz.app.panels.folders import Roots
+from spherloc_viz.app.wish import Run, Wish
+from spherloc_viz.options import option_fields, typed, usable_estimators
+
+VERSION = 1
+MOST_LETTERS = 15_000
+"""A longer link is not written: some thousand matches are changed by hand."""
+THEMES = ("dark", "light")
+LISTS = ("spoil", "mend", "hide")
+"""Keys of ``EDITS``, in their order."""
+ONCE = ("v", "scene", "place", "seed", "query", "camera", *LISTS, "estimator", "step", "select", "theme")
+MANY = ("set", "option")
+
+
+@dataclass(frozen=True)
+class View:
+    """How a run is looked at."""
+
+    step: str
+    """Key of the step."""
+    selected: tuple[int, ...]
+    """Numbers of the selected matches, as they are where nothing is hidden."""
+    theme: str
+
+
+def link_of(run: Run, view: View, catalog: Catalog, known: Iterable[str], roots: Roots) -> str:
+    """The text that brings a run and the view of it back; empty if it would be too long.
+
+    ``known`` are the labels of the scenes that every page has.
+    """
+    wish, scene = run.wish, run.wish.scene
+    place = None if scene.scene in known else roots.place(catalog.path(scene.scene))
+    variation = scene.variation
+    cameras = {path: label for label, path in catalog.cameras.items()}
+    default = default_options(wish.estimator, run.trace.problem)
+    pairs = [
+        ("v", str(VERSION)),
+        ("scene", scene.scene),
+        ("place", place),
+        ("seed", str(scene.seed)),
+        ("query", scene.query),
+        ("camera", None if variation.camera is None else cameras.get(variation.camera)),
+        *(("set", setting) for setting in settings_of(replace(variation, camera=None))),
+        *((key, numbers_text(getattr(variation, name))) for key, name in zip(LISTS, EDITS, strict=True)),
+        ("estimator", wish.estimator),
+        *(("option", f"{name}={typed(value)}") for name, value in _changed(wish.options, default)),
+        ("step", view.step),
+        ("select", numbers_text(view.selected)),
+        ("theme", view.theme if view.theme != THEMES[0] else None),
+    ]
+    text = urlencode([(key, value) for key, value in pairs if value])
+    return text if len(text) <= MOST_LETTERS else ""
+
+
+def _changed(options: Any, default: Any) -> list[tuple[str, Any]]:
+    names = [item.name for item in fields(options)]
+    return [(name, getattr(options, name)) for name in names if getattr(options, name) != getattr(default, name)]
+
+
+def numbers_text(numbers: Iterable[int]) -> str:
+    """Numbers with commas between them."""
+    return ",".join(map(str, numbers))
+
+
+def address_html(link: str, session: str, followed: int) -> str:
+    """Tells the page's script (``link.js``) what to keep as the address, and how many links were followed so far."""
+    return f'<div hidden data-address="{escape(link)}" data-session="{session}" data-followed="{followed}"></div>'
+
+
+@dataclass(frozen=True)
+class Followed:
+    """What a link led to."""
+
+    wish: Wish
+    view: View
+    remarks: tuple[str, ...]
+    """What of the link could not be opened, a sentence each."""
+
+
+class Follower:
+    """Follows links on one page. Whatever a link says wrongly becomes a remark, and the page's own stays."""
+
+    def __init__(self, catalog: Catalog, roots: Roots, problem: Callable[[SceneWish], Problem]) -> None:
+        """``problem`` gives the problem of a wish; it may take long, and raises ``InputError`` if there is none."""
+        self._catalog, self._roots, self._problem = catalog, roots, problem
+
+    def follow(self, text: str, now: Wish, view: View) -> Followed:
+        """Where a link leads from what the page shows ``now``. Raises ``Cancelled`` if the map's work is ended."""
+        remarks: list[str] = []
+        said = _read(text, remarks)
+        scene = self._scene(said, now.scene, remarks)
+        estimator = said.get("estimator", now.estimator)
+        if estimator not in usable_estimators():
+            remarks.append(f"the estimator {show(estimator)} is unknown.")
+            estimator = now.estimator
+        try:
+            problem = self._problem(scene)
+        except InputError as error:
+            remarks.append(str(error))
+            scene = SceneWish(scene.scene, scene.seed)
+            problem = self._problem(scene)
+        options = self._options(said.get("option", ()), default_options(estimator, problem), estimator, remarks)
+        theme = said.get("theme", THEMES[0])
+        if theme not in THEMES:
+            remarks.append(f"the theme {show(theme)} is unknown.")
+            theme = view.theme
+        try:
+            selected = _numbers(said.get("select", ""))
+        except InputError as error:
+            remarks.append(str(error))
+            selected = ()
+        return Followed(
+            Wish(scene, estimator, options), View(said.get("step", view.step), selected, theme), tuple(remarks)
+        )
+
+    def _scene(self, said: dict[str, Any], now: SceneWish, remarks: list[str]) -> SceneWish:
+        """The scene with its changes; the page's own if the link's is not to be had."""
+        try:
+            label = self._label(said, now.scene)
+        except SpherlocError as error:
+            remarks.append(str(error))
+            return now
+        scene = self._catalog.scenes[label]
+        seed = said.get("seed", str(getattr(scene, "seed", 0)))
+        if not (seed.isascii() and seed.isdigit() and len(seed) < 20 and int(seed) < 2**63):
+            remarks.append(f"the seed {show(seed)} is no whole number from 0 to 2^63 - 1.")
+            seed = "0"
+        query, images = said.get("query"), self._catalog.map_scene(label)
+        try:
+            query = None if images is None else images.query(query).name
+        except InputError as error:
+            remarks.append(str(error))
+            query = None
+        return SceneWish(label, int(seed), query, self._variation(said, label, remarks))
+
+    def _label(self, said: dict[str, Any], now: str) -> str:
+        if "place" in said:
+            path = self._roots.find(said["place"])
+            return self._catalog.add(load_scene(path), path)
+        label = said.get("scene", now)
+        if label not in self._catalog.scenes:
+            raise InputError(f"the scene {show(label)} is not open here; open it in the tab Open.")
+        return label
+
+    def _variation(self, said: dict[str, Any], label: str, remarks: list[str]) -> Variation:
+        settings = said.get("set", ())
+        try:
+            if any(setting.startswith("camera=") for setting in settings):
+                raise InputError("a link names a camera by its label, not by its file.")
+            variation = parse_variation(settings, *(said.get(key) for key in LISTS))
+        except InputError as error:
+            remarks.append(str(error))
+            return Variation()
+        if self._catalog.synthetic(label) is None:
+            return Variation(spoiled=variation.spoiled, mended=variation.mended, hidden=variation.hidden)
+        camera = said.get("camera")
+        if camera is not None and camera not in self._catalog.cameras:
+            remarks.append(f"the camera {show(camera)} is unknown.")
+            camera = None
+        return replace(variation, camera=None if camera is None else self._catalog.cameras[camera])
+
+    def _options(self, texts: Iterable[str], default: Any, estimator: str, remarks: list[str]) -> Any:
+        known = {item.name: item for item in option_fields(options_type(estimator))}
+        try:
+            values = {}
+            for text in texts:
+                name, _, value = text.partition("=")
+                if name not in known:
+                    raise InputError(f"the estimator {estimator} has no option {show(name)}.")
+                values[name] = known[name].parse(value)
+            return replace(default, **values)
+        except InputError as error:
+            remarks.append(str(error))
+            return default
+
+
+def _read(text: str, remarks: list[str]) -> dict[str, Any]:
+    """What a link says, by key: a text, or a list of texts for those of ``MANY``."""
+    said: dict[str, Any] = {}
+    try:
+        pairs = parse_qsl(text, keep_blank_values=True, max_num_fields=200, errors="strict")
+    except ValueError:
+        remarks.append("the link is damaged.")
+        return said
+    for key, value in pairs:
+        if key in MANY:
+            said.setdefault(key, []).append(value)
+        elif key in ONCE and key not in said:
+            said[key] = value
+        else:
+            remarks.append(f"the link says {show(key)}, which this version does not know.")
+    version = said.get("v", str(VERSION))
+    if version != str(VERSION):
+        remarks.insert(0, f"the link is of version {show(version)}, and this is version {VERSION}.")
+    return said
+
+
+def _numbers(text: str) -> tuple[int, ...]:
+    words = text.split(",") if text else []
+    if not all(word.isascii() and word.isdigit() and len(word) < 10 for word in words):
+        raise InputError(f"select is {show(text)}; give the numbers of matches with commas between them, such as 3,5.")
+    return tuple(map(int, words))

@@ -1,0 +1,119 @@
+"""Links: what a page writes it reads again, and what anybody writes is a remark at worst."""
+
+from dataclasses import replace
+from pathlib import Path
+from urllib.parse import urlencode
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from spherloc.datasets import load_scene
+from spherloc.datasets.variation import Variation
+from spherloc.estimators import default_options, estimate
+from spherloc_viz.app.catalog import Catalog, SceneWish
+from spherloc_viz.app.link import MANY, MOST_LETTERS, ONCE, Follower, View, link_of
+from spherloc_viz.app.panels.folders import Roots
+from spherloc_viz.app.wish import Run, Wish
+from tests.tiny_scene import write_tiny_scene
+
+VIEW = View("outcome", (), "dark")
+
+
+class Place:
+    """A page's catalog, and what it shows."""
+
+    def __init__(self, folder: Path) -> None:
+        self.scene = write_tiny_scene(folder)
+        self.base = Catalog(self.scene)
+        self.catalog, self.roots = self.base.branch(), Roots([folder])
+        (self.label, *_) = self.catalog.scenes
+        self.follower = Follower(self.catalog, self.roots, self.catalog.problem)
+        wish = SceneWish(self.label, 5)
+        self.now = Wish(wish, "mc", default_options("mc", self.catalog.problem(wish)))
+
+    def link(self, wish: Wish, view: View) -> str:
+        problem = self.catalog.problem(wish.scene)
+        trace = estimate(problem, wish.estimator, wish.options, wish.scene.seed)
+        return link_of(Run(wish, trace, np.arange(len(problem))), view, self.catalog, self.base.scenes, self.roots)
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Place:
+    return Place(tmp_path_factory.mktemp("links"))
+
+
+def test_what_is_written_is_read_again(place: Place) -> None:
+    camera = list(place.catalog.cameras.values())[-1]
+    variation = Variation(
+        camera, 30, 0.1 + 0.2, 1 / 3, "coherent", true_camera=(1.5, -2.0, 1e-7, 3.0), spoiled=(3, 1), hidden=(7,)
+    )
+    scene = SceneWish(place.label, 2**62, None, variation)
+    options = replace(default_options("ransac-2p", place.catalog.problem(scene)), iterations=77, confidence=0.97)
+    wish, view = Wish(scene, "ransac-2p", options), View("sample-3", (2, 4), "light")
+    found = place.follower.follow(place.link(wish, view), place.now, VIEW)
+    assert (found.wish, found.view, found.remarks) == (wish, view, ())
+    assert place.follower.follow("", place.now, VIEW).remarks == ()
+
+
+def test_a_scene_of_an_allowed_folder_is_opened_again(place: Place) -> None:
+    path = place.scene.with_name("other.toml")
+    path.write_text(place.scene.read_text().replace('name = "', 'name = "another '))
+    other = Place(place.scene.parent)
+    label = other.catalog.add(load_scene(path), path)
+    scene = SceneWish(label, 1)
+    link = other.link(Wish(scene, "mc", default_options("mc", other.catalog.problem(scene))), VIEW)
+    assert "place=0%3Aother.toml" in link
+    found = place.follower.follow(link, place.now, VIEW)
+    assert found.remarks == () and found.wish.scene == scene and place.catalog.path(label) == path.resolve()
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "remark"),
+    [
+        ("v", "2", "the link is of version '2', and this is version 1."),
+        ("colour", "red", "the link says 'colour', which this version does not know."),
+        ("scene", "nowhere", "the scene 'nowhere' is not open here"),
+        ("place", "0:../../../etc/passwd", "not in an allowed folder"),
+        ("place", "7:x.toml", "not allowed any more"),
+        ("seed", "-1", "the seed '-1' is no whole number"),
+        ("seed", "9" * 19, "is no whole number"),
+        ("estimator", "magic", "the estimator 'magic' is unknown."),
+        ("option", "bound_px=far", "option bound_px is 'far'"),
+        ("option", "magic=1", "has no option 'magic'"),
+        ("set", "outlier_rate=most", "setting outlier_rate is 'most'"),
+        ("set", "outlier_rate=7", "outlier_rate"),
+        ("set", "camera=/etc/passwd", "names a camera by its label"),
+        ("camera", "/etc/passwd", "the camera '/etc/passwd' is unknown."),
+        ("spoil", "1,b", "spoil is '1,b'"),
+        ("hide", "99999", "99999"),
+        ("select", "-3", "select is '-3'"),
+        ("theme", "pink", "the theme 'pink' is unknown."),
+    ],
+)
+def test_what_is_wrong_is_a_remark_and_the_rest_is_opened(place: Place, key: str, value: str, remark: str) -> None:
+    others = {"v": "1", "seed": "8", "estimator": "ransac-2p", "step": "bearings"}
+    found = place.follower.follow(urlencode({**others, key: value}), place.now, VIEW)
+    assert len(found.remarks) == 1 and remark in found.remarks[0], found.remarks
+    assert found.view.step == "bearings"
+    assert found.wish.estimator == ("mc" if key == "estimator" else "ransac-2p")
+    if key not in ("scene", "place", "seed"):
+        assert found.wish.scene.seed == 8
+    place.catalog.problem(found.wish.scene)
+
+
+PAIRS = st.lists(st.tuples(st.sampled_from((*ONCE, *MANY)), st.text(max_size=12)), max_size=6)
+
+
+@given(text=st.one_of(st.text(max_size=200), PAIRS.map(urlencode)))
+def test_any_text_leads_to_a_run(place: Place, text: str) -> None:
+    found = place.follower.follow(text, place.now, VIEW)
+    assert place.catalog.problem(found.wish.scene) is not None
+
+
+def test_a_long_link_is_not_written(place: Place) -> None:
+    hidden = tuple(range(10_000, 10_000 + MOST_LETTERS // 6))
+    scene = SceneWish(place.label, 1)
+    wish = Wish(scene, "mc", default_options("mc", place.catalog.problem(scene)))
+    assert place.link(wish, View("outcome", hidden, "dark")) == ""
