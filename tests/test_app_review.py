@@ -112,6 +112,10 @@ def test_filters_count_what_they_would_leave(shelf: Shelf) -> None:
     assert dict(counts.outcome)["failure"] == found.total and dict(counts.outcome)["success"] > 0
     assert sum(count for _, count in counts.unfolded) == found.total
     assert shelf.page(look.choose("estimator", "mc"))[0].total == dict(counts.unfolded)["mc"]
+    judged = look.choose("judged", "doubtful")
+    assert shelf.page(judged)[0].total == counts.doubtful == sum(bool(row.doubtful) for row in found.rows) > 0
+    assert judged.filtered and not look.choose("judged", "sure").judged
+    assert "runs-filter:judged:doubtful" in Elements(filters_html(look, counts)).touches
     assert not look.cleared().filtered and shelf.page(look.cleared())[0].total == 50
     assert look.choose("outcome", "failure").outcome is None, "pressed again, it is taken away"
 
@@ -180,7 +184,7 @@ def evil_row() -> RunRow:
 
 def test_texts_of_strangers_are_no_html() -> None:
     row = evil_row()
-    counts = Counts(1, ((EVIL, 1),), ((EVIL, 1),), ((EVIL, 1),))
+    counts = Counts(1, ((EVIL, 1),), ((EVIL, 1),), 0, ((EVIL, 1),))
     pages = (
         rows_html([row], frozenset(), None, 1, Look(), NOW),
         filters_html(Look(scene=EVIL, unfolded="scene"), counts),

@@ -112,7 +112,7 @@ def pages(row: RunRow) -> dict[str, str]:
     look = Look(text=row.name, diagnosis=row.diagnosis, estimator=row.name, unfolded="estimator")
     return {
         "list": rows_html([row, other], frozenset((row.file,)), row.file, 2, look, NOW),
-        "filters": filters_html(look, Counts(2, (("failure", 1),), groups, groups)),
+        "filters": filters_html(look, Counts(2, (("failure", 1),), groups, 0, groups)),
         "comparison": comparison_html(row, other),
         "export": summary_html([row, other], row.name, NOW),
         "viewer": viewer_page(row.file, row, 3, "0.1", "step"),

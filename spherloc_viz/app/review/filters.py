@@ -25,6 +25,7 @@ class Counts:
     total: int
     outcome: Groups
     diagnosis: Groups
+    doubtful: int
     unfolded: Groups = ()
     """Of the filter that is unfolded, if its values can be counted."""
 
@@ -37,6 +38,8 @@ def filters_html(look: Look, counts: Counts) -> str:
         for value in ("failure", "success", "unknown")
         if outcomes.get(value, 0) or look.outcome == value
     ]
+    if counts.doubtful or look.judged:
+        chips.append(_chip("judged", "doubtful", "doubtful", counts.doubtful, look.judged))
     causes = [
         _chip("diagnosis", value, value or NOT_DIAGNOSED, count, look.diagnosis)
         for value, count in counts.diagnosis

@@ -31,6 +31,9 @@ SORTS: Mapping[str, str] = {
     "name": "name",
 }
 """What runs are sorted by, and what it is called."""
+JUDGED = ("doubtful",)
+"""What the diagnosis says of a run, also where the truth is not known."""
+FILTERS = (*EXACT, "judged", "outliers", "when")
 UNFOLDED = (*EXACT[2:], "outliers", "when", "sort")
 """What is chosen in a row that is unfolded."""
 
@@ -48,6 +51,8 @@ class Look:
     scene: str | None = None
     label: str | None = None
     source: str | None = None
+    judged: str | None = None
+    """One of ``JUDGED``."""
     outliers: str | None = None
     """One of ``OUTLIERS``, or a range as it is typed."""
     when: str | None = None
@@ -64,6 +69,7 @@ class Look:
         exact = {name: getattr(self, name) for name in EXACT}
         return RunQuery(
             text=self.text.strip()[:MAX_TEXT] or None,
+            doubtful=None if self.judged is None else True,
             outlier_rate=self._range(),
             since=None if self.when is None else parse_when(AGES[self.when], now),
             sort=self.sort,
@@ -76,8 +82,8 @@ class Look:
 
     def choose(self, name: str, value: str) -> "Look":
         """The list with this filter set, or taken away if it was set to that; as it is if there is no such filter."""
-        known = {"outcome": OUTCOMES, "outliers": tuple(OUTLIERS), "when": tuple(AGES)}
-        if name not in (*EXACT, "outliers", "when") or (name in known and value not in known[name]):
+        known = {"outcome": OUTCOMES, "judged": JUDGED, "outliers": tuple(OUTLIERS), "when": tuple(AGES)}
+        if name not in FILTERS or (name in known and value not in known[name]):
             return self
         chosen = None if getattr(self, name) == value else value
         return replace(self, page=0, **{name: chosen})
@@ -109,4 +115,4 @@ class Look:
     @property
     def filtered(self) -> bool:
         """Whether anything is left out."""
-        return bool(self.text.strip()) or any(getattr(self, name) is not None for name in (*EXACT, "outliers", "when"))
+        return bool(self.text.strip()) or any(getattr(self, name) is not None for name in FILTERS)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from spherloc.errors import RecordingError
 from spherloc_viz.app.review.filters import Counts
-from spherloc_viz.app.review.look import EXACT, PAGE, Look
+from spherloc_viz.app.review.look import EXACT, JUDGED, PAGE, Look
 from spherloc_viz.recording.content.reader import RecordedRun, read_recording
 from spherloc_viz.recording.index.query import MAX_TEXT, RunQuery
 from spherloc_viz.recording.index.run_index import Found, RunIndex
@@ -59,7 +59,8 @@ class Shelf:
         """What each filter would leave."""
         outcome, diagnosis = self._groups(look, "outcome"), self._groups(look, "diagnosis")
         unfolded = self._groups(look, look.unfolded) if look.unfolded in EXACT else ()
-        return Counts(total, outcome, diagnosis, unfolded)
+        doubtful = self._index.find(_query(replace(look, judged=JUDGED[0])), 0).total
+        return Counts(total, outcome, diagnosis, doubtful, unfolded)
 
     def _groups(self, look: Look, name: str) -> Sequence[tuple[str, int]]:
         """How many runs there are of each value, if this filter were not set."""
