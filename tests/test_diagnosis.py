@@ -8,7 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from spherloc.bounds import bounds_of
+from spherloc.datasets import bundled_scenes, load_scene
 from spherloc.datasets.failures import MAKERS, failure_case
+from spherloc.datasets.variation import Variation
 from spherloc.diagnosis import Cause, diagnose
 from spherloc.diagnosis.measures import apart, pose_sd
 from spherloc.estimators import default_options, estimate
@@ -79,6 +81,22 @@ def test_truth_shows_the_true_pose(traces):
         assert rival is not None and trace.problem.truth_cam_from_map is not None
         turn, distance = apart(rival, trace.problem.truth_cam_from_map)
         assert turn < np.radians(1) and distance < 0.1
+
+
+@pytest.mark.parametrize("use_truth", [True, False])
+def test_a_refinement_that_believes_a_wrong_gravity(use_truth):
+    """Gravity is within its bound, but the refinement is told to keep it: no search has missed anything."""
+    scene = load_scene(bundled_scenes()["mei_outliers_80"])
+    problem = Variation(outlier_rate=0.5, gravity_error_deg=1.0).problem(scene, 1)
+    for estimator in ("mc", "mc-exact"):
+        options = replace(default_options(estimator, problem), gravity_sd_deg=0.0)
+        trace = estimate(problem, estimator, options, 1)
+        diagnosis = diagnose(trace, use_truth)
+        assert diagnosis.cause == Cause.GRAVITY_OFF and "the refinement keeps it as it is" in diagnosis.summary
+        assert "gravity_sd_deg" in diagnosis.advice
+        counted, (told, allowing) = np.count_nonzero(trace.inlier_mask), diagnosis.evidence[:2]
+        assert f"The run counts {counted}," in allowing and not told.startswith(f"{counted} of")
+        assert diagnose(estimate(problem, estimator, seed=1), use_truth).cause == Cause.OK
 
 
 def changed(trace, **fields):

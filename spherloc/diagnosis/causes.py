@@ -20,7 +20,8 @@ class Cause(StrEnum):
     """No match is right. Without the truth: no pose stands out, though there are so many matches that a right
     reference image would have given one."""
     GRAVITY_OFF = "gravity prior off"
-    """Gravity is off by more than its bound, and by more than the noise bound in the image."""
+    """Gravity is off by more than its bound, or than the refinement is told to allow for, and by more than the noise
+    bound in the image."""
     BOUND_TOO_SMALL = "noise bound too small"
     """Many right matches are farther off than the noise bound: twice of it holds half as many again, or more."""
     DEGENERATE = "degenerate geometry"

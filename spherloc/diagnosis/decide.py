@@ -19,7 +19,7 @@ the reference is wrong. Without the truth nothing else tells the two apart."""
 SPREAD = 1.5
 """The bound is too small if twice of it holds as many times as many matches: noise of 0.75 times the bound does so."""
 TILT_SDS = 4.0
-"""Gravity is off if the matches tilt it beyond its bound by as many standard deviations..."""
+"""Gravity is off if the matches tilt it beyond what the run believes by as many standard deviations..."""
 HARM = 1.0
 """... and by as many noise bounds in the image: less does no harm. (A calibration that is a little off tilts real
 images by some tenths of a degree.)"""
@@ -33,7 +33,7 @@ STRONG = 0.45
 MISSED = 0.85
 """A run whose pose has less than this share of the best pose's support has missed it."""
 TILT_RAD = np.radians(0.05)
-"""A true gravity that is beyond its bound by more explains a pose that is wrong and otherwise well supported."""
+"""A true gravity that is beyond what the run believes by more explains a pose that is wrong and otherwise well supported."""
 TO_BE_PROVEN = (Cause.FALSE_CONSENSUS, Cause.AMBIGUOUS, Cause.ITERATIONS_RAN_OUT, Cause.SEARCH_MISSED)
 """Causes whose evidence is complete only with a bound on every pose's support."""
 
@@ -98,7 +98,7 @@ def with_truth(e: Evidence, t: Truth) -> Cause:
         return Cause.OK
     if missed(e, true):
         return Cause.ITERATIONS_RAN_OUT
-    if t.tilt_rad > e.aligned.gravity_bound_rad + TILT_RAD:
+    if t.tilt_rad > e.believed_rad + TILT_RAD:
         return Cause.GRAVITY_OFF
     return Cause.DEGENERATE if undetermined(e.rotation_sd_rad, e.position_sd_m) else Cause.UNKNOWN
 
@@ -114,8 +114,8 @@ def undetermined(rotation_sd_rad: float, position_sd_m: float) -> bool:
 
 
 def tilts(e: Evidence, tilt_rad: float, slack_rad: float) -> bool:
-    """Whether gravity is off by more than its bound, and so much that it matters."""
-    excess = tilt_rad - e.aligned.gravity_bound_rad
+    """Whether gravity is off by more than the run believes, and so much that it matters."""
+    excess = tilt_rad - e.believed_rad
     harm_px = excess * float(np.median(e.aligned.pixels_per_radian))
     return excess > slack_rad and harm_px > HARM * e.bound_px
 

@@ -18,6 +18,8 @@ LOOSE_ENDS = 2
 """Matches that may agree by chance with one of the poses that all others leave open."""
 FEW = 8
 """Sets smaller than this are judged with all their members: each is needed."""
+BELIEVED_SDS = 4.0
+"""A refinement that is told gravity's standard deviation follows the matches no farther than so many of it."""
 DIFFERENT_RAD = np.radians(3.0)
 DIFFERENT_M = 0.3
 """Poses farther apart than either are clearly different: three times what counts as a success."""
@@ -31,6 +33,8 @@ class Evidence:
     """The usable correspondences."""
     bound_px: float
     """The run's noise bound."""
+    believed_rad: float
+    """How far gravity may be off by what the run was told: its bound, or less if the refinement believes it more."""
     chance_rate: float
     """Probability that a wrong pose explains one correspondence."""
     run: Fit | None
@@ -105,6 +109,7 @@ def gather(trace: Trace) -> Evidence:
     return Evidence(
         aligned=aligned,
         bound_px=bound_px,
+        believed_rad=min(aligned.gravity_bound_rad, BELIEVED_SDS * _gravity_sd(aligned, options)),
         chance_rate=chance_rate(aligned.bearings, bounds.radians),
         run=run,
         best=best,

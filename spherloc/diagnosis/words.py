@@ -36,14 +36,16 @@ def describe(
         doubtful=cause is not Cause.OK,
         summary=_summary(e, truth, cause, other),
         evidence=tuple(_sentences(trace, e, truth, certificate)),
-        advice=_advice(trace, cause),
+        advice=_advice(trace, e, cause),
         used_truth=truth is not None,
         rival_cam_from_map=None if other is None else e.aligned.unalign_pose(other.cam_from_map),
     )
 
 
-def _advice(trace: Trace, cause: Cause) -> str:
+def _advice(trace: Trace, e: Evidence, cause: Cause) -> str:
     """What to do; never to use what was used."""
+    if cause is Cause.GRAVITY_OFF and e.believed_rad < e.aligned.gravity_bound_rad:
+        return "Set gravity_sd_deg to what the problem states, or leave it out; then the refinement corrects the tilt."
     if cause is Cause.SEARCH_MISSED and trace.stage(ConsensusStage) is not None:
         return "Raise the effort and the time budget."
     return ADVICE[cause]
@@ -88,7 +90,7 @@ def _summary(e: Evidence, truth: Truth | None, cause: Cause, other: Fit | None) 
         case Cause.AMBIGUOUS:
             return f"Two clearly different poses are supported alike: by {run} and by {second} of {total} matches."
         case Cause.ITERATIONS_RAN_OUT | Cause.SEARCH_MISSED:
-            better = max(best, second)
+            better = max(best, second, 0 if truth is None else truth.fit.support(bound))
             return f"The search missed the best pose: one with {better} of {total} matches exists, the run's has {run}."
         case Cause.UNKNOWN:
             return f"The pose is off the true one, though {run} of {total} matches agree with it and fix it well."
@@ -106,7 +108,11 @@ def _measured_summary(e: Evidence, truth: Truth | None, cause: Cause) -> str:
         raise ValueError(f"{cause} was found without a pose to show it")
     if cause is Cause.GRAVITY_OFF:
         tilt_rad = fit.tilt_rad if truth is None else truth.tilt_rad
-        return f"The known gravity is off by {_deg(tilt_rad)}, but its bound is {_deg(e.aligned.gravity_bound_rad)}."
+        bound_rad = e.aligned.gravity_bound_rad
+        if e.believed_rad < bound_rad:
+            believed = f"allows for {_deg(e.believed_rad)} at most" if e.believed_rad else "keeps it as it is"
+            return f"The known gravity is off by {_deg(tilt_rad)}, but the refinement {believed}."
+        return f"The known gravity is off by {_deg(tilt_rad)}, but its bound is {_deg(bound_rad)}."
     errors = fit.errors_px if truth is None else fit.errors_px[truth.right]
     one, two = (int(np.count_nonzero(errors <= factor * e.bound_px)) for factor in (1, 2))
     return f"The noise exceeds the bound: {one} matches are within its {e.bound_px:.3g} px, {two} within twice as much."
@@ -117,7 +123,10 @@ def _sentences(trace: Trace, e: Evidence, truth: Truth | None, certificate: Cert
     if e.run is None:
         yield "The run has no pose."
     else:
-        yield f"{e.run.support(bound)} of {total} matches agree with the run's pose within {bound:.3g} px."
+        support, counted = e.run.support(bound), int(np.count_nonzero(trace.inlier_mask))
+        yield f"{support} of {total} matches agree with the run's pose within {bound:.3g} px."
+        if counted != support:
+            yield f"The run counts {counted}, within a bound that allows for the error of gravity too."
     if e.best is not None:
         best = e.best.support(bound)
         if e.run is None or best > e.run.support(bound):

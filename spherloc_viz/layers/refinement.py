@@ -90,8 +90,11 @@ def _inliers(view: RunView, stage: RefinementStage) -> Frame:
     if not len(errors):
         told = "No match is within the bound. The pose stays where it started"
     else:
+        bound = "the bound"
+        if errors.max() > view.bounds.noise_px:
+            bound = f"the bound, which is {view.bounds.noise_px:.3g} px and what gravity may be off"
         told = (
-            f"{len(errors)} of {len(mask)} matches are within the bound, the median one is off by "
+            f"{len(errors)} of {len(mask)} matches are within {bound}; the median one is off by "
             f"{np.median(errors):.2f} px and the worst by {errors.max():.2f} px. "
         )
         told += (
