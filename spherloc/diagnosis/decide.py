@@ -33,7 +33,7 @@ STRONG = 0.45
 MISSED = 0.85
 """A run whose pose has less than this share of the best pose's support has missed it."""
 TILT_RAD = np.radians(0.05)
-"""A true gravity that is beyond what the run believes by more explains a pose that is wrong and otherwise well supported."""
+"""A true gravity that is beyond what the run believes by more explains a wrong pose that is well supported."""
 TO_BE_PROVEN = (Cause.FALSE_CONSENSUS, Cause.AMBIGUOUS, Cause.ITERATIONS_RAN_OUT, Cause.SEARCH_MISSED)
 """Causes whose evidence is complete only with a bound on every pose's support."""
 
