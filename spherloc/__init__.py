@@ -2,14 +2,35 @@
 
 import atexit
 import hashlib
+import importlib
 import os
 import shutil
 import sys
 import tempfile
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 __version__ = version("spherloc")
+
+EXPORTS = {
+    "localize": "localization",
+    "Localization": "localization",
+    "estimate_absolute_pose": "localization",
+    "estimate": "estimators",
+    "options_type": "estimators",
+    "diagnose": "diagnosis",
+    "evaluate": "metrics",
+    "load_scene": "datasets",
+    "bundled_scenes": "datasets",
+    "load_camera": "cameras.calibration",
+    "Problem": "problem",
+    "Trace": "trace",
+    "InputError": "errors",
+    "SpherlocError": "errors",
+}
+"""What is to be had from the package itself, and where it comes from: imported when it is first asked for, since the
+solvers take a second. ``__init__.pyi`` tells type checkers."""
 
 KERNEL_SOURCES = ("watch.py", "geometry.py", "gauss_newton.py", "refine.py", "solvers", "consensus", "estimators")
 """Files and folders of this package that hold compiled kernels and whatever their values come from."""
@@ -20,6 +41,18 @@ KEPT_KERNELS = 4
 
 kernels_are_temporary = False
 """Whether compiled kernels are lost when this process ends, since no folder to keep them can be written."""
+
+
+def __getattr__(name: str) -> Any:
+    if name not in EXPORTS:
+        raise AttributeError(f"module 'spherloc' has no attribute {name!r}")
+    found = getattr(importlib.import_module(f"spherloc.{EXPORTS[name]}"), name)
+    globals()[name] = found
+    return found
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *EXPORTS})
 
 
 def user_cache() -> Path | None:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spherloc.cameras.base import BoolArray, FloatArray
+from spherloc.errors import show
 from spherloc.problem import Problem
 
 IndexArray = NDArray[np.int32]
@@ -257,6 +258,9 @@ class Trace:
         for array in (self.cam_from_map, self.inlier_mask):
             if array is not None:
                 array.setflags(write=False)
+
+    def __repr__(self) -> str:
+        return f"<Trace of {self.estimator} on {show(self.problem.name)}: {self.message}>"
 
     def stage(self, kind: type[StageT]) -> StageT | None:
         """The stage of that type, or None if the run did not reach it."""

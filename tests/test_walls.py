@@ -44,6 +44,7 @@ FLOORS = (
         "spherloc.frontend",
     ),
     ("spherloc.estimators", "spherloc.proof", "spherloc.diagnosis", "spherloc.outcome", "spherloc.experiments"),
+    ("spherloc.localization",),
     ("spherloc_viz.style", "spherloc_viz.layers", "spherloc_viz.options", "spherloc_viz.share", "spherloc_viz"),
     ("spherloc_viz.recording", "spherloc_viz.sweep_plot"),
     ("spherloc_viz.gallery",),

@@ -1,0 +1,24 @@
+from pathlib import Path
+
+from spherloc.cameras.calibration import load_camera as load_camera
+from spherloc.datasets import bundled_scenes as bundled_scenes
+from spherloc.datasets import load_scene as load_scene
+from spherloc.diagnosis import diagnose as diagnose
+from spherloc.errors import InputError as InputError
+from spherloc.errors import SpherlocError as SpherlocError
+from spherloc.estimators import estimate as estimate
+from spherloc.estimators import options_type as options_type
+from spherloc.localization import Localization as Localization
+from spherloc.localization import estimate_absolute_pose as estimate_absolute_pose
+from spherloc.localization import localize as localize
+from spherloc.metrics import evaluate as evaluate
+from spherloc.problem import Problem as Problem
+from spherloc.trace import Trace as Trace
+
+EXPORTS: dict[str, str]
+KERNEL_SOURCES: tuple[str, ...]
+KEPT_KERNELS: int
+__version__: str
+kernels_are_temporary: bool
+
+def user_cache() -> Path | None: ...

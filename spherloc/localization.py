@@ -1,0 +1,239 @@
+"""From arrays to a pose: the way in for programs that have matches of their own."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from html import escape
+from numbers import Real
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from spherloc.cameras.base import BoolArray, Camera, FloatArray
+from spherloc.cameras.calibration import camera_from_table, load_camera
+from spherloc.cameras.colmap_models import camera_from_colmap
+from spherloc.diagnosis import Diagnosis, diagnose
+from spherloc.errors import CalibrationError, InputError, show
+from spherloc.estimators import default_options, estimate
+from spherloc.extras import require
+from spherloc.geometry import camera_centre
+from spherloc.outcome import Judgement, Outcome, judge
+from spherloc.problem import Problem
+from spherloc.trace import Certificate, RefinementStage, Trace
+
+CAMERA = "the camera"
+"""What a sentence calls a camera that comes from no file."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Localization:
+    """What became of one query. N correspondences."""
+
+    trace: Trace
+    """The whole run: all stages with their arrays."""
+
+    @property
+    def cam_from_map(self) -> FloatArray | None:
+        """Estimated pose [R | t] (3, 4): x_cam = R x_map + t, metres; None if the matches allow none."""
+        return self.trace.cam_from_map
+
+    @property
+    def position(self) -> FloatArray | None:
+        """The camera's position (3,) in the map frame, metres; None without a pose."""
+        return None if self.cam_from_map is None else camera_centre(self.cam_from_map)
+
+    @property
+    def inliers(self) -> BoolArray:
+        """(N,) correspondences that agree with the pose."""
+        return self.trace.inlier_mask
+
+    @property
+    def certificate(self) -> Certificate | None:
+        """What is proven about the number of inliers; None if the estimator proves nothing."""
+        return self.trace.certificate
+
+    @property
+    def covariance(self) -> FloatArray | None:
+        """(6, 6) of the pose's error, see ``RefinementStage.covariance``; None without a pose."""
+        stage = self.trace.stage(RefinementStage)
+        return None if stage is None else stage.covariance
+
+    @cached_property
+    def judgement(self) -> Judgement:
+        """Whether the pose is to be believed, with a score and with reasons if it is not."""
+        return judge(self.trace)
+
+    @property
+    def outcome(self) -> Outcome:
+        """Localized, doubtful or failed."""
+        return self.judgement.outcome
+
+    @cached_property
+    def diagnosis(self) -> Diagnosis:
+        """Why the run failed or is doubtful; runs further experiments, some tens of milliseconds."""
+        return diagnose(self.trace)
+
+    def _rows(self) -> list[tuple[str, str]]:
+        count, total = int(np.count_nonzero(self.inliers)), len(self.inliers)
+        rows = [("outcome", f"{self.outcome} by {self.trace.estimator}")]
+        if self.position is not None:
+            rows += [
+                ("position", f"{np.array2string(self.position, precision=3, suppress_small=True)} m"),
+                ("inliers", f"{count} of {total}"),
+            ]
+        if self.certificate is not None:
+            rows.append(("at most", f"{self.certificate.upper_bound} for any pose"))
+        return rows + [("but", reason) for reason in self.judgement.reasons]
+
+    def __repr__(self) -> str:
+        return "Localization\n" + "\n".join(f"  {name:9} {value}" for name, value in self._rows())
+
+    def _repr_html_(self) -> str:
+        rows = (f"<tr><th>{escape(name)}</th><td>{escape(value)}</td></tr>" for name, value in self._rows())
+        return f"<table>{''.join(rows)}</table>"
+
+
+def localize(
+    pixels: ArrayLike,
+    points: ArrayLike,
+    camera: Any,
+    gravity: ArrayLike,
+    *,
+    gravity_map: ArrayLike = (0.0, 0.0, -1.0),
+    gravity_bound_deg: float = 0.0,
+    gravity_sd_deg: float | None = None,
+    bound_px: float | None = None,
+    estimator: str = "auto",
+    options: Any = None,
+    seed: int = 0,
+    name: str = "query",
+) -> Localization:
+    """Localize one query image from its 2D-3D correspondences.
+
+    Args:
+        pixels: Measured pixels (N, 2); the centre of the top-left pixel is (0.5, 0.5), as in COLMAP.
+        points: Matched map points (N, 3), metres.
+        camera: A camera of this package, the path of a calibration file, a dict as in a scene's ``[camera]``, or a
+            camera of COLMAP: a ``pycolmap.Camera``, or a dict with its model, width, height and params.
+        gravity: Vector (3,) that points down in the camera frame (x right, y down, z forward), of any length.
+        gravity_map: Vector (3,) that points down in the map frame.
+        gravity_bound_deg: Bound on the angular error of ``gravity``, degrees.
+        gravity_sd_deg: Standard deviation of each of its two tilts, degrees; None takes a third of the bound.
+        bound_px: Bound on an inlier's reprojection error, pixels; None takes the estimator's own.
+        estimator: Registered name, such as "auto", "mc-exact", "mc" or "ransac-2p".
+        options: The estimator's options, as a dict of what differs from the defaults or as ``options_type(estimator)``.
+        seed: Of all random draws; the same arguments give the same result.
+        name: What sentences and recordings call the query.
+
+    Returns:
+        The pose, its inliers, covariance and certificate, and whether it is to be believed.
+
+    Raises:
+        InputError: For arrays of a wrong shape or with values that are not finite, a camera that cannot be used, and an
+            unknown estimator or option, in one sentence.
+    """
+    problem = Problem(
+        name=name,
+        camera=as_camera(camera),
+        pixels=_array("pixels", pixels),
+        points=_array("points", points),
+        gravity_camera=_direction("gravity", gravity),
+        gravity_map=_direction("gravity_map", gravity_map),
+        gravity_bound_rad=_radians("gravity_bound_deg", gravity_bound_deg),
+        gravity_sd_rad=None if gravity_sd_deg is None else _radians("gravity_sd_deg", gravity_sd_deg),
+        bound_px=bound_px,
+    )
+    return Localization(estimate(problem, estimator, _options(estimator, problem, options), seed))
+
+
+def estimate_absolute_pose(
+    points2D: ArrayLike,
+    points3D: ArrayLike,
+    camera: Any,
+    gravity: ArrayLike,
+    **settings: Any,
+) -> dict[str, Any] | None:
+    """``localize`` in the place of ``pycolmap.estimate_absolute_pose``, with gravity (3,) besides.
+
+    ``settings`` are further arguments of ``localize``.
+
+    Returns:
+        A dict with ``cam_from_world`` (``pycolmap.Rigid3d``), ``num_inliers`` and ``inlier_mask``, and with
+        ``localization``, what ``localize`` gives; None if there is no pose.
+
+    Raises:
+        InputError: As ``localize``, and without pycolmap.
+    """
+    pycolmap = require("pycolmap", "colmap", "estimate_absolute_pose")
+    found = localize(points2D, points3D, camera, gravity, **settings)
+    if found.cam_from_map is None:
+        return None
+    return {
+        "cam_from_world": pycolmap.Rigid3d(np.ascontiguousarray(found.cam_from_map)),
+        "num_inliers": int(np.count_nonzero(found.inliers)),
+        "inlier_mask": found.inliers,
+        "localization": found,
+    }
+
+
+def as_camera(camera: Any) -> Camera:
+    """A camera from whatever describes one, see ``localize``; raises ``InputError`` for anything else."""
+    if isinstance(camera, Camera):
+        return camera
+    if isinstance(camera, str | Path):
+        return load_camera(camera)
+    if isinstance(camera, Mapping):
+        if "params" not in camera:
+            return camera_from_table(dict(camera), CAMERA)
+        missing = [key for key in ("model", "width", "height") if key not in camera]
+        if missing:
+            raise CalibrationError(f"{CAMERA}: {missing[0]} is missing; give model, width, height and params.")
+        return _from_colmap(camera["model"], camera["width"], camera["height"], camera["params"])
+    if all(hasattr(camera, key) for key in ("model", "width", "height", "params")):
+        return _from_colmap(camera.model, camera.width, camera.height, camera.params)
+    raise InputError(
+        f"the camera is {show(type(camera).__name__)}; give a camera, the path of a calibration file, a dict or a "
+        "pycolmap.Camera."
+    )
+
+
+def _from_colmap(model: Any, width: Any, height: Any, params: Any) -> Camera:
+    """Of a COLMAP camera; its model may be a member of pycolmap's enumeration."""
+    return camera_from_colmap(getattr(model, "name", model), width, height, params, CAMERA)
+
+
+def _array(name: str, values: ArrayLike) -> Any:
+    """An array, whose shape and kind ``Problem`` checks."""
+    try:
+        return np.asarray(values)
+    except ValueError:
+        raise InputError(f"{name} has rows of different lengths; give one row for each correspondence.") from None
+
+
+def _direction(name: str, vector: ArrayLike) -> FloatArray:
+    """A unit vector (3,)."""
+    values = _array(name, vector)
+    length = np.linalg.norm(values) if values.shape == (3,) and values.dtype.kind in "iuf" else np.nan
+    if not (np.isfinite(length) and length > 0.0):
+        raise InputError(f"{name} is {show(values.tolist())}; give three numbers that point down.")
+    return values / length
+
+
+def _radians(name: str, degrees: Any) -> float:
+    if not isinstance(degrees, Real) or isinstance(degrees, bool):
+        raise InputError(f"{name} is {show(degrees)}; give a number of degrees.")
+    return float(np.radians(float(degrees)))
+
+
+def _options(estimator: str, problem: Problem, given: Any) -> Any:
+    """The options dataclass; of a dict what it names, over the defaults."""
+    default = default_options(estimator, problem)
+    if given is None or not isinstance(given, Mapping):
+        return default if given is None else given
+    known = [item.name for item in fields(default)]
+    unknown = [key for key in given if key not in known]
+    if unknown:
+        raise InputError(f"estimator {estimator} has no option {show(unknown[0])}; it has {', '.join(known)}.")
+    return replace(default, **given)
