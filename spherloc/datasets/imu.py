@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import fftconvolve
 from scipy.spatial.transform import Rotation
 
 from spherloc.cameras.base import FloatArray
@@ -112,6 +111,8 @@ def _down(times_s: FloatArray, rates_rad_s: FloatArray, forces_m_s2: FloatArray,
     reach = int(3.0 * width)
     window = np.exp(-0.5 * (np.arange(-reach, reach + 1) / width) ** 2)
     forces = weights[:, None] * steady_from_unit.apply(forces_m_s2)
+    from scipy.signal import fftconvolve  # its import takes most of a second
+
     # A sum instead of an average: only its direction is asked for, at the ends of the piece too.
     up = fftconvolve(np.pad(forces, ((reach, reach), (0, 0))), window[:, None], mode="valid", axes=0)
     at = np.minimum(np.searchsorted(times_s, asked_s, side="right") - 1, len(times_s) - 1)
