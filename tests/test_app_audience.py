@@ -93,6 +93,12 @@ def test_an_audience_follows_the_presenter_each_with_a_state_of_its_own(house: H
     presenter_page.set(presenter._controls.scene._simulation._noise, 3.0)
     until(noisier)
     assert (title(other), title(early)) == ("Outcome", opening), "each keeps its step"
+    # What the presenter hides, the audience cannot see; what its own switch hides, nobody else misses.
+    until(lambda: "off the truth" in other._face.story.steps._text.content)
+    presenter_page.set(presenter._controls.display._hide, True)
+    until(lambda: "The truth is unknown" in other._face.story.steps._text.content)
+    presenter_page.set(presenter._controls.display._hide, False)
+    until(lambda: "off the truth" in other._face.story.steps._text.content)
     house.sessions.notice("A recording was deleted.")
     assert not any(isinstance(page, Audience) for page in house.sessions._presenters())
 

@@ -51,7 +51,7 @@ def test_what_is_written_is_read_again(place: Place) -> None:
     )
     scene = SceneWish(place.label, 2**62, None, variation)
     options = replace(default_options("ransac-2p", place.catalog.problem(scene)), iterations=77, confidence=0.97)
-    wish, view = Wish(scene, "ransac-2p", options), View("sample-3", (2, 4), "light")
+    wish, view = Wish(scene, "ransac-2p", options), View("sample-3", (2, 4), "light", answers_hidden=True)
     found = place.follower.follow(place.link(wish, view), place.now, VIEW)
     assert (found.wish, found.view, found.remarks) == (wish, view, ())
     assert place.follower.follow("", place.now, VIEW).remarks == ()
@@ -89,7 +89,7 @@ def test_a_scene_of_an_allowed_folder_is_opened_again(place: Place) -> None:
         ("spoil", "1,b", "spoil is '1,b'"),
         ("hide", "99999", "99999"),
         ("select", "-3", "select is '-3'"),
-        ("theme", "pink", "the theme 'pink' is unknown."),
+        ("theme", "pink", "theme is 'pink'; it is dark or light."),
     ],
 )
 def test_what_is_wrong_is_a_remark_and_the_rest_is_opened(place: Place, key: str, value: str, remark: str) -> None:

@@ -18,6 +18,7 @@ from spherloc_viz.app.catalog import Catalog
 from spherloc_viz.app.server import Sessions
 from spherloc_viz.app.services import Services
 from spherloc_viz.app.session import Session
+from spherloc_viz.app.story import HIDDEN
 from spherloc_viz.app.web.touch import Touch
 from spherloc_viz.app.web.viser_seams import start_viser, stop_viser
 from spherloc_viz.recording.keeping.recorder import Ended
@@ -396,6 +397,34 @@ def test_undo_takes_back_a_change_that_cannot_be_and_nothing_before_it(house: Ho
     assert session._run is not None and session._run.wish.scene.seed == 77
     session.step_history(-1)
     until(lambda: session._run.wish.scene.seed != 77)  # type: ignore[union-attr]
+
+
+def test_answers_are_hidden_until_they_are_asked_for(house: House) -> None:
+    page, session = house.visit()
+    story, display = session._face.story, session._controls.display
+
+    def told() -> str:
+        parts = (story._summary, story.steps._text, story._diagnosis, story._outcome)
+        return "".join(part.content for part in parts)
+
+    def drawn() -> set[str]:
+        assert session._face._shown is not None
+        return {item.name for item in session._face._shown[2].scene}
+
+    until(lambda: "off the truth" in told() and "rotation error" in told())
+    assert "cameras/truth" in drawn()
+    page.set(display._hide, True)
+    until(lambda: "truth unknown" in told() and "The truth is unknown" in told())
+    assert "off the truth" not in told() and "rotation error" not in told() and "cameras/truth" not in drawn()
+    shown = house.services.presented.newest
+    assert shown is not None and shown.answers_hidden
+    # Before the last step not even the outcome is told.
+    story.steps.go("bearings")
+    until(lambda: HIDDEN in told())
+    assert "inliers" not in told() and story._outcome.content == ""
+    until(lambda: "answers=hidden" in session._address.content)
+    page.set(display._hide, False)
+    until(lambda: "Success" in told() and "answers=hidden" not in session._address.content)
 
 
 def test_a_slow_run_gives_way_and_can_be_cancelled(house: House) -> None:

@@ -111,7 +111,8 @@ class Audience:
             wish = shown.run.wish
             self._status.say(f"The presenter shows {wish.scene.scene}, {wish.estimator}, seed {wish.scene.seed}.")
             selected = self._edits.places(shown.run.kept)
-            return self._face.draw(shown.run, shown.mesh, shown.diagnosis, selected, asked, now)
+            hidden = shown.answers_hidden
+            return self._face.draw(shown.run, shown.mesh, shown.diagnosis, selected, asked, now, hidden)
         except Exception as error:
             self._status.fail(error)
             return None

@@ -74,6 +74,8 @@ class Face:
         moved = places.move or (lambda place: None)
         self.canvas = Canvas(client, self.controls.display, select, moved, sum(widths_px))
         self._shown: tuple[Run, bytes | None, Picture] | None = None
+        self._blind: tuple[Run, Run] | None = None
+        """A run, and the same without the truth."""
         self._theme = START_THEME
 
     def draw(
@@ -84,13 +86,19 @@ class Face:
         selected: tuple[int, ...],
         asked: bool,
         answers: int,
+        hidden: bool = False,
     ) -> float | None:
         """Show the step at hand of a run, whose map has that mesh; returns seconds to the next step if they play.
 
         ``selected`` are numbers in the problem, and ``diagnosis`` is None for as long as there is none. ``asked`` is
-        false if only time has passed. The run answers the changes up to the number ``answers``.
+        false if only time has passed. The run answers the changes up to the number ``answers``. ``hidden`` hides the
+        truth, and the outcome before the last step, as this page's own switch does.
         """
-        trace, controls = run.trace, self.controls
+        controls, known = self.controls, run
+        hidden = hidden or controls.display.answers_hidden
+        if hidden:
+            run, diagnosis = self._untold(run), None
+        trace = run.trace
         timeline = steps(trace)
         index, pause = self.story.steps.settle(timeline, asked)
         picture, last = paint(trace, index), index == len(timeline) - 1
@@ -99,7 +107,7 @@ class Face:
             picture = with_rival(picture, trace, rival)
         drawn = with_selection(picture, trace, selected)
         drawn = replace(drawn, scene=drawn.scene + controls.items(run))
-        self._shown = run, mesh, drawn
+        self._shown = known, mesh, drawn
         with self._client.atomic():
             self._follow_theme()
             with changes_of(self._client.gui).as_of(answers):
@@ -107,12 +115,19 @@ class Face:
                 controls.draw(run, diagnosis)
             # The other views tell inliers by the colours of the picture as it was.
             told = replace(picture, step=drawn.step)
-            self.story.draw(run, told, pause is not None, outcome_table(trace), selected)
-            waiting = status_html("Diagnosing …")
+            self.story.draw(run, told, pause is not None, outcome_table(trace), selected, hidden and not last)
+            waiting = "" if hidden else status_html("Diagnosing …")
             self.story.diagnose(waiting if diagnosis is None else diagnosis_html(diagnosis, whole=last))
             self.card.draw(trace, selected, run.kept, rival, self.canvas.clicked_left)
         self._client.flush()
         return self.canvas.check() if pause is None else pause
+
+    def _untold(self, run: Run) -> Run:
+        """The run without the truth."""
+        if self._blind is None or self._blind[0] is not run:
+            problem = replace(run.trace.problem, truth_cam_from_map=None, truth_inliers=None)
+            self._blind = run, replace(run, trace=replace(run.trace, problem=problem))
+        return self._blind[1]
 
     @property
     def step_key(self) -> str:

@@ -26,9 +26,10 @@ VERSION = 1
 MOST_LETTERS = 15_000
 """A longer link is not written: some thousand matches are changed by hand."""
 THEMES = ("dark", "light")
+ANSWERS = ("told", "hidden")
 LISTS = ("spoil", "mend", "hide")
 """Keys of ``EDITS``, in their order."""
-ONCE = ("v", "scene", "place", "seed", "query", "camera", *LISTS, "estimator", "step", "select", "theme")
+ONCE = ("v", "scene", "place", "seed", "query", "camera", *LISTS, "estimator", "step", "select", "theme", "answers")
 MANY = ("set", "option")
 
 
@@ -41,6 +42,7 @@ class View:
     selected: tuple[int, ...]
     """Numbers of the selected matches, as they are where nothing is hidden."""
     theme: str
+    answers_hidden: bool = False
 
 
 def link_of(run: Run, view: View, catalog: Catalog, known: Iterable[str], roots: Roots) -> str:
@@ -67,6 +69,7 @@ def link_of(run: Run, view: View, catalog: Catalog, known: Iterable[str], roots:
         ("step", view.step),
         ("select", numbers_text(view.selected)),
         ("theme", view.theme if view.theme != THEMES[0] else None),
+        ("answers", ANSWERS[1] if view.answers_hidden else None),
     ]
     text = urlencode([(key, value) for key, value in pairs if value])
     return text if len(text) <= MOST_LETTERS else ""
@@ -120,18 +123,15 @@ class Follower:
             scene = SceneWish(scene.scene, scene.seed)
             problem = self._problem(scene)
         options = self._options(said.get("option", ()), default_options(estimator, problem), estimator, remarks)
-        theme = said.get("theme", THEMES[0])
-        if theme not in THEMES:
-            remarks.append(f"the theme {show(theme)} is unknown.")
-            theme = view.theme
+        theme = _one_of(said, "theme", THEMES, remarks)
+        hidden = _one_of(said, "answers", ANSWERS, remarks) == ANSWERS[1]
         try:
             selected = _numbers(said.get("select", ""))
         except InputError as error:
             remarks.append(str(error))
             selected = ()
-        return Followed(
-            Wish(scene, estimator, options), View(said.get("step", view.step), selected, theme), tuple(remarks)
-        )
+        seen = View(said.get("step", view.step), selected, theme, hidden)
+        return Followed(Wish(scene, estimator, options), seen, tuple(remarks))
 
     def _scene(self, said: dict[str, Any], now: SceneWish, remarks: list[str]) -> SceneWish:
         """The scene with its changes; the page's own if the link's is not to be had."""
@@ -213,6 +213,15 @@ def _read(text: str, remarks: list[str]) -> dict[str, Any]:
     if version != str(VERSION):
         remarks.insert(0, f"the link is of version {show(version)}, and this is version {VERSION}.")
     return said
+
+
+def _one_of(said: dict[str, Any], key: str, words: tuple[str, ...], remarks: list[str]) -> str:
+    """The word that a link says, or the first one."""
+    word = said.get(key, words[0])
+    if word not in words:
+        remarks.append(f"{key} is {show(word)}; it is {' or '.join(words)}.")
+        return words[0]
+    return word
 
 
 def _numbers(text: str) -> tuple[int, ...]:

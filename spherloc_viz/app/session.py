@@ -238,6 +238,7 @@ class Session:
         """A link was followed: look at its run as it says. ``number`` is that of the change before it."""
         with self._changes.as_of(number):
             self._controls.display.theme = followed.view.theme
+            self._controls.display.answers_hidden = followed.view.answers_hidden
         if self._run is not None:
             self._edits.select(set(followed.view.selected) & set(self._run.kept.tolist()))
         self._face.story.steps.go(followed.view.step)
@@ -246,7 +247,8 @@ class Session:
 
     def _view(self) -> View:
         """How the page looks at its run."""
-        return View(self._face.step_key, self._edits.selected, self._controls.display.theme)
+        display = self._controls.display
+        return View(self._face.step_key, self._edits.selected, display.theme, display.answers_hidden)
 
     def _solve_wish(self) -> float | None:
         number, gesture = self._changes.moment(), self._changes.gesture
@@ -313,7 +315,8 @@ class Session:
         if run is None:
             return None
         self._controls.settle(run)
-        self._services.presented.show(run, self._mesh(run), self._diagnosis(run))
+        hidden = self._controls.display.answers_hidden
+        self._services.presented.show(run, self._mesh(run), self._diagnosis(run), hidden)
         sentence, pause = self._runs.settle(run, self._diagnosis(run))
         self._status.say(sentence)
         return pause
@@ -340,6 +343,7 @@ class Session:
         if run is None:
             return None
         diagnosis = self._diagnosis(run)
+        self._services.presented.hide(run, self._controls.display.answers_hidden)
         pause = self._face.draw(run, self._mesh(run), diagnosis, self._edits.places(run.kept), asked, answers)
         link = link_of(run, self._view(), self._catalog, self._services.catalog.scenes, self._roots)
         html = address_html(link, self._name, self._followed)

@@ -15,7 +15,7 @@ from spherloc_viz.app.plots.charts import ChartPanel
 from spherloc_viz.app.plots.graph_view import GraphView
 from spherloc_viz.app.plots.residual_view import ResidualView
 from spherloc_viz.app.plots.yaw_view import YawView
-from spherloc_viz.app.text import legend_html, opening_html, summary_html, table_html
+from spherloc_viz.app.text import legend_html, opening_html, status_html, summary_html, table_html
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.wish import Run
 from spherloc_viz.layers import graph_begins, steps
@@ -63,8 +63,11 @@ class Story:
         views.dock_below(steps)
         steps.set_width(width_px)
 
-    def draw(self, run: Run, picture: Picture, playing: bool, outcome: Table, selected: tuple[int, ...]) -> None:
-        """Show a step of a run, in the views that are to be seen. ``selected`` are numbers in the problem."""
+    def draw(
+        self, run: Run, picture: Picture, playing: bool, outcome: Table, selected: tuple[int, ...], hidden: bool
+    ) -> None:
+        """Show a step of a run, in the views that are to be seen. ``selected`` are numbers in the problem; ``hidden``
+        says that the outcome is not to be told yet."""
         kept: NDArray = run.kept
         tables = [table for table in picture.tables if table.name != outcome.name]
         self.steps.show(picture.step, playing, tables)
@@ -83,6 +86,8 @@ class Story:
         if "Matches" in seen:
             self._matches.draw(run.trace, selected, kept)
         summary, ending = summary_html(run.trace), table_html(outcome)
+        if hidden:
+            summary, ending = status_html(HIDDEN), ""
         if self._opening == run.wish.scene.scene:
             self._opening = ""
         elif self._opening:
@@ -116,6 +121,7 @@ class Story:
             self._diagnosis.content = html
 
 
+HIDDEN = "Answers are hidden: what came out is told at the last step, and the truth when Hide answers is off."
 FRONTS = {
     "Matches": "Images",
     "Samples": "Yaw",

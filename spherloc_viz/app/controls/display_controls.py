@@ -18,11 +18,14 @@ class DisplayControls:
         self._wanted: str | None = None
         self._views = gui.add_button_group("View", views.NAMES)
         self._dark = gui.add_checkbox("Dark", True, hint="Dark for a screen, light for a projector and for print.")
+        self._hide = gui.add_checkbox(
+            "Hide answers", False, hint="No true pose, no true labels, and no outcome before the last step."
+        )
         with gui.add_folder("Layers", expand_by_default=False):
             self._follow = gui.add_checkbox("Follow steps", True, hint="Move to where the step's subject reads best.")
             self._layers = {name: gui.add_checkbox(name.capitalize(), True) for name in style.LAYERS}
         self._views.on_click(self._press)
-        for widget in (self._dark, *self._layers.values()):
+        for widget in (self._dark, self._hide, *self._layers.values()):
             widget.on_update(changed)
 
     @property
@@ -33,6 +36,15 @@ class DisplayControls:
     @theme.setter
     def theme(self, theme: str) -> None:
         put(self._dark, theme == "dark")
+
+    @property
+    def answers_hidden(self) -> bool:
+        """Whether the truth, and before the last step the outcome too, are not to be told."""
+        return self._hide.value
+
+    @answers_hidden.setter
+    def answers_hidden(self, hidden: bool) -> None:
+        put(self._hide, hidden)
 
     @property
     def follow(self) -> bool:
