@@ -229,9 +229,14 @@ class Playground:
         self.page.get_by_role("button", name=button, exact=True).click()
 
     def unfold(self, folder: str) -> None:
-        """Open a folder."""
+        """Open a folder, and wait until it is open: what is pressed while it grows moves away under the pointer."""
         title = self.page.locator("[class*=Paper-root] > [class*=Paper-root]")
         title.filter(has_text=re.compile(rf"^{re.escape(folder)}$")).locator("visible=true").click()
+        self.page.evaluate(PAINT)
+        moving = (
+            "() => document.getAnimations().some(one => one instanceof CSSTransition && one.playState === 'running')"
+        )
+        self.until(lambda: not self.page.evaluate(moving), f"the folder {folder} is open")
 
     def tab(self, name: str) -> None:
         """Open a tab."""
