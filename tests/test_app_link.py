@@ -13,12 +13,12 @@ from spherloc.datasets import load_scene
 from spherloc.datasets.variation import Variation
 from spherloc.estimators import default_options, estimate
 from spherloc_viz.app.catalog import Catalog, SceneWish
-from spherloc_viz.app.link import MANY, MOST_LETTERS, ONCE, Follower, View, link_of
+from spherloc_viz.app.link import MANY, MOST_LETTERS, ONCE, Follower, PageView, link_of
 from spherloc_viz.app.panels.folders import Roots
 from spherloc_viz.app.wish import Run, Wish
 from tests.tiny_scene import write_tiny_scene
 
-VIEW = View("outcome", (), "dark")
+VIEW = PageView("outcome", (), "dark")
 
 
 class Place:
@@ -33,7 +33,7 @@ class Place:
         wish = SceneWish(self.label, 5)
         self.now = Wish(wish, "mc", default_options("mc", self.catalog.problem(wish)))
 
-    def link(self, wish: Wish, view: View) -> str:
+    def link(self, wish: Wish, view: PageView) -> str:
         problem = self.catalog.problem(wish.scene)
         trace = estimate(problem, wish.estimator, wish.options, wish.scene.seed)
         return link_of(Run(wish, trace, np.arange(len(problem))), view, self.catalog, self.base.scenes, self.roots)
@@ -51,7 +51,7 @@ def test_what_is_written_is_read_again(place: Place) -> None:
     )
     scene = SceneWish(place.label, 2**62, None, variation)
     options = replace(default_options("ransac-2p", place.catalog.problem(scene)), iterations=77, confidence=0.97)
-    wish, view = Wish(scene, "ransac-2p", options), View("sample-3", (2, 4), "light", answers_hidden=True)
+    wish, view = Wish(scene, "ransac-2p", options), PageView("sample-3", (2, 4), "light", answers_hidden=True)
     found = place.follower.follow(place.link(wish, view), place.now, VIEW)
     assert (found.wish, found.view, found.remarks) == (wish, view, ())
     assert place.follower.follow("", place.now, VIEW).remarks == ()
@@ -116,4 +116,4 @@ def test_a_long_link_is_not_written(place: Place) -> None:
     hidden = tuple(range(10_000, 10_000 + MOST_LETTERS // 6))
     scene = SceneWish(place.label, 1)
     wish = Wish(scene, "mc", default_options("mc", place.catalog.problem(scene)))
-    assert place.link(wish, View("outcome", hidden, "dark")) == ""
+    assert place.link(wish, PageView("outcome", hidden, "dark")) == ""

@@ -34,7 +34,7 @@ MANY = ("set", "option")
 
 
 @dataclass(frozen=True)
-class View:
+class PageView:
     """How a run is looked at."""
 
     step: str
@@ -45,7 +45,7 @@ class View:
     answers_hidden: bool = False
 
 
-def link_of(run: Run, view: View, catalog: Catalog, known: Iterable[str], roots: Roots) -> str:
+def link_of(run: Run, view: PageView, catalog: Catalog, known: Iterable[str], roots: Roots) -> str:
     """The text that brings a run and the view of it back; empty if it would be too long.
 
     ``known`` are the labels of the scenes that every page has.
@@ -95,7 +95,7 @@ class Followed:
     """What a link led to."""
 
     wish: Wish
-    view: View
+    view: PageView
     remarks: tuple[str, ...]
     """What of the link could not be opened, a sentence each."""
 
@@ -107,7 +107,7 @@ class Follower:
         """``problem`` gives the problem of a wish; it may take long, and raises ``InputError`` if there is none."""
         self._catalog, self._roots, self._problem = catalog, roots, problem
 
-    def follow(self, text: str, now: Wish, view: View) -> Followed:
+    def follow(self, text: str, now: Wish, view: PageView) -> Followed:
         """Where a link leads from what the page shows ``now``. Raises ``Cancelled`` if the map's work is ended."""
         remarks: list[str] = []
         said = _read(text, remarks)
@@ -130,7 +130,7 @@ class Follower:
         except InputError as error:
             remarks.append(str(error))
             selected = ()
-        seen = View(said.get("step", view.step), selected, theme, hidden)
+        seen = PageView(said.get("step", view.step), selected, theme, hidden)
         return Followed(Wish(scene, estimator, options), seen, tuple(remarks))
 
     def _scene(self, said: dict[str, Any], now: SceneWish, remarks: list[str]) -> SceneWish:

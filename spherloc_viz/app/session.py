@@ -24,7 +24,7 @@ from spherloc_viz.app.controls.controls import Controls
 from spherloc_viz.app.edits import Edits
 from spherloc_viz.app.face import Face, Places
 from spherloc_viz.app.history import History
-from spherloc_viz.app.link import Followed, Follower, View, address_html, link_of
+from spherloc_viz.app.link import Followed, Follower, PageView, address_html, link_of
 from spherloc_viz.app.newest import Job, Newest
 from spherloc_viz.app.notices import Notices
 from spherloc_viz.app.page_runs import Known, PageRuns
@@ -245,10 +245,10 @@ class Session:
         if followed.remarks:
             self.complain(" ".join(remark[:1].upper() + remark[1:] for remark in followed.remarks))
 
-    def _view(self) -> View:
+    def _view(self) -> PageView:
         """How the page looks at its run."""
         display = self._controls.display
-        return View(self._face.step_key, self._edits.selected, display.theme, display.answers_hidden)
+        return PageView(self._face.step_key, self._edits.selected, display.theme, display.answers_hidden)
 
     def _solve_wish(self) -> float | None:
         number, gesture = self._changes.moment(), self._changes.gesture
