@@ -27,7 +27,7 @@ play: ## Install what it needs, start the playground and print its address
 test: ## Install what the tests need, a Chromium included, and run them all
 	@SPHERLOC_CHROMIUM="$$(scripts/setup.sh test)" && export SPHERLOC_CHROMIUM && \
 	  printf 'spherloc: running the tests; browser: %s\n' "$$SPHERLOC_CHROMIUM" && \
-	  exec $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)
+	  exec $(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder $(ARGS)
 
 test-python: ## Run part of the tests with a newer Python (3.12, 3.13), if one is here
 	@scripts/test_python.sh $(if $(findstring command,$(origin PYTHON)),'$(PYTHON)')
