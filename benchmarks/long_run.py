@@ -65,7 +65,7 @@ def _record(count: int, pipe: Connection) -> None:
     """Record so many runs, telling how many are done."""
     from spherloc.datasets import bundled_scenes, load_scene
     from spherloc.estimators import estimate
-    from spherloc_viz.recording.keeping.recorder import Recorder
+    from spherloc_viz.recording.storage.recorder import Recorder
 
     scene = load_scene(bundled_scenes()["mei_outliers_80"])
     traces = [estimate(scene.problem(seed), "mc", seed=seed) for seed in range(20)]

@@ -27,7 +27,7 @@ from spherloc.diagnosis import diagnose
 from spherloc.estimators import estimate
 from spherloc.trace import Trace
 from spherloc_viz.layers import paint, steps
-from spherloc_viz.layers.decisive import decisive_step
+from spherloc_viz.layers.key_step import key_step
 from spherloc_viz.layers.primitives import Balls, Label, Mesh, Picture, Points, SceneItem, Segments
 from spherloc_viz.recording.content.chart_bars import bars
 from spherloc_viz.recording.content.drawing import chart_path
@@ -36,8 +36,8 @@ from spherloc_viz.recording.content.markdown import step_text
 from spherloc_viz.recording.content.panels import panels_of
 from spherloc_viz.recording.content.properties import APPLICATION_ID
 from spherloc_viz.recording.content.writer import recorded_steps
-from spherloc_viz.recording.keeping.keeper import Keeper
 from spherloc_viz.recording.origin import Origin
+from spherloc_viz.recording.storage.store import RecordingStore
 
 RUNS = (("mei_outliers_80", "mc"), ("mei_outliers_90", "mc-exact"), ("fisheye_outliers_80", "ransac-2p"))
 RENDERED = "apartment_night_panorama", "mc"
@@ -77,7 +77,7 @@ def thread_count() -> int:
 def painted(trace: Trace) -> dict[int, Picture]:
     """The pictures of a lean recording."""
     stops = steps(trace)
-    return {index: paint(trace, index) for index in recorded_steps(stops, decisive_step(trace, diagnose(trace)))}
+    return {index: paint(trace, index) for index in recorded_steps(stops, key_step(trace, diagnose(trace)))}
 
 
 def plainly(trace: Trace, path: Path) -> None:
@@ -134,10 +134,10 @@ def measure(scene: str, estimator: str, size: int | None, runs: int, folder: Pat
     threads = thread_count()
     diagnosing = cost_ms(diagnose, traces())
     painting = cost_ms(lambda trace: [paint(trace, index) for index in recorded_steps(steps(trace), 0)], traces())
-    with Keeper(folder / "lean", print, keep_bytes=None) as keeper:
-        lean = cost_ms(lambda trace: keeper.record(trace, origin, told), traces())
-    with Keeper(folder / "full", print, full=True, keep_bytes=None) as keeper:
-        full = cost_ms(lambda trace: keeper.record(trace, origin, told), traces())
+    with RecordingStore(folder / "lean", print, keep_bytes=None) as store:
+        lean = cost_ms(lambda trace: store.record(trace, origin, told), traces())
+    with RecordingStore(folder / "full", print, full=True, keep_bytes=None) as store:
+        full = cost_ms(lambda trace: store.record(trace, origin, told), traces())
     lean_mb, full_mb = (largest_mb(folder / name) for name in ("lean", "full"))
     before = thread_count()
     peer = cost_ms(lambda trace: plainly(trace, path), traces()) - diagnosing

@@ -75,7 +75,7 @@ def synthetic_row(number: int, rng: np.random.Generator) -> RunRow:
         time_ms=float(rng.exponential(30.0)),
         proven=None if estimator != "mc-exact" else bool(rng.random() < 0.8),
         steps=int(rng.integers(8, 60)),
-        decisive_step=4,
+        key_step=4,
         labels=(WORDS[rng.integers(len(WORDS))],) if labelled else (),
         note="Somebody should look at this one again. " * 3 if labelled else "",
         size_bytes=int(rng.integers(300_000, 1_000_000)),

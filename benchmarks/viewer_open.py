@@ -2,7 +2,7 @@
 
     python -m benchmarks.viewer_open [--openings 5]
 
-Ours is the link of a running playground, which opens at the decisive step, paused. The peer is rerun's own way to show
+Ours is the link of a running playground, which opens at the key step, paused. The peer is rerun's own way to show
 a file in a browser, ``rerun --serve-web FILE``, which opens at the first step. Both show the same file in the same
 Chromium, in turn, each in a profile of its own: the first opening has empty caches (and ours unpacks the viewer's
 program then), the others do not. The time ends with the third frame after the viewer has recording and layout, and for
@@ -58,7 +58,7 @@ def main() -> None:
         runs = folder / "runs"
         row = write_recording(estimate(load_scene(SCENE).problem(None), "mc"), runs / "run.rrd")
         address = stack.enter_context(playground(recordings=runs))[0].rstrip("/")
-        links = {OURS: address + viewer_link("run.rrd", row.decisive_step)}
+        links = {OURS: address + viewer_link("run.rrd", row.key_step)}
         links[PEER] = stack.enter_context(_served_by_rerun(runs / "run.rrd"))
         player = stack.enter_context(sync_playwright())
         profiles = {name: stack.enter_context(_profile(player, folder / name)) for name in links}

@@ -143,7 +143,7 @@ def gallery(page: Page) -> None:
 SYNTHETIC_VIEWS: Views = {
     "outcome": lambda page: tab(page, "Yaw"),
     "arcs": lambda page: step(page, "The yaw most arcs share"),
-    "twins": lambda page: step(page, "twin"),
+    "roots": lambda page: step(page, "roots"),
     "charts": lambda page: (step(page, "The yaw most arcs share"), tab(page, "Charts")),
     "balls": lambda page: (tab(page, "Yaw"), step(page, "The maximum clique of balls")),
     "residuals": lambda page: (step(page, "Outcome"), tab(page, "Residuals")),

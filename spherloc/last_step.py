@@ -33,7 +33,7 @@ Model = tuple[float, float]
 """Noise in px, and the standard deviation of gravity in rad."""
 
 MOST_STARTS = 4
-RIVAL_SHARE = 0.6
+ALTERNATIVE_SHARE = 0.6
 """Share of the most inliers that a start must have: what has less never wins."""
 
 
@@ -82,7 +82,7 @@ def conclude(
 def _promising(aligned: AlignedProblem, starts: Sequence[FloatArray], bounds: Bounds) -> list[FloatArray]:
     """The first start and those of the next ones that explain enough beside it."""
     counts = [int(np.count_nonzero(residuals_px(aligned, start) <= bounds.pixels)) for start in starts[:MOST_STARTS]]
-    enough = RIVAL_SHARE * max(counts)
+    enough = ALTERNATIVE_SHARE * max(counts)
     return [start for k, (start, count) in enumerate(zip(starts, counts, strict=False)) if k == 0 or count >= enough]
 
 

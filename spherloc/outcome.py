@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spherloc.bounds import bounds_of
-from spherloc.consensus.chance import chance_rate, chance_sets
+from spherloc.consensus.chance import chance_rate, nfa
 from spherloc.consensus.inliers import mark_each
 from spherloc.consensus.two_point_search import search_two_point
 from spherloc.diagnosis.evidence import FEW, LOOSE_ENDS, different
@@ -26,16 +26,16 @@ from spherloc.trace import ConsensusStage, RefinementStage, Trace
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
-MOST_CHANCE_SETS = 1e-3
-"""Expected number of chance sets of the size of the inliers below which they are believed."""
+MOST_NFA = 1e-3
+"""Expected number of false alarms (NFA) of the size of the inliers below which they are believed."""
 LEAST_LEAD = 2.0
-"""By how many standard deviations of counting a pose must lead a rival that stands out from chance itself."""
+"""By how many standard deviations of counting a pose must lead a alternative that stands out from chance itself."""
 LEAST_SDS = 2.0
 """Standard deviations that must lie within the error of a success."""
 TILT_RAD = np.radians(6.0)
 """Gravity errors up to about this are looked for."""
 SAMPLES, CONFIDENCE = 2000, 0.99
-"""Of the search for a rival among what the pose does not explain."""
+"""Of the search for a alternative among what the pose does not explain."""
 FAR = 3.0
 """A correspondence farther off than so many bounds is not explained by the pose."""
 
@@ -46,7 +46,7 @@ class Outcome(StrEnum):
     LOCALIZED = "localized"
     """The pose is believed."""
     DOUBTFUL = "doubtful"
-    """There is a pose, but chance, a rival, or what its inliers leave open speaks against it."""
+    """There is a pose, but chance, a alternative, or what its inliers leave open speaks against it."""
     FAILED = "failed"
     """There is no pose."""
 
@@ -78,7 +78,7 @@ def judge(trace: Trace) -> Judgement:
         rate = chance_rate(aligned.bearings, bounds_of(replace(aligned, gravity_bound_rad=0.0), bound_px).radians)
     found = [
         _chance_margin(len(aligned.points), size, rate, fixed_by),
-        _rival_margin(trace, aligned, state, errors, size, rate, fixed_by),
+        _alternative_margin(trace, aligned, state, errors, size, rate, fixed_by),
         _gravity_margin(aligned, state, bound_px, inliers, trace.options),
         _error_margin(trace, aligned, state, inliers),
     ]
@@ -97,17 +97,17 @@ def _different(aligned: AlignedProblem, mask: BoolArray) -> int:
 
 def _expected(count: int, size: int, rate: float, fixed_by: int) -> float:
     """Chance sets of that size, where so many correspondences fix a pose."""
-    return chance_sets(count, size, rate) * rate ** (2 - fixed_by) if size > fixed_by else np.inf
+    return nfa(count, size, rate) * rate ** (2 - fixed_by) if size > fixed_by else np.inf
 
 
 def _chance_margin(count: int, size: int, rate: float, fixed_by: int) -> tuple[float, str]:
     expected = max(_expected(count, size, rate, fixed_by), 1e-300)
-    margin = np.log10(MOST_CHANCE_SETS) - np.log10(min(expected, 1e300))
+    margin = np.log10(MOST_NFA) - np.log10(min(expected, 1e300))
     many = f"{expected:.1g}" if expected < 1e6 else "millions"
     return margin, f"Only {size} different matches agree with it; {many} such sets are expected by chance."
 
 
-def _rival_margin(
+def _alternative_margin(
     trace: Trace, aligned: AlignedProblem, state: FloatArray, errors: FloatArray, size: int, rate: float, fixed_by: int
 ) -> tuple[float, str]:
     """The lead over the best clearly different pose that is itself no chance."""
@@ -129,7 +129,7 @@ def _rival_margin(
             yaws, places = found.yaws_rad[best : best + 1], found.translations[best : best + 1]
             mask = mark_each(yaws, places, part.bearings, part.points, part.pixel_from_bearing, limits)[0]
             most = max(most, _different(part, mask))
-    if _expected(len(aligned.points), most, rate, fixed_by) > MOST_CHANCE_SETS:
+    if _expected(len(aligned.points), most, rate, fixed_by) > MOST_NFA:
         return np.inf, ""
     lead = (size - most) / np.sqrt(max(size + most, 1))
     return lead - LEAST_LEAD, f"Another pose explains {most} different matches, this one {size}."

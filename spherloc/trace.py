@@ -210,7 +210,7 @@ class Certificate:
     """No pose explains more correspondences."""
     lower_bound: int
     """Some pose explains as many."""
-    chance_sets: float
+    nfa: float
     """Expected number of sets of ``lower_bound`` outliers that agree with some pose by chance. If it is not far below
     1, no method can know the answer."""
 

@@ -21,12 +21,12 @@ from spherloc.problem import Problem
 from spherloc.trace import Trace
 from spherloc_viz.options import json_text, option_fields
 from spherloc_viz.progress import prepare, say, solve
-from spherloc_viz.recording.keeping.room import KEEP_GIGABYTES, kept_bytes
 from spherloc_viz.recording.origin import Origin
+from spherloc_viz.recording.storage.room import KEEP_GIGABYTES, kept_bytes
 from spherloc_viz.share import is_recording
 
 if TYPE_CHECKING:
-    from spherloc_viz.recording.keeping.keeper import Keeper
+    from spherloc_viz.recording.storage.store import RecordingStore
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def run_scenes(
     jobs: list[Future[int]] = []
     warm = False
     # One thread writes and prints, in order, while the next scene is being solved.
-    with keeper_of(records) as keeper, ThreadPoolExecutor(1) as finisher:
+    with store_of(records) as store, ThreadPoolExecutor(1) as finisher:
         for path in paths:
             try:
                 scene = open_scene(path)
@@ -76,7 +76,7 @@ def run_scenes(
                     warm = True
                 options = resolved_options(estimator, problem, changes)
                 trace = solve(problem, estimator, options, used_seed(scene, seed))
-                origin = None if keeper is None else _origin(path, scene, seed, query, variation)
+                origin = None if store is None else _origin(path, scene, seed, query, variation)
                 if proof is not None:
                     _prove(trace, proof)
             except KeyboardInterrupt:
@@ -85,7 +85,7 @@ def run_scenes(
             except SpherlocError as error:
                 jobs.append(finisher.submit(_report, error))
                 continue
-            jobs.append(finisher.submit(_finish, path, trace, origin, as_json, keeper))
+            jobs.append(finisher.submit(_finish, path, trace, origin, as_json, store))
         return max(job.result() for job in jobs)
 
 
@@ -103,19 +103,19 @@ def open_scene(path: Path) -> Scene:
     """The scene of a scene file or of a recording; raises ``SpherlocError`` if it is neither."""
     if not is_recording(path):
         return load_scene(path)
-    from spherloc_viz.recording.again.scene import load_recorded_scene
+    from spherloc_viz.recording.replay.scene import load_recorded_scene
 
     return load_recorded_scene(path)
 
 
 def _origin(path: Path, scene: Scene, seed: int | None, query: str | None, variation: Variation) -> Origin:
-    from spherloc_viz.recording.again.scene import origin_of
+    from spherloc_viz.recording.replay.scene import origin_of
 
     return origin_of("command", path, scene, seed, query, variation)
 
 
 @contextmanager
-def keeper_of(records: Records | None) -> "Iterator[Keeper | None]":
+def store_of(records: Records | None) -> "Iterator[RecordingStore | None]":
     """Who records runs, in a folder from which the leftovers of killed processes are gone.
 
     Raises ``InputError`` for a wrong size to be kept.
@@ -125,15 +125,15 @@ def keeper_of(records: Records | None) -> "Iterator[Keeper | None]":
         return
     keep_bytes = kept_bytes(records.keep_gigabytes)
     # Only now, since it takes most of a second.
-    from spherloc_viz.recording.keeping.keeper import Keeper
+    from spherloc_viz.recording.storage.store import RecordingStore
 
-    with Keeper(records.folder, say, records.full, keep_bytes) as keeper:
+    with RecordingStore(records.folder, say, records.full, keep_bytes) as store:
         with suppress(OSError):  # whoever cannot read the folder is told when a run cannot be written
             try:
-                keeper.tidy()
+                store.tidy()
             except RecordingError as error:
                 say(f"what killed processes left is not recovered: {error}")
-        yield keeper
+        yield store
 
 
 def _problem(path: Path, scene: Scene, seed: int | None, query: str | None, variation: Variation) -> Problem:
@@ -177,13 +177,13 @@ def _report(error: SpherlocError) -> int:
     return 2
 
 
-def _finish(path: Path, trace: Trace, origin: Origin | None, as_json: bool, keeper: "Keeper | None") -> int:
+def _finish(path: Path, trace: Trace, origin: Origin | None, as_json: bool, store: "RecordingStore | None") -> int:
     """Record and print one run; returns its exit code."""
     code = 0 if judge(trace).outcome is Outcome.LOCALIZED else 1
     recording, diagnosis = None, diagnose(trace)
-    if keeper is not None:
+    if store is not None:
         try:
-            recording = keeper.record(trace, origin, diagnosis)
+            recording = store.record(trace, origin, diagnosis)
         except SpherlocError as error:
             code = _report(error)
     if as_json:
@@ -221,7 +221,7 @@ def as_record(path: Path, trace: Trace, diagnosis: Diagnosis, recording: Path | 
 def as_text(path: Path, trace: Trace, diagnosis: Diagnosis, recording: Path | None) -> str:
     """A run as a few lines for people."""
     metrics, pose = evaluate(trace), trace.cam_from_map
-    # What a stranger's recording says must not steer the terminal.
+    # What an untrusted recording says must not steer the terminal.
     name = "".join(letter if letter.isprintable() else " " for letter in trace.problem.name)
     lines = [f"{name} ({path}), {trace.estimator}, seed {trace.seed}"]
     if pose is None:

@@ -25,13 +25,13 @@ from spherloc.experiments.trajectories import estimated_trajectory, timed, true_
 from spherloc.frontend.view import View
 from spherloc.trace import Trace
 from spherloc.trajectory import write_tum
-from spherloc_viz.batch import Records, keeper_of, parse_settings
+from spherloc_viz.batch import Records, parse_settings, store_of
 from spherloc_viz.options import json_text
 from spherloc_viz.progress import prepare, progress, say
 from spherloc_viz.recording.origin import Origin
 
 if TYPE_CHECKING:
-    from spherloc_viz.recording.keeping.keeper import Keeper
+    from spherloc_viz.recording.storage.store import RecordingStore
 
 MAX_TOLD = 5
 
@@ -64,8 +64,8 @@ def localize_sequence(
         todo = _todo(scene, chosen, log, retry_failed)
         if todo:
             warm_up(say, [estimator])
-            with keeper_of(records) as keeper:
-                recorder = None if keeper is None else _Recorder(keeper, path.resolve(), log)
+            with store_of(records) as store:
+                recorder = None if store is None else _Recorder(store, path.resolve(), log)
                 _work(scene, todo, log, (estimator, options, seed), recorder)
         results = log.results()
         _finish(log, results)
@@ -121,7 +121,7 @@ def _work(
 class _Recorder:
     """Records the queries of a sequence."""
 
-    keeper: "Keeper"
+    store: "RecordingStore"
     """Of the folder of the recordings."""
     scene_path: Path
     """Absolute."""
@@ -135,7 +135,7 @@ class _Recorder:
         """
         log = self.log
         try:
-            path = self.keeper.record(trace, Origin("sequence", str(self.scene_path), trace.seed, query))
+            path = self.store.record(trace, Origin("sequence", str(self.scene_path), trace.seed, query))
         except RecordingError as error:
             if isinstance(error.__cause__, OSError):
                 raise InputError(

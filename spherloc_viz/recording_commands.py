@@ -39,10 +39,10 @@ def view(
     Args:
         recording: A recording (.rrd).
         web: Serve the viewer to a browser on this machine instead of opening a window.
-        step: The step to open at; 0 is the first, and the decisive one is taken if it is not given.
+        step: The step to open at; 0 is the first, and the key step is taken if it is not given.
         port: Port of the web viewer; 0 takes a free one.
     """
-    from spherloc_viz.recording.strangers.examiner import examine
+    from spherloc_viz.recording.sandbox.examiner import examine
     from spherloc_viz.recording.viewing.view import step_of, view_in_window
 
     row = examine(recording)
@@ -78,7 +78,7 @@ def repeat(
         json: Print one JSON object a recording, on one line; infinity is the text "inf".
     """
     from spherloc_viz.progress import solve
-    from spherloc_viz.recording.again.repeat_text import repeat_all
+    from spherloc_viz.recording.replay.repeat_text import repeat_all
 
     return repeat_all(without_reviews(recordings), json, solve)
 
@@ -191,7 +191,7 @@ def steps(
     The condition is SQL of columns, numbers, texts, comparisons, AND, OR, NOT, IN, BETWEEN, LIKE, IS NULL and
     arithmetic. Columns of a step: step (its index), stage, key (its name), agreeing (matches), rotation_error_deg,
     position_error_m (of its pose). Columns of its run: created, source, scene, name, estimator, seed, outcome,
-    diagnosis, doubtful, correspondences, inliers, outlier_rate, steps, decisive_step, time_ms. What is unknown is NULL.
+    diagnosis, doubtful, correspondences, inliers, outlier_rate, steps, key_step, time_ms. What is unknown is NULL.
     Needs the extra "catalog".
 
     For example:

@@ -16,7 +16,7 @@ from spherloc_viz.recording.index.refresh import Refreshed
 from spherloc_viz.recording.index.run_index import RunIndex
 from spherloc_viz.recording.index.run_text import FORMS, counts_text, rows_text
 from spherloc_viz.recording.review.notes import Review, checked_review
-from spherloc_viz.recording.strangers.examiner import examine, examine_review
+from spherloc_viz.recording.sandbox.examiner import examine, examine_review
 
 SORT_WORDS = {
     "outliers": "outlier_rate",

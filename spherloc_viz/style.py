@@ -10,7 +10,7 @@ OUTLIER: RGB = (213, 70, 60)
 CLIQUE: RGB = (240, 180, 30)
 ESTIMATE: RGB = (40, 120, 220)
 TRUTH: RGB = (160, 130, 210)
-RIVAL: RGB = (110, 205, 215)
+ALTERNATIVE: RGB = (110, 205, 215)
 SAMPLE: RGB = (230, 90, 190)
 UNDECIDED: RGB = (140, 146, 156)
 SPHERE: RGB = (170, 190, 215)
@@ -25,7 +25,7 @@ LEGEND: tuple[tuple[RGB, str], ...] = (
     (SAMPLE, "tried"),
     (ESTIMATE, "estimate"),
     (TRUTH, "truth"),
-    (RIVAL, "rival pose"),
+    (ALTERNATIVE, "alternative pose"),
     (UNDECIDED, "not decided yet"),
     (SELECTED, "selected"),
 )
@@ -54,7 +54,7 @@ MAX_DRAWN_RAYS = 600
 MAX_DRAWN_ARCS = 240
 MAX_DRAWN_BALLS = 70
 MAX_DRAWN_PAIRS = 200
-MAX_DRAWN_RIVALS = 8
+MAX_DRAWN_ALTERNATIVES = 8
 MAX_SELECTED_DOTS = 500
 MAX_SELECTED_CIRCLES = 8
 MAX_SELECTED_ARCS = 40

@@ -12,13 +12,13 @@ from spherloc.experiments.sweep import Entrant, Keep, SweepPlan, planned, run_sw
 from spherloc.experiments.sweep_log import PICTURE, SUMMARY, SweepLog
 from spherloc.experiments.sweep_summary import summarize
 from spherloc.experiments.sweep_text import parse_values
-from spherloc_viz.batch import Records, keeper_of, parse_settings
+from spherloc_viz.batch import Records, parse_settings, store_of
 from spherloc_viz.layers.primitives import Table
 from spherloc_viz.layers.sweep import sweep_table
 from spherloc_viz.progress import progress, say
 
 if TYPE_CHECKING:
-    from spherloc_viz.recording.keeping.keeper import Keeper
+    from spherloc_viz.recording.storage.store import RecordingStore
 
 PRUNE_EVERY = 100
 """Runs of a sweep, of which the workers record some in a second."""
@@ -49,8 +49,8 @@ def sweep(
             say(f"{out}: {plan.rows - left:,} of {plan.rows:,} runs are done already.")
         try:
             if left:
-                with keeper_of(records) as keeper:
-                    _work(plan, log, left, workers, scheduler, keeper)
+                with store_of(records) as store:
+                    _work(plan, log, left, workers, scheduler, store)
         except KeyboardInterrupt:
             say(f"stopped; {len(log.rows):,} runs are in {out}, and the same command goes on from there.")
             raise
@@ -65,11 +65,11 @@ def sweep(
 
 
 def _work(
-    plan: SweepPlan, log: SweepLog, left: int, workers: int, scheduler: str | None, keeper: "Keeper | None"
+    plan: SweepPlan, log: SweepLog, left: int, workers: int, scheduler: str | None, store: "RecordingStore | None"
 ) -> None:
     if scheduler is None:
         warm_up(say, {entrant.estimator for entrant in plan.entrants})  # once, before all workers do it
-    recorded = None if keeper is None else Recorded(keeper)
+    recorded = None if store is None else Recorded(store)
     keep = None if recorded is None else recorded.keep(scheduler is not None)
     complain = say if recorded is None else recorded.complain
     with progress(left, "runs") as advance:
@@ -85,17 +85,17 @@ def _work(
 class Recorded:
     """The recordings of a sweep, which its workers write: makes room for them, and says once what fails."""
 
-    def __init__(self, keeper: "Keeper") -> None:
-        self._keeper, self._lost = keeper, 0
+    def __init__(self, store: "RecordingStore") -> None:
+        self._store, self._lost = store, 0
 
     def keep(self, cluster: bool) -> Keep:
         """What records a run where it is done."""
-        from spherloc_viz.recording.keeping.sweep_keeper import SweepKeeper
+        from spherloc_viz.recording.storage.sweep_store import SweepStore
 
-        folder = self._keeper.folder.resolve()
+        folder = self._store.folder.resolve()
         if cluster:
             say(f"runs of the cluster's workers on this machine are recorded in {folder}, those of others are not.")
-        return SweepKeeper(folder)
+        return SweepStore(folder)
 
     def complain(self, sentence: str) -> None:
         """A run could not be recorded: of many, the first one says why."""
@@ -106,7 +106,7 @@ class Recorded:
     def prune(self) -> None:
         """Delete old successes where there are too many."""
         try:
-            self._keeper.prune()
+            self._store.prune()
         except RecordingError as error:
             self.complain(str(error))
 

@@ -17,8 +17,8 @@ from hypothesis import HealthCheck, settings
 from spherloc.datasets import load_scene
 from spherloc.datasets.synthetic import SyntheticScene
 from spherloc_viz.recording.index.run_index import RunIndex
-from spherloc_viz.recording.strangers import examiner as strangers
-from spherloc_viz.recording.strangers.examiner import Examiner
+from spherloc_viz.recording.sandbox import examiner as strangers
+from spherloc_viz.recording.sandbox.examiner import Examiner
 from tests.needs import lacking, real_data
 
 ROOT = Path(__file__).resolve().parents[1]

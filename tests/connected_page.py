@@ -12,7 +12,7 @@ import viser
 import zstandard
 
 from spherloc_viz.app.web.access import Role
-from spherloc_viz.app.web.viser_seams import KEY_HEADER, ROLE_HEADER
+from spherloc_viz.app.web.viser_internals import KEY_HEADER, ROLE_HEADER
 from tests.waiting import LIMIT_S, until
 
 HELLO = {

@@ -67,13 +67,13 @@ def lost_run() -> Trace:
 def exact_run(**changes: Any) -> Trace:
     """A run by hand as "auto" and an exact estimator leave it, with its certificate; ``changes`` are of the stage.
 
-    Its bound peaks where the best pose looks, and there is a rival.
+    Its bound peaks where the best pose looks, and there is a alternative.
     """
     trace = estimate(scene_problem("mei_outliers_80"), "mc")
     pose, clique = trace.cam_from_map, np.flatnonzero(trace.inlier_mask)
     refinement = trace.stage(RefinementStage)
     assert pose is not None and refinement is not None
-    rival = np.column_stack([pose[:, :3] @ yaw_rotation(0.5), pose[:, 3] + [1.0, 0.0, 2.0]])
+    alternative = np.column_stack([pose[:, :3] @ yaw_rotation(0.5), pose[:, 3] + [1.0, 0.0, 2.0]])
     yaw_rad = yaw_of(trace.problem.aligned.align_pose(pose)[:, :3])
     bound = np.full(1440, len(clique) - 3, np.int32)
     bound[int((yaw_rad + np.pi) / np.pi * 720)] = len(clique)
@@ -85,11 +85,11 @@ def exact_run(**changes: Any) -> Trace:
         finished=True,
         yaw_rad=yaw_rad,
         clique=clique.astype(np.int32),
-        cam_from_map=np.array([pose, rival]),
+        cam_from_map=np.array([pose, alternative]),
         support=np.array([len(clique), 6], np.int32),
     )
     decision = DecisionStage("mc-exact", "100 matches are few enough to compare all pairs.", 500, 0.2)
-    certificate = Certificate(upper_bound=len(clique), lower_bound=len(clique), chance_sets=2e-9)
+    certificate = Certificate(upper_bound=len(clique), lower_bound=len(clique), nfa=2e-9)
     stages = (decision, replace(stage, **changes), refinement)
     return replace(trace, estimator="auto", stages=stages, certificate=certificate)
 

@@ -7,13 +7,13 @@ import viser
 
 from spherloc.errors import RecordingError
 from spherloc_viz.app.catalog import Catalog
-from spherloc_viz.app.review.shelf import Shelf
+from spherloc_viz.app.review.run_library import RunLibrary
 from spherloc_viz.app.server import Sessions
 from spherloc_viz.app.services import Services
 from spherloc_viz.app.session import Session
 from spherloc_viz.app.web.touch import Touch
-from spherloc_viz.app.web.viser_seams import start_viser, stop_viser
-from spherloc_viz.recording.keeping.recorder import Recorder
+from spherloc_viz.app.web.viser_internals import start_viser, stop_viser
+from spherloc_viz.recording.storage.recorder import Recorder
 from tests.connected_page import ConnectedPage
 from tests.tiny_scene import write_tiny_scene
 from tests.waiting import until
@@ -29,7 +29,7 @@ class Office:
         self.errors: list[RecordingError] = []
         self.recorder = Recorder(self.folder, self.report, on_recovery=lambda words: self.sessions.recover(words))
         catalog = Catalog(write_tiny_scene(folder))
-        self.services = Services(catalog, (folder,), self.recorder, Shelf(self.recorder.index))
+        self.services = Services(catalog, (folder,), self.recorder, RunLibrary(self.recorder.index))
         self.sessions = Sessions(self.services)
         self.server: viser.ViserServer = start_viser(KEY)
         self.sessions.attend(self.server)
@@ -89,7 +89,7 @@ class Visitor:
     @property
     def opening(self) -> bool:
         """Whether a run is still being opened; what is said of it in the end is empty."""
-        return self.panel._reviewer._errand._busy
+        return self.panel._reviewer._background._busy
 
     @property
     def rows(self) -> str:
@@ -98,7 +98,7 @@ class Visitor:
 
     @property
     def drawn(self) -> dict[str, Any]:
-        return self.session._face.canvas._painter._drawn
+        return self.session._display.canvas._painter._drawn
 
     def see(self) -> None:
         """Have the tab in front."""

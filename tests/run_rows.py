@@ -38,7 +38,7 @@ def some_row(file: str = "a.rrd", **changes: Any) -> RunRow:
         "time_ms": 14.0,
         "proven": None,
         "steps": 20,
-        "decisive_step": 12,
+        "key_step": 12,
         "size_bytes": 1000,
         "thumbnail": b"\x89PNG\r\n",
         "format_version": 2,

@@ -1,4 +1,4 @@
-"""A keeper of runs that kills its worker: sent to workers, which import it from here."""
+"""A store of runs that kills its worker: sent to workers, which import it from here."""
 
 import os
 import signal
@@ -7,20 +7,20 @@ from pathlib import Path
 
 from spherloc.experiments.sweep import Job, SweepPlan
 from spherloc.trace import Trace
-from spherloc_viz.recording.keeping.sweep_keeper import SweepKeeper
+from spherloc_viz.recording.storage.sweep_store import SweepStore
 
 
 @dataclass(frozen=True)
-class DeadlyKeeper:
+class DeadlyStore:
     """Keeps every run, and kills its process just after some of them are kept and before anybody has their rows."""
 
-    keeper: SweepKeeper
+    store: SweepStore
     marks: Path
     """Folder with a file for each death."""
     deaths: int
 
     def __call__(self, plan: SweepPlan, job: Job, trace: Trace) -> str:
-        told = self.keeper(plan, job, trace)
+        told = self.store(plan, job, trace)
         for death in range(self.deaths):
             try:
                 (self.marks / str(death)).touch(exist_ok=False)

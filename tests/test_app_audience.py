@@ -59,12 +59,12 @@ def seat(house: House) -> tuple[Page, Audience]:
 
 def drawn(page: Audience) -> Any:
     """The run that a page shows."""
-    return None if page._face._shown is None else page._face._shown[0]
+    return None if page._display._shown is None else page._display._shown[0]
 
 
 def title(page: Any) -> str:
     """Of the step at hand."""
-    return page._face.story.steps._choice.value.split("  ")[1]
+    return page._display.panels.steps._choice.value.split("  ")[1]
 
 
 def test_an_audience_follows_the_presenter_each_with_a_state_of_its_own(house: House) -> None:
@@ -74,31 +74,31 @@ def test_an_audience_follows_the_presenter_each_with_a_state_of_its_own(house: H
     other_page, other = seat(house)
     for page in (early, other):
         until(lambda page=page: drawn(page) is presenter._run is not None)
-        until(lambda page=page: page._face.story._diagnosis.content == presenter._face.story._diagnosis.content)
+        until(lambda page=page: page._display.panels._diagnosis.content == presenter._display.panels._diagnosis.content)
         assert "The presenter shows tiny" in page._status._line.content
     opening, presented = title(early), title(presenter)
     for ending in ("Refinement", "Outcome"):
-        steps = other._face.story.steps
+        steps = other._display.panels.steps
         other_page.set(steps._choice, next(name for name in steps._choice.options if name.endswith(ending)))
         until(lambda ending=ending: title(other) == ending)
     assert (title(presenter), title(early)) == (presented, opening) and opening != "Outcome"
     other._touches.deliver(Touch("select", "3", 0, 0, 0, 0, False))
-    until(lambda: "Match 3" in other._face.card._html.content)
-    assert "Only the presenter changes matches" in other._face.card._html.content
-    assert not early._face.card._panel.visible and not presenter._face.card._panel.visible
+    until(lambda: "Match 3" in other._display.card._html.content)
+    assert "Only the presenter changes matches" in other._display.card._html.content
+    assert not early._display.card._panel.visible and not presenter._display.card._panel.visible
 
     def noisier() -> bool:
-        return drawn(other) is drawn(early) is presenter._run and presenter._run.wish.scene.variation.noise_px == 3.0
+        return drawn(other) is drawn(early) is presenter._run and presenter._run.request.scene.variation.noise_px == 3.0
 
     presenter_page.set(presenter._controls.scene._simulation._noise, 3.0)
     until(noisier)
     assert (title(other), title(early)) == ("Outcome", opening), "each keeps its step"
     # What the presenter hides, the audience cannot see; what its own switch hides, nobody else misses.
-    until(lambda: "off the truth" in other._face.story.steps._text.content)
+    until(lambda: "off the truth" in other._display.panels.steps._text.content)
     presenter_page.set(presenter._controls.display._hide, True)
-    until(lambda: "The truth is unknown" in other._face.story.steps._text.content)
+    until(lambda: "The truth is unknown" in other._display.panels.steps._text.content)
     presenter_page.set(presenter._controls.display._hide, False)
-    until(lambda: "off the truth" in other._face.story.steps._text.content)
+    until(lambda: "off the truth" in other._display.panels.steps._text.content)
     house.sessions.notice("A recording was deleted.")
     assert not any(isinstance(page, Audience) for page in house.sessions._presenters())
 
@@ -109,7 +109,7 @@ def test_an_audience_can_do_nothing(house: House, monkeypatch: pytest.MonkeyPatc
     _, presenter = house.visit()
     wire, page = seat(house)
     until(lambda: drawn(page) is presenter._run)
-    gui = page._face._client.gui
+    gui = page._display._client.gui
     assert set(page._touches._handlers) <= MAY_PRESS
     for handle in gui._gui_input_handle_from_uuid.values():
         switch = isinstance(handle, viser.GuiCheckboxHandle)  # of what is shown
@@ -135,7 +135,7 @@ def test_an_audience_can_do_nothing(house: House, monkeypatch: pytest.MonkeyPatc
         wire.send({"type": "TransformControlsDragStartMessage", "name": name})
         wire.send({"type": "TransformControlsUpdateMessage", "name": name} | camera)
     # All of this has been read once what was sent after it has had its effect.
-    wire.set(page._face.story.steps._buttons, "Previous")
+    wire.set(page._display.panels.steps._buttons, "Previous")
     until(lambda: title(page) != title(presenter))
     assert presenter._run is before is drawn(page)
     assert gui._current_file_upload_states == {}

@@ -20,7 +20,7 @@ from spherloc.watch import Cancelled, Watch
 from spherloc_viz.app.panels import compare_panel
 from spherloc_viz.app.panels.compare_panel import START, STOP, TICKED, ComparePanel, is_same
 from spherloc_viz.app.web.touch import Touch, Touches
-from spherloc_viz.app.web.viser_seams import start_viser, stop_viser
+from spherloc_viz.app.web.viser_internals import start_viser, stop_viser
 from spherloc_viz.layers.primitives import Label
 from tests.waiting import LIMIT_S, until
 
@@ -64,7 +64,7 @@ class Stage:
         return [item.text for item in self.panel.items(trace) if isinstance(item, Label)]
 
     def settle(self) -> None:
-        until(lambda: not self.panel._errand._busy)
+        until(lambda: not self.panel._background._busy)
 
 
 @pytest.fixture(scope="module")

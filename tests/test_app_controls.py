@@ -19,12 +19,12 @@ from spherloc.datasets.outliers import OUTLIER_KINDS
 from spherloc.datasets.variation import Variation
 from spherloc.errors import InputError
 from spherloc.estimators import options_type
-from spherloc_viz.app.catalog import Catalog, SceneWish
+from spherloc_viz.app.catalog import Catalog, SceneRequest
 from spherloc_viz.app.controls.estimator_controls import EstimatorControls
 from spherloc_viz.app.controls.presets import presets
 from spherloc_viz.app.controls.scene_controls import LISTED_QUERIES, SceneControls
 from spherloc_viz.app.controls.simulation_controls import KINDS, SIMULATED
-from spherloc_viz.app.web.viser_seams import start_viser, stop_viser
+from spherloc_viz.app.web.viser_internals import start_viser, stop_viser
 from tests.datasets.test_rendered import SMALL
 
 CATALOG = Catalog(None)
@@ -66,36 +66,36 @@ VARIATIONS = st.builds(
 SIMULATIONS = [label for label in CATALOG.scenes if CATALOG.synthetic(label) is not None]
 
 
-def own(wish: SceneWish) -> SceneWish:
-    """The wish without what the scene says already."""
-    scene, changes = CATALOG.synthetic(wish.scene), wish.variation
+def own(request: SceneRequest) -> SceneRequest:
+    """The request without what the scene says already."""
+    scene, changes = CATALOG.synthetic(request.scene), request.variation
     same = {name: None for name in SIMULATED if getattr(changes, name) == getattr(scene, name)}
-    return replace(wish, variation=replace(changes, **same))
+    return replace(request, variation=replace(changes, **same))
 
 
 @settings(max_examples=40)
 @given(st.sampled_from(SIMULATIONS), st.integers(0, 2**63 - 1), VARIATIONS)
 def test_what_is_written_is_read(controls: SceneControls, label: str, seed: int, variation: Variation) -> None:
     """To the last bit, so that undo, presets and links restore what was."""
-    wish = SceneWish(label, seed, None, variation)
-    controls.write(wish)
-    assert controls.read() == own(wish) and not controls.follow_scene()
+    request = SceneRequest(label, seed, None, variation)
+    controls.write(request)
+    assert controls.read() == own(request) and not controls.follow_scene()
     assert controls.true_camera == variation.true_camera
 
 
 def test_changes_to_single_matches_are_not_shown(controls: SceneControls) -> None:
-    controls.write(SceneWish(FIRST, 1, None, Variation(noise_px=3.0, spoiled=(1,), hidden=(2,))))
-    assert controls.read() == SceneWish(FIRST, 1, None, Variation(noise_px=3.0))
+    controls.write(SceneRequest(FIRST, 1, None, Variation(noise_px=3.0, spoiled=(1,), hidden=(2,))))
+    assert controls.read() == SceneRequest(FIRST, 1, None, Variation(noise_px=3.0))
 
 
 def test_a_scene_that_is_chosen_brings_its_own_settings(controls: SceneControls) -> None:
-    controls.write(SceneWish(FIRST, 5, None, Variation(noise_px=3.0, true_camera=(0.0, 1.0, 2.0, 3.0))))
+    controls.write(SceneRequest(FIRST, 5, None, Variation(noise_px=3.0, true_camera=(0.0, 1.0, 2.0, 3.0))))
     other = SIMULATIONS[1]
     controls._scene.value = other
     assert controls.read().variation == Variation(), "nothing of the scene before"
     assert controls.follow_scene() and not controls.follow_scene()
     scene = CATALOG.synthetic(other)
-    assert scene is not None and controls.read() == SceneWish(other, scene.seed)
+    assert scene is not None and controls.read() == SceneRequest(other, scene.seed)
     assert not controls._simulation._moved.visible and not controls._simulation._home.visible
     np.testing.assert_array_equal(CATALOG.problem(controls.read()).pixels, scene.problem().pixels)
 
@@ -114,7 +114,7 @@ def test_every_slider_and_choice_changes_what_it_says(controls: SceneControls) -
         (shown._camera, list(CATALOG.cameras)[1], "camera", list(CATALOG.cameras.values())[1]),
     ]
     for widget, value, name, expected in cases:
-        controls.write(SceneWish(FIRST, 0))
+        controls.write(SceneRequest(FIRST, 0))
         widget.value = value
         assert controls.read().variation == Variation(**{name: expected})
     assert tuple(KINDS.values()) == OUTLIER_KINDS
@@ -122,7 +122,7 @@ def test_every_slider_and_choice_changes_what_it_says(controls: SceneControls) -
 
 def test_the_slider_of_points_goes_to_5000_where_that_is_wanted(controls: SceneControls) -> None:
     shown, asked = controls._simulation, []
-    controls.write(SceneWish(FIRST, 0))
+    controls.write(SceneRequest(FIRST, 0))
     shown._range.value = "to 500"
     shown._rescale(Press())
     assert shown._points.max == 500 and shown._points.value == 100
@@ -134,14 +134,14 @@ def test_the_slider_of_points_goes_to_5000_where_that_is_wanted(controls: SceneC
     shown._changed = asked.append
     shown._rescale(Press())
     assert shown._points.max == 500 and shown._points.value == 500 and len(asked) == 1
-    controls.write(SceneWish(FIRST, 0, None, Variation(correspondences=1000)))
+    controls.write(SceneRequest(FIRST, 0, None, Variation(correspondences=1000)))
     assert shown._range.value == "to 5,000" and shown._points.max == 5000
 
 
 def test_the_true_camera_is_shown_and_put_back(server: viser.ViserServer) -> None:
     asked: list[object] = []
     controls = SceneControls(server.gui, CATALOG.branch(), lambda event: asked.append(event))
-    controls.write(SceneWish(FIRST, 0))
+    controls.write(SceneRequest(FIRST, 0))
     controls.true_camera = (12.34, 1.0, -2.0, 0.5)
     assert controls.read().variation == Variation(true_camera=(12.34, 1.0, -2.0, 0.5))
     assert (
@@ -150,21 +150,21 @@ def test_the_true_camera_is_shown_and_put_back(server: viser.ViserServer) -> Non
     )
     asked.clear()
     controls._simulation._put_back(press := Press())
-    assert asked == [press] and controls.true_camera is None and controls.read() == SceneWish(FIRST, 0)
+    assert asked == [press] and controls.true_camera is None and controls.read() == SceneRequest(FIRST, 0)
     assert not controls._simulation._home.visible
 
 
 def test_reset_sets_everything_to_what_the_scene_says(server: viser.ViserServer) -> None:
     controls = SceneControls(server.gui, CATALOG.branch(), lambda event: None)
-    controls.write(SceneWish(FIRST, 77, None, Variation(noise_px=3.0, true_camera=(0.0, 1.0, 2.0, 3.0))))
+    controls.write(SceneRequest(FIRST, 77, None, Variation(noise_px=3.0, true_camera=(0.0, 1.0, 2.0, 3.0))))
     scene, reset = CATALOG.synthetic(FIRST), controls.read_unchanged()
-    assert scene is not None and reset == SceneWish(FIRST, scene.seed) != controls.read()
+    assert scene is not None and reset == SceneRequest(FIRST, scene.seed) != controls.read()
     controls.write(reset)
     assert controls.read() == reset
 
 
 def test_seeds(controls: SceneControls) -> None:
-    controls.write(SceneWish(FIRST, 2**63 - 1))
+    controls.write(SceneRequest(FIRST, 2**63 - 1))
     assert controls.read().seed == 2**63 - 1
     controls.next_seed()
     assert controls.read().seed == 0
@@ -189,10 +189,10 @@ def test_thousands_of_queries_stay_usable(server: viser.ViserServer, tmp_path: P
     catalog = CATALOG.branch()
     label = catalog.add(many(tmp_path / "many.toml", 4000), tmp_path / "many.toml")
     controls = SceneControls(server.gui, catalog, lambda event: None)
-    assert controls.write(SceneWish(label, 0)) and controls.read() == SceneWish(label, 0, "Drive/00000.png")
+    assert controls.write(SceneRequest(label, 0)) and controls.read() == SceneRequest(label, 0, "Drive/00000.png")
     assert controls._find.visible and len(controls._query.options) == LISTED_QUERIES
     assert "50 of 4,000 queries are listed" in controls._found.content
-    assert not controls.write(SceneWish(label, 0, "Drive/03999.png")) and controls.read().query == "Drive/03999.png"
+    assert not controls.write(SceneRequest(label, 0, "Drive/03999.png")) and controls.read().query == "Drive/03999.png"
     controls._find.value = " drive/0123 "
     controls._filter(Press())
     found = [f"Drive/0123{digit}.png" for digit in range(10)]
@@ -201,16 +201,16 @@ def test_thousands_of_queries_stay_usable(server: viser.ViserServer, tmp_path: P
     controls._query.value = found[4]
     assert controls.read().query == found[4]
     with pytest.raises(InputError, match="no query image 'gone'"):
-        controls.write(SceneWish(label, 0, "gone"))
-    assert controls.write(SceneWish(FIRST, 0)) and not controls._find.visible and not controls._query.visible
+        controls.write(SceneRequest(label, 0, "gone"))
+    assert controls.write(SceneRequest(FIRST, 0)) and not controls._find.visible and not controls._query.visible
 
 
 def test_few_queries_need_no_filter(server: viser.ViserServer, tmp_path: Path) -> None:
     catalog = CATALOG.branch()
     label = catalog.add(many(tmp_path / "few.toml", 7), tmp_path / "few.toml")
     controls = SceneControls(server.gui, catalog, lambda event: None)
-    controls.write(SceneWish(label, 3, "Drive/00004.png"))
-    assert controls.read() == SceneWish(label, 3, "Drive/00004.png")
+    controls.write(SceneRequest(label, 3, "Drive/00004.png"))
+    assert controls.read() == SceneRequest(label, 3, "Drive/00004.png")
     assert not controls._find.visible and len(controls._query.options) == 7
     assert not controls._simulation._folder.visible and not controls._simulation._points.visible
 
@@ -223,7 +223,7 @@ def test_a_page_has_its_own_scenes(server: viser.ViserServer, tmp_path: Path) ->
     label = one.add(load_scene(path), path)
     assert label == f"{FIRST} (mine.toml)" and one.path(label) == path.resolve()
     assert label not in other.scenes and label not in CATALOG.scenes
-    controls.write(SceneWish(label, 0))
+    controls.write(SceneRequest(label, 0))
     assert controls._scene.value == label and np.mean(one.problem(controls.read()).truth_inliers) == 0.5  # type: ignore[arg-type]
     assert one.add(load_scene(path), path, "another name") == label, "the same file once"
     third = tmp_path / "more" / "mine.toml"
@@ -231,8 +231,8 @@ def test_a_page_has_its_own_scenes(server: viser.ViserServer, tmp_path: Path) ->
     third.write_text(path.read_text())
     assert one.add(load_scene(third), third) == f"{FIRST} 2"
     with pytest.raises(InputError, match="is not open on this page"):
-        controls.write(SceneWish("gone", 0))
-    assert other.problem(SceneWish(FIRST, 0)) is CATALOG.problem(SceneWish(FIRST, 0)), "caches are shared"
+        controls.write(SceneRequest("gone", 0))
+    assert other.problem(SceneRequest(FIRST, 0)) is CATALOG.problem(SceneRequest(FIRST, 0)), "caches are shared"
 
 
 def test_one_more_edit_does_not_match_images_again(tmp_path: Path) -> None:
@@ -247,22 +247,22 @@ def test_one_more_edit_does_not_match_images_again(tmp_path: Path) -> None:
 
     label = catalog.add(replace(scene, matcher=counted), tmp_path / "few.toml")
     for variation in (Variation(), Variation(spoiled=(1,)), Variation(spoiled=(1,), hidden=(0,)), Variation()):
-        problem = catalog.problem(SceneWish(label, 4, "Drive/00001.png", variation))
+        problem = catalog.problem(SceneRequest(label, 4, "Drive/00001.png", variation))
         assert len(problem) > 10
     assert calls == ["Drive/00001.png"]
 
 
 def test_estimator_controls_show_what_they_are_told(server: viser.ViserServer) -> None:
     controls = EstimatorControls(server.gui, lambda event: None)
-    wishes: list[tuple[str, Any]] = [(name, options_type(name)()) for name in registry.names("estimators")]
-    wishes += [(preset.estimator, preset.options) for preset in presets(CATALOG)]
-    wishes += [
+    requests: list[tuple[str, Any]] = [(name, options_type(name)()) for name in registry.names("estimators")]
+    requests += [(preset.estimator, preset.options) for preset in presets(CATALOG)]
+    requests += [
         ("mc-exact", options_type("mc-exact")(bound_px=0.123456789, gravity_sd_deg=0.3, time_budget_s=1e-3)),
         ("mc-exact", options_type("mc-exact")(bound_px=77.5, gravity_sd_deg=math.inf, robust="huber")),
         ("mc", options_type("mc")(max_balls=1500, noise_px=9.0)),
         ("ransac-2p", options_type("ransac-2p")(confidence=0.12345, iterations=7, local_optimization=True)),
     ]
-    for name, options in [*wishes, *reversed(wishes)]:
+    for name, options in [*requests, *reversed(requests)]:
         controls.write(name, options)
         assert controls.read() == (name, options)
         assert [other for other, folder in controls._folders.items() if folder.visible] == [name]

@@ -20,7 +20,7 @@ from spherloc.estimators import estimate
 from spherloc_viz.app.panels import export_panel
 from spherloc_viz.app.panels.export_panel import CANVAS, ExportPanel, Shown, code_html, file_stem, on_canvas
 from spherloc_viz.app.stage.still_page import Still, still_html
-from spherloc_viz.app.web.viser_seams import start_viser, stop_viser
+from spherloc_viz.app.web.viser_internals import start_viser, stop_viser
 from spherloc_viz.layers import paint, steps
 from spherloc_viz.recording.content.reader import read_recording
 from tests.connected_page import ConnectedPage
@@ -53,8 +53,8 @@ def page(server: viser.ViserServer) -> Iterator[ConnectedPage]:
 
 def press(panel: ExportPanel, job: Callable[[], None]) -> str:
     """What the panel says at the end."""
-    panel._errand.ask(job)
-    until(lambda: not panel._errand._busy)
+    panel._background.ask(job)
+    until(lambda: not panel._background._busy)
     return panel._status.content
 
 
@@ -204,4 +204,4 @@ def test_nothing_to_export_and_gone_recordings_are_said(page: ConnectedPage, sho
     panel.draw("a = 1", "spherloc run x")
     assert panel._text.content is before and "spherloc run x" in before
     panel.close()
-    panel._errand.ask(lambda: pytest.fail("a closed panel does nothing more"))
+    panel._background.ask(lambda: pytest.fail("a closed panel does nothing more"))

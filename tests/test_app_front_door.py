@@ -20,7 +20,7 @@ from viser import _messages
 from spherloc.errors import InputError
 from spherloc_viz.app.server import serve
 from spherloc_viz.app.web import access as access_module
-from spherloc_viz.app.web import viser_seams
+from spherloc_viz.app.web import viser_internals
 from spherloc_viz.app.web.access import Access, Role
 from spherloc_viz.app.web.downloads import Downloads
 from spherloc_viz.app.web.front_door import FrontDoor
@@ -142,7 +142,7 @@ async def echoing() -> AsyncIterator[tuple[int, list[str]]]:
     keys: list[str] = []
 
     async def answer(request: web.Request) -> web.WebSocketResponse:
-        keys.append(request.headers.get(viser_seams.KEY_HEADER, ""))
+        keys.append(request.headers.get(viser_internals.KEY_HEADER, ""))
         page = web.WebSocketResponse(protocols=[VERSION], max_msg_size=0)
         await page.prepare(request)
         async for message in page:
@@ -249,13 +249,13 @@ def test_without_a_server_behind_it_says_so() -> None:
 
 def test_viser_itself_answers_the_key_only() -> None:
     """Its port can be guessed; a page that does so, or a program without the key, gets nothing."""
-    server = viser_seams.start_viser(KEY)
+    server = viser_internals.start_viser(KEY)
     try:
 
         async def run() -> None:
             url = f"http://127.0.0.1:{server.get_port()}/"
             async with aiohttp.ClientSession() as client:
-                for wrong in ({}, {viser_seams.KEY_HEADER: ""}, {viser_seams.KEY_HEADER: KEY + "x"}):
+                for wrong in ({}, {viser_internals.KEY_HEADER: ""}, {viser_internals.KEY_HEADER: KEY + "x"}):
                     assert (await client.get(url, headers=wrong)).status == 403
                     with pytest.raises(aiohttp.WSServerHandshakeError, match="403"):
                         await client.ws_connect(url, headers=wrong, protocols=[VERSION])
@@ -266,11 +266,11 @@ def test_viser_itself_answers_the_key_only() -> None:
         asyncio.run(asyncio.wait_for(run(), LIMIT_S))
         assert server.get_host() == "127.0.0.1"
     finally:
-        viser_seams.stop_viser(server)
+        viser_internals.stop_viser(server)
 
 
 def test_nobody_can_open_a_public_tunnel(monkeypatch: pytest.MonkeyPatch) -> None:
-    server = viser_seams.start_viser(KEY)
+    server = viser_internals.start_viser(KEY)
     try:
         asked: list[str] = []
         monkeypatch.setattr(server, "request_share_url", lambda *_: asked.append("request"))
@@ -282,14 +282,14 @@ def test_nobody_can_open_a_public_tunnel(monkeypatch: pytest.MonkeyPatch) -> Non
         server._thread_executor.shutdown(wait=True)
         assert asked == []
     finally:
-        viser_seams.stop_viser(server)
+        viser_internals.stop_viser(server)
 
 
 def test_another_viser_fails_closed(monkeypatch: pytest.MonkeyPatch) -> None:
     """A version that starts its server in another way must not run unguarded."""
     monkeypatch.setattr(viser, "ViserServer", lambda **_: SimpleNamespace())
     with pytest.raises(RuntimeError, match="viser"):
-        viser_seams.start_viser(KEY)
+        viser_internals.start_viser(KEY)
 
 
 ROUTES = (

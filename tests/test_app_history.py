@@ -9,112 +9,112 @@ from hypothesis import strategies as st
 
 from spherloc.datasets.variation import Variation
 from spherloc.estimators import options_type
-from spherloc_viz.app.catalog import SceneWish
+from spherloc_viz.app.catalog import SceneRequest
 from spherloc_viz.app.edits import Edits
 from spherloc_viz.app.history import MOST, SAME_MOVE_S, History, changed_fields
-from spherloc_viz.app.wish import Wish
+from spherloc_viz.app.run_request import RunRequest
 
-SCENE = SceneWish("a scene", 0, None, Variation())
+SCENE = SceneRequest("a scene", 0, None, Variation())
 
 
-def wish(seed: int = 0, noise_px: float | None = None, estimator: str = "mc", **options: float) -> Wish:
+def request(seed: int = 0, noise_px: float | None = None, estimator: str = "mc", **options: float) -> RunRequest:
     scene = replace(SCENE, seed=seed, variation=Variation(noise_px=noise_px))
-    return Wish(scene, estimator, options_type(estimator)(**options))
+    return RunRequest(scene, estimator, options_type(estimator)(**options))
 
 
 def test_undo_and_redo_walk_through_what_was_asked_for() -> None:
-    history, wishes = History(), [wish(seed=k) for k in range(4)]
+    history, requests = History(), [request(seed=k) for k in range(4)]
     assert history.ways() == (False, False) and history.step(-1) is None
-    for k, asked in enumerate(wishes):
+    for k, asked in enumerate(requests):
         history.note(asked, 10.0 * k)
     assert history.ways() == (True, False) and history.step(1) is None
-    assert [history.step(-1) for _ in range(4)] == [wishes[2], wishes[1], wishes[0], None]
+    assert [history.step(-1) for _ in range(4)] == [requests[2], requests[1], requests[0], None]
     assert history.ways() == (False, True)
-    assert history.step(1) is wishes[1]
-    history.note(wishes[1], 50.0)
+    assert history.step(1) is requests[1]
+    history.note(requests[1], 50.0)
     assert history.ways() == (True, True), "that the page asks for what was gone back to changes nothing"
-    history.note(wish(seed=9), 60.0)
-    assert history.ways() == (True, False) and history.step(-1) is wishes[1], "what was undone is forgotten"
+    history.note(request(seed=9), 60.0)
+    assert history.ways() == (True, False) and history.step(-1) is requests[1], "what was undone is forgotten"
 
 
 def test_dragging_a_slider_is_one_move() -> None:
     history = History()
-    history.note(wish(), 0.0)
+    history.note(request(), 0.0)
     for k in range(20):
-        history.note(wish(noise_px=1.0 + 0.1 * k), 5.0 + 0.05 * k)
-    history.note(wish(noise_px=3.0, seed=1), 6.0)
-    assert history.step(-1) == wish(noise_px=1.0 + 0.1 * 19) and history.step(-1) == wish()
+        history.note(request(noise_px=1.0 + 0.1 * k), 5.0 + 0.05 * k)
+    history.note(request(noise_px=3.0, seed=1), 6.0)
+    assert history.step(-1) == request(noise_px=1.0 + 0.1 * 19) and history.step(-1) == request()
     assert history.step(-1) is None
 
 
 def test_a_hand_that_rests_on_a_slider_has_not_let_go() -> None:
     history = History()
-    history.note(wish(), 0.0)
+    history.note(request(), 0.0)
     for k, now_s in enumerate((10.0, 10.1, 13.0, 16.5, 20.0)):
-        history.note(wish(noise_px=1.0 + k), now_s)
-    assert history.step(-1) == wish() and history.ways() == (False, True)
-    assert history.step(1) == wish(noise_px=5.0)
+        history.note(request(noise_px=1.0 + k), now_s)
+    assert history.step(-1) == request() and history.ways() == (False, True)
+    assert history.step(1) == request(noise_px=5.0)
 
 
 def test_another_control_ends_a_move_though_it_has_the_same_name() -> None:
     """There is the noise of the scene, and the noise that the estimator expects."""
-    history, wishes = History(), [wish()]
+    history, requests = History(), [request()]
     for scene_px, option_px in ((2.0, 1.0), (2.0, 3.0), (4.0, 3.0)):
         scene = replace(SCENE, variation=Variation(noise_px=scene_px))
-        wishes.append(Wish(scene, "mc", options_type("mc")(noise_px=option_px)))
-    for k, asked in enumerate(wishes):
+        requests.append(RunRequest(scene, "mc", options_type("mc")(noise_px=option_px)))
+    for k, asked in enumerate(requests):
         history.note(asked, 0.1 * k)
-    assert [history.step(-1) for _ in range(3)] == wishes[2::-1]
+    assert [history.step(-1) for _ in range(3)] == requests[2::-1]
 
 
 def test_a_move_that_leads_back_is_none() -> None:
     history = History()
-    history.note(wish(seed=1), 0.0)
-    history.note(wish(), 10.0)
+    history.note(request(seed=1), 0.0)
+    history.note(request(), 10.0)
     for k, bound_px in enumerate((4.0, 5.0, 3.0)):
-        history.note(wish(bound_px=bound_px), 20.0 + k)
-    assert wish(bound_px=3.0) == wish() and history.step(-1) == wish(seed=1)
-    assert history.step(1) == wish() and history.ways() == (True, False)
-    history.note(wish(bound_px=4.0), 30.0)
-    history.note(wish(bound_px=3.0), 31.0)
-    history.note(wish(bound_px=6.0), 32.0)
-    assert history.step(-1) == wish() and history.step(-1) == wish(seed=1)
+        history.note(request(bound_px=bound_px), 20.0 + k)
+    assert request(bound_px=3.0) == request() and history.step(-1) == request(seed=1)
+    assert history.step(1) == request() and history.ways() == (True, False)
+    history.note(request(bound_px=4.0), 30.0)
+    history.note(request(bound_px=3.0), 31.0)
+    history.note(request(bound_px=6.0), 32.0)
+    assert history.step(-1) == request() and history.step(-1) == request(seed=1)
 
 
 def test_what_is_switched_to_and_fro_is_no_drag() -> None:
     history = History()
-    wishes = [wish(estimator="ransac-2p", local_optimization=value) for value in (False, True, False)]
-    for k, asked in enumerate(wishes):
+    requests = [request(estimator="ransac-2p", local_optimization=value) for value in (False, True, False)]
+    for k, asked in enumerate(requests):
         history.note(asked, 0.1 * k)
-    assert [history.step(-1) for _ in range(3)] == [wishes[1], wishes[0], None]
+    assert [history.step(-1) for _ in range(3)] == [requests[1], requests[0], None]
 
 
 def test_the_oldest_moves_are_forgotten_in_the_middle_of_one_too() -> None:
     history = History()
     for k in range(MOST + 7):
-        history.note(wish(seed=k), 10.0 * k)
+        history.note(request(seed=k), 10.0 * k)
     for k in range(30):
-        history.note(wish(seed=MOST + 6, noise_px=1.0 + k), 10.0 * (MOST + 8) + 0.1 * k)
-    assert history.step(-1) == wish(seed=MOST + 6) and history.step(-1) == wish(seed=MOST + 5)
+        history.note(request(seed=MOST + 6, noise_px=1.0 + k), 10.0 * (MOST + 8) + 0.1 * k)
+    assert history.step(-1) == request(seed=MOST + 6) and history.step(-1) == request(seed=MOST + 5)
 
 
 def test_single_changes_are_never_one_move() -> None:
-    history, wishes = History(), [wish(), *(wish(seed=k) for k in (1, 2, 3))]
-    for k, asked in enumerate(wishes):
+    history, requests = History(), [request(), *(request(seed=k) for k in (1, 2, 3))]
+    for k, asked in enumerate(requests):
         history.note(asked, 0.01 * k)
-    assert [history.step(-1) for _ in range(3)] == wishes[2::-1]
+    assert [history.step(-1) for _ in range(3)] == requests[2::-1]
 
 
 def test_estimators_that_are_chosen_one_after_another_are_single_changes() -> None:
-    history, wishes = History(), [wish(estimator=name) for name in ("mc", "mc-exact", "ransac-2p", "mc")]
-    for k, asked in enumerate(wishes):
+    history, requests = History(), [request(estimator=name) for name in ("mc", "mc-exact", "ransac-2p", "mc")]
+    for k, asked in enumerate(requests):
         history.note(asked, 0.1 * k)
-    assert [history.step(-1) for _ in range(3)] == wishes[2::-1]
+    assert [history.step(-1) for _ in range(3)] == requests[2::-1]
 
 
-def camera(x_m: float | None) -> Wish:
+def camera(x_m: float | None) -> RunRequest:
     place = None if x_m is None else (30.0, x_m, 0.0, 0.0)
-    return replace(wish(), scene=replace(SCENE, variation=Variation(true_camera=place)))
+    return replace(request(), scene=replace(SCENE, variation=Variation(true_camera=place)))
 
 
 @pytest.mark.parametrize("gesture", [0, 7])
@@ -129,27 +129,27 @@ def test_dragging_the_camera_is_one_move_and_putting_it_back_another(gesture: in
 
 def test_what_is_held_all_the_time_is_one_move_however_long_it_rests() -> None:
     history = History()
-    history.note(wish(), 0.0, 1)
+    history.note(request(), 0.0, 1)
     for k in range(4):
-        history.note(wish(noise_px=2.0 + k), 3.0 * SAME_MOVE_S * k, 2)
-    history.note(wish(noise_px=9.0), 12.0 * SAME_MOVE_S, 3)
-    assert history.step(-1) == wish(noise_px=5.0) and history.step(-1) == wish()
+        history.note(request(noise_px=2.0 + k), 3.0 * SAME_MOVE_S * k, 2)
+    history.note(request(noise_px=9.0), 12.0 * SAME_MOVE_S, 3)
+    assert history.step(-1) == request(noise_px=5.0) and history.step(-1) == request()
 
 
 def test_two_moves_of_one_slider_are_two() -> None:
     history = History()
     for k in range(3):
-        history.note(wish(noise_px=1.0 + k), (SAME_MOVE_S + 0.1) * k)
-    assert history.step(-1) == wish(noise_px=2.0)
+        history.note(request(noise_px=1.0 + k), (SAME_MOVE_S + 0.1) * k)
+    assert history.step(-1) == request(noise_px=2.0)
     # After going back, the next move starts anew, however soon it comes.
-    history.note(wish(noise_px=7.0), 2.0 * (SAME_MOVE_S + 0.1))
-    assert history.step(-1) == wish(noise_px=2.0)
+    history.note(request(noise_px=7.0), 2.0 * (SAME_MOVE_S + 0.1))
+    assert history.step(-1) == request(noise_px=2.0)
 
 
 def test_it_remembers_so_many() -> None:
     history = History()
     for k in range(MOST + 50):
-        history.note(wish(seed=k), 10.0 * k)
+        history.note(request(seed=k), 10.0 * k)
     steps = 0
     while history.step(-1) is not None:
         steps += 1
@@ -159,16 +159,16 @@ def test_it_remembers_so_many() -> None:
 @pytest.mark.parametrize(
     "other, names",
     [
-        (wish(), set()),
-        (wish(seed=1), {"seed"}),
-        (wish(noise_px=2.0), {"noise_px"}),
-        (wish(bound_px=2.0), {"bound_px"}),
-        (wish(estimator="ransac-2p", seed=3), {"estimator"}),
-        (wish(seed=1, noise_px=2.0, bound_px=2.0), {"seed", "noise_px", "bound_px"}),
+        (request(), set()),
+        (request(seed=1), {"seed"}),
+        (request(noise_px=2.0), {"noise_px"}),
+        (request(bound_px=2.0), {"bound_px"}),
+        (request(estimator="ransac-2p", seed=3), {"estimator"}),
+        (request(seed=1, noise_px=2.0, bound_px=2.0), {"seed", "noise_px", "bound_px"}),
     ],
 )
-def test_what_differs(other: Wish, names: set[str]) -> None:
-    assert changed_fields(wish(), other) == names
+def test_what_differs(other: RunRequest, names: set[str]) -> None:
+    assert changed_fields(request(), other) == names
 
 
 NUMBERS = st.sets(st.integers(0, 30), max_size=8)

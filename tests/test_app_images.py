@@ -25,7 +25,7 @@ from spherloc_viz.app.matches.match_card import MatchCard
 from spherloc_viz.app.matches.match_crops import HEIGHT_PX, SIDE_PX, WIDTH_PX, crops_html
 from spherloc_viz.app.matches.match_table import MatchTable
 from spherloc_viz.app.matches.photos import MOST_BYTES, photo_uri
-from spherloc_viz.app.web.viser_seams import start_viser, stop_viser
+from spherloc_viz.app.web.viser_internals import start_viser, stop_viser
 from spherloc_viz.layers import paint, steps
 from spherloc_viz.layers.match_view import match_view, valid_outlines
 from spherloc_viz.layers.primitives import Picture, Points

@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from spherloc.datasets import load_scene
 from spherloc.datasets.variation import Variation
 from spherloc.estimators import default_options, estimate
-from spherloc_viz.app.catalog import Catalog, SceneWish
+from spherloc_viz.app.catalog import Catalog, SceneRequest
 from spherloc_viz.app.link import MANY, MOST_LETTERS, ONCE, Follower, PageView, link_of
 from spherloc_viz.app.panels.folders import Roots
-from spherloc_viz.app.wish import Run, Wish
+from spherloc_viz.app.run_request import Run, RunRequest
 from tests.tiny_scene import write_tiny_scene
 
 VIEW = PageView("outcome", (), "dark")
@@ -30,13 +30,13 @@ class Place:
         self.catalog, self.roots = self.base.branch(), Roots([folder])
         (self.label, *_) = self.catalog.scenes
         self.follower = Follower(self.catalog, self.roots, self.catalog.problem)
-        wish = SceneWish(self.label, 5)
-        self.now = Wish(wish, "mc", default_options("mc", self.catalog.problem(wish)))
+        request = SceneRequest(self.label, 5)
+        self.now = RunRequest(request, "mc", default_options("mc", self.catalog.problem(request)))
 
-    def link(self, wish: Wish, view: PageView) -> str:
-        problem = self.catalog.problem(wish.scene)
-        trace = estimate(problem, wish.estimator, wish.options, wish.scene.seed)
-        return link_of(Run(wish, trace, np.arange(len(problem))), view, self.catalog, self.base.scenes, self.roots)
+    def link(self, request: RunRequest, view: PageView) -> str:
+        problem = self.catalog.problem(request.scene)
+        trace = estimate(problem, request.estimator, request.options, request.scene.seed)
+        return link_of(Run(request, trace, np.arange(len(problem))), view, self.catalog, self.base.scenes, self.roots)
 
 
 @pytest.fixture(scope="module")
@@ -49,11 +49,11 @@ def test_what_is_written_is_read_again(place: Place) -> None:
     variation = Variation(
         camera, 30, 0.1 + 0.2, 1 / 3, "coherent", true_camera=(1.5, -2.0, 1e-7, 3.0), spoiled=(3, 1), hidden=(7,)
     )
-    scene = SceneWish(place.label, 2**62, None, variation)
+    scene = SceneRequest(place.label, 2**62, None, variation)
     options = replace(default_options("ransac-2p", place.catalog.problem(scene)), iterations=77, confidence=0.97)
-    wish, view = Wish(scene, "ransac-2p", options), PageView("sample-3", (2, 4), "light", answers_hidden=True)
-    found = place.follower.follow(place.link(wish, view), place.now, VIEW)
-    assert (found.wish, found.view, found.remarks) == (wish, view, ())
+    request, view = RunRequest(scene, "ransac-2p", options), PageView("sample-3", (2, 4), "light", answers_hidden=True)
+    found = place.follower.follow(place.link(request, view), place.now, VIEW)
+    assert (found.request, found.view, found.remarks) == (request, view, ())
     assert place.follower.follow("", place.now, VIEW).remarks == ()
 
 
@@ -62,11 +62,11 @@ def test_a_scene_of_an_allowed_folder_is_opened_again(place: Place) -> None:
     path.write_text(place.scene.read_text().replace('name = "', 'name = "another '))
     other = Place(place.scene.parent)
     label = other.catalog.add(load_scene(path), path)
-    scene = SceneWish(label, 1)
-    link = other.link(Wish(scene, "mc", default_options("mc", other.catalog.problem(scene))), VIEW)
+    scene = SceneRequest(label, 1)
+    link = other.link(RunRequest(scene, "mc", default_options("mc", other.catalog.problem(scene))), VIEW)
     assert "place=0%3Aother.toml" in link
     found = place.follower.follow(link, place.now, VIEW)
-    assert found.remarks == () and found.wish.scene == scene and place.catalog.path(label) == path.resolve()
+    assert found.remarks == () and found.request.scene == scene and place.catalog.path(label) == path.resolve()
 
 
 @pytest.mark.parametrize(
@@ -97,10 +97,10 @@ def test_what_is_wrong_is_a_remark_and_the_rest_is_opened(place: Place, key: str
     found = place.follower.follow(urlencode({**others, key: value}), place.now, VIEW)
     assert len(found.remarks) == 1 and remark in found.remarks[0], found.remarks
     assert found.view.step == "bearings"
-    assert found.wish.estimator == ("mc" if key == "estimator" else "ransac-2p")
+    assert found.request.estimator == ("mc" if key == "estimator" else "ransac-2p")
     if key not in ("scene", "place", "seed"):
-        assert found.wish.scene.seed == 8
-    place.catalog.problem(found.wish.scene)
+        assert found.request.scene.seed == 8
+    place.catalog.problem(found.request.scene)
 
 
 PAIRS = st.lists(st.tuples(st.sampled_from((*ONCE, *MANY)), st.text(max_size=12)), max_size=6)
@@ -109,11 +109,11 @@ PAIRS = st.lists(st.tuples(st.sampled_from((*ONCE, *MANY)), st.text(max_size=12)
 @given(text=st.one_of(st.text(max_size=200), PAIRS.map(urlencode)))
 def test_any_text_leads_to_a_run(place: Place, text: str) -> None:
     found = place.follower.follow(text, place.now, VIEW)
-    assert place.catalog.problem(found.wish.scene) is not None
+    assert place.catalog.problem(found.request.scene) is not None
 
 
 def test_a_long_link_is_not_written(place: Place) -> None:
     hidden = tuple(range(10_000, 10_000 + MOST_LETTERS // 6))
-    scene = SceneWish(place.label, 1)
-    wish = Wish(scene, "mc", default_options("mc", place.catalog.problem(scene)))
-    assert place.link(wish, PageView("outcome", hidden, "dark")) == ""
+    scene = SceneRequest(place.label, 1)
+    request = RunRequest(scene, "mc", default_options("mc", place.catalog.problem(scene)))
+    assert place.link(request, PageView("outcome", hidden, "dark")) == ""

@@ -16,7 +16,7 @@ from spherloc_viz import style
 from spherloc_viz.app.matches.image_panel import ImagePanel
 from spherloc_viz.app.matches.match_card import MatchCard
 from spherloc_viz.app.matches.match_table import PAGE, MatchTable
-from spherloc_viz.app.web.viser_seams import start_viser, stop_viser
+from spherloc_viz.app.web.viser_internals import start_viser, stop_viser
 from spherloc_viz.layers import paint
 
 SceneOf = Callable[..., SyntheticScene]

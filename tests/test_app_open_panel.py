@@ -15,7 +15,7 @@ from spherloc_viz.app.panels.open_panel import Opened, OpenPanel
 from spherloc_viz.app.panels.recent import RecentScenes
 from spherloc_viz.app.panels.uploads import MOST_BYTES
 from spherloc_viz.app.web.touch import Touch, Touches
-from spherloc_viz.app.web.viser_seams import start_viser, stop_viser
+from spherloc_viz.app.web.viser_internals import start_viser, stop_viser
 from tests.connected_page import ConnectedPage
 from tests.waiting import until
 
@@ -60,7 +60,7 @@ class Visitor:
         raise error
 
     def settle(self) -> None:
-        until(lambda: not self.panel._errand._busy)
+        until(lambda: not self.panel._background._busy)
 
     def touch(self, words: str) -> None:
         action, _, argument = words.partition(":")

@@ -14,7 +14,7 @@ import viser
 
 from spherloc_viz import style
 from spherloc_viz.app.stage.painter import MOST_BATCHED, SHELLS, Painter
-from spherloc_viz.app.web.viser_seams import start_viser, stop_viser
+from spherloc_viz.app.web.viser_internals import start_viser, stop_viser
 from spherloc_viz.layers.frame import one_color
 from spherloc_viz.layers.primitives import Balls, Label, Mesh, Points, Segments, Textured
 

@@ -20,14 +20,14 @@ from spherloc.diagnosis import Cause, Diagnosis
 from spherloc.errors import InputError
 from spherloc.estimators import estimate, options_type
 from spherloc_viz import style
-from spherloc_viz.app.catalog import Catalog, SceneWish, camera_label
+from spherloc_viz.app.catalog import Catalog, SceneRequest, camera_label
 from spherloc_viz.app.controls.estimator_controls import EstimatorControls, Option, estimator_labels
 from spherloc_viz.app.controls.steps_panel import find_step
-from spherloc_viz.app.newest import Newest
+from spherloc_viz.app.latest_worker import LatestWorker
 from spherloc_viz.app.stage import views
 from spherloc_viz.app.stage.colors import light_bytes, surface_bytes
 from spherloc_viz.app.text import diagnosis_html, status_html, step_html, table_html
-from spherloc_viz.app.web.viser_seams import start_viser, stop_viser
+from spherloc_viz.app.web.viser_internals import start_viser, stop_viser
 from spherloc_viz.layers import paint, steps
 from spherloc_viz.layers.primitives import Balls, Points, Step, Stop, Table
 from spherloc_viz.options import option_fields
@@ -92,10 +92,10 @@ def test_a_step_is_kept_over_runs_where_it_can(key: str, found: str) -> None:
     assert keys[find_step(timeline, key)] == found
 
 
-def wish_of(catalog: Catalog, label: str) -> SceneWish:
+def request_of(catalog: Catalog, label: str) -> SceneRequest:
     scene = catalog.synthetic(label)
     assert scene is not None
-    return SceneWish(label, scene.seed)
+    return SceneRequest(label, scene.seed)
 
 
 def test_untouched_controls_give_the_scene_itself() -> None:
@@ -103,7 +103,7 @@ def test_untouched_controls_give_the_scene_itself() -> None:
     simulated = [scene for path in bundled_scenes().values() if isinstance(scene := load_scene(path), SyntheticScene)]
     assert len(simulated) >= 6 and list(catalog.scenes)[: len(simulated)] == [scene.name for scene in simulated]
     for scene in simulated:
-        expected, given = scene.problem(), catalog.problem(wish_of(catalog, scene.name))
+        expected, given = scene.problem(), catalog.problem(request_of(catalog, scene.name))
         assert np.array_equal(expected.pixels, given.pixels) and np.array_equal(expected.points, given.points)
 
 
@@ -112,14 +112,14 @@ def test_another_camera_sees_the_same_simulation() -> None:
     label = next(iter(catalog.scenes))
     assert len(catalog.cameras) == 3
     for name, path in catalog.cameras.items():
-        problem = catalog.problem(replace(wish_of(catalog, label), variation=Variation(camera=path)))
+        problem = catalog.problem(replace(request_of(catalog, label), variation=Variation(camera=path)))
         assert camera_label(problem.camera) == name and len(problem) == 100
 
 
 def test_gravity_error_is_simulated_and_stated() -> None:
     catalog = Catalog(None)
-    wish = wish_of(catalog, next(iter(catalog.scenes)))
-    exact, off = catalog.problem(wish), catalog.problem(replace(wish, variation=Variation(gravity_error_deg=0.5)))
+    request = request_of(catalog, next(iter(catalog.scenes)))
+    exact, off = catalog.problem(request), catalog.problem(replace(request, variation=Variation(gravity_error_deg=0.5)))
     assert off.gravity_sd_rad == pytest.approx(np.radians(0.5)) and np.array_equal(exact.points, off.points)
     assert not np.array_equal(exact.gravity_camera, off.gravity_camera)
 
@@ -291,7 +291,7 @@ def test_requests_never_queue() -> None:
         inside.set()
         gate.wait(LIMIT_S)
 
-    worker = Newest("test", job)
+    worker = LatestWorker("test", job)
     worker.start()
     worker.ask()
     assert inside.wait(LIMIT_S)
@@ -307,7 +307,7 @@ def test_requests_never_queue() -> None:
 
 def test_an_alarm_rings_once_and_a_request_puts_it_off() -> None:
     calls: list[bool] = []
-    worker = Newest("test", lambda asked: calls.append(asked) or (0.01 if asked else None))
+    worker = LatestWorker("test", lambda asked: calls.append(asked) or (0.01 if asked else None))
     worker.start()
     worker.ask()
     until(lambda: calls == [True, False])
@@ -319,7 +319,7 @@ def test_an_alarm_rings_once_and_a_request_puts_it_off() -> None:
 
 
 def test_close_ends_a_waiting_thread() -> None:
-    workers = [Newest("test", lambda asked: 1000.0) for _ in range(3)]
+    workers = [LatestWorker("test", lambda asked: 1000.0) for _ in range(3)]
     for worker in workers:
         worker.start()
         worker.ask()

@@ -10,9 +10,9 @@ from spherloc.estimators import estimate, options_type
 from spherloc.geometry import camera_centre, rotation_angle
 from spherloc.metrics import evaluate
 from spherloc.trace import Trace
-from spherloc_viz.app.catalog import Catalog, SceneWish
+from spherloc_viz.app.catalog import Catalog, SceneRequest
 from spherloc_viz.app.controls.presets import RECIPES, Preset, presets
-from spherloc_viz.app.wish import Wish
+from spherloc_viz.app.run_request import RunRequest
 
 CATALOG = Catalog(None)
 PRESETS = {preset.title: preset for preset in presets(CATALOG)}
@@ -24,7 +24,7 @@ def solve(preset: Preset, seed: int | None = None, **changes: object) -> Trace:
     estimator = str(changes.pop("estimator", preset.estimator))
     options = changes.pop("options", preset.options if estimator == preset.estimator else options_type(estimator)())
     variation = replace(preset.scene.variation, **changes)  # type: ignore[arg-type]
-    return estimate(CATALOG.problem(SceneWish(preset.scene.scene, seed, None, variation)), estimator, options, seed)
+    return estimate(CATALOG.problem(SceneRequest(preset.scene.scene, seed, None, variation)), estimator, options, seed)
 
 
 def right(trace: Trace) -> np.ndarray:
@@ -41,7 +41,9 @@ def test_there_are_the_promised_ones_and_each_is_a_sentence() -> None:
     assert list(PRESETS) == [recipe.title for recipe in RECIPES] and len(PRESETS) == 7
     for preset in PRESETS.values():
         assert preset.story.endswith(".") and preset.story.count(".") <= 3 and len(preset.story) < 200
-        assert len({Wish(preset.scene, preset.estimator, preset.options)}) == 1, "wishes are kept by their value"
+        assert len({RunRequest(preset.scene, preset.estimator, preset.options)}) == 1, (
+            "requests are kept by their value"
+        )
 
 
 def test_a_catalog_with_a_scene_of_its_own_has_them_too(tmp_path) -> None:

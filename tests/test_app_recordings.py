@@ -15,12 +15,12 @@ from spherloc.datasets.variation import Variation
 from spherloc.errors import RecordingError
 from spherloc.estimators import default_options, estimate
 from spherloc_viz.app import session as session_module
-from spherloc_viz.app.catalog import MOST_BRIEF, Catalog, SceneWish
+from spherloc_viz.app.catalog import MOST_BRIEF, Catalog, SceneRequest
 from spherloc_viz.app.page_runs import LOOK_S, PageRuns
 from spherloc_viz.app.review import notes as notes_module
 from spherloc_viz.app.review.exporter import Exporter
-from spherloc_viz.app.review.shelf import Shelf
-from spherloc_viz.app.wish import Run, Wish
+from spherloc_viz.app.review.run_library import RunLibrary
+from spherloc_viz.app.run_request import Run, RunRequest
 from spherloc_viz.gallery import gallery_cases
 from spherloc_viz.recording.content.reader import read_recording
 from spherloc_viz.recording.review.notes import Review, read_review
@@ -61,7 +61,7 @@ def test_a_run_is_recorded_with_its_origin_and_opened_exactly(office: Office) ->
 
     session = visitor.session
     visitor.touch(f"run-open:{first}")
-    until(lambda: session._run is not None and session._run.wish.scene.variation == Variation())
+    until(lambda: session._run is not None and session._run.request.scene.variation == Variation())
     until(lambda: f"Opened {first}" in session._status._line.content)
     recorded = read_recording(office.folder / first)
     assert session._run is not None
@@ -75,7 +75,7 @@ def test_a_run_is_recorded_with_its_origin_and_opened_exactly(office: Office) ->
     # The next run by key, then what is changed shows both.
     visitor.touch("run-step:-1")
     until(lambda: visitor.card.opened is not None and visitor.card.opened.recorded.row.file == second)
-    until(lambda: session._run is not None and session._run.wish.scene.variation == origin.variation)
+    until(lambda: session._run is not None and session._run.request.scene.variation == origin.variation)
     visitor.touch("run-step:-1")
     until(lambda: "first run of the list" in visitor.panel._status.content)
     until(lambda: "first run of the list" in visitor.card._html.content)
@@ -85,7 +85,7 @@ def test_a_run_is_recorded_with_its_origin_and_opened_exactly(office: Office) ->
     until(lambda: "recorded/0" in visitor.drawn and visitor.drawn["recorded/0"][0].visible)
     assert "as recorded" in visitor.card._html.content
     visitor.touch("run-return:")
-    until(lambda: session._run is not None and session._run.wish.scene.variation == origin.variation)
+    until(lambda: session._run is not None and session._run.request.scene.variation == origin.variation)
     until(lambda: not visitor.drawn["recorded/0"][0].visible)
     visitor.touch("run-close:")
     until(lambda: not visitor.card._html.visible and visitor.card.opened is None)
@@ -186,15 +186,15 @@ def test_words_that_are_refused_leave_nothing_in_those_typed_meanwhile(
     visitor.touch("run-label:seam")
     until(lambda: read_review(office.folder / first).labels == ("seam",))
     until(lambda: notes._storing is None)
-    review, at_work, go_on = Shelf.review, threading.Event(), threading.Event()
+    review, at_work, go_on = RunLibrary.review, threading.Event(), threading.Event()
 
     def refused(*words: Any) -> RunRow:
         at_work.set()
         go_on.wait(LIMIT_S)
-        monkeypatch.setattr(Shelf, "review", review)
+        monkeypatch.setattr(RunLibrary, "review", review)
         raise RecordingError("these words are refused.")
 
-    monkeypatch.setattr(Shelf, "review", refused)
+    monkeypatch.setattr(RunLibrary, "review", refused)
     visitor.set(notes._fields.labels, "refused")
     until(at_work.is_set)
     visitor.set(notes._fields.labels, "taken")
@@ -350,7 +350,7 @@ def test_the_gallery_opens_in_one_press(office: Office) -> None:
     visitor.touch(f"gallery-open:{case.key}")
     session = visitor.session
     until(lambda: session._run is not None and session._run.trace.estimator == case.estimator)
-    until(lambda: session._run is not None and session._run.wish.scene.seed == case.seed)
+    until(lambda: session._run is not None and session._run.request.scene.seed == case.seed)
     assert session._run is not None and np.array_equal(session._run.trace.problem.pixels, case.problem().pixels)
     until(lambda: case.story.split(".")[0].split("'")[0] in visitor.panel._gallery._html.content)
 
@@ -375,7 +375,7 @@ def test_a_run_is_said_to_be_recorded_when_it_is_and_failures_stand_until_then(o
     office.folder.write_text("in the way")
     for count, px in enumerate((1.5, 2.5), start=1):
         visitor.set(noise, px)
-        until(lambda: session._run is not None and session._run.wish.scene.variation.noise_px == px)  # noqa: B023
+        until(lambda: session._run is not None and session._run.request.scene.variation.noise_px == px)  # noqa: B023
         until(lambda: "the run cannot be recorded" in line.content)
         until(lambda: notices._failure is not None)
         if count > 1:
@@ -407,15 +407,15 @@ def test_what_becomes_of_a_run_is_told_when_it_is_known(tmp_path: Path) -> None:
 
     catalog, slow = Catalog(write_tiny_scene(tmp_path)), Slow()
     runs = PageRuns(slow, catalog)  # type: ignore[arg-type]
-    problem = catalog.problem(SceneWish("tiny", 1))
-    wish = Wish(SceneWish("tiny", 1), "mc", default_options("mc", problem))
-    run = Run(wish, estimate(problem, "mc", wish.options, 1), np.arange(len(problem)))
-    assert runs.settle(run, None) == ("Recording as run.rrd … 7 runs wait to be recorded.", LOOK_S)
+    problem = catalog.problem(SceneRequest("tiny", 1))
+    request = RunRequest(SceneRequest("tiny", 1), "mc", default_options("mc", problem))
+    run = Run(request, estimate(problem, "mc", request.options, 1), np.arange(len(problem)))
+    assert runs.finish(run, None) == ("Recording as run.rrd … 7 runs wait to be recorded.", LOOK_S)
     assert runs.path(run.trace) is None
     slow.ended(None)
-    assert runs.settle(run, None) == ("Recorded as run.rrd", None) and runs.path(run.trace) == tmp_path / "run.rrd"
+    assert runs.finish(run, None) == ("Recorded as run.rrd", None) and runs.path(run.trace) == tmp_path / "run.rrd"
     other = replace(run, trace=replace(run.trace))
-    runs.settle(other, None)
+    runs.finish(other, None)
     slow.ended(RecordingError("run.rrd: no room."))
-    assert runs.settle(other, None) == ("run.rrd: no room.", None) and runs.path(other.trace) is None
-    assert PageRuns(None, catalog).settle(run, None) == ("Runs are not recorded.", None)
+    assert runs.finish(other, None) == ("run.rrd: no room.", None) and runs.path(other.trace) is None
+    assert PageRuns(None, catalog).finish(run, None) == ("Runs are not recorded.", None)

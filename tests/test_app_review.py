@@ -22,7 +22,7 @@ from spherloc_viz.app.review.filters import Counts, filters_html
 from spherloc_viz.app.review.gallery_list import file_of, gallery_html
 from spherloc_viz.app.review.look import PAGE, Look
 from spherloc_viz.app.review.rows import WIDTH_PX, rows_html, verdict_html
-from spherloc_viz.app.review.shelf import Shelf, merged
+from spherloc_viz.app.review.run_library import RunLibrary, merged
 from spherloc_viz.app.review.summary_page import summary_html
 from spherloc_viz.app.web.touch import MOST_LETTERS, Touch, Touches, parse
 from spherloc_viz.cli import app
@@ -65,7 +65,7 @@ def made_row(number: int, **changes: Any) -> RunRow:
         time_ms=2.0,
         proven=None,
         steps=20,
-        decisive_step=7,
+        key_step=7,
         thumbnail=PNG,
         size_bytes=1000,
     )
@@ -93,51 +93,52 @@ class Elements(HTMLParser):
 
 
 @pytest.fixture
-def shelf(tmp_path: Path) -> Iterator[Shelf]:
+def library(tmp_path: Path) -> Iterator[RunLibrary]:
     """A list of 50 runs without files."""
     with RunIndex(tmp_path / "recordings") as index:
         index.add_all([made_row(number) for number in range(50)])
         index.stale = False
-        yield Shelf(index)
+        yield RunLibrary(index)
 
 
-def test_filters_count_what_they_would_leave(shelf: Shelf) -> None:
+def test_filters_count_what_they_would_leave(library: RunLibrary) -> None:
     look = Look().choose("outcome", "failure").choose("outliers", "80 to 90 %")
-    found, _ = shelf.page(look)
+    found, _ = library.page(look)
     assert found.total == len(found.rows) and all(row.outcome == "failure" for row in found.rows)
     assert {row.outlier_rate for row in found.rows} == {0.8, 0.9}
-    counts = shelf.counts(look.unfold("estimator"), found.total)
+    counts = library.counts(look.unfold("estimator"), found.total)
     assert dict(counts.diagnosis) == {"too few inliers": found.total}
     # A filter's own counts say what another value of it would leave.
     assert dict(counts.outcome)["failure"] == found.total and dict(counts.outcome)["success"] > 0
     assert sum(count for _, count in counts.unfolded) == found.total
-    assert shelf.page(look.choose("estimator", "mc"))[0].total == dict(counts.unfolded)["mc"]
+    assert library.page(look.choose("estimator", "mc"))[0].total == dict(counts.unfolded)["mc"]
     judged = look.choose("judged", "doubtful")
-    assert shelf.page(judged)[0].total == counts.doubtful == sum(bool(row.doubtful) for row in found.rows) > 0
+    assert library.page(judged)[0].total == counts.doubtful == sum(bool(row.doubtful) for row in found.rows) > 0
     assert judged.filtered and not look.choose("judged", "sure").judged
     assert "runs-filter:judged:doubtful" in Elements(filters_html(look, counts)).touches
-    assert not look.cleared().filtered and shelf.page(look.cleared())[0].total == 50
+    assert not look.cleared().filtered and library.page(look.cleared())[0].total == 50
     assert look.choose("outcome", "failure").outcome is None, "pressed again, it is taken away"
 
 
-def test_the_list_is_sorted_and_turned(shelf: Shelf) -> None:
-    newest, _ = shelf.page(Look())
+def test_the_list_is_sorted_and_turned(library: RunLibrary) -> None:
+    newest, _ = library.page(Look())
     assert [row.seed for row in newest.rows] == list(range(49, 49 - PAGE, -1))
-    last, look = shelf.page(Look().turn("9999"))
+    last, look = library.page(Look().turn("9999"))
     assert look.page == 2 and [row.seed for row in last.rows] == list(range(9, -1, -1)), "the nearest page that exists"
     worst = Look().sorted("rotation_error_deg")
     assert (
-        shelf.page(worst)[0].rows[0].seed == 49 and shelf.page(worst.sorted("rotation_error_deg"))[0].rows[0].seed == 0
+        library.page(worst)[0].rows[0].seed == 49
+        and library.page(worst.sorted("rotation_error_deg"))[0].rows[0].seed == 0
     )
-    assert shelf.place(worst, "run-0040.rrd", 0) == (9, 50) and shelf.place(worst, "gone.rrd", 0) == (None, 50)
+    assert library.place(worst, "run-0040.rrd", 0) == (9, 50) and library.place(worst, "gone.rrd", 0) == (None, 50)
     far = made_row(999, file="far.rrd", rotation_error_deg=-1.0)
-    shelf._index.add_all([far, *(made_row(number) for number in range(50, 300))])
-    assert shelf.place(worst, "far.rrd", 0) == (300, 301), "however far it is"
-    assert shelf.place(worst.choose("outcome", "success"), "far.rrd", 200)[0] is not None
-    assert shelf.place(worst.choose("outcome", "failure"), "far.rrd", 0)[0] is None
-    shelf._index.remove("far.rrd")
-    row = shelf.at(worst, 260)
-    assert row is not None and row.seed == 39 and shelf.at(worst, 300) is None and shelf.at(worst, -1) is None
+    library._index.add_all([far, *(made_row(number) for number in range(50, 300))])
+    assert library.place(worst, "far.rrd", 0) == (300, 301), "however far it is"
+    assert library.place(worst.choose("outcome", "success"), "far.rrd", 200)[0] is not None
+    assert library.place(worst.choose("outcome", "failure"), "far.rrd", 0)[0] is None
+    library._index.remove("far.rrd")
+    row = library.at(worst, 260)
+    assert row is not None and row.seed == 39 and library.at(worst, 300) is None and library.at(worst, -1) is None
 
 
 @pytest.mark.parametrize(
@@ -239,14 +240,16 @@ def test_two_runs_differ_in_what_differs() -> None:
     assert "bound px" not in comparison_html(one, replace(other, options="[1"))
 
 
-def test_an_export_is_whole_readable_and_bounded(shelf: Shelf, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_export_is_whole_readable_and_bounded(
+    library: RunLibrary, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     rows = [made_row(0, note="=1+1", labels=("a", "b")), made_row(1), made_row(2), made_row(3, file="../secret.rrd")]
     (tmp_path / "secret.rrd").write_bytes(b"secret")
     for row in rows[:2]:
-        (shelf.folder / row.file).write_bytes(row.file.encode())
-    (shelf.folder / "run-0000.review.rrd").write_bytes(b"review")
-    path = shelf.folder / "runs.zip"
-    packed = bundle(path, shelf.folder, rows, 9, NOW, lambda: False)
+        (library.folder / row.file).write_bytes(row.file.encode())
+    (library.folder / "run-0000.review.rrd").write_bytes(b"review")
+    path = library.folder / "runs.zip"
+    packed = bundle(path, library.folder, rows, 9, NOW, lambda: False)
     with zipfile.ZipFile(path) as archive:
         names = {f"recordings/{name}" for name in ("run-0000.rrd", "run-0000.review.rrd", "run-0001.rrd")}
         assert set(archive.namelist()) == names | {"index.html", "runs.csv"} and archive.testzip() is None
@@ -258,13 +261,13 @@ def test_an_export_is_whole_readable_and_bounded(shelf: Shelf, tmp_path: Path, m
     assert packed.runs == 2 and "2 were left out, since their files are gone" in packed.sentence
     assert "5 more were left out" in packed.sentence
     monkeypatch.setattr(bundle_module, "MOST_BYTES", 20)
-    assert bundle(path, shelf.folder, rows, 4, NOW, lambda: False).runs == 1
+    assert bundle(path, library.folder, rows, 4, NOW, lambda: False).runs == 1
     with pytest.raises(RecordingError, match="nothing to export"):
-        bundle(path, shelf.folder, rows[2:], 2, NOW, lambda: False)
+        bundle(path, library.folder, rows[2:], 2, NOW, lambda: False)
     with pytest.raises(RecordingError, match="page was closed"):
-        bundle(path, shelf.folder, rows, 4, NOW, lambda: True)
+        bundle(path, library.folder, rows, 4, NOW, lambda: True)
     with pytest.raises(RecordingError, match=r"cannot be written \(.*\); make room"):
-        bundle(shelf.folder / "none" / "runs.zip", shelf.folder, rows, 4, NOW, lambda: False)
+        bundle(library.folder / "none" / "runs.zip", library.folder, rows, 4, NOW, lambda: False)
 
 
 def test_an_export_names_commands_that_there_are() -> None:

@@ -15,20 +15,20 @@ from spherloc.estimators import estimate
 from spherloc.trace import Trace
 from spherloc_viz.app import session as session_module
 from spherloc_viz.app.catalog import Catalog
+from spherloc_viz.app.left_panels import HIDDEN
 from spherloc_viz.app.server import Sessions
 from spherloc_viz.app.services import Services
 from spherloc_viz.app.session import Session
-from spherloc_viz.app.story import HIDDEN
 from spherloc_viz.app.web.touch import Touch
-from spherloc_viz.app.web.viser_seams import start_viser, stop_viser
-from spherloc_viz.recording.keeping.recorder import Ended
+from spherloc_viz.app.web.viser_internals import start_viser, stop_viser
 from spherloc_viz.recording.origin import Origin
+from spherloc_viz.recording.storage.recorder import Ended
 from tests.connected_page import Wire
 from tests.tiny_scene import write_tiny_scene
 from tests.waiting import LIMIT_S, until
 
 KEY = "a key of this test"
-RIVAL = np.column_stack([np.eye(3), [1.0, 2.0, 3.0]])
+ALTERNATIVE = np.column_stack([np.eye(3), [1.0, 2.0, 3.0]])
 
 
 class Notes:
@@ -85,8 +85,8 @@ class House:
         until(lambda: len(self.notes.traces) > recorded)
         (number,) = set(self.sessions._open) - known
         session = self.sessions._open[number]
-        session._face.story.steps.go("outcome")
-        until(lambda: session._face.story.steps._choice.value.endswith("Outcome"))
+        session._display.panels.steps.go("outcome")
+        until(lambda: session._display.panels.steps._choice.value.endswith("Outcome"))
         return self.pages[-1], session
 
     def close(self) -> None:
@@ -107,7 +107,9 @@ def house(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[House]:
 def shown(session: Session) -> str:
     """The step at hand, the outcome and the status, as HTML."""
     return (
-        session._face.story.steps._text.content + session._face.story._outcome.content + session._status._line.content
+        session._display.panels.steps._text.content
+        + session._display.panels._outcome.content
+        + session._status._line.content
     )
 
 
@@ -118,7 +120,7 @@ def test_only_the_run_that_is_settled_on_is_recorded(house: House, monkeypatch: 
         patch.setattr(session_module, "QUIET_S", 3600.0)
         for percent in range(60, 0, -1):
             page.set(slider, float(percent))
-        until(lambda: session._run.wish.scene.variation.outlier_rate == 0.01)
+        until(lambda: session._run.request.scene.variation.outlier_rate == 0.01)
         assert len(house.notes.traces) == 1, "values on the way are not recorded"
     page.set(slider, 0.0)
 
@@ -151,18 +153,18 @@ def test_steps_can_be_walked_while_a_run_is_solved(house: House, monkeypatch: py
     assert entered.wait(LIMIT_S)
     for noise in np.linspace(1.1, 3.0, 15):
         page.set(session._controls.scene._simulation._noise, float(noise))
-    page.set(session._face.story.steps._buttons, "Previous")
+    page.set(session._display.panels.steps._buttons, "Previous")
     until(lambda: "Refinement" in shown(session))
     assert not solved, "and it is still being solved"
     gate.set()
     until(lambda: len(house.notes.traces) == 2)
     assert len(solved) == 2, "of fifteen changes meanwhile only the newest was run"
-    assert session._face.story.steps._choice.value.endswith("Refinement"), "the stage is kept"
+    assert session._display.panels.steps._choice.value.endswith("Refinement"), "the stage is kept"
 
 
 def test_while_another_scene_opens_nothing_stands_under_its_name(house: House) -> None:
     _, session = house.visit()
-    story = session._face.story
+    story = session._display.panels
     shown = story._summary.content
     story.begin_opening("<elsewhere>")
     until(lambda: "Opening &lt;elsewhere&gt;" in story._summary.content)
@@ -175,12 +177,12 @@ def test_stepping_solves_nothing(house: House, monkeypatch: pytest.MonkeyPatch) 
     page, session = house.visit()
     monkeypatch.setattr(session_module, "estimate", lambda *_: pytest.fail("solved again"))
     for button, title in (("Previous", "Refinement"), ("Next", "Outcome"), ("Next", "Outcome")):
-        page.set(session._face.story.steps._buttons, button)
-        until(lambda title=title: title in session._face.story.steps._choice.value)
-    page.set(session._face.story.steps._choice, session._face.story.steps._choice.options[0])
-    until(lambda: "The matches" in session._face.story.steps._text.content)
+        page.set(session._display.panels.steps._buttons, button)
+        until(lambda title=title: title in session._display.panels.steps._choice.value)
+    page.set(session._display.panels.steps._choice, session._display.panels.steps._choice.options[0])
+    until(lambda: "The matches" in session._display.panels.steps._text.content)
     page.set(session._controls.display._layers["map"], False)
-    until(lambda: not session._face.canvas._painter._drawn["map/points"][0].visible)
+    until(lambda: not session._display.canvas._painter._drawn["map/points"][0].visible)
     assert len(house.notes.traces) == 1
 
 
@@ -189,11 +191,12 @@ def test_play_goes_to_the_end_and_stops(house: House, monkeypatch: pytest.Monkey
 
     monkeypatch.setattr(steps_panel, "PLAY_S", 0.05)
     page, session = house.visit()
-    page.set(session._face.story.steps._choice, session._face.story.steps._choice.options[0])
-    until(lambda: "The matches" in session._face.story.steps._text.content)
-    page.set(session._face.story.steps._buttons, "Play")
-    until(lambda: session._face.story.steps._choice.value.endswith("Outcome"))
-    until(lambda: not session._face.story.steps._playing and "Play" in session._face.story.steps._buttons.options)
+    page.set(session._display.panels.steps._choice, session._display.panels.steps._choice.options[0])
+    until(lambda: "The matches" in session._display.panels.steps._text.content)
+    page.set(session._display.panels.steps._buttons, "Play")
+    until(lambda: session._display.panels.steps._choice.value.endswith("Outcome"))
+    steps = session._display.panels.steps
+    until(lambda: not steps._playing and "Play" in steps._buttons.options)
 
 
 def test_a_wrong_seed_is_a_sentence_and_the_page_goes_on(house: House) -> None:
@@ -237,25 +240,27 @@ def test_diagnosis_comes_after_the_picture_and_only_for_the_newest_run(
         seen.append(trace)
         entered.set()
         assert gate.wait(LIMIT_S)
-        return Diagnosis(Cause.AMBIGUOUS, True, "Two poses.", ("Both explain 9.",), "Look twice.", True, RIVAL)
+        return Diagnosis(Cause.AMBIGUOUS, True, "Two poses.", ("Both explain 9.",), "Look twice.", True, ALTERNATIVE)
 
     monkeypatch.setattr(session_module, "diagnose", slow)
     page.set(session._controls.scene._simulation._noise, 1.0)
     assert entered.wait(LIMIT_S)
-    until(lambda: "Diagnosing" in session._face.story._diagnosis.content)
+    until(lambda: "Diagnosing" in session._display.panels._diagnosis.content)
     for noise in np.linspace(1.1, 3.0, 15):
         page.set(session._controls.scene._simulation._noise, float(noise))
-    until(lambda: session._run.wish.scene.variation.noise_px == 3.0 and house.notes.traces[-1] is session._run.trace)
-    page.set(session._face.story.steps._buttons, "Previous")
+    until(lambda: session._run.request.scene.variation.noise_px == 3.0 and house.notes.traces[-1] is session._run.trace)
+    page.set(session._display.panels.steps._buttons, "Previous")
     until(lambda: "Refinement" in shown(session))
-    assert len(seen) == 1 and "cameras/rival" not in session._face.canvas._painter._drawn, "the page goes on meanwhile"
+    assert len(seen) == 1 and "cameras/alternative" not in session._display.canvas._painter._drawn, (
+        "the page goes on meanwhile"
+    )
     gate.set()
-    until(lambda: "Two poses." in session._face.story._diagnosis.content)
+    until(lambda: "Two poses." in session._display.panels._diagnosis.content)
     assert len(seen) == 2 and seen[1] is session._run.trace, "of fifteen runs meanwhile only the newest was diagnosed"
-    page.set(session._face.story.steps._buttons, "Next")
-    until(lambda: "cameras/rival" in session._face.canvas._painter._drawn)
-    page.set(session._face.story.steps._buttons, "Previous")
-    until(lambda: not session._face.canvas._painter._drawn["cameras/rival"][0].visible)
+    page.set(session._display.panels.steps._buttons, "Next")
+    until(lambda: "cameras/alternative" in session._display.canvas._painter._drawn)
+    page.set(session._display.panels.steps._buttons, "Previous")
+    until(lambda: not session._display.canvas._painter._drawn["cameras/alternative"][0].visible)
 
 
 def test_a_full_disk_and_a_bug_are_sentences(house: House, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -281,12 +286,12 @@ def test_pages_share_nothing_and_leave_nothing(house: House) -> None:
     kept = two._run.trace
     first.set(one._controls.scene._simulation._points, 33)
     until(lambda: one._run is not None and len(one._run.trace.problem) == 33)
-    first.set(one._face.story.steps._buttons, "Previous")
-    until(lambda: one._face.story.steps._choice.value.endswith("Refinement"))
+    first.set(one._display.panels.steps._buttons, "Previous")
+    until(lambda: one._display.panels.steps._choice.value.endswith("Refinement"))
     assert (
         two._run.trace is kept
         and two._controls.scene._simulation._points.value == 20
-        and two._face.story.steps._choice.value.endswith("Outcome")
+        and two._display.panels.steps._choice.value.endswith("Outcome")
     )
     first.close()
     until(lambda: threads() == before + 4 and len(house.sessions._open) == 1)
@@ -296,7 +301,7 @@ def test_pages_share_nothing_and_leave_nothing(house: House) -> None:
 
 def test_only_views_that_are_seen_are_drawn(house: House) -> None:
     _, session = house.visit()
-    table, residuals = session._face.story._matches._html, session._face.story._residuals._html
+    table, residuals = session._display.panels._matches._html, session._display.panels._residuals._html
     assert table.content == "" and residuals.content == "", "another tab is open"
 
     def see(names: str) -> None:
@@ -322,10 +327,10 @@ def test_matches_are_selected_and_changed_by_hand(house: House) -> None:
 
     def variation() -> Variation:
         assert session._run is not None
-        return session._run.wish.scene.variation
+        return session._run.request.scene.variation
 
     press("select:3")
-    until(lambda: session._face.card._panel.visible and "Match 3" in session._face.card._html.content)
+    until(lambda: session._display.card._panel.visible and "Match 3" in session._display.card._html.content)
     press("select:7,5", extend=True)
     assert session._edits.selected == (3, 5, 7)
     for wrong in ("select:99", "select:-1", "select:x", "select:", "select:1e3", "nothing:1"):
@@ -345,7 +350,7 @@ def test_matches_are_selected_and_changed_by_hand(house: House) -> None:
     until(lambda: variation().hidden == (5,))
     for _ in range(2):
         session.step_history(-1)
-    until(lambda: variation() == before.wish.scene.variation)  # type: ignore[union-attr]
+    until(lambda: variation() == before.request.scene.variation)  # type: ignore[union-attr]
     assert session._run is not None and before is not None
     assert np.array_equal(session._run.trace.cam_from_map, before.trace.cam_from_map), "to the last bit"
 
@@ -372,10 +377,10 @@ def test_undo_takes_back_what_was_not_solved_yet(house: House, monkeypatch: pyte
 
     def shown_now() -> tuple[int, float | None]:
         assert session._run is not None
-        wish = session._run.wish.scene
-        return wish.seed, wish.variation.noise_px
+        request = session._run.request.scene
+        return request.seed, request.variation.noise_px
 
-    start = session._run.wish.scene.seed  # type: ignore[union-attr]
+    start = session._run.request.scene.seed  # type: ignore[union-attr]
     until(lambda: shown_now() == (start, 4.0) and scene._seed.value == str(start))
     session.step_history(1)
     until(lambda: shown_now() == (77, 4.0))
@@ -389,27 +394,27 @@ def test_undo_takes_back_a_change_that_cannot_be_and_nothing_before_it(house: Ho
     until(lambda: session._run is not None)
     scene = session._controls.scene
     page.set(scene._seed, "77")
-    until(lambda: session._run.wish.scene.seed == 77)  # type: ignore[union-attr]
+    until(lambda: session._run.request.scene.seed == 77)  # type: ignore[union-attr]
     page.set(scene._seed, "seven")
     until(lambda: session._status._complaint is not None)
     session.step_history(-1)
     until(lambda: scene._seed.value == "77")
-    assert session._run is not None and session._run.wish.scene.seed == 77
+    assert session._run is not None and session._run.request.scene.seed == 77
     session.step_history(-1)
-    until(lambda: session._run.wish.scene.seed != 77)  # type: ignore[union-attr]
+    until(lambda: session._run.request.scene.seed != 77)  # type: ignore[union-attr]
 
 
 def test_answers_are_hidden_until_they_are_asked_for(house: House) -> None:
     page, session = house.visit()
-    story, display = session._face.story, session._controls.display
+    story, display = session._display.panels, session._controls.display
 
     def told() -> str:
         parts = (story._summary, story.steps._text, story._diagnosis, story._outcome)
         return "".join(part.content for part in parts)
 
     def drawn() -> set[str]:
-        assert session._face._shown is not None
-        return {item.name for item in session._face._shown[2].scene}
+        assert session._display._shown is not None
+        return {item.name for item in session._display._shown[2].scene}
 
     until(lambda: "off the truth" in told() and "rotation error" in told())
     assert "cameras/truth" in drawn()
@@ -437,7 +442,7 @@ def test_a_slow_run_gives_way_and_can_be_cancelled(house: House) -> None:
     bar, button = session._controls.slow._bar, session._controls.slow._button
     until(lambda: bar.visible and button.visible)
     until(lambda: 0.0 < bar.value < 100.0)
-    page.set(session._face.story.steps._buttons, "Previous")
+    page.set(session._display.panels.steps._buttons, "Previous")
     until(lambda: "Refinement" in shown(session))
     page.send({"type": "GuiUpdateMessage", "uuid": button._impl.uuid, "updates": {"value": True}})
     until(lambda: "Cancelled" in shown(session) and not bar.visible)

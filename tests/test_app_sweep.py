@@ -20,17 +20,17 @@ import viser
 from spherloc.datasets.variation import Variation
 from spherloc.errors import InputError
 from spherloc.estimators import warm_up
-from spherloc_viz.app.catalog import SceneWish
+from spherloc_viz.app.catalog import SceneRequest
 from spherloc_viz.app.panels import sweep_runs_panel
 from spherloc_viz.app.panels.estimator_chips import chips_html
 from spherloc_viz.app.panels.sweep_runs_panel import CANCEL, START, SweepPanel
 from spherloc_viz.app.plots.sweep_charts import charts_html, sweep_svg, table_html
 from spherloc_viz.app.web.touch import Touch, Touches
-from spherloc_viz.app.web.viser_seams import start_viser, stop_viser
+from spherloc_viz.app.web.viser_internals import start_viser, stop_viser
 from spherloc_viz.layers.primitives import Chart, Curve
 from spherloc_viz.layers.sweep import SweepChart
 from spherloc_viz.recording.index.query import RunQuery
-from spherloc_viz.recording.keeping.recorder import Recorder
+from spherloc_viz.recording.storage.recorder import Recorder
 from tests.tiny_scene import write_tiny_scene
 from tests.waiting import LIMIT_S, until
 
@@ -48,10 +48,10 @@ class Desk:
     """A panel, and the page around it."""
 
     def __init__(self, server: viser.ViserServer, scene: Path, recorder: Recorder | None = None) -> None:
-        self.wish = SceneWish(NAME, 5, None, Variation(noise_px=1.0, outlier_rate=0.4, hidden=(3,)))
+        self.request = SceneRequest(NAME, 5, None, Variation(noise_px=1.0, outlier_rate=0.4, hidden=(3,)))
         self.scene = scene
         self.touches = Touches(lambda error: None)
-        self.panel: Any = SweepPanel(server.gui, self.touches, lambda: (self.scene, self.wish), recorder)
+        self.panel: Any = SweepPanel(server.gui, self.touches, lambda: (self.scene, self.request), recorder)
 
     def tick(self, *names: str) -> None:
         """Have just these estimators ticked."""

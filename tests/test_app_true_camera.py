@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from spherloc.geometry import pose, yaw_rotation
 from spherloc_viz.app.stage.true_camera import Place, TrueCamera, place_of, pose_of
-from spherloc_viz.app.web.viser_seams import changes_of, start_viser, stop_viser
+from spherloc_viz.app.web.viser_internals import changes_of, start_viser, stop_viser
 
 metres = st.floats(-1e3, 1e3)
 

@@ -108,13 +108,13 @@ def test_a_link_opens_its_run_at_its_step(folder: Folder) -> None:
     visit(runs, row, calls)
 
 
-def test_without_a_step_it_is_the_decisive_one(folder: Folder) -> None:
+def test_without_a_step_it_is_the_key_step(folder: Folder) -> None:
     async def calls(door: Door) -> None:
         response = await door.get("viewer/?run=good.rrd")
-        assert Parsed(await response.text()).body["data-step"] == str(decided.decisive_step)
+        assert Parsed(await response.text()).body["data-step"] == str(decided.key_step)
 
     runs, row = folder
-    decided = replace(row, decisive_step=row.steps - 2)
+    decided = replace(row, key_step=row.steps - 2)
     visit(runs, decided, calls)
 
 
@@ -305,9 +305,9 @@ def test_links_survive_odd_names() -> None:
 
 
 def test_step_of(folder: Folder) -> None:
-    row = replace(folder[1], steps=5, decisive_step=3)
-    assert [step_of(row, wish) for wish in (None, 0, 4)] == [3, 0, 4]
-    for wish in (-1, 5):
+    row = replace(folder[1], steps=5, key_step=3)
+    assert [step_of(row, request) for request in (None, 0, 4)] == [3, 0, 4]
+    for request in (-1, 5):
         with pytest.raises(InputError, match="steps 0 to 4"):
-            step_of(row, wish)
-    assert step_of(replace(row, steps=0, decisive_step=0), 7) == 7, "the first version does not say how many there are"
+            step_of(row, request)
+    assert step_of(replace(row, steps=0, key_step=0), 7) == 7, "the first version does not say how many there are"

@@ -243,7 +243,7 @@ def test_bars_lie_where_their_tooltips_say(server: viser.ViserServer, runs: dict
             assert any(float(found[2]) == pytest.approx(max(1.5, span), abs=0.5) for span in spans)
 
 
-def test_a_selected_pair_is_there_with_its_twin_wherever_its_arcs_are(
+def test_a_selected_pair_is_there_with_its_second_arc_wherever_its_arcs_are(
     server: viser.ViserServer, runs: dict[str, Trace]
 ) -> None:
     run = runs["mc"]
@@ -260,7 +260,7 @@ def test_a_selected_pair_is_there_with_its_twin_wherever_its_arcs_are(
         assert np.allclose(bars.lo_deg[bars.owner == mine[0]], ends)
     view, _, _ = make(server)
     view.draw(run, "", pair, np.arange(120))
-    chosen = [path for path in drawn(view).iter(f"{SVG}path") if path.attrib.get("class") == "yaw-twin chosen"]
+    chosen = [path for path in drawn(view).iter(f"{SVG}path") if path.attrib.get("class") == "yaw-second chosen"]
     assert len(chosen) == 1 and chosen[0].attrib["d"].count("Q") == 1, "one arch joins the two roots"
 
 

@@ -109,7 +109,7 @@ def test_json_has_certificate_and_diagnosis(tmp_path: Path, estimator: str) -> N
     else:
         certificate = record["certificate"]
         assert certificate["upper_bound"] - certificate["lower_bound"] == certificate["gap"] == 0
-        assert certificate["proven"] is True and 0 <= certificate["chance_sets"] < 1e-6
+        assert certificate["proven"] is True and 0 <= certificate["nfa"] < 1e-6
     assert set(record["diagnosis"]) == {item.name for item in fields(Diagnosis)}
     assert record["diagnosis"]["cause"] == "ok" and record["diagnosis"]["doubtful"] is False
 
@@ -131,7 +131,7 @@ def test_doubtful_runs_get_a_line_of_diagnosis() -> None:
     assert "diagnosis" not in batch.as_text(SCENE, trace, replace(wrong, cause=Cause.OK, doubtful=False), None)
     record = json.loads(json_text(batch.as_record(SCENE, trace, wrong, None)))
     assert record["diagnosis"]["cause"] == "gravity prior off" and record["diagnosis"]["evidence"] == ["By 3 degrees."]
-    assert record["diagnosis"]["rival_cam_from_map"] == np.eye(3, 4).tolist()
+    assert record["diagnosis"]["alternative_cam_from_map"] == np.eye(3, 4).tolist()
 
 
 def test_an_answer_that_cannot_be_known_is_said() -> None:

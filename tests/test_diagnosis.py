@@ -66,20 +66,20 @@ def test_the_other_pose_is_shown(traces, cause, use_truth):
         diagnosis = diagnose(trace, use_truth)
         if diagnosis.cause != cause:
             continue
-        aligned, rival = trace.problem.aligned, diagnosis.rival_cam_from_map
-        assert rival is not None and trace.cam_from_map is not None
-        turn, distance = apart(rival, trace.cam_from_map)
+        aligned, alternative = trace.problem.aligned, diagnosis.alternative_cam_from_map
+        assert alternative is not None and trace.cam_from_map is not None
+        turn, distance = apart(alternative, trace.cam_from_map)
         assert turn > np.radians(3) or distance > 0.3
-        support = np.count_nonzero(residuals_px(aligned, aligned.align_pose(rival)) <= trace.options.bound_px)
+        support = np.count_nonzero(residuals_px(aligned, aligned.align_pose(alternative)) <= trace.options.bound_px)
         assert support > 0.4 * np.count_nonzero(trace.inlier_mask)
         assert any("within the gravity bound explains more than" in text for text in diagnosis.evidence)
 
 
 def test_truth_shows_the_true_pose(traces):
     for trace in traces[Cause.FALSE_CONSENSUS]:
-        rival = diagnose(trace).rival_cam_from_map
-        assert rival is not None and trace.problem.truth_cam_from_map is not None
-        turn, distance = apart(rival, trace.problem.truth_cam_from_map)
+        alternative = diagnose(trace).alternative_cam_from_map
+        assert alternative is not None and trace.problem.truth_cam_from_map is not None
+        turn, distance = apart(alternative, trace.problem.truth_cam_from_map)
         assert turn < np.radians(1) and distance < 0.1
 
 
@@ -129,7 +129,7 @@ def test_same_run_same_diagnosis(traces):
     trace = traces[Cause.AMBIGUOUS][1]
     one, two = diagnose(trace), diagnose(trace)
     assert (one.cause, one.evidence) == (two.cause, two.evidence)
-    np.testing.assert_array_equal(one.rival_cam_from_map, two.rival_cam_from_map)
+    np.testing.assert_array_equal(one.alternative_cam_from_map, two.alternative_cam_from_map)
 
 
 def test_rivals_of_the_exact_search_are_heard(traces):

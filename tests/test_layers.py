@@ -168,11 +168,13 @@ def test_rivals_are_ghosts_and_rows(exact: Trace) -> None:
     stage, aligned = exact.stage(ConsensusStage), exact.problem.aligned
     assert stage is not None
     picture = at(exact, "consensus-poses")
-    best, rivals = item(picture, "cameras/estimate"), item(picture, "cameras/rivals")
-    assert isinstance(best, Segments) and isinstance(rivals, Segments)
+    best, alternatives = item(picture, "cameras/estimate"), item(picture, "cameras/alternatives")
+    assert isinstance(best, Segments) and isinstance(alternatives, Segments)
     np.testing.assert_allclose(best.points[0, 0], camera_centre(aligned.align_pose(stage.cam_from_map[0])), atol=1e-9)
-    np.testing.assert_allclose(rivals.points[0, 0], camera_centre(aligned.align_pose(stage.cam_from_map[1])), atol=1e-9)
-    assert is_color(rivals.colors, style.RIVAL).all()
+    np.testing.assert_allclose(
+        alternatives.points[0, 0], camera_centre(aligned.align_pose(stage.cam_from_map[1])), atol=1e-9
+    )
+    assert is_color(alternatives.colors, style.ALTERNATIVE).all()
     assert [row[1] for row in picture.tables[0].rows] == [str(support) for support in stage.support]
     assert picture.tables[0].columns[-1] == "off the truth"
 
@@ -182,10 +184,10 @@ def test_many_rivals_are_thinned_and_none_is_said() -> None:
     assert pose is not None
     many = exact_run(cam_from_map=np.tile(pose, (20, 1, 1)), support=np.arange(40, 20, -1, dtype=np.int32))
     picture = at(many, "consensus-poses")
-    assert len(picture.tables[0].rows) == 1 + style.MAX_DRAWN_RIVALS
-    assert f"{style.MAX_DRAWN_RIVALS} of 19 other poses" in picture.step.note
+    assert len(picture.tables[0].rows) == 1 + style.MAX_DRAWN_ALTERNATIVES
+    assert f"{style.MAX_DRAWN_ALTERNATIVES} of 19 other poses" in picture.step.note
     alone = at(exact_run(cam_from_map=pose[None], support=np.array([20], np.int32)), "consensus-poses")
-    assert "cameras/rivals" not in {found.name for found in alone.scene}
+    assert "cameras/alternatives" not in {found.name for found in alone.scene}
     assert "No clearly different pose" in alone.step.caption
 
 

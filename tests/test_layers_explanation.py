@@ -162,8 +162,8 @@ def test_words_about_a_run_that_ended_elsewhere(trace: Trace) -> None:
     )
     plain = explain(unknown, int(np.argmax(right)))
     assert plain.verdict == "Rejected" and plain.right is None and plain.at_truth is None and plain.truth is None
-    rival = explain(unknown, int(np.argmax(right)), trace.cam_from_map)
-    assert "agrees with another pose" in rival.reason and "agrees with another pose" not in plain.reason
+    alternative = explain(unknown, int(np.argmax(right)), trace.cam_from_map)
+    assert "agrees with another pose" in alternative.reason and "agrees with another pose" not in plain.reason
 
 
 def test_labels_that_the_true_pose_does_not_bear_out(trace: Trace) -> None:

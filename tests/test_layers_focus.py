@@ -25,8 +25,8 @@ ABOUT: tuple[tuple[str, tuple[str, ...], float], ...] = (
     (r"positions-\d+", ("boxes/positions",), 0.4),
     (r"match", ("pairs/ray", "sphere/bearings"), 0.5),
     (r"unknowns", ("ring/circle",), 0.5),
-    (r"yaw-pair|yaw-twins", ("ring/hand", "ring/overlap", "pairs/sample"), 0.5),
-    (r"yaw-arcs.*|yaw-hand-.*|yaw-clique", ("ring/arcs", "ring/overlap"), 0.5),
+    (r"yaw-pair|yaw-roots", ("ring/candidate", "ring/overlap", "pairs/sample"), 0.5),
+    (r"yaw-arcs.*|yaw-candidate-.*|yaw-clique", ("ring/arcs", "ring/overlap"), 0.5),
     (r"consensus-bound|consensus-yaw-.*", ("ring/bound", "ring/bars"), 0.5),
     (r"consensus-clique.*", ("pairs/clique",), 0.4),
     (r"balls-pair", ("pairs/rays", "balls/one"), 0.5),
@@ -112,7 +112,9 @@ def test_steps_about_one_thing_are_seen_from_one_side(trace: Trace) -> None:
     sides: dict[str, list[FloatArray]] = {}
     for index, stop in enumerate(steps(trace)):
         view = views.follow(paint(trace, index), ASPECTS[0])
-        kind = next((kind for kind in ("yaw-arcs", "yaw-hand", "balls-", "clique") if stop.key.startswith(kind)), None)
+        kind = next(
+            (kind for kind in ("yaw-arcs", "yaw-candidate", "balls-", "clique") if stop.key.startswith(kind)), None
+        )
         if kind is not None and stop.key != "balls-pair":
             away = view.position - view.target
             sides.setdefault(kind, []).append(away / np.linalg.norm(away))

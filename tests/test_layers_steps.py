@@ -15,7 +15,7 @@ from spherloc.problem import Problem
 from spherloc.solvers.two_point import two_point
 from spherloc.trace import ConsensusStage, RansacStage, RefinementStage, Stage, Trace, TranslationStage, YawStage
 from spherloc_viz import style
-from spherloc_viz.layers import paint, ring, steps, twins, yaw
+from spherloc_viz.layers import paint, ring, steps, two_roots, yaw
 from spherloc_viz.layers.arcs import Arcs
 from spherloc_viz.layers.balls import BallSet
 from spherloc_viz.layers.frame import RunView
@@ -159,8 +159,8 @@ def test_growing_arcs_overlap_as_often_as_they_say(mc: Trace) -> None:
 def test_the_hand_meets_as_many_arcs_as_it_says(mc: Trace) -> None:
     stage = of(mc, YawStage)
     assert isinstance(stage, YawStage)
-    everything, keys = np.arange(len(stage.lo_rad)), keys_like(mc, r"yaw-hand-\d+")
-    stops = yaw.hand_stops(stage)
+    everything, keys = np.arange(len(stage.lo_rad)), keys_like(mc, r"yaw-candidate-\d+")
+    stops = yaw.candidate_yaws(stage)
     assert len(keys) == len(stops) >= 3 and (np.diff(stops) > 0).all()
     for key, place in zip(keys, stops.tolist(), strict=True):
         lo, hi = (np.radians(ring.degrees_of(place + part, 1440)) for part in (0, 1))
@@ -180,8 +180,8 @@ def test_the_hand_meets_as_many_arcs_as_it_says(mc: Trace) -> None:
 def test_the_story_of_the_hand_is_that_of_its_stops(mc: Trace) -> None:
     stage = of(mc, YawStage)
     assert isinstance(stage, YawStage)
-    stops = yaw.hand_stops(stage)
-    for k, key in enumerate(keys_like(mc, r"yaw-hand-\d+")):
+    stops = yaw.candidate_yaws(stage)
+    for k, key in enumerate(keys_like(mc, r"yaw-candidate-\d+")):
         said, here = at(mc, key).step.caption, stage.overlap[stops[k]]
         most = max(stage.overlap[stops[:k]], default=0)
         assert ("beats the stops before" in said) == bool(k and here > most)
@@ -194,7 +194,7 @@ def test_roots_are_those_of_the_solver(mc: Trace, rng: np.random.Generator) -> N
     for first, second in rng.integers(0, len(mc.problem), (60, 2)):
         if first == second:
             continue
-        roots = twins.pair_roots(view, int(first), int(second))
+        roots = two_roots.pair_roots(view, int(first), int(second))
         d, n = view.points[first] - view.points[second], np.cross(aligned.bearings[first], aligned.bearings[second])
         for root in roots.yaws_rad:
             assert abs(n @ yaw_rotation(root) @ d) < 1e-9 * np.linalg.norm(d)
@@ -208,13 +208,13 @@ def test_roots_are_those_of_the_solver(mc: Trace, rng: np.random.Generator) -> N
 def test_twins_are_both_arcs_of_one_pair_and_all_pairs_are_counted(mc: Trace) -> None:
     stage = of(mc, YawStage)
     assert isinstance(stage, YawStage)
-    picture = at(mc, "yaw-twins")
+    picture = at(mc, "yaw-roots")
     arcs = Counter(tuple(pair) for pair in stage.pairs.tolist())
     one, several = sum(count == 1 for count in arcs.values()), sum(count > 1 for count in arcs.values())
     none = stage.pairs_total - one - several
     told = f"{several:,} have two arcs or more, {one:,} have one, and {none:,} have none"
     assert told in picture.step.caption
-    band, hands = item(picture, "ring/arcs"), item(picture, "ring/hand")
+    band, hands = item(picture, "ring/arcs"), item(picture, "ring/candidate")
     assert isinstance(band, Segments) and isinstance(hands, Segments) and band.ids is not None
     (pair,) = {tuple(pair) for pair in band.ids.tolist()}
     assert arcs[pair] == len(hands.points) == 2
@@ -235,7 +235,7 @@ def test_without_twins_the_other_root_is_explained() -> None:
         hi_rad=stage.hi_rad[single],
         clique=np.flatnonzero(np.isin(single, stage.clique)).astype(np.int32),
     )
-    said = at(replace(trace, stages=(thin, *trace.stages[1:])), "yaw-twins").step.caption
+    said = at(replace(trace, stages=(thin, *trace.stages[1:])), "yaw-roots").step.caption
     assert re.search(r"behind the camera|too wide|only comes near", said) and " 0 have two arcs or more" in said
 
 
@@ -331,7 +331,7 @@ def test_peaks_of_the_bound_come_from_the_highest_down(exact: Trace) -> None:
     heights = []
     for key in keys:
         picture = at(exact, key)
-        hand = next(curve for curve in picture.charts[-1].curves if curve.label == "hand")
+        hand = next(curve for curve in picture.charts[-1].curves if curve.label == "candidate")
         height = int(stage.bound[int((hand.x[0] + 180.0) * 4)])
         heights.append(height)
         assert f"no pose explains more than {height} of" in picture.step.caption

@@ -23,7 +23,7 @@ from spherloc.metrics import evaluate
 from spherloc.problem import Problem
 from spherloc.trace import Certificate, RefinementStage, Trace
 from spherloc_viz.layers import paint, steps
-from spherloc_viz.layers.decisive import decisive_step
+from spherloc_viz.layers.key_step import key_step
 from spherloc_viz.layers.primitives import Balls, Label, Mesh, Points, Segments, Stop, Textured
 from spherloc_viz.recording.content import data
 from spherloc_viz.recording.content.chart_bars import LEVEL_OPACITY
@@ -32,7 +32,7 @@ from spherloc_viz.recording.content.letters import legible
 from spherloc_viz.recording.content.properties import APPLICATION_ID, FORMAT_VERSION
 from spherloc_viz.recording.content.reader import check_recording, read_recording
 from spherloc_viz.recording.content.writer import recorded_steps, write_recording
-from spherloc_viz.recording.keeping.machine import machine
+from spherloc_viz.recording.storage.machine import machine
 from spherloc_viz.recording.viewing.rerun_program import rerun_command, rerun_environment
 from tests.needs import needs
 from tests.waiting import LIMIT_S
@@ -63,7 +63,7 @@ def recorded(path: Path) -> Recorded:
 
 def shown_steps(trace: Trace) -> list[int]:
     """The steps that a lean recording of a run shows."""
-    return recorded_steps(steps(trace), decisive_step(trace, diagnose(trace)))
+    return recorded_steps(steps(trace), key_step(trace, diagnose(trace)))
 
 
 def assert_same_bits(one: Problem, two: Problem) -> None:
@@ -326,14 +326,14 @@ def test_words_cannot_become_markup(tmp_path: Path) -> None:
     assert unescaped(line) == evil
 
 
-def test_what_a_stage_came_to_and_the_decisive_step_are_recorded() -> None:
+def test_what_a_stage_came_to_and_the_key_step_are_recorded() -> None:
     keys = [
         "problem",
         "gravity",
         *(f"yaw-arcs-{k}" for k in (10, 30, 100, 300)),
         "yaw-arcs",
-        "yaw-hand-1",
-        "yaw-hand-2",
+        "yaw-candidate-1",
+        "yaw-candidate-2",
     ]
     keys += [name for k in range(1, 9) for name in (f"sample-{k}-pose", f"sample-{k}")] + ["outcome"]
     kept = [keys[index] for index in recorded_steps([Stop(key, key) for key in keys], keys.index("yaw-arcs-100"))]

@@ -20,10 +20,10 @@ from spherloc_viz.recording.content import writer
 from spherloc_viz.recording.content.reader import read_recording
 from spherloc_viz.recording.content.writer import write_recording
 from spherloc_viz.recording.index.query import RunQuery
-from spherloc_viz.recording.keeping import recorder as background
-from spherloc_viz.recording.keeping.keeper import Keeper, file_name
-from spherloc_viz.recording.keeping.recorder import Recorder
 from spherloc_viz.recording.origin import Origin
+from spherloc_viz.recording.storage import recorder as background
+from spherloc_viz.recording.storage.recorder import Recorder
+from spherloc_viz.recording.storage.store import RecordingStore, file_name
 from tests.waiting import LIMIT_S, until
 
 
@@ -76,9 +76,9 @@ def test_what_is_submitted_is_there_and_listed_after_closing(trace: Trace, tmp_p
     assert [run.seed for run in runs] == [0, 1, 2, 3, 4, 11]
     assert [run.origin for run in runs[:5]] == [origin] * 5
     assert runs[5].row.summary == "Told before." and runs[5].row.source == "unknown"
-    with Keeper(folder, notices.hear) as keeper:
-        found = keeper.index.find(RunQuery(sort="file", descending=False)).rows
-        refreshed = keeper.index.refresh()
+    with RecordingStore(folder, notices.hear) as store:
+        found = store.index.find(RunQuery(sort="file", descending=False)).rows
+        refreshed = store.index.refresh()
     assert [row.file for row in found] == sorted(path.name for path in paths) and {row.steps for row in found} != {0}
     assert (refreshed.read, refreshed.removed, refreshed.skipped) == (0, 0, ())
 
@@ -94,8 +94,8 @@ def test_names_of_files_are_safe_and_unique(trace: Trace, tmp_path: Path, name: 
         assert "_ransac-2p_11_" in file
         assert all(letter.isascii() and (letter.isalnum() or letter in "-_.") for letter in file)
         assert (tmp_path / file).parent == tmp_path
-    with Keeper(tmp_path, Told().hear) as keeper:
-        assert read_recording(keeper.record(run)).problem.name == name
+    with RecordingStore(tmp_path, Told().hear) as store:
+        assert read_recording(store.record(run)).problem.name == name
 
 
 def test_every_run_that_cannot_be_written_is_told(
@@ -181,9 +181,9 @@ def test_without_a_usable_list_runs_are_recorded_too(trace: Trace, tmp_path: Pat
 
 def test_a_run_that_cannot_be_listed_is_told_once(trace: Trace, tmp_path: Path) -> None:
     told = Told()
-    with Keeper(tmp_path, told.hear) as keeper:
-        keeper.index.close()
-        paths = [keeper.record(trace) for _ in range(3)]
+    with RecordingStore(tmp_path, told.hear) as store:
+        store.index.close()
+        paths = [store.record(trace) for _ in range(3)]
     assert all(path.is_file() for path in paths)
     assert len(told) == 1 and told[0].startswith("A run is recorded, but not listed: ")
 

@@ -16,10 +16,10 @@ import pytest
 from spherloc.errors import RecordingError
 from spherloc_viz.recording.index.refresh import examine_side_by_side
 from spherloc_viz.recording.index.run_index import RunIndex
-from spherloc_viz.recording.keeping.recorder import Recorder
-from spherloc_viz.recording.strangers import examiner as strangers
-from spherloc_viz.recording.strangers.child_process import ExaminerError
-from spherloc_viz.recording.strangers.examiner import Examiner
+from spherloc_viz.recording.sandbox import examiner as strangers
+from spherloc_viz.recording.sandbox.child_process import ExaminerError
+from spherloc_viz.recording.sandbox.examiner import Examiner
+from spherloc_viz.recording.storage.recorder import Recorder
 from tests.waiting import LIMIT_S, until
 
 STUCK = """#!{python}
@@ -36,7 +36,7 @@ import contextlib, signal, sys, threading, time
 signal.signal(signal.SIGINT, signal.default_int_handler)  # programs in the background begin without it
 from pathlib import Path
 from spherloc_viz.cli import main
-from spherloc_viz.recording.strangers import examiner
+from spherloc_viz.recording.sandbox import examiner
 sys.executable, examiner.FILE_LIMIT_S = sys.argv[1], 3600.0
 folder, pids = Path(sys.argv[2]), Path(sys.argv[3])
 {do}

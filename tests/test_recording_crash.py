@@ -18,17 +18,17 @@ from recording_samples import scene_problem
 
 from spherloc.estimators import estimate
 from spherloc.trace import Trace
-from spherloc_viz.recording.again.repeat import compare
 from spherloc_viz.recording.content.reader import read_recording, read_run_row
 from spherloc_viz.recording.content.writer import write_recording
 from spherloc_viz.recording.index.query import RunQuery
-from spherloc_viz.recording.keeping.keeper import Keeper
-from spherloc_viz.recording.keeping.leftovers import STALE_AFTER_S, here, leftovers, unfinished
-from spherloc_viz.recording.keeping.recorder import Recorder
-from spherloc_viz.recording.keeping.rescue import Rescued, rescue
+from spherloc_viz.recording.replay.repeat import compare
 from spherloc_viz.recording.review.notes import write_review
-from spherloc_viz.recording.strangers.child_process import ExaminerError
-from spherloc_viz.recording.strangers.examiner import Examiner
+from spherloc_viz.recording.sandbox.child_process import ExaminerError
+from spherloc_viz.recording.sandbox.examiner import Examiner
+from spherloc_viz.recording.storage.leftovers import STALE_AFTER_S, here, leftovers, unfinished
+from spherloc_viz.recording.storage.recorder import Recorder
+from spherloc_viz.recording.storage.rescue import Rescued, rescue
+from spherloc_viz.recording.storage.store import RecordingStore
 from tests.needs import needs
 from tests.waiting import LIMIT_S, until
 
@@ -38,7 +38,7 @@ KILLER = """
 import os, pathlib, random, signal, sys, time
 from spherloc.datasets import load_scene
 from spherloc.estimators import estimate
-from spherloc_viz.recording.keeping.keeper import Keeper
+from spherloc_viz.recording.storage.store import RecordingStore
 
 folder, scene, seed, kills = pathlib.Path(sys.argv[1]), pathlib.Path(sys.argv[2]), *map(int, sys.argv[3:])
 trace, draws = estimate(load_scene(scene).problem(), "ransac-2p"), random.Random(seed)
@@ -46,9 +46,9 @@ for number in range(kills):
     reader, writer = os.pipe()
     pid = os.fork()
     if not pid:
-        with Keeper(folder, sys.stderr.write) as keeper:
+        with RecordingStore(folder, sys.stderr.write) as store:
             while True:
-                keeper.record(trace)
+                store.record(trace)
                 os.write(writer, b"1")
     os.read(reader, 1)  # it has recorded once: what takes long the first time is over
     time.sleep(draws.uniform(0.0, 0.06))
@@ -78,7 +78,7 @@ def recorded(trace: Trace, tmp_path_factory: pytest.TempPathFactory) -> bytes:
 @pytest.fixture(scope="module")
 def dead() -> str:
     """How names of unfinished files tell of a process of this machine that has ended."""
-    lines = ("import pathlib", "from spherloc_viz.recording.keeping.leftovers import unfinished")
+    lines = ("import pathlib", "from spherloc_viz.recording.storage.leftovers import unfinished")
     code = "\n".join((*lines, "print(unfinished(pathlib.Path('a')))"))
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     return done.stdout.strip().removeprefix("a.").rpartition("-")[0]
@@ -235,8 +235,8 @@ def test_the_next_start_tells_what_it_recovered(recorded: bytes, dead: str, tmp_
     (tmp_path / "c.rrd").write_bytes(recorded)
     write_review(tmp_path / "c.rrd", ["street"], "was not listed")
     notices: list[str] = []
-    with Keeper(tmp_path, notices.append) as keeper:
-        keeper.index.add(read_run_row(tmp_path / "c.rrd"))
+    with RecordingStore(tmp_path, notices.append) as store:
+        store.index.add(read_run_row(tmp_path / "c.rrd"))
         (tmp_path / "c.rrd").rename(tmp_path / "d.rrd")
         (tmp_path / "c.review.rrd").rename(tmp_path / "d.review.rrd")
     with Recorder(tmp_path, lambda error: notices.append(str(error)), notices.append) as recorder:

@@ -20,7 +20,7 @@ from spherloc.problem import Problem
 from spherloc.trace import RansacStage, Trace
 from spherloc_viz import style
 from spherloc_viz.layers import paint, steps
-from spherloc_viz.layers.decisive import decisive_step
+from spherloc_viz.layers.key_step import key_step
 from spherloc_viz.layers.step_numbers import step_pose
 from spherloc_viz.recording.content.data import MAX_SCENE_BYTES, scene_text
 from spherloc_viz.recording.content.numbers import NUMBERS
@@ -118,7 +118,7 @@ def test_the_row_that_is_returned_is_the_row_that_is_read(run: object, tmp_path:
     row = write_recording(trace, path, Origin("sweep"))
     assert read_run_row(path) == read_recording(path).row == row
     assert (row.file, row.size_bytes, row.format_version) == ("a run.rrd", path.stat().st_size, 3)
-    assert row.steps == len(steps(trace)) and 0 <= row.decisive_step < row.steps
+    assert row.steps == len(steps(trace)) and 0 <= row.key_step < row.steps
     labels = trace.problem.truth_inliers
     assert row.outlier_rate == (None if labels is None else 1.0 - labels.mean())
     assert row.proven == (None if trace.certificate is None else trace.certificate.proven)
@@ -161,7 +161,7 @@ def test_every_recorded_step_has_its_numbers(run: tuple[str, str], tmp_path: Pat
     trace = estimate(scene_problem(run[0]), run[1], seed=3)
     row = write_recording(trace, tmp_path / "run.rrd")
     rows = dict(Recorded(tmp_path / "run.rrd").rows[NUMBERS])
-    assert list(rows) == recorded_steps(steps(trace), row.decisive_step)
+    assert list(rows) == recorded_steps(steps(trace), row.key_step)
     truth = trace.problem.truth_cam_from_map
     assert truth is not None
     for index, numbers in rows.items():
@@ -193,11 +193,11 @@ def test_a_step_has_a_pose_exactly_where_its_picture_has_an_estimate(run: tuple[
             assert np.allclose(apex, -aligned[:, :3].T @ aligned[:, 3], atol=1e-9), stop.key
 
 
-# ---------------------------------------------------------------------------------------------- the decisive step
+# ---------------------------------------------------------------------------------------------- the key step
 
 
 def key_of(trace: Trace) -> str:
-    return steps(trace)[decisive_step(trace, diagnose(trace))].key
+    return steps(trace)[key_step(trace, diagnose(trace))].key
 
 
 def test_a_right_run_was_decided_where_its_consensus_was_found(trace: Trace) -> None:
@@ -279,7 +279,7 @@ def test_the_query_image_is_recorded_small_with_its_matches(trace: Trace, tmp_pa
     assert np.allclose(image[::50, ::50, 0], np.where(np.arange(0, image.shape[1], 50) < image.shape[1] / 2, 200, 90))
     recorded = Recorded(tmp_path / "run.rrd")
     scale = image.shape[1] / camera.width
-    for step in (0, row.decisive_step, row.steps - 1):
+    for step in (0, row.key_step, row.steps - 1):
         places = recorded.array(MATCHES, step, "Points2D:positions")
         assert np.allclose(places, scale * trace.problem.pixels, atol=0.01)
         assert np.array_equal(

@@ -19,7 +19,7 @@ from spherloc_viz.recording.content.writer import write_recording
 from spherloc_viz.recording.index.query import RunQuery
 from spherloc_viz.recording.index.run_index import RunIndex
 from spherloc_viz.recording.run_row import RunRow
-from spherloc_viz.recording.strangers.examiner import examine_all
+from spherloc_viz.recording.sandbox.examiner import examine_all
 
 Noise = Callable[[bytes, np.random.Generator], bytes]
 

@@ -31,7 +31,7 @@ from spherloc_viz.recording.index.run_text import counts_text, rows_text
 from spherloc_viz.recording.origin import Origin
 from spherloc_viz.recording.review.notes import review_path, write_review
 from spherloc_viz.recording.run_row import RunRow
-from spherloc_viz.recording.strangers.examiner import examine
+from spherloc_viz.recording.sandbox.examiner import examine
 
 pytestmark = pytest.mark.usefixtures("own_examiner")
 

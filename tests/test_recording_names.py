@@ -7,7 +7,7 @@ import pytest
 
 from spherloc.errors import RecordingError
 from spherloc_viz.recording.review.notes import review_path, reviewed_name
-from spherloc_viz.recording.strangers.examiner import check_name, resolve_inside
+from spherloc_viz.recording.sandbox.examiner import check_name, resolve_inside
 
 
 def test_names_of_recordings(tmp_path: Path) -> None:

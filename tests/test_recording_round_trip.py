@@ -17,8 +17,8 @@ from spherloc_viz.recording.index.run_index import RunIndex
 from spherloc_viz.recording.origin import Origin
 from spherloc_viz.recording.review.notes import checked_review, write_review
 from spherloc_viz.recording.run_row import RunRow
-from spherloc_viz.recording.strangers.checked_row import row_from_table, table_from_row
-from spherloc_viz.recording.strangers.examiner import examine
+from spherloc_viz.recording.sandbox.checked_row import row_from_table, table_from_row
+from spherloc_viz.recording.sandbox.examiner import examine
 
 pytestmark = pytest.mark.usefixtures("own_examiner")
 
@@ -53,7 +53,7 @@ rows = st.builds(
     time_ms=st.floats(0.0, 1e300),
     proven=st.none() | st.booleans(),
     steps=st.integers(50, 10**6),
-    decisive_step=st.integers(0, 49),
+    key_step=st.integers(0, 49),
     title=anything,
     labels=st.lists(anything, max_size=3, unique=True).map(tuple),
     note=anything,

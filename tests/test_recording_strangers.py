@@ -41,10 +41,10 @@ from spherloc_viz.recording.content.reader import read_recording
 from spherloc_viz.recording.content.writer import write_recording
 from spherloc_viz.recording.review.notes import Review, review_path, write_review
 from spherloc_viz.recording.run_row import RunRow
-from spherloc_viz.recording.strangers import content_check
-from spherloc_viz.recording.strangers import examiner as strangers
-from spherloc_viz.recording.strangers.child import FILE_LIMIT_BYTES
-from spherloc_viz.recording.strangers.examiner import Examiner, examine, examine_all
+from spherloc_viz.recording.sandbox import content_check
+from spherloc_viz.recording.sandbox import examiner as strangers
+from spherloc_viz.recording.sandbox.child import FILE_LIMIT_BYTES
+from spherloc_viz.recording.sandbox.examiner import Examiner, examine, examine_all
 from tests.needs import needs
 from tests.waiting import LIMIT_S
 
@@ -304,7 +304,7 @@ def test_a_child_that_hangs_or_has_ended_is_replaced(
 
 def test_the_child_is_limited_in_time_and_what_it_writes(tmp_path: Path) -> None:
     program = f"""
-from spherloc_viz.recording.strangers import child as examine
+from spherloc_viz.recording.sandbox import child as examine
 examine.TIME_LIMIT_S = 1
 examine._limit_process()
 try:

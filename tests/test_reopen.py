@@ -12,13 +12,13 @@ from spherloc.datasets.variation import Variation
 from spherloc.errors import RecordingError
 from spherloc.estimators import estimate, options_type
 from spherloc.trace import Trace
-from spherloc_viz.app.catalog import Catalog, SceneWish
-from spherloc_viz.recording.again.reopen import Reopened, reopen
-from spherloc_viz.recording.again.repeat import compare
-from spherloc_viz.recording.again.scene import RecordedScene
+from spherloc_viz.app.catalog import Catalog, SceneRequest
 from spherloc_viz.recording.content.reader import RecordedRun, read_recording
 from spherloc_viz.recording.content.writer import write_recording
 from spherloc_viz.recording.origin import Origin
+from spherloc_viz.recording.replay.reopen import Reopened, reopen
+from spherloc_viz.recording.replay.repeat import compare
+from spherloc_viz.recording.replay.scene import RecordedScene
 from tests.datasets.test_rendered import SMALL
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -41,7 +41,7 @@ def solved(opened: Reopened) -> Trace:
     """As a page would."""
     catalog = Catalog(None)
     label = catalog.add(opened.scene, opened.path, opened.label)
-    problem = catalog.problem(SceneWish(label, opened.seed, opened.query, opened.variation))
+    problem = catalog.problem(SceneRequest(label, opened.seed, opened.query, opened.variation))
     return estimate(problem, opened.estimator, opened.options, opened.seed)
 
 

@@ -16,14 +16,14 @@ from spherloc.errors import InputError, RecordingError
 from spherloc.estimators import estimate, options_type
 from spherloc.trace import Certificate, Trace
 from spherloc_viz.batch import Records, run_scenes
-from spherloc_viz.recording.again import repeat as repeating
-from spherloc_viz.recording.again.repeat import compare, other_versions, repeat
-from spherloc_viz.recording.again.repeat_text import as_record, as_text, repeat_all
-from spherloc_viz.recording.again.same import different_fields
-from spherloc_viz.recording.again.scene import load_recorded_scene, missing_options, recorded_options
 from spherloc_viz.recording.content.reader import RecordedRun, read_recording
 from spherloc_viz.recording.content.writer import write_recording
 from spherloc_viz.recording.origin import Origin
+from spherloc_viz.recording.replay import repeat as repeating
+from spherloc_viz.recording.replay.repeat import compare, other_versions, repeat
+from spherloc_viz.recording.replay.repeat_text import as_record, as_text, repeat_all
+from spherloc_viz.recording.replay.same import different_fields
+from spherloc_viz.recording.replay.scene import load_recorded_scene, missing_options, recorded_options
 from spherloc_viz.share import as_command, as_python
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -86,7 +86,7 @@ def test_a_difference_by_rounding_is_told_as_one(path: Path, trace: Trace, monke
 def test_all_that_differs_is_told(path: Path, trace: Trace, monkeypatch: pytest.MonkeyPatch) -> None:
     mask = trace.inlier_mask.copy()
     mask[np.flatnonzero(mask)[:2]] = False
-    proof = Certificate(upper_bound=30, lower_bound=20, chance_sets=1e-3)
+    proof = Certificate(upper_bound=30, lower_bound=20, nfa=1e-3)
     pretend(
         monkeypatch,
         cam_from_map=None,
@@ -111,15 +111,15 @@ def test_all_that_differs_is_told(path: Path, trace: Trace, monkeypatch: pytest.
 
 def test_certificates_that_differ_by_rounding(trace: Trace, path: Path) -> None:
     run = read_recording(path)
-    before = Certificate(upper_bound=30, lower_bound=20, chance_sets=1e-3)
+    before = Certificate(upper_bound=30, lower_bound=20, nfa=1e-3)
 
     def told(now: Certificate) -> list[bool]:
         found = compare(replace(run, certificate=before), replace(trace, certificate=now))
         return [item.rounding for item in found]
 
     assert told(before) == []
-    assert told(replace(before, chance_sets=float(np.nextafter(1e-3, 1)))) == [True]
-    assert told(replace(before, chance_sets=2e-3)) == told(replace(before, upper_bound=31)) == [False]
+    assert told(replace(before, nfa=float(np.nextafter(1e-3, 1)))) == [True]
+    assert told(replace(before, nfa=2e-3)) == told(replace(before, upper_bound=31)) == [False]
 
 
 def test_versions_that_are_not_what_they_were() -> None:

@@ -222,9 +222,9 @@ def test_as_a_user_calls_it(folder: Path):
 def test_steps_are_asked_for_over_all_runs(folder: Path, capsys: pytest.CaptureFixture[str]):
     with RunIndex(folder) as index:
         rows = {row.file: row for row in index.find(RunQuery()).rows}
-    assert steps("step = decisive_step AND correspondences = 100", folder, format="csv") == 0
+    assert steps("step = key_step AND correspondences = 100", folder, format="csv") == 0
     found = listed(capsys)
-    assert {row["file"]: int(row["step"]) for row in found} == {name: row.decisive_step for name, row in rows.items()}
+    assert {row["file"]: int(row["step"]) for row in found} == {name: row.key_step for name, row in rows.items()}
     assert steps("position_error_m < 0.1 AND stage = 'Refinement'", folder, format="json") == 0
     near = json.loads(capsys.readouterr().out)
     assert {row["file"] for row in near} == {"right.rrd", "sampled.rrd"}

@@ -54,15 +54,15 @@ def pasted(script: str, command: str, cwd: Path) -> tuple[Any, Any]:
 def test_many_changes_of_a_simulation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     options = options_type("mc-exact")(bound_px=2.7, gravity_sd_deg=math.inf, time_budget_s=7.25, robust="huber")
-    wish = (MEI, 7, None, MANY, "mc-exact", options)
+    request = (MEI, 7, None, MANY, "mc-exact", options)
     expected = estimate(MANY.problem(load_scene(MEI), 7), "mc-exact", options, 7)
     assert expected.cam_from_map is not None
-    (tmp_path / "pasted.py").write_text(as_python(*wish))
+    (tmp_path / "pasted.py").write_text(as_python(*request))
     words = [sys.executable, "pasted.py"]
     done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=LIMIT_S, check=False)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout.splitlines()[-1]) == expected.cam_from_map.tolist()
-    words = shlex.split(as_command(*wish).removeprefix("spherloc "))
+    words = shlex.split(as_command(*request).removeprefix("spherloc "))
     result = spherloc_here(*words, "--json", "--no-record", cwd=tmp_path)
     assert json.loads(result.stdout)["cam_from_map"] == expected.cam_from_map.tolist(), result.stderr
 
@@ -76,8 +76,8 @@ def test_a_query_image(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     options = options_type("ransac-2p")(confidence=0.99, local_optimization=True, scoring="msac")
     expected = estimate(variation.problem(load_scene(path), 3, "query_001"), "ransac-2p", options, 3)
     assert expected.cam_from_map is not None
-    wish = (path, 3, "query_001", variation, "ransac-2p", options)
-    script, command = as_python(*wish), as_command(*wish)
+    request = (path, 3, "query_001", variation, "ransac-2p", options)
+    script, command = as_python(*request), as_command(*request)
     assert str(tmp_path) not in script + command
     assert pasted(script, command, tmp_path) == (expected.cam_from_map.tolist(), expected.cam_from_map.tolist())
 
@@ -132,13 +132,13 @@ def test_names_that_look_like_flags_or_code(tmp_path: Path, monkeypatch: pytest.
     monkeypatch.chdir(tmp_path)
     path = tmp_path / "-x; rm $HOME.toml"
     for query in ("--seed", "a b'c\"d\\e\n", "$(id)"):
-        wish = (path, 0, query, Variation(), "mc", options_type("mc")())
-        words = shlex.split(as_command(*wish))
+        request = (path, 0, query, Variation(), "mc", options_type("mc")())
+        words = shlex.split(as_command(*request))
         assert words[2] == f"./{path.name}" and (
             f"--query={query}" in words or words[words.index("--query") + 1] == query
         )
-        compile(as_python(*wish), "pasted.py", "exec")
-        assert repr(query) in as_python(*wish) or f'"{query}"' in as_python(*wish)
+        compile(as_python(*request), "pasted.py", "exec")
+        assert repr(query) in as_python(*request) or f'"{query}"' in as_python(*request)
 
 
 def test_every_scene_is_changed_and_a_wrong_one_is_a_sentence(capsys: pytest.CaptureFixture[str]) -> None:

@@ -22,7 +22,7 @@ from spherloc_viz.app.controls.steps_panel import (
     moved,
     stages_html,
 )
-from spherloc_viz.app.web.viser_seams import changes_of, start_viser, stop_viser
+from spherloc_viz.app.web.viser_internals import changes_of, start_viser, stop_viser
 from spherloc_viz.layers.primitives import Step, Stop
 
 TIMELINE = (
@@ -65,7 +65,7 @@ class Panel:
 
     def settle(self, steps: tuple[Stop, ...] = TIMELINE, asked: bool = True) -> str:
         """Key of the step at hand, after it was shown."""
-        index, self.pause = self.panel.settle(steps, asked)
+        index, self.pause = self.panel.advance(steps, asked)
         stop = steps[index]
         self.panel.show(Step(stop.key, stop.title, "One. Two.", ""), self.pause is not None, ())
         return stop.key
@@ -147,16 +147,16 @@ def test_a_thumb_that_moves_on_is_not_pulled_back(panel: Panel) -> None:
 
     slide(3)
     with changes.as_of(changes.now()):
-        index, _ = inner.settle(TIMELINE, True)
+        index, _ = inner.advance(TIMELINE, True)
         slide(7)
         inner.show(Step(KEYS[index], "", "", ""), False, ())
     assert slider.value == 7
     assert panel.settle() == KEYS[6] and slider.value == 7
 
 
-@pytest.mark.parametrize("wish", ["4711", "", "no-such-step", "yaw-arcs-9999999999999999999", "../../etc"])
-def test_any_wish_of_a_page_leads_somewhere(panel: Panel, wish: str) -> None:
-    panel.panel.go(wish)
+@pytest.mark.parametrize("request", ["4711", "", "no-such-step", "yaw-arcs-9999999999999999999", "../../etc"])
+def test_any_wish_of_a_page_leads_somewhere(panel: Panel, request: str) -> None:
+    panel.panel.go(request)
     assert panel.settle() in KEYS
 
 
@@ -194,7 +194,7 @@ def test_another_run_stays_at_the_same_kind_of_step(panel: Panel) -> None:
         ("yaw-arcs-1000", "yaw-arcs-300"),
         ("yaw-arcs-50", "yaw-arcs-30"),
         ("yaw-arcs-3", "yaw-arcs"),
-        ("yaw-hand-4", "yaw-clique"),
+        ("yaw-candidate-4", "yaw-clique"),
         ("balls-10", "outcome"),
     ],
 )

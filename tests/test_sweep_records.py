@@ -8,20 +8,20 @@ from pathlib import Path
 
 import distributed
 import pytest
-from sweep_deaths import DeadlyKeeper
+from sweep_deaths import DeadlyStore
 
 from spherloc.datasets.variation import Variation
 from spherloc.experiments.sweep import Entrant, Job, planned, run_sweep
-from spherloc.experiments.sweep_crew import solve
+from spherloc.experiments.sweep_workers import solve
 from spherloc.trace import Trace
 from spherloc_viz.batch import Records
-from spherloc_viz.recording.again.reopen import reopen
 from spherloc_viz.recording.content.reader import read_recording
 from spherloc_viz.recording.index.query import RunQuery
 from spherloc_viz.recording.index.run_index import RunIndex
-from spherloc_viz.recording.keeping import sweep_keeper
-from spherloc_viz.recording.keeping.keeper import Keeper
-from spherloc_viz.recording.keeping.sweep_keeper import SweepKeeper, sweep_run_id
+from spherloc_viz.recording.replay.reopen import reopen
+from spherloc_viz.recording.storage import sweep_store
+from spherloc_viz.recording.storage.store import RecordingStore
+from spherloc_viz.recording.storage.sweep_store import SweepStore, sweep_run_id
 from spherloc_viz.sweep import Recorded, sweep
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -91,7 +91,7 @@ def test_a_run_of_a_killed_worker_is_done_again_and_listed_once(tmp_path: Path) 
     marks.mkdir()
     entrants = [Entrant("ransac-2p", (("iterations", 20),))]
     plan = planned(SCENE, "outlier_rate", [0.2, 0.5], entrants, 4, Variation(correspondences=30), 7)
-    rows = list(run_sweep(plan, workers=1, keep=DeadlyKeeper(SweepKeeper(folder), marks, deaths=1)))
+    rows = list(run_sweep(plan, workers=1, keep=DeadlyStore(SweepStore(folder), marks, deaths=1)))
     assert len(list(marks.iterdir())) == 1
     with RunIndex(folder) as index:
         index.refresh()
@@ -101,24 +101,24 @@ def test_a_run_of_a_killed_worker_is_done_again_and_listed_once(tmp_path: Path) 
 
 def test_a_run_that_is_recorded_anew_replaces_itself_and_keeps_what_a_reviewer_said(tmp_path: Path) -> None:
     plan = planned(SCENE, "noise_px", [1.0, 2.0], [Entrant("ransac-2p")], 2, Variation(correspondences=20))
-    jobs, keeper = list(plan.jobs()), SweepKeeper(tmp_path)
+    jobs, store = list(plan.jobs()), SweepStore(tmp_path)
     assert len({sweep_run_id(plan, job) for job in jobs}) == 4
     assert sweep_run_id(replace(plan, runs=50, values=(0.5, 1.0, 2.0)), Job(0, 1, 0)) == sweep_run_id(plan, jobs[0])
     try:
-        plan.solve(jobs, lambda job, trace: keeper(plan, job, trace))
+        plan.solve(jobs, lambda job, trace: store(plan, job, trace))
         with RunIndex(tmp_path) as index:
             before = {row.file: row for row in index.find(RunQuery(), limit=None).rows}
             chosen = min(before)
             index.set_review(chosen, ["street"], "wet road")
-            plan.solve(jobs, lambda job, trace: keeper(plan, job, trace))
+            plan.solve(jobs, lambda job, trace: store(plan, job, trace))
             after = {row.file: row for row in index.find(RunQuery(), limit=None).rows}
             assert after.keys() == before.keys() and len(after) == 4
             assert all(row.run_id == before[file].run_id != "" for file, row in after.items())
             assert after[chosen].labels == ("street",) and after[chosen].note == "wet road"
             assert index.refresh().read == 0
     finally:
-        sweep_keeper._keeper(keeper.folder)[0].close()
-        sweep_keeper._keeper.cache_clear()
+        sweep_store._store(store.folder)[0].close()
+        sweep_store._store.cache_clear()
 
 
 def test_where_nothing_can_be_recorded_the_sweep_goes_on_and_says_it_once(
@@ -126,8 +126,8 @@ def test_where_nothing_can_be_recorded_the_sweep_goes_on_and_says_it_once(
 ) -> None:
     (tmp_path / "file").write_text("in the way")
     plan = planned(SCENE, "noise_px", [1.0], [Entrant("ransac-2p")], 3, Variation(correspondences=20))
-    with Keeper(tmp_path / "file", print) as keeper:
-        recorded = Recorded(keeper)
+    with RecordingStore(tmp_path / "file", print) as store:
+        recorded = Recorded(store)
         solved = solve(plan, list(plan.jobs()), recorded.keep(cluster=False))
         assert len(solved.rows) == len(solved.complaints) == 3
         for sentence in solved.complaints:
@@ -142,10 +142,10 @@ def test_workers_of_other_machines_record_nothing(tmp_path: Path) -> None:
     plan = planned(SCENE, "noise_px", [1.0], [Entrant("ransac-2p")], 1, Variation(correspondences=20))
     done: list[tuple[Job, Trace]] = []
     plan.solve(list(plan.jobs()), lambda job, trace: done.append((job, trace)))
-    keeper = SweepKeeper(tmp_path / "recordings")
-    assert replace(keeper, machine="another")(plan, *done[0]) == "" and not list(tmp_path.iterdir())
-    assert keeper(plan, *done[0]) == ""
-    sweep_keeper._keeper(keeper.folder)[0].close()
-    sweep_keeper._keeper.cache_clear()
+    store = SweepStore(tmp_path / "recordings")
+    assert replace(store, machine="another")(plan, *done[0]) == "" and not list(tmp_path.iterdir())
+    assert store(plan, *done[0]) == ""
+    sweep_store._store(store.folder)[0].close()
+    sweep_store._store.cache_clear()
     (path,) = (tmp_path / "recordings").glob("*.rrd")
     assert read_recording(path).row.source == "sweep" and read_recording(path).problem.pixels.shape == (20, 2)

@@ -8,7 +8,7 @@ import pytest
 import viser
 from viser import _messages
 
-from spherloc_viz.app.web.viser_seams import at_once, guard_callbacks, start_viser, stop_viser
+from spherloc_viz.app.web.viser_internals import at_once, guard_callbacks, start_viser, stop_viser
 from tests.connected_page import ConnectedPage
 from tests.waiting import until
 

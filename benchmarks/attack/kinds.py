@@ -257,7 +257,7 @@ def _write_recordings(folder: Path) -> None:
 
 def _read_recording(folder: Path, damaged: Path) -> object:
     from spherloc_viz.recording.content.reader import read_recording
-    from spherloc_viz.recording.strangers.examiner import examine
+    from spherloc_viz.recording.sandbox.examiner import examine
     from spherloc_viz.recording.viewing.view import labels_of
 
     row = examine(damaged)
@@ -266,7 +266,7 @@ def _read_recording(folder: Path, damaged: Path) -> object:
 
 
 def _read_review(folder: Path, damaged: Path) -> object:
-    from spherloc_viz.recording.strangers.examiner import examine, examine_review
+    from spherloc_viz.recording.sandbox.examiner import examine, examine_review
 
     recording = damaged.with_name(damaged.name.replace(".review", ""))
     examine(recording)

@@ -28,11 +28,11 @@ def chance_rate(bearings: FloatArray, bound_rad: FloatArray) -> float:
 
 
 def least_size(count: int, rate: float, expected: float) -> int:
-    """The least size of which at most ``expected`` chance sets are expected: see ``chance_sets``."""
-    return next((size for size in range(2, count) if chance_sets(count, size, rate) <= expected), count)
+    """The least size whose NFA is at most ``expected``: see ``nfa``."""
+    return next((size for size in range(2, count) if nfa(count, size, rate) <= expected), count)
 
 
-def chance_sets(count: int, size: int, rate: float) -> float:
+def nfa(count: int, size: int, rate: float) -> float:
     """Expected number of sets of ``size`` among ``count`` correspondences that agree with some pose by chance.
 
     Two of them fix a pose and each other one is explained with probability ``rate``: C(count, size) rate^(size - 2).

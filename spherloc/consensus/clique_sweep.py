@@ -112,7 +112,7 @@ def _completed(rows, a, b, candidates, floor, effort_limit, board):
 
 
 @numba.njit(cache=True, nogil=True)
-def settle(data, limits, view, everybody, balls, poses, supports, masks, known, board):
+def certify(data, limits, view, everybody, balls, poses, supports, masks, known, board):
     """Prove that no pose explains more of ``everybody`` than the best known one does; ``balls`` (B, 4) hold all that
     might.
 
@@ -199,7 +199,7 @@ def sweep_bin(data, limits, trig, pairs, lo, hi, nodes, rows, span, poses, suppo
             continue
         everybody = np.append(nodes[candidates], nodes[np.array([a, b])])
         balls = star_balls(view, trig, everybody, len(everybody) - supports[0], ball)
-        known, proven, work = settle(data, limits, view, everybody, balls, poses, supports, masks, known, board)
+        known, proven, work = certify(data, limits, view, everybody, balls, poses, supports, masks, known, board)
         effort += work
         if not proven and len(clique) > len(largest):
             largest = nodes[clique]

@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 
 from spherloc.bounds import Bounds
 from spherloc.consensus.balls_of_pairs import apart_balls, view_between
-from spherloc.consensus.chance import chance_sets, least_size
+from spherloc.consensus.bin_cliques import core_graph, largest_bin_cliques
+from spherloc.consensus.chance import least_size, nfa
 from spherloc.consensus.clique_search import colour_bound
-from spherloc.consensus.clique_sweep import settle, sweep_bin
+from spherloc.consensus.clique_sweep import certify, sweep_bin
 from spherloc.consensus.depth_bounds import chord
 from spherloc.consensus.level_fit import place, translation_of
 from spherloc.consensus.pair_arcs import pair_arcs, turn_of
-from spherloc.consensus.scout import core_graph, scout
 from spherloc.consensus.support import improve
 from spherloc.consensus.yaw_bins import BIN_TURN, BINS, degree_bounds, sort_into_bins
 from spherloc.geometry import yaw_rotation
@@ -32,11 +32,11 @@ BoolArray = NDArray[np.bool_]
 IndexArray = NDArray[np.int32]
 
 DOUBTFUL = 1e-6
-"""Expected number of chance sets of the size of the guess above which better guesses are looked for."""
-HOPELESS = 1000.0
-"""Expected number of chance sets of a size at which it says nothing."""
+"""Expected number of false alarms (NFA) of the size of the guess above which better guesses are looked for."""
+LARGEST_NFA = 1000.0
+"""NFA of a size at which it says nothing."""
 MOST_SPARE = 8
-"""Nodes of a bin more than the best support up to which the whole bin is tried to be settled at once."""
+"""Nodes of a bin more than the best support up to which the whole bin is tried to be certified at once."""
 MOST_POSES = 8
 """Clearly different poses that are remembered."""
 PAIRS_UNTIL, BINS_UNTIL, SCOUT_UNTIL, SEARCH_UNTIL = 0.5, 0.7, 0.75, 0.98
@@ -115,12 +115,12 @@ def exact_consensus(
     starts, edges = sort_into_bins(pairs, lo, hi, watch.board)
     watch.reach(3)
     bound = degree_bounds(count, starts, edges, watch.board)
-    watch.begin("scout", SCOUT_UNTIL)
+    watch.begin("largest_bin_cliques", SCOUT_UNTIL)
     # What chance explains too often to be told apart is looked for last.
-    for expected in (HOPELESS, np.inf) if len(edges) < effort_limit else ():
-        if chance_sets(count, int(supports[0]), wrong_rate) > DOUBTFUL:
+    for expected in (LARGEST_NFA, np.inf) if len(edges) < effort_limit else ():
+        if nfa(count, int(supports[0]), wrong_rate) > DOUBTFUL:
             floor = least_size(count, wrong_rate, expected) - 1
-            known = scout(data, starts, edges, bound, floor, poses, supports, masks, known, watch.board)
+            known = largest_bin_cliques(data, starts, edges, bound, floor, poses, supports, masks, known, watch.board)
     watch.begin("search", SEARCH_UNTIL)
     watch.expect(effort_limit)
     effort, finished = len(edges), True
@@ -136,7 +136,7 @@ def exact_consensus(
         nodes, rows = core_graph(count, edges[starts[b] : starts[b + 1]], int(supports[0]), watch.board)
         watch.check()
         span = (b * BIN_TURN, (b + 1) * BIN_TURN)
-        known, most, work = _settle_bin(
+        known, most, work = _certify_bin(
             data, limits, trig, nodes, rows, span, poses, supports, masks, known, watch.board
         )
         effort += work
@@ -167,7 +167,7 @@ def exact_consensus(
     )
 
 
-def _settle_bin(data, limits, trig, nodes, rows, span, poses, supports, masks, known, board) -> tuple[int, int, int]:
+def _certify_bin(data, limits, trig, nodes, rows, span, poses, supports, masks, known, board) -> tuple[int, int, int]:
     """Bound a bin without walking its arcs: by colours, and by proof where few nodes more than the best support are
     left.
 
@@ -178,7 +178,7 @@ def _settle_bin(data, limits, trig, nodes, rows, span, poses, supports, masks, k
     if most > best and len(nodes) - best <= MOST_SPARE:
         view = view_between(data, *span)
         balls = apart_balls(view, trig, nodes, len(nodes) - best)
-        known, proven, work = settle(data, limits, view, nodes, balls, poses, supports, masks, known, board)
+        known, proven, work = certify(data, limits, view, nodes, balls, poses, supports, masks, known, board)
         effort += work
         most = 0 if proven else most
     return int(known), int(max(most, supports[0])), int(effort)

@@ -110,10 +110,10 @@ class CaseMaker:
             pixels = np.concatenate([pixels, more[self.camera.unproject(more)[1]]])
         self.parts.append((pixels[:count], (cloud or self.cube)(self.rng, count), False))
 
-    def coherent(self, count: int, twins: int = 0) -> None:
+    def coherent(self, count: int, doubled: int = 0) -> None:
         """Add wrong correspondences that agree with one wrong pose, as repeated structure makes them.
 
-        The first ``twins`` of them take the pixels' points twice: each point was matched in both of its places.
+        The first ``doubled`` of them take the pixels' points twice: each point was matched in both of its places.
         """
         found = None
         while found is None:
@@ -122,8 +122,8 @@ class CaseMaker:
                 found = self.visible(count, self.cube, self.truth, wrong)
         points, (right, off) = found
         self.parts.append((off, points, False))
-        if twins:
-            self.parts.append((right[:twins], points[:twins], True))
+        if doubled:
+            self.parts.append((right[:doubled], points[:doubled], True))
 
     def agreeing(self, count: int, wrong: FloatArray) -> None:
         """Add wrong correspondences that agree with that pose (3, 4), and are seen from the true one too."""

@@ -70,7 +70,7 @@ def _ambiguous(make: CaseMaker) -> FailureCase:
     count = make.whole(80, 300)
     half = round(count * make.between(0.2, 0.45))
     if make.rng.random() < 0.5:
-        make.coherent(half, twins=half)
+        make.coherent(half, doubled=half)
     else:
         make.right(half)
         make.coherent(half)

@@ -1,7 +1,7 @@
 """Rendered scenes: a street, an apartment or a campus, built and drawn by code, with true poses and depth.
 
 References travel along the world's path in good conditions; queries come later, beside the path, in other light,
-another season, with strangers about. Pictures are drawn when they are first needed and kept on disk.
+another season, with people about. Pictures are drawn when they are first needed and kept on disk.
 """
 
 from collections.abc import Mapping

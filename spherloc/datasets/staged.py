@@ -16,7 +16,7 @@ from spherloc.errors import InputError, show
 from spherloc.geometry import pose, yaw_rotation
 from spherloc.problem import Problem
 
-GroupKind = Literal["right", "agreeing", "near", "twins", "random"]
+GroupKind = Literal["right", "agreeing", "near", "doubled", "random"]
 GROUP_KINDS: tuple[str, ...] = get_args(GroupKind)
 CUBE = "cube"
 MOST_MATCHES = 2_000
@@ -31,10 +31,10 @@ class Group:
 
     kind: GroupKind
     """"right"; "agreeing": all with one wrong pose, a new one for each group; "near": all with one pose half a metre
-    beside the true one, as where a fence's bars are mistaken for the next ones; "twins": each point is matched twice,
+    beside the true one, as where a fence's bars are mistaken for the next ones; "doubled": each point is matched twice,
     right and by one wrong pose; "random": any pixel with any point."""
     count: int
-    """How many; twins are twice as many."""
+    """How many; doubled matches are twice as many."""
     place: str = CUBE
     """Where their points are: all over the "cube", or a key of ``PLACES``. For right and random ones only."""
 
@@ -107,7 +107,7 @@ def _add(make: CaseMaker, group: Group) -> None:
     elif group.kind == "near":
         make.agreeing(group.count, _beside(make))
     else:
-        make.coherent(group.count, twins=group.count if group.kind == "twins" else 0)
+        make.coherent(group.count, doubled=group.count if group.kind == "doubled" else 0)
 
 
 def _beside(make: CaseMaker) -> FloatArray:

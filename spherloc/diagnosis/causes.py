@@ -52,6 +52,6 @@ class Diagnosis:
     """What to do."""
     used_truth: bool
     """Whether the true pose or true labels were looked at."""
-    rival_cam_from_map: FloatArray | None = None
+    alternative_cam_from_map: FloatArray | None = None
     """Another pose (3, 4) to look at beside the run's own: the second one where two are ambiguous, the better or the
     true one where it is known; else None."""

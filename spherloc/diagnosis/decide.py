@@ -59,7 +59,7 @@ def without_truth(e: Evidence) -> Cause:
     believed = stands_out(e, best)
     if believed and undetermined(e.rotation_sd_rad, e.position_sd_m):
         return Cause.DEGENERATE
-    if e.free is not None and e.chance_sets(int(e.found(WIDER)), WIDER, fixed_by=3) < CHANCE:
+    if e.free is not None and e.nfa(int(e.found(WIDER)), WIDER, fixed_by=3) < CHANCE:
         free = e.free.support(e.bound_px)
         if free >= max(LEAST, AS_GOOD * best) and tilts(e, e.free.tilt_rad, TILT_SDS * e.free_tilt_sd_rad):
             return Cause.GRAVITY_OFF
@@ -68,10 +68,10 @@ def without_truth(e: Evidence) -> Cause:
     if not believed:
         expected = int(LEAST_RIGHT_RATE * len(e.aligned.points))
         return Cause.WRONG_REFERENCE if stands_out(e, expected) else Cause.TOO_FEW_INLIERS
-    second = 0 if e.rival is None else e.rival.support(e.bound_px)
+    second = 0 if e.alternative is None else e.alternative.support(e.bound_px)
     if stands_out(e, second) and second >= EQUAL * best:
         return Cause.AMBIGUOUS
-    if stands_out(e, own := e.rivals_own()) and own >= STRONG * best:
+    if stands_out(e, own := e.alternatives_own()) and own >= STRONG * best:
         return Cause.FALSE_CONSENSUS
     return Cause.ITERATIONS_RAN_OUT if missed(e, best) else Cause.OK
 
@@ -105,7 +105,7 @@ def with_truth(e: Evidence, t: Truth) -> Cause:
 
 def stands_out(e: Evidence, size: int) -> bool:
     """Whether a consensus of that size is more than chance gives."""
-    return size >= LEAST and e.chance_sets(size) < CHANCE
+    return size >= LEAST and e.nfa(size) < CHANCE
 
 
 def undetermined(rotation_sd_rad: float, position_sd_m: float) -> bool:
@@ -127,6 +127,6 @@ def missed(e: Evidence, best: int) -> bool:
 
 def _other(e: Evidence, true: Fit) -> int:
     """Most support of a pose that is clearly not the true one."""
-    fits = [fit for fit in (e.run, e.best, e.rival) if fit is not None]
+    fits = [fit for fit in (e.run, e.best, e.alternative) if fit is not None]
     wrong = [fit for fit in fits if different(fit.cam_from_map, true.cam_from_map)]
     return max((fit.support(e.bound_px) for fit in wrong), default=0)

@@ -6,8 +6,8 @@ import numpy as np
 
 from spherloc.bounds import Bounds, bounds_of
 from spherloc.cameras.base import BoolArray, FloatArray
-from spherloc.consensus.chance import chance_rate, chance_sets
-from spherloc.diagnosis.experiments import WIDER, Fit, fit_of, free_fit, rival, search, subset
+from spherloc.consensus.chance import chance_rate, nfa
+from spherloc.diagnosis.experiments import WIDER, Fit, alternative, fit_of, free_fit, search, subset
 from spherloc.diagnosis.measures import apart, pose_sd
 from spherloc.metrics import evaluate
 from spherloc.problem import AlignedProblem
@@ -41,7 +41,7 @@ class Evidence:
     """The run's own pose."""
     best: Fit | None
     """The pose with the most support: the run's own, or one of a longer search if that has more."""
-    rival: Fit | None
+    alternative: Fit | None
     """The pose with the most support that is clearly different from ``best``."""
     free: Fit | None
     """The pose with the most support within a wider bound and without belief in gravity."""
@@ -52,19 +52,21 @@ class Evidence:
     position_sd_m: float
     """The same of its position."""
 
-    def chance_sets(self, size: int, wider: float = 1.0, fixed_by: int = 2) -> float:
-        """Expected number of chance sets of that size within ``wider`` times the bound.
+    def nfa(self, size: int, wider: float = 1.0, fixed_by: int = 2) -> float:
+        """Expected number of false alarms (NFA) of that size within ``wider`` times the bound.
 
         ``fixed_by`` correspondences fix a pose: 2, or 3 where gravity is free.
         """
         rate = min(1.0, self.chance_rate * wider**2)
-        return chance_sets(len(self.aligned.points), size, rate) * rate ** (2 - fixed_by)
+        return nfa(len(self.aligned.points), size, rate) * rate ** (2 - fixed_by)
 
-    def rivals_own(self) -> int:
-        """Correspondences that the rival explains and the best pose does not."""
-        if self.rival is None or self.best is None:
+    def alternatives_own(self) -> int:
+        """Correspondences that the alternative explains and the best pose does not."""
+        if self.alternative is None or self.best is None:
             return 0
-        return int(np.count_nonzero((self.rival.errors_px <= self.bound_px) & (self.best.errors_px > self.bound_px)))
+        return int(
+            np.count_nonzero((self.alternative.errors_px <= self.bound_px) & (self.best.errors_px > self.bound_px))
+        )
 
     def found(self, factor: float) -> float:
         """Support of the free pose within ``factor`` times the bound, less what is there by chance."""
@@ -101,7 +103,7 @@ def gather(trace: Trace) -> Evidence:
     best = max(fits, key=lambda fit: fit.support(bound_px), default=None)
     second, sd = None, (np.inf, np.inf)
     if best is not None:
-        others = [*fits, rival(aligned, best, bound_px, options)]
+        others = [*fits, alternative(aligned, best, bound_px, options)]
         others = [fit for fit in others if fit is not None and different(fit.cam_from_map, best.cam_from_map)]
         second = max(others, key=lambda fit: fit.support(bound_px), default=None)
         sd = _sd(aligned, best, bound_px, options)
@@ -113,7 +115,7 @@ def gather(trace: Trace) -> Evidence:
         chance_rate=chance_rate(aligned.bearings, bounds.radians),
         run=run,
         best=best,
-        rival=second,
+        alternative=second,
         free=free,
         free_tilt_sd_rad=np.inf if free is None else _free_tilt_sd(aligned, free, bound_px),
         rotation_sd_rad=sd[0],

@@ -72,7 +72,7 @@ def subset(aligned: AlignedProblem, mask: BoolArray) -> AlignedProblem:
     return replace(aligned, **{name: np.ascontiguousarray(getattr(aligned, name)[mask]) for name in names})
 
 
-def rival(aligned: AlignedProblem, best: Fit, bound_px: float, options: RefinementOptions) -> Fit | None:
+def alternative(aligned: AlignedProblem, best: Fit, bound_px: float, options: RefinementOptions) -> Fit | None:
     """The pose that explains most of what ``best`` is far from explaining, with its support among all."""
     rest = best.errors_px > 3.0 * bound_px
     if np.count_nonzero(rest) < 2:

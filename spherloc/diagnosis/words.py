@@ -38,7 +38,7 @@ def describe(
         evidence=tuple(_sentences(trace, e, truth, certificate)),
         advice=_advice(trace, e, cause),
         used_truth=truth is not None,
-        rival_cam_from_map=None if other is None else e.aligned.unalign_pose(other.cam_from_map),
+        alternative_cam_from_map=None if other is None else e.aligned.unalign_pose(other.cam_from_map),
     )
 
 
@@ -56,7 +56,7 @@ def _other(e: Evidence, truth: Truth | None, cause: Cause) -> Fit | None:
     if cause is Cause.OK:
         return None
     if cause in (Cause.AMBIGUOUS, Cause.FALSE_CONSENSUS):
-        candidates = [e.rival, e.best] if truth is None else [truth.fit, e.rival, e.best]
+        candidates = [e.alternative, e.best] if truth is None else [truth.fit, e.alternative, e.best]
     elif truth is not None:
         candidates = [truth.fit]
     elif cause in (Cause.ITERATIONS_RAN_OUT, Cause.SEARCH_MISSED):
@@ -131,13 +131,14 @@ def _sentences(trace: Trace, e: Evidence, truth: Truth | None, certificate: Cert
         best = e.best.support(bound)
         if e.run is None or best > e.run.support(bound):
             yield f"A longer search finds a pose that {best} agree with."
-        yield f"Sets of {best} that agree by chance: {_expected(e.chance_sets(best))} expected."
+        yield f"Sets of {best} that agree by chance: {_expected(e.nfa(best))} expected."
         if np.isfinite(e.position_sd_m):
             fixed = f"{_metres(e.position_sd_m)} and {_deg(e.rotation_sd_rad)}"
             yield f"They fix it to {fixed} (1 sd)."
-    if e.best is not None and e.rival is not None and e.rival.support(bound) > 1:
-        turn, distance = apart(e.best.cam_from_map, e.rival.cam_from_map)
-        yield f"The next pose, {_metres(distance)} and {_deg(turn)} away from the best, has {e.rival.support(bound)}."
+    if e.best is not None and e.alternative is not None and e.alternative.support(bound) > 1:
+        turn, distance = apart(e.best.cam_from_map, e.alternative.cam_from_map)
+        away = f"{_metres(distance)} and {_deg(turn)}"
+        yield f"The next pose, {away} away from the best, has {e.alternative.support(bound)}."
     if e.free is not None and np.isfinite(e.free_tilt_sd_rad):
         one, two, four = (e.free.support(factor * bound) for factor in (1, 2, 4))
         yield (

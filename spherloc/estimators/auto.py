@@ -5,7 +5,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from spherloc.bounds import Bounds
-from spherloc.consensus.chance import chance_rate, chance_sets
+from spherloc.consensus.chance import chance_rate, nfa
 from spherloc.consensus.two_point_search import TwoPointSearch, search_two_point
 from spherloc.estimators.base import Clock, Outcome, check_positive
 from spherloc.estimators.mc_exact import MOST_CORRESPONDENCES, ExactMaximumConsensus, McExactOptions
@@ -20,7 +20,7 @@ PROBE_CONFIDENCE = 0.99
 CHEAP = 500
 """Correspondences up to which the proof costs a few hundredths of a second, so that nothing speaks against it."""
 CERTAIN = 1e-6
-"""Expected number of chance sets of the size of the probe's consensus below which it is no chance."""
+"""Expected number of false alarms (NFA) of the size of the probe's consensus below which it is no chance."""
 RANSAC_CONFIDENCE = 0.9999
 RANSAC_SAMPLES = 100_000
 
@@ -90,7 +90,7 @@ def _probe_samples(aligned: AlignedProblem) -> int:
 def _decide(aligned: AlignedProblem, bounds: Bounds, probe: TwoPointSearch) -> DecisionStage:
     count = len(aligned.bearings)
     support = int(probe.support.max(initial=0))
-    chance = chance_sets(count, support, chance_rate(aligned.bearings, bounds.radians))
+    chance = nfa(count, support, chance_rate(aligned.bearings, bounds.radians))
     expected = aligned.estimated_outlier_rate
     guess = "" if expected is None else f", and the front end expects {100 * (1 - expected):.0f} %"
     share = (

@@ -3,7 +3,7 @@
 Two exact searches share what they find: one over yaw that compares pairs of correspondences
 (``consensus.exact``; gravity exact, few correspondences or few inliers), and one over camera positions, yaw and tilt
 (``consensus.positions``), which needs memory for the correspondences only. Each starts from the other's best pose and
-leaves out the yaws that the other has settled.
+leaves out the yaws that the other has excluded.
 """
 
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spherloc.bounds import Bounds
-from spherloc.consensus.chance import chance_rate, chance_sets
+from spherloc.consensus.chance import chance_rate, nfa
 from spherloc.consensus.exact import ExactConsensus, exact_consensus
 from spherloc.consensus.pose_cells import Matches, matches_of
 from spherloc.consensus.positions import PositionSearch, search_positions
@@ -98,14 +98,18 @@ class ExactMaximumConsensus:
         stage = _stage(aligned, bounds, start, found)
         stages: tuple[Stage, ...] = (stage,) if found.positions is None else (stage, found.positions)
         if found.pose is None:
-            certificate = Certificate(found.upper, 1, chance_sets(count, 1, rate))
+            certificate = Certificate(found.upper, 1, nfa(count, 1, rate))
             reason = "No pose: no pair of correspondences has a solution in front of the camera."
             return Outcome(stages, None, np.zeros(count, dtype=bool), reason, certificate=certificate)
         with clock.stage("refinement", until=1.0):
-            starts = [found.pose, *_rivals(found.pairs), *(pose(yaw_rotation(yaw), at) for yaw, at in _poses(guess))]
+            starts = [
+                found.pose,
+                *_alternatives(found.pairs),
+                *(pose(yaw_rotation(yaw), at) for yaw, at in _poses(guess)),
+            ]
             refined, inliers, refinement = conclude(aligned, starts, bounds, options)
         lower = _lower_bound(aligned, bounds, found.pose, refined, refinement.tilt_rad)
-        certificate = Certificate(max(found.upper, lower), lower, chance_sets(count, lower, rate))
+        certificate = Certificate(max(found.upper, lower), lower, nfa(count, lower, rate))
         return Outcome((*stages, refinement), refined, inliers, certificate=certificate)
 
 
@@ -194,7 +198,7 @@ def _boxes(found: PositionSearch) -> PositionStage | None:
     )
 
 
-def _rivals(pairs: ExactConsensus | None) -> list[FloatArray]:
+def _alternatives(pairs: ExactConsensus | None) -> list[FloatArray]:
     """The clearly different poses (3, 4) that the search over pairs verified beside the best one."""
     return [] if pairs is None else list(pairs.poses[1:])
 

@@ -9,9 +9,9 @@ from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterator, Sequence
 
 from spherloc.errors import InputError
-from spherloc.experiments.sweep_crew import Crew, Keep, LocalCrew
 from spherloc.experiments.sweep_plan import AXES, Entrant, Job, SweepPlan, planned
 from spherloc.experiments.sweep_rows import SweepRow
+from spherloc.experiments.sweep_workers import Keep, LocalWorkers, Workers
 
 __all__ = ["AXES", "Entrant", "Job", "Keep", "SweepPlan", "SweepRow", "planned", "run_sweep"]
 
@@ -48,13 +48,13 @@ def run_sweep(
     Raises ``InputError`` if a run is impossible or kills its worker every time, or if there are no workers.
     """
     backlog = Backlog(plan, done, OVERHEAD_MS + (0.0 if keep is None else KEEPING_MS))
-    crew = _crew(plan, workers, scheduler, keep)
+    pool = _start_workers(plan, workers, scheduler, keep)
     try:
         while backlog.left and not (stop is not None and stop.is_set()):
-            for _ in range(crew.room()):
+            for _ in range(pool.room()):
                 if jobs := backlog.take():
-                    crew.submit(jobs)
-            for task in crew.collect(LISTEN_S):
+                    pool.submit(jobs)
+            for task in pool.collect(LISTEN_S):
                 if task.solved is None:
                     backlog.put_back(task.jobs)
                     continue
@@ -62,12 +62,12 @@ def run_sweep(
                     complain(sentence)
                 yield from backlog.book(task.jobs, task.solved.rows)
     finally:
-        crew.close()
+        pool.close()
 
 
-def _crew(plan: SweepPlan, workers: int, scheduler: str | None, keep: Keep | None) -> Crew:
+def _start_workers(plan: SweepPlan, workers: int, scheduler: str | None, keep: Keep | None) -> Workers:
     if scheduler is None:
-        return LocalCrew(plan, workers, keep)
+        return LocalWorkers(plan, workers, keep)
     from spherloc.experiments.sweep_cluster import Cluster
 
     return Cluster(plan, scheduler, keep)

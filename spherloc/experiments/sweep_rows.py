@@ -46,7 +46,7 @@ class SweepRow:
     """Certificate: no pose explains more correspondences. None if the estimator proves nothing, as the next two."""
     lower_bound: int | None
     """Certificate: some pose explains as many."""
-    chance_sets: float | None
+    nfa: float | None
     """Certificate: expected number of false sets of that size."""
 
 
@@ -68,7 +68,7 @@ def row_of(trace: Trace, label: str, value: float) -> SweepRow:
         f1=metrics.f1,
         upper_bound=None if certificate is None else int(certificate.upper_bound),
         lower_bound=None if certificate is None else int(certificate.lower_bound),
-        chance_sets=None if certificate is None else float(certificate.chance_sets),
+        nfa=None if certificate is None else float(certificate.nfa),
     )
 
 

@@ -1,6 +1,6 @@
 """Walks the files of a COLMAP model in binary form (little endian) before anything else reads them.
 
-Counts are compared with the size of the file before anything is allocated; see ``colmap_walk``.
+Counts are compared with the size of the file before anything is allocated; see ``colmap_parts``.
 """
 
 import os
@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 
 from spherloc.errors import InputError
 from spherloc.files import is_file, open_file, reading
-from spherloc.formats.colmap_walk import (
+from spherloc.formats.colmap_parts import (
     LARGEST,
     MODELS,
     OBSERVATION,
     ORDER,
     SPHERE,
+    ModelParts,
     Observed,
-    Walked,
     check_observations,
     check_pose,
     make_points,
@@ -69,12 +69,12 @@ class _Reader:
         return InputError(f"{self.path}, up to byte {self.at}: {what}; replace the damaged file.")
 
 
-def walk_binary(folder: Path) -> Walked:
+def check_binary(folder: Path) -> ModelParts:
     """Check ``cameras.bin``, ``images.bin``, ``points3D.bin`` and, where they are, ``rigs.bin`` and ``frames.bin``.
 
     Raises ``InputError`` with the file and the byte of what is wrong.
     """
-    walked = Walked()
+    walked = ModelParts()
     for name, step in zip(ORDER, (_cameras, _rigs, _frames, _images, _points), strict=True):
         path = folder / f"{name}.bin"
         if name in ("rigs", "frames") and not is_file(path):
@@ -86,7 +86,7 @@ def walk_binary(folder: Path) -> Walked:
     return walked
 
 
-def _cameras(reader: _Reader, walked: Walked) -> None:
+def _cameras(reader: _Reader, walked: ModelParts) -> None:
     count = reader.count("<Q", 24, "cameras")
     sphere_bytes = 8 + count * (24 + 8 * _SPHERE_PARAMETERS)
     for _ in range(count):
@@ -99,7 +99,7 @@ def _cameras(reader: _Reader, walked: Walked) -> None:
         walked.camera(number, params, reader.broken)
 
 
-def _rigs(reader: _Reader, walked: Walked) -> None:
+def _rigs(reader: _Reader, walked: ModelParts) -> None:
     for _ in range(reader.count("<Q", 8, "rigs")):
         number, count = reader.take("<II", "a rig")
         what = f"the sensors of rig {number}"
@@ -112,7 +112,7 @@ def _rigs(reader: _Reader, walked: Walked) -> None:
         walked.rig(number, [sensor for kind, sensor in sensors if kind == _CAMERA], reader.broken)
 
 
-def _frames(reader: _Reader, walked: Walked) -> None:
+def _frames(reader: _Reader, walked: ModelParts) -> None:
     for _ in range(reader.count("<Q", 68, "frames")):
         number, rig, *pose = reader.take("<II7d", "a frame")
         check_pose(pose, reader.broken, f"frame {number}")
@@ -121,7 +121,7 @@ def _frames(reader: _Reader, walked: Walked) -> None:
         walked.frame(number, rig, [(sensor, image) for kind, sensor, image in data if kind == _CAMERA], reader.broken)
 
 
-def _images(reader: _Reader, walked: Walked) -> None:
+def _images(reader: _Reader, walked: ModelParts) -> None:
     for _ in range(reader.count("<Q", 73, "images")):
         number, *pose, camera_id = reader.take("<I7dI", "an image")
         check_pose(pose, reader.broken, f"image {number}")
@@ -154,7 +154,7 @@ def _load(path: Path, offset: int, count: int) -> NDArray[Any]:
     return observations
 
 
-def _points(reader: _Reader, walked: Walked) -> None:
+def _points(reader: _Reader, walked: ModelParts) -> None:
     records, tracks = bytearray(), bytearray()
     for _ in range(reader.count("<Q", _POINT.itemsize, "points")):
         records += reader.bytes(_POINT.itemsize - 8, "a point")
@@ -174,6 +174,6 @@ def _points(reader: _Reader, walked: Walked) -> None:
     walked.points = make_points(table["id"], table["xyz"], table["error"], table["track"])
 
 
-def _check_tracks(reader: _Reader, walked: Walked, content: bytearray) -> None:
+def _check_tracks(reader: _Reader, walked: ModelParts, content: bytearray) -> None:
     track = np.frombuffer(bytes(content), _TRACK)
     walked.tracks(track["image"].astype(np.int64), track["place"].astype(np.int64), reader.broken)

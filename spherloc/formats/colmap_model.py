@@ -18,9 +18,9 @@ from spherloc.cameras.colmap_models import camera_from_colmap
 from spherloc.errors import MOST_REASON, CalibrationError, InputError, reason, shorten, show
 from spherloc.extras import require
 from spherloc.files import is_file, is_folder
-from spherloc.formats.colmap_check import walk_binary
-from spherloc.formats.colmap_text import walk_text
-from spherloc.formats.colmap_walk import Points, Walked
+from spherloc.formats.colmap_check import check_binary
+from spherloc.formats.colmap_parts import ModelParts, Points
+from spherloc.formats.colmap_text import check_text
 
 _FILES = ("cameras", "images", "points3D")
 _PATIENCE_S = 120.0
@@ -37,7 +37,7 @@ class ColmapImage:
     cam_from_map: FloatArray
     """Pose (3, 4), absolute, also for an image of a rig."""
     load: Callable[[], NDArray[Any]]
-    """Its observations, records of ``colmap_walk.OBSERVATION``."""
+    """Its observations, records of ``colmap_parts.OBSERVATION``."""
 
     @property
     def pixels(self) -> FloatArray:
@@ -115,7 +115,7 @@ def read_model(folder: Path) -> ColmapModel:
     folder = Path(folder)
     form = _form(folder)
     require("pycolmap", "colmap", "reading COLMAP models")
-    walked = walk_binary(folder) if form == "bin" else walk_text(folder)
+    walked = check_binary(folder) if form == "bin" else check_text(folder)
     answer = _read_by_pycolmap(folder, form)
     cameras = {row[0]: (str(row[1]), int(row[2]), int(row[3]), tuple(row[4])) for row in answer["cameras"]}
     images, remarks = _images(folder, walked, answer["images"])
@@ -162,7 +162,7 @@ def _read_by_pycolmap(folder: Path, form: str) -> dict[str, Any]:
     return answer
 
 
-def _images(folder: Path, walked: Walked, rows: list[list[Any]]) -> tuple[dict[str, ColmapImage], tuple[str, ...]]:
+def _images(folder: Path, walked: ModelParts, rows: list[list[Any]]) -> tuple[dict[str, ColmapImage], tuple[str, ...]]:
     if {(row[0], row[1]) for row in rows} != {(number, image.name) for number, image in walked.images.items()}:
         raise InputError(f"{folder}: COLMAP's own reader finds other images in it; export the model again.")
     names = Counter(row[1] for row in rows)

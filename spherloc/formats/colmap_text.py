@@ -1,4 +1,4 @@
-"""Walks the files of a COLMAP model in text form before anything else reads them; see ``colmap_walk``."""
+"""Walks the files of a COLMAP model in text form before anything else reads them; see ``colmap_parts``."""
 
 import io
 from collections.abc import Iterator
@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 
 from spherloc.errors import InputError, show
 from spherloc.files import is_file, open_file, reading
-from spherloc.formats.colmap_walk import (
+from spherloc.formats.colmap_parts import (
     LARGEST,
     MODELS,
     OBSERVATION,
     ORDER,
     SPHERE,
+    ModelParts,
     Observed,
-    Walked,
     check_observations,
     check_pose,
     make_points,
@@ -78,12 +78,12 @@ def _is_number(word: str) -> bool:
         return False
 
 
-def walk_text(folder: Path) -> Walked:
+def check_text(folder: Path) -> ModelParts:
     """Check ``cameras.txt``, ``images.txt``, ``points3D.txt`` and, where they are, ``rigs.txt`` and ``frames.txt``.
 
     Raises ``InputError`` with the file and the line of what is wrong.
     """
-    walked = Walked()
+    walked = ModelParts()
     for name, step in zip(ORDER, (_cameras, _rigs, _frames, _images, _points), strict=True):
         path = folder / f"{name}.txt"
         if name in ("rigs", "frames") and not is_file(path):
@@ -109,7 +109,7 @@ def _records(lines: Iterator[_Line]) -> Iterator[_Line]:
     return (line for line in lines if line.text and not line.text.startswith("#"))
 
 
-def _cameras(lines: Iterator[_Line], walked: Walked) -> None:
+def _cameras(lines: Iterator[_Line], walked: ModelParts) -> None:
     for line in _records(lines):
         number, model, width, height, *params = line.words(4, "CAMERA_ID, MODEL, WIDTH, HEIGHT and parameters")
         for word in (width, height):
@@ -124,7 +124,7 @@ def _cameras(lines: Iterator[_Line], walked: Walked) -> None:
         walked.camera(line.whole(number), numbers, line.broken)
 
 
-def _rigs(lines: Iterator[_Line], walked: Walked) -> None:
+def _rigs(lines: Iterator[_Line], walked: ModelParts) -> None:
     for line in _records(lines):
         number, count, *words = line.words(2, "RIG_ID, NUM_SENSORS and the sensors")
         words[2:2] = ["0"] if len(words) >= 2 else []  # the reference has no pose, as others may have none
@@ -143,7 +143,7 @@ def _rigs(lines: Iterator[_Line], walked: Walked) -> None:
         walked.rig(line.whole(number), cameras, line.broken)
 
 
-def _frames(lines: Iterator[_Line], walked: Walked) -> None:
+def _frames(lines: Iterator[_Line], walked: ModelParts) -> None:
     for line in _records(lines):
         number, rig, *rest = line.words(10, "FRAME_ID, RIG_ID, a pose, NUM_DATA_IDS and the images")
         check_pose(line.numbers(rest[:7]), line.broken, f"frame {number}")
@@ -155,7 +155,7 @@ def _frames(lines: Iterator[_Line], walked: Walked) -> None:
         walked.frame(line.whole(number), line.whole(rig), images, line.broken)
 
 
-def _images(lines: Iterator[_Line], walked: Walked) -> None:
+def _images(lines: Iterator[_Line], walked: ModelParts) -> None:
     for line in _records(lines):
         words = line.words(10, "IMAGE_ID, a pose, CAMERA_ID and NAME")
         number, *pose, camera_id, name = words[:10]
@@ -185,7 +185,7 @@ def _observations(line: _Line) -> NDArray[Any]:
     return table
 
 
-def _points(lines: Iterator[_Line], walked: Walked) -> None:
+def _points(lines: Iterator[_Line], walked: ModelParts) -> None:
     ids, columns = [], []
     for line in _records(lines):
         number, *rest = line.words(8, "POINT3D_ID, X, Y, Z, R, G, B, ERROR and the track")

@@ -25,7 +25,7 @@ SEAM_LEAST_PX = 128
 """Repeated of a small one: ORB finds nothing within 31 pixels of the border of its coarsest level, 111 of the image."""
 SEAM_STEP_PX = 32
 """The wrap is a multiple of it, so that the coarse levels of the pyramid sample the same pixels as without it."""
-SEAM_TWIN_PX = 1.0
+SEAM_DUPLICATE_PX = 1.0
 """A feature this close to the seam may be found on both sides of it."""
 MOST_PIXELS = 5_000_000
 """Larger images are shrunk to this for detection, as COLMAP does: SIFT needs 250 bytes a pixel."""
@@ -127,13 +127,13 @@ def _detected(
     kept = _usable_rows(table, descriptors, room, kind.reach)
     table[:, 0] -= wrap
     if wrap:
-        kept &= (table[:, 0] >= -SEAM_TWIN_PX) & (table[:, 0] < columns + SEAM_TWIN_PX)
+        kept &= (table[:, 0] >= -SEAM_DUPLICATE_PX) & (table[:, 0] < columns + SEAM_DUPLICATE_PX)
     table, descriptors = table[kept], descriptors[kept]
     order = np.lexsort([*table.T[[2, 3, 0, 1]], -table[:, 4]])
     table, descriptors = table[order], descriptors[order]
     if wrap:
         table[:, 0] %= columns
-        kept = _without_twins(table, columns)
+        kept = _without_duplicates(table, columns)
         table, descriptors = table[kept], descriptors[kept]
     table[:, :3] *= width / columns, height / rows, width / columns
     return table[: options.max_features], np.ascontiguousarray(descriptors[: options.max_features])
@@ -160,15 +160,15 @@ def _usable_rows(table: FloatArray, descriptors: Descriptors, room_px: NDArray[n
     return inside & (room_px[v, u] > RIM_PX + reach * np.where(finite, table[:, 2], 0.0))
 
 
-def _without_twins(table: FloatArray, columns: int) -> BoolArray:
+def _without_duplicates(table: FloatArray, columns: int) -> BoolArray:
     """(N,) all but the weaker of two features that are the same one, found on both sides of the seam."""
     kept = np.ones(len(table), bool)
-    near = np.flatnonzero(np.minimum(table[:, 0], columns - table[:, 0]) <= SEAM_TWIN_PX)
+    near = np.flatnonzero(np.minimum(table[:, 0], columns - table[:, 0]) <= SEAM_DUPLICATE_PX)
     for position, one in enumerate(near):
         others = near[:position][kept[near[:position]]]
         apart = np.abs(table[others, :2] - table[one, :2])
         apart[:, 0] = np.minimum(apart[:, 0], columns - apart[:, 0])
         turned = np.abs((table[others, 3] - table[one, 3] + pi) % tau - pi)
         growth = np.abs(np.log(table[others, 2] / table[one, 2]))
-        kept[one] = not ((apart.max(axis=1) < SEAM_TWIN_PX / 2) & (turned < 0.2) & (growth < 0.2)).any()
+        kept[one] = not ((apart.max(axis=1) < SEAM_DUPLICATE_PX / 2) & (turned < 0.2) & (growth < 0.2)).any()
     return kept

@@ -50,7 +50,7 @@ class ImageMatcher:
     Up to ``options.references`` references are all matched; of more, retrieval picks that many. An image is never
     matched with itself: a map's own images can be localized in it. References with more correspondences are the more
     similar ones. Where several references give a query keypoint the same point (``SAME_POINT``), it counts once, from
-    the most similar of them; different points are rivals and all stay.
+    the most similar of them; different points are alternatives and all stay.
     """
 
     references: tuple[View, ...]

@@ -12,16 +12,16 @@ import viser
 from spherloc.diagnosis import Diagnosis
 from spherloc_viz.app.controls.display_controls import DisplayControls
 from spherloc_viz.app.edits import Edits
-from spherloc_viz.app.face import Face, Places
-from spherloc_viz.app.newest import Newest
+from spherloc_viz.app.latest_worker import LatestWorker
+from spherloc_viz.app.run_display import Places, RunDisplay
+from spherloc_viz.app.run_request import Run
 from spherloc_viz.app.services import Services
 from spherloc_viz.app.stage.canvas import panel_widths_px
 from spherloc_viz.app.status import Status
 from spherloc_viz.app.text import DIM, box
 from spherloc_viz.app.web.touch import READY, Touch, Touches
 from spherloc_viz.app.web.upload_limit import limit_uploads
-from spherloc_viz.app.web.viser_seams import follow_changes, guard_callbacks
-from spherloc_viz.app.wish import Run
+from spherloc_viz.app.web.viser_internals import follow_changes, guard_callbacks
 from spherloc_viz.layers.primitives import SceneItem
 
 WAITING = "The presenter has not shown anything yet."
@@ -61,11 +61,11 @@ class Audience:
         self._changes = follow_changes(client, self._touches.hear)
         limit_uploads(client, 0, self._status.complain)
         self._edits = Edits()
-        self._page = Newest(f"spherloc-page-{client.client_id}", self._draw)
+        self._page = LatestWorker(f"spherloc-page-{client.client_id}", self._draw)
         left_px, right_px = panel_widths_px(client.camera.image_width)
         controls = AudienceControls(client.gui, right_px, self._redraw)
         places = Places(self._redraw, self._select, None)
-        self._face = Face(client, self._touches, controls, places, (left_px, right_px))
+        self._display = RunDisplay(client, self._touches, controls, places, (left_px, right_px))
         self._touches.on("select", self._select_numbers)
         self._touches.on("deselect", lambda touch: self._select(()))
         # Only now may the page tell what is pressed: everything that listens is there.
@@ -108,11 +108,13 @@ class Audience:
             if shown is None:
                 self._status.say(WAITING)
                 return None
-            wish = shown.run.wish
-            self._status.say(f"The presenter shows {wish.scene.scene}, {wish.estimator}, seed {wish.scene.seed}.")
+            request = shown.run.request
+            self._status.say(
+                f"The presenter shows {request.scene.scene}, {request.estimator}, seed {request.scene.seed}."
+            )
             selected = self._edits.places(shown.run.kept)
             hidden = shown.answers_hidden
-            return self._face.draw(shown.run, shown.mesh, shown.diagnosis, selected, asked, now, hidden)
+            return self._display.draw(shown.run, shown.mesh, shown.diagnosis, selected, asked, now, hidden)
         except Exception as error:
             self._status.fail(error)
             return None

@@ -18,7 +18,7 @@ MOST_BRIEF = 8
 
 
 @dataclass(frozen=True)
-class SceneWish:
+class SceneRequest:
     """What the page asks of a scene."""
 
     scene: str
@@ -55,10 +55,10 @@ class Catalog:
 
     def branch(self) -> "Catalog":
         """A catalog with the same scenes and caches, to which one page can add scenes that others do not see."""
-        twin = copy.copy(self)
-        twin.scenes, twin._paths, twin.cameras = dict(self.scenes), dict(self._paths), dict(self.cameras)
-        twin._brief = list(self._brief)
-        return twin
+        branch = copy.copy(self)
+        branch.scenes, branch._paths, branch.cameras = dict(self.scenes), dict(self._paths), dict(self.cameras)
+        branch._brief = list(self._brief)
+        return branch
 
     def add(self, scene: Scene, path: Path, label: str | None = None) -> str:
         """Add a scene, or load it anew if its file is known already; returns its label, by default its name.
@@ -87,9 +87,9 @@ class Catalog:
         """The scene file of that label, absolute."""
         return self._paths[label]
 
-    def problem(self, wish: SceneWish) -> Problem:
-        """The problem (cached) that a wish describes; raises ``InputError`` if there is none."""
-        return self._caches.problem(self.scenes[wish.scene], wish.seed, wish.query, wish.variation)
+    def problem(self, request: SceneRequest) -> Problem:
+        """The problem (cached) that a request describes; raises ``InputError`` if there is none."""
+        return self._caches.problem(self.scenes[request.scene], request.seed, request.query, request.variation)
 
     def mesh(self, label: str) -> bytes | None:
         """Binary glTF (cached) of a scene's map, in the map frame; None if it has none."""

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spherloc.datasets.variation import Variation
-from spherloc_viz.app.catalog import SceneWish
+from spherloc_viz.app.catalog import SceneRequest
 
 Numbers = tuple[int, ...]
 
@@ -80,29 +80,29 @@ class Edits:
         with self._lock:
             self._changes = Variation()
 
-    def write(self, wish: SceneWish) -> None:
-        """Take over the changes of a wish."""
-        known = wish.variation
+    def write(self, request: SceneRequest) -> None:
+        """Take over the changes of a request."""
+        known = request.variation
         with self._lock:
-            self._owner = _owner(wish)
+            self._owner = _owner(request)
             self._changes = Variation(spoiled=known.spoiled, mended=known.mended, hidden=known.hidden)
 
-    def apply(self, wish: SceneWish) -> SceneWish:
-        """The wish with the changes. Those of another problem are dropped, and the selection with them."""
+    def apply(self, request: SceneRequest) -> SceneRequest:
+        """The request with the changes. Those of another problem are dropped, and the selection with them."""
         with self._lock:
-            if _owner(wish) != self._owner:
-                self._owner, self._changes, self._selected = _owner(wish), Variation(), ()
-            edited, count = self._changes, wish.variation.correspondences
+            if _owner(request) != self._owner:
+                self._owner, self._changes, self._selected = _owner(request), Variation(), ()
+            edited, count = self._changes, request.variation.correspondences
             changes = {
                 name: tuple(number for number in getattr(edited, name) if count is None or number < count)
                 for name in ("spoiled", "mended", "hidden")
             }
-            return replace(wish, variation=replace(wish.variation, **changes))
+            return replace(request, variation=replace(request.variation, **changes))
 
     def places(self, kept: NDArray[np.int64]) -> Numbers:
         """Where the selected matches are in a problem in which the matches ``kept`` (N,) are left."""
         return tuple(np.flatnonzero(np.isin(kept, self._selected)).tolist())
 
 
-def _owner(wish: SceneWish) -> tuple:
-    return wish.scene, wish.seed, wish.query
+def _owner(request: SceneRequest) -> tuple:
+    return request.scene, request.seed, request.query

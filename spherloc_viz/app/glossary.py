@@ -20,7 +20,8 @@ TERMS: dict[str, str] = {
     "yaw. Its outline is as high as arcs overlap there.",
     "arc": "The yaws at which two matches can both be right, up to their noise: a piece of the yaw ring. Most pairs "
     "have two, of which at most one is right.",
-    "twin": "The second arc of a pair: a wave crosses zero twice in a turn.",
+    "root": "A yaw at which the line between a pair's points lies in the plane of its bearings. A pair has two or "
+    "none, so it has up to two arcs.",
     "ball": "All camera positions that two matches allow, once the yaw is known: around the point where their rays "
     "come nearest to each other, as far as noise can move it.",
     "edge": "Two nodes of a graph that agree: two balls that overlap, or two matches that can both be right.",

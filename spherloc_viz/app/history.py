@@ -5,10 +5,10 @@ import math
 import threading
 from typing import Any
 
-from spherloc_viz.app.wish import Wish
+from spherloc_viz.app.run_request import RunRequest
 
 MOST = 200
-"""Wishes that are remembered."""
+"""Requests that are remembered."""
 SAME_MOVE_S = 5.0
 """Changes of the same things count as one while the pointer is held down, and within this time: what a hand does to the
 same slider right after it has looked at the picture, it hardly wants to take back alone. Another control, or an undo,
@@ -21,64 +21,64 @@ CAMERA = "true_camera"
 
 
 class History:
-    """The wishes that a page went through, and where in them it is."""
+    """The requests that a page went through, and where in them it is."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._wishes: list[Wish] = []
+        self._requests: list[RunRequest] = []
         self._at = -1
         self._noted_s, self._gesture = -math.inf, 0
         self._moved: frozenset[str] = frozenset()
         self._start = -1
-        """Place of the wish from which the last move began."""
+        """Place of the request from which the last move began."""
 
-    def note(self, wish: Wish, now_s: float, gesture: int = 0) -> None:
-        """The page asks for this now; what was undone before is forgotten unless it is this very wish.
+    def note(self, request: RunRequest, now_s: float, gesture: int = 0) -> None:
+        """The page asks for this now; what was undone before is forgotten unless it is this very request.
 
         Changes of the same ``gesture``, if it is not 0, were made without a new press of the pointer or of a key.
         """
         with self._lock:
-            if self._at >= 0 and wish == self._wishes[self._at]:
+            if self._at >= 0 and request == self._requests[self._at]:
                 return
-            moved = _changed(self._wishes[self._at], wish) if self._at >= 0 else frozenset()
+            moved = _changed(self._requests[self._at], request) if self._at >= 0 else frozenset()
             held = gesture != 0 and gesture == self._gesture
-            if not (held or now_s - self._noted_s < SAME_MOVE_S) or not self._goes_on(moved, wish):
+            if not (held or now_s - self._noted_s < SAME_MOVE_S) or not self._goes_on(moved, request):
                 self._start = self._at
-            del self._wishes[self._start + 1 :]
-            if self._start < 0 or wish != self._wishes[self._start]:  # else the move has led back
-                self._wishes.append(wish)
-            forgotten = max(0, len(self._wishes) - MOST)
-            del self._wishes[:forgotten]
+            del self._requests[self._start + 1 :]
+            if self._start < 0 or request != self._requests[self._start]:  # else the move has led back
+                self._requests.append(request)
+            forgotten = max(0, len(self._requests) - MOST)
+            del self._requests[:forgotten]
             self._start -= forgotten
-            self._at, self._noted_s, self._moved, self._gesture = len(self._wishes) - 1, now_s, moved, gesture
+            self._at, self._noted_s, self._moved, self._gesture = len(self._requests) - 1, now_s, moved, gesture
 
-    def _goes_on(self, moved: frozenset[str], wish: Wish) -> bool:
+    def _goes_on(self, moved: frozenset[str], request: RunRequest) -> bool:
         """Whether a change is of the same things as the last one, and all of them can be dragged."""
         if moved != self._moved or moved & PRESSED or self._start < 0:
             return False
-        parts = [(name, _values(one)[name]) for one in (self._wishes[self._at], wish) for name in moved]
+        parts = [(name, _values(one)[name]) for one in (self._requests[self._at], request) for name in moved]
         return all(type(value) in (int, float) or (name == CAMERA and value is not None) for name, value in parts)
 
-    def step(self, by: int) -> Wish | None:
-        """The wish before (-1) or after (+1), which is then the one that the page is at; None if there is none."""
+    def step(self, by: int) -> RunRequest | None:
+        """The request before (-1) or after (+1), which is then the one that the page is at; None if there is none."""
         with self._lock:
-            if not 0 <= self._at + by < len(self._wishes):
+            if not 0 <= self._at + by < len(self._requests):
                 return None
             self._at, self._noted_s, self._gesture = self._at + by, -math.inf, 0
-            return self._wishes[self._at]
+            return self._requests[self._at]
 
     def ways(self) -> tuple[bool, bool]:
-        """Whether there is a wish before, and one after."""
+        """Whether there is a request before, and one after."""
         with self._lock:
-            return self._at > 0, 0 <= self._at < len(self._wishes) - 1
+            return self._at > 0, 0 <= self._at < len(self._requests) - 1
 
 
-def changed_fields(one: Wish, other: Wish) -> frozenset[str]:
+def changed_fields(one: RunRequest, other: RunRequest) -> frozenset[str]:
     """Names of what differs."""
     return frozenset(name.removeprefix(OPTIONS) for name in _changed(one, other))
 
 
-def _changed(one: Wish, other: Wish) -> frozenset[str]:
+def _changed(one: RunRequest, other: RunRequest) -> frozenset[str]:
     """The same, but those of options begin with ``OPTIONS``: a scene may have a number of the same name."""
     if one.estimator != other.estimator:
         return frozenset({"estimator"})
@@ -86,9 +86,9 @@ def _changed(one: Wish, other: Wish) -> frozenset[str]:
     return frozenset(name for name in before if before[name] != after[name])
 
 
-def _values(wish: Wish) -> dict[str, Any]:
-    """All that a wish says, by names."""
-    parts = (("", wish.scene), ("", wish.scene.variation), (OPTIONS, wish.options))
+def _values(request: RunRequest) -> dict[str, Any]:
+    """All that a request says, by names."""
+    parts = (("", request.scene), ("", request.scene.variation), (OPTIONS, request.options))
     values = {
         prefix + item.name: getattr(part, item.name) for prefix, part in parts for item in dataclasses.fields(part)
     }

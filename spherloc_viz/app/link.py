@@ -17,9 +17,9 @@ from spherloc.datasets.variation_text import parse_variation, settings_of
 from spherloc.errors import InputError, SpherlocError, show
 from spherloc.estimators import default_options, options_type
 from spherloc.problem import Problem
-from spherloc_viz.app.catalog import Catalog, SceneWish
+from spherloc_viz.app.catalog import Catalog, SceneRequest
 from spherloc_viz.app.panels.folders import Roots
-from spherloc_viz.app.wish import Run, Wish
+from spherloc_viz.app.run_request import Run, RunRequest
 from spherloc_viz.options import option_fields, typed, usable_estimators
 
 VERSION = 1
@@ -50,11 +50,11 @@ def link_of(run: Run, view: PageView, catalog: Catalog, known: Iterable[str], ro
 
     ``known`` are the labels of the scenes that every page has.
     """
-    wish, scene = run.wish, run.wish.scene
+    request, scene = run.request, run.request.scene
     place = None if scene.scene in known else roots.place(catalog.path(scene.scene))
     variation = scene.variation
     cameras = {path: label for label, path in catalog.cameras.items()}
-    default = default_options(wish.estimator, run.trace.problem)
+    default = default_options(request.estimator, run.trace.problem)
     pairs = [
         ("v", str(VERSION)),
         ("scene", scene.scene),
@@ -64,8 +64,8 @@ def link_of(run: Run, view: PageView, catalog: Catalog, known: Iterable[str], ro
         ("camera", None if variation.camera is None else cameras.get(variation.camera)),
         *(("set", setting) for setting in settings_of(replace(variation, camera=None))),
         *((key, numbers_text(getattr(variation, name))) for key, name in zip(LISTS, EDITS, strict=True)),
-        ("estimator", wish.estimator),
-        *(("option", f"{name}={typed(value)}") for name, value in _changed(wish.options, default)),
+        ("estimator", request.estimator),
+        *(("option", f"{name}={typed(value)}") for name, value in _changed(request.options, default)),
         ("step", view.step),
         ("select", numbers_text(view.selected)),
         ("theme", view.theme if view.theme != THEMES[0] else None),
@@ -94,7 +94,7 @@ def address_html(link: str, session: str, followed: int) -> str:
 class Followed:
     """What a link led to."""
 
-    wish: Wish
+    request: RunRequest
     view: PageView
     remarks: tuple[str, ...]
     """What of the link could not be opened, a sentence each."""
@@ -103,11 +103,11 @@ class Followed:
 class Follower:
     """Follows links on one page. Whatever a link says wrongly becomes a remark, and the page's own stays."""
 
-    def __init__(self, catalog: Catalog, roots: Roots, problem: Callable[[SceneWish], Problem]) -> None:
-        """``problem`` gives the problem of a wish; it may take long, and raises ``InputError`` if there is none."""
+    def __init__(self, catalog: Catalog, roots: Roots, problem: Callable[[SceneRequest], Problem]) -> None:
+        """``problem`` gives the problem of a request; it may take long, and raises ``InputError`` if there is none."""
         self._catalog, self._roots, self._problem = catalog, roots, problem
 
-    def follow(self, text: str, now: Wish, view: PageView) -> Followed:
+    def follow(self, text: str, now: RunRequest, view: PageView) -> Followed:
         """Where a link leads from what the page shows ``now``. Raises ``Cancelled`` if the map's work is ended."""
         remarks: list[str] = []
         said = _read(text, remarks)
@@ -120,7 +120,7 @@ class Follower:
             problem = self._problem(scene)
         except InputError as error:
             remarks.append(str(error))
-            scene = SceneWish(scene.scene, scene.seed)
+            scene = SceneRequest(scene.scene, scene.seed)
             problem = self._problem(scene)
         options = self._options(said.get("option", ()), default_options(estimator, problem), estimator, remarks)
         theme = _one_of(said, "theme", THEMES, remarks)
@@ -131,9 +131,9 @@ class Follower:
             remarks.append(str(error))
             selected = ()
         seen = PageView(said.get("step", view.step), selected, theme, hidden)
-        return Followed(Wish(scene, estimator, options), seen, tuple(remarks))
+        return Followed(RunRequest(scene, estimator, options), seen, tuple(remarks))
 
-    def _scene(self, said: dict[str, Any], now: SceneWish, remarks: list[str]) -> SceneWish:
+    def _scene(self, said: dict[str, Any], now: SceneRequest, remarks: list[str]) -> SceneRequest:
         """The scene with its changes; the page's own if the link's is not to be had."""
         try:
             label = self._label(said, now.scene)
@@ -151,7 +151,7 @@ class Follower:
         except InputError as error:
             remarks.append(str(error))
             query = None
-        return SceneWish(label, int(seed), query, self._variation(said, label, remarks))
+        return SceneRequest(label, int(seed), query, self._variation(said, label, remarks))
 
     def _label(self, said: dict[str, Any], now: str) -> str:
         if "place" in said:

@@ -7,12 +7,12 @@ from spherloc.cameras.base import FloatArray
 from spherloc.diagnosis import Diagnosis
 from spherloc.errors import RecordingError
 from spherloc.trace import Trace
-from spherloc_viz.app.catalog import Catalog, SceneWish
+from spherloc_viz.app.catalog import Catalog, SceneRequest
 from spherloc_viz.app.review.opened import is_same_pose
-from spherloc_viz.app.wish import Run, Wish
-from spherloc_viz.recording.again.scene import origin_of
-from spherloc_viz.recording.keeping.recorder import Recorder
+from spherloc_viz.app.run_request import Run, RunRequest
 from spherloc_viz.recording.origin import Origin, Source
+from spherloc_viz.recording.replay.scene import origin_of
+from spherloc_viz.recording.storage.recorder import Recorder
 
 RETRY_S = 1.0
 """After this long a run is recorded that could not be before."""
@@ -25,7 +25,7 @@ NOT_RECORDED = "Runs are not recorded."
 class Known:
     """A run that is recorded already and opened again."""
 
-    wish: Wish
+    request: RunRequest
     path: Path
     cam_from_map: FloatArray | None
     """Its pose (3, 4), if it had one."""
@@ -59,10 +59,10 @@ class PageRuns:
         """The page is about to repeat a recorded run, which is not to be recorded once more."""
         self._known = known
 
-    def became(self, asked: Wish, wish: Wish) -> None:
+    def became(self, asked: RunRequest, request: RunRequest) -> None:
         """The page says in its own words what it was asked for, such as nothing for what the scene says already."""
-        if self._known is not None and self._known.wish is asked:
-            self._known = replace(self._known, wish=wish)
+        if self._known is not None and self._known.request is asked:
+            self._known = replace(self._known, request=request)
 
     def announce(self, run: Run) -> str:
         """What will become of a run, in a sentence."""
@@ -70,7 +70,7 @@ class PageRuns:
             return "This run is recorded already."
         return NOT_RECORDED if self._recorder is None else "Will be recorded when nothing changes any more."
 
-    def settle(self, run: Run, diagnosis: Diagnosis | None) -> tuple[str, float | None]:
+    def finish(self, run: Run, diagnosis: Diagnosis | None) -> tuple[str, float | None]:
         """Record a run that the page has settled on, unless it is recorded.
 
         Returns what became of it, in a sentence, and the seconds after which to ask again if that is not known yet.
@@ -84,7 +84,7 @@ class PageRuns:
         submitted = self._submitted
         if submitted is None or submitted.trace is not run.trace:
             submitted = Submitted(run.trace, Path())
-            origin = self._origin("page", run.wish.scene)
+            origin = self._origin("page", run.request.scene)
             try:
                 submitted.path = self._recorder.submit(run.trace, origin, diagnosis, submitted.end)
             except RecordingError as error:
@@ -97,7 +97,7 @@ class PageRuns:
         waiting = self._recorder.overload
         return f"Recording as {submitted.path.name} …{f' {waiting}' if waiting else ''}", LOOK_S
 
-    def record(self, trace: Trace, scene: SceneWish) -> None:
+    def record(self, trace: Trace, scene: SceneRequest) -> None:
         """Record a query of a sequence that a panel localized, if runs are recorded; raises ``RecordingError``."""
         if self._recorder is not None:
             self._recorder.submit(trace, self._origin("sequence", scene))
@@ -110,9 +110,9 @@ class PageRuns:
     def _repeats(self, run: Run) -> bool:
         """Whether a run is the one that was opened, and finds the same pose."""
         known = self._known
-        same = known is not None and run.wish == known.wish
+        same = known is not None and run.request == known.request
         return same and known is not None and is_same_pose(known.cam_from_map, run.trace.cam_from_map)
 
-    def _origin(self, source: Source, scene: SceneWish) -> Origin:
+    def _origin(self, source: Source, scene: SceneRequest) -> Origin:
         catalog, label = self._catalog, scene.scene
         return origin_of(source, catalog.path(label), catalog.scenes[label], scene.seed, scene.query, scene.variation)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 from spherloc.diagnosis import Diagnosis
 from spherloc.trace import Trace
-from spherloc_viz.app.wish import Run
+from spherloc_viz.app.run_request import Run
 
 
 @dataclass(frozen=True, eq=False)

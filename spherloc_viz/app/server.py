@@ -20,7 +20,7 @@ from spherloc.estimators import warm_up
 from spherloc.files import is_folder
 from spherloc_viz.app.audience import Audience
 from spherloc_viz.app.catalog import Catalog
-from spherloc_viz.app.review.shelf import Shelf
+from spherloc_viz.app.review.run_library import RunLibrary
 from spherloc_viz.app.services import Services
 from spherloc_viz.app.session import Session
 from spherloc_viz.app.stage import views
@@ -29,12 +29,12 @@ from spherloc_viz.app.web.access import Access, Role
 from spherloc_viz.app.web.front_door import FrontDoor
 from spherloc_viz.app.web.guard import open_socket
 from spherloc_viz.app.web.viewer_room import ViewerRoom, of_index
-from spherloc_viz.app.web.viser_seams import role_header, set_theme, start_viser, stop_viser
+from spherloc_viz.app.web.viser_internals import role_header, set_theme, start_viser, stop_viser
 from spherloc_viz.options import unusable_estimators
 from spherloc_viz.recording.index.run_index import RunIndex
-from spherloc_viz.recording.keeping.recorder import Recorder
-from spherloc_viz.recording.keeping.room import KEEP_GIGABYTES, kept_bytes
-from spherloc_viz.recording.strangers.examiner import end_examining
+from spherloc_viz.recording.sandbox.examiner import end_examining
+from spherloc_viz.recording.storage.recorder import Recorder
+from spherloc_viz.recording.storage.room import KEEP_GIGABYTES, kept_bytes
 
 SWITCH_S = 0.001
 NOT_ENCRYPTED = (
@@ -78,7 +78,7 @@ def serve(
                 )
             )
         index = _open_index(services.recorder, recordings, stack)
-        services.shelf = None if index is None else Shelf(index)
+        services.library = None if index is None else RunLibrary(index)
         viewer = None if index is None else ViewerRoom(of_index(index))
         key = secrets.token_urlsafe(32)
         server = start_viser(key)

@@ -5,9 +5,9 @@ from pathlib import Path
 
 from spherloc_viz.app.catalog import Catalog
 from spherloc_viz.app.presented import Presented
-from spherloc_viz.app.review.shelf import Shelf
+from spherloc_viz.app.review.run_library import RunLibrary
 from spherloc_viz.app.web.downloads import Downloads
-from spherloc_viz.recording.keeping.recorder import Recorder
+from spherloc_viz.recording.storage.recorder import Recorder
 
 
 @dataclass
@@ -19,7 +19,7 @@ class Services:
     """Folders that pages may open scenes from."""
     recorder: Recorder | None = None
     """Where settled runs go; None if they are not recorded."""
-    shelf: Shelf | None = None
+    library: RunLibrary | None = None
     """The recordings that pages review; None if there is no folder of them."""
     downloads: Downloads = field(default_factory=Downloads)
     """Files that pages may fetch."""

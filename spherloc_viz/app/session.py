@@ -19,23 +19,23 @@ from spherloc.estimators import default_options, estimate
 from spherloc.problem import Problem
 from spherloc.trace import Trace
 from spherloc.watch import Cancelled
-from spherloc_viz.app.catalog import SceneWish
+from spherloc_viz.app.catalog import SceneRequest
 from spherloc_viz.app.controls.controls import Controls
 from spherloc_viz.app.edits import Edits
-from spherloc_viz.app.face import Face, Places
 from spherloc_viz.app.history import History
+from spherloc_viz.app.latest_worker import Job, LatestWorker
 from spherloc_viz.app.link import Followed, Follower, PageView, address_html, link_of
-from spherloc_viz.app.newest import Job, Newest
 from spherloc_viz.app.notices import Notices
 from spherloc_viz.app.page_runs import Known, PageRuns
 from spherloc_viz.app.panels.export_panel import Shown
 from spherloc_viz.app.panels.folders import Roots
+from spherloc_viz.app.run_display import Places, RunDisplay
+from spherloc_viz.app.run_request import Run, RunRequest
 from spherloc_viz.app.services import Services
 from spherloc_viz.app.stage.canvas import panel_widths_px
 from spherloc_viz.app.status import Status
 from spherloc_viz.app.web.touch import READY, Touch, Touches
-from spherloc_viz.app.web.viser_seams import follow_changes, guard_callbacks
-from spherloc_viz.app.wish import Run, Wish
+from spherloc_viz.app.web.viser_internals import follow_changes, guard_callbacks
 
 QUIET_S = 0.7
 """Runs count as settled, and are recorded, when nothing has changed for this long."""
@@ -46,7 +46,7 @@ DIAGNOSE_AFTER_S = 0.2
 class Session:
     """Lives as long as the tab's connection.
 
-    Threads of its own, so that steps can be walked while the next run is being solved: one solves the newest wish,
+    Threads of its own, so that steps can be walked while the next run is being solved: one solves the newest request,
     one shows the newest run, one diagnoses it, one looks after slow runs. All leave the interpreter while they compute
     or wait.
     """
@@ -58,11 +58,11 @@ class Session:
         self._touches = Touches(self._status.fail)
         self._changes = follow_changes(client, self._touches.hear)
         number = client.client_id
-        self._solver = Newest(f"spherloc-solver-{number}", self._guarded(self._solve))
-        self._page = Newest(f"spherloc-page-{number}", self._guarded(self._show))
-        self._doctor = Newest(f"spherloc-doctor-{number}", self._guarded(self._examine))
+        self._solver = LatestWorker(f"spherloc-solver-{number}", self._guarded(self._solve))
+        self._page = LatestWorker(f"spherloc-page-{number}", self._guarded(self._show))
+        self._diagnoser = LatestWorker(f"spherloc-diagnosis-{number}", self._guarded(self._examine))
         self._edits, self._history = Edits(), History()
-        self._opened: tuple[Wish, int] | None = None
+        self._opened: tuple[RunRequest, int] | None = None
         """What is to be opened, and the number of the change that asked for it."""
         self._steps: deque[tuple[int, int]] = deque()
         """Steps through the history that are to be made, each with the number of the change that asked for it."""
@@ -81,7 +81,7 @@ class Session:
         left_px, right_px = panel_widths_px(client.camera.image_width)
         self._controls = Controls(client, self._catalog, services, self._touches, self, right_px)
         places = Places(self.redraw, self.select, self._move_camera)
-        self._face = Face(client, self._touches, self._controls, places, (left_px, right_px))
+        self._display = RunDisplay(client, self._touches, self._controls, places, (left_px, right_px))
         self._listen()
         self._name, self._address = secrets.token_hex(8), client.gui.add_html("")
         # Only now may the page tell what is pressed: everything that listens is there.
@@ -89,20 +89,20 @@ class Session:
 
     def start(self) -> None:
         """Solve and show the first problem."""
-        for worker in (self._page, self._doctor, self._controls.slow, self._solver):
+        for worker in (self._page, self._diagnoser, self._controls.slow, self._solver):
             worker.start()
         self._solver.ask()
 
     def close(self) -> None:
         """End the threads; does not wait."""
-        for worker in (self._solver, self._page, self._doctor, self._controls):
+        for worker in (self._solver, self._page, self._diagnoser, self._controls):
             worker.close()
 
     def complain(self, sentence: str) -> None:
         """Say in one sentence what went wrong; the page keeps its last run and stays usable."""
         self._status.complain(sentence)
 
-    # What a person does. All of this comes on threads of viser's or of the front door's, and only notes wishes.
+    # What a person does. All of this comes on threads of viser's or of the front door's, and only notes requests.
 
     def changed(self, event: object = None) -> None:
         """A widget that a run depends on was changed by a hand on the page."""
@@ -113,15 +113,15 @@ class Session:
         """The page is to be drawn anew."""
         self._page.ask()
 
-    def open(self, wish: Wish) -> None:
+    def open(self, request: RunRequest) -> None:
         """Have the page ask for this."""
-        self._opened = wish, self._changes.moment()
+        self._opened = request, self._changes.moment()
         self.changed()
 
-    def open_recorded(self, wish: Wish, path: Path, cam_from_map: FloatArray | None) -> None:
+    def open_recorded(self, request: RunRequest, path: Path, cam_from_map: FloatArray | None) -> None:
         """Have the page ask for a run that is recorded as ``path``, with this pose (3, 4)."""
-        self._runs.expect(Known(wish, path, cam_from_map))
-        self.open(wish)
+        self._runs.expect(Known(request, path, cam_from_map))
+        self.open(request)
 
     def step_history(self, by: int) -> None:
         """Undo (-1) or redo (+1)."""
@@ -153,7 +153,7 @@ class Session:
 
     def _reset(self, event: object) -> None:
         """All changes to the scene, at once: it is one step of the history."""
-        self.open(Wish(self._controls.scene.read_unchanged(), *self._controls.estimator.read()))
+        self.open(RunRequest(self._controls.scene.read_unchanged(), *self._controls.estimator.read()))
 
     def _take_back(self, event: object) -> None:
         """All changes to single matches."""
@@ -169,7 +169,7 @@ class Session:
         """Go on with another estimator and its default options."""
         run = self._run
         if run is not None:
-            self.open(Wish(run.wish.scene, name, None))
+            self.open(RunRequest(run.request.scene, name, None))
 
     def _move_camera(self, true_camera: TrueCamera) -> None:
         self._controls.scene.true_camera = true_camera
@@ -178,11 +178,11 @@ class Session:
     def shown(self) -> Shown | None:
         """What is on the page, to be exported."""
         run = self._run
-        return self._face.shown(None if run is None else self._runs.path(run.trace))
+        return self._display.shown(None if run is None else self._runs.path(run.trace))
 
     # What the threads do.
 
-    def _wish(self) -> Wish:
+    def _request(self) -> RunRequest:
         """What the page asks for now."""
         controls, opened = self._controls, self._opened
         if opened is not None:
@@ -197,11 +197,11 @@ class Session:
             with self._changes.as_of(controls.scene.chosen_at):
                 if controls.follow_scene():
                     controls.estimator.follow_problem(self._problem(controls.scene.read()))
-        wish = Wish(self._edits.apply(controls.scene.read()), *controls.estimator.read())
+        request = RunRequest(self._edits.apply(controls.scene.read()), *controls.estimator.read())
         if opened is not None:
-            self._runs.became(opened[0], wish)
-            controls.review.became(opened[0], wish)
-        return wish
+            self._runs.became(opened[0], request)
+            controls.review.became(opened[0], request)
+        return request
 
     def _solve(self, asked: bool) -> float | None:
         """The solver thread's job: solve what the page asks for now, or record what it has settled on."""
@@ -212,22 +212,22 @@ class Session:
         except Cancelled:
             if self._controls.slow.stopped:
                 self._status.say("Cancelled; the page still shows the run before.")
-            self._face.story.end_opening()
+            self._display.panels.end_opening()
             return None
         except Exception:
-            self._face.story.end_opening()
+            self._display.panels.end_opening()
             raise
 
     def _solve_newest(self) -> float | None:
         """Solve what the page asks for now, if that is not shown. Raises ``Cancelled`` if that was ended."""
         link, run = self._link, self._run
         if link is None or run is None:
-            return self._solve_wish()
+            return self._solve_request()
         self._link = None
         try:
-            followed = self._follower.follow(link[0], run.wish, self._view())
-            self._opened = followed.wish, link[1]
-            pause = self._solve_wish()
+            followed = self._follower.follow(link[0], run.request, self._view())
+            self._opened = followed.request, link[1]
+            pause = self._solve_request()
             self._arrive(followed, link[1])
             return pause
         finally:
@@ -241,28 +241,28 @@ class Session:
             self._controls.display.answers_hidden = followed.view.answers_hidden
         if self._run is not None:
             self._edits.select(set(followed.view.selected) & set(self._run.kept.tolist()))
-        self._face.story.steps.go(followed.view.step)
+        self._display.panels.steps.go(followed.view.step)
         if followed.remarks:
             self.complain(" ".join(remark[:1].upper() + remark[1:] for remark in followed.remarks))
 
     def _view(self) -> PageView:
         """How the page looks at its run."""
         display = self._controls.display
-        return PageView(self._face.step_key, self._edits.selected, display.theme, display.answers_hidden)
+        return PageView(self._display.step_key, self._edits.selected, display.theme, display.answers_hidden)
 
-    def _solve_wish(self) -> float | None:
+    def _solve_request(self) -> float | None:
         number, gesture = self._changes.moment(), self._changes.gesture
         self._walk_history(gesture)
-        wish = self._wish()
-        self._history.note(wish, time.monotonic(), gesture)
-        if self._run is None or wish != self._run.wish:
-            problem = self._problem(wish.scene)
+        request = self._request()
+        self._history.note(request, time.monotonic(), gesture)
+        if self._run is None or request != self._run.request:
+            problem = self._problem(request.scene)
             watch = self._controls.slow.begin()
             try:
-                trace = estimate(problem, wish.estimator, wish.options, wish.scene.seed, watch)
+                trace = estimate(problem, request.estimator, request.options, request.scene.seed, watch)
             finally:
                 self._controls.slow.end()
-            self._run, self._answers = Run(wish, trace, _kept(wish, problem)), number
+            self._run, self._answers = Run(request, trace, _kept(request, problem)), number
             self._page.ask()
         elif self._answers != number:
             self._answers = number
@@ -276,24 +276,24 @@ class Session:
         while self._steps:
             by, number = self._steps.popleft()
             try:
-                self._history.note(self._wish(), time.monotonic(), gesture)
+                self._history.note(self._request(), time.monotonic(), gesture)
             except InputError:
                 # A change that cannot be is in no history: Undo takes it back, and nothing before it.
                 by = max(by, 0)
-            wish = self._history.step(by)
-            if wish is not None:
-                self._opened = wish, number
+            request = self._history.step(by)
+            if request is not None:
+                self._opened = request, number
 
-    def _problem(self, wish: SceneWish) -> Problem:
+    def _problem(self, request: SceneRequest) -> Problem:
         """The problem that the page asks for; of images, with word of how far they are.
 
         Raises ``Cancelled`` if a person ends it while the map is described.
         """
-        scene = self._catalog.map_scene(wish.scene)
+        scene = self._catalog.map_scene(request.scene)
         if scene is None:
-            return self._catalog.problem(wish)
-        if self._run is not None and wish.scene != self._run.wish.scene.scene:
-            self._face.story.begin_opening(wish.scene)
+            return self._catalog.problem(request)
+        if self._run is not None and request.scene != self._run.request.scene.scene:
+            self._display.panels.begin_opening(request.scene)
         watch = self._controls.slow.begin(lasting=True)
         try:
             watch.begin("map", 1.0)
@@ -305,7 +305,7 @@ class Session:
 
             scene.prepare(report)
             self._status.say("Reading and matching images …")
-            return self._catalog.problem(wish)
+            return self._catalog.problem(request)
         finally:
             self._controls.slow.end()
 
@@ -314,14 +314,14 @@ class Session:
         run = self._run
         if run is None:
             return None
-        self._controls.settle(run)
+        self._controls.show_how_to_repeat(run)
         hidden = self._controls.display.answers_hidden
         self._services.presented.show(run, self._mesh(run), self._diagnosis(run), hidden)
-        sentence, pause = self._runs.settle(run, self._diagnosis(run))
+        sentence, pause = self._runs.finish(run, self._diagnosis(run))
         self._status.say(sentence)
         return pause
 
-    def record(self, trace: Trace, scene: SceneWish) -> None:
+    def record(self, trace: Trace, scene: SceneRequest) -> None:
         """Record a run that a panel made, if runs are recorded."""
         try:
             self._runs.record(trace, scene)
@@ -335,7 +335,7 @@ class Session:
 
     def _mesh(self, run: Run) -> bytes | None:
         """Of the run's map, if it has one."""
-        return self._catalog.mesh(run.wish.scene.scene)
+        return self._catalog.mesh(run.request.scene.scene)
 
     def _show(self, asked: bool) -> float | None:
         """The page thread's job: show the step at hand of the newest run."""
@@ -344,13 +344,13 @@ class Session:
             return None
         diagnosis = self._diagnosis(run)
         self._services.presented.hide(run, self._controls.display.answers_hidden)
-        pause = self._face.draw(run, self._mesh(run), diagnosis, self._edits.places(run.kept), asked, answers)
+        pause = self._display.draw(run, self._mesh(run), diagnosis, self._edits.places(run.kept), asked, answers)
         link = link_of(run, self._view(), self._catalog, self._services.catalog.scenes, self._roots)
         html = address_html(link, self._name, self._followed)
         if self._address.content != html:
             self._address.content = html
         if diagnosis is None:
-            self._doctor.ask()
+            self._diagnoser.ask()
         return pause
 
     def _examine(self, asked: bool) -> float | None:
@@ -379,7 +379,7 @@ class Session:
         return run
 
 
-def _kept(wish: Wish, problem: Problem) -> NDArray[np.int64]:
+def _kept(request: RunRequest, problem: Problem) -> NDArray[np.int64]:
     """The original numbers (N,) of a problem's correspondences."""
-    variation = wish.scene.variation
+    variation = request.scene.variation
     return variation.kept(len(problem) + len(variation.hidden))

@@ -83,7 +83,7 @@ class GalleryCase(Play):
     fails: tuple[str, ...]
     """How: "position", "rotation" (each worse than a success may be) or "no pose"."""
     step: str
-    """Key of the step at which it goes wrong, see ``layers.decisive``."""
+    """Key of the step at which it goes wrong, see ``layers.key_step``."""
     quoted: tuple[float, ...]
     """Numbers that the story has from elsewhere: from the paper, or from how the problem is made."""
     beside: tuple[Beside, ...]

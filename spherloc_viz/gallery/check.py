@@ -14,7 +14,7 @@ from spherloc.trace import Trace
 from spherloc_viz.gallery.case import Beside, GalleryCase, Play
 from spherloc_viz.gallery.measures import MEASURES
 from spherloc_viz.layers import steps
-from spherloc_viz.layers.decisive import decisive_step
+from spherloc_viz.layers.key_step import key_step
 
 PICTURES_SLACK = 0.15
 """Share by which facts of a run on pictures may be off: other processors round otherwise when pictures are drawn and
@@ -52,7 +52,7 @@ def faults(played: Played) -> Iterator[str]:
         yield f"{case.key}: without the truth the diagnosis is {blind}, and not {case.without_truth}."
     if sorted(happened := failures(trace)) != sorted(case.fails):
         yield f"{case.key}: what fails is {', '.join(happened) or 'nothing'}, and not {', '.join(case.fails)}."
-    if (key := steps(trace)[decisive_step(trace, played.diagnosis)].key) != case.step:
+    if (key := steps(trace)[key_step(trace, played.diagnosis)].key) != case.step:
         yield f"{case.key}: it goes wrong at the step {key}, and not at {case.step}."
     yield from _wrong_facts(case.key, case, trace)
     for item, other in played.beside:

@@ -139,6 +139,6 @@ MEASURES: Mapping[str, Callable[[Trace], float]] = {
     "pairs_at_true_yaw": _pairs_at_truth,
     "least_bound": _least_bound,
     "at_most": lambda trace: _known(None if trace.certificate is None else trace.certificate.upper_bound),
-    "chance_sets": lambda trace: _known(None if trace.certificate is None else trace.certificate.chance_sets),
+    "nfa": lambda trace: _known(None if trace.certificate is None else trace.certificate.nfa),
 }
 """By name: counts of matches, pairs and samples, errors against the truth, and what is proven."""

@@ -17,7 +17,7 @@ from spherloc_viz.gallery.check import Played, faults, play
 from spherloc_viz.recording.content.writer import write_recording
 from spherloc_viz.recording.origin import Origin
 from spherloc_viz.recording.review.notes import has_review, write_review
-from spherloc_viz.recording.strangers.examiner import examine, examine_review
+from spherloc_viz.recording.sandbox.examiner import examine, examine_review
 
 WIDTH = 100
 """Of stories on a terminal, characters."""

@@ -137,8 +137,10 @@ def paint(trace: Trace, index: int) -> Picture:
     return Picture(step, scene, drawn, tables, focus_of(timeline.view, frame), timeline.graph(index))
 
 
-def with_rival(picture: Picture, trace: Trace, cam_from_map: FloatArray) -> Picture:
+def with_alternative(picture: Picture, trace: Trace, cam_from_map: FloatArray) -> Picture:
     """The picture with another pose (3, 4) beside the run's own."""
     view = _timeline(trace).view
-    rival = camera("cameras/rival", view.aligned_pose(cam_from_map), 1.7 * view.sphere_m, style.RIVAL, 2.5)
-    return replace(picture, scene=(*picture.scene, rival))
+    alternative = camera(
+        "cameras/alternative", view.aligned_pose(cam_from_map), 1.7 * view.sphere_m, style.ALTERNATIVE, 2.5
+    )
+    return replace(picture, scene=(*picture.scene, alternative))

@@ -66,9 +66,9 @@ class Arcs:
         """The arcs of one pair: of those with an arc over the estimated yaw the one whose arc there is the shortest,
         among those with two arcs if there are any."""
         arcs, same = self.stage.clique.astype(np.int64), self._continues
-        twins = same[arcs] | np.append(same[1:], False)[arcs]
-        if twins.any():
-            arcs = arcs[twins]
+        several = same[arcs] | np.append(same[1:], False)[arcs]
+        if several.any():
+            arcs = arcs[several]
         first = int(arcs[np.argmin((self.stage.hi_rad - self.stage.lo_rad)[arcs])])
         end = first + 1
         while same[first]:

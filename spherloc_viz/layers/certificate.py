@@ -3,7 +3,7 @@
 from spherloc.trace import Certificate
 
 KNOWABLE = 0.01
-"""From this many expected chance sets on, the answer cannot be known."""
+"""From this NFA on, the answer cannot be known."""
 UNKNOWABLE = "the answer cannot be known"
 
 
@@ -17,12 +17,12 @@ def proof(certificate: Certificate) -> str:
 
 def is_knowable(certificate: Certificate) -> bool:
     """Whether wrong matches are unlikely to agree as well as the inliers do."""
-    return certificate.chance_sets < KNOWABLE
+    return certificate.nfa < KNOWABLE
 
 
 def chance(certificate: Certificate) -> str:
     """How many sets of wrong matches of that size agree by chance, as a number to read."""
-    value = certificate.chance_sets
+    value = certificate.nfa
     return f"{value:.2g}" if value >= 1e-99 else "below 1e-99"
 
 

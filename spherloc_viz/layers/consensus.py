@@ -35,9 +35,9 @@ def plans(view: RunView, stage: ConsensusStage) -> list[Plan]:
         title, words = "The largest set that agrees", f"{whole} matches that all agree, a full block of the matrix."
         graph = partial(_graph, view, nodes, stage.clique, words)
         out.append(Plan("consensus-clique", title, lambda: _clique(view, stage), charts, graph))
-    shown = min(len(stage.support), 1 + style.MAX_DRAWN_RIVALS)
+    shown = min(len(stage.support), 1 + style.MAX_DRAWN_ALTERNATIVES)
     for rank in range(shown if shown > 1 else 0):
-        title = "The best pose" if rank == 0 else f"Rival pose {rank}"
+        title = "The best pose" if rank == 0 else f"Alternative pose {rank}"
         out.append(Plan(f"consensus-pose-{rank + 1}", title, partial(_pose, view, stage, rank), charts))
     if len(stage.support):
         out.append(Plan("consensus-poses", "The poses that were verified", lambda: _poses(view, stage), charts))
@@ -155,14 +155,18 @@ def _pose(view: RunView, stage: ConsensusStage, rank: int) -> Frame:
 
 
 def _poses(view: RunView, stage: ConsensusStage) -> Frame:
-    states = [view.aligned_pose(state) for state in stage.cam_from_map[: 1 + style.MAX_DRAWN_RIVALS]]
-    rivals, count, most = states[1:], len(stage.support), highest_bound(stage)
-    if rivals:
+    states = [view.aligned_pose(state) for state in stage.cam_from_map[: 1 + style.MAX_DRAWN_ALTERNATIVES]]
+    alternatives, count, most = states[1:], len(stage.support), highest_bound(stage)
+    if alternatives:
         away, turned = translation_error_m(states[0], states[1]), rotation_error_deg(states[0], states[1])
         other = f"The best other pose, {away:.2f} m and {turned:.1f}° away, explains {stage.support[1]}"
     else:
         other = "No clearly different pose was found beside it"
-    note = f"The best and {len(rivals)} of {count - 1:,} other poses are shown." if count > len(rivals) + 1 else ""
+    note = (
+        f"The best and {len(alternatives)} of {count - 1:,} other poses are shown."
+        if count > len(alternatives) + 1
+        else ""
+    )
     return Frame(
         f"The best pose explains {stage.support[0]} of {len(view.points)} matches from {view.position(states[0])}. "
         f"{other}; no pose explains more than {most}.",
@@ -172,17 +176,19 @@ def _poses(view: RunView, stage: ConsensusStage) -> Frame:
         view.mask(stage.clique),
         note=note,
         located=True,
-        items=_ghosts(view, rivals),
+        items=_ghosts(view, alternatives),
         tables=(_table(view, stage, states),),
     )
 
 
-def _ghosts(view: RunView, rivals: list[FloatArray]) -> tuple[SceneItem, ...]:
-    if not rivals:
+def _ghosts(view: RunView, alternatives: list[FloatArray]) -> tuple[SceneItem, ...]:
+    if not alternatives:
         return ()
-    ghosts = [camera("cameras/rivals", state, 1.5 * view.sphere_m, style.RIVAL, 2.0) for state in rivals]
+    ghosts = [
+        camera("cameras/alternatives", state, 1.5 * view.sphere_m, style.ALTERNATIVE, 2.0) for state in alternatives
+    ]
     ends = np.concatenate([ghost.points for ghost in ghosts])
-    return (Segments("cameras/rivals", "cameras", ends, one_color(style.RIVAL, len(ends)), 2.0),)
+    return (Segments("cameras/alternatives", "cameras", ends, one_color(style.ALTERNATIVE, len(ends)), 2.0),)
 
 
 def _table(view: RunView, stage: ConsensusStage, states: list[FloatArray]) -> Table:

@@ -85,11 +85,11 @@ class Explanation:
     """Why, in one or two sentences."""
 
 
-def explain(trace: Trace, number: int, rival_cam_from_map: FloatArray | None = None) -> Explanation:
+def explain(trace: Trace, number: int, alternative_cam_from_map: FloatArray | None = None) -> Explanation:
     """Why the run kept or rejected the correspondence of that index in the problem.
 
-    ``rival_cam_from_map`` (3, 4) is another pose to hold it against, as a diagnosis may know one; the poses that an
-    exact search verified are looked at too. Raises ``IndexError`` if the problem has no such correspondence.
+    ``alternative_cam_from_map`` (3, 4) is another pose to hold it against, as a diagnosis may know one; the poses that
+    an exact search verified are looked at too. Raises ``IndexError`` if the problem has no such correspondence.
     """
     problem, known = trace.problem, verdicts(trace)
     if not 0 <= number < len(problem):
@@ -118,7 +118,7 @@ def explain(trace: Trace, number: int, rival_cam_from_map: FloatArray | None = N
         bound_px=float(known.limit_px[number]),
         estimate=None if estimate is None else (estimate.px, estimate.deg),
         truth=None if truth is None else (truth.px, truth.deg),
-        rival=_rival(trace, number, rival_cam_from_map),
+        alternative=_alternative(trace, number, alternative_cam_from_map),
         agree_inliers=None if at_estimate is None else (at_estimate.agree_inliers, int(inliers.sum())),
     )
     verdict, why = reason(trace, poses)
@@ -162,7 +162,7 @@ def _pairs(
     )
 
 
-def _rival(trace: Trace, number: int, given: FloatArray | None) -> tuple[FloatArray, float] | None:
+def _alternative(trace: Trace, number: int, given: FloatArray | None) -> tuple[FloatArray, float] | None:
     """Of the other poses that are known, the one (3, 4) that explains the correspondence best, and its residual, px."""
     stage = trace.stage(ConsensusStage)
     poses = ([] if given is None else [given]) + ([] if stage is None else list(stage.cam_from_map[1:]))

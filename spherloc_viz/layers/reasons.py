@@ -25,7 +25,7 @@ class Poses:
     """Residual at the run's pose in px and degrees; None without one."""
     truth: tuple[float, float] | None
     """The same at the true pose."""
-    rival: tuple[FloatArray, float] | None
+    alternative: tuple[FloatArray, float] | None
     """Another pose (3, 4), and the residual there, px."""
     agree_inliers: tuple[int, int] | None
     """Of the pairs with the run's other inliers, how many agree at its yaw, and how many there are."""
@@ -81,10 +81,10 @@ def _why_kept(trace: Trace, poses: Poses) -> str:
 def _why_rejected(trace: Trace, poses: Poses) -> str:
     if poses.right:
         return _why_lost(trace, poses)
-    rival = _by_rival(trace, poses)
+    alternative = _by_alternative(trace, poses)
     if poses.right is False:
-        return _joined(_by_truth(poses), rival)
-    return rival or _by_pairs(poses)
+        return _joined(_by_truth(poses), alternative)
+    return alternative or _by_pairs(poses)
 
 
 def _why_lost(trace: Trace, poses: Poses) -> str:
@@ -109,10 +109,10 @@ def _by_truth(poses: Poses) -> str:
     return f"At the true pose it is {_off(poses.truth)}: a wrong match."
 
 
-def _by_rival(trace: Trace, poses: Poses) -> str:
-    if poses.rival is None or not poses.rival[1] <= poses.bound_px or trace.cam_from_map is None:
+def _by_alternative(trace: Trace, poses: Poses) -> str:
+    if poses.alternative is None or not poses.alternative[1] <= poses.bound_px or trace.cam_from_map is None:
         return ""
-    return f"It agrees with another pose, {_between(trace.cam_from_map, poses.rival[0])} from the estimated one."
+    return f"It agrees with another pose, {_between(trace.cam_from_map, poses.alternative[0])} from the estimated one."
 
 
 def _by_pairs(poses: Poses) -> str:

@@ -1,4 +1,4 @@
-"""Yaw: arcs of pairs gather on the ring around the sphere, a hand sweeps over it, and stops where most overlap."""
+"""Yaw: arcs of pairs gather on the ring around the sphere, candidate yaws are tried, and most arcs overlap at one."""
 
 from functools import partial
 
@@ -7,7 +7,7 @@ import numpy as np
 from spherloc.geometry import yaw_rotation
 from spherloc.trace import YawStage
 from spherloc_viz import style
-from spherloc_viz.layers import ring, twins
+from spherloc_viz.layers import ring, two_roots
 from spherloc_viz.layers.arcs import Arcs, IndexArray
 from spherloc_viz.layers.frame import Frame, Plan, RunView, growing
 from spherloc_viz.layers.primitives import Chart, SceneItem
@@ -15,35 +15,41 @@ from spherloc_viz.layers.primitives import Chart, SceneItem
 SIZES = (10, 30, 100, 300, 1000, 3000)
 """How many arcs are shown before all are."""
 STOPS = 8
-"""The hand stops at most at so many peaks before the highest."""
+"""Candidate yaws shown at most, before the one with the deepest overlap."""
 REACH = 40
 """A peak is the highest within so many quarters of a degree."""
 
 
 def plans(view: RunView, stage: YawStage) -> list[Plan]:
-    """One pair with its arcs, more and more arcs, the stops of the hand, and the deepest overlap."""
+    """One pair with its arcs, more and more arcs, candidate yaws, and the deepest overlap."""
     arcs = Arcs(stage)
+    own = two_roots.charts(view, arcs, counts_chart)
     out = [
-        Plan("yaw-pair", "One pair of matches", lambda: twins.pair(view, arcs)),
-        Plan("yaw-twins", "Two roots: twins", lambda: twins.twins(view, arcs), twins.charts(view, arcs, counts_chart)),
+        Plan("yaw-pair", "One pair of matches", lambda: two_roots.pair(view, arcs)),
+        Plan(
+            "yaw-roots",
+            "The two roots of a pair",
+            lambda: two_roots.roots(view, arcs),
+            own,
+        ),
     ]
     for size in growing(len(arcs), *SIZES):
         charts = {"yaw": partial(_growing_chart, view, arcs, size)}
         out.append(Plan(f"yaw-arcs-{size}", f"{size:,} arcs", partial(_some, view, arcs, size), charts))
     out.append(Plan("yaw-arcs", "Yaw arcs of all pairs", lambda: _all(view, arcs), {"yaw": lambda: chart(view, stage)}))
-    stops = hand_stops(stage)
+    stops = candidate_yaws(stage)
     for number, place in enumerate(stops, 1):
         yaw = ring.degrees_of(place + 0.5, len(stage.overlap))
-        charts = {"yaw": partial(chart, view, stage, hand_rad=np.radians(yaw))}
-        draw = partial(_hand, view, arcs, stops[:number])
-        out.append(Plan(f"yaw-hand-{number}", f"The hand at {yaw:.1f}°", draw, charts))
+        charts = {"yaw": partial(chart, view, stage, candidate_rad=np.radians(yaw))}
+        draw = partial(_candidate, view, arcs, stops[:number])
+        out.append(Plan(f"yaw-candidate-{number}", f"Candidate yaw {yaw:.1f}°", draw, charts))
     charts = {"yaw": lambda: chart(view, stage, found=True)}
     out.append(Plan("yaw-clique", "The yaw most arcs share", lambda: _clique(view, arcs), charts))
     return out
 
 
-def hand_stops(stage: YawStage) -> IndexArray:
-    """Quarters of a degree at which the hand stops: the highest peaks but the one it ends at, by yaw."""
+def candidate_yaws(stage: YawStage) -> IndexArray:
+    """Candidate yaws, in quarters of a degree from -180: the highest peaks without the deepest overlap, by yaw."""
     highest = ring.peaks(stage.overlap, REACH, STOPS + 1)
     places = len(stage.overlap)
     end = int((stage.yaw_rad + np.pi) / (2 * np.pi) * places)
@@ -92,8 +98,8 @@ def _all(view: RunView, arcs: Arcs) -> Frame:
     )
 
 
-def _hand(view: RunView, arcs: Arcs, stops: IndexArray) -> Frame:
-    """The hand at the last of the stops so far."""
+def _candidate(view: RunView, arcs: Arcs, stops: IndexArray) -> Frame:
+    """The last of the candidate yaws so far."""
     counts, place = arcs.stage.overlap, int(stops[-1])
     lo, hi = (ring.degrees_of(place + part, len(counts)) for part in (0, 1))
     yaw, here = np.radians(0.5 * (lo + hi)), int(counts[place])
@@ -102,27 +108,27 @@ def _hand(view: RunView, arcs: Arcs, stops: IndexArray) -> Frame:
     mean = float(np.sum(arcs.stage.hi_rad - arcs.stage.lo_rad)) / (2 * np.pi)
     items = _ring(view, arcs, drawn, counts, met, style.SAMPLE)
     return Frame(
-        f"Turned to {lo:.2f}°, the hand meets up to {here:,} of {len(arcs):,} arcs within a quarter of a degree, the "
+        f"The candidate yaw {lo:.2f}° lies in up to {here:,} of {len(arcs):,} arcs within a quarter of a degree, the "
         f"most within 10° on either side. {_so_far(counts, stops)}",
         f"Σ 1(|f(θ)| ≤ τ) = {here:,}   (Eq. 34)",
         turned,
         view.colors(style.UNDECIDED),
         view.nobody(),
-        note=f"A yaw at random lies in {mean:,.0f} arcs on average. {len(drawn)} arcs are drawn; pink ones are met.",
-        items=(*items, ring.spoke("ring/hand", view, view.middle, yaw, style.SAMPLE)),
+        note=f"A yaw at random lies in {mean:,.0f} arcs on average. {len(drawn)} arcs are drawn; pink ones hold it.",
+        items=(*items, ring.spoke("ring/candidate", view, view.middle, yaw, style.SAMPLE)),
     )
 
 
 def _so_far(counts: np.ndarray, stops: IndexArray) -> str:
-    """How the last stop compares with those before it."""
+    """How the last candidate compares with those before it."""
     if len(stops) == 1:
-        return "It is the first stop on the way around from −180°, at the highest peaks only."
+        return "It is the first candidate from −180° on; only the highest peaks are shown."
     best = stops[:-1][int(np.argmax(counts[stops[:-1]]))]
     most, here = int(counts[best]), int(counts[stops[-1]])
     where = f"{ring.degrees_of(best, len(counts)):.2f}°"
     if here > most:
-        return f"That beats the stops before, of which {where} was the best with {most:,}."
-    return f"The stop at {where} {'has met more' if most > here else 'has met as many'}: {most:,}."
+        return f"That beats the candidates before it, of which {where} was the best with {most:,}."
+    return f"The candidate at {where} {'is in more' if most > here else 'is in as many'}: {most:,}."
 
 
 def _clique(view: RunView, arcs: Arcs) -> Frame:
@@ -178,10 +184,10 @@ def counts_chart(view: RunView, counts: np.ndarray, yaw_rad: float | None = None
     return Chart("yaw", "Arcs that overlap at each yaw", "yaw (°)", "arcs", tuple(curves))
 
 
-def chart(view: RunView, stage: YawStage, found: bool = False, hand_rad: float | None = None) -> Chart:
-    """Overlap count of all arcs over yaw, with the truth and, once found, the estimate, or where the hand stands."""
+def chart(view: RunView, stage: YawStage, found: bool = False, candidate_rad: float | None = None) -> Chart:
+    """Overlap count of all arcs over yaw, with the truth and, once found, the estimate, or a candidate yaw."""
     plain = counts_chart(view, stage.overlap, stage.yaw_rad if found else None)
-    if hand_rad is None:
+    if candidate_rad is None:
         return plain
-    hand = ring.marker("hand", hand_rad, float(stage.overlap.max(initial=1)), style.SAMPLE)
-    return Chart(plain.name, plain.title, plain.x_label, plain.y_label, (*plain.curves, hand))
+    candidate = ring.marker("candidate", candidate_rad, float(stage.overlap.max(initial=1)), style.SAMPLE)
+    return Chart(plain.name, plain.title, plain.x_label, plain.y_label, (*plain.curves, candidate))

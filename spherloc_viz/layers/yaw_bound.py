@@ -38,9 +38,9 @@ def plans(view: RunView, stage: ConsensusStage) -> list[Plan]:
     for rank, place in enumerate(peaks.tolist(), 1):
         yaw = ring.degrees_of(place + 0.5, len(stage.bound))
         title = f"At {yaw:.1f}°: at most {stage.bound[place]}"
-        with_hand = {"consensus": partial(chart, view, stage, hand_rad=np.radians(yaw))}
+        with_candidate = {"consensus": partial(chart, view, stage, candidate_rad=np.radians(yaw))}
         draw = partial(_peak, view, stage, rank, place, len(peaks))
-        out.append(Plan(f"consensus-yaw-{rank}", title, draw, with_hand))
+        out.append(Plan(f"consensus-yaw-{rank}", title, draw, with_candidate))
     return out
 
 
@@ -116,13 +116,13 @@ def _peak(view: RunView, stage: ConsensusStage, rank: int, place: int, peaks: in
         note=f"Yaws are searched by falling bound until none could hide a better pose.{rest}",
         items=(
             *_ring(view, stage, place),
-            ring.spoke("ring/hand", view, view.middle, yaw, style.SAMPLE),
+            ring.spoke("ring/candidate", view, view.middle, yaw, style.SAMPLE),
         ),
     )
 
 
-def chart(view: RunView, stage: ConsensusStage, hand_rad: float | None = None) -> Chart:
-    """The bound over yaw, what the first guess and the best pose explain, the truth, the estimate, and the hand."""
+def chart(view: RunView, stage: ConsensusStage, candidate_rad: float | None = None) -> Chart:
+    """The bound over yaw, what the first guess and the best pose explain, the truth, the estimate, a candidate yaw."""
     peak, ends = float(max(highest_bound(stage), 1)), np.array([-180.0, 180.0])
     curves = [
         ring.step_curve("bound", stage.bound),
@@ -130,8 +130,8 @@ def chart(view: RunView, stage: ConsensusStage, hand_rad: float | None = None) -
         Curve("best pose", ends, np.full(2, float(best_support(stage))), style.INLIER, "level"),
         *ring.markers(view, peak, _yaw(stage)),
     ]
-    if hand_rad is not None:
-        curves.append(ring.marker("hand", hand_rad, peak, style.SAMPLE))
+    if candidate_rad is not None:
+        curves.append(ring.marker("candidate", candidate_rad, peak, style.SAMPLE))
     return Chart("consensus", "No pose with this yaw explains more than", "yaw (°)", "matches", tuple(curves))
 
 

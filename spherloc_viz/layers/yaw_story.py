@@ -58,7 +58,7 @@ def yaw_story(trace: Trace) -> YawStory:
         ends = np.array(ALL)
         level = Curve("best pose", ends, np.full(2, float(best)), style.INLIER, "level")
         curves = (ring.step_curve("bound", exact.bound), level)
-        poses = list(zip(exact.cam_from_map, exact.support.tolist(), strict=True))[: 1 + style.MAX_DRAWN_RIVALS]
+        poses = list(zip(exact.cam_from_map, exact.support.tolist(), strict=True))[: 1 + style.MAX_DRAWN_ALTERNATIVES]
         tried = tuple((_yaw_deg(trace, pose), support, "verified pose", "") for pose, support in poses)
         if len(poses) < len(exact.support):
             note = f"Of {len(exact.support):,} verified poses, the best {len(poses)} are shown as stems."

@@ -2,6 +2,9 @@
 
 from dataclasses import dataclass
 
+STORED_AS = {"key_step": "decisive_step"}
+"""Fields that recordings know by the name that they had in the first format."""
+
 
 @dataclass(frozen=True)
 class RunRow:
@@ -55,7 +58,7 @@ class RunRow:
     """Whether the consensus is proven to be the largest; None without a certificate."""
     steps: int
     """Steps on the timeline."""
-    decisive_step: int
+    key_step: int
     """The step at which the run was decided, or went wrong."""
     title: str = ""
     """Of a curated case."""

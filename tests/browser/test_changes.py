@@ -18,7 +18,7 @@ from spherloc_viz.app.web.access import Access
 from spherloc_viz.app.web.downloads import Downloads
 from spherloc_viz.app.web.front_door import FrontDoor
 from spherloc_viz.app.web.guard import open_socket
-from spherloc_viz.app.web.viser_seams import (
+from spherloc_viz.app.web.viser_internals import (
     ANSWERS,
     at_once,
     follow_changes,

@@ -21,7 +21,7 @@ from spherloc.diagnosis import Cause, diagnose
 from spherloc.estimators import default_options, estimate
 from spherloc.metrics import evaluate
 from spherloc.problem import Problem
-from spherloc_viz.app.catalog import Catalog, SceneWish
+from spherloc_viz.app.catalog import Catalog, SceneRequest
 from spherloc_viz.layers.comparison import Entry, comparison_table
 
 RANSAC = "ransac-2p (two points)"
@@ -134,7 +134,7 @@ def test_compare(page: Playground, scene: Path) -> None:
     tick_only(tab, "compare", COMPARED)
     tab.press("Compare")
     first, second, third = (
-        expected_rows(catalog.problem(SceneWish("small street", seed)), seed, name)
+        expected_rows(catalog.problem(SceneRequest("small street", seed)), seed, name)
         for seed, name in ((3, "mc"), (4, "ransac-2p"), (5, "ransac-2p"))
     )
     assert first != second != third
@@ -308,7 +308,7 @@ def test_a_sweep_to_its_end(page: Playground, server: tuple[str, int], scene: Pa
     # The rows are what the core computes.
     for row in rows:
         variation = Variation(outlier_rate=float(row["outlier_rate"]))
-        problem = Catalog(scene).problem(SceneWish("small street", int(row["seed"]), None, variation))
+        problem = Catalog(scene).problem(SceneRequest("small street", int(row["seed"]), None, variation))
         metrics = evaluate(estimate(problem, row["estimator"], seed=int(row["seed"])))
         assert float(row["translation_error_m"]) == pytest.approx(metrics.translation_error_m, rel=1e-6)
 

@@ -15,7 +15,7 @@ from benchmarks.page_client import PageClient
 from benchmarks.playground import memory_mib, thread_count
 from spherloc.datasets.variation import Variation
 from spherloc.estimators import estimate
-from spherloc_viz.app.catalog import Catalog, SceneWish
+from spherloc_viz.app.catalog import Catalog, SceneRequest
 from spherloc_viz.app.controls.estimator_controls import ABOUT
 from spherloc_viz.layers.tables import outcome_table
 
@@ -60,7 +60,7 @@ def expected(wanted: dict[str, Any], catalog: Catalog) -> dict[str, str]:
         outlier_rate=wanted["Outliers (%)"] / 100.0,
     )
     seed = int(wanted["Seed"])
-    problem = catalog.problem(SceneWish("small street", seed, None, variation))
+    problem = catalog.problem(SceneRequest("small street", seed, None, variation))
     rows = dict(outcome_table(estimate(problem, ESTIMATORS[wanted["Estimator"]], seed=seed)).rows)
     return {name: rows[name] for name in COMPARED if name in rows}
 

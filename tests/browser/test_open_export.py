@@ -14,7 +14,7 @@ from playwright.sync_api import Browser, Locator, Page, expect
 
 from spherloc.estimators import estimate
 from spherloc.problem import Problem
-from spherloc_viz.app.catalog import Catalog, SceneWish
+from spherloc_viz.app.catalog import Catalog, SceneRequest
 from spherloc_viz.layers.tables import outcome_table
 from spherloc_viz.recording.content.reader import read_recording
 
@@ -126,7 +126,7 @@ def test_an_upload_is_solved_and_stays_with_its_page(
     open_page: Callable[..., Playground], own_address: str, folders: Path
 ) -> None:
     catalog = Catalog(folders / "start" / "small.toml")
-    problem = catalog.problem(SceneWish("small street", 77))
+    problem = catalog.problem(SceneRequest("small street", 77))
     assert problem.truth_cam_from_map is not None
     tab, text = open_page(), matches_csv(problem)
     tab.tab("Open")
@@ -207,7 +207,9 @@ def test_what_is_seen_leaves_as_files(
     recording = downloaded(tab, "Recording (.rrd)", tmp_path)
     run = read_recording(recording)
     assert f"{int(run.inlier_mask.sum())} of {len(run.problem)}" == inliers
-    expected = estimate(Catalog(folders / "start" / "small.toml").problem(SceneWish("small street", 3)), "mc", seed=3)
+    expected = estimate(
+        Catalog(folders / "start" / "small.toml").problem(SceneRequest("small street", 3)), "mc", seed=3
+    )
     np.testing.assert_array_equal(run.cam_from_map, expected.cam_from_map)
 
     page = downloaded(tab, "Scene (HTML)", tmp_path)

@@ -53,7 +53,7 @@ def expect_lit(tab: Playground, *numbers: int) -> None:
     tab.tab("Yaw")
     tab.until(lambda: arcs_are_chosen(tab, numbers), f"only arcs of {numbers} are brought out")
     tab.tab("Residuals")
-    expect(tab.page.locator("svg path.chosen:not(.yaw-twin)")).to_have_count(2 if numbers else 0)
+    expect(tab.page.locator("svg path.chosen:not(.yaw-second)")).to_have_count(2 if numbers else 0)
 
 
 def rows_are_marked(tab: Playground, numbers: tuple[int, ...]) -> bool:

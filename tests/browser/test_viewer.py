@@ -114,7 +114,7 @@ def tab(browser: Browser) -> Iterator[Tab]:
 
 
 def test_it_opens_at_the_step_and_stays_at_home(tab: Tab, home: str, row: RunRow) -> None:
-    step = row.decisive_step or 1
+    step = row.key_step or 1
     tab.page.goto(home + viewer_link("good.rrd", step))
     expect(tab.page).to_have_title(f"small street, mc, seed 0: step {step} - spherloc")
     expect(tab.page.locator("body")).to_have_attribute("data-state", "open", timeout=OPENING_MS)

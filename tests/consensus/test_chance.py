@@ -5,7 +5,7 @@ from math import comb, inf
 import numpy as np
 import pytest
 
-from spherloc.consensus.chance import chance_rate, chance_sets, least_size
+from spherloc.consensus.chance import chance_rate, least_size, nfa
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
 
@@ -15,33 +15,33 @@ def unit(vectors):
 
 
 @pytest.mark.parametrize("rate", [1e-4, 0.03, 0.5, 1.0])
-def test_chance_sets_is_the_formula(rate):
+def test_nfa_is_the_formula(rate):
     for count in (2, 3, 10, 30):
         for size in range(2, count + 1):
             expected = comb(count, size) * rate ** (size - 2)
-            assert chance_sets(count, size, rate) == pytest.approx(expected, rel=1e-9)
+            assert nfa(count, size, rate) == pytest.approx(expected, rel=1e-9)
 
 
 def test_less_than_two_fix_no_pose():
-    assert chance_sets(7, 1, 0.1) == 7.0
-    assert chance_sets(7, 0, 0.1) == 7.0
+    assert nfa(7, 1, 0.1) == 7.0
+    assert nfa(7, 0, 0.1) == 7.0
 
 
 def test_huge_numbers_stay_finite():
-    assert np.isfinite(chance_sets(10_000, 5000, 1.0))
-    assert chance_sets(10_000, 5000, 1e-300) == 0.0
+    assert np.isfinite(nfa(10_000, 5000, 1.0))
+    assert nfa(10_000, 5000, 1e-300) == 0.0
 
 
 def test_more_chance_with_a_higher_rate_and_more_correspondences():
     for size in (3, 6, 12):
-        by_rate = [chance_sets(40, size, rate) for rate in (1e-5, 1e-3, 0.1, 1.0)]
-        by_count = [chance_sets(count, size, 0.01) for count in (12, 20, 50, 400)]
+        by_rate = [nfa(40, size, rate) for rate in (1e-5, 1e-3, 0.1, 1.0)]
+        by_count = [nfa(count, size, 0.01) for count in (12, 20, 50, 400)]
         assert by_rate == sorted(by_rate) and len(set(by_rate)) == 4
         assert by_count == sorted(by_count) and len(set(by_count)) == 4
 
 
 def test_larger_sets_are_less_likely_where_chance_is_small():
-    values = [chance_sets(100, size, 1e-3) for size in range(2, 60)]
+    values = [nfa(100, size, 1e-3) for size in range(2, 60)]
     assert values == sorted(values, reverse=True)
 
 
@@ -49,8 +49,8 @@ def test_larger_sets_are_less_likely_where_chance_is_small():
 def test_least_size_is_the_first_that_is_rare_enough(expected):
     for count, rate in ((10, 0.01), (100, 1e-3), (100, 0.05), (3000, 1e-4)):
         size = least_size(count, rate, expected)
-        assert chance_sets(count, size, rate) <= expected
-        assert all(chance_sets(count, smaller, rate) > expected for smaller in range(2, size))
+        assert nfa(count, size, rate) <= expected
+        assert all(nfa(count, smaller, rate) > expected for smaller in range(2, size))
 
 
 def test_least_size_of_what_chance_always_explains():

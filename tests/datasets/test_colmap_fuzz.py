@@ -12,9 +12,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from spherloc.errors import InputError
-from spherloc.formats.colmap_check import walk_binary
+from spherloc.formats.colmap_check import check_binary
 from spherloc.formats.colmap_model import read_model
-from spherloc.formats.colmap_text import walk_text
+from spherloc.formats.colmap_text import check_text
 
 NASTY = (
     b"\xff" * 8,
@@ -73,7 +73,7 @@ def test_walks_say_what_is_wrong_and_where(case, tmp_path):
     text, files = case
     folder = write(tmp_path, files)
     try:
-        walked = (walk_text if text else walk_binary)(folder)
+        walked = (check_text if text else check_binary)(folder)
     except InputError as error:
         check_sentence(error, folder)
         assert re.search(r"\.(bin, up to byte \d+|txt, line \d+|bin|txt): ", str(error))
@@ -114,7 +114,7 @@ def test_every_cut_of_a_binary_file_is_noticed(name, tmp_path):
     for length in range(0, len(files[name]), max(1, len(files[name]) // 60)):
         (folder / name).write_bytes(files[name][:length])
         with pytest.raises(InputError, match=rf"{name}, up to byte \d+: "):
-            walk_binary(folder)
+            check_binary(folder)
 
 
 @pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin"])
@@ -123,7 +123,7 @@ def test_huge_counts_and_wrong_endianness(name, count, tmp_path):
     files = intact("rigs", False)
     folder = write(tmp_path, files | {name: struct.pack("<Q", count) + files[name][8:]})
     with pytest.raises(InputError, match=rf"{name}, up to byte 8: {count} .* more than the file can hold"):
-        walk_binary(folder)
+        check_binary(folder)
 
 
 def changed(sample, what):
@@ -169,7 +169,7 @@ def test_what_is_wrong_is_said(what, files_of, rng, tmp_path):
     place = r"(\.bin, up to byte \d+: |\.txt, line \d+: )"
     words = SENTENCES[what].replace(".*", place + ".*", 1)
     with pytest.raises(InputError, match=words):
-        (walk_binary if files_of is binary_files else walk_text)(
+        (check_binary if files_of is binary_files else check_text)(
             write(tmp_path, files_of(changed(sample_model(rng), what)))
         )
 
@@ -196,4 +196,4 @@ def test_what_is_wrong_is_said(what, files_of, rng, tmp_path):
 def test_rigs_and_frames_must_agree(change, words, files_of, rng, tmp_path):
     sample = change(with_rigs(sample_model(rng), rng))
     with pytest.raises(InputError, match=words):
-        (walk_binary if files_of is binary_files else walk_text)(write(tmp_path, files_of(sample)))
+        (check_binary if files_of is binary_files else check_text)(write(tmp_path, files_of(sample)))

@@ -12,7 +12,7 @@ from spherloc.errors import InputError
 from spherloc.geometry import DOWN, camera_centre, transform
 from spherloc.refine import residuals_px
 
-ALL = (Group("right", 12), Group("agreeing", 9), Group("near", 6), Group("twins", 5), Group("random", 20))
+ALL = (Group("right", 12), Group("agreeing", 9), Group("near", 6), Group("doubled", 5), Group("random", 20))
 
 
 @pytest.fixture(params=["mei", "fisheye", "panorama"])
@@ -28,7 +28,7 @@ def test_counts_and_labels(staged):
     errors = residuals_px(problem.aligned, problem.truth_cam_from_map)
     assert errors[problem.truth_inliers].max() < 5.0
     assert np.median(errors[~problem.truth_inliers]) > 20.0
-    assert problem.scene == "staged: 12 right, 9 agreeing, 6 near, 5 twins, 20 random"
+    assert problem.scene == "staged: 12 right, 9 agreeing, 6 near, 5 doubled, 20 random"
 
 
 def test_it_follows_from_its_fields(staged):

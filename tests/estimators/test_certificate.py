@@ -8,7 +8,7 @@ import pytest
 from small_problems import explained, good_poses, level_poses
 
 from spherloc.bounds import bounds_of
-from spherloc.consensus.chance import chance_rate, chance_sets
+from spherloc.consensus.chance import chance_rate, nfa
 from spherloc.estimators import estimate, options_type
 from spherloc.geometry import pose, rotation_angle, so3_exp, yaw_of, yaw_rotation
 from spherloc.problem import Problem
@@ -38,7 +38,7 @@ def check(trace, bound_px):
     assert certificate.gap == certificate.upper_bound - certificate.lower_bound
     assert certificate.proven == (certificate.gap == 0)
     rate = chance_rate(aligned.bearings, bounds.radians)
-    assert certificate.chance_sets == pytest.approx(chance_sets(len(aligned.bearings), certificate.lower_bound, rate))
+    assert certificate.nfa == pytest.approx(nfa(len(aligned.bearings), certificate.lower_bound, rate))
     # Level poses of pairs and of fits at the widened bounds, counted at the noise's.
     yaws, centres = good_poses(aligned, bounds)
     level = level_poses(yaws, centres)
@@ -134,10 +134,10 @@ def test_simulation_is_proven(scene_of):
             problem = scene_of(camera, outlier_rate=0.8).problem(seed)
             certificate = solve(problem, Options(bound_px=4.0), seed).certificate
             assert certificate.proven and certificate.lower_bound >= 18
-            assert certificate.chance_sets < 1e-6
+            assert certificate.nfa < 1e-6
 
 
 def test_only_outliers_are_called_chance(scene_of):
     for seed in range(3):
         trace = solve(scene_of("panorama", outlier_rate=1.0).problem(seed), seed=seed)
-        assert trace.certificate.chance_sets > 1e-3
+        assert trace.certificate.nfa > 1e-3

@@ -86,7 +86,7 @@ def test_two_correspondences(scene_of, camera):
         scene = scene_of(camera, correspondences=2, outlier_rate=0.0, noise_px=0.0)
         trace = solve(scene.problem(seed), seed=seed)
         assert trace.certificate.upper_bound == 2 == trace.certificate.lower_bound
-        assert trace.inlier_mask.all() and trace.certificate.chance_sets >= 1.0
+        assert trace.inlier_mask.all() and trace.certificate.nfa >= 1.0
 
 
 def test_no_pose_at_all():
@@ -108,7 +108,7 @@ def test_only_outliers(scene_of, camera):
     trace = solve(scene_of(camera, correspondences=50, outlier_rate=1.0).problem())
     certificate = trace.certificate
     assert 2 <= certificate.lower_bound <= certificate.upper_bound < 20
-    assert certificate.chance_sets > 1e-6
+    assert certificate.nfa > 1e-6
 
 
 def crowd(count):

@@ -110,7 +110,7 @@ class Impatient(Watch):
     "estimator, stage",
     [("ransac-2p", "ransac"), ("ransac-2p", "refinement"), ("ransac-epnp", "ransac")]
     + [("mc", stage) for stage in ("yaw", "sweep", "translation", "refinement")]
-    + [("mc-exact", stage) for stage in ("guess", "pairs", "bins", "scout", "search", "refinement")]
+    + [("mc-exact", stage) for stage in ("guess", "pairs", "bins", "largest_bin_cliques", "search", "refinement")]
     + [("auto", stage) for stage in ("decision", "guess", "pairs")],
 )
 @pytest.mark.parametrize("outlier_rate", [0.5, 0.98])

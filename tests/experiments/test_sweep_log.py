@@ -151,7 +151,7 @@ ROWS = st.builds(
     f1=st.none() | FLOATS,
     upper_bound=st.none() | st.integers(0, 10_000),
     lower_bound=st.none() | st.integers(0, 10_000),
-    chance_sets=st.none() | FLOATS,
+    nfa=st.none() | FLOATS,
 )
 
 

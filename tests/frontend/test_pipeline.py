@@ -111,7 +111,7 @@ def test_the_same_point_from_two_references_counts_once(references, queries, fol
 def test_different_points_from_two_references_are_rivals(references, queries, folder):
     one = references["fisheye"]
     alone = matcher([one])(queries["fisheye"])
-    both = matcher([one, twin(one, folder, "rival", 0.5)])(queries["fisheye"])
+    both = matcher([one, twin(one, folder, "alternative", 0.5)])(queries["fisheye"])
     assert len(both.pixels) == 2 * len(alone.pixels)
     assert np.array_equal(both.points[: len(alone.points)] + 0.5, both.points[len(alone.points) :])
 

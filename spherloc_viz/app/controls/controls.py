@@ -14,7 +14,7 @@ from spherloc.diagnosis import Diagnosis
 from spherloc.errors import InputError
 from spherloc.trace import Trace
 from spherloc_viz import share
-from spherloc_viz.app.catalog import Catalog, SceneWish
+from spherloc_viz.app.catalog import Catalog, SceneRequest
 from spherloc_viz.app.controls.display_controls import DisplayControls
 from spherloc_viz.app.controls.estimator_controls import EstimatorControls
 from spherloc_viz.app.controls.presets import presets
@@ -27,14 +27,14 @@ from spherloc_viz.app.panels.open_panel import Opened, OpenPanel
 from spherloc_viz.app.panels.recordings_panel import Page, RecordingsPanel
 from spherloc_viz.app.panels.sweep_runs_panel import SweepPanel
 from spherloc_viz.app.review.review_card import ReviewCard
+from spherloc_viz.app.run_request import Run, RunRequest
 from spherloc_viz.app.services import Services
 from spherloc_viz.app.text import DIM, box
 from spherloc_viz.app.web.touch import Touches
-from spherloc_viz.app.web.viser_seams import at_once, put
-from spherloc_viz.app.wish import Run, Wish
+from spherloc_viz.app.web.viser_internals import at_once, put
 from spherloc_viz.layers.primitives import SceneItem
 from spherloc_viz.layers.trajectory import trajectory_items
-from spherloc_viz.recording.again.reopen import Reopened
+from spherloc_viz.recording.replay.reopen import Reopened
 
 UNDO, REDO, NEW_SEED = "Undo", "Redo", "New seed"
 NO_PRESET = "choose …"
@@ -49,7 +49,7 @@ class Owner(Protocol):
     def redraw(self, event: object = None) -> None:
         """Something that is shown was changed."""
 
-    def open(self, wish: Wish) -> None:
+    def open(self, request: RunRequest) -> None:
         """Ask for this."""
 
     def use_estimator(self, name: str) -> None:
@@ -58,10 +58,10 @@ class Owner(Protocol):
     def step_history(self, by: int) -> None:
         """Undo (-1) or redo (+1)."""
 
-    def open_recorded(self, wish: Wish, path: Path, cam_from_map: FloatArray | None) -> None:
+    def open_recorded(self, request: RunRequest, path: Path, cam_from_map: FloatArray | None) -> None:
         """Ask for a run that is recorded already, as ``path`` and with this pose (3, 4)."""
 
-    def record(self, trace: Trace, scene: SceneWish) -> None:
+    def record(self, trace: Trace, scene: SceneRequest) -> None:
         """Record a run that a panel made of a scene."""
 
     def shown(self) -> Shown | None:
@@ -69,7 +69,7 @@ class Owner(Protocol):
 
 
 class Controls:
-    """One client's controls. Widgets only note wishes; the session's threads act on them."""
+    """One client's controls. Widgets only note requests; the session's threads act on them."""
 
     def __init__(
         self,
@@ -82,7 +82,7 @@ class Controls:
     ) -> None:
         gui = client.gui
         self._catalog, self._owner = catalog, owner
-        self._sequence: SceneWish | None = None
+        self._sequence: SceneRequest | None = None
         """What the sequence that was started last is of."""
         self._presets = {preset.title: preset for preset in presets(catalog)}
         self.slow = SlowRun(gui, f"spherloc-clock-{client.client_id}")
@@ -100,7 +100,7 @@ class Controls:
             self._open = OpenPanel(gui, client, touches, services.roots, self._open_scene)
         with tabs.add_tab("Recordings"):
             page = Page(services.roots, self._enter, owner.open, owner.open_recorded, services.downloads)
-            self._recordings = RecordingsPanel(gui, client, touches, services.shelf, self.review, page)
+            self._recordings = RecordingsPanel(gui, client, touches, services.library, self.review, page)
         with tabs.add_tab("Share"):
             self._export = ExportPanel(gui, client, owner.shown)
         for label, key, modifier, by in ((UNDO, "Z", "cmd/ctrl", -1), (REDO, "Z", "cmd/ctrl+shift", 1)):
@@ -138,11 +138,11 @@ class Controls:
             self._show_scene(self.scene.read().scene)
         return another
 
-    def write(self, wish: Wish) -> None:
+    def write(self, request: RunRequest) -> None:
         """Show this; raises ``InputError`` if it cannot be."""
-        self.scene.write(wish.scene)
-        self.estimator.write(wish.estimator, wish.options)
-        self._show_scene(wish.scene.scene)
+        self.scene.write(request.scene)
+        self.estimator.write(request.estimator, request.options)
+        self._show_scene(request.scene.scene)
 
     def items(self, run: Run) -> tuple[SceneItem, ...]:
         """What the canvas shows beside a run: cameras of other estimators, recorded ones, and those of a sequence."""
@@ -150,23 +150,23 @@ class Controls:
 
     def draw(self, run: Run, diagnosis: Diagnosis | None) -> None:
         """Follow the run at hand; ``diagnosis`` is None for as long as there is none."""
-        self._follow_preset(run.wish)
-        html = _edits_html(run.wish.scene.variation)
+        self._follow_preset(run.request)
+        html = _edits_html(run.request.scene.variation)
         if self._edits.content != html:
             self._edits.content, self._edits.visible = html, bool(html)
         self.compare.draw(run.trace)
         self.review.draw(run, diagnosis)
 
-    def settle(self, run: Run) -> None:
+    def show_how_to_repeat(self, run: Run) -> None:
         """Say how to repeat a run that the page has settled on."""
-        wish, scene = run.wish, run.wish.scene
-        words = (scene.seed, scene.query, scene.variation, wish.estimator, wish.options)
+        request, scene = run.request, run.request.scene
+        words = (scene.seed, scene.query, scene.variation, request.estimator, request.options)
         path = self._catalog.path(scene.scene)
         self._export.draw(share.as_python(path, *words), share.as_command(path, *words))
 
     def _trajectory(self, run: Run) -> tuple[SceneItem, ...]:
         """The sequence that was localized in the scene at hand, if any."""
-        label = run.wish.scene.scene
+        label = run.request.scene.scene
         scene, rows = self._catalog.map_scene(label), self.sequence.rows(label)
         if scene is None or not rows:
             return ()
@@ -176,13 +176,13 @@ class Controls:
         self.sequence.show(self._catalog.map_scene(label))
         self._movable.visible = self._catalog.synthetic(label) is not None
 
-    def _follow_preset(self, wish: Wish) -> None:
+    def _follow_preset(self, request: RunRequest) -> None:
         """Show the preset's name and story for as long as the page is as it says."""
         title = next(
             (
                 title
                 for title, preset in self._presets.items()
-                if wish == Wish(preset.scene, preset.estimator, preset.options)
+                if request == RunRequest(preset.scene, preset.estimator, preset.options)
             ),
             NO_PRESET,
         )
@@ -196,7 +196,7 @@ class Controls:
     def _choose_preset(self, event: viser.GuiEvent) -> None:
         preset = self._presets.get(event.target.value)
         if event.client is not None and preset is not None:
-            self._owner.open(Wish(preset.scene, preset.estimator, preset.options))
+            self._owner.open(RunRequest(preset.scene, preset.estimator, preset.options))
 
     @at_once
     def _move(self, event: viser.GuiEvent) -> None:
@@ -211,35 +211,35 @@ class Controls:
         label = self._catalog.add(opened.scene, opened.path, opened.label)
         seed = getattr(opened.scene, "seed", 0)
         estimator, _ = self.estimator.read()
-        self._owner.open(Wish(SceneWish(label, seed), estimator, None))
+        self._owner.open(RunRequest(SceneRequest(label, seed), estimator, None))
 
-    def _enter(self, got: Reopened) -> Wish:
-        """Offer a reopened scene, and wish for its run."""
+    def _enter(self, got: Reopened) -> RunRequest:
+        """Offer a reopened scene, and request for its run."""
         label = self._catalog.enter(got.scene, got.path, got.label, brief=not got.live)
-        return Wish(SceneWish(label, got.seed, got.query, got.variation), got.estimator, got.options)
+        return RunRequest(SceneRequest(label, got.seed, got.query, got.variation), got.estimator, got.options)
 
     def _chosen_sequence(self) -> tuple[str, MapScene, str, Any, int]:
         """What the sequence panel localizes; raises ``InputError`` if the page says nothing that can be."""
-        wish = self.scene.read()
-        scene = self._catalog.map_scene(wish.scene)
+        request = self.scene.read()
+        scene = self._catalog.map_scene(request.scene)
         if scene is None:
             raise InputError("this scene has no query images; choose one that has.")
-        self._sequence = wish
-        return wish.scene, scene, *self.estimator.read(), wish.seed
+        self._sequence = request
+        return request.scene, scene, *self.estimator.read(), request.seed
 
     def _localized(self, trace: Trace | None) -> None:
         """One more query of a sequence is done."""
-        wish = self._sequence
-        if trace is not None and wish is not None:
-            images = self._catalog.map_scene(wish.scene)
+        request = self._sequence
+        if trace is not None and request is not None:
+            images = self._catalog.map_scene(request.scene)
             views = () if images is None else images.queries
             query = next((view.name for view in views if view.path == trace.problem.image), None)
-            self._owner.record(trace, replace(wish, query=query))
+            self._owner.record(trace, replace(request, query=query))
         self._owner.redraw()
 
-    def _chosen_sweep(self) -> tuple[Path, SceneWish]:
-        wish = self.scene.read()
-        return self._catalog.path(wish.scene), wish
+    def _chosen_sweep(self) -> tuple[Path, SceneRequest]:
+        request = self.scene.read()
+        return self._catalog.path(request.scene), request
 
 
 def _edits_html(variation: Variation) -> str:

@@ -7,7 +7,7 @@ import viser
 
 from spherloc_viz import style
 from spherloc_viz.app.stage import views
-from spherloc_viz.app.web.viser_seams import at_once, put
+from spherloc_viz.app.web.viser_internals import at_once, put
 
 
 class DisplayControls:

@@ -10,7 +10,7 @@ from spherloc.errors import InputError, show
 from spherloc.estimators import default_options, options_type
 from spherloc.problem import Problem
 from spherloc.ranges import check_option
-from spherloc_viz.app.web.viser_seams import put
+from spherloc_viz.app.web.viser_internals import put
 from spherloc_viz.options import NONE, OptionField, option_fields, usable_estimators
 
 ABOUT: Mapping[str, str] = {

@@ -7,7 +7,7 @@ from typing import Any
 from spherloc.datasets import bundled_scenes
 from spherloc.datasets.variation import Variation
 from spherloc.estimators import options_type
-from spherloc_viz.app.catalog import Catalog, SceneWish
+from spherloc_viz.app.catalog import Catalog, SceneRequest
 
 
 @dataclass(frozen=True)
@@ -18,7 +18,7 @@ class Preset:
     """A few words."""
     story: str
     """What is seen and what to try, in one sentence."""
-    scene: SceneWish
+    scene: SceneRequest
     estimator: str
     """Registered name."""
     options: Any
@@ -107,7 +107,7 @@ def presets(catalog: Catalog) -> tuple[Preset, ...]:
         Preset(
             recipe.title,
             recipe.story,
-            SceneWish(labels[paths[recipe.scene]], recipe.seed, None, recipe.variation),
+            SceneRequest(labels[paths[recipe.scene]], recipe.seed, None, recipe.variation),
             recipe.estimator,
             options_type(recipe.estimator)(**recipe.options),
         )

@@ -9,10 +9,10 @@ from spherloc.datasets.map_scene import MapScene
 from spherloc.datasets.synthetic import TrueCamera
 from spherloc.datasets.variation import Variation
 from spherloc.errors import InputError
-from spherloc_viz.app.catalog import Catalog, SceneWish
+from spherloc_viz.app.catalog import Catalog, SceneRequest
 from spherloc_viz.app.controls.simulation_controls import SimulationControls
 from spherloc_viz.app.text import box
-from spherloc_viz.app.web.viser_seams import number_of, put
+from spherloc_viz.app.web.viser_internals import number_of, put
 
 LISTED_QUERIES = 50
 """A page with thousands of entries in a dropdown is slow; of more, those that fit a filter are listed."""
@@ -23,7 +23,7 @@ Changed = Callable[[Any], None]
 class SceneControls:
     """Scene, query image, what is changed about a simulation, and seed. Changes to single matches are kept elsewhere.
 
-    Everything can be read and written as a ``SceneWish``. ``changed`` is called with viser's event.
+    Everything can be read and written as a ``SceneRequest``. ``changed`` is called with viser's event.
     """
 
     def __init__(self, gui: viser.GuiApi, catalog: Catalog, changed: Changed) -> None:
@@ -50,7 +50,7 @@ class SceneControls:
         label = self._scene.value
         if label == self._followed:
             return False
-        self.write(SceneWish(label, getattr(self._catalog.scenes[label], "seed", self._read_seed(0))))
+        self.write(SceneRequest(label, getattr(self._catalog.scenes[label], "seed", self._read_seed(0))))
         return True
 
     @property
@@ -58,41 +58,41 @@ class SceneControls:
         """The number of the change that chose the scene."""
         return number_of(self._scene)
 
-    def read(self) -> SceneWish:
+    def read(self) -> SceneRequest:
         """What the widgets say now, with all matches as they are.
 
         Raises ``InputError`` if the seed is no seed.
         """
         label, seed = self._scene.value, self._read_seed()
         if self._catalog.map_scene(label) is not None:
-            return SceneWish(label, seed, self._query.value)
-        return SceneWish(label, seed, None, self._variation(label))
+            return SceneRequest(label, seed, self._query.value)
+        return SceneRequest(label, seed, None, self._variation(label))
 
-    def read_unchanged(self) -> SceneWish:
+    def read_unchanged(self) -> SceneRequest:
         """The scene and the query that the widgets say, with everything else as the scene has it."""
         label = self._scene.value
         query = None if self._catalog.map_scene(label) is None else self._query.value
-        return SceneWish(label, getattr(self._catalog.scenes[label], "seed", 0), query)
+        return SceneRequest(label, getattr(self._catalog.scenes[label], "seed", 0), query)
 
-    def write(self, wish: SceneWish) -> bool:
-        """Set the widgets to what a wish says but for changes to single matches; tells whether the scene is another.
+    def write(self, request: SceneRequest) -> bool:
+        """Set the widgets to what a request says but for changes to single matches; tells whether the scene is another.
 
         Raises ``InputError`` if the catalog does not have the scene, or the scene not the query.
         """
-        if wish.scene not in self._catalog.scenes:
-            raise InputError(f"the scene '{wish.scene}' is not open on this page; open it first.")
-        another = wish.scene != self._followed
-        self._followed = wish.scene
+        if request.scene not in self._catalog.scenes:
+            raise InputError(f"the scene '{request.scene}' is not open on this page; open it first.")
+        another = request.scene != self._followed
+        self._followed = request.scene
         self.list_scenes()
-        put(self._scene, wish.scene)
-        images = self._catalog.map_scene(wish.scene)
+        put(self._scene, request.scene)
+        images = self._catalog.map_scene(request.scene)
         if images is not None:
-            self._write_query(images, wish.query)
+            self._write_query(images, request.query)
         self._query.visible = images is not None
         many = images is not None and len(images.queries) > LISTED_QUERIES
         self._find.visible = self._found.visible = many
-        self._simulation.write(self._catalog.synthetic(wish.scene), wish.variation)
-        put(self._seed, str(wish.seed))
+        self._simulation.write(self._catalog.synthetic(request.scene), request.variation)
+        put(self._seed, str(request.seed))
         return another
 
     def list_scenes(self) -> None:

@@ -9,7 +9,7 @@ import viser
 from spherloc.datasets.synthetic import LIMITS, SyntheticScene, TrueCamera
 from spherloc.datasets.variation import Variation
 from spherloc_viz.app.text import box
-from spherloc_viz.app.web.viser_seams import changes_of, put
+from spherloc_viz.app.web.viser_internals import changes_of, put
 
 OWN_CAMERA = "the scene's own"
 RANGES: Mapping[str, int] = {"to 500": 500, "to 5,000": 5000}

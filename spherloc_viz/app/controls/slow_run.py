@@ -5,11 +5,11 @@ import threading
 import viser
 
 from spherloc.watch import Watch
-from spherloc_viz.app.newest import Newest
+from spherloc_viz.app.latest_worker import LatestWorker
 
 AFTER_S = 0.4
-"""A run that takes longer shows its progress, and gives way to a newer wish. Shorter ones are let finish: else dragging
-a slider would show nothing until it stands still."""
+"""A run that takes longer shows its progress, and gives way to a newer request. Shorter ones are let finish: else
+dragging a slider would show nothing until it stands still."""
 EVERY_S = 0.1
 
 
@@ -24,7 +24,7 @@ class SlowRun:
         self._watch: Watch | None = None
         self._outdated = False
         self._stopped = self._lasting = False
-        self._clock = Newest(name, self._tick)
+        self._clock = LatestWorker(name, self._tick)
 
     def start(self) -> None:
         """Start the clock."""

@@ -11,7 +11,7 @@ from spherloc_viz import style
 from spherloc_viz.app.glossary import linked
 from spherloc_viz.app.introduction import opening_step
 from spherloc_viz.app.text import box, step_html, table_html
-from spherloc_viz.app.web.viser_seams import at_once, put
+from spherloc_viz.app.web.viser_internals import at_once, put
 from spherloc_viz.layers.primitives import Step, Stop, Table
 
 PLAY_S = 3.0
@@ -34,7 +34,7 @@ HOTKEYS = (
 
 
 class StepsPanel:
-    """Which step is on. Widgets only note wishes; ``settle`` acts on them, on the session's page thread."""
+    """Which step is on. Widgets only note requests; ``advance`` acts on them, on the session's page thread."""
 
     def __init__(self, gui: viser.GuiApi, changed: Callable[[object], None]) -> None:
         self._changed = changed
@@ -60,7 +60,7 @@ class StepsPanel:
             command: Any = gui.add_command(label, hotkey=hotkey, modifier=modifier)  # type: ignore[arg-type]
             command.on_trigger(lambda event, button=button: self._press(button))
 
-    def settle(self, steps: tuple[Stop, ...], asked: bool) -> tuple[int, float | None]:
+    def advance(self, steps: tuple[Stop, ...], asked: bool) -> tuple[int, float | None]:
         """Index of the step to show, and seconds to the next one if playing; ``asked`` is false for its alarm."""
         if steps != self._steps:
             known = self._steps

@@ -44,17 +44,22 @@ class MatchCard:
         trace: Trace,
         selected: tuple[int, ...],
         kept: NDArray,
-        rival_cam_from_map: FloatArray | None = None,
+        alternative_cam_from_map: FloatArray | None = None,
         right: bool = False,
     ) -> None:
         """Show what is selected, numbers in the problem; ``kept`` (N,) are the original ones. ``right`` is whether the
         card stands on the right of the canvas, when it comes up or is about others: what was clicked is on the left.
 
-        ``rival_cam_from_map`` (3, 4) is another pose that a diagnosis knows, to hold a match against.
+        ``alternative_cam_from_map`` (3, 4) is another pose that a diagnosis knows, to hold a match against.
         """
         if self._panel.visible != bool(selected):
             self._panel.visible = bool(selected)
-        drawn = (trace, selected, kept.tobytes(), None if rival_cam_from_map is None else rival_cam_from_map.tobytes())
+        drawn = (
+            trace,
+            selected,
+            kept.tobytes(),
+            None if alternative_cam_from_map is None else alternative_cam_from_map.tobytes(),
+        )
         if not selected or (self._drawn is not None and self._drawn[0] is trace and self._drawn[1:] == drawn[1:]):
             return
         if right != self._right:
@@ -62,7 +67,7 @@ class MatchCard:
             self._panel.float(x=-MARGIN_PX if right else MARGIN_PX, y=MARGIN_PX, width=WIDTH_PX)
         self._drawn = drawn
         if len(selected) == 1:
-            what = explain(trace, selected[0], rival_cam_from_map)
+            what = explain(trace, selected[0], alternative_cam_from_map)
             html, details = one_html(trace, what, kept, self._editable), details_html(what, kept)
         else:
             numbers, traits = kept[list(selected)], explain_many(trace, np.array(selected))

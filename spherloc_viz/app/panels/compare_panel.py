@@ -17,7 +17,7 @@ from spherloc.problem import Problem
 from spherloc.trace import Trace
 from spherloc.watch import Cancelled, Watch
 from spherloc_viz import style
-from spherloc_viz.app.panels.errand import Errand
+from spherloc_viz.app.background_worker import BackgroundWorker
 from spherloc_viz.app.panels.estimator_chips import chips_html, ordered
 from spherloc_viz.app.plots.svg import chart_svg
 from spherloc_viz.app.text import DIM, WORDS, box, dot_html, status_html
@@ -91,7 +91,7 @@ class ComparePanel:
         self._shown: tuple[Comparison | None, bool] = (None, False)
         self._stop, self._watch = threading.Event(), Watch()
         self._closed, self._seen = False, False
-        self._errand = Errand("spherloc-compare", self._complain)
+        self._background = BackgroundWorker("spherloc-compare", self._complain)
         self._button.on_click(self._press)
         self._live.on_update(self._switch)
         touches.on("compare", self._tick)
@@ -114,7 +114,7 @@ class ComparePanel:
     def close(self) -> None:
         """End the comparison at hand; does not wait."""
         self._closed = True
-        self._errand.close()
+        self._background.close()
         self._halt()
 
     def _see(self, touch: Touch) -> None:
@@ -126,7 +126,7 @@ class ComparePanel:
 
     def _press(self, event: viser.GuiEvent) -> None:
         if self._button.label == STOP:
-            self._errand.forget()
+            self._background.forget()
             self._halt()
         else:
             self._start()
@@ -150,7 +150,7 @@ class ComparePanel:
     def _start(self, after_s: float = 0.0) -> None:
         """Compare after a while; what is being compared gives way."""
         self._halt()
-        self._errand.ask(partial(self._work, after_s))
+        self._background.ask(partial(self._work, after_s))
 
     def _halt(self) -> None:
         """End the comparison at hand, also within a run."""

@@ -14,7 +14,7 @@ from PIL import Image
 
 from spherloc.errors import InputError
 from spherloc.trace import Trace
-from spherloc_viz.app.panels.errand import Errand
+from spherloc_viz.app.background_worker import BackgroundWorker
 from spherloc_viz.app.stage.still_page import Still, still_html, viewpoint
 from spherloc_viz.app.text import DIM, box, status_html
 from spherloc_viz.layers.primitives import SceneItem
@@ -44,7 +44,7 @@ class Shown:
     backdrop: bytes | None
     """The map's mesh, if it is shown."""
     title: str
-    """The scene's label; a stranger's if it was uploaded."""
+    """The scene's label; untrusted if it was uploaded."""
     note: str
     """A line about the run."""
     recorded: Path | None
@@ -58,7 +58,7 @@ class ExportPanel:
     def __init__(self, gui: viser.GuiApi, client: viser.ClientHandle, shown: Callable[[], Shown | None]) -> None:
         """``shown`` tells what is on the page, on a thread of this panel; None before the first picture."""
         self._client, self._shown = client, shown
-        self._errand = Errand(f"spherloc-export-{client.client_id}", self._complain)
+        self._background = BackgroundWorker(f"spherloc-export-{client.client_id}", self._complain)
         self._code: tuple[str, str] | None = None
         buttons = (
             ("Picture (PNG)", "The canvas as it is seen now.", self._picture),
@@ -66,7 +66,7 @@ class ExportPanel:
             ("Recording (.rrd)", "The run with all of its steps, for a Rerun viewer.", self._recording),
         )
         for label, hint, job in buttons:
-            gui.add_button(label, hint=hint).on_click(lambda event, job=job: self._errand.ask(job))
+            gui.add_button(label, hint=hint).on_click(lambda event, job=job: self._background.ask(job))
         gui.add_html(LINK)
         self._status = gui.add_html("", visible=False)
         self._text = gui.add_html("")
@@ -83,7 +83,7 @@ class ExportPanel:
 
     def close(self) -> None:
         """Export nothing more; does not wait."""
-        self._errand.close()
+        self._background.close()
 
     def _now(self) -> Shown:
         shown = self._shown()

@@ -10,7 +10,7 @@ import viser
 
 from spherloc.datasets import Scene, bundled_scenes, load_scene
 from spherloc.errors import InputError
-from spherloc_viz.app.panels.errand import Errand
+from spherloc_viz.app.background_worker import BackgroundWorker
 from spherloc_viz.app.panels.folders import Listing, Roots, Row, describe
 from spherloc_viz.app.panels.open_list import list_html
 from spherloc_viz.app.panels.recent import RecentScenes
@@ -28,7 +28,7 @@ class Opened:
     """A scene to go to."""
 
     label: str
-    """What to call it; text of a stranger if it was uploaded."""
+    """What to call it; untrusted text if it was uploaded."""
     path: Path
     """Its scene file."""
     scene: Scene
@@ -50,7 +50,7 @@ class OpenPanel:
         self._open_scene = open_scene
         self._roots, self._recent = Roots(roots), recent or RecentScenes()
         self._scratch = Scratch()
-        self._errand = Errand(f"spherloc-open-{client.client_id}", self._complain)
+        self._background = BackgroundWorker(f"spherloc-open-{client.client_id}", self._complain)
         self._lock = threading.Lock()
         self._at: tuple[str, int] | None = None
         self._files: dict[str, File] = {}
@@ -61,13 +61,13 @@ class OpenPanel:
         self._list = gui.add_html("")
         # Larger files are turned away before they fill this process's memory.
         limit_uploads(client, MOST_BYTES, self._complain)
-        touches.on("open-scene", lambda touch: self._errand.ask(lambda: self._open(touch.argument)))
+        touches.on("open-scene", lambda touch: self._background.ask(lambda: self._open(touch.argument)))
         touches.on("open-folder", self._walk)
-        self._errand.ask(self._refresh)
+        self._background.ask(self._refresh)
 
     def close(self) -> None:
         """Forget what was uploaded; does not wait for what is being opened."""
-        self._errand.close()
+        self._background.close()
         self._scratch.close()
 
     def _build_form(self, gui: viser.GuiApi) -> None:
@@ -95,7 +95,7 @@ class OpenPanel:
         go = gui.add_button("Open upload")
         matches.on_upload(lambda event: self._take("matches", event.target.value))
         calibration.on_upload(lambda event: self._take("calibration", event.target.value))
-        go.on_click(lambda event: self._errand.ask(self._open_upload))
+        go.on_click(lambda event: self._background.ask(self._open_upload))
 
     def _take(self, what: str, given: viser.UploadedFile) -> None:
         """Keep an uploaded file until the form is sent."""
@@ -139,7 +139,7 @@ class OpenPanel:
         page, _, place = touch.argument.partition(":")
         with self._lock:
             self._at = (place, int(page)) if page.isascii() and page.isdigit() and len(page) < 6 else None
-        self._errand.ask(self._refresh)
+        self._background.ask(self._refresh)
 
     def _refresh(self) -> None:
         """Show the list anew."""

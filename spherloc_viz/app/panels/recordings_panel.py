@@ -8,7 +8,7 @@ import viser
 
 from spherloc.cameras.base import FloatArray
 from spherloc.errors import RecordingError
-from spherloc_viz.app.panels.errand import Errand
+from spherloc_viz.app.background_worker import BackgroundWorker
 from spherloc_viz.app.review.differences import comparison_html
 from spherloc_viz.app.review.exporter import Exporter
 from spherloc_viz.app.review.filters import pill
@@ -16,13 +16,13 @@ from spherloc_viz.app.review.gallery_list import GalleryList
 from spherloc_viz.app.review.notes import Notes
 from spherloc_viz.app.review.review_card import ReviewCard
 from spherloc_viz.app.review.reviewer import Reviewer, Reviewing
+from spherloc_viz.app.review.run_library import RunLibrary
 from spherloc_viz.app.review.run_list import RunList
-from spherloc_viz.app.review.shelf import Shelf
+from spherloc_viz.app.run_request import RunRequest
 from spherloc_viz.app.text import box, status_html
 from spherloc_viz.app.web.downloads import Downloads
 from spherloc_viz.app.web.touch import Touch, Touches
-from spherloc_viz.app.wish import Wish
-from spherloc_viz.recording.again.reopen import Reopened
+from spherloc_viz.recording.replay.reopen import Reopened
 from spherloc_viz.recording.run_row import RunRow
 
 RUNS, GALLERY = "runs", "gallery"
@@ -36,11 +36,11 @@ class Page:
 
     roots: tuple[Path, ...]
     """Folders that scenes may be opened from."""
-    enter: Callable[[Reopened], Wish]
-    """Makes a reopened scene known to the page, and gives the wish for its run."""
-    open: Callable[[Wish], None]
+    enter: Callable[[Reopened], RunRequest]
+    """Makes a reopened scene known to the page, and gives the request for its run."""
+    open: Callable[[RunRequest], None]
     """Asks for a run."""
-    open_recorded: Callable[[Wish, Path, FloatArray | None], None]
+    open_recorded: Callable[[RunRequest, Path, FloatArray | None], None]
     """Asks for a run that is recorded already, as this file and with this pose (3, 4)."""
     downloads: Downloads
     """Files that pages may fetch."""
@@ -54,38 +54,38 @@ class RecordingsPanel:
         gui: viser.GuiApi,
         client: viser.ClientHandle,
         touches: Touches,
-        shelf: Shelf | None,
+        library: RunLibrary | None,
         card: ReviewCard,
         page: Page,
     ) -> None:
         name = str(client.client_id)
-        self._shelf, self._page = shelf, page
+        self._library, self._page = library, page
         gui.add_html(f'<div data-view="{VIEW}"></div>')
-        self._switch = gui.add_html(_switch_html(RUNS if shelf is not None else GALLERY))
+        self._switch = gui.add_html(_switch_html(RUNS if library is not None else GALLERY))
         self._status = gui.add_html("", visible=False)
         self._parts: list[RunList | Notes | Reviewer | Exporter | GalleryList] = []
         self._runs: RunList | None = None
         # Apart, as it may take minutes to take in a thousand new recordings.
-        self._preparing = Errand(f"spherloc-runs-preparing-{name}", self._complain)
-        self._comparing = Errand(f"spherloc-runs-comparing-{name}", self._complain)
-        if shelf is None:
+        self._preparing = BackgroundWorker(f"spherloc-runs-preparing-{name}", self._complain)
+        self._comparing = BackgroundWorker(f"spherloc-runs-comparing-{name}", self._complain)
+        if library is None:
             self._say("Runs are not recorded: start the playground without --no-record to review them here.")
         else:
-            self._build(gui, client, touches, shelf, card)
-        self._gallery = GalleryList(gui, touches, shelf, name, self._open_file, self._open_scene)
+            self._build(gui, client, touches, library, card)
+        self._gallery = GalleryList(gui, touches, library, name, self._open_file, self._open_scene)
         self._parts.append(self._gallery)
-        self._shown, self._seen = RUNS if shelf is not None else GALLERY, False
+        self._shown, self._seen = RUNS if library is not None else GALLERY, False
         touches.on("recordings", self._choose)
         touches.on("views", self._see)
 
     def _build(
-        self, gui: viser.GuiApi, client: viser.ClientHandle, touches: Touches, shelf: Shelf, card: ReviewCard
+        self, gui: viser.GuiApi, client: viser.ClientHandle, touches: Touches, library: RunLibrary, card: ReviewCard
     ) -> None:
         name, page = str(client.client_id), self._page
-        self._notes = Notes(gui, touches, shelf, name, self._stored, self._complain)
+        self._notes = Notes(gui, touches, library, name, self._stored, self._complain)
         self._comparison = gui.add_html("", visible=False)
         self._compared: tuple[str, ...] = ()
-        self._runs = RunList(gui, touches, shelf, name, self._renew)
+        self._runs = RunList(gui, touches, library, name, self._renew)
 
         def say(words: str) -> None:
             self._say(words)
@@ -95,9 +95,9 @@ class RecordingsPanel:
             self._complain(sentence)
             card.say(_begun(sentence), wrong=True)
 
-        reviewing = Reviewing(shelf, page.roots, card, page.enter, page.open_recorded, say, complain, self._follow)
+        reviewing = Reviewing(library, page.roots, card, page.enter, page.open_recorded, say, complain, self._follow)
         self._reviewer = Reviewer(touches, self._runs, reviewing, name)
-        exporter = Exporter(gui, name, touches, shelf, page.downloads, self._runs, self._say, self._complain)
+        exporter = Exporter(gui, name, touches, library, page.downloads, self._runs, self._say, self._complain)
         self._parts += [self._notes, self._runs, self._reviewer, exporter]
         touches.on("runs-compare", lambda touch: self._comparing.ask(self._compare))
         touches.on("runs-uncompare", lambda touch: self._uncompare())
@@ -112,8 +112,8 @@ class RecordingsPanel:
     def _see(self, touch: Touch) -> None:
         """Other tabs are open now."""
         before, self._seen = self._seen, VIEW in touch.argument.split(",")
-        if self._seen and not before and self._shelf is not None:
-            self._preparing.ask(self._shelf.prepare)
+        if self._seen and not before and self._library is not None:
+            self._preparing.ask(self._library.prepare)
         self._show()
 
     def _choose(self, touch: Touch) -> None:
@@ -135,8 +135,8 @@ class RecordingsPanel:
 
     def _compare(self) -> None:
         """Put the two marked runs side by side."""
-        assert self._shelf is not None and self._runs is not None
-        rows = self._shelf.rows(self._runs.marked)
+        assert self._library is not None and self._runs is not None
+        rows = self._library.rows(self._runs.marked)
         if len(rows) != 2:
             raise RecordingError("one of the marked runs is not in the list any more; mark two others.")
         self._compared = rows[0].file, rows[1].file
@@ -149,24 +149,24 @@ class RecordingsPanel:
 
     def _follow(self, row: RunRow | None) -> None:
         """Another run is open, or none."""
-        assert self._shelf is not None
-        self._notes.show(row, () if row is None else self._shelf.labels())
+        assert self._library is not None
+        self._notes.show(row, () if row is None else self._library.labels())
         if row is not None and row.file not in self._compared:
             self._compared, self._comparison.visible = (), False
 
     def _renew(self) -> None:
         """The list may have become another one: where in it the open run is, and what other pages say of that run."""
-        assert self._shelf is not None
+        assert self._library is not None
         self._reviewer.locate()
         row = self._reviewer.news()
         if row is not None:
-            self._notes.refresh(row, self._shelf.labels())
+            self._notes.refresh(row, self._library.labels())
 
     def _stored(self, row: RunRow) -> None:
         """A run was labelled."""
-        assert self._shelf is not None and self._runs is not None
+        assert self._library is not None and self._runs is not None
         self._reviewer.relabelled(row)
-        self._notes.refresh(row, self._shelf.labels())
+        self._notes.refresh(row, self._library.labels())
         self._runs.ask()
 
     def _open_file(self, file: str) -> None:

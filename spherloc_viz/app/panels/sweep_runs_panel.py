@@ -14,14 +14,14 @@ from spherloc.errors import InputError, SpherlocError
 from spherloc.experiments.sweep import AXES, Entrant, SweepPlan, SweepRow, planned, run_sweep
 from spherloc.experiments.sweep_summary import rows_text, summarize, summary_text
 from spherloc.experiments.sweep_text import parse_values
-from spherloc_viz.app.catalog import SceneWish
+from spherloc_viz.app.catalog import SceneRequest
 from spherloc_viz.app.panels.estimator_chips import chips_html, ordered
 from spherloc_viz.app.plots.sweep_charts import charts_html, table_html
 from spherloc_viz.app.text import status_html
 from spherloc_viz.app.web.touch import Touch, Touches
-from spherloc_viz.app.web.viser_seams import put
+from spherloc_viz.app.web.viser_internals import put
 from spherloc_viz.options import usable_estimators
-from spherloc_viz.recording.keeping.recorder import Recorder
+from spherloc_viz.recording.storage.recorder import Recorder
 
 START, CANCEL = "Start sweep", "Cancel"
 VALUES = {
@@ -66,7 +66,7 @@ class SweepPanel:
         self,
         gui: viser.GuiApi,
         touches: Touches,
-        chosen: Callable[[], tuple[Path, SceneWish]],
+        chosen: Callable[[], tuple[Path, SceneRequest]],
         recorder: Recorder | None = None,
     ) -> None:
         """``chosen`` tells the file of the page's scene and what is changed about it; it may raise ``InputError``.
@@ -161,12 +161,12 @@ class SweepPanel:
 
     def _begin(self) -> _Results:
         """The sweep that the page describes, with the results of the last one if it was the same."""
-        path, wish = self._chosen()
+        path, request = self._chosen()
         over = self._axis()
-        variation = replace(wish.variation.without_edits(), **{over: None})
+        variation = replace(request.variation.without_edits(), **{over: None})
         entrants = [Entrant(name) for name in self._names if name in self._ticked]
         values, runs = parse_values([self._values.value]), int(self._runs.value)
-        plan = planned(path, over, values, entrants, runs, variation, wish.seed)
+        plan = planned(path, over, values, entrants, runs, variation, request.seed)
         if plan.rows > MOST_PAGE_ROWS:
             raise InputError(
                 f"these are {plan.rows:,} runs; ask for {MOST_PAGE_ROWS:,} or fewer, or take spherloc sweep on the "
@@ -174,8 +174,8 @@ class SweepPanel:
             )
         before = self._results
         same = before is not None and replace(before.plan, runs=runs) == plan
-        rows = tuple(row for row in before.rows if row.seed < wish.seed + runs) if before and same else ()
-        self._results = _Results(plan, wish.scene, rows)
+        rows = tuple(row for row in before.rows if row.seed < request.seed + runs) if before and same else ()
+        self._results = _Results(plan, request.scene, rows)
         return self._results
 
     def _sweep(self, results: _Results, stop: threading.Event) -> None:
@@ -184,7 +184,7 @@ class SweepPanel:
         done = {(row.estimator, row.value, row.seed) for row in rows}
         began, before, due = time.monotonic(), len(rows), 0.0
         recorder, self._complaints = self._recorder if self._record.value else None, []
-        keep = None if recorder is None else recorder.sweep_keeper()
+        keep = None if recorder is None else recorder.sweep_store()
         workers, complain = int(self._workers.value), self._complaints.append
         for row in run_sweep(plan, done, workers, stop=stop, keep=keep, complain=complain):
             rows.append(row)

@@ -1,6 +1,6 @@
 """Makes a scene of what a person uploads: matches, a calibration, gravity and maybe the truth.
 
-What is uploaded is a stranger's. It is limited in size, read only as what it should be, and written nowhere but into
+What is uploaded is untrusted. It is limited in size, read only as what it should be, and written nowhere but into
 the session's own folder, under names of ours. No uploaded file can name another file.
 """
 
@@ -34,7 +34,7 @@ class File:
     """A file as it was uploaded."""
 
     name: str
-    """A stranger's word: shown, never used as a path."""
+    """Untrusted text: shown, never used as a path."""
     content: bytes
 
     @property

@@ -31,7 +31,7 @@ LOOKS = (
 LINK = shapes.stroke(style.SELECTED, 1.5)
 EDGE = f' stroke="{style.css(style.SELECTED)}" stroke-width="1.5"'
 HOVER = (
-    "<style>.yaw-twin{display:none;pointer-events:none}.yaw-arc:hover+.yaw-twin,.yaw-twin.chosen{display:inline}"
+    "<style>.yaw-second{display:none;pointer-events:none}.yaw-arc:hover+.yaw-second,.yaw-second.chosen{display:inline}"
     ".yaw-arc:hover{stroke:currentColor;stroke-width:1.2}</style>"
 )
 """A pair under the pointer shows its arcs over the whole circle too."""
@@ -170,48 +170,49 @@ def _hypotheses(story: YawStory, x: Scale, y: Scale, window: Window, now: str) -
 
 
 def _bars(bars: Bars, whole: Scale, part: Scale, pitch: float, window: Window, kept: NDArray[np.int64]) -> list[str]:
-    """A bar an arc in the window; behind it, shown when the pair is pointed at or chosen, what joins it to its twin."""
-    data, twins = _bar_data(bars, whole, part, pitch, window)
+    """A bar an arc in the window; behind it, shown when the pair is pointed at or chosen, what joins
+    it to the other arc of the pair."""
+    data, links = _bar_data(bars, whole, part, pitch, window)
     rows = zip(
-        kept[bars.pairs].tolist(), bars.kind.tolist(), bars.chosen.tolist(), data, twins, _tips(bars), strict=True
+        kept[bars.pairs].tolist(), bars.kind.tolist(), bars.chosen.tolist(), data, links, _tips(bars), strict=True
     )
     out: list[str] = []
-    for (a, b), kind, chosen, path, twin, tip in rows:
+    for (a, b), kind, chosen, path, link, tip in rows:
         tag = f'class="yaw-arc" data-touch="select:{a},{b}" d="{path}" {LOOKS[kind]}{EDGE if chosen else ""}'
         if path:
             out.append(f"<path {tag}><title>{a} and {b}, {KINDS[kind]}: {tip}</title></path>")
-        if twin:
-            out.append(f'<path class="yaw-twin{" chosen" if chosen else ""}" d="{twin}" {LINK}/>')
+        if link:
+            out.append(f'<path class="yaw-second{" chosen" if chosen else ""}" d="{link}" {LINK}/>')
     return out
 
 
 def _bar_data(bars: Bars, whole: Scale, part: Scale, pitch: float, window: Window) -> tuple[list[str], list[str]]:
-    """The data of two paths for every pair: of its arcs in the window; and, if it has a twin or is chosen, of ticks at
-    all of its arcs over the whole circle and of what joins them, there and in the window.
+    """The data of two paths for every pair: of its arcs in the window; and, if it has a second arc or is chosen, of
+    ticks at all of its arcs over the whole circle and of what joins them, there and in the window.
     """
     arc, low, high = spans_in(bars.lo_deg, bars.hi_deg, window)
     left = part.px(low)
     width = np.maximum(1.5, part.px(high) - left)
     top = WINDOW_FOOT_PX + 6.0 + pitch * bars.row[arc]
-    data, twins = [""] * len(bars.pairs), [""] * len(bars.pairs)
+    data, links = [""] * len(bars.pairs), [""] * len(bars.pairs)
     linked = ((bars.count > 1) | bars.chosen)[bars.owner]
     boxes = _each(f"M%.1f %.1fh%.1fv{0.78 * pitch:.1f}h-%.1fz", left, top, width, width)
     spots = _each("%.1f %.1f", left + 0.5 * width, top + 0.39 * pitch)
     for pair, link, text, spot in zip(bars.owner[arc].tolist(), linked[arc].tolist(), boxes, spots, strict=True):
         data[pair] += text
         if link:
-            twins[pair] += f"{'L' if twins[pair] else 'M'}{spot}"
+            links[pair] += f"{'L' if links[pair] else 'M'}{spot}"
     middles = whole.px(wrapped_deg(0.5 * (bars.lo_deg + bars.hi_deg)))
     ends = whole.px(np.maximum(bars.lo_deg, -180.0)), whole.px(np.minimum(bars.hi_deg, 180.0))
     ticks = _each(f"M%.1f {CIRCLE_FOOT_PX - 2:g}H%.1f", ends[0], np.maximum(ends[1], ends[0] + 1.5))
     before: dict[int, float] = {}
     for k in np.flatnonzero(linked).tolist():
         pair, middle = int(bars.owner[k]), float(middles[k])
-        twins[pair] += ticks[k]
+        links[pair] += ticks[k]
         if pair in before:
-            twins[pair] += _arch(before[pair], middle)
+            links[pair] += _arch(before[pair], middle)
         before[pair] = middle
-    return data, twins
+    return data, links
 
 
 def _arch(a: float, b: float) -> str:
@@ -233,5 +234,5 @@ def _tips(bars: Bars) -> list[str]:
         texts[k] = "every yaw"
     tips = [""] * len(bars.pairs)
     for pair, text in zip(bars.owner[order].tolist(), texts, strict=True):
-        tips[pair] += f", twin {text}" if tips[pair] else text
+        tips[pair] += f", second arc {text}" if tips[pair] else text
     return [tip.replace("-", MINUS) for tip in tips]

@@ -13,7 +13,7 @@ from spherloc.trace import Trace
 from spherloc_viz.app.plots.yaw_drawing import ZOOM, yaw_svg
 from spherloc_viz.app.text import box
 from spherloc_viz.app.web.touch import Touch, Touches
-from spherloc_viz.app.web.viser_seams import at_once
+from spherloc_viz.app.web.viser_internals import at_once
 from spherloc_viz.layers.yaw_bars import (
     KINDS,
     Arcs,

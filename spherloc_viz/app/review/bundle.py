@@ -16,7 +16,7 @@ from spherloc_viz.app.review.summary_page import summary_html
 from spherloc_viz.recording.index.run_text import rows_text
 from spherloc_viz.recording.review.notes import review_path
 from spherloc_viz.recording.run_row import RunRow
-from spherloc_viz.recording.strangers.examiner import resolve_inside
+from spherloc_viz.recording.sandbox.examiner import resolve_inside
 
 MOST_RUNS = 500
 MOST_BYTES = 200_000_000

@@ -13,9 +13,9 @@ from spherloc_viz.app.review import words
 from spherloc_viz.app.review.filters import key_html, keyed, pill
 from spherloc_viz.app.review.opened import Opened, is_same_pose
 from spherloc_viz.app.review.rows import NEXT_KEY, PREVIOUS_KEY, badge_html, verdict_html
+from spherloc_viz.app.run_request import Run
 from spherloc_viz.app.text import DIM, box
 from spherloc_viz.app.web.viewer_room import viewer_link
-from spherloc_viz.app.wish import Run
 from spherloc_viz.layers import steps
 from spherloc_viz.recording.content.properties import outcome
 from spherloc_viz.recording.run_row import RunRow
@@ -53,7 +53,7 @@ def said_html(sentence: str, wrong: bool) -> str:
 def card_html(opened: Opened, run: Run, diagnosis: Diagnosis | None, bar: str) -> str:
     """The whole card: the run as it was recorded, and as soon as it is changed, a table of both."""
     row = opened.recorded.row
-    is_it = run.wish == opened.wish
+    is_it = run.request == opened.request
     title = (
         f'<div style="font-weight:600;padding-top:.3em;white-space:nowrap;overflow:hidden;text-overflow:ellipsis" '
         f'title="{escape(row.file)}">{escape(words.title_of(row))}'
@@ -121,7 +121,7 @@ def _remark(opened: Opened, run: Run, is_it: bool) -> str:
         return ""
     sentence = "Repeated here, it finds another pose."
     if not is_it:
-        fields = sorted(name.replace("_", " ") for name in changed_fields(opened.wish, run.wish))
+        fields = sorted(name.replace("_", " ") for name in changed_fields(opened.request, run.request))
         sentence = f"Changed: {', '.join(fields)}.{' The pose is the same.' if same else ''}"
     return f'<div style="{DIM}">{escape(sentence)}</div>'
 
@@ -131,13 +131,13 @@ def _ways(row: RunRow, run: Run | None) -> str:
     ways = []
     if run is None:
         ways.append(_way("run-return:", "back to the recorded run"))
-    elif 0 <= row.decisive_step < len(stops := steps(run.trace)):
-        stop = stops[row.decisive_step]
-        ways.append(_way(f"step:{stop.key}", f"step {row.decisive_step + 1}: {stop.title}"))
-    link = escape(viewer_link(row.file, row.decisive_step))
+    elif 0 <= row.key_step < len(stops := steps(run.trace)):
+        stop = stops[row.key_step]
+        ways.append(_way(f"step:{stop.key}", f"step {row.key_step + 1}: {stop.title}"))
+    link = escape(viewer_link(row.file, row.key_step))
     ways.append(
         f'<a href="{link}" target="_blank" rel="noopener" title="Open in the Rerun viewer at the step where it was '
-        f'decided: #{row.decisive_step} on its timeline, which counts from 0" '
+        f'decided: #{row.key_step} on its timeline, which counts from 0" '
         'style="color:inherit;white-space:nowrap">Open in Rerun ↗</a>'
     )
     row_css = "padding-top:.25em;display:flex;justify-content:space-between;gap:1em"

@@ -8,11 +8,11 @@ from html import escape
 import viser
 
 from spherloc.errors import RecordingError
-from spherloc_viz.app.panels.errand import Errand
+from spherloc_viz.app.background_worker import BackgroundWorker
 from spherloc_viz.app.review import words
 from spherloc_viz.app.review.bundle import MOST_RUNS, bundle
+from spherloc_viz.app.review.run_library import RunLibrary
 from spherloc_viz.app.review.run_list import RunList
-from spherloc_viz.app.review.shelf import Shelf
 from spherloc_viz.app.text import box
 from spherloc_viz.app.web.downloads import Download, Downloads
 from spherloc_viz.app.web.touch import Touches
@@ -26,33 +26,33 @@ class Exporter:
         gui: viser.GuiApi,
         name: str,
         touches: Touches,
-        shelf: Shelf,
+        library: RunLibrary,
         downloads: Downloads,
         runs: RunList,
         say: Callable[[str], None],
         complain: Callable[[str], None],
     ) -> None:
         """``name`` tells its thread from those of other pages."""
-        self._shelf, self._downloads, self._runs, self._say = shelf, downloads, runs, say
+        self._library, self._downloads, self._runs, self._say = library, downloads, runs, say
         self._link = gui.add_html("", visible=False)
         self._offered: Download | None = None
         self._lock = threading.Lock()
         self._closed = False
-        self._errand = Errand(f"spherloc-zip-{name}", complain)
-        touches.on("runs-export", lambda touch: self._errand.ask(self._export))
+        self._background = BackgroundWorker(f"spherloc-zip-{name}", complain)
+        touches.on("runs-export", lambda touch: self._background.ask(self._export))
 
     def close(self) -> None:
         """Export nothing more, and offer nothing; does not wait."""
         self._closed = True
-        self._errand.close()
+        self._background.close()
         self._offer(None)
 
     def _export(self) -> None:
         marked = self._runs.marked
         if marked:
-            rows, total = self._shelf.rows(marked[:MOST_RUNS]), len(marked)
+            rows, total = self._library.rows(marked[:MOST_RUNS]), len(marked)
         else:
-            found = self._shelf.all(self._runs.look, MOST_RUNS)
+            found = self._library.all(self._runs.look, MOST_RUNS)
             rows, total = found.rows, found.total
         self._offer(None)
         about = sum(row.size_bytes for row in rows)
@@ -60,7 +60,7 @@ class Exporter:
         now = datetime.now(UTC)
         download = self._downloads.room(f"spherloc-runs-{now:%Y%m%dT%H%M%SZ}.zip")
         try:
-            packed = bundle(download.path, self._shelf.folder, rows, total, now, lambda: self._closed)
+            packed = bundle(download.path, self._library.folder, rows, total, now, lambda: self._closed)
         except RecordingError:
             self._downloads.withdraw(download)
             raise

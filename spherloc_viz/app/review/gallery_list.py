@@ -8,14 +8,14 @@ from pathlib import Path
 import viser
 
 from spherloc_viz import style
-from spherloc_viz.app.panels.errand import Errand
+from spherloc_viz.app.background_worker import BackgroundWorker
 from spherloc_viz.app.review.filters import pill
 from spherloc_viz.app.review.rows import OPENED, RULE, picture_html
-from spherloc_viz.app.review.shelf import Shelf
+from spherloc_viz.app.review.run_library import RunLibrary
 from spherloc_viz.app.text import DIM, box, status_html
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.gallery import GALLERY, GalleryCase, Play, gallery_cases
-from spherloc_viz.recording.again.reopen import Reopened
+from spherloc_viz.recording.replay.reopen import Reopened
 from spherloc_viz.recording.run_row import RunRow
 
 FOLDER = "gallery"
@@ -29,15 +29,15 @@ class GalleryList:
         self,
         gui: viser.GuiApi,
         touches: Touches,
-        shelf: Shelf | None,
+        library: RunLibrary | None,
         name: str,
         open_file: Callable[[str], None],
         open_scene: Callable[[Reopened, bool], None],
     ) -> None:
         """``open_file`` opens a recording, ``open_scene`` what has none, beside the open recording or instead of it;
         both are called on a thread of this part."""
-        self._shelf, self._open_file, self._open_scene = shelf, open_file, open_scene
-        self._errand = Errand(f"spherloc-gallery-{name}", self._fail)
+        self._library, self._open_file, self._open_scene = library, open_file, open_scene
+        self._background = BackgroundWorker(f"spherloc-gallery-{name}", self._fail)
         self._html = gui.add_html("", visible=False)
         self._opened: str | None = None
         touches.on("gallery-open", self._press)
@@ -47,19 +47,19 @@ class GalleryList:
         """Show the list, or make room."""
         self._html.visible = shown
         if shown:
-            self._errand.ask(self._draw)
+            self._background.ask(self._draw)
 
     def close(self) -> None:
         """Open nothing more; does not wait."""
-        self._errand.close()
+        self._background.close()
 
     def _press(self, touch: Touch) -> None:
-        self._errand.ask(partial(self._open, touch.argument))
+        self._background.ask(partial(self._open, touch.argument))
 
     def _press_beside(self, touch: Touch) -> None:
         key, _, number = touch.argument.rpartition(":")
         if number.isascii() and number.isdigit() and len(number) < 4:
-            self._errand.ask(partial(self._open_beside, key, int(number)))
+            self._background.ask(partial(self._open_beside, key, int(number)))
 
     def _open(self, key: str) -> None:
         case = next((case for case in gallery_cases() if case.key == key), None)
@@ -82,7 +82,7 @@ class GalleryList:
     def _rows(self) -> dict[str, RunRow]:
         """The recordings of the cases that have one."""
         files = [file_of(case) for case in gallery_cases()]
-        return {} if self._shelf is None else {row.file: row for row in self._shelf.rows(files)}
+        return {} if self._library is None else {row.file: row for row in self._library.rows(files)}
 
     def _draw(self) -> None:
         html = gallery_html(gallery_cases(), self._rows(), self._opened)

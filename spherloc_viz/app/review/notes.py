@@ -9,12 +9,12 @@ from html import escape
 import viser
 
 from spherloc.errors import SpherlocError
-from spherloc_viz.app.panels.errand import Errand
+from spherloc_viz.app.background_worker import BackgroundWorker
 from spherloc_viz.app.review.filters import pill
-from spherloc_viz.app.review.shelf import Shelf
+from spherloc_viz.app.review.run_library import RunLibrary
 from spherloc_viz.app.text import box
 from spherloc_viz.app.web.touch import Touch, Touches
-from spherloc_viz.app.web.viser_seams import at_once, changes_of, put
+from spherloc_viz.app.web.viser_internals import at_once, changes_of, put
 from spherloc_viz.recording.review.notes import Review, checked_review
 from spherloc_viz.recording.run_row import RunRow
 
@@ -53,13 +53,13 @@ class Notes:
         self,
         gui: viser.GuiApi,
         touches: Touches,
-        shelf: Shelf,
+        library: RunLibrary,
         name: str,
         stored: Callable[[RunRow], None],
         failed: Callable[[str], None],
     ) -> None:
         """``stored`` is called, on a thread of this part, with the row as it is by then."""
-        self._shelf, self._stored, self._failed = shelf, stored, failed
+        self._library, self._stored, self._failed = library, stored, failed
         self._changes = changes_of(gui)
         hint = "Words that tell what kind of run it is, with commas between them."
         labels = [gui.add_text("Labels", "", visible=False, hint=hint) for _ in range(2)]
@@ -73,7 +73,7 @@ class Notes:
         """What the fields said before, and what they say now."""
         self._storing: str | None = None
         self._typed, self._closed = threading.Event(), False
-        self._errand = Errand(f"spherloc-notes-{name}", failed)
+        self._background = BackgroundWorker(f"spherloc-notes-{name}", failed)
         for widget in (*labels, *notes):
             widget.on_update(self._type)
         touches.on("run-label", self._toggle)
@@ -165,7 +165,7 @@ class Notes:
         self._pending[fields.file] = base, fields.read()
         self._typed.set()
         self._typed = threading.Event()
-        self._errand.ask(partial(self._store, self._typed, pause_s))
+        self._background.ask(partial(self._store, self._typed, pause_s))
 
     def _store(self, typed: threading.Event, pause_s: float) -> None:
         """Store all that waits, unless more is typed meanwhile: what comes then is stored by the next job."""
@@ -182,7 +182,7 @@ class Notes:
                 if about is not None:
                     about.known = now
             try:
-                row = self._shelf.review(file, before, now)
+                row = self._library.review(file, before, now)
                 stored = Review(row.labels, row.note)
                 known = stored if stored == checked_review(now.labels, now.note) else now
             except SpherlocError as error:  # what was said of other runs is stored all the same

@@ -10,7 +10,7 @@ from spherloc import registry
 from spherloc.cameras.base import FloatArray
 from spherloc.geometry import camera_centre
 from spherloc_viz import style
-from spherloc_viz.app.wish import Run, Wish
+from spherloc_viz.app.run_request import Run, RunRequest
 from spherloc_viz.layers.comparison import color_of
 from spherloc_viz.layers.frame import RunView
 from spherloc_viz.layers.primitives import Label, SceneItem
@@ -42,7 +42,7 @@ class Opened:
     recorded: Recorded
     path: Path
     """Its file."""
-    wish: Wish
+    request: RunRequest
     """Gives the same run again."""
     truth_cam_from_map: FloatArray | None = None
     """The recorded problem's true pose (3, 4), if known."""
@@ -57,7 +57,7 @@ class Opened:
 def is_its_world(opened: Opened, run: Run) -> bool:
     """Whether places of the run that was opened mean something in the run on the page: another seed of a simulation
     draws another map, and with it another true camera."""
-    one, other = opened.wish.scene, run.wish.scene
+    one, other = opened.request.scene, run.request.scene
     truth, now = opened.truth_cam_from_map, run.trace.problem.truth_cam_from_map
     if truth is not None and is_same_pose(truth, now):
         return True

@@ -9,7 +9,7 @@ import viser
 from spherloc.diagnosis import Diagnosis
 from spherloc_viz.app.review.card import bar_html, card_html, said_html
 from spherloc_viz.app.review.opened import Opened, reference_items
-from spherloc_viz.app.wish import Run, Wish
+from spherloc_viz.app.run_request import Run, RunRequest
 from spherloc_viz.layers.primitives import SceneItem
 
 
@@ -50,9 +50,9 @@ class ReviewCard:
         if before != self._said:
             self._redraw()
 
-    def became(self, asked: Wish, wish: Wish) -> None:
+    def became(self, asked: RunRequest, request: RunRequest) -> None:
         """The page says in its own words what it was asked for."""
-        self.amend(lambda opened: replace(opened, wish=wish) if opened.wish is asked else opened)
+        self.amend(lambda opened: replace(opened, request=request) if opened.request is asked else opened)
 
     def place(self, place: int | None, total: int) -> None:
         """Say where in the list the run is."""

@@ -7,16 +7,16 @@ from functools import partial
 from pathlib import Path
 
 from spherloc.cameras.base import FloatArray
-from spherloc_viz.app.panels.errand import Errand
+from spherloc_viz.app.background_worker import BackgroundWorker
 from spherloc_viz.app.review.differences import NAMES, same_problem
 from spherloc_viz.app.review.look import PAGE
 from spherloc_viz.app.review.opened import AS_RECORDED, Opened, Recorded
 from spherloc_viz.app.review.review_card import ReviewCard
+from spherloc_viz.app.review.run_library import RunLibrary
 from spherloc_viz.app.review.run_list import RunList
-from spherloc_viz.app.review.shelf import Shelf
+from spherloc_viz.app.run_request import RunRequest
 from spherloc_viz.app.web.touch import Touch, Touches
-from spherloc_viz.app.wish import Wish
-from spherloc_viz.recording.again.reopen import Reopened, reopen
+from spherloc_viz.recording.replay.reopen import Reopened, reopen
 from spherloc_viz.recording.run_row import RunRow
 
 
@@ -24,13 +24,13 @@ from spherloc_viz.recording.run_row import RunRow
 class Reviewing:
     """What a reviewer needs of the page."""
 
-    shelf: Shelf
+    library: RunLibrary
     roots: tuple[Path, ...]
     """Folders that scenes may be opened from."""
     card: ReviewCard
-    enter: Callable[[Reopened], Wish]
-    """Makes a reopened scene known to the page, and gives the wish for the run."""
-    open: Callable[[Wish, Path, FloatArray | None], None]
+    enter: Callable[[Reopened], RunRequest]
+    """Makes a reopened scene known to the page, and gives the request for the run."""
+    open: Callable[[RunRequest, Path, FloatArray | None], None]
     """Asks for a run that is recorded already, as this file and with this pose (3, 4)."""
     say: Callable[[str], None]
     """Shows a sentence about what goes on; an empty one for nothing."""
@@ -41,11 +41,11 @@ class Reviewing:
 
 
 class Reviewer:
-    """One page's. Presses only note what is to be opened; a thread of an errand does it."""
+    """One page's. Presses only note what is to be opened; a thread of an background job does it."""
 
     def __init__(self, touches: Touches, runs: RunList, reviewing: Reviewing, name: str) -> None:
         self._runs, self._has = runs, reviewing
-        self._errand = Errand(f"spherloc-reviewer-{name}", reviewing.complain)
+        self._background = BackgroundWorker(f"spherloc-reviewer-{name}", reviewing.complain)
         self._lock = threading.Lock()
         self._steps, self._place = 0, 0
         touches.on("run-open", lambda touch: self.ask(touch.argument))
@@ -57,12 +57,12 @@ class Reviewer:
         """Have a recording opened."""
         with self._lock:
             self._steps, self._place = 0, PAGE * self._runs.look.page
-        self._errand.ask(partial(self._open_file, file))
+        self._background.ask(partial(self._open_file, file))
 
     def compare(self, one: RunRow, other: RunRow) -> None:
         """Have the first opened and, if both are of one problem, the second one drawn beside it."""
         if same_problem(one, other):
-            self._errand.ask(partial(self._open_both, one.file, other.file))
+            self._background.ask(partial(self._open_both, one.file, other.file))
 
     def leave(self) -> None:
         """Take the recorded run away; the page stays as it is."""
@@ -88,7 +88,7 @@ class Reviewer:
         opened = self._has.card.opened
         if opened is None:
             return None
-        row = next(iter(self._has.shelf.rows([opened.recorded.row.file])), None)
+        row = next(iter(self._has.library.rows([opened.recorded.row.file])), None)
         if row is None or row == opened.recorded.row:
             return None
         self.relabelled(row)
@@ -99,20 +99,20 @@ class Reviewer:
         opened = self._has.card.opened
         if opened is None:
             return None
-        at, total = self._has.shelf.place(self._runs.look, opened.recorded.row.file, self._place)
+        at, total = self._has.library.place(self._runs.look, opened.recorded.row.file, self._place)
         self._place = self._place if at is None else at
         self._has.card.place(at, total)
         return at
 
     def close(self) -> None:
         """Open nothing more; does not wait."""
-        self._errand.close()
+        self._background.close()
 
     def _step(self, touch: Touch) -> None:
         by = {"1": 1, "-1": -1}.get(touch.argument, 0)
         with self._lock:
             self._steps += by
-        self._errand.ask(self._walk)
+        self._background.ask(self._walk)
 
     def _walk(self) -> None:
         """Go on by as many runs as was asked for meanwhile: what is passed quickly is not opened."""
@@ -124,10 +124,10 @@ class Reviewer:
         if opened is None:
             goal = look.page * PAGE + by - 1
         else:
-            at, _ = self._has.shelf.place(look, opened.recorded.row.file, self._place)
+            at, _ = self._has.library.place(look, opened.recorded.row.file, self._place)
             # A run that no longer fits the filter has left its place to the next one.
             goal = at + by if at is not None else self._place + by - (by > 0)
-        row = self._has.shelf.at(look, goal)
+        row = self._has.library.at(look, goal)
         if row is None:
             self._has.say("This is the last run of the list." if by > 0 else "This is the first run of the list.")
             return
@@ -139,25 +139,25 @@ class Reviewer:
 
     def _open_both(self, one: str, other: str) -> None:
         opened = self._read(one)
-        run, _ = self._has.shelf.read(other)
-        beside = Recorded(self._has.shelf.row(other), run.cam_from_map, NAMES[1])
+        run, _ = self._has.library.read(other)
+        beside = Recorded(self._has.library.row(other), run.cam_from_map, NAMES[1])
         self._show(replace(opened, recorded=replace(opened.recorded, name=NAMES[0]), other=beside))
 
     def _read(self, file: str) -> Opened:
         """Read a recording and open its scene."""
-        row = self._has.shelf.row(file)
+        row = self._has.library.row(file)
         self._has.say(f"Opening {row.file} …")
-        run, path = self._has.shelf.read(file)
+        run, path = self._has.library.read(file)
         got = reopen(run, path, self._has.roots)
         story = "" if run.origin is None else run.origin.story
         recorded = Recorded(row, run.cam_from_map)
-        wish = self._has.enter(got)
-        return Opened(recorded, path, wish, run.problem.truth_cam_from_map, got.sentence, story)
+        request = self._has.enter(got)
+        return Opened(recorded, path, request, run.problem.truth_cam_from_map, got.sentence, story)
 
     def _show(self, opened: Opened) -> None:
         row = opened.recorded.row
         self._has.card.show(opened)
-        self._has.open(opened.wish, opened.path, opened.recorded.cam_from_map)
+        self._has.open(opened.request, opened.path, opened.recorded.cam_from_map)
         self._runs.show(row.file, self.locate())
         self._has.changed(row)
         self._has.say("")
@@ -165,7 +165,7 @@ class Reviewer:
     def _return(self) -> None:
         opened = self._has.card.opened
         if opened is not None:
-            self._has.open(opened.wish, opened.path, opened.recorded.cam_from_map)
+            self._has.open(opened.request, opened.path, opened.recorded.cam_from_map)
 
 
 def _alone(opened: Opened) -> Opened:

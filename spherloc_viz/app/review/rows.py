@@ -13,7 +13,7 @@ from spherloc_viz.app.review.look import PAGE, Look
 from spherloc_viz.app.text import DIM, box, dot_html
 from spherloc_viz.app.web.viewer_room import viewer_link
 from spherloc_viz.recording.run_row import RunRow
-from spherloc_viz.recording.strangers.checked_row import is_thumbnail
+from spherloc_viz.recording.sandbox.checked_row import is_thumbnail
 
 WIDTH_PX, HEIGHT_PX = 64, 46
 """Of a row's picture."""
@@ -47,10 +47,10 @@ def row_html(row: RunRow, marked: bool, opened: bool, now: datetime) -> str:
         f'data-touch="run-mark:{file}" title="Mark, to compare or export" '
         f'style="position:absolute;left:4px;top:4px;{look}">{"☑" if marked else "☐"}</span>'
     )
-    address = escape(viewer_link(row.file, row.decisive_step))
+    address = escape(viewer_link(row.file, row.key_step))
     link = (
         f'<a href="{address}" target="_blank" rel="noopener" '
-        f'title="Open in Rerun\'s viewer at step {row.decisive_step + 1} of {row.steps}, #{row.decisive_step} there" '
+        f'title="Open in Rerun\'s viewer at step {row.key_step + 1} of {row.steps}, #{row.key_step} there" '
         'style="color:inherit;text-decoration:none;padding:.4em .1em .4em .4em;opacity:.75;font-size:13px">↗</a>'
     )
     about = f'<div style="flex:1;min-width:0">{_lines(row, now)}</div>'

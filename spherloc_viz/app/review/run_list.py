@@ -10,14 +10,14 @@ from html import escape
 import viser
 
 from spherloc.errors import SpherlocError
-from spherloc_viz.app.panels.errand import Errand
+from spherloc_viz.app.background_worker import BackgroundWorker
 from spherloc_viz.app.review.filters import filters_html, pill
 from spherloc_viz.app.review.look import EXACT, OUTLIERS, Look
 from spherloc_viz.app.review.rows import rows_html
-from spherloc_viz.app.review.shelf import Shelf
+from spherloc_viz.app.review.run_library import RunLibrary
 from spherloc_viz.app.text import DIM, box, status_html
 from spherloc_viz.app.web.touch import Touch, Touches
-from spherloc_viz.app.web.viser_seams import put
+from spherloc_viz.app.web.viser_internals import put
 from spherloc_viz.recording.index.query import MAX_TEXT
 
 FOLLOW_S = 1.5
@@ -31,18 +31,18 @@ class RunList:
     """Draws on a thread that lives only while the list is seen or asked for something."""
 
     def __init__(
-        self, gui: viser.GuiApi, touches: Touches, shelf: Shelf, name: str, drawn: Callable[[], object]
+        self, gui: viser.GuiApi, touches: Touches, library: RunLibrary, name: str, drawn: Callable[[], object]
     ) -> None:
         """``drawn`` is called, on a thread of the list, whenever it may have become another one."""
         self._drawn = drawn
-        self._shelf = shelf
+        self._library = library
         self._lock = threading.Lock()
         self._look = Look()
         self._marked: tuple[str, ...] = ()
         self._opened: str | None = None
         self._seen = self._hidden = False
         self._due = threading.Event()
-        self._errand = Errand(f"spherloc-runs-{name}", self._fail)
+        self._background = BackgroundWorker(f"spherloc-runs-{name}", self._fail)
         self._search = gui.add_text("Search", "", hint="Words in the name, the message, the note, labels …")
         self._range = gui.add_text("Outliers", "", visible=False, hint="A range of shares: >0.9, 0.5..0.9 or <=0.3.")
         self._filters = gui.add_html("")
@@ -91,7 +91,7 @@ class RunList:
             due = self._due
         before.set()
         if self._seen:
-            self._errand.ask(partial(self._follow, due, after_s))
+            self._background.ask(partial(self._follow, due, after_s))
 
     def hide(self, hidden: bool) -> None:
         """Make room for something else, or show the list again."""
@@ -104,7 +104,7 @@ class RunList:
     def close(self) -> None:
         """End it; does not wait."""
         self._seen = False
-        self._errand.close()
+        self._background.close()
         self._due.set()
 
     def _listen(self, touches: Touches) -> None:
@@ -158,7 +158,7 @@ class RunList:
             return
         version: tuple[int, ...] | None = None
         while self._seen:
-            newest = self._shelf.version()
+            newest = self._library.version()
             if newest != version:
                 version = newest
                 try:
@@ -171,8 +171,8 @@ class RunList:
     def _draw(self) -> None:
         with self._lock:
             look, marked, opened = self._look, self._marked, self._opened
-        found, look = self._shelf.page(look)
-        counts = self._shelf.counts(look, found.total)
+        found, look = self._library.page(look)
+        counts = self._library.counts(look, found.total)
         now = datetime.now().astimezone()
         parts = (
             (self._filters, filters_html(look, counts)),

@@ -7,10 +7,10 @@ import numpy as np
 import viser
 
 from spherloc_viz.app.controls.display_controls import DisplayControls
+from spherloc_viz.app.run_request import Run
 from spherloc_viz.app.stage import views
 from spherloc_viz.app.stage.painter import Painter
 from spherloc_viz.app.stage.true_camera import TrueCamera
-from spherloc_viz.app.wish import Run
 from spherloc_viz.layers.primitives import Picture
 
 FIRST_CHECKS, MOST_CHECKS, CHECK_S = 8, 40, 0.4
@@ -99,7 +99,7 @@ class Canvas:
         wanted, step, scene = (
             self._display.take_view(),
             (run.trace.problem.name, picture.step.key),
-            run.wish.scene.scene,
+            run.request.scene.scene,
         )
         other_step, elsewhere = step != self._step, self._scene not in (None, scene)
         self._step, self._scene = step, scene

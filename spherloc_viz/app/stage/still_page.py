@@ -15,7 +15,7 @@ import numpy as np
 from spherloc_viz import style
 from spherloc_viz.app.stage.painter import Painter
 from spherloc_viz.app.web.page import QUIET
-from spherloc_viz.app.web.viser_seams import start_viser, stop_viser
+from spherloc_viz.app.web.viser_internals import start_viser, stop_viser
 from spherloc_viz.layers.primitives import FloatArray, SceneItem
 
 _one_at_a_time = threading.Lock()

@@ -7,7 +7,7 @@ import viser
 import viser.transforms as vtf
 
 from spherloc.geometry import camera_centre, pose, yaw_of, yaw_rotation
-from spherloc_viz.app.web.viser_seams import at_once, put_handle
+from spherloc_viz.app.web.viser_internals import at_once, put_handle
 from spherloc_viz.layers.primitives import FloatArray
 
 Place = tuple[float, float, float, float]

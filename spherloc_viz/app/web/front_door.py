@@ -13,7 +13,7 @@ from spherloc_viz.app.web.downloads import DOWNLOADS, Downloads
 from spherloc_viz.app.web.guard import SAFE, refusal
 from spherloc_viz.app.web.page import Page, load_page
 from spherloc_viz.app.web.viewer_room import NOT_RECORDED, PAGE, ViewerRoom
-from spherloc_viz.app.web.viser_seams import KEY_HEADER, ROLE_HEADER
+from spherloc_viz.app.web.viser_internals import KEY_HEADER, ROLE_HEADER
 
 MAX_MESSAGE_BYTES = 50 * 1024 * 1024
 """What viser accepts from a page."""
@@ -29,7 +29,7 @@ PARAMETERS = frozenset(f"initialCamera{part}" for part in ("Position", "LookAt",
     "fixedDpr",
     "hideViserLogo",
 }
-"""What a link may ask of viser's page. Others are dropped: they make it play a stranger's file or server."""
+"""What a link may ask of viser's page. Others are dropped: they make it play another server's file."""
 NOT_FOR_AUDIENCE = "Recordings are the presenter's to open: the link for an audience shows what the presenter shows."
 
 

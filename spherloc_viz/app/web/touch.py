@@ -40,7 +40,7 @@ Handler = Callable[[Touch], object]
 
 
 class Touches:
-    """The presses on one page. Handlers are called one after another, on viser's event loop: they only note wishes."""
+    """The presses on one page. Handlers are called one by one on viser's event loop: they only note requests."""
 
     def __init__(self, failed: Callable[[Exception], None]) -> None:
         """``failed`` is called with what a handler raises."""

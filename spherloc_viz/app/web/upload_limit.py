@@ -1,6 +1,6 @@
 """Turns away uploads that are too large while they arrive; viser itself would collect them in memory without a limit.
 
-This leans on viser's insides, as ``viser_seams`` does.
+This leans on viser's insides, as ``viser_internals`` does.
 """
 
 from collections.abc import Callable

@@ -18,7 +18,7 @@ from spherloc_viz.recording.content.columns import TIMELINE
 from spherloc_viz.recording.index.run_index import RunIndex
 from spherloc_viz.recording.review.notes import REVIEW_SUFFIX, reviewed_name
 from spherloc_viz.recording.run_row import RunRow
-from spherloc_viz.recording.strangers.examiner import examine, resolve_inside
+from spherloc_viz.recording.sandbox.examiner import examine, resolve_inside
 from spherloc_viz.recording.viewing.view import labels_of, step_of
 from spherloc_viz.recording.viewing.viewer_files import NAMES, viewer_folder, viewer_version
 

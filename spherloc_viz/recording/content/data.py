@@ -23,11 +23,11 @@ from spherloc.cameras.calibration import camera_from_table
 from spherloc.datasets.variation import Variation
 from spherloc.diagnosis import Cause, Diagnosis
 from spherloc.problem import Problem
-from spherloc.trace import Trace
+from spherloc.trace import Certificate, Trace
 from spherloc_viz.options import plain
 from spherloc_viz.recording.content.columns import Values, static_chunk
-from spherloc_viz.recording.keeping.machine import machine
 from spherloc_viz.recording.origin import Origin
+from spherloc_viz.recording.storage.machine import machine
 
 MAX_ARRAY_BYTES = 16_384
 """Stage arrays above this are left out of a lean recording: they follow from the problem, the options and the seed."""
@@ -36,6 +36,8 @@ MAX_SCENE_BYTES = 65_536
 
 DATA = "/data"
 ARRAYS = "arrays"
+STORED_AS = {"nfa": "chance_sets", "alternative_cam_from_map": "rival_cam_from_map"}
+"""Fields that recordings know by the name that they had in the first format."""
 NOT_FINITE = "number"
 """Key of the table that stands for infinity or NaN."""
 
@@ -51,7 +53,7 @@ def data_chunk(trace: Trace, origin: Origin, diagnosis: Diagnosis, full: bool) -
         "problem": _problem_row(trace.problem),
         "run": _run_row(trace),
         "origin": asdict(origin) | {"scene_text": scene_text(origin.scene_path)},
-        "diagnosis": {item.name: getattr(diagnosis, item.name) for item in fields(diagnosis)},
+        "diagnosis": _stored({item.name: getattr(diagnosis, item.name) for item in fields(diagnosis)}),
     }
     for stage in trace.stages:
         row = {item.name: getattr(stage, item.name) for item in fields(stage)}
@@ -89,7 +91,7 @@ def _run_row(trace: Trace) -> Row:
         "cam_from_map": trace.cam_from_map,
         "inlier_mask": trace.inlier_mask,
         "message": trace.message,
-        "certificate": None if trace.certificate is None else asdict(trace.certificate),
+        "certificate": None if trace.certificate is None else _stored(asdict(trace.certificate)),
     }
 
 
@@ -120,14 +122,23 @@ def origin_from_row(row: Row) -> tuple[Origin, str | None]:
     return Origin(variation=Variation(**variation), **row), text
 
 
+def _stored(row: Row) -> Row:
+    return {STORED_AS.get(name, name): value for name, value in row.items()}
+
+
+def certificate_from_row(row: Row) -> Certificate:
+    """What is proven of the run. Raises ``KeyError`` or ``TypeError`` if the row says no such thing."""
+    return Certificate(nfa=row.pop(STORED_AS["nfa"]), **row)
+
+
 def diagnosis_from_row(row: Row) -> Diagnosis:
     """What was wrong with the run.
 
     Raises ``KeyError``, ``TypeError`` or ``ValueError`` if the row says no such thing.
     """
-    rival = row.pop("rival_cam_from_map", None)
+    alternative = row.pop(STORED_AS["alternative_cam_from_map"], None)
     cause, evidence = Cause(row.pop("cause")), tuple(row.pop("evidence"))
-    return Diagnosis(cause=cause, evidence=evidence, rival_cam_from_map=rival, **row)
+    return Diagnosis(cause=cause, evidence=evidence, alternative_cam_from_map=alternative, **row)
 
 
 def _chunk(rows: dict[str, Row]) -> Chunk:

@@ -24,7 +24,7 @@ from spherloc_viz.options import json_text
 from spherloc_viz.recording.content.columns import Values, encoded_image, static_chunk
 from spherloc_viz.recording.content.letters import legible
 from spherloc_viz.recording.origin import Origin
-from spherloc_viz.recording.run_row import RunRow
+from spherloc_viz.recording.run_row import STORED_AS, RunRow
 
 APPLICATION_ID = "spherloc"
 """What Rerun keeps our recordings, and their layout, apart from others by."""
@@ -50,7 +50,7 @@ NOT_RECORDED = {"file", "run_id", "labels", "note", "size_bytes", "thumbnail"}
 
 _KINDS: dict[type, pa.DataType] = {str: pa.utf8(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
 RUN_TYPES: dict[str, pa.DataType] = {
-    name: _KINDS[(get_args(hint) or (hint,))[0]]
+    STORED_AS.get(name, name): _KINDS[(get_args(hint) or (hint,))[0]]
     for name, hint in get_type_hints(RunRow).items()
     if name not in NOT_RECORDED
 } | {"upper_bound": pa.int64(), "lower_bound": pa.int64(), "chance_sets": pa.float64(), "versions": pa.utf8()}
@@ -121,12 +121,13 @@ def property_chunks(trace: Trace, row: RunRow, created: datetime) -> Iterator[Ch
 
     Unknown values are absent, so that a query finds nulls. In ``options``, which is JSON, infinity is the text "inf".
     """
-    values = {item.name: getattr(row, item.name) for item in fields(row) if item.name not in NOT_RECORDED}
+    kept = [item.name for item in fields(row) if item.name not in NOT_RECORDED]
+    values = {STORED_AS.get(name, name): getattr(row, name) for name in kept}
     certificate = trace.certificate
     if certificate is not None:
         values["upper_bound"] = certificate.upper_bound
         values["lower_bound"] = certificate.lower_bound
-        values["chance_sets"] = certificate.chance_sets
+        values["chance_sets"] = certificate.nfa
     values["versions"] = json.dumps(dict(trace.versions))
     yield static_chunk(f"/__properties/{RUN_PROPERTY}", _named(values))
     if row.thumbnail:
@@ -174,7 +175,7 @@ def row_from_properties(values: Mapping[str, Any], **known: Any) -> RunRow:
         if item.name in known or item.name in NOT_RECORDED:
             continue
         kinds: tuple[type, ...] = get_args(item.type) or (cast(type, item.type),)
-        value = values.get(item.name)
+        value = values.get(STORED_AS.get(item.name, item.name))
         if value is None:
             row[item.name] = None if type(None) in kinds else _EMPTY[kinds[0]]
         elif isinstance(value, kinds) or (float in kinds and isinstance(value, int)):

@@ -18,6 +18,7 @@ from spherloc.trace import Certificate
 from spherloc_viz.recording.content.data import (
     DATA,
     Row,
+    certificate_from_row,
     diagnosis_from_row,
     origin_from_row,
     problem_from_row,
@@ -179,7 +180,7 @@ def _run(path: Path, entry: StoreEntry, chunks: Mapping[str, Chunk]) -> Recorded
         properties=read_properties(chunks[PROPERTIES]),
         problem=problem_from_row(rows["problem"], str(path)),
         stages={name[len(STAGES) :]: row for name, row in rows.items() if name.startswith(STAGES)},
-        certificate=None if found is None else Certificate(**found),
+        certificate=None if found is None else certificate_from_row(found),
         origin=origin,
         scene_text=scene,
         diagnosis=None if told is None else diagnosis_from_row(told),

@@ -15,7 +15,7 @@ from spherloc.errors import RecordingError
 from spherloc.metrics import evaluate
 from spherloc.trace import Trace
 from spherloc_viz.layers import paint, steps
-from spherloc_viz.layers.decisive import decisive_step
+from spherloc_viz.layers.key_step import key_step
 from spherloc_viz.layers.primitives import Picture, Stop
 from spherloc_viz.layers.step_numbers import step_numbers
 from spherloc_viz.recording.content.columns import markdown, static_chunk
@@ -29,18 +29,18 @@ from spherloc_viz.recording.content.properties import APPLICATION_ID, property_c
 from spherloc_viz.recording.content.query_image import image_chunks, query_image
 from spherloc_viz.recording.content.rrd_file import append
 from spherloc_viz.recording.content.thumbnail import thumbnail
-from spherloc_viz.recording.keeping.leftovers import unfinished
 from spherloc_viz.recording.origin import Origin
 from spherloc_viz.recording.run_row import RunRow
+from spherloc_viz.recording.storage.leftovers import unfinished
 
 EXPLAINING = frozenset(
     {
-        *("bearings", "match", "gravity", "unknowns", "yaw-pair", "yaw-twins", "balls-pair"),
+        *("bearings", "match", "gravity", "unknowns", "yaw-pair", "yaw-roots", "balls-pair"),
         *("clique-greedy-smallest", "clique-greedy-degree"),
         *("refinement-inliers", "refinement-outliers", "refinement-error"),
     }
 )
-"""Keys of steps that explain the method, as the stops of the hand do: the page shows them, and a full recording."""
+"""Keys of steps that explain the method, as the candidate yaws do: the page shows them, and a full recording."""
 
 _DISK = re.compile(r"([^:(]+) \(os error \d+\)")
 """How rerun tells of what a disk cannot do."""
@@ -99,8 +99,8 @@ class _Run:
     recording_id: str
 
 
-def recorded_steps(stops: Sequence[Stop], decisive: int) -> list[int]:
-    """The steps that a lean recording shows: what each stage came to, and the decisive one.
+def recorded_steps(stops: Sequence[Stop], key: int) -> list[int]:
+    """The steps that a lean recording shows: what each stage came to, and the key step.
 
     Left out is what explains the method, alike in every run, and series: steps whose keys differ in a number only, as
     "yaw-arcs-10" and "yaw-arcs-30" do, more and more arcs until the step "yaw-arcs" has them all. Of a series without
@@ -110,16 +110,16 @@ def recorded_steps(stops: Sequence[Stop], decisive: int) -> list[int]:
     last: dict[str, int] = {}
     for index, stop in enumerate(stops):
         series = stop.key if stop.key.startswith("sample-") else re.sub(r"-\d+$", "", stop.key)
-        explains = stop.key in EXPLAINING or stop.key.endswith("-pose") or stop.key.startswith("yaw-hand-")
+        explains = stop.key in EXPLAINING or stop.key.endswith("-pose") or stop.key.startswith("yaw-candidate-")
         if not explains and (series == stop.key or series not in keys):
             last[series] = index
-    return sorted({decisive, *last.values()})
+    return sorted({key, *last.values()})
 
 
 def _write(run: _Run, part: Path, file: str) -> RunRow:
     """Write the recording to ``part`` and return its row, for the name that the ``file`` is to have."""
     trace, metrics = run.trace, evaluate(run.trace)
-    stops, decisive = steps(trace), decisive_step(trace, run.diagnosis)
+    stops, key = steps(trace), key_step(trace, run.diagnosis)
     row = run_row(
         trace,
         metrics,
@@ -129,10 +129,10 @@ def _write(run: _Run, part: Path, file: str) -> RunRow:
         file=file,
         run_id=run.recording_id,
         steps=len(stops),
-        decisive_step=decisive,
+        key_step=key,
         thumbnail=thumbnail(trace),
     )
-    chosen = list(range(len(stops))) if run.full else recorded_steps(stops, decisive)
+    chosen = list(range(len(stops))) if run.full else recorded_steps(stops, key)
     pictures = {index: paint(trace, index) for index in chosen}
     panels = panels_of(trace)
     layout = layout_file(shown_in(list(pictures.values()), panels))

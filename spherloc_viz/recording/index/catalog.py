@@ -9,11 +9,11 @@ from spherloc.errors import InputError, RecordingError
 from spherloc.extras import require
 from spherloc_viz.recording.content.numbers import NUMBERS
 from spherloc_viz.recording.index.step_condition import COLUMNS, RUN_COLUMNS, STEP_COLUMNS, checked_condition
-from spherloc_viz.recording.run_row import RunRow
+from spherloc_viz.recording.run_row import STORED_AS, RunRow
 
 FIRST_VERSION = 2
 """Recordings of this format and later have numbers for every step."""
-_RENAMED = {"position_error_m": "translation_error_m"}
+_RENAMED = {"position_error_m": "translation_error_m"} | STORED_AS
 """What a condition calls differently than a recording."""
 _RUN = "rerun_segment_id"
 
@@ -83,7 +83,7 @@ def _frame(dataset: Any) -> Any:
     steps = dataset.filter_contents([NUMBERS]).reader(index="step", include_semantically_empty_columns=True)
     runs = dataset.segment_table()
     of_step = [_first(steps, f"{NUMBERS}:{_RENAMED.get(name, name)}", name) for name in STEP_COLUMNS if name != "step"]
-    of_run = [_first(runs, f"property:run:{name}", name) for name in RUN_COLUMNS]
+    of_run = [_first(runs, f"property:run:{_RENAMED.get(name, name)}", name) for name in RUN_COLUMNS]
     steps = steps.select(col(_RUN), col("step"), *of_step)
     return steps.join(runs.select(col(_RUN).alias("run"), *of_run), left_on=_RUN, right_on="run")
 

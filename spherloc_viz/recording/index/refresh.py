@@ -14,7 +14,7 @@ from spherloc.errors import RecordingError
 from spherloc_viz.recording.index.rows import put
 from spherloc_viz.recording.review.notes import REVIEW_SUFFIX, UNREADABLE, has_review, review_path
 from spherloc_viz.recording.run_row import RunRow
-from spherloc_viz.recording.strangers.examiner import Examiners, check_name, examine_all
+from spherloc_viz.recording.sandbox.examiner import Examiners, check_name, examine_all
 
 Examine = Callable[[Sequence[Path]], Iterable[tuple[Path, RunRow | RecordingError]]]
 """Reads recordings one after another: the row of each, or what is wrong with it."""
@@ -39,9 +39,9 @@ def examine_side_by_side(
     They end with this, or with their owner ``examiners``, which raises ``ExaminerError``.
     """
     workers = max(1, min(MOST_WORKERS, os.cpu_count() or 1, len(paths) // WORTH_A_WORKER))
-    with ThreadPoolExecutor(workers) as threads, (examiners or Examiners()).crew(workers) as crew:
-        readers = [examine_all(paths[k::workers], crew[k]) for k in range(workers)]
-        # Whoever leaves early, as by Ctrl-C, ends the crew first and waits for no file.
+    with ThreadPoolExecutor(workers) as threads, (examiners or Examiners()).start(workers) as started:
+        readers = [examine_all(paths[k::workers], started[k]) for k in range(workers)]
+        # Whoever leaves early, as by Ctrl-C, ends the processes first and waits for no file.
         answers = [threads.submit(next, reader, None) for reader in readers]
         for number in range(len(paths)):
             k = number % workers

@@ -17,7 +17,7 @@ from spherloc_viz.recording.index.refresh import Examine, Progress, Refreshed, R
 from spherloc_viz.recording.index.rows import DamagedError, put, rows_of
 from spherloc_viz.recording.review.notes import Review, write_review
 from spherloc_viz.recording.run_row import RunRow
-from spherloc_viz.recording.strangers.examiner import Examiners, check_name, examine
+from spherloc_viz.recording.sandbox.examiner import Examiners, check_name, examine
 
 T = TypeVar("T")
 MOST_TRIES = 4

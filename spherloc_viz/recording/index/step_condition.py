@@ -30,7 +30,7 @@ RUN_COLUMNS = {
     "inliers": pa.int64(),
     "outlier_rate": pa.float64(),
     "steps": pa.int64(),
-    "decisive_step": pa.int64(),
+    "key_step": pa.int64(),
     "time_ms": pa.float64(),
 }
 """What is known of its run."""

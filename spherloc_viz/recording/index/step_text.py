@@ -28,7 +28,7 @@ def _run(folder: Path, found: Sequence[StepFound]) -> str:
     told = f"{run.title or run.name}, {run.estimator}: {run.outcome}, {run.diagnosis or 'not diagnosed'}"
     lines = [one_line(told), f"    {one_line(str(folder / run.file))}"]
     for step in found:
-        mark = "  <- decisive" if step.step == run.decisive_step else ""
+        mark = "  <- key step" if step.step == run.key_step else ""
         off = f"{number_text(step.rotation_error_deg):>8} deg {number_text(step.position_error_m):>8} m"
         where = f"step {step.step:>3} of {run.steps:<3} {one_line(step.stage):<14.14} {one_line(step.key):<24.24}"
         lines.append(f"    {where} {step.agreeing:>5} agree {off}{mark}")

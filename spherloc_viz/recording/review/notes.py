@@ -80,8 +80,8 @@ def write_review(recording: Path, labels: Sequence[str], note: str, run_id: str 
     never sees half a file. Raises ``InputError`` if they are too long, ``RecordingError`` if they cannot be written.
     """
     # Here, as lists of runs need only names and limits of this file, and rerun takes a second to load.
-    from spherloc_viz.recording.keeping.leftovers import unfinished
     from spherloc_viz.recording.review.file import recording_id, write_file
+    from spherloc_viz.recording.storage.leftovers import unfinished
 
     review = checked_review(labels, note)
     path = review_path(Path(recording))

@@ -15,7 +15,7 @@ from spherloc.errors import InputError, RecordingError
 from spherloc_viz.recording.content.columns import TIMELINE
 from spherloc_viz.recording.review.notes import Review, review_path
 from spherloc_viz.recording.run_row import RunRow
-from spherloc_viz.recording.strangers.examiner import examine_review
+from spherloc_viz.recording.sandbox.examiner import examine_review
 from spherloc_viz.recording.viewing.rerun_program import rerun_command, rerun_environment
 
 HOST = "127.0.0.1"
@@ -24,17 +24,17 @@ PAUSE_S = 0.2
 """Between two tries to tell a viewer that is starting where to stand: a minute in all."""
 
 
-def step_of(row: RunRow, wish: int | None) -> int:
-    """The step to open a run at: the one that is wished for, else the decisive one.
+def step_of(row: RunRow, request: int | None) -> int:
+    """The step to open a run at: the one that is asked for, else the key step.
 
     Recordings of the first version do not say how many steps they have. Raises ``InputError`` if there is no such step.
     """
-    if wish is None:
-        return row.decisive_step
-    if wish < 0 or (row.steps and wish >= row.steps):
+    if request is None:
+        return row.key_step
+    if request < 0 or (row.steps and request >= row.steps):
         steps = "only step 0" if row.steps == 1 else f"steps 0 to {row.steps - 1}"
-        raise InputError(f"{row.file}: there is no step {wish}; the run has {steps}.")
-    return wish
+        raise InputError(f"{row.file}: there is no step {request}; the run has {steps}.")
+    return request
 
 
 def labels_of(recording: Path, run_id: str) -> Path | None:

@@ -1,7 +1,7 @@
-"""Recordings from strangers: their names, and their content, which another process reads first.
+"""Untrusted recordings: their names, and their content, which another process reads first.
 
 A recording may be hostile: made so that reading it takes gigabytes, minutes, or down the process that reads it. So what
-comes from elsewhere is read by a child first (``spherloc_viz.recording.strangers.child``) whose memory and time are
+comes from elsewhere is read by a child first (``spherloc_viz.recording.sandbox.child``) whose memory and time are
 limited. What has passed is safe to be read here.
 """
 
@@ -16,8 +16,8 @@ from typing import Any, Self
 from spherloc.errors import InputError, RecordingError, show
 from spherloc_viz.recording.review.notes import UNREADABLE, Review, checked_review, has_review, review_path
 from spherloc_viz.recording.run_row import RunRow
-from spherloc_viz.recording.strangers.checked_row import row_from_table
-from spherloc_viz.recording.strangers.child_process import Child, ExaminerError, cannot_start
+from spherloc_viz.recording.sandbox.checked_row import row_from_table
+from spherloc_viz.recording.sandbox.child_process import Child, ExaminerError, cannot_start
 
 FILE_LIMIT_S = 60.0
 """A good file takes a hundredth of a second; the child gives up sooner, by the processor time that it used."""
@@ -216,24 +216,24 @@ class Examiners:
         self._closed = False
 
     @contextlib.contextmanager
-    def crew(self, count: int) -> Iterator[list[Examiner]]:
+    def start(self, count: int) -> Iterator[list[Examiner]]:
         """So many examiners, which end with the context. Raises ``ExaminerError`` after ``close``."""
-        crew = [Examiner() for _ in range(count)]
+        started = [Examiner() for _ in range(count)]
         with self._lock:
             if self._closed:
                 raise ExaminerError(ENDED)
-            self._open.update(crew)
+            self._open.update(started)
         try:
-            yield crew
+            yield started
         finally:
-            for examiner in crew:
+            for examiner in started:
                 examiner.close()
             with self._lock:
-                self._open.difference_update(crew)
+                self._open.difference_update(started)
 
     def close(self) -> None:
         """End them for good, also in the middle of a file."""
         with self._lock:
-            self._closed, crew = True, tuple(self._open)
-        for examiner in crew:
+            self._closed, started = True, tuple(self._open)
+        for examiner in started:
             examiner.close()

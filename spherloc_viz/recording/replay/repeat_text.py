@@ -9,7 +9,7 @@ from typing import Any
 from spherloc.errors import InputError, SpherlocError
 from spherloc.estimators import warm_up
 from spherloc_viz.options import json_text
-from spherloc_viz.recording.again.repeat import Repeated, Solve, repeat
+from spherloc_viz.recording.replay.repeat import Repeated, Solve, repeat
 
 
 def repeat_all(paths: Sequence[Path], as_json: bool, solve: Solve | None = None) -> int:
@@ -53,7 +53,7 @@ def as_text(repeated: Repeated) -> str:
         if repeated.same and item.recorded is None:
             continue  # what an older recording does not say has changed nothing
         lines.append(f"  {item.name}: {item.recorded or 'not recorded'} then, {item.here or 'none'} now")
-    # What a stranger's file says must not steer the terminal.
+    # What an untrusted file says must not steer the terminal.
     return "\n".join("".join(letter if letter.isprintable() else " " for letter in line) for line in lines)
 
 

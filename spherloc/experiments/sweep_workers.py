@@ -54,7 +54,7 @@ class Done:
     """Its results; None if its worker died."""
 
 
-class Crew(Protocol):
+class Workers(Protocol):
     """Workers that do tasks, each of which is a few jobs."""
 
     def room(self) -> int:
@@ -93,7 +93,7 @@ def _warm(estimators: frozenset[str]) -> None:
     warm_up(estimators=estimators)
 
 
-class LocalCrew:
+class LocalWorkers:
     """Processes on this machine.
 
     They hold one end of a pipe, the lifeline, and end when its other end is closed: by ``close``, or because this

@@ -83,7 +83,7 @@ def make_points(ids: ArrayLike, xyz: ArrayLike, errors_px: ArrayLike, track_leng
 
 
 @dataclass(eq=False)
-class Walked:
+class ModelParts:
     """What was found so far. Its methods take what a file says next; ``broken`` makes the error if it cannot be."""
 
     cameras: set[int] = field(default_factory=set)

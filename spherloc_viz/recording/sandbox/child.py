@@ -1,4 +1,4 @@
-"""The child that reads recordings which may be hostile: ``python -m spherloc_viz.recording.strangers.child``.
+"""The child that reads recordings which may be hostile: ``python -m spherloc_viz.recording.sandbox.child``.
 
 It reads questions, one a line, ``{"path": "...", "want": "row"}``, and answers each with two lines of JSON:
 ``{"begun": true}``, then ``{"row": {...}}`` or ``{"error": "..."}``. What can be wanted is a row with labels and note,
@@ -25,8 +25,8 @@ from spherloc_viz.recording.content.properties import APPLICATION_ID
 from spherloc_viz.recording.content.reader import check_recording, read_recording
 from spherloc_viz.recording.review.notes import read_review
 from spherloc_viz.recording.run_row import RunRow
-from spherloc_viz.recording.strangers.checked_row import row_from_table, table_from_row
-from spherloc_viz.recording.strangers.content_check import check_content, check_run
+from spherloc_viz.recording.sandbox.checked_row import row_from_table, table_from_row
+from spherloc_viz.recording.sandbox.content_check import check_content, check_run
 
 try:
     import resource

@@ -12,10 +12,10 @@ from spherloc.diagnosis import Diagnosis
 from spherloc.errors import RecordingError
 from spherloc.trace import Trace
 from spherloc_viz.recording.index.run_index import RunIndex
-from spherloc_viz.recording.keeping.keeper import Keeper
-from spherloc_viz.recording.keeping.room import KEEP_BYTES
-from spherloc_viz.recording.keeping.sweep_keeper import SweepKeeper
 from spherloc_viz.recording.origin import Origin
+from spherloc_viz.recording.storage.room import KEEP_BYTES
+from spherloc_viz.recording.storage.store import RecordingStore
+from spherloc_viz.recording.storage.sweep_store import SweepStore
 
 log = logging.getLogger(__name__)
 
@@ -55,7 +55,7 @@ class Recorder:
         threads of the recorder."""
         self._on_error, self._on_notice = _safe(on_error), _safe(on_notice)
         self._on_recovery = _safe(on_recovery or on_notice)
-        self._keeper = Keeper(folder, self._on_notice, full, keep_bytes)
+        self._store = RecordingStore(folder, self._on_notice, full, keep_bytes)
         self._queue: queue.Queue[_Job | None] = queue.Queue(QUEUE_LENGTH)
         self._lock = threading.Lock()
         self._waiting = self._lost = 0
@@ -67,12 +67,12 @@ class Recorder:
     @property
     def folder(self) -> Path:
         """Where the recordings are."""
-        return self._keeper.folder
+        return self._store.folder
 
     @property
     def index(self) -> RunIndex:
         """The list of the folder's runs. Raises ``RecordingError`` if it cannot be opened."""
-        return self._keeper.index
+        return self._store.index
 
     @property
     def waiting(self) -> int:
@@ -98,7 +98,7 @@ class Recorder:
         the run is written and listed, or why it is not written. Raises ``RecordingError`` if too many runs wait
         already, or after ``close``.
         """
-        path = self._keeper.path_of(trace)
+        path = self._store.path_of(trace)
         with self._lock:
             if self._closed:
                 raise RecordingError(f"{path.name}: not recorded, since recording has ended.")
@@ -111,9 +111,9 @@ class Recorder:
             self._waiting += 1
         return path
 
-    def sweep_keeper(self) -> SweepKeeper:
+    def sweep_store(self) -> SweepStore:
         """What records the runs of a sweep into this folder, in the processes that do them."""
-        return SweepKeeper(self.folder.resolve())
+        return SweepStore(self.folder.resolve())
 
     def make_room(self) -> None:
         """Have old successes deleted if other processes have written too much. Never waits."""
@@ -127,11 +127,11 @@ class Recorder:
             if self._closed:
                 return
             self._closed = True
-        self._keeper.end_reading()  # which a hostile file can keep up for a minute
+        self._store.end_reading()  # which a hostile file can keep up for a minute
         self._queue.put(None)
         self._thread.join()
         self._upkeep.join(UPKEEP_LIMIT_S)
-        self._keeper.close()
+        self._store.close()
 
     def __enter__(self) -> Self:
         return self
@@ -150,7 +150,7 @@ class Recorder:
         self, trace: Trace, path: Path, origin: Origin | None, diagnosis: Diagnosis | None, ended: Ended
     ) -> None:
         try:
-            self._keeper.record(trace, origin, diagnosis, path)
+            self._store.record(trace, origin, diagnosis, path)
         except RecordingError as error:
             self._lose(error, ended)
         except Exception as error:  # a bug in drawing one run must not end the recording of the others
@@ -174,7 +174,7 @@ class Recorder:
     def _put_right(self) -> None:
         with contextlib.suppress(_StoppedError):
             try:
-                self._keeper.tidy()
+                self._store.tidy()
                 if self.folder.is_dir():
                     self._go_on()
                     self.index.refresh(progress=self._go_on)
@@ -187,7 +187,7 @@ class Recorder:
         if not self.folder.is_dir():
             return
         try:
-            self._keeper.prune()
+            self._store.prune()
         except RecordingError as error:
             self._complain(f"Old successes cannot be deleted: {error}")
 

@@ -16,7 +16,7 @@ from spherloc.ranges import check_options
 from spherloc_viz.options import OptionField, option_fields
 from spherloc_viz.recording.content.reader import RecordedRun, read_recording
 from spherloc_viz.recording.origin import Origin, Source
-from spherloc_viz.recording.strangers.examiner import examine
+from spherloc_viz.recording.sandbox.examiner import examine
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +44,7 @@ class RecordedScene:
 
 
 def load_recorded_scene(path: Path) -> RecordedScene:
-    """The scene of a recording (.rrd), which may come from a stranger: another process reads it first.
+    """The scene of a recording (.rrd), which may be untrusted: another process reads it first.
 
     Raises ``RecordingError``, in one sentence, if there is no such file or it is no whole recording of ours.
     """

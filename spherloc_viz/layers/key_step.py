@@ -24,7 +24,7 @@ POSITION_SLACK_M = 0.5
 """A position before refinement that is off by more than this is wrong."""
 
 
-def decisive_step(trace: Trace, diagnosis: Diagnosis) -> int:
+def key_step(trace: Trace, diagnosis: Diagnosis) -> int:
     """The index in ``layers.steps(trace)`` of the step at which the run was decided or, if it failed, went wrong.
 
     A gravity that is off spoils a run before anything is computed. Else, where the truth is known, it is the first

@@ -1,12 +1,12 @@
-"""The core of a bin's graph against an exact one; the scout's bounds hold, and its poses explain what they say."""
+"""The core of a bin's graph against an exact one; bounds of bins hold, and their poses explain what they say."""
 
 import networkx as nx
 import numpy as np
 import pytest
 from small_problems import explained, good_poses, tight_problem
 
+from spherloc.consensus.bin_cliques import core_graph, largest_bin_cliques
 from spherloc.consensus.pair_arcs import pair_arcs, turn_of
-from spherloc.consensus.scout import core_graph, scout
 from spherloc.consensus.yaw_bins import BIN_TURN, BINS, degree_bounds, sort_into_bins
 from spherloc.watch import Watch
 
@@ -55,7 +55,7 @@ def test_two_arcs_of_a_pair_are_one_edge(rng):
 
 
 def run(problem, floor):
-    """Bounds of the bins before and after a scout that knows nothing, and what it found."""
+    """Bounds of the bins before and after a largest_bin_cliques that knows nothing, and what it found."""
     aligned, bounds = problem.aligned, problem.bounds
     count, board = len(aligned.bearings), Watch().board
     least_cos = np.cos(np.minimum(bounds.radians + 1e-9, np.pi / 2))
@@ -65,7 +65,7 @@ def run(problem, floor):
     before = degree_bounds(count, starts, edges, board)
     bound = before.copy()
     poses, supports, masks = np.empty((8, 5)), np.zeros(8, np.int32), np.zeros((8, count), np.bool_)
-    known = scout(data, starts, edges, bound, floor, poses, supports, masks, 0, board)
+    known = largest_bin_cliques(data, starts, edges, bound, floor, poses, supports, masks, 0, board)
     return before, bound, poses[:known], supports[:known], masks[:known]
 
 

@@ -7,14 +7,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spherloc.trace import Trace
-from spherloc_viz.app.catalog import SceneWish
+from spherloc_viz.app.catalog import SceneRequest
 
 
 @dataclass(frozen=True)
-class Wish:
+class RunRequest:
     """All that a run depends on."""
 
-    scene: SceneWish
+    scene: SceneRequest
     estimator: str
     """Registered name."""
     options: Any
@@ -23,9 +23,9 @@ class Wish:
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A wish fulfilled."""
+    """A request fulfilled."""
 
-    wish: Wish
+    request: RunRequest
     trace: Trace
     kept: NDArray[np.int64]
     """(N,) number that each correspondence of the problem has where nothing is hidden."""

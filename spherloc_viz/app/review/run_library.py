@@ -15,7 +15,7 @@ from spherloc_viz.recording.index.query import MAX_TEXT, RunQuery
 from spherloc_viz.recording.index.run_index import Found, RunIndex
 from spherloc_viz.recording.review.notes import Review
 from spherloc_viz.recording.run_row import RunRow
-from spherloc_viz.recording.strangers.examiner import examine, resolve_inside
+from spherloc_viz.recording.sandbox.examiner import examine, resolve_inside
 
 NEAR = 50
 """A run that was at some place of the list is looked for among so many around it."""
@@ -25,7 +25,7 @@ MOST_LABELS = 12
 """Labels that are offered, those used most."""
 
 
-class Shelf:
+class RunLibrary:
     """Thread-safe, and slow now and then: asked on the threads of errands only."""
 
     def __init__(self, index: RunIndex) -> None:

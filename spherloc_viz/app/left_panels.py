@@ -15,14 +15,14 @@ from spherloc_viz.app.plots.charts import ChartPanel
 from spherloc_viz.app.plots.graph_view import GraphView
 from spherloc_viz.app.plots.residual_view import ResidualView
 from spherloc_viz.app.plots.yaw_view import YawView
+from spherloc_viz.app.run_request import Run
 from spherloc_viz.app.text import legend_html, opening_html, status_html, summary_html, table_html
 from spherloc_viz.app.web.touch import Touch, Touches
-from spherloc_viz.app.wish import Run
 from spherloc_viz.layers import graph_begins, steps
 from spherloc_viz.layers.primitives import Picture, Table
 
 
-class Story:
+class LeftPanels:
     """One client's panels."""
 
     def __init__(
@@ -88,7 +88,7 @@ class Story:
         summary, ending = summary_html(run.trace), table_html(outcome)
         if hidden:
             summary, ending = status_html(HIDDEN), ""
-        if self._opening == run.wish.scene.scene:
+        if self._opening == run.request.scene.scene:
             self._opening = ""
         elif self._opening:
             summary, ending = opening_html(self._opening), f'<div style="opacity:.35">{ending}</div>'

@@ -13,10 +13,10 @@ from spherloc.estimators import estimate
 from spherloc.metrics import rotation_error_deg, translation_error_m
 from spherloc.problem import Problem
 from spherloc.trace import Certificate, Trace
-from spherloc_viz.recording.again.same import same_bits
-from spherloc_viz.recording.again.scene import load_recorded_scene, missing_options, recorded_options
 from spherloc_viz.recording.content.reader import RecordedRun
-from spherloc_viz.recording.keeping.machine import machine
+from spherloc_viz.recording.replay.same import same_bits
+from spherloc_viz.recording.replay.scene import load_recorded_scene, missing_options, recorded_options
+from spherloc_viz.recording.storage.machine import machine
 
 ROUNDING = 1e-9
 """Numbers that differ by no more, relative to the largest of a pose's, differ by rounding."""
@@ -76,7 +76,7 @@ class Repeated:
 def repeat(path: Path, solve: Solve | None = None) -> Repeated:
     """Solve the problem of a recording again with its estimator, options and seed, and compare.
 
-    ``solve`` does it in the place of ``estimate``: of a stranger's options that may take hours.
+    ``solve`` does it in the place of ``estimate``: of untrusted options that may take hours.
 
     Raises ``RecordingError`` if there is no such recording, or this spherloc has no such estimator or option.
     """
@@ -135,13 +135,13 @@ def _certificates(before: Certificate | None, now: Certificate | None) -> Differ
     said = [
         "none"
         if item is None
-        else f"{item.lower_bound} to {item.upper_bound} inliers and {item.chance_sets:.6g} sets by chance"
+        else f"{item.lower_bound} to {item.upper_bound} inliers and {item.nfa:.6g} sets by chance"
         for item in (before, now)
     ]
     near = (
         before is not None
         and now is not None
         and (before.lower_bound, before.upper_bound) == (now.lower_bound, now.upper_bound)
-        and bool(np.isclose(before.chance_sets, now.chance_sets, rtol=ROUNDING, atol=0.0, equal_nan=True))
+        and bool(np.isclose(before.nfa, now.nfa, rtol=ROUNDING, atol=0.0, equal_nan=True))
     )
     return Difference("certificate", f"{said[0]} was recorded, {said[1]} is found now.", near)

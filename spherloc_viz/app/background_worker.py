@@ -11,7 +11,7 @@ from spherloc.errors import SpherlocError
 log = logging.getLogger(__name__)
 
 
-class Errand:
+class BackgroundWorker:
     """Does one job at a time; of those that are asked for meanwhile the newest is next, and the others are dropped."""
 
     def __init__(self, name: str, failed: Callable[[str], None]) -> None:

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from spherloc.errors import RecordingError
-from spherloc_viz.recording.keeping.leftovers import target_of, unfinished
 from spherloc_viz.recording.review.notes import REVIEW_SUFFIX
-from spherloc_viz.recording.strangers.child_process import ExaminerError
-from spherloc_viz.recording.strangers.examiner import Examiner
+from spherloc_viz.recording.sandbox.child_process import ExaminerError
+from spherloc_viz.recording.sandbox.examiner import Examiner
+from spherloc_viz.recording.storage.leftovers import target_of, unfinished
 from spherloc_viz.recording.viewing.rerun_program import rerun_command, rerun_environment
 
 UNREADABLE_SUFFIX = ".unreadable"

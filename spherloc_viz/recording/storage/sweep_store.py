@@ -9,17 +9,17 @@ from pathlib import Path
 from spherloc.errors import RecordingError
 from spherloc.experiments.sweep import Job, SweepPlan
 from spherloc.trace import Trace
-from spherloc_viz.recording.keeping.keeper import Keeper, sweep_file_name
-from spherloc_viz.recording.keeping.leftovers import here
 from spherloc_viz.recording.origin import Origin
+from spherloc_viz.recording.storage.leftovers import here
+from spherloc_viz.recording.storage.store import RecordingStore, sweep_file_name
 
 
 @dataclass(frozen=True)
-class SweepKeeper:
+class SweepStore:
     """Keeps the runs of all workers on the machine where it was made; others cannot reach its folder.
 
     A run that is done again, because its worker was killed or its sweep interrupted, replaces its own recording.
-    Nothing is deleted to make room: that is for one process to do, which has a ``Keeper``.
+    Nothing is deleted to make room: that is for one process to do, which has a ``RecordingStore``.
     """
 
     folder: Path
@@ -32,10 +32,10 @@ class SweepKeeper:
         if here() != self.machine:
             return ""
         origin = Origin("sweep", plan.scene, plan.first_seed + job.run, None, plan.variation_at(job.value))
-        keeper, told = _keeper(self.folder)
+        store, told = _store(self.folder)
         try:
             run_id = sweep_run_id(plan, job)
-            keeper.record(trace, origin, path=self.folder / sweep_file_name(trace, run_id), run_id=str(run_id))
+            store.record(trace, origin, path=self.folder / sweep_file_name(trace, run_id), run_id=str(run_id))
         except RecordingError as error:
             return str(error)
         except Exception as error:  # a bug in drawing one run must not end the sweep
@@ -58,7 +58,7 @@ def sweep_run_id(plan: SweepPlan, job: Job) -> uuid.UUID:
 
 
 @lru_cache(maxsize=1)
-def _keeper(folder: Path) -> tuple[Keeper, list[str]]:
+def _store(folder: Path) -> tuple[RecordingStore, list[str]]:
     """This process's own, and what it has to say."""
     told: list[str] = []
-    return Keeper(folder, told.append, keep_bytes=None), told
+    return RecordingStore(folder, told.append, keep_bytes=None), told

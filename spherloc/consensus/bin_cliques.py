@@ -15,12 +15,12 @@ EFFORT_LIMIT = 200_000
 """Words touched in one bin."""
 MOST_THINNED = 1_000_000
 """Edges times words of a graph up to which it is thinned."""
-RUMOUR = 3
+CLIQUE_MARGIN = 3
 """How much smaller than a clique without pose the next one may be."""
 
 
 @numba.njit(cache=True, nogil=True)
-def scout(data, starts, edges, bound, least, poses, supports, masks, known, board=None):
+def largest_bin_cliques(data, starts, edges, bound, least, poses, supports, masks, known, board=None):
     """Verify the largest clique of each bin; better poses become known, and the bound of each bin is lowered in place.
 
     A clique must be larger than the best support. While that is not above ``least`` it must be larger than this, and
@@ -40,7 +40,7 @@ def scout(data, starts, edges, bound, least, poses, supports, masks, known, boar
             bound[b] = max(floor, len(clique))
         if len(clique):
             known = verify(data, nodes[clique], poses, supports, masks, known)
-            floor = supports[0] if supports[0] > least else max(floor, len(clique) - RUMOUR)
+            floor = supports[0] if supports[0] > least else max(floor, len(clique) - CLIQUE_MARGIN)
     return known
 
 

@@ -9,10 +9,10 @@ from spherloc.datasets import Scene, load_scene
 from spherloc.datasets.variation import Variation
 from spherloc.errors import SpherlocError, show
 from spherloc.problem import Problem
-from spherloc_viz.recording.again.same import different_fields
-from spherloc_viz.recording.again.scene import RecordedScene, recorded_options
 from spherloc_viz.recording.content.reader import RecordedRun
 from spherloc_viz.recording.origin import Origin
+from spherloc_viz.recording.replay.same import different_fields
+from spherloc_viz.recording.replay.scene import RecordedScene, recorded_options
 from spherloc_viz.share import is_recording
 
 

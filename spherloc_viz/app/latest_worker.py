@@ -8,7 +8,7 @@ Job = Callable[[bool], float | None]
 """Called with whether somebody asked (else its own alarm rang); returns seconds to its next alarm, or None."""
 
 
-class Newest:
+class LatestWorker:
     """Calls one job on one thread, once more if asked while it works; requests never queue.
 
     viser runs callbacks on a pool, several at once and out of order. So they only ``ask``, and the job reads

@@ -16,13 +16,13 @@ from spherloc.errors import RecordingError
 from spherloc.trace import Trace
 from spherloc_viz.recording.content.writer import write_recording
 from spherloc_viz.recording.index.run_index import RunIndex
-from spherloc_viz.recording.keeping.leftovers import leftovers
-from spherloc_viz.recording.keeping.rescue import rescue
-from spherloc_viz.recording.keeping.retention import Pruned, prune
-from spherloc_viz.recording.keeping.room import KEEP_BYTES, size_words
 from spherloc_viz.recording.origin import Origin
 from spherloc_viz.recording.review.notes import has_review
-from spherloc_viz.recording.strangers.examiner import Examiners, examine_review
+from spherloc_viz.recording.sandbox.examiner import Examiners, examine_review
+from spherloc_viz.recording.storage.leftovers import leftovers
+from spherloc_viz.recording.storage.rescue import rescue
+from spherloc_viz.recording.storage.retention import Pruned, prune
+from spherloc_viz.recording.storage.room import KEEP_BYTES, size_words
 
 GALLERY = "gallery"
 """The folder inside that has the curated cases."""
@@ -30,7 +30,7 @@ CHECKS = 50
 """The size of all recordings is looked at when a new part of it, one of so many, was written."""
 
 
-class Keeper:
+class RecordingStore:
     """Writes runs into a folder, here and now. Any number of threads and processes may write into the same one."""
 
     def __init__(
@@ -121,7 +121,7 @@ class Keeper:
         """
         folders = [folder for folder in (self.folder, self.folder / GALLERY) if folder.is_dir()]
         found = [part for folder in folders for part in leftovers(folder)]
-        with self._examiners.crew(1) as (examiner,):
+        with self._examiners.start(1) as (examiner,):
             rescued = [rescue(part, examiner) for part in found]
         saved = [done.recording for done in rescued if done.recording is not None]
         kept = [done.kept for done in rescued if done.kept is not None]

@@ -66,9 +66,9 @@ def row_from_table(table: Any, path: Path) -> RunRow:
         if not _fits(name, value):
             raise _bad(path, name, value)
     row = RunRow(**values)
-    if row.inliers > row.correspondences or row.decisive_step >= max(row.steps, 1) or row.decisive_step < 0:
-        shown = (row.inliers, row.correspondences, row.decisive_step, row.steps)
-        raise _bad(path, "inliers, correspondences, decisive_step, steps", shown)
+    if row.inliers > row.correspondences or row.key_step >= max(row.steps, 1) or row.key_step < 0:
+        shown = (row.inliers, row.correspondences, row.key_step, row.steps)
+        raise _bad(path, "inliers, correspondences, key_step, steps", shown)
     return row
 
 

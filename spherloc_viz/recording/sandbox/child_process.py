@@ -25,7 +25,7 @@ def cannot_start(reason: str) -> ExaminerError:
     """What to raise, and why."""
     return ExaminerError(
         f"recordings cannot be examined: the process that reads them does not start ({reason}); "
-        "'python -m spherloc_viz.recording.strangers.child' says more."
+        "'python -m spherloc_viz.recording.sandbox.child' says more."
     )
 
 
@@ -36,7 +36,7 @@ class Child:
         """Raises ``RecordingError`` if it does not start."""
         try:
             self._process = subprocess.Popen(
-                [sys.executable, "-P", "-m", "spherloc_viz.recording.strangers.child"],
+                [sys.executable, "-P", "-m", "spherloc_viz.recording.sandbox.child"],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,

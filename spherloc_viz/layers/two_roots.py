@@ -54,12 +54,12 @@ def pair(view: RunView, arcs: Arcs) -> Frame:
     first, second = (int(number) for number in stage.pairs[example[0]])
     k = int(example[np.argmax(arcs.in_clique[example])])
     lo, hi = np.degrees(stage.lo_rad[k]), np.degrees(stage.hi_rad[k])
-    twin = ", and a twin of it" if len(example) > 1 else ""
+    also = ", and a second arc" if len(example) > 1 else ""
     d1, d2, d3 = pair_roots(view, first, second).wave
     return Frame(
         f"Matches {first} and {second} can both be right only where the line between their points turns into the plane "
         f"of their bearings, and that fixes the yaw. With {view.trace.options.bound_px:.3g} px of noise it is an arc "
-        f"of {hi - lo:.2g}°, from {lo:.2f}° to {hi:.2f}°{twin}.",
+        f"of {hi - lo:.2g}°, from {lo:.2f}° to {hi:.2f}°{also}.",
         f"{d1:.3g} cos θ {_signed(d2)} sin θ {_signed(d3)} = 0   (Eq. 22)",
         *_shown(view, (first, second), 0.5 * float(stage.lo_rad[k] + stage.hi_rad[k])),
         note=stage.rule,
@@ -73,16 +73,16 @@ def pair(view: RunView, arcs: Arcs) -> Frame:
     )
 
 
-def twins(view: RunView, arcs: Arcs) -> Frame:
+def roots(view: RunView, arcs: Arcs) -> Frame:
     """All arcs of the pair, and how many arcs pairs have."""
     example, stage = arcs.example, arcs.stage
     first, second = (int(number) for number in stage.pairs[example[0]])
-    roots = pair_roots(view, first, second)
+    found = pair_roots(view, first, second)
     one, several = arcs.pair_counts
     none = stage.pairs_total - one - several
     other = example[np.argmin(arcs.in_clique[example])]
     return Frame(
-        f"{_why(roots, len(example))} Of all {stage.pairs_total:,} pairs, {several:,} have two arcs or more, {one:,} "
+        f"{_why(found, len(example))} Of all {stage.pairs_total:,} pairs, {several:,} have two arcs or more, {one:,} "
         f"have one, and {none:,} have none.",
         "θ = atan2(d2, d1) ± arccos(−d3 / √(d1² + d2²))   (Eq. 22-23)",
         *_shown(view, (first, second), 0.5 * float(stage.lo_rad[other] + stage.hi_rad[other])),
@@ -95,11 +95,11 @@ def twins(view: RunView, arcs: Arcs) -> Frame:
 def _why(roots: PairRoots, arcs: int) -> str:
     """Why the pair has as many arcs as it has, as a sentence."""
     if len(roots.yaws_rad) == 0:
-        return "The wave of this pair only comes near zero, so it has no exact root and no twin."
+        return "The wave of this pair only comes near zero, so it has no exact root."
     one, two = (f"{value:.2f}°" for value in np.degrees(roots.yaws_rad))
     wave = f"A wave crosses zero twice in a turn, so the pair has two roots, {one} and {two}"
     if roots.in_front.all() and arcs > 1:
-        return f"{wave}, and both put its points in front of the camera: only other matches tell such twins apart."
+        return f"{wave}, and both put its points in front of the camera: only other matches tell the two apart."
     if roots.in_front.all():
         return f"{wave}, but the arc around one of them is too wide to say much."
     behind = two if roots.in_front[0] else one
@@ -119,14 +119,14 @@ def _shown(view: RunView, numbers: tuple[int, int], yaw_rad: float) -> tuple[Flo
 def _items(view: RunView, arcs: Arcs, shown: np.ndarray, numbers: tuple[int, int]) -> tuple[SceneItem, ...]:
     """Some arcs of the pair with a spoke through each, and the line between its points."""
     middles = 0.5 * (arcs.stage.lo_rad + arcs.stage.hi_rad)[shown]
-    hands = [ring.spoke("ring/hand", view, view.middle, float(yaw), style.SAMPLE).points for yaw in middles]
+    spokes = [ring.spoke("ring/candidate", view, view.middle, float(yaw), style.SAMPLE).points for yaw in middles]
     marked = np.ones(len(shown), dtype=bool)
     ends = view.points[list(numbers)][None]
     ids = np.array([numbers], dtype=np.int64)
     return (
         arcs.drawn(view, shown, marked, style.SAMPLE),
         ring.outline("ring/overlap", ring.circle(view, view.middle, np.zeros(())), style.SPHERE),
-        Segments("ring/hand", "yaw ring", np.concatenate(hands), one_color(style.SAMPLE, len(hands)), 4.0),
+        Segments("ring/candidate", "yaw ring", np.concatenate(spokes), one_color(style.SAMPLE, len(spokes)), 4.0),
         *ring.spokes(view, view.middle, None),
         Segments("pairs/sample", "pairs", ends, one_color(style.SAMPLE, 1), 3.0, ids=ids),
     )

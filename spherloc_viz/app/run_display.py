@@ -10,15 +10,15 @@ import viser
 from spherloc.datasets.synthetic import TrueCamera
 from spherloc.diagnosis import Diagnosis
 from spherloc_viz.app.controls.display_controls import DisplayControls
+from spherloc_viz.app.left_panels import LeftPanels
 from spherloc_viz.app.matches.match_card import MatchCard
 from spherloc_viz.app.panels.export_panel import Shown
+from spherloc_viz.app.run_request import Run
 from spherloc_viz.app.stage.canvas import Canvas
-from spherloc_viz.app.story import Story
 from spherloc_viz.app.text import diagnosis_html, status_html
 from spherloc_viz.app.web.touch import Touches
-from spherloc_viz.app.web.viser_seams import changes_of, set_theme
-from spherloc_viz.app.wish import Run
-from spherloc_viz.layers import paint, steps, with_rival
+from spherloc_viz.app.web.viser_internals import changes_of, set_theme
+from spherloc_viz.layers import paint, steps, with_alternative
 from spherloc_viz.layers.primitives import Picture, SceneItem
 from spherloc_viz.layers.selection import with_selection
 from spherloc_viz.layers.tables import outcome_table
@@ -60,7 +60,7 @@ class Places:
     """The true camera was dragged to a new place; None where it may not be."""
 
 
-class Face:
+class RunDisplay:
     """One client's page. Everything is drawn on the session's page thread."""
 
     def __init__(
@@ -69,7 +69,7 @@ class Face:
         """``widths_px`` are those of the panels left and right of the canvas."""
         self._client, self.controls = client, controls
         select, movable = places.select, places.move is not None
-        self.story = Story(client.gui, touches, places.redraw, lambda chosen: select(chosen, False), widths_px[0])
+        self.panels = LeftPanels(client.gui, touches, places.redraw, lambda chosen: select(chosen, False), widths_px[0])
         self.card = MatchCard(client.gui, editable=movable)
         moved = places.move or (lambda place: None)
         self.canvas = Canvas(client, self.controls.display, select, moved, sum(widths_px))
@@ -100,11 +100,11 @@ class Face:
             run, diagnosis = self._untold(run), None
         trace = run.trace
         timeline = steps(trace)
-        index, pause = self.story.steps.settle(timeline, asked)
+        index, pause = self.panels.steps.advance(timeline, asked)
         picture, last = paint(trace, index), index == len(timeline) - 1
-        rival = None if diagnosis is None else diagnosis.rival_cam_from_map
-        if last and rival is not None:
-            picture = with_rival(picture, trace, rival)
+        alternative = None if diagnosis is None else diagnosis.alternative_cam_from_map
+        if last and alternative is not None:
+            picture = with_alternative(picture, trace, alternative)
         drawn = with_selection(picture, trace, selected)
         drawn = replace(drawn, scene=drawn.scene + controls.items(run))
         self._shown = known, mesh, drawn
@@ -115,10 +115,10 @@ class Face:
                 controls.draw(run, diagnosis)
             # The other views tell inliers by the colours of the picture as it was.
             told = replace(picture, step=drawn.step)
-            self.story.draw(run, told, pause is not None, outcome_table(trace), selected, hidden and not last)
+            self.panels.draw(run, told, pause is not None, outcome_table(trace), selected, hidden and not last)
             waiting = "" if hidden else status_html("Diagnosing …")
-            self.story.diagnose(waiting if diagnosis is None else diagnosis_html(diagnosis, whole=last))
-            self.card.draw(trace, selected, run.kept, rival, self.canvas.clicked_left)
+            self.panels.diagnose(waiting if diagnosis is None else diagnosis_html(diagnosis, whole=last))
+            self.card.draw(trace, selected, run.kept, alternative, self.canvas.clicked_left)
         self._client.flush()
         return self.canvas.check() if pause is None else pause
 
@@ -144,7 +144,7 @@ class Face:
             trace=trace,
             items=tuple(item for item in picture.scene if item.layer in layers),
             backdrop=mesh if "mesh" in layers else None,
-            title=run.wish.scene.scene,
+            title=run.request.scene.scene,
             note=f"{trace.estimator}, seed {trace.seed}. {trace.message}",
             recorded=recorded,
             dark=display.theme == "dark",

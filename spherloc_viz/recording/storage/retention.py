@@ -8,9 +8,9 @@ from pathlib import Path
 from spherloc.errors import RecordingError
 from spherloc_viz.recording.index.query import RunQuery
 from spherloc_viz.recording.index.run_index import RunIndex
-from spherloc_viz.recording.keeping.room import size_words
 from spherloc_viz.recording.review.notes import has_review
 from spherloc_viz.recording.run_row import RunRow
+from spherloc_viz.recording.storage.room import size_words
 
 NEWEST_KEPT = 20
 """The last runs stay whatever they are: somebody may be looking at them."""

@@ -1,6 +1,6 @@
 """Whether a recording is of moderate size in every respect and of the types that we write, before it is believed.
 
-For the child that reads recordings from strangers: whatever is refused here would otherwise cost memory or time later.
+For the child that reads untrusted recordings: whatever is refused here would otherwise cost memory or time later.
 """
 
 import io
@@ -23,7 +23,7 @@ from spherloc_viz.recording.content.data import ARRAYS, DATA
 from spherloc_viz.recording.content.numbers import NUMBERS, TYPES
 from spherloc_viz.recording.content.properties import RUN_TYPES
 from spherloc_viz.recording.content.reader import PROPERTIES, RecordedRun
-from spherloc_viz.recording.strangers.checked_row import COUNT_LIMIT
+from spherloc_viz.recording.sandbox.checked_row import COUNT_LIMIT
 
 PROBLEM = f"{DATA}/problem"
 """The row of the problem in formats 1 and 2."""
@@ -167,7 +167,7 @@ def check_run(run: RecordedRun, path: Path) -> None:
         "the origin": run.origin is None or _fits(run.origin, type(run.origin)),
         "the scene's text": run.scene_text is None or isinstance(run.scene_text, str),
         "the diagnosis": run.diagnosis is None or _fits(run.diagnosis, type(run.diagnosis)),
-        "the other pose": run.diagnosis is None or _is_pose_or_none(run.diagnosis.rival_cam_from_map),
+        "the other pose": run.diagnosis is None or _is_pose_or_none(run.diagnosis.alternative_cam_from_map),
         "the query image": run.query_image is None or _is_moderate_image(run.query_image),
     }
     wrong = [name for name, is_good in good.items() if not is_good]
