@@ -8,13 +8,11 @@ try to win one correspondence more, then another.
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from spherloc.geometry import yaw_of
 from spherloc.problem import AlignedProblem
 from spherloc.solvers.two_point import two_point
-
-FloatArray = NDArray[np.float64]
+from spherloc.types import FloatArray
 
 STEPS = 8
 STEP = 1e-6

@@ -7,7 +7,6 @@ from multiprocessing import get_context
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.brute_force import largest_consensus
 from spherloc.cameras.base import Camera, in_image
@@ -18,8 +17,7 @@ from spherloc.estimators import estimate
 from spherloc.estimators.base import options_type
 from spherloc.geometry import DOWN, pose, so3_exp, tangent_basis
 from spherloc.problem import Problem
-
-FloatArray = NDArray[np.float64]
+from spherloc.types import FloatArray
 
 MOST = 14
 KINDS = ("anywhere", "near-horizontal", "near-vertical", "repeated", "narrow", "plane", "far")

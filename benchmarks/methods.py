@@ -5,16 +5,12 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from spherloc import registry
 from spherloc.estimators import estimate
 from spherloc.estimators.base import options_type
 from spherloc.problem import Problem
 from spherloc.trace import Certificate
-
-FloatArray = NDArray[np.float64]
+from spherloc.types import FloatArray
 
 BOUND_PX = 3.0
 """The noise bound of every method, px of the scene's camera; noise is 1 px."""

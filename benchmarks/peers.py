@@ -13,14 +13,12 @@ import cv2
 import numpy as np
 import poselib
 import pycolmap
-from numpy.typing import NDArray
 
 from benchmarks.methods import BOUND_PX, CONFIDENCE, MOST_ITERATIONS, Answer, Method, Solve
 from spherloc.geometry import pose
 from spherloc.problem import Problem
+from spherloc.types import FloatArray, IntArray
 
-FloatArray = NDArray[np.float64]
-IndexArray = NDArray[np.int64]
 Project = Callable[[FloatArray], FloatArray]
 
 FOCAL_PX = 375.0
@@ -55,12 +53,12 @@ def to_panorama(rays: FloatArray) -> FloatArray:
     return FOCAL_PX * np.column_stack([lon + np.pi, lat + np.pi / 2])
 
 
-def face_of(rays: FloatArray) -> IndexArray:
+def face_of(rays: FloatArray) -> IntArray:
     """Index (N,) of the face of the cube that each ray (N, 3) falls in."""
     return np.argmax(rays @ FACES[:, 2].T, axis=1)
 
 
-def pixel_ratio(problem: Problem, rows: IndexArray, project: Project) -> float:
+def pixel_ratio(problem: Problem, rows: IntArray, project: Project) -> float:
     """Median over the correspondences ``rows`` of how many of the peer's pixels a scene pixel is wide."""
     half = 0.25
     columns = []
@@ -76,12 +74,12 @@ def _answer(rotation: Any, translation: Any) -> Answer:
     return Answer(estimate if np.isfinite(estimate).all() else None)
 
 
-def _front(problem: Problem, most_rad: float) -> IndexArray:
+def _front(problem: Problem, most_rad: float) -> IntArray:
     """The usable correspondences (K,) within an angle of the optical axis."""
     return np.flatnonzero(problem.usable & (np.nan_to_num(problem.bearings[:, 2], nan=-1.0) > np.cos(most_rad)))
 
 
-def _rig_data(problem: Problem) -> tuple[IndexArray, IndexArray, FloatArray, float]:
+def _rig_data(problem: Problem) -> tuple[IntArray, IntArray, FloatArray, float]:
     """Rows of the usable correspondences (K,), their faces (K,), pixels (K, 2) there, and the threshold, px."""
     rows = np.flatnonzero(problem.usable)
     faces = face_of(problem.bearings[rows])

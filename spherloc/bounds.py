@@ -3,13 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from spherloc.errors import InputError, show
 from spherloc.problem import AlignedProblem
 from spherloc.ranges import LEAST_PX, MOST_PX
-
-FloatArray = NDArray[np.float64]
+from spherloc.types import FloatArray
 
 LEAST_BOUND_PX, MOST_BOUND_PX = LEAST_PX / 100, 100 * MOST_PX
 """What a diagnosis asks for may be some times wider or tighter than what people may give."""

@@ -4,9 +4,9 @@ A pose is ``cam_from_map``, a (3, 4) matrix [R | t] in metres with p_cam = R p_m
 """
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-FloatArray = NDArray[np.float64]
+from spherloc.types import FloatArray
 
 DOWN = np.array([0.0, 1.0, 0.0])
 """Gravity in every aligned frame: the y axis points down."""

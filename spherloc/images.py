@@ -12,15 +12,14 @@ from PIL import Image
 
 from spherloc.errors import InputError
 from spherloc.files import open_file, read_file, reading
-
-ByteImage = NDArray[np.uint8]
+from spherloc.types import ByteArray
 
 MAX_BYTES = 200_000_000
 MAX_PIXELS = 150_000_000
 """Beyond any panorama, so that a corrupt header cannot exhaust the memory."""
 
 
-def read_image(path: Path) -> ByteImage:
+def read_image(path: Path) -> ByteArray:
     """An image as (H, W, 3) BGR or (H, W) grey bytes.
 
     Raises ``InputError`` for what is missing, unreadable, too large or no image.
@@ -52,7 +51,7 @@ def read_size(path: Path) -> tuple[int, int]:
         return _size(file, path)
 
 
-def grey(image: ByteImage) -> ByteImage:
+def grey(image: ByteArray) -> ByteArray:
     """(H, W) of a BGR or grey image."""
     return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
 

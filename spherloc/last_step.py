@@ -8,7 +8,6 @@ the winner.
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from spherloc.bounds import Bounds
 from spherloc.gauss_newton import LEAST_GRAVITY_SD_RAD
@@ -24,9 +23,8 @@ from spherloc.refine import (
     residuals_px,
 )
 from spherloc.trace import RefinementStage
+from spherloc.types import BoolArray, FloatArray
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 Data = tuple[FloatArray, FloatArray, FloatArray]
 """Bearings, points, and the tangent planes' pixels, as the kernels of ``narrowing`` take them."""
 Model = tuple[float, float]

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from spherloc.cameras.base import BoolArray, Camera, FloatArray
+from spherloc.cameras.base import Camera
 from spherloc.cameras.calibration import camera_from_table, load_camera
 from spherloc.cameras.colmap_models import camera_from_colmap
 from spherloc.diagnosis import Diagnosis, diagnose
@@ -22,6 +22,7 @@ from spherloc.geometry import camera_centre
 from spherloc.outcome import Judgement, Outcome, judge
 from spherloc.problem import Problem
 from spherloc.trace import Certificate, RefinementStage, Trace
+from spherloc.types import BoolArray, FloatArray
 
 CAMERA = "the camera"
 """What a sentence calls a camera that comes from no file."""

@@ -3,13 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from spherloc.geometry import camera_centre, rotation_angle
 from spherloc.trace import Trace
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
+from spherloc.types import BoolArray, FloatArray
 
 SUCCESS_DEG = 1.0
 SUCCESS_M = 0.1

@@ -8,15 +8,11 @@ which is steadier than the matrix where there are few matches).
 """
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from spherloc.problem import AlignedProblem
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-IntArray = NDArray[np.int64]
+from spherloc.types import BoolArray, FloatArray, IntArray
 
 PRIOR_GROUPS = 10.0
 """Groups of matches with the stated noise that are believed in beforehand."""

@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
-from numpy.typing import NDArray
 
 from spherloc.bounds import bounds_of
 from spherloc.consensus.chance import chance_rate, nfa
@@ -22,9 +21,7 @@ from spherloc.narrowing import NARROWINGS, narrow
 from spherloc.problem import AlignedProblem
 from spherloc.refine import RefinementOptions, gravity_sd_rad, residuals_px
 from spherloc.trace import ConsensusStage, RefinementStage, Trace
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
+from spherloc.types import BoolArray, FloatArray
 
 MOST_NFA = 1e-3
 """Expected number of false alarms (NFA) of the size of the inliers below which they are believed."""

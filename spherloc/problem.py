@@ -8,12 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spherloc.cameras.base import BoolArray, Camera, FloatArray
+from spherloc.cameras.base import Camera
 from spherloc.errors import ProblemError, show
 from spherloc.geometry import align_to_down, pose, tangent_basis
 from spherloc.ranges import LEAST_M, LEAST_PX, MOST_M, MOST_PX, is_number
-
-IntArray = NDArray[np.int64]
+from spherloc.types import BoolArray, FloatArray, IntArray
 
 LEAST_STRETCH = 0.01
 """Smallest ratio of the two singular values of an unprojection's Jacobian that residuals believe in."""

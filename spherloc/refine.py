@@ -10,7 +10,6 @@ from typing import Literal, get_args
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from spherloc.bounds import Bounds
 from spherloc.errors import InputError, show
@@ -33,9 +32,7 @@ from spherloc.noise_scale import variance_factor
 from spherloc.problem import AlignedProblem
 from spherloc.ranges import check_options, is_number
 from spherloc.trace import RefinementStage
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
+from spherloc.types import BoolArray, FloatArray
 
 MAX_STEPS = 15
 MAX_ROUNDS = 10

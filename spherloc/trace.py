@@ -8,11 +8,10 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from spherloc.cameras.base import BoolArray, FloatArray
 from spherloc.errors import show
 from spherloc.problem import Problem
+from spherloc.types import BoolArray, FloatArray, IndexArray
 
-IndexArray = NDArray[np.int32]
 StageT = TypeVar("StageT", bound="Stage")
 
 

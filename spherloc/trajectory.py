@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from spherloc.errors import InputError, reason, show
 from spherloc.files import open_file, reading
-
-FloatArray = NDArray[np.float64]
+from spherloc.types import FloatArray
 
 NS_PER_S = 1_000_000_000
 

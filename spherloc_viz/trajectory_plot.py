@@ -9,10 +9,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 
-from spherloc.cameras.base import BoolArray, FloatArray
 from spherloc.experiments.results import SequenceResults
 from spherloc.experiments.rows import FAILED
 from spherloc.geometry import align_to_down
+from spherloc.types import BoolArray, FloatArray
 from spherloc_viz.style import ERROR_RAMP, ESTIMATE, OUTLIER, TRUTH, css, error_scale
 
 WIDTH_INCHES = 9.0

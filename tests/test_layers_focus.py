@@ -10,9 +10,10 @@ from spherloc.estimators import estimate
 from spherloc.geometry import camera_centre
 from spherloc.registry import names
 from spherloc.trace import Trace
+from spherloc.types import FloatArray
 from spherloc_viz.app.stage import views
 from spherloc_viz.layers import paint, steps
-from spherloc_viz.layers.primitives import Balls, FloatArray, Label, Picture, Points, Segments
+from spherloc_viz.layers.primitives import Balls, Label, Picture, Points, Segments
 
 ASPECTS = (0.83, 1.2)
 """Width over height of the canvas of a page of 1366 x 768 and 1920 x 1080."""

@@ -9,7 +9,7 @@ from math import inf
 import numpy as np
 
 from spherloc.cameras._radial import RIM_MARGIN, InverseTable, first_positive_root
-from spherloc.cameras.base import BoolArray, FloatArray
+from spherloc.types import BoolArray, FloatArray
 
 _TABLE_NODES = 1025
 _NEWTON_STEPS = 2

@@ -9,8 +9,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from spherloc.cameras.base import FloatArray
 from spherloc.errors import CalibrationError, ProblemError, show
+from spherloc.types import FloatArray
 
 MAX_SIDE_PX = 100_000
 """Largest width or height: beyond any panorama, so that a corrupt size cannot exhaust the memory."""

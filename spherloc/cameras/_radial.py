@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from spherloc.cameras.base import FloatArray
+from spherloc.types import FloatArray
 
 RIM_MARGIN = 1e-6
 """Share of a validity limit given up, under a thousandth of a pixel: at the limit itself nothing can be inverted."""

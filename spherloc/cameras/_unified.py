@@ -11,8 +11,8 @@ import numpy as np
 
 from spherloc.cameras import _checks
 from spherloc.cameras._radial import RIM_MARGIN
-from spherloc.cameras.base import BoolArray, FloatArray
 from spherloc.errors import CalibrationError
+from spherloc.types import BoolArray, FloatArray
 
 _FARTHEST = 1e3
 """Largest ``max_radius``: no image is a thousand focal lengths wide."""

@@ -7,10 +7,8 @@ top-left pixel is (0.5, 0.5).
 from typing import Any, ClassVar, Protocol, Self, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
+from spherloc.types import BoolArray, FloatArray
 
 
 @runtime_checkable

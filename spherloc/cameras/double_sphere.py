@@ -15,8 +15,8 @@ import numpy as np
 
 from spherloc.cameras import _checks, _unified
 from spherloc.cameras._radial import RIM_MARGIN
-from spherloc.cameras.base import BoolArray, FloatArray
 from spherloc.errors import CalibrationError
+from spherloc.types import BoolArray, FloatArray
 
 _LARGEST_XI = 1e3
 """Far beyond any lens, for which xi is between -1 and 1."""

@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from spherloc.cameras import _checks
-from spherloc.cameras.base import BoolArray, FloatArray
+from spherloc.types import BoolArray, FloatArray
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ import numpy as np
 from spherloc.cameras import _checks
 from spherloc.cameras._angle_curve import AngleCurve
 from spherloc.cameras._radial import first_positive_root
-from spherloc.cameras.base import BoolArray, FloatArray
+from spherloc.types import BoolArray, FloatArray
 
 _FARTHEST = 1e3
 """Largest disc: no image is a thousand focal lengths wide."""

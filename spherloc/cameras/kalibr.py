@@ -22,12 +22,13 @@ from spherloc.cameras._files import (
     table_of,
     value_of,
 )
-from spherloc.cameras.base import Camera, FloatArray
+from spherloc.cameras.base import Camera
 from spherloc.cameras.double_sphere import DoubleSphere
 from spherloc.cameras.eucm import Eucm
 from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.cameras.mei import Mei
 from spherloc.errors import CalibrationError, show
+from spherloc.types import FloatArray
 
 _ROTATION_TOLERANCE = 1e-3
 """Largest error of R R^T: matrices rounded to four digits pass, a scale or a wrong matrix does not."""

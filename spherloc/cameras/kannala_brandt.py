@@ -13,7 +13,7 @@ import numpy as np
 
 from spherloc.cameras import _checks
 from spherloc.cameras._angle_curve import AngleCurve
-from spherloc.cameras.base import BoolArray, FloatArray
+from spherloc.types import BoolArray, FloatArray
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,8 @@ import numpy as np
 
 from spherloc.cameras import _checks
 from spherloc.cameras._radial import RIM_MARGIN, InverseTable, first_positive_root
-from spherloc.cameras.base import BoolArray, FloatArray
 from spherloc.errors import CalibrationError
+from spherloc.types import BoolArray, FloatArray
 
 _FARTHEST = 1e3
 """Largest ``max_radius``: with xi <= 1 the plane has no end, but no image is a thousand focal lengths wide."""

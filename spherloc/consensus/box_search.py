@@ -10,9 +10,8 @@ from spherloc.consensus.pair_arcs import CIRCLE, direction_of_turn
 from spherloc.consensus.pose_cells import has_tilt, place_cell
 from spherloc.consensus.pose_search import BEST, CELL_EFFORT, CELLS, EFFORT, HALT, SPLITS, put_off, search_poses
 from spherloc.consensus.stabbing import EVERYWHERE, deepest, keep_possible
+from spherloc.types import FloatArray
 from spherloc.watch import stopped
-
-FloatArray = NDArray[np.float64]
 
 MOST_BOXES = 1024
 """Boxes that wait; the deepest is split first."""

@@ -1,10 +1,9 @@
 """What chance alone explains: when it explains as much as the best pose, no method can know the answer."""
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import gammaln
 
-FloatArray = NDArray[np.float64]
+from spherloc.types import FloatArray
 
 NEIGHBOURHOOD_RAD = 0.2
 """Bearings are counted within this angle, to know how dense they are around each other."""

@@ -9,7 +9,6 @@ promising first.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from spherloc.bounds import Bounds
 from spherloc.consensus.balls_of_pairs import apart_balls, view_between
@@ -24,12 +23,9 @@ from spherloc.consensus.support import improve
 from spherloc.consensus.yaw_bins import BIN_TURN, BINS, degree_bounds, sort_into_bins
 from spherloc.geometry import yaw_rotation
 from spherloc.problem import AlignedProblem
+from spherloc.types import BoolArray, FloatArray, IndexArray
 from spherloc.watch import Watch
 from spherloc.working_time import working_s
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-IndexArray = NDArray[np.int32]
 
 DOUBTFUL = 1e-6
 """Expected number of false alarms (NFA) of the size of the guess above which better guesses are looked for."""

@@ -9,14 +9,11 @@ every graph.
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from spherloc.consensus.depth_bounds import chord, pair_sinusoids
 from spherloc.problem import AlignedProblem
+from spherloc.types import FloatArray, IndexArray
 from spherloc.watch import DONE, Watch, stopped
-
-FloatArray = NDArray[np.float64]
-IndexArray = NDArray[np.int32]
 
 CIRCLE = 4.0
 """Turns of the whole circle."""

@@ -37,11 +37,9 @@ from typing import NamedTuple
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from spherloc.problem import AlignedProblem
-
-FloatArray = NDArray[np.float64]
+from spherloc.types import FloatArray
 
 CHARTS = 7
 YAW, TILT_A, TILT_C = 3, 4, 5

@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spherloc.consensus.pose_cells import SLACK, has_tilt, place_cell
+from spherloc.types import FloatArray
 from spherloc.watch import stopped
-
-FloatArray = NDArray[np.float64]
 
 BEND = 1.1547005383792517
 """2 / sqrt 3."""

@@ -36,10 +36,9 @@ from spherloc.consensus.pose_search import (
 from spherloc.consensus.stabbing import scratch_for
 from spherloc.consensus.yaw_bins import BINS
 from spherloc.problem import AlignedProblem
+from spherloc.types import FloatArray
 from spherloc.watch import DONE, Watch
 from spherloc.working_time import working_s
-
-FloatArray = NDArray[np.float64]
 
 SWITCH_RAD = 0.06
 """Mean movement of directions in a box below which it is searched with derivatives."""

@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 
 from spherloc.consensus.pair_arcs import CIRCLE
 from spherloc.consensus.pose_cells import SLACK
-
-FloatArray = NDArray[np.float64]
+from spherloc.types import FloatArray
 
 FEW_BINS, MANY_BINS = 256, 1024
 """Multiples of the bins of ``yaw_bins``."""

@@ -18,11 +18,8 @@ from numpy.typing import NDArray
 
 from spherloc.consensus.depth_bounds import chord, pair_sinusoids
 from spherloc.problem import AlignedProblem
+from spherloc.types import BoolArray, FloatArray, IndexArray
 from spherloc.watch import DONE, Watch, stopped
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-IndexArray = NDArray[np.int32]
 
 ROUNDING = 1e-9
 """Part by which a lower bound is lowered, so that rounding never turns away a ball."""

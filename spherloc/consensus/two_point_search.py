@@ -15,17 +15,13 @@ from typing import Literal
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from spherloc.consensus.inliers import BLOCK, pack_blocks, reaches, score_inliers
 from spherloc.consensus.level_fit import fit, place, translation_of
 from spherloc.problem import AlignedProblem
 from spherloc.solvers.two_point import solve_pair
+from spherloc.types import BoolArray, FloatArray, IndexArray
 from spherloc.watch import DONE, TOTAL, Watch, stopped
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-IndexArray = NDArray[np.int32]
 
 Scoring = Literal["count", "msac"]
 

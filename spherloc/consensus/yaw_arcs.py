@@ -11,14 +11,11 @@ angles are computed only of the arcs that are returned: half of all pairs have n
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from spherloc.consensus.depth_bounds import chord, pair_sinusoids
 from spherloc.problem import AlignedProblem
+from spherloc.types import FloatArray, IndexArray
 from spherloc.watch import DONE, Watch, stopped
-
-FloatArray = NDArray[np.float64]
-IndexArray = NDArray[np.int32]
 
 FULL = 2.0 * np.pi
 MOST_ARCS = 4

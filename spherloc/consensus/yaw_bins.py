@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spherloc.consensus.pair_arcs import CIRCLE
+from spherloc.types import FloatArray, IndexArray
 from spherloc.watch import SELDOM, stopped
 
-FloatArray = NDArray[np.float64]
-IndexArray = NDArray[np.int32]
 EdgeArray = NDArray[np.uint16]
 
 BINS = 256

@@ -9,12 +9,9 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
+from spherloc.types import FloatArray, IndexArray
 from spherloc.watch import SELDOM, Watch, stopped
-
-FloatArray = NDArray[np.float64]
-IndexArray = NDArray[np.int32]
 
 BINS = 1440
 """Bins of the overlap curve kept for display, a quarter of a degree each."""

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from spherloc.cameras.base import BoolArray, FloatArray
 from spherloc.datasets import scene_file
 from spherloc.errors import CalibrationError, InputError, shorten
 from spherloc.files import is_file
 from spherloc.formats.colmap_model import ColmapImage, ColmapModel
 from spherloc.frontend.lifting import SfmLift
 from spherloc.frontend.view import View
+from spherloc.types import BoolArray, FloatArray
 
 _KEPT = 64
 """Images whose observations stay in memory, those used last."""

@@ -6,7 +6,6 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from spherloc.cameras.base import Camera
 from spherloc.datasets.outliers import clearly_apart
@@ -14,9 +13,8 @@ from spherloc.datasets.point_cloud import HALF_SIZE_M, sees
 from spherloc.datasets.scene_file import bundled_scenes, load_scene
 from spherloc.geometry import DOWN, pose, so3_exp, transform, yaw_rotation
 from spherloc.problem import Problem
+from spherloc.types import BoolArray, FloatArray
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 Cloud = Callable[[np.random.Generator, int], FloatArray]
 
 SCENES = ("mei_outliers_80", "fisheye_outliers_80", "panorama_outliers_80")

@@ -16,8 +16,7 @@ from spherloc.datasets.failure_parts import CaseMaker, Cloud, FailureCase
 from spherloc.datasets.point_cloud import HALF_SIZE_M
 from spherloc.errors import InputError, show
 from spherloc.geometry import camera_centre, pose, yaw_rotation
-
-FloatArray = NDArray[np.float64]
+from spherloc.types import FloatArray
 
 GUESSES = 100
 """Pairs that mc-exact samples with the least effort."""

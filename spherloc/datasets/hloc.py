@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from spherloc.cameras.base import Camera, FloatArray
+from spherloc.cameras.base import Camera
 from spherloc.datasets import map_settings, scene_file
 from spherloc.datasets.colmap_views import gravity_of_map, model_views, some, split_gravity
 from spherloc.datasets.hloc_matches import HlocMatcher
@@ -26,6 +26,7 @@ from spherloc.formats.hloc_files import open_hdf5, read_global_descriptors, read
 from spherloc.frontend.frontend_options import MOST_REFERENCES
 from spherloc.frontend.pipeline import image_matcher
 from spherloc.frontend.view import Matcher, View
+from spherloc.types import FloatArray
 
 EXTRAS = ("colmap", "hloc")
 EXAMPLE = """\

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from spherloc.cameras.base import FloatArray
 from spherloc.errors import InputError, show
 from spherloc.formats.colmap_model import ColmapModel
-from spherloc.formats.hloc_files import Hdf5, IntArray, Keypoints, open_hdf5, read_keypoints, read_matches
+from spherloc.formats.hloc_files import Hdf5, Keypoints, open_hdf5, read_keypoints, read_matches
 from spherloc.frontend.view import Matches, View
+from spherloc.types import FloatArray, IntArray
 
 _WORTH_SAYING_PX = 1.0
 """Rounding and uncertainty of keypoints beyond it are said: bounds on the noise are a few pixels."""

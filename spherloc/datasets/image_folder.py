@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from spherloc.cameras.base import Camera, FloatArray
+from spherloc.cameras.base import Camera
 from spherloc.datasets import map_settings, scene_file
 from spherloc.datasets.colmap_views import gravity_of_map, model_views, some, split_gravity, unit_vector
 from spherloc.datasets.map_scene import MapScene
@@ -14,6 +14,7 @@ from spherloc.files import is_file, names_in
 from spherloc.formats.colmap_model import read_model
 from spherloc.frontend.view import View
 from spherloc.images import read_size
+from spherloc.types import FloatArray
 
 EXAMPLE = """\
 kind = "image-folder"

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from spherloc.cameras.base import FloatArray
 from spherloc.errors import InputError
 from spherloc.formats.text_rows import finite_numbers, rows
 from spherloc.trajectory import NS_PER_S
+from spherloc.types import FloatArray
 
 GRAVITY_M_S2 = 9.81
 WINDOW_S = 3.0

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from spherloc.cameras.base import FloatArray
 from spherloc.datasets import scene_file
 from spherloc.datasets.map_scene import MapScene
 from spherloc.datasets.map_settings import OPTIONAL, REQUIRED, folder, read_settings
@@ -34,6 +33,7 @@ from spherloc.formats.layout import needed_file
 from spherloc.frontend.lifting import PointCloudLift
 from spherloc.frontend.view import View
 from spherloc.geometry import pose, transform
+from spherloc.types import FloatArray
 
 EXAMPLE = """\
 kind = "kitti360"

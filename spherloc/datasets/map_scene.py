@@ -7,12 +7,12 @@ from functools import cached_property
 
 import numpy as np
 
-from spherloc.cameras.base import FloatArray
 from spherloc.datasets.registration import Registration
 from spherloc.errors import InputError, show
 from spherloc.frontend.view import Matcher, Matches, NeedsPreparing, Report, View
 from spherloc.problem import Problem
 from spherloc.refine import residuals_px
+from spherloc.types import FloatArray
 
 TRUE_INLIER_PX = 8.0
 """Matches this close to their true pixel count as true inliers (Sec. VI-B.1)."""

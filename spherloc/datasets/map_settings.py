@@ -5,13 +5,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from spherloc.cameras.base import FloatArray
 from spherloc.datasets import scene_file
 from spherloc.datasets.map_scene import DEFAULT_THRESHOLDS, MapScene, Thresholds
 from spherloc.errors import InputError
 from spherloc.files import is_folder
 from spherloc.frontend.pipeline import image_matcher
 from spherloc.frontend.view import View
+from spherloc.types import FloatArray
 
 REQUIRED = {"kind", "name"}
 OPTIONAL = {"about", "frontend", "gravity", "options", "thresholds"}

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from spherloc.cameras.base import FloatArray
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.datasets import map_settings, scene_file
 from spherloc.datasets.map_scene import MapScene
@@ -25,6 +24,7 @@ from spherloc.frontend.view import Lift, View
 from spherloc.geometry import pose
 from spherloc.images import read_size
 from spherloc.trajectory import rotation_from_wxyz
+from spherloc.types import FloatArray
 
 GRAVITY_MAP = (0.0, 0.0, -1.0)
 GRAVITY_BOUND_DEG = 2.0

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from spherloc.cameras.base import BoolArray, Camera, FloatArray
+from spherloc.cameras.base import Camera
 from spherloc.cameras.kalibr import read_kalibr_chain
 from spherloc.datasets import scene_file
 from spherloc.datasets.imu import down_at, read_imu
@@ -27,6 +27,7 @@ from spherloc.frontend.lifting import PointCloudLift, SfmLift
 from spherloc.frontend.view import Lift, View
 from spherloc.geometry import camera_centre, pose
 from spherloc.trajectory import NS_PER_S, Trajectory, pose_at, read_newer_college
+from spherloc.types import BoolArray, FloatArray
 
 EXTRAS = ("colmap",)
 EXAMPLE = """\

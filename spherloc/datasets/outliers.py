@@ -4,9 +4,10 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from spherloc.datasets.point_cloud import HALF_SIZE_M, WHOLE_SPHERE_DEG, FloatArray, Lens, random_bearings
+from spherloc.datasets.point_cloud import HALF_SIZE_M, WHOLE_SPHERE_DEG, Lens, random_bearings
 from spherloc.errors import InputError
 from spherloc.geometry import camera_centre, pose, wrap_angle, yaw_of, yaw_rotation
+from spherloc.types import FloatArray
 
 OutlierKind = Literal["random", "coherent", "repeated"]
 OUTLIER_KINDS: tuple[str, ...] = get_args(OutlierKind)

@@ -4,15 +4,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from spherloc.cameras.base import Camera, in_image
 from spherloc.errors import InputError
 from spherloc.geometry import camera_centre, transform
+from spherloc.types import BoolArray, FloatArray, IntArray
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-IntArray = NDArray[np.int64]
 Rngs = tuple[np.random.Generator, np.random.Generator, np.random.Generator]
 
 HALF_SIZE_M = 5.0

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from spherloc.cameras.base import Camera, FloatArray
+from spherloc.cameras.base import Camera
 from spherloc.cameras.calibration import camera_from_table, load_camera
 from spherloc.datasets import scene_file
 from spherloc.errors import InputError, shorten, show
@@ -19,6 +19,7 @@ from spherloc.frontend.lifting import DepthLift
 from spherloc.frontend.view import View
 from spherloc.images import read_depth_png
 from spherloc.trajectory import Trajectory, pose_at, read_euroc, read_tum
+from spherloc.types import FloatArray
 
 MAX_GAP_S = 0.5
 """Poses of a trajectory farther apart than this are not interpolated."""

@@ -12,10 +12,11 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from spherloc.cameras.base import Camera, FloatArray, in_image
+from spherloc.cameras.base import Camera, in_image
 from spherloc.errors import InputError
 from spherloc.frontend.view import Lift, View
 from spherloc.geometry import pose, so3_exp, transform
+from spherloc.types import FloatArray
 
 SAMPLES = 6000
 """Directions, spread evenly over the sphere, in which a depth map is looked up."""

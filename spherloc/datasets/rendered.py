@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spherloc.cameras.base import BoolArray, Camera, FloatArray
+from spherloc.cameras.base import Camera
 from spherloc.cameras.calibration import camera_from_table
 from spherloc.datasets import map_settings, scene_file
 from spherloc.datasets.map_scene import MapScene
@@ -22,7 +22,7 @@ from spherloc.files import is_file
 from spherloc.frontend.lifting import DepthLift
 from spherloc.frontend.view import View
 from spherloc.geometry import pose, so3_exp
-from spherloc.images import ByteImage
+from spherloc.types import BoolArray, ByteArray, FloatArray
 from spherloc.worlds import Conditions, World, build_world, image_path, render, stored_range
 
 MOST_VIEWS = 500
@@ -78,7 +78,7 @@ class Picture:
     def _all(self) -> tuple[World, Camera, FloatArray, Conditions, int, str]:
         return self.world, self.camera, self.cam_from_map, self.conditions, self.seed, self.name
 
-    def image(self) -> ByteImage:
+    def image(self) -> ByteArray:
         """(H, W, 3) BGR, drawn if it is not there yet."""
         return render(*self._all).image
 
@@ -96,7 +96,7 @@ class RenderedView(View):
 
     picture: Picture
 
-    def read(self) -> ByteImage:
+    def read(self) -> ByteArray:
         """See ``View``."""
         return self.picture.image()
 

@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from spherloc.cameras.base import FloatArray
 from spherloc.datasets.scene_file import numbers
 from spherloc.errors import InputError
 from spherloc.geometry import pose
+from spherloc.types import FloatArray
 
 TOLERANCE = 1e-3
 """How far a rotation given by hand may be from orthonormal."""

@@ -10,11 +10,12 @@ from typing import Literal, get_args
 import numpy as np
 
 from spherloc.cameras.base import Camera
-from spherloc.datasets.failure_parts import CaseMaker, Cloud, FloatArray
+from spherloc.datasets.failure_parts import CaseMaker, Cloud
 from spherloc.datasets.failures import PLACES
 from spherloc.errors import InputError, show
 from spherloc.geometry import pose, yaw_rotation
 from spherloc.problem import Problem
+from spherloc.types import FloatArray
 
 GroupKind = Literal["right", "agreeing", "near", "doubled", "random"]
 GROUP_KINDS: tuple[str, ...] = get_args(GroupKind)

@@ -17,10 +17,11 @@ from spherloc.cameras.base import Camera
 from spherloc.cameras.calibration import camera_from_table
 from spherloc.datasets import scene_file
 from spherloc.datasets.outliers import OUTLIER_KINDS, OutlierKind, copies, random_pixels, random_poses, second_pose
-from spherloc.datasets.point_cloud import HALF_SIZE_M, WHOLE_SPHERE_DEG, Cloud, FloatArray, Lens
+from spherloc.datasets.point_cloud import HALF_SIZE_M, WHOLE_SPHERE_DEG, Cloud, Lens
 from spherloc.errors import InputError, show
 from spherloc.geometry import DOWN, camera_centre, pose, so3_exp, transform, yaw_rotation
 from spherloc.problem import Problem
+from spherloc.types import FloatArray
 
 EXAMPLE = """\
 kind = "synthetic"

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from spherloc.cameras.base import Camera
 from spherloc.cameras.calibration import load_camera
@@ -19,9 +18,7 @@ from spherloc.datasets.synthetic import SyntheticScene, TrueCamera
 from spherloc.errors import InputError, show
 from spherloc.geometry import transform
 from spherloc.problem import Problem
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from spherloc.types import FloatArray, IntArray
 
 EDITS = ("spoiled", "mended", "hidden")
 SPOIL_STREAM = 17

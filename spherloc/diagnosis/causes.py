@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from enum import StrEnum
 
-from spherloc.cameras.base import FloatArray
+from spherloc.types import FloatArray
 
 
 class Cause(StrEnum):

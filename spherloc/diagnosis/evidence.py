@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from spherloc.bounds import Bounds, bounds_of
-from spherloc.cameras.base import BoolArray, FloatArray
 from spherloc.consensus.chance import chance_rate, nfa
 from spherloc.diagnosis.experiments import WIDER, Fit, alternative, fit_of, free_fit, search, subset
 from spherloc.diagnosis.measures import apart, pose_sd
@@ -13,6 +12,7 @@ from spherloc.metrics import evaluate
 from spherloc.problem import AlignedProblem
 from spherloc.refine import RefinementOptions, refine
 from spherloc.trace import ConsensusStage, Trace
+from spherloc.types import BoolArray, FloatArray
 
 LOOSE_ENDS = 2
 """Matches that may agree by chance with one of the poses that all others leave open."""

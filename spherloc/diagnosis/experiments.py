@@ -5,7 +5,6 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from spherloc.bounds import bounds_of
-from spherloc.cameras.base import BoolArray, FloatArray
 from spherloc.consensus.two_point_search import search_two_point
 from spherloc.estimators.base import estimate
 from spherloc.estimators.mc_exact import McExactOptions
@@ -14,6 +13,7 @@ from spherloc.geometry import pose, yaw_rotation
 from spherloc.problem import AlignedProblem
 from spherloc.refine import RefinementOptions, refine, residuals_px
 from spherloc.trace import Certificate, Trace
+from spherloc.types import BoolArray, FloatArray
 
 SAMPLES = 20_000
 """Most samples of a search: 99 % sure to draw two of 1.5 % right matches together. A confidence ends it earlier."""

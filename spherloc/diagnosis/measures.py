@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from spherloc.cameras.base import BoolArray, FloatArray
 from spherloc.gauss_newton import LEAST_GRAVITY_SD_RAD
 from spherloc.geometry import camera_centre, rotation_angle, transform
 from spherloc.problem import AlignedProblem
+from spherloc.types import BoolArray, FloatArray
 
 SINGULAR = 1e-12
 """Information below this share of what each unknown has by itself is rounding."""

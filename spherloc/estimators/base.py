@@ -10,7 +10,6 @@ from numbers import Real
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from spherloc import registry
 from spherloc.bounds import Bounds, bounds_of
@@ -19,10 +18,8 @@ from spherloc.problem import AlignedProblem, Problem
 from spherloc.ranges import check_options, check_seed
 from spherloc.refine import RefinementOptions
 from spherloc.trace import Certificate, Stage, Trace
+from spherloc.types import BoolArray, FloatArray
 from spherloc.watch import Cancelled, Watch
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 REFINEMENT_FIELDS = {item.name for item in fields(RefinementOptions)}
 

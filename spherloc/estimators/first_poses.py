@@ -1,7 +1,6 @@
 """Where mc-exact begins: poses within the gravity bound that explain many matches within the noise bound alone."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from spherloc.bounds import Bounds
 from spherloc.consensus.pose_cells import TILT_A, Matches, parameters_of, pose_of
@@ -10,8 +9,7 @@ from spherloc.gauss_newton import LEAST_FOR_SIX_DOF, ROBUST_CAUCHY, polish
 from spherloc.geometry import pose, yaw_rotation
 from spherloc.problem import AlignedProblem
 from spherloc.refine import residuals_px
-
-FloatArray = NDArray[np.float64]
+from spherloc.types import FloatArray
 
 NARROWINGS, ROUNDS, STEPS = 5, 2, 10
 """Bounds from the widened one to that of the noise, choices of inliers at each, and steps on each choice."""

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from spherloc.bounds import Bounds
 from spherloc.consensus.inliers import BLOCK, ROWS, count_inliers, pack_blocks, reaches
@@ -22,11 +21,8 @@ from spherloc.problem import AlignedProblem
 from spherloc.refine import RefinementOptions
 from spherloc.solvers.two_point import two_point
 from spherloc.trace import Stage, TranslationStage, YawStage
+from spherloc.types import FloatArray, IndexArray
 from spherloc.watch import SELDOM, Watch, stopped
-
-FloatArray = NDArray[np.float64]
-IndexArray = NDArray[np.int32]
-
 
 WIDEST_RAD = np.radians(60.0)
 """A pair that leaves more than a sixth of the circle open says too little about yaw; wide arcs are mostly outliers'

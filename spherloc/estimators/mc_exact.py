@@ -26,9 +26,8 @@ from spherloc.last_step import conclude
 from spherloc.problem import AlignedProblem
 from spherloc.refine import RefinementOptions, residuals_px
 from spherloc.trace import Certificate, ConsensusStage, PositionStage, Stage
+from spherloc.types import FloatArray
 from spherloc.working_time import working_s
-
-FloatArray = NDArray[np.float64]
 
 MOST_CORRESPONDENCES = 200_000
 """Some ten seconds and 1 GB."""

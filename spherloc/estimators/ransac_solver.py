@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from spherloc.bounds import Bounds
 from spherloc.errors import InputError
@@ -31,11 +30,8 @@ from spherloc.solvers.odlt import Odlt
 from spherloc.solvers.svd import Svd
 from spherloc.solvers.virtual_pinhole import VirtualPinhole
 from spherloc.trace import RansacStage
+from spherloc.types import BoolArray, FloatArray, IntArray
 from spherloc.watch import Watch
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-IntArray = NDArray[np.int64]
 
 MOST_ITERATIONS = 1_000_000
 

@@ -11,13 +11,13 @@ from typing import Any
 import cv2
 import numpy as np
 
-from spherloc.cameras.base import FloatArray
 from spherloc.datasets.map_scene import MapScene, Thresholds
 from spherloc.datasets.scene_file import numbers
 from spherloc.errors import InputError, show
 from spherloc.estimators.base import versions
 from spherloc.experiments.differences import differences
 from spherloc.files import read_file, reading
+from spherloc.types import FloatArray
 
 FORMAT = 1
 MAX_BYTES = 1_000_000

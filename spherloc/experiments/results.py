@@ -11,12 +11,12 @@ from typing import Self
 
 import numpy as np
 
-from spherloc.cameras.base import FloatArray
 from spherloc.errors import InputError, reason, show
 from spherloc.experiments.configuration import Configuration, read_configuration
 from spherloc.experiments.differences import in_short
 from spherloc.experiments.rows import POSED, QueryResult, csv_text, json_line, row_of_json
 from spherloc.files import read_file, reading
+from spherloc.types import FloatArray
 
 CONFIGURATION, ROWS, TABLE = "configuration.json", "results.jsonl", "results.csv"
 TRAJECTORY, TRUE_TRAJECTORY, PICTURE, SUMMARY = "trajectory.tum", "truth.tum", "trajectory.png", "summary.json"

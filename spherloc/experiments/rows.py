@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from spherloc.cameras.base import FloatArray
 from spherloc.datasets.scene_file import numbers
 from spherloc.errors import InputError, show
 from spherloc.geometry import camera_centre
 from spherloc.outcome import Outcome
+from spherloc.types import FloatArray
 
 LOCALIZED, DOUBTFUL, FAILED = (str(outcome) for outcome in (Outcome.LOCALIZED, Outcome.DOUBTFUL, Outcome.FAILED))
 UNREADABLE = "unreadable"

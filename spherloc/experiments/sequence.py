@@ -9,7 +9,6 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from spherloc.cameras.base import FloatArray
 from spherloc.datasets.map_scene import MapScene
 from spherloc.diagnosis import diagnose
 from spherloc.errors import InputError, SpherlocError, show
@@ -19,6 +18,7 @@ from spherloc.frontend.view import Matches, View
 from spherloc.metrics import evaluate
 from spherloc.outcome import judge
 from spherloc.trace import Trace
+from spherloc.types import FloatArray
 
 T = TypeVar("T")
 R = TypeVar("R")

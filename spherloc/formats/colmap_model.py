@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spherloc.cameras.base import Camera, FloatArray
+from spherloc.cameras.base import Camera
 from spherloc.cameras.colmap_models import camera_from_colmap
 from spherloc.errors import MOST_REASON, CalibrationError, InputError, reason, shorten, show
 from spherloc.extras import require
@@ -21,6 +21,7 @@ from spherloc.files import is_file, is_folder
 from spherloc.formats.colmap_check import check_binary
 from spherloc.formats.colmap_parts import ModelParts, Points
 from spherloc.formats.colmap_text import check_text
+from spherloc.types import FloatArray
 
 _FILES = ("cameras", "images", "points3D")
 _PATIENCE_S = 120.0

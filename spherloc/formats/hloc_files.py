@@ -14,13 +14,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spherloc.cameras.base import Camera, FloatArray
+from spherloc.cameras.base import Camera
 from spherloc.cameras.colmap_models import camera_from_colmap
 from spherloc.errors import CalibrationError, InputError, reason, show
 from spherloc.extras import require
 from spherloc.formats.text_rows import finite_numbers, pose_from_words, refuse_pickle, rows
-
-IntArray = NDArray[np.int64]
+from spherloc.types import FloatArray, IntArray
 
 MAX_BYTES = 1 << 28
 """Of one array: 16 million keypoints."""

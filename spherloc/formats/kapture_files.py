@@ -11,13 +11,14 @@ from pathlib import Path
 
 import numpy as np
 
-from spherloc.cameras.base import Camera, FloatArray
+from spherloc.cameras.base import Camera
 from spherloc.cameras.colmap_models import camera_from_colmap
 from spherloc.errors import CalibrationError, InputError, show
 from spherloc.files import is_file
 from spherloc.formats.layout import needed_file
 from spherloc.formats.text_rows import finite_numbers, pose_from_words, rows
 from spherloc.geometry import pose
+from spherloc.types import FloatArray
 
 _LARGEST_TIMESTAMP = 2**63
 _UNKNOWN = "UNKNOWN_CAMERA"

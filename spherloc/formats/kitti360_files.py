@@ -13,12 +13,13 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from spherloc.cameras.base import BoolArray, Camera, FloatArray
+from spherloc.cameras.base import Camera
 from spherloc.cameras.calibration import load_camera
 from spherloc.errors import InputError, show
 from spherloc.files import is_file, is_folder, names_in, read_file, reading, size_of
 from spherloc.formats.layout import needed_file
 from spherloc.formats.text_rows import finite_numbers, rows
+from spherloc.types import BoolArray, FloatArray
 
 MAX_SCAN_BYTES = 1 << 28
 """A hundred times a scan of the dataset."""

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from spherloc.cameras.base import FloatArray
 from spherloc.errors import InputError, show
 from spherloc.files import open_file, reading
 from spherloc.geometry import pose
 from spherloc.trajectory import rotation_from_wxyz
+from spherloc.types import FloatArray
 
 MAX_BYTES = 1 << 28
 """Larger than the lists of any dataset: millions of pairs of images or of poses."""

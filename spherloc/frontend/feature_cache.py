@@ -9,11 +9,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from spherloc.cameras.base import BoolArray, FloatArray
 from spherloc.disk_cache import cache_folder, key_of, make_room_once, store, used
 from spherloc.files import read_file
 from spherloc.frontend.feature_kinds import Descriptors
 from spherloc.images import MAX_BYTES
+from spherloc.types import BoolArray, FloatArray
 
 VERSION = 2
 """Raised when the same options give other features, so that old files are not taken for them."""

@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from spherloc.cameras.base import FloatArray
 from spherloc.errors import InputError
 from spherloc.frontend import learned
-from spherloc.images import ByteImage, grey
+from spherloc.images import grey
+from spherloc.types import ByteArray, FloatArray
 
 Descriptors = NDArray[np.float32 | np.uint8]
 
@@ -26,7 +26,7 @@ SMALLEST_PX = 16
 class Kind:
     """One kind of features."""
 
-    run: Callable[[ByteImage, ByteImage, int, Path | None], tuple[FloatArray, Any]]
+    run: Callable[[ByteArray, ByteArray, int, Path | None], tuple[FloatArray, Any]]
     """``detect`` of this kind: image, mask, most features, weights -> keypoints (N, 5) and descriptors."""
     reach: float
     """How far around a keypoint its detector looks, as a part of the keypoint's size."""
@@ -37,7 +37,7 @@ class Kind:
 
 
 def detect(
-    method: str, image: ByteImage, mask: ByteImage, most: int, weights: Path | None
+    method: str, image: ByteArray, mask: ByteArray, most: int, weights: Path | None
 ) -> tuple[FloatArray, Descriptors]:
     """Features of an image, (H, W) or (H, W, 3) BGR, at the non-zero pixels of ``mask`` (H, W).
 
@@ -60,7 +60,7 @@ def keypoint_table(keypoints: Any, shift_px: float = 0.5) -> FloatArray:
     return table
 
 
-def _sift(image: ByteImage, mask: ByteImage, _most: int, _weights: Path | None) -> tuple[FloatArray, Any]:
+def _sift(image: ByteArray, mask: ByteArray, _most: int, _weights: Path | None) -> tuple[FloatArray, Any]:
     # Not ``nfeatures``: OpenCV applies it before the mask, and what the mask removes would have used it up.
     # Without the precise upscale every keypoint lies a quarter of a pixel too far right and down.
     sift = cv2.SIFT.create(contrastThreshold=SIFT_CONTRAST, enable_precise_upscale=True)
@@ -79,12 +79,12 @@ def root_normalised(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.sqrt(descriptors / np.maximum(total, np.finfo(np.float32).tiny))
 
 
-def _orb(image: ByteImage, mask: ByteImage, most: int, _weights: Path | None) -> tuple[FloatArray, Any]:
+def _orb(image: ByteArray, mask: ByteArray, most: int, _weights: Path | None) -> tuple[FloatArray, Any]:
     keypoints, descriptors = cv2.ORB.create(nfeatures=most).detectAndCompute(grey(image), mask)
     return keypoint_table(keypoints), descriptors
 
 
-def _akaze(image: ByteImage, mask: ByteImage, _most: int, _weights: Path | None) -> tuple[FloatArray, Any]:
+def _akaze(image: ByteArray, mask: ByteArray, _most: int, _weights: Path | None) -> tuple[FloatArray, Any]:
     # OpenCV 5 moved it to the contributed modules.
     create = getattr(cv2, "AKAZE_create", None) or _contributed("AKAZE_create")
     if create is None:
@@ -96,7 +96,7 @@ def _akaze(image: ByteImage, mask: ByteImage, _most: int, _weights: Path | None)
     return keypoint_table(keypoints), descriptors
 
 
-def _surf(image: ByteImage, mask: ByteImage, _most: int, _weights: Path | None) -> tuple[FloatArray, Any]:
+def _surf(image: ByteArray, mask: ByteArray, _most: int, _weights: Path | None) -> tuple[FloatArray, Any]:
     create = _contributed("SURF_create")
     try:
         surf = None if create is None else create(hessianThreshold=100.0, extended=True)

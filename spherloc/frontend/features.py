@@ -8,12 +8,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from spherloc.cameras.base import BoolArray, FloatArray
 from spherloc.errors import InputError, show
 from spherloc.frontend.feature_cache import feature_file, fetch, keep
 from spherloc.frontend.feature_kinds import KINDS, Descriptors, detect
 from spherloc.frontend.view import View
-from spherloc.images import ByteImage
+from spherloc.types import BoolArray, ByteArray, FloatArray
 
 METHODS = tuple(KINDS)
 MOST_FEATURES = 50_000
@@ -106,7 +105,7 @@ def extract(view: View, options: FeatureOptions | None = None) -> Features:
 
 
 def _detected(
-    image: ByteImage, usable: ByteImage, options: FeatureOptions, seam: bool
+    image: ByteArray, usable: ByteArray, options: FeatureOptions, seam: bool
 ) -> tuple[FloatArray, Descriptors]:
     """Keypoints (N, 5) and descriptors of an image in its own pixels, the strongest first."""
     height, width = image.shape[:2]
@@ -143,7 +142,7 @@ def _wrap_px(columns: int) -> int:
     return min(columns, SEAM_STEP_PX * ceil(max(SEAM_WRAP * columns, SEAM_LEAST_PX) / SEAM_STEP_PX))
 
 
-def _room_px(usable: ByteImage) -> NDArray[np.float32]:
+def _room_px(usable: ByteArray) -> NDArray[np.float32]:
     """(H, W) distance to the nearest pixel that may not be used; the image's own border is none."""
     if usable.all():
         return np.full(usable.shape, np.inf, np.float32)

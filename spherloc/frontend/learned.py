@@ -13,10 +13,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from spherloc.cameras.base import FloatArray
 from spherloc.errors import MOST_REASON, InputError, shorten
 from spherloc.files import open_file, reading
-from spherloc.images import ByteImage
+from spherloc.types import ByteArray, FloatArray
 
 ALIKED_INPUT_PX = 640
 DISK_INPUT_PX = 1024
@@ -37,7 +36,7 @@ _one_at_a_time = Lock()
 """OpenCV's networks keep the state of a run, and are shared by all threads."""
 
 
-def aliked(image: ByteImage, _mask: ByteImage, _most: int, weights: Path | None) -> tuple[FloatArray, Any]:
+def aliked(image: ByteArray, _mask: ByteArray, _most: int, weights: Path | None) -> tuple[FloatArray, Any]:
     """ALIKED features (Zhao et al. 2023) of an image: keypoints (N, 5) as in ``feature_kinds.detect``, descriptors.
 
     Everywhere in the image: OpenCV's ALIKED knows no mask. Raises ``InputError`` for what is no network of ALIKED.
@@ -49,7 +48,7 @@ def aliked(image: ByteImage, _mask: ByteImage, _most: int, weights: Path | None)
     return rows, descriptors
 
 
-def disk(image: ByteImage, mask: ByteImage, _most: int, weights: Path | None) -> tuple[FloatArray, Any]:
+def disk(image: ByteArray, mask: ByteArray, _most: int, weights: Path | None) -> tuple[FloatArray, Any]:
     """DISK features (Tyszkiewicz et al. 2020), as ``aliked``."""
     rows, descriptors = _detect("DISK", weights, image, mask)
     rows[:, :2] += 0.5 * np.array(image.shape[1::-1]) / DISK_INPUT_PX  # the centre of a pixel of the network
@@ -77,7 +76,7 @@ def lightglue(
     return np.array([(match.queryIdx, match.trainIdx) for match in found], np.int64).reshape(-1, 2)
 
 
-def _detect(name: str, weights: Path | None, image: ByteImage, mask: ByteImage | None) -> tuple[FloatArray, Any]:
+def _detect(name: str, weights: Path | None, image: ByteArray, mask: ByteArray | None) -> tuple[FloatArray, Any]:
     network = _network(name, weights)
     colour = image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
     with _one_at_a_time:

@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from spherloc.cameras.base import BoolArray, Camera, FloatArray, in_image
+from spherloc.cameras.base import Camera, in_image
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.errors import InputError
 from spherloc.geometry import camera_centre, transform
+from spherloc.types import BoolArray, FloatArray
 
 if TYPE_CHECKING:
     from scipy.spatial import KDTree

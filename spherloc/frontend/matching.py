@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from spherloc.cameras.base import BoolArray, FloatArray
 from spherloc.errors import InputError, show
 from spherloc.frontend import learned
 from spherloc.frontend.feature_kinds import KINDS, Descriptors
 from spherloc.frontend.features import Features
+from spherloc.types import BoolArray, FloatArray
 
 METHODS = ("nearest", "lightglue")
 BLOCK_BYTES = 16_000_000

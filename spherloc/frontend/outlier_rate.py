@@ -18,7 +18,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from spherloc.cameras.base import FloatArray
+from spherloc.types import FloatArray
 
 RATIOS = (0.6, 0.7, 0.8, 0.9, 0.95, 1.0)
 """Bounds on the ratio of the distances to the nearest and the second nearest descriptor."""

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spherloc.cameras.base import BoolArray, FloatArray
 from spherloc.errors import InputError, show
 from spherloc.frontend import retrieval
 from spherloc.frontend.feature_kinds import KINDS
@@ -20,6 +19,7 @@ from spherloc.frontend.outlier_rate import right_shares, wrong_matches
 from spherloc.frontend.triangulation import TriangulationLift
 from spherloc.frontend.view import Matcher, Matches, Report, View
 from spherloc.geometry import camera_centre
+from spherloc.types import BoolArray, FloatArray
 
 SAME_POINT = 0.02
 """Points of two references are one if they are closer than this share of their distance to the first of them."""

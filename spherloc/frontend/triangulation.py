@@ -9,13 +9,14 @@ from functools import cached_property
 
 import numpy as np
 
-from spherloc.cameras.base import BoolArray, Camera, FloatArray
+from spherloc.cameras.base import Camera
 from spherloc.errors import InputError
 from spherloc.frontend.features import FeatureOptions, extract
 from spherloc.frontend.lifting import SFM_RADIUS_PX, SfmLift
 from spherloc.frontend.matching import MatchOptions, match
 from spherloc.frontend.view import View
 from spherloc.geometry import camera_centre
+from spherloc.types import BoolArray, FloatArray
 
 LEAST_PARALLAX_DEG = 1.0
 """With an error of 0.1 degrees (1 px of a fisheye is 0.15 to 0.25), the range is then good to a tenth."""

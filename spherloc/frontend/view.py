@@ -9,9 +9,10 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from spherloc.cameras.base import BoolArray, Camera, FloatArray
+from spherloc.cameras.base import Camera
 from spherloc.errors import InputError
-from spherloc.images import ByteImage, read_image
+from spherloc.images import read_image
+from spherloc.types import BoolArray, ByteArray, FloatArray
 
 PIXELS_AT_ONCE = 200_000
 """A large panorama unprojected as a whole would take gigabytes."""
@@ -48,7 +49,7 @@ class View:
     mask: Callable[[], BoolArray] | None = None
     """(H, W) of the pixels that may be used; None for all that the camera model can see."""
 
-    def read(self) -> ByteImage:
+    def read(self) -> ByteArray:
         """The pixels, (H, W, 3) BGR or (H, W) grey, read anew every time: a long sequence must not fill the memory.
 
         Raises ``InputError`` if the file cannot be read or has another size than the calibration.

@@ -3,12 +3,10 @@
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from spherloc.errors import ProblemError
 from spherloc.geometry import pose
-
-FloatArray = NDArray[np.float64]
+from spherloc.types import FloatArray
 
 NO_POSES = np.empty((0, 3, 4))
 """What a solver returns that has found none."""

@@ -9,13 +9,11 @@ Lepetit, Moreno-Noguer, Fua: EPnP: An accurate O(n) solution to the PnP problem,
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from spherloc.solvers.base import NO_POSES, checked, poses
 from spherloc.solvers.linear_pose import condition
 from spherloc.solvers.virtual_pinhole import image_plane
-
-FloatArray = NDArray[np.float64]
+from spherloc.types import FloatArray
 
 
 class Epnp:

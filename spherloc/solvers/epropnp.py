@@ -14,15 +14,13 @@ object pose estimation, CVPR 2022.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from spherloc.geometry import pose, so3_exp, transform
 from spherloc.solvers.base import checked
 from spherloc.solvers.epnp import Epnp
 from spherloc.solvers.pose_posterior import Posterior, sample_posterior
 from spherloc.solvers.virtual_pinhole import image_plane
-
-FloatArray = NDArray[np.float64]
+from spherloc.types import FloatArray
 
 HUBER = 0.1
 """Width of the Huber kernel, as a share of the spread of the image points."""

@@ -5,9 +5,8 @@ origin and the unit of the map do not matter. Functions that find nothing return
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from spherloc.types import FloatArray
 
 DEGENERATE = 1e-9
 """Singular values below this, relative to the largest, are zero: several poses would solve the system."""

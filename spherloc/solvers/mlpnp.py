@@ -17,7 +17,6 @@ III-3, 2016.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from spherloc.geometry import tangent_basis
 from spherloc.solvers.base import NO_POSES, checked, poses
@@ -32,8 +31,7 @@ from spherloc.solvers.linear_pose import (
     translation_given,
 )
 from spherloc.solvers.tangent_refinement import refine_on_tangents
-
-FloatArray = NDArray[np.float64]
+from spherloc.types import FloatArray
 
 PLANAR = 0.02
 """Points whose smallest spread is below this share of the largest are treated as a plane."""

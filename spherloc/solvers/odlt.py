@@ -15,14 +15,12 @@ Henry, Christian: Optimal DLT-based solutions for the perspective-n-point, 2024 
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from spherloc.geometry import skew, so3_exp
 from spherloc.solvers.base import NO_POSES, checked, poses
 from spherloc.solvers.linear_pose import DEGENERATE, condition, nearest_rotation
 from spherloc.solvers.virtual_pinhole import image_plane
-
-FloatArray = NDArray[np.float64]
+from spherloc.types import FloatArray
 
 LEAST_DEPTH = 1e-3
 """Depths are taken to be at least this share of their median: a point at the camera must not outweigh all others."""

@@ -13,13 +13,9 @@ Abdel-Aziz, Karara: Direct linear transformation from comparator coordinates int
 close-range photogrammetry, 1971. Conditioning: Hartley, In defense of the eight-point algorithm, PAMI 1997.
 """
 
-import numpy as np
-from numpy.typing import NDArray
-
 from spherloc.solvers.base import NO_POSES, checked, poses
 from spherloc.solvers.linear_pose import condition, linear_pose, projectors
-
-FloatArray = NDArray[np.float64]
+from spherloc.types import FloatArray
 
 
 class Svd:

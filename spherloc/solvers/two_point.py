@@ -12,12 +12,9 @@ or two points coincide.
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from spherloc.errors import ProblemError
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
+from spherloc.types import BoolArray, FloatArray
 
 DEGENERATE = 1e-12
 """Below this, relative to |d|, the pair says nothing about yaw."""

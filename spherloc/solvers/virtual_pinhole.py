@@ -11,10 +11,8 @@ somewhere, and the correspondences beyond are lost. The paper does not say where
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
+from spherloc.types import BoolArray, FloatArray
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
 """An apartment of six rooms: walls with hardly any texture, doors that look alike, furniture and a few pictures."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from spherloc.types import FloatArray
 from spherloc.worlds import furniture_indoor as put
 from spherloc.worlds.atlas import pack
 from spherloc.worlds.corners import with_dark_corners
@@ -12,8 +12,6 @@ from spherloc.worlds.occluder_tiles import occluder_tiles
 from spherloc.worlds.outdoor_tiles import nature_tiles
 from spherloc.worlds.rooms import Opening, Room, add_room
 from spherloc.worlds.world import Lane, Surfaces, World
-
-FloatArray = NDArray[np.float64]
 
 EYE_M = 1.45
 PROVENANCE = (

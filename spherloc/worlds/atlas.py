@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-ByteImage = NDArray[np.uint8]
+from spherloc.types import ByteArray
 
 WIDTH = 2048
 
@@ -18,7 +18,7 @@ WIDTH = 2048
 class Atlas:
     """Tiles with sides of powers of two, packed so that none leaks into the smaller copies of another."""
 
-    texels: ByteImage
+    texels: ByteArray
     """(H, W, 4): red, green, blue, and how much a texel shines when it is lit."""
     names: tuple[str, ...]
     """Of the tiles."""
@@ -33,7 +33,7 @@ class Atlas:
         return {name: number for number, name in enumerate(self.names)}
 
     @cached_property
-    def pyramid(self) -> tuple[ByteImage, ...]:
+    def pyramid(self) -> tuple[ByteArray, ...]:
         """The atlas, and copies of half the size each."""
         levels: list[Any] = [self.texels]
         for _ in range(int(np.log2(self.boxes[:, 2:].min())), 0, -1):
@@ -74,7 +74,7 @@ class Atlas:
         return values
 
 
-def pack(tiles: Mapping[str, tuple[str, ByteImage]]) -> Atlas:
+def pack(tiles: Mapping[str, tuple[str, ByteArray]]) -> Atlas:
     """An atlas of named tiles (kind, (H, W, 4) with sides of powers of two up to ``WIDTH``)."""
     order = sorted(tiles, key=lambda name: (*(-size for size in tiles[name][1].shape[:2]), name))
     boxes, left, top, shelf = {}, 0, 0, 0

@@ -3,12 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from spherloc.types import FloatArray
 from spherloc.worlds.mesh import WHITE, MeshBuilder, xyz
 from spherloc.worlds.outdoor_tiles import DOOR, SHOPS, WINDOW
-
-FloatArray = NDArray[np.float64]
 
 BAY_M = 3.0
 STOREY_M = 3.2

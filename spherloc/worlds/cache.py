@@ -14,11 +14,10 @@ from spherloc.cameras.base import Camera
 from spherloc.disk_cache import cache_folder, key_of, make_room_once, store, used
 from spherloc.errors import InputError
 from spherloc.images import read_image
+from spherloc.types import FloatArray
 from spherloc.worlds.conditions import CLEAR, Conditions
 from spherloc.worlds.render import Render, draw
 from spherloc.worlds.world import World
-
-FloatArray = NDArray[np.float64]
 
 
 @cache

@@ -3,8 +3,8 @@
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from spherloc.types import FloatArray
 from spherloc.worlds.atlas import pack
 from spherloc.worlds.buildings import BAY_M, Front, add_house
 from spherloc.worlds.corners import with_dark_corners
@@ -13,8 +13,6 @@ from spherloc.worlds.mesh import MeshBuilder, xyz
 from spherloc.worlds.occluder_tiles import occluder_tiles
 from spherloc.worlds.outdoor_tiles import facade_tiles, ground_tiles, nature_tiles, sign_tiles
 from spherloc.worlds.world import Lane, Surfaces, World
-
-FloatArray = NDArray[np.float64]
 
 HALF_M = 45.0
 """From the middle of the square to the houses."""

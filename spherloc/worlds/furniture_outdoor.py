@@ -1,11 +1,10 @@
 """Trees, lamps and benches."""
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from spherloc.types import FloatArray
 from spherloc.worlds.mesh import MeshBuilder, xyz
-
-FloatArray = NDArray[np.float64]
 
 
 def add_tree(

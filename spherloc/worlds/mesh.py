@@ -8,9 +8,9 @@ import numpy as np
 import trimesh
 from numpy.typing import ArrayLike, NDArray
 
+from spherloc.types import FloatArray
 from spherloc.worlds.atlas import Atlas
 
-FloatArray = NDArray[np.float64]
 WHITE = (1.0, 1.0, 1.0)
 WHOLE = (0.0, 0.0, 1.0, 1.0)
 

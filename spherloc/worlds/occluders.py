@@ -3,13 +3,11 @@
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from spherloc.types import FloatArray
 from spherloc.worlds.mesh import MeshBuilder, joined, xyz
 from spherloc.worlds.rays import RayScene
 from spherloc.worlds.world import Lane, World
-
-FloatArray = NDArray[np.float64]
 
 CLEAR_M = {"car": 4.5, "person": 1.6, "box": 1.8}
 """Nothing stands closer to the camera."""

@@ -7,9 +7,8 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
+from spherloc.types import FloatArray
 from spherloc.worlds.mesh import Mesh
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

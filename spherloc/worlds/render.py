@@ -7,16 +7,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from spherloc.cameras.base import BoolArray, Camera
+from spherloc.cameras.base import Camera
 from spherloc.geometry import camera_centre
-from spherloc.images import ByteImage
+from spherloc.types import BoolArray, ByteArray, FloatArray
 from spherloc.worlds.conditions import CLEAR, Conditions
 from spherloc.worlds.occluders import with_occluders
 from spherloc.worlds.rays import Hits, RayScene
 from spherloc.worlds.shading import GAMMA, Lighting
 from spherloc.worlds.world import World
-
-FloatArray = NDArray[np.float64]
 
 CORNERS = np.array([[-0.125, -0.375], [0.375, -0.125], [0.125, 0.375], [-0.375, 0.125]])
 """Where a pixel at an edge is sampled, from its centre, px."""
@@ -29,7 +27,7 @@ BLOCK = 65536
 class Render:
     """One picture."""
 
-    image: ByteImage
+    image: ByteArray
     """(H, W, 3) BGR; black where the camera model cannot see."""
     range_m: NDArray[np.float32]
     """(H, W) distance along the ray of each pixel's centre; inf where nothing is hit, NaN where none can see."""
@@ -114,7 +112,7 @@ def _refined(
 
 def _developed(
     linear: NDArray[np.float32], seen: BoolArray, camera: Camera, conditions: Conditions, seed: int
-) -> ByteImage:
+) -> ByteArray:
     """Bytes BGR of linear RGB: blur, exposure, a film's soft shoulder, noise."""
     linear = _blurred(linear, conditions, wraps=camera.model == "equirectangular")
     bright = linear * np.float32(2.0**conditions.exposure_stops)

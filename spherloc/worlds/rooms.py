@@ -4,11 +4,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from spherloc.types import FloatArray
 from spherloc.worlds.mesh import MeshBuilder
-
-FloatArray = NDArray[np.float64]
 
 HEIGHT_M = 2.6
 WALL_M = 0.06

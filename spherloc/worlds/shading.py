@@ -6,13 +6,13 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from spherloc.types import FloatArray
 from spherloc.worlds.conditions import LIGHTS, Conditions, Light
 from spherloc.worlds.paint import noise
 from spherloc.worlds.rays import Hits, RayScene
 from spherloc.worlds.seasons import SNOW, recoloured
 from spherloc.worlds.world import World
 
-FloatArray = NDArray[np.float64]
 Colours = NDArray[np.float32]
 
 GAMMA = 2.2

@@ -6,16 +6,14 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from spherloc.errors import InputError
 from spherloc.geometry import pose
+from spherloc.types import FloatArray
 from spherloc.worlds.atlas import Atlas
 from spherloc.worlds.glb import write_glb
 from spherloc.worlds.mesh import Mesh
 from spherloc.worlds.rays import RayScene
-
-FloatArray = NDArray[np.float64]
 
 MOST_POSES = 100_000
 

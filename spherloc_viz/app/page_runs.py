@@ -3,10 +3,10 @@
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from spherloc.cameras.base import FloatArray
 from spherloc.diagnosis import Diagnosis
 from spherloc.errors import RecordingError
 from spherloc.trace import Trace
+from spherloc.types import FloatArray
 from spherloc_viz.app.catalog import Catalog, SceneRequest
 from spherloc_viz.app.review.opened import is_same_pose
 from spherloc_viz.app.run_request import Run, RunRequest

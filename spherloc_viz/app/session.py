@@ -11,13 +11,13 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from spherloc.cameras.base import FloatArray
 from spherloc.datasets.synthetic import TrueCamera
 from spherloc.diagnosis import Diagnosis, diagnose
 from spherloc.errors import InputError, SpherlocError
 from spherloc.estimators import default_options, estimate
 from spherloc.problem import Problem
 from spherloc.trace import Trace
+from spherloc.types import FloatArray
 from spherloc.watch import Cancelled
 from spherloc_viz.app.catalog import SceneRequest
 from spherloc_viz.app.controls.controls import Controls

@@ -4,15 +4,12 @@ from collections.abc import Callable, Mapping
 from math import comb
 
 import numpy as np
-from numpy.typing import NDArray
 
 from spherloc.geometry import yaw_of
 from spherloc.metrics import evaluate, ransac_success_probability
 from spherloc.refine import residuals_px
 from spherloc.trace import ConsensusStage, RansacStage, Trace, YawStage
-
-BoolArray = NDArray[np.bool_]
-FloatArray = NDArray[np.float64]
+from spherloc.types import BoolArray, FloatArray
 
 
 def _count(mask: BoolArray) -> int:

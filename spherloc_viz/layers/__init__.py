@@ -17,6 +17,7 @@ from spherloc.trace import (
     TranslationStage,
     YawStage,
 )
+from spherloc.types import FloatArray
 from spherloc_viz import style
 from spherloc_viz.layers import (
     consensus,
@@ -32,7 +33,7 @@ from spherloc_viz.layers import (
 )
 from spherloc_viz.layers.focus import focus_of
 from spherloc_viz.layers.frame import Plan, RunView
-from spherloc_viz.layers.primitives import Chart, FloatArray, Graph, Picture, Step, Stop
+from spherloc_viz.layers.primitives import Chart, Graph, Picture, Step, Stop
 from spherloc_viz.layers.scene import base_items, camera
 from spherloc_viz.layers.tables import outcome_table
 

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spherloc.cameras.base import BoolArray, FloatArray
 from spherloc.consensus.depth_bounds import chord
 from spherloc.consensus.yaw_arcs import yaw_arcs
 from spherloc.geometry import yaw_rotation
-from spherloc.problem import AlignedProblem, IntArray
+from spherloc.problem import AlignedProblem
+from spherloc.types import BoolArray, FloatArray, IntArray
 
 BLOCK = 24
 """Partners whose arcs with one match are computed by one call: their arcs with each other come along."""

@@ -10,12 +10,11 @@ from numpy.typing import NDArray
 
 from spherloc.consensus.yaw_sweep import YawConsensus, deepest_yaw
 from spherloc.trace import YawStage
+from spherloc.types import FloatArray, IntArray
 from spherloc_viz import style
 from spherloc_viz.layers import ring
 from spherloc_viz.layers.frame import RunView, even, one_color
-from spherloc_viz.layers.primitives import FloatArray, Segments
-
-IndexArray = NDArray[np.int64]
+from spherloc_viz.layers.primitives import Segments
 
 INNER, OUTER = 1.3, 1.95
 """Radii of the band of arcs, in sphere radii."""
@@ -62,7 +61,7 @@ class Arcs:
         return pairs - several, several
 
     @cached_property
-    def example(self) -> IndexArray:
+    def example(self) -> IntArray:
         """The arcs of one pair: of those with an arc over the estimated yaw the one whose arc there is the shortest,
         among those with two arcs if there are any."""
         arcs, same = self.stage.clique.astype(np.int64), self._continues
@@ -77,7 +76,7 @@ class Arcs:
             end += 1
         return np.arange(first, end)
 
-    def spread(self, count: int) -> IndexArray:
+    def spread(self, count: int) -> IntArray:
         """The first ``count`` arcs in an order in which every beginning is spread evenly over all pairs."""
         total = len(self)
         stride = max(1, round(ring.GOLDEN * total))
@@ -85,18 +84,18 @@ class Arcs:
             stride += 1
         return np.arange(min(count, total), dtype=np.int64) * stride % total
 
-    def overlap_of(self, arcs: IndexArray) -> YawConsensus:
+    def overlap_of(self, arcs: IntArray) -> YawConsensus:
         """The yaw that most of some arcs share, and their overlap."""
         found = deepest_yaw(self.stage.lo_rad[arcs], self.stage.hi_rad[arcs])
         assert found is not None
         return found
 
-    def over(self, arcs: IndexArray, lo_rad: float, hi_rad: float) -> NDArray[np.bool_]:
+    def over(self, arcs: IntArray, lo_rad: float, hi_rad: float) -> NDArray[np.bool_]:
         """Which of some arcs touch an interval of yaw within [-pi, pi]."""
         lo, hi = self.stage.lo_rad[arcs], self.stage.hi_rad[arcs]
         return ((lo <= hi_rad) & (hi >= lo_rad)) | (hi >= lo_rad + 2 * np.pi)
 
-    def with_clique(self) -> IndexArray:
+    def with_clique(self) -> IntArray:
         """Arcs to draw: an even sample of the clique's and of the others, half and half if there are too many."""
         members, room = self.stage.clique.astype(np.int64), style.MAX_DRAWN_ARCS
         take = min(len(members), max(room // 2, room - (len(self) - len(members))))
@@ -106,7 +105,7 @@ class Arcs:
             others = np.flatnonzero(~self.in_clique)
         return np.concatenate([even(members, take), others[: room - take]])
 
-    def drawn(self, view: RunView, arcs: IndexArray, marked: np.ndarray, mark: style.RGB) -> Segments:
+    def drawn(self, view: RunView, arcs: IntArray, marked: np.ndarray, mark: style.RGB) -> Segments:
         """Arcs on the ring around the middle of the map, the marked ones (mask) in their colour. Arcs that overlap lie
         side by side, so that the band is as broad as they are many."""
         order, arc, points = view.kept("arcs", arcs.tobytes(), lambda: self._band(view, arcs))
@@ -115,7 +114,7 @@ class Arcs:
         ids = self.stage.pairs[arcs[order][arc]].astype(np.int64)
         return Segments("ring/arcs", "yaw ring", points, colors, 2.0, ids=ids)
 
-    def _band(self, view: RunView, arcs: IndexArray) -> tuple[IndexArray, IndexArray, FloatArray]:
+    def _band(self, view: RunView, arcs: IntArray) -> tuple[IntArray, IntArray, FloatArray]:
         """Some arcs as S straight lines (S, 2, 3), which arc each line is of (S,), and the order of these arcs."""
         order = np.argsort(self.stage.lo_rad[arcs], kind="stable")
         arcs = arcs[order]
@@ -130,7 +129,7 @@ class Arcs:
         return order, arc, view.middle + view.sphere_m * radii[arc, None, None] * directions
 
 
-def _tracks(lo_rad: FloatArray, hi_rad: FloatArray) -> IndexArray:
+def _tracks(lo_rad: FloatArray, hi_rad: FloatArray) -> IntArray:
     """The innermost track (A,) that is free for each of the arcs, which begin one after another."""
     free: list[int] = []
     busy: list[tuple[float, int]] = []

@@ -9,13 +9,12 @@ from numpy.typing import NDArray
 
 from spherloc.geometry import camera_centre
 from spherloc.trace import TranslationStage
+from spherloc.types import FloatArray, IntArray
 from spherloc_viz import style
 from spherloc_viz.layers.focus import ball_boxes
 from spherloc_viz.layers.frame import RunView, even, one_color
-from spherloc_viz.layers.primitives import Balls, FloatArray, Focus, Points, SceneItem, Segments
+from spherloc_viz.layers.primitives import Balls, Focus, Points, SceneItem, Segments
 from spherloc_viz.layers.ring import GOLDEN
-
-IndexArray = NDArray[np.int64]
 
 OPACITIES = ((4, 0.3), (12, 0.22), (35, 0.14), (np.inf, 0.1))
 """Up to how many balls have which opacity: few are seen well, and many do not hide what is behind them."""
@@ -31,12 +30,12 @@ class BallSet:
         return len(self.stage.radii_m)
 
     @cached_property
-    def by_radius(self) -> IndexArray:
+    def by_radius(self) -> IntArray:
         """(M,) the smallest first."""
         return np.argsort(self.stage.radii_m, kind="stable")
 
     @cached_property
-    def order(self) -> IndexArray:
+    def order(self) -> IntArray:
         """(M,) in which order the balls come: two of the maximum clique, the rest of the smaller half so that every
         beginning is spread evenly over it, and then the others, the smallest first.
 
@@ -55,7 +54,7 @@ class BallSet:
         """A ball to explain balls by."""
         return int(self.order[0])
 
-    def focus(self, shown: IndexArray) -> Focus:
+    def focus(self, shown: IntArray) -> Focus:
         """These balls, the smallest first, as far as they are drawn, or the denser half of many, from the side from
         which most of the clique is seen."""
         drawn = self.drawn(shown, self.mask(shown))
@@ -73,17 +72,17 @@ class BallSet:
         return self.mask(self.stage.clique)
 
     @cached_property
-    def members(self) -> IndexArray:
+    def members(self) -> IntArray:
         """(S,) balls of the maximum clique, the smallest first."""
         return self.by_radius[self.in_clique[self.by_radius]]
 
     @cached_property
-    def degrees(self) -> IndexArray:
+    def degrees(self) -> IntArray:
         """(M,) how many others each ball overlaps."""
         return np.bincount(self.stage.edges.ravel(), minlength=len(self))
 
     @cached_property
-    def busiest(self) -> IndexArray:
+    def busiest(self) -> IntArray:
         """(M,) those that overlap most others first."""
         return np.argsort(-self.degrees, kind="stable")
 
@@ -103,11 +102,11 @@ class BallSet:
         return edges[inside[edges[:, 1]]]
 
     @cached_property
-    def _starts(self) -> IndexArray:
+    def _starts(self) -> IntArray:
         """(M + 1,) where each ball's edges to later ones begin: edges are sorted."""
         return np.searchsorted(self.stage.edges[:, 0], np.arange(len(self) + 1))
 
-    def greedy(self, order: IndexArray) -> IndexArray:
+    def greedy(self, order: IntArray) -> IntArray:
         """A clique: each ball in the given order that overlaps all that were taken before it."""
         count = len(order)
         rank = np.empty(count, dtype=np.int64)
@@ -124,7 +123,7 @@ class BallSet:
             fitting &= int.from_bytes(rows[ball].tobytes(), "little")
         return order[taken]
 
-    def drawn(self, shown: IndexArray, inside: NDArray[np.bool_]) -> IndexArray:
+    def drawn(self, shown: IntArray, inside: NDArray[np.bool_]) -> IntArray:
         """Which of some balls, the smallest first, to draw: of those of a mask (M,) and of the others an even sample
         of the smaller half, if there are too many. Large balls hold the whole picture in them and hide it."""
         most = style.MAX_DRAWN_BALLS
@@ -135,7 +134,7 @@ class BallSet:
         return np.concatenate([even(halves[0], take), even(halves[1], most - take)])
 
     def items(
-        self, view: RunView, shown: IndexArray, inside: NDArray[np.bool_], color: style.RGB = style.CLIQUE
+        self, view: RunView, shown: IntArray, inside: NDArray[np.bool_], color: style.RGB = style.CLIQUE
     ) -> tuple[SceneItem, ...]:
         """Some balls, the smallest first, their centres and their overlaps; those of a mask (M,) in their colour."""
         stage, drawn = self.stage, self.drawn(shown, inside)
@@ -157,7 +156,7 @@ class BallSet:
             items.append(Points("balls/truth", "balls", truth, one_color(style.TRUTH, 1), 2.0 * dot_m))
         return tuple(items)
 
-    def _edges(self, drawn: IndexArray, inside: NDArray[np.bool_], color: style.RGB) -> Segments:
+    def _edges(self, drawn: IntArray, inside: NDArray[np.bool_], color: style.RGB) -> Segments:
         """Overlaps between the drawn balls."""
         edges = self.edges_within(self.mask(drawn))
         colors = one_color(style.UNDECIDED, len(edges))

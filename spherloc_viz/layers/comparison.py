@@ -11,10 +11,11 @@ from spherloc.geometry import camera_centre, yaw_of
 from spherloc.metrics import evaluate
 from spherloc.refine import residuals_px
 from spherloc.trace import Certificate, ConsensusStage, Trace, YawStage
+from spherloc.types import FloatArray
 from spherloc_viz import style
 from spherloc_viz.layers.certificate import is_knowable
 from spherloc_viz.layers.frame import RunView, one_color
-from spherloc_viz.layers.primitives import Chart, Curve, FloatArray, Label, SceneItem, Segments, Table
+from spherloc_viz.layers.primitives import Chart, Curve, Label, SceneItem, Segments, Table
 from spherloc_viz.layers.scene import camera
 
 PALETTE: tuple[style.RGB, ...] = (

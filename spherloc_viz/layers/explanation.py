@@ -4,10 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spherloc.cameras.base import BoolArray, FloatArray
 from spherloc.geometry import yaw_of
-from spherloc.problem import IntArray
-from spherloc.trace import ConsensusStage, IndexArray, RansacStage, Trace, TranslationStage, YawStage
+from spherloc.trace import ConsensusStage, RansacStage, Trace, TranslationStage, YawStage
+from spherloc.types import BoolArray, FloatArray, IndexArray, IntArray
 from spherloc_viz.layers.agreement import PartnerArcs, partner_arcs, unbounded
 from spherloc_viz.layers.reasons import Poses, reason
 from spherloc_viz.layers.verdicts import residuals_at, run_bounds, verdicts

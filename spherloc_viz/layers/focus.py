@@ -6,8 +6,9 @@ Every step has one focus, whatever step was looked at before.
 import numpy as np
 
 from spherloc.geometry import camera_centre
+from spherloc.types import FloatArray
 from spherloc_viz.layers.frame import Frame, RunView
-from spherloc_viz.layers.primitives import FloatArray, Focus
+from spherloc_viz.layers.primitives import Focus
 
 STRAY = 4.0
 """Map points farther from the middle than this many times the median distance are not framed: they would make all

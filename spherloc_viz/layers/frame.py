@@ -16,10 +16,10 @@ from spherloc.bounds import Bounds, bounds_of
 from spherloc.geometry import camera_centre, pose
 from spherloc.refine import residuals_px
 from spherloc.trace import Trace
+from spherloc.types import BoolArray, ByteArray, FloatArray
 from spherloc_viz import style
-from spherloc_viz.layers.primitives import Chart, ColorArray, FloatArray, Focus, Graph, SceneItem, Table
+from spherloc_viz.layers.primitives import Chart, Focus, Graph, SceneItem, Table
 
-BoolArray = NDArray[np.bool_]
 T = TypeVar("T")
 
 SPHERE_SHARE = 0.17
@@ -39,7 +39,7 @@ class Frame:
     equation: str
     cam_from_map: FloatArray
     """Pose (3, 4) between the aligned frames: the camera's, or where to stand before a position is known."""
-    colors: ColorArray
+    colors: ByteArray
     """(N, 3) colour of every correspondence."""
     rays: BoolArray
     """(N,) mask: correspondences whose match is drawn as a line."""
@@ -146,7 +146,7 @@ class RunView:
         out[aligned.index] = residuals_px(aligned, cam_from_map)
         return out
 
-    def colors(self, color: style.RGB, *marks: tuple[np.ndarray, style.RGB]) -> ColorArray:
+    def colors(self, color: style.RGB, *marks: tuple[np.ndarray, style.RGB]) -> ByteArray:
         """(N, 3): one colour for all, then others for masks or indices, later ones winning."""
         out = np.empty((len(self.points), 3), np.uint8)
         out[:] = color
@@ -178,7 +178,7 @@ class RunView:
         return "" if labels is None else f", {np.count_nonzero(labels[indices])} of them right ones"
 
 
-def one_color(color: style.RGB, count: int) -> ColorArray:
+def one_color(color: style.RGB, count: int) -> ByteArray:
     """(count, 3) of one colour."""
     out = np.empty((count, 3), np.uint8)
     out[:] = color

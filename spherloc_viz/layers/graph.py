@@ -6,17 +6,14 @@ A run has one layout: nodes do not move from step to step.
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from spherloc.geometry import yaw_rotation
 from spherloc.trace import ConsensusStage, TranslationStage
+from spherloc.types import BoolArray, FloatArray, IntArray
 from spherloc_viz import style
 from spherloc_viz.layers.agreement import agreement
 from spherloc_viz.layers.frame import RunView, even
-from spherloc_viz.layers.primitives import FloatArray, Graph, Nodes
-
-BoolArray = NDArray[np.bool_]
-IntArray = NDArray[np.int64]
+from spherloc_viz.layers.primitives import Graph, Nodes
 
 MOST_NODES = 400
 """More are thinned: to the clique, or an even sample of it, and an even sample of the others."""

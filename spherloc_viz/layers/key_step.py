@@ -6,8 +6,8 @@ from spherloc.diagnosis import Cause, Diagnosis
 from spherloc.geometry import yaw_of
 from spherloc.metrics import SUCCESS_DEG, SUCCESS_M, evaluate, rotation_error_deg, translation_error_m
 from spherloc.trace import ConsensusStage, RansacStage, RefinementStage, Trace, TranslationStage, YawStage
+from spherloc.types import FloatArray
 from spherloc_viz.layers import steps
-from spherloc_viz.layers.primitives import FloatArray
 
 BY_CAUSE: dict[Cause, tuple[str, ...]] = {
     Cause.GRAVITY_OFF: ("gravity",),

@@ -7,10 +7,9 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from spherloc.cameras.base import BoolArray, FloatArray
 from spherloc.geometry import yaw_of
-from spherloc.problem import IntArray
 from spherloc.trace import Trace
+from spherloc.types import BoolArray, FloatArray, IntArray
 from spherloc_viz.layers.agreement import agreement
 from spherloc_viz.layers.frame import even
 from spherloc_viz.layers.verdicts import run_bounds, verdicts

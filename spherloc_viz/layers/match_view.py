@@ -7,11 +7,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from spherloc.cameras.base import BoolArray, Camera, FloatArray
-from spherloc.problem import IntArray, Problem
+from spherloc.cameras.base import Camera
+from spherloc.problem import Problem
+from spherloc.types import BoolArray, ByteArray, FloatArray, IntArray
 from spherloc_viz import style
 from spherloc_viz.layers.frame import even
-from spherloc_viz.layers.primitives import ColorArray
 
 CELLS = 129
 """Places a side at which a camera is asked what it can see."""
@@ -35,7 +35,7 @@ class MatchView:
 
 def match_view(
     problem: Problem,
-    colors: ColorArray,
+    colors: ByteArray,
     inlier_mask: BoolArray,
     selected: tuple[int, ...] = (),
     reference: int | None = None,
@@ -81,7 +81,7 @@ def valid_outlines(camera: Camera) -> tuple[FloatArray, ...]:
     return tuple(contour.reshape(-1, 2) * scale for contour in found if len(contour) > 2)
 
 
-def inlier_colored(colors: ColorArray) -> BoolArray:
+def inlier_colored(colors: ByteArray) -> BoolArray:
     """Which colours (N, 3) are those of inliers, (N,)."""
     return np.asarray(np.equal(colors, np.array(style.INLIER, np.uint8)).all(axis=1))
 

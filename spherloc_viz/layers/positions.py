@@ -6,9 +6,10 @@ import numpy as np
 
 from spherloc.geometry import camera_centre
 from spherloc.trace import ConsensusStage, PositionStage
+from spherloc.types import ByteArray, FloatArray
 from spherloc_viz import style
-from spherloc_viz.layers.frame import ColorArray, Frame, Plan, RunView, length
-from spherloc_viz.layers.primitives import FloatArray, Focus, Segments
+from spherloc_viz.layers.frame import Frame, Plan, RunView, length
+from spherloc_viz.layers.primitives import Focus, Segments
 
 EDGES = np.array([(a, a | 1 << axis) for axis in range(3) for a in range(8) if not a >> axis & 1])
 """(12, 2) corners that the edges of a box join; bit k of a corner's number says at which end of axis k it is."""
@@ -65,13 +66,13 @@ def _camera_inside(boxes: FloatArray, centre: FloatArray) -> str:
     return " The best pose's camera is in one of them." if inside else ""
 
 
-def _shades(bound: np.ndarray, support: int) -> ColorArray:
+def _shades(bound: np.ndarray, support: int) -> ByteArray:
     """(B, 3): grey for the least that could beat the best pose, gold for the largest bound."""
     share = (bound - support) / max(1, int(bound.max()) - support)
     return np.round(FAINT + share[:, None] * (STRONG - FAINT)).astype(np.uint8)
 
 
-def _edges(boxes: FloatArray, colors: ColorArray) -> Segments:
+def _edges(boxes: FloatArray, colors: ByteArray) -> Segments:
     ends = np.array([[corner >> axis & 1 for axis in range(3)] for corner in range(8)])
     corners = np.stack([boxes[:, ends[:, axis], axis] for axis in range(3)], axis=2)
     return Segments("boxes/positions", "boxes", corners[:, EDGES].reshape(-1, 2, 3), np.repeat(colors, 12, axis=0), 1.0)

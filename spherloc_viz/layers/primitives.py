@@ -11,8 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
-ColorArray = NDArray[np.uint8]
+from spherloc.types import ByteArray, FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +30,7 @@ class Points(Primitive):
 
     positions: FloatArray
     """(N, 3)."""
-    colors: ColorArray
+    colors: ByteArray
     """(N, 3)."""
     radius_m: float
     """Radius of every dot."""
@@ -47,7 +46,7 @@ class Segments(Primitive):
 
     points: FloatArray
     """(N, 2, 3) ends."""
-    colors: ColorArray
+    colors: ByteArray
     """(N, 3)."""
     width_px: float
     """Thickness on the screen."""
@@ -63,7 +62,7 @@ class Balls(Primitive):
     """(N, 3)."""
     radii_m: FloatArray
     """(N,)."""
-    colors: ColorArray
+    colors: ByteArray
     """(N, 3)."""
     opacity: float
     """0 to 1, of every ball."""
@@ -96,7 +95,7 @@ class Textured(Primitive):
     """(V, 2) place of each vertex in the picture, from its lower left corner, 0 to 1."""
     map_from_mesh: FloatArray
     """(3, 4) rotation times scale, and shift, so that a mesh that moves keeps its vertices and its picture."""
-    image: Callable[[], ColorArray | None]
+    image: Callable[[], ByteArray | None]
     """Makes the picture, (H, W, 3) sRGB or (H, W, 4) with holes where the last is below 128; None if there is none."""
     key: Hashable
     """Equal keys mean equal meshes with equal pictures: a picture is large, so it is made and sent once."""

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spherloc.cameras.base import FloatArray
 from spherloc.metrics import evaluate, rotation_error_deg, translation_error_m
 from spherloc.trace import Trace
+from spherloc.types import FloatArray
 
 NEARLY = 2.0
 """A residual up to this many times its bound is just beyond it."""

@@ -7,11 +7,12 @@ import numpy as np
 from spherloc.geometry import camera_centre
 from spherloc.metrics import rotation_error_deg, translation_error_m
 from spherloc.trace import RefinementStage
+from spherloc.types import BoolArray, FloatArray
 from spherloc_viz import style
 from spherloc_viz.layers import uncertainty
 from spherloc_viz.layers.focus import sphere_box
-from spherloc_viz.layers.frame import BoolArray, Frame, Plan, RunView, even, length, one_color
-from spherloc_viz.layers.primitives import Chart, Curve, FloatArray, Focus, SceneItem, Segments
+from spherloc_viz.layers.frame import Frame, Plan, RunView, even, length, one_color
+from spherloc_viz.layers.primitives import Chart, Curve, Focus, SceneItem, Segments
 from spherloc_viz.layers.scale_bar import angle_text, length_text
 
 MOST_STATES = 20

@@ -13,10 +13,10 @@ from spherloc.geometry import transform
 from spherloc.metrics import precision_recall_f1
 from spherloc.refine import residuals_px
 from spherloc.trace import RansacStage, Trace
-from spherloc_viz.layers.primitives import FloatArray, Table
+from spherloc.types import FloatArray, IntArray
+from spherloc_viz.layers.primitives import Table
 from spherloc_viz.layers.yaw_bars import right_ones
 
-IntArray = NDArray[np.int64]
 Unit = Literal["px", "deg"]
 
 BINS_A_DECADE = 6

@@ -7,9 +7,10 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d
 
 from spherloc.geometry import wrap_angle, yaw_of
+from spherloc.types import ByteArray, FloatArray
 from spherloc_viz import style
 from spherloc_viz.layers.frame import RunView, one_color
-from spherloc_viz.layers.primitives import ColorArray, Curve, FloatArray, Label, Segments
+from spherloc_viz.layers.primitives import Curve, Label, Segments
 
 FOOT = 2.05
 """Radius at which the outline has the height 0, in sphere radii."""
@@ -57,7 +58,7 @@ def outline(name: str, line: FloatArray, color: style.RGB) -> Segments:
     return loop(name, "yaw ring", line, color)
 
 
-def bars(name: str, feet: FloatArray, tops: FloatArray, colors: ColorArray) -> Segments:
+def bars(name: str, feet: FloatArray, tops: FloatArray, colors: ByteArray) -> Segments:
     """Lines from the foot of the outline to it, (360, 3) each."""
     return Segments(name, "yaw ring", np.stack([feet, tops], axis=1), colors, 2.0)
 

@@ -11,9 +11,10 @@ from spherloc.cameras.base import Camera, in_image
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.geometry import camera_centre
 from spherloc.problem import Problem
+from spherloc.types import ByteArray, FloatArray
 from spherloc_viz import style
 from spherloc_viz.layers.frame import Frame, RunView, one_color
-from spherloc_viz.layers.primitives import ColorArray, FloatArray, Mesh, Points, SceneItem, Segments, Textured
+from spherloc_viz.layers.primitives import Mesh, Points, SceneItem, Segments, Textured
 from spherloc_viz.layers.scale_bar import scale_bar
 from spherloc_viz.layers.sphere_image import sphere_texture
 from spherloc_viz.layers.uncertainty import error_items
@@ -114,7 +115,7 @@ def _panorama() -> tuple[FloatArray, np.ndarray, FloatArray]:
     return vertices, faces, uv
 
 
-def _sphere_image(problem: Problem) -> ColorArray | None:
+def _sphere_image(problem: Problem) -> ByteArray | None:
     """The query image around the sphere, with a hole where the camera sees nothing."""
     texture = sphere_texture(problem)
     if texture is None:
@@ -127,7 +128,7 @@ def _sphere_image(problem: Problem) -> ColorArray | None:
     return np.asarray(np.dstack([texture, alpha]), np.uint8)
 
 
-def _seen(camera: Camera, camera_turn: FloatArray) -> ColorArray:
+def _seen(camera: Camera, camera_turn: FloatArray) -> ByteArray:
     """255 where the camera sees what lies behind a pixel of ``COVERAGE``, else 0."""
     columns, rows = np.meshgrid(np.arange(COVERAGE.width) + 0.5, np.arange(COVERAGE.height) + 0.5)
     bearings, _ = COVERAGE.unproject(np.column_stack([columns.ravel(), rows.ravel()]).astype(np.float64))

@@ -9,12 +9,11 @@ from numpy.typing import NDArray
 
 from spherloc.geometry import tangent_basis
 from spherloc.trace import ConsensusStage, Trace, TranslationStage, YawStage
+from spherloc.types import ByteArray, FloatArray, IntArray
 from spherloc_viz import style
 from spherloc_viz.layers import ring
 from spherloc_viz.layers.frame import even, one_color
-from spherloc_viz.layers.primitives import Balls, ColorArray, FloatArray, Picture, Points, SceneItem, Segments
-
-IntArray = NDArray[np.int64]
+from spherloc_viz.layers.primitives import Balls, Picture, Points, SceneItem, Segments
 
 LAYER = "selection"
 DOTS = ("map/points", "sphere/bearings")
@@ -64,7 +63,7 @@ def _dimmed(item: SceneItem, chosen: IntArray) -> SceneItem:
     return replace(item, colors=_dim(item.colors, np.zeros(len(item.colors), bool))) if item.layer == "rays" else item
 
 
-def _dim(colors: ColorArray, keep: NDArray[np.bool_]) -> ColorArray:
+def _dim(colors: ByteArray, keep: NDArray[np.bool_]) -> ByteArray:
     grey = np.array(style.UNDECIDED, dtype=np.float64)
     dim = np.round((1.0 - style.DIM) * colors + style.DIM * grey).astype(np.uint8)
     return np.where(keep[:, None], colors, dim)

@@ -6,8 +6,8 @@ import numpy as np
 
 from spherloc.consensus.yaw_arcs import yaw_arcs
 from spherloc.geometry import yaw_of
-from spherloc.problem import IntArray
 from spherloc.trace import Trace
+from spherloc.types import IntArray
 from spherloc_viz.layers.agreement import agreement, subset
 from spherloc_viz.layers.frame import even
 from spherloc_viz.layers.verdicts import run_bounds, verdicts

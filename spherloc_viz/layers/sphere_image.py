@@ -7,9 +7,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from spherloc.cameras.base import Camera, FloatArray
+from spherloc.cameras.base import Camera
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.problem import Problem
+from spherloc.types import FloatArray
 from spherloc_viz.layers.photograph import modified, photograph, shrunk
 
 PANORAMA = Equirectangular(1024, 512)

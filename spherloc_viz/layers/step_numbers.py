@@ -8,8 +8,9 @@ import numpy as np
 
 from spherloc.metrics import rotation_error_deg, translation_error_m
 from spherloc.trace import ConsensusStage, RansacStage, RefinementStage, Trace, TranslationStage
+from spherloc.types import ByteArray, FloatArray
 from spherloc_viz import style
-from spherloc_viz.layers.primitives import ColorArray, FloatArray, Picture, Points
+from spherloc_viz.layers.primitives import Picture, Points
 
 AGREEING = (style.INLIER, style.CLIQUE)
 """Colours of matches that agree."""
@@ -51,13 +52,13 @@ def _agreeing(picture: Picture) -> int:
     return int(np.count_nonzero(agreeing(match_colors(picture))))
 
 
-def match_colors(picture: Picture) -> ColorArray:
+def match_colors(picture: Picture) -> ByteArray:
     """(N, 3) colours of all matches in a picture."""
     shown = next((item for item in picture.scene if isinstance(item, Points) and item.name == ALL_MATCHES), None)
     return np.zeros((0, 3), np.uint8) if shown is None else shown.colors
 
 
-def agreeing(colors: ColorArray) -> np.ndarray:
+def agreeing(colors: ByteArray) -> np.ndarray:
     """Which of the colours (N, 3) say that a match agrees, (N,)."""
     red, green, blue = colors.T
     marked = np.zeros(len(colors), dtype=bool)

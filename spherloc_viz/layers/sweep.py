@@ -9,9 +9,10 @@ import numpy as np
 from spherloc.experiments.sweep_plan import AXES
 from spherloc.experiments.sweep_summary import Point, Quartiles
 from spherloc.metrics import SUCCESS_DEG, SUCCESS_M
+from spherloc.types import FloatArray
 from spherloc_viz import style
 from spherloc_viz.layers.comparison import PALETTE, color_of
-from spherloc_viz.layers.primitives import Chart, Curve, FloatArray, Table
+from spherloc_viz.layers.primitives import Chart, Curve, Table
 
 NO_VALUE = "–"
 LIMIT = "limit of success"

@@ -5,9 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from spherloc.experiments.rows import QueryResult
+from spherloc.types import FloatArray
 from spherloc_viz import style
 from spherloc_viz.layers.frame import one_color
-from spherloc_viz.layers.primitives import FloatArray, Points, SceneItem, Segments
+from spherloc_viz.layers.primitives import Points, SceneItem, Segments
 
 LAYER = "trajectory"
 

@@ -7,12 +7,13 @@ import numpy as np
 
 from spherloc.geometry import camera_centre
 from spherloc.trace import TranslationStage
+from spherloc.types import FloatArray, IntArray
 from spherloc_viz import style
-from spherloc_viz.layers.balls import BallSet, IndexArray
+from spherloc_viz.layers.balls import BallSet
 from spherloc_viz.layers.focus import ball_boxes
 from spherloc_viz.layers.frame import Frame, Plan, RunView, growing, length, one_color
 from spherloc_viz.layers.graph import ball_nodes, graph_at
-from spherloc_viz.layers.primitives import Balls, FloatArray, Focus, Graph, Label, Segments
+from spherloc_viz.layers.primitives import Balls, Focus, Graph, Label, Segments
 
 SIZES = (3, 10, 30, 100, 300)
 """How many balls are shown before all are, in the order of ``BallSet.order``."""
@@ -27,7 +28,7 @@ def plans(view: RunView, stage: TranslationStage) -> list[Plan]:
     balls, nobody = BallSet(stage), np.zeros(0, dtype=np.int64)
     nodes = cache(partial(ball_nodes, stage))
 
-    def graph(shown: IndexArray | None, marked: IndexArray, words: str, color: style.RGB = style.CLIQUE) -> Graph:
+    def graph(shown: IntArray | None, marked: IntArray, words: str, color: style.RGB = style.CLIQUE) -> Graph:
         return graph_at(nodes, shown, marked, color, words)
 
     one = np.array([balls.example])
@@ -67,7 +68,7 @@ def plans(view: RunView, stage: TranslationStage) -> list[Plan]:
     return out
 
 
-def _greedy_graph(balls: BallSet, graph: Callable[..., Graph], order: Callable[[], IndexArray]) -> Graph:
+def _greedy_graph(balls: BallSet, graph: Callable[..., Graph], order: Callable[[], IntArray]) -> Graph:
     found, most = balls.greedy(order()), len(balls.stage.clique)
     bound = f"≤ ω(G) = {most:,}" if balls.stage.proven else "≤ ω(G)"
     return graph(None, found, f"A clique of {len(found):,} nodes: a lower bound, {len(found):,} {bound}.", style.SAMPLE)
@@ -78,7 +79,7 @@ def _turned(view: RunView, balls: BallSet) -> FloatArray:
     return view.standing(view.aligned_pose(balls.stage.cam_from_map)[:, :3])
 
 
-def _note(balls: BallSet, shown: IndexArray, inside: np.ndarray) -> str:
+def _note(balls: BallSet, shown: IntArray, inside: np.ndarray) -> str:
     """By which rules balls were left out."""
     drawn = len(balls.drawn(shown, inside))
     if drawn == len(shown):
@@ -177,7 +178,7 @@ def _from_busiest(view: RunView, balls: BallSet) -> Frame:
     return _greedy(view, balls, found, f"the ball that overlaps most others, {most:,}", "the next busiest one")
 
 
-def _greedy(view: RunView, balls: BallSet, found: IndexArray, first: str, then: str) -> Frame:
+def _greedy(view: RunView, balls: BallSet, found: IntArray, first: str, then: str) -> Frame:
     """A clique that was put together without looking back."""
     missing = len(balls.stage.clique) - len(found)
     verdict = "which is as large as the maximum" if missing == 0 else f"{missing:,} fewer than the maximum has"

@@ -6,12 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from spherloc.geometry import wrap_angle, yaw_rotation
+from spherloc.types import FloatArray
 from spherloc_viz import style
 from spherloc_viz.layers import ring
 from spherloc_viz.layers.arcs import Arcs
 from spherloc_viz.layers.focus import ring_focus
 from spherloc_viz.layers.frame import Frame, RunView, one_color
-from spherloc_viz.layers.primitives import Chart, FloatArray, SceneItem, Segments
+from spherloc_viz.layers.primitives import Chart, SceneItem, Segments
 
 
 @dataclass(frozen=True, eq=False)

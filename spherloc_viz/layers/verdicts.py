@@ -6,11 +6,11 @@ from functools import lru_cache
 import numpy as np
 
 from spherloc.bounds import Bounds, bounds_of
-from spherloc.cameras.base import BoolArray, FloatArray
 from spherloc.geometry import transform
 from spherloc.problem import Problem
 from spherloc.refine import residuals_px
 from spherloc.trace import Trace
+from spherloc.types import BoolArray, FloatArray
 
 
 @dataclass(frozen=True, eq=False)

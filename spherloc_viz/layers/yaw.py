@@ -6,9 +6,10 @@ import numpy as np
 
 from spherloc.geometry import yaw_rotation
 from spherloc.trace import YawStage
+from spherloc.types import IntArray
 from spherloc_viz import style
 from spherloc_viz.layers import ring, two_roots
-from spherloc_viz.layers.arcs import Arcs, IndexArray
+from spherloc_viz.layers.arcs import Arcs
 from spherloc_viz.layers.frame import Frame, Plan, RunView, growing
 from spherloc_viz.layers.primitives import Chart, SceneItem
 
@@ -48,7 +49,7 @@ def plans(view: RunView, stage: YawStage) -> list[Plan]:
     return out
 
 
-def candidate_yaws(stage: YawStage) -> IndexArray:
+def candidate_yaws(stage: YawStage) -> IntArray:
     """Candidate yaws, in quarters of a degree from -180: the highest peaks without the deepest overlap, by yaw."""
     highest = ring.peaks(stage.overlap, REACH, STOPS + 1)
     places = len(stage.overlap)
@@ -98,7 +99,7 @@ def _all(view: RunView, arcs: Arcs) -> Frame:
     )
 
 
-def _candidate(view: RunView, arcs: Arcs, stops: IndexArray) -> Frame:
+def _candidate(view: RunView, arcs: Arcs, stops: IntArray) -> Frame:
     """The last of the candidate yaws so far."""
     counts, place = arcs.stage.overlap, int(stops[-1])
     lo, hi = (ring.degrees_of(place + part, len(counts)) for part in (0, 1))
@@ -119,7 +120,7 @@ def _candidate(view: RunView, arcs: Arcs, stops: IndexArray) -> Frame:
     )
 
 
-def _so_far(counts: np.ndarray, stops: IndexArray) -> str:
+def _so_far(counts: np.ndarray, stops: IntArray) -> str:
     """How the last candidate compares with those before it."""
     if len(stops) == 1:
         return "It is the first candidate from −180° on; only the highest peaks are shown."
@@ -160,7 +161,7 @@ def _clique(view: RunView, arcs: Arcs) -> Frame:
 def _ring(
     view: RunView,
     arcs: Arcs,
-    drawn: IndexArray,
+    drawn: IntArray,
     counts: np.ndarray,
     marked: np.ndarray | None = None,
     mark: style.RGB = style.UNDECIDED,

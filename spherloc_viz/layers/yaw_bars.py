@@ -9,10 +9,9 @@ from spherloc.bounds import bounds_of
 from spherloc.consensus.yaw_arcs import yaw_arcs
 from spherloc.geometry import wrap_angle
 from spherloc.trace import Trace, YawStage
-from spherloc_viz.layers.primitives import FloatArray
+from spherloc.types import FloatArray, IntArray
 from spherloc_viz.layers.yaw_story import ALL, Window, YawStory, window_around
 
-IntArray = NDArray[np.int64]
 WIDTHS_DEG = (1.0, 2.0, 4.0, 6.0, 10.0, 20.0, 30.0, 60.0, 120.0)
 """Of the window around the peak."""
 MOST_BARS = 60

@@ -6,10 +6,11 @@ import numpy as np
 
 from spherloc.geometry import yaw_of
 from spherloc.trace import ConsensusStage, RansacStage, Trace, YawStage
+from spherloc.types import FloatArray
 from spherloc_viz import style
 from spherloc_viz.layers import ring
 from spherloc_viz.layers.frame import RunView
-from spherloc_viz.layers.primitives import Curve, FloatArray
+from spherloc_viz.layers.primitives import Curve
 
 Window = tuple[float, float]
 """Yaws from the first, in [-180, 180) degrees, to the second, which exceeds 180 where the window crosses the seam."""

@@ -7,13 +7,14 @@ import cv2
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from spherloc.cameras.base import Camera, FloatArray
+from spherloc.cameras.base import Camera
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.cameras.mei import Mei
 from spherloc.frontend.lifting import DepthLift
 from spherloc.frontend.view import View
 from spherloc.geometry import camera_centre, pose, so3_exp
+from spherloc.types import FloatArray
 
 PANORAMA = Equirectangular(512, 256)
 FISHEYE = KannalaBrandt(300, 290, 94.0, 95.0, 151.0, 144.0, (0.02, -0.01, 0.003, -0.0005))

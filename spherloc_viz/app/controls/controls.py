@@ -7,12 +7,12 @@ from typing import Any, Protocol
 
 import viser
 
-from spherloc.cameras.base import FloatArray
 from spherloc.datasets.map_scene import MapScene
 from spherloc.datasets.variation import EDITS, Variation
 from spherloc.diagnosis import Diagnosis
 from spherloc.errors import InputError
 from spherloc.trace import Trace
+from spherloc.types import FloatArray
 from spherloc_viz import share
 from spherloc_viz.app.catalog import Catalog, SceneRequest
 from spherloc_viz.app.controls.display_controls import DisplayControls

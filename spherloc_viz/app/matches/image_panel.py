@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from spherloc.problem import Problem
 from spherloc.trace import Trace
+from spherloc.types import ByteArray
 from spherloc_viz import style
 from spherloc_viz.app.matches import match_drawing as drawing
 from spherloc_viz.app.matches.match_chips import chips_html
@@ -19,7 +20,7 @@ from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.layers.frame import one_color
 from spherloc_viz.layers.match_view import MatchView, match_view
 from spherloc_viz.layers.photograph import photograph
-from spherloc_viz.layers.primitives import ColorArray, Picture, Points
+from spherloc_viz.layers.primitives import Picture, Points
 
 PHOTO_PX = 900
 """Width of a photograph that fills the panel."""
@@ -82,7 +83,7 @@ def _assign(handle: viser.GuiHtmlHandle, html: str) -> None:
         handle.content = html
 
 
-def _colors(picture: Picture, count: int) -> ColorArray:
+def _colors(picture: Picture, count: int) -> ByteArray:
     """Colours (N, 3) of the matches at a step: those of the map's points."""
     colors = one_color(style.UNDECIDED, count)
     for item in picture.scene:

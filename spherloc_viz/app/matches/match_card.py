@@ -6,8 +6,8 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from spherloc.cameras.base import FloatArray
 from spherloc.trace import Trace
+from spherloc.types import FloatArray
 from spherloc_viz import style
 from spherloc_viz.app.matches.match_chips import chip
 from spherloc_viz.app.matches.match_crops import crops_html

@@ -4,8 +4,8 @@ from html import escape
 
 import numpy as np
 
-from spherloc.cameras.base import BoolArray
 from spherloc.problem import Problem
+from spherloc.types import BoolArray
 from spherloc_viz.app.text import box
 from spherloc_viz.layers.match_view import reference_votes
 

@@ -5,8 +5,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from spherloc.cameras.base import FloatArray
 from spherloc.problem import Problem
+from spherloc.types import FloatArray
 from spherloc_viz import style
 from spherloc_viz.app.matches.photos import jpeg_uri
 from spherloc_viz.layers.photograph import photograph

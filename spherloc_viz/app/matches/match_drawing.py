@@ -9,12 +9,10 @@ from html import escape
 
 import numpy as np
 
-from spherloc.cameras.base import BoolArray, FloatArray
-from spherloc.problem import IntArray
+from spherloc.types import BoolArray, ByteArray, FloatArray, IntArray
 from spherloc_viz import style
 from spherloc_viz.app.plots import shapes
 from spherloc_viz.layers.frame import even
-from spherloc_viz.layers.primitives import ColorArray
 
 WIDTH, GAP = 1000.0, 14.0
 """Of the drawing, in its own units; the page scales it."""
@@ -102,7 +100,7 @@ def thinned(own: IntArray, inlier: BoolArray, chosen: IntArray) -> IntArray:
     return np.concatenate([even(others, MOST_DOTS - take), np.union1d(even(inliers, take), chosen)])
 
 
-def dots(places: FloatArray, colors: ColorArray) -> list[str]:
+def dots(places: FloatArray, colors: ByteArray) -> list[str]:
     """Dots (N, 2), one path a colour; the last colours lie on top."""
     width_px = next(width for least, width in DOT_PX if len(places) >= least)
     look = f'fill="none" stroke-linecap="round" stroke-width="{width_px}" vector-effect="non-scaling-stroke"'
@@ -114,7 +112,7 @@ def dots(places: FloatArray, colors: ColorArray) -> list[str]:
     return parts
 
 
-def lines(starts: FloatArray, ends: FloatArray, colors: ColorArray, width_px: float, opacity: float) -> list[str]:
+def lines(starts: FloatArray, ends: FloatArray, colors: ByteArray, width_px: float, opacity: float) -> list[str]:
     """Straight lines between places (N, 2), one path a colour."""
     look = f'fill="none" stroke-width="{width_px:g}" opacity="{opacity:g}" vector-effect="non-scaling-stroke"'
     parts = []
@@ -161,7 +159,7 @@ def rings(places: FloatArray, numbers: Sequence[int]) -> list[str]:
     return parts
 
 
-def _by_color(rows: FloatArray, colors: ColorArray) -> list[tuple[str, FloatArray]]:
+def _by_color(rows: FloatArray, colors: ByteArray) -> list[tuple[str, FloatArray]]:
     """Rows without gaps in their numbers, by colour, the most frequent colours first."""
     known = np.isfinite(rows).all(axis=1)
     rows, colors = rows[known], colors[known]

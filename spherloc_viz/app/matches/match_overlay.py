@@ -6,16 +6,15 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from spherloc.cameras.base import Camera, FloatArray
+from spherloc.cameras.base import Camera
 from spherloc.geometry import transform
-from spherloc.problem import IntArray
 from spherloc.trace import Trace
+from spherloc.types import ByteArray, FloatArray, IntArray
 from spherloc_viz import style
 from spherloc_viz.app.matches import match_drawing as drawing
 from spherloc_viz.app.matches.match_drawing import Place
 from spherloc_viz.layers.frame import even, one_color
 from spherloc_viz.layers.match_view import MatchView, inlier_colored, valid_outlines
-from spherloc_viz.layers.primitives import ColorArray
 
 MOST_RINGS = 100
 REACH = 32.0
@@ -53,7 +52,7 @@ class Overlay:
 def overlay(
     trace: Trace,
     view: MatchView,
-    colors: ColorArray,
+    colors: ByteArray,
     places: list[Place],
     selected: tuple[int, ...],
     kept: NDArray,

@@ -8,8 +8,8 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from spherloc.problem import IntArray
 from spherloc.trace import Trace
+from spherloc.types import IntArray
 from spherloc_viz import style
 from spherloc_viz.app.matches.match_chips import chip
 from spherloc_viz.app.text import DIM, box

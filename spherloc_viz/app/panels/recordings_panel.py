@@ -6,8 +6,8 @@ from pathlib import Path
 
 import viser
 
-from spherloc.cameras.base import FloatArray
 from spherloc.errors import RecordingError
+from spherloc.types import FloatArray
 from spherloc_viz.app.background_worker import BackgroundWorker
 from spherloc_viz.app.review.differences import comparison_html
 from spherloc_viz.app.review.exporter import Exporter

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-FloatArray = NDArray[np.float64]
+from spherloc.types import FloatArray
 
 MINUS = "\N{MINUS SIGN}"
 ROUND = (1.0, 2.0, 5.0, 10.0)

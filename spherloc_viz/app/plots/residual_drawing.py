@@ -3,11 +3,12 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from spherloc.types import FloatArray
 from spherloc_viz import style
 from spherloc_viz.app.plots import shapes
 from spherloc_viz.app.plots.axes import Scale, decade_ticks, round_ticks, tick_texts
 from spherloc_viz.app.plots.svg import curve_parts
-from spherloc_viz.layers.primitives import Curve, FloatArray
+from spherloc_viz.layers.primitives import Curve
 from spherloc_viz.layers.residuals import Histogram, History, bin_words
 
 SELECT_BIN = "select-bin"

@@ -9,8 +9,9 @@ from html import escape
 import numpy as np
 from numpy.typing import ArrayLike
 
+from spherloc.types import FloatArray
 from spherloc_viz import style
-from spherloc_viz.app.plots.axes import FloatArray, Scale
+from spherloc_viz.app.plots.axes import Scale
 
 FONT_PX = 11.0
 MOST_CORNERS = 400

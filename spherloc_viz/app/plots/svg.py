@@ -4,8 +4,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from spherloc.types import FloatArray
 from spherloc_viz.app.plots import shapes
-from spherloc_viz.app.plots.axes import MINUS, FloatArray, Scale, round_ticks, tick_texts
+from spherloc_viz.app.plots.axes import MINUS, Scale, round_ticks, tick_texts
 from spherloc_viz.layers.primitives import Chart, Curve
 
 WIDTH_PX, HEIGHT_PX = 380.0, 180.0

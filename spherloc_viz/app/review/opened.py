@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from spherloc import registry
-from spherloc.cameras.base import FloatArray
 from spherloc.geometry import camera_centre
+from spherloc.types import FloatArray
 from spherloc_viz import style
 from spherloc_viz.app.run_request import Run, RunRequest
 from spherloc_viz.layers.comparison import color_of

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from spherloc.cameras.base import FloatArray
+from spherloc.types import FloatArray
 from spherloc_viz.app.background_worker import BackgroundWorker
 from spherloc_viz.app.review.differences import NAMES, same_problem
 from spherloc_viz.app.review.look import PAGE

@@ -6,10 +6,8 @@ sent through the inverse of that chain; what remains is shading.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
-ByteArray = NDArray[np.uint8]
-FloatArray = NDArray[np.float64]
+from spherloc.types import ByteArray, FloatArray
 
 # three.js, ACESFilmicToneMapping: matrix, rational curve (v^2 + A v - B) / (C v^2 + D v + E), matrix, at exposure 1.
 _INTO = np.array([[0.59719, 0.35458, 0.04823], [0.07600, 0.90834, 0.01566], [0.02840, 0.13383, 0.83777]])

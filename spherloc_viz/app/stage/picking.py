@@ -7,7 +7,8 @@ import numpy as np
 import viser
 import viser.transforms as vtf
 
-from spherloc_viz.layers.primitives import Balls, FloatArray, Points, SceneItem, Segments
+from spherloc.types import FloatArray
+from spherloc_viz.layers.primitives import Balls, Points, SceneItem, Segments
 
 DOT_PX = 8.0
 """A click that misses a dot by so much still means it."""

@@ -12,11 +12,12 @@ from typing import Any
 
 import numpy as np
 
+from spherloc.types import FloatArray
 from spherloc_viz import style
 from spherloc_viz.app.stage.painter import Painter
 from spherloc_viz.app.web.page import QUIET
 from spherloc_viz.app.web.viser_internals import start_viser, stop_viser
-from spherloc_viz.layers.primitives import FloatArray, SceneItem
+from spherloc_viz.layers.primitives import SceneItem
 
 _one_at_a_time = threading.Lock()
 """Starting and stopping a viser server changes what belongs to the whole process for a moment."""

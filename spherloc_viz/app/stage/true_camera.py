@@ -7,8 +7,8 @@ import viser
 import viser.transforms as vtf
 
 from spherloc.geometry import camera_centre, pose, yaw_of, yaw_rotation
+from spherloc.types import FloatArray
 from spherloc_viz.app.web.viser_internals import at_once, put_handle
-from spherloc_viz.layers.primitives import FloatArray
 
 Place = tuple[float, float, float, float]
 """Yaw in degrees and position in metres, of a level camera."""

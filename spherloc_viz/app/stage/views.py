@@ -6,8 +6,9 @@ import numpy as np
 import viser
 
 from spherloc.geometry import yaw_rotation
+from spherloc.types import FloatArray
 from spherloc_viz.layers.focus import RING_ROOM, SPHERE_ROOM, ball_boxes, circle, dense_points, sphere_box
-from spherloc_viz.layers.primitives import Balls, FloatArray, Mesh, Picture, Points, SceneItem, Segments, Textured
+from spherloc_viz.layers.primitives import Balls, Mesh, Picture, Points, SceneItem, Segments, Textured
 
 FIELD_OF_VIEW_RAD = np.radians(45.0)
 WIDE_RAD = np.radians(85.0)

@@ -10,9 +10,8 @@ import pyarrow as pa
 import rerun as rr
 from numpy.typing import NDArray
 
+from spherloc.types import FloatArray
 from spherloc_viz.layers.primitives import Chart, Curve
-
-FloatArray = NDArray[np.float64]
 
 MARKER_SHARE = 0.003
 """Width of a marker's bar, as a share of the chart."""

@@ -9,8 +9,9 @@ import pyarrow as pa
 import rerun as rr
 from numpy.typing import NDArray
 
+from spherloc.types import FloatArray
 from spherloc_viz import style
-from spherloc_viz.layers.primitives import Balls, FloatArray, Mesh, Points, Segments, Step, Table
+from spherloc_viz.layers.primitives import Balls, Mesh, Points, Segments, Step, Table
 from spherloc_viz.recording.content.chart_bars import Bars, tensors
 from spherloc_viz.recording.content.columns import (
     MARKDOWN,

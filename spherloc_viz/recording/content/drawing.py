@@ -10,7 +10,8 @@ import rerun as rr
 from numpy.typing import NDArray
 from rerun.chunk import Chunk
 
-from spherloc_viz.layers.primitives import FloatArray, Label, Picture, Points, Textured
+from spherloc.types import FloatArray
+from spherloc_viz.layers.primitives import Label, Picture, Points, Textured
 from spherloc_viz.layers.step_numbers import match_colors
 from spherloc_viz.recording.content.chart_bars import Bars, bars
 from spherloc_viz.recording.content.columns import VECTOR_3D, Times, Values, static_chunk, vectors

@@ -11,9 +11,9 @@ from rerun.chunk import Chunk
 
 from spherloc.geometry import yaw_of
 from spherloc.trace import Trace, TranslationStage, YawStage
+from spherloc.types import FloatArray
 from spherloc_viz import style
 from spherloc_viz.layers.frame import even
-from spherloc_viz.layers.primitives import FloatArray
 from spherloc_viz.layers.residuals import Histogram, residuals_of
 from spherloc_viz.recording.content.chart_bars import Bars
 from spherloc_viz.recording.content.columns import (

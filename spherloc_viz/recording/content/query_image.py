@@ -12,10 +12,10 @@ from rerun.chunk import Chunk
 
 from spherloc.errors import show
 from spherloc.problem import Problem
+from spherloc.types import ByteArray, FloatArray
 from spherloc_viz import style
 from spherloc_viz.layers.match_view import valid_outlines
 from spherloc_viz.layers.photograph import Photograph, photograph, shrunk
-from spherloc_viz.layers.primitives import ColorArray, FloatArray
 from spherloc_viz.recording.content.columns import (
     STRIP_2D,
     Values,
@@ -60,7 +60,7 @@ class Keypoints:
 
     pixels: FloatArray
     """(N, 2) in the recorded image."""
-    colors: ColorArray
+    colors: ByteArray
     """(N, 3)."""
 
 

@@ -10,11 +10,11 @@ from typing import Any
 from rerun.chunk import Chunk, LazyStore, RrdReader, StoreEntry
 from rerun.error_utils import RerunWarning
 
-from spherloc.cameras.base import BoolArray, FloatArray
 from spherloc.diagnosis import Diagnosis
 from spherloc.errors import InputError, RecordingError, show
 from spherloc.problem import Problem
 from spherloc.trace import Certificate
+from spherloc.types import BoolArray, FloatArray
 from spherloc_viz.recording.content.data import (
     DATA,
     Row,

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from spherloc.geometry import camera_centre
 from spherloc.problem import AlignedProblem
 from spherloc.trace import Trace
+from spherloc.types import FloatArray
 from spherloc_viz import style
 
 WIDTH_PX, HEIGHT_PX = 96, 64
@@ -20,8 +21,6 @@ CAMERA_PX = 7.0
 COMPRESSION = 3
 OUTSIDE_SHARE = 0.04
 """Share of the map points on every side that do not set the scale; some may lie far away."""
-
-FloatArray = NDArray[np.float64]
 
 
 def thumbnail(trace: Trace) -> bytes:

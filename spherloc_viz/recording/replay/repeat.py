@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from spherloc.cameras.base import FloatArray
 from spherloc.errors import InputError, RecordingError
 from spherloc.estimators import estimate
 from spherloc.metrics import rotation_error_deg, translation_error_m
 from spherloc.problem import Problem
 from spherloc.trace import Certificate, Trace
+from spherloc.types import FloatArray
 from spherloc_viz.recording.content.reader import RecordedRun
 from spherloc_viz.recording.replay.same import same_bits
 from spherloc_viz.recording.replay.scene import load_recorded_scene, missing_options, recorded_options

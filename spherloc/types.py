@@ -1,0 +1,13 @@
+"""Types of arrays that many modules speak of."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.int64]
+"""Numbers of matches, and what is counted."""
+IndexArray = NDArray[np.int32]
+"""Indices of correspondences, pairs and nodes, as the kernels hold them."""
+ByteArray = NDArray[np.uint8]
+"""Images and colours."""
