@@ -143,7 +143,7 @@ IMPOSSIBLE: dict[str, dict[str, Change]] = {
     "a time that is not finite": {RUN_PROPERTY: properties(time_ms=float("nan"))},
     "an error below nothing": {RUN_PROPERTY: properties(rotation_error_deg=-1.0)},
     "150 % outliers": {RUN_PROPERTY: properties(outlier_rate=1.5)},
-    "a key step that there is not": {RUN_PROPERTY: properties(key_step=10**6)},
+    "a key step that there is not": {RUN_PROPERTY: properties(decisive_step=10**6)},
     "a cause that there is not": {RUN_PROPERTY: properties(diagnosis="<script>alert(1)</script>")},
     "an outcome that there is not": {RUN_PROPERTY: properties(outcome="' OR 1=1 --")},
     "a date that is none": {RUN_PROPERTY: properties(created="<b>today</b>")},

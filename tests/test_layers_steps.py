@@ -156,7 +156,7 @@ def test_growing_arcs_overlap_as_often_as_they_say(mc: Trace) -> None:
         assert {tuple(pair) for pair in band.ids} <= {tuple(pair) for pair in stage.pairs[arcs]}
 
 
-def test_the_hand_meets_as_many_arcs_as_it_says(mc: Trace) -> None:
+def test_a_candidate_yaw_lies_in_as_many_arcs_as_it_says(mc: Trace) -> None:
     stage = of(mc, YawStage)
     assert isinstance(stage, YawStage)
     everything, keys = np.arange(len(stage.lo_rad)), keys_like(mc, r"yaw-candidate-\d+")
@@ -177,15 +177,15 @@ def test_the_hand_meets_as_many_arcs_as_it_says(mc: Trace) -> None:
         assert touched.any() and pink
 
 
-def test_the_story_of_the_hand_is_that_of_its_stops(mc: Trace) -> None:
+def test_candidate_yaws_are_held_against_those_before(mc: Trace) -> None:
     stage = of(mc, YawStage)
     assert isinstance(stage, YawStage)
     stops = yaw.candidate_yaws(stage)
     for k, key in enumerate(keys_like(mc, r"yaw-candidate-\d+")):
         said, here = at(mc, key).step.caption, stage.overlap[stops[k]]
         most = max(stage.overlap[stops[:k]], default=0)
-        assert ("beats the stops before" in said) == bool(k and here > most)
-        assert ("has met more" in said) == bool(here < most)
+        assert ("beats the candidates before" in said) == bool(k and here > most)
+        assert ("is in more" in said) == bool(here < most)
 
 
 def test_roots_are_those_of_the_solver(mc: Trace, rng: np.random.Generator) -> None:
@@ -205,7 +205,7 @@ def test_roots_are_those_of_the_solver(mc: Trace, rng: np.random.Generator) -> N
     assert compared > 20
 
 
-def test_twins_are_both_arcs_of_one_pair_and_all_pairs_are_counted(mc: Trace) -> None:
+def test_roots_are_both_arcs_of_one_pair_and_all_pairs_are_counted(mc: Trace) -> None:
     stage = of(mc, YawStage)
     assert isinstance(stage, YawStage)
     picture = at(mc, "yaw-roots")
@@ -222,7 +222,7 @@ def test_twins_are_both_arcs_of_one_pair_and_all_pairs_are_counted(mc: Trace) ->
     assert f"Matches {pair[0]} and {pair[1]} " in at(mc, "yaw-pair").step.caption
 
 
-def test_without_twins_the_other_root_is_explained() -> None:
+def test_without_a_second_arc_the_other_root_is_explained() -> None:
     problem = scene_problem("panorama_outliers_80")
     trace = estimate(problem, "mc")
     stage = of(trace, YawStage)

@@ -116,7 +116,7 @@ def test_slider_list_and_stage_bars_go_to_their_step_and_agree(panel: Panel) -> 
         assert f'data-touch="step:{key}"' in inner._stages.content
 
 
-def test_what_python_sets_is_no_wish(panel: Panel) -> None:
+def test_what_python_sets_is_no_request(panel: Panel) -> None:
     inner = panel.panel
     for callback, widget in ((inner._slide, inner._slider), (inner._pick, inner._choice)):
         callback(event(widget, None))
@@ -154,9 +154,9 @@ def test_a_thumb_that_moves_on_is_not_pulled_back(panel: Panel) -> None:
     assert panel.settle() == KEYS[6] and slider.value == 7
 
 
-@pytest.mark.parametrize("request", ["4711", "", "no-such-step", "yaw-arcs-9999999999999999999", "../../etc"])
-def test_any_wish_of_a_page_leads_somewhere(panel: Panel, request: str) -> None:
-    panel.panel.go(request)
+@pytest.mark.parametrize("asked_for", ["4711", "", "no-such-step", "yaw-arcs-9999999999999999999", "../../etc"])
+def test_any_request_of_a_page_leads_somewhere(panel: Panel, asked_for: str) -> None:
+    panel.panel.go(asked_for)
     assert panel.settle() in KEYS
 
 
