@@ -29,12 +29,12 @@ from spherloc.trace import Trace
 from spherloc_viz.layers import paint, steps
 from spherloc_viz.layers.key_step import key_step
 from spherloc_viz.layers.primitives import Balls, Label, Mesh, Picture, Points, SceneItem, Segments
-from spherloc_viz.recording.content.chart_bars import bars
+from spherloc_viz.recording.content.components import bars
 from spherloc_viz.recording.content.drawing import chart_path
 from spherloc_viz.recording.content.layout import blueprint, shown_in
-from spherloc_viz.recording.content.markdown import step_text
 from spherloc_viz.recording.content.panels import panels_of
 from spherloc_viz.recording.content.properties import APPLICATION_ID
+from spherloc_viz.recording.content.text import step_text
 from spherloc_viz.recording.content.writer import recorded_steps
 from spherloc_viz.recording.origin import Origin
 from spherloc_viz.recording.storage.store import RecordingStore

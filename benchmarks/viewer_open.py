@@ -30,9 +30,9 @@ from benchmarks.machine import describe
 from benchmarks.playground import SCENE, playground
 from spherloc.datasets import load_scene
 from spherloc.estimators import estimate
-from spherloc_viz.app.web.viewer_room import viewer_link
+from spherloc_viz.app.web.viewer import viewer_link
 from spherloc_viz.recording.content.writer import write_recording
-from spherloc_viz.recording.viewing.rerun_program import rerun_command, rerun_environment
+from spherloc_viz.recording.rerun_program import rerun_command, rerun_environment
 
 RESULTS = Path(__file__).parent / "results" / "viewer_open.json"
 OURS, PEER = "spherloc", "rerun --serve-web"

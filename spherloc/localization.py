@@ -17,10 +17,10 @@ from spherloc.cameras.colmap_models import camera_from_colmap
 from spherloc.diagnosis import Diagnosis, diagnose
 from spherloc.errors import CalibrationError, InputError, show
 from spherloc.estimators import default_options, estimate
-from spherloc.extras import require
 from spherloc.geometry import camera_centre
 from spherloc.outcome import Judgement, Outcome, judge
 from spherloc.problem import Problem
+from spherloc.registry import require
 from spherloc.trace import Certificate, RefinementStage, Trace
 from spherloc.types import BoolArray, FloatArray
 

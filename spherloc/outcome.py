@@ -14,8 +14,7 @@ from spherloc.bounds import bounds_of
 from spherloc.consensus.chance import chance_rate, nfa
 from spherloc.consensus.inliers import mark_each
 from spherloc.consensus.two_point_search import search_two_point
-from spherloc.diagnosis.evidence import FEW, LOOSE_ENDS, different
-from spherloc.diagnosis.measures import pose_sd
+from spherloc.diagnosis.evidence import FEW, LOOSE_ENDS, different, pose_sd
 from spherloc.metrics import SUCCESS_DEG, SUCCESS_M
 from spherloc.narrowing import NARROWINGS, narrow
 from spherloc.problem import AlignedProblem

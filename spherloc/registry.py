@@ -4,6 +4,7 @@ What another package registers is an extension. One that cannot be imported or f
 it gets one sentence that names it.
 """
 
+import importlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
@@ -82,3 +83,14 @@ def _is_own(point: EntryPoint) -> bool:
 
 def _distribution(point: EntryPoint) -> str:
     return "" if point.dist is None else point.dist.name
+
+
+def require(module: str, extra: str, purpose: str) -> Any:
+    """The optional module; ``purpose`` says what needs it ("reading COLMAP models").
+
+    Raises ``InputError`` that names the extra which brings it.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError:
+        raise InputError(f"{purpose} needs {module}; install it with: pip install 'spherloc[{extra}]'.") from None

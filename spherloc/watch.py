@@ -6,9 +6,11 @@ at once, with whatever it has; the function that called it then raises ``Cancell
 """
 
 import threading
+import time
 
 import numba
 import numpy as np
+from numba.core import event
 from numpy.typing import NDArray
 
 from spherloc.errors import SpherlocError
@@ -105,3 +107,12 @@ class Watch:
 def stopped(board):
     """Whether a kernel shall return. A kernel that nobody watches has None for a board."""
     return board is not None and board[STOP] != 0
+
+
+_compiling = event.TimingListener()
+event.register("numba:compile", _compiling)
+
+
+def working_s() -> float:
+    """Seconds of some fixed origin, which stand still while a kernel is compiled (and not merely loaded)."""
+    return time.perf_counter() - (_compiling.duration if _compiling.done else 0.0)

@@ -22,7 +22,7 @@ from spherloc.trace import Trace
 from spherloc_viz.options import json_text, option_fields
 from spherloc_viz.progress import prepare, say, solve
 from spherloc_viz.recording.origin import Origin
-from spherloc_viz.recording.storage.room import KEEP_GIGABYTES, kept_bytes
+from spherloc_viz.recording.storage.retention import KEEP_GIGABYTES, kept_bytes
 from spherloc_viz.share import is_recording
 
 if TYPE_CHECKING:
@@ -246,7 +246,7 @@ def as_text(path: Path, trace: Trace, diagnosis: Diagnosis, recording: Path | No
         lines.append(f"  precision {metrics.precision:.3f}, recall {metrics.recall:.3f}, F1 {metrics.f1:.3f}")
     if trace.certificate is not None:
         # Only now: the layers take half a second.
-        from spherloc_viz.layers.certificate import chance, proof, warning
+        from spherloc_viz.layers.outcome import chance, proof, warning
 
         lines.append(f"  {proof(trace.certificate)}; expected false sets of this size: {chance(trace.certificate)}")
         lines += [f"  {sentence}" for sentence in (warning(trace.certificate),) if sentence]

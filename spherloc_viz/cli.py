@@ -15,7 +15,7 @@ from tyro.extras import SubcommandApp
 from spherloc.errors import SpherlocError, reason, show
 from spherloc_viz import recording_commands
 from spherloc_viz.arguments import refuse_repeated
-from spherloc_viz.recording.storage.room import KEEP_GIGABYTES
+from spherloc_viz.recording.storage.retention import KEEP_GIGABYTES
 
 RECORDINGS = Path("recordings")
 Settings = Annotated[tyro.conf.UseAppendAction[tuple[tuple[str, ...], ...]], arg(metavar="KEY=VALUE ...")]
@@ -84,7 +84,7 @@ def run(
             it: python -m spherloc.proof_check FILE, which needs numpy only.
     """
     from spherloc.datasets import scene_path
-    from spherloc.datasets.variation_text import parse_variation
+    from spherloc.datasets.variation import parse_variation
     from spherloc_viz import batch
 
     variation = parse_variation(list(chain(*set)), spoil, mend, hide)

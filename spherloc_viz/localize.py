@@ -11,17 +11,19 @@ from spherloc.errors import InputError, RecordingError, show
 from spherloc.estimators import options_type, warm_up
 from spherloc.experiments.configuration import configuration_of
 from spherloc.experiments.results import (
+    LOCALIZED,
     PICTURE,
+    POSED,
     SUMMARY,
     TRAJECTORY,
     TRUE_TRAJECTORY,
+    UNREADABLE,
+    QueryResult,
     ResultsLog,
     SequenceResults,
 )
-from spherloc.experiments.rows import LOCALIZED, POSED, UNREADABLE, QueryResult
 from spherloc.experiments.sequence import chosen_queries, localize
-from spherloc.experiments.summary import SuccessRate, Summary, summarize
-from spherloc.experiments.trajectories import estimated_trajectory, timed, true_trajectory
+from spherloc.experiments.summary import SuccessRate, Summary, estimated_trajectory, summarize, timed, true_trajectory
 from spherloc.frontend.view import View
 from spherloc.trace import Trace
 from spherloc.trajectory import write_tum
@@ -152,7 +154,7 @@ class _Recorder:
 
 def _finish(log: ResultsLog, results: SequenceResults) -> None:
     """Trajectories, picture and summary of all that is done by now."""
-    from spherloc_viz.trajectory_plot import trajectory_png
+    from spherloc_viz.plots import trajectory_png
 
     truth = true_trajectory(results)
     write_tum(log.folder / TRAJECTORY, estimated_trajectory(results))

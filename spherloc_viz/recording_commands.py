@@ -14,7 +14,7 @@ RangeText = Annotated[str | None, arg(metavar="RANGE")]
 
 def without_reviews(files: Sequence[Path]) -> tuple[Path, ...]:
     """What a shell's pattern such as ``*.rrd`` is meant to find; all if there is nothing but labels and notes."""
-    from spherloc_viz.recording.review.notes import REVIEW_SUFFIX
+    from spherloc_viz.recording.reviews import REVIEW_SUFFIX
 
     return tuple(file for file in files if not file.name.endswith(REVIEW_SUFFIX)) or tuple(files)
 
@@ -43,12 +43,12 @@ def view(
         port: Port of the web viewer; 0 takes a free one.
     """
     from spherloc_viz.recording.sandbox.examiner import examine
-    from spherloc_viz.recording.viewing.view import step_of, view_in_window
+    from spherloc_viz.recording.viewer import step_of, view_in_window
 
     row = examine(recording)
     place = step_of(row, step)
     if web:
-        from spherloc_viz.app.web.viewer_server import serve_recording
+        from spherloc_viz.app.web.viewer import serve_recording
 
         serve_recording(recording, row, place, port)
     else:
@@ -78,7 +78,7 @@ def repeat(
         json: Print one JSON object a recording, on one line; infinity is the text "inf".
     """
     from spherloc_viz.progress import solve
-    from spherloc_viz.recording.replay.repeat_text import repeat_all
+    from spherloc_viz.recording.replay.repeat import repeat_all
 
     return repeat_all(without_reviews(recordings), json, solve)
 

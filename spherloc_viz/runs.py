@@ -15,7 +15,7 @@ from spherloc_viz.recording.index.query import GROUP_KEYS, OUTCOMES, SORT_KEYS, 
 from spherloc_viz.recording.index.refresh import Refreshed
 from spherloc_viz.recording.index.run_index import RunIndex
 from spherloc_viz.recording.index.run_text import FORMS, counts_text, rows_text
-from spherloc_viz.recording.review.notes import Review, checked_review
+from spherloc_viz.recording.reviews import Review, checked_review
 from spherloc_viz.recording.sandbox.examiner import examine, examine_review
 
 SORT_WORDS = {
@@ -66,9 +66,7 @@ def print_steps(folder: Path, condition: str, limit: int | None, form: str) -> i
 
     Raises ``InputError`` for a condition that cannot be understood, and as ``print_runs`` does.
     """
-    from spherloc_viz.recording.index.catalog import find_steps
-    from spherloc_viz.recording.index.step_condition import checked_condition
-    from spherloc_viz.recording.index.step_text import steps_text
+    from spherloc_viz.recording.index.steps import checked_condition, find_steps, steps_text
 
     form, most = one_of("format", form, FORMS), _limit(limit, form)
     checked_condition(condition)

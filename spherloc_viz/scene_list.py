@@ -3,8 +3,7 @@
 from pathlib import Path
 
 from spherloc.datasets import bundled_scenes
-from spherloc.datasets.loaders import SceneKind, scene_kind, scene_kinds
-from spherloc.datasets.scene_file import read_table
+from spherloc.datasets.scene_file import SceneKind, read_table, scene_kind, scene_kinds
 from spherloc.errors import InputError
 
 

@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from spherloc.datasets import scene_file
-from spherloc.datasets.variation import EDITS, Variation
-from spherloc.datasets.variation_text import settings_of
+from spherloc.datasets.variation import EDITS, Variation, settings_of
 from spherloc.errors import InputError
 from spherloc.estimators import options_type
 from spherloc_viz.options import typed

@@ -5,13 +5,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from spherloc.datasets import load_scene
-from spherloc.datasets.variation_text import parse_variation
+from spherloc.datasets.variation import parse_variation
 from spherloc.errors import RecordingError
 from spherloc.estimators import warm_up
 from spherloc.experiments.sweep import Entrant, Keep, SweepPlan, planned, run_sweep
 from spherloc.experiments.sweep_log import PICTURE, SUMMARY, SweepLog
-from spherloc.experiments.sweep_summary import summarize
-from spherloc.experiments.sweep_text import parse_values
+from spherloc.experiments.sweep_plan import parse_values
+from spherloc.experiments.sweep_rows import summarize
 from spherloc_viz.batch import Records, parse_settings, store_of
 from spherloc_viz.layers.primitives import Table
 from spherloc_viz.layers.sweep import sweep_table
@@ -56,7 +56,7 @@ def sweep(
             raise
         log.finish()
         points = summarize(plan.labels, log.rows)
-        from spherloc_viz.sweep_plot import sweep_png
+        from spherloc_viz.plots import sweep_png
 
         log.write(log.beside(PICTURE), sweep_png(load_scene(scene).name, over, plan.labels, points))
         print(text_of(sweep_table(over, points)))
@@ -90,7 +90,7 @@ class Recorded:
 
     def keep(self, cluster: bool) -> Keep:
         """What records a run where it is done."""
-        from spherloc_viz.recording.storage.sweep_store import SweepStore
+        from spherloc_viz.recording.storage.store import SweepStore
 
         folder = self._store.folder.resolve()
         if cluster:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from spherloc.experiments.sweep import Job, SweepPlan
 from spherloc.trace import Trace
-from spherloc_viz.recording.storage.sweep_store import SweepStore
+from spherloc_viz.recording.storage.store import SweepStore
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from spherloc import registry
 from spherloc.datasets import load_scene
 from spherloc.datasets.map_scene import MapScene
-from spherloc.datasets.outliers import OUTLIER_KINDS
+from spherloc.datasets.point_cloud import OUTLIER_KINDS
 from spherloc.datasets.variation import Variation
 from spherloc.errors import InputError
 from spherloc.estimators import options_type

@@ -26,7 +26,7 @@ from spherloc_viz.app.web.downloads import Downloads
 from spherloc_viz.app.web.front_door import FrontDoor
 from spherloc_viz.app.web.guard import is_own_name, open_socket, refusal
 from spherloc_viz.app.web.page import load_page
-from spherloc_viz.app.web.viewer_room import ViewerRoom
+from spherloc_viz.app.web.viewer import ViewerRoom
 from tests.waiting import LIMIT_S
 
 KEY = "a key of this test"

@@ -14,10 +14,9 @@ from spherloc.consensus.yaw_arcs import yaw_arcs
 from spherloc.estimators import estimate
 from spherloc.trace import ConsensusStage, Trace, TranslationStage
 from spherloc_viz import style
-from spherloc_viz.app.plots.graph_drawing import MOST_EDGES, cell_nodes, edges_of, matrix_png
-from spherloc_viz.app.plots.graph_view import graph_html
+from spherloc_viz.app.plots.graph_view import MOST_EDGES, cell_nodes, edges_of, graph_html, matrix_png
 from spherloc_viz.layers import graph_begins, paint, steps
-from spherloc_viz.layers.graph import MOST_NODES, ball_nodes
+from spherloc_viz.layers.balls import MOST_NODES, ball_nodes
 from spherloc_viz.layers.primitives import Graph
 
 

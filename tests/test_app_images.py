@@ -20,14 +20,12 @@ from spherloc.problem import Problem
 from spherloc.trace import Trace
 from spherloc_viz import style
 from spherloc_viz.app.matches import match_drawing as drawing
-from spherloc_viz.app.matches.image_panel import ImagePanel
-from spherloc_viz.app.matches.match_card import MatchCard
-from spherloc_viz.app.matches.match_crops import HEIGHT_PX, SIDE_PX, WIDTH_PX, crops_html
+from spherloc_viz.app.matches.image_panel import MOST_BYTES, ImagePanel, photo_uri
+from spherloc_viz.app.matches.match_card import CROP_HEIGHT_PX, CROP_WIDTH_PX, SIDE_PX, MatchCard, crops_html
 from spherloc_viz.app.matches.match_table import MatchTable
-from spherloc_viz.app.matches.photos import MOST_BYTES, photo_uri
 from spherloc_viz.app.web.viser_internals import start_viser, stop_viser
 from spherloc_viz.layers import paint, steps
-from spherloc_viz.layers.match_view import match_view, valid_outlines
+from spherloc_viz.layers.matches import match_view, valid_outlines
 from spherloc_viz.layers.primitives import Picture, Points
 
 SceneOf = Callable[..., SyntheticScene]
@@ -248,10 +246,10 @@ def test_a_crop_is_centred_on_its_pixel(tmp_path: Path) -> None:
         data = re.search(r"base64,([^\"]*)", html)
         assert data is not None
         crop = cv2.imdecode(np.frombuffer(base64.b64decode(data[1]), np.uint8), cv2.IMREAD_COLOR)
-        assert crop is not None and crop.shape[:2] == (HEIGHT_PX, WIDTH_PX)
+        assert crop is not None and crop.shape[:2] == (CROP_HEIGHT_PX, CROP_WIDTH_PX)
         rows, columns = np.nonzero(crop[..., 1].astype(int) - crop[..., 0] > 60)
         middle = np.array([columns.mean() + 0.5, rows.mean() + 0.5])
-        assert np.abs(middle - [WIDTH_PX / 2, HEIGHT_PX / 2]).max() < 0.3 * WIDTH_PX / SIDE_PX
+        assert np.abs(middle - [CROP_WIDTH_PX / 2, CROP_HEIGHT_PX / 2]).max() < 0.3 * CROP_WIDTH_PX / SIDE_PX
     assert crops_html(replace(problem, image=None), 0) == ""
 
 

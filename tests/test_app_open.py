@@ -14,7 +14,7 @@ from spherloc.datasets import bundled_scenes
 from spherloc.datasets.correspondences import CorrespondencesScene
 from spherloc.errors import InputError
 from spherloc_viz.app.panels.folders import MOST_ENTRIES, PAGE, Roots
-from spherloc_viz.app.panels.recent import MOST, RecentScenes
+from spherloc_viz.app.panels.open_panel import MOST_RECENT, RecentScenes
 from spherloc_viz.app.panels.uploads import MOST_BYTES, MOST_ROWS, File, Form, Scratch, numbers, open_upload
 from tests.needs import real_data
 
@@ -172,11 +172,11 @@ def test_an_endless_folder_is_looked_at_in_part(tmp_path: Path, monkeypatch: pyt
 def test_recent_scenes_are_remembered_newest_first(tmp_path: Path) -> None:
     recent = RecentScenes(tmp_path / "deep" / "scenes.json")
     assert recent.read() == ((), "")
-    paths = [tmp_path / f"{number}.toml" for number in range(MOST + 3)]
+    paths = [tmp_path / f"{number}.toml" for number in range(MOST_RECENT + 3)]
     for path in [*paths, paths[-2]]:
         recent.note(path)
     kept, remark = RecentScenes(tmp_path / "deep" / "scenes.json").read()
-    assert kept[:3] == (paths[-2], paths[-1], paths[-3]) and len(kept) == MOST and not remark
+    assert kept[:3] == (paths[-2], paths[-1], paths[-3]) and len(kept) == MOST_RECENT and not remark
     assert [path.name for path in (tmp_path / "deep").iterdir()] == ["scenes.json"], "no half-written file is left"
 
 

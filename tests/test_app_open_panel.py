@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 import viser
 
-from spherloc_viz.app.panels.open_panel import Opened, OpenPanel
-from spherloc_viz.app.panels.recent import RecentScenes
+from spherloc_viz.app.panels.open_panel import Opened, OpenPanel, RecentScenes
 from spherloc_viz.app.panels.uploads import MOST_BYTES
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.web.viser_internals import start_viser, stop_viser

@@ -18,12 +18,12 @@ from spherloc_viz.app import session as session_module
 from spherloc_viz.app.catalog import MOST_BRIEF, Catalog, SceneRequest
 from spherloc_viz.app.page_runs import LOOK_S, PageRuns
 from spherloc_viz.app.review import notes as notes_module
-from spherloc_viz.app.review.exporter import Exporter
+from spherloc_viz.app.review.export import Exporter
 from spherloc_viz.app.review.run_library import RunLibrary
 from spherloc_viz.app.run_request import Run, RunRequest
 from spherloc_viz.gallery import gallery_cases
 from spherloc_viz.recording.content.reader import read_recording
-from spherloc_viz.recording.review.notes import Review, read_review
+from spherloc_viz.recording.reviews import Review, read_review
 from spherloc_viz.recording.run_row import RunRow
 from tests.reviewing_pages import Office, recorded_twice
 from tests.tiny_scene import write_tiny_scene

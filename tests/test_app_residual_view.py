@@ -13,9 +13,15 @@ import viser
 from spherloc.datasets.synthetic import SyntheticScene
 from spherloc.estimators import estimate
 from spherloc.trace import Trace
-from spherloc_viz.app.plots.axes import Scale
-from spherloc_viz.app.plots.residual_drawing import FOOT_PX, histogram_svg, history_svg
-from spherloc_viz.app.plots.residual_view import ResidualView, history_caption, residuals_caption
+from spherloc_viz.app.plots.residual_view import (
+    FOOT_PX,
+    ResidualView,
+    histogram_svg,
+    history_caption,
+    history_svg,
+    residuals_caption,
+)
+from spherloc_viz.app.plots.shapes import Scale
 from spherloc_viz.app.server import start_viser, stop_viser
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.layers.residuals import history_of, residuals_of

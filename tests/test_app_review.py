@@ -15,22 +15,20 @@ from typing import Any
 import pytest
 
 from spherloc.errors import InputError, RecordingError
-from spherloc_viz.app.review import bundle as bundle_module
-from spherloc_viz.app.review.bundle import bundle
-from spherloc_viz.app.review.differences import comparison_html
-from spherloc_viz.app.review.filters import Counts, filters_html
+from spherloc_viz.app.review import export
+from spherloc_viz.app.review.card import comparison_html
+from spherloc_viz.app.review.export import bundle, summary_html
+from spherloc_viz.app.review.filters import PAGE, Counts, Look, filters_html
 from spherloc_viz.app.review.gallery_list import file_of, gallery_html
-from spherloc_viz.app.review.look import PAGE, Look
 from spherloc_viz.app.review.rows import WIDTH_PX, rows_html, verdict_html
 from spherloc_viz.app.review.run_library import RunLibrary, merged
-from spherloc_viz.app.review.summary_page import summary_html
 from spherloc_viz.app.web.touch import MOST_LETTERS, Touch, Touches, parse
 from spherloc_viz.cli import app
 from spherloc_viz.gallery import gallery_cases
 from spherloc_viz.recording.index.query import Range
 from spherloc_viz.recording.index.run_index import RunIndex
 from spherloc_viz.recording.index.run_text import rows_text
-from spherloc_viz.recording.review.notes import Review
+from spherloc_viz.recording.reviews import Review
 from spherloc_viz.recording.run_row import RunRow
 
 NOW = datetime(2026, 5, 1, 12, tzinfo=UTC)
@@ -260,7 +258,7 @@ def test_an_export_is_whole_readable_and_bounded(
     assert first["note"] == "'=1+1" and first["labels"] == "a; b" and first["rotation_error_deg"] == "0.0"
     assert packed.runs == 2 and "2 were left out, since their files are gone" in packed.sentence
     assert "5 more were left out" in packed.sentence
-    monkeypatch.setattr(bundle_module, "MOST_BYTES", 20)
+    monkeypatch.setattr(export, "MOST_BYTES", 20)
     assert bundle(path, library.folder, rows, 4, NOW, lambda: False).runs == 1
     with pytest.raises(RecordingError, match="nothing to export"):
         bundle(path, library.folder, rows[2:], 2, NOW, lambda: False)

@@ -13,9 +13,8 @@ from hypothesis import strategies as st
 
 from spherloc_viz import style
 from spherloc_viz.app.plots import shapes
-from spherloc_viz.app.plots.axes import MINUS, Scale, decade_ticks, round_ticks, tick_texts, wrapped_deg
-from spherloc_viz.app.plots.charts import ChartPanel, chart_html
-from spherloc_viz.app.plots.svg import MOST_STEPS, chart_svg, curve_parts
+from spherloc_viz.app.plots.charts import MOST_STEPS, ChartPanel, chart_html, chart_svg, curve_parts
+from spherloc_viz.app.plots.shapes import MINUS, Scale, decade_ticks, round_ticks, tick_texts, wrapped_deg
 from spherloc_viz.app.server import start_viser, stop_viser
 from spherloc_viz.layers.primitives import Chart, Curve
 

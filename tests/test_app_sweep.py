@@ -22,7 +22,7 @@ from spherloc.errors import InputError
 from spherloc.estimators import warm_up
 from spherloc_viz.app.catalog import SceneRequest
 from spherloc_viz.app.panels import sweep_runs_panel
-from spherloc_viz.app.panels.estimator_chips import chips_html
+from spherloc_viz.app.panels.compare_panel import chips_html
 from spherloc_viz.app.panels.sweep_runs_panel import CANCEL, START, SweepPanel
 from spherloc_viz.app.plots.sweep_charts import charts_html, sweep_svg, table_html
 from spherloc_viz.app.web.touch import Touch, Touches
@@ -212,8 +212,7 @@ class Tags(HTMLParser):
 
 
 def test_html_is_whole_and_escaped() -> None:
-    from spherloc.experiments.sweep_rows import SweepRow
-    from spherloc.experiments.sweep_summary import point_of
+    from spherloc.experiments.sweep_rows import SweepRow, point_of
 
     labels = ("mc", "mc <i>=1")
     rows = [

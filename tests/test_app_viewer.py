@@ -20,15 +20,22 @@ from test_app_front_door import Door, door_to
 
 from spherloc.errors import InputError, RecordingError
 from spherloc.estimators import estimate
-from spherloc_viz.app.web import viewer_room
-from spherloc_viz.app.web.viewer_page import sorry_page, viewer_page, viewer_policy
-from spherloc_viz.app.web.viewer_room import Viewable, ViewerRoom, of_index, viewer_link
+from spherloc_viz.app.web import viewer
+from spherloc_viz.app.web.viewer import (
+    Viewable,
+    ViewerRoom,
+    of_index,
+    sorry_page,
+    viewer_link,
+    viewer_page,
+    viewer_policy,
+)
 from spherloc_viz.recording.content.writer import write_recording
 from spherloc_viz.recording.index.run_index import RunIndex
-from spherloc_viz.recording.review.notes import review_path, write_review
+from spherloc_viz.recording.rerun_program import viewer_version
+from spherloc_viz.recording.reviews import review_path, write_review
 from spherloc_viz.recording.run_row import RunRow
-from spherloc_viz.recording.viewing.view import step_of
-from spherloc_viz.recording.viewing.viewer_files import viewer_version
+from spherloc_viz.recording.viewer import step_of
 from tests.waiting import LIMIT_S
 
 Folder = tuple[Path, RunRow]
@@ -240,7 +247,7 @@ def test_strangers_are_refused_here_too(folder: Folder) -> None:
 
 
 def test_a_run_that_goes_meanwhile_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(viewer_room, "resolve_inside", lambda folder, file: folder / file)
+    monkeypatch.setattr(viewer, "resolve_inside", lambda folder, file: folder / file)
     with RunIndex(tmp_path) as index, pytest.raises(RecordingError, match=r"gone\.rrd: the recording cannot be read"):
         of_index(index)("gone.rrd")
 

@@ -20,23 +20,25 @@ from spherloc.estimators import estimate
 from spherloc.estimators.mc import WIDEST_RAD
 from spherloc.problem import Problem
 from spherloc.trace import RansacStage, Trace, YawStage
-from spherloc_viz.app.plots.yaw_drawing import yaw_svg
-from spherloc_viz.app.plots.yaw_view import PEAK, WHOLE, YawView
+from spherloc_viz.app.plots.yaw_view import PEAK, WHOLE, YawView, yaw_svg
 from spherloc_viz.app.server import start_viser, stop_viser
 from spherloc_viz.app.web.touch import Touch, Touches
-from spherloc_viz.layers.yaw_bars import (
+from spherloc_viz.layers.yaw_story import (
+    ALL,
     KINDS,
     MOST_BARS,
     MOST_CHOSEN,
     Arcs,
     Bars,
+    Window,
     arcs_of,
     bars_in,
     peak_window,
     sample,
     spans_in,
+    window_around,
+    yaw_story,
 )
-from spherloc_viz.layers.yaw_story import ALL, Window, window_around, yaw_story
 
 SVG = "{http://www.w3.org/2000/svg}"
 SceneOf = Callable[..., SyntheticScene]

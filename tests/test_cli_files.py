@@ -8,7 +8,7 @@ from cli_process import SCENE, one_sentence, spherloc, spherloc_here
 from spherloc.datasets import bundled_scenes, load_scene, scene_path
 from spherloc.estimators import estimate
 from spherloc_viz.recording.content.writer import write_recording
-from spherloc_viz.recording.review.notes import write_review
+from spherloc_viz.recording.reviews import write_review
 from spherloc_viz.recording_commands import without_reviews
 
 

@@ -12,7 +12,7 @@ from spherloc.datasets import bundled_scenes, load_scene
 from spherloc.datasets.failures import MAKERS, failure_case
 from spherloc.datasets.variation import Variation
 from spherloc.diagnosis import Cause, diagnose
-from spherloc.diagnosis.measures import apart, pose_sd
+from spherloc.diagnosis.evidence import apart, pose_sd
 from spherloc.estimators import default_options, estimate
 from spherloc.problem import Problem
 from spherloc.refine import RefinementOptions, refine, residuals_px

@@ -18,12 +18,12 @@ from spherloc.errors import InputError
 from spherloc.metrics import evaluate
 from spherloc_viz.cli import app
 from spherloc_viz.gallery import GALLERY, gallery_cases
-from spherloc_viz.gallery.check import Played, agrees, faults, loose_numbers, play
+from spherloc_viz.gallery.case import Played, agrees, faults, loose_numbers, play
 from spherloc_viz.gallery.file import parse_gallery
 from spherloc_viz.gallery.regenerate import chosen, outcome, record, stories
 from spherloc_viz.recording.content.reader import read_recording
-from spherloc_viz.recording.review.notes import Review, read_review, review_path, write_review
-from spherloc_viz.recording.viewing.view import labels_of
+from spherloc_viz.recording.reviews import Review, read_review, review_path, write_review
+from spherloc_viz.recording.viewer import labels_of
 
 KEYS = [case.key for case in gallery_cases()]
 ASKED_FOR = {

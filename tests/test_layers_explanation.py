@@ -19,9 +19,9 @@ from spherloc.problem import Problem
 from spherloc.trace import Trace
 from spherloc_viz.layers.agreement import agreement, partner_arcs, unbounded
 from spherloc_viz.layers.explanation import WORST, explain
-from spherloc_viz.layers.match_rows import FILTERS, SORTS, match_rows, order
-from spherloc_viz.layers.selection_traits import MOST, explain_many
-from spherloc_viz.layers.verdicts import run_bounds, verdicts
+from spherloc_viz.layers.matches import FILTERS, SORTS, match_rows, order
+from spherloc_viz.layers.residuals import run_bounds, verdicts
+from spherloc_viz.layers.selection import MOST, explain_many
 
 SceneOf = Callable[..., SyntheticScene]
 
@@ -264,7 +264,7 @@ def test_rows_filter_and_sort(trace: Trace) -> None:
 
 
 def test_many_inliers_are_sampled(scene_of: SceneOf, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("spherloc_viz.layers.match_rows.MOST_PAIRS", 100)
+    monkeypatch.setattr("spherloc_viz.layers.matches.MOST_PAIRS", 100)
     trace = estimate(scene_of("mei", correspondences=60, outlier_rate=0.2).problem(), "ransac-2p")
     rows = match_rows(trace)
     assert rows.partners == 16 < trace.inlier_mask.sum() and rows.agree.max() <= 16

@@ -26,14 +26,14 @@ from spherloc_viz.layers import paint, steps
 from spherloc_viz.layers.key_step import key_step
 from spherloc_viz.layers.primitives import Balls, Label, Mesh, Points, Segments, Stop, Textured
 from spherloc_viz.recording.content import data
-from spherloc_viz.recording.content.chart_bars import LEVEL_OPACITY
+from spherloc_viz.recording.content.components import LEVEL_OPACITY
 from spherloc_viz.recording.content.drawing import WORDS
-from spherloc_viz.recording.content.letters import legible
 from spherloc_viz.recording.content.properties import APPLICATION_ID, FORMAT_VERSION
 from spherloc_viz.recording.content.reader import check_recording, read_recording
+from spherloc_viz.recording.content.text import legible
 from spherloc_viz.recording.content.writer import recorded_steps, write_recording
-from spherloc_viz.recording.storage.machine import machine
-from spherloc_viz.recording.viewing.rerun_program import rerun_command, rerun_environment
+from spherloc_viz.recording.origin import machine
+from spherloc_viz.recording.rerun_program import rerun_command, rerun_environment
 from tests.needs import needs
 from tests.waiting import LIMIT_S
 

@@ -17,8 +17,7 @@ from spherloc.errors import RecordingError
 from spherloc_viz.recording.index.refresh import examine_side_by_side
 from spherloc_viz.recording.index.run_index import RunIndex
 from spherloc_viz.recording.sandbox import examiner as strangers
-from spherloc_viz.recording.sandbox.child_process import ExaminerError
-from spherloc_viz.recording.sandbox.examiner import Examiner
+from spherloc_viz.recording.sandbox.examiner import Examiner, ExaminerError
 from spherloc_viz.recording.storage.recorder import Recorder
 from tests.waiting import LIMIT_S, until
 

@@ -22,13 +22,11 @@ from spherloc_viz.recording.content.reader import read_recording, read_run_row
 from spherloc_viz.recording.content.writer import write_recording
 from spherloc_viz.recording.index.query import RunQuery
 from spherloc_viz.recording.replay.repeat import compare
-from spherloc_viz.recording.review.notes import write_review
-from spherloc_viz.recording.sandbox.child_process import ExaminerError
-from spherloc_viz.recording.sandbox.examiner import Examiner
-from spherloc_viz.recording.storage.leftovers import STALE_AFTER_S, here, leftovers, unfinished
+from spherloc_viz.recording.reviews import write_review
+from spherloc_viz.recording.sandbox.examiner import Examiner, ExaminerError
 from spherloc_viz.recording.storage.recorder import Recorder
-from spherloc_viz.recording.storage.rescue import Rescued, rescue
 from spherloc_viz.recording.storage.store import RecordingStore
+from spherloc_viz.recording.storage.unfinished import STALE_AFTER_S, Rescued, here, leftovers, rescue, unfinished
 from tests.needs import needs
 from tests.waiting import LIMIT_S, until
 
@@ -78,7 +76,7 @@ def recorded(trace: Trace, tmp_path_factory: pytest.TempPathFactory) -> bytes:
 @pytest.fixture(scope="module")
 def dead() -> str:
     """How names of unfinished files tell of a process of this machine that has ended."""
-    lines = ("import pathlib", "from spherloc_viz.recording.storage.leftovers import unfinished")
+    lines = ("import pathlib", "from spherloc_viz.recording.storage.unfinished import unfinished")
     code = "\n".join((*lines, "print(unfinished(pathlib.Path('a')))"))
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     return done.stdout.strip().removeprefix("a.").rpartition("-")[0]

@@ -20,17 +20,14 @@ from spherloc.problem import Problem
 from spherloc.trace import RansacStage, Trace
 from spherloc_viz import style
 from spherloc_viz.layers import paint, steps
-from spherloc_viz.layers.key_step import key_step
-from spherloc_viz.layers.step_numbers import step_pose
-from spherloc_viz.recording.content.data import MAX_SCENE_BYTES, scene_text
-from spherloc_viz.recording.content.numbers import NUMBERS
+from spherloc_viz.layers.key_step import key_step, step_pose
+from spherloc_viz.recording.content.data import MAX_SCENE_BYTES, NUMBERS, scene_text
+from spherloc_viz.recording.content.pictures import HEIGHT_PX, LONGEST_PX, MATCHES, WIDTH_PX, thumbnail
 from spherloc_viz.recording.content.properties import MOST_CHARACTERS, problem_key
-from spherloc_viz.recording.content.query_image import LONGEST_PX, MATCHES
 from spherloc_viz.recording.content.reader import read_recording, read_run_row
-from spherloc_viz.recording.content.thumbnail import HEIGHT_PX, WIDTH_PX, thumbnail
 from spherloc_viz.recording.content.writer import recorded_steps, write_recording
 from spherloc_viz.recording.origin import Origin
-from spherloc_viz.recording.review.notes import write_review
+from spherloc_viz.recording.reviews import write_review
 from tests.needs import needs
 
 FORMAT_1, FORMAT_2 = (Path(__file__).parent / "data" / f"format_{version}.rrd" for version in (1, 2))

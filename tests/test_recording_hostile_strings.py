@@ -17,19 +17,17 @@ from rerun.chunk import RrdReader
 from run_rows import some_row
 
 from spherloc.estimators import estimate
-from spherloc_viz.app.review.bundle import bundle
-from spherloc_viz.app.review.differences import comparison_html
-from spherloc_viz.app.review.filters import Counts, filters_html
-from spherloc_viz.app.review.look import Look
+from spherloc_viz.app.review.card import comparison_html
+from spherloc_viz.app.review.export import bundle, summary_html
+from spherloc_viz.app.review.filters import Counts, Look, filters_html
 from spherloc_viz.app.review.rows import rows_html
-from spherloc_viz.app.review.summary_page import summary_html
-from spherloc_viz.app.web.viewer_page import sorry_page, viewer_page
+from spherloc_viz.app.web.viewer import sorry_page, viewer_page
 from spherloc_viz.recording.content.writer import write_recording
 from spherloc_viz.recording.index.query import RunQuery
 from spherloc_viz.recording.index.run_index import RunIndex
 from spherloc_viz.recording.index.run_text import counts_text, rows_text
 from spherloc_viz.recording.origin import Origin
-from spherloc_viz.recording.review.notes import review_path, write_review
+from spherloc_viz.recording.reviews import review_path, write_review
 from spherloc_viz.recording.run_row import RunRow
 from spherloc_viz.recording.sandbox.examiner import examine
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from spherloc.errors import RecordingError
-from spherloc_viz.recording.review.notes import review_path, reviewed_name
+from spherloc_viz.recording.reviews import review_path, reviewed_name
 from spherloc_viz.recording.sandbox.examiner import check_name, resolve_inside
 
 

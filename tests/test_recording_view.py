@@ -17,12 +17,12 @@ from rerun.experimental import ViewerClient
 
 from spherloc.errors import InputError, RecordingError
 from spherloc.estimators import estimate
-from spherloc_viz.app.web.viewer_server import serve_recording
+from spherloc_viz.app.web.viewer import serve_recording
 from spherloc_viz.recording.content.writer import write_recording
-from spherloc_viz.recording.review.notes import review_path, write_review
+from spherloc_viz.recording.rerun_program import rerun_command, rerun_environment
+from spherloc_viz.recording.reviews import review_path, write_review
 from spherloc_viz.recording.run_row import RunRow
-from spherloc_viz.recording.viewing.rerun_program import rerun_command, rerun_environment
-from spherloc_viz.recording.viewing.view import labels_of, stand_at, view_in_window
+from spherloc_viz.recording.viewer import labels_of, stand_at, view_in_window
 from tests.needs import needs, vulkan
 from tests.waiting import LIMIT_S
 

@@ -20,9 +20,15 @@ from spherloc_viz.recording.content.reader import RecordedRun, read_recording
 from spherloc_viz.recording.content.writer import write_recording
 from spherloc_viz.recording.origin import Origin
 from spherloc_viz.recording.replay import repeat as repeating
-from spherloc_viz.recording.replay.repeat import compare, other_versions, repeat
-from spherloc_viz.recording.replay.repeat_text import as_record, as_text, repeat_all
-from spherloc_viz.recording.replay.same import different_fields
+from spherloc_viz.recording.replay.repeat import (
+    as_record,
+    as_text,
+    compare,
+    different_fields,
+    other_versions,
+    repeat,
+    repeat_all,
+)
 from spherloc_viz.recording.replay.scene import load_recorded_scene, missing_options, recorded_options
 from spherloc_viz.share import as_command, as_python
 

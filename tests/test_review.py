@@ -9,7 +9,7 @@ from rerun.chunk import RrdReader
 
 from spherloc.errors import InputError, RecordingError
 from spherloc_viz.recording.content.properties import APPLICATION_ID
-from spherloc_viz.recording.review.notes import (
+from spherloc_viz.recording.reviews import (
     MOST_BYTES,
     MOST_LABEL_CHARACTERS,
     MOST_LABELS,

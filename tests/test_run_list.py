@@ -15,12 +15,12 @@ from run_rows import random_row, some_row
 from spherloc.errors import InputError
 from spherloc.estimators import default_options, estimate
 from spherloc_viz.recording.content.writer import write_recording
-from spherloc_viz.recording.index.catalog import find_steps
 from spherloc_viz.recording.index.query import RunQuery
 from spherloc_viz.recording.index.run_index import RunIndex
 from spherloc_viz.recording.index.run_text import FORMS, WIDTH, counts_text, rows_text
+from spherloc_viz.recording.index.steps import find_steps
 from spherloc_viz.recording.origin import Origin
-from spherloc_viz.recording.review.notes import Review, read_review, write_review
+from spherloc_viz.recording.reviews import Review, read_review, write_review
 from spherloc_viz.recording.run_row import RunRow
 from spherloc_viz.recording_commands import label, reindex, runs, steps
 from spherloc_viz.runs import diagnosis_of, sort_key

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from spherloc.errors import InputError
 from spherloc_viz.recording.index.query import MAX_TEXT, Range, RunQuery, parse_range, parse_when
-from spherloc_viz.recording.index.step_condition import COLUMNS, WORDS, checked_condition
+from spherloc_viz.recording.index.steps import COLUMNS, WORDS, checked_condition
 
 NOW = datetime(2026, 3, 1, 12, 0, tzinfo=UTC)
 

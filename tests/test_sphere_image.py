@@ -15,8 +15,7 @@ from spherloc.datasets import load_scene
 from spherloc.datasets.synthetic import SyntheticScene
 from spherloc.geometry import so3_exp
 from spherloc.problem import Problem
-from spherloc_viz.layers.photograph import MOST_PIXELS, photograph
-from spherloc_viz.layers.sphere_image import DIM, PANORAMA, UNSEEN, sphere_texture
+from spherloc_viz.layers.query_image import DIM, MOST_PIXELS, PANORAMA, UNSEEN, photograph, sphere_texture
 
 BLOB_PX = 8
 

@@ -14,11 +14,10 @@ import pytest
 from cli_process import spherloc_here
 
 from spherloc.errors import InputError
-from spherloc.experiments.sweep_rows import SweepRow
-from spherloc.experiments.sweep_summary import point_of
+from spherloc.experiments.sweep_rows import SweepRow, point_of
 from spherloc_viz.layers.sweep import LIMIT, sweep_charts, sweep_colors, sweep_table
+from spherloc_viz.plots import sweep_png
 from spherloc_viz.sweep import parse_entrant, sweep
-from spherloc_viz.sweep_plot import sweep_png
 from tests.tiny_scene import write_tiny_scene
 from tests.waiting import LIMIT_S
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from spherloc.experiments.rows import FAILED, LOCALIZED, QueryResult
+from spherloc.experiments.results import FAILED, LOCALIZED, QueryResult
 from spherloc.geometry import align_to_down, pose
 from spherloc_viz import style
 from spherloc_viz.layers.primitives import Points, Segments

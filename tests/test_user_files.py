@@ -16,15 +16,14 @@ from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.cameras.kalibr import read_kalibr_chain
 from spherloc.datasets import load_scene
 from spherloc.datasets.correspondences import read_csv
-from spherloc.datasets.loaders import scene_kinds
-from spherloc.datasets.matterport360 import read_pose
+from spherloc.datasets.matterport360 import read_dpt, read_pose
 from spherloc.datasets.posed_images import read_depth
+from spherloc.datasets.scene_file import scene_kinds
 from spherloc.errors import MOST_UNBROKEN, CalibrationError, InputError, SpherlocError, legible, show
 from spherloc.experiments.configuration import read_configuration
 from spherloc.experiments.results import read_results
 from spherloc.formats import kitti360_files, newer_college_files
 from spherloc.formats.colmap_model import read_model
-from spherloc.formats.dpt import read_dpt
 from spherloc.formats.hloc_files import open_hdf5, read_pairs, read_queries
 from spherloc.formats.hloc_files import read_results as read_hloc_results
 from spherloc.formats.kapture_files import read_kapture

@@ -4,7 +4,7 @@ import time
 
 import numba
 
-from spherloc.working_time import working_s
+from spherloc.watch import working_s
 
 
 def stood_still_s() -> float:

@@ -179,7 +179,7 @@ def _write_matterport(folder: Path) -> None:
 
 
 def _read_matterport(folder: Path, damaged: Path) -> object:
-    from spherloc.formats.dpt import read_dpt
+    from spherloc.datasets.matterport360 import read_dpt
 
     return read_dpt(damaged) if damaged.suffix == ".dpt" else _load(folder, damaged)
 
@@ -247,7 +247,7 @@ def _write_recordings(folder: Path) -> None:
     from spherloc.datasets import bundled_scenes, load_scene
     from spherloc.estimators import estimate
     from spherloc_viz.recording.content.writer import write_recording
-    from spherloc_viz.recording.review.notes import write_review
+    from spherloc_viz.recording.reviews import write_review
 
     problem = load_scene(bundled_scenes()["mei_outliers_80"]).problem()
     for estimator in ("mc", "mc-exact", "ransac-2p"):
@@ -258,7 +258,7 @@ def _write_recordings(folder: Path) -> None:
 def _read_recording(folder: Path, damaged: Path) -> object:
     from spherloc_viz.recording.content.reader import read_recording
     from spherloc_viz.recording.sandbox.examiner import examine
-    from spherloc_viz.recording.viewing.view import labels_of
+    from spherloc_viz.recording.viewer import labels_of
 
     row = examine(damaged)
     labels_of(damaged, row.run_id)

@@ -13,7 +13,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from spherloc.cameras import _checks, _unified
+from spherloc.cameras import _checks, eucm
 from spherloc.cameras._radial import RIM_MARGIN
 from spherloc.errors import CalibrationError
 from spherloc.types import BoolArray, FloatArray
@@ -51,7 +51,7 @@ class DoubleSphere:
         object.__setattr__(self, "xi", _checks.finite("xi", self.xi))
         if not -1.0 < self.xi <= _LARGEST_XI:
             raise CalibrationError(f"camera key 'xi' is {self.xi:g}: give a number above -1 and up to {_LARGEST_XI:g}.")
-        object.__setattr__(self, "alpha", _unified.alpha_of(self.alpha))
+        object.__setattr__(self, "alpha", eucm.alpha_of(self.alpha))
         _checks.check_focal(self)
         with np.errstate(all="ignore"):
             keys = f"camera keys 'xi', 'alpha' are {self.xi:g}, {self.alpha:g}"
@@ -60,7 +60,7 @@ class DoubleSphere:
     @cached_property
     def max_radius(self) -> float:
         """Distance from the principal point, in focal lengths, below which the model is one to one."""
-        second = _unified.max_radius(self.alpha, 1.0)
+        second = eucm.max_radius(self.alpha, 1.0)
         if self.xi < _TOUCHES:
             return second
         # At the end of the first sphere the moved ray has the sine 1 / xi, and it looks sideways where xi is 1.
@@ -77,7 +77,7 @@ class DoubleSphere:
         x, y, z = _checks.rows("points", points, 3).T
         with np.errstate(all="ignore"):
             norm = np.hypot(np.hypot(x, y), z)
-            mx, my, valid = _unified.plane_points(x, y, z + self.xi * norm, self.alpha, 1.0)
+            mx, my, valid = eucm.plane_points(x, y, z + self.xi * norm, self.alpha, 1.0)
             valid &= (norm + self.xi * z > 0.0) & (norm < np.inf) & (np.hypot(mx, my) < self.max_radius)
             pixels = np.column_stack([self.cx + self.fx * mx, self.cy + self.fy * my])
         pixels[~valid] = np.nan
@@ -89,7 +89,7 @@ class DoubleSphere:
         Raises ``ProblemError`` for a wrong shape.
         """
         mx, my = _checks.plane(self, pixels, self.max_radius)
-        moved = _unified.rays(mx, my, self.alpha, 1.0)
+        moved = eucm.rays(mx, my, self.alpha, 1.0)
         root, reach = self._first_sphere(moved)
         z = moved[:, 2] * root - self.xi * (moved[:, 0] ** 2 + moved[:, 1] ** 2)
         return np.column_stack([reach * moved[:, 0], reach * moved[:, 1], z]), ~np.isnan(mx)
@@ -97,8 +97,8 @@ class DoubleSphere:
     def unprojection_jacobian(self, pixels: FloatArray) -> FloatArray:
         """d bearing / d pixel (N, 3, 2), per pixel; NaN where ``unproject`` is invalid."""
         mx, my = _checks.plane(self, pixels, self.max_radius)
-        moved = _unified.rays(mx, my, self.alpha, 1.0)
-        jacobian = _unified.rays_jacobian(mx, my, self.alpha, 1.0) / (self.fx, self.fy)
+        moved = eucm.rays(mx, my, self.alpha, 1.0)
+        jacobian = eucm.rays_jacobian(mx, my, self.alpha, 1.0) / (self.fx, self.fy)
         root, reach = self._first_sphere(moved)
         # d reach = xi reach / root dz, where dz is that of the moved ray
         longer = (self.xi / root)[:, None, None] * moved[:, :, None] * jacobian[:, None, 2, :]

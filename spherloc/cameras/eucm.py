@@ -5,12 +5,70 @@ The formulas and the limits are as in Usenko, Demmel, Cremers (3DV 2018). COLMAP
 
 from dataclasses import dataclass
 from functools import cached_property
+from math import inf, sqrt
 from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from spherloc.cameras import _checks, _unified
+from spherloc.cameras import _checks
+from spherloc.cameras._radial import RIM_MARGIN
+from spherloc.errors import CalibrationError
 from spherloc.types import BoolArray, FloatArray
+
+_FARTHEST = 1e3
+"""Largest ``max_radius``: no image is a thousand focal lengths wide."""
+
+
+def alpha_of(value: object) -> float:
+    """The checked key ``alpha``; raises ``CalibrationError`` unless it is a number from 0 to 1."""
+    alpha = _checks.finite("alpha", value)
+    if not 0.0 <= alpha <= 1.0:
+        raise CalibrationError(f"camera key 'alpha' is {alpha:g}: give a number from 0 to 1.")
+    return alpha
+
+
+def max_radius(alpha: float, beta: float) -> float:
+    """Radius in the plane below which the projection is one to one."""
+    curvature = beta * (2.0 * alpha - 1.0)
+    return min(1.0 / sqrt(curvature) if curvature > 0.0 else inf, _FARTHEST) * (1.0 - RIM_MARGIN)
+
+
+def plane_points(
+    x: FloatArray, y: FloatArray, z: FloatArray, alpha: float, beta: float
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Plane coordinates of rays, each (N,), and the mask (N,) of rays before the fold and before infinity."""
+    d = np.hypot(sqrt(beta) * np.hypot(x, y), z)
+    denominator = alpha * d + (1.0 - alpha) * z
+    steepest = min(alpha, 1.0 - alpha) / max(alpha, 1.0 - alpha)
+    return x / denominator, y / denominator, (denominator > 0.0) & (z > -steepest * d)
+
+
+def rays(x: FloatArray, y: FloatArray, alpha: float, beta: float) -> FloatArray:
+    """Unit rays (N, 3) through the plane points x, y, each (N,); NaN beyond the fold."""
+    z, _ = _depth(x, y, alpha, beta)
+    length = np.hypot(np.hypot(x, y), z)
+    return np.column_stack([x / length, y / length, z / length])
+
+
+def rays_jacobian(x: FloatArray, y: FloatArray, alpha: float, beta: float) -> FloatArray:
+    """d ray / d (x, y), (N, 3, 2)."""
+    z, slope = _depth(x, y, alpha, beta)
+    length = np.hypot(np.hypot(x, y), z)
+    ray = np.column_stack([x, y, z]) / length[:, None]
+    moved = np.zeros((len(x), 3, 2))
+    moved[:, 0, 0] = moved[:, 1, 1] = 1.0
+    moved[:, 2, 0], moved[:, 2, 1] = 2.0 * slope * x, 2.0 * slope * y
+    moved /= length[:, None, None]
+    return moved - ray[:, :, None] * np.einsum("nk,nkc->nc", ray, moved)[:, None, :]
+
+
+def _depth(x: FloatArray, y: FloatArray, alpha: float, beta: float) -> tuple[FloatArray, FloatArray]:
+    """z of the ray (x, y, z) through a plane point, and its derivative by x^2 + y^2, each (N,)."""
+    s = beta * (x * x + y * y)
+    root = np.sqrt(1.0 - (2.0 * alpha - 1.0) * s)
+    below = alpha * root + 1.0 - alpha
+    z = (1.0 - alpha * alpha * s) / below
+    return z, beta * (0.5 * z * alpha * (2.0 * alpha - 1.0) / root - alpha * alpha) / below
 
 
 @dataclass(frozen=True)
@@ -37,7 +95,7 @@ class Eucm:
     """Squared ratio of the ellipsoid's axes, above 0; 1 is a sphere."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "alpha", _unified.alpha_of(self.alpha))
+        object.__setattr__(self, "alpha", alpha_of(self.alpha))
         object.__setattr__(self, "beta", _checks.positive("beta", self.beta))
         _checks.check_focal(self)
         with np.errstate(all="ignore"):
@@ -47,7 +105,7 @@ class Eucm:
     @cached_property
     def max_radius(self) -> float:
         """Distance from the principal point, in focal lengths, below which the model is one to one."""
-        return _unified.max_radius(self.alpha, self.beta)
+        return max_radius(self.alpha, self.beta)
 
     def project(self, points: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Pixels (N, 2) of camera-frame points (N, 3) in metres, and the mask (N,) of directions that are valid.
@@ -57,7 +115,7 @@ class Eucm:
         """
         x, y, z = _checks.rows("points", points, 3).T
         with np.errstate(all="ignore"):
-            mx, my, valid = _unified.plane_points(x, y, z, self.alpha, self.beta)
+            mx, my, valid = plane_points(x, y, z, self.alpha, self.beta)
             valid &= (np.hypot(mx, my) < self.max_radius) & np.isfinite(z)
             pixels = np.column_stack([self.cx + self.fx * mx, self.cy + self.fy * my])
         pixels[~valid] = np.nan
@@ -69,12 +127,12 @@ class Eucm:
         Raises ``ProblemError`` for a wrong shape.
         """
         mx, my = _checks.plane(self, pixels, self.max_radius)
-        return _unified.rays(mx, my, self.alpha, self.beta), ~np.isnan(mx)
+        return rays(mx, my, self.alpha, self.beta), ~np.isnan(mx)
 
     def unprojection_jacobian(self, pixels: FloatArray) -> FloatArray:
         """d bearing / d pixel (N, 3, 2), per pixel; NaN where ``unproject`` is invalid."""
         mx, my = _checks.plane(self, pixels, self.max_radius)
-        return _unified.rays_jacobian(mx, my, self.alpha, self.beta) / (self.fx, self.fy)
+        return rays_jacobian(mx, my, self.alpha, self.beta) / (self.fx, self.fy)
 
     def to_dict(self) -> dict[str, Any]:
         """The ``[camera]`` table: model, width, height, fx, fy, cx, cy, alpha, beta."""

@@ -15,8 +15,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from spherloc.cameras import _checks
-from spherloc.cameras._angle_curve import AngleCurve
-from spherloc.cameras._radial import first_positive_root
+from spherloc.cameras._radial import AngleCurve, first_positive_root
 from spherloc.types import BoolArray, FloatArray
 
 _FARTHEST = 1e3

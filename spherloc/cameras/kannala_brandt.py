@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from spherloc.cameras import _checks
-from spherloc.cameras._angle_curve import AngleCurve
+from spherloc.cameras._radial import AngleCurve
 from spherloc.types import BoolArray, FloatArray
 
 

@@ -24,8 +24,7 @@ from spherloc.consensus.yaw_bins import BIN_TURN, BINS, degree_bounds, sort_into
 from spherloc.geometry import yaw_rotation
 from spherloc.problem import AlignedProblem
 from spherloc.types import BoolArray, FloatArray, IndexArray
-from spherloc.watch import Watch
-from spherloc.working_time import working_s
+from spherloc.watch import Watch, working_s
 
 DOUBTFUL = 1e-6
 """Expected number of false alarms (NFA) of the size of the guess above which better guesses are looked for."""

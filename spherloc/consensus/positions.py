@@ -37,8 +37,7 @@ from spherloc.consensus.stabbing import scratch_for
 from spherloc.consensus.yaw_bins import BINS
 from spherloc.problem import AlignedProblem
 from spherloc.types import FloatArray
-from spherloc.watch import DONE, Watch
-from spherloc.working_time import working_s
+from spherloc.watch import DONE, Watch, working_s
 
 SWITCH_RAD = 0.06
 """Mean movement of directions in a box below which it is searched with derivatives."""

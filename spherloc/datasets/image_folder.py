@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Any
 
 from spherloc.cameras.base import Camera
-from spherloc.datasets import map_settings, scene_file
-from spherloc.datasets.colmap_views import gravity_of_map, model_views, some, split_gravity, unit_vector
+from spherloc.datasets import map_scene, scene_file
+from spherloc.datasets.colmap import gravity_of_map, model_views, some, split_gravity, unit_vector
 from spherloc.datasets.map_scene import MapScene
 from spherloc.datasets.posed_images import read_camera, read_pose, read_references
 from spherloc.errors import InputError, show
@@ -58,10 +58,10 @@ def load(table: dict[str, Any], path: Path) -> MapScene:
     Raises ``InputError`` for a wrong key or value, a missing file, or a map that cannot be read.
     """
     where = str(path)
-    scene_file.check_keys(table, map_settings.REQUIRED | {"images"}, map_settings.OPTIONAL | _OPTIONAL, where)
+    scene_file.check_keys(table, map_scene.REQUIRED | {"images"}, map_scene.OPTIONAL | _OPTIONAL, where)
     shared_gravity, gravity = split_gravity(table, where)
     bound_deg = 0.0 if "camera" in gravity else GRAVITY_BOUND_DEG
-    settings = map_settings.read_settings(table | {"gravity": shared_gravity}, where, bound_deg)
+    settings = map_scene.read_settings(table | {"gravity": shared_gravity}, where, bound_deg)
     camera = read_camera(table, path, where)
     if camera is None:
         raise InputError(f"{where}: the query images have no camera; add 'calibration' or a section [camera].")
@@ -79,8 +79,8 @@ def _references(table: dict[str, Any], camera: Camera, path: Path) -> tuple[tupl
         return posed.views, list(posed.remarks)
     section = scene_file.section(table, "map", str(path))
     scene_file.check_keys(section, {"model", "images"}, set(), f"{path} [map]")
-    images = map_settings.folder(section, "images", path)
-    views, remarks = model_views(read_model(map_settings.folder(section, "model", path)), images)
+    images = map_scene.folder(section, "images", path)
+    views, remarks = model_views(read_model(map_scene.folder(section, "model", path)), images)
     return tuple(views), remarks
 
 
@@ -109,7 +109,7 @@ def _names(table: dict[str, Any], path: Path) -> tuple[Path, list[str]]:
         if not value or not all(isinstance(name, str) and name and "\0" not in name for name in value):
             raise InputError(f"{path}: images is {show(value)}; give a folder or a list of files.")
         return path.parent, value
-    root = map_settings.folder(table, "images", path)
+    root = map_scene.folder(table, "images", path)
     names = [name for name in names_in(root) if Path(name).suffix.lower() in _SUFFIXES]
     if not names:
         raise InputError(f"{path}: the folder {root} has no images ({', '.join(sorted(_SUFFIXES))}); correct 'images'.")

@@ -14,13 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from spherloc.datasets import map_settings, scene_file
-from spherloc.datasets.colmap_views import gravity_of_map, some, split_gravity
+from spherloc.datasets import map_scene, scene_file
+from spherloc.datasets.colmap import gravity_of_map, some, split_gravity
 from spherloc.datasets.map_scene import MapScene
 from spherloc.errors import InputError, show
 from spherloc.files import is_file
 from spherloc.formats.kapture_files import Kapture, Record, read_kapture
-from spherloc.frontend.frontend_options import FrontendOptions, frontend_options
+from spherloc.frontend.pipeline import FrontendOptions, frontend_options
 from spherloc.frontend.triangulation import TriangulationLift
 from spherloc.frontend.view import View
 from spherloc.geometry import camera_centre
@@ -63,12 +63,12 @@ def load(table: dict[str, Any], path: Path) -> MapScene:
     Raises ``InputError`` for a missing file, a wrong line in one, or a wrong key.
     """
     where = str(path)
-    required = map_settings.REQUIRED | {"root", "queries"}
-    scene_file.check_keys(table, required, map_settings.OPTIONAL | {"references"}, where)
+    required = map_scene.REQUIRED | {"root", "queries"}
+    scene_file.check_keys(table, required, map_scene.OPTIONAL | {"references"}, where)
     shared_gravity, gravity = split_gravity(table, where)
     scene_file.check_keys(gravity, set(), {"map"}, f"{where} [gravity]")
-    settings = map_settings.read_settings(table | {"gravity": shared_gravity}, where, GRAVITY_BOUND_DEG)
-    root = map_settings.folder(table, "root", path)
+    settings = map_scene.read_settings(table | {"gravity": shared_gravity}, where, GRAVITY_BOUND_DEG)
+    root = map_scene.folder(table, "root", path)
     kapture = read_kapture(root, where)
     records, remarks = _usable(kapture, root)
     queries = _selected(records, table, "queries", where)

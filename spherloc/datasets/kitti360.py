@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from spherloc.datasets import scene_file
-from spherloc.datasets.map_scene import MapScene
-from spherloc.datasets.map_settings import OPTIONAL, REQUIRED, folder, read_settings
+from spherloc.datasets.map_scene import OPTIONAL, REQUIRED, MapScene, folder, read_settings
 from spherloc.errors import InputError, show
 from spherloc.files import is_file
 from spherloc.formats.kitti360_files import (
@@ -29,7 +28,7 @@ from spherloc.formats.kitti360_files import (
     unwrapped,
     without_car,
 )
-from spherloc.formats.layout import needed_file
+from spherloc.formats.text_rows import needed_file
 from spherloc.frontend.lifting import PointCloudLift
 from spherloc.frontend.view import View
 from spherloc.geometry import pose, transform

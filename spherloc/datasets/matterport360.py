@@ -5,26 +5,59 @@ Layout (researchdata.bath.ac.uk/1126): a folder a building, and in it ``<id>_rgb
 """
 
 import fnmatch
+import os
+import struct
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from spherloc.cameras.equirectangular import Equirectangular
-from spherloc.datasets import map_settings, scene_file
+from spherloc.datasets import map_scene, scene_file
 from spherloc.datasets.map_scene import MapScene
 from spherloc.datasets.registration import DepthRegistration
 from spherloc.errors import InputError, shorten, show
-from spherloc.files import is_file, names_in, read_file, reading
-from spherloc.formats.dpt import read_dpt
+from spherloc.files import is_file, names_in, open_file, read_file, reading
 from spherloc.frontend.lifting import DepthLift
 from spherloc.frontend.view import Lift, View
 from spherloc.geometry import pose
-from spherloc.images import read_size
+from spherloc.images import MAX_PIXELS, read_size
 from spherloc.trajectory import rotation_from_wxyz
 from spherloc.types import FloatArray
+
+TAG = 202021.25
+HEADER = struct.Struct("<fii")
+
+
+def read_dpt(path: Path) -> NDArray[np.float32]:
+    """Depth (H, W), metres, as it is stored: what is not positive and finite is no depth.
+
+    Layout: float32 tag 202021.25, int32 width, int32 height, then float32 row by row, all little endian. Raises
+    ``InputError`` for a missing file, another tag, or a size that does not fit the file's.
+    """
+    with reading(path, "the panorama beside it needs this depth map"), open_file(path) as file:
+        header = file.read(HEADER.size)
+        if len(header) < HEADER.size:
+            raise InputError(f"{path}: is only {len(header)} bytes long; replace this depth map.")
+        tag, width, height = HEADER.unpack(header)
+        if tag != TAG:
+            hint = "; its byte order is reversed" if struct.unpack(">f", header[:4])[0] == TAG else ""
+            raise InputError(f"{path}: does not begin with the tag {TAG}{hint}; give a .dpt depth map.")
+        count = width * height
+        if width < 1 or height < 1 or count > MAX_PIXELS:
+            raise InputError(f"{path}: claims {width} x {height} pixels; replace this depth map.")
+        length = os.fstat(file.fileno()).st_size - HEADER.size
+        if length != 4 * count:
+            raise InputError(
+                f"{path}: {length:,} bytes follow its header, but {width} x {height} pixels take {4 * count:,}; "
+                "replace this depth map."
+            )
+        content = file.read(4 * count)
+    return np.frombuffer(content, "<f4").reshape(height, width)
+
 
 GRAVITY_MAP = (0.0, 0.0, -1.0)
 GRAVITY_BOUND_DEG = 2.0
@@ -53,9 +86,9 @@ def load(table: dict[str, Any], path: Path) -> MapScene:
     """
     where = str(path)
     own = {"root", "queries"}
-    scene_file.check_keys(table, map_settings.REQUIRED | own, map_settings.OPTIONAL | {"depth", "trust_poses"}, where)
-    settings = map_settings.read_settings(table, where, GRAVITY_BOUND_DEG)
-    root = map_settings.folder(table, "root", path)
+    scene_file.check_keys(table, map_scene.REQUIRED | own, map_scene.OPTIONAL | {"depth", "trust_poses"}, where)
+    settings = map_scene.read_settings(table, where, GRAVITY_BOUND_DEG)
+    root = map_scene.folder(table, "root", path)
     along = table.get("depth", "ray")
     if along not in ("ray", "z"):
         raise InputError(f'{where}: depth is {show(along)}; give "ray" or "z".')

@@ -15,14 +15,13 @@ from spherloc.cameras.base import Camera
 from spherloc.cameras.kalibr import read_kalibr_chain
 from spherloc.datasets import scene_file
 from spherloc.datasets.imu import down_at, read_imu
-from spherloc.datasets.map_scene import MapScene
-from spherloc.datasets.map_settings import OPTIONAL, REQUIRED, folder, read_settings
+from spherloc.datasets.map_scene import OPTIONAL, REQUIRED, MapScene, folder, read_settings
 from spherloc.datasets.similarity import Similarity, align, similarity_of
 from spherloc.errors import InputError, show
 from spherloc.files import is_file, is_folder
 from spherloc.formats.colmap_model import ColmapImage, ColmapModel, read_model
-from spherloc.formats.layout import needed_file
 from spherloc.formats.newer_college_files import NAME_RULE, TimedImage, images_in, read_cloud, timestamp_of
+from spherloc.formats.text_rows import needed_file
 from spherloc.frontend.lifting import PointCloudLift, SfmLift
 from spherloc.frontend.view import Lift, View
 from spherloc.geometry import camera_centre, pose

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from spherloc.cameras.base import Camera
 from spherloc.cameras.calibration import camera_from_table
-from spherloc.datasets import map_settings, scene_file
+from spherloc.datasets import map_scene, scene_file
 from spherloc.datasets.map_scene import MapScene
 from spherloc.errors import InputError
 from spherloc.files import is_file
@@ -113,8 +113,8 @@ def load(table: dict[str, Any], path: Path) -> MapScene:
     Raises ``InputError`` for unknown or missing keys, an unknown world, or a value out of its limits.
     """
     where = str(path)
-    known = map_settings.REQUIRED | {"world", "provenance", "camera", "references", "queries"}
-    scene_file.check_keys(table, known, map_settings.OPTIONAL | {"seed"}, where)
+    known = map_scene.REQUIRED | {"world", "provenance", "camera", "references", "queries"}
+    scene_file.check_keys(table, known, map_scene.OPTIONAL | {"seed"}, where)
     scene_file.text(table, "provenance", where)
     seed = scene_file.integer(table, "seed", where, 0, 2**31 - 1) if "seed" in table else 0
     try:
@@ -125,7 +125,7 @@ def load(table: dict[str, Any], path: Path) -> MapScene:
     if camera.width * camera.height > MOST_PIXELS:
         raise InputError(f"{where} [camera]: more than {MOST_PIXELS:,} pixels take too long to draw; give fewer.")
     queries, tilt_deg = _queries(scene_file.section(table, "queries", where), f"{where} [queries]", world, camera)
-    settings = map_settings.read_settings(table, where, gravity_bound_deg=tilt_deg)
+    settings = map_scene.read_settings(table, where, gravity_bound_deg=tilt_deg)
     references = _references(scene_file.section(table, "references", where), f"{where} [references]", world, camera)
     return settings.scene(path, queries, references, GRAVITY_DOWN, mesh=world.glb)
 

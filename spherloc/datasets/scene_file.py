@@ -1,8 +1,11 @@
 """Scene files: small TOML documents whose ``kind`` names the dataset loader that reads them."""
 
+import importlib
+import inspect
 import math
 import tomllib
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -148,3 +151,42 @@ def gravity_error_rad(table: Mapping[str, Any], where: str) -> tuple[float, floa
     if "bound_deg" in table:
         return math.radians(number(table, "bound_deg", where, 0.0, 90.0)), sd_rad
     return (0.0 if sd_rad is None else 3.0 * sd_rad), sd_rad
+
+
+@dataclass(frozen=True)
+class SceneKind:
+    """One kind of scene file."""
+
+    name: str
+    """Value of the scene file's ``kind``."""
+    documentation: str
+    """Docstring of the loader's module; its first line says what it reads."""
+    extras: tuple[str, ...] = ()
+    """Extras of spherloc that bring the packages it needs: the module's ``EXTRAS``, if it has one."""
+    example: str = ""
+    """A scene file of this kind (TOML): the module's ``EXAMPLE``, if it has one."""
+    problem: str = ""
+    """Why the loader cannot be imported; empty if it can."""
+
+
+def scene_kinds() -> tuple[SceneKind, ...]:
+    """All registered kinds, in alphabetical order."""
+    return tuple(scene_kind(name) for name in registry.names("datasets"))
+
+
+def scene_kind(name: str) -> SceneKind:
+    """The kind of that name. Raises ``InputError`` naming the known ones if there is none."""
+    try:
+        loader = registry.lookup("datasets", name)
+        with registry.guarded("datasets", name):
+            module = importlib.import_module(loader.__module__)
+            return SceneKind(
+                name=name,
+                documentation=inspect.getdoc(module) or "",
+                extras=tuple(map(str, getattr(module, "EXTRAS", ()))),
+                example=str(getattr(module, "EXAMPLE", "")),
+            )
+    except InputError as error:
+        if name not in registry.names("datasets"):
+            raise
+        return SceneKind(name, "", problem=str(error))  # an extension that cannot be imported hides no other

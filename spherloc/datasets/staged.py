@@ -10,8 +10,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from spherloc.cameras.base import Camera
-from spherloc.datasets.failure_parts import CaseMaker, Cloud
-from spherloc.datasets.failures import PLACES
+from spherloc.datasets.failures import PLACES, CaseMaker, Cloud
 from spherloc.errors import InputError, show
 from spherloc.geometry import pose, yaw_rotation
 from spherloc.problem import Problem

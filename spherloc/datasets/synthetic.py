@@ -16,8 +16,18 @@ import numpy as np
 from spherloc.cameras.base import Camera
 from spherloc.cameras.calibration import camera_from_table
 from spherloc.datasets import scene_file
-from spherloc.datasets.outliers import OUTLIER_KINDS, OutlierKind, copies, random_pixels, random_poses, second_pose
-from spherloc.datasets.point_cloud import HALF_SIZE_M, WHOLE_SPHERE_DEG, Cloud, Lens
+from spherloc.datasets.point_cloud import (
+    HALF_SIZE_M,
+    OUTLIER_KINDS,
+    WHOLE_SPHERE_DEG,
+    Cloud,
+    Lens,
+    OutlierKind,
+    copies,
+    random_pixels,
+    random_poses,
+    second_pose,
+)
 from spherloc.errors import InputError, show
 from spherloc.geometry import DOWN, camera_centre, pose, so3_exp, transform, yaw_rotation
 from spherloc.problem import Problem

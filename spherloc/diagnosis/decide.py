@@ -3,8 +3,7 @@
 import numpy as np
 
 from spherloc.diagnosis.causes import Cause, Diagnosis
-from spherloc.diagnosis.evidence import Evidence, Truth, different, gather, gather_truth
-from spherloc.diagnosis.experiments import WIDER, Fit, certify
+from spherloc.diagnosis.evidence import WIDER, Evidence, Fit, Truth, certify, different, gather, gather_truth
 from spherloc.diagnosis.words import describe
 from spherloc.metrics import SUCCESS_DEG, SUCCESS_M
 from spherloc.trace import RansacStage, Trace

@@ -1,18 +1,172 @@
 """Measures what the diagnosis decides by; decides nothing. Poses are between the aligned frames."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
 from spherloc.bounds import Bounds, bounds_of
 from spherloc.consensus.chance import chance_rate, nfa
-from spherloc.diagnosis.experiments import WIDER, Fit, alternative, fit_of, free_fit, search, subset
-from spherloc.diagnosis.measures import apart, pose_sd
+from spherloc.consensus.two_point_search import search_two_point
+from spherloc.estimators.base import estimate
+from spherloc.estimators.mc_exact import McExactOptions
+from spherloc.gauss_newton import LEAST_GRAVITY_SD_RAD, tilt_of
+from spherloc.geometry import camera_centre, pose, rotation_angle, transform, yaw_rotation
 from spherloc.metrics import evaluate
 from spherloc.problem import AlignedProblem
-from spherloc.refine import RefinementOptions, refine
-from spherloc.trace import ConsensusStage, Trace
+from spherloc.refine import RefinementOptions, refine, residuals_px
+from spherloc.trace import Certificate, ConsensusStage, Trace
 from spherloc.types import BoolArray, FloatArray
+
+SINGULAR = 1e-12
+"""Information below this share of what each unknown has by itself is rounding."""
+
+
+def apart(one: FloatArray, other: FloatArray) -> tuple[float, float]:
+    """Angle (rad) and distance (m) between two poses (3, 4)."""
+    turn = rotation_angle(one[:, :3] @ other[:, :3].T)
+    return turn, float(np.linalg.norm(camera_centre(one) - camera_centre(other)))
+
+
+def pose_sd(
+    aligned: AlignedProblem,
+    cam_from_map: FloatArray,
+    mask: BoolArray,
+    noise_px: float,
+    gravity_sd_rad: float,
+    drop: int,
+) -> tuple[float, float, float]:
+    """Standard deviations of rotation (rad), position (m) and tilt (rad) in their worst directions.
+
+    They are those of the masked correspondences less the ``drop`` on which the position hangs most: where the others
+    leave a valley of poses open, some pose in it agrees with a wrong match too, which then seems to fix it.
+    """
+    each = _information(aligned, cam_from_map, mask) / noise_px**2
+    weight = max(gravity_sd_rad, LEAST_GRAVITY_SD_RAD) ** -2.0
+    information = each.sum(axis=0) + np.diag([weight, 0.0, weight, 0.0, 0.0, 0.0])
+    for _ in range(min(drop, len(each) - 3)):
+        spread = np.linalg.norm(_inverse(information - each)[:, 3:, 3:], ord=2, axis=(1, 2))
+        worst = int(np.argmax(spread))
+        information = information - each[worst]
+        each = np.delete(each, worst, axis=0)
+    covariance = _inverse(information)
+    return _worst(covariance[:3, :3]), _worst(covariance[3:, 3:]), _worst(covariance[0:3:2, 0:3:2])
+
+
+def _worst(covariance: FloatArray) -> float:
+    """Standard deviation in the direction in which it is largest."""
+    return float(np.sqrt(np.linalg.norm(covariance, ord=2)))
+
+
+def _information(aligned: AlignedProblem, cam_from_map: FloatArray, mask: BoolArray) -> FloatArray:
+    """What each masked correspondence says (K, 6, 6) of a turn and a shift of the camera, in its frame, at 1 px."""
+    rays, weights = transform(cam_from_map, aligned.points[mask]), aligned.pixel_from_bearing[mask]
+    length = np.linalg.norm(rays, axis=1)[:, None]
+    unit = rays / length
+    by_ray = (weights - np.einsum("nij,nj,nk->nik", weights, unit, unit)) / length[..., None]
+    # Columns e_x x ray, e_y x ray, e_z x ray.
+    by_turn = by_ray @ np.cross(np.eye(3)[None], rays[:, None, :]).transpose(0, 2, 1)
+    jacobian = np.concatenate([by_turn, -by_ray], axis=2)
+    return np.einsum("nij,nik->njk", jacobian, jacobian)
+
+
+def _inverse(information: FloatArray) -> FloatArray:
+    """Inverses of information matrices (..., 6, 6), large instead of infinite where something is undetermined."""
+    scale = 1.0 / np.sqrt(np.maximum(np.einsum("...ii->...i", information), SINGULAR))
+    scale = scale[..., :, None] * scale[..., None, :]
+    return np.linalg.inv(information * scale + SINGULAR * np.eye(6)) * scale
+
+
+SAMPLES = 20_000
+"""Most samples of a search: 99 % sure to draw two of 1.5 % right matches together. A confidence ends it earlier."""
+MOST_WORK = 20_000_000
+"""Samples times correspondences; above it the search draws fewer."""
+CONFIDENCE = 0.9999
+MOST_TILT_RAD = np.radians(12.0)
+"""Gravity errors up to this are looked for."""
+WIDER = 4.0
+"""A noise bound that is too small is looked for up to this many times as much."""
+MOST_CERTIFIED = 500
+"""Correspondences up to which a run without a certificate is given one."""
+EFFORT = 0.3
+"""Of an exact search: enough where a pose stands out, and little where many are alike."""
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A pose and what it explains."""
+
+    cam_from_map: FloatArray
+    """(3, 4)."""
+    errors_px: FloatArray
+    """(M,) reprojection errors."""
+
+    def support(self, bound_px: float) -> int:
+        """How many correspondences are within a bound."""
+        return int(np.count_nonzero(self.errors_px <= bound_px))
+
+    @property
+    def tilt_rad(self) -> float:
+        """Angle between the given gravity and the pose's."""
+        return float(tilt_of(self.cam_from_map))
+
+
+def fit_of(aligned: AlignedProblem, cam_from_map: FloatArray) -> Fit:
+    """A pose (3, 4) with its errors."""
+    return Fit(cam_from_map, residuals_px(aligned, cam_from_map))
+
+
+def search(aligned: AlignedProblem, bound_px: float, options: RefinementOptions) -> FloatArray | None:
+    """The pose (3, 4) that a long 2P-RANSAC finds, refined; None if no sample has a pose."""
+    bounds = bounds_of(aligned, bound_px)
+    samples = min(SAMPLES, MOST_WORK // len(aligned.points))
+    found = search_two_point(aligned, bounds.pixels, 0, samples, CONFIDENCE, local_optimization=True)
+    if not found.found:
+        return None
+    best = int(np.argmax(found.support))
+    start = pose(yaw_rotation(found.yaws_rad[best]), found.translations[best])
+    return refine(aligned, start, bounds, options)[0]
+
+
+def subset(aligned: AlignedProblem, mask: BoolArray) -> AlignedProblem:
+    """The masked correspondences alone."""
+    names = ("index", "bearings", "points", "pixel_from_bearing", "radians_per_pixel")
+    return replace(aligned, **{name: np.ascontiguousarray(getattr(aligned, name)[mask]) for name in names})
+
+
+def alternative(aligned: AlignedProblem, best: Fit, bound_px: float, options: RefinementOptions) -> Fit | None:
+    """The pose that explains most of what ``best`` is far from explaining, with its support among all."""
+    rest = best.errors_px > 3.0 * bound_px
+    if np.count_nonzero(rest) < 2:
+        return None
+    found = search(subset(aligned, rest), bound_px, options)
+    return None if found is None else fit_of(aligned, found)
+
+
+def certify(trace: Trace) -> Certificate | None:
+    """The run's certificate, or that of an exact search of its problem; None if that has too many correspondences."""
+    if trace.certificate is not None or len(trace.problem) > MOST_CERTIFIED:
+        return trace.certificate
+    given = {item.name: getattr(trace.options, item.name) for item in fields(RefinementOptions)}
+    options = McExactOptions(bound_px=trace.options.bound_px, effort=EFFORT, **given)
+    return estimate(trace.problem, "mc-exact", options).certificate
+
+
+def free_fit(aligned: AlignedProblem, starts: list[FloatArray], bound_px: float) -> Fit | None:
+    """The pose with the most support within ``WIDER`` times the bound where gravity is not believed.
+
+    From ``starts``, and from a search that allows for a wrong gravity and tightens its bound step by step.
+    """
+    free = replace(aligned, gravity_bound_rad=0.0, gravity_sd_rad=np.inf)
+    wide, options = WIDER * bound_px, RefinementOptions(gravity_sd_deg=np.inf)
+    steps = wide + float(np.median(aligned.pixels_per_radian)) * MOST_TILT_RAD * 0.5 ** np.arange(5)
+    loose = search(replace(aligned, gravity_bound_rad=MOST_TILT_RAD), wide, options)
+    fits = []
+    for start, levels in [(start, ()) for start in starts] + ([] if loose is None else [(loose, steps)]):
+        for level in (*levels, wide):
+            start = refine(free, start, bounds_of(free, float(level)), options)[0]
+        fits.append(fit_of(aligned, start))
+    return max(fits, key=lambda fit: fit.support(wide), default=None)
+
 
 LOOSE_ENDS = 2
 """Matches that may agree by chance with one of the poses that all others leave open."""

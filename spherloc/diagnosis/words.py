@@ -5,9 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from spherloc.diagnosis.causes import Cause, Diagnosis
-from spherloc.diagnosis.evidence import Evidence, Truth, different
-from spherloc.diagnosis.experiments import Fit
-from spherloc.diagnosis.measures import apart
+from spherloc.diagnosis.evidence import Evidence, Fit, Truth, apart, different
 from spherloc.metrics import evaluate
 from spherloc.trace import Certificate, ConsensusStage, RansacStage, Trace
 

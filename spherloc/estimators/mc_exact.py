@@ -27,7 +27,7 @@ from spherloc.problem import AlignedProblem
 from spherloc.refine import RefinementOptions, residuals_px
 from spherloc.trace import Certificate, ConsensusStage, PositionStage, Stage
 from spherloc.types import FloatArray
-from spherloc.working_time import working_s
+from spherloc.watch import working_s
 
 MOST_CORRESPONDENCES = 200_000
 """Some ten seconds and 1 GB."""

@@ -13,7 +13,7 @@ from spherloc.datasets.map_scene import MapScene
 from spherloc.diagnosis import diagnose
 from spherloc.errors import InputError, SpherlocError, show
 from spherloc.estimators import estimate
-from spherloc.experiments.rows import FAILED, UNREADABLE, QueryResult
+from spherloc.experiments.results import FAILED, UNREADABLE, QueryResult
 from spherloc.frontend.view import Matches, View
 from spherloc.metrics import evaluate
 from spherloc.outcome import judge

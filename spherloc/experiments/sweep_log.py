@@ -10,10 +10,18 @@ from types import TracebackType
 from typing import Any, Self
 
 from spherloc.errors import InputError, reason, show
-from spherloc.experiments.differences import differences, in_short
+from spherloc.experiments.configuration import differences, in_short
 from spherloc.experiments.sweep_plan import SweepPlan
-from spherloc.experiments.sweep_rows import SweepRow, columns, csv_line, row_line, row_of_line
-from spherloc.experiments.sweep_summary import rows_text, summarize, summary_text
+from spherloc.experiments.sweep_rows import (
+    SweepRow,
+    columns,
+    csv_line,
+    row_line,
+    row_of_line,
+    rows_text,
+    summarize,
+    summary_text,
+)
 from spherloc.files import is_file, read_file, reading, size_of
 
 MAX_BYTES = 1_000_000_000

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from spherloc.cameras.base import Camera
 from spherloc.cameras.colmap_models import camera_from_colmap
 from spherloc.errors import MOST_REASON, CalibrationError, InputError, reason, shorten, show
-from spherloc.extras import require
 from spherloc.files import is_file, is_folder
 from spherloc.formats.colmap_check import check_binary
 from spherloc.formats.colmap_parts import ModelParts, Points
 from spherloc.formats.colmap_text import check_text
+from spherloc.registry import require
 from spherloc.types import FloatArray
 
 _FILES = ("cameras", "images", "points3D")

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from spherloc.cameras.base import Camera
 from spherloc.cameras.colmap_models import camera_from_colmap
 from spherloc.errors import CalibrationError, InputError, reason, show
-from spherloc.extras import require
 from spherloc.formats.text_rows import finite_numbers, pose_from_words, refuse_pickle, rows
+from spherloc.registry import require
 from spherloc.types import FloatArray, IntArray
 
 MAX_BYTES = 1 << 28

@@ -15,8 +15,7 @@ from spherloc.cameras.base import Camera
 from spherloc.cameras.colmap_models import camera_from_colmap
 from spherloc.errors import CalibrationError, InputError, show
 from spherloc.files import is_file
-from spherloc.formats.layout import needed_file
-from spherloc.formats.text_rows import finite_numbers, pose_from_words, rows
+from spherloc.formats.text_rows import finite_numbers, needed_file, pose_from_words, rows
 from spherloc.geometry import pose
 from spherloc.types import FloatArray
 

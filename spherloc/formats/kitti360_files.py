@@ -17,8 +17,7 @@ from spherloc.cameras.base import Camera
 from spherloc.cameras.calibration import load_camera
 from spherloc.errors import InputError, show
 from spherloc.files import is_file, is_folder, names_in, read_file, reading, size_of
-from spherloc.formats.layout import needed_file
-from spherloc.formats.text_rows import finite_numbers, rows
+from spherloc.formats.text_rows import finite_numbers, needed_file, rows
 from spherloc.types import BoolArray, FloatArray
 
 MAX_SCAN_BYTES = 1 << 28

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from spherloc.errors import InputError, show
-from spherloc.files import open_file, reading
+from spherloc.files import is_file, open_file, reading
 from spherloc.geometry import pose
 from spherloc.trajectory import rotation_from_wxyz
 from spherloc.types import FloatArray
@@ -89,3 +89,14 @@ def pose_from_words(words: Sequence[str], place: str) -> FloatArray:
     if np.abs(numbers[4:]).max() > _LARGEST_M:
         raise InputError(f"{place}: its position is beyond {_LARGEST_M:g} m; correct it.")
     return pose(rotation_from_wxyz(numbers[:4]), numbers[4:])
+
+
+def needed_file(root: Path, name: str, where: str, what: str) -> Path:
+    """A file that a dataset's layout demands; raises ``InputError`` that names it if it is missing.
+
+    ``what`` says what it holds ("the calibration of image_02").
+    """
+    named = root / name
+    if not is_file(named):
+        raise InputError(f"{where}: {named} is missing, {what}; check that 'root' is the dataset's own folder.")
+    return named

@@ -3,14 +3,14 @@
 import numpy as np
 
 from spherloc.types import FloatArray
-from spherloc.worlds import furniture_indoor as put
+from spherloc.worlds import furniture as put
 from spherloc.worlds.atlas import pack
-from spherloc.worlds.corners import with_dark_corners
 from spherloc.worlds.indoor_tiles import PICTURES, furniture_tiles, room_tiles
 from spherloc.worlds.mesh import MeshBuilder
-from spherloc.worlds.occluder_tiles import occluder_tiles
+from spherloc.worlds.occluders import occluder_tiles
 from spherloc.worlds.outdoor_tiles import nature_tiles
 from spherloc.worlds.rooms import Opening, Room, add_room
+from spherloc.worlds.shading import with_dark_corners
 from spherloc.worlds.world import Lane, Surfaces, World
 
 EYE_M = 1.45

@@ -7,11 +7,11 @@ import numpy as np
 from spherloc.types import FloatArray
 from spherloc.worlds.atlas import pack
 from spherloc.worlds.buildings import BAY_M, Front, add_house
-from spherloc.worlds.corners import with_dark_corners
-from spherloc.worlds.furniture_outdoor import add_bench, add_lamp, add_tree
+from spherloc.worlds.furniture import add_bench, add_lamp, add_tree
 from spherloc.worlds.mesh import MeshBuilder, xyz
-from spherloc.worlds.occluder_tiles import occluder_tiles
+from spherloc.worlds.occluders import occluder_tiles
 from spherloc.worlds.outdoor_tiles import facade_tiles, ground_tiles, nature_tiles, sign_tiles
+from spherloc.worlds.shading import with_dark_corners
 from spherloc.worlds.world import Lane, Surfaces, World
 
 HALF_M = 45.0

@@ -4,12 +4,11 @@ import numpy as np
 
 from spherloc.worlds.atlas import pack
 from spherloc.worlds.buildings import BAY_M, Front, add_house
-from spherloc.worlds.corners import with_dark_corners
-from spherloc.worlds.furniture_outdoor import add_bench, add_lamp, add_tree
+from spherloc.worlds.furniture import add_bench, add_lamp, add_tree
 from spherloc.worlds.mesh import MeshBuilder
-from spherloc.worlds.occluder_tiles import occluder_tiles
-from spherloc.worlds.occluders import add_car
+from spherloc.worlds.occluders import add_car, occluder_tiles
 from spherloc.worlds.outdoor_tiles import STYLES, facade_tiles, ground_tiles, nature_tiles, sign_tiles
+from spherloc.worlds.shading import with_dark_corners
 from spherloc.worlds.world import Lane, Surfaces, World
 
 LENGTH_M = 108.0

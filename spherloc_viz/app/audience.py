@@ -10,9 +10,8 @@ from html import escape
 import viser
 
 from spherloc.diagnosis import Diagnosis
-from spherloc_viz.app.controls.display_controls import DisplayControls
+from spherloc_viz.app.controls.controls import DisplayControls
 from spherloc_viz.app.edits import Edits
-from spherloc_viz.app.latest_worker import LatestWorker
 from spherloc_viz.app.run_display import Places, RunDisplay
 from spherloc_viz.app.run_request import Run
 from spherloc_viz.app.services import Services
@@ -20,8 +19,8 @@ from spherloc_viz.app.stage.canvas import panel_widths_px
 from spherloc_viz.app.status import Status
 from spherloc_viz.app.text import DIM, box
 from spherloc_viz.app.web.touch import READY, Touch, Touches
-from spherloc_viz.app.web.upload_limit import limit_uploads
-from spherloc_viz.app.web.viser_internals import follow_changes, guard_callbacks
+from spherloc_viz.app.web.viser_internals import follow_changes, guard_callbacks, limit_uploads
+from spherloc_viz.app.workers import LatestWorker
 from spherloc_viz.layers.primitives import SceneItem
 
 WAITING = "The presenter has not shown anything yet."

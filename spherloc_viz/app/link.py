@@ -12,8 +12,7 @@ from typing import Any
 from urllib.parse import parse_qsl, urlencode
 
 from spherloc.datasets import load_scene
-from spherloc.datasets.variation import EDITS, Variation
-from spherloc.datasets.variation_text import parse_variation, settings_of
+from spherloc.datasets.variation import EDITS, Variation, parse_variation, settings_of
 from spherloc.errors import InputError, SpherlocError, show
 from spherloc.estimators import default_options, options_type
 from spherloc.problem import Problem

@@ -9,7 +9,7 @@ import viser
 
 from spherloc.datasets.synthetic import TrueCamera
 from spherloc.diagnosis import Diagnosis
-from spherloc_viz.app.controls.display_controls import DisplayControls
+from spherloc_viz.app.controls.controls import DisplayControls
 from spherloc_viz.app.left_panels import LeftPanels
 from spherloc_viz.app.matches.match_card import MatchCard
 from spherloc_viz.app.panels.export_panel import Shown
@@ -19,9 +19,9 @@ from spherloc_viz.app.text import diagnosis_html, status_html
 from spherloc_viz.app.web.touch import Touches
 from spherloc_viz.app.web.viser_internals import changes_of, set_theme
 from spherloc_viz.layers import paint, steps, with_alternative
+from spherloc_viz.layers.outcome import outcome_table
 from spherloc_viz.layers.primitives import Picture, SceneItem
 from spherloc_viz.layers.selection import with_selection
-from spherloc_viz.layers.tables import outcome_table
 
 START_THEME = "dark"
 

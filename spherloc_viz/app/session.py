@@ -23,9 +23,7 @@ from spherloc_viz.app.catalog import SceneRequest
 from spherloc_viz.app.controls.controls import Controls
 from spherloc_viz.app.edits import Edits
 from spherloc_viz.app.history import History
-from spherloc_viz.app.latest_worker import Job, LatestWorker
 from spherloc_viz.app.link import Followed, Follower, PageView, address_html, link_of
-from spherloc_viz.app.notices import Notices
 from spherloc_viz.app.page_runs import Known, PageRuns
 from spherloc_viz.app.panels.export_panel import Shown
 from spherloc_viz.app.panels.folders import Roots
@@ -33,9 +31,10 @@ from spherloc_viz.app.run_display import Places, RunDisplay
 from spherloc_viz.app.run_request import Run, RunRequest
 from spherloc_viz.app.services import Services
 from spherloc_viz.app.stage.canvas import panel_widths_px
-from spherloc_viz.app.status import Status
+from spherloc_viz.app.status import Notices, Status
 from spherloc_viz.app.web.touch import READY, Touch, Touches
 from spherloc_viz.app.web.viser_internals import follow_changes, guard_callbacks
+from spherloc_viz.app.workers import Job, LatestWorker
 
 QUIET_S = 0.7
 """Runs count as settled, and are recorded, when nothing has changed for this long."""

@@ -57,3 +57,40 @@ class Status:
 def _line_html(sentence: str, wrong: bool = False) -> str:
     """As high as two lines, so that widgets below do not jump under a hand when the sentence gets longer."""
     return f'<div style="font-size:12px;min-height:3.4em">{status_html(sentence, wrong)}</div>'
+
+
+SHOWN_S = 15.0
+
+
+class Notices:
+    """One client's."""
+
+    def __init__(self, client: viser.ClientHandle) -> None:
+        self._client = client
+        self._shown: viser.NotificationHandle | None = None
+        self._failure: viser.NotificationHandle | None = None
+        self._lock = threading.Lock()
+
+    def show(self, sentence: str) -> None:
+        """Show a sentence for a while."""
+        with self._lock:
+            if self._shown is not None:
+                self._shown.remove()
+            self._shown = self._client.add_notification(
+                "Recordings", sentence, color="blue", auto_close_seconds=SHOWN_S
+            )
+
+    def fail(self, sentence: str) -> None:
+        """Say that runs are not recorded, in place of what was said of that before, until somebody closes it."""
+        with self._lock:
+            if self._failure is not None:
+                self._failure.remove()
+            self._failure = self._client.add_notification("Not recorded", sentence, color="red")
+
+    def recover(self, sentence: str) -> None:
+        """Say that runs are recorded again."""
+        with self._lock:
+            if self._failure is not None:
+                self._failure.remove()
+                self._failure = None
+        self.show(sentence)

@@ -9,12 +9,11 @@ from spherloc.diagnosis import Diagnosis
 from spherloc.metrics import evaluate
 from spherloc.trace import Trace
 from spherloc_viz import style
-from spherloc_viz.layers.certificate import UNKNOWABLE
 from spherloc_viz.layers.comparison import duration_text
 from spherloc_viz.layers.frame import length
+from spherloc_viz.layers.outcome import UNKNOWABLE, verdict
 from spherloc_viz.layers.primitives import Step, Table
 from spherloc_viz.layers.scale_bar import angle_text
-from spherloc_viz.layers.tables import verdict
 
 DIM = "opacity:.65"
 WORDS = {"success": style.INLIER, "failure": style.OUTLIER, "no pose": style.OUTLIER, UNKNOWABLE: style.OUTLIER}

@@ -1,18 +1,26 @@
 """What a case of the gallery is: a run that is described wholly, the story it tells, and what shows that it is true."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import astuple, dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from spherloc.datasets import Scene, load_scene
+from spherloc.datasets.map_scene import MapScene
 from spherloc.datasets.staged import StagedScene
 from spherloc.datasets.variation import Variation
-from spherloc.diagnosis import Cause
+from spherloc.diagnosis import Cause, Diagnosis, diagnose
 from spherloc.estimators import estimate
+from spherloc.metrics import SUCCESS_DEG, SUCCESS_M, evaluate
 from spherloc.problem import Problem
 from spherloc.trace import Trace
+from spherloc_viz.gallery.measures import MEASURES
+from spherloc_viz.layers import steps
+from spherloc_viz.layers.key_step import key_step
 from spherloc_viz.recording.origin import Origin
 
 
@@ -107,3 +115,102 @@ def origin_of(play: Play, title: str, story: str) -> Origin:
         title=title,
         story=story,
     )
+
+
+PICTURES_SLACK = 0.15
+"""Share by which facts of a run on pictures may be off: other processors round otherwise when pictures are drawn and
+described, so that some matches come and go."""
+_CITATION = re.compile(r"Fig\. \d+[a-z]?( and \d+[a-z])?|Table VI|experiment \d+|Eq\. \d+( and \d+)?|\b2P(\d+k)?\b")
+_NUMBER = re.compile(r"\d[\d,]*(?:\.\d+)?")
+
+
+@dataclass(frozen=True, eq=False)
+class Played:
+    """A case that was run."""
+
+    case: GalleryCase
+    """What is told."""
+    trace: Trace
+    """Its run."""
+    diagnosis: Diagnosis
+    """With the truth."""
+    beside: tuple[tuple[Beside, Trace], ...]
+    """The runs to compare with."""
+
+
+def play(case: GalleryCase) -> Played:
+    """Run a case and all that is beside it."""
+    trace = case.run()
+    return Played(case, trace, diagnose(trace), tuple((item, item.run()) for item in case.beside))
+
+
+def faults(played: Played) -> Iterator[str]:
+    """What happened otherwise than it is told, in sentences; nothing if the story is true."""
+    case, trace = played.case, played.trace
+    if played.diagnosis.cause != case.cause:
+        yield f"{case.key}: the diagnosis is {played.diagnosis.cause}, and not {case.cause}."
+    if case.without_truth is not None and (blind := diagnose(trace, use_truth=False).cause) != case.without_truth:
+        yield f"{case.key}: without the truth the diagnosis is {blind}, and not {case.without_truth}."
+    if sorted(happened := failures(trace)) != sorted(case.fails):
+        yield f"{case.key}: what fails is {', '.join(happened) or 'nothing'}, and not {', '.join(case.fails)}."
+    if (key := steps(trace)[key_step(trace, played.diagnosis)].key) != case.step:
+        yield f"{case.key}: it goes wrong at the step {key}, and not at {case.step}."
+    yield from _wrong_facts(case.key, case, trace)
+    for item, other in played.beside:
+        where = f"{case.key}, beside {item.name}"
+        if bool(evaluate(other).success) != item.succeeds:
+            yield f"{where}: it {'fails' if item.succeeds else 'succeeds'}, against what is told."
+        yield from _wrong_facts(where, item, other)
+
+
+def failures(trace: Trace) -> list[str]:
+    """How a run with a known true pose fails; empty if it does not."""
+    metrics = evaluate(trace)
+    if metrics.rotation_error_deg is None or metrics.translation_error_m is None:
+        return ["no pose"]
+    found = {
+        "position": metrics.translation_error_m >= SUCCESS_M,
+        "rotation": metrics.rotation_error_deg >= SUCCESS_DEG,
+    }
+    return [name for name, so in found.items() if so]
+
+
+def _wrong_facts(where: str, told: Play, trace: Trace) -> Iterator[str]:
+    slack = PICTURES_SLACK if isinstance(told.scene, MapScene) else 0.0
+    for name, value in told.facts.items():
+        if not agrees(value, measured := MEASURES[name](trace), slack):
+            yield f"{where}: {name} is {measured:.6g}, and not {value}."
+
+
+def agrees(told: float, measured: float, slack: float = 0.0) -> bool:
+    """Whether a number was measured as it is told: whole ones when rounded, others up to one in their last digit.
+
+    ``slack`` is a share by which it may be off besides.
+    """
+    if isinstance(told, int):
+        return bool(abs(told - np.round(measured)) <= np.ceil(slack * (abs(told) + 1)))
+    decimals = len(repr(told).partition(".")[2])
+    return bool(abs(told - measured) <= 10.0**-decimals + slack * abs(told))
+
+
+def loose_numbers(case: GalleryCase) -> tuple[str, ...]:
+    """Numbers of the story that are no fact, no setting and not quoted, and facts that it does not tell."""
+    plays = (case, *case.beside)
+    facts = {float(value) for item in plays for value in item.facts.values()}
+    known = facts | {float(value) for value in case.quoted} | {float(value) for value in _numbers(plays)}
+    told = {float(text.replace(",", "")): text for text in _NUMBER.findall(_CITATION.sub("", case.story))}
+    return tuple(
+        [f"{text} is told, but is no fact" for value, text in told.items() if value not in known]
+        + [f"{value:g} is a fact, but is not told" for value in sorted(facts - told.keys()) if value]
+    )
+
+
+def _numbers(plays: tuple[Play, ...]) -> Iterator[float]:
+    """The settings of runs, shares in percent too."""
+    for item in plays:
+        groups = () if item.staged is None else item.staged.groups
+        staged = () if item.staged is None else (item.staged.gravity_bound_deg, item.staged.focal_off)
+        values: list[Any] = [item.seed, *staged, *astuple(item.options), *item.variation.simulation.values()]
+        for value in [*values, *(group.count for group in groups)]:
+            if isinstance(value, int | float):
+                yield from (value, round(100 * value, 6))

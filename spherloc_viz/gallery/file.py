@@ -10,8 +10,7 @@ from typing import Any
 from spherloc.datasets import bundled_scenes, load_scene, scene_file
 from spherloc.datasets.scene_file import check_keys, integer, text
 from spherloc.datasets.staged import CUBE, Group, StagedScene
-from spherloc.datasets.variation import EDITS, Variation
-from spherloc.datasets.variation_text import parse_variation
+from spherloc.datasets.variation import EDITS, Variation, parse_variation
 from spherloc.diagnosis import Cause
 from spherloc.errors import InputError, show
 from spherloc.estimators import options_type

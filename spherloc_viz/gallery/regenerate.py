@@ -12,11 +12,10 @@ from spherloc.errors import InputError, RecordingError, show
 from spherloc.estimators import warm_up
 from spherloc.metrics import evaluate
 from spherloc.trace import Trace
-from spherloc_viz.gallery.case import Beside, GalleryCase, origin_of
-from spherloc_viz.gallery.check import Played, faults, play
+from spherloc_viz.gallery.case import Beside, GalleryCase, Played, faults, origin_of, play
 from spherloc_viz.recording.content.writer import write_recording
 from spherloc_viz.recording.origin import Origin
-from spherloc_viz.recording.review.notes import has_review, write_review
+from spherloc_viz.recording.reviews import has_review, write_review
 from spherloc_viz.recording.sandbox.examiner import examine, examine_review
 
 WIDTH = 100

@@ -31,11 +31,10 @@ from spherloc_viz.layers import (
     translation,
     yaw,
 )
-from spherloc_viz.layers.focus import focus_of
-from spherloc_viz.layers.frame import Plan, RunView
+from spherloc_viz.layers.frame import Plan, RunView, focus_of
+from spherloc_viz.layers.outcome import outcome_table
 from spherloc_viz.layers.primitives import Chart, Graph, Picture, Step, Stop
 from spherloc_viz.layers.scene import base_items, camera
-from spherloc_viz.layers.tables import outcome_table
 
 STAGES: dict[type[Stage], tuple[str, Callable[[RunView, Any], list[Plan]]]] = {
     DecisionStage: ("Choice", decision.plans),

@@ -13,8 +13,8 @@ from spherloc.refine import residuals_px
 from spherloc.trace import Certificate, ConsensusStage, Trace, YawStage
 from spherloc.types import FloatArray
 from spherloc_viz import style
-from spherloc_viz.layers.certificate import is_knowable
 from spherloc_viz.layers.frame import RunView, one_color
+from spherloc_viz.layers.outcome import is_knowable
 from spherloc_viz.layers.primitives import Chart, Curve, Label, SceneItem, Segments, Table
 from spherloc_viz.layers.scene import camera
 

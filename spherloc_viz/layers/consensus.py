@@ -12,9 +12,8 @@ from spherloc.types import FloatArray
 from spherloc_viz import style
 from spherloc_viz.layers import ring
 from spherloc_viz.layers import yaw_bound as bound
-from spherloc_viz.layers.focus import sphere_box
-from spherloc_viz.layers.frame import Frame, Plan, RunView, even, growing, one_color
-from spherloc_viz.layers.graph import graph_at, match_nodes
+from spherloc_viz.layers.balls import graph_at, match_nodes
+from spherloc_viz.layers.frame import Frame, Plan, RunView, even, growing, one_color, sphere_box
 from spherloc_viz.layers.primitives import Focus, Graph, Nodes, SceneItem, Segments, Table
 from spherloc_viz.layers.scene import camera
 from spherloc_viz.layers.yaw_bound import best_support, highest_bound

@@ -7,8 +7,7 @@ import numpy as np
 from spherloc.metrics import ransac_success_probability
 from spherloc.trace import RansacStage
 from spherloc_viz import style
-from spherloc_viz.layers.focus import close_focus
-from spherloc_viz.layers.frame import Frame, Plan, RunView, even, one_color
+from spherloc_viz.layers.frame import Frame, Plan, RunView, close_focus, even, one_color
 from spherloc_viz.layers.primitives import Chart, Curve, Segments, Table
 
 MOST_IMPROVEMENTS = 60

@@ -10,8 +10,7 @@ from spherloc.trace import RefinementStage
 from spherloc.types import BoolArray, FloatArray
 from spherloc_viz import style
 from spherloc_viz.layers import uncertainty
-from spherloc_viz.layers.focus import sphere_box
-from spherloc_viz.layers.frame import Frame, Plan, RunView, even, length, one_color
+from spherloc_viz.layers.frame import Frame, Plan, RunView, even, length, one_color, sphere_box
 from spherloc_viz.layers.primitives import Chart, Curve, Focus, SceneItem, Segments
 from spherloc_viz.layers.scale_bar import angle_text, length_text
 

@@ -15,8 +15,8 @@ from spherloc.types import ByteArray, FloatArray
 from spherloc_viz import style
 from spherloc_viz.layers.frame import Frame, RunView, one_color
 from spherloc_viz.layers.primitives import Mesh, Points, SceneItem, Segments, Textured
+from spherloc_viz.layers.query_image import sphere_texture
 from spherloc_viz.layers.scale_bar import scale_bar
-from spherloc_viz.layers.sphere_image import sphere_texture
 from spherloc_viz.layers.uncertainty import error_items
 
 CAMERA = 1.9

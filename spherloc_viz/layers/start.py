@@ -5,8 +5,7 @@ import numpy as np
 from spherloc.problem import Problem
 from spherloc_viz import style
 from spherloc_viz.layers import ring
-from spherloc_viz.layers.focus import sphere_box
-from spherloc_viz.layers.frame import Frame, Plan, RunView, one_color
+from spherloc_viz.layers.frame import Frame, Plan, RunView, one_color, sphere_box
 from spherloc_viz.layers.primitives import Focus, Label, SceneItem, Segments
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from spherloc.experiments.sweep_plan import AXES
-from spherloc.experiments.sweep_summary import Point, Quartiles
+from spherloc.experiments.sweep_rows import Point, Quartiles
 from spherloc.metrics import SUCCESS_DEG, SUCCESS_M
 from spherloc.types import FloatArray
 from spherloc_viz import style

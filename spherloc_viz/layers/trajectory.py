@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from spherloc.experiments.rows import QueryResult
+from spherloc.experiments.results import QueryResult
 from spherloc.types import FloatArray
 from spherloc_viz import style
 from spherloc_viz.layers.frame import one_color

@@ -9,10 +9,8 @@ from spherloc.geometry import camera_centre
 from spherloc.trace import TranslationStage
 from spherloc.types import FloatArray, IntArray
 from spherloc_viz import style
-from spherloc_viz.layers.balls import BallSet
-from spherloc_viz.layers.focus import ball_boxes
-from spherloc_viz.layers.frame import Frame, Plan, RunView, growing, length, one_color
-from spherloc_viz.layers.graph import ball_nodes, graph_at
+from spherloc_viz.layers.balls import BallSet, ball_nodes, graph_at
+from spherloc_viz.layers.frame import Frame, Plan, RunView, ball_boxes, growing, length, one_color
 from spherloc_viz.layers.primitives import Balls, Focus, Graph, Label, Segments
 
 SIZES = (3, 10, 30, 100, 300)

@@ -10,8 +10,7 @@ from spherloc.types import FloatArray
 from spherloc_viz import style
 from spherloc_viz.layers import ring
 from spherloc_viz.layers.arcs import Arcs
-from spherloc_viz.layers.focus import ring_focus
-from spherloc_viz.layers.frame import Frame, RunView, one_color
+from spherloc_viz.layers.frame import Frame, RunView, one_color, ring_focus
 from spherloc_viz.layers.primitives import Chart, SceneItem, Segments
 
 

@@ -1,12 +1,15 @@
 """What a run says about yaw, as curves over the whole circle, and windows of the circle."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from spherloc.geometry import yaw_of
+from spherloc.bounds import bounds_of
+from spherloc.consensus.yaw_arcs import yaw_arcs
+from spherloc.geometry import wrap_angle, yaw_of
 from spherloc.trace import ConsensusStage, RansacStage, Trace, YawStage
-from spherloc.types import FloatArray
+from spherloc.types import FloatArray, IntArray
 from spherloc_viz import style
 from spherloc_viz.layers import ring
 from spherloc_viz.layers.frame import RunView
@@ -97,3 +100,224 @@ def places_of(yaw_deg: float, window: Window) -> list[float]:
     """Where a yaw is in a window: none, one, or two if it is at both ends of the circle."""
     low, high = window
     return [yaw for yaw in (yaw_deg - 360.0, yaw_deg, yaw_deg + 360.0) if low <= yaw <= high]
+
+
+WIDTHS_DEG = (1.0, 2.0, 4.0, 6.0, 10.0, 20.0, 30.0, 60.0, 120.0)
+"""Of the window around the peak."""
+MOST_BARS = 60
+MOST_CHOSEN = 24
+"""Bars that a selection may take of all."""
+MOST_MATCHES, MOST_INLIERS = 32, 20
+"""Where a run keeps no arcs: matches whose pairs are looked at, and inliers among them."""
+KINDS = ("both right", "one wrong", "both wrong")
+CELLS = 240
+"""Places across the window by which bars are packed into rows."""
+
+
+@dataclass(frozen=True, eq=False)
+class Arcs:
+    """A arcs of feasible yaw of pairs of matches, one or more a pair."""
+
+    pairs: NDArray[np.integer]
+    """(A, 2) correspondences of the problem, ascending."""
+    lo_rad: FloatArray
+    """(A,) in [-pi, pi)."""
+    hi_rad: FloatArray
+    """(A,) not below ``lo_rad``."""
+    rule: str
+    """Which arcs these are, as a sentence; empty if they are the run's own."""
+
+
+@dataclass(frozen=True, eq=False)
+class Bars:
+    """P pairs, with an arc in a window or selected, and all of their arcs."""
+
+    pairs: IntArray
+    """(P, 2) correspondences of the problem."""
+    kind: IntArray
+    """(P,) index into ``KINDS``."""
+    chosen: NDArray[np.bool_]
+    """(P,) whether the selection holds the pair."""
+    count: IntArray
+    """(P,) arcs of each pair; those outside of the window too."""
+    owner: IntArray
+    """(B,) place in ``pairs`` of each arc."""
+    lo_deg: FloatArray
+    """(B,) in [-180, 180)."""
+    hi_deg: FloatArray
+    """(B,) not below ``lo_deg``."""
+    row: IntArray
+    """(B,) row of each arc in the window, from the top; -1 outside of it."""
+    total: tuple[int, int, int]
+    """Arcs in the window of each kind, drawn or not."""
+
+    @property
+    def rows(self) -> int:
+        """How many rows there are."""
+        return int(self.row.max(initial=-1)) + 1
+
+
+def right_ones(trace: Trace) -> tuple[NDArray[np.bool_], str]:
+    """Which matches (N,) are right, by the truth where it is known, else by the run's inliers; and which it was."""
+    if trace.problem.truth_inliers is not None:
+        return trace.problem.truth_inliers, "by the truth"
+    return trace.inlier_mask, "by this run's inliers"
+
+
+def arcs_of(trace: Trace, selected: tuple[int, ...]) -> Arcs:
+    """The run's own arcs; where it keeps none, those of some matches: of its inliers, the selection and others."""
+    stage = trace.stage(YawStage)
+    if stage is not None:
+        return Arcs(stage.pairs, stage.lo_rad, stage.hi_rad, "")
+    aligned = trace.problem.aligned
+    members = _members(trace, selected)
+    places = np.searchsorted(aligned.index, members)
+    bounds = bounds_of(aligned, trace.options.bound_px)
+    some = replace(
+        aligned,
+        index=members,
+        bearings=aligned.bearings[places],
+        points=aligned.points[places],
+        pixel_from_bearing=aligned.pixel_from_bearing[places],
+        radians_per_pixel=aligned.radians_per_pixel[places],
+    )
+    pairs, lo, hi = yaw_arcs(some, bounds.radians[places])
+    whole = f"all {len(members)}" if len(members) == len(trace.problem) else f"{len(members)} of {len(trace.problem):,}"
+    return Arcs(members[pairs], lo, hi, f"{trace.estimator} keeps no arcs; these are of the pairs of {whole} matches.")
+
+
+def _members(trace: Trace, selected: tuple[int, ...]) -> IntArray:
+    """Usable matches whose pairs are looked at, ascending: an even sample of inliers, selection and others."""
+    usable = trace.problem.aligned.index
+    if len(usable) <= MOST_MATCHES:
+        return usable
+    wanted = np.zeros(len(trace.problem), dtype=bool)
+    wanted[[number for number in selected if trace.problem.usable[number]][: MOST_MATCHES // 3]] = True
+    wanted[sample(np.flatnonzero(trace.inlier_mask), MOST_INLIERS)] = True
+    others = usable[~wanted[usable]]
+    wanted[sample(others, MOST_MATCHES - int(np.count_nonzero(wanted)))] = True
+    return np.flatnonzero(wanted)
+
+
+def sample(indices: IntArray, count: int) -> IntArray:
+    """At most ``count`` of the indices, evenly spaced."""
+    count = min(count, len(indices))
+    return indices[np.arange(count) * len(indices) // max(1, count)]
+
+
+def peak_window(story: YawStory, arcs: Arcs) -> Window:
+    """A window around the estimated yaw, wide enough for most of the arcs over it; the circle without an estimate."""
+    if story.estimate_deg is None:
+        return ALL
+    middle = np.radians(story.estimate_deg)
+    over = _overlapping(arcs, middle, middle)
+    away = wrap_angle(arcs.lo_rad[over] - middle), wrap_angle(arcs.hi_rad[over] - middle)
+    reach = np.maximum(np.abs(away[0]), np.abs(away[1]))
+    need = 3.0 * np.degrees(float(np.median(reach))) if len(reach) else 10.0
+    width = next((width for width in WIDTHS_DEG if width >= need), WIDTHS_DEG[-1])
+    # Rounded, so that the window stands still while a slider moves the estimate by little.
+    step = 0.1 * width
+    return window_around(step * round(story.estimate_deg / step), width)
+
+
+def _overlapping(arcs: Arcs, low_rad: float, high_rad: float) -> IntArray:
+    """Indices of the arcs that reach into a window from -pi <= low < pi to high <= low + 2 pi."""
+    lo, hi, circle = arcs.lo_rad, arcs.hi_rad, 2.0 * np.pi
+    inside = ((lo <= high_rad) & (hi >= low_rad)) | (hi >= low_rad + circle) | (lo <= high_rad - circle)
+    return np.flatnonzero(inside)
+
+
+def bars_in(trace: Trace, arcs: Arcs, window: Window, selected: tuple[int, ...], most: int = MOST_BARS) -> Bars:
+    """Selected pairs, wherever their arcs are, and pairs with an arc in a window: an even sample with an equal share of
+    each kind.
+    """
+    right, _ = right_ones(trace)
+    inside = _overlapping(arcs, *np.radians(window).tolist())
+    pairs = arcs.pairs[inside]
+    kind = 2 - right[pairs[:, 0]].astype(np.int64) - right[pairs[:, 1]]
+    of_kind = [inside[kind == k] for k in range(len(KINDS))]
+    drawn = np.zeros(len(arcs.pairs), dtype=bool)
+    if selected:
+        drawn[sample(np.flatnonzero(_chosen(arcs.pairs, selected)), MOST_CHOSEN)] = True
+    room = most - int(np.count_nonzero(drawn[inside]))
+    for place, group in enumerate(sorted(of_kind, key=len)):
+        some = sample(group[~drawn[group]], room // (len(KINDS) - place))
+        drawn[some] = True
+        room -= len(some)
+    codes = arcs.pairs[:, 0].astype(np.int64) * len(right) + arcs.pairs[:, 1]
+    shown = codes[drawn]
+    shown = shown[np.diff(shown, prepend=-1) > 0]
+    first, last = np.searchsorted(codes, shown, "left"), np.searchsorted(codes, shown, "right")
+    owner = np.repeat(np.arange(len(shown)), last - first)
+    mine = np.arange(len(owner)) - np.repeat(np.cumsum(last - first) - (last - first), last - first) + first[owner]
+    those = arcs.pairs[first].astype(np.int64)
+    lo_deg, hi_deg = np.degrees(arcs.lo_rad[mine]), np.degrees(arcs.hi_rad[mine])
+    kinds = 2 - right[those[:, 0]].astype(np.int64) - right[those[:, 1]]
+    return Bars(
+        pairs=those,
+        kind=kinds,
+        chosen=_chosen(those, selected),
+        count=last - first,
+        owner=owner,
+        lo_deg=lo_deg,
+        hi_deg=hi_deg,
+        row=_rows(lo_deg, hi_deg, kinds[owner], window),
+        total=(len(of_kind[0]), len(of_kind[1]), len(of_kind[2])),
+    )
+
+
+def _chosen(pairs: NDArray[np.integer], selected: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Which pairs (P, 2) a selection holds: those among the selected, or with the one that is."""
+    if not selected:
+        return np.zeros(len(pairs), dtype=bool)
+    held = np.isin(pairs, selected)
+    return np.all(held, axis=1) if len(selected) > 1 else np.any(held, axis=1)
+
+
+def spans_in(lo_deg: FloatArray, hi_deg: FloatArray, window: Window) -> tuple[IntArray, FloatArray, FloatArray]:
+    """What of the arcs (B,) lies in a window: indices (S,) of the arcs, ascending, and ends (S,), (S,) in the window.
+
+    An arc has two parts there if it leaves the window and comes back; one of a whole turn or more does not leave it.
+    """
+    low, high = window
+    turns = np.array([-360.0, 0.0, 360.0])
+    lo, hi = lo_deg[:, None] + turns, hi_deg[:, None] + turns
+    inside = (lo <= high) & (hi >= low)
+    whole = hi_deg - lo_deg >= 360.0
+    lo[whole], hi[whole], inside[whole] = low, high, turns == 0.0
+    arc, turn = np.nonzero(inside)
+    return arc, np.maximum(lo[arc, turn], low), np.minimum(hi[arc, turn], high)
+
+
+def _rows(lo_deg: FloatArray, hi_deg: FloatArray, kind: IntArray, window: Window) -> IntArray:
+    """A row (B,) for every arc in the window such that those in a row do not touch: the kinds one under the other,
+    narrow arcs above wide ones, each in the first row of its kind that has room.
+    """
+    low, high = window
+    cell = (high - low) / CELLS
+    row = np.full(len(lo_deg), -1, dtype=np.int64)
+    arc, left, right = spans_in(lo_deg, hi_deg, window)
+    masks = dict.fromkeys(arc.tolist(), 0)
+    cells = ((left - low) / cell).astype(np.int64).tolist(), ((right - low) / cell).astype(np.int64).tolist()
+    for bar, first, last in zip(arc.tolist(), *cells, strict=True):
+        # A bit a cell, and one more so that neighbours do not touch.
+        masks[bar] |= ((1 << (last - first + 2)) - 1) << first
+    there = np.array(list(masks), dtype=np.int64)
+    taken: list[int] = []
+    start, current = 0, -1
+    for place in np.lexsort(((hi_deg - lo_deg)[there], kind[there])).tolist():
+        bar = int(there[place])
+        if kind[bar] != current:
+            start, current = len(taken), int(kind[bar])
+        row[bar] = _first_free(taken, start, masks[bar])
+    return row
+
+
+def _first_free(taken: list[int], start: int, mask: int) -> int:
+    """The first row from ``start`` on in which no bit of the mask is taken, a new one if there is none; takes them."""
+    for place in range(start, len(taken)):
+        if not taken[place] & mask:
+            taken[place] |= mask
+            return place
+    taken.append(mask)
+    return len(taken) - 1

@@ -1,6 +1,10 @@
 """Where a recorded run came from, so that it can be opened and changed again."""
 
+import os
+import platform
 from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
 from typing import Literal
 
 from spherloc.datasets.variation import Variation
@@ -26,3 +30,19 @@ class Origin:
     """Of a curated case; empty for others."""
     story: str = ""
     """What a curated case shows, in a few sentences; empty for others."""
+
+
+@cache
+def machine() -> str:
+    """The system and the processor, such as "Linux x86_64, AMD EPYC 7763 64-Core Processor"."""
+    return f"{platform.system()} {platform.machine()}, {_processor()}"
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        lines = []
+    named = (line.partition(":")[2].strip() for line in lines if line.startswith(("model name", "Model", "Hardware")))
+    name = next(named, "") or platform.processor() or os.environ.get("PROCESSOR_IDENTIFIER", "")
+    return " ".join(name.split()) or "unknown processor"

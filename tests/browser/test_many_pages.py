@@ -17,7 +17,7 @@ from spherloc.datasets.variation import Variation
 from spherloc.estimators import estimate
 from spherloc_viz.app.catalog import Catalog, SceneRequest
 from spherloc_viz.app.controls.estimator_controls import ABOUT
-from spherloc_viz.layers.tables import outcome_table
+from spherloc_viz.layers.outcome import outcome_table
 
 PAGES = 8
 BURSTS = 4

@@ -15,7 +15,7 @@ from playwright.sync_api import Browser, Locator, Page, expect
 from spherloc.estimators import estimate
 from spherloc.problem import Problem
 from spherloc_viz.app.catalog import Catalog, SceneRequest
-from spherloc_viz.layers.tables import outcome_table
+from spherloc_viz.layers.outcome import outcome_table
 from spherloc_viz.recording.content.reader import read_recording
 
 CAMERA = '[camera]\nmodel = "equirectangular"\nwidth = 2048\nheight = 1024\n'

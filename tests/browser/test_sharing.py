@@ -16,7 +16,7 @@ from playwright.sync_api import expect
 from spherloc.estimators import estimate
 from spherloc_viz.app.catalog import Catalog
 from spherloc_viz.app.controls.presets import RECIPES, presets
-from spherloc_viz.layers.tables import outcome_table
+from spherloc_viz.layers.outcome import outcome_table
 from spherloc_viz.recording.content.reader import RecordedRun, read_recording
 
 OUTCOMES = {

@@ -11,7 +11,7 @@ from playwright.sync_api import expect
 from spherloc.estimators import estimate
 from spherloc.trace import Trace
 from spherloc_viz.app.catalog import Catalog
-from spherloc_viz.layers.match_rows import match_rows
+from spherloc_viz.layers.matches import match_rows
 
 pytestmark = pytest.mark.browser
 

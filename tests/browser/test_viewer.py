@@ -14,10 +14,10 @@ from playwright.sync_api import Browser, Page, expect
 from spherloc.datasets import load_scene
 from spherloc.estimators import estimate
 from spherloc_viz import style
-from spherloc_viz.app.web.viewer_room import viewer_link
+from spherloc_viz.app.web.viewer import viewer_link
 from spherloc_viz.recording.content.reader import read_run_row
 from spherloc_viz.recording.content.writer import write_recording
-from spherloc_viz.recording.review.notes import write_review
+from spherloc_viz.recording.reviews import write_review
 from spherloc_viz.recording.run_row import RunRow
 from tests.waiting import until
 

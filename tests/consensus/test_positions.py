@@ -23,7 +23,7 @@ from spherloc.consensus.positions import search_positions
 from spherloc.consensus.stabbing import EVERYWHERE, deepest, keep_possible, scratch_for
 from spherloc.geometry import pose
 from spherloc.refine import residuals_px
-from spherloc.working_time import working_s
+from spherloc.watch import working_s
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
 

@@ -7,7 +7,7 @@ import pytest
 
 from spherloc import registry
 from spherloc.datasets import load_scene
-from spherloc.datasets.loaders import scene_kind
+from spherloc.datasets.scene_file import scene_kind
 from spherloc.errors import InputError
 
 ALL = registry.names("datasets")

@@ -11,10 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from spherloc.datasets import load_scene
 from spherloc.datasets.map_scene import MapScene
-from spherloc.datasets.matterport360 import read_pose
+from spherloc.datasets.matterport360 import read_dpt, read_pose
 from spherloc.errors import InputError
 from spherloc.estimators import estimate
-from spherloc.formats.dpt import read_dpt
 from spherloc.geometry import camera_centre, pose, so3_exp
 from spherloc.metrics import evaluate
 

@@ -7,7 +7,7 @@ import pytest
 
 from spherloc.cameras.base import in_image
 from spherloc.datasets import load_scene
-from spherloc.datasets.outliers import second_pose
+from spherloc.datasets.point_cloud import second_pose
 from spherloc.errors import InputError
 from spherloc.geometry import camera_centre, transform, yaw_of
 

@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from spherloc.cameras.base import in_image
 from spherloc.datasets import load_scene
 from spherloc.datasets.correspondences import CorrespondencesScene
-from spherloc.datasets.variation import Variation
-from spherloc.datasets.variation_text import KEYS, parse_variation, settings_of
+from spherloc.datasets.variation import KEYS, Variation, parse_variation, settings_of
 from spherloc.errors import InputError
 from spherloc.geometry import transform
 from tests.datasets.scene_texts import write

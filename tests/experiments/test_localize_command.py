@@ -24,9 +24,9 @@ from spherloc.experiments import read_results
 from spherloc.trajectory import read_tum
 from spherloc_viz.batch import Records
 from spherloc_viz.localize import localize_sequence
+from spherloc_viz.plots import trajectory_png
 from spherloc_viz.recording.content.reader import read_recording
 from spherloc_viz.scene_list import all_scenes, one_kind
-from spherloc_viz.trajectory_plot import trajectory_png
 from tests.cli_process import spherloc_here
 from tests.waiting import LIMIT_S
 

@@ -19,10 +19,9 @@ from spherloc.errors import InputError
 from spherloc.estimators import options_type
 from spherloc.experiments import SequenceResults
 from spherloc.experiments.configuration import configuration_of
-from spherloc.experiments.rows import QueryResult
+from spherloc.experiments.results import QueryResult
 from spherloc.experiments.sequence import chosen_queries, localize
-from spherloc.experiments.summary import summarize, wilson
-from spherloc.experiments.trajectories import estimated_trajectory, timed, true_trajectory
+from spherloc.experiments.summary import estimated_trajectory, summarize, timed, true_trajectory, wilson
 from tests.waiting import LIMIT_S
 
 

@@ -15,8 +15,7 @@ from hypothesis import strategies as st
 from spherloc.errors import InputError
 from spherloc.experiments import QueryResult, read_results
 from spherloc.experiments.configuration import Configuration, read_configuration
-from spherloc.experiments.results import ResultsLog
-from spherloc.experiments.rows import COLUMNS, csv_text, json_line, row_of_json
+from spherloc.experiments.results import COLUMNS, ResultsLog, csv_text, json_line, row_of_json
 
 CONFIGURATION = Configuration(
     scene="walk.toml",

@@ -16,9 +16,8 @@ from spherloc.errors import InputError
 from spherloc.experiments.summary import wilson
 from spherloc.experiments.sweep import Entrant, SweepPlan, SweepRow
 from spherloc.experiments.sweep_log import SweepLog
-from spherloc.experiments.sweep_rows import row_line, row_of_line
-from spherloc.experiments.sweep_summary import point_of, summarize, summary_text
-from spherloc.experiments.sweep_text import parse_values
+from spherloc.experiments.sweep_plan import parse_values
+from spherloc.experiments.sweep_rows import point_of, row_line, row_of_line, summarize, summary_text
 
 
 def done(plan: SweepPlan, path: Path, count: int | None = None) -> list[SweepRow]:

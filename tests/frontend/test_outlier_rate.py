@@ -6,8 +6,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from spherloc.frontend.features import Features
-from spherloc.frontend.matching import MatchOptions, match
-from spherloc.frontend.outlier_rate import BINARY_SHARES, LEAST_SHARED, RATIOS, SHARES, right_shares, wrong_matches
+from spherloc.frontend.matching import (
+    BINARY_SHARES,
+    LEAST_SHARED,
+    RATIOS,
+    SHARES,
+    MatchOptions,
+    match,
+    right_shares,
+    wrong_matches,
+)
 
 
 def features(descriptors: np.ndarray, random: np.random.Generator) -> Features:

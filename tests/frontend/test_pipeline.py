@@ -12,9 +12,8 @@ from spherloc.datasets.map_scene import MapScene
 from spherloc.errors import InputError, ProblemError
 from spherloc.estimators import estimate
 from spherloc.frontend.features import FeatureOptions, extract
-from spherloc.frontend.frontend_options import frontend_options
 from spherloc.frontend.lifting import DepthLift, SfmLift
-from spherloc.frontend.pipeline import image_matcher
+from spherloc.frontend.pipeline import frontend_options, image_matcher
 from spherloc.frontend.triangulation import TriangulationLift
 from spherloc.frontend.view import View
 from spherloc.geometry import camera_centre, rotation_angle

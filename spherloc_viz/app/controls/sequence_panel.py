@@ -9,7 +9,7 @@ import viser
 
 from spherloc.datasets.map_scene import MapScene
 from spherloc.errors import SpherlocError
-from spherloc.experiments.rows import QueryResult
+from spherloc.experiments.results import QueryResult
 from spherloc.experiments.sequence import localize
 from spherloc.experiments.summary import success_rates
 from spherloc.trace import Trace

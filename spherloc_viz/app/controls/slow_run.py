@@ -5,7 +5,7 @@ import threading
 import viser
 
 from spherloc.watch import Watch
-from spherloc_viz.app.latest_worker import LatestWorker
+from spherloc_viz.app.workers import LatestWorker
 
 AFTER_S = 0.4
 """A run that takes longer shows its progress, and gives way to a newer request. Shorter ones are let finish: else

@@ -1,8 +1,12 @@
 """The images of the problem with their matches, or where the camera sees them if there are no images."""
 
+import base64
 from collections.abc import Callable
 from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
 
+import cv2
 import numpy as np
 import viser
 from numpy.typing import NDArray
@@ -12,15 +16,41 @@ from spherloc.trace import Trace
 from spherloc.types import ByteArray
 from spherloc_viz import style
 from spherloc_viz.app.matches import match_drawing as drawing
-from spherloc_viz.app.matches.match_chips import chips_html
-from spherloc_viz.app.matches.match_overlay import Overlay, overlay
-from spherloc_viz.app.matches.photos import photo_uri
+from spherloc_viz.app.matches.match_drawing import Overlay, overlay
+from spherloc_viz.app.matches.match_table import chips_html
 from spherloc_viz.app.text import box, status_html
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.layers.frame import one_color
-from spherloc_viz.layers.match_view import MatchView, match_view
-from spherloc_viz.layers.photograph import photograph
+from spherloc_viz.layers.matches import MatchView, match_view
 from spherloc_viz.layers.primitives import Picture, Points
+from spherloc_viz.layers.query_image import modified, photograph, shrunk
+
+QUALITIES = (82, 70, 55, 40)
+MOST_BYTES = 85_000
+"""A JPEG is encoded with less quality while it is larger; as text it takes a third more."""
+
+
+def photo_uri(path: Path | None, width_px: int) -> str | None:
+    """The image of a file, at most that wide, as a data URI (cached); None without one."""
+    return None if path is None else _photo_uri(path, modified(path), width_px)
+
+
+@lru_cache(maxsize=16)
+def _photo_uri(path: Path, changed_ns: int, width_px: int) -> str | None:
+    photo = photograph(path)
+    return None if photo is None else jpeg_uri(shrunk(photo.image, width_px / photo.image.shape[1]))
+
+
+def jpeg_uri(image: NDArray[np.uint8]) -> str:
+    """An image (H, W, 3) sRGB as a data URI."""
+    bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
+    data = b""
+    for quality in QUALITIES:
+        data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
+        if len(data) <= MOST_BYTES:
+            break
+    return f"data:image/jpeg;base64,{base64.b64encode(data).decode()}"
+
 
 PHOTO_PX = 900
 """Width of a photograph that fills the panel."""

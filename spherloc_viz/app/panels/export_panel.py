@@ -14,9 +14,9 @@ from PIL import Image
 
 from spherloc.errors import InputError
 from spherloc.trace import Trace
-from spherloc_viz.app.background_worker import BackgroundWorker
 from spherloc_viz.app.stage.still_page import Still, still_html, viewpoint
 from spherloc_viz.app.text import DIM, box, status_html
+from spherloc_viz.app.workers import BackgroundWorker
 from spherloc_viz.layers.primitives import SceneItem
 from spherloc_viz.recording.content.writer import write_recording
 

@@ -1,5 +1,6 @@
 """Opens scenes from the page: bundled ones, recent ones, files in allowed folders, and uploaded matches."""
 
+import json
 import threading
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -9,15 +10,114 @@ from pathlib import Path
 import viser
 
 from spherloc.datasets import Scene, bundled_scenes, load_scene
+from spherloc.disk_cache import cache_folder, store
 from spherloc.errors import InputError
-from spherloc_viz.app.background_worker import BackgroundWorker
 from spherloc_viz.app.panels.folders import Listing, Roots, Row, describe
-from spherloc_viz.app.panels.open_list import list_html
-from spherloc_viz.app.panels.recent import RecentScenes
 from spherloc_viz.app.panels.uploads import MOST_BYTES, MOST_CALIBRATION_BYTES, File, Form, Scratch, open_upload
 from spherloc_viz.app.text import DIM, box, status_html
 from spherloc_viz.app.web.touch import Touch, Touches
-from spherloc_viz.app.web.upload_limit import limit_uploads
+from spherloc_viz.app.web.viser_internals import limit_uploads
+from spherloc_viz.app.workers import BackgroundWorker
+
+RULE = "border-top:1px solid rgba(128,140,160,.22)"
+
+
+def list_html(
+    listing: Listing | None, roots: Sequence[Path], recent: Sequence[Row], bundled: Sequence[Row], remark: str
+) -> str:
+    """A folder's content, or the folders that may be looked into; then recent and bundled scenes."""
+    if listing is None:
+        folders = [_row_html(f"open-folder:0:{k}:", f"{root.name}/", str(root)) for k, root in enumerate(roots)]
+        parts = [_section("Folders", folders)]
+    else:
+        parts = [_folder_html(listing)]
+    parts += [_section(title, [_scene_html(row) for row in rows]) for title, rows in _titled(recent, bundled)]
+    return box("".join(parts), "font-size:12.5px") + (status_html(remark) if remark else "")
+
+
+def _titled(recent: Sequence[Row], bundled: Sequence[Row]) -> list[tuple[str, Sequence[Row]]]:
+    return [(title, rows) for title, rows in (("Recent", recent), ("Bundled", bundled)) if rows]
+
+
+def _folder_html(listing: Listing) -> str:
+    """Folder by folder; first the way up, last the other pages."""
+    above = "open-folder:" if listing.parent is None else f"open-folder:0:{listing.parent}"
+    rows = [_row_html(above, "↑ up" if listing.parent else "↑ all folders", "")]
+    for row in listing.rows:
+        if row.kind == "folder":
+            rows.append(_row_html(f"open-folder:0:{row.place}", f"{row.name}/", ""))
+        else:
+            rows.append(_scene_html(row))
+    if not listing.rows:
+        rows.append(_row_html(None, "no folders and no scene files (*.toml)", ""))
+    pages = ""
+    if listing.pages > 1:
+        ways = (("‹ before", listing.page - 1), ("after ›", listing.page + 1))
+        links = [
+            _link(f"open-folder:{page}:{listing.place}", words) for words, page in ways if 0 <= page < listing.pages
+        ]
+        pages = f'<div style="padding:.3em 0">page {listing.page + 1} of {listing.pages} {" ".join(links)}</div>'
+    remarks = "".join(f'<div style="font-size:11.5px;{DIM}">{escape(words)}</div>' for words in listing.remarks)
+    return _section(f"{listing.folder.name}/", rows) + pages + remarks
+
+
+def _link(action: str, words: str) -> str:
+    look = "text-decoration:underline;margin-left:.6em"
+    return f'<span role="button" tabindex="0" data-touch="{escape(action)}" style="{look}">{escape(words)}</span>'
+
+
+def _section(title: str, rows: Sequence[str]) -> str:
+    head = f'<div style="font-weight:600;padding:.5em 0 .2em;overflow-wrap:anywhere">{escape(title)}</div>'
+    return f'{head}<table style="border-collapse:collapse;width:100%">{"".join(rows)}</table>'
+
+
+def _scene_html(row: Row) -> str:
+    return _row_html(f"open-scene:{row.place}" if row.kind == "scene" else None, row.name, row.about)
+
+
+def _row_html(action: str | None, name: str, about: str) -> str:
+    """A row that is pressed; paler if there is nothing to press."""
+    touch = "" if action is None else f' role="button" tabindex="0" data-touch="{escape(action)}"'
+    words = f'<div style="font-size:11.5px;{DIM};overflow-wrap:anywhere">{escape(about)}</div>' if about else ""
+    pale = f"{DIM};" if action is None else ""
+    cell = f'<td style="{RULE};{pale}padding:.25em .4em;overflow-wrap:anywhere">{escape(name)}{words}</td>'
+    return f"<tr{touch}>{cell}</tr>"
+
+
+MOST_RECENT = 8
+"""Scenes that are remembered."""
+MOST_RECENT_BYTES = 100_000
+
+_writing = threading.Lock()
+
+
+class RecentScenes:
+    """Paths of scene files, the newest first, in a small JSON file that all pages share."""
+
+    def __init__(self, path: Path | None = None) -> None:
+        self._path = path or cache_folder("recent") / "scenes.json"
+
+    def read(self) -> tuple[tuple[Path, ...], str]:
+        """The paths, and a remark if the file is damaged; whether the scenes are still there is not known."""
+        try:
+            if not self._path.exists():
+                return (), ""
+            if self._path.stat().st_size > MOST_RECENT_BYTES:
+                raise ValueError("too large")
+            values = json.loads(self._path.read_text(encoding="utf-8"))
+            if not isinstance(values, list) or not all(isinstance(value, str) for value in values):
+                raise ValueError("no list of paths")
+        except (OSError, ValueError, RecursionError):
+            return (), f"The list of recent scenes ({self._path.name}) is damaged and is begun anew."
+        return tuple(Path(value) for value in values[:MOST_RECENT] if value and "\0" not in value), ""
+
+    def note(self, path: Path) -> None:
+        """Put a scene file in front."""
+        with _writing:
+            before, _ = self.read()
+            paths = [str(path), *(str(other) for other in before if other != path)]
+            store(self._path, json.dumps(paths[:MOST_RECENT], indent=1).encode())
+
 
 UPLOADED = "uploaded: "
 PASTED = "the pasted calibration"

@@ -8,20 +8,19 @@ import viser
 
 from spherloc.errors import RecordingError
 from spherloc.types import FloatArray
-from spherloc_viz.app.background_worker import BackgroundWorker
-from spherloc_viz.app.review.differences import comparison_html
-from spherloc_viz.app.review.exporter import Exporter
+from spherloc_viz.app.review.card import comparison_html
+from spherloc_viz.app.review.export import Exporter
 from spherloc_viz.app.review.filters import pill
 from spherloc_viz.app.review.gallery_list import GalleryList
 from spherloc_viz.app.review.notes import Notes
-from spherloc_viz.app.review.review_card import ReviewCard
-from spherloc_viz.app.review.reviewer import Reviewer, Reviewing
+from spherloc_viz.app.review.reviewer import ReviewCard, Reviewer, Reviewing
 from spherloc_viz.app.review.run_library import RunLibrary
 from spherloc_viz.app.review.run_list import RunList
 from spherloc_viz.app.run_request import RunRequest
 from spherloc_viz.app.text import box, status_html
 from spherloc_viz.app.web.downloads import Downloads
 from spherloc_viz.app.web.touch import Touch, Touches
+from spherloc_viz.app.workers import BackgroundWorker
 from spherloc_viz.recording.replay.reopen import Reopened
 from spherloc_viz.recording.run_row import RunRow
 

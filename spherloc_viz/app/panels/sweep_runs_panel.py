@@ -12,10 +12,10 @@ import viser
 
 from spherloc.errors import InputError, SpherlocError
 from spherloc.experiments.sweep import AXES, Entrant, SweepPlan, SweepRow, planned, run_sweep
-from spherloc.experiments.sweep_summary import rows_text, summarize, summary_text
-from spherloc.experiments.sweep_text import parse_values
+from spherloc.experiments.sweep_plan import parse_values
+from spherloc.experiments.sweep_rows import rows_text, summarize, summary_text
 from spherloc_viz.app.catalog import SceneRequest
-from spherloc_viz.app.panels.estimator_chips import chips_html, ordered
+from spherloc_viz.app.panels.compare_panel import chips_html, ordered
 from spherloc_viz.app.plots.sweep_charts import charts_html, table_html
 from spherloc_viz.app.text import status_html
 from spherloc_viz.app.web.touch import Touch, Touches
@@ -239,7 +239,7 @@ def download_of(plan: SweepPlan, scene: str, rows: tuple[SweepRow, ...], kind: s
     points = summarize(plan.labels, rows)
     if kind == "Summary":
         return f"{stem}.summary.csv", summary_text(plan.over, points).encode()
-    from spherloc_viz.sweep_plot import sweep_png
+    from spherloc_viz.plots import sweep_png
 
     with _pictures:
         return f"{stem}.png", sweep_png(scene, plan.over, plan.labels, points)

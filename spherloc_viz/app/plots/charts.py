@@ -1,12 +1,210 @@
 """The charts of a step beside the canvas."""
 
+from collections.abc import Mapping
 from html import escape
 
+import numpy as np
 import viser
 
-from spherloc_viz.app.plots.svg import chart_svg
+from spherloc.types import FloatArray
+from spherloc_viz.app.plots import shapes
+from spherloc_viz.app.plots.shapes import MINUS, Scale, round_ticks, tick_texts
 from spherloc_viz.app.text import box
-from spherloc_viz.layers.primitives import Chart
+from spherloc_viz.layers.primitives import Chart, Curve
+
+WIDTH_PX, HEIGHT_PX = 380.0, 180.0
+RIGHT_PX, ROW_PX = 12.0, 15.0
+MOST_DOTS = 40
+"""Corners up to which a line shows each as a dot."""
+MOST_STEPS = 360
+HEADROOM = 1.06
+
+Bands = Mapping[str, tuple[FloatArray, FloatArray]]
+"""Lower and upper ends (K,), (K,) of the band around a curve, by the curve's label."""
+
+
+def chart_svg(
+    chart: Chart,
+    width_px: float = WIDTH_PX,
+    height_px: float = HEIGHT_PX,
+    x_range: tuple[float, float] | None = None,
+    touch: str | None = None,
+    bands: Bands | None = None,
+) -> str:
+    """A chart without its title, as SVG that fits the width of what it stands in.
+
+    ``x_range`` shows a part of it. ``touch`` is the action of a drag across the plot, whose x from 0 to 1 is that
+    range. ``bands`` are drawn behind their curves.
+    """
+    bands = bands or {}
+    low, high = x_range or _span(chart)
+    bottom, top = _reach(chart, bands)
+    legend = _legend(chart, width_px)
+    foot_px = height_px - (33.0 if chart.x_label else 19.0)
+    y = Scale(bottom, top, foot_px, 6.0 + ROW_PX * max(1, len(legend)))
+    y_ticks = _ticks(y, 22.0, [curve.y for curve in chart.curves])
+    texts = tick_texts(y_ticks)
+    left_px = 9.0 + max(map(shapes.text_width_px, texts), default=0.0)
+    x = Scale(low, high, left_px, width_px - RIGHT_PX)
+    x_ticks = _ticks(x, 50.0, [curve.x for curve in chart.curves], degrees="°" in chart.x_label)
+    parts = shapes.y_axis(y, left_px, x.high_px, y_ticks, texts)
+    parts += shapes.x_axis(x, foot_px, x_ticks, tick_texts(x_ticks), chart.x_label)
+    parts += legend_parts(chart.y_label, legend, width_px)
+    parts += curve_parts(chart.curves, x, y, bands)
+    if touch is not None:
+        size = (x.high_px - x.low_px, foot_px - y.high_px)
+        parts.append(shapes.rect(x.low_px, y.high_px, *size, 'fill="transparent"' + shapes.touch(touch, drag=True)))
+    return shapes.svg(width_px, height_px, parts, f"{chart.title}: {chart.y_label} over {chart.x_label}")
+
+
+def _ticks(scale: Scale, apart_px: float, values: list[FloatArray], degrees: bool = False) -> tuple[float, ...]:
+    """Round numbers about ``apart_px`` or more from each other; whole ones if all values are."""
+    most = max(2, int(abs(scale.high_px - scale.low_px) / apart_px))
+    few = all(len(value) <= MOST_DOTS and np.array_equal(value, np.round(value)) for value in values)
+    if few:
+        most = max(2, min(most, int(scale.high - scale.low) + 1))
+    return round_ticks(scale.low, scale.high, most, degrees)
+
+
+def _span(chart: Chart) -> tuple[float, float]:
+    """The x of all curves; in degrees of a whole circle, the circle."""
+    ends = [curve.x[[0, -1]] for curve in chart.curves if len(curve.x)]
+    low, high = (float(np.min(ends)), float(np.max(ends))) if ends else (0.0, 1.0)
+    if "°" in chart.x_label and low <= -179.0 and high >= 179.0:
+        return -180.0, 180.0
+    return (low, high) if high > low else (low - 0.5, high + 0.5)
+
+
+def _reach(chart: Chart, bands: Bands) -> tuple[float, float]:
+    """The y from 0, or below, to a little more than the largest."""
+    values = [curve.y for curve in chart.curves] + [side for band in bands.values() for side in band]
+    known = np.concatenate([np.zeros(1), *values])
+    known = known[np.isfinite(known)]
+    low, high = float(known.min()), float(known.max())
+    return low, (low + HEADROOM * (high - low) if high > low else low + 1.0)
+
+
+def _legend(chart: Chart, width_px: float) -> list[list[tuple[Curve, float]]]:
+    """Rows of curves with the place of their sample; none if the one curve needs no name."""
+    if len(chart.curves) < 2:
+        return []
+    start = 14.0 + shapes.text_width_px(chart.y_label)
+    rows, place = [[]], start
+    for curve in chart.curves:
+        width = 30.0 + shapes.text_width_px(curve.label)
+        if place + width > width_px and rows[-1]:
+            rows.append([])
+            place = start
+        rows[-1].append((curve, place))
+        place += width
+    return rows
+
+
+def legend_parts(y_label: str, rows: list[list[tuple[Curve, float]]], width_px: float) -> list[str]:
+    """What is measured, at the upper left, and what each colour stands for, beside it, to the right."""
+    parts = [shapes.text(0.0, 11.0, y_label)]
+    for k, row in enumerate(rows):
+        last, place = row[-1]
+        shift = max(0.0, width_px - RIGHT_PX - (place + 17.0 + shapes.text_width_px(last.label)))
+        for curve, left in row:
+            y = 11.0 + ROW_PX * k
+            dashes = ' stroke-dasharray="3 3"' if curve.kind == "level" else ""
+            width = 3.0 if curve.kind == "marker" else 2.0
+            parts.append(
+                shapes.line(left + shift, y - 4, left + shift + 13, y - 4, shapes.stroke(curve.color, width, dashes))
+            )
+            parts.append(shapes.text(left + shift + 17, y, curve.label))
+    return parts
+
+
+def curve_parts(curves: tuple[Curve, ...], x: Scale, y: Scale, bands: Bands | None = None) -> list[str]:
+    """The curves between the ends of the x axis: bands below, then lines, then markers, the first of them broad and
+    those after it thin and dashed, so that both show where they coincide."""
+    bands = bands or {}
+    parts = [_band(curve, x, y, *bands[curve.label]) for curve in curves if curve.label in bands]
+    marked = False
+    for curve in curves:
+        if len(curve.x) == 0:
+            continue
+        if curve.kind == "marker":
+            if x.low <= curve.x[0] <= x.high:
+                parts.append(_marker(curve, x, y, marked))
+            marked = True
+        elif curve.kind == "level":
+            px, height = x.px(curve.x), y.at(curve.y[0])
+            ends = np.clip(px, x.low_px, x.high_px).tolist()
+            parts.append(shapes.line(ends[0], height, ends[-1], height, shapes.stroke(curve.color, 1.5, LEVEL_DASHES)))
+        elif curve.kind == "step":
+            parts += step_parts(curve, x, y)
+        else:
+            parts += _line(curve, x, y)
+    return parts
+
+
+LEVEL_DASHES = ' stroke-dasharray="3 3"'
+
+
+def _marker(curve: Curve, x: Scale, y: Scale, second: bool) -> str:
+    place, name = x.at(curve.x[0]), f"{curve.label}: {curve.x[0]:.2f}".replace("-", MINUS)
+    look = shapes.stroke(curve.color, 2.0, ' stroke-dasharray="5 5"') if second else shapes.stroke(curve.color, 4.0)
+    return f"<g>{shapes.tooltip(name)}{shapes.line(place, y.at(0.0), place, y.at(curve.y[0]), look)}</g>"
+
+
+def step_parts(curve: Curve, x: Scale, y: Scale) -> list[str]:
+    """A step curve and the area below it, within the ends of the x axis."""
+    first = max(0, int(np.searchsorted(curve.x, x.low, "right")) - 1)
+    last = int(np.searchsorted(curve.x, x.high, "left"))
+    xs, ys = shapes.thin_steps(curve.x[first:last], curve.y[first:last], MOST_STEPS)
+    if len(xs) == 0:
+        return []
+    # The last of all ends where it begins; of a part, where the next begins.
+    end = min(float(curve.x[min(last, len(curve.x) - 1)]), x.high)
+    left, foot = max(x.low, float(xs[0])), y.at(max(0.0, y.low))
+    x_px = x.px(np.maximum(xs, left))
+    # One path for both: it begins and ends on the ground, where the fill closes it.
+    data = shapes.steps(x_px, y.px(ys), x.at(end), foot)
+    return [f'<path d="{data}" {shapes.stroke(curve.color, 1.25, fill=shapes.fill(curve.color, 0.22))}/>']
+
+
+def _known(curve: Curve, *values: FloatArray) -> tuple[FloatArray, ...]:
+    """x and values (K,) where all are finite."""
+    known = np.all([np.isfinite(value) for value in (curve.x, *values)], axis=0)
+    return curve.x[known], *(value[known] for value in values)
+
+
+def _clipped(x: Scale, xs: FloatArray, *values: FloatArray) -> tuple[FloatArray, ...]:
+    """A line's corners within the ends of the x axis, cut where it leaves them."""
+    if len(xs) == 0 or (xs[0] >= x.low and xs[-1] <= x.high):
+        return xs, *values
+    inside = (xs > x.low) & (xs < x.high)
+    ends = [end for end in (x.low, x.high) if xs[0] <= end <= xs[-1]]
+    cut = np.sort(np.concatenate([xs[inside], ends]))
+    return cut, *(np.interp(cut, xs, value) for value in values)
+
+
+def _line(curve: Curve, x: Scale, y: Scale) -> list[str]:
+    known = _known(curve, curve.y)
+    xs, ys = _clipped(x, *known)
+    xs, ys = shapes.thin(xs, ys)
+    if len(xs) == 0:
+        return []
+    parts = [f'<path d="{shapes.corners(x.px(xs), y.px(ys))}" {shapes.stroke(curve.color, 1.75)}/>']
+    if len(known[0]) <= MOST_DOTS:
+        inside = (known[0] >= x.low) & (known[0] <= x.high)
+        for left, top in zip(x.px(known[0][inside]).tolist(), y.px(known[1][inside]).tolist(), strict=True):
+            parts.append(
+                f'<circle cx="{shapes.number(left)}" cy="{shapes.number(top)}" r="2.5" {shapes.fill(curve.color)}/>'
+            )
+    return parts
+
+
+def _band(curve: Curve, x: Scale, y: Scale, lower: FloatArray, upper: FloatArray) -> str:
+    xs, low, high = _clipped(x, *_known(curve, lower, upper))
+    there, back = shapes.thin(xs, high), shapes.thin(xs, low)
+    outline = [np.concatenate([there[k], back[k][::-1]]) for k in (0, 1)]
+    data = shapes.corners(x.px(outline[0]), y.px(outline[1]))
+    return f'<path d="{data}" {shapes.fill(curve.color, 0.18)}/>'
+
 
 NONE_YET = "No chart yet: the first one comes with a later step, and then it stays."
 

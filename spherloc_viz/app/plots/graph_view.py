@@ -1,17 +1,173 @@
 """The graph view: the graph that a step speaks of, linked with all that is selected."""
 
-from collections.abc import Callable
+import base64
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from html import escape
 
+import cv2
 import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from spherloc_viz import style
 from spherloc_viz.app.glossary import help_html, linked
-from spherloc_viz.app.plots.graph_drawing import CELL, cell_nodes, edges_of, graph_note, graph_svg
+from spherloc_viz.app.plots import shapes
 from spherloc_viz.app.text import box
 from spherloc_viz.app.web.touch import Touch, Touches
+from spherloc_viz.layers.frame import even
 from spherloc_viz.layers.primitives import Graph
+
+CELL = "graph-cell"
+WIDTH_PX, HEIGHT_PX = 400.0, 208.0
+MIDDLE_PX, RADIUS_PX = (98.0, 110.0), 93.0
+MATRIX_PX = (212.0, 20.0, 186.0)
+"""Left, top and size of the matrix."""
+FONT = ' style="font-size:13px"'
+MOST_EDGES = 450
+"""Edges drawn between marked nodes, and as many between others."""
+MOST_LIT = 12
+"""Selected nodes that are marked in the matrix."""
+
+
+@dataclass(frozen=True, eq=False)
+class Edges:
+    """Those of a graph that are drawn."""
+
+    marked: NDArray[np.int64]
+    """(E, 2) between marked nodes."""
+    others: NDArray[np.int64]
+    """(F, 2) between nodes of which not both are marked."""
+    total: int
+    """How many there are between the nodes that are there, drawn or not."""
+
+
+def graph_svg(graph: Graph, edges: Edges, lit: NDArray[np.int64], kept: NDArray[np.int64]) -> str:
+    """The drawing. ``lit`` are the selected nodes, ``kept`` (N,) the numbers that matches are known by."""
+    nodes = graph.nodes
+    parts = [
+        shapes.text(0.0, 12.0, f"{_many(nodes.name)} and {_edge(nodes.name)}", more=FONT),
+        shapes.text(MATRIX_PX[0], 12.0, "matrix, clique first", more=FONT),
+        *_edges(graph, edges),
+        *_nodes(graph, lit, kept),
+        *_matrix(graph, lit),
+    ]
+    return shapes.svg(WIDTH_PX, HEIGHT_PX, parts, f"Graph of {_many(nodes.name)}: {graph.words}")
+
+
+def edges_of(graph: Graph) -> Edges:
+    """An even sample where there are too many."""
+    edges = graph.nodes.edges
+    a, b = edges.T
+    both = graph.marked[a] & graph.marked[b]
+    marked, others = np.flatnonzero(both), np.flatnonzero(graph.shown[a] & graph.shown[b] & ~both)
+    return Edges(edges[even(marked, MOST_EDGES)], edges[even(others, MOST_EDGES)], len(marked) + len(others))
+
+
+def graph_note(graph: Graph, edges: Edges) -> str:
+    """What is left out, and what can be pressed."""
+    nodes, drawn = graph.nodes, len(edges.marked) + len(edges.others)
+    shown = int(np.count_nonzero(graph.shown))
+    thin = f"{len(nodes.number):,} of {nodes.total:,} {_many(nodes.name)} are drawn, evenly from clique and rest. "
+    rule = thin if len(nodes.number) < nodes.total else ""
+    count = f"{drawn:,} of {edges.total:,} edges are drawn, evenly"
+    lines = count if drawn < edges.total else f"All {edges.total:,} edges are drawn"
+    return f"{rule}{lines}; the matrix has all of its {shown:,} nodes. Press a node or a cell to select its matches."
+
+
+def _many(name: str) -> str:
+    return "matches" if name == "match" else f"{name}s"
+
+
+def _edge(name: str) -> str:
+    return "their overlaps" if name == "ball" else "who agrees"
+
+
+def _places(graph: Graph) -> NDArray[np.float64]:
+    """(K, 2) pixels."""
+    return np.array(MIDDLE_PX) + RADIUS_PX * graph.nodes.places
+
+
+def _edges(graph: Graph, drawn: Edges) -> list[str]:
+    places = _places(graph)
+    looks = (
+        (drawn.others, 'stroke="currentColor" stroke-opacity=".16" stroke-width=".6"'),
+        (drawn.marked, f'stroke="{style.css(graph.color)}" stroke-opacity=".5" stroke-width=".7"'),
+    )
+    return [f'<path d="{_lines(places[edges])}" {look}/>' for edges, look in looks if len(edges)]
+
+
+def _lines(ends: NDArray[np.float64]) -> str:
+    """Lines (E, 2, 2) as the data of one path."""
+    return "M%.0f %.0fL%.0f %.0f" * len(ends) % tuple(ends.ravel().tolist())
+
+
+def _nodes(graph: Graph, lit: NDArray[np.int64], kept: NDArray[np.int64]) -> list[str]:
+    """A dot for every node that is there; those that are marked, and then the selected, above the others."""
+    nodes, places = graph.nodes, _places(graph)
+    count = int(np.count_nonzero(graph.shown))
+    radius = 5.0 if count <= 12 else 3.6 if count <= 110 else 2.5
+    chosen = np.zeros(len(nodes.number), dtype=bool)
+    chosen[lit] = True
+    numbers = kept[nodes.matches].tolist()
+    parts: list[str] = []
+    grey = ' fill="currentColor" fill-opacity=".55"'
+    color = f' fill="{style.css(graph.color)}"'
+    ring = f' fill="{style.css(style.SELECTED)}" stroke="currentColor"'
+    groups = (
+        (graph.shown & ~graph.marked & ~chosen, grey, radius),
+        (graph.marked & ~chosen, color, radius),
+        (graph.shown & chosen, ring, radius + 1.5),
+    )
+    for members, look, size in groups:
+        dots = _dots(np.flatnonzero(members).tolist(), places, numbers, size)
+        parts.append(f"<g{look}>{''.join(dots)}</g>")
+    return parts
+
+
+def _dots(members: Iterable[int], places: NDArray[np.float64], numbers: list, radius: float) -> list[str]:
+    return [
+        f'<circle cx="{places[k, 0]:.1f}" cy="{places[k, 1]:.1f}" r="{radius:g}" '
+        f'data-touch="select:{",".join(map(str, numbers[k]))}"/>'
+        for k in members
+    ]
+
+
+def _matrix(graph: Graph, lit: NDArray[np.int64]) -> list[str]:
+    left, top, size = MATRIX_PX
+    look = 'fill="none" stroke="currentColor" stroke-opacity=".35"'
+    parts = [
+        f'<image href="data:image/png;base64,{matrix_png(graph)}" x="{left:g}" y="{top:g}" width="{size:g}" '
+        f'height="{size:g}" preserveAspectRatio="none" style="image-rendering:pixelated"/>',
+        shapes.rect(left, top, size, size, look),
+    ]
+    there = np.flatnonzero(graph.shown)
+    cell = size / max(1, len(there))
+    for k in np.searchsorted(there, lit[:MOST_LIT]).tolist():
+        violet = f'fill="{style.css(style.SELECTED)}" fill-opacity=".75"'
+        parts.append(shapes.rect(left, top + k * cell, size, min(max(cell, 1.0), 4.0), violet))
+        parts.append(shapes.rect(left + k * cell, top, min(max(cell, 1.0), 4.0), size, violet))
+    parts.append(shapes.rect(left, top, size, size, f'fill="transparent"{shapes.touch(f"{CELL}:")}'))
+    return parts
+
+
+def matrix_png(graph: Graph) -> str:
+    """The matrix of the nodes that are there as a PNG in base64, a pixel a cell: who agrees is grey, and marked pairs
+    that agree have their colour."""
+    grey, there = style.UNDECIDED[::-1], np.flatnonzero(graph.shown)
+    look = np.array([(*grey, 26), (*grey, 190), (*graph.color[::-1], 255)], np.uint8)
+    marked = graph.marked[there].astype(np.uint8)
+    agrees = graph.nodes.agrees[np.ix_(there, there)] | np.eye(len(there), dtype=bool)
+    done, data = cv2.imencode(".png", look[(1 + np.outer(marked, marked)) * agrees], (cv2.IMWRITE_PNG_COMPRESSION, 1))
+    assert done
+    return base64.b64encode(data.tobytes()).decode()
+
+
+def cell_nodes(graph: Graph, x: float, y: float) -> NDArray[np.int64]:
+    """The nodes of the cell at a place in the matrix, shares of its width and height."""
+    there = np.flatnonzero(graph.shown)
+    return np.unique(there[[min(int(share * len(there)), len(there) - 1) for share in (x, y)]])
+
 
 Select = Callable[[tuple[int, ...]], None]
 NONE_YET = "Here the graph will grow, from the step at which there is one."

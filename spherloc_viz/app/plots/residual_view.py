@@ -9,13 +9,145 @@ import viser
 from numpy.typing import NDArray
 
 from spherloc.trace import Trace
+from spherloc.types import FloatArray
 from spherloc_viz import style
-from spherloc_viz.app.plots.charts import chart_html
-from spherloc_viz.app.plots.residual_drawing import SELECT_BIN, histogram_svg, history_svg
+from spherloc_viz.app.plots import shapes
+from spherloc_viz.app.plots.charts import chart_html, curve_parts
+from spherloc_viz.app.plots.shapes import Scale, decade_ticks, round_ticks, tick_texts
 from spherloc_viz.app.text import DIM, box, dot_html, table_html
 from spherloc_viz.app.web.touch import Touch, Touches
-from spherloc_viz.layers.primitives import Chart
-from spherloc_viz.layers.residuals import Histogram, History, Residuals, history_of, residuals_of, scores_table
+from spherloc_viz.layers.primitives import Chart, Curve
+from spherloc_viz.layers.residuals import (
+    Histogram,
+    History,
+    Residuals,
+    bin_words,
+    history_of,
+    residuals_of,
+    scores_table,
+)
+
+SELECT_BIN = "select-bin"
+WIDTH_PX, RIGHT_PX = 380.0, 12.0
+HEIGHT_PX, FOOT_PX, TOP_PX = 150.0, 117.0, 20.0
+GAP_PX = 5.0
+"""Between the bins and those of all that is smaller or larger."""
+UNITS = {"px": "residual (px)", "deg": "residual (°)"}
+
+
+def histogram_svg(histogram: Histogram, selected: NDArray[np.bool_]) -> str:
+    """A histogram, right matches below wrong ones; of the ``selected`` (N,) matches, outlines show how many are in a
+    bin. Every bin that holds something can be pressed.
+    """
+    total = histogram.right + histogram.wrong
+    top = 1.08 * max(1, int(total.max()))
+    y = Scale(0.0, top, FOOT_PX, TOP_PX)
+    y_ticks = [tick for tick in round_ticks(0.0, top, 5) if tick == int(tick)]
+    texts = tick_texts(tuple(y_ticks))
+    left_px = 9.0 + max(map(shapes.text_width_px, texts))
+    bins, step = len(total), (WIDTH_PX - RIGHT_PX - left_px - 2 * GAP_PX) / len(total)
+    x = Scale(
+        float(histogram.edges[0]),
+        float(histogram.edges[-1]),
+        left_px + step + GAP_PX,
+        WIDTH_PX - RIGHT_PX - step - GAP_PX,
+        log=True,
+    )
+    ticks = decade_ticks(x.low, x.high, 8)
+    parts = shapes.y_axis(y, left_px, WIDTH_PX - RIGHT_PX, y_ticks, texts)
+    texts_x = tick_texts(ticks, log=True)
+    parts += shapes.x_axis(x, FOOT_PX, ticks, texts_x, UNITS[histogram.unit])
+    parts += [shapes.text(left_px, FOOT_PX + 29, f"< {texts_x[0]}"), shapes.text(0.0, 11.0, "matches")]
+    parts += [shapes.text(WIDTH_PX - RIGHT_PX, FOOT_PX + 29, f"≥ {texts_x[-1]}", "end"), *_bound(histogram, x)]
+    across = [left_px + step * k + GAP_PX * ((k > 0) + (k == bins - 1)) + 0.5 for k in range(bins)]
+    chosen = np.bincount(histogram.bin[selected], minlength=bins)
+    parts += _bars(histogram, chosen, across, step - 1.0, y)
+    return shapes.svg(WIDTH_PX, HEIGHT_PX, parts, f"Histogram of residuals, {UNITS[histogram.unit]}")
+
+
+def _bars(histogram: Histogram, chosen: NDArray[np.int64], across: list[float], width: float, y: Scale) -> list[str]:
+    """One path a colour, and over each bin that holds something a place to press, as high as the plot."""
+    feet, middle = np.full(len(across), FOOT_PX), y.px(histogram.right)
+    top = y.px(histogram.right + histogram.wrong)
+    parts = [
+        _boxes(across, width, feet, middle, "right", shapes.fill(style.INLIER)),
+        _boxes(across, width, middle, top, "wrong", shapes.fill(style.OUTLIER)),
+        _boxes(across, width, feet, y.px(chosen), "chosen", shapes.stroke(style.SELECTED, 2.0)),
+    ]
+    press, words = (
+        f'class="bin" fill="transparent" data-touch="{SELECT_BIN}:{histogram.unit}:',
+        bin_words(histogram.unit),
+    )
+    rows = zip(across, words, histogram.right.tolist(), histogram.wrong.tolist(), strict=True)
+    for place, (left, range_words, right, wrong) in enumerate(rows):
+        if right + wrong:
+            tip = shapes.tooltip(f"{range_words}: {right} right, {wrong} wrong; click to select")
+            parts.append(shapes.rect(left, TOP_PX, width, FOOT_PX - TOP_PX, f'{press}{place}"', tip))
+    return parts
+
+
+def _boxes(across: list[float], width: float, feet: FloatArray, tops: FloatArray, name: str, look: str) -> str:
+    """A path of upright boxes, without those of no height."""
+    rows = zip(across, feet.tolist(), tops.tolist(), strict=True)
+    data = "".join(f"M{x:.1f} {foot:.1f}V{top:.1f}h{width:.1f}V{foot:.1f}z" for x, foot, top in rows if foot > top)
+    return f'<path class="{name}" d="{data}" {look}/>' if data else ""
+
+
+def _bound(histogram: Histogram, x: Scale) -> list[str]:
+    """The median bound as a line, and all of them as a band where they are not the same."""
+    low, middle, high = (x.at(value) for value in histogram.bound)
+    parts = []
+    least, median, most = (f"{value:.2g}" for value in histogram.bound)
+    unit = "°" if histogram.unit == "deg" else " px"
+    words = f"bound {median}{unit}"
+    if high - low > 1.0:
+        parts.append(shapes.rect(low, TOP_PX, high - low, FOOT_PX - TOP_PX, shapes.fill(style.ESTIMATE, 0.15)))
+        words += f", of some {least} to {most}{unit}"
+    look = shapes.stroke(style.ESTIMATE, 1.5, ' stroke-dasharray="4 3"')
+    parts.append(shapes.line(middle, TOP_PX - 4, middle, FOOT_PX, look))
+    half = 0.5 * shapes.text_width_px(words)
+    return [*parts, shapes.text(min(max(middle, 60.0 + half), WIDTH_PX - half), 11.0, words, "middle")]
+
+
+def history_svg(history: History) -> str:
+    """Inliers of the best hypothesis over the samples drawn (left axis), and Eq. 28's prediction (right axis)."""
+    top, last = 1.08 * float(history.inliers[-1]), float(max(10, history.iterations))
+    y, chance = Scale(0.0, top, FOOT_PX, TOP_PX), Scale(0.0, 1.08, FOOT_PX, TOP_PX)
+    y_ticks = tuple(tick for tick in round_ticks(0.0, top, 5) if tick == int(tick))
+    texts = tick_texts(y_ticks)
+    left_px, right_px = 9.0 + max(map(shapes.text_width_px, texts)), WIDTH_PX - 38.0
+    x = Scale(1.0, last, left_px, right_px, log=True)
+    ticks = decade_ticks(1.0, last, 8)
+    parts = shapes.y_axis(y, left_px, right_px, y_ticks, texts)
+    parts += shapes.x_axis(x, FOOT_PX, ticks, tick_texts(ticks, log=True), "samples drawn")
+    parts += [shapes.text(right_px + 5, chance.at(0.5 * k) + 4, f"{50 * k} %") for k in range(3)]
+    drawn = np.append(history.drawn, history.iterations)
+    held = Curve("best", drawn, np.append(history.inliers, history.inliers[-1]), style.INLIER, "step")
+    parts += curve_parts((held,), x, y)
+    if history.share > 0.0:
+        k = np.geomspace(1.0, last, 80)
+        data = shapes.corners(x.px(k), chance.px(history.probability(k)))
+        parts.append(f'<path class="chance" d="{data}" {shapes.stroke(style.ESTIMATE, 1.75)}/>')
+    if history.clean_at is not None:
+        place = x.at(history.clean_at)
+        parts.append(
+            shapes.line(place, TOP_PX, place, FOOT_PX, shapes.stroke(style.TRUTH, 2.0, ' stroke-dasharray="5 4"'))
+        )
+    return shapes.svg(WIDTH_PX, HEIGHT_PX, [*parts, *_history_legend(history, right_px)], "Inliers over samples drawn")
+
+
+def _history_legend(history: History, right_px: float) -> list[str]:
+    parts = [shapes.text(0.0, 11.0, "inliers"), shapes.text(WIDTH_PX, 11.0, "chance", "end")]
+    names = [("Eq. 28", style.ESTIMATE), ("best so far", style.INLIER)]
+    names += [("clean sample", style.TRUTH)] if history.clean_at is not None else []
+    end = right_px - 12.0
+    for name, color in names:
+        start = end - shapes.text_width_px(name)
+        parts += [shapes.text(end, 11.0, name, "end")]
+        parts.append(shapes.line(start - 16, 7.0, start - 4, 7.0, shapes.stroke(color, 2.5)))
+        end = start - 26.0
+    return parts
+
 
 Select = Callable[[tuple[int, ...]], None]
 

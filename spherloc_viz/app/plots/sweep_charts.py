@@ -5,10 +5,10 @@ from html import escape
 
 import numpy as np
 
-from spherloc.experiments.sweep_summary import Point
+from spherloc.experiments.sweep_rows import Point
 from spherloc_viz.app.plots import shapes
-from spherloc_viz.app.plots.axes import Scale, decade_ticks, round_ticks, tick_texts
-from spherloc_viz.app.plots.svg import curve_parts
+from spherloc_viz.app.plots.charts import curve_parts
+from spherloc_viz.app.plots.shapes import Scale, decade_ticks, round_ticks, tick_texts
 from spherloc_viz.app.text import DIM, box, dot_html
 from spherloc_viz.layers.sweep import LIMIT, SweepChart, sweep_charts, sweep_colors, sweep_table
 

@@ -3,6 +3,7 @@
 import math
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from html import escape
 
 import numpy as np
@@ -10,20 +11,255 @@ import viser
 from numpy.typing import NDArray
 
 from spherloc.trace import Trace
-from spherloc_viz.app.plots.yaw_drawing import ZOOM, yaw_svg
+from spherloc_viz import style
+from spherloc_viz.app.plots import shapes
+from spherloc_viz.app.plots.charts import curve_parts
+from spherloc_viz.app.plots.shapes import MINUS, Scale, round_ticks, tick_texts, wrapped_deg
 from spherloc_viz.app.text import box
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.web.viser_internals import at_once
-from spherloc_viz.layers.yaw_bars import (
+from spherloc_viz.layers.primitives import Curve
+from spherloc_viz.layers.yaw_story import (
+    ALL,
     KINDS,
     Arcs,
     Bars,
+    Window,
+    YawStory,
     arcs_of,
     bars_in,
     peak_window,
+    places_of,
     right_ones,
+    spans_in,
+    window_around,
+    yaw_story,
 )
-from spherloc_viz.layers.yaw_story import ALL, Window, YawStory, window_around, yaw_story
+
+ZOOM = "yaw-zoom"
+WIDTH_PX = 380.0
+CIRCLE_STEPS = 180
+CIRCLE_TOP_PX, CIRCLE_FOOT_PX = 21.0, 77.0
+WINDOW_TOP_PX, WINDOW_FOOT_PX = 116.0, 176.0
+RIGHT_PX = 12.0
+STACK_PX = 196.0
+"""Most room for the rows of bars."""
+LEAST_PITCH_PX, MOST_PITCH_PX = 3.0, 9.0
+LOOKS = (
+    shapes.fill(style.INLIER),
+    shapes.fill(style.OUTLIER, 0.5),
+    shapes.fill(style.OUTLIER),
+)
+"""Of the kinds of pairs."""
+LINK = shapes.stroke(style.SELECTED, 1.5)
+EDGE = f' stroke="{style.css(style.SELECTED)}" stroke-width="1.5"'
+HOVER = (
+    "<style>.yaw-second{display:none;pointer-events:none}.yaw-arc:hover+.yaw-second,.yaw-second.chosen{display:inline}"
+    ".yaw-arc:hover{stroke:currentColor;stroke-width:1.2}</style>"
+)
+"""A pair under the pointer shows its arcs over the whole circle too."""
+
+
+def yaw_svg(story: YawStory, bars: Bars, window: Window, kept: NDArray[np.int64], now: str) -> str:
+    """The drawing. ``kept`` (N,) are the numbers that matches are known by, ``now`` is the key of the step at hand."""
+    top = 1.08 * story.top
+    low_px = 9.0 + shapes.text_width_px(tick_texts((story.top,))[0])
+    whole = Scale(*ALL, low_px, WIDTH_PX - RIGHT_PX)
+    part = Scale(*window, low_px, WIDTH_PX - RIGHT_PX)
+    pitch = min(MOST_PITCH_PX, max(LEAST_PITCH_PX, STACK_PX / max(1, bars.rows)))
+    foot = WINDOW_FOOT_PX + (8.0 + pitch * bars.rows if bars.rows else 0.0)
+    y = Scale(0.0, top, CIRCLE_FOOT_PX, CIRCLE_TOP_PX)
+    y_part = Scale(0.0, top, WINDOW_FOOT_PX, WINDOW_TOP_PX)
+    parts = [HOVER, shapes.text(0.0, 10.0, story.y_label), *_legend(story), *_circle(story, whole, y, window, part)]
+    parts += [*_window(story, part, y_part, foot, now), *_bars(bars, whole, part, pitch, window, kept)]
+    parts.append(f'<g pointer-events="none">{"".join(_markers(story, part, WINDOW_TOP_PX, foot, window))}</g>')
+    return shapes.svg(WIDTH_PX, foot + 33.0, parts, f"{story.title}, over yaw")
+
+
+def degrees(value: float) -> str:
+    """An angle to read, in [-180, 180)."""
+    return f"{wrapped_deg(value):.2f}°".replace("-", MINUS)
+
+
+def zoom(window: Window) -> str:
+    """The attributes of what can be dragged across to choose a part of a window."""
+    return shapes.touch(f"{ZOOM}:{window[0]:.6f},{window[1]:.6f}", drag=True)
+
+
+def _legend(story: YawStory) -> list[str]:
+    """Samples of the lines, from the right."""
+    names = [(curve.label, curve.color, curve.kind == "level") for curve in story.curves]
+    names += [("hypotheses", style.INLIER, False)] if story.hypotheses and not story.curves else []
+    names += [("truth", style.TRUTH, False)] if story.truth_deg is not None else []
+    names += [("estimate", style.ESTIMATE, True)] if story.estimate_deg is not None else []
+    parts, end = [], WIDTH_PX - RIGHT_PX
+    for name, color, dashed in reversed(names):
+        start = end - shapes.text_width_px(name)
+        dashes = ' stroke-dasharray="3 2"' if dashed else ""
+        parts += [shapes.text(start, 10.0, name)]
+        parts.append(shapes.line(start - 16, 6.0, start - 4, 6.0, shapes.stroke(color, 2.5, dashes)))
+        end = start - 26.0
+    return parts
+
+
+def _circle(story: YawStory, x: Scale, y: Scale, window: Window, part: Scale) -> list[str]:
+    """The whole circle, with the window marked and led down to where it is drawn wide."""
+    ticks = round_ticks(*ALL, 5, degrees=True)
+    parts = shapes.x_axis(x, CIRCLE_FOOT_PX, ticks, tick_texts(ticks))
+    parts += curve_parts(tuple(map(_coarse, story.curves)), x, y)
+    parts += _markers(story, x, CIRCLE_TOP_PX, CIRCLE_FOOT_PX, ALL)
+    parts += _hypotheses(story, x, y, ALL, "")
+    size = (x.high_px - x.low_px, CIRCLE_FOOT_PX - CIRCLE_TOP_PX + 2)
+    if window != ALL:
+        _, low, high = spans_in(np.array(window[:1]), np.array(window[1:]), ALL)
+        for left, right in zip(x.px(low).tolist(), x.px(high).tolist(), strict=True):
+            look = 'fill="currentColor" fill-opacity=".13"'
+            parts.append(shapes.rect(left, CIRCLE_TOP_PX - 2, max(2.0, right - left), size[1], look))
+        middle = x.at(wrapped_deg(0.5 * (window[0] + window[1])))
+        fan = f"M{middle - 1:.1f} 79L{part.low_px:.1f} {WINDOW_TOP_PX - 4}H{part.high_px:.1f}L{middle + 1:.1f} 79Z"
+        parts.append(f'<path d="{fan}" fill="currentColor" fill-opacity=".05"/>')
+    tip = shapes.tooltip("Drag to zoom, click to move the window here")
+    look = 'fill="transparent"' + zoom(ALL)
+    return [*parts, shapes.rect(x.low_px, CIRCLE_TOP_PX - 2, *size, look, tip)]
+
+
+def _window(story: YawStory, x: Scale, y: Scale, foot: float, now: str) -> list[str]:
+    """The curves in the window, its axis under the bars, and the area that can be dragged across."""
+    low, high = x.low, x.high
+    ticks = round_ticks(low, high, 6, degrees=True)
+    texts = tick_texts(ticks)
+    if high > 180.0:
+        # Beyond the seam the numbers start again.
+        texts = [
+            words if tick < 180.0 else tick_texts((tick - 360.0,))[0] for tick, words in zip(ticks, texts, strict=True)
+        ]
+    heights = round_ticks(0.0, y.high, 3)
+    parts = shapes.x_axis(x, foot, ticks, texts, "yaw (°)")
+    parts += shapes.y_axis(y, x.low_px, x.high_px, heights, tick_texts(heights))
+    parts += curve_parts(tuple(_beyond(curve, high) for curve in story.curves), x, y)
+    tip = shapes.tooltip("Drag to zoom")
+    size = (x.high_px - x.low_px, foot - WINDOW_TOP_PX)
+    parts.append(shapes.rect(x.low_px, WINDOW_TOP_PX, *size, 'fill="transparent"' + zoom((low, high)), tip))
+    return parts + _hypotheses(story, x, y, (low, high), now)
+
+
+def _coarse(curve: Curve) -> Curve:
+    """The curve as the small drawing of the circle needs it."""
+    if curve.kind != "step":
+        return curve
+    return replace(curve, **dict(zip("xy", shapes.thin_steps(curve.x, curve.y, CIRCLE_STEPS), strict=True)))
+
+
+def _beyond(curve: Curve, high: float) -> Curve:
+    """The curve, continued around the circle if a window crosses the seam."""
+    if high <= 180.0:
+        return curve
+    if curve.kind == "level":
+        return Curve(curve.label, np.array([-180.0, 540.0]), curve.y, curve.color, "level")
+    x, y = np.concatenate([curve.x, curve.x + 360.0]), np.concatenate([curve.y, curve.y])
+    return Curve(curve.label, x, y, curve.color, curve.kind)
+
+
+def _markers(story: YawStory, x: Scale, top: float, foot: float, window: Window) -> list[str]:
+    """Truth, broad, and estimate, thin and dashed, so that both show where they coincide."""
+    parts = []
+    known = (
+        (story.truth_deg, style.TRUTH, 3.5, ""),
+        (story.estimate_deg, style.ESTIMATE, 1.75, ' stroke-dasharray="5 4"'),
+    )
+    for yaw, color, width, dashes in known:
+        if yaw is not None:
+            for place in places_of(yaw, window):
+                parts.append(shapes.line(x.at(place), top, x.at(place), foot, shapes.stroke(color, width, dashes)))
+    return parts
+
+
+def _hypotheses(story: YawStory, x: Scale, y: Scale, window: Window, now: str) -> list[str]:
+    """Stems of the poses that were tried, as high as what they explain; that of the step at hand is filled in."""
+    parts = []
+    for yaw, count, name, key in story.hypotheses:
+        for place in places_of(yaw, window):
+            left, top = x.at(place), y.at(count)
+            color = style.SAMPLE if key and key == now else style.INLIER
+            press = shapes.touch(f"step:{key}") if key else ""
+            tip = shapes.tooltip(f"{name}: {count} inliers at {degrees(yaw)}")
+            stem = f"M{left:.1f} {y.low_px:.1f}V{top:.1f}"
+            parts.append(
+                f'<g{press}>{tip}<path d="{stem}" {shapes.stroke(color, 1.5)}/>'
+                + shapes.dot(left, top, 3.0, shapes.fill(color))
+                + "</g>"
+            )
+    return parts
+
+
+def _bars(bars: Bars, whole: Scale, part: Scale, pitch: float, window: Window, kept: NDArray[np.int64]) -> list[str]:
+    """A bar an arc in the window; behind it, shown when the pair is pointed at or chosen, what joins
+    it to the other arc of the pair."""
+    data, links = _bar_data(bars, whole, part, pitch, window)
+    rows = zip(
+        kept[bars.pairs].tolist(), bars.kind.tolist(), bars.chosen.tolist(), data, links, _tips(bars), strict=True
+    )
+    out: list[str] = []
+    for (a, b), kind, chosen, path, link, tip in rows:
+        tag = f'class="yaw-arc" data-touch="select:{a},{b}" d="{path}" {LOOKS[kind]}{EDGE if chosen else ""}'
+        if path:
+            out.append(f"<path {tag}><title>{a} and {b}, {KINDS[kind]}: {tip}</title></path>")
+        if link:
+            out.append(f'<path class="yaw-second{" chosen" if chosen else ""}" d="{link}" {LINK}/>')
+    return out
+
+
+def _bar_data(bars: Bars, whole: Scale, part: Scale, pitch: float, window: Window) -> tuple[list[str], list[str]]:
+    """The data of two paths for every pair: of its arcs in the window; and, if it has a second arc or is chosen, of
+    ticks at all of its arcs over the whole circle and of what joins them, there and in the window.
+    """
+    arc, low, high = spans_in(bars.lo_deg, bars.hi_deg, window)
+    left = part.px(low)
+    width = np.maximum(1.5, part.px(high) - left)
+    top = WINDOW_FOOT_PX + 6.0 + pitch * bars.row[arc]
+    data, links = [""] * len(bars.pairs), [""] * len(bars.pairs)
+    linked = ((bars.count > 1) | bars.chosen)[bars.owner]
+    boxes = _each(f"M%.1f %.1fh%.1fv{0.78 * pitch:.1f}h-%.1fz", left, top, width, width)
+    spots = _each("%.1f %.1f", left + 0.5 * width, top + 0.39 * pitch)
+    for pair, link, text, spot in zip(bars.owner[arc].tolist(), linked[arc].tolist(), boxes, spots, strict=True):
+        data[pair] += text
+        if link:
+            links[pair] += f"{'L' if links[pair] else 'M'}{spot}"
+    middles = whole.px(wrapped_deg(0.5 * (bars.lo_deg + bars.hi_deg)))
+    ends = whole.px(np.maximum(bars.lo_deg, -180.0)), whole.px(np.minimum(bars.hi_deg, 180.0))
+    ticks = _each(f"M%.1f {CIRCLE_FOOT_PX - 2:g}H%.1f", ends[0], np.maximum(ends[1], ends[0] + 1.5))
+    before: dict[int, float] = {}
+    for k in np.flatnonzero(linked).tolist():
+        pair, middle = int(bars.owner[k]), float(middles[k])
+        links[pair] += ticks[k]
+        if pair in before:
+            links[pair] += _arch(before[pair], middle)
+        before[pair] = middle
+    return data, links
+
+
+def _arch(a: float, b: float) -> str:
+    foot, top = CIRCLE_FOOT_PX - 4, CIRCLE_TOP_PX - 12
+    return f"M{a:.1f} {foot:g}Q{0.5 * (a + b):.1f} {top:g} {b:.1f} {foot:g}"
+
+
+def _each(template: str, *columns: NDArray[np.floating]) -> list[str]:
+    """The template filled in with each row of the columns (K,): one formatting is much faster than K."""
+    flat = np.column_stack(columns).ravel().tolist()
+    return (f"{template}\n" * len(columns[0]) % tuple(flat)).split("\n")[:-1]
+
+
+def _tips(bars: Bars) -> list[str]:
+    """The ends of every pair's arcs to read, those in the window first."""
+    order = np.lexsort((bars.row < 0, bars.owner))
+    texts = _each("%.2f° to %.2f°", bars.lo_deg[order], wrapped_deg(bars.hi_deg[order]))
+    for k in np.flatnonzero((bars.hi_deg - bars.lo_deg)[order] >= 360.0).tolist():
+        texts[k] = "every yaw"
+    tips = [""] * len(bars.pairs)
+    for pair, text in zip(bars.owner[order].tolist(), texts, strict=True):
+        tips[pair] += f", second arc {text}" if tips[pair] else text
+    return [tip.replace("-", MINUS) for tip in tips]
+
 
 PEAK, WHOLE = "Zoom to the peak", "All yaws"
 LEAST_DRAG = 0.012

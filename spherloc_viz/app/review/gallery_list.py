@@ -8,12 +8,12 @@ from pathlib import Path
 import viser
 
 from spherloc_viz import style
-from spherloc_viz.app.background_worker import BackgroundWorker
 from spherloc_viz.app.review.filters import pill
 from spherloc_viz.app.review.rows import OPENED, RULE, picture_html
 from spherloc_viz.app.review.run_library import RunLibrary
 from spherloc_viz.app.text import DIM, box, status_html
 from spherloc_viz.app.web.touch import Touch, Touches
+from spherloc_viz.app.workers import BackgroundWorker
 from spherloc_viz.gallery import GALLERY, GalleryCase, Play, gallery_cases
 from spherloc_viz.recording.replay.reopen import Reopened
 from spherloc_viz.recording.run_row import RunRow

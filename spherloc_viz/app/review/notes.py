@@ -9,13 +9,13 @@ from html import escape
 import viser
 
 from spherloc.errors import SpherlocError
-from spherloc_viz.app.background_worker import BackgroundWorker
 from spherloc_viz.app.review.filters import pill
 from spherloc_viz.app.review.run_library import RunLibrary
 from spherloc_viz.app.text import box
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.web.viser_internals import at_once, changes_of, put
-from spherloc_viz.recording.review.notes import Review, checked_review
+from spherloc_viz.app.workers import BackgroundWorker
+from spherloc_viz.recording.reviews import Review, checked_review
 from spherloc_viz.recording.run_row import RunRow
 
 PAUSE_S = 0.7

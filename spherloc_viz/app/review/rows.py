@@ -8,12 +8,11 @@ from html import escape
 from spherloc.diagnosis import Cause
 from spherloc_viz import style
 from spherloc_viz.app.review import words
-from spherloc_viz.app.review.filters import key_html, keyed, pill, sorting_html
-from spherloc_viz.app.review.look import PAGE, Look
+from spherloc_viz.app.review.filters import PAGE, Look, key_html, keyed, pill, sorting_html
 from spherloc_viz.app.text import DIM, box, dot_html
-from spherloc_viz.app.web.viewer_room import viewer_link
+from spherloc_viz.app.web.viewer import viewer_link
 from spherloc_viz.recording.run_row import RunRow
-from spherloc_viz.recording.sandbox.checked_row import is_thumbnail
+from spherloc_viz.recording.sandbox.checks import is_thumbnail
 
 WIDTH_PX, HEIGHT_PX = 64, 46
 """Of a row's picture."""

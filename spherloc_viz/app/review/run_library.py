@@ -8,12 +8,11 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from spherloc.errors import RecordingError
-from spherloc_viz.app.review.filters import Counts
-from spherloc_viz.app.review.look import EXACT, JUDGED, PAGE, Look
+from spherloc_viz.app.review.filters import EXACT, JUDGED, PAGE, Counts, Look
 from spherloc_viz.recording.content.reader import RecordedRun, read_recording
 from spherloc_viz.recording.index.query import MAX_TEXT, RunQuery
 from spherloc_viz.recording.index.run_index import Found, RunIndex
-from spherloc_viz.recording.review.notes import Review
+from spherloc_viz.recording.reviews import Review
 from spherloc_viz.recording.run_row import RunRow
 from spherloc_viz.recording.sandbox.examiner import examine, resolve_inside
 

@@ -10,14 +10,13 @@ from html import escape
 import viser
 
 from spherloc.errors import SpherlocError
-from spherloc_viz.app.background_worker import BackgroundWorker
-from spherloc_viz.app.review.filters import filters_html, pill
-from spherloc_viz.app.review.look import EXACT, OUTLIERS, Look
+from spherloc_viz.app.review.filters import EXACT, OUTLIERS, Look, filters_html, pill
 from spherloc_viz.app.review.rows import rows_html
 from spherloc_viz.app.review.run_library import RunLibrary
 from spherloc_viz.app.text import DIM, box, status_html
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.web.viser_internals import put
+from spherloc_viz.app.workers import BackgroundWorker
 from spherloc_viz.recording.index.query import MAX_TEXT
 
 FOLLOW_S = 1.5

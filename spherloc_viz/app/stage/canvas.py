@@ -6,7 +6,7 @@ from collections.abc import Callable
 import numpy as np
 import viser
 
-from spherloc_viz.app.controls.display_controls import DisplayControls
+from spherloc_viz.app.controls.controls import DisplayControls
 from spherloc_viz.app.run_request import Run
 from spherloc_viz.app.stage import views
 from spherloc_viz.app.stage.painter import Painter

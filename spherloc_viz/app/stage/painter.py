@@ -9,9 +9,8 @@ import trimesh
 import viser
 import viser.transforms as vtf
 
-from spherloc_viz.app.stage.colors import light_bytes, surface_bytes
+from spherloc_viz.app.stage.appearance import light_bytes, surface_bytes, textured_glb
 from spherloc_viz.app.stage.picking import inside, nearest, viewer_of
-from spherloc_viz.app.stage.texture import textured_glb
 from spherloc_viz.layers.primitives import Balls, Label, Mesh, Points, SceneItem, Segments, Textured
 
 OnPick = Callable[[tuple[int, ...], bool], None]

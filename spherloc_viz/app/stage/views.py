@@ -7,7 +7,7 @@ import viser
 
 from spherloc.geometry import yaw_rotation
 from spherloc.types import FloatArray
-from spherloc_viz.layers.focus import RING_ROOM, SPHERE_ROOM, ball_boxes, circle, dense_points, sphere_box
+from spherloc_viz.layers.frame import RING_ROOM, SPHERE_ROOM, ball_boxes, circle, dense_points, sphere_box
 from spherloc_viz.layers.primitives import Balls, Mesh, Picture, Points, SceneItem, Segments, Textured
 
 FIELD_OF_VIEW_RAD = np.radians(45.0)

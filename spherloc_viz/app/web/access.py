@@ -13,7 +13,7 @@ from urllib.parse import urlencode
 from aiohttp import web
 
 from spherloc_viz.app.web.guard import SAFE
-from spherloc_viz.app.web.viewer_page import SORRY_POLICY, sorry_page
+from spherloc_viz.app.web.viewer import SORRY_POLICY, sorry_page
 
 TOKEN = "token"
 """What the token is called in a link."""

@@ -12,7 +12,7 @@ from spherloc_viz.app.web.access import NO_TOKEN, Access, Role, refused
 from spherloc_viz.app.web.downloads import DOWNLOADS, Downloads
 from spherloc_viz.app.web.guard import SAFE, refusal
 from spherloc_viz.app.web.page import Page, load_page
-from spherloc_viz.app.web.viewer_room import NOT_RECORDED, PAGE, ViewerRoom
+from spherloc_viz.app.web.viewer import NOT_RECORDED, PAGE, ViewerRoom
 from spherloc_viz.app.web.viser_internals import KEY_HEADER, ROLE_HEADER
 
 MAX_MESSAGE_BYTES = 50 * 1024 * 1024

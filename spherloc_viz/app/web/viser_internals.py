@@ -5,7 +5,9 @@ import contextlib
 import contextvars
 import hmac
 import io
+import logging
 import time
+import traceback
 import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future
@@ -14,10 +16,47 @@ from typing import Any, TypeVar
 import numpy as np
 import viser
 import websockets.asyncio.server
+from aiohttp.http_exceptions import HttpProcessingError
 from viser import _messages
 
 from spherloc_viz.app.web.changes import Changes
-from spherloc_viz.app.web.terminal import keep_tracebacks_short, tell_in_short
+
+log = logging.getLogger(__name__)
+
+
+def keep_tracebacks_short() -> None:
+    """Have requests that are none pass in silence, and a page that sends what is no message told in a line."""
+    logging.getLogger("aiohttp.server").addFilter(_is_news)
+    logging.getLogger("websockets.server").addFilter(_in_short)
+    warnings.filterwarnings("ignore", message=r"\[viser\] .* does not match annotation")
+
+
+def tell_in_short(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+    """A loop's exception handler: a line of what a page's message raised, unless the error is ours."""
+    error = context.get("exception")
+    if isinstance(error, Exception) and not _is_ours(error):
+        log.warning("a page sent a value that is none; it was left out (%s).", type(error).__name__)
+    else:
+        loop.default_exception_handler(context)
+
+
+def _is_news(record: logging.LogRecord) -> bool:
+    """Not what was answered with a 400 already, nor that the other side has gone."""
+    error = record.exc_info[1] if record.exc_info else None
+    return not isinstance(error, HttpProcessingError | ConnectionError)
+
+
+def _in_short(record: logging.LogRecord) -> bool:
+    error = record.exc_info[1] if record.exc_info else None
+    if isinstance(error, Exception) and not _is_ours(error):
+        record.levelno, record.levelname, record.args, record.exc_info = logging.WARNING, "WARNING", (), None
+        record.msg = f"a page was cut off, since what it sent is no message of a page ({type(error).__name__})."
+    return True
+
+
+def _is_ours(error: Exception) -> bool:
+    return any("spherloc_viz" in frame.filename for frame in traceback.extract_tb(error.__traceback__))
+
 
 KEY_HEADER = "X-Spherloc-Key"
 """Request header that carries the key; a web page cannot set headers on a websocket, a program can."""
@@ -282,3 +321,47 @@ def _wake_on_loop(server: viser.ViserServer) -> None:
 
     # Before viser's own callback, from which on messages are queued, and before anybody waits for one.
     sockets._client_connect_cb.insert(0, connected)
+
+
+MOST_AT_ONCE = 2
+"""Files on their way."""
+LEAST_PART_BYTES = 4096
+"""The page sends parts of half a megabyte; far smaller ones would fill the memory with their bookkeeping."""
+
+
+def limit_uploads(client: viser.ClientHandle, most_bytes: int, complain: Callable[[str], None]) -> None:
+    """Drop files of more than ``most_bytes``, whether the page says so or just sends more; tell ``complain`` why."""
+    gui, connection = client.gui, client._websock_connection
+    begin, add = gui._handle_file_transfer_start, gui._handle_file_transfer_part
+    under_way = gui._current_file_upload_states
+
+    def refuse(message: Any, sentence: str) -> None:
+        # Else the page would wait for ever, with its button disabled.
+        ack = _messages.FileTransferPartAck(message.source_component_uuid, message.transfer_uuid, 1, 1)
+        connection.queue_message(ack)
+        complain(sentence)
+
+    def checked_begin(client_id: Any, message: Any) -> None:
+        parts = max(1, most_bytes // LEAST_PART_BYTES)
+        if not (0 <= message.size_bytes <= most_bytes and 0 <= message.part_count <= parts):
+            refuse(message, f"the file is larger than {most_bytes / 1e6:.2g} MB; upload a smaller one.")
+        elif len(under_way) >= MOST_AT_ONCE:
+            refuse(message, "two files are on their way already; wait for them.")
+        else:
+            begin(client_id, message)
+
+    def checked_add(client_id: Any, message: Any) -> None:
+        state = under_way.get(message.transfer_uuid)
+        if state is not None and state["transferred_bytes"] + len(message.content) > state["total_bytes"]:
+            under_way.pop(message.transfer_uuid, None)
+            refuse(message, "the file is larger than it said; upload it again.")
+            return
+        add(client_id, message)
+
+    handlers: Any = (
+        (_messages.FileTransferStartUpload, begin, checked_begin),
+        (_messages.FileTransferPart, add, checked_add),
+    )
+    for kind, original, checked in handlers:
+        connection.unregister_handler(kind, original)
+        connection.register_handler(kind, checked)

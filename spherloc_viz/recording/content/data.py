@@ -9,6 +9,7 @@ in format 1 each array a column.
 
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
@@ -24,10 +25,10 @@ from spherloc.datasets.variation import Variation
 from spherloc.diagnosis import Cause, Diagnosis
 from spherloc.problem import Problem
 from spherloc.trace import Certificate, Trace
+from spherloc_viz.layers.key_step import StepNumbers
 from spherloc_viz.options import plain
-from spherloc_viz.recording.content.columns import Values, static_chunk
-from spherloc_viz.recording.origin import Origin
-from spherloc_viz.recording.storage.machine import machine
+from spherloc_viz.recording.content.columns import Times, Values, static_chunk
+from spherloc_viz.recording.origin import Origin, machine
 
 MAX_ARRAY_BYTES = 16_384
 """Stage arrays above this are left out of a lean recording: they follow from the problem, the options and the seed."""
@@ -205,3 +206,25 @@ def _numpy(values: pa.Array) -> NDArray[Any]:
     array = values.to_numpy(zero_copy_only=False).reshape(shape)
     array.setflags(write=False)
     return array
+
+
+NUMBERS = "/numbers"
+"""Its columns are the fields of ``StepNumbers``."""
+TYPES = {
+    "stage": pa.utf8(),
+    "key": pa.utf8(),
+    "agreeing": pa.int64(),
+    "rotation_error_deg": pa.float64(),
+    "translation_error_m": pa.float64(),
+}
+
+
+def numbers_chunk(numbers: Sequence[StepNumbers]) -> Chunk:
+    """A row a step; what is unknown there is null."""
+    columns = []
+    for name, kind in TYPES.items():
+        values = [getattr(row, name) for row in numbers]
+        known = [k for k, value in enumerate(values) if value is not None]
+        column = Values(rr.ComponentDescriptor(name), pa.array([values[k] for k in known], kind), [1] * len(known))
+        columns.append(column.among(known, len(values)))
+    return Chunk.from_columns(NUMBERS, [Times(pa.array([row.step for row in numbers], pa.int64()))], columns)

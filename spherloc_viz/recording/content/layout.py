@@ -14,10 +14,10 @@ from rerun.blueprint import archetypes
 
 from spherloc_viz.layers.primitives import Chart, Picture
 from spherloc_viz.recording.content.drawing import chart_path, table_path
-from spherloc_viz.recording.content.letters import legible
 from spherloc_viz.recording.content.panels import ARCS, GRAPH, RESIDUALS, Panels
 from spherloc_viz.recording.content.properties import APPLICATION_ID, REVIEW_ENTITY
 from spherloc_viz.recording.content.rrd_file import RrdFile, split
+from spherloc_viz.recording.content.text import legible
 
 EYE = (1.15, -1.2, -1.55)
 """Where one looks from, in the frame in which the scene has radius 1: from the same side as the page's overview."""

@@ -15,7 +15,6 @@ from spherloc.types import FloatArray
 from spherloc_viz import style
 from spherloc_viz.layers.frame import even
 from spherloc_viz.layers.residuals import Histogram, residuals_of
-from spherloc_viz.recording.content.chart_bars import Bars
 from spherloc_viz.recording.content.columns import (
     STRIP_2D,
     VECTOR_2D,
@@ -26,7 +25,7 @@ from spherloc_viz.recording.content.columns import (
     static_chunk,
     vectors,
 )
-from spherloc_viz.recording.content.components import PARTS
+from spherloc_viz.recording.content.components import PARTS, Bars
 
 ARCS, GRAPH, RESIDUALS = "/arcs", "/graph", "/charts/residuals"
 MOST_ARCS = 120

@@ -22,7 +22,7 @@ from spherloc.problem import Problem
 from spherloc.trace import Trace
 from spherloc_viz.options import json_text
 from spherloc_viz.recording.content.columns import Values, encoded_image, static_chunk
-from spherloc_viz.recording.content.letters import legible
+from spherloc_viz.recording.content.text import legible
 from spherloc_viz.recording.origin import Origin
 from spherloc_viz.recording.run_row import STORED_AS, RunRow
 

@@ -36,7 +36,7 @@ from spherloc_viz.recording.content.properties import (
     row_from_properties,
 )
 from spherloc_viz.recording.origin import Origin
-from spherloc_viz.recording.review.notes import read_review
+from spherloc_viz.recording.reviews import read_review
 from spherloc_viz.recording.run_row import RunRow
 
 STAGES = "stages/"

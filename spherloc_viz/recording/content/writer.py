@@ -15,23 +15,20 @@ from spherloc.errors import RecordingError
 from spherloc.metrics import evaluate
 from spherloc.trace import Trace
 from spherloc_viz.layers import paint, steps
-from spherloc_viz.layers.key_step import key_step
+from spherloc_viz.layers.key_step import key_step, step_numbers
 from spherloc_viz.layers.primitives import Picture, Stop
-from spherloc_viz.layers.step_numbers import step_numbers
 from spherloc_viz.recording.content.columns import markdown, static_chunk
-from spherloc_viz.recording.content.data import data_chunk
+from spherloc_viz.recording.content.data import data_chunk, numbers_chunk
 from spherloc_viz.recording.content.drawing import drawing_chunks
 from spherloc_viz.recording.content.layout import layout_file, shown_in
-from spherloc_viz.recording.content.markdown import outcome_text
-from spherloc_viz.recording.content.numbers import numbers_chunk
 from spherloc_viz.recording.content.panels import Panels, panel_chunks, panels_of
+from spherloc_viz.recording.content.pictures import image_chunks, query_image, thumbnail
 from spherloc_viz.recording.content.properties import APPLICATION_ID, property_chunks, run_row
-from spherloc_viz.recording.content.query_image import image_chunks, query_image
 from spherloc_viz.recording.content.rrd_file import append
-from spherloc_viz.recording.content.thumbnail import thumbnail
+from spherloc_viz.recording.content.text import outcome_text
 from spherloc_viz.recording.origin import Origin
 from spherloc_viz.recording.run_row import RunRow
-from spherloc_viz.recording.storage.leftovers import unfinished
+from spherloc_viz.recording.storage.unfinished import unfinished
 
 EXPLAINING = frozenset(
     {

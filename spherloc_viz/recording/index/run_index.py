@@ -11,11 +11,10 @@ from typing import Self, TypeVar
 
 from spherloc.errors import InputError, RecordingError, show
 from spherloc_viz.recording.index import file as index_file
-from spherloc_viz.recording.index.filters import condition, groups, order
-from spherloc_viz.recording.index.query import GROUP_KEYS, RunQuery
+from spherloc_viz.recording.index.query import GROUP_KEYS, RunQuery, condition, groups, order
 from spherloc_viz.recording.index.refresh import Examine, Progress, Refreshed, Refresher, examine_side_by_side, stamp_of
 from spherloc_viz.recording.index.rows import DamagedError, put, rows_of
-from spherloc_viz.recording.review.notes import Review, write_review
+from spherloc_viz.recording.reviews import Review, write_review
 from spherloc_viz.recording.run_row import RunRow
 from spherloc_viz.recording.sandbox.examiner import Examiners, check_name, examine
 

@@ -11,7 +11,7 @@ from spherloc.errors import SpherlocError, show
 from spherloc.problem import Problem
 from spherloc_viz.recording.content.reader import RecordedRun
 from spherloc_viz.recording.origin import Origin
-from spherloc_viz.recording.replay.same import different_fields
+from spherloc_viz.recording.replay.repeat import different_fields
 from spherloc_viz.recording.replay.scene import RecordedScene, recorded_options
 from spherloc_viz.share import is_recording
 

@@ -1,22 +1,43 @@
 """Repeats a recorded run and compares: the same to the last bit, or what differs and what may be why."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from spherloc.errors import InputError, RecordingError
-from spherloc.estimators import estimate
+from spherloc.errors import InputError, RecordingError, SpherlocError
+from spherloc.estimators import estimate, warm_up
 from spherloc.metrics import rotation_error_deg, translation_error_m
 from spherloc.problem import Problem
 from spherloc.trace import Certificate, Trace
 from spherloc.types import FloatArray
+from spherloc_viz.options import json_text
 from spherloc_viz.recording.content.reader import RecordedRun
-from spherloc_viz.recording.replay.same import same_bits
+from spherloc_viz.recording.origin import machine
 from spherloc_viz.recording.replay.scene import load_recorded_scene, missing_options, recorded_options
-from spherloc_viz.recording.storage.machine import machine
+
+WORDS = {"name", "scene", "image", "reference_images", "remarks"}
+"""Fields that only people read."""
+
+
+def same_bits(a: Any, b: Any) -> bool:
+    """Whether two arrays or numbers, or None, are equal in type, shape and every bit; NaN equals itself."""
+    if a is None or b is None:
+        return a is b
+    left, right = np.asarray(a), np.asarray(b)
+    return left.dtype == right.dtype and left.shape == right.shape and left.tobytes() == right.tobytes()
+
+
+def different_fields(a: Problem, b: Problem) -> tuple[str, ...]:
+    """Names of the fields in which two problems differ, but for the words about them."""
+    names = [item.name for item in fields(Problem) if item.name not in WORDS | {"camera"}]
+    changed = [name for name in names if not same_bits(getattr(a, name), getattr(b, name))]
+    same_camera = type(a.camera) is type(b.camera) and a.camera.to_dict() == b.camera.to_dict()
+    return (*([] if same_camera else ["camera"]), *changed)
+
 
 ROUNDING = 1e-9
 """Numbers that differ by no more, relative to the largest of a pose's, differ by rounding."""
@@ -145,3 +166,75 @@ def _certificates(before: Certificate | None, now: Certificate | None) -> Differ
         and bool(np.isclose(before.nfa, now.nfa, rtol=ROUNDING, atol=0.0, equal_nan=True))
     )
     return Difference("certificate", f"{said[0]} was recorded, {said[1]} is found now.", near)
+
+
+def repeat_all(paths: Sequence[Path], as_json: bool, solve: Solve | None = None) -> int:
+    """Repeat recordings and print the outcome of each; returns the exit code.
+
+    0 if all are the same, 1 if one differs, 2 if one cannot be repeated, which is reported while the others still are.
+    ``solve`` does it in the place of ``estimate``. Raises ``InputError`` if there is none.
+    """
+    if not paths:
+        raise InputError("no recording given; name one or more files (.rrd).")
+    warm_up(_say)
+    worst = 0
+    for done, path in enumerate(paths):
+        try:
+            repeated = repeat(path, solve)
+        except KeyboardInterrupt:
+            _say(f"stopped in {path}; {done} of {len(paths)} recordings were repeated.")
+            raise
+        except SpherlocError as error:
+            _say(str(error))
+            worst = 2
+            continue
+        print(json_text(as_record(repeated)) if as_json else as_text(repeated), flush=True)
+        worst = max(worst, 0 if repeated.same else 1)
+    return worst
+
+
+def _say(sentence: str) -> None:
+    print(f"spherloc: {sentence}", file=sys.stderr, flush=True)
+
+
+def as_text(repeated: Repeated) -> str:
+    """A few lines; the first says whether it is the same run."""
+    run = repeated.run
+    what = f"{run.problem.name}, {run.estimator}, seed {run.seed}"
+    lines = [f"{repeated.path}: {verdict(repeated)}", f"  {what}"]
+    lines += [f"  {item.what}: {item.sentence}" for item in repeated.differences]
+    if repeated.assumed:
+        lines.append(f"  the recording does not know {', '.join(repeated.assumed)}: taken as by default")
+    for item in repeated.versions:
+        if repeated.same and item.recorded is None:
+            continue  # what an older recording does not say has changed nothing
+        lines.append(f"  {item.name}: {item.recorded or 'not recorded'} then, {item.here or 'none'} now")
+    # What an untrusted file says must not steer the terminal.
+    return "\n".join("".join(letter if letter.isprintable() else " " for letter in line) for line in lines)
+
+
+def verdict(repeated: Repeated) -> str:
+    """Whether it is the same run, as the end of a sentence."""
+    if repeated.same:
+        return "the same to the last bit"
+    return "differs by rounding only" if repeated.rounding else "differs"
+
+
+def as_record(repeated: Repeated) -> dict[str, Any]:
+    """The same as what ``json_text`` writes."""
+    run, trace = repeated.run, repeated.trace
+    poses = [None if pose is None else pose.tolist() for pose in (run.cam_from_map, trace.cam_from_map)]
+    return {
+        "recording": str(repeated.path),
+        "name": run.problem.name,
+        "estimator": run.estimator,
+        "seed": run.seed,
+        "options": asdict(trace.options),
+        "same": repeated.same,
+        "rounding": repeated.rounding,
+        "differences": [asdict(item) for item in repeated.differences],
+        "recorded_cam_from_map": poses[0],
+        "cam_from_map": poses[1],
+        "assumed_options": list(repeated.assumed),
+        "versions": [asdict(item) for item in repeated.versions],
+    }

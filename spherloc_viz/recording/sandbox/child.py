@@ -23,10 +23,9 @@ from rerun.error_utils import RerunWarning
 from spherloc.errors import RecordingError, SpherlocError
 from spherloc_viz.recording.content.properties import APPLICATION_ID
 from spherloc_viz.recording.content.reader import check_recording, read_recording
-from spherloc_viz.recording.review.notes import read_review
+from spherloc_viz.recording.reviews import read_review
 from spherloc_viz.recording.run_row import RunRow
-from spherloc_viz.recording.sandbox.checked_row import row_from_table, table_from_row
-from spherloc_viz.recording.sandbox.content_check import check_content, check_run
+from spherloc_viz.recording.sandbox.checks import check_content, check_run, row_from_table, table_from_row
 
 try:
     import resource

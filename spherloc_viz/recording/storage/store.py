@@ -1,28 +1,29 @@
 """A folder of recordings as its writers see it: a run becomes a file and a row, and old successes make room."""
 
 import contextlib
+import json
 import re
 import threading
 import unicodedata
 import uuid
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
+from functools import lru_cache
 from pathlib import Path
 from typing import Self
 
 from spherloc.diagnosis import Diagnosis
 from spherloc.errors import RecordingError
+from spherloc.experiments.sweep import Job, SweepPlan
 from spherloc.trace import Trace
 from spherloc_viz.recording.content.writer import write_recording
 from spherloc_viz.recording.index.run_index import RunIndex
 from spherloc_viz.recording.origin import Origin
-from spherloc_viz.recording.review.notes import has_review
+from spherloc_viz.recording.reviews import has_review
 from spherloc_viz.recording.sandbox.examiner import Examiners, examine_review
-from spherloc_viz.recording.storage.leftovers import leftovers
-from spherloc_viz.recording.storage.rescue import rescue
-from spherloc_viz.recording.storage.retention import Pruned, prune
-from spherloc_viz.recording.storage.room import KEEP_BYTES, size_words
+from spherloc_viz.recording.storage.retention import KEEP_BYTES, Pruned, prune, size_words
+from spherloc_viz.recording.storage.unfinished import here, leftovers, rescue
 
 GALLERY = "gallery"
 """The folder inside that has the curated cases."""
@@ -188,3 +189,53 @@ def _names(paths: Sequence[Path]) -> str:
 def _slug(text: str) -> str:
     ascii_text = unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode()
     return re.sub(r"[^a-z0-9]+", "-", ascii_text.lower()).strip("-")[:60] or "run"
+
+
+@dataclass(frozen=True)
+class SweepStore:
+    """Keeps the runs of all workers on the machine where it was made; others cannot reach its folder.
+
+    A run that is done again, because its worker was killed or its sweep interrupted, replaces its own recording.
+    Nothing is deleted to make room: that is for one process to do, which has a ``RecordingStore``.
+    """
+
+    folder: Path
+    """Of the recordings, absolute."""
+    machine: str = field(default_factory=here)
+    """Where it was made."""
+
+    def __call__(self, plan: SweepPlan, job: Job, trace: Trace) -> str:
+        """Record a run; returns why that failed, in a sentence."""
+        if here() != self.machine:
+            return ""
+        origin = Origin("sweep", plan.scene, plan.first_seed + job.run, None, plan.variation_at(job.value))
+        store, told = _store(self.folder)
+        try:
+            run_id = sweep_run_id(plan, job)
+            store.record(trace, origin, path=self.folder / sweep_file_name(trace, run_id), run_id=str(run_id))
+        except RecordingError as error:
+            return str(error)
+        except Exception as error:  # a bug in drawing one run must not end the sweep
+            return f"{plan.place(job)}: the run cannot be recorded: {error!r}."
+        sentence = " ".join(told)
+        told.clear()
+        return sentence
+
+
+def sweep_run_id(plan: SweepPlan, job: Job) -> uuid.UUID:
+    """What tells a run of a sweep from others: a hash of all that decides its result."""
+    table = plan.record()
+    shared = {name: table[name] for name in ("scene", "scene_sha256", "camera_sha256", "versions")}
+    own = {
+        "variation": plan.variation_at(job.value).simulation,
+        "estimator": table["entrants"][job.entrant],
+        "seed": plan.first_seed + job.run,
+    }
+    return uuid.uuid5(uuid.NAMESPACE_URL, json.dumps(shared | own, sort_keys=True))
+
+
+@lru_cache(maxsize=1)
+def _store(folder: Path) -> tuple[RecordingStore, list[str]]:
+    """This process's own, and what it has to say."""
+    told: list[str] = []
+    return RecordingStore(folder, told.append, keep_bytes=None), told

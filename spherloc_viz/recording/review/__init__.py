@@ -1,1 +1,0 @@
-"""Labels and notes, in a file beside the run."""

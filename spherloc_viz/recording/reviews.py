@@ -1,0 +1,181 @@
+"""A review as a file of Rerun: a property that queries see, and a text for people."""
+
+import contextlib
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import rerun as rr
+from rerun.chunk import Chunk, LazyChunkStream, RrdReader
+from rerun.error_utils import RerunWarning
+
+from spherloc.errors import InputError, RecordingError, show
+from spherloc_viz.recording.content.properties import APPLICATION_ID, REVIEW_ENTITY, REVIEW_PROPERTY
+from spherloc_viz.recording.content.text import plain
+
+
+def write_file(path: Path, labels: Sequence[str], note: str, run_id: str) -> None:
+    """Write labels and note as a layer of the recording with this id. Raises ``OSError`` and what rerun raises."""
+    values: dict[str, Any] = {"labels": pa.array(labels, pa.string()), "note": pa.array([note], pa.string())}
+    lines = [" ".join(f"**{plain(label)}**" for label in labels), *map(plain, note.splitlines())]
+    document = rr.TextDocument.columns(text=["\n\n".join(lines).strip()], media_type=[rr.MediaType.MARKDOWN])
+    chunks = [
+        Chunk.from_property(REVIEW_PROPERTY, rr.AnyValues(**values)),
+        Chunk.from_columns(REVIEW_ENTITY, [], document),
+    ]
+    LazyChunkStream.from_iter(chunks).write_rrd(path, application_id=APPLICATION_ID, recording_id=run_id)
+
+
+def read_file(path: Path, most_labels: int) -> tuple[list[str], str]:
+    """Labels and note of a file. Raises ``TypeError``, ``ValueError`` and what rerun raises if it is damaged."""
+    found = _reader(path).stream().filter(content=[f"/__properties/{REVIEW_PROPERTY}"]).to_chunks()
+    (batch,) = (chunk.to_record_batch() for chunk in found)
+    batch.validate(full=True)
+    (note,) = _texts(batch.column("note"), 1)
+    return _texts(batch.column("labels"), most_labels), note
+
+
+def _texts(column: pa.Array, most: int) -> list[str]:
+    """The only cell of a column of lists of texts; looked at before it becomes Python's, which could take gigabytes."""
+    if len(column) != 1 or column.type != pa.list_(pa.string()) or len(column[0].values or ()) > most:
+        raise TypeError("not one list of texts")
+    return [value for value in column[0].as_py() if value is not None]
+
+
+def recording_id(recording: Path) -> str:
+    """The recording's id. Raises ``RecordingError`` if it is none of ours."""
+    if not recording.is_file():
+        raise RecordingError(f"{recording}: no such file; give the path of a recording (.rrd).")
+    with contextlib.suppress(OSError, RuntimeError, ValueError):
+        for entry in _reader(recording).recordings():
+            if entry.application_id == APPLICATION_ID:
+                return entry.recording_id
+    raise RecordingError(f"{recording}: not a whole recording (.rrd); give one that spherloc wrote.")
+
+
+def _reader(path: Path) -> RrdReader:
+    """Raises ``ValueError`` for a file without its end, of which rerun only warns."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RerunWarning)
+        try:
+            return RrdReader(path)
+        except RerunWarning as warning:
+            raise ValueError(str(warning)) from warning
+
+
+REVIEW_SUFFIX = ".review.rrd"
+"""Ends the name of a review file, which otherwise is that of its run."""
+MOST_LABELS = 20
+MOST_LABEL_CHARACTERS = 40
+MOST_NOTE_CHARACTERS = 4_000
+MOST_BYTES = 1 << 20
+"""Of a review file, which has 6 kB and the text."""
+UNREADABLE = "labels and note cannot be read; delete the file and label the run again."
+
+
+@dataclass(frozen=True)
+class Review:
+    """What a reviewer said about a run."""
+
+    labels: tuple[str, ...] = ()
+    """Words, each once."""
+    note: str = ""
+    """Text, of several lines perhaps."""
+
+
+def checked_review(labels: Sequence[str], note: str) -> Review:
+    """Labels and a note as they are stored: without spaces around them, no label twice, no control characters.
+
+    Raises ``InputError`` if there are more or longer ones than are stored.
+    """
+    clean = tuple(dict.fromkeys(label for label in (_line(text) for text in labels) if label))
+    if len(clean) > MOST_LABELS:
+        raise InputError(f"{len(clean)} labels are too many for a run: give at most {MOST_LABELS}.")
+    for label in clean:
+        if len(label) > MOST_LABEL_CHARACTERS:
+            raise InputError(f"the label {show(label)} is too long: give at most {MOST_LABEL_CHARACTERS} characters.")
+    text = "\n".join(_printable(line).rstrip() for line in note.splitlines()).strip()
+    if len(text) > MOST_NOTE_CHARACTERS:
+        raise InputError(f"a note of {len(text)} characters is too long: give at most {MOST_NOTE_CHARACTERS}.")
+    return Review(clean, text)
+
+
+def _line(text: str) -> str:
+    return " ".join(_printable(text).split())
+
+
+def _printable(text: str) -> str:
+    return "".join(character if character.isprintable() else " " for character in text)
+
+
+def review_path(recording: Path) -> Path:
+    """The review file of a recording, whether or not there is one."""
+    return recording.with_name(recording.name.removesuffix(".rrd") + REVIEW_SUFFIX)
+
+
+def reviewed_name(name: str) -> str:
+    """The name of the recording whose review file has this name."""
+    stem = name.removesuffix(REVIEW_SUFFIX)
+    # "a.RRD" is a recording too, and keeps its ending.
+    return stem if stem.lower().endswith(".rrd") and not stem.endswith(".rrd") else f"{stem}.rrd"
+
+
+def has_review(recording: Path) -> bool:
+    """Whether there is a review file; none has a name that is too long for the disk."""
+    try:
+        review_path(recording).stat()
+    except OSError:
+        return False
+    return True
+
+
+def write_review(recording: Path, labels: Sequence[str], note: str, run_id: str | None = None) -> Review:
+    """Store labels and a note beside a recording, in place of those before, and return them as they are stored.
+
+    Without any, the file is removed. ``run_id`` is that of the recording, which is read if it is not given. A reader
+    never sees half a file. Raises ``InputError`` if they are too long, ``RecordingError`` if they cannot be written.
+    """
+    # Here, as lists of runs need only names and limits of this file, and rerun takes a second to load.
+    from spherloc_viz.recording.reviews import recording_id, write_file
+    from spherloc_viz.recording.storage.unfinished import unfinished
+
+    review = checked_review(labels, note)
+    path = review_path(Path(recording))
+    part = unfinished(path)
+    try:
+        if review == Review():
+            path.unlink(missing_ok=True)
+            return review
+        write_file(part, review.labels, review.note, run_id or recording_id(Path(recording)))
+        part.replace(path)
+    except (OSError, RuntimeError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise RecordingError(
+            f"{path}: labels and note cannot be stored ({reason}); make room or check the folder."
+        ) from error
+    finally:
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
+    return review
+
+
+def read_review(recording: Path) -> Review:
+    """Labels and note of a recording; empty if it has none.
+
+    Raises ``RecordingError``, in one sentence, if the file that has them is damaged.
+    """
+    path = review_path(Path(recording))
+    if not has_review(Path(recording)):
+        return Review()
+    from spherloc_viz.recording.reviews import read_file
+
+    damaged = RecordingError(f"{path}: {UNREADABLE}")
+    try:
+        if not path.is_file() or path.stat().st_size > MOST_BYTES:
+            raise damaged
+        return checked_review(*read_file(path, MOST_LABELS))
+    except (OSError, RuntimeError, ValueError, TypeError, LookupError, AttributeError, InputError) as error:
+        raise damaged from error

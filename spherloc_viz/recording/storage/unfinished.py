@@ -1,0 +1,204 @@
+"""Unfinished files: their names tell who writes them, so that what a killed process left is recovered or swept."""
+
+import contextlib
+import hashlib
+import os
+import re
+import secrets
+import shutil
+import socket
+import subprocess
+import time
+from dataclasses import dataclass
+from functools import cache, lru_cache
+from pathlib import Path
+
+from spherloc.errors import RecordingError
+from spherloc_viz.recording.rerun_program import rerun_command, rerun_environment
+from spherloc_viz.recording.reviews import REVIEW_SUFFIX
+from spherloc_viz.recording.sandbox.examiner import Examiner, ExaminerError
+
+STALE_AFTER_S = 600.0
+"""An unfinished file this old is nobody's if nothing tells whether its owner lives: a file takes less than a second."""
+
+_OWNER = r"(?P<machine>[0-9a-f]{8})-(?P<boot>[0-9a-f]{8})-(?P<pid>\d{1,10})-(?P<start>\d{1,20})-"
+_PART = re.compile(rf"(?P<name>.+\.rrd)\.(?:{_OWNER})?[0-9a-f]{{8}}\.part")
+
+
+def unfinished(path: Path) -> Path:
+    """The name under which this process writes the file ``path`` before it is moved to its own; new in every call."""
+    return path.with_name(f"{path.name}.{_owner()}-{secrets.token_hex(4)}.part")
+
+
+def target_of(part: Path) -> Path | None:
+    """The file that an unfinished recording was to become; None if it is none."""
+    match = _PART.fullmatch(part.name)
+    return None if match is None else part.with_name(match["name"])
+
+
+def leftovers(folder: Path) -> list[Path]:
+    """Unfinished recordings in ``folder`` that nobody will finish, because their process has ended or they are old.
+
+    Age counts only where it cannot be known whether the process is alive, as on another machine. Raises ``OSError``
+    if the folder cannot be read.
+    """
+    found: list[Path] = []
+    with os.scandir(folder) as entries:
+        for entry in entries:
+            match = _PART.fullmatch(entry.name)
+            with contextlib.suppress(FileNotFoundError):  # finished meanwhile
+                if match is not None and entry.is_file(follow_symlinks=False):
+                    alive = _alive(match)
+                    if alive is None:
+                        alive = time.time() - entry.stat().st_mtime <= STALE_AFTER_S
+                    if not alive:
+                        found.append(Path(entry.path))
+    return sorted(found)
+
+
+def _owner() -> str:
+    """This process."""
+    return _named(os.getpid())
+
+
+@lru_cache(maxsize=1)
+def _named(pid: int) -> str:
+    """This process, which has another number once it is forked."""
+    return f"{here()}-{pid}-{_start_of(pid) or 0}"
+
+
+def _alive(part: re.Match[str]) -> bool | None:
+    """Whether the process that a name tells of is alive; None if that cannot be known here."""
+    if part["machine"] is None:
+        return None
+    machine, boot = _here()
+    if part["machine"] != machine:
+        return None
+    if part["boot"] != boot:
+        return False
+    start = _start_of(int(part["pid"]))
+    if not start:
+        return None if start == 0 else False
+    return str(start) == part["start"] if part["start"] != "0" else None
+
+
+def here() -> str:
+    """What tells this machine, since it was started, from others."""
+    return "-".join(_here())
+
+
+@cache
+def _here() -> tuple[str, str]:
+    """Hashes of this machine, with its space of process numbers, and of the time since which it runs."""
+    try:
+        space = str(Path("/proc/self/ns/pid").readlink())
+        boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+    except OSError:
+        space = boot = ""
+    return _hash(f"{socket.gethostname()} {space}"), _hash(boot)
+
+
+def _hash(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:8]
+
+
+def _start_of(pid: int) -> int | None:
+    """When a process began, in ticks since the machine did (0 where that is not known); None if it has ended."""
+    if not Path("/proc/self/stat").exists():
+        return 0 if _exists(pid) else None
+    try:
+        # The name of the program, in parentheses, may hold anything.
+        words = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        return None if words[0] in "ZX" else int(words[19])  # dead, though its parent has not heard of it yet
+    except (FileNotFoundError, ProcessLookupError):
+        return 0 if _exists(pid) else None  # processes of other users may be hidden
+    except (OSError, ValueError, IndexError):
+        return 0
+
+
+def _exists(pid: int) -> bool:
+    if os.name == "nt":
+        return True  # sending a signal there would end it
+    try:
+        os.kill(pid, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except OSError:
+        return True
+    return True
+
+
+UNREADABLE_SUFFIX = ".unreadable"
+"""Ends the name of what was left unfinished and cannot be read; it began with the name that the file was to have."""
+ROOM = 4
+"""A recovered recording takes up to twice the room of what it is made of, since it is packed less tightly."""
+MERGE_LIMIT_S = 60.0
+"""rerun takes a twentieth of a second; one that takes this long has got stuck."""
+
+
+@dataclass(frozen=True)
+class Rescued:
+    """What became of a leftover."""
+
+    recording: Path | None = None
+    """The recording that was made of it."""
+    kept: Path | None = None
+    """Where it lies now if none could be made of it."""
+
+
+def rescue(part: Path, examiner: Examiner) -> Rescued:
+    """Make a recording of what is left of one, if there is enough; otherwise rename it, so that a person can decide.
+
+    The problem and the result come first in a file, so that even a fifth of it has all that repeats the run. The
+    leftover stays as it is if the disk has no room to recover it; deleted are only an empty one, and one of a run whose
+    recording is there and can be read. Raises ``OSError`` if the folder cannot be written, ``ExaminerError`` if
+    ``examiner`` has ended: the leftover stays then too.
+    """
+    target = target_of(part)
+    if target is None:
+        return Rescued()
+    mended = unfinished(target)
+    try:
+        if not part.stat().st_size:
+            part.unlink()
+            return Rescued()
+        is_run = not target.name.endswith(REVIEW_SUFFIX)
+        if is_run and target.exists() and _readable(target, examiner):
+            part.unlink()
+            return Rescued()
+        if is_run and not target.exists():
+            if _readable(part, examiner):
+                return Rescued(part.replace(target))
+            if shutil.disk_usage(part.parent).free < ROOM * part.stat().st_size:
+                return Rescued()
+            if _merged(part, mended) and _readable(mended, examiner):
+                mended.replace(target)
+                part.unlink()
+                return Rescued(target)
+        number = part.name.removesuffix(".part")[-8:]  # tells leftovers of one file apart
+        return Rescued(kept=part.replace(part.with_name(f"{target.name}.{number}{UNREADABLE_SUFFIX}")))
+    except FileNotFoundError:
+        return Rescued()  # another process has done it meanwhile
+    finally:
+        mended.unlink(missing_ok=True)
+
+
+def _readable(path: Path, examiner: Examiner) -> bool:
+    """Whether it is whole. What a power cut leaves can end the process that reads it, so another one does."""
+    try:
+        examiner.examine(path)
+    except ExaminerError:
+        raise  # says nothing about the file
+    except RecordingError:
+        return False
+    return True
+
+
+def _merged(part: Path, mended: Path) -> bool:
+    """Whether rerun could save what is whole at the start of ``part``."""
+    command = [*rerun_command(), "rrd", "merge", "--continue-on-error", str(part), "-o", str(mended)]
+    try:
+        done = subprocess.run(command, capture_output=True, check=False, timeout=MERGE_LIMIT_S, env=rerun_environment())
+    except subprocess.SubprocessError:
+        return False
+    return done.returncode == 0 and mended.is_file()

@@ -1,1 +1,0 @@
-"""The Rerun viewer, in a window or a browser."""
