@@ -11,7 +11,8 @@ import pytest
 from sweep_deaths import DeadlyStore
 
 from spherloc.datasets.variation import Variation
-from spherloc.experiments.sweep import Entrant, Job, planned, run_sweep, solve
+from spherloc.experiments.sweep import Entrant, Job, planned, run_sweep
+from spherloc.experiments.sweep_workers import solve
 from spherloc.trace import Trace
 from spherloc_viz.batch import Records
 from spherloc_viz.recording.content.reader import read_recording

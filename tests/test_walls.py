@@ -7,7 +7,6 @@
 
 import ast
 import functools
-import graphlib
 import subprocess
 import sys
 from pathlib import Path
@@ -226,17 +225,3 @@ def test_walls_would_be_noticed(monkeypatch, tmp_path):
     names = [name for _, name in imports("spherloc.hole")]
     assert names == ["viser.uplot", "rerun", "spherloc_viz.app", "spherloc.errors", "spherloc.cameras.base"]
     assert room_of("spherloc.hole") == "spherloc"
-
-
-def test_no_module_imports_in_a_circle():
-    """Two modules that need each other are one idea, or one of them knows too much."""
-    above = {module: set() for module in MODULES}
-    for module, path in MODULES.items():
-        for node in ast.parse(path.read_text(encoding="utf-8")).body:
-            for alias in node.names if isinstance(node, ast.ImportFrom) and not node.level else ():
-                whole = f"{node.module}.{alias.name}"
-                above[module] |= {whole if whole in MODULES else node.module} & set(MODULES)
-    try:
-        tuple(graphlib.TopologicalSorter(above).static_order())
-    except graphlib.CycleError as error:
-        pytest.fail(" imports ".join(reversed(error.args[1])))
