@@ -153,7 +153,11 @@ print(" ".join(sorted({{name.partition(".")[0] for name in sys.modules}})))
 
 def loaded_by(names):
     """Top-level modules in a fresh interpreter after importing ``names``."""
-    code = LOADER.format(names=sorted(names))
+    return told_by(LOADER.format(names=sorted(names)))
+
+
+def told_by(code):
+    """Words that a fresh interpreter prints."""
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return set(done.stdout.split())
@@ -167,6 +171,14 @@ def test_no_screen_is_loaded(packages):
     found = loaded & (SCREENS - {top})
     assert top in loaded
     assert not found, f"importing all of {' and '.join(packages)} also loads {', '.join(sorted(found))}"
+
+
+def test_the_command_line_answers_before_anything_large_is_loaded():
+    """``spherloc --help`` and ``spherloc scenes`` are asked while somebody waits."""
+    large = {"numba", "scipy", "cv2", "rerun", "viser", "pyarrow"}
+    assert not loaded_by(["spherloc_viz.cli", "spherloc_viz.recording_commands"]) & {*large, "numpy"}
+    scenes = "from spherloc_viz.scene_list import all_scenes; all_scenes()"
+    assert not told_by(scenes + LOADER.format(names=[])) & large
 
 
 def test_every_import_goes_down():
