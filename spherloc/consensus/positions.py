@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spherloc.consensus.box_search import MOST_BOXES, boxes_for, search_boxes, splits_for
-from spherloc.consensus.pose_cells import AXES, TILT_A, YAW, Matches, parameters_of, pose_of, whole_domain
+from spherloc.consensus.pose_cells import AXES, TILT_A, YAW, PackedMatches, parameters_of, pose_of, whole_domain
 from spherloc.consensus.pose_search import (
     BEST,
     EFFORT,
@@ -86,7 +86,7 @@ class PositionSearch:
 
 def search_positions(
     aligned: AlignedProblem,
-    matches: Matches,
+    matches: PackedMatches,
     start: tuple[FloatArray, int] | None,
     effort: int,
     deadline: float,
@@ -95,7 +95,7 @@ def search_positions(
 ) -> PositionSearch:
     """Search all poses within the gravity bound for one that explains more matches than ``start`` does.
 
-    ``matches`` is that of ``matches_of``. ``start`` is a pose (3, 4) between the aligned frames, within the gravity
+    ``matches`` is that of ``pack_matches``. ``start`` is a pose (3, 4) between the aligned frames, within the gravity
     bound, and what it explains. After ``effort`` tests or at ``deadline`` (``working_s``) the search stops.
     ``yaw_bound`` (BINS,) bounds what poses explain by bin of turn, if anything is known. ``watch`` counts the tests;
     raises ``Cancelled``.
@@ -134,7 +134,7 @@ class _Search:
     def __init__(
         self,
         aligned: AlignedProblem,
-        matches: Matches,
+        matches: PackedMatches,
         start: tuple[FloatArray, int] | None,
         yaw_bound: NDArray[np.int32] | None,
         watch: Watch,
@@ -306,7 +306,7 @@ class _Search:
         self.lower, self.upper_ends, self.about = self.lower[more], self.upper_ends[more], self.about[more]
 
 
-def pose_distances(matches: Matches, chart: int, at: FloatArray) -> FloatArray:
+def pose_distances(matches: PackedMatches, chart: int, at: FloatArray) -> FloatArray:
     """|w| (M,) of a chart's parameters."""
     scale, c = 1.0, at[:3].copy()
     if chart:
