@@ -8,8 +8,19 @@ from numpy.typing import NDArray
 
 from spherloc.consensus.pair_arcs import CIRCLE, direction_of_turn
 from spherloc.consensus.pose_cells import CELL_SIZE, HALF_ANGLES, HALF_C, HALF_S, YAW, has_tilt, place_cell
-from spherloc.consensus.pose_search import BEST, CELL_EFFORT, CELLS, EFFORT, HALT, SPLITS, put_off, search_poses
-from spherloc.consensus.stabbing import EVERYWHERE, deepest, keep_possible
+from spherloc.consensus.pose_search import (
+    BEST,
+    CELL_EFFORT,
+    CELLS,
+    EFFORT,
+    HALT,
+    SPLITS,
+    Room,
+    put_off,
+    room_for,
+    search_poses,
+)
+from spherloc.consensus.stabbing import EVERYWHERE, Scratch, deepest, keep_possible, scratch_for
 from spherloc.types import FloatArray
 from spherloc.watch import stopped
 
@@ -39,6 +50,24 @@ class Splits(NamedTuple):
     """(K, 3)."""
     about: NDArray[np.int32]
     """(K, 2): chart and bound."""
+
+
+class Memory(NamedTuple):
+    """All memory of one search."""
+
+    boxes: Boxes
+    """That wait."""
+    scratch: Scratch
+    """Of one box."""
+    room: Room
+    """Of the search of one small cell."""
+    splits: Splits
+    """For the picture."""
+
+
+def memory_for(count: int, most_splits: int) -> Memory:
+    """Memory for ``count`` matches and so many boxes for the picture."""
+    return Memory(boxes_for(count), scratch_for(count), room_for(count), splits_for(most_splits))
 
 
 def splits_for(count: int) -> Splits:
@@ -87,8 +116,8 @@ def _in_window(scratch, kept, count, start, end, out):
 def search_boxes(matches, tasks, yaw_bound, memory, limits, found, board):
     """Search the boxes ``tasks`` = (charts (K,), lower (K, 6), upper (K, 6), bounds (K,)) at all yaws.
 
-    ``yaw_bound`` (B,) is what is known of the bins of turn, ``memory`` is (Boxes, Scratch, Room, Splits); the others
-    are as in ``search_poses``.
+    ``yaw_bound`` (B,) is what is known of the bins of turn, ``memory`` is ``Memory``; the others are as in
+    ``search_poses``.
     """
     boxes, scratch, room, splits = memory
     charts, lowers, uppers, bounds = tasks

@@ -40,7 +40,7 @@ from spherloc.types import BoolArray, FloatArray, IndexArray
 from spherloc.watch import DONE, SELDOM, TOTAL, Watch, stopped
 from spherloc.working_time import working_s
 
-DOUBTFUL = 1e-6
+DOUBTFUL_NFA = 1e-6
 """Expected number of false alarms (NFA) of the size of the guess above which better guesses are looked for."""
 LARGEST_NFA = 1000.0
 """NFA of a size at which it says nothing."""
@@ -48,7 +48,7 @@ MOST_LEFT_OUT = 8
 """Nodes of a bin more than the best support up to which the whole bin is tried to be certified at once."""
 MOST_POSES = 8
 """Clearly different poses that are remembered."""
-PAIRS_UNTIL, BINS_UNTIL, SCOUT_UNTIL, SEARCH_UNTIL = 0.5, 0.7, 0.75, 0.98
+PAIRS_UNTIL, BINS_UNTIL, CLIQUES_UNTIL, SEARCH_UNTIL = 0.5, 0.7, 0.75, 0.98
 """How far the run of an estimator is by ``Watch.fraction`` at the ends of the parts of this search."""
 MOST_TRIALS = 16
 """Cliques of a bin that may stay without pose or proof before only larger ones are searched for."""
@@ -128,10 +128,10 @@ def exact_consensus(
     starts, edges = sort_into_bins(*arcs, watch.board)
     watch.reach(3)
     bound = degree_bounds(count, starts, edges, watch.board)
-    watch.begin("largest_bin_cliques", SCOUT_UNTIL)
+    watch.begin("largest_bin_cliques", CLIQUES_UNTIL)
     # What chance explains too often to be told apart is looked for last.
     for expected in (LARGEST_NFA, np.inf) if len(edges) < effort_limit else ():
-        if nfa(count, int(supports[0]), wrong_rate) > DOUBTFUL:
+        if nfa(count, int(supports[0]), wrong_rate) > DOUBTFUL_NFA:
             floor = least_size(count, wrong_rate, expected) - 1
             largest_bin_cliques(matches, starts, edges, bound, floor, best, watch.board)
     watch.begin("search", SEARCH_UNTIL)

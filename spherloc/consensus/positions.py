@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spherloc.consensus.box_search import MOST_BOXES, boxes_for, search_boxes, splits_for
+from spherloc.consensus.box_search import MOST_BOXES, memory_for, search_boxes
 from spherloc.consensus.pose_cells import AXES, TILT_A, YAW, PackedMatches, parameters_of, pose_of, whole_domain
 from spherloc.consensus.pose_search import (
     BEST,
@@ -30,10 +30,8 @@ from spherloc.consensus.pose_search import (
     STATE,
     Left,
     Limits,
-    room_for,
     search_poses,
 )
-from spherloc.consensus.stabbing import scratch_for
 from spherloc.consensus.yaw_bins import BINS
 from spherloc.problem import AlignedProblem
 from spherloc.types import FloatArray
@@ -121,7 +119,7 @@ class _Worker:
     """Memory of one thread."""
 
     def __init__(self, count: int) -> None:
-        self.memory = (boxes_for(count), scratch_for(count), room_for(count), splits_for(MOST_SPLITS))
+        self.memory = memory_for(count, MOST_SPLITS)
         most = MOST_BOXES + MOST_WAITING + 64
         self.left = Left(np.empty((most, AXES)), np.empty((most, AXES)), np.empty((most, 3), np.int64))
         self.state = np.zeros(STATE, np.int64)
@@ -203,7 +201,7 @@ class _Search:
             self.matches,
             (chart, at - half, at + half),
             everybody,
-            worker.memory[2],
+            worker.memory.room,
             limits,
             (worker.best_at, worker.state, worker.left),
             self.watch.board,
@@ -272,7 +270,7 @@ class _Search:
         if narrow:
             everybody = np.arange(self.count, dtype=np.int32)
             cell = (chart, lower, upper)
-            search_poses(self.matches, cell, everybody, worker.memory[2], limits, found, self.watch.board)
+            search_poses(self.matches, cell, everybody, worker.memory.room, limits, found, self.watch.board)
             return
         tasks = (np.array([chart]), lower[None], upper[None], np.array([bound]))
         search_boxes(self.matches, tasks, self.yaw_bound, worker.memory, limits, found, self.watch.board)
@@ -290,7 +288,7 @@ class _Search:
         """Make what workers left tasks, unless it cannot explain more than the best pose."""
         lower, upper, about = [self.lower], [self.upper_ends], [self.about]
         for worker in workers:
-            many, splits = int(worker.state[SPLITS]), worker.memory[3]
+            many, splits = int(worker.state[SPLITS]), worker.memory.splits
             if self._kept < MOST_KEPT:
                 left_ends, right_ends, bounds = splits
                 self._splits.append((left_ends[:many].copy(), right_ends[:many].copy(), bounds[:many].copy()))

@@ -30,6 +30,7 @@ def prove_cells(matches, chart, ends, claim, switch_rad, memory, cells, board):
     cannot be bounded by ``claim``.
     """
     scratch, unknown = memory
+    _, _, about = cells
     lo, up = np.empty((MOST_WAITING, 6)), np.empty((MOST_WAITING, 6))
     spans = np.empty((MOST_WAITING, 4), np.int64)
     count = len(matches.rows)
@@ -43,7 +44,7 @@ def prove_cells(matches, chart, ends, claim, switch_rad, memory, cells, board):
     axis = (chart - 1) // 2 if chart > 0 else -1
     cell, spread, reach, spare = np.empty(CELL_SIZE), np.empty(2), np.empty(6), np.empty(count, np.int32)
     while waiting > 0:
-        if stopped(board) or used + 2 * len(scratch.windows) + 8 > len(cells[2]):
+        if stopped(board) or used + 2 * len(scratch.windows) + 8 > len(about):
             return -1
         board[DONE] += 1
         waiting -= 1
@@ -102,16 +103,19 @@ def prove_cells(matches, chart, ends, claim, switch_rad, memory, cells, board):
 @numba.njit(cache=True, nogil=True)
 def _put(cells, used, lower, upper, rule, bound):
     """Write a final cell, ends (6,), as number ``used`` of ``cells``; returns how many there are."""
-    cells[0][used], cells[1][used] = lower, upper
-    cells[2][used, 0], cells[2][used, 1] = rule, bound
+    lowers, uppers, about = cells
+    lowers[used], uppers[used] = lower, upper
+    about[used, 0], about[used, 1] = rule, bound
     return used + 1
 
 
 @numba.njit(cache=True, nogil=True)
 def _by_yaw(cells, used, lo, up, spans, waiting, about, scratch):
-    """Cut a cell at the ends of its windows of yaw: these wait, what lies between them is final.
+    """Cut the cell ``waiting`` at the ends of its windows of yaw: these wait, what lies between them is final.
 
-    Returns how many are final and how many wait.
+    ``lo`` and ``up`` (W, 6) are the ends of waiting cells, ``spans`` (W, 4) what ``prove_cells`` keeps of each;
+    ``about`` is (first, last, windows, claim) of this one, ``scratch`` holds its windows. Final cells are written to
+    ``cells`` from number ``used`` on. Returns how many are final and how many wait.
     """
     first, last, windows, claim = about
     lower, upper = lo[waiting].copy(), up[waiting].copy()

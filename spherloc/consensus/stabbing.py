@@ -46,7 +46,7 @@ MANY = 400
 MOST_SORTED = 1500
 """Intervals up to which the exact depth is found where bins do not decide."""
 MOST_WINDOWS = 64
-JOINED = 0.004
+MOST_GAP = 0.004
 """Turns between two windows of yaw up to which they are one."""
 EVERYWHERE = 8.0
 """End of an interval that is the whole circle."""
@@ -208,7 +208,7 @@ def _open_window(windows, used, start):
 
     Or the last one goes on, if that is near or there is no room for more.
     """
-    if used > 0 and (start - windows[used - 1, 1] <= JOINED or used == len(windows)):
+    if used > 0 and (start - windows[used - 1, 1] <= MOST_GAP or used == len(windows)):
         return used
     windows[used, 0] = windows[used, 1] = start
     return used + 1

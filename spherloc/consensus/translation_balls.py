@@ -287,13 +287,13 @@ def _value(wave, c, s):
 
 @numba.njit(cache=True, nogil=True, inline="always")
 def _slope(wave, c, s):
-    """Its derivative by yaw."""
+    """The derivative by yaw of a wave (cos, sin, constant)."""
     return wave[1] * c - wave[0] * s
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
 def _amplitude(wave):
-    """Most that it differs from its constant."""
+    """The most that a wave (cos, sin, constant) differs from its constant."""
     return np.sqrt(wave[0] * wave[0] + wave[1] * wave[1])
 
 

@@ -125,7 +125,7 @@ def refine_on_tangents(basis, points, rotation, translation):
 
 @numba.njit(cache=True, nogil=True)
 def _normal_equations(basis, points, rotation, translation, normal, right):
-    """Add J^T J to ``normal`` (6, 6) and -J^T r to ``right`` (6,) for a rotation vector and a translation; return r^T r.
+    """Add J^T J to ``normal`` (6, 6) and -J^T r to ``right`` (6,), by rotation vector and translation; return r^T r.
 
     ``basis`` (K, 2, 3), ``points`` (K, 3), ``rotation`` (3, 3), ``translation`` (3,).
     """
