@@ -29,8 +29,8 @@ FLOORS = (
         "spherloc.disk_cache",
         "spherloc.images",
     ),
-    ("spherloc.cameras", "spherloc.solvers", "spherloc.trajectory"),
-    ("spherloc.gauss_newton", "spherloc.narrowing", "spherloc.worlds", "spherloc.formats"),
+    ("spherloc.cameras", "spherloc.gauss_newton", "spherloc.solvers", "spherloc.trajectory"),
+    ("spherloc.narrowing", "spherloc.worlds", "spherloc.formats"),
     ("spherloc.problem", "spherloc.bounds", "spherloc.consensus"),
     (
         "spherloc.trace",
