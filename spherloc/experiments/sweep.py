@@ -47,6 +47,8 @@ class Solved:
     """A row a run."""
     complaints: tuple[str, ...] = ()
     """Why runs could not be kept, a sentence each."""
+    failures: tuple[tuple[str, str], ...] = ()
+    """Estimators of other packages that failed, by their labels, and how."""
 
 
 @dataclass(frozen=True)
@@ -85,11 +87,14 @@ class Workers(Protocol):
 def solve(plan: SweepPlan, jobs: Sequence[Job], keep: Keep | None) -> Solved:
     """What a worker does."""
     _warm(frozenset(entrant.estimator for entrant in plan.entrants))
-    if keep is None:
-        return Solved(plan.solve(jobs))
     complaints: list[str] = []
-    rows = plan.solve(jobs, lambda job, trace: complaints.append(keep(plan, job, trace)))
-    return Solved(rows, tuple(filter(None, complaints)))
+    failures: dict[str, str] = {}
+    rows = plan.solve(
+        jobs,
+        None if keep is None else lambda job, trace: complaints.append(keep(plan, job, trace)),
+        lambda job, sentence: failures.update({plan.labels[job.entrant]: sentence}),
+    )
+    return Solved(rows, tuple(filter(None, complaints)), tuple(failures.items()))
 
 
 @cache
@@ -221,6 +226,7 @@ def run_sweep(
     stop: threading.Event | None = None,
     keep: Keep | None = None,
     complain: Callable[[str], None] = lambda sentence: None,
+    warn: Callable[[str], None] = lambda sentence: None,
 ) -> Iterator[SweepRow]:
     """The rows of a sweep as they come, all points growing evenly; none is done here, all in other processes.
 
@@ -231,18 +237,23 @@ def run_sweep(
     again.
 
     ``keep`` is given every run where it is done, before its row comes here and between the times that are measured;
-    ``complain`` gets a sentence for each that could not be kept.
+    ``complain`` gets a sentence for each that could not be kept. ``warn`` gets one, once for each, about estimators of
+    other packages that fail: such runs count as failures without a pose.
 
     Raises ``InputError`` if a run is impossible or kills its worker every time, or if there are no workers.
     """
     backlog = Backlog(plan, done, OVERHEAD_MS + (0.0 if keep is None else KEEPING_MS))
-    pool = _start_workers(plan, workers, scheduler, keep)
+    pool, warned = _start_workers(plan, workers, scheduler, keep), set[str]()
     try:
         while backlog.left and not (stop is not None and stop.is_set()):
             for _ in range(pool.room()):
                 if jobs := backlog.take():
                     pool.submit(jobs)
             for task in pool.collect(LISTEN_S):
+                for label, sentence in () if task.solved is None else task.solved.failures:
+                    if label not in warned:
+                        warned.add(label)
+                        warn(f"{sentence} Such runs count as failures.")
                 if task.solved is None:
                     backlog.put_back(task.jobs)
                     continue
