@@ -130,7 +130,8 @@ def _guarded(view: RunView, stage: Stage, plan: Plan) -> Callable[[], Frame]:
 
 def _failure(stage: Stage, error: Exception) -> str:
     kind = str(stage.kind)
-    by = registry.extension_of("layers", kind) if kind in registry.names("layers") else ""
+    is_own = type(stage).__module__ == Stage.__module__
+    by = "" if is_own or kind not in registry.names("layers") else registry.extension_of("layers", kind)
     drawn_by = f" by the layer of {by}" if by else ""
     return f"The stage {shorten(kind)} cannot be drawn{drawn_by} ({type(error).__name__}: {reason(error)})."
 
