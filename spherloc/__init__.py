@@ -32,7 +32,16 @@ EXPORTS = {
 """What is to be had from the package itself, and where it comes from: imported when it is first asked for, since the
 solvers take a second. ``__init__.pyi`` tells type checkers."""
 
-KERNEL_SOURCES = ("watch.py", "geometry.py", "gauss_newton.py", "refine.py", "solvers", "consensus", "estimators")
+KERNEL_SOURCES = (
+    "watch.py",
+    "geometry.py",
+    "gauss_newton.py",
+    "narrowing.py",
+    "refine.py",
+    "solvers",
+    "consensus",
+    "estimators",
+)
 """Files and folders of this package that hold compiled kernels and whatever their values come from."""
 
 KEPT_KERNELS = 4

@@ -9,8 +9,12 @@ makes (Exp(w) R, m + d). It turns about the middle, which keeps rotation and tra
 when the points are far away or the map's origin is.
 """
 
+from typing import NamedTuple
+
 import numba
 import numpy as np
+
+from spherloc.types import FloatArray
 
 ROBUST_NONE, ROBUST_HUBER, ROBUST_CAUCHY = 0, 1, 2
 HUBER_WIDTH, CAUCHY_WIDTH = 1.345, 2.3849
@@ -27,58 +31,99 @@ next would be a hundred times shorter."""
 RESIDUAL_TOLERANCE = 1e-10
 """Root mean square residual, in standard deviations, that is nothing but rounding."""
 LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e4
+"""Damping of the normal equations, relative to their diagonal: what a failed step starts with and what ends the fit."""
+
+
+class Matches(NamedTuple):
+    """M matches as the kernels take them, in gravity-aligned frames."""
+
+    bearings: FloatArray
+    """(M, 3) measured unit vectors, camera frame."""
+    points: FloatArray
+    """(M, 3) map points, m."""
+    pixel_jacobian: FloatArray
+    """(M, 2, 3) px per unit of the unit vector towards the point: ``AlignedProblem.pixel_from_bearing``."""
+
+
+class Noise(NamedTuple):
+    """Standard deviations that weigh residuals."""
+
+    sd_px: float
+    """Of a residual, px."""
+    gravity_sd_rad: float
+    """Of each of the two tilts of the known gravity, rad: 0 where it is exact, inf where it is unknown."""
+
+
+class CostModel(NamedTuple):
+    """Which cost is minimised, and over what."""
+
+    noise: Noise
+    """Weights of pixels and gravity."""
+    robust: int | np.int64
+    """One of ``ROBUST_*``."""
+    dof: int
+    """6, or 4 where the tilt stays as it is."""
+
+
+class NormalEquations(NamedTuple):
+    """Quadratic model of the cost for a step (w, d) at zero."""
+
+    hessian: FloatArray
+    """J^T J (6, 6)."""
+    gradient: FloatArray
+    """J^T r (6,)."""
 
 
 @numba.njit(cache=True, nogil=True)
-def polish(points, weights, chosen, rotation, translation, noise_px, gravity_sd_rad, robust, most_steps):
-    """Minimise the cost over the chosen correspondences; return the accepted steps. The pose is changed in place.
+def empty_equations():
+    """``NormalEquations`` to be written."""
+    return NormalEquations(np.empty((6, 6)), np.empty(6))
 
-    ``points`` (M, 3) m, ``weights`` (M, 2, 3) px, ``chosen`` (M,) bool, ``rotation`` (3, 3), ``translation`` (3,) m.
-    ``gravity_sd_rad`` of 0 is 4 DoF: the rotation is projected to a pure yaw first. inf is 6 DoF without prior, or
-    4 DoF at the given tilt for fewer than ``LEAST_FOR_SIX_DOF``. Fewer than two chosen leave the pose. ``robust`` is
-    one of ``ROBUST_*``. The cost never rises (after the projection), and no NaN is written. Chosen points must lie in
-    front of their bearings.
+
+@numba.njit(cache=True, nogil=True)
+def polish(matches, chosen, rotation, translation, noise, robust, most_steps):
+    """Minimise the cost over the chosen ``matches``; return the accepted steps. The pose is changed in place.
+
+    ``chosen`` (M,) bool, ``rotation`` (3, 3), ``translation`` (3,) m, ``noise`` a ``Noise``, ``robust`` one of
+    ``ROBUST_*``. A gravity of standard deviation 0 is 4 DoF: the rotation is projected to a pure yaw first. inf is
+    6 DoF without prior, or 4 DoF at the given tilt for fewer than ``LEAST_FOR_SIX_DOF``. Fewer than two chosen leave
+    the pose. The cost never rises (after the projection), and no NaN is written. Chosen points must lie in front of
+    their bearings.
     """
-    no_path = np.empty((0, 3, 4))
-    return polish_path(
-        points, weights, chosen, rotation, translation, noise_px, gravity_sd_rad, robust, most_steps, no_path
-    )
+    return polish_path(matches, chosen, rotation, translation, noise, robust, most_steps, np.empty((0, 3, 4)))
 
 
 @numba.njit(cache=True, nogil=True)
-def polish_path(points, weights, chosen, rotation, translation, noise_px, gravity_sd_rad, robust, most_steps, path):
+def polish_path(matches, chosen, rotation, translation, noise, robust, most_steps, path):
     """As ``polish``; the pose after each accepted step is written to ``path`` (K, 3, 4) as far as that reaches."""
-    count, centre = middle_of(points, chosen)
+    count, centre = middle_of(matches.points, chosen)
     if count < 2:
         return 0
     middle = rotation @ centre + translation
-    if gravity_sd_rad < LEAST_GRAVITY_SD_RAD:
+    if noise.gravity_sd_rad < LEAST_GRAVITY_SD_RAD:
         rotation[:] = nearest_yaw(rotation)
         translation[:] = middle - rotation @ centre
-    dof = degrees_of_freedom(count, gravity_sd_rad)
-    hessian, gradient, step = np.empty((6, 6)), np.empty(6), np.empty(6)
-    next_hessian, next_gradient = np.empty((6, 6)), np.empty(6)
+    model = CostModel(noise, robust, degrees_of_freedom(count, noise.gravity_sd_rad))
+    system, next_system, step = empty_equations(), empty_equations(), np.empty(6)
     turned, moved, factor = np.empty((3, 3)), np.empty(3), np.empty((6, 6))
-    data, model = (points, weights, chosen, centre), (noise_px, gravity_sd_rad, robust, dof)
-    cost = normal_equations(*data, rotation, middle, *model, hessian, gradient)
+    cost = normal_equations(matches, chosen, centre, rotation, middle, model, system)
     floor = count * RESIDUAL_TOLERANCE**2
     steps, damping = 0, 0.0
     while steps < most_steps and floor < cost < np.inf and damping <= MOST_DAMPING:
         lower = np.inf
-        if solve(hessian, gradient, damping, factor, step):
+        if solve(system, damping, factor, step):
             turn(step, rotation, turned)
             moved[:] = middle + step[3:]
-            lower = normal_equations(*data, turned, moved, *model, next_hessian, next_gradient)
+            lower = normal_equations(matches, chosen, centre, turned, moved, model, next_system)
         if not lower < cost:
-            if lower < np.inf and -(gradient @ step) <= GAIN_TOLERANCE * cost:
+            if lower < np.inf and -(system.gradient @ step) <= GAIN_TOLERANCE * cost:
                 break
             damping = max(LEAST_DAMPING, 10.0 * damping)
             continue
         gain, cost = cost - lower, lower
         rotation[:], middle[:] = turned, moved
         translation[:] = middle - rotation @ centre
-        hessian, next_hessian = next_hessian, hessian
-        gradient, next_gradient = next_gradient, gradient
+        system, next_system = next_system, system
         damping = 0.1 * damping if damping > LEAST_DAMPING else 0.0
         if steps < len(path):
             path[steps, :, :3], path[steps, :, 3] = rotation, translation
@@ -90,14 +135,14 @@ def polish_path(points, weights, chosen, rotation, translation, noise_px, gravit
 
 @numba.njit(cache=True, nogil=True)
 def degrees_of_freedom(count, gravity_sd_rad):
-    """6, or 4 where the tilt stays as it is: gravity exact, or unknown with too few points to find it."""
+    """6, or 4 where the tilt stays as it is: gravity exact, or unknown with too few of ``count`` points to find it."""
     unknown = gravity_sd_rad == np.inf and count < LEAST_FOR_SIX_DOF
     return 4 if unknown or gravity_sd_rad < LEAST_GRAVITY_SD_RAD else 6
 
 
 @numba.njit(cache=True, nogil=True)
 def middle_of(points, chosen):
-    """Number of chosen points, and their mean (3,)."""
+    """Number of the ``points`` (M, 3), m, that are ``chosen`` (M,), and their mean (3,), m."""
     count, x, y, z = 0, 0.0, 0.0, 0.0
     for k in range(len(points)):
         if chosen[k]:
@@ -115,7 +160,7 @@ def nearest_yaw(rotation):
 
 @numba.njit(cache=True, nogil=True)
 def levelled(cam_from_map, centre):
-    """The pose (3, 4) with the nearest yaw for its rotation that leaves the point ``centre`` (3,) where it is."""
+    """The pose (3, 4) with the nearest yaw for its rotation that leaves the point ``centre`` (3,), m, where it is."""
     rotation = cam_from_map[:, :3].copy()
     level = np.empty((3, 4))
     level[:, :3] = nearest_yaw(rotation)
@@ -125,7 +170,7 @@ def levelled(cam_from_map, centre):
 
 @numba.njit(cache=True, nogil=True)
 def turn(step, rotation, turned):
-    """Write Exp(w) R with w = ``step[:3]`` (Rodrigues, exact to rounding at zero)."""
+    """Write Exp(w) R (3, 3) to ``turned``, w = ``step[:3]`` in rad (Rodrigues, exact to rounding at zero)."""
     wx, wy, wz = step[0], step[1], step[2]
     angle = np.sqrt(wx * wx + wy * wy + wz * wz)
     first, second = 1.0, 0.5
@@ -142,7 +187,7 @@ def turn(step, rotation, turned):
 
 @numba.njit(cache=True, nogil=True, inline="always")
 def robust_weight(square, robust):
-    """rho(s) and its derivative, s a squared residual in units of the noise's variance."""
+    """rho(s) and its derivative, s = ``square`` a squared residual in units of the noise's variance."""
     if robust == ROBUST_HUBER and square > HUBER_WIDTH * HUBER_WIDTH:
         norm = np.sqrt(square)
         return HUBER_WIDTH * (2.0 * norm - HUBER_WIDTH), HUBER_WIDTH / norm
@@ -153,18 +198,19 @@ def robust_weight(square, robust):
 
 
 @numba.njit(cache=True, nogil=True)
-def normal_equations(
-    points, weights, chosen, centre, rotation, middle, noise_px, gravity_sd_rad, robust, dof, hessian, gradient
-):
-    """The cost at (R, m); write J^T J (6, 6) and J^T r (6,) of the step (w, d) at zero.
+def normal_equations(matches, chosen, centre, rotation, middle, model, system):
+    """The cost at (R, m); write the ``NormalEquations`` of the step (w, d) at zero to ``system``.
 
-    Only the chosen points count; inf if one of them lies at the camera's centre. ``dof`` of 4 leaves w_x and w_z out:
-    theirs are the rows of a unit matrix, so that a step does not change them.
+    R is ``rotation`` (3, 3), m is ``middle`` (3,), m, where R takes ``centre`` (3,), m, ``model`` a ``CostModel``. Only
+    the ``chosen`` (M,) matches count; inf if the point of one of them lies at the camera's centre. ``dof`` of 4 leaves
+    w_x and w_z out: theirs are the rows of a unit matrix, so that a step does not change them.
     """
+    points, pixel_jacobian = matches.points, matches.pixel_jacobian
+    hessian, gradient, robust = system.hessian, system.gradient, model.robust
     r00, r01, r02 = rotation[0, 0], rotation[0, 1], rotation[0, 2]
     r10, r11, r12 = rotation[1, 0], rotation[1, 1], rotation[1, 2]
     r20, r21, r22 = rotation[2, 0], rotation[2, 1], rotation[2, 2]
-    precision = (1.0 / noise_px) ** 2
+    precision = (1.0 / model.noise.sd_px) ** 2
     h00 = h01 = h02 = h03 = h04 = h05 = h11 = h12 = h13 = h14 = h15 = 0.0
     h22 = h23 = h24 = h25 = h33 = h34 = h35 = h44 = h45 = h55 = 0.0
     g0 = g1 = g2 = g3 = g4 = g5 = cost = 0.0
@@ -179,9 +225,8 @@ def normal_equations(
             return np.inf
         inverse = 1.0 / np.sqrt(square)
         x, y, z = x * inverse, y * inverse, z * inverse
-        u0, u1, u2, v0, v1, v2 = (
-            weights[k, 0, 0], weights[k, 0, 1], weights[k, 0, 2], weights[k, 1, 0], weights[k, 1, 1], weights[k, 1, 2],
-        )  # fmt: skip
+        u0, u1, u2 = pixel_jacobian[k, 0, 0], pixel_jacobian[k, 0, 1], pixel_jacobian[k, 0, 2]
+        v0, v1, v2 = pixel_jacobian[k, 1, 0], pixel_jacobian[k, 1, 1], pixel_jacobian[k, 1, 2]
         ru, rv = u0 * x + u1 * y + u2 * z, v0 * x + v1 * y + v2 * z
         loss, weight = robust_weight((ru * ru + rv * rv) * precision, robust)
         cost += loss
@@ -212,28 +257,29 @@ def normal_equations(
     gradient[:] = g0, g1, g2, g3, g4, g5
     hessian *= precision
     gradient *= precision
-    if dof == 4:
+    if model.dof == 4:
         for k in (0, 2):
             hessian[k, :], hessian[:, k], hessian[k, k], gradient[k] = 0.0, 0.0, 1.0, 0.0
         return cost
-    return cost + add_gravity(rotation, gravity_sd_rad, hessian, gradient)
+    return cost + add_gravity(rotation, model.noise.gravity_sd_rad, system)
 
 
 @numba.njit(cache=True, nogil=True)
 def tilt_of(rotation):
-    """Angle (rad) between the map's down direction, R e_y, and the +y of the aligned camera."""
+    """Angle, rad, between the map's down direction, R e_y, and the camera's +y; of a rotation (3, 3) or pose (3, 4)."""
     return np.arctan2(np.hypot(rotation[0, 1], rotation[2, 1]), rotation[1, 1])
 
 
 @numba.njit(cache=True, nogil=True)
-def add_gravity(rotation, gravity_sd_rad, hessian, gradient):
-    """Cost of the gravity prior; add its J^T J and J^T r.
+def add_gravity(rotation, gravity_sd_rad, system):
+    """Cost of the gravity prior at ``rotation`` (3, 3); add its J^T J and J^T r to ``system``, ``NormalEquations``.
 
     The residual is the tilt's angle times the horizontal direction u of R e_y = (u sin, cos), not its sine, which
     would fold beyond 90 degrees.
     """
     if gravity_sd_rad == np.inf:
         return 0.0
+    hessian, gradient = system.hessian, system.gradient
     gx, gy, gz = rotation[0, 1], rotation[1, 1], rotation[2, 1]
     sine = np.sqrt(gx * gx + gz * gz)
     angle = tilt_of(rotation)
@@ -256,7 +302,7 @@ def add_gravity(rotation, gravity_sd_rad, hessian, gradient):
 def factorise(hessian, damping, factor):
     """Write L of S H S + damping I = L L^T, S scaling the columns to length 1; False if there is no full rank.
 
-    Nothing is written above the diagonal of ``factor`` (6, 6).
+    H is ``hessian`` (6, 6); L goes to ``factor`` (6, 6), above whose diagonal nothing is written.
     """
     for a in range(6):
         for b in range(a + 1):
@@ -276,13 +322,17 @@ def factorise(hessian, damping, factor):
 
 @numba.njit(cache=True, nogil=True, inline="always")
 def scale_of(hessian, k):
-    """What scales a column of the normal equations to length 1."""
+    """What scales column ``k`` of the normal equations (6, 6) to length 1."""
     return 1.0 / np.sqrt(hessian[k, k]) if hessian[k, k] > 0.0 else 1.0
 
 
 @numba.njit(cache=True, nogil=True)
-def solve(hessian, gradient, damping, factor, step):
-    """Write the damped step -(H + damping diag H)^-1 g; False if H has no full rank."""
+def solve(system, damping, factor, step):
+    """Write the damped ``step`` (6,), -(H + damping diag H)^-1 g, rad and m; False if H has no full rank.
+
+    H and g are those of ``system``, ``NormalEquations``; ``factor`` (6, 6) is written, see ``factorise``.
+    """
+    hessian, gradient = system.hessian, system.gradient
     if not factorise(hessian, damping, factor):
         return False
     for a in range(6):

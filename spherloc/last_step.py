@@ -10,14 +10,15 @@ from collections.abc import Sequence
 import numpy as np
 
 from spherloc.bounds import Bounds
-from spherloc.gauss_newton import LEAST_GRAVITY_SD_RAD
+from spherloc.gauss_newton import LEAST_GRAVITY_SD_RAD, Matches, Noise
 from spherloc.narrowing import MOST_DESCENTS, NARROWINGS, descend, narrow, search_nearby, truncated_squares
 from spherloc.problem import AlignedProblem
 from spherloc.refine import (
     RESCUE_REACH,
     RefinementOptions,
     fitted_path,
-    gravity_sd_rad,
+    matches_of,
+    noise_of,
     record,
     refined_path,
     residuals_px,
@@ -25,12 +26,8 @@ from spherloc.refine import (
 from spherloc.trace import RefinementStage
 from spherloc.types import BoolArray, FloatArray
 
-Data = tuple[FloatArray, FloatArray, FloatArray]
-"""Bearings, points, and the tangent planes' pixels, as the kernels of ``narrowing`` take them."""
-Model = tuple[float, float]
-"""Noise in px, and the standard deviation of gravity in rad."""
-
 MOST_STARTS = 4
+"""Poses of a search that are refined."""
 ALTERNATIVE_SHARE = 0.6
 """Share of the most inliers that a start must have: what has less never wins."""
 
@@ -48,10 +45,8 @@ def conclude(
 
     Returns what ``refine`` does. All poses are between the aligned frames.
     """
-    sd = gravity_sd_rad(aligned, options)
-    data = (aligned.bearings, aligned.points, aligned.pixel_from_bearing.copy())
-    model = (options.noise_px, sd)
-    kept = sd < LEAST_GRAVITY_SD_RAD
+    matches, noise = matches_of(aligned), noise_of(aligned, options)
+    kept = noise.gravity_sd_rad < LEAST_GRAVITY_SD_RAD
     limits = bounds.pixels.copy() if kept else np.full(len(aligned.points), bounds.noise_px)
     wide = bounds.pixels.copy()
     least, best = np.inf, np.empty((0, 3, 4))
@@ -60,19 +55,19 @@ def conclude(
         if not kept and reach == np.inf:
             # Too few for a tilt: there is nothing to choose from.
             return record(aligned, plain, bounds.pixels, options, measured=True)
-        for path in [plain] if kept else [plain, _narrowed(data, wide, limits, start, model)]:
-            path, cost = _descended(data, limits, path, model)
+        for path in [plain] if kept else [plain, _narrowed(matches, wide, limits, start, noise)]:
+            path, cost = _descended(matches, limits, path, noise)
             if cost < least:
                 least, best = cost, path
     if not kept:
         for start in (best[-1], starts[0]):
-            at = best[-1].copy()
-            cost = search_nearby(*data, wide, limits, start.copy(), *model, at, least)
+            state = best[-1].copy()
+            cost = search_nearby(matches, wide, limits, start.copy(), noise, state, least)
             if cost < least:
-                best, least = _descended(data, limits, np.array([best[0], at]), model)
+                best, least = _descended(matches, limits, np.array([best[0], state]), noise)
     if options.robust != "none":
         fit = fitted_path(aligned, best[-1], limits, options)
-        if len(fit) and truncated_squares(*data, limits, fit[-1].copy(), *model, np.inf) <= least + RESCUE_REACH:
+        if len(fit) and truncated_squares(matches, limits, fit[-1].copy(), noise, np.inf) <= least + RESCUE_REACH:
             best = np.concatenate([best, fit])
     return record(aligned, best, limits, options, measured=True)
 
@@ -84,15 +79,16 @@ def _promising(aligned: AlignedProblem, starts: Sequence[FloatArray], bounds: Bo
     return [start for k, (start, count) in enumerate(zip(starts, counts, strict=False)) if k == 0 or count >= enough]
 
 
-def _narrowed(data: Data, wide: FloatArray, limits: FloatArray, start: FloatArray, model: Model) -> FloatArray:
+def _narrowed(matches: Matches, wide: FloatArray, limits: FloatArray, start: FloatArray, noise: Noise) -> FloatArray:
+    """The start and the poses (I, 3, 4) at bounds that narrow from ``wide`` (M,) to ``limits`` (M,), px."""
     path = np.empty((1 + len(NARROWINGS), 3, 4))
     path[0] = start
-    narrow(*data, wide, limits, path[0].copy(), *model, path[1:])
+    narrow(matches, wide, limits, path[0].copy(), noise, path[1:])
     return path
 
 
-def _descended(data: Data, limits: FloatArray, path: FloatArray, model: Model) -> tuple[FloatArray, float]:
+def _descended(matches: Matches, limits: FloatArray, path: FloatArray, noise: Noise) -> tuple[FloatArray, float]:
     """The path (I, 3, 4) and how it goes on downhill, and the truncated squares of its end."""
-    more, at = np.empty((MOST_DESCENTS, 3, 4)), path[-1].copy()
-    states, cost = descend(*data, limits, at, *model, more)
+    more, last = np.empty((MOST_DESCENTS, 3, 4)), path[-1].copy()
+    states, cost = descend(matches, limits, last, noise, more)
     return np.concatenate([path, more[:states]]), float(cost)

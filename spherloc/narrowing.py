@@ -12,7 +12,10 @@ import numpy as np
 from spherloc.gauss_newton import (
     LEAST_GRAVITY_SD_RAD,
     ROBUST_NONE,
+    CostModel,
+    Matches,
     degrees_of_freedom,
+    empty_equations,
     middle_of,
     normal_equations,
     polish,
@@ -23,67 +26,75 @@ from spherloc.gauss_newton import (
 
 NARROWINGS = (1.0, 0.4, 0.15, 0.0)
 """Shares of what gravity's error adds to the bound that the successive bounds keep."""
-SCALE = 1.0 / 3.0
+GEMAN_MCCLURE_SCALE = 1.0 / 3.0
 """Scale of the Geman-McClure weights in bounds: the bound is three standard deviations of the noise, or so."""
 MOST_STEPS = 6
 """At each bound."""
 LEAST_STEP = 1e-7
 """Length of a step (rad, and m) at which a bound is done with."""
 DAMPING = 1e-9
+"""Of the Gauss-Newton steps, relative to the diagonal: just enough to solve what is almost singular."""
 MOST_DESCENTS = 10
 """Choices of inliers on the way to a minimum of the truncated squares."""
-SAMPLE, SAMPLE_STEPS, SAMPLE_DAMPING = 4, 4, 1e-6
+SAMPLE_SIZE, SAMPLE_STEPS, SAMPLE_DAMPING = 4, 4, 1e-6
 """Correspondences of a random fit, one more than fix a pose, and the steps and damping of its Gauss-Newton."""
 PROMISING_STEPS = 3
+"""Robust steps from a random fit that is better than the best pose so far."""
 LEAST_SAMPLES, MOST_SAMPLES = 30, 200
 """Sampling goes on for at least so many after the last improvement."""
-MISSED = 1e-3
+MOST_FAILURE_PROBABILITY = 1e-3
 """Probability, by Eq. 28, that no sample held inliers only, at which sampling ends."""
-FINE = 0.3
+FINE_NOISE = 0.3
 """Standard deviation of the finer part of the noise, in units of the stated noise: real matches mix sharp and blurred
 ones. (Two scales: with four, normal noise is taken for a mixture more often, and real poses gain little.)"""
-PRIOR = (10.0, 0.1)
+PRIOR_STATED, PRIOR_FINE = 10.0, 0.1
 """Correspondences with stated and with finer noise that are believed in beforehand."""
-FIRST_ROUNDS, ROUNDS = 20, 3
+FIRST_EM_ROUNDS, EM_ROUNDS = 20, 3
 """Of expectation and maximisation for the share of finer noise, at the first step and at the others."""
-ADAPTIVE_STEPS, ADAPTIVE_END = 15, 1e-6
+ADAPTIVE_STEPS, ADAPTIVE_LEAST_STEP = 15, 1e-6
+"""Most steps of ``fit_to_noise``, and the length of a step (rad, and m) at which it ends."""
 LEAST_FOR_NOISE = 8
 """Correspondences from which something can be said about their noise."""
 
 
 @numba.njit(cache=True, nogil=True)
-def errors_of(bearings, points, weights, cam_from_map, errors):
-    """Write the reprojection errors (M,), px to first order; inf for points behind their measured bearing."""
-    p = cam_from_map
+def errors_of(matches, cam_from_map, errors):
+    """Write the reprojection ``errors`` (M,) at a pose (3, 4), px to first order; inf for points behind their bearing.
+
+    ``matches`` are ``gauss_newton.Matches``, as in all functions here.
+    """
+    bearings, points, jacobian, p = matches.bearings, matches.points, matches.pixel_jacobian, cam_from_map
     for k in range(len(points)):
         x = p[0, 0] * points[k, 0] + p[0, 1] * points[k, 1] + p[0, 2] * points[k, 2] + p[0, 3]
         y = p[1, 0] * points[k, 0] + p[1, 1] * points[k, 1] + p[1, 2] * points[k, 2] + p[1, 3]
         z = p[2, 0] * points[k, 0] + p[2, 1] * points[k, 1] + p[2, 2] * points[k, 2] + p[2, 3]
         if bearings[k, 0] * x + bearings[k, 1] * y + bearings[k, 2] * z > 0.0:
-            du = weights[k, 0, 0] * x + weights[k, 0, 1] * y + weights[k, 0, 2] * z
-            dv = weights[k, 1, 0] * x + weights[k, 1, 1] * y + weights[k, 1, 2] * z
+            du = jacobian[k, 0, 0] * x + jacobian[k, 0, 1] * y + jacobian[k, 0, 2] * z
+            dv = jacobian[k, 1, 0] * x + jacobian[k, 1, 1] * y + jacobian[k, 1, 2] * z
             errors[k] = np.sqrt((du * du + dv * dv) / (x * x + y * y + z * z))
         else:
             errors[k] = np.inf
 
 
 @numba.njit(cache=True, nogil=True)
-def truncated_squares(bearings, points, weights, limits_px, cam_from_map, noise_px, gravity_sd_rad, most):
+def truncated_squares(matches, limits_px, cam_from_map, noise, most):
     """The truncated squares of a pose (3, 4) at the bounds ``limits_px`` (M,); more than ``most`` once that is passed.
 
-    The tilt costs nothing where gravity is exact (the pose keeps it) or unknown.
+    In variances of ``noise``, a ``gauss_newton.Noise``. The tilt costs nothing where gravity is exact (the pose keeps
+    it) or unknown.
     """
-    p, precision, total = cam_from_map, noise_px**-2.0, 0.0
-    if LEAST_GRAVITY_SD_RAD <= gravity_sd_rad < np.inf:
-        total = (tilt_of(p) / gravity_sd_rad) ** 2
+    bearings, points, jacobian, p = matches.bearings, matches.points, matches.pixel_jacobian, cam_from_map
+    precision, total = noise.sd_px**-2.0, 0.0
+    if LEAST_GRAVITY_SD_RAD <= noise.gravity_sd_rad < np.inf:
+        total = (tilt_of(p) / noise.gravity_sd_rad) ** 2
     for k in range(len(points)):
         x = p[0, 0] * points[k, 0] + p[0, 1] * points[k, 1] + p[0, 2] * points[k, 2] + p[0, 3]
         y = p[1, 0] * points[k, 0] + p[1, 1] * points[k, 1] + p[1, 2] * points[k, 2] + p[1, 3]
         z = p[2, 0] * points[k, 0] + p[2, 1] * points[k, 1] + p[2, 2] * points[k, 2] + p[2, 3]
         limit = limits_px[k] * limits_px[k]
         if bearings[k, 0] * x + bearings[k, 1] * y + bearings[k, 2] * z > 0.0:
-            du = weights[k, 0, 0] * x + weights[k, 0, 1] * y + weights[k, 0, 2] * z
-            dv = weights[k, 1, 0] * x + weights[k, 1, 1] * y + weights[k, 1, 2] * z
+            du = jacobian[k, 0, 0] * x + jacobian[k, 0, 1] * y + jacobian[k, 0, 2] * z
+            dv = jacobian[k, 1, 0] * x + jacobian[k, 1, 1] * y + jacobian[k, 1, 2] * z
             limit = min(limit, (du * du + dv * dv) / (x * x + y * y + z * z))
         total += precision * limit
         if total > most:
@@ -92,37 +103,44 @@ def truncated_squares(bearings, points, weights, limits_px, cam_from_map, noise_
 
 
 @numba.njit(cache=True, nogil=True)
-def robust_steps(bearings, points, weights, limits_px, cam_from_map, noise_px, gravity_sd_rad, most_steps):
-    """Move ``cam_from_map`` (3, 4) in place by Gauss-Newton steps on Geman-McClure weights within ``limits_px``."""
+def robust_steps(matches, limits_px, cam_from_map, noise, most_steps):
+    """Move ``cam_from_map`` (3, 4) in place by Gauss-Newton steps on Geman-McClure weights.
+
+    Only matches within ``limits_px`` (M,) of the pose count, chosen anew for each step.
+    """
+    bearings, points, jacobian = matches.bearings, matches.points, matches.pixel_jacobian
     count = len(points)
-    errors, near, heavy = np.empty(count), np.empty(count, np.bool_), np.empty((count, 2, 3))
+    errors, near, scaled_jacobian = np.empty(count), np.empty(count, np.bool_), np.empty((count, 2, 3))
     for _ in range(most_steps):
-        errors_of(bearings, points, weights, cam_from_map, errors)
+        errors_of(matches, cam_from_map, errors)
         for k in range(count):
             near[k] = errors[k] <= limits_px[k]
             if near[k]:
-                ratio = errors[k] / (SCALE * limits_px[k])
+                ratio = errors[k] / (GEMAN_MCCLURE_SCALE * limits_px[k])
                 share = 1.0 / (1.0 + ratio * ratio)
                 for a in range(2):
                     for b in range(3):
-                        heavy[k, a, b] = share * weights[k, a, b]
-        if not _step(points, heavy, near, cam_from_map, noise_px, gravity_sd_rad, DAMPING) > LEAST_STEP:
+                        scaled_jacobian[k, a, b] = share * jacobian[k, a, b]
+        if not _step(Matches(bearings, points, scaled_jacobian), near, cam_from_map, noise, DAMPING) > LEAST_STEP:
             break
 
 
 @numba.njit(cache=True, nogil=True)
-def _step(points, weights, chosen, cam_from_map, noise_px, gravity_sd_rad, damping):
-    """One Gauss-Newton step on the chosen correspondences, in place; its length, 0 if there is none."""
-    count, centre = middle_of(points, chosen)
+def _step(matches, chosen, cam_from_map, noise, damping):
+    """One Gauss-Newton step of a pose (3, 4) on the ``chosen`` (M,) matches, in place; its length, 0 if there is none.
+
+    The length is that of the rotation vector, rad, and the translation, m, together.
+    """
+    count, centre = middle_of(matches.points, chosen)
     if count < 2:
         return 0.0
-    dof = degrees_of_freedom(count, gravity_sd_rad)
-    hessian, gradient, step, factor = np.empty((6, 6)), np.empty(6), np.empty(6), np.empty((6, 6))
+    step, factor = np.empty(6), np.empty((6, 6))
     rotation, turned = cam_from_map[:, :3].copy(), np.empty((3, 3))
     middle = rotation @ centre + cam_from_map[:, 3]
-    model = (noise_px, gravity_sd_rad, ROBUST_NONE, dof)
-    cost = normal_equations(points, weights, chosen, centre, rotation, middle, *model, hessian, gradient)
-    if not cost < np.inf or not solve(hessian, gradient, damping, factor, step):
+    model = CostModel(noise, np.int64(ROBUST_NONE), degrees_of_freedom(count, noise.gravity_sd_rad))
+    system = empty_equations()
+    cost = normal_equations(matches, chosen, centre, rotation, middle, model, system)
+    if not cost < np.inf or not solve(system, damping, factor, step):
         return 0.0
     length = np.sqrt((step * step).sum())
     turn(step, rotation, turned)
@@ -134,104 +152,108 @@ def _step(points, weights, chosen, cam_from_map, noise_px, gravity_sd_rad, dampi
 
 
 @numba.njit(cache=True, nogil=True)
-def narrow(bearings, points, weights, wide_px, tight_px, start, noise_px, gravity_sd_rad, path):
-    """Fits at bounds that narrow from ``wide_px`` (M,) to ``tight_px`` (M,), each from the last: written to ``path``.
+def narrow(matches, wide_px, tight_px, start, noise, path):
+    """Fits from ``start`` (3, 4) at bounds that narrow from ``wide_px`` (M,) to ``tight_px`` (M,), each from the last.
 
-    ``path`` is (``len(NARROWINGS)``, 3, 4).
+    The pose at each bound is written to ``path`` (``len(NARROWINGS)``, 3, 4).
     """
-    at = start.copy()
-    for k, share in enumerate(NARROWINGS):
+    state = start.copy()
+    for index, share in enumerate(NARROWINGS):
         limits = tight_px + share * (wide_px - tight_px)
-        robust_steps(bearings, points, weights, limits, at, noise_px, gravity_sd_rad, np.int64(MOST_STEPS))
-        path[k] = at
+        robust_steps(matches, limits, state, noise, np.int64(MOST_STEPS))
+        path[index] = state
 
 
 @numba.njit(cache=True, nogil=True)
-def descend(bearings, points, weights, limits_px, cam_from_map, noise_px, gravity_sd_rad, path):
+def descend(matches, limits_px, cam_from_map, noise, path):
     """Least squares on the inliers and new choices of these while the truncated squares fall.
 
     ``cam_from_map`` (3, 4) is changed in place, the pose after each choice written to ``path`` (``MOST_DESCENTS``, 3,
-    4). Returns how many, and the truncated squares.
+    4). Returns how many, and the truncated squares at the bounds ``limits_px`` (M,).
     """
-    data = (bearings, points, weights)
-    errors, states = np.empty(len(points)), 0
-    least = truncated_squares(*data, limits_px, cam_from_map, noise_px, gravity_sd_rad, np.inf)
-    before = np.zeros(len(points), np.bool_)
+    count, states = len(matches.points), 0
+    errors, before = np.empty(count), np.zeros(count, np.bool_)
+    least = truncated_squares(matches, limits_px, cam_from_map, noise, np.inf)
     while states < MOST_DESCENTS:
-        errors_of(bearings, points, weights, cam_from_map, errors)
+        errors_of(matches, cam_from_map, errors)
         mask = errors <= limits_px
         if np.array_equal(mask, before):
             break
         rotation, translation = cam_from_map[:, :3].copy(), cam_from_map[:, 3].copy()
-        model = (noise_px, gravity_sd_rad, np.int64(ROBUST_NONE))
-        polish(points, weights, mask, rotation, translation, *model, np.int64(MOST_STEPS))
-        at = np.empty((3, 4))
-        at[:, :3], at[:, 3] = rotation, translation
-        cost = truncated_squares(*data, limits_px, at, noise_px, gravity_sd_rad, np.inf)
+        polish(matches, mask, rotation, translation, noise, np.int64(ROBUST_NONE), np.int64(MOST_STEPS))
+        state = np.empty((3, 4))
+        state[:, :3], state[:, 3] = rotation, translation
+        cost = truncated_squares(matches, limits_px, state, noise, np.inf)
         if not cost < least:
             break
-        cam_from_map[:], path[states], least, before = at, at, cost, mask
+        cam_from_map[:], path[states], least, before = state, state, cost, mask
         states += 1
     return states, least
 
 
 @numba.njit(cache=True, nogil=True)
-def search_nearby(bearings, points, weights, wide_px, limits_px, start, noise_px, gravity_sd_rad, best, least):
+def search_nearby(matches, wide_px, limits_px, start, noise, best, least):
     """Look for a better pose than ``best`` by fits to few random ones of what ``start`` explains within ``wide_px``.
 
-    ``best`` (3, 4), of ``least`` truncated squares, is changed in place; returns its truncated squares. Every call
-    draws alike.
+    ``best`` (3, 4), of ``least`` truncated squares at the bounds ``limits_px`` (M,), is changed in place; returns its
+    truncated squares. Every call draws alike.
     """
-    data = (bearings, points, weights)
-    errors = np.empty(len(points))
-    errors_of(bearings, points, weights, start, errors)
+    errors = np.empty(len(matches.points))
+    errors_of(matches, start, errors)
     around = np.flatnonzero(errors <= wide_px)
-    if len(around) <= SAMPLE:
+    if len(around) <= SAMPLE_SIZE:
         return least
-    state, drawn, improved = np.uint64(0x9E3779B97F4A7C15), 0, 0
-    needed = _samples_needed(bearings, points, weights, limits_px, best, around, errors)
-    sample, chosen = np.empty(SAMPLE, np.int64), np.ones(SAMPLE, np.bool_)
+    random_state, drawn, improved = np.uint64(0x9E3779B97F4A7C15), 0, 0
+    needed = _samples_needed(matches, limits_px, best, around, errors)
+    sample, chosen = np.empty(SAMPLE_SIZE, np.int64), np.ones(SAMPLE_SIZE, np.bool_)
     while drawn < MOST_SAMPLES and (drawn < needed or drawn < improved + LEAST_SAMPLES):
-        for k in range(SAMPLE):
+        for k in range(SAMPLE_SIZE):
             fresh = False
             while not fresh:
-                state, place = _draw(state, len(around))
-                sample[k], fresh = around[place], True
+                random_state, index = _draw(random_state, len(around))
+                sample[k], fresh = around[index], True
                 for other in range(k):
                     fresh = fresh and sample[other] != sample[k]
         drawn += 1
-        at = start.copy()
+        state = start.copy()
+        few = Matches(matches.bearings[sample], matches.points[sample], matches.pixel_jacobian[sample])
         for _ in range(SAMPLE_STEPS):
-            _step(points[sample], weights[sample], chosen, at, noise_px, gravity_sd_rad, SAMPLE_DAMPING)
-        if truncated_squares(*data, limits_px, at, noise_px, gravity_sd_rad, least) >= least:
+            _step(few, chosen, state, noise, SAMPLE_DAMPING)
+        if truncated_squares(matches, limits_px, state, noise, least) >= least:
             continue
-        robust_steps(*data, limits_px, at, noise_px, gravity_sd_rad, np.int64(PROMISING_STEPS))
-        cost = truncated_squares(*data, limits_px, at, noise_px, gravity_sd_rad, least)
+        robust_steps(matches, limits_px, state, noise, np.int64(PROMISING_STEPS))
+        cost = truncated_squares(matches, limits_px, state, noise, least)
         if cost >= least:
             continue
-        least, best[:], improved = cost, at, drawn
-        needed = _samples_needed(bearings, points, weights, limits_px, best, around, errors)
+        least, best[:], improved = cost, state, drawn
+        needed = _samples_needed(matches, limits_px, best, around, errors)
     return least
 
 
 @numba.njit(cache=True, nogil=True)
-def _samples_needed(bearings, points, weights, limits_px, best, around, errors):
-    """Samples from ``around`` after which one was surely drawn from inliers of the best pose only (Eq. 28)."""
-    errors_of(bearings, points, weights, best, errors)
+def _samples_needed(matches, limits_px, best, around, errors):
+    """Samples from ``around`` (K,) after which one was surely drawn from inliers of the ``best`` pose only (Eq. 28).
+
+    ``errors`` (M,) px are written.
+    """
+    errors_of(matches, best, errors)
     inliers = 0
     for k in around:
         inliers += errors[k] <= limits_px[k]
-    clean = (inliers / len(around)) ** SAMPLE
-    return 1 if clean >= 1.0 else int(min(np.log(MISSED) / np.log1p(-max(clean, 1e-9)), MOST_SAMPLES))
+    clean = (inliers / len(around)) ** SAMPLE_SIZE
+    if clean >= 1.0:
+        return 1
+    return int(min(np.log(MOST_FAILURE_PROBABILITY) / np.log1p(-max(clean, 1e-9)), MOST_SAMPLES))
 
 
 @numba.njit(cache=True, nogil=True)
-def share_of_fine(errors, near, limits_px, noise_px, share, rounds, fine):
-    """Share of the ``near`` correspondences with the finer noise, from a guess; their probabilities to ``fine`` (M,).
+def share_of_fine(errors, near, limits_px, noise_px, share, rounds, fine_probability):
+    """Share of the ``near`` (M,) matches with the finer noise, from a guess ``share``, after so many ``rounds``.
 
-    Expectation and maximisation of a mixture of two normal distributions in the plane, cut off at ``limits_px`` (M,).
+    Expectation and maximisation of a mixture of two normal distributions in the plane, cut off at ``limits_px`` (M,),
+    from ``errors`` (M,) px. Each one's probability of finer noise is written to ``fine_probability`` (M,).
     """
-    wide, sharp = 0.5 / noise_px**2, 0.5 / (FINE * noise_px) ** 2
+    wide, sharp = 0.5 / noise_px**2, 0.5 / (FINE_NOISE * noise_px) ** 2
     for _ in range(rounds):
         total, count = 0.0, 0
         for k in range(len(errors)):
@@ -239,49 +261,50 @@ def share_of_fine(errors, near, limits_px, noise_px, share, rounds, fine):
                 square, most = errors[k] * errors[k], limits_px[k] * limits_px[k]
                 blurred = (1.0 - share) * wide * np.exp(-wide * square) / -np.expm1(-wide * most)
                 crisp = share * sharp * np.exp(-sharp * square) / -np.expm1(-sharp * most)
-                fine[k] = crisp / (blurred + crisp) if crisp > 0.0 else 0.0
-                total, count = total + fine[k], count + 1
-        share = (total + PRIOR[1]) / (count + PRIOR[0] + PRIOR[1])
+                fine_probability[k] = crisp / (blurred + crisp) if crisp > 0.0 else 0.0
+                total, count = total + fine_probability[k], count + 1
+        share = (total + PRIOR_FINE) / (count + PRIOR_STATED + PRIOR_FINE)
     return share
 
 
 @numba.njit(cache=True, nogil=True)
-def fit_to_noise(bearings, points, weights, limits_px, cam_from_map, noise_px, gravity_sd_rad, path):
+def fit_to_noise(matches, limits_px, cam_from_map, noise, path):
     """Maximise the likelihood of what lies within ``limits_px`` (M,) under a mixture of stated and finer noise.
 
-    The share of the finer noise is estimated with the pose: normal noise of ``noise_px`` is fitted by least squares,
+    The share of the finer noise is estimated with the pose: normal noise of the stated size is fitted by least squares,
     and where most matches are much sharper, they decide. ``cam_from_map`` (3, 4) is changed in place, the pose after
     each step written to ``path`` (``ADAPTIVE_STEPS``, 3, 4); returns the steps.
     """
+    bearings, points, jacobian = matches.bearings, matches.points, matches.pixel_jacobian
     count = len(points)
     errors, near = np.empty(count), np.empty(count, np.bool_)
-    fine, heavy = np.empty(count), np.empty((count, 2, 3))
-    share = PRIOR[1] / (PRIOR[0] + PRIOR[1])
+    fine_probability, scaled_jacobian = np.empty(count), np.empty((count, 2, 3))
+    share = PRIOR_FINE / (PRIOR_STATED + PRIOR_FINE)
     for done in range(ADAPTIVE_STEPS):
-        errors_of(bearings, points, weights, cam_from_map, errors)
+        errors_of(matches, cam_from_map, errors)
         for k in range(count):
             near[k] = errors[k] <= limits_px[k]
         if np.count_nonzero(near) < LEAST_FOR_NOISE:
             return done
-        rounds = ROUNDS if done else FIRST_ROUNDS
-        share = share_of_fine(errors, near, limits_px, noise_px, share, rounds, fine)
+        rounds = EM_ROUNDS if done else FIRST_EM_ROUNDS
+        share = share_of_fine(errors, near, limits_px, noise.sd_px, share, rounds, fine_probability)
         for k in range(count):
             if near[k]:
-                scale = np.sqrt(1.0 - fine[k] + fine[k] / (FINE * FINE))
+                scale = np.sqrt(1.0 - fine_probability[k] + fine_probability[k] / (FINE_NOISE * FINE_NOISE))
                 for a in range(2):
                     for b in range(3):
-                        heavy[k, a, b] = scale * weights[k, a, b]
-        length = _step(points, heavy, near, cam_from_map, noise_px, gravity_sd_rad, DAMPING)
+                        scaled_jacobian[k, a, b] = scale * jacobian[k, a, b]
+        length = _step(Matches(bearings, points, scaled_jacobian), near, cam_from_map, noise, DAMPING)
         path[done] = cam_from_map
-        if not length > ADAPTIVE_END:
+        if not length > ADAPTIVE_LEAST_STEP:
             return done + 1
     return ADAPTIVE_STEPS
 
 
 @numba.njit(cache=True, nogil=True)
-def _draw(state, count):
-    """The next state of xorshift64, and a number below ``count``."""
-    state ^= state << np.uint64(13)
-    state ^= state >> np.uint64(7)
-    state ^= state << np.uint64(17)
-    return state, np.int64((state >> np.uint64(33)) % np.uint64(count))
+def _draw(random_state, count):
+    """The next state (uint64) of the generator xorshift64, and a random number from 0 to ``count`` - 1."""
+    random_state ^= random_state << np.uint64(13)
+    random_state ^= random_state >> np.uint64(7)
+    random_state ^= random_state << np.uint64(17)
+    return random_state, np.int64((random_state >> np.uint64(33)) % np.uint64(count))

@@ -18,7 +18,7 @@ PRIOR_GROUPS = 10.0
 """Groups of matches with the stated noise that are believed in beforehand."""
 SHARED_PX = 0.15
 """Error that all matches share, px: no calibration and no map is better, however many matches there are."""
-_KEY = np.array([0.7390851332151607, 0.5671432904097838, 0.9159655941772190])
+_GENERIC_DIRECTION = np.array([0.7390851332151607, 0.5671432904097838, 0.9159655941772190])
 """A direction in which no two different points have the same coordinate, for practical purposes."""
 
 
@@ -31,12 +31,12 @@ def variance_factor(
     """
     if np.count_nonzero(inliers) <= dof:
         return 1.0
-    points, weights = aligned.points[inliers], aligned.pixel_from_bearing[inliers]
+    points, pixel_jacobian = aligned.points[inliers], aligned.pixel_from_bearing[inliers]
     ray = points @ cam_from_map[:, :3].T + cam_from_map[:, 3]
     length = np.linalg.norm(ray, axis=1)[:, None]
     ray = ray / length
-    residual = np.einsum("nij,nj->ni", weights, ray) / noise_px
-    by_ray = (weights - residual[:, :, None] * noise_px * ray[:, None, :]) / noise_px
+    residual = np.einsum("nij,nj->ni", pixel_jacobian, ray) / noise_px
+    by_ray = (pixel_jacobian - residual[:, :, None] * noise_px * ray[:, None, :]) / noise_px
     # A turn moves the ray by w x ray, whatever the distance; a shift by d / length.
     by_turn = np.cross(ray[:, None, :], by_ray)
     jacobian = np.concatenate([by_turn, by_ray / length[..., None]], axis=2)
@@ -59,8 +59,8 @@ def variance_factor(
 
 def _groups(points: FloatArray, bearings: FloatArray) -> IntArray:
     """(K,) number of each match's group: those with the same point, or the same bearing, are together."""
-    by_point = np.unique(points @ _KEY, return_inverse=True)[1]
-    by_bearing = np.unique(bearings @ _KEY, return_inverse=True)[1]
+    by_point = np.unique(points @ _GENERIC_DIRECTION, return_inverse=True)[1]
+    by_bearing = np.unique(bearings @ _GENERIC_DIRECTION, return_inverse=True)[1]
     count = len(points)
     if by_point.max() == count - 1 and by_bearing.max() == count - 1:
         return np.arange(count)

@@ -15,10 +15,11 @@ from spherloc.consensus.chance import chance_rate, nfa
 from spherloc.consensus.inliers import mark_each
 from spherloc.consensus.two_point_search import search_two_point
 from spherloc.diagnosis.evidence import FEW, LOOSE_ENDS, different, pose_sd
+from spherloc.gauss_newton import Noise
 from spherloc.metrics import SUCCESS_DEG, SUCCESS_M
 from spherloc.narrowing import NARROWINGS, narrow
 from spherloc.problem import AlignedProblem
-from spherloc.refine import RefinementOptions, gravity_sd_rad, residuals_px
+from spherloc.refine import RefinementOptions, gravity_sd_rad, matches_of, residuals_px
 from spherloc.trace import ConsensusStage, RefinementStage, Trace
 from spherloc.types import BoolArray, FloatArray
 
@@ -137,8 +138,7 @@ def _gravity_margin(
     """By how little a pose nearby explains more if gravity is not believed."""
     wide = np.maximum(bounds_of(aligned, bound_px).pixels, bound_px + TILT_RAD * aligned.pixels_per_radian)
     tight, path = np.full(len(wide), bound_px), np.empty((len(NARROWINGS), 3, 4))
-    data = (aligned.bearings, aligned.points, aligned.pixel_from_bearing.copy())
-    narrow(*data, wide, tight, state.copy(), options.noise_px, np.inf, path)
+    narrow(matches_of(aligned), wide, tight, state.copy(), Noise(float(options.noise_px), np.inf), path)
     size, free = _different(aligned, inliers), _different(aligned, residuals_px(aligned, path[-1]) <= tight)
     lead = (free - size) / np.sqrt(max(free + size, 1))
     return LEAST_LEAD - lead, f"Without the known gravity, {free} different matches agree instead of {size}."

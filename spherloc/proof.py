@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from spherloc.bounds import bounds_of
-from spherloc.consensus.pose_cells import AXES, CHARTS, matches_of, whole_domain
+from spherloc.consensus.pose_cells import AXES, CHARTS, pack_matches, whole_domain
 from spherloc.consensus.positions import SWITCH_RAD
 from spherloc.consensus.proof_cells import prove_cells
 from spherloc.consensus.stabbing import scratch_for
@@ -34,7 +34,7 @@ def write_proof(trace: Trace, path: Path, watch: Watch | None = None) -> int:
         raise InputError(f"a proof has up to {MOST_FOR_PROOF:,} correspondences, not {count:,}; thin them.")
     watch = watch or Watch()
     bound_px = bounds_of(aligned, trace.options.bound_px).noise_px
-    matches, claim = matches_of(aligned, bound_px), certificate.upper_bound
+    matches, claim = pack_matches(aligned, bound_px), certificate.upper_bound
     room = (np.empty((MOST_CELLS, AXES)), np.empty((MOST_CELLS, AXES)), np.empty((MOST_CELLS, 2), np.int64))
     memory = (scratch_for(count), np.full(BINS, count, np.int32))
     lowers, uppers = whole_domain(aligned.gravity_bound_rad)

@@ -18,7 +18,11 @@ from spherloc.gauss_newton import (
     ROBUST_CAUCHY,
     ROBUST_HUBER,
     ROBUST_NONE,
+    CostModel,
+    Matches,
+    Noise,
     degrees_of_freedom,
+    empty_equations,
     levelled,
     middle_of,
     normal_equations,
@@ -37,6 +41,7 @@ from spherloc.types import BoolArray, FloatArray
 MAX_STEPS = 15
 MAX_ROUNDS = 10
 MAX_RESCUES = 8
+"""Steps of one fit; choices of inliers; fits of a rescue."""
 RESCUE_FACTOR = 1.5
 """By which the residuals of inliers that least squares would lose grow from one rescue to the next."""
 RESCUE_REACH = 16.8
@@ -80,9 +85,23 @@ def gravity_sd_rad(aligned: AlignedProblem, options: RefinementOptions) -> float
     return aligned.gravity_sd_rad if options.gravity_sd_deg is None else float(np.radians(options.gravity_sd_deg))
 
 
+def matches_of(aligned: AlignedProblem) -> Matches:
+    """The matches as kernels take them.
+
+    The Jacobians are a copy: kernels also call each other with scaled ones, which may be written to, and a read-only
+    array would be another type, for which all of them are compiled once more.
+    """
+    return Matches(aligned.bearings, aligned.points, aligned.pixel_from_bearing.copy())
+
+
+def noise_of(aligned: AlignedProblem, options: RefinementOptions) -> Noise:
+    """What weighs pixels against gravity."""
+    return Noise(float(options.noise_px), gravity_sd_rad(aligned, options))
+
+
 def residuals_px(aligned: AlignedProblem, cam_from_map: FloatArray) -> FloatArray:
     """Reprojection error (M,), pixels to first order; inf for points behind their measured bearing."""
-    return _residuals(aligned.bearings, aligned.points, aligned.pixel_from_bearing.copy(), cam_from_map.copy())
+    return _residuals(matches_of(aligned), cam_from_map.copy())
 
 
 def refine(
@@ -109,10 +128,8 @@ def refined_path(
 ) -> tuple[FloatArray, float]:
     """The poses (I + 1, 3, 4) of ``refine`` between the aligned frames, and its inliers' bound where it is below
     ``bounds.pixels`` (else inf)."""
-    # A copy may be written to: one type of array, so that the kernels below are compiled once.
-    data = (aligned.bearings, aligned.points, aligned.pixel_from_bearing.copy())
-    model = (options.noise_px, gravity_sd_rad(aligned, options), ROBUST_CODES[options.robust])
-    return _alternate(*data, bounds.pixels, bounds.noise_px, cam_from_map.copy(), *model)
+    matches, noise, robust = matches_of(aligned), noise_of(aligned, options), ROBUST_CODES[options.robust]
+    return _alternate(matches, bounds.pixels, bounds.noise_px, cam_from_map.copy(), noise, robust)
 
 
 def fitted_path(
@@ -120,15 +137,13 @@ def fitted_path(
 ) -> FloatArray:
     """The poses (I, 3, 4) after each step of a fit to what a pose explains within ``limits_px`` (M,), weighed as the
     options ask for. Aligned frames."""
-    weights, state = aligned.pixel_from_bearing.copy(), cam_from_map.copy()
-    model = (options.noise_px, gravity_sd_rad(aligned, options))
+    matches, noise, state = matches_of(aligned), noise_of(aligned, options), cam_from_map.copy()
     path = np.empty((max(MAX_STEPS, ADAPTIVE_STEPS), 3, 4))
     if options.robust == "adaptive":
-        return path[: fit_to_noise(aligned.bearings, aligned.points, weights, limits_px, state, *model, path)]
-    mask = _residuals(aligned.bearings, aligned.points, weights, state) <= limits_px
-    rotation, translation = state[:, :3].copy(), state[:, 3].copy()
-    steps = (*model, ROBUST_CODES[options.robust], MAX_STEPS, path)
-    return path[: polish_path(aligned.points, weights, mask, rotation, translation, *steps)]
+        return path[: fit_to_noise(matches, limits_px, state, noise, path)]
+    mask = _residuals(matches, state) <= limits_px
+    rotation, translation, robust = state[:, :3].copy(), state[:, 3].copy(), ROBUST_CODES[options.robust]
+    return path[: polish_path(matches, mask, rotation, translation, noise, robust, MAX_STEPS, path)]
 
 
 def record(
@@ -143,22 +158,21 @@ def record(
     Its inliers are the correspondences within ``limits_px`` (M,). ``measured`` has the covariance be that of the noise
     that the residuals show (``noise_scale``), not that of the stated noise.
     """
-    data, sd = (aligned.points, aligned.pixel_from_bearing.copy()), gravity_sd_rad(aligned, options)
-    inliers, costs, counts = _account(aligned.bearings, *data, limits_px, path)
+    matches, noise = matches_of(aligned), noise_of(aligned, options)
+    inliers, costs, counts = _account(matches, limits_px, path)
     last = path[-1].copy()
-    model = (options.noise_px, sd, ROBUST_CODES[options.robust])
-    dof, centre, steps = _step_covariance(*data, inliers, last, *model)
+    dof, centre, steps = _step_covariance(matches, inliers, last, noise, ROBUST_CODES[options.robust])
     if measured and np.isfinite(steps).all():
         factor = variance_factor(aligned, last, inliers, options.noise_px, dof)
-        model = (options.noise_px * np.sqrt(factor), sd, ROBUST_NONE)
-        dof, centre, steps = _step_covariance(*data, inliers, last, *model)
+        measured_noise = Noise(float(options.noise_px * np.sqrt(factor)), noise.gravity_sd_rad)
+        dof, centre, steps = _step_covariance(matches, inliers, last, measured_noise, ROBUST_NONE)
     stage = RefinementStage(
         dof=dof,
         cam_from_map=_unaligned(aligned, path),
         cost_px2=costs,
         inlier_counts=counts,
         covariance=_covariance(aligned, last, centre, steps),
-        gravity_sd_rad=sd,
+        gravity_sd_rad=noise.gravity_sd_rad,
         tilt_rad=float(tilt_of(last)),
     )
     return last, inliers, stage
@@ -185,37 +199,38 @@ def _covariance(aligned: AlignedProblem, cam_from_map: FloatArray, centre: Float
 
 
 @numba.njit(cache=True, nogil=True)
-def _residuals(bearings, points, weights, cam_from_map):
-    """See ``residuals_px``."""
-    errors = np.empty(len(points))
-    errors_of(bearings, points, weights, cam_from_map, errors)
+def _residuals(matches, cam_from_map):
+    """Reprojection errors (M,), px, at a pose (3, 4); see ``residuals_px``."""
+    errors = np.empty(len(matches.points))
+    errors_of(matches, cam_from_map, errors)
     return errors
 
 
 @numba.njit(cache=True, nogil=True)
-def _alternate(bearings, points, weights, wide_px, tight_px, start, noise_px, gravity_sd_rad, robust):
-    """The states (I + 1, 3, 4) from ``start`` (3, 4) to the one to return; an inlier's bound, if below ``wide_px``."""
+def _alternate(matches, wide_px, tight_px, start, noise, robust):
+    """The states (I + 1, 3, 4) from ``start`` (3, 4) to the one to return; an inlier's bound, if below ``wide_px``.
+
+    ``wide_px`` (M,) are the bounds while gravity is kept, ``tight_px`` the one bound once the tilt is estimated.
+    """
     path = np.empty((2 + (MAX_ROUNDS + MAX_RESCUES) * MAX_STEPS, 3, 4))
     path[0], states = start, 1
-    errors = _residuals(bearings, points, weights, start)
+    errors = _residuals(matches, start)
     mask = errors <= wide_px
     if np.count_nonzero(mask) < 2:
         return path[:1], np.inf
-    if gravity_sd_rad < LEAST_GRAVITY_SD_RAD and tilt_of(start) > 0.0:
-        path[1], states = levelled(start, middle_of(points, mask)[1]), 2
-        errors = _residuals(bearings, points, weights, path[1])
+    if noise.gravity_sd_rad < LEAST_GRAVITY_SD_RAD and tilt_of(start) > 0.0:
+        path[1], states = levelled(start, middle_of(matches.points, mask)[1]), 2
+        errors = _residuals(matches, path[1])
         mask = errors <= wide_px
     first_errors, limit_px = errors, np.inf
     kept, most, least_cost = states, -1, np.inf
     rotation, translation = path[states - 1, :, :3].copy(), path[states - 1, :, 3].copy()
     most_steps = np.int64(MAX_STEPS)
     for _ in range(MAX_ROUNDS):
-        if limit_px == np.inf and degrees_of_freedom(np.count_nonzero(mask), gravity_sd_rad) == 6:
+        if limit_px == np.inf and degrees_of_freedom(np.count_nonzero(mask), noise.gravity_sd_rad) == 6:
             limit_px, most = tight_px, -1
-        states += polish_path(
-            points, weights, mask, rotation, translation, noise_px, gravity_sd_rad, robust, most_steps, path[states:]
-        )
-        errors = _residuals(bearings, points, weights, path[states - 1])
+        states += polish_path(matches, mask, rotation, translation, noise, robust, most_steps, path[states:])
+        errors = _residuals(matches, path[states - 1])
         before, mask = mask, errors <= np.minimum(wide_px, limit_px)
         inliers, cost = np.count_nonzero(mask), np.sum(errors[mask] ** 2)
         if inliers > most or (inliers == most and cost < least_cost):
@@ -225,46 +240,51 @@ def _alternate(bearings, points, weights, wide_px, tight_px, start, noise_px, gr
     limits = np.minimum(wide_px, limit_px)
     if np.count_nonzero(first_errors <= limits) > most:
         explained = first_errors <= limits
-        kept += _rescue(bearings, points, weights, limits, explained, path, kept, noise_px, gravity_sd_rad)
+        kept += _rescue(matches, limits, explained, path, kept, noise)
     return path[:kept].copy(), limit_px
 
 
 @numba.njit(cache=True, nogil=True)
-def _rescue(bearings, points, weights, limits_px, explained, path, states, noise_px, gravity_sd_rad):
-    """Move on from the last of ``states`` until as many as are in ``explained`` are inliers; the steps, 0 if in vain.
+def _rescue(matches, limits_px, explained, path, states, noise):
+    """Move on from the last of the ``states`` of ``path`` until as many as are in ``explained`` (M,) are inliers.
+
+    The next poses are written to ``path`` (I, 3, 4); returns how many, 0 if in vain.
 
     Least squares on these, each of them weighing more the more often it was found to be outside. In vain too if the
     pose ends farther from the least-squares one, in the latter's residuals, than noise explains: then it would be bent
     towards an outlier.
     """
-    errors = _residuals(bearings, points, weights, path[states - 1])
+    errors = _residuals(matches, path[states - 1])
     fitted = errors <= limits_px
     cost = np.sum(errors[fitted] ** 2)
-    variance = max(noise_px * noise_px, cost / max(2 * np.count_nonzero(fitted), 1))
-    heavy, steps = weights.copy(), 0
+    variance = max(noise.sd_px * noise.sd_px, cost / max(2 * np.count_nonzero(fitted), 1))
+    scaled, steps = Matches(matches.bearings, matches.points, matches.pixel_jacobian.copy()), 0
     rotation, translation = path[states - 1, :, :3].copy(), path[states - 1, :, 3].copy()
     for _ in range(MAX_RESCUES):
         rest = path[states + steps :]
-        model = (noise_px, gravity_sd_rad, np.int64(ROBUST_NONE), np.int64(MAX_STEPS))
-        steps += polish_path(points, heavy, explained, rotation, translation, *model, rest)
-        errors = _residuals(bearings, points, weights, path[states + steps - 1])
+        robust, most_steps = np.int64(ROBUST_NONE), np.int64(MAX_STEPS)
+        steps += polish_path(scaled, explained, rotation, translation, noise, robust, most_steps, rest)
+        errors = _residuals(matches, path[states + steps - 1])
         if np.sum(errors[fitted] ** 2) - cost > RESCUE_REACH * variance:
             return 0
         inside = errors <= limits_px
         if np.count_nonzero(inside) >= np.count_nonzero(explained):
             return steps
         for k in np.flatnonzero(explained & ~inside):
-            heavy[k] *= RESCUE_FACTOR
+            scaled.pixel_jacobian[k] *= RESCUE_FACTOR
     return 0
 
 
 @numba.njit(cache=True, nogil=True)
-def _account(bearings, points, weights, limits_px, path):
-    """Inlier mask (M,) of the last state; mean squared residual of these, and number of inliers, at every state."""
-    inliers = _residuals(bearings, points, weights, path[-1]) <= limits_px
+def _account(matches, limits_px, path):
+    """Inlier mask (M,) of the last pose of ``path`` (I, 3, 4); mean squared residual of these, px^2, and inliers.
+
+    The latter two (I,) are of every pose. Inliers are those within ``limits_px`` (M,).
+    """
+    inliers = _residuals(matches, path[-1]) <= limits_px
     costs, counts = np.full(len(path), np.nan), np.zeros(len(path), np.int32)
     for k in range(len(path)):
-        errors, total = _residuals(bearings, points, weights, path[k]), 0.0
+        errors, total = _residuals(matches, path[k]), 0.0
         for i in range(len(errors)):
             counts[k] += errors[i] <= limits_px[i]
             total += errors[i] ** 2 if inliers[i] else 0.0
@@ -274,23 +294,24 @@ def _account(bearings, points, weights, limits_px, path):
 
 
 @numba.njit(cache=True, nogil=True)
-def _step_covariance(points, weights, inliers, cam_from_map, noise_px, gravity_sd_rad, robust):
-    """Degrees of freedom; middle (3,) of the inliers; covariance (6, 6) of a step (w, d), NaN if it has none."""
-    count, centre = middle_of(points, inliers)
-    dof = degrees_of_freedom(count, gravity_sd_rad)
+def _step_covariance(matches, inliers, cam_from_map, noise, robust):
+    """Degrees of freedom; middle (3,) of the ``inliers`` (M,), m; covariance (6, 6) of a step (w, d), rad and m.
+
+    The step is from a pose (3, 4); its covariance is NaN if it has none.
+    """
+    count, centre = middle_of(matches.points, inliers)
+    dof = degrees_of_freedom(count, noise.gravity_sd_rad)
     covariance = np.full((6, 6), np.nan)
-    if count < 2 or (dof == 4 and gravity_sd_rad == np.inf):
+    if count < 2 or (dof == 4 and noise.gravity_sd_rad == np.inf):
         return dof, centre, covariance
     rotation = cam_from_map[:, :3].copy()
     middle = rotation @ centre + cam_from_map[:, 3]
-    hessian, factor, unit, column = np.empty((6, 6)), np.empty((6, 6)), np.zeros(6), np.empty(6)
-    normal_equations(
-        points, weights, inliers, centre, rotation, middle, noise_px, gravity_sd_rad, robust, dof, hessian, unit
-    )
-    for k in range(6):
-        unit[:] = 0.0
-        unit[k] = -1.0
-        if not solve(hessian, unit, 0.0, factor, column):
+    system, factor, column = empty_equations(), np.empty((6, 6)), np.empty(6)
+    normal_equations(matches, inliers, centre, rotation, middle, CostModel(noise, robust, dof), system)
+    for k in range(6):  # column by column: the step of a unit gradient
+        system.gradient[:] = 0.0
+        system.gradient[k] = -1.0
+        if not solve(system, 0.0, factor, column):
             return dof, centre, np.full((6, 6), np.nan)
         covariance[:, k] = column
     if dof == 4:

@@ -89,6 +89,13 @@ def extension_of(kind: str, name: str) -> str:
     return "" if point is None or _is_own(point) else shorten(_distribution(point) or point.value)
 
 
+@cache
+def own_module(kind: str, name: str) -> str:
+    """Dotted name of spherloc's own module that has ``name``; empty for an extension and for an unknown name."""
+    point = _point(kind, name)
+    return point.module if point is not None and _is_own(point) else ""
+
+
 def title(kind: str, name: str) -> str:
     """What a sentence calls it, with the extension that it comes from."""
     return _titled(kind, name, extension_of(kind, name))

@@ -22,7 +22,7 @@ from spherloc.trace import Trace
 from spherloc_viz.options import json_text, option_fields
 from spherloc_viz.progress import prepare, say, solve
 from spherloc_viz.recording.origin import Origin
-from spherloc_viz.recording.storage.retention import KEEP_GIGABYTES, kept_bytes
+from spherloc_viz.recording.storage.room import KEEP_GIGABYTES, kept_bytes
 from spherloc_viz.share import is_recording
 
 if TYPE_CHECKING:

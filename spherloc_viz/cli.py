@@ -15,7 +15,7 @@ from tyro.extras import SubcommandApp
 from spherloc.errors import SpherlocError, reason, show
 from spherloc_viz import recording_commands
 from spherloc_viz.arguments import refuse_repeated
-from spherloc_viz.recording.storage.retention import KEEP_GIGABYTES
+from spherloc_viz.recording.storage.room import KEEP_GIGABYTES
 
 RECORDINGS = Path("recordings")
 Settings = Annotated[tyro.conf.UseAppendAction[tuple[tuple[str, ...], ...]], arg(metavar="KEY=VALUE ...")]

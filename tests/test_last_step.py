@@ -9,25 +9,21 @@ import pytest
 from spherloc.bounds import bounds_of
 from spherloc.datasets import load_scene
 from spherloc.estimators import estimate
-from spherloc.gauss_newton import tilt_of
+from spherloc.gauss_newton import Noise, tilt_of
 from spherloc.geometry import DOWN, camera_centre, pose, so3_exp
 from spherloc.last_step import conclude
 from spherloc.metrics import rotation_error_deg, translation_error_m
-from spherloc.narrowing import PRIOR, search_nearby, share_of_fine, truncated_squares
+from spherloc.narrowing import PRIOR_FINE, PRIOR_STATED, search_nearby, share_of_fine, truncated_squares
 from spherloc.problem import Problem
-from spherloc.refine import RefinementOptions, refine, residuals_px
+from spherloc.refine import RefinementOptions, matches_of, refine, residuals_px
 from tests.needs import real_data
 
 BOUND_PX = 3.0
 
 
-def data_of(aligned):
-    return aligned.bearings, aligned.points, aligned.pixel_from_bearing.copy()
-
-
 def squares(aligned, state):
     limits = np.full(len(aligned.points), BOUND_PX)
-    return truncated_squares(*data_of(aligned), limits, state, 1.0, aligned.gravity_sd_rad, np.inf)
+    return truncated_squares(matches_of(aligned), limits, state, Noise(1.0, aligned.gravity_sd_rad), np.inf)
 
 
 def errors(problem, state):
@@ -58,9 +54,9 @@ def test_truncated_squares_are_what_they_say(rng, scene_of, sd):
     expected = np.sum(np.minimum(residuals_px(aligned, state), limits) ** 2) / 0.7**2
     if 0.0 < sd < np.inf:
         expected += (tilt_of(state) / sd) ** 2
-    found = truncated_squares(*data_of(aligned), limits, state, 0.7, sd, np.inf)
+    found = truncated_squares(matches_of(aligned), limits, state, Noise(0.7, sd), np.inf)
     assert found == pytest.approx(expected, rel=1e-12)
-    early = truncated_squares(*data_of(aligned), limits, state, 0.7, sd, 0.5 * expected)
+    early = truncated_squares(matches_of(aligned), limits, state, Noise(0.7, sd), 0.5 * expected)
     assert 0.5 * expected < early <= expected
 
 
@@ -119,7 +115,7 @@ def test_share_of_fine_noise(rng, sharp):
 def test_share_of_fine_noise_is_the_priors_without_evidence():
     limits = np.full(3, 3.0)
     nothing = share_of_fine(np.full(3, 9.0), np.zeros(3, bool), limits, 1.0, 0.5, 5, np.zeros(3))
-    assert nothing == pytest.approx(PRIOR[1] / sum(PRIOR))
+    assert nothing == pytest.approx(PRIOR_FINE / (PRIOR_STATED + PRIOR_FINE))
 
 
 def test_adapts_to_sharp_matches_and_loses_little_on_normal_noise(rng, scene_of):
@@ -156,11 +152,11 @@ def test_search_nearby_never_loses(rng, scene_of):
         aligned = problem.aligned
         start = moved(aligned, aligned.align_pose(problem.truth_cam_from_map), rng.normal(0, 0.01, 3), 0.02)
         limits, wide = np.full(len(aligned.points), BOUND_PX), np.full(len(aligned.points), 15.0)
-        model = (1.0, aligned.gravity_sd_rad)
+        noise = Noise(1.0, aligned.gravity_sd_rad)
         before, results = squares(aligned, start), []
         for _ in range(2):
             best = start.copy()
-            least = search_nearby(*data_of(aligned), wide, limits, start.copy(), *model, best, before)
+            least = search_nearby(matches_of(aligned), wide, limits, start.copy(), noise, best, before)
             assert least <= before and squares(aligned, best) == pytest.approx(least, rel=1e-12)
             results.append(best)
         np.testing.assert_array_equal(*results)

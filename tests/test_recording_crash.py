@@ -25,8 +25,9 @@ from spherloc_viz.recording.replay.repeat import compare
 from spherloc_viz.recording.reviews import write_review
 from spherloc_viz.recording.sandbox.examiner import Examiner, ExaminerError
 from spherloc_viz.recording.storage.recorder import Recorder
+from spherloc_viz.recording.storage.recovery import Rescued, rescue
 from spherloc_viz.recording.storage.store import RecordingStore
-from spherloc_viz.recording.storage.unfinished import STALE_AFTER_S, Rescued, here, leftovers, rescue, unfinished
+from spherloc_viz.recording.storage.unfinished import STALE_AFTER_S, here, leftovers, unfinished
 from tests.needs import needs
 from tests.waiting import LIMIT_S, until
 

@@ -13,10 +13,10 @@ from spherloc import gauss_newton
 from spherloc.bounds import Bounds, bounds_of
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.errors import InputError
-from spherloc.gauss_newton import normal_equations, polish
+from spherloc.gauss_newton import CostModel, Noise, NormalEquations, empty_equations, normal_equations, polish
 from spherloc.geometry import DOWN, pose, rotation_angle, so3_exp, transform, yaw_rotation
 from spherloc.problem import Problem
-from spherloc.refine import RefinementOptions, refine, residuals_px
+from spherloc.refine import RefinementOptions, matches_of, refine, residuals_px
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
 
@@ -51,8 +51,8 @@ def whitened(aligned, cam_from_map, mask, noise_px=1.0, gravity_sd_rad=np.inf):
 def polished(aligned, mask, start, gravity_sd_rad, noise_px=1.0, robust=gauss_newton.ROBUST_NONE, most_steps=50):
     """The pose (3, 4) and number of steps of ``polish``."""
     rotation, translation = start[:, :3].copy(), start[:, 3].copy()
-    data = (aligned.points, aligned.pixel_from_bearing.copy(), mask, rotation, translation)
-    steps = polish(*data, noise_px, gravity_sd_rad, robust, most_steps)
+    noise = Noise(noise_px, gravity_sd_rad)
+    steps = polish(matches_of(aligned), mask, rotation, translation, noise, robust, most_steps)
     return pose(rotation, translation), steps
 
 
@@ -74,10 +74,10 @@ def test_normal_equations_against_central_differences(rng, scene_of, camera, gra
 
         numeric = np.array([(residual(step) - residual(-step)) / 2e-5 for step in 1e-5 * np.eye(6)]).T
         free = [1, 3, 4, 5] if gravity_sd_rad == 0.0 else [0, 1, 2, 3, 4, 5]
-        hessian, gradient, centre = np.empty((6, 6)), np.empty(6), chosen.points.mean(axis=0)
-        rotation = at[:, :3].copy()
-        data = (aligned.points, aligned.pixel_from_bearing.copy(), mask, centre, rotation, rotation @ centre + at[:, 3])
-        cost = normal_equations(*data, 1.7, gravity_sd_rad, 0, len(free), hessian, gradient)
+        system, centre, rotation = empty_equations(), chosen.points.mean(axis=0), at[:, :3].copy()
+        model, middle = CostModel(Noise(1.7, gravity_sd_rad), 0, len(free)), rotation @ centre + at[:, 3]
+        cost = normal_equations(matches_of(aligned), mask, centre, rotation, middle, model, system)
+        hessian, gradient = system
         r = residual(np.zeros(6))
         assert cost == pytest.approx(r @ r, rel=1e-12)
         lengths = np.linalg.norm(numeric, axis=0)
@@ -96,14 +96,15 @@ def test_gravity_residual_does_not_fold(rng, tilt_deg):
     axis = np.array([direction[0], 0.0, direction[1]]) / np.linalg.norm(direction)
     rotation = so3_exp(np.radians(tilt_deg) * axis) @ yaw_rotation(0.7)
     hessian, gradient = np.zeros((6, 6)), np.zeros(6)
-    cost = gauss_newton.add_gravity(rotation, 0.01, hessian, gradient)
+    system = NormalEquations(hessian, gradient)
+    cost = gauss_newton.add_gravity(rotation, 0.01, system)
     assert cost == pytest.approx((np.radians(tilt_deg) / 0.01) ** 2, rel=1e-6)
     downhill = -gradient[:3]
     assert np.linalg.norm(downhill) == pytest.approx(np.radians(tilt_deg) / 0.01**2, rel=1e-6)
     if tilt_deg:
         np.testing.assert_allclose(downhill / np.linalg.norm(downhill), -axis, atol=1e-6)
     if tilt_deg > 1.0:
-        assert gauss_newton.add_gravity(so3_exp(-0.01 * axis) @ rotation, 0.01, hessian, gradient) < cost
+        assert gauss_newton.add_gravity(so3_exp(-0.01 * axis) @ rotation, 0.01, system) < cost
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
@@ -189,13 +190,11 @@ def test_polish_never_climbs_or_breaks(seed, count, sd):
     turn = yaw_rotation(1.0) if sd < 1e-9 else so3_exp(rng.normal(size=3))
     start = pose(turn, rng.normal(size=3) * np.abs(points).max())
 
-    weights = aligned.pixel_from_bearing.copy()
+    matches, model = matches_of(aligned), CostModel(Noise(1.0, sd), robust, gauss_newton.degrees_of_freedom(count, sd))
 
     def cost(state):
-        return normal_equations(
-            *(aligned.points, weights, mask, np.zeros(3), state[:, :3].copy(), state[:, 3].copy()),
-            *(1.0, sd, robust, gauss_newton.degrees_of_freedom(count, sd), np.empty((6, 6)), np.empty(6)),
-        )
+        rotation, translation = state[:, :3].copy(), state[:, 3].copy()
+        return normal_equations(matches, mask, np.zeros(3), rotation, translation, model, empty_equations())
 
     state, steps = polished(aligned, mask, start, sd, robust=robust)
     assert np.isfinite(state).all() and 0 <= steps <= 50

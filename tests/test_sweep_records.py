@@ -11,13 +11,15 @@ import pytest
 from sweep_deaths import DeadlyStore
 
 from spherloc.datasets.variation import Variation
-from spherloc.experiments.sweep import Entrant, Job, planned, run_sweep, solve
+from spherloc.experiments.sweep import Entrant, Job, planned, run_sweep
+from spherloc.experiments.sweep_workers import solve
 from spherloc.trace import Trace
 from spherloc_viz.batch import Records
 from spherloc_viz.recording.content.reader import read_recording
 from spherloc_viz.recording.index.query import RunQuery
 from spherloc_viz.recording.index.run_index import RunIndex
 from spherloc_viz.recording.replay.reopen import reopen
+from spherloc_viz.recording.storage import store as storage
 from spherloc_viz.recording.storage.store import RecordingStore, SweepStore, sweep_run_id
 from spherloc_viz.sweep import Recorded, sweep
 
@@ -114,8 +116,8 @@ def test_a_run_that_is_recorded_anew_replaces_itself_and_keeps_what_a_reviewer_s
             assert after[chosen].labels == ("street",) and after[chosen].note == "wet road"
             assert index.refresh().read == 0
     finally:
-        store._store(store.folder)[0].close()
-        store._store.cache_clear()
+        storage._store(store.folder)[0].close()
+        storage._store.cache_clear()
 
 
 def test_where_nothing_can_be_recorded_the_sweep_goes_on_and_says_it_once(
@@ -142,7 +144,7 @@ def test_workers_of_other_machines_record_nothing(tmp_path: Path) -> None:
     store = SweepStore(tmp_path / "recordings")
     assert replace(store, machine="another")(plan, *done[0]) == "" and not list(tmp_path.iterdir())
     assert store(plan, *done[0]) == ""
-    store._store(store.folder)[0].close()
-    store._store.cache_clear()
+    storage._store(store.folder)[0].close()
+    storage._store.cache_clear()
     (path,) = (tmp_path / "recordings").glob("*.rrd")
     assert read_recording(path).row.source == "sweep" and read_recording(path).problem.pixels.shape == (20, 2)

@@ -7,7 +7,6 @@
 
 import ast
 import functools
-import graphlib
 import subprocess
 import sys
 from pathlib import Path
@@ -30,8 +29,8 @@ FLOORS = (
         "spherloc.disk_cache",
         "spherloc.images",
     ),
-    ("spherloc.cameras", "spherloc.solvers", "spherloc.trajectory"),
-    ("spherloc.gauss_newton", "spherloc.narrowing", "spherloc.worlds", "spherloc.formats"),
+    ("spherloc.cameras", "spherloc.gauss_newton", "spherloc.solvers", "spherloc.trajectory"),
+    ("spherloc.narrowing", "spherloc.worlds", "spherloc.formats"),
     ("spherloc.problem", "spherloc.bounds", "spherloc.consensus"),
     (
         "spherloc.trace",
@@ -161,7 +160,11 @@ print(" ".join(sorted({{name.partition(".")[0] for name in sys.modules}})))
 
 def loaded_by(names):
     """Top-level modules in a fresh interpreter after importing ``names``."""
-    code = LOADER.format(names=sorted(names))
+    return told_by(LOADER.format(names=sorted(names)))
+
+
+def told_by(code):
+    """Words that a fresh interpreter prints."""
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return set(done.stdout.split())
@@ -175,6 +178,14 @@ def test_no_screen_is_loaded(packages):
     found = loaded & (SCREENS - {top})
     assert top in loaded
     assert not found, f"importing all of {' and '.join(packages)} also loads {', '.join(sorted(found))}"
+
+
+def test_the_command_line_answers_before_anything_large_is_loaded():
+    """``spherloc --help`` and ``spherloc scenes`` are asked while somebody waits."""
+    large = {"numba", "scipy", "cv2", "rerun", "viser", "pyarrow"}
+    assert not loaded_by(["spherloc_viz.cli", "spherloc_viz.recording_commands"]) & {*large, "numpy"}
+    scenes = "from spherloc_viz.scene_list import all_scenes; all_scenes()"
+    assert not told_by(scenes + LOADER.format(names=[])) & large
 
 
 def test_every_import_goes_down():
@@ -233,17 +244,3 @@ def test_walls_would_be_noticed(monkeypatch, tmp_path):
     names = [name for _, name in imports("spherloc.hole")]
     assert names == ["viser.uplot", "rerun", "spherloc_viz.app", "spherloc.errors", "spherloc.cameras.base"]
     assert room_of("spherloc.hole") == "spherloc"
-
-
-def test_no_module_imports_in_a_circle():
-    """Two modules that need each other are one idea, or one of them knows too much."""
-    above = {module: set() for module in MODULES}
-    for module, path in MODULES.items():
-        for node in ast.parse(path.read_text(encoding="utf-8")).body:
-            for alias in node.names if isinstance(node, ast.ImportFrom) and not node.level else ():
-                whole = f"{node.module}.{alias.name}"
-                above[module] |= {whole if whole in MODULES else node.module} & set(MODULES)
-    try:
-        tuple(graphlib.TopologicalSorter(above).static_order())
-    except graphlib.CycleError as error:
-        pytest.fail(" imports ".join(reversed(error.args[1])))

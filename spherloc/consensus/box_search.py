@@ -7,9 +7,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spherloc.consensus.pair_arcs import CIRCLE, direction_of_turn
-from spherloc.consensus.pose_cells import has_tilt, place_cell
-from spherloc.consensus.pose_search import BEST, CELL_EFFORT, CELLS, EFFORT, HALT, SPLITS, put_off, search_poses
-from spherloc.consensus.stabbing import EVERYWHERE, deepest, keep_possible
+from spherloc.consensus.pose_cells import CELL_SIZE, HALF_ANGLES, HALF_C, HALF_S, YAW, has_tilt, place_cell
+from spherloc.consensus.pose_search import (
+    BEST,
+    CELL_EFFORT,
+    CELLS,
+    EFFORT,
+    HALT,
+    SPLITS,
+    Room,
+    put_off,
+    room_for,
+    search_poses,
+)
+from spherloc.consensus.stabbing import EVERYWHERE, Scratch, deepest, keep_possible, scratch_for
 from spherloc.types import FloatArray
 from spherloc.watch import stopped
 
@@ -41,6 +52,24 @@ class Splits(NamedTuple):
     """(K, 2): chart and bound."""
 
 
+class Memory(NamedTuple):
+    """All memory of one search."""
+
+    boxes: Boxes
+    """That wait."""
+    scratch: Scratch
+    """Of one box."""
+    room: Room
+    """Of the search of one small cell."""
+    splits: Splits
+    """For the picture."""
+
+
+def memory_for(count: int, most_splits: int) -> Memory:
+    """Memory for ``count`` matches and so many boxes for the picture."""
+    return Memory(boxes_for(count), scratch_for(count), room_for(count), splits_for(most_splits))
+
+
 def splits_for(count: int) -> Splits:
     """Room for so many boxes."""
     return Splits(np.empty((count, 3)), np.empty((count, 3)), np.empty((count, 2), np.int32))
@@ -58,13 +87,14 @@ def boxes_for(count: int) -> Boxes:
 
 @numba.njit(cache=True, nogil=True)
 def _yaw_of_turn(turn):
+    """Yaw, rad in [-pi, pi], of a turn."""
     c, s = direction_of_turn(turn)
     return np.arctan2(s, c)
 
 
 @numba.njit(cache=True, nogil=True)
 def _in_window(scratch, kept, count, start, end, out):
-    """Those of the kept whose interval meets the window, into ``out``; returns how many."""
+    """Write those of ``count`` in ``kept`` whose interval meets a window of turns to ``out`` (K,); returns how many."""
     used = 0
     for k in range(count):
         first, last = scratch.starts[k], scratch.ends[k]
@@ -86,8 +116,8 @@ def _in_window(scratch, kept, count, start, end, out):
 def search_boxes(matches, tasks, yaw_bound, memory, limits, found, board):
     """Search the boxes ``tasks`` = (charts (K,), lower (K, 6), upper (K, 6), bounds (K,)) at all yaws.
 
-    ``yaw_bound`` (B,) is what is known of the bins of turn, ``memory`` is (Boxes, Scratch, Room, Splits); the others
-    are as in ``search_poses``.
+    ``yaw_bound`` (B,) is what is known of the bins of turn, ``memory`` is ``Memory``; the others are as in
+    ``search_poses``.
     """
     boxes, scratch, room, splits = memory
     charts, lowers, uppers, bounds = tasks
@@ -100,7 +130,7 @@ def search_boxes(matches, tasks, yaw_bound, memory, limits, found, board):
     for k in range(waiting):
         lo[k], up[k] = lowers[k], uppers[k]
         spans[k, 0], spans[k, 1], spans[k, 2], spans[k, 3] = 0, count, charts[k], bounds[k]
-    cell, spread, move = np.empty(16), np.empty(2), np.empty(6)
+    cell, spread, move = np.empty(CELL_SIZE), np.empty(2), np.empty(6)
     overflow, inside = np.empty(0, np.int32), np.empty(count, np.int32)
     at_lower, at_upper = np.empty(6), np.empty(6)
     while waiting > 0:
@@ -126,18 +156,18 @@ def search_boxes(matches, tasks, yaw_bound, memory, limits, found, board):
         bound, windows = deepest(scratch, kept, free, cutoff, yaw_bound)
         if bound <= cutoff:
             continue
-        place = state[SPLITS]
-        if place < len(splits.about):
-            splits.lower[place], splits.upper[place] = lo[waiting, :3], up[waiting, :3]
-            splits.about[place, 0], splits.about[place, 1] = chart, bound
-            state[SPLITS] = place + 1
+        index = state[SPLITS]
+        if index < len(splits.about):
+            splits.lower[index], splits.upper[index] = lo[waiting, :3], up[waiting, :3]
+            splits.about[index, 0], splits.about[index, 1] = chart, bound
+            state[SPLITS] = index + 1
         axis = (chart - 1) // 2 if chart > 0 else -1
         split, total = 0, 0.0
         for a in range(6):
             if a < 3:
-                move[a] = cell[4] * spread[1] if a == axis else cell[5 + a] * spread[0]
+                move[a] = cell[HALF_S] * spread[1] if a == axis else cell[HALF_C + a] * spread[0]
             else:
-                move[a] = cell[10 + a] if a > 3 else 0.0
+                move[a] = cell[HALF_ANGLES + a - YAW] if a > 3 else 0.0
             total += move[a]
             if move[a] > move[split]:
                 split = a

@@ -4,38 +4,61 @@ At a yaw, let the graph have an edge where an arc of the pair covers it (``pair_
 explains is a clique, so the largest clique over all yaws bounds every consensus from above. Bins of yaw whose cheap
 bound does not exceed the best verified support cannot hold a better pose and are never searched; the others are, most
 promising first.
+
+A bin is searched by walking its arcs and keeping the graph at the yaw reached. A largest clique is completed by the
+last of its edges, so only when an edge is inserted whose ends have enough common neighbours need these be searched.
+One pair may own two arcs: an edge is cleared when the last one ends.
 """
 
 from dataclasses import dataclass
 
+import numba
 import numpy as np
+from numpy.typing import NDArray
 
 from spherloc.bounds import Bounds
-from spherloc.consensus.balls_of_pairs import apart_balls, view_between
-from spherloc.consensus.bin_cliques import core_graph, largest_bin_cliques
 from spherloc.consensus.chance import least_size, nfa
-from spherloc.consensus.clique_search import colour_bound
-from spherloc.consensus.clique_sweep import certify, sweep_bin
-from spherloc.consensus.depth_bounds import chord
-from spherloc.consensus.level_fit import place, translation_of
-from spherloc.consensus.pair_arcs import pair_arcs, turn_of
-from spherloc.consensus.support import improve
-from spherloc.consensus.yaw_bins import BIN_TURN, BINS, degree_bounds, sort_into_bins
+from spherloc.consensus.level_pose import (
+    BestPoses,
+    BoundedMatches,
+    bounded_matches,
+    empty_list,
+    improve,
+    verify,
+    write_level_pose,
+    write_translation,
+)
+from spherloc.consensus.long_sort import order_of
+from spherloc.consensus.max_clique import ONE, clear_edge, colour_bound, larger_clique, popcount, set_edge, subgraph
+from spherloc.consensus.pair_arcs import CIRCLE, pair_arcs, turn_of, yaws_between
+from spherloc.consensus.region_proof import FOUND, IMPOSSIBLE, UNKNOWN, Region, prove_none, search_region
+from spherloc.consensus.translation_balls import apart_balls, may_be_seen, pair_ball, star_balls
+from spherloc.consensus.yaw_bins import BIN_TURN, BINS, core_graph, degree_bounds, largest_bin_cliques, sort_into_bins
 from spherloc.geometry import yaw_rotation
 from spherloc.problem import AlignedProblem
 from spherloc.types import BoolArray, FloatArray, IndexArray
-from spherloc.watch import Watch, working_s
+from spherloc.watch import DONE, SELDOM, TOTAL, Watch, stopped, working_s
 
-DOUBTFUL = 1e-6
+DOUBTFUL_NFA = 1e-6
 """Expected number of false alarms (NFA) of the size of the guess above which better guesses are looked for."""
 LARGEST_NFA = 1000.0
 """NFA of a size at which it says nothing."""
-MOST_SPARE = 8
+MOST_LEFT_OUT = 8
 """Nodes of a bin more than the best support up to which the whole bin is tried to be certified at once."""
 MOST_POSES = 8
 """Clearly different poses that are remembered."""
-PAIRS_UNTIL, BINS_UNTIL, SCOUT_UNTIL, SEARCH_UNTIL = 0.5, 0.7, 0.75, 0.98
+PAIRS_UNTIL, BINS_UNTIL, CLIQUES_UNTIL, SEARCH_UNTIL = 0.5, 0.7, 0.75, 0.98
 """How far the run of an estimator is by ``Watch.fraction`` at the ends of the parts of this search."""
+MOST_TRIALS = 16
+"""Cliques of a bin that may stay without pose or proof before only larger ones are searched for."""
+MOST_CELLS = 4000
+"""Cells of yaw and position in one proof."""
+MOST_IN_CELLS = 16
+"""Correspondences up to which cells are tried where duality proves nothing."""
+SORT_EFFORT = 70
+"""Words that take as long as sorting an arc in."""
+ROUND_EFFORT, VERIFY_EFFORT = 40, 200
+"""Words that take as long as one correspondence in a round of a proof, and as one when a pose is verified."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,31 +114,25 @@ def exact_consensus(
     deadline = working_s() + time_budget_s
     watch = watch or Watch()
     count = len(aligned.bearings)
-    # Rounding must not exclude what the pixel bound allows.
-    least_cos = np.cos(np.minimum(bounds.radians + 1e-9, np.pi / 2))
-    data = (aligned.bearings, aligned.points, aligned.pixel_from_bearing, bounds.pixels, least_cos)
-    limits = (aligned.pixel_from_bearing, bounds.pixels, bounds.radians, aligned.pixels_per_radian)
-    trig = (chord(bounds.radians), np.sin(bounds.radians))
-    poses, supports = np.empty((MOST_POSES, 5)), np.zeros(MOST_POSES, np.int32)
-    masks = np.zeros((MOST_POSES, count), np.bool_)
-    known = 0
+    matches, best = bounded_matches(aligned, bounds), empty_list(MOST_POSES, count)
+    supports = best.supports
     for yaw, translation in guesses:
-        here = np.empty(5)
-        place(yaw, translation, here)
-        known = improve(data, np.empty(0, np.int64), here, poses, supports, masks, known)
+        pose = np.empty(5)
+        write_level_pose(yaw, translation, pose)
+        improve(matches, np.empty(0, np.int64), pose, best)
     watch.begin("pairs", PAIRS_UNTIL)
-    pairs, lo, hi = pair_arcs(aligned, bounds.radians, watch)
+    arcs = pair_arcs(aligned, bounds.radians, watch)
     watch.begin("bins", BINS_UNTIL)
     watch.expect(4)
-    starts, edges = sort_into_bins(pairs, lo, hi, watch.board)
+    starts, edges = sort_into_bins(*arcs, watch.board)
     watch.reach(3)
     bound = degree_bounds(count, starts, edges, watch.board)
-    watch.begin("largest_bin_cliques", SCOUT_UNTIL)
+    watch.begin("largest_bin_cliques", CLIQUES_UNTIL)
     # What chance explains too often to be told apart is looked for last.
     for expected in (LARGEST_NFA, np.inf) if len(edges) < effort_limit else ():
-        if nfa(count, int(supports[0]), wrong_rate) > DOUBTFUL:
+        if nfa(count, int(supports[0]), wrong_rate) > DOUBTFUL_NFA:
             floor = least_size(count, wrong_rate, expected) - 1
-            known = largest_bin_cliques(data, starts, edges, bound, floor, poses, supports, masks, known, watch.board)
+            largest_bin_cliques(matches, starts, edges, bound, floor, best, watch.board)
     watch.begin("search", SEARCH_UNTIL)
     watch.expect(effort_limit)
     effort, finished = len(edges), True
@@ -131,17 +148,13 @@ def exact_consensus(
         nodes, rows = core_graph(count, edges[starts[b] : starts[b + 1]], int(supports[0]), watch.board)
         watch.check()
         span = (b * BIN_TURN, (b + 1) * BIN_TURN)
-        known, most, work = _certify_bin(
-            data, limits, trig, nodes, rows, span, poses, supports, masks, known, watch.board
-        )
+        most, work = _certify_bin(matches, nodes, rows, span, best, watch.board)
         effort += work
         bound[b] = min(bound[b], most)
         if bound[b] <= supports[0]:
             continue
         left = effort_limit - effort
-        known, most, found, work, exact = sweep_bin(
-            data, limits, trig, pairs, lo, hi, nodes, rows, span, poses, supports, masks, known, left, watch.board
-        )
+        most, found, work, exact = sweep_bin(matches, arcs, nodes, rows, span, best, left, watch.board)
         effort += work
         finished = finished and exact
         bound[b] = min(bound[b], most)
@@ -149,40 +162,237 @@ def exact_consensus(
     watch.check()
     # A bin that was left out explains no more than the best pose.
     if len(clique) <= supports[0]:
-        clique = np.flatnonzero(masks[0])
+        clique = np.flatnonzero(best.masks[0])
+    known = int(best.known[0])
     return ExactConsensus(
-        poses=_as_matrices(poses[:known]),
+        poses=_as_matrices(best.poses[:known]),
         supports=supports[:known],
-        mask=masks[0],
+        mask=best.masks[0],
         bound=np.maximum(bound, 1),  # a camera can always be where it sees one point
         clique=clique.astype(np.int32),
-        arcs=len(pairs),
+        arcs=len(arcs.pairs),
         effort=effort,
         finished=finished,
     )
 
 
-def _certify_bin(data, limits, trig, nodes, rows, span, poses, supports, masks, known, board) -> tuple[int, int, int]:
+def _certify_bin(
+    matches: BoundedMatches,
+    nodes: NDArray[np.int64],
+    rows: NDArray[np.uint64],
+    span: tuple[float, float],
+    best: BestPoses,
+    board: NDArray[np.int64],
+) -> tuple[int, int]:
     """Bound a bin without walking its arcs: by colours, and by proof where few nodes more than the best support are
     left.
 
-    The arguments are those of ``sweep_bin``. Returns how many poses are known, the bound, and the effort.
+    The arguments are those of ``sweep_bin``. Returns the bound, and the effort.
     """
-    best, effort = int(supports[0]), rows.size
-    most = min(len(nodes), colour_bound(rows)) if len(nodes) > best else best
-    if most > best and len(nodes) - best <= MOST_SPARE:
-        view = view_between(data, *span)
-        balls = apart_balls(view, trig, nodes, len(nodes) - best)
-        known, proven, work = certify(data, limits, view, nodes, balls, poses, supports, masks, known, board)
+    support, effort = int(best.supports[0]), rows.size
+    most = min(len(nodes), colour_bound(rows)) if len(nodes) > support else support
+    if most > support and len(nodes) - support <= MOST_LEFT_OUT:
+        yaws = yaws_between(*span)
+        balls = apart_balls(matches, yaws, nodes, len(nodes) - support)
+        proven, work = certify(matches, yaws, nodes, balls, best, board)
         effort += work
         most = 0 if proven else most
-    return int(known), int(max(most, supports[0])), int(effort)
+    return int(max(most, best.supports[0])), int(effort)
 
 
 def _as_matrices(poses: FloatArray) -> FloatArray:
     """Level poses (C, 5) as (C, 3, 4)."""
     matrices = np.zeros((len(poses), 3, 4))
-    for here, matrix in zip(poses, matrices, strict=True):
-        matrix[:, :3] = yaw_rotation(np.arctan2(here[1], here[0]))
-        translation_of(here, matrix[:, 3])
+    for pose, matrix in zip(poses, matrices, strict=True):
+        matrix[:, :3] = yaw_rotation(np.arctan2(pose[1], pose[0]))
+        write_translation(pose, matrix[:, 3])
     return matrices
+
+
+@numba.njit(cache=True, nogil=True)
+def _pieces(arcs, nodes, count, start, end, board):
+    """``Arcs`` among ``nodes`` (K,) that touch the bin from turn ``start`` to turn ``end``, clipped to it.
+
+    Nodes are numbers of ``count`` matches. Returns edges (E, 2), indices into ``nodes``, and their first and last ends
+    (E,), (E,), turns. A watch's ``board`` can end it, after which there are none.
+    """
+    pairs, lo, hi = arcs
+    index_of = np.full(count, -1, np.int64)
+    for index in range(len(nodes)):
+        index_of[nodes[index]] = index
+    used, room = 0, 0
+    edges, first, last = np.empty((0, 2), np.int64), np.empty(0), np.empty(0)
+    for counting in (True, False):
+        for arc in range(len(lo)):
+            if arc & SELDOM == 0 and stopped(board):
+                return np.empty((0, 2), np.int64), np.empty(0), np.empty(0)
+            for turns in (0.0, CIRCLE):
+                if lo[arc] - turns > end or hi[arc] - turns < start:
+                    continue
+                a, b = index_of[pairs[arc, 0]], index_of[pairs[arc, 1]]
+                if a < 0 or b < 0:
+                    continue
+                if counting:
+                    room += 1
+                    continue
+                edges[used, 0], edges[used, 1] = a, b
+                first[used], last[used] = max(lo[arc] - turns, start), min(hi[arc] - turns, end)
+                used += 1
+        if counting:
+            edges, first, last = np.empty((room, 2), np.int64), np.empty(room), np.empty(room)
+    return edges, first, last
+
+
+@numba.njit(cache=True, nogil=True)
+def _common(rows, a, b, out):
+    """Write the common neighbours of two nodes of a graph ``rows`` (K, words) to ``out`` (words,); returns how many."""
+    found = 0
+    for w in range(rows.shape[1]):
+        word = rows[a, w] & rows[b, w]
+        found += popcount(word)
+        out[w] = word
+    return found
+
+
+@numba.njit(cache=True, nogil=True)
+def _members(bits, count):
+    """The ``count`` nodes (N,) of a bitset (words,), ascending."""
+    nodes = np.empty(count, np.int64)
+    used = 0
+    for w in range(len(bits)):
+        word = bits[w]
+        while word != 0:
+            low = word & (~word + ONE)
+            nodes[used] = w * 64 + popcount(low - ONE)
+            used += 1
+            word ^= low
+    return nodes[:used]
+
+
+@numba.njit(cache=True, nogil=True)
+def _candidates(matches, yaws, ball, nodes, common, shared):
+    """Those of the ``shared`` neighbours in the bitset ``common`` that may be seen from somewhere in a ``ball`` (4,).
+
+    Indices (C,) into ``nodes`` (K,), which are numbers of ``BoundedMatches``; ``yaws`` is a ``YawInterval``.
+    """
+    kept, used = np.empty(shared, np.int64), 0
+    for index in _members(common, shared):
+        if may_be_seen(matches, yaws, nodes[index], ball):
+            kept[used] = index
+            used += 1
+    return kept[:used]
+
+
+@numba.njit(cache=True, nogil=True)
+def _completed(rows, a, b, candidates, floor, effort_limit, board):
+    """A clique of nodes a, b and ``candidates`` (C,) with more than ``floor`` nodes in all, or nothing.
+
+    Nodes are those of the graph ``rows`` (K, words). Returns it, the effort, and whether it is exact.
+    """
+    small, old = subgraph(rows, candidates)
+    inside, effort, exact = larger_clique(small, floor - 2, effort_limit, board)
+    effort += len(candidates) * len(candidates)
+    if len(inside) == 0 and floor >= 2:
+        return inside, effort, exact
+    clique = np.empty(len(inside) + 2, np.int64)
+    for k in range(len(inside)):
+        clique[k] = old[inside[k]]
+    clique[-2], clique[-1] = a, b
+    return clique, effort, exact
+
+
+@numba.njit(cache=True, nogil=True)
+def certify(matches, yaws, everybody, balls, best, board):
+    """Prove that no pose explains more of ``everybody`` (K,) than the best known one does.
+
+    All that might are at ``yaws``, a ``YawInterval``, with positions in ``balls`` (B, 4). Better poses that are met are
+    added to ``best``, ``BestPoses``, and the proof goes on against them. Returns whether it is proven, and the effort.
+    A watch's ``board`` can end it unproven.
+    """
+    found = np.empty(5)
+    effort, b = 0, 0
+    while b < len(balls):
+        if not balls[b, 3] < np.inf or stopped(board):
+            return False, effort
+        support, region = np.int64(best.supports[0]), Region(yaws, balls[b])
+        answer, work = prove_none(matches, region, everybody, support, found, board)
+        effort += work * ROUND_EFFORT
+        if answer == UNKNOWN and len(everybody) <= MOST_IN_CELLS:
+            answer, work = search_region(matches, region, everybody, support, np.int64(MOST_CELLS), found)
+            effort += work
+        if answer == FOUND:
+            improve(matches, everybody, found, best)
+            if best.supports[0] <= support:  # it climbed down by rounding
+                return False, effort
+        elif answer == IMPOSSIBLE:
+            b += 1
+        else:
+            return False, effort
+    return True, effort
+
+
+@numba.njit(cache=True, nogil=True)
+def sweep_bin(matches, arcs, nodes, rows, span, best, effort_limit, board):
+    """Search the bin between the turns ``span``.
+
+    ``matches`` are ``BoundedMatches``, ``arcs`` the ``Arcs`` of all pairs; ``nodes`` (K,) and ``rows`` (K, words) are
+    the bin's core and its graph, which is used up. ``best`` holds the verified poses, ``BestPoses``; better ones are
+    added in place. Returns the bound for the bin, its largest clique that may have a pose (nodes; empty if none is
+    larger than the support), the effort, and whether the bin was searched to its end. A watch's ``board`` can end it,
+    and learns how much of the effort is left.
+    """
+    count, supports = len(matches.points), best.supports
+    nothing = np.empty(0, np.int64)
+    whole = colour_bound(rows)
+    edges, first, last = _pieces(arcs, nodes, count, span[0], span[1], board)
+    effort = len(arcs.lo) + SORT_EFFORT * len(edges)
+    if effort > effort_limit:
+        return whole, nothing, len(arcs.lo), False
+    rows[:] = 0
+    owned = np.zeros((len(nodes), len(nodes)), np.uint8)
+    common = np.empty(rows.shape[1], np.uint64)
+    opening, closing = order_of(first, board), order_of(last, board)
+    largest, trials, closed, floor = nothing, 0, 0, np.int64(supports[0])
+    exact = True
+    for edge in opening:
+        if stopped(board):
+            return whole, largest, effort, False
+        while last[closing[closed]] < first[edge]:
+            a, b = edges[closing[closed], 0], edges[closing[closed], 1]
+            owned[a, b] -= 1
+            if owned[a, b] == 0:
+                clear_edge(rows, a, b)
+            closed += 1
+        a, b = edges[edge, 0], edges[edge, 1]
+        owned[a, b] += 1
+        set_edge(rows, a, b)
+        effort += len(common)
+        shared = _common(rows, a, b, common)
+        if shared + 2 <= floor:
+            continue
+        if effort >= effort_limit:
+            return whole, largest, effort, False
+        board[DONE] = max(board[DONE], board[TOTAL] - effort_limit + effort)
+        # Who completes a clique with this edge is seen from its ball, at a yaw of its arc.
+        yaws = yaws_between(first[edge], last[edge])
+        ball = pair_ball(matches, yaws, nodes[a], nodes[b])
+        candidates = _candidates(matches, yaws, ball, nodes, common, shared)
+        clique, work, done = _completed(rows, a, b, candidates, floor, effort_limit - effort, board)
+        effort += work
+        exact = exact and done
+        if len(clique) == 0:
+            continue
+        verify(matches, nodes[clique], best)
+        effort += VERIFY_EFFORT * count
+        floor = max(floor, supports[0])
+        if len(clique) <= floor:
+            continue
+        everybody = np.append(nodes[candidates], nodes[np.array([a, b])])
+        balls = star_balls(matches, yaws, everybody, len(everybody) - supports[0], ball)
+        proven, work = certify(matches, yaws, everybody, balls, best, board)
+        effort += work
+        if not proven and len(clique) > len(largest):
+            largest = nodes[clique]
+        trials += not proven
+        floor = np.int64(supports[0] if trials < MOST_TRIALS else max(supports[0], len(largest)))
+    return max(floor, len(largest)) if exact else whole, largest, effort, exact

@@ -5,7 +5,7 @@ import numpy as np
 
 from spherloc.watch import stopped
 
-SHORT = 15
+MOST_INSERTED = 15
 """Fewer numbers are sorted by insertion."""
 MOST_WAITING = 100
 """Parts that wait to be sorted. The longer one waits, so that they are at most the logarithm of the count."""
@@ -13,7 +13,10 @@ MOST_WAITING = 100
 
 @numba.njit(cache=True, nogil=True)
 def order_of(values, board):
-    """What ``np.argsort`` gives in a kernel, ties included: the same quicksort. Stopped by ``board``, some order."""
+    """The order (N,) that ``np.argsort`` gives ``values`` (N,) in a kernel, ties included: the same quicksort.
+
+    Stopped by a watch's ``board``, some order.
+    """
     order = np.arange(len(values))
     waiting = np.empty((MOST_WAITING, 2), np.int64)
     waiting[0] = 0, len(values) - 1
@@ -21,8 +24,8 @@ def order_of(values, board):
     while count > 0:
         count -= 1
         low, high = waiting[count]
-        while high - low >= SHORT and not stopped(board):
-            middle = _part(values, order, low, high)
+        while high - low >= MOST_INSERTED and not stopped(board):
+            middle = _partition(values, order, low, high)
             if high - middle > middle - low:
                 waiting[count] = middle + 1, high
                 count += high > middle
@@ -39,7 +42,7 @@ def order_of(values, board):
 
 @numba.njit(cache=True, nogil=True)
 def _insert(values, order, low, high):
-    """Sort ``order[low : high + 1]`` by insertion."""
+    """Sort ``order[low : high + 1]`` of ``order`` (N,) by the ``values`` (N,), by insertion."""
     for i in range(low + 1, high + 1):
         moved, j = order[i], i
         while j > low and values[moved] < values[order[j - 1]]:
@@ -49,8 +52,11 @@ def _insert(values, order, low, high):
 
 
 @numba.njit(cache=True, nogil=True)
-def _part(values, order, low, high):
-    """Part ``order[low : high + 1]`` at the median of its first, middle and last; returns the place of this one."""
+def _partition(values, order, low, high):
+    """Partition ``order[low : high + 1]`` by ``values`` (N,) at the median of its first, middle and last.
+
+    Returns the index of this one.
+    """
     middle = (low + high) >> 1
     if values[order[middle]] < values[order[low]]:
         order[low], order[middle] = order[middle], order[low]

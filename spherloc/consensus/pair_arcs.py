@@ -1,16 +1,33 @@
-"""Yaw arcs of all pairs for the exact search, without trigonometry: ends as turns on a square instead of a circle.
+"""What a pair of bounded bearings says about yaw and depth, exactly, and the arcs of yaw that it leaves.
 
-The conditions are those of ``depth_bounds``: |f| <= tau where depths may be positive. The exact search only compares
+**Sinusoids of yaw.** For a pair (i, j) let w(yaw) = R d be the vector between its points, a = v_i . v_j and alpha the
+angle between the measured bearings. Every quantity here has the form A cos yaw + B sin yaw + C, kept as the triple
+(A, B, C):
+
+- f = (v_i x v_j) . w, Eq. 22;
+- the measured depths s, the least-squares solution of w = s_i v_i - s_j v_j;
+- upper bounds S on the true depths. With true bearings at most eps away, chords c = 2 sin(eps / 2) and
+  g = c / sin alpha, the dual vectors of v_i and v_j (length 1 / sin alpha) give
+      s_i >= (1 - g_i) s_i* - g_j s_j*,    s_j >= (1 - g_j) s_j* - g_i s_i*,
+  and, since that matrix is inverse-positive for g_i + g_j < 1,
+      s_i* <= S_i = ((1 - g_j) s_i + g_j s_j) / (1 - g_i - g_j),    and S_j alike;
+- the bound on |f| at the true yaw, tau = sin alpha (S_i sin eps_i + S_j sin eps_j): f is linear in each bearing, and
+  |(v_i x v_j) . v_i*| = |v_j . (v_i* x v_i)| <= sin alpha sin eps_i.
+
+Nothing here is a first-order approximation. A pair with g_i + g_j >= 1 (bearings too close) bounds nothing.
+
+**Arcs**, for the exact search, without trigonometry: |f| <= tau where depths may be positive. That search only compares
 yaws, so an end (cos, sin) becomes its turn, the length along the square |cos| + |sin| = 1, from 0 to 4, which grows
 with yaw and costs one division. The arcs bound as those of ``yaw_arcs`` do and are a little wider: a depth that
 changes its sign within an arc does not shorten it. A pair that bounds nothing has the whole circle: its edge is in
 every graph.
 """
 
+from typing import NamedTuple
+
 import numba
 import numpy as np
 
-from spherloc.consensus.depth_bounds import chord, pair_sinusoids
 from spherloc.problem import AlignedProblem
 from spherloc.types import FloatArray, IndexArray
 from spherloc.watch import DONE, Watch, stopped
@@ -21,6 +38,88 @@ ROUNDING = 1e-12
 """Slack of every condition, relative to its amplitude, so that rounding never excludes the true yaw."""
 
 
+class BoundedRays(NamedTuple):
+    """M rays from map points to the camera, and the bounds on their directions."""
+
+    bearings: FloatArray
+    """(M, 3) measured unit vectors, aligned camera frame."""
+    points: FloatArray
+    """(M, 3) map points, m, aligned map frame."""
+    chord: FloatArray
+    """(M,) distance of unit vectors at the largest angular error."""
+    sine: FloatArray
+    """(M,) sine of that angle."""
+
+
+class YawInterval(NamedTuple):
+    """Yaws less than a quarter of a circle around one."""
+
+    cos: float
+    """Of the middle."""
+    sin: float
+    """Of the middle."""
+    half_width_rad: float
+    """How far the ends are from it."""
+
+
+class Arcs(NamedTuple):
+    """A arcs of feasible yaw of pairs of matches."""
+
+    pairs: IndexArray
+    """(A, 2) the two matches of each."""
+    lo: FloatArray
+    """(A,) first ends, in [0, 4), turns."""
+    hi: FloatArray
+    """(A,) second ends, up to a circle larger than the first, turns."""
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _along(v, dx, dy, dz):
+    """v . (R d) of a bearing v (3,) and d = (dx, dy, dz), m, as (cos, sin, constant)."""
+    return v[0] * dx + v[2] * dz, v[0] * dz - v[2] * dx, v[1] * dy
+
+
+@numba.njit(cache=True, nogil=True)
+def chord(angle):
+    """Distance between unit vectors at this angle, rad (any shape)."""
+    return 2.0 * np.sin(0.5 * angle)
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def pair_sinusoids(vi, vj, pi, pj, chord_i, chord_j, sin_i, sin_j):
+    """sin alpha, and the (cos, sin, constant) of f, s_i, s_j, S_i, S_j, tau, m, of two bearings and points, all (3,).
+
+    Also given are the ``chord`` and the sine of the bound on each bearing's angular error.
+    sin alpha is 0 for a pair that bounds nothing: its bearings are too close, or its points coincide.
+    """
+    zero = (0.0, 0.0, 0.0)
+    dx, dy, dz = pi[0] - pj[0], pi[1] - pj[1], pi[2] - pj[2]
+    nx = vi[1] * vj[2] - vi[2] * vj[1]
+    ny = vi[2] * vj[0] - vi[0] * vj[2]
+    nz = vi[0] * vj[1] - vi[1] * vj[0]
+    sin2 = nx * nx + ny * ny + nz * nz
+    sin_alpha = np.sqrt(sin2)
+    if sin_alpha <= chord_i + chord_j or (dx == 0.0 and dy == 0.0 and dz == 0.0):
+        return 0.0, zero, zero, zero, zero, zero, zero
+    dot = vi[0] * vj[0] + vi[1] * vj[1] + vi[2] * vj[2]
+    gi, gj = chord_i / sin_alpha, chord_j / sin_alpha
+    scale = 1.0 / (1.0 - gi - gj)
+    f = (nx * dx + nz * dz, nx * dz - nz * dx, ny * dy)
+    along_i, along_j = _along(vi, dx, dy, dz), _along(vj, dx, dy, dz)
+    per_sin2 = 1.0 / sin2
+    si = _mix(per_sin2, along_i, -dot * per_sin2, along_j)
+    sj = _mix(dot * per_sin2, along_i, -per_sin2, along_j)
+    most_i = _mix(scale * (1.0 - gj), si, scale * gj, sj)
+    most_j = _mix(scale * (1.0 - gi), sj, scale * gi, si)
+    return sin_alpha, f, si, sj, most_i, most_j, _mix(sin_alpha * sin_i, most_i, sin_alpha * sin_j, most_j)
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _mix(a, u, b, v):
+    """a u + b v of two sinusoids, as (cos, sin, constant)."""
+    return a * u[0] + b * v[0], a * u[1] + b * v[1], a * u[2] + b * v[2]
+
+
 def turn_of(yaw_rad: FloatArray) -> FloatArray:
     """Turns in [0, 4) of yaws (any shape), rad."""
     c, s = np.cos(yaw_rad), np.sin(yaw_rad)
@@ -29,13 +128,10 @@ def turn_of(yaw_rad: FloatArray) -> FloatArray:
     return np.where(turn < CIRCLE, turn, 0.0)
 
 
-def pair_arcs(
-    aligned: AlignedProblem, bound_rad: FloatArray, watch: Watch | None = None
-) -> tuple[IndexArray, FloatArray, FloatArray]:
-    """Arcs of all pairs: pairs (A, 2) of places in ``aligned``, first ends (A,) in [0, 4) and second ends (A,), turns.
+def pair_arcs(aligned: AlignedProblem, bound_rad: FloatArray, watch: Watch | None = None) -> Arcs:
+    """Arcs of all pairs of the matches of ``aligned``.
 
-    The second end is up to a circle larger than the first. ``bound_rad`` (M,) bounds each bearing's angular error.
-    ``watch`` counts the pairs; raises ``Cancelled``.
+    ``bound_rad`` (M,) bounds each bearing's angular error. ``watch`` counts the pairs; raises ``Cancelled``.
     """
     watch = watch or Watch()
     count = len(aligned.bearings)
@@ -46,12 +142,12 @@ def pair_arcs(
     used = _fill(aligned.bearings, aligned.points, bound_rad, pairs, ends, watch.board)
     watch.check()
     # Of one layout, however many there are: kernels are compiled for it.
-    return pairs[:used], np.ascontiguousarray(ends[:used, 0]), np.ascontiguousarray(ends[:used, 1])
+    return Arcs(pairs[:used], np.ascontiguousarray(ends[:used, 0]), np.ascontiguousarray(ends[:used, 1]))
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
-def _turn(c, s):
-    """Turn in [0, 4] of a direction of any length."""
+def turn_of_direction(c, s):
+    """Turn in [0, 4] of the direction (c, s) of any length."""
     quarter = s / (abs(c) + abs(s))
     if c < 0.0:
         return 2.0 - quarter
@@ -68,20 +164,22 @@ def direction_of_turn(turn):
 
 
 @numba.njit(cache=True, nogil=True)
-def middle_of_turns(lo, hi):
-    """(cos, sin) in the middle of an arc of less than half a circle, and half its width, rad."""
+def yaws_between(lo, hi):
+    """The ``YawInterval`` between two turns less than half a circle apart."""
     c0, s0 = direction_of_turn(lo)
     c1, s1 = direction_of_turn(hi)
     c, s = c0 + c1, s0 + s1
     norm = np.sqrt(c * c + s * s)
-    return c / norm, s / norm, 0.5 * np.arctan2(c0 * s1 - s0 * c1, c0 * c1 + s0 * s1) + ROUNDING
+    half_width_rad = 0.5 * np.arctan2(c0 * s1 - s0 * c1, c0 * c1 + s0 * s1) + ROUNDING
+    return YawInterval(c / norm, s / norm, half_width_rad)
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
 def _behind(a, b, c, u0, v0, u1, v1):
     """Whether a cos + b sin + c < 0 on all of the arc, shorter than half a circle, between two unit vectors.
 
-    A wave exceeds the larger of its ends by at most its amplitude times sin^2 of half the arc's width.
+    They are (u0, v0) and (u1, v1). A wave exceeds the larger of its ends by at most its amplitude times sin^2 of half
+    the arc's width.
     """
     most = max(a * u0 + b * v0, a * u1 + b * v1) + c
     if most >= 0.0:
@@ -92,6 +190,10 @@ def _behind(a, b, c, u0, v0, u1, v1):
 
 @numba.njit(cache=True, nogil=True)
 def _fill(bearings, points, eps, pairs, ends, board):
+    """Write the arcs of ``pair_arcs`` to ``pairs`` (K, 2) and ``ends`` (K, 2), turns; returns how many.
+
+    ``bearings`` (M, 3), ``points`` (M, 3), m, ``eps`` (M,), rad. A watch's ``board`` counts the pairs and can end it.
+    """
     used = 0
     chords, sines = chord(eps), np.sin(eps)
     for i in range(len(bearings)):
@@ -164,7 +266,7 @@ def _fill(bearings, points, eps, pairs, ends, board):
                     or _behind(most_j[0], most_j[1], most_j[2], u0, v0, u1, v1)
                 ):
                     continue
-                lo, hi = _turn(u0, v0) % CIRCLE, _turn(u1, v1)
+                lo, hi = turn_of_direction(u0, v0) % CIRCLE, turn_of_direction(u1, v1)
                 if hi < lo:
                     hi = lo if lo - hi < ROUNDING else hi + CIRCLE
                 pairs[used, 0], pairs[used, 1] = i, j

@@ -52,11 +52,13 @@ COORDINATE_ROUNDING = 4e-16
 SCALE_SHARE = 0.9
 """Share of the points that the scale looks at: a few far away must not make the cube large."""
 
-Q, Q_NORM, BEARING, WEIGHTS, BOUND_PX, PX_PER_RAD, BOUND_RAD, SINE, COSINE, WIDTH = 0, 3, 4, 7, 13, 14, 15, 16, 17, 18
-"""Columns of ``Matches.rows``; q, bearing and weights are 3, 3 and 6 columns."""
+Q, Q_NORM, BEARING, JACOBIAN, BOUND_PX, PX_PER_RAD, BOUND_RAD, SINE, COSINE, WIDTH = 0, 3, 4, 7, 13, 14, 15, 16, 17, 18
+"""Columns of ``PackedMatches.rows``; q, bearing and pixel Jacobian are 3, 3 and 6 columns."""
+S, C, HALF_S, HALF_C, HALF_C_NORM, HALF_C_FLAT, ANGLES, HALF_ANGLES, CELL_SIZE = 0, 1, 4, 5, 8, 9, 10, 13, 16
+"""Where the numbers of a cell are in an array (CELL_SIZE,), see ``place_cell``; c and the angles are 3 numbers each."""
 
 
-class Matches(NamedTuple):
+class PackedMatches(NamedTuple):
     """What the search looks at, M correspondences."""
 
     rows: FloatArray
@@ -74,7 +76,7 @@ class Matches(NamedTuple):
     """D, metres."""
 
 
-def matches_of(aligned: AlignedProblem, bound_px: float) -> Matches:
+def pack_matches(aligned: AlignedProblem, bound_px: float) -> PackedMatches:
     """The correspondences with the noise bound alone (the tilt of a cell is what gravity's bound allows)."""
     points = aligned.points
     middle = np.median(points, axis=0)
@@ -86,13 +88,13 @@ def matches_of(aligned: AlignedProblem, bound_px: float) -> Matches:
     rows[:, Q : Q + 3] = (points - middle) / scale
     rows[:, Q_NORM] = np.linalg.norm(rows[:, Q : Q + 3], axis=1)
     rows[:, BEARING : BEARING + 3] = aligned.bearings
-    rows[:, WEIGHTS : WEIGHTS + 6] = aligned.pixel_from_bearing.reshape(-1, 6)
+    rows[:, JACOBIAN : JACOBIAN + 6] = aligned.pixel_from_bearing.reshape(-1, 6)
     rows[:, BOUND_PX] = bound_px
     rows[:, PX_PER_RAD] = aligned.pixels_per_radian
     angle = np.arcsin(np.minimum(1.0, bound_px * aligned.radians_per_pixel)) + SLACK
     rows[:, BOUND_RAD], rows[:, SINE], rows[:, COSINE] = angle, np.sin(angle), np.cos(angle)
     gamma = aligned.gravity_bound_rad
-    return Matches(
+    return PackedMatches(
         rows=rows,
         rounding=COORDINATE_ROUNDING * (float(np.abs(points).max()) + float(np.abs(middle).max())) / scale + 1e-15,
         least_cosine=float(np.cos(gamma)),
@@ -112,7 +114,7 @@ def whole_domain(gravity_bound_rad: float) -> tuple[FloatArray, FloatArray]:
     return lower, upper
 
 
-def pose_of(matches: Matches, chart: int, at: FloatArray) -> FloatArray:
+def pose_of(matches: PackedMatches, chart: int, at: FloatArray) -> FloatArray:
     """The pose (3, 4) between the aligned frames of a chart's parameters (6,)."""
     turn = np.empty((3, 3))
     rotation_of(at[YAW], at[TILT_A], at[TILT_C], turn)
@@ -121,7 +123,7 @@ def pose_of(matches: Matches, chart: int, at: FloatArray) -> FloatArray:
     return np.column_stack([turn, -turn @ centre])
 
 
-def parameters_of(matches: Matches, cam_from_map: FloatArray) -> tuple[int, FloatArray]:
+def parameters_of(matches: PackedMatches, cam_from_map: FloatArray) -> tuple[int, FloatArray]:
     """Chart and parameters (6,) of a pose (3, 4) between the aligned frames."""
     rotation = cam_from_map[:, :3]
     at = np.zeros(AXES)
@@ -154,7 +156,7 @@ def _homogeneous(chart: int, at: FloatArray) -> tuple[float, FloatArray]:
 
 @numba.njit(cache=True, nogil=True)
 def rotation_of(yaw, a, c, out):
-    """Write R_x(a) R_z(c) R_y(yaw) (3, 3)."""
+    """Write R_x(a) R_z(c) R_y(yaw) to ``out`` (3, 3); angles in rad."""
     cy, sy, ca, sa, cc, sc = np.cos(yaw), np.sin(yaw), np.cos(a), np.sin(a), np.cos(c), np.sin(c)
     out[0, 0], out[0, 1], out[0, 2] = cc * cy, -sc, cc * sy
     out[1, 0], out[1, 1], out[1, 2] = ca * sc * cy + sa * sy, ca * cc, ca * sc * sy - sa * cy
@@ -163,30 +165,32 @@ def rotation_of(yaw, a, c, out):
 
 @numba.njit(cache=True, nogil=True)
 def has_tilt(matches, lower, upper):
-    """Whether some tilt of a cell, ends (6,) and (6,), is within the gravity bound."""
-    a = max(lower[4], -upper[4], 0.0)
-    c = max(lower[5], -upper[5], 0.0)
+    """Whether some tilt of a cell, ends ``lower`` (6,) and ``upper`` (6,), is within the gravity bound."""
+    a = max(lower[TILT_A], -upper[TILT_A], 0.0)
+    c = max(lower[TILT_C], -upper[TILT_C], 0.0)
     return np.cos(a) * np.cos(c) >= matches.least_cosine - 1e-15
 
 
 @numba.njit(cache=True, nogil=True)
 def place_cell(chart, lower, upper, cell):
-    """Write what the bounds need of a cell, (16,): middle of s, of c (3,), half sides of s, of c (3,), |h_c| and its
-    horizontal part, then middle and half sides of yaw, a, c.
+    """Write what bounds need of a cell of a chart, ends ``lower`` (6,) and ``upper`` (6,), to ``cell`` (CELL_SIZE,).
+
+    Middle of s, of c (3,), half sides of s, of c (3,), |h_c| and its horizontal part, then middles and half sides of
+    yaw, a, c, rad.
     """
     axis = (chart - 1) // 2 if chart > 0 else -1
-    cell[0], cell[4] = 1.0, 0.0
+    cell[S], cell[HALF_S] = 1.0, 0.0
     for k in range(3):
         middle = 0.5 * (lower[k] + upper[k])
         half = max(upper[k] - middle, middle - lower[k])
         if k == axis:
-            cell[0], cell[4] = middle, half
-            cell[1 + k], cell[5 + k] = (1.0 if chart % 2 == 1 else -1.0), 0.0
+            cell[S], cell[HALF_S] = middle, half
+            cell[C + k], cell[HALF_C + k] = (1.0 if chart % 2 == 1 else -1.0), 0.0
         else:
-            cell[1 + k], cell[5 + k] = middle, half
-    flat = cell[5] * cell[5] + cell[7] * cell[7]
-    cell[8], cell[9] = np.sqrt(flat + cell[6] * cell[6]), np.sqrt(flat)
+            cell[C + k], cell[HALF_C + k] = middle, half
+    flat = cell[HALF_C] * cell[HALF_C] + cell[HALF_C + 2] * cell[HALF_C + 2]
+    cell[HALF_C_NORM], cell[HALF_C_FLAT] = np.sqrt(flat + cell[HALF_C + 1] * cell[HALF_C + 1]), np.sqrt(flat)
     for k in range(3):
         middle = 0.5 * (lower[3 + k] + upper[3 + k])
-        cell[10 + k] = middle
-        cell[13 + k] = max(upper[3 + k] - middle, middle - lower[3 + k])
+        cell[ANGLES + k] = middle
+        cell[HALF_ANGLES + k] = max(upper[3 + k] - middle, middle - lower[3 + k])

@@ -10,18 +10,39 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from spherloc.consensus.pose_cells import SLACK, has_tilt, place_cell
+from spherloc.consensus.pose_cells import (
+    ANGLES,
+    BEARING,
+    BOUND_PX,
+    BOUND_RAD,
+    CELL_SIZE,
+    HALF_ANGLES,
+    HALF_C,
+    HALF_C_NORM,
+    HALF_S,
+    JACOBIAN,
+    PX_PER_RAD,
+    Q_NORM,
+    SLACK,
+    C,
+    Q,
+    S,
+    has_tilt,
+    place_cell,
+)
 from spherloc.types import FloatArray
 from spherloc.watch import stopped
 
-BEND = 1.1547005383792517
-"""2 / sqrt 3."""
+CURVATURE = 1.1547005383792517
+"""2 / sqrt 3, of the remainder in ``pose_cells``."""
 MOST_WAITING = 2048
+"""Cells that wait to be split; the deepest is split first."""
 CELL_EFFORT = 8
 """Matches whose test takes as long as what a cell needs besides."""
 BEST, OPEN, EFFORT, CELLS, LEFT, SPLITS, HALT = 0, 1, 2, 3, 4, 5, 6
-"""Places of ``state``: most matches that a pose was seen to explain; the largest bound of cells too small to be split;
-work done; cells looked at; cells left for later; boxes logged; not 0 if the search shall leave off."""
+"""Indices into ``state`` (STATE,), int64: most matches that a pose was seen to explain; the largest bound of cells too
+small to be split; work done; cells looked at; cells left for later; boxes logged; not 0 if the search shall leave
+off."""
 STATE = 8
 
 
@@ -74,19 +95,20 @@ def room_for(count: int) -> Room:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def sort_matches(matches, cell, axis, members, kept, cutoff, reach):
-    """Sort the matches ``members`` of a cell; write the undecided to ``kept``.
+    """Sort the ``members`` (K,) of ``PackedMatches`` by what a ``cell`` (CELL_SIZE,) explains.
 
+    The undecided are written to ``kept``. ``axis`` is the one of c that s takes the place of in this chart, -1 if none.
     Returns how many are surely explained, how many undecided, and how many of these the middle explains; -1 if all
     together are no more than ``cutoff``. ``reach`` (6,) gets the sums over the undecided of the px by which each
     parameter moves their residuals.
     """
     rows = matches.rows
-    s0, c0, c1, c2 = cell[0], cell[1], cell[2], cell[3]
-    half_s, half_c = cell[4], cell[8]
-    hy, ha, hc = cell[13], cell[14], cell[15]
+    s0, c0, c1, c2 = cell[S], cell[C], cell[C + 1], cell[C + 2]
+    half_s, half_c = cell[HALF_S], cell[HALF_C_NORM]
+    hy, ha, hc = cell[HALF_ANGLES], cell[HALF_ANGLES + 1], cell[HALF_ANGLES + 2]
     tilted = ha > 0.0 or hc > 0.0
-    cy, sy, ca, sa = np.cos(cell[10]), np.sin(cell[10]), np.cos(cell[11]), np.sin(cell[11])
-    cc, sc = np.cos(cell[12]), np.sin(cell[12])
+    cy, sy, ca, sa = np.cos(cell[ANGLES]), np.sin(cell[ANGLES]), np.cos(cell[ANGLES + 1]), np.sin(cell[ANGLES + 1])
+    cc, sc = np.cos(cell[ANGLES + 2]), np.sin(cell[ANGLES + 2])
     r00, r01, r02 = cc * cy, -sc, cc * sy
     r10, r11, r12 = ca * sc * cy + sa * sy, ca * cc, ca * sc * sy - sa * cy
     r20, r21, r22 = sa * sc * cy - ca * sy, sa * cc, sa * sc * sy + ca * cy
@@ -98,33 +120,33 @@ def sort_matches(matches, cell, axis, members, kept, cutoff, reach):
     sure, undecided, inside = 0, 0, 0
     spare = len(members) - cutoff
     gone = 0
-    for place in range(len(members)):
+    for index in range(len(members)):
         if gone >= spare:
             return -1, 0, 0
-        k = members[place]
+        k = members[index]
         row = rows[k]
-        x, y, z = s0 * row[0] - c0, s0 * row[1] - c1, s0 * row[2] - c2
+        x, y, z = s0 * row[Q] - c0, s0 * row[Q + 1] - c1, s0 * row[Q + 2] - c2
         d2 = x * x + y * y + z * z
-        delta = half_c + half_s * row[3] + matches.rounding * (1.0 + row[3])
-        px = row[14]
+        delta = half_c + half_s * row[Q_NORM] + matches.rounding * (1.0 + row[Q_NORM])
+        px = row[PX_PER_RAD]
         if delta * delta >= 0.998 * d2:
             kept[undecided] = k
             undecided += 1
             for j in range(3):
-                reach[j] += px * (half_s * row[3] if j == axis else cell[5 + j]) / delta
+                reach[j] += px * (half_s * row[Q_NORM] if j == axis else cell[HALF_C + j]) / delta
             continue
         d = np.sqrt(d2)
         x, y, z = x / d, y / d, z / d
         ratio = delta / d
-        m00 = row[7] * r00 + row[8] * r10 + row[9] * r20
-        m01 = row[7] * r01 + row[8] * r11 + row[9] * r21
-        m02 = row[7] * r02 + row[8] * r12 + row[9] * r22
-        m10 = row[10] * r00 + row[11] * r10 + row[12] * r20
-        m11 = row[10] * r01 + row[11] * r11 + row[12] * r21
-        m12 = row[10] * r02 + row[11] * r12 + row[12] * r22
+        m00 = row[JACOBIAN] * r00 + row[JACOBIAN + 1] * r10 + row[JACOBIAN + 2] * r20
+        m01 = row[JACOBIAN] * r01 + row[JACOBIAN + 1] * r11 + row[JACOBIAN + 2] * r21
+        m02 = row[JACOBIAN] * r02 + row[JACOBIAN + 1] * r12 + row[JACOBIAN + 2] * r22
+        m10 = row[JACOBIAN + 3] * r00 + row[JACOBIAN + 4] * r10 + row[JACOBIAN + 5] * r20
+        m11 = row[JACOBIAN + 3] * r01 + row[JACOBIAN + 4] * r11 + row[JACOBIAN + 5] * r21
+        m12 = row[JACOBIAN + 3] * r02 + row[JACOBIAN + 4] * r12 + row[JACOBIAN + 5] * r22
         u, v = m00 * x + m01 * y + m02 * z, m10 * x + m11 * y + m12 * z
         r2 = u * u + v * v
-        tau = row[13]
+        tau = row[BOUND_PX]
         # asin(x) <= x / sqrt(1 - x^2)
         alpha = turn + ratio / np.sqrt(1.0 - ratio * ratio)
         move = px * alpha
@@ -132,33 +154,33 @@ def sort_matches(matches, cell, axis, members, kept, cutoff, reach):
             gone += 1
             continue
         along = (
-            row[4] * (r00 * x + r01 * y + r02 * z)
-            + row[5] * (r10 * x + r11 * y + r12 * z)
-            + row[6] * (r20 * x + r21 * y + r22 * z)
+            row[BEARING] * (r00 * x + r01 * y + r02 * z)
+            + row[BEARING + 1] * (r10 * x + r11 * y + r12 * z)
+            + row[BEARING + 2] * (r20 * x + r21 * y + r22 * z)
         )
-        if along <= -alpha or (along <= 0.0 and alpha + row[15] < 1.57):
+        if along <= -alpha or (along <= 0.0 and alpha + row[BOUND_RAD] < 1.57):
             gone += 1
             continue
         r = np.sqrt(r2)
         e = ratio / (1.0 - ratio)
-        rest = px * (0.5 * (turn * turn + 2.0 * turn * e + BEND * e * e) + SLACK)
+        rest = px * (0.5 * (turn * turn + 2.0 * turn * e + CURVATURE * e * e) + SLACK)
         nu, nv = (u / r, v / r) if r > 0.0 else (1.0, 0.0)
         # Derivative by yaw: W R (e_y x w).
         p, q = m00 * z - m02 * x, m10 * z - m12 * x
         f0, g0 = hy * abs(nu * p + nv * q), hy * abs(nu * q - nv * p)
         p, q = (m00 - u * x) / d, (m10 - v * x) / d
-        h = cell[5]
+        h = cell[HALF_C]
         f1, g1 = h * abs(nu * p + nv * q), h * abs(nu * q - nv * p)
         p, q = (m01 - u * y) / d, (m11 - v * y) / d
-        h = cell[6]
+        h = cell[HALF_C + 1]
         f2, g2 = h * abs(nu * p + nv * q), h * abs(nu * q - nv * p)
         p, q = (m02 - u * z) / d, (m12 - v * z) / d
-        h = cell[7]
+        h = cell[HALF_C + 2]
         f3, g3 = h * abs(nu * p + nv * q), h * abs(nu * q - nv * p)
         if axis >= 0:
-            along_q = x * row[0] + y * row[1] + z * row[2]
-            p = (m00 * row[0] + m01 * row[1] + m02 * row[2] - u * along_q) / d
-            q = (m10 * row[0] + m11 * row[1] + m12 * row[2] - v * along_q) / d
+            along_q = x * row[Q] + y * row[Q + 1] + z * row[Q + 2]
+            p = (m00 * row[Q] + m01 * row[Q + 1] + m02 * row[Q + 2] - u * along_q) / d
+            q = (m10 * row[Q] + m11 * row[Q + 1] + m12 * row[Q + 2] - v * along_q) / d
             fs, gs = half_s * abs(nu * p + nv * q), half_s * abs(nu * q - nv * p)
             if axis == 0:
                 f1, g1 = fs, gs
@@ -199,14 +221,19 @@ def sort_matches(matches, cell, axis, members, kept, cutoff, reach):
 
 @numba.njit(cache=True, nogil=True)
 def put_off(left, state, cell_of, bound, narrow):
-    """Leave a cell for later, or count its bound as open if there is no room."""
-    place = state[LEFT]
-    if place == len(left.about):
+    """Write a cell, ``cell_of`` = (chart, lower (6,), upper (6,)), to ``left``, or its bound to ``state`` if that is
+    full.
+
+    ``narrow`` is 1 if the cell's yaw is not the whole circle.
+    """
+    chart, lower, upper = cell_of
+    index = state[LEFT]
+    if index == len(left.about):
         state[OPEN] = max(state[OPEN], bound)
         return
-    left.lower[place], left.upper[place] = cell_of[1], cell_of[2]
-    left.about[place, 0], left.about[place, 1], left.about[place, 2] = cell_of[0], bound, narrow
-    state[LEFT] = place + 1
+    left.lower[index], left.upper[index] = lower, upper
+    left.about[index, 0], left.about[index, 1], left.about[index, 2] = chart, bound, narrow
+    state[LEFT] = index + 1
 
 
 @numba.njit(cache=True, nogil=True)
@@ -226,7 +253,7 @@ def search_poses(matches, cell_of, members, room, limits, found, board):
     lo[0], up[0] = lower, upper
     spans[0, 0], spans[0, 1], spans[0, 2] = 0, count, 0
     waiting = 1
-    cell, reach = np.empty(16), np.empty(6)
+    cell, reach = np.empty(CELL_SIZE), np.empty(6)
     while waiting > 0:
         if state[EFFORT] >= limits.effort or state[HALT] != 0 or stopped(board):
             for k in range(waiting):
@@ -245,7 +272,8 @@ def search_poses(matches, cell_of, members, room, limits, found, board):
         sure, undecided, inside = sort_matches(matches, cell, axis, lists[first:last], target, cutoff, reach)
         if sure < 0:
             continue
-        if known + sure + inside > state[BEST] and np.cos(cell[11]) * np.cos(cell[12]) >= matches.least_cosine:
+        tilt_a, tilt_c = cell[ANGLES + 1], cell[ANGLES + 2]
+        if known + sure + inside > state[BEST] and np.cos(tilt_a) * np.cos(tilt_c) >= matches.least_cosine:
             state[BEST] = known + sure + inside
             best_at[0] = chart
             for a in range(6):

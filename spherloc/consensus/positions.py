@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spherloc.consensus.box_search import MOST_BOXES, boxes_for, search_boxes, splits_for
-from spherloc.consensus.pose_cells import AXES, TILT_A, YAW, Matches, parameters_of, pose_of, whole_domain
+from spherloc.consensus.box_search import MOST_BOXES, memory_for, search_boxes
+from spherloc.consensus.pose_cells import AXES, TILT_A, YAW, PackedMatches, parameters_of, pose_of, whole_domain
 from spherloc.consensus.pose_search import (
     BEST,
     EFFORT,
@@ -30,10 +30,8 @@ from spherloc.consensus.pose_search import (
     STATE,
     Left,
     Limits,
-    room_for,
     search_poses,
 )
-from spherloc.consensus.stabbing import scratch_for
 from spherloc.consensus.yaw_bins import BINS
 from spherloc.problem import AlignedProblem
 from spherloc.types import FloatArray
@@ -85,7 +83,7 @@ class PositionSearch:
 
 def search_positions(
     aligned: AlignedProblem,
-    matches: Matches,
+    matches: PackedMatches,
     start: tuple[FloatArray, int] | None,
     effort: int,
     deadline: float,
@@ -94,7 +92,7 @@ def search_positions(
 ) -> PositionSearch:
     """Search all poses within the gravity bound for one that explains more matches than ``start`` does.
 
-    ``matches`` is that of ``matches_of``. ``start`` is a pose (3, 4) between the aligned frames, within the gravity
+    ``matches`` is that of ``pack_matches``. ``start`` is a pose (3, 4) between the aligned frames, within the gravity
     bound, and what it explains. After ``effort`` tests or at ``deadline`` (``working_s``) the search stops.
     ``yaw_bound`` (BINS,) bounds what poses explain by bin of turn, if anything is known. ``watch`` counts the tests;
     raises ``Cancelled``.
@@ -120,7 +118,7 @@ class _Worker:
     """Memory of one thread."""
 
     def __init__(self, count: int) -> None:
-        self.memory = (boxes_for(count), scratch_for(count), room_for(count), splits_for(MOST_SPLITS))
+        self.memory = memory_for(count, MOST_SPLITS)
         most = MOST_BOXES + MOST_WAITING + 64
         self.left = Left(np.empty((most, AXES)), np.empty((most, AXES)), np.empty((most, 3), np.int64))
         self.state = np.zeros(STATE, np.int64)
@@ -133,7 +131,7 @@ class _Search:
     def __init__(
         self,
         aligned: AlignedProblem,
-        matches: Matches,
+        matches: PackedMatches,
         start: tuple[FloatArray, int] | None,
         yaw_bound: NDArray[np.int32] | None,
         watch: Watch,
@@ -202,7 +200,7 @@ class _Search:
             self.matches,
             (chart, at - half, at + half),
             everybody,
-            worker.memory[2],
+            worker.memory.room,
             limits,
             (worker.best_at, worker.state, worker.left),
             self.watch.board,
@@ -271,7 +269,7 @@ class _Search:
         if narrow:
             everybody = np.arange(self.count, dtype=np.int32)
             cell = (chart, lower, upper)
-            search_poses(self.matches, cell, everybody, worker.memory[2], limits, found, self.watch.board)
+            search_poses(self.matches, cell, everybody, worker.memory.room, limits, found, self.watch.board)
             return
         tasks = (np.array([chart]), lower[None], upper[None], np.array([bound]))
         search_boxes(self.matches, tasks, self.yaw_bound, worker.memory, limits, found, self.watch.board)
@@ -289,7 +287,7 @@ class _Search:
         """Make what workers left tasks, unless it cannot explain more than the best pose."""
         lower, upper, about = [self.lower], [self.upper_ends], [self.about]
         for worker in workers:
-            many, splits = int(worker.state[SPLITS]), worker.memory[3]
+            many, splits = int(worker.state[SPLITS]), worker.memory.splits
             if self._kept < MOST_KEPT:
                 left_ends, right_ends, bounds = splits
                 self._splits.append((left_ends[:many].copy(), right_ends[:many].copy(), bounds[:many].copy()))
@@ -305,7 +303,7 @@ class _Search:
         self.lower, self.upper_ends, self.about = self.lower[more], self.upper_ends[more], self.about[more]
 
 
-def pose_distances(matches: Matches, chart: int, at: FloatArray) -> FloatArray:
+def pose_distances(matches: PackedMatches, chart: int, at: FloatArray) -> FloatArray:
     """|w| (M,) of a chart's parameters."""
     scale, c = 1.0, at[:3].copy()
     if chart:

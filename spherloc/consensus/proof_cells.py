@@ -8,7 +8,7 @@ import numba
 import numpy as np
 
 from spherloc.consensus.pair_arcs import CIRCLE, direction_of_turn
-from spherloc.consensus.pose_cells import has_tilt, place_cell
+from spherloc.consensus.pose_cells import CELL_SIZE, HALF_ANGLES, HALF_C, HALF_S, YAW, has_tilt, place_cell
 from spherloc.consensus.pose_search import sort_matches
 from spherloc.consensus.stabbing import deepest, keep_possible
 from spherloc.watch import DONE, stopped
@@ -16,7 +16,8 @@ from spherloc.watch import DONE, stopped
 NO_TILT, STABBED, LINEAR = 0, 1, 2
 """Why a cell explains no more: all of its tilts are beyond gravity's bound; intervals of yaw; residuals."""
 MOST_WAITING = 4096
-EDGE = 1e-12
+"""Cells that wait to be split."""
+WINDOW_MARGIN = 1e-12
 """Rad by which windows of yaw are widened; less than the intervals were."""
 
 
@@ -29,6 +30,7 @@ def prove_cells(matches, chart, ends, claim, switch_rad, memory, cells, board):
     cannot be bounded by ``claim``.
     """
     scratch, unknown = memory
+    _, _, about = cells
     lo, up = np.empty((MOST_WAITING, 6)), np.empty((MOST_WAITING, 6))
     spans = np.empty((MOST_WAITING, 4), np.int64)
     count = len(matches.rows)
@@ -40,9 +42,9 @@ def prove_cells(matches, chart, ends, claim, switch_rad, memory, cells, board):
     spans[0, 1] = count
     waiting, used = 1, 0
     axis = (chart - 1) // 2 if chart > 0 else -1
-    cell, spread, reach, spare = np.empty(16), np.empty(2), np.empty(6), np.empty(count, np.int32)
+    cell, spread, reach, spare = np.empty(CELL_SIZE), np.empty(2), np.empty(6), np.empty(count, np.int32)
     while waiting > 0:
-        if stopped(board) or used + 2 * len(scratch.windows) + 8 > len(cells[2]):
+        if stopped(board) or used + 2 * len(scratch.windows) + 8 > len(about):
             return -1
         board[DONE] += 1
         waiting -= 1
@@ -76,9 +78,9 @@ def prove_cells(matches, chart, ends, claim, switch_rad, memory, cells, board):
                 first, last = last, last + kept
             for a in range(6):
                 if a < 3:
-                    reach[a] = cell[4] * spread[1] if a == axis else cell[5 + a] * spread[0]
+                    reach[a] = cell[HALF_S] * spread[1] if a == axis else cell[HALF_C + a] * spread[0]
                 else:
-                    reach[a] = cell[10 + a] if a > 3 else 0.0
+                    reach[a] = cell[HALF_ANGLES + a - YAW] if a > 3 else 0.0
             if np.sum(reach) <= switch_rad and waiting + len(scratch.windows) * 2 + 4 < MOST_WAITING:
                 again, free = keep_possible(matches, cell, everybody, spare, scratch, -1, spread)
                 bound, windows = deepest(scratch, again, free, claim, unknown)
@@ -100,17 +102,20 @@ def prove_cells(matches, chart, ends, claim, switch_rad, memory, cells, board):
 
 @numba.njit(cache=True, nogil=True)
 def _put(cells, used, lower, upper, rule, bound):
-    """Write a final cell; returns how many there are."""
-    cells[0][used], cells[1][used] = lower, upper
-    cells[2][used, 0], cells[2][used, 1] = rule, bound
+    """Write a final cell, ends (6,), as number ``used`` of ``cells``; returns how many there are."""
+    lowers, uppers, about = cells
+    lowers[used], uppers[used] = lower, upper
+    about[used, 0], about[used, 1] = rule, bound
     return used + 1
 
 
 @numba.njit(cache=True, nogil=True)
 def _by_yaw(cells, used, lo, up, spans, waiting, about, scratch):
-    """Cut a cell at the ends of its windows of yaw: these wait, what lies between them is final.
+    """Cut the cell ``waiting`` at the ends of its windows of yaw: these wait, what lies between them is final.
 
-    Returns how many are final and how many wait.
+    ``lo`` and ``up`` (W, 6) are the ends of waiting cells, ``spans`` (W, 4) what ``prove_cells`` keeps of each;
+    ``about`` is (first, last, windows, claim) of this one, ``scratch`` holds its windows. Final cells are written to
+    ``cells`` from number ``used`` on. Returns how many are final and how many wait.
     """
     first, last, windows, claim = about
     lower, upper = lo[waiting].copy(), up[waiting].copy()
@@ -124,7 +129,7 @@ def _by_yaw(cells, used, lo, up, spans, waiting, about, scratch):
             begin = -np.pi if half == 2.0 and start <= 2.0 else np.arctan2(s, c)
             c, s = direction_of_turn(end)
             stop = 0.0 if end >= CIRCLE else np.pi if half == 0.0 and end >= 2.0 else np.arctan2(s, c)
-            begin, stop = max(begin - EDGE, here), min(stop + EDGE, np.pi)
+            begin, stop = max(begin - WINDOW_MARGIN, here), min(stop + WINDOW_MARGIN, np.pi)
             if stop <= here:
                 continue
             if begin > here:

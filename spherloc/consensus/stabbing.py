@@ -20,8 +20,23 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from spherloc.consensus.pair_arcs import CIRCLE
-from spherloc.consensus.pose_cells import SLACK
+from spherloc.consensus.pair_arcs import CIRCLE, turn_of_direction
+from spherloc.consensus.pose_cells import (
+    ANGLES,
+    BEARING,
+    COSINE,
+    HALF_ANGLES,
+    HALF_C,
+    HALF_C_FLAT,
+    HALF_C_NORM,
+    HALF_S,
+    Q_NORM,
+    SINE,
+    SLACK,
+    C,
+    Q,
+    S,
+)
 from spherloc.types import FloatArray
 
 FEW_BINS, MANY_BINS = 256, 1024
@@ -31,7 +46,7 @@ MANY = 400
 MOST_SORTED = 1500
 """Intervals up to which the exact depth is found where bins do not decide."""
 MOST_WINDOWS = 64
-JOINED = 0.004
+MOST_GAP = 0.004
 """Turns between two windows of yaw up to which they are one."""
 EVERYWHERE = 8.0
 """End of an interval that is the whole circle."""
@@ -55,50 +70,45 @@ def scratch_for(count: int) -> Scratch:
     return Scratch(np.empty(count), np.empty(count), np.zeros(MANY_BINS + 2, np.int32), np.empty((MOST_WINDOWS, 2)))
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
-def _turn(c, s):
-    """Turn in [0, 4] of a direction of any length."""
-    quarter = s / (abs(c) + abs(s))
-    if c < 0.0:
-        return 2.0 - quarter
-    return quarter if quarter >= 0.0 else 4.0 + quarter
-
-
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def keep_possible(matches, cell, members, kept, scratch, cutoff, spread):
-    """Write to ``kept`` those of ``members`` that some pose of the cell may explain, their intervals to ``scratch``.
+    """Write those of ``members`` (K,) that some pose of a cell may explain to ``kept``, their intervals to ``scratch``.
 
-    Returns how many, and how many of them have the whole circle; -1 and 0 as soon as no more than ``cutoff`` can be
-    left. ``spread`` (2,) gets the mean of 1 / |w| and of |q| / |w| over those kept.
+    ``matches`` are ``PackedMatches``, ``cell`` (CELL_SIZE,) is that of ``place_cell``. Returns how many, and how many
+    of them have the whole circle; -1 and 0 as soon as no more than ``cutoff`` can be left. ``spread`` (2,) gets the
+    mean of 1 / |w| and of |q| / |w| over those kept.
     """
     rows = matches.rows
-    s0, c0, c1, c2, half_s, half_c, half_flat = cell[0], cell[1], cell[2], cell[3], cell[4], cell[8], cell[9]
-    ca, sa, cc, sc = np.cos(cell[11]), np.sin(cell[11]), np.cos(cell[12]), np.sin(cell[12])
-    psi = min(np.sqrt(cell[14] * cell[14] + cell[15] * cell[15]), matches.widest_turn + abs(cell[11]) + abs(cell[12]))
+    s0, c0, c1, c2 = cell[S], cell[C], cell[C + 1], cell[C + 2]
+    half_s, half_c, half_flat = cell[HALF_S], cell[HALF_C_NORM], cell[HALF_C_FLAT]
+    a, c, half_a, half_tilt_c = cell[ANGLES + 1], cell[ANGLES + 2], cell[HALF_ANGLES + 1], cell[HALF_ANGLES + 2]
+    ca, sa, cc, sc = np.cos(a), np.sin(a), np.cos(c), np.sin(c)
+    psi = min(np.sqrt(half_a * half_a + half_tilt_c * half_tilt_c), matches.widest_turn + abs(a) + abs(c))
     cos_psi, sin_psi = np.cos(psi), np.sin(psi)
-    half_y = cell[6]
+    half_y = cell[HALF_C + 1]
     used, free = 0, 0
     near, far = 0.0, 0.0
     starts, ends = scratch.starts, scratch.ends
     spare = len(members) - cutoff
-    for place in range(len(members)):
-        if place - used >= spare:
+    for index in range(len(members)):
+        if index - used >= spare:
             return -1, 0
-        k = members[place]
+        k = members[index]
         row = rows[k]
-        x, y, z = s0 * row[0] - c0, s0 * row[1] - c1, s0 * row[2] - c2
+        x, y, z = s0 * row[Q] - c0, s0 * row[Q + 1] - c1, s0 * row[Q + 2] - c2
         flat2 = x * x + z * z
         flat = np.sqrt(flat2)
-        more = half_s * row[3] + matches.rounding * (1.0 + row[3])
+        more = half_s * row[Q_NORM] + matches.rounding * (1.0 + row[Q_NORM])
         delta_flat = half_flat + more
         delta_y = half_y + more
         distance = max(np.sqrt(flat2 + y * y), half_c + more)
         # v' = T^T v
-        b1 = ca * row[5] + sa * row[6]
-        vx, vy, vz = cc * row[4] + sc * b1, cc * b1 - sc * row[4], ca * row[6] - sa * row[5]
+        b0, b1, b2 = row[BEARING], row[BEARING + 1], row[BEARING + 2]
+        along_a = ca * b1 + sa * b2
+        vx, vy, vz = cc * b0 + sc * along_a, cc * along_a - sc * b0, ca * b2 - sa * b1
         level = np.sqrt(vx * vx + vz * vz)
-        sin_e = row[16] * cos_psi + row[17] * sin_psi
-        cos_e = row[17] * cos_psi - row[16] * sin_psi
+        sin_e = row[SINE] * cos_psi + row[COSINE] * sin_psi
+        cos_e = row[COSINE] * cos_psi - row[SINE] * sin_psi
         pole = True
         if cos_e > 0.0:
             low, high = max(flat - delta_flat, 0.0), flat + delta_flat
@@ -112,7 +122,7 @@ def keep_possible(matches, cell, members, kept, scratch, cutoff, spread):
             pole = below <= 0.0 or above <= 0.0
         kept[used] = k
         near += 1.0 / distance
-        far += row[3] / distance
+        far += row[Q_NORM] / distance
         if pole or delta_flat >= flat:
             starts[used], ends[used] = 0.0, EVERYWHERE
             free += 1
@@ -123,8 +133,8 @@ def keep_possible(matches, cell, members, kept, scratch, cutoff, spread):
             cos_half = cos1 * cos2 - sin1 * sin2
             sin_half, cos_half = sin_half + SLACK * cos_half, cos_half - SLACK * sin_half
             ex, ez = x * vx + z * vz, z * vx - x * vz
-            starts[used] = _turn(ex * cos_half + ez * sin_half, ez * cos_half - ex * sin_half)
-            ends[used] = _turn(ex * cos_half - ez * sin_half, ez * cos_half + ex * sin_half)
+            starts[used] = turn_of_direction(ex * cos_half + ez * sin_half, ez * cos_half - ex * sin_half)
+            ends[used] = turn_of_direction(ex * cos_half - ez * sin_half, ez * cos_half + ex * sin_half)
         used += 1
     if used <= cutoff:
         return -1, 0
@@ -176,7 +186,10 @@ def deepest(scratch, count, free, cutoff, yaw_bound):
 
 @numba.njit(cache=True, nogil=True)
 def _clip_windows(windows, used, cutoff, yaw_bound):
-    """Leave out windows all of whose bins are bounded by ``cutoff``; returns how many are left."""
+    """Leave out those of the first ``used`` ``windows`` (W, 2), turns, whose bins are all bounded by ``cutoff``.
+
+    ``yaw_bound`` (B,) is by bin of turn. Returns how many are left.
+    """
     per_turn = len(yaw_bound) / CIRCLE
     kept = 0
     for w in range(used):
@@ -191,8 +204,11 @@ def _clip_windows(windows, used, cutoff, yaw_bound):
 
 @numba.njit(cache=True, nogil=True)
 def _open_window(windows, used, start):
-    """A window that starts there, or the last one if that is near or there is no room for more; returns how many."""
-    if used > 0 and (start - windows[used - 1, 1] <= JOINED or used == len(windows)):
+    """Add a window to the first ``used`` of ``windows`` (W, 2) that starts at a turn; returns how many there are.
+
+    Or the last one goes on, if that is near or there is no room for more.
+    """
+    if used > 0 and (start - windows[used - 1, 1] <= MOST_GAP or used == len(windows)):
         return used
     windows[used, 0] = windows[used, 1] = start
     return used + 1
@@ -200,7 +216,7 @@ def _open_window(windows, used, start):
 
 @numba.njit(cache=True, nogil=True)
 def _exactly(scratch, count, free, cutoff):
-    """``deepest`` by sorting all ends."""
+    """``deepest`` by sorting all ends: the depth, and how many windows were written to ``scratch.windows``."""
     windows = scratch.windows
     opening, closing = np.empty(count - free), np.empty(count - free)
     used, depth = 0, free

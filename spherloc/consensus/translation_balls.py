@@ -3,20 +3,23 @@
 Paper, Eq. 24-27 and 38, stated for the camera position C = -R^T t in the aligned map frame instead of t: the two rays
 of a pair start at their map points, and C is where they come closest. (Eq. 25's H loses rank for horizontal bearings;
 the distance to both rays, H = [I - v_i v_i^T; I - v_j v_j^T], does not, and its least-squares solution is the middle of
-their shortest connection.) With depth bounds S (see ``depth_bounds``) and a true yaw at most delta away, a pair of
+their shortest connection.) With depth bounds S (see ``pair_arcs``) and a true yaw at most delta away, a pair of
 inliers has
 
     |C - C_true| <= ||H^+|| hypot(S_i sin eps_i, S_j sin eps_j) + |C'| delta + |C''| delta^2 / 2,
 
 where ||H^+|| = (1 - |cos alpha|)^(-1/2), the derivatives are by yaw, and S and |C''| are taken at their largest within
 delta: the ball contains the true position.
+
+The second half is for the exact search: balls of pairs chosen so that every consensus of a given size has its camera in
+one of them. A set that leaves out at most m of the candidates holds at least one of any m + 1 disjoint pairs entirely.
 """
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from spherloc.consensus.depth_bounds import chord, pair_sinusoids
+from spherloc.consensus.pair_arcs import Arcs, BoundedRays, YawInterval, chord, pair_sinusoids
 from spherloc.problem import AlignedProblem
 from spherloc.types import BoolArray, FloatArray, IndexArray
 from spherloc.watch import DONE, Watch, stopped
@@ -27,14 +30,16 @@ FIRST_SORTED, MORE_SORTED = 32_000, 8
 """Smallest balls that are sorted to spread them, and how many times as many where these are too few."""
 MOST_SORTED = 500_000
 """Numbers whose order is found at once: some hundredths of a second."""
-FEW = 1023
+WATCH_MASK = 1023
 """Where these bits of the number of arcs are 0, the watch is looked at."""
+MOST_FIRST = 16
+"""Candidates from which disjoint pairs are started."""
 
 
 def translation_balls(
     aligned: AlignedProblem, bound_rad: FloatArray, pairs: IndexArray, yaw_rad: float, yaw_slack_rad: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Camera positions (P, 3) and radii (P,), metres, of ``pairs`` (P, 2) of places in ``aligned`` at a yaw.
+    """Camera positions (P, 3) and radii (P,), metres, of ``pairs`` (P, 2) of matches of ``aligned`` at a yaw.
 
     ``yaw_slack_rad`` (P,) bounds how far the true yaw may lie from ``yaw_rad``. A pair that bounds nothing has the
     radius inf.
@@ -61,8 +66,9 @@ def smallest_balls(
     """
     watch = watch or Watch()
     watch.expect(len(covering))
-    data = (aligned.bearings, aligned.points, bound_rad)
-    pairs, centres, radii = _smallest(*data, *arcs, covering, yaw_rad, most, watch.board)
+    bearings, points = aligned.bearings, aligned.points
+    found = _smallest(bearings, points, bound_rad, Arcs(*arcs), covering, yaw_rad, most, watch.board)
+    pairs, centres, radii = found
     kept = _order(radii, watch)[:most]
     return pairs[kept], centres[kept], radii[kept]
 
@@ -120,12 +126,13 @@ def overlapping(centres: FloatArray, radii: FloatArray) -> BoolArray:
 
 
 def edges_of(overlap: BoolArray) -> IndexArray:
-    """(E, 2) places of the balls that overlap, the smaller one first, in ascending order."""
+    """(E, 2) indices of the balls that overlap, the smaller one first, in ascending order."""
     return _edges(overlap, np.count_nonzero(overlap) // 2)
 
 
 @numba.njit(cache=True, nogil=True)
 def _edges(overlap, count):
+    """The ``count`` edges (E, 2) of the symmetric matrix ``overlap`` (M, M)."""
     edges = np.empty((count + 1, 2), np.int32)
     found = 0
     for a in range(len(overlap)):
@@ -137,6 +144,7 @@ def _edges(overlap, count):
 
 @numba.njit(cache=True, nogil=True)
 def _overlap(centres, radii, overlap):
+    """Write which balls overlap to ``overlap`` (M, M), false before; ``centres`` (3, M), m, ``radii`` (M,), m."""
     x, y, z = centres
     for a in range(len(radii)):
         for b in range(a):
@@ -146,7 +154,7 @@ def _overlap(centres, radii, overlap):
 
 @numba.njit(cache=True, nogil=True)
 def _spread(pairs, share, most, count):
-    """Places of the first ``most`` pairs in which nobody has more than ``share``."""
+    """Indices of the first ``most`` of ``pairs`` (P, 2) in which none of ``count`` matches has more than ``share``."""
     kept, used = np.empty(most, np.int64), np.zeros(count, np.int64)
     found = 0
     for k in range(len(pairs)):
@@ -160,25 +168,35 @@ def _spread(pairs, share, most, count):
 
 
 @numba.njit(cache=True, nogil=True)
-def _smallest(bearings, points, eps, pairs, lo, hi, covering, yaw, most, board):
-    """Pairs (S, 2) in their order, centres and radii: the ``most`` smallest balls and some more."""
-    chords, sines = chord(eps), np.sin(eps)
+def bounded_rays(bearings, points, eps):
+    """``BoundedRays`` of ``bearings`` (M, 3) and ``points`` (M, 3), m, with angular errors up to ``eps`` (M,), rad."""
+    return BoundedRays(bearings, points, chord(eps), np.sin(eps))
+
+
+@numba.njit(cache=True, nogil=True)
+def _smallest(bearings, points, eps, arcs, covering, yaw, most, board):
+    """Pairs (S, 2) in their order, centres (S, 3) and radii (S,), m: the ``most`` smallest balls and some more.
+
+    The arguments are those of ``smallest_balls``; a watch's ``board`` counts the arcs and can end it.
+    """
+    rays = bounded_rays(bearings, points, eps)
+    pairs, lo, hi = arcs
     c, s = np.cos(yaw), np.sin(yaw)
     room = min(2 * most, len(covering) + 1)
     near, centres, radii = np.empty((room, 2), np.int32), np.empty((room, 3)), np.empty(room)
     count, limit = 0, np.inf
-    for place in range(len(covering)):
-        if place & FEW == 0:
-            board[DONE] = place
+    for index in range(len(covering)):
+        if index & WATCH_MASK == 0:
+            board[DONE] = index
             if stopped(board):
                 break
-        arc = covering[place]
+        arc = covering[index]
         i, j = np.int64(pairs[arc, 0]), np.int64(pairs[arc, 1])
-        if not _least_squared_radius(i, j, bearings, points, chords, sines, c, s) < limit * limit:
+        if not _least_squared_radius(i, j, rays, c, s) < limit * limit:
             continue
-        at = yaw if lo[arc] <= yaw else yaw + 2.0 * np.pi
-        slack = max(at - lo[arc], hi[arc] - at)
-        radii[count] = ball_of_pair(i, j, bearings, points, chords, sines, c, s, slack, centres[count])
+        unwrapped = yaw if lo[arc] <= yaw else yaw + 2.0 * np.pi
+        slack = max(unwrapped - lo[arc], hi[arc] - unwrapped)
+        radii[count] = ball_of_pair(i, j, rays, YawInterval(c, s, slack), centres[count])
         near[count, 0], near[count, 1] = i, j
         count += radii[count] < limit
         if count < room:
@@ -195,39 +213,49 @@ def _smallest(bearings, points, eps, pairs, lo, hi, covering, yaw, most, board):
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
-def _least_squared_radius(i, j, bearings, points, chords, sines, c, s):
-    """A lower bound on the squared radius of ``ball_of_pair``, whatever its slack, for a fraction of the time."""
-    vi, vj, pi, pj = bearings[i], bearings[j], points[i], points[j]
+def _least_squared_radius(i, j, rays, c, s):
+    """A lower bound on the squared radius, m^2, of ``ball_of_pair``, whatever its slack, for a fraction of the time.
+
+    ``rays`` are ``BoundedRays``, c and s are cos and sin of the yaw.
+    """
+    vi, vj, pi, pj = rays.bearings[i], rays.bearings[j], rays.points[i], rays.points[j]
+    chord_i, chord_j, sine_i, sine_j = rays.chord[i], rays.chord[j], rays.sine[i], rays.sine[j]
     dx, dy, dz = pi[0] - pj[0], pi[1] - pj[1], pi[2] - pj[2]
     x, z = dx * c + dz * s, dz * c - dx * s
     along_i, along_j = vi[0] * x + vi[1] * dy + vi[2] * z, vj[0] * x + vj[1] * dy + vj[2] * z
     dot, sin2 = vi[0] * vj[0] + vi[1] * vj[1] + vi[2] * vj[2], _sin2_between(vi, vj)
-    spare = np.sqrt(sin2) - chords[i] - chords[j]
+    spare = np.sqrt(sin2) - chord_i - chord_j
     if spare <= 0.0:
         return np.inf
     # The depths and their bounds as in ``pair_sinusoids``, with the divisions left for the end.
     depth_i, depth_j = along_i - dot * along_j, dot * along_i - along_j
-    most_i = max(0.0, (spare + chords[i]) * depth_i + chords[j] * depth_j) * sines[i]
-    most_j = max(0.0, (spare + chords[j]) * depth_j + chords[i] * depth_i) * sines[j]
+    most_i = max(0.0, (spare + chord_i) * depth_i + chord_j * depth_j) * sine_i
+    most_j = max(0.0, (spare + chord_j) * depth_j + chord_i * depth_i) * sine_j
     squared = (most_i * most_i + most_j * most_j) * (1.0 + abs(dot)) / (spare * spare * sin2 * sin2 * sin2)
     return squared * (1.0 - ROUNDING)
 
 
 @numba.njit(cache=True, nogil=True)
 def _fill(bearings, points, eps, pairs, yaw, slack, centres, radii):
-    chords, sines = chord(eps), np.sin(eps)
+    """Write the balls of ``translation_balls`` to ``centres`` (P, 3) and ``radii`` (P,), m."""
+    rays = bounded_rays(bearings, points, eps)
     c, s = np.cos(yaw), np.sin(yaw)
     for k in range(len(pairs)):
         i, j = np.int64(pairs[k, 0]), np.int64(pairs[k, 1])
-        radii[k] = ball_of_pair(i, j, bearings, points, chords, sines, c, s, slack[k], centres[k])
+        radii[k] = ball_of_pair(i, j, rays, YawInterval(c, s, slack[k]), centres[k])
 
 
 @numba.njit(cache=True, nogil=True)
-def ball_of_pair(i, j, bearings, points, chords, sines, c, s, slack, centre):
-    """Radius of the ball of a pair at the yaw (c, s), inf if it bounds nothing; its centre is written."""
-    vi, vj, pi, pj = bearings[i], bearings[j], points[i], points[j]
+def ball_of_pair(i, j, rays, yaws, centre):
+    """Radius, m, of the ball of a pair of ``BoundedRays`` for a ``YawInterval``, inf if it bounds nothing.
+
+    Its ``centre`` (3,), m, is written.
+    """
+    c, s, slack = yaws
+    vi, vj, pi, pj = rays.bearings[i], rays.bearings[j], rays.points[i], rays.points[j]
+    sine_i, sine_j = rays.sine[i], rays.sine[j]
     sin_alpha, _, depth_i, depth_j, largest_i, largest_j, _ = pair_sinusoids(
-        vi, vj, pi, pj, chords[i], chords[j], sines[i], sines[j]
+        vi, vj, pi, pj, rays.chord[i], rays.chord[j], sine_i, sine_j
     )
     if sin_alpha == 0.0:
         centre[:] = 0.5 * (pi + pj)
@@ -244,7 +272,7 @@ def ball_of_pair(i, j, bearings, points, chords, sines, c, s, slack, centre):
     bend = 0.5 * (_amplitude(depth_i) * 4.0 + abs(depth_i[2]) + _amplitude(depth_j) * 4.0 + abs(depth_j[2]))
     most_i = max(0.0, _value(largest_i, c, s) + _amplitude(largest_i) * slack)
     most_j = max(0.0, _value(largest_j, c, s) + _amplitude(largest_j) * slack)
-    spread2 = (most_i * sines[i]) ** 2 + (most_j * sines[j]) ** 2
+    spread2 = (most_i * sine_i) ** 2 + (most_j * sine_j) ** 2
     dot = vi[0] * vj[0] + vi[1] * vj[1] + vi[2] * vj[2]
     # 1 - |cos| = sin^2 / (1 + |cos|)
     noise = np.sqrt(spread2 * (1.0 + abs(dot)) / _sin2_between(vi, vj))
@@ -253,22 +281,25 @@ def ball_of_pair(i, j, bearings, points, chords, sines, c, s, slack, centre):
 
 @numba.njit(cache=True, nogil=True, inline="always")
 def _value(wave, c, s):
+    """Of a wave (cos, sin, constant) at the yaw with cos c and sin s."""
     return wave[0] * c + wave[1] * s + wave[2]
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
 def _slope(wave, c, s):
+    """The derivative by yaw of a wave (cos, sin, constant)."""
     return wave[1] * c - wave[0] * s
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
 def _amplitude(wave):
+    """The most that a wave (cos, sin, constant) differs from its constant."""
     return np.sqrt(wave[0] * wave[0] + wave[1] * wave[1])
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
 def _sin2_between(vi, vj):
-    """sin^2 of the angle between two unit vectors, without cancellation for small angles."""
+    """sin^2 of the angle between two unit vectors (3,), without cancellation for small angles."""
     cx = vi[1] * vj[2] - vi[2] * vj[1]
     cy = vi[2] * vj[0] - vi[0] * vj[2]
     cz = vi[0] * vj[1] - vi[1] * vj[0]
@@ -277,9 +308,79 @@ def _sin2_between(vi, vj):
 
 @numba.njit(cache=True, nogil=True)
 def _turned_back(v, c, s, axis):
-    """Component ``axis`` of R^T v and of its derivative by yaw."""
+    """Component ``axis`` of R^T v, v (3,), and of its derivative by yaw."""
     if axis == 0:
         return v[0] * c - v[2] * s, -v[0] * s - v[2] * c
     if axis == 1:
         return v[1], 0.0
     return v[0] * s + v[2] * c, v[0] * c - v[2] * s
+
+
+@numba.njit(cache=True, nogil=True)
+def pair_ball(matches, yaws, i, j):
+    """The ball of a pair of ``BoundedMatches`` for a ``YawInterval``, (4,): centre and radius, m."""
+    rays = BoundedRays(matches.bearings, matches.points, matches.chord, matches.sine)
+    ball = np.empty(4)
+    ball[3] = ball_of_pair(i, j, rays, yaws, ball[:3])
+    return ball
+
+
+@numba.njit(cache=True, nogil=True)
+def may_be_seen(matches, yaws, k, ball):
+    """Whether match ``k`` of ``BoundedMatches`` is explained from somewhere in a ``ball`` (4,) at a yaw of ``yaws``."""
+    c, s, slack = yaws
+    points = matches.points
+    x, y, z = points[k, 0] - ball[0], points[k, 1] - ball[1], points[k, 2] - ball[2]
+    distance = np.sqrt(x * x + y * y + z * z)
+    if distance <= ball[3]:
+        return True
+    v = matches.bearings[k]
+    cosine = (v[0] * (c * x + s * z) + v[1] * y + v[2] * (c * z - s * x)) / distance
+    angle = np.arccos(min(1.0, max(-1.0, cosine)))
+    return angle <= (matches.bound_rad[k] + slack + np.arcsin(ball[3] / distance)) * (1.0 + 1e-9) + 1e-7
+
+
+@numba.njit(cache=True, nogil=True)
+def star_balls(matches, yaws, everybody, most, alone):
+    """Balls (B, 4) for all sets that hold the last two of ``everybody`` (K,) and leave out less than ``most`` of all.
+
+    ``matches`` are ``BoundedMatches``, ``yaws`` a ``YawInterval``. The ball ``alone`` of the last two holds them all;
+    so do together the smallest of the balls of one of these with each of ``most`` others.
+    """
+    size = len(everybody) - 2
+    if most > size:
+        return alone.reshape(1, 4)
+    balls = np.empty((size, 4))
+    for k in range(size):
+        balls[k] = pair_ball(matches, yaws, everybody[k], everybody[-2])
+        other = pair_ball(matches, yaws, everybody[k], everybody[-1])
+        if other[3] < balls[k, 3]:
+            balls[k] = other
+    order = np.argsort(balls[:, 3])[:most]
+    if np.sum(balls[order, 3] ** 3) < alone[3] ** 3:
+        return balls[order]
+    return alone.reshape(1, 4)
+
+
+@numba.njit(cache=True, nogil=True)
+def apart_balls(matches, yaws, nodes, most):
+    """Small balls (B, 4) of disjoint pairs for all sets that leave out less than ``most`` of ``nodes`` (K,).
+
+    One with an infinite radius says that there are not enough pairs.
+    """
+    balls = np.full((most, 4), np.inf)
+    free = np.ones(len(nodes), np.bool_)
+    for b in range(most):
+        mate_a, mate_b = -1, -1
+        for a in range(min(MOST_FIRST + most, len(nodes))):
+            if not free[a]:
+                continue
+            for other in range(a + 1, len(nodes)):
+                if free[other]:
+                    ball = pair_ball(matches, yaws, nodes[a], nodes[other])
+                    if ball[3] < balls[b, 3]:
+                        balls[b], mate_a, mate_b = ball, a, other
+        if mate_a < 0:
+            break
+        free[mate_a] = free[mate_b] = False
+    return balls

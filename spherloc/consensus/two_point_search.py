@@ -2,11 +2,11 @@
 
 Sample k is a function of the seed and of k alone, so no sample is stored and every machine draws the same ones.
 
-With a confidence, a hypothesis may be turned away after a part of the correspondences, in an order that is random but
+With a confidence, a hypothesis may be rejected after a part of the correspondences, in an order that is random but
 fixed: if a set of K correspondences is spread over M at random, then fewer than f of them fall among the first n with
 probability at most exp(-n KL((f - 1) / n || K / M)) (Hoeffding, 1963, which holds for drawing without replacement).
-The chance to lose the best set by that is at most ``TURNED_AWAY`` of the chance that the confidence leaves, and
-is accounted for. Without a confidence nothing is left to chance: a hypothesis is turned away only when all remaining
+The chance to lose the best set by that is at most ``REJECTED_SHARE`` of the chance that the confidence leaves, and
+is accounted for. Without a confidence nothing is left to chance: a hypothesis is rejected only when all remaining
 correspondences could not make it the best.
 """
 
@@ -17,7 +17,8 @@ import numba
 import numpy as np
 
 from spherloc.consensus.inliers import BLOCK, pack_blocks, reaches, score_inliers
-from spherloc.consensus.level_fit import fit, place, translation_of
+from spherloc.consensus.level_pose import fit, write_level_pose, write_translation
+from spherloc.gauss_newton import Matches
 from spherloc.problem import AlignedProblem
 from spherloc.solvers.two_point import solve_pair
 from spherloc.types import BoolArray, FloatArray, IndexArray
@@ -25,14 +26,12 @@ from spherloc.watch import DONE, TOTAL, Watch, stopped
 
 Scoring = Literal["count", "msac"]
 
-TURNED_AWAY = 1e-3
-"""Share of 1 - confidence that may be lost by turning hypotheses away early; the samples must earn the rest."""
+REJECTED_SHARE = 1e-3
+"""Share of 1 - confidence that may be lost by rejecting hypotheses early; the samples must earn the rest."""
 
 OPTIMIZATION_ROUNDS, OPTIMIZATION_STEPS = 3, 2
 """Choices of inliers, and Gauss-Newton steps on each; more steps change nothing (measured)."""
-
-
-FEW = 15
+WATCH_MASK = 15
 """The search looks at its watch where these bits of the number of samples are 0."""
 
 
@@ -47,7 +46,7 @@ class TwoPointSearch:
     improved_at: IndexArray
     """(J,) the sample of each improvement, from 0."""
     samples: IndexArray
-    """(J, 2) places of its two correspondences in the aligned problem."""
+    """(J, 2) indices of its two correspondences in the aligned problem."""
     yaws_rad: FloatArray
     """(J,) yaws."""
     translations: FloatArray
@@ -83,9 +82,7 @@ def search_two_point(
     watch = watch or Watch()
     watch.expect(iterations)
     log, drawn, reached = _search(
-        aligned.bearings,
-        aligned.points,
-        aligned.pixel_from_bearing,
+        Matches(aligned.bearings, aligned.points, aligned.pixel_from_bearing),
         np.array(bound_px),  # a copy: for a read-only array numba would compile the kernel once more
         np.uint64(seed),
         iterations,
@@ -109,7 +106,10 @@ def search_two_point(
 
 @numba.njit(cache=True, nogil=True, inline="always")
 def _mixed(state):
-    """SplitMix64's output function (Steele et al., "Fast splittable pseudorandom number generators", 2014)."""
+    """SplitMix64's output function of a ``state`` (uint64).
+
+    Steele et al., "Fast splittable pseudorandom number generators", 2014.
+    """
     state = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     state = (state ^ (state >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     return state ^ (state >> np.uint64(31))
@@ -117,7 +117,7 @@ def _mixed(state):
 
 @numba.njit(cache=True, nogil=True, inline="always")
 def _random(stream, k):
-    """Random number k, 64 bits, of a stream."""
+    """Random number k, 64 bits, of a ``stream`` (uint64)."""
     return _mixed(stream + np.uint64(k + 1) * np.uint64(0x9E3779B97F4A7C15))
 
 
@@ -138,7 +138,7 @@ def sample_pair(seed, k, count):
 
 @numba.njit(cache=True, nogil=True)
 def _shuffled(seed, count):
-    """A random order of ``count`` things, independent of the samples of the same seed."""
+    """A random order (``count``,) of so many things, independent of the samples of the same seed (uint64)."""
     stream = _mixed(~seed)
     order = np.arange(count)
     for k in range(count - 1, 0, -1):
@@ -167,7 +167,10 @@ def _least_of_first(seen, target, count, miss):
 
 @numba.njit(cache=True, nogil=True)
 def _set_floors(floors, target, count, miss):
-    """What a pose with ``target`` inliers must have after each block, see ``reaches``; fails with probability miss."""
+    """Write what a pose with ``target`` inliers of ``count`` must have after each block to ``floors`` (B,).
+
+    See ``reaches``; this fails with probability ``miss``.
+    """
     checks = np.int64(np.log2(len(floors))) + 1
     for b in range(len(floors)):
         seen = min(count, (b + 1) * BLOCK)
@@ -177,41 +180,45 @@ def _set_floors(floors, target, count, miss):
 
 
 @numba.njit(cache=True, nogil=True)
-def _optimize(yaw, translation, bearings, points, weights, bound_px, mask):
-    """Fit yaw (returned) and translation (in place) to the inliers, choose these anew, and so on.
+def _optimize(yaw, translation, matches, bound_px, mask):
+    """Fit yaw, rad (returned), and translation (3,), m (in place), to the inliers, choose these anew, and so on.
+
+    ``matches`` are ``gauss_newton.Matches``, ``bound_px`` (M,); ``mask`` (M,) is written.
 
     The pose of two noisy correspondences explains those around them; each fit reaches farther. A wider bound at first
     would reach farther still, but where gravity's error has widened the bounds it lets in too many false ones
     (measured).
     """
-    here, heavy = np.empty(5), np.empty(len(points))
-    place(yaw, translation, here)
+    pose, weights = np.empty(5), np.empty(len(mask))
+    write_level_pose(yaw, translation, pose)
     for _ in range(OPTIMIZATION_ROUNDS):
-        score_inliers(yaw, translation, bearings, points, weights, bound_px, mask)
-        heavy[:] = mask
-        fit(points, weights, heavy, here, np.int64(OPTIMIZATION_STEPS))
-        yaw = np.arctan2(here[1], here[0])
-        translation_of(here, translation)
+        score_inliers(yaw, translation, matches, bound_px, mask)
+        weights[:] = mask
+        fit(matches.points, matches.pixel_jacobian, weights, pose, np.int64(OPTIMIZATION_STEPS))
+        yaw = np.arctan2(pose[1], pose[0])
+        write_translation(pose, translation)
     return yaw
 
 
 @numba.njit(cache=True, nogil=True)
-def _search(bearings, points, weights, bound_px, seed, iterations, miss, msac, local, board):
+def _search(matches, bound_px, seed, iterations, miss, msac, local, board):
     """Rows (sample, i, j, yaw, translation, inliers, optimized) of all improvements, samples drawn, confidence reached.
 
-    ``miss`` is 1 - confidence, or NaN to draw all samples.
+    ``matches`` are ``gauss_newton.Matches``, ``bound_px`` (M,), ``seed`` is uint64; ``miss`` is 1 - confidence, or NaN
+    to draw all samples; ``msac`` and ``local`` are switches. Rows (J, 9) are float64. A watch's ``board`` counts the
+    samples and can end it.
     """
-    count = len(points)
+    bearings, points, count = matches.bearings, matches.points, len(matches.points)
     bounded = not np.isnan(miss)
-    turned_away = TURNED_AWAY * miss if bounded else 0.0
-    blocks = pack_blocks(points, weights, bound_px, _shuffled(seed, count))
+    rejected_share = REJECTED_SHARE * miss if bounded else 0.0
+    blocks = pack_blocks(matches, bound_px, _shuffled(seed, count))
     floors = np.empty((count + BLOCK - 1) // BLOCK, np.int64)
-    _set_floors(floors, np.int64(1), count, turned_away)
+    _set_floors(floors, np.int64(1), count, rejected_share)
     yaws, translations, mask = np.empty(2), np.empty((2, 3)), np.empty(count, np.bool_)
     log, rows, best, drawn = np.empty((32, 9)), 0, 0.0, 0
     log_unclean = 0.0  # logarithm of the chance that one sample is not of the best hypothesis's inliers only
-    while drawn < iterations and not (bounded and rows > 0 and drawn * log_unclean <= np.log(miss - turned_away)):
-        if drawn & FEW == 0:
+    while drawn < iterations and not (bounded and rows > 0 and drawn * log_unclean <= np.log(miss - rejected_share)):
+        if drawn & WATCH_MASK == 0:
             board[DONE] = drawn
             if stopped(board):
                 break
@@ -222,8 +229,8 @@ def _search(bearings, points, weights, bound_px, seed, iterations, miss, msac, l
                 continue
             for optimized in range(2 if local else 1):
                 if optimized:
-                    yaw = _optimize(yaw, translation, bearings, points, weights, bound_px, mask)
-                inliers, support = score_inliers(yaw, translation, bearings, points, weights, bound_px, mask)
+                    yaw = _optimize(yaw, translation, matches, bound_px, mask)
+                inliers, support = score_inliers(yaw, translation, matches, bound_px, mask)
                 score = support if msac else float(inliers)
                 if score <= best:
                     break
@@ -233,11 +240,11 @@ def _search(bearings, points, weights, bound_px, seed, iterations, miss, msac, l
                 log[rows, 4:7], log[rows, 7], log[rows, 8] = translation, inliers, optimized
                 rows, best = rows + 1, score
                 log_unclean = np.log1p(-((inliers / count) ** 2))
-                _set_floors(floors, int(np.floor(best)) + 1, count, turned_away)
+                _set_floors(floors, int(np.floor(best)) + 1, count, rejected_share)
                 if bounded and log_unclean < 0.0:
-                    needed = np.ceil(np.log(miss - turned_away) / log_unclean)
+                    needed = np.ceil(np.log(miss - rejected_share) / log_unclean)
                     board[TOTAL] = np.int64(min(float(iterations), max(needed, 1.0)))
         drawn += 1
     board[DONE] = drawn
-    reached = -np.expm1(drawn * log_unclean) - turned_away if rows > 0 else 0.0
+    reached = -np.expm1(drawn * log_unclean) - rejected_share if rows > 0 else 0.0
     return log[:rows].copy(), drawn, max(0.0, reached)

@@ -1,35 +1,46 @@
-"""Yaw arcs: for every pair of correspondences, the yaws at which both can be inliers.
+"""Yaw arcs: for every pair of correspondences, the yaws at which both can be inliers; and the yaw that most arcs cover.
 
-At the true yaw of a pair of inliers, |f| <= tau, S_i >= 0 and S_j >= 0 (see ``depth_bounds``). Each of these is
+**Arcs.** At the true yaw of a pair of inliers, |f| <= tau, S_i >= 0 and S_j >= 0 (see ``pair_arcs``). Each of these is
 A cos yaw + B sin yaw + C >= 0, which is one arc, so the feasible yaws are an intersection of four arcs in closed form:
 usually one short arc around each root of Eq. 22 with positive depths. The arcs bound: the true yaw cannot be
-outside while the noise is within its bound.
+outside while the noise is within its bound. They are intersected as pairs of unit vectors (cos, sin), from the first
+end counterclockwise to the second, so that angles are computed only of the arcs that are returned: half of all pairs
+have none.
 
-Arcs are intersected as pairs of unit vectors (cos, sin), from the first end counterclockwise to the second, so that
-angles are computed only of the arcs that are returned: half of all pairs have none.
+**The deepest yaw**, covered by most arcs: a maximum clique of the rotation graph (Eq. 34, 37) without building a graph.
+Arcs on a line that overlap pairwise share a point, so a clique of their graph is a point and the arcs over it. On the
+circle this holds for the arcs through any one yaw, which is what the estimator needs. Sorting the ends and walking
+them finds the deepest yaw exactly, in O(A log A). (Eq. 37 as printed has the interval ends swapped.)
 """
+
+from dataclasses import dataclass
 
 import numba
 import numpy as np
 
-from spherloc.consensus.depth_bounds import chord, pair_sinusoids
+from spherloc.consensus.pair_arcs import chord, pair_sinusoids
 from spherloc.problem import AlignedProblem
 from spherloc.types import FloatArray, IndexArray
-from spherloc.watch import DONE, Watch, stopped
+from spherloc.watch import DONE, SELDOM, Watch, stopped
 
 FULL = 2.0 * np.pi
+"""The whole circle, rad."""
 MOST_ARCS = 4
 """Four arcs of a circle intersect in at most four."""
 ROUNDING = 1e-12
 """Slack of every condition, relative to its amplitude, so that rounding never excludes the true yaw."""
-SAME = 1e-9
+LEAST_SINE = 1e-9
 """Sine of the angle by which the ends of a short arc may be swapped by rounding. No long arc leaves so little open."""
+BINS = 1440
+"""Bins of the overlap curve kept for display, a quarter of a degree each."""
+MOST_SORTED = 2_000_000
+"""Numbers that are sorted at once: some hundredths of a second."""
 
 
 def yaw_arcs(
     aligned: AlignedProblem, bound_rad: FloatArray, widest_rad: float = FULL, watch: Watch | None = None
 ) -> tuple[IndexArray, FloatArray, FloatArray]:
-    """All arcs: pairs (A, 2) of places in ``aligned``, lower ends (A,) in [-pi, pi), upper ends (A,) >= lower.
+    """All arcs: pairs (A, 2) of matches of ``aligned``, lower ends (A,) in [-pi, pi), upper ends (A,) >= lower.
 
     ``bound_rad`` (M,) bounds the angular error of each bearing. Arcs wider than ``widest_rad`` are left out, and so is
     a pair that bounds nothing: it would cover every yaw alike. ``watch`` counts the pairs; raises ``Cancelled``.
@@ -48,14 +59,17 @@ def yaw_arcs(
 
 @numba.njit(cache=True, nogil=True, inline="always")
 def _sine_and_cosine(u0, v0, u1, v1):
-    """Of an arc's width, from its ends; the sine is below 0 only if the arc is longer than half the circle."""
+    """Of an arc's width, from its ends, unit vectors (u0, v0) and (u1, v1).
+
+    The sine is below 0 only if the arc is longer than half the circle.
+    """
     sine, cosine = u0 * v1 - v0 * u1, u0 * u1 + v0 * v1
-    return (0.0 if sine < 0.0 and sine > -SAME and cosine > 0.0 else sine), cosine
+    return (0.0 if sine < 0.0 and sine > -LEAST_SINE and cosine > 0.0 else sine), cosine
 
 
 @numba.njit(cache=True, nogil=True)
 def _holds(u0, v0, u1, v1, x, y):
-    """Whether an arc holds the direction (x, y)."""
+    """Whether the arc from (u0, v0) to (u1, v1) holds the direction (x, y)."""
     after_first, before_second = u0 * y - v0 * x >= 0.0, x * v1 - y * u1 >= 0.0
     if _sine_and_cosine(u0, v0, u1, v1)[0] >= 0.0:
         return after_first and before_second and u0 * x + v0 * y + u1 * x + v1 * y >= 0.0
@@ -64,8 +78,9 @@ def _holds(u0, v0, u1, v1, x, y):
 
 @numba.njit(cache=True, nogil=True)
 def _cut(arcs, count, a, b, c):
-    """Replace ``count`` arcs, rows (u0, v0, u1, v1), by what of them has a cos + b sin + c >= 0; return how many are
-    left. A row of zeros is the whole circle.
+    """Replace ``count`` of the ``arcs`` (K, 4), rows (u0, v0, u1, v1), by what of them has a cos + b sin + c >= 0.
+
+    Returns how many are left. A row of zeros is the whole circle.
     """
     square = a * a + b * b
     amplitude = np.sqrt(square)
@@ -109,7 +124,10 @@ def _cut(arcs, count, a, b, c):
 
 @numba.njit(cache=True, nogil=True, inline="always")
 def _clear_sign(wave, u0, v0, u1, v1, cosine):
-    """1 or -1 if the wave has this sign on all of a short arc with the given cosine of its width, 0 if unclear."""
+    """1 or -1 if the ``wave`` (cos, sin, constant) has this sign on all of a short arc, 0 if unclear.
+
+    The arc is from (u0, v0) to (u1, v1); ``cosine`` is that of its width.
+    """
     at_first, at_second = wave[0] * u0 + wave[1] * v0 + wave[2], wave[0] * u1 + wave[1] * v1 + wave[2]
     # At least the bulge of ``_cut``.
     amplitude = abs(wave[0]) + abs(wave[1])
@@ -120,9 +138,10 @@ def _clear_sign(wave, u0, v0, u1, v1, cosine):
 
 @numba.njit(cache=True, nogil=True)
 def _arcs_at_roots(f, tau, most_i, most_j, arcs):
-    """The arcs where all conditions hold if there is at most a short one at each of two roots of f; else -1.
+    """Write the arcs where all conditions hold to ``arcs`` (K, 4), if f has two roots and at most a short one at each.
 
-    Gives what four cuts give, for most pairs, with few branches.
+    Returns how many, or -1 where it is not so simple. f, tau and the upper bounds on both depths are waves (cos, sin,
+    constant). Gives what four cuts give, for most pairs, with few branches.
     """
     a, b, c = tau[0] - f[0], tau[1] - f[1], tau[2] - f[2]
     d, e, g = tau[0] + f[0], tau[1] + f[1], tau[2] + f[2]
@@ -163,9 +182,14 @@ def _arcs_at_roots(f, tau, most_i, most_j, arcs):
 
 @numba.njit(cache=True, nogil=True)
 def _fill(bearings, points, eps, widest, pairs, lo, hi, board):
+    """Write the arcs of ``yaw_arcs`` to ``pairs`` (K, 2), ``lo`` (K,) and ``hi`` (K,), rad; returns how many.
+
+    ``bearings`` (M, 3), ``points`` (M, 3), m, ``eps`` (M,), rad, ``widest`` in rad. A watch's ``board`` counts the
+    pairs and can end it.
+    """
     used = 0
     chords, sines = chord(eps), np.sin(eps)
-    least_cosine = np.cos(widest) - SAME if widest < np.pi else -2.0
+    least_cosine = np.cos(widest) - LEAST_SINE if widest < np.pi else -2.0
     arcs = np.empty((2 * MOST_ARCS, 4))
     for i in range(len(bearings)):
         if stopped(board):
@@ -199,3 +223,135 @@ def _fill(bearings, points, eps, widest, pairs, lo, hi, board):
                     used += 1
         board[DONE] += len(bearings) - 1 - i
     return used
+
+
+@dataclass(frozen=True, eq=False)
+class YawConsensus:
+    """The deepest yaw of A arcs."""
+
+    interval_rad: tuple[float, float]
+    """The longest of the intervals covered by most arcs; its upper end exceeds pi where it crosses the seam."""
+    yaw_rad: float
+    """Its middle, in [-pi, pi)."""
+    clique: IndexArray
+    """Indices of the arcs that cover it."""
+    overlap: IndexArray
+    """(BINS,) the most arcs over any one yaw of each bin, from -pi upwards."""
+
+
+def deepest_yaw(lo_rad: FloatArray, hi_rad: FloatArray, watch: Watch | None = None) -> YawConsensus | None:
+    """The yaw that most of the closed arcs [lo, hi] cover (-pi <= lo < pi, hi <= lo + 2 pi); None without arcs.
+
+    -pi and pi are one yaw. ``watch`` counts the steps below; raises ``Cancelled``.
+    """
+    if len(lo_rad) == 0:
+        return None
+    watch = watch or Watch()
+    watch.expect(5)
+    starts, ends, depth = _ends(lo_rad, hi_rad, watch.board)
+    watch.reach(1)
+    _sort(starts, watch)
+    watch.reach(2)
+    _sort(ends, watch)
+    watch.reach(3)
+    overlap = np.zeros(BINS, np.int32)
+    start, end = _sweep(starts, ends, depth, overlap, watch.board)
+    watch.reach(4)
+    yaw = 0.5 * (start + end)
+    yaw -= 2 * np.pi if yaw >= np.pi else 0.0
+    clique = _covering(lo_rad, hi_rad, yaw, watch.board)
+    watch.reach(5)
+    return YawConsensus((start, end), yaw, clique, overlap)
+
+
+def _sort(values: FloatArray, watch: Watch) -> None:
+    """Sort in place, by halves where one sort would take long: numpy's cannot be stopped."""
+    watch.check()
+    if len(values) <= MOST_SORTED:
+        values.sort()
+        return
+    half = len(values) // 2
+    values.partition(half)
+    _sort(values[:half], watch)
+    _sort(values[half:], watch)
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _kind(lo, hi):
+    """Whether an arc, ends in rad, is the whole circle, whether it crosses the seam, and its upper end below pi."""
+    full = hi - lo >= 2 * np.pi
+    wraps = hi >= np.pi and not full
+    return full, wraps, hi - 2 * np.pi if wraps else hi
+
+
+@numba.njit(cache=True, nogil=True)
+def _ends(lo, hi, board):
+    """Lower and upper ends (K,) of the arcs but whole circles, in any order, and how many arcs cover -pi from before.
+
+    ``lo`` (A,) and ``hi`` (A,) are in rad; a watch's ``board`` can end it.
+    """
+    starts, ends = np.empty(len(lo)), np.empty(len(lo))
+    count, depth = 0, 0
+    for k in range(len(lo)):
+        if k & SELDOM == 0 and stopped(board):
+            break
+        full, wraps, end = _kind(lo[k], hi[k])
+        starts[count], ends[count] = lo[k], end
+        count += not full
+        depth += full or wraps
+    return starts[:count], ends[:count], depth
+
+
+@numba.njit(cache=True, nogil=True)
+def _covering(lo, hi, yaw, board):
+    """Indices (K,) of the arcs, ``lo`` (A,) and ``hi`` (A,), rad, that cover a ``yaw`` of [-pi, pi)."""
+    covering = np.empty(len(lo), np.int32)
+    count = 0
+    for k in range(len(lo)):
+        if k & SELDOM == 0 and stopped(board):
+            break
+        full, wraps, end = _kind(lo[k], hi[k])
+        above, below = lo[k] <= yaw, yaw <= end
+        covering[count] = k
+        count += full | (wraps & (above | below)) | (above & below)
+    return covering[:count].copy()
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _bin(yaw):
+    """The bin of ``overlap`` that holds a yaw of [-pi, pi], rad."""
+    return max(0, min(BINS - 1, int((yaw + np.pi) * (BINS / (2 * np.pi)))))
+
+
+@numba.njit(cache=True, nogil=True)
+def _sweep(starts, ends, depth, overlap, board):
+    """Walk the sorted ends from -pi to pi, starting with ``depth`` arcs that cover -pi; fill ``overlap`` (BINS,).
+
+    ``starts`` and ``ends`` (K,) are in rad. Returns the longest interval of greatest depth. Where an arc ends and
+    another starts at the same yaw, both cover it, since arcs are closed.
+    """
+    count = len(starts)
+    opened, closed = 0, 0
+    here, first, best, best_lo, best_hi = -np.pi, 0, -1, -np.pi, np.pi
+    # The interval that starts at -pi continues the one that ends at pi.
+    seam_depth, seam_end = -1, -np.pi
+    while True:
+        next_open = starts[opened] if opened < count else np.inf
+        next_close = ends[closed] if closed < count else np.inf
+        there = min(next_open, next_close, np.pi)
+        last = _bin(there)
+        for b in range(first, last + 1):
+            overlap[b] = max(overlap[b], depth)
+        if seam_depth < 0 and there > -np.pi:
+            seam_depth, seam_end = depth, there
+        far = there + (seam_end + np.pi if there == np.pi and depth == seam_depth and here > -np.pi else 0.0)
+        if depth > best or (depth == best and far - here > best_hi - best_lo):
+            best, best_lo, best_hi = depth, here, far
+        if there == np.pi or ((opened + closed) & SELDOM == 0 and stopped(board)):
+            return best_lo, best_hi
+        # Which one comes next is as good as random: arithmetic instead of a branch.
+        opens = np.int64(next_open <= next_close)
+        depth += 2 * opens - 1
+        opened += opens
+        closed += 1 - opens
+        here, first = there, last

@@ -1,13 +1,19 @@
-"""First pass of the exact search: the circle in bins of yaw, and in each a cheap bound on the clique number.
+"""The circle in bins of yaw: a cheap bound on the consensus in each, and the largest cliques of whole bins.
 
 The graph of a bin has an edge for every pair with an arc that touches the bin, so it contains the graphs of all yaws in
 the bin. A clique of k nodes needs k nodes of degree k - 1 at least: the largest such k bounds the consensus.
+
+Cliques of whole bins give a first good pose where sampling found none. With few inliers a sampled pair is seldom one of
+two inliers, but at the true yaw every pair of inliers is an edge. A bin's graph holds all of its yaws at once, so its
+cliques bound those of each yaw, but may have no pose.
 """
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from spherloc.consensus.level_pose import verify
+from spherloc.consensus.max_clique import colour_bound, larger_clique, remove_weak_edges, set_edge, subgraph
 from spherloc.consensus.pair_arcs import CIRCLE
 from spherloc.types import FloatArray, IndexArray
 from spherloc.watch import SELDOM, stopped
@@ -17,16 +23,24 @@ EdgeArray = NDArray[np.uint16]
 BINS = 256
 """Narrow beside the arcs of an error of some pixels, and few enough to cost nothing."""
 BIN_TURN = CIRCLE / BINS
+"""Turns of a bin."""
+EFFORT_LIMIT = 200_000
+"""Words touched in one bin."""
+MOST_THINNED = 1_000_000
+"""Edges times words of a graph up to which it is thinned."""
+CLIQUE_MARGIN = 3
+"""How much smaller than a clique without pose the next one may be."""
 
 
 @numba.njit(cache=True, nogil=True)
 def sort_into_bins(
     pairs: IndexArray, lo: FloatArray, hi: FloatArray, board: NDArray[np.int64] | None = None
 ) -> tuple[NDArray[np.int64], EdgeArray]:
-    """Places (BINS + 1,) where each bin's edges start in a list of edges (E, 2), and the list: nodes below 65,536.
+    """Indices (BINS + 1,) where each bin's edges start in a list of edges (E, 2), and the list: nodes below 65,536.
 
-    An arc is an edge of every bin that it touches. Nodes are copied, so that a bin is read from one place. A
-    watch's ``board`` can end it, after which the edges are none.
+    ``pairs`` (A, 2) are those of arcs from ``lo`` (A,) to ``hi`` (A,), turns. An arc is an edge of every bin that it
+    touches. Nodes are copied, so that a bin is read from one place. A watch's ``board`` can end it, after which the
+    edges are none.
     """
     starts = np.zeros(BINS + 1, np.int64)
     for arc in range(len(lo)):
@@ -38,20 +52,21 @@ def sort_into_bins(
     for b in range(BINS):
         starts[b + 1] += starts[b]
     edges = np.empty((starts[BINS], 2), np.uint16)
-    place = starts[:BINS].copy()
+    next_of_bin = starts[:BINS].copy()
     for arc in range(len(lo)):
         if arc & SELDOM == 0 and stopped(board):
             return np.zeros(BINS + 1, np.int64), np.empty((0, 2), np.uint16)
         first, last = _bins(lo[arc], hi[arc])
         for b in range(first, last + 1):
-            edges[place[b % BINS], 0], edges[place[b % BINS], 1] = pairs[arc, 0], pairs[arc, 1]
-            place[b % BINS] += 1
+            index = next_of_bin[b % BINS]
+            edges[index, 0], edges[index, 1] = pairs[arc, 0], pairs[arc, 1]
+            next_of_bin[b % BINS] += 1
     return starts, edges
 
 
 @numba.njit(cache=True, nogil=True)
 def _bins(lo, hi):
-    """First and last bin that an arc touches; not more than all."""
+    """First and last bin that an arc, ends in turns, touches; not more than all."""
     first, last = int(lo / BIN_TURN), int(hi / BIN_TURN)
     return first, min(last, first + BINS - 1)
 
@@ -70,9 +85,9 @@ def degree_bounds(
         if stopped(board):
             break
         degree[:] = 0
-        for place in range(starts[b], starts[b + 1]):
-            degree[edges[place, 0]] += 1
-            degree[edges[place, 1]] += 1
+        for index in range(starts[b], starts[b + 1]):
+            degree[edges[index, 0]] += 1
+            degree[edges[index, 1]] += 1
         tally[:] = 0
         for node in range(count):
             tally[min(degree[node], count)] += 1
@@ -86,3 +101,72 @@ def degree_bounds(
             k -= 1
         bound[b] = k
     return bound
+
+
+@numba.njit(cache=True, nogil=True)
+def largest_bin_cliques(matches, starts, edges, bound, least, best, board=None):
+    """Verify the largest clique of each bin; better poses go to ``best``, and each bin's ``bound`` (BINS,) is lowered.
+
+    ``matches`` are ``BoundedMatches``, ``starts`` and ``edges`` those of ``sort_into_bins``, ``best`` is ``BestPoses``.
+    A clique must be larger than the best support. While that is not above ``least`` it must be larger than this, and
+    not much smaller than the largest clique that had no pose. A watch's ``board`` can end it.
+    """
+    count, supports = len(matches.points), best.supports
+    floor = max(least, supports[0])
+    for b in np.argsort(-bound, kind="mergesort"):
+        if bound[b] <= floor or stopped(board):
+            break
+        nodes, rows = core_graph(count, edges[starts[b] : starts[b + 1]], floor, board)
+        if len(nodes) <= floor or colour_bound(rows) <= floor:
+            bound[b] = floor
+            continue
+        clique, _, exact = larger_clique(rows, floor, np.int64(EFFORT_LIMIT), board)
+        if exact:
+            bound[b] = max(floor, len(clique))
+        if len(clique):
+            verify(matches, nodes[clique], best)
+            floor = supports[0] if supports[0] > least else max(floor, len(clique) - CLIQUE_MARGIN)
+
+
+@numba.njit(cache=True, nogil=True)
+def core_graph(count, edges, least, board=None):
+    """Nodes (K,) that may belong to a clique of more than ``least``, by falling degree, and their graph (K, words).
+
+    ``edges`` (E, 2) are among ``count`` nodes. Nodes have ``least`` edges among themselves or more (two between the
+    same nodes count as two, but are one in the graph), and in a graph that is not too large the ends of every edge have
+    ``least`` - 1 neighbours in common. Stopped by a watch's ``board``, it has no edges.
+    """
+    degree, alive = np.empty(count, np.int64), np.ones(count, np.bool_)
+    left = edges.copy()
+    changed = True
+    while changed and not stopped(board):
+        changed = False
+        degree[:] = 0
+        used = 0
+        for k in range(len(left)):
+            i, j = left[k, 0], left[k, 1]
+            if alive[i] and alive[j]:
+                degree[i] += 1
+                degree[j] += 1
+                left[used, 0], left[used, 1] = i, j
+                used += 1
+        left = left[:used]
+        for node in range(count):
+            if alive[node] and degree[node] < least:
+                alive[node] = False
+                changed = True
+    nodes = np.flatnonzero(alive)
+    nodes = nodes[np.argsort(-degree[nodes])]
+    index_of = np.full(count, -1, np.int64)
+    for index in range(len(nodes)):
+        index_of[nodes[index]] = index
+    rows = np.zeros((len(nodes), (len(nodes) + 63) // 64), np.uint64)
+    if stopped(board):
+        return nodes, rows
+    for k in range(len(left)):
+        set_edge(rows, index_of[left[k, 0]], index_of[left[k, 1]])
+    if len(left) * rows.shape[1] > MOST_THINNED or len(nodes) <= least:
+        return nodes, rows
+    kept = remove_weak_edges(rows, least)
+    small, old = subgraph(rows, kept)
+    return nodes[old], small

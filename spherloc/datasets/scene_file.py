@@ -1,5 +1,6 @@
 """Scene files: small TOML documents whose ``kind`` names the dataset loader that reads them."""
 
+import ast
 import importlib
 import inspect
 import math
@@ -214,6 +215,8 @@ def scene_kinds() -> tuple[SceneKind, ...]:
 
 def scene_kind(name: str) -> SceneKind:
     """The kind of that name. Raises ``InputError`` naming the known ones if there is none."""
+    if own := registry.own_module("datasets", name):
+        return _own_kind(name, own)
     try:
         loader = loader_of(name)
         with registry.guarded("datasets", name):
@@ -228,3 +231,18 @@ def scene_kind(name: str) -> SceneKind:
         if name not in registry.names("datasets"):
             raise
         return SceneKind(name, "", problem=str(error))  # an extension that cannot be imported hides no other
+
+
+def _own_kind(name: str, module: str) -> SceneKind:
+    """From the source of the module: to import all loaders takes seconds."""
+    path = Path(__file__).with_name(f"{module.rpartition('.')[2]}.py")
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    values = {
+        target.id: ast.literal_eval(item.value)
+        for item in tree.body
+        if isinstance(item, ast.Assign)
+        for target in item.targets
+        if isinstance(target, ast.Name) and target.id in ("EXTRAS", "EXAMPLE")
+    }
+    documentation = inspect.cleandoc(ast.get_docstring(tree) or "")
+    return SceneKind(name, documentation, values.get("EXTRAS", ()), values.get("EXAMPLE", ""))

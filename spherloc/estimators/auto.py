@@ -17,9 +17,9 @@ from spherloc.trace import DecisionStage
 PROBE_SAMPLES = 500
 MOST_PROBE_SAMPLES = 5000
 PROBE_CONFIDENCE = 0.99
-CHEAP = 500
+MOST_FOR_CHEAP_PROOF = 500
 """Correspondences up to which the proof costs a few hundredths of a second, so that nothing speaks against it."""
-CERTAIN = 1e-6
+MOST_NFA_BY_CHANCE = 1e-6
 """Expected number of false alarms (NFA) of the size of the probe's consensus below which it is no chance."""
 RANSAC_CONFIDENCE = 0.9999
 RANSAC_SAMPLES = 100_000
@@ -98,9 +98,9 @@ def _decide(aligned: AlignedProblem, bounds: Bounds, probe: TwoPointSearch) -> D
     )
     if count > MOST_CORRESPONDENCES:
         chosen, reason = "ransac-2p", f"{count:,} matches are too many for an exact search."
-    elif count <= CHEAP:
+    elif count <= MOST_FOR_CHEAP_PROOF:
         chosen, reason = "mc-exact", f"{count:,} matches are few enough to prove the answer in a moment."
-    elif chance < CERTAIN:
+    elif chance < MOST_NFA_BY_CHANCE:
         chosen, reason = "ransac-2p", f"{share}, which is no chance: sampling finds the pose and is faster."
     else:
         chosen, reason = "mc-exact", f"only {share}, which may be chance: all poses must be searched."

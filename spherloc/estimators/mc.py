@@ -11,10 +11,10 @@ from spherloc.bounds import Bounds
 from spherloc.consensus.inliers import BLOCK, ROWS, count_inliers, pack_blocks, reaches
 from spherloc.consensus.max_clique import max_clique
 from spherloc.consensus.translation_balls import edges_of, overlapping, share_of_each, spread_balls
-from spherloc.consensus.yaw_arcs import yaw_arcs
-from spherloc.consensus.yaw_sweep import YawConsensus, deepest_yaw
+from spherloc.consensus.yaw_arcs import YawConsensus, deepest_yaw, yaw_arcs
 from spherloc.errors import InputError
 from spherloc.estimators.base import Clock, Outcome, check_positive
+from spherloc.gauss_newton import Matches
 from spherloc.geometry import pose, yaw_rotation
 from spherloc.last_step import conclude
 from spherloc.problem import AlignedProblem
@@ -111,7 +111,10 @@ def _yaw_stage(
 
 @numba.njit(cache=True, nogil=True)
 def _rename(pairs, index, named, board):
-    """Write the numbers in the problem of ``pairs`` (A, 2), whose places are those of ``index`` (M,)."""
+    """Write ``pairs`` (A, 2) of usable matches to ``named`` (A, 2) by their numbers in the problem, ``index`` (M,).
+
+    A watch's ``board`` can end it.
+    """
     for k in range(len(pairs)):
         if k & SELDOM == 0 and stopped(board):
             break
@@ -163,21 +166,24 @@ def _best_start(
     mean = pose(yaw_rotation(yaw), -yaw_rotation(yaw) @ (weights @ centres / weights.sum()))
     yaws, translations, exists = two_point(aligned.bearings[pairs], aligned.points[pairs])
     yaws, translations = np.append(yaw, yaws[exists]), np.vstack([mean[:, 3], translations[exists]])
-    data = (aligned.bearings, aligned.points, aligned.pixel_from_bearing, bounds.pixels)
-    best = _most_inliers(yaws, translations, *data)
+    matches = Matches(aligned.bearings, aligned.points, aligned.pixel_from_bearing)
+    best = _most_inliers(yaws, translations, matches, bounds.pixels)
     return pose(yaw_rotation(yaws[best]), translations[best])
 
 
 @numba.njit(cache=True, nogil=True)
-def _most_inliers(yaws, translations, bearings, points, weights, bound_px):
-    """Index of the pose that explains most correspondences, the first of equals."""
-    count = len(points)
-    blocks = pack_blocks(points, weights, bound_px, np.arange(count))
+def _most_inliers(yaws, translations, matches, bound_px):
+    """Index of the level pose that explains most correspondences, the first of equals.
+
+    ``yaws`` (J,), rad, ``translations`` (J, 3), m, ``matches`` are ``gauss_newton.Matches``, ``bound_px`` (M,).
+    """
+    count = len(matches.points)
+    blocks = pack_blocks(matches, bound_px, np.arange(count))
     left = np.maximum(count - BLOCK * np.arange(1, len(blocks) // (ROWS * BLOCK) + 1), 0)
     best, most = 0, -1
     for k in range(len(yaws)):
         if reaches(yaws[k], translations[k], blocks, most + 1 - left):
-            inliers = count_inliers(yaws[k], translations[k], bearings, points, weights, bound_px)
+            inliers = count_inliers(yaws[k], translations[k], matches, bound_px)
             if inliers > most:
                 best, most = k, inliers
     return best

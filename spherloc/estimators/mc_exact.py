@@ -3,7 +3,8 @@
 Two exact searches share what they find: one over yaw that compares pairs of correspondences
 (``consensus.exact``; gravity exact, few correspondences or few inliers), and one over camera positions, yaw and tilt
 (``consensus.positions``), which needs memory for the correspondences only. Each starts from the other's best pose and
-leaves out the yaws that the other has excluded.
+leaves out the yaws that the other has excluded. Both begin with a pose within the gravity bound that explains many
+matches within the noise bound alone, from 2P-RANSAC and, where gravity is uncertain, robust fits to its hypotheses.
 """
 
 from dataclasses import dataclass
@@ -14,17 +15,17 @@ from numpy.typing import NDArray
 from spherloc.bounds import Bounds
 from spherloc.consensus.chance import chance_rate, nfa
 from spherloc.consensus.exact import ExactConsensus, exact_consensus
-from spherloc.consensus.pose_cells import Matches, matches_of
+from spherloc.consensus.level_pose import SAME_CONSENSUS
+from spherloc.consensus.pose_cells import TILT_A, PackedMatches, pack_matches, parameters_of, pose_of
 from spherloc.consensus.positions import PositionSearch, search_positions
-from spherloc.consensus.support import SAME_CONSENSUS
 from spherloc.consensus.two_point_search import TwoPointSearch, search_two_point
 from spherloc.errors import InputError
 from spherloc.estimators.base import Clock, Outcome, check_positive
-from spherloc.estimators.first_poses import first_pose, supported
+from spherloc.gauss_newton import LEAST_FOR_SIX_DOF, ROBUST_CAUCHY, Noise, polish
 from spherloc.geometry import pose, yaw_of, yaw_rotation
 from spherloc.last_step import conclude
 from spherloc.problem import AlignedProblem
-from spherloc.refine import RefinementOptions, residuals_px
+from spherloc.refine import RefinementOptions, matches_of, residuals_px
 from spherloc.trace import Certificate, ConsensusStage, PositionStage, Stage
 from spherloc.types import FloatArray
 from spherloc.watch import working_s
@@ -39,6 +40,11 @@ SEED_SAMPLES = 20_000
 """Most samples of the 2P-RANSAC that finds the first lower bound: enough at 1.5 % inliers, and some milliseconds."""
 LEAST_SAMPLES = 100
 SEED_CONFIDENCE = 0.99
+FIRST_STARTS = 3
+"""Hypotheses of the sampling, the last ones, that are tried where gravity is uncertain."""
+FIRST_BOUNDS, ROUNDS_PER_BOUND, STEPS_PER_ROUND = 5, 2, 10
+"""Of their fits: bounds from the widened one to that of the noise, choices of inliers at each, and steps on each
+choice."""
 YAW_BINS = 1440
 MOST_LEVELS, MOST_BOXES = 12, 200
 """Of the boxes that are kept for the picture."""
@@ -89,7 +95,7 @@ class ExactMaximumConsensus:
             guess = search_two_point(
                 aligned, bounds.pixels, seed, samples, SEED_CONFIDENCE, local_optimization=True, watch=clock.watch
             )
-            matches = matches_of(aligned, bounds.noise_px)
+            matches = pack_matches(aligned, bounds.noise_px)
             start = first_pose(aligned, bounds, matches, guess)
         rate = chance_rate(aligned.bearings, bounds.radians)
         with clock.stage("consensus"):
@@ -133,7 +139,7 @@ def _search(
     bounds: Bounds,
     rate: float,
     guess: TwoPointSearch,
-    matches: Matches,
+    matches: PackedMatches,
     start: tuple[FloatArray, int] | None,
     options: McExactOptions,
     clock: Clock,
@@ -258,3 +264,55 @@ def _different(
         if all(np.count_nonzero(masks[k] & masks[other]) < fewest for other in kept):
             kept.append(k)
     return [poses[k] for k in kept], [masks[k] for k in kept]
+
+
+def supported(aligned: AlignedProblem, cam_from_map: FloatArray, bound_px: float) -> int:
+    """How many matches a pose (3, 4) explains."""
+    return int(np.count_nonzero(residuals_px(aligned, cam_from_map) <= bound_px))
+
+
+def first_pose(
+    aligned: AlignedProblem, bounds: Bounds, matches: PackedMatches, guess: TwoPointSearch
+) -> tuple[FloatArray, int] | None:
+    """A pose (3, 4) within the gravity bound and what it explains, from a search that took gravity as exact."""
+    if not guess.found:
+        return None
+    best = np.argsort(-guess.support, kind="stable")[: FIRST_STARTS if aligned.gravity_bound_rad > 0.0 else 1]
+    poses = [pose(yaw_rotation(float(guess.yaws_rad[k])), guess.translations[k]) for k in best]
+    if aligned.gravity_bound_rad > 0.0:
+        poses += [tilted for level in poses for tilted in _narrowed(aligned, bounds, matches, level)]
+    counts = [supported(aligned, one, bounds.noise_px) for one in poses]
+    most = int(np.argmax(counts))
+    return (poses[most], counts[most]) if counts[most] > 1 else None
+
+
+def within_gravity(matches: PackedMatches, cam_from_map: FloatArray, gravity_bound_rad: float) -> FloatArray:
+    """The pose (3, 4), or one with the same position whose tilt is just within the gravity bound."""
+    chart, at = parameters_of(matches, cam_from_map)
+    tilt = float(np.arccos(min(1.0, np.cos(at[TILT_A]) * np.cos(at[TILT_A + 1]))))
+    if tilt <= gravity_bound_rad:
+        return cam_from_map
+    # cos a cos c falls with both, and (a, c) scaled by bound / tilt is within.
+    at[TILT_A:] *= gravity_bound_rad / tilt * (1.0 - 1e-9)
+    while np.cos(at[TILT_A]) * np.cos(at[TILT_A + 1]) < np.cos(gravity_bound_rad):
+        at[TILT_A:] *= 1.0 - 1e-3
+    return pose_of(matches, chart, at)
+
+
+def _narrowed(
+    aligned: AlignedProblem, bounds: Bounds, matches: PackedMatches, cam_from_map: FloatArray
+) -> list[FloatArray]:
+    """Poses (3, 4) within the gravity bound from robust fits in six degrees of freedom at narrowing bounds."""
+    plain_matches = matches_of(aligned)
+    widest = float(np.median(bounds.pixels))
+    rotation, translation = cam_from_map[:, :3].copy(), cam_from_map[:, 3].copy()
+    found = []
+    for limit_px in np.geomspace(widest, bounds.noise_px, FIRST_BOUNDS):
+        for _ in range(ROUNDS_PER_BOUND):
+            chosen = residuals_px(aligned, pose(rotation, translation)) <= limit_px
+            if np.count_nonzero(chosen) < LEAST_FOR_SIX_DOF:
+                return found
+            noise = Noise(float(limit_px / 3.0), aligned.gravity_bound_rad / 3.0)
+            polish(plain_matches, chosen, rotation, translation, noise, ROBUST_CAUCHY, STEPS_PER_ROUND)
+        found.append(within_gravity(matches, pose(rotation, translation), aligned.gravity_bound_rad))
+    return found

@@ -23,12 +23,11 @@ from spherloc.metrics import ransac_success_probability
 from spherloc.problem import AlignedProblem
 from spherloc.refine import RefinementOptions, residuals_px
 from spherloc.solvers.base import Solver, solver_of
-from spherloc.solvers.epnp import Epnp
+from spherloc.solvers.epnp import Epnp, VirtualPinhole
 from spherloc.solvers.epropnp import EproPnp
 from spherloc.solvers.mlpnp import Mlpnp
 from spherloc.solvers.odlt import Odlt
 from spherloc.solvers.svd import Svd
-from spherloc.solvers.virtual_pinhole import VirtualPinhole
 from spherloc.trace import RansacStage
 from spherloc.types import BoolArray, FloatArray, IntArray
 from spherloc.watch import Watch

@@ -1,4 +1,10 @@
-"""Loads or compiles the numeric kernels before somebody waits for an answer."""
+"""Loads or compiles the numeric kernels before somebody waits for an answer.
+
+A kernel is compiled for the types of its arguments, so that one is loaded here only if later calls have the same types.
+That is why kernels pass constants to each other as ``np.int64(MOST_STEPS)``: to numba a constant of a module is a type
+of its own, its value, for which the callee would be compiled again. And that is why arrays are given to a kernel with
+the same layout, and writable or not, every time.
+"""
 
 import os
 from collections.abc import Callable, Iterable
@@ -27,7 +33,7 @@ def warm_up(announce: Callable[[str], None] | None = None, estimators: Iterable[
             how_often = "at every start, since no folder to keep them can be written (NUMBA_CACHE_DIR names another)"
         announce(f"preparing the solvers, {how_often}: some two minutes …")
     scene = tiny_scene()
-    names = set(registry.names("estimators") if cold or estimators is None else estimators)
+    names = tuple(dict.fromkeys(registry.names("estimators") if cold or estimators is None else estimators))
     for estimator in names:
         try:
             estimate(scene.problem(), estimator)
@@ -39,7 +45,7 @@ def warm_up(announce: Callable[[str], None] | None = None, estimators: Iterable[
     # With uncertain gravity, and enough matches to weigh them: the last step of all.
     uncertain = replace(scene, correspondences=40, noise_px=0.5, gravity_error_deg=0.5).problem()
     estimate(uncertain, "ransac-2p")
-    if names.isdisjoint(("auto", "mc-exact")):
+    if "auto" not in names and "mc-exact" not in names:
         return
     # So murky that the exact search has to use all that it has.
     murky = replace(scene, correspondences=12, outlier_rate=0.6, noise_px=10.0).problem()

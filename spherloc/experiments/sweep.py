@@ -4,207 +4,14 @@
 >>> rows = list(run_sweep(plan))
 """
 
-import contextlib
-import multiprocessing
-import os
-import signal
 import threading
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Future, ProcessPoolExecutor, wait
-from dataclasses import dataclass
-from functools import cache
-from multiprocessing.connection import Connection
-from typing import Any, Protocol
 
-from spherloc.errors import InputError, reason
-from spherloc.estimators import warm_up
+from spherloc.errors import InputError
 from spherloc.experiments.sweep_plan import AXES, Entrant, Job, SweepPlan, planned
 from spherloc.experiments.sweep_rows import SweepRow
-from spherloc.trace import Trace
-
-MOST_WORKERS = 64
-AHEAD = 1
-"""Tasks that wait beside those that are being done, so that no worker waits for us."""
-MOST_FAILED_STARTS = 2
-NICENESS = 10
-"""Whoever waits for an answer of this machine goes before a sweep in the background."""
-
-
-class Keep(Protocol):
-    """Keeps whole runs where they are done. It is sent to the workers, so it is plain data."""
-
-    def __call__(self, plan: SweepPlan, job: Job, trace: Trace) -> str:
-        """Keep a run; returns why it could not be kept, in a sentence, or nothing if it was."""
-        ...
-
-
-@dataclass(frozen=True)
-class Solved:
-    """What a worker has done."""
-
-    rows: list[SweepRow]
-    """A row a run."""
-    complaints: tuple[str, ...] = ()
-    """Why runs could not be kept, a sentence each."""
-    failures: tuple[tuple[str, str], ...] = ()
-    """Estimators of other packages that failed, by their labels, and how."""
-
-
-@dataclass(frozen=True)
-class Done:
-    """A task that has ended."""
-
-    jobs: tuple[Job, ...]
-    """What it was."""
-    solved: Solved | None
-    """Its results; None if its worker died."""
-
-
-class Workers(Protocol):
-    """Workers that do tasks, each of which is a few jobs."""
-
-    def room(self) -> int:
-        """How many more tasks it should be given now."""
-        ...
-
-    def submit(self, jobs: tuple[Job, ...]) -> None:
-        """Take a task."""
-        ...
-
-    def collect(self, timeout_s: float) -> list[Done]:
-        """Tasks that have ended, as soon as there is one; none if there is none in time.
-
-        Raises ``InputError`` if a task is impossible or the workers are lost for good.
-        """
-        ...
-
-    def close(self) -> None:
-        """End the workers, whatever they are doing. May be called twice."""
-        ...
-
-
-def solve(plan: SweepPlan, jobs: Sequence[Job], keep: Keep | None) -> Solved:
-    """What a worker does."""
-    _warm(frozenset(entrant.estimator for entrant in plan.entrants))
-    complaints: list[str] = []
-    failures: dict[str, str] = {}
-    rows = plan.solve(
-        jobs,
-        None if keep is None else lambda job, trace: complaints.append(keep(plan, job, trace)),
-        lambda job, sentence: failures.update({plan.labels[job.entrant]: sentence}),
-    )
-    return Solved(rows, tuple(filter(None, complaints)), tuple(failures.items()))
-
-
-@cache
-def _warm(estimators: frozenset[str]) -> None:
-    """So that no run's time includes the loading of the kernels."""
-    warm_up(estimators=estimators)
-
-
-class LocalWorkers:
-    """Processes on this machine.
-
-    They hold one end of a pipe, the lifeline, and end when its other end is closed: by ``close``, or because this
-    process has ended, whatever ended it. A pool with a dead process is replaced, and its tasks are reported as lost.
-    """
-
-    def __init__(self, plan: SweepPlan, workers: int, keep: Keep | None) -> None:
-        """Raises ``InputError`` for a wrong number of workers."""
-        if not 1 <= workers <= MOST_WORKERS:
-            raise InputError(f"the sweep has {workers} workers; give a number from 1 to {MOST_WORKERS}.")
-        self._plan, self._workers, self._keep = plan, workers, keep
-        self._tasks: dict[Future[Solved], tuple[Job, ...]] = {}
-        self._failed_starts = 0
-        self._start()
-
-    def room(self) -> int:
-        return self._workers + AHEAD - len(self._tasks)
-
-    def submit(self, jobs: tuple[Job, ...]) -> None:
-        try:
-            with _deaf_to_ctrl_c():
-                future = self._pool.submit(solve, self._plan, jobs, self._keep)
-        except BrokenExecutor as error:  # found out before we collected
-            future = Future()
-            future.set_exception(error)
-        self._tasks[future] = jobs
-
-    def collect(self, timeout_s: float) -> list[Done]:
-        ended, _ = wait(self._tasks, timeout_s, FIRST_COMPLETED)
-        if any(_is_broken(future) for future in ended):
-            ended = set(self._tasks)  # those that have a result keep it
-            self._replace()
-        return [Done(self._tasks.pop(future), _result(future)) for future in ended]
-
-    def close(self) -> None:
-        self._lifeline.close()
-        self._pool.shutdown(wait=True, cancel_futures=True)
-
-    def _start(self) -> None:
-        spawn = multiprocessing.get_context("spawn")  # the page has threads, which a fork would break
-        reader, self._lifeline = spawn.Pipe(duplex=False)
-        try:
-            self._pool = ProcessPoolExecutor(self._workers, spawn, _begin, (reader,))
-            with _deaf_to_ctrl_c():
-                self._begun = self._pool.submit(os.getpid)
-        except OSError as error:
-            self._lifeline.close()
-            raise InputError(
-                f"the worker processes cannot be started ({reason(error)}); see whether /dev/shm can be written and "
-                "how many processes are allowed."
-            ) from None
-
-    def _replace(self) -> None:
-        begun = _result(self._begun) is not None
-        self._failed_starts = 0 if begun else self._failed_starts + 1
-        if self._failed_starts == MOST_FAILED_STARTS:
-            raise InputError(
-                "the worker processes end while they start: in a script, call this under "
-                "'if __name__ == \"__main__\":', else see whether the memory is full."
-            )
-        self.close()
-        self._start()
-
-
-def _begin(lifeline: Connection) -> None:
-    """What a worker process does first."""
-    if hasattr(os, "nice"):
-        os.nice(NICENESS)
-    threading.Thread(target=_end_with, args=(lifeline,), name="spherloc-lifeline", daemon=True).start()
-
-
-def _end_with(lifeline: Connection) -> None:
-    with contextlib.suppress(EOFError, OSError):
-        lifeline.recv_bytes()
-    os._exit(0)
-
-
-def _is_broken(future: Future[Solved]) -> bool:
-    return not future.cancelled() and isinstance(future.exception(), BrokenExecutor)
-
-
-def _result(future: Future[Any]) -> Any:
-    """The result of a task that has ended or never will; None if its worker died. Raises what the task raised."""
-    try:
-        return future.result(timeout=0)
-    except (BrokenExecutor, CancelledError, TimeoutError):
-        return None
-
-
-@contextlib.contextmanager
-def _deaf_to_ctrl_c() -> Iterator[None]:
-    """Processes that are started meanwhile never hear of Ctrl-C, which a terminal sends to them too."""
-    if not hasattr(signal, "pthread_sigmask"):  # Windows
-        yield
-        return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
+from spherloc.experiments.sweep_workers import Keep, LocalWorkers, Workers
 
 __all__ = ["AXES", "Entrant", "Job", "Keep", "SweepPlan", "SweepRow", "planned", "run_sweep"]
 
@@ -250,13 +57,13 @@ def run_sweep(
                 if jobs := backlog.take():
                     pool.submit(jobs)
             for task in pool.collect(LISTEN_S):
-                for label, sentence in () if task.solved is None else task.solved.failures:
-                    if label not in warned:
-                        warned.add(label)
-                        warn(f"{sentence} Such runs count as failures.")
                 if task.solved is None:
                     backlog.put_back(task.jobs)
                     continue
+                for label, sentence in task.solved.failures:
+                    if label not in warned:
+                        warned.add(label)
+                        warn(f"{sentence} Such runs count as failures.")
                 for sentence in task.solved.complaints:
                     complain(sentence)
                 yield from backlog.book(task.jobs, task.solved.rows)

@@ -9,8 +9,8 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 from spherloc.errors import InputError
-from spherloc.experiments.sweep import AHEAD, Done, Keep, solve
 from spherloc.experiments.sweep_plan import Job, SweepPlan
+from spherloc.experiments.sweep_workers import AHEAD, Done, Keep, solve
 from spherloc.registry import require
 
 CONNECT_S = 10.0

@@ -18,8 +18,8 @@ import numpy as np
 
 from spherloc.geometry import skew, so3_exp
 from spherloc.solvers.base import NO_POSES, checked, poses
+from spherloc.solvers.epnp import image_plane
 from spherloc.solvers.linear_pose import DEGENERATE, condition, nearest_rotation
-from spherloc.solvers.virtual_pinhole import image_plane
 from spherloc.types import FloatArray
 
 LEAST_DEPTH = 1e-3

@@ -22,7 +22,10 @@ DEGENERATE = 1e-12
 
 @numba.njit(cache=True, nogil=True, inline="always")
 def yaw_coefficients(vi, vj, pi, pj):
-    """(d1, d2, d3) of Eq. 22, |n|^2 = sin^2 of the angle between the bearings, and |d|^2."""
+    """(d1, d2, d3) of Eq. 22, m, |n|^2 = sin^2 of the angle between the bearings, and |d|^2, m^2.
+
+    ``vi`` and ``vj`` (3,) are unit bearings, ``pi`` and ``pj`` (3,) points, m.
+    """
     dx, dy, dz = pi[0] - pj[0], pi[1] - pj[1], pi[2] - pj[2]
     nx = vi[1] * vj[2] - vi[2] * vj[1]
     ny = vi[2] * vj[0] - vi[0] * vj[2]
@@ -32,7 +35,10 @@ def yaw_coefficients(vi, vj, pi, pj):
 
 @numba.njit(cache=True, nogil=True, inline="always")
 def depths(vi, vj, pi, pj, cosine, sine, sin2):
-    """Depths (s_i, s_j) with R d = s_i v_i - s_j v_j in the least-squares sense; sin2 = |v_i x v_j|^2."""
+    """Depths (s_i, s_j), m, with R d = s_i v_i - s_j v_j in the least-squares sense; sin2 = |v_i x v_j|^2.
+
+    ``cosine`` and ``sine`` are those of the yaw; the others are as in ``yaw_coefficients``.
+    """
     dx, dy, dz = pi[0] - pj[0], pi[1] - pj[1], pi[2] - pj[2]
     rx, rz = dx * cosine + dz * sine, dz * cosine - dx * sine
     nx = vi[1] * vj[2] - vi[2] * vj[1]
@@ -46,7 +52,10 @@ def depths(vi, vj, pi, pj, cosine, sine, sin2):
 
 @numba.njit(cache=True, nogil=True)
 def solve_pair(vi, vj, pi, pj, yaws, translations):
-    """Write the roots with positive depths into ``yaws`` (2,) and ``translations`` (2, 3); return how many."""
+    """Write the roots with positive depths to ``yaws`` (2,), rad, and ``translations`` (2, 3), m; return how many.
+
+    ``vi`` and ``vj`` (3,) are unit bearings, ``pi`` and ``pj`` (3,) points, m.
+    """
     d1, d2, d3, sin2, dist2 = yaw_coefficients(vi, vj, pi, pj)
     rho = np.sqrt(d1 * d1 + d2 * d2)
     # Where both roots meet, rounding may put |d3| above rho.
@@ -72,6 +81,7 @@ def solve_pair(vi, vj, pi, pj, yaws, translations):
 
 @numba.njit(cache=True, nogil=True)
 def _solve_batch(bearings, points, yaws, translations, valid):
+    """Write ``solve_pair`` of B pairs, see ``two_point``; ``valid`` (B, 2) becomes true where there is a root."""
     for b in range(len(bearings)):
         found = solve_pair(bearings[b, 0], bearings[b, 1], points[b, 0], points[b, 1], yaws[b], translations[b])
         valid[b, :found] = True

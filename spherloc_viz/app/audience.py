@@ -69,6 +69,7 @@ class Audience:
         self._touches.on("deselect", lambda touch: self._select(()))
         # Only now may the page tell what is pressed: everything that listens is there.
         client.gui.add_html(READY)
+        self._display.panels.ready()
 
     def start(self) -> None:
         """Show what the presenter shows."""

@@ -17,7 +17,7 @@ from spherloc_viz.app.plots.residual_view import ResidualView
 from spherloc_viz.app.plots.yaw_view import YawView
 from spherloc_viz.app.run_request import Run
 from spherloc_viz.app.text import legend_html, opening_html, status_html, summary_html, table_html
-from spherloc_viz.app.web.touch import Touch, Touches
+from spherloc_viz.app.web.touch import READY, Touch, Touches
 from spherloc_viz.layers import graph_begins, steps
 from spherloc_viz.layers.primitives import Picture, Table
 
@@ -39,10 +39,12 @@ class LeftPanels:
             self._summary = gui.add_html("")
             self.steps = StepsPanel(gui, changed)
             touches.on("step", lambda touch: self.steps.go(touch.argument))
+            touches.on("move", lambda touch: self.steps.move(touch.argument))
+            touches.on("projector", self._widen)
             self._diagnosis = gui.add_html("")
             gui.add_html(legend_html())
             self._outcome = gui.add_html("")
-            self._introduction, self._front = gui.add_html(""), gui.add_html("")
+            self._introduction, self._front, self._ready = gui.add_html(""), gui.add_html(""), gui.add_html("")
         Glossary(gui, touches)
         self._opening = ""
         self._seen, self._changed = frozenset({"Yaw"}), changed
@@ -59,6 +61,7 @@ class LeftPanels:
             self._images = ImagePanel(gui, touches, changed)
         with _view(gui, views, "Matches"):
             self._matches = MatchTable(gui, touches, changed)
+        self._panel, self._width_px = steps, width_px
         steps.dock_left()
         views.dock_below(steps)
         steps.set_width(width_px)
@@ -115,12 +118,23 @@ class LeftPanels:
         self._seen = frozenset(touch.argument.split(","))
         self._changed(None)
 
+    def _widen(self, touch: Touch) -> None:
+        """Make room for the projector view on a window of so many pixels; 0 ends it."""
+        window_px = int(touch.argument) if touch.argument.isdecimal() and len(touch.argument) < 6 else 0
+        self._panel.set_width(max(self._width_px, int(PROJECTOR_SHARE * window_px)))
+
+    def ready(self) -> None:
+        """Tell the page that presses are heard, in a panel that stays when the other one is folded."""
+        self._ready.content = READY
+
     def diagnose(self, html: str) -> None:
         """Show what the diagnosis says by now."""
         if self._diagnosis.content != html:
             self._diagnosis.content = html
 
 
+PROJECTOR_SHARE = 0.4
+"""Of the window, for the view left of the canvas in the projector view."""
 HIDDEN = "Answers are hidden: what came out is told at the last step, and the truth when Hide answers is off."
 FRONTS = {
     "Matches": "Images",

@@ -34,7 +34,7 @@ from spherloc_viz.plugins import extensions
 from spherloc_viz.recording.index.run_index import RunIndex
 from spherloc_viz.recording.sandbox.examiner import end_examining
 from spherloc_viz.recording.storage.recorder import Recorder
-from spherloc_viz.recording.storage.retention import KEEP_GIGABYTES, kept_bytes
+from spherloc_viz.recording.storage.room import KEEP_GIGABYTES, kept_bytes
 
 SWITCH_S = 0.001
 NOT_ENCRYPTED = (

@@ -85,6 +85,7 @@ class Session:
         self._name, self._address = secrets.token_hex(8), client.gui.add_html("")
         # Only now may the page tell what is pressed: everything that listens is there.
         client.gui.add_html(READY)
+        self._display.panels.ready()
 
     def start(self) -> None:
         """Solve and show the first problem."""

@@ -28,15 +28,18 @@ def box(content: str, css: str = "") -> str:
 def step_html(step: Step, caption_html: Callable[[str], str] = escape) -> str:
     """Title, caption, equation and note of a step; ``caption_html`` makes HTML of the words of the caption."""
     parts = [
-        f'<div style="font-size:15px;font-weight:600;padding-bottom:.25em">{escape(step.title)}</div>',
+        '<div class="step-title" style="font-size:15px;font-weight:600;padding-bottom:.25em">'
+        f"{escape(step.title)}</div>",
         f"<div>{caption_html(step.caption)}</div>",
     ]
     if step.equation:
         face = "font-family:Cambria,Georgia,serif;font-style:italic;font-size:14px"
-        parts.append(f'<div style="{face};padding-top:.4em;{DIM}">{escape(step.equation)}</div>')
+        parts.append(f'<div class="step-equation" style="{face};padding-top:.4em;{DIM}">{escape(step.equation)}</div>')
     if step.note:
-        parts.append(f'<div style="font-size:11.5px;padding-top:.35em;{DIM}">{escape(step.note)}</div>')
-    return box("".join(parts))
+        parts.append(
+            f'<div class="step-note" style="font-size:11.5px;padding-top:.35em;{DIM}">{escape(step.note)}</div>'
+        )
+    return box(f'<div class="step-words">{"".join(parts)}</div>')
 
 
 def table_html(table: Table) -> str:

@@ -1,7 +1,7 @@
 """Which pairs of correspondences agree at one yaw: the yaw arcs of both, asked at a single point.
 
 A pair agrees at a yaw that lies in one of its arcs (``spherloc.consensus.yaw_arcs``): |f| <= tau and depths that may be
-positive, with the bounds of ``spherloc.consensus.depth_bounds``. At a fixed yaw all of these are products of bearings v
+positive, with the bounds of ``spherloc.consensus.pair_arcs``. At a fixed yaw all of these are products of bearings v
 and turned points q, so that many pairs are matrix products: with the moments m = q x v, f = m_i . v_j + v_i . m_j
 (Eq. 22: two rays meet if that is 0).
 """
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spherloc.consensus.depth_bounds import chord
+from spherloc.consensus.pair_arcs import chord
 from spherloc.consensus.yaw_arcs import yaw_arcs
 from spherloc.geometry import yaw_rotation
 from spherloc.problem import AlignedProblem

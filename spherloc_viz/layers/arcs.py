@@ -8,7 +8,7 @@ from math import gcd
 import numpy as np
 from numpy.typing import NDArray
 
-from spherloc.consensus.yaw_sweep import YawConsensus, deepest_yaw
+from spherloc.consensus.yaw_arcs import YawConsensus, deepest_yaw
 from spherloc.trace import YawStage
 from spherloc.types import FloatArray, IntArray
 from spherloc_viz import style

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from small_problems import explained, good_poses, tight_problem
 
-from spherloc.consensus.bin_cliques import core_graph, largest_bin_cliques
+from spherloc.consensus.level_pose import bounded_matches, empty_list
 from spherloc.consensus.pair_arcs import pair_arcs, turn_of
-from spherloc.consensus.yaw_bins import BIN_TURN, BINS, degree_bounds, sort_into_bins
+from spherloc.consensus.yaw_bins import BIN_TURN, BINS, core_graph, degree_bounds, largest_bin_cliques, sort_into_bins
 from spherloc.watch import Watch
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
@@ -58,15 +58,14 @@ def run(problem, floor):
     """Bounds of the bins before and after a largest_bin_cliques that knows nothing, and what it found."""
     aligned, bounds = problem.aligned, problem.bounds
     count, board = len(aligned.bearings), Watch().board
-    least_cos = np.cos(np.minimum(bounds.radians + 1e-9, np.pi / 2))
-    data = (aligned.bearings, aligned.points, aligned.pixel_from_bearing, bounds.pixels, least_cos)
     pairs, lo, hi = pair_arcs(aligned, bounds.radians)
     starts, edges = sort_into_bins(pairs, lo, hi, board)
     before = degree_bounds(count, starts, edges, board)
     bound = before.copy()
-    poses, supports, masks = np.empty((8, 5)), np.zeros(8, np.int32), np.zeros((8, count), np.bool_)
-    known = largest_bin_cliques(data, starts, edges, bound, floor, poses, supports, masks, 0, board)
-    return before, bound, poses[:known], supports[:known], masks[:known]
+    best = empty_list(8, count)
+    largest_bin_cliques(bounded_matches(aligned, bounds), starts, edges, bound, floor, best, board)
+    known = int(best.known[0])
+    return before, bound, best.poses[:known], best.supports[:known], best.masks[:known]
 
 
 @pytest.mark.parametrize("floor", [0, 2, 4])

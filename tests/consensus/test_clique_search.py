@@ -4,8 +4,8 @@ import networkx as nx
 import numpy as np
 import pytest
 
-from spherloc.consensus import clique_search
-from spherloc.consensus.clique_search import (
+from spherloc.consensus import max_clique
+from spherloc.consensus.max_clique import (
     all_nodes,
     clear_edge,
     colour_bound,
@@ -174,7 +174,7 @@ def test_colours_listed_are_a_proper_colouring(rng):
     """Nodes of one colour share no edge, and every node has a colour."""
     adjacency = random_graph(rng, 90, 0.6)
     order, bound = np.empty(90, np.int32), np.empty(90, np.int32)
-    listed = clique_search.colour(all_nodes(90), rows_of(adjacency), 0, order, bound)
+    listed = max_clique.colour(all_nodes(90), rows_of(adjacency), 0, order, bound)
     assert listed == 90 and sorted(order) == list(range(90)) and (np.diff(bound) >= 0).all()
     for shade in np.unique(bound):
         same = order[bound == shade]

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 from small_problems import explained, fit, tight_problem
 
-from spherloc.consensus import dual_proof
-from spherloc.consensus.dual_proof import FOUND, IMPOSSIBLE, UNKNOWN, prove_none
+from spherloc.consensus import region_proof
+from spherloc.consensus.level_pose import bounded_matches
+from spherloc.consensus.pair_arcs import YawInterval
+from spherloc.consensus.region_proof import FOUND, IMPOSSIBLE, UNKNOWN, LawsonState, Region, prove_none
 from spherloc.geometry import yaw_rotation
 from spherloc.watch import Watch
 
@@ -15,23 +17,23 @@ BOARD = Watch().board
 
 
 def region_around(rng, problem, wide):
-    """A view and a ball that hold the true pose, often at their edge."""
+    """A region that holds the true pose, often at its edge."""
     slack, radius = wide * 10 ** rng.uniform(-2.5, -1), wide * 10 ** rng.uniform(-2.5, -0.5)
     edge = rng.choice([0.0, 0.7, 0.999])
     away = rng.normal(size=3)
     yaw = problem.yaw + edge * slack * rng.choice([-1, 1])
     ball = np.array([*(problem.centre + edge * radius * away / np.linalg.norm(away)), radius])
-    return (problem.aligned.bearings, problem.aligned.points, np.cos(yaw), np.sin(yaw), slack), ball
+    return Region(YawInterval(np.cos(yaw), np.sin(yaw), slack), ball)
 
 
-def limits_of(problem):
-    aligned, bounds = problem.aligned, problem.bounds
-    return aligned.pixel_from_bearing, bounds.pixels, bounds.radians, aligned.pixels_per_radian
+def matches_of(problem):
+    return bounded_matches(problem.aligned, problem.bounds)
 
 
-def most_in_region(rng, problem, view, ball):
+def most_in_region(rng, problem, region):
     """The largest consensus found inside by sampling, and by fits to what good samples explain; the truth is one."""
-    middle, slack = np.arctan2(view[3], view[2]), view[4]
+    (c, s, slack), ball = region
+    middle = np.arctan2(s, c)
     yaws = middle + slack * rng.uniform(-1, 1, 600)
     away = rng.normal(size=(600, 3))
     away *= (rng.random((600, 1)) ** (1 / 3)) / np.linalg.norm(away, axis=1, keepdims=True)
@@ -61,12 +63,12 @@ def test_never_denies_what_a_pose_explains(rng, wide, bound_px):
     for _ in range(30):
         count = int(rng.integers(4, 15))
         problem = tight_problem(rng, count, int(rng.integers(0, count // 2 + 1)), bound_px)
-        view, ball = region_around(rng, problem, wide)
-        best = most_in_region(rng, problem, view, ball)
+        region = region_around(rng, problem, wide)
+        best = most_in_region(rng, problem, region)
         everybody = np.arange(count)
         for floor in range(max(0, best - 2), count):
             found = np.full(5, np.nan)
-            answer, effort = prove_none(view, limits_of(problem), everybody, ball, floor, found, BOARD)
+            answer, effort = prove_none(matches_of(problem), region, everybody, floor, found, BOARD)
             assert effort > 0
             if answer == IMPOSSIBLE:
                 assert best <= floor, f"a pose explains {best}, which was proven to be {floor} at most"
@@ -82,12 +84,12 @@ def test_only_those_asked_for_count(rng):
     proven = 0
     for _ in range(60):
         problem = tight_problem(rng, 14, 5, 3.0)
-        view, ball = region_around(rng, problem, 0.3)
+        region = region_around(rng, problem, 0.3)
         everybody = rng.permutation(14)[:8]
         inside = int(problem.inliers[everybody].sum())
         for floor in range(8):
             found = np.full(5, np.nan)
-            answer, _ = prove_none(view, limits_of(problem), everybody, ball, floor, found, BOARD)
+            answer, _ = prove_none(matches_of(problem), region, everybody, floor, found, BOARD)
             assert answer != IMPOSSIBLE or inside <= floor
             assert answer != FOUND or explained_by(problem, found, everybody) > floor
             proven += answer == IMPOSSIBLE
@@ -99,15 +101,15 @@ def test_what_linear_residuals_neglect_is_bounded(rng):
     shares = []
     for _ in range(300):
         problem = tight_problem(rng, 4, 0, 3.0, nearest=0.5)
-        (_, points, c, s, slack), ball = view, _ = region_around(rng, problem, 10 ** rng.uniform(-1, 0.7))
-        limits = limits_of(problem)
-        here = np.array([c, s, *ball[:3]])
-        region = np.array([c, s, slack, *ball])
+        (c, s, slack), ball = region_around(rng, problem, 10 ** rng.uniform(-1, 0.7))
+        matches = matches_of(problem)
+        points = matches.points
+        possible = np.array([c, s, slack, *ball])
         yaw0 = np.arctan2(s, c)
         for k in range(4):
-            normal, slope, out = np.empty((4, 4)), np.empty(4), np.empty(1)
-            _, cost, _, bend = dual_proof._normal_equations(
-                view, limits, np.array([k]), region, here, np.ones(1), out, normal, slope
+            state = LawsonState(np.array([c, s, *ball[:3]]), np.ones(1), np.empty(1))
+            _, cost, _, neglected = region_proof._normal_equations(
+                matches, np.array([k]), possible, state, np.empty((4, 4)), np.empty(4)
             )
             if cost == 0.0:
                 continue  # too near to say anything
@@ -125,16 +127,16 @@ def test_what_linear_residuals_neglect_is_bounded(rng):
             minus = at(yaw0 - tiny * turn, ball[:3] - tiny * shift)
             linear = at([yaw0], [ball[:3]]) + (plus - minus) / (2 * tiny)
             off = np.linalg.norm(at(yaw0 + turn, ball[:3] + shift) - linear, axis=1).max()
-            assert off <= np.sqrt(bend) * (1 + 1e-6) + 1e-6
-            shares.append(off / np.sqrt(bend))
+            assert off <= np.sqrt(neglected) * (1 + 1e-6) + 1e-6
+            shares.append(off / np.sqrt(neglected))
     assert len(shares) > 500 and max(shares) > 0.5
 
 
 def test_no_spare_and_no_correspondences_within_reach(rng):
     """As many as there are cannot be exceeded; and points inside the region bound nothing."""
     problem = tight_problem(rng, 6, 0, 3.0)
-    view, ball = region_around(rng, problem, 0.3)
+    region = region_around(rng, problem, 0.3)
     found = np.full(5, np.nan)
-    assert prove_none(view, limits_of(problem), np.arange(6), ball, 6, found, BOARD)[0] != FOUND
-    ball[3] = 1e3
-    assert prove_none(view, limits_of(problem), np.arange(6), ball, 6, found, BOARD)[0] == UNKNOWN
+    assert prove_none(matches_of(problem), region, np.arange(6), 6, found, BOARD)[0] != FOUND
+    region.ball[3] = 1e3
+    assert prove_none(matches_of(problem), region, np.arange(6), 6, found, BOARD)[0] == UNKNOWN

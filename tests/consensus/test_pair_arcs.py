@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pair_samples import aligned_problem, sample, unit
 
-from spherloc.consensus.pair_arcs import CIRCLE, direction_of_turn, middle_of_turns, pair_arcs, turn_of
+from spherloc.consensus.pair_arcs import CIRCLE, direction_of_turn, pair_arcs, turn_of, yaws_between
 from spherloc.consensus.yaw_arcs import yaw_arcs
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
@@ -176,7 +176,7 @@ def test_middle_holds_all_of_the_arc(start, width):
     """Half width, rad, must reach both ends, across the seam too."""
     lo, hi = float(turn_of(np.array(start))), float(turn_of(np.array(start + width)))
     hi += CIRCLE if hi < lo else 0.0
-    c, s, half = middle_of_turns(lo, hi)
+    c, s, half = yaws_between(lo, hi)
     middle = np.arctan2(s, c)
     for yaw in (start, start + width):
         assert abs((yaw - middle + np.pi) % (2 * np.pi) - np.pi) <= half + 2e-15

@@ -12,7 +12,7 @@ from spherloc.consensus.pair_arcs import CIRCLE, pair_arcs, turn_of
 from spherloc.consensus.pose_cells import (
     AXES,
     CHARTS,
-    matches_of,
+    pack_matches,
     parameters_of,
     place_cell,
     pose_of,
@@ -41,7 +41,7 @@ def tilted(scene_of, seed, bound_rad, **changes):
 
 def test_every_pose_is_in_one_of_the_charts(rng, scene_of):
     aligned, _ = tilted(scene_of, 0, TILT_RAD)
-    matches = matches_of(aligned, BOUND_PX)
+    matches = pack_matches(aligned, BOUND_PX)
     lower, upper = whole_domain(TILT_RAD)
     seen = set()
     for reach in (0.1, 1.0, 10.0, 1e5):
@@ -67,7 +67,7 @@ def test_a_million_poses_obey_the_bounds_of_their_cells(rng, scene_of, bound_rad
     checked = decided = 0
     for seed in range(180):
         aligned, truth = tilted(scene_of, seed % 12, bound_rad)
-        matches, count = matches_of(aligned, BOUND_PX), len(aligned.points)
+        matches, count = pack_matches(aligned, BOUND_PX), len(aligned.points)
         chart, at = parameters_of(matches, truth)
         at[4:] = np.clip(at[4:], -bound_rad / 2, bound_rad / 2)
         if seed % 3 == 0:  # any cell; the others are around a pose that explains much
@@ -121,7 +121,7 @@ def test_against_brute_force(seed):
 
 
 def everything(aligned, start=None, effort=10**9):
-    return search_positions(aligned, matches_of(aligned, BOUND_PX), start, effort, working_s() + 600.0)
+    return search_positions(aligned, pack_matches(aligned, BOUND_PX), start, effort, working_s() + 600.0)
 
 
 def test_no_larger_than_the_largest_clique_of_pairs(scene_of):
@@ -152,9 +152,9 @@ def test_the_start_and_the_threads_do_not_matter(scene_of, monkeypatch):
         second.effort,
     )
     np.testing.assert_array_equal(first.pose, second.pose)
-    level = parameters_of(matches_of(aligned, BOUND_PX), truth)
+    level = parameters_of(pack_matches(aligned, BOUND_PX), truth)
     level[1][4:] = 0.0
-    start = pose_of(matches_of(aligned, BOUND_PX), *level)
+    start = pose_of(pack_matches(aligned, BOUND_PX), *level)
     explained = int(np.count_nonzero(residuals_px(aligned, start) <= BOUND_PX))
     again = everything(aligned, (start, explained))
     assert again.finished and again.upper == first.upper
@@ -170,5 +170,5 @@ def test_a_search_that_stops_says_what_is_left(scene_of):
         assert part.pose is None or np.count_nonzero(residuals_px(aligned, part.pose) <= BOUND_PX) == part.support
         uppers.append(part.upper)
     assert uppers[0] == len(aligned.points)
-    late = search_positions(aligned, matches_of(aligned, BOUND_PX), None, 10**9, working_s() - 1.0)
+    late = search_positions(aligned, pack_matches(aligned, BOUND_PX), None, 10**9, working_s() - 1.0)
     assert late.upper == len(aligned.points) and late.pose is None

@@ -4,7 +4,15 @@ import numpy as np
 import pytest
 from small_problems import explained, tight_problem
 
-from spherloc.consensus.support import explain_more, improve, mark_support, residual, verify
+from spherloc.consensus.level_pose import (
+    bounded_matches,
+    empty_list,
+    explain_more,
+    improve,
+    mark_support,
+    residual,
+    verify,
+)
 from spherloc.geometry import pose, yaw_rotation
 from spherloc.refine import residuals_px
 
@@ -12,9 +20,7 @@ pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
 
 
 def data_of(problem):
-    least_cos = np.cos(np.minimum(problem.bounds.radians + 1e-9, np.pi / 2))
-    aligned = problem.aligned
-    return aligned.bearings, aligned.points, aligned.pixel_from_bearing, problem.bounds.pixels, least_cos
+    return bounded_matches(problem.aligned, problem.bounds)
 
 
 def here_of(yaw, centre):
@@ -25,10 +31,6 @@ def marked(problem, here):
     return explained(problem.aligned, problem.bounds, np.array([np.arctan2(here[1], here[0])]), here[None, 2:])[0]
 
 
-def empty_list(count, most=8):
-    return np.empty((most, 5)), np.zeros(most, np.int32), np.zeros((most, count), np.bool_)
-
-
 def test_residuals_are_those_of_refinement(rng):
     """Within the angular bound; beyond it a correspondence is explained by no residual, however small."""
     for _ in range(20):
@@ -36,7 +38,7 @@ def test_residuals_are_those_of_refinement(rng):
         yaw, centre = problem.yaw + rng.normal(0, 0.02), problem.centre + rng.normal(0, 0.05, 3)
         turn, here = yaw_rotation(yaw), here_of(yaw, centre)
         expected = residuals_px(problem.aligned, pose(turn, -turn @ centre))
-        mine = np.array([residual(data_of(problem), k, here, data_of(problem)[4][k]) for k in range(30)])
+        mine = np.array([residual(data_of(problem), k, here, data_of(problem).least_cos[k]) for k in range(30)])
         ray = (problem.aligned.points - centre) @ turn.T
         cosine = np.sum(ray * problem.aligned.bearings, axis=1) / np.linalg.norm(ray, axis=1)
         inside = np.arccos(np.clip(cosine, -1, 1)) <= problem.bounds.radians
@@ -52,7 +54,7 @@ def test_opposite_points_are_not_explained(rng):
     problem = tight_problem(rng, 12, 0, 2.0, share=0.5)
     behind = 2 * problem.centre - problem.aligned.points
     behind.setflags(write=False)
-    data = (data_of(problem)[0], behind, *data_of(problem)[2:])
+    data = data_of(problem)._replace(points=behind)
     mask = np.ones(12, np.bool_)
     assert mark_support(data, here_of(problem.yaw, problem.centre), mask) == 0 and not mask.any()
 
@@ -102,10 +104,10 @@ def test_members_are_squeezed_in_after_a_long_climb(rng):
 def test_clique_of_inliers_gives_its_pose(rng):
     for _ in range(30):
         problem = tight_problem(rng, 16, 8, 2.0, share=0.5, nearest=1.0)
-        poses, supports, masks = empty_list(16)
-        known = verify(data_of(problem), np.flatnonzero(problem.inliers), poses, supports, masks, 0)
-        assert known == 1 and supports[0] >= problem.inliers.sum()
-        np.testing.assert_array_equal(masks[0], marked(problem, poses[0]))
+        best = empty_list(8, 16)
+        verify(data_of(problem), np.flatnonzero(problem.inliers), best)
+        assert best.known[0] == 1 and best.supports[0] >= problem.inliers.sum()
+        np.testing.assert_array_equal(best.masks[0], marked(problem, best.poses[0]))
 
 
 def test_clique_without_a_pose_adds_nothing(rng):
@@ -115,10 +117,9 @@ def test_clique_without_a_pose_adds_nothing(rng):
     points = np.tile([[0.0, -1.0, 0.0], [0.0, 1.0, 0.0]], (6, 1))
     for array in (bearings, points):
         array.setflags(write=False)
-    poses, supports, masks = empty_list(12)
-    data = (bearings, points, *data_of(problem)[2:])
-    assert verify(data, np.array([0, 1]), poses, supports, masks, 0) == 0
-    assert (supports == 0).all()
+    best = empty_list(8, 12)
+    verify(data_of(problem)._replace(bearings=bearings, points=points), np.array([0, 1]), best)
+    assert best.known[0] == 0 and (best.supports == 0).all()
 
 
 def test_list_keeps_the_best_of_clearly_different_poses(rng):
@@ -126,31 +127,32 @@ def test_list_keeps_the_best_of_clearly_different_poses(rng):
     kept = []
     for _ in range(20):
         problem = tight_problem(rng, 40, 30, 20.0, nearest=1.0)
-        poses, supports, masks = empty_list(40, 4)
-        known, best = 0, 0
+        found, known, best = empty_list(4, 40), 0, 0
+        supports = found.supports
         for _ in range(60):
             clique = rng.choice(40, 3, replace=False)
             before = known
-            known = verify(data_of(problem), clique, poses, supports, masks, known)
+            verify(data_of(problem), clique, found)
+            known = int(found.known[0])
             assert before <= known <= 4
             assert (np.diff(supports[:known]) <= 0).all()
             assert supports[:known].sum() == 0 or supports[0] >= best
             best = max(best, int(supports[0]))
         for k in range(known):
-            np.testing.assert_array_equal(masks[k], marked(problem, poses[k]))
-            assert masks[k].sum() == supports[k]
+            np.testing.assert_array_equal(found.masks[k], marked(problem, found.poses[k]))
+            assert found.masks[k].sum() == supports[k]
         kept.append(known)
     assert np.mean(kept) > 3
 
 
 def test_list_replaces_a_pose_by_a_better_one_of_the_same_consensus(rng):
     problem = tight_problem(rng, 12, 0, 3.0, share=0.5, nearest=1.0)
-    poses, supports, masks = empty_list(12)
-    data, nothing = data_of(problem), np.empty(0, np.int64)
+    best, data, nothing = empty_list(8, 12), data_of(problem), np.empty(0, np.int64)
     far = here_of(problem.yaw, problem.centre + 0.05)
-    known = improve(data, nothing, far.copy(), poses, supports, masks, 0)
-    first = supports[0]
-    known = improve(data, nothing, here_of(problem.yaw, problem.centre), poses, supports, masks, known)
-    assert known == 1 and supports[0] == 12 >= first
+    improve(data, nothing, far.copy(), best)
+    first = best.supports[0]
+    improve(data, nothing, here_of(problem.yaw, problem.centre), best)
+    assert best.known[0] == 1 and best.supports[0] == 12 >= first
     # And a worse one of the same set changes nothing.
-    assert improve(data, nothing, far, poses, supports, masks, known) == 1 and supports[0] == 12
+    improve(data, nothing, far, best)
+    assert best.known[0] == 1 and best.supports[0] == 12

@@ -12,8 +12,7 @@ from spherloc.consensus.translation_balls import (
     spread_balls,
     translation_balls,
 )
-from spherloc.consensus.yaw_arcs import yaw_arcs
-from spherloc.consensus.yaw_sweep import deepest_yaw
+from spherloc.consensus.yaw_arcs import deepest_yaw, yaw_arcs
 from spherloc.geometry import yaw_rotation
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from spherloc.consensus.yaw_sweep import BINS, deepest_yaw
+from spherloc.consensus.yaw_arcs import BINS, deepest_yaw
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
 

@@ -11,11 +11,12 @@ ROOT = Path(__file__).resolve().parents[2]
 RUN = """
 import numpy as np
 from spherloc.estimators.mc import _most_inliers
+from spherloc.gauss_newton import Matches
 
 bearings, points = np.eye(3), np.eye(3) * [[1.0], [2.0], [3.0]]
-weights = np.array([[np.eye(3)[(k + 1) % 3], np.eye(3)[(k + 2) % 3]] for k in range(3)])
+jacobian = np.array([[np.eye(3)[(k + 1) % 3], np.eye(3)[(k + 2) % 3]] for k in range(3)])
 translations = np.array([[9.0, 9.0, 9.0], [0.0, 0.0, 0.0]])
-print(_most_inliers(np.zeros(2), translations, bearings, points, weights, np.full(3, 0.1)))
+print(_most_inliers(np.zeros(2), translations, Matches(bearings, points, jacobian), np.full(3, 0.1)))
 """
 """Of two poses, only the second, which looks along the bearings at their points, explains anything."""
 

@@ -12,6 +12,7 @@ from spherloc.consensus import two_point_search
 from spherloc.consensus.inliers import BLOCK, count_inliers, score_inliers
 from spherloc.consensus.two_point_search import sample_pair, search_two_point
 from spherloc.estimators import estimate, options_type
+from spherloc.gauss_newton import Matches
 from spherloc.geometry import DOWN, pose, yaw_rotation
 from spherloc.metrics import evaluate
 from spherloc.problem import Problem
@@ -73,14 +74,14 @@ def test_scores_are_those_of_the_residuals(scene_of):
     bound_px = bounds_of(aligned, 3.0).pixels
     truth = aligned.align_pose(problem.truth_cam_from_map)
     yaw = np.arctan2(truth[0, 2], truth[0, 0])
-    data = (aligned.bearings, aligned.points, aligned.pixel_from_bearing, bound_px)
+    matches = Matches(aligned.bearings, aligned.points, aligned.pixel_from_bearing)
     for scale in np.repeat([0.0, 0.001, 0.01, 0.1, 3.0], 20):
         angle, t = yaw + scale * rng.normal(), truth[:, 3] + scale * rng.normal(size=3)
         error = residuals_px(aligned, pose(yaw_rotation(angle), t))
         mask = np.zeros(len(bound_px), dtype=bool)
-        inliers, support = score_inliers(angle, t, *data, mask)
+        inliers, support = score_inliers(angle, t, matches, bound_px, mask)
         np.testing.assert_array_equal(mask, error <= bound_px)
-        assert inliers == count_inliers(angle, t, *data) == np.count_nonzero(mask)
+        assert inliers == count_inliers(angle, t, matches, bound_px) == np.count_nonzero(mask)
         cost = np.minimum(np.square(error / bound_px), 1.0).sum()
         assert len(mask) - support == pytest.approx(cost, abs=1e-8)
 
@@ -88,12 +89,14 @@ def test_scores_are_those_of_the_residuals(scene_of):
 def test_point_opposite_of_its_bearing_is_no_inlier(scene_of):
     """The early test lets it pass; the score must not."""
     aligned = scene_of("mei", correspondences=20, outlier_rate=0.0, noise_px=0.0).problem().aligned
-    flipped = replace(aligned, bearings=-aligned.bearings)
-    data = (flipped.points, flipped.pixel_from_bearing, np.full(20, 8.0))
+    matches = Matches(aligned.bearings, aligned.points, aligned.pixel_from_bearing)
+    opposite = -aligned.bearings
+    opposite.setflags(write=False)
+    flipped, bound_px = matches._replace(bearings=opposite), np.full(20, 8.0)
     truth = search_two_point(aligned, np.full(20, 8.0), 0, 50)
     mask = np.ones(20, dtype=bool)
-    assert score_inliers(truth.yaws_rad[-1], truth.translations[-1], aligned.bearings, *data, mask)[0] == 20
-    assert score_inliers(truth.yaws_rad[-1], truth.translations[-1], flipped.bearings, *data, mask) == (0, 0.0)
+    assert score_inliers(truth.yaws_rad[-1], truth.translations[-1], matches, bound_px, mask)[0] == 20
+    assert score_inliers(truth.yaws_rad[-1], truth.translations[-1], flipped, bound_px, mask) == (0, 0.0)
     assert not mask.any()
 
 

@@ -19,10 +19,9 @@ from spherloc.datasets import load_scene
 from spherloc.datasets.variation import Variation
 from spherloc.errors import InputError
 from spherloc.estimators import estimate, options_type, warm_up
-from spherloc.experiments import sweep, sweep_cluster
+from spherloc.experiments import sweep_cluster, sweep_workers
 from spherloc.experiments.sweep import (
     MOST_DEATHS,
-    NICENESS,
     TASK_S,
     Backlog,
     Entrant,
@@ -32,6 +31,7 @@ from spherloc.experiments.sweep import (
     planned,
     run_sweep,
 )
+from spherloc.experiments.sweep_workers import NICENESS
 from spherloc.metrics import evaluate
 from tests.waiting import LIMIT_S, until
 
@@ -163,7 +163,7 @@ def test_a_machine_that_starts_no_workers_is_a_sentence(tmp_path: Path, monkeypa
     def read_only(*words: object) -> None:
         raise OSError(errno.EROFS, "Read-only file system")
 
-    monkeypatch.setattr(sweep, "ProcessPoolExecutor", read_only)
+    monkeypatch.setattr(sweep_workers, "ProcessPoolExecutor", read_only)
     with pytest.raises(InputError, match=r"cannot be started \(Read-only file system\); see whether /dev/shm"):
         list(run_sweep(small_plan(tmp_path)))
 

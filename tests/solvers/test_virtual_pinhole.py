@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from pose_samples import around
 
-from spherloc.solvers.virtual_pinhole import VirtualPinhole, image_plane
+from spherloc.solvers.epnp import VirtualPinhole, image_plane
 
 
 @pytest.mark.parametrize("fov_deg", [60.0, 120.0, 160.0])

@@ -37,6 +37,11 @@ from spherloc_viz.layers.primitives import SceneItem
 from spherloc_viz.layers.trajectory import trajectory_items
 from spherloc_viz.recording.replay.reopen import Reopened
 
+PROJECTOR = (
+    '<div class="words" style="padding:.2em .8em .3em"><button class="projector-toggle" title="The canvas, what the '
+    'step says in large type, and the view that goes with it">Projector view, key L</button></div>'
+)
+
 
 class DisplayControls:
     """View buttons, whether the view follows the steps, dark or light, and a switch for each layer."""
@@ -46,6 +51,7 @@ class DisplayControls:
         self._wanted: str | None = None
         self._views = gui.add_button_group("View", views.NAMES)
         self._dark = gui.add_checkbox("Dark", True, hint="Dark for a screen, light for a projector and for print.")
+        gui.add_html(PROJECTOR)
         self._hide = gui.add_checkbox(
             "Hide answers", False, hint="No true pose, no true labels, and no outcome before the last step."
         )

@@ -113,6 +113,11 @@ class StepsPanel:
         self._ask_for(key)
         self._changed(None)
 
+    def move(self, button: str) -> None:
+        """Press "Previous", "Next" or "Play"; anything else is nothing."""
+        if button in (PREVIOUS, NEXT, PLAY):
+            self._press(button)
+
     def _ask_for(self, goal: str | int) -> None:
         with self._lock:
             self._goal, self._moves, self._playing = goal, [], False

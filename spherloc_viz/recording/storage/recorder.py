@@ -13,7 +13,7 @@ from spherloc.errors import RecordingError
 from spherloc.trace import Trace
 from spherloc_viz.recording.index.run_index import RunIndex
 from spherloc_viz.recording.origin import Origin
-from spherloc_viz.recording.storage.retention import KEEP_BYTES
+from spherloc_viz.recording.storage.room import KEEP_BYTES
 from spherloc_viz.recording.storage.store import RecordingStore, SweepStore
 
 log = logging.getLogger(__name__)

@@ -1,35 +1,16 @@
 """What is kept: failures and what a reviewer labelled for ever, successes as long as there is room."""
 
-import math
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from spherloc.errors import InputError, RecordingError
+from spherloc.errors import RecordingError
 from spherloc_viz.recording.index.query import RunQuery
 from spherloc_viz.recording.index.run_index import RunIndex
 from spherloc_viz.recording.reviews import has_review
 from spherloc_viz.recording.run_row import RunRow
-
-GIGABYTE = 1_000_000_000
-KEEP_GIGABYTES = 2.0
-"""Size of the recordings beyond which old successes are deleted, if nobody says otherwise."""
-KEEP_BYTES = int(KEEP_GIGABYTES * GIGABYTE)
-
-
-def kept_bytes(gigabytes: float) -> int:
-    """The size that recordings may have, in bytes; infinity keeps all. Raises ``InputError`` for what is no size."""
-    if math.isnan(gigabytes) or gigabytes <= 0:
-        raise InputError(f"{gigabytes:g} gigabytes cannot be kept; give a positive number, or inf to keep all.")
-    return sys.maxsize if gigabytes >= sys.maxsize / GIGABYTE else int(gigabytes * GIGABYTE)
-
-
-def size_words(count: int) -> str:
-    """A number of bytes for people."""
-    return f"{count / GIGABYTE:.3g} GB" if count >= GIGABYTE / 10 else f"{count / 1e6:.3g} MB"
-
+from spherloc_viz.recording.storage.room import size_words
 
 NEWEST_KEPT = 20
 """The last runs stay whatever they are: somebody may be looking at them."""

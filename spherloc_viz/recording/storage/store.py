@@ -22,8 +22,10 @@ from spherloc_viz.recording.index.run_index import RunIndex
 from spherloc_viz.recording.origin import Origin
 from spherloc_viz.recording.reviews import has_review
 from spherloc_viz.recording.sandbox.examiner import Examiners, examine_review
-from spherloc_viz.recording.storage.retention import KEEP_BYTES, Pruned, prune, size_words
-from spherloc_viz.recording.storage.unfinished import here, leftovers, rescue
+from spherloc_viz.recording.storage.recovery import rescue
+from spherloc_viz.recording.storage.retention import Pruned, prune
+from spherloc_viz.recording.storage.room import KEEP_BYTES, size_words
+from spherloc_viz.recording.storage.unfinished import here, leftovers
 
 GALLERY = "gallery"
 """The folder inside that has the curated cases."""

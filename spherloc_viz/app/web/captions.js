@@ -1,0 +1,114 @@
+// Two ways of showing a step with few words, for a lecture and for a phone. On a narrow screen the settings are folded
+// away at the start, and what the step says stands below the canvas, with Previous and Next. The projector view, key L or
+// an element of the class "projector-toggle", folds the panel on the right and has the view that goes with the step and,
+// in large type, what the step says on the left, for which it asks the server for room (projector:WIDTH of the window).
+(() => {
+  const EVERY_MS = 150, NARROW_PX = 600, FOLD = "Collapse panel area", UNFOLD = "Expand column";
+  let bar = null, words = null, projector = false, folded = false, toldWidth = 0;
+
+  // While the settings are unfolded on a narrow screen, they take it all.
+  const small = () => innerWidth < NARROW_PX;
+  const unfolded = () => [...document.querySelectorAll("[data-ready]")].some((one) => one.getClientRects().length > 0);
+  const narrow = () => small() && folded && !unfolded();
+  const tell = (detail) => dispatchEvent(new CustomEvent("spherloc-touch", { detail }));
+  const rightmost = (label) =>
+    [...document.querySelectorAll(`[aria-label="${label}"]`)]
+      .filter((one) => one.getBoundingClientRect().left > innerWidth / 2)[0];
+
+  function button(text, label, press) {
+    const made = document.createElement("button");
+    made.textContent = text;
+    made.setAttribute("aria-label", label);
+    made.addEventListener("click", press);
+    return made;
+  }
+
+  function build() {
+    bar = document.createElement("div");
+    bar.className = "captions";
+    bar.setAttribute("role", "region");
+    bar.setAttribute("aria-label", "What the step says");
+    words = document.createElement("div");
+    words.setAttribute("aria-live", "polite");
+    const row = document.createElement("div");
+    row.className = "row";
+    row.append(
+      button("‹ Previous", "Previous step", () => tell("move:Previous")),
+      button("Next ›", "Next step", () => tell("move:Next")),
+    );
+    const close = button("Close (L)", "Close the projector view", toggle);
+    close.className = "close";
+    row.append(close);
+    bar.append(words, row);
+    document.body.append(bar);
+  }
+
+  // Only what is new is written: a screen reader would read it again.
+  function fill() {
+    const source = document.querySelector(".step-words");
+    if (!source) return;
+    const told = source.innerHTML;
+    if (words.dataset.told === told) return;
+    words.dataset.told = told;
+    words.innerHTML = told;
+    words.scrollTop = 0;
+  }
+
+  function place() {
+    const panel = narrow() ? null : document.querySelector("[data-view]")?.closest("[style*='left: 0px']");
+    bar.style.width = `${panel ? panel.getBoundingClientRect().width : innerWidth}px`;
+    document.body.style.setProperty("--captions", `${bar.getBoundingClientRect().height}px`);
+  }
+
+  function toggle() {
+    projector = !projector;
+    document.body.classList.toggle("projector", projector);
+    if (projector) {
+      rightmost(FOLD)?.click();
+      folded = true;
+    } else {
+      rightmost(UNFOLD)?.click();
+      folded = false;
+    }
+    look();
+  }
+
+  // Once, when the page is ready: what is on the screen first is the scene.
+  function foldSettings() {
+    if (folded || !small() || !document.querySelector("[data-ready]")) return;
+    const title = [...document.querySelectorAll("div")].find((one) => !one.childElementCount && one.textContent === "spherloc");
+    if (!title) return;
+    folded = true;
+    title.click();
+  }
+
+  function look() {
+    foldSettings();
+    const wanted = (projector || narrow()) && document.querySelector(".step-words") && !document.querySelector(".introduction");
+    document.body.classList.toggle("narrow", narrow());
+    if (!wanted) {
+      bar?.remove();
+      bar = null;
+    } else {
+      if (!bar) build();
+      fill();
+      place();
+    }
+    const width = projector ? innerWidth : 0;
+    if (width !== toldWidth && document.querySelector("[data-ready]")) {
+      toldWidth = width;
+      tell(`projector:${width}`);
+    }
+  }
+
+  setInterval(look, EVERY_MS);
+  addEventListener("keydown", (event) => {
+    const writing = event.target instanceof Element && event.target.closest("input,textarea,select,[contenteditable=true]");
+    if (writing || event.ctrlKey || event.metaKey || event.altKey || event.key.toLowerCase() !== "l") return;
+    event.preventDefault();
+    toggle();
+  }, true);
+  addEventListener("click", (event) => {
+    if (event.target instanceof Element && event.target.closest(".projector-toggle")) toggle();
+  }, true);
+})();
