@@ -7,13 +7,14 @@ import subprocess
 import sys
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
 from spherloc.datasets import bundled_scenes, load_scene
-from tests.installed import python, spherloc_each
+from tests.installed import SEVERAL, python
 from tests.waiting import LIMIT_S
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "extending.md"
@@ -87,28 +88,35 @@ def commands(page: str) -> list[list[str]]:
     return [line[1:] for line in words]
 
 
-def test_the_packages_keep_the_contracts_and_the_layer_draws(place: Path) -> None:
+@pytest.fixture(scope="module")
+def told(place: Path) -> tuple[list[Any], list[Any]]:
+    """What the script printed of the layer, and of each command its words, exit code, output and errors."""
+    asked = commands(PAGE.read_text())
+    done = python(place, CHECKS + PAINT + SEVERAL, json.dumps(asked))
+    assert done.returncode == 0, done.stderr
+    painted, found = map(json.loads, done.stdout.splitlines())
+    return painted, [(words, *rest) for words, rest in zip(asked, found, strict=True)]
+
+
+def test_the_packages_keep_the_contracts_and_the_layer_draws(told: tuple[list[Any], list[Any]]) -> None:
     """What the layer gives is what the page's painter gets."""
-    told = python(place, CHECKS + PAINT)
-    assert told.returncode == 0, told.stderr
-    stage, caption, charts, pink = json.loads(told.stdout)
+    stage, caption, charts, pink = told[0]
     assert stage == "Guesses" and re.match(r"Of 300 guesses the one by the matches \d+ and \d+ explains most", caption)
     assert charts == ["guess"] and pink == 2
 
 
-def test_the_commands_of_the_page_work(place: Path) -> None:
+def test_the_commands_of_the_page_work(place: Path, told: tuple[list[Any], list[Any]]) -> None:
     """The last recording is one with the layer, the last command the list of what is installed."""
-    asked = commands(PAGE.read_text())
-    assert {words[0] for words in asked} == {"run", "scenes", "plugins"}
-    found = spherloc_each(place, asked)
+    assert {words[0] for words, *_ in told[1]} == {"run", "scenes", "plugins"}
     recordings = []
-    for done in found:
-        assert done.returncode == 0, done
-        if done.args[0] == "run":
-            assert "correspondences are inliers" in done.stdout and "doubtful" not in done.stdout
-            recordings += re.findall(r"recorded: (.*)", done.stdout)
-    assert "Matches in a file of numpy" in next(done for done in found if done.args[0] == "scenes").stdout
-    listed = found[-1].stdout
+    for words, code, output, errors in told[1]:
+        assert code == 0, (words, errors)
+        if words[0] == "run":
+            assert "correspondences are inliers" in output and "doubtful" not in output
+            recordings += re.findall(r"recorded: (.*)", output)
+        elif words[0] == "scenes":
+            assert "Matches in a file of numpy" in output and 'matches = "matches.npz"' in output
+    listed = told[1][-1][2]
     assert listed.count(": usable; ") == len(PACKAGES) and "cannot be used" not in listed
     assert "guess: usable; guess-layer 1.0, guess_layer:GUESSES" in listed
     assert drawn(place / recordings[-1]) and not drawn(place / recordings[0])

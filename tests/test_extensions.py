@@ -1,6 +1,7 @@
 """Packages of others that are broken in every way there is: each costs itself only, and is named in one sentence."""
 
 import json
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -369,8 +370,9 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_commands_go_on(place: Path) -> None:
-    """Each was a traceback, or the end of all, before anything was solved."""
+@pytest.fixture(scope="module")
+def done(place: Path) -> list[subprocess.CompletedProcess[str]]:
+    """All commands, in one process."""
     run = ["run", "tiny.toml", "--no-record", "--estimator"]
     wanted = [
         ["scenes"],
@@ -383,7 +385,13 @@ def test_commands_go_on(place: Path) -> None:
         ["sweep", "tiny.toml", *["--values", "0.2", "--runs", "2", "--workers", "1", "--no-record", "--out", "a.csv"]],
     ]
     wanted[-1] += ["--estimator", "mc", "--estimator", "refusing"]
-    scenes, several, quitting, shapeless, sizeless, refuse, zebra, sweep = spherloc_each(place, wanted)
+    wanted += [["plugins", "--json"], ["plugins"]]
+    return spherloc_each(place, wanted)
+
+
+def test_commands_go_on(place: Path, done: list[subprocess.CompletedProcess[str]]) -> None:
+    """Each was a traceback, or the end of all, before anything was solved."""
+    scenes, several, quitting, shapeless, sizeless, refuse, zebra, sweep = done[:-2]
 
     assert scenes.returncode == 0 and scenes.stderr == ""
     lines = {line.split()[0]: line for line in scenes.stdout.splitlines() if line.strip()}
@@ -410,7 +418,7 @@ def test_commands_go_on(place: Path) -> None:
     record = json.loads(several.stdout)
     assert record["estimator"] == "odd" and Path(place / record["recording"]).is_file()
 
-    for done, words in (
+    for ended, words in (
         (quitting, f"the estimator 'quitting' {ODD} cannot be imported (SystemExit: 7)"),
         (
             shapeless,
@@ -425,8 +433,8 @@ def test_commands_go_on(place: Path) -> None:
         (refuse, f"the calibration reader 'text' {ODD} gave '# refuse\\n\\x00', which is no camera"),
         (refuse, f"the calibration reader 'gone' {ODD} cannot be imported"),
     ):
-        assert done.returncode == 2 and done.stdout == "" and words in done.stderr, done
-        assert all(line.isprintable() for line in done.stderr.splitlines())
+        assert ended.returncode == 2 and ended.stdout == "" and words in ended.stderr, ended
+        assert all(line.isprintable() for line in ended.stderr.splitlines())
     assert refuse.stderr.count("\n") == 1 and quitting.stderr.count("\n") == 1
     assert zebra.returncode == 0 and "success" in zebra.stdout and zebra.stderr == ""
 
@@ -440,8 +448,8 @@ def test_commands_go_on(place: Path) -> None:
     assert "refusing at outlier rate 0.2, seed " in sweep.stderr
 
 
-def test_the_list_says_what_cannot_be_used(place: Path) -> None:
-    as_json, as_text = spherloc_each(place, [["plugins", "--json"], ["plugins"]])
+def test_the_list_says_what_cannot_be_used(done: list[subprocess.CompletedProcess[str]]) -> None:
+    as_json, as_text = done[-2:]
     assert as_json.returncode == as_text.returncode == 1 and as_json.stderr == as_text.stderr == ""
     found = [json.loads(line) for line in as_json.stdout.splitlines()]
     assert len(found) == sum(map(len, POINTS.values())) + 1
