@@ -1,12 +1,13 @@
-"""Finds camera models, estimators and dataset loaders by entry point: a new kind is one file and one line.
+"""Finds cameras, calibration readers, solvers, estimators, dataset loaders and layers by entry point.
 
-What another package registers is an extension. One that cannot be imported or fails costs itself only: whoever asks for
-it gets one sentence that names it.
+A new kind is one file and one line. What another package registers is an extension (docs/extending.md). One that cannot
+be imported or fails costs itself only: whoever asks for it gets one sentence that names it.
 """
 
 import importlib
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
@@ -15,12 +16,50 @@ from spherloc.errors import InputError, SpherlocError, reason, shorten, show
 
 OWN = "spherloc"
 """The distribution whose entry points are no extensions."""
+KINDS = {
+    "cameras": "camera",
+    "calibrations": "calibration reader",
+    "solvers": "solver",
+    "estimators": "estimator",
+    "datasets": "dataset",
+    "layers": "layer",
+}
+"""What there is to register, the last part of the name of its group of entry points, and what a sentence calls one."""
+RANSAC = "ransac-"
+"""A solver "p6" is the estimator "ransac-p6" too, unless there is an estimator of that name."""
+_AROUND_SOLVER = EntryPoint("around", "spherloc.estimators.ransac_solver:around", "spherloc")
+"""Makes that estimator; imported when one is asked for, since it stands on a floor above."""
+
+
+@dataclass(frozen=True)
+class Registered:
+    """One entry point."""
+
+    kind: str
+    """A key of ``KINDS``."""
+    name: str
+    package: str
+    """Its distribution."""
+    version: str
+    """Of the distribution; empty if that states none."""
+    target: str
+    """Where it points, "module:object"."""
+    clash: str = ""
+    """Why another one is used in its place, as a sentence; empty if it is used."""
+
+    @property
+    def is_own(self) -> bool:
+        """Whether it is spherloc's own."""
+        return self.package == OWN
 
 
 @cache
 def names(kind: str) -> tuple[str, ...]:
-    """Names registered for ``kind`` ("cameras", "estimators", "datasets"), by alphabet; nothing is imported."""
-    return tuple(sorted({point.name for point in entry_points(group=f"spherloc.{kind}")}))
+    """Names registered for ``kind``, a key of ``KINDS``, by alphabet; nothing is imported."""
+    found = {point.name for point in entry_points(group=_group(kind))}
+    if kind == "estimators":
+        found |= {RANSAC + name for name in names("solvers")}
+    return tuple(sorted(found))
 
 
 @cache
@@ -31,7 +70,9 @@ def lookup(kind: str, name: str) -> Any:
     """
     point = _point(kind, name)
     if point is None:
-        raise InputError(f"unknown {kind[:-1]} {show(name)}: choose one of {', '.join(map(shorten, names(kind)))}.")
+        raise InputError(f"unknown {KINDS[kind]} {show(name)}: choose one of {', '.join(map(shorten, names(kind)))}.")
+    if point.group != _group(kind):
+        return _AROUND_SOLVER.load()(name, point.name)
     try:
         return point.load()
     except (Exception, SystemExit) as error:  # whatever the code of others does when it is imported
@@ -57,8 +98,26 @@ def own_module(kind: str, name: str) -> str:
 
 def title(kind: str, name: str) -> str:
     """What a sentence calls it, with the extension that it comes from."""
-    extension = extension_of(kind, name)
-    return f"the {kind[:-1]} {show(name)}" + (f" of the extension {extension}" if extension else "")
+    return _titled(kind, name, extension_of(kind, name))
+
+
+def registered(kind: str, taken: Collection[str] = ()) -> tuple[Registered, ...]:
+    """Every entry point of ``kind`` by name, with those in whose place another one is used; nothing is imported.
+
+    ``taken`` are names that spherloc has without an entry point.
+    """
+    points = sorted(entry_points(group=_group(kind)), key=lambda point: (point.name, *_rank(point)))
+    return tuple(
+        Registered(
+            kind,
+            point.name,
+            _distribution(point) or point.value,
+            "" if point.dist is None else str(point.dist.version or ""),
+            point.value,
+            _clash(kind, point, taken),
+        )
+        for point in points
+    )
 
 
 @contextmanager
@@ -79,9 +138,46 @@ def guarded(kind: str, name: str, where: str = "") -> Iterator[None]:
         raise InputError(f"{what_failed} failed ({what}); tell its authors, or use another one.") from error
 
 
+def _titled(kind: str, name: str, extension: str) -> str:
+    return f"the {KINDS[kind]} {show(name)}" + (f" of the extension {extension}" if extension else "")
+
+
+def _clash(kind: str, point: EntryPoint, taken: Collection[str]) -> str:
+    """Why this one is not used, as a sentence; empty if it is."""
+    mine = _titled(kind, point.name, shorten(_distribution(point) or point.value))
+    if _is_own(point):
+        return ""
+    if point.name in taken:
+        return f"{mine} is not used, since spherloc has one of that name; rename it."
+    used = _point(kind, point.name)
+    if used is not None and _distribution(used) != _distribution(point):
+        return f"{mine} is not used, since {_whose(used)} has one of that name; rename it."
+    above = _point("estimators", RANSAC + point.name) if kind == "solvers" else None
+    if above is not None and above.group == _group("estimators"):
+        return f"{mine} is not used, since {_whose(above)} has an estimator {show(above.name)}; rename it."
+    return ""
+
+
+def _whose(point: EntryPoint) -> str:
+    return OWN if _is_own(point) else f"the extension {shorten(_distribution(point) or point.value)}"
+
+
+def _group(kind: str) -> str:
+    return f"spherloc.{kind}"
+
+
+@cache
 def _point(kind: str, name: str) -> EntryPoint | None:
-    found = sorted(entry_points(group=f"spherloc.{kind}", name=name), key=_is_own, reverse=True)
-    return found[0] if found else None
+    """The entry point that is used; of an estimator maybe that of its solver."""
+    found = sorted(entry_points(group=_group(kind), name=name), key=_rank)
+    if found or kind != "estimators" or not name.startswith(RANSAC):
+        return found[0] if found else None
+    return _point("solvers", name.removeprefix(RANSAC))
+
+
+def _rank(point: EntryPoint) -> tuple[bool, str]:
+    """Of several with one name the lowest is used."""
+    return not _is_own(point), _distribution(point)
 
 
 def _is_own(point: EntryPoint) -> bool:
@@ -89,7 +185,7 @@ def _is_own(point: EntryPoint) -> bool:
 
 
 def _distribution(point: EntryPoint) -> str:
-    return "" if point.dist is None else point.dist.name
+    return "" if point.dist is None else str(point.dist.name or "")
 
 
 def require(module: str, extra: str, purpose: str) -> Any:

@@ -308,13 +308,39 @@ def scenes(kind: Positional[str | None] = None, /) -> int:
     return 0
 
 
+@app.command
+def plugins(json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False) -> int:
+    """List what other packages add to spherloc, and what of it cannot be used.
+
+    These are camera models, readers of calibration files, solvers, estimators, kinds of scene files and layers, which
+    packages register by entry points; docs/extending.md has an example of each. Estimators and solvers are tried on a
+    tiny problem. Ends with 0, or with 1 if something cannot be used; everything else works without it.
+
+    For example:
+
+    spherloc plugins
+
+    spherloc plugins --json
+
+    Args:
+        json: Print one JSON object an extension, on one line, and nothing of what spherloc has itself.
+    """
+    from spherloc_viz.plugins import extensions, plugins_json, plugins_text
+    from spherloc_viz.progress import say
+
+    found = extensions(say)
+    if text := plugins_json(found) if json else plugins_text(found):
+        print(text)
+    return 1 if any(plugin.problem for plugin in found) else 0
+
+
 def main() -> None:
     """Entry point: every error that a user can cause is one line on stderr and exit code 2."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # names that are no UTF-8, or a terminal that knows ASCII only
             stream.reconfigure(errors="backslashreplace")
     try:
-        refuse_repeated(sys.argv[1:], (run, localize, sweep, play, scenes, *_OTHERS))
+        refuse_repeated(sys.argv[1:], (run, localize, sweep, play, scenes, plugins, *_OTHERS))
         code: Any = app.cli(
             prog="spherloc",
             description="See why visual localization with fisheye and 360-degree cameras succeeds or fails.",

@@ -94,17 +94,13 @@ def usable_estimators() -> tuple[str, ...]:
     return tuple(name for name in registry.names("estimators") if not _why_unusable(name))
 
 
-def unusable_estimators() -> tuple[str, ...]:
-    """A sentence about every extension that ``usable_estimators`` leaves out."""
-    return tuple(filter(None, map(_why_unusable, registry.names("estimators"))))
-
-
 @cache
 def _why_unusable(name: str) -> str:
     try:
         option_fields(options_type(name))
     except InputError as error:
-        return str(error) if show(name) in str(error) else f"{registry.title('estimators', name)} {error}"
+        named = registry.extension_of("estimators", name) in str(error)
+        return str(error) if named else f"{registry.title('estimators', name)} {error}"
     return ""
 
 

@@ -73,7 +73,7 @@ def _work(
     keep = None if recorded is None else recorded.keep(scheduler is not None)
     complain = say if recorded is None else recorded.complain
     with progress(left, "runs") as advance:
-        for count, row in enumerate(run_sweep(plan, log.done, workers, scheduler, keep=keep, complain=complain)):
+        for count, row in enumerate(run_sweep(plan, log.done, workers, scheduler, None, keep, complain, say)):
             log.append(row)
             advance("")
             if recorded is not None and count % PRUNE_EVERY == 0:

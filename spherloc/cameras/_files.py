@@ -25,6 +25,10 @@ KNOWN = (
 )
 
 
+class UnrecognisedError(CalibrationError):
+    """The file is of no kind that spherloc itself reads; an extension may know it."""
+
+
 class _Loader(yaml.SafeLoader):
     """``yaml.safe_load`` without merge keys, through which a small file can take up all memory."""
 
@@ -43,7 +47,7 @@ def read_text(path: Path) -> str:
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise CalibrationError(f"byte {error.start} is not UTF-8 text: {KNOWN}.") from None
+        raise UnrecognisedError(f"byte {error.start} is not UTF-8 text: {KNOWN}.") from None
 
 
 def parse_yaml(text: str) -> Any:
@@ -63,10 +67,10 @@ def parse_yaml(text: str) -> Any:
         what = shorten(
             str(getattr(error, "problem", None) or getattr(error, "reason", None) or "syntax error"), MOST_REASON
         )
-        raise CalibrationError(f"{place} is not valid YAML ({what}): correct it.") from None
+        raise UnrecognisedError(f"{place} is not valid YAML ({what}): correct it.") from None
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         # PyYAML lets these through for impossible dates, numbers and tags, and for deep nesting.
-        raise CalibrationError(f"a value is not valid YAML ({reason(error)}): correct it.") from None
+        raise UnrecognisedError(f"a value is not valid YAML ({reason(error)}): correct it.") from None
 
 
 def _refuse_multiplied(root: yaml.Node) -> None:
@@ -94,9 +98,9 @@ def parse_json(text: str) -> Any:
     try:
         return json.loads(text)
     except json.JSONDecodeError as error:
-        raise CalibrationError(f"line {error.lineno} is not valid JSON ({error.msg}): correct it.") from None
+        raise UnrecognisedError(f"line {error.lineno} is not valid JSON ({error.msg}): correct it.") from None
     except (ValueError, RecursionError) as error:
-        raise CalibrationError(f"a value is not valid JSON ({reason(error)}): correct it.") from None
+        raise UnrecognisedError(f"a value is not valid JSON ({reason(error)}): correct it.") from None
 
 
 def table_of(value: Any) -> dict[Any, Any]:

@@ -11,10 +11,11 @@ from typing import Any
 
 from spherloc.cameras import kalibr, tool_files
 from spherloc.cameras._checks import located
-from spherloc.cameras._files import KNOWN, parse_json, parse_yaml, read_text, table_of, value_of
+from spherloc.cameras._files import KNOWN, UnrecognisedError, parse_json, parse_yaml, read_text, table_of, value_of
 from spherloc.cameras.base import Camera
+from spherloc.cameras.extensions import camera_class_of, read_by_extensions, tried
 from spherloc.errors import CalibrationError, InputError, reason, show
-from spherloc.registry import guarded, lookup
+from spherloc.registry import extension_of, guarded
 
 _ONE_CAMERA = {"imgw": tool_files.loc360, "parameter": tool_files.adapter, "Camera": tool_files.stella}
 """YAML files of one camera without a name, by the key at their top that gives them away."""
@@ -30,17 +31,16 @@ def load_camera(path: str | Path, name: str | None = None) -> Camera:
     fisheye-calib-adapter (``parameter``), a Basalt JSON (``value0``) and a TOML with a ``[camera]`` table or with its
     keys at the top. ``name`` picks a camera of a camchain or of a Basalt JSON ("cam1"), by default its first one.
     Principal points that count from the centre of the top-left pixel are moved by +0.5 pixels to this project's
-    convention (that centre is (0.5, 0.5)).
+    convention (that centre is (0.5, 0.5)). A file of no such kind is given to the readers of other packages
+    (docs/extending.md).
 
     Raises ``CalibrationError``, naming the file and the place, for whatever cannot be read as a usable camera.
     """
     with located(str(path)):
-        text = read_text(Path(path))
-        if text.lstrip().startswith("{"):
-            return _from_json(parse_json(text), name)
-        if _looks_like_yaml(text):
-            return _from_yaml(parse_yaml(text), name)
-        return _from_toml(text, name)
+        try:
+            return _own_kind(Path(path), name)
+        except UnrecognisedError as error:
+            return read_by_extensions(Path(path), name, str(error))
 
 
 def camera_from_table(table: Any, where: str) -> Camera:
@@ -52,16 +52,27 @@ def camera_from_table(table: Any, where: str) -> Camera:
         model = value_of(table_of(table), "model")
         try:
             # The sentence about an unknown model quotes it: a short text on one line.
-            camera_class = lookup("cameras", show(model).strip("'"))
+            camera_class = camera_class_of(show(model).strip("'"))
         except InputError as error:
             raise CalibrationError(str(error)) from None
     try:
         with guarded("cameras", model, where):
-            return camera_class.from_dict(table, where)
+            camera = camera_class.from_dict(table, where)
+        return tried(camera, model) if extension_of("cameras", model) else camera
     except CalibrationError:
         raise
     except InputError as error:  # of an extension
         raise CalibrationError(str(error)) from error
+
+
+def _own_kind(path: Path, name: str | None) -> Camera:
+    """The camera of a file that spherloc itself reads; raises ``UnrecognisedError`` for one of another kind."""
+    text = read_text(path)
+    if text.lstrip().startswith("{"):
+        return _from_json(parse_json(text), name)
+    if _looks_like_yaml(text):
+        return _from_yaml(parse_yaml(text), name)
+    return _from_toml(text, name)
 
 
 def _looks_like_yaml(text: str) -> bool:
@@ -74,7 +85,7 @@ def _looks_like_yaml(text: str) -> bool:
 def _from_json(document: Any, name: str | None) -> Camera:
     if isinstance(document, dict) and "value0" in document:
         return tool_files.basalt(document, name)
-    raise CalibrationError(f"this JSON has no 'value0' at its top: {KNOWN}.")
+    raise UnrecognisedError(f"this JSON has no 'value0' at its top: {KNOWN}.")
 
 
 def _from_yaml(document: Any, name: str | None) -> Camera:
@@ -93,20 +104,20 @@ def _from_yaml(document: Any, name: str | None) -> Camera:
         if mark in keys:
             _refuse_name(name)
             return read(document)
-    raise CalibrationError(f"this YAML has neither 'model_type' nor 'cam0', nor any other known key: {KNOWN}.")
+    raise UnrecognisedError(f"this YAML has neither 'model_type' nor 'cam0', nor any other known key: {KNOWN}.")
 
 
 def _from_toml(text: str, name: str | None) -> Camera:
     try:
         document = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
-        raise CalibrationError(f"is neither YAML nor valid TOML ({reason(error)}): {KNOWN}.") from None
+        raise UnrecognisedError(f"is neither YAML nor valid TOML ({reason(error)}): {KNOWN}.") from None
     _refuse_name(name)
     if "camera" in document:
         return camera_from_table(document["camera"], "[camera]")
     if "model" in document:
         return camera_from_table(document, "top level")
-    raise CalibrationError(f"has neither a [camera] table nor a key 'model': {KNOWN}.")
+    raise UnrecognisedError(f"has neither a [camera] table nor a key 'model': {KNOWN}.")
 
 
 def _refuse_name(name: str | None) -> None:

@@ -5,7 +5,7 @@ import importlib
 import inspect
 import math
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -21,6 +21,10 @@ MAX_BYTES = 1_000_000
 _INSTALLED = Path(__file__).resolve().parent / "scenes"
 BUNDLED = _INSTALLED if _INSTALLED.is_dir() else Path(__file__).resolve().parents[2] / "scenes"
 """An installation has them inside of this package, a checkout beside its packages."""
+
+
+_KINDS: dict[type, str] = {}
+"""The kinds of extensions by the classes of the scenes that their loaders gave."""
 
 
 class Scene(Protocol):
@@ -45,11 +49,45 @@ def load_scene(path: Path) -> Scene:
     table = read_table(path)
     kind = text(table, "kind", str(path))
     try:
-        load = registry.lookup("datasets", kind)
+        load = loader_of(kind)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     with registry.guarded("datasets", kind, str(path)):
-        return load(table, path)
+        scene = load(table, path)
+    if registry.extension_of("datasets", kind):
+        if not isinstance(getattr(scene, "name", None), str) or not callable(getattr(scene, "problem", None)):
+            raise InputError(
+                f"{path}: {registry.title('datasets', kind)} gave {show(scene)}, which has no name or no problem(); "
+                "tell its authors."
+            )
+        _KINDS.setdefault(type(scene), kind)
+    return scene
+
+
+def loader_of(kind: str) -> Any:
+    """The loader of a kind of scene files; raises ``InputError`` if there is none or it is no function."""
+    load = registry.lookup("datasets", kind)
+    if not callable(load):
+        raise InputError(f"{registry.title('datasets', kind)} is {show(load)}, no function; tell its authors.")
+    return load
+
+
+def drawn(scene: Scene, problem: Callable[[], Any]) -> Problem:
+    """What ``problem`` gives, a call of the scene's method; of an extension's scene it is looked at.
+
+    Raises ``InputError`` for whatever an extension's scene raises, and if it gives no problem.
+    """
+    kind = _KINDS.get(type(scene))
+    if kind is None or type(scene).__module__.startswith("spherloc."):
+        return problem()
+    with registry.guarded("datasets", kind, scene.name):
+        found = problem()
+    if not isinstance(found, Problem):
+        raise InputError(
+            f"{scene.name}: {registry.title('datasets', kind)} gave {show(found)}, which is no Problem; tell its "
+            "authors."
+        )
+    return found
 
 
 def read_table(path: Path) -> dict[str, Any]:
@@ -180,7 +218,7 @@ def scene_kind(name: str) -> SceneKind:
     if own := registry.own_module("datasets", name):
         return _own_kind(name, own)
     try:
-        loader = registry.lookup("datasets", name)
+        loader = loader_of(name)
         with registry.guarded("datasets", name):
             module = importlib.import_module(loader.__module__)
             return SceneKind(

@@ -12,7 +12,7 @@ from spherloc.cameras.base import Camera
 from spherloc.cameras.calibration import load_camera
 from spherloc.datasets.map_scene import MapScene
 from spherloc.datasets.point_cloud import OUTLIER_KINDS, Lens, OutlierKind
-from spherloc.datasets.scene_file import Scene
+from spherloc.datasets.scene_file import Scene, drawn
 from spherloc.datasets.synthetic import SyntheticScene, TrueCamera
 from spherloc.errors import InputError, show
 from spherloc.geometry import transform
@@ -110,10 +110,10 @@ class Variation:
         """``problem`` with all matches as they are."""
         changed = self.scene(scene)
         if isinstance(changed, MapScene):
-            return changed.problem(seed, query)
+            return drawn(changed, lambda: changed.problem(seed, query))
         if query is not None:
             raise InputError(f"{scene.name}: has no query images to choose from; leave out the query.")
-        return changed.problem(seed)
+        return drawn(changed, lambda: changed.problem(seed))
 
     def scene(self, scene: Scene) -> Scene:
         """The scene with its simulation changed; raises ``InputError`` if it has none."""

@@ -110,8 +110,11 @@ def estimator_of(name: str) -> Any:
 
 def default_options(estimator: str, problem: Problem) -> Any:
     """The estimator's default options, with the problem's own pixel bound if it states one."""
-    given = {} if problem.bound_px is None else {"bound_px": problem.bound_px}
-    return options_type(estimator)(**given)
+    return _default_options(options_type(estimator), problem)
+
+
+def _default_options(kind: type, problem: Problem) -> Any:
+    return kind(**({} if problem.bound_px is None else {"bound_px": problem.bound_px}))
 
 
 def check_positive(options: Any) -> None:
@@ -128,20 +131,15 @@ def check_positive(options: Any) -> None:
             raise InputError(f"option {item.name} is {show(value)}; give a positive number.")
 
 
-def _check_outcome(estimator: str, outcome: Any, count: int) -> None:
-    """Raise ``InputError`` where an extension returns what cannot become a trace of ``count`` usable matches."""
-    if not registry.extension_of("estimators", estimator):
-        return
+def outcome_faults(outcome: Any, count: int) -> list[str]:
+    """What of an outcome has a form that cannot become a trace of ``count`` usable matches, in words."""
     pose = outcome.cam_from_map
     good = {
         "stages": all(isinstance(stage, Stage) and isinstance(stage.kind, str) for stage in outcome.stages),
         "a pose": pose is None or (np.shape(pose) == (3, 4) and bool(np.isfinite(pose).all())),
         "an inlier mask": np.shape(outcome.inlier_mask) == (count,) and np.asarray(outcome.inlier_mask).dtype == bool,
     }
-    wrong = [what for what, fits in good.items() if not fits]
-    if wrong:
-        what = f"{registry.title('estimators', estimator)} returned {' and '.join(wrong)}"
-        raise InputError(f"{what} of a wrong form; tell its authors.")
+    return [what for what, fits in good.items() if not fits]
 
 
 def estimate(
@@ -155,8 +153,14 @@ def estimate(
     Raises ``Cancelled`` if it did, ``InputError`` for an unknown estimator, options of another estimator or beyond
     ``spherloc.ranges``, a seed outside 0 to 2^63 - 1, and for whatever an extension raises.
     """
-    kind = estimator_of(estimator)
-    options = default_options(estimator, problem) if options is None else options
+    return run_estimator(estimator_of(estimator), estimator, problem, options, seed, watch)
+
+
+def run_estimator(
+    kind: Any, estimator: str, problem: Problem, options: Any = None, seed: int = 0, watch: Watch | None = None
+) -> Trace:
+    """``estimate`` by the estimator ``kind``, which need not be registered; ``estimator`` is what it is called."""
+    options = _default_options(kind.Options, problem) if options is None else options
     if not isinstance(options, kind.Options):
         raise InputError(f"estimator {estimator} takes {kind.Options.__name__}, not {type(options).__name__}.")
     check_options(options)
@@ -169,7 +173,10 @@ def estimate(
         clock.watch.check()
         with registry.guarded("estimators", estimator):
             outcome = kind.run(aligned, options, bounds, seed, clock)
-            _check_outcome(estimator, outcome, len(aligned.index))
+            is_extension = bool(registry.extension_of("estimators", estimator))
+            if is_extension and (faults := outcome_faults(outcome, len(aligned.index))):
+                what = f"{registry.title('estimators', estimator)} returned {' and '.join(faults)}"
+                raise InputError(f"{what} of a wrong form; tell its authors.")
         clock.watch.finish()
     except Cancelled as cancelled:
         raise cancelled.with_traceback(None) from None  # whose frames would keep the gigabytes of the run alive

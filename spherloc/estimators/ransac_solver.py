@@ -22,7 +22,7 @@ from spherloc.last_step import conclude
 from spherloc.metrics import ransac_success_probability
 from spherloc.problem import AlignedProblem
 from spherloc.refine import RefinementOptions, residuals_px
-from spherloc.solvers.base import Solver
+from spherloc.solvers.base import Solver, solver_of
 from spherloc.solvers.epnp import Epnp, VirtualPinhole
 from spherloc.solvers.epropnp import EproPnp
 from spherloc.solvers.mlpnp import Mlpnp
@@ -182,6 +182,14 @@ RANSAC_MLPNP = SolverRansac("ransac-mlpnp", Mlpnp())
 RANSAC_EPNP = SolverRansac("ransac-epnp", Epnp(), Epnp())
 RANSAC_ODLT = SolverRansac("ransac-odlt", Epnp(), Odlt())
 RANSAC_EPROPNP = SolverRansac("ransac-epropnp", Epnp(), EproPnp())
+
+
+def around(name: str, solver: str) -> SolverRansac:
+    """The estimator ``name`` around the solver that is registered as ``solver``; it leaves the fit to the refinement.
+
+    Raises ``InputError`` for a solver that cannot be used.
+    """
+    return SolverRansac(name, solver_of(solver))
 
 
 def draw_samples(rng: np.random.Generator, count: int, size: int, draws: int) -> IntArray:

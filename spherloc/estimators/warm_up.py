@@ -32,8 +32,7 @@ def warm_up(announce: Callable[[str], None] | None = None, estimators: Iterable[
         if spherloc.kernels_are_temporary:
             how_often = "at every start, since no folder to keep them can be written (NUMBA_CACHE_DIR names another)"
         announce(f"preparing the solvers, {how_often}: some two minutes …")
-    camera = Equirectangular(width=2048, height=1024)  # sharp enough for every stage to have something to do
-    scene = SyntheticScene("warm-up", camera, correspondences=8, outlier_rate=0.25, noise_px=0.1, seed=0)
+    scene = tiny_scene()
     names = tuple(dict.fromkeys(registry.names("estimators") if cold or estimators is None else estimators))
     for estimator in names:
         try:
@@ -53,3 +52,9 @@ def warm_up(announce: Callable[[str], None] | None = None, estimators: Iterable[
     estimate(murky, "mc-exact", options_type("mc-exact")(bound_px=40.0))
     # With uncertain gravity it searches positions and tilts.
     estimate(uncertain, "mc-exact")
+
+
+def tiny_scene() -> SyntheticScene:
+    """The problem that every estimator has to take: 8 matches, 2 of them wrong."""
+    camera = Equirectangular(width=2048, height=1024)  # sharp enough for every stage to have something to do
+    return SyntheticScene("warm-up", camera, correspondences=8, outlier_rate=0.25, noise_px=0.1, seed=0)

@@ -33,6 +33,7 @@ def run_sweep(
     stop: threading.Event | None = None,
     keep: Keep | None = None,
     complain: Callable[[str], None] = lambda sentence: None,
+    warn: Callable[[str], None] = lambda sentence: None,
 ) -> Iterator[SweepRow]:
     """The rows of a sweep as they come, all points growing evenly; none is done here, all in other processes.
 
@@ -43,12 +44,13 @@ def run_sweep(
     again.
 
     ``keep`` is given every run where it is done, before its row comes here and between the times that are measured;
-    ``complain`` gets a sentence for each that could not be kept.
+    ``complain`` gets a sentence for each that could not be kept. ``warn`` gets one, once for each, about estimators of
+    other packages that fail: such runs count as failures without a pose.
 
     Raises ``InputError`` if a run is impossible or kills its worker every time, or if there are no workers.
     """
     backlog = Backlog(plan, done, OVERHEAD_MS + (0.0 if keep is None else KEEPING_MS))
-    pool = _start_workers(plan, workers, scheduler, keep)
+    pool, warned = _start_workers(plan, workers, scheduler, keep), set[str]()
     try:
         while backlog.left and not (stop is not None and stop.is_set()):
             for _ in range(pool.room()):
@@ -58,6 +60,10 @@ def run_sweep(
                 if task.solved is None:
                     backlog.put_back(task.jobs)
                     continue
+                for label, sentence in task.solved.failures:
+                    if label not in warned:
+                        warned.add(label)
+                        warn(f"{sentence} Such runs count as failures.")
                 for sentence in task.solved.complaints:
                     complain(sentence)
                 yield from backlog.book(task.jobs, task.solved.rows)

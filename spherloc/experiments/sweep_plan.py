@@ -6,6 +6,7 @@ Figs. 5 to 7 are sweeps: errors against pixel noise, success and time against th
 import dataclasses
 import hashlib
 import math
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
@@ -14,13 +15,14 @@ from typing import Any
 
 import numpy as np
 
+from spherloc import registry
 from spherloc.datasets import load_scene, scene_file
 from spherloc.datasets.synthetic import SyntheticScene
 from spherloc.datasets.variation import Variation
 from spherloc.errors import InputError, show
 from spherloc.estimators import default_options, estimate, options_type
 from spherloc.estimators.base import versions
-from spherloc.experiments.sweep_rows import SweepRow, row_of
+from spherloc.experiments.sweep_rows import SweepRow, lost_row, row_of
 from spherloc.files import read_file, reading
 from spherloc.problem import Problem
 from spherloc.trace import Trace
@@ -124,8 +126,15 @@ class SweepPlan:
         number = self.values[value]
         return replace(self.variation, **{self.over: int(number) if self.over == "correspondences" else number})
 
-    def solve(self, jobs: Sequence[Job], done: Callable[[Job, Trace], None] | None = None) -> list[SweepRow]:
+    def solve(
+        self,
+        jobs: Sequence[Job],
+        done: Callable[[Job, Trace], None] | None = None,
+        failed: Callable[[Job, str], None] = lambda job, sentence: None,
+    ) -> list[SweepRow]:
         """Do some of the runs, here and now; ``done`` is given each of them, between the times that are measured.
+
+        A run in which an estimator of another package fails is a failure without a pose; ``failed`` gets the sentence.
 
         Raises ``InputError`` if the scene file or the software is not what the plan was made with, or a run is
         impossible.
@@ -144,9 +153,19 @@ class SweepPlan:
             try:
                 if drawn is None or drawn[0] != (job.run, job.value):
                     drawn = (job.run, job.value), self.variation_at(job.value).problem(scene, seed)
-                trace = estimate(drawn[1], entrant.estimator, entrant.options(drawn[1]), seed)
             except InputError as error:
                 raise InputError(f"{self.place(job)}: {error}") from None
+            start = time.perf_counter()
+            try:
+                trace = estimate(drawn[1], entrant.estimator, entrant.options(drawn[1]), seed)
+            except InputError as error:
+                sentence = f"{self.place(job)}: {error}"
+                if not registry.extension_of("estimators", entrant.estimator):
+                    raise InputError(sentence) from None
+                failed(job, sentence)
+                took_ms = 1e3 * (time.perf_counter() - start)
+                rows.append(lost_row(entrant.label, self.values[job.value], seed, took_ms, len(drawn[1])))
+                continue
             rows.append(row_of(trace, entrant.label, self.values[job.value]))
             if done is not None:
                 done(job, trace)

@@ -74,6 +74,11 @@ def row_of(trace: Trace, label: str, value: float) -> SweepRow:
     )
 
 
+def lost_row(label: str, value: float, seed: int, time_ms: float, correspondences: int) -> SweepRow:
+    """The row of a run that ended without a trace."""
+    return SweepRow(label, value, seed, False, None, None, time_ms, 0, correspondences, 0.0, 0.0, 0.0, None, None, None)
+
+
 def _truth(text: str) -> bool:
     return {"true": True, "false": False}[text]
 

@@ -42,6 +42,8 @@ class Solved:
     """A row a run."""
     complaints: tuple[str, ...] = ()
     """Why runs could not be kept, a sentence each."""
+    failures: tuple[tuple[str, str], ...] = ()
+    """Estimators of other packages that failed, by their labels, and how."""
 
 
 @dataclass(frozen=True)
@@ -80,11 +82,14 @@ class Workers(Protocol):
 def solve(plan: SweepPlan, jobs: Sequence[Job], keep: Keep | None) -> Solved:
     """What a worker does."""
     _warm(frozenset(entrant.estimator for entrant in plan.entrants))
-    if keep is None:
-        return Solved(plan.solve(jobs))
     complaints: list[str] = []
-    rows = plan.solve(jobs, lambda job, trace: complaints.append(keep(plan, job, trace)))
-    return Solved(rows, tuple(filter(None, complaints)))
+    failures: dict[str, str] = {}
+    rows = plan.solve(
+        jobs,
+        None if keep is None else lambda job, trace: complaints.append(keep(plan, job, trace)),
+        lambda job, sentence: failures.update({plan.labels[job.entrant]: sentence}),
+    )
+    return Solved(rows, tuple(filter(None, complaints)), tuple(failures.items()))
 
 
 @cache

@@ -1,16 +1,20 @@
 """What a pose solver offers to RANSAC, which knows nothing else of it."""
 
-from typing import Protocol
+from numbers import Integral
+from typing import Any, Protocol
 
 import numpy as np
 
-from spherloc.errors import ProblemError
+from spherloc import registry
+from spherloc.errors import InputError, ProblemError, show
 from spherloc.geometry import pose
 from spherloc.types import FloatArray
 
 NO_POSES = np.empty((0, 3, 4))
 """What a solver returns that has found none."""
 NO_POSES.setflags(write=False)
+LARGEST_SAMPLE = 100
+"""Correspondences; no minimal solver needs that many, and RANSAC could not find a clean sample of them."""
 
 
 class Solver(Protocol):
@@ -50,3 +54,45 @@ def poses(rotation: FloatArray, translation: FloatArray) -> FloatArray:
     """One pose (1, 3, 4), or none (0, 3, 4) if a number is not finite."""
     solution = pose(rotation, translation)[None]
     return solution if np.isfinite(solution).all() else NO_POSES
+
+
+def solver_of(name: str) -> Solver:
+    """The solver registered as ``name``: an object of its class, which is made without arguments.
+
+    Raises ``InputError`` if there is none of that name, or if it is an extension that is no ``Solver``.
+    """
+    kind = registry.lookup("solvers", name)
+    what = registry.title("solvers", name)
+    if not isinstance(kind, type):
+        raise InputError(f"{what} is {show(kind)}, which is no class; tell its authors.")
+    with registry.guarded("solvers", name):
+        solver: Any = kind()
+    size = getattr(solver, "sample_size", None)
+    good = {
+        "name": isinstance(getattr(solver, "name", None), str),
+        "sample_size": isinstance(size, Integral) and 1 <= int(size) <= LARGEST_SAMPLE,
+        "pinhole": isinstance(getattr(solver, "pinhole", None), bool),
+        "solve()": callable(getattr(solver, "solve", None)),
+    }
+    wrong = [part for part, fits in good.items() if not fits]
+    if wrong:
+        raise InputError(f"{what} has no usable {' and no '.join(wrong)}; tell its authors.")
+    return _Checked(solver, what) if registry.extension_of("solvers", name) else solver
+
+
+class _Checked:
+    """An extension's solver, whose answers are looked at before they are believed."""
+
+    def __init__(self, solver: Solver, what: str) -> None:
+        self.name, self.sample_size, self.pinhole = solver.name, int(solver.sample_size), solver.pinhole
+        self._solve, self._what = solver.solve, what
+
+    def solve(self, bearings: FloatArray, points: FloatArray) -> FloatArray:
+        """See ``Solver.solve``; poses with a number that is not finite are left out.
+
+        Raises ``InputError`` for what are no poses.
+        """
+        found = np.asarray(self._solve(bearings, points), dtype=np.float64)
+        if found.ndim != 3 or found.shape[1:] != (3, 4):
+            raise InputError(f"{self._what} returned an array of shape {found.shape}, not (S, 3, 4); tell its authors.")
+        return found[np.isfinite(found).all(axis=(1, 2))]

@@ -30,7 +30,7 @@ from spherloc_viz.app.web.front_door import FrontDoor
 from spherloc_viz.app.web.guard import open_socket
 from spherloc_viz.app.web.viewer import ViewerRoom, of_index
 from spherloc_viz.app.web.viser_internals import role_header, set_theme, start_viser, stop_viser
-from spherloc_viz.options import unusable_estimators
+from spherloc_viz.plugins import extensions
 from spherloc_viz.recording.index.run_index import RunIndex
 from spherloc_viz.recording.sandbox.examiner import end_examining
 from spherloc_viz.recording.storage.recorder import Recorder
@@ -99,9 +99,9 @@ def _prepare() -> None:
         _say(sentence)
 
     warm_up(tell)
-    for sentence in unusable_estimators():
-        if not any(line.startswith(sentence) for line in told):
-            tell(sentence)
+    for plugin in extensions():
+        if plugin.problem and not any(line.startswith(plugin.problem) for line in told):
+            tell(plugin.problem)
 
 
 def _say(sentence: str) -> None:

@@ -46,6 +46,8 @@ STAGES: dict[type[Stage], tuple[str, Callable[[RunView, Any], list[Plan]]]] = {
     RefinementStage: ("Refinement", refinement.plans),
 }
 """What each kind of stage is called, and what draws it."""
+KINDS = tuple(stage.kind for stage in STAGES)
+"""Of the stages that are spherloc's own."""
 FIRST, LAST = "Matches", "Outcome"
 """Stages that every run has."""
 
@@ -67,7 +69,7 @@ class _Timeline:
             return None
         if draw not in self.graphs:
             try:
-                self.graphs[draw] = draw()
+                self.graphs[draw] = extension.whole_graph(draw())
             except Exception:
                 if not extension.is_extension(self.view):
                     raise
@@ -78,7 +80,7 @@ class _Timeline:
         """The chart that ``draw`` makes, made once; None where that fails on the numbers of an extension."""
         if draw not in self.charts:
             try:
-                self.charts[draw] = draw()
+                self.charts[draw] = extension.whole_chart(draw())
             except Exception:
                 if not extension.is_extension(self.view):
                     raise
@@ -105,8 +107,11 @@ def _timeline(trace: Trace) -> _Timeline:
 def _planned(view: RunView) -> _Timeline:
     parts = [(FIRST, start.plans(view))]
     for stage in view.trace.stages:
-        name, plans = STAGES.get(type(stage), (extension.UNKNOWN, extension.unknown))
-        parts.append((name, extension.guarded_plans(view, stage, partial(plans, view, stage))))
+        if type(stage) in STAGES:
+            name, plans = STAGES[type(stage)]
+            parts.append((name, extension.guarded_plans(view, stage, partial(plans, view, stage))))
+        else:
+            parts.append(extension.named_plans(view, stage, KINDS))
     parts.append((LAST, outcome.plans(view)))
     named = [(name, plan) for name, plans in parts for plan in plans]
     stops = tuple(Stop(plan.key, plan.title, name) for name, plan in named)

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from playwright.sync_api import Browser, Locator, Page, expect
 
 from spherloc_viz.app.stage.views import START
+from tests.installed import with_packages
 from tests.needs import BROWSERS, NEEDS
 
 SCENE = """
@@ -99,7 +100,7 @@ def served(*words: str | Path, packages: Path | None = None) -> Iterator[tuple[s
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        env=os.environ | ({"PYTHONPATH": str(packages)} if packages else {}),
+        env=with_packages(packages) if packages else None,
     )
     assert server.stdout is not None
     # Its first start on a machine compiles the solvers, which is no test's time.

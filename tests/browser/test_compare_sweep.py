@@ -23,6 +23,7 @@ from spherloc.metrics import evaluate
 from spherloc.problem import Problem
 from spherloc_viz.app.catalog import Catalog, SceneRequest
 from spherloc_viz.layers.comparison import Entry, comparison_table
+from tests.installed import install
 
 RANSAC = "ransac-2p (two points)"
 COMPARED = ("mc-exact", "mc", "ransac-2p")
@@ -72,11 +73,8 @@ def server(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tu
     It has an estimator more, of an extension.
     """
     packages = tmp_path_factory.mktemp("packages")
-    (packages / "patient_pack.py").write_text(PATIENT)
-    information = packages / "patient_pack-1.0.dist-info"
-    information.mkdir()
-    (information / "METADATA").write_text("Metadata-Version: 2.1\nName: patient-pack\nVersion: 1.0\n")
-    (information / "entry_points.txt").write_text("[spherloc.estimators]\npatient = patient_pack:Patient\n")
+    points = {"spherloc.estimators": {"patient": "patient_pack:Patient"}}
+    install(packages, "patient-pack", points, {"patient_pack.py": PATIENT})
     with served(scene, "--no-record", packages=packages) as (address, process):
         yield address, process.pid
 

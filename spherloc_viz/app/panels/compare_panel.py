@@ -190,7 +190,8 @@ class ComparePanel:
             self._button.label, self._bar.visible, self._status.visible = START, False, False
 
     def _compare(self, stop: threading.Event) -> None:
-        """Run all and diagnose all, showing each as it comes. Raises ``InputError`` if there is nothing to compare."""
+        """Run all and diagnose all, showing each as it comes. Raises ``InputError`` if there is nothing to
+        compare, and in the end about each estimator that failed."""
         with self._lock:
             trace, names = self._trace, [name for name in self._names if name in self._ticked]
         if trace is None:
@@ -198,6 +199,7 @@ class ComparePanel:
         if not names:
             raise InputError("no estimator is ticked; tick one or more.")
         entries: tuple[Entry, ...] = ()
+        failures: list[str] = []
         for place, name in enumerate(names):
             self._progress(place / len(names), f"{name}, {place + 1} of {len(names)} …")
             watch = self._watch = Watch()
@@ -207,6 +209,9 @@ class ComparePanel:
                 entries = (*entries, Entry(_run(trace, name, watch)))
             except Cancelled:
                 return
+            except InputError as error:  # of one estimator: the others are compared
+                failures.append(str(error))
+                continue
             self._publish(entries)
         for place, entry in enumerate(entries):
             self._progress(place / len(names), f"Diagnosing {entry.trace.estimator} …")
@@ -214,6 +219,8 @@ class ComparePanel:
                 return
             entries = (*entries[:place], replace(entry, diagnosis=diagnose(entry.trace)), *entries[place + 1 :])
             self._publish(entries)
+        if failures:
+            raise InputError(" ".join(failures))
 
     def _progress(self, share: float, words: str) -> None:
         self._bar.value = 100.0 * share

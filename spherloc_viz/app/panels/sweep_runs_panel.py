@@ -100,6 +100,8 @@ class SweepPanel:
         self._results: _Results | None = None
         self._complaints: list[str] = []
         """Why runs of the last sweep could not be recorded."""
+        self._warnings: list[str] = []
+        """Estimators of other packages that failed in it."""
         self._closed = False
         self._button.on_click(self._press)
         self._over.on_update(self._follow)
@@ -184,9 +186,10 @@ class SweepPanel:
         done = {(row.estimator, row.value, row.seed) for row in rows}
         began, before, due = time.monotonic(), len(rows), 0.0
         recorder, self._complaints = self._recorder if self._record.value else None, []
+        self._warnings = []
         keep = None if recorder is None else recorder.sweep_store()
-        workers, complain = int(self._workers.value), self._complaints.append
-        for row in run_sweep(plan, done, workers, stop=stop, keep=keep, complain=complain):
+        workers, complain, warn = int(self._workers.value), self._complaints.append, self._warnings.append
+        for row in run_sweep(plan, done, workers, None, stop, keep, complain, warn):
             rows.append(row)
             if recorder is not None and len(rows) % ROOM_EVERY == 0:
                 recorder.make_room()
@@ -206,6 +209,7 @@ class SweepPanel:
     def _outcome(self, plan: SweepPlan) -> str:
         done, lost = 0 if self._results is None else len(self._results.rows), self._complaints
         said = f" {len(lost):,} could not be recorded, the first since: {lost[0]}" if lost else ""
+        said = " ".join([said, *self._warnings])
         if done == plan.rows:
             return f"{done:,} runs on {plan.runs} problems at each value, from seed {plan.first_seed} on.{said}"
         return f"Stopped at {done:,} of {plan.rows:,} runs; {START} goes on while nothing is changed.{said}"

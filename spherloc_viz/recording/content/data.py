@@ -48,7 +48,8 @@ Row = dict[str, Any]
 def data_chunk(trace: Trace, origin: Origin, diagnosis: Diagnosis, full: bool) -> Chunk:
     """A static chunk with the problem, the result, where it came from, what is wrong with it, and every stage.
 
-    Of a stage it is the small arrays or, with ``full``, all of them.
+    Of a stage it is the small arrays or, with ``full``, all of them; of an extension's stage only arrays of numbers and
+    what JSON can hold.
     """
     rows = {
         "problem": _problem_row(trace.problem),
@@ -58,9 +59,23 @@ def data_chunk(trace: Trace, origin: Origin, diagnosis: Diagnosis, full: bool) -
     }
     for stage in trace.stages:
         row = {item.name: getattr(stage, item.name) for item in fields(stage)}
-        kept = {name: value for name, value in row.items() if full or getattr(value, "nbytes", 0) <= MAX_ARRAY_BYTES}
+        kept = {
+            name: value
+            for name, value in row.items()
+            if (full or getattr(value, "nbytes", 0) <= MAX_ARRAY_BYTES) and _can_be_written(value)
+        }
         rows[f"stages/{stage.kind}"] = kept
     return _chunk(rows)
+
+
+def _can_be_written(value: Any) -> bool:
+    if isinstance(value, np.ndarray):
+        return value.dtype.kind in "biuf"
+    try:
+        json.dumps(plain(value, str))
+    except (TypeError, ValueError, RecursionError):
+        return False
+    return True
 
 
 def scene_text(path: str | None) -> str | None:
