@@ -1,7 +1,7 @@
 """Writes what the documentation takes from the program itself: ``python -m scripts.documentation``.
 
-These are the page of all commands, from the help that they print, and the picture of the rooms and floors, from the test
-that keeps them. A test compares both with what is in docs/.
+These are the page of all commands, from the help that they print, and the picture of the rooms and floors, from the
+test that keeps them. A test compares both with what is in docs/.
 """
 
 import contextlib
@@ -19,8 +19,8 @@ HOUSE = ROOT / "docs" / "pictures" / "floors.svg"
 WIDTH = "100"
 INTRODUCTION = """# Commands
 
-What every command takes, as `spherloc COMMAND --help` prints it. `python -m scripts.documentation` writes this page, and a
-test compares it with the program.
+What every command takes, as `spherloc COMMAND --help` prints it. `python -m scripts.documentation` writes this page,
+and a test compares it with the program.
 
 Every command ends with 2 and one sentence if an input cannot be used, and with 130 after Ctrl-C.
 """
@@ -58,7 +58,9 @@ def _section(command: str) -> str:
     examples = [paragraph for paragraph in paragraphs if paragraph.startswith("spherloc ")]
     parts += [paragraph for paragraph in paragraphs if paragraph not in [*examples, "For example:"]]
     if examples:
-        parts.append("For example:\n\n```sh\n" + "\n".join(example.replace("\n", " ") for example in examples) + "\n```")
+        parts.append(
+            "For example:\n\n```sh\n" + "\n".join(example.replace("\n", " ") for example in examples) + "\n```"
+        )
     lines = [line.rstrip() for line in (box + options).splitlines()]
     return "\n\n".join([*parts, "```text\n" + "\n".join(lines) + "\n```"]) + "\n"
 
@@ -73,7 +75,9 @@ def house() -> str:
     heights = [-(-len(floor) // COLUMNS) for floor in FLOORS]
     height = TOP + sum(count * (ROW + GAP) + 2 * GAP for count in heights) + 58
     width = LEFT + COLUMNS * (ROOM_W + GAP) + 20
-    drawing = Drawing(width, height, "The rooms of spherloc by floor; a file imports from its own floor and those below")
+    drawing = Drawing(
+        width, height, "The rooms of spherloc by floor; a file imports from its own floor and those below"
+    )
     drawing.text(20, 32, "a file imports from its own floor and from those below", size=15)
     y = TOP
     for number in reversed(range(len(FLOORS))):

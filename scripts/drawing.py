@@ -79,7 +79,14 @@ class Drawing:
         )
 
     def text(
-        self, x: float, y: float, words: str, size: float = 14, color: str = INK, anchor: str = "start", weight: str = ""
+        self,
+        x: float,
+        y: float,
+        words: str,
+        size: float = 14,
+        color: str = INK,
+        anchor: str = "start",
+        weight: str = "",
     ) -> None:
         """A line of words; ``anchor`` is start, middle or end."""
         bold = f' font-weight="{weight}"' if weight else ""

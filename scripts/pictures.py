@@ -1,6 +1,6 @@
 """Draws the pictures of docs/concepts.md and docs/architecture.md from real runs: ``python -m scripts.pictures``.
 
-All but two come from the bundled scene of an MEI fisheye with 90 % outliers, seed 7, which the page's examples solve too.
+Most come from the bundled scene of an MEI fisheye with 90 % outliers, seed 7, which the page's examples solve too.
 """
 
 from collections.abc import Callable
@@ -113,7 +113,7 @@ def roots() -> Drawing:
     """f over yaw of a pair of right matches: two roots, and the arcs where noise lets f be zero."""
     trace = spherloc.estimate(problem(), "mc")
     stage, aligned = trace.stage(YawStage), trace.problem.aligned
-    assert stage is not None
+    assert stage is not None and trace.problem.truth_inliers is not None
     right = set(np.flatnonzero(trace.problem.truth_inliers))
     place = {int(index): number for number, index in enumerate(aligned.index)}
     width = stage.hi_rad - stage.lo_rad
@@ -173,7 +173,13 @@ def ransac() -> Drawing:
             curve = [at(count, ransac_success_probability(rate, size, int(count))) for count in draws]
             drawing.path(curve, color, 2, dash=dash)
     drawing.text(left, 26, "P = 1 - (1 - w^n)^k over the number of samples k (Eq. 28)", size=15)
-    drawing.text(left, 48, "gold: n = 2; pink: n = 6; solid, dashed, dotted: share of right matches w = 50 %, 20 %, 10 %", 13, FAINT)
+    drawing.text(
+        left,
+        48,
+        "gold: n = 2; pink: n = 6; solid, dashed, dotted: share of right matches w = 50 %, 20 %, 10 %",
+        13,
+        FAINT,
+    )
     drawing.text((left + right) / 2, bottom + 42, "samples k", size=13, color=FAINT, anchor="middle")
     return drawing
 
@@ -234,7 +240,10 @@ def balls() -> Drawing:
     clique = np.zeros(len(stage.pairs), bool)
     clique[stage.clique] = True
     near = 2.2 * float(np.quantile(stage.radii_m[stage.clique], 0.6))
-    for left, span, title in ((0, 14.0, f"all {len(stage.pairs)} balls"), (460, round(near, 1), "the small ones of the clique")):
+    for left, span, title in (
+        (0, 14.0, f"all {len(stage.pairs)} balls"),
+        (460, round(near, 1), "the small ones of the clique"),
+    ):
         middle, scale = np.array([left + 230.0, 215.0]), 300.0 / span
         drawing.text(left + 24, 30, f"{title}, {span:g} m across", size=14)
         drawing.box(left + 60, 60, 340, 310, "#0b0f14", "#3a4352")
