@@ -4,6 +4,7 @@ import contextlib
 import functools
 import importlib
 import io
+import os
 import re
 import shlex
 import subprocess
