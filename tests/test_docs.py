@@ -3,6 +3,7 @@
 import contextlib
 import functools
 import importlib
+import inspect
 import io
 import os
 import re
@@ -10,7 +11,7 @@ import shlex
 import subprocess
 import sys
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,14 +21,21 @@ import yaml
 
 from scripts import documentation
 from spherloc import registry
+from spherloc.metrics import SUCCESS_DEG, SUCCESS_M
 from spherloc_viz import cli, recording_commands
+from spherloc_viz.app.catalog import Catalog
 from spherloc_viz.app.glossary import TERMS
+from spherloc_viz.app.session import DIAGNOSE_AFTER_S, QUIET_S
+from spherloc_viz.gallery import gallery_cases
 from tests.needs import needs
 from tests.waiting import LIMIT_S
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *sorted(DOCS.rglob("*.md"))]
+PAGES = [
+    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "benchmarks/README.md")),
+    *sorted(DOCS.rglob("*.md")),
+]
 OWN_TESTS = {"extending.md"}
 """A page whose examples are whole packages, which its own tests build and run."""
 IDS = [str(page.relative_to(ROOT)) for page in PAGES]
@@ -139,12 +147,12 @@ def command_lines(page: Path) -> Iterator[tuple[list[str], bool]]:
         yield shlex.split(line.replace("\n", " ")), False
 
 
-def command(name: str):
+def command(name: str) -> Callable[..., object] | None:
     """The function of a command; None if there is no such command."""
     if name not in documentation.commands():
         return None
     name = name.replace("-", "_")
-    return getattr(cli, name, None) or getattr(recording_commands, name)
+    return next(getattr(module, name) for module in (cli, recording_commands) if hasattr(module, name))
 
 
 @functools.cache
@@ -249,6 +257,21 @@ def test_every_estimator_is_in_the_table_of_the_start() -> None:
     named = set(re.findall(r"`([a-z0-9-]+)`", text[text.index("## Which estimator?") :]))
     own = {name for name in registry.names("estimators") if not registry.extension_of("estimators", name)}
     assert own <= named
+
+
+def test_numbers_in_words_are_those_of_the_code() -> None:
+    """Those that no example prints."""
+    text = {page.name: page.read_text("utf-8") for page in PAGES}
+    assert f"nothing changed for {QUIET_S:g} s" in text["architecture.md"]
+    assert f"stood still for {DIAGNOSE_AFTER_S:g} s" in text["architecture.md"]
+    kept = inspect.signature(cli.play).parameters["keep_gigabytes"].default
+    assert f"more than {kept:g} GB" in text["CHANGELOG.md"]
+    assert abs(len(gallery_cases()) - 24) <= 2, "two dozen, says docs/concepts.md"
+    assert f"less than {SUCCESS_DEG:g} degree and less than {SUCCESS_M:g} m" in text["glossary.md"]
+    first = next(iter(Catalog(None).scenes.values())).problem(seed=0)
+    assert first.truth_inliers is not None
+    wrong = len(first) - first.truth_inliers.sum()
+    assert f"with {len(first)} matches,\nof which {wrong} are wrong" in text["start.md"]
 
 
 def test_every_page_has_its_place_in_the_site() -> None:
