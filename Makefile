@@ -9,7 +9,7 @@ export PYTHON
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help play test test-python lint bench screenshots clean
+.PHONY: help play test test-python lint bench docs screenshots clean
 
 help: ## Show this
 	@printf 'spherloc: see why visual localization works, and why it fails\n\n'
@@ -43,6 +43,11 @@ lint: ## Check style, format and types
 bench: ## Measure spherloc beside its peers, some 25 minutes; a stopped run goes on
 	@scripts/setup.sh bench
 	@exec $(BIN)/python -m benchmarks.run $(ARGS)
+
+docs: ## Build the documentation into build/docs, to be read without a network
+	@scripts/setup.sh docs
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs -q build --strict $(ARGS)
+	@printf 'spherloc: the documentation is in %s\n' build/docs/index.html
 
 screenshots: ## Photograph every view, dark and light, into build/screenshots and docs
 	@SPHERLOC_CHROMIUM="$$(scripts/setup.sh test)" && export SPHERLOC_CHROMIUM && \

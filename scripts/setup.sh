@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Installs what a make target needs into .venv and, if the system lacks it, from Debian; a repeated call is quick.
 #
-#   scripts/setup.sh play|test|lint|bench     "test" prints the path of the browser for the tests on stdout
+#   scripts/setup.sh play|test|lint|bench|docs     "test" prints the path of the browser for the tests on stdout
 #
 # It works, or it ends with one sentence that says what to do.  Python is $PYTHON, else python3.
 set -euo pipefail
@@ -9,11 +9,12 @@ cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
 target=${1:-}
 case $target in
-  play) extras='' enough=(play test lint bench) ;; # any of these targets' packages will do
+  play) extras='' enough=(play test lint bench docs) ;; # any of these targets' packages will do
   test) extras='[test]' enough=(test lint) ;;
   lint) extras='[test,lint]' enough=(lint) ;;
   bench) extras='[bench]' enough=(bench) ;;
-  *) echo "usage: scripts/setup.sh play|test|lint|bench" >&2 && exit 2 ;;
+  docs) extras='[docs]' enough=(docs) ;;
+  *) echo "usage: scripts/setup.sh play|test|lint|bench|docs" >&2 && exit 2 ;;
 esac
 python=${PYTHON:-python3}
 venv=.venv/bin/python
@@ -143,7 +144,7 @@ install_python() {
   say "installing Python packages into .venv (the first time takes a minute or more)"
   watch "$venv" -m pip install --disable-pip-version-check -e ".$extras" ||
     die "pip could not install the packages, for the reason above; mend that and try again."
-  if [ "$target" != lint ]; then
+  if [[ $target != @(lint|docs) ]]; then
     say "preparing the solvers, once: some two minutes"
     "$venv" -c 'from spherloc.estimators import warm_up; warm_up()' ||
       die "the solvers could not be prepared, for the reason above; mend that and try again."

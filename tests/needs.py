@@ -6,6 +6,7 @@ that skips for another reason fails (see conftest.py), since the start did not t
 
 import ctypes
 import functools
+import importlib.util
 import os
 import resource
 import shutil
@@ -75,6 +76,10 @@ NEEDS = {
     "chromium": Need(
         lambda: bool(os.environ.get("SPHERLOC_CHROMIUM") or any(map(shutil.which, BROWSERS))),
         "no Chromium found: install Debian's chromium or set SPHERLOC_CHROMIUM to the path of one",
+    ),
+    "mkdocs": Need(
+        lambda: all(map(importlib.util.find_spec, ("mkdocs", "material", "mkdocstrings_handlers"))),
+        "the documentation cannot be built: its packages are not installed (make docs installs them)",
     ),
     "vulkan": Need(lambda: vulkan() is not None, "no Vulkan driver, which rerun's viewer needs without a screen"),
     "mount": Need(_mounts, "no file system can be mounted here"),
