@@ -61,7 +61,8 @@ BLIND = """for (const kind of [WebGLRenderingContext, WebGL2RenderingContext])
         if (kind.prototype[call]) kind.prototype[call] = () => undefined;"""
 """Makes the canvas draw nothing. What tests read is in the page and in the scene's nodes, and a frame in software takes
 most of a second, for which every click waits."""
-SELDOM = """const [frame, cancel, frames] = [requestAnimationFrame.bind(window), cancelAnimationFrame.bind(window), new Map()];
+SELDOM = """const frame = requestAnimationFrame.bind(window), cancel = cancelAnimationFrame.bind(window);
+    const frames = new Map();
     window.requestAnimationFrame = done => {
         const id = setTimeout(() => frames.set(id, frame(now => { frames.delete(id); done(now) })), 34);
         return id;
@@ -190,7 +191,8 @@ class Playground:
         try:
             self.page.goto(f"{self._address}/away")
         except Error:  # the server is gone
-            self.page.goto("about:blank")
+            self.page.context.close()
+            return
         for event, listener in self._listeners:
             self.page.remove_listener(event, listener)
         self.page.context.clear_cookies()
