@@ -48,12 +48,12 @@ def test_outputs_that_cannot_be_written(tmp_path: Path, scene_of: Callable[..., 
     started = {
         "closed output": in_shell('"$@" >&-', *brief),
         "all closed": in_shell('"$@" <&- >&- 2>&-', *brief),
-        "full disk": in_shell('"$@" scenes >/dev/full'),
+        "full disk": in_shell('"$@" >/dev/full', *brief),
         "full disk for help": in_shell('"$@" scenes --help >/dev/full'),
         "a reader that goes": in_shell('"$@" | true', *brief),
-        "all goes to a reader that goes": in_shell('"$@" runs /nowhere 2>&1 | true'),
+        "all goes to a reader that goes": in_shell('"$@" 2>&1 | true', "check-proof", "/nowhere"),
         "ASCII, no home": begin("scenes", environment=ascii_only | {"HOME": None, "XDG_CACHE_HOME": None}),
-        "no UTF-8": begin("run", name, "--no-record", cwd=tmp_path),
+        "no UTF-8": begin("check-proof", name, cwd=tmp_path),
         "no UTF-8, ASCII": begin("run", name, "--no-record", cwd=tmp_path, environment=ascii_only),
         "nothing to write into": begin(
             "scenes", environment={"TMPDIR": "/nowhere", "NUMBA_CACHE_DIR": "/proc/nowhere"}
@@ -65,9 +65,10 @@ def test_outputs_that_cannot_be_written(tmp_path: Path, scene_of: Callable[..., 
         assert error.count(b"\n") <= 1, f"{what}: {error.decode()}"
     codes = {what: code for what, (_, _, code) in ended.items()}
     assert codes["closed output"] == codes["all closed"] == codes["ASCII, no home"] == 0
-    assert codes["full disk"] == codes["full disk for help"] == codes["no UTF-8"] == codes["no UTF-8, ASCII"] == 2
+    assert codes["full disk"] == codes["full disk for help"] == codes["no UTF-8, ASCII"] == 2
     assert b"No space left on device" in ended["full disk"][1]
-    assert rb"caf\udce9.toml: no such file" in ended["no UTF-8"][1]
+    assert rb"caf\udce9.toml: no such file" in ended["no UTF-8, ASCII"][1]
+    assert rb"caf\udce9.toml" in ended["no UTF-8"][1] and codes["no UTF-8"] == 1
     assert ended["ASCII, no home"][0].isascii() and b"panorama" in ended["ASCII, no home"][0]
 
 

@@ -19,7 +19,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from playwright.sync_api import Browser, Locator, Page, expect
+from playwright.sync_api import Browser, Error, Locator, Page, expect
 
 from spherloc_viz.app.stage.views import START
 from tests.installed import with_packages
@@ -62,6 +62,15 @@ BLIND = """for (const kind of [WebGLRenderingContext, WebGL2RenderingContext])
         if (kind.prototype[call]) kind.prototype[call] = () => undefined;"""
 """Makes the canvas draw nothing. What tests read is in the page and in the scene's nodes, and a frame in software takes
 most of a second, for which every click waits."""
+SELDOM = """const frame = requestAnimationFrame.bind(window), cancel = cancelAnimationFrame.bind(window);
+    const frames = new Map();
+    window.requestAnimationFrame = done => {
+        const id = setTimeout(() => frames.set(id, frame(now => { frames.delete(id); done(now) })), 34);
+        return id;
+    };
+    window.cancelAnimationFrame = id => { clearTimeout(id); cancel(frames.get(id) ?? 0); frames.delete(id) };"""
+"""Makes the page paint twenty times a second, as on a slow machine, and not sixty times: a page that only stands there
+took a fifth of a processor."""
 ASIDE = """addEventListener("DOMContentLoaded", () => {
     const look = document.createElement("style");
     look.textContent = "[class*=Notifications-root], [class*=Notifications-root] * {pointer-events: none !important}";
@@ -142,6 +151,7 @@ class Playground:
                 context.add_init_script(KNOWN)
             if not drawn:
                 context.add_init_script(BLIND)
+                context.add_init_script(f"{{ {SELDOM} }}")
             self.page = context.new_page()
             self.page.set_default_timeout(PATIENCE_MS)
         self.errors: list[str] = []
@@ -154,6 +164,7 @@ class Playground:
         )
         for event, listener in self._listeners:
             self.page.on(event, listener)
+        self._address = address.partition("/?")[0]
         self.page.goto(address)
         expect(self.value("outcome")).not_to_be_empty()
         if not new:
@@ -171,12 +182,18 @@ class Playground:
             self.hosts.add(url.split("/")[2])
 
     def close(self) -> None:
-        """Leave the page, as closing it does. Another test may go on with the tab: a new one costs twice the time."""
+        """Leave the page, as closing it does. Another test may go on with the tab: a new one costs twice the time.
+
+        It waits at a page that the server does not have, since elsewhere it would lose its process."""
         if self._spare is None or self.page.is_closed():
             self.page.context.close()
             return
         self.page.evaluate("() => { localStorage.clear(); sessionStorage.clear() }")
-        self.page.goto("about:blank")
+        try:
+            self.page.goto(f"{self._address}/away")
+        except Error:  # the server is gone
+            self.page.context.close()
+            return
         for event, listener in self._listeners:
             self.page.remove_listener(event, listener)
         self.page.context.clear_cookies()

@@ -100,16 +100,23 @@ def stage() -> Iterator[Stage]:
     stage.close()
 
 
-@pytest.fixture
-def page(browser: Browser, stage: Stage) -> Iterator[Page]:
+@pytest.fixture(scope="module")
+def only_page(browser: Browser) -> Iterator[Page]:
+    """One for all tests: a new one costs twice the time."""
     context = browser.new_context(viewport=SIZE)  # pyright: ignore[reportArgumentType]
     context.add_init_script(BLIND)
     page = context.new_page()
     page.set_default_timeout(PATIENCE_MS)
-    page.goto(stage.address)
-    expect(page.get_by_text("mark 0", exact=True)).to_be_visible()
     yield page
     context.close()
+
+
+@pytest.fixture
+def page(only_page: Page, stage: Stage) -> Iterator[Page]:
+    only_page.goto(stage.address)
+    expect(only_page.get_by_text("mark 0", exact=True)).to_be_visible()
+    yield only_page
+    only_page.goto("about:blank")
 
 
 def field(page: Page, handle: Any) -> Locator:

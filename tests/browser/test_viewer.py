@@ -8,7 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from playground import PATIENCE_MS, SCENE, served
+from playground import PATIENCE_MS, SCENE
 from playwright.sync_api import Browser, Page, expect
 
 from spherloc.datasets import load_scene
@@ -38,15 +38,14 @@ REACH_OUT = """() => new Promise(done => {
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory: pytest.TempPathFactory, recordings: Path) -> Path:
     """With a run that has labels and a note."""
     scene = tmp_path_factory.mktemp("scene") / "small.toml"
     scene.write_text(SCENE)
-    folder = tmp_path_factory.mktemp("recordings")
     trace = estimate(load_scene(scene).problem(None), "mc")
-    write_recording(trace, folder / "good.rrd")
-    write_review(folder / "good.rrd", ["seam"], "Look at the left edge.")
-    return folder
+    write_recording(trace, recordings / "good.rrd")
+    write_review(recordings / "good.rrd", ["seam"], "Look at the left edge.")
+    return recordings
 
 
 @pytest.fixture(scope="module")
@@ -56,10 +55,9 @@ def row(folder: Path) -> RunRow:
 
 
 @pytest.fixture(scope="module")
-def home(folder: Path) -> Iterator[str]:
-    """Address of a playground that records into the folder."""
-    with served("--recordings", folder) as (address, _):
-        yield address
+def home(folder: Path, address: str) -> str:
+    """Address of the playground that records into the folder."""
+    return address
 
 
 class Tab:

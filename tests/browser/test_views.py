@@ -172,14 +172,9 @@ def test_layers_and_views(tab: Playground, address: str) -> None:
         assert tab.drawn()["sphere/bearings"] == 40
         tab.tick(label, True)
         tab.until(lambda before=before: tab.drawn() == before, f"{label} is back")
-    tab.expect_quiet(address)
 
-
-def test_layers_that_are_switched_at_once_are_as_their_boxes_say(tab: Playground) -> None:
-    """viser sends only the last of several changes within 50 ms; the page must not go on showing what was lost."""
-    tab.unfold("Layers")
+    # viser sends only the last of several changes within 50 ms; the page must not go on showing what was lost.
     shown = {"Map": "map/points", "Rays": "rays", "Cameras": "cameras/estimate"}
-    expect(tab.widget("Map")).to_be_visible()
     boxes = [tab.widget(label).element_handle() for label in shown]
     tab.page.evaluate("boxes => boxes.forEach(box => box.click())", boxes)
     tab.until(lambda: not set(shown.values()) <= tab.drawn().keys(), "a layer is hidden")
@@ -187,28 +182,12 @@ def test_layers_that_are_switched_at_once_are_as_their_boxes_say(tab: Playground
         tab.widget(label).is_checked() == (node in tab.drawn()) for label, node in shown.items()
     )
     tab.until(agree, "each layer is as its box says")
-
-
-def test_widgets_that_change_at_once_show_what_was_solved(tab: Playground, address: str, recordings: Path) -> None:
-    names = ("Noise (px)", "Outliers (%)", "Points")
-    thumbs = [tab.thumb(name).element_handle() for name in names]
-    script = """thumbs => thumbs.forEach(
-        thumb => thumb.dispatchEvent(new KeyboardEvent("keydown", {key: "End", code: "End", bubbles: true})))"""
-    tab.page.evaluate(script, thumbs)
-    tab.until(lambda: tab.instances("/map/points") == 500, "the last of the changes has been heard of")
-    said = tab.page.get_by_text(re.compile(r"Recorded as \S+\.rrd"))
-
-    def recorded_as_shown() -> bool:
-        path = next((recordings / text.split()[-1] for text in said.all_inner_texts()), None)
-        noise, outliers, points = (float(tab.entry(name).input_value()) for name in names)
-        scene = f"synthetic: N {points:g}, outliers {outliers / 100:g}, noise {noise:g} px, seed 3"
-        return path is not None and path.is_file() and read_recording(path).problem.scene == scene
-
-    tab.until(recorded_as_shown, "what is recorded is what the boxes say")
     tab.expect_quiet(address)
 
 
-def test_a_dragged_slider_ends_where_it_was_let_go(tab: Playground, address: str) -> None:
+def test_a_dragged_slider_and_widgets_that_change_at_once_show_what_was_solved(
+    tab: Playground, address: str, recordings: Path
+) -> None:
     thumb = tab.thumb("Points")
     place = lambda: (thumb.bounding_box(), tab.widget("Points").bounding_box())  # noqa: E731
     start, track = tab.still(place, "the slider stands still")
@@ -224,6 +203,22 @@ def test_a_dragged_slider_ends_where_it_was_let_go(tab: Playground, address: str
     tab.until(lambda: tab.instances("/map/points") == shown, "the canvas has as many points")
     expect(tab.entry("Points")).to_have_value(str(shown))
     expect(thumb).to_have_attribute("aria-valuenow", str(shown))
+
+    names = ("Noise (px)", "Outliers (%)", "Points")
+    thumbs = [tab.thumb(name).element_handle() for name in names]
+    script = """thumbs => thumbs.forEach(
+        thumb => thumb.dispatchEvent(new KeyboardEvent("keydown", {key: "End", code: "End", bubbles: true})))"""
+    tab.page.evaluate(script, thumbs)
+    tab.until(lambda: tab.instances("/map/points") == 500, "the last of the changes has been heard of")
+    said = tab.page.get_by_text(re.compile(r"Recorded as \S+\.rrd"))
+
+    def recorded_as_shown() -> bool:
+        path = next((recordings / text.split()[-1] for text in said.all_inner_texts()), None)
+        noise, outliers, points = (float(tab.entry(name).input_value()) for name in names)
+        scene = f"synthetic: N {points:g}, outliers {outliers / 100:g}, noise {noise:g} px, seed 3"
+        return path is not None and path.is_file() and read_recording(path).problem.scene == scene
+
+    tab.until(recorded_as_shown, "what is recorded is what the boxes say")
     tab.expect_quiet(address)
 
 

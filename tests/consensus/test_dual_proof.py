@@ -99,7 +99,7 @@ def test_only_those_asked_for_count(rng):
 def test_what_linear_residuals_neglect_is_bounded(rng):
     """Of one correspondence in regions of all sizes: its true residual is off the linear one by the bound at most."""
     shares = []
-    for _ in range(300):
+    for _ in range(120):
         problem = tight_problem(rng, 4, 0, 3.0, nearest=0.5)
         (c, s, slack), ball = region_around(rng, problem, 10 ** rng.uniform(-1, 0.7))
         matches = matches_of(problem)
@@ -129,7 +129,7 @@ def test_what_linear_residuals_neglect_is_bounded(rng):
             off = np.linalg.norm(at(yaw0 + turn, ball[:3] + shift) - linear, axis=1).max()
             assert off <= np.sqrt(neglected) * (1 + 1e-6) + 1e-6
             shares.append(off / np.sqrt(neglected))
-    assert len(shares) > 500 and max(shares) > 0.5
+    assert len(shares) > 200 and max(shares) > 0.5
 
 
 def test_no_spare_and_no_correspondences_within_reach(rng):

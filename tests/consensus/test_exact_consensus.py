@@ -83,7 +83,7 @@ def check(problem, found):
 @pytest.mark.parametrize("bound_px", [0.5, 3.0, 10.0, 30.0])
 def test_nothing_explains_more_than_the_bound(rng, bound_px, gravity_bound_rad):
     """Residuals on the edge of their bounds, points seen twice, level bearings, near points, only outliers."""
-    proven, missed, trials = 0, 0, 12
+    proven, missed, trials = 0, 0, 8
     for k in range(trials):
         count = int(rng.integers(3, 15))
         outliers = int(rng.integers(0, count + 1)) if k % 4 else count
@@ -101,7 +101,7 @@ def test_nothing_explains_more_than_the_bound(rng, bound_px, gravity_bound_rad):
 @pytest.mark.parametrize("camera", ["mei", "fisheye", "panorama"])
 def test_cameras(rng, scene_of, camera):
     closed = 0
-    for seed in range(8):
+    for seed in range(5):
         tilt = rng.choice([0.0, 0.2])
         rate = rng.choice([0.5, 0.8, 1.0])
         scene = scene_of(camera, correspondences=14, outlier_rate=rate, noise_px=1.0, gravity_error_deg=tilt)
@@ -109,7 +109,7 @@ def test_cameras(rng, scene_of, camera):
         found = search(problem)
         check(problem, found)
         closed += found.bound.max() <= found.supports.max(initial=1)
-    assert closed >= 5
+    assert closed >= 3
 
 
 def test_repeated_structure(rng):
@@ -136,7 +136,7 @@ def test_repeated_structure(rng):
 
 def test_guesses_only_help(rng):
     """The truth or nonsense to start from: the same consensus is proven."""
-    for _ in range(8):
+    for _ in range(4):
         problem = tight_problem(rng, 12, 6, 2.0, share=0.9)
         turn = yaw_rotation(problem.yaw)
         truth = (problem.yaw, -turn @ problem.centre)
@@ -152,7 +152,7 @@ def test_guesses_only_help(rng):
 def test_bounds_hold_when_effort_or_time_run_out(rng):
     """Of a search that stopped early the bounds are wider, never wrong."""
     stopped = 0
-    for _ in range(5):
+    for _ in range(3):
         problem = tight_problem(rng, 30, 24, 20.0)
         full = search(problem)
         for found in (search(problem, effort=1), search(problem, effort=20_000), search(problem, budget_s=1e-9)):
@@ -161,7 +161,7 @@ def test_bounds_hold_when_effort_or_time_run_out(rng):
             stopped += not found.finished
             if not found.finished:
                 assert found.bound.max() > found.supports.max(initial=0), "stopped with nothing left to be done"
-    assert stopped >= 5
+    assert stopped >= 3
 
 
 def test_two_correspondences(rng):

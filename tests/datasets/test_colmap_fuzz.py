@@ -68,7 +68,7 @@ def check_sentence(error, folder):
 
 
 @given(case=damaged())
-@settings(max_examples=600, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=250, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_walks_say_what_is_wrong_and_where(case, tmp_path):
     text, files = case
     folder = write(tmp_path, files)

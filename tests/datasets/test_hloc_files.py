@@ -286,7 +286,7 @@ def sound(tmp_path_factory):
     return [(folder / f"{libver}.h5").read_bytes() for libver in ("latest", "earliest")]
 
 
-@settings(max_examples=400)
+@settings(max_examples=150)
 @given(st.data())
 def test_flipped_and_truncated_hdf5(folder, sound, data):
     """Numbers, nothing or one sentence; in no case gigabytes, a crash or another exception."""

@@ -215,7 +215,7 @@ READERS = {"imu": (read_imu, IMU), "ply": (read_cloud, PLY), "ascii": (read_clou
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # of trimesh
 @pytest.mark.parametrize("kind", READERS)
 @given(data=st.data())
-@settings(max_examples=120)
+@settings(max_examples=60)
 def test_any_bytes_are_read_or_refused(folder, kind, data):
     read, sample = READERS[kind]
     path = write(folder, data.draw(st.one_of(mutations(sample), st.binary(max_size=80))), f"fuzz-{kind}")
