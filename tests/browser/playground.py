@@ -62,15 +62,6 @@ BLIND = """for (const kind of [WebGLRenderingContext, WebGL2RenderingContext])
         if (kind.prototype[call]) kind.prototype[call] = () => undefined;"""
 """Makes the canvas draw nothing. What tests read is in the page and in the scene's nodes, and a frame in software takes
 most of a second, for which every click waits."""
-SELDOM = """const frame = requestAnimationFrame.bind(window), cancel = cancelAnimationFrame.bind(window);
-    const frames = new Map();
-    window.requestAnimationFrame = done => {
-        const id = setTimeout(() => frames.set(id, frame(now => { frames.delete(id); done(now) })), 34);
-        return id;
-    };
-    window.cancelAnimationFrame = id => { clearTimeout(id); cancel(frames.get(id) ?? 0); frames.delete(id) };"""
-"""Makes the page paint twenty times a second, as on a slow machine, and not sixty times: a page that only stands there
-took a fifth of a processor."""
 ASIDE = """addEventListener("DOMContentLoaded", () => {
     const look = document.createElement("style");
     look.textContent = "[class*=Notifications-root], [class*=Notifications-root] * {pointer-events: none !important}";
@@ -151,7 +142,6 @@ class Playground:
                 context.add_init_script(KNOWN)
             if not drawn:
                 context.add_init_script(BLIND)
-                context.add_init_script(f"{{ {SELDOM} }}")
             self.page = context.new_page()
             self.page.set_default_timeout(PATIENCE_MS)
         self.errors: list[str] = []
