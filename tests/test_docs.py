@@ -97,8 +97,6 @@ def test_links_lead_somewhere(page: Path) -> None:
             continue
         name, _, anchor = target.partition("#")
         other = (page.parent / name).resolve() if name else page
-        if other.name in OWN_TESTS and not other.exists():
-            continue  # written beside the package that it is about
         if not other.exists() or (anchor and anchor not in anchors(other)):
             broken.append(target)
     assert not broken
@@ -161,9 +159,7 @@ def flags_of(name: str) -> frozenset[str]:
     return frozenset(re.findall(r"(?<![\w-])--[a-z][a-z-]*", documentation.help_of(name)))
 
 
-@pytest.mark.parametrize(
-    "page", [page for page in PAGES if page.name not in OWN_TESTS and list(command_lines(page))], ids=lambda p: p.name
-)
+@pytest.mark.parametrize("page", [page for page in PAGES if list(command_lines(page))], ids=lambda page: page.name)
 def test_commands_exist(page: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Whole command lines are parsed by the program itself; of those within a sentence, the command and its flags."""
     for words, whole in command_lines(page):
@@ -215,7 +211,7 @@ def test_named_files_exist(page: Path) -> None:
         r"`((?:spherloc|spherloc_viz|tests|scripts|benchmarks|docs|scenes|examples)/[\w./-]+)", prose(page)
     )
     named += [f"{name.replace('.', '/')}.py" for name in re.findall(r"`(?:python -m )?(scripts\.\w+)`", prose(page))]
-    assert not [name for name in named if not (ROOT / name).exists() and Path(name).name not in OWN_TESTS]
+    assert not [name for name in named if not (ROOT / name).exists()]
 
 
 @every_page
@@ -282,7 +278,7 @@ def test_every_page_has_its_place_in_the_site() -> None:
         return [node] if isinstance(node, str) else [leaf for part in parts for leaf in leaves(part)]
 
     pages = {page.relative_to(DOCS).as_posix() for page in DOCS.rglob("*.md")}
-    assert sorted(set(leaves(table["nav"])) - OWN_TESTS) == sorted(pages - OWN_TESTS)
+    assert sorted(leaves(table["nav"])) == sorted(pages)
 
 
 def test_the_citation_is_of_this_version() -> None:
