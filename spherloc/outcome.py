@@ -26,13 +26,13 @@ from spherloc.types import BoolArray, FloatArray
 MOST_NFA = 1e-3
 """Expected number of false alarms (NFA) of the size of the inliers below which they are believed."""
 LEAST_LEAD = 2.0
-"""By how many standard deviations of counting a pose must lead a alternative that stands out from chance itself."""
+"""By how many standard deviations of counting a pose must lead an alternative that stands out from chance itself."""
 LEAST_SDS = 2.0
 """Standard deviations that must lie within the error of a success."""
 TILT_RAD = np.radians(6.0)
 """Gravity errors up to about this are looked for."""
 SAMPLES, CONFIDENCE = 2000, 0.99
-"""Of the search for a alternative among what the pose does not explain."""
+"""Of the search for an alternative among what the pose does not explain."""
 FAR = 3.0
 """A correspondence farther off than so many bounds is not explained by the pose."""
 
@@ -43,7 +43,7 @@ class Outcome(StrEnum):
     LOCALIZED = "localized"
     """The pose is believed."""
     DOUBTFUL = "doubtful"
-    """There is a pose, but chance, a alternative, or what its inliers leave open speaks against it."""
+    """There is a pose, but chance, an alternative, or what its inliers leave open speaks against it."""
     FAILED = "failed"
     """There is no pose."""
 

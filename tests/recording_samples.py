@@ -67,7 +67,7 @@ def lost_run() -> Trace:
 def exact_run(**changes: Any) -> Trace:
     """A run by hand as "auto" and an exact estimator leave it, with its certificate; ``changes`` are of the stage.
 
-    Its bound peaks where the best pose looks, and there is a alternative.
+    Its bound peaks where the best pose looks, and there is an alternative.
     """
     trace = estimate(scene_problem("mei_outliers_80"), "mc")
     pose, clique = trace.cam_from_map, np.flatnonzero(trace.inlier_mask)
