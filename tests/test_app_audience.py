@@ -23,6 +23,8 @@ MAY_PRESS = {
     "select",
     "deselect",
     "step",
+    "move",
+    "projector",
     "views",
     "yaw-zoom",
     "graph-cell",

@@ -9,9 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
+from spherloc.cameras._files import MAX_FILE_BYTES
 from spherloc.cameras.base import Camera
 from spherloc.cameras.extensions import Reader, reader_of
 from spherloc.errors import CalibrationError, show
+from spherloc.files import read_file
 from spherloc.testing.saying import Saying, name_of
 from spherloc.types import BoolArray, FloatArray
 
@@ -55,7 +57,7 @@ def check_calibration_reader(reader: Reader | str, path: str | Path, name: str |
     say.need(isinstance(camera, Camera), f"gives {show(camera)} for {path}, which is no camera")
     assert isinstance(camera, Camera)
     check_camera(camera)
-    content = Path(path).read_bytes()
+    content = read_file(Path(path), MAX_FILE_BYTES)
     others = (
         b"",
         b"\n",

@@ -151,7 +151,7 @@ def test_cancelled_run_keeps_nothing_alive(scene_of):
     while traceback is not None:
         names.append(traceback.tb_frame.f_code.co_name)
         traceback = traceback.tb_next
-    assert names == ["run", "estimate"] and error.__context__ is None
+    assert names == ["run", "estimate", "run_estimator"] and error.__context__ is None
 
 
 @pytest.mark.parametrize("estimator", LONG)
