@@ -6,10 +6,10 @@ pose of every pair, level and tilted, and from the true pose, Gauss-Newton steps
 try to win one correspondence more, then another.
 """
 
-import numba
 import numpy as np
 
 from spherloc.geometry import yaw_of
+from spherloc.kernel_cache import kernel
 from spherloc.problem import AlignedProblem
 from spherloc.solvers.two_point import two_point
 from spherloc.types import FloatArray
@@ -22,7 +22,7 @@ NEAR = 3
 """Starts that explain fewer than the best by more than this are not climbed from."""
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _rotation(state, out):
     """R of a state, by Rodrigues' formula for the tilt."""
     a, c = state[4], state[5]
@@ -40,7 +40,7 @@ def _rotation(state, out):
         out[i, 2] = left * sine + right * cosine
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _residuals(state, bearings, points, weights, out):
     """Residuals (N, 2), px, of a state; inf behind the measured bearing."""
     rotation = np.empty((3, 3))
@@ -57,7 +57,7 @@ def _residuals(state, bearings, points, weights, out):
             out[k, row] = value if ahead else np.inf
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _support(state, data, bound_px, norms):
     """How many a state explains; writes the norm (N,) of every residual."""
     bearings, points, weights = data
@@ -70,7 +70,7 @@ def _support(state, data, bound_px, norms):
     return count
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _step(state, data, members, norms, bound_px, limit_rad):
     """One weighted Gauss-Newton step on ``members``, in place; false where it is impossible."""
     bearings, points, weights = data
@@ -104,7 +104,7 @@ def _step(state, data, members, norms, bound_px, limit_rad):
     return True
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _climb(start, data, bound_px, limit_rad):
     """The most that steps from a state lead to, winning one correspondence at a time."""
     norms = np.empty(len(data[1]))
@@ -129,7 +129,7 @@ def _climb(start, data, bound_px, limit_rad):
     return best
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _search(starts, data, bound_px, limit_rad):
     """The largest consensus reached from any of the states (S, 6)."""
     supports, norms = np.empty(len(starts), np.int64), np.empty(len(data[1]))

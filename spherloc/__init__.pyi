@@ -1,5 +1,3 @@
-from pathlib import Path
-
 from spherloc.cameras.calibration import load_camera as load_camera
 from spherloc.datasets import bundled_scenes as bundled_scenes
 from spherloc.datasets import load_scene as load_scene
@@ -16,9 +14,4 @@ from spherloc.problem import Problem as Problem
 from spherloc.trace import Trace as Trace
 
 EXPORTS: dict[str, str]
-KERNEL_SOURCES: tuple[str, ...]
-KEPT_KERNELS: int
 __version__: str
-kernels_are_temporary: bool
-
-def user_cache() -> Path | None: ...

@@ -11,8 +11,6 @@ import uuid
 from functools import cache
 from pathlib import Path
 
-from spherloc import user_cache
-
 VARIABLE = "SPHERLOC_CACHE"
 """Environment variable that moves the cache."""
 KEEP_BYTES = 2 << 30
@@ -30,6 +28,14 @@ def cache_folder(kind: str) -> Path:
     """
     own = os.environ.get(VARIABLE)
     return (Path(own) if own else user_cache() or _temporary()) / kind
+
+
+def user_cache() -> Path | None:
+    """The user's folder for what can be computed again; None for a user without a home."""
+    try:
+        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "spherloc"
+    except RuntimeError:
+        return None
 
 
 @cache

@@ -11,9 +11,9 @@ when the points are far away or the map's origin is.
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from spherloc.kernel_cache import kernel
 from spherloc.types import FloatArray
 
 ROBUST_NONE, ROBUST_HUBER, ROBUST_CAUCHY = 0, 1, 2
@@ -74,13 +74,13 @@ class NormalEquations(NamedTuple):
     """J^T r (6,)."""
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def empty_equations():
     """``NormalEquations`` to be written."""
     return NormalEquations(np.empty((6, 6)), np.empty(6))
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def polish(matches, chosen, rotation, translation, noise, robust, most_steps):
     """Minimise the cost over the chosen ``matches``; return the accepted steps. The pose is changed in place.
 
@@ -93,7 +93,7 @@ def polish(matches, chosen, rotation, translation, noise, robust, most_steps):
     return polish_path(matches, chosen, rotation, translation, noise, robust, most_steps, np.empty((0, 3, 4)))
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def polish_path(matches, chosen, rotation, translation, noise, robust, most_steps, path):
     """As ``polish``; the pose after each accepted step is written to ``path`` (K, 3, 4) as far as that reaches."""
     count, centre = middle_of(matches.points, chosen)
@@ -133,14 +133,14 @@ def polish_path(matches, chosen, rotation, translation, noise, robust, most_step
     return steps
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def degrees_of_freedom(count, gravity_sd_rad):
     """6, or 4 where the tilt stays as it is: gravity exact, or unknown with too few of ``count`` points to find it."""
     unknown = gravity_sd_rad == np.inf and count < LEAST_FOR_SIX_DOF
     return 4 if unknown or gravity_sd_rad < LEAST_GRAVITY_SD_RAD else 6
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def middle_of(points, chosen):
     """Number of the ``points`` (M, 3), m, that are ``chosen`` (M,), and their mean (3,), m."""
     count, x, y, z = 0, 0.0, 0.0, 0.0
@@ -150,7 +150,7 @@ def middle_of(points, chosen):
     return count, np.array([x, y, z]) / max(count, 1)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def nearest_yaw(rotation):
     """The rotation (3, 3) about y closest to ``rotation``; see ``geometry.yaw_of``."""
     yaw = np.arctan2(rotation[0, 2] - rotation[2, 0], rotation[0, 0] + rotation[2, 2])
@@ -158,7 +158,7 @@ def nearest_yaw(rotation):
     return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def levelled(cam_from_map, centre):
     """The pose (3, 4) with the nearest yaw for its rotation that leaves the point ``centre`` (3,), m, where it is."""
     rotation = cam_from_map[:, :3].copy()
@@ -168,7 +168,7 @@ def levelled(cam_from_map, centre):
     return level
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def turn(step, rotation, turned):
     """Write Exp(w) R (3, 3) to ``turned``, w = ``step[:3]`` in rad (Rodrigues, exact to rounding at zero)."""
     wx, wy, wz = step[0], step[1], step[2]
@@ -185,7 +185,7 @@ def turn(step, rotation, turned):
         turned[2, k] = z + first * dz + second * (wx * dy - wy * dx)
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def robust_weight(square, robust):
     """rho(s) and its derivative, s = ``square`` a squared residual in units of the noise's variance."""
     if robust == ROBUST_HUBER and square > HUBER_WIDTH * HUBER_WIDTH:
@@ -197,7 +197,7 @@ def robust_weight(square, robust):
     return square, 1.0
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def normal_equations(matches, chosen, centre, rotation, middle, model, system):
     """The cost at (R, m); write the ``NormalEquations`` of the step (w, d) at zero to ``system``.
 
@@ -264,13 +264,13 @@ def normal_equations(matches, chosen, centre, rotation, middle, model, system):
     return cost + add_gravity(rotation, model.noise.gravity_sd_rad, system)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def tilt_of(rotation):
     """Angle, rad, between the map's down direction, R e_y, and the camera's +y; of a rotation (3, 3) or pose (3, 4)."""
     return np.arctan2(np.hypot(rotation[0, 1], rotation[2, 1]), rotation[1, 1])
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def add_gravity(rotation, gravity_sd_rad, system):
     """Cost of the gravity prior at ``rotation`` (3, 3); add its J^T J and J^T r to ``system``, ``NormalEquations``.
 
@@ -298,7 +298,7 @@ def add_gravity(rotation, gravity_sd_rad, system):
     return (angle / gravity_sd_rad) ** 2
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def factorise(hessian, damping, factor):
     """Write L of S H S + damping I = L L^T, S scaling the columns to length 1; False if there is no full rank.
 
@@ -320,13 +320,13 @@ def factorise(hessian, damping, factor):
     return True
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def scale_of(hessian, k):
     """What scales column ``k`` of the normal equations (6, 6) to length 1."""
     return 1.0 / np.sqrt(hessian[k, k]) if hessian[k, k] > 0.0 else 1.0
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def solve(system, damping, factor, step):
     """Write the damped ``step`` (6,), -(H + damping diag H)^-1 g, rad and m; False if H has no full rank.
 

@@ -6,7 +6,6 @@ but not as well. They have many local minima. A fit at narrowing bounds, by Gaus
 passes by those that only the wide bound makes; fits to few random correspondences near a pose leave others.
 """
 
-import numba
 import numpy as np
 
 from spherloc.gauss_newton import (
@@ -23,6 +22,7 @@ from spherloc.gauss_newton import (
     tilt_of,
     turn,
 )
+from spherloc.kernel_cache import kernel
 
 NARROWINGS = (1.0, 0.4, 0.15, 0.0)
 """Shares of what gravity's error adds to the bound that the successive bounds keep."""
@@ -57,7 +57,7 @@ LEAST_FOR_NOISE = 8
 """Correspondences from which something can be said about their noise."""
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def errors_of(matches, cam_from_map, errors):
     """Write the reprojection ``errors`` (M,) at a pose (3, 4), px to first order; inf for points behind their bearing.
 
@@ -76,7 +76,7 @@ def errors_of(matches, cam_from_map, errors):
             errors[k] = np.inf
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def truncated_squares(matches, limits_px, cam_from_map, noise, most):
     """The truncated squares of a pose (3, 4) at the bounds ``limits_px`` (M,); more than ``most`` once that is passed.
 
@@ -102,7 +102,7 @@ def truncated_squares(matches, limits_px, cam_from_map, noise, most):
     return total
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def robust_steps(matches, limits_px, cam_from_map, noise, most_steps):
     """Move ``cam_from_map`` (3, 4) in place by Gauss-Newton steps on Geman-McClure weights.
 
@@ -125,7 +125,7 @@ def robust_steps(matches, limits_px, cam_from_map, noise, most_steps):
             break
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _step(matches, chosen, cam_from_map, noise, damping):
     """One Gauss-Newton step of a pose (3, 4) on the ``chosen`` (M,) matches, in place; its length, 0 if there is none.
 
@@ -151,7 +151,7 @@ def _step(matches, chosen, cam_from_map, noise, damping):
     return length
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def narrow(matches, wide_px, tight_px, start, noise, path):
     """Fits from ``start`` (3, 4) at bounds that narrow from ``wide_px`` (M,) to ``tight_px`` (M,), each from the last.
 
@@ -164,7 +164,7 @@ def narrow(matches, wide_px, tight_px, start, noise, path):
         path[index] = state
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def descend(matches, limits_px, cam_from_map, noise, path):
     """Least squares on the inliers and new choices of these while the truncated squares fall.
 
@@ -191,7 +191,7 @@ def descend(matches, limits_px, cam_from_map, noise, path):
     return states, least
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def search_nearby(matches, wide_px, limits_px, start, noise, best, least):
     """Look for a better pose than ``best`` by fits to few random ones of what ``start`` explains within ``wide_px``.
 
@@ -230,7 +230,7 @@ def search_nearby(matches, wide_px, limits_px, start, noise, best, least):
     return least
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _samples_needed(matches, limits_px, best, around, errors):
     """Samples from ``around`` (K,) after which one was surely drawn from inliers of the ``best`` pose only (Eq. 28).
 
@@ -246,7 +246,7 @@ def _samples_needed(matches, limits_px, best, around, errors):
     return int(min(np.log(MOST_FAILURE_PROBABILITY) / np.log1p(-max(clean, 1e-9)), MOST_SAMPLES))
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def share_of_fine(errors, near, limits_px, noise_px, share, rounds, fine_probability):
     """Share of the ``near`` (M,) matches with the finer noise, from a guess ``share``, after so many ``rounds``.
 
@@ -267,7 +267,7 @@ def share_of_fine(errors, near, limits_px, noise_px, share, rounds, fine_probabi
     return share
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def fit_to_noise(matches, limits_px, cam_from_map, noise, path):
     """Maximise the likelihood of what lies within ``limits_px`` (M,) under a mixture of stated and finer noise.
 
@@ -301,7 +301,7 @@ def fit_to_noise(matches, limits_px, cam_from_map, noise, path):
     return ADAPTIVE_STEPS
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _draw(random_state, count):
     """The next state (uint64) of the generator xorshift64, and a random number from 0 to ``count`` - 1."""
     random_state ^= random_state << np.uint64(13)

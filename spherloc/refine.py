@@ -8,7 +8,6 @@ Eq. 2, in pixels, for any camera model and across panorama seams.
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-import numba
 import numpy as np
 
 from spherloc.bounds import Bounds
@@ -31,6 +30,7 @@ from spherloc.gauss_newton import (
     tilt_of,
 )
 from spherloc.geometry import skew
+from spherloc.kernel_cache import kernel
 from spherloc.narrowing import ADAPTIVE_STEPS, errors_of, fit_to_noise
 from spherloc.noise_scale import variance_factor
 from spherloc.problem import AlignedProblem
@@ -198,7 +198,7 @@ def _covariance(aligned: AlignedProblem, cam_from_map: FloatArray, centre: Float
     return by_step @ steps @ by_step.T
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _residuals(matches, cam_from_map):
     """Reprojection errors (M,), px, at a pose (3, 4); see ``residuals_px``."""
     errors = np.empty(len(matches.points))
@@ -206,7 +206,7 @@ def _residuals(matches, cam_from_map):
     return errors
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _alternate(matches, wide_px, tight_px, start, noise, robust):
     """The states (I + 1, 3, 4) from ``start`` (3, 4) to the one to return; an inlier's bound, if below ``wide_px``.
 
@@ -244,7 +244,7 @@ def _alternate(matches, wide_px, tight_px, start, noise, robust):
     return path[:kept].copy(), limit_px
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _rescue(matches, limits_px, explained, path, states, noise):
     """Move on from the last of the ``states`` of ``path`` until as many as are in ``explained`` (M,) are inliers.
 
@@ -275,7 +275,7 @@ def _rescue(matches, limits_px, explained, path, states, noise):
     return 0
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _account(matches, limits_px, path):
     """Inlier mask (M,) of the last pose of ``path`` (I, 3, 4); mean squared residual of these, px^2, and inliers.
 
@@ -293,7 +293,7 @@ def _account(matches, limits_px, path):
     return inliers, costs, counts
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _step_covariance(matches, inliers, cam_from_map, noise, robust):
     """Degrees of freedom; middle (3,) of the ``inliers`` (M,), m; covariance (6, 6) of a step (w, d), rad and m.
 

@@ -8,12 +8,12 @@ at once, with whatever it has; the function that called it then raises ``Cancell
 import threading
 import time
 
-import numba
 import numpy as np
 from numba.core import event
 from numpy.typing import NDArray
 
 from spherloc.errors import SpherlocError
+from spherloc.kernel_cache import kernel
 
 STOP, DONE, TOTAL = 0, 1, 2
 """Places of the board: not 0 once the run is cancelled; work done of the stage at hand, and all of its work (0 if
@@ -103,7 +103,7 @@ class Watch:
         self.reach(1)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def stopped(board):
     """Whether a kernel shall return. A kernel that nobody watches has None for a board."""
     return board is not None and board[STOP] != 0

@@ -11,8 +11,7 @@ from pathlib import Path
 
 import pytest
 
-import spherloc
-from spherloc import disk_cache
+from spherloc import disk_cache, kernel_cache
 from spherloc.datasets.synthetic import SyntheticScene
 from spherloc.errors import InputError
 from spherloc.estimators import estimate
@@ -98,17 +97,21 @@ def until_python_runs(process: subprocess.Popen[bytes]) -> None:
 def test_kernels_where_nothing_can_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """numba refused every kernel: "no locator available". A folder below a file cannot be made, whoever asks."""
     (tmp_path / "file").write_text("")
-    monkeypatch.setattr(spherloc, "kernels_are_temporary", False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "file" / "kernels"))
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    folder = spherloc._first_writable(tmp_path / "file", "kernels-1")
-    assert folder.is_dir() and folder.parent == tmp_path and spherloc.kernels_are_temporary
-    assert folder.stat().st_mode & 0o077 == 0, "others could put their code there"
+    kernel_cache._temporary.cache_clear()
+    assert not kernel_cache.is_temporary()
+    folder = kernel_cache._first_writable(tmp_path / "file", "kernels-1")
+    assert folder.parent.is_dir() and folder.parent.parent == tmp_path and kernel_cache.is_temporary()
+    assert folder.parent.stat().st_mode & 0o077 == 0, "others could put their code there"
+    assert os.environ["NUMBA_CACHE_DIR"] == str(folder.parent), "a child would compile again"
+    kernel_cache._temporary.cache_clear()
+    monkeypatch.delenv("NUMBA_CACHE_DIR")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    assert spherloc._first_writable(tmp_path / "file", "kernels-1").is_relative_to(tmp_path / "cache")
+    assert kernel_cache._first_writable(tmp_path / "file", "kernels-1").is_relative_to(tmp_path / "cache")
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "own"))
-    assert spherloc._first_writable(tmp_path / "file", "kernels-1") == tmp_path / "own"
+    assert kernel_cache._first_writable(tmp_path / "file", "kernels-1") == tmp_path / "own" / "kernels-1"
 
 
 def test_a_user_without_a_home_has_a_cache(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -131,7 +131,7 @@ def test_paths_within_scenes_too(tmp_path: Path) -> None:
 
 
 OPENERS = {"read_text", "read_bytes", "is_file", "is_dir", "iterdir", "open"}
-OWN_FILES = {"files", "__init__", "worlds.render", "disk_cache", "estimators.warm_up", "datasets.scene_file"}
+OWN_FILES = {"files", "kernel_cache", "worlds.render", "disk_cache", "datasets.scene_file"}
 """Those that open what spherloc itself wrote or brings with it; the last one looks where its own scenes are."""
 
 

@@ -25,6 +25,7 @@ FLOORS = (
         "spherloc.ranges",
         "spherloc.registry",
         "spherloc.geometry",
+        "spherloc.kernel_cache",
         "spherloc.watch",
         "spherloc.disk_cache",
         "spherloc.images",

@@ -2,7 +2,6 @@
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,6 +20,7 @@ from spherloc.consensus.pose_search import (
     search_poses,
 )
 from spherloc.consensus.stabbing import EVERYWHERE, Scratch, deepest, keep_possible, scratch_for
+from spherloc.kernel_cache import kernel
 from spherloc.types import FloatArray
 from spherloc.watch import stopped
 
@@ -85,14 +85,14 @@ def boxes_for(count: int) -> Boxes:
     )
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _yaw_of_turn(turn):
     """Yaw, rad in [-pi, pi], of a turn."""
     c, s = direction_of_turn(turn)
     return np.arctan2(s, c)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _in_window(scratch, kept, count, start, end, out):
     """Write those of ``count`` in ``kept`` whose interval meets a window of turns to ``out`` (K,); returns how many."""
     used = 0
@@ -112,7 +112,7 @@ def _in_window(scratch, kept, count, start, end, out):
     return used
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def search_boxes(matches, tasks, yaw_bound, memory, limits, found, board):
     """Search the boxes ``tasks`` = (charts (K,), lower (K, 6), upper (K, 6), bounds (K,)) at all yaws.
 

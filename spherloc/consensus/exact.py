@@ -12,7 +12,6 @@ One pair may own two arcs: an edge is cleared when the last one ends.
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -35,6 +34,7 @@ from spherloc.consensus.region_proof import FOUND, IMPOSSIBLE, UNKNOWN, Region, 
 from spherloc.consensus.translation_balls import apart_balls, may_be_seen, pair_ball, star_balls
 from spherloc.consensus.yaw_bins import BIN_TURN, BINS, core_graph, degree_bounds, largest_bin_cliques, sort_into_bins
 from spherloc.geometry import yaw_rotation
+from spherloc.kernel_cache import kernel
 from spherloc.problem import AlignedProblem
 from spherloc.types import BoolArray, FloatArray, IndexArray
 from spherloc.watch import DONE, SELDOM, TOTAL, Watch, stopped, working_s
@@ -209,7 +209,7 @@ def _as_matrices(poses: FloatArray) -> FloatArray:
     return matrices
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _pieces(arcs, nodes, count, start, end, board):
     """``Arcs`` among ``nodes`` (K,) that touch the bin from turn ``start`` to turn ``end``, clipped to it.
 
@@ -243,7 +243,7 @@ def _pieces(arcs, nodes, count, start, end, board):
     return edges, first, last
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _common(rows, a, b, out):
     """Write the common neighbours of two nodes of a graph ``rows`` (K, words) to ``out`` (words,); returns how many."""
     found = 0
@@ -254,7 +254,7 @@ def _common(rows, a, b, out):
     return found
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _members(bits, count):
     """The ``count`` nodes (N,) of a bitset (words,), ascending."""
     nodes = np.empty(count, np.int64)
@@ -269,7 +269,7 @@ def _members(bits, count):
     return nodes[:used]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _candidates(matches, yaws, ball, nodes, common, shared):
     """Those of the ``shared`` neighbours in the bitset ``common`` that may be seen from somewhere in a ``ball`` (4,).
 
@@ -283,7 +283,7 @@ def _candidates(matches, yaws, ball, nodes, common, shared):
     return kept[:used]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _completed(rows, a, b, candidates, floor, effort_limit, board):
     """A clique of nodes a, b and ``candidates`` (C,) with more than ``floor`` nodes in all, or nothing.
 
@@ -301,7 +301,7 @@ def _completed(rows, a, b, candidates, floor, effort_limit, board):
     return clique, effort, exact
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def certify(matches, yaws, everybody, balls, best, board):
     """Prove that no pose explains more of ``everybody`` (K,) than the best known one does.
 
@@ -331,7 +331,7 @@ def certify(matches, yaws, everybody, balls, best, board):
     return True, effort
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def sweep_bin(matches, arcs, nodes, rows, span, best, effort_limit, board):
     """Search the bin between the turns ``span``.
 

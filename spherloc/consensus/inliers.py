@@ -1,12 +1,12 @@
 """Which correspondences a gravity-aligned pose explains: the inner loop of every estimator."""
 
-import numba
 import numpy as np
 
 from spherloc.gauss_newton import Matches
+from spherloc.kernel_cache import kernel
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def count_inliers(yaw, translation, matches, bound_px):
     """How many ``matches`` (``gauss_newton.Matches``) a level pose explains: a yaw, rad, and a translation (3,), m.
 
@@ -28,7 +28,7 @@ def count_inliers(yaw, translation, matches, bound_px):
     return inliers
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def score_inliers(yaw, translation, matches, bound_px, mask):
     """Fill ``mask`` (M,) with what ``count_inliers`` counts; return how many, and the MSAC support.
 
@@ -53,7 +53,7 @@ def score_inliers(yaw, translation, matches, bound_px, mask):
     return inliers, support
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def mark_each(yaws, translations, bearings, points, pixel_jacobian, bound_px):
     """The inlier masks (J, M) of J level poses: ``yaws`` (J,), rad, and ``translations`` (J, 3), m."""
     matches = Matches(bearings, points, pixel_jacobian)
@@ -69,7 +69,7 @@ ROWS = 10
 """Numbers of a correspondence: its point, the two rows of its pixel Jacobian, its squared bound."""
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def pack_blocks(matches, bound_px, order):
     """The ``matches`` in the given ``order`` (K,), as ``reaches`` reads them: blocks of ROWS x BLOCK, flat.
 
@@ -88,7 +88,7 @@ def pack_blocks(matches, bound_px, order):
     return blocks.ravel()
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def reaches(yaw, translation, blocks, floors):
     """Whether a level pose may explain enough: False once the count after block b is below ``floors[b]`` (B,).
 

@@ -7,7 +7,6 @@ weighted residuals in pixels. The clearly different poses that explain most are 
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,6 +14,7 @@ from spherloc.bounds import Bounds
 from spherloc.consensus.inliers import count_inliers
 from spherloc.consensus.pair_arcs import chord
 from spherloc.gauss_newton import Matches
+from spherloc.kernel_cache import kernel
 from spherloc.problem import AlignedProblem
 from spherloc.solvers.two_point import solve_pair
 from spherloc.types import BoolArray, FloatArray, IndexArray
@@ -89,7 +89,7 @@ def empty_list(most: int, count: int) -> BestPoses:
     )
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def write_level_pose(yaw, translation, pose):
     """Write the level ``pose`` (5,) of a yaw, rad, and a translation (3,), m."""
     c, s = np.cos(yaw), np.sin(yaw)
@@ -99,14 +99,14 @@ def write_level_pose(yaw, translation, pose):
     pose[4] = -s * translation[0] - c * translation[2]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def write_translation(pose, translation):
     """Write the ``translation`` (3,), m, of a level pose (5,)."""
     c, s, x, y, z = pose
     translation[0], translation[1], translation[2] = -(c * x + s * z), -y, s * x - c * z
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def ray(point, pose):
     """The unit vector (3 numbers) to a ``point`` (3,) in camera axes, and its distance, m, from a level pose (5,)."""
     dx, dy, dz = point[0] - pose[2], point[1] - pose[3], point[2] - pose[4]
@@ -114,7 +114,7 @@ def ray(point, pose):
     return (pose[0] * dx + pose[1] * dz) / distance, dy / distance, (pose[0] * dz - pose[1] * dx) / distance, distance
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def linearized(jacobian_row, gx, gy, gz, distance):
     """A residual, px, one of two, of the ray (gx, gy, gz), and its derivative by the four numbers of a step.
 
@@ -125,7 +125,7 @@ def linearized(jacobian_row, gx, gy, gz, distance):
     return r, wx * gz - wz * gx, (r * gx - wx) / distance, (r * gy - wy) / distance, (r * gz - wz) / distance
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def accumulate(normal, gradient, weight, r, row):
     """Add a weighted residual ``r`` with derivative ``row`` (4 numbers) to the equations, (4, 4) and (4,)."""
     for a in range(4):
@@ -134,7 +134,7 @@ def accumulate(normal, gradient, weight, r, row):
             normal[a, b] += weight * row[a] * row[b]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def fit(points, pixel_jacobian, weights, pose, steps):
     """Move a level ``pose`` (5,) by Gauss-Newton ``steps`` on residuals weighted by ``weights`` (M,).
 
@@ -156,7 +156,7 @@ def fit(points, pixel_jacobian, weights, pose, steps):
         move(pose, step)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def solve_step(normal, gradient, step):
     """Write the ``step`` (4,) of the normal equations (4, 4) and (4,); return the fall of the cost, or -1.
 
@@ -185,7 +185,7 @@ def solve_step(normal, gradient, step):
     return fall
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def move(pose, step):
     """Turn and move a level ``pose`` (5,) by a ``step`` (4,), rad and m."""
     c, s = pose[0], pose[1]
@@ -195,7 +195,7 @@ def move(pose, step):
     pose[0], pose[1] = c * np.cos(step[0]) - s * np.sin(step[0]), s * np.cos(step[0]) + c * np.sin(step[0])
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def residual(matches, k, pose, least_cos):
     """Residual of match ``k`` at a level pose (5,), px; inf behind, or farther from the bearing than ``least_cos``."""
     gx, gy, gz, _ = ray(matches.points[k], pose)
@@ -208,7 +208,7 @@ def residual(matches, k, pose, least_cos):
     return np.sqrt(du * du + dv * dv)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def mark_support(matches, pose, mask):
     """Set ``mask`` (M,) to what a level ``pose`` (5,) explains of the ``BoundedMatches``; returns how many."""
     inliers = 0
@@ -218,7 +218,7 @@ def mark_support(matches, pose, mask):
     return inliers
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def explain_more(matches, members, pose, mask):
     """Fit a level ``pose`` (5,) to what it explains, then to all ``members`` (K,).
 
@@ -252,7 +252,7 @@ def explain_more(matches, members, pose, mask):
     return best
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _reweight(matches, members, pose, weights):
     """Multiply the ``weights`` (M,) of the ``members`` (K,) by the share of the bound that their residuals take.
 
@@ -266,7 +266,7 @@ def _reweight(matches, members, pose, weights):
         weights[k] *= len(members) / total
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _propose(matches, clique, pose):
     """Write the 2P pose of a pair of the ``clique`` (K,) that explains most of the clique; false if no pair has one."""
     bearings, points = matches.bearings, matches.points
@@ -287,7 +287,7 @@ def _propose(matches, clique, pose):
     return best > 0
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def verify(matches, clique, best):
     """Find the level pose that explains most of a ``clique`` (K,), and add it to the ``BestPoses`` if it is good."""
     pose = np.empty(5)
@@ -295,7 +295,7 @@ def verify(matches, clique, best):
         improve(matches, clique, pose, best)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def improve(matches, members, pose, best):
     """Improve a level ``pose`` (5,) in place, see ``explain_more``, and add it to ``best``, as ``verify`` does."""
     mask = np.empty(best.masks.shape[1], np.bool_)
@@ -303,7 +303,7 @@ def improve(matches, members, pose, best):
     _keep(pose, support, mask, best)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _keep(pose, support, mask, best):
     """Insert a ``pose`` (5,) that explains ``mask`` (M,) into the list, unless a better one explains much the same."""
     poses, supports, masks, known = best.poses, best.supports, best.masks, best.known[0]

@@ -1,8 +1,8 @@
 """The order of millions of numbers, in a kernel that a watch can end: numba's own sort cannot be stopped."""
 
-import numba
 import numpy as np
 
+from spherloc.kernel_cache import kernel
 from spherloc.watch import stopped
 
 MOST_INSERTED = 15
@@ -11,7 +11,7 @@ MOST_WAITING = 100
 """Parts that wait to be sorted. The longer one waits, so that they are at most the logarithm of the count."""
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def order_of(values, board):
     """The order (N,) that ``np.argsort`` gives ``values`` (N,) in a kernel, ties included: the same quicksort.
 
@@ -40,7 +40,7 @@ def order_of(values, board):
     return order
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _insert(values, order, low, high):
     """Sort ``order[low : high + 1]`` of ``order`` (N,) by the ``values`` (N,), by insertion."""
     for i in range(low + 1, high + 1):
@@ -51,7 +51,7 @@ def _insert(values, order, low, high):
         order[j] = moved
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _partition(values, order, low, high):
     """Partition ``order[low : high + 1]`` by ``values`` (N,) at the median of its first, middle and last.
 

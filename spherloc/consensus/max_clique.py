@@ -11,10 +11,10 @@ and the same result on every machine.
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from spherloc.kernel_cache import kernel
 from spherloc.watch import Watch, stopped
 
 EFFORT_LIMIT = 200_000_000
@@ -52,7 +52,7 @@ def max_clique(adjacency: NDArray[np.bool_], effort_limit: int = EFFORT_LIMIT, w
     return Clique(nodes, bool(proven))
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _pack(adjacency):
     """The graph (M, M) as bitsets (M, words) of renumbered nodes, and each one's old number (M,)."""
     count, order = len(adjacency), _degeneracy_order(adjacency)
@@ -68,7 +68,7 @@ def _pack(adjacency):
     return rows, order
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _all_adjacent(adjacency, nodes):
     """Whether each of ``nodes`` (K,) is adjacent to all others in the graph (M, M)."""
     for a in nodes:
@@ -78,7 +78,7 @@ def _all_adjacent(adjacency, nodes):
     return True
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _degeneracy_order(adjacency):
     """Nodes (M,) of a graph (M, M) by repeated removal of one of least degree, the first removed last.
 
@@ -100,7 +100,7 @@ def _degeneracy_order(adjacency):
     return order
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _greedy(rows):
     """Members (K,) of some clique of a graph ``rows`` (M, words): each node in turn that is adjacent to all before it.
 
@@ -118,7 +118,7 @@ def _greedy(rows):
     return members[:taken].copy()
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def popcount(word):
     """Number of set bits of a 64-bit word."""
     word -= (word >> np.uint64(1)) & np.uint64(0x5555555555555555)
@@ -127,27 +127,27 @@ def popcount(word):
     return np.int64((word * np.uint64(0x0101010101010101)) >> np.uint64(56))
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def lowest_bit(word):
     """Index of the lowest set bit of a word that is not zero."""
     return popcount((word & (~word + ONE)) - ONE)
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def set_edge(rows, a, b):
     """Join two nodes of the graph ``rows`` (M, words), in place."""
     rows[a, b >> 6] |= ONE << np.uint64(b & 63)
     rows[b, a >> 6] |= ONE << np.uint64(a & 63)
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def clear_edge(rows, a, b):
     """Remove the edge between two nodes of the graph ``rows`` (M, words), in place."""
     rows[a, b >> 6] &= ~(ONE << np.uint64(b & 63))
     rows[b, a >> 6] &= ~(ONE << np.uint64(a & 63))
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def colour(candidates, rows, needed, order, bound):
     """Colour the ``candidates`` (words,) greedily; list the nodes whose colour exceeds ``needed``, with the colour.
 
@@ -181,7 +181,7 @@ def colour(candidates, rows, needed, order, bound):
     return listed
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def all_nodes(count):
     """The bitset (words,) of nodes 0 to ``count`` - 1."""
     bits = np.zeros((count + 63) // 64, np.uint64)
@@ -190,7 +190,7 @@ def all_nodes(count):
     return bits
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def colour_bound(rows):
     """Colours that greedy colouring of the graph ``rows`` (M, words) needs: no clique is larger."""
     count = len(rows)
@@ -201,7 +201,7 @@ def colour_bound(rows):
     return np.int64(bound[listed - 1])
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def larger_clique(rows, floor, effort_limit, board=None):
     """A largest clique (K,) if it has more than ``floor`` nodes, else an empty array; the effort; whether it is exact.
 
@@ -248,7 +248,7 @@ def larger_clique(rows, floor, effort_limit, board=None):
     return best, effort, True
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def subgraph(rows, nodes):
     """The graph (K, words) among ``nodes`` (K,) of ``rows`` (M, words), and their old numbers (K,).
 
@@ -268,7 +268,7 @@ def subgraph(rows, nodes):
     return small, old
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def remove_weak_edges(rows, floor):
     """Clear, again and again, edges whose ends have less than ``floor`` - 1 common neighbours, in ``rows`` (M, words).
 

@@ -25,9 +25,9 @@ every graph.
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from spherloc.kernel_cache import kernel
 from spherloc.problem import AlignedProblem
 from spherloc.types import FloatArray, IndexArray
 from spherloc.watch import DONE, Watch, stopped
@@ -73,19 +73,19 @@ class Arcs(NamedTuple):
     """(A,) second ends, up to a circle larger than the first, turns."""
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _along(v, dx, dy, dz):
     """v . (R d) of a bearing v (3,) and d = (dx, dy, dz), m, as (cos, sin, constant)."""
     return v[0] * dx + v[2] * dz, v[0] * dz - v[2] * dx, v[1] * dy
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def chord(angle):
     """Distance between unit vectors at this angle, rad (any shape)."""
     return 2.0 * np.sin(0.5 * angle)
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def pair_sinusoids(vi, vj, pi, pj, chord_i, chord_j, sin_i, sin_j):
     """sin alpha, and the (cos, sin, constant) of f, s_i, s_j, S_i, S_j, tau, m, of two bearings and points, all (3,).
 
@@ -114,7 +114,7 @@ def pair_sinusoids(vi, vj, pi, pj, chord_i, chord_j, sin_i, sin_j):
     return sin_alpha, f, si, sj, most_i, most_j, _mix(sin_alpha * sin_i, most_i, sin_alpha * sin_j, most_j)
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _mix(a, u, b, v):
     """a u + b v of two sinusoids, as (cos, sin, constant)."""
     return a * u[0] + b * v[0], a * u[1] + b * v[1], a * u[2] + b * v[2]
@@ -145,7 +145,7 @@ def pair_arcs(aligned: AlignedProblem, bound_rad: FloatArray, watch: Watch | Non
     return Arcs(pairs[:used], np.ascontiguousarray(ends[:used, 0]), np.ascontiguousarray(ends[:used, 1]))
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def turn_of_direction(c, s):
     """Turn in [0, 4] of the direction (c, s) of any length."""
     quarter = s / (abs(c) + abs(s))
@@ -154,7 +154,7 @@ def turn_of_direction(c, s):
     return quarter if quarter >= 0.0 else 4.0 + quarter
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def direction_of_turn(turn):
     """(cos, sin) of the yaw of a turn."""
     turn %= CIRCLE
@@ -163,7 +163,7 @@ def direction_of_turn(turn):
     return c / norm, s / norm
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def yaws_between(lo, hi):
     """The ``YawInterval`` between two turns less than half a circle apart."""
     c0, s0 = direction_of_turn(lo)
@@ -174,7 +174,7 @@ def yaws_between(lo, hi):
     return YawInterval(c / norm, s / norm, half_width_rad)
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _behind(a, b, c, u0, v0, u1, v1):
     """Whether a cos + b sin + c < 0 on all of the arc, shorter than half a circle, between two unit vectors.
 
@@ -188,7 +188,7 @@ def _behind(a, b, c, u0, v0, u1, v1):
     return most + bulge + ROUNDING * abs(c) < 0.0
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _fill(bearings, points, eps, pairs, ends, board):
     """Write the arcs of ``pair_arcs`` to ``pairs`` (K, 2) and ``ends`` (K, 2), turns; returns how many.
 

@@ -35,9 +35,9 @@ the rounding of the few operations between them and a comparison.
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from spherloc.kernel_cache import kernel
 from spherloc.problem import AlignedProblem
 from spherloc.types import FloatArray
 
@@ -154,7 +154,7 @@ def _homogeneous(chart: int, at: FloatArray) -> tuple[float, FloatArray]:
     return scale, c
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def rotation_of(yaw, a, c, out):
     """Write R_x(a) R_z(c) R_y(yaw) to ``out`` (3, 3); angles in rad."""
     cy, sy, ca, sa, cc, sc = np.cos(yaw), np.sin(yaw), np.cos(a), np.sin(a), np.cos(c), np.sin(c)
@@ -163,7 +163,7 @@ def rotation_of(yaw, a, c, out):
     out[2, 0], out[2, 1], out[2, 2] = sa * sc * cy - ca * sy, sa * cc, sa * sc * sy + ca * cy
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def has_tilt(matches, lower, upper):
     """Whether some tilt of a cell, ends ``lower`` (6,) and ``upper`` (6,), is within the gravity bound."""
     a = max(lower[TILT_A], -upper[TILT_A], 0.0)
@@ -171,7 +171,7 @@ def has_tilt(matches, lower, upper):
     return np.cos(a) * np.cos(c) >= matches.least_cosine - 1e-15
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def place_cell(chart, lower, upper, cell):
     """Write what bounds need of a cell of a chart, ends ``lower`` (6,) and ``upper`` (6,), to ``cell`` (CELL_SIZE,).
 

@@ -6,7 +6,6 @@ are told how many are sure and look at the undecided only: near the optimum some
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -30,6 +29,7 @@ from spherloc.consensus.pose_cells import (
     has_tilt,
     place_cell,
 )
+from spherloc.kernel_cache import kernel
 from spherloc.types import FloatArray
 from spherloc.watch import stopped
 
@@ -93,7 +93,7 @@ def room_for(count: int) -> Room:
     )
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def sort_matches(matches, cell, axis, members, kept, cutoff, reach):
     """Sort the ``members`` (K,) of ``PackedMatches`` by what a ``cell`` (CELL_SIZE,) explains.
 
@@ -219,7 +219,7 @@ def sort_matches(matches, cell, axis, members, kept, cutoff, reach):
     return sure, undecided, inside
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def put_off(left, state, cell_of, bound, narrow):
     """Write a cell, ``cell_of`` = (chart, lower (6,), upper (6,)), to ``left``, or its bound to ``state`` if that is
     full.
@@ -236,7 +236,7 @@ def put_off(left, state, cell_of, bound, narrow):
     state[LEFT] = index + 1
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def search_poses(matches, cell_of, members, room, limits, found, board):
     """Split a cell, ``cell_of`` = (chart, lower (6,), upper (6,)), until no part may explain more than the best pose
     and ``limits.gap``.

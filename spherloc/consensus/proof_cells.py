@@ -4,13 +4,13 @@ The search (``box_search``, ``pose_search``) tells children what their parents h
 bounded once more by all matches, and split where that does not suffice.
 """
 
-import numba
 import numpy as np
 
 from spherloc.consensus.pair_arcs import CIRCLE, direction_of_turn
 from spherloc.consensus.pose_cells import CELL_SIZE, HALF_ANGLES, HALF_C, HALF_S, YAW, has_tilt, place_cell
 from spherloc.consensus.pose_search import sort_matches
 from spherloc.consensus.stabbing import deepest, keep_possible
+from spherloc.kernel_cache import kernel
 from spherloc.watch import DONE, stopped
 
 NO_TILT, STABBED, LINEAR = 0, 1, 2
@@ -21,7 +21,7 @@ WINDOW_MARGIN = 1e-12
 """Rad by which windows of yaw are widened; less than the intervals were."""
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def prove_cells(matches, chart, ends, claim, switch_rad, memory, cells, board):
     """Write final cells of a chart, ``ends`` = (lower (6,), upper (6,)), that together hold it, to ``cells``.
 
@@ -100,7 +100,7 @@ def prove_cells(matches, chart, ends, claim, switch_rad, memory, cells, board):
     return used
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _put(cells, used, lower, upper, rule, bound):
     """Write a final cell, ends (6,), as number ``used`` of ``cells``; returns how many there are."""
     lowers, uppers, about = cells
@@ -109,7 +109,7 @@ def _put(cells, used, lower, upper, rule, bound):
     return used + 1
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _by_yaw(cells, used, lo, up, spans, waiting, about, scratch):
     """Cut the cell ``waiting`` at the ends of its windows of yaw: these wait, what lies between them is final.
 

@@ -21,11 +21,11 @@ left, or the limit is reached.
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
 from spherloc.consensus.level_pose import accumulate, linearized, move, ray, solve_step
 from spherloc.consensus.pair_arcs import YawInterval
+from spherloc.kernel_cache import kernel
 from spherloc.types import FloatArray
 from spherloc.watch import stopped
 
@@ -72,7 +72,7 @@ class LawsonState(NamedTuple):
     """(K,) residuals in units of their bounds."""
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def prove_none(matches, region, everybody, floor, found, board=None):
     """Whether no level pose of a ``Region`` explains more than ``floor`` of ``everybody`` (K,).
 
@@ -116,7 +116,7 @@ def prove_none(matches, region, everybody, floor, found, board=None):
     return IMPOSSIBLE, effort
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _basis(matches, region, everybody, gone, state):
     """Few members, those of largest weight first, that alone cannot be explained; none if no such are found.
 
@@ -143,7 +143,7 @@ def _basis(matches, region, everybody, gone, state):
     return order[:total] if total <= 2 * BASIS_SIZES[-1] else order[:0]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _lawson(matches, region, everybody, gone, floor, state, rounds):
     """Lawson's iteration on those of ``everybody`` (K,) not ``gone`` (K,), so many ``rounds`` at most.
 
@@ -171,7 +171,7 @@ def _lawson(matches, region, everybody, gone, floor, state, rounds):
     return UNKNOWN, rounds
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _shrink(root, room, pose, possible):
     """Shrink ``possible`` (7,) to the ellipsoid of steps x from ``pose`` (5,) with |root^T x|^2 <= ``room``.
 
@@ -195,7 +195,7 @@ def _shrink(root, room, pose, possible):
         possible[6] = reach
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _reweight(gone, state):
     """Multiply each weight of those not ``gone`` (K,) by the share of the bound that its residual takes.
 
@@ -210,7 +210,7 @@ def _reweight(gone, state):
     weights *= left / total
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _normal_equations(matches, everybody, possible, state, normal, gradient):
     """Fill the equations (4, 4) and (4,) of the linear residuals by yaw and by position in camera axes, and the shares.
 
@@ -245,7 +245,7 @@ def _normal_equations(matches, everybody, possible, state, normal, gradient):
     return explained, cost, allowed, neglected
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def search_region(matches, region, everybody, floor, cell_limit, found):
     """Whether some level pose of a ``Region`` explains more than ``floor`` of ``everybody`` (K,): as ``prove_none``.
 
@@ -291,7 +291,7 @@ def search_region(matches, region, everybody, floor, cell_limit, found):
     return (IMPOSSIBLE if exact else UNKNOWN), used
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _mean_distance(points, everybody, ball):
     """Mean distance, m, of ``everybody`` (K,) of the ``points`` (M, 3) from the centre of a ``ball`` (4,)."""
     total = 0.0
@@ -301,7 +301,7 @@ def _mean_distance(points, everybody, ball):
     return total / len(everybody)
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _excess(matches, k, pose):
     """Of match ``k`` at a level ``pose`` (5 numbers): what its residual exceeds its bound by, times the distance, px m;
     the distance along its bearing, and the distance, m.
@@ -317,7 +317,7 @@ def _excess(matches, k, pose):
     return np.sqrt(du * du + dv * dv) - matches.bound_px[k] * distance, along, distance
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _explained(matches, everybody, pose):
     """How many of ``everybody`` (K,) a level ``pose`` (5 numbers) explains."""
     inliers = 0
@@ -327,7 +327,7 @@ def _explained(matches, everybody, pose):
     return inliers
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _may_explain(matches, order, middle, half_yaw, reach, floor):
     """Whether some pose of a cell might explain more than ``floor`` of ``order`` (K,).
 

@@ -16,7 +16,6 @@ turns of ``pair_arcs``, from 0 to 4, which need no trigonometry.
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -37,6 +36,7 @@ from spherloc.consensus.pose_cells import (
     Q,
     S,
 )
+from spherloc.kernel_cache import kernel
 from spherloc.types import FloatArray
 
 FEW_BINS, MANY_BINS = 256, 1024
@@ -70,7 +70,7 @@ def scratch_for(count: int) -> Scratch:
     return Scratch(np.empty(count), np.empty(count), np.zeros(MANY_BINS + 2, np.int32), np.empty((MOST_WINDOWS, 2)))
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def keep_possible(matches, cell, members, kept, scratch, cutoff, spread):
     """Write those of ``members`` (K,) that some pose of a cell may explain to ``kept``, their intervals to ``scratch``.
 
@@ -142,7 +142,7 @@ def keep_possible(matches, cell, members, kept, scratch, cutoff, spread):
     return used, free
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def deepest(scratch, count, free, cutoff, yaw_bound):
     """Most of ``count`` intervals over one yaw, and how many windows hold all yaws where that exceeds ``cutoff``.
 
@@ -184,7 +184,7 @@ def deepest(scratch, count, free, cutoff, yaw_bound):
     return most, used
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _clip_windows(windows, used, cutoff, yaw_bound):
     """Leave out those of the first ``used`` ``windows`` (W, 2), turns, whose bins are all bounded by ``cutoff``.
 
@@ -202,7 +202,7 @@ def _clip_windows(windows, used, cutoff, yaw_bound):
     return kept
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _open_window(windows, used, start):
     """Add a window to the first ``used`` of ``windows`` (W, 2) that starts at a turn; returns how many there are.
 
@@ -214,7 +214,7 @@ def _open_window(windows, used, start):
     return used + 1
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _exactly(scratch, count, free, cutoff):
     """``deepest`` by sorting all ends: the depth, and how many windows were written to ``scratch.windows``."""
     windows = scratch.windows

@@ -15,11 +15,11 @@ The second half is for the exact search: balls of pairs chosen so that every con
 one of them. A set that leaves out at most m of the candidates holds at least one of any m + 1 disjoint pairs entirely.
 """
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from spherloc.consensus.pair_arcs import Arcs, BoundedRays, YawInterval, chord, pair_sinusoids
+from spherloc.kernel_cache import kernel
 from spherloc.problem import AlignedProblem
 from spherloc.types import BoolArray, FloatArray, IndexArray
 from spherloc.watch import DONE, Watch, stopped
@@ -130,7 +130,7 @@ def edges_of(overlap: BoolArray) -> IndexArray:
     return _edges(overlap, np.count_nonzero(overlap) // 2)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _edges(overlap, count):
     """The ``count`` edges (E, 2) of the symmetric matrix ``overlap`` (M, M)."""
     edges = np.empty((count + 1, 2), np.int32)
@@ -142,7 +142,7 @@ def _edges(overlap, count):
     return edges[:count]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _overlap(centres, radii, overlap):
     """Write which balls overlap to ``overlap`` (M, M), false before; ``centres`` (3, M), m, ``radii`` (M,), m."""
     x, y, z = centres
@@ -152,7 +152,7 @@ def _overlap(centres, radii, overlap):
             overlap[a, b] = overlap[b, a] = dx * dx + dy * dy + dz * dz <= reach * reach
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _spread(pairs, share, most, count):
     """Indices of the first ``most`` of ``pairs`` (P, 2) in which none of ``count`` matches has more than ``share``."""
     kept, used = np.empty(most, np.int64), np.zeros(count, np.int64)
@@ -167,13 +167,13 @@ def _spread(pairs, share, most, count):
     return kept[:found]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def bounded_rays(bearings, points, eps):
     """``BoundedRays`` of ``bearings`` (M, 3) and ``points`` (M, 3), m, with angular errors up to ``eps`` (M,), rad."""
     return BoundedRays(bearings, points, chord(eps), np.sin(eps))
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _smallest(bearings, points, eps, arcs, covering, yaw, most, board):
     """Pairs (S, 2) in their order, centres (S, 3) and radii (S,), m: the ``most`` smallest balls and some more.
 
@@ -212,7 +212,7 @@ def _smallest(bearings, points, eps, arcs, covering, yaw, most, board):
     return near[:count].copy(), centres[:count].copy(), radii[:count].copy()
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _least_squared_radius(i, j, rays, c, s):
     """A lower bound on the squared radius, m^2, of ``ball_of_pair``, whatever its slack, for a fraction of the time.
 
@@ -235,7 +235,7 @@ def _least_squared_radius(i, j, rays, c, s):
     return squared * (1.0 - ROUNDING)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _fill(bearings, points, eps, pairs, yaw, slack, centres, radii):
     """Write the balls of ``translation_balls`` to ``centres`` (P, 3) and ``radii`` (P,), m."""
     rays = bounded_rays(bearings, points, eps)
@@ -245,7 +245,7 @@ def _fill(bearings, points, eps, pairs, yaw, slack, centres, radii):
         radii[k] = ball_of_pair(i, j, rays, YawInterval(c, s, slack[k]), centres[k])
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def ball_of_pair(i, j, rays, yaws, centre):
     """Radius, m, of the ball of a pair of ``BoundedRays`` for a ``YawInterval``, inf if it bounds nothing.
 
@@ -279,25 +279,25 @@ def ball_of_pair(i, j, rays, yaws, centre):
     return noise + np.sqrt(slope2) * slack + 0.5 * bend * slack * slack
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _value(wave, c, s):
     """Of a wave (cos, sin, constant) at the yaw with cos c and sin s."""
     return wave[0] * c + wave[1] * s + wave[2]
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _slope(wave, c, s):
     """The derivative by yaw of a wave (cos, sin, constant)."""
     return wave[1] * c - wave[0] * s
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _amplitude(wave):
     """The most that a wave (cos, sin, constant) differs from its constant."""
     return np.sqrt(wave[0] * wave[0] + wave[1] * wave[1])
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _sin2_between(vi, vj):
     """sin^2 of the angle between two unit vectors (3,), without cancellation for small angles."""
     cx = vi[1] * vj[2] - vi[2] * vj[1]
@@ -306,7 +306,7 @@ def _sin2_between(vi, vj):
     return cx * cx + cy * cy + cz * cz
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _turned_back(v, c, s, axis):
     """Component ``axis`` of R^T v, v (3,), and of its derivative by yaw."""
     if axis == 0:
@@ -316,7 +316,7 @@ def _turned_back(v, c, s, axis):
     return v[0] * s + v[2] * c, v[0] * c - v[2] * s
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def pair_ball(matches, yaws, i, j):
     """The ball of a pair of ``BoundedMatches`` for a ``YawInterval``, (4,): centre and radius, m."""
     rays = BoundedRays(matches.bearings, matches.points, matches.chord, matches.sine)
@@ -325,7 +325,7 @@ def pair_ball(matches, yaws, i, j):
     return ball
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def may_be_seen(matches, yaws, k, ball):
     """Whether match ``k`` of ``BoundedMatches`` is explained from somewhere in a ``ball`` (4,) at a yaw of ``yaws``."""
     c, s, slack = yaws
@@ -340,7 +340,7 @@ def may_be_seen(matches, yaws, k, ball):
     return angle <= (matches.bound_rad[k] + slack + np.arcsin(ball[3] / distance)) * (1.0 + 1e-9) + 1e-7
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def star_balls(matches, yaws, everybody, most, alone):
     """Balls (B, 4) for all sets that hold the last two of ``everybody`` (K,) and leave out less than ``most`` of all.
 
@@ -362,7 +362,7 @@ def star_balls(matches, yaws, everybody, most, alone):
     return alone.reshape(1, 4)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def apart_balls(matches, yaws, nodes, most):
     """Small balls (B, 4) of disjoint pairs for all sets that leave out less than ``most`` of ``nodes`` (K,).
 

@@ -13,12 +13,12 @@ correspondences could not make it the best.
 from dataclasses import dataclass
 from typing import Literal
 
-import numba
 import numpy as np
 
 from spherloc.consensus.inliers import BLOCK, pack_blocks, reaches, score_inliers
 from spherloc.consensus.level_pose import fit, write_level_pose, write_translation
 from spherloc.gauss_newton import Matches
+from spherloc.kernel_cache import kernel
 from spherloc.problem import AlignedProblem
 from spherloc.solvers.two_point import solve_pair
 from spherloc.types import BoolArray, FloatArray, IndexArray
@@ -104,7 +104,7 @@ def search_two_point(
     )
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _mixed(state):
     """SplitMix64's output function of a ``state`` (uint64).
 
@@ -115,19 +115,19 @@ def _mixed(state):
     return state ^ (state >> np.uint64(31))
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _random(stream, k):
     """Random number k, 64 bits, of a ``stream`` (uint64)."""
     return _mixed(stream + np.uint64(k + 1) * np.uint64(0x9E3779B97F4A7C15))
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _below(bits, count):
     """A number from 0 to count - 1 from 32 random bits, uniform to within a share of count / 2^32."""
     return np.int64((bits * np.uint64(count)) >> np.uint64(32))
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def sample_pair(seed, k, count):
     """Sample k of a seed (uint64): two different numbers below ``count``, every ordered pair equally likely."""
     bits = _random(_mixed(seed), k)
@@ -136,7 +136,7 @@ def sample_pair(seed, k, count):
     return i, j + 1 if j >= i else j
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _shuffled(seed, count):
     """A random order (``count``,) of so many things, independent of the samples of the same seed (uint64)."""
     stream = _mixed(~seed)
@@ -147,7 +147,7 @@ def _shuffled(seed, count):
     return order
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _least_of_first(seen, target, count, miss):
     """The f for which fewer than f of ``target`` out of ``count`` are in ``seen`` random ones with chance <= miss."""
     rate, enough = target / count, -np.log(miss)
@@ -165,7 +165,7 @@ def _least_of_first(seen, target, count, miss):
     return low + 1
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _set_floors(floors, target, count, miss):
     """Write what a pose with ``target`` inliers of ``count`` must have after each block to ``floors`` (B,).
 
@@ -179,7 +179,7 @@ def _set_floors(floors, target, count, miss):
             floors[b] = max(floors[b], _least_of_first(seen, target, count, miss / checks))
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _optimize(yaw, translation, matches, bound_px, mask):
     """Fit yaw, rad (returned), and translation (3,), m (in place), to the inliers, choose these anew, and so on.
 
@@ -200,7 +200,7 @@ def _optimize(yaw, translation, matches, bound_px, mask):
     return yaw
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _search(matches, bound_px, seed, iterations, miss, msac, local, board):
     """Rows (sample, i, j, yaw, translation, inliers, optimized) of all improvements, samples drawn, confidence reached.
 

@@ -15,10 +15,10 @@ them finds the deepest yaw exactly, in O(A log A). (Eq. 37 as printed has the in
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 
 from spherloc.consensus.pair_arcs import chord, pair_sinusoids
+from spherloc.kernel_cache import kernel
 from spherloc.problem import AlignedProblem
 from spherloc.types import FloatArray, IndexArray
 from spherloc.watch import DONE, SELDOM, Watch, stopped
@@ -57,7 +57,7 @@ def yaw_arcs(
     return pairs[:used], lo[:used], hi[:used]
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _sine_and_cosine(u0, v0, u1, v1):
     """Of an arc's width, from its ends, unit vectors (u0, v0) and (u1, v1).
 
@@ -67,7 +67,7 @@ def _sine_and_cosine(u0, v0, u1, v1):
     return (0.0 if sine < 0.0 and sine > -LEAST_SINE and cosine > 0.0 else sine), cosine
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _holds(u0, v0, u1, v1, x, y):
     """Whether the arc from (u0, v0) to (u1, v1) holds the direction (x, y)."""
     after_first, before_second = u0 * y - v0 * x >= 0.0, x * v1 - y * u1 >= 0.0
@@ -76,7 +76,7 @@ def _holds(u0, v0, u1, v1, x, y):
     return after_first or before_second
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _cut(arcs, count, a, b, c):
     """Replace ``count`` of the ``arcs`` (K, 4), rows (u0, v0, u1, v1), by what of them has a cos + b sin + c >= 0.
 
@@ -122,7 +122,7 @@ def _cut(arcs, count, a, b, c):
     return kept
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _clear_sign(wave, u0, v0, u1, v1, cosine):
     """1 or -1 if the ``wave`` (cos, sin, constant) has this sign on all of a short arc, 0 if unclear.
 
@@ -136,7 +136,7 @@ def _clear_sign(wave, u0, v0, u1, v1, cosine):
     return (min(at_first, at_second) >= bulge) - (max(at_first, at_second) < below)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _arcs_at_roots(f, tau, most_i, most_j, arcs):
     """Write the arcs where all conditions hold to ``arcs`` (K, 4), if f has two roots and at most a short one at each.
 
@@ -180,7 +180,7 @@ def _arcs_at_roots(f, tau, most_i, most_j, arcs):
     return count if clear and (roots < 2 or c * amplitude2 >= a * d + b * e) else -1
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _fill(bearings, points, eps, widest, pairs, lo, hi, board):
     """Write the arcs of ``yaw_arcs`` to ``pairs`` (K, 2), ``lo`` (K,) and ``hi`` (K,), rad; returns how many.
 
@@ -276,7 +276,7 @@ def _sort(values: FloatArray, watch: Watch) -> None:
     _sort(values[half:], watch)
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _kind(lo, hi):
     """Whether an arc, ends in rad, is the whole circle, whether it crosses the seam, and its upper end below pi."""
     full = hi - lo >= 2 * np.pi
@@ -284,7 +284,7 @@ def _kind(lo, hi):
     return full, wraps, hi - 2 * np.pi if wraps else hi
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _ends(lo, hi, board):
     """Lower and upper ends (K,) of the arcs but whole circles, in any order, and how many arcs cover -pi from before.
 
@@ -302,7 +302,7 @@ def _ends(lo, hi, board):
     return starts[:count], ends[:count], depth
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _covering(lo, hi, yaw, board):
     """Indices (K,) of the arcs, ``lo`` (A,) and ``hi`` (A,), rad, that cover a ``yaw`` of [-pi, pi)."""
     covering = np.empty(len(lo), np.int32)
@@ -317,13 +317,13 @@ def _covering(lo, hi, yaw, board):
     return covering[:count].copy()
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _bin(yaw):
     """The bin of ``overlap`` that holds a yaw of [-pi, pi], rad."""
     return max(0, min(BINS - 1, int((yaw + np.pi) * (BINS / (2 * np.pi)))))
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _sweep(starts, ends, depth, overlap, board):
     """Walk the sorted ends from -pi to pi, starting with ``depth`` arcs that cover -pi; fill ``overlap`` (BINS,).
 

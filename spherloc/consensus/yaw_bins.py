@@ -8,13 +8,13 @@ two inliers, but at the true yaw every pair of inliers is an edge. A bin's graph
 cliques bound those of each yaw, but may have no pose.
 """
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from spherloc.consensus.level_pose import verify
 from spherloc.consensus.max_clique import colour_bound, larger_clique, remove_weak_edges, set_edge, subgraph
 from spherloc.consensus.pair_arcs import CIRCLE
+from spherloc.kernel_cache import kernel
 from spherloc.types import FloatArray, IndexArray
 from spherloc.watch import SELDOM, stopped
 
@@ -32,7 +32,7 @@ CLIQUE_MARGIN = 3
 """How much smaller than a clique without pose the next one may be."""
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def sort_into_bins(
     pairs: IndexArray, lo: FloatArray, hi: FloatArray, board: NDArray[np.int64] | None = None
 ) -> tuple[NDArray[np.int64], EdgeArray]:
@@ -64,14 +64,14 @@ def sort_into_bins(
     return starts, edges
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _bins(lo, hi):
     """First and last bin that an arc, ends in turns, touches; not more than all."""
     first, last = int(lo / BIN_TURN), int(hi / BIN_TURN)
     return first, min(last, first + BINS - 1)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def degree_bounds(
     count: int, starts: NDArray[np.int64], edges: EdgeArray, board: NDArray[np.int64] | None = None
 ) -> IndexArray:
@@ -103,7 +103,7 @@ def degree_bounds(
     return bound
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def largest_bin_cliques(matches, starts, edges, bound, least, best, board=None):
     """Verify the largest clique of each bin; better poses go to ``best``, and each bin's ``bound`` (BINS,) is lowered.
 
@@ -128,7 +128,7 @@ def largest_bin_cliques(matches, starts, edges, bound, least, best, board=None):
             floor = supports[0] if supports[0] > least else max(floor, len(clique) - CLIQUE_MARGIN)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def core_graph(count, edges, least, board=None):
     """Nodes (K,) that may belong to a clique of more than ``least``, by falling degree, and their graph (K, words).
 

@@ -4,7 +4,6 @@ maximum clique, refinement. Deterministic: no random draw.
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 
 from spherloc.bounds import Bounds
@@ -16,6 +15,7 @@ from spherloc.errors import InputError
 from spherloc.estimators.base import Clock, Outcome, check_positive
 from spherloc.gauss_newton import Matches
 from spherloc.geometry import pose, yaw_rotation
+from spherloc.kernel_cache import kernel
 from spherloc.last_step import conclude
 from spherloc.problem import AlignedProblem
 from spherloc.refine import RefinementOptions
@@ -109,7 +109,7 @@ def _yaw_stage(
     )
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _rename(pairs, index, named, board):
     """Write ``pairs`` (A, 2) of usable matches to ``named`` (A, 2) by their numbers in the problem, ``index`` (M,).
 
@@ -168,10 +168,10 @@ def _best_start(
     yaws, translations = np.append(yaw, yaws[exists]), np.vstack([mean[:, 3], translations[exists]])
     matches = Matches(aligned.bearings, aligned.points, aligned.pixel_from_bearing)
     best = _most_inliers(yaws, translations, matches, bounds.pixels)
-    return pose(yaw_rotation(yaws[best]), translations[best])
+    return pose(yaw_rotation(float(yaws[best])), translations[best])
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _most_inliers(yaws, translations, matches, bound_px):
     """Index of the level pose that explains most correspondences, the first of equals.
 

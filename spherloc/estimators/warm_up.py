@@ -6,13 +6,10 @@ of its own, its value, for which the callee would be compiled again. And that is
 the same layout, and writable or not, every time.
 """
 
-import os
 from collections.abc import Callable, Iterable
 from dataclasses import replace
-from pathlib import Path
 
-import spherloc
-from spherloc import registry
+from spherloc import kernel_cache, registry
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.datasets.synthetic import SyntheticScene
 from spherloc.errors import InputError
@@ -26,10 +23,10 @@ def warm_up(announce: Callable[[str], None] | None = None, estimators: Iterable[
     ``announce`` is called with a sentence to show if it will be long, and for every extension that fails here, which
     hinders nothing else.
     """
-    cold = not any(Path(os.environ["NUMBA_CACHE_DIR"]).rglob("*.nbi"))
+    cold = kernel_cache.is_cold()
     if announce is not None and cold:
         how_often = "once after an installation"
-        if spherloc.kernels_are_temporary:
+        if kernel_cache.is_temporary():
             how_often = "at every start, since no folder to keep them can be written (NUMBA_CACHE_DIR names another)"
         announce(f"preparing the solvers, {how_often}: some two minutes …")
     scene = tiny_scene()

@@ -16,11 +16,11 @@ Urban, Leitloff, Hinz: MLPnP - A real-time maximum likelihood solution to the pe
 III-3, 2016.
 """
 
-import numba
 import numpy as np
 
 from spherloc.gauss_newton import turn
 from spherloc.geometry import tangent_basis
+from spherloc.kernel_cache import kernel
 from spherloc.solvers.base import NO_POSES, checked, poses
 from spherloc.solvers.linear_pose import (
     DEGENERATE,
@@ -95,7 +95,7 @@ def _planar_pose(
     return None if translation is None else (rotation, translation)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def refine_on_tangents(basis, points, rotation, translation):
     """R (3, 3) and t (3,) with the least sum of (n . u)^2, u the unit vector towards R p + t, by Gauss-Newton.
 
@@ -123,7 +123,7 @@ def refine_on_tangents(basis, points, rotation, translation):
     return rotation, translation
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _normal_equations(basis, points, rotation, translation, normal, right):
     """Add J^T J to ``normal`` (6, 6) and -J^T r to ``right`` (6,), by rotation vector and translation; return r^T r.
 
@@ -155,7 +155,7 @@ def _normal_equations(basis, points, rotation, translation, normal, right):
     return cost
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _solve(matrix, x):
     """Solve ``matrix`` (N, N) y = ``x`` (N,) by Cholesky, in place of both; False if it is not positive definite."""
     for i in range(len(x)):

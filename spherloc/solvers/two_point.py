@@ -10,17 +10,17 @@ Degenerate only if n or d is vertical (both bearings horizontal; one point above
 or two points coincide.
 """
 
-import numba
 import numpy as np
 
 from spherloc.errors import ProblemError
+from spherloc.kernel_cache import kernel
 from spherloc.types import BoolArray, FloatArray
 
 DEGENERATE = 1e-12
 """Below this, relative to |d|, the pair says nothing about yaw."""
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def yaw_coefficients(vi, vj, pi, pj):
     """(d1, d2, d3) of Eq. 22, m, |n|^2 = sin^2 of the angle between the bearings, and |d|^2, m^2.
 
@@ -33,7 +33,7 @@ def yaw_coefficients(vi, vj, pi, pj):
     return nx * dx + nz * dz, nx * dz - nz * dx, ny * dy, nx * nx + ny * ny + nz * nz, dx * dx + dy * dy + dz * dz
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def depths(vi, vj, pi, pj, cosine, sine, sin2):
     """Depths (s_i, s_j), m, with R d = s_i v_i - s_j v_j in the least-squares sense; sin2 = |v_i x v_j|^2.
 
@@ -50,7 +50,7 @@ def depths(vi, vj, pi, pj, cosine, sine, sin2):
     return si / sin2, sj / sin2
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def solve_pair(vi, vj, pi, pj, yaws, translations):
     """Write the roots with positive depths to ``yaws`` (2,), rad, and ``translations`` (2, 3), m; return how many.
 
@@ -79,7 +79,7 @@ def solve_pair(vi, vj, pi, pj, yaws, translations):
     return found
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _solve_batch(bearings, points, yaws, translations, valid):
     """Write ``solve_pair`` of B pairs, see ``two_point``; ``valid`` (B, 2) becomes true where there is a root."""
     for b in range(len(bearings)):

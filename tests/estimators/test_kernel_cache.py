@@ -1,10 +1,12 @@
-"""Compiled kernels follow the sources: after an update nobody may go on with the old machine code."""
+"""Compiled kernels follow the sources, and processes that compile at once do not take each other's machine code."""
 
 import os
 import shutil
 import subprocess
 import sys
 from pathlib import Path
+
+from spherloc import kernel_cache
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -40,3 +42,37 @@ def test_change_in_a_called_kernel_is_noticed(tmp_path):
     changed = text.replace("        if inliers < floors[b]:\n            return False\n", "        return False\n")
     counting.write_text(changed, encoding="utf-8")
     assert best_of_two(tmp_path) == "0"
+
+
+def halved(value):
+    """What the kernels below do."""
+    return value / 2
+
+
+def test_processes_that_compile_at_once_do_not_mix_their_kernels(tmp_path, monkeypatch):
+    """Both read the index before either wrote and numbered from 1: the later index led to the earlier code."""
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr(kernel_cache, "kernel_folder", lambda: tmp_path)
+    first, second, third = (kernel_cache.kernel()(halved) for _ in range(3))
+    files = first._cache._cache_file
+    save = files._save_data
+
+    def save_late(name, data):
+        assert second(3.0) == 1.5
+        save(name, data)
+
+    monkeypatch.setattr(second._cache._cache_file, "_load_index", dict)
+    monkeypatch.setattr(files, "_save_data", save_late)
+    assert first(3) == 1.5
+    assert third(3.0) == 1.5 and third.stats.cache_hits, "the later index was not read"
+    assert third(3) == 1.5
+
+
+def test_another_librarys_kernels_stay_where_they_are(monkeypatch, tmp_path):
+    """Importing moves nobody else's cache."""
+    script = (
+        "import os, numba, spherloc.refine; print(numba.config.CACHE_DIR, 'NUMBA_CACHE_DIR' in os.environ)"
+    )
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["False"], done.stdout

@@ -13,10 +13,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-import numba
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
+
+from spherloc.kernel_cache import kernel
 
 HEADER_BYTES = 12
 END, CHUNK = 0, 2
@@ -167,12 +168,12 @@ def _coded(value: int) -> bytes:
     return bytes(out)
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _rotated(value, by):
     return np.uint32((value << by) | (value >> np.uint32(np.uint32(32) - by)))
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def xxh32(data, seed):
     """The hash XXH32 of bytes, by which rerun checks an index."""
     p1, p2, p3 = np.uint32(2654435761), np.uint32(2246822519), np.uint32(3266489917)
