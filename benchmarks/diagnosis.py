@@ -12,8 +12,9 @@ import numpy as np
 
 from spherloc.datasets.failures import MAKERS, FailureCase, failure_case
 from spherloc.diagnosis import Cause, diagnose
-from spherloc.estimators import default_options, estimate, warm_up
+from spherloc.estimators import default_options, estimate
 from spherloc.trace import Trace
+from spherloc.warm_up import warm_up
 
 
 def run(case: FailureCase) -> Trace:

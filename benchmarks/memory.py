@@ -32,7 +32,8 @@ def _status_mb(key: str) -> float:
 
 def _run(correspondences: int, estimator: str) -> dict[str, Any]:
     from benchmarks.cases import simulated
-    from spherloc.estimators import estimate, warm_up
+    from spherloc.estimators import estimate
+    from spherloc.warm_up import warm_up
 
     warm_up()
     problem = simulated(correspondences, 0.9)(0)

@@ -13,8 +13,9 @@ from spherloc import registry
 from spherloc.datasets import bundled_scenes
 from spherloc.datasets.scene_file import load_scene
 from spherloc.datasets.synthetic import SyntheticScene
-from spherloc.estimators import estimate, warm_up
+from spherloc.estimators import estimate
 from spherloc.metrics import evaluate
+from spherloc.warm_up import warm_up
 
 RATES = (0.0, 0.5, 0.8, 0.9)
 CAMERAS = ("mei", "fisheye", "panorama")

@@ -145,8 +145,8 @@ install_python() {
   watch "$venv" -m pip install --disable-pip-version-check -e ".$extras" ||
     die "pip could not install the packages, for the reason above; mend that and try again."
   if [[ $target != @(lint|docs) ]]; then
-    say "preparing the solvers, once: some two minutes"
-    "$venv" -c 'from spherloc.estimators import warm_up; warm_up()' ||
+    say "compiling the solvers, once: one to three minutes"
+    "$venv" -c 'from spherloc.warm_up import warm_up; warm_up()' ||
       die "the solvers could not be prepared, for the reason above; mend that and try again."
   fi
   printf '%s\n' "$state" >"$stamp$target"

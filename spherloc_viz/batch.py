@@ -14,11 +14,12 @@ from spherloc.datasets.map_scene import MapScene
 from spherloc.datasets.variation import Variation, used_seed
 from spherloc.diagnosis import Diagnosis, diagnose
 from spherloc.errors import InputError, RecordingError, SpherlocError
-from spherloc.estimators import default_options, options_type, warm_up
+from spherloc.estimators import default_options, options_type
 from spherloc.metrics import evaluate
 from spherloc.outcome import Outcome, judge
 from spherloc.problem import Problem
 from spherloc.trace import Trace
+from spherloc.warm_up import warm_up
 from spherloc_viz.options import json_text, option_fields
 from spherloc_viz.progress import prepare, say, solve
 from spherloc_viz.recording.origin import Origin

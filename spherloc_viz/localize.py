@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from spherloc.datasets import load_scene
 from spherloc.datasets.map_scene import MapScene
 from spherloc.errors import InputError, RecordingError, show
-from spherloc.estimators import options_type, warm_up
+from spherloc.estimators import options_type
 from spherloc.experiments.configuration import configuration_of
 from spherloc.experiments.results import (
     LOCALIZED,
@@ -27,6 +27,7 @@ from spherloc.experiments.summary import SuccessRate, Summary, estimated_traject
 from spherloc.frontend.view import View
 from spherloc.trace import Trace
 from spherloc.trajectory import write_tum
+from spherloc.warm_up import warm_up
 from spherloc_viz.batch import Records, parse_settings, store_of
 from spherloc_viz.options import json_text
 from spherloc_viz.progress import prepare, progress, say

@@ -7,10 +7,10 @@ from spherloc import registry
 from spherloc.cameras.extensions import camera_class_of, reader_of
 from spherloc.datasets.scene_file import loader_of, scene_kind
 from spherloc.errors import InputError, shorten
-from spherloc.estimators import estimate, options_type, warm_up
-from spherloc.estimators.warm_up import tiny_scene
+from spherloc.estimators import estimate, options_type
 from spherloc.registry import KINDS, Registered
 from spherloc.solvers.base import solver_of
+from spherloc.warm_up import tiny_problem, warm_up
 from spherloc_viz import layers
 from spherloc_viz.layers.extension import layer_of
 from spherloc_viz.options import json_text, option_fields
@@ -85,7 +85,7 @@ def _problem(kind: str, name: str, try_out: bool) -> str:
     try:
         _LOOK[kind](name)
         if try_out and kind in TRIED:
-            estimate(tiny_scene().problem(), f"{TRIED[kind]}{name}")
+            estimate(tiny_problem(), f"{TRIED[kind]}{name}")
     except InputError as error:
         named = registry.extension_of(kind, name) in str(error)
         return str(error) if named else f"{registry.title(kind, name)} {error}"

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 from spherloc.datasets import load_scene
 from spherloc.datasets.variation import parse_variation
 from spherloc.errors import RecordingError
-from spherloc.estimators import warm_up
 from spherloc.experiments.sweep import Entrant, Keep, SweepPlan, planned, run_sweep
 from spherloc.experiments.sweep_log import PICTURE, SUMMARY, SweepLog
 from spherloc.experiments.sweep_plan import parse_values
 from spherloc.experiments.sweep_rows import summarize
+from spherloc.warm_up import warm_up
 from spherloc_viz.batch import Records, parse_settings, store_of
 from spherloc_viz.layers.primitives import Table
 from spherloc_viz.layers.sweep import sweep_table

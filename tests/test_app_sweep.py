@@ -19,7 +19,7 @@ import viser
 
 from spherloc.datasets.variation import Variation
 from spherloc.errors import InputError
-from spherloc.estimators import warm_up
+from spherloc.warm_up import warm_up
 from spherloc_viz.app.catalog import SceneRequest
 from spherloc_viz.app.panels import sweep_runs_panel
 from spherloc_viz.app.panels.compare_panel import chips_html

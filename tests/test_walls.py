@@ -42,7 +42,14 @@ FLOORS = (
         "spherloc.datasets",
         "spherloc.frontend",
     ),
-    ("spherloc.estimators", "spherloc.proof", "spherloc.diagnosis", "spherloc.outcome", "spherloc.experiments"),
+    (
+        "spherloc.estimators",
+        "spherloc.warm_up",
+        "spherloc.proof",
+        "spherloc.diagnosis",
+        "spherloc.outcome",
+        "spherloc.experiments",
+    ),
     ("spherloc.localization", "spherloc.testing"),
     (
         "spherloc_viz.style",

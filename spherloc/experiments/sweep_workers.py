@@ -13,10 +13,10 @@ from multiprocessing.connection import Connection
 from typing import Any, Protocol
 
 from spherloc.errors import InputError, reason
-from spherloc.estimators import warm_up
 from spherloc.experiments.sweep_plan import Job, SweepPlan
 from spherloc.experiments.sweep_rows import SweepRow
 from spherloc.trace import Trace
+from spherloc.warm_up import warm_up
 
 MOST_WORKERS = 64
 AHEAD = 1

@@ -16,8 +16,8 @@ import viser
 
 from spherloc.datasets import bundled_scenes
 from spherloc.errors import InputError, RecordingError
-from spherloc.estimators import warm_up
 from spherloc.files import is_folder
+from spherloc.warm_up import warm_up
 from spherloc_viz.app.audience import Audience
 from spherloc_viz.app.catalog import Catalog
 from spherloc_viz.app.review.run_library import RunLibrary

@@ -9,9 +9,9 @@ from pathlib import Path
 from spherloc.datasets.map_scene import MapScene
 from spherloc.diagnosis import Diagnosis
 from spherloc.errors import InputError, RecordingError, show
-from spherloc.estimators import warm_up
 from spherloc.metrics import evaluate
 from spherloc.trace import Trace
+from spherloc.warm_up import warm_up
 from spherloc_viz.gallery.case import Beside, GalleryCase, Played, faults, origin_of, play
 from spherloc_viz.recording.content.writer import write_recording
 from spherloc_viz.recording.origin import Origin

@@ -70,9 +70,7 @@ def test_processes_that_compile_at_once_do_not_mix_their_kernels(tmp_path, monke
 
 def test_another_librarys_kernels_stay_where_they_are(monkeypatch, tmp_path):
     """Importing moves nobody else's cache."""
-    script = (
-        "import os, numba, spherloc.refine; print(numba.config.CACHE_DIR, 'NUMBA_CACHE_DIR' in os.environ)"
-    )
+    script = "import os, numba, spherloc.refine; print(numba.config.CACHE_DIR, 'NUMBA_CACHE_DIR' in os.environ)"
     monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["False"], done.stdout

@@ -1,11 +1,14 @@
 """Nobody waits for a compiler once the kernels are warm."""
 
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
 
-from spherloc.estimators import warm_up
+import pytest
+
+from spherloc.warm_up import warm_up
 from tests.waiting import LIMIT_S
 
 SCRIPT = """
@@ -14,7 +17,8 @@ import spherloc
 from spherloc import registry
 from spherloc.diagnosis import diagnose
 from spherloc.datasets import bundled_scenes, load_scene
-from spherloc.estimators import estimate, warm_up
+from spherloc.estimators import estimate
+from spherloc.warm_up import warm_up
 
 def compiled():
     found = {}
@@ -46,16 +50,23 @@ def test_warm_up_leaves_nothing_to_compile() -> None:
 
 def test_a_cold_start_is_announced_and_a_warm_one_is_not(tmp_path: Path) -> None:
     """Seconds of silence look like a hang; a sentence at every start would be noise."""
-    script = "from spherloc.estimators import warm_up; warm_up(lambda sentence: print(sentence, flush=True))"
+    script = "from spherloc.warm_up import warm_up; warm_up(lambda sentence: print(sentence, flush=True))"
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
     cold = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True, env=environment)
     assert cold.stdout is not None
     try:
-        assert "preparing the solvers" in cold.stdout.readline()
+        assert "compiling the solvers, once after an installation" in cold.stdout.readline()
     finally:
-        cold.kill()  # what it announces takes a minute
+        cold.send_signal(signal.SIGINT)  # what it announces takes a minute; its own processes end with it
         cold.communicate()
-    warm_up(estimators=["ransac-2p"])  # compiles everything if nothing is compiled yet
+    warm_up(estimators=["ransac-2p"])
     said: list[str] = []
     warm_up(said.append, ["ransac-2p"])
     assert said == []
+
+
+@pytest.mark.parametrize("part", ["refinement", "search", "mc-exact, uncertain gravity"])
+def test_a_part_that_is_compiled_in_a_process_of_its_own(part: str) -> None:
+    """It failed in silence, and everything was compiled by one process."""
+    done = subprocess.run([sys.executable, "-m", "spherloc.warm_up", part], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")

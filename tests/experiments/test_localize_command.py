@@ -19,9 +19,9 @@ from sequence_samples import true_pose, write_scene
 
 from spherloc import registry
 from spherloc.errors import SpherlocError
-from spherloc.estimators import warm_up
 from spherloc.experiments import read_results
 from spherloc.trajectory import read_tum
+from spherloc.warm_up import warm_up
 from spherloc_viz.batch import Records
 from spherloc_viz.localize import localize_sequence
 from spherloc_viz.plots import trajectory_png

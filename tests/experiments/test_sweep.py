@@ -18,7 +18,7 @@ from sweep_samples import QUICK, SCENE, small_plan, write_scene
 from spherloc.datasets import load_scene
 from spherloc.datasets.variation import Variation
 from spherloc.errors import InputError
-from spherloc.estimators import estimate, options_type, warm_up
+from spherloc.estimators import estimate, options_type
 from spherloc.experiments import sweep_cluster, sweep_workers
 from spherloc.experiments.sweep import (
     MOST_DEATHS,
@@ -33,6 +33,7 @@ from spherloc.experiments.sweep import (
 )
 from spherloc.experiments.sweep_workers import NICENESS
 from spherloc.metrics import evaluate
+from spherloc.warm_up import warm_up
 from tests.waiting import LIMIT_S, until
 
 

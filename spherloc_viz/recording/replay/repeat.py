@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 
 from spherloc.errors import InputError, RecordingError, SpherlocError
-from spherloc.estimators import estimate, warm_up
+from spherloc.estimators import estimate
 from spherloc.metrics import rotation_error_deg, translation_error_m
 from spherloc.problem import Problem
 from spherloc.trace import Certificate, Trace
 from spherloc.types import FloatArray
+from spherloc.warm_up import warm_up
 from spherloc_viz.options import json_text
 from spherloc_viz.recording.content.reader import RecordedRun
 from spherloc_viz.recording.origin import machine

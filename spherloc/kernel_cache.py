@@ -1,0 +1,123 @@
+"""Compiles numeric kernels with numba and keeps the machine code on disk, for just this state of the sources.
+
+numba notices when a kernel's own file changes but not when a function that it calls from another file does, and would
+go on with the old machine code after an update. And of two processes that compile for different types at once, each may
+give its file the same name, so that a later process runs machine code for the wrong types.
+"""
+
+import atexit
+import hashlib
+import os
+import shutil
+import tempfile
+import uuid
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numba
+from numba.core import config
+
+from spherloc.disk_cache import user_cache
+
+KERNEL_SOURCES = (
+    "watch.py",
+    "geometry.py",
+    "gauss_newton.py",
+    "narrowing.py",
+    "refine.py",
+    "solvers",
+    "consensus",
+    "estimators",
+)
+"""Files and folders of this package that hold kernels and whatever their values come from."""
+
+KEPT_STATES = 4
+"""States of the sources whose machine code is kept, for who goes back and forth between them."""
+
+VARIABLE = "NUMBA_CACHE_DIR"
+"""numba's environment variable that moves the cache."""
+
+
+def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Decorator: compile a function when it is first called, without the interpreter's lock, and keep the machine code.
+
+    ``options`` are those of ``numba.njit``. The function's own file must be named in ``KERNEL_SOURCES`` if another
+    file's kernels call it.
+    """
+
+    def decorate(function: Callable[..., Any]) -> Any:
+        dispatcher: Any = numba.njit(nogil=True, **options)(function)
+        settings: Any = config
+        before, settings.CACHE_DIR = settings.CACHE_DIR, str(kernel_folder())  # read when the cache is made
+        try:
+            dispatcher.enable_caching()
+        finally:
+            settings.CACHE_DIR = before
+        files = dispatcher._cache._cache_file
+        files._data_name_pattern = files._data_name_pattern.replace(
+            "{number:d}", f"{uuid.uuid4().hex[:12]}-{{number:d}}"
+        )
+        return dispatcher
+
+    return decorate
+
+
+@cache
+def kernel_folder() -> Path:
+    """Folder of the machine code: of $NUMBA_CACHE_DIR, beside the package, in the user's cache, or of this process."""
+    package = Path(__file__).parent
+    rooms = [package / name for name in KERNEL_SOURCES]
+    files = sorted(file for room in rooms for file in (room.rglob("*.py") if room.is_dir() else [room]))
+    digest = hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
+    return _first_writable(package, f"kernels-{digest[:16]}")
+
+
+def is_cold() -> bool:
+    """Whether nothing is compiled yet, as after an installation."""
+    return not any(kernel_folder().rglob("*.nbi"))
+
+
+@cache
+def _temporary() -> Path:
+    """A folder of this process and its children alone: whoever can write into a folder of kernels decides what runs."""
+    folder = Path(tempfile.mkdtemp(prefix="spherloc-kernels-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    os.environ[VARIABLE] = str(folder)
+    return folder
+
+
+def is_temporary() -> bool:
+    """Whether the machine code is lost when this process ends, since no folder to keep it can be written."""
+    kernel_folder()
+    return _temporary.cache_info().currsize > 0
+
+
+def _first_writable(package: Path, name: str) -> Path:
+    given, user = os.environ.get(VARIABLE), user_cache()
+    if given and _is_writable(Path(given) / name):
+        return Path(given) / name
+    for home in (package, user):
+        if home is not None and _is_writable(folder := home / "__pycache__" / name):
+            others = sorted(set(folder.parent.glob("kernels-*")) - {folder}, key=_changed_s)
+            for old in others[:-KEPT_STATES]:
+                shutil.rmtree(old, ignore_errors=True)
+            return folder
+    return _temporary() / name
+
+
+def _is_writable(folder: Path) -> bool:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return True
+    except (OSError, ValueError):
+        return False
+
+
+def _changed_s(folder: Path) -> float:
+    try:
+        return folder.stat().st_mtime
+    except OSError:  # another process has deleted it
+        return 0.0

@@ -1,0 +1,183 @@
+"""Loads or compiles the numeric kernels before somebody waits for an answer.
+
+A kernel is compiled for the types of its arguments, so that one is loaded here only if later calls have the same types.
+That is why kernels pass constants to each other as ``np.int64(MOST_STEPS)``: to numba a constant of a module is a type
+of its own, its value, for which the callee would be compiled again. And that is why arrays are given to a kernel with
+the same layout, and writable or not, every time.
+
+numba compiles one kernel at a time in a process, so that parts of the work are given to processes of their own.
+"""
+
+import contextlib
+import os
+import subprocess
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+
+from spherloc import kernel_cache, registry
+from spherloc.bounds import bounds_of
+from spherloc.cameras.equirectangular import Equirectangular
+from spherloc.consensus.two_point_search import search_two_point
+from spherloc.datasets.synthetic import SyntheticScene
+from spherloc.errors import InputError
+from spherloc.estimators.base import estimate, options_type
+from spherloc.narrowing import MOST_DESCENTS, NARROWINGS, descend, narrow, search_nearby
+from spherloc.problem import Problem
+from spherloc.refine import fitted_path, matches_of, noise_of, record, refined_path
+from spherloc.watch import Watch
+
+FASTEST = "ransac-2p"
+"""The estimator with the fewest kernels."""
+MOST_PROCESSES = 4
+"""Processes that compile at once: each takes 300 MB."""
+
+
+def warm_up(announce: Callable[[str], None] | None = None, estimators: Iterable[str] | None = None) -> None:
+    """Run estimators once on a tiny problem: a minute or two after an installation, a fraction of a second later.
+
+    ``estimators`` are the names of those that will be needed; all if it is None. ``announce`` is called with a sentence
+    to show if it will be long, and for every extension that fails here, which hinders nothing else.
+    """
+    runs: dict[str, Callable[[], object]] = {}
+    for name in registry.names("estimators") if estimators is None else estimators:
+        runs |= _runs(name)
+    cold = [part for part in (*SHARED, *runs) if not _is_compiled(part)]
+    if cold:
+        if announce is not None:
+            how_often = "once after an installation"
+            if kernel_cache.is_temporary():
+                how_often = "at every start, as no folder to keep them can be written (NUMBA_CACHE_DIR names another)"
+            announce(f"compiling the solvers, {how_often}: {_expected(cold)} …")
+        _compile_apart([part for part in cold if part in SHARED])
+        _compile_apart([part for part in cold if part not in SHARED and not registry.extension_of("estimators", part)])
+    for part, run in runs.items():
+        try:
+            run()
+        except InputError as error:
+            if not registry.extension_of("estimators", part):
+                raise
+            if announce is not None:
+                announce(f"{error} The others work.")
+    for part in cold:
+        _note_compiled(part)
+
+
+def tiny_problem() -> Problem:
+    """The problem that every estimator has to take: 8 matches, 2 of them wrong."""
+    return _scene().problem()
+
+
+def _scene() -> SyntheticScene:
+    camera = Equirectangular(width=2048, height=1024)  # sharp enough for every stage to have something to do
+    return SyntheticScene("warm-up", camera, correspondences=8, outlier_rate=0.25, noise_px=0.1, seed=0)
+
+
+def _uncertain_problem() -> Problem:
+    """Uncertain gravity, and enough matches to weigh them: the last step of all."""
+    return replace(_scene(), correspondences=40, noise_px=0.5, gravity_error_deg=0.5).problem()
+
+
+def _murky_problem() -> Problem:
+    """So murky that the exact search has to use all that it has."""
+    return replace(_scene(), correspondences=12, outlier_rate=0.6, noise_px=10.0).problem()
+
+
+def _refine() -> None:
+    """The refinement of a pose, which all estimators share."""
+    problem = _uncertain_problem()
+    assert problem.truth_cam_from_map is not None
+    aligned, options = problem.aligned, options_type(FASTEST)()
+    bounds = bounds_of(aligned, 3.0)
+    path, _ = refined_path(aligned, aligned.align_pose(problem.truth_cam_from_map), bounds, options)
+    record(aligned, path, bounds.pixels, options, measured=True)
+    fitted_path(aligned, path[-1], bounds.pixels, options)
+
+
+def _search() -> None:
+    """The search of two matches, and the fits at narrowing bounds, which all estimators share."""
+    problem = _uncertain_problem()
+    assert problem.truth_cam_from_map is not None
+    aligned, options = problem.aligned, options_type(FASTEST)()
+    bounds, matches, noise = bounds_of(aligned, 3.0), matches_of(aligned), noise_of(aligned, options)
+    search_two_point(aligned, bounds.pixels, 0, 100, 0.99, options.scoring, True, Watch())
+    start, limits = aligned.align_pose(problem.truth_cam_from_map), np.full(len(aligned.points), bounds.noise_px)
+    narrow(matches, bounds.pixels.copy(), limits, start.copy(), noise, np.empty((len(NARROWINGS), 3, 4)))
+    _, cost = descend(matches, limits, start.copy(), noise, np.empty((MOST_DESCENTS, 3, 4)))
+    search_nearby(matches, bounds.pixels.copy(), limits, start.copy(), noise, start.copy(), cost)
+
+
+SHARED: dict[str, Callable[[], object]] = {"refinement": _refine, "search": _search}
+"""What all estimators need, by name; compiled first."""
+
+
+def _runs(estimator: str) -> dict[str, Callable[[], object]]:
+    """What an estimator has to compute to have all of its kernels compiled, by name; the first is its own."""
+    runs: dict[str, Callable[[], object]] = {estimator: lambda: estimate(tiny_problem(), estimator)}
+    if estimator in (FASTEST, "mc-exact"):
+        runs[f"{estimator}, uncertain gravity"] = lambda: estimate(_uncertain_problem(), estimator)
+    if estimator == "mc-exact":
+        options = options_type(estimator)(bound_px=40.0)
+        runs[f"{estimator}, large bound"] = lambda: estimate(_murky_problem(), estimator, options)
+    return runs
+
+
+def _compile_apart(parts: Sequence[str]) -> None:
+    """Compile parts in processes of their own, as many at once as there are processors; nothing where that is one.
+
+    What fails there is compiled here later, and says why.
+    """
+    lanes = min(MOST_PROCESSES, len(parts), _processors())
+    if lanes < 2:
+        return
+    waiting, running = deque(parts), []
+    try:
+        while waiting or running:
+            while waiting and len(running) < lanes:
+                command = [sys.executable, "-m", "spherloc.warm_up", waiting.popleft()]
+                nothing = subprocess.DEVNULL
+                running.append(subprocess.Popen(command, stdin=nothing, stdout=nothing, stderr=nothing))
+            time.sleep(0.02)
+            running = [process for process in running if process.poll() is None]
+    except OSError:
+        return
+    finally:
+        for process in running:
+            process.kill()
+            process.wait()
+
+
+def _processors() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _expected(cold: Sequence[str]) -> str:
+    """How long compiling may take, in words."""
+    one_estimator = len(set(cold) - SHARED.keys()) <= 1
+    return "half a minute to a minute" if one_estimator else "one to three minutes"
+
+
+def _is_compiled(part: str) -> bool:
+    return _mark(part).exists()
+
+
+def _note_compiled(part: str) -> None:
+    with contextlib.suppress(OSError):
+        _mark(part).touch()
+
+
+def _mark(part: str) -> Path:
+    """The file that says that a part was compiled, by this numba for this Python."""
+    return kernel_cache.kernel_folder() / f"{part}-{sys.implementation.cache_tag}-numba{version('numba')}.compiled"
+
+
+if __name__ == "__main__":
+    part = sys.argv[1]
+    (_runs(part.partition(",")[0]) | SHARED)[part]()
+    _note_compiled(part)
