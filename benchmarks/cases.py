@@ -13,7 +13,15 @@ from spherloc.datasets.synthetic import SyntheticScene
 from spherloc.metrics import SUCCESS_DEG, SUCCESS_M
 from spherloc.problem import Problem
 
-PEERS = ("PoseLib rig", "PoseLib fisheye", "pycolmap rig", "pycolmap panorama", "OpenCV USAC")
+PEERS = (
+    "PoseLib rig",
+    "PoseLib fisheye",
+    "PoseLib up2p",
+    "pycolmap rig",
+    "pycolmap panorama",
+    "OpenCV USAC",
+    "SupeRANSAC",
+)
 PLAIN = "ransac-2p"
 ADAPTIVE = "ransac-2p to 99.9 %"
 
@@ -109,6 +117,10 @@ ARIA = {"rgb": (0.3, 0.02), "slam_left": (0.3, 0.02), "slam_right": (1.0, 0.03)}
 """Real images, and the errors (degrees, metres) up to which their pose counts as right."""
 
 
+ARIA_GEN2 = (1.0, 0.1)
+"""The same of the queries of Aria Gen 2, in a folder beside the others."""
+
+
 def aria_cases(folder: Path) -> list[Case]:
     """The real problems; a seed changes only the random draws of the methods. Empty if they are not there."""
     cases = []
@@ -120,4 +132,12 @@ def aria_cases(folder: Path) -> list[Case]:
         counts = {"mc-exact": 100, ADAPTIVE: 100, **dict.fromkeys(PEERS, 100), "mc": 3}
         title = f"real image {image}, {len(scene.problem())} matches"
         cases.append(Case(f"aria-{image.replace('_', '-')}", title, scene.problem, counts, degrees, metres))
+    scenes = [load_scene(path) for path in sorted((folder.parent / "aria_gen2").glob("*.toml"))]
+    if scenes:
+        title = f"{len(scenes)} real queries of Aria Gen 2, gravity known to 3 degrees"
+        methods = ("mc-exact", ADAPTIVE, "auto", "mc", PLAIN, *PEERS)
+        counts = dict.fromkeys(methods, 5 * len(scenes)) | {"mc": len(scenes)}
+        cases.append(
+            Case("aria-gen2", title, lambda seed: scenes[seed % len(scenes)].problem(seed), counts, *ARIA_GEN2)
+        )
     return cases

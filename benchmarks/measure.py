@@ -26,6 +26,7 @@ class Tally:
     times_ms: list[float] = field(default_factory=list)
     errors: list[tuple[float, float]] = field(default_factory=list)
     gaps: list[int] = field(default_factory=list)
+    inside_ms: list[float] = field(default_factory=list)
 
     def add(self, elapsed_s: float, problem: Problem, answer: Answer) -> None:
         """Count one answer; no pose is an infinite error."""
@@ -38,6 +39,8 @@ class Tally:
         self.errors.append(errors)
         if answer.certificate is not None:
             self.gaps.append(answer.certificate.gap)
+        if answer.inside_ms is not None:
+            self.inside_ms.append(answer.inside_ms)
 
     def summary(self, case: Case) -> dict[str, Any]:
         """Success, times and errors, as written to the results."""
@@ -53,6 +56,8 @@ class Tally:
         if right.any():
             summary["median_error_deg"] = _round(np.median(degrees[right]))
             summary["median_error_m"] = _round(np.median(metres[right]))
+        if self.inside_ms:
+            summary["median_inside_ms"] = _round(np.median(self.inside_ms))
         if self.gaps:
             summary["proven_optimal"] = float(np.mean(np.array(self.gaps) <= 0))
             summary["mean_gap"] = float(np.mean(self.gaps))

@@ -26,6 +26,8 @@ class Answer:
     """Pose (3, 4), or None."""
     certificate: Certificate | None = None
     """What is proven, by the methods that prove anything."""
+    inside_ms: float | None = None
+    """Time inside a compiled library whose RANSAC is a loop written in Python here, ms."""
 
 
 Solve = Callable[[], Answer]
@@ -68,6 +70,7 @@ def our_methods() -> dict[str, Method]:
     methods = [_ours("mc", "mc", bound_px=BOUND_PX), _ours("ransac-2p", "ransac-2p", bound_px=BOUND_PX)]
     if "mc-exact" in registry.names("estimators"):
         methods.insert(0, _ours("mc-exact", "mc-exact", bound_px=BOUND_PX))
+        methods.append(_ours("auto", "auto", bound_px=BOUND_PX))
     methods.append(
         _ours(
             "ransac-2p to 99.9 %",

@@ -1,12 +1,15 @@
 """The peers: each gets the same correspondences in the form that it takes, prepared before the clock starts.
 
 No released peer has a robust path for known gravity or takes bare bearings, so bearings are projected into a camera
-that the peer knows. All of them end with a refinement of the pose, as ours do. The threshold of each is ours, 3 px of
+that the peer knows; PoseLib's minimal solver for known gravity gets a RANSAC of ours around it. All of them end with a
+refinement of the pose, as ours do. The threshold of each is ours, 3 px of
 the scene's camera, times the median of (peer's pixels per scene pixel) over the correspondences it gets; the ratio at
 one of them is sqrt |det| of d peer pixel / d scene pixel.
 """
 
+import time
 from collections.abc import Callable
+from importlib.util import find_spec
 from typing import Any
 
 import cv2
@@ -79,6 +82,26 @@ def _front(problem: Problem, most_rad: float) -> IntArray:
     return np.flatnonzero(problem.usable & (np.nan_to_num(problem.bearings[:, 2], nan=-1.0) > np.cos(most_rad)))
 
 
+def _on_faces(
+    rows: IntArray, faces: IntArray, pixels: FloatArray, points: FloatArray, used: IntArray
+) -> tuple[list[FloatArray], list[FloatArray]]:
+    """Pixels and points of the correspondences ``rows`` by face, as PoseLib takes them."""
+    on = [rows[faces[rows] == face] for face in used]
+    return [pixels[some] for some in on], [points[some] for some in on]
+
+
+def _rig_cameras(used: IntArray) -> tuple[list[Any], list[dict[str, Any]]]:
+    """PoseLib's extrinsics and cameras of the faces ``used``."""
+    extrinsics = []
+    for face in used:
+        extrinsic = poselib.CameraPose()
+        extrinsic.R = FACES[face]
+        extrinsics.append(extrinsic)
+    size = int(2 * FOCAL_PX)
+    camera = {"model": "SIMPLE_PINHOLE", "width": size, "height": size, "params": [FOCAL_PX, 0.0, 0.0]}
+    return extrinsics, [camera] * len(used)
+
+
 def _rig_data(problem: Problem) -> tuple[IntArray, IntArray, FloatArray, float]:
     """Rows of the usable correspondences (K,), their faces (K,), pixels (K, 2) there, and the threshold, px."""
     rows = np.flatnonzero(problem.usable)
@@ -113,19 +136,73 @@ def _poselib_fisheye(problem: Problem, seed: int) -> Solve:
 def _poselib_rig(problem: Problem, seed: int) -> Solve:
     rows, faces, pixels, threshold = _rig_data(problem)
     used = np.unique(faces)
-    per_face = [pixels[faces == face] for face in used], [problem.points[rows[faces == face]] for face in used]
-    extrinsics = []
-    for face in used:
-        extrinsic = poselib.CameraPose()
-        extrinsic.R = FACES[face]
-        extrinsics.append(extrinsic)
-    size = int(2 * FOCAL_PX)
-    cameras = [{"model": "SIMPLE_PINHOLE", "width": size, "height": size, "params": [FOCAL_PX, 0.0, 0.0]}] * len(used)
+    per_face = _on_faces(np.arange(len(rows)), faces, pixels, problem.points[rows], used)
+    extrinsics, cameras = _rig_cameras(used)
     options = {**_POSELIB, "max_reproj_error": threshold, "seed": seed}
 
     def solve() -> Answer:
         found, _ = poselib.estimate_generalized_absolute_pose(*per_face, extrinsics, cameras, options, {})
         return _answer(found.R, found.t)
+
+    return solve
+
+
+def _poselib_up2p(problem: Problem, seed: int) -> Solve:
+    """The minimal solver for known gravity in a RANSAC written here: truncated squares, refined at every improvement.
+
+    Two matches fix a pose with roll and pitch as measured; the refinement, PoseLib's of the rig, has six unknowns.
+    """
+    rows, faces, pixels, threshold = _rig_data(problem)
+    aligned = problem.aligned
+    bearings, points = problem.bearings[rows] @ aligned.camera_turn.T, problem.points[rows] @ aligned.map_turn.T
+    turned = FACES[faces]
+    used = np.unique(faces)
+    extrinsics, cameras = _rig_cameras(used)
+    options = {"max_iterations": 25, "loss_type": "TRUNCATED", "loss_scale": threshold}
+
+    def squares(rotation: FloatArray, translation: FloatArray) -> FloatArray:
+        """Squared errors (N,) on the faces, px^2, of a pose between the camera and the map."""
+        rays = np.einsum("nij,nj->ni", turned, problem.points[rows] @ rotation.T + translation)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            errors = ((to_plane(rays) - pixels) ** 2).sum(axis=1)
+        return np.where(rays[:, 2] > 0.0, errors, np.inf)
+
+    def solve() -> Answer:
+        rng = np.random.default_rng(seed)
+        best, least, inside_s, drawn, needed = None, np.inf, 0.0, 0, MOST_ITERATIONS
+        while drawn < max(100, needed) and drawn < MOST_ITERATIONS:
+            pair = rng.choice(len(rows), 2, replace=False)
+            drawn += 1
+            start = time.perf_counter()
+            found = poselib.up2p(bearings[pair], points[pair])
+            inside_s += time.perf_counter() - start
+            for level in found:
+                # Between the camera and the map, and back from their aligned frames.
+                rotation = aligned.camera_turn.T @ level.R @ aligned.map_turn
+                translation = aligned.camera_turn.T @ level.t
+                errors = squares(rotation, translation)
+                cost = np.minimum(errors, threshold**2).sum()
+                if cost >= least:
+                    continue
+                start = time.perf_counter()
+                state = poselib.CameraPose()
+                state.R, state.t = rotation, translation
+                per_face = _on_faces(np.flatnonzero(errors < threshold**2), faces, pixels, problem.points[rows], used)
+                if sum(map(len, per_face[0])) >= 4:
+                    state, _ = poselib.refine_generalized_absolute_pose(*per_face, state, extrinsics, cameras, options)
+                inside_s += time.perf_counter() - start
+                refined = squares(state.R, state.t)
+                if np.minimum(refined, threshold**2).sum() < cost:
+                    errors, cost, rotation, translation = (
+                        refined,
+                        np.minimum(refined, threshold**2).sum(),
+                        state.R,
+                        state.t,
+                    )
+                best, least = pose(np.asarray(rotation), np.asarray(translation)), cost
+                right = np.mean(errors < threshold**2) ** 2
+                needed = np.log(1.0 - CONFIDENCE) / np.log1p(-min(max(right, 1e-9), 1.0 - 1e-9))
+        return Answer(best, inside_ms=1e3 * inside_s)
 
     return solve
 
@@ -200,6 +277,47 @@ def _opencv_usac(problem: Problem, seed: int) -> Solve:
     return solve
 
 
+# --- SupeRANSAC -------------------------------------------------------------------------------------------------------
+
+
+_SUPERANSAC = {"max_iterations": MOST_ITERATIONS, "min_iterations": 100, "confidence": CONFIDENCE}
+
+
+def _superansac(problem: Problem, seed: int) -> Solve:
+    """Its own example's scoring and optimizations, with uniform samples as there is no order by quality.
+
+    It takes no seed, and points with negative coordinates make its search for neighbours fail, so that all are moved.
+    """
+    import pysuperansac
+
+    rows = _front(problem, FRONT_RAD)
+    settings = pysuperansac.RANSACSettings()
+    for name, value in _SUPERANSAC.items():
+        setattr(settings, name, value)
+    settings.inlier_threshold = BOUND_PX * pixel_ratio(problem, rows, to_plane)
+    settings.sampler = pysuperansac.SamplerType.Uniform
+    settings.scoring = pysuperansac.ScoringType.MAGSAC
+    settings.local_optimization = pysuperansac.LocalOptimizationType.NestedRANSAC
+    settings.final_optimization = pysuperansac.LocalOptimizationType.IteratedLSQ
+    pixels, points = to_plane(problem.bearings[rows]), problem.points[rows]
+    middle_px, low = 1.0 - pixels.min(axis=0, initial=0.0), points.min(axis=0, initial=0.0) - 1.0
+    data = np.ascontiguousarray(np.hstack([pixels + middle_px, points - low]))
+    size = np.ptp(data, axis=0)
+    box = [*(data.max(axis=0)[:2] + 1.0), *(size[2:] + 2.0)]
+    params = [FOCAL_PX, *middle_px]
+
+    def solve() -> Answer:
+        rotation, translation, *_ = pysuperansac.estimateAbsolutePose(
+            data, pysuperansac.CameraType.SimplePinhole, params, box, config=settings
+        )
+        rotation, translation = np.asarray(rotation), np.asarray(translation).ravel()
+        if not rotation.any():
+            return Answer(None)
+        return _answer(rotation, translation - rotation @ low)
+
+    return solve
+
+
 def peers() -> dict[str, Method]:
     """All of them by name."""
     rig = "sphere cut into six 90 degree pinhole faces"
@@ -213,8 +331,16 @@ def peers() -> dict[str, Method]:
             _colmap_panorama,
             {"camera": "EQUIRECTANGULAR", "threshold_factor": PANORAMA_SLACK, **_COLMAP},
         ),
+        Method(
+            "PoseLib up2p",
+            _poselib_up2p,
+            {"camera": rig, "gravity": "given", "max_iterations": MOST_ITERATIONS, "confidence": CONFIDENCE},
+        ),
         Method("OpenCV USAC", _opencv_usac, {"camera": "pinhole plane, points within 87 degrees", **usac}),
     )
+    if find_spec("pysuperansac"):
+        plane = {"camera": "pinhole plane, points within 87 degrees", "scoring": "MAGSAC", **_SUPERANSAC}
+        methods += (Method("SupeRANSAC", _superansac, plane),)
     return {method.name: method for method in methods}
 
 
