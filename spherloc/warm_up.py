@@ -48,7 +48,8 @@ def warm_up(announce: Callable[[str], None] | None = None, estimators: Iterable[
     runs: dict[str, Callable[[], object]] = {}
     for name in registry.names("estimators") if estimators is None else estimators:
         runs |= _runs(name)
-    cold = [part for part in (*SHARED, *runs) if not _is_compiled(part)]
+    own = [part for part in (*SHARED, *runs) if not registry.extension_of("estimators", part)]
+    cold = [part for part in own if not _is_compiled(part)]
     if cold:
         if announce is not None:
             how_often = "once after an installation"
@@ -56,7 +57,7 @@ def warm_up(announce: Callable[[str], None] | None = None, estimators: Iterable[
                 how_often = "at every start, as no folder to keep them can be written (NUMBA_CACHE_DIR names another)"
             announce(f"compiling the solvers, {how_often}: {_expected(cold)} …")
         _compile_apart([part for part in cold if part in SHARED])
-        _compile_apart([part for part in cold if part not in SHARED and not registry.extension_of("estimators", part)])
+        _compile_apart([part for part in cold if part not in SHARED])
     for part, run in runs.items():
         try:
             run()
