@@ -8,8 +8,6 @@ which is steadier than the matrix where there are few matches).
 """
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from spherloc.problem import AlignedProblem
 from spherloc.types import BoolArray, FloatArray, IntArray
@@ -64,6 +62,9 @@ def _groups(points: FloatArray, bearings: FloatArray) -> IntArray:
     count = len(points)
     if by_point.max() == count - 1 and by_bearing.max() == count - 1:
         return np.arange(count)
+    from scipy.sparse import coo_array  # takes a quarter of a second
+    from scipy.sparse.csgraph import connected_components
+
     shape = (int(by_point.max()) + int(by_bearing.max()) + 2,) * 2
     edges = coo_array((np.ones(count), (by_point, by_point.max() + 1 + by_bearing)), shape=shape)
     return connected_components(edges, directed=False)[1][by_point].astype(np.int64)

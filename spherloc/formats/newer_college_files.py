@@ -8,7 +8,6 @@ from itertools import pairwise
 from pathlib import Path, PurePosixPath
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
 from spherloc.errors import InputError, reason, shorten
@@ -74,6 +73,8 @@ def read_cloud(path: Path) -> NDArray[np.float32]:
 
     Raises ``InputError`` for what is no such file or holds no finite point.
     """
+    import trimesh  # takes half a second
+
     _check_header(path)
     try:
         cloud = trimesh.load(path, file_type="ply", process=False)

@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import trimesh
 from numpy.typing import ArrayLike, NDArray
 
 from spherloc.types import FloatArray
@@ -162,6 +161,8 @@ class MeshBuilder:
         fine: int = 2,
     ) -> None:
         """A bumpy ball: the crown of a tree, a bush, a head."""
+        import trimesh  # takes half a second
+
         ball = trimesh.creation.icosphere(subdivisions=fine)
         direction = np.asarray(ball.vertices)
         shape = 1 + bumps * rng.uniform(-1, 1, len(direction))

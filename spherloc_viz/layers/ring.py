@@ -4,7 +4,6 @@ On the ring, the direction of a yaw is where the camera looks with that yaw.
 """
 
 import numpy as np
-from scipy.ndimage import maximum_filter1d
 
 from spherloc.geometry import wrap_angle, yaw_of
 from spherloc.types import ByteArray, FloatArray
@@ -119,6 +118,8 @@ def peaks(counts: np.ndarray, reach: int, most: int) -> np.ndarray:
     At a peak no count within ``reach`` places is larger, and no other peak is that close. Equal ones come in an order
     that jumps around the circle, so that a few of many do not lie side by side.
     """
+    from scipy.ndimage import maximum_filter1d  # takes a quarter of a second
+
     highest = maximum_filter1d(counts, 2 * reach + 1, mode="wrap")
     candidates = np.flatnonzero((counts == highest) & (counts > 0))
     candidates = candidates[np.lexsort((candidates * GOLDEN % 1.0, -counts[candidates]))]

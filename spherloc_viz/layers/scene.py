@@ -5,7 +5,6 @@ from functools import cache, partial
 
 import cv2
 import numpy as np
-import trimesh
 
 from spherloc.cameras.base import Camera, in_image
 from spherloc.cameras.equirectangular import Equirectangular
@@ -33,6 +32,8 @@ COVERAGE = Equirectangular(512, 256)
 
 @cache
 def _icosphere() -> tuple[np.ndarray, np.ndarray]:
+    import trimesh  # takes half a second
+
     mesh = trimesh.creation.icosphere(subdivisions=3)
     return np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
 
