@@ -8,14 +8,14 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional, arg
 
+from spherloc_viz.recording import REVIEW_SUFFIX
+
 RECORDINGS = Path("recordings")
 RangeText = Annotated[str | None, arg(metavar="RANGE")]
 
 
 def without_reviews(files: Sequence[Path]) -> tuple[Path, ...]:
     """What a shell's pattern such as ``*.rrd`` is meant to find; all if there is nothing but labels and notes."""
-    from spherloc_viz.recording.reviews import REVIEW_SUFFIX
-
     return tuple(file for file in files if not file.name.endswith(REVIEW_SUFFIX)) or tuple(files)
 
 

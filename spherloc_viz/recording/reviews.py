@@ -13,6 +13,7 @@ from rerun.chunk import Chunk, LazyChunkStream, RrdReader
 from rerun.error_utils import RerunWarning
 
 from spherloc.errors import InputError, RecordingError, show
+from spherloc_viz.recording import REVIEW_SUFFIX
 from spherloc_viz.recording.content.properties import APPLICATION_ID, REVIEW_ENTITY, REVIEW_PROPERTY
 from spherloc_viz.recording.content.text import plain
 
@@ -66,8 +67,6 @@ def _reader(path: Path) -> RrdReader:
             raise ValueError(str(warning)) from warning
 
 
-REVIEW_SUFFIX = ".review.rrd"
-"""Ends the name of a review file, which otherwise is that of its run."""
 MOST_LABELS = 20
 MOST_LABEL_CHARACTERS = 40
 MOST_NOTE_CHARACTERS = 4_000

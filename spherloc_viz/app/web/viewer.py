@@ -18,10 +18,11 @@ from aiohttp import web
 
 from spherloc.errors import InputError, RecordingError, SpherlocError, show
 from spherloc_viz.app.web.guard import SAFE, open_socket, refusal
+from spherloc_viz.recording import REVIEW_SUFFIX
 from spherloc_viz.recording.content.columns import TIMELINE
 from spherloc_viz.recording.index.run_index import RunIndex
 from spherloc_viz.recording.rerun_program import NAMES, viewer_folder, viewer_version
-from spherloc_viz.recording.reviews import REVIEW_SUFFIX, reviewed_name
+from spherloc_viz.recording.reviews import reviewed_name
 from spherloc_viz.recording.run_row import RunRow
 from spherloc_viz.recording.sandbox.examiner import examine, resolve_inside
 from spherloc_viz.recording.viewer import labels_of, step_of
