@@ -146,7 +146,7 @@ install_python() {
     die "pip could not install the packages, for the reason above; mend that and try again."
   if [[ $target != @(lint|docs) ]]; then
     say "compiling the solvers, once: one to three minutes"
-    "$venv" -c 'from spherloc.warm_up import warm_up; warm_up()' ||
+    "$venv" -c "from spherloc.warm_up import warm_up; warm_up(estimators=$([ "$target" = play ] && echo "['mc']" || echo None))" ||
       die "the solvers could not be prepared, for the reason above; mend that and try again."
   fi
   printf '%s\n' "$state" >"$stamp$target"

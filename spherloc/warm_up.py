@@ -56,8 +56,8 @@ def warm_up(announce: Callable[[str], None] | None = None, estimators: Iterable[
             if kernel_cache.is_temporary():
                 how_often = "at every start, as no folder to keep them can be written (NUMBA_CACHE_DIR names another)"
             announce(f"compiling the solvers, {how_often}: {_expected(cold)} …")
-        _compile_apart([part for part in cold if part in SHARED])
-        _compile_apart([part for part in cold if part not in SHARED])
+        if _processors() > 1:
+            _compile_in_order(cold)
     for part, run in runs.items():
         try:
             run()
@@ -68,6 +68,14 @@ def warm_up(announce: Callable[[str], None] | None = None, estimators: Iterable[
                 announce(f"{error} The others work.")
     for part in cold:
         _note_compiled(part)
+
+
+def compile_apart(estimator: str, stopped: Callable[[], bool]) -> None:
+    """Compile what an estimator needs in processes of low priority, and none of it here.
+
+    Returns when that is done, at once if nothing is missing, or soon after ``stopped`` says so.
+    """
+    _compile_in_order([part for part in (*SHARED, *_runs(estimator)) if not _is_compiled(part)], stopped, niceness=10)
 
 
 def tiny_problem() -> Problem:
@@ -129,19 +137,23 @@ def _runs(estimator: str) -> dict[str, Callable[[], object]]:
     return runs
 
 
-def _compile_apart(parts: Sequence[str]) -> None:
-    """Compile parts in processes of their own, as many at once as there are processors; nothing where that is one.
+def _compile_in_order(parts: Sequence[str], stopped: Callable[[], bool] = lambda: False, niceness: int = 0) -> None:
+    """Compile parts in processes of their own, first those that all estimators share.
 
-    What fails there is compiled here later, and says why.
+    What fails there is compiled later by who needs it, and says why.
     """
-    lanes = min(MOST_PROCESSES, len(parts), _processors())
-    if lanes < 2:
-        return
+    _compile_at_once([part for part in parts if part in SHARED], stopped, niceness)
+    _compile_at_once([part for part in parts if part not in SHARED], stopped, niceness)
+
+
+def _compile_at_once(parts: Sequence[str], stopped: Callable[[], bool], niceness: int) -> None:
+    """As many at once as there are processors."""
+    lanes = min(MOST_PROCESSES, _processors())
     waiting, running = deque(parts), []
     try:
-        while waiting or running:
+        while (waiting or running) and not stopped():
             while waiting and len(running) < lanes:
-                command = [sys.executable, "-m", "spherloc.warm_up", waiting.popleft()]
+                command = [sys.executable, "-m", "spherloc.warm_up", waiting.popleft(), str(niceness)]
                 nothing = subprocess.DEVNULL
                 running.append(subprocess.Popen(command, stdin=nothing, stdout=nothing, stderr=nothing))
             time.sleep(0.02)
@@ -180,5 +192,7 @@ def _mark(part: str) -> Path:
 
 if __name__ == "__main__":
     part = sys.argv[1]
+    if hasattr(os, "nice"):
+        os.nice(int(sys.argv[2]))
     (_runs(part.partition(",")[0]) | SHARED)[part]()
     _note_compiled(part)

@@ -20,6 +20,7 @@ from spherloc.files import is_folder
 from spherloc.warm_up import warm_up
 from spherloc_viz.app.audience import Audience
 from spherloc_viz.app.catalog import Catalog
+from spherloc_viz.app.compilation import Compilation, first_and_later
 from spherloc_viz.app.review.run_library import RunLibrary
 from spherloc_viz.app.services import Services
 from spherloc_viz.app.session import Session
@@ -67,8 +68,12 @@ def serve(
     catalog, keep_bytes = Catalog(scene), kept_bytes(keep_gigabytes)
     with open_socket(host, port) as listener, contextlib.ExitStack() as stack:
         _answer_quickly()
-        _prepare()
-        services = Services(catalog, allowed_roots(scene, allow))
+        first, later = first_and_later()
+        _prepare(first)
+        compilation = Compilation(later)
+        stack.callback(compilation.close)
+        compilation.start()
+        services = Services(catalog, allowed_roots(scene, allow), compilation=compilation)
         sessions = Sessions(services)
         stack.callback(services.downloads.close)
         if record:
@@ -90,15 +95,15 @@ def serve(
         asyncio.run(_serve_until_told(door, access, listener))
 
 
-def _prepare() -> None:
-    """Warm up; an extension that cannot be used is named once, and the page goes on without it."""
+def _prepare(estimators: Sequence[str]) -> None:
+    """Warm up what the first run needs; an extension that cannot be used is named once, and the page goes on."""
     told: list[str] = []
 
     def tell(sentence: str) -> None:
         told.append(sentence)
         _say(sentence)
 
-    warm_up(tell)
+    warm_up(tell, estimators)
     for plugin in extensions():
         if plugin.problem and not any(line.startswith(plugin.problem) for line in told):
             tell(plugin.problem)

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from spherloc_viz.app.catalog import Catalog
+from spherloc_viz.app.compilation import Compilation
 from spherloc_viz.app.presented import Presented
 from spherloc_viz.app.review.run_library import RunLibrary
 from spherloc_viz.app.web.downloads import Downloads
@@ -23,5 +24,7 @@ class Services:
     """The recordings that pages review; None if there is no folder of them."""
     downloads: Downloads = field(default_factory=Downloads)
     """Files that pages may fetch."""
+    compilation: Compilation | None = None
+    """Compiles the solvers that are not yet; None if all are ready."""
     presented: Presented = field(default_factory=Presented)
     """What pages of an audience show."""

@@ -18,7 +18,7 @@ from spherloc.estimators import default_options, estimate
 from spherloc.problem import Problem
 from spherloc.trace import Trace
 from spherloc.types import FloatArray
-from spherloc.watch import Cancelled
+from spherloc.watch import Cancelled, Watch
 from spherloc_viz.app.catalog import SceneRequest
 from spherloc_viz.app.controls.controls import Controls
 from spherloc_viz.app.edits import Edits
@@ -171,6 +171,11 @@ class Session:
         if run is not None:
             self.open(RunRequest(run.request.scene, name, None))
 
+    def prepare_estimator(self, name: str, watch: Watch) -> None:
+        """Return when an estimator is compiled; raises ``Cancelled`` if ``watch`` ends that."""
+        if self._services.compilation is not None:
+            self._services.compilation.wait_for(name, watch, self._status.say)
+
     def _move_camera(self, true_camera: TrueCamera) -> None:
         self._controls.scene.true_camera = true_camera
         self.changed()
@@ -259,6 +264,7 @@ class Session:
             problem = self._problem(request.scene)
             watch = self._controls.slow.begin()
             try:
+                self.prepare_estimator(request.estimator, watch)
                 trace = estimate(problem, request.estimator, request.options, request.scene.seed, watch)
             finally:
                 self._controls.slow.end()

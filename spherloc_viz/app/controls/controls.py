@@ -14,6 +14,7 @@ from spherloc.diagnosis import Diagnosis
 from spherloc.errors import InputError
 from spherloc.trace import Trace
 from spherloc.types import FloatArray
+from spherloc.watch import Watch
 from spherloc_viz import share, style
 from spherloc_viz.app.catalog import Catalog, SceneRequest
 from spherloc_viz.app.controls.estimator_controls import EstimatorControls
@@ -119,6 +120,9 @@ class Owner(Protocol):
     def use_estimator(self, name: str) -> None:
         """Go on with another estimator."""
 
+    def prepare_estimator(self, name: str, watch: Watch) -> None:
+        """Return when an estimator is compiled; raises ``Cancelled`` if ``watch`` ends that."""
+
     def step_history(self, by: int) -> None:
         """Undo (-1) or redo (+1)."""
 
@@ -157,7 +161,7 @@ class Controls:
         with tabs.add_tab("Play"):
             self._build_play(gui)
         with tabs.add_tab("Compare"):
-            self.compare = ComparePanel(gui, touches, owner.use_estimator, owner.redraw)
+            self.compare = ComparePanel(gui, touches, owner.use_estimator, owner.redraw, owner.prepare_estimator)
         with tabs.add_tab("Sweep"):
             self._sweep = SweepPanel(gui, touches, self._chosen_sweep, services.recorder)
         with tabs.add_tab("Open"):

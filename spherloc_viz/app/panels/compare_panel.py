@@ -95,9 +95,11 @@ class ComparePanel:
         touches: Touches,
         use: Callable[[str], None],
         changed: Callable[[object], None],
+        prepare: Callable[[str, Watch], None] = lambda name, watch: None,
     ) -> None:
-        """``use`` is called with the estimator of a row that is pressed, ``changed`` when there is more to show."""
-        self._use, self._changed = use, changed
+        """``use`` is called with the estimator of a row that is pressed, ``changed`` when there is more to show,
+        ``prepare`` before an estimator runs, which may take long and is ended by the watch."""
+        self._use, self._changed, self._prepare = use, changed, prepare
         self._names = ordered(usable_estimators())
         self._ticked = {name for name in self._names if name in TICKED}
         gui.add_html(f'<div data-view="{VIEW}"></div>')
@@ -206,6 +208,7 @@ class ComparePanel:
             if stop.is_set() or self._closed:
                 return
             try:
+                self._prepare(name, watch)
                 entries = (*entries, Entry(_run(trace, name, watch)))
             except Cancelled:
                 return
