@@ -234,12 +234,15 @@ def play(
 
     spherloc play panorama_outliers_90 --port 9000
 
+    spherloc play RUN.rrd
+
     spherloc play --allow ~/maps
 
     spherloc play --host 0.0.0.0
 
     Args:
-        scene: Scene file (TOML) or bundled scene's name to start with; a bundled one if not given.
+        scene: Scene file (TOML), bundled scene's name, or recording (.rrd), whose run is opened, to start with; a
+            bundled scene if not given.
         host: Address to listen on. Beyond this machine the printed links carry tokens: one link is yours, the other is
             for an audience, which can only look.
         port: Port to listen on; 0 takes a free one.

@@ -71,6 +71,7 @@ FLOORS = (
         "spherloc_viz.sweep",
         "spherloc_viz.scene_list",
         "spherloc_viz.progress",
+        "spherloc_viz.showing",
         "spherloc_viz.cli",
         "spherloc_viz.start",
     ),
