@@ -55,6 +55,7 @@ FLOORS = (
         "spherloc_viz.style",
         "spherloc_viz.layers",
         "spherloc_viz.options",
+        "spherloc_viz.given_files",
         "spherloc_viz.share",
         "spherloc_viz.plugins",
         "spherloc_viz",

@@ -14,10 +14,11 @@ import numpy as np
 
 from spherloc import registry
 from spherloc.errors import InputError, reason, show
-from spherloc.files import is_file, read_file, reading
+from spherloc.files import is_file, read_file, reading, size_of
 from spherloc.problem import Problem
 
 MAX_BYTES = 1_000_000
+ADVICE = "give the path of a scene file (TOML) or a bundled scene's name"
 _INSTALLED = Path(__file__).resolve().parent / "scenes"
 BUNDLED = _INSTALLED if _INSTALLED.is_dir() else Path(__file__).resolve().parents[2] / "scenes"
 """An installation has them inside of this package, a checkout beside its packages."""
@@ -95,7 +96,7 @@ def read_table(path: Path) -> dict[str, Any]:
 
     Raises ``InputError`` for a missing file and for one that is no TOML.
     """
-    with reading(path, "give the path of a scene file (TOML) or a bundled scene's name"):
+    with reading(path, ADVICE):
         content = read_file(path, MAX_BYTES)
     try:
         return tomllib.loads(content.decode("utf-8"))
@@ -105,6 +106,12 @@ def read_table(path: Path) -> dict[str, Any]:
         raise InputError(f"{path}: not valid TOML: {reason(error)}; correct it there.") from None
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: no usable scene file ({reason(error)}); correct or replace it.") from None
+
+
+def check_there(path: Path) -> None:
+    """Raise ``InputError`` if there is no such scene file."""
+    with reading(path, ADVICE):
+        size_of(path)
 
 
 def bundled_scenes() -> dict[str, Path]:

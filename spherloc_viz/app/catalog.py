@@ -12,8 +12,8 @@ from spherloc.datasets.map_scene import MapScene
 from spherloc.datasets.synthetic import SyntheticScene
 from spherloc.datasets.variation import Variation
 from spherloc.problem import Problem
+from spherloc_viz.given_files import is_recording
 from spherloc_viz.recording.replay.scene import load_recorded_scene
-from spherloc_viz.share import is_recording
 
 MOST_BRIEF = 8
 """Recorded problems that a page offers beside its scenes."""

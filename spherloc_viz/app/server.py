@@ -33,13 +33,13 @@ from spherloc_viz.app.web.front_door import FrontDoor
 from spherloc_viz.app.web.guard import open_socket
 from spherloc_viz.app.web.viewer import ViewerRoom, of_index
 from spherloc_viz.app.web.viser_internals import role_header, set_theme, start_viser, stop_viser
+from spherloc_viz.given_files import is_recording
 from spherloc_viz.plugins import extensions
 from spherloc_viz.recording.index.run_index import RunIndex
 from spherloc_viz.recording.replay.scene import RecordedScene, recorded_options
 from spherloc_viz.recording.sandbox.examiner import end_examining
 from spherloc_viz.recording.storage.recorder import Recorder
 from spherloc_viz.recording.storage.room import KEEP_GIGABYTES, kept_bytes
-from spherloc_viz.share import is_recording
 
 SWITCH_S = 0.001
 NOT_ENCRYPTED = (

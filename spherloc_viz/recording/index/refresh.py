@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Protocol, TypeVar
 
 from spherloc.errors import RecordingError
+from spherloc_viz.given_files import REVIEW_SUFFIX
 from spherloc_viz.recording.index.rows import put
-from spherloc_viz.recording.reviews import REVIEW_SUFFIX, UNREADABLE, has_review, review_path
+from spherloc_viz.recording.reviews import UNREADABLE, has_review, review_path
 from spherloc_viz.recording.run_row import RunRow
 from spherloc_viz.recording.sandbox.examiner import Examiners, check_name, examine_all
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from spherloc.errors import RecordingError
+from spherloc_viz.given_files import REVIEW_SUFFIX
 from spherloc_viz.recording.rerun_program import rerun_command, rerun_environment
-from spherloc_viz.recording.reviews import REVIEW_SUFFIX
 from spherloc_viz.recording.sandbox.examiner import Examiner, ExaminerError
 from spherloc_viz.recording.storage.unfinished import target_of, unfinished
 
