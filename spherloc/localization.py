@@ -233,7 +233,10 @@ def estimate_absolute_pose(
 
 
 def as_camera(camera: Any) -> Camera:
-    """A camera from whatever describes one, see ``localize``; raises ``InputError`` for anything else."""
+    """A camera from whatever describes one, see ``localize``.
+
+    Raises ``InputError`` for anything else, and ``CalibrationError``, which is one, for a camera that cannot be used.
+    """
     if isinstance(camera, Camera):
         return camera
     if isinstance(camera, str | Path):

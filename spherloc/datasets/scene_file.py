@@ -136,7 +136,7 @@ def check_keys(table: Mapping[str, Any], required: set[str], optional: set[str],
 
 
 def text(table: Mapping[str, Any], key: str, where: str) -> str:
-    """A text value that must exist."""
+    """A text value that must exist; raises ``InputError`` otherwise."""
     value = table.get(key)
     if not isinstance(value, str) or not value:
         raise InputError(f"{where}: key '{key}' must be a text; add {key} = \"...\".")
@@ -144,7 +144,7 @@ def text(table: Mapping[str, Any], key: str, where: str) -> str:
 
 
 def section(table: Mapping[str, Any], key: str, where: str) -> dict[str, Any]:
-    """A sub-table; empty if absent."""
+    """A sub-table; empty if absent. Raises ``InputError`` for another value."""
     value = table.get(key, {})
     if not isinstance(value, dict):
         raise InputError(f"{where}: '{key}' must be a section [{key}].")
@@ -152,7 +152,7 @@ def section(table: Mapping[str, Any], key: str, where: str) -> dict[str, Any]:
 
 
 def number(table: Mapping[str, Any], key: str, where: str, lowest: float, highest: float) -> float:
-    """A finite number within limits that must exist."""
+    """A finite number within limits that must exist; raises ``InputError`` otherwise."""
     value = table.get(key)
     if isinstance(value, bool) or not isinstance(value, int | float) or not lowest <= value <= highest:
         raise InputError(f"{where}: {key} is {show(value)}; give a number from {lowest:g} to {highest:g}.")
@@ -160,7 +160,7 @@ def number(table: Mapping[str, Any], key: str, where: str, lowest: float, highes
 
 
 def integer(table: Mapping[str, Any], key: str, where: str, lowest: int, highest: int) -> int:
-    """A whole number within limits that must exist."""
+    """A whole number within limits that must exist; raises ``InputError`` otherwise."""
     value = table.get(key)
     if isinstance(value, bool) or not isinstance(value, int) or not lowest <= value <= highest:
         raise InputError(f"{where}: {key} is {show(value)}; give a whole number from {lowest} to {highest}.")
@@ -168,7 +168,7 @@ def integer(table: Mapping[str, Any], key: str, where: str, lowest: int, highest
 
 
 def numbers(value: Any, shape: tuple[int, ...], key: str, where: str) -> np.ndarray:
-    """A (nested) list of finite numbers of the given shape."""
+    """A (nested) list of finite numbers of the given shape; raises ``InputError`` for anything else."""
     try:
         array = np.array(value, dtype=object)
         real = all(isinstance(item, int | float) and not isinstance(item, bool) for item in array.flat)

@@ -37,8 +37,9 @@ def pose_sd(
 ) -> tuple[float, float, float]:
     """Standard deviations of rotation (rad), position (m) and tilt (rad) in their worst directions.
 
-    They are those of the masked correspondences less the ``drop`` on which the position hangs most: where the others
-    leave a valley of poses open, some pose in it agrees with a wrong match too, which then seems to fix it.
+    They are those of the correspondences of ``mask`` (M,) at an aligned pose (3, 4), less the ``drop`` on which the
+    position hangs most: where the others leave a valley of poses open, some pose in it agrees with a wrong match too,
+    which then seems to fix it.
     """
     each = _information(aligned, cam_from_map, mask) / noise_px**2
     weight = max(gravity_sd_rad, LEAST_GRAVITY_SD_RAD) ** -2.0
@@ -128,7 +129,7 @@ def search(aligned: AlignedProblem, bound_px: float, options: RefinementOptions)
 
 
 def subset(aligned: AlignedProblem, mask: BoolArray) -> AlignedProblem:
-    """The masked correspondences alone."""
+    """The correspondences of ``mask`` (M,) alone."""
     names = ("index", "bearings", "points", "pixel_from_bearing", "radians_per_pixel")
     return replace(aligned, **{name: np.ascontiguousarray(getattr(aligned, name)[mask]) for name in names})
 
@@ -154,7 +155,8 @@ def certify(trace: Trace) -> Certificate | None:
 def free_fit(aligned: AlignedProblem, starts: list[FloatArray], bound_px: float) -> Fit | None:
     """The pose with the most support within ``WIDER`` times the bound where gravity is not believed.
 
-    From ``starts``, and from a search that allows for a wrong gravity and tightens its bound step by step.
+    From the aligned poses ``starts``, each (3, 4), and from a search that allows for a wrong gravity and tightens its
+    bound step by step.
     """
     free = replace(aligned, gravity_bound_rad=0.0, gravity_sd_rad=np.inf)
     wide, options = WIDER * bound_px, RefinementOptions(gravity_sd_deg=np.inf)

@@ -44,7 +44,10 @@ class Render:
 def draw(
     world: World, camera: Camera, cam_from_world: FloatArray, conditions: Conditions = CLEAR, seed: int = 0
 ) -> Render:
-    """Cast a ray through every pixel, and four more where surfaces meet. ``seed`` places occluders and makes noise."""
+    """Cast a ray through every pixel, and four more where surfaces meet.
+
+    ``cam_from_world`` is the camera's pose (3, 4); ``seed`` places occluders and makes noise.
+    """
     rotation, centre = cam_from_world[:, :3], camera_centre(cam_from_world)
     rays = with_occluders(world, centre, conditions.occluders, seed)
     lighting = Lighting(world, rays, conditions)
@@ -164,7 +167,7 @@ def image_path(
 ) -> Path:
     """Where the picture is kept, whether or not it was drawn yet; its distances are beside it with the suffix .npz.
 
-    ``name`` is the stem of the file, for people to read.
+    ``cam_from_world`` is the camera's pose (3, 4); ``name`` is the stem of the file, for people to read.
     """
     place = np.ascontiguousarray(cam_from_world, np.float64).tobytes()
     key = key_of(*world.identity(), sorted(camera.to_dict().items()), place, conditions, seed, sources_hash())
