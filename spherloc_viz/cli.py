@@ -344,7 +344,7 @@ def plugins(json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False) -> int:
     found = extensions(say)
     if text := plugins_json(found) if json else plugins_text(found):
         print(text)
-    return 1 if any(plugin.problem for plugin in found) else 0
+    return 1 if any(extension.problem for extension in found) else 0
 
 
 def main() -> None:

@@ -13,7 +13,7 @@ from spherloc.gauss_newton import LEAST_GRAVITY_SD_RAD, tilt_of
 from spherloc.geometry import camera_centre, pose, rotation_angle, transform, yaw_rotation
 from spherloc.metrics import evaluate
 from spherloc.problem import AlignedProblem
-from spherloc.refine import RefinementOptions, refine, residuals_px
+from spherloc.refine import RefinementOptions, gravity_sd_rad, refine, residuals_px
 from spherloc.trace import Certificate, ConsensusStage, Trace
 from spherloc.types import BoolArray, FloatArray
 
@@ -267,7 +267,7 @@ def gather(trace: Trace) -> Evidence:
     return Evidence(
         aligned=aligned,
         bound_px=bound_px,
-        believed_rad=min(aligned.gravity_bound_rad, BELIEVED_SDS * _gravity_sd(aligned, options)),
+        believed_rad=min(aligned.gravity_bound_rad, BELIEVED_SDS * gravity_sd_rad(aligned, options)),
         chance_rate=chance_rate(aligned.bearings, bounds.radians),
         run=run,
         best=best,
@@ -295,10 +295,6 @@ def different(one: FloatArray, other: FloatArray) -> bool:
     return turn > DIFFERENT_RAD or distance > DIFFERENT_M
 
 
-def _gravity_sd(aligned: AlignedProblem, options: RefinementOptions) -> float:
-    return aligned.gravity_sd_rad if options.gravity_sd_deg is None else float(np.radians(options.gravity_sd_deg))
-
-
 def _sd(aligned: AlignedProblem, best: Fit, bound_px: float, options: RefinementOptions) -> tuple[float, float]:
     """Standard deviations of rotation (rad) and position (m)."""
     mask = best.errors_px <= bound_px
@@ -306,7 +302,7 @@ def _sd(aligned: AlignedProblem, best: Fit, bound_px: float, options: Refinement
     if size < 2:
         return np.inf, np.inf
     drop = LOOSE_ENDS if size >= FEW else 0
-    return pose_sd(aligned, best.cam_from_map, mask, options.noise_px, _gravity_sd(aligned, options), drop)[:2]
+    return pose_sd(aligned, best.cam_from_map, mask, options.noise_px, gravity_sd_rad(aligned, options), drop)[:2]
 
 
 def _free_tilt_sd(aligned: AlignedProblem, free: Fit, bound_px: float) -> float:
@@ -339,7 +335,7 @@ def gather_truth(trace: Trace, bound_px: float) -> Truth | None:
     right = fit.errors_px <= WIDER * bound_px if labels is None else labels
     rotation_sd, position_sd = np.inf, np.inf
     if np.count_nonzero(right) >= 2:
-        gravity_sd = _gravity_sd(aligned, options)
+        gravity_sd = gravity_sd_rad(aligned, options)
         rotation_sd, position_sd, _ = pose_sd(aligned, true, right, options.noise_px, gravity_sd, 0)
     success = evaluate(trace).success
     if success is None:

@@ -1,8 +1,6 @@
 """Pictures of a world through any camera model, with the distance along every ray."""
 
 import io
-import zipfile
-import zlib
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -13,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spherloc.cameras.base import Camera
-from spherloc.disk_cache import cache_folder, key_of, make_room_once, store, used
+from spherloc.disk_cache import DAMAGED_NPZ, cache_folder, key_of, make_room_once, store, used
 from spherloc.errors import InputError
 from spherloc.geometry import camera_centre
 from spherloc.images import read_image
@@ -209,7 +207,7 @@ def stored_range(path: Path, camera: Camera) -> NDArray[np.float32] | None:
     try:
         with np.load(path.with_suffix(".npz"), allow_pickle=False) as content:
             range_m = content["range_m"]
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError):
+    except DAMAGED_NPZ:
         return None
     right = range_m.shape == (camera.height, camera.width) and range_m.dtype == np.float32
     return range_m if right else None

@@ -125,9 +125,9 @@ def _prepare() -> None:
         _say(sentence)
 
     warm_up(tell)
-    for plugin in extensions():
-        if plugin.problem and not any(line.startswith(plugin.problem) for line in told):
-            tell(plugin.problem)
+    for extension in extensions():
+        if extension.problem and not any(line.startswith(extension.problem) for line in told):
+            tell(extension.problem)
 
 
 def _say(sentence: str) -> None:
