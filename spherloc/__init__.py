@@ -8,6 +8,7 @@ __version__ = version("spherloc")
 
 EXPORTS = {
     "localize": "localization",
+    "localize_bearings": "localization",
     "Localization": "localization",
     "estimate_absolute_pose": "localization",
     "estimate": "estimators",

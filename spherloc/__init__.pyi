@@ -9,6 +9,7 @@ from spherloc.estimators import options_type as options_type
 from spherloc.localization import Localization as Localization
 from spherloc.localization import estimate_absolute_pose as estimate_absolute_pose
 from spherloc.localization import localize as localize
+from spherloc.localization import localize_bearings as localize_bearings
 from spherloc.metrics import evaluate as evaluate
 from spherloc.problem import Problem as Problem
 from spherloc.trace import Trace as Trace

@@ -8,6 +8,8 @@ import shutil
 import tempfile
 import time
 import uuid
+import zipfile
+import zlib
 from functools import cache
 from pathlib import Path
 
@@ -19,6 +21,8 @@ UNUSED_S = 7 * 86_400.0
 """What was used within this time stays: somebody may be looking at it."""
 TOUCH_S = 3_600.0
 """A use is not noted again within this time."""
+DAMAGED_NPZ = (OSError, ValueError, LookupError, EOFError, MemoryError, zipfile.BadZipFile, zlib.error, RuntimeError)
+"""What numpy raises for an .npz that was cut off or changed."""
 
 
 def cache_folder(kind: str) -> Path:

@@ -11,9 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from spherloc.cameras._checks import MAX_SIDE_PX, rows
 from spherloc.cameras.base import Camera
 from spherloc.cameras.calibration import camera_from_table, load_camera
 from spherloc.cameras.colmap_models import camera_from_colmap
+from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.diagnosis import Diagnosis, diagnose
 from spherloc.errors import CalibrationError, InputError, show
 from spherloc.estimators import default_options, estimate
@@ -26,6 +28,10 @@ from spherloc.types import BoolArray, FloatArray
 
 CAMERA = "the camera"
 """What a sentence calls a camera that comes from no file."""
+BOUND_PX = 3.0
+"""About so many pixels are the bound on bearings, as the bound on pixels is by default."""
+MOST_OFF_UNIT = 1e-3
+"""By so much the length of a bearing may differ from 1."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -149,6 +155,43 @@ def localize(
     return Localization(estimate(problem, estimator, _options(estimator, problem, options), seed))
 
 
+def localize_bearings(
+    bearings: ArrayLike, points: ArrayLike, gravity: ArrayLike, *, bound_deg: float, **settings: Any
+) -> Localization:
+    """``localize`` from directions instead of pixels and a camera, such as those of a rig or of a camera of your own.
+
+    The result names a panorama as its camera, whose errors are angles and of which a pixel is about a third of the
+    bound.
+
+    Args:
+        bearings: Unit vectors (N, 3) in the camera frame (x right, y down, z forward), one towards each matched point.
+        points: Matched map points (N, 3), metres.
+        gravity: Vector (3,) that points down in the camera frame, of any length.
+        bound_deg: Bound on the angle between an inlier's bearing and its point, degrees, above 0 and below 90.
+        settings: Further arguments of ``localize``, but for ``bound_px``.
+
+    Returns:
+        As ``localize``.
+
+    Raises:
+        InputError: As ``localize``, and for bearings that are no unit vectors.
+    """
+    if "bound_px" in settings:
+        raise InputError("bearings have no pixels; give bound_deg alone, without bound_px.")
+    bound_rad = _radians("bound_deg", bound_deg)
+    if not 0.0 < bound_rad < np.pi / 2:
+        raise InputError(f"bound_deg is {show(bound_deg)}; give an angle above 0 and below 90 degrees.")
+    directions = rows("bearings", bearings, 3)
+    off = np.abs(np.linalg.norm(directions, axis=1) - 1.0)
+    if not (off <= MOST_OFF_UNIT).all():
+        row = int(np.flatnonzero(~(off <= MOST_OFF_UNIT))[0])
+        raise InputError(f"bearings row {row} is {show(directions[row].tolist())}; give a unit vector.")
+    half = min(max(round(np.pi / (bound_rad / BOUND_PX)), 1), MAX_SIDE_PX // 2)
+    camera = Equirectangular(2 * half, half, angular=True)
+    bound_px = np.sin(bound_rad) * half / np.pi  # residuals are measured in the tangent plane
+    return localize(camera.project(directions)[0], points, camera, gravity, bound_px=bound_px, **settings)
+
+
 def estimate_absolute_pose(
     points2D: ArrayLike,
     points3D: ArrayLike,
@@ -158,17 +201,27 @@ def estimate_absolute_pose(
 ) -> dict[str, Any] | None:
     """``localize`` in the place of ``pycolmap.estimate_absolute_pose``, with gravity (3,) besides.
 
-    ``settings`` are further arguments of ``localize``.
+    Args:
+        points2D: Pixels (N, 2); bearings (N, 3) if ``camera`` is None, see ``localize_bearings``.
+        points3D: Matched map points (N, 3), metres.
+        camera: As for ``localize``; None for bearings.
+        gravity: Vector (3,) that points down in the camera frame, of any length.
+        settings: Further arguments of ``localize``; of ``localize_bearings`` for bearings.
 
     Returns:
         A dict with ``cam_from_world`` (``pycolmap.Rigid3d``), ``num_inliers`` and ``inlier_mask``, and with
         ``localization``, what ``localize`` gives; None if there is no pose.
 
     Raises:
-        InputError: As ``localize``, and without pycolmap.
+        InputError: As ``localize``, without pycolmap, and for bearings without ``bound_deg``.
     """
     pycolmap = require("pycolmap", "colmap", "estimate_absolute_pose")
-    found = localize(points2D, points3D, camera, gravity, **settings)
+    if camera is not None:
+        found = localize(points2D, points3D, camera, gravity, **settings)
+    elif "bound_deg" in settings:
+        found = localize_bearings(points2D, points3D, gravity, **settings)
+    else:
+        raise InputError("bound_deg is missing; bearings, which have no camera, need it.")
     if found.cam_from_map is None:
         return None
     return {
@@ -180,7 +233,10 @@ def estimate_absolute_pose(
 
 
 def as_camera(camera: Any) -> Camera:
-    """A camera from whatever describes one, see ``localize``; raises ``InputError`` for anything else."""
+    """A camera from whatever describes one, see ``localize``.
+
+    Raises ``InputError`` for anything else, and ``CalibrationError``, which is one, for a camera that cannot be used.
+    """
     if isinstance(camera, Camera):
         return camera
     if isinstance(camera, str | Path):

@@ -3,12 +3,17 @@
 import typing
 from collections import Counter
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 
 from spherloc.errors import InputError, show
 
+OptionalText = Annotated[str | None, tyro.conf.arg(metavar="STR")]
+OptionalNumber = Annotated[int | None, tyro.conf.arg(metavar="INT")]
+OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH")]
+"""These are for flags that may be left out, whose help would else list None beside the type."""
 _APPEND = typing.get_args(tyro.conf.UseAppendAction[int])[1]
 HINTS = {
     ("run", "--estimator"): "or compare estimators with: spherloc sweep SCENE --estimator A --estimator B",

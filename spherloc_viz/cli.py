@@ -13,8 +13,8 @@ from tyro.conf import Positional, arg
 from tyro.extras import SubcommandApp
 
 from spherloc.errors import SpherlocError, reason, show
-from spherloc_viz import recording_commands
-from spherloc_viz.arguments import refuse_repeated
+from spherloc_viz import given_files, recording_commands
+from spherloc_viz.arguments import OptionalNumber, OptionalPath, OptionalText, refuse_repeated
 from spherloc_viz.recording.storage.room import KEEP_GIGABYTES
 
 RECORDINGS = Path("recordings")
@@ -33,19 +33,19 @@ def run(
     scenes: Positional[tuple[Path, ...]],
     /,
     estimator: str = "mc",
-    seed: int | None = None,
+    seed: OptionalNumber = None,
     option: Settings = (),
     set: Settings = (),
-    spoil: str | None = None,
-    mend: str | None = None,
-    hide: str | None = None,
+    spoil: OptionalText = None,
+    mend: OptionalText = None,
+    hide: OptionalText = None,
     json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
     record: bool = True,
     full: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
     recordings: Path = RECORDINGS,
     keep_gigabytes: float = KEEP_GIGABYTES,
-    query: str | None = None,
-    proof: Path | None = None,
+    query: OptionalText = None,
+    proof: OptionalPath = None,
 ) -> int:
     """Solve localization problems and record each run.
 
@@ -84,12 +84,15 @@ def run(
             it: python -m spherloc.proof_check FILE, which needs numpy only.
     """
     from spherloc.datasets import scene_path
+
+    paths = [scene_path(scene) for scene in given_files.without_reviews(scenes)]
+    if given_files.none_there(paths, given_files.check_scene_file):
+        return 2
     from spherloc.datasets.variation import parse_variation
     from spherloc_viz import batch
 
     variation = parse_variation(list(chain(*set)), spoil, mend, hide)
     kept = batch.Records(recordings, full, keep_gigabytes) if record else None
-    paths = [scene_path(scene) for scene in recording_commands.without_reviews(scenes)]
     return batch.run_scenes(paths, estimator, seed, list(chain(*option)), json, kept, query, variation, proof)
 
 
@@ -101,9 +104,9 @@ def localize(
     seed: int = 0,
     option: Settings = (),
     queries: Annotated[tuple[str, ...], arg(metavar="NAME|FIRST:LAST:STEP ...")] = (),
-    output: Path | None = None,
+    output: OptionalPath = None,
     record: bool = True,
-    recordings: Path | None = None,
+    recordings: OptionalPath = None,
     keep_gigabytes: float = KEEP_GIGABYTES,
     retry_failed: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
 ) -> int:
@@ -136,11 +139,13 @@ def localize(
         keep_gigabytes: What the recordings may take; beyond it the oldest successes that nobody labelled are deleted.
         retry_failed: Do queries again that have no pose yet.
     """
-    from spherloc.datasets import scene_path
+    from spherloc.datasets.scene_file import check_there, scene_path
+
+    scene = scene_path(scene)
+    check_there(scene)
     from spherloc_viz.batch import Records
     from spherloc_viz.localize import localize_sequence
 
-    scene = scene_path(scene)
     folder = output or RECORDINGS / f"{scene.stem}_{estimator}_{seed}"
     kept = Records(recordings or folder / "recordings", keep_gigabytes=keep_gigabytes) if record else None
     try:
@@ -161,8 +166,8 @@ def sweep(
     runs: int = 100,
     seed: int = 0,
     workers: int = 2,
-    scheduler: str | None = None,
-    out: Path | None = None,
+    scheduler: OptionalText = None,
+    out: OptionalPath = None,
     record: bool = True,
     recordings: Path = RECORDINGS,
     keep_gigabytes: float = KEEP_GIGABYTES,
@@ -203,11 +208,13 @@ def sweep(
         recordings: Folder of the recordings.
         keep_gigabytes: What the recordings may take; beyond it the oldest successes that nobody labelled are deleted.
     """
-    from spherloc.datasets import scene_path
+    from spherloc.datasets.scene_file import check_there, scene_path
+
+    scene = scene_path(scene)
+    check_there(scene)
     from spherloc_viz.batch import Records
     from spherloc_viz.sweep import sweep as do_sweep
 
-    scene = scene_path(scene)
     file = out or RECORDINGS / f"{scene.stem}_{over}_{seed}.csv"
     chosen = estimator or ("mc", "ransac-2p")
     kept = Records(recordings, keep_gigabytes=keep_gigabytes) if record else None
@@ -216,7 +223,7 @@ def sweep(
 
 @app.command
 def play(
-    scene: Positional[Path | None] = None,
+    scene: Positional[Annotated[Path | None, arg(metavar="[PATH]")]] = None,
     /,
     host: str = "127.0.0.1",
     port: int = 8080,
@@ -234,12 +241,15 @@ def play(
 
     spherloc play panorama_outliers_90 --port 9000
 
+    spherloc play RUN.rrd
+
     spherloc play --allow ~/maps
 
     spherloc play --host 0.0.0.0
 
     Args:
-        scene: Scene file (TOML) or bundled scene's name to start with; a bundled one if not given.
+        scene: Scene file (TOML), bundled scene's name, or recording (.rrd), whose run is opened, to start with; a
+            bundled scene if not given.
         host: Address to listen on. Beyond this machine the printed links carry tokens: one link is yours, the other is
             for an audience, which can only look.
         port: Port to listen on; 0 takes a free one.
@@ -250,9 +260,12 @@ def play(
         token: Demand a token on this machine too, where others have accounts on it.
     """
     from spherloc.datasets import scene_path
-    from spherloc_viz.app.server import serve
 
     start = None if scene is None else scene_path(scene)
+    if start is not None:
+        given_files.check_scene_file(start)
+    from spherloc_viz.app.server import serve
+
     serve(start, host, port, recordings, record, allow, keep_gigabytes, token)
     return 0
 
@@ -290,7 +303,7 @@ def check_proof(file: Positional[Path], /) -> int:
 
 
 @app.command
-def scenes(kind: Positional[str | None] = None, /) -> int:
+def scenes(kind: Positional[Annotated[str | None, arg(metavar="[KIND]")]] = None, /) -> int:
     """List the bundled scenes and the kinds of scene files, or show how a kind is written.
 
     For example:
@@ -331,7 +344,7 @@ def plugins(json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False) -> int:
     found = extensions(say)
     if text := plugins_json(found) if json else plugins_text(found):
         print(text)
-    return 1 if any(plugin.problem for plugin in found) else 0
+    return 1 if any(extension.problem for extension in found) else 0
 
 
 def main() -> None:

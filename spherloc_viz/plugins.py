@@ -23,7 +23,7 @@ FASTEST = "ransac-2p"
 
 
 @dataclass(frozen=True)
-class Plugin:
+class Extension:
     """One thing that is registered."""
 
     registered: Registered
@@ -31,7 +31,7 @@ class Plugin:
     """Why it cannot be used, as a sentence; empty if it can."""
 
 
-def extensions(announce: Callable[[str], None] | None = None) -> tuple[Plugin, ...]:
+def extensions(announce: Callable[[str], None] | None = None) -> tuple[Extension, ...]:
     """All extensions, by the order of ``KINDS`` and by name; each is imported and its form looked at.
 
     With ``announce`` estimators and solvers are tried on a tiny problem too; it is called with a sentence if that will
@@ -40,7 +40,7 @@ def extensions(announce: Callable[[str], None] | None = None) -> tuple[Plugin, .
     found = [one for kind in KINDS for one in registry.registered(kind, _taken(kind)) if not one.is_own]
     if announce is not None and any(one.kind in TRIED for one in found):
         warm_up(announce, [FASTEST])
-    return tuple(Plugin(one, one.clash or _problem(one.kind, one.name, announce is not None)) for one in found)
+    return tuple(Extension(one, one.clash or _problem(one.kind, one.name, announce is not None)) for one in found)
 
 
 def built_in(kind: str) -> tuple[str, ...]:
@@ -49,31 +49,31 @@ def built_in(kind: str) -> tuple[str, ...]:
     return tuple(sorted(own | set(_taken(kind)) | (set(FORMATS) if kind == "calibrations" else set())))
 
 
-def plugins_text(found: Collection[Plugin]) -> str:
+def plugins_text(found: Collection[Extension]) -> str:
     """A paragraph a group for people: in a line what spherloc has itself, then a line or two an extension."""
-    return "\n\n".join(_group_text(kind, [plugin for plugin in found if plugin.registered.kind == kind])
+    return "\n\n".join(_group_text(kind, [extension for extension in found if extension.registered.kind == kind])
                        for kind in KINDS)  # fmt: skip
 
 
-def plugins_json(found: Collection[Plugin]) -> str:
+def plugins_json(found: Collection[Extension]) -> str:
     """A line of JSON an extension."""
-    return "\n".join(json_text(_record(plugin)) for plugin in found)
+    return "\n".join(json_text(_record(extension)) for extension in found)
 
 
-def _record(plugin: Plugin) -> dict[str, str]:
-    told = {name: getattr(plugin.registered, name) for name in ("kind", "name", "package", "version", "target")}
-    return told | {"problem": plugin.problem}
+def _record(extension: Extension) -> dict[str, str]:
+    told = {name: getattr(extension.registered, name) for name in ("kind", "name", "package", "version", "target")}
+    return told | {"problem": extension.problem}
 
 
-def _group_text(kind: str, found: Collection[Plugin]) -> str:
+def _group_text(kind: str, found: Collection[Extension]) -> str:
     lines = [f"{KINDS[kind].capitalize()}s, group spherloc.{kind}", f"  built in: {', '.join(built_in(kind))}"]
-    for plugin in found:
-        entry = plugin.registered
+    for extension in found:
+        entry = extension.registered
         package = f"{shorten(entry.package)} {shorten(entry.version)}".strip()
-        state = "cannot be used" if plugin.problem else "usable"
+        state = "cannot be used" if extension.problem else "usable"
         lines.append(f"  {shorten(entry.name)}: {state}; {package}, {shorten(entry.target)}")
-        if plugin.problem:
-            lines.append(f"    {plugin.problem}")
+        if extension.problem:
+            lines.append(f"    {extension.problem}")
     return "\n".join(lines)
 
 

@@ -1,6 +1,5 @@
 """The commands about recordings; ``spherloc_viz.cli`` registers them."""
 
-from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated
@@ -8,22 +7,18 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional, arg
 
-from spherloc_viz.recording import REVIEW_SUFFIX
+from spherloc_viz.arguments import OptionalNumber, OptionalText
+from spherloc_viz.given_files import check_recording_file, check_recordings_folder, none_there, without_reviews
 
 RECORDINGS = Path("recordings")
 RangeText = Annotated[str | None, arg(metavar="RANGE")]
-
-
-def without_reviews(files: Sequence[Path]) -> tuple[Path, ...]:
-    """What a shell's pattern such as ``*.rrd`` is meant to find; all if there is nothing but labels and notes."""
-    return tuple(file for file in files if not file.name.endswith(REVIEW_SUFFIX)) or tuple(files)
 
 
 def view(
     recording: Positional[Path],
     /,
     web: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
-    step: int | None = None,
+    step: OptionalNumber = None,
     port: int = 9090,
 ) -> int:
     """Open a recording in the Rerun viewer, paused at the step where the run was decided or went wrong.
@@ -42,6 +37,7 @@ def view(
         step: The step to open at; 0 is the first, and the key step is taken if it is not given.
         port: Port of the web viewer; 0 takes a free one.
     """
+    check_recording_file(recording)
     from spherloc_viz.recording.sandbox.examiner import examine
     from spherloc_viz.recording.viewer import step_of, view_in_window
 
@@ -77,10 +73,13 @@ def repeat(
         recordings: Recordings (.rrd), one or more.
         json: Print one JSON object a recording, on one line; infinity is the text "inf".
     """
+    files = without_reviews(recordings)
+    if none_there(files, check_recording_file):
+        return 2
     from spherloc_viz.progress import solve
     from spherloc_viz.recording.replay.repeat import repeat_all
 
-    return repeat_all(without_reviews(recordings), json, solve)
+    return repeat_all(files, json, solve)
 
 
 def runs(
@@ -88,13 +87,13 @@ def runs(
     /,
     failed: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
     doubtful: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
-    outcome: str | None = None,
-    diagnosis: str | None = None,
-    estimator: str | None = None,
-    scene: str | None = None,
-    source: str | None = None,
-    label: str | None = None,
-    text: str | None = None,
+    outcome: OptionalText = None,
+    diagnosis: OptionalText = None,
+    estimator: OptionalText = None,
+    scene: OptionalText = None,
+    source: OptionalText = None,
+    label: OptionalText = None,
+    text: OptionalText = None,
     outliers: RangeText = None,
     rotation_error: RangeText = None,
     position_error: RangeText = None,
@@ -105,8 +104,8 @@ def runs(
     until: Annotated[str | None, arg(metavar="DATE|AGE")] = None,
     sort: str = "created",
     ascending: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
-    group: str | None = None,
-    limit: int | None = None,
+    group: OptionalText = None,
+    limit: OptionalNumber = None,
     format: str = "table",
 ) -> int:
     """List recorded runs: which failed, and of what.
@@ -149,6 +148,7 @@ def runs(
         limit: How many to list; 0 for all. A table has 50 if it is not given, JSON and CSV have all.
         format: table, json or csv.
     """
+    check_recordings_folder(folder)
     from spherloc_viz import runs as listing
     from spherloc_viz.recording.index.query import RunQuery, parse_range, parse_when
 
@@ -183,7 +183,7 @@ def steps(
     condition: Positional[str],
     folder: Positional[Path] = RECORDINGS,
     /,
-    limit: int | None = None,
+    limit: OptionalNumber = None,
     format: str = "table",
 ) -> int:
     """List the steps of recorded runs for which a condition holds, such as those that had the right pose and lost it.
@@ -206,6 +206,7 @@ def steps(
         limit: How many steps to list; 0 for all. A table has 50 if it is not given, JSON and CSV have all.
         format: table, json or csv.
     """
+    check_recordings_folder(folder)
     from spherloc_viz.runs import print_steps
 
     return print_steps(folder, condition, limit, format)
@@ -216,7 +217,7 @@ def label(
     /,
     add: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
     remove: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
-    note: str | None = None,
+    note: OptionalText = None,
 ) -> int:
     """Give recordings labels and a note, which lists and the Rerun viewer show; print what they are then.
 
@@ -234,9 +235,12 @@ def label(
         remove: A label to take away; give it once for each.
         note: The note, in place of the one before; an empty one takes it away.
     """
+    files = without_reviews(recordings)
+    if none_there(files, check_recording_file):
+        return 2
     from spherloc_viz.runs import label_runs
 
-    return label_runs(without_reviews(recordings), add, remove, note)
+    return label_runs(files, add, remove, note)
 
 
 def reindex(folder: Positional[Path] = RECORDINGS, /) -> int:
@@ -253,6 +257,7 @@ def reindex(folder: Positional[Path] = RECORDINGS, /) -> int:
     Args:
         folder: Folder of the recordings.
     """
+    check_recordings_folder(folder)
     from spherloc_viz.runs import reindex as read_all
 
     return read_all(folder)

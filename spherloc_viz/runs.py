@@ -9,7 +9,7 @@ from pathlib import Path
 from spherloc import registry
 from spherloc.diagnosis import Cause
 from spherloc.errors import InputError, RecordingError, show
-from spherloc.files import is_file, is_folder
+from spherloc_viz.given_files import check_recording_file, check_recordings_folder
 from spherloc_viz.progress import progress, say
 from spherloc_viz.recording.index.query import GROUP_KEYS, OUTCOMES, SORT_KEYS, SOURCES, RunQuery
 from spherloc_viz.recording.index.refresh import Refreshed
@@ -110,8 +110,7 @@ def label_runs(paths: Sequence[Path], add: Sequence[str], remove: Sequence[str],
 
 
 def _label(path: Path, add: Sequence[str], remove: Sequence[str], note: str | None) -> Review:
-    if not is_file(path):
-        raise RecordingError(f"{path}: no such file; spherloc runs lists the recordings.")
+    check_recording_file(path)
     row, before = examine(path), examine_review(path)
     added, gone = checked_review(add, "").labels, checked_review(remove, "").labels
     for label in gone:
@@ -191,8 +190,7 @@ def _check_known(index: RunIndex, query: RunQuery) -> None:
 
 
 def _open(folder: Path) -> RunIndex:
-    if not is_folder(folder):
-        raise InputError(f"{folder}: no such folder of recordings; run a scene first, or name another folder.")
+    check_recordings_folder(folder)
     return RunIndex(folder, say)
 
 

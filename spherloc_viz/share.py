@@ -10,9 +10,9 @@ from spherloc.datasets import scene_file
 from spherloc.datasets.variation import EDITS, Variation, settings_of
 from spherloc.errors import InputError
 from spherloc.estimators import options_type
+from spherloc_viz.given_files import is_recording
 from spherloc_viz.options import typed
 
-RECORDING = ".rrd"
 WORDS = {"spoiled": "--spoil", "mended": "--mend", "hidden": "--hide"}
 
 
@@ -71,11 +71,6 @@ def as_command(
     for name, value in _changed(scene_path, estimator, options):
         words += ["--option", f"{name}={typed(value)}"]
     return shlex.join(words)
-
-
-def is_recording(path: Path) -> bool:
-    """Whether a path that is given as a scene is that of a recording."""
-    return path.suffix.lower() == RECORDING
 
 
 def _written_changes(variation: Variation) -> dict[str, Any]:

@@ -1,15 +1,19 @@
 """What the command line takes for a scene or a recording: names, patterns, and what it lists."""
 
+import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 from cli_process import SCENE, one_sentence, spherloc, spherloc_here
 
+from scripts.documentation import commands, help_of
 from spherloc.datasets import bundled_scenes, load_scene, scene_path
 from spherloc.estimators import estimate
+from spherloc_viz.given_files import without_reviews
 from spherloc_viz.recording.content.writer import write_recording
 from spherloc_viz.recording.reviews import write_review
-from spherloc_viz.recording_commands import without_reviews
 
 
 @pytest.mark.usefixtures("own_examiner")
@@ -49,3 +53,37 @@ def test_scenes_shows_how_a_kind_is_written(tmp_path: Path) -> None:
     assert 'kind = "colmap"' in shown and "``" not in shown and "code-block" not in shown
     assert str(SCENE) in spherloc_here("scenes", "synthetic", cwd=tmp_path).stdout
     assert "'magic'" in one_sentence(spherloc_here("scenes", "magic", cwd=tmp_path))
+
+
+MISSING = (
+    *(["run", "missing.toml", "missing.rrd"], ["localize", "missing.toml"], ["sweep", "missing.toml"]),
+    *(["play", "missing.toml"], ["play", "missing.rrd"], ["view", "missing.rrd"], ["repeat", "missing.rrd"]),
+    *(["label", "missing.rrd", "--add", "seen"], ["runs", "missing"], ["steps", "step = 1", "missing"]),
+    ["reindex", "missing"],
+)
+ENDED = """
+import sys
+from spherloc_viz.cli import main
+try:
+    main()
+except SystemExit as end:
+    print(end.code, *({"numba", "scipy", "cv2", "rerun", "viser", "pyarrow"} & set(sys.modules)))
+"""
+
+
+@pytest.mark.parametrize("words", MISSING, ids=" ".join)
+def test_a_missing_file_is_said_before_anything_large_is_imported(words: list[str], tmp_path: Path) -> None:
+    done = subprocess.run([sys.executable, "-c", ENDED, *words], cwd=tmp_path, capture_output=True, text=True)
+    assert done.stdout.split() == ["2"], done.stderr
+    named = [word for word in words if word.startswith("missing")]
+    sentences = done.stderr.splitlines()
+    assert len(sentences) == len(named)
+    for name, sentence in zip(named, sentences, strict=True):
+        assert sentence.startswith(f"spherloc: {name}: no such ")
+
+
+@pytest.mark.parametrize("command", ["", *commands()])
+def test_help_tells_no_union_of_types(command: str) -> None:
+    """Such as {None}|STR of a flag that may be left out."""
+    text = help_of(*command.split())
+    assert "show this help" in text and not re.search(r"None\}|\{None|\}\||\|\{", text)

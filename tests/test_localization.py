@@ -8,13 +8,17 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
+from scipy.spatial.transform import Rotation
 
 import spherloc
 from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.errors import InputError
+from spherloc.geometry import camera_centre
 from spherloc.localization import Localization, as_camera
 from spherloc.outcome import Outcome
 from spherloc.trace import RefinementStage
+from spherloc_viz.recording.content.reader import read_recording
+from spherloc_viz.recording.content.writer import write_recording
 
 README = Path(__file__).resolve().parents[1] / "README.md"
 FISHEYE = KannalaBrandt(640, 480, 300.0, 310.0, 320.0, 240.0, (0.01, -0.02, 0.003, 0.0))
@@ -148,3 +152,67 @@ def test_the_readme_runs(capsys):
     (code,) = (part.split("```")[0] for part in README.read_text().split("```python\n")[1:])
     exec(compile(code, str(README), "exec"), {})
     assert "localized by mc-exact" in capsys.readouterr().out
+
+
+def turned_by(turn, problem):
+    """Bearings, points and gravity of a problem whose camera frame is turned by ``turn`` (3, 3)."""
+    return problem.bearings @ turn.T, problem.points, turn @ problem.gravity_camera
+
+
+@pytest.mark.parametrize("estimator", ["ransac-2p", "mc-exact"])
+def test_bearings_are_as_good_as_pixels(problem, estimator, rng):
+    """The same matches as pixels and as bearings, however the camera frame is turned: an angle is the same at the
+    poles of the panorama in which the bearings are kept."""
+    bound_deg = np.degrees(3.0 * np.median(problem.radians_per_pixel))
+    settings = {"gravity_map": problem.gravity_map, "estimator": estimator}
+    by_pixels = spherloc.localize(*arguments(problem), bound_px=3.0, **settings)
+    truth = problem.truth_cam_from_map
+    assert by_pixels.outcome is Outcome.LOCALIZED
+    for turn in (np.eye(3), Rotation.random(random_state=rng).as_matrix()):
+        found = spherloc.localize_bearings(*turned_by(turn, problem), bound_deg=bound_deg, **settings)
+        np.testing.assert_allclose(found.position, by_pixels.position, atol=0.05)
+        np.testing.assert_allclose(found.position, camera_centre(truth), atol=0.1)
+        np.testing.assert_allclose(turn.T @ found.cam_from_map[:, :3], truth[:, :3], atol=np.radians(1.0))
+        ray = problem.points @ found.cam_from_map[:, :3].T + found.cam_from_map[:, 3]
+        sine = np.linalg.norm(np.cross(ray, problem.bearings @ turn.T), axis=1) / np.linalg.norm(ray, axis=1)
+        ahead = np.einsum("ni,ni->n", ray, problem.bearings @ turn.T) > 0.0
+        np.testing.assert_array_equal(found.inliers, ahead & (sine <= np.sin(np.radians(bound_deg))))
+
+
+def test_a_panorama_with_angular_errors_is_kept_in_recordings(problem, tmp_path):
+    found = spherloc.localize_bearings(*turned_by(np.eye(3), problem), bound_deg=0.5, estimator="ransac-2p")
+    camera = found.trace.problem.camera
+    assert camera.angular and as_camera(camera.to_dict()) == camera
+    write_recording(found.trace, tmp_path / "run.rrd")
+    assert read_recording(tmp_path / "run.rrd").problem.camera == camera
+
+
+def test_bearings_in_the_place_of_pycolmap(problem):
+    bearings, points, gravity = turned_by(np.eye(3), problem)
+    settings = {"gravity_map": problem.gravity_map, "bound_deg": 0.5}
+    found = spherloc.estimate_absolute_pose(bearings, points, None, gravity, **settings)
+    again = spherloc.localize_bearings(bearings, points, gravity, **settings)
+    np.testing.assert_allclose(found["cam_from_world"].matrix(), again.cam_from_map, atol=1e-12)
+    with pytest.raises(InputError, match="bound_deg is missing"):
+        spherloc.estimate_absolute_pose(bearings, points, None, gravity)
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"bearings": [[0.0, 0.0, 2.0]]}, "bearings row 0 is [0.0, 0.0, 2.0]; give a unit vector."),
+        ({"bearings": [[0.0, 0.0, np.nan]]}, "bearings row 0 is"),
+        ({"bearings": [[0.0, 1.0]]}, "bearings have the shape (1, 2)"),
+        ({"bearings": [["a", "b", "c"]]}, "bearings hold"),
+        ({"bound_deg": 0.0}, "bound_deg is 0.0; give an angle above 0"),
+        ({"bound_deg": np.nan}, "bound_deg is"),
+        ({"bound_deg": "1"}, "bound_deg is '1'; give a number of degrees."),
+        ({"bound_px": 3.0}, "give bound_deg alone"),
+    ],
+)
+def test_what_is_wrong_with_bearings_is_one_sentence(problem, changes, sentence):
+    bearings, points, gravity = turned_by(np.eye(3), problem)
+    given = {"bearings": bearings, "points": points, "gravity": gravity, "bound_deg": 0.5} | changes
+    with pytest.raises(InputError) as caught:
+        spherloc.localize_bearings(**given)
+    assert sentence in str(caught.value) and "\n" not in str(caught.value)

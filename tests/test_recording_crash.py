@@ -25,7 +25,7 @@ from spherloc_viz.recording.replay.repeat import compare
 from spherloc_viz.recording.reviews import write_review
 from spherloc_viz.recording.sandbox.examiner import Examiner, ExaminerError
 from spherloc_viz.recording.storage.recorder import Recorder
-from spherloc_viz.recording.storage.recovery import Rescued, rescue
+from spherloc_viz.recording.storage.recovery import Recovered, recover
 from spherloc_viz.recording.storage.store import RecordingStore
 from spherloc_viz.recording.storage.unfinished import STALE_AFTER_S, here, leftovers, unfinished
 from tests.needs import needs
@@ -152,14 +152,14 @@ def test_what_is_left_of_a_file_becomes_the_run_again_or_nothing(
         part = part_of(folder, "a.rrd", dead, recorded[: round(share * len(recorded))] + garbage)
         assert leftovers(folder) == [part]
         content = part.read_bytes()
-        done = rescue(part, examiner)
+        done = recover(part, examiner)
         left = [file.name for file in folder.iterdir()]
         if done.recording is None:
             assert share < 0.6
             assert done.kept is None if not content else done.kept is not None and done.kept.read_bytes() == content
             assert left == ([] if done.kept is None else ["a.rrd.00000000.unreadable"])
         else:
-            assert left == ["a.rrd"] and done == Rescued(folder / "a.rrd")
+            assert left == ["a.rrd"] and done == Recovered(folder / "a.rrd")
             assert compare(read_recording(done.recording), trace) == []
             assert read_run_row(done.recording).outcome == "success"
 
@@ -167,12 +167,12 @@ def test_what_is_left_of_a_file_becomes_the_run_again_or_nothing(
 def test_a_finished_file_without_its_name_is_moved_and_never_onto_another(
     recorded: bytes, dead: str, examiner: Examiner, tmp_path: Path
 ) -> None:
-    path = rescue(part_of(tmp_path, "a.rrd", dead, recorded), examiner).recording
+    path = recover(part_of(tmp_path, "a.rrd", dead, recorded), examiner).recording
     assert path == tmp_path / "a.rrd" and path.read_bytes() == recorded
-    assert rescue(part_of(tmp_path, "a.rrd", dead, recorded[:1000]), examiner) == Rescued()
+    assert recover(part_of(tmp_path, "a.rrd", dead, recorded[:1000]), examiner) == Recovered()
     assert path.read_bytes() == recorded and list(tmp_path.iterdir()) == [path]
     path.write_bytes(b"damaged")
-    kept = rescue(part_of(tmp_path, "a.rrd", dead, recorded[:1000]), examiner).kept
+    kept = recover(part_of(tmp_path, "a.rrd", dead, recorded[:1000]), examiner).kept
     assert kept is not None and kept.read_bytes() == recorded[:1000]
     assert path.read_bytes() == b"damaged" and sorted(tmp_path.iterdir()) == [path, kept]
 
@@ -181,7 +181,7 @@ def test_what_a_reviewer_said_last_is_kept_if_its_file_was_not_finished(
     dead: str, examiner: Examiner, tmp_path: Path
 ) -> None:
     (tmp_path / "a.review.rrd").write_bytes(b"before")
-    kept = rescue(part_of(tmp_path, "a.review.rrd", dead, b"after"), examiner).kept
+    kept = recover(part_of(tmp_path, "a.review.rrd", dead, b"after"), examiner).kept
     assert kept == tmp_path / "a.review.rrd.00000000.unreadable" and kept.read_bytes() == b"after"
     assert (tmp_path / "a.review.rrd").read_bytes() == b"before"
 
@@ -192,8 +192,8 @@ def test_without_room_a_leftover_waits(
     part = part_of(tmp_path, "a.rrd", dead, recorded[: len(recorded) * 9 // 10])
     with monkeypatch.context() as patch:
         patch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=1000))
-        assert rescue(part, examiner) == Rescued() and part.exists()
-    assert rescue(part, examiner) == Rescued(tmp_path / "a.rrd") and not part.exists()
+        assert recover(part, examiner) == Recovered() and part.exists()
+    assert recover(part, examiner) == Recovered(tmp_path / "a.rrd") and not part.exists()
 
 
 def test_a_leftover_that_cannot_be_read_since_nothing_can_be_stays(recorded: bytes, dead: str, tmp_path: Path) -> None:
@@ -201,7 +201,7 @@ def test_a_leftover_that_cannot_be_read_since_nothing_can_be_stays(recorded: byt
     part, ended = part_of(tmp_path, "a.rrd", dead, recorded), Examiner()
     ended.close()
     with pytest.raises(ExaminerError):
-        rescue(part, ended)
+        recover(part, ended)
     assert part.read_bytes() == recorded and [path.name for path in tmp_path.iterdir()] == [part.name]
 
 

@@ -19,10 +19,14 @@ class Camera(Protocol):
     """Name used in TOML files and in the registry."""
 
     @property
-    def width(self) -> int: ...
+    def width(self) -> int:
+        """Of the image, pixels."""
+        ...
 
     @property
-    def height(self) -> int: ...
+    def height(self) -> int:
+        """Of the image, pixels."""
+        ...
 
     def project(self, points: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Project camera-frame points (N, 3), metres, to pixels (N, 2).

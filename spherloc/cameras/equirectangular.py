@@ -11,6 +11,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from spherloc.cameras import _checks
+from spherloc.errors import CalibrationError, show
 from spherloc.types import BoolArray, FloatArray
 
 
@@ -24,10 +25,15 @@ class Equirectangular:
     """Image width in pixels: 360 degrees."""
     height: int
     """Image height in pixels: 180 degrees."""
+    angular: bool = False
+    """Whether errors are angles instead of distances in the image, for bearings that no panorama measured: a pixel is
+    then the angle of one column at the horizon, 2 pi / ``width``, in every direction and also at the poles."""
 
     def __post_init__(self) -> None:
         for key in ("width", "height"):
             object.__setattr__(self, key, _checks.whole_pixels(key, getattr(self, key)))
+        if not isinstance(self.angular, bool):
+            raise CalibrationError(f"camera key 'angular' is {show(self.angular)}: give true or false.")
 
     def project(self, points: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Pixels (N, 2) of camera-frame points (N, 3) in metres, and the mask (N,): all but zero and non-finite points.
@@ -60,15 +66,19 @@ class Equirectangular:
     def unprojection_jacobian(self, pixels: FloatArray) -> FloatArray:
         """d bearing / d pixel (N, 3, 2), per pixel; NaN where ``unproject`` is invalid.
 
-        At the poles the column of u vanishes: every pixel of that row looks the same way.
+        At the poles the column of u vanishes: every pixel of that row looks the same way. If errors are angles, the
+        columns are the same two directions, each of length 2 pi / ``width``.
         """
         lon, lat, _ = self._angles(pixels)
         level, rise = np.cos(lat), np.sin(lat)
         east, north = np.sin(lon), np.cos(lon)
         jacobian = np.zeros((len(lon), 3, 2))
         per_u, per_v = tau / self.width, pi / self.height
-        jacobian[:, 0, 0] = level * north * per_u
-        jacobian[:, 2, 0] = -level * east * per_u
+        along = level
+        if self.angular:
+            along, per_v = 1.0, per_u
+        jacobian[:, 0, 0] = along * north * per_u
+        jacobian[:, 2, 0] = -along * east * per_u
         jacobian[:, 0, 1] = rise * east * per_v
         jacobian[:, 1, 1] = level * per_v
         jacobian[:, 2, 1] = rise * north * per_v
@@ -76,13 +86,15 @@ class Equirectangular:
         return jacobian
 
     def to_dict(self) -> dict[str, Any]:
-        """The ``[camera]`` table: model, width, height."""
-        return _checks.camera_to_table(self)
+        """The ``[camera]`` table: model, width, height, and angular where errors are angles."""
+        table = _checks.camera_to_table(self)
+        return table if self.angular else {key: value for key, value in table.items() if key != "angular"}
 
     @classmethod
     def from_dict(cls, table: dict[str, Any], where: str) -> Self:
         """Build from a ``[camera]`` table; raises ``CalibrationError`` (see ``Camera.from_dict``)."""
-        return _checks.camera_from_keys(cls, table, where)
+        given = {"angular": False} | table if isinstance(table, dict) else table
+        return _checks.camera_from_keys(cls, given, where)
 
     def _angles(self, pixels: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
         """Longitude and latitude (Eq. 16) in radians and validity, each (N,); NaN angles where invalid."""

@@ -23,7 +23,7 @@ _NO_LENS = (0.0, 0.0, 0.0, 0.0)
 
 
 def kitti360(document: dict[Any, Any], name: str | None) -> Camera:
-    """MEI with gamma1, gamma2, u0, v0."""
+    """MEI with gamma1, gamma2, u0, v0; raises ``CalibrationError`` for what is no such file."""
     if document["model_type"] != "MEI":
         raise CalibrationError(f"the model_type {show(document['model_type'])} is not supported: give MEI.")
     own_name = document.get("camera_name")
@@ -37,7 +37,10 @@ def kitti360(document: dict[Any, Any], name: str | None) -> Camera:
 
 
 def basalt(document: dict[Any, Any], name: str | None) -> Camera:
-    """A camera of a Basalt JSON; they have no names there and are called cam0, cam1, ... in their order."""
+    """A camera of a Basalt JSON; they have no names there and are called cam0, cam1, ... in their order.
+
+    Raises ``CalibrationError`` for what is no such file.
+    """
     with located("value0"):
         rig = table_of(document["value0"])
         cameras, sizes = value_of(rig, "intrinsics"), value_of(rig, "resolution")
@@ -58,7 +61,10 @@ def basalt(document: dict[Any, Any], name: str | None) -> Camera:
 
 
 def stella(document: dict[Any, Any]) -> Camera:
-    """The ``Camera`` section of stella_vslam, or OpenVSLAM's keys ``Camera.model``, ``Camera.fx``, ..."""
+    """The ``Camera`` section of stella_vslam, or OpenVSLAM's keys ``Camera.model``, ``Camera.fx``, ...
+
+    Raises ``CalibrationError`` for what is no such file.
+    """
     dotted = {
         key.removeprefix(STELLA_PREFIX): value for key, value in document.items() if str(key).startswith(STELLA_PREFIX)
     }
@@ -90,7 +96,10 @@ def loc360(document: dict[Any, Any]) -> Camera:
 
 
 def adapter(document: dict[Any, Any]) -> Camera:
-    """A file of fisheye-calib-adapter, which names no model: it is known by its keys."""
+    """A file of fisheye-calib-adapter, which names no model: it is known by its keys.
+
+    Raises ``CalibrationError`` for what is no such file.
+    """
     image = value_of(document, "image")
     with located("image"):
         size = value_of(table_of(image), "width"), value_of(image, "height")

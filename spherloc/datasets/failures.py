@@ -72,6 +72,7 @@ class CaseMaker:
         return pose(rotation, -rotation @ centre)
 
     def between(self, low: float, high: float) -> float:
+        """From ``low`` to ``high``, uniformly."""
         return float(self.rng.uniform(low, high))
 
     def whole(self, low: int, high: int) -> int:
@@ -79,6 +80,7 @@ class CaseMaker:
         return int(self.rng.integers(low, high + 1))
 
     def cube(self, rng: np.random.Generator, count: int) -> FloatArray:
+        """Points (count, 3) of the cube, uniformly, metres."""
         return rng.uniform(-HALF_SIZE_M, HALF_SIZE_M, (count, 3))
 
     def seen(self, points: FloatArray, cam_from_map: FloatArray) -> tuple[FloatArray, BoolArray]:
@@ -162,6 +164,7 @@ class CaseMaker:
 
 @cache
 def cameras() -> tuple[Camera, ...]:
+    """Those of the scenes ``SCENES``."""
     scenes = bundled_scenes()
     return tuple(load_scene(scenes[name]).camera for name in SCENES)  # type: ignore[attr-defined]
 

@@ -166,7 +166,8 @@ class MapSettings:
         remarks: Iterable[str] = (),
         **others: Any,
     ) -> MapScene:
-        """The scene of these images; ``path`` is its file, and ``others`` are further fields of ``MapScene``.
+        """The scene of these images; ``path`` is its file, ``gravity_map`` the unit vector (3,) that points down in
+        the map, and ``others`` are further fields of ``MapScene``.
 
         Without a ``matcher`` among them, the front end that [frontend] describes is taken. Raises ``InputError`` for a
         wrong [frontend] and if there is no query or no reference.

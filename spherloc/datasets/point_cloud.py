@@ -81,9 +81,9 @@ class Cloud:
     ) -> tuple[FloatArray, FloatArray]:
         """Random points (count, 3) that are seen from all ``poses``, and the noise (count, 2) of their pixels, sd 1.
 
-        They are the first that the whole camera sees from ``home``. Those that are not seen from ``poses`` are
-        replaced by others of the cube that are, and if there are too few by points in front of the camera.
-        ``rngs`` draw points, noise, and the points in front. Raises ``InputError`` if too few are seen.
+        They are the first that the whole camera sees from the pose ``home`` (3, 4). Those that are not seen from
+        ``poses`` are replaced by others of the cube that are, and if there are too few by points in front of the
+        camera. ``rngs`` draw points, noise, and the points in front. Raises ``InputError`` if too few are seen.
         """
         whole = Lens(lens.camera)
         changed = lens != whole or len(poses) > 1 or poses[0] is not home

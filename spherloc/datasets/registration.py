@@ -98,7 +98,10 @@ def surfaces(camera: Camera, lift: Lift) -> Surfaces:
 
 
 def registration_error_m(start: Surfaces, fixed: Surfaces, down: FloatArray) -> float:
-    """RMS distance (metres) by which ICP moves ``start`` until it fits ``fixed``; inf if it does not fit."""
+    """RMS distance (metres) by which ICP moves ``start`` until it fits ``fixed``; inf if it does not fit.
+
+    ``down`` is the unit vector (3,) of gravity.
+    """
     from scipy.spatial import KDTree  # takes half a second
 
     tree = KDTree(fixed.points)

@@ -14,10 +14,11 @@ import numpy as np
 
 from spherloc import registry
 from spherloc.errors import InputError, reason, show
-from spherloc.files import is_file, read_file, reading
+from spherloc.files import is_file, read_file, reading, size_of
 from spherloc.problem import Problem
 
 MAX_BYTES = 1_000_000
+ADVICE = "give the path of a scene file (TOML) or a bundled scene's name"
 _INSTALLED = Path(__file__).resolve().parent / "scenes"
 BUNDLED = _INSTALLED if _INSTALLED.is_dir() else Path(__file__).resolve().parents[2] / "scenes"
 """An installation has them inside of this package, a checkout beside its packages."""
@@ -95,7 +96,7 @@ def read_table(path: Path) -> dict[str, Any]:
 
     Raises ``InputError`` for a missing file and for one that is no TOML.
     """
-    with reading(path, "give the path of a scene file (TOML) or a bundled scene's name"):
+    with reading(path, ADVICE):
         content = read_file(path, MAX_BYTES)
     try:
         return tomllib.loads(content.decode("utf-8"))
@@ -105,6 +106,12 @@ def read_table(path: Path) -> dict[str, Any]:
         raise InputError(f"{path}: not valid TOML: {reason(error)}; correct it there.") from None
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: no usable scene file ({reason(error)}); correct or replace it.") from None
+
+
+def check_there(path: Path) -> None:
+    """Raise ``InputError`` if there is no such scene file."""
+    with reading(path, ADVICE):
+        size_of(path)
 
 
 def bundled_scenes() -> dict[str, Path]:
@@ -129,7 +136,7 @@ def check_keys(table: Mapping[str, Any], required: set[str], optional: set[str],
 
 
 def text(table: Mapping[str, Any], key: str, where: str) -> str:
-    """A text value that must exist."""
+    """A text value that must exist; raises ``InputError`` otherwise."""
     value = table.get(key)
     if not isinstance(value, str) or not value:
         raise InputError(f"{where}: key '{key}' must be a text; add {key} = \"...\".")
@@ -137,7 +144,7 @@ def text(table: Mapping[str, Any], key: str, where: str) -> str:
 
 
 def section(table: Mapping[str, Any], key: str, where: str) -> dict[str, Any]:
-    """A sub-table; empty if absent."""
+    """A sub-table; empty if absent. Raises ``InputError`` for another value."""
     value = table.get(key, {})
     if not isinstance(value, dict):
         raise InputError(f"{where}: '{key}' must be a section [{key}].")
@@ -145,7 +152,7 @@ def section(table: Mapping[str, Any], key: str, where: str) -> dict[str, Any]:
 
 
 def number(table: Mapping[str, Any], key: str, where: str, lowest: float, highest: float) -> float:
-    """A finite number within limits that must exist."""
+    """A finite number within limits that must exist; raises ``InputError`` otherwise."""
     value = table.get(key)
     if isinstance(value, bool) or not isinstance(value, int | float) or not lowest <= value <= highest:
         raise InputError(f"{where}: {key} is {show(value)}; give a number from {lowest:g} to {highest:g}.")
@@ -153,7 +160,7 @@ def number(table: Mapping[str, Any], key: str, where: str, lowest: float, highes
 
 
 def integer(table: Mapping[str, Any], key: str, where: str, lowest: int, highest: int) -> int:
-    """A whole number within limits that must exist."""
+    """A whole number within limits that must exist; raises ``InputError`` otherwise."""
     value = table.get(key)
     if isinstance(value, bool) or not isinstance(value, int) or not lowest <= value <= highest:
         raise InputError(f"{where}: {key} is {show(value)}; give a whole number from {lowest} to {highest}.")
@@ -161,7 +168,7 @@ def integer(table: Mapping[str, Any], key: str, where: str, lowest: int, highest
 
 
 def numbers(value: Any, shape: tuple[int, ...], key: str, where: str) -> np.ndarray:
-    """A (nested) list of finite numbers of the given shape."""
+    """A (nested) list of finite numbers of the given shape; raises ``InputError`` for anything else."""
     try:
         array = np.array(value, dtype=object)
         real = all(isinstance(item, int | float) and not isinstance(item, bool) for item in array.flat)

@@ -107,7 +107,7 @@ class Variation:
         return self.edit(self.unedited(scene, seed, query), used_seed(scene, seed))
 
     def unedited(self, scene: Scene, seed: int | None = None, query: str | None = None) -> Problem:
-        """``problem`` with all matches as they are."""
+        """``problem`` with all matches as they are; raises ``InputError`` as it does."""
         changed = self.scene(scene)
         if isinstance(changed, MapScene):
             return drawn(changed, lambda: changed.problem(seed, query))

@@ -13,7 +13,7 @@ from spherloc.gauss_newton import LEAST_GRAVITY_SD_RAD, tilt_of
 from spherloc.geometry import camera_centre, pose, rotation_angle, transform, yaw_rotation
 from spherloc.metrics import evaluate
 from spherloc.problem import AlignedProblem
-from spherloc.refine import RefinementOptions, refine, residuals_px
+from spherloc.refine import RefinementOptions, gravity_sd_rad, refine, residuals_px
 from spherloc.trace import Certificate, ConsensusStage, Trace
 from spherloc.types import BoolArray, FloatArray
 
@@ -37,8 +37,9 @@ def pose_sd(
 ) -> tuple[float, float, float]:
     """Standard deviations of rotation (rad), position (m) and tilt (rad) in their worst directions.
 
-    They are those of the masked correspondences less the ``drop`` on which the position hangs most: where the others
-    leave a valley of poses open, some pose in it agrees with a wrong match too, which then seems to fix it.
+    They are those of the correspondences of ``mask`` (M,) at an aligned pose (3, 4), less the ``drop`` on which the
+    position hangs most: where the others leave a valley of poses open, some pose in it agrees with a wrong match too,
+    which then seems to fix it.
     """
     each = _information(aligned, cam_from_map, mask) / noise_px**2
     weight = max(gravity_sd_rad, LEAST_GRAVITY_SD_RAD) ** -2.0
@@ -128,7 +129,7 @@ def search(aligned: AlignedProblem, bound_px: float, options: RefinementOptions)
 
 
 def subset(aligned: AlignedProblem, mask: BoolArray) -> AlignedProblem:
-    """The masked correspondences alone."""
+    """The correspondences of ``mask`` (M,) alone."""
     names = ("index", "bearings", "points", "pixel_from_bearing", "radians_per_pixel")
     return replace(aligned, **{name: np.ascontiguousarray(getattr(aligned, name)[mask]) for name in names})
 
@@ -154,7 +155,8 @@ def certify(trace: Trace) -> Certificate | None:
 def free_fit(aligned: AlignedProblem, starts: list[FloatArray], bound_px: float) -> Fit | None:
     """The pose with the most support within ``WIDER`` times the bound where gravity is not believed.
 
-    From ``starts``, and from a search that allows for a wrong gravity and tightens its bound step by step.
+    From the aligned poses ``starts``, each (3, 4), and from a search that allows for a wrong gravity and tightens its
+    bound step by step.
     """
     free = replace(aligned, gravity_bound_rad=0.0, gravity_sd_rad=np.inf)
     wide, options = WIDER * bound_px, RefinementOptions(gravity_sd_deg=np.inf)
@@ -265,7 +267,7 @@ def gather(trace: Trace) -> Evidence:
     return Evidence(
         aligned=aligned,
         bound_px=bound_px,
-        believed_rad=min(aligned.gravity_bound_rad, BELIEVED_SDS * _gravity_sd(aligned, options)),
+        believed_rad=min(aligned.gravity_bound_rad, BELIEVED_SDS * gravity_sd_rad(aligned, options)),
         chance_rate=chance_rate(aligned.bearings, bounds.radians),
         run=run,
         best=best,
@@ -293,10 +295,6 @@ def different(one: FloatArray, other: FloatArray) -> bool:
     return turn > DIFFERENT_RAD or distance > DIFFERENT_M
 
 
-def _gravity_sd(aligned: AlignedProblem, options: RefinementOptions) -> float:
-    return aligned.gravity_sd_rad if options.gravity_sd_deg is None else float(np.radians(options.gravity_sd_deg))
-
-
 def _sd(aligned: AlignedProblem, best: Fit, bound_px: float, options: RefinementOptions) -> tuple[float, float]:
     """Standard deviations of rotation (rad) and position (m)."""
     mask = best.errors_px <= bound_px
@@ -304,7 +302,7 @@ def _sd(aligned: AlignedProblem, best: Fit, bound_px: float, options: Refinement
     if size < 2:
         return np.inf, np.inf
     drop = LOOSE_ENDS if size >= FEW else 0
-    return pose_sd(aligned, best.cam_from_map, mask, options.noise_px, _gravity_sd(aligned, options), drop)[:2]
+    return pose_sd(aligned, best.cam_from_map, mask, options.noise_px, gravity_sd_rad(aligned, options), drop)[:2]
 
 
 def _free_tilt_sd(aligned: AlignedProblem, free: Fit, bound_px: float) -> float:
@@ -337,7 +335,7 @@ def gather_truth(trace: Trace, bound_px: float) -> Truth | None:
     right = fit.errors_px <= WIDER * bound_px if labels is None else labels
     rotation_sd, position_sd = np.inf, np.inf
     if np.count_nonzero(right) >= 2:
-        gravity_sd = _gravity_sd(aligned, options)
+        gravity_sd = gravity_sd_rad(aligned, options)
         rotation_sd, position_sd, _ = pose_sd(aligned, true, right, options.noise_px, gravity_sd, 0)
     success = evaluate(trace).success
     if success is None:

@@ -54,16 +54,19 @@ class Cluster:
             raise
 
     def room(self) -> int:
+        """How many more tasks can be submitted now."""
         if time.monotonic() - self._counted > COUNT_EVERY_S:
             self._count()
         return self._threads + AHEAD - len(self._tasks)
 
     def submit(self, jobs: tuple[Job, ...]) -> None:
+        """Have a worker do these jobs as one task; does not wait."""
         future = self._client.submit(solve, self._plan, jobs, self._keep, pure=False)
         self._tasks[future] = jobs
         future.add_done_callback(self._ended.put)
 
     def collect(self, timeout_s: float) -> list[Done]:
+        """Tasks that ended since the last call; waits so long, seconds, for the first one."""
         found: list[Done] = []
         with contextlib.suppress(queue.Empty):
             future = self._ended.get(timeout=timeout_s)
@@ -76,6 +79,7 @@ class Cluster:
         return found
 
     def close(self) -> None:
+        """Drop what is not done and let the workers go."""
         with contextlib.suppress(Exception):  # the scheduler may be gone
             self._client.cancel(list(self._tasks), asynchronous=False)
         self._tasks.clear()

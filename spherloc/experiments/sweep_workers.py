@@ -115,9 +115,11 @@ class LocalWorkers:
         self._start()
 
     def room(self) -> int:
+        """How many more tasks can be submitted now."""
         return self._workers + AHEAD - len(self._tasks)
 
     def submit(self, jobs: tuple[Job, ...]) -> None:
+        """Have a worker do these jobs as one task; does not wait."""
         try:
             with _deaf_to_ctrl_c():
                 future = self._pool.submit(solve, self._plan, jobs, self._keep)
@@ -127,6 +129,7 @@ class LocalWorkers:
         self._tasks[future] = jobs
 
     def collect(self, timeout_s: float) -> list[Done]:
+        """Tasks that ended since the last call; waits so long, seconds, for the first one."""
         ended, _ = wait(self._tasks, timeout_s, FIRST_COMPLETED)
         if any(_is_broken(future) for future in ended):
             ended = set(self._tasks)  # those that have a result keep it
@@ -134,6 +137,7 @@ class LocalWorkers:
         return [Done(self._tasks.pop(future), _result(future)) for future in ended]
 
     def close(self) -> None:
+        """Drop what is not begun, and end the processes."""
         self._lifeline.close()
         self._pool.shutdown(wait=True, cancel_futures=True)
 

@@ -109,7 +109,10 @@ def read_rig(root: Path, camera: str, where: str) -> Rig:
 
 
 def read_cam_to_pose(path: Path) -> dict[str, FloatArray]:
-    """``imu_from_camera`` by camera, of lines "image_0X: " and twelve numbers."""
+    """``imu_from_camera`` by camera, of lines "image_0X: " and twelve numbers.
+
+    Raises ``InputError`` for a wrong line.
+    """
     found: dict[str, FloatArray] = {}
     for place, text in rows(path, "the dataset's calib_cam_to_pose.txt"):
         key, _, values = text.partition(":")
@@ -120,7 +123,7 @@ def read_cam_to_pose(path: Path) -> dict[str, FloatArray]:
 
 
 def read_cam_to_velo(path: Path) -> FloatArray:
-    """``velodyne_from_image_00``, the twelve numbers of the only line."""
+    """``velodyne_from_image_00`` (3, 4), the twelve numbers of the only line; raises ``InputError`` for other lines."""
     lines = list(rows(path, "the dataset's calib_cam_to_velo.txt"))
     if len(lines) != 1:
         raise InputError(f"{path}: has {len(lines)} lines of numbers instead of one; take the dataset's own file.")
@@ -129,7 +132,10 @@ def read_cam_to_velo(path: Path) -> FloatArray:
 
 
 def read_poses(path: Path) -> dict[int, FloatArray]:
-    """``world_from_imu`` by frame, in growing order, of lines with a frame and twelve numbers. Frames have gaps."""
+    """``world_from_imu`` by frame, in growing order, of lines with a frame and twelve numbers. Frames have gaps.
+
+    Raises ``InputError`` for a wrong line.
+    """
     poses: dict[int, FloatArray] = {}
     last = -1
     for place, text in rows(path, "the poses.txt of a sequence"):
@@ -163,7 +169,10 @@ def _rigid(words: list[str], place: str) -> FloatArray:
 
 
 def read_timestamps(path: Path) -> list[float]:
-    """Seconds since 1970 (UTC) of every frame, of lines "2013-05-28 08:46:02.904094720"."""
+    """Seconds since 1970 (UTC) of every frame, of lines "2013-05-28 08:46:02.904094720".
+
+    Raises ``InputError`` for a wrong line.
+    """
     times = []
     for place, text in rows(path, "the timestamps.txt of a camera"):
         match = _TIME.fullmatch(text)

@@ -2,7 +2,6 @@
 
 import io
 import zipfile
-import zlib
 from dataclasses import dataclass
 from math import ceil, pi, tau
 from pathlib import Path
@@ -12,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from spherloc.disk_cache import cache_folder, key_of, make_room_once, store, used
+from spherloc.disk_cache import DAMAGED_NPZ, cache_folder, key_of, make_room_once, store, used
 from spherloc.errors import InputError, show
 from spherloc.files import read_file
 from spherloc.frontend.feature_kinds import KINDS, Descriptors, detect
@@ -22,8 +21,6 @@ from spherloc.types import BoolArray, ByteArray, FloatArray
 
 VERSION = 2
 """Raised when the same options give other features, so that old files are not taken for them."""
-
-_DAMAGED = (OSError, ValueError, KeyError, EOFError, MemoryError, zipfile.BadZipFile, zlib.error, NotImplementedError)
 
 
 def feature_file(image: Path, usable: BoolArray, options: Any, seam: bool) -> Path | None:
@@ -57,7 +54,7 @@ def fetch(path: Path) -> tuple[FloatArray, Descriptors] | None:
                 return None
         with np.load(io.BytesIO(content), allow_pickle=False) as stored:
             table, descriptors = stored["table"], stored["descriptors"]
-    except _DAMAGED:
+    except DAMAGED_NPZ:
         return None
     whole = table.dtype == np.float64 and descriptors.dtype in (np.float32, np.uint8) and descriptors.ndim == 2
     if not whole or table.shape != (len(descriptors), 5):

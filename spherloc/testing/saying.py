@@ -14,13 +14,16 @@ class Saying:
         self._what = what
 
     def need(self, true: Any, otherwise: str) -> None:
+        """Raise ``AssertionError`` with ``otherwise`` unless it is true."""
         if not true:
             self.fail(otherwise)
 
     def fail(self, otherwise: str) -> None:
+        """Raise ``AssertionError`` with a sentence that ends with ``otherwise``."""
         raise AssertionError(f"{self._what} {otherwise}.")
 
     def raises(self, kind: type[Exception], call: Callable[[], Any], of: str) -> None:
+        """Raise ``AssertionError`` unless ``call`` raises this kind of error; ``of`` says of what."""
         try:
             call()
         except kind:
@@ -31,6 +34,7 @@ class Saying:
 
 
 def name_of(thing: Any) -> str:
+    """What to call it: its name, or that of its type."""
     return str(getattr(thing, "name", getattr(thing, "__name__", type(thing).__name__)))
 
 

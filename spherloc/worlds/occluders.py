@@ -118,7 +118,7 @@ def _disc(builder: MeshBuilder, hub: FloatArray, axes: FloatArray, side: int) ->
 
 
 def add_person(builder: MeshBuilder, rng: np.random.Generator, place: FloatArray) -> None:
-    """Somebody about 1.75 m tall."""
+    """Somebody about 1.75 m tall, who stands at ``place`` (3,), metres."""
     tall = rng.uniform(0.93, 1.06)
     turn = rng.uniform(0, 2 * np.pi)
     across = np.array([-np.sin(turn), np.cos(turn), 0.0])
@@ -139,7 +139,7 @@ def add_person(builder: MeshBuilder, rng: np.random.Generator, place: FloatArray
 
 
 def add_boxes(builder: MeshBuilder, rng: np.random.Generator, place: FloatArray) -> None:
-    """Two parcels, one on the other."""
+    """Two parcels, one on the other, at ``place`` (3,), metres."""
     height = 0.0
     for _ in range(2):
         half = np.append(rng.uniform(0.18, 0.36, 2), 0.0)

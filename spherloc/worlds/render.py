@@ -1,8 +1,6 @@
 """Pictures of a world through any camera model, with the distance along every ray."""
 
 import io
-import zipfile
-import zlib
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -13,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spherloc.cameras.base import Camera
-from spherloc.disk_cache import cache_folder, key_of, make_room_once, store, used
+from spherloc.disk_cache import DAMAGED_NPZ, cache_folder, key_of, make_room_once, store, used
 from spherloc.errors import InputError
 from spherloc.geometry import camera_centre
 from spherloc.images import read_image
@@ -44,7 +42,10 @@ class Render:
 def draw(
     world: World, camera: Camera, cam_from_world: FloatArray, conditions: Conditions = CLEAR, seed: int = 0
 ) -> Render:
-    """Cast a ray through every pixel, and four more where surfaces meet. ``seed`` places occluders and makes noise."""
+    """Cast a ray through every pixel, and four more where surfaces meet.
+
+    ``cam_from_world`` is the camera's pose (3, 4); ``seed`` places occluders and makes noise.
+    """
     rotation, centre = cam_from_world[:, :3], camera_centre(cam_from_world)
     rays = with_occluders(world, centre, conditions.occluders, seed)
     lighting = Lighting(world, rays, conditions)
@@ -164,7 +165,7 @@ def image_path(
 ) -> Path:
     """Where the picture is kept, whether or not it was drawn yet; its distances are beside it with the suffix .npz.
 
-    ``name`` is the stem of the file, for people to read.
+    ``cam_from_world`` is the camera's pose (3, 4); ``name`` is the stem of the file, for people to read.
     """
     place = np.ascontiguousarray(cam_from_world, np.float64).tobytes()
     key = key_of(*world.identity(), sorted(camera.to_dict().items()), place, conditions, seed, sources_hash())
@@ -206,7 +207,7 @@ def stored_range(path: Path, camera: Camera) -> NDArray[np.float32] | None:
     try:
         with np.load(path.with_suffix(".npz"), allow_pickle=False) as content:
             range_m = content["range_m"]
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError):
+    except DAMAGED_NPZ:
         return None
     right = range_m.shape == (camera.height, camera.width) and range_m.dtype == np.float32
     return range_m if right else None

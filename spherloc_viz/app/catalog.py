@@ -12,6 +12,8 @@ from spherloc.datasets.map_scene import MapScene
 from spherloc.datasets.synthetic import SyntheticScene
 from spherloc.datasets.variation import Variation
 from spherloc.problem import Problem
+from spherloc_viz.given_files import is_recording
+from spherloc_viz.recording.replay.scene import load_recorded_scene
 
 MOST_BRIEF = 8
 """Recorded problems that a page offers beside its scenes."""
@@ -35,11 +37,11 @@ class Catalog:
     """Scenes by label: the one of the command line first, then those that come with the project, simulations first."""
 
     def __init__(self, given: Path | None) -> None:
-        """Raises ``InputError`` if the given scene cannot be used."""
+        """``given`` is a scene file or a recording; raises ``SpherlocError`` if it cannot be used."""
         self.scenes: dict[str, Scene] = {}
         self._paths: dict[str, Path] = {}
         if given is not None:
-            self.add(load_scene(given), given)
+            self.add(load_recorded_scene(given) if is_recording(given) else load_scene(given), given)
         others = [path for path in bundled_scenes().values() if given is None or path.resolve() != given.resolve()]
         loaded = [(load_scene(path), path) for path in others]
         # A simulation shows its first picture at once, images take seconds.

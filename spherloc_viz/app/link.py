@@ -62,11 +62,11 @@ def link_of(run: Run, view: PageView, catalog: Catalog, known: Iterable[str], ro
         ("query", scene.query),
         ("camera", None if variation.camera is None else cameras.get(variation.camera)),
         *(("set", setting) for setting in settings_of(replace(variation, camera=None))),
-        *((key, numbers_text(getattr(variation, name))) for key, name in zip(LISTS, EDITS, strict=True)),
+        *((key, _numbers_text(getattr(variation, name))) for key, name in zip(LISTS, EDITS, strict=True)),
         ("estimator", request.estimator),
         *(("option", f"{name}={typed(value)}") for name, value in _changed(request.options, default)),
         ("step", view.step),
-        ("select", numbers_text(view.selected)),
+        ("select", _numbers_text(view.selected)),
         ("theme", view.theme if view.theme != THEMES[0] else None),
         ("answers", ANSWERS[1] if view.answers_hidden else None),
     ]
@@ -79,7 +79,7 @@ def _changed(options: Any, default: Any) -> list[tuple[str, Any]]:
     return [(name, getattr(options, name)) for name in names if getattr(options, name) != getattr(default, name)]
 
 
-def numbers_text(numbers: Iterable[int]) -> str:
+def _numbers_text(numbers: Iterable[int]) -> str:
     """Numbers with commas between them."""
     return ",".join(map(str, numbers))
 

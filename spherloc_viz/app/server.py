@@ -9,7 +9,7 @@ import signal
 import socket
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import viser
@@ -19,9 +19,11 @@ from spherloc.errors import InputError, RecordingError
 from spherloc.files import is_folder
 from spherloc.warm_up import warm_up
 from spherloc_viz.app.audience import Audience
-from spherloc_viz.app.catalog import Catalog
+from spherloc_viz.app.catalog import Catalog, SceneRequest
 from spherloc_viz.app.compilation import Compilation, first_and_later
+from spherloc_viz.app.page_runs import Known
 from spherloc_viz.app.review.run_library import RunLibrary
+from spherloc_viz.app.run_request import RunRequest
 from spherloc_viz.app.services import Services
 from spherloc_viz.app.session import Session
 from spherloc_viz.app.stage import views
@@ -31,8 +33,10 @@ from spherloc_viz.app.web.front_door import FrontDoor
 from spherloc_viz.app.web.guard import open_socket
 from spherloc_viz.app.web.viewer import ViewerRoom, of_index
 from spherloc_viz.app.web.viser_internals import role_header, set_theme, start_viser, stop_viser
+from spherloc_viz.given_files import is_recording
 from spherloc_viz.plugins import extensions
 from spherloc_viz.recording.index.run_index import RunIndex
+from spherloc_viz.recording.replay.scene import RecordedScene, recorded_options
 from spherloc_viz.recording.sandbox.examiner import end_examining
 from spherloc_viz.recording.storage.recorder import Recorder
 from spherloc_viz.recording.storage.room import KEEP_GIGABYTES, kept_bytes
@@ -55,25 +59,33 @@ def serve(
     allow: Sequence[Path] = (),
     keep_gigabytes: float = KEEP_GIGABYTES,
     token: bool = False,
+    framed: bool = False,
+    on_address: Callable[[str], None] | None = None,
 ) -> None:
     """Run the playground until Ctrl-C or a termination signal.
 
-    ``scene`` is offered first, before those that come with the project; port 0 takes any free port. Runs that a
-    page settles on are recorded into ``recordings`` unless ``record`` is false; beyond ``keep_gigabytes`` the oldest
-    successes are deleted. Pages may open scenes from the folder of ``scene``, from that of the bundled ones and from
-    ``allow``. A token is demanded if ``token`` says so, and always where the address is not this machine's alone.
+    ``scene`` is offered first, before those that come with the project; of a recording (.rrd), pages open its run.
+    Port 0 takes any free port. ``on_address`` is called with the address as soon as browsers can be sent there, where
+    they wait until all is ready; ``framed`` lets other pages of this machine, such as a notebook's, show the page in a
+    frame. Runs that a page settles on are recorded into ``recordings`` unless ``record`` is false; beyond
+    ``keep_gigabytes`` the oldest successes are deleted. Pages may open scenes from the folder of ``scene`` if it is a
+    scene file, from that of the bundled ones and from ``allow``. A token is
+    demanded if ``token`` says so, and always where the address is not this machine's alone.
     Raises ``InputError`` if the scene, one of these folders or the size cannot be used or the port cannot
-    be had.
+    be had, and ``RecordingError`` for a recording that cannot be opened.
     """
     catalog, keep_bytes = Catalog(scene), kept_bytes(keep_gigabytes)
+    first = _first_run(catalog)
     with open_socket(host, port) as listener, contextlib.ExitStack() as stack:
+        if on_address is not None:
+            on_address(_address(listener))
         _answer_quickly()
-        first, later = first_and_later()
-        _prepare(first)
+        early, later = first_and_later()
+        _prepare(early)
         compilation = Compilation(later)
         stack.callback(compilation.close)
         compilation.start()
-        services = Services(catalog, allowed_roots(scene, allow), compilation=compilation)
+        services = Services(catalog, allowed_roots(scene, allow), first=first, compilation=compilation)
         sessions = Sessions(services)
         stack.callback(services.downloads.close)
         if record:
@@ -91,8 +103,18 @@ def serve(
         stack.callback(sessions.close)
         sessions.attend(server)
         access = Access(demanded=token or not _is_loopback(listener))
-        door = FrontDoor(host, server.get_port(), key, access, services.downloads, viewer)
+        door = FrontDoor(host, server.get_port(), key, access, services.downloads, viewer, framed)
         asyncio.run(_serve_until_told(door, access, listener))
+
+
+def _first_run(catalog: Catalog) -> Known | None:
+    """The run of the recording that the catalog begins with, if it does."""
+    label, scene = next(iter(catalog.scenes.items()))
+    if not isinstance(scene, RecordedScene):
+        return None
+    run = scene.run
+    request = RunRequest(SceneRequest(label, run.seed), run.estimator, recorded_options(run, scene.path))
+    return Known(request, scene.path, run.cam_from_map)
 
 
 def _prepare(estimators: Sequence[str]) -> None:
@@ -104,9 +126,9 @@ def _prepare(estimators: Sequence[str]) -> None:
         _say(sentence)
 
     warm_up(tell, estimators)
-    for plugin in extensions():
-        if plugin.problem and not any(line.startswith(plugin.problem) for line in told):
-            tell(plugin.problem)
+    for extension in extensions():
+        if extension.problem and not any(line.startswith(extension.problem) for line in told):
+            tell(extension.problem)
 
 
 def _say(sentence: str) -> None:
@@ -138,7 +160,8 @@ def allowed_roots(scene: Path | None, allow: Sequence[Path]) -> tuple[Path, ...]
         if not is_folder(folder):
             raise InputError(f"{folder}: is no folder; give --allow one that exists.")
     bundled = {path.parent for path in bundled_scenes().values()}
-    return (*allow, *(() if scene is None else (scene.parent,)), *sorted(bundled))
+    own = () if scene is None or is_recording(scene) else (scene.parent,)
+    return (*allow, *own, *sorted(bundled))
 
 
 class Sessions:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from spherloc_viz.app.catalog import Catalog
 from spherloc_viz.app.compilation import Compilation
+from spherloc_viz.app.page_runs import Known
 from spherloc_viz.app.presented import Presented
 from spherloc_viz.app.review.run_library import RunLibrary
 from spherloc_viz.app.web.downloads import Downloads
@@ -20,6 +21,8 @@ class Services:
     """Folders that pages may open scenes from."""
     recorder: Recorder | None = None
     """Where settled runs go; None if they are not recorded."""
+    first: Known | None = None
+    """The recorded run that pages open with; None for the catalog's first scene."""
     library: RunLibrary | None = None
     """The recordings that pages review; None if there is no folder of them."""
     downloads: Downloads = field(default_factory=Downloads)

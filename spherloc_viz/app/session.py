@@ -88,10 +88,14 @@ class Session:
         self._display.panels.ready()
 
     def start(self) -> None:
-        """Solve and show the first problem."""
+        """Solve and show the first problem, or the recorded run that was asked for."""
         for worker in (self._page, self._diagnoser, self._controls.slow, self._solver):
             worker.start()
-        self._solver.ask()
+        first = self._services.first
+        if first is None:
+            self._solver.ask()
+        else:
+            self.open_recorded(first.request, first.path, first.cam_from_map)
 
     def close(self) -> None:
         """End the threads; does not wait."""

@@ -13,7 +13,7 @@ from rerun.chunk import Chunk, LazyChunkStream, RrdReader
 from rerun.error_utils import RerunWarning
 
 from spherloc.errors import InputError, RecordingError, show
-from spherloc_viz.recording import REVIEW_SUFFIX
+from spherloc_viz.given_files import REVIEW_SUFFIX, check_recording_file
 from spherloc_viz.recording.content.properties import APPLICATION_ID, REVIEW_ENTITY, REVIEW_PROPERTY
 from spherloc_viz.recording.content.text import plain
 
@@ -48,8 +48,7 @@ def _texts(column: pa.Array, most: int) -> list[str]:
 
 def recording_id(recording: Path) -> str:
     """The recording's id. Raises ``RecordingError`` if it is none of ours."""
-    if not recording.is_file():
-        raise RecordingError(f"{recording}: no such file; give the path of a recording (.rrd).")
+    check_recording_file(recording)
     with contextlib.suppress(OSError, RuntimeError, ValueError):
         for entry in _reader(recording).recordings():
             if entry.application_id == APPLICATION_ID:

@@ -44,14 +44,16 @@ class FrontDoor:
         access: Access,
         downloads: Downloads,
         viewer: ViewerRoom | None = None,
+        framed: bool = False,
     ) -> None:
-        """``viewer`` is None where nothing is recorded."""
+        """``viewer`` is None where nothing is recorded; ``framed`` lets other pages of this machine, such as a
+        notebook's, show the page in a frame."""
         self._host, self._access = host, access
         self._viewer = viewer
         self._downloads = downloads
         self._upstream = f"http://127.0.0.1:{viser_port}/"
         self._key = key
-        self._page: Page = load_page()
+        self._page: Page = load_page(framed)
         self._client: aiohttp.ClientSession | None = None
         self._open: set[web.WebSocketResponse] = set()
         self._audience = 0

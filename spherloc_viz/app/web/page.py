@@ -20,6 +20,9 @@ SCRIPTS = ("changes.js", "touch.js", "introduction.js", "captions.js", "link.js"
 shows the introduction and the captions of the projector view and of phones, and keeps the address (``app/link.py``)."""
 
 
+THIS_MACHINE = "http://localhost:* http://127.0.0.1:* https://localhost:* https://127.0.0.1:*"
+
+
 @dataclass(frozen=True)
 class Page:
     """The page and what may run in it."""
@@ -31,8 +34,8 @@ class Page:
     """The content security policy."""
 
 
-def load_page() -> Page:
-    """The page of the installed viser."""
+def load_page(framed: bool = False) -> Page:
+    """The page of the installed viser; ``framed`` is one that other pages of this machine may show in a frame."""
     path = Path(viser.__file__).parent / "client" / "build" / "index.html"
     html = path.read_text(encoding="utf-8")
     own = Path(__file__).parent
@@ -40,16 +43,16 @@ def load_page() -> Page:
     ours = f"{QUIET}<style>{own.joinpath(STYLE).read_text(encoding='utf-8')}</style>{scripts}"
     html = html.replace("<title>Viser</title>", f"<title>spherloc</title>{ours}", 1)
     data = html.encode()
-    return Page(html=data, zipped=gzip.compress(data, mtime=0), policy=content_policy(html))
+    return Page(html=data, zipped=gzip.compress(data, mtime=0), policy=content_policy(html, framed))
 
 
-def content_policy(html: str) -> str:
+def content_policy(html: str, framed: bool = False) -> str:
     """A policy under which the page runs with no network but this server, and nothing else runs in it.
 
     - Scripts: the page's own inline loader by its hash, and what that loader inserts; so neither text from a
       scene file nor viser's "run this JavaScript" message can execute anything.
     - Connections: this server only; a link with ``?websocket=`` or ``?playbackPath=`` cannot point elsewhere.
-    - No frames: another site cannot lay this page under its own buttons.
+    - No frames, but of this machine if ``framed``: another site cannot lay this page under its own buttons.
     """
     scripts = re.findall(r"<script\b[^>]*>(.*?)</script>", html, flags=re.DOTALL)
     hashes = [base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in scripts]
@@ -65,6 +68,6 @@ def content_policy(html: str) -> str:
         "connect-src": "'self' data: blob:",
         "base-uri": "'none'",
         "form-action": "'none'",
-        "frame-ancestors": "'none'",
+        "frame-ancestors": THIS_MACHINE if framed else "'none'",
     }
     return "; ".join(f"{name} {value}" for name, value in rules.items())

@@ -15,6 +15,7 @@ from spherloc.errors import InputError, RecordingError, show
 from spherloc.problem import Problem
 from spherloc.trace import Certificate
 from spherloc.types import BoolArray, FloatArray
+from spherloc_viz.given_files import check_recording_file
 from spherloc_viz.recording.content.data import (
     DATA,
     Row,
@@ -129,8 +130,7 @@ def _sentences(path: Path) -> Iterator[None]:
 
 
 def _open(path: Path) -> tuple[StoreEntry, LazyStore]:
-    if not path.is_file():
-        raise RecordingError(f"{path}: no such file; give the path of a recording (.rrd).")
+    check_recording_file(path)
     try:
         with warnings.catch_warnings():
             # rerun only warns where a file has no index at its end.

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Protocol, TypeVar
 
 from spherloc.errors import RecordingError
-from spherloc_viz.recording import REVIEW_SUFFIX
+from spherloc_viz.given_files import REVIEW_SUFFIX
 from spherloc_viz.recording.index.rows import put
 from spherloc_viz.recording.reviews import UNREADABLE, has_review, review_path
 from spherloc_viz.recording.run_row import RunRow

@@ -9,11 +9,11 @@ from spherloc.datasets import Scene, load_scene
 from spherloc.datasets.variation import Variation
 from spherloc.errors import SpherlocError, show
 from spherloc.problem import Problem
+from spherloc_viz.given_files import is_recording
 from spherloc_viz.recording.content.reader import RecordedRun
 from spherloc_viz.recording.origin import Origin
 from spherloc_viz.recording.replay.repeat import different_fields
 from spherloc_viz.recording.replay.scene import RecordedScene, recorded_options
-from spherloc_viz.share import is_recording
 
 
 @dataclass(frozen=True, eq=False)

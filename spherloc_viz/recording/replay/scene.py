@@ -10,9 +10,9 @@ from spherloc.datasets import Scene
 from spherloc.datasets.variation import Variation, used_seed
 from spherloc.errors import InputError, RecordingError, show
 from spherloc.estimators import options_type
-from spherloc.files import is_file
 from spherloc.problem import Problem
 from spherloc.ranges import check_options
+from spherloc_viz.given_files import check_recording_file
 from spherloc_viz.options import OptionField, option_fields
 from spherloc_viz.recording.content.reader import RecordedRun, read_recording
 from spherloc_viz.recording.origin import Origin, Source
@@ -49,8 +49,7 @@ def load_recorded_scene(path: Path) -> RecordedScene:
     Raises ``RecordingError``, in one sentence, if there is no such file or it is no whole recording of ours.
     """
     path = Path(path)
-    if not is_file(path):
-        raise RecordingError(f"{path}: no such file; give the path of a recording (.rrd).")
+    check_recording_file(path)
     examine(path)
     return RecordedScene(read_recording(path), path)
 

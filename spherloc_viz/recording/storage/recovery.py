@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from spherloc.errors import RecordingError
-from spherloc_viz.recording import REVIEW_SUFFIX
+from spherloc_viz.given_files import REVIEW_SUFFIX
 from spherloc_viz.recording.rerun_program import rerun_command, rerun_environment
 from spherloc_viz.recording.sandbox.examiner import Examiner, ExaminerError
 from spherloc_viz.recording.storage.unfinished import target_of, unfinished
@@ -20,7 +20,7 @@ MERGE_LIMIT_S = 60.0
 
 
 @dataclass(frozen=True)
-class Rescued:
+class Recovered:
     """What became of a leftover."""
 
     recording: Path | None = None
@@ -29,7 +29,7 @@ class Rescued:
     """Where it lies now if none could be made of it."""
 
 
-def rescue(part: Path, examiner: Examiner) -> Rescued:
+def recover(part: Path, examiner: Examiner) -> Recovered:
     """Make a recording of what is left of one, if there is enough; otherwise rename it, so that a person can decide.
 
     The problem and the result come first in a file, so that even a fifth of it has all that repeats the run. The
@@ -39,29 +39,29 @@ def rescue(part: Path, examiner: Examiner) -> Rescued:
     """
     target = target_of(part)
     if target is None:
-        return Rescued()
+        return Recovered()
     mended = unfinished(target)
     try:
         if not part.stat().st_size:
             part.unlink()
-            return Rescued()
+            return Recovered()
         is_run = not target.name.endswith(REVIEW_SUFFIX)
         if is_run and target.exists() and _readable(target, examiner):
             part.unlink()
-            return Rescued()
+            return Recovered()
         if is_run and not target.exists():
             if _readable(part, examiner):
-                return Rescued(part.replace(target))
+                return Recovered(part.replace(target))
             if shutil.disk_usage(part.parent).free < ROOM * part.stat().st_size:
-                return Rescued()
+                return Recovered()
             if _merged(part, mended) and _readable(mended, examiner):
                 mended.replace(target)
                 part.unlink()
-                return Rescued(target)
+                return Recovered(target)
         number = part.name.removesuffix(".part")[-8:]  # tells leftovers of one file apart
-        return Rescued(kept=part.replace(part.with_name(f"{target.name}.{number}{UNREADABLE_SUFFIX}")))
+        return Recovered(kept=part.replace(part.with_name(f"{target.name}.{number}{UNREADABLE_SUFFIX}")))
     except FileNotFoundError:
-        return Rescued()  # another process has done it meanwhile
+        return Recovered()  # another process has done it meanwhile
     finally:
         mended.unlink(missing_ok=True)
 

@@ -22,7 +22,7 @@ from spherloc_viz.recording.index.run_index import RunIndex
 from spherloc_viz.recording.origin import Origin
 from spherloc_viz.recording.reviews import has_review
 from spherloc_viz.recording.sandbox.examiner import Examiners, examine_review
-from spherloc_viz.recording.storage.recovery import rescue
+from spherloc_viz.recording.storage.recovery import recover
 from spherloc_viz.recording.storage.retention import Pruned, prune
 from spherloc_viz.recording.storage.room import KEEP_BYTES, size_words
 from spherloc_viz.recording.storage.unfinished import here, leftovers
@@ -125,9 +125,9 @@ class RecordingStore:
         folders = [folder for folder in (self.folder, self.folder / GALLERY) if folder.is_dir()]
         found = [part for folder in folders for part in leftovers(folder)]
         with self._examiners.start(1) as (examiner,):
-            rescued = [rescue(part, examiner) for part in found]
-        saved = [done.recording for done in rescued if done.recording is not None]
-        kept = [done.kept for done in rescued if done.kept is not None]
+            recovered = [recover(part, examiner) for part in found]
+        saved = [done.recording for done in recovered if done.recording is not None]
+        kept = [done.kept for done in recovered if done.kept is not None]
         if saved:
             runs = "a run" if len(saved) == 1 else f"{len(saved)} runs"
             self._notice(f"Recovered the recording of {runs} that was not finished: {_names(saved)}.")

@@ -1,0 +1,62 @@
+"""What tells recordings from other files, and whether files that somebody names are there.
+
+Imports nothing large, so that a command says at once that a file is missing.
+"""
+
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from spherloc.errors import InputError, RecordingError, SpherlocError
+from spherloc.files import is_file, is_folder
+
+RECORDING = ".rrd"
+REVIEW_SUFFIX = ".review.rrd"
+"""Ends the name of a review file, which otherwise is that of its run."""
+
+
+def is_recording(path: Path) -> bool:
+    """Whether a path that is given as a scene is that of a recording."""
+    return path.suffix.lower() == RECORDING
+
+
+def without_reviews(files: Sequence[Path]) -> tuple[Path, ...]:
+    """What a shell's pattern such as ``*.rrd`` is meant to find; all if there is nothing but labels and notes."""
+    return tuple(file for file in files if not file.name.endswith(REVIEW_SUFFIX)) or tuple(files)
+
+
+def check_recording_file(path: Path) -> None:
+    """Raise ``RecordingError`` if there is no such file."""
+    if not is_file(path):
+        raise RecordingError(f"{path}: no such file; give the path of a recording (.rrd).")
+
+
+def check_recordings_folder(folder: Path) -> None:
+    """Raise ``InputError`` if there is no such folder of recordings."""
+    if not is_folder(folder):
+        raise InputError(f"{folder}: no such folder of recordings; run a scene first, or name another folder.")
+
+
+def check_scene_file(path: Path) -> None:
+    """Raise ``SpherlocError`` if there is no such scene file or recording."""
+    if is_recording(path):
+        check_recording_file(path)
+        return
+    from spherloc.datasets.scene_file import check_there
+
+    check_there(path)
+
+
+def none_there(paths: Sequence[Path], check: Callable[[Path], None]) -> bool:
+    """Whether ``check`` refuses all of one or more files, which is then said of each on stderr."""
+    refusals: list[str] = []
+    for path in paths:
+        try:
+            check(path)
+        except SpherlocError as error:
+            refusals.append(f"spherloc: {error}")
+        else:
+            return False
+    if refusals:
+        print("\n".join(refusals), file=sys.stderr, flush=True)
+    return bool(refusals)
