@@ -309,6 +309,7 @@ from spherloc.diagnosis import diagnose
 from spherloc.errors import CalibrationError, InputError
 from spherloc.estimators import estimate, options_type
 from spherloc_viz.app.panels.compare_panel import ComparePanel
+from spherloc_viz.app.compilation import first_and_later
 from spherloc_viz.app.server import _prepare
 from spherloc_viz.app.web.touch import Touches
 from spherloc_viz.app.web.viser_internals import start_viser, stop_viser
@@ -317,7 +318,7 @@ from spherloc_viz.options import option_fields, usable_estimators
 from spherloc_viz.recording.content.reader import read_recording
 from spherloc_viz.recording.content.writer import write_recording
 
-_prepare()
+_prepare(first_and_later()[0])
 problem = load_scene(Path("tiny.toml")).problem()
 trace = estimate(problem, "odd")
 pictures = [paint(trace, place) for place, stop in enumerate(steps(trace))]
