@@ -16,6 +16,7 @@ from spherloc_viz.layers.primitives import Step, Table
 from spherloc_viz.layers.scale_bar import angle_text
 
 DIM = "opacity:.65"
+WITHHELD = "Answers are hidden. What stands here would tell them: switch Hide answers off to see it."
 WORDS = {"success": style.INLIER, "failure": style.OUTLIER, "no pose": style.OUTLIER, UNKNOWABLE: style.OUTLIER}
 """Values of a table that are shown in colour."""
 

@@ -12,7 +12,7 @@ from spherloc.problem import Problem
 from spherloc.trace import Trace
 from spherloc.types import BoolArray, IntArray
 from spherloc_viz import style
-from spherloc_viz.app.text import DIM, box
+from spherloc_viz.app.text import DIM, WITHHELD, box, status_html
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.layers.matches import FILTERS, SORTS, MatchRows, match_rows, order, reference_votes
 
@@ -89,11 +89,16 @@ class MatchTable:
         ):
             touches.on(action, handler)
 
-    def draw(self, trace: Trace, selected: tuple[int, ...], kept: NDArray) -> None:
+    def draw(self, trace: Trace, selected: tuple[int, ...], kept: NDArray, hidden: bool = False) -> None:
         """Show the matches of a run. ``selected`` are numbers in the problem, ``kept`` (N,) the original ones.
 
-        A match that was just selected elsewhere brings its page up.
+        A match that was just selected elsewhere brings its page up. ``hidden`` shows none: all columns are answers.
         """
+        if hidden:
+            self._drawn = None
+            if self._html.content != status_html(WITHHELD):
+                self._html.content = status_html(WITHHELD)
+            return
         drawn = (trace, selected, kept.tobytes(), self._look)
         if self._drawn is not None and self._drawn[0] is trace and self._drawn[1:] == drawn[1:]:
             return

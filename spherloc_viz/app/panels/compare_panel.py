@@ -18,7 +18,7 @@ from spherloc.trace import Trace
 from spherloc.watch import Cancelled, Watch
 from spherloc_viz import style
 from spherloc_viz.app.plots.charts import chart_svg
-from spherloc_viz.app.text import DIM, WORDS, box, dot_html, status_html
+from spherloc_viz.app.text import DIM, WITHHELD, WORDS, box, dot_html, status_html
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.workers import BackgroundWorker
 from spherloc_viz.layers.comparison import (
@@ -110,7 +110,9 @@ class ComparePanel:
         self._lock = threading.Lock()
         self._trace: Trace | None = None
         self._done: Comparison | None = None
-        self._shown: tuple[Comparison | None, bool] = (None, False)
+        self._shown: tuple[Comparison | None, bool, bool] = (None, False, False)
+        """What was compared, whether it is of the problem at hand, and whether it is hidden."""
+        self._hidden = False
         self._stop, self._watch = threading.Event(), Watch()
         self._closed, self._seen = False, False
         self._background = BackgroundWorker("spherloc-compare", self._complain)
@@ -120,10 +122,11 @@ class ComparePanel:
         touches.on("use", self._choose)
         touches.on("views", self._see)
 
-    def draw(self, trace: Trace) -> None:
-        """Follow the run at hand, whose problem, seed and options are those to compare with."""
+    def draw(self, trace: Trace, hidden: bool = False) -> None:
+        """Follow the run at hand, whose problem, seed and options are those to compare with; ``hidden`` shows nothing
+        of what comes out."""
         with self._lock:
-            before, self._trace = self._trace, trace
+            before, self._trace, self._hidden = self._trace, trace, hidden
         if self._live.value and (before is None or not is_same(before.problem, trace.problem)):
             self._start(LIVE_AFTER_S)
         self._show()
@@ -241,14 +244,15 @@ class ComparePanel:
     def _show(self) -> None:
         """Put the comparison on the page, paler if it is of an earlier problem."""
         with self._lock:
-            done, trace = self._done, self._trace
+            done, trace, hidden = self._done, self._trace, self._hidden
             if done is None or trace is None:
                 return
             fits = is_same(done.problem, trace.problem)
-            if self._shown == (done, fits):
+            if self._shown == (done, fits, hidden):
                 return
-            self._shown = (done, fits)
-            self._table.content = comparison_html(done.entries, done.charts, fits)
+            self._shown = (done, fits, hidden)
+            told = status_html(WITHHELD) if hidden else comparison_html(done.entries, done.charts, fits)
+            self._table.content = told
 
 
 def _run(trace: Trace, name: str, watch: Watch) -> Trace:

@@ -14,7 +14,7 @@ from spherloc_viz import style
 from spherloc_viz.app.plots import shapes
 from spherloc_viz.app.plots.charts import chart_html, curve_parts
 from spherloc_viz.app.plots.shapes import Scale, decade_ticks, round_ticks, tick_texts
-from spherloc_viz.app.text import DIM, box, dot_html, table_html
+from spherloc_viz.app.text import DIM, WITHHELD, box, dot_html, status_html, table_html
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.layers.primitives import Chart, Curve
 from spherloc_viz.layers.residuals import (
@@ -164,11 +164,23 @@ class ResidualView:
         self._html = gui.add_html("")
         touches.on(SELECT_BIN, self._press)
 
-    def draw(self, trace: Trace, selected: tuple[int, ...], kept: NDArray[np.int64], cost: Chart | None = None) -> None:
+    def draw(
+        self,
+        trace: Trace,
+        selected: tuple[int, ...],
+        kept: NDArray[np.int64],
+        cost: Chart | None = None,
+        hidden: bool = False,
+    ) -> None:
         """Show a run with the ``selected`` matches (numbers of the problem) marked; nothing here needs ``kept``, the
         numbers (N,) by which matches are known on the page. ``cost`` is how the residuals fell so far, to stand above.
-        Sends nothing if nothing changed.
+        All of it are answers, which ``hidden`` leaves out. Sends nothing if nothing changed.
         """
+        if hidden:
+            self._known, self._drawn, self._bins = None, None, {}
+            if self._html.content != status_html(WITHHELD):
+                self._html.content = status_html(WITHHELD)
+            return
         if self._known is None or self._known[0] is not trace:
             residuals, history = residuals_of(trace), history_of(trace)
             self._known = trace, residuals, table_html(scores_table(trace)), _history_html(history)

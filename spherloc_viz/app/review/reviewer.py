@@ -10,7 +10,7 @@ import viser
 
 from spherloc.diagnosis import Diagnosis
 from spherloc.types import FloatArray
-from spherloc_viz.app.review.card import NAMES, bar_html, card_html, said_html, same_problem
+from spherloc_viz.app.review.card import NAMES, bar_html, card_html, said_html, same_problem, untold_html
 from spherloc_viz.app.review.filters import PAGE
 from spherloc_viz.app.review.opened import AS_RECORDED, Opened, Recorded, reference_items
 from spherloc_viz.app.review.run_library import RunLibrary
@@ -70,12 +70,12 @@ class ReviewCard:
         if before != self._where:
             self._redraw()
 
-    def draw(self, run: Run, diagnosis: Diagnosis | None) -> None:
-        """Show what was recorded beside the run on the page."""
-        opened = self._opened
-        html = (
-            "" if opened is None else card_html(opened, run, diagnosis, bar_html(*self._where) + said_html(*self._said))
-        )
+    def draw(self, run: Run, diagnosis: Diagnosis | None, hidden: bool = False) -> None:
+        """Show what was recorded beside the run on the page; if ``hidden``, only what the recorded run is of."""
+        opened, html = self._opened, ""
+        if opened is not None:
+            bar = bar_html(*self._where) + said_html(*self._said)
+            html = untold_html(opened, run, bar) if hidden else card_html(opened, run, diagnosis, bar)
         if self._html.content != html:
             self._html.content = html
         self._html.visible = bool(html)
