@@ -214,4 +214,4 @@ def stages_html(steps: Sequence[Stop], index: int) -> str:
             f'<div style="padding-top:.15em;white-space:nowrap">{escape(stage)}</div></div>'
         )
     row = f'<div style="display:flex;gap:5px">{"".join(bars)}</div>'
-    return box(row, "font-size:11px;padding-top:.4em;padding-bottom:.2em")
+    return box(row, "font-size:12px;padding-top:.4em;padding-bottom:.2em")

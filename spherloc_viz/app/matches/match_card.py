@@ -58,7 +58,7 @@ def _crop_html(path: Path | None, pixel: FloatArray, name: str) -> str:
         '<div style="flex:1;min-width:0;max-width:50%"><div style="position:relative;aspect-ratio:3/2">'
         f'<img alt="{name} around the match" src="{jpeg_uri(np.asarray(crop, np.uint8))}" '
         f'style="width:100%;height:100%;border-radius:3px;display:block">{cross}</div>'
-        f'<div style="font-size:11.5px;opacity:.65">{name}</div></div>'
+        f'<div style="font-size:12px;opacity:.65">{name}</div></div>'
     )
 
 

@@ -175,12 +175,14 @@ def _headings(look: Look) -> str:
 
 def _row(rows: MatchRows, k: int, chosen: bool, number: int) -> str:
     cell, right = '<td style="padding:.08em .3em">', '<td style="padding:.08em .3em;text-align:right">'
-    mark = f"background:{style.css(style.SELECTED)}40" if chosen else ""
+    mark = (
+        f"background:{style.css(style.SELECTED)}1c;box-shadow:inset 3px 0 {style.css(style.SELECTED)}" if chosen else ""
+    )
     truth = "–" if rows.right is None else _word(bool(rows.right[k]))
     agree = "–" if rows.agree[k] < 0 else f"{rows.agree[k]}"
     return (
-        f'<tr data-touch="select:{number}" style="{mark}">{cell}{number}</td>{cell}{_word(bool(rows.kept[k]))}</td>'
-        f"{cell}{truth}</td>{right}{_number(rows.px[k])}</td>{right}{_number(rows.deg[k])}</td>{right}{agree}</td></tr>"
+        f'<tr tabindex="0" data-touch="select:{number}" style="{mark}">{cell}{number}</td>'
+        f"{cell}{_word(bool(rows.kept[k]))}</td>{cell}{truth}</td>{right}{_number(rows.px[k])}</td>{right}{_number(rows.deg[k])}</td>{right}{agree}</td></tr>"
     )
 
 

@@ -106,7 +106,7 @@ class ComparePanel:
         self._live = gui.add_checkbox("Live", False, hint="Compare again whenever the problem changes.")
         self._bar = gui.add_progress_bar(0.0, visible=False)
         self._status = gui.add_html("", visible=False)
-        self._table = gui.add_html(box(f'<div style="{DIM}">{escape(NOTE)}</div>', "font-size:11.5px"))
+        self._table = gui.add_html(box(f'<div style="{DIM}">{escape(NOTE)}</div>', "font-size:12px"))
         self._lock = threading.Lock()
         self._trace: Trace | None = None
         self._done: Comparison | None = None
@@ -292,14 +292,14 @@ def comparison_html(entries: Sequence[Entry], charts: Sequence[Chart], fits: boo
     table = comparison_table(entries)
     rows = "".join(_row_html(table, row) for row in table.rows)
     head = "".join(f'<td style="text-align:right;{DIM}">{escape(name)}</td>' for name in MEASURED)
-    style_css = "border-collapse:collapse;width:100%;font-size:11.5px;font-variant-numeric:tabular-nums"
+    style_css = "border-collapse:collapse;width:100%;font-size:12px;font-variant-numeric:tabular-nums"
     body = box(f'<table style="{style_css}"><tr><td></td>{head}</tr>{rows}</table>')
     body += "".join(
         f'<div style="padding:0 .8em .2em;font-size:12.5px;font-weight:600">{escape(chart.title)}</div>'
-        + box(chart_svg(chart) + f'<div style="font-size:11.5px;{DIM}">{escape(coinciding(chart))}</div>')
+        + box(chart_svg(chart) + f'<div style="font-size:12px;{DIM}">{escape(coinciding(chart))}</div>')
         for chart in charts
     )
-    body += box(f'<div style="{DIM}">{escape(NOTE)}</div>', "font-size:11.5px")
+    body += box(f'<div style="{DIM}">{escape(NOTE)}</div>', "font-size:12px")
     if fits:
         return body
     return status_html(f"The problem has changed since; press {START}.") + f'<div style="opacity:.45">{body}</div>'
@@ -320,8 +320,10 @@ def _row_html(table: Table, row: tuple) -> str:
     # Named as what it is: beside "no pose" a cause alone reads as if it were about a pose.
     words += [f"diagnosis: {value['diagnosis']}"] if value["diagnosis"] not in (NO_VALUE, Cause.OK) else []
     color = WORDS.get(value["outcome"])
-    verdict = f'<span style="{f"color:{style.css(color)};font-weight:600" if color else ""}">{value["outcome"]}</span>'
+    verdict = (
+        f'<span style="{f"color:{style.css_text(color)};font-weight:600" if color else ""}">{value["outcome"]}</span>'
+    )
     line = f'{verdict}<span style="{DIM}"> · {escape(" · ".join(words))}</span>' if words else verdict
     below = f'<td colspan="{1 + len(MEASURED)}" style="padding:0 0 .35em 1.15em">{line}</td>'
     rule = 'style="border-top:1px solid rgba(128,140,160,.25)"'
-    return f"<tr {touch} {rule}>{head}{numbers}</tr><tr {touch}>{below}</tr>"
+    return f'<tr tabindex="0" {touch} {rule}>{head}{numbers}</tr><tr {touch}>{below}</tr>'

@@ -259,4 +259,4 @@ def _title(words: str) -> str:
 
 
 def _note(words: str) -> str:
-    return f'<div style="font-size:11.5px;opacity:.7;padding-top:.3em">{escape(words)}</div>'
+    return f'<div style="font-size:12px;opacity:.7;padding-top:.3em">{escape(words)}</div>'

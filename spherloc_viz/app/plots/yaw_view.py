@@ -315,7 +315,7 @@ class YawView:
         content = box(
             f'<div style="font-weight:600;padding-bottom:.3em">{escape(story.title)}</div>'
             f"{yaw_svg(story, bars, window, kept, shown_key)}"
-            f'<div style="font-size:11.5px;opacity:.7;padding-top:.3em">{note}</div>'
+            f'<div style="font-size:12px;opacity:.7;padding-top:.3em">{note}</div>'
         )
         if content != self._html.content:
             self._html.content = content

@@ -71,7 +71,7 @@ def untold_html(opened: Opened, run: Run, bar: str) -> str:
 
 
 def _card(parts: Sequence[str]) -> str:
-    content = box("".join(parts), "font-size:11.5px;line-height:1.38;padding:.4em .7em")
+    content = box("".join(parts), "font-size:12px;line-height:1.38;padding:.4em .7em")
     return f'<div class="review-card" style="{GROUND}">{content}</div>'
 
 
@@ -182,7 +182,7 @@ def comparison_html(one: RunRow, other: RunRow) -> str:
     )
     remark = "" if same else "They solved different problems, so their cameras are not drawn together."
     note = f'<div style="{DIM};padding-top:.2em">{remark}</div>' if remark else ""
-    return box(head + two_columns_html(lines(one, other), *NAMES) + note, "font-size:11.5px")
+    return box(head + two_columns_html(lines(one, other), *NAMES) + note, "font-size:12px")
 
 
 def lines(one: RunRow, other: RunRow) -> list[Line]:

@@ -157,7 +157,7 @@ def filters_html(look: Look, counts: Counts, hidden: bool = False) -> str:
     out those that tell answers."""
     if hidden:
         values = [_line(_values(look, counts.unfolded, UNTOLD_SORTS))] if look.unfolded else []
-        return box("".join([_handles(look, UNTOLD), *values]), "font-size:11.5px;padding-bottom:.2em")
+        return box("".join([_handles(look, UNTOLD), *values]), "font-size:12px;padding-bottom:.2em")
     outcomes = {value: count for value, count in counts.outcome}
     chips = [
         _chip("outcome", value, value, outcomes.get(value, 0), look.outcome, COLORS[value])
@@ -174,7 +174,7 @@ def filters_html(look: Look, counts: Counts, hidden: bool = False) -> str:
     lines = [_line(chips), _line(causes), _handles(look)]
     if look.unfolded:
         lines.append(_line(_values(look, counts.unfolded)))
-    return box("".join(lines), "font-size:11.5px;padding-bottom:.2em")
+    return box("".join(lines), "font-size:12px;padding-bottom:.2em")
 
 
 def _line(chips: Sequence[str]) -> str:
@@ -208,7 +208,7 @@ def pill(content: str, touch: str, on: bool, hint: str, extra: str = "") -> str:
 
 def key_html(key: str) -> str:
     """The sign of a key on a button."""
-    look = "border:1px solid currentColor;border-radius:.25em;padding:0 .3em;opacity:.6;font:inherit;font-size:10px"
+    look = "border:1px solid currentColor;border-radius:.25em;padding:0 .3em;opacity:.6;font:inherit;font-size:12px"
     return f'<kbd style="{look}">{escape(key)}</kbd>'
 
 

@@ -40,7 +40,7 @@ def rows_html(
         return box(f'<div style="{DIM}">{what}</div>', "font-size:12.5px")
     body = "".join(row_html(row, row.file in marked, row.file == opened, now, hidden) for row in rows)
     top, below = pages_html(look, total, opened is None), pages_html(look, total, None)
-    return box(f"{top}{body}{below if total > PAGE else ''}", "font-size:11px;line-height:1.35")
+    return box(f"{top}{body}{below if total > PAGE else ''}", "font-size:12px;line-height:1.35")
 
 
 def row_html(row: RunRow, marked: bool, opened: bool, now: datetime, hidden: bool = False) -> str:

@@ -211,4 +211,4 @@ def bar_html(marked: tuple[str, ...]) -> str:
     words = f'<b style="font-weight:600">{escape(f"{len(marked):,} marked")}</b>'
     css = "display:flex;flex-wrap:wrap;gap:.5em;align-items:center"
     row = f'<div class="marked-bar" style="{css}">{words}{"".join(ways)}{hint}</div>'
-    return box(row, "font-size:11.5px;padding-top:.5em")
+    return box(row, "font-size:12px;padding-top:.5em")
