@@ -23,9 +23,11 @@ from spherloc_viz.app.controls.sequence_panel import SequencePanel
 from spherloc_viz.app.controls.slow_run import SlowRun
 from spherloc_viz.app.panels.compare_panel import ComparePanel
 from spherloc_viz.app.panels.export_panel import ExportPanel, Shown
-from spherloc_viz.app.panels.open_panel import Opened, OpenPanel
+from spherloc_viz.app.panels.open_panel import Opened as OpenedScene
+from spherloc_viz.app.panels.open_panel import OpenPanel
 from spherloc_viz.app.panels.recordings_panel import Page, RecordingsPanel
 from spherloc_viz.app.panels.sweep_runs_panel import SweepPanel
+from spherloc_viz.app.review.opened import Opened
 from spherloc_viz.app.review.reviewer import ReviewCard
 from spherloc_viz.app.run_request import Run, RunRequest
 from spherloc_viz.app.services import Services
@@ -285,11 +287,15 @@ class Controls:
         else:
             self._owner.step_history(-1 if button == UNDO else 1)
 
-    def _open_scene(self, opened: Opened) -> None:
+    def _open_scene(self, opened: OpenedScene) -> None:
         label = self._catalog.add(opened.scene, opened.path, opened.label)
         seed = getattr(opened.scene, "seed", 0)
         estimator, _ = self.estimator.read()
         self._owner.open(RunRequest(SceneRequest(label, seed), estimator, None))
+
+    def open_linked(self, file: str) -> Opened:
+        """Open a recording to which a link leads; raises ``RecordingError`` if it cannot be."""
+        return self._recordings.open_linked(file)
 
     def _enter(self, got: Reopened) -> RunRequest:
         """Offer a reopened scene, and request for its run."""

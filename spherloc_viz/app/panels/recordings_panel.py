@@ -13,6 +13,7 @@ from spherloc_viz.app.review.export import Exporter
 from spherloc_viz.app.review.filters import pill
 from spherloc_viz.app.review.gallery_list import GalleryList
 from spherloc_viz.app.review.notes import Notes
+from spherloc_viz.app.review.opened import Opened
 from spherloc_viz.app.review.reviewer import ReviewCard, Reviewer, Reviewing
 from spherloc_viz.app.review.run_library import RunLibrary
 from spherloc_viz.app.review.run_list import RunList
@@ -179,6 +180,12 @@ class RecordingsPanel:
         self._reviewer.relabelled(row)
         self._notes.refresh(row, self._library.labels())
         self._runs.ask()
+
+    def open_linked(self, file: str) -> Opened:
+        """Open a recording to which a link leads; raises ``RecordingError`` if it cannot be."""
+        if self._library is None:
+            raise RecordingError("runs are not recorded here, so that no recording can be opened.")
+        return self._reviewer.follow(file)
 
     def _open_file(self, file: str) -> None:
         self._reviewer.ask(file)

@@ -125,6 +125,15 @@ class Reviewer:
             self._steps, self._place = 0, PAGE * self._runs.look.page
         self._background.ask(partial(self._open_file, file))
 
+    def follow(self, file: str) -> Opened:
+        """Open a recording whose run the page asks for by itself; raises ``RecordingError`` if it cannot be."""
+        library = self._has.library
+        if not library.rows([file]):
+            library.prepare()
+        opened = self._read(file)
+        self._present(opened)
+        return opened
+
     def compare(self, one: RunRow, other: RunRow) -> None:
         """Have the first opened and, if both are of one problem, the second one drawn beside it."""
         if same_problem(one, other):
@@ -221,9 +230,13 @@ class Reviewer:
         return Opened(recorded, path, request, run.problem.truth_cam_from_map, got.sentence, story)
 
     def _show(self, opened: Opened) -> None:
+        self._present(opened)
+        self._has.open(opened.request, opened.path, opened.recorded.cam_from_map)
+
+    def _present(self, opened: Opened) -> None:
+        """Show what is recorded."""
         row = opened.recorded.row
         self._has.card.show(opened)
-        self._has.open(opened.request, opened.path, opened.recorded.cam_from_map)
         self._runs.show(row.file, self.locate())
         self._has.changed(row)
         self._has.say("")
