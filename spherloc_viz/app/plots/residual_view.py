@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from spherloc.trace import Trace
 from spherloc.types import FloatArray
 from spherloc_viz import style
+from spherloc_viz.app.glossary import help_html
 from spherloc_viz.app.plots import shapes
 from spherloc_viz.app.plots.charts import chart_html, curve_parts
 from spherloc_viz.app.plots.shapes import Scale, decade_ticks, round_ticks, tick_texts
@@ -212,7 +213,7 @@ def _residuals_html(residuals: Residuals | None, selected: tuple[int, ...]) -> s
     marked[list(selected)] = True
     drawings = "".join(histogram_svg(one, marked) for one in residuals.histograms)
     note = _note(residuals_caption(residuals))
-    return box(_title("Residuals at the estimated pose") + _legend_html(residuals.judged) + drawings + note)
+    return box(_title("Residuals at the estimated pose", "residual") + _legend_html(residuals.judged) + drawings + note)
 
 
 def _legend_html(judged: str) -> str:
@@ -238,7 +239,7 @@ def residuals_caption(residuals: Residuals) -> str:
 def _history_html(history: History | None) -> str:
     if history is None:
         return ""
-    return box(_title("How RANSAC got there") + history_svg(history) + _note(history_caption(history)))
+    return box(_title("How RANSAC got there", "RANSAC") + history_svg(history) + _note(history_caption(history)))
 
 
 def history_caption(history: History) -> str:
@@ -254,8 +255,10 @@ def history_caption(history: History) -> str:
     return words
 
 
-def _title(words: str) -> str:
-    return f'<div style="font-weight:600;padding-bottom:.3em">{escape(words)}</div>'
+def _title(words: str, term: str | None = None) -> str:
+    """A heading, with a "?" that tells what a term means."""
+    help_ = "" if term is None else help_html(term)
+    return f'<div style="font-weight:600;padding-bottom:.3em">{escape(words)}{help_}</div>'
 
 
 def _note(words: str) -> str:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from spherloc.trace import Trace
 from spherloc_viz import style
+from spherloc_viz.app.glossary import help_html
 from spherloc_viz.app.plots import shapes
 from spherloc_viz.app.plots.charts import curve_parts
 from spherloc_viz.app.plots.shapes import MINUS, Scale, round_ticks, tick_texts, wrapped_deg
@@ -313,7 +314,7 @@ class YawView:
         bars = bars_in(trace, arcs, window, selected)
         note = escape(UNTOLD if hidden else caption(trace, story, arcs, bars))
         content = box(
-            f'<div style="font-weight:600;padding-bottom:.3em">{escape(story.title)}</div>'
+            f'<div style="font-weight:600;padding-bottom:.3em">{escape(story.title)}{help_html("arc")}</div>'
             f"{yaw_svg(story, bars, window, kept, shown_key)}"
             f'<div style="font-size:12px;opacity:.7;padding-top:.3em">{note}</div>'
         )
