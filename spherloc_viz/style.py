@@ -71,7 +71,7 @@ def css(color: RGB) -> str:
 
 def css_text(color: RGB) -> str:
     """The colour for words: nearer to that of the words around, so that it reads on dark and on light."""
-    return f"color-mix(in srgb, {css(color)} 60%, currentColor)"
+    return f"color-mix(in srgb, {css(color)} 45%, currentColor)"
 
 
 ERROR_RAMP: tuple[RGB, ...] = ((48, 96, 214), (60, 190, 180), (245, 205, 70))

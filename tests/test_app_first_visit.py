@@ -2,15 +2,22 @@
 
 import json
 import re
+from collections.abc import Iterator
 from html import unescape
 
+import numpy as np
 import pytest
+import viser
+from pressed_page import Page
 from recording_samples import scene_problem
 
 from spherloc.estimators import estimate
 from spherloc.registry import names
 from spherloc_viz.app.glossary import TERMS, glossary_html, help_html, linked
 from spherloc_viz.app.introduction import MOMENTS, introduction_html, opening_step
+from spherloc_viz.app.plots.residual_view import ResidualView
+from spherloc_viz.app.plots.yaw_view import YawView
+from spherloc_viz.app.web.viser_internals import start_viser, stop_viser
 from spherloc_viz.layers import paint, steps
 
 
@@ -34,6 +41,24 @@ def test_the_glossary_begins_with_what_was_asked_for_and_has_every_term() -> Non
     assert html.index("<b>ball</b>") < min(html.index(f"<b>{term}</b>") for term in TERMS if term != "ball")
     assert all(html.count(f"<b>{term}</b>") == 1 for term in TERMS)
     assert 'aria-label="What is ball?"' in help_html("ball")
+
+
+@pytest.fixture
+def server() -> Iterator[viser.ViserServer]:
+    server = start_viser("a key of this test")
+    yield server
+    stop_viser(server)
+
+
+def test_views_tell_what_their_words_mean(server: viser.ViserServer) -> None:
+    trace, page = estimate(scene_problem("mei_outliers_80"), "ransac-2p"), Page()
+    kept = np.arange(len(trace.problem))
+    yaw = YawView(server.gui, page.touches, page.changed)
+    residuals = ResidualView(server.gui, page.touches, page.changed, lambda chosen: None)
+    yaw.draw(trace, "outcome", (), kept)
+    residuals.draw(trace, (), kept)
+    assert 'aria-label="What is arc?"' in yaw._html.content
+    assert all(f'aria-label="What is {term}?"' in residuals._html.content for term in ("residual", "RANSAC"))
 
 
 @pytest.mark.parametrize("estimator", names("estimators"))

@@ -11,14 +11,20 @@ from hypothesis import strategies as st
 
 from spherloc.datasets import load_scene
 from spherloc.datasets.variation import Variation
+from spherloc.errors import RecordingError
 from spherloc.estimators import default_options, estimate
 from spherloc_viz.app.catalog import Catalog, SceneRequest
 from spherloc_viz.app.link import MANY, MOST_LETTERS, ONCE, Follower, PageView, link_of
 from spherloc_viz.app.panels.folders import Roots
+from spherloc_viz.app.review.opened import Opened
 from spherloc_viz.app.run_request import Run, RunRequest
 from tests.tiny_scene import write_tiny_scene
 
 VIEW = PageView("outcome", (), "dark")
+
+
+def no_recording(file: str) -> Opened:
+    raise RecordingError(f"{file}: is not in the list any more; choose another run.")
 
 
 class Place:
@@ -29,7 +35,7 @@ class Place:
         self.base = Catalog(self.scene)
         self.catalog, self.roots = self.base.branch(), Roots([folder])
         (self.label, *_) = self.catalog.scenes
-        self.follower = Follower(self.catalog, self.roots, self.catalog.problem)
+        self.follower = Follower(self.catalog, self.roots, self.catalog.problem, no_recording)
         request = SceneRequest(self.label, 5)
         self.now = RunRequest(request, "mc", default_options("mc", self.catalog.problem(request)))
 
@@ -51,7 +57,9 @@ def test_what_is_written_is_read_again(place: Place) -> None:
     )
     scene = SceneRequest(place.label, 2**62, None, variation)
     options = replace(default_options("ransac-2p", place.catalog.problem(scene)), iterations=77, confidence=0.97)
-    request, view = RunRequest(scene, "ransac-2p", options), PageView("sample-3", (2, 4), "light", answers_hidden=True)
+    viewpoint = (1.5, -2.25, 3.0, 0.0, 0.125, -1e-05, 45.0)
+    request = RunRequest(scene, "ransac-2p", options)
+    view = PageView("sample-3", (2, 4), "light", answers_hidden=True, viewpoint=viewpoint)
     found = place.follower.follow(place.link(request, view), place.now, VIEW)
     assert (found.request, found.view, found.remarks) == (request, view, ())
     assert place.follower.follow("", place.now, VIEW).remarks == ()
@@ -89,6 +97,11 @@ def test_a_scene_of_an_allowed_folder_is_opened_again(place: Place) -> None:
         ("spoil", "1,b", "spoil is '1,b'"),
         ("hide", "99999", "99999"),
         ("select", "-3", "select is '-3'"),
+        ("run", "../../etc/passwd", "is not in the list"),
+        ("view", "1,2,3", "view is '1,2,3'; give a place"),
+        ("view", "0,0,0,0,0,0,45", "view is"),
+        ("view", "1,2,nan,0,0,0,45", "view is"),
+        ("view", "1,2,3,0,0,0,999", "view is"),
         ("theme", "pink", "theme is 'pink'; it is dark or light."),
     ],
 )

@@ -104,7 +104,7 @@ def test_the_card_follows_run_and_rival(server: viser.ViserServer, trace: Trace)
 
 
 def numbers(table: MatchTable) -> list[int]:
-    return [int(number) for number in re.findall(r'<tr data-touch="select:(\d+)"', table._html.content)]
+    return [int(number) for number in re.findall(r'<tr tabindex="0" data-touch="select:(\d+)"', table._html.content)]
 
 
 def test_pages_filters_and_sorting(server: viser.ViserServer, page: Page, trace: Trace) -> None:

@@ -41,11 +41,11 @@ class AudienceControls:
         gui.main_panel.dock_right()
         gui.main_panel.set_width(width_px)
 
-    def items(self, run: Run) -> tuple[SceneItem, ...]:
+    def items(self, run: Run, hidden: bool) -> tuple[SceneItem, ...]:
         """Nothing beside the run."""
         return ()
 
-    def draw(self, run: Run, diagnosis: Diagnosis | None) -> None:
+    def draw(self, run: Run, diagnosis: Diagnosis | None, hidden: bool) -> None:
         """Nothing here depends on the run."""
 
 

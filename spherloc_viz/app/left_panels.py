@@ -70,27 +70,25 @@ class LeftPanels:
         self, run: Run, picture: Picture, playing: bool, outcome: Table, selected: tuple[int, ...], hidden: bool
     ) -> None:
         """Show a step of a run, in the views that are to be seen. ``selected`` are numbers in the problem; ``hidden``
-        says that the outcome is not to be told yet."""
+        says that the outcome is not to be told yet: then the run is without its pose and its inliers."""
         kept: NDArray = run.kept
         tables = [table for table in picture.tables if table.name != outcome.name]
-        self.steps.show(picture.step, playing, tables)
+        self.steps.show(picture.step, playing, tables, hidden)
         seen = self._seen
         if "Yaw" in seen:
-            self._yaw.draw(run.trace, picture.step.key, selected, kept)
+            self._yaw.draw(run.trace, picture.step.key, selected, kept, hidden)
         if "Graph" in seen:
             self._graph.draw(picture.graph, graph_begins(run.trace), selected, kept)
         if "Charts" in seen:
             self._charts.draw(picture.charts)
         if "Residuals" in seen:
             cost = next((chart for chart in picture.charts if chart.name == "refinement"), None)
-            self._residuals.draw(run.trace, selected, kept, cost)
+            self._residuals.draw(run.trace, selected, kept, cost, hidden)
         if "Images" in seen:
-            self._images.draw(run.trace, picture, selected, kept)
+            self._images.draw(run.trace, picture, selected, kept, hidden)
         if "Matches" in seen:
-            self._matches.draw(run.trace, selected, kept)
-        summary, ending = summary_html(run.trace), table_html(outcome)
-        if hidden:
-            summary, ending = status_html(HIDDEN), ""
+            self._matches.draw(run.trace, selected, kept, hidden)
+        summary, ending = (status_html(HIDDEN), "") if hidden else (summary_html(run.trace), table_html(outcome))
         if self._opening == run.request.scene.scene:
             self._opening = ""
         elif self._opening:

@@ -5,6 +5,7 @@ says what differs from what the scene and the estimator say. Anybody may have ma
 label or by a place in an allowed folder, cameras by their label, and nothing else is read from the disk.
 """
 
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields, replace
 from html import escape
@@ -18,17 +19,23 @@ from spherloc.estimators import default_options, options_type
 from spherloc.problem import Problem
 from spherloc_viz.app.catalog import Catalog, SceneRequest
 from spherloc_viz.app.panels.folders import Roots
+from spherloc_viz.app.review.opened import Opened
 from spherloc_viz.app.run_request import Run, RunRequest
 from spherloc_viz.options import option_fields, typed, usable_estimators
 
 VERSION = 1
 MOST_LETTERS = 15_000
 """A longer link is not written: some thousand matches are changed by hand."""
+MOST_M, LEAST_M = 1e7, 1e-6
+"""How far off a viewer may stand, and how far from what it looks at at least."""
 THEMES = ("dark", "light")
 ANSWERS = ("told", "hidden")
 LISTS = ("spoil", "mend", "hide")
 """Keys of ``EDITS``, in their order."""
-ONCE = ("v", "scene", "place", "seed", "query", "camera", *LISTS, "estimator", "step", "select", "theme", "answers")
+ONCE = (
+    *("v", "run", "scene", "place", "seed", "query", "camera", *LISTS, "estimator"),
+    *("step", "select", "view", "theme", "answers"),
+)
 MANY = ("set", "option")
 
 
@@ -42,12 +49,17 @@ class PageView:
     """Numbers of the selected matches, as they are where nothing is hidden."""
     theme: str
     answers_hidden: bool = False
+    viewpoint: tuple[float, ...] = ()
+    """Where the viewer stands (3), what it looks at (3), and its field of view, degrees; empty for the step's own."""
 
 
-def link_of(run: Run, view: PageView, catalog: Catalog, known: Iterable[str], roots: Roots) -> str:
+def link_of(
+    run: Run, view: PageView, catalog: Catalog, known: Iterable[str], roots: Roots, recording: str | None = None
+) -> str:
     """The text that brings a run and the view of it back; empty if it would be too long.
 
-    ``known`` are the labels of the scenes that every page has.
+    ``known`` are the labels of the scenes that every page has, and ``recording`` is the file in which the run is
+    recorded, if it was opened from there.
     """
     request, scene = run.request, run.request.scene
     place = None if scene.scene in known else roots.place(catalog.path(scene.scene))
@@ -56,6 +68,7 @@ def link_of(run: Run, view: PageView, catalog: Catalog, known: Iterable[str], ro
     default = default_options(request.estimator, run.trace.problem)
     pairs = [
         ("v", str(VERSION)),
+        ("run", recording),
         ("scene", scene.scene),
         ("place", place),
         ("seed", str(scene.seed)),
@@ -67,6 +80,7 @@ def link_of(run: Run, view: PageView, catalog: Catalog, known: Iterable[str], ro
         *(("option", f"{name}={typed(value)}") for name, value in _changed(request.options, default)),
         ("step", view.step),
         ("select", _numbers_text(view.selected)),
+        ("view", ",".join(f"{number:.6g}" for number in view.viewpoint)),
         ("theme", view.theme if view.theme != THEMES[0] else None),
         ("answers", ANSWERS[1] if view.answers_hidden else None),
     ]
@@ -97,19 +111,44 @@ class Followed:
     view: PageView
     remarks: tuple[str, ...]
     """What of the link could not be opened, a sentence each."""
+    opened: Opened | None = None
+    """The recording that it is a link to."""
 
 
 class Follower:
     """Follows links on one page. Whatever a link says wrongly becomes a remark, and the page's own stays."""
 
-    def __init__(self, catalog: Catalog, roots: Roots, problem: Callable[[SceneRequest], Problem]) -> None:
-        """``problem`` gives the problem of a request; it may take long, and raises ``InputError`` if there is none."""
-        self._catalog, self._roots, self._problem = catalog, roots, problem
+    def __init__(
+        self,
+        catalog: Catalog,
+        roots: Roots,
+        problem: Callable[[SceneRequest], Problem],
+        open_recording: Callable[[str], Opened],
+    ) -> None:
+        """``problem`` gives the problem of a request; it may take long, and raises ``InputError`` if there is none.
+        ``open_recording`` opens a file of the run library, and raises ``RecordingError`` if it cannot."""
+        self._catalog, self._roots, self._problem, self._open_recording = catalog, roots, problem, open_recording
 
     def follow(self, text: str, now: RunRequest, view: PageView) -> Followed:
         """Where a link leads from what the page shows ``now``. Raises ``Cancelled`` if the map's work is ended."""
         remarks: list[str] = []
         said = _read(text, remarks)
+        opened = self._recorded(said, remarks)
+        request = self._request(said, now, remarks) if opened is None else opened.request
+        return Followed(request, _view(said, view, opened, remarks), tuple(remarks), opened)
+
+    def _recorded(self, said: dict[str, Any], remarks: list[str]) -> Opened | None:
+        """The recording that a link says; if it cannot be opened, the run is made anew from what else is said."""
+        if "run" not in said:
+            return None
+        try:
+            return self._open_recording(said["run"])
+        except SpherlocError as error:
+            remarks.append(str(error))
+            return None
+
+    def _request(self, said: dict[str, Any], now: RunRequest, remarks: list[str]) -> RunRequest:
+        """What a link asks for."""
         scene = self._scene(said, now.scene, remarks)
         estimator = said.get("estimator", now.estimator)
         if estimator not in usable_estimators():
@@ -122,15 +161,7 @@ class Follower:
             scene = SceneRequest(scene.scene, scene.seed)
             problem = self._problem(scene)
         options = self._options(said.get("option", ()), default_options(estimator, problem), estimator, remarks)
-        theme = _one_of(said, "theme", THEMES, remarks)
-        hidden = _one_of(said, "answers", ANSWERS, remarks) == ANSWERS[1]
-        try:
-            selected = _numbers(said.get("select", ""))
-        except InputError as error:
-            remarks.append(str(error))
-            selected = ()
-        seen = PageView(said.get("step", view.step), selected, theme, hidden)
-        return Followed(RunRequest(scene, estimator, options), seen, tuple(remarks))
+        return RunRequest(scene, estimator, options)
 
     def _scene(self, said: dict[str, Any], now: SceneRequest, remarks: list[str]) -> SceneRequest:
         """The scene with its changes; the page's own if the link's is not to be had."""
@@ -212,6 +243,41 @@ def _read(text: str, remarks: list[str]) -> dict[str, Any]:
     if version != str(VERSION):
         remarks.insert(0, f"the link is of version {show(version)}, and this is version {VERSION}.")
     return said
+
+
+def _view(said: dict[str, Any], view: PageView, opened: Opened | None, remarks: list[str]) -> PageView:
+    """How a link looks at its run: a recording without a step at the one that decided it."""
+    theme = _one_of(said, "theme", THEMES, remarks)
+    hidden = _one_of(said, "answers", ANSWERS, remarks) == ANSWERS[1]
+    selected: tuple[int, ...] = ()
+    viewpoint: tuple[float, ...] = ()
+    try:
+        selected = _numbers(said.get("select", ""))
+    except InputError as error:
+        remarks.append(str(error))
+    try:
+        viewpoint = _viewpoint(said.get("view", ""))
+    except InputError as error:
+        remarks.append(str(error))
+    step = said.get("step", view.step if opened is None else "")
+    return PageView(step, selected, theme, hidden, viewpoint)
+
+
+def _viewpoint(text: str) -> tuple[float, ...]:
+    """Where a viewer stands, what it looks at, and its field of view."""
+    if not text:
+        return ()
+    try:
+        numbers = tuple(map(float, text.split(",")))
+    except ValueError:
+        numbers = ()
+    sensible = len(numbers) == 7 and all(abs(number) < MOST_M for number in numbers) and 1.0 <= numbers[6] <= 170.0
+    if not sensible or math.dist(numbers[:3], numbers[3:6]) < LEAST_M:
+        raise InputError(
+            f"view is {show(text)}; give a place, what is looked at, and a field of view from 1 to 170 degrees: seven "
+            "numbers with commas between them."
+        )
+    return numbers
 
 
 def _one_of(said: dict[str, Any], key: str, words: tuple[str, ...], remarks: list[str]) -> str:

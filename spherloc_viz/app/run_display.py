@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
 
+import numpy as np
 import viser
 
 from spherloc.datasets.synthetic import TrueCamera
@@ -39,12 +40,12 @@ class Panel(Protocol):
         """Whether the true camera can be dragged."""
         ...
 
-    def items(self, run: Run) -> tuple[SceneItem, ...]:
-        """What the canvas shows beside a run."""
+    def items(self, run: Run, hidden: bool) -> tuple[SceneItem, ...]:
+        """What the canvas shows beside a run; ``hidden`` leaves out what would tell the answers."""
         ...
 
-    def draw(self, run: Run, diagnosis: Diagnosis | None) -> None:
-        """Follow the run at hand."""
+    def draw(self, run: Run, diagnosis: Diagnosis | None, hidden: bool) -> None:
+        """Follow the run at hand; ``hidden`` tells nothing of the answers."""
         ...
 
 
@@ -74,8 +75,10 @@ class RunDisplay:
         moved = places.move or (lambda place: None)
         self.canvas = Canvas(client, self.controls.display, select, moved, sum(widths_px))
         self._shown: tuple[Run, bytes | None, Picture] | None = None
-        self._blind: tuple[Run, Run] | None = None
-        """A run, and the same without the truth."""
+        self._hidden = False
+        """Whether the answers of what is shown are hidden."""
+        self._blind: tuple[Run, Run, Run] | None = None
+        """A run, the same without the truth, and that without what came out."""
         self._theme = START_THEME
 
     def draw(
@@ -95,9 +98,10 @@ class RunDisplay:
         truth, and the outcome before the last step, as this page's own switch does.
         """
         controls, known = self.controls, run
-        hidden = hidden or controls.display.answers_hidden
+        hidden = self._hidden = hidden or controls.display.answers_hidden
+        blank = run
         if hidden:
-            run, diagnosis = self._untold(run), None
+            (run, blank), diagnosis = self._untold(run), None
         trace = run.trace
         timeline = steps(trace)
         index, pause = self.panels.steps.advance(timeline, asked)
@@ -105,29 +109,33 @@ class RunDisplay:
         alternative = None if diagnosis is None else diagnosis.alternative_cam_from_map
         if last and alternative is not None:
             picture = with_alternative(picture, trace, alternative)
+        early = hidden and not last
         drawn = with_selection(picture, trace, selected)
-        drawn = replace(drawn, scene=drawn.scene + controls.items(run))
+        drawn = replace(drawn, scene=drawn.scene + controls.items(known, hidden))
         self._shown = known, mesh, drawn
         with self._client.atomic():
             self._follow_theme()
             with changes_of(self._client.gui).as_of(answers):
                 self.canvas.draw(run, drawn, mesh, controls.camera_movable)
-                controls.draw(run, diagnosis)
+                controls.draw(known, diagnosis, hidden)
             # The other views tell inliers by the colours of the picture as it was.
             told = replace(picture, step=drawn.step)
-            self.panels.draw(run, told, pause is not None, outcome_table(trace), selected, hidden and not last)
+            outcome = outcome_table(trace)
+            self.panels.draw(blank if early else run, told, pause is not None, outcome, selected, early)
             waiting = "" if hidden else status_html("Diagnosing …")
             self.panels.diagnose(waiting if diagnosis is None else diagnosis_html(diagnosis, whole=last))
-            self.card.draw(trace, selected, run.kept, alternative, self.canvas.clicked_left)
+            self.card.draw(trace, selected, run.kept, alternative, self.canvas.clicked_left, early)
         self._client.flush()
         return self.canvas.check() if pause is None else pause
 
-    def _untold(self, run: Run) -> Run:
-        """The run without the truth."""
+    def _untold(self, run: Run) -> tuple[Run, Run]:
+        """The run without the truth, and also without what came out."""
         if self._blind is None or self._blind[0] is not run:
             problem = replace(run.trace.problem, truth_cam_from_map=None, truth_inliers=None)
-            self._blind = run, replace(run, trace=replace(run.trace, problem=problem))
-        return self._blind[1]
+            trace = replace(run.trace, problem=problem)
+            blank = replace(trace, cam_from_map=None, inlier_mask=np.zeros_like(trace.inlier_mask))
+            self._blind = run, replace(run, trace=trace), replace(run, trace=blank)
+        return self._blind[1:]
 
     @property
     def step_key(self) -> str:
@@ -145,7 +153,7 @@ class RunDisplay:
             items=tuple(item for item in picture.scene if item.layer in layers),
             backdrop=mesh if "mesh" in layers else None,
             title=run.request.scene.scene,
-            note=f"{trace.estimator}, seed {trace.seed}. {trace.message}",
+            note=f"{trace.estimator}, seed {trace.seed}.{'' if self._hidden else f' {trace.message}'}",
             recorded=recorded,
             dark=display.theme == "dark",
         )

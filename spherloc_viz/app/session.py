@@ -21,12 +21,14 @@ from spherloc.types import FloatArray
 from spherloc.watch import Cancelled, Watch
 from spherloc_viz.app.catalog import SceneRequest
 from spherloc_viz.app.controls.controls import Controls
+from spherloc_viz.app.controls.steps_panel import find_step
 from spherloc_viz.app.edits import Edits
 from spherloc_viz.app.history import History
 from spherloc_viz.app.link import Followed, Follower, PageView, address_html, link_of
 from spherloc_viz.app.page_runs import Known, PageRuns
 from spherloc_viz.app.panels.export_panel import Shown
 from spherloc_viz.app.panels.folders import Roots
+from spherloc_viz.app.review.opened import Opened
 from spherloc_viz.app.run_display import Places, RunDisplay
 from spherloc_viz.app.run_request import Run, RunRequest
 from spherloc_viz.app.services import Services
@@ -35,9 +37,12 @@ from spherloc_viz.app.status import Notices, Status
 from spherloc_viz.app.web.touch import READY, Touch, Touches
 from spherloc_viz.app.web.viser_internals import follow_changes, guard_callbacks
 from spherloc_viz.app.workers import Job, LatestWorker
+from spherloc_viz.layers import steps
 
 QUIET_S = 0.7
 """Runs count as settled, and are recorded, when nothing has changed for this long."""
+VIEWER_STILL_S = 0.3
+"""The address follows the viewer when it has not moved for this long."""
 DIAGNOSE_AFTER_S = 0.2
 """A diagnosis costs more than many a run, so it waits until the picture has stood still for this long."""
 
@@ -59,6 +64,7 @@ class Session:
         number = client.client_id
         self._solver = LatestWorker(f"spherloc-solver-{number}", self._guarded(self._solve))
         self._page = LatestWorker(f"spherloc-page-{number}", self._guarded(self._show))
+        self._viewer = LatestWorker(f"spherloc-viewer-{number}", self._guarded(self._follow_viewer))
         self._diagnoser = LatestWorker(f"spherloc-diagnosis-{number}", self._guarded(self._examine))
         self._edits, self._history = Edits(), History()
         self._opened: tuple[RunRequest, int] | None = None
@@ -66,7 +72,7 @@ class Session:
         self._steps: deque[tuple[int, int]] = deque()
         """Steps through the history that are to be made, each with the number of the change that asked for it."""
         self._roots = Roots(services.roots)
-        self._follower = Follower(self._catalog, self._roots, self._problem)
+        self._follower = Follower(self._catalog, self._roots, self._problem, self._open_linked)
         self._link: tuple[str, int] | None = None
         """A link that is to be followed, and the number of the change before it."""
         self._followed = 0
@@ -89,7 +95,8 @@ class Session:
 
     def start(self) -> None:
         """Solve and show the first problem, or the recorded run that was asked for."""
-        for worker in (self._page, self._diagnoser, self._controls.slow, self._solver):
+        self._client.camera.on_update(lambda camera: self._viewer.ask())
+        for worker in (self._page, self._viewer, self._diagnoser, self._controls.slow, self._solver):
             worker.start()
         first = self._services.first
         if first is None:
@@ -99,7 +106,7 @@ class Session:
 
     def close(self) -> None:
         """End the threads; does not wait."""
-        for worker in (self._solver, self._page, self._diagnoser, self._controls):
+        for worker in (self._solver, self._page, self._viewer, self._diagnoser, self._controls):
             worker.close()
 
     def complain(self, sentence: str) -> None:
@@ -250,14 +257,24 @@ class Session:
             self._controls.display.answers_hidden = followed.view.answers_hidden
         if self._run is not None:
             self._edits.select(set(followed.view.selected) & set(self._run.kept.tolist()))
-        self._display.panels.steps.go(followed.view.step)
+            key = _step_key(self._run.trace, followed)
+            self._display.panels.steps.go(key)
+            if followed.view.viewpoint:
+                self._display.canvas.hold(key, followed.view.viewpoint)
         if followed.remarks:
             self.complain(" ".join(remark[:1].upper() + remark[1:] for remark in followed.remarks))
 
     def _view(self) -> PageView:
         """How the page looks at its run."""
         display = self._controls.display
-        return PageView(self._display.step_key, self._edits.selected, display.theme, display.answers_hidden)
+        viewpoint = self._display.canvas.viewpoint()
+        return PageView(self._display.step_key, self._edits.selected, display.theme, display.answers_hidden, viewpoint)
+
+    def _open_linked(self, file: str) -> Opened:
+        """Open a recording to which a link leads."""
+        opened = self._controls.open_linked(file)
+        self._runs.expect(Known(opened.request, opened.path, opened.recorded.cam_from_map))
+        return opened
 
     def _solve_request(self) -> float | None:
         number, gesture = self._changes.moment(), self._changes.gesture
@@ -355,13 +372,28 @@ class Session:
         diagnosis = self._diagnosis(run)
         self._services.presented.hide(run, self._controls.display.answers_hidden)
         pause = self._display.draw(run, self._mesh(run), diagnosis, self._edits.places(run.kept), asked, answers)
-        link = link_of(run, self._view(), self._catalog, self._services.catalog.scenes, self._roots)
-        html = address_html(link, self._name, self._followed)
-        if self._address.content != html:
-            self._address.content = html
+        self._write_address(run)
         if diagnosis is None:
             self._diagnoser.ask()
         return pause
+
+    def _write_address(self, run: Run) -> None:
+        """Have the page keep what it shows as its address."""
+        opened = self._controls.review.opened
+        recording = opened.recorded.row.file if opened is not None and opened.request == run.request else None
+        link = link_of(run, self._view(), self._catalog, self._services.catalog.scenes, self._roots, recording)
+        html = address_html(link, self._name, self._followed)
+        if self._address.content != html:
+            self._address.content = html
+
+    def _follow_viewer(self, asked: bool) -> float | None:
+        """The viewer thread's job: once the viewer stands still, have the address say where."""
+        run = self._run
+        if asked:
+            return VIEWER_STILL_S
+        if run is not None and self._display.step_key:
+            self._write_address(run)
+        return None
 
     def _examine(self, asked: bool) -> float | None:
         """The doctor thread's job: once nothing has changed for a while, diagnose the newest run and show it."""
@@ -387,6 +419,14 @@ class Session:
             return None
 
         return run
+
+
+def _step_key(trace: Trace, followed: Followed) -> str:
+    """The key of the step that a link leads to; of a recording, the one that decided it, unless the link says."""
+    timeline, opened = steps(trace), followed.opened
+    if opened is not None and not followed.view.step:
+        return timeline[min(opened.recorded.row.key_step, len(timeline) - 1)].key
+    return timeline[find_step(timeline, followed.view.step)].key
 
 
 def _kept(request: RunRequest, problem: Problem) -> NDArray[np.int64]:

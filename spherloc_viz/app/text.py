@@ -16,6 +16,7 @@ from spherloc_viz.layers.primitives import Step, Table
 from spherloc_viz.layers.scale_bar import angle_text
 
 DIM = "opacity:.65"
+WITHHELD = "Answers are hidden. What stands here would tell them: switch Hide answers off to see it."
 WORDS = {"success": style.INLIER, "failure": style.OUTLIER, "no pose": style.OUTLIER, UNKNOWABLE: style.OUTLIER}
 """Values of a table that are shown in colour."""
 
@@ -36,9 +37,7 @@ def step_html(step: Step, caption_html: Callable[[str], str] = escape) -> str:
         face = "font-family:Cambria,Georgia,serif;font-style:italic;font-size:14px"
         parts.append(f'<div class="step-equation" style="{face};padding-top:.4em;{DIM}">{escape(step.equation)}</div>')
     if step.note:
-        parts.append(
-            f'<div class="step-note" style="font-size:11.5px;padding-top:.35em;{DIM}">{escape(step.note)}</div>'
-        )
+        parts.append(f'<div class="step-note" style="font-size:12px;padding-top:.35em;{DIM}">{escape(step.note)}</div>')
     return box(f'<div class="step-words">{"".join(parts)}</div>')
 
 
@@ -73,7 +72,7 @@ def diagnosis_html(diagnosis: Diagnosis, whole: bool) -> str:
         parts += [
             f'<ul style="margin:.4em 0;padding-left:1.2em;font-size:12px">{evidence}</ul>' if evidence else "",
             f"<div>{escape(diagnosis.advice)}</div>",
-            f'<div style="font-size:11.5px;padding-top:.35em;{DIM}">{known}</div>',
+            f'<div style="font-size:12px;padding-top:.35em;{DIM}">{known}</div>',
         ]
     return box("".join(parts))
 

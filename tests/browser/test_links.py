@@ -3,7 +3,9 @@
 import re
 from collections.abc import Callable
 from pathlib import Path
+from urllib.parse import unquote
 
+import numpy as np
 import pytest
 from playground import SCENE, Playground, served
 from playwright.sync_api import Browser, expect
@@ -87,3 +89,31 @@ def test_a_reload_and_a_link_bring_back_what_is_shown(
     expect(said.first).to_be_visible()
     for page in (tab, other):
         page.expect_quiet(address)
+
+
+def told_place(link: str) -> list[float]:
+    """Where a link says that the viewer stands, as ``Playground.viewer`` measures it; infinite if it does not."""
+    found = re.search(r"&view=([^&]*)", link)
+    x, y, z = map(float, unquote(found[1]).split(",")[:3]) if found else (np.inf,) * 3
+    return [-z, -y, -x]
+
+
+def test_a_link_brings_back_where_one_stands(tab: Playground) -> None:
+    tab.settle()
+    room = tab.page.locator("canvas").last.bounding_box()
+    assert room is not None
+    tab.page.mouse.move(room["x"] + 0.5 * room["width"], room["y"] + 0.7 * room["height"])
+    tab.page.mouse.down()
+    tab.page.mouse.move(room["x"] + 0.7 * room["width"], room["y"] + 0.6 * room["height"], steps=4)
+    tab.page.mouse.up()
+    stood = tab.still(lambda: tab.viewer, "the viewer stands still")
+    tab.until(lambda: np.allclose(told_place(tab.page.url), stood[:3], atol=2e-3), "the address says where one stands")
+    link = tab.page.url
+    tab.page.reload()
+    expect(tab.value("outcome")).not_to_be_empty()
+    tab.until(lambda: np.allclose(tab.viewer, stood, atol=2e-3), "the viewer stands there again")
+    assert tab.still(lambda: tab.page.url, "the address stays") == link
+    tab.page.locator("[data-touch^='step:yaw']").locator("visible=true").first.click()
+    expect(tab.page).to_have_url(re.compile("step=yaw[^&]*$"))
+    tab.page.goto(re.sub("view=[^&]*", "view=here", link))
+    expect(tab.page.get_by_text(re.compile("^View is 'here'; give a place")).first).to_be_visible()

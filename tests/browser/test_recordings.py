@@ -123,6 +123,20 @@ def test_failures_are_gone_through(tab: Playground, own_address: str, folder: Pa
     assert tab.errors == []
 
 
+def test_a_link_opens_a_recording_at_its_step(tab: Playground, own_address: str, folder: Path) -> None:
+    file = recorded(tab)
+    tab.until(lambda: (folder / "recordings" / file).exists(), "the run is on the disk")
+    row = read_run_row(folder / "recordings" / file)
+    for step, number in (("", row.key_step + 1), ("&step=bearings", 2)):
+        tab.page.goto(f"{own_address}/#v=1&run={file}{step}")
+        expect(tab.step).to_have_value(re.compile(f"^{number}/{row.steps} "))
+        expect(tab.touch("run-close:")).to_have_count(1)
+        expect(tab.page).to_have_url(re.compile(f"run={re.escape(file)}&scene="))
+    tab.page.goto(f"{own_address}/#v=1&run=..%2F..%2Fgone.rrd")
+    expect(said(tab, "gone.rrd: is not in the list any more")).to_be_visible()
+    assert tab.errors == []
+
+
 def test_runs_are_viewed_and_taken_away(tab: Playground, own_address: str, folder: Path) -> None:
     recorded(tab)
     tab.tab("Recordings")

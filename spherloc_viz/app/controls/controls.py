@@ -1,6 +1,6 @@
 """The panel right of the canvas: what is solved and how, comparisons, sweeps, other scenes, and what to take away."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from html import escape
 from pathlib import Path
@@ -18,15 +18,17 @@ from spherloc.watch import Watch
 from spherloc_viz import share, style
 from spherloc_viz.app.catalog import Catalog, SceneRequest
 from spherloc_viz.app.controls.estimator_controls import EstimatorControls
-from spherloc_viz.app.controls.presets import presets
+from spherloc_viz.app.controls.presets import Preset, presets
 from spherloc_viz.app.controls.scene_controls import SceneControls
 from spherloc_viz.app.controls.sequence_panel import SequencePanel
 from spherloc_viz.app.controls.slow_run import SlowRun
 from spherloc_viz.app.panels.compare_panel import ComparePanel
 from spherloc_viz.app.panels.export_panel import ExportPanel, Shown
-from spherloc_viz.app.panels.open_panel import Opened, OpenPanel
+from spherloc_viz.app.panels.open_panel import Opened as OpenedScene
+from spherloc_viz.app.panels.open_panel import OpenPanel
 from spherloc_viz.app.panels.recordings_panel import Page, RecordingsPanel
 from spherloc_viz.app.panels.sweep_runs_panel import SweepPanel
+from spherloc_viz.app.review.opened import Opened
 from spherloc_viz.app.review.reviewer import ReviewCard
 from spherloc_viz.app.run_request import Run, RunRequest
 from spherloc_viz.app.services import Services
@@ -54,7 +56,7 @@ class DisplayControls:
         self._dark = gui.add_checkbox("Dark", True, hint="Dark for a screen, light for a projector and for print.")
         gui.add_html(PROJECTOR)
         self._hide = gui.add_checkbox(
-            "Hide answers", False, hint="No true pose, no true labels, and no outcome before the last step."
+            "Hide answers", False, hint="No truth and no comparison, and no outcome before the last step."
         )
         with gui.add_folder("Layers", expand_by_default=False):
             self._follow = gui.add_checkbox("Follow steps", True, hint="Move to where the step's subject reads best.")
@@ -101,8 +103,16 @@ class DisplayControls:
         self._changed(event)
 
 
-UNDO, REDO, NEW_SEED = "Undo", "Redo", "New seed"
 NO_PRESET = "choose …"
+
+
+def preset_names(known: Sequence[Preset], hidden: bool) -> tuple[str, ...]:
+    """What the list of presets offers, nothing first; ``hidden`` numbers them, since their titles tell what happens."""
+    titles = (f"Preset {number}" if hidden else preset.title for number, preset in enumerate(known, 1))
+    return (NO_PRESET, *titles)
+
+
+UNDO, REDO, NEW_SEED = "Undo", "Redo", "New seed"
 
 
 class Owner(Protocol):
@@ -152,7 +162,7 @@ class Controls:
         self._catalog, self._owner = catalog, owner
         self._sequence: SceneRequest | None = None
         """What the sequence that was started last is of."""
-        self._presets = {preset.title: preset for preset in presets(catalog)}
+        self._presets = presets(catalog)
         self.slow = SlowRun(gui, f"spherloc-clock-{client.client_id}")
         self._moves = gui.add_button_group("", (UNDO, REDO, NEW_SEED))
         self._moves.on_click(self._move)
@@ -178,7 +188,9 @@ class Controls:
         gui.main_panel.set_width(width_px)
 
     def _build_play(self, gui: viser.GuiApi) -> None:
-        self._preset = gui.add_dropdown("Preset", (NO_PRESET, *self._presets), hint="Each of them shows one thing.")
+        self._preset = gui.add_dropdown(
+            "Preset", preset_names(self._presets, False), hint="Each of them shows one thing."
+        )
         self._preset.on_update(self._choose_preset)
         self._story = gui.add_html("", visible=False)
         self.scene = SceneControls(gui, self._catalog, self._owner.changed)
@@ -212,18 +224,23 @@ class Controls:
         self.estimator.write(request.estimator, request.options)
         self._show_scene(request.scene.scene)
 
-    def items(self, run: Run) -> tuple[SceneItem, ...]:
-        """What the canvas shows beside a run: cameras of other estimators, recorded ones, and those of a sequence."""
-        return self.compare.items(run.trace) + self.review.items(run) + self._trajectory(run)
+    def items(self, run: Run, hidden: bool) -> tuple[SceneItem, ...]:
+        """What the canvas shows beside a run: cameras of other estimators, recorded ones, and those of a sequence.
 
-    def draw(self, run: Run, diagnosis: Diagnosis | None) -> None:
-        """Follow the run at hand; ``diagnosis`` is None for as long as there is none."""
-        self._follow_preset(run.request)
+        All of them are answers, which ``hidden`` leaves out.
+        """
+        return () if hidden else self.compare.items(run.trace) + self.review.items(run) + self._trajectory(run)
+
+    def draw(self, run: Run, diagnosis: Diagnosis | None, hidden: bool) -> None:
+        """Follow the run at hand; ``diagnosis`` is None for as long as there is none; ``hidden`` tells no answers."""
+        self._follow_preset(run.request, hidden)
         html = _edits_html(run.request.scene.variation)
         if self._edits.content != html:
             self._edits.content, self._edits.visible = html, bool(html)
-        self.compare.draw(run.trace)
-        self.review.draw(run, diagnosis)
+        self.compare.draw(run.trace, hidden)
+        self.review.draw(run, diagnosis, hidden)
+        for part in (self._sweep, self.sequence, self._recordings):
+            part.hide_answers(hidden)
 
     def show_how_to_repeat(self, run: Run) -> None:
         """Say how to repeat a run that the page has settled on."""
@@ -244,26 +261,25 @@ class Controls:
         self.sequence.show(self._catalog.map_scene(label))
         self._movable.visible = self._catalog.synthetic(label) is not None
 
-    def _follow_preset(self, request: RunRequest) -> None:
-        """Show the preset's name and story for as long as the page is as it says."""
-        title = next(
-            (
-                title
-                for title, preset in self._presets.items()
-                if request == RunRequest(preset.scene, preset.estimator, preset.options)
-            ),
-            NO_PRESET,
-        )
-        if self._preset.value != title:
-            put(self._preset, title)
-        html = box(escape(self._presets[title].story), f"font-size:12px;{DIM}") if title in self._presets else ""
+    def _follow_preset(self, request: RunRequest, hidden: bool) -> None:
+        """Show the preset's name and story for as long as the page is as it says; both are answers."""
+        names = preset_names(self._presets, hidden)
+        if self._preset.options != names:
+            self._preset.options = names
+        asked = (RunRequest(preset.scene, preset.estimator, preset.options) for preset in self._presets)
+        place = next((place for place, one in enumerate(asked, 1) if one == request), 0)
+        if self._preset.value != names[place]:
+            put(self._preset, names[place])
+        told = place > 0 and not hidden
+        html = box(escape(self._presets[place - 1].story), f"font-size:12px;{DIM}") if told else ""
         if self._story.content != html:
             self._story.content, self._story.visible = html, bool(html)
 
     @at_once
     def _choose_preset(self, event: viser.GuiEvent) -> None:
-        preset = self._presets.get(event.target.value)
-        if event.client is not None and preset is not None:
+        place = self._preset.options.index(event.target.value)
+        if event.client is not None and place > 0:
+            preset = self._presets[place - 1]
             self._owner.open(RunRequest(preset.scene, preset.estimator, preset.options))
 
     @at_once
@@ -275,11 +291,15 @@ class Controls:
         else:
             self._owner.step_history(-1 if button == UNDO else 1)
 
-    def _open_scene(self, opened: Opened) -> None:
+    def _open_scene(self, opened: OpenedScene) -> None:
         label = self._catalog.add(opened.scene, opened.path, opened.label)
         seed = getattr(opened.scene, "seed", 0)
         estimator, _ = self.estimator.read()
         self._owner.open(RunRequest(SceneRequest(label, seed), estimator, None))
+
+    def open_linked(self, file: str) -> Opened:
+        """Open a recording to which a link leads; raises ``RecordingError`` if it cannot be."""
+        return self._recordings.open_linked(file)
 
     def _enter(self, got: Reopened) -> RunRequest:
         """Offer a reopened scene, and request for its run."""

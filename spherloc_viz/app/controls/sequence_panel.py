@@ -46,6 +46,11 @@ class SequencePanel:
         """Show the panel for scenes with queries, and hide it for others."""
         self._folder.visible = scene is not None
 
+    def hide_answers(self, hidden: bool) -> None:
+        """Say nothing of how it went, or say it again."""
+        if self._text.visible == hidden:
+            self._text.visible = not hidden
+
     def rows(self, label: str) -> tuple[QueryResult, ...]:
         """Results by now, in the order of the sequence; none if the last sequence was of another scene."""
         with self._lock:

@@ -44,7 +44,6 @@ class StepsPanel:
         """Key, or number of a step from 1 on, that was asked for."""
         self._playing = False
         self._steps: tuple[Stop, ...] = ()
-        self._titles: tuple[str, ...] = ()
         self._index = 0
         titles: list[str] = ["-"]
         self._stages = gui.add_html("")
@@ -66,7 +65,6 @@ class StepsPanel:
             known = self._steps
             self._index = find_step(steps, known[self._index].key) if known else opening_step(steps)
             self._steps = steps
-            self._titles = tuple(f"{k}/{len(steps)}  {step.title}" for k, step in enumerate(steps, 1))
         with self._lock:
             moves, self._moves = self._moves, []
             goal, self._goal = self._goal, None
@@ -89,13 +87,15 @@ class StepsPanel:
         short = stages.count(stage) >= LONG_STAGE and stages[self._index + 1 : self._index + 2] == [stage]
         return PLAY_S * (SHORT if short else 1.0) / PACES[self._pace.value]
 
-    def show(self, step: Step, playing: bool, tables: Sequence[Table]) -> None:
-        """Put the step at hand, as it was painted, and its tables on the page."""
-        if self._choice.options != self._titles:
-            self._choice.options = self._titles
-            self._slider.max = max(2, len(self._titles))
+    def show(self, step: Step, playing: bool, tables: Sequence[Table], hidden: bool = False) -> None:
+        """Put the step at hand, as it was painted, and its tables on the page; ``hidden`` calls the steps that are to
+        come by their stage, since their titles tell what will be found."""
+        titles = titles_of(self._steps, self._index if hidden else len(self._steps))
+        if self._choice.options != titles:
+            self._choice.options = titles
+            self._slider.max = max(2, len(titles))
         with self._lock:
-            put(self._choice, self._titles[self._index])
+            put(self._choice, titles[self._index])
             put(self._slider, self._index + 1)
         buttons = (PREVIOUS, NEXT, PAUSE if playing else PLAY)
         if self._buttons.options != buttons:
@@ -150,6 +150,12 @@ class StepsPanel:
                 self._playing = False
                 self._moves.append(button)
         self._changed(None)
+
+
+def titles_of(steps: Sequence[Stop], told: int) -> tuple[str, ...]:
+    """What the steps are called in the list; those after the one of index ``told`` by their stage."""
+    names = (step.title if k <= told else step.stage for k, step in enumerate(steps))
+    return tuple(f"{k}/{len(steps)}  {name}" for k, name in enumerate(names, 1))
 
 
 def moved(steps: Sequence[Stop], index: int, move: str) -> int:
@@ -208,4 +214,4 @@ def stages_html(steps: Sequence[Stop], index: int) -> str:
             f'<div style="padding-top:.15em;white-space:nowrap">{escape(stage)}</div></div>'
         )
     row = f'<div style="display:flex;gap:5px">{"".join(bars)}</div>'
-    return box(row, "font-size:11px;padding-top:.4em;padding-bottom:.2em")
+    return box(row, "font-size:12px;padding-top:.4em;padding-bottom:.2em")

@@ -73,14 +73,17 @@ class ImagePanel:
         touches.on("image-pick", self._pick)
         touches.on("image-reference", self._want)
 
-    def draw(self, trace: Trace, picture: Picture, selected: tuple[int, ...], kept: NDArray) -> None:
-        """Show the images of a run at a step. ``selected`` are numbers in the problem, ``kept`` (N,) original ones."""
+    def draw(
+        self, trace: Trace, picture: Picture, selected: tuple[int, ...], kept: NDArray, hidden: bool = False
+    ) -> None:
+        """Show the images of a run at a step. ``selected`` are numbers in the problem, ``kept`` (N,) original ones;
+        ``hidden`` does not tell how many inliers a reference has."""
         problem = trace.problem
         followed = (problem.name, problem.reference_images, kept[list(selected)].tolist())
         if followed != self._followed:
             self._followed, self._wanted = followed, None
         colors = _colors(picture, len(problem))
-        drawn = (selected, self._wanted, colors.tobytes(), kept.tobytes())
+        drawn = (selected, self._wanted, colors.tobytes(), kept.tobytes(), hidden)
         if self._drawn is not None and self._drawn[0] is trace and self._drawn[1] == drawn:
             return
         self._drawn = (trace, drawn)
@@ -93,7 +96,8 @@ class ImagePanel:
         gone = [path.name for path, uri in zip(paths, uris, strict=True) if path is not None and uri is None]
         caption = " ".join([shown.caption, *(f"{name} cannot be read any more." for name in gone)])
         html = drawing.frame_html(places, height, [uri is not None for uri in uris], shown.parts, caption)
-        html = box(html) + status_html(caption) + chips_html(problem, trace.inlier_mask, view.reference)
+        votes = "" if hidden else chips_html(problem, trace.inlier_mask, view.reference)
+        html = box(html) + status_html(caption) + votes
         _assign(self._backgrounds, drawing.backgrounds_html(uris))
         _assign(self._drawing, html)
 

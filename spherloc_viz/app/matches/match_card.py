@@ -58,7 +58,7 @@ def _crop_html(path: Path | None, pixel: FloatArray, name: str) -> str:
         '<div style="flex:1;min-width:0;max-width:50%"><div style="position:relative;aspect-ratio:3/2">'
         f'<img alt="{name} around the match" src="{jpeg_uri(np.asarray(crop, np.uint8))}" '
         f'style="width:100%;height:100%;border-radius:3px;display:block">{cross}</div>'
-        f'<div style="font-size:11.5px;opacity:.65">{name}</div></div>'
+        f'<div style="font-size:12px;opacity:.65">{name}</div></div>'
     )
 
 
@@ -92,11 +92,13 @@ class MatchCard:
         kept: NDArray,
         alternative_cam_from_map: FloatArray | None = None,
         right: bool = False,
+        hidden: bool = False,
     ) -> None:
         """Show what is selected, numbers in the problem; ``kept`` (N,) are the original ones. ``right`` is whether the
         card stands on the right of the canvas, when it comes up or is about others: what was clicked is on the left.
 
-        ``alternative_cam_from_map`` (3, 4) is another pose that a diagnosis knows, to hold a match against.
+        ``alternative_cam_from_map`` (3, 4) is another pose that a diagnosis knows, to hold a match against. ``hidden``
+        does not tell what the run made of the matches.
         """
         if self._panel.visible != bool(selected):
             self._panel.visible = bool(selected)
@@ -105,6 +107,7 @@ class MatchCard:
             selected,
             kept.tobytes(),
             None if alternative_cam_from_map is None else alternative_cam_from_map.tobytes(),
+            hidden,
         )
         if not selected or (self._drawn is not None and self._drawn[0] is trace and self._drawn[1:] == drawn[1:]):
             return
@@ -112,7 +115,9 @@ class MatchCard:
             self._right = right
             self._panel.float(x=-MARGIN_PX if right else MARGIN_PX, y=MARGIN_PX, width=WIDTH_PX)
         self._drawn = drawn
-        if len(selected) == 1:
+        if hidden:
+            html, details = untold_html(trace, selected, kept, self._editable), ""
+        elif len(selected) == 1:
             what = explain(trace, selected[0], alternative_cam_from_map)
             html, details = one_html(trace, what, kept, self._editable), details_html(what, kept)
         else:
@@ -133,6 +138,17 @@ def one_html(trace: Trace, what: Explanation, kept: NDArray, editable: bool) -> 
     head = f'<div>{_walk(what.number, kept)}{title} <span style="{look}">{escape(what.verdict)}</span></div>'
     body = f'<div style="padding-top:.3em">{escape(what.reason)}</div>{crops_html(trace.problem, what.number)}'
     return box(head + body) + _actions(trace, 1, editable)
+
+
+def untold_html(trace: Trace, selected: tuple[int, ...], kept: NDArray, editable: bool) -> str:
+    """The card of matches of which nothing is told: which they are, and what can be done."""
+    number = selected[0]
+    if len(selected) == 1:
+        head, crops = f"{_walk(number, kept)}Match {kept[number]}", crops_html(trace.problem, number)
+    else:
+        head, crops = f"{len(selected):,} matches", ""
+    title = f'<div style="font-size:15px;font-weight:600">{head}</div>'
+    return box(f"{title}{crops}") + _actions(trace, len(selected), editable)
 
 
 def details_html(what: Explanation, kept: NDArray) -> str:

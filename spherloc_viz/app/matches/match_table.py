@@ -12,7 +12,7 @@ from spherloc.problem import Problem
 from spherloc.trace import Trace
 from spherloc.types import BoolArray, IntArray
 from spherloc_viz import style
-from spherloc_viz.app.text import DIM, box
+from spherloc_viz.app.text import DIM, WITHHELD, box, status_html
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.layers.matches import FILTERS, SORTS, MatchRows, match_rows, order, reference_votes
 
@@ -89,11 +89,16 @@ class MatchTable:
         ):
             touches.on(action, handler)
 
-    def draw(self, trace: Trace, selected: tuple[int, ...], kept: NDArray) -> None:
+    def draw(self, trace: Trace, selected: tuple[int, ...], kept: NDArray, hidden: bool = False) -> None:
         """Show the matches of a run. ``selected`` are numbers in the problem, ``kept`` (N,) the original ones.
 
-        A match that was just selected elsewhere brings its page up.
+        A match that was just selected elsewhere brings its page up. ``hidden`` shows none: all columns are answers.
         """
+        if hidden:
+            self._drawn = None
+            if self._html.content != status_html(WITHHELD):
+                self._html.content = status_html(WITHHELD)
+            return
         drawn = (trace, selected, kept.tobytes(), self._look)
         if self._drawn is not None and self._drawn[0] is trace and self._drawn[1:] == drawn[1:]:
             return
@@ -170,12 +175,14 @@ def _headings(look: Look) -> str:
 
 def _row(rows: MatchRows, k: int, chosen: bool, number: int) -> str:
     cell, right = '<td style="padding:.08em .3em">', '<td style="padding:.08em .3em;text-align:right">'
-    mark = f"background:{style.css(style.SELECTED)}40" if chosen else ""
+    mark = (
+        f"background:{style.css(style.SELECTED)}1c;box-shadow:inset 3px 0 {style.css(style.SELECTED)}" if chosen else ""
+    )
     truth = "–" if rows.right is None else _word(bool(rows.right[k]))
     agree = "–" if rows.agree[k] < 0 else f"{rows.agree[k]}"
     return (
-        f'<tr data-touch="select:{number}" style="{mark}">{cell}{number}</td>{cell}{_word(bool(rows.kept[k]))}</td>'
-        f"{cell}{truth}</td>{right}{_number(rows.px[k])}</td>{right}{_number(rows.deg[k])}</td>{right}{agree}</td></tr>"
+        f'<tr tabindex="0" data-touch="select:{number}" style="{mark}">{cell}{number}</td>'
+        f"{cell}{_word(bool(rows.kept[k]))}</td>{cell}{truth}</td>{right}{_number(rows.px[k])}</td>{right}{_number(rows.deg[k])}</td>{right}{agree}</td></tr>"
     )
 
 

@@ -18,7 +18,7 @@ from spherloc.trace import Trace
 from spherloc.watch import Cancelled, Watch
 from spherloc_viz import style
 from spherloc_viz.app.plots.charts import chart_svg
-from spherloc_viz.app.text import DIM, WORDS, box, dot_html, status_html
+from spherloc_viz.app.text import DIM, WITHHELD, WORDS, box, dot_html, status_html
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.workers import BackgroundWorker
 from spherloc_viz.layers.comparison import (
@@ -108,11 +108,13 @@ class ComparePanel:
         self._live = gui.add_checkbox("Live", False, hint="Compare again whenever the problem changes.")
         self._bar = gui.add_progress_bar(0.0, visible=False)
         self._status = gui.add_html("", visible=False)
-        self._table = gui.add_html(box(f'<div style="{DIM}">{escape(NOTE)}</div>', "font-size:11.5px"))
+        self._table = gui.add_html(box(f'<div style="{DIM}">{escape(NOTE)}</div>', "font-size:12px"))
         self._lock = threading.Lock()
         self._trace: Trace | None = None
         self._done: Comparison | None = None
-        self._shown: tuple[Comparison | None, bool] = (None, False)
+        self._shown: tuple[Comparison | None, bool, bool] = (None, False, False)
+        """What was compared, whether it is of the problem at hand, and whether it is hidden."""
+        self._hidden = False
         self._stop, self._watch = threading.Event(), Watch()
         self._closed, self._seen = False, False
         self._background = BackgroundWorker("spherloc-compare", self._complain)
@@ -122,10 +124,11 @@ class ComparePanel:
         touches.on("use", self._choose)
         touches.on("views", self._see)
 
-    def draw(self, trace: Trace) -> None:
-        """Follow the run at hand, whose problem, seed and options are those to compare with."""
+    def draw(self, trace: Trace, hidden: bool = False) -> None:
+        """Follow the run at hand, whose problem, seed and options are those to compare with; ``hidden`` shows nothing
+        of what comes out."""
         with self._lock:
-            before, self._trace = self._trace, trace
+            before, self._trace, self._hidden = self._trace, trace, hidden
         if self._live.value and (before is None or not is_same(before.problem, trace.problem)):
             self._start(LIVE_AFTER_S)
         self._show()
@@ -244,14 +247,15 @@ class ComparePanel:
     def _show(self) -> None:
         """Put the comparison on the page, paler if it is of an earlier problem."""
         with self._lock:
-            done, trace = self._done, self._trace
+            done, trace, hidden = self._done, self._trace, self._hidden
             if done is None or trace is None:
                 return
             fits = is_same(done.problem, trace.problem)
-            if self._shown == (done, fits):
+            if self._shown == (done, fits, hidden):
                 return
-            self._shown = (done, fits)
-            self._table.content = comparison_html(done.entries, done.charts, fits)
+            self._shown = (done, fits, hidden)
+            told = status_html(WITHHELD) if hidden else comparison_html(done.entries, done.charts, fits)
+            self._table.content = told
 
 
 def _run(trace: Trace, name: str, watch: Watch) -> Trace:
@@ -291,14 +295,14 @@ def comparison_html(entries: Sequence[Entry], charts: Sequence[Chart], fits: boo
     table = comparison_table(entries)
     rows = "".join(_row_html(table, row) for row in table.rows)
     head = "".join(f'<td style="text-align:right;{DIM}">{escape(name)}</td>' for name in MEASURED)
-    style_css = "border-collapse:collapse;width:100%;font-size:11.5px;font-variant-numeric:tabular-nums"
+    style_css = "border-collapse:collapse;width:100%;font-size:12px;font-variant-numeric:tabular-nums"
     body = box(f'<table style="{style_css}"><tr><td></td>{head}</tr>{rows}</table>')
     body += "".join(
         f'<div style="padding:0 .8em .2em;font-size:12.5px;font-weight:600">{escape(chart.title)}</div>'
-        + box(chart_svg(chart) + f'<div style="font-size:11.5px;{DIM}">{escape(coinciding(chart))}</div>')
+        + box(chart_svg(chart) + f'<div style="font-size:12px;{DIM}">{escape(coinciding(chart))}</div>')
         for chart in charts
     )
-    body += box(f'<div style="{DIM}">{escape(NOTE)}</div>', "font-size:11.5px")
+    body += box(f'<div style="{DIM}">{escape(NOTE)}</div>', "font-size:12px")
     if fits:
         return body
     return status_html(f"The problem has changed since; press {START}.") + f'<div style="opacity:.45">{body}</div>'
@@ -319,8 +323,10 @@ def _row_html(table: Table, row: tuple) -> str:
     # Named as what it is: beside "no pose" a cause alone reads as if it were about a pose.
     words += [f"diagnosis: {value['diagnosis']}"] if value["diagnosis"] not in (NO_VALUE, Cause.OK) else []
     color = WORDS.get(value["outcome"])
-    verdict = f'<span style="{f"color:{style.css(color)};font-weight:600" if color else ""}">{value["outcome"]}</span>'
+    verdict = (
+        f'<span style="{f"color:{style.css_text(color)};font-weight:600" if color else ""}">{value["outcome"]}</span>'
+    )
     line = f'{verdict}<span style="{DIM}"> · {escape(" · ".join(words))}</span>' if words else verdict
     below = f'<td colspan="{1 + len(MEASURED)}" style="padding:0 0 .35em 1.15em">{line}</td>'
     rule = 'style="border-top:1px solid rgba(128,140,160,.25)"'
-    return f"<tr {touch} {rule}>{head}{numbers}</tr><tr {touch}>{below}</tr>"
+    return f'<tr tabindex="0" {touch} {rule}>{head}{numbers}</tr><tr {touch}>{below}</tr>'

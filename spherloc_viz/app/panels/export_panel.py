@@ -160,7 +160,7 @@ def file_stem(shown: Shown) -> str:
 def code_html(title: str, code: str) -> str:
     """Code with a button that copies it."""
     link = "text-decoration:underline;font-size:12px;margin-left:.8em"
-    face = "font-family:ui-monospace,Menlo,Consolas,monospace;font-size:11px;line-height:1.45"
+    face = "font-family:ui-monospace,Menlo,Consolas,monospace;font-size:12px;line-height:1.45"
     look = "white-space:pre-wrap;overflow-wrap:anywhere;max-height:24em;overflow-y:auto;padding:.5em .7em"
     ground = "background:rgba(128,140,160,.12);border-radius:.4em;margin:.25em 0 0"
     copy = (

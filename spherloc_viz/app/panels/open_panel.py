@@ -57,7 +57,7 @@ def _folder_html(listing: Listing) -> str:
             _link(f"open-folder:{page}:{listing.place}", words) for words, page in ways if 0 <= page < listing.pages
         ]
         pages = f'<div style="padding:.3em 0">page {listing.page + 1} of {listing.pages} {" ".join(links)}</div>'
-    remarks = "".join(f'<div style="font-size:11.5px;{DIM}">{escape(words)}</div>' for words in listing.remarks)
+    remarks = "".join(f'<div style="font-size:12px;{DIM}">{escape(words)}</div>' for words in listing.remarks)
     return _section(f"{listing.folder.name}/", rows) + pages + remarks
 
 
@@ -78,7 +78,7 @@ def _scene_html(row: Row) -> str:
 def _row_html(action: str | None, name: str, about: str) -> str:
     """A row that is pressed; paler if there is nothing to press."""
     touch = "" if action is None else f' role="button" tabindex="0" data-touch="{escape(action)}"'
-    words = f'<div style="font-size:11.5px;{DIM};overflow-wrap:anywhere">{escape(about)}</div>' if about else ""
+    words = f'<div style="font-size:12px;{DIM};overflow-wrap:anywhere">{escape(about)}</div>' if about else ""
     pale = f"{DIM};" if action is None else ""
     cell = f'<td style="{RULE};{pale}padding:.25em .4em;overflow-wrap:anywhere">{escape(name)}{words}</td>'
     return f"<tr{touch}>{cell}</tr>"

@@ -13,11 +13,12 @@ from spherloc_viz.app.review.export import Exporter
 from spherloc_viz.app.review.filters import pill
 from spherloc_viz.app.review.gallery_list import GalleryList
 from spherloc_viz.app.review.notes import Notes
+from spherloc_viz.app.review.opened import Opened
 from spherloc_viz.app.review.reviewer import ReviewCard, Reviewer, Reviewing
 from spherloc_viz.app.review.run_library import RunLibrary
 from spherloc_viz.app.review.run_list import RunList
 from spherloc_viz.app.run_request import RunRequest
-from spherloc_viz.app.text import box, status_html
+from spherloc_viz.app.text import WITHHELD, box, status_html
 from spherloc_viz.app.web.downloads import Downloads
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.workers import BackgroundWorker
@@ -73,7 +74,10 @@ class RecordingsPanel:
             self._build(gui, client, touches, library, card)
         self._gallery = GalleryList(gui, touches, library, name, self._open_file, self._open_scene)
         self._parts.append(self._gallery)
+        self._withheld = gui.add_html(status_html(WITHHELD), visible=False)
         self._shown, self._seen = RUNS if library is not None else GALLERY, False
+        self._untold = False
+        """Whether answers are hidden."""
         touches.on("recordings", self._choose)
         touches.on("views", self._see)
 
@@ -115,6 +119,14 @@ class RecordingsPanel:
             self._preparing.ask(self._library.prepare)
         self._show()
 
+    def hide_answers(self, hidden: bool) -> None:
+        """Tell no more of the runs than what they are of, or tell all again."""
+        if hidden != self._untold:
+            self._untold = hidden
+            if self._runs is not None:
+                self._runs.hide_answers(hidden)
+            self._show()
+
     def _choose(self, touch: Touch) -> None:
         if touch.argument in (RUNS, GALLERY):
             self._shown = touch.argument
@@ -127,10 +139,11 @@ class RecordingsPanel:
         gallery = self._shown == GALLERY
         if self._runs is not None:
             self._runs.hide(gallery)
-            self._notes.hide(gallery)
-            self._comparison.visible = bool(self._compared) and not gallery
+            self._notes.hide(gallery or self._untold)
+            self._comparison.visible = bool(self._compared) and not gallery and not self._untold
             self._runs.see(self._seen and not gallery)
-        self._gallery.show(gallery and self._seen)
+        self._gallery.show(gallery and self._seen and not self._untold)
+        self._withheld.visible = gallery and self._untold
 
     def _compare(self) -> None:
         """Put the two marked runs side by side."""
@@ -139,7 +152,7 @@ class RecordingsPanel:
         if len(rows) != 2:
             raise RecordingError("one of the marked runs is not in the list any more; mark two others.")
         self._compared = rows[0].file, rows[1].file
-        self._comparison.content, self._comparison.visible = comparison_html(*rows), True
+        self._comparison.content, self._comparison.visible = comparison_html(*rows), not self._untold
         self._reviewer.compare(*rows)
 
     def _uncompare(self) -> None:
@@ -167,6 +180,12 @@ class RecordingsPanel:
         self._reviewer.relabelled(row)
         self._notes.refresh(row, self._library.labels())
         self._runs.ask()
+
+    def open_linked(self, file: str) -> Opened:
+        """Open a recording to which a link leads; raises ``RecordingError`` if it cannot be."""
+        if self._library is None:
+            raise RecordingError("runs are not recorded here, so that no recording can be opened.")
+        return self._reviewer.follow(file)
 
     def _open_file(self, file: str) -> None:
         self._reviewer.ask(file)

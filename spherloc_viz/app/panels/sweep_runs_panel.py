@@ -17,7 +17,7 @@ from spherloc.experiments.sweep_rows import rows_text, summarize, summary_text
 from spherloc_viz.app.catalog import SceneRequest
 from spherloc_viz.app.panels.compare_panel import chips_html, ordered
 from spherloc_viz.app.plots.sweep_charts import charts_html, table_html
-from spherloc_viz.app.text import status_html
+from spherloc_viz.app.text import WITHHELD, status_html
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.web.viser_internals import put
 from spherloc_viz.options import usable_estimators
@@ -102,7 +102,8 @@ class SweepPanel:
         """Why runs of the last sweep could not be recorded."""
         self._warnings: list[str] = []
         """Estimators of other packages that failed in it."""
-        self._closed = False
+        self._closed = self._hidden = False
+        self._withheld = gui.add_html(status_html(WITHHELD), visible=False)
         self._button.on_click(self._press)
         self._over.on_update(self._follow)
         self._files.on_click(self._download)
@@ -114,6 +115,18 @@ class SweepPanel:
             self._closed = True
             if self._stop is not None:
                 self._stop.set()
+
+    def hide_answers(self, hidden: bool) -> None:
+        """Put the results away, or show them again."""
+        if hidden != self._hidden:
+            self._hidden = hidden
+            self._show_results()
+
+    def _show_results(self) -> None:
+        results = self._results
+        there = results is not None and bool(results.rows)
+        self._charts.visible = self._table.visible = self._files.visible = there and not self._hidden
+        self._withheld.visible = there and self._hidden
 
     def _tick(self, touch: Touch) -> None:
         if touch.argument in self._names:
@@ -222,7 +235,7 @@ class SweepPanel:
         points = summarize(plan.labels, results.rows)
         self._charts.content = charts_html(plan.over, plan.labels, points)
         self._table.content = table_html(plan.over, plan.labels, points)
-        self._charts.visible = self._table.visible = self._files.visible = True
+        self._show_results()
 
     def _say(self, sentence: str, wrong: bool = False) -> None:
         self._status.content = status_html(sentence[:1].upper() + sentence[1:], wrong)

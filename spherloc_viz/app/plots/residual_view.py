@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from spherloc.trace import Trace
 from spherloc.types import FloatArray
 from spherloc_viz import style
+from spherloc_viz.app.glossary import help_html
 from spherloc_viz.app.plots import shapes
 from spherloc_viz.app.plots.charts import chart_html, curve_parts
 from spherloc_viz.app.plots.shapes import Scale, decade_ticks, round_ticks, tick_texts
-from spherloc_viz.app.text import DIM, box, dot_html, table_html
+from spherloc_viz.app.text import DIM, WITHHELD, box, dot_html, status_html, table_html
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.layers.primitives import Chart, Curve
 from spherloc_viz.layers.residuals import (
@@ -164,11 +165,23 @@ class ResidualView:
         self._html = gui.add_html("")
         touches.on(SELECT_BIN, self._press)
 
-    def draw(self, trace: Trace, selected: tuple[int, ...], kept: NDArray[np.int64], cost: Chart | None = None) -> None:
+    def draw(
+        self,
+        trace: Trace,
+        selected: tuple[int, ...],
+        kept: NDArray[np.int64],
+        cost: Chart | None = None,
+        hidden: bool = False,
+    ) -> None:
         """Show a run with the ``selected`` matches (numbers of the problem) marked; nothing here needs ``kept``, the
         numbers (N,) by which matches are known on the page. ``cost`` is how the residuals fell so far, to stand above.
-        Sends nothing if nothing changed.
+        All of it are answers, which ``hidden`` leaves out. Sends nothing if nothing changed.
         """
+        if hidden:
+            self._known, self._drawn, self._bins = None, None, {}
+            if self._html.content != status_html(WITHHELD):
+                self._html.content = status_html(WITHHELD)
+            return
         if self._known is None or self._known[0] is not trace:
             residuals, history = residuals_of(trace), history_of(trace)
             self._known = trace, residuals, table_html(scores_table(trace)), _history_html(history)
@@ -200,7 +213,7 @@ def _residuals_html(residuals: Residuals | None, selected: tuple[int, ...]) -> s
     marked[list(selected)] = True
     drawings = "".join(histogram_svg(one, marked) for one in residuals.histograms)
     note = _note(residuals_caption(residuals))
-    return box(_title("Residuals at the estimated pose") + _legend_html(residuals.judged) + drawings + note)
+    return box(_title("Residuals at the estimated pose", "residual") + _legend_html(residuals.judged) + drawings + note)
 
 
 def _legend_html(judged: str) -> str:
@@ -226,7 +239,7 @@ def residuals_caption(residuals: Residuals) -> str:
 def _history_html(history: History | None) -> str:
     if history is None:
         return ""
-    return box(_title("How RANSAC got there") + history_svg(history) + _note(history_caption(history)))
+    return box(_title("How RANSAC got there", "RANSAC") + history_svg(history) + _note(history_caption(history)))
 
 
 def history_caption(history: History) -> str:
@@ -242,9 +255,11 @@ def history_caption(history: History) -> str:
     return words
 
 
-def _title(words: str) -> str:
-    return f'<div style="font-weight:600;padding-bottom:.3em">{escape(words)}</div>'
+def _title(words: str, term: str | None = None) -> str:
+    """A heading, with a "?" that tells what a term means."""
+    help_ = "" if term is None else help_html(term)
+    return f'<div style="font-weight:600;padding-bottom:.3em">{escape(words)}{help_}</div>'
 
 
 def _note(words: str) -> str:
-    return f'<div style="font-size:11.5px;opacity:.7;padding-top:.3em">{escape(words)}</div>'
+    return f'<div style="font-size:12px;opacity:.7;padding-top:.3em">{escape(words)}</div>'

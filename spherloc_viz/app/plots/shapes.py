@@ -106,7 +106,7 @@ def wrapped_deg(angle_deg: Any) -> Any:
     return (angle_deg + 180.0) % 360.0 - 180.0
 
 
-FONT_PX = 11.0
+FONT_PX = 13.0
 MOST_CORNERS = 400
 """Corners that a line keeps: about one a pixel."""
 TEXT_OPACITY, GRID_OPACITY, AXIS_OPACITY = 0.7, 0.12, 0.4

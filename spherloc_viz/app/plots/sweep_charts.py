@@ -37,7 +37,7 @@ def charts_html(over: str, labels: Sequence[str], points: Sequence[Point]) -> st
         if item.chart.name in SHOWN
     )
     return box(f'<div style="font-size:12px">{names}</div>{drawn}') + box(
-        f'<div style="{DIM}">{escape(NOTE)}</div>', "font-size:11.5px"
+        f'<div style="{DIM}">{escape(NOTE)}</div>', "font-size:12px"
     )
 
 
@@ -93,5 +93,5 @@ def table_html(over: str, labels: Sequence[str], points: Sequence[Point]) -> str
         for row in table.rows
     )
     body = f'<table style="border-collapse:collapse;width:100%"><tr><td></td>{head}</tr>{rows}</table>'
-    css = "font-size:11.5px;font-variant-numeric:tabular-nums"
+    css = "font-size:12px;font-variant-numeric:tabular-nums"
     return box(f'<div style="max-height:{TABLE_PX}px;overflow:auto">{body}</div>', css)

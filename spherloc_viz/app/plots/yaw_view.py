@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from spherloc.trace import Trace
 from spherloc_viz import style
+from spherloc_viz.app.glossary import help_html
 from spherloc_viz.app.plots import shapes
 from spherloc_viz.app.plots.charts import curve_parts
 from spherloc_viz.app.plots.shapes import MINUS, Scale, round_ticks, tick_texts, wrapped_deg
@@ -261,6 +262,8 @@ def _tips(bars: Bars) -> list[str]:
     return [tip.replace("-", MINUS) for tip in tips]
 
 
+NO_ARCS = Arcs(np.zeros((0, 2), np.int64), np.zeros(0), np.zeros(0), "")
+UNTOLD = "Answers are hidden: poses that were tried, the estimate, and which arcs are of right matches are told later."
 PEAK, WHOLE = "Zoom to the peak", "All yaws"
 LEAST_DRAG = 0.012
 """Share of the plot that a press must cross to count as a drag."""
@@ -282,30 +285,38 @@ class YawView:
         self._buttons.on_click(self._click)
         touches.on(ZOOM, self._zoom)
 
-    def draw(self, trace: Trace, step_key: str, selected: tuple[int, ...], kept: NDArray[np.int64]) -> None:
+    def draw(
+        self,
+        trace: Trace,
+        step_key: str,
+        selected: tuple[int, ...],
+        kept: NDArray[np.int64],
+        hidden: bool = False,
+    ) -> None:
         """Show a run, at a step, with the pairs of the ``selected`` matches (numbers of the problem) brought out.
 
-        ``kept`` (N,) are the numbers by which the matches are known on the page. Sends nothing if nothing changed.
+        ``kept`` (N,) are the numbers by which the matches are known on the page. ``hidden`` leaves out what was found.
+        Sends nothing if nothing changed.
         """
         with self._lock:
             wanted = self._wanted
-        story = self._story(trace)
+        story = untold(self._story(trace)) if hidden else self._story(trace)
         hypothesis = step_key.removesuffix("-pose")
         shown_key = hypothesis if any(hypothesis == key for *_, key in story.hypotheses) else ""
-        drawn = (trace, shown_key, selected, wanted)
+        drawn = (trace, shown_key, selected, wanted, hidden)
         if self._drawn is not None and self._drawn[1:] == drawn[1:] and self._drawn[0] is trace:
             return
-        arcs = self._arcs_of(trace, selected)
+        arcs = NO_ARCS if hidden else self._arcs_of(trace, selected)
         peak = peak_window(story, arcs)
         window = peak if wanted is None else wanted
         with self._lock:
             self._peak = peak
         bars = bars_in(trace, arcs, window, selected)
-        note = escape(caption(trace, story, arcs, bars))
+        note = escape(UNTOLD if hidden else caption(trace, story, arcs, bars))
         content = box(
-            f'<div style="font-weight:600;padding-bottom:.3em">{escape(story.title)}</div>'
+            f'<div style="font-weight:600;padding-bottom:.3em">{escape(story.title)}{help_html("arc")}</div>'
             f"{yaw_svg(story, bars, window, kept, shown_key)}"
-            f'<div style="font-size:11.5px;opacity:.7;padding-top:.3em">{note}</div>'
+            f'<div style="font-size:12px;opacity:.7;padding-top:.3em">{note}</div>'
         )
         if content != self._html.content:
             self._html.content = content
@@ -343,6 +354,13 @@ class YawView:
         with self._lock:
             self._wanted = window
         self._changed(None)
+
+
+def untold(story: YawStory) -> YawStory:
+    """The story without what was found: poses, what they explain, and the estimate."""
+    curves = tuple(curve for curve in story.curves if curve.kind != "level")
+    top = max([1.0, *(float(curve.y.max(initial=0.0)) for curve in curves)])
+    return replace(story, curves=curves, hypotheses=(), top=top, estimate_deg=None, note="")
 
 
 def _window_of(argument: str) -> Window | None:

@@ -54,19 +54,33 @@ def card_html(opened: Opened, run: Run, diagnosis: Diagnosis | None, bar: str) -
     """The whole card: the run as it was recorded, and as soon as it is changed, a table of both."""
     row = opened.recorded.row
     is_it = run.request == opened.request
-    title = (
-        f'<div style="font-weight:600;padding-top:.3em;white-space:nowrap;overflow:hidden;text-overflow:ellipsis" '
-        f'title="{escape(row.file)}">{escape(words.title_of(row))}'
-        f'<span style="font-weight:400;{DIM}"> · {escape(row.estimator)} #{row.seed}</span></div>'
-    )
     body = _result(row) if is_it else two_columns_html(lines_of(row, run, diagnosis), "as recorded", "now")
     remark = _remark(opened, run, is_it)
-    parts = [bar, title, body, remark]
+    parts = [bar, _title(words.title_of(row), row), body, remark]
     if opened.sentence:
         parts.append(f'<div style="{DIM}">{escape(opened.sentence)}</div>')
     parts.append(_ways(row, run if is_it else None))
-    content = box("".join(parts), "font-size:11.5px;line-height:1.38;padding:.4em .7em")
+    return _card(parts)
+
+
+def untold_html(opened: Opened, run: Run, bar: str) -> str:
+    """The card of a run of which no answers are told."""
+    row = opened.recorded.row
+    back = "" if run.request == opened.request else _way("run-return:", "back to the recorded run")
+    return _card([bar, _title(words.untold_title_of(row), row), back])
+
+
+def _card(parts: Sequence[str]) -> str:
+    content = box("".join(parts), "font-size:12px;line-height:1.38;padding:.4em .7em")
     return f'<div class="review-card" style="{GROUND}">{content}</div>'
+
+
+def _title(title: str, row: RunRow) -> str:
+    return (
+        f'<div style="font-weight:600;padding-top:.3em;white-space:nowrap;overflow:hidden;text-overflow:ellipsis" '
+        f'title="{escape(row.file)}">{escape(title)}'
+        f'<span style="font-weight:400;{DIM}"> · {escape(row.estimator)} #{row.seed}</span></div>'
+    )
 
 
 def _result(row: RunRow) -> str:
@@ -168,7 +182,7 @@ def comparison_html(one: RunRow, other: RunRow) -> str:
     )
     remark = "" if same else "They solved different problems, so their cameras are not drawn together."
     note = f'<div style="{DIM};padding-top:.2em">{remark}</div>' if remark else ""
-    return box(head + two_columns_html(lines(one, other), *NAMES) + note, "font-size:11.5px")
+    return box(head + two_columns_html(lines(one, other), *NAMES) + note, "font-size:12px")
 
 
 def lines(one: RunRow, other: RunRow) -> list[Line]:

@@ -38,6 +38,8 @@ SORTS: Mapping[str, str] = {
 JUDGED = ("doubtful",)
 """What the diagnosis says of a run, also where the truth is not known."""
 FILTERS = (*EXACT, "judged", "outliers", "when")
+UNTOLD, UNTOLD_SORTS = ("estimator", "scene", "source", "when"), ("created", "name")
+"""Filters and orders that tell nothing of what came out."""
 UNFOLDED = (*EXACT[2:], "outliers", "when", "sort")
 """What is chosen in a row that is unfolded."""
 
@@ -116,6 +118,13 @@ class Look:
         """The list with no filters."""
         return Look(sort=self.sort, descending=self.descending)
 
+    def untold(self) -> "Look":
+        """The list without filters and an order that tell what came out."""
+        kept = {name: getattr(self, name) for name in ("text", "page", *UNTOLD)}
+        told = self.sort not in UNTOLD_SORTS
+        order = {} if told else {"sort": self.sort, "descending": self.descending}
+        return Look(**kept, **order, unfolded=self.unfolded if self.unfolded in (*UNTOLD, "sort") else "")
+
     @property
     def filtered(self) -> bool:
         """Whether anything is left out."""
@@ -143,8 +152,12 @@ class Counts:
     """Of the filter that is unfolded, if its values can be counted."""
 
 
-def filters_html(look: Look, counts: Counts) -> str:
-    """Outcomes, diagnoses, and a row of further filters with the values of the one that is unfolded."""
+def filters_html(look: Look, counts: Counts, hidden: bool = False) -> str:
+    """Outcomes, diagnoses, and a row of further filters with the values of the one that is unfolded; ``hidden`` leaves
+    out those that tell answers."""
+    if hidden:
+        values = [_line(_values(look, counts.unfolded, UNTOLD_SORTS))] if look.unfolded else []
+        return box("".join([_handles(look, UNTOLD), *values]), "font-size:12px;padding-bottom:.2em")
     outcomes = {value: count for value, count in counts.outcome}
     chips = [
         _chip("outcome", value, value, outcomes.get(value, 0), look.outcome, COLORS[value])
@@ -161,7 +174,7 @@ def filters_html(look: Look, counts: Counts) -> str:
     lines = [_line(chips), _line(causes), _handles(look)]
     if look.unfolded:
         lines.append(_line(_values(look, counts.unfolded)))
-    return box("".join(lines), "font-size:11.5px;padding-bottom:.2em")
+    return box("".join(lines), "font-size:12px;padding-bottom:.2em")
 
 
 def _line(chips: Sequence[str]) -> str:
@@ -195,7 +208,7 @@ def pill(content: str, touch: str, on: bool, hint: str, extra: str = "") -> str:
 
 def key_html(key: str) -> str:
     """The sign of a key on a button."""
-    look = "border:1px solid currentColor;border-radius:.25em;padding:0 .3em;opacity:.6;font:inherit;font-size:10px"
+    look = "border:1px solid currentColor;border-radius:.25em;padding:0 .3em;opacity:.6;font:inherit;font-size:12px"
     return f'<kbd style="{look}">{escape(key)}</kbd>'
 
 
@@ -204,10 +217,10 @@ def keyed(key: str) -> str:
     return f'data-key="{escape(key)}"'
 
 
-def _handles(look: Look) -> str:
-    """What else can be chosen, with what is chosen now."""
+def _handles(look: Look, names: Sequence[str] = UNFOLDED[:-1]) -> str:
+    """What else can be chosen, with what is chosen now; how the list is sorted stands above the list."""
     parts = []
-    for name in UNFOLDED[:-1]:  # the last one, how the list is sorted, stands above the list
+    for name in names:
         chosen = getattr(look, name)
         bold = "font-weight:600" if chosen is not None else DIM
         words = name if chosen is None else f"{name}: {chosen or NOTHING}"
@@ -230,14 +243,19 @@ def sorting_html(look: Look) -> str:
     return pill(words, "runs-unfold:sort", look.unfolded == "sort", "How the list is sorted")
 
 
-def _values(look: Look, groups: Groups) -> list[str]:
-    """The values of the filter that is unfolded."""
+def _values(look: Look, groups: Groups, sorts: Sequence[str] = tuple(SORTS)) -> list[str]:
+    """The values of the filter that is unfolded; of orders, the ``sorts``."""
     name = look.unfolded
     if name == "sort":
         arrow = " ↓" if look.descending else " ↑"
         return [
-            pill(escape(words) + (arrow if key == look.sort else ""), f"runs-sort:{key}", key == look.sort, words)
-            for key, words in SORTS.items()
+            pill(
+                escape(SORTS[key]) + (arrow if key == look.sort else ""),
+                f"runs-sort:{key}",
+                key == look.sort,
+                SORTS[key],
+            )
+            for key in sorts
         ]
     fixed: Mapping[str, Mapping[str, str]] = {"outliers": OUTLIERS, "when": AGES}
     if name in fixed:

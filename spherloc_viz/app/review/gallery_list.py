@@ -112,7 +112,7 @@ def gallery_html(cases: Sequence[GalleryCase], rows: dict[str, RunRow], opened: 
     # Before "spherloc gallery" has recorded them, no case has one, and a column of empty frames says nothing.
     shown = [picture_html(png) if any(pictures) else "" for png in pictures]
     body = "".join(_case_html(case, picture, case.key == opened) for case, picture in zip(cases, shown, strict=True))
-    return box(f'<div style="{DIM};padding-bottom:.4em">{about}</div>{body}', "font-size:11.5px;line-height:1.4")
+    return box(f'<div style="{DIM};padding-bottom:.4em">{about}</div>{body}', "font-size:12px;line-height:1.4")
 
 
 def _thumbnail(row: RunRow | None) -> bytes:

@@ -133,7 +133,7 @@ class Notes:
 
     def _draw(self, offered: tuple[str, ...], own: tuple[str, ...]) -> None:
         chips = "".join(pill(escape(label), f"run-label:{label}", label in own, label) for label in offered)
-        html = box(f'<div style="display:flex;flex-wrap:wrap;gap:.3em">{chips}</div>', "font-size:11.5px")
+        html = box(f'<div style="display:flex;flex-wrap:wrap;gap:.3em">{chips}</div>', "font-size:12px")
         if self._chips.content != html:
             self._chips.content = html
         self._offers = bool(offered)

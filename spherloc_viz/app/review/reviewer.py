@@ -10,7 +10,7 @@ import viser
 
 from spherloc.diagnosis import Diagnosis
 from spherloc.types import FloatArray
-from spherloc_viz.app.review.card import NAMES, bar_html, card_html, said_html, same_problem
+from spherloc_viz.app.review.card import NAMES, bar_html, card_html, said_html, same_problem, untold_html
 from spherloc_viz.app.review.filters import PAGE
 from spherloc_viz.app.review.opened import AS_RECORDED, Opened, Recorded, reference_items
 from spherloc_viz.app.review.run_library import RunLibrary
@@ -70,12 +70,12 @@ class ReviewCard:
         if before != self._where:
             self._redraw()
 
-    def draw(self, run: Run, diagnosis: Diagnosis | None) -> None:
-        """Show what was recorded beside the run on the page."""
-        opened = self._opened
-        html = (
-            "" if opened is None else card_html(opened, run, diagnosis, bar_html(*self._where) + said_html(*self._said))
-        )
+    def draw(self, run: Run, diagnosis: Diagnosis | None, hidden: bool = False) -> None:
+        """Show what was recorded beside the run on the page; if ``hidden``, only what the recorded run is of."""
+        opened, html = self._opened, ""
+        if opened is not None:
+            bar = bar_html(*self._where) + said_html(*self._said)
+            html = untold_html(opened, run, bar) if hidden else card_html(opened, run, diagnosis, bar)
         if self._html.content != html:
             self._html.content = html
         self._html.visible = bool(html)
@@ -124,6 +124,15 @@ class Reviewer:
         with self._lock:
             self._steps, self._place = 0, PAGE * self._runs.look.page
         self._background.ask(partial(self._open_file, file))
+
+    def follow(self, file: str) -> Opened:
+        """Open a recording whose run the page asks for by itself; raises ``RecordingError`` if it cannot be."""
+        library = self._has.library
+        if not library.rows([file]):
+            library.prepare()
+        opened = self._read(file)
+        self._present(opened)
+        return opened
 
     def compare(self, one: RunRow, other: RunRow) -> None:
         """Have the first opened and, if both are of one problem, the second one drawn beside it."""
@@ -221,9 +230,13 @@ class Reviewer:
         return Opened(recorded, path, request, run.problem.truth_cam_from_map, got.sentence, story)
 
     def _show(self, opened: Opened) -> None:
+        self._present(opened)
+        self._has.open(opened.request, opened.path, opened.recorded.cam_from_map)
+
+    def _present(self, opened: Opened) -> None:
+        """Show what is recorded."""
         row = opened.recorded.row
         self._has.card.show(opened)
-        self._has.open(opened.request, opened.path, opened.recorded.cam_from_map)
         self._runs.show(row.file, self.locate())
         self._has.changed(row)
         self._has.say("")

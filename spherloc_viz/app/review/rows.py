@@ -25,19 +25,26 @@ OPENED = "rgba(60,130,230,.2)"
 
 
 def rows_html(
-    rows: Sequence[RunRow], marked: frozenset[str], opened: str | None, total: int, look: Look, now: datetime
+    rows: Sequence[RunRow],
+    marked: frozenset[str],
+    opened: str | None,
+    total: int,
+    look: Look,
+    now: datetime,
+    hidden: bool = False,
 ) -> str:
-    """A page of the list and what turns it. ``opened`` is the file of the run that is open."""
+    """A page of the list and what turns it. ``opened`` is the file of the run that is open; ``hidden`` tells no
+    answers."""
     if not rows:
         what = "No recorded run fits these filters." if look.filtered else "No run is recorded yet."
         return box(f'<div style="{DIM}">{what}</div>', "font-size:12.5px")
-    body = "".join(row_html(row, row.file in marked, row.file == opened, now) for row in rows)
+    body = "".join(row_html(row, row.file in marked, row.file == opened, now, hidden) for row in rows)
     top, below = pages_html(look, total, opened is None), pages_html(look, total, None)
-    return box(f"{top}{body}{below if total > PAGE else ''}", "font-size:11px;line-height:1.35")
+    return box(f"{top}{body}{below if total > PAGE else ''}", "font-size:12px;line-height:1.35")
 
 
-def row_html(row: RunRow, marked: bool, opened: bool, now: datetime) -> str:
-    """One run."""
+def row_html(row: RunRow, marked: bool, opened: bool, now: datetime, hidden: bool = False) -> str:
+    """One run; ``hidden`` tells only what it is of."""
     file = escape(row.file)
     ground = f"background:{OPENED};box-shadow:inset 2px 0 0 {style.css(style.ESTIMATE)}" if opened else ""
     look = "background:rgba(20,24,32,.55);color:#fff;border-radius:3px;padding:0 .2em;font-size:12px;line-height:1.25"
@@ -52,25 +59,30 @@ def row_html(row: RunRow, marked: bool, opened: bool, now: datetime) -> str:
         f'title="Open in Rerun\'s viewer at step {row.key_step + 1} of {row.steps}, #{row.key_step} there" '
         'style="color:inherit;text-decoration:none;padding:.4em .1em .4em .4em;opacity:.75;font-size:13px">↗</a>'
     )
-    about = f'<div style="flex:1;min-width:0">{_lines(row, now)}</div>'
+    hint, picture = _hint(row), row.thumbnail
+    if hidden:
+        link, hint, picture = "", escape(row.file), b""
+    about = f'<div style="flex:1;min-width:0">{_lines(row, now, hidden)}</div>'
     return (
         f'<div style="{RULE};position:relative;display:flex;align-items:flex-start;padding:2px 0;{ground}">'
-        f'<div role="button" tabindex="0" class="touch-row" data-touch="run-open:{file}" title="{_hint(row)}" '
-        f'style="flex:1;min-width:0;display:flex;gap:.6em;padding-left:2px">{picture_html(row.thumbnail)}{about}</div>'
+        f'<div role="button" tabindex="0" class="touch-row" data-touch="run-open:{file}" title="{hint}" '
+        f'style="flex:1;min-width:0;display:flex;gap:.6em;padding-left:2px">{picture_html(picture)}{about}</div>'
         f"{mark}{link}</div>"
     )
 
 
-def _lines(row: RunRow, now: datetime) -> str:
+def _lines(row: RunRow, now: datetime, hidden: bool) -> str:
     """What the run is, what came out, and numbers; below, what a reviewer wrote."""
+    title = words.untold_title_of(row) if hidden else words.title_of(row)
     name = (
         f'<div style="display:flex;gap:.5em"><span style="flex:1;font-weight:600;{CUT}">'
-        f"{escape(words.title_of(row))}</span>"
+        f"{escape(title)}</span>"
         f'<span style="{DIM};white-space:nowrap">{escape(words.moment(row.created, now))}</span></div>'
     )
-    how = (
-        f'<div style="{CUT}">{verdict_html(row)}<span style="{DIM}"> · {escape(row.estimator)} #{row.seed}</span></div>'
-    )
+    method = f"{escape(row.estimator)} #{row.seed}"
+    if hidden:
+        return f'{name}<div style="{CUT};{DIM}">{method} · {row.correspondences} matches</div>'
+    how = f'<div style="{CUT}">{verdict_html(row)}<span style="{DIM}"> · {method}</span></div>'
     facts = [f"{row.inliers}/{row.correspondences}"]
     facts += [] if row.outlier_rate is None else [f"{100.0 * row.outlier_rate:.0f} % out"]
     errors = (words.angle(row.rotation_error_deg), words.distance(row.translation_error_m))

@@ -39,7 +39,7 @@ class RunList:
         self._look = Look()
         self._marked: tuple[str, ...] = ()
         self._opened: str | None = None
-        self._seen = self._hidden = False
+        self._seen = self._hidden = self._untold = False
         self._due = threading.Event()
         self._background = BackgroundWorker(f"spherloc-runs-{name}", self._fail)
         self._search = gui.add_text("Search", "", hint="Words in the name, the message, the note, labels …")
@@ -60,7 +60,7 @@ class RunList:
     @property
     def look(self) -> Look:
         """What is shown now."""
-        return self._look
+        return self._look.untold() if self._untold else self._look
 
     @property
     def marked(self) -> tuple[str, ...]:
@@ -99,6 +99,11 @@ class RunList:
             widget.visible = not hidden
         self._show_parts()
         self._problem.visible = False
+
+    def hide_answers(self, hidden: bool) -> None:
+        """Tell no more of the runs than what they are of, or tell all again."""
+        self._untold = hidden
+        self.ask()
 
     def close(self) -> None:
         """End it; does not wait."""
@@ -169,13 +174,13 @@ class RunList:
 
     def _draw(self) -> None:
         with self._lock:
-            look, marked, opened = self._look, self._marked, self._opened
+            look, marked, opened, hidden = self.look, self._marked, self._opened, self._untold
         found, look = self._library.page(look)
         counts = self._library.counts(look, found.total)
         now = datetime.now().astimezone()
         parts = (
-            (self._filters, filters_html(look, counts)),
-            (self._rows, rows_html(found.rows, frozenset(marked), opened, found.total, look, now)),
+            (self._filters, filters_html(look, counts, hidden)),
+            (self._rows, rows_html(found.rows, frozenset(marked), opened, found.total, look, now, hidden)),
             (self._bar, bar_html(marked)),
         )
         for widget, html in parts:
@@ -187,7 +192,7 @@ class RunList:
 
     def _show_parts(self) -> None:
         """Show what is needed now and then, if the list is not hidden."""
-        self._range.visible = not self._hidden and self._look.unfolded == "outliers"
+        self._range.visible = not self._hidden and self.look.unfolded == "outliers"
         self._bar.visible = not self._hidden and bool(self._marked)
 
     def _fail(self, sentence: str) -> None:
@@ -206,4 +211,4 @@ def bar_html(marked: tuple[str, ...]) -> str:
     words = f'<b style="font-weight:600">{escape(f"{len(marked):,} marked")}</b>'
     css = "display:flex;flex-wrap:wrap;gap:.5em;align-items:center"
     row = f'<div class="marked-bar" style="{css}">{words}{"".join(ways)}{hint}</div>'
-    return box(row, "font-size:11.5px;padding-top:.5em")
+    return box(row, "font-size:12px;padding-top:.5em")

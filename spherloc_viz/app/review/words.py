@@ -19,6 +19,12 @@ def title_of(row: RunRow) -> str:
     return f"{name}, {row.query}" if row.query and row.query not in name else name
 
 
+def untold_title_of(row: RunRow) -> str:
+    """What the run is called where no answers are told: a case's title is one."""
+    name = row.name or row.scene
+    return f"{name}, {row.query}" if row.query and row.query not in name else name
+
+
 def percent(share: float | None) -> str:
     """A share of wrong matches."""
     return UNKNOWN if share is None else f"{100.0 * share:.3g} %"

@@ -16,6 +16,8 @@ from spherloc_viz.layers.primitives import Picture
 FIRST_CHECKS, MOST_CHECKS, CHECK_S = 8, 40, 0.4
 """A page that is still building itself drops its first view and reports that its viewer has not moved; a slow one for
 many checks."""
+HELD = "held"
+"""In place of a view's name."""
 RESHAPED = 0.02
 """From this change of the canvas' width over height on, as a share, its view is fitted anew."""
 
@@ -45,6 +47,8 @@ class Canvas:
         """The view that showed the subject of the last step that moved the viewer."""
         self._looked: tuple[str | None, views.View, float] | None = None
         """The last view that was taken: its name, or None for that of the step, and for which canvas."""
+        self._held: tuple[str, views.View] | None = None
+        """A view that a link asked for, and the key of the step at which it does."""
         self._scene: str | None = None
         self._checks, self._movable = 0, False
         self._lock = threading.Lock()
@@ -64,6 +68,26 @@ class Canvas:
             self._movable = movable
         self._move_viewer(run, picture)
         self._make_room()
+
+    def hold(self, step_key: str, viewpoint: tuple[float, ...]) -> None:
+        """Look from there, as ``viewpoint`` told it, for as long as this step is shown and nobody moves."""
+        *numbers, degrees = viewpoint
+        self._held = step_key, views.View(np.array(numbers[:3]), np.array(numbers[3:]), np.radians(degrees))
+        self._looked = None
+
+    def viewpoint(self) -> tuple[float, ...]:
+        """Where the viewer stands (3), what it looks at (3), and its field of view, degrees; empty if that is what the
+        step is seen from anyway."""
+        held, looked = self._held, self._looked
+        if held is not None and (looked is None or views.stands_at(self._client, held[1])):
+            view = held[1]
+        elif looked is None or (looked[0] is None and self._untouched()) or views.stands_at(self._client, views.START):
+            return ()
+        else:
+            camera = self._client.camera
+            view = views.View(np.array(camera.position), np.array(camera.look_at), float(camera.fov))
+        degrees = float(np.degrees(view.field_of_view_rad))
+        return (*view.position.tolist(), *view.target.tolist(), degrees)
 
     def _make_room(self) -> None:
         """Hide what would be before the eyes of who stands in a camera; on threads of viser's and of the page's."""
@@ -101,10 +125,14 @@ class Canvas:
             (run.trace.problem.name, picture.step.key),
             run.request.scene.scene,
         )
+        if self._held is not None and (wanted is not None or self._held[0] != step[1]):
+            self._held = None
         other_step, elsewhere = step != self._step, self._scene not in (None, scene)
         self._step, self._scene = step, scene
         if wanted is not None:
             self._look(wanted, picture)
+        elif self._held is not None:
+            self._look_again(self._held[1])
         elif elsewhere or views.stands_at(self._client, views.START):
             self._look(None, picture)
         elif self._display.follow and (other_step or self._untouched()):
@@ -119,6 +147,11 @@ class Canvas:
                 self._take(None, view, aspect)
         elif self._looked is not None and not views.shows(self._looked[1], picture.focus.points, aspect):
             self._look(None, picture)
+
+    def _look_again(self, view: views.View) -> None:
+        """Take a view that is held, also after a page that was still building itself has dropped it."""
+        if self._looked is None or views.stands_at(self._client, views.START):
+            self._take(HELD, view, self._aspect())
 
     def _look(self, name: str | None, picture: Picture) -> None:
         """Take the view of that name, or the one of the step."""
@@ -141,7 +174,7 @@ class Canvas:
         looked, picture = self._looked, self._picture
         if looked is None or picture is None:
             return
-        if abs(np.log(self._aspect() / looked[2])) > RESHAPED and self._untouched():
+        if looked[0] != HELD and abs(np.log(self._aspect() / looked[2])) > RESHAPED and self._untouched():
             with self._lock:
                 self._look(looked[0], picture)
 

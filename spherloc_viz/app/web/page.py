@@ -15,9 +15,10 @@ QUIET = (
 """viser loads a sorter for Gaussian splats that wants ``eval``. The policy denies it, nobody here draws splats,
 and the console stays clean for errors that matter."""
 STYLE = "touch.css"
-SCRIPTS = ("changes.js", "touch.js", "introduction.js", "captions.js", "link.js")
+SCRIPTS = ("changes.js", "touch.js", "introduction.js", "captions.js", "link.js", "names.js")
 """What numbers the changes of widgets (``app/web/changes.py``), reports presses (``app/web/touch.py``),
-shows the introduction and the captions of the projector view and of phones, and keeps the address (``app/link.py``)."""
+shows the introduction and the captions of the projector view and of phones, keeps the address (``app/link.py``), and
+names for screen readers what viser does not."""
 
 
 THIS_MACHINE = "http://localhost:* http://127.0.0.1:* https://localhost:* https://127.0.0.1:*"
