@@ -44,9 +44,17 @@ ASKED_FOR = {
 }
 
 
+BASELINES = ("ransac-svd", "ransac-epnp", "ransac-odlt", "ransac-epropnp", "ransac-mlpnp")
+SLOW_BESIDE = "table-vi-1"
+"""Its baselines take eleven seconds; ``spherloc gallery`` checks them when it makes the case anew."""
+
+
 @cache
 def played(key: str) -> Played:
-    return play(chosen(gallery_cases(), [key])[0])
+    case = chosen(gallery_cases(), [key])[0]
+    if key == SLOW_BESIDE:
+        case = replace(case, beside=tuple(item for item in case.beside if item.estimator not in BASELINES))
+    return play(case)
 
 
 @pytest.mark.parametrize("key", KEYS)

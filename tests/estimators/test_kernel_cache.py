@@ -6,42 +6,33 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from spherloc import kernel_cache
 
 ROOT = Path(__file__).resolve().parents[2]
 
-RUN = """
-import numpy as np
-from spherloc.estimators.mc import _most_inliers
-from spherloc.gauss_newton import Matches
-
-bearings, points = np.eye(3), np.eye(3) * [[1.0], [2.0], [3.0]]
-jacobian = np.array([[np.eye(3)[(k + 1) % 3], np.eye(3)[(k + 2) % 3]] for k in range(3)])
-translations = np.array([[9.0, 9.0, 9.0], [0.0, 0.0, 0.0]])
-print(_most_inliers(np.zeros(2), translations, Matches(bearings, points, jacobian), np.full(3, 0.1)))
-"""
-"""Of two poses, only the second, which looks along the bearings at their points, explains anything."""
+FOLDER = "from spherloc.kernel_cache import kernel_folder; print(kernel_folder())"
 
 
-def best_of_two(folder):
-    """What a kernel of one file, which calls those of another, finds with the copy of the package in ``folder``."""
+def folder_of(copy):
+    """Where the kernels of the copy of the package in the folder ``copy`` are kept."""
     environment = {key: value for key, value in os.environ.items() if key != "NUMBA_CACHE_DIR"}
-    environment["PYTHONPATH"] = str(folder)
-    done = subprocess.run([sys.executable, "-c", RUN], env=environment, cwd=folder, capture_output=True, text=True)
+    environment["PYTHONPATH"] = str(copy)
+    done = subprocess.run([sys.executable, "-c", FOLDER], env=environment, cwd=copy, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return done.stdout.strip()
 
 
-def test_change_in_a_called_kernel_is_noticed(tmp_path):
-    """numba watches only the file of the kernel that it cached, and this one calls a kernel of another file."""
+@pytest.mark.parametrize("file", ["consensus/inliers.py", "gauss_newton.py", "solvers/two_point.py"])
+def test_change_in_a_called_kernel_is_noticed(tmp_path, file):
+    """numba watches only the file of the kernel that it cached, which calls kernels of other files."""
     shutil.copytree(ROOT / "spherloc", tmp_path / "spherloc", ignore=shutil.ignore_patterns("__pycache__"))
-    assert best_of_two(tmp_path) == "1"
-    counting = tmp_path / "spherloc" / "consensus" / "inliers.py"
-    text = counting.read_text(encoding="utf-8")
-    assert text.count("        if inliers < floors[b]:\n            return False\n") == 1
-    changed = text.replace("        if inliers < floors[b]:\n            return False\n", "        return False\n")
-    counting.write_text(changed, encoding="utf-8")
-    assert best_of_two(tmp_path) == "0"
+    before = folder_of(tmp_path)
+    assert before.startswith(str(tmp_path)) and folder_of(tmp_path) == before
+    changed = tmp_path / "spherloc" / file
+    changed.write_text(changed.read_text(encoding="utf-8") + "\n", encoding="utf-8")
+    assert folder_of(tmp_path) != before
 
 
 def halved(value):
@@ -74,3 +65,11 @@ def test_another_librarys_kernels_stay_where_they_are(monkeypatch, tmp_path):
     monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["False"], done.stdout
+
+
+def test_every_file_with_kernels_is_watched():
+    package = ROOT / "spherloc"
+    files = {path for path in package.rglob("*.py") if "@kernel(" in path.read_text(encoding="utf-8")}
+    watched = {package / name for name in kernel_cache.KERNEL_SOURCES}
+    assert len(files) > 20
+    assert [path for path in files if not {path, *path.parents} & watched] == []
