@@ -282,7 +282,7 @@ def test_a_full_disk_and_a_bug_are_sentences(house: House, monkeypatch: pytest.M
 def test_pages_share_nothing_and_leave_nothing(house: House) -> None:
     before = threads()
     (first, one), (second, two) = house.visit(), house.visit()
-    assert threads() == before + 8
+    assert threads() == before + 10
     kept = two._run.trace
     first.set(one._controls.scene._simulation._points, 33)
     until(lambda: one._run is not None and len(one._run.trace.problem) == 33)
@@ -294,7 +294,7 @@ def test_pages_share_nothing_and_leave_nothing(house: House) -> None:
         and two._display.panels.steps._choice.value.endswith("Outcome")
     )
     first.close()
-    until(lambda: threads() == before + 4 and len(house.sessions._open) == 1)
+    until(lambda: threads() == before + 5 and len(house.sessions._open) == 1)
     second.close()
     until(lambda: threads() == before and not house.sessions._open)
 

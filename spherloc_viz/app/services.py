@@ -21,13 +21,13 @@ class Services:
     """Folders that pages may open scenes from."""
     recorder: Recorder | None = None
     """Where settled runs go; None if they are not recorded."""
-    first: Known | None = None
-    """The recorded run that pages open with; None for the catalog's first scene."""
     library: RunLibrary | None = None
     """The recordings that pages review; None if there is no folder of them."""
     downloads: Downloads = field(default_factory=Downloads)
     """Files that pages may fetch."""
-    compilation: Compilation | None = None
-    """Compiles the solvers that are not yet; None if all are ready."""
     presented: Presented = field(default_factory=Presented)
     """What pages of an audience show."""
+    first: Known | None = None
+    """The recorded run that pages open with; None for the catalog's first scene."""
+    compilation: Compilation | None = None
+    """Compiles the solvers that are not yet; None if all are ready."""

@@ -166,7 +166,7 @@ class Playground:
 
     def expect_quiet(self, address: str) -> None:
         """No errors on the console, and no word to any other server."""
-        assert self.errors == []
+        assert self.errors == [], self.errors
         assert self.hosts == {address.removeprefix("http://")}
 
     def _note_error(self, message: ConsoleMessage) -> None:

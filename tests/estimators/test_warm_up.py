@@ -68,5 +68,5 @@ def test_a_cold_start_is_announced_and_a_warm_one_is_not(tmp_path: Path) -> None
 @pytest.mark.parametrize("part", ["refinement", "search", "mc-exact, uncertain gravity"])
 def test_a_part_that_is_compiled_in_a_process_of_its_own(part: str) -> None:
     """It failed in silence, and everything was compiled by one process."""
-    done = subprocess.run([sys.executable, "-m", "spherloc.warm_up", part], capture_output=True, text=True)
+    done = subprocess.run([sys.executable, "-m", "spherloc.warm_up", part, "0"], capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")

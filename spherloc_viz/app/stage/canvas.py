@@ -49,6 +49,8 @@ class Canvas:
         """The last view that was taken: its name, or None for that of the step, and for which canvas."""
         self._held: tuple[str, views.View] | None = None
         """A view that a link asked for, and the key of the step at which it does."""
+        self._held_step_came = False
+        """Whether that step has been shown: pictures that were asked for before may come first."""
         self._scene: str | None = None
         self._checks, self._movable = 0, False
         self._lock = threading.Lock()
@@ -73,7 +75,7 @@ class Canvas:
         """Look from there, as ``viewpoint`` told it, for as long as this step is shown and nobody moves."""
         *numbers, degrees = viewpoint
         self._held = step_key, views.View(np.array(numbers[:3]), np.array(numbers[3:]), np.radians(degrees))
-        self._looked = None
+        self._looked, self._held_step_came = None, False
 
     def viewpoint(self) -> tuple[float, ...]:
         """Where the viewer stands (3), what it looks at (3), and its field of view, degrees; empty if that is what the
@@ -125,13 +127,15 @@ class Canvas:
             (run.trace.problem.name, picture.step.key),
             run.request.scene.scene,
         )
-        if self._held is not None and (wanted is not None or self._held[0] != step[1]):
+        at_held = self._held is not None and self._held[0] == step[1]
+        if wanted is not None or (self._held_step_came and not at_held):
             self._held = None
+        self._held_step_came = self._held is not None and (self._held_step_came or at_held)
         other_step, elsewhere = step != self._step, self._scene not in (None, scene)
         self._step, self._scene = step, scene
         if wanted is not None:
             self._look(wanted, picture)
-        elif self._held is not None:
+        elif self._held is not None and at_held:
             self._look_again(self._held[1])
         elif elsewhere or views.stands_at(self._client, views.START):
             self._look(None, picture)
@@ -150,7 +154,7 @@ class Canvas:
 
     def _look_again(self, view: views.View) -> None:
         """Take a view that is held, also after a page that was still building itself has dropped it."""
-        if self._looked is None or views.stands_at(self._client, views.START):
+        if self._looked is None or self._looked[0] != HELD or views.stands_at(self._client, views.START):
             self._take(HELD, view, self._aspect())
 
     def _look(self, name: str | None, picture: Picture) -> None:

@@ -83,6 +83,7 @@
   }
 
   function look() {
+    if (!document.body) return; // the page is still being read
     foldSettings();
     const wanted = (projector || narrow()) && document.querySelector(".step-words") && !document.querySelector(".introduction");
     document.body.classList.toggle("narrow", narrow());
