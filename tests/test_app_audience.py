@@ -94,7 +94,8 @@ def test_an_audience_follows_the_presenter_each_with_a_state_of_its_own(house: H
 
     presenter_page.set(presenter._controls.scene._simulation._noise, 3.0)
     until(noisier)
-    assert (title(other), title(early)) == ("Outcome", opening), "each keeps its step"
+    # Each keeps its step; the list of the steps is put on a page after the canvas.
+    until(lambda: (title(other), title(early)) == ("Outcome", opening))
     # What the presenter hides, the audience cannot see; what its own switch hides, nobody else misses.
     until(lambda: "off the truth" in other._display.panels.steps._text.content)
     presenter_page.set(presenter._controls.display._hide, True)

@@ -9,7 +9,7 @@ from spherloc.watch import Cancelled, Watch
 from spherloc_viz.app import compilation
 from spherloc_viz.app.compilation import Compilation, first_and_later
 from spherloc_viz.app.controls.estimator_controls import START
-from tests.waiting import until
+from tests.waiting import LIMIT_S, until
 
 
 class Compiler:
@@ -52,7 +52,7 @@ def test_who_waits_is_next_and_goes_on_when_it_is_ready(running: Compilation, co
     until(lambda: compiler.asked == ["mc-exact", "auto"])
     assert waiting.is_alive()
     compiler.go_on.release()
-    waiting.join(60.0)
+    waiting.join(LIMIT_S)
     assert not waiting.is_alive()
     running.wait_for("mc-exact", Watch(), said.append)
     assert len(said) == 1, "nobody waits for what is ready"

@@ -18,6 +18,7 @@ from spherloc.estimators import estimate
 from spherloc.proof import write_proof
 from spherloc_viz.arguments import refuse_repeated
 from spherloc_viz.cli import localize, play, run, sweep
+from tests.waiting import LIMIT_S
 
 PROGRAM = [sys.executable, "-c", "from spherloc_viz.start import main\nmain()"]
 
@@ -58,7 +59,7 @@ def test_outputs_that_cannot_be_written(tmp_path: Path, scene_of: Callable[..., 
             "scenes", environment={"TMPDIR": "/nowhere", "NUMBA_CACHE_DIR": "/proc/nowhere"}
         ),
     }
-    ended = {what: (*process.communicate(timeout=240), process.returncode) for what, process in started.items()}
+    ended = {what: (*process.communicate(timeout=LIMIT_S), process.returncode) for what, process in started.items()}
     for what, (out, error, _) in ended.items():
         assert b"Traceback" not in out + error and b"Exception ignored" not in out + error, f"{what}: {error.decode()}"
         assert error.count(b"\n") <= 1, f"{what}: {error.decode()}"
@@ -82,7 +83,7 @@ def test_a_signal_while_importing_ends_it_without_a_word(number: signal.Signals)
         process.send_signal(number)
         started.append(process)
     for process in started:
-        out, error = process.communicate(timeout=120)
+        out, error = process.communicate(timeout=LIMIT_S)
         assert error == b"", error.decode()
         assert process.returncode in (-number, 128 + number) or (process.returncode == 0 and out)
 

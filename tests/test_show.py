@@ -21,7 +21,7 @@ import spherloc
 import spherloc_viz
 from spherloc.errors import InputError
 from spherloc_viz.showing import Playground
-from tests.browser.playground import FLAGS, find_chromium
+from tests.browser.playground import FLAGS, PATIENCE_MS, find_chromium
 from tests.browser.playground import Playground as Tab
 from tests.waiting import until
 
@@ -74,7 +74,7 @@ def test_the_page_opens_on_the_run(found: spherloc.Localization, playground: Pla
     tab = Tab(browser, playground.url)
     expect(tab.value("inliers")).to_contain_text(f"{np.count_nonzero(found.inliers)} of {len(found.inliers)}")
     for said in ("scene=query\\+17", f"seed={SEED}", "estimator=ransac-2p", "option=iterations%3D77"):
-        expect(tab.page).to_have_url(re.compile(f"[#&]{said}(&|$)"), timeout=60_000)
+        expect(tab.page).to_have_url(re.compile(f"[#&]{said}(&|$)"), timeout=PATIENCE_MS)
     tab.expect_quiet(playground.url)
     tab.close()
 
@@ -108,7 +108,7 @@ def test_a_notebook_shows_it_inline_and_no_other_site_can(
     with notebook(playground) as port:
         page.goto(f"http://localhost:{port}/lab")
         inliers = page.frame_locator("iframe").locator("//tr[td[1][normalize-space()='inliers']]/td[2]")
-        expect(inliers).to_contain_text(str(np.count_nonzero(found.inliers)), timeout=60_000)
+        expect(inliers).to_contain_text(str(np.count_nonzero(found.inliers)), timeout=PATIENCE_MS)
         assert page.get_by_role("link").get_attribute("href") == playground.url
         with page.expect_console_message(lambda message: "frame-ancestors" in message.text):
             page.goto(f"http://127.0.0.2:{port}/")  # no address that notebooks of this machine have

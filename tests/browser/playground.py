@@ -24,6 +24,7 @@ from playwright.sync_api import Browser, Error, Locator, Page, expect
 from spherloc_viz.app.stage.views import START
 from tests.installed import with_packages
 from tests.needs import BROWSERS, NEEDS
+from tests.waiting import LIMIT_S
 
 SCENE = """
 kind = "synthetic"
@@ -120,7 +121,7 @@ def served(*words: str | Path, packages: Path | None = None) -> Iterator[tuple[s
         too_late.cancel()
         server.send_signal(signal.SIGINT)
         try:
-            server.communicate(timeout=60)
+            server.communicate(timeout=LIMIT_S)
         except subprocess.TimeoutExpired:
             server.kill()
             raise

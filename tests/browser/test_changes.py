@@ -28,6 +28,7 @@ from spherloc_viz.app.web.viser_internals import (
     start_viser,
     stop_viser,
 )
+from tests.waiting import LIMIT_S
 
 pytestmark = pytest.mark.browser
 KEY = "a key of this test"
@@ -88,7 +89,7 @@ class Stage:
 
     def close(self) -> None:
         self._loop.call_soon_threadsafe(self._leaving.set)
-        self._thread.join(60)
+        self._thread.join(LIMIT_S)
         self._loop.close()
         stop_viser(self._server)
 

@@ -5,7 +5,6 @@ import csv
 import io
 import itertools
 import re
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -24,6 +23,7 @@ from spherloc.problem import Problem
 from spherloc_viz.app.catalog import Catalog, SceneRequest
 from spherloc_viz.layers.comparison import Entry, comparison_table
 from tests.installed import install
+from tests.waiting import until
 
 RANSAC = "ransac-2p (two points)"
 COMPARED = ("mc-exact", "mc", "ransac-2p")
@@ -341,7 +341,4 @@ def test_a_sweep_is_cancelled_and_no_process_is_left(page: Playground, server: t
     tab.until(lambda: count() > done, "it goes on", SWEEP_MS / 2000)
     assert workers(server[1])
     tab.page.close()
-    end = time.monotonic() + 60.0
-    while workers(server[1]):
-        assert time.monotonic() < end, "the workers outlive their page"
-        time.sleep(0.05)
+    until(lambda: not workers(server[1]))

@@ -2,7 +2,6 @@
 
 import asyncio
 import re
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from spherloc.estimators import estimate
 from spherloc_viz.app.catalog import Catalog, SceneRequest
 from spherloc_viz.app.controls.estimator_controls import ABOUT
 from spherloc_viz.layers.outcome import outcome_table
+from tests.waiting import LIMIT_S, until
 
 PAGES = 8
 BURSTS = 4
@@ -82,7 +82,7 @@ async def visit(address: str, number: int, catalog: Catalog, rng: np.random.Gene
     """
     changes = 0
     async with PageClient(address) as page:
-        await page.until(lambda: outcome(page), 120.0)
+        await page.until(lambda: outcome(page), LIMIT_S)
         wanted = {name: page.widget(name).value for name in ("Noise (px)", "Outliers (%)", "Estimator", "Seed")}
         wanted["Points"] = 40 + number
         await page.set("Points", wanted["Points"])
@@ -96,14 +96,14 @@ async def visit(address: str, number: int, catalog: Catalog, rng: np.random.Gene
             rows = expected(wanted, catalog)
             assert rows["inliers"].endswith(f" of {40 + number}")
             try:
-                await page.until(lambda rows=rows: rows.items() <= outcome(page).items(), 120.0)
+                await page.until(lambda rows=rows: rows.items() <= outcome(page).items(), LIMIT_S)
             except TimeoutError:
                 pytest.fail(f"page {number} was asked for {wanted}, so {rows}, and shows {outcome(page)}")
             # Nor has the server put another value into a widget.
             await page.settle()
             told = lambda: {name: page.widget(name).value for name in wanted}  # noqa: E731
             try:
-                await page.until(lambda told=told: told() == wanted)
+                await page.until(lambda told=told: told() == wanted, LIMIT_S)
             except TimeoutError:
                 pytest.fail(f"page {number} was asked for {wanted} and told {told()}")
             assert rows.items() <= outcome(page).items()
@@ -129,7 +129,7 @@ async def greetings(address: str) -> None:
 
     async def greet() -> None:
         async with PageClient(address) as page:
-            await page.until(lambda: outcome(page), 120.0)
+            await page.until(lambda: outcome(page), LIMIT_S)
 
     await asyncio.gather(*(greet() for _ in range(PAGES)))
 
@@ -143,8 +143,5 @@ def test_pages_do_not_disturb_each_other_and_leave_nothing(server: tuple[str, in
     changes, threads = asyncio.run(visits(address, process, Catalog(scene)))
     assert changes > 5 * PAGES * BURSTS
     # The pool that answers all pages keeps its threads, but the pages' own must end.
-    wanted, end = threads - PAGES * OWN_THREADS, time.monotonic() + 60.0
-    while thread_count(process) > wanted + SLACK:
-        assert time.monotonic() < end, f"{thread_count(process)} threads, not {wanted}"
-        time.sleep(0.05)
+    until(lambda: thread_count(process) <= threads - PAGES * OWN_THREADS + SLACK)
     assert memory_mib(process) < memory + MEMORY_MIB

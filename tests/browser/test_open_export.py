@@ -17,6 +17,7 @@ from spherloc.problem import Problem
 from spherloc_viz.app.catalog import Catalog, SceneRequest
 from spherloc_viz.layers.outcome import outcome_table
 from spherloc_viz.recording.content.reader import read_recording
+from tests.waiting import LIMIT_S, until
 
 CAMERA = '[camera]\nmodel = "equirectangular"\nwidth = 2048\nheight = 1024\n'
 
@@ -164,11 +165,7 @@ def test_an_upload_is_solved_and_stays_with_its_page(
     expect(other.page.get_by_text(re.compile(r"mine\.csv"))).to_have_count(0)
 
     tab.page.close()
-    end = time.monotonic() + 60.0
-    while scratch_files(folders):
-        assert time.monotonic() < end, "the upload outlives its page"
-        time.sleep(0.05)
-    assert not any(folders.joinpath("scratch").glob("spherloc-*"))
+    until(lambda: not scratch_files(folders) and not any(folders.joinpath("scratch").glob("spherloc-*")))
 
 
 def downloaded(tab: Playground, button: str, folder: Path) -> Path:
@@ -240,7 +237,7 @@ def check_page(browser: Browser, path: Path, shown: dict[str, int]) -> None:
     page.goto(path.as_uri())
     expect(page).to_have_title("small street")
     expect(page.get_by_text("maximum clique", exact=True)).to_be_visible()
-    end = time.monotonic() + 60.0
+    end = time.monotonic() + LIMIT_S
     while (found := visible_nodes(page)) != shown:
         assert time.monotonic() < end, f"the file shows {found}, not {shown}"
         page.wait_for_timeout(100)

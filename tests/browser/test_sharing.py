@@ -18,6 +18,7 @@ from spherloc_viz.app.catalog import Catalog
 from spherloc_viz.app.controls.presets import RECIPES, presets
 from spherloc_viz.layers.outcome import outcome_table
 from spherloc_viz.recording.content.reader import RecordedRun, read_recording
+from tests.waiting import LIMIT_S
 
 OUTCOMES = {
     "A quiet start": "success",
@@ -143,9 +144,9 @@ def repeated(python: str, command: str, folder: Path) -> tuple[np.ndarray, Recor
         env=environment,
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=LIMIT_S,
     )
-    said, complaint = one.communicate(timeout=120)
+    said, complaint = one.communicate(timeout=LIMIT_S)
     assert one.returncode == 0, complaint
     assert other.returncode == 0, other.stderr
     (recording,) = folder.glob("*.rrd")
