@@ -45,8 +45,10 @@ def tried(kind: Kind, name: str, number: int, seed: int, intact: Path, folder: P
             shutil.rmtree(folder, ignore_errors=True)
             shutil.copytree(intact, folder)
         else:
-            shutil.rmtree(path, ignore_errors=True)
-            path.unlink(missing_ok=True)
+            if path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path)
+            else:  # rmtree would open a pipe and wait for its writer
+                path.unlink(missing_ok=True)
             shutil.copy2(original, path)
 
 
