@@ -252,6 +252,7 @@ WRONG = {
     "two runs beside have the same name": SMALL + BESIDE + BESIDE,
     "a key has small letters": SMALL.replace('"one"', '"../one"'),
     "is there once only": SMALL + SMALL,
+    "camera is that of a simulation, and 'street_fisheye' is none": STAGED.replace("mei_outliers_80", "street_fisheye"),
     "groups must be a list": STAGED.replace('[[5, "right"]]', '[["right", 5]]'),
     "a group's kind is 'left'": STAGED.replace('"right"', '"left"'),
     "a group's count is 0": STAGED.replace("5", "0"),

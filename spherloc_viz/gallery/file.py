@@ -10,6 +10,7 @@ from typing import Any
 from spherloc.datasets import bundled_scenes, load_scene, scene_file
 from spherloc.datasets.scene_file import check_keys, integer, text
 from spherloc.datasets.staged import CUBE, Group, StagedScene
+from spherloc.datasets.synthetic import SyntheticScene
 from spherloc.datasets.variation import EDITS, Variation, parse_variation
 from spherloc.diagnosis import Cause
 from spherloc.errors import InputError, show
@@ -189,7 +190,11 @@ def _staged(table: Mapping[str, Any], base: StagedScene | None, where: str) -> S
     else:
         check_keys(staged, set(), STAGED_NUMBERS | {"camera", "groups"}, place)
     if "camera" in staged:
-        given["camera"] = load_scene(_bundled(text(staged, "camera", place), place)).camera  # type: ignore[attr-defined]
+        name = text(staged, "camera", place)
+        simulation = load_scene(_bundled(name, place))
+        if not isinstance(simulation, SyntheticScene):
+            raise InputError(f"{place}: camera is that of a simulation, and {show(name)} is none; name another scene.")
+        given["camera"] = simulation.camera
     if "groups" in staged:
         given["groups"] = _groups(staged["groups"], place)
     if "seed" in staged:
