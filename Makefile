@@ -6,6 +6,8 @@ PYTHON ?= python3
 BIN := .venv/bin
 
 export PYTHON
+# The tests start some hundred processes, each of which would compile every module again.
+unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:

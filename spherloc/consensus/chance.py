@@ -1,7 +1,8 @@
 """What chance alone explains: when it explains as much as the best pose, no method can know the answer."""
 
+from math import lgamma
+
 import numpy as np
-from scipy.special import gammaln
 
 from spherloc.types import FloatArray
 
@@ -38,5 +39,5 @@ def nfa(count: int, size: int, rate: float) -> float:
     """
     if size < 2:
         return float(count)
-    ways = gammaln(count + 1) - gammaln(size + 1) - gammaln(count - size + 1)
+    ways = lgamma(count + 1) - lgamma(size + 1) - lgamma(count - size + 1)
     return float(np.exp(min(700.0, ways + (size - 2) * np.log(rate))))

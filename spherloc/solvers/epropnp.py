@@ -19,7 +19,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from spherloc.geometry import pose, so3_exp, transform
 from spherloc.solvers.base import checked
@@ -230,6 +229,8 @@ def sample_posterior(
 
 def _first_proposal(mode: FloatArray, covariance: FloatArray) -> _Proposal:
     """The proposal that Gauss-Newton suggests."""
+    from scipy.spatial.transform import Rotation  # takes half a second
+
     w, x, y, z = Rotation.from_matrix(mode[:, :3]).as_quat(scalar_first=True)
     # A small turn by the vector d moves the quaternion by tangent @ d / 2.
     tangent = np.array([[-x, -y, -z], [w, z, -y], [-z, w, x], [y, -x, w]])
@@ -266,10 +267,14 @@ def _cholesky(covariance: FloatArray) -> FloatArray:
 
 
 def _matrices(quaternions: FloatArray) -> FloatArray:
+    from scipy.spatial.transform import Rotation  # takes half a second
+
     return Rotation.from_quat(quaternions, scalar_first=True).as_matrix()
 
 
 def _summary(translations: FloatArray, quaternions: FloatArray, weights: FloatArray, origin: FloatArray) -> Posterior:
+    from scipy.spatial.transform import Rotation  # takes half a second
+
     middle = weights @ translations
     mean = _matrices(np.linalg.eigh((weights[:, None] * quaternions).T @ quaternions)[1][:, -1])
     rotations = _matrices(quaternions)

@@ -3,11 +3,7 @@
 from typing import Any
 
 import numpy as np
-import trimesh
 from PIL import Image
-from trimesh.exchange.gltf import export_glb
-from trimesh.visual.material import PBRMaterial
-from trimesh.visual.texture import TextureVisuals
 
 from spherloc.types import ByteArray, FloatArray
 
@@ -51,6 +47,11 @@ UNLIT = "KHR_materials_unlit"
 
 def textured_glb(vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray, image: np.ndarray) -> bytes:
     """The mesh with its picture (H, W, 3 or 4), unlit and seen from both sides, in the colours of the picture."""
+    import trimesh  # takes a second
+    from trimesh.exchange.gltf import export_glb
+    from trimesh.visual.material import PBRMaterial
+    from trimesh.visual.texture import TextureVisuals
+
     pixels = image.copy()
     pixels[..., :3] = surface_bytes(image[..., :3])
     holes = image.shape[2] == 4

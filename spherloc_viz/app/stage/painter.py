@@ -5,7 +5,6 @@ from functools import cache, partial
 from typing import Any, Literal
 
 import numpy as np
-import trimesh
 import viser
 import viser.transforms as vtf
 
@@ -229,6 +228,8 @@ def _instances(positions: np.ndarray, radii_m: np.ndarray, colors: np.ndarray) -
 
 @cache
 def _unit_ball(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
+    import trimesh  # takes a second
+
     mesh = trimesh.creation.icosphere(subdivisions=subdivisions)
     return np.asarray(mesh.vertices), np.asarray(mesh.faces)
 

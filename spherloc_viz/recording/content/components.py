@@ -121,7 +121,7 @@ Rows = list[Any]
 """One primitive per row, or None where it is absent and the row clears it."""
 WORDS = int(packed(np.array([style.SCALE]))[0])
 """Colour of words in the scene, which reads on dark and on light."""
-SOLID: int = rr.components.FillModeBatch(["solid"]).as_arrow_array()[0].as_py()
+SOLID: int = rr.components.FillMode.Solid.value
 
 
 @dataclass(frozen=True, eq=False)
