@@ -317,28 +317,14 @@ def test_a_sweep_to_its_end(page: Playground, server: tuple[str, int], scene: Pa
     assert tab.errors == []
 
 
-def test_a_sweep_is_cancelled_and_no_process_is_left(page: Playground, server: tuple[str, int]) -> None:
+def test_a_sweep_ends_with_its_page(page: Playground, server: tuple[str, int]) -> None:
     """A sweep of large problems, which would take many minutes."""
     tab = page
     tab.slide("Points", "End")
     expect(tab.value("inliers")).to_have_text(re.compile(" of 500$"))
     describe_sweep(tab, "0.3:0.9:0.05", 700)
     tab.press("Start sweep")
-    going = tab.page.get_by_text(re.compile(r"^\d[\d,]* of 18,200 runs, about "))
-    expect(going).to_be_visible(timeout=SWEEP_MS / 2)
+    expect(tab.page.get_by_text(re.compile(r"^\d[\d,]* of 18,200 runs"))).to_be_visible(timeout=SWEEP_MS / 2)
     tab.until(lambda: len(workers(server[1])) == 2, "two processes work")
-    tab.press("Cancel")
-    said = tab.page.get_by_text(re.compile(r"^Stopped at [\d,]+ of 18,200 runs; Start sweep goes on"))
-    expect(said).to_be_visible()
-    tab.until(lambda: not workers(server[1]), "no process is left")
-
-    # It goes on where it was, and ends with the page.
-    done = int(re.sub(r"\D", "", said.inner_text().split(" of ")[0]))
-    assert done > 0
-    tab.press("Start sweep")
-    expect(going).to_be_visible(timeout=SWEEP_MS / 2)
-    count = lambda: int(re.sub(r"\D", "", going.inner_text().split(" of ")[0]))  # noqa: E731
-    tab.until(lambda: count() > done, "it goes on", SWEEP_MS / 2000)
-    assert workers(server[1])
     tab.page.close()
     until(lambda: not workers(server[1]))
