@@ -58,7 +58,7 @@ def main() -> None:
         runs = folder / "runs"
         row = write_recording(estimate(load_scene(SCENE).problem(None), "mc"), runs / "run.rrd")
         address = stack.enter_context(playground(recordings=runs))[0].rstrip("/")
-        links = {OURS: address + viewer_link("run.rrd", row.key_step)}
+        links = {OURS: address + viewer_link("run.rrd", row.key_step + 1)}
         links[PEER] = stack.enter_context(_served_by_rerun(runs / "run.rrd"))
         player = stack.enter_context(sync_playwright())
         profiles = {name: stack.enter_context(_profile(player, folder / name)) for name in links}

@@ -34,7 +34,7 @@ def view(
     Args:
         recording: A recording (.rrd).
         web: Serve the viewer to a browser on this machine instead of opening a window.
-        step: The step to open at; 0 is the first, and the key step is taken if it is not given.
+        step: The step to open at; 1 is the first, and the key step is taken if it is not given.
         port: Port of the web viewer; 0 takes a free one.
     """
     check_recording_file(recording)
@@ -42,13 +42,13 @@ def view(
     from spherloc_viz.recording.viewer import step_of, view_in_window
 
     row = examine(recording)
-    place = step_of(row, step)
+    number = step_of(row, step)
     if web:
         from spherloc_viz.app.web.viewer import serve_recording
 
-        serve_recording(recording, row, place, port)
+        serve_recording(recording, row, number, port)
     else:
-        view_in_window(recording, row, place)
+        view_in_window(recording, row, number)
     return 0
 
 
@@ -189,9 +189,10 @@ def steps(
     """List the steps of recorded runs for which a condition holds, such as those that had the right pose and lost it.
 
     The condition is SQL of columns, numbers, texts, comparisons, AND, OR, NOT, IN, BETWEEN, LIKE, IS NULL and
-    arithmetic. Columns of a step: step (its index), stage, key (its name), agreeing (matches), rotation_error_deg,
-    position_error_m (of its pose). Columns of its run: created, source, scene, name, estimator, seed, outcome,
-    diagnosis, doubtful, correspondences, inliers, outlier_rate, steps, key_step, time_ms. What is unknown is NULL.
+    arithmetic. Columns of a step: step (its number, from 1), stage, key (its name), agreeing (matches),
+    rotation_error_deg, position_error_m (of its pose). Columns of its run: created, source, scene, name, estimator,
+    seed, outcome, diagnosis, doubtful, correspondences, inliers, outlier_rate, steps, key_step, time_ms. What is
+    unknown is NULL.
     Needs the extra "catalog".
 
     For example:

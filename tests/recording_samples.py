@@ -95,7 +95,7 @@ def exact_run(**changes: Any) -> Trace:
 
 
 class Recorded:
-    """A recording as rerun's reader gives it: rows of every entity, the newest one at a step."""
+    """A recording as rerun's reader gives it: rows of every entity, the newest one at a step, which is an index."""
 
     def __init__(self, path: Path) -> None:
         self.rows: dict[str, list[tuple[int, dict[str, Any]]]] = {}
@@ -106,7 +106,7 @@ class Recorded:
                 row = {name: batch.column(name)[index] for name in batch.schema.names}
                 # A component that a row does not change is null in it.
                 row = {name: value for name, value in row.items() if value.is_valid}
-                step = row["step"].as_py() if "step" in row else -1
+                step = row["step"].as_py() - 1 if "step" in row else -1
                 self.rows.setdefault(chunk.entity_path, []).append((step, row))
 
     def at(self, entity: str, step: int) -> dict[str, Any] | None:

@@ -205,7 +205,7 @@ def test_a_row_says_what_came_out_and_where_to_go() -> None:
     for words in ("failure", "too few inliers", "4/50", "40 % out", "4.00°", "40 cm", "seam", "look", "☑"):
         assert words in html, words
     found = Elements(html)
-    assert found.links == ["/viewer/?run=run-0004.rrd&step=7"] and "run-open:run-0004.rrd" in found.touches
+    assert found.links == ["/viewer/?run=run-0004.rrd&step=8"] and "run-open:run-0004.rrd" in found.touches
     large = replace(row, thumbnail=PNG + bytes(200_000))
     assert "data:image" not in rows_html([large], frozenset(), None, 1, Look(), NOW)
     assert "No recorded run fits" in rows_html([], frozenset(), None, 0, Look(text="x"), NOW)

@@ -118,7 +118,7 @@ def test_a_link_opens_its_run_at_its_step(folder: Folder) -> None:
 def test_without_a_step_it_is_the_key_step(folder: Folder) -> None:
     async def calls(door: Door) -> None:
         response = await door.get("viewer/?run=good.rrd")
-        assert Parsed(await response.text()).body["data-step"] == str(decided.key_step)
+        assert Parsed(await response.text()).body["data-step"] == str(decided.key_step + 1)
 
     runs, row = folder
     decided = replace(row, key_step=row.steps - 2)
@@ -255,7 +255,7 @@ def test_a_run_that_goes_meanwhile_is_one_sentence(tmp_path: Path, monkeypatch: 
 def test_where_nothing_is_recorded_it_says_so() -> None:
     async def calls() -> None:
         async with door_to(1) as door:
-            response = await door.get(viewer_link("good.rrd", 0).lstrip("/"))
+            response = await door.get(viewer_link("good.rrd", 1).lstrip("/"))
             assert response.status == 404 and "--no-record" in await response.text()
 
     asyncio.run(calls())
@@ -313,8 +313,8 @@ def test_links_survive_odd_names() -> None:
 
 def test_step_of(folder: Folder) -> None:
     row = replace(folder[1], steps=5, key_step=3)
-    assert [step_of(row, request) for request in (None, 0, 4)] == [3, 0, 4]
-    for request in (-1, 5):
-        with pytest.raises(InputError, match="steps 0 to 4"):
+    assert [step_of(row, request) for request in (None, 1, 5)] == [4, 1, 5]
+    for request in (0, 6):
+        with pytest.raises(InputError, match="steps 1 to 5"):
             step_of(row, request)
     assert step_of(replace(row, steps=0, key_step=0), 7) == 7, "the first version does not say how many there are"

@@ -23,14 +23,14 @@ from spherloc_viz.layers import paint, steps
 from spherloc_viz.layers.key_step import key_step, step_pose
 from spherloc_viz.recording.content.data import MAX_SCENE_BYTES, NUMBERS, scene_text
 from spherloc_viz.recording.content.pictures import HEIGHT_PX, LONGEST_PX, MATCHES, WIDTH_PX, thumbnail
-from spherloc_viz.recording.content.properties import MOST_CHARACTERS, problem_key
+from spherloc_viz.recording.content.properties import FORMAT_VERSION, MOST_CHARACTERS, problem_key
 from spherloc_viz.recording.content.reader import read_recording, read_run_row
 from spherloc_viz.recording.content.writer import recorded_steps, write_recording
 from spherloc_viz.recording.origin import Origin
 from spherloc_viz.recording.reviews import write_review
 from tests.needs import needs
 
-FORMAT_1, FORMAT_2 = (Path(__file__).parent / "data" / f"format_{version}.rrd" for version in (1, 2))
+FORMAT_1, FORMAT_2, FORMAT_3 = (Path(__file__).parent / "data" / f"format_{version}.rrd" for version in (1, 2, 3))
 """Written by the first version of the format: 24 matches, ransac-2p, seed 5."""
 
 
@@ -114,7 +114,7 @@ def test_the_row_that_is_returned_is_the_row_that_is_read(run: object, tmp_path:
     path = tmp_path / "a run.rrd"
     row = write_recording(trace, path, Origin("sweep"))
     assert read_run_row(path) == read_recording(path).row == row
-    assert (row.file, row.size_bytes, row.format_version) == ("a run.rrd", path.stat().st_size, 3)
+    assert (row.file, row.size_bytes, row.format_version) == ("a run.rrd", path.stat().st_size, FORMAT_VERSION)
     assert row.steps == len(steps(trace)) and 0 <= row.key_step < row.steps
     labels = trace.problem.truth_inliers
     assert row.outlier_rate == (None if labels is None else 1.0 - labels.mean())
@@ -343,11 +343,12 @@ def test_a_file_of_format_1_still_opens() -> None:
     assert run.stages["ransac"]["cam_from_map"].shape[1:] == (3, 4)
 
 
-def test_a_file_of_format_2_still_opens() -> None:
-    run, row = read_recording(FORMAT_2), read_run_row(FORMAT_2)
-    variation = Variation(correspondences=24)
-    assert row == run.row and (row.format_version, row.source, row.title) == (2, "command", "As in format 2")
-    assert run.origin == Origin("command", variation=variation, title="As in format 2")
+@pytest.mark.parametrize(("version", "path"), [(2, FORMAT_2), (3, FORMAT_3)])
+def test_files_of_later_formats_still_open(version: int, path: Path) -> None:
+    run, row = read_recording(path), read_run_row(path)
+    variation, title = Variation(correspondences=24), f"As in format {version}"
+    assert row == run.row and (row.format_version, row.source, row.title) == (version, "command", title)
+    assert run.origin == Origin("command", variation=variation, title=title)
     assert run.diagnosis is not None and run.diagnosis.cause is Cause.OK and run.diagnosis.evidence
     problem = variation.problem(_scene("mei_outliers_80"))
     assert run.problem.pixels.tobytes() == problem.pixels.tobytes() and problem_key(run.problem) == row.problem_key

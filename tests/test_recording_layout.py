@@ -243,8 +243,8 @@ def test_the_viewer_has_no_fault_to_find(
     assert recording.current_timeline == "step"
     _, views = layout_of(path)
     assert {view.origin for view in state.views} == set(views)
-    # The third step has a letter that the viewer's font lacks, and the name of the problem has others.
-    for step in (3, row.key_step, row.steps - 1):
+    # The fourth step has a letter that the viewer's font lacks, and the name of the problem has others.
+    for step in (4, row.key_step + 1, row.steps):
         viewer.set_time(timeline="step", sequence=step)
         (picture,) = until(lambda: () if (taken := photograph(viewer)) is None else (taken,))
         assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 100, "a picture, not a blank"

@@ -224,7 +224,7 @@ def test_steps_are_asked_for_over_all_runs(folder: Path, capsys: pytest.CaptureF
         rows = {row.file: row for row in index.find(RunQuery()).rows}
     assert steps("step = key_step AND correspondences = 100", folder, format="csv") == 0
     found = listed(capsys)
-    assert {row["file"]: int(row["step"]) for row in found} == {name: row.key_step for name, row in rows.items()}
+    assert {row["file"]: int(row["step"]) for row in found} == {name: row.key_step + 1 for name, row in rows.items()}
     assert steps("position_error_m < 0.1 AND stage = 'Refinement'", folder, format="json") == 0
     near = json.loads(capsys.readouterr().out)
     assert {row["file"] for row in near} == {"right.rrd", "sampled.rrd"}
@@ -232,7 +232,7 @@ def test_steps_are_asked_for_over_all_runs(folder: Path, capsys: pytest.CaptureF
     assert last["position_error_m"] == pytest.approx(rows["right.rrd"].translation_error_m)
     assert steps("position_error_m IS NULL AND name = 'blind'", folder) == 0
     out = capsys.readouterr().out
-    assert "blind, mc: unknown" in out and "step   0 of" in out and out.count("    step ") > 2
+    assert "blind, mc: unknown" in out and "step   1 of" in out and out.count("    step ") > 2
     assert steps("step >= 0", folder, limit=3) == 0
     captured = capsys.readouterr()
     assert captured.out.count("    step ") == 3 and "--limit 0 shows all" in captured.err
@@ -244,23 +244,36 @@ def test_steps_are_asked_for_over_all_runs(folder: Path, capsys: pytest.CaptureF
         assert "\n" not in str(caught.value)
 
 
+def test_steps_count_from_1_in_recordings_of_every_format(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    (tmp_path / "format_3.rrd").write_bytes((Path(__file__).parent / "data" / "format_3.rrd").read_bytes())
+    write_recording(estimate(scene_problem("mei_outliers_80"), "mc"), tmp_path / "now.rrd")
+    assert steps("step = key_step OR step < 1 OR step >= steps", tmp_path, format="csv") == 0
+    found = {(row["file"], int(row["step"]), int(row["key_step"]), int(row["steps"])) for row in listed(capsys)}
+    with RunIndex(tmp_path) as index:
+        rows = index.find(RunQuery()).rows
+    expected = {
+        (row.file, number, row.key_step + 1, row.steps) for row in rows for number in (row.key_step + 1, row.steps)
+    }
+    assert found == expected and [row.on_timeline(1) for row in sorted(rows, key=lambda row: row.file)] == [0, 1]
+
+
 def test_steps_of_runs_that_cannot_be_asked(folder: Path, capsys: pytest.CaptureFixture[str]):
     """Copies have the same id, old formats no numbers, and files vanish: none of them costs the others."""
     shutil.copy(folder / "right.rrd", folder / "copy.rrd")
-    assert steps("step = 0 AND estimator = 'mc' AND outcome = 'success'", folder, format="csv") == 0
+    assert steps("step = 1 AND estimator = 'mc' AND outcome = 'success'", folder, format="csv") == 0
     assert len(listed(capsys)) == 1
     assert "left out" not in capsys.readouterr().err
     with RunIndex(folder) as index:
         rows = index.find(RunQuery()).rows
         (folder / "vanished.rrd").write_text("no run")
         vanished = replace(rows[0], run_id="0", file="vanished.rrd")
-        steps_found = find_steps(folder, [vanished, *rows], "step = 0")
+        steps_found = find_steps(folder, [vanished, *rows], "step = 1")
         assert steps_found.refused == ("vanished.rrd",)
         (folder / "vanished.rrd").unlink()
         assert {step.run.run_id for step in steps_found.found} == {row.run_id for row in rows}
         for row in rows:
             index.add(replace(row, format_version=1))
-    assert steps("step = 0", folder, format="csv") == 0
+    assert steps("step = 1", folder, format="csv") == 0
     assert listed(capsys) == []
 
 

@@ -62,7 +62,9 @@ class MapScene:
     def __post_init__(self) -> None:
         for what, views in (("query", self.queries), ("reference", self.references)):
             if not views:
-                raise InputError(f"{self.where}: there is no {what} image; {' '.join(self.remarks) or 'name some.'}")
+                raise InputError(
+                    f"{self.where}: there is no {what} image; {' '.join(self.remarks[:2]) or 'name some.'}"
+                )
             twice = next((name for name, times in Counter(view.name for view in views).items() if times > 1), None)
             if twice is not None:
                 raise InputError(f"{self.where}: the {what} image {show(twice)} is there twice; name it once.")

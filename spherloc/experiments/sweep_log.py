@@ -125,6 +125,9 @@ class SweepLog:
         """Raise ``InputError`` where a new sweep would write to a file that is not its own; before anything is made."""
         if os.path.lexists(self.beside(PLAN)):
             self._compare()
+            # To open a pipe would wait for somebody who reads it.
+            if os.path.lexists(self.path) and not is_file(self.path):
+                raise InputError(f"{self.path}: is no regular file; remove it or give another file.")
         elif os.path.lexists(self.path) and not (is_file(self.path) and size_of(self.path) == 0):
             raise InputError(
                 f"{self.path}: is no table of a sweep, or has lost its {self.beside(PLAN).name}; give another file."

@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 STORED_AS = {"key_step": "decisive_step"}
 """Fields that recordings know by the name that they had in the first format."""
+COUNTED_FROM_1 = 4
+"""The first format whose timeline counts steps from 1."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +61,7 @@ class RunRow:
     steps: int
     """Steps on the timeline."""
     key_step: int
-    """The step at which the run was decided, or went wrong."""
+    """Index of the step at which the run was decided, or went wrong."""
     title: str = ""
     """Of a curated case."""
     labels: tuple[str, ...] = ()
@@ -72,3 +74,8 @@ class RunRow:
     """A small PNG; empty if there is none."""
     format_version: int = 0
     """Of the recording."""
+
+    def on_timeline(self, number: int) -> int:
+        """Where a step is on the recording's timeline; ``number`` counts from 1, as pages do, and so do timelines of
+        the format ``COUNTED_FROM_1`` and later."""
+        return number if self.format_version >= COUNTED_FROM_1 else number - 1

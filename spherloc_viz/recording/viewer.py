@@ -25,14 +25,14 @@ PAUSE_S = 0.2
 
 
 def step_of(row: RunRow, request: int | None) -> int:
-    """The step to open a run at: the one that is asked for, else the key step.
+    """The number of the step to open a run at, from 1: the one that is asked for, else the key step.
 
     Recordings of the first version do not say how many steps they have. Raises ``InputError`` if there is no such step.
     """
     if request is None:
-        return row.key_step
-    if request < 0 or (row.steps and request >= row.steps):
-        steps = "only step 0" if row.steps == 1 else f"steps 0 to {row.steps - 1}"
+        return row.key_step + 1
+    if request < 1 or (row.steps and request > row.steps):
+        steps = "only step 1" if row.steps == 1 else f"steps 1 to {row.steps}"
         raise InputError(f"{row.file}: there is no step {request}; the run has {steps}.")
     return request
 
@@ -51,7 +51,7 @@ def labels_of(recording: Path, run_id: str) -> Path | None:
 
 
 def view_in_window(path: Path, row: RunRow, step: int) -> None:
-    """Open a recording, with its labels and note, paused at a step, and return when the window is closed.
+    """Open a recording, with its labels and note, paused at a step (from 1), and return when the window is closed.
 
     Raises ``RecordingError`` if the viewer cannot open, or cannot show the labels.
     """
@@ -63,18 +63,19 @@ def view_in_window(path: Path, row: RunRow, step: int) -> None:
     # The port is for programs that control the viewer, as we do: nobody else on the network should.
     command = [*rerun_command(), "--bind", HOST, "--port", str(port), *files]
     with subprocess.Popen(command, env=rerun_environment()) as viewer:
-        stand_at(viewer, f"rerun+http://{HOST}:{port}/proxy", step)
+        stand_at(viewer, f"rerun+http://{HOST}:{port}/proxy", row.on_timeline(step))
         if viewer.wait():
             raise RecordingError(f"{path.name}: the Rerun viewer has failed; add --web to use a browser instead.")
 
 
-def stand_at(viewer: subprocess.Popen[bytes], address: str, step: int) -> bool:
-    """Tell a viewer that is starting to pause at a step as soon as it has its recording; False if it never takes it."""
+def stand_at(viewer: subprocess.Popen[bytes], address: str, place: int) -> bool:
+    """Tell a viewer that is starting to pause at a place of the timeline as soon as it has its recording; False if it
+    never takes it."""
     for _ in range(TRIES):
         if viewer.poll() is not None:
             return False
         with contextlib.suppress(Exception):  # of many kinds, and all mean: not yet
-            ViewerClient.connect(address).set_time(TIMELINE, sequence=step, play_state="paused")
+            ViewerClient.connect(address).set_time(TIMELINE, sequence=place, play_state="paused")
             return True
         time.sleep(PAUSE_S)
     return False

@@ -112,7 +112,7 @@ def tab(browser: Browser) -> Iterator[Tab]:
 
 
 def test_it_opens_at_the_step_and_stays_at_home(tab: Tab, home: str, row: RunRow) -> None:
-    step = row.key_step or 1
+    step = row.key_step + 1
     tab.page.goto(home + viewer_link("good.rrd", step))
     expect(tab.page).to_have_title(f"small street, mc, seed 0: step {step} - spherloc")
     expect(tab.page.locator("body")).to_have_attribute("data-state", "open", timeout=OPENING_MS)
@@ -121,7 +121,7 @@ def test_it_opens_at_the_step_and_stays_at_home(tab: Tab, home: str, row: RunRow
     (recording,) = [message(each) for each in state[3]]
     assert recording[1] == [f"Recording:spherloc:{row.run_id}".encode()], "run and review are one recording"
     (timeline,) = [message(each) for each in recording[2]]
-    assert message(timeline[3][0])[2] == [row.steps - 1], "all steps are there"
+    assert message(timeline[3][0])[2] == [row.steps], "all steps are there"
     cursor = message(recording[3][0])
     assert message(cursor[1][0])[1] == [b"step"] and message(cursor[3][0])[1] == [step]
     assert recording[5] == [PAUSED]
@@ -173,7 +173,7 @@ def test_what_cannot_be_opened_is_one_sentence(tab: Tab, home: str, query: str, 
 def test_a_recording_that_has_gone_is_one_sentence(tab: Tab, home: str, folder: Path) -> None:
     """Retention may delete it between the page and its data: no blank viewer then."""
     tab.page.route("**/viewer/data/good.rrd", lambda route: route.fulfill(status=404, body="good.rrd: it is gone."))
-    tab.page.goto(home + viewer_link("good.rrd", 0))
+    tab.page.goto(home + viewer_link("good.rrd", 1))
     expect(tab.page.locator("#said")).to_have_text("good.rrd: it is gone.")
     expect(tab.page.locator("canvas")).to_be_hidden()
     tab.page.route("**/viewer/data/good.rrd", lambda route: route.abort())
@@ -183,6 +183,6 @@ def test_a_recording_that_has_gone_is_one_sentence(tab: Tab, home: str, folder: 
 
 def test_a_browser_that_cannot_draw_is_told(tab: Tab, home: str) -> None:
     tab.page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
-    tab.page.goto(home + viewer_link("good.rrd", 0))
+    tab.page.goto(home + viewer_link("good.rrd", 1))
     expect(tab.page.locator("#said")).to_contain_text("cannot start in this browser")
     expect(tab.page.locator("canvas")).to_be_hidden()

@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -109,6 +110,11 @@ def test_damage_is_one_sentence(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=said):
             SweepLog(path, plan)
         assert path.read_text() == text
+    path.unlink()
+    os.mkfifo(path)
+    with pytest.raises(InputError, match=r"sweep.csv: is no regular file; remove it"):
+        SweepLog(path, plan)
+    path.unlink()
     path.write_text(good)
     beside = path.with_suffix(".plan.json")
     for text in ("[]", "{", "[" * 100_000):

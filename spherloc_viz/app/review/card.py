@@ -148,10 +148,10 @@ def _ways(row: RunRow, run: Run | None) -> str:
     elif 0 <= row.key_step < len(stops := steps(run.trace)):
         stop = stops[row.key_step]
         ways.append(_way(f"step:{stop.key}", f"step {row.key_step + 1}: {stop.title}"))
-    link = escape(viewer_link(row.file, row.key_step))
+    link = escape(viewer_link(row.file, row.key_step + 1))
     ways.append(
         f'<a href="{link}" target="_blank" rel="noopener" title="Open in the Rerun viewer at the step where it was '
-        f'decided: #{row.key_step} on its timeline, which counts from 0" '
+        f'decided, number {row.key_step + 1}" '
         'style="color:inherit;white-space:nowrap">Open in Rerun ↗</a>'
     )
     row_css = "padding-top:.25em;display:flex;justify-content:space-between;gap:1em"

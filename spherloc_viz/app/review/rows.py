@@ -53,10 +53,10 @@ def row_html(row: RunRow, marked: bool, opened: bool, now: datetime, hidden: boo
         f'data-touch="run-mark:{file}" title="Mark, to compare or export" '
         f'style="position:absolute;left:4px;top:4px;{look}">{"☑" if marked else "☐"}</span>'
     )
-    address = escape(viewer_link(row.file, row.key_step))
+    address = escape(viewer_link(row.file, row.key_step + 1))
     link = (
         f'<a href="{address}" target="_blank" rel="noopener" '
-        f'title="Open in Rerun\'s viewer at step {row.key_step + 1} of {row.steps}, #{row.key_step} there" '
+        f'title="Open in Rerun\'s viewer at step {row.key_step + 1} of {row.steps}" '
         'style="color:inherit;text-decoration:none;padding:.4em .1em .4em .4em;opacity:.75;font-size:13px">↗</a>'
     )
     hint, picture = _hint(row), row.thumbnail

@@ -16,6 +16,8 @@ from spherloc_viz.layers.primitives import Picture
 FIRST_CHECKS, MOST_CHECKS, CHECK_S = 8, 40, 0.4
 """A page that is still building itself drops its first view and reports that its viewer has not moved; a slow one for
 many checks."""
+MOST_PX = 1 << 20
+"""Whatever a page says of its window, it is no larger."""
 HELD = "held"
 """In place of a view's name."""
 RESHAPED = 0.02
@@ -188,7 +190,8 @@ class Canvas:
         # The page tells its size before it docks the panels, and again some frames later.
         if camera.image_width != self._full_width:
             self._docked_px = 0
-        return max(0.3, (camera.image_width - self._docked_px) / max(1, camera.image_height))
+        width_px, height_px = min(camera.image_width, MOST_PX), min(camera.image_height, MOST_PX)
+        return max(0.3, (width_px - self._docked_px) / max(1, height_px))
 
 
 def panel_widths_px(window_px: int) -> tuple[int, int]:

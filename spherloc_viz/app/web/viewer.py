@@ -46,7 +46,7 @@ def sorry_page(sentence: str) -> str:
 
 
 def viewer_page(file: str, row: RunRow, step: int, version: str, timeline: str) -> str:
-    """The page that opens the run of ``file`` at a step, in the viewer of a version."""
+    """The page that opens the run of ``file`` at a step (from 1), in the viewer of a version."""
     run = row.title or f"{row.name}, {row.estimator}, seed {row.seed}"
     layers = (file, file.removesuffix(".rrd") + ".review.rrd")
     values = {
@@ -55,7 +55,7 @@ def viewer_page(file: str, row: RunRow, step: int, version: str, timeline: str) 
         "program": f"{PROGRAM}{quote(version)}/",
         "files": " ".join(DATA + quote(name) for name in layers),
         "timeline": timeline,
-        "step": str(step),
+        "step": str(row.on_timeline(step)),
     }
     escaped = {name: html.escape(value) for name, value in values.items()}
     return Template(_text("viewer.html")).substitute(escaped, script=_text("viewer.js"))
@@ -93,7 +93,7 @@ FOREVER = "private, max-age=31536000, immutable"
 
 
 def viewer_link(file: str, step: int) -> str:
-    """The path and query that open a recording of the folder of recordings at a step, unescaped for HTML."""
+    """The path and query that open a recording of the folder of recordings at a step (from 1), unescaped for HTML."""
     return PAGE + "?" + urlencode({"run": file, "step": step})
 
 

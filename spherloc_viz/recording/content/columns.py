@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from rerun.chunk import Chunk
 
 TIMELINE = "step"
-"""The sequence timeline of every recording: the index of the step in ``layers.steps``."""
+"""The sequence timeline of every recording: the number of the step in ``layers.steps``, from 1, as on the page."""
 
 MARKDOWN = "text/markdown"
 """Media type of texts."""
@@ -65,17 +65,18 @@ class Column(rr.ComponentColumn):
 
 @dataclass(frozen=True, eq=False)
 class Times:
-    """The steps of the rows of a chunk, which ``Chunk.from_columns`` takes too."""
+    """When the rows of a chunk are, which ``Chunk.from_columns`` takes too."""
 
-    steps: pa.Int64Array
+    steps: NDArray[np.int64]
+    """(R,) indices of steps."""
 
     def timeline_name(self) -> str:
         """Their timeline."""
         return TIMELINE
 
     def as_arrow_array(self) -> pa.Int64Array:
-        """The steps."""
-        return self.steps
+        """The numbers of the steps."""
+        return pa.array(self.steps + 1)
 
 
 def _lists(lengths: Sequence[int], values: pa.Array, present: Sequence[int] | None = None) -> pa.ListArray:

@@ -242,4 +242,4 @@ def numbers_chunk(numbers: Sequence[StepNumbers]) -> Chunk:
         known = [k for k, value in enumerate(values) if value is not None]
         column = Values(rr.ComponentDescriptor(name), pa.array([values[k] for k in known], kind), [1] * len(known))
         columns.append(column.among(known, len(values)))
-    return Chunk.from_columns(NUMBERS, [Times(pa.array([row.step for row in numbers], pa.int64()))], columns)
+    return Chunk.from_columns(NUMBERS, [Times(np.array([row.step for row in numbers], np.int64))], columns)

@@ -5,7 +5,6 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 import rerun as rr
 from numpy.typing import NDArray
 from rerun.chunk import Chunk
@@ -75,7 +74,7 @@ def _chunk(path: str, parts: list[tuple[list[int], Part]], track: Rows, when: ND
         places = [place_of[index] for index in changes]
         for values in part.encode([track[index] for index in changes]):
             columns.append(values.whole() if len(places) == len(steps) else values.among(places, len(steps)))
-    return Chunk.from_columns(path, [Times(pa.array(when[steps]))], columns)
+    return Chunk.from_columns(path, [Times(when[steps])], columns)
 
 
 def _changes(track: Rows, look: tuple[str, ...]) -> list[int]:

@@ -28,7 +28,7 @@ from spherloc_viz.recording.run_row import STORED_AS, RunRow
 
 APPLICATION_ID = "spherloc"
 """What Rerun keeps our recordings, and their layout, apart from others by."""
-FORMAT_VERSION = 3
+FORMAT_VERSION = 4
 """Of what is recorded and how. A reader opens this one and older ones."""
 OLDEST_VERSION = 1
 

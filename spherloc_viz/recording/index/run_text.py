@@ -80,7 +80,7 @@ def _cell(value: Any) -> Any:
 
 def _plain(row: RunRow) -> dict[str, Any]:
     """All of a run but its picture."""
-    table = asdict(row) | {"labels": list(row.labels)}
+    table = asdict(row) | {"labels": list(row.labels), "key_step": row.key_step + 1}
     del table["thumbnail"]
     # Of a recording that somebody else wrote it may be anything.
     with contextlib.suppress(ValueError, RecursionError):

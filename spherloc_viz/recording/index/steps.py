@@ -13,7 +13,7 @@ from spherloc.errors import InputError, RecordingError, show
 from spherloc.registry import require
 from spherloc_viz.recording.content.data import NUMBERS
 from spherloc_viz.recording.index.run_text import csv_text, json_lines, number_text, one_line
-from spherloc_viz.recording.run_row import STORED_AS, RunRow
+from spherloc_viz.recording.run_row import COUNTED_FROM_1, STORED_AS, RunRow
 
 STEP_COLUMNS = {
     "step": pa.int64(),
@@ -23,8 +23,8 @@ STEP_COLUMNS = {
     "rotation_error_deg": pa.float64(),
     "position_error_m": pa.float64(),
 }
-"""What is known of a step: its index, the stage that it belongs to, its name within that, matches that agree, and how
-far its pose is off."""
+"""What is known of a step: its number from 1, the stage that it belongs to, its name within that, matches that agree,
+and how far its pose is off."""
 RUN_COLUMNS = {
     "created": pa.string(),
     "source": pa.string(),
@@ -89,7 +89,7 @@ FIRST_VERSION = 2
 """Recordings of this format and later have numbers for every step."""
 _RENAMED = {"position_error_m": "translation_error_m"} | STORED_AS
 """What a condition calls differently than a recording."""
-_RUN = "rerun_segment_id"
+_RUN, _FORMAT = "rerun_segment_id", "format_version"
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ class StepFound:
 
     run: RunRow
     step: int
-    """Index on the timeline."""
+    """Its number, from 1."""
     stage: str
     """Named stage."""
     key: str
@@ -151,15 +151,20 @@ def find_steps(folder: Path, rows: Sequence[RunRow], condition: str, limit: int 
 
 def _frame(dataset: Any) -> Any:
     """A table with a row a step, and what is known of its run beside it."""
-    from datafusion import col
+    from datafusion import col, lit
 
     # A column that is empty in one recording would else be missing for all.
     steps = dataset.filter_contents([NUMBERS]).reader(index="step", include_semantically_empty_columns=True)
     runs = dataset.segment_table()
     of_step = [_first(steps, f"{NUMBERS}:{_RENAMED.get(name, name)}", name) for name in STEP_COLUMNS if name != "step"]
-    of_run = [_first(runs, f"property:run:{_RENAMED.get(name, name)}", name) for name in RUN_COLUMNS]
+    names = {**RUN_COLUMNS, _FORMAT: pa.int64()}
+    of_run = [_first(runs, f"property:run:{_RENAMED.get(name, name)}", name) for name in names]
     steps = steps.select(col(_RUN), col("step"), *of_step)
-    return steps.join(runs.select(col(_RUN).alias("run"), *of_run), left_on=_RUN, right_on="run")
+    table = steps.join(runs.select(col(_RUN).alias("run"), *of_run), left_on=_RUN, right_on="run")
+    # Recordings have the index of the key step, and timelines of older ones indices of all steps.
+    table = table.with_column("key_step", col("key_step") + lit(1))
+    older = (col(_FORMAT) < lit(COUNTED_FROM_1)).cast(pa.int64())
+    return table.with_column("step", col("step") + older).drop(_FORMAT)
 
 
 def _first(frame: Any, column: str, name: str) -> Any:
@@ -167,7 +172,7 @@ def _first(frame: Any, column: str, name: str) -> Any:
     from datafusion import col, functions, lit
 
     if column not in frame.schema().names:
-        return lit(None).cast(COLUMNS[name]).alias(name)
+        return lit(None).cast(COLUMNS.get(name, pa.int64())).alias(name)
     return functions.array_element(col(f'"{column}"'), lit(1)).alias(name)
 
 
@@ -201,7 +206,8 @@ def steps_text(folder: Path, found: Sequence[StepFound], form: str) -> str:
 
 def _plain(found: StepFound) -> dict[str, Any]:
     step = {name: getattr(found, name) for name in STEP_COLUMNS}
-    return {"file": found.run.file} | step | {name: getattr(found.run, name) for name in RUN_COLUMNS}
+    run = {name: getattr(found.run, name) for name in RUN_COLUMNS}
+    return {"file": found.run.file} | step | run | {"key_step": found.run.key_step + 1}
 
 
 def _run(folder: Path, found: Sequence[StepFound]) -> str:
@@ -209,7 +215,7 @@ def _run(folder: Path, found: Sequence[StepFound]) -> str:
     told = f"{run.title or run.name}, {run.estimator}: {run.outcome}, {run.diagnosis or 'not diagnosed'}"
     lines = [one_line(told), f"    {one_line(str(folder / run.file))}"]
     for step in found:
-        mark = "  <- key step" if step.step == run.key_step else ""
+        mark = "  <- key step" if step.step == run.key_step + 1 else ""
         off = f"{number_text(step.rotation_error_deg):>8} deg {number_text(step.position_error_m):>8} m"
         where = f"step {step.step:>3} of {run.steps:<3} {one_line(step.stage):<14.14} {one_line(step.key):<24.24}"
         lines.append(f"    {where} {step.agreeing:>5} agree {off}{mark}")
