@@ -145,7 +145,9 @@ def test_a_full_disk_keeps_what_is_done(tmp_path: Path, drawn: dict[str, str]) -
     def limit() -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (4000, 4000))
 
-    process = command(scene, "--output", out, "--no-record", environment=drawn, preexec_fn=limit)
+    # Python would leave the first half of compiled modules behind.
+    environment = drawn | {"PYTHONDONTWRITEBYTECODE": "1"}
+    process = command(scene, "--output", out, "--no-record", environment=environment, preexec_fn=limit)
     output, errors = process.communicate(timeout=LIMIT_S)
     assert process.returncode == 2 and output == "", errors
     (sentence,) = errors.strip().splitlines()
