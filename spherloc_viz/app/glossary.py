@@ -6,7 +6,7 @@ from typing import Any
 
 import viser
 
-from spherloc_viz.app.text import box
+from spherloc_viz.app.text import DIM, box
 from spherloc_viz.app.web.touch import Touch, Touches
 
 DEFINE = "define"
@@ -38,6 +38,11 @@ TERMS: dict[str, str] = {
     "sample": "The matches that RANSAC draws to fix one pose.",
     "certificate": "A bound that no pose can beat; where the pose at hand reaches it, it is proven to be the best.",
     "covariance": "How sure the pose is by its inliers: drawn as an ellipsoid of three standard deviations.",
+    "estimator": "A method that computes the pose from all matches, most of them wrong. mc-exact can prove its answer, "
+    "mc is the paper's, ransac-2p draws pairs; the others are baselines that draw larger samples.",
+    "scene": "What there is to localize: a simulation, drawn or real images, or a file of matches.",
+    "sweep": "Many runs while one property of the scene grows, to see from where on an estimator fails.",
+    "recording": "A file of one run with all its numbers: it opens again here, in Rerun's viewer, and in Python.",
 }
 """By the word that stands on the page."""
 _PLURALS = {"match": "matches", "maximum clique": "maximum cliques"}
@@ -63,6 +68,11 @@ def linked(words: str) -> str:
 def help_html(term: str) -> str:
     """A question mark that tells what a term means."""
     return _mark(term, "?", "help")
+
+
+def heading_html(words: str, term: str) -> str:
+    """What a panel shows, in a line, with a question mark that tells what a term means."""
+    return box(f'<div style="{DIM}">{escape(words)}{help_html(term)}</div>', "font-size:12px")
 
 
 def _mark(term: str, words: str, look: str) -> str:

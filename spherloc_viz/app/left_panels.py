@@ -7,7 +7,7 @@ import viser
 from numpy.typing import NDArray
 
 from spherloc_viz.app.controls.steps_panel import StepsPanel
-from spherloc_viz.app.glossary import Glossary
+from spherloc_viz.app.glossary import Glossary, heading_html
 from spherloc_viz.app.introduction import introduction_html
 from spherloc_viz.app.matches.image_panel import ImagePanel
 from spherloc_viz.app.matches.match_table import MatchTable
@@ -58,8 +58,10 @@ class LeftPanels:
         with _view(gui, views, "Residuals"):
             self._residuals = ResidualView(gui, touches, changed, select)
         with _view(gui, views, "Images"):
+            gui.add_html(heading_html("What the camera measured, and where the pose puts it", "residual"))
             self._images = ImagePanel(gui, touches, changed)
         with _view(gui, views, "Matches"):
+            gui.add_html(heading_html("Press a row: the match lights up everywhere", "match"))
             self._matches = MatchTable(gui, touches, changed)
         self._panel, self._width_px = steps, width_px
         steps.dock_left()

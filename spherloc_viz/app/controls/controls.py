@@ -22,6 +22,7 @@ from spherloc_viz.app.controls.presets import Preset, presets
 from spherloc_viz.app.controls.scene_controls import SceneControls
 from spherloc_viz.app.controls.sequence_panel import SequencePanel
 from spherloc_viz.app.controls.slow_run import SlowRun
+from spherloc_viz.app.glossary import heading_html
 from spherloc_viz.app.panels.compare_panel import ComparePanel
 from spherloc_viz.app.panels.export_panel import ExportPanel, Shown
 from spherloc_viz.app.panels.open_panel import Opened as OpenedScene
@@ -171,12 +172,16 @@ class Controls:
         with tabs.add_tab("Play"):
             self._build_play(gui)
         with tabs.add_tab("Compare"):
+            gui.add_html(heading_html("Several estimators on this problem", "estimator"))
             self.compare = ComparePanel(gui, touches, owner.use_estimator, owner.redraw, owner.prepare_estimator)
         with tabs.add_tab("Sweep"):
+            gui.add_html(heading_html("From where on does an estimator fail?", "sweep"))
             self._sweep = SweepPanel(gui, touches, self._chosen_sweep, services.recorder)
         with tabs.add_tab("Open"):
+            gui.add_html(heading_html("Other scenes, and matches of your own", "scene"))
             self._open = OpenPanel(gui, client, touches, services.roots, self._open_scene)
         with tabs.add_tab("Recordings"):
+            gui.add_html(heading_html("Recorded runs, and a gallery of failures", "recording"))
             page = Page(services.roots, self._enter, owner.open, owner.open_recorded, services.downloads)
             self._recordings = RecordingsPanel(gui, client, touches, services.library, self.review, page)
         with tabs.add_tab("Share"):
