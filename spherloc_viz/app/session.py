@@ -116,7 +116,7 @@ class Session:
     # What a person does. All of this comes on threads of viser's or of the front door's, and only notes requests.
 
     def changed(self, event: object = None) -> None:
-        """A widget that a run depends on was changed by a hand on the page."""
+        """A widget that a run depends on was changed on the page by its user."""
         self._controls.slow.outdate()
         self._solver.ask()
 
@@ -396,7 +396,7 @@ class Session:
         return None
 
     def _examine(self, asked: bool) -> float | None:
-        """The doctor thread's job: once nothing has changed for a while, diagnose the newest run and show it."""
+        """The diagnosis thread's job: once nothing has changed for a while, diagnose the newest run and show it."""
         run = self._run
         if run is None or self._diagnosis(run) is not None:
             return None

@@ -55,7 +55,7 @@ class Status:
 
 
 def _line_html(sentence: str, wrong: bool = False) -> str:
-    """As high as two lines, so that widgets below do not jump under a hand when the sentence gets longer."""
+    """As high as two lines, so that widgets below do not jump under the pointer when the sentence gets longer."""
     return f'<div style="font-size:12px;min-height:3.4em">{status_html(sentence, wrong)}</div>'
 
 

@@ -104,7 +104,7 @@ def stop_viser(server: viser.ViserServer) -> None:
 
 
 def changes_of(part: Any) -> Changes:
-    """The numbers of what a hand changes in a client's ``gui``."""
+    """The numbers of what a user changes in a client's ``gui``."""
     return part.__dict__.setdefault("_spherloc_changes", Changes())
 
 
@@ -138,7 +138,7 @@ def put_handle(handle: Any, wxyz: Any, position: Any) -> None:
 
 
 def follow_changes(client: viser.ClientHandle, pressed: Callable[[Any], None]) -> Changes:
-    """Number what a hand changes on a client's page, and what is set in answer.
+    """Number what a user changes on a client's page, and what is set in answer.
 
     ``pressed`` is called at once with what the page reports of other presses.
 
@@ -169,7 +169,7 @@ def follow_changes(client: viser.ClientHandle, pressed: Callable[[Any], None]) -
 
 
 def _hear(client: viser.ClientHandle, changes: Changes, message: Any, pressed: Callable[[Any], None]) -> None:
-    """Take over what a hand has changed, and call the callbacks, which are no coroutines."""
+    """Take over what a user has changed, and call the callbacks, which are no coroutines."""
     if not (isinstance(message.uuid, str) and isinstance(message.updates, dict)):
         return
     gui: Any = client.gui
