@@ -10,8 +10,8 @@ from spherloc_viz.app.run_request import RunRequest
 MOST = 200
 """Requests that are remembered."""
 SAME_MOVE_S = 5.0
-"""Changes of the same control count as one while the pointer is held down, and within this time, since a slider is often
-corrected after a look at the picture. Another control, or an undo, in between ends the move at once."""
+"""Changes of the same control count as one while the pointer is held down, and within this time, since a slider is
+often corrected after a look at the picture. Another control, or an undo, in between ends the move at once."""
 PRESSED = frozenset({"seed", "estimator"})
 """What is not dragged: each change counts."""
 OPTIONS = "options."
