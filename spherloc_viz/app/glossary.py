@@ -72,7 +72,7 @@ def help_html(term: str) -> str:
 
 def heading_html(words: str, term: str) -> str:
     """What a panel shows, in a line, with a question mark that tells what a term means."""
-    return box(f'<div style="{DIM}">{escape(words)}{help_html(term)}</div>', "font-size:12px")
+    return box(f'<span style="{DIM}">{escape(words)}</span>{help_html(term)}', "font-size:12px")
 
 
 def _mark(term: str, words: str, look: str) -> str:
