@@ -1,0 +1,62 @@
+"""The pages of the lessons: the list at ``/learn``, a lesson at ``/learn/NAME``, and their pictures."""
+
+import base64
+import hashlib
+import re
+
+from aiohttp import web
+
+from spherloc.errors import InputError
+from spherloc_viz.app.web.guard import SAFE
+from spherloc_viz.app.web.viewer import SORRY_POLICY, sorry_page
+from spherloc_viz.lessons import lesson_named, lessons
+from spherloc_viz.lessons.course import picture_of
+from spherloc_viz.lessons.html import lesson_page, list_page
+
+LEARN = "/learn"
+PICTURES = f"{LEARN}/pictures/"
+
+
+def is_learning(path: str) -> bool:
+    """Whether a path is that of a page of the lessons."""
+    return path == LEARN or path.startswith(f"{LEARN}/")
+
+
+def learn_answer(request: web.Request) -> web.Response:
+    """The list, a lesson, or a picture; who asks has been checked at the door."""
+    path = request.path
+    if path.startswith(PICTURES):
+        picture = picture_of(path.removeprefix(PICTURES))
+        if picture is None:
+            return web.Response(status=404, text="There is no such picture.\n", headers=SAFE)
+        headers = SAFE | {"Cache-Control": "max-age=3600"}
+        return web.Response(body=picture, content_type="image/webp", headers=headers)
+    try:
+        if path.rstrip("/") == LEARN:
+            pictures = {one.name: PICTURES + one.name for one in lessons() if picture_of(one.name)}
+            return _html(list_page(lessons(), pictures))
+        return _html(lesson_page(lesson_named(path.removeprefix(f"{LEARN}/")), lessons()))
+    except InputError as error:
+        return _html(sorry_page(str(error)), SORRY_POLICY, 404)
+
+
+def _html(text: str, policy: str = "", status: int = 200) -> web.Response:
+    headers = SAFE | {"Content-Security-Policy": policy or _policy(text), "Cache-Control": "no-cache"}
+    return web.Response(status=status, text=text, content_type="text/html", charset="utf-8", headers=headers)
+
+
+def _policy(html: str) -> str:
+    """Only the page's own script runs, and only this server's page is shown in its frame."""
+    scripts = re.findall(r"<script>(.*?)</script>", html, flags=re.DOTALL)
+    hashes = [base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in scripts]
+    rules = {
+        "default-src": "'none'",
+        "script-src": " ".join(f"'sha256-{digest}'" for digest in hashes) or "'none'",
+        "style-src": "'unsafe-inline'",
+        "img-src": "'self' data:",
+        "frame-src": "'self'",
+        "base-uri": "'none'",
+        "form-action": "'none'",
+        "frame-ancestors": "'none'",
+    }
+    return "; ".join(f"{name} {value}" for name, value in rules.items())

@@ -1,0 +1,186 @@
+// Has the scene beside a lesson show the moment that is read. The scene is the playground's own page in a frame; it is
+// driven through its address, as a link would (app/web/link.js), and tells the numbers of its run when it is asked to.
+(() => {
+  const EVERY_MS = 150, MANY = ["set", "option"];
+  const frame = document.querySelector("iframe"), prose = document.querySelector(".prose");
+  const moments = [...document.querySelectorAll("section")], where = document.querySelector(".where");
+  const changes = new Map();  // what the reader changed, by moment
+  const light = matchMedia("(prefers-color-scheme: light)");
+  let now = null, wanted = "", sent = "", landed = "";
+
+  // Values of a state by key; of those that may be said several times by key and name.
+  function parts(state) {
+    return new Map([...new URLSearchParams(state)].map(([key, value]) =>
+      [MANY.includes(key) ? `${key}.${value.split("=")[0]}` : key, value]));
+  }
+
+  function text(all) {
+    const said = [...all].filter(([, value]) => value);
+    return new URLSearchParams(said.map(([key, value]) => [key.split(".")[0], value])).toString();
+  }
+
+  const changed = (state, more) => text(new Map([...parts(state), ...parts(more)]));
+
+  function stateOf(moment) {
+    const hidden = moment.dataset.before && !moment.classList.contains("answered");
+    const state = changed(hidden ? moment.dataset.before : moment.dataset.state, changes.get(moment) ?? "");
+    return light.matches ? changed(state, "theme=light") : state;
+  }
+
+  function go() {
+    wanted = stateOf(now);
+    document.body.classList.add("waiting");
+    const open = now.querySelector(".open a");
+    if (open) open.href = `/#${wanted}`;
+    for (const control of now.querySelectorAll("[data-key]")) {
+      const value = parts(wanted).get(control.dataset.key);
+      if (value === undefined) continue;
+      control.value = control.dataset.key.includes(".") ? value.slice(value.indexOf("=") + 1) : value;
+      tellValue(control);
+    }
+  }
+
+  function tellValue(control) {
+    if (control.type !== "range") return;
+    const percent = "percent" in control.dataset;
+    control.nextElementSibling.textContent = percent ? `${Math.round(100 * control.value)} %` : control.value;
+  }
+
+  function change(moment, more) {
+    changes.set(moment, changed(changes.get(moment) ?? "", more));
+    if (moment !== now) enter(moment);
+    go();
+  }
+
+  function enter(moment) {
+    now?.classList.remove("now");
+    now = moment;
+    now.classList.add("now");
+    const place = moments.indexOf(now);
+    where.textContent = `${place + 1} of ${moments.length}: ${now.querySelector("h2").textContent}`;
+    history.replaceState(null, "", `#m${place}`);
+    go();
+  }
+
+  // The moment that is read is the last one that begins in the upper part of the text.
+  function look() {
+    const box = prose.getBoundingClientRect(), line = box.top + 0.4 * box.height;
+    const atEnd = prose.scrollTop + prose.clientHeight >= prose.scrollHeight - 2;
+    const begun = moments.filter((one) => one.getBoundingClientRect().top <= line);
+    const found = atEnd ? moments.at(-1) : (begun.at(-1) ?? moments[0]);
+    if (found !== now) enter(found);
+  }
+
+  function step(by) {
+    const next = moments[Math.min(Math.max(moments.indexOf(now) + by, 0), moments.length - 1)];
+    next.scrollIntoView({ block: "start" });
+    next.focus({ preventScroll: true });
+  }
+
+  const inside = (selector) => frame.contentDocument?.querySelector(selector);
+
+  // The lesson is the panel here: of the playground's own only the views can be seen, if somebody wants (touch.css).
+  function fold() {
+    const look = frame.contentDocument?.body?.classList, views = document.body.classList.contains("views");
+    if (!look || (look.contains("in-lesson") && look.contains("in-lesson-views") === views)) return;
+    look.add("in-lesson");
+    look.toggle("in-lesson-views", views);
+    frame.contentWindow.dispatchEvent(new Event("resize"));
+  }
+
+  function tell(detail) {
+    const page = frame.contentWindow;
+    page.dispatchEvent(new page.CustomEvent("spherloc-touch", { detail }));
+  }
+
+  function write(numbers) {
+    for (const place of now.querySelectorAll("[data-number]"))
+      place.textContent = numbers[place.dataset.number] ?? "no number";
+    document.body.classList.remove("waiting");
+  }
+
+  setInterval(() => {
+    fold();
+    const said = inside("[data-address]");
+    if (!said || !inside("[data-ready]")) return;
+    if (wanted !== sent) {
+      sent = wanted;
+      landed = "";
+      frame.contentWindow.location.replace(`/#${wanted}`);
+      return;
+    }
+    if (!said.dataset.numbers) tell("numbers:");
+    else if (frame.contentWindow.location.hash === `#${said.dataset.address}`) {
+      if (landed !== said.dataset.numbers) {
+        landed = said.dataset.numbers;
+        write(JSON.parse(landed));
+      }
+    }
+  }, EVERY_MS);
+
+  // Answers. With the teacher's view on, a press counts a vote, and the answer is shown when the class has voted.
+  function answer(item) {
+    const moment = item.closest("section");
+    item.classList.add("told");
+    item.querySelector("button").setAttribute("aria-expanded", "true");
+    moment.classList.add("answered");
+    changes.set(moment, item.dataset.go ?? "");
+    if (moment !== now) enter(moment);
+    go();
+  }
+
+  function vote(item) {
+    const count = item.querySelector(".votes");
+    count.textContent = String(Number(count.textContent) + 1);
+  }
+
+  function press(name, button) {
+    if (name === "up" || name === "down") return step(name === "up" ? -1 : 1);
+    const on = document.body.classList.toggle(name);
+    (button ?? document.querySelector(`[data-press=${name}]`)).setAttribute("aria-pressed", String(on));
+    now.scrollIntoView({ block: "start" });
+  }
+
+  addEventListener("click", (event) => {
+    if (!(event.target instanceof Element)) return;
+    const link = event.target.closest("[data-change]"), item = event.target.closest(".answers li > button")?.parentElement;
+    const button = event.target.closest("[data-press]");
+    if (link) {
+      event.preventDefault();
+      change(link.closest("section") ?? now, link.dataset.change);
+    } else if (item) {
+      const unanswered = !item.closest("section").classList.contains("answered");
+      if (document.body.classList.contains("teacher") && unanswered) vote(item);
+      else answer(item);
+    } else if (event.target.closest(".reveal")) answer(event.target.closest(".question").querySelector(".right"));
+    else if (button) press(button.dataset.press, button);
+  });
+
+  addEventListener("input", ({ target }) => {
+    const key = target.dataset?.key;
+    if (!key) return;
+    const [many, name] = key.split(".");
+    const more = new URLSearchParams([[many, name ? `${name}=${target.value}` : target.value]]);
+    change(target.closest("section"), more.toString());
+  });
+
+  addEventListener("keydown", (event) => {
+    const writing = event.target instanceof Element && event.target.closest("input,select,textarea");
+    if (writing || event.ctrlKey || event.metaKey || event.altKey) return;
+    const moves = { PageDown: 1, ArrowRight: 1, PageUp: -1, ArrowLeft: -1 };
+    if (event.key in moves) step(moves[event.key]);
+    else if (event.key.toLowerCase() === "l") press("large");
+    else if (event.key.toLowerCase() === "t") press("teacher");
+    else if (event.key.toLowerCase() === "v") press("views");
+    else return;
+    event.preventDefault();
+  });
+
+  light.addEventListener("change", () => go());
+  prose.addEventListener("scroll", look, { passive: true });
+  const start = moments[Number(/^#m(\d+)$/.exec(location.hash)?.[1] ?? 0)] ?? moments[0];
+  if (start !== moments[0]) start.scrollIntoView({ block: "start" });
+  enter(start);
+  sent = wanted;
+  frame.src = `/#${wanted}`;
+})();
