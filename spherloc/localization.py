@@ -91,11 +91,13 @@ class Localization:
                 ("inliers", f"{count} of {total}"),
             ]
         if self.certificate is not None:
-            rows.append(("at most", f"{self.certificate.upper_bound} for any pose"))
+            least, most = self.certificate.lower_bound, self.certificate.upper_bound
+            size = f"{most}" if least == most else f"{least} to {most}"
+            rows.append(("certificate", f"the largest consensus of any pose, before refinement: {size} of {total}"))
         return rows + [("but", reason) for reason in self.judgement.reasons]
 
     def __repr__(self) -> str:
-        return "Localization\n" + "\n".join(f"  {name:9} {value}" for name, value in self._rows())
+        return "Localization\n" + "\n".join(f"  {name:11} {value}" for name, value in self._rows())
 
     def _repr_html_(self) -> str:
         rows = (f"<tr><th>{escape(name)}</th><td>{escape(value)}</td></tr>" for name, value in self._rows())

@@ -1,16 +1,16 @@
-"""Checks that every camera model shares: calibration values, ``[camera]`` tables and coordinate arrays."""
+"""What camera models share: checks of calibration values and coordinate arrays, ``[camera]`` tables, focal lengths."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from math import inf, isfinite
 from numbers import Integral, Real
-from typing import Any, TypeVar
+from typing import Any, ClassVar, Self, TypeVar
 
 import numpy as np
 
 from spherloc.errors import CalibrationError, ProblemError, show
-from spherloc.types import FloatArray
+from spherloc.types import BoolArray, FloatArray
 
 MAX_SIDE_PX = 100_000
 """Largest width or height: beyond any panorama, so that a corrupt size cannot exhaust the memory."""
@@ -49,44 +49,6 @@ def coefficients(key: str, value: Any, names: str) -> tuple[float, ...]:
     if len(numbers) != count or not all(number is not None and isfinite(number) for number in numbers):
         raise _bad(key, value, f"give a list of {count} finite numbers, {names}")
     return tuple(number for number in numbers if number is not None)
-
-
-def check_focal(camera: Any) -> None:
-    """Check and normalise width, height, fx, fy, cx and cy of a frozen camera while it is being constructed.
-
-    Raises ``CalibrationError`` for an unusable value.
-    """
-    checked: dict[str, Any] = {key: whole_pixels(key, getattr(camera, key)) for key in ("width", "height")}
-    checked |= {key: positive(key, getattr(camera, key)) for key in ("fx", "fy")}
-    checked |= {key: finite(key, getattr(camera, key)) for key in ("cx", "cy")}
-    for key, value in checked.items():
-        object.__setattr__(camera, key, value)
-
-
-def check_lens(camera: Any, coefficient_names: str) -> None:
-    """``check_focal``, and the same for ``distortion``; raises ``CalibrationError`` for an unusable value."""
-    check_focal(camera)
-    object.__setattr__(camera, "distortion", coefficients("distortion", camera.distortion, coefficient_names))
-
-
-def check_sees_image(camera: Any, rim: float, shape: str | None = None) -> None:
-    """Raise ``CalibrationError`` for a fisheye camera that can unproject no pixel of its own image.
-
-    ``rim`` is the distorted radius, in focal lengths, of the last direction that the model can invert; ``shape``
-    quotes the keys that decide on it, by default the distortion.
-    """
-    if not 1.0 <= rim * min(camera.fx, camera.fy) < inf:
-        quoted = shape or f"camera key 'distortion' is {show(list(camera.distortion))}"
-        raise CalibrationError(
-            f"{quoted}, which cannot be inverted one pixel away from the principal point: "
-            "check the order and the signs of the coefficients."
-        )
-    nearest = [[min(max(camera.cx, 0.0), camera.width), min(max(camera.cy, 0.0), camera.height)]]
-    if not camera.unproject(np.array(nearest))[1][0]:
-        raise CalibrationError(
-            f"camera keys 'cx', 'cy' are {camera.cx:g}, {camera.cy:g}, from where the lens reaches no pixel of the "
-            f"{camera.width} x {camera.height} image: give the principal point in pixels."
-        )
 
 
 def camera_from_keys(cls: type[C], table: Any, where: str) -> C:
@@ -144,17 +106,121 @@ def rows(name: str, array: Any, columns: int) -> FloatArray:
     return given.astype(np.float64, copy=False)
 
 
-def plane(camera: Any, pixels: Any, max_radius: float) -> tuple[FloatArray, FloatArray]:
-    """Pixels (N, 2) in focal lengths from the principal point, x and y, each (N,); NaN from ``max_radius`` on.
+@dataclass(frozen=True)
+class FocalCamera:
+    """A camera with focal lengths and a principal point; what a focal length is exactly, each model says."""
 
-    Raises ``ProblemError`` for a wrong shape.
-    """
-    u, v = rows("pixels", pixels, 2).T
-    with np.errstate(all="ignore"):
-        x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
-        outside = ~(np.hypot(x, y) < max_radius)
-    x[outside] = y[outside] = np.nan
-    return x, y
+    model: ClassVar[str]
+
+    width: int
+    """Image width in pixels."""
+    height: int
+    """Image height in pixels."""
+    fx: float
+    """Focal length along x in pixels."""
+    fy: float
+    """Focal length along y in pixels."""
+    cx: float
+    """Principal point, x in pixels; the centre of the top-left pixel is 0.5."""
+    cy: float
+    """Principal point, y in pixels; the centre of the top-left pixel is 0.5."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """The ``[camera]`` table: model and all fields."""
+        return camera_to_table(self)
+
+    @classmethod
+    def from_dict(cls, table: dict[str, Any], where: str) -> Self:
+        """Build from a ``[camera]`` table; raises ``CalibrationError`` (see ``Camera.from_dict``)."""
+        return camera_from_keys(cls, table, where)
+
+    def project(self, points: FloatArray) -> tuple[FloatArray, BoolArray]:
+        """Pixels (N, 2) of camera-frame points (N, 3) in metres, and the mask (N,) of directions that are valid.
+
+        Valid is what the model maps to pixels of their own (see its module); other pixels are NaN.
+        Raises ``ProblemError`` for a wrong shape.
+        """
+        points = rows("points", points, 3)
+        with np.errstate(all="ignore"):
+            x, y, valid = self._plane_points(points)
+            pixels = np.column_stack([self.cx + self.fx * x, self.cy + self.fy * y])
+        pixels[~valid] = np.nan
+        return pixels, valid
+
+    def unproject(self, pixels: FloatArray) -> tuple[FloatArray, BoolArray]:
+        """Unit bearings (N, 3) of pixels (N, 2), and the mask (N,) of pixels that the lens reaches.
+
+        Raises ``ProblemError`` for a wrong shape.
+        """
+        with np.errstate(all="ignore"):
+            bearings = self._bearings(pixels)
+        return bearings, ~np.isnan(bearings[:, 2])
+
+    def _plane_points(self, points: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Where points (N, 3) are seen, in focal lengths from the principal point: x, y and which are valid, (N,)."""
+        raise NotImplementedError
+
+    def _bearings(self, pixels: FloatArray) -> FloatArray:
+        """Unit bearings (N, 3) of pixels (N, 2), NaN where the lens reaches none."""
+        raise NotImplementedError
+
+    def check_focal(self) -> None:
+        """Check and normalise sizes, focal lengths and principal point while the camera is being constructed.
+
+        Raises ``CalibrationError`` for an unusable value.
+        """
+        checks = {
+            "width": whole_pixels,
+            "height": whole_pixels,
+            "fx": positive,
+            "fy": positive,
+            "cx": finite,
+            "cy": finite,
+        }
+        for key, check in checks.items():
+            object.__setattr__(self, key, check(key, getattr(self, key)))
+
+    def check_lens(self, coefficient_names: str) -> None:
+        """``check_focal``, and the same for ``distortion``; raises ``CalibrationError`` for an unusable value."""
+        self.check_focal()
+        given = getattr(self, "distortion", None)
+        object.__setattr__(self, "distortion", coefficients("distortion", given, coefficient_names))
+
+    def check_sees_image(self, rim: float, shape: str | None = None) -> None:
+        """Raise ``CalibrationError`` for a fisheye camera that can unproject no pixel of its own image.
+
+        ``rim`` is the distorted radius, in focal lengths, of the last direction that the model can invert; ``shape``
+        quotes the keys that decide on it, by default the distortion.
+        """
+        if not 1.0 <= rim * min(self.fx, self.fy) < inf:
+            quoted = shape or f"camera key 'distortion' is {show(list(getattr(self, 'distortion', ())))}"
+            raise CalibrationError(
+                f"{quoted}, which cannot be inverted one pixel away from the principal point: "
+                "check the order and the signs of the coefficients."
+            )
+        nearest = [[min(max(self.cx, 0.0), self.width), min(max(self.cy, 0.0), self.height)]]
+        if not self.unproject(np.array(nearest))[1][0]:
+            raise CalibrationError(
+                f"camera keys 'cx', 'cy' are {self.cx:g}, {self.cy:g}, from where the lens reaches no pixel of the "
+                f"{self.width} x {self.height} image: give the principal point in pixels."
+            )
+
+    def plane(self, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Pixels (N, 2) in focal lengths from the principal point, x and y, each (N,).
+
+        Raises ``ProblemError`` for a wrong shape.
+        """
+        u, v = rows("pixels", pixels, 2).T
+        with np.errstate(all="ignore"):
+            return (u - self.cx) / self.fx, (v - self.cy) / self.fy
+
+    def plane_within(self, pixels: FloatArray, max_radius: float) -> tuple[FloatArray, FloatArray]:
+        """``plane``, with NaN from ``max_radius`` on."""
+        x, y = self.plane(pixels)
+        with np.errstate(all="ignore"):
+            outside = ~(np.hypot(x, y) < max_radius)
+        x[outside] = y[outside] = np.nan
+        return x, y
 
 
 def _as_float(value: Any) -> float | None:

@@ -9,7 +9,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-from spherloc.cameras import kalibr, tool_files
+from spherloc.cameras import tool_files
 from spherloc.cameras._checks import located
 from spherloc.cameras._files import KNOWN, UnrecognisedError, parse_json, parse_yaml, read_text, table_of, value_of
 from spherloc.cameras.base import Camera
@@ -92,12 +92,12 @@ def _from_yaml(document: Any, name: str | None) -> Camera:
     keys = {str(key) for key in document} if isinstance(document, dict) else set()
     if "model_type" in keys:
         return tool_files.kitti360(document, name)
-    chain = kalibr.chain_tables(document)
+    chain = tool_files.chain_tables(document)
     if chain:
         if name is not None and name not in chain:
             raise CalibrationError(f"has no camera {show(name)}: choose one of {', '.join(chain)}.")
         name = name or next(iter(chain))
-        return kalibr.camera_of(name, chain[name])
+        return tool_files.camera_of(name, chain[name])
     if any(key.startswith(tool_files.STELLA_PREFIX) for key in keys):
         keys.add("Camera")
     for mark, read in _ONE_CAMERA.items():

@@ -9,7 +9,7 @@ These are the folds themselves; the limit w2 that the paper prints is up to a fe
 from dataclasses import dataclass
 from functools import cached_property
 from math import sqrt
-from typing import Any, ClassVar, Self
+from typing import ClassVar
 
 import numpy as np
 
@@ -25,23 +25,14 @@ _TOUCHES = 1.0 - 1e-6
 
 
 @dataclass(frozen=True)
-class DoubleSphere:
-    """Fisheye camera that projects onto two unit spheres, one after the other, and from there onto the plane."""
+class DoubleSphere(_checks.FocalCamera):
+    """Fisheye camera that projects onto two unit spheres, one after the other, and from there onto the plane.
+
+    fx and fy are those of the projection behind both spheres.
+    """
 
     model: ClassVar[str] = "double_sphere"
 
-    width: int
-    """Image width in pixels."""
-    height: int
-    """Image height in pixels."""
-    fx: float
-    """Focal length along x in pixels, of the projection behind both spheres."""
-    fy: float
-    """Focal length along y in pixels, of the projection behind both spheres."""
-    cx: float
-    """Principal point, x in pixels; the centre of the top-left pixel is 0.5."""
-    cy: float
-    """Principal point, y in pixels; the centre of the top-left pixel is 0.5."""
     xi: float
     """Distance between the centres of the two spheres, above -1."""
     alpha: float
@@ -52,10 +43,10 @@ class DoubleSphere:
         if not -1.0 < self.xi <= _LARGEST_XI:
             raise CalibrationError(f"camera key 'xi' is {self.xi:g}: give a number above -1 and up to {_LARGEST_XI:g}.")
         object.__setattr__(self, "alpha", eucm.alpha_of(self.alpha))
-        _checks.check_focal(self)
+        self.check_focal()
         with np.errstate(all="ignore"):
             keys = f"camera keys 'xi', 'alpha' are {self.xi:g}, {self.alpha:g}"
-            _checks.check_sees_image(self, self.max_radius, keys)
+            self.check_sees_image(self.max_radius, keys)
 
     @cached_property
     def max_radius(self) -> float:
@@ -68,50 +59,28 @@ class DoubleSphere:
         depth = self.alpha + (1.0 - self.alpha) * sqrt(1.0 - sine * sine)
         return min(sine / depth * (1.0 - RIM_MARGIN), second) if depth > 0.0 else second
 
-    def project(self, points: FloatArray) -> tuple[FloatArray, BoolArray]:
-        """Pixels (N, 2) of camera-frame points (N, 3) in metres, and the mask (N,) of directions that are valid.
+    def _plane_points(self, points: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Valid is what lies before both folds (see the module's text)."""
+        x, y, z = points.T
+        norm = np.hypot(np.hypot(x, y), z)
+        mx, my, valid = eucm.plane_points(x, y, z + self.xi * norm, self.alpha, 1.0)
+        return mx, my, valid & (norm + self.xi * z > 0.0) & (norm < np.inf) & (np.hypot(mx, my) < self.max_radius)
 
-        Valid is what lies before both folds (see the module's text); other pixels are NaN.
-        Raises ``ProblemError`` for a wrong shape.
-        """
-        x, y, z = _checks.rows("points", points, 3).T
-        with np.errstate(all="ignore"):
-            norm = np.hypot(np.hypot(x, y), z)
-            mx, my, valid = eucm.plane_points(x, y, z + self.xi * norm, self.alpha, 1.0)
-            valid &= (norm + self.xi * z > 0.0) & (norm < np.inf) & (np.hypot(mx, my) < self.max_radius)
-            pixels = np.column_stack([self.cx + self.fx * mx, self.cy + self.fy * my])
-        pixels[~valid] = np.nan
-        return pixels, valid
-
-    def unproject(self, pixels: FloatArray) -> tuple[FloatArray, BoolArray]:
-        """Unit bearings (N, 3) of pixels (N, 2), and the mask (N,) of pixels that the lens reaches.
-
-        Raises ``ProblemError`` for a wrong shape.
-        """
-        mx, my = _checks.plane(self, pixels, self.max_radius)
-        moved = eucm.rays(mx, my, self.alpha, 1.0)
+    def _bearings(self, pixels: FloatArray) -> FloatArray:
+        moved = eucm.rays(*self.plane_within(pixels, self.max_radius), self.alpha, 1.0)
         root, reach = self._first_sphere(moved)
         z = moved[:, 2] * root - self.xi * (moved[:, 0] ** 2 + moved[:, 1] ** 2)
-        return np.column_stack([reach * moved[:, 0], reach * moved[:, 1], z]), ~np.isnan(mx)
+        return np.column_stack([reach * moved[:, 0], reach * moved[:, 1], z])
 
     def unprojection_jacobian(self, pixels: FloatArray) -> FloatArray:
         """d bearing / d pixel (N, 3, 2), per pixel; NaN where ``unproject`` is invalid."""
-        mx, my = _checks.plane(self, pixels, self.max_radius)
+        mx, my = self.plane_within(pixels, self.max_radius)
         moved = eucm.rays(mx, my, self.alpha, 1.0)
         jacobian = eucm.rays_jacobian(mx, my, self.alpha, 1.0) / (self.fx, self.fy)
         root, reach = self._first_sphere(moved)
         # d reach = xi reach / root dz, where dz is that of the moved ray
         longer = (self.xi / root)[:, None, None] * moved[:, :, None] * jacobian[:, None, 2, :]
         return reach[:, None, None] * (jacobian + longer)
-
-    def to_dict(self) -> dict[str, Any]:
-        """The ``[camera]`` table: model, width, height, fx, fy, cx, cy, xi, alpha."""
-        return _checks.camera_to_table(self)
-
-    @classmethod
-    def from_dict(cls, table: dict[str, Any], where: str) -> Self:
-        """Build from a ``[camera]`` table; raises ``CalibrationError`` (see ``Camera.from_dict``)."""
-        return _checks.camera_from_keys(cls, table, where)
 
     def _first_sphere(self, moved: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Where unit rays (N, 3) from (0, 0, -xi) meet the unit sphere: the root in the solution, and the distance."""

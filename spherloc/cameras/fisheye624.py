@@ -10,7 +10,7 @@ for real lenses is far wider than the image.
 from dataclasses import dataclass
 from functools import cached_property
 from math import hypot
-from typing import Any, ClassVar, Self
+from typing import ClassVar
 
 import numpy as np
 
@@ -29,58 +29,32 @@ _TOLERANCE = 1e-13
 
 
 @dataclass(frozen=True)
-class Fisheye624:
-    """Fisheye camera with radial, tangential and thin-prism distortion."""
+class Fisheye624(_checks.FocalCamera):
+    """Fisheye camera with radial, tangential and thin-prism distortion; fx, fy are pixels per radian on the axis."""
 
     model: ClassVar[str] = "fisheye624"
 
-    width: int
-    """Image width in pixels."""
-    height: int
-    """Image height in pixels."""
-    fx: float
-    """Focal length along x in pixels per radian on the optical axis."""
-    fy: float
-    """Focal length along y in pixels per radian on the optical axis."""
-    cx: float
-    """Principal point, x in pixels; the centre of the top-left pixel is 0.5."""
-    cy: float
-    """Principal point, y in pixels; the centre of the top-left pixel is 0.5."""
     distortion: tuple[float, ...]
     """k0 to k5 (radial), p0, p1 (tangential) and s0 to s3 (prism), without unit, in Aria's and COLMAP's order."""
 
     def __post_init__(self) -> None:
-        _checks.check_lens(self, "k0, k1, k2, k3, k4, k5, p0, p1, s0, s1, s2, s3")
+        self.check_lens("k0, k1, k2, k3, k4, k5, p0, p1, s0, s1, s2, s3")
         with np.errstate(all="ignore"):
-            _checks.check_sees_image(self, self._curve.end)
+            self.check_sees_image(self._curve.end)
 
     @property
     def max_angle_rad(self) -> float:
         """Largest angle to the optical axis that the model can invert, at most pi."""
         return self._curve.max_angle_rad
 
-    def project(self, points: FloatArray) -> tuple[FloatArray, BoolArray]:
-        """Pixels (N, 2) of camera-frame points (N, 3) in metres, and the mask (N,) of directions that are valid.
+    def _plane_points(self, points: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Valid is what is within ``max_angle_rad`` of the optical axis."""
+        x, y, valid = self._curve.plane(points)
+        dx, dy = self._shift(x, y)
+        return x + dx, y + dy, valid
 
-        Valid is what is within ``max_angle_rad`` of the optical axis; other pixels are NaN.
-        Raises ``ProblemError`` for a wrong shape.
-        """
-        points = _checks.rows("points", points, 3)
-        with np.errstate(all="ignore"):
-            x, y, valid = self._curve.plane(points)
-            dx, dy = self._shift(x, y)
-            pixels = np.column_stack([self.cx + self.fx * (x + dx), self.cy + self.fy * (y + dy)])
-        pixels[~valid] = np.nan
-        return pixels, valid
-
-    def unproject(self, pixels: FloatArray) -> tuple[FloatArray, BoolArray]:
-        """Unit bearings (N, 3) of pixels (N, 2), and the mask (N,) of pixels that the lens reaches.
-
-        Raises ``ProblemError`` for a wrong shape.
-        """
-        with np.errstate(all="ignore"):
-            bearings = self._curve.bearings(*self._unshift(pixels))
-        return bearings, ~np.isnan(bearings[:, 2])
+    def _bearings(self, pixels: FloatArray) -> FloatArray:
+        return self._curve.bearings(*self._unshift(pixels))
 
     def unprojection_jacobian(self, pixels: FloatArray) -> FloatArray:
         """d bearing / d pixel (N, 3, 2), per pixel; NaN where ``unproject`` is invalid."""
@@ -89,15 +63,6 @@ class Fisheye624:
             xx, xy, yx, yy = self._shift_jacobian(x, y)
             inverse = np.array([[yy, -xy], [-yx, xx]]) / (xx * yy - xy * yx)
             return np.einsum("nij,jkn->nik", self._curve.jacobian(x, y), inverse) / (self.fx, self.fy)
-
-    def to_dict(self) -> dict[str, Any]:
-        """The ``[camera]`` table: model, width, height, fx, fy, cx, cy, distortion."""
-        return _checks.camera_to_table(self)
-
-    @classmethod
-    def from_dict(cls, table: dict[str, Any], where: str) -> Self:
-        """Build from a ``[camera]`` table; raises ``CalibrationError`` (see ``Camera.from_dict``)."""
-        return _checks.camera_from_keys(cls, table, where)
 
     @cached_property
     def _curve(self) -> AngleCurve:
@@ -135,8 +100,7 @@ class Fisheye624:
 
     def _unshift(self, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Solve q + d(q) = m for pixels (N, 2): x, y of q, each (N,); NaN where there is no solution in the disc."""
-        u, v = _checks.rows("pixels", pixels, 2).T
-        mx, my = (u - self.cx) / self.fx, (v - self.cy) / self.fy
+        mx, my = self.plane(pixels)
         x, y = mx.copy(), my.copy()
         for _ in range(_NEWTON_STEPS):
             dx, dy = self._shift(x, y)

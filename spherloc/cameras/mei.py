@@ -10,7 +10,7 @@ therefore one to one. Such a disc, of the radius ``max_radius``, holds all that 
 from dataclasses import dataclass
 from functools import cached_property
 from math import atan, hypot, sqrt
-from typing import Any, ClassVar, Self
+from typing import ClassVar
 
 import numpy as np
 
@@ -33,23 +33,11 @@ _TOLERANCE = 1e-13
 
 
 @dataclass(frozen=True)
-class Mei:
-    """Unified omnidirectional camera with radial and tangential distortion."""
+class Mei(_checks.FocalCamera):
+    """Unified omnidirectional camera with radial and tangential distortion; fx, fy are KITTI-360's gamma1, gamma2."""
 
     model: ClassVar[str] = "mei"
 
-    width: int
-    """Image width in pixels."""
-    height: int
-    """Image height in pixels."""
-    fx: float
-    """Generalised focal length along x in pixels: KITTI-360's gamma1."""
-    fy: float
-    """Generalised focal length along y in pixels: KITTI-360's gamma2."""
-    cx: float
-    """Principal point, x in pixels; the centre of the top-left pixel is 0.5."""
-    cy: float
-    """Principal point, y in pixels; the centre of the top-left pixel is 0.5."""
     xi: float
     """Offset of the projection centre from the centre of the unit sphere, above -1; 0 is a pinhole, 1 stereographic."""
     distortion: tuple[float, float, float, float]
@@ -59,9 +47,9 @@ class Mei:
         object.__setattr__(self, "xi", _checks.finite("xi", self.xi))
         if not -1.0 < self.xi <= _LARGEST_XI:
             raise CalibrationError(f"camera key 'xi' is {self.xi:g}: give a number above -1 and up to {_LARGEST_XI:g}.")
-        _checks.check_lens(self, "k1, k2, p1, p2")
+        self.check_lens("k1, k2, p1, p2")
         with np.errstate(all="ignore"):
-            _checks.check_sees_image(self, self._reach)
+            self.check_sees_image(self._reach)
 
     @cached_property
     def max_radius(self) -> float:
@@ -82,36 +70,23 @@ class Mei:
         fold = first_positive_root([-7.0 * hypot(p1, p2), 3.0 * k1, 0.0, 5.0 * k2])
         return min(fold, _FARTHEST) * (1.0 - RIM_MARGIN)
 
-    def project(self, points: FloatArray) -> tuple[FloatArray, BoolArray]:
-        """Pixels (N, 2) of camera-frame points (N, 3) in metres, and the mask (N,) of directions that are valid.
+    def _plane_points(self, points: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Valid is what lies before both folds (see the module's text)."""
+        px, py, pz = points.T
+        norm = np.hypot(np.hypot(px, py), pz)
+        depth = pz + self.xi * norm
+        x, y = px / depth, py / depth
+        valid = (depth > 0.0) & (norm + self.xi * pz > 0.0) & (norm < np.inf) & (np.hypot(x, y) < self.max_radius)
+        return *self._distort(x, y), valid
 
-        Valid is what lies before both folds (see the module's text); other pixels are NaN.
-        Raises ``ProblemError`` for a wrong shape.
-        """
-        px, py, pz = _checks.rows("points", points, 3).T
-        with np.errstate(all="ignore"):
-            norm = np.hypot(np.hypot(px, py), pz)
-            depth = pz + self.xi * norm
-            x, y = px / depth, py / depth
-            valid = (depth > 0.0) & (norm + self.xi * pz > 0.0) & (norm < np.inf) & (np.hypot(x, y) < self.max_radius)
-            x, y = self._distort(x, y)
-            pixels = np.column_stack([self.cx + self.fx * x, self.cy + self.fy * y])
-        pixels[~valid] = np.nan
-        return pixels, valid
-
-    def unproject(self, pixels: FloatArray) -> tuple[FloatArray, BoolArray]:
-        """Unit bearings (N, 3) of pixels (N, 2), and the mask (N,) of pixels that the lens reaches (Eq. 8, 13, 14).
-
-        Raises ``ProblemError`` for a wrong shape.
-        """
-        with np.errstate(all="ignore"):
-            x, y = self._undistort(pixels)
-            s = x * x + y * y
-            root = np.sqrt(1.0 + s * (1.0 - self.xi**2))
-            scale = (self.xi + root) / (1.0 + s)
-            # Eq. 14 has z = scale - xi; this form of it does not cancel for a large xi.
-            bearings = np.column_stack([scale * x, scale * y, (root - self.xi * s) / (1.0 + s)])
-        return bearings, ~np.isnan(x)
+    def _bearings(self, pixels: FloatArray) -> FloatArray:
+        """Eq. 8, 13, 14."""
+        x, y = self._undistort(pixels)
+        s = x * x + y * y
+        root = np.sqrt(1.0 + s * (1.0 - self.xi**2))
+        scale = (self.xi + root) / (1.0 + s)
+        # Eq. 14 has z = scale - xi; this form of it does not cancel for a large xi.
+        return np.column_stack([scale * x, scale * y, (root - self.xi * s) / (1.0 + s)])
 
     def unprojection_jacobian(self, pixels: FloatArray) -> FloatArray:
         """d bearing / d pixel (N, 3, 2), per pixel; NaN where ``unproject`` is invalid."""
@@ -132,15 +107,6 @@ class Mei:
                 jacobian[:, 1, column] = scale * dy + y * dz
                 jacobian[:, 2, column] = dz
         return jacobian
-
-    def to_dict(self) -> dict[str, Any]:
-        """The ``[camera]`` table: model, width, height, fx, fy, cx, cy, xi, distortion."""
-        return _checks.camera_to_table(self)
-
-    @classmethod
-    def from_dict(cls, table: dict[str, Any], where: str) -> Self:
-        """Build from a ``[camera]`` table; raises ``CalibrationError`` (see ``Camera.from_dict``)."""
-        return _checks.camera_from_keys(cls, table, where)
 
     @cached_property
     def _inverse(self) -> InverseTable:
@@ -174,8 +140,7 @@ class Mei:
 
     def _undistort(self, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Solve Eq. 8 with p1, p2 for the undistorted points x, y of pixels (N, 2), each (N,); NaN beyond the rim."""
-        u, v = _checks.rows("pixels", pixels, 2).T
-        x0, y0 = (u - self.cx) / self.fx, (v - self.cy) / self.fy
+        x0, y0 = self.plane(pixels)
         radius = np.hypot(x0, y0)
         shrink = np.where(radius > 0.0, self._inverse(radius) / radius, 1.0)
         x, y = shrink * x0, shrink * y0

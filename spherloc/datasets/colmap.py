@@ -16,7 +16,8 @@ from spherloc.datasets import map_scene, scene_file
 from spherloc.datasets.map_scene import MapScene
 from spherloc.errors import CalibrationError, InputError, shorten, show
 from spherloc.files import is_file
-from spherloc.formats.colmap_model import ColmapImage, ColmapModel, read_model
+from spherloc.formats.colmap_files import read_model
+from spherloc.formats.colmap_model import ColmapImage, ColmapModel
 from spherloc.frontend.lifting import SfmLift
 from spherloc.frontend.view import View
 from spherloc.types import BoolArray, FloatArray

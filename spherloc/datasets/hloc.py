@@ -21,7 +21,8 @@ from spherloc.datasets.colmap import gravity_of_map, model_views, some, split_gr
 from spherloc.datasets.map_scene import MapScene
 from spherloc.errors import InputError, shorten, show
 from spherloc.files import is_file
-from spherloc.formats.colmap_model import ColmapModel, read_model
+from spherloc.formats.colmap_files import read_model
+from spherloc.formats.colmap_model import ColmapModel
 from spherloc.formats.hloc_files import (
     Hdf5,
     Keypoints,

@@ -14,6 +14,7 @@ from spherloc.datasets.registration import Registration
 from spherloc.errors import InputError, show
 from spherloc.files import is_folder
 from spherloc.frontend.pipeline import image_matcher
+from spherloc.frontend.stored_matches import StoredMatches
 from spherloc.frontend.view import Matcher, Matches, NeedsPreparing, Report, View
 from spherloc.problem import Problem
 from spherloc.refine import residuals_px
@@ -98,6 +99,18 @@ class MapScene:
         """
         view = self.query(query)
         return self.problem_of(view, self.matcher(view))
+
+    def stored_problem(self, query: str | None = None) -> Problem | None:
+        """``problem`` at once where its matches are stored, else None. Its ``pictures`` may not be drawn yet."""
+        view = self.query(query)
+        stored = self.matcher.stored(view) if isinstance(self.matcher, StoredMatches) else None
+        return None if stored is None else self.problem_of(view, stored)
+
+    def pictures(self, problem: Problem) -> tuple[View, ...]:
+        """The query and the references of a problem of this scene."""
+        shown = [problem.image, *problem.reference_images]
+        by_path = {view.path: view for view in (*self.references, *self.queries)}
+        return tuple(by_path[path] for path in shown if path in by_path)
 
     def problem_of(self, view: View, matches: Matches) -> Problem:
         """The problem of a query and the correspondences that ``matcher`` found for it.

@@ -4,29 +4,225 @@ The map is a COLMAP model of the reference images, whose frame and scale ``map_f
 ground truth lets the loader fit, or a point cloud in the frame of the ground truth.
 """
 
+import os
+import re
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from pathlib import Path
+from itertools import pairwise
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from spherloc.cameras.base import Camera
-from spherloc.cameras.kalibr import read_kalibr_chain
+from spherloc.cameras.tool_files import read_kalibr_chain
 from spherloc.datasets import scene_file
 from spherloc.datasets.imu import down_at, read_imu
 from spherloc.datasets.map_scene import OPTIONAL, REQUIRED, MapScene, folder, read_settings
-from spherloc.datasets.similarity import Similarity, align, similarity_of
-from spherloc.errors import InputError, show
-from spherloc.files import is_file, is_folder
-from spherloc.formats.colmap_model import ColmapImage, ColmapModel, read_model
-from spherloc.formats.newer_college_files import NAME_RULE, TimedImage, images_in, read_cloud, timestamp_of
+from spherloc.datasets.scene_file import numbers
+from spherloc.errors import InputError, reason, shorten, show
+from spherloc.files import is_file, is_folder, names_in, open_file, reading
+from spherloc.formats.colmap_files import read_model
+from spherloc.formats.colmap_model import ColmapImage, ColmapModel
 from spherloc.formats.text_rows import needed_file
 from spherloc.frontend.lifting import PointCloudLift, SfmLift
 from spherloc.frontend.view import Lift, View
 from spherloc.geometry import camera_centre, pose
 from spherloc.trajectory import NS_PER_S, Trajectory, pose_at, read_newer_college
 from spherloc.types import BoolArray, FloatArray
+
+ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
+NAME_RULE = "names like 1625133000_123456789.png (seconds_nanoseconds) or 1625133000123456789.png (nanoseconds)"
+MAX_CLOUD_BYTES = 1 << 32
+"""The whole campus at a centimetre takes a few gigabytes."""
+_HEADER_BYTES = 1 << 16
+_ELEMENT = re.compile(rb"element\s+(\S+)\s+(\d{1,18})\s*$")
+_SECONDS = re.compile(r"(?:.*\D)?(\d{9,10})_(\d{1,9})", re.ASCII)
+_NANOSECONDS = re.compile(r"(?:.*\D)?(\d{18,19})", re.ASCII)
+
+
+@dataclass(frozen=True)
+class TimedImage:
+    """An image file."""
+
+    name: str
+    """Its path below the folder, with forward slashes."""
+    path: Path
+    timestamp_ns: int
+
+
+def timestamp_of(name: str) -> int | None:
+    """Nanoseconds that an image's name ends with, as <seconds>_<nanoseconds> or as nanoseconds; None for other names.
+
+    Something else may precede: infra1_1583836591_182590976.png. The nanoseconds need not have leading zeros.
+    """
+    stem = PurePosixPath(name).stem
+    if match := _SECONDS.fullmatch(stem):
+        return int(match[1]) * NS_PER_S + int(match[2])
+    if match := _NANOSECONDS.fullmatch(stem):
+        return int(match[1])
+    return None
+
+
+def images_in(folder: Path) -> tuple[list[TimedImage], int]:
+    """Images of a folder by time, and how many others there are whose names carry none.
+
+    Raises ``InputError`` if none carries a time, or if two carry the same one.
+    """
+    files = [folder / name for name in names_in(folder) if Path(name).suffix.lower() in ENDINGS]
+    timed = [(timestamp_of(path.name), path) for path in files]
+    images = sorted(
+        (TimedImage(path.name, path, time) for time, path in timed if time is not None),
+        key=lambda image: (image.timestamp_ns, image.name),
+    )
+    if not images:
+        raise InputError(f"{folder}: none of its {len(files)} images has a time in its name; give {NAME_RULE}.")
+    for one, other in pairwise(images):
+        if one.timestamp_ns == other.timestamp_ns:
+            both = f"{shorten(one.name)} and {shorten(other.name)}"
+            raise InputError(f"{folder}: {both} have the same time; keep the images of one camera.")
+    return images, len(files) - len(images)
+
+
+@lru_cache(maxsize=1)
+def read_cloud(path: Path) -> NDArray[np.float32]:
+    """Points (N, 3) of a PLY file, metres; kept, because all references share them.
+
+    Raises ``InputError`` for what is no such file or holds no finite point.
+    """
+    import trimesh  # takes half a second
+
+    _check_header(path)
+    try:
+        cloud = trimesh.load(path, file_type="ply", process=False)
+        points = np.asarray(getattr(cloud, "vertices", ()), dtype=np.float32).reshape(-1, 3)
+    except Exception as error:  # trimesh lets whatever its parsers stumble over through
+        raise InputError(f"{path}: no readable PLY point cloud ({reason(error)}); export the map again.") from None
+    points = points[np.isfinite(points).all(axis=1)]
+    if not len(points):
+        raise InputError(f"{path}: holds no finite point; export the map again.")
+    points.setflags(write=False)
+    return points
+
+
+def _check_header(path: Path) -> None:
+    """Refuse what claims more than it holds before anything is allocated for it."""
+    with reading(path, "give the prior map as a PLY file"), open_file(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        header, end, _ = file.read(_HEADER_BYTES).partition(b"end_header")
+    if not header.startswith(b"ply") or not end or size > MAX_CLOUD_BYTES:
+        raise InputError(f"{path}: no PLY file of at most {MAX_CLOUD_BYTES >> 30} GiB; give the prior map as one.")
+    lines = [line.strip() for line in header.splitlines() if line.startswith(b"element")]
+    matches = [_ELEMENT.match(line) for line in lines]
+    if not lines or not all(matches) or sum(int(match[2]) for match in matches if match) > size:
+        raise InputError(f"{path}: its header claims more points than fit into {size} bytes; export the map again.")
+
+
+TOLERANCE = 1e-3
+"""How far a rotation given by hand may be from orthonormal."""
+LEAST_SPREAD = 0.02
+"""Positions whose second extent is a smaller share of the first lie on a line, which fixes no rotation about it."""
+FARTHEST = 1e9
+"""In the units of either frame."""
+WORST_FIT = 0.1
+"""Of the extent of the positions: a larger residual means that they are not the same positions."""
+LEAST_USED = 0.8
+"""Share of the positions that must fit: three of four always do, whatever they are."""
+_REMEDY = "give map_from_model"
+_ROUNDS = 30
+_INLIER_MEDIANS = 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class Similarity:
+    """x_to = scale rotation x_from + translation."""
+
+    scale: float
+    rotation: FloatArray
+    """(3, 3)"""
+    translation: FloatArray
+    """(3,)"""
+
+    def points(self, points: FloatArray) -> FloatArray:
+        """Points (N, 3) in the other frame."""
+        return self.scale * points @ self.rotation.T + self.translation
+
+    def pose(self, cam_from_old: FloatArray) -> FloatArray:
+        """``cam_from_new`` (3, 4) of a camera, whose own axes keep their length."""
+        rotation = cam_from_old[:, :3] @ self.rotation.T
+        return pose(rotation, self.scale * cam_from_old[:, 3] - rotation @ self.translation)
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """A similarity that was fitted to pairs of points."""
+
+    similarity: Similarity
+    used: int
+    """Pairs that fit."""
+    rms_m: float
+    """Of their residuals."""
+
+
+def similarity_of(value: Any, key: str, where: str) -> Similarity:
+    """A similarity given as ``[[...], [...], [...]]``, 3 x 4: scale times rotation, and translation.
+
+    Raises ``InputError`` for another shape, and if the 3 x 3 part is no rotation times a positive scale.
+    """
+    matrix = numbers(value, (3, 4), key, where)
+    left, sizes, right = np.linalg.svd(matrix[:, :3])
+    scale = float(sizes.mean())
+    if not 1e-9 <= scale <= 1e9 or np.ptp(sizes) > TOLERANCE * scale or np.linalg.det(left @ right) < 0:
+        raise InputError(f"{where}: the 3 x 3 part of {key} is no rotation times a positive scale; correct it.")
+    return Similarity(scale, left @ right, matrix[:, 3])
+
+
+def align(old: FloatArray, new: FloatArray, where: str) -> Alignment:
+    """The similarity that takes the positions ``old`` (N, 3) to ``new`` (N, 3), against a few wrong ones among them.
+
+    Umeyama's closed form (1991), reweighted so that the sum of distances is least instead of that of squares.
+    Raises ``InputError`` for fewer than three pairs, for positions on a line, and for positions that do not fit.
+    """
+    if len(old) < 3:
+        raise InputError(f"{where}: only {len(old)} positions are known in both, and it takes three; {_REMEDY}.")
+    if not (np.abs(old) <= FARTHEST).all():
+        raise InputError(f"{where}: a position lies beyond {FARTHEST:g}; correct or remove it.")
+    _check_spread(old, new, where)
+    weights = np.ones(len(old))
+    for _ in range(_ROUNDS):
+        found = _umeyama(old, new, weights / weights.sum())
+        residuals = np.linalg.norm(found.points(old) - new, axis=1)
+        weights = 1.0 / np.maximum(residuals, 1e-3 + 0.1 * np.median(residuals))
+    good = np.less_equal(residuals, max(_INLIER_MEDIANS * float(np.median(residuals)), 1e-3))
+    used, rms = int(good.sum()), float(np.sqrt(np.mean(residuals[good] ** 2)))
+    extent = float(np.sqrt(np.mean(np.sum((new - new.mean(axis=0)) ** 2, axis=1))))
+    if rms > WORST_FIT * extent or used < LEAST_USED * len(old):
+        raise InputError(
+            f"{where}: the positions do not fit, {used} of {len(old)} by {rms:.2g} m over {extent:.2g} m; take both "
+            f"from the same recording, or {_REMEDY}."
+        )
+    _check_spread(old[good], new[good], where)
+    return Alignment(found, used, rms)
+
+
+def _check_spread(old: FloatArray, new: FloatArray, where: str) -> None:
+    for positions in (old, new):
+        extents = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False)
+        if not extents[1] > LEAST_SPREAD * extents[0]:
+            raise InputError(f"{where}: the positions lie on a line, so that a rotation stays open; {_REMEDY}.")
+
+
+def _umeyama(old: FloatArray, new: FloatArray, weights: FloatArray) -> Similarity:
+    """Least weighted squares; weights (N,) that sum to 1."""
+    old_mean, new_mean = weights @ old, weights @ new
+    old_centred, new_centred = old - old_mean, new - new_mean
+    left, sizes, right = np.linalg.svd((weights[:, None] * new_centred).T @ old_centred)
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
+    rotation = left @ np.diag(signs) @ right
+    scale = float(sizes @ signs / (weights @ np.sum(old_centred**2, axis=1)))
+    return Similarity(scale, rotation, new_mean - scale * rotation @ old_mean)
+
 
 EXTRAS = ("colmap",)
 EXAMPLE = """\

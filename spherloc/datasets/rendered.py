@@ -20,6 +20,8 @@ from spherloc.datasets.map_scene import MapScene
 from spherloc.errors import InputError
 from spherloc.files import is_file
 from spherloc.frontend.lifting import DepthLift
+from spherloc.frontend.pipeline import image_matcher
+from spherloc.frontend.stored_matches import SUFFIX, StoredMatches, key_of_table
 from spherloc.frontend.view import View
 from spherloc.geometry import pose, so3_exp
 from spherloc.types import BoolArray, ByteArray, FloatArray
@@ -102,9 +104,13 @@ class RenderedView(View):
 
     def usable_pixels(self) -> BoolArray:
         """See ``View``. Features are kept by their image's content, and this is asked before they are sought."""
+        self.make_file()
+        return super().usable_pixels()
+
+    def make_file(self) -> None:
+        """See ``View``."""
         if not is_file(self.path):
             self.picture.image()
-        return super().usable_pixels()
 
 
 def load(table: dict[str, Any], path: Path) -> MapScene:
@@ -127,7 +133,10 @@ def load(table: dict[str, Any], path: Path) -> MapScene:
     queries, tilt_deg = _queries(scene_file.section(table, "queries", where), f"{where} [queries]", world, camera)
     settings = map_scene.read_settings(table, where, gravity_bound_deg=tilt_deg)
     references = _references(scene_file.section(table, "references", where), f"{where} [references]", world, camera)
-    return settings.scene(path, queries, references, GRAVITY_DOWN, mesh=world.glb)
+    matcher = image_matcher(references, settings.frontend, where, path.parent)
+    if path.resolve().parent == scene_file.BUNDLED:
+        matcher = StoredMatches(matcher, references, path.with_suffix(SUFFIX), key_of_table(table))
+    return settings.scene(path, queries, references, GRAVITY_DOWN, mesh=world.glb, matcher=matcher)
 
 
 def _references(table: Mapping[str, Any], where: str, world: World, camera: Camera) -> tuple[View, ...]:

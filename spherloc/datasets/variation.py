@@ -127,7 +127,8 @@ class Variation:
             )
         if "camera" in changes:
             changes["camera"] = _camera(Path(changes["camera"]))
-        return replace(scene, **changes)
+        changed = replace(scene, **changes)
+        return replace(changed, name=_changed_name(scene, changed, changes.keys()))
 
     def edit(self, problem: Problem, seed: int) -> Problem:
         """An unedited problem with these matches spoiled, mended and hidden."""
@@ -147,6 +148,7 @@ class Variation:
         index, reference_pixels = problem.reference_index, problem.reference_pixels
         return replace(
             problem,
+            name=f"{problem.name}, edited",
             pixels=pixels[kept],
             points=problem.points[kept],
             truth_inliers=None if labels is None else labels[kept],
@@ -168,6 +170,25 @@ class Variation:
     def _remark(self) -> str:
         edits = [f"{len(getattr(self, name))} {name}" for name in EDITS if getattr(self, name)]
         return f"Matches were changed by hand: {', '.join(edits)}."
+
+
+def _changed_name(scene: SyntheticScene, changed: SyntheticScene, fields_changed: Iterable[str]) -> str:
+    """The scene's name, with what it says of outliers as it is now, and with the other changes."""
+    before, now = (f"{100 * rate:.3g} % outliers" for rate in (scene.outlier_rate, changed.outlier_rate))
+    name = scene.name.replace(before, now)
+    words = {
+        "camera": f"through {changed.camera.model.replace('_', ' ')}",
+        "correspondences": f"{changed.correspondences} matches",
+        "noise_px": f"{changed.noise_px:g} px noise",
+        "outlier_rate": now,
+        "outlier_kind": f"{changed.outlier_kind} outliers",
+        "field_of_view_deg": f"{changed.field_of_view_deg:g}° wide",
+        "cloud_height_m": f"{changed.cloud_height_m:g} m high",
+        "gravity_error_deg": f"gravity off by {changed.gravity_error_deg:g}°",
+        "true_camera": "camera moved",
+    }
+    told = [words[field] for field in words if field in fields_changed and words[field] not in name]
+    return ", ".join([name, *told])
 
 
 def used_seed(scene: Scene, seed: int | None) -> int:

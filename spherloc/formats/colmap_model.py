@@ -1,32 +1,53 @@
-"""A COLMAP model: cameras, posed images and points, from its binary or its text form, old or with rigs and frames."""
+"""A COLMAP model: cameras, posed images and points, collected and checked while its files are read.
 
-import json
-import subprocess
-import sys
-from collections import Counter
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+COLMAP's own reader takes a truncated file for a shorter one, believes every count, and passes NaN on; this one says
+where what is wrong. Poses, observations and points are columns, for which COLMAP has an object each. Layout:
+doc/format.rst of COLMAP 4.2.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from spherloc.cameras.base import Camera
 from spherloc.cameras.colmap_models import camera_from_colmap
-from spherloc.errors import MOST_REASON, CalibrationError, InputError, reason, shorten, show
-from spherloc.files import is_file, is_folder
-from spherloc.formats.colmap_check import check_binary
-from spherloc.formats.colmap_parts import ModelParts, Points
-from spherloc.formats.colmap_text import check_text
-from spherloc.registry import require
+from spherloc.errors import CalibrationError, InputError, show
+from spherloc.geometry import pose, transform
+from spherloc.trajectory import rotation_from_wxyz
 from spherloc.types import FloatArray
 
-_FILES = ("cameras", "images", "points3D")
-_PATIENCE_S = 120.0
-_BYTES_PER_S = 1_000_000
-"""Far slower than any disk: what takes longer is stuck."""
+MODELS = (
+    *(("SIMPLE_PINHOLE", 3), ("PINHOLE", 4), ("SIMPLE_RADIAL", 4), ("RADIAL", 5), ("OPENCV", 8)),
+    *(("OPENCV_FISHEYE", 8), ("FULL_OPENCV", 12), ("FOV", 5), ("SIMPLE_RADIAL_FISHEYE", 4), ("RADIAL_FISHEYE", 5)),
+    *(("THIN_PRISM_FISHEYE", 12), ("RAD_TAN_THIN_PRISM_FISHEYE", 16), ("SIMPLE_DIVISION", 4), ("DIVISION", 5)),
+    *(("SIMPLE_FISHEYE", 3), ("FISHEYE", 4), ("EUCM", 6), ("EQUIRECTANGULAR", 2)),
+)
+"""Name and number of parameters of COLMAP's camera models, by id."""
+
+SPHERE = (
+    "has panoramas of the camera model SPHERE, which only the fork SphereSfM knows and whose id is another model's in "
+    "COLMAP; make the model anew with COLMAP 4.1 or later and its camera model EQUIRECTANGULAR."
+)
+
+OBSERVATION = np.dtype([("pixel", "<f8", (2,)), ("point", "<i8")])
+"""A pixel and the id of its point, -1 for none."""
+
+Broken = Callable[[str], InputError]
+"""Makes the error that says at which place of which file what is wrong."""
+
+LARGEST = 1e12
+"""Coordinates beyond this are damage, whatever the model's unit: what is computed from them would overflow."""
+
+_NORM_TOLERANCE = 1e-3
+
+
+RawCamera = tuple[str, int, int, tuple[float, ...]]
+"""COLMAP's model, width, height and parameters."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,8 +58,10 @@ class ColmapImage:
     camera_id: int
     cam_from_map: FloatArray
     """Pose (3, 4), absolute, also for an image of a rig."""
+    count: int
+    """Number of observations."""
     load: Callable[[], NDArray[Any]]
-    """Its observations, records of ``colmap_parts.OBSERVATION``."""
+    """The ``OBSERVATION`` records, (count,). Raises ``InputError`` if the file cannot be read any more."""
 
     @property
     def pixels(self) -> FloatArray:
@@ -59,6 +82,20 @@ class ColmapImage:
 
 
 @dataclass(frozen=True, eq=False)
+class Points:
+    """Columns of P points, by rising id."""
+
+    ids: NDArray[np.int64]
+    """(P,)"""
+    xyz: FloatArray
+    """(P, 3), in the model's unit, metres if it is scaled."""
+    errors_px: FloatArray
+    """(P,) mean reprojection error; -1 where COLMAP did not compute it."""
+    track_lengths: NDArray[np.int64]
+    """(P,) number of keypoints that see the point."""
+
+
+@dataclass(frozen=True, eq=False)
 class ColmapModel:
     """A model, in columns."""
 
@@ -67,8 +104,8 @@ class ColmapModel:
     """Images with a pose, by name, in the order of names."""
     points: Points
     """All points, by rising id."""
-    raw_cameras: Mapping[int, tuple[str, int, int, tuple[float, ...]]]
-    """COLMAP's model, width, height and parameters, by camera id."""
+    raw_cameras: Mapping[int, RawCamera]
+    """By camera id."""
     remarks: tuple[str, ...] = ()
     """What was left out and why, in sentences."""
 
@@ -106,81 +143,124 @@ def _converted(name: str, width: int, height: int, params: tuple[float, ...], wh
         return str(error)
 
 
-def read_model(folder: Path) -> ColmapModel:
-    """Read the model in ``folder``: the binary form if all of its three files are there, else the text form.
+@dataclass(eq=False)
+class ModelParts:
+    """What was found so far. Its methods take what a file says next; ``broken`` makes the error if it cannot be."""
 
-    Every file is walked and checked first; then pycolmap reads cameras and poses, in a process of its own. Raises
-    ``InputError`` that names the missing file, or the file and the byte or line of what is wrong, and where pycolmap
-    is not installed.
-    """
-    folder = Path(folder)
-    form = _form(folder)
-    require("pycolmap", "colmap", "reading COLMAP models")
-    walked = check_binary(folder) if form == "bin" else check_text(folder)
-    answer = _read_by_pycolmap(folder, form)
-    cameras = {row[0]: (str(row[1]), int(row[2]), int(row[3]), tuple(row[4])) for row in answer["cameras"]}
-    images, remarks = _images(folder, walked, answer["images"])
-    return ColmapModel(folder, images, walked.points, cameras, remarks)
+    cameras: dict[int, RawCamera] = field(default_factory=dict)
+    """By camera id."""
+    rigs: dict[int, dict[int, FloatArray | None]] = field(default_factory=dict)
+    """By rig id and camera id, the pose (3, 4) of the camera in the rig; None where the rig leaves it open."""
+    frames: dict[int, tuple[int, FloatArray | None]] = field(default_factory=dict)
+    """Of the images that a frame lists, by image id: camera id and pose (3, 4); None where the rig leaves it open."""
+    images: dict[int, ColmapImage] = field(default_factory=dict)
+    """By id, without those that have no pose."""
+    counts: dict[int, int] = field(default_factory=dict)
+    """Number of observations by image id, of all images."""
+    names: set[str] = field(default_factory=set)
+    """Of all images."""
+    points: Points = field(init=False)
+    """Set when they are read, which is last."""
+
+    def camera(self, number: int, camera: RawCamera, broken: Broken) -> None:
+        """A camera."""
+        if number in self.cameras:
+            raise broken(f"camera {number} is there twice")
+        if not np.isfinite(camera[3]).all():
+            raise broken(f"a parameter of camera {number} is not a finite number")
+        self.cameras[number] = camera
+
+    def rig(self, number: int, sensors: Sequence[tuple[int, FloatArray | None]], broken: Broken) -> None:
+        """A rig with its cameras, each with its pose (3, 4) in the rig; None where that is open."""
+        cameras = dict(sensors)
+        if number in self.rigs:
+            raise broken(f"rig {number} is there twice")
+        if len(cameras) < len(sensors) or not self.cameras.keys() >= cameras.keys():
+            raise broken(f"rig {number} has a camera twice, or one that is not among the cameras")
+        self.rigs[number] = cameras
+
+    def frame(
+        self, number: int, rig: int, rig_from_map: FloatArray, images: Sequence[tuple[int, int]], broken: Broken
+    ) -> None:
+        """A frame of a rig with its pose (3, 4) and pairs of a camera id and an image id."""
+        if rig not in self.rigs:
+            raise broken(f"frame {number} is of rig {rig}, which is not among the rigs")
+        for camera, image in images:
+            if camera not in self.rigs[rig]:
+                raise broken(f"frame {number} has an image of camera {camera}, which is not in its rig {rig}")
+            if image in self.frames:
+                raise broken(f"image {image} is in two frames")
+            cam_from_rig = self.rigs[rig][camera]
+            if cam_from_rig is None:
+                self.frames[image] = camera, None
+            else:
+                position = transform(cam_from_rig, rig_from_map[None, :, 3])[0]
+                self.frames[image] = camera, pose(cam_from_rig[:, :3] @ rig_from_map[:, :3], position)
+
+    def image(self, number: int, image: ColmapImage, broken: Broken) -> None:
+        """An image with the pose beside it, which frames overrule; its observations have been checked."""
+        if number in self.counts:
+            raise broken(f"image {number} is there twice")
+        if not image.name:
+            raise broken(f"image {number} has no name")
+        if image.name in self.names:
+            raise broken(f"two images have the name {show(image.name)}; give every image a name of its own")
+        if image.camera_id not in self.cameras:
+            raise broken(f"image {number} has the camera {image.camera_id}, which is not among the cameras")
+        self.counts[number] = image.count
+        self.names.add(image.name)
+        if not self.rigs:
+            self.images[number] = image
+            return
+        camera, cam_from_map = self.frames.get(number, (None, None))
+        if camera != image.camera_id:
+            raise broken(f"no frame has image {number} with its camera {image.camera_id}")
+        if cam_from_map is not None:
+            self.images[number] = replace(image, cam_from_map=cam_from_map)
+
+    @cached_property
+    def _keypoints(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Ids of the images, rising, and their numbers of keypoints; asked for once all images are there."""
+        known = sorted(self.counts)
+        return np.array(known, dtype=np.int64), np.array([self.counts[number] for number in known], dtype=np.int64)
+
+    def tracks(self, image_ids: NDArray[np.int64], places: NDArray[np.int64], broken: Broken) -> None:
+        """Which keypoints see some of the points: image ids (T,) and places among the image's keypoints (T,)."""
+        known, counts = self._keypoints
+        index = np.searchsorted(known, image_ids)
+        there = index < len(known)
+        there[there] = known[index[there]] == image_ids[there]
+        there[there] = places[there] < counts[index[there]]
+        if not there.all():
+            first = int(np.flatnonzero(~there)[0])
+            raise broken(f"a point has keypoint {places[first]} of image {image_ids[first]}, which does not exist")
 
 
-def _form(folder: Path) -> str:
-    """Which form is complete; raises ``InputError`` for none."""
-    if not is_folder(folder):
-        raise InputError(f"{folder}: no such folder; give the folder of a COLMAP model.")
-    missing = {form: [name for name in _FILES if not is_file(folder / f"{name}.{form}")] for form in ("bin", "txt")}
-    form = min(missing, key=lambda form: len(missing[form]))
-    if len(missing[form]) == len(_FILES):
-        models = sorted({path.parent.name for path in folder.glob("*/cameras.*")})
-        hint = f"one of its folders {', '.join(map(shorten, models[:5]))}" if models else "the folder that holds one"
-        raise InputError(f"{folder}: no COLMAP model (cameras, images and points3D as .bin or .txt); give {hint}.")
-    if missing[form]:
-        raise InputError(f"{folder / missing[form][0]}.{form} is missing; a COLMAP model needs it, so export it again.")
-    has = [name for name in ("rigs", "frames") if is_file(folder / f"{name}.{form}")]
-    if len(has) == 1:
-        other = "frames" if has == ["rigs"] else "rigs"
-        raise InputError(f"{folder / other}.{form} is missing beside {has[0]}.{form}; add it, or remove both.")
-    return form
+def make_points(ids: ArrayLike, xyz: ArrayLike, errors_px: ArrayLike, track_lengths: ArrayLike) -> Points:
+    """Columns in the order of ids."""
+    numbers = np.asarray(ids, dtype=np.int64)
+    order = np.argsort(numbers, kind="stable")
+    return Points(
+        ids=numbers[order],
+        xyz=np.asarray(xyz, dtype=np.float64).reshape(-1, 3)[order],
+        errors_px=np.asarray(errors_px, dtype=np.float64)[order],
+        track_lengths=np.asarray(track_lengths, dtype=np.int64)[order],
+    )
 
 
-def _read_by_pycolmap(folder: Path, form: str) -> dict[str, Any]:
-    """pycolmap's answer; raises ``InputError`` if it refuses the model or does not survive it."""
-    child = Path(__file__).with_name("colmap_child.py")
-    size = sum(path.stat().st_size for path in folder.glob(f"*.{form}"))
-    try:
-        done = subprocess.run(
-            [sys.executable, "-P", str(child), str(folder), form],
-            capture_output=True,
-            timeout=_PATIENCE_S + size / _BYTES_PER_S,
-        )
-        answer = json.loads(done.stdout) if done.returncode == 0 else {"error": f"it ended with {done.returncode}"}
-    except subprocess.TimeoutExpired:
-        answer = {"error": "it does not come to an end"}
-    except (OSError, ValueError) as error:
-        answer = {"error": reason(error)}
-    if "error" in answer:
-        said = shorten(" ".join(str(answer["error"]).split("Check failed:")[-1].split()), MOST_REASON)
-        raise InputError(f"{folder}: COLMAP's own reader refuses the model ({said}); export the model again.")
-    return answer
+def read_pose(numbers: Sequence[float], broken: Broken, what: str) -> FloatArray:
+    """Pose (3, 4) from a unit quaternion, w first, and a translation; raises what ``broken`` makes for others."""
+    values = np.asarray(numbers, dtype=np.float64)
+    with np.errstate(over="ignore", invalid="ignore"):
+        norm = float(np.linalg.norm(values[:4]))
+    if not ((np.abs(values) <= LARGEST).all() and abs(norm - 1.0) <= _NORM_TOLERANCE):
+        raise broken(f"the pose of {what} is {show(list(numbers))}, no unit quaternion and possible translation")
+    return pose(rotation_from_wxyz(values[:4]), values[4:])
 
 
-def _images(folder: Path, walked: ModelParts, rows: list[list[Any]]) -> tuple[dict[str, ColmapImage], tuple[str, ...]]:
-    if {(row[0], row[1]) for row in rows} != {(number, image.name) for number, image in walked.images.items()}:
-        raise InputError(f"{folder}: COLMAP's own reader finds other images in it; export the model again.")
-    names = Counter(row[1] for row in rows)
-    twice = next((name for name, count in names.items() if count > 1), None)
-    if twice is not None:
-        raise InputError(f"{folder}: two images have the name {show(twice)}; give every image a name of its own.")
-    images = {
-        name: ColmapImage(name, camera_id, _rigid(numbers), walked.images[number].load)
-        for number, name, camera_id, numbers in sorted(rows, key=lambda row: row[1])
-        if numbers is not None
-    }
-    without = len(rows) - len(images)
-    return images, (f"{folder}: {without} images have no pose and were left out.",) if without else ()
-
-
-def _rigid(numbers: list[float]) -> FloatArray:
-    """Pose (3, 4) with the nearest rotation: quaternions in the files are rounded."""
-    matrix = np.array(numbers).reshape(3, 4)
-    left, _, right = np.linalg.svd(matrix[:, :3])
-    return np.column_stack([left @ right, matrix[:, 3]])
+def check_observations(observations: NDArray[Any], broken: Broken, what: str) -> None:
+    """Raise what ``broken`` makes unless all ``OBSERVATION`` records have a finite pixel and a possible point."""
+    possible = (np.abs(observations["pixel"]) <= LARGEST).all(axis=1) & (observations["point"] >= -1)
+    if not possible.all():
+        first = int(np.flatnonzero(~possible)[0]) + 1
+        raise broken(f"observation {first} of {what} has no possible pixel or point")

@@ -62,6 +62,9 @@ class View:
             )
         return image
 
+    def make_file(self) -> None:
+        """Make the image file if it is one that is drawn when it is first needed, and not there yet."""
+
     def usable_pixels(self) -> BoolArray:
         """(H, W): pixels that the camera model can see and that ``mask`` allows.
 

@@ -5,10 +5,9 @@ from functools import lru_cache
 
 from spherloc.errors import InputError, show
 from spherloc.worlds.apartment import build_apartment
-from spherloc.worlds.campus import build_campus
 from spherloc.worlds.conditions import Conditions
+from spherloc.worlds.houses import build_campus, build_street
 from spherloc.worlds.render import Render, image_path, render, stored_range
-from spherloc.worlds.street import build_street
 from spherloc.worlds.world import World
 
 __all__ = ["WORLDS", "Conditions", "Render", "World", "build_world", "image_path", "render", "stored_range"]

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spherloc.errors import InputError, show
-from spherloc.worlds.atlas import Atlas
+from spherloc.worlds.mesh import Atlas
 
 
 @dataclass(frozen=True)

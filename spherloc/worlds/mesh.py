@@ -1,14 +1,97 @@
-"""Triangles with texture coordinates, and the builder that worlds are made with."""
+"""A world's surfaces: triangles with texture coordinates, all textures in one image, and both as binary glTF 2.0."""
 
-from collections.abc import Sequence
+import json
+import struct
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spherloc.types import FloatArray
-from spherloc.worlds.atlas import Atlas
+from spherloc.types import ByteArray, FloatArray
+
+WIDTH = 2048
+
+
+@dataclass(frozen=True, eq=False)
+class Atlas:
+    """Tiles with sides of powers of two, packed so that none leaks into the smaller copies of another."""
+
+    texels: ByteArray
+    """(H, W, 4): red, green, blue, and how much a texel shines when it is lit."""
+    names: tuple[str, ...]
+    """Of the tiles."""
+    kinds: tuple[str, ...]
+    """What each tile shows ("wall", "foliage", "grass", ...): seasons recolour by kind."""
+    boxes: NDArray[np.int32]
+    """(T, 4): left, top, width, height of each tile, texels."""
+
+    @cached_property
+    def index(self) -> Mapping[str, int]:
+        """Number of a tile by its name."""
+        return {name: number for number, name in enumerate(self.names)}
+
+    @cached_property
+    def pyramid(self) -> tuple[ByteArray, ...]:
+        """The atlas, and copies of half the size each."""
+        levels: list[Any] = [self.texels]
+        for _ in range(int(np.log2(self.boxes[:, 2:].min())), 0, -1):
+            height, width = levels[-1].shape[:2]
+            levels.append(cv2.resize(levels[-1], (width // 2, height // 2), interpolation=cv2.INTER_AREA))
+        return tuple(levels)
+
+    def sample(self, at: NDArray[np.float32], tiles: NDArray[np.int32], level: NDArray[np.float32]) -> NDArray:
+        """Values (N, 4), float32 from 0 to 255, at ``at`` (N, 2) in texels, between the two nearest of the copies.
+
+        ``level`` (N,) is the logarithm to base 2 of the pixel's size in texels; never beyond two texels of the tile.
+        """
+        boxes = self.boxes[tiles].astype(np.float32)
+        most = np.minimum(np.log2(boxes[:, 2:].min(axis=1)) - 1, len(self.pyramid) - 1)
+        level = np.clip(level, 0, most)
+        below = np.floor(level).astype(np.int32)
+        share = (level - below)[:, None]
+        upper = np.minimum(below + 1, most.astype(np.int32))
+        return (1 - share) * self._at_level(at, boxes, below) + share * self._at_level(at, boxes, upper)
+
+    def _at_level(self, at: NDArray, boxes: NDArray, level: NDArray[np.int32]) -> NDArray:
+        values = np.zeros((len(at), 4), dtype=np.float32)
+        for number, image in enumerate(self.pyramid):
+            chosen = np.flatnonzero(level == number)
+            if len(chosen) == 0:
+                continue
+            scale = np.float32(0.5**number)
+            low = boxes[chosen, :2] * scale + 0.5
+            high = (boxes[chosen, :2] + boxes[chosen, 2:]) * scale - 0.5
+            # OpenCV puts texel centres at whole numbers, and its maps have a limited width.
+            spot = np.clip(at[chosen] * scale, low, high) - 0.5
+            rows = -(-len(chosen) // 1024)
+            maps = np.zeros((rows * 1024, 2), dtype=np.float32)
+            maps[: len(chosen)] = spot
+            maps = maps.reshape(rows, 1024, 2)
+            found = cv2.remap(image, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR)
+            values[chosen] = found.reshape(-1, 4)[: len(chosen)]
+        return values
+
+
+def pack(tiles: Mapping[str, tuple[str, ByteArray]]) -> Atlas:
+    """An atlas of named tiles (kind, (H, W, 4) with sides of powers of two up to ``WIDTH``)."""
+    order = sorted(tiles, key=lambda name: (*(-size for size in tiles[name][1].shape[:2]), name))
+    boxes, left, top, shelf = {}, 0, 0, 0
+    for name in order:
+        height, width = tiles[name][1].shape[:2]
+        if left + width > WIDTH:
+            left, top = 0, top + shelf
+        shelf = height if left == 0 else shelf
+        boxes[name] = (left, top, width, height)
+        left += width
+    texels = np.zeros((top + shelf, WIDTH, 4), dtype=np.uint8)
+    for name, (x, y, width, height) in boxes.items():
+        texels[y : y + height, x : x + width] = tiles[name][1]
+    return Atlas(texels, tuple(tiles), tuple(tiles[n][0] for n in tiles), np.array([boxes[n] for n in tiles], np.int32))
+
 
 WHITE = (1.0, 1.0, 1.0)
 WHOLE = (0.0, 0.0, 1.0, 1.0)
@@ -200,3 +283,72 @@ class MeshBuilder:
                 lit=np.full(len(faces), lit),
             )
         )
+
+
+MOST_BYTES = 400_000
+LEAST_TEXTURE_BYTES = 60_000
+HEADER_BYTES = 2_000
+FLOAT, USHORT, UINT, UBYTE = 5126, 5123, 5125, 5121
+
+
+def write_glb(mesh: Mesh, atlas: Atlas) -> bytes:
+    """Vertices as they are (metres, the mesh's own frame), tints as vertex colours, and the atlas as a small JPEG."""
+    height, width = atlas.texels.shape[:2]
+    vertices = mesh.vertices.astype(np.float32)
+    uv = np.round(np.clip(mesh.uv / (width, height), 0, 1) * 65535).astype(np.uint16)
+    colour = np.full((len(mesh.tint), 4), 255, np.uint8)
+    colour[:, :3] = np.round(np.clip(mesh.tint, 0, 1) * 255)
+    index = mesh.faces.astype(np.uint16 if len(vertices) <= 65535 else np.uint32)
+    parts = [index.tobytes(), vertices.tobytes(), uv.tobytes(), colour.tobytes()]
+    parts.append(_jpeg(atlas, max(LEAST_TEXTURE_BYTES, MOST_BYTES - HEADER_BYTES - sum(map(len, parts)))))
+    views, binary = [], b""
+    for part in parts:
+        views.append({"buffer": 0, "byteOffset": len(binary), "byteLength": len(part)})
+        binary += part + b"\0" * (-len(part) % 4)
+    box = {"min": vertices.min(axis=0).tolist(), "max": vertices.max(axis=0).tolist()}
+    count, whole = len(vertices), USHORT if index.itemsize == 2 else UINT
+    accessors = [
+        {"bufferView": 0, "componentType": whole, "count": index.size, "type": "SCALAR"},
+        {"bufferView": 1, "componentType": FLOAT, "count": count, "type": "VEC3"} | box,
+        {"bufferView": 2, "componentType": USHORT, "normalized": True, "count": count, "type": "VEC2"},
+        {"bufferView": 3, "componentType": UBYTE, "normalized": True, "count": count, "type": "VEC4"},
+    ]
+    return _container(_document(accessors, views, len(binary)), binary)
+
+
+def _document(accessors: list[dict[str, Any]], views: list[dict[str, Any]], length: int) -> dict[str, Any]:
+    """The JSON part: one mesh with one matt material."""
+    attributes = {"POSITION": 1, "TEXCOORD_0": 2, "COLOR_0": 3}
+    matt = {"baseColorTexture": {"index": 0}, "metallicFactor": 0.0, "roughnessFactor": 1.0}
+    return {
+        "asset": {"version": "2.0", "generator": "spherloc"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": attributes, "indices": 0, "material": 0}]}],
+        "materials": [{"pbrMetallicRoughness": matt}],
+        "textures": [{"source": 0}],
+        "images": [{"bufferView": 4, "mimeType": "image/jpeg"}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": length}],
+    }
+
+
+def _container(document: dict[str, Any], binary: bytes) -> bytes:
+    header = json.dumps(document, separators=(",", ":")).encode()
+    header += b" " * (-len(header) % 4)
+    chunks = struct.pack("<I4s", len(header), b"JSON") + header + struct.pack("<I4s", len(binary), b"BIN\0") + binary
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+def _jpeg(atlas: Atlas, most_bytes: int) -> bytes:
+    """The largest of the atlas's smaller copies that fits, at the best quality that fits."""
+    content = b""
+    for image in atlas.pyramid[1:4]:
+        for quality in (85, 70, 50):
+            done, data = cv2.imencode(".jpg", image[..., 2::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
+            content = data.tobytes() if done else b""
+            if len(content) <= most_bytes:
+                return content
+    return content

@@ -7,9 +7,9 @@ import numpy as np
 from spherloc.types import FloatArray
 from spherloc.worlds import paint
 from spherloc.worlds.mesh import MeshBuilder, joined, xyz
-from spherloc.worlds.outdoor_tiles import Tiles
 from spherloc.worlds.paint import Canvas
 from spherloc.worlds.rays import RayScene
+from spherloc.worlds.tiles import Tiles
 from spherloc.worlds.world import Lane, World
 
 CLEAR_M = {"car": 4.5, "person": 1.6, "box": 1.8}

@@ -10,9 +10,7 @@ import numpy as np
 from spherloc.errors import InputError
 from spherloc.geometry import pose
 from spherloc.types import FloatArray
-from spherloc.worlds.atlas import Atlas
-from spherloc.worlds.glb import write_glb
-from spherloc.worlds.mesh import Mesh
+from spherloc.worlds.mesh import Atlas, Mesh, write_glb
 from spherloc.worlds.rays import RayScene
 
 MOST_POSES = 100_000
