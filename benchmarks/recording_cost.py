@@ -33,8 +33,7 @@ from spherloc_viz.recording.content.components import bars
 from spherloc_viz.recording.content.drawing import chart_path
 from spherloc_viz.recording.content.layout import blueprint, shown_in
 from spherloc_viz.recording.content.panels import panels_of
-from spherloc_viz.recording.content.properties import APPLICATION_ID
-from spherloc_viz.recording.content.text import step_text
+from spherloc_viz.recording.content.properties import APPLICATION_ID, step_text
 from spherloc_viz.recording.content.writer import recorded_steps
 from spherloc_viz.recording.origin import Origin
 from spherloc_viz.recording.storage.store import RecordingStore
@@ -76,8 +75,8 @@ def thread_count() -> int:
 
 def painted(trace: Trace) -> dict[int, Picture]:
     """The pictures of a lean recording."""
-    stops = steps(trace)
-    return {index: paint(trace, index) for index in recorded_steps(stops, key_step(trace, diagnose(trace)))}
+    headings = steps(trace)
+    return {index: paint(trace, index) for index in recorded_steps(headings, key_step(trace, diagnose(trace)))}
 
 
 def plainly(trace: Trace, path: Path) -> None:

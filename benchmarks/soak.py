@@ -26,7 +26,7 @@ async def visit(address: str, number: int, end_s: float, mistakes: list[str], an
     rng = np.random.default_rng(number)
     runs, points = 0, 40 + number
     async with PageClient(address) as page:
-        await page.until(lambda: page.says("success") or page.says("failure"), 120.0)
+        await page.until(lambda: page.says("data-ready"), 120.0)
         await page.set("Points", points)
         while time.perf_counter() < end_s:
             for _ in range(rng.integers(3, 12)):

@@ -104,13 +104,13 @@ def open_scene(path: Path) -> Scene:
     """The scene of a scene file or of a recording; raises ``SpherlocError`` if it is neither."""
     if not is_recording(path):
         return load_scene(path)
-    from spherloc_viz.recording.replay.scene import load_recorded_scene
+    from spherloc_viz.recording.replay import load_recorded_scene
 
     return load_recorded_scene(path)
 
 
 def _origin(path: Path, scene: Scene, seed: int | None, query: str | None, variation: Variation) -> Origin:
-    from spherloc_viz.recording.replay.scene import origin_of
+    from spherloc_viz.recording.replay import origin_of
 
     return origin_of("command", path, scene, seed, query, variation)
 

@@ -77,7 +77,7 @@ def repeat(
     if none_there(files, check_recording_file):
         return 2
     from spherloc_viz.progress import solve
-    from spherloc_viz.recording.replay.repeat import repeat_all
+    from spherloc_viz.recording.replay import repeat_all
 
     return repeat_all(files, json, solve)
 

@@ -12,8 +12,7 @@ from spherloc.errors import InputError, RecordingError, show
 from spherloc_viz.given_files import check_recording_file, check_recordings_folder
 from spherloc_viz.progress import progress, say
 from spherloc_viz.recording.index.query import GROUP_KEYS, OUTCOMES, SORT_KEYS, SOURCES, RunQuery
-from spherloc_viz.recording.index.refresh import Refreshed
-from spherloc_viz.recording.index.run_index import RunIndex
+from spherloc_viz.recording.index.run_index import Refreshed, RunIndex
 from spherloc_viz.recording.index.run_text import FORMS, counts_text, rows_text
 from spherloc_viz.recording.reviews import Review, checked_review
 from spherloc_viz.recording.sandbox.examiner import examine, examine_review

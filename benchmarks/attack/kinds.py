@@ -121,7 +121,7 @@ def _write_colmap(folder: Path, text: bool) -> None:
 
 
 def _read_colmap(folder: Path, damaged: Path) -> object:
-    from spherloc.formats.colmap_model import read_model
+    from spherloc.formats.colmap_files import read_model
 
     read_model(folder / "model")
     return _load(folder, damaged)
@@ -165,7 +165,7 @@ def _write_newer_college(folder: Path) -> None:
 
 
 def _read_newer_college(folder: Path, damaged: Path) -> object:
-    from spherloc.formats.newer_college_files import read_cloud
+    from spherloc.datasets.newer_college import read_cloud
 
     return read_cloud(damaged) if damaged.suffix == ".ply" else _load(folder, damaged)
 
@@ -256,7 +256,7 @@ def _write_recordings(folder: Path) -> None:
 
 
 def _read_recording(folder: Path, damaged: Path) -> object:
-    from spherloc_viz.recording.content.reader import read_recording
+    from spherloc_viz.recording.content.data import read_recording
     from spherloc_viz.recording.sandbox.examiner import examine
     from spherloc_viz.recording.viewer import labels_of
 

@@ -21,10 +21,8 @@ from spherloc.types import FloatArray
 from spherloc_viz import style
 from spherloc_viz.layers import (
     consensus,
-    decision,
     extension,
     outcome,
-    positions,
     ransac,
     refinement,
     start,
@@ -33,16 +31,16 @@ from spherloc_viz.layers import (
 )
 from spherloc_viz.layers.frame import Plan, RunView, focus_of
 from spherloc_viz.layers.outcome import outcome_table
-from spherloc_viz.layers.primitives import Chart, Graph, Picture, Step, Stop
+from spherloc_viz.layers.primitives import Chart, Graph, Picture, Step, StepHeading
 from spherloc_viz.layers.scene import base_items, camera
 
 STAGES: dict[type[Stage], tuple[str, Callable[[RunView, Any], list[Plan]]]] = {
-    DecisionStage: ("Choice", decision.plans),
+    DecisionStage: ("Choice", ransac.decision_plans),
     RansacStage: ("Samples", ransac.plans),
     YawStage: ("Yaw", yaw.plans),
     TranslationStage: ("Translation", translation.plans),
     ConsensusStage: ("Consensus", consensus.plans),
-    PositionStage: ("Positions", positions.plans),
+    PositionStage: ("Positions", consensus.position_plans),
     RefinementStage: ("Refinement", refinement.plans),
 }
 """What each kind of stage is called, and what draws it."""
@@ -56,7 +54,7 @@ FIRST, LAST = "Matches", "Outcome"
 class _Timeline:
     view: RunView
     plans: tuple[Plan, ...]
-    stops: tuple[Stop, ...]
+    headings: tuple[StepHeading, ...]
     charts: dict[Callable[[], Chart], Chart | None] = field(default_factory=dict)
     """Those that were drawn already: they stay for all later steps."""
 
@@ -114,13 +112,13 @@ def _planned(view: RunView) -> _Timeline:
             parts.append(extension.named_plans(view, stage, KINDS))
     parts.append((LAST, outcome.plans(view)))
     named = [(name, plan) for name, plans in parts for plan in plans]
-    stops = tuple(Stop(plan.key, plan.title, name) for name, plan in named)
-    return _Timeline(view, tuple(plan for _, plan in named), stops)
+    headings = tuple(StepHeading(plan.key, plan.title, name) for name, plan in named)
+    return _Timeline(view, tuple(plan for _, plan in named), headings)
 
 
-def steps(trace: Trace) -> tuple[Stop, ...]:
-    """The stops on the run's timeline, from the matches to the outcome. What they say is painted with them."""
-    return _timeline(trace).stops
+def steps(trace: Trace) -> tuple[StepHeading, ...]:
+    """The headings of a run's steps, from the matches to the outcome. What the steps say is painted with them."""
+    return _timeline(trace).headings
 
 
 def graph_begins(trace: Trace) -> str:
@@ -131,12 +129,12 @@ def graph_begins(trace: Trace) -> str:
 def paint(trace: Trace, index: int) -> Picture:
     """What the step at ``index`` looks like. Charts of earlier steps stay."""
     timeline = _timeline(trace)
-    stop, frame = timeline.stops[index], timeline.plans[index].draw()
+    heading, frame = timeline.headings[index], timeline.plans[index].draw()
     charts: dict[str, Callable[[], Chart]] = {}
     for plan in timeline.plans[: index + 1]:
         charts.update(plan.charts)
     tables = (*frame.tables, outcome_table(trace)) if index == len(timeline.plans) - 1 else frame.tables
-    step = Step(stop.key, stop.title, frame.caption, frame.equation, frame.note, stop.stage)
+    step = Step(heading.key, heading.title, frame.caption, frame.equation, frame.note, heading.stage)
     scene = base_items(timeline.view, frame) + frame.items
     drawn = tuple(chart for chart in map(timeline.chart, charts.values()) if chart is not None)
     return Picture(step, scene, drawn, tables, focus_of(timeline.view, frame), timeline.graph(index))

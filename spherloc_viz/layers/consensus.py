@@ -1,4 +1,4 @@
-"""Exact consensus: the bound over yaw, the largest set of matches that agrees, and the poses that were verified."""
+"""Exact consensus: the bound over yaw, the largest set of matches that agrees, verified poses, boxes of positions."""
 
 from collections.abc import Callable
 from functools import cache, partial
@@ -7,16 +7,162 @@ import numpy as np
 
 from spherloc.geometry import camera_centre, yaw_of, yaw_rotation
 from spherloc.metrics import rotation_error_deg, translation_error_m
-from spherloc.trace import ConsensusStage
-from spherloc.types import FloatArray
+from spherloc.trace import ConsensusStage, PositionStage
+from spherloc.types import ByteArray, FloatArray
 from spherloc_viz import style
 from spherloc_viz.layers import ring
-from spherloc_viz.layers import yaw_bound as bound
-from spherloc_viz.layers.balls import graph_at, match_nodes
-from spherloc_viz.layers.frame import Frame, Plan, RunView, even, growing, one_color, sphere_box
-from spherloc_viz.layers.primitives import Focus, Graph, Nodes, SceneItem, Segments, Table
+from spherloc_viz.layers.frame import Frame, Plan, RunView, even, growing, length, one_color, sphere_box
+from spherloc_viz.layers.primitives import Chart, Curve, Focus, Graph, Nodes, SceneItem, Segments, Table
 from spherloc_viz.layers.scene import camera
-from spherloc_viz.layers.yaw_bound import best_support, highest_bound
+from spherloc_viz.layers.translation import graph_at, match_nodes
+
+PEAKS = 16
+"""At most so many peaks of the bound are visited."""
+REACH = 10
+"""A peak is the highest within so many quarters of a degree."""
+
+
+def highest_bound(stage: ConsensusStage) -> int:
+    """No pose explains more correspondences."""
+    return int(stage.bound.max())
+
+
+def best_support(stage: ConsensusStage) -> int:
+    """Correspondences that the best known pose explains."""
+    return int(stage.support.max(initial=stage.seed_support))
+
+
+def _bound_plans(view: RunView, stage: ConsensusStage) -> list[Plan]:
+    """The first guess, the bound, and its peaks from the highest down."""
+    charts = {"consensus": partial(bound_chart, view, stage)}
+    out = [
+        Plan("consensus-guess", "The first guess", lambda: _guess(view, stage)),
+        Plan("consensus-bound", "What no pose can beat, at each yaw", lambda: _bound(view, stage), charts),
+    ]
+    peaks = ring.peaks(stage.bound, REACH, PEAKS)
+    for rank, place in enumerate(peaks.tolist(), 1):
+        yaw = ring.degrees_of(place + 0.5, len(stage.bound))
+        title = f"At {yaw:.1f}°: at most {stage.bound[place]}"
+        with_candidate = {"consensus": partial(bound_chart, view, stage, candidate_rad=np.radians(yaw))}
+        draw = partial(_peak, view, stage, rank, place, len(peaks))
+        out.append(Plan(f"consensus-yaw-{rank}", title, draw, with_candidate))
+    return out
+
+
+def _guess(view: RunView, stage: ConsensusStage) -> Frame:
+    count, seed = len(view.points), stage.seed_support
+    return Frame(
+        f"Before anything is proven, poses of sampled pairs are tried, and the best of them explains {seed} of {count} "
+        f"matches. A pose that beats it must explain {seed + 1}, so yaws at which fewer agree need no search.",
+        f"max over R, t of Σ 1(‖π(R p + t) − u‖ ≤ ε) ≥ {seed}",
+        view.standing(np.eye(3)),
+        view.colors(style.UNDECIDED),
+        view.nobody(),
+    )
+
+
+def _bound(view: RunView, stage: ConsensusStage) -> Frame:
+    most, best, start = highest_bound(stage), best_support(stage), view.standing(np.eye(3))
+    open_share = 100.0 * np.count_nonzero(stage.bound > best) / len(stage.bound)
+    left = f"{open_share:.3g} % of all yaws could hide a better one" if open_share else "no yaw could hide a better one"
+    if stage.arcs:
+        why = (
+            f"Matches that one pose explains agree in pairs at its yaw, as {stage.arcs:,} arcs tell, so the largest "
+            "set that agrees at a yaw is a bound"
+        )
+        formula = f"max over θ of ω(G(θ)) = {most},  ij ∈ G(θ) ⇔ |f_ij(θ)| ≤ τ_ij"
+    else:
+        why = "All camera positions were searched, at every yaw and every tilt that gravity allows"
+        formula = f"max over R, t of Σ 1(‖π(R p + t) − u‖ ≤ ε) ≤ {most}"
+    return Frame(
+        f"{why}: no pose explains more than {most} of {len(view.points)} matches. "
+        f"The first guess explains {stage.seed_support} and the best pose {best}, and {left}.",
+        formula,
+        start,
+        view.colors(style.UNDECIDED),
+        view.nobody(),
+        note=_effort(stage),
+        items=(
+            *_ring(view, stage),
+            ring.name("ring/name", view, stage.yaw_rad + np.pi, "bound: most matches at each yaw"),
+        ),
+    )
+
+
+def _effort(stage: ConsensusStage) -> str:
+    end = (
+        "every yaw that could hide a better pose was searched to its end."
+        if stage.finished
+        else "the budget ran out before every yaw was searched, so that the bound is larger than it might be."
+    )
+    what = "words of bitsets and tests of a match" if stage.arcs else "tests of a match"
+    return f"Effort: {stage.effort:,} {what}; {end}"
+
+
+def _peak(view: RunView, stage: ConsensusStage, rank: int, place: int, peaks: int) -> Frame:
+    """One of the highest peaks of the bound."""
+    here, best = int(stage.bound[place]), best_support(stage)
+    yaw = np.radians(ring.degrees_of(place + 0.5, len(stage.bound)))
+    turned = view.standing(yaw_rotation(yaw))
+    if here > best:
+        verdict = f"That is {here - best} more than the best pose explains, so a better one is not excluded here."
+    elif here == best:
+        verdict = f"The best pose explains as many, {best}, so nothing here can beat it."
+    else:
+        verdict = f"That is {best - here} fewer than the best pose explains, so nothing here can beat it."
+    rest = f" The {peaks} highest peaks of the bound are shown." if rank == 1 else ""
+    return Frame(
+        f"Peak {rank} of the bound: with a yaw near {np.degrees(yaw):.1f}°{ring.off_truth(view, yaw)}, no pose "
+        f"explains more than {here} of {len(view.points)} matches. {verdict}",
+        f"ω(G(θ)) ≤ {here} {'>' if here > best else '≤'} {best}",
+        turned,
+        view.colors(style.UNDECIDED),
+        view.nobody(),
+        note=f"Yaws are searched by falling bound until none could hide a better pose.{rest}",
+        items=(
+            *_ring(view, stage, place),
+            ring.spoke("ring/candidate", view, view.middle, yaw, style.SAMPLE),
+        ),
+    )
+
+
+def bound_chart(view: RunView, stage: ConsensusStage, candidate_rad: float | None = None) -> Chart:
+    """The bound over yaw, what the first guess and the best pose explain, the truth, the estimate, a candidate yaw."""
+    peak, ends = float(max(highest_bound(stage), 1)), np.array([-180.0, 180.0])
+    curves = [
+        ring.step_curve("bound", stage.bound),
+        Curve("first guess", ends, np.full(2, float(stage.seed_support)), style.SAMPLE, "level"),
+        Curve("best pose", ends, np.full(2, float(best_support(stage))), style.INLIER, "level"),
+        *ring.markers(view, peak, _yaw(stage)),
+    ]
+    if candidate_rad is not None:
+        curves.append(ring.marker("candidate", candidate_rad, peak, style.SAMPLE))
+    return Chart("consensus", "No pose with this yaw explains more than", "yaw (°)", "matches", tuple(curves))
+
+
+def _yaw(stage: ConsensusStage) -> float | None:
+    """Yaw of the best pose, if there is one."""
+    return stage.yaw_rad if len(stage.support) else None
+
+
+def _ring(view: RunView, stage: ConsensusStage, place: int | None = None) -> tuple[SceneItem, ...]:
+    """The bound around the sphere, where it is largest in the colour of the clique, or in that of a sample at one
+    place, and the best pose's support as a circle: what pokes out of it could hide a better pose."""
+    centre, heights, most = view.middle, ring.by_degree(stage.bound), max(1, highest_bound(stage))
+    feet, tops = ring.circle(view, centre, np.zeros(())), ring.circle(view, centre, heights / most)
+    colors = one_color(style.UNDECIDED, len(feet))
+    if place is None:
+        colors[heights == most] = style.CLIQUE
+    else:
+        colors[place * len(feet) // len(stage.bound)] = style.SAMPLE
+    support = ring.circle(view, centre, np.array(best_support(stage) / most))
+    return (
+        ring.bars("ring/bars", feet, tops, colors),
+        ring.outline("ring/bound", tops, style.SPHERE),
+        ring.outline("ring/support", support, style.INLIER),
+        *ring.spokes(view, centre, _yaw(stage)),
+    )
+
 
 CLIQUE_SIZES = (3, 5, 10, 20, 50, 100)
 """How many members of the largest set are shown before all are."""
@@ -24,8 +170,8 @@ CLIQUE_SIZES = (3, 5, 10, 20, 50, 100)
 
 def plans(view: RunView, stage: ConsensusStage) -> list[Plan]:
     """The first guess and the bound; then the set and the poses, where the search has found any."""
-    charts = {"consensus": partial(bound.chart, view, stage)}
-    out = bound.plans(view, stage)
+    charts = {"consensus": partial(bound_chart, view, stage)}
+    out = _bound_plans(view, stage)
     nodes, whole = cache(partial(match_nodes, view, stage)), len(stage.clique)
     for size in growing(whole, *CLIQUE_SIZES):
         title, draw = f"{size} matches that agree", partial(_members, view, stage, size)
@@ -200,3 +346,72 @@ def _table(view: RunView, stage: ConsensusStage, states: list[FloatArray]) -> Ta
         rows.append((str(rank), str(support), f"{np.degrees(yaw_of(state[:, :3])):.2f}°", place, *off))
     columns = ("", "explains", "yaw", "camera (m)", *(() if view.truth is None else ("off the truth",)))
     return Table("verified poses", columns, tuple(rows))
+
+
+BOX_EDGES = np.array([(a, a | 1 << axis) for axis in range(3) for a in range(8) if not a >> axis & 1])
+"""(12, 2) corners that the edges of a box join; bit k of a corner's number says at which end of axis k it is."""
+FAINT, STRONG = np.array(style.UNDECIDED, float), np.array(style.CLIQUE, float)
+
+
+def position_plans(view: RunView, stage: PositionStage) -> list[Plan]:
+    """One step a level, from the box around the map to those around the camera."""
+    out = []
+    for rank, level in enumerate(np.unique(stage.level).tolist(), 1):
+        left = int(stage.left[stage.level == level][0])
+        title = f"{left:,} boxes could hold a better camera" if left != 1 else "One box could hold a better camera"
+        out.append(Plan(f"positions-{rank}", title, partial(_level, view, stage, level)))
+    return out
+
+
+def _level(view: RunView, stage: PositionStage, level: int) -> Frame:
+    mine = stage.level == level
+    boxes, bound, left = stage.boxes_m[mine].astype(float), stage.bound[mine], int(stage.left[mine][0])
+    most, count = int(bound.max()), len(view.points)
+    size = np.sort(boxes[0, 1] - boxes[0, 0])
+    pose = _best_pose(view)
+    inside = "" if pose is None else _camera_inside(boxes, camera_centre(pose))
+    last = level == stage.level[-1]
+    end = (
+        f" Smaller boxes are divided in yaw as well: in the end no pose explains more than {stage.upper_bound}."
+        if last
+        else " Each is halved, and halves that cannot explain more than the best pose are dropped."
+    )
+    drawn = f" The {len(boxes)} of them that could explain most are drawn." if len(boxes) < left else ""
+    boxes_text = "box is" if left == 1 else "boxes are"
+    return Frame(
+        f"{left:,} {boxes_text} left, {length(size[0])} to {length(size[2])} long, in which a camera might explain "
+        f"more than the {stage.support} matches of the best pose; one of them up to {most} of {count}.{end}",
+        f"max over C ∈ box, θ of Σ 1(|el(p − C) − el(v)| ≤ β + ε) · 1(θ ∈ interval) = {most} > {stage.support}",
+        view.standing(np.eye(3)) if pose is None else pose,
+        view.colors(style.UNDECIDED),
+        view.nobody(),
+        note=f"Colour: from grey, one match more than the best pose, to gold, {most}.{inside}{drawn}",
+        located=pose is not None,
+        items=(_box_edges(boxes, _shades(bound, stage.support)),),
+        focus=Focus("Overview", boxes.reshape(-1, 3)),
+    )
+
+
+def _best_pose(view: RunView) -> FloatArray | None:
+    """The best pose (3, 4) of the search, between the aligned frames."""
+    stage = view.trace.stage(ConsensusStage)
+    return None if stage is None or not len(stage.cam_from_map) else view.aligned_pose(stage.cam_from_map[0])
+
+
+def _camera_inside(boxes: FloatArray, centre: FloatArray) -> str:
+    inside = ((boxes[:, 0] <= centre) & (centre <= boxes[:, 1])).all(axis=1).any()
+    return " The best pose's camera is in one of them." if inside else ""
+
+
+def _shades(bound: np.ndarray, support: int) -> ByteArray:
+    """(B, 3): grey for the least that could beat the best pose, gold for the largest bound."""
+    share = (bound - support) / max(1, int(bound.max()) - support)
+    return np.round(FAINT + share[:, None] * (STRONG - FAINT)).astype(np.uint8)
+
+
+def _box_edges(boxes: FloatArray, colors: ByteArray) -> Segments:
+    ends = np.array([[corner >> axis & 1 for axis in range(3)] for corner in range(8)])
+    corners = np.stack([boxes[:, ends[:, axis], axis] for axis in range(3)], axis=2)
+    return Segments(
+        "boxes/positions", "boxes", corners[:, BOX_EDGES].reshape(-1, 2, 3), np.repeat(colors, 12, axis=0), 1.0
+    )

@@ -1,6 +1,6 @@
 """Stages of estimators that other packages register, and the layers that draw them.
 
-A stage that nothing draws, or whose drawing fails, becomes a stop that says so in a sentence.
+A stage that nothing draws, or whose drawing fails, becomes a step that says so in a sentence.
 """
 
 from collections.abc import Callable, Collection, Mapping
@@ -55,7 +55,7 @@ class Layer:
     title: str
     """What the stage is called, a word or two, such as "Samples"."""
     plans: Callable[[RunView, Any], list[Plan]]
-    """The stops of such a stage of a run, in their order. Keys begin with the stage's kind, such as "guess-3"."""
+    """The steps of such a stage of a run, in their order. Keys begin with the stage's kind, such as "guess-3"."""
 
 
 def layer_of(kind: str) -> Layer:
@@ -80,7 +80,7 @@ def is_extension(view: RunView) -> bool:
 
 
 def named_plans(view: RunView, stage: Stage, taken: Collection[str]) -> tuple[str, list[Plan]]:
-    """Name and stops of a stage that is none of spherloc's own; ``taken`` are the kinds of those, which no other layer
+    """Name and steps of a stage that is none of spherloc's own; ``taken`` are the kinds of those, which no other layer
     draws."""
     kind = str(stage.kind)
     if kind in taken or kind not in registry.names("layers"):
@@ -88,32 +88,34 @@ def named_plans(view: RunView, stage: Stage, taken: Collection[str]) -> tuple[st
     try:
         layer = layer_of(kind)
     except InputError as error:
-        return UNKNOWN, [_stop(view, stage, str(error))]
+        return UNKNOWN, [_sentence_step(view, stage, str(error))]
     title = shorten(layer.title)
     if type(stage) is not layer.stage:
         what = f"{type(stage).__module__}.{type(stage).__name__}"
-        return UNKNOWN, [_stop(view, stage, f"{registry.title('layers', kind)} draws another class than {what}.")]
+        return UNKNOWN, [
+            _sentence_step(view, stage, f"{registry.title('layers', kind)} draws another class than {what}.")
+        ]
     return title, guarded_plans(view, stage, lambda: whole_plans(layer.plans(view, stage), kind))
 
 
 def unknown(view: RunView, stage: Stage) -> list[Plan]:
-    """One stop that says what is not drawn."""
+    """One step that says what is not drawn."""
     kind = shorten(str(stage.kind))
     return [Plan(f"stage-{kind}", f"Stage {kind}", lambda: _said(view, f"The stage {kind} has no drawing here."))]
 
 
 def guarded_plans(view: RunView, stage: Stage, plans: Callable[[], list[Plan]]) -> list[Plan]:
-    """What ``plans`` gives; for an extension, a stage that cannot be drawn becomes a stop that says why."""
+    """What ``plans`` gives; for an extension, a stage that cannot be drawn becomes a step that says why."""
     if not is_extension(view):
         return plans()
     try:
         found = plans()
     except Exception as error:  # the numbers of others
-        return [_stop(view, stage, _failure(stage, error))]
+        return [_sentence_step(view, stage, _failure(stage, error))]
     return [replace(plan, draw=_guarded(view, stage, plan)) for plan in found]
 
 
-def _stop(view: RunView, stage: Stage, sentence: str) -> Plan:
+def _sentence_step(view: RunView, stage: Stage, sentence: str) -> Plan:
     sentence = sentence[:1].upper() + sentence[1:]
     return Plan(f"stage-{shorten(str(stage.kind))}", "Not drawn", lambda: _said(view, sentence))
 

@@ -1,6 +1,6 @@
-"""A frame: one stop on a run's timeline, before it is turned into primitives.
+"""A frame: one step of a run, before it is turned into primitives.
 
-A run has up to 200 stops and a page shows one at a time, so a stop is planned first, which costs next to nothing, and
+A run has up to 200 steps and a page shows one at a time, so a step is planned first, which costs next to nothing, and
 drawn when it is looked at.
 """
 
@@ -58,16 +58,16 @@ class Frame:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """A stop and how to draw it."""
+    """A step and how to draw it."""
 
     key: str
     """Stable name, such as "yaw-arcs-100"."""
     title: str
     draw: Callable[[], Frame]
     charts: Mapping[str, Callable[[], Chart]] = field(default_factory=dict)
-    """Charts by name. They stay until a later stop has one of the same name."""
+    """Charts by name. They stay until a later step has one of the same name."""
     graph: Callable[[], Graph] | None = None
-    """What it shows of the run's graph. It stays until a later stop has one."""
+    """What it shows of the run's graph. It stays until a later step has one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,7 +208,32 @@ def length(metres: float) -> str:
     if metres >= 1.0:
         return f"{metres:.2f} m"
     digits = 0 if metres >= 0.1 else 1 if metres >= 0.01 else 2
-    return f"{100.0 * metres:.{digits}f} cm" if metres >= 1e-4 else "less than 0.1 mm"
+    return f"{100.0 * metres:.{digits}f} cm" if metres >= LEAST_M else "less than 0.1 mm"
+
+
+LEAST_M = 1e-4
+"""Shorter lengths are told as less than this."""
+
+
+def length_text(length_m: float) -> str:
+    """A length in the unit that suits its size, with two digits."""
+    if 0.0 < length_m < LEAST_M:
+        return "< 0.1 mm"
+    for unit, metres in (("km", 1000.0), ("m", 1.0), ("cm", 0.01)):
+        if length_m >= 0.995 * metres:
+            return f"{_digits(length_m / metres)} {unit}"
+    return f"{_digits(1000.0 * length_m)} mm"
+
+
+def angle_text(angle_deg: float) -> str:
+    """An angle with two digits behind the point where it is small."""
+    return (
+        f"{angle_deg:.3f}°" if angle_deg < 0.0995 else f"{angle_deg:.2f}°" if angle_deg < 9.95 else f"{angle_deg:.0f}°"
+    )
+
+
+def _digits(value: float) -> str:
+    return f"{value:.2g}" if value < 99.5 else f"{value:.0f}"
 
 
 STRAY = 4.0

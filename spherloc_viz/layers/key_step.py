@@ -37,7 +37,7 @@ def key_step(trace: Trace, diagnosis: Diagnosis) -> int:
     stage whose result is wrong; where it is not, the step that shows the cause. A run that looks right was decided
     where its consensus was found, and one without any such step by its outcome.
     """
-    index = {stop.key: number for number, stop in enumerate(steps(trace))}
+    index = {heading.key: number for number, heading in enumerate(steps(trace))}
     wanted = [*_wrong(trace, diagnosis), *_decided(trace, index), "outcome"]
     return next(index[key] for key in wanted if key in index)
 

@@ -8,9 +8,8 @@ from spherloc.outcome import judge
 from spherloc.trace import Certificate, RefinementStage, Trace
 from spherloc_viz import style
 from spherloc_viz.layers import uncertainty
-from spherloc_viz.layers.frame import Frame, Plan, RunView, length, map_focus, place_text
+from spherloc_viz.layers.frame import Frame, Plan, RunView, angle_text, length, length_text, map_focus, place_text
 from spherloc_viz.layers.primitives import Table
-from spherloc_viz.layers.scale_bar import angle_text, length_text
 
 KNOWABLE = 0.01
 """From this NFA on, the answer cannot be known."""
@@ -47,7 +46,7 @@ def warning(certificate: Certificate) -> str:
 
 
 def plans(view: RunView) -> list[Plan]:
-    """One stop."""
+    """One step."""
     cam_from_map = view.trace.cam_from_map
     if cam_from_map is None:
         return [Plan("outcome", "No pose", lambda: _no_pose(view))]

@@ -211,8 +211,8 @@ class Table:
 
 
 @dataclass(frozen=True)
-class Stop:
-    """One stop on the timeline of a run, by name: what is known of a step before it is painted."""
+class StepHeading:
+    """What is known of a step before it is painted."""
 
     key: str
     """Stable name, such as "yaw-arcs" or "sample-3"."""
@@ -224,7 +224,7 @@ class Stop:
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """What one stop on the timeline of a run says."""
+    """What one step of a run says."""
 
     key: str
     """Stable name, such as "yaw-arcs" or "sample-3"."""

@@ -1,11 +1,11 @@
-"""RANSAC: every hypothesis that beat those before it, with the sample that made it, and what Eq. 28 expected."""
+"""RANSAC: every hypothesis that beat those before it, and what Eq. 28 expected; the choice of ``auto``."""
 
 from functools import partial
 
 import numpy as np
 
 from spherloc.metrics import ransac_success_probability
-from spherloc.trace import RansacStage
+from spherloc.trace import DecisionStage, RansacStage
 from spherloc_viz import style
 from spherloc_viz.layers.frame import Frame, Plan, RunView, close_focus, even, one_color
 from spherloc_viz.layers.primitives import Chart, Curve, Segments, Table
@@ -13,7 +13,7 @@ from spherloc_viz.layers.primitives import Chart, Curve, Segments, Table
 MOST_IMPROVEMENTS = 60
 """More improvements are thinned evenly; the first and the last, which is the best, stay."""
 MOST_IN_TWO = 30
-"""Up to so many, an improvement has two stops: its sample, and how the matches vote."""
+"""Up to so many, an improvement has two steps: its sample, and how the matches vote."""
 SHARES = (0.5, 0.2, 0.1, 0.05, 0.02)
 """Shares of inliers for which Eq. 28 is told."""
 CURVE_POINTS = 80
@@ -185,3 +185,33 @@ def chance_chart(stage: RansacStage) -> Chart:
         Curve("best pose found", np.array([best]), np.array([1.0]), style.INLIER, "marker"),
     )
     return Chart("chance", "Chance that a sample was clean, by Eq. 28", "samples drawn", "probability", curves)
+
+
+def decision_plans(view: RunView, stage: DecisionStage) -> list[Plan]:
+    """One step."""
+    return [Plan("decision", f"Chosen: {stage.chosen}", lambda: _decision(view, stage))]
+
+
+def _decision(view: RunView, stage: DecisionStage) -> Frame:
+    count, rate = len(view.points), stage.inlier_rate
+    chance = ransac_success_probability(rate, 2, stage.samples)
+    return Frame(
+        f"{stage.reason.rstrip('.')}. "
+        f"The best of {stage.samples:,} sampled pairs explains {round(rate * count)} of {count} matches, so "
+        f"that a clean pair was among them with probability {chance:.3g}.",
+        f"P = 1 − (1 − wⁿ)ᵏ,  n = 2,  w = {rate:.3g},  k = {stage.samples:,}   (Eq. 28)",
+        view.standing(np.eye(3)),
+        view.colors(style.UNDECIDED),
+        view.nobody(),
+        tables=(_decision_table(stage, count),),
+    )
+
+
+def _decision_table(stage: DecisionStage, count: int) -> Table:
+    rows = (
+        ("chosen", stage.chosen),
+        ("matches", f"{count:,}"),
+        ("sampled pairs", f"{stage.samples:,}"),
+        ("inliers of the best", f"{100 * stage.inlier_rate:.1f} %"),
+    )
+    return Table("decision", ("", "this problem"), rows)

@@ -10,9 +10,8 @@ from spherloc.trace import RefinementStage
 from spherloc.types import BoolArray, FloatArray
 from spherloc_viz import style
 from spherloc_viz.layers import uncertainty
-from spherloc_viz.layers.frame import Frame, Plan, RunView, even, length, one_color, sphere_box
+from spherloc_viz.layers.frame import Frame, Plan, RunView, angle_text, even, length, length_text, one_color, sphere_box
 from spherloc_viz.layers.primitives import Chart, Curve, Focus, SceneItem, Segments
-from spherloc_viz.layers.scale_bar import angle_text, length_text
 
 MOST_STATES = 20
 """More states are thinned evenly; the first and the last stay."""

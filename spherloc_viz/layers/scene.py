@@ -1,6 +1,7 @@
 """What every picture shows: map points, the unit sphere with its bearings and the query image, matches, true and
-estimated camera with the error, and a scale bar."""
+estimated camera with the error, a scale bar, and a localized sequence."""
 
+from collections.abc import Sequence
 from functools import cache, partial
 
 import cv2
@@ -8,15 +9,77 @@ import numpy as np
 
 from spherloc.cameras.base import Camera, in_image
 from spherloc.cameras.equirectangular import Equirectangular
+from spherloc.experiments.results import QueryResult
 from spherloc.geometry import camera_centre
 from spherloc.problem import Problem
 from spherloc.types import ByteArray, FloatArray
 from spherloc_viz import style
-from spherloc_viz.layers.frame import Frame, RunView, one_color
-from spherloc_viz.layers.primitives import Mesh, Points, SceneItem, Segments, Textured
-from spherloc_viz.layers.query_image import sphere_texture
-from spherloc_viz.layers.scale_bar import scale_bar
+from spherloc_viz.layers.frame import Frame, RunView, length_text, one_color
+from spherloc_viz.layers.primitives import Label, Mesh, Points, SceneItem, Segments, Textured
+from spherloc_viz.layers.query_image import modified, sphere_texture
 from spherloc_viz.layers.uncertainty import error_items
+
+BAR_SHARE = 0.25
+"""Length of the scale bar as a share of the map's width, at most."""
+BAR_TICK = 0.04
+"""Height of its marks, as a share of the bar."""
+CELL_SHARE, GROUND_SHARE = 0.2, 0.9
+"""Side of a cell of the ground, at most, and the ground's radius, as shares of the map's width."""
+RIM = 72
+"""Pieces of the ground's edge."""
+
+
+def scale_bar(view: RunView) -> list[SceneItem]:
+    """The bar, before the front of the map as the overview shows it, with its length."""
+    low, high = view.dense_box
+    length = round_length(BAR_SHARE * max(float((high - low)[[0, 2]].max()), 1e-3))
+    start = np.array([0.5 * (low + high)[0] - 0.5 * length, high[1], low[2] - BAR_TICK * length])
+    along, tick = np.array([length, 0.0, 0.0]), np.array([0.0, -BAR_TICK * length, 0.0])
+    marks = start + np.array([0.0, 0.5, 1.0])[:, None] * along
+    heights = np.array([1.0, 0.6, 1.0])[:, None] * tick
+    lines = np.concatenate([[[start, start + along]], np.stack([marks, marks + heights], axis=1)])
+    below = start + 0.5 * along - 1.5 * tick
+    return [
+        Segments("scale/bar", "scale bar", lines, one_color(style.SCALE, len(lines)), 3.0),
+        Label("scale/length", "scale bar", below, length_text(length)),
+    ]
+
+
+def ground(view: RunView) -> list[SceneItem]:
+    """A round grid at the foot of the map, which tells what is level and what is far, with the map's level axes."""
+    low, high = view.dense_box
+    middle, extent = 0.5 * (low + high), max(float((high - low)[[0, 2]].max()), 1e-3)
+    cell, radius = round_length(CELL_SHARE * extent), GROUND_SHARE * extent
+    lines: list[FloatArray] = []
+    for axis, other in ((0, 2), (2, 0)):
+        first, last = (int(np.floor((middle[axis] + side * radius) / cell)) for side in (-1, 1))
+        places = cell * np.arange(first + 1, last + 1)
+        half = np.sqrt(np.maximum(radius**2 - (places - middle[axis]) ** 2, 0.0))
+        ends = np.tile(np.array([0.0, high[1], 0.0]), (len(places), 2, 1))
+        ends[:, :, axis] = places[:, None]
+        ends[:, :, other] = middle[other] + half[:, None] * np.array([-1.0, 1.0])
+        lines.append(ends)
+    turns = np.linspace(0.0, 2.0 * np.pi, RIM + 1)
+    rim = np.tile([middle[0], high[1], middle[2]], (RIM + 1, 1))
+    rim[:, [0, 2]] += radius * np.column_stack([np.cos(turns), np.sin(turns)])
+    lines.append(np.stack([rim[:-1], rim[1:]], axis=1))
+    grid = np.concatenate(lines)
+    edge = np.array([middle[0], high[1], middle[2]])
+    names = (("x", np.array([1.0, 0.0, 0.0])), ("z, yaw 0°", np.array([0.0, 0.0, 1.0])))
+    return [
+        Segments("ground/grid", "ground", grid, one_color(style.GROUND, len(grid)), 1.0),
+        *(
+            Label(f"ground/{text[0]}", "ground", edge + (radius + 0.4 * cell) * along, text, 0.25 * cell)
+            for text, along in names
+        ),
+    ]
+
+
+def round_length(most: float) -> float:
+    """The largest of 1, 2 and 5 times a power of ten that is not larger."""
+    power = 10.0 ** np.floor(np.log10(most))
+    return max(float(step * power) for step in (0.5, 1.0, 2.0, 5.0) if step * power <= most * (1.0 + 1e-9))
+
 
 CAMERA = 1.9
 """Size of a camera, in sphere radii."""
@@ -48,6 +111,7 @@ def base_items(view: RunView, frame: Frame) -> tuple[SceneItem, ...]:
         *_sphere(view, frame),
         *view.kept("located", (pose, frame.located), lambda: _located(view, frame)),
         *view.kept("scale bar", None, lambda: scale_bar(view)),
+        *view.kept("ground", None, lambda: ground(view)),
     )
 
 
@@ -71,7 +135,7 @@ def _true_camera(view: RunView, truth: FloatArray) -> Segments:
 
 def _sphere(view: RunView, frame: Frame) -> list[SceneItem]:
     aligned = view.trace.problem.aligned
-    key = frame.cam_from_map.tobytes(), frame.sphere_aside
+    key = frame.cam_from_map.tobytes(), frame.sphere_aside, _changed(view.trace.problem)
     surfaces, dots = view.kept("sphere", key, lambda: _placed_sphere(view, frame))
     drawn = np.flatnonzero(frame.rays[aligned.index])[: style.MAX_DRAWN_RAYS]
     ends = np.stack([dots[drawn], view.points[aligned.index[drawn]]], axis=1)
@@ -98,8 +162,13 @@ def _image(problem: Problem, centre: FloatArray, map_from_sphere: FloatArray) ->
     """The query image on the sphere. Vertices are bearings of the aligned camera frame."""
     vertices, faces, uv = _panorama()
     placed = np.column_stack([map_from_sphere, centre])
-    key = (problem.image, problem.camera, problem.aligned.camera_turn.tobytes())
+    key = (problem.image, _changed(problem), problem.camera, problem.aligned.camera_turn.tobytes())
     return Textured("sphere/image", "image", vertices, faces, uv, placed, partial(_sphere_image, problem), key)
+
+
+def _changed(problem: Problem) -> int:
+    """When the query image was written: it may be drawn only after the run."""
+    return 0 if problem.image is None else modified(problem.image)
 
 
 @cache
@@ -172,3 +241,36 @@ def camera(name: str, cam_from_map: FloatArray, size_m: float, color: style.RGB,
     centre, rotation = camera_centre(cam_from_map), cam_from_map[:, :3]
     ends = centre + size_m * _EDGES @ rotation
     return Segments(name, "cameras", ends, one_color(color, len(ends)), width_px)
+
+
+DOT_SHARE = 0.06
+"""Radius of a dot as a share of the usual distance between neighbours, so that dots do not hide each other."""
+
+
+def trajectory_items(rows: Sequence[QueryResult], map_turn: FloatArray, limit_m: float) -> tuple[SceneItem, ...]:
+    """What a sequence adds to the canvas.
+
+    ``rows`` are in the order of the sequence, ``map_turn`` (3, 3) turns the map to the aligned map, and ``limit_m``
+    is the loosest limit of success. Poses whose truth is unknown have the estimate's colour; a query without a pose is
+    a dot in the outliers' colour where it truly was.
+    """
+    truth = np.array([row.true_position_m for row in rows]).reshape(-1, 3) @ map_turn.T
+    found = np.array([row.position_m for row in rows]).reshape(-1, 3) @ map_turn.T
+    errors: FloatArray = np.linalg.norm(found - truth, axis=1)
+    known, located = np.isfinite(truth[:, 0]), np.isfinite(found[:, 0])
+    colors = np.where(known[:, None], style.error_colors(errors, limit_m), np.array(style.ESTIMATE, np.uint8))
+    places = np.where(located[:, None], found, truth)
+    colors[~located] = style.OUTLIER
+    shown = located | known
+    followed = known[:-1] & known[1:]
+    legs = np.stack([truth[:-1], truth[1:]], axis=1)[followed]
+    both = known & located
+    offsets = np.stack([truth, found], axis=1)[both]
+    ids = np.flatnonzero(shown)
+    steps = np.linalg.norm(np.diff(places[shown], axis=0), axis=1)
+    dot_m = DOT_SHARE * float(np.median(steps)) if len(steps) else limit_m
+    return (
+        Points("trajectory/queries", "trajectory", places[shown], colors[shown], dot_m, ids),
+        Segments("trajectory/truth", "trajectory", legs, one_color(style.TRUTH, len(legs)), 2.0),
+        Segments("trajectory/errors", "trajectory", offsets, colors[both], 2.0),
+    )

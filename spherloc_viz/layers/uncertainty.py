@@ -7,9 +7,8 @@ from spherloc.metrics import rotation_error_deg
 from spherloc.trace import RefinementStage
 from spherloc.types import FloatArray
 from spherloc_viz import style
-from spherloc_viz.layers.frame import Frame, RunView, length, one_color
+from spherloc_viz.layers.frame import Frame, RunView, angle_text, length, length_text, one_color
 from spherloc_viz.layers.primitives import Label, Points, SceneItem, Segments, Table
-from spherloc_viz.layers.scale_bar import angle_text, length_text
 
 LAYER = "uncertainty"
 SIGMAS = 3.0

@@ -1,21 +1,266 @@
 """Yaw: arcs of pairs gather on the ring around the sphere, candidate yaws are tried, and most arcs overlap at one."""
 
-from functools import partial
+from dataclasses import dataclass
+from functools import cached_property, partial
+from heapq import heappop, heappush
+from math import gcd
 
 import numpy as np
+from numpy.typing import NDArray
 
-from spherloc.geometry import yaw_rotation
+from spherloc.consensus.yaw_arcs import YawConsensus, deepest_yaw
+from spherloc.geometry import wrap_angle, yaw_rotation
 from spherloc.trace import YawStage
-from spherloc.types import IntArray
+from spherloc.types import FloatArray, IntArray
 from spherloc_viz import style
-from spherloc_viz.layers import ring, two_roots
-from spherloc_viz.layers.arcs import Arcs
-from spherloc_viz.layers.frame import Frame, Plan, RunView, growing
-from spherloc_viz.layers.primitives import Chart, SceneItem
+from spherloc_viz.layers import ring
+from spherloc_viz.layers.frame import Frame, Plan, RunView, even, growing, one_color, ring_focus
+from spherloc_viz.layers.primitives import Chart, SceneItem, Segments
+
+INNER, OUTER = 1.3, 1.95
+"""Radii of the band of arcs, in sphere radii."""
+STEP_RAD = np.radians(4.0)
+FEWEST_TRACKS = 24
+"""The band has room for so many arcs over one yaw, or more if more are drawn there."""
+
+
+@dataclass(frozen=True, eq=False)
+class Arcs:
+    """A yaw stage and what several of its frames need, computed when it is first asked for. A arcs."""
+
+    stage: YawStage
+
+    def __len__(self) -> int:
+        return len(self.stage.lo_rad)
+
+    @property
+    def median_width_rad(self) -> float:
+        """Of all arcs; numpy's own median is ten times slower."""
+        return float(np.partition(self.stage.hi_rad - self.stage.lo_rad, len(self) // 2)[len(self) // 2])
+
+    @cached_property
+    def in_clique(self) -> NDArray[np.bool_]:
+        """(A,) arcs that cover the estimated yaw."""
+        inside = np.zeros(len(self), dtype=bool)
+        inside[self.stage.clique] = True
+        return inside
+
+    @cached_property
+    def _continues(self) -> NDArray[np.bool_]:
+        """(A,) arcs of the same pair as the arc before them; the arcs of a pair follow one another."""
+        pairs = np.ascontiguousarray(self.stage.pairs, dtype=np.int32).view(np.int64).ravel()
+        same = np.zeros(len(pairs), dtype=bool)
+        same[1:] = pairs[1:] == pairs[:-1]
+        return same
+
+    @cached_property
+    def pair_counts(self) -> tuple[int, int]:
+        """How many pairs have one arc, and how many have more."""
+        same = self._continues
+        pairs = len(same) - int(np.count_nonzero(same))
+        several = int(np.count_nonzero(same[1:] & ~same[:-1]))
+        return pairs - several, several
+
+    @cached_property
+    def example(self) -> IntArray:
+        """The arcs of one pair: of those with an arc over the estimated yaw the one whose arc there is the shortest,
+        among those with two arcs if there are any."""
+        arcs, same = self.stage.clique.astype(np.int64), self._continues
+        several = same[arcs] | np.append(same[1:], False)[arcs]
+        if several.any():
+            arcs = arcs[several]
+        first = int(arcs[np.argmin((self.stage.hi_rad - self.stage.lo_rad)[arcs])])
+        end = first + 1
+        while same[first]:
+            first -= 1
+        while end < len(same) and same[end]:
+            end += 1
+        return np.arange(first, end)
+
+    def spread(self, count: int) -> IntArray:
+        """The first ``count`` arcs in an order in which every beginning is spread evenly over all pairs."""
+        total = len(self)
+        stride = max(1, round(ring.GOLDEN * total))
+        while gcd(stride, total) > 1:
+            stride += 1
+        return np.arange(min(count, total), dtype=np.int64) * stride % total
+
+    def overlap_of(self, arcs: IntArray) -> YawConsensus:
+        """The yaw that most of some arcs share, and their overlap."""
+        found = deepest_yaw(self.stage.lo_rad[arcs], self.stage.hi_rad[arcs])
+        assert found is not None
+        return found
+
+    def over(self, arcs: IntArray, lo_rad: float, hi_rad: float) -> NDArray[np.bool_]:
+        """Which of some arcs touch an interval of yaw within [-pi, pi]."""
+        lo, hi = self.stage.lo_rad[arcs], self.stage.hi_rad[arcs]
+        return ((lo <= hi_rad) & (hi >= lo_rad)) | (hi >= lo_rad + 2 * np.pi)
+
+    def with_clique(self) -> IntArray:
+        """Arcs to draw: an even sample of the clique's and of the others, half and half if there are too many."""
+        members, room = self.stage.clique.astype(np.int64), style.MAX_DRAWN_ARCS
+        take = min(len(members), max(room // 2, room - (len(self) - len(members))))
+        others = self.spread(8 * room)
+        others = others[~self.in_clique[others]]
+        if len(others) < room - take:
+            others = np.flatnonzero(~self.in_clique)
+        return np.concatenate([even(members, take), others[: room - take]])
+
+    def drawn(self, view: RunView, arcs: IntArray, marked: np.ndarray, mark: style.RGB) -> Segments:
+        """Arcs on the ring around the middle of the map, the marked ones (mask) in their colour. Arcs that overlap lie
+        side by side, so that the band is as broad as they are many."""
+        order, arc, points = view.kept("arcs", arcs.tobytes(), lambda: self._band(view, arcs))
+        colors = one_color(style.UNDECIDED, len(arc))
+        colors[marked[order][arc]] = mark
+        ids = self.stage.pairs[arcs[order][arc]].astype(np.int64)
+        return Segments("ring/arcs", "yaw ring", points, colors, 2.0, ids=ids)
+
+    def _band(self, view: RunView, arcs: IntArray) -> tuple[IntArray, IntArray, FloatArray]:
+        """Some arcs as S straight lines (S, 2, 3), which arc each line is of (S,), and the order of these arcs."""
+        order = np.argsort(self.stage.lo_rad[arcs], kind="stable")
+        arcs = arcs[order]
+        lo, hi = self.stage.lo_rad[arcs], self.stage.hi_rad[arcs]
+        tracks = _tracks(lo, hi)
+        radii = INNER + (OUTER - INNER) * (tracks + 0.5) / max(FEWEST_TRACKS, int(tracks.max(initial=0)) + 1)
+        steps = np.maximum(1, np.ceil((hi - lo) / STEP_RAD)).astype(np.int64)
+        arc = np.repeat(np.arange(len(arcs)), steps)
+        part = np.arange(len(arc)) - np.repeat(np.cumsum(steps) - steps, steps)
+        ends = lo[arc, None] + ((hi - lo) / steps)[arc, None] * (part[:, None] + np.array([0.0, 1.0]))
+        directions = ring.directions(ends.ravel()).reshape(-1, 2, 3)
+        return order, arc, view.middle + view.sphere_m * radii[arc, None, None] * directions
+
+
+def _tracks(lo_rad: FloatArray, hi_rad: FloatArray) -> IntArray:
+    """The innermost track (A,) that is free for each of the arcs, which begin one after another."""
+    free: list[int] = []
+    busy: list[tuple[float, int]] = []
+    tracks = np.empty(len(lo_rad), dtype=np.int64)
+    for k, (lo, hi) in enumerate(zip(lo_rad.tolist(), hi_rad.tolist(), strict=True)):
+        while busy and busy[0][0] < lo:
+            heappush(free, heappop(busy)[1])
+        # Each track is either free or busy.
+        track = heappop(free) if free else len(busy)
+        heappush(busy, (hi, track))
+        tracks[k] = track
+    return tracks
+
+
+@dataclass(frozen=True, eq=False)
+class PairRoots:
+    """Eq. 22 of two correspondences."""
+
+    wave: FloatArray
+    """(d1, d2, d3)."""
+    yaws_rad: FloatArray
+    """(0 or 2,) roots, in [-pi, pi)."""
+    in_front: np.ndarray
+    """(0 or 2,) whether both points are in front of the camera there."""
+
+
+def pair_roots(view: RunView, first: int, second: int) -> PairRoots:
+    """Where the wave of two correspondences is zero."""
+    aligned = view.trace.problem.aligned
+    vi, vj = aligned.bearings[np.searchsorted(aligned.index, [first, second])]
+    d, n = view.points[first] - view.points[second], np.cross(vi, vj)
+    wave = np.array([n[0] * d[0] + n[2] * d[2], n[0] * d[2] - n[2] * d[0], n[1] * d[1]])
+    rho = float(np.hypot(wave[0], wave[1]))
+    if rho == 0.0 or abs(wave[2]) > rho:
+        return PairRoots(wave, np.zeros(0), np.zeros(0, dtype=bool))
+    half = float(np.arccos(-wave[2] / rho))
+    yaws = np.asarray(wrap_angle(np.arctan2(wave[1], wave[0]) + half * np.array([1.0, -1.0])))
+    # R d = s_i v_i - s_j v_j has both depths positive if both points are in front.
+    rays = np.column_stack([vi, -vj])
+    depths = np.array([np.linalg.lstsq(rays, yaw_rotation(yaw) @ d, rcond=None)[0] for yaw in yaws])
+    return PairRoots(wave, yaws, np.all(depths > 0.0, axis=1))
+
+
+def _pair(view: RunView, arcs: Arcs) -> Frame:
+    """A pair, and the arc of yaws that it allows."""
+    example, stage = arcs.example, arcs.stage
+    first, second = (int(number) for number in stage.pairs[example[0]])
+    k = int(example[np.argmax(arcs.in_clique[example])])
+    lo, hi = np.degrees(stage.lo_rad[k]), np.degrees(stage.hi_rad[k])
+    also = ", and a second arc" if len(example) > 1 else ""
+    d1, d2, d3 = pair_roots(view, first, second).wave
+    return Frame(
+        f"Matches {first} and {second} can both be right only where the line between their points turns into the plane "
+        f"of their bearings, and that fixes the yaw. With {view.trace.options.bound_px:.3g} px of noise it is an arc "
+        f"of {hi - lo:.2g}°, from {lo:.2f}° to {hi:.2f}°{also}.",
+        f"{d1:.3g} cos θ {_signed(d2)} sin θ {_signed(d3)} = 0   (Eq. 22)",
+        *_shown(view, (first, second), 0.5 * float(stage.lo_rad[k] + stage.hi_rad[k])),
+        note=stage.rule,
+        items=(
+            *_items(view, arcs, np.array([k]), (first, second)),
+            ring.name(
+                "ring/name", view, 0.5 * float(stage.lo_rad[k] + stage.hi_rad[k]), "arc: the yaws this pair allows"
+            ),
+        ),
+        focus=ring_focus(view, view.points[[first, second]]),
+    )
+
+
+def _roots(view: RunView, arcs: Arcs) -> Frame:
+    """All arcs of the pair, and how many arcs pairs have."""
+    example, stage = arcs.example, arcs.stage
+    first, second = (int(number) for number in stage.pairs[example[0]])
+    found = pair_roots(view, first, second)
+    one, several = arcs.pair_counts
+    none = stage.pairs_total - one - several
+    other = example[np.argmin(arcs.in_clique[example])]
+    return Frame(
+        f"{_why(found, len(example))} Of all {stage.pairs_total:,} pairs, {several:,} have two arcs or more, {one:,} "
+        f"have one, and {none:,} have none.",
+        "θ = atan2(d2, d1) ± arccos(−d3 / √(d1² + d2²))   (Eq. 22-23)",
+        *_shown(view, (first, second), 0.5 * float(stage.lo_rad[other] + stage.hi_rad[other])),
+        note=stage.rule,
+        items=_items(view, arcs, example, (first, second)),
+        focus=ring_focus(view, view.points[[first, second]]),
+    )
+
+
+def _why(roots: PairRoots, arcs: int) -> str:
+    """Why the pair has as many arcs as it has, as a sentence."""
+    if len(roots.yaws_rad) == 0:
+        return "The wave of this pair only comes near zero, so it has no exact root."
+    one, two = (f"{value:.2f}°" for value in np.degrees(roots.yaws_rad))
+    wave = f"A wave crosses zero twice in a turn, so the pair has two roots, {one} and {two}"
+    if roots.in_front.all() and arcs > 1:
+        return f"{wave}, and both put its points in front of the camera: only other matches tell the two apart."
+    if roots.in_front.all():
+        return f"{wave}, but the arc around one of them is too wide to say much."
+    behind = two if roots.in_front[0] else one
+    return f"{wave}, but {behind} would put a point behind the camera."
+
+
+def _signed(value: float) -> str:
+    return f"{'−' if value < 0 else '+'} {abs(value):.3g}"
+
+
+def _shown(view: RunView, numbers: tuple[int, int], yaw_rad: float) -> tuple[FloatArray, np.ndarray, np.ndarray]:
+    """The sphere at a yaw, the pair in its colour, and its rays."""
+    mask = view.mask(np.array(numbers))
+    return view.standing(yaw_rotation(yaw_rad)), view.colors(style.UNDECIDED, (mask, style.SAMPLE)), mask
+
+
+def _items(view: RunView, arcs: Arcs, shown: np.ndarray, numbers: tuple[int, int]) -> tuple[SceneItem, ...]:
+    """Some arcs of the pair with a spoke through each, and the line between its points."""
+    middles = 0.5 * (arcs.stage.lo_rad + arcs.stage.hi_rad)[shown]
+    spokes = [ring.spoke("ring/candidate", view, view.middle, float(yaw), style.SAMPLE).points for yaw in middles]
+    marked = np.ones(len(shown), dtype=bool)
+    ends = view.points[list(numbers)][None]
+    ids = np.array([numbers], dtype=np.int64)
+    return (
+        arcs.drawn(view, shown, marked, style.SAMPLE),
+        ring.outline("ring/overlap", ring.circle(view, view.middle, np.zeros(())), style.SPHERE),
+        Segments("ring/candidate", "yaw ring", np.concatenate(spokes), one_color(style.SAMPLE, len(spokes)), 4.0),
+        *ring.spokes(view, view.middle, None),
+        Segments("pairs/sample", "pairs", ends, one_color(style.SAMPLE, 1), 3.0, ids=ids),
+    )
+
 
 SIZES = (10, 30, 100, 300, 1000, 3000)
 """How many arcs are shown before all are."""
-STOPS = 8
+MOST_CANDIDATES = 8
 """Candidate yaws shown at most, before the one with the deepest overlap."""
 REACH = 40
 """A peak is the highest within so many quarters of a degree."""
@@ -24,13 +269,13 @@ REACH = 40
 def plans(view: RunView, stage: YawStage) -> list[Plan]:
     """One pair with its arcs, more and more arcs, candidate yaws, and the deepest overlap."""
     arcs = Arcs(stage)
-    own = two_roots.charts(view, arcs, counts_chart)
+    own = {"yaw": lambda: counts_chart(view, arcs.overlap_of(arcs.example).overlap)}
     out = [
-        Plan("yaw-pair", "One pair of matches", lambda: two_roots.pair(view, arcs)),
+        Plan("yaw-pair", "One pair of matches", lambda: _pair(view, arcs)),
         Plan(
             "yaw-roots",
             "The two roots of a pair",
-            lambda: two_roots.roots(view, arcs),
+            lambda: _roots(view, arcs),
             own,
         ),
     ]
@@ -38,11 +283,11 @@ def plans(view: RunView, stage: YawStage) -> list[Plan]:
         charts = {"yaw": partial(_growing_chart, view, arcs, size)}
         out.append(Plan(f"yaw-arcs-{size}", f"{size:,} arcs", partial(_some, view, arcs, size), charts))
     out.append(Plan("yaw-arcs", "Yaw arcs of all pairs", lambda: _all(view, arcs), {"yaw": lambda: chart(view, stage)}))
-    stops = candidate_yaws(stage)
-    for number, place in enumerate(stops, 1):
+    places = candidate_yaws(stage)
+    for number, place in enumerate(places, 1):
         yaw = ring.degrees_of(place + 0.5, len(stage.overlap))
         charts = {"yaw": partial(chart, view, stage, candidate_rad=np.radians(yaw))}
-        draw = partial(_candidate, view, arcs, stops[:number])
+        draw = partial(_candidate, view, arcs, places[:number])
         out.append(Plan(f"yaw-candidate-{number}", f"Candidate yaw {yaw:.1f}°", draw, charts))
     charts = {"yaw": lambda: chart(view, stage, found=True)}
     out.append(Plan("yaw-clique", "The yaw most arcs share", lambda: _clique(view, arcs), charts))
@@ -51,11 +296,11 @@ def plans(view: RunView, stage: YawStage) -> list[Plan]:
 
 def candidate_yaws(stage: YawStage) -> IntArray:
     """Candidate yaws, in quarters of a degree from -180: the highest peaks without the deepest overlap, by yaw."""
-    highest = ring.peaks(stage.overlap, REACH, STOPS + 1)
+    highest = ring.peaks(stage.overlap, REACH, MOST_CANDIDATES + 1)
     places = len(stage.overlap)
     end = int((stage.yaw_rad + np.pi) / (2 * np.pi) * places)
     gaps = np.abs(highest - end)
-    return np.sort(highest[np.minimum(gaps, places - gaps) > REACH][:STOPS])
+    return np.sort(highest[np.minimum(gaps, places - gaps) > REACH][:MOST_CANDIDATES])
 
 
 def _some(view: RunView, arcs: Arcs, size: int) -> Frame:
@@ -99,9 +344,9 @@ def _all(view: RunView, arcs: Arcs) -> Frame:
     )
 
 
-def _candidate(view: RunView, arcs: Arcs, stops: IntArray) -> Frame:
+def _candidate(view: RunView, arcs: Arcs, places: IntArray) -> Frame:
     """The last of the candidate yaws so far."""
-    counts, place = arcs.stage.overlap, int(stops[-1])
+    counts, place = arcs.stage.overlap, int(places[-1])
     lo, hi = (ring.degrees_of(place + part, len(counts)) for part in (0, 1))
     yaw, here = np.radians(0.5 * (lo + hi)), int(counts[place])
     turned, drawn = view.standing(yaw_rotation(yaw)), arcs.spread(style.MAX_DRAWN_ARCS)
@@ -110,7 +355,7 @@ def _candidate(view: RunView, arcs: Arcs, stops: IntArray) -> Frame:
     items = _ring(view, arcs, drawn, counts, met, style.SAMPLE)
     return Frame(
         f"The candidate yaw {lo:.2f}° lies in up to {here:,} of {len(arcs):,} arcs within a quarter of a degree, the "
-        f"most within 10° on either side. {_so_far(counts, stops)}",
+        f"most within 10° on either side. {_so_far(counts, places)}",
         f"Σ 1(|f(θ)| ≤ τ) = {here:,}   (Eq. 34)",
         turned,
         view.colors(style.UNDECIDED),
@@ -120,12 +365,12 @@ def _candidate(view: RunView, arcs: Arcs, stops: IntArray) -> Frame:
     )
 
 
-def _so_far(counts: np.ndarray, stops: IntArray) -> str:
+def _so_far(counts: np.ndarray, places: IntArray) -> str:
     """How the last candidate compares with those before it."""
-    if len(stops) == 1:
+    if len(places) == 1:
         return "It is the first candidate from −180° on; only the highest peaks are shown."
-    best = stops[:-1][int(np.argmax(counts[stops[:-1]]))]
-    most, here = int(counts[best]), int(counts[stops[-1]])
+    best = places[:-1][int(np.argmax(counts[places[:-1]]))]
+    most, here = int(counts[best]), int(counts[places[-1]])
     where = f"{ring.degrees_of(best, len(counts)):.2f}°"
     if here > most:
         return f"That beats the candidates before it, of which {where} was the best with {most:,}."

@@ -14,8 +14,7 @@ from rerun.error_utils import RerunWarning
 
 from spherloc.errors import InputError, RecordingError, show
 from spherloc_viz.given_files import REVIEW_SUFFIX, check_recording_file
-from spherloc_viz.recording.content.properties import APPLICATION_ID, REVIEW_ENTITY, REVIEW_PROPERTY
-from spherloc_viz.recording.content.text import plain
+from spherloc_viz.recording.content.properties import APPLICATION_ID, REVIEW_ENTITY, REVIEW_PROPERTY, plain
 
 
 def write_file(path: Path, labels: Sequence[str], note: str, run_id: str) -> None:

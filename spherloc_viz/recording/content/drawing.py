@@ -13,8 +13,7 @@ from spherloc.types import FloatArray
 from spherloc_viz.layers.key_step import match_colors
 from spherloc_viz.layers.primitives import Label, Picture, Points, Textured
 from spherloc_viz.recording.content.columns import VECTOR_3D, Times, Values, static_chunk, vectors
-from spherloc_viz.recording.content.components import PARTS, Bars, Part, Rows, Words, bars
-from spherloc_viz.recording.content.pictures import MATCHES, Keypoints
+from spherloc_viz.recording.content.components import MATCHES, PARTS, Bars, Keypoints, Part, Rows, Words, bars
 
 NEAR = 1e-6
 """Numbers that differ by no more, relative to the largest of them, are equal: they are written with 24 bits."""

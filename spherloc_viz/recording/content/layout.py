@@ -1,23 +1,220 @@
-"""How a recording opens: the blueprint that is put into the recording's own file."""
+"""How a recording opens: the blueprint, a second store in the recording's own ``.rrd`` file.
 
+An ``.rrd`` file is a header of 12 bytes, messages of 16 bytes (kind, length) and a payload, and a message with an index
+of all chunks by their places in the file (https://rerun.io/docs, "RRD format"). So files cannot be put end to end: the
+places in the second one's index move. They are a column of an arrow table, ``chunk_byte_offset``, which is moved here.
+The layout comes second, since it is the same for many runs: what it takes to move it is little and known.
+"""
+
+import io
+import os
+import struct
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
+import pyarrow as pa
 import rerun.blueprint as rrb
 import rerun_bindings
+from numpy.typing import NDArray
 from rerun import RecordingStream
 from rerun.blueprint import archetypes
 
+from spherloc.kernel_cache import kernel
 from spherloc_viz.layers.primitives import Chart, Picture
 from spherloc_viz.recording.content.drawing import chart_path, table_path
 from spherloc_viz.recording.content.panels import ARCS, GRAPH, RESIDUALS, Panels
-from spherloc_viz.recording.content.properties import APPLICATION_ID, REVIEW_ENTITY
-from spherloc_viz.recording.content.rrd_file import RrdFile, split
-from spherloc_viz.recording.content.text import legible
+from spherloc_viz.recording.content.properties import APPLICATION_ID, REVIEW_ENTITY, legible
+
+HEADER_BYTES = 12
+END, CHUNK = 0, 2
+"""Kinds of messages: the last one, which holds the index, and one that is in it."""
+TAIL = struct.Struct("<QQI8sI")
+"""At the end of a file: place and length of the index, its checksum, ``RRF2FOOT``, and how many of them there are."""
+MARK = b"RRF2FOOT"
+MESSAGE = struct.Struct("<QQ")
+CHECKSUM_SEED = 7_850_921
+LZ4 = 2
+"""Code of a compressed table."""
+
+
+@dataclass(frozen=True, eq=False)
+class RrdFile:
+    """The parts of a file with one store."""
+
+    header: bytes
+    """Version and packing."""
+    messages: bytes
+    """Without the index."""
+    index: bytes
+    """Payload of the last message."""
+
+
+def split(content: bytes) -> RrdFile:
+    """The parts of a file that rerun wrote.
+
+    Raises ``ValueError`` if it has no index, or one of a form that is not known here.
+    """
+    start, index = _index_of(io.BytesIO(content))
+    return RrdFile(content[:HEADER_BYTES], content[HEADER_BYTES : start - MESSAGE.size], index)
+
+
+def append(path: Path, second: RrdFile) -> int:
+    """Put the store of ``second`` behind the one in a file that rerun has just written; returns the size in bytes.
+
+    Raises ``OSError``, and ``ValueError`` if an index has a form that is not known here.
+    """
+    with path.open("r+b") as file:
+        if file.read(HEADER_BYTES) != second.header:
+            raise ValueError("rerun wrote two files of different forms")
+        start, index = _index_of(file)
+        end = start - MESSAGE.size
+        # Indices are protobuf messages with one repeated field, of which one behind the other are both.
+        index += _moved(second, end - HEADER_BYTES)
+        start = end + len(second.messages) + MESSAGE.size
+        tail = TAIL.pack(start, len(index), _checksum(index), MARK, 1)
+        file.seek(end)
+        file.write(b"".join([second.messages, MESSAGE.pack(END, len(index)), index, tail]))
+        file.truncate()
+        return file.tell()
+
+
+def _index_of(file: BinaryIO) -> tuple[int, bytes]:
+    """Where in a file the index is, and the index. Raises ``OSError``, and ``ValueError`` if there is none."""
+    size = file.seek(0, os.SEEK_END)
+    if size < HEADER_BYTES + MESSAGE.size + TAIL.size:
+        raise ValueError("rerun wrote a file without an index")
+    file.seek(size - TAIL.size)
+    start, length, checksum, mark, count = TAIL.unpack(file.read(TAIL.size))
+    if mark != MARK or count != 1 or not HEADER_BYTES + MESSAGE.size <= start <= start + length <= size - TAIL.size:
+        raise ValueError("rerun wrote a file whose index is not where it was expected")
+    file.seek(start)
+    index = file.read(length)
+    if checksum != _checksum(index):
+        raise ValueError("rerun wrote a file whose index is damaged")
+    return start, index
+
+
+def _checksum(index: bytes) -> int:
+    return int(xxh32(np.frombuffer(index, np.uint8), CHECKSUM_SEED))
+
+
+def _moved(file: RrdFile, by: int) -> bytes:
+    """The index of a file with all places in it larger by ``by`` bytes."""
+    (manifest,) = _fields(file.index).values()
+    parts = _fields(manifest)
+    table = _fields(parts[4])
+    if table[3] != LZ4 or set(parts) != {1, 2, 3, 4}:
+        raise ValueError("rerun wrote an index of an unknown form")
+    content = bytearray(pa.decompress(table[2], table[4], codec="lz4_raw", asbytes=True))
+    # Looked for by what it must be: to have arrow read a table of some hundred columns takes far longer.
+    known = _places(file.messages)
+    column = known.tobytes()
+    if not len(known) or content.count(column) != 1:
+        raise ValueError("rerun wrote an index of an unknown form")
+    start = content.index(column)
+    content[start : start + len(column)] = (known + np.uint64(by)).tobytes()
+    table[2] = pa.compress(bytes(content), codec="lz4_raw", asbytes=True)
+    parts[4] = _message(table)
+    return _message({1: _message(parts)})
+
+
+def _places(messages: bytes) -> NDArray[np.uint64]:
+    """Where in the file the payloads of chunks begin, in order."""
+    places, at = [], 0
+    while at + MESSAGE.size <= len(messages):
+        kind, length = MESSAGE.unpack_from(messages, at)
+        at += MESSAGE.size
+        if kind == CHUNK:
+            places.append(HEADER_BYTES + at)
+        at += length
+    return np.array(places, "<u8")
+
+
+def _fields(message: bytes | int) -> dict[int, bytes | int]:
+    """Fields of a protobuf message by number: bytes, or whole numbers."""
+    if isinstance(message, int):
+        raise ValueError("rerun wrote an index of an unknown form")
+    fields: dict[int, bytes | int] = {}
+    at = 0
+    while at < len(message):
+        key, at = _varint(message, at)
+        value, at = _varint(message, at)
+        if key & 7 == 2:
+            value, at = message[at : at + value], at + value
+        elif key & 7:
+            raise ValueError("rerun wrote an index of an unknown form")
+        fields[key >> 3] = value
+    return fields
+
+
+def _message(fields: dict[int, bytes | int]) -> bytes:
+    out = bytearray()
+    for number, value in fields.items():
+        out += _coded(number << 3 | (0 if isinstance(value, int) else 2))
+        out += _coded(value) if isinstance(value, int) else _coded(len(value)) + value
+    return bytes(out)
+
+
+def _varint(message: bytes, at: int) -> tuple[int, int]:
+    value = shift = 0
+    while True:
+        byte = message[at]
+        value |= (byte & 0x7F) << shift
+        at, shift = at + 1, shift + 7
+        if byte < 0x80:
+            return value, at
+
+
+def _coded(value: int) -> bytes:
+    out = bytearray()
+    while value >= 0x80:
+        out.append(value & 0x7F | 0x80)
+        value >>= 7
+    out.append(value)
+    return bytes(out)
+
+
+@kernel(inline="always")
+def _rotated(value, by):
+    return np.uint32((value << by) | (value >> np.uint32(np.uint32(32) - by)))
+
+
+@kernel()
+def xxh32(data, seed):
+    """The hash XXH32 of bytes, by which rerun checks an index."""
+    p1, p2, p3 = np.uint32(2654435761), np.uint32(2246822519), np.uint32(3266489917)
+    p4, p5 = np.uint32(668265263), np.uint32(374761393)
+    seed, size, at = np.uint32(seed), len(data), 0
+    if size >= 16:
+        lanes = np.array([np.uint32(seed + p1 + p2), np.uint32(seed + p2), seed, np.uint32(seed - p1)], np.uint32)
+        while at + 16 <= size:
+            for k in range(4):
+                word = np.uint32(data[at]) | np.uint32(data[at + 1]) << np.uint32(8)
+                word |= np.uint32(data[at + 2]) << np.uint32(16) | np.uint32(data[at + 3]) << np.uint32(24)
+                lanes[k] = np.uint32(_rotated(np.uint32(lanes[k] + np.uint32(word) * p2), np.uint32(13)) * p1)
+                at += 4
+        out = _rotated(lanes[0], np.uint32(1)) + _rotated(lanes[1], np.uint32(7))
+        out = np.uint32(out + _rotated(lanes[2], np.uint32(12)) + _rotated(lanes[3], np.uint32(18)))
+    else:
+        out = np.uint32(seed + p5)
+    out = np.uint32(out + np.uint32(size))
+    while at + 4 <= size:
+        word = np.uint32(data[at]) | np.uint32(data[at + 1]) << np.uint32(8)
+        word |= np.uint32(data[at + 2]) << np.uint32(16) | np.uint32(data[at + 3]) << np.uint32(24)
+        out = np.uint32(_rotated(np.uint32(out + np.uint32(word) * p3), np.uint32(17)) * p4)
+        at += 4
+    while at < size:
+        out = np.uint32(_rotated(np.uint32(out + np.uint32(data[at]) * p5), np.uint32(11)) * p1)
+        at += 1
+    out = np.uint32((out ^ (out >> np.uint32(15))) * p2)
+    out = np.uint32((out ^ (out >> np.uint32(13))) * p3)
+    return np.uint32(out ^ (out >> np.uint32(16)))
+
 
 EYE = (1.15, -1.2, -1.55)
 """Where one looks from, in the frame in which the scene has radius 1: from the same side as the page's overview."""

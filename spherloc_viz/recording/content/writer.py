@@ -16,16 +16,14 @@ from spherloc.metrics import evaluate
 from spherloc.trace import Trace
 from spherloc_viz.layers import paint, steps
 from spherloc_viz.layers.key_step import key_step, step_numbers
-from spherloc_viz.layers.primitives import Picture, Stop
+from spherloc_viz.layers.primitives import Picture, StepHeading
 from spherloc_viz.recording.content.columns import markdown, static_chunk
+from spherloc_viz.recording.content.components import image_chunks, query_image, thumbnail
 from spherloc_viz.recording.content.data import data_chunk, numbers_chunk
 from spherloc_viz.recording.content.drawing import drawing_chunks
-from spherloc_viz.recording.content.layout import layout_file, shown_in
+from spherloc_viz.recording.content.layout import append, layout_file, shown_in
 from spherloc_viz.recording.content.panels import Panels, panel_chunks, panels_of
-from spherloc_viz.recording.content.pictures import image_chunks, query_image, thumbnail
-from spherloc_viz.recording.content.properties import APPLICATION_ID, property_chunks, run_row
-from spherloc_viz.recording.content.rrd_file import append
-from spherloc_viz.recording.content.text import outcome_text
+from spherloc_viz.recording.content.properties import APPLICATION_ID, outcome_text, property_chunks, run_row
 from spherloc_viz.recording.origin import Origin
 from spherloc_viz.recording.run_row import RunRow
 from spherloc_viz.recording.storage.unfinished import unfinished
@@ -96,19 +94,21 @@ class _Run:
     recording_id: str
 
 
-def recorded_steps(stops: Sequence[Stop], key: int) -> list[int]:
+def recorded_steps(headings: Sequence[StepHeading], key: int) -> list[int]:
     """The steps that a lean recording shows: what each stage came to, and the key step.
 
     Left out is what explains the method, alike in every run, and series: steps whose keys differ in a number only, as
     "yaw-arcs-10" and "yaw-arcs-30" do, more and more arcs until the step "yaw-arcs" has them all. Of a series without
     such a step there is the last. The samples of RANSAC are all there. Between two steps a viewer shows the earlier.
     """
-    keys = {stop.key for stop in stops}
+    keys = {heading.key for heading in headings}
     last: dict[str, int] = {}
-    for index, stop in enumerate(stops):
-        series = stop.key if stop.key.startswith("sample-") else re.sub(r"-\d+$", "", stop.key)
-        explains = stop.key in EXPLAINING or stop.key.endswith("-pose") or stop.key.startswith("yaw-candidate-")
-        if not explains and (series == stop.key or series not in keys):
+    for index, heading in enumerate(headings):
+        series = heading.key if heading.key.startswith("sample-") else re.sub(r"-\d+$", "", heading.key)
+        explains = (
+            heading.key in EXPLAINING or heading.key.endswith("-pose") or heading.key.startswith("yaw-candidate-")
+        )
+        if not explains and (series == heading.key or series not in keys):
             last[series] = index
     return sorted({key, *last.values()})
 
@@ -116,7 +116,7 @@ def recorded_steps(stops: Sequence[Stop], key: int) -> list[int]:
 def _write(run: _Run, part: Path, file: str) -> RunRow:
     """Write the recording to ``part`` and return its row, for the name that the ``file`` is to have."""
     trace, metrics = run.trace, evaluate(run.trace)
-    stops, key = steps(trace), key_step(trace, run.diagnosis)
+    headings, key = steps(trace), key_step(trace, run.diagnosis)
     row = run_row(
         trace,
         metrics,
@@ -125,11 +125,11 @@ def _write(run: _Run, part: Path, file: str) -> RunRow:
         run.created,
         file=file,
         run_id=run.recording_id,
-        steps=len(stops),
+        steps=len(headings),
         key_step=key,
         thumbnail=thumbnail(trace),
     )
-    chosen = list(range(len(stops))) if run.full else recorded_steps(stops, key)
+    chosen = list(range(len(headings))) if run.full else recorded_steps(headings, key)
     pictures = {index: paint(trace, index) for index in chosen}
     panels = panels_of(trace)
     layout = layout_file(shown_in(list(pictures.values()), panels))

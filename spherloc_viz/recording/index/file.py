@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from spherloc.errors import RecordingError
-from spherloc_viz.recording.index.rows import SCHEMA, DamagedError
+from spherloc_viz.recording.index.query import SCHEMA, DamagedError
 
 try:
     import fcntl

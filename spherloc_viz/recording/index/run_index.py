@@ -1,24 +1,208 @@
 """The list of all runs of a folder: a database beside the recordings, which are the truth that it is made from."""
 
 import contextlib
+import os
 import sqlite3
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
-from typing import Self, TypeVar
+from typing import Protocol, Self, TypeVar
 
 from spherloc.errors import InputError, RecordingError, show
+from spherloc_viz.given_files import REVIEW_SUFFIX
 from spherloc_viz.recording.index import file as index_file
-from spherloc_viz.recording.index.query import GROUP_KEYS, RunQuery, condition, groups, order
-from spherloc_viz.recording.index.refresh import Examine, Progress, Refreshed, Refresher, examine_side_by_side, stamp_of
-from spherloc_viz.recording.index.rows import DamagedError, put, rows_of
-from spherloc_viz.recording.reviews import Review, write_review
+from spherloc_viz.recording.index.query import (
+    GROUP_KEYS,
+    DamagedError,
+    RunQuery,
+    condition,
+    groups,
+    order,
+    put,
+    rows_of,
+)
+from spherloc_viz.recording.reviews import UNREADABLE, Review, has_review, review_path, write_review
 from spherloc_viz.recording.run_row import RunRow
-from spherloc_viz.recording.sandbox.examiner import Examiners, check_name, examine
+from spherloc_viz.recording.sandbox.examiner import Examiners, check_name, examine, examine_all
 
+Examine = Callable[[Sequence[Path]], Iterable[tuple[Path, RunRow | RecordingError]]]
+"""Reads recordings one after another: the row of each, or what is wrong with it."""
+Progress = Callable[[int, int], None]
+"""Is told how many of how many files are read."""
+Item = TypeVar("Item")
 T = TypeVar("T")
+
+BATCH = 20
+"""Rows that are written at once: others wait a few milliseconds."""
+MOST_WORKERS = 4
+"""Processes that read recordings, at 20 ms each."""
+WORTH_A_WORKER = 50
+"""Recordings for which it pays to start another process, which takes a second."""
+
+
+def examine_side_by_side(
+    paths: Sequence[Path], examiners: Examiners | None = None
+) -> Generator[tuple[Path, RunRow | RecordingError], None, None]:
+    """``examine_all`` by several processes at once, in the order of the paths; by one where there are few paths.
+
+    They end with this, or with their owner ``examiners``, which raises ``ExaminerError``.
+    """
+    workers = max(1, min(MOST_WORKERS, os.cpu_count() or 1, len(paths) // WORTH_A_WORKER))
+    with ThreadPoolExecutor(workers) as threads, (examiners or Examiners()).start(workers) as started:
+        readers = [examine_all(paths[k::workers], started[k]) for k in range(workers)]
+        # Whoever leaves early, as by Ctrl-C, ends the processes first and waits for no file.
+        answers = [threads.submit(next, reader, None) for reader in readers]
+        for number in range(len(paths)):
+            k = number % workers
+            answer = answers[k].result()
+            assert answer is not None
+            answers[k] = threads.submit(next, readers[k], None)
+            yield answer
+
+
+@dataclass(frozen=True)
+class Refreshed:
+    """What reading the files has changed."""
+
+    read: int
+    """Runs that are new, or read again."""
+    removed: int
+    """Runs whose files are gone."""
+    skipped: tuple[tuple[str, str], ...]
+    """Files that are no runs, or whose labels cannot be read, each with a sentence that says why; those found at an
+    earlier time too."""
+
+
+def stamp_of(path: Path) -> str:
+    """Which version of a recording and its review lies there; empty if there is none."""
+    parts = []
+    for file in (path, review_path(path)):
+        try:
+            status = file.stat()
+        except OSError:
+            parts.append("")
+        else:
+            parts.append(f"{status.st_mtime_ns}:{status.st_size}")
+    return " ".join(parts) if parts[0] else ""
+
+
+def files_of(folder: Path) -> dict[str, str]:
+    """Every recording of the folder and of its gallery, by name, with its stamp. Raises ``OSError``."""
+    found: dict[str, str] = {}
+    for place in ("", "gallery/"):
+        inside = folder / place
+        if place and not inside.is_dir():
+            continue
+        for path in inside.iterdir():
+            name = path.name.lower()
+            if name.endswith(".rrd") and not name.endswith(REVIEW_SUFFIX) and (stamp := stamp_of(path)):
+                found[place + path.name] = stamp
+    return found
+
+
+class Write(Protocol):
+    """Runs something in a transaction of its own."""
+
+    def __call__(self, work: Callable[[sqlite3.Connection], T], /) -> T: ...
+
+
+class Refresher:
+    """Brings the tables up to date with the files of a folder."""
+
+    def __init__(self, folder: Path, write: Write, examine: Examine) -> None:
+        self._folder = folder
+        self._write = write
+        self._examine = examine
+
+    def refresh(self, everything: bool, progress: Progress) -> Refreshed:
+        """Read what is new or has changed, or all; the list stays usable meanwhile.
+
+        Raises ``RecordingError`` if the folder cannot be read.
+        """
+        try:
+            files = files_of(self._folder)
+        except OSError as error:
+            reason = error.strerror or error
+            raise RecordingError(f"{self._folder}: the folder cannot be read ({reason}); check it.") from error
+        known = self._write(_known)
+        removed = self._write(lambda connection: self._forget(connection, known.keys() - files.keys()))
+        new = sorted(file for file, stamp in files.items() if everything or known.get(file) != stamp)
+        wanted = [file for file in new if _misnamed(file) is None]
+        misnamed = [(file, error) for file in new if (error := _misnamed(file)) is not None]
+        self._write(lambda connection: self._store(connection, misnamed, files))
+        read = done = 0
+        progress(done, len(wanted))
+        results = self._examine([self._folder / file for file in wanted])
+        with contextlib.closing(results) if isinstance(results, Generator) else contextlib.nullcontext():
+            for batch in _batches(zip(wanted, (result for _, result in results), strict=True)):
+                read += self._write(lambda connection, batch=batch: self._store(connection, batch, files))
+                done += len(batch)
+                progress(done, len(wanted))
+        return Refreshed(read, removed, self._write(_skipped))
+
+    def _forget(self, connection: sqlite3.Connection, files: Iterable[str]) -> int:
+        """Forget files that are gone, and return how many of them were runs."""
+        # A file may have come since the folder was looked at, and its writer has listed it.
+        gone = [(file,) for file in files if _misnamed(file) is not None or not (self._folder / file).exists()]
+        connection.executemany("DELETE FROM skipped WHERE file = ?", gone)
+        return connection.executemany("DELETE FROM runs WHERE file = ?", gone).rowcount if gone else 0
+
+    def _store(
+        self,
+        connection: sqlite3.Connection,
+        batch: Sequence[tuple[str, RunRow | RecordingError]],
+        stamps: Mapping[str, str],
+    ) -> int:
+        """Store what was found in some files, and return how many of them are runs."""
+        runs = 0
+        for file, result in batch:
+            path, stamp = self._folder / file, stamps[file]
+            if stamp_of(path) != stamp:
+                continue  # rewritten, labelled or deleted meanwhile, by somebody who has listed that
+            if isinstance(result, RecordingError):
+                name = file.encode(errors="backslashreplace").decode()  # on a disk it need not be Unicode
+                connection.execute("DELETE FROM runs WHERE file = ?", (name,))
+                _skip(connection, name, stamp, str(result))
+                continue
+            put(connection, replace(result, file=file), stamp)
+            runs += 1
+            if has_review(path) and not result.labels and not result.note:
+                _skip(connection, file, stamp, f"{review_path(path)}: {UNREADABLE}")
+        return runs
+
+
+def _misnamed(file: str) -> RecordingError | None:
+    """What is wrong with the name of a file, if it cannot be that of a recording."""
+    try:
+        check_name(file)
+    except RecordingError as error:
+        return error
+    return None
+
+
+def _known(connection: sqlite3.Connection) -> dict[str, str]:
+    """Files that were read before, with their stamps."""
+    return dict(connection.execute("SELECT file, stamp FROM skipped UNION SELECT file, stamp FROM runs"))
+
+
+def _skip(connection: sqlite3.Connection, file: str, stamp: str, sentence: str) -> None:
+    connection.execute("INSERT OR REPLACE INTO skipped VALUES (?, ?, ?)", (file, stamp, sentence))
+
+
+def _skipped(connection: sqlite3.Connection) -> tuple[tuple[str, str], ...]:
+    return tuple(connection.execute("SELECT file, sentence FROM skipped ORDER BY file"))
+
+
+def _batches(items: Iterable[Item]) -> Iterator[list[Item]]:
+    remaining = iter(items)
+    while batch := list(islice(remaining, BATCH)):
+        yield batch
+
+
 MOST_TRIES = 4
 """With a database that gets damaged or set aside meanwhile."""
 PAUSE_S = 0.02

@@ -20,9 +20,8 @@ from rerun.chunk import Chunk, RrdReader
 
 from spherloc.diagnosis.causes import Cause
 from spherloc.errors import RecordingError, show
-from spherloc_viz.recording.content.data import ARRAYS, DATA, NUMBERS, TYPES
+from spherloc_viz.recording.content.data import ARRAYS, DATA, NUMBERS, PROPERTIES, TYPES, RecordedRun
 from spherloc_viz.recording.content.properties import RUN_TYPES
-from spherloc_viz.recording.content.reader import PROPERTIES, RecordedRun
 from spherloc_viz.recording.origin import Source
 from spherloc_viz.recording.run_row import RunRow
 

@@ -21,8 +21,8 @@ from rerun.chunk import Chunk, LazyChunkStream, RrdReader
 from rerun.error_utils import RerunWarning
 
 from spherloc.errors import RecordingError, SpherlocError
+from spherloc_viz.recording.content.data import check_recording, read_recording
 from spherloc_viz.recording.content.properties import APPLICATION_ID
-from spherloc_viz.recording.content.reader import check_recording, read_recording
 from spherloc_viz.recording.reviews import read_review
 from spherloc_viz.recording.run_row import RunRow
 from spherloc_viz.recording.sandbox.checks import check_content, check_run, row_from_table, table_from_row

@@ -1,12 +1,14 @@
-"""A folder of recordings as its writers see it: a run becomes a file and a row, and old successes make room."""
+"""A folder of recordings as its writers see it: runs become files and rows, killed ones are recovered, old ones go."""
 
 import contextlib
 import json
 import re
+import shutil
+import subprocess
 import threading
 import unicodedata
 import uuid
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import lru_cache
@@ -17,15 +19,196 @@ from spherloc.diagnosis import Diagnosis
 from spherloc.errors import RecordingError
 from spherloc.experiments.sweep import Job, SweepPlan
 from spherloc.trace import Trace
+from spherloc_viz.given_files import REVIEW_SUFFIX
 from spherloc_viz.recording.content.writer import write_recording
+from spherloc_viz.recording.index.query import RunQuery
 from spherloc_viz.recording.index.run_index import RunIndex
 from spherloc_viz.recording.origin import Origin
+from spherloc_viz.recording.rerun_program import rerun_command, rerun_environment
 from spherloc_viz.recording.reviews import has_review
-from spherloc_viz.recording.sandbox.examiner import Examiners, examine_review
-from spherloc_viz.recording.storage.recovery import recover
-from spherloc_viz.recording.storage.retention import Pruned, prune
+from spherloc_viz.recording.run_row import RunRow
+from spherloc_viz.recording.sandbox.examiner import Examiner, ExaminerError, Examiners, examine_review
 from spherloc_viz.recording.storage.room import KEEP_BYTES, size_words
-from spherloc_viz.recording.storage.unfinished import here, leftovers
+from spherloc_viz.recording.storage.unfinished import here, leftovers, target_of, unfinished
+
+UNREADABLE_SUFFIX = ".unreadable"
+"""Ends the name of what was left unfinished and cannot be read; it began with the name that the file was to have."""
+ROOM = 4
+"""A recovered recording takes up to twice the room of what it is made of, since it is packed less tightly."""
+MERGE_LIMIT_S = 60.0
+"""rerun takes a twentieth of a second; one that takes this long has got stuck."""
+
+
+@dataclass(frozen=True)
+class Recovered:
+    """What became of a leftover."""
+
+    recording: Path | None = None
+    """The recording that was made of it."""
+    kept: Path | None = None
+    """Where it lies now if none could be made of it."""
+
+
+def recover(part: Path, examiner: Examiner) -> Recovered:
+    """Make a recording of what is left of one, if there is enough; otherwise rename it, so that a person can decide.
+
+    The problem and the result come first in a file, so that even a fifth of it has all that repeats the run. The
+    leftover stays as it is if the disk has no room to recover it; deleted are only an empty one, and one of a run whose
+    recording is there and can be read. Raises ``OSError`` if the folder cannot be written, ``ExaminerError`` if
+    ``examiner`` has ended: the leftover stays then too.
+    """
+    target = target_of(part)
+    if target is None:
+        return Recovered()
+    mended = unfinished(target)
+    try:
+        if not part.stat().st_size:
+            part.unlink()
+            return Recovered()
+        is_run = not target.name.endswith(REVIEW_SUFFIX)
+        if is_run and target.exists() and _readable(target, examiner):
+            part.unlink()
+            return Recovered()
+        if is_run and not target.exists():
+            if _readable(part, examiner):
+                return Recovered(part.replace(target))
+            if shutil.disk_usage(part.parent).free < ROOM * part.stat().st_size:
+                return Recovered()
+            if _merged(part, mended) and _readable(mended, examiner):
+                mended.replace(target)
+                part.unlink()
+                return Recovered(target)
+        number = part.name.removesuffix(".part")[-8:]  # tells leftovers of one file apart
+        return Recovered(kept=part.replace(part.with_name(f"{target.name}.{number}{UNREADABLE_SUFFIX}")))
+    except FileNotFoundError:
+        return Recovered()  # another process has done it meanwhile
+    finally:
+        mended.unlink(missing_ok=True)
+
+
+def _readable(path: Path, examiner: Examiner) -> bool:
+    """Whether it is whole. What a power cut leaves can end the process that reads it, so another one does."""
+    try:
+        examiner.examine(path)
+    except ExaminerError:
+        raise  # says nothing about the file
+    except RecordingError:
+        return False
+    return True
+
+
+def _merged(part: Path, mended: Path) -> bool:
+    """Whether rerun could save what is whole at the start of ``part``."""
+    command = [*rerun_command(), "rrd", "merge", "--continue-on-error", str(part), "-o", str(mended)]
+    try:
+        done = subprocess.run(command, capture_output=True, check=False, timeout=MERGE_LIMIT_S, env=rerun_environment())
+    except subprocess.SubprocessError:
+        return False
+    return done.returncode == 0 and mended.is_file()
+
+
+NEWEST_KEPT = 20
+"""The last runs stay whatever they are: somebody may be looking at them."""
+LOG_NAME = "pruned.log"
+"""In the folder of the recordings: a line for every run that was deleted."""
+AT_ONCE = 50
+
+
+@dataclass(frozen=True)
+class Pruned:
+    """What was deleted to make room."""
+
+    files: tuple[str, ...]
+    """Names of the recordings, the oldest first."""
+    freed_bytes: int
+    """Their size."""
+    left_bytes: int
+    """Size of those that are left."""
+    keep_bytes: int
+    """What they may have."""
+
+    @property
+    def over(self) -> bool:
+        """Whether those that are left take more than they may, since none of them may be deleted."""
+        return self.left_bytes > self.keep_bytes
+
+    @property
+    def sentence(self) -> str:
+        """What was deleted, in a sentence; empty if nothing was."""
+        if not self.files:
+            return ""
+        runs = "1 old success was" if len(self.files) == 1 else f"{len(self.files):,} old successes were"
+        freed, most = size_words(self.freed_bytes), size_words(self.keep_bytes)
+        return f"{runs} deleted ({freed}), since the recordings took more than {most}; {LOG_NAME} names them."
+
+
+def prune(folder: Path, index: RunIndex, keep_bytes: int) -> Pruned:
+    """Delete the oldest successes until the recordings in ``folder`` take no more than ``keep_bytes``.
+
+    Failures stay, and whatever was labelled or noted, belongs to the gallery, or is doubtful without a truth to say
+    more. Every deletion is first written into ``pruned.log``; where that cannot be, nothing is deleted. Any number of
+    processes may do this at once. Raises ``RecordingError`` if index or log cannot be used.
+    """
+    left = index.bytes()
+    if left <= keep_bytes:
+        return Pruned((), 0, left, keep_bytes)
+    deleted: list[RunRow] = []
+    for row in _candidates(index):
+        if left <= keep_bytes:
+            break
+        if _delete(folder / row.file, row):
+            deleted.append(row)
+        if not (folder / row.file).exists():
+            index.remove(row.file)
+        left = index.bytes()
+    return Pruned(tuple(row.file for row in deleted), sum(row.size_bytes for row in deleted), left, keep_bytes)
+
+
+def prunable(row: RunRow) -> bool:
+    """Whether a run is one that nobody will look for: right, or nothing speaks against it, and nobody labelled it."""
+    fine = row.outcome == "success" or (row.outcome == "unknown" and row.doubtful is False)
+    marked = bool(row.labels or row.note or row.title)
+    return fine and not marked and row.source != "gallery" and "/" not in row.file
+
+
+def _candidates(index: RunIndex) -> Iterator[RunRow]:
+    """Runs that may be deleted, the oldest first, each once. Those that are must leave the index too."""
+    spared = {row.file for row in index.find(RunQuery(), limit=NEWEST_KEPT).rows}
+    while rows := [row for row in index.oldest_successes(AT_ONCE + len(spared)) if row.file not in spared]:
+        for row in rows:
+            fit = prunable(row)
+            if fit:
+                yield row
+            if not fit or (index.folder / row.file).exists():
+                spared.add(row.file)
+
+
+def _delete(path: Path, row: RunRow) -> bool:
+    """Delete a recording; whether that was done, and here."""
+    if not path.exists() or has_review(path):  # deleted or labelled since it was listed
+        return False
+    _log(path.parent / LOG_NAME, row)
+    try:
+        path.unlink()
+    except OSError:
+        return False
+    return True
+
+
+def _log(log: Path, row: RunRow) -> None:
+    """Write down what is about to be deleted. Raises ``RecordingError`` if that cannot be done."""
+    when = datetime.now(UTC).isoformat(timespec="milliseconds")
+    cells = (when, row.file, row.name, row.estimator, f"seed {row.seed}", row.outcome, f"{row.size_bytes} bytes")
+    line = "\t".join("".join(c if c.isprintable() else " " for c in cell) for cell in cells) + "\n"
+    try:
+        # One write to a file that is only appended to: lines of several processes do not mix.
+        with log.open("ab", buffering=0) as file:
+            file.write(line.encode())
+    except OSError as error:
+        raise RecordingError(
+            f"{log}: cannot be written ({error.strerror or error}), so no old success is deleted; make room for it."
+        ) from error
+
 
 GALLERY = "gallery"
 """The folder inside that has the curated cases."""

@@ -1,24 +1,119 @@
-"""Repeats a recorded run and compares: the same to the last bit, or what differs and what may be why."""
+"""A recorded run as a scene: opened as it was, changed, and solved again to see whether every bit is the same."""
 
+import math
 import sys
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from spherloc.errors import InputError, RecordingError, SpherlocError
-from spherloc.estimators import estimate
+from spherloc.datasets import Scene, load_scene
+from spherloc.datasets.variation import Variation, used_seed
+from spherloc.errors import InputError, RecordingError, SpherlocError, show
+from spherloc.estimators import estimate, options_type
 from spherloc.metrics import rotation_error_deg, translation_error_m
 from spherloc.problem import Problem
+from spherloc.ranges import check_options
 from spherloc.trace import Certificate, Trace
 from spherloc.types import FloatArray
 from spherloc.warm_up import warm_up
-from spherloc_viz.options import json_text
-from spherloc_viz.recording.content.reader import RecordedRun
-from spherloc_viz.recording.origin import machine
-from spherloc_viz.recording.replay.scene import load_recorded_scene, missing_options, recorded_options
+from spherloc_viz.given_files import check_recording_file, is_recording
+from spherloc_viz.options import OptionField, json_text, option_fields
+from spherloc_viz.recording.content.data import RecordedRun, read_recording
+from spherloc_viz.recording.origin import Origin, Source, machine
+from spherloc_viz.recording.sandbox.examiner import examine
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedScene:
+    """Gives the problem of a recording, bit for bit. Satisfies ``spherloc.datasets.Scene``."""
+
+    run: RecordedRun
+    """What was recorded."""
+    path: Path
+    """Its file."""
+
+    @property
+    def name(self) -> str:
+        """That of the recorded problem."""
+        return self.run.problem.name
+
+    @property
+    def seed(self) -> int:
+        """The recorded one, which an estimator takes if it is given no other."""
+        return self.run.seed
+
+    def problem(self, seed: int | None = None) -> Problem:
+        """The recorded problem; nothing about it is random, so ``seed`` changes nothing."""
+        return self.run.problem
+
+
+def load_recorded_scene(path: Path) -> RecordedScene:
+    """The scene of a recording (.rrd), which may be untrusted: another process reads it first.
+
+    Raises ``RecordingError``, in one sentence, if there is no such file or it is no whole recording of ours.
+    """
+    path = Path(path)
+    check_recording_file(path)
+    examine(path)
+    return RecordedScene(read_recording(path), path)
+
+
+def origin_of(
+    source: Source, path: Path, scene: Scene, seed: int | None, query: str | None, variation: Variation
+) -> Origin:
+    """Where a run of this scene comes from. That of an unchanged recorded problem comes from where the problem does."""
+    if isinstance(scene, RecordedScene) and variation == Variation() and scene.run.origin is not None:
+        return replace(scene.run.origin, source=source, title="", story="")
+    if variation.camera is not None:
+        variation = replace(variation, camera=str(Path(variation.camera).resolve()))
+    return Origin(source, str(Path(path).resolve()), used_seed(scene, seed), query, variation)
+
+
+def recorded_options(run: RecordedRun, where: Path) -> Any:
+    """The options that a run was solved with, as its estimator takes them.
+
+    What an older recording lacks has its default. Raises ``RecordingError`` if this spherloc has no such estimator or
+    no such option, or a value is none that the option takes.
+    """
+    try:
+        kind = options_type(run.estimator)
+    except InputError as error:
+        raise RecordingError(f"{where}: {error}") from None
+    if not isinstance(run.options, Mapping):
+        raise RecordingError(f"{where}: its options are no table; record the run again.")
+    known = {item.name: item for item in option_fields(kind)}
+    for name, value in run.options.items():
+        if name not in known:
+            raise RecordingError(f"{where}: {run.estimator} has no option {show(name)} here; record the run again.")
+        if not _takes(known[name], value):
+            raise RecordingError(f"{where}: option {name} is {show(value)}, which it cannot be; record the run again.")
+    try:
+        options = kind(**run.options)
+        check_options(options)
+        return options
+    except (InputError, TypeError, ValueError) as error:
+        raise RecordingError(f"{where}: has options that cannot be: {error}") from None
+
+
+def missing_options(run: RecordedRun) -> tuple[str, ...]:
+    """Options of its estimator that a recording knows nothing of, since it is older than they are."""
+    return tuple(item.name for item in fields(options_type(run.estimator)) if item.name not in run.options)
+
+
+def _takes(option: OptionField, value: Any) -> bool:
+    """Whether a value that a file says is one that ``option`` can have."""
+    if value is None:
+        return option.optional
+    if option.choices:
+        return isinstance(value, str) and value in option.choices
+    if option.kind is float:
+        return isinstance(value, int | float) and not isinstance(value, bool) and not math.isnan(value)
+    whole = isinstance(value, float) and value.is_integer()
+    return type(value) is option.kind or (option.kind is int and whole)
+
 
 WORDS = {"name", "scene", "image", "reference_images", "remarks"}
 """Fields that only people read."""
@@ -239,3 +334,96 @@ def as_record(repeated: Repeated) -> dict[str, Any]:
         "assumed_options": list(repeated.assumed),
         "versions": [asdict(item) for item in repeated.versions],
     }
+
+
+@dataclass(frozen=True, eq=False)
+class Reopened:
+    """A run as it can be asked for again: these words give the same trace to the last bit."""
+
+    scene: Scene
+    """The live one, or a ``RecordedScene``."""
+    path: Path
+    """The scene file, or the recording; absolute."""
+    label: str
+    """What to call it."""
+    seed: int
+    """Of the simulation, of spoiled matches, and of the estimator."""
+    query: str | None
+    """Name of the query image; None for the first, or if there is none."""
+    variation: Variation
+    """What is changed about the scene; nothing about a recorded one, whose problem is changed already."""
+    estimator: str
+    """Registered name."""
+    options: Any
+    """An instance of its options."""
+    sentence: str = ""
+    """Why it is not the live scene; empty if it is."""
+
+    @property
+    def live(self) -> bool:
+        """Whether it is the scene that the run came from."""
+        return not self.sentence
+
+
+def reopen(run: RecordedRun, file: Path, roots: Sequence[Path]) -> Reopened:
+    """Open the recording ``file``, which was read as ``run``.
+
+    The scene that it came from is opened if its file, and that of its camera, lie in one of the folders ``roots``
+    (links count as what they point to) and its problem is still the recorded one in every bit; for scenes of images
+    that takes seconds, since they are matched. Raises ``RecordingError`` if this spherloc has no such estimator or
+    option.
+    """
+    file = Path(file).resolve()
+    options = recorded_options(run, file)
+    live = _live(run, roots)
+    if isinstance(live, str):
+        name = f"{run.problem.name} (recorded)"
+        scene = RecordedScene(run, file)
+        return Reopened(scene, file, name, run.seed, None, Variation(), run.estimator, options, live)
+    scene, origin = live
+    path = Path(origin.scene_path or "").resolve()
+    return Reopened(scene, path, scene.name, run.seed, origin.query, origin.variation, run.estimator, options)
+
+
+def _live(run: RecordedRun, roots: Sequence[Path]) -> tuple[Scene, Origin] | str:
+    """The scene that a run came from, or why it cannot be opened, in a sentence."""
+    instead = "so the recorded problem is opened instead"
+    origin = run.origin
+    if origin is not None and origin.scene_path is None and origin.source == "gallery":
+        return "The case was put together match by match: what is opened is the recorded problem."
+    if origin is None or origin.scene_path is None:
+        return f"The recording does not say which scene file it came from, {instead}."
+    if is_recording(Path(origin.scene_path)):
+        return f"The run was of the problem of another recording, {instead}."
+    if origin.scene_seed not in (None, run.seed):
+        return (
+            f"The scene was drawn with the seed {origin.scene_seed} and solved with {run.seed}, which a page cannot, "
+            f"{instead}."
+        )
+    for file in (origin.scene_path, origin.variation.camera):
+        if file is not None and (reason := _forbidden(file, roots)):
+            return f"{reason}, {instead}."
+    try:
+        scene = load_scene(Path(origin.scene_path))
+        problem = _drawn(scene, origin, run.seed)
+    except SpherlocError as error:
+        return f"The scene cannot be opened as it was ({str(error).rstrip('.')}), {instead}."
+    changed = different_fields(problem, run.problem)
+    if changed:
+        return f"The scene {show(scene.name)} gives another problem by now ({', '.join(changed)}), {instead}."
+    return scene, origin
+
+
+def _drawn(scene: Scene, origin: Origin, seed: int) -> Problem:
+    return origin.variation.problem(scene, seed, origin.query)
+
+
+def _forbidden(file: str, roots: Sequence[Path]) -> str:
+    """Why a file may not be opened, as the start of a sentence; empty if it may."""
+    try:
+        path = Path(file).resolve()
+        if not any(path.is_relative_to(Path(root).resolve()) for root in roots):
+            return f"{Path(file).name} lies outside the folders that pages may open scenes from"
+        return "" if path.is_file() else f"{Path(file).name} is no longer there"
+    except (OSError, ValueError, RuntimeError):  # a path with a NUL, or a loop of links
+        return f"{show(file)} is no path"

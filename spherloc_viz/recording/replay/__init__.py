@@ -1,1 +1,0 @@
-"""A recorded run as a scene that can be opened, changed and repeated."""
