@@ -33,7 +33,7 @@ def as_python(
         *([] if recorded else ["from spherloc.datasets import load_scene"]),
         *(["from spherloc.datasets.variation import Variation"] if changes else []),
         f"from spherloc.estimators import {'estimate, options_type' if options_given else 'estimate'}",
-        *(["from spherloc_viz.recording.replay.scene import load_recorded_scene"] if recorded else []),
+        *(["from spherloc_viz.recording.replay import load_recorded_scene"] if recorded else []),
         "",
         f"scene = {'load_recorded_scene' if recorded else 'load_scene'}(Path({_code(_written(scene_path))}))",
         f"problem = Variation({given}).problem(scene, {', '.join(chosen)})"

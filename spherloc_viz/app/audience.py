@@ -113,8 +113,8 @@ class Audience:
                 f"The presenter shows {request.scene.scene}, {request.estimator}, seed {request.scene.seed}."
             )
             selected = self._edits.places(shown.run.kept)
-            hidden = shown.answers_hidden
-            return self._display.draw(shown.run, shown.mesh, shown.diagnosis, selected, asked, now, hidden)
+            withheld = shown.withheld
+            return self._display.draw(shown.run, shown.mesh, shown.diagnosis, selected, asked, now, withheld)
         except Exception as error:
             self._status.fail(error)
             return None

@@ -13,10 +13,12 @@ from spherloc.datasets.synthetic import SyntheticScene
 from spherloc.datasets.variation import Variation
 from spherloc.problem import Problem
 from spherloc_viz.given_files import is_recording
-from spherloc_viz.recording.replay.scene import load_recorded_scene
+from spherloc_viz.recording.replay import load_recorded_scene
 
 MOST_BRIEF = 8
 """Recorded problems that a page offers beside its scenes."""
+MOST_MESHES = 4
+"""Maps whose meshes are kept."""
 
 
 @dataclass(frozen=True)
@@ -90,13 +92,21 @@ class Catalog:
         return self._paths[label]
 
     def problem(self, request: SceneRequest) -> Problem:
-        """The problem (cached) that a request describes; raises ``InputError`` if there is none."""
+        """The problem (cached) that a request describes; raises ``InputError`` if there is none.
+
+        Its pictures may not be drawn yet.
+        """
         return self._caches.problem(self.scenes[request.scene], request.seed, request.query, request.variation)
 
     def mesh(self, label: str) -> bytes | None:
-        """Binary glTF (cached) of a scene's map, in the map frame; None if it has none."""
+        """Binary glTF (cached) of a scene's map, in the map frame; None if it has none. May take a second or two."""
         scene = self.map_scene(label)
         return None if scene is None or scene.mesh is None else self._caches.mesh(scene)
+
+    def known_mesh(self, label: str) -> bytes | None:
+        """``mesh`` if it has been made, else None, at once."""
+        scene = self.map_scene(label)
+        return None if scene is None else self._caches.meshes.get(scene)
 
     def synthetic(self, label: str) -> SyntheticScene | None:
         """The scene of that label if it is a random one, whose parameters can be changed."""
@@ -115,17 +125,25 @@ class _Caches:
     def __init__(self) -> None:
         self.problem = lru_cache(maxsize=16)(self._problem)
         self._unedited = lru_cache(maxsize=16)(self._draw)
-        self.mesh = lru_cache(maxsize=4)(self._mesh)
+        self.meshes: dict[MapScene, bytes] = {}
 
     def _problem(self, scene: Scene, seed: int, query: str | None, variation: Variation) -> Problem:
         # Images take long to match: one more spoiled match must not have them matched again.
         return variation.edit(self._unedited(scene, seed, query, variation.without_edits()), seed)
 
     def _draw(self, scene: Scene, seed: int, query: str | None, variation: Variation) -> Problem:
-        return variation.unedited(scene, seed, query)
+        stored = scene.stored_problem(query) if isinstance(scene, MapScene) and not variation.simulation else None
+        return variation.unedited(scene, seed, query) if stored is None else stored
 
-    def _mesh(self, scene: MapScene) -> bytes | None:
-        return None if scene.mesh is None else scene.mesh()
+    def mesh(self, scene: MapScene) -> bytes | None:
+        """Made once; the newest few are kept."""
+        found = self.meshes.get(scene)
+        if found is None and scene.mesh is not None:
+            found = scene.mesh()
+            for old in tuple(self.meshes)[: 1 - MOST_MESHES]:
+                self.meshes.pop(old, None)
+            self.meshes[scene] = found
+        return found
 
 
 def camera_label(camera: Camera) -> str:

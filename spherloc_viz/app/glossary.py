@@ -1,15 +1,11 @@
 """What the words on the page mean, each in a sentence or two, one press away from where it stands."""
 
+import json
 import re
 from html import escape
-from typing import Any
-
-import viser
 
 from spherloc_viz.app.text import DIM, box
-from spherloc_viz.app.web.touch import Touch, Touches
 
-DEFINE = "define"
 TERMS: dict[str, str] = {
     "match": "A pixel of the query image and the map point that it is said to show. Many are wrong.",
     "bearing": "The direction in which a pixel looks: a dot on the unit sphere, whatever the lens.",
@@ -40,6 +36,7 @@ TERMS: dict[str, str] = {
     "covariance": "How sure the pose is by its inliers: drawn as an ellipsoid of three standard deviations.",
     "estimator": "A method that computes the pose from all matches, most of them wrong. mc-exact can prove its answer, "
     "mc is the paper's, ransac-2p draws pairs; the others are baselines that draw larger samples.",
+    "step": "A moment of a run with a picture and words of its own. Previous, Next and the timeline walk through them.",
     "scene": "What there is to localize: a simulation, drawn or real images, or a file of matches.",
     "sweep": "Many runs while one property of the scene grows, to see from where on an estimator fails.",
     "recording": "A file of one run with all its numbers: it opens again here, in Rerun's viewer, and in Python.",
@@ -79,37 +76,11 @@ def _mark(term: str, words: str, look: str) -> str:
     tip = escape(f"{term}: {TERMS[term]}")
     name = f' aria-label="What is {escape(term)}?"' if words == "?" else ""
     return (
-        f'<span class="{look}" role="button" tabindex="0" data-touch="{DEFINE}:{escape(term)}" title="{tip}"{name}>'
+        f'<span class="{look}" role="button" tabindex="0" data-define="{escape(term)}" title="{tip}"{name}>'
         f"{words}</span>"
     )
 
 
-class Glossary:
-    """One client's: a window with all terms, the one that was asked for first."""
-
-    def __init__(self, gui: viser.GuiApi, touches: Touches) -> None:
-        self._gui = gui
-        self._open: Any = None
-        """viser's window, whose type it does not export; None before the first."""
-        touches.on(DEFINE, self._define)
-
-    def _define(self, touch: Touch) -> None:
-        if touch.argument not in TERMS:
-            return
-        if self._open is not None:
-            self._open.close()
-        self._open = self._gui.add_modal("What the words mean")
-        with self._open:
-            self._gui.add_html(glossary_html(touch.argument))
-
-
-def glossary_html(first: str) -> str:
-    """All terms, the given one before the others."""
-    others = [term for term in TERMS if term != first]
-    look = "padding:.5em .7em;border-radius:.4em;background:color-mix(in srgb, currentColor 10%, transparent)"
-    top = f'<div style="{look};font-size:14px"><b>{escape(first)}</b>: {escape(TERMS[first])}</div>'
-    rows = "".join(
-        f'<div style="padding-top:.45em"><b>{escape(term)}</b>: {escape(TERMS[term])}</div>' for term in others
-    )
-    again = '<div style="padding-top:.8em"><button class="introduce">Show the introduction again</button></div>'
-    return box(top + rows + again, "max-height:60vh;overflow:auto")
+def glossary_html() -> str:
+    """All terms, for the window that a press on one opens (``glossary.js``)."""
+    return f'<div hidden data-glossary="{escape(json.dumps(TERMS))}"></div>'

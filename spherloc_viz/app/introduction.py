@@ -4,7 +4,7 @@ import json
 from collections.abc import Sequence
 from html import escape
 
-from spherloc_viz.layers.primitives import Stop
+from spherloc_viz.layers.primitives import StepHeading
 
 Moment = tuple[tuple[str, ...], str, str]
 """Keys of the steps that show it, of which the first that a run has is taken; title; what it says."""
@@ -61,13 +61,13 @@ OPENING = ("yaw-clique", "consensus-bound")
 """Steps of which a page opens at the first that a run has, if it has any."""
 
 
-def opening_step(steps: Sequence[Stop]) -> int:
+def opening_step(steps: Sequence[StepHeading]) -> int:
     """Where a page opens: at the yaw ring of the run that was found, or else at the outcome."""
     keys = [step.key for step in steps]
     return next((keys.index(key) for key in OPENING if key in keys), len(keys) - 1)
 
 
-def introduction_html(steps: Sequence[Stop]) -> str:
+def introduction_html(steps: Sequence[StepHeading]) -> str:
     """What the page's script reads, put on the page once there is something to see."""
     keys = [step.key for step in steps]
     moments = []

@@ -7,7 +7,7 @@ import viser
 from numpy.typing import NDArray
 
 from spherloc_viz.app.controls.steps_panel import StepsPanel
-from spherloc_viz.app.glossary import Glossary, heading_html
+from spherloc_viz.app.glossary import glossary_html, heading_html
 from spherloc_viz.app.introduction import introduction_html
 from spherloc_viz.app.matches.image_panel import ImagePanel
 from spherloc_viz.app.matches.match_table import MatchTable
@@ -16,7 +16,7 @@ from spherloc_viz.app.plots.graph_view import GraphView
 from spherloc_viz.app.plots.residual_view import ResidualView
 from spherloc_viz.app.plots.yaw_view import YawView
 from spherloc_viz.app.run_request import Run
-from spherloc_viz.app.text import legend_html, opening_html, status_html, summary_html, table_html
+from spherloc_viz.app.text import legend_html, opening_card_html, opening_html, summary_html, table_html
 from spherloc_viz.app.web.touch import READY, Touch, Touches
 from spherloc_viz.layers import graph_begins, steps
 from spherloc_viz.layers.primitives import Picture, Table
@@ -45,7 +45,8 @@ class LeftPanels:
             gui.add_html(legend_html())
             self._outcome = gui.add_html("")
             self._introduction, self._front, self._ready = gui.add_html(""), gui.add_html(""), gui.add_html("")
-        Glossary(gui, touches)
+            gui.add_html(glossary_html())
+            self._card = gui.add_html("")
         self._opening = ""
         self._seen, self._changed = frozenset({"Yaw"}), changed
         touches.on("views", self._see)
@@ -54,6 +55,7 @@ class LeftPanels:
         with _view(gui, views, "Graph"):
             self._graph = GraphView(gui, touches, select)
         with _view(gui, views, "Charts"):
+            gui.add_html(heading_html("Curves of the step at hand", "step"))
             self._charts = ChartPanel(gui)
         with _view(gui, views, "Residuals"):
             self._residuals = ResidualView(gui, touches, changed, select)
@@ -69,10 +71,18 @@ class LeftPanels:
         steps.set_width(width_px)
 
     def draw(
-        self, run: Run, picture: Picture, playing: bool, outcome: Table, selected: tuple[int, ...], hidden: bool
+        self,
+        run: Run,
+        picture: Picture,
+        playing: bool,
+        outcome: Table,
+        selected: tuple[int, ...],
+        hidden: bool,
+        offered: str = "",
     ) -> None:
         """Show a step of a run, in the views that are to be seen. ``selected`` are numbers in the problem; ``hidden``
-        says that the outcome is not to be told yet: then the run is without its pose and its inliers."""
+        says that the outcome is not to be told yet: then the run is without its pose and its inliers. ``offered`` is
+        HTML that says which answers are hidden."""
         kept: NDArray = run.kept
         tables = [table for table in picture.tables if table.name != outcome.name]
         self.steps.show(picture.step, playing, tables, hidden)
@@ -90,9 +100,10 @@ class LeftPanels:
             self._images.draw(run.trace, picture, selected, kept, hidden)
         if "Matches" in seen:
             self._matches.draw(run.trace, selected, kept, hidden)
-        summary, ending = (status_html(HIDDEN), "") if hidden else (summary_html(run.trace), table_html(outcome))
+        summary, ending = ("", "") if hidden else (summary_html(run.trace), table_html(outcome))
+        summary = offered + summary
         if self._opening == run.request.scene.scene:
-            self._opening = ""
+            self._opening = self._card.content = ""
         elif self._opening:
             summary, ending = opening_html(self._opening), f'<div style="opacity:.35">{ending}</div>'
         front = front_html(picture.step.stage, picture.step.key)
@@ -107,10 +118,15 @@ class LeftPanels:
         self._opening = label
         self._changed(None)
 
+    def tell_opening(self, words: str, share: float) -> None:
+        """Say how far the opening is, 0 to 1."""
+        if self._opening:
+            self._card.content = opening_card_html(self._opening, words, share)
+
     def end_opening(self) -> None:
         """The scene before stays."""
         if self._opening:
-            self._opening = ""
+            self._opening = self._card.content = ""
             self._changed(None)
 
     def _see(self, touch: Touch) -> None:
@@ -135,7 +151,6 @@ class LeftPanels:
 
 PROJECTOR_SHARE = 0.4
 """Of the window, for the view left of the canvas in the projector view."""
-HIDDEN = "Answers are hidden: what came out is told at the last step, and the truth when Hide answers is off."
 FRONTS = {
     "Matches": "Images",
     "Samples": "Yaw",

@@ -5,8 +5,9 @@ says what differs from what the scene and the estimator say. Anybody may have ma
 label or by a place in an allowed folder, cameras by their label, and nothing else is read from the disk.
 """
 
+import json
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from html import escape
 from typing import Any
@@ -98,9 +99,11 @@ def _numbers_text(numbers: Iterable[int]) -> str:
     return ",".join(map(str, numbers))
 
 
-def address_html(link: str, session: str, followed: int) -> str:
-    """Tells the page's script (``link.js``) what to keep as the address, and how many links were followed so far."""
-    return f'<div hidden data-address="{escape(link)}" data-session="{session}" data-followed="{followed}"></div>'
+def address_html(link: str, session: str, followed: int, numbers: Mapping[str, str] | None = None) -> str:
+    """Tells the page's script (``link.js``) what to keep as the address, and how many links were followed so far; and
+    a lesson around the page the run's ``numbers``, if it has asked for them."""
+    told = "" if numbers is None else f' data-numbers="{escape(json.dumps(numbers))}"'
+    return f'<div hidden data-address="{escape(link)}" data-session="{session}" data-followed="{followed}"{told}></div>'
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from spherloc_viz.app.catalog import Catalog, SceneRequest
 from spherloc_viz.app.review.opened import is_same_pose
 from spherloc_viz.app.run_request import Run, RunRequest
 from spherloc_viz.recording.origin import Origin, Source
-from spherloc_viz.recording.replay.scene import origin_of
+from spherloc_viz.recording.replay import origin_of
 from spherloc_viz.recording.storage.recorder import Recorder
 
 RETRY_S = 1.0

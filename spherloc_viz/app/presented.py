@@ -18,8 +18,8 @@ class Shown:
     """Binary glTF of the map, in the map frame; None if it has none."""
     diagnosis: Diagnosis | None
     """None for as long as there is none."""
-    answers_hidden: bool = False
-    """Whether the presenter hides the answers, see ``DisplayControls``."""
+    withheld: frozenset[str] = frozenset()
+    """The answers that the presenter hides, see ``RunDisplay``."""
 
 
 class Presented:
@@ -35,20 +35,22 @@ class Presented:
         """What is shown now; None before the first run."""
         return self._newest
 
-    def show(self, run: Run, mesh: bytes | None, diagnosis: Diagnosis | None, answers_hidden: bool = False) -> None:
+    def show(
+        self, run: Run, mesh: bytes | None, diagnosis: Diagnosis | None, withheld: frozenset[str] = frozenset()
+    ) -> None:
         """Show a run, unless it is shown already."""
         with self._lock:
             if self._newest is not None and self._newest.run is run:
                 return
-            self._newest = Shown(run, mesh, diagnosis, answers_hidden)
+            self._newest = Shown(run, mesh, diagnosis, withheld)
         self._tell()
 
-    def hide(self, run: Run, answers_hidden: bool) -> None:
+    def hide(self, run: Run, withheld: frozenset[str]) -> None:
         """Hide the answers of a run or tell them, if it is the one shown."""
         with self._lock:
-            if self._newest is None or self._newest.run is not run or self._newest.answers_hidden == answers_hidden:
+            if self._newest is None or self._newest.run is not run or self._newest.withheld == withheld:
                 return
-            self._newest = replace(self._newest, answers_hidden=answers_hidden)
+            self._newest = replace(self._newest, withheld=withheld)
         self._tell()
 
     def diagnose(self, trace: Trace, diagnosis: Diagnosis) -> None:

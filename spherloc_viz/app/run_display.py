@@ -8,6 +8,7 @@ from typing import Protocol
 import numpy as np
 import viser
 
+from spherloc.datasets.map_scene import MapScene
 from spherloc.datasets.synthetic import TrueCamera
 from spherloc.diagnosis import Diagnosis
 from spherloc_viz.app.controls.controls import DisplayControls
@@ -16,8 +17,8 @@ from spherloc_viz.app.matches.match_card import MatchCard
 from spherloc_viz.app.panels.export_panel import Shown
 from spherloc_viz.app.run_request import Run
 from spherloc_viz.app.stage.canvas import Canvas
-from spherloc_viz.app.text import diagnosis_html, status_html
-from spherloc_viz.app.web.touch import Touches
+from spherloc_viz.app.text import diagnosis_html, hidden_html, status_html
+from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.web.viser_internals import changes_of, set_theme
 from spherloc_viz.layers import paint, steps, with_alternative
 from spherloc_viz.layers.outcome import outcome_table
@@ -25,6 +26,8 @@ from spherloc_viz.layers.primitives import Picture, SceneItem
 from spherloc_viz.layers.selection import with_selection
 
 START_THEME = "dark"
+ANSWERS = frozenset({"outcome", "truth"})
+"""What may be hidden: what came out, until the last step, and the true pose with all that follows from it."""
 
 
 class Panel(Protocol):
@@ -75,11 +78,44 @@ class RunDisplay:
         moved = places.move or (lambda place: None)
         self.canvas = Canvas(client, self.controls.display, select, moved, sum(widths_px))
         self._shown: tuple[Run, bytes | None, Picture] | None = None
-        self._hidden = False
-        """Whether the answers of what is shown are hidden."""
-        self._blind: tuple[Run, Run, Run] | None = None
-        """A run, the same without the truth, and that without what came out."""
+        self._map: tuple[str, MapScene, bytes | None] | None = None
+        """What is opened: label, scene and mesh."""
+        self._revealed: tuple[Run | None, frozenset[str]] = None, frozenset()
+        """A run, and which of its answers were asked for although answers are hidden."""
+        self._blind: tuple[Run, frozenset[str], Run, Run] | None = None
+        """A run, what is withheld of it, the same without the truth if that is, and that without what came out."""
         self._theme = START_THEME
+        self._redraw = places.redraw
+        touches.on("reveal", self._reveal)
+
+    def withheld(self, run: Run) -> frozenset[str]:
+        """Which of ``ANSWERS`` this page does not tell of a run."""
+        told = self._revealed[1] if self._revealed[0] is run else frozenset()
+        return ANSWERS - told if self.controls.display.answers_hidden else frozenset()
+
+    def _reveal(self, touch: Touch) -> None:
+        """Tell one of the answers of the run that is shown, until answers are hidden anew or another run comes."""
+        if self._shown is not None:
+            run = self._shown[0]
+            told = self._revealed[1] if self._revealed[0] is run else frozenset()
+            self._revealed = run, told | ANSWERS & {touch.argument}
+            self._redraw(touch)
+
+    def open_map(self, label: str, scene: MapScene, mesh: bytes | None) -> None:
+        """Until a run of this scene is drawn, show its map in place of the run at hand."""
+        self._map = label, scene, mesh
+
+    def draw_map(self) -> None:
+        """Show the map of what is opened before there is any run."""
+        if self._map is not None:
+            with self._client.atomic():
+                self.canvas.draw_map(*self._map)
+            self._client.flush()
+
+    def end_opening(self) -> None:
+        """The scene before stays."""
+        self._map = None
+        self.panels.end_opening()
 
     def draw(
         self,
@@ -89,19 +125,21 @@ class RunDisplay:
         selected: tuple[int, ...],
         asked: bool,
         answers: int,
-        hidden: bool = False,
+        presenter: frozenset[str] = frozenset(),
     ) -> float | None:
         """Show the step at hand of a run, whose map has that mesh; returns seconds to the next step if they play.
 
         ``selected`` are numbers in the problem, and ``diagnosis`` is None for as long as there is none. ``asked`` is
-        false if only time has passed. The run answers the changes up to the number ``answers``. ``hidden`` hides the
-        truth, and the outcome before the last step, as this page's own switch does.
+        false if only time has passed. The run answers the changes up to the number ``answers``. ``presenter``
+        are the answers that a presenter hides, besides those that this page does.
         """
         controls, known = self.controls, run
-        hidden = self._hidden = hidden or controls.display.answers_hidden
-        blank = run
+        if not controls.display.answers_hidden:
+            self._revealed = None, frozenset()
+        withheld = presenter | self.withheld(run)
+        hidden, blank = bool(withheld), run
         if hidden:
-            (run, blank), diagnosis = self._untold(run), None
+            (run, blank), diagnosis = self._untold(run, withheld), None
         trace = run.trace
         timeline = steps(trace)
         index, pause = self.panels.steps.advance(timeline, asked)
@@ -109,33 +147,40 @@ class RunDisplay:
         alternative = None if diagnosis is None else diagnosis.alternative_cam_from_map
         if last and alternative is not None:
             picture = with_alternative(picture, trace, alternative)
-        early = hidden and not last
+        early = "outcome" in withheld and not last
+        withheld -= {"outcome"} if last else frozenset()
         drawn = with_selection(picture, trace, selected)
         drawn = replace(drawn, scene=drawn.scene + controls.items(known, hidden))
         self._shown = known, mesh, drawn
         with self._client.atomic():
             self._follow_theme()
             with changes_of(self._client.gui).as_of(answers):
-                self.canvas.draw(run, drawn, mesh, controls.camera_movable)
+                if self._map is not None and self._map[0] != run.request.scene.scene:
+                    self.canvas.draw_map(*self._map)
+                else:
+                    self._map = None
+                    self.canvas.draw(run, drawn, mesh, controls.camera_movable)
                 controls.draw(known, diagnosis, hidden)
             # The other views tell inliers by the colours of the picture as it was.
             told = replace(picture, step=drawn.step)
             outcome = outcome_table(trace)
-            self.panels.draw(blank if early else run, told, pause is not None, outcome, selected, early)
+            offered = hidden_html(withheld, not presenter) if withheld else ""
+            self.panels.draw(blank if early else run, told, pause is not None, outcome, selected, early, offered)
             waiting = "" if hidden else status_html("Diagnosing …")
             self.panels.diagnose(waiting if diagnosis is None else diagnosis_html(diagnosis, whole=last))
             self.card.draw(trace, selected, run.kept, alternative, self.canvas.clicked_left, early)
         self._client.flush()
         return self.canvas.check() if pause is None else pause
 
-    def _untold(self, run: Run) -> tuple[Run, Run]:
-        """The run without the truth, and also without what came out."""
-        if self._blind is None or self._blind[0] is not run:
-            problem = replace(run.trace.problem, truth_cam_from_map=None, truth_inliers=None)
-            trace = replace(run.trace, problem=problem)
+    def _untold(self, run: Run, withheld: frozenset[str]) -> tuple[Run, Run]:
+        """The run without the truth, if that is withheld, and also without what came out."""
+        if self._blind is None or self._blind[0] is not run or self._blind[1] != withheld:
+            trace = run.trace
+            if "truth" in withheld:
+                trace = replace(trace, problem=replace(trace.problem, truth_cam_from_map=None, truth_inliers=None))
             blank = replace(trace, cam_from_map=None, inlier_mask=np.zeros_like(trace.inlier_mask))
-            self._blind = run, replace(run, trace=trace), replace(run, trace=blank)
-        return self._blind[1:]
+            self._blind = run, withheld, replace(run, trace=trace), replace(run, trace=blank)
+        return self._blind[2:]
 
     @property
     def step_key(self) -> str:
@@ -153,7 +198,7 @@ class RunDisplay:
             items=tuple(item for item in picture.scene if item.layer in layers),
             backdrop=mesh if "mesh" in layers else None,
             title=run.request.scene.scene,
-            note=f"{trace.estimator}, seed {trace.seed}.{'' if self._hidden else f' {trace.message}'}",
+            note=f"{trace.estimator}, seed {trace.seed}.{'' if self.withheld(run) else f' {trace.message}'}",
             recorded=recorded,
             dark=display.theme == "dark",
         )

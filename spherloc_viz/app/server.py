@@ -36,7 +36,7 @@ from spherloc_viz.app.web.viser_internals import role_header, set_theme, start_v
 from spherloc_viz.given_files import is_recording
 from spherloc_viz.plugins import extensions
 from spherloc_viz.recording.index.run_index import RunIndex
-from spherloc_viz.recording.replay.scene import RecordedScene, recorded_options
+from spherloc_viz.recording.replay import RecordedScene, recorded_options
 from spherloc_viz.recording.sandbox.examiner import end_examining
 from spherloc_viz.recording.storage.recorder import Recorder
 from spherloc_viz.recording.storage.room import KEEP_GIGABYTES, kept_bytes

@@ -25,6 +25,7 @@ from spherloc_viz.app.controls.steps_panel import find_step
 from spherloc_viz.app.edits import Edits
 from spherloc_viz.app.history import History
 from spherloc_viz.app.link import Followed, Follower, PageView, address_html, link_of
+from spherloc_viz.app.map_pictures import MapPictures
 from spherloc_viz.app.page_runs import Known, PageRuns
 from spherloc_viz.app.panels.export_panel import Shown
 from spherloc_viz.app.panels.folders import Roots
@@ -38,6 +39,7 @@ from spherloc_viz.app.web.touch import READY, Touch, Touches
 from spherloc_viz.app.web.viser_internals import follow_changes, guard_callbacks
 from spherloc_viz.app.workers import Job, LatestWorker
 from spherloc_viz.layers import steps
+from spherloc_viz.lessons.numbers import number_text, numbers_of
 
 QUIET_S = 0.7
 """Runs count as settled, and are recorded, when nothing has changed for this long."""
@@ -66,6 +68,7 @@ class Session:
         self._page = LatestWorker(f"spherloc-page-{number}", self._guarded(self._show))
         self._viewer = LatestWorker(f"spherloc-viewer-{number}", self._guarded(self._follow_viewer))
         self._diagnoser = LatestWorker(f"spherloc-diagnosis-{number}", self._guarded(self._examine))
+        self._pictures = MapPictures(number, self._catalog, self._status.say, self._page.ask, self._guarded)
         self._edits, self._history = Edits(), History()
         self._opened: tuple[RunRequest, int] | None = None
         """What is to be opened, and the number of the change that asked for it."""
@@ -77,6 +80,9 @@ class Session:
         """A link that is to be followed, and the number of the change before it."""
         self._followed = 0
         """How many links were followed."""
+        self._in_lesson = False
+        self._numbers: tuple[Trace, dict[str, str]] | None = None
+        """Those of a run, for the lesson around the page."""
         self._run: Run | None = None
         self._answers = 0
         """The number of the newest change that the run knows, or an earlier one."""
@@ -96,7 +102,7 @@ class Session:
     def start(self) -> None:
         """Solve and show the first problem, or the recorded run that was asked for."""
         self._client.camera.on_update(lambda camera: self._viewer.ask())
-        for worker in (self._page, self._viewer, self._diagnoser, self._controls.slow, self._solver):
+        for worker in (self._page, self._viewer, self._diagnoser, self._pictures, self._controls.slow, self._solver):
             worker.start()
         first = self._services.first
         if first is None:
@@ -106,7 +112,7 @@ class Session:
 
     def close(self) -> None:
         """End the threads; does not wait."""
-        for worker in (self._solver, self._page, self._viewer, self._diagnoser, self._controls):
+        for worker in (self._solver, self._page, self._viewer, self._diagnoser, self._pictures, self._controls):
             worker.close()
 
     def complain(self, sentence: str) -> None:
@@ -156,11 +162,18 @@ class Session:
         on("unhide", lambda touch: (self._edits.show_all(), self.changed()))
         on("unedit", self._take_back)
         on("link", self._note_link)
+        on("numbers", self._tell_numbers)
+        on("cancel", lambda touch: self._controls.slow.cancel())
 
     def _note_link(self, touch: Touch) -> None:
         """The page's address is that of a link."""
         self._link = touch.argument, self._changes.moment()
         self.changed()
+
+    def _tell_numbers(self, touch: Touch) -> None:
+        """A lesson around the page asks for the numbers of the runs."""
+        self._in_lesson = True
+        self._page.ask()
 
     def _reset(self, event: object) -> None:
         """All changes to the scene, at once: it is one step of the history."""
@@ -227,11 +240,12 @@ class Session:
             return self._solve_newest()
         except Cancelled:
             if self._controls.slow.stopped:
-                self._status.say("Cancelled; the page still shows the run before.")
-            self._display.panels.end_opening()
+                what = "choose another scene." if self._run is None else "the page still shows the run before."
+                self._status.say(f"Cancelled; {what}")
+            self._display.end_opening()
             return None
         except Exception:
-            self._display.panels.end_opening()
+            self._display.end_opening()
             raise
 
     def _solve_newest(self) -> float | None:
@@ -289,8 +303,10 @@ class Session:
                 trace = estimate(problem, request.estimator, request.options, request.scene.seed, watch)
             finally:
                 self._controls.slow.end()
-            self._run, self._answers = Run(request, trace, _kept(request, problem)), number
+            run = Run(request, trace, _kept(request, problem))
+            self._run, self._answers = run, number
             self._page.ask()
+            self._pictures.want(run)
         elif self._answers != number:
             self._answers = number
             self._page.ask()
@@ -319,20 +335,32 @@ class Session:
         scene = self._catalog.map_scene(request.scene)
         if scene is None:
             return self._catalog.problem(request)
-        if self._run is not None and request.scene != self._run.request.scene.scene:
-            self._display.panels.begin_opening(request.scene)
+        if scene.stored_problem(request.query) is not None:
+            return self._catalog.problem(request)
+        panels = self._display.panels
         watch = self._controls.slow.begin(lasting=True)
         try:
             watch.begin("map", 1.0)
+            if self._run is None or request.scene != self._run.request.scene.scene:
+                panels.begin_opening(request.scene)
+                panels.tell_opening("Making the map …", 0.0)
+                self._display.open_map(request.scene, scene, self._catalog.mesh(request.scene))
+                self._page.ask()
 
             def report(done: int, count: int) -> None:
-                self._status.say(f"Describing the map: {done} of {count} images …")
+                words = f"Describing the map: {done} of {count} images …"
+                self._status.say(words)
+                panels.tell_opening(words, done / (count + 1))
                 watch.expect(count)
                 watch.reach(done)
 
             scene.prepare(report)
             self._status.say("Reading and matching images …")
-            return self._catalog.problem(request)
+            panels.tell_opening("Reading and matching images …", 0.9)
+            watch.check()
+            problem = self._catalog.problem(request)
+            watch.check()
+            return problem
         finally:
             self._controls.slow.end()
 
@@ -341,9 +369,11 @@ class Session:
         run = self._run
         if run is None:
             return None
+        if not self._pictures.whole(run):  # its recording has the query image
+            return QUIET_S
         self._controls.show_how_to_repeat(run)
-        hidden = self._controls.display.answers_hidden
-        self._services.presented.show(run, self._mesh(run), self._diagnosis(run), hidden)
+        withheld = self._display.withheld(run)
+        self._services.presented.show(run, self._mesh(run), self._diagnosis(run), withheld)
         sentence, pause = self._runs.finish(run, self._diagnosis(run))
         self._status.say(sentence)
         return pause
@@ -361,16 +391,17 @@ class Session:
         return known[1] if known is not None and known[0] is run.trace else None
 
     def _mesh(self, run: Run) -> bytes | None:
-        """Of the run's map, if it has one."""
-        return self._catalog.mesh(run.request.scene.scene)
+        """Of the run's map, if it has one and it is there by now."""
+        return self._catalog.known_mesh(run.request.scene.scene)
 
     def _show(self, asked: bool) -> float | None:
         """The page thread's job: show the step at hand of the newest run."""
         answers, run = self._answers, self._run
         if run is None:
+            self._display.draw_map()
             return None
         diagnosis = self._diagnosis(run)
-        self._services.presented.hide(run, self._controls.display.answers_hidden)
+        self._services.presented.hide(run, self._display.withheld(run))
         pause = self._display.draw(run, self._mesh(run), diagnosis, self._edits.places(run.kept), asked, answers)
         self._write_address(run)
         if diagnosis is None:
@@ -382,9 +413,17 @@ class Session:
         opened = self._controls.review.opened
         recording = opened.recorded.row.file if opened is not None and opened.request == run.request else None
         link = link_of(run, self._view(), self._catalog, self._services.catalog.scenes, self._roots, recording)
-        html = address_html(link, self._name, self._followed)
+        html = address_html(link, self._name, self._followed, self._told_numbers(run.trace))
         if self._address.content != html:
             self._address.content = html
+
+    def _told_numbers(self, trace: Trace) -> dict[str, str] | None:
+        """The run's numbers for a lesson, if there is one around the page."""
+        if not self._in_lesson:
+            return None
+        if self._numbers is None or self._numbers[0] is not trace:
+            self._numbers = trace, {name: number_text(value) for name, value in numbers_of(trace).items()}
+        return self._numbers[1]
 
     def _follow_viewer(self, asked: bool) -> float | None:
         """The viewer thread's job: once the viewer stands still, have the address say where."""

@@ -1,5 +1,6 @@
 """Text and tables as HTML. viser puts HTML into the page as it is, so every string is escaped here."""
 
+import json
 from collections.abc import Callable
 from html import escape
 
@@ -10,10 +11,9 @@ from spherloc.metrics import evaluate
 from spherloc.trace import Trace
 from spherloc_viz import style
 from spherloc_viz.layers.comparison import duration_text
-from spherloc_viz.layers.frame import length
+from spherloc_viz.layers.frame import angle_text, length
 from spherloc_viz.layers.outcome import UNKNOWABLE, verdict
 from spherloc_viz.layers.primitives import Step, Table
-from spherloc_viz.layers.scale_bar import angle_text
 
 DIM = "opacity:.65"
 WITHHELD = "Answers are hidden. What stands here would tell them: switch Hide answers off to see it."
@@ -77,10 +77,31 @@ def diagnosis_html(diagnosis: Diagnosis, whole: bool) -> str:
     return box("".join(parts))
 
 
+HIDDEN = "Answers are hidden"
+OFFERS = {"outcome": "Show the outcome", "truth": "Show the truth"}
+
+
+def hidden_html(withheld: frozenset[str], buttons: bool) -> str:
+    """Which answers are hidden, each with a button that tells it."""
+    line = HIDDEN if "outcome" in withheld else "The truth is hidden"
+    offers = "".join(
+        f'<button class="reveal" data-touch="reveal:{answer}">{words}</button>'
+        for answer, words in OFFERS.items()
+        if answer in withheld and buttons
+    )
+    return box(f'<span style="{DIM}">{line}.</span> {offers}', "font-size:12px;padding-top:.2em")
+
+
 def opening_html(label: str) -> str:
     """In place of a run's summary, while another scene is opened."""
-    words = f"<b>Opening {escape(label)} …</b> What is shown is still the scene before."
+    words = f"<b>Opening {escape(label)} …</b> What stands below is still of the scene before."
     return box(words, "font-size:12.5px;padding-top:.2em")
+
+
+def opening_card_html(label: str, words: str, share: float) -> str:
+    """Has the page's script (``opening.js``) show over the canvas how far the opening of a scene is, 0 to 1."""
+    told = {"title": f"Opening {label} …", "words": words, "share": round(share, 3)}
+    return f'<div hidden data-opening="{escape(json.dumps(told))}"></div>'
 
 
 def summary_html(trace: Trace) -> str:

@@ -38,12 +38,13 @@ from spherloc_viz.app.text import DIM, box
 from spherloc_viz.app.web.touch import Touches
 from spherloc_viz.app.web.viser_internals import at_once, put
 from spherloc_viz.layers.primitives import SceneItem
-from spherloc_viz.layers.trajectory import trajectory_items
-from spherloc_viz.recording.replay.reopen import Reopened
+from spherloc_viz.layers.scene import trajectory_items
+from spherloc_viz.recording.replay import Reopened
 
 PROJECTOR = (
     '<div class="words" style="padding:.2em .8em .3em"><button class="projector-toggle" title="The canvas, what the '
-    'step says in large type, and the view that goes with it">Projector view, key L</button></div>'
+    'step says in large type, and the view that goes with it">Projector view, key L</button> '
+    '<a href="/learn" target="_blank" title="Lessons beside the live canvas">Learn how it works</a></div>'
 )
 
 
@@ -193,6 +194,7 @@ class Controls:
         gui.main_panel.set_width(width_px)
 
     def _build_play(self, gui: viser.GuiApi) -> None:
+        gui.add_html(heading_html("Drag a slider: it is solved anew meanwhile", "estimator"))
         self._preset = gui.add_dropdown(
             "Preset", preset_names(self._presets, False), hint="Each of them shows one thing."
         )

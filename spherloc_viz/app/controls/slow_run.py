@@ -19,7 +19,7 @@ class SlowRun:
     def __init__(self, gui: viser.GuiApi, name: str) -> None:
         self._bar = gui.add_progress_bar(0.0, visible=False)
         self._button = gui.add_button("Cancel", visible=False, color="red")
-        self._button.on_click(self._press)
+        self._button.on_click(lambda event: self.cancel())
         self._lock = threading.Lock()
         self._watch: Watch | None = None
         self._outdated = False
@@ -61,7 +61,8 @@ class SlowRun:
         """Whether a person ended the last run."""
         return self._stopped
 
-    def _press(self, event: viser.GuiEvent) -> None:
+    def cancel(self) -> None:
+        """A person wants no more of the run at hand."""
         with self._lock:
             if self._watch is not None:
                 self._stopped = True

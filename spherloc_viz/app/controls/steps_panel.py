@@ -12,7 +12,7 @@ from spherloc_viz.app.glossary import linked
 from spherloc_viz.app.introduction import opening_step
 from spherloc_viz.app.text import box, step_html, table_html
 from spherloc_viz.app.web.viser_internals import at_once, put
-from spherloc_viz.layers.primitives import Step, Stop, Table
+from spherloc_viz.layers.primitives import Step, StepHeading, Table
 
 PLAY_S = 3.0
 """How long a step stays while playing: time to read its two sentences."""
@@ -43,7 +43,7 @@ class StepsPanel:
         self._goal: str | int | None = None
         """Key, or number of a step from 1 on, that was asked for."""
         self._playing = False
-        self._steps: tuple[Stop, ...] = ()
+        self._steps: tuple[StepHeading, ...] = ()
         self._index = 0
         titles: list[str] = ["-"]
         self._stages = gui.add_html("")
@@ -59,7 +59,7 @@ class StepsPanel:
             command: Any = gui.add_command(label, hotkey=hotkey, modifier=modifier)  # type: ignore[arg-type]
             command.on_trigger(lambda event, button=button: self._press(button))
 
-    def advance(self, steps: tuple[Stop, ...], asked: bool) -> tuple[int, float | None]:
+    def advance(self, steps: tuple[StepHeading, ...], asked: bool) -> tuple[int, float | None]:
         """Index of the step to show, and seconds to the next one if playing; ``asked`` is false for its alarm."""
         if steps != self._steps:
             known = self._steps
@@ -152,13 +152,13 @@ class StepsPanel:
         self._changed(None)
 
 
-def titles_of(steps: Sequence[Stop], told: int) -> tuple[str, ...]:
+def titles_of(steps: Sequence[StepHeading], told: int) -> tuple[str, ...]:
     """What the steps are called in the list; those after the one of index ``told`` by their stage."""
     names = (step.title if k <= told else step.stage for k, step in enumerate(steps))
     return tuple(f"{k}/{len(steps)}  {name}" for k, name in enumerate(names, 1))
 
 
-def moved(steps: Sequence[Stop], index: int, move: str) -> int:
+def moved(steps: Sequence[StepHeading], index: int, move: str) -> int:
     """Where a button leads from a step."""
     starts = [k for k, step in enumerate(steps) if k == 0 or step.stage != steps[k - 1].stage]
     if move == BACK:
@@ -168,7 +168,7 @@ def moved(steps: Sequence[Stop], index: int, move: str) -> int:
     return min(max(0, index + (1 if move == NEXT else -1)), len(steps) - 1)
 
 
-def find_step(steps: Sequence[Stop], key: str) -> int:
+def find_step(steps: Sequence[StepHeading], key: str) -> int:
     """The step of that key; else the nearest of its kind; else the outcome.
 
     "sample-12" is of the kind of "sample-9", and "yaw-arcs-100" of that of "yaw-arcs-30" and "yaw-arcs", and rather
@@ -193,7 +193,7 @@ def _number(parts: str | list[str]) -> float:
     return float(text) if text.isdecimal() else float("inf")
 
 
-def stages_html(steps: Sequence[Stop], index: int) -> str:
+def stages_html(steps: Sequence[StepHeading], index: int) -> str:
     """The stages as bars, each as long as it has steps and filled as far as the step at hand; a press goes there."""
     stages = list(dict.fromkeys(step.stage for step in steps))
     bars = []

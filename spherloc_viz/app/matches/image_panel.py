@@ -25,6 +25,7 @@ from spherloc_viz.layers.matches import MatchView, match_view
 from spherloc_viz.layers.primitives import Picture, Points
 from spherloc_viz.layers.query_image import modified, photograph, shrunk
 
+GONE = "cannot be read: it is still being drawn, or it is gone."
 QUALITIES = (82, 70, 55, 40)
 MOST_BYTES = 85_000
 """A JPEG is encoded with less quality while it is larger; as text it takes a third more."""
@@ -83,7 +84,8 @@ class ImagePanel:
         if followed != self._followed:
             self._followed, self._wanted = followed, None
         colors = _colors(picture, len(problem))
-        drawn = (selected, self._wanted, colors.tobytes(), kept.tobytes(), hidden)
+        written = [modified(path) for path in (problem.image, *problem.reference_images) if path is not None]
+        drawn = (selected, self._wanted, colors.tobytes(), kept.tobytes(), hidden, written)
         if self._drawn is not None and self._drawn[0] is trace and self._drawn[1] == drawn:
             return
         self._drawn = (trace, drawn)
@@ -94,7 +96,7 @@ class ImagePanel:
         uris = [photo_uri(path, round(PHOTO_PX * share)) for path, share in zip(paths, shares, strict=True)]
         self._shown = shown = overlay(trace, view, colors, places, selected, kept, uris[0] is not None)
         gone = [path.name for path, uri in zip(paths, uris, strict=True) if path is not None and uri is None]
-        caption = " ".join([shown.caption, *(f"{name} cannot be read any more." for name in gone)])
+        caption = " ".join([shown.caption, *(f"{name} {GONE}" for name in gone)])
         html = drawing.frame_html(places, height, [uri is not None for uri in uris], shown.parts, caption)
         votes = "" if hidden else chips_html(problem, trace.inlier_mask, view.reference)
         html = box(html) + status_html(caption) + votes

@@ -14,6 +14,7 @@ from PIL import Image
 
 from spherloc.errors import InputError
 from spherloc.trace import Trace
+from spherloc_viz.app.glossary import heading_html
 from spherloc_viz.app.stage.still_page import Still, still_html, viewpoint
 from spherloc_viz.app.text import DIM, box, status_html
 from spherloc_viz.app.workers import BackgroundWorker
@@ -24,9 +25,10 @@ PATIENCE_S = 60.0
 """A page that draws in software takes some ten seconds for a picture of its canvas."""
 WHERE = "Paths in the code are relative to the folder in which the playground was started; run it there."
 LINK = box(
-    '<span role="button" tabindex="0" aria-label="Copy the link" data-copy="" style="text-decoration:underline">'
-    f'Copy the link</span><div style="{DIM}">The page\'s address holds all that is set and the step that is shown. '
-    "It leads back to it, here and on any playground that has the scene.</div>",
+    '<button class="copy-link" data-copy="" title="The page\'s address, to be pasted into a message">'
+    f'Copy the link to what you see</button><div style="{DIM}">'
+    "It leads to this scene, these settings, this step and this view; reload, back and bookmarks keep them too. On "
+    "another machine, open what follows the # at the address of a playground there.</div>",
     "font-size:12px",
 )
 """The page's script knows the address, see ``touch.js``."""
@@ -53,13 +55,15 @@ class Shown:
 
 
 class ExportPanel:
-    """Three buttons and two pieces of code."""
+    """The link, three buttons and two pieces of code."""
 
     def __init__(self, gui: viser.GuiApi, client: viser.ClientHandle, shown: Callable[[], Shown | None]) -> None:
         """``shown`` tells what is on the page, on a thread of this panel; None before the first picture."""
         self._client, self._shown = client, shown
         self._background = BackgroundWorker(f"spherloc-export-{client.client_id}", self._complain)
         self._code: tuple[str, str] | None = None
+        gui.add_html(heading_html("Send what you see, or repeat it elsewhere", "recording"))
+        gui.add_html(LINK)
         buttons = (
             ("Picture (PNG)", "The canvas as it is seen now.", self._picture),
             ("Scene (HTML)", "The canvas as a file that opens in any browser, with no network.", self._page),
@@ -67,7 +71,6 @@ class ExportPanel:
         )
         for label, hint, job in buttons:
             gui.add_button(label, hint=hint).on_click(lambda event, job=job: self._background.ask(job))
-        gui.add_html(LINK)
         self._status = gui.add_html("", visible=False)
         self._text = gui.add_html("")
 

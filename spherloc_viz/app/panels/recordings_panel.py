@@ -22,7 +22,7 @@ from spherloc_viz.app.text import WITHHELD, box, status_html
 from spherloc_viz.app.web.downloads import Downloads
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.workers import BackgroundWorker
-from spherloc_viz.recording.replay.reopen import Reopened
+from spherloc_viz.recording.replay import Reopened
 from spherloc_viz.recording.run_row import RunRow
 
 RUNS, GALLERY = "runs", "gallery"

@@ -145,9 +145,9 @@ def _ways(row: RunRow, run: Run | None) -> str:
     ways = []
     if run is None:
         ways.append(_way("run-return:", "back to the recorded run"))
-    elif 0 <= row.key_step < len(stops := steps(run.trace)):
-        stop = stops[row.key_step]
-        ways.append(_way(f"step:{stop.key}", f"step {row.key_step + 1}: {stop.title}"))
+    elif 0 <= row.key_step < len(headings := steps(run.trace)):
+        heading = headings[row.key_step]
+        ways.append(_way(f"step:{heading.key}", f"step {row.key_step + 1}: {heading.title}"))
     link = escape(viewer_link(row.file, row.key_step + 1))
     ways.append(
         f'<a href="{link}" target="_blank" rel="noopener" title="Open in the Rerun viewer at the step where it was '

@@ -15,7 +15,7 @@ from spherloc_viz.app.text import DIM, box, status_html
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.workers import BackgroundWorker
 from spherloc_viz.gallery import GALLERY, GalleryCase, Play, gallery_cases
-from spherloc_viz.recording.replay.reopen import Reopened
+from spherloc_viz.recording.replay import Reopened
 from spherloc_viz.recording.run_row import RunRow
 
 FOLDER = "gallery"

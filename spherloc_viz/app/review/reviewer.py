@@ -19,7 +19,7 @@ from spherloc_viz.app.run_request import Run, RunRequest
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.workers import BackgroundWorker
 from spherloc_viz.layers.primitives import SceneItem
-from spherloc_viz.recording.replay.reopen import Reopened, reopen
+from spherloc_viz.recording.replay import Reopened, reopen
 from spherloc_viz.recording.run_row import RunRow
 
 

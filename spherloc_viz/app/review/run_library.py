@@ -9,7 +9,7 @@ from pathlib import Path
 
 from spherloc.errors import RecordingError
 from spherloc_viz.app.review.filters import EXACT, JUDGED, PAGE, Counts, Look
-from spherloc_viz.recording.content.reader import RecordedRun, read_recording
+from spherloc_viz.recording.content.data import RecordedRun, read_recording
 from spherloc_viz.recording.index.query import MAX_TEXT, RunQuery
 from spherloc_viz.recording.index.run_index import Found, RunIndex
 from spherloc_viz.recording.reviews import Review

@@ -4,8 +4,7 @@ import json
 from datetime import UTC, datetime
 
 from spherloc_viz import style
-from spherloc_viz.layers.frame import length
-from spherloc_viz.layers.scale_bar import angle_text
+from spherloc_viz.layers.frame import angle_text, length
 from spherloc_viz.recording.run_row import RunRow
 
 UNKNOWN = "–"

@@ -1,17 +1,24 @@
 """One client's canvas: draws pictures, moves the viewer, and tells what is picked and dragged."""
 
+import math
 import threading
+import time
 from collections.abc import Callable
 
 import numpy as np
 import viser
 
+from spherloc.datasets.map_scene import MapScene
+from spherloc.geometry import align_to_down, camera_centre
+from spherloc_viz import style
 from spherloc_viz.app.controls.controls import DisplayControls
 from spherloc_viz.app.run_request import Run
 from spherloc_viz.app.stage import views
-from spherloc_viz.app.stage.painter import Painter
+from spherloc_viz.app.stage.painter import LABEL_SCALE, Painter
 from spherloc_viz.app.stage.true_camera import TrueCamera
-from spherloc_viz.layers.primitives import Picture
+from spherloc_viz.app.stage.walls import Walls
+from spherloc_viz.layers.frame import one_color
+from spherloc_viz.layers.primitives import Picture, Points
 
 FIRST_CHECKS, MOST_CHECKS, CHECK_S = 8, 40, 0.4
 """A page that is still building itself drops its first view and reports that its viewer has not moved; a slow one for
@@ -20,6 +27,10 @@ MOST_PX = 1 << 20
 """Whatever a page says of its window, it is no larger."""
 HELD = "held"
 """In place of a view's name."""
+REFERENCE_DOT = 0.01
+"""Radius of a reference's dot by the extent of all of them, before there is a run."""
+MOVE_S = 1.0
+"""The page moves its viewer smoothly, within less (``smooth.js``)."""
 RESHAPED = 0.02
 """From this change of the canvas' width over height on, as a share, its view is fitted anew."""
 
@@ -41,7 +52,7 @@ class Canvas:
         """
         client.scene.set_up_direction("-y")
         self._client, self._display = client, display
-        self._painter = Painter(client, picked)
+        self._painter = Painter(client, picked, LABEL_SCALE * text_scale(client.camera.image_width))
         self._camera = TrueCamera(client, moved)
         self._docked_px, self._full_width = docked_px, client.camera.image_width
         self._step: tuple[str, str] | None = None
@@ -49,6 +60,8 @@ class Canvas:
         """The view that showed the subject of the last step that moved the viewer."""
         self._looked: tuple[str | None, views.View, float] | None = None
         """The last view that was taken: its name, or None for that of the step, and for which canvas."""
+        self._taken_s = -math.inf
+        """When that was."""
         self._held: tuple[str, views.View] | None = None
         """A view that a link asked for, and the key of the step at which it does."""
         self._held_step_came = False
@@ -57,21 +70,42 @@ class Canvas:
         self._checks, self._movable = 0, False
         self._lock = threading.Lock()
         self._picture: Picture | None = None
+        self._walls: Walls | None = None
         client.camera.on_update(lambda camera: self._follow_page())
 
     def draw(self, run: Run, picture: Picture, mesh: bytes | None, movable: bool) -> None:
         """Show a picture of a run; ``mesh`` is the map's, and ``movable`` whether the true camera may be dragged."""
         problem, layers = run.trace.problem, self._display.layers()
+        if mesh is not None and "mesh" in layers:  # it has a ground of its own
+            layers -= {"ground"}
         with self._lock:
+            self._painter.dark = self._display.theme == "dark"
             self._painter.draw(picture.scene, layers)
             self._painter.draw_backdrop(mesh, problem.aligned.map_turn, "mesh" in layers)
             self._picture = picture
+            walls = Walls(mesh, problem.aligned.map_turn) if mesh is not None and "mesh" in layers else None
+            walls_came, self._walls = walls is not None and self._walls is None, walls
         if movable or self._movable:
             truth = problem.truth_cam_from_map
             self._camera.show(None if truth is None else problem.aligned.align_pose(truth), movable)
             self._movable = movable
-        self._move_viewer(run, picture)
+        self._move_viewer(run, picture, walls_came)
         self._make_room()
+
+    def draw_map(self, label: str, scene: MapScene, mesh: bytes | None) -> None:
+        """Show a scene before there is a run of it: its mesh, and where its references stand."""
+        turn, layers = align_to_down(scene.gravity_map), self._display.layers()
+        posed = [view.cam_from_map for view in scene.references if view.cam_from_map is not None]
+        places = np.array([camera_centre(pose) for pose in posed]).reshape(-1, 3) @ turn.T
+        with self._lock:
+            self._picture = None
+            size_m = float(np.max(np.ptp(places, axis=0), initial=0.0)) or 1.0
+            colors = one_color(style.UNDECIDED, len(places))
+            self._painter.draw([Points("map/references", "map", places, colors, REFERENCE_DOT * size_m)], layers)
+            self._painter.draw_backdrop(mesh, turn, "mesh" in layers)
+        if label != self._scene and len(places):
+            self._scene = label
+            self._take(None, views.around(places, self._aspect()), self._aspect())
 
     def hold(self, step_key: str, viewpoint: tuple[float, ...]) -> None:
         """Look from there, as ``viewpoint`` told it, for as long as this step is shown and nobody moves."""
@@ -95,18 +129,20 @@ class Canvas:
 
     def _make_room(self) -> None:
         """Hide what would be before the eyes of who stands in a camera; on threads of viser's and of the page's."""
-        # Not to wait for a picture that is being drawn each time that the viewer moves.
-        if self._in_the_way() != self._painter.hidden:
-            with self._lock:
-                self._painter.hide(self._in_the_way())
-
-    def _in_the_way(self) -> frozenset[str]:
         picture = self._picture
         try:
             position = np.array(self._client.camera.position, dtype=np.float64).reshape(3)
         except (TypeError, ValueError):  # viser takes whatever a page says of its camera
-            return frozenset()
-        return frozenset() if picture is None else views.before_the_eyes(picture, position)
+            return
+        if picture is None:
+            return
+        in_the_way = views.before_the_eyes(picture, position)
+        eye = position if views.inside(picture, position) else None
+        # Not to wait for a picture that is being drawn each time that the viewer moves.
+        if in_the_way != self._painter.hidden or (eye is None) != (self._painter.eye is None):
+            with self._lock:
+                self._painter.hide(in_the_way)
+                self._painter.see_from(eye)
 
     @property
     def clicked_left(self) -> bool:
@@ -119,16 +155,14 @@ class Canvas:
         most = MOST_CHECKS if views.stands_at(self._client, views.START) else FIRST_CHECKS
         return CHECK_S if self._checks <= most else None
 
-    def _move_viewer(self, run: Run, picture: Picture) -> None:
+    def _move_viewer(self, run: Run, picture: Picture, walls_came: bool) -> None:
         """Go where the person wants, or, if that is to follow the steps, where the step's subject reads best.
 
-        There too if another scene has been opened, since nothing of it may be in sight.
+        There too if another scene has been opened, since nothing of it may be in sight, and if its walls have come.
         """
-        wanted, step, scene = (
-            self._display.take_view(),
-            (run.trace.problem.name, picture.step.key),
-            run.request.scene.scene,
-        )
+        # Not by the problem's name, which follows every slider.
+        wanted, scene, query = self._display.take_view(), run.request.scene.scene, run.request.scene.query
+        step = (f"{scene}, {query}", picture.step.key)
         at_held = self._held is not None and self._held[0] == step[1]
         if wanted is not None or (self._held_step_came and not at_held):
             self._held = None
@@ -141,6 +175,8 @@ class Canvas:
             self._look_again(self._held[1])
         elif elsewhere or views.stands_at(self._client, views.START):
             self._look(None, picture)
+        elif walls_came and self._looked is not None and self._untouched():
+            self._look(self._looked[0], picture)
         elif self._display.follow and (other_step or self._untouched()):
             self._follow_step(picture, other_step)
 
@@ -148,7 +184,7 @@ class Canvas:
         """Go to the step's view unless the viewer is there, or, at the same step, sees its subject well enough."""
         aspect = self._aspect()
         if other_step:
-            view = views.follow(picture, aspect)
+            view = views.follow(picture, aspect, self._walls)
             if self._followed is None or not views.same(view, self._followed):
                 self._take(None, view, aspect)
         elif self._looked is not None and not views.shows(self._looked[1], picture.focus.points, aspect):
@@ -162,17 +198,20 @@ class Canvas:
     def _look(self, name: str | None, picture: Picture) -> None:
         """Take the view of that name, or the one of the step."""
         aspect = self._aspect()
-        self._take(name, views.follow(picture, aspect) if name is None else views.find(name, picture, aspect), aspect)
+        walls = self._walls
+        wanted = views.follow(picture, aspect, walls) if name is None else views.find(name, picture, aspect, walls)
+        self._take(name, wanted, aspect)
 
     def _take(self, name: str | None, view: views.View, aspect: float) -> None:
         if name is None:
             self._followed = view
-        self._looked = name, view, aspect
+        self._looked, self._taken_s = (name, view, aspect), time.monotonic()
         views.look(self._client, view)
 
     def _untouched(self) -> bool:
-        """Whether the viewer still stands where it was put."""
-        return self._looked is not None and views.stands_at(self._client, self._looked[1])
+        """Whether the viewer still stands where it was put, or is on its way there."""
+        moving = time.monotonic() - self._taken_s < MOVE_S
+        return self._looked is not None and (moving or views.stands_at(self._client, self._looked[1]))
 
     def _follow_page(self) -> None:
         """The page's viewer has moved, or its canvas has another shape; on threads of viser's."""
@@ -196,12 +235,19 @@ class Canvas:
 
 def panel_widths_px(window_px: int) -> tuple[int, int]:
     """Widths of the panels left and right of the canvas."""
-    return next(widths for least, widths in PANELS_PX if window_px >= least)
+    return next(widths for least, widths, _ in WINDOWS_PX if window_px >= least)
 
 
-PANELS_PX: tuple[tuple[int, tuple[int, int]], ...] = (
-    (1800, (500, 450)),
-    (1600, (480, 400)),
-    (0, (380, 340)),
+def text_scale(window_px: int) -> float:
+    """How much larger words are in a window of that width than on a laptop, as in ``touch.css``."""
+    return next(scale for least, _, scale in WINDOWS_PX if window_px >= least)
+
+
+WINDOWS_PX: tuple[tuple[int, tuple[int, int], float], ...] = (
+    (3400, (860, 780), 2.0),
+    (2500, (650, 585), 1.5),
+    (1800, (500, 450), 1.15),
+    (1600, (480, 400), 1.0),
+    (0, (380, 340), 1.0),
 )
-"""From this width of the window on: widths of the panels left and right."""
+"""From this width of the window on: widths of the panels left and right, and the size of words."""

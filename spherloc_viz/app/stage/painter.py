@@ -1,6 +1,7 @@
 """Draws a picture's primitives into one client's canvas, changing what is there rather than drawing anew."""
 
 from collections.abc import Callable, Hashable, Iterable
+from dataclasses import replace
 from functools import cache, partial
 from typing import Any, Literal
 
@@ -8,8 +9,10 @@ import numpy as np
 import viser
 import viser.transforms as vtf
 
+from spherloc_viz import style
 from spherloc_viz.app.stage.appearance import light_bytes, surface_bytes, textured_glb
 from spherloc_viz.app.stage.picking import inside, nearest, viewer_of
+from spherloc_viz.layers.frame import one_color
 from spherloc_viz.layers.primitives import Balls, Label, Mesh, Points, SceneItem, Segments, Textured
 
 OnPick = Callable[[tuple[int, ...], bool], None]
@@ -21,6 +24,8 @@ MOST_ROUND = 400
 """Above this many, dots get fewer faces."""
 MOST_BATCHED = 3000
 """Above this many, dots become a point cloud, which costs less."""
+LARGEST_DOT = 0.007
+"""Radius of a dot by its distance, as seen from within a camera."""
 LABEL_SCALE = 0.9
 """Size of words, by viser's own."""
 
@@ -29,16 +34,27 @@ class Painter:
     """The canvas of one client. What is picked there is found here, by the ray of the click: so lines, dots of a
     point cloud and balls within balls can be picked too, and a small dot within some pixels."""
 
-    def __init__(self, client: viser.ClientHandle | viser.ViserServer, on_pick: OnPick | None = None) -> None:
-        """``on_pick`` is called on viser's threads, and a click on nothing picks (). None is for a page that cannot
+    def __init__(
+        self,
+        client: viser.ClientHandle | viser.ViserServer,
+        on_pick: OnPick | None = None,
+        label_scale: float = LABEL_SCALE,
+    ) -> None:
+        """``label_scale`` is the size of words, by viser's own.
+
+        ``on_pick`` is called on viser's threads, and a click on nothing picks (). None is for a page that cannot
         answer: a still one, which is drawn on a server."""
-        self._client = client
+        self._client, self._label_scale = client, label_scale
         self._drawn: dict[str, tuple[Any, tuple, SceneItem]] = {}
         self._textured: dict[str, tuple[Hashable, bytes | None]] = {}
         self._shown: tuple[SceneItem, ...] = ()
         self._names: frozenset[str] = frozenset()
         self.hidden: frozenset[str] = frozenset()
         """Nodes that are left out of what is shown."""
+        self.eye: np.ndarray | None = None
+        """Where the viewer stands who is in a camera."""
+        self.dark = True
+        """Whether that is what is behind everything."""
         self.clicked_x = 0.5
         """Where the canvas was clicked last: share of its width."""
         self._backdrop: tuple[bytes, Any] | None = None
@@ -54,6 +70,8 @@ class Painter:
         names, shown = set(), []
         with self._client.atomic():
             for item in items:
+                if item.layer == "ground" and isinstance(item, Segments) and not self.dark:
+                    item = replace(item, colors=one_color(style.GROUND_ON_LIGHT, len(item.points)))
                 if item.layer in layers:
                     shown.append(item)
                 if isinstance(item, Textured) and (item.layer not in layers or self._glb(item) is None):
@@ -72,6 +90,22 @@ class Painter:
             self.hidden = names
             with self._client.atomic():
                 self._follow()
+
+    def see_from(self, eye: np.ndarray | None) -> None:
+        """No dot is larger than ``LARGEST_DOT`` for a viewer who stands in a camera, at ``eye`` (3,): dots would hide
+        the photograph. None is for anywhere else."""
+        if (eye is None) != (self.eye is None):
+            self.eye = eye
+            with self._client.atomic():
+                for handle, _, item in self._drawn.values():
+                    if isinstance(item, Points) and len(item.positions) <= MOST_BATCHED:
+                        handle.batched_scales = np.float32(self._dot_radii_m(item))
+
+    def _dot_radii_m(self, item: Points) -> np.ndarray:
+        radii_m = np.full(len(item.positions), item.radius_m)
+        if self.eye is None:
+            return radii_m
+        return np.minimum(radii_m, LARGEST_DOT * np.linalg.norm(item.positions - self.eye, axis=1))
 
     def _follow(self) -> None:
         """Have nodes visible that are to be seen."""
@@ -100,9 +134,13 @@ class Painter:
     def _put(self, item: SceneItem, look: tuple) -> None:
         handle, known, last = self._drawn.get(item.name, (None, None, None))
         if handle is None or known != look:
-            handle = _add(self._client.scene, item, self._glb(item) if isinstance(item, Textured) else None)
+            glb = self._glb(item) if isinstance(item, Textured) else None
+            handle = _add(self._client.scene, item, glb, self._label_scale)
         elif not _same(item, last):
-            for name, value in _changing(item).items():
+            changing = _changing(item)
+            if isinstance(item, Points) and "batched_scales" in changing:
+                changing["batched_scales"] = np.float32(self._dot_radii_m(item))
+            for name, value in changing.items():
                 setattr(handle, name, value)
         self._drawn[item.name] = (handle, look, item)
 
@@ -234,7 +272,7 @@ def _unit_ball(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(mesh.vertices), np.asarray(mesh.faces)
 
 
-def _add(scene: viser.SceneApi, item: SceneItem, glb: bytes | None) -> Any:
+def _add(scene: viser.SceneApi, item: SceneItem, glb: bytes | None, label_scale: float) -> Any:
     name, props = f"/{item.name}", _changing(item)
     match item:
         case Points() if "points" in props:
@@ -261,7 +299,7 @@ def _add(scene: viser.SceneApi, item: SceneItem, glb: bytes | None) -> Any:
         case Label():
             mode = "screen" if item.height_m is None else "scene"
             return scene.add_label(
-                name, font_size_mode=mode, font_screen_scale=LABEL_SCALE, anchor="center-center", **props
+                name, font_size_mode=mode, font_screen_scale=label_scale, anchor="center-center", **props
             )
 
 

@@ -68,6 +68,7 @@ def _replay(still: Still) -> str:
             camera.position, camera.look_at = tuple(still.position), tuple(still.target)
             server.gui.configure_theme(dark_mode=still.dark, show_logo=False, show_share_button=False)
             painter = Painter(server)
+            painter.dark = still.dark
             painter.draw(still.items, layers)
             painter.draw_backdrop(still.backdrop, still.aligned_from_map, True)
             return server.get_scene_serializer().as_html(dark_mode=still.dark)

@@ -7,6 +7,7 @@ import viser
 
 from spherloc.geometry import yaw_rotation
 from spherloc.types import FloatArray
+from spherloc_viz.app.stage.walls import Walls
 from spherloc_viz.layers.frame import RING_ROOM, SPHERE_ROOM, ball_boxes, circle, dense_points, sphere_box
 from spherloc_viz.layers.primitives import Balls, Mesh, Picture, Points, SceneItem, Segments, Textured
 
@@ -31,6 +32,8 @@ DIRECTIONS = {
     "Balls": (0.35, -0.45, -0.8),
 }
 """From the subject to the viewer; y points down."""
+STEEP = (0.3, -2.0, -0.6)
+"""Over walls."""
 INSIDE = "From the camera"
 NAMES = (*DIRECTIONS, INSIDE)
 """All views."""
@@ -76,12 +79,18 @@ def look(client: viser.ClientHandle, view: View) -> None:
         camera.look_at = view.target
 
 
-def follow(picture: Picture, aspect: float) -> View:
-    """The view that shows what the step is about, on a canvas of that width over height."""
+def follow(picture: Picture, aspect: float, walls: Walls | None = None) -> View:
+    """The view that shows what the step is about, on a canvas of that width over height, between ``walls``."""
     focus = picture.focus
     route = [item.positions for item in picture.scene if isinstance(item, Points) and item.layer == "trajectory"]
     subject = np.vstack([focus.points, *route]) if focus.view == "Overview" else focus.points
-    return _clear(focus.view, picture, subject, subject if focus.clear is None else focus.clear, aspect)
+    return _clear(focus.view, picture, subject, subject if focus.clear is None else focus.clear, aspect, walls)
+
+
+def around(places: FloatArray, aspect: float) -> View:
+    """An overview of places (K, 3), with room around them."""
+    room_m = 0.2 * float(np.max(np.ptp(places, axis=0))) + 1.0
+    return _fit(np.vstack([places - room_m, places + room_m]), np.array(DIRECTIONS["Overview"]), aspect)
 
 
 def shows(view: View, subject: FloatArray, aspect: float) -> bool:
@@ -117,29 +126,49 @@ def before_the_eyes(picture: Picture, position: FloatArray) -> frozenset[str]:
     return frozenset(names)
 
 
+def inside(picture: Picture, position: FloatArray) -> bool:
+    """Whether a viewer at that position (3,) stands in the estimated camera or in the sphere's centre."""
+    items = {item.name: item for item in picture.scene}
+    surface, camera = items.get("sphere/surface"), items.get("cameras/estimate")
+    if not isinstance(surface, Mesh):
+        return False
+    centre = _centre(surface)
+    close = CLOSE * float(np.max(surface.vertices[:, 0] - centre[0]))
+    apart = [float(np.linalg.norm(centre - position))]
+    if isinstance(camera, Segments) and len(camera.points):
+        apart.append(_apart(camera, position))
+    return min(apart) < close
+
+
 def _apart(camera: Segments, position: FloatArray) -> float:
     """From a camera's centre, where its first line begins."""
     return float(np.linalg.norm(camera.points[0, 0] - position))
 
 
-def find(name: str, picture: Picture, aspect: float) -> View:
+def find(name: str, picture: Picture, aspect: float, walls: Walls | None = None) -> View:
     """The view of that name, fitted to a picture and to a canvas of that width over height.
 
-    Close views are turned about the vertical until few map points stand in their way.
+    Close views are turned about the vertical until little of the ``walls`` and few map points stand in their way.
     """
     if name == INSIDE:
         return _inside(picture)
     subject = _subject(name, picture)
-    return _clear(name, picture, subject, subject, aspect)
+    return _clear(name, picture, subject, subject, aspect, walls)
 
 
-def _clear(name: str, picture: Picture, subject: FloatArray, clear: FloatArray, aspect: float) -> View:
-    """A view of a subject (K, 3) from the side of a named view, turned so that few map points hide ``clear`` (L, 3)."""
+def _clear(
+    name: str, picture: Picture, subject: FloatArray, clear: FloatArray, aspect: float, walls: Walls | None
+) -> View:
+    """A view of a subject (K, 3) from the side of a named view, turned so that little hides ``clear`` (L, 3)."""
     if name not in ("Sphere", "Balls"):
         return _fit(subject, np.array(DIRECTIONS[name]), aspect)
-    directions = [yaw_rotation(turn) @ np.array(DIRECTIONS[name]) for turn in TURNS_RAD]
+    sides = [DIRECTIONS[name]] if walls is None else [DIRECTIONS[name], STEEP]
+    directions = [yaw_rotation(turn) @ np.array(side) for side in sides for turn in TURNS_RAD]
     points = next(item for item in picture.scene if isinstance(item, Points) and item.name == "map/points")
     hidden = [_in_the_way(_fit(clear, one, aspect), points.positions) + 0.5 * k for k, one in enumerate(directions)]
+    if walls is not None:
+        blocked = [walls.blocked(_fit(subject, one, aspect).position, subject) for one in directions]
+        hidden = [cost + len(points.positions) * share for cost, share in zip(hidden, blocked, strict=True)]
     return _fit(subject, directions[int(np.argmin(hidden))], aspect)
 
 

@@ -11,6 +11,7 @@ from aiohttp import web
 from spherloc_viz.app.web.access import NO_TOKEN, Access, Role, refused
 from spherloc_viz.app.web.downloads import DOWNLOADS, Downloads
 from spherloc_viz.app.web.guard import SAFE, refusal
+from spherloc_viz.app.web.learn import is_learning, learn_answer
 from spherloc_viz.app.web.page import Page, load_page
 from spherloc_viz.app.web.viewer import NOT_RECORDED, PAGE, ViewerRoom
 from spherloc_viz.app.web.viser_internals import KEY_HEADER, ROLE_HEADER
@@ -30,11 +31,14 @@ PARAMETERS = frozenset(f"initialCamera{part}" for part in ("Position", "LookAt",
     "hideViserLogo",
 }
 """What a link may ask of viser's page. Others are dropped: they make it play another server's file."""
+LESSONS_NOT_FOR_AUDIENCE = (
+    "Lessons are the presenter's to open: the link for an audience shows what the presenter shows."
+)
 NOT_FOR_AUDIENCE = "Recordings are the presenter's to open: the link for an audience shows what the presenter shows."
 
 
 class FrontDoor:
-    """Serves one page, one websocket, the viewer of recordings and exported files; everything else is refused."""
+    """Serves one page, one websocket, the lessons, the viewer of recordings and exported files, and nothing else."""
 
     def __init__(
         self,
@@ -102,6 +106,8 @@ class FrontDoor:
             if role is not Role.PRESENTER:
                 return refused(request, NOT_FOR_AUDIENCE)
             return self._downloads.answer(request)
+        if is_learning(request.path):
+            return learn_answer(request) if role is Role.PRESENTER else refused(request, LESSONS_NOT_FOR_AUDIENCE)
         if not request.query.keys() <= PARAMETERS:
             raise web.HTTPFound("/")
         if request.path != "/":

@@ -31,11 +31,11 @@
 
   function draw() {
     const { title, words } = told.moments[index], last = index === told.moments.length - 1;
-    const skip = element("button", "", last ? "Close" : "Skip"), next = element("button", "main", last ? "Begin" : "Next");
+    const skip = element("button", "", "Skip"), next = element("button", "main", last ? "Begin" : "Next");
     skip.addEventListener("click", end);
     next.addEventListener("click", () => (last ? end() : show(index + 1)));
     const row = element("div", "row", "");
-    row.append(element("span", "count", `${index + 1} of ${told.moments.length}`), skip, next);
+    row.append(element("span", "count", `${index + 1} of ${told.moments.length}`), ...(last ? [] : [skip]), next);
     const bar = element("div", "bar", "");
     bar.append(element("div", "", ""));
     card.replaceChildren(element("div", "title", title), element("div", "", words), row, bar);
@@ -50,7 +50,7 @@
 
   function begin() {
     const source = document.querySelector("[data-introduction]");
-    if (!source || card) return;
+    if (!source || card || !document.querySelector("canvas")) return;
     told = JSON.parse(source.dataset.introduction);
     card = element("div", "introduction", "");
     card.setAttribute("role", "dialog");
@@ -59,6 +59,7 @@
     document.body.append(card);
     paused = false;
     show(0);
+    place();
   }
 
   function end() {
@@ -71,7 +72,7 @@
   function place() {
     const box = document.querySelector("canvas")?.getBoundingClientRect();
     if (!box) return;
-    const width = Math.min(470, box.width - 24);
+    const width = Math.min(32.4 * parseFloat(getComputedStyle(card).fontSize), box.width - 24);
     Object.assign(card.style, { left: `${box.left + (box.width - width) / 2}px`, width: `${width}px` });
   }
 
@@ -100,8 +101,6 @@
     if (!(event.target instanceof Element) || !event.target.closest(".introduce")) return;
     card?.remove();
     card = null;
-    // The window that it stands in would lie over it.
-    document.querySelector("[class*=Modal-close]")?.click();
     begin();
   }, true);
 })();

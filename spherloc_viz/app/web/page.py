@@ -15,10 +15,22 @@ QUIET = (
 """viser loads a sorter for Gaussian splats that wants ``eval``. The policy denies it, nobody here draws splats,
 and the console stays clean for errors that matter."""
 STYLE = "touch.css"
-SCRIPTS = ("changes.js", "touch.js", "introduction.js", "captions.js", "link.js", "names.js")
-"""What numbers the changes of widgets (``app/web/changes.py``), reports presses (``app/web/touch.py``),
-shows the introduction and the captions of the projector view and of phones, keeps the address (``app/link.py``), and
-names for screen readers what viser does not."""
+SCRIPTS = (
+    "changes.js",
+    "touch.js",
+    "glossary.js",
+    "introduction.js",
+    "captions.js",
+    "opening.js",
+    "smooth.js",
+    "link.js",
+    "numbers.js",
+    "names.js",
+)
+"""What numbers the changes of widgets (``app/web/changes.py``), reports presses (``app/web/touch.py``), shows the
+glossary, the introduction, the captions of the projector view and of phones, and how far the opening of a scene is,
+moves the viewer smoothly, keeps the address (``app/link.py``), mends what is typed into number boxes, and names for
+screen readers what viser does not."""
 
 
 THIS_MACHINE = "http://localhost:* http://127.0.0.1:* https://localhost:* https://127.0.0.1:*"
@@ -53,7 +65,8 @@ def content_policy(html: str, framed: bool = False) -> str:
     - Scripts: the page's own inline loader by its hash, and what that loader inserts; so neither text from a
       scene file nor viser's "run this JavaScript" message can execute anything.
     - Connections: this server only; a link with ``?websocket=`` or ``?playbackPath=`` cannot point elsewhere.
-    - No frames, but of this machine if ``framed``: another site cannot lay this page under its own buttons.
+    - No frames but those of this server's lessons, and of this machine if ``framed``: another site cannot lay this page
+      under its own buttons.
     """
     scripts = re.findall(r"<script\b[^>]*>(.*?)</script>", html, flags=re.DOTALL)
     hashes = [base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in scripts]
@@ -69,6 +82,6 @@ def content_policy(html: str, framed: bool = False) -> str:
         "connect-src": "'self' data: blob:",
         "base-uri": "'none'",
         "form-action": "'none'",
-        "frame-ancestors": THIS_MACHINE if framed else "'none'",
+        "frame-ancestors": f"'self' {THIS_MACHINE}" if framed else "'self'",
     }
     return "; ".join(f"{name} {value}" for name, value in rules.items())

@@ -1,0 +1,54 @@
+"""Whether a map's mesh stands between the viewer and what is to be seen: walls, roofs, trees."""
+
+from functools import lru_cache
+from io import BytesIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spherloc.types import FloatArray
+
+CELLS = 160
+"""Cells of the grid along the mesh's longest side."""
+SAMPLES = 400_000
+"""Places on the surface that fill cells."""
+STEPS = 64
+"""Looks along each line of sight."""
+TARGETS = 24
+"""Lines of sight, at most."""
+NEAR, FAR = 0.08, 0.97
+"""Of each line, from the viewer, that is looked at, as shares: the mesh may touch what is to be seen."""
+
+
+class Walls:
+    """Cells of a grid, in the aligned map frame, that hold some of a mesh's surface."""
+
+    def __init__(self, glb: bytes, aligned_from_map: FloatArray) -> None:
+        """``glb`` is a binary glTF in the map frame, ``aligned_from_map`` (3, 3) a rotation."""
+        self._turn = aligned_from_map
+        self._low, self._cell_m, self._filled = _grid(glb)
+
+    def blocked(self, position: FloatArray, targets: FloatArray) -> float:
+        """Share of the targets (K, 3) that cannot be seen from a position (3,)."""
+        targets = targets[:: max(1, len(targets) // TARGETS)]
+        along = np.linspace(NEAR, FAR, STEPS)[:, None, None]
+        places = (position + along * (targets - position)) @ self._turn  # back into the map frame
+        cells = np.floor((places - self._low) / self._cell_m).astype(np.int64)
+        within = np.all((cells >= 0) & (cells < self._filled.shape), axis=-1)
+        x, y, z = np.moveaxis(np.where(within[..., None], cells, 0), -1, 0)
+        return float(np.mean(np.any(within & self._filled[x, y, z], axis=0)))
+
+
+@lru_cache(maxsize=2)
+def _grid(glb: bytes) -> tuple[FloatArray, float, NDArray[np.bool_]]:
+    """Lower corner (3,) and side of the cells, and which of them hold some of the surface."""
+    import trimesh  # takes a second
+
+    mesh = trimesh.load_mesh(BytesIO(glb), file_type="glb")
+    low, high = np.asarray(mesh.bounds, dtype=np.float64)
+    cell_m = float(np.max(high - low)) / CELLS
+    filled = np.zeros(np.floor((high - low) / cell_m).astype(np.int64) + 1, np.bool_)
+    places, _ = trimesh.sample.sample_surface(mesh, SAMPLES, seed=0)
+    x, y, z = np.floor((np.asarray(places) - low) / cell_m).astype(np.int64).T
+    filled[x, y, z] = True
+    return low, cell_m, filled
