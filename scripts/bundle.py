@@ -5,7 +5,11 @@ from pathlib import Path
 from setuptools.command.build_py import build_py
 
 ROOT = Path(__file__).resolve().parents[1]
-BUNDLED = {"scenes/*.toml": "spherloc/datasets/scenes", "recordings/gallery.toml": "spherloc_viz/gallery"}
+BUNDLED = {
+    "scenes/*.toml": "spherloc/datasets/scenes",
+    "scenes/*.npz": "spherloc/datasets/scenes",
+    "recordings/gallery.toml": "spherloc_viz/gallery",
+}
 """Files of the checkout, and the folder of a package where an installation looks for them."""
 
 

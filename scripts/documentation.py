@@ -89,7 +89,8 @@ def house() -> str:
             package, _, name = room.partition(".")
             x, top = LEFT + column * (ROOM_W + GAP), y + GAP + row * (ROW + GAP)
             drawing.box(x, top, ROOM_W, ROW, CORE if package == "spherloc" else SCREEN)
-            label = f"{name}/" if name and (ROOT / package / name).is_dir() else name or f"{package} itself"
+            is_package = bool(name) and (ROOT / package / name / "__init__.py").exists()
+            label = f"{name}/" if is_package else name or f"{package} itself"
             drawing.text(x + ROOM_W / 2, top + 20, label, size=13, anchor="middle")
         y += rows * (ROW + GAP) + 2 * GAP
         if number:

@@ -25,6 +25,7 @@ MAY_PRESS = {
     "step",
     "move",
     "projector",
+    "reveal",
     "views",
     "yaw-zoom",
     "graph-cell",

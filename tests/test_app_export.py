@@ -22,7 +22,7 @@ from spherloc_viz.app.panels.export_panel import CANVAS, ExportPanel, Shown, cod
 from spherloc_viz.app.stage.still_page import Still, still_html
 from spherloc_viz.app.web.viser_internals import start_viser, stop_viser
 from spherloc_viz.layers import paint, steps
-from spherloc_viz.recording.content.reader import read_recording
+from spherloc_viz.recording.content.data import read_recording
 from tests.connected_page import ConnectedPage
 from tests.waiting import until
 

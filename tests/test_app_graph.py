@@ -16,8 +16,8 @@ from spherloc.trace import ConsensusStage, Trace, TranslationStage
 from spherloc_viz import style
 from spherloc_viz.app.plots.graph_view import MOST_EDGES, cell_nodes, edges_of, graph_html, matrix_png
 from spherloc_viz.layers import graph_begins, paint, steps
-from spherloc_viz.layers.balls import MOST_NODES, ball_nodes
 from spherloc_viz.layers.primitives import Graph
+from spherloc_viz.layers.translation import MOST_NODES, ball_nodes
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +31,7 @@ def exact() -> Trace:
 
 
 def graphs(trace: Trace) -> dict[str, Graph]:
-    found = {stop.key: paint(trace, index).graph for index, stop in enumerate(steps(trace))}
+    found = {heading.key: paint(trace, index).graph for index, heading in enumerate(steps(trace))}
     return {key: graph for key, graph in found.items() if graph is not None}
 
 

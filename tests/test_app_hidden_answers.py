@@ -17,6 +17,7 @@ TELLING = re.compile(
     r"|decided|best pose",
     re.IGNORECASE,
 )
+TRUE = {"off the truth", "rotation error", "position error", "precision", "recall"}
 OTHERS = frozenset({"comparison/mc-exact", "comparison/ransac-2p"})
 """Cameras of other estimators."""
 VIEWS = "views:Charts,Compare,Graph,Images,Matches,Recordings,Residuals,Yaw"
@@ -69,5 +70,14 @@ def test_no_tab_tells_hidden_answers(office: Office) -> None:
     until(lambda: "Match 3" in session._display.card._html.content)
     assert told(visitor) == []
 
+    visitor.touch("reveal:everything")
+    visitor.touch("reveal:outcome")
+    until(lambda: len(told(visitor)) > 3)
+    assert not TRUE.intersection(word.lower() for word in told(visitor)), "what came out says nothing of the truth"
+    visitor.touch("reveal:truth")
+    until(lambda: TRUE.intersection(word.lower() for word in told(visitor)))
+    visitor.set(controls.display._hide, False)
+    visitor.set(controls.display._hide, True)
+    until(lambda: told(visitor) == [])
     visitor.set(controls.display._hide, False)
     until(lambda: len(told(visitor)) > 10)

@@ -208,10 +208,10 @@ def test_images_that_have_gone_are_said(server: viser.ViserServer, page: Page, i
     gone = replace(images, problem=replace(images.problem, image=Path(f"/nowhere/{EVIL}.png")))
     view = panel(server, page)
     view.draw(gone, outcome(gone), (), np.arange(60))
-    assert "cannot be read any more" in view._drawing.content and "<img" not in view._drawing.content
+    assert "it is still being drawn, or it is gone" in view._drawing.content and "<img" not in view._drawing.content
     lost = replace(images, problem=replace(images.problem, reference_images=(Path("a.png"), Path("b.png"))))
     view.draw(lost, outcome(lost), (), np.arange(60))
-    assert "b.png cannot be read any more" in view._drawing.content
+    assert "b.png cannot be read" in view._drawing.content
 
 
 def test_real_photographs_fit_their_budget(aria: Path, scene_of: SceneOf) -> None:

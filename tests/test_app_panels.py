@@ -29,7 +29,7 @@ from spherloc_viz.app.text import diagnosis_html, status_html, step_html, table_
 from spherloc_viz.app.web.viser_internals import start_viser, stop_viser
 from spherloc_viz.app.workers import LatestWorker
 from spherloc_viz.layers import paint, steps
-from spherloc_viz.layers.primitives import Balls, Points, Step, Stop, Table
+from spherloc_viz.layers.primitives import Balls, Points, Step, StepHeading, Table
 from spherloc_viz.options import option_fields
 from tests.waiting import LIMIT_S, until
 
@@ -88,7 +88,7 @@ def test_every_text_is_escaped() -> None:
 )
 def test_a_step_is_kept_over_runs_where_it_can(key: str, found: str) -> None:
     keys = ["problem", "bearings", "sample-1", "sample-2", "sample-3", "outcome"]
-    timeline = [Stop(name, name) for name in keys]
+    timeline = [StepHeading(name, name) for name in keys]
     assert keys[find_step(timeline, key)] == found
 
 

@@ -22,7 +22,7 @@ from spherloc_viz.app.review.export import Exporter
 from spherloc_viz.app.review.run_library import RunLibrary
 from spherloc_viz.app.run_request import Run, RunRequest
 from spherloc_viz.gallery import gallery_cases
-from spherloc_viz.recording.content.reader import read_recording
+from spherloc_viz.recording.content.data import read_recording
 from spherloc_viz.recording.reviews import Review, read_review
 from spherloc_viz.recording.run_row import RunRow
 from tests.reviewing_pages import Office, recorded_twice

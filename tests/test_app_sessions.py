@@ -8,17 +8,20 @@ from typing import Any
 import numpy as np
 import pytest
 
+from spherloc.datasets import bundled_scenes, load_scene
+from spherloc.datasets.map_scene import MapScene
 from spherloc.datasets.variation import Variation
 from spherloc.diagnosis import Cause, Diagnosis
 from spherloc.errors import RecordingError
 from spherloc.estimators import estimate
+from spherloc.geometry import align_to_down, camera_centre
 from spherloc.trace import Trace
 from spherloc_viz.app import session as session_module
 from spherloc_viz.app.catalog import Catalog
-from spherloc_viz.app.left_panels import HIDDEN
 from spherloc_viz.app.server import Sessions
 from spherloc_viz.app.services import Services
 from spherloc_viz.app.session import Session
+from spherloc_viz.app.text import HIDDEN
 from spherloc_viz.app.web.touch import Touch
 from spherloc_viz.app.web.viser_internals import start_viser, stop_viser
 from spherloc_viz.recording.origin import Origin
@@ -166,11 +169,23 @@ def test_while_another_scene_opens_nothing_stands_under_its_name(house: House) -
     _, session = house.visit()
     story = session._display.panels
     shown = story._summary.content
+    street = load_scene(bundled_scenes()["street_fisheye"])
+    assert isinstance(street, MapScene)
+    session._display.open_map("<elsewhere>", street, None)
     story.begin_opening("<elsewhere>")
+    story.tell_opening("1 of 2", 0.5)
     until(lambda: "Opening &lt;elsewhere&gt;" in story._summary.content)
     assert "opacity:.35" in story._outcome.content and shown not in story._summary.content
-    story.end_opening()
-    until(lambda: story._summary.content == shown and "opacity:.35" not in story._outcome.content)
+    assert "Opening &lt;elsewhere&gt;" in story._card.content and "1 of 2" in story._card.content
+    drawn, look = session._display.canvas._painter._drawn, session._client.camera
+    until(lambda: "map/references" in drawn and not drawn["map/points"][0].visible)
+    ends = [camera_centre(street.references[k].cam_from_map) for k in (0, -1)]
+    middle = align_to_down(street.gravity_map) @ np.mean(ends, axis=0)
+    until(lambda: np.linalg.norm(look.look_at - middle) < np.linalg.norm(ends[1] - ends[0]))
+    session._display.end_opening()
+    until(lambda: drawn["map/points"][0].visible and not drawn["map/references"][0].visible)
+    until(lambda: story._card.content == "" and story._summary.content == shown)
+    assert "opacity:.35" not in story._outcome.content
 
 
 def test_stepping_solves_nothing(house: House, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -282,7 +297,7 @@ def test_a_full_disk_and_a_bug_are_sentences(house: House, monkeypatch: pytest.M
 def test_pages_share_nothing_and_leave_nothing(house: House) -> None:
     before = threads()
     (first, one), (second, two) = house.visit(), house.visit()
-    assert threads() == before + 10
+    assert threads() == before + 12
     kept = two._run.trace
     first.set(one._controls.scene._simulation._points, 33)
     until(lambda: one._run is not None and len(one._run.trace.problem) == 33)
@@ -294,7 +309,7 @@ def test_pages_share_nothing_and_leave_nothing(house: House) -> None:
         and two._display.panels.steps._choice.value.endswith("Outcome")
     )
     first.close()
-    until(lambda: threads() == before + 5 and len(house.sessions._open) == 1)
+    until(lambda: threads() == before + 6 and len(house.sessions._open) == 1)
     second.close()
     until(lambda: threads() == before and not house.sessions._open)
 
@@ -422,7 +437,7 @@ def test_answers_are_hidden_until_they_are_asked_for(house: House) -> None:
     until(lambda: "truth unknown" in told() and "The truth is unknown" in told())
     assert "off the truth" not in told() and "rotation error" not in told() and "cameras/truth" not in drawn()
     shown = house.services.presented.newest
-    assert shown is not None and shown.answers_hidden
+    assert shown is not None and shown.withheld == {"outcome", "truth"}
     # Before the last step not even the outcome is told.
     story.steps.go("bearings")
     until(lambda: HIDDEN in told())

@@ -50,11 +50,11 @@ from spherloc_viz import style
 from spherloc_viz.layers import paint, steps
 from spherloc_viz.layers.key_step import match_colors
 trace = estimate(load_scene(bundled_scenes()["mei_outliers_80"]).problem(), "guess")
-stops = steps(trace)
-(place,) = [number for number, stop in enumerate(stops) if stop.key == "guess-best"]
+headings = steps(trace)
+(place,) = [number for number, heading in enumerate(headings) if heading.key == "guess-best"]
 picture = paint(trace, place)
 pink = int((match_colors(picture) == style.SAMPLE).all(axis=1).sum())
-print(json.dumps([stops[place].stage, picture.step.caption, [chart.name for chart in picture.charts], pink]))
+print(json.dumps([headings[place].stage, picture.step.caption, [chart.name for chart in picture.charts], pink]))
 """
 
 

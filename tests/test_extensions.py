@@ -315,7 +315,7 @@ from spherloc_viz.app.web.touch import Touches
 from spherloc_viz.app.web.viser_internals import start_viser, stop_viser
 from spherloc_viz.layers import paint, steps
 from spherloc_viz.options import option_fields, usable_estimators
-from spherloc_viz.recording.content.reader import read_recording
+from spherloc_viz.recording.content.data import read_recording
 from spherloc_viz.recording.content.writer import write_recording
 
 _prepare(first_and_later()[0])

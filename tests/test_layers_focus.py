@@ -73,27 +73,27 @@ def is_on(seen: FloatArray) -> np.ndarray:
 
 @pytest.mark.parametrize("aspect", ASPECTS)
 def test_every_step_shows_what_it_is_about(trace: Trace, aspect: float) -> None:
-    for index, stop in enumerate(steps(trace)):
+    for index, heading in enumerate(steps(trace)):
         picture = paint(trace, index)
         view = views.follow(picture, aspect)
         framed = on_screen(view, picture.focus.points, aspect)
-        assert is_on(framed).all(), f"{stop.key}: its focus is on the screen"
-        assert np.ptp(framed, axis=0).max() >= 1.0, f"{stop.key}: its focus covers half of the screen"
+        assert is_on(framed).all(), f"{heading.key}: its focus is on the screen"
+        assert np.ptp(framed, axis=0).max() >= 1.0, f"{heading.key}: its focus covers half of the screen"
         assert views.shows(view, picture.focus.points, aspect)
-        items, share = about(stop.key)
+        items, share = about(heading.key)
         drawn = {item.name for item in picture.scene} & set(items)
-        assert drawn, stop.key
+        assert drawn, heading.key
         seen = np.vstack([on_screen(view, ends(picture, name), aspect) for name in sorted(drawn)])
         on = is_on(seen)
-        assert np.mean(on) >= (0.5 if "balls" in items[0] else 0.85), f"{stop.key}: {items} are on the screen"
-        assert np.ptp(seen[on], axis=0).max() / 2 >= share or "balls" in items[0], f"{stop.key}: {items} can be seen"
+        assert np.mean(on) >= (0.5 if "balls" in items[0] else 0.85), f"{heading.key}: {items} are on the screen"
+        assert np.ptp(seen[on], axis=0).max() / 2 >= share or "balls" in items[0], f"{heading.key}: {items} can be seen"
 
 
 @pytest.mark.parametrize("aspect", ASPECTS)
 def test_balls_are_large_enough_to_be_seen(aspect: float) -> None:
     """Also the first few, and whatever was looked at before."""
     trace = estimate(scene_problem("mei_outliers_80"), "mc")
-    for index, stop in enumerate(steps(trace)):
+    for index, heading in enumerate(steps(trace)):
         picture = paint(trace, index)
         balls = [item for item in picture.scene if isinstance(item, Balls)]
         if not balls:
@@ -103,20 +103,20 @@ def test_balls_are_large_enough_to_be_seen(aspect: float) -> None:
         depth = np.linalg.norm(shown.centers - view.position, axis=1)
         heights = shown.radii_m / depth / np.tan(view.field_of_view_rad / 2)
         seen = is_on(on_screen(view, shown.centers, aspect))
-        assert seen.any() and np.median(heights[seen]) >= BALL_SHARE, f"{stop.key}: {np.median(heights[seen]):.3f}"
-        if (size := re.fullmatch(r"balls-(\d+)", stop.key)) and int(size[1]) <= 3:
+        assert seen.any() and np.median(heights[seen]) >= BALL_SHARE, f"{heading.key}: {np.median(heights[seen]):.3f}"
+        if (size := re.fullmatch(r"balls-(\d+)", heading.key)) and int(size[1]) <= 3:
             assert seen.all() and len(seen) == int(size[1])
 
 
 def test_steps_about_one_thing_are_seen_from_one_side(trace: Trace) -> None:
     """So that what grows from step to step does not turn as well."""
     sides: dict[str, list[FloatArray]] = {}
-    for index, stop in enumerate(steps(trace)):
+    for index, heading in enumerate(steps(trace)):
         view = views.follow(paint(trace, index), ASPECTS[0])
         kind = next(
-            (kind for kind in ("yaw-arcs", "yaw-candidate", "balls-", "clique") if stop.key.startswith(kind)), None
+            (kind for kind in ("yaw-arcs", "yaw-candidate", "balls-", "clique") if heading.key.startswith(kind)), None
         )
-        if kind is not None and stop.key != "balls-pair":
+        if kind is not None and heading.key != "balls-pair":
             away = view.position - view.target
             sides.setdefault(kind, []).append(away / np.linalg.norm(away))
     for kind, found in sides.items():
@@ -127,15 +127,15 @@ def test_new_things_are_named_in_the_canvas_where_they_first_appear() -> None:
     trace = estimate(scene_problem("mei_outliers_80"), "mc")
     words = ("unit sphere", "yaw ring", "arc:", "ball:", "edge", "clique")
     named: dict[str, str] = {}
-    for index, stop in enumerate(steps(trace)):
+    for index, heading in enumerate(steps(trace)):
         picture = paint(trace, index)
         for label in (item for item in picture.scene if isinstance(item, Label)):
             for word in words:
                 if word in label.text:
-                    named.setdefault(word, stop.key)
+                    named.setdefault(word, heading.key)
             if label.name.endswith("/name"):
                 place = on_screen(views.follow(picture, ASPECTS[0]), label.position[None], ASPECTS[0])
-                assert is_on(place).all(), f"{stop.key}: {label.text}"
+                assert is_on(place).all(), f"{heading.key}: {label.text}"
     assert named == {
         "unit sphere": "bearings", "yaw ring": "unknowns", "arc:": "yaw-pair", "ball:": "balls-pair",
         "edge": "balls-3", "clique": "yaw-clique",

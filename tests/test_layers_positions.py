@@ -40,7 +40,7 @@ def test_boxes_hold_what_they_say(trace):
 def test_each_level_is_a_step(trace):
     stage = trace.stage(PositionStage)
     levels = np.unique(stage.level)
-    mine = [index for index, stop in enumerate(steps(trace)) if stop.stage == "Positions"]
+    mine = [index for index, heading in enumerate(steps(trace)) if heading.stage == "Positions"]
     assert 3 <= len(mine) == len(levels) <= 12
     for index, level in zip(mine, levels, strict=True):
         picture = paint(trace, index)

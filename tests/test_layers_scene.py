@@ -19,9 +19,10 @@ from spherloc.problem import Problem
 from spherloc.trace import RefinementStage, Trace
 from spherloc_viz import style
 from spherloc_viz.layers import paint, steps
+from spherloc_viz.layers.frame import angle_text, length_text
 from spherloc_viz.layers.primitives import Label, Mesh, Picture, Points, SceneItem, Segments, Textured
 from spherloc_viz.layers.query_image import DIM
-from spherloc_viz.layers.scale_bar import angle_text, length_text, round_length
+from spherloc_viz.layers.scene import round_length
 from spherloc_viz.layers.uncertainty import FACTORS, SIGMAS
 
 SceneOf = Callable[..., SyntheticScene]

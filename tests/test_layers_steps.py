@@ -15,12 +15,12 @@ from spherloc.problem import Problem
 from spherloc.solvers.two_point import two_point
 from spherloc.trace import ConsensusStage, RansacStage, RefinementStage, Stage, Trace, TranslationStage, YawStage
 from spherloc_viz import style
-from spherloc_viz.layers import paint, ring, steps, two_roots, yaw
-from spherloc_viz.layers.arcs import Arcs
-from spherloc_viz.layers.balls import BallSet
+from spherloc_viz.layers import paint, ring, steps, yaw
 from spherloc_viz.layers.frame import RunView
 from spherloc_viz.layers.primitives import Balls, Picture, Points, SceneItem, Segments
 from spherloc_viz.layers.ransac import MOST_IMPROVEMENTS
+from spherloc_viz.layers.translation import BallSet
+from spherloc_viz.layers.yaw import Arcs
 
 
 @pytest.fixture(scope="module")
@@ -77,13 +77,13 @@ def colored(picture: Picture, color: style.RGB) -> np.ndarray:
 @pytest.mark.parametrize("estimator", ["mc", "mc-exact", "ransac-2p", "auto"])
 def test_a_run_has_20_to_200_steps_in_stages(scene: str, estimator: str) -> None:
     trace = estimate(scene_problem(scene), estimator)
-    stops = steps(trace)
-    assert 20 <= len(stops) <= 200 and len({stop.key for stop in stops}) == len(stops)
-    stages = [stop.stage for stop in stops]
+    headings = steps(trace)
+    assert 20 <= len(headings) <= 200 and len({heading.key for heading in headings}) == len(headings)
+    stages = [heading.stage for heading in headings]
     assert stages[0] == "Matches" and stages[-1] == "Outcome"
     runs = [stage for k, stage in enumerate(stages) if k == 0 or stage != stages[k - 1]]
     assert len(runs) == len(set(runs)), "a stage is in one piece"
-    assert stops == steps(replace(trace)), "the same run has the same steps"
+    assert headings == steps(replace(trace)), "the same run has the same steps"
 
 
 def test_nothing_is_drawn_before_it_is_looked_at(mc: Trace, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -124,8 +124,8 @@ def test_two_matches_and_no_truth_can_be_told(estimator: str, known: bool) -> No
 
 
 def test_a_run_without_a_pose_ends_with_its_stages() -> None:
-    stops = steps(lost_run())
-    assert stops[-1].title == "No pose" and [stop.stage for stop in stops][:5] == ["Matches"] * 5
+    headings = steps(lost_run())
+    assert headings[-1].title == "No pose" and [heading.stage for heading in headings][:5] == ["Matches"] * 5
 
 
 # ---------------------------------------------------------------------------------------------- yaw
@@ -160,9 +160,9 @@ def test_a_candidate_yaw_lies_in_as_many_arcs_as_it_says(mc: Trace) -> None:
     stage = of(mc, YawStage)
     assert isinstance(stage, YawStage)
     everything, keys = np.arange(len(stage.lo_rad)), keys_like(mc, r"yaw-candidate-\d+")
-    stops = yaw.candidate_yaws(stage)
-    assert len(keys) == len(stops) >= 3 and (np.diff(stops) > 0).all()
-    for key, place in zip(keys, stops.tolist(), strict=True):
+    places = yaw.candidate_yaws(stage)
+    assert len(keys) == len(places) >= 3 and (np.diff(places) > 0).all()
+    for key, place in zip(keys, places.tolist(), strict=True):
         lo, hi = (np.radians(ring.degrees_of(place + part, 1440)) for part in (0, 1))
         inside = stage.lo_rad[(stage.lo_rad >= lo) & (stage.lo_rad < hi)]
         brute = covering(stage, everything, np.append(inside, lo)).max()
@@ -180,10 +180,10 @@ def test_a_candidate_yaw_lies_in_as_many_arcs_as_it_says(mc: Trace) -> None:
 def test_candidate_yaws_are_held_against_those_before(mc: Trace) -> None:
     stage = of(mc, YawStage)
     assert isinstance(stage, YawStage)
-    stops = yaw.candidate_yaws(stage)
+    places = yaw.candidate_yaws(stage)
     for k, key in enumerate(keys_like(mc, r"yaw-candidate-\d+")):
-        said, here = at(mc, key).step.caption, stage.overlap[stops[k]]
-        most = max(stage.overlap[stops[:k]], default=0)
+        said, here = at(mc, key).step.caption, stage.overlap[places[k]]
+        most = max(stage.overlap[places[:k]], default=0)
         assert ("beats the candidates before" in said) == bool(k and here > most)
         assert ("is in more" in said) == bool(here < most)
 
@@ -194,7 +194,7 @@ def test_roots_are_those_of_the_solver(mc: Trace, rng: np.random.Generator) -> N
     for first, second in rng.integers(0, len(mc.problem), (60, 2)):
         if first == second:
             continue
-        roots = two_roots.pair_roots(view, int(first), int(second))
+        roots = yaw.pair_roots(view, int(first), int(second))
         d, n = view.points[first] - view.points[second], np.cross(aligned.bearings[first], aligned.bearings[second])
         for root in roots.yaws_rad:
             assert abs(n @ yaw_rotation(root) @ d) < 1e-9 * np.linalg.norm(d)

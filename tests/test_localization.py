@@ -17,7 +17,7 @@ from spherloc.geometry import camera_centre
 from spherloc.localization import Localization, as_camera
 from spherloc.outcome import Outcome
 from spherloc.trace import RefinementStage
-from spherloc_viz.recording.content.reader import read_recording
+from spherloc_viz.recording.content.data import read_recording
 from spherloc_viz.recording.content.writer import write_recording
 
 README = Path(__file__).resolve().parents[1] / "README.md"

@@ -24,13 +24,12 @@ from spherloc.problem import Problem
 from spherloc.trace import Certificate, RefinementStage, Trace
 from spherloc_viz.layers import paint, steps
 from spherloc_viz.layers.key_step import key_step
-from spherloc_viz.layers.primitives import Balls, Label, Mesh, Points, Segments, Stop, Textured
+from spherloc_viz.layers.primitives import Balls, Label, Mesh, Points, Segments, StepHeading, Textured
 from spherloc_viz.recording.content import data
 from spherloc_viz.recording.content.components import LEVEL_OPACITY
+from spherloc_viz.recording.content.data import check_recording, read_recording
 from spherloc_viz.recording.content.drawing import WORDS
-from spherloc_viz.recording.content.properties import APPLICATION_ID, FORMAT_VERSION
-from spherloc_viz.recording.content.reader import check_recording, read_recording
-from spherloc_viz.recording.content.text import legible
+from spherloc_viz.recording.content.properties import APPLICATION_ID, FORMAT_VERSION, legible
 from spherloc_viz.recording.content.writer import recorded_steps, write_recording
 from spherloc_viz.recording.origin import machine
 from spherloc_viz.recording.rerun_program import rerun_command, rerun_environment
@@ -336,7 +335,9 @@ def test_what_a_stage_came_to_and_the_key_step_are_recorded() -> None:
         "yaw-candidate-2",
     ]
     keys += [name for k in range(1, 9) for name in (f"sample-{k}-pose", f"sample-{k}")] + ["outcome"]
-    kept = [keys[index] for index in recorded_steps([Stop(key, key) for key in keys], keys.index("yaw-arcs-100"))]
+    kept = [
+        keys[index] for index in recorded_steps([StepHeading(key, key) for key in keys], keys.index("yaw-arcs-100"))
+    ]
     samples = [f"sample-{k}" for k in range(1, 9)]
     assert kept == ["problem", "yaw-arcs-100", "yaw-arcs", *samples, "outcome"]
 

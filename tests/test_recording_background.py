@@ -17,7 +17,7 @@ from spherloc.errors import RecordingError
 from spherloc.estimators import estimate
 from spherloc.trace import Stage, Trace
 from spherloc_viz.recording.content import writer
-from spherloc_viz.recording.content.reader import read_recording
+from spherloc_viz.recording.content.data import read_recording
 from spherloc_viz.recording.content.writer import write_recording
 from spherloc_viz.recording.index.query import RunQuery
 from spherloc_viz.recording.origin import Origin

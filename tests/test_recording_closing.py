@@ -14,8 +14,7 @@ from pathlib import Path
 import pytest
 
 from spherloc.errors import RecordingError
-from spherloc_viz.recording.index.refresh import examine_side_by_side
-from spherloc_viz.recording.index.run_index import RunIndex
+from spherloc_viz.recording.index.run_index import RunIndex, examine_side_by_side
 from spherloc_viz.recording.sandbox import examiner as strangers
 from spherloc_viz.recording.sandbox.examiner import Examiner, ExaminerError
 from spherloc_viz.recording.storage.recorder import Recorder

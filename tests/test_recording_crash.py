@@ -18,15 +18,14 @@ from recording_samples import scene_problem
 
 from spherloc.estimators import estimate
 from spherloc.trace import Trace
-from spherloc_viz.recording.content.reader import read_recording, read_run_row
+from spherloc_viz.recording.content.data import read_recording, read_run_row
 from spherloc_viz.recording.content.writer import write_recording
 from spherloc_viz.recording.index.query import RunQuery
-from spherloc_viz.recording.replay.repeat import compare
+from spherloc_viz.recording.replay import compare
 from spherloc_viz.recording.reviews import write_review
 from spherloc_viz.recording.sandbox.examiner import Examiner, ExaminerError
 from spherloc_viz.recording.storage.recorder import Recorder
-from spherloc_viz.recording.storage.recovery import Recovered, recover
-from spherloc_viz.recording.storage.store import RecordingStore
+from spherloc_viz.recording.storage.store import RecordingStore, Recovered, recover
 from spherloc_viz.recording.storage.unfinished import STALE_AFTER_S, here, leftovers, unfinished
 from tests.needs import needs
 from tests.waiting import LIMIT_S, until

@@ -21,10 +21,9 @@ from spherloc.trace import RansacStage, Trace
 from spherloc_viz import style
 from spherloc_viz.layers import paint, steps
 from spherloc_viz.layers.key_step import key_step, step_pose
-from spherloc_viz.recording.content.data import MAX_SCENE_BYTES, NUMBERS, scene_text
-from spherloc_viz.recording.content.pictures import HEIGHT_PX, LONGEST_PX, MATCHES, WIDTH_PX, thumbnail
+from spherloc_viz.recording.content.components import HEIGHT_PX, LONGEST_PX, MATCHES, WIDTH_PX, thumbnail
+from spherloc_viz.recording.content.data import MAX_SCENE_BYTES, NUMBERS, read_recording, read_run_row, scene_text
 from spherloc_viz.recording.content.properties import FORMAT_VERSION, MOST_CHARACTERS, problem_key
-from spherloc_viz.recording.content.reader import read_recording, read_run_row
 from spherloc_viz.recording.content.writer import recorded_steps, write_recording
 from spherloc_viz.recording.origin import Origin
 from spherloc_viz.recording.reviews import write_review
@@ -162,12 +161,12 @@ def test_every_recorded_step_has_its_numbers(run: tuple[str, str], tmp_path: Pat
     truth = trace.problem.truth_cam_from_map
     assert truth is not None
     for index, numbers in rows.items():
-        stop, picture = steps(trace)[index], paint(trace, index)
+        heading, picture = steps(trace)[index], paint(trace, index)
         found = {name: value.as_py()[0] for name, value in numbers.items() if name in ("stage", "key", "agreeing")}
         colors = next(item for item in picture.scene if item.name == "map/points").colors  # type: ignore[union-attr]
         marked = sum(tuple(color) in (style.INLIER, style.CLIQUE) for color in colors.tolist())
-        assert found == {"stage": stop.stage, "key": stop.key, "agreeing": marked}
-        pose = step_pose(trace, stop.key)
+        assert found == {"stage": heading.stage, "key": heading.key, "agreeing": marked}
+        pose = step_pose(trace, heading.key)
         assert ("rotation_error_deg" in numbers) == ("translation_error_m" in numbers) == (pose is not None)
         if pose is not None:
             assert numbers["rotation_error_deg"].as_py() == [rotation_error_deg(truth, pose)]
@@ -180,14 +179,14 @@ def test_every_recorded_step_has_its_numbers(run: tuple[str, str], tmp_path: Pat
 @pytest.mark.parametrize("run", RUNS, ids=str)
 def test_a_step_has_a_pose_exactly_where_its_picture_has_an_estimate(run: tuple[str, str]) -> None:
     trace = estimate(scene_problem(run[0]), run[1], seed=3)
-    for index, stop in enumerate(steps(trace)):
+    for index, heading in enumerate(steps(trace)):
         drawn = next((item for item in paint(trace, index).scene if item.name == "cameras/estimate"), None)
-        pose = step_pose(trace, stop.key)
-        assert (pose is None) == (drawn is None), stop.key
+        pose = step_pose(trace, heading.key)
+        assert (pose is None) == (drawn is None), heading.key
         if pose is not None:
             aligned = trace.problem.aligned.align_pose(pose)
             apex = drawn.points[0, 0]  # type: ignore[union-attr]
-            assert np.allclose(apex, -aligned[:, :3].T @ aligned[:, 3], atol=1e-9), stop.key
+            assert np.allclose(apex, -aligned[:, :3].T @ aligned[:, 3], atol=1e-9), heading.key
 
 
 # ---------------------------------------------------------------------------------------------- the key step

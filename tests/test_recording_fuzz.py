@@ -14,7 +14,7 @@ from rerun.chunk import Chunk, LazyChunkStream
 
 from spherloc.errors import RecordingError
 from spherloc.estimators import estimate
-from spherloc_viz.recording.content.reader import read_recording
+from spherloc_viz.recording.content.data import read_recording
 from spherloc_viz.recording.content.writer import write_recording
 from spherloc_viz.recording.index.query import RunQuery
 from spherloc_viz.recording.index.run_index import RunIndex

@@ -37,7 +37,7 @@ from typing_extensions import TypeAliasType
 
 from spherloc.errors import RecordingError
 from spherloc.estimators import estimate
-from spherloc_viz.recording.content.reader import read_recording
+from spherloc_viz.recording.content.data import read_recording
 from spherloc_viz.recording.content.writer import write_recording
 from spherloc_viz.recording.reviews import Review, review_path, write_review
 from spherloc_viz.recording.run_row import RunRow

@@ -16,20 +16,22 @@ from spherloc.errors import InputError, RecordingError
 from spherloc.estimators import estimate, options_type
 from spherloc.trace import Certificate, Trace
 from spherloc_viz.batch import Records, run_scenes
-from spherloc_viz.recording.content.reader import RecordedRun, read_recording
+from spherloc_viz.recording import replay as repeating
+from spherloc_viz.recording.content.data import RecordedRun, read_recording
 from spherloc_viz.recording.content.writer import write_recording
 from spherloc_viz.recording.origin import Origin
-from spherloc_viz.recording.replay import repeat as repeating
-from spherloc_viz.recording.replay.repeat import (
+from spherloc_viz.recording.replay import (
     as_record,
     as_text,
     compare,
     different_fields,
+    load_recorded_scene,
+    missing_options,
     other_versions,
+    recorded_options,
     repeat,
     repeat_all,
 )
-from spherloc_viz.recording.replay.scene import load_recorded_scene, missing_options, recorded_options
 from spherloc_viz.share import as_command, as_python
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -14,8 +14,8 @@ from spherloc_viz.recording.index.query import RunQuery
 from spherloc_viz.recording.index.run_index import RunIndex
 from spherloc_viz.recording.reviews import review_path
 from spherloc_viz.recording.run_row import RunRow
-from spherloc_viz.recording.storage.retention import LOG_NAME, NEWEST_KEPT, prunable, prune
 from spherloc_viz.recording.storage.room import KEEP_BYTES, kept_bytes
+from spherloc_viz.recording.storage.store import LOG_NAME, NEWEST_KEPT, prunable, prune
 from tests.needs import needs
 
 SIZE = 1000

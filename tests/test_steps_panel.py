@@ -23,18 +23,18 @@ from spherloc_viz.app.controls.steps_panel import (
     stages_html,
 )
 from spherloc_viz.app.web.viser_internals import changes_of, start_viser, stop_viser
-from spherloc_viz.layers.primitives import Step, Stop
+from spherloc_viz.layers.primitives import Step, StepHeading
 
 TIMELINE = (
-    Stop("problem", "The matches", "Matches"),
-    Stop("bearings", "Bearings", "Matches"),
-    Stop("yaw-pair", "One pair", "Yaw"),
-    *(Stop(f"yaw-arcs-{k}", f"{k} arcs", "Yaw") for k in (10, 30, 100, 300)),
-    Stop("yaw-arcs", "All arcs", "Yaw"),
-    Stop("yaw-clique", "The yaw", "Yaw"),
-    Stop("outcome", "Outcome", "Outcome"),
+    StepHeading("problem", "The matches", "Matches"),
+    StepHeading("bearings", "Bearings", "Matches"),
+    StepHeading("yaw-pair", "One pair", "Yaw"),
+    *(StepHeading(f"yaw-arcs-{k}", f"{k} arcs", "Yaw") for k in (10, 30, 100, 300)),
+    StepHeading("yaw-arcs", "All arcs", "Yaw"),
+    StepHeading("yaw-clique", "The yaw", "Yaw"),
+    StepHeading("outcome", "Outcome", "Outcome"),
 )
-KEYS = [stop.key for stop in TIMELINE]
+KEYS = [heading.key for heading in TIMELINE]
 
 
 @pytest.fixture(scope="module")
@@ -63,12 +63,12 @@ class Panel:
     def _changed(self, event: object) -> None:
         self.asked += 1
 
-    def settle(self, steps: tuple[Stop, ...] = TIMELINE, asked: bool = True) -> str:
+    def settle(self, steps: tuple[StepHeading, ...] = TIMELINE, asked: bool = True) -> str:
         """Key of the step at hand, after it was shown."""
         index, self.pause = self.panel.advance(steps, asked)
-        stop = steps[index]
-        self.panel.show(Step(stop.key, stop.title, "One. Two.", ""), self.pause is not None, ())
-        return stop.key
+        heading = steps[index]
+        self.panel.show(Step(heading.key, heading.title, "One. Two.", ""), self.pause is not None, ())
+        return heading.key
 
     def page(self, callback: Any, widget: Any, value: Any) -> str:
         """The page sets a widget."""
@@ -183,7 +183,7 @@ def test_the_pace_is_chosen_and_a_press_pauses(panel: Panel) -> None:
 def test_another_run_stays_at_the_same_kind_of_step(panel: Panel) -> None:
     panel.panel.go("yaw-arcs-300")
     assert panel.settle() == "yaw-arcs-300"
-    fewer = tuple(stop for stop in TIMELINE if stop.key not in ("yaw-arcs-300", "yaw-arcs-100"))
+    fewer = tuple(heading for heading in TIMELINE if heading.key not in ("yaw-arcs-300", "yaw-arcs-100"))
     assert panel.settle(fewer) == "yaw-arcs-30"
     assert panel.panel._slider.max == len(fewer) and panel.panel._slider.value == 5
 
@@ -203,6 +203,6 @@ def test_the_nearest_of_a_kind(key: str, found: str) -> None:
 
 
 def test_stage_bars_are_escaped_and_filled(panel: Panel) -> None:
-    evil = (Stop('"><img src=x>', "t", "<b>"), Stop("b", "t", "<b>"), Stop("c", "t", "End"))
+    evil = (StepHeading('"><img src=x>', "t", "<b>"), StepHeading("b", "t", "<b>"), StepHeading("c", "t", "End"))
     html = stages_html(evil, 0)
     assert "<img" not in html and "<b>" not in html and "width:50.0%" in html and "width:0.0%" in html

@@ -15,10 +15,10 @@ from spherloc.experiments.sweep import Entrant, Job, planned, run_sweep
 from spherloc.experiments.sweep_workers import solve
 from spherloc.trace import Trace
 from spherloc_viz.batch import Records
-from spherloc_viz.recording.content.reader import read_recording
+from spherloc_viz.recording.content.data import read_recording
 from spherloc_viz.recording.index.query import RunQuery
 from spherloc_viz.recording.index.run_index import RunIndex
-from spherloc_viz.recording.replay.reopen import reopen
+from spherloc_viz.recording.replay import reopen
 from spherloc_viz.recording.storage import store as storage
 from spherloc_viz.recording.storage.store import RecordingStore, SweepStore, sweep_run_id
 from spherloc_viz.sweep import Recorded, sweep

@@ -6,7 +6,7 @@ from spherloc.experiments.results import FAILED, LOCALIZED, QueryResult
 from spherloc.geometry import align_to_down, pose
 from spherloc_viz import style
 from spherloc_viz.layers.primitives import Points, Segments
-from spherloc_viz.layers.trajectory import trajectory_items
+from spherloc_viz.layers.scene import trajectory_items
 
 LIMIT_M = 1.0
 

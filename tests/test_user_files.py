@@ -13,17 +13,17 @@ import pytest
 from spherloc import files
 from spherloc.cameras.calibration import load_camera
 from spherloc.cameras.equirectangular import Equirectangular
-from spherloc.cameras.kalibr import read_kalibr_chain
-from spherloc.datasets import load_scene
+from spherloc.cameras.tool_files import read_kalibr_chain
+from spherloc.datasets import load_scene, newer_college
 from spherloc.datasets.correspondences import read_csv
+from spherloc.datasets.image_folder import read_depth
 from spherloc.datasets.matterport360 import read_dpt, read_pose
-from spherloc.datasets.posed_images import read_depth
 from spherloc.datasets.scene_file import scene_kinds
 from spherloc.errors import MOST_UNBROKEN, CalibrationError, InputError, SpherlocError, legible, show
 from spherloc.experiments.configuration import read_configuration
 from spherloc.experiments.results import read_results
-from spherloc.formats import kitti360_files, newer_college_files
-from spherloc.formats.colmap_model import read_model
+from spherloc.formats import kitti360_files
+from spherloc.formats.colmap_files import read_model
 from spherloc.formats.hloc_files import open_hdf5, read_pairs, read_queries
 from spherloc.formats.hloc_files import read_results as read_hloc_results
 from spherloc.formats.kapture_files import read_kapture
@@ -61,7 +61,7 @@ READERS: dict[str, Callable[[Path], Any]] = {
     "poses of a drive": kitti360_files.read_poses,
     "times of a drive": kitti360_files.read_timestamps,
     "mask of the car": _mask,
-    "point cloud": newer_college_files.read_cloud,
+    "point cloud": newer_college.read_cloud,
     "pairs": read_pairs,
     "queries": read_queries,
     "poses of hloc": read_hloc_results,
@@ -71,7 +71,7 @@ READERS: dict[str, Callable[[Path], Any]] = {
     "results": read_results,
     "COLMAP model": read_model,
     "kapture": lambda path: read_kapture(path, "scene.toml"),
-    "images by time": newer_college_files.images_in,
+    "images by time": newer_college.images_in,
 }
 
 

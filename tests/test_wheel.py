@@ -14,7 +14,8 @@ from tests.waiting import LIMIT_S
 ROOT = Path(__file__).resolve().parents[1]
 SOURCES = ("pyproject.toml", "MANIFEST.in", "README.md", "LICENSE", "scripts", "scenes", "recordings/gallery.toml")
 PACKAGES = ("spherloc", "spherloc_viz")
-SCENES = sorted(path.name for path in (ROOT / "scenes").glob("*.toml"))
+FILES = sorted(path.name for path in (ROOT / "scenes").iterdir())
+SCENES = [name for name in FILES if name.endswith(".toml")]
 
 BUILD = "import sys; from setuptools import build_meta; build_meta.{hook}(sys.argv[1])"
 LOOK = """
@@ -66,7 +67,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_wheel_has_scenes_gallery_and_every_file_of_the_packages(wheel: Path):
     with zipfile.ZipFile(wheel) as packed:
         names = set(packed.namelist())
-    wanted = {f"spherloc/datasets/scenes/{name}" for name in SCENES} | {"spherloc_viz/gallery/gallery.toml"}
+    wanted = {f"spherloc/datasets/scenes/{name}" for name in FILES} | {"spherloc_viz/gallery/gallery.toml"}
     for package in PACKAGES:
         files = (path.relative_to(ROOT) for path in (ROOT / package).rglob("*") if path.is_file())
         wanted |= {path.as_posix() for path in files if "__pycache__" not in path.parts}

@@ -141,7 +141,11 @@ class Playground:
         if self._spare:
             self.page = self._spare.pop()
         else:
-            context = browser.new_context(viewport=SIZE, device_scale_factor=SHARPNESS)  # pyright: ignore[reportArgumentType]
+            context = browser.new_context(
+                viewport=SIZE,  # pyright: ignore[reportArgumentType]
+                device_scale_factor=SHARPNESS,
+                reduced_motion="reduce",
+            )
             context.add_init_script(ASIDE)
             if not new:
                 context.add_init_script(KNOWN)

@@ -56,8 +56,6 @@ def test_every_state_of_the_page_is_accessible(browser: Browser, address: str) -
     tab.tab("Residuals")
     assert faults(tab) == []
     tab.tab("Play")
-    tab.tab("Yaw")
-    assert faults(tab) == []
     tab.tick("Hide answers", True)
     tab.slide("Timeline", "Home")
     expect(tab.step).to_have_value(re.compile("^1/"))

@@ -39,6 +39,7 @@ def test_the_projector_view_says_each_step_in_large_type(browser: Browser, addre
 def test_a_phone_shows_the_canvas_and_what_the_step_says(browser: Browser, address: str) -> None:
     tab = Playground(browser, address)
     tab.page.set_viewport_size({"width": 390, "height": 844})
+    tab.until(lambda: "step=outcome" in tab.page.evaluate("location.hash"), "the address holds the step")
     tab.page.reload()
     captions = tab.page.get_by_role("region", name="What the step says")
     expect(captions).to_contain_text("Outcome")

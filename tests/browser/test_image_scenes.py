@@ -8,7 +8,7 @@ import pytest
 from playground import SELECTED, Playground, served
 from playwright.sync_api import Browser, expect
 
-from spherloc_viz.recording.content.reader import read_recording
+from spherloc_viz.recording.content.data import read_recording
 
 PANORAMA = """
 model = "equirectangular"
@@ -63,19 +63,32 @@ def images_tab(browser: Browser, images_address: tuple[str, Path]) -> Iterator[P
     tab.close()
 
 
-READ_PHOTO = """async ([place]) => {
+READ_PHOTO = """async place => {
     const image = new Image();
     image.src = getComputedStyle(place).backgroundImage.slice(5, -2);
-    await image.decode();
+    try {
+        await image.decode();
+    } catch {
+        return null;
+    }
     return [image.naturalWidth, image.naturalHeight];
 }"""
 
 
 def photo(tab: Playground, name: str) -> list[int]:
-    """Width and height of the photograph behind the query's or the reference's matches."""
+    """Width and height of the photograph behind the query's or the reference's matches.
+
+    There is none for a moment while the page puts another one there.
+    """
     place = tab.page.locator(f".match-{name}")
-    tab.until(lambda: place.evaluate("place => getComputedStyle(place).backgroundImage") != "none", "a photograph")
-    return tab.page.evaluate(READ_PHOTO, [place.element_handle()])
+    size: list[int] = []
+
+    def read() -> bool:
+        size[:] = place.evaluate(READ_PHOTO) or []
+        return bool(size)
+
+    tab.until(read, f"a photograph of the {name}")
+    return size
 
 
 def ringed(tab: Playground) -> list[str]:

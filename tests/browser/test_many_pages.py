@@ -20,7 +20,7 @@ from spherloc_viz.layers.outcome import outcome_table
 from tests.waiting import LIMIT_S, until
 
 PAGES = 8
-BURSTS = 4
+BURSTS = 2
 ESTIMATORS = {f"{name} ({ABOUT[name]})": name for name in ("mc", "mc-exact", "ransac-2p")}
 COMPARED = ("estimator", "outcome", "rotation error", "position error", "inliers")
 OWN_THREADS = 4
@@ -137,7 +137,7 @@ async def greetings(address: str) -> None:
 def test_pages_do_not_disturb_each_other_and_leave_nothing(server: tuple[str, int], scene: Path) -> None:
     address, process = server
     # The first ones also fill the caches that all pages share.
-    for _ in range(3):
+    for _ in range(2):
         asyncio.run(greetings(address))
     memory = memory_mib(process)
     changes, threads = asyncio.run(visits(address, process, Catalog(scene)))

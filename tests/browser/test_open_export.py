@@ -16,7 +16,7 @@ from spherloc.estimators import estimate
 from spherloc.problem import Problem
 from spherloc_viz.app.catalog import Catalog, SceneRequest
 from spherloc_viz.layers.outcome import outcome_table
-from spherloc_viz.recording.content.reader import read_recording
+from spherloc_viz.recording.content.data import read_recording
 from tests.waiting import LIMIT_S, until
 
 CAMERA = '[camera]\nmodel = "equirectangular"\nwidth = 2048\nheight = 1024\n'
@@ -165,7 +165,7 @@ def test_an_upload_is_solved_and_stays_with_its_page(
     expect(other.page.get_by_text(re.compile(r"mine\.csv"))).to_have_count(0)
 
     tab.page.close()
-    until(lambda: not scratch_files(folders) and not any(folders.joinpath("scratch").glob("spherloc-*")))
+    until(lambda: not any(folders.joinpath("scratch").glob("spherloc-*")))
 
 
 def downloaded(tab: Playground, button: str, folder: Path) -> Path:

@@ -12,7 +12,7 @@ import pytest
 from playground import PATIENCE_MS, SCENE, Playground, served
 from playwright.sync_api import Browser, Locator, expect
 
-from spherloc_viz.recording.content.reader import read_run_row
+from spherloc_viz.recording.content.data import read_run_row
 from spherloc_viz.recording.reviews import read_review
 
 pytestmark = pytest.mark.browser

@@ -15,7 +15,7 @@ from spherloc.datasets import load_scene
 from spherloc.estimators import estimate
 from spherloc_viz import style
 from spherloc_viz.app.web.viewer import viewer_link
-from spherloc_viz.recording.content.reader import read_run_row
+from spherloc_viz.recording.content.data import read_run_row
 from spherloc_viz.recording.content.writer import write_recording
 from spherloc_viz.recording.reviews import write_review
 from spherloc_viz.recording.run_row import RunRow

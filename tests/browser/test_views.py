@@ -9,7 +9,7 @@ import pytest
 from playground import PAINT, Playground
 from playwright.sync_api import expect
 
-from spherloc_viz.recording.content.reader import read_recording
+from spherloc_viz.recording.content.data import read_recording
 
 pytestmark = pytest.mark.browser
 
@@ -151,6 +151,12 @@ def test_balls_are_on_the_screen_at_every_step_that_one_walks_to(tab: Playground
     tab.expect_quiet(address)
 
 
+COUNT_MOVES = """() => {
+    window.smoothMoves = 0;
+    window.__viserMutable.cameraControl.addEventListener("transitionstart", () => window.smoothMoves++);
+}"""
+
+
 def test_layers_and_views(tab: Playground, address: str) -> None:
     tab.settle()
     seen = [tab.viewer]
@@ -160,6 +166,19 @@ def test_layers_and_views(tab: Playground, address: str) -> None:
         tab.settle()
         seen.append(tab.viewer)
     assert len(set(seen[1:])) == 5
+    # Only who asked for less motion sees it jump.
+    tab.page.evaluate(COUNT_MOVES)
+    tab.page.emulate_media(reduced_motion="no-preference")
+    for name, place in (("Above", seen[1]), ("Overview", seen[-1])):
+        tab.press(name)
+        tab.until(lambda place=place: np.allclose(tab.viewer, place, atol=0.1), f"the viewer moves to {name}")
+    smooth = tab.page.evaluate("window.smoothMoves")
+    assert smooth >= 2
+    tab.page.emulate_media(reduced_motion="reduce")
+    tab.press("Sphere")
+    tab.until(lambda: np.allclose(tab.viewer, seen[2], atol=0.1), "the viewer jumps")
+    assert tab.page.evaluate("window.smoothMoves") == smooth
+    tab.press("Overview")
     centre = tab.centre("/cameras/estimate")
     away = [sum((a - b) ** 2 for a, b in zip(place[:3], centre, strict=True)) ** 0.5 for place in seen]
     assert away[4] < 0.05 < min(away[1:4] + away[5:])
@@ -281,6 +300,10 @@ def test_mistakes_are_sentences_and_the_page_stays_usable(tab: Playground, addre
     tab.choose("Estimator", EXACT)
     expect(tab.value("estimator")).to_have_text("mc-exact")
     mistake("Effort", "0", "Option effort is 0", "2", lambda: None)
+    # A slider's box keeps within its ends, and is never left without a number.
+    for typed, taken in (("500", "99"), ("ten", "99"), ("", "99"), ("40", "40")):
+        tab.type("Outliers (%)", typed)
+        expect(tab.entry("Outliers (%)")).to_have_value(taken)
     tab.expect_quiet(address)
 
 

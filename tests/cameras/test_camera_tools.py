@@ -15,9 +15,9 @@ from spherloc.cameras.calibration import load_camera
 from spherloc.cameras.double_sphere import DoubleSphere
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.cameras.eucm import Eucm
-from spherloc.cameras.kalibr import read_kalibr_chain
 from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.cameras.mei import Mei
+from spherloc.cameras.tool_files import read_kalibr_chain
 from spherloc.errors import CalibrationError
 
 pytestmark = pytest.mark.filterwarnings("error")

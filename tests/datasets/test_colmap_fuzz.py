@@ -12,9 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from spherloc.errors import InputError
-from spherloc.formats.colmap_check import check_binary
-from spherloc.formats.colmap_model import read_model
-from spherloc.formats.colmap_text import check_text
+from spherloc.formats.colmap_files import read_model
 
 NASTY = (
     b"\xff" * 8,
@@ -69,38 +67,20 @@ def check_sentence(error, folder):
 
 @given(case=damaged())
 @settings(max_examples=250, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_walks_say_what_is_wrong_and_where(case, tmp_path):
-    text, files = case
-    folder = write(tmp_path, files)
-    try:
-        walked = (check_text if text else check_binary)(folder)
-    except InputError as error:
-        check_sentence(error, folder)
-        assert re.search(r"\.(bin, up to byte \d+|txt, line \d+|bin|txt): ", str(error))
-    else:
-        assert np.isfinite(walked.points.xyz).all()
-        for image in walked.images.values():
-            assert np.isfinite(image.load()["pixel"]).all()
-    finally:
-        for path in folder.iterdir():
-            path.unlink()
-
-
-@given(case=damaged())
-@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_models_are_read_or_refused_whole(case, tmp_path):
-    """Through pycolmap in its own process: an abort there would be a sentence here."""
+def test_models_are_read_whole_or_refused_with_the_place(case, tmp_path):
     _, files = case
     folder = write(tmp_path, files)
     try:
         model = read_model(folder)
     except InputError as error:
         check_sentence(error, folder)
+        assert re.search(r"\.(bin, up to byte \d+|txt, line \d+|bin|txt): ", str(error))
     else:
+        assert np.isfinite(model.points.xyz).all()
         for image in model.images.values():
             rotation = image.cam_from_map[:, :3]
             np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
-            assert np.isfinite(image.cam_from_map).all()
+            assert np.isfinite(image.cam_from_map).all() and np.isfinite(image.pixels).all()
     finally:
         for path in folder.iterdir():
             path.unlink()
@@ -114,7 +94,7 @@ def test_every_cut_of_a_binary_file_is_noticed(name, tmp_path):
     for length in range(0, len(files[name]), max(1, len(files[name]) // 60)):
         (folder / name).write_bytes(files[name][:length])
         with pytest.raises(InputError, match=rf"{name}, up to byte \d+: "):
-            check_binary(folder)
+            read_model(folder)
 
 
 @pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin"])
@@ -123,7 +103,7 @@ def test_huge_counts_and_wrong_endianness(name, count, tmp_path):
     files = intact("rigs", False)
     folder = write(tmp_path, files | {name: struct.pack("<Q", count) + files[name][8:]})
     with pytest.raises(InputError, match=rf"{name}, up to byte 8: {count} .* more than the file can hold"):
-        check_binary(folder)
+        read_model(folder)
 
 
 def changed(sample, what):
@@ -143,6 +123,7 @@ def changed(sample, what):
         "NaN point": lambda: replace(sample, points=[(100, np.array([0, np.nan, 0]), *point[2:]), *rest]),
         "far point": lambda: replace(sample, points=[(100, np.array([0, -1e200, 0]), *point[2:]), *rest]),
         "track of no image": lambda: replace(sample, points=[(*point[:3], [(999, 0)]), *rest]),
+        "point twice": lambda: replace(sample, points=[*sample.points, point]),
         "track of no keypoint": lambda: replace(sample, points=[(*point[:3], [(10, 999)]), *rest]),
     }[what]()
 
@@ -159,6 +140,7 @@ SENTENCES = {
     "NaN point": r"points3D.*(record 1 of the points has no possible position|'nan' is not a finite number)",
     "far point": r"points3D.*(record 1 of the points has no possible position|is impossible)",
     "track of no image": r"points3D.*keypoint 0 of image 999, which does not exist",
+    "point twice": r"points3D.*point 100 is there twice",
     "track of no keypoint": r"points3D.*keypoint 999 of image 10, which does not exist",
 }
 
@@ -169,9 +151,7 @@ def test_what_is_wrong_is_said(what, files_of, rng, tmp_path):
     place = r"(\.bin, up to byte \d+: |\.txt, line \d+: )"
     words = SENTENCES[what].replace(".*", place + ".*", 1)
     with pytest.raises(InputError, match=words):
-        (check_binary if files_of is binary_files else check_text)(
-            write(tmp_path, files_of(changed(sample_model(rng), what)))
-        )
+        read_model(write(tmp_path, files_of(changed(sample_model(rng), what))))
 
 
 @pytest.mark.parametrize("files_of", [binary_files, text_files], ids=["binary", "text"])
@@ -196,4 +176,4 @@ def test_what_is_wrong_is_said(what, files_of, rng, tmp_path):
 def test_rigs_and_frames_must_agree(change, words, files_of, rng, tmp_path):
     sample = change(with_rigs(sample_model(rng), rng))
     with pytest.raises(InputError, match=words):
-        (check_binary if files_of is binary_files else check_text)(write(tmp_path, files_of(sample)))
+        read_model(write(tmp_path, files_of(sample)))

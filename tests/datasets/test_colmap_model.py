@@ -18,7 +18,7 @@ from colmap_samples import (
 from scipy.spatial.transform import Rotation
 
 from spherloc.errors import CalibrationError, InputError
-from spherloc.formats.colmap_model import _read_by_pycolmap, read_model
+from spherloc.formats.colmap_files import read_model
 from tests.needs import real_data
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -195,15 +195,6 @@ def test_two_images_of_one_name_are_refused(rng, tmp_path):
     doubled = replace(sample, images=[(*image[:3], "same.jpg", image[4]) for image in sample.images])
     with pytest.raises(InputError, match=r"two images have the name 'same.jpg'"):
         read_model(write(tmp_path / "model", binary_files(doubled)))
-
-
-def test_what_pycolmap_refuses_is_a_sentence(rng, tmp_path):
-    """Its process is not ours: it is also asked with a count that no walk would let pass."""
-    files = binary_files(sample_model(rng))
-    files["images.bin"] = files["images.bin"][:90].replace(b".jpg\0", b".jpg\0" + b"\xff" * 7 + b"\0")
-    folder = write(tmp_path / "model", files)
-    with pytest.raises(InputError, match="COLMAP's own reader refuses the model"):
-        _read_by_pycolmap(folder, "bin")
 
 
 def test_names_with_spaces_and_letters_of_all_kinds(rng, tmp_path):

@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from spherloc.datasets import load_scene
-from spherloc.datasets.posed_images import read_depth
+from spherloc.datasets.image_folder import read_depth
 from spherloc.errors import InputError
 from spherloc.estimators.base import estimate
 from spherloc.geometry import so3_exp, transform

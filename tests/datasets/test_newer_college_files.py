@@ -10,9 +10,8 @@ from newer_college_tree import NS, QUERY_WALK, between
 from scipy.spatial.transform import Rotation
 
 from spherloc.datasets.imu import ImuSamples, down_at, read_imu
-from spherloc.datasets.similarity import Similarity, align, similarity_of
+from spherloc.datasets.newer_college import Similarity, align, images_in, read_cloud, similarity_of, timestamp_of
 from spherloc.errors import InputError
-from spherloc.formats.newer_college_files import images_in, read_cloud, timestamp_of
 from spherloc.geometry import camera_centre, pose, transform
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")

@@ -1,6 +1,7 @@
 """Rendered scenes: loaded at once, drawn when needed, localized by real matching."""
 
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,8 @@ from spherloc.datasets import bundled_scenes, load_scene, rendered
 from spherloc.datasets.map_scene import MapScene
 from spherloc.errors import InputError
 from spherloc.estimators import estimate
+from spherloc.frontend.pipeline import ImageMatcher
+from spherloc.frontend.stored_matches import StoredMatches
 from spherloc.geometry import camera_centre, rotation_angle
 
 BUNDLED = {
@@ -86,6 +89,39 @@ def test_bundled_scenes_load_without_drawing(name, cache):
     assert all(view.cam_from_map is not None for view in (*scene.queries, *scene.references))
     assert all(view.lift is not None for view in scene.references)
     assert scene.gravity_bound_rad > 0
+
+
+def test_bundled_scenes_bring_their_matches(cache):
+    """For all queries, at once; and for one of them they are those that are found."""
+    for path in BUNDLED.values():
+        scene = load_scene(path)
+        assert isinstance(scene, MapScene)
+        problems = [scene.stored_problem(view.name) for view in scene.queries]
+        assert all(problem is not None and len(problem) > 50 for problem in problems), path
+    assert not cache.exists(), "nothing was drawn"
+    scene = load_scene(BUNDLED["campus_panorama"])
+    assert isinstance(scene, MapScene) and isinstance(scene.matcher, StoredMatches)
+    query, seeker = scene.queries[0], scene.matcher.matcher
+    stored = scene.matcher(query)
+    assert len(drawn(cache)) == 1, "only the query is drawn"
+    assert isinstance(seeker, ImageMatcher)
+    found = replace(seeker, references=stored.references[:1])(query)
+    first = stored.reference_index == 0
+    again = "python -m scripts.scene_matches makes them anew"
+    np.testing.assert_allclose(stored.pixels[first], found.pixels, atol=1e-3, err_msg=again)
+    np.testing.assert_allclose(stored.points[first], found.points, atol=1e-3, err_msg=again)
+
+
+@pytest.mark.parametrize("change", ["another camera", "cut off", "no file"])
+def test_matches_of_another_scene_are_not_taken(change, tmp_path):
+    query = load_scene(BUNDLED["campus_panorama"]).queries[0]
+    stored = load_scene(BUNDLED["campus_panorama"]).matcher
+    path = tmp_path / "scene.npz"
+    path.write_bytes(stored.path.read_bytes()[: 5000 if change == "cut off" else None])
+    if change == "no file":
+        path.unlink()
+    key = "other" if change == "another camera" else stored.key
+    assert StoredMatches(lambda view: "sought", stored.references, path, key)(query) == "sought"
 
 
 def test_a_query_is_localized(cache, tmp_path):

@@ -50,7 +50,12 @@ def test_warm_up_leaves_nothing_to_compile() -> None:
 
 def test_a_cold_start_is_announced_and_a_warm_one_is_not(tmp_path: Path) -> None:
     """Seconds of silence look like a hang; a sentence at every start would be noise."""
-    script = "from spherloc.warm_up import warm_up; warm_up(lambda sentence: print(sentence, flush=True))"
+    # Ctrl-C ends it, even if whoever started these tests ignores it.
+    script = """
+import signal
+from spherloc.warm_up import warm_up
+signal.signal(signal.SIGINT, signal.default_int_handler)
+warm_up(lambda sentence: print(sentence, flush=True))"""
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
     cold = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True, env=environment)
     assert cold.stdout is not None

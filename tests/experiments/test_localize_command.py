@@ -25,7 +25,7 @@ from spherloc.warm_up import warm_up
 from spherloc_viz.batch import Records
 from spherloc_viz.localize import localize_sequence
 from spherloc_viz.plots import trajectory_png
-from spherloc_viz.recording.content.reader import read_recording
+from spherloc_viz.recording.content.data import read_recording
 from spherloc_viz.scene_list import all_scenes, one_kind
 from tests.cli_process import spherloc_here
 from tests.waiting import LIMIT_S

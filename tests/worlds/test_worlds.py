@@ -13,7 +13,7 @@ from spherloc.errors import InputError
 from spherloc.geometry import camera_centre
 from spherloc.worlds import WORLDS, Conditions, build_world, image_path, render, stored_range
 from spherloc.worlds.conditions import CLEAR
-from spherloc.worlds.glb import MOST_BYTES
+from spherloc.worlds.mesh import MOST_BYTES
 from spherloc.worlds.render import draw
 
 KINDS = sorted(WORLDS)
