@@ -1,10 +1,12 @@
-"""Standing in the camera: at its place, along its axis, with a wide view."""
+"""Where a view stands: in the camera, along its axis; elsewhere, where no wall hides its subject."""
 
 from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
+from trimesh.exchange.gltf import export_glb
 
 from spherloc.datasets.synthetic import SyntheticScene
 from spherloc.estimators import estimate
@@ -12,8 +14,9 @@ from spherloc.geometry import camera_centre, so3_exp
 from spherloc.problem import Problem
 from spherloc.trace import Trace
 from spherloc_viz.app.stage import views
+from spherloc_viz.app.stage.walls import Walls
 from spherloc_viz.layers import paint, steps
-from spherloc_viz.layers.primitives import Mesh, Segments
+from spherloc_viz.layers.primitives import Label, Mesh, Segments
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +57,8 @@ def test_who_stands_in_a_camera_does_not_see_its_lines(trace: Trace) -> None:
     around = {item.name for item in picture.scene if item.layer == "uncertainty"}
     assert around and views.before_the_eyes(picture, outside) == frozenset()
     hidden = views.before_the_eyes(picture, inside)
-    assert hidden == around | {"cameras/estimate", "cameras/truth", "cameras/error"}
+    words = {item.name for item in picture.scene if isinstance(item, Label)}
+    assert hidden == around | words | {"cameras/estimate", "cameras/truth", "cameras/error"}
     truth = next(item for item in picture.scene if item.name == "cameras/truth")
     assert isinstance(truth, Segments)
     far = replace(truth, points=truth.points + 1e3)
@@ -67,3 +71,36 @@ def test_every_view_is_found_at_every_step(trace: Trace) -> None:
         for name in views.NAMES:
             view = views.find(name, paint(trace, index), 1.5)
             assert np.isfinite(view.position).all() and np.linalg.norm(view.target - view.position) > 1e-6
+
+
+def box(low: tuple[float, float, float], high: tuple[float, float, float]) -> trimesh.Trimesh:
+    return trimesh.creation.box(bounds=np.array([low, high]))
+
+
+def glb(*boxes: trimesh.Trimesh) -> bytes:
+    return bytes(export_glb(trimesh.Scene(boxes)))
+
+
+def test_a_wall_hides_what_is_behind_it_and_nothing_before_it() -> None:
+    walls = Walls(glb(box((-5, -2, 1.0), (5, 2, 1.1)), box((-5, 2, -5), (5, 2.1, 5))), np.eye(3))
+    targets = np.array([[x, 0.0, 3.0] for x in (-1.0, 0.0, 1.0)])
+    assert walls.blocked(np.array([0.0, 0.0, -3.0]), targets) == 1.0
+    assert walls.blocked(np.array([0.0, 0.0, 4.5]), targets) == 0.0
+    assert walls.blocked(np.array([0.0, -9.0, 3.0]), targets) == 0.0, "over the wall, beyond all of the mesh"
+    turn = so3_exp(np.array([0.0, np.pi, 0.0]))
+    turned = Walls(glb(box((-5, -2, 1.0), (5, 2, 1.1))), turn)
+    assert turned.blocked(np.array([0.0, 0.0, -3.0]), -targets) == 0.0, "the wall is in the map's frame"
+    assert turned.blocked(np.array([0.0, 0.0, 3.0]), -targets) == 1.0
+
+
+def test_a_step_is_seen_from_a_side_where_no_wall_hides_it(trace: Trace) -> None:
+    index = next(k for k in range(1, len(steps(trace))) if paint(trace, k).focus.view == "Sphere")
+    picture = paint(trace, index)
+    subject, free = picture.focus.points, views.follow(picture, 1.5)
+    middle, toward = subject.mean(axis=0), free.position - subject.mean(axis=0)
+    wall = middle + 0.6 * toward
+    size_m = 0.4 * float(np.linalg.norm(toward))
+    mesh = glb(box(tuple(wall - size_m * np.array([1, 1, 0.1])), tuple(wall + size_m * np.array([1, 1, 0.1]))))
+    walls = Walls(mesh, np.eye(3))
+    assert walls.blocked(free.position, subject) > 0.5
+    assert walls.blocked(views.follow(picture, 1.5, walls).position, subject) < 0.2

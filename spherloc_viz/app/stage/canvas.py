@@ -16,7 +16,7 @@ from spherloc_viz.app.run_request import Run
 from spherloc_viz.app.stage import views
 from spherloc_viz.app.stage.painter import LABEL_SCALE, Painter
 from spherloc_viz.app.stage.true_camera import TrueCamera
-from spherloc_viz.app.stage.walls import Walls
+from spherloc_viz.app.stage.walls import MOST_BYTES, Walls
 from spherloc_viz.layers.frame import one_color
 from spherloc_viz.layers.primitives import Picture, Points
 
@@ -83,7 +83,11 @@ class Canvas:
             self._painter.draw(picture.scene, layers)
             self._painter.draw_backdrop(mesh, problem.aligned.map_turn, "mesh" in layers)
             self._picture = picture
-            walls = Walls(mesh, problem.aligned.map_turn) if mesh is not None and "mesh" in layers else None
+            solid = mesh if "mesh" in layers else None
+            if solid is not None and len(solid) <= MOST_BYTES:
+                walls = Walls(solid, problem.aligned.map_turn)
+            else:
+                walls = None
             walls_came, self._walls = walls is not None and self._walls is None, walls
         if movable or self._movable:
             truth = problem.truth_cam_from_map

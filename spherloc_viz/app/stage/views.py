@@ -9,7 +9,7 @@ from spherloc.geometry import yaw_rotation
 from spherloc.types import FloatArray
 from spherloc_viz.app.stage.walls import Walls
 from spherloc_viz.layers.frame import RING_ROOM, SPHERE_ROOM, ball_boxes, circle, dense_points, sphere_box
-from spherloc_viz.layers.primitives import Balls, Mesh, Picture, Points, SceneItem, Segments, Textured
+from spherloc_viz.layers.primitives import Balls, Label, Mesh, Picture, Points, SceneItem, Segments, Textured
 
 FIELD_OF_VIEW_RAD = np.radians(45.0)
 WIDE_RAD = np.radians(85.0)
@@ -112,32 +112,40 @@ def projected(view: View, positions: FloatArray) -> FloatArray:
 
 
 def before_the_eyes(picture: Picture, position: FloatArray) -> frozenset[str]:
-    """Names of the cameras in which a viewer at that position (3,) stands, and of what is drawn around them: their
-    lines would cross all that is seen."""
-    items = {item.name: item for item in picture.scene}
-    surface = items.get("sphere/surface")
-    if not isinstance(surface, Mesh):
+    """Names of the cameras in which a viewer at that position (3,) stands, of what is drawn around them, whose lines
+    would cross all that is seen, and of the words in the scene, which would cover the photograph."""
+    surface = _surface(picture)
+    if surface is None:
         return frozenset()
-    close = CLOSE * float(np.max(surface.vertices[:, 0] - _centre(surface)[0]))
+    close_m = CLOSE * _radius_m(surface)
     cameras = [item for item in picture.scene if isinstance(item, Segments) and item.layer == "cameras"]
-    names = {item.name for item in cameras if len(item.points) and _apart(item, position) < close}
+    names = {item.name for item in cameras if len(item.points) and _apart(item, position) < close_m}
     if "cameras/estimate" in names:
         names |= {item.name for item in picture.scene if item.layer == "uncertainty"} | {"cameras/error"}
+    if inside(picture, position):
+        names |= {item.name for item in picture.scene if isinstance(item, Label)}
     return frozenset(names)
 
 
 def inside(picture: Picture, position: FloatArray) -> bool:
     """Whether a viewer at that position (3,) stands in the estimated camera or in the sphere's centre."""
-    items = {item.name: item for item in picture.scene}
-    surface, camera = items.get("sphere/surface"), items.get("cameras/estimate")
-    if not isinstance(surface, Mesh):
+    surface = _surface(picture)
+    if surface is None:
         return False
-    centre = _centre(surface)
-    close = CLOSE * float(np.max(surface.vertices[:, 0] - centre[0]))
-    apart = [float(np.linalg.norm(centre - position))]
+    camera = next((item for item in picture.scene if item.name == "cameras/estimate"), None)
+    apart_m = [float(np.linalg.norm(_centre(surface) - position))]
     if isinstance(camera, Segments) and len(camera.points):
-        apart.append(_apart(camera, position))
-    return min(apart) < close
+        apart_m.append(_apart(camera, position))
+    return min(apart_m) < CLOSE * _radius_m(surface)
+
+
+def _surface(picture: Picture) -> Mesh | None:
+    """That of the sphere, if the picture has one."""
+    return next((item for item in picture.scene if isinstance(item, Mesh) and item.name == "sphere/surface"), None)
+
+
+def _radius_m(surface: Mesh) -> float:
+    return float(np.max(surface.vertices[:, 0] - _centre(surface)[0]))
 
 
 def _apart(camera: Segments, position: FloatArray) -> float:
@@ -175,15 +183,14 @@ def _clear(
 def _inside(picture: Picture) -> View:
     """From where the camera, or, while its position is unknown, the sphere is, along its axis."""
     items = {item.name: item for item in picture.scene}
-    surface = items["sphere/surface"]
-    assert isinstance(surface, Mesh)
+    surface = _surface(picture)
+    assert surface is not None
     centre = _centre(surface)
     axis = _axis(items)
     camera = items.get("cameras/estimate")
     if isinstance(camera, Segments):
         centre = camera.points[0, 0]
-    radius = float(np.max(surface.vertices[:, 0] - _centre(surface)[0]))
-    return View(centre, centre + TURNING * radius * axis, WIDE_RAD)
+    return View(centre, centre + TURNING * _radius_m(surface) * axis, WIDE_RAD)
 
 
 def _axis(items: dict[str, SceneItem]) -> FloatArray:

@@ -18,6 +18,8 @@ TARGETS = 24
 """Lines of sight, at most."""
 NEAR, FAR = 0.08, 0.97
 """Of each line, from the viewer, that is looked at, as shares: the mesh may touch what is to be seen."""
+MOST_BYTES = 60 << 20
+"""A larger mesh takes too long to read: views are then chosen without it."""
 
 
 class Walls:
@@ -48,7 +50,7 @@ def _grid(glb: bytes) -> tuple[FloatArray, float, NDArray[np.bool_]]:
     low, high = np.asarray(mesh.bounds, dtype=np.float64)
     cell_m = float(np.max(high - low)) / CELLS
     filled = np.zeros(np.floor((high - low) / cell_m).astype(np.int64) + 1, np.bool_)
-    places, _ = trimesh.sample.sample_surface(mesh, SAMPLES, seed=0)
-    x, y, z = np.floor((np.asarray(places) - low) / cell_m).astype(np.int64).T
+    places = np.asarray(trimesh.sample.sample_surface(mesh, SAMPLES, seed=0)[0])
+    x, y, z = np.floor((places - low) / cell_m).astype(np.int64).T
     filled[x, y, z] = True
     return low, cell_m, filled
