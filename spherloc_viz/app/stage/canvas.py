@@ -84,10 +84,7 @@ class Canvas:
             self._painter.draw_backdrop(mesh, problem.aligned.map_turn, "mesh" in layers)
             self._picture = picture
             solid = mesh if "mesh" in layers else None
-            if solid is not None and len(solid) <= MOST_BYTES:
-                walls = Walls(solid, problem.aligned.map_turn)
-            else:
-                walls = None
+            walls = Walls(solid, problem.aligned.map_turn) if solid is not None and len(solid) <= MOST_BYTES else None
             walls_came, self._walls = walls is not None and self._walls is None, walls
         if movable or self._movable:
             truth = problem.truth_cam_from_map
