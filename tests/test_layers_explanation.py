@@ -16,7 +16,7 @@ from spherloc.datasets.synthetic import SyntheticScene
 from spherloc.estimators import estimate
 from spherloc.geometry import pose, transform, yaw_of, yaw_rotation
 from spherloc.problem import Problem
-from spherloc.trace import Trace
+from spherloc.trace import Trace, TranslationStage, YawStage
 from spherloc_viz.layers.agreement import agreement, partner_arcs, unbounded
 from spherloc_viz.layers.explanation import WORST, explain
 from spherloc_viz.layers.matches import FILTERS, SORTS, match_rows, order
@@ -218,6 +218,20 @@ def test_stages_say_what_part_a_match_had(scene_of: SceneOf, estimator: str, wor
     for word, part, other in zip(words, inside, outside, strict=True):
         assert word in part and word in other
         assert other.startswith(("in 0 of", "not in", "explained by 0", "explained by")), other
+
+
+def test_a_card_says_at_which_stage_a_match_was_lost(scene_of: SceneOf) -> None:
+    trace = estimate(scene_of("panorama", correspondences=60, outlier_rate=0.5, seed=2).problem(), "mc")
+    yaw, translation = trace.stage(YawStage), trace.stage(TranslationStage)
+    assert yaw is not None and translation is not None
+    voted, located = set(yaw.pairs[yaw.clique].ravel()), set(translation.pairs[translation.clique].ravel())
+    lost = {"yaw arcs": set(range(60)) - voted, "translation balls": voted - located, "": located}
+    assert all(lost.values())
+    for where, numbers in lost.items():
+        for number in numbers:
+            what = explain(trace, int(number))
+            said = "lost at the " in what.reason
+            assert said == (bool(where) and not what.kept) and (not said or f"lost at the {where}" in what.reason)
 
 
 def test_what_several_have_in_common(trace: Trace) -> None:

@@ -80,8 +80,8 @@ class RunDisplay:
         self._shown: tuple[Run, bytes | None, Picture] | None = None
         self._map: tuple[str, MapScene, bytes | None] | None = None
         """What is opened: label, scene and mesh."""
-        self._revealed: tuple[Run | None, frozenset[str]] = None, frozenset()
-        """A run, and which of its answers were asked for although answers are hidden."""
+        self._revealed: tuple[Run | None, int, frozenset[str]] = None, 0, frozenset()
+        """A run, how often answers had been hidden or shown, and which were then asked for although hidden."""
         self._blind: tuple[Run, frozenset[str], Run, Run] | None = None
         """A run, what is withheld of it, the same without the truth if that is, and that without what came out."""
         self._theme = START_THEME
@@ -90,15 +90,19 @@ class RunDisplay:
 
     def withheld(self, run: Run) -> frozenset[str]:
         """Which of ``ANSWERS`` this page does not tell of a run."""
-        told = self._revealed[1] if self._revealed[0] is run else frozenset()
-        return ANSWERS - told if self.controls.display.answers_hidden else frozenset()
+        return ANSWERS - self._told(run) if self.controls.display.answers_hidden else frozenset()
+
+    def _told(self, run: Run) -> frozenset[str]:
+        """Which answers of a run were asked for since answers were hidden."""
+        of, times, told = self._revealed
+        return told if of is run and times == self.controls.display.times_hidden else frozenset()
 
     def _reveal(self, touch: Touch) -> None:
         """Tell one of the answers of the run that is shown, until answers are hidden anew or another run comes."""
         if self._shown is not None:
             run = self._shown[0]
-            told = self._revealed[1] if self._revealed[0] is run else frozenset()
-            self._revealed = run, told | ANSWERS & {touch.argument}
+            told = self._told(run) | ANSWERS & {touch.argument}
+            self._revealed = run, self.controls.display.times_hidden, told
             self._redraw(touch)
 
     def open_map(self, label: str, scene: MapScene, mesh: bytes | None) -> None:
@@ -134,8 +138,6 @@ class RunDisplay:
         are the answers that a presenter hides, besides those that this page does.
         """
         controls, known = self.controls, run
-        if not controls.display.answers_hidden:
-            self._revealed = None, frozenset()
         withheld = presenter | self.withheld(run)
         hidden, blank = bool(withheld), run
         if hidden:

@@ -28,6 +28,8 @@ class Poses:
     """Residual at the run's pose in px and degrees; None without one."""
     truth: tuple[float, float] | None
     """The same at the true pose."""
+    lost: str
+    """At which stage the run lost it, in a sentence; empty if at none."""
     alternative: tuple[FloatArray, float] | None
     """Another pose (3, 4), and the residual there, px."""
     agree_inliers: tuple[int, int] | None
@@ -49,7 +51,7 @@ def reason(trace: Trace, poses: Poses) -> tuple[str, str]:
         first = f"At the estimated pose it is {_px(poses.estimate[0])} off, within its bound of {_px(poses.bound_px)}."
         return verdict, _joined(first, _why_kept(trace, poses))
     verdict = "Rejected" + rightly[None if poses.right is None else not poses.right]
-    return verdict, _joined(_how_far(poses, poses.estimate), _why_rejected(trace, poses))
+    return verdict, _joined(_how_far(poses, poses.estimate), _why_rejected(trace, poses), poses.lost)
 
 
 def _joined(*sentences: str) -> str:
@@ -251,6 +253,7 @@ def explain(trace: Trace, number: int, alternative_cam_from_map: FloatArray | No
         bound_px=float(known.limit_px[number]),
         estimate=None if estimate is None else (estimate.px, estimate.deg),
         truth=None if truth is None else (truth.px, truth.deg),
+        lost=_lost_at(trace, number),
         alternative=_alternative(trace, number, alternative_cam_from_map),
         agree_inliers=None if at_estimate is None else (at_estimate.agree_inliers, int(inliers.sum())),
     )
@@ -322,6 +325,20 @@ def part_in_stages(trace: Trace, number: int) -> tuple[str, ...]:
             inside = "in" if number in stage.clique else "not in"
             parts.append(f"{inside} the largest set that agrees, of {len(stage.clique)}")
     return tuple(parts)
+
+
+def _lost_at(trace: Trace, number: int) -> str:
+    """The first stage in which the correspondence had no part, in a sentence; empty if it had a part in all."""
+    for stage in trace.stages:
+        if isinstance(stage, YawStage) and not _members(stage.pairs, stage.clique, number):
+            return "It was lost at the yaw arcs: none of its arcs is in the maximum clique."
+        if isinstance(stage, TranslationStage) and not _members(stage.pairs, stage.clique, number):
+            return "It was lost at the translation balls: none of its balls is in the maximum clique."
+        if isinstance(stage, ConsensusStage) and number not in stage.clique:
+            return "It is not in the largest set that agrees."
+        if isinstance(stage, RansacStage) and not stage.inlier_masks[:, number].any():
+            return "None of RANSAC's best poses so far explained it."
+    return ""
 
 
 def _members(pairs: IndexArray, clique: IndexArray, number: int) -> int:

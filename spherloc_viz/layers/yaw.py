@@ -387,8 +387,9 @@ def _clique(view: RunView, arcs: Arcs) -> Frame:
     off = ring.off_truth(view, stage.yaw_rad)
     items = _ring(view, arcs, drawn, stage.overlap, arcs.in_clique[drawn], style.CLIQUE)
     return Frame(
-        f"{len(stage.clique):,} arcs overlap at {np.degrees(stage.yaw_rad):.2f}°{off}; no other yaw lies in more. "
-        f"They are a maximum clique of the rotation graph and agree on an interval of {interval:.2g}°.",
+        f"{len(stage.clique):,} arcs, each of a pair of matches, overlap at {np.degrees(stage.yaw_rad):.2f}°{off}; no "
+        f"other yaw lies in more. They are a maximum clique of the rotation graph and agree on an interval of "
+        f"{interval:.2g}°.",
         "max over θ of Σ 1(|f(θ)| ≤ τ)   (Eq. 34, 37)",
         turned,
         view.colors(style.UNDECIDED, (view.mask(stage.pairs[stage.clique]), style.CLIQUE)),
@@ -397,7 +398,7 @@ def _clique(view: RunView, arcs: Arcs) -> Frame:
         items=(
             *items,
             ring.spoke("ring/estimate", view, view.middle, stage.yaw_rad, style.ESTIMATE),
-            ring.name("ring/name", view, stage.yaw_rad, "maximum clique: these arcs overlap"),
+            ring.name("ring/name", view, stage.yaw_rad, "maximum clique"),
             ring.name("ring/ring", view, stage.yaw_rad + np.pi, "yaw ring"),
         ),
     )

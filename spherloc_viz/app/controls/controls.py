@@ -9,7 +9,7 @@ from typing import Any, Literal, Protocol
 import viser
 
 from spherloc.datasets.map_scene import MapScene
-from spherloc.datasets.variation import EDITS, Variation
+from spherloc.datasets.variation import EDITS
 from spherloc.diagnosis import Diagnosis
 from spherloc.errors import InputError
 from spherloc.trace import Trace
@@ -54,6 +54,8 @@ class DisplayControls:
     def __init__(self, gui: viser.GuiApi, changed: Callable[[object], None]) -> None:
         self._changed = changed
         self._wanted: str | None = None
+        self.times_hidden = 0
+        """How often the answers were hidden or shown."""
         self._views = gui.add_button_group("View", views.NAMES)
         self._dark = gui.add_checkbox("Dark", True, hint="Dark for a screen, light for a projector and for print.")
         gui.add_html(PROJECTOR)
@@ -64,7 +66,8 @@ class DisplayControls:
             self._follow = gui.add_checkbox("Follow steps", True, hint="Move to where the step's subject reads best.")
             self._layers = {name: gui.add_checkbox(name.capitalize(), True) for name in style.LAYERS}
         self._views.on_click(self._press)
-        for widget in (self._dark, self._hide, *self._layers.values()):
+        self._hide.on_update(self._hide_or_show)
+        for widget in (self._dark, *self._layers.values()):
             widget.on_update(changed)
 
     @property
@@ -98,6 +101,11 @@ class DisplayControls:
         """The view that was asked for since the last call, if any."""
         wanted, self._wanted = self._wanted, None
         return wanted
+
+    @at_once
+    def _hide_or_show(self, event: viser.GuiEvent) -> None:
+        self.times_hidden += 1
+        self._changed(event)
 
     @at_once
     def _press(self, event: viser.GuiEvent) -> None:
@@ -241,7 +249,7 @@ class Controls:
     def draw(self, run: Run, diagnosis: Diagnosis | None, hidden: bool) -> None:
         """Follow the run at hand; ``diagnosis`` is None for as long as there is none; ``hidden`` tells no answers."""
         self._follow_preset(run.request, hidden)
-        html = _edits_html(run.request.scene.variation)
+        html = _changes_html(run)
         if self._edits.content != html:
             self._edits.content, self._edits.visible = html, bool(html)
         self.compare.draw(run.trace, hidden)
@@ -337,11 +345,15 @@ class Controls:
         return self._catalog.path(request.scene), request
 
 
-def _edits_html(variation: Variation) -> str:
-    """What was done to single matches, and how to take it back; empty if nothing was."""
+def _changes_html(run: Run) -> str:
+    """What is not as the scene's name says, and what was done to single matches; empty if nothing was."""
+    variation, parts = run.request.scene.variation, []
+    label, name = run.request.scene.scene, run.trace.problem.name.removesuffix(", edited")
+    if not name.startswith(label) and not label.startswith(name):
+        parts.append(f"Changed: {escape(name)}")
     done = [f"{len(getattr(variation, name))} {name}" for name in EDITS if getattr(variation, name)]
-    if not done:
-        return ""
-    links = [("unedit:", "take back")] + [("unhide:", "show hidden")] * bool(variation.hidden)
-    ways = " · ".join(f'<u data-touch="{action}" role="button" tabindex="0">{words}</u>' for action, words in links)
-    return box(f"Matches by hand: {', '.join(done)}. {ways}", "font-size:12px")
+    if done:
+        links = [("unedit:", "take back")] + [("unhide:", "show hidden")] * bool(variation.hidden)
+        ways = " · ".join(f'<u data-touch="{action}" role="button" tabindex="0">{words}</u>' for action, words in links)
+        parts.append(f"Matches by hand: {', '.join(done)}. {ways}")
+    return box("".join(f"<div>{part}</div>" for part in parts), "font-size:12px") if parts else ""
