@@ -44,7 +44,8 @@ from spherloc_viz.recording.replay import Reopened
 PROJECTOR = (
     '<div class="words" style="padding:.2em .8em .3em"><button class="projector-toggle" title="The canvas, what the '
     'step says in large type, and the view that goes with it">Projector view, key L</button> '
-    '<a href="/learn" target="_blank" title="Lessons beside the live canvas">Learn how it works</a></div>'
+    '<a href="/learn" target="_blank" title="Lessons beside the live canvas" style="font-size:13.5px;margin-left:.4em;'
+    'white-space:nowrap">Learn how it works</a></div>'
 )
 
 
