@@ -8,10 +8,13 @@ from pathlib import Path
 
 from spherloc.cameras.base import Camera
 from spherloc.datasets import Scene, bundled_scenes, load_scene
+from spherloc.datasets.failures import StagedScene
 from spherloc.datasets.map_scene import MapScene
 from spherloc.datasets.synthetic import SyntheticScene
 from spherloc.datasets.variation import Variation
+from spherloc.errors import InputError, show
 from spherloc.problem import Problem
+from spherloc_viz.gallery import play_of, staged_path
 from spherloc_viz.given_files import is_recording
 from spherloc_viz.recording.replay import load_recorded_scene
 
@@ -86,6 +89,20 @@ class Catalog:
                 del self.scenes[old], self._paths[old]
             self._brief = self._brief[-MOST_BRIEF:]
         return entered
+
+    def enter_case(self, name: str) -> str:
+        """Offer a staged scene of the gallery, by the name of its case (``play_of``); returns its label.
+
+        Raises ``InputError`` if there is no such case, or if its scene is in the catalog already.
+        """
+        case, play = play_of(name)
+        if play.staged is None:
+            raise InputError(f"the case {show(name)} is not staged; name its scene.")
+        return self.add(play.staged, staged_path(name), case.title)
+
+    def case(self, label: str) -> str | None:
+        """The name of the case whose staged scene has that label; None for other scenes."""
+        return self._paths[label].stem if isinstance(self.scenes[label], StagedScene) else None
 
     def path(self, label: str) -> Path:
         """The scene file of that label, absolute."""

@@ -2,7 +2,8 @@
 
 The text is a query string, such as ``v=1&scene=street&seed=3&set=outlier_rate%3D0.4&estimator=mc&step=outcome``. It
 says what differs from what the scene and the estimator say. Anybody may have made it, so scenes are named by their
-label or by a place in an allowed folder, cameras by their label, and nothing else is read from the disk.
+label, by their case of the gallery or by a place in an allowed folder, cameras by their label, and nothing else is read
+from the disk.
 """
 
 import json
@@ -34,7 +35,7 @@ ANSWERS = ("told", "hidden")
 LISTS = ("spoil", "mend", "hide")
 """Keys of ``EDITS``, in their order."""
 ONCE = (
-    *("v", "run", "scene", "place", "seed", "query", "camera", *LISTS, "estimator"),
+    *("v", "run", "scene", "case", "place", "seed", "query", "camera", *LISTS, "estimator"),
     *("step", "select", "view", "theme", "answers"),
 )
 MANY = ("set", "option")
@@ -71,6 +72,7 @@ def link_of(
         ("v", str(VERSION)),
         ("run", recording),
         ("scene", scene.scene),
+        ("case", catalog.case(scene.scene)),
         ("place", place),
         ("seed", str(scene.seed)),
         ("query", scene.query),
@@ -190,6 +192,8 @@ class Follower:
         if "place" in said:
             path = self._roots.find(said["place"])
             return self._catalog.add(load_scene(path), path)
+        if "case" in said:
+            return self._catalog.enter_case(said["case"])
         label = said.get("scene", now)
         if label not in self._catalog.scenes:
             raise InputError(f"the scene {show(label)} is not open here; open it in the tab Open.")

@@ -11,6 +11,7 @@ import viser
 from spherloc.datasets.map_scene import MapScene
 from spherloc.datasets.synthetic import TrueCamera
 from spherloc.diagnosis import Diagnosis
+from spherloc.trace import Trace
 from spherloc_viz.app.controls.controls import DisplayControls
 from spherloc_viz.app.left_panels import LeftPanels
 from spherloc_viz.app.matches.match_card import MatchCard
@@ -177,9 +178,7 @@ class RunDisplay:
     def _untold(self, run: Run, withheld: frozenset[str]) -> tuple[Run, Run]:
         """The run without the truth, if that is withheld, and also without what came out."""
         if self._blind is None or self._blind[0] is not run or self._blind[1] != withheld:
-            trace = run.trace
-            if "truth" in withheld:
-                trace = replace(trace, problem=replace(trace.problem, truth_cam_from_map=None, truth_inliers=None))
+            trace = without_truth(run.trace) if "truth" in withheld else run.trace
             blank = replace(trace, cam_from_map=None, inlier_mask=np.zeros_like(trace.inlier_mask))
             self._blind = run, withheld, replace(run, trace=trace), replace(run, trace=blank)
         return self._blind[2:]
@@ -210,3 +209,8 @@ class RunDisplay:
         if theme != self._theme:
             self._theme = theme
             set_theme(self._client.gui, theme)
+
+
+def without_truth(trace: Trace) -> Trace:
+    """A run as it looks where the true pose is not known."""
+    return replace(trace, problem=replace(trace.problem, truth_cam_from_map=None, truth_inliers=None))

@@ -173,6 +173,7 @@ class Session:
     def _tell_numbers(self, touch: Touch) -> None:
         """A lesson around the page asks for the numbers of the runs."""
         self._in_lesson = True
+        self._display.canvas.fill_page()
         self._page.ask()
 
     def _reset(self, event: object) -> None:

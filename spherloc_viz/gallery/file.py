@@ -41,6 +41,26 @@ def gallery_cases(path: Path = GALLERY) -> tuple[GalleryCase, ...]:
     return parse_gallery(scene_file.read_table(path), path)
 
 
+def play_of(name: str) -> tuple[GalleryCase, Play]:
+    """A case by its key, with its run, or with the run beside it of that number where the name is "KEY_NUMBER".
+
+    Raises ``InputError`` if there is none.
+    """
+    key = name.partition("_")[0]
+    case = next((case for case in gallery_cases() if case.key == key), None)
+    plays: dict[str, Play] = {}
+    if case is not None:
+        plays = {key: case} | {f"{key}_{place}": one for place, one in enumerate(case.beside)}
+    if case is None or name not in plays:
+        raise InputError(f"the gallery has no case {show(name)}; spherloc gallery --list has them all.")
+    return case, plays[name]
+
+
+def staged_path(name: str) -> Path:
+    """What stands for the file of a staged scene of the gallery, by the name of its case as in ``play_of``."""
+    return GALLERY.with_name("gallery") / f"{name}.rrd"
+
+
 def parse_gallery(table: Mapping[str, Any], path: Path) -> tuple[GalleryCase, ...]:
     """The cases that the keys of a gallery's file describe; raises as ``gallery_cases`` does."""
     check_keys(table, {"case"}, set(), str(path))

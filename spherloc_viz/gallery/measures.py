@@ -38,6 +38,8 @@ def _agree_with_truth(trace: Trace, wider: float = 1.0) -> int:
 def _median_error_px(trace: Trace, rim: bool) -> float:
     """Of the right matches in the outer or the inner half of the view, at the true pose."""
     right, errors = _right(trace), _true_errors_px(trace)
+    if not right.any():
+        return np.nan
     forward = trace.problem.bearings[:, 2]
     outer = forward < np.median(forward[right])
     return float(np.median(errors[right & (outer if rim else ~outer)]))

@@ -7,6 +7,7 @@ from spherloc.errors import InputError, show
 from spherloc_viz.lessons.lesson import Lesson, read_lesson
 
 TEXTS = Path(__file__).with_name("texts")
+PICTURES = Path(__file__).with_name("pictures")
 
 
 @cache
@@ -23,6 +24,7 @@ def lesson_named(name: str) -> Lesson:
     return found
 
 
-def picture_of(name: str) -> bytes | None:
-    """The picture of a lesson for the list, WebP; None if it has none."""
-    return next((path.read_bytes() for path in TEXTS.glob("*.webp") if path.stem == name), None)
+def picture_of(name: str, place: int) -> bytes | None:
+    """The picture of a moment of a lesson, WebP; None if it has none."""
+    path = PICTURES / f"{name}-{place}.webp"
+    return path.read_bytes() if path.is_file() else None

@@ -1,7 +1,8 @@
-"""Lessons as HTML: the list of all, and the page with a lesson's prose beside the live canvas."""
+"""Lessons as HTML: the list of all, the page with a lesson's prose beside the scene, and the hand-out."""
 
 import re
 from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
 from functools import cache
 from html import escape, unescape
 from pathlib import Path
@@ -20,13 +21,38 @@ MARK, END = "\ue000", "\ue001"
 """Around the number of a formula while Markdown is read, which would take its signs for its own."""
 PERCENT = "%"
 
-NumberOf = Callable[[str], str]
-"""What stands for a number of the run, by its name."""
+
+@dataclass(frozen=True)
+class Form:
+    """What of a lesson works where it is shown."""
+
+    number: Callable[[str], str]
+    """HTML for a number of the run, by its name."""
+    state: Callable[[str], str]
+    """What the page's script calls a state."""
+    change: Callable[[str, str], str]
+    """What it calls changes, the second, to a state, the first; empty if it cannot show them."""
+    controls: bool
+    """Whether sliders, choices and links to the playground work."""
+
+
+def live_number(name: str) -> str:
+    """A place that the page's script fills with a number of the run on the canvas."""
+    return f'<output data-number="{name}">…</output>'
+
+
+LIVE = Form(live_number, lambda state: state, lambda state, changes: changes, controls=True)
+"""Beside the playground."""
+
+
+def printed(numbers: Mapping[str, str]) -> Form:
+    """On paper, with these numbers."""
+    return Form(lambda name: f"<b>{escape(numbers[name])}</b>", lambda state: "", lambda state, changes: "", False)
 
 
 @cache
 def text_of(name: str) -> str:
-    """A file of this folder: the script and the style of the pages."""
+    """A file of this folder: the scripts and the style of the pages."""
     return Path(__file__).with_name(name).read_text(encoding="utf-8")
 
 
@@ -35,13 +61,8 @@ def _markdown() -> MarkdownIt:
     return MarkdownIt("commonmark", {"html": False}).enable("table")
 
 
-def live_number(name: str) -> str:
-    """A place that the page's script fills with a number of the run on the canvas."""
-    return f'<output data-number="{name}">…</output>'
-
-
-def prose_html(text: str, state: str, number: NumberOf = live_number, live: bool = True) -> str:
-    """Markdown of a lesson as HTML; where it is not ``live``, sliders are their value and links their words.
+def prose_html(text: str, state: str, form: Form = LIVE) -> str:
+    """Markdown of a lesson as HTML; without controls sliders are their value, and links may be their words.
 
     Raises ``InputError`` for a field that is neither a number nor a control.
     """
@@ -52,8 +73,8 @@ def prose_html(text: str, state: str, number: NumberOf = live_number, live: bool
         return f"{MARK}{len(formulas) - 1}{END}"
 
     html = _markdown().render(FORMULA.sub(keep, text))
-    html = LINK.sub(lambda found: _link(unescape(found[1]), state, live), html)
-    html = FIELD.sub(lambda found: _field(unescape(found[1]), state, number, live), html)
+    html = LINK.sub(lambda found: _link(unescape(found[1]), state, form), html)
+    html = FIELD.sub(lambda found: _field(unescape(found[1]), state, form), html)
     return re.sub(f"{MARK}(\\d+){END}", lambda found: formulas[int(found[1])], html)
 
 
@@ -62,9 +83,14 @@ def names_in(text: str) -> set[str]:
     return {name for name in FIELD.findall(FORMULA.sub("", text)) if " " not in name}
 
 
+def links_in(text: str) -> tuple[str, ...]:
+    """The changes of the state that the links of a text make."""
+    return tuple(unescape(changes) for changes in LINK.findall(_markdown().render(text)))
+
+
 def changes_in(text: str) -> tuple[str, ...]:
     """The changes of the state that a text offers: its links, and both ends of its sliders."""
-    found = [unescape(changes) for changes in LINK.findall(_markdown().render(text))]
+    found = list(links_in(text))
     for words in FIELD.findall(text):
         kind, *rest = words.split(" ", 2)
         if kind == "slider":
@@ -79,20 +105,22 @@ def _change(key: str, value: str) -> str:
     return changed_state("", f"{key.replace('.', '=', 1)}%3D{value}" if "." in key else f"{key}={value}")
 
 
-def _link(changes: str, state: str, live: bool) -> str:
-    if not live:
+def _link(changes: str, state: str, form: Form) -> str:
+    said = form.change(state, changes)
+    if not said:
         return '<a class="still">'
-    return f'<a href="/#{escape(changed_state(state, changes))}" data-change="{escape(changes)}">'
+    where = f"/#{escape(changed_state(state, changes))}" if form.controls else "#"
+    return f'<a href="{where}" data-change="{escape(said)}">'
 
 
-def _field(words: str, state: str, number: NumberOf, live: bool) -> str:
+def _field(words: str, state: str, form: Form) -> str:
     kind, *rest = words.split(" ", 2)
     if not rest:
-        return number(kind)
+        return form.number(kind)
     key = rest[0]
     value = state_parts(state).get(key, "").partition("=")[2] if "." in key else state_parts(state).get(key, "")
     if kind == "choice" and len(rest) == 2:
-        if not live:
+        if not form.controls:
             return f"<b>{escape(value)}</b>"
         options = "".join(
             f"<option{' selected' * (word == value)}>{escape(word)}</option>" for word in rest[1].split("|")
@@ -104,7 +132,7 @@ def _field(words: str, state: str, number: NumberOf, live: bool) -> str:
         if not value:
             raise InputError(f"the slider of {show(key)} needs a state that says {show(key)}.")
         shown = f"{100 * float(value):.0f} %" if percent else value
-        if not live:
+        if not form.controls:
             return f"<b>{shown}</b>"
         name = key.rpartition(".")[2].replace("_", " ")
         return (
@@ -114,51 +142,52 @@ def _field(words: str, state: str, number: NumberOf, live: bool) -> str:
     raise InputError(f"the text has {show('{' + words + '}')}, which is no number and no control.")
 
 
-def _question_html(question: Question, state: str, number: NumberOf, live: bool) -> str:
+def _inline(text: str, state: str, form: Form) -> str:
+    return prose_html(text, state, form).removeprefix("<p>").removesuffix("</p>\n")
+
+
+def _question_html(question: Question, state: str, form: Form) -> str:
     answers = []
     for place, answer in enumerate(question.answers):
-        said = prose_html(answer.shows, state, number, live)
         mark = "right" if answer.right else "wrong"
-        text = prose_html(answer.text, state, number, live).removeprefix("<p>").removesuffix("</p>\n")
-        head = (
-            f'<button type="button" aria-expanded="false">{text}<span class="votes"></span></button>'
-            if live
-            else f"<p><b>{text}</b></p>"
+        go = f' data-go="{escape(form.change(state, answer.go))}"' if answer.go else ""
+        answers.append(
+            f'<li class="{mark}"{go} data-answer="{place}"><button type="button" aria-expanded="false">'
+            f'{_inline(answer.text, state, form)}<span class="votes"></span></button>'
+            f'<div class="shows">{prose_html(answer.shows, state, form)}</div></li>'
         )
-        go = f' data-go="{escape(answer.go)}"' if answer.go else ""
-        answers.append(f'<li class="{mark}"{go} data-answer="{place}">{head}<div class="shows">{said}</div></li>')
-    ask = prose_html(question.ask, state, number, live)
-    reveal = '<button type="button" class="reveal">Show the answer</button>' if live else ""
-    listed = f'<ol class="answers">{"".join(answers)}</ol>'
-    if not live:
-        listed = f"<details><summary>Predict first; then open the answers</summary>{listed}</details>"
-    return f'<div class="question"><div class="ask">{ask}</div>{listed}{reveal}</div>'
+    return (
+        f'<div class="question"><div class="ask">{prose_html(question.ask, state, form)}</div>'
+        f'<ol class="answers">{"".join(answers)}</ol>'
+        '<button type="button" class="reveal">Show the answer</button></div>'
+    )
 
 
-def moment_html(moment: Moment, place: int, number: NumberOf = live_number, picture: str = "") -> str:
-    """A moment as a section; with the address of a ``picture`` it is a still one, without controls."""
-    live = not picture
+def _notes_html(moment: Moment, form: Form) -> str:
+    notes = prose_html(moment.notes, moment.state, form)
+    return f'<aside class="notes"><h3>For the teacher · {moment.minutes:g} min</h3>{notes}</aside>'
+
+
+def moment_html(moment: Moment, place: int, form: Form = LIVE) -> str:
+    """A moment as a section beside a scene."""
     state = moment.state
-    parts = [f"<h2>{escape(moment.title)}</h2>"]
-    if picture:
-        parts.append(f'<img src="{picture}" alt="The scene at the moment: {escape(moment.title)}">')
-    parts.append(prose_html(moment.prose, state, number, live))
-    after = prose_html(moment.after, state, number, live)
+    parts = [f"<h2>{escape(moment.title)}</h2>", prose_html(moment.prose, state, form)]
+    after = prose_html(moment.after, state, form)
     if moment.question is not None:
-        parts.append(_question_html(moment.question, state, number, live))
-        after = (
-            f'<div class="after">{after}</div>'
-            if live
-            else f"<details><summary>What follows</summary>{after}</details>"
-        )
+        parts.append(_question_html(moment.question, state, form))
+        after = f'<div class="after">{after}</div>'
     parts.append(after)
     if moment.notes:
-        notes = prose_html(moment.notes, state, number, live)
-        parts.append(f'<aside class="notes"><h3>For the teacher · {moment.minutes:g} min</h3>{notes}</aside>')
-    if live:
+        parts.append(_notes_html(moment, form))
+    if form.controls:
         parts.append(f'<p class="open"><a href="/#{escape(state)}" target="_blank">Open in the playground</a></p>')
-    before = f' data-before="{escape(changed_state(state, moment.before))}"' if moment.before else ""
-    return f'<section id="moment-{place}" data-state="{escape(state)}"{before} tabindex="-1">{"".join(parts)}</section>'
+    before = ""
+    if moment.before:
+        before = f' data-before="{escape(form.state(changed_state(state, moment.before)))}"'
+    return (
+        f'<section id="moment-{place}" data-state="{escape(form.state(state))}"{before} tabindex="-1">'
+        f"{''.join(parts)}</section>"
+    )
 
 
 def lesson_page(lesson: Lesson, others: Collection[Lesson]) -> str:
@@ -171,38 +200,140 @@ def lesson_page(lesson: Lesson, others: Collection[Lesson]) -> str:
         if following
         else '<a href="/learn">All lessons</a>'
     )
-    sections = "".join(moment_html(moment, number) for number, moment in enumerate(lesson.moments))
+    bar = Template(text_of("live_bar.html")).substitute(name=escape(lesson.name))
+    forms = [LIVE] * len(lesson.moments)
+    return _lesson_html(lesson, forms, bar, onward, "", text_of("live.js") + text_of("lesson.js"))
+
+
+def exported_page(lesson: Lesson, forms: Collection[Form], data: str) -> str:
+    """The page of a lesson as a file: a form for each moment, and ``data``, HTML with what the script shows."""
+    bar = '<span class="dim">A recorded lesson of <i>spherloc</i></span>'
+    onward = '<span class="dim">In the playground this lesson has sliders, and any scene can be changed.</span>'
+    return _lesson_html(lesson, forms, bar, onward, data, text_of("recorded.js") + text_of("lesson.js"))
+
+
+def _lesson_html(lesson: Lesson, forms: Collection[Form], bar: str, onward: str, data: str, script: str) -> str:
+    both = zip(lesson.moments, forms, strict=True)
     return _page(
         "lesson.html",
         title=escape(lesson.title),
         summary=escape(lesson.summary),
         minutes=str(lesson.minutes),
         introduction=prose_html(lesson.introduction, ""),
-        sections=sections,
+        sections="".join(moment_html(moment, place, form) for place, (moment, form) in enumerate(both)),
+        bar=bar,
         onward=onward,
-        first=escape(_first_state(lesson)),
         count=str(len(lesson.moments)),
-        script=text_of("lesson.js"),
+        data=data,
+        script=script,
     )
 
 
-def _first_state(lesson: Lesson) -> str:
-    first = lesson.moments[0]
-    return changed_state(first.state, first.before)
+def handout_page(lesson: Lesson, numbers: Collection[Mapping[str, str]], pictures: Mapping[int, str]) -> str:
+    """A lesson to be printed: the numbers of each moment's run, and addresses of pictures by a moment's place."""
+    parts, solutions = [], []
+    for place, (moment, told) in enumerate(zip(lesson.moments, numbers, strict=True)):
+        form, state = printed(told), moment.state
+        parts.append(f"<section><h2>{place + 1}. {escape(moment.title)}</h2>")
+        if place in pictures:
+            parts.append(f'<img src="{pictures[place]}" alt="The scene at the moment: {escape(moment.title)}">')
+        parts.append(prose_html(moment.prose, state, form))
+        question = moment.question
+        if question is not None:
+            answers = "".join(f"<li>☐ {_inline(answer.text, state, form)}</li>" for answer in question.answers)
+            asked = prose_html(question.ask, state, form)
+            parts.append(f'<div class="question">{asked}<ol class="answers">{answers}</ol></div>')
+            told_why = "".join(
+                f"<li>{'✓' if answer.right else '✗'} <b>{_inline(answer.text, state, form)}.</b> "
+                f"{_inline(answer.shows, state, form)}</li>"
+                for answer in question.answers
+            )
+            solutions.append(f'<h3>{place + 1}. {escape(moment.title)}</h3><ul class="answers">{told_why}</ul>')
+        parts.append(f"{prose_html(moment.after, state, form)}</section>")
+    if solutions:
+        parts.append(f'<section class="solutions"><h2>Answers</h2>{"".join(solutions)}</section>')
+    return _page(
+        "handout.html",
+        title=escape(lesson.title),
+        summary=escape(lesson.summary),
+        introduction=prose_html(lesson.introduction, ""),
+        sections="".join(parts),
+    )
+
+
+def notes_page(lesson: Lesson) -> str:
+    """What only the teacher sees, in a window of its own: notes, time and answers, which follow the lesson's page."""
+    rows, minute = [], 0.0
+    for place, moment in enumerate(lesson.moments):
+        form = Form(lambda name: f'<output data-number="{name}">…</output>', str, lambda state, changes: "", False)
+        right = ""
+        if moment.question is not None:
+            answer = next(one for one in moment.question.answers if one.right)
+            right = (
+                f'<p><b>Answer:</b> {_inline(answer.text, moment.state, form)} <span class="votes"></span></p>'
+                '<button type="button" data-press="reveal">Show the answer to the class</button>'
+            )
+        when = f"minute {minute:g} to {minute + moment.minutes:g}"
+        notes = prose_html(moment.notes, moment.state, form)
+        rows.append(
+            f'<li data-place="{place}" data-ends="{minute + moment.minutes:g}"><h2><button type="button" '
+            f'data-press="go:{place}">{place + 1}. {escape(moment.title)}</button></h2>'
+            f'<p class="dim">{when}</p>{notes}{right}</li>'
+        )
+        minute += moment.minutes
+    return _page(
+        "notes.html",
+        title=escape(lesson.title),
+        minutes=f"{minute:g}",
+        rows="".join(rows),
+        script=text_of("notes.js"),
+    )
 
 
 def list_page(course: Collection[Lesson], pictures: Mapping[str, str]) -> str:
     """The list of all lessons; ``pictures`` are addresses of images by the name of a lesson."""
-    rows = []
+    rows: dict[bool, list[str]] = {False: [], True: []}
     for lesson in course:
         picture = pictures.get(lesson.name)
         image = f'<img src="{picture}" alt="">' if picture else '<div class="blank"></div>'
-        rows.append(
+        rows[lesson.lecture].append(
             f'<li><a href="/learn/{escape(lesson.name)}">{image}<div><h2>{escape(lesson.title)}</h2>'
             f"<p>{escape(lesson.summary)}</p><p class='dim'>{len(lesson.moments)} moments, about {lesson.minutes} min"
             "</p></div></a></li>"
         )
-    return _page("list.html", rows="".join(rows))
+    return _page("list.html", lessons="".join(rows[False]), lectures="".join(rows[True]))
+
+
+def teacher_page(course: Collection[Lesson]) -> str:
+    """How to teach with the lessons: the lecture moment by moment with its timing, and what each lesson has."""
+    lectures, rows = [], []
+    for lesson in course:
+        name, title = escape(lesson.name), escape(lesson.title)
+        if lesson.lecture:
+            lectures.append(_timetable(lesson))
+        asked = sum(moment.question is not None for moment in lesson.moments)
+        rows.append(
+            f'<tr><td><a href="/learn/{name}">{title}</a></td><td>{lesson.minutes} min</td><td>{asked}</td>'
+            f'<td><a href="/learn/{name}/notes">notes</a></td>'
+            f'<td><a href="/learn/{name}/handout">hand-out</a></td></tr>'
+        )
+    return _page("teacher.html", lectures="".join(lectures), rows="".join(rows))
+
+
+def _timetable(lesson: Lesson) -> str:
+    name, minute, rows = escape(lesson.name), 0.0, []
+    for place, moment in enumerate(lesson.moments):
+        notes = prose_html(moment.notes, moment.state, Form(lambda name: "…", str, lambda state, changes: "", False))
+        rows.append(
+            f'<tr><td class="when">{minute:g}–{minute + moment.minutes:g} min</td>'
+            f'<td><a href="/learn/{name}#m{place}"><b>{escape(moment.title)}</b></a>{notes}</td></tr>'
+        )
+        minute += moment.minutes
+    return (
+        f'<h2><a href="/learn/{name}">{escape(lesson.title)}</a></h2>'
+        f"<p>{escape(lesson.summary)} {minute:g} minutes.</p>"
+        f'<table class="timetable">{"".join(rows)}</table>'
+    )
 
 
 def _page(name: str, **values: str) -> str:

@@ -1,12 +1,11 @@
-// Has the scene beside a lesson show the moment that is read. The scene is the playground's own page in a frame; it is
-// driven through its address, as a link would (app/web/link.js), and tells the numbers of its run when it is asked to.
+// Has the scene beside a lesson show the moment that is read. What draws the scene is in live.js or recorded.js.
 (() => {
-  const EVERY_MS = 150, MANY = ["set", "option"];
-  const frame = document.querySelector("iframe"), prose = document.querySelector(".prose");
+  const MANY = ["set", "option"], OPENING_MS = 30000;
+  const prose = document.querySelector(".prose"), scene = openScene((numbers) => write(numbers));
   const moments = [...document.querySelectorAll("section")], where = document.querySelector(".where");
   const changes = new Map();  // what the reader changed, by moment
   const light = matchMedia("(prefers-color-scheme: light)");
-  let now = null, wanted = "", sent = "", landed = "";
+  let now = null, wanted = "", channel = null;
 
   // Values of a state by key; of those that may be said several times by key and name.
   function parts(state) {
@@ -15,7 +14,7 @@
   }
 
   function text(all) {
-    const said = [...all].filter(([, value]) => value);
+    const said = [...all].filter(([, value]) => value && !value.endsWith("="));
     return new URLSearchParams(said.map(([key, value]) => [key.split(".")[0], value])).toString();
   }
 
@@ -38,6 +37,7 @@
       control.value = control.dataset.key.includes(".") ? value.slice(value.indexOf("=") + 1) : value;
       tellValue(control);
     }
+    scene.show(wanted);
   }
 
   function tellValue(control) {
@@ -77,46 +77,12 @@
     next.focus({ preventScroll: true });
   }
 
-  const inside = (selector) => frame.contentDocument?.querySelector(selector);
-
-  // The lesson is the panel here: of the playground's own only the views can be seen, if somebody wants (touch.css).
-  function fold() {
-    const look = frame.contentDocument?.body?.classList, views = document.body.classList.contains("views");
-    if (!look || (look.contains("in-lesson") && look.contains("in-lesson-views") === views)) return;
-    look.add("in-lesson");
-    look.toggle("in-lesson-views", views);
-    frame.contentWindow.dispatchEvent(new Event("resize"));
-  }
-
-  function tell(detail) {
-    const page = frame.contentWindow;
-    page.dispatchEvent(new page.CustomEvent("spherloc-touch", { detail }));
-  }
-
   function write(numbers) {
     for (const place of now.querySelectorAll("[data-number]"))
       place.textContent = numbers[place.dataset.number] ?? "no number";
-    document.body.classList.remove("waiting");
+    document.body.classList.remove("waiting", "opening");
+    report(numbers);
   }
-
-  setInterval(() => {
-    fold();
-    const said = inside("[data-address]");
-    if (!said || !inside("[data-ready]")) return;
-    if (wanted !== sent) {
-      sent = wanted;
-      landed = "";
-      frame.contentWindow.location.replace(`/#${wanted}`);
-      return;
-    }
-    if (!said.dataset.numbers) tell("numbers:");
-    else if (frame.contentWindow.location.hash === `#${said.dataset.address}`) {
-      if (landed !== said.dataset.numbers) {
-        landed = said.dataset.numbers;
-        write(JSON.parse(landed));
-      }
-    }
-  }, EVERY_MS);
 
   // Answers. With the teacher's view on, a press counts a vote, and the answer is shown when the class has voted.
   function answer(item) {
@@ -127,15 +93,44 @@
     changes.set(moment, item.dataset.go ?? "");
     if (moment !== now) enter(moment);
     go();
+    report();
   }
 
   function vote(item) {
     const count = item.querySelector(".votes");
     count.textContent = String(Number(count.textContent) + 1);
+    report();
   }
+
+  const right = () => now.querySelector(".answers .right");
+
+  // The teacher's notes, in a window that the class does not see (notes.js).
+  function openNotes() {
+    document.body.classList.remove("teacher");
+    document.body.classList.add("voting");
+    if (!channel) {
+      channel = new BroadcastChannel(`spherloc${location.pathname}`);
+      channel.onmessage = ({ data }) => {
+        if (data === "hello") report();
+        else if (data === "reveal" && right()) answer(right());
+        else if (data.startsWith("go:")) step(Number(data.slice(3)) - moments.indexOf(now));
+        else if (data === "up" || data === "down") press(data);
+      };
+    }
+    open(`${location.pathname}/notes`, "spherloc-notes", "width=720,height=900");
+  }
+
+  function report(numbers) {
+    const votes = [...now.querySelectorAll(".answers li")].map((item) => Number(item.querySelector(".votes").textContent));
+    channel?.postMessage({ place: moments.indexOf(now), votes, answered: now.classList.contains("answered"), numbers });
+  }
+
+  // An exported lesson has no playground and no second window, and no buttons for them.
+  const live = (name) => document.querySelector(`[data-press=${name}]`);
 
   function press(name, button) {
     if (name === "up" || name === "down") return step(name === "up" ? -1 : 1);
+    if (name === "notes") return openNotes();
     const on = document.body.classList.toggle(name);
     (button ?? document.querySelector(`[data-press=${name}]`)).setAttribute("aria-pressed", String(on));
     now.scrollIntoView({ block: "start" });
@@ -150,7 +145,8 @@
       change(link.closest("section") ?? now, link.dataset.change);
     } else if (item) {
       const unanswered = !item.closest("section").classList.contains("answered");
-      if (document.body.classList.contains("teacher") && unanswered) vote(item);
+      const counting = ["teacher", "voting"].some((name) => document.body.classList.contains(name));
+      if (counting && unanswered) vote(item);
       else answer(item);
     } else if (event.target.closest(".reveal")) answer(event.target.closest(".question").querySelector(".right"));
     else if (button) press(button.dataset.press, button);
@@ -171,7 +167,8 @@
     if (event.key in moves) step(moves[event.key]);
     else if (event.key.toLowerCase() === "l") press("large");
     else if (event.key.toLowerCase() === "t") press("teacher");
-    else if (event.key.toLowerCase() === "v") press("views");
+    else if (event.key.toLowerCase() === "v" && live("views")) press("views");
+    else if (event.key.toLowerCase() === "n" && live("notes")) press("notes");
     else return;
     event.preventDefault();
   });
@@ -181,6 +178,5 @@
   const start = moments[Number(/^#m(\d+)$/.exec(location.hash)?.[1] ?? 0)] ?? moments[0];
   if (start !== moments[0]) start.scrollIntoView({ block: "start" });
   enter(start);
-  sent = wanted;
-  frame.src = `/#${wanted}`;
+  setTimeout(() => document.body.classList.remove("opening"), OPENING_MS);
 })();

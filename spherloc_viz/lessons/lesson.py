@@ -30,7 +30,7 @@ MANY = ("set", "option")
 """Keys of a state that may be said several times, each with a name of its own."""
 HEAD = re.compile(r"\A\+\+\+\n(.*?)\n\+\+\+\n", re.DOTALL)
 BLOCK = re.compile(r"^```(moment|question|notes)\n(.*?)^```$\n?", re.DOTALL | re.MULTILINE)
-LESSON_KEYS = {"title", "summary", "order", "quoted", "picture"}
+LESSON_KEYS = {"title", "summary", "order", "quoted", "picture", "lecture"}
 MOMENT_KEYS = {"state", "minutes", "claims", "before"}
 QUESTION_KEYS = {"ask", "answers"}
 ANSWER_KEYS = {"text", "shows", "right", "go"}
@@ -85,6 +85,8 @@ class Lesson:
     """One sentence."""
     order: int
     """Place in the course."""
+    lecture: bool
+    """Whether it is for the front of a class, and not of the course."""
     picture: int
     """Number of the moment whose picture stands for the lesson, from 0 on."""
     quoted: tuple[float, ...]
@@ -126,6 +128,7 @@ def parse_lesson(text: str, name: str, where: str) -> Lesson:
         _get(table, "title", str, where),
         _get(table, "summary", str, where),
         _get(table, "order", int, where, 1000),
+        _get(table, "lecture", bool, where, False),
         picture,
         tuple(float(number) for number in _get(table, "quoted", list, where, [])),
         introduction.strip(),
@@ -194,10 +197,13 @@ def _get(table: Mapping[str, Any], key: str, kind: Any, where: str, default: Any
 
 
 def changed_state(state: str, changes: str) -> str:
-    """A state with changes to it, both as in the page's address: of ``set`` and ``option`` those of that name only."""
+    """A state with changes to it, both as in the page's address: of ``set`` and ``option`` those of that name only.
+
+    An empty value takes its key away, such as ``seed=`` or ``option=iterations%3D``.
+    """
     pairs = state_parts(state) | state_parts(changes)
     return urlencode([(name.partition(".")[0] if name.partition(".")[0] in MANY else name, value)
-                      for name, value in pairs.items() if value])  # fmt: skip
+                      for name, value in pairs.items() if value and not value.endswith("=")])  # fmt: skip
 
 
 def state_parts(state: str) -> dict[str, str]:

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Sequence
 from functools import partial
 from html import escape
-from pathlib import Path
 
 import viser
 
@@ -14,7 +13,7 @@ from spherloc_viz.app.review.run_library import RunLibrary
 from spherloc_viz.app.text import DIM, box, status_html
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.workers import BackgroundWorker
-from spherloc_viz.gallery import GALLERY, GalleryCase, Play, gallery_cases
+from spherloc_viz.gallery import GalleryCase, Play, gallery_cases, staged_path
 from spherloc_viz.recording.replay import Reopened
 from spherloc_viz.recording.run_row import RunRow
 
@@ -100,7 +99,7 @@ def file_of(case: GalleryCase) -> str:
 
 def reopened(case: GalleryCase, play: Play, stem: str) -> Reopened:
     """A case, or a run beside it, as a scene to open; ``stem`` names those that have no scene file."""
-    path = play.scene_path or Path(GALLERY).with_name(FOLDER) / f"{stem}.rrd"
+    path = play.scene_path or staged_path(stem)
     label = case.title if play.scene_path is None else play.scene.name
     return Reopened(play.scene, path, label, play.seed, play.query, play.variation, play.estimator, play.options)
 

@@ -114,6 +114,11 @@ class Canvas:
         self._held = step_key, views.View(np.array(numbers[:3]), np.array(numbers[3:]), np.radians(degrees))
         self._looked, self._held_step_came = None, False
 
+    def fill_page(self) -> None:
+        """There are no panels beside the canvas: a lesson is around the page."""
+        self._docked_px = 0
+        self._follow_page()
+
     def viewpoint(self) -> tuple[float, ...]:
         """Where the viewer stands (3), what it looks at (3), and its field of view, degrees; empty if that is what the
         step is seen from anyway."""

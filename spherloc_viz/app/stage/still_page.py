@@ -5,7 +5,7 @@ import hashlib
 import re
 import secrets
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from html import escape
 from typing import Any
@@ -15,7 +15,8 @@ import numpy as np
 from spherloc.types import FloatArray
 from spherloc_viz import style
 from spherloc_viz.app.stage.painter import Painter
-from spherloc_viz.app.web.page import QUIET
+from spherloc_viz.app.stage.views import LEAST_REACH
+from spherloc_viz.app.web.page import QUIET, client_html
 from spherloc_viz.app.web.viser_internals import start_viser, stop_viser
 from spherloc_viz.layers.primitives import SceneItem
 
@@ -44,16 +45,29 @@ class Still:
     field_of_view_rad: float
     """From top to bottom."""
     dark: bool
+    reach: float = LEAST_REACH
+    """How far is drawn."""
 
 
 def still_html(still: Still) -> str:
     """The file. Takes about a second."""
-    page = _embed(_replay(still), still)
-    return page.replace("<head>", f'<head><meta http-equiv="Content-Security-Policy" content="{_policy(page)}">', 1)
+    page = client_html().replace("</head>", f"<script>{scene_script(still)}</script></head>", 1)
+    return with_policy(_embed(page, still))
 
 
-def _replay(still: Still) -> str:
-    """Viser's page with the scene in it.
+def with_policy(page: str, more_scripts: Iterable[str] = ()) -> str:
+    """A page that runs its own scripts and ``more_scripts``, fetches nothing, and so needs and uses no network."""
+    policy = _policy([*scripts_in(page), *more_scripts])
+    return page.replace("<head>", f'<head><meta http-equiv="Content-Security-Policy" content="{policy}">', 1)
+
+
+def scripts_in(page: str) -> list[str]:
+    """What of a page is executed."""
+    return re.findall(r"<script\b(?![^>]*application/json)[^>]*>(.*?)</script>", page, flags=re.DOTALL)
+
+
+def scene_script(still: Still) -> str:
+    """A script that has viser's page (``client_html``) show the scene. Takes about a second.
 
     What one client is shown cannot be saved; only what a server shows to all can be. So a server is started for this.
     """
@@ -65,15 +79,18 @@ def _replay(still: Still) -> str:
             server.scene.set_up_direction("-y")
             camera = server.initial_camera
             camera.up, camera.fov = tuple(still.up), still.field_of_view_rad
+            camera.far = still.reach
             camera.position, camera.look_at = tuple(still.position), tuple(still.target)
             server.gui.configure_theme(dark_mode=still.dark, show_logo=False, show_share_button=False)
             painter = Painter(server)
             painter.dark = still.dark
             painter.draw(still.items, layers)
             painter.draw_backdrop(still.backdrop, still.aligned_from_map, True)
-            return server.get_scene_serializer().as_html(dark_mode=still.dark)
+            data = base64.b64encode(server.get_scene_serializer().serialize()).decode()
         finally:
             stop_viser(server)
+    config = f"{{darkMode:{str(still.dark).lower()}}}"
+    return f'window.__VISER_EMBED_DATA__="{data}";window.__VISER_EMBED_CONFIG__={config};'
 
 
 def _embed(page: str, still: Still) -> str:
@@ -99,9 +116,8 @@ def _embed(page: str, still: Still) -> str:
     return page[:at] + over + page[at:]
 
 
-def _policy(page: str) -> str:
-    """A policy under which nothing is fetched and no other script runs, so that the file needs and uses no network."""
-    scripts = re.findall(r"<script\b[^>]*>(.*?)</script>", page, flags=re.DOTALL)
+def _policy(scripts: Iterable[str]) -> str:
+    """A policy under which nothing is fetched and no other script runs."""
     hashes = [base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in scripts]
     allowed = " ".join(f"'sha256-{digest}'" for digest in hashes)
     return (
@@ -118,4 +134,5 @@ def viewpoint(camera: Any) -> dict[str, Any]:
         "target": np.array(camera.look_at),
         "up": np.array(camera.up_direction),
         "field_of_view_rad": float(camera.fov),
+        "reach": float(camera.far),
     }

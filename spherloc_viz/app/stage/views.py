@@ -21,6 +21,8 @@ MARGINS = np.array([0.13, 0.06])
 """Shares of the canvas' half width and half height that stay free on every side: labels are wide."""
 ROUNDS = 4
 """Perspective shifts the middle of what is seen, so the target is moved there a few times."""
+LEAST_REACH, REACH = 1000.0, 5.0
+"""How far a page draws at least, as viser does, and by the distance to what is looked at."""
 STILL = 1e-3
 """Views whose places differ by less, as a share of their distance to what they show, are the same."""
 LEAST_SHARE = 0.5
@@ -69,12 +71,18 @@ def same(view: View, other: View) -> bool:
     return bool(np.all(np.linalg.norm(places, axis=1) <= near)) and view.field_of_view_rad == other.field_of_view_rad
 
 
+def reach(view: View) -> float:
+    """How far a page must draw for a view: a map of mountains is larger than viser thinks."""
+    return max(LEAST_REACH, REACH * float(np.linalg.norm(view.target - view.position)))
+
+
 def look(client: viser.ClientHandle, view: View) -> None:
     """Move a client's viewer there."""
     with client.atomic():
         camera = client.camera
         camera.up_direction = UP
         camera.fov = view.field_of_view_rad
+        camera.far = reach(view)
         camera.position = view.position
         camera.look_at = view.target
 

@@ -107,7 +107,7 @@ class FrontDoor:
                 return refused(request, NOT_FOR_AUDIENCE)
             return self._downloads.answer(request)
         if is_learning(request.path):
-            return learn_answer(request) if role is Role.PRESENTER else refused(request, LESSONS_NOT_FOR_AUDIENCE)
+            return await learn_answer(request) if role is Role.PRESENTER else refused(request, LESSONS_NOT_FOR_AUDIENCE)
         if not request.query.keys() <= PARAMETERS:
             raise web.HTTPFound("/")
         if request.path != "/":

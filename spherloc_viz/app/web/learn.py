@@ -1,5 +1,6 @@
 """The pages of the lessons: the list at ``/learn``, a lesson at ``/learn/NAME``, and their pictures."""
 
+import asyncio
 import base64
 import hashlib
 import re
@@ -7,14 +8,16 @@ import re
 from aiohttp import web
 
 from spherloc.errors import InputError
+from spherloc_viz.app.lesson_file import handout
 from spherloc_viz.app.web.guard import SAFE
 from spherloc_viz.app.web.viewer import SORRY_POLICY, sorry_page
 from spherloc_viz.lessons import lesson_named, lessons
 from spherloc_viz.lessons.course import picture_of
-from spherloc_viz.lessons.html import lesson_page, list_page
+from spherloc_viz.lessons.html import lesson_page, list_page, notes_page, teacher_page
 
 LEARN = "/learn"
 PICTURES = f"{LEARN}/pictures/"
+TEACHER = f"{LEARN}/teacher"
 
 
 def is_learning(path: str) -> bool:
@@ -22,22 +25,36 @@ def is_learning(path: str) -> bool:
     return path == LEARN or path.startswith(f"{LEARN}/")
 
 
-def learn_answer(request: web.Request) -> web.Response:
+async def learn_answer(request: web.Request) -> web.Response:
     """The list, a lesson, or a picture; who asks has been checked at the door."""
     path = request.path
     if path.startswith(PICTURES):
-        picture = picture_of(path.removeprefix(PICTURES))
+        picture = _picture(path.removeprefix(PICTURES))
         if picture is None:
             return web.Response(status=404, text="There is no such picture.\n", headers=SAFE)
         headers = SAFE | {"Cache-Control": "max-age=3600"}
         return web.Response(body=picture, content_type="image/webp", headers=headers)
     try:
         if path.rstrip("/") == LEARN:
-            pictures = {one.name: PICTURES + one.name for one in lessons() if picture_of(one.name)}
+            pictures = {one.name: f"{PICTURES}{one.name}" for one in lessons() if picture_of(one.name, one.picture)}
             return _html(list_page(lessons(), pictures))
-        return _html(lesson_page(lesson_named(path.removeprefix(f"{LEARN}/")), lessons()))
+        if path == TEACHER:
+            return _html(teacher_page(lessons()))
+        name, _, part = path.removeprefix(f"{LEARN}/").partition("/")
+        lesson = lesson_named(name)
+        if part == "notes":
+            return _html(notes_page(lesson))
+        if part == "handout":
+            return _html(await asyncio.to_thread(handout, lesson))
+        return _html(lesson_page(lesson, lessons()))
     except InputError as error:
         return _html(sorry_page(str(error)), SORRY_POLICY, 404)
+
+
+def _picture(name: str) -> bytes | None:
+    """The picture that stands for a lesson."""
+    lesson = next((one for one in lessons() if one.name == name), None)
+    return None if lesson is None else picture_of(name, lesson.picture)
 
 
 def _html(text: str, policy: str = "", status: int = 200) -> web.Response:

@@ -47,10 +47,14 @@ class Page:
     """The content security policy."""
 
 
+def client_html() -> str:
+    """The page of the installed viser as it comes."""
+    return (Path(viser.__file__).parent / "client" / "build" / "index.html").read_text(encoding="utf-8")
+
+
 def load_page(framed: bool = False) -> Page:
     """The page of the installed viser; ``framed`` is one that other pages of this machine may show in a frame."""
-    path = Path(viser.__file__).parent / "client" / "build" / "index.html"
-    html = path.read_text(encoding="utf-8")
+    html = client_html()
     own = Path(__file__).parent
     scripts = "".join(f"<script>{own.joinpath(name).read_text(encoding='utf-8')}</script>" for name in SCRIPTS)
     ours = f"{QUIET}<style>{own.joinpath(STYLE).read_text(encoding='utf-8')}</style>{scripts}"

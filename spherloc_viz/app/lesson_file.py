@@ -1,0 +1,144 @@
+"""Lessons as files: a page with recorded scenes that opens without a server, and the hand-out."""
+
+import base64
+import json
+from collections.abc import Callable, Mapping
+from html import escape
+
+from spherloc.diagnosis import diagnose
+from spherloc.errors import InputError
+from spherloc_viz import style
+from spherloc_viz.app.controls.steps_panel import find_step
+from spherloc_viz.app.linked_run import LinkedRun, LinkedRuns
+from spherloc_viz.app.run_display import without_truth
+from spherloc_viz.app.stage import views
+from spherloc_viz.app.stage.still_page import Still, scene_script, scripts_in, with_policy
+from spherloc_viz.app.stage.walls import MOST_BYTES, Walls
+from spherloc_viz.app.web.page import QUIET, client_html
+from spherloc_viz.layers import paint, steps, with_alternative
+from spherloc_viz.lessons.course import picture_of
+from spherloc_viz.lessons.html import Form, exported_page, handout_page, links_in, names_in
+from spherloc_viz.lessons.lesson import Lesson, Moment, changed_state
+from spherloc_viz.lessons.numbers import number_text, numbers_of
+
+ASPECT = 1.15
+"""Width over height for which views are chosen: between those of a screen's canvas and of a phone's."""
+MOST_BYTES_OF_FILE = 8_000_000
+BARE = "<style>#root button,[class*=Notifications-root]{display:none!important}</style>"
+"""Viser's own buttons and notes would be dead in a file."""
+LEAVES = frozenset({"mesh"})
+"""Layers that a file does not have: the meshes of maps would make it several times as large."""
+
+
+def exported(lesson: Lesson, tell: Callable[[str], None]) -> str:
+    """A lesson as one HTML file with all of its scenes; ``tell`` is called with how far it is, in a sentence.
+
+    Raises ``InputError`` for a state that cannot be shown, and for a file of more than ``MOST_BYTES_OF_FILE``.
+    """
+    runs, found = LinkedRuns(), {state: place for place, state in enumerate(recorded_states(lesson))}
+    asked = {name for moment in lesson.moments for text in texts(moment) for name in names_in(text)}
+    scripts, numbers = [], []
+    for state, place in found.items():
+        tell(f"scene {place + 1} of {len(found)}")
+        linked = runs.run(state)
+        scripts.append(scene_script(still_of(linked, runs)))
+        told = numbers_text(linked)
+        numbers.append({name: told[name] for name in asked & told.keys()})
+    viewer = client_html().replace("<title>Viser</title>", f"<title>scene</title>{QUIET}{BARE}", 1)
+    data = [
+        _data("viewer", json.dumps(viewer)),
+        _data("numbers", json.dumps({str(place): one for place, one in enumerate(numbers)})),
+        *(_data(f"scene-{place}", script) for place, script in enumerate(scripts)),
+    ]
+    forms = [_recorded(found, numbers[found[_state(moment.state)]]) for moment in lesson.moments]
+    page = exported_page(lesson, forms, "\n".join(data))
+    page = with_policy(page, [*scripts_in(viewer), *scripts])
+    if len(page.encode()) > MOST_BYTES_OF_FILE:
+        raise InputError(f"the lesson would be a file of {len(page.encode()) / 1e6:.1f} MB; make it two lessons.")
+    return page
+
+
+def handout(lesson: Lesson) -> str:
+    """A lesson as HTML to be printed; its pictures are inside."""
+    runs = LinkedRuns()
+    numbers = [numbers_text(runs.run(moment.state)) for moment in lesson.moments]
+    pictures = {}
+    for place in range(len(lesson.moments)):
+        picture = picture_of(lesson.name, place)
+        if picture is not None:
+            pictures[place] = f"data:image/webp;base64,{base64.b64encode(picture).decode()}"
+    return handout_page(lesson, numbers, pictures)
+
+
+def recorded_states(lesson: Lesson) -> tuple[str, ...]:
+    """All states that a lesson shows but for those of sliders and choices, each once."""
+    found: dict[str, None] = {}
+    for moment in lesson.moments:
+        answers = () if moment.question is None else moment.question.answers
+        links = [changes for text in texts(moment) for changes in links_in(text)]
+        for changes in ("", moment.before, *(answer.go for answer in answers), *links):
+            found[changed_state(moment.state, changes)] = None
+    return tuple(found)
+
+
+def texts(moment: Moment) -> tuple[str, ...]:
+    """All Markdown of a moment."""
+    asked = moment.question
+    answers = () if asked is None else (asked.ask, *(part for one in asked.answers for part in (one.text, one.shows)))
+    return moment.prose, moment.after, moment.notes, *answers
+
+
+def numbers_text(linked: LinkedRun) -> dict[str, str]:
+    """The numbers of a run as prose has them."""
+    return {name: number_text(value) for name, value in numbers_of(linked.run.trace).items()}
+
+
+def still_of(linked: LinkedRun, runs: LinkedRuns) -> Still:
+    """The canvas of a link, as the playground shows it."""
+    run, view = linked.run, linked.view
+    trace = without_truth(run.trace) if view.answers_hidden else run.trace
+    timeline = steps(trace)
+    index = find_step(timeline, view.step)
+    picture = paint(trace, index)
+    if index == len(timeline) - 1 and not view.answers_hidden:
+        alternative = diagnose(trace).alternative_cam_from_map
+        if alternative is not None:
+            picture = with_alternative(picture, trace, alternative)
+    turn = trace.problem.aligned.map_turn
+    mesh = runs.catalog.mesh(run.request.scene.scene)
+    walls = Walls(mesh, turn) if mesh is not None and len(mesh) <= MOST_BYTES else None
+    place = views.follow(picture, ASPECT, walls)
+    return Still(
+        title="",
+        note="",
+        items=[item for item in picture.scene if item.layer in style.LAYERS and item.layer not in LEAVES],
+        backdrop=None,
+        aligned_from_map=turn,
+        position=place.position,
+        target=place.target,
+        up=views.UP,
+        field_of_view_rad=place.field_of_view_rad,
+        dark=True,
+        reach=views.reach(place),
+    )
+
+
+def _state(state: str) -> str:
+    return changed_state(state, "")
+
+
+def _data(name: str, text: str) -> str:
+    """Text that the page's script reads; viser's page has closing tags of its own."""
+    return f'<script type="application/json" id="{name}">{text.replace("</", "<" + chr(92) + "/")}</script>'
+
+
+def _recorded(places: Mapping[str, int], numbers: Mapping[str, str]) -> Form:
+    """The form of a moment with recorded scenes; ``numbers`` are those of its run."""
+
+    def number(name: str) -> str:
+        return f'<output data-number="{name}">{escape(numbers[name])}</output>'
+
+    def at(state: str) -> str:
+        return f"at={places[_state(state)]}"
+
+    return Form(number, at, lambda state, changes: at(changed_state(state, changes)), controls=False)
