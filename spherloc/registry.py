@@ -23,6 +23,7 @@ KINDS = {
     "estimators": "estimator",
     "datasets": "dataset",
     "layers": "layer",
+    "lessons": "lesson",
 }
 """What there is to register, the last part of the name of its group of entry points, and what a sentence calls one."""
 RANSAC = "ransac-"

@@ -270,6 +270,38 @@ def play(
     return 0
 
 
+@app.command
+def lesson(
+    name: Positional[Annotated[str | None, arg(metavar="[NAME]")]] = None,
+    /,
+    export: OptionalPath = None,
+    handout: OptionalPath = None,
+) -> int:
+    """List the lessons, or write one as a file for machines without spherloc or for paper.
+
+    The lessons themselves are at /learn of the playground. An exported lesson is one HTML file with the scenes of all
+    its moments, which opens in any browser without a network; it has no sliders.
+
+    For example:
+
+    spherloc lesson
+
+    spherloc lesson ransac --export ransac.html
+
+    spherloc lesson ransac --handout ransac-handout.html
+
+    Args:
+        name: The lesson.
+        export: HTML file to write, with recorded scenes.
+        handout: HTML file to write, to be printed.
+    """
+    from spherloc_viz.lesson_command import list_lessons, write_lesson
+
+    if name is None:
+        return list_lessons(export, handout)
+    return write_lesson(name, export, handout)
+
+
 _OTHERS = (
     recording_commands.view,
     recording_commands.repeat,
@@ -325,8 +357,8 @@ def scenes(kind: Positional[Annotated[str | None, arg(metavar="[KIND]")]] = None
 def plugins(json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False) -> int:
     """List what other packages add to spherloc, and what of it cannot be used.
 
-    These are camera models, readers of calibration files, solvers, estimators, kinds of scene files and layers, which
-    packages register by entry points; docs/extending.md has an example of each. Estimators and solvers are tried on a
+    These are camera models, readers of calibration files, solvers, estimators, kinds of scene files, layers and
+    lessons, which packages register by entry points, see docs/extending.md. Estimators and solvers are tried on a
     tiny problem. Ends with 0, or with 1 if something cannot be used; everything else works without it.
 
     For example:
@@ -353,7 +385,7 @@ def main() -> None:
         if isinstance(stream, io.TextIOWrapper):  # names that are no UTF-8, or a terminal that knows ASCII only
             stream.reconfigure(errors="backslashreplace")
     try:
-        refuse_repeated(sys.argv[1:], (run, localize, sweep, play, scenes, plugins, *_OTHERS))
+        refuse_repeated(sys.argv[1:], (run, localize, sweep, play, lesson, scenes, plugins, *_OTHERS))
         code: Any = app.cli(
             prog="spherloc",
             description="See why visual localization with fisheye and 360-degree cameras succeeds or fails.",

@@ -13,6 +13,7 @@ from spherloc.solvers.base import solver_of
 from spherloc.warm_up import tiny_problem, warm_up
 from spherloc_viz import layers
 from spherloc_viz.layers.extension import layer_of
+from spherloc_viz.lessons.course import lesson_of, own_names
 from spherloc_viz.options import json_text, option_fields
 
 FORMATS = ("360loc", "adapter", "basalt", "kalibr", "kitti360", "stella", "toml")
@@ -78,7 +79,7 @@ def _group_text(kind: str, found: Collection[Extension]) -> str:
 
 
 def _taken(kind: str) -> tuple[str, ...]:
-    return layers.KINDS if kind == "layers" else ()
+    return {"layers": layers.KINDS, "lessons": own_names()}.get(kind, ())
 
 
 def _problem(kind: str, name: str, try_out: bool) -> str:
@@ -109,4 +110,5 @@ _LOOK: dict[str, Callable[[str], object]] = {
     "estimators": _look_at_estimator,
     "datasets": _look_at_loader,
     "layers": layer_of,
+    "lessons": lesson_of,
 }

@@ -130,3 +130,13 @@ def test_a_long_link_is_not_written(place: Place) -> None:
     scene = SceneRequest(place.label, 1)
     request = RunRequest(scene, "mc", default_options("mc", place.catalog.problem(scene)))
     assert place.link(request, PageView("outcome", hidden, "dark")) == ""
+
+
+def test_a_staged_case_of_the_gallery_is_named_by_its_key(place: Place) -> None:
+    text = "v=1&case=wrong-calibration_0&seed=4&estimator=mc&step=outcome"
+    followed = place.follower.follow(text, place.now, VIEW)
+    assert followed.remarks == () and place.catalog.case(followed.request.scene.scene) == "wrong-calibration_0"
+    assert "case=wrong-calibration_0" in place.link(followed.request, VIEW)
+    for wrong, remark in (("nothing", "the gallery has no case 'nothing'"), ("pairs-outvote", "is not staged")):
+        followed = place.follower.follow(f"v=1&case={wrong}", place.now, VIEW)
+        assert remark in followed.remarks[0] and followed.request.scene == place.now.scene

@@ -1,8 +1,8 @@
 """Lessons as files: a page with recorded scenes that opens without a server, and the hand-out."""
 
-import base64
 import json
 from collections.abc import Callable, Mapping
+from functools import lru_cache
 from html import escape
 
 from spherloc.diagnosis import diagnose
@@ -12,11 +12,11 @@ from spherloc_viz.app.controls.steps_panel import find_step
 from spherloc_viz.app.linked_run import LinkedRun, LinkedRuns
 from spherloc_viz.app.run_display import without_truth
 from spherloc_viz.app.stage import views
+from spherloc_viz.app.stage.flat_picture import svg
 from spherloc_viz.app.stage.still_page import Still, scene_script, scripts_in, with_policy
 from spherloc_viz.app.stage.walls import MOST_BYTES, Walls
 from spherloc_viz.app.web.page import QUIET, client_html
 from spherloc_viz.layers import paint, steps, with_alternative
-from spherloc_viz.lessons.course import picture_of
 from spherloc_viz.lessons.html import Form, exported_page, handout_page, links_in, names_in
 from spherloc_viz.lessons.lesson import Lesson, Moment, changed_state
 from spherloc_viz.lessons.numbers import number_text, numbers_of
@@ -26,12 +26,10 @@ ASPECT = 1.15
 MOST_BYTES_OF_FILE = 8_000_000
 BARE = "<style>#root button,[class*=Notifications-root]{display:none!important}</style>"
 """Viser's own buttons and notes would be dead in a file."""
-LEAVES = frozenset({"mesh"})
-"""Layers that a file does not have: the meshes of maps would make it several times as large."""
 
 
-def exported(lesson: Lesson, tell: Callable[[str], None]) -> str:
-    """A lesson as one HTML file with all of its scenes; ``tell`` is called with how far it is, in a sentence.
+def exported(lesson: Lesson, tell: Callable[[str], None], dark: bool = True) -> str:
+    """A lesson as one HTML file with all of its scenes; ``tell`` is called with how far it is, in a few words.
 
     Raises ``InputError`` for a state that cannot be shown, and for a file of more than ``MOST_BYTES_OF_FILE``.
     """
@@ -41,7 +39,7 @@ def exported(lesson: Lesson, tell: Callable[[str], None]) -> str:
     for state, place in found.items():
         tell(f"scene {place + 1} of {len(found)}")
         linked = runs.run(state)
-        scripts.append(scene_script(still_of(linked, runs)))
+        scripts.append(scene_script(still_of(linked, runs, dark)))
         told = numbers_text(linked)
         numbers.append({name: told[name] for name in asked & told.keys()})
     viewer = client_html().replace("<title>Viser</title>", f"<title>scene</title>{QUIET}{BARE}", 1)
@@ -58,16 +56,19 @@ def exported(lesson: Lesson, tell: Callable[[str], None]) -> str:
     return page
 
 
-def handout(lesson: Lesson) -> str:
+def handout_of(lesson: Lesson) -> str:
     """A lesson as HTML to be printed; its pictures are inside."""
     runs = LinkedRuns()
-    numbers = [numbers_text(runs.run(moment.state)) for moment in lesson.moments]
-    pictures = {}
-    for place in range(len(lesson.moments)):
-        picture = picture_of(lesson.name, place)
-        if picture is not None:
-            pictures[place] = f"data:image/webp;base64,{base64.b64encode(picture).decode()}"
-    return handout_page(lesson, numbers, pictures)
+    linked = [runs.run(moment.state) for moment in lesson.moments]
+    pictures = [svg(still_of(one, runs, dark=False)) for one in linked]
+    return handout_page(lesson, list(map(numbers_text, linked)), pictures)
+
+
+@lru_cache(maxsize=64)
+def picture(lesson: Lesson) -> str:
+    """The picture that stands for a lesson, SVG."""
+    runs = LinkedRuns()
+    return svg(still_of(runs.run(lesson.moments[lesson.picture].state), runs, dark=False))
 
 
 def recorded_states(lesson: Lesson) -> tuple[str, ...]:
@@ -93,7 +94,7 @@ def numbers_text(linked: LinkedRun) -> dict[str, str]:
     return {name: number_text(value) for name, value in numbers_of(linked.run.trace).items()}
 
 
-def still_of(linked: LinkedRun, runs: LinkedRuns) -> Still:
+def still_of(linked: LinkedRun, runs: LinkedRuns, dark: bool) -> Still:
     """The canvas of a link, as the playground shows it."""
     run, view = linked.run, linked.view
     trace = without_truth(run.trace) if view.answers_hidden else run.trace
@@ -108,17 +109,18 @@ def still_of(linked: LinkedRun, runs: LinkedRuns) -> Still:
     mesh = runs.catalog.mesh(run.request.scene.scene)
     walls = Walls(mesh, turn) if mesh is not None and len(mesh) <= MOST_BYTES else None
     place = views.follow(picture, ASPECT, walls)
+    layers = set(style.LAYERS) - ({"ground"} if mesh is not None else set())
     return Still(
         title="",
         note="",
-        items=[item for item in picture.scene if item.layer in style.LAYERS and item.layer not in LEAVES],
-        backdrop=None,
+        items=[item for item in picture.scene if item.layer in layers],
+        backdrop=mesh,
         aligned_from_map=turn,
         position=place.position,
         target=place.target,
         up=views.UP,
         field_of_view_rad=place.field_of_view_rad,
-        dark=True,
+        dark=dark,
         reach=views.reach(place),
     )
 

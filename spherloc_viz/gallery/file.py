@@ -50,7 +50,7 @@ def play_of(name: str) -> tuple[GalleryCase, Play]:
     case = next((case for case in gallery_cases() if case.key == key), None)
     plays: dict[str, Play] = {}
     if case is not None:
-        plays = {key: case} | {f"{key}_{place}": one for place, one in enumerate(case.beside)}
+        plays.update({key: case}, **{f"{key}_{place}": one for place, one in enumerate(case.beside)})
     if case is None or name not in plays:
         raise InputError(f"the gallery has no case {show(name)}; spherloc gallery --list has them all.")
     return case, plays[name]

@@ -229,14 +229,13 @@ def _lesson_html(lesson: Lesson, forms: Collection[Form], bar: str, onward: str,
     )
 
 
-def handout_page(lesson: Lesson, numbers: Collection[Mapping[str, str]], pictures: Mapping[int, str]) -> str:
-    """A lesson to be printed: the numbers of each moment's run, and addresses of pictures by a moment's place."""
+def handout_page(lesson: Lesson, numbers: Collection[Mapping[str, str]], pictures: Collection[str]) -> str:
+    """A lesson to be printed: the numbers of each moment's run, and its picture, SVG."""
     parts, solutions = [], []
-    for place, (moment, told) in enumerate(zip(lesson.moments, numbers, strict=True)):
+    for place, (moment, told, picture) in enumerate(zip(lesson.moments, numbers, pictures, strict=True)):
         form, state = printed(told), moment.state
         parts.append(f"<section><h2>{place + 1}. {escape(moment.title)}</h2>")
-        if place in pictures:
-            parts.append(f'<img src="{pictures[place]}" alt="The scene at the moment: {escape(moment.title)}">')
+        parts.append(f'<figure role="img" aria-label="The scene of {escape(moment.title)}">{picture}</figure>')
         parts.append(prose_html(moment.prose, state, form))
         question = moment.question
         if question is not None:
@@ -290,12 +289,11 @@ def notes_page(lesson: Lesson) -> str:
     )
 
 
-def list_page(course: Collection[Lesson], pictures: Mapping[str, str]) -> str:
-    """The list of all lessons; ``pictures`` are addresses of images by the name of a lesson."""
+def list_page(course: Collection[Lesson], pictures: str) -> str:
+    """The list of all lessons; ``pictures`` is the address of images, which have the names of lessons."""
     rows: dict[bool, list[str]] = {False: [], True: []}
     for lesson in course:
-        picture = pictures.get(lesson.name)
-        image = f'<img src="{picture}" alt="">' if picture else '<div class="blank"></div>'
+        image = f'<img src="{pictures}{escape(lesson.name)}" alt="" loading="lazy">'
         rows[lesson.lecture].append(
             f'<li><a href="/learn/{escape(lesson.name)}">{image}<div><h2>{escape(lesson.title)}</h2>'
             f"<p>{escape(lesson.summary)}</p><p class='dim'>{len(lesson.moments)} moments, about {lesson.minutes} min"

@@ -151,10 +151,13 @@ def _moment(text: str, where: str) -> Moment:
     prose, _, after = re.sub(
         BLOCK, lambda found: "\f" if found[1] == "question" else "", body
     ).partition("\f")  # fmt: skip
+    before = _get(table, "before", str, where, "")
+    if before and "question" not in said:
+        raise InputError(f"{where}: says before, but has no question that would end it.")
     return Moment(
         title,
         _get(table, "state", str, where),
-        _get(table, "before", str, where, ""),
+        before,
         float(_get(table, "minutes", (int, float), where, 2)),
         prose.strip(),
         _question(said["question"], where) if "question" in said else None,

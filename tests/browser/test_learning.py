@@ -1,9 +1,13 @@
 """A lesson as a reader and a teacher use it: the text moves the scene, and tells the numbers of its run."""
 
 import re
+from pathlib import Path
 
 from playground import BLIND, PATIENCE_MS, SHARPNESS, SIZE
 from playwright.sync_api import Browser, expect
+
+from spherloc_viz.app.lesson_file import exported
+from spherloc_viz.lessons import lesson_named
 
 
 def test_a_lesson_is_read(browser: Browser, address: str) -> None:
@@ -45,5 +49,65 @@ def test_a_lesson_is_read(browser: Browser, address: str) -> None:
     frame = next(one for one in page.frames if one != page.main_frame)
     assert "outlier_rate%3D0.9" in frame.url and "step=samples-needed" in frame.url
     expect(cost.locator(".open a")).to_have_attribute("href", re.compile("outlier_rate%3D0.9"))
+    assert errors == []
+    context.close()
+
+
+def test_the_teachers_notes_follow_in_a_window_of_their_own(browser: Browser, address: str) -> None:
+    context = browser.new_context(viewport=SIZE, reduced_motion="reduce")  # pyright: ignore[reportArgumentType]
+    context.add_init_script(BLIND)
+    page = context.new_page()
+    page.set_default_timeout(PATIENCE_MS)
+    page.goto(f"{address}/learn/ransac")
+    with context.expect_page() as opened:
+        page.keyboard.press("n")
+    notes = opened.value
+    notes.set_default_timeout(PATIENCE_MS)
+    expect(notes.locator(".where")).to_have_text(re.compile("^1 of"))
+    expect(page.locator(".notes").first).to_be_hidden()
+
+    # A remote control that is pointed at the notes turns the lesson's pages.
+    notes.keyboard.press("PageDown")
+    cost = page.locator("#moment-1")
+    expect(cost).to_have_class(re.compile("now"))
+    expect(notes.locator(".now")).to_have_attribute("data-place", "1")
+    cost.locator(".wrong button").first.click()
+    expect(notes.locator(".now .votes")).to_have_text("votes: 1, 0, 0")
+    expect(cost.locator(".after")).to_be_hidden()
+    notes.locator(".now [data-press=reveal]").click()
+    expect(cost.locator(".after")).to_be_visible()
+    context.close()
+
+
+def test_an_exported_lesson_is_read_without_a_server(browser: Browser, tmp_path: Path) -> None:
+    path = tmp_path / "lesson.html"
+    path.write_text(exported(lesson_named("yaw-arcs"), lambda words: None), encoding="utf-8")
+    context = browser.new_context(viewport=SIZE, reduced_motion="reduce")  # pyright: ignore[reportArgumentType]
+    context.add_init_script(BLIND)
+    page = context.new_page()
+    page.set_default_timeout(PATIENCE_MS)
+    errors: list[str] = []
+    asked: list[str] = []
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
+    page.on("request", lambda request: asked.append(request.url))
+    page.on("websocket", lambda socket: asked.append(socket.url))
+    page.goto(path.as_uri())
+    arcs = """() => Object.keys(document.querySelector(".scene iframe:not(.coming)")?.contentWindow.__viserSceneTree
+        ?.getState() ?? {}).filter(name => name.startsWith("/ring"))"""
+    expect(page.locator("body")).not_to_have_class(re.compile("opening"))
+    first = page.evaluate(arcs)
+    assert first
+
+    page.keyboard.press("PageDown")
+    second = page.locator("#moment-1")
+    expect(second).to_have_class(re.compile("now"))
+    expect(second.locator(".after")).to_be_hidden()
+    second.locator(".right button").click()
+    expect(second.locator("[data-number=pairs_at_yaw]")).to_have_text("218")
+    expect(page.locator(".scene iframe")).to_have_count(1)
+    page.wait_for_function(f"before => ({arcs})().join() !== before", arg=",".join(first))
+    own = path.as_uri()
+    assert [url for url in asked if not url.startswith((own, "data:", "blob:", "about:"))] == []
     assert errors == []
     context.close()

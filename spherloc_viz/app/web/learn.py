@@ -8,16 +8,16 @@ import re
 from aiohttp import web
 
 from spherloc.errors import InputError
-from spherloc_viz.app.lesson_file import handout
+from spherloc_viz.app.lesson_file import handout_of, picture
 from spherloc_viz.app.web.guard import SAFE
 from spherloc_viz.app.web.viewer import SORRY_POLICY, sorry_page
 from spherloc_viz.lessons import lesson_named, lessons
-from spherloc_viz.lessons.course import picture_of
 from spherloc_viz.lessons.html import lesson_page, list_page, notes_page, teacher_page
 
 LEARN = "/learn"
 PICTURES = f"{LEARN}/pictures/"
 TEACHER = f"{LEARN}/teacher"
+_one_at_a_time = asyncio.Lock()
 
 
 def is_learning(path: str) -> bool:
@@ -29,15 +29,10 @@ async def learn_answer(request: web.Request) -> web.Response:
     """The list, a lesson, or a picture; who asks has been checked at the door."""
     path = request.path
     if path.startswith(PICTURES):
-        picture = _picture(path.removeprefix(PICTURES))
-        if picture is None:
-            return web.Response(status=404, text="There is no such picture.\n", headers=SAFE)
-        headers = SAFE | {"Cache-Control": "max-age=3600"}
-        return web.Response(body=picture, content_type="image/webp", headers=headers)
+        return await _picture(path.removeprefix(PICTURES))
     try:
         if path.rstrip("/") == LEARN:
-            pictures = {one.name: f"{PICTURES}{one.name}" for one in lessons() if picture_of(one.name, one.picture)}
-            return _html(list_page(lessons(), pictures))
+            return _html(list_page(lessons(), PICTURES))
         if path == TEACHER:
             return _html(teacher_page(lessons()))
         name, _, part = path.removeprefix(f"{LEARN}/").partition("/")
@@ -45,16 +40,22 @@ async def learn_answer(request: web.Request) -> web.Response:
         if part == "notes":
             return _html(notes_page(lesson))
         if part == "handout":
-            return _html(await asyncio.to_thread(handout, lesson))
+            return _html(await asyncio.to_thread(handout_of, lesson))
         return _html(lesson_page(lesson, lessons()))
     except InputError as error:
         return _html(sorry_page(str(error)), SORRY_POLICY, 404)
 
 
-def _picture(name: str) -> bytes | None:
-    """The picture that stands for a lesson."""
-    lesson = next((one for one in lessons() if one.name == name), None)
-    return None if lesson is None else picture_of(name, lesson.picture)
+async def _picture(name: str) -> web.Response:
+    """The picture that stands for a lesson; one is made at a time."""
+    try:
+        lesson = lesson_named(name)
+        async with _one_at_a_time:
+            image = await asyncio.to_thread(picture, lesson)
+    except InputError as error:
+        return web.Response(status=404, text=f"{error}\n", headers=SAFE)
+    headers = SAFE | {"Cache-Control": "max-age=3600"}
+    return web.Response(text=image, content_type="image/svg+xml", headers=headers)
 
 
 def _html(text: str, policy: str = "", status: int = 200) -> web.Response:
