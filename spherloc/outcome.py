@@ -11,26 +11,19 @@ from enum import StrEnum
 import numpy as np
 
 from spherloc.bounds import bounds_of
-from spherloc.consensus.chance import chance_rate, nfa
+from spherloc.consensus.chance import chance_rate
 from spherloc.consensus.inliers import mark_each
 from spherloc.consensus.two_point_search import search_two_point
 from spherloc.diagnosis.evidence import FEW, LOOSE_ENDS, different, pose_sd
-from spherloc.gauss_newton import Noise
+from spherloc.free_gravity import LEAST_LEAD, MOST_NFA, count_distinct, expected_by_chance, lead, nearby_support
 from spherloc.metrics import SUCCESS_DEG, SUCCESS_M
-from spherloc.narrowing import NARROWINGS, narrow
 from spherloc.problem import AlignedProblem
-from spherloc.refine import RefinementOptions, gravity_sd_rad, matches_of, residuals_px
+from spherloc.refine import RefinementOptions, gravity_sd_rad, residuals_px
 from spherloc.trace import ConsensusStage, RefinementStage, Trace
 from spherloc.types import BoolArray, FloatArray
 
-MOST_NFA = 1e-3
-"""Expected number of false alarms (NFA) of the size of the inliers below which they are believed."""
-LEAST_LEAD = 2.0
-"""By how many standard deviations of counting a pose must lead an alternative that stands out from chance itself."""
 LEAST_SDS = 2.0
 """Standard deviations that must lie within the error of a success."""
-TILT_RAD = np.radians(6.0)
-"""Gravity errors up to about this are looked for."""
 SAMPLES, CONFIDENCE = 2000, 0.99
 """Of the search for an alternative among what the pose does not explain."""
 FAR = 3.0
@@ -70,7 +63,7 @@ def judge(trace: Trace) -> Judgement:
     limits = bounds.pixels if stage is not None and stage.dof == 4 else np.full(len(aligned.points), bound_px)
     errors = residuals_px(aligned, state)
     inliers, fixed_by = errors <= limits, 3 if stage is not None and stage.dof == 6 else 2
-    size, rate = _different(aligned, inliers), chance_rate(aligned.bearings, np.minimum(bounds.radians, np.pi / 2))
+    size, rate = count_distinct(aligned, inliers), chance_rate(aligned.bearings, np.minimum(bounds.radians, np.pi / 2))
     if fixed_by == 3:
         rate = chance_rate(aligned.bearings, bounds_of(replace(aligned, gravity_bound_rad=0.0), bound_px).radians)
     found = [
@@ -84,21 +77,8 @@ def judge(trace: Trace) -> Judgement:
     return Judgement(Outcome.DOUBTFUL if reasons else Outcome.LOCALIZED, float(score), reasons)
 
 
-def _different(aligned: AlignedProblem, mask: BoolArray) -> int:
-    """Masked correspondences, those that share a point or a bearing counted once."""
-    if not mask.any():
-        return 0
-    points, bearings = np.unique(aligned.points[mask], axis=0), np.unique(aligned.bearings[mask], axis=0)
-    return min(len(points), len(bearings))
-
-
-def _expected(count: int, size: int, rate: float, fixed_by: int) -> float:
-    """Chance sets of that size, where so many correspondences fix a pose."""
-    return nfa(count, size, rate) * rate ** (2 - fixed_by) if size > fixed_by else np.inf
-
-
 def _chance_margin(count: int, size: int, rate: float, fixed_by: int) -> tuple[float, str]:
-    expected = max(_expected(count, size, rate, fixed_by), 1e-300)
+    expected = max(expected_by_chance(count, size, rate, fixed_by), 1e-300)
     margin = np.log10(MOST_NFA) - np.log10(min(expected, 1e300))
     many = f"{expected:.1g}" if expected < 1e6 else "millions"
     return margin, f"Only {size} different matches agree with it; {many} such sets are expected by chance."
@@ -114,7 +94,7 @@ def _alternative_margin(
     )
     for other in poses:
         if different(state, other):
-            most = max(most, _different(aligned, (residuals_px(aligned, other) <= bound_px) & (errors > bound_px)))
+            most = max(most, count_distinct(aligned, (residuals_px(aligned, other) <= bound_px) & (errors > bound_px)))
     rest = np.flatnonzero(errors > FAR * bound_px)
     if len(rest) > 2:
         names = ("index", "bearings", "points", "pixel_from_bearing", "radians_per_pixel")
@@ -125,23 +105,22 @@ def _alternative_margin(
             best = int(np.argmax(found.support))
             yaws, places = found.yaws_rad[best : best + 1], found.translations[best : best + 1]
             mask = mark_each(yaws, places, part.bearings, part.points, part.pixel_from_bearing, limits)[0]
-            most = max(most, _different(part, mask))
-    if _expected(len(aligned.points), most, rate, fixed_by) > MOST_NFA:
+            most = max(most, count_distinct(part, mask))
+    if expected_by_chance(len(aligned.points), most, rate, fixed_by) > MOST_NFA:
         return np.inf, ""
-    lead = (size - most) / np.sqrt(max(size + most, 1))
-    return lead - LEAST_LEAD, f"Another pose explains {most} different matches, this one {size}."
+    return lead(size, most) - LEAST_LEAD, f"Another pose explains {most} different matches, this one {size}."
 
 
 def _gravity_margin(
     aligned: AlignedProblem, state: FloatArray, bound_px: float, inliers: BoolArray, options: RefinementOptions
 ) -> tuple[float, str]:
     """By how little a pose nearby explains more if gravity is not believed."""
-    wide = np.maximum(bounds_of(aligned, bound_px).pixels, bound_px + TILT_RAD * aligned.pixels_per_radian)
-    tight, path = np.full(len(wide), bound_px), np.empty((len(NARROWINGS), 3, 4))
-    narrow(matches_of(aligned), wide, tight, state.copy(), Noise(float(options.noise_px), np.inf), path)
-    size, free = _different(aligned, inliers), _different(aligned, residuals_px(aligned, path[-1]) <= tight)
-    lead = (free - size) / np.sqrt(max(free + size, 1))
-    return LEAST_LEAD - lead, f"Without the known gravity, {free} different matches agree instead of {size}."
+    size = count_distinct(aligned, inliers)
+    free = nearby_support(aligned, state, bound_px, float(options.noise_px))
+    return (
+        LEAST_LEAD - lead(free, size),
+        f"Without the known gravity, {free} different matches agree instead of {size}.",
+    )
 
 
 def _error_margin(trace: Trace, aligned: AlignedProblem, state: FloatArray, inliers: BoolArray) -> tuple[float, str]:

@@ -38,6 +38,7 @@ FLOORS = (
         "spherloc.noise_scale",
         "spherloc.refine",
         "spherloc.last_step",
+        "spherloc.free_gravity",
         "spherloc.metrics",
         "spherloc.datasets",
         "spherloc.frontend",

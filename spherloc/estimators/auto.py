@@ -1,18 +1,25 @@
-"""auto: chooses between ``mc-exact`` and ``ransac-2p`` from what can be measured beforehand, and says why."""
+"""auto: chooses between ``mc-exact`` and ``ransac-2p`` from what can be measured beforehand, and says why.
 
-from dataclasses import dataclass, fields
+Where what comes out contradicts the given gravity, the pose is found without it.
+"""
+
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from spherloc.bounds import Bounds
+from spherloc.bounds import Bounds, bounds_of
 from spherloc.consensus.chance import chance_rate, nfa
 from spherloc.consensus.two_point_search import TwoPointSearch, search_two_point
 from spherloc.estimators.base import Clock, Outcome, check_positive
 from spherloc.estimators.mc_exact import MOST_CORRESPONDENCES, ExactMaximumConsensus, McExactOptions
 from spherloc.estimators.ransac import RansacOptions, TwoPointRansac
+from spherloc.free_gravity import Contradiction, contradicts, without_gravity
+from spherloc.geometry import pose, yaw_rotation
+from spherloc.last_step import conclude
 from spherloc.problem import AlignedProblem
-from spherloc.refine import RefinementOptions
+from spherloc.refine import RefinementOptions, noise_of
 from spherloc.trace import DecisionStage
+from spherloc.types import BoolArray, FloatArray
 
 PROBE_SAMPLES = 500
 MOST_PROBE_SAMPLES = 5000
@@ -56,6 +63,10 @@ class Auto:
                 watch=clock.watch,
             )
             decision = _decide(aligned, bounds, probe)
+        # With uncertain gravity the exact search takes seconds where it is in vain.
+        early = decision.chosen == "mc-exact" and aligned.gravity_bound_rad > 0.0
+        if early and (wrong := _gravity_fault(aligned, *_best_of(aligned, bounds, probe, options), options, clock)):
+            return _without_gravity(aligned, wrong, decision, options)
         shared = {item.name: getattr(options, item.name) for item in fields(options)}
         if decision.chosen == "mc-exact":
             outcome = ExactMaximumConsensus.run(aligned, McExactOptions(**shared), bounds, seed, clock)
@@ -68,6 +79,8 @@ class Auto:
                 local_optimization=True,
             )
             outcome = TwoPointRansac.run(aligned, sampling, bounds, seed, clock)
+        if not early and (wrong := _gravity_fault(aligned, outcome.cam_from_map, outcome.inlier_mask, options, clock)):
+            return _without_gravity(aligned, wrong, decision, options)
         return Outcome(
             (decision, *outcome.stages),
             outcome.cam_from_map,
@@ -76,6 +89,46 @@ class Auto:
             outcome.note,
             outcome.certificate,
         )
+
+
+def _best_of(
+    aligned: AlignedProblem, bounds: Bounds, probe: TwoPointSearch, options: AutoOptions
+) -> tuple[FloatArray | None, BoolArray]:
+    """The probe's best pose (3, 4), refined, if it has one, and the mask (M,) of its inliers."""
+    if not probe.found:
+        return None, np.zeros(len(aligned.points), dtype=bool)
+    best = int(np.argmax(probe.support))
+    start = pose(yaw_rotation(probe.yaws_rad[best]), probe.translations[best])
+    return conclude(aligned, [start], bounds, options)[:2]
+
+
+def _gravity_fault(
+    aligned: AlignedProblem, cam_from_map: FloatArray | None, inliers: BoolArray, options: AutoOptions, clock: Clock
+) -> Contradiction | None:
+    """What shows the given gravity to be beyond its bound; None where nothing does, or nothing is known of gravity."""
+    noise = noise_of(aligned, options)
+    if not np.isfinite(noise.gravity_sd_rad):
+        return None
+    with clock.stage("gravity"):
+        return contradicts(aligned, cam_from_map, inliers, float(options.bound_px), noise.sd_px)
+
+
+def _without_gravity(
+    aligned: AlignedProblem, wrong: Contradiction, decision: DecisionStage, options: AutoOptions
+) -> Outcome:
+    """The outcome where gravity is beyond its bound: the pose that shows it, refined without gravity."""
+    more = f": {wrong.support} different matches agree without it, {wrong.believed_support} with it"
+    note = (
+        f"Gravity is off by {np.degrees(wrong.tilt_rad):.2g}°, beyond its bound of "
+        f"{np.degrees(aligned.gravity_bound_rad):.2g}°{more if wrong.support > wrong.believed_support else ''}. The "
+        "pose is found without it."
+    )
+    free = without_gravity(aligned)
+    state, mask, refinement = conclude(
+        free, [wrong.cam_from_map], bounds_of(free, float(options.bound_px)), replace(options, gravity_sd_deg=np.inf)
+    )
+    told = replace(decision, reason=f"{decision.reason} {note}")
+    return Outcome((told, refinement), state, mask, note=note)
 
 
 def _probe_samples(aligned: AlignedProblem) -> int:
