@@ -145,7 +145,7 @@ install_python() {
   watch "$venv" -m pip install --disable-pip-version-check -e ".$extras" ||
     die "pip could not install the packages, for the reason above; mend that and try again."
   if [[ $target != @(lint|docs) ]]; then
-    say "compiling the solvers, once: one to three minutes"
+    say "compiling the solvers, once: one to two minutes"
     "$venv" -c "from spherloc.warm_up import warm_up; warm_up(estimators=$([ "$target" = play ] && echo "['mc']" || echo None))" ||
       die "the solvers could not be prepared, for the reason above; mend that and try again."
   fi

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from spherloc.kernel_cache import kernel
+from spherloc.small_arrays import copy_matrix, copy_vector, moved_point, write_pose, write_translation_to
 from spherloc.types import FloatArray
 
 ROBUST_NONE, ROBUST_HUBER, ROBUST_CAUCHY = 0, 1, 2
@@ -99,10 +100,10 @@ def polish_path(matches, chosen, rotation, translation, noise, robust, most_step
     count, centre = middle_of(matches.points, chosen)
     if count < 2:
         return 0
-    middle = rotation @ centre + translation
+    middle = moved_point(rotation, translation, centre)
     if noise.gravity_sd_rad < LEAST_GRAVITY_SD_RAD:
-        rotation[:] = nearest_yaw(rotation)
-        translation[:] = middle - rotation @ centre
+        write_yaw(nearest_yaw(rotation), rotation)
+        write_translation_to(middle, rotation, centre, translation)
     model = CostModel(noise, robust, degrees_of_freedom(count, noise.gravity_sd_rad))
     system, next_system, step = empty_equations(), empty_equations(), np.empty(6)
     turned, moved, factor = np.empty((3, 3)), np.empty(3), np.empty((6, 6))
@@ -113,20 +114,25 @@ def polish_path(matches, chosen, rotation, translation, noise, robust, most_step
         lower = np.inf
         if solve(system, damping, factor, step):
             turn(step, rotation, turned)
-            moved[:] = middle + step[3:]
+            for k in range(3):
+                moved[k] = middle[k] + step[3 + k]
             lower = normal_equations(matches, chosen, centre, turned, moved, model, next_system)
         if not lower < cost:
-            if lower < np.inf and -(system.gradient @ step) <= GAIN_TOLERANCE * cost:
+            expected = 0.0
+            for k in range(6):
+                expected -= system.gradient[k] * step[k]
+            if lower < np.inf and expected <= GAIN_TOLERANCE * cost:
                 break
             damping = max(LEAST_DAMPING, 10.0 * damping)
             continue
         gain, cost = cost - lower, lower
-        rotation[:], middle[:] = turned, moved
-        translation[:] = middle - rotation @ centre
+        copy_matrix(turned, rotation)
+        copy_vector(moved, middle)
+        write_translation_to(middle, rotation, centre, translation)
         system, next_system = next_system, system
         damping = 0.1 * damping if damping > LEAST_DAMPING else 0.0
         if steps < len(path):
-            path[steps, :, :3], path[steps, :, 3] = rotation, translation
+            write_pose(rotation, translation, path[steps])
         steps += 1
         if gain <= GAIN_TOLERANCE * cost:
             break
@@ -147,24 +153,37 @@ def middle_of(points, chosen):
     for k in range(len(points)):
         if chosen[k]:
             count, x, y, z = count + 1, x + points[k, 0], y + points[k, 1], z + points[k, 2]
-    return count, np.array([x, y, z]) / max(count, 1)
+    middle, divisor = np.empty(3), max(count, 1)
+    middle[0], middle[1], middle[2] = x / divisor, y / divisor, z / divisor
+    return count, middle
 
 
 @kernel()
 def nearest_yaw(rotation):
-    """The rotation (3, 3) about y closest to ``rotation``; see ``geometry.yaw_of``."""
-    yaw = np.arctan2(rotation[0, 2] - rotation[2, 0], rotation[0, 0] + rotation[2, 2])
+    """Yaw, rad, of the rotation about y closest to ``rotation`` (3, 3); see ``geometry.yaw_of``."""
+    return np.arctan2(rotation[0, 2] - rotation[2, 0], rotation[0, 0] + rotation[2, 2])
+
+
+@kernel()
+def write_yaw(yaw, rotation):
+    """Write the rotation by a yaw, rad, to ``rotation`` (3, 3), or to that of a pose (3, 4)."""
     c, s = np.cos(yaw), np.sin(yaw)
-    return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+    rotation[0, 0], rotation[0, 1], rotation[0, 2] = c, 0.0, s
+    rotation[1, 0], rotation[1, 1], rotation[1, 2] = 0.0, 1.0, 0.0
+    rotation[2, 0], rotation[2, 1], rotation[2, 2] = -s, 0.0, c
 
 
 @kernel()
 def levelled(cam_from_map, centre):
     """The pose (3, 4) with the nearest yaw for its rotation that leaves the point ``centre`` (3,), m, where it is."""
-    rotation = cam_from_map[:, :3].copy()
-    level = np.empty((3, 4))
-    level[:, :3] = nearest_yaw(rotation)
-    level[:, 3] = cam_from_map[:, 3] + (rotation - level[:, :3]) @ centre
+    level, tilt = np.empty((3, 4)), np.empty((3, 3))
+    write_yaw(nearest_yaw(cam_from_map), level)
+    for a in range(3):
+        for b in range(3):
+            tilt[a, b] = cam_from_map[a, b] - level[a, b]
+    moved = tilt @ centre
+    for k in range(3):
+        level[k, 3] = cam_from_map[k, 3] + moved[k]
     return level
 
 
@@ -185,7 +204,7 @@ def turn(step, rotation, turned):
         turned[2, k] = z + first * dz + second * (wx * dy - wy * dx)
 
 
-@kernel(inline="always")
+@kernel()
 def robust_weight(square, robust):
     """rho(s) and its derivative, s = ``square`` a squared residual in units of the noise's variance."""
     if robust == ROBUST_HUBER and square > HUBER_WIDTH * HUBER_WIDTH:
@@ -248,18 +267,29 @@ def normal_equations(matches, chosen, centre, rotation, middle, model, system):
         b0, b1, b2 = scale * (u0 * ru + v0 * rv), scale * (u1 * ru + v1 * rv), scale * (u2 * ru + v2 * rv)
         g0, g1, g2 = g0 + ay * b2 - az * b1, g1 + az * b0 - ax * b2, g2 + ax * b1 - ay * b0
         g3, g4, g5 = g3 + b0, g4 + b1, g5 + b2
-    hessian[0] = h00, h01, h02, h03, h04, h05
-    hessian[1] = h01, h11, h12, h13, h14, h15
-    hessian[2] = h02, h12, h22, h23, h24, h25
-    hessian[3] = h03, h13, h23, h33, h34, h35
-    hessian[4] = h04, h14, h24, h34, h44, h45
-    hessian[5] = h05, h15, h25, h35, h45, h55
-    gradient[:] = g0, g1, g2, g3, g4, g5
-    hessian *= precision
-    gradient *= precision
+    hessian[0, 0], hessian[0, 1], hessian[0, 2], hessian[0, 3], hessian[0, 4], hessian[0, 5] = (
+        h00,
+        h01,
+        h02,
+        h03,
+        h04,
+        h05,
+    )
+    hessian[1, 1], hessian[1, 2], hessian[1, 3], hessian[1, 4], hessian[1, 5] = h11, h12, h13, h14, h15
+    hessian[2, 2], hessian[2, 3], hessian[2, 4], hessian[2, 5] = h22, h23, h24, h25
+    hessian[3, 3], hessian[3, 4], hessian[3, 5] = h33, h34, h35
+    hessian[4, 4], hessian[4, 5], hessian[5, 5] = h44, h45, h55
+    gradient[0], gradient[1], gradient[2], gradient[3], gradient[4], gradient[5] = g0, g1, g2, g3, g4, g5
+    for a in range(6):
+        gradient[a] *= precision
+        for b in range(a, 6):
+            hessian[a, b] *= precision
+            hessian[b, a] = hessian[a, b]
     if model.dof == 4:
-        for k in (0, 2):
-            hessian[k, :], hessian[:, k], hessian[k, k], gradient[k] = 0.0, 0.0, 1.0, 0.0
+        for k in range(0, 3, 2):
+            for a in range(6):
+                hessian[k, a] = hessian[a, k] = 0.0
+            hessian[k, k], gradient[k] = 1.0, 0.0
         return cost
     return cost + add_gravity(rotation, model.noise.gravity_sd_rad, system)
 
@@ -285,11 +315,14 @@ def add_gravity(rotation, gravity_sd_rad, system):
     angle = tilt_of(rotation)
     # Level, any direction will do, and upside down none is better.
     ux, uz, stretch = (gx / sine, gz / sine, min(angle / sine, 1e6)) if sine > 0.0 else (1.0, 0.0, 1.0)
-    by_x, by_y, by_z = np.array([0.0, gz, -gy]), np.array([-gz, 0.0, gx]), np.array([gy, -gx, 0.0])  # of w x R e_y
-    outward = ux * by_x + uz * by_z
-    by_angle = gy * outward - sine * by_y
-    for u, by in ((ux, by_x), (uz, by_z)):
-        row = (u * by_angle + stretch * (by - u * outward)) / gravity_sd_rad
+    by_x, by_y, by_z = (0.0, gz, -gy), (-gz, 0.0, gx), (gy, -gx, 0.0)  # of w x R e_y
+    row = np.empty(3)
+    for axis in range(2):
+        u, by = (ux, by_x) if axis == 0 else (uz, by_z)
+        for a in range(3):
+            outward = ux * by_x[a] + uz * by_z[a]
+            by_angle = gy * outward - sine * by_y[a]
+            row[a] = (u * by_angle + stretch * (by[a] - u * outward)) / gravity_sd_rad
         residual = angle * u / gravity_sd_rad
         for a in range(3):
             gradient[a] += row[a] * residual
@@ -320,7 +353,7 @@ def factorise(hessian, damping, factor):
     return True
 
 
-@kernel(inline="always")
+@kernel()
 def scale_of(hessian, k):
     """What scales column ``k`` of the normal equations (6, 6) to length 1."""
     return 1.0 / np.sqrt(hessian[k, k]) if hessian[k, k] > 0.0 else 1.0

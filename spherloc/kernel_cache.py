@@ -24,6 +24,7 @@ from spherloc.disk_cache import user_cache
 KERNEL_SOURCES = (
     "watch.py",
     "geometry.py",
+    "small_arrays.py",
     "gauss_newton.py",
     "narrowing.py",
     "refine.py",

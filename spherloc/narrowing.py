@@ -17,12 +17,24 @@ from spherloc.gauss_newton import (
     empty_equations,
     middle_of,
     normal_equations,
-    polish,
+    polish_path,
     solve,
     tilt_of,
     turn,
 )
 from spherloc.kernel_cache import kernel
+from spherloc.small_arrays import (
+    copy_matrix,
+    copy_vector,
+    equal,
+    fill_vector,
+    mark_within,
+    moved_point,
+    rotation_of,
+    translation_of,
+    write_pose,
+    write_translation_to,
+)
 
 NARROWINGS = (1.0, 0.4, 0.15, 0.0)
 """Shares of what gravity's error adds to the bound that the successive bounds keep."""
@@ -135,20 +147,29 @@ def _step(matches, chosen, cam_from_map, noise, damping):
     if count < 2:
         return 0.0
     step, factor = np.empty(6), np.empty((6, 6))
-    rotation, turned = cam_from_map[:, :3].copy(), np.empty((3, 3))
-    middle = rotation @ centre + cam_from_map[:, 3]
+    rotation, turned = rotation_of(cam_from_map), np.empty((3, 3))
+    middle = moved_point(rotation, translation_of(cam_from_map), centre)
     model = CostModel(noise, np.int64(ROBUST_NONE), degrees_of_freedom(count, noise.gravity_sd_rad))
     system = empty_equations()
     cost = normal_equations(matches, chosen, centre, rotation, middle, model, system)
     if not cost < np.inf or not solve(system, damping, factor, step):
         return 0.0
-    length = np.sqrt((step * step).sum())
+    square = 0.0
+    for k in range(6):
+        square += step[k] * step[k]
     turn(step, rotation, turned)
-    moved = middle + step[3:] - turned @ centre
-    if not np.isfinite(moved).all() or not np.isfinite(turned).all():
-        return 0.0
-    cam_from_map[:, :3], cam_from_map[:, 3] = turned, moved
-    return length
+    translation = np.empty(3)
+    for k in range(3):
+        middle[k] += step[3 + k]
+    write_translation_to(middle, turned, centre, translation)
+    for a in range(3):
+        for b in range(3):
+            if not np.isfinite(turned[a, b]):
+                return 0.0
+        if not np.isfinite(translation[a]):
+            return 0.0
+    write_pose(turned, translation, cam_from_map)
+    return np.sqrt(square)
 
 
 @kernel()
@@ -157,11 +178,13 @@ def narrow(matches, wide_px, tight_px, start, noise, path):
 
     The pose at each bound is written to ``path`` (``len(NARROWINGS)``, 3, 4).
     """
-    state = start.copy()
-    for index, share in enumerate(NARROWINGS):
-        limits = tight_px + share * (wide_px - tight_px)
+    state, limits = np.empty((3, 4)), np.empty(len(wide_px))
+    copy_matrix(start, state)
+    for index in range(len(NARROWINGS)):
+        for k in range(len(limits)):
+            limits[k] = tight_px[k] + NARROWINGS[index] * (wide_px[k] - tight_px[k])
         robust_steps(matches, limits, state, noise, np.int64(MOST_STEPS))
-        path[index] = state
+        copy_matrix(state, path[index])
 
 
 @kernel()
@@ -172,21 +195,25 @@ def descend(matches, limits_px, cam_from_map, noise, path):
     4). Returns how many, and the truncated squares at the bounds ``limits_px`` (M,).
     """
     count, states = len(matches.points), 0
-    errors, before = np.empty(count), np.zeros(count, np.bool_)
+    errors, before, mask = np.empty(count), np.zeros(count, np.bool_), np.empty(count, np.bool_)
+    state, no_path = np.empty((3, 4)), np.empty((0, 3, 4))
     least = truncated_squares(matches, limits_px, cam_from_map, noise, np.inf)
     while states < MOST_DESCENTS:
         errors_of(matches, cam_from_map, errors)
-        mask = errors <= limits_px
-        if np.array_equal(mask, before):
+        mark_within(errors, limits_px, mask)
+        if equal(mask, before):
             break
-        rotation, translation = cam_from_map[:, :3].copy(), cam_from_map[:, 3].copy()
-        polish(matches, mask, rotation, translation, noise, np.int64(ROBUST_NONE), np.int64(MOST_STEPS))
-        state = np.empty((3, 4))
-        state[:, :3], state[:, 3] = rotation, translation
+        rotation, translation = rotation_of(cam_from_map), translation_of(cam_from_map)
+        robust, most_steps = np.int64(ROBUST_NONE), np.int64(MOST_STEPS)
+        polish_path(matches, mask, rotation, translation, noise, robust, most_steps, no_path)
+        write_pose(rotation, translation, state)
         cost = truncated_squares(matches, limits_px, state, noise, np.inf)
         if not cost < least:
             break
-        cam_from_map[:], path[states], least, before = state, state, cost, mask
+        copy_matrix(state, cam_from_map)
+        copy_matrix(state, path[states])
+        copy_vector(mask, before)
+        least = cost
         states += 1
     return states, least
 
@@ -200,12 +227,19 @@ def search_nearby(matches, wide_px, limits_px, start, noise, best, least):
     """
     errors = np.empty(len(matches.points))
     errors_of(matches, start, errors)
-    around = np.flatnonzero(errors <= wide_px)
-    if len(around) <= SAMPLE_SIZE:
+    around, size = np.empty(len(errors), np.int64), 0
+    for k in range(len(errors)):
+        if errors[k] <= wide_px[k]:
+            around[size] = k
+            size += 1
+    if size <= SAMPLE_SIZE:
         return least
+    around = around[:size]
     random_state, drawn, improved = np.uint64(0x9E3779B97F4A7C15), 0, 0
     needed = _samples_needed(matches, limits_px, best, around, errors)
-    sample, chosen = np.empty(SAMPLE_SIZE, np.int64), np.ones(SAMPLE_SIZE, np.bool_)
+    sample, chosen, state = np.empty(SAMPLE_SIZE, np.int64), np.empty(SAMPLE_SIZE, np.bool_), np.empty((3, 4))
+    few = Matches(np.empty((SAMPLE_SIZE, 3)), np.empty((SAMPLE_SIZE, 3)), np.empty((SAMPLE_SIZE, 2, 3)))
+    fill_vector(chosen, True)
     while drawn < MOST_SAMPLES and (drawn < needed or drawn < improved + LEAST_SAMPLES):
         for k in range(SAMPLE_SIZE):
             fresh = False
@@ -215,8 +249,8 @@ def search_nearby(matches, wide_px, limits_px, start, noise, best, least):
                 for other in range(k):
                     fresh = fresh and sample[other] != sample[k]
         drawn += 1
-        state = start.copy()
-        few = Matches(matches.bearings[sample], matches.points[sample], matches.pixel_jacobian[sample])
+        copy_matrix(start, state)
+        _take(matches, sample, few)
         for _ in range(SAMPLE_STEPS):
             _step(few, chosen, state, noise, SAMPLE_DAMPING)
         if truncated_squares(matches, limits_px, state, noise, least) >= least:
@@ -225,9 +259,19 @@ def search_nearby(matches, wide_px, limits_px, start, noise, best, least):
         cost = truncated_squares(matches, limits_px, state, noise, least)
         if cost >= least:
             continue
-        least, best[:], improved = cost, state, drawn
+        copy_matrix(state, best)
+        least, improved = cost, drawn
         needed = _samples_needed(matches, limits_px, best, around, errors)
     return least
+
+
+@kernel()
+def _take(matches, sample, few):
+    """Write those matches to ``few``, K matches, whose indices are in ``sample`` (K,)."""
+    for k in range(len(sample)):
+        copy_vector(matches.bearings[sample[k]], few.bearings[k])
+        copy_vector(matches.points[sample[k]], few.points[k])
+        copy_matrix(matches.pixel_jacobian[sample[k]], few.pixel_jacobian[k])
 
 
 @kernel()
@@ -282,9 +326,7 @@ def fit_to_noise(matches, limits_px, cam_from_map, noise, path):
     share = PRIOR_FINE / (PRIOR_STATED + PRIOR_FINE)
     for done in range(ADAPTIVE_STEPS):
         errors_of(matches, cam_from_map, errors)
-        for k in range(count):
-            near[k] = errors[k] <= limits_px[k]
-        if np.count_nonzero(near) < LEAST_FOR_NOISE:
+        if mark_within(errors, limits_px, near) < LEAST_FOR_NOISE:
             return done
         rounds = EM_ROUNDS if done else FIRST_EM_ROUNDS
         share = share_of_fine(errors, near, limits_px, noise.sd_px, share, rounds, fine_probability)
@@ -295,7 +337,7 @@ def fit_to_noise(matches, limits_px, cam_from_map, noise, path):
                     for b in range(3):
                         scaled_jacobian[k, a, b] = scale * jacobian[k, a, b]
         length = _step(Matches(bearings, points, scaled_jacobian), near, cam_from_map, noise, DAMPING)
-        path[done] = cam_from_map
+        copy_matrix(cam_from_map, path[done])
         if not length > ADAPTIVE_LEAST_STEP:
             return done + 1
     return ADAPTIVE_STEPS

@@ -35,6 +35,19 @@ from spherloc.narrowing import ADAPTIVE_STEPS, errors_of, fit_to_noise
 from spherloc.noise_scale import variance_factor
 from spherloc.problem import AlignedProblem
 from spherloc.ranges import check_options, is_number
+from spherloc.small_arrays import (
+    copy_matrix,
+    copy_vector,
+    count_true,
+    equal,
+    fill_matrix,
+    fill_vector,
+    mark_within,
+    moved_point,
+    rotation_of,
+    sum_of_squares,
+    translation_of,
+)
 from spherloc.trace import RefinementStage
 from spherloc.types import BoolArray, FloatArray
 
@@ -88,10 +101,10 @@ def gravity_sd_rad(aligned: AlignedProblem, options: RefinementOptions) -> float
 def matches_of(aligned: AlignedProblem) -> Matches:
     """The matches as kernels take them.
 
-    The Jacobians are a copy: kernels also call each other with scaled ones, which may be written to, and a read-only
+    All are copies: kernels also call each other with arrays of their own, which may be written to, and a read-only
     array would be another type, for which all of them are compiled once more.
     """
-    return Matches(aligned.bearings, aligned.points, aligned.pixel_from_bearing.copy())
+    return Matches(aligned.bearings.copy(), aligned.points.copy(), aligned.pixel_from_bearing.copy())
 
 
 def noise_of(aligned: AlignedProblem, options: RefinementOptions) -> Noise:
@@ -129,7 +142,13 @@ def refined_path(
     """The poses (I + 1, 3, 4) of ``refine`` between the aligned frames, and its inliers' bound where it is below
     ``bounds.pixels`` (else inf)."""
     matches, noise, robust = matches_of(aligned), noise_of(aligned, options), ROBUST_CODES[options.robust]
-    return _alternate(matches, bounds.pixels, bounds.noise_px, cam_from_map.copy(), noise, robust)
+    path = np.empty((2 + (MAX_ROUNDS + MAX_RESCUES) * MAX_STEPS, 3, 4))
+    path[0] = cam_from_map
+    limits, lost = np.empty(len(aligned.points)), np.empty(len(aligned.points), np.bool_)
+    kept, limit_px = _alternate(matches, bounds.pixels, bounds.noise_px, path, noise, robust, limits, lost)
+    if lost.any():
+        kept += rescue(matches, limits, lost, path, kept, noise)
+    return path[:kept].copy(), limit_px
 
 
 def fitted_path(
@@ -207,45 +226,51 @@ def _residuals(matches, cam_from_map):
 
 
 @kernel()
-def _alternate(matches, wide_px, tight_px, start, noise, robust):
-    """The states (I + 1, 3, 4) from ``start`` (3, 4) to the one to return; an inlier's bound, if below ``wide_px``.
+def _alternate(matches, wide_px, tight_px, path, noise, robust, limits, lost):
+    """Fit and choose inliers in turn from ``path[0]``; return how many poses of ``path`` (I, 3, 4) lead to the best.
 
-    ``wide_px`` (M,) are the bounds while gravity is kept, ``tight_px`` the one bound once the tilt is estimated.
+    ``wide_px`` (M,) are the bounds while gravity is kept, ``tight_px`` the one bound once the tilt is estimated. Also
+    returned is an inlier's bound, if below ``wide_px`` (else inf). ``limits`` (M,) are set to the bounds of the end,
+    and ``lost`` (M,) to what the start explains within these, if that is more than the best explains (else to none).
     """
-    path = np.empty((2 + (MAX_ROUNDS + MAX_RESCUES) * MAX_STEPS, 3, 4))
-    path[0], states = start, 1
-    errors = _residuals(matches, start)
-    mask = errors <= wide_px
-    if np.count_nonzero(mask) < 2:
-        return path[:1], np.inf
-    if noise.gravity_sd_rad < LEAST_GRAVITY_SD_RAD and tilt_of(start) > 0.0:
-        path[1], states = levelled(start, middle_of(matches.points, mask)[1]), 2
-        errors = _residuals(matches, path[1])
-        mask = errors <= wide_px
-    first_errors, limit_px = errors, np.inf
-    kept, most, least_cost = states, -1, np.inf
-    rotation, translation = path[states - 1, :, :3].copy(), path[states - 1, :, 3].copy()
+    states, count = 1, len(matches.points)
+    first_errors, errors, mask = np.empty(count), np.empty(count), np.empty(count, np.bool_)
+    errors_of(matches, path[0], errors)
+    inliers, limit_px = mark_within(errors, wide_px, mask), np.inf
+    fill_vector(lost, False)
+    if inliers < 2:
+        return states, limit_px
+    if noise.gravity_sd_rad < LEAST_GRAVITY_SD_RAD and tilt_of(path[0]) > 0.0:
+        copy_matrix(levelled(path[0], middle_of(matches.points, mask)[1]), path[1])
+        states = 2
+        errors_of(matches, path[1], errors)
+        inliers = mark_within(errors, wide_px, mask)
+    copy_vector(errors, first_errors)
+    copy_vector(wide_px, limits)
+    kept, most, least_cost, before = states, -1, np.inf, np.empty(count, np.bool_)
+    rotation, translation = rotation_of(path[states - 1]), translation_of(path[states - 1])
     most_steps = np.int64(MAX_STEPS)
     for _ in range(MAX_ROUNDS):
-        if limit_px == np.inf and degrees_of_freedom(np.count_nonzero(mask), noise.gravity_sd_rad) == 6:
+        if limit_px == np.inf and degrees_of_freedom(inliers, noise.gravity_sd_rad) == 6:
             limit_px, most = tight_px, -1
+            for k in range(count):
+                limits[k] = min(wide_px[k], limit_px)
         states += polish_path(matches, mask, rotation, translation, noise, robust, most_steps, path[states:])
-        errors = _residuals(matches, path[states - 1])
-        before, mask = mask, errors <= np.minimum(wide_px, limit_px)
-        inliers, cost = np.count_nonzero(mask), np.sum(errors[mask] ** 2)
+        errors_of(matches, path[states - 1], errors)
+        copy_vector(mask, before)
+        inliers = mark_within(errors, limits, mask)
+        cost = sum_of_squares(errors, mask)
         if inliers > most or (inliers == most and cost < least_cost):
             kept, most, least_cost = states, inliers, cost
-        if inliers < 2 or np.array_equal(mask, before):
+        if inliers < 2 or equal(mask, before):
             break
-    limits = np.minimum(wide_px, limit_px)
-    if np.count_nonzero(first_errors <= limits) > most:
-        explained = first_errors <= limits
-        kept += _rescue(matches, limits, explained, path, kept, noise)
-    return path[:kept].copy(), limit_px
+    if mark_within(first_errors, limits, lost) <= most:
+        fill_vector(lost, False)
+    return kept, limit_px
 
 
 @kernel()
-def _rescue(matches, limits_px, explained, path, states, noise):
+def rescue(matches, limits_px, explained, path, states, noise):
     """Move on from the last of the ``states`` of ``path`` until as many as are in ``explained`` (M,) are inliers.
 
     The next poses are written to ``path`` (I, 3, 4); returns how many, 0 if in vain.
@@ -254,24 +279,28 @@ def _rescue(matches, limits_px, explained, path, states, noise):
     pose ends farther from the least-squares one, in the latter's residuals, than noise explains: then it would be bent
     towards an outlier.
     """
-    errors = _residuals(matches, path[states - 1])
-    fitted = errors <= limits_px
-    cost = np.sum(errors[fitted] ** 2)
-    variance = max(noise.sd_px * noise.sd_px, cost / max(2 * np.count_nonzero(fitted), 1))
+    count = len(matches.points)
+    errors, fitted, inside = np.empty(count), np.empty(count, np.bool_), np.empty(count, np.bool_)
+    errors_of(matches, path[states - 1], errors)
+    members = mark_within(errors, limits_px, fitted)
+    cost = sum_of_squares(errors, fitted)
+    variance = max(noise.sd_px * noise.sd_px, cost / max(2 * members, 1))
     scaled, steps = Matches(matches.bearings, matches.points, matches.pixel_jacobian.copy()), 0
-    rotation, translation = path[states - 1, :, :3].copy(), path[states - 1, :, 3].copy()
+    rotation, translation = rotation_of(path[states - 1]), translation_of(path[states - 1])
+    robust, most_steps = np.int64(ROBUST_NONE), np.int64(MAX_STEPS)
     for _ in range(MAX_RESCUES):
         rest = path[states + steps :]
-        robust, most_steps = np.int64(ROBUST_NONE), np.int64(MAX_STEPS)
         steps += polish_path(scaled, explained, rotation, translation, noise, robust, most_steps, rest)
-        errors = _residuals(matches, path[states + steps - 1])
-        if np.sum(errors[fitted] ** 2) - cost > RESCUE_REACH * variance:
+        errors_of(matches, path[states + steps - 1], errors)
+        if sum_of_squares(errors, fitted) - cost > RESCUE_REACH * variance:
             return 0
-        inside = errors <= limits_px
-        if np.count_nonzero(inside) >= np.count_nonzero(explained):
+        if mark_within(errors, limits_px, inside) >= count_true(explained):
             return steps
-        for k in np.flatnonzero(explained & ~inside):
-            scaled.pixel_jacobian[k] *= RESCUE_FACTOR
+        for k in range(count):
+            if explained[k] and not inside[k]:
+                for a in range(2):
+                    for b in range(3):
+                        scaled.pixel_jacobian[k, a, b] *= RESCUE_FACTOR
     return 0
 
 
@@ -281,15 +310,18 @@ def _account(matches, limits_px, path):
 
     The latter two (I,) are of every pose. Inliers are those within ``limits_px`` (M,).
     """
-    inliers = _residuals(matches, path[-1]) <= limits_px
-    costs, counts = np.full(len(path), np.nan), np.zeros(len(path), np.int32)
+    errors, inliers, mask = (
+        np.empty(len(limits_px)),
+        np.empty(len(limits_px), np.bool_),
+        np.empty(len(limits_px), np.bool_),
+    )
+    errors_of(matches, path[-1], errors)
+    found = mark_within(errors, limits_px, inliers)
+    costs, counts = np.empty(len(path)), np.empty(len(path), np.int32)
     for k in range(len(path)):
-        errors, total = _residuals(matches, path[k]), 0.0
-        for i in range(len(errors)):
-            counts[k] += errors[i] <= limits_px[i]
-            total += errors[i] ** 2 if inliers[i] else 0.0
-        if inliers.any():
-            costs[k] = total / np.count_nonzero(inliers)
+        errors_of(matches, path[k], errors)
+        counts[k] = mark_within(errors, limits_px, mask)
+        costs[k] = sum_of_squares(errors, inliers) / found if found > 0 else np.nan
     return inliers, costs, counts
 
 
@@ -301,19 +333,25 @@ def _step_covariance(matches, inliers, cam_from_map, noise, robust):
     """
     count, centre = middle_of(matches.points, inliers)
     dof = degrees_of_freedom(count, noise.gravity_sd_rad)
-    covariance = np.full((6, 6), np.nan)
+    covariance = np.empty((6, 6))
+    fill_matrix(covariance, np.nan)
     if count < 2 or (dof == 4 and noise.gravity_sd_rad == np.inf):
         return dof, centre, covariance
-    rotation = cam_from_map[:, :3].copy()
-    middle = rotation @ centre + cam_from_map[:, 3]
+    rotation = rotation_of(cam_from_map)
+    middle = moved_point(rotation, translation_of(cam_from_map), centre)
     system, factor, column = empty_equations(), np.empty((6, 6)), np.empty(6)
     normal_equations(matches, inliers, centre, rotation, middle, CostModel(noise, robust, dof), system)
     for k in range(6):  # column by column: the step of a unit gradient
-        system.gradient[:] = 0.0
+        fill_vector(system.gradient, 0.0)
         system.gradient[k] = -1.0
         if not solve(system, 0.0, factor, column):
-            return dof, centre, np.full((6, 6), np.nan)
-        covariance[:, k] = column
+            fill_matrix(covariance, np.nan)
+            return dof, centre, covariance
+        for a in range(6):
+            covariance[a, k] = column[a]
     if dof == 4:
         covariance[0, 0] = covariance[2, 2] = 0.0
-    return dof, centre, 0.5 * (covariance + covariance.T)
+    for a in range(6):
+        for b in range(a, 6):
+            covariance[a, b] = covariance[b, a] = 0.5 * (covariance[a, b] + covariance[b, a])
+    return dof, centre, covariance

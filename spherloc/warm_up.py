@@ -20,17 +20,24 @@ from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from spherloc import kernel_cache, registry
 from spherloc.bounds import bounds_of
 from spherloc.cameras.equirectangular import Equirectangular
+from spherloc.consensus.exact import MOST_POSES, certify
+from spherloc.consensus.inliers import mark_each
+from spherloc.consensus.level_pose import BestPoses, BoundedMatches, bounded_matches, empty_list
+from spherloc.consensus.pair_arcs import yaws_between
+from spherloc.consensus.translation_balls import apart_balls
 from spherloc.consensus.two_point_search import search_two_point
+from spherloc.consensus.yaw_bins import BIN_TURN, degree_bounds, largest_bin_cliques, sort_into_bins
 from spherloc.datasets.synthetic import SyntheticScene
 from spherloc.errors import InputError
 from spherloc.estimators.base import estimate, options_type
 from spherloc.narrowing import MOST_DESCENTS, NARROWINGS, descend, narrow, search_nearby
 from spherloc.problem import Problem
-from spherloc.refine import fitted_path, matches_of, noise_of, record, refined_path
+from spherloc.refine import MAX_RESCUES, MAX_STEPS, fitted_path, matches_of, noise_of, record, refined_path, rescue
 from spherloc.watch import Watch
 
 FASTEST = "ransac-2p"
@@ -40,7 +47,7 @@ MOST_PROCESSES = 4
 
 
 def warm_up(announce: Callable[[str], None] | None = None, estimators: Iterable[str] | None = None) -> None:
-    """Run estimators once on a tiny problem: a minute or two after an installation, a fraction of a second later.
+    """Run estimators once on a tiny problem: a minute or so after an installation, a fraction of a second later.
 
     ``estimators`` are the names of those that will be needed; all if it is None. ``announce`` is called with a sentence
     to show if it will be long, and for every extension that fails here, which hinders nothing else.
@@ -57,7 +64,8 @@ def warm_up(announce: Callable[[str], None] | None = None, estimators: Iterable[
                 how_often = "at every start, as no folder to keep them can be written (NUMBA_CACHE_DIR names another)"
             announce(f"compiling the solvers, {how_often}: {_expected(cold)} …")
         if _processors() > 1:
-            _compile_in_order(cold)
+            # What is left of the fastest estimator is compiled here before another process would have begun.
+            _compile_in_order([part for part in cold if not part.startswith(FASTEST)])
     for part, run in runs.items():
         try:
             run()
@@ -105,8 +113,8 @@ def _refine() -> None:
     aligned, options = problem.aligned, options_type(FASTEST)()
     bounds = bounds_of(aligned, 3.0)
     path, _ = refined_path(aligned, aligned.align_pose(problem.truth_cam_from_map), bounds, options)
-    record(aligned, path, bounds.pixels, options, measured=True)
     fitted_path(aligned, path[-1], bounds.pixels, options)
+    record(aligned, path, bounds.pixels, options, measured=True)
 
 
 def _search() -> None:
@@ -115,11 +123,39 @@ def _search() -> None:
     assert problem.truth_cam_from_map is not None
     aligned, options = problem.aligned, options_type(FASTEST)()
     bounds, matches, noise = bounds_of(aligned, 3.0), matches_of(aligned), noise_of(aligned, options)
-    search_two_point(aligned, bounds.pixels, 0, 100, 0.99, options.scoring, True, Watch())
+    found = search_two_point(aligned, bounds.pixels, 0, 100, 0.99, options.scoring, True, Watch())
+    rays = aligned.bearings, aligned.points, aligned.pixel_from_bearing
+    mark_each(found.yaws_rad, found.translations, *rays, bounds.pixels)
     start, limits = aligned.align_pose(problem.truth_cam_from_map), np.full(len(aligned.points), bounds.noise_px)
     narrow(matches, bounds.pixels.copy(), limits, start.copy(), noise, np.empty((len(NARROWINGS), 3, 4)))
     _, cost = descend(matches, limits, start.copy(), noise, np.empty((MOST_DESCENTS, 3, 4)))
     search_nearby(matches, bounds.pixels.copy(), limits, start.copy(), noise, start.copy(), cost)
+    path = np.tile(start, (1 + MAX_RESCUES * MAX_STEPS, 1, 1))
+    rescue(matches, limits, np.ones(len(limits), np.bool_), path, 1, noise)
+
+
+def _proofs() -> None:
+    """What the exact search proves bins with."""
+    matches, best, nodes = _exact_search()
+    yaws = yaws_between(0.0, BIN_TURN)
+    certify(matches, yaws, nodes, apart_balls(matches, yaws, nodes, 2), best, Watch().board)
+
+
+def _cliques() -> None:
+    """The exact search for cliques of whole bins."""
+    matches, best, nodes = _exact_search()
+    pairs = np.array([(i, j) for j in nodes for i in range(j)], np.int32)
+    board, ends = Watch().board, np.zeros(len(pairs))
+    starts, edges = sort_into_bins(pairs, ends, ends.copy(), board)
+    bound = degree_bounds(len(nodes), starts, edges, board)
+    largest_bin_cliques(matches, starts, edges, bound, np.argsort(-bound), 1, best, board)
+
+
+def _exact_search() -> tuple[BoundedMatches, BestPoses, NDArray[np.int64]]:
+    """Matches, an empty list of poses, and the numbers (M,) of all matches."""
+    aligned = _murky_problem().aligned
+    count = len(aligned.points)
+    return bounded_matches(aligned, bounds_of(aligned, 40.0)), empty_list(MOST_POSES, count), np.arange(count)
 
 
 SHARED: dict[str, Callable[[], object]] = {"refinement": _refine, "search": _search}
@@ -132,6 +168,7 @@ def _runs(estimator: str) -> dict[str, Callable[[], object]]:
     if estimator in (FASTEST, "mc-exact"):
         runs[f"{estimator}, uncertain gravity"] = lambda: estimate(_uncertain_problem(), estimator)
     if estimator == "mc-exact":
+        runs |= {f"{estimator}, proofs": _proofs, f"{estimator}, cliques": _cliques}
         options = options_type(estimator)(bound_px=40.0)
         runs[f"{estimator}, large bound"] = lambda: estimate(_murky_problem(), estimator, options)
     return runs
@@ -173,7 +210,7 @@ def _processors() -> int:
 def _expected(cold: Sequence[str]) -> str:
     """How long compiling may take, in words."""
     one_estimator = len(set(cold) - SHARED.keys()) <= 1
-    return "half a minute to a minute" if one_estimator else "one to three minutes"
+    return "a quarter to half a minute" if one_estimator else "one to two minutes"
 
 
 def _is_compiled(part: str) -> bool:

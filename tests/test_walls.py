@@ -26,6 +26,7 @@ FLOORS = (
         "spherloc.registry",
         "spherloc.geometry",
         "spherloc.kernel_cache",
+        "spherloc.small_arrays",
         "spherloc.watch",
         "spherloc.disk_cache",
         "spherloc.images",

@@ -21,6 +21,7 @@ from spherloc.consensus.pose_search import (
 )
 from spherloc.consensus.stabbing import EVERYWHERE, Scratch, deepest, keep_possible, scratch_for
 from spherloc.kernel_cache import kernel
+from spherloc.small_arrays import copy_vector
 from spherloc.types import FloatArray
 from spherloc.watch import stopped
 
@@ -128,7 +129,8 @@ def search_boxes(matches, tasks, yaw_bound, memory, limits, found, board):
         lists[k] = k
     waiting = len(charts)
     for k in range(waiting):
-        lo[k], up[k] = lowers[k], uppers[k]
+        copy_vector(lowers[k], lo[k])
+        copy_vector(uppers[k], up[k])
         spans[k, 0], spans[k, 1], spans[k, 2], spans[k, 3] = 0, count, charts[k], bounds[k]
     cell, spread, move = np.empty(CELL_SIZE), np.empty(2), np.empty(6)
     overflow, inside = np.empty(0, np.int32), np.empty(count, np.int32)
@@ -136,7 +138,7 @@ def search_boxes(matches, tasks, yaw_bound, memory, limits, found, board):
     while waiting > 0:
         if state[EFFORT] >= limits.effort or state[HALT] != 0 or stopped(board):
             for k in range(waiting):
-                put_off(left, state, (spans[k, 2], lo[k], up[k]), spans[k, 3], 0)
+                put_off(left, state, (spans[k, 2], lo[k], up[k]), spans[k, 3], np.int64(0))
             return
         waiting -= 1
         first, last, chart = spans[waiting, 0], spans[waiting, 1], spans[waiting, 2]
@@ -158,7 +160,8 @@ def search_boxes(matches, tasks, yaw_bound, memory, limits, found, board):
             continue
         index = state[SPLITS]
         if index < len(splits.about):
-            splits.lower[index], splits.upper[index] = lo[waiting, :3], up[waiting, :3]
+            for a in range(3):
+                splits.lower[index, a], splits.upper[index, a] = lo[waiting, a], up[waiting, a]
             splits.about[index, 0], splits.about[index, 1] = chart, bound
             state[SPLITS] = index + 1
         axis = (chart - 1) // 2 if chart > 0 else -1
@@ -178,12 +181,14 @@ def search_boxes(matches, tasks, yaw_bound, memory, limits, found, board):
             for side in range(2):
                 spans[waiting, 0], spans[waiting, 1], spans[waiting, 2], spans[waiting, 3] = first, last, chart, bound
                 if side == 1:
-                    lo[waiting], up[waiting] = lo[waiting - 1], up[waiting - 1]
+                    copy_vector(lo[waiting - 1], lo[waiting])
+                    copy_vector(up[waiting - 1], up[waiting])
                     up[waiting - 1, split] = middle
                     lo[waiting, split] = middle
                 waiting += 1
             continue
-        at_lower[:], at_upper[:] = lo[waiting], up[waiting]
+        copy_vector(lo[waiting], at_lower)
+        copy_vector(up[waiting], at_upper)
         for w in range(windows):
             start, end = scratch.windows[w, 0], scratch.windows[w, 1]
             at_lower[3] = _yaw_of_turn(start) - 1e-12
@@ -194,7 +199,7 @@ def search_boxes(matches, tasks, yaw_bound, memory, limits, found, board):
                 at_upper[3] += 2.0 * np.pi
             cell_of = (chart, at_lower, at_upper)
             if state[EFFORT] >= limits.effort:
-                put_off(left, state, cell_of, bound, 1)
+                put_off(left, state, cell_of, bound, np.int64(1))
                 continue
             size = _in_window(scratch, target, kept, start, end, inside)
             if size > state[BEST] + limits.gap:

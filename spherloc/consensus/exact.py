@@ -36,6 +36,7 @@ from spherloc.consensus.yaw_bins import BIN_TURN, BINS, core_graph, degree_bound
 from spherloc.geometry import yaw_rotation
 from spherloc.kernel_cache import kernel
 from spherloc.problem import AlignedProblem
+from spherloc.small_arrays import elements, fill_matrix, fill_vector
 from spherloc.types import BoolArray, FloatArray, IndexArray
 from spherloc.watch import DONE, SELDOM, TOTAL, Watch, stopped, working_s
 
@@ -132,7 +133,8 @@ def exact_consensus(
     for expected in (LARGEST_NFA, np.inf) if len(edges) < effort_limit else ():
         if nfa(count, int(supports[0]), wrong_rate) > DOUBTFUL_NFA:
             floor = least_size(count, wrong_rate, expected) - 1
-            largest_bin_cliques(matches, starts, edges, bound, floor, best, watch.board)
+            order = np.argsort(-bound, kind="stable")
+            largest_bin_cliques(matches, starts, edges, bound, order, floor, best, watch.board)
     watch.begin("search", SEARCH_UNTIL)
     watch.expect(effort_limit)
     effort, finished = len(edges), True
@@ -217,7 +219,8 @@ def _pieces(arcs, nodes, count, start, end, board):
     (E,), (E,), turns. A watch's ``board`` can end it, after which there are none.
     """
     pairs, lo, hi = arcs
-    index_of = np.full(count, -1, np.int64)
+    index_of = np.empty(count, np.int64)
+    fill_vector(index_of, -1)
     for index in range(len(nodes)):
         index_of[nodes[index]] = index
     used, room = 0, 0
@@ -348,7 +351,7 @@ def sweep_bin(matches, arcs, nodes, rows, span, best, effort_limit, board):
     effort = len(arcs.lo) + SORT_EFFORT * len(edges)
     if effort > effort_limit:
         return whole, nothing, len(arcs.lo), False
-    rows[:] = 0
+    fill_matrix(rows, 0)
     owned = np.zeros((len(nodes), len(nodes)), np.uint8)
     common = np.empty(rows.shape[1], np.uint64)
     opening, closing = order_of(first, board), order_of(last, board)
@@ -382,17 +385,20 @@ def sweep_bin(matches, arcs, nodes, rows, span, best, effort_limit, board):
         exact = exact and done
         if len(clique) == 0:
             continue
-        verify(matches, nodes[clique], best)
+        verify(matches, elements(nodes, clique), best)
         effort += VERIFY_EFFORT * count
         floor = max(floor, supports[0])
         if len(clique) <= floor:
             continue
-        everybody = np.append(nodes[candidates], nodes[np.array([a, b])])
+        everybody = np.empty(len(candidates) + 2, np.int64)
+        for k in range(len(candidates)):
+            everybody[k] = nodes[candidates[k]]
+        everybody[-2], everybody[-1] = nodes[a], nodes[b]
         balls = star_balls(matches, yaws, everybody, len(everybody) - supports[0], ball)
         proven, work = certify(matches, yaws, everybody, balls, best, board)
         effort += work
         if not proven and len(clique) > len(largest):
-            largest = nodes[clique]
+            largest = elements(nodes, clique)
         trials += not proven
         floor = np.int64(supports[0] if trials < MOST_TRIALS else max(supports[0], len(largest)))
     return max(floor, len(largest)) if exact else whole, largest, effort, exact

@@ -4,6 +4,7 @@ import numpy as np
 
 from spherloc.gauss_newton import Matches
 from spherloc.kernel_cache import kernel
+from spherloc.small_arrays import fill_vector
 
 
 @kernel()
@@ -77,7 +78,8 @@ def pack_blocks(matches, bound_px, order):
     """
     count = len(order)
     blocks = np.zeros(((count + BLOCK - 1) // BLOCK, ROWS, BLOCK))
-    blocks[:, ROWS - 1] = np.nan
+    for b in range(len(blocks)):
+        fill_vector(blocks[b, ROWS - 1], np.nan)
     for index in range(count):
         b, lane, k = index // BLOCK, index % BLOCK, order[index]
         for axis in range(3):

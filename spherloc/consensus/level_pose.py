@@ -16,6 +16,7 @@ from spherloc.consensus.pair_arcs import chord
 from spherloc.gauss_newton import Matches
 from spherloc.kernel_cache import kernel
 from spherloc.problem import AlignedProblem
+from spherloc.small_arrays import copy_matrix, copy_vector, fill_matrix, fill_vector
 from spherloc.solvers.two_point import solve_pair
 from spherloc.types import BoolArray, FloatArray, IndexArray
 
@@ -106,7 +107,7 @@ def write_translation(pose, translation):
     translation[0], translation[1], translation[2] = -(c * x + s * z), -y, s * x - c * z
 
 
-@kernel(inline="always")
+@kernel()
 def ray(point, pose):
     """The unit vector (3 numbers) to a ``point`` (3,) in camera axes, and its distance, m, from a level pose (5,)."""
     dx, dy, dz = point[0] - pose[2], point[1] - pose[3], point[2] - pose[4]
@@ -114,7 +115,7 @@ def ray(point, pose):
     return (pose[0] * dx + pose[1] * dz) / distance, dy / distance, (pose[0] * dz - pose[1] * dx) / distance, distance
 
 
-@kernel(inline="always")
+@kernel()
 def linearized(jacobian_row, gx, gy, gz, distance):
     """A residual, px, one of two, of the ray (gx, gy, gz), and its derivative by the four numbers of a step.
 
@@ -125,7 +126,7 @@ def linearized(jacobian_row, gx, gy, gz, distance):
     return r, wx * gz - wz * gx, (r * gx - wx) / distance, (r * gy - wy) / distance, (r * gz - wz) / distance
 
 
-@kernel(inline="always")
+@kernel()
 def accumulate(normal, gradient, weight, r, row):
     """Add a weighted residual ``r`` with derivative ``row`` (4 numbers) to the equations, (4, 4) and (4,)."""
     for a in range(4):
@@ -142,8 +143,8 @@ def fit(points, pixel_jacobian, weights, pose, steps):
     """
     normal, gradient, step = np.empty((4, 4)), np.empty(4), np.empty(4)
     for _ in range(steps):
-        normal[:] = 0.0
-        gradient[:] = 0.0
+        fill_matrix(normal, 0.0)
+        fill_vector(gradient, 0.0)
         for k in range(len(points)):
             if weights[k] == 0.0:
                 continue
@@ -229,11 +230,13 @@ def explain_more(matches, members, pose, mask):
     """
     points, jacobian, count = matches.points, matches.pixel_jacobian, len(mask)
     best = mark_support(matches, pose, mask)
-    weights, moved, chosen = np.empty(count), pose.copy(), mask.copy()
+    weights, moved, chosen = np.empty(count), np.empty(5), np.empty(count, np.bool_)
+    copy_vector(pose, moved)
+    copy_vector(mask, chosen)
     climbing = True
     for done in range(INLIER_ROUNDS + LAWSON_ROUNDS):
         if climbing:
-            weights[:] = chosen
+            copy_vector(chosen, weights)
         else:
             if best >= len(members):
                 break
@@ -243,12 +246,14 @@ def explain_more(matches, members, pose, mask):
         grown = support > best
         if grown:
             best = support
-            pose[:], mask[:] = moved, chosen
+            copy_vector(moved, pose)
+            copy_vector(chosen, mask)
         if climbing and not (grown and done + 1 < INLIER_ROUNDS):
             climbing = False
-            moved[:] = pose
-            weights[:] = 0.0
-            weights[members] = 1.0
+            copy_vector(pose, moved)
+            fill_vector(weights, 0.0)
+            for k in members:
+                weights[k] = 1.0
     return best
 
 
@@ -270,7 +275,13 @@ def _reweight(matches, members, pose, weights):
 def _propose(matches, clique, pose):
     """Write the 2P pose of a pair of the ``clique`` (K,) that explains most of the clique; false if no pair has one."""
     bearings, points = matches.bearings, matches.points
-    few, bound_px = Matches(bearings[clique], points[clique], matches.pixel_jacobian[clique]), matches.bound_px[clique]
+    few = Matches(np.empty((len(clique), 3)), np.empty((len(clique), 3)), np.empty((len(clique), 2, 3)))
+    bound_px = np.empty(len(clique))
+    for index in range(len(clique)):
+        copy_vector(bearings[clique[index]], few.bearings[index])
+        copy_vector(points[clique[index]], few.points[index])
+        copy_matrix(matches.pixel_jacobian[clique[index]], few.pixel_jacobian[index])
+        bound_px[index] = matches.bound_px[clique[index]]
     yaws, translations = np.empty(2), np.empty((2, 3))
     size, best, tried = len(clique), 0, 0
     for apart in range(1, size):
@@ -309,7 +320,9 @@ def _keep(pose, support, mask, best):
     poses, supports, masks, known = best.poses, best.supports, best.masks, best.known[0]
     position = known
     for index in range(known):
-        shared = np.count_nonzero(masks[index] & mask)
+        shared = 0
+        for k in range(len(mask)):
+            shared += masks[index, k] and mask[k]
         if shared >= SAME_CONSENSUS * min(support, supports[index]):
             if support <= supports[index]:
                 return
@@ -322,7 +335,9 @@ def _keep(pose, support, mask, best):
     best.known[0] = max(known, position + 1)
     while position > 0 and supports[position - 1] < support:
         supports[position] = supports[position - 1]
-        poses[position], masks[position] = poses[position - 1], masks[position - 1]
+        copy_vector(poses[position - 1], poses[position])
+        copy_vector(masks[position - 1], masks[position])
         position -= 1
     supports[position] = support
-    poses[position], masks[position] = pose, mask
+    copy_vector(pose, poses[position])
+    copy_vector(mask, masks[position])

@@ -14,7 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from spherloc.consensus.long_sort import order_of_few
 from spherloc.kernel_cache import kernel
+from spherloc.small_arrays import copy_vector, elements, fill_vector
 from spherloc.watch import Watch, stopped
 
 EFFORT_LIMIT = 200_000_000
@@ -118,7 +120,7 @@ def _greedy(rows):
     return members[:taken].copy()
 
 
-@kernel(inline="always")
+@kernel()
 def popcount(word):
     """Number of set bits of a 64-bit word."""
     word -= (word >> np.uint64(1)) & np.uint64(0x5555555555555555)
@@ -127,20 +129,20 @@ def popcount(word):
     return np.int64((word * np.uint64(0x0101010101010101)) >> np.uint64(56))
 
 
-@kernel(inline="always")
+@kernel()
 def lowest_bit(word):
     """Index of the lowest set bit of a word that is not zero."""
     return popcount((word & (~word + ONE)) - ONE)
 
 
-@kernel(inline="always")
+@kernel()
 def set_edge(rows, a, b):
     """Join two nodes of the graph ``rows`` (M, words), in place."""
     rows[a, b >> 6] |= ONE << np.uint64(b & 63)
     rows[b, a >> 6] |= ONE << np.uint64(a & 63)
 
 
-@kernel(inline="always")
+@kernel()
 def clear_edge(rows, a, b):
     """Remove the edge between two nodes of the graph ``rows`` (M, words), in place."""
     rows[a, b >> 6] &= ~(ONE << np.uint64(b & 63))
@@ -157,12 +159,13 @@ def colour(candidates, rows, needed, order, bound):
     many were listed, in ascending order of colour.
     """
     words = len(candidates)
-    uncoloured = candidates.copy()
-    free = np.empty(words, np.uint64)
+    uncoloured, free = np.empty(words, np.uint64), np.empty(words, np.uint64)
+    copy_vector(candidates, uncoloured)
     listed, shade, first = 0, 0, 0
     while first < words:
         shade += 1
-        free[first:] = uncoloured[first:]
+        for w in range(first, words):
+            free[w] = uncoloured[w]
         for w in range(first, words):
             while free[w] != 0:
                 bit = lowest_bit(free[w])
@@ -214,7 +217,7 @@ def larger_clique(rows, floor, effort_limit, board=None):
     if count <= floor:
         return best, 0, True
     candidates = np.empty((count + 1, words), np.uint64)
-    candidates[0] = all_nodes(count)
+    copy_vector(all_nodes(count), candidates[0])
     order = np.empty((count + 1, count), np.int32)
     bound = np.empty((count + 1, count), np.int32)
     cursor = np.zeros(count + 1, np.int64)
@@ -237,7 +240,8 @@ def larger_clique(rows, floor, effort_limit, board=None):
         candidates[depth, node >> 6] &= ~(ONE << np.uint64(node & 63))
         if size == 0:
             if depth + 1 > largest:
-                best, largest = current[: depth + 1].copy(), depth + 1
+                best, largest = np.empty(depth + 1, np.int64), depth + 1
+                copy_vector(current, best)
             continue
         effort += words
         if depth + 1 + size <= largest:
@@ -249,17 +253,27 @@ def larger_clique(rows, floor, effort_limit, board=None):
 
 
 @kernel()
+def order_of_degrees(degree):
+    """The order (K,) of falling ``degree`` (K,)."""
+    falling = np.empty(len(degree))
+    for k in range(len(degree)):
+        falling[k] = -degree[k]
+    return order_of_few(falling)
+
+
+@kernel()
 def subgraph(rows, nodes):
     """The graph (K, words) among ``nodes`` (K,) of ``rows`` (M, words), and their old numbers (K,).
 
     Nodes are numbered by descending degree.
     """
     count = len(nodes)
-    degree = np.zeros(count, np.int64)
+    degree = np.empty(count, np.int64)
+    fill_vector(degree, 0)
     for a in range(count):
         for b in range(count):
             degree[a] += np.int64((rows[nodes[a], nodes[b] >> 6] >> np.uint64(nodes[b] & 63)) & ONE)
-    old = nodes[np.argsort(-degree)]
+    old = elements(nodes, order_of_degrees(degree))
     small = np.zeros((count, (count + 63) // 64), np.uint64)
     for a in range(count):
         for b in range(a):
@@ -293,4 +307,11 @@ def remove_weak_edges(rows, floor):
                     if common < floor - 1:
                         clear_edge(rows, a, b)
                         changed = True
-    return np.array([a for a in range(count) if np.any(rows[a] != 0)], np.int64)
+    left, found = np.empty(count, np.int64), 0
+    for a in range(count):
+        for w in range(words):
+            if rows[a, w] != 0:
+                left[found] = a
+                found += 1
+                break
+    return left[:found]

@@ -145,7 +145,7 @@ def pair_arcs(aligned: AlignedProblem, bound_rad: FloatArray, watch: Watch | Non
     return Arcs(pairs[:used], np.ascontiguousarray(ends[:used, 0]), np.ascontiguousarray(ends[:used, 1]))
 
 
-@kernel(inline="always")
+@kernel()
 def turn_of_direction(c, s):
     """Turn in [0, 4] of the direction (c, s) of any length."""
     quarter = s / (abs(c) + abs(s))
@@ -174,7 +174,7 @@ def yaws_between(lo, hi):
     return YawInterval(c / norm, s / norm, half_width_rad)
 
 
-@kernel(inline="always")
+@kernel()
 def _behind(a, b, c, u0, v0, u1, v1):
     """Whether a cos + b sin + c < 0 on all of the arc, shorter than half a circle, between two unit vectors.
 
@@ -195,7 +195,9 @@ def _fill(bearings, points, eps, pairs, ends, board):
     ``bearings`` (M, 3), ``points`` (M, 3), m, ``eps`` (M,), rad. A watch's ``board`` counts the pairs and can end it.
     """
     used = 0
-    chords, sines = chord(eps), np.sin(eps)
+    chords, sines = np.empty(len(eps)), np.empty(len(eps))
+    for i in range(len(eps)):
+        chords[i], sines[i] = chord(eps[i]), np.sin(eps[i])
     for i in range(len(bearings)):
         if stopped(board):
             break

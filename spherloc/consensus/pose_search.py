@@ -30,6 +30,7 @@ from spherloc.consensus.pose_cells import (
     place_cell,
 )
 from spherloc.kernel_cache import kernel
+from spherloc.small_arrays import copy_vector, fill_vector
 from spherloc.types import FloatArray
 from spherloc.watch import stopped
 
@@ -116,7 +117,7 @@ def sort_matches(matches, cell, axis, members, kept, cutoff, reach):
     ax, ay, az = r00, r01, r02
     bx, by, bz = ca * r20 - sa * r10, ca * r21 - sa * r11, ca * r22 - sa * r12
     turn = hy + ha + hc + SLACK
-    reach[:] = 0.0
+    fill_vector(reach, 0.0)
     sure, undecided, inside = 0, 0, 0
     spare = len(members) - cutoff
     gone = 0
@@ -231,7 +232,8 @@ def put_off(left, state, cell_of, bound, narrow):
     if index == len(left.about):
         state[OPEN] = max(state[OPEN], bound)
         return
-    left.lower[index], left.upper[index] = lower, upper
+    copy_vector(lower, left.lower[index])
+    copy_vector(upper, left.upper[index])
     left.about[index, 0], left.about[index, 1], left.about[index, 2] = chart, bound, narrow
     state[LEFT] = index + 1
 
@@ -249,15 +251,17 @@ def search_poses(matches, cell_of, members, room, limits, found, board):
     lists, spans, lo, up = room.lists, room.spans, room.lower, room.upper
     axis = (chart - 1) // 2 if chart > 0 else -1
     count = len(members)
-    lists[:count] = members
-    lo[0], up[0] = lower, upper
+    for k in range(count):
+        lists[k] = members[k]
+    copy_vector(lower, lo[0])
+    copy_vector(upper, up[0])
     spans[0, 0], spans[0, 1], spans[0, 2] = 0, count, 0
     waiting = 1
     cell, reach = np.empty(CELL_SIZE), np.empty(6)
     while waiting > 0:
         if state[EFFORT] >= limits.effort or state[HALT] != 0 or stopped(board):
             for k in range(waiting):
-                put_off(left, state, (chart, lo[k], up[k]), spans[k, 2] + spans[k, 1] - spans[k, 0], 1)
+                put_off(left, state, (chart, lo[k], up[k]), spans[k, 2] + spans[k, 1] - spans[k, 0], np.int64(1))
             return
         waiting -= 1
         first, last, known = spans[waiting, 0], spans[waiting, 1], spans[waiting, 2]
@@ -294,7 +298,8 @@ def search_poses(matches, cell_of, members, room, limits, found, board):
         for side in range(2):
             spans[waiting, 0], spans[waiting, 1], spans[waiting, 2] = first, last, known
             if side == 1:
-                lo[waiting], up[waiting] = lo[waiting - 1], up[waiting - 1]
+                copy_vector(lo[waiting - 1], lo[waiting])
+                copy_vector(up[waiting - 1], up[waiting])
                 up[waiting - 1, split] = middle
                 lo[waiting, split] = middle
             waiting += 1

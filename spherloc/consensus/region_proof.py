@@ -24,8 +24,10 @@ from typing import NamedTuple
 import numpy as np
 
 from spherloc.consensus.level_pose import accumulate, linearized, move, ray, solve_step
+from spherloc.consensus.long_sort import order_of_few
 from spherloc.consensus.pair_arcs import YawInterval
 from spherloc.kernel_cache import kernel
+from spherloc.small_arrays import copy_vector, count_true, fill_matrix, fill_vector
 from spherloc.types import FloatArray
 from spherloc.watch import stopped
 
@@ -85,23 +87,28 @@ def prove_none(matches, region, everybody, floor, found, board=None):
     starts = np.empty((MOST_SETS + BASIS_SIZES[-1], 5))
     removed = np.zeros((MOST_SETS + BASIS_SIZES[-1], count), np.bool_)
     kept = np.zeros((MOST_SETS + BASIS_SIZES[-1], count), np.bool_)
-    starts[0, 0], starts[0, 1], starts[0, 2:] = region.yaws.cos, region.yaws.sin, region.ball[:3]
+    starts[0, 0], starts[0, 1] = region.yaws.cos, region.yaws.sin
+    copy_vector(region.ball, starts[0, 2:])
     waiting, sets, effort = 1, 0, 0
     state = LawsonState(np.empty(5), np.empty(count), np.empty(count))
+    gone, stay = np.empty(count, np.bool_), np.empty(count, np.bool_)
     while waiting > 0:
         if stopped(board):
             return UNKNOWN, effort
         waiting -= 1
         sets += 1
-        gone, stay, state.pose[:] = removed[waiting].copy(), kept[waiting].copy(), starts[waiting]
-        state.weights[:] = np.where(gone, 0.0, 1.0)
+        copy_vector(removed[waiting], gone)
+        copy_vector(kept[waiting], stay)
+        copy_vector(starts[waiting], state.pose)
+        for k in range(count):
+            state.weights[k] = 0.0 if gone[k] else 1.0
         answer, rounds = _lawson(matches, region, everybody, gone, floor, state, np.int64(LAWSON_ROUNDS))
         effort += rounds * count
         if answer == FOUND:
-            found[:] = state.pose
+            copy_vector(state.pose, found)
         if answer != IMPOSSIBLE or sets >= MOST_SETS or waiting + BASIS_SIZES[-1] > len(starts):
             return (answer if answer == FOUND else UNKNOWN), effort
-        if np.count_nonzero(gone) + 1 >= spare:
+        if count_true(gone) + 1 >= spare:
             continue  # without one more, too few would be left
         basis = _basis(matches, region, everybody, gone, state)
         if len(basis) == 0:
@@ -109,7 +116,9 @@ def prove_none(matches, region, everybody, floor, found, board=None):
         for k in basis:
             if stay[k]:
                 continue
-            removed[waiting], kept[waiting], starts[waiting] = gone, stay, state.pose
+            copy_vector(gone, removed[waiting])
+            copy_vector(stay, kept[waiting])
+            copy_vector(state.pose, starts[waiting])
             removed[waiting, k] = True
             waiting += 1
             stay[k] = True
@@ -123,18 +132,19 @@ def _basis(matches, region, everybody, gone, state):
     Indices (B,) into ``everybody`` (K,), of which those ``gone`` (K,) are left out. ``state`` is where the iteration on
     all others ended; its shares are overwritten.
     """
-    order = np.argsort(-np.where(gone, 0.0, state.weights))
-    total = len(everybody) - np.count_nonzero(gone)
-    start = state.pose.copy()
-    alone = LawsonState(state.pose, np.empty_like(state.weights), state.shares)
-    for size in BASIS_SIZES:
-        size = min(size, total)
-        others = np.ones(len(everybody), np.bool_)
-        others[order[:size]] = False
-        alone.pose[:] = start
-        alone.weights[:] = np.where(others, 0.0, state.weights)
+    count, total = len(everybody), len(everybody) - count_true(gone)
+    alone = LawsonState(np.empty(5), np.empty(count), state.shares)
+    for k in range(count):
+        alone.weights[k] = -0.0 if gone[k] else -state.weights[k]
+    order, others = order_of_few(alone.weights), np.empty(count, np.bool_)
+    for index in range(len(BASIS_SIZES)):
+        size = min(BASIS_SIZES[index], total)
+        fill_vector(others, True)
+        fill_vector(alone.weights, 0.0)
+        for k in order[:size]:
+            others[k], alone.weights[k] = False, state.weights[k]
+        copy_vector(state.pose, alone.pose)
         answer, _ = _lawson(matches, region, everybody, others, len(everybody), alone, np.int64(BASIS_ROUNDS))
-        alone.pose[:] = start
         if answer == IMPOSSIBLE:
             return order[:size]
         if size == total:
@@ -154,7 +164,9 @@ def _lawson(matches, region, everybody, gone, floor, state, rounds):
     # Where poses that explain all may be: cos, sin and half width of yaw, and a ball. It shrinks.
     c, s, half_yaw = region.yaws
     ball = region.ball
-    possible = np.array([c, s, half_yaw, ball[0], ball[1], ball[2], ball[3]])
+    possible = np.empty(7)
+    possible[0], possible[1], possible[2] = c, s, half_yaw
+    copy_vector(ball, possible[3:])
     for k in range(rounds):
         explained, cost, allowed, neglected = _normal_equations(matches, everybody, possible, state, normal, gradient)
         if explained > floor:
@@ -178,7 +190,8 @@ def _shrink(root, room, pose, possible):
     Only where that is smaller. ``root`` (4, 4) is lower triangular; ``possible`` holds cos, sin and half width of the
     yaw, and centre and radius of the positions.
     """
-    inverse = np.zeros((4, 4))
+    inverse = np.empty((4, 4))
+    fill_matrix(inverse, 0.0)
     for a in range(4):
         inverse[a, a] = 1.0 / root[a, a]
         for b in range(a + 1, 4):
@@ -186,12 +199,16 @@ def _shrink(root, room, pose, possible):
                 inverse[b, a] -= root[b, d] * inverse[d, a]
             inverse[b, a] /= root[b, b]
     # A step is root^-T times a vector of length sqrt(room) at most: column a of ``inverse`` spans its axis a.
-    turn = np.sqrt(room * np.sum(inverse[:, 0] ** 2))
-    reach = np.sqrt(room * np.sum(inverse[:, 1:] ** 2))
+    turn2 = reach2 = 0.0
+    for a in range(4):
+        turn2 += inverse[a, 0] * inverse[a, 0]
+        for b in range(1, 4):
+            reach2 += inverse[a, b] * inverse[a, b]
+    turn, reach = np.sqrt(room * turn2), np.sqrt(room * reach2)
     if turn < possible[2]:
         possible[0], possible[1], possible[2] = pose[0], pose[1], turn
     if reach < possible[6]:
-        possible[3:6] = pose[2:]
+        copy_vector(pose[2:], possible[3:6])
         possible[6] = reach
 
 
@@ -207,7 +224,8 @@ def _reweight(gone, state):
             weights[k] *= min(max(state.shares[k], 1e-3), 10.0)
             total += weights[k]
             left += 1
-    weights *= left / total
+    for k in range(len(weights)):
+        weights[k] *= left / total
 
 
 @kernel()
@@ -218,11 +236,11 @@ def _normal_equations(matches, everybody, possible, state, normal, gradient):
     bounds and of what the linear residuals neglect among the ``possible`` (7,) poses, see ``_shrink``.
     """
     bearings, bound_px = matches.bearings, matches.bound_px
-    c, s, x0, y0, z0 = state.pose
+    c, s, x0, y0, z0 = state.pose[0], state.pose[1], state.pose[2], state.pose[3], state.pose[4]
     reach = np.sqrt((x0 - possible[3]) ** 2 + (y0 - possible[4]) ** 2 + (z0 - possible[5]) ** 2) + possible[6]
     swing = abs(np.arctan2(s * possible[0] - c * possible[1], c * possible[0] + s * possible[1])) + possible[2]
-    normal[:] = 0.0
-    gradient[:] = 0.0
+    fill_matrix(normal, 0.0)
+    fill_vector(gradient, 0.0)
     explained, cost, allowed, neglected = 0, 0.0, 0.0, 0.0
     for index in range(len(everybody)):
         k = everybody[index]
@@ -252,9 +270,10 @@ def search_region(matches, region, everybody, floor, cell_limit, found):
     ``matches`` are ``BoundedMatches``. Returns the answer, and how many cells were looked at, ``cell_limit`` at most.
     """
     c0, s0, slack = region.yaws
-    ball, order = region.ball, everybody.copy()
-    cells = np.empty((MOST_WAITING, 6))
-    cells[0, 0], cells[0, 1], cells[0, 2:5], cells[0, 5] = 0.0, slack, ball[:3], ball[3]
+    ball, order, cells = region.ball, np.empty(len(everybody), np.int64), np.empty((MOST_WAITING, 6))
+    copy_vector(everybody, order)
+    cells[0, 0], cells[0, 1] = 0.0, slack
+    copy_vector(ball, cells[0, 2:])
     waiting, used, exact = 1, 0, True
     reach = _mean_distance(matches.points, everybody, ball)
     while waiting > 0:
@@ -301,7 +320,7 @@ def _mean_distance(points, everybody, ball):
     return total / len(everybody)
 
 
-@kernel(inline="always")
+@kernel()
 def _excess(matches, k, pose):
     """Of match ``k`` at a level ``pose`` (5 numbers): what its residual exceeds its bound by, times the distance, px m;
     the distance along its bearing, and the distance, m.

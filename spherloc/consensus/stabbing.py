@@ -37,6 +37,7 @@ from spherloc.consensus.pose_cells import (
     S,
 )
 from spherloc.kernel_cache import kernel
+from spherloc.small_arrays import copy_vector, fill_vector, sort_in_place
 from spherloc.types import FloatArray
 
 FEW_BINS, MANY_BINS = 256, 1024
@@ -152,7 +153,7 @@ def deepest(scratch, count, free, cutoff, yaw_bound):
     bins = MANY_BINS if count >= MANY else FEW_BINS
     per_turn = bins / CIRCLE
     steps = scratch.steps
-    steps[: bins + 1] = 0
+    fill_vector(steps[: bins + 1], 0)
     for k in range(count):
         if ends[k] >= EVERYWHERE:
             continue
@@ -196,7 +197,7 @@ def _clip_windows(windows, used, cutoff, yaw_bound):
         first, last = int(windows[w, 0] * per_turn), int(windows[w, 1] * per_turn)
         for b in range(first, last + 1):
             if yaw_bound[min(b, len(yaw_bound) - 1)] > cutoff:
-                windows[kept] = windows[w]
+                copy_vector(windows[w], windows[kept])
                 kept += 1
                 break
     return kept
@@ -225,8 +226,8 @@ def _exactly(scratch, count, free, cutoff):
             opening[used], closing[used] = scratch.starts[k], scratch.ends[k]
             depth += scratch.ends[k] < scratch.starts[k]
             used += 1
-    opening.sort()
-    closing.sort()
+    sort_in_place(opening)
+    sort_in_place(closing)
     most, here, there, found = depth, 0, 0, 0
     if depth > cutoff:
         found = _open_window(windows, 0, 0.0)

@@ -18,9 +18,11 @@ one of them. A set that leaves out at most m of the candidates holds at least on
 import numpy as np
 from numpy.typing import NDArray
 
+from spherloc.consensus.long_sort import order_of_few
 from spherloc.consensus.pair_arcs import Arcs, BoundedRays, YawInterval, chord, pair_sinusoids
 from spherloc.kernel_cache import kernel
 from spherloc.problem import AlignedProblem
+from spherloc.small_arrays import copy_vector, fill_matrix, fill_vector
 from spherloc.types import BoolArray, FloatArray, IndexArray
 from spherloc.watch import DONE, Watch, stopped
 
@@ -258,7 +260,8 @@ def ball_of_pair(i, j, rays, yaws, centre):
         vi, vj, pi, pj, rays.chord[i], rays.chord[j], sine_i, sine_j
     )
     if sin_alpha == 0.0:
-        centre[:] = 0.5 * (pi + pj)
+        for axis in range(3):
+            centre[axis] = 0.5 * (pi[axis] + pj[axis])
         return np.inf
     si, sj = _value(depth_i, c, s), _value(depth_j, c, s)
     di, dj = _slope(depth_i, c, s), _slope(depth_j, c, s)
@@ -350,16 +353,17 @@ def star_balls(matches, yaws, everybody, most, alone):
     size = len(everybody) - 2
     if most > size:
         return alone.reshape(1, 4)
-    balls = np.empty((size, 4))
+    balls, radii = np.empty((size, 4)), np.empty(size)
     for k in range(size):
-        balls[k] = pair_ball(matches, yaws, everybody[k], everybody[-2])
+        ball = pair_ball(matches, yaws, everybody[k], everybody[-2])
         other = pair_ball(matches, yaws, everybody[k], everybody[-1])
-        if other[3] < balls[k, 3]:
-            balls[k] = other
-    order = np.argsort(balls[:, 3])[:most]
-    if np.sum(balls[order, 3] ** 3) < alone[3] ** 3:
-        return balls[order]
-    return alone.reshape(1, 4)
+        copy_vector(other if other[3] < ball[3] else ball, balls[k])
+        radii[k] = balls[k, 3]
+    order, volume, smallest = order_of_few(radii), 0.0, np.empty((most, 4))
+    for index in range(most):
+        copy_vector(balls[order[index]], smallest[index])
+        volume += radii[order[index]] ** 3
+    return smallest if volume < alone[3] ** 3 else alone.reshape(1, 4)
 
 
 @kernel()
@@ -368,8 +372,9 @@ def apart_balls(matches, yaws, nodes, most):
 
     One with an infinite radius says that there are not enough pairs.
     """
-    balls = np.full((most, 4), np.inf)
-    free = np.ones(len(nodes), np.bool_)
+    balls, free = np.empty((most, 4)), np.empty(len(nodes), np.bool_)
+    fill_matrix(balls, np.inf)
+    fill_vector(free, True)
     for b in range(most):
         mate_a, mate_b = -1, -1
         for a in range(min(MOST_FIRST + most, len(nodes))):
@@ -379,7 +384,8 @@ def apart_balls(matches, yaws, nodes, most):
                 if free[other]:
                     ball = pair_ball(matches, yaws, nodes[a], nodes[other])
                     if ball[3] < balls[b, 3]:
-                        balls[b], mate_a, mate_b = ball, a, other
+                        copy_vector(ball, balls[b])
+                        mate_a, mate_b = a, other
         if mate_a < 0:
             break
         free[mate_a] = free[mate_b] = False

@@ -20,6 +20,7 @@ from spherloc.consensus.level_pose import fit, write_level_pose, write_translati
 from spherloc.gauss_newton import Matches
 from spherloc.kernel_cache import kernel
 from spherloc.problem import AlignedProblem
+from spherloc.small_arrays import copy_matrix, copy_vector
 from spherloc.solvers.two_point import solve_pair
 from spherloc.types import BoolArray, FloatArray, IndexArray
 from spherloc.watch import DONE, TOTAL, Watch, stopped
@@ -104,7 +105,7 @@ def search_two_point(
     )
 
 
-@kernel(inline="always")
+@kernel()
 def _mixed(state):
     """SplitMix64's output function of a ``state`` (uint64).
 
@@ -115,13 +116,13 @@ def _mixed(state):
     return state ^ (state >> np.uint64(31))
 
 
-@kernel(inline="always")
+@kernel()
 def _random(stream, k):
     """Random number k, 64 bits, of a ``stream`` (uint64)."""
     return _mixed(stream + np.uint64(k + 1) * np.uint64(0x9E3779B97F4A7C15))
 
 
-@kernel(inline="always")
+@kernel()
 def _below(bits, count):
     """A number from 0 to count - 1 from 32 random bits, uniform to within a share of count / 2^32."""
     return np.int64((bits * np.uint64(count)) >> np.uint64(32))
@@ -193,7 +194,7 @@ def _optimize(yaw, translation, matches, bound_px, mask):
     write_level_pose(yaw, translation, pose)
     for _ in range(OPTIMIZATION_ROUNDS):
         score_inliers(yaw, translation, matches, bound_px, mask)
-        weights[:] = mask
+        copy_vector(mask, weights)
         fit(matches.points, matches.pixel_jacobian, weights, pose, np.int64(OPTIMIZATION_STEPS))
         yaw = np.arctan2(pose[1], pose[0])
         write_translation(pose, translation)
@@ -215,7 +216,7 @@ def _search(matches, bound_px, seed, iterations, miss, msac, local, board):
     floors = np.empty((count + BLOCK - 1) // BLOCK, np.int64)
     _set_floors(floors, np.int64(1), count, rejected_share)
     yaws, translations, mask = np.empty(2), np.empty((2, 3)), np.empty(count, np.bool_)
-    log, rows, best, drawn = np.empty((32, 9)), 0, 0.0, 0
+    log, rows, best, drawn = np.empty((32, 9)), 0, 0.0, np.int64(0)
     log_unclean = 0.0  # logarithm of the chance that one sample is not of the best hypothesis's inliers only
     while drawn < iterations and not (bounded and rows > 0 and drawn * log_unclean <= np.log(miss - rejected_share)):
         if drawn & WATCH_MASK == 0:
@@ -235,9 +236,12 @@ def _search(matches, bound_px, seed, iterations, miss, msac, local, board):
                 if score <= best:
                     break
                 if rows == len(log):
-                    log = np.concatenate((log, np.empty_like(log)))
+                    longer = np.empty((2 * rows, 9))
+                    copy_matrix(log, longer[:rows])
+                    log = longer
                 log[rows, 0], log[rows, 1], log[rows, 2], log[rows, 3] = drawn, i, j, yaw
-                log[rows, 4:7], log[rows, 7], log[rows, 8] = translation, inliers, optimized
+                copy_vector(translation, log[rows, 4:7])
+                log[rows, 7], log[rows, 8] = inliers, optimized
                 rows, best = rows + 1, score
                 log_unclean = np.log1p(-((inliers / count) ** 2))
                 _set_floors(floors, int(np.floor(best)) + 1, count, rejected_share)
@@ -247,4 +251,4 @@ def _search(matches, bound_px, seed, iterations, miss, msac, local, board):
         drawn += 1
     board[DONE] = drawn
     reached = -np.expm1(drawn * log_unclean) - rejected_share if rows > 0 else 0.0
-    return log[:rows].copy(), drawn, max(0.0, reached)
+    return log[:rows], drawn, max(0.0, reached)

@@ -12,9 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spherloc.consensus.level_pose import verify
-from spherloc.consensus.max_clique import colour_bound, larger_clique, remove_weak_edges, set_edge, subgraph
+from spherloc.consensus.max_clique import (
+    colour_bound,
+    larger_clique,
+    order_of_degrees,
+    remove_weak_edges,
+    set_edge,
+    subgraph,
+)
 from spherloc.consensus.pair_arcs import CIRCLE
 from spherloc.kernel_cache import kernel
+from spherloc.small_arrays import copy_matrix, copy_vector, elements, fill_vector, indices_of_true
 from spherloc.types import FloatArray, IndexArray
 from spherloc.watch import SELDOM, stopped
 
@@ -52,7 +60,8 @@ def sort_into_bins(
     for b in range(BINS):
         starts[b + 1] += starts[b]
     edges = np.empty((starts[BINS], 2), np.uint16)
-    next_of_bin = starts[:BINS].copy()
+    next_of_bin = np.empty(BINS, np.int64)
+    copy_vector(starts, next_of_bin)
     for arc in range(len(lo)):
         if arc & SELDOM == 0 and stopped(board):
             return np.zeros(BINS + 1, np.int64), np.empty((0, 2), np.uint16)
@@ -79,16 +88,17 @@ def degree_bounds(
 
     A watch's ``board`` can end it, after which the other bounds are ``count``.
     """
-    bound = np.full(BINS, count, np.int32)
+    bound = np.empty(BINS, np.int32)
+    fill_vector(bound, count)
     degree, tally = np.empty(count, np.int64), np.empty(count + 1, np.int64)
     for b in range(BINS):
         if stopped(board):
             break
-        degree[:] = 0
+        fill_vector(degree, 0)
         for index in range(starts[b], starts[b + 1]):
             degree[edges[index, 0]] += 1
             degree[edges[index, 1]] += 1
-        tally[:] = 0
+        fill_vector(tally, 0)
         for node in range(count):
             tally[min(degree[node], count)] += 1
         # Nodes of degree k - 1 at least, for falling k, until there are k of them.
@@ -104,16 +114,17 @@ def degree_bounds(
 
 
 @kernel()
-def largest_bin_cliques(matches, starts, edges, bound, least, best, board=None):
+def largest_bin_cliques(matches, starts, edges, bound, order, least, best, board=None):
     """Verify the largest clique of each bin; better poses go to ``best``, and each bin's ``bound`` (BINS,) is lowered.
 
     ``matches`` are ``BoundedMatches``, ``starts`` and ``edges`` those of ``sort_into_bins``, ``best`` is ``BestPoses``.
+    ``order`` (BINS,) is that of falling bounds.
     A clique must be larger than the best support. While that is not above ``least`` it must be larger than this, and
     not much smaller than the largest clique that had no pose. A watch's ``board`` can end it.
     """
     count, supports = len(matches.points), best.supports
     floor = max(least, supports[0])
-    for b in np.argsort(-bound, kind="mergesort"):
+    for b in order:
         if bound[b] <= floor or stopped(board):
             break
         nodes, rows = core_graph(count, edges[starts[b] : starts[b + 1]], floor, board)
@@ -124,7 +135,7 @@ def largest_bin_cliques(matches, starts, edges, bound, least, best, board=None):
         if exact:
             bound[b] = max(floor, len(clique))
         if len(clique):
-            verify(matches, nodes[clique], best)
+            verify(matches, elements(nodes, clique), best)
             floor = supports[0] if supports[0] > least else max(floor, len(clique) - CLIQUE_MARGIN)
 
 
@@ -136,12 +147,13 @@ def core_graph(count, edges, least, board=None):
     same nodes count as two, but are one in the graph), and in a graph that is not too large the ends of every edge have
     ``least`` - 1 neighbours in common. Stopped by a watch's ``board``, it has no edges.
     """
-    degree, alive = np.empty(count, np.int64), np.ones(count, np.bool_)
-    left = edges.copy()
+    degree, alive, left = np.empty(count, np.int64), np.empty(count, np.bool_), np.empty(edges.shape, edges.dtype)
+    fill_vector(alive, True)
+    copy_matrix(edges, left)
     changed = True
     while changed and not stopped(board):
         changed = False
-        degree[:] = 0
+        fill_vector(degree, 0)
         used = 0
         for k in range(len(left)):
             i, j = left[k, 0], left[k, 1]
@@ -155,9 +167,9 @@ def core_graph(count, edges, least, board=None):
             if alive[node] and degree[node] < least:
                 alive[node] = False
                 changed = True
-    nodes = np.flatnonzero(alive)
-    nodes = nodes[np.argsort(-degree[nodes])]
-    index_of = np.full(count, -1, np.int64)
+    nodes = indices_of_true(alive)
+    nodes = elements(nodes, order_of_degrees(elements(degree, nodes)))
+    index_of = np.empty(count, np.int64)
     for index in range(len(nodes)):
         index_of[nodes[index]] = index
     rows = np.zeros((len(nodes), (len(nodes) + 63) // 64), np.uint64)
@@ -169,4 +181,4 @@ def core_graph(count, edges, least, board=None):
         return nodes, rows
     kept = remove_weak_edges(rows, least)
     small, old = subgraph(rows, kept)
-    return nodes[old], small
+    return elements(nodes, old), small

@@ -20,7 +20,7 @@ DEGENERATE = 1e-12
 """Below this, relative to |d|, the pair says nothing about yaw."""
 
 
-@kernel(inline="always")
+@kernel()
 def yaw_coefficients(vi, vj, pi, pj):
     """(d1, d2, d3) of Eq. 22, m, |n|^2 = sin^2 of the angle between the bearings, and |d|^2, m^2.
 
@@ -33,7 +33,7 @@ def yaw_coefficients(vi, vj, pi, pj):
     return nx * dx + nz * dz, nx * dz - nz * dx, ny * dy, nx * nx + ny * ny + nz * nz, dx * dx + dy * dy + dz * dz
 
 
-@kernel(inline="always")
+@kernel()
 def depths(vi, vj, pi, pj, cosine, sine, sin2):
     """Depths (s_i, s_j), m, with R d = s_i v_i - s_j v_j in the least-squares sense; sin2 = |v_i x v_j|^2.
 

@@ -63,7 +63,8 @@ def run(problem, floor):
     before = degree_bounds(count, starts, edges, board)
     bound = before.copy()
     best = empty_list(8, count)
-    largest_bin_cliques(bounded_matches(aligned, bounds), starts, edges, bound, floor, best, board)
+    order = np.argsort(-bound, kind="stable")
+    largest_bin_cliques(bounded_matches(aligned, bounds), starts, edges, bound, order, floor, best, board)
     known = int(best.known[0])
     return before, bound, best.poses[:known], best.supports[:known], best.masks[:known]
 
