@@ -311,9 +311,9 @@ def teacher_page(course: Collection[Lesson]) -> str:
             lectures.append(_timetable(lesson))
         asked = sum(moment.question is not None for moment in lesson.moments)
         rows.append(
-            f'<tr><td><a href="/learn/{name}">{title}</a></td><td>{lesson.minutes} min</td><td>{asked}</td>'
+            f'<tr><td><a href="/learn/{name}">{title}</a></td><td class="when">{lesson.minutes} min</td><td>{asked}</td>'
             f'<td><a href="/learn/{name}/notes">notes</a></td>'
-            f'<td><a href="/learn/{name}/handout">hand-out</a></td></tr>'
+            f'<td><a href="/learn/{name}/handout">paper</a></td></tr>'
         )
     return _page("teacher.html", lectures="".join(lectures), rows="".join(rows))
 

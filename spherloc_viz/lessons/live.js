@@ -4,7 +4,7 @@ function openScene(told) {
   const EVERY_MS = 150;
   const frame = Object.assign(document.createElement("iframe"), { title: "The live scene" });
   document.querySelector(".scene").append(frame);
-  let wanted = "", sent = "", landed = "";
+  let wanted = "", sent = "", landed = "", heard = false;
 
   const inside = (selector) => frame.contentDocument?.querySelector(selector);
 
@@ -35,12 +35,13 @@ function openScene(told) {
     if (!said || !inside("[data-ready]")) return;
     if (wanted !== sent) {
       sent = wanted;
-      landed = "";
       frame.contentWindow.location.replace(`/#${wanted}`);
       return;
     }
     if (!said.dataset.numbers) tell("numbers:");
-    else if (frame.contentWindow.location.hash === `#${said.dataset.address}` && landed !== said.dataset.numbers) {
+    else if (frame.contentWindow.location.hash === `#${said.dataset.address}`) {
+      if (heard && landed === said.dataset.numbers) return;
+      heard = true;
       landed = said.dataset.numbers;
       told(JSON.parse(landed));
     }
@@ -49,6 +50,7 @@ function openScene(told) {
   return {
     show(state) {
       wanted = state;
+      heard = false;
       if (frame.getAttribute("src")) return;
       sent = wanted;
       frame.src = `/#${wanted}`;

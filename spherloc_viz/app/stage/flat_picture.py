@@ -85,7 +85,7 @@ def _discs(
     faint = f' fill-opacity="{opacity:.2g}"' if opacity < 1.0 else ""
     for (x, y), depth, radius, color in zip(eye.pixels(positions), depths, radii, colors, strict=True):
         if depth > NEAR_M and -radius < x < WIDTH + radius and -radius < y < HEIGHT + radius:
-            fill = style.css(tuple(map(int, color)))
+            fill = _css(color)
             yield float(depth), f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius:.1f}" fill="{fill}"{faint}/>'
 
 
@@ -102,7 +102,7 @@ def _lines(eye: _Eye, item: Segments) -> Iterator[Shape]:
         (x, y), (u, v) = np.clip(eye.pixels(ends), -1e5, 1e5)
         if max(x, u) < 0 or min(x, u) > WIDTH or max(y, v) < 0 or min(y, v) > HEIGHT:
             continue
-        stroke = ground or style.css(tuple(map(int, color)))
+        stroke = ground or _css(color)
         yield (
             float(depth.mean()),
             f'<path d="M{x:.1f} {y:.1f}L{u:.1f} {v:.1f}" stroke="{stroke}" stroke-width="{LINE * item.width_px:.2g}"/>',
@@ -121,3 +121,8 @@ def _outline(eye: _Eye, item: Mesh) -> Iterator[Shape]:
     corners = " ".join(f"{x:.1f},{y:.1f}" for x, y in around)
     fill = style.css(item.color)
     yield float(depths.max()), f'<polygon points="{corners}" fill="{fill}" fill-opacity="{0.5 * item.opacity:.2g}"/>'
+
+
+def _css(color: np.ndarray) -> str:
+    red, green, blue = map(int, color)
+    return style.css((red, green, blue))
