@@ -167,7 +167,7 @@ class CaseMaker:
 def cameras() -> tuple[Camera, ...]:
     """Those of the scenes ``SCENES``."""
     scenes = bundled_scenes()
-    return tuple(load_scene(scenes[name]).camera for name in SCENES)  # type: ignore[attr-defined]
+    return tuple(load_scene(scenes[name]).problem().camera for name in SCENES)
 
 
 GUESSES = 100
@@ -474,8 +474,9 @@ class StagedScene:
         """The camera as the calibration has it."""
         if not self.focal_off:
             return self.camera
+        camera: Any = self.camera  # ``__post_init__`` wants one with focal lengths
         longer = 1.0 + self.focal_off
-        return replace(self.camera, fx=self.camera.fx * longer, fy=self.camera.fy * longer)  # type: ignore[attr-defined]
+        return replace(camera, fx=camera.fx * longer, fy=camera.fy * longer)
 
 
 def _add(make: CaseMaker, group: Group) -> None:

@@ -196,9 +196,10 @@ class Controls:
             self._recordings = RecordingsPanel(gui, client, touches, services.library, self.review, page)
         with tabs.add_tab("Share"):
             self._export = ExportPanel(gui, client, owner.shown)
-        for label, key, modifier, by in ((UNDO, "Z", "cmd/ctrl", -1), (REDO, "Z", "cmd/ctrl+shift", 1)):
-            command: Any = gui.add_command(label, hotkey=key, modifier=modifier)  # type: ignore[arg-type]
-            command.on_trigger(lambda event, by=by: owner.step_history(by))
+        undo: Any = gui.add_command(UNDO, hotkey="Z", modifier="cmd/ctrl")
+        redo: Any = gui.add_command(REDO, hotkey="Z", modifier="cmd/ctrl+shift")
+        undo.on_trigger(lambda event: owner.step_history(-1))
+        redo.on_trigger(lambda event: owner.step_history(1))
         gui.main_panel.dock_right()
         gui.main_panel.set_width(width_px)
 

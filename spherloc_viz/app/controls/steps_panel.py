@@ -3,7 +3,7 @@
 import threading
 from collections.abc import Callable, Sequence
 from html import escape
-from typing import Any
+from typing import Any, Literal
 
 import viser
 
@@ -23,7 +23,7 @@ LONG_STAGE = 6
 PACES = {"1×": 1.0, "2×": 2.0, "4×": 4.0, "½×": 0.5}
 PREVIOUS, NEXT, PLAY, PAUSE = "Previous", "Next", "Play", "Pause"
 BACK, ON = "Previous stage", "Next stage"
-HOTKEYS = (
+HOTKEYS: tuple[tuple[str, str, Literal["B", "N", "P"], Literal["shift"] | None], ...] = (
     (PREVIOUS, "Previous step", "B", None),
     (NEXT, "Next step", "N", None),
     (PLAY, "Play or pause", "P", None),
@@ -56,7 +56,7 @@ class StepsPanel:
         self._choice.on_update(self._pick)
         self._buttons.on_click(self._click)
         for button, label, hotkey, modifier in HOTKEYS:
-            command: Any = gui.add_command(label, hotkey=hotkey, modifier=modifier)  # type: ignore[arg-type]
+            command: Any = gui.add_command(label, hotkey=hotkey, modifier=modifier)
             command.on_trigger(lambda event, button=button: self._press(button))
 
     def advance(self, steps: tuple[StepHeading, ...], asked: bool) -> tuple[int, float | None]:

@@ -285,8 +285,7 @@ def is_same(one: Problem, other: Problem) -> bool:
     arrays = ("pixels", "points", "gravity_camera", "gravity_map", "truth_cam_from_map", "truth_inliers")
     plain = ("name", "camera", "bound_px", "gravity_bound_rad", "gravity_sd_rad")
     return all(getattr(one, name) == getattr(other, name) for name in plain) and all(
-        np.array_equal(getattr(one, name), getattr(other, name))  # type: ignore[arg-type]
-        for name in arrays
+        np.array_equal(getattr(one, name), getattr(other, name)) for name in arrays
     )
 
 

@@ -270,7 +270,8 @@ def _demand(key: str) -> Iterator[None]:
 
         return original(*args, process_request=checked, **options)
 
-    websockets.asyncio.server.serve = serve  # type: ignore[assignment]
+    module: Any = websockets.asyncio.server
+    module.serve = serve
     try:
         yield
     finally:
