@@ -75,11 +75,6 @@ def kernel_folder() -> Path:
     return _first_writable(package, f"kernels-{digest[:16]}")
 
 
-def is_cold() -> bool:
-    """Whether nothing is compiled yet, as after an installation."""
-    return not any(kernel_folder().rglob("*.nbi"))
-
-
 @cache
 def _temporary() -> Path:
     """A folder of this process and its children alone: whoever can write into a folder of kernels decides what runs."""

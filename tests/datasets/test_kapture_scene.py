@@ -20,8 +20,6 @@ ROOT = Path(__file__).resolve().parents[2]
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
 
-STEP_NS = 100_000_000
-
 
 @pytest.fixture
 def t265():
