@@ -209,8 +209,8 @@ def _processors() -> int:
 
 def _expected(cold: Sequence[str]) -> str:
     """How long compiling may take, in words."""
-    one_estimator = len(set(cold) - SHARED.keys()) <= 1
-    return "a quarter to half a minute" if one_estimator else "one to two minutes"
+    one_estimator = len({part.partition(",")[0] for part in cold} - SHARED.keys()) <= 1
+    return "half a minute to a minute" if one_estimator else "one to two minutes"
 
 
 def _is_compiled(part: str) -> bool:

@@ -311,7 +311,8 @@ def teacher_page(course: Collection[Lesson]) -> str:
             lectures.append(_timetable(lesson))
         asked = sum(moment.question is not None for moment in lesson.moments)
         rows.append(
-            f'<tr><td><a href="/learn/{name}">{title}</a></td><td class="when">{lesson.minutes} min</td><td>{asked}</td>'
+            f'<tr><td><a href="/learn/{name}">{title}</a></td><td class="when">{lesson.minutes} min</td>'
+            f"<td>{asked}</td>"
             f'<td><a href="/learn/{name}/notes">notes</a></td>'
             f'<td><a href="/learn/{name}/handout">paper</a></td></tr>'
         )
