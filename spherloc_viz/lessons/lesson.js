@@ -1,6 +1,6 @@
 // Has the scene beside a lesson show the moment that is read. What draws the scene is in live.js or recorded.js.
 (() => {
-  const MANY = ["set", "option"], OPENING_MS = 30000;
+  const MANY = ["set", "option"], OPENING_MS = 90000;
   const prose = document.querySelector(".prose"), scene = openScene((numbers) => write(numbers));
   const moments = [...document.querySelectorAll("section")], where = document.querySelector(".where");
   const changes = new Map();  // what the reader changed, by moment
