@@ -46,7 +46,7 @@ CASES = (
 
 async def prepare(page: PageClient, case: Case) -> None:
     """Bring a page to a case."""
-    await page.until(lambda: page.says("success") or page.says("failure"))
+    await page.until(lambda: page.says("data-ready"), 120.0)
     await page.set("Points", case.points)
     await page.set("Outliers (%)", case.outliers_percent)
     await page.set("Estimator", case.estimator)

@@ -101,7 +101,7 @@ def record(count: int) -> bool:
 
 async def _greet(address: str) -> None:
     async with PageClient(address) as page:
-        await page.until(lambda: page.says("success") or page.says("failure"), 180.0)
+        await page.until(lambda: page.says("data-ready"), 180.0)
 
 
 async def visits(count: int) -> bool:

@@ -138,7 +138,7 @@ async def _press(
     """Reports of presses."""
     async with PageClient(address, cookie=cookie) as page:
         await page.until(lambda: page.says("data-ready"), 120.0)
-        await page.until(lambda: page.says("success") or page.says("failure"), 120.0)
+        await page.until(lambda: page.says("data-ready"), 120.0)
         said = " ".join(page.html.values())
         others = {"run-open", "run-label", "runs-export", "run-mark"}
         actions = sorted(set(re.findall(r'data-touch="([\w-]+):', said)) | others)
@@ -170,7 +170,7 @@ async def _talk(
     number = 0
     while number < count:
         async with PageClient(address, cookie=cookie) as page:
-            await page.until(lambda page=page: page.says("success") or page.says("failure"), 120.0)
+            await page.until(lambda page=page: page.says("data-ready"), 120.0)
             for _ in range(EACH):
                 data = _hostile_message(rng, page)
                 start, outcome = time.perf_counter(), "accepted"
@@ -191,7 +191,7 @@ async def _talk(
         start = time.perf_counter()
         async with PageClient(address, cookie=cookie) as page:
             try:
-                await page.until(lambda page=page: page.says("success") or page.says("failure"), 120.0)
+                await page.until(lambda page=page: page.says("data-ready"), 120.0)
             except TimeoutError:
                 seconds = time.perf_counter() - start
                 _note(tally, number, "no more pages", seconds, server, "a page that was opened stayed empty")

@@ -89,12 +89,15 @@ class Session:
         self._diagnosed: tuple[Trace, Diagnosis] | None = None
         self._runs = PageRuns(services.recorder, self._catalog)
         self.notices = Notices(client)
+        self._built = False
+        """Whether all widgets are there: the first of them may be used before the last one is made."""
         left_px, right_px = panel_widths_px(client.camera.image_width)
         self._controls = Controls(client, self._catalog, services, self._touches, self, right_px)
         places = Places(self.redraw, self.select, self._move_camera)
         self._display = RunDisplay(client, self._touches, self._controls, places, (left_px, right_px))
         self._listen()
         self._name, self._address = secrets.token_hex(8), client.gui.add_html("")
+        self._built = True
         # Only now may the page tell what is pressed: everything that listens is there.
         client.gui.add_html(READY)
         self._display.panels.ready()
@@ -123,7 +126,8 @@ class Session:
 
     def changed(self, event: object = None) -> None:
         """A widget that a run depends on was changed on the page by its user."""
-        self._controls.slow.outdate()
+        if self._built:
+            self._controls.slow.outdate()
         self._solver.ask()
 
     def redraw(self, event: object = None) -> None:
