@@ -59,6 +59,7 @@
     const place = moments.indexOf(now);
     where.textContent = `${place + 1} of ${moments.length}: ${now.querySelector("h2").textContent}`;
     history.replaceState(null, "", `#m${place}`);
+    report();  // the notes do not wait for the run's numbers
     go();
   }
 
