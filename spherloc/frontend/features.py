@@ -1,9 +1,9 @@
-"""Local features of an image: keypoints and descriptors, within its valid pixels, across a panorama's seam."""
+"""Local features of an image: keypoints and descriptors, within its valid pixels; of a panorama on virtual faces."""
 
 import io
 import zipfile
 from dataclasses import dataclass
-from math import ceil, pi, tau
+from math import pi, tau
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from spherloc.cameras.equirectangular import Equirectangular
+from spherloc.cameras.faces import Faces, panorama_faces
 from spherloc.disk_cache import DAMAGED_NPZ, cache_folder, key_of, make_room_once, store, used
 from spherloc.errors import InputError, show
 from spherloc.files import read_file
@@ -19,11 +21,11 @@ from spherloc.frontend.view import View
 from spherloc.images import MAX_BYTES
 from spherloc.types import BoolArray, ByteArray, FloatArray
 
-VERSION = 2
+VERSION = 3
 """Raised when the same options give other features, so that old files are not taken for them."""
 
 
-def feature_file(image: Path, usable: BoolArray, options: Any, seam: bool) -> Path | None:
+def feature_file(image: Path, usable: BoolArray, options: Any, panorama: bool) -> Path | None:
     """Where the features of an image are kept: named by its content, its usable pixels (H, W) and the options.
 
     None if a file cannot be read: whoever needs it says so.
@@ -31,7 +33,7 @@ def feature_file(image: Path, usable: BoolArray, options: Any, seam: bool) -> Pa
     contents = [_content(file) for file in (image, options.weights) if file is not None]
     if any(content is None for content in contents):
         return None
-    said = (VERSION, cv2.__version__, options.method, options.max_features, seam, usable.shape)
+    said = (VERSION, cv2.__version__, options.method, options.max_features, panorama, usable.shape)
     return cache_folder("features") / f"{key_of(said, np.packbits(usable).tobytes(), *contents)}.npz"
 
 
@@ -74,16 +76,14 @@ METHODS = tuple(KINDS)
 MOST_FEATURES = 50_000
 RIM_PX = 4.0
 """Features this close to pixels that may not be used, and farther for large ones, are the rim's and not the scene's."""
-SEAM_WRAP = 0.05
-"""Part of a panorama's width that is repeated beyond its seam, so that features there see both sides."""
-SEAM_LEAST_PX = 128
-"""Repeated of a small one: ORB finds nothing within 31 pixels of the border of its coarsest level, 111 of the image."""
-SEAM_STEP_PX = 32
-"""The wrap is a multiple of it, so that the coarse levels of the pyramid sample the same pixels as without it."""
-SEAM_DUPLICATE_PX = 1.0
-"""A feature this close to the seam may be found on both sides of it."""
 MOST_PIXELS = 5_000_000
 """Larger images are shrunk to this for detection, as COLMAP does: SIFT needs 250 bytes a pixel."""
+FACE_SHARPNESS = 1.4
+"""Pixels of a panorama's face, at its centre, for one of the panorama: a third more right matches than 1.0 gives."""
+SAME_FEATURE_PX = 1.0
+"""Two faces place the same feature this close to each other, in pixels of the panorama's horizon."""
+MOST_FACE_PIXELS = 12_000_000
+"""Of all faces of a panorama."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ class FeatureOptions:
 
     method: str = "sift"
     """One of ``METHODS``; SIFT is root-normalised."""
-    max_features: int = 4000
+    max_features: int = 8000
     """The strongest are kept."""
     weights: Path | None = None
     """ONNX file of the learned methods, ALIKED and DISK."""
@@ -147,11 +147,12 @@ def extract(view: View, options: FeatureOptions | None = None) -> Features:
     """
     options = options or FeatureOptions()
     usable = view.usable_pixels()
-    seam = view.camera.model == "equirectangular"
-    path = feature_file(view.path, usable, options, seam)
+    panorama = view.camera if isinstance(view.camera, Equirectangular) else None
+    path = feature_file(view.path, usable, options, panorama is not None)
     found = fetch(path) if path else None
     if found is None:
-        found = _detected(view.read(), usable.astype(np.uint8), options, seam)
+        image, allowed = view.read(), usable.astype(np.uint8)
+        found = _on_faces(image, allowed, options, panorama) if panorama else _on_image(image, allowed, options)
         if path:
             keep(path, *found)
     table, descriptors = found
@@ -160,9 +161,7 @@ def extract(view: View, options: FeatureOptions | None = None) -> Features:
     return Features(pixels, sizes, angles, scores, descriptors, options.method, size)
 
 
-def _detected(
-    image: ByteArray, usable: ByteArray, options: FeatureOptions, seam: bool
-) -> tuple[FloatArray, Descriptors]:
+def _on_image(image: ByteArray, usable: ByteArray, options: FeatureOptions) -> tuple[FloatArray, Descriptors]:
     """Keypoints (N, 5) and descriptors of an image in its own pixels, the strongest first."""
     height, width = image.shape[:2]
     shrink = min(1.0, (MOST_PIXELS / (width * height)) ** 0.5)
@@ -171,31 +170,78 @@ def _detected(
         image = np.asarray(cv2.resize(image, small, interpolation=cv2.INTER_AREA), np.uint8)
         usable = np.asarray(cv2.resize(usable, small, interpolation=cv2.INTER_NEAREST), np.uint8)
     rows, columns = usable.shape
-    wrap = _wrap_px(columns) if seam else 0
-    if wrap:
-        image, usable = (np.concatenate([part[:, -wrap:], part, part[:, :wrap]], axis=1) for part in (image, usable))
+    table, descriptors = _detected(image, usable, np.ones(usable.shape, bool), options)
+    table[:, :3] *= width / columns, height / rows, width / columns
+    return _strongest(table, descriptors, options)
+
+
+def _on_faces(
+    image: ByteArray, usable: ByteArray, options: FeatureOptions, panorama: Equirectangular
+) -> tuple[FloatArray, Descriptors]:
+    """Keypoints (N, 5) and descriptors of a panorama in its own pixels, the strongest first.
+
+    They are found on flat faces: a panorama stretches what is near its poles, and cuts what is at its seam.
+    """
+    faces = panorama_faces(panorama, FACE_SHARPNESS, MOST_FACE_PIXELS)
+    tables, parts = [], []
+    for face in range(len(faces)):
+        table, descriptors = _detected(*faces.cut(face, image, usable), options)
+        tables.append(_on_panorama(table, faces, face))
+        parts.append(descriptors)
+    table = np.concatenate(tables)
+    descriptors = np.concatenate([part for part in parts if len(part)] or parts[:1])
+    face_of = np.repeat(np.arange(len(faces)), [len(one) for one in tables])
+    kept = _once(table, face_of, panorama)
+    return _strongest(table[kept], descriptors[kept], options)
+
+
+def _once(table: FloatArray, face_of: NDArray[np.int64], panorama: Equirectangular) -> BoolArray:
+    """(N,) all but the weaker of two features that are the same one, found on two faces (N,)."""
+    from scipy.spatial import KDTree  # a quarter of a second that only panoramas need
+
+    kept = np.ones(len(table), bool)
+    if len(table) == 0:
+        return kept
+    bearings, _ = panorama.unproject(table[:, :2])
+    pairs = KDTree(bearings).query_pairs(SAME_FEATURE_PX * tau / panorama.width, output_type="ndarray")
+    first, second = pairs.T
+    growth = np.abs(np.log(table[first, 2] / table[second, 2]))
+    turned = np.abs((table[first, 3] - table[second, 3] + pi) % tau - pi)
+    same = (face_of[first] != face_of[second]) & (growth < 0.3) & (turned < 0.3)
+    weaker = np.where(table[first, 4] < table[second, 4], first, second)
+    kept[weaker[same]] = False
+    return kept
+
+
+def _on_panorama(table: FloatArray, faces: Faces, face: int) -> FloatArray:
+    """Keypoints (N, 5) of a face in the panorama's pixels; their size and orientation are those of a step of it."""
+    moved = table.copy()
+    turn = np.column_stack([np.cos(table[:, 3]), np.sin(table[:, 3])])
+    moved[:, :2], _ = faces.panorama.project(faces.bearings(face, table[:, :2]))
+    ends, _ = faces.panorama.project(faces.bearings(face, table[:, :2] + turn))  # a step of one pixel of the face
+    width = faces.panorama.width
+    step = ends - moved[:, :2]
+    step[:, 0] = (step[:, 0] + width / 2) % width - width / 2
+    moved[:, 2] *= width / (tau * faces.focal_px)
+    moved[:, 3] = np.arctan2(step[:, 1], step[:, 0])
+    return moved
+
+
+def _detected(
+    image: ByteArray, usable: ByteArray, wanted: BoolArray, options: FeatureOptions
+) -> tuple[FloatArray, Descriptors]:
+    """Keypoints (N, 5) and descriptors of a flat image, (H, W) masks of what may be used and of what is wanted."""
     kind = KINDS[options.method]
     room = _room_px(usable)
-    mask = (room > RIM_PX).astype(np.uint8)
-    most = ceil(options.max_features * mask.shape[1] / columns)
-    table, descriptors = detect(options.method, image, mask, most, options.weights)
-    kept = _usable_rows(table, descriptors, room, kind.reach)
-    table[:, 0] -= wrap
-    if wrap:
-        kept &= (table[:, 0] >= -SEAM_DUPLICATE_PX) & (table[:, 0] < columns + SEAM_DUPLICATE_PX)
-    table, descriptors = table[kept], descriptors[kept]
-    order = np.lexsort([*table.T[[2, 3, 0, 1]], -table[:, 4]])
-    table, descriptors = table[order], descriptors[order]
-    if wrap:
-        table[:, 0] %= columns
-        kept = _without_duplicates(table, columns)
-        table, descriptors = table[kept], descriptors[kept]
-    table[:, :3] *= width / columns, height / rows, width / columns
-    return table[: options.max_features], np.ascontiguousarray(descriptors[: options.max_features])
+    mask = (wanted & (room > RIM_PX)).astype(np.uint8)
+    table, descriptors = detect(options.method, image, mask, options.max_features, options.weights)
+    kept = _usable_rows(table, descriptors, np.where(wanted, room, np.float32(0.0)), kind.reach)
+    return table[kept], descriptors[kept]
 
 
-def _wrap_px(columns: int) -> int:
-    return min(columns, SEAM_STEP_PX * ceil(max(SEAM_WRAP * columns, SEAM_LEAST_PX) / SEAM_STEP_PX))
+def _strongest(table: FloatArray, descriptors: Descriptors, options: FeatureOptions) -> tuple[FloatArray, Descriptors]:
+    order = np.lexsort([*table.T[[2, 3, 0, 1]], -table[:, 4]])[: options.max_features]
+    return table[order], np.ascontiguousarray(descriptors[order])
 
 
 def _room_px(usable: ByteArray) -> NDArray[np.float32]:
@@ -213,17 +259,3 @@ def _usable_rows(table: FloatArray, descriptors: Descriptors, room_px: NDArray[n
     inside = finite & (u >= 0) & (u < columns) & (v >= 0) & (v < rows)
     u, v = np.where(inside, u, 0), np.where(inside, v, 0)
     return inside & (room_px[v, u] > RIM_PX + reach * np.where(finite, table[:, 2], 0.0))
-
-
-def _without_duplicates(table: FloatArray, columns: int) -> BoolArray:
-    """(N,) all but the weaker of two features that are the same one, found on both sides of the seam."""
-    kept = np.ones(len(table), bool)
-    near = np.flatnonzero(np.minimum(table[:, 0], columns - table[:, 0]) <= SEAM_DUPLICATE_PX)
-    for position, one in enumerate(near):
-        others = near[:position][kept[near[:position]]]
-        apart = np.abs(table[others, :2] - table[one, :2])
-        apart[:, 0] = np.minimum(apart[:, 0], columns - apart[:, 0])
-        turned = np.abs((table[others, 3] - table[one, 3] + pi) % tau - pi)
-        growth = np.abs(np.log(table[others, 2] / table[one, 2]))
-        kept[one] = not ((apart.max(axis=1) < SEAM_DUPLICATE_PX / 2) & (turned < 0.2) & (growth < 0.2)).any()
-    return kept

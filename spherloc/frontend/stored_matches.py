@@ -17,7 +17,7 @@ from spherloc.frontend.view import Matcher, Matches, NeedsPreparing, Report, Vie
 SUFFIX = ".npz"
 """Of the file beside a scene file."""
 MOST_BYTES = 20_000_000
-VERSION = 1
+VERSION = 2
 """Raised when pictures, features or matching change, so that stored matches are not those that would be found."""
 
 

@@ -137,35 +137,33 @@ def test_tiny_pictures(tmp_path, rng, method, size):
     assert len(np.unique(np.column_stack([found.pixels, found.sizes_px, found.angles_rad]), axis=0)) == len(found)
 
 
-@pytest.mark.parametrize("method", CLASSICAL)
-@pytest.mark.parametrize("roll", [32, 131, 320])
-def test_a_rolled_panorama_has_the_same_features(tmp_path, rng, method, roll):
-    """Wherever the seam falls: by a multiple of the pyramid's steps almost exactly, by any other as well as it can."""
+@pytest.mark.parametrize("roll, most", [(128, 0.06), (32, 0.2), (131, 0.2), (320, 0.2)])
+def test_a_rolled_panorama_has_the_same_features(tmp_path, rng, roll, most):
+    """Wherever the seam falls: by a fifth, which takes faces to faces, almost all; by any other most."""
     width = 640
     image = texture(rng, 320, width)
-    options = FeatureOptions(method, max_features=3000)
-    plain = extract(view_of(tmp_path, image), options)
-    rolled = extract(view_of(tmp_path, np.roll(image, roll, axis=1), name="rolled.png"), options)
+    plain = extract(view_of(tmp_path, image))
+    rolled = extract(view_of(tmp_path, np.roll(image, roll, axis=1), name="rolled.png"))
     moved = (plain.pixels + np.array([roll, 0])) % (width, 1000)
     lost = nearest(moved, rolled.pixels, width)[1] > 0.7
     close = np.minimum(plain.pixels[:, 0], width - plain.pixels[:, 0]) < 30
     close |= np.minimum(moved[:, 0], width - moved[:, 0]) < 30
-    most = 0.4 if method == "orb" else 0.02 if roll % 32 == 0 else 0.15  # the levels of ORB have no common step
-    assert len(plain) > 200 and close.sum() > 30
+    assert len(plain) > 1000 and close.sum() > 100
     assert lost.mean() < most and lost[close].mean() < lost.mean() + 0.1
     assert abs(len(plain) - len(rolled)) < most * len(plain)
 
 
 @pytest.mark.parametrize("width", [640, 500])
-@pytest.mark.parametrize("offset", [-0.4, -0.02, 0.0, 0.013, 0.3])
-def test_a_blob_on_the_seam_is_found_once(tmp_path, width, offset):
-    """Both of the wrapped copies are seen, on either side of the seam; also where the width halves badly."""
-    image = blobs(width // 2, width, [(offset, 90.3)], 5.0, periodic=True)
+@pytest.mark.parametrize("row", [60.2, 90.3, 130.4])
+@pytest.mark.parametrize("offset", [-0.4, 0.013, 0.3])
+def test_a_blob_on_the_seam_is_found_once(tmp_path, width, row, offset):
+    """Also where two faces meet there, and each places it a little beyond itself."""
+    image = blobs(width // 2, width, [(offset, row)], 3.0, periodic=True)
     found = extract(view_of(tmp_path, image))
     strong = found.scores > 0.5 * found.scores.max()
     rows = np.column_stack([found.pixels, found.sizes_px, found.angles_rad])[strong]
-    _, distance = nearest(found.pixels[strong], np.array([[offset, 90.3]]), width)
-    assert len(rows) >= 1 and distance.max() < 0.3
+    _, distance = nearest(found.pixels[strong], np.array([[offset, row]]), width)
+    assert len(rows) >= 1 and distance.max() < 0.15
     for first, second in zip(*np.triu_indices(len(rows), 1), strict=True):  # it may have several orientations
         assert np.abs(np.angle(np.exp(1j * (rows[first, 3] - rows[second, 3])))) > 0.3
 
@@ -182,19 +180,8 @@ def test_features_match_across_the_seam(tmp_path, rng):
     expected = (query.pixels[pairs.query_index] + np.array([317, 0])) % (width, 1000)
     error = np.abs(expected - reference.pixels[pairs.reference_index])
     right = np.minimum(error, (width, np.inf) - error).max(axis=1) < 1.0
-    assert seam.sum() > 10 and right[matched].sum() > 0.75 * seam.sum()
+    assert seam.sum() > 10 and right[matched].sum() > 0.6 * seam.sum()
     assert right.mean() > 0.97
-
-
-def test_the_wrap_changes_nothing_far_from_the_seam(tmp_path, rng):
-    """The same picture, taken for a panorama and for another camera that sees all of it."""
-    image = texture(rng, 320, 640)
-    options = FeatureOptions(max_features=50_000)
-    wrapped = extract(view_of(tmp_path, image), options)
-    plain = extract(view_of(tmp_path, image, fisheye_of(640, 320)), options)
-    inner = [one.pixels[(np.abs(one.pixels[:, 0] - 320) < 160) & (one.sizes_px < 15)] for one in (wrapped, plain)]
-    assert len(inner[0]) > 100
-    assert nearest(*inner)[1].max() < 0.01 and nearest(*reversed(inner))[1].max() < 0.01
 
 
 def test_large_images_are_shrunk_for_detection(tmp_path, rng, monkeypatch):
