@@ -20,6 +20,8 @@ from pathlib import Path
 import cv2
 import pytest
 
+from spherloc.frontend import trained
+
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 """Real data, which lie beside the project."""
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "microsoft-edge")
@@ -73,6 +75,8 @@ NEEDS = {
     "kapture_t265": _data("kapture_t265", "the real stereo fisheyes"),
     "stella_equirect_pair": _data("stella_equirect_pair", "the real panoramas"),
     "opencv 5": Need(lambda: hasattr(cv2, "ALIKED_create"), "this OpenCV has no learned features (OpenCV 5 has)"),
+    "weights": _data("weights", "trained weights of learned features"),
+    "learned": Need(trained.installed, "the extra 'learned' is not installed (it takes 5 GB)"),
     "chromium": Need(
         lambda: bool(os.environ.get("SPHERLOC_CHROMIUM") or any(map(shutil.which, BROWSERS))),
         "no Chromium found: install Debian's chromium or set SPHERLOC_CHROMIUM to the path of one",

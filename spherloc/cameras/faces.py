@@ -64,7 +64,7 @@ class Faces:
 
 @lru_cache(maxsize=12)
 def _lookup(faces: Faces, face: int, width: int, height: int) -> tuple[FloatImage, FloatImage, BoolArray]:
-    """Columns and rows (S, S) of an image where OpenCV finds the pixels of a face, and those that belong to it with the rim."""
+    """Columns and rows (S, S) of an image where OpenCV finds the pixels of a face; those that are its own, with rim."""
     centres = np.arange(faces.size_px) + 0.5
     bearings = faces.bearings(face, np.column_stack([part.ravel() for part in np.meshgrid(centres, centres)]))
     pixels, _ = Equirectangular(width, height).project(bearings)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spherloc.errors import InputError
-from spherloc.frontend import learned
+from spherloc.frontend import learned, trained
 from spherloc.images import grey
 from spherloc.types import ByteArray, FloatArray
 
@@ -33,7 +33,11 @@ class Kind:
     binary: bool = False
     """Its descriptors are bits, compared by their Hamming distance."""
     learned: bool = False
-    """It needs a file of weights."""
+    """It can have a file of weights."""
+    packaged: bool = False
+    """It does without one if the extra ``learned`` is installed."""
+    most: int = 8000
+    """Of its features the strongest are kept, unless a number is given."""
 
 
 def detect(
@@ -115,12 +119,16 @@ def _contributed(name: str) -> Any:
     return getattr(getattr(cv2, "xfeatures2d", None), name, None)
 
 
+def _aliked(image: ByteArray, mask: ByteArray, most: int, weights: Path | None) -> tuple[FloatArray, Any]:
+    return trained.aliked(image, most) if weights is None else learned.aliked(image, mask, most, weights)
+
+
 KINDS = {
     # Two standard deviations of the Gaussian at which the keypoint was found; size means something else to each.
     "sift": Kind(_sift, reach=1.0),
     "orb": Kind(_orb, reach=0.2, binary=True),
     "akaze": Kind(_akaze, reach=0.7, binary=True),
     "surf": Kind(_surf, reach=0.5),
-    "aliked": Kind(learned.aliked, reach=1.0, learned=True),
-    "disk": Kind(learned.disk, reach=1.0, learned=True),
+    "aliked": Kind(_aliked, reach=1.0, learned=True, packaged=True, most=2048),
+    "disk": Kind(learned.disk, reach=1.0, learned=True, most=2048),
 }

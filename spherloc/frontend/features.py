@@ -16,6 +16,7 @@ from spherloc.cameras.faces import Faces, panorama_faces
 from spherloc.disk_cache import DAMAGED_NPZ, cache_folder, key_of, make_room_once, store, used
 from spherloc.errors import InputError, show
 from spherloc.files import read_file
+from spherloc.frontend import trained
 from spherloc.frontend.feature_kinds import KINDS, Descriptors, detect
 from spherloc.frontend.view import View
 from spherloc.images import MAX_BYTES
@@ -33,7 +34,7 @@ def feature_file(image: Path, usable: BoolArray, options: Any, panorama: bool) -
     contents = [_content(file) for file in (image, options.weights) if file is not None]
     if any(content is None for content in contents):
         return None
-    said = (VERSION, cv2.__version__, options.method, options.max_features, panorama, usable.shape)
+    said = (VERSION, cv2.__version__, options.method, options.most, panorama, usable.shape)
     return cache_folder("features") / f"{key_of(said, np.packbits(usable).tobytes(), *contents)}.npz"
 
 
@@ -92,21 +93,29 @@ class FeatureOptions:
 
     method: str = "sift"
     """One of ``METHODS``; SIFT is root-normalised."""
-    max_features: int = 8000
-    """The strongest are kept."""
+    max_features: int | None = None
+    """The strongest are kept; as many as their kind says (``Kind.most``) if it is None."""
     weights: Path | None = None
-    """ONNX file of the learned methods, ALIKED and DISK."""
+    """ONNX file of the learned methods, ALIKED and DISK; ALIKED does without if the extra ``learned`` is there."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.method, str) or self.method not in KINDS:
             raise InputError(f"There are no features {show(self.method)}; take one of {', '.join(METHODS)}.")
-        count = self.max_features
-        if isinstance(count, bool) or not isinstance(count, int) or not 1 <= count <= MOST_FEATURES:
+        count, kind = self.max_features, KINDS[self.method]
+        whole = isinstance(count, int) and not isinstance(count, bool)
+        if count is not None and not (whole and 1 <= count <= MOST_FEATURES):
             raise InputError(f"max_features is {show(count)}; give a whole number from 1 to {MOST_FEATURES}.")
-        if KINDS[self.method].learned and self.weights is None:
+        if kind.packaged and self.weights is None:
+            trained.check_installed(self.method)
+        if kind.learned and not kind.packaged and self.weights is None:
             raise InputError(f"{self.method} features need a file of weights; give its ONNX file as weights.")
-        if not KINDS[self.method].learned and self.weights is not None:
+        if not kind.learned and self.weights is not None:
             raise InputError(f"{self.method} features have no weights; leave weights out, or take aliked or disk.")
+
+    @property
+    def most(self) -> int:
+        """How many features are kept."""
+        return KINDS[self.method].most if self.max_features is None else self.max_features
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,13 +243,13 @@ def _detected(
     kind = KINDS[options.method]
     room = _room_px(usable)
     mask = (wanted & (room > RIM_PX)).astype(np.uint8)
-    table, descriptors = detect(options.method, image, mask, options.max_features, options.weights)
+    table, descriptors = detect(options.method, image, mask, options.most, options.weights)
     kept = _usable_rows(table, descriptors, np.where(wanted, room, np.float32(0.0)), kind.reach)
     return table[kept], descriptors[kept]
 
 
 def _strongest(table: FloatArray, descriptors: Descriptors, options: FeatureOptions) -> tuple[FloatArray, Descriptors]:
-    order = np.lexsort([*table.T[[2, 3, 0, 1]], -table[:, 4]])[: options.max_features]
+    order = np.lexsort([*table.T[[2, 3, 0, 1]], -table[:, 4]])[: options.most]
     return table[order], np.ascontiguousarray(descriptors[order])
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spherloc.errors import InputError, show
-from spherloc.frontend import learned
+from spherloc.frontend import learned, trained
 from spherloc.frontend.feature_kinds import KINDS, Descriptors
 from spherloc.frontend.features import Features
 from spherloc.types import BoolArray, FloatArray
@@ -29,7 +29,7 @@ class MatchOptions:
     mutual: bool = True
     """The query's feature must be the nearest of the reference's one, too. LightGlue's always are."""
     weights: Path | None = None
-    """ONNX file of LightGlue."""
+    """ONNX file of LightGlue; the extra ``learned`` does without."""
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
@@ -38,7 +38,7 @@ class MatchOptions:
         if self.ratio is not None and not (number and 0.0 < self.ratio <= 1.0):
             raise InputError(f"The ratio of matching is {show(self.ratio)}; give a number above 0, up to 1.")
         if self.method == "lightglue" and self.weights is None:
-            raise InputError("LightGlue matching needs a file of weights; give its ONNX file as weights.")
+            trained.check_installed("LightGlue")
         if self.method == "nearest" and self.weights is not None:
             raise InputError("Nearest matching has no weights; leave weights out, or take lightglue.")
 
@@ -90,8 +90,11 @@ def _by_lightglue(query: Features, reference: Features, options: MatchOptions) -
         raise InputError(
             f"LightGlue is for aliked features, not {query.method}; take those, or the matching 'nearest'."
         )
-    sides = ((one.pixels, one.descriptors.astype(np.float32), one.image_size) for one in (query, reference))
-    pairs = learned.lightglue(options.weights, *sides)
+    left, right = ((one.pixels, one.descriptors.astype(np.float32), one.image_size) for one in (query, reference))
+    if options.weights is None:
+        pairs = trained.lightglue(left, right)
+    else:
+        pairs = learned.lightglue(options.weights, left, right)
     pairs = pairs[np.argsort(pairs[:, 0], kind="stable")]
     return FeatureMatches(pairs[:, 0], pairs[:, 1], np.full(len(pairs), np.nan))
 

@@ -76,6 +76,8 @@ def _weights(folder: Path, key: str, value: Any, place: str) -> Path:
 
 SAME_POINT = 0.02
 """Points of two references are one if they are closer than this share of their distance to the first of them."""
+SHORTLIST = 2
+"""Times as many references are matched as stay: matches tell better than retrieval which see the same place."""
 VOCABULARY_IMAGES = 64
 """The words are learnt from so many references, spread over all."""
 
@@ -100,10 +102,11 @@ def image_matcher(
 class ImageMatcher:
     """Finds the correspondences of a query with the references most similar to it.
 
-    Up to ``options.references`` references are all matched; of more, retrieval picks that many. An image is never
-    matched with itself: a map's own images can be localized in it. References with more correspondences are the more
-    similar ones. Where several references give a query keypoint the same point (``SAME_POINT``), it counts once, from
-    the most similar of them; different points are alternatives and all stay.
+    Up to ``options.references`` references are all matched; of more, retrieval picks ``SHORTLIST`` times that many, and
+    those with the most correspondences stay. An image is never matched with itself: a map's own images can be localized
+    in it. References with more correspondences are the more similar ones. Where several references give a query
+    keypoint the same point (``SAME_POINT``), it counts once, from the most similar of them; different points are
+    alternatives and all stay.
     """
 
     references: tuple[View, ...]
@@ -124,7 +127,7 @@ class ImageMatcher:
                 continue
             if isinstance(reference.lift, TriangulationLift):
                 remarks += reference.lift.remarks
-        return _joined(found, tried, remarks)
+        return _joined(found, tried, self.options.references, remarks)
 
     def prepare(self, report: Report) -> None:
         """Describe all references, if there are so many that retrieval has to choose."""
@@ -145,7 +148,7 @@ class ImageMatcher:
             remarks += index.remarks
             allowed = set(others)
             order = index.views[retrieval.rank(index.describe(features), index.vectors)].tolist()
-            others = [place for place in order if place in allowed][: self.options.references]
+            others = [place for place in order if place in allowed][: SHORTLIST * self.options.references]
         return [self.references[place] for place in others], remarks
 
     def _paired(self, query: View, names: Sequence[str]) -> tuple[list[View], list[str]]:
@@ -255,14 +258,16 @@ def _correspondences(query: Features, reference: View, options: FrontendOptions)
     )
 
 
-def _joined(found: Sequence[_Found], tried: Sequence[View], remarks: list[str]) -> Matches:
-    ranked = sorted((part for part in found if len(part.pixels)), key=lambda part: -len(part.pixels))
+def _joined(found: Sequence[_Found], tried: Sequence[View], most: int, remarks: list[str]) -> Matches:
+    """What ``most`` references at most gave, those with the most correspondences."""
+    found = sorted(found, key=lambda part: -len(part.pixels))[:most]
+    ranked = [part for part in found if len(part.pixels)]
     total, lifted = sum(part.matches for part in found), sum(len(part.pixels) for part in found)
     if lifted < total:
         remarks.append(f"{total - lifted:,} of {total:,} matches have no point in the map.")
     if not ranked:
         none = np.empty((0, 2))
-        return Matches(none, np.empty((0, 3)), tuple(tried), np.empty(0, np.int64), none, None, tuple(remarks))
+        return Matches(none, np.empty((0, 3)), tuple(tried[:most]), np.empty(0, np.int64), none, None, tuple(remarks))
     pixels = np.concatenate([part.pixels for part in ranked])
     points = np.concatenate([part.points for part in ranked])
     index = np.repeat(np.arange(len(ranked)), [len(part.pixels) for part in ranked])

