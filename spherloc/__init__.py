@@ -11,6 +11,7 @@ EXPORTS = {
     "localize_bearings": "localization",
     "Localization": "localization",
     "estimate_absolute_pose": "localization",
+    "gravity_from_image": "localization",
     "estimate": "estimators",
     "options_type": "estimators",
     "diagnose": "diagnosis",

@@ -8,6 +8,7 @@ from spherloc.estimators import estimate as estimate
 from spherloc.estimators import options_type as options_type
 from spherloc.localization import Localization as Localization
 from spherloc.localization import estimate_absolute_pose as estimate_absolute_pose
+from spherloc.localization import gravity_from_image as gravity_from_image
 from spherloc.localization import localize as localize
 from spherloc.localization import localize_bearings as localize_bearings
 from spherloc.metrics import evaluate as evaluate

@@ -6,7 +6,7 @@ from functools import cached_property
 from html import escape
 from numbers import Real
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,6 +25,9 @@ from spherloc.problem import Problem
 from spherloc.registry import require
 from spherloc.trace import Certificate, RefinementStage, Trace
 from spherloc.types import BoolArray, FloatArray
+
+if TYPE_CHECKING:
+    from spherloc.frontend.view import Gravity
 
 CAMERA = "the camera"
 """What a sentence calls a camera that comes from no file."""
@@ -192,6 +195,37 @@ def localize_bearings(
     camera = Equirectangular(2 * half, half, angular=True)
     bound_px = np.sin(bound_rad) * half / np.pi  # residuals are measured in the tangent plane
     return localize(camera.project(directions)[0], points, camera, gravity, bound_px=bound_px, **settings)
+
+
+def gravity_from_image(image: Any, camera: Any, near: ArrayLike = (0.0, 1.0, 0.0)) -> "Gravity":
+    """Which way is down in an image, from the direction in which its vertical lines meet.
+
+    Args:
+        image: The path of an image, or its pixels (H, W) or (H, W, 3), BGR bytes.
+        camera: As for ``localize``.
+        near: Vector (3,) that points about down in the camera frame, of any length; by up to 45 degrees it may be off.
+
+    Returns:
+        ``down`` (3,), a unit vector in the camera frame, with the bound ``bound_rad`` on its error and ``sd_rad``.
+
+    Raises:
+        InputError: If the image shows too few vertical lines, cannot be read, or has another size than the camera.
+    """
+    # OpenCV takes a while to import.
+    from spherloc.frontend.gravity_from_lines import gravity_of_pixels
+    from spherloc.frontend.view import seen_pixels
+    from spherloc.images import grey, read_image
+
+    lens, direction = as_camera(camera), _direction("near", near)
+    named = isinstance(image, str | Path)
+    pixels = grey(read_image(Path(image))) if named else _array("image", image)
+    if pixels.dtype != np.uint8 or pixels.ndim not in (2, 3) or (pixels.ndim == 3 and pixels.shape[2] != 3):
+        raise InputError(f"the image is {pixels.dtype} of shape {pixels.shape}; give bytes (H, W) or (H, W, 3).")
+    if pixels.shape[:2] != (lens.height, lens.width):
+        size = f"{pixels.shape[1]} x {pixels.shape[0]}"
+        raise InputError(f"the image has {size} pixels, its camera {lens.width} x {lens.height}; give those of one.")
+    name = str(image) if named else "the image"
+    return gravity_of_pixels(grey(pixels), lens, seen_pixels(lens), direction, name)
 
 
 def estimate_absolute_pose(

@@ -17,6 +17,9 @@ from spherloc.types import BoolArray, FloatArray, IntArray
 LEAST_STRETCH = 0.01
 """Smallest ratio of the two singular values of an unprojection's Jacobian that residuals believe in."""
 
+MOST_SOURCE = 200
+"""Characters of ``Problem.gravity_source``."""
+
 
 @dataclass(frozen=True, eq=False)
 class Problem:
@@ -38,6 +41,8 @@ class Problem:
     """Bound on the angular error of ``gravity_camera``."""
     gravity_sd_rad: float | None = None
     """Standard deviation of each of its two tilts; None takes a third of the bound."""
+    gravity_source: str = ""
+    """What says where down is in the camera, in a few words such as "the IMU"; empty if nothing is told of it."""
     bound_px: float | None = None
     """Pixel bound asked for by the scene; None leaves it to the estimator."""
     truth_cam_from_map: FloatArray | None = None
@@ -68,6 +73,8 @@ class Problem:
         below_90 = float(np.nextafter(np.pi / 2, 0.0))
         _scalar(self, "gravity_bound_rad", 0.0, below_90, "an angle from 0 to below pi / 2")
         _scalar(self, "gravity_sd_rad", 0.0, np.inf, "0 or more, or inf if nothing is known")
+        if not isinstance(self.gravity_source, str) or len(self.gravity_source) > MOST_SOURCE:
+            raise ProblemError(f"{self.name}: gravity_source is no text of at most {MOST_SOURCE} characters; give one.")
         _scalar(self, "bound_px", LEAST_PX, MOST_PX, f"{LEAST_PX:g} to {MOST_PX:,.0f} pixels")
         _scalar(self, "estimated_outlier_rate", 0.0, 1.0, "a share from 0 to 1")
         _check_reach(self.name, "points reach", points)
@@ -90,6 +97,22 @@ class Problem:
 
     def __len__(self) -> int:
         return len(self.pixels)
+
+    @property
+    def gravity_words(self) -> str:
+        """Where gravity comes from and how far it may be off: "from the IMU, within 3 deg"."""
+        source = f"from {self.gravity_source}, " if self.gravity_source else ""
+        bound_deg = np.degrees(self.gravity_bound_rad)
+        return f"{source}{f'within {bound_deg:.2g} deg' if bound_deg else 'taken as exact'}"
+
+    @property
+    def gravity_error_rad(self) -> float | None:
+        """Angle between ``gravity_camera`` and down at the true pose; None if that is unknown."""
+        if self.truth_cam_from_map is None:
+            return None
+        down = self.truth_cam_from_map[:, :3] @ self.gravity_map
+        sine = np.linalg.norm(np.cross(self.gravity_camera, down))
+        return float(np.arctan2(sine, self.gravity_camera @ down))
 
     @cached_property
     def _unprojected(self) -> tuple[FloatArray, BoolArray]:

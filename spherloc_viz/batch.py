@@ -13,7 +13,7 @@ from spherloc.datasets import Scene, load_scene
 from spherloc.datasets.map_scene import MapScene
 from spherloc.datasets.variation import Variation, used_seed
 from spherloc.diagnosis import Diagnosis, diagnose
-from spherloc.errors import InputError, RecordingError, SpherlocError
+from spherloc.errors import InputError, RecordingError, SpherlocError, legible
 from spherloc.estimators import default_options, options_type
 from spherloc.metrics import evaluate
 from spherloc.outcome import Outcome, judge
@@ -153,7 +153,10 @@ def _problem(path: Path, scene: Scene, seed: int | None, query: str | None, vari
     matches = changed.matcher(view)
     for remark in matches.remarks:
         say(remark)
-    return variation.edit(changed.problem_of(view, matches), used_seed(scene, seed))
+    problem = changed.problem_of(view, matches)
+    for remark in problem.remarks[len(changed.remarks) + len(matches.remarks) :]:
+        say(remark)
+    return variation.edit(problem, used_seed(scene, seed))
 
 
 def parse_settings(estimator: str, settings: Sequence[str]) -> dict[str, Any]:
@@ -206,6 +209,8 @@ def as_record(path: Path, trace: Trace, diagnosis: Diagnosis, recording: Path | 
         "seed": trace.seed,
         "options": asdict(trace.options),
         "cam_from_map": None if pose is None else pose.tolist(),
+        "gravity_source": trace.problem.gravity_source,
+        "gravity_bound_deg": float(np.degrees(trace.problem.gravity_bound_rad)),
         "inliers": int(np.count_nonzero(trace.inlier_mask)),
         "correspondences": len(trace.problem),
         "time_ms": trace.timings_ms["total"],
@@ -217,6 +222,12 @@ def as_record(path: Path, trace: Trace, diagnosis: Diagnosis, recording: Path | 
         "diagnosis": asdict(diagnosis),
         "recording": None if recording is None else str(recording),
     }
+
+
+def _gravity(problem: Problem) -> str:
+    error_rad = problem.gravity_error_rad
+    off = "" if error_rad is None else f"; {np.degrees(error_rad):.2g} deg off the truth"
+    return f"{problem.gravity_words}{off}"
 
 
 def as_text(path: Path, trace: Trace, diagnosis: Diagnosis, recording: Path | None) -> str:
@@ -234,6 +245,8 @@ def as_text(path: Path, trace: Trace, diagnosis: Diagnosis, recording: Path | No
         f"  {np.count_nonzero(trace.inlier_mask)} of {len(trace.problem)} correspondences are inliers, "
         f"{trace.timings_ms['total']:.1f} ms"
     )
+    if trace.problem.gravity_source:
+        lines.append(f"  gravity {legible(_gravity(trace.problem))}")
     judged = judge(trace)
     if judged.outcome is Outcome.DOUBTFUL:
         lines.append(f"  doubtful: {' '.join(judged.reasons)}")

@@ -3,11 +3,12 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from statistics import median
 from typing import TYPE_CHECKING, Any
 
 from spherloc.datasets import load_scene
 from spherloc.datasets.map_scene import MapScene
-from spherloc.errors import InputError, RecordingError, show
+from spherloc.errors import InputError, RecordingError, shorten, show
 from spherloc.estimators import options_type
 from spherloc.experiments.configuration import configuration_of
 from spherloc.experiments.results import (
@@ -191,10 +192,25 @@ def _text(results: SequenceResults, summary: Summary) -> str:
             f"  median time {summary.median_matching_ms or 0:.0f} ms for matching, "
             f"{summary.median_estimating_ms:.1f} ms for estimating"
         )
+    lines += [f"  {line}" for line in _gravity(results.rows)]
     lines += [f"  {line}" for line in (*_skipped(summary), *_without_pose(results.rows))]
     if not timed(results):
         lines.append("  trajectory: times are places in the sequence, as the queries have no growing times")
     return "\n".join([*lines, f"  written to {results.folder}"])
+
+
+def _gravity(rows: Sequence[QueryResult]) -> Iterator[str]:
+    """Of each source: in how many queries, its bounds and its true errors."""
+    by_source: dict[str, list[QueryResult]] = {}
+    for row in rows:
+        if row.gravity_source:
+            by_source.setdefault(row.gravity_source, []).append(row)
+    for source, told in by_source.items():
+        bounds = [row.gravity_bound_deg for row in told if row.gravity_bound_deg is not None]
+        errors = [row.gravity_error_deg for row in told if row.gravity_error_deg is not None]
+        most = f" to {max(bounds):.2g}" if max(bounds) > min(bounds) else ""
+        off = f"; off the truth by {median(errors):.2g} deg in the median, {max(errors):.2g} at most" if errors else ""
+        yield f"gravity from {shorten(source)} in {len(told)} queries, within {min(bounds):.2g}{most} deg{off}"
 
 
 def _rate(rate: SuccessRate) -> str:

@@ -190,6 +190,8 @@ truth = "outputs/results.txt"              # optional, rows: name qw qx qy qz tx
 [gravity]                                  # optional
 map = [0.0, 0.0, -1.0]                     # down; else the mean +y axis of the reference cameras
 bound_deg = 5.0                            # how far a query's roll and pitch may be from its reference's
+# query = "lines"                          # down in a query from the vertical lines of its image instead
+# file = "gravity.txt"                     # or from rows: image gx gy gz [sd_deg]
 """
 
 GRAVITY_BOUND_DEG = 5.0

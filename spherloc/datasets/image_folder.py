@@ -19,7 +19,7 @@ from spherloc.errors import InputError, shorten, show
 from spherloc.files import is_file, names_in, size_of
 from spherloc.formats.colmap_files import read_model
 from spherloc.frontend.lifting import DepthLift
-from spherloc.frontend.view import View
+from spherloc.frontend.view import Gravity, View
 from spherloc.images import read_depth_png, read_size
 from spherloc.trajectory import Trajectory, pose_at, read_euroc, read_tum
 from spherloc.types import FloatArray
@@ -192,6 +192,8 @@ images = "mapping"
 map = [0.0, 0.0, -1.0]          # down; else the mean +y axis of the reference cameras
 bound_deg = 3.0
 # camera = [0.0, 1.0, 0.0]      # down in all queries; else as in the most similar reference
+# query = "lines"               # or in each query from the vertical lines of its image
+# file = "gravity.txt"          # or from rows: image gx gy gz [sd_deg]
 
 # [truth]                       # optional: cam_from_map of queries
 # "a.jpg" = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]
@@ -243,14 +245,16 @@ def _queries(
     where = str(path)
     root, names = _names(table, path)
     truth = _truth(table, names, where)
-    down = unit_vector(gravity["camera"], "camera", f"{where} [gravity]") if "camera" in gravity else None
+    down = None
+    if "camera" in gravity:
+        down = Gravity(unit_vector(gravity["camera"], "camera", f"{where} [gravity]"), "the scene file")
     views, reasons = [], {}
     for name in names:
         reason = _unusable(root / name, camera)
         if reason:
             reasons.setdefault(reason, []).append(name)
         else:
-            views.append(View(name, camera, root / name, truth.get(name), gravity_camera=down))
+            views.append(View(name, camera, root / name, truth.get(name), gravity=down))
     return tuple(views), [f"{some(bad, 'query image')} left out: {reason}." for reason, bad in reasons.items()]
 
 

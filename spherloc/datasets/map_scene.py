@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 
 from spherloc.datasets import scene_file
+from spherloc.datasets.query_gravity import GravitySettings, MeasuredGravity, read_gravity
 from spherloc.datasets.registration import Registration
 from spherloc.errors import InputError, show
 from spherloc.files import is_folder
 from spherloc.frontend.pipeline import image_matcher
 from spherloc.frontend.stored_matches import StoredMatches
-from spherloc.frontend.view import Matcher, Matches, NeedsPreparing, Report, View
+from spherloc.frontend.view import Gravity, Matcher, Matches, NeedsPreparing, Report, View
 from spherloc.problem import Problem
 from spherloc.refine import residuals_px
 from spherloc.types import FloatArray
@@ -49,6 +50,8 @@ class MapScene:
     """Bound on the error of a query's known gravity, whether measured or taken from its reference."""
     gravity_sd_rad: float | None = None
     """Standard deviation of each of its two tilts; None takes a third of the bound."""
+    measured_gravity: MeasuredGravity | None = None
+    """Measures it in a query whose ``gravity`` is None; None takes that of the query's most similar reference."""
     bound_px: float | None = None
     """Pixel bound asked of estimators; None leaves it to them."""
     thresholds: Thresholds = DEFAULT_THRESHOLDS
@@ -118,15 +121,17 @@ class MapScene:
         Gravity is the query's own if it is measured, else that of the most similar reference (Sec. III: a vehicle's
         roll and pitch are about those of the vehicle that mapped the place). Raises ``ProblemError`` for too few.
         """
+        gravity, said = self._gravity(view, matches)
         problem = Problem(
             name=f"{self.name}, {view.name}",
             camera=view.camera,
             pixels=matches.pixels,
             points=matches.points,
-            gravity_camera=self._gravity(view, matches),
+            gravity_camera=gravity.down,
             gravity_map=self.gravity_map,
-            gravity_bound_rad=self.gravity_bound_rad,
-            gravity_sd_rad=self.gravity_sd_rad,
+            gravity_bound_rad=self.gravity_bound_rad if gravity.bound_rad is None else gravity.bound_rad,
+            gravity_sd_rad=self.gravity_sd_rad if gravity.bound_rad is None else gravity.sd_rad,
+            gravity_source=gravity.source,
             bound_px=self.bound_px,
             truth_cam_from_map=view.cam_from_map,
             image=view.path,
@@ -135,7 +140,7 @@ class MapScene:
             reference_index=matches.reference_index,
             reference_pixels=matches.reference_pixels,
             estimated_outlier_rate=matches.estimated_outlier_rate,
-            remarks=(*self.remarks, *matches.remarks),
+            remarks=(*self.remarks, *matches.remarks, *said),
         )
         if view.cam_from_map is None:
             return problem
@@ -143,17 +148,40 @@ class MapScene:
         close = residuals_px(aligned, aligned.align_pose(view.cam_from_map)) <= TRUE_INLIER_PX
         return replace(problem, truth_inliers=aligned.full_mask(close))
 
-    def _gravity(self, view: View, matches: Matches) -> FloatArray:
-        if view.gravity_camera is not None:
-            return view.gravity_camera
+    def _gravity(self, view: View, matches: Matches) -> tuple[Gravity, tuple[str, ...]]:
+        """Of a query, and what is to be said of it."""
         posed = [reference for reference in matches.references if reference.cam_from_map is not None]
-        if not posed:
+        nearby = self._like(posed[0]) if posed else None
+        if view.gravity is not None:
+            return view.gravity, _contradiction(view.gravity, nearby)
+        said: tuple[str, ...] = ()
+        if self.measured_gravity is not None:
+            try:
+                return self.measured_gravity(view, None if nearby is None else nearby.down), ()
+            except InputError as error:
+                said = (f"{error} Gravity is that of the most similar reference.",) if nearby else (str(error),)
+        if nearby is None:
             raise InputError(
                 f"{self.where}: gravity is not known in the query image {show(view.name)}, and none of its references "
-                "has a pose to take it from; give its gravity."
+                f"has a pose to take it from; give its gravity.{''.join(f' {remark}' for remark in said)}"
             )
-        down = np.asarray(posed[0].cam_from_map)[:, :3] @ self.gravity_map
-        return down / np.linalg.norm(down)
+        return nearby, said
+
+    def _like(self, reference: View) -> Gravity:
+        """Of a query that stands as a reference does."""
+        down = np.asarray(reference.cam_from_map)[:, :3] @ self.gravity_map
+        return Gravity(down / np.linalg.norm(down), "its most similar reference")
+
+
+def _contradiction(stated: Gravity, nearby: Gravity | None) -> tuple[str, ...]:
+    """What to say of a gravity that points up in the camera of the most similar reference."""
+    if nearby is None or stated.down @ nearby.down >= 0.0:
+        return ()
+    angle_deg = np.degrees(np.arccos(np.clip(stated.down @ nearby.down, -1.0, 1.0)))
+    return (
+        f"Gravity from {stated.source} is {angle_deg:.0f} degrees away from that of its most similar reference; it "
+        "must point down, in the camera frame with x right, y down and z forward.",
+    )
 
 
 REQUIRED = {"kind", "name"}
@@ -167,8 +195,7 @@ class MapSettings:
     name: str
     frontend: Mapping[str, Any]
     """The section [frontend], for ``image_matcher`` to check."""
-    gravity_bound_rad: float
-    gravity_sd_rad: float | None
+    gravity: GravitySettings
     bound_px: float | None
     thresholds: Thresholds
 
@@ -188,19 +215,22 @@ class MapSettings:
         wrong [frontend] and if there is no query or no reference.
         """
         given = tuple(references)
+        gravity = self.gravity
+        known, said = gravity.of_queries(queries, gravity_map)
         if "matcher" not in others:
             others["matcher"] = image_matcher(given, self.frontend, str(path), path.parent)
         return MapScene(
             name=self.name,
             where=str(path),
-            queries=tuple(queries),
+            queries=known,
             references=given,
             gravity_map=gravity_map,
-            gravity_bound_rad=self.gravity_bound_rad,
-            gravity_sd_rad=self.gravity_sd_rad,
+            gravity_bound_rad=gravity.bound_rad,
+            gravity_sd_rad=gravity.sd_rad,
+            measured_gravity=gravity.measured,
             bound_px=self.bound_px,
             thresholds=self.thresholds,
-            remarks=tuple(remarks),
+            remarks=(*remarks, *said),
             **others,
         )
 
@@ -213,14 +243,10 @@ def read_settings(
     Keys of the loader's own are for it to check, by ``scene_file.check_keys`` with ``REQUIRED`` and ``OPTIONAL``
     among the known ones. Raises ``InputError`` for a wrong value.
     """
-    gravity = {"bound_deg": gravity_bound_deg} | scene_file.section(table, "gravity", where)
-    scene_file.check_keys(gravity, set(), {"bound_deg", "sd_deg"}, f"{where} [gravity]")
-    bound_rad, sd_rad = scene_file.gravity_error_rad(gravity, f"{where} [gravity]")
     return MapSettings(
         name=scene_file.text(table, "name", where),
         frontend=scene_file.section(table, "frontend", where),
-        gravity_bound_rad=bound_rad,
-        gravity_sd_rad=sd_rad,
+        gravity=read_gravity(scene_file.section(table, "gravity", where), where, gravity_bound_deg),
         bound_px=scene_file.bound_px(table, where),
         thresholds=_thresholds(table["thresholds"], where) if "thresholds" in table else thresholds,
     )

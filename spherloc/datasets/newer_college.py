@@ -27,7 +27,7 @@ from spherloc.formats.colmap_files import read_model
 from spherloc.formats.colmap_model import ColmapImage, ColmapModel
 from spherloc.formats.text_rows import needed_file
 from spherloc.frontend.lifting import PointCloudLift, SfmLift
-from spherloc.frontend.view import Lift, View
+from spherloc.frontend.view import Gravity, Lift, View
 from spherloc.geometry import camera_centre, pose
 from spherloc.trajectory import NS_PER_S, Trajectory, pose_at, read_newer_college
 from spherloc.types import BoolArray, FloatArray
@@ -350,7 +350,7 @@ def _queries(place: _Place, rig: _Rig) -> tuple[list[View], list[str]]:
     down_camera = down @ rig.cam_from_imu[:3, :3].T
     known = [bool(np.isfinite(direction).all()) for direction in down_camera]
     views = [
-        _view(image, rig.camera, cam_from_map, gravity_camera=direction)
+        _view(image, rig.camera, cam_from_map, gravity=Gravity(direction, "the IMU"))
         for image, cam_from_map, direction, measured in zip(images, poses, down_camera, known, strict=True)
         if cam_from_map is not None and measured
     ]
@@ -465,14 +465,14 @@ def _view(
     camera: Camera,
     cam_from_map: FloatArray,
     lift: Lift | None = None,
-    gravity_camera: FloatArray | None = None,
+    gravity: Gravity | None = None,
 ) -> View:
     return View(
         name=image.name,
         camera=camera,
         path=image.path,
         cam_from_map=cam_from_map,
-        gravity_camera=gravity_camera,
+        gravity=gravity,
         timestamp_s=image.timestamp_ns / NS_PER_S,
         lift=lift,
     )

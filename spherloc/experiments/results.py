@@ -65,6 +65,12 @@ class QueryResult:
     """Share of the correspondences within 8 px of their true pixel that are inliers."""
     f1: float | None = None
     """Harmonic mean of both."""
+    gravity_source: str | None = None
+    """What says where down is in the query."""
+    gravity_bound_deg: float | None = None
+    """Bound on the error of that, degrees."""
+    gravity_error_deg: float | None = None
+    """Angle between it and down at the true pose, degrees."""
     matching_ms: float | None = None
     """Wall time of features, retrieval, matching and lifting; another query may have been solved meanwhile."""
     estimating_ms: float | None = None
@@ -96,8 +102,10 @@ class QueryResult:
 _FIELDS = tuple(item.name for item in fields(QueryResult))
 _POSES = ("cam_from_map", "truth_cam_from_map")
 _WHOLE = {"index", "references", "matches", "inliers"}
-_TEXTS = {"query", "status", "diagnosis", "recording", "message"}
+_TEXTS = {"query", "status", "gravity_source", "diagnosis", "recording", "message"}
 _NEEDED = {"index", "query", "status", "message", "remarks"}
+_LATER = {"gravity_source", "gravity_bound_deg", "gravity_error_deg"}
+"""Which older files do not have."""
 
 COLUMNS = tuple(name for name in _FIELDS if name not in _POSES)
 """Of the CSV; poses are in the trajectory."""
@@ -123,8 +131,10 @@ def row_of_json(line: str, place: str) -> QueryResult:
         values = json.loads(line, parse_constant=lambda word: show(word))
     except (ValueError, RecursionError):
         values = None
-    if not isinstance(values, dict) or set(values) != set(_FIELDS):
+    if not isinstance(values, dict) or not set(_FIELDS) - _LATER <= set(values) <= set(_FIELDS):
         raise _damaged(place, "is no result of a query")
+    for name in _LATER:
+        values.setdefault(name, None)
     for name in _FIELDS:
         if values[name] is None and name not in _NEEDED:
             continue

@@ -102,7 +102,8 @@ def _status_without_matches(view: View) -> str:
 def _judged(scene: MapScene, view: View, references: tuple[View, ...], trace: Trace, row: QueryResult) -> QueryResult:
     """The row with all that the trace tells."""
     problem, metrics, pose = trace.problem, evaluate(trace), trace.cam_from_map
-    judged, registration_error_m, remarks = judge(trace), None, row.remarks
+    judged, registration_error_m = judge(trace), None
+    remarks = tuple(dict.fromkeys((*row.remarks, *problem.remarks[len(scene.remarks) :])))
     if scene.registration is not None and pose is not None:
         try:
             registration_error_m = float(scene.registration(view, pose, references))
@@ -117,6 +118,9 @@ def _judged(scene: MapScene, view: View, references: tuple[View, ...], trace: Tr
         rotation_error_deg=metrics.rotation_error_deg,
         translation_error_m=metrics.translation_error_m,
         registration_error_m=registration_error_m,
+        gravity_source=problem.gravity_source,
+        gravity_bound_deg=float(np.degrees(problem.gravity_bound_rad)),
+        gravity_error_deg=None if problem.gravity_error_rad is None else float(np.degrees(problem.gravity_error_rad)),
         precision=metrics.precision,
         recall=metrics.recall,
         f1=metrics.f1,

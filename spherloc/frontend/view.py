@@ -30,6 +30,20 @@ class Lift(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
+class Gravity:
+    """Which way is down in one image, how far that may be off, and what says so."""
+
+    down: FloatArray
+    """Unit vector (3,), camera frame."""
+    source: str
+    """A few words, such as "the IMU" or "lines of the image"."""
+    bound_rad: float | None = None
+    """Bound on the angular error of ``down``; None takes the scene's."""
+    sd_rad: float | None = None
+    """Standard deviation of each of its two tilts; None takes a third of the bound."""
+
+
+@dataclass(frozen=True, eq=False)
 class View:
     """One image of a map or of a query sequence. Cheap to make: pixels and depths are read when they are asked for."""
 
@@ -40,8 +54,8 @@ class View:
     """The image file."""
     cam_from_map: FloatArray | None = None
     """Pose (3, 4): a reference's known pose, or a query's true one; None if unknown."""
-    gravity_camera: FloatArray | None = None
-    """Unit vector (3,) pointing down in the camera frame, if something measured it (an IMU)."""
+    gravity: Gravity | None = None
+    """Which way is down in it, if something measured that."""
     timestamp_s: float | None = None
     """When it was taken, seconds."""
     lift: Lift | None = None

@@ -46,11 +46,8 @@ def _median_error_px(trace: Trace, rim: bool) -> float:
 
 
 def _gravity_off_deg(trace: Trace) -> float:
-    problem, truth = trace.problem, trace.problem.truth_cam_from_map
-    if truth is None:
-        return np.nan
-    cosine = problem.gravity_camera @ (truth[:, :3] @ problem.gravity_map)
-    return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
+    error_rad = trace.problem.gravity_error_rad
+    return np.nan if error_rad is None else float(np.degrees(error_rad))
 
 
 def _from_axis_deg(trace: Trace) -> float:

@@ -107,9 +107,10 @@ def _gravity(view: RunView) -> Frame:
     problem = view.trace.problem
     lean = np.degrees(np.arctan2(np.hypot(*problem.gravity_camera[[0, 2]]), problem.gravity_camera[1]))
     bound = problem.gravity_bound_rad
-    known = "exactly" if bound == 0.0 else f"to within {np.degrees(bound):.2g}°"
+    source = f" from {problem.gravity_source}" if problem.gravity_source else ""
+    known = f"{source} exactly" if bound == 0.0 else f"{source} to within {np.degrees(bound):.2g}°"
     return Frame(
-        f"Gravity is known {known} in the camera, where it points {lean:.1f}° away from the image's down, and in the "
+        f"Gravity is known{known} in the camera, where it points {lean:.1f}° away from the image's down, and in the "
         "map. Both frames are turned until it points straight down, which settles roll and pitch.",
         "R = A_camᵀ R_y(θ) A_map,  A g = e_y   (Eq. 1)",
         view.standing(np.eye(3)),

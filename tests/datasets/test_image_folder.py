@@ -60,14 +60,14 @@ def test_a_folder_of_queries_in_the_order_of_names(tmp_path):
     np.testing.assert_array_equal(scene.queries[1].cam_from_map[:, 3], [0.5, 0, -2])
     assert scene.queries[1].read().shape == (32, 64, 3)
     assert scene.references[0].camera == scene.queries[0].camera
-    assert scene.queries[0].gravity_camera is None and scene.gravity_bound_rad == pytest.approx(np.radians(3))
+    assert scene.queries[0].gravity is None and scene.gravity_bound_rad == pytest.approx(np.radians(3))
 
 
 def test_a_list_of_queries_and_their_own_gravity(tmp_path):
     gravity = "[gravity]\nmap = [0, 0, -1]\ncamera = [0, 2, 0]\n"
     scene = load_scene(make_tree(tmp_path, CAMERA + POSED + gravity, head='images = ["queries/b.png"]'))
     assert [view.name for view in scene.queries] == ["queries/b.png"]
-    np.testing.assert_array_equal(scene.queries[0].gravity_camera, [0, 1, 0])
+    np.testing.assert_array_equal(scene.queries[0].gravity.down, [0, 1, 0])
     np.testing.assert_array_equal(scene.gravity_map, [0, 0, -1])
     assert scene.gravity_bound_rad == 0.0 and scene.remarks == ()
 

@@ -69,7 +69,7 @@ def test_views_are_those_of_the_files(tree):
             assert view.camera.project(np.array([[0.3, 0.2, 1.0]]))[0] == pytest.approx(
                 CAMERA.project(np.array([[0.3, 0.2, 1.0]]))[0], abs=1e-6
             )
-            assert view.gravity_camera is None
+            assert view.gravity is None
     # 2013-05-28 08:46:02 UTC and ten frames a second from there
     assert scene.queries[0].timestamp_s == pytest.approx(1369730762 + 3.1 + 0.004094720, abs=1e-5)
 

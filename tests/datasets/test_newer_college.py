@@ -82,7 +82,7 @@ def test_gravity_comes_from_the_imu(base):
     assert scene.gravity_bound_rad == pytest.approx(np.radians(3.0))
     for time, view in zip(GOOD, scene.queries, strict=True):
         down = QUERY_WALK.cam_from_map(time)[:, :3] @ [0.0, 0.0, -1.0]
-        assert np.arccos(view.gravity_camera @ down) < 0.5 * scene.gravity_bound_rad
+        assert np.arccos(view.gravity.down @ down) < 0.5 * scene.gravity_bound_rad
         assert np.arccos(down @ [0.0, 1.0, 0.0]) > scene.gravity_bound_rad
         assert view.timestamp_s == pytest.approx(time / 1e9, abs=1e-6)
 
@@ -101,7 +101,7 @@ def test_the_imu_s_own_clock_is_believed(base, copy):
     imu.write_text("\n".join(["#counter,sec,nsec,wx,wy,wz,ax,ay,az", *ahead]) + "\n")
     calibration.write_text(calibration.read_text() + "  timeshift_cam_imu: 0.4\n")
     for view, expected in zip(load(copy).queries, load(base).queries, strict=True):
-        assert np.allclose(view.gravity_camera, expected.gravity_camera, atol=1e-9)
+        assert np.allclose(view.gravity.down, expected.gravity.down, atol=1e-9)
 
 
 def test_poses_are_the_ground_truth_s(base):

@@ -16,7 +16,7 @@ from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.datasets.map_scene import MapScene
 from spherloc.datasets.scene_file import check_keys
 from spherloc.errors import InputError
-from spherloc.frontend.view import Matches, View
+from spherloc.frontend.view import Gravity, Matches, View
 from spherloc.geometry import pose, transform, yaw_rotation
 
 CAMERA = Equirectangular(width=1024, height=512)
@@ -95,7 +95,7 @@ def load(table: dict[str, Any], path: Path) -> MapScene:
             image.write_bytes(content.tobytes() if ok and place not in broken else b"no image")
         known = None if place in unknown else true_pose(place)
         stamp = 1520530308.25 + 0.1 * place if table.get("timed", False) else None
-        queries.append(View(image.name, CAMERA, image, known, STANDING @ GRAVITY_MAP, stamp))
+        queries.append(View(image.name, CAMERA, image, known, Gravity(STANDING @ GRAVITY_MAP, "the IMU"), stamp))
     reference = View("reference", CAMERA, folder / "image0.png", true_pose(0))
     few, wrong = tuple(table.get("few", ())), tuple(table.get("wrong", ()))
     return MapScene(

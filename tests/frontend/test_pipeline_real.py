@@ -18,7 +18,7 @@ from spherloc.frontend.lifting import DepthLift, SfmLift
 from spherloc.frontend.matching import MatchOptions, match
 from spherloc.frontend.pipeline import image_matcher
 from spherloc.frontend.triangulation import TriangulationLift
-from spherloc.frontend.view import View
+from spherloc.frontend.view import Gravity, View
 from spherloc.geometry import camera_centre, pose, rotation_angle, transform
 from spherloc.images import read_depth_png
 from tests.needs import DATA, real_data, require
@@ -130,7 +130,8 @@ class Aria:
         if depth_ns is not None:
             lift = DepthLift(partial(self.depth, f"{camera}_{depth_ns}.png"), model, truth, "z")
         path = self.folder / "images" / f"{camera}_{image_ns}.png"
-        return View(path.name, model, path, truth, truth[:, :3] @ self.down, lift=lift, mask=lambda: lit)
+        gravity = Gravity(truth[:, :3] @ self.down, "the true pose")
+        return View(path.name, model, path, truth, gravity, lift=lift, mask=lambda: lit)
 
     down = np.array([0.0, -1.0, 0.0])
 

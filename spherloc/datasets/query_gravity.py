@@ -1,0 +1,140 @@
+"""Gravity of queries, for every kind of scene with images: from a file, the image itself, or the true pose.
+
+A gravity file has a row ``image gx gy gz [sd_deg]`` a query: its name as the scene has it (in quotation marks where it
+has spaces), a vector that points down in the camera frame, of any length, and the standard deviation of each of its two
+tilts in degrees, a third of the bound. Words are parted by spaces or commas; # begins a comment.
+"""
+
+import re
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from spherloc.datasets import scene_file
+from spherloc.errors import InputError, shorten, show
+from spherloc.formats.text_rows import finite_numbers, rows
+from spherloc.frontend.view import Gravity, View
+from spherloc.types import FloatArray
+
+MeasuredGravity = Callable[[View, FloatArray | None], Gravity]
+"""Gravity of a query, from about where down is in it (3,), if that is known. ``InputError`` if nothing shows it."""
+
+SOURCES = ("reference", "lines", "truth")
+"""Values of ``[gravity] query``."""
+BOUND_SD = 3.0
+"""A bound in standard deviations."""
+_MOST_SD_DEG = 25.0
+_ROW = re.compile(r'(?:"([^"]+)"|([^\s,"]+))[\s,]+(.*)')
+_COLUMNS = "image gx gy gz [sd_deg]"
+
+
+@dataclass(frozen=True)
+class GravitySettings:
+    """What the section [gravity] says of the queries."""
+
+    bound_rad: float
+    """Of a gravity that comes without a bound of its own."""
+    sd_rad: float | None
+    """The same; None takes a third of the bound."""
+    query: str
+    """One of ``SOURCES``."""
+    file: str
+    """Path of the gravity file; empty if there is none."""
+    stated: Mapping[str, Gravity]
+    """Its rows by the names of the images."""
+    bound_is_stated: bool
+    """Whether the scene file states ``bound_rad``, which otherwise is the loader's default."""
+
+    def of_queries(self, views: Iterable[View], gravity_map: FloatArray) -> tuple[tuple[View, ...], list[str]]:
+        """The queries with their gravity, as far as it is known before they are read, and remarks on the others.
+
+        ``gravity_map`` (3,) is the unit vector that points down in the map.
+        """
+        queries = tuple(self._with_gravity(view, gravity_map) for view in views)
+        names = {view.name for view in queries}
+        remarks, strange = [], [name for name in self.stated if name not in names]
+        without = [view.name for view in queries if self.file and view.name not in self.stated]
+        if strange:
+            remarks.append(
+                f"{len(strange)} of {len(self.stated)} rows of {self.file} are of no query, the first is "
+                f"{shorten(strange[0])}."
+            )
+        if without:
+            remarks.append(
+                f"{len(without)} of {len(queries)} queries have no row in {self.file}, the first is "
+                f"{shorten(without[0])}."
+            )
+        if self.query == "truth":
+            unknown = sum(view.cam_from_map is None for view in queries)
+            remarks.append(
+                "Gravity of the queries is that of their true poses, which a real query does not have: errors are "
+                f"smaller than they would be{f'; {unknown} of {len(queries)} have no true pose' if unknown else ''}."
+            )
+        return queries, remarks
+
+    def _with_gravity(self, view: View, gravity_map: FloatArray) -> View:
+        if view.name in self.stated:
+            return replace(view, gravity=self.stated[view.name])
+        if self.query == "truth" and view.cam_from_map is not None:
+            down = view.cam_from_map[:, :3] @ gravity_map
+            # The loader's default is for a gravity that is taken from another image.
+            exact = None if self.bound_is_stated else 0.0
+            return replace(view, gravity=Gravity(down / np.linalg.norm(down), "the true pose", exact))
+        return view
+
+    @property
+    def measured(self) -> MeasuredGravity | None:
+        """What measures gravity in a query image."""
+        return _from_lines if self.query == "lines" else None
+
+
+def read_gravity(table: Mapping[str, Any], where: str, bound_deg: float) -> GravitySettings:
+    """The keys of the section [gravity] ``table`` that all kinds share; ``bound_deg`` is the loader's default.
+
+    ``where`` is the scene file. Raises ``InputError`` for a wrong key or value and for a gravity file with a wrong row.
+    """
+    section = f"{where} [gravity]"
+    scene_file.check_keys(table, set(), {"bound_deg", "sd_deg", "file", "query"}, section)
+    bound_rad, sd_rad = scene_file.gravity_error_rad({"bound_deg": bound_deg} | dict(table), section)
+    query = table.get("query", "reference")
+    if query not in SOURCES:
+        raise InputError(f"{section}: query is {show(query)}; give one of {', '.join(map(show, SOURCES))}.")
+    file = scene_file.text(table, "file", section) if "file" in table else ""
+    stated = read_gravity_file(Path(where).parent / file) if file else {}
+    return GravitySettings(bound_rad, sd_rad, query, file, stated, "bound_deg" in table)
+
+
+def read_gravity_file(path: Path) -> dict[str, Gravity]:
+    """Gravity by image.
+
+    Raises ``InputError``, one sentence with the file and the line, for a row that is none, for a vector without a
+    length, and for an image that is there twice.
+    """
+    found: dict[str, Gravity] = {}
+    for place, text in rows(path, f"rows of {_COLUMNS}"):
+        match = _ROW.match(text)
+        words = match[3].partition("#")[0].replace(",", " ").split() if match else []
+        if match is None or len(words) not in (3, 4):
+            raise InputError(f"{place}: is no row {_COLUMNS}; give a name and three or four numbers.")
+        name = match[1] or match[2]
+        x, y, z, *sd_deg = finite_numbers(words, place)
+        length = float(np.linalg.norm([x, y, z]))
+        if not 1e-3 < length < 1e6:
+            raise InputError(f"{place}: its vector has the length {length:.3g}; give one that points down.")
+        if sd_deg and not 0.0 <= sd_deg[0] <= _MOST_SD_DEG:
+            raise InputError(f"{place}: sd_deg is {sd_deg[0]:g}; give degrees from 0 to {_MOST_SD_DEG:g}.")
+        if name in found:
+            raise InputError(f"{place}: {show(name)} is there a second time; keep one row.")
+        sd_rad = float(np.radians(sd_deg[0])) if sd_deg else None
+        bound_rad = None if sd_rad is None else BOUND_SD * sd_rad
+        found[name] = Gravity(np.array([x, y, z]) / length, "the gravity file", bound_rad, sd_rad)
+    return found
+
+
+def _from_lines(view: View, near: FloatArray | None) -> Gravity:
+    from spherloc.frontend.gravity_from_lines import gravity_from_lines  # only where it is asked for
+
+    return gravity_from_lines(view, near)

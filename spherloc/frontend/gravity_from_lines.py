@@ -1,0 +1,320 @@
+"""Which way is down, from the image itself: the direction in which its vertical edges meet.
+
+An edge and the camera's centre span a plane, which cuts the unit sphere in a great circle with the normal n. All planes
+of vertical edges contain the vertical v, so that n . v = 0 for each. Edges are found by LSD (von Gioi et al. 2010) on
+virtual pinhole faces, on which they are straight whatever the lens. v is sought on a grid of directions around where
+down is expected, which keeps horizontal edges from being taken for vertical ones, and refined by least squares,
+where edges one above the other count as one: those of a door frame lean together. It is believed if more edges meet
+there than would by chance (a-contrario, Desolneux et al. 2000).
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from spherloc.cameras.base import Camera, in_image
+from spherloc.errors import InputError, shorten
+from spherloc.frontend.view import Gravity, View
+from spherloc.geometry import DOWN, align_to_down, tangent_basis
+from spherloc.images import grey
+from spherloc.types import BoolArray, ByteArray, FloatArray
+
+SOURCE = "lines of the image"
+
+FACE_DEG = 100.0
+"""Field of view of a face: an edge that one face cuts goes on by ten degrees there."""
+MOST_FOCAL_PX = 330.0
+"""Of a face; larger images are made smaller first, since LSD takes time and long edges need no more pixels."""
+RIM_PX = 4
+"""Edges that end this close to pixels that the camera does not see are those of the image, not of the scene."""
+LEAST_LENGTH_RAD = np.radians(2.5)
+MOST_LINES = 800
+"""The longest ones."""
+END_SD_PX = 0.4
+"""Standard deviation of an edge's ends across it, pixels of a face."""
+MOST_END_SD_RAD = np.radians(2.5)
+"""Edges whose ends fix v no better than that are too short to be told from others."""
+
+WITHIN_DEG = 45.0
+"""Farther from where down is expected lie the directions in which horizontal edges meet."""
+GRID_DEG = 1.5
+GATE_RAD = np.radians(1.5)
+"""Edges that are off by less vote for a direction of the grid."""
+LEAN_SD_RAD = np.radians(0.4)
+"""Of what is built upright, and of a lens's calibration."""
+MOST_OFF = 0.06
+"""Largest n . v of an edge that is taken for a vertical one."""
+POLE = 0.95
+"""Square of the cosine between v and an edge's middle beyond which the edge says nothing."""
+GROUP_RAD = np.radians(3.0)
+"""Edges whose azimuths, or planes, differ by less count as one."""
+
+MOST_NFA = 1e-2
+"""Directions in which that many edges would meet by chance."""
+LEAST_GROUPS = 5
+RIVAL_DEG, RIVAL_SHARE = 12.0, 0.75
+"""Another direction at least that far away must have fewer votes than this share."""
+LEAST_SD_RAD, MOST_SD_RAD = np.radians(0.1), np.radians(1.5)
+BOUND_SD = 3.0
+"""The bound in standard deviations."""
+
+
+@dataclass(frozen=True, eq=False)
+class Lines:
+    """L edges in the camera frame."""
+
+    normals: FloatArray
+    """(L, 3) unit normals of their planes."""
+    middles: FloatArray
+    """(L, 3) unit vectors to their middles."""
+    lengths_rad: FloatArray
+    """(L,) angles between their ends."""
+    end_sd_rad: float
+    """Standard deviation of an end across the edge."""
+
+    def __len__(self) -> int:
+        return len(self.normals)
+
+    def among(self, chosen: BoolArray) -> "Lines":
+        """Those of a mask (L,)."""
+        return Lines(self.normals[chosen], self.middles[chosen], self.lengths_rad[chosen], self.end_sd_rad)
+
+    def variance(self, along: FloatArray) -> FloatArray:
+        """(..., L) variance of n . v by the errors of the ends, where (middle . v)^2 is ``along`` (..., L).
+
+        Errors that move an edge turn n towards its middle, those that turn it turn n along it.
+        """
+        moving = 0.5 * self.end_sd_rad**2
+        turning = 0.5 * (self.end_sd_rad / np.sin(0.5 * self.lengths_rad)) ** 2
+        return moving * along + turning * (1.0 - along)
+
+
+@dataclass(frozen=True, eq=False)
+class Vertical:
+    """The direction in which vertical edges meet."""
+
+    down: FloatArray
+    """Unit vector (3,), camera frame."""
+    sd_rad: float
+    """Standard deviation of its worse tilt."""
+    groups: int
+    """Edges that meet there, those with about the same azimuth counted once."""
+
+
+def gravity_from_lines(view: View, near: FloatArray | None = None) -> Gravity:
+    """Gravity of an image; ``near`` (3,) is about where down is in it, +y if nothing is known.
+
+    Raises ``InputError`` if the image cannot be read or shows too few vertical edges.
+    """
+    usable = view.usable_pixels()
+    return gravity_of_pixels(grey(view.read()), view.camera, usable, DOWN if near is None else near, view.name)
+
+
+def gravity_of_pixels(image: ByteArray, camera: Camera, usable: BoolArray, near: FloatArray, name: str) -> Gravity:
+    """``gravity_from_lines`` of a grey image (H, W) called ``name``, with its ``usable`` pixels (H, W)."""
+    try:
+        found = vertical(image_lines(image, camera, usable), near)
+    except InputError as error:
+        raise InputError(f"{shorten(name)}: gravity cannot be told from its lines, since {error}") from None
+    return Gravity(found.down, SOURCE, BOUND_SD * found.sd_rad, found.sd_rad)
+
+
+def vertical(lines: Lines, near: FloatArray) -> Vertical:
+    """The vertical of some edges, less than ``WITHIN_DEG`` from the unit vector ``near`` (3,).
+
+    Raises ``InputError``, a part of a sentence, where there is too little evidence.
+    """
+    if len(lines) < LEAST_GROUPS:
+        raise InputError(f"it has {len(lines)} straight edges, fewer than {LEAST_GROUPS}.")
+    grid = _grid(near)
+    votes = _votes(lines, grid)
+    down = grid[votes.argmax()]
+    for gate_rad in (2.0 * GATE_RAD, *[GATE_RAD] * 8):
+        down = _fit(lines, down, gate_rad).down
+    found = _fit(lines, down, GATE_RAD)
+    nearer = int(np.count_nonzero(grid @ near >= down @ near))
+    rival = votes[grid @ down < np.cos(np.radians(RIVAL_DEG))].max(initial=0.0)
+    if nearer == len(grid):
+        raise InputError(f"its edges meet {WITHIN_DEG:g} degrees or more from where down was expected.")
+    if found.groups < LEAST_GROUPS:
+        raise InputError(f"it has the edges of {found.groups} upright things, fewer than {LEAST_GROUPS}.")
+    # Directions are tried from the expected one outwards, so that fewer chances are had to find one near it.
+    if _nfa(lines, down, nearer + 1) > MOST_NFA:
+        raise InputError("no more of its edges meet in one direction than may do so by chance.")
+    if rival > RIVAL_SHARE * votes.max():
+        raise InputError("about as many of its edges meet in another direction.")
+    if found.sd_rad > MOST_SD_RAD:
+        raise InputError(f"its vertical edges fix it to {np.degrees(found.sd_rad):.1f} degrees only.")
+    return Vertical(found.down, max(found.sd_rad, float(LEAST_SD_RAD)), found.groups)
+
+
+def _grid(near: FloatArray) -> FloatArray:
+    """(G, 3) unit vectors about ``GRID_DEG`` apart, at most ``WITHIN_DEG`` from ``near`` (3,): Fibonacci's lattice."""
+    cap = 1.0 - np.cos(np.radians(WITHIN_DEG))
+    count = int(2 * np.pi * cap / np.radians(GRID_DEG) ** 2)
+    height = 1.0 - cap * (np.arange(count) + 0.5) / count
+    turn = np.arange(count) * np.pi * (3.0 - np.sqrt(5.0))
+    radius = np.sqrt(1.0 - height**2)
+    return np.column_stack([radius * np.cos(turn), height, radius * np.sin(turn)]) @ align_to_down(near)
+
+
+def _votes(lines: Lines, directions: FloatArray) -> FloatArray:
+    """(G,) how much of the edges' lengths points towards directions (G, 3)."""
+    off = (directions @ lines.normals.T) ** 2
+    along = (directions @ lines.middles.T) ** 2
+    # Whatever is right overhead points there, so an edge counts by its distance from it.
+    weight = np.minimum(lines.lengths_rad, 0.5) * (1.0 - along)
+    return (weight * np.maximum(0.0, 1.0 - off / (GATE_RAD**2 + 4.0 * lines.variance(along)))).sum(axis=1)
+
+
+def _fit(lines: Lines, start: FloatArray, gate_rad: float) -> Vertical:
+    """One step of weighted least squares from the direction ``start`` (3,), of edges up to ``gate_rad`` off it."""
+    along, off = (lines.middles @ start) ** 2, lines.normals @ start
+    variance = lines.variance(along)
+    wide = variance + gate_rad**2 / 4.0
+    near = (off**2 <= np.minimum(9.0 * wide, MOST_OFF**2)) & (variance < MOST_END_SD_RAD**2) & (along < POLE)
+    used, along, off, variance, wide = lines.among(near), along[near], off[near], variance[near], wide[near]
+    # How likely an edge is a vertical one; n . v of others is uniform from -1 to 1. Floors have edges underfoot.
+    prior = 0.5 * (1.0 - along) ** 2
+    density = prior * np.exp(-0.5 * off**2 / wide) / np.sqrt(2 * np.pi * wide)
+    known = density / (density + 0.5 * (1.0 - prior)) / variance
+    across = tangent_basis(start[None])[0]
+    azimuth = np.arctan2(*(used.middles @ across.T).T)
+    group = np.unique((azimuth / GROUP_RAD).round().astype(int), return_inverse=True)[1].ravel()
+    total = np.bincount(group, known)
+    information = 1.0 / (LEAN_SD_RAD**2 + 1.0 / total)
+    group_off = np.bincount(group, known * off) / total
+    robust = 1.0 / (1.0 + group_off**2 * information / 4.0)  # Cauchy's
+    weight = known * (information * robust / total)[group]
+    scatter = np.einsum("l,li,lj->ij", weight, used.normals, used.normals)
+    down = np.linalg.eigh(scatter)[1][:, 0]
+    chi2 = float((robust * information * group_off**2).sum() / max(1.0, robust.sum() - 2.0))
+    least = float(np.linalg.eigvalsh(across @ scatter @ across.T)[0])
+    sd_rad = np.sqrt(max(1.0, chi2) / least) if least > 0.0 else np.inf
+    return Vertical(down if down @ start > 0.0 else -down, float(sd_rad), len(total))
+
+
+def _nfa(lines: Lines, down: FloatArray, tests: int) -> float:
+    """Of ``tests`` directions, how many would by chance have as many edges as ``down`` (3,).
+
+    The plane of an edge that is turned at random about its middle m passes v at t or less with the chance
+    (2 / pi) asin(t / |m x v|). Edges of about the same plane count as one.
+    """
+    from scipy.special import gammainc  # the chance that a Poisson variable reaches a number; its import takes long
+
+    along = (lines.middles @ down) ** 2
+    variance = lines.variance(along)
+    clear = (variance < MOST_END_SD_RAD**2) & (along < 0.75)
+    normals, along = lines.normals[clear], along[clear]
+    reach = np.minimum(2.0 * np.sqrt(variance[clear] + LEAN_SD_RAD**2), MOST_OFF)
+    chance = 2 / np.pi * np.arcsin(np.minimum(1.0, reach / np.sqrt(1.0 - along)))
+    near = np.abs(normals @ down) <= reach
+    cells = np.round(normals * np.where(normals[:, :1] < 0.0, -1.0, 1.0) / GROUP_RAD).astype(int)
+    plane = np.unique(cells, axis=0, return_inverse=True)[1].ravel()
+    expected = float((chance / np.bincount(plane)[plane]).sum())
+    seen = len(np.unique(plane[near]))
+    return tests * float(gammainc(seen, expected)) if seen else float(tests)
+
+
+def image_lines(image: ByteArray, camera: Camera, usable: BoolArray) -> Lines:
+    """The longest straight edges of a grey image (H, W) within its ``usable`` pixels (H, W)."""
+    sharpness = _focal_px(camera)
+    focal_px = min(MOST_FOCAL_PX, sharpness)
+    if focal_px < 0.75 * sharpness:
+        image = np.asarray(
+            cv2.resize(image, None, fx=focal_px / sharpness, fy=focal_px / sharpness, interpolation=cv2.INTER_AREA),
+            np.uint8,
+        )
+    detector = cv2.createLineSegmentDetector(cv2.LSD_REFINE_STD)
+    ends = [np.empty((0, 2, 3))]
+    for face in _faces(camera, focal_px):
+        drawn, allowed = face.cut(image), face.cut(usable.astype(np.uint8)) * face.seen
+        found = detector.detect(drawn)[0]
+        if found is None:
+            continue
+        pairs = found.reshape(-1, 2, 2).astype(np.float64)
+        allowed = cv2.erode(allowed, np.ones((2 * RIM_PX + 1, 2 * RIM_PX + 1), np.uint8))
+        places = np.concatenate([pairs, pairs.mean(axis=1, keepdims=True)], axis=1).round().astype(int)
+        columns, rows = np.moveaxis(places.clip(0, len(allowed) - 1), 2, 0)
+        ends.append(face.rays(pairs[(allowed[rows, columns] > 0).all(axis=1)] + 0.5))
+    first, second = np.moveaxis(np.concatenate(ends), 1, 0)
+    normals, middles = np.cross(first, second), first + second
+    sine = np.linalg.norm(normals, axis=1)
+    lengths = np.arctan2(sine, (first * second).sum(axis=1))
+    order = np.argsort(-lengths, kind="stable")[:MOST_LINES]
+    order = order[lengths[order] >= LEAST_LENGTH_RAD]
+    return Lines(
+        normals[order] / sine[order, None],
+        middles[order] / np.linalg.norm(middles[order], axis=1, keepdims=True),
+        lengths[order],
+        END_SD_PX / focal_px,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Face:
+    """A square pinhole image of S x S pixels."""
+
+    face_from_camera: FloatArray
+    """Rotation (3, 3); the face looks along its own +z."""
+    focal_px: float
+    places: NDArray[np.float32]
+    """(S, S, 2) where its pixels are in the image, parts of its width and height; 0 where the camera is blind."""
+    seen: ByteArray
+    """(S, S) 1 where it does, else 0."""
+
+    def cut(self, image: ByteArray) -> ByteArray:
+        """The face (S, S) of a grey image (H, W) of any size."""
+        height, width = image.shape
+        # OpenCV's first pixel has its centre at 0.
+        u, v = (self.places[..., k] * np.float32(size) - np.float32(0.5) for k, size in enumerate((width, height)))
+        # A panorama goes on at its other side; other images have a rim there, where no edge is kept.
+        return np.asarray(cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP), np.uint8)
+
+    def rays(self, pixels: FloatArray) -> FloatArray:
+        """Unit vectors (..., 3), camera frame, of pixels (..., 2)."""
+        return _rays(pixels, len(self.places), self.focal_px, self.face_from_camera)
+
+
+def _rays(pixels: FloatArray, size: int, focal_px: float, face_from_camera: FloatArray) -> FloatArray:
+    flat = (pixels - 0.5 * size) / focal_px
+    rays = np.concatenate([flat, np.ones((*flat.shape[:-1], 1))], axis=-1) @ face_from_camera
+    return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+
+
+_AXES = ((0, 0, 1), (1, 0, 0), (0, 0, -1), (-1, 0, 0), (0, -1, 0), (0, 1, 0))
+"""Of the faces of a cube."""
+
+
+@lru_cache(maxsize=8)
+def _faces(camera: Camera, focal_px: float) -> tuple[_Face, ...]:
+    """Those faces that the camera sees something of."""
+    size = int(np.ceil(2 * np.tan(np.radians(FACE_DEG / 2)) * focal_px))
+    at = np.arange(size, dtype=np.float64) + 0.5
+    centres = np.stack(np.meshgrid(at, at), axis=-1)
+    faces = []
+    for axis in np.array(_AXES, dtype=np.float64):
+        right = np.cross([0.0, 1.0, 0.0], axis) if axis[1] == 0.0 else np.array([1.0, 0.0, 0.0])
+        face_from_camera = np.stack([right, np.cross(axis, right), axis])
+        pixels, seen = camera.project(_rays(centres, size, focal_px, face_from_camera).reshape(-1, 3))
+        seen &= in_image(camera, pixels)
+        if seen.any():
+            parts = np.where(seen[:, None], pixels / [camera.width, camera.height], 0.0).astype(np.float32)
+            shape = (size, size)
+            faces.append(
+                _Face(face_from_camera, focal_px, parts.reshape(*shape, 2), seen.astype(np.uint8).reshape(shape))
+            )
+    return tuple(faces)
+
+
+def _focal_px(camera: Camera) -> float:
+    """Pixels a radian where the camera looks, or in the middle of its image if it does not see there."""
+    pixels, seen = camera.project(np.array([[0.0, 0.0, 1.0]]))
+    middle = pixels if seen[0] else np.array([[0.5 * camera.width, 0.5 * camera.height]])
+    stretch = np.linalg.norm(camera.unprojection_jacobian(middle), ord=2, axis=(1, 2))[0]
+    if not np.isfinite(stretch):
+        raise InputError("the camera sees nothing in the middle of its image; check its calibration.")
+    return float(1.0 / stretch)

@@ -1,0 +1,169 @@
+"""Gravity of single queries: the file, its bound and source on the way to a problem, and what is said of it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from spherloc.datasets import load_scene
+from spherloc.datasets.map_scene import MapScene
+from spherloc.datasets.query_gravity import read_gravity, read_gravity_file
+from spherloc.errors import InputError, ProblemError
+from spherloc.estimators import default_options
+from spherloc.experiments.results import json_line, row_of_json
+from spherloc.experiments.sequence import localize
+from spherloc.frontend.view import Gravity, Matches, View
+from tests.datasets.test_image_folder import CAMERA, POSED, make_tree
+from tests.tiny_scene import write_tiny_scene
+
+HERE = "gravity.txt"
+
+
+@pytest.fixture(scope="module")
+def problem(tmp_path_factory):
+    return load_scene(write_tiny_scene(tmp_path_factory.mktemp("tiny"))).problem()
+
+
+def written(folder, text):
+    path = folder / HERE
+    path.write_text(text)
+    return path
+
+
+def test_rows_of_a_gravity_file(tmp_path):
+    text = '# image gx gy gz sd_deg\na.jpg 0 9.81 0\n"my photo.png", 0, 3, 4, 0.5  \n\nsub/c.png 1 0 0 0 # exact\n'
+    found = read_gravity_file(written(tmp_path, text))
+    assert list(found) == ["a.jpg", "my photo.png", "sub/c.png"]
+    np.testing.assert_allclose(found["my photo.png"].down, [0, 0.6, 0.8])
+    assert found["a.jpg"].bound_rad is None and found["a.jpg"].sd_rad is None
+    assert found["my photo.png"].sd_rad == pytest.approx(np.radians(0.5))
+    assert found["my photo.png"].bound_rad == pytest.approx(np.radians(1.5))
+    assert found["sub/c.png"].bound_rad == 0.0
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("a.jpg 0 1\n", "line 1: is no row image gx gy gz"),
+        ("# c\na.jpg 0 1 0 1 1\n", "line 2: is no row image gx gy gz"),
+        ("a.jpg 0 one 0\n", "line 1: 'one' is not a finite number"),
+        ("a.jpg 0 nan 0\n", "line 1: 'nan' is not a finite number"),
+        ("a.jpg 0 0 0\n", "line 1: its vector has the length 0;"),
+        ("a.jpg 0 1 0 -1\n", "line 1: sd_deg is -1;"),
+        ("a.jpg 0 1 0 90\n", "line 1: sd_deg is 90;"),
+        ("a.jpg 0 1 0\na.jpg 0 1 0\n", "line 2: 'a.jpg' is there a second time"),
+    ],
+)
+def test_a_wrong_row_is_named_with_its_line(tmp_path, text, said):
+    with pytest.raises(InputError) as caught:
+        read_gravity_file(written(tmp_path, text))
+    assert said in str(caught.value) and HERE in str(caught.value)
+
+
+def test_keys_of_the_section_are_checked(tmp_path):
+    scene = str(tmp_path / "scene.toml")
+    for table, said in (
+        ({"query": "north"}, "give one of 'reference', 'lines', 'truth'"),
+        ({"file": "none.txt"}, "no such file"),
+        ({"files": "a"}, "unknown key 'files'"),
+    ):
+        with pytest.raises(InputError, match=said):
+            read_gravity(table, scene, 3.0)
+
+
+def test_a_file_gives_queries_of_a_folder_their_gravity(tmp_path):
+    written(tmp_path, "a.jpg 0 0.8 0.6 0.1\nnone.jpg 0 1 0\n")
+    scene = load_scene(make_tree(tmp_path, CAMERA + POSED + f'[gravity]\nmap = [0, 1, 0]\nfile = "{HERE}"\n'))
+    assert isinstance(scene, MapScene)
+    first, second = scene.queries
+    assert first.gravity is not None and second.gravity is None
+    np.testing.assert_allclose(first.gravity.down, [0, 0.8, 0.6])
+    assert any("1 of 2 rows" in remark and "none.jpg" in remark for remark in scene.remarks)
+    assert any("1 of 2 queries have no row" in remark and "b.png" in remark for remark in scene.remarks)
+
+
+def small_scene(tmp_path, problem, view, measured=None, bound_rad=0.05):
+    """A scene of one query, whose matches are those of a simulated problem."""
+    reference = View("reference", problem.camera, tmp_path / "r.png", problem.truth_cam_from_map)
+    count = len(problem)
+    matches = Matches(
+        problem.pixels, problem.points, (reference,), np.zeros(count, np.int64), np.full((count, 2), np.nan)
+    )
+    query = replace(view, camera=problem.camera, cam_from_map=problem.truth_cam_from_map)
+    scene = MapScene(
+        "s",
+        "s.toml",
+        (query,),
+        (reference,),
+        lambda _: matches,
+        problem.gravity_map,
+        bound_rad,
+        measured_gravity=measured,
+    )
+    return scene
+
+
+def test_a_problem_has_the_bound_and_the_source_of_its_own_query(tmp_path, problem):
+    down = problem.gravity_camera
+    own = Gravity(down, "the IMU", 0.01, 0.002)
+    for gravity, expected in (
+        (own, (0.01, 0.002, "the IMU")),
+        (Gravity(down, "the scene file"), (0.05, None, "the scene file")),
+        (None, (0.05, None, "its most similar reference")),
+    ):
+        view = View("query", problem.camera, tmp_path / "q.png", gravity=gravity)
+        scene = small_scene(tmp_path, problem, view)
+        found = scene.problem()
+        assert (found.gravity_bound_rad, found.gravity_sd_rad, found.gravity_source) == expected
+        assert found.aligned.gravity_bound_rad == expected[0]
+        assert found.gravity_error_rad == pytest.approx(0.0, abs=1e-7)
+        row, _ = next(iter(localize(scene, scene.queries, "mc", default_options("mc", found), 0)))
+        assert row.gravity_source == expected[2] and row.gravity_bound_deg == pytest.approx(np.degrees(expected[0]))
+        assert row_of_json(json_line(row), "here").gravity_source == expected[2]
+
+
+def test_what_cannot_be_measured_comes_from_the_reference_and_is_said(tmp_path, problem):
+    def refused(view, near):
+        assert near is not None
+        raise InputError(f"{view.name}: shows too few lines.")
+
+    view = View("query", problem.camera, tmp_path / "q.png")
+    found = small_scene(tmp_path, problem, view, refused).problem()
+    assert found.gravity_source == "its most similar reference"
+    assert found.remarks[-1] == "query: shows too few lines. Gravity is that of the most similar reference."
+
+
+def test_gravity_that_points_up_is_remarked_on(tmp_path, problem):
+    up = Gravity(-problem.gravity_camera, "the gravity file", 0.01)
+    found = small_scene(tmp_path, problem, View("query", problem.camera, tmp_path / "q.png", gravity=up)).problem()
+    assert "180 degrees away" in found.remarks[-1] and "must point down" in found.remarks[-1]
+
+
+def test_the_true_pose_as_a_source_is_exact_and_said(tmp_path, problem):
+    settings = read_gravity({"query": "truth"}, "s.toml", 3.0)
+    view = View("query", problem.camera, tmp_path / "q.png", problem.truth_cam_from_map)
+    (known,), remarks = settings.of_queries(
+        [view, replace(view, name="other", cam_from_map=None)][:1], problem.gravity_map
+    )
+    assert known.gravity is not None and known.gravity.bound_rad == 0.0 and "true poses" in remarks[0]
+    np.testing.assert_allclose(known.gravity.down, problem.truth_cam_from_map[:, :3] @ problem.gravity_map)
+
+
+def test_rows_of_older_results_are_read():
+    row = json_line(row_of_json(OLD, "here"))
+    assert '"gravity_source": null' in row
+
+
+OLD = (
+    '{"index": 0, "query": "a", "status": "failed", "timestamp_s": null, "references": null, "matches": null, '
+    '"inliers": null, "estimated_outlier_rate": null, "true_outlier_rate": null, "rotation_error_deg": null, '
+    '"translation_error_m": null, "registration_error_m": null, "precision": null, "recall": null, "f1": null, '
+    '"matching_ms": null, "estimating_ms": null, "diagnosis": null, "recording": null, "message": "", "remarks": [], '
+    '"cam_from_map": null, "truth_cam_from_map": null}'
+)
+
+
+def test_a_source_is_a_short_text(problem):
+    for wrong in (3, "x" * 300):
+        with pytest.raises(ProblemError, match="gravity_source"):
+            replace(problem, gravity_source=wrong)
