@@ -1,4 +1,4 @@
-"""Gravity of queries, for every kind of scene with images: from a file, the image itself, or the true pose.
+"""Gravity of queries, for every kind of scene with images: from a file, the image, its tags, or the true pose.
 
 A gravity file has a row ``image gx gy gz [sd_deg]`` a query: its name as the scene has it (in quotation marks where it
 has spaces), a vector that points down in the camera frame, of any length, and the standard deviation of each of its two
@@ -17,12 +17,13 @@ from spherloc.datasets import scene_file
 from spherloc.errors import InputError, shorten, show
 from spherloc.formats.text_rows import finite_numbers, rows
 from spherloc.frontend.view import Gravity, View
+from spherloc.geometry import DOWN
 from spherloc.types import FloatArray
 
 MeasuredGravity = Callable[[View, FloatArray | None], Gravity]
 """Gravity of a query, from about where down is in it (3,), if that is known. ``InputError`` if nothing shows it."""
 
-SOURCES = ("reference", "lines", "truth")
+SOURCES = ("reference", "lines", "tags", "level", "truth")
 """Values of ``[gravity] query``."""
 BOUND_SD = 3.0
 """A bound in standard deviations."""
@@ -78,6 +79,8 @@ class GravitySettings:
     def _with_gravity(self, view: View, gravity_map: FloatArray) -> View:
         if view.name in self.stated:
             return replace(view, gravity=self.stated[view.name])
+        if self.query == "level":
+            return replace(view, gravity=Gravity(DOWN, "the image's own up"))
         if self.query == "truth" and view.cam_from_map is not None:
             down = view.cam_from_map[:, :3] @ gravity_map
             # The loader's default is for a gravity that is taken from another image.
@@ -88,7 +91,7 @@ class GravitySettings:
     @property
     def measured(self) -> MeasuredGravity | None:
         """What measures gravity in a query image."""
-        return _from_lines if self.query == "lines" else None
+        return {"lines": _from_lines, "tags": _from_tags}.get(self.query)
 
 
 def read_gravity(table: Mapping[str, Any], where: str, bound_deg: float) -> GravitySettings:
@@ -138,3 +141,9 @@ def _from_lines(view: View, near: FloatArray | None) -> Gravity:
     from spherloc.frontend.gravity_from_lines import gravity_from_lines  # only where it is asked for
 
     return gravity_from_lines(view, near)
+
+
+def _from_tags(view: View, near: FloatArray | None) -> Gravity:
+    from spherloc.datasets.panorama_tags import gravity_from_tags
+
+    return gravity_from_tags(view, near)

@@ -63,7 +63,7 @@ def test_a_wrong_row_is_named_with_its_line(tmp_path, text, said):
 def test_keys_of_the_section_are_checked(tmp_path):
     scene = str(tmp_path / "scene.toml")
     for table, said in (
-        ({"query": "north"}, "give one of 'reference', 'lines', 'truth'"),
+        ({"query": "north"}, "give one of 'reference', 'lines', 'tags', 'level', 'truth'"),
         ({"file": "none.txt"}, "no such file"),
         ({"files": "a"}, "unknown key 'files'"),
     ):

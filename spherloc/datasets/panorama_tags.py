@@ -1,0 +1,82 @@
+"""The pose that a 360-degree camera writes into its photographs: pitch and roll in an XMP packet, after Google's
+Photo Sphere metadata (https://developers.google.com/streetview/spherical-metadata)."""
+
+import warnings
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+from PIL import Image
+
+from spherloc.errors import InputError, shorten, show
+from spherloc.files import open_file, reading
+from spherloc.formats.text_rows import finite_numbers
+from spherloc.frontend.view import Gravity, View
+from spherloc.types import FloatArray
+
+SOURCE = "pitch and roll in the photograph's tags"
+MOST_BYTES = 1_000_000
+_GPANO = "{http://ns.google.com/photos/1.0/panorama/}"
+_PITCH, _ROLL = "PosePitchDegrees", "PoseRollDegrees"
+_LIMITS_DEG = {_PITCH: 90.0, _ROLL: 180.0}
+
+
+def gravity_from_tags(view: View, near: FloatArray | None = None) -> Gravity:
+    """Gravity of a panorama by the pitch and roll in its XMP packet; what is ``near`` (3,) does not matter.
+
+    Raises ``InputError`` if the image cannot be read, has none, or has what is no angle.
+    """
+    place = shorten(view.name)
+    packet = _packet(view.path)
+    if packet is None:
+        raise InputError(f"{place}: has no XMP tags, which would hold its pitch and roll.")
+    pitch_deg, roll_deg = _pitch_and_roll(packet, place)
+    return Gravity(down_of(np.radians(pitch_deg), np.radians(roll_deg)), SOURCE)
+
+
+def down_of(pitch_rad: float, roll_rad: float) -> FloatArray:
+    """Down (3,) in the camera frame of a panorama whose middle is ``pitch_rad`` above the horizon.
+
+    The horizon is turned counterclockwise in the image by ``roll_rad``.
+    """
+    level = np.cos(pitch_rad)
+    return np.array([level * np.sin(roll_rad), level * np.cos(roll_rad), -np.sin(pitch_rad)])
+
+
+def _packet(path: Path) -> bytes | None:
+    """The XMP packet of an image; None if it has none."""
+    with reading(path, "correct the path of the image"), open_file(path) as file, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            with Image.open(file) as image:
+                packet = image.info.get("xmp") or image.info.get("XML:com.adobe.xmp")
+        except (Image.UnidentifiedImageError, Image.DecompressionBombError, SyntaxError, ValueError):
+            raise InputError(f"{path}: is no image that can be read; give another one.") from None
+    return packet.encode() if isinstance(packet, str) else packet
+
+
+def _pitch_and_roll(packet: bytes, place: str) -> tuple[float, float]:
+    """Degrees; pitch alone is enough, as cameras leave out a roll of 0, and the other way round."""
+    damaged = InputError(f"{place}: its XMP tags are damaged, so that its pitch and roll cannot be read.")
+    # Declarations could define entities that grow without end or name other files; XMP has none.
+    if len(packet) > MOST_BYTES or b"<!" in packet or b"\0" in packet:
+        raise damaged
+    try:
+        root = ElementTree.fromstring(packet.strip())
+    except (ElementTree.ParseError, ValueError, RecursionError, LookupError):
+        raise damaged from None
+    found: dict[str, float] = {}
+    for element in root.iter():
+        for name in (_PITCH, _ROLL):
+            text = element.text if element.tag == f"{_GPANO}{name}" else element.get(f"{_GPANO}{name}")
+            if text is not None:
+                (angle,) = finite_numbers([text.strip()], f"{place}, {name}")
+                if abs(angle) > _LIMITS_DEG[name]:
+                    limit = _LIMITS_DEG[name]
+                    raise InputError(
+                        f"{place}: {name} is {show(angle)}; an angle from {-limit:g} to {limit:g} is meant."
+                    )
+                found[name] = angle
+    if not found:
+        raise InputError(f"{place}: its XMP tags hold no pitch and roll ({_PITCH}, {_ROLL}).")
+    return found.get(_PITCH, 0.0), found.get(_ROLL, 0.0)
