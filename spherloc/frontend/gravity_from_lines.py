@@ -114,7 +114,10 @@ def gravity_from_lines(view: View, near: FloatArray | None = None) -> Gravity:
 
 
 def gravity_of_pixels(image: ByteArray, camera: Camera, usable: BoolArray, near: FloatArray, name: str) -> Gravity:
-    """``gravity_from_lines`` of a grey image (H, W) called ``name``, with its ``usable`` pixels (H, W)."""
+    """``gravity_from_lines`` of a grey image (H, W) called ``name``, with its ``usable`` pixels (H, W).
+
+    ``near`` (3,) is about where down is. Raises ``InputError`` that names the image if it shows too few vertical edges.
+    """
     try:
         found = vertical(image_lines(image, camera, usable), near)
     except InputError as error:
