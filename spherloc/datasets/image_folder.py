@@ -1,4 +1,4 @@
-"""Image folder: a user's own panoramas or fisheyes, localized in a COLMAP model or among images with pose and depth."""
+"""Image folder: a user's own panoramas or fisheyes, localized in a COLMAP model or among images with poses."""
 
 import warnings
 from collections.abc import Mapping
@@ -19,6 +19,8 @@ from spherloc.errors import InputError, shorten, show
 from spherloc.files import is_file, names_in, size_of
 from spherloc.formats.colmap_files import read_model
 from spherloc.frontend.lifting import DepthLift
+from spherloc.frontend.partners import with_triangulation
+from spherloc.frontend.pipeline import frontend_options
 from spherloc.frontend.view import Gravity, View
 from spherloc.images import read_depth_png, read_size
 from spherloc.trajectory import Trajectory, pose_at, read_euroc, read_tum
@@ -29,7 +31,7 @@ MAX_GAP_S = 0.5
 
 _CAMERA_KEYS = {"camera", "calibration", "calibration_camera"}
 _TRAJECTORY_KEYS = {"trajectory", "timestamp_ns", "trajectory_unit", "body_from_camera"}
-_KEYS = {"image", "depth", "depth_unit_m", "along"}
+_DEPTH_KEYS = {"depth", "depth_unit_m", "along"}
 _ROTATION_TOLERANCE = 1e-3
 
 
@@ -98,7 +100,8 @@ def read_references(entries: Any, shared: Camera | None, path: Path) -> PosedIma
 def _check(entry: Mapping[str, Any], where: str) -> None:
     given = {"cam_from_map"} if "trajectory" not in entry else {"trajectory", "timestamp_ns"}
     optional = _CAMERA_KEYS | ({"cam_from_map"} if "trajectory" not in entry else _TRAJECTORY_KEYS)
-    scene_file.check_keys(entry, _KEYS | given, optional, where)
+    needed = _DEPTH_KEYS if _DEPTH_KEYS & entry.keys() else set()
+    scene_file.check_keys(entry, {"image"} | needed | given, optional | _DEPTH_KEYS, where)
 
 
 def _view(entry: Mapping[str, Any], pose: FloatArray, shared: Camera | None, path: Path, where: str) -> View:
@@ -108,7 +111,13 @@ def _view(entry: Mapping[str, Any], pose: FloatArray, shared: Camera | None, pat
     image = scene_file.text(entry, "image", where)
     if not is_file(path.parent / image):
         raise InputError(f"{where}: the image {path.parent / image} does not exist; correct the path.")
-    return View(image, camera, path.parent / image, pose, lift=_lift(entry, camera, pose, path, where))
+    return View(
+        image,
+        camera,
+        path.parent / image,
+        pose,
+        lift=_lift(entry, camera, pose, path, where) if "depth" in entry else None,
+    )
 
 
 def _pose(entry: Mapping[str, Any], path: Path, where: str, trajectories: Any) -> FloatArray | None:
@@ -178,12 +187,13 @@ calibration = "camera.yaml"     # of the queries: any file that spherloc reads; 
 model = "sparse/0"
 images = "mapping"
 
-# [[references]]                # ... or images with pose and depth
+# [[references]]                # ... or images with pose, and depth if there is one
 # image = "reference.png"
 # calibration = "other.yaml"    # or camera = {...}; that of the queries if absent
 # cam_from_map = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]
 # # or: trajectory = "poses.txt" (TUM; a .csv is EuRoC's), timestamp_ns, body_from_camera (3 or 4 rows),
 # # trajectory_unit = "s" or "ns", what TUM's first column counts
+# # Without the next three keys, its points are triangulated with other references.
 # depth = "reference_depth.png" # 16-bit PNG or .npy
 # depth_unit_m = 0.001
 # along = "z"                   # or "ray"
@@ -220,17 +230,26 @@ def load(table: dict[str, Any], path: Path) -> MapScene:
     if camera is None:
         raise InputError(f"{where}: the query images have no camera; add 'calibration' or a section [camera].")
     queries, remarks = _queries(table, camera, gravity, path)
-    references, more = _references(table, camera, path)
+    references, more = _references(table, camera, settings.frontend, path)
     down, assumed = gravity_of_map(gravity, references, where)
     return settings.scene(path, queries, references, down, (*remarks, *more, *assumed))
 
 
-def _references(table: dict[str, Any], camera: Camera, path: Path) -> tuple[tuple[View, ...], list[str]]:
+def _references(
+    table: dict[str, Any], camera: Camera, frontend: Mapping[str, Any], path: Path
+) -> tuple[tuple[View, ...], list[str]]:
     if ("map" in table) == ("references" in table):
         raise InputError(f"{path}: needs either a section [map] with a COLMAP model or sections [[references]].")
     if "references" in table:
         posed = read_references(table["references"], camera, path)
-        return posed.views, list(posed.remarks)
+        without = sum(view.lift is None for view in posed.views)
+        if without and len(posed.views) == 1:
+            raise InputError(
+                f"{path}: the only reference has no depth, and points are triangulated between two or more; add its "
+                "depth, or other references."
+            )
+        options = frontend_options(frontend, str(path), path.parent)
+        return with_triangulation(posed.views, options) if without else posed.views, list(posed.remarks)
     section = scene_file.section(table, "map", str(path))
     scene_file.check_keys(section, {"model", "images"}, set(), f"{path} [map]")
     images = map_scene.folder(section, "images", path)

@@ -7,12 +7,9 @@ https://github.com/naver/kapture/blob/main/kapture_format.adoc
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from spherloc.datasets import map_scene, scene_file
 from spherloc.datasets.colmap import gravity_of_map, some, split_gravity
@@ -20,10 +17,9 @@ from spherloc.datasets.map_scene import MapScene
 from spherloc.errors import InputError, show
 from spherloc.files import is_file
 from spherloc.formats.kapture_files import Kapture, Record, read_kapture
+from spherloc.frontend.partners import with_triangulation
 from spherloc.frontend.pipeline import FrontendOptions, frontend_options
-from spherloc.frontend.triangulation import TriangulationLift
 from spherloc.frontend.view import View
-from spherloc.geometry import camera_centre
 
 EXAMPLE = """\
 kind = "kapture"
@@ -48,14 +44,6 @@ GRAVITY_BOUND_DEG = 5.0
 """A reference's roll and pitch are not the query's: cameras are held by hand."""
 _LEAST_NANOSECONDS = 10**17
 """Timestamps from here on, March 1973, are nanoseconds; smaller ones may be running numbers."""
-_NEIGHBOURS = 64
-"""Among so many of the nearest references, those are sought that points are triangulated with."""
-_OTHERS = 4
-"""Not counting what the rig took at the same time: each costs one matching, once."""
-_GROWTH = 2.0
-"""Each is so many times farther than the one before: near things need a short baseline, far things a long one."""
-_LEAST_COSINE = 0.5
-"""Between optical axes: those that look elsewhere see other things."""
 _SELECTION = {"images", "devices", "timestamps", "every"}
 
 
@@ -184,50 +172,13 @@ def _view(kapture: Kapture, root: Path, record: Record) -> View:
 
 
 def _references(kapture: Kapture, root: Path, records: Sequence[Record], options: FrontendOptions) -> tuple[View, ...]:
-    """Views whose points are triangulated with others of them."""
-    views = [_view(kapture, root, record) for record in records]
-    return tuple(
-        replace(
-            view,
-            lift=TriangulationLift(view, tuple(views[other] for other in others), options.features, options.matching),
-        )
-        for view, others in zip(views, _neighbours(kapture, records, views), strict=True)
-    )
-
-
-def _neighbours(kapture: Kapture, records: Sequence[Record], views: Sequence[View]) -> list[list[int]]:
-    """For each of R posed records, which others show the same things from elsewhere, its rig's own first."""
-    if len(records) < 2:
-        return [[] for _ in records]
-    from scipy.spatial import KDTree  # takes half a second
-
-    poses = np.array([view.cam_from_map for view in views])
-    centres, axes = np.stack([camera_centre(pose) for pose in poses]), poses[:, 2, :3]
-    count = min(_NEIGHBOURS, len(records))
-    distances, nearest = map(np.asarray, KDTree(centres).query(centres, k=count))
+    """Views whose points are triangulated with others of them, their rig's own first."""
     by_rig: dict[tuple[int, str], list[int]] = {}
     for index, record in enumerate(records):
         for rig in kapture.carriers(record.device):
             by_rig.setdefault((record.timestamp, rig), []).append(index)
-    chosen = []
-    for index, record in enumerate(records):
-        rigs = sorted(kapture.carriers(record.device))
-        partners = list(dict.fromkeys(other for rig in rigs for other in by_rig[record.timestamp, rig]))
-        near = [
-            (distance, other)
-            for distance, other in zip(distances[index].tolist(), nearest[index].tolist(), strict=True)
-            if axes[other] @ axes[index] >= _LEAST_COSINE and other not in partners
-        ]
-        alike = [other for other in partners if other != index and axes[other] @ axes[index] >= _LEAST_COSINE]
-        chosen.append(alike + _spread(near))
-    return chosen
-
-
-def _spread(near: Sequence[tuple[float, int]]) -> list[int]:
-    """At most ``_OTHERS`` of some neighbours at rising distances, metres, that lie ever farther apart."""
-    found, last = [], 0.0
-    for distance, other in near:
-        if distance > 0.0 and distance >= _GROWTH * last and len(found) < _OTHERS:
-            found.append(other)
-            last = distance
-    return found
+    together = [
+        list(dict.fromkeys(at for rig in sorted(kapture.carriers(one.device)) for at in by_rig[one.timestamp, rig]))
+        for one in records
+    ]
+    return with_triangulation([_view(kapture, root, record) for record in records], options, together)

@@ -1,13 +1,10 @@
 """Scenes of kapture datasets: which images are queries and references, and real stereo fisheyes to a pose."""
 
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from kapture_samples import SENSORS, write_kapture
 
 from spherloc.datasets import kapture, load_scene
@@ -227,14 +224,3 @@ def test_few_references(tmp_path, count):
     assert len(scene.references) == count
     assert all(view.lift.others == () for view in scene.references)  # all were taken from one place
     assert scene.query().timestamp_s is None  # running numbers
-
-
-@settings(max_examples=100)
-@given(st.lists(st.floats(0.0, 100.0), max_size=20).map(sorted))
-def test_spread_of_neighbours(distances):
-    chosen = kapture._spread([(distance, index) for index, distance in enumerate(distances)])
-    far = [distances[index] for index in chosen]
-    assert len(far) <= 4 and all(distance > 0.0 for distance in far)
-    assert all(b >= 2.0 * a for a, b in pairwise(far))
-    if any(distance > 0.0 for distance in distances):
-        assert far[0] == min(distance for distance in distances if distance > 0.0)
