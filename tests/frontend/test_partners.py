@@ -34,7 +34,7 @@ def test_spread_of_neighbours(distances):
 
 def row(camera, yaws):
     """Cameras one after another, which look where ``yaws`` say."""
-    places_m = (0.0, 1.0, 2.1, 3.0, 4.5)
+    places_m = (0.0, 1.0, 2.2, 3.3, 4.5)
     return [View(f"{x}", camera, Path("x"), standing(x, 0.0, yaw)) for x, yaw in zip(places_m, yaws, strict=False)]
 
 
