@@ -27,6 +27,10 @@ def without_reviews(files: Sequence[Path]) -> tuple[Path, ...]:
 
 def check_recording_file(path: Path) -> None:
     """Raise ``RecordingError`` if there is no such file."""
+    if is_folder(path):
+        from spherloc.datasets.given_path import what_it_is
+
+        raise RecordingError(what_it_is(path))
     if not is_file(path):
         raise RecordingError(f"{path}: no such file; give the path of a recording (.rrd).")
 

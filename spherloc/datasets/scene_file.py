@@ -13,6 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from spherloc import registry
+from spherloc.datasets.given_path import what_it_is
 from spherloc.errors import InputError, reason, show
 from spherloc.files import is_file, read_file, reading, size_of
 from spherloc.problem import Problem
@@ -47,6 +48,7 @@ def load_scene(path: Path) -> Scene:
     Raises ``InputError``, in one sentence with the file's name, if it is missing, unreadable, or has a wrong key.
     """
     path = Path(path)
+    _refuse_others(path)
     table = read_table(path)
     kind = text(table, "kind", str(path))
     try:
@@ -109,9 +111,15 @@ def read_table(path: Path) -> dict[str, Any]:
 
 
 def check_there(path: Path) -> None:
-    """Raise ``InputError`` if there is no such scene file."""
+    """Raise ``InputError`` if there is no such scene file; of a folder, an image or a video it says what takes it."""
+    _refuse_others(path)
     with reading(path, ADVICE):
         size_of(path)
+
+
+def _refuse_others(path: Path) -> None:
+    if told := what_it_is(path):
+        raise InputError(told)
 
 
 def bundled_scenes() -> dict[str, Path]:

@@ -269,7 +269,7 @@ def test_missing_scene(tmp_path):
 
 def test_scene_is_a_folder(tmp_path):
     (tmp_path / "scene.toml").mkdir()
-    check_refused(tmp_path / "scene.toml", "scene.toml", "cannot be read")
+    check_refused(tmp_path / "scene.toml", "scene.toml", "is an empty folder")
 
 
 def test_path_with_nul(tmp_path):

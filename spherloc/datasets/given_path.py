@@ -1,0 +1,115 @@
+"""What somebody gave in the place of a scene file, such as a folder of images, and which command takes it."""
+
+import re
+import shlex
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+from spherloc.errors import InputError, shorten
+from spherloc.files import is_file, is_folder, names_in
+
+IMAGES = {".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"}
+VIDEOS = {".360", ".avi", ".insv", ".m4v", ".mkv", ".mov", ".mp4", ".webm"}
+SCENE = "give the path of a scene file (TOML) or a bundled scene's name, which spherloc scenes lists"
+COMMAND = re.compile(r": spherloc [^;]*$")
+"""A command at the end of a sentence."""
+_MOST_FOLDERS = 50
+"""Folders in a folder that are looked into for images."""
+
+_COLMAP = "a scene of kind colmap localizes its images: spherloc scenes colmap prints one to start from"
+_FILES = {
+    ".bin": ("a binary file, maybe of a COLMAP model", f"give its folder in a scene file: {_COLMAP}"),
+    ".csv": (
+        "a table",
+        "its matches are solved by a scene of kind correspondences: spherloc scenes correspondences",
+    ),
+    ".db": (
+        "a database as COLMAP has it, which holds features and matches but no poses and points",
+        f"the folder with cameras, images and points3D is the map, and {_COLMAP}",
+    ),
+    ".h5": ("an HDF5 file, as hloc writes them", "a scene of kind hloc names it: spherloc scenes hloc prints one"),
+    ".ply": ("a point cloud or a mesh", "a scene of kind newer-college names it as prior_map"),
+    ".vrs": (
+        "a recording of Project Aria's glasses",
+        "save its images with projectaria-tools, then make a map of their folder with: spherloc map FOLDER",
+    ),
+    ".json": ("a JSON file", "a calibration is named by the key 'calibration' of a scene file"),
+    ".yaml": ("a YAML file", "a calibration is named by the key 'calibration' of a scene file"),
+    ".yml": ("a YAML file", "a calibration is named by the key 'calibration' of a scene file"),
+}
+"""What files with these endings are, and where they belong."""
+
+
+def what_it_is(path: Path) -> str:
+    """What a path is and what takes it: "photos: is a folder of 32 images; make a map of it with: spherloc map photos".
+
+    No full stop follows a command, so that it can be copied. Empty for a path that may be that of a scene file, and for
+    one where there is nothing.
+    """
+    if is_folder(path):
+        what, advice = _folder(path)
+    elif is_file(path) and path.suffix.lower() != ".toml":
+        what, advice = _file(path)
+    else:
+        return ""
+    return f"{path}: is {what}; {advice}{'' if COMMAND.search(advice) else '.'}"
+
+
+def _file(path: Path) -> tuple[str, str]:
+    suffix, folder = path.suffix.lower(), _quoted(path.parent)
+    if suffix in IMAGES:
+        return "an image", f"make a map of all images of its folder with: spherloc map {folder}"
+    if suffix in VIDEOS:
+        return "a video", f"make a map of its frames with: spherloc map {folder} --video {_quoted(path)}"
+    what, advice = _FILES.get(suffix, ("no scene file", ""))
+    return what, f"{advice}; else {SCENE}" if advice else SCENE
+
+
+def _folder(path: Path) -> tuple[str, str]:
+    try:
+        names = names_in(path)
+    except InputError:
+        return "a folder that cannot be listed", SCENE
+    suffixes = Counter(Path(name).suffix.lower() for name in names)
+    stems = {Path(name).stem for name in names if Path(name).suffix in (".bin", ".txt")}
+    if stems >= {"cameras", "images", "points3D"}:
+        return "a COLMAP model", _COLMAP
+    if "sensors" in names:
+        return "a dataset of kapture", "a scene of kind kapture localizes its images: see spherloc scenes kapture"
+    if "results.jsonl" in names:
+        runs = _quoted(path / "recordings")
+        return "a folder of results of spherloc localize", f"list its runs with: spherloc runs {runs}"
+    if suffixes[".rrd"]:
+        return _counted(suffixes[".rrd"], "recording"), f"list them with: spherloc runs {_quoted(path)}"
+    images = _images(path, names)
+    if images:
+        return _counted(images, "image"), f"make a map of it with: spherloc map {_quoted(path)}"
+    scenes = [name for name in names if name.endswith(".toml")]
+    if scenes:
+        return _counted(len(scenes), "scene file"), f"give one of them, such as {shorten(str(path / scenes[0]))}"
+    videos = [name for name in names if Path(name).suffix.lower() in VIDEOS]
+    if videos:
+        video = _quoted(path / videos[0])
+        advice = f"make a map of the frames of one with: spherloc map {_quoted(path)} --video {video}"
+        return _counted(len(videos), "video"), advice
+    return ("an empty folder" if not names else "a folder without images or scene files"), SCENE
+
+
+def _images(path: Path, names: Sequence[str]) -> int:
+    """How many images there are in a folder and in the folders in it."""
+    count = sum(Path(name).suffix.lower() in IMAGES for name in names)
+    for name in [name for name in names if is_folder(path / name)][:_MOST_FOLDERS]:
+        try:
+            count += sum(Path(inside).suffix.lower() in IMAGES for inside in names_in(path / name))
+        except InputError:
+            continue
+    return count
+
+
+def _counted(count: int, what: str) -> str:
+    return f"a folder of {count:,} {what}{'' if count == 1 else 's'}"
+
+
+def _quoted(path: Path) -> str:
+    return shlex.quote(str(path))

@@ -1,0 +1,67 @@
+"""What is said of a path that is no scene file."""
+
+import pytest
+
+from spherloc.datasets import load_scene
+from spherloc.datasets.given_path import what_it_is
+from spherloc.datasets.scene_file import check_there
+from spherloc.errors import InputError
+
+
+def filled(folder, *names):
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(b"")
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("names", "said"),
+    [
+        ([f"{k}.JPG" for k in range(3)], "is a folder of 3 images; make a map of it with: spherloc map "),
+        (["left/1.png", "right/1.png", "scene.toml"], "is a folder of 2 images; make a map"),
+        (["1.png"], "is a folder of 1 image; make a map"),
+        (["cameras.bin", "images.bin", "points3D.bin", "frames.bin"], "is a COLMAP model; a scene of kind colmap"),
+        (["sensors/sensors.txt"], "is a dataset of kapture"),
+        (["results.jsonl", "trajectory.png"], "is a folder of results of spherloc localize; list its runs with"),
+        (["a.rrd", "b.rrd"], "is a folder of 2 recordings; list them with: spherloc runs "),
+        (["a.toml"], "is a folder of 1 scene file; give one of them, such as "),
+        (["a.mp4"], "is a folder of 1 video; make a map of the frames of one with: spherloc map "),
+        ([], "is an empty folder; give the path of a scene file"),
+        (["notes.txt"], "is a folder without images or scene files; give the path of a scene file"),
+    ],
+)
+def test_folders(tmp_path, names, said):
+    folder = tmp_path / "my photos"
+    folder.mkdir()
+    told = what_it_is(filled(folder, *names))
+    assert told.startswith(f"{folder}: {said}") and told.endswith(".") != (": spherloc " in told)
+    for ask in (check_there, load_scene):
+        with pytest.raises(InputError) as caught:
+            ask(folder)
+        assert str(caught.value) == told
+    assert "'" in told or "spherloc map" not in told  # a path with a space is quoted for the shell
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("a.png", "is an image; make a map of all images of its folder with: spherloc map "),
+        ("a.insv", "is a video; make a map of its frames with: spherloc map "),
+        ("a.vrs", "is a recording of Project Aria's glasses; save its images"),
+        ("database.db", "is a database as COLMAP has it"),
+        ("matches.csv", "is a table; its matches are solved by a scene of kind correspondences"),
+        ("camera.yaml", "is a YAML file; a calibration is named by the key 'calibration'"),
+        ("README.md", "is no scene file; give the path of a scene file (TOML) or a bundled scene's name"),
+    ],
+)
+def test_files(tmp_path, name, said):
+    path = filled(tmp_path, name) / name
+    assert what_it_is(path).startswith(f"{path}: {said}")
+    with pytest.raises(InputError, match=r"spherloc|calibration"):
+        check_there(path)
+
+
+def test_what_may_be_a_scene_file_and_what_is_not_there_are_left_alone(tmp_path):
+    filled(tmp_path, "a.toml")
+    assert what_it_is(tmp_path / "a.toml") == "" == what_it_is(tmp_path / "none") == what_it_is(tmp_path / ("x" * 5000))
