@@ -1,4 +1,4 @@
-"""Which way is down, from an inertial measurement unit: Newer College's CSV, and a filter of its two sensors.
+"""Which way is down, from an inertial measurement unit: logs in CSV, and a filter of its two sensors.
 
 An accelerometer measures gravity plus the motion's own acceleration, which for a walking person exceeds a metre per
 second squared but averages out within seconds. The gyroscope says how the unit turned meanwhile: its turns are
@@ -6,15 +6,17 @@ accumulated into a frame that keeps its direction, in which the measured forces 
 that runs forward only, the window is symmetric, so that to first order a constant bias of the gyroscope cancels.
 """
 
+import re
 from array import array
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from spherloc.errors import InputError
+from spherloc.errors import InputError, show
 from spherloc.formats.text_rows import finite_numbers, rows
 from spherloc.trajectory import NS_PER_S
 from spherloc.types import FloatArray
@@ -29,7 +31,10 @@ LEAST_S = 1.0
 """Of measurements without a gap that a direction must come from."""
 DISTURBED_M_S2 = 2.0
 """Forces that differ from gravity by this much weigh 0.6 of the others."""
-_COLUMNS = "counter,sec,nsec,wx,wy,wz,ax,ay,az"
+NAME_RULE = "names like 1625133000_123456789.png (seconds_nanoseconds) or 1625133000123456789.png (nanoseconds)"
+_SECONDS = re.compile(r"(?:.*\D)?(\d{9,10})_(\d{1,9})", re.ASCII)
+_NANOSECONDS = re.compile(r"(?:.*\D)?(\d{18,19})", re.ASCII)
+_COLUMNS = "counter,sec,nsec,wx,wy,wz,ax,ay,az or timestamp_ns,wx,wy,wz,ax,ay,az"
 _LARGEST_S = 2**33
 _LARGEST_RATE_RAD_S = 1000.0
 _LARGEST_FORCE_M_S2 = 10_000.0
@@ -48,19 +53,19 @@ class ImuSamples:
 
 
 def read_imu(path: Path) -> ImuSamples:
-    """Rows ``counter,sec,nsec,wx,wy,wz,ax,ay,az``, rad/s and m/s^2.
+    """Rows ``counter,sec,nsec,wx,wy,wz,ax,ay,az`` or, as EuRoC has them, ``timestamp_ns,wx,wy,wz,ax,ay,az``.
+
+    Rates are in rad/s, accelerations in m/s^2.
 
     Raises ``InputError``, one sentence with the file and the line, for whatever is no such file.
     """
     times, numbers = array("q"), array("d")
     for place, text in rows(path, f"lines of {_COLUMNS}"):
-        words = text.split(",")
-        if len(words) != 9:
+        words = [word.strip() for word in text.split(",")]
+        if len(words) not in (7, 9):
             raise InputError(f"{place}: has {len(words)} columns; give {_COLUMNS}.")
-        _, sec, nsec, *measured = finite_numbers([word.strip() for word in words], place)
-        if not (0 <= sec <= _LARGEST_S and 0 <= nsec < NS_PER_S and sec == int(sec) and nsec == int(nsec)):
-            raise InputError(f"{place}: sec {sec:g} and nsec {nsec:g} are no time; check the order of the columns.")
-        time_ns = int(sec) * NS_PER_S + int(nsec)
+        time_ns = _time_ns(words[:-6], place)
+        measured = finite_numbers(words[-6:], place)
         if times and time_ns <= times[-1]:
             raise InputError(f"{place}: its time is not after that of the line before; sort the lines by time.")
         if max(map(abs, measured[:3])) > _LARGEST_RATE_RAD_S or max(map(abs, measured[3:])) > _LARGEST_FORCE_M_S2:
@@ -77,6 +82,31 @@ def read_imu(path: Path) -> ImuSamples:
             "check its unit and the order of the columns."
         )
     return ImuSamples(np.array(times, dtype=np.int64), table[:, :3], table[:, 3:])
+
+
+def _time_ns(words: Sequence[str], place: str) -> int:
+    """Of ``timestamp_ns`` or of ``counter,sec,nsec``."""
+    if len(words) == 1:
+        if not (words[0].isdecimal() and words[0].isascii() and len(words[0]) < 20):
+            raise InputError(f"{place}: {show(words[0])} is no time in nanoseconds; check the order of the columns.")
+        return int(words[0])
+    _, sec, nsec = finite_numbers(words, place)
+    if not (0 <= sec <= _LARGEST_S and 0 <= nsec < NS_PER_S and sec == int(sec) and nsec == int(nsec)):
+        raise InputError(f"{place}: sec {sec:g} and nsec {nsec:g} are no time; check the order of the columns.")
+    return int(sec) * NS_PER_S + int(nsec)
+
+
+def timestamp_of(name: str) -> int | None:
+    """Nanoseconds that an image's name ends with, as <seconds>_<nanoseconds> or as nanoseconds; None for other names.
+
+    Something else may precede: infra1_1583836591_182590976.png. The nanoseconds need not have leading zeros.
+    """
+    stem = PurePosixPath(name).stem
+    if match := _SECONDS.fullmatch(stem):
+        return int(match[1]) * NS_PER_S + int(match[2])
+    if match := _NANOSECONDS.fullmatch(stem):
+        return int(match[1])
+    return None
 
 
 def down_at(samples: ImuSamples, timestamps_ns: NDArray[np.int64]) -> FloatArray:

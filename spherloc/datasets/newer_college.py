@@ -9,7 +9,7 @@ import re
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from itertools import pairwise
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from spherloc.cameras.base import Camera
 from spherloc.cameras.tool_files import read_kalibr_chain
 from spherloc.datasets import scene_file
-from spherloc.datasets.imu import down_at, read_imu
+from spherloc.datasets.imu import NAME_RULE, down_at, read_imu, timestamp_of
 from spherloc.datasets.map_scene import OPTIONAL, REQUIRED, MapScene, folder, read_settings
 from spherloc.datasets.scene_file import numbers
 from spherloc.errors import InputError, reason, shorten, show
@@ -33,13 +33,10 @@ from spherloc.trajectory import NS_PER_S, Trajectory, pose_at, read_newer_colleg
 from spherloc.types import BoolArray, FloatArray
 
 ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
-NAME_RULE = "names like 1625133000_123456789.png (seconds_nanoseconds) or 1625133000123456789.png (nanoseconds)"
 MAX_CLOUD_BYTES = 1 << 32
 """The whole campus at a centimetre takes a few gigabytes."""
 _HEADER_BYTES = 1 << 16
 _ELEMENT = re.compile(rb"element\s+(\S+)\s+(\d{1,18})\s*$")
-_SECONDS = re.compile(r"(?:.*\D)?(\d{9,10})_(\d{1,9})", re.ASCII)
-_NANOSECONDS = re.compile(r"(?:.*\D)?(\d{18,19})", re.ASCII)
 
 
 @dataclass(frozen=True)
@@ -50,19 +47,6 @@ class TimedImage:
     """Its path below the folder, with forward slashes."""
     path: Path
     timestamp_ns: int
-
-
-def timestamp_of(name: str) -> int | None:
-    """Nanoseconds that an image's name ends with, as <seconds>_<nanoseconds> or as nanoseconds; None for other names.
-
-    Something else may precede: infra1_1583836591_182590976.png. The nanoseconds need not have leading zeros.
-    """
-    stem = PurePosixPath(name).stem
-    if match := _SECONDS.fullmatch(stem):
-        return int(match[1]) * NS_PER_S + int(match[2])
-    if match := _NANOSECONDS.fullmatch(stem):
-        return int(match[1])
-    return None
 
 
 def images_in(folder: Path) -> tuple[list[TimedImage], int]:

@@ -1,4 +1,4 @@
-"""Gravity of queries, for every kind of scene with images: from a file, the image, its tags, or the true pose.
+"""Gravity of queries, for every kind of scene with images: from a file, the image, its tags, an IMU, or the true pose.
 
 A gravity file has a row ``image gx gy gz [sd_deg]`` a query: its name as the scene has it (in quotation marks where it
 has spaces), a vector that points down in the camera frame, of any length, and the standard deviation of each of its two
@@ -14,10 +14,12 @@ from typing import Any
 import numpy as np
 
 from spherloc.datasets import scene_file
+from spherloc.datasets.imu import NAME_RULE, ImuSamples, down_at, read_imu, timestamp_of
 from spherloc.errors import InputError, shorten, show
 from spherloc.formats.text_rows import finite_numbers, rows
 from spherloc.frontend.view import Gravity, View
 from spherloc.geometry import DOWN
+from spherloc.trajectory import NS_PER_S
 from spherloc.types import FloatArray
 
 MeasuredGravity = Callable[[View, FloatArray | None], Gravity]
@@ -25,11 +27,40 @@ MeasuredGravity = Callable[[View, FloatArray | None], Gravity]
 
 SOURCES = ("reference", "lines", "tags", "level", "truth")
 """Values of ``[gravity] query``."""
+_KEYS = {"bound_deg", "sd_deg", "file", "query"}
 BOUND_SD = 3.0
 """A bound in standard deviations."""
 _MOST_SD_DEG = 25.0
 _ROW = re.compile(r'(?:"([^"]+)"|([^\s,"]+))[\s,]+(.*)')
 _COLUMNS = "image gx gy gz [sd_deg]"
+
+
+@dataclass(frozen=True, eq=False)
+class ImuLog:
+    """Measurements of an inertial measurement unit that is fixed to the camera."""
+
+    file: Path
+    samples: ImuSamples
+    camera_from_imu: FloatArray
+    """Rotation (3, 3)."""
+
+    def with_gravity(self, views: tuple[View, ...]) -> tuple[View, ...]:
+        """The views, with gravity where they have a time within the log and no gravity yet."""
+        times = [_time_ns(view) for view in views]
+        down = down_at(self.samples, np.array([0 if time is None else time for time in times], dtype=np.int64))
+        down = down @ self.camera_from_imu.T
+        known = [time is not None and bool(np.isfinite(row).all()) for time, row in zip(times, down, strict=True)]
+        return tuple(
+            replace(view, gravity=Gravity(row / np.linalg.norm(row), "the IMU"))
+            if measured and view.gravity is None
+            else view
+            for view, row, measured in zip(views, down, known, strict=True)
+        )
+
+
+def _time_ns(view: View) -> int | None:
+    """When a view was taken, by what the loader knows or by the name of its image."""
+    return round(view.timestamp_s * NS_PER_S) if view.timestamp_s is not None else timestamp_of(view.name)
 
 
 @dataclass(frozen=True)
@@ -48,6 +79,8 @@ class GravitySettings:
     """Its rows by the names of the images."""
     bound_is_stated: bool
     """Whether the scene file states ``bound_rad``, which otherwise is the loader's default."""
+    imu: ImuLog | None = None
+    """Of a unit that moved with the camera."""
 
     def of_queries(self, views: Iterable[View], gravity_map: FloatArray) -> tuple[tuple[View, ...], list[str]]:
         """The queries with their gravity, as far as it is known before they are read, and remarks on the others.
@@ -55,6 +88,8 @@ class GravitySettings:
         ``gravity_map`` (3,) is the unit vector that points down in the map.
         """
         queries = tuple(self._with_gravity(view, gravity_map) for view in views)
+        if self.imu is not None:
+            queries = self.imu.with_gravity(queries)
         names = {view.name for view in queries}
         remarks, strange = [], [name for name in self.stated if name not in names]
         without = [view.name for view in queries if self.file and view.name not in self.stated]
@@ -68,6 +103,13 @@ class GravitySettings:
                 f"{len(without)} of {len(queries)} queries have no row in {self.file}, the first is "
                 f"{shorten(without[0])}."
             )
+        if self.imu is not None:
+            lost = [view.name for view in queries if view.gravity is None]
+            if lost:
+                remarks.append(
+                    f"{len(lost)} of {len(queries)} queries have no gravity from {self.imu.file}, the first is "
+                    f"{shorten(lost[0])}: no time ({NAME_RULE}), or one in a gap or outside of the log."
+                )
         if self.query == "truth":
             unknown = sum(view.cam_from_map is None for view in queries)
             remarks.append(
@@ -100,14 +142,29 @@ def read_gravity(table: Mapping[str, Any], where: str, bound_deg: float) -> Grav
     ``where`` is the scene file. Raises ``InputError`` for a wrong key or value and for a gravity file with a wrong row.
     """
     section = f"{where} [gravity]"
-    scene_file.check_keys(table, set(), {"bound_deg", "sd_deg", "file", "query"}, section)
+    with_imu = {"imu", "camera_from_imu"}
+    scene_file.check_keys(table, with_imu if with_imu & table.keys() else set(), with_imu | _KEYS, section)
     bound_rad, sd_rad = scene_file.gravity_error_rad({"bound_deg": bound_deg} | dict(table), section)
     query = table.get("query", "reference")
     if query not in SOURCES:
         raise InputError(f"{section}: query is {show(query)}; give one of {', '.join(map(show, SOURCES))}.")
     file = scene_file.text(table, "file", section) if "file" in table else ""
     stated = read_gravity_file(Path(where).parent / file) if file else {}
-    return GravitySettings(bound_rad, sd_rad, query, file, stated, "bound_deg" in table)
+    imu = None
+    if "imu" in table:
+        log = Path(where).parent / scene_file.text(table, "imu", section)
+        imu = ImuLog(log, read_imu(log), _rotation(table["camera_from_imu"], section))
+    return GravitySettings(bound_rad, sd_rad, query, file, stated, "bound_deg" in table, imu)
+
+
+def _rotation(value: Any, section: str) -> FloatArray:
+    """``camera_from_imu`` (3, 3)."""
+    rotation = scene_file.numbers(value, (3, 3), "camera_from_imu", section)
+    with np.errstate(over="ignore", invalid="ignore"):
+        proper = np.allclose(rotation @ rotation.T, np.eye(3), rtol=0, atol=1e-3) and np.linalg.det(rotation) > 0
+    if not proper:
+        raise InputError(f"{section}: camera_from_imu is no rotation; give the 3 x 3 part of T_cam_imu.")
+    return rotation
 
 
 def read_gravity_file(path: Path) -> dict[str, Gravity]:

@@ -88,6 +88,15 @@ def test_imu_file(folder):
     np.testing.assert_array_equal(samples.forces_m_s2[3], [0.1, 0.2 * 3, 9.7])
 
 
+def test_an_imu_file_as_euroc_has_it(folder):
+    rows = "".join(f"{10**18 + 5 * n},0.1,0.2,0.3,9.7,0,{n}\n" for n in range(3))
+    samples = read_imu(write(folder, f"#timestamp [ns],w_RS_S_x [rad s^-1]\n{rows}", "imu.csv"))
+    assert samples.timestamps_ns.tolist() == [10**18, 10**18 + 5, 10**18 + 10]
+    np.testing.assert_array_equal(samples.forces_m_s2[2], [9.7, 0, 2])
+    with pytest.raises(InputError, match=r"line 1: '1.5' is no time in nanoseconds"):
+        read_imu(write(folder, "1.5,0,0,0,9.8,0,0\n", "wrong.csv"))
+
+
 @pytest.mark.parametrize(
     "text, says",
     [

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.datasets import load_scene
 from spherloc.datasets.map_scene import MapScene
 from spherloc.datasets.query_gravity import read_gravity, read_gravity_file
@@ -13,6 +14,7 @@ from spherloc.estimators import default_options
 from spherloc.experiments.results import json_line, row_of_json
 from spherloc.experiments.sequence import localize
 from spherloc.frontend.view import Gravity, Matches, View
+from spherloc.geometry import DOWN
 from tests.datasets.test_image_folder import CAMERA, POSED, make_tree
 from tests.tiny_scene import write_tiny_scene
 
@@ -80,6 +82,26 @@ def test_a_file_gives_queries_of_a_folder_their_gravity(tmp_path):
     np.testing.assert_allclose(first.gravity.down, [0, 0.8, 0.6])
     assert any("1 of 2 rows" in remark and "none.jpg" in remark for remark in scene.remarks)
     assert any("1 of 2 queries have no row" in remark and "b.png" in remark for remark in scene.remarks)
+
+
+def test_a_log_of_an_imu_gives_queries_gravity_by_the_times_in_their_names(tmp_path):
+    """A unit at rest, turned against the camera, whose x axis points up; one image is from after the log."""
+    rows = "".join(f"{10**18 + n * 10**7},0,0,0,9.81,0,0\n" for n in range(300))
+    (tmp_path / "imu.csv").write_text(rows)
+    turn = [[0, 1, 0], [-1, 0, 0], [0, 0, 1]]
+    settings = read_gravity({"imu": "imu.csv", "camera_from_imu": turn}, str(tmp_path / "s.toml"), 3.0)
+    times = (10**18 + 10**9, 10**18 + 10**10)
+    views = [View(f"{time}.png", Equirectangular(64, 32), tmp_path / "q.png") for time in times]
+    (inside, after), remarks = settings.of_queries(views, DOWN)
+    assert inside.gravity is not None and inside.gravity.source == "the IMU" and inside.gravity.bound_rad is None
+    np.testing.assert_allclose(inside.gravity.down, [0, 1, 0], atol=1e-12)
+    assert after.gravity is None and "1 of 2 queries have no gravity from" in remarks[0]
+    for table, said in (
+        ({"imu": "imu.csv"}, "key 'camera_from_imu' is missing"),
+        ({"imu": "imu.csv", "camera_from_imu": [[1, 0, 0]] * 3}, "is no rotation"),
+    ):
+        with pytest.raises(InputError, match=said):
+            read_gravity(table, str(tmp_path / "s.toml"), 3.0)
 
 
 def small_scene(tmp_path, problem, view, measured=None, bound_rad=0.05):
