@@ -12,9 +12,9 @@ import tyro
 from tyro.conf import Positional, arg
 from tyro.extras import SubcommandApp
 
-from spherloc.errors import SpherlocError, reason, show
+from spherloc.errors import InputError, SpherlocError, reason, show
 from spherloc_viz import given_files, recording_commands
-from spherloc_viz.arguments import OptionalNumber, OptionalPath, OptionalText, refuse_repeated
+from spherloc_viz.arguments import OptionalFloat, OptionalNumber, OptionalPath, OptionalText, refuse_repeated
 from spherloc_viz.recording.storage.room import KEEP_GIGABYTES
 
 RECORDINGS = Path("recordings")
@@ -271,6 +271,56 @@ def play(
 
 
 @app.command
+def map(
+    folder: Positional[Annotated[Path, arg(metavar="FOLDER")]],
+    /,
+    camera: OptionalPath = None,
+    video: OptionalPath = None,
+    frames: int = 40,
+    output: OptionalPath = None,
+    camera_height: OptionalFloat = None,
+    distance: Annotated[tuple[str, str, float] | None, arg(metavar="IMAGE IMAGE METRES")] = None,
+    localize: OptionalPath = None,
+) -> int:
+    """Make a map of your own photographs: panoramas, or images of one calibrated wide camera.
+
+    Features, matches, COLMAP's structure from motion, which way is down, and scale if you give one; then a scene file
+    that opens at once. Needs the extra colmap. Stop it when you like: the same command goes on. Ends with 0 if all
+    images are in the map, 1 if some are not (report.html says why), 2 if an input is wrong.
+
+    For example:
+
+    spherloc map my_panoramas
+
+    spherloc map my_fisheyes --camera calibration.yaml --camera-height 1.6
+
+    spherloc map frames --video walk.mp4 --localize new_photographs
+
+    Args:
+        folder: Folder of the photographs; with --video, where its frames are put.
+        camera: Calibration file of the camera; without it, images of 2 to 1 are taken for full panoramas.
+        video: Take frames from this video first, the sharpest of each stretch.
+        frames: How many frames to take.
+        output: Folder of the map; FOLDER_map here if not given.
+        camera_height: Metres of the cameras above the ground: gives the scale.
+        distance: Two images by name and the metres between them: gives the scale.
+        localize: Folder of other images of that camera; a scene is written that localizes them in the map.
+    """
+    from spherloc.mapping.make import Measured
+    from spherloc_viz.map_command import make
+
+    if camera_height is not None and distance is not None:
+        raise InputError("--camera-height and --distance both give the scale; keep one.")
+    for flag, metres in (("--camera-height", camera_height), ("--distance", distance and distance[2])):
+        if metres is not None and not 0.0 < metres < 1e6:
+            raise InputError(f"{flag} is {metres:g}; give a positive number of metres.")
+    if not 2 <= frames <= 2000:
+        raise InputError(f"--frames is {frames}; give a number from 2 to 2000.")
+    taken = None if video is None else (video, frames)
+    return make(folder, output, camera, taken, Measured(camera_height, distance), localize)
+
+
+@app.command
 def lesson(
     name: Positional[Annotated[str | None, arg(metavar="[NAME]")]] = None,
     /,
@@ -385,7 +435,7 @@ def main() -> None:
         if isinstance(stream, io.TextIOWrapper):  # names that are no UTF-8, or a terminal that knows ASCII only
             stream.reconfigure(errors="backslashreplace")
     try:
-        refuse_repeated(sys.argv[1:], (run, localize, sweep, play, lesson, scenes, plugins, *_OTHERS))
+        refuse_repeated(sys.argv[1:], (run, localize, sweep, play, map, lesson, scenes, plugins, *_OTHERS))
         code: Any = app.cli(
             prog="spherloc",
             description="See why visual localization with fisheye and 360-degree cameras succeeds or fails.",

@@ -52,7 +52,7 @@ FLOORS = (
         "spherloc.outcome",
         "spherloc.experiments",
     ),
-    ("spherloc.localization", "spherloc.testing"),
+    ("spherloc.localization", "spherloc.testing", "spherloc.mapping"),
     (
         "spherloc_viz.style",
         "spherloc_viz.layers",
@@ -73,6 +73,8 @@ FLOORS = (
         "spherloc_viz.sweep",
         "spherloc_viz.scene_list",
         "spherloc_viz.lesson_command",
+        "spherloc_viz.map_report",
+        "spherloc_viz.map_command",
         "spherloc_viz.progress",
         "spherloc_viz.showing",
         "spherloc_viz.cli",

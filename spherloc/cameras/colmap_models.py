@@ -95,3 +95,23 @@ _MODELS: dict[str, tuple[str, Callable[..., Any]]] = {
     "SPHERE": ("f, cx, cy", _sphere),
 }
 """Names of the parameters, in COLMAP's order, and what makes a camera of the size and of them."""
+
+
+def colmap_camera(camera: Camera) -> tuple[str, list[float]]:
+    """Name and parameters of COLMAP's model of a camera.
+
+    Raises ``CalibrationError`` if COLMAP has none.
+    """
+    if isinstance(camera, Equirectangular):
+        return "EQUIRECTANGULAR", [camera.width, camera.height]
+    if isinstance(camera, KannalaBrandt):
+        return "OPENCV_FISHEYE", [camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion]
+    if isinstance(camera, Fisheye624):
+        return "RAD_TAN_THIN_PRISM_FISHEYE", [camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion]
+    if isinstance(camera, Eucm):
+        return "EUCM", [camera.fx, camera.fy, camera.cx, camera.cy, camera.alpha, camera.beta]
+    if isinstance(camera, Mei) and camera.xi == 0.0:
+        return "OPENCV", [camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion]
+    raise CalibrationError(
+        f"COLMAP has no camera model {camera.model}; give a calibration as kannala_brandt, fisheye624 or eucm."
+    )

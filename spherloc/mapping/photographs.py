@@ -1,0 +1,126 @@
+"""The photographs that a map is made of: a folder's images with their camera, or the sharpest frames of a video."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from math import ceil
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from spherloc.cameras.base import Camera
+from spherloc.cameras.equirectangular import Equirectangular
+from spherloc.errors import InputError, shorten
+from spherloc.files import is_file, is_folder, names_in
+from spherloc.frontend.view import View
+from spherloc.images import grey, read_size
+from spherloc.types import ByteArray
+
+SUFFIXES = {".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"}
+LEAST_IMAGES = 2
+LEAST_PANORAMA_PX = 200
+"""Of the longer side."""
+SHARPNESS_PX = 512
+"""Frames are compared at this longer side."""
+
+
+@dataclass(frozen=True)
+class Photographs:
+    """What can be mapped, in the order of names, and what is said of the rest."""
+
+    views: tuple[View, ...]
+    remarks: tuple[str, ...]
+
+
+def photographs(folder: Path, camera: Camera | None) -> Photographs:
+    """The images of a folder, all of ``camera``; without one they are taken for panoramas if they are 2 to 1.
+
+    Raises ``InputError`` if there are fewer than two of one size, or if their camera is not known.
+    """
+    if not is_folder(folder):
+        raise InputError(f"{folder}: is no folder; give the folder of the photographs.")
+    sizes: dict[tuple[int, int], list[str]] = {}
+    remarks = []
+    for name in (name for name in names_in(folder) if Path(name).suffix.lower() in SUFFIXES):
+        try:
+            sizes.setdefault(read_size(folder / name), []).append(name)
+        except InputError as error:
+            remarks.append(f"{shorten(name)} was left out: {error}")
+    if not sizes:
+        raise InputError(
+            f"{folder}: has no photographs ({', '.join(sorted(SUFFIXES))}); give the folder that has them."
+        )
+    size = (camera.width, camera.height) if camera else max(sizes, key=lambda key: len(sizes[key]))
+    width, height = size
+    if camera is None:
+        if width != 2 * height or width < LEAST_PANORAMA_PX:
+            raise InputError(
+                f"{folder}: its photographs are {width} x {height} pixels, so they are no full panoramas (2 to 1); "
+                "give their calibration with --camera FILE."
+            )
+        camera = Equirectangular(width, height)
+    names = sizes.pop(size, [])
+    others = sorted(name for rest in sizes.values() for name in rest)
+    if others:
+        remarks.append(
+            f"{len(others)} of {len(others) + len(names)} images were left out, as they are not {width} x {height} "
+            f"pixels; the first is {shorten(others[0])}."
+        )
+    if len(names) < LEAST_IMAGES:
+        raise InputError(
+            f"{folder}: has {len(names)} photographs of {width} x {height} pixels; a map needs {LEAST_IMAGES} or more, "
+            "better ten."
+        )
+    return Photographs(tuple(View(name, camera, folder / name) for name in sorted(names)), tuple(remarks))
+
+
+def frames_of(video: Path, folder: Path, count: int, advance: Callable[[str], None]) -> int:
+    """Write some ``count`` frames of a video into ``folder``, the sharpest of each stretch; how many were written.
+
+    ``advance`` is called after each with its name. Frames that are there are not written again. Raises ``InputError``
+    if the video cannot be read or the folder cannot be written.
+    """
+    if not is_file(video):
+        raise InputError(f"{video}: is no file; give a video.")
+    reader = cv2.VideoCapture(str(video))
+    total = int(reader.get(cv2.CAP_PROP_FRAME_COUNT)) if reader.isOpened() else 0
+    if total <= 0:
+        raise InputError(f"{video}: OpenCV cannot read it as a video; convert it, to MP4 with H.264 for instance.")
+    stretch = max(1, ceil(total / count))
+    written = 0
+    for number, frame in _sharpest(reader, stretch):
+        name = f"frame_{number:06d}.jpg"
+        path = folder / name
+        if not path.is_file():
+            done, content = cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, 95])
+            try:
+                path.write_bytes(content.tobytes() if done else b"")
+            except OSError as error:
+                raise InputError(f"{path}: cannot be written ({error.strerror}); give another --output.") from None
+        written += 1
+        advance(name)
+    return written
+
+
+def _sharpest(reader: cv2.VideoCapture, stretch: int) -> Iterator[tuple[int, ByteArray]]:
+    """Number and pixels of the sharpest frame of each ``stretch`` frames."""
+    best: tuple[float, int, ByteArray] | None = None
+    number = 0
+    while True:
+        there, frame = reader.read()
+        if best is not None and (not there or number % stretch == 0):
+            yield best[1], best[2]
+            best = None
+        if not there:
+            return
+        sharpness = _sharpness(np.asarray(frame, np.uint8))
+        if best is None or sharpness > best[0]:
+            best = sharpness, number, np.asarray(frame, np.uint8)
+        number += 1
+
+
+def _sharpness(frame: ByteArray) -> float:
+    """Variance of the Laplacian at ``SHARPNESS_PX``."""
+    scale = min(1.0, SHARPNESS_PX / max(frame.shape[:2]))
+    small = cv2.resize(grey(frame), None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    return float(cv2.Laplacian(small, cv2.CV_32F).var())

@@ -1,0 +1,128 @@
+"""Which way is down in a model made of images alone, and how long its unit is."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from spherloc.errors import InputError, show
+from spherloc.frontend.gravity_from_lines import gravity_from_lines
+from spherloc.frontend.view import View
+from spherloc.geometry import DOWN, align_to_down, camera_centre
+from spherloc.types import FloatArray
+
+LEAST_LINES = 3
+"""Images whose lines must tell down; of fewer, all images count as held upright."""
+MOST_SPREAD_DEG = 25.0
+GROUND_SHARE = 0.1
+"""Of the points below the cameras, the part that lies deeper than the ground: reflections, wrong points."""
+LEAST_GROUND_POINTS = 30
+
+
+@dataclass(frozen=True)
+class Level:
+    """Down in a model."""
+
+    down: FloatArray
+    """Unit vector (3,), model frame."""
+    source: str
+    """What measured it, in words."""
+    spread_deg: float
+    """Median angle between it and what single images say."""
+
+
+@dataclass(frozen=True)
+class Scale:
+    """How long the model's unit is."""
+
+    metres_per_unit: float
+    source: str
+    """What measured it, in words; empty if nothing did, and the unit is arbitrary."""
+
+
+def level_of(poses: Mapping[str, FloatArray], views: Sequence[View]) -> Level:
+    """Down, from the vertical lines of the images, else as the mean of their vertical axes.
+
+    ``poses`` (3, 4) are those of the registered ones, by name. Raises ``InputError`` if the images do not agree.
+    """
+    measured, axes = [], []
+    for view in views:
+        if view.name not in poses:
+            continue
+        rotation = poses[view.name][:, :3]
+        axes.append(rotation.T @ DOWN)
+        try:
+            measured.append(rotation.T @ gravity_from_lines(view).down)
+        except InputError:  # too few lines: the others tell
+            continue
+    by_lines = len(measured) >= LEAST_LINES
+    directions = np.stack(measured if by_lines else axes)
+    down = _middle(directions)
+    spread_deg = float(np.median(np.degrees(np.arccos(np.clip(directions @ down, -1.0, 1.0)))))
+    if spread_deg > MOST_SPREAD_DEG:
+        raise InputError(
+            f"the photographs do not agree on where down is: the median is {spread_deg:.0f} degrees off their mean. "
+            "Take them with the camera held upright."
+        )
+    source = f"vertical lines of {len(measured)} images" if by_lines else "the images' own vertical, as if held upright"
+    return Level(down, source, spread_deg)
+
+
+def _middle(directions: FloatArray) -> FloatArray:
+    """The unit vector with the least sum of distances to unit vectors (N, 3): Weiszfeld's iteration."""
+    middle = directions.mean(axis=0)
+    for _ in range(50):
+        weights = 1.0 / np.maximum(np.linalg.norm(directions - middle, axis=1), 1e-9)
+        middle = weights @ directions / weights.sum()
+    return middle / np.linalg.norm(middle)
+
+
+def scale_by_distance(poses: Mapping[str, FloatArray], first: str, second: str, metres: float) -> Scale:
+    """The scale that makes two images ``metres`` apart. Raises ``InputError`` if one is not in the map."""
+    for name in (first, second):
+        if name not in poses:
+            raise InputError(f"{show(name)} is no image of the map; name two that were registered: {_some(poses)}.")
+    apart = float(np.linalg.norm(camera_centre(poses[first]) - camera_centre(poses[second])))
+    if apart == 0.0:
+        raise InputError(f"{show(first)} and {show(second)} were taken from one place; name two others.")
+    return Scale(metres / apart, f"{first} and {second} are {metres:g} m apart")
+
+
+def scale_by_height(poses: Mapping[str, FloatArray], points: FloatArray, level: Level, metres: float) -> Scale:
+    """The scale that puts the cameras ``metres`` above the ground, the deepest of the points (N, 3) below them.
+
+    Raises ``InputError`` if there are too few points below the cameras.
+    """
+    centres = np.stack([camera_centre(pose) for pose in poses.values()])
+    offset = points - centres[KDTree(centres).query(points)[1]]
+    below = offset @ level.down
+    # Of what is seen at 45 degrees or more below the horizon, nearly all is ground.
+    depths = below[below > 0.707 * np.linalg.norm(offset, axis=1)]
+    if len(depths) < LEAST_GROUND_POINTS:
+        raise InputError(
+            f"only {len(depths)} points of the map lie below the cameras, too few to find the ground; give a distance "
+            "between two images with --distance instead."
+        )
+    height = float(np.quantile(depths, 1.0 - GROUND_SHARE))
+    return Scale(metres / height, f"cameras {metres:g} m above the ground")
+
+
+def arbitrary_scale(poses: Mapping[str, FloatArray]) -> Scale:
+    """The scale at which the nearest other image is one unit away in the median."""
+    centres = np.stack([camera_centre(pose) for pose in poses.values()])
+    apart = np.linalg.norm(centres[:, None] - centres[None], axis=2)
+    np.fill_diagonal(apart, np.inf)
+    nearest = float(np.median(apart.min(axis=1)))
+    return Scale(1.0 / nearest if nearest > 0.0 else 1.0, "")
+
+
+def upright_frame(level: Level) -> FloatArray:
+    """Rotation (3, 3) from the model's frame to one whose z axis is up."""
+    to_down = align_to_down(level.down)  # takes down to +y
+    return np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]) @ to_down
+
+
+def _some(poses: Mapping[str, FloatArray]) -> str:
+    names = sorted(poses)
+    return ", ".join(names[:4]) + (", ..." if len(names) > 4 else "")

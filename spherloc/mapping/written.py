@@ -1,0 +1,145 @@
+"""What a map leaves on the disk: COLMAP's model, and scene files that open it."""
+
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from spherloc.errors import InputError
+from spherloc.frontend.view import View
+from spherloc.mapping.reconstruction import Reconstruction
+from spherloc.mapping.upright import Level, Scale, upright_frame
+from spherloc.registry import require
+from spherloc.types import FloatArray
+
+MODEL = "model"
+SCENE = "scene.toml"
+NEW_SCENE = "new_images.toml"
+LEAST_BOUND_DEG = 3.0
+EVERY = 4
+"""Of the map's images every fourth is a query, localized against the others."""
+
+
+@dataclass(frozen=True, eq=False)
+class Written:
+    """Where things are, and what is in them."""
+
+    scene: Path
+    """Its queries are images of the map, each localized without itself."""
+    new_scene: Path | None
+    """Of other images of the same camera, if there are some."""
+    poses: dict[str, FloatArray]
+    """Poses (3, 4) from the map, whose z is up."""
+    points: FloatArray
+    """(N, 3), map frame."""
+    error_px: float
+    """Mean reprojection error."""
+
+
+def write_map(
+    made: Reconstruction,
+    level: Level,
+    scale: Scale,
+    views: Sequence[View],
+    images: Path,
+    folder: Path,
+    new_images: Path | None,
+) -> Written:
+    """Level and scale a model and write it with its scenes into ``folder``.
+
+    ``images`` is the folder of the views, ``new_images`` one of images to be localized. Raises ``InputError`` if
+    something cannot be written.
+    """
+    pycolmap = require("pycolmap", "colmap", "making a map")
+    turn = pycolmap.Rotation3d(upright_frame(level))
+    made.model.transform(pycolmap.Sim3d(scale.metres_per_unit, turn, np.zeros(3)))
+    poses = {
+        image.name: np.asarray(image.cam_from_world().matrix())
+        for image in (made.model.image(number) for number in made.model.reg_image_ids())
+    }
+    names = [view.name for view in views if view.name in poses]
+    about = _about(made, level, scale, len(views))
+    try:
+        (folder / MODEL).mkdir(parents=True, exist_ok=True)
+        made.model.write(str(folder / MODEL))
+        scene = folder / SCENE
+        scene.write_text(_scene(folder, images, names, about, level, scale), encoding="utf-8")
+        new_scene = None
+        if new_images is not None:
+            new_scene = folder / NEW_SCENE
+            content = _new_scene(folder, images, new_images, views[0], about, level, scale)
+            new_scene.write_text(content, encoding="utf-8")
+    except (OSError, RuntimeError) as error:
+        raise InputError(f"{folder}: cannot be written ({error}); give another --output.") from None
+    return Written(scene, new_scene, poses, made.points(), float(made.model.compute_mean_reprojection_error()))
+
+
+def _about(made: Reconstruction, level: Level, scale: Scale, count: int) -> str:
+    units = f"metres: {scale.source}" if scale.source else "unknown, one is the usual distance between two images"
+    return (
+        f"Map of {len(made.poses)} of {count} images, {len(made.model.points3D):,} points. "
+        f"Units are {units}. Down is from {level.source}."
+    )
+
+
+def _scene(folder: Path, images: Path, names: Sequence[str], about: str, level: Level, scale: Scale) -> str:
+    queries = names[EVERY - 1 :: EVERY] or names[-1:]
+    lines = [
+        'kind = "colmap"',
+        f"name = {_text(_name(images, scale))}",
+        f"about = {_text(about)}",
+        f"model = {_text(MODEL)}",
+        f"images = {_text(_relative(images, folder))}",
+        "# Localized against the other images; those of the map that you name here are left out of it.",
+        f"queries = {json.dumps(queries, ensure_ascii=False)}",
+        *_gravity(level),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _new_scene(folder: Path, images: Path, new_images: Path, view: View, about: str, level: Level, scale: Scale) -> str:
+    lines = [
+        'kind = "image-folder"',
+        f"name = {_text(f'{new_images.name} in {_name(images, scale)}')}",
+        f"about = {_text(about)}",
+        f"images = {_text(_relative(new_images, folder))}",
+        "",
+        "[camera]",
+        *(f"{key} = {_value(value)}" for key, value in view.camera.to_dict().items()),
+        "",
+        "[map]",
+        f"model = {_text(MODEL)}",
+        f"images = {_text(_relative(images, folder))}",
+        *_gravity(level),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _name(images: Path, scale: Scale) -> str:
+    return images.resolve().name + ("" if scale.source else " (units unknown)")
+
+
+def _gravity(level: Level) -> list[str]:
+    bound = max(LEAST_BOUND_DEG, round(2.0 * level.spread_deg, 1))
+    return ["", "[gravity]", "map = [0.0, 0.0, -1.0]", f"bound_deg = {bound}"]
+
+
+def _relative(path: Path, folder: Path) -> str:
+    """A path that stays right if both are moved together; absolute on another drive."""
+    try:
+        return Path(os.path.relpath(path, folder)).as_posix()
+    except ValueError:
+        return path.resolve().as_posix()
+
+
+def _text(value: str) -> str:
+    """A TOML basic string: JSON's strings are those."""
+    return json.dumps(value, ensure_ascii=False)
+
+
+def _value(value: Any) -> str:
+    return _text(value) if isinstance(value, str) else json.dumps(value)
