@@ -20,7 +20,7 @@ PIXEL_CENTRE_SHIFT = 0.5
 """Added to a principal point that counts from the centre of the top-left pixel."""
 
 KNOWN = (
-    "give a YAML of KITTI-360, Kalibr, stella or 360Loc, a Basalt JSON or a TOML with a [camera] table "
+    "give a YAML of KITTI-360, Kalibr, stella, OpenCV, ROS or 360Loc, a Basalt JSON or a TOML with a [camera] table "
     "(docs/conventions.md has its keys)"
 )
 
@@ -34,6 +34,10 @@ class _Loader(yaml.SafeLoader):
 
     def flatten_mapping(self, node: yaml.MappingNode) -> None:
         """Leave ``<<`` as it is; it is then refused like any unknown tag."""
+
+
+# OpenCV's FileStorage: a table of rows, cols, dt and data, which is taken as such.
+_Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", yaml.SafeLoader.construct_yaml_map)
 
 
 def read_text(path: Path) -> str:

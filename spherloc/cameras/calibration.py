@@ -14,10 +14,16 @@ from spherloc.cameras._checks import located
 from spherloc.cameras._files import KNOWN, UnrecognisedError, parse_json, parse_yaml, read_text, table_of, value_of
 from spherloc.cameras.base import Camera
 from spherloc.cameras.extensions import camera_class_of, read_by_extensions, tried
+from spherloc.cameras.opencv_files import opencv
 from spherloc.errors import CalibrationError, InputError, reason, show
 from spherloc.registry import extension_of, guarded
 
-_ONE_CAMERA = {"imgw": tool_files.loc360, "parameter": tool_files.adapter, "Camera": tool_files.stella}
+_ONE_CAMERA = {
+    "imgw": tool_files.loc360,
+    "parameter": tool_files.adapter,
+    "Camera": tool_files.stella,
+    "distortion_coefficients": opencv,
+}
 """YAML files of one camera without a name, by the key at their top that gives them away."""
 
 _YAML_KEY = re.compile(r"""["']?[\w.-]+["']?\s*:(\s|$)""")
@@ -28,8 +34,9 @@ def load_camera(path: str | Path, name: str | None = None) -> Camera:
 
     Recognised by content: a KITTI-360 YAML (``model_type: MEI``), a Kalibr camchain (``cam0``, ...: pinhole or omni
     with radtan, equidistant or none, ds, eucm), the YAML of stella_vslam (``Camera``), 360Loc (``imgw``) and
-    fisheye-calib-adapter (``parameter``), a Basalt JSON (``value0``) and a TOML with a ``[camera]`` table or with its
-    keys at the top. ``name`` picks a camera of a camchain or of a Basalt JSON ("cam1"), by default its first one.
+    fisheye-calib-adapter (``parameter``), that of OpenCV's samples and of ROS (``distortion_coefficients``), a Basalt
+    JSON (``value0``) and a TOML with a ``[camera]`` table or with its keys at the top. ``name`` picks a camera of a
+    camchain or of a Basalt JSON ("cam1"), by default its first one.
     Principal points that count from the centre of the top-left pixel are moved by +0.5 pixels to this project's
     convention (that centre is (0.5, 0.5)). A file of no such kind is given to the readers of other packages
     (docs/extending.md).

@@ -1,0 +1,92 @@
+"""Calibrations that OpenCV itself wrote, against its own projections; and those of ROS."""
+
+import cv2
+import numpy as np
+import pytest
+
+from spherloc.cameras.calibration import load_camera
+from spherloc.cameras.kannala_brandt import KannalaBrandt
+from spherloc.cameras.mei import Mei
+from spherloc.errors import CalibrationError
+
+MATRIX = np.array([[401.5, 0.0, 318.25], [0.0, 402.5, 239.75], [0.0, 0.0, 1.0]])
+RADIAL = np.array([-0.2, 0.05, 0.001, -0.002])
+FISHEYE = np.array([0.02, -0.01, 0.003, -0.0005])
+
+
+def written(folder, lens, **others):
+    """A file by OpenCV's FileStorage."""
+    path = folder / "camera.yml"
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    storage.write("calibration_time", "Mon 1 Jan 2024")
+    for name, value in {"image_width": 640, "image_height": 480, **others}.items():
+        storage.write(name, value)
+    storage.write("camera_matrix", MATRIX)
+    storage.write("distortion_coefficients", np.asarray(lens, dtype=np.float64).reshape(-1, 1))
+    storage.release()
+    return path
+
+
+def points(rng):
+    return rng.normal(size=(50, 3)) * [0.5, 0.4, 0.2] + [0.0, 0.0, 2.0]
+
+
+def test_a_pinhole_as_opencv_projects_it(tmp_path):
+    camera = load_camera(written(tmp_path, [*RADIAL, 0.0]))
+    found, seen = camera.project(points(np.random.default_rng(1)))
+    there = cv2.projectPoints(points(np.random.default_rng(1)), np.zeros(3), np.zeros(3), MATRIX, RADIAL)[0][:, 0]
+    assert isinstance(camera, Mei) and seen.all()
+    np.testing.assert_allclose(found, there + 0.5, atol=1e-9)
+
+
+def test_a_fisheye_as_opencv_projects_it(tmp_path):
+    camera = load_camera(written(tmp_path, FISHEYE, fisheye_model=1))
+    places = points(np.random.default_rng(2))
+    there = cv2.fisheye.projectPoints(places[:, None], np.zeros(3), np.zeros(3), MATRIX, FISHEYE)[0][:, 0]
+    assert isinstance(camera, KannalaBrandt) and (camera.width, camera.height) == (640, 480)
+    np.testing.assert_allclose(camera.project(places)[0], there + 0.5, atol=1e-9)
+
+
+def test_mei_has_its_mirror(tmp_path):
+    camera = load_camera(written(tmp_path, RADIAL, xi=np.array([[1.25]])))
+    assert isinstance(camera, Mei) and camera.xi == 1.25 and camera.distortion == tuple(RADIAL)
+
+
+ROS = """image_width: 640
+image_height: 480
+camera_name: front
+camera_matrix: {rows: 3, cols: 3, data: [401.5, 0, 318.25, 0, 402.5, 239.75, 0, 0, 1]}
+distortion_model: equidistant
+distortion_coefficients:
+  rows: 1
+  cols: 4
+  data: [0.02, -0.01, 0.003, -0.0005]
+"""
+
+
+def test_ros(tmp_path):
+    path = tmp_path / "ros.yaml"
+    path.write_text(ROS)
+    assert load_camera(path) == KannalaBrandt(640, 480, 401.5, 402.5, 318.75, 240.25, tuple(FISHEYE))
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (ROS.replace("distortion_model: equidistant\n", ""), "may be those of a fisheye or of a pinhole"),
+        (ROS.replace("equidistant", "rational_polynomial"), "'rational_polynomial' is not supported"),
+        (ROS.replace("401.5, 0,", "401.5, 3,"), "camera_matrix: is no matrix"),
+        (ROS.replace("cols: 4", "cols: 5"), "has 4 numbers in 1 rows and 5 columns"),
+        (ROS.replace("[0.02, -0.01, 0.003, -0.0005]", "[a, 1, 2, 3]"), "distortion_coefficients"),
+        (ROS.replace("cols: 4", "cols: 5").replace("-0.0005]", "-0.0005, 1]"), "calibrate with k1, k2, k3, k4 alone"),
+        (ROS.replace("image_width: 640\n", ""), "key 'image_width' is missing"),
+        (ROS.replace("[0.02", "[.nan"), "data"),
+        ("%YAML:1.0\n---\na: !!opencv-matrix [1]\ndistortion_coefficients: 3\n", "is not valid YAML"),
+    ],
+)
+def test_what_is_wrong_is_said(tmp_path, text, said):
+    path = tmp_path / "wrong.yaml"
+    path.write_text(text)
+    with pytest.raises(CalibrationError) as caught:
+        load_camera(path)
+    assert said in str(caught.value) and str(path) in str(caught.value)
