@@ -1,10 +1,12 @@
 """COLMAP: some images of a model are localized against the others.
 
-Queries are no references, and their poses in the model are the truth. Lengths are those of the model.
+Queries are no references, and their poses in the model are the truth. Points that only the queries made possible are
+left out; the others, and all poses, stay as the adjustment of the whole model left them. Lengths are those of the
+model.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from functools import lru_cache
 from pathlib import Path
@@ -17,15 +19,18 @@ from spherloc.datasets.map_scene import MapScene
 from spherloc.errors import CalibrationError, InputError, shorten, show
 from spherloc.files import is_file
 from spherloc.formats.colmap_files import read_model
-from spherloc.formats.colmap_model import ColmapImage, ColmapModel
+from spherloc.formats.colmap_model import ColmapImage, ColmapModel, Points
 from spherloc.frontend.lifting import SfmLift
 from spherloc.frontend.view import View
-from spherloc.types import BoolArray, FloatArray
+from spherloc.geometry import camera_centre
+from spherloc.types import BoolArray, FloatArray, IntArray
 
 _KEPT = 64
 """Images whose observations stay in memory, those used last."""
 _LEAST_AGREEMENT = 0.9
 """Length of the mean of the cameras' +y axes: 0.9 where all tilt by 25 degrees."""
+_LEAST_ANGLE_DEG = 1.5
+"""Between the rays to a point: COLMAP's mapper removes points below it (``filter_min_tri_angle``)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +72,49 @@ def model_views(model: ColmapModel, images: Path) -> tuple[list[View], list[str]
         remarks.append(f"{some(missing, 'image')} of the model not found in {images}: left out.")
     remarks += [f"{some(names, 'image')} left out: {reason}" for reason, names in unsupported.items()]
     return views, remarks
+
+
+def without_queries(model: ColmapModel, queries: Collection[str], where: str) -> tuple[ColmapModel, list[str]]:
+    """The model without the points that it has only because of the images named ``queries``, and a remark on them.
+
+    A point that a query observes stays if the rays to it from other images are ``_LEAST_ANGLE_DEG`` apart. One that
+    only the query and one reference (or several at one place) see was intersected with the query's own ray: by its
+    construction it fits the query's true pose, so that a match with it would test nothing. For more than two rays their
+    angle is that across the box around their unit vectors, at most sqrt(3) times the largest between two.
+
+    Raises ``InputError`` if no point stays or the observations cannot be read.
+    """
+    points = model.points
+    observed = np.zeros(len(points.ids), dtype=bool)
+    for name in queries:
+        observed[_observed(model, name)] = True
+    low, high = np.full_like(points.xyz, np.inf), np.full_like(points.xyz, -np.inf)
+    others = [name for name in model.images if name not in queries]
+    for name in others:
+        places = _observed(model, name)
+        places = places[observed[places]]
+        rays = points.xyz[places] - camera_centre(model.images[name].cam_from_map)
+        rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), np.finfo(float).tiny)
+        low[places] = np.minimum(low[places], rays)
+        high[places] = np.maximum(high[places], rays)
+    apart = np.linalg.norm(high - low, axis=1) >= 2.0 * np.sin(np.radians(_LEAST_ANGLE_DEG) / 2.0)
+    stay = ~observed | (np.isfinite(low[:, 0]) & apart)
+    if stay.all():
+        return model, []
+    reason = f"without the queries, no two images see them from directions {_LEAST_ANGLE_DEG} degrees apart"
+    if others and not stay.any():
+        raise InputError(
+            f"{where}: no point of the model can be used: {reason}; name fewer queries, or add images to the model."
+        )
+    kept = Points(points.ids[stay], points.xyz[stay], points.errors_px[stay], points.track_lengths[stay])
+    gone = np.count_nonzero(~stay)
+    return replace(model, points=kept), [f"{gone:,} of {len(stay):,} points of the model left out: {reason}."]
+
+
+def _observed(model: ColmapModel, name: str) -> IntArray:
+    """Which of the model's points an image observes, as indices (K,)."""
+    places = model.point_places(model.images[name].point_ids)
+    return places[places >= 0]
 
 
 def some(names: Sequence[str], what: str) -> str:
@@ -146,11 +194,12 @@ def load(table: dict[str, Any], path: Path) -> MapScene:
     images = map_scene.folder(table, "images", path)
     model = read_model(map_scene.folder(table, "model", path))
     chosen = set(_chosen(table["queries"], list(model.images), where))
+    model, left_out = without_queries(model, chosen, where)
     views, remarks = model_views(model, images)
     references = tuple(view for view in views if view.name not in chosen)
     down, assumed = gravity_of_map(gravity, references, where)
     queries = (view for view in views if view.name in chosen)
-    return settings.scene(path, queries, references, down, (*remarks, *assumed))
+    return settings.scene(path, queries, references, down, (*remarks, *left_out, *assumed))
 
 
 def _chosen(value: Any, names: list[str], where: str) -> list[str]:

@@ -19,7 +19,7 @@ from spherloc.cameras.colmap_models import camera_from_colmap
 from spherloc.errors import CalibrationError, InputError, show
 from spherloc.geometry import pose, transform
 from spherloc.trajectory import rotation_from_wxyz
-from spherloc.types import FloatArray
+from spherloc.types import FloatArray, IntArray
 
 MODELS = (
     *(("SIMPLE_PINHOLE", 3), ("PINHOLE", 4), ("SIMPLE_RADIAL", 4), ("RADIAL", 5), ("OPENCV", 8)),
@@ -127,13 +127,19 @@ class ColmapModel:
             raise CalibrationError(camera)
         return camera
 
+    def point_places(self, ids: NDArray[np.integer]) -> IntArray:
+        """(K,) where points are in the columns of ``points``; -1 for those that the model does not have."""
+        if not len(self.points.ids):
+            return np.full(len(ids), -1)
+        place = np.minimum(np.searchsorted(self.points.ids, ids), len(self.points.ids) - 1)
+        return np.where(self.points.ids[place] == ids, place, -1)
+
     def point_xyz(self, ids: NDArray[np.integer]) -> FloatArray:
         """(K, 3) positions of points, metres; NaN for -1 and for ids that the model does not have."""
-        if not len(self.points.ids):
-            return np.full((len(ids), 3), np.nan)
-        place = np.minimum(np.searchsorted(self.points.ids, ids), len(self.points.ids) - 1)
-        known = self.points.ids[place] == ids
-        return np.where(known[:, None], self.points.xyz[place], np.nan)
+        places = self.point_places(ids)
+        xyz = np.full((len(ids), 3), np.nan)
+        xyz[places >= 0] = self.points.xyz[places[places >= 0]]
+        return xyz
 
 
 def _converted(name: str, width: int, height: int, params: tuple[float, ...], where: str) -> Camera | str:

@@ -1,6 +1,8 @@
-"""Scenes of kind "colmap": which images are queries, what is left out, where down is; and the real panorama pair."""
+"""Scenes of kind "colmap": which images are queries, what is left out, where down is; and a real pair."""
 
+import re
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +11,7 @@ from colmap_samples import EQUIRECTANGULAR, NO_POINT, OPENCV_FISHEYE, binary_fil
 
 from spherloc.datasets import load_scene
 from spherloc.errors import InputError
-from spherloc.estimators.base import estimate
-from spherloc.metrics import rotation_error_deg, translation_error_m
+from spherloc.geometry import camera_centre
 from tests.needs import real_data
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -135,24 +136,75 @@ def test_wrong_keys_and_values(queries, extra, words, rng, tmp_path):
     assert str(path) in str(caught.value)
 
 
-@pytest.fixture(scope="module")
-def stella(tmp_path_factory):
-    """The real pair: image 002 against the model with image 001 as its only reference."""
+def seen_by_some(sample, rng):
+    """The sample with each keypoint's point taken away with a probability of one half."""
+    images = [
+        (*image[:4], [(*pixel, p if rng.random() < 0.5 else NO_POINT) for *pixel, p in image[4]])
+        for image in sample.images
+    ]
+    sees = {image[0]: {item[2] for item in image[4]} for image in images}
+    points = [(*point[:3], [item for item in point[3] if point[0] in sees[item[0]]]) for point in sample.points]
+    return replace(sample, images=images, points=points)
+
+
+def widest_deg(sample, point, names):
+    """Largest angle between two rays to a point from the images of these names that observe it; 0 without two."""
+    seeing = [image for image in sample.images if image[3] in names and any(p == point[0] for *_, p in image[4])]
+    rays = [point[1] - camera_centre(image[1]) for image in seeing]
+    angles = [np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b) for a, b in combinations(rays, 2)]
+    return np.degrees(max(angles, default=0.0))
+
+
+def lifted(view, sample):
+    """Ids of the points that the keypoints of a reference lift to."""
+    points, known = view.lift(np.array([item[:2] for item in sample.image(view.name)[4]]))
+    ids = {tuple(point[1]): point[0] for point in sample.points}
+    return {ids[tuple(point)] for point in points[known]}
+
+
+def test_points_that_only_queries_made_possible_are_left_out(rng, tmp_path):
+    """Against all pairs of rays; what no query sees stays, also at an angle of nothing."""
+    sample = seen_by_some(sample_model(rng, images=5, points=80), rng)
+    distances = rng.uniform(200, 300, len(sample.points))  # rays to half of the points are 0 to 2 degrees apart
+    points = [
+        (*p[:1], p[1] / np.linalg.norm(p[1]) * (distance if at % 2 else 5.0), *p[2:])
+        for at, (p, distance) in enumerate(zip(sample.points, distances, strict=True))
+    ]
+    sample = replace(sample, points=points)
+    queries = ["seq/001.jpg", "seq/003.jpg"]
+    scene = load_scene(scene_file(make_tree(tmp_path, sample), str(queries).replace("'", '"')))
+    names = {view.name for view in scene.references}
+    observed = {item[2] for name in queries for item in sample.image(name)[4]} - {NO_POINT}
+    angles = {point[0]: widest_deg(sample, point, names) for point in points if point[0] in observed}
+    gone = observed - set().union(*(lifted(view, sample) for view in scene.references))
+    alone = {point for point, angle in angles.items() if angle < 1.5 / np.sqrt(3.0)}
+    assert len(alone) > 10 and alone <= gone <= {point for point, angle in angles.items() if angle < 1.5}
+    assert len(observed - gone) > 10
+    for view in scene.references:
+        assert lifted(view, sample) == {item[2] for item in sample.image(view.name)[4]} - {NO_POINT} - gone
+    left_out = int(re.search(r"(\d+) of 80 points of the model left out: ", " ".join(scene.remarks))[1])
+    assert left_out == len(gone)
+
+
+def test_two_references_at_one_place_are_one(rng, tmp_path):
+    """As the virtual faces of a panorama are: both rays are the same, and the query alone gave the range."""
+    sample = sample_model(rng, images=4)
+    first, second, third, query = sample.images
+    turned = np.diag([-1.0, 1.0, -1.0]) @ first[1]
+    few = [(*pixel, p if p < 110 else NO_POINT) for *pixel, p in third[4]]
+    points = [(*p[:3], [item for item in p[3] if item[0] != third[0] or p[0] < 110]) for p in sample.points]
+    images = [first, (second[0], turned, *second[2:]), (*third[:4], few), query]
+    sample = replace(sample, images=images, points=points)
+    scene = load_scene(scene_file(make_tree(tmp_path, sample), '["seq/003.jpg"]', "[gravity]\nmap = [0, 1, 0]\n"))
+    assert lifted(scene.references[0], sample) == set(range(100, 110))
+
+
+def test_a_real_model_of_two_images_has_no_point_without_one_of_them(tmp_path):
     folder = real_data("stella_equirect_pair")
-    path = tmp_path_factory.mktemp("stella") / "pair.toml"
+    path = tmp_path / "pair.toml"
     path.write_text(
         f'kind = "colmap"\nname = "pair"\nmodel = "{folder / "colmap_equirect" / "0"}"\n'
         f'images = "{folder}"\nqueries = ["equirectangular_image_002.jpg"]\n'
     )
-    scene = load_scene(path)
-    assert [view.name for view in scene.references] == ["equirectangular_image_001.jpg"]
-    return scene.problem()
-
-
-@pytest.mark.parametrize("estimator", ["mc-exact", "ransac-2p"])
-def test_the_real_panorama_is_localized_by_own_matches(stella, estimator):
-    """The pair's relative position has no unit: it is scaled so that the cameras are 9 apart."""
-    assert len(stella) > 150 and stella.truth_inliers.mean() > 0.8
-    trace = estimate(stella, estimator)
-    assert rotation_error_deg(stella.truth_cam_from_map, trace.cam_from_map) < 0.5
-    assert translation_error_m(stella.truth_cam_from_map, trace.cam_from_map) < 0.1
+    with pytest.raises(InputError, match=r"pair.toml: no point of the model can be used: .*name fewer queries, or"):
+        load_scene(path)
