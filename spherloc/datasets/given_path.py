@@ -61,7 +61,7 @@ def _file(path: Path) -> tuple[str, str]:
     if suffix in IMAGES:
         return "an image", f"make a map of all images of its folder with: spherloc map {folder}"
     if suffix in VIDEOS:
-        return "a video", f"make a map of its frames with: spherloc map {folder} --video {_quoted(path)}"
+        return "a video", f"make a map of its frames with: spherloc map frames --video {_quoted(path)}"
     what, advice = _FILES.get(suffix, ("no scene file", ""))
     return what, f"{advice}; else {SCENE}" if advice else SCENE
 
@@ -91,7 +91,7 @@ def _folder(path: Path) -> tuple[str, str]:
     videos = [name for name in names if Path(name).suffix.lower() in VIDEOS]
     if videos:
         video = _quoted(path / videos[0])
-        advice = f"make a map of the frames of one with: spherloc map {_quoted(path)} --video {video}"
+        advice = f"make a map of the frames of one with: spherloc map frames --video {video}"
         return _counted(len(videos), "video"), advice
     return ("an empty folder" if not names else "a folder without images or scene files"), SCENE
 
