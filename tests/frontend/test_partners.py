@@ -74,7 +74,7 @@ def test_posed_images_without_depth_are_a_map(tmp_path):
     assert metrics.rotation_error_deg is not None and metrics.translation_error_m is not None
     assert metrics.rotation_error_deg < 0.3 and metrics.translation_error_m < 0.03
 
-    scene.write_text("\n".join(text[:3]))
+    scene.write_text("\n".join(text[:4]))
     with pytest.raises(InputError, match="the only reference has no depth"):
         load_scene(scene)
     scene.write_text("\n".join([*text, 'depth = "2.png"']))
