@@ -224,6 +224,9 @@ def load(table: dict[str, Any], path: Path) -> MapScene:
     where = str(path)
     scene_file.check_keys(table, map_scene.REQUIRED | {"images"}, map_scene.OPTIONAL | _OPTIONAL, where)
     shared_gravity, gravity = split_gravity(table, where)
+    other = next((key for key in ("query", "imu") if "camera" in gravity and key in shared_gravity), None)
+    if other is not None:
+        raise InputError(f"{where} [gravity]: has both 'camera' and '{other}'; keep one.")
     bound_deg = 0.0 if "camera" in gravity else GRAVITY_BOUND_DEG
     settings = map_scene.read_settings(table | {"gravity": shared_gravity}, where, bound_deg)
     camera = read_camera(table, path, where)

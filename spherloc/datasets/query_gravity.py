@@ -121,6 +121,8 @@ class GravitySettings:
     def _with_gravity(self, view: View, gravity_map: FloatArray) -> View:
         if view.name in self.stated:
             return replace(view, gravity=self.stated[view.name])
+        if self.query != "reference" or self.imu is not None:
+            view = replace(view, gravity=None)  # what the scene asks for replaces what the loader has
         if self.query == "level":
             return replace(view, gravity=Gravity(DOWN, "the image's own up"))
         if self.query == "truth" and view.cam_from_map is not None:

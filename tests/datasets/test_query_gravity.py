@@ -104,6 +104,24 @@ def test_a_log_of_an_imu_gives_queries_gravity_by_the_times_in_their_names(tmp_p
             read_gravity(table, str(tmp_path / "s.toml"), 3.0)
 
 
+def test_what_the_scene_asks_for_replaces_what_the_loader_has(tmp_path, problem):
+    own = Gravity(DOWN, "the IMU")
+    view = View("a.jpg", problem.camera, tmp_path / "a.jpg", problem.truth_cam_from_map, own)
+    written(tmp_path, "a.jpg 1 0 0\n")
+    for table, source in (
+        ({}, "the IMU"),
+        ({"query": "lines"}, None),
+        ({"query": "level"}, "the image's own up"),
+        ({"query": "truth"}, "the true pose"),
+        ({"query": "lines", "file": HERE}, "the gravity file"),
+    ):
+        (found,), _ = read_gravity(table, str(tmp_path / "s.toml"), 3.0).of_queries([view], problem.gravity_map)
+        assert (None if found.gravity is None else found.gravity.source) == source
+    both = CAMERA + POSED + '[gravity]\nmap = [0, 1, 0]\ncamera = [0, 1, 0]\nquery = "lines"\n'
+    with pytest.raises(InputError, match="has both 'camera' and 'query'; keep one"):
+        load_scene(make_tree(tmp_path, both))
+
+
 def small_scene(tmp_path, problem, view, measured=None, bound_rad=0.05):
     """A scene of one query, whose matches are those of a simulated problem."""
     reference = View("reference", problem.camera, tmp_path / "r.png", problem.truth_cam_from_map)

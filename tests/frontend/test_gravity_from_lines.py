@@ -6,7 +6,9 @@ import pytest
 
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.cameras.kannala_brandt import KannalaBrandt
+from spherloc.datasets.colmap import model_views
 from spherloc.errors import InputError
+from spherloc.formats.colmap_files import read_model
 from spherloc.frontend.gravity_from_lines import Lines, gravity_from_lines, image_lines, vertical
 from spherloc.frontend.view import View
 from spherloc.geometry import DOWN, pose, so3_exp
@@ -96,7 +98,8 @@ def edges(random, middles, directions, noise_rad):
 
 def joined(*parts):
     names = ("normals", "middles", "lengths_rad")
-    return Lines(*(np.concatenate([getattr(part, name) for part in parts]) for name in names), parts[0].end_sd_rad)
+    normals, middles, lengths = (np.concatenate([getattr(part, name) for part in parts]) for name in names)
+    return Lines(normals, middles, lengths, parts[0].end_sd_rad)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -141,6 +144,14 @@ def test_edges_at_random_are_no_evidence():
         except InputError:
             pass
     assert passed <= 2
+
+
+def test_two_real_panoramas_agree_by_the_poses_of_their_model():
+    folder = real_data("stella_equirect_pair")
+    model = read_model(folder / "colmap_equirect" / "0")
+    views = model_views(model, folder)[0]
+    one, other = (np.asarray(view.cam_from_map)[:, :3].T @ gravity_from_lines(view).down for view in views)
+    assert angle_deg(one, other) < 0.1
 
 
 @pytest.mark.parametrize(("name", "most_deg"), [("hall", 0.3), ("room", 0.3), ("stairs", 0.5)])
