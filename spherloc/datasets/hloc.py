@@ -222,7 +222,7 @@ def load(table: dict[str, Any], path: Path) -> MapScene:
     pairs, unpaired = _pairs(table, path, queries, references)
     said = (*remarks, *assumed, *skipped, *unknown, *missing, *unpaired)
     matcher = _matcher(table, path, model, tuple(references), pairs)
-    return settings.scene(path, queries, references, down, said, matcher=matcher)
+    return settings.scene(path, queries, references, down, said, matcher=matcher, assumed_down=bool(assumed))
 
 
 def _check_combination(table: Mapping[str, Any], where: str) -> None:

@@ -235,7 +235,7 @@ def load(table: dict[str, Any], path: Path) -> MapScene:
     queries, remarks = _queries(table, camera, gravity, path)
     references, more = _references(table, camera, settings.frontend, path)
     down, assumed = gravity_of_map(gravity, references, where)
-    return settings.scene(path, queries, references, down, (*remarks, *more, *assumed))
+    return settings.scene(path, queries, references, down, (*remarks, *more, *assumed), assumed_down=bool(assumed))
 
 
 def _references(

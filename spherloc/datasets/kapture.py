@@ -70,7 +70,9 @@ def load(table: dict[str, Any], path: Path) -> MapScene:
     references = _references(kapture, root, others, frontend_options(settings.frontend, where, path.parent))
     down, assumed = gravity_of_map(gravity, references, where)
     views = (_view(kapture, root, record) for record in queries)
-    return settings.scene(path, views, references, down, (*kapture.remarks, *remarks, *left_out, *assumed))
+    return settings.scene(
+        path, views, references, down, (*kapture.remarks, *remarks, *left_out, *assumed), assumed_down=bool(assumed)
+    )
 
 
 def _file(root: Path, record: Record) -> Path:

@@ -69,7 +69,7 @@ def load(table: dict[str, Any], path: Path) -> MapScene:
     mapped, missing = _views(root, {"mapping": ["mapping"]} | table, "mapping", "reference_step", where)
     references = with_triangulation(mapped, frontend_options(settings.frontend, where, path.parent))
     down, assumed = gravity_of_map(gravity, references, where)
-    return settings.scene(path, queries, references, down, (*skipped, *missing, *assumed))
+    return settings.scene(path, queries, references, down, (*skipped, *missing, *assumed), assumed_down=bool(assumed))
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from spherloc.datasets import scene_file
-from spherloc.datasets.query_gravity import GravitySettings, MeasuredGravity, read_gravity
+from spherloc.datasets.query_gravity import BOUND_SD, GravitySettings, MeasuredGravity, read_gravity
 from spherloc.datasets.registration import Registration
 from spherloc.errors import InputError, show
 from spherloc.files import is_folder
@@ -23,6 +23,11 @@ from spherloc.types import FloatArray
 
 TRUE_INLIER_PX = 8.0
 """Matches this close to their true pixel count as true inliers (Sec. VI-B.1)."""
+
+ASSUMED_DOWN_DEG = 5.0
+"""Bound on the error of a map's gravity that is taken from how its cameras were held."""
+
+MOST_BOUND_RAD = float(np.radians(85.0))
 
 Thresholds = tuple[tuple[float, float], ...]
 """Limits (degrees, metres) within which a localization counts as a success, strictest first."""
@@ -50,6 +55,8 @@ class MapScene:
     """Bound on the error of a query's known gravity, whether measured or taken from its reference."""
     gravity_sd_rad: float | None = None
     """Standard deviation of each of its two tilts; None takes a third of the bound."""
+    gravity_map_bound_rad: float = 0.0
+    """Bound on the error of ``gravity_map``, which adds to that of a query's gravity unless it follows from the map."""
     measured_gravity: MeasuredGravity | None = None
     """Measures it in a query whose ``gravity`` is None; None takes that of the query's most similar reference."""
     bound_px: float | None = None
@@ -122,6 +129,7 @@ class MapScene:
         roll and pitch are about those of the vehicle that mapped the place). Raises ``ProblemError`` for too few.
         """
         gravity, said = self._gravity(view, matches)
+        bound_rad, sd_rad = self._gravity_error(gravity)
         problem = Problem(
             name=f"{self.name}, {view.name}",
             camera=view.camera,
@@ -129,8 +137,8 @@ class MapScene:
             points=matches.points,
             gravity_camera=gravity.down,
             gravity_map=self.gravity_map,
-            gravity_bound_rad=self.gravity_bound_rad if gravity.bound_rad is None else gravity.bound_rad,
-            gravity_sd_rad=self.gravity_sd_rad if gravity.bound_rad is None else gravity.sd_rad,
+            gravity_bound_rad=bound_rad,
+            gravity_sd_rad=sd_rad,
             gravity_source=gravity.source,
             bound_px=self.bound_px,
             truth_cam_from_map=view.cam_from_map,
@@ -167,10 +175,20 @@ class MapScene:
             )
         return nearby, said
 
+    def _gravity_error(self, gravity: Gravity) -> tuple[float, float | None]:
+        """Bound and standard deviation between the gravities of a query and of the map."""
+        own = (self.gravity_bound_rad, self.gravity_sd_rad)
+        bound_rad, sd_rad = own if gravity.bound_rad is None else (gravity.bound_rad, gravity.sd_rad)
+        more_rad = 0.0 if gravity.by_map else self.gravity_map_bound_rad
+        if not more_rad:
+            return bound_rad, sd_rad
+        known_rad = bound_rad / BOUND_SD if sd_rad is None else sd_rad
+        return min(bound_rad + more_rad, MOST_BOUND_RAD), float(np.hypot(known_rad, more_rad / BOUND_SD))
+
     def _like(self, reference: View) -> Gravity:
         """Of a query that stands as a reference does."""
         down = np.asarray(reference.cam_from_map)[:, :3] @ self.gravity_map
-        return Gravity(down / np.linalg.norm(down), "its most similar reference")
+        return Gravity(down / np.linalg.norm(down), "its most similar reference", by_map=True)
 
 
 def _contradiction(stated: Gravity, nearby: Gravity | None) -> tuple[str, ...]:
@@ -206,10 +224,11 @@ class MapSettings:
         references: Iterable[View],
         gravity_map: FloatArray,
         remarks: Iterable[str] = (),
+        assumed_down: bool = False,
         **others: Any,
     ) -> MapScene:
         """The scene of these images; ``path`` is its file, ``gravity_map`` the unit vector (3,) that points down in
-        the map, and ``others`` are further fields of ``MapScene``.
+        the map, which may be ``assumed_down`` without being known, and ``others`` are further fields of ``MapScene``.
 
         Without a ``matcher`` among them, the front end that [frontend] describes is taken. Raises ``InputError`` for a
         wrong [frontend] and if there is no query or no reference.
@@ -227,6 +246,7 @@ class MapSettings:
             gravity_map=gravity_map,
             gravity_bound_rad=gravity.bound_rad,
             gravity_sd_rad=gravity.sd_rad,
+            gravity_map_bound_rad=float(np.radians(ASSUMED_DOWN_DEG)) if assumed_down else gravity.map_bound_rad,
             measured_gravity=gravity.measured,
             bound_px=self.bound_px,
             thresholds=self.thresholds,

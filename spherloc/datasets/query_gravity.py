@@ -27,7 +27,7 @@ MeasuredGravity = Callable[[View, FloatArray | None], Gravity]
 
 SOURCES = ("reference", "lines", "tags", "level", "truth")
 """Values of ``[gravity] query``."""
-_KEYS = {"bound_deg", "sd_deg", "file", "query"}
+_KEYS = {"bound_deg", "sd_deg", "file", "query", "map_bound_deg"}
 BOUND_SD = 3.0
 """A bound in standard deviations."""
 _MOST_SD_DEG = 25.0
@@ -79,6 +79,8 @@ class GravitySettings:
     """Its rows by the names of the images."""
     bound_is_stated: bool
     """Whether the scene file states ``bound_rad``, which otherwise is the loader's default."""
+    map_bound_rad: float = 0.0
+    """Bound on the error of the map's own gravity."""
     imu: ImuLog | None = None
     """Of a unit that moved with the camera."""
 
@@ -129,7 +131,7 @@ class GravitySettings:
             down = view.cam_from_map[:, :3] @ gravity_map
             # The loader's default is for a gravity that is taken from another image.
             exact = None if self.bound_is_stated else 0.0
-            return replace(view, gravity=Gravity(down / np.linalg.norm(down), "the true pose", exact))
+            return replace(view, gravity=Gravity(down / np.linalg.norm(down), "the true pose", exact, by_map=True))
         return view
 
     @property
@@ -156,7 +158,9 @@ def read_gravity(table: Mapping[str, Any], where: str, bound_deg: float) -> Grav
     if "imu" in table:
         log = Path(where).parent / scene_file.text(table, "imu", section)
         imu = ImuLog(log, read_imu(log), _rotation(table["camera_from_imu"], section))
-    return GravitySettings(bound_rad, sd_rad, query, file, stated, "bound_deg" in table, imu)
+    map_bound_deg = scene_file.number({"map_bound_deg": 0.0} | dict(table), "map_bound_deg", section, 0.0, 45.0)
+    map_bound_rad = float(np.radians(map_bound_deg))
+    return GravitySettings(bound_rad, sd_rad, query, file, stated, "bound_deg" in table, map_bound_rad, imu)
 
 
 def _rotation(value: Any, section: str) -> FloatArray:

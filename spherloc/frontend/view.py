@@ -41,6 +41,8 @@ class Gravity:
     """Bound on the angular error of ``down``; None takes the scene's."""
     sd_rad: float | None = None
     """Standard deviation of each of its two tilts; None takes a third of the bound."""
+    by_map: bool = False
+    """Whether it follows from a pose and the map's gravity, whose error is then no error here."""
 
 
 @dataclass(frozen=True, eq=False)

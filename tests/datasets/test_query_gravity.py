@@ -162,6 +162,31 @@ def test_a_problem_has_the_bound_and_the_source_of_its_own_query(tmp_path, probl
         assert row_of_json(json_line(row), "here").gravity_source == expected[2]
 
 
+def test_the_error_of_the_map_adds_to_a_gravity_that_does_not_follow_from_it(tmp_path, problem):
+    view = View("query", problem.camera, tmp_path / "q.png")
+    own = Gravity(problem.gravity_camera, "the IMU", 0.03, 0.01)
+    for gravity, bound_rad, sd_rad in (
+        (own, 0.09, np.hypot(0.01, 0.02)),
+        (replace(own, by_map=True), 0.03, 0.01),
+        (None, 0.05, None),
+    ):
+        scene = replace(small_scene(tmp_path, problem, replace(view, gravity=gravity)), gravity_map_bound_rad=0.06)
+        found = scene.problem()
+        assert found.gravity_bound_rad == pytest.approx(bound_rad)
+        assert found.gravity_sd_rad == (None if sd_rad is None else pytest.approx(sd_rad))
+
+
+def test_down_that_is_assumed_in_a_map_is_not_taken_for_certain(tmp_path):
+    """The mean of the cameras' axes, where the scene does not say; a map that says has no error, or what it says."""
+    for text, bound_deg in (
+        ("", 5.0),
+        ("[gravity]\nmap = [0, 1, 0]\n", 0.0),
+        ("[gravity]\nmap = [0, 1, 0]\nmap_bound_deg = 2\n", 2.0),
+    ):
+        scene = load_scene(make_tree(tmp_path, CAMERA + POSED + text))
+        assert isinstance(scene, MapScene) and scene.gravity_map_bound_rad == pytest.approx(np.radians(bound_deg))
+
+
 def test_what_cannot_be_measured_comes_from_the_reference_and_is_said(tmp_path, problem):
     def refused(view, near):
         assert near is not None
