@@ -103,4 +103,10 @@ def _summary(made: Map, found: Photographs) -> list[str]:
     ]
     if missing:
         lines.append(f"left out      {', '.join(missing[:5])}{', …' if len(missing) > 5 else ''}: see the report")
+    if made.made.contradictions:
+        first, second = made.made.contradictions[0]
+        lines.append(
+            f"in doubt      {len(made.made.contradictions)} pairs of images lie side by side and hardly match (such as "
+            f"{first}, {second}): a wall between them, or places that look alike"
+        )
     return lines

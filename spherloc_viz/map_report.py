@@ -53,6 +53,7 @@ def map_report(made: Map, found: Photographs) -> str:
             *(f"<tr><th>{key}</th><td>{html.escape(value)}</td></tr>" for key, value in facts.items()),
             "</table>",
             *(f'<p class="out">{html.escape(remark)}</p>' for remark in found.remarks),
+            *_doubts(made),
             "<h2>From above</h2>",
             f'<img alt="Points and cameras of the map from above" src="{_from_above(made, unit)}">',
             "<h2>Not in the map</h2>" if left else "",
@@ -62,6 +63,18 @@ def map_report(made: Map, found: Photographs) -> str:
             "</table></body></html>",
         ]
     )
+
+
+def _doubts(made: Map) -> list[str]:
+    against = made.made.contradictions
+    if not against:
+        return []
+    pairs = "; ".join(f"{first} and {second}" for first, second in against[:10])
+    return [
+        '<p class="out">These images lie side by side in the map and hardly match. There may be a wall between them; '
+        "if there is none, the map takes two places that look alike for one: "
+        f"{html.escape(pairs)}{' …' if len(against) > 10 else ''}</p>"
+    ]
 
 
 def _row(made: Map, names: list[str], index: int) -> str:

@@ -14,6 +14,7 @@ from spherloc.errors import InputError, shorten
 from spherloc.files import is_file, is_folder, names_in
 from spherloc.frontend.view import View
 from spherloc.images import grey, read_size
+from spherloc.mapping.lens import for_colmap
 from spherloc.types import ByteArray
 
 SUFFIXES = {".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"}
@@ -35,7 +36,8 @@ class Photographs:
 def photographs(folder: Path, camera: Camera | None) -> Photographs:
     """The images of a folder, all of ``camera``; without one they are taken for panoramas if they are 2 to 1.
 
-    Raises ``InputError`` if there are fewer than two of one size, or if their camera is not known.
+    Raises ``InputError`` if there are fewer than two of one size, or if their camera is not known, or is none that
+    COLMAP can have.
     """
     if not is_folder(folder):
         raise InputError(f"{folder}: is no folder; give the folder of the photographs.")
@@ -71,6 +73,9 @@ def photographs(folder: Path, camera: Camera | None) -> Photographs:
             f"{folder}: has {len(names)} photographs of {width} x {height} pixels; a map needs {LEAST_IMAGES} or more, "
             "better ten."
         )
+    camera, about_lens = for_colmap(camera)
+    if about_lens:
+        remarks.append(about_lens)
     return Photographs(tuple(View(name, camera, folder / name) for name in sorted(names)), tuple(remarks))
 
 

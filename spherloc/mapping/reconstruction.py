@@ -3,12 +3,17 @@
 Panoramas stay panoramas: COLMAP's camera EQUIRECTANGULAR. Between two of them a match must fit an essential matrix and
 not only a homography: a full sphere sees more than one plane, and what fits one plane alone is a facade, a poster or a
 floor that looks the same elsewhere.
+
+Places that look alike (two hotel rooms, a row of houses) give matches that fit all the same. A map that takes them for
+one place puts photographs side by side that have hardly a match. So a second map is made of the strong pairs alone, and
+the one that explains more images, less those contradictions, is taken.
 """
 
 import hashlib
 import json
 import os
-from collections.abc import Callable, Iterator, Sequence
+import shutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from itertools import combinations
@@ -28,6 +33,7 @@ from spherloc.frontend import retrieval
 from spherloc.frontend.features import VERSION, FeatureOptions, Features, extract
 from spherloc.frontend.matching import match
 from spherloc.frontend.view import View
+from spherloc.geometry import camera_centre
 from spherloc.registry import require
 from spherloc.types import BoolArray, FloatArray
 
@@ -44,6 +50,14 @@ MOST_EXHAUSTIVE = 50
 NEIGHBOURS, ALIKE = 5, 15
 WIDEST_RAD = np.radians(85.0)
 """Features farther from the optical axis are left out: COLMAP's fisheyes end at 90 degrees."""
+STRONG = 0.3
+"""A strong pair has this share of the matches of the best pair of either image."""
+NEARBY = 2
+"""Images next to one in the map, that should match it."""
+LEAST_SUPPORT = 0.15
+"""Share of the matches of the best pair of either image that two nearby images have; with less they contradict."""
+COST_OF_CONTRADICTION = 4.0
+"""Share of the images that a map is worth less for each share of contradictions."""
 _TRIES = (
     {"init_min_num_inliers": 50, "init_min_tri_angle": 4.0},
     {"init_min_num_inliers": 25, "init_min_tri_angle": 2.0},
@@ -64,6 +78,8 @@ class Reconstruction:
     """(V, V) matches of each pair of images after the two-view check."""
     other_groups: tuple[tuple[str, ...], ...]
     """Names of images that fit together, but could not be joined with the rest."""
+    contradictions: tuple[tuple[str, str], ...]
+    """Names of images that the model puts side by side although they hardly match."""
 
     def points(self) -> FloatArray:
         """(N, 3) in the frame that the model has now."""
@@ -77,7 +93,7 @@ def reconstruct(views: Sequence[View], folder: Path, tell: Tell) -> Reconstructi
     together.
     """
     pycolmap = require("pycolmap", "colmap", "making a map")
-    pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
+    pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)  # what fails is said here
     camera = views[0].camera
     features = []
     for view in views:
@@ -91,7 +107,7 @@ def reconstruct(views: Sequence[View], folder: Path, tell: Tell) -> Reconstructi
         raise InputError(f"{path}: cannot be written ({reason(error)}); give another --output.") from None
     try:
         ids = _described(pycolmap, database, views, features, usable)
-        counts = _matched(pycolmap, database, ids, features, usable, tell)
+        counts = _matched(pycolmap, database, ids, camera, features, usable, tell)
     finally:
         database.close()
     if counts.max(initial=0) < LEAST_MATCHES:
@@ -100,17 +116,68 @@ def reconstruct(views: Sequence[View], folder: Path, tell: Tell) -> Reconstructi
             f"{counts.max(initial=0)} matches that fit together, of {LEAST_MATCHES} that are needed. Take them closer "
             "to each other, half a metre to two metres apart indoors."
         )
-    models = _models(pycolmap, path, len(views), tell)
-    if not models:
+    names = [view.name for view in views]
+    made = [_best_model(pycolmap, path, names, ids, counts, keep, tell) for keep in (0.0, STRONG)]
+    candidates = [one for one in made if one is not None]
+    if not candidates:
         raise InputError(
             f"COLMAP could not start a map from these {len(views)} photographs, although pairs of them match: they "
             "may have been taken from one place. Take them half a metre to two metres apart."
         )
-    best = models[0]
-    poses = {image.name: np.asarray(image.cam_from_world().matrix()) for image in _registered(best)}
+    return max(candidates, key=_worth)
+
+
+def _best_model(
+    pycolmap: Any,
+    path: Path,
+    names: Sequence[str],
+    ids: Sequence[int],
+    counts: NDArray[np.int64],
+    keep: float,
+    tell: Tell,
+) -> Reconstruction | None:
+    """The largest model of the pairs with at least the share ``keep`` of the matches of either image's best pair."""
+    with TemporaryDirectory() as folder:  # COLMAP takes all pairs of a database, and writes its models itself, too
+        database = Path(folder) / "matches.db"
+        shutil.copyfile(path, database)
+        best = counts.max(axis=1)
+        weak = [pair for pair in combinations(range(len(ids)), 2) if counts[pair] < keep * best[list(pair)].max()]
+        with pycolmap.Database.open(str(database)) as opened:
+            for pair in weak:
+                if counts[pair]:
+                    opened.delete_two_view_geometry(*_of(ids, pair))
+                    opened.delete_matches(*_of(ids, pair))
+        models = _models(pycolmap, database, Path(folder), len(ids), tell)
+    if not models:
+        return None
+    poses = {image.name: np.asarray(image.cam_from_world().matrix()) for image in _registered(models[0])}
     groups = [tuple(sorted(image.name for image in _registered(model))) for model in models[1:]]
-    left = tuple(tuple(name for name in group if name not in poses) for group in groups)
-    return Reconstruction(best, poses, counts, tuple(group for group in left if group))
+    left = [tuple(name for name in group if name not in poses) for group in groups]
+    against = _contradictions(poses, names, counts)
+    return Reconstruction(models[0], poses, counts, tuple(group for group in left if group), against)
+
+
+def _worth(made: Reconstruction) -> float:
+    share = len(made.contradictions) / (NEARBY * len(made.poses))
+    return len(made.poses) * (1.0 - COST_OF_CONTRADICTION * share)
+
+
+def _contradictions(
+    poses: Mapping[str, FloatArray], names: Sequence[str], counts: NDArray[np.int64]
+) -> tuple[tuple[str, str], ...]:
+    """Images and those next to them that hardly match."""
+    inside = [index for index, name in enumerate(names) if name in poses]
+    centres = np.stack([camera_centre(poses[names[index]]) for index in inside])
+    apart = np.linalg.norm(centres[:, None] - centres[None], axis=2)
+    np.fill_diagonal(apart, np.inf)
+    best = counts.max(axis=1)
+    found = []
+    for row, index in enumerate(inside):
+        for place in np.argsort(apart[row])[: min(NEARBY, len(inside) - 1)]:
+            other = inside[int(place)]
+            if counts[index, other] < LEAST_SUPPORT * min(best[index], best[other]):
+                found.append((names[index], names[other]))
+    return tuple(found)
 
 
 def _registered(model: Any) -> list[Any]:
@@ -148,6 +215,7 @@ def _described(
     name, parameters = colmap_camera(views[0].camera)
     width, height = views[0].camera.width, views[0].camera.height
     camera = pycolmap.Camera(model=name, width=width, height=height, params=parameters)
+    camera.has_prior_focal_length = True  # calibrated, that means
     camera.camera_id = database.write_camera(camera)
     rig = pycolmap.Rig()
     rig.add_ref_sensor(camera.sensor_id)
@@ -169,21 +237,26 @@ def _matched(
     pycolmap: Any,
     database: Any,
     ids: Sequence[int],
+    camera: Camera,
     features: Sequence[Features],
     usable: Sequence[NDArray[np.int64]],
     tell: Tell,
 ) -> NDArray[np.int64]:
     """Matches of each pair of images that fit a pair of poses (V, V), which are in the database then."""
-    camera = database.read_all_cameras()[0]
+    height = round(np.pi * _focal_px(camera))
+    sphere = Equirectangular(2 * height, height)
     options = pycolmap.TwoViewGeometryOptions()
     options.min_num_inliers = LEAST_MATCHES
-    options.ransac.max_error = float(np.clip(BOUND_RAD * _focal_px(features[0]), *BOUND_PX))
+    options.ransac.max_error = float(np.clip(BOUND_RAD * sphere.width / tau, *BOUND_PX))
     options.ransac.random_seed = 0
-    whole = camera.model.name == "EQUIRECTANGULAR"
-    fitting = {pycolmap.TwoViewGeometryConfiguration.CALIBRATED}
-    if not whole:
-        fitting.add(pycolmap.TwoViewGeometryConfiguration.PLANAR)
-    pixels = [found.pixels[index] for found, index in zip(features, usable, strict=True)]
+    # Whatever the lens, bearings are compared: of fisheyes COLMAP would ask for fundamental matrices, too.
+    panorama = pycolmap.Camera(
+        model="EQUIRECTANGULAR", width=sphere.width, height=sphere.height, params=[sphere.width, sphere.height]
+    )
+    pixels = [
+        sphere.project(camera.unproject(found.pixels[index])[0])[0]
+        for found, index in zip(features, usable, strict=True)
+    ]
     number_of = [np.full(len(found), -1) for found in features]
     for numbers, index in zip(number_of, usable, strict=True):
         numbers[index] = np.arange(len(index))
@@ -195,19 +268,16 @@ def _matched(
         if len(pairs) < LEAST_MATCHES:
             return pairs, None
         geometry = pycolmap.estimate_calibrated_two_view_geometry(
-            camera, pixels[first], camera, pixels[second], pairs, options
+            panorama, pixels[first], panorama, pixels[second], pairs, options
         )
-        return pairs, geometry if geometry.config in fitting else None
+        return pairs, geometry if geometry.config == pycolmap.TwoViewGeometryConfiguration.CALIBRATED else None
 
     counts = np.zeros((len(ids), len(ids)), np.int64)
     waiting, done = _pairs(features), 0
     todo = [pair for pair in waiting if not database.exists_matches(*_of(ids, pair))]
     for pair in set(waiting) - set(todo):
-        counts[pair] = (
-            database.read_two_view_geometry_num_inliers(*_of(ids, pair))
-            if (database.exists_two_view_geometry(*_of(ids, pair)))
-            else 0
-        )
+        if database.exists_two_view_geometry(*_of(ids, pair)):
+            counts[pair] = len(database.read_two_view_geometry(*_of(ids, pair)).inlier_matches)
         done += 1
     with ThreadPoolExecutor(_workers()) as pool:
         for pair, (pairs, geometry) in _as_completed(pool, verified, todo):
@@ -243,9 +313,11 @@ def _of(ids: Sequence[int], pair: tuple[int, int]) -> tuple[int, int]:
     return ids[pair[0]], ids[pair[1]]
 
 
-def _focal_px(features: Features) -> float:
-    """Pixels a radian, on average."""
-    return max(features.image_size) / (tau if features.image_size[0] == 2 * features.image_size[1] else np.pi)
+def _focal_px(camera: Camera) -> float:
+    """Pixels a radian in the middle of the image."""
+    ahead = np.array([[0.0, 0.0, 1.0], [1e-3, 0.0, 1.0]])
+    pixels, _ = camera.project(ahead)
+    return float(np.linalg.norm(pixels[1] - pixels[0]) / 1e-3)
 
 
 def _pairs(features: Sequence[Features]) -> list[tuple[int, int]]:
@@ -264,7 +336,7 @@ def _pairs(features: Sequence[Features]) -> list[tuple[int, int]]:
     return sorted(pairs)
 
 
-def _models(pycolmap: Any, database: Path, count: int, tell: Tell) -> list[Any]:
+def _models(pycolmap: Any, database: Path, folder: Path, count: int, tell: Tell) -> list[Any]:
     """COLMAP's models, the one with most images first; none if it finds no first pair."""
     options = pycolmap.IncrementalPipelineOptions()
     options.min_num_matches, options.min_model_size, options.random_seed = LEAST_MATCHES, 2, 0
@@ -277,14 +349,14 @@ def _models(pycolmap: Any, database: Path, count: int, tell: Tell) -> list[Any]:
     for first_pair in _TRIES:
         for key, value in first_pair.items():
             setattr(mapper, key, value)
-        found = _mapped(pycolmap, database, options, lambda done: tell("images mapped", done, count))
+        found = _mapped(pycolmap, database, folder, options, lambda done: tell("images mapped", done, count))
         models = sorted(found.values(), key=lambda model: -model.num_reg_images())
         if models and models[0].num_reg_images() > count / 2:
             break
     return models
 
 
-def _mapped(pycolmap: Any, database: Path, options: Any, tell: Callable[[int], None]) -> dict[int, Any]:
+def _mapped(pycolmap: Any, database: Path, folder: Path, options: Any, tell: Callable[[int], None]) -> dict[int, Any]:
     """COLMAP's mapper, in a thread so that Ctrl-C ends it."""
     stop, done = pycolmap.CancellationToken(), 0
 
@@ -293,13 +365,12 @@ def _mapped(pycolmap: Any, database: Path, options: Any, tell: Callable[[int], N
         done += 1
         tell(done)
 
-    # COLMAP writes its models itself, too.
-    with TemporaryDirectory() as folder, ThreadPoolExecutor(1) as pool:
+    with ThreadPoolExecutor(1) as pool:
         job = pool.submit(
             pycolmap.incremental_mapping,
             str(database),
-            folder,
-            folder,
+            str(folder),
+            str(folder),
             options,
             next_image_callback=another,
             cancellation_token=stop,

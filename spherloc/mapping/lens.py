@@ -1,0 +1,69 @@
+"""A lens that COLMAP has no model of, as a Kannala-Brandt camera."""
+
+from math import radians
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from spherloc.cameras.base import Camera
+from spherloc.cameras.colmap_models import colmap_camera
+from spherloc.cameras.kannala_brandt import KannalaBrandt
+from spherloc.errors import CalibrationError
+from spherloc.types import FloatArray
+
+MOST_OFF_PX = 0.5
+"""Largest distance between a pixel of the lens and of its Kannala-Brandt form."""
+WIDEST_RAD = radians(85.0)
+"""Directions farther from the optical axis do not count: COLMAP's fisheyes end at 90 degrees."""
+_GRID = 40
+
+
+def for_colmap(camera: Camera) -> tuple[Camera, str]:
+    """The camera itself if COLMAP has its model, else one with the same pixels to half a pixel, and a remark.
+
+    Raises ``CalibrationError`` if there is none.
+    """
+    try:
+        colmap_camera(camera)
+    except CalibrationError:
+        return _fitted(camera)
+    return camera, ""
+
+
+def _fitted(camera: Camera) -> tuple[Camera, str]:
+    u, v = np.meshgrid(*(np.linspace(0.5, size - 0.5, _GRID) for size in (camera.width, camera.height)))
+    pixels = np.column_stack([u.ravel(), v.ravel()])
+    bearings, seen = camera.unproject(pixels)
+    seen &= bearings[:, 2] > np.cos(WIDEST_RAD)
+    pixels, bearings = pixels[seen], bearings[seen]
+
+    def off(values: FloatArray) -> FloatArray:
+        return (_projected(values, bearings) - pixels).ravel()
+
+    half = np.array([camera.width, camera.height]) / 2
+    per_rad = np.median(np.linalg.norm(pixels - half, axis=1) / np.maximum(_angle(bearings), 1e-3))
+    found = least_squares(off, [per_rad, per_rad, *half, 0, 0, 0, 0], x_scale=[100, 100, 10, 10, 0.1, 0.1, 0.1, 0.1])
+    worst = float(np.linalg.norm(off(found.x).reshape(-1, 2), axis=1).max())
+    if worst > MOST_OFF_PX:
+        raise CalibrationError(
+            f"COLMAP has no camera model {camera.model}, and the nearest Kannala-Brandt lens is {worst:.1f} px off; "
+            "give a calibration as kannala_brandt, fisheye624 or eucm."
+        )
+    fx, fy, cx, cy, *distortion = (float(value) for value in found.x)
+    k1, k2, k3, k4 = distortion
+    fitted = KannalaBrandt(camera.width, camera.height, fx, fy, cx, cy, (k1, k2, k3, k4))
+    return fitted, f"The lens ({camera.model}) is written as Kannala-Brandt for COLMAP, {worst:.2f} px off at most."
+
+
+def _angle(bearings: FloatArray) -> FloatArray:
+    """(N,) to the optical axis, rad."""
+    return np.arctan2(np.hypot(bearings[:, 0], bearings[:, 1]), bearings[:, 2])
+
+
+def _projected(values: FloatArray, bearings: FloatArray) -> FloatArray:
+    """Pixels (N, 2) of bearings (N, 3) by fx, fy, cx, cy, k1, k2, k3, k4 (Eq. 4)."""
+    theta = _angle(bearings)
+    curve = theta * (1.0 + sum(k * theta ** (2 * n) for n, k in enumerate(values[4:], start=1)))
+    around = np.hypot(bearings[:, 0], bearings[:, 1])
+    scale = curve / np.where(around > 0.0, around, 1.0)
+    return values[:2] * bearings[:, :2] * scale[:, None] + values[2:4]
