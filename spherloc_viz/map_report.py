@@ -94,9 +94,11 @@ def why_not(made: Map, names: list[str], index: int) -> str:
     inside = np.array([name in made.written.poses for name in names])
     group = next((group for group in made.made.other_groups if names[index] in group), None)
     if group is not None:
-        others = len(group) - 1
+        return f"It is one of {len(group)} images that fit together, but not with the map: take some in between."
+    if names[index] in made.level.leaning:
         return (
-            f"It fits together with {others} other images that could not be joined with the map: take some in between."
+            f"COLMAP placed it so that it leans {made.level.leaning[names[index]]:.1f}° against the map, at a place "
+            "that looks like the right one: take more images around it."
         )
     if counts.max() < LEAST_MATCHES:
         return f"No other image has {LEAST_MATCHES} matches with it that fit together: take images closer to it."

@@ -55,6 +55,7 @@ def make_map(
         raise InputError(f"{folder}: cannot be made ({error.strerror}); give another --output.") from None
     made = reconstruct(views, folder, tell)
     level = level_of(made.poses, views)
+    made = made.without(level.leaning)
     if measured.distance is not None:
         scale = scale_by_distance(made.poses, *measured.distance)
     elif measured.camera_height_m is not None:

@@ -13,9 +13,9 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from math import tau
 from pathlib import Path
@@ -80,6 +80,16 @@ class Reconstruction:
     """Names of images that fit together, but could not be joined with the rest."""
     contradictions: tuple[tuple[str, str], ...]
     """Names of images that the model puts side by side although they hardly match."""
+
+    def without(self, names: Collection[str]) -> "Reconstruction":
+        """The same with fewer images; points that fewer than two others see are gone."""
+        for number in list(self.model.reg_image_ids()):
+            image = self.model.image(number)
+            if image.name in names:
+                self.model.deregister_frame(image.frame_id)
+        poses = {name: pose for name, pose in self.poses.items() if name not in names}
+        against = tuple(pair for pair in self.contradictions if not set(pair) & set(names))
+        return replace(self, poses=poses, contradictions=against)
 
     def points(self) -> FloatArray:
         """(N, 3) in the frame that the model has now."""

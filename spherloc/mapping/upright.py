@@ -15,6 +15,9 @@ from spherloc.types import FloatArray
 LEAST_LINES = 3
 """Images whose lines must tell down; of fewer, all images count as held upright."""
 MOST_SPREAD_DEG = 25.0
+LEAST_LIMIT_DEG, LIMIT_SPREADS = 2.0, 5.0
+"""An image that leans against the map by more than the first, and by more than so many times the median of all, was
+placed wrongly: at a place that looks like the right one."""
 GROUND_SHARE = 0.1
 """Of the points below the cameras, the part that lies deeper than the ground: reflections, wrong points."""
 LEAST_GROUND_POINTS = 30
@@ -30,6 +33,8 @@ class Level:
     """What measured it, in words."""
     spread_deg: float
     """Median angle between it and what single images say."""
+    leaning: dict[str, float]
+    """Images that lean against it, by name, degrees: COLMAP placed them wrongly."""
 
 
 @dataclass(frozen=True)
@@ -46,27 +51,31 @@ def level_of(poses: Mapping[str, FloatArray], views: Sequence[View]) -> Level:
 
     ``poses`` (3, 4) are those of the registered ones, by name. Raises ``InputError`` if the images do not agree.
     """
-    measured, axes = [], []
+    measured: dict[str, FloatArray] = {}
+    axes: dict[str, FloatArray] = {}
     for view in views:
         if view.name not in poses:
             continue
         rotation = poses[view.name][:, :3]
-        axes.append(rotation.T @ DOWN)
+        axes[view.name] = rotation.T @ DOWN
         try:
-            measured.append(rotation.T @ gravity_from_lines(view).down)
+            measured[view.name] = rotation.T @ gravity_from_lines(view).down
         except InputError:  # too few lines: the others tell
             continue
     by_lines = len(measured) >= LEAST_LINES
-    directions = np.stack(measured if by_lines else axes)
-    down = _middle(directions)
-    spread_deg = float(np.median(np.degrees(np.arccos(np.clip(directions @ down, -1.0, 1.0)))))
+    directions = measured if by_lines else axes
+    down = _middle(np.stack(list(directions.values())))
+    off_deg = {name: float(np.degrees(np.arccos(min(1.0, one @ down)))) for name, one in directions.items()}
+    spread_deg = float(np.median(list(off_deg.values())))
     if spread_deg > MOST_SPREAD_DEG:
         raise InputError(
             f"the photographs do not agree on where down is: the median is {spread_deg:.0f} degrees off their mean. "
             "Take them with the camera held upright."
         )
+    limit_deg = max(LEAST_LIMIT_DEG, LIMIT_SPREADS * spread_deg)
+    leaning = {name: off for name, off in off_deg.items() if off > limit_deg}
     source = f"vertical lines of {len(measured)} images" if by_lines else "the images' own vertical, as if held upright"
-    return Level(down, source, spread_deg)
+    return Level(down, source, spread_deg, leaning)
 
 
 def _middle(directions: FloatArray) -> FloatArray:
@@ -79,7 +88,10 @@ def _middle(directions: FloatArray) -> FloatArray:
 
 
 def scale_by_distance(poses: Mapping[str, FloatArray], first: str, second: str, metres: float) -> Scale:
-    """The scale that makes two images ``metres`` apart. Raises ``InputError`` if one is not in the map."""
+    """The scale that makes two images of ``poses`` (3, 4) ``metres`` apart.
+
+    Raises ``InputError`` if one is not in the map.
+    """
     for name in (first, second):
         if name not in poses:
             raise InputError(f"{show(name)} is no image of the map; name two that were registered: {_some(poses)}.")
@@ -109,7 +121,7 @@ def scale_by_height(poses: Mapping[str, FloatArray], points: FloatArray, level: 
 
 
 def arbitrary_scale(poses: Mapping[str, FloatArray]) -> Scale:
-    """The scale at which the nearest other image is one unit away in the median."""
+    """The scale at which the nearest other image is one unit away in the median, of ``poses`` (3, 4)."""
     centres = np.stack([camera_centre(pose) for pose in poses.values()])
     apart = np.linalg.norm(centres[:, None] - centres[None], axis=2)
     np.fill_diagonal(apart, np.inf)

@@ -22,6 +22,8 @@ NEW_SCENE = "new_images.toml"
 LEAST_BOUND_DEG = 3.0
 EVERY = 4
 """Of the map's images every fourth is a query, localized against the others."""
+LEAST_WITHOUT = 4
+"""Images of a map from which some can be left out; those of a smaller one are localized with all points."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +31,7 @@ class Written:
     """Where things are, and what is in them."""
 
     scene: Path
-    """Its queries are images of the map, each localized without itself."""
+    """Its queries are images of the map."""
     new_scene: Path | None
     """Of other images of the same camera, if there are some."""
     poses: dict[str, FloatArray]
@@ -67,7 +69,11 @@ def write_map(
         (folder / MODEL).mkdir(parents=True, exist_ok=True)
         made.model.write(str(folder / MODEL))
         scene = folder / SCENE
-        scene.write_text(_scene(folder, images, names, about, level, scale), encoding="utf-8")
+        if len(names) >= LEAST_WITHOUT:
+            content = _scene(folder, images, names, about, level, scale)
+        else:
+            content = _new_scene(folder, images, images, views[0], about, level, scale)
+        scene.write_text(content, encoding="utf-8")
         new_scene = None
         if new_images is not None:
             new_scene = folder / NEW_SCENE

@@ -1,0 +1,186 @@
+"""Maps of photographs: rendered panoramas with known poses, on the way that the command takes, and what is refused."""
+
+import cv2
+import numpy as np
+import pytest
+
+from spherloc.cameras.kannala_brandt import KannalaBrandt
+from spherloc.cameras.mei import Mei
+from spherloc.datasets import bundled_scenes, load_scene
+from spherloc.errors import CalibrationError, InputError
+from spherloc.formats.colmap_files import read_model
+from spherloc.geometry import camera_centre, rotation_angle, so3_exp
+from spherloc.mapping.lens import for_colmap
+from spherloc.mapping.make import Measured, make_map
+from spherloc.mapping.photographs import frames_of, photographs
+from spherloc.mapping.upright import Level, level_of, scale_by_height, upright_frame
+from spherloc.problem import Problem
+from spherloc_viz.map_report import map_report
+
+IMAGES = ("reference_002", "reference_003", "reference_004", "reference_005", "reference_006")
+
+
+@pytest.fixture(scope="module")
+def walk(tmp_path_factory):
+    """Five panoramas of a square, 5.9 m apart, their poses, and the map that is made of them."""
+    folder = tmp_path_factory.mktemp("walk")
+    scene = load_scene(bundled_scenes()["campus_panorama"])
+    poses = {}
+    for view in scene.references:
+        if view.name in IMAGES:
+            view.make_file()
+            cv2.imwrite(str(folder / f"{view.name}.png"), cv2.imread(str(view.path)))
+            poses[f"{view.name}.png"] = view.cam_from_map
+    told = []
+    first, second = sorted(poses)[:2]
+    apart = float(np.linalg.norm(camera_centre(poses[first]) - camera_centre(poses[second])))
+    found = photographs(folder, None)
+    output = tmp_path_factory.mktemp("map")
+    measured = Measured(distance=(first, second, apart))
+
+    def again():
+        return make_map(found.views, folder, output, measured, folder, lambda *what: told.append(what))
+
+    return poses, found, again(), again, told, output
+
+
+def test_a_map_has_the_poses_of_the_photographs(walk):
+    """To scale and upright; yaw and origin are the map's own."""
+    poses, _, made, *_ = walk
+    assert sorted(made.written.poses) == sorted(poses)
+    names = sorted(poses)
+    true = np.stack([camera_centre(poses[name]) for name in names])
+    centres = np.stack([camera_centre(made.written.poses[name]) for name in names])
+    for i, one in enumerate(names):
+        for j, other in enumerate(names[:i]):
+            assert np.linalg.norm(centres[i] - centres[j]) == pytest.approx(np.linalg.norm(true[i] - true[j]), rel=0.04)
+            turn = made.written.poses[one][:, :3] @ made.written.poses[other][:, :3].T
+            assert rotation_angle(turn @ poses[other][:, :3] @ poses[one][:, :3].T) < np.radians(0.2)
+        lean = made.written.poses[one][:, :3] @ [0, 0, 1] @ (poses[one][:, :3] @ [0, 0, 1])
+        assert np.degrees(np.arccos(min(1.0, lean))) < 1.0  # the rendered map has z up, too
+    assert "5.9" in made.scale.source and made.level.source == "vertical lines of 5 images"
+    assert not made.made.contradictions and not made.level.leaning
+
+
+def test_its_scenes_open(walk):
+    _, _, made, _, _, output = walk
+    scene = load_scene(made.written.scene)
+    assert [view.name for view in scene.queries] == ["reference_005.png"]
+    assert scene.gravity_map.tolist() == [0, 0, -1]
+    problem = scene.problem()
+    assert isinstance(problem, Problem) and problem.truth_inliers.sum() > 30
+    new = load_scene(made.written.new_scene)
+    assert len(new.queries) == 5 and len(new.references) == 5 and new.queries[0].camera == scene.queries[0].camera
+    assert len(read_model(output / "model").images) == 5
+
+
+def test_what_is_done_is_not_done_again(walk):
+    _, _, made, again, told, _ = walk
+    assert ("pairs of images matched", 10, 10) in told
+    told.clear()
+    repeated = again()
+    assert not any(what[0] == "pairs of images matched" for what in told)
+    assert repeated.written.poses.keys() == made.written.poses.keys()
+
+
+def test_the_report_says_what_is_in_the_map(walk):
+    _, found, made, *_ = walk
+    page = map_report(made, found)
+    assert "5 of 5" in page and "Not in the map" not in page and "data:image/png;base64," in page
+    smaller = map_report(type(made)(made.made, made.level, made.scale, _less(made.written, "reference_004.png")), found)
+    assert "4 of 5" in smaller and "reference_004.png: It has " in smaller
+
+
+def _less(written, name):
+    poses = {key: value for key, value in written.poses.items() if key != name}
+    return type(written)(written.scene, written.new_scene, poses, written.points, written.error_px)
+
+
+def picture(path, width, height, rng):
+    assert cv2.imwrite(str(path), rng.integers(0, 255, (height, width), np.uint8))
+
+
+def test_photographs_that_are_refused_or_left_out(tmp_path, rng):
+    with pytest.raises(InputError, match="is no folder"):
+        photographs(tmp_path / "none", None)
+    with pytest.raises(InputError, match="has no photographs"):
+        photographs(tmp_path, None)
+    picture(tmp_path / "a.png", 400, 300, rng)
+    with pytest.raises(InputError, match=r"400 x 300 pixels.*--camera FILE"):
+        photographs(tmp_path, None)
+    (tmp_path / "a.png").unlink()
+    picture(tmp_path / "b.png", 400, 200, rng)
+    with pytest.raises(InputError, match="has 1 photographs of 400 x 200"):
+        photographs(tmp_path, None)
+    picture(tmp_path / "c.png", 400, 200, rng)
+    picture(tmp_path / "d.png", 300, 200, rng)
+    (tmp_path / "e.jpg").write_bytes(b"no image")
+    found = photographs(tmp_path, None)
+    assert [view.name for view in found.views] == ["b.png", "c.png"]
+    assert len(found.remarks) == 2 and "d.png" in found.remarks[1] and "e.jpg" in found.remarks[0]
+
+
+def test_images_that_show_nothing_together(tmp_path, rng):
+    for name in ("a.png", "b.png"):
+        picture(tmp_path / name, 400, 200, rng)
+    found = photographs(tmp_path, None)
+    with pytest.raises(InputError, match="no two of the 2 photographs show the same place"):
+        make_map(found.views, tmp_path, tmp_path / "map", Measured(), None, lambda *_: None)
+
+
+def test_frames_of_a_video_are_its_sharpest(tmp_path, rng):
+    video = tmp_path / "walk.avi"
+    writer = cv2.VideoWriter(str(video), cv2.VideoWriter.fourcc(*"MJPG"), 10, (160, 80))
+    if not writer.isOpened():
+        pytest.fail("this OpenCV writes no MJPG")
+    sharp = rng.integers(0, 255, (80, 160, 3), np.uint8)
+    for number in range(12):
+        writer.write(sharp if number % 4 == 2 else np.asarray(cv2.GaussianBlur(sharp, (0, 0), 3.0), np.uint8))
+    writer.release()
+    names = []
+    assert frames_of(video, tmp_path, 3, names.append) == 3
+    assert names == ["frame_000002.jpg", "frame_000006.jpg", "frame_000010.jpg"]
+    (tmp_path / "text.mp4").write_text("no video")
+    with pytest.raises(InputError, match="cannot read it as a video"):
+        frames_of(tmp_path / "text.mp4", tmp_path, 3, names.append)
+
+
+def test_a_lens_that_colmap_lacks_is_fitted():
+    lens = Mei(716, 705, 668.16, 667.89, 358.47, 352.88, 2.2134, (0.0168, 1.6548, 0.00042, 0.00046))
+    fitted, remark = for_colmap(lens)
+    assert isinstance(fitted, KannalaBrandt) and "px off at most" in remark
+    rng = np.random.default_rng(0)
+    pixels = rng.uniform((0, 0), (716, 705), (500, 2))
+    bearings, seen = lens.unproject(pixels)
+    seen &= bearings[:, 2] > np.cos(np.radians(84))
+    back, _ = fitted.project(bearings[seen])
+    assert np.linalg.norm(back - pixels[seen], axis=1).max() < 0.2
+    assert for_colmap(fitted) == (fitted, "")
+    bent = Mei(640, 480, 300.0, 300.0, 320.0, 240.0, 0.5, (0.0, 0.0, 0.05, 0.05))
+    with pytest.raises(CalibrationError, match="no camera model mei"):
+        for_colmap(bent)
+
+
+def test_images_that_lean_against_the_map_are_told(walk):
+    _, found, made, *_ = walk
+    turned = dict(made.written.poses)
+    name = sorted(turned)[2]
+    turned[name] = np.column_stack([so3_exp(np.array([0.1, 0.0, 0.0])) @ turned[name][:, :3], turned[name][:, 3]])
+    level = level_of(turned, found.views)
+    assert list(level.leaning) == [name] and level.leaning[name] == pytest.approx(np.degrees(0.1), abs=1.0)
+
+
+def test_the_height_of_the_cameras_gives_the_scale(rng):
+    """Cameras 1.6 m above a floor, in a model whose unit is 0.4 m and whose up is anywhere."""
+    turn = so3_exp(np.array([0.3, -0.8, 0.5]))
+    floor = np.column_stack([rng.uniform(-3, 3, (2000, 2)), rng.normal(0, 0.01, 2000)])
+    walls = np.column_stack([rng.uniform(-3, 3, 2000), np.full(2000, 3.0), rng.uniform(0, 2.5, 2000)])
+    points = np.concatenate([floor, walls]) @ turn.T / 0.4
+    centres = np.column_stack([np.linspace(-2, 2, 5), np.zeros(5), np.full(5, 1.6)]) @ turn.T / 0.4
+    poses = {str(index): np.column_stack([np.eye(3), -centre]) for index, centre in enumerate(centres)}
+    level = Level(turn @ [0.0, 0.0, -1.0], "a test", 0.0, {})
+    scale = scale_by_height(poses, points, level, 1.6)
+    assert scale.metres_per_unit == pytest.approx(0.4, rel=0.03)
+    np.testing.assert_allclose(upright_frame(level) @ level.down, [0, 0, -1], atol=1e-12)
+    with pytest.raises(InputError, match="too few to find the ground"):
+        scale_by_height(poses, points[2000:], level, 1.6)
