@@ -226,7 +226,7 @@ def as_record(path: Path, trace: Trace, diagnosis: Diagnosis, recording: Path | 
 
 def _gravity(problem: Problem) -> str:
     error_rad = problem.gravity_error_rad
-    off = "" if error_rad is None else f"; {np.degrees(error_rad):.2g} deg off the truth"
+    off = "" if error_rad is None else f"; {np.degrees(error_rad):.3g} deg off the truth"
     return f"{problem.gravity_words}{off}"
 
 

@@ -209,7 +209,7 @@ def _gravity(rows: Sequence[QueryResult]) -> Iterator[str]:
         bounds = [row.gravity_bound_deg for row in told if row.gravity_bound_deg is not None]
         errors = [row.gravity_error_deg for row in told if row.gravity_error_deg is not None]
         most = f" to {max(bounds):.2g}" if max(bounds) > min(bounds) else ""
-        off = f"; off the truth by {median(errors):.2g} deg in the median, {max(errors):.2g} at most" if errors else ""
+        off = f"; off the truth by {median(errors):.3g} deg in the median, {max(errors):.3g} at most" if errors else ""
         yield f"gravity from {shorten(source)} in {len(told)} queries, within {min(bounds):.2g}{most} deg{off}"
 
 
