@@ -192,14 +192,14 @@ def _text(results: SequenceResults, summary: Summary) -> str:
             f"  median time {summary.median_matching_ms or 0:.0f} ms for matching, "
             f"{summary.median_estimating_ms:.1f} ms for estimating"
         )
-    lines += [f"  {line}" for line in _gravity(results.rows)]
+    lines += [f"  {line}" for line in gravity_by_source(results.rows)]
     lines += [f"  {line}" for line in (*_skipped(summary), *_without_pose(results.rows))]
     if not timed(results):
         lines.append("  trajectory: times are places in the sequence, as the queries have no growing times")
     return "\n".join([*lines, f"  written to {results.folder}"])
 
 
-def _gravity(rows: Sequence[QueryResult]) -> Iterator[str]:
+def gravity_by_source(rows: Sequence[QueryResult]) -> Iterator[str]:
     """Of each source: in how many queries, its bounds and its true errors."""
     by_source: dict[str, list[QueryResult]] = {}
     for row in rows:
@@ -210,7 +210,8 @@ def _gravity(rows: Sequence[QueryResult]) -> Iterator[str]:
         errors = [row.gravity_error_deg for row in told if row.gravity_error_deg is not None]
         most = f" to {max(bounds):.2g}" if max(bounds) > min(bounds) else ""
         off = f"; off the truth by {median(errors):.3g} deg in the median, {max(errors):.3g} at most" if errors else ""
-        yield f"gravity from {shorten(source)} in {len(told)} queries, within {min(bounds):.2g}{most} deg{off}"
+        queries = "query" if len(told) == 1 else "queries"
+        yield f"gravity from {shorten(source)} in {len(told)} {queries}, within {min(bounds):.2g}{most} deg{off}"
 
 
 def _rate(rate: SuccessRate) -> str:

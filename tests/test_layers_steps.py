@@ -70,6 +70,13 @@ def colored(picture: Picture, color: style.RGB) -> np.ndarray:
     return np.flatnonzero((points.colors == np.array(color)).all(axis=1))
 
 
+def test_the_gravity_step_says_where_gravity_comes_from(ransac: Trace) -> None:
+    assert at(ransac, "gravity").step.caption.startswith("Gravity is known exactly in the camera")
+    told = replace(ransac.problem, gravity_source="lines of the image", gravity_bound_rad=0.01)
+    caption = at(estimate(told, "ransac-2p"), "gravity").step.caption
+    assert caption.startswith("Gravity is known from lines of the image to within 0.57° in the camera")
+
+
 # ---------------------------------------------------------------------------------------------- the timeline
 
 

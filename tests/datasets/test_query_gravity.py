@@ -9,12 +9,15 @@ from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.datasets import load_scene
 from spherloc.datasets.map_scene import MapScene
 from spherloc.datasets.query_gravity import read_gravity, read_gravity_file
+from spherloc.diagnosis import diagnose
 from spherloc.errors import InputError, ProblemError
 from spherloc.estimators import default_options
 from spherloc.experiments.results import json_line, row_of_json
 from spherloc.experiments.sequence import localize
 from spherloc.frontend.view import Gravity, Matches, View
 from spherloc.geometry import DOWN
+from spherloc_viz.batch import as_record, as_text
+from spherloc_viz.localize import gravity_by_source as summed_up
 from tests.datasets.test_image_folder import CAMERA, POSED, make_tree
 from tests.tiny_scene import write_tiny_scene
 
@@ -232,3 +235,18 @@ def test_a_source_is_a_short_text(problem):
     for wrong in (3, "x" * 300):
         with pytest.raises(ProblemError, match="gravity_source"):
             replace(problem, gravity_source=wrong)
+
+
+def test_runs_and_sequences_say_where_gravity_came_from(tmp_path, problem):
+    view = View("query", problem.camera, tmp_path / "q.png", gravity=Gravity(problem.gravity_camera, "the IMU", 0.01))
+    scene = small_scene(tmp_path, problem, view)
+    row, trace = next(iter(localize(scene, scene.queries, "mc", default_options("mc", scene.problem()), 0)))
+    assert trace is not None
+    told = as_text(tmp_path / "s.toml", trace, diagnose(trace), None)
+    assert "  gravity from the IMU, within 0.57 deg; 0 deg off the truth\n" in told
+    assert as_record(tmp_path, trace, diagnose(trace), None)["gravity_source"] == "the IMU"
+    rows = [row, replace(row, gravity_bound_deg=2.0, gravity_error_deg=1.5), replace(row, gravity_source="lines")]
+    assert list(summed_up(rows)) == [
+        "gravity from the IMU in 2 queries, within 0.57 to 2 deg; off the truth by 0.75 deg in the median, 1.5 at most",
+        "gravity from lines in 1 query, within 0.57 deg; off the truth by 0 deg in the median, 0 at most",
+    ]
