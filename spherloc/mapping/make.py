@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from spherloc.errors import InputError
+from spherloc.errors import InputError, show
 from spherloc.files import is_folder
 from spherloc.frontend.view import View
 from spherloc.mapping.reconstruction import Reconstruction, Tell, reconstruct
@@ -49,6 +49,12 @@ def make_map(
     """
     if new_images is not None and not is_folder(new_images):
         raise InputError(f"{new_images}: is no folder; give one with images that are to be localized.")
+    names = {view.name for view in views}
+    for name in () if measured.distance is None else measured.distance[:2]:
+        if name not in names:
+            raise InputError(
+                f"{show(name)} is none of the {len(views)} photographs; name two as their files are called."
+            )
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
