@@ -127,7 +127,7 @@ def test_images_that_show_nothing_together(tmp_path, rng):
     for name in ("a.png", "b.png"):
         picture(tmp_path / name, 400, 200, rng)
     found = photographs(tmp_path, None)
-    with pytest.raises(InputError, match="'z.png' is none of the 2 photographs"):
+    with pytest.raises(InputError, match=r"'z\.png' is none of the 2 photographs"):
         make_map(found.views, tmp_path, tmp_path / "map", Measured(distance=("a.png", "z.png", 1.0)), None, print)
     with pytest.raises(InputError, match="no two of the 2 photographs show the same place"):
         make_map(found.views, tmp_path, tmp_path / "map", Measured(), None, lambda *_: None)
