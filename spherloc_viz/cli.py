@@ -314,8 +314,8 @@ def map(
     for flag, metres in (("--camera-height", camera_height), ("--distance", distance and distance[2])):
         if metres is not None and not 0.0 < metres < 1e6:
             raise InputError(f"{flag} is {metres:g}; give a positive number of metres.")
-    if not 2 <= frames <= 2000:
-        raise InputError(f"--frames is {frames}; give a number from 2 to 2000.")
+    if not 2 <= frames <= 500:
+        raise InputError(f"--frames is {frames}; give a number from 2 to 500.")
     taken = None if video is None else (video, frames)
     return make(folder, output, camera, taken, Measured(camera_height, distance), localize)
 

@@ -19,6 +19,8 @@ from spherloc.types import ByteArray
 
 SUFFIXES = {".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"}
 LEAST_IMAGES = 2
+MOST_IMAGES = 500
+"""Their features take 4 MB each."""
 LEAST_PANORAMA_PX = 200
 """Of the longer side."""
 SHARPNESS_PX = 512
@@ -36,7 +38,7 @@ class Photographs:
 def photographs(folder: Path, camera: Camera | None) -> Photographs:
     """The images of a folder, all of ``camera``; without one they are taken for panoramas if they are 2 to 1.
 
-    Raises ``InputError`` if there are fewer than two of one size, or if their camera is not known, or is none that
+    Raises ``InputError`` if there are fewer than two of one size, or too many, or if their camera is not known, or is none that
     COLMAP can have.
     """
     if not is_folder(folder):
@@ -72,6 +74,11 @@ def photographs(folder: Path, camera: Camera | None) -> Photographs:
         raise InputError(
             f"{folder}: has {len(names)} photographs of {width} x {height} pixels; a map needs {LEAST_IMAGES} or more, "
             "better ten."
+        )
+    if len(names) > MOST_IMAGES:
+        raise InputError(
+            f"{folder}: has {len(names)} photographs, of {MOST_IMAGES} that are mapped at once; take every n-th of them, "
+            'or map them with COLMAP and open its model as kind = "colmap".'
         )
     camera, about_lens = for_colmap(camera)
     if about_lens:
