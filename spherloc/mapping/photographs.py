@@ -38,8 +38,8 @@ class Photographs:
 def photographs(folder: Path, camera: Camera | None) -> Photographs:
     """The images of a folder, all of ``camera``; without one they are taken for panoramas if they are 2 to 1.
 
-    Raises ``InputError`` if there are fewer than two of one size, or too many, or if their camera is not known, or is none that
-    COLMAP can have.
+    Raises ``InputError`` if there are fewer than two of one size or too many, or if their camera is not known or none
+    that COLMAP can have.
     """
     if not is_folder(folder):
         raise InputError(f"{folder}: is no folder; give the folder of the photographs.")
@@ -77,8 +77,8 @@ def photographs(folder: Path, camera: Camera | None) -> Photographs:
         )
     if len(names) > MOST_IMAGES:
         raise InputError(
-            f"{folder}: has {len(names)} photographs, of {MOST_IMAGES} that are mapped at once; take every n-th of them, "
-            'or map them with COLMAP and open its model as kind = "colmap".'
+            f"{folder}: has {len(names)} photographs, of {MOST_IMAGES} that are mapped at once; take every n-th of "
+            'them, or map them with COLMAP and open its model as kind = "colmap".'
         )
     camera, about_lens = for_colmap(camera)
     if about_lens:
