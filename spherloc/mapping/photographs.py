@@ -103,7 +103,7 @@ def frames_of(video: Path, folder: Path, count: int, advance: Callable[[str], No
     for number, frame in _sharpest(reader, stretch):
         name = f"frame_{number:06d}.jpg"
         path = folder / name
-        if not path.is_file():
+        if not is_file(path):
             done, content = cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, 95])
             try:
                 path.write_bytes(content.tobytes() if done else b"")
