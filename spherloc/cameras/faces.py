@@ -66,7 +66,8 @@ class Faces:
 def _lookup(faces: Faces, face: int, width: int, height: int) -> tuple[FloatImage, FloatImage, BoolArray]:
     """Columns and rows (S, S) of an image where OpenCV finds the pixels of a face; those that are its own, with rim."""
     centres = np.arange(faces.size_px) + 0.5
-    bearings = faces.bearings(face, np.column_stack([part.ravel() for part in np.meshgrid(centres, centres)]))
+    grid = np.column_stack([part.ravel() for part in np.meshgrid(centres, centres)]).astype(np.float64)
+    bearings = faces.bearings(face, grid)
     pixels, _ = Equirectangular(width, height).project(bearings)
     shape = (faces.size_px, faces.size_px)
     # OpenCV's first pixel has its centre at 0; the rows end at the poles, the columns go round.
