@@ -40,11 +40,15 @@ from spherloc.types import BoolArray, FloatArray
 Tell = Callable[[str, int, int], None]
 """Told of each piece of work that is done: its kind in the plural, how many are done, how many there are."""
 
+DATABASE_VERSION = 3
+"""Raised when pairs are matched or checked in another way."""
 LEAST_MATCHES = 15
 """Of a pair of images, after the two-view check."""
 BOUND_RAD = np.radians(0.5)
 """Of a match to its epipolar plane; in pixels it is kept within ``BOUND_PX``."""
 BOUND_PX = 1.5, 6.0
+ONE_PLACE_RAD = np.radians(0.5)
+"""Rays of a match that differ by less: two images from one place, whose matches fit a homography as well."""
 MOST_EXHAUSTIVE = 50
 """Images of which all pairs are tried; of more, each with its neighbours by name and with those that look alike."""
 NEIGHBOURS, ALIKE = 5, 15
@@ -196,7 +200,7 @@ def _registered(model: Any) -> list[Any]:
 
 def _key(views: Sequence[View]) -> str:
     """Of the images and of all that their matches depend on: another key is another database."""
-    said = [VERSION, FeatureOptions().method, repr(views[0].camera)]
+    said = [DATABASE_VERSION, VERSION, FeatureOptions().method, repr(views[0].camera)]
     for view in views:
         status = view.path.stat()
         said += [view.name, status.st_size, status.st_mtime_ns]
@@ -271,6 +275,14 @@ def _matched(
     for numbers, index in zip(number_of, usable, strict=True):
         numbers[index] = np.arange(len(index))
 
+    kinds = pycolmap.TwoViewGeometryConfiguration
+    options.compute_relative_pose = True  # for the angle between the rays of a match
+
+    def fits(geometry: Any) -> bool:
+        if geometry.config == kinds.PLANAR:
+            return geometry.tri_angle < ONE_PLACE_RAD
+        return geometry.config in (kinds.CALIBRATED, kinds.PANORAMIC)
+
     def verified(first: int, second: int) -> tuple[NDArray[np.uint32], Any]:
         found = match(features[first], features[second])
         pairs = np.column_stack([number_of[first][found.query_index], number_of[second][found.reference_index]])
@@ -280,7 +292,7 @@ def _matched(
         geometry = pycolmap.estimate_calibrated_two_view_geometry(
             panorama, pixels[first], panorama, pixels[second], pairs, options
         )
-        return pairs, geometry if geometry.config == pycolmap.TwoViewGeometryConfiguration.CALIBRATED else None
+        return pairs, geometry if fits(geometry) else None
 
     counts = np.zeros((len(ids), len(ids)), np.int64)
     waiting, done = _pairs(features), 0
