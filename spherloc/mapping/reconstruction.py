@@ -40,7 +40,7 @@ from spherloc.types import BoolArray, FloatArray
 Tell = Callable[[str, int, int], None]
 """Told of each piece of work that is done: its kind in the plural, how many are done, how many there are."""
 
-DATABASE_VERSION = 3
+DATABASE_VERSION = 4
 """Raised when pairs are matched or checked in another way."""
 LEAST_MATCHES = 15
 """Of a pair of images, after the two-view check."""
@@ -48,7 +48,7 @@ BOUND_RAD = np.radians(0.5)
 """Of a match to its epipolar plane; in pixels it is kept within ``BOUND_PX``."""
 BOUND_PX = 1.5, 6.0
 ONE_PLACE_RAD = np.radians(0.5)
-"""Rays of a match that differ by less: two images from one place, whose matches fit a homography as well."""
+"""Rays of a match that differ by less: two images from one place, which tell nothing of depth."""
 MOST_EXHAUSTIVE = 50
 """Images of which all pairs are tried; of more, each with its neighbours by name and with those that look alike."""
 NEIGHBOURS, ALIKE = 5, 15
@@ -121,7 +121,7 @@ def reconstruct(views: Sequence[View], folder: Path, tell: Tell) -> Reconstructi
         raise InputError(f"{path}: cannot be written ({reason(error)}); give another --output.") from None
     try:
         ids = _described(pycolmap, database, views, features, usable)
-        counts = _matched(pycolmap, database, ids, camera, features, usable, tell)
+        counts, same_place = _matched(pycolmap, database, ids, camera, features, usable, tell)
     finally:
         database.close()
     if counts.max(initial=0) < LEAST_MATCHES:
@@ -131,7 +131,7 @@ def reconstruct(views: Sequence[View], folder: Path, tell: Tell) -> Reconstructi
             "to each other, half a metre to two metres apart indoors."
         )
     names = [view.name for view in views]
-    made = [_best_model(pycolmap, path, names, ids, counts, keep, tell) for keep in (0.0, STRONG)]
+    made = [_best_model(pycolmap, path, names, ids, counts, same_place, keep, tell) for keep in (0.0, STRONG)]
     candidates = [one for one in made if one is not None]
     if not candidates:
         raise InputError(
@@ -147,6 +147,7 @@ def _best_model(
     names: Sequence[str],
     ids: Sequence[int],
     counts: NDArray[np.int64],
+    same_place: NDArray[np.int64],
     keep: float,
     tell: Tell,
 ) -> Reconstruction | None:
@@ -155,10 +156,11 @@ def _best_model(
         database = Path(folder) / "matches.db"
         shutil.copyfile(path, database)
         best = counts.max(axis=1)
-        weak = [pair for pair in combinations(range(len(ids)), 2) if counts[pair] < keep * best[list(pair)].max()]
+        pairs = combinations(range(len(ids)), 2)
+        weak = [pair for pair in pairs if not counts[pair] or counts[pair] < keep * best[list(pair)].max()]
         with pycolmap.Database.open(str(database)) as opened:
             for pair in weak:
-                if counts[pair]:
+                if counts[pair] or same_place[pair]:
                     opened.delete_two_view_geometry(*_of(ids, pair))
                     opened.delete_matches(*_of(ids, pair))
         models = _models(pycolmap, database, Path(folder), len(ids), tell)
@@ -167,7 +169,7 @@ def _best_model(
     poses = {image.name: np.asarray(image.cam_from_world().matrix()) for image in _registered(models[0])}
     groups = [tuple(sorted(image.name for image in _registered(model))) for model in models[1:]]
     left = [tuple(name for name in group if name not in poses) for group in groups]
-    against = _contradictions(poses, names, counts)
+    against = _contradictions(poses, names, counts + same_place)
     return Reconstruction(models[0], poses, counts, tuple(group for group in left if group), against)
 
 
@@ -255,8 +257,11 @@ def _matched(
     features: Sequence[Features],
     usable: Sequence[NDArray[np.int64]],
     tell: Tell,
-) -> NDArray[np.int64]:
-    """Matches of each pair of images that fit a pair of poses (V, V), which are in the database then."""
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Matches (V, V) of each pair of images that fit two poses, and (V, V) of pairs that were taken from one place.
+
+    They are in the database then.
+    """
     height = round(np.pi * _focal_px(camera))
     sphere = Equirectangular(2 * height, height)
     options = pycolmap.TwoViewGeometryOptions()
@@ -294,22 +299,26 @@ def _matched(
         )
         return pairs, geometry if fits(geometry) else None
 
-    counts = np.zeros((len(ids), len(ids)), np.int64)
+    counts, same_place = np.zeros((2, len(ids), len(ids)), np.int64)
+
+    def count(pair: tuple[int, int], geometry: Any) -> None:
+        (counts if geometry.config == kinds.CALIBRATED else same_place)[pair] = len(geometry.inlier_matches)
+
     waiting, done = _pairs(features), 0
     todo = [pair for pair in waiting if not database.exists_matches(*_of(ids, pair))]
     for pair in set(waiting) - set(todo):
         if database.exists_two_view_geometry(*_of(ids, pair)):
-            counts[pair] = len(database.read_two_view_geometry(*_of(ids, pair)).inlier_matches)
+            count(pair, database.read_two_view_geometry(*_of(ids, pair)))
         done += 1
     with ThreadPoolExecutor(_workers()) as pool:
         for pair, (pairs, geometry) in _as_completed(pool, verified, todo):
             if geometry is not None:
-                counts[pair] = len(geometry.inlier_matches)
+                count(pair, geometry)
                 database.write_two_view_geometry(*_of(ids, pair), geometry)
             database.write_matches(*_of(ids, pair), pairs)  # last: it says that the pair is done
             done += 1
             tell("pairs of images matched", done, len(waiting))
-    return counts + counts.T
+    return counts + counts.T, same_place + same_place.T
 
 
 def _as_completed(
@@ -362,6 +371,7 @@ def _models(pycolmap: Any, database: Path, folder: Path, count: int, tell: Tell)
     """COLMAP's models, the one with most images first; none if it finds no first pair."""
     options = pycolmap.IncrementalPipelineOptions()
     options.min_num_matches, options.min_model_size, options.random_seed = LEAST_MATCHES, 2, 0
+    options.num_threads = 1  # else every run gives another map
     options.ba_refine_focal_length = options.ba_refine_extra_params = options.extract_colors = False
     mapper = options.mapper
     mapper.abs_pose_refine_focal_length = mapper.abs_pose_refine_extra_params = False

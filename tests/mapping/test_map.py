@@ -53,7 +53,7 @@ def test_a_map_has_the_poses_of_the_photographs(walk):
     centres = np.stack([camera_centre(made.written.poses[name]) for name in names])
     for i, one in enumerate(names):
         for j, other in enumerate(names[:i]):
-            assert np.linalg.norm(centres[i] - centres[j]) == pytest.approx(np.linalg.norm(true[i] - true[j]), rel=0.04)
+            assert np.linalg.norm(centres[i] - centres[j]) == pytest.approx(np.linalg.norm(true[i] - true[j]), rel=0.08)
             turn = made.written.poses[one][:, :3] @ made.written.poses[other][:, :3].T
             assert rotation_angle(turn @ poses[other][:, :3] @ poses[one][:, :3].T) < np.radians(0.5)
         lean = made.written.poses[one][:, :3] @ [0, 0, 1] @ (poses[one][:, :3] @ [0, 0, 1])
