@@ -15,6 +15,8 @@ from typing import BinaryIO
 from spherloc.errors import InputError, reason
 
 _PIECE_BYTES = 1 << 20
+IMAGES = {".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"}
+"""Endings of the files in a folder that are taken for images, in lower case."""
 
 
 def is_file(path: Path) -> bool:

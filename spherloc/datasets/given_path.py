@@ -7,9 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from spherloc.errors import InputError, shorten
-from spherloc.files import is_file, is_folder, names_in
+from spherloc.files import IMAGES, is_file, is_folder, names_in
 
-IMAGES = {".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"}
 VIDEOS = {".360", ".avi", ".insv", ".m4v", ".mkv", ".mov", ".mp4", ".webm"}
 SCENE = "give the path of a scene file (TOML) or a bundled scene's name, which spherloc scenes lists"
 COMMAND = re.compile(r": spherloc [^;]*$")
@@ -82,9 +81,14 @@ def _folder(path: Path) -> tuple[str, str]:
         return "a folder of results of spherloc localize", f"list its runs with: spherloc runs {runs}"
     if suffixes[".rrd"]:
         return _counted(suffixes[".rrd"], "recording"), f"list them with: spherloc runs {_quoted(path)}"
-    images = _images(path, names)
+    images = _images(names)
     if images:
         return _counted(images, "image"), f"make a map of it with: spherloc map {_quoted(path)}"
+    inside = _image_folders(path, names)
+    if inside:
+        most = max(inside, key=lambda name: inside[name])
+        what = f"a folder without images, but with {sum(inside.values()):,} in the folders in it"
+        return what, f"make a map of one of them with: spherloc map {_quoted(path / most)}"
     scenes = [name for name in names if name.endswith(".toml")]
     if scenes:
         return _counted(len(scenes), "scene file"), f"give one of them, such as {shorten(str(path / scenes[0]))}"
@@ -96,15 +100,19 @@ def _folder(path: Path) -> tuple[str, str]:
     return ("an empty folder" if not names else "a folder without images or scene files"), SCENE
 
 
-def _images(path: Path, names: Sequence[str]) -> int:
-    """How many images there are in a folder and in the folders in it."""
-    count = sum(Path(name).suffix.lower() in IMAGES for name in names)
+def _images(names: Sequence[str]) -> int:
+    return sum(Path(name).suffix.lower() in IMAGES for name in names)
+
+
+def _image_folders(path: Path, names: Sequence[str]) -> dict[str, int]:
+    """How many images there are in those folders in a folder that have some, by name."""
+    counts = {}
     for name in [name for name in names if is_folder(path / name)][:_MOST_FOLDERS]:
         try:
-            count += sum(Path(inside).suffix.lower() in IMAGES for inside in names_in(path / name))
+            counts[name] = _images(names_in(path / name))
         except InputError:
             continue
-    return count
+    return {name: count for name, count in counts.items() if count}
 
 
 def _counted(count: int, what: str) -> str:

@@ -16,7 +16,7 @@ from spherloc.datasets import map_scene, scene_file
 from spherloc.datasets.colmap import gravity_of_map, model_views, some, split_gravity, unit_vector
 from spherloc.datasets.map_scene import MapScene
 from spherloc.errors import InputError, shorten, show
-from spherloc.files import is_file, names_in, size_of
+from spherloc.files import IMAGES, is_file, names_in, size_of
 from spherloc.formats.colmap_files import read_model
 from spherloc.frontend.lifting import DepthLift
 from spherloc.frontend.partners import with_triangulation
@@ -212,7 +212,6 @@ bound_deg = 3.0
 GRAVITY_BOUND_DEG = 3.0
 """Default bound on a query's gravity, taken from its most similar reference; 0 where the scene states it."""
 
-_SUFFIXES = {".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"}
 _OPTIONAL = {"calibration", "calibration_camera", "camera", "map", "references", "truth"}
 
 
@@ -288,9 +287,9 @@ def _names(table: dict[str, Any], path: Path) -> tuple[Path, list[str]]:
             raise InputError(f"{path}: images is {show(value)}; give a folder or a list of files.")
         return path.parent, value
     root = map_scene.folder(table, "images", path)
-    names = [name for name in names_in(root) if Path(name).suffix.lower() in _SUFFIXES]
+    names = [name for name in names_in(root) if Path(name).suffix.lower() in IMAGES]
     if not names:
-        raise InputError(f"{path}: the folder {root} has no images ({', '.join(sorted(_SUFFIXES))}); correct 'images'.")
+        raise InputError(f"{path}: the folder {root} has no images ({', '.join(sorted(IMAGES))}); correct 'images'.")
     return root, names
 
 

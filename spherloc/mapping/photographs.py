@@ -11,13 +11,12 @@ import numpy as np
 from spherloc.cameras.base import Camera
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.errors import InputError, shorten
-from spherloc.files import is_file, is_folder, names_in
+from spherloc.files import IMAGES, is_file, is_folder, names_in
 from spherloc.frontend.view import View
 from spherloc.images import grey, read_size
 from spherloc.mapping.lens import for_colmap
 from spherloc.types import ByteArray
 
-SUFFIXES = {".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"}
 LEAST_IMAGES = 2
 MOST_IMAGES = 500
 """Their features take 4 MB each."""
@@ -45,15 +44,13 @@ def photographs(folder: Path, camera: Camera | None) -> Photographs:
         raise InputError(f"{folder}: is no folder; give the folder of the photographs.")
     sizes: dict[tuple[int, int], list[str]] = {}
     remarks = []
-    for name in (name for name in names_in(folder) if Path(name).suffix.lower() in SUFFIXES):
+    for name in (name for name in names_in(folder) if Path(name).suffix.lower() in IMAGES):
         try:
             sizes.setdefault(read_size(folder / name), []).append(name)
         except InputError as error:
             remarks.append(f"{shorten(name)} was left out: {error}")
     if not sizes:
-        raise InputError(
-            f"{folder}: has no photographs ({', '.join(sorted(SUFFIXES))}); give the folder that has them."
-        )
+        raise InputError(f"{folder}: has no photographs ({', '.join(sorted(IMAGES))}); give the folder that has them.")
     size = (camera.width, camera.height) if camera else max(sizes, key=lambda key: len(sizes[key]))
     width, height = size
     if camera is None:

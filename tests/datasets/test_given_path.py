@@ -19,7 +19,10 @@ def filled(folder, *names):
     ("names", "said"),
     [
         ([f"{k}.JPG" for k in range(3)], "is a folder of 3 images; make a map of it with: spherloc map "),
-        (["left/1.png", "right/1.png", "scene.toml"], "is a folder of 2 images; make a map"),
+        (
+            ["left/1.png", "right/1.png", "scene.toml"],
+            "is a folder without images, but with 2 in the folders in it; make a map of one of them with: spherloc ",
+        ),
         (["1.png"], "is a folder of 1 image; make a map"),
         (["cameras.bin", "images.bin", "points3D.bin", "frames.bin"], "is a COLMAP model; a scene of kind colmap"),
         (["sensors/sensors.txt"], "is a dataset of kapture"),
