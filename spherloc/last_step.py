@@ -6,14 +6,16 @@ the winner.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from spherloc.bounds import Bounds
-from spherloc.gauss_newton import LEAST_GRAVITY_SD_RAD, Matches, Noise
+from spherloc.gauss_newton import LEAST_GRAVITY_SD_RAD, ROBUST_NONE, Matches, Noise, polish_path
 from spherloc.narrowing import MOST_DESCENTS, NARROWINGS, descend, narrow, search_nearby, truncated_squares
 from spherloc.problem import AlignedProblem
 from spherloc.refine import (
+    MAX_STEPS,
     RESCUE_REACH,
     RefinementOptions,
     fitted_path,
@@ -70,6 +72,27 @@ def conclude(
         if len(fit) and truncated_squares(matches, limits, fit[-1].copy(), noise, np.inf) <= least + RESCUE_REACH:
             best = np.concatenate([best, fit])
     return record(aligned, best, limits, options, measured=True)
+
+
+def conclude_as_printed(
+    aligned: AlignedProblem, start: FloatArray, members: BoolArray, bounds: Bounds, options: RefinementOptions
+) -> tuple[FloatArray, BoolArray, RefinementStage]:
+    """The last line of Algorithms 1 and 2 and nothing else: Gauss-Newton in 6 DoF from ``start`` (3, 4).
+
+    It fits the matches ``members`` (M,), all weighed alike, without gravity and without choosing them anew; fewer than
+    4 keep their tilt. The reported inliers are the matches within the bound on the noise of the pose that comes out.
+
+    Returns what ``refine`` does, poses between the aligned frames.
+    """
+    plain = replace(options, gravity_sd_deg=np.inf, robust="none")
+    path = np.empty((1 + MAX_STEPS, 3, 4))
+    path[0] = start
+    rotation, translation = start[:, :3].copy(), start[:, 3].copy()
+    matches, noise = matches_of(aligned), noise_of(aligned, plain)
+    steps = polish_path(
+        matches, members.copy(), rotation, translation, noise, np.int64(ROBUST_NONE), np.int64(MAX_STEPS), path[1:]
+    )
+    return record(aligned, path[: 1 + steps].copy(), np.full(len(members), bounds.noise_px), plain)
 
 
 def _promising(aligned: AlignedProblem, starts: Sequence[FloatArray], bounds: Bounds) -> list[FloatArray]:

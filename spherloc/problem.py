@@ -235,6 +235,11 @@ class AlignedProblem:
         rotation = self.camera_turn @ cam_from_map[:, :3] @ self.map_turn.T
         return pose(rotation, self.camera_turn @ cam_from_map[:, 3])
 
+    def align_poses(self, cam_from_map: FloatArray) -> FloatArray:
+        """``align_pose`` of each of P poses (P, 3, 4)."""
+        rotations = self.camera_turn @ cam_from_map[:, :, :3] @ self.map_turn.T
+        return np.concatenate([rotations, (cam_from_map[:, :, 3] @ self.camera_turn.T)[:, :, None]], axis=2)
+
     def full_mask(self, mask: BoolArray) -> BoolArray:
         """A mask (M,) over the usable correspondences as one (N,) over all."""
         full = np.zeros(self.count, dtype=bool)

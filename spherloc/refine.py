@@ -49,7 +49,7 @@ from spherloc.small_arrays import (
     translation_of,
 )
 from spherloc.trace import RefinementStage
-from spherloc.types import BoolArray, FloatArray
+from spherloc.types import BoolArray, FloatArray, IntArray
 
 MAX_STEPS = 15
 MAX_ROUNDS = 10
@@ -115,6 +115,11 @@ def noise_of(aligned: AlignedProblem, options: RefinementOptions) -> Noise:
 def residuals_px(aligned: AlignedProblem, cam_from_map: FloatArray) -> FloatArray:
     """Reprojection error (M,), pixels to first order; inf for points behind their measured bearing."""
     return _residuals(matches_of(aligned), cam_from_map.copy())
+
+
+def inlier_counts(aligned: AlignedProblem, cam_from_map: FloatArray, bound_px: float) -> IntArray:
+    """How many correspondences each of P poses (P, 3, 4) between the aligned frames explains within ``bound_px``."""
+    return _inlier_counts(matches_of(aligned), cam_from_map, bound_px)
 
 
 def refine(
@@ -223,6 +228,17 @@ def _residuals(matches, cam_from_map):
     errors = np.empty(len(matches.points))
     errors_of(matches, cam_from_map, errors)
     return errors
+
+
+@kernel()
+def _inlier_counts(matches, poses, bound_px):
+    """Matches within ``bound_px`` of each of the ``poses`` (P, 3, 4)."""
+    counts, errors = np.zeros(len(poses), np.int64), np.empty(len(matches.points))
+    for p in range(len(poses)):
+        errors_of(matches, poses[p], errors)
+        for k in range(len(errors)):
+            counts[p] += errors[k] <= bound_px
+    return counts
 
 
 @kernel()

@@ -385,6 +385,38 @@ def check_proof(file: Positional[Path], /) -> int:
 
 
 @app.command
+def verify(
+    quick: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
+    only: Annotated[tuple[str, ...], arg(metavar="EXPERIMENT ...")] = (),
+    workers: int = 2,
+    scheduler: OptionalText = None,
+    output: OptionalPath = None,
+) -> int:
+    """Check the paper's claims: run its simulations and write a page that says which reproduce.
+
+    About an hour on two cores, two minutes with --quick. Stop it when you like: the same command goes on. Writes
+    index.md, figures, claims.json and a CSV of all runs.
+
+    For example:
+
+    spherloc verify --quick
+
+    spherloc verify --only fig6 fig7 --workers 8
+
+    Args:
+        quick: Few problems at few points, without the slowest methods.
+        only: Only these experiments, such as fig6; a wrong name lists them all.
+        workers: Processes on this machine.
+        scheduler: Address of a Dask scheduler, whose workers do the runs instead.
+        output: Folder of the page; verification here if not given, verification-quick with --quick.
+    """
+    from spherloc_viz.verify_command import verify as do_verify
+
+    folder = output or Path("verification-quick" if quick else "verification")
+    return do_verify(folder, quick, workers, scheduler, only)
+
+
+@app.command
 def scenes(kind: Positional[Annotated[str | None, arg(metavar="[KIND]")]] = None, /) -> int:
     """List the bundled scenes and the kinds of scene files, or show how a kind is written.
 
@@ -435,7 +467,7 @@ def main() -> None:
         if isinstance(stream, io.TextIOWrapper):  # names that are no UTF-8, or a terminal that knows ASCII only
             stream.reconfigure(errors="backslashreplace")
     try:
-        refuse_repeated(sys.argv[1:], (run, localize, sweep, play, map, lesson, scenes, plugins, *_OTHERS))
+        refuse_repeated(sys.argv[1:], (run, localize, sweep, play, map, lesson, verify, scenes, plugins, *_OTHERS))
         code: Any = app.cli(
             prog="spherloc",
             description="See why visual localization with fisheye and 360-degree cameras succeeds or fails.",

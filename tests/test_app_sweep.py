@@ -216,7 +216,7 @@ def test_html_is_whole_and_escaped() -> None:
 
     labels = ("mc", "mc <i>=1")
     rows = [
-        SweepRow(label, 0.5, 0, False, error, error, 2.0, 5, 20, 1.0, 0.5, 0.6, None, None, None)
+        SweepRow(label, 0.5, 0, False, error, error, error, 2.0, 5, 20, 1.0, 0.5, 0.6, None, None, None)
         for label, error in zip(labels, (None, 1e-9), strict=True)
     ]
     points = [point_of([row]) for row in rows]

@@ -113,7 +113,7 @@ def test_entrants_as_people_type_them() -> None:
 
 def row(label: str, value: float, seed: int, error: float | None) -> SweepRow:
     good = error is not None and error < 0.1
-    return SweepRow(label, value, seed, good, error, error, 2.0 + seed, 5, 20, 1.0, 0.5, 0.6, None, None, None)
+    return SweepRow(label, value, seed, good, error, error, error, 2.0 + seed, 5, 20, 1.0, 0.5, 0.6, None, None, None)
 
 
 LABELS = ("mc", "ransac-2p iterations=50", "ransac-2p iterations=500")

@@ -52,7 +52,7 @@ FLOORS = (
         "spherloc.outcome",
         "spherloc.experiments",
     ),
-    ("spherloc.localization", "spherloc.testing", "spherloc.mapping"),
+    ("spherloc.localization", "spherloc.testing", "spherloc.mapping", "spherloc.verification"),
     (
         "spherloc_viz.style",
         "spherloc_viz.layers",

@@ -13,6 +13,8 @@ from spherloc.types import BoolArray, FloatArray, IntArray
 
 Rngs = tuple[np.random.Generator, np.random.Generator, np.random.Generator]
 
+Draws = Literal["uniform", "normal"]
+DRAWS: tuple[str, ...] = get_args(Draws)
 HALF_SIZE_M = 5.0
 """Half the side of the paper's cube."""
 WHOLE_SPHERE_DEG = 360.0
@@ -54,6 +56,13 @@ class Lens:
         return pixels, visible
 
 
+def _coordinates(rng: np.random.Generator, count: int, draws: Draws) -> FloatArray:
+    """(count, 3) in metres, uniform in the cube or standard normal."""
+    if draws == "normal":
+        return rng.standard_normal((count, 3))
+    return rng.uniform(-HALF_SIZE_M, HALF_SIZE_M, (count, 3))
+
+
 @dataclass(frozen=True)
 class Cloud:
     """Random points in the paper's cube, or in a flat part of it."""
@@ -64,10 +73,12 @@ class Cloud:
     """Height of the middle of a flat cloud (y of the map)."""
     height_m: float = 2 * HALF_SIZE_M
     """How high it is; at most as high as the cube."""
+    draws: Draws = "uniform"
+    """The distribution of the coordinates: uniform in the cube, or standard normal, m."""
 
     def draw(self, rng: np.random.Generator, count: int) -> FloatArray:
         """Points (count, 3) anywhere in the cloud."""
-        return self.flattened(rng.uniform(-HALF_SIZE_M, HALF_SIZE_M, (count, 3)), 0.0)
+        return self.flattened(_coordinates(rng, count, self.draws), 0.0)
 
     def flattened(self, points: FloatArray, middle_m: float) -> FloatArray:
         """The points (N, 3) of a cube around the height ``middle_m``, moved up and down into the cloud."""
@@ -170,11 +181,11 @@ NARROW_POSE_DRAWS = 8
 PIXEL_DRAWS = 400
 
 
-def random_poses(rng: np.random.Generator, count: int) -> FloatArray:
-    """Level poses (count, 3, 4): any yaw, translation uniform in the cube."""
+def random_poses(rng: np.random.Generator, count: int, draws: Draws = "uniform") -> FloatArray:
+    """Level poses (count, 3, 4): any yaw, translation uniform in the cube or standard normal (m)."""
     yaws = rng.uniform(-np.pi, np.pi, count)
     poses = np.zeros((count, 3, 4))
-    poses[:, :, 3] = rng.uniform(-HALF_SIZE_M, HALF_SIZE_M, (count, 3))
+    poses[:, :, 3] = _coordinates(rng, count, draws)
     poses[:, 0, 0] = poses[:, 2, 2] = np.cos(yaws)
     poses[:, 0, 2] = np.sin(yaws)
     poses[:, 2, 0] = -poses[:, 0, 2]
@@ -182,7 +193,9 @@ def random_poses(rng: np.random.Generator, count: int) -> FloatArray:
     return poses
 
 
-def random_pixels(rng: np.random.Generator, lens: Lens, points: FloatArray, name: str) -> FloatArray:
+def random_pixels(
+    rng: np.random.Generator, lens: Lens, points: FloatArray, name: str, draws: Draws = "uniform"
+) -> FloatArray:
     """Pixels (N, 2) of the points (N, 3) under a random level pose each under which it is visible.
 
     Where many poses in turn do not see a point, its pixel is that of a random bearing. Raises ``InputError``, with
@@ -195,7 +208,7 @@ def random_pixels(rng: np.random.Generator, lens: Lens, points: FloatArray, name
         if len(missing) == 0:
             return pixels
         if draw < pose_draws:
-            poses = random_poses(rng, len(points))[missing]
+            poses = random_poses(rng, len(points), draws)[missing]
             rays = np.einsum("nij,nj->ni", poses[:, :, :3], points[missing]) + poses[:, :, 3]
         else:
             rays = random_bearings(rng, len(missing), lens.field_of_view_deg)

@@ -1,6 +1,7 @@
 """The paper's simulation (Sec. VI-A): map points in the cube [-5, 5]^3 seen by a level camera.
 
-Where the paper is silent or breaks: points and positions are uniform in the cube; points are drawn until N are
+Where the paper is silent or breaks: points and positions are uniform in the cube, or standard normal, since it says
+both; points are drawn until N are
 visible, that is valid for the camera model and inside the image after noise; an outlier is the projection of its map
 point by a random wrong pose of its own. The paper's gravity is exact; here it may be off. Beyond the paper, outliers
 may agree with each other, the field of view and the height of the cloud may be smaller, and the camera can be placed.
@@ -17,10 +18,12 @@ from spherloc.cameras.base import Camera
 from spherloc.cameras.calibration import camera_from_table
 from spherloc.datasets import scene_file
 from spherloc.datasets.point_cloud import (
+    DRAWS,
     HALF_SIZE_M,
     OUTLIER_KINDS,
     WHOLE_SPHERE_DEG,
     Cloud,
+    Draws,
     Lens,
     OutlierKind,
     copies,
@@ -51,6 +54,7 @@ gravity_error_deg = 0.0           # optional: standard deviation of the error of
 outlier_kind = "random"           # optional: "random", "coherent" (one wrong pose) or "repeated" (a facade's copies)
 field_of_view_deg = 360.0         # optional: points farther than half of it from the optical axis are not seen
 cloud_height_m = 10.0             # optional: height of the cloud of points, around the camera's if less than 10
+draws = "uniform"                 # optional: of coordinates, in the cube; or "normal", standard normal in metres
 # true_camera = [30, 1, 0, 2]     # optional: yaw (deg) and position (m) of the camera; drawn if absent
 """
 
@@ -112,6 +116,9 @@ class SyntheticScene:
     near 0 all right bearings are horizontal."""
     true_camera: TrueCamera | None = None
     """Yaw (deg) and position (m) of the true camera in the map frame; None for the one that is drawn."""
+    draws: Draws = "uniform"
+    """Distribution of the coordinates of points and of all poses' translations: "uniform" in the cube, or "normal",
+    standard normal in metres. Sec. VI-A says both."""
 
     def __post_init__(self) -> None:
         for name, (lowest, highest) in LIMITS.items():
@@ -122,6 +129,8 @@ class SyntheticScene:
             raise InputError(
                 f"{self.name}: outlier_kind is {show(self.outlier_kind)}; give one of {', '.join(OUTLIER_KINDS)}."
             )
+        if self.draws not in DRAWS:
+            raise InputError(f"{self.name}: draws is {show(self.draws)}; give one of {', '.join(DRAWS)}.")
         placed = self.true_camera
         if placed is not None and not (
             len(placed) == len(TRUE_CAMERA_LIMITS)
@@ -141,11 +150,11 @@ class SyntheticScene:
             return replace(self, seed=seed).problem()
         streams = [np.random.default_rng([self.seed, stream]) for stream in range(7)]
         geometry, noise, choice, wrong, tilt, second, ahead = streams
-        drawn, lens = random_poses(geometry, 1)[0], Lens(self.camera, self.field_of_view_deg)
+        drawn, lens = random_poses(geometry, 1, self.draws)[0], Lens(self.camera, self.field_of_view_deg)
         truth = drawn if self.true_camera is None else _placed(self.true_camera)
         other = second_pose(second, truth, self.field_of_view_deg) if self.outlier_kind == "coherent" else None
         poses = [truth] if other is None else [truth, other]
-        cloud = Cloud(self.name, float(camera_centre(drawn)[1]), self.cloud_height_m)
+        cloud = Cloud(self.name, float(camera_centre(drawn)[1]), self.cloud_height_m, self.draws)
         points, shift = cloud.seen_from((geometry, noise, ahead), self.correspondences, lens, drawn, poses)
         outliers = np.zeros(self.correspondences, dtype=bool)
         outliers[choice.permutation(self.correspondences)[: round(self.outlier_rate * self.correspondences)]] = True
@@ -155,7 +164,7 @@ class SyntheticScene:
         elif self.outlier_kind == "repeated":
             points[outliers] = copies(second, lens, truth, points)[outliers]
         else:
-            pixels[outliers] = random_pixels(wrong, lens, points, self.name)[outliers]
+            pixels[outliers] = random_pixels(wrong, lens, points, self.name, self.draws)[outliers]
         gravity_sd_rad = float(np.radians(self.gravity_error_deg))
         return Problem(
             name=self.name,
@@ -180,6 +189,7 @@ class SyntheticScene:
             f"gravity error {self.gravity_error_deg:g} deg" if self.gravity_error_deg else "",
             f"field of view {self.field_of_view_deg:g} deg" if self.field_of_view_deg < WHOLE_SPHERE_DEG else "",
             f"cloud {self.cloud_height_m:g} m high" if self.cloud_height_m < 2 * HALF_SIZE_M else "",
+            "normal draws" if self.draws == "normal" else "",
             "camera placed" if self.true_camera is not None else "",
             f"seed {self.seed}",
         ]
@@ -225,15 +235,16 @@ def load(table: dict[str, Any], path: Path) -> SyntheticScene:
     place = f"{where} [simulation]"
     required = {"correspondences", "outlier_rate", "noise_px", "seed"}
     numbers = {"gravity_error_deg", "field_of_view_deg", "cloud_height_m"}
-    scene_file.check_keys(simulation, required, numbers | {"outlier_kind", "true_camera"}, place)
+    scene_file.check_keys(simulation, required, numbers | {"outlier_kind", "true_camera", "draws"}, place)
     given: dict[str, Any] = {
         key: scene_file.number(simulation, key, place, *LIMITS[key])
         for key in ("outlier_rate", "noise_px", *sorted(numbers & simulation.keys()))
     }
     for key, most in (("correspondences", MOST_CORRESPONDENCES), ("seed", 2**63 - 1)):
         given[key] = scene_file.integer(simulation, key, place, int(LIMITS[key][0]), most)
-    if "outlier_kind" in simulation:
-        given["outlier_kind"] = scene_file.text(simulation, "outlier_kind", place)
+    for key in ("outlier_kind", "draws"):
+        if key in simulation:
+            given[key] = scene_file.text(simulation, key, place)
     if "true_camera" in simulation:
         given["true_camera"] = tuple(scene_file.numbers(simulation["true_camera"], (4,), "true_camera", place).tolist())
     name, bound_px = scene_file.text(table, "name", where), scene_file.bound_px(table, where)

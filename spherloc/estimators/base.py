@@ -131,6 +131,14 @@ def check_positive(options: Any) -> None:
             raise InputError(f"option {item.name} is {show(value)}; give a positive number.")
 
 
+def check_switches(options: Any) -> None:
+    """Raise ``InputError`` if a field of ``options`` whose default is true or false is neither."""
+    for item in fields(options):
+        value = getattr(options, item.name)
+        if isinstance(item.default, bool) and not isinstance(value, bool):
+            raise InputError(f"option {item.name} is {show(value)}; give true or false.")
+
+
 def outcome_faults(outcome: Any, count: int) -> list[str]:
     """What of an outcome has a form that cannot become a trace of ``count`` usable matches, in words."""
     pose = outcome.cam_from_map

@@ -8,17 +8,17 @@ import numpy as np
 
 from spherloc.bounds import Bounds
 from spherloc.consensus.inliers import BLOCK, ROWS, count_inliers, pack_blocks, reaches
-from spherloc.consensus.max_clique import max_clique
+from spherloc.consensus.max_clique import EFFORT_LIMIT, max_clique
 from spherloc.consensus.translation_balls import edges_of, overlapping, share_of_each, spread_balls
-from spherloc.consensus.yaw_arcs import YawConsensus, deepest_yaw, yaw_arcs
+from spherloc.consensus.yaw_arcs import FULL, YawConsensus, deepest_yaw, yaw_arcs
 from spherloc.errors import InputError
-from spherloc.estimators.base import Clock, Outcome, check_positive
+from spherloc.estimators.base import Clock, Outcome, check_positive, check_switches
 from spherloc.gauss_newton import Matches
 from spherloc.geometry import pose, yaw_rotation
 from spherloc.kernel_cache import kernel
-from spherloc.last_step import conclude
+from spherloc.last_step import conclude, conclude_as_printed
 from spherloc.problem import AlignedProblem
-from spherloc.refine import RefinementOptions
+from spherloc.refine import RefinementOptions, residuals_px
 from spherloc.solvers.two_point import two_point
 from spherloc.trace import Stage, TranslationStage, YawStage
 from spherloc.types import FloatArray, IndexArray
@@ -29,6 +29,10 @@ WIDEST_RAD = np.radians(60.0)
 and only raise the count everywhere. At 90 % outliers this turns 95 % success into 99 % (MEI) and costs nothing."""
 
 
+MOST_PRINTED_BALLS = 8_000
+"""Balls of Algorithm 2 as printed, whose 32 million edges take 256 MB."""
+PRINTED_EFFORT = 10 * EFFORT_LIMIT
+"""Of their maximum clique: about 2 s."""
 MOST_CORRESPONDENCES = 10_000
 """Their 50 million pairs take about a minute and 5 GB."""
 
@@ -42,12 +46,17 @@ class McOptions(RefinementOptions):
     max_balls: int = 500
     """Pairs of the rotation clique that become balls, if there are more: the smallest, and of each correspondence no
     more than its share."""
+    as_printed: bool = False
+    """Do what the paper prints, with none of what this estimator adds: arcs of any width, a ball for each pair in
+    the rotation clique, the exact maximum clique, and one least-squares fit in 6 DoF to what its pose explains
+    (Algorithm 2). The paper's bound is 8 px."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_positive(self)
         if self.max_balls != int(self.max_balls) or self.max_balls > 2000:
             raise InputError(f"option max_balls is {self.max_balls}; give a whole number up to 2000.")
+        check_switches(self)
 
 
 class MaximumConsensus:
@@ -66,26 +75,33 @@ class MaximumConsensus:
             )
         nobody = np.zeros(count, dtype=bool)
         with clock.stage("yaw", until=0.75):
-            pairs, lo, hi = yaw_arcs(aligned, bounds.radians, WIDEST_RAD, clock.watch)
+            widest_rad = FULL if options.as_printed else WIDEST_RAD
+            pairs, lo, hi = yaw_arcs(aligned, bounds.radians, widest_rad, clock.watch)
             clock.watch.begin("sweep", until=0.9)
             consensus = deepest_yaw(lo, hi, clock.watch)
         if consensus is None:
-            reason = f"No pose: none of {count * (count - 1) // 2} pairs fixes the yaw to within 60 degrees."
+            enough = "" if options.as_printed else " to within 60 degrees"
+            reason = f"No pose: none of {count * (count - 1) // 2} pairs fixes the yaw{enough}."
             return Outcome((), None, nobody, reason)
-        yaw = _yaw_stage(aligned, pairs, lo, hi, consensus, clock.watch)
+        yaw = _yaw_stage(aligned, options, pairs, lo, hi, consensus, clock.watch)
         with clock.stage("translation", until=0.99):
             translation, start = _locate(aligned, options, bounds, pairs, lo, hi, consensus, clock.watch)
         if translation is None or start is None:
             reason = "No pose: no pair in the rotation clique bounds the camera's position."
             return Outcome((yaw,), None, nobody, reason)
         with clock.stage("refinement", until=1.0):
-            refined, inliers, refinement = conclude(aligned, [start], bounds, options)
+            if options.as_printed:
+                members = residuals_px(aligned, start) <= bounds.pixels
+                refined, inliers, refinement = conclude_as_printed(aligned, start, members, bounds, options)
+            else:
+                refined, inliers, refinement = conclude(aligned, [start], bounds, options)
         stages: tuple[Stage, ...] = (yaw, translation, refinement)
         return Outcome(stages, refined, inliers)
 
 
 def _yaw_stage(
     aligned: AlignedProblem,
+    options: McOptions,
     pairs: IndexArray,
     lo: FloatArray,
     hi: FloatArray,
@@ -98,7 +114,7 @@ def _yaw_stage(
     watch.check()
     return YawStage(
         pairs_total=count * (count - 1) // 2,
-        rule="Arcs wider than 60° say too little and are left out.",
+        rule="" if options.as_printed else "Arcs wider than 60° say too little and are left out.",
         pairs=named,
         lo_rad=lo,
         hi_rad=hi,
@@ -133,13 +149,19 @@ def _locate(
 ) -> tuple[TranslationStage | None, FloatArray | None]:
     """Balls of the rotation clique, their maximum clique, and the aligned pose (3, 4) that it proposes."""
     yaw, arcs = consensus.yaw_rad, consensus.clique
-    most = int(options.max_balls)
+    if options.as_printed and len(arcs) > MOST_PRINTED_BALLS:
+        raise InputError(
+            f"option as_printed makes a ball of each of the {len(arcs):,} pairs in the rotation clique and takes up to "
+            f"{MOST_PRINTED_BALLS:,}; give fewer matches or a smaller bound_px, or as_printed=false."
+        )
+    most = len(arcs) if options.as_printed else int(options.max_balls)
     pairs, centres, radii, bounded = spread_balls(aligned, bounds.radians, (pairs, lo, hi), arcs, yaw, most, watch)
     if len(pairs) == 0:
         return None, None
     overlap = overlapping(centres, radii)
-    clique = max_clique(overlap, watch=watch)
-    start = _best_start(aligned, bounds, pairs[clique.nodes], yaw, centres[clique.nodes], radii[clique.nodes])
+    clique = max_clique(overlap, PRINTED_EFFORT if options.as_printed else EFFORT_LIMIT, watch)
+    members = pairs[clique.nodes], yaw, centres[clique.nodes], radii[clique.nodes]
+    start = _mean_start(*members[1:]) if options.as_printed else _best_start(aligned, bounds, *members)
     stage = TranslationStage(
         candidates=len(arcs),
         rule=_rule(len(pairs), bounded, len(arcs), share_of_each(len(aligned.bearings), most)),
@@ -154,6 +176,12 @@ def _locate(
     return stage, start
 
 
+def _mean_start(yaw: float, centres: FloatArray, radii: FloatArray) -> FloatArray:
+    """The aligned pose (3, 4) of a yaw and the mean of the clique's balls, weighted by radius^-2."""
+    weights, rotation = radii**-2.0, yaw_rotation(yaw)
+    return pose(rotation, -rotation @ (weights @ centres / weights.sum()))
+
+
 def _best_start(
     aligned: AlignedProblem, bounds: Bounds, pairs: IndexArray, yaw: float, centres: FloatArray, radii: FloatArray
 ) -> FloatArray:
@@ -162,8 +190,7 @@ def _best_start(
     These are its own yaw with the mean of its balls, weighted by radius^-2, and the 2P poses of its pairs: the yaw is
     only as sharp as the widest arcs allow, while some pair of the clique is sharper.
     """
-    weights = radii**-2.0
-    mean = pose(yaw_rotation(yaw), -yaw_rotation(yaw) @ (weights @ centres / weights.sum()))
+    mean = _mean_start(yaw, centres, radii)
     yaws, translations, exists = two_point(aligned.bearings[pairs], aligned.points[pairs])
     yaws, translations = np.append(yaw, yaws[exists]), np.vstack([mean[:, 3], translations[exists]])
     matches = Matches(aligned.bearings, aligned.points, aligned.pixel_from_bearing)

@@ -9,9 +9,9 @@ from spherloc.bounds import Bounds
 from spherloc.consensus.inliers import mark_each
 from spherloc.consensus.two_point_search import Scoring, TwoPointSearch, search_two_point
 from spherloc.errors import InputError, show
-from spherloc.estimators.base import Clock, Outcome, check_positive
+from spherloc.estimators.base import Clock, Outcome, check_positive, check_switches
 from spherloc.geometry import pose, yaw_rotation
-from spherloc.last_step import conclude
+from spherloc.last_step import conclude, conclude_as_printed
 from spherloc.problem import AlignedProblem
 from spherloc.refine import RefinementOptions
 from spherloc.trace import RansacStage
@@ -21,7 +21,7 @@ MOST_ITERATIONS = 100_000_000
 
 @dataclass(frozen=True)
 class RansacOptions(RefinementOptions):
-    """Options of 2P-RANSAC. The defaults are the paper's plain form."""
+    """Options of 2P-RANSAC. The defaults search as the paper does, and end with this project's own last step."""
 
     bound_px: float = 8.0
     """Reprojection error up to which a correspondence is an inlier, px (8, as OpenCV's default and the paper's)."""
@@ -36,6 +36,10 @@ class RansacOptions(RefinementOptions):
     local_optimization: bool = False
     """Fit yaw and position to the inliers of each improvement, which frees it from the noise of its two samples."""
 
+    as_printed: bool = False
+    """Do what the paper prints, with none of what this estimator adds: the last step is one least-squares fit in 6 DoF
+    to the inliers of the best sample, which does not use gravity (Algorithm 1, line 16)."""
+
     def __post_init__(self) -> None:
         super().__post_init__()
         check_positive(self)
@@ -45,8 +49,7 @@ class RansacOptions(RefinementOptions):
             raise InputError(f"option confidence is {self.confidence}; give a probability below 1.")
         if self.scoring not in get_args(Scoring):
             raise InputError(f"option scoring is {show(self.scoring)}; give one of {', '.join(get_args(Scoring))}.")
-        if not isinstance(self.local_optimization, bool):
-            raise InputError(f"option local_optimization is {show(self.local_optimization)}; give true or false.")
+        check_switches(self)
 
 
 class TwoPointRansac:
@@ -74,7 +77,11 @@ class TwoPointRansac:
             return Outcome((stage,), None, np.zeros(len(aligned.bearings), dtype=bool), reason)
         with clock.stage("refinement", until=1.0):
             start = pose(yaw_rotation(search.yaws_rad[-1]), search.translations[-1])
-            refined, inliers, refinement = conclude(aligned, [start], bounds, options)
+            if options.as_printed:
+                members = stage.inlier_masks[-1][aligned.index]
+                refined, inliers, refinement = conclude_as_printed(aligned, start, members, bounds, options)
+            else:
+                refined, inliers, refinement = conclude(aligned, [start], bounds, options)
         return Outcome((stage, refinement), refined, inliers)
 
 

@@ -17,12 +17,12 @@ import numpy as np
 
 from spherloc.bounds import Bounds
 from spherloc.errors import InputError
-from spherloc.estimators.base import Clock, Outcome, check_positive
-from spherloc.last_step import conclude
+from spherloc.estimators.base import Clock, Outcome, check_positive, check_switches
+from spherloc.last_step import conclude, conclude_as_printed
 from spherloc.metrics import ransac_success_probability
 from spherloc.problem import AlignedProblem
-from spherloc.refine import RefinementOptions, residuals_px
-from spherloc.solvers.base import Solver, solver_of
+from spherloc.refine import RefinementOptions, inlier_counts, residuals_px
+from spherloc.solvers.base import Solver, solve_each, solver_of
 from spherloc.solvers.epnp import Epnp, VirtualPinhole
 from spherloc.solvers.epropnp import EproPnp
 from spherloc.solvers.mlpnp import Mlpnp
@@ -33,11 +33,13 @@ from spherloc.types import BoolArray, FloatArray, IntArray
 from spherloc.watch import Watch
 
 MOST_ITERATIONS = 1_000_000
+BATCH = 128
+"""Samples that are solved at once."""
 
 
 @dataclass(frozen=True)
 class SolverRansacOptions(RefinementOptions):
-    """Options of the baselines. The defaults are the paper's."""
+    """Options of the baselines. The defaults search as the paper does, and end with this project's own last step."""
 
     bound_px: float = 8.0
     """Reprojection error up to which a correspondence is an inlier, px (8, as OpenCV's default and the paper's)."""
@@ -48,6 +50,9 @@ class SolverRansacOptions(RefinementOptions):
     gravity_sd_deg: float | None = np.inf
     """Standard deviation of the known roll and pitch, degrees, for the refinement: inf ignores them, as the paper's
     baselines do; None takes the problem's."""
+    as_printed: bool = False
+    """Do what the paper prints, with none of what this estimator adds: the last step is one least-squares fit in 6 DoF
+    to the inliers of the best pose (Algorithm 1, line 16)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -56,6 +61,7 @@ class SolverRansacOptions(RefinementOptions):
             raise InputError(f"option iterations is {self.iterations}; give a whole number up to {MOST_ITERATIONS:,}.")
         if self.confidence is not None and self.confidence >= 1.0:
             raise InputError(f"option confidence is {self.confidence}; give a probability below 1.")
+        check_switches(self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +122,11 @@ class SolverRansac:
         if reason:
             return Outcome((stage,), None, inlier_mask, " ".join(filter(None, (reason, _lost(view)))))
         with clock.stage("refinement", until=1.0):
-            refined, inliers, refinement = conclude(view.aligned, [found[-1].cam_from_map], view.bounds, options)
+            start, members = found[-1].cam_from_map, found[-1].mask
+            if options.as_printed:
+                refined, inliers, refinement = conclude_as_printed(view.aligned, start, members, view.bounds, options)
+            else:
+                refined, inliers, refinement = conclude(view.aligned, [start], view.bounds, options)
         inlier_mask[view.seen] = inliers
         return Outcome((stage, refinement), refined, inlier_mask, note=_lost(view))
 
@@ -133,18 +143,21 @@ class SolverRansac:
         watch.expect(len(samples))
         while drawn < len(samples) and drawn < needed:
             watch.reach(drawn)
-            sample = samples[drawn]
-            for solution in self.sampler.solve(view.bearings[sample], view.points[sample]):
-                state = view.aligned.align_pose(solution)
-                inliers, mask = _explained(view, state)
-                if inliers <= best:
+            batch = samples[drawn : drawn + BATCH]
+            solutions, places = solve_each(self.sampler, view.bearings[batch], view.points[batch])
+            states = view.aligned.align_poses(solutions)
+            counts, last = _explained_by_each(view, states), drawn
+            for k in np.flatnonzero(counts > best):
+                iteration = drawn + int(places[k])
+                if counts[k] <= best or iteration >= max(needed, last + 1):
                     continue
-                best = inliers
-                found.append(_Hypothesis(drawn, sample, state, mask))
+                best, last = int(counts[k]), iteration
+                _, mask = _explained(view, states[k])
+                found.append(_Hypothesis(iteration, samples[iteration], states[k], mask))
                 if options.confidence is not None:
-                    needed = _samples_needed(options.confidence, inliers / count, size)
+                    needed = _samples_needed(options.confidence, best / count, size)
                     watch.expect(max(1, min(len(samples), math.ceil(needed))))
-            drawn += 1
+            drawn = min(drawn + len(batch), max(last + 1, math.ceil(needed)))
         return drawn, found
 
     def _fit(self, view: _View, best: _Hypothesis) -> _Hypothesis | None:
@@ -231,6 +244,11 @@ def _lost(view: _View) -> str:
         f"{lost} of {len(view.seen)} usable correspondences {'lies' if lost == 1 else 'lie'} outside the virtual "
         f"camera's {VirtualPinhole().fov_deg:g} degrees."
     )
+
+
+def _explained_by_each(view: _View, cam_from_map: FloatArray) -> IntArray:
+    """How many correspondences each of P poses (P, 3, 4) explains: (P,)."""
+    return inlier_counts(view.aligned, cam_from_map, view.bounds.noise_px)
 
 
 def _explained(view: _View, cam_from_map: FloatArray) -> tuple[int, BoolArray]:

@@ -36,7 +36,7 @@ AXES: Mapping[str, str] = {
 """What a sweep can go over, and its name for people."""
 
 MOST_VALUES, MOST_ENTRANTS, MOST_RUNS, MOST_ROWS = 200, 20, 100_000, 2_000_000
-FORMAT = 1
+FORMAT = 2
 
 
 @dataclass(frozen=True)

@@ -32,6 +32,8 @@ class SweepRow:
     """Angle between true and estimated rotation, degrees; None without a pose."""
     translation_error_m: float | None
     """Distance between true and estimated camera position, metres; None without a pose."""
+    t_error_m: float | None
+    """|t_true - t| of the poses, metres: the paper's error (Sec. VI-A); None without a pose."""
     time_ms: float
     """Wall time of the estimator."""
     inliers: int
@@ -62,6 +64,7 @@ def row_of(trace: Trace, label: str, value: float) -> SweepRow:
         success=bool(metrics.success),
         rotation_error_deg=metrics.rotation_error_deg,
         translation_error_m=metrics.translation_error_m,
+        t_error_m=metrics.t_error_m,
         time_ms=float(trace.timings_ms["total"]),
         inliers=int(np.count_nonzero(trace.inlier_mask)),
         correspondences=len(trace.problem),
@@ -76,7 +79,9 @@ def row_of(trace: Trace, label: str, value: float) -> SweepRow:
 
 def lost_row(label: str, value: float, seed: int, time_ms: float, correspondences: int) -> SweepRow:
     """The row of a run that ended without a trace."""
-    return SweepRow(label, value, seed, False, None, None, time_ms, 0, correspondences, 0.0, 0.0, 0.0, None, None, None)
+    return SweepRow(
+        label, value, seed, False, None, None, None, time_ms, 0, correspondences, 0.0, 0.0, 0.0, None, None, None
+    )
 
 
 def _truth(text: str) -> bool:

@@ -8,7 +8,7 @@ import numpy as np
 from spherloc import registry
 from spherloc.errors import InputError, ProblemError, show
 from spherloc.geometry import pose
-from spherloc.types import FloatArray
+from spherloc.types import BoolArray, FloatArray, IntArray
 
 NO_POSES = np.empty((0, 3, 4))
 """What a solver returns that has found none."""
@@ -48,6 +48,30 @@ def checked(solver: Solver, bearings: FloatArray, points: FloatArray) -> tuple[F
     if solver.pinhole and not (bearings[:, 2] > 0.0).all():
         raise ProblemError(f"{solver.name}: a bearing has z <= 0, which no pinhole sees; leave it out.")
     return bearings, points
+
+
+Many = tuple[FloatArray, IntArray]
+"""Poses (P, 3, 4), cam_from_map, and the sample (P,) that each is a solution of, ascending."""
+
+
+def solve_each(solver: Solver, bearings: FloatArray, points: FloatArray) -> Many:
+    """The solver's poses of each of B samples: ``bearings`` (B, K, 3) and ``points`` (B, K, 3), metres.
+
+    A solver may have a method ``solve_each`` that does the same at once, for a fraction of the time.
+    """
+    at_once = getattr(solver, "solve_each", None)
+    if at_once is not None:
+        return at_once(bearings, points)
+    found = [solver.solve(one, some) for one, some in zip(bearings, points, strict=True)]
+    sample = np.repeat(np.arange(len(found)), [len(solutions) for solutions in found])
+    return np.concatenate([NO_POSES, *found]), sample
+
+
+def poses_of_samples(rotations: FloatArray, translations: FloatArray, exists: BoolArray) -> Many:
+    """One pose a sample from R (B, 3, 3) and t (B, 3) where it ``exists`` (B,) and all its numbers are finite."""
+    found = np.concatenate([rotations, translations[:, :, None]], axis=2)
+    sample = np.flatnonzero(exists & np.isfinite(found).all(axis=(1, 2)))
+    return found[sample], sample
 
 
 def poses(rotation: FloatArray, translation: FloatArray) -> FloatArray:

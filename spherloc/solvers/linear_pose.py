@@ -6,7 +6,8 @@ origin and the unit of the map do not matter. Functions that find nothing return
 
 import numpy as np
 
-from spherloc.types import FloatArray
+from spherloc.geometry import tangent_basis
+from spherloc.types import BoolArray, FloatArray
 
 DEGENERATE = 1e-9
 """Singular values below this, relative to the largest, are zero: several poses would solve the system."""
@@ -25,6 +26,19 @@ def condition(points: FloatArray) -> tuple[FloatArray, FloatArray, float] | None
 def projectors(bearings: FloatArray) -> FloatArray:
     """I - v v^T (K, 3, 3) of each bearing: it keeps what is orthogonal to v, and |(I - v v^T) x| = |v x x|."""
     return np.eye(3) - bearings[:, :, None] * bearings[:, None, :]
+
+
+def condition_each(points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
+    """``condition`` for each of B sets of points (B, K, 3): points, means (B, 3), scales (B,), and which exist (B,).
+
+    Where all points of a set coincide, they are only moved.
+    """
+    middle = points.mean(axis=1)
+    moved = points - middle[:, None]
+    size = np.sqrt(np.einsum("bki,bki->bk", moved, moved).mean(axis=1))
+    exists = size > 1e-12 * (1.0 + np.abs(middle).max(axis=1))
+    scale = 1.0 / np.where(exists, size, 1.0)
+    return moved * scale[:, None, None], middle, scale, exists
 
 
 def null_matrix(projector: FloatArray, coordinates: FloatArray) -> FloatArray | None:
@@ -59,13 +73,31 @@ def translation_given(rotation: FloatArray, projector: FloatArray, points: Float
     return -np.linalg.solve(normal, np.einsum("nij,nj->i", projector, points @ rotation.T))
 
 
-def linear_pose(
-    bearings: FloatArray, projector: FloatArray, points: FloatArray
-) -> tuple[FloatArray, FloatArray] | None:
-    """R and t by the direct linear transform: null vector, rotation, translation."""
-    matrix = null_matrix(projector, points)
-    if matrix is None:
-        return None
-    rotation = nearest_rotation(facing(matrix, bearings, points)[:, :3])
-    translation = None if rotation is None else translation_given(rotation, projector, points)
-    return None if rotation is None or translation is None else (rotation, translation)
+def linear_poses(bearings: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """R (B, 3, 3) and t (B, 3) by the direct linear transform (null vector, rotation, translation), and which exist.
+
+    ``bearings`` (B, K, 3) are unit vectors, ``points`` (B, K, 3) conditioned. The two rows of a correspondence are
+    those of its tangents n: n . (A p + b) = 0. What does not exist is the identity and zero.
+    """
+    samples, count = points.shape[:2]
+    tangents = tangent_basis(bearings.reshape(-1, 3)).reshape(samples, count, 2, 3)
+    known = np.concatenate([points, np.ones((samples, count, 1))], axis=2)
+    system = (tangents[:, :, :, :, None] * known[:, :, None, None, :]).reshape(samples, 2 * count, 12)
+    stretch, right = np.linalg.svd(system, full_matrices=False)[1:]
+    exists = stretch[:, -2] > DEGENERATE * stretch[:, 0]
+    matrices = right[:, -1].reshape(samples, 3, 4)
+    rays = np.einsum("bij,bkj->bki", matrices[:, :, :3], points) + matrices[:, None, :, 3]
+    ahead = np.count_nonzero(np.einsum("bki,bki->bk", rays, bearings) > 0.0, axis=1)
+    matrices = np.where((2 * ahead >= count)[:, None, None], matrices, -matrices)
+    left, stretch, right = np.linalg.svd(matrices[:, :, :3])
+    rotations = left @ right
+    exists &= (np.linalg.det(rotations) > 0.0) & (stretch[:, 1] > DEGENERATE * stretch[:, 0])
+    projector = projectors(bearings.reshape(-1, 3)).reshape(samples, count, 3, 3)
+    normal = projector.sum(axis=1)
+    exists &= np.linalg.det(normal) > DEGENERATE * count**3
+    rotations[~exists], normal[~exists] = np.eye(3), np.eye(3)
+    turned = np.einsum("bij,bkj->bki", rotations, points)
+    moment = np.einsum("bkij,bkj->bi", projector, turned)
+    translations = -np.linalg.solve(normal, moment[:, :, None])[:, :, 0]
+    translations[~exists] = 0.0
+    return rotations, translations, exists

@@ -21,18 +21,19 @@ import numpy as np
 from spherloc.gauss_newton import turn
 from spherloc.geometry import tangent_basis
 from spherloc.kernel_cache import kernel
-from spherloc.solvers.base import NO_POSES, checked, poses
+from spherloc.small_arrays import copy_matrix, copy_vector
+from spherloc.solvers.base import Many, checked, poses_of_samples
 from spherloc.solvers.linear_pose import (
     DEGENERATE,
-    condition,
+    condition_each,
     facing,
-    linear_pose,
+    linear_poses,
     nearest_rotation,
     null_matrix,
     projectors,
     translation_given,
 )
-from spherloc.types import FloatArray
+from spherloc.types import BoolArray, FloatArray
 
 PLANAR = 0.02
 """Points whose smallest spread is below this share of the largest are treated as a plane."""
@@ -51,25 +52,34 @@ class Mlpnp:
     def solve(self, bearings: FloatArray, points: FloatArray) -> FloatArray:
         """See ``Solver.solve``; at most one pose."""
         bearings, points = checked(self, bearings, points)
-        conditioned = condition(points)
-        if conditioned is None:
-            return NO_POSES
-        points, middle, scale = conditioned
-        start = _linear_start(bearings, points)
-        if start is None:
-            return NO_POSES
-        rotation, translation = refine_on_tangents(tangent_basis(bearings), points, *start)
-        return poses(rotation, translation / scale - rotation @ middle)
+        return self.solve_each(bearings[None], points[None])[0]
+
+    def solve_each(self, bearings: FloatArray, points: FloatArray) -> Many:
+        """See ``solvers.base.solve_each``; at most one pose a sample."""
+        points, middle, scale, exists = condition_each(points)
+        rotations, translations, solved = _linear_starts(bearings, points)
+        exists &= solved
+        tangents = tangent_basis(bearings.reshape(-1, 3)).reshape(*bearings.shape[:2], 2, 3)
+        refine_each(tangents, np.ascontiguousarray(points), rotations, translations, exists)
+        translations = translations / scale[:, None] - np.einsum("bij,bj->bi", rotations, middle)
+        return poses_of_samples(rotations, translations, exists)
 
 
-def _linear_start(bearings: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray] | None:
-    """R and t of the linear system that suits the shape of the conditioned points."""
-    spread2, axes = np.linalg.eigh(points.T @ points)
-    if spread2[1] <= DEGENERATE * spread2[2]:
-        return None  # on a line, about which any turn is as good
-    if spread2[0] <= PLANAR**2 * spread2[2]:
-        return _planar_pose(bearings, projectors(bearings), points, axes[:, ::-1])
-    return linear_pose(bearings, projectors(bearings), points)
+def _linear_starts(bearings: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """R (B, 3, 3), t (B, 3) and which exist (B,), of the linear system that suits the shape of the conditioned points.
+
+    ``bearings`` and ``points`` are (B, K, 3).
+    """
+    spread2, axes = np.linalg.eigh(np.einsum("bki,bkj->bij", points, points))
+    rotations, translations, exists = linear_poses(bearings, points)
+    for sample in np.flatnonzero(spread2[:, 0] <= PLANAR**2 * spread2[:, 2]):
+        one, some = bearings[sample], points[sample]
+        found = _planar_pose(one, projectors(one), some, axes[sample][:, ::-1])
+        exists[sample] = found is not None
+        if found is not None:
+            rotations[sample], translations[sample] = found
+    exists &= spread2[:, 1] > DEGENERATE * spread2[:, 2]  # on a line, about which any turn is as good
+    return rotations, translations, exists
 
 
 def _planar_pose(
@@ -93,6 +103,20 @@ def _planar_pose(
     rotation = turned @ frame.T
     translation = translation_given(rotation, projector, points)
     return None if translation is None else (rotation, translation)
+
+
+@kernel()
+def refine_each(basis, points, rotations, translations, exists):
+    """``refine_on_tangents`` of each of B samples that ``exists`` (B,), in place of the poses (B, 3, 3) and (B, 3).
+
+    ``basis`` (B, K, 2, 3), ``points`` (B, K, 3).
+    """
+    for sample in range(len(points)):
+        if exists[sample]:
+            start, moved = rotations[sample].copy(), translations[sample].copy()
+            rotation, translation = refine_on_tangents(basis[sample], points[sample], start, moved)
+            copy_matrix(rotation, rotations[sample])
+            copy_vector(translation, translations[sample])
 
 
 @kernel()

@@ -13,8 +13,10 @@ Abdel-Aziz, Karara: Direct linear transformation from comparator coordinates int
 close-range photogrammetry, 1971. Conditioning: Hartley, In defense of the eight-point algorithm, PAMI 1997.
 """
 
-from spherloc.solvers.base import NO_POSES, checked, poses
-from spherloc.solvers.linear_pose import condition, linear_pose, projectors
+import numpy as np
+
+from spherloc.solvers.base import Many, checked, poses_of_samples
+from spherloc.solvers.linear_pose import condition_each, linear_poses
 from spherloc.types import FloatArray
 
 
@@ -28,12 +30,11 @@ class Svd:
     def solve(self, bearings: FloatArray, points: FloatArray) -> FloatArray:
         """See ``Solver.solve``; at most one pose."""
         bearings, points = checked(self, bearings, points)
-        conditioned = condition(points)
-        if conditioned is None:
-            return NO_POSES
-        points, middle, scale = conditioned
-        found = linear_pose(bearings, projectors(bearings), points)
-        if found is None:
-            return NO_POSES
-        rotation, translation = found
-        return poses(rotation, translation / scale - rotation @ middle)
+        return self.solve_each(bearings[None], points[None])[0]
+
+    def solve_each(self, bearings: FloatArray, points: FloatArray) -> Many:
+        """See ``solvers.base.solve_each``; at most one pose a sample."""
+        conditioned, middle, scale, exists = condition_each(points)
+        rotations, translations, solved = linear_poses(bearings, conditioned)
+        translations = translations / scale[:, None] - np.einsum("bij,bj->bi", rotations, middle)
+        return poses_of_samples(rotations, translations, exists & solved)

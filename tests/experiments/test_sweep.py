@@ -208,7 +208,7 @@ def test_workers_that_cannot_start_end_in_a_sentence(tmp_path: Path) -> None:
         ({"entrants": ()}, "has 0 estimators"),
         ({"entrants": (Entrant("magic"),)}, "'magic': choose one of"),
         ({"entrants": (QUICK[0], QUICK[0])}, "'ransac-2p iterations=20' twice"),
-        ({"entrants": (Entrant("mc", (("magic", 1),)),)}, "mc has no option 'magic'; it has bound_px"),
+        ({"entrants": (Entrant("mc", (("magic", 1),)),)}, "mc has no option 'magic'; it has as_printed, bound_px"),
         ({"entrants": (Entrant("mc", (("bound_px", -1.0),)),)}, "bound_px is -1.0"),
         ({"runs": 0}, "has 0 runs a point"),
         ({"runs": 100_000, "values": [k / 100 for k in range(99)]}, "runs in all; ask for 2,000,000 or fewer"),

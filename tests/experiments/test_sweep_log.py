@@ -99,7 +99,7 @@ def test_damage_is_one_sentence(tmp_path: Path) -> None:
     header, first, second = good.splitlines(keepends=True)
     for text, said in (
         (first + second, "line 1: is not the heading"),
-        (header + "a,b\n" + second, "line 2: has 2 cells, not 15"),
+        (header + "a,b\n" + second, "line 2: has 2 cells, not 16"),
         (header + first.replace("true", "yes").replace("false", "yes"), "line 2: has 'yes' for success"),
         (header + first + second.replace("0.5", "0.6", 1), "line 3: holds 'mc-exact' at 0.6, seed 3, no run of this"),
         (header + first + first, "holds a run twice"),
@@ -175,7 +175,7 @@ def test_any_line_is_a_row_or_a_sentence(line: str) -> None:
         assert str(error).startswith("here: ")
 
 
-BASE = SweepRow("mc", 0.5, 0, True, 0.1, 0.01, 5.0, 9, 30, 1.0, 0.5, 2 / 3, None, None, None)
+BASE = SweepRow("mc", 0.5, 0, True, 0.1, 0.01, 0.01, 5.0, 9, 30, 1.0, 0.5, 2 / 3, None, None, None)
 
 
 def test_a_point_is_what_its_runs_come_to(tmp_path: Path) -> None:

@@ -1,0 +1,216 @@
+"""The paper's simulations (Sec. VI-A) as sweeps, and the methods that take part in them.
+
+A method is named as in the paper where it does what is printed (``as_printed``, a bound of 8 px), and as the
+estimator is called here where it is this project's own form of it.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from spherloc.datasets import scene_path
+from spherloc.datasets.variation import Variation
+from spherloc.experiments.sweep_plan import Entrant, SweepPlan, planned
+
+BOUND_PX = 8.0
+"""The paper's bound of an inlier (Sec. VI-B)."""
+
+
+def _printed(estimator: str, bound_px: float = BOUND_PX, **options: float) -> Entrant:
+    return Entrant(estimator, (("as_printed", True), ("bound_px", bound_px), *options.items()))
+
+
+def _own(estimator: str, **options: float) -> Entrant:
+    return Entrant(estimator, tuple(options.items()))
+
+
+METHODS: Mapping[str, Entrant] = {
+    "MC": _printed("mc"),
+    "MC 3px": _printed("mc", 3.0),
+    "2P100": _printed("ransac-2p", iterations=100),
+    "2P1k": _printed("ransac-2p", iterations=1000),
+    "2P10k": _printed("ransac-2p", iterations=10_000),
+    "SVD100": _printed("ransac-svd", iterations=100),
+    "SVD10k": _printed("ransac-svd", iterations=10_000),
+    "ML100": _printed("ransac-mlpnp", iterations=100),
+    "ML1k": _printed("ransac-mlpnp", iterations=1000),
+    "ML10k": _printed("ransac-mlpnp", iterations=10_000),
+    "R+EPnP": _printed("ransac-epnp", iterations=10_000),
+    "R+EPro": _printed("ransac-epropnp", iterations=10_000),
+    "R+oDLT": _printed("ransac-odlt", iterations=10_000),
+    "mc": _own("mc"),
+    "mc 8px": _own("mc", bound_px=BOUND_PX),
+    "mc-exact": _own("mc-exact"),
+    "mc-exact 8px": _own("mc-exact", bound_px=BOUND_PX),
+    "ransac-2p 100": _own("ransac-2p", iterations=100),
+    "ransac-2p 1k": _own("ransac-2p", iterations=1000),
+    "ransac-2p 10k": _own("ransac-2p", iterations=10_000),
+    "ransac-svd 100": _own("ransac-svd", iterations=100),
+    "ransac-mlpnp 100": _own("ransac-mlpnp", iterations=100),
+}
+"""Every method by its name on the page. R+EPro is EPro-PnP's solver alone: its learned weights are not public for
+these matches, so all weights are equal."""
+
+CAMERAS: Mapping[str, str] = {
+    "MEI": "mei_outliers_80",
+    "Kannala-Brandt": "fisheye_outliers_80",
+    "equirectangular": "panorama_outliers_80",
+}
+"""The camera models of Sec. IV-B, and the bundled scene that each is taken from. The paper simulates the first."""
+NORMAL = "MEI, normal draws"
+"""The first camera, with coordinates drawn from a standard normal distribution, as Sec. VI-A says too."""
+SCENES: Mapping[str, str] = CAMERAS | {NORMAL: "mei_normal_draws"}
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """A sweep for each of some cameras."""
+
+    key: str
+    """In file names."""
+    place: str
+    """In the paper."""
+    over: str
+    """What it goes over, a key of ``AXES``."""
+    values: tuple[float, ...]
+    """Ascending."""
+    correspondences: int
+    """N; where the sweep goes over it, not used."""
+    methods: tuple[str, ...]
+    """Keys of ``METHODS``."""
+    runs: int
+    """Problems a point."""
+    quick_values: tuple[float, ...]
+    """Those of the values that the quick form keeps."""
+    quick_runs: int
+    """Problems a point in the quick form."""
+    cameras: tuple[str, ...] = tuple(CAMERAS)
+    """Keys of ``SCENES``."""
+    settings: Mapping[str, float] = field(default_factory=dict)
+    """What else is set of the simulation."""
+    quick_leaves_out: tuple[str, ...] = ()
+    """Methods that are too slow for the quick form."""
+
+    def plan(self, camera: str, quick: bool = False) -> SweepPlan:
+        """The sweep through a camera, a key of ``SCENES``. Raises ``InputError`` if it is impossible."""
+        changes = dict(self.settings)
+        if self.over != "correspondences":
+            changes["correspondences"] = self.correspondences
+        return planned(
+            scene_path(Path(SCENES[camera])),
+            self.over,
+            self.quick_values if quick else self.values,
+            [METHODS[name] for name in self.taking_part(quick)],
+            self.quick_runs if quick else self.runs,
+            Variation(**changes),
+        )
+
+    def taking_part(self, quick: bool = False) -> tuple[str, ...]:
+        """The methods, keys of ``METHODS``."""
+        return tuple(name for name in self.methods if not (quick and name in self.quick_leaves_out))
+
+
+def _steps(first: float, last: float, step: float) -> tuple[float, ...]:
+    return tuple(round(first + k * step, 10) for k in range(round((last - first) / step) + 1))
+
+
+_SLOW = ("SVD10k", "ML10k", "R+EPnP", "R+EPro", "R+oDLT")
+_CASE = ("MC", "2P1k", "2P10k", "SVD10k", "ML10k", "R+EPro", "R+EPnP", "R+oDLT", "mc", "mc-exact")
+
+CASES: Mapping[str, tuple[int, int]] = {"case1": (13, 52), "case2": (9, 42), "case3": (28, 130)}
+"""Table VI: right matches and all matches of its three experiments."""
+
+
+def _case(key: str, right: int, count: int) -> Experiment:
+    return Experiment(
+        key=key,
+        place="Table VI",
+        over="correspondences",
+        values=(float(count),),
+        correspondences=count,
+        methods=_CASE,
+        runs=100,
+        quick_values=(float(count),),
+        quick_runs=5,
+        cameras=("Kannala-Brandt",),
+        settings={"outlier_rate": (count - right) / count, "noise_px": 3.0},
+        quick_leaves_out=_SLOW,
+    )
+
+
+EXPERIMENTS: Sequence[Experiment] = (
+    Experiment(
+        key="fig5",
+        place="Fig. 5",
+        over="noise_px",
+        values=_steps(0, 10, 1),
+        correspondences=100,
+        methods=(
+            *("MC", "MC 3px", "2P100", "SVD100", "ML100"),
+            *("mc 8px", "mc-exact 8px", "ransac-2p 100", "ransac-svd 100", "ransac-mlpnp 100"),
+        ),
+        runs=100,
+        quick_values=(0.0, 1.0, 4.0),
+        quick_runs=5,
+        settings={"outlier_rate": 0.0},
+    ),
+    Experiment(
+        key="fig6",
+        place="Fig. 6",
+        over="outlier_rate",
+        values=_steps(0.0, 0.9, 0.1),
+        correspondences=100,
+        methods=(
+            *("MC", "MC 3px", "2P100", "2P1k", "SVD100", "ML100", "ML1k"),
+            *("mc", "mc-exact", "ransac-2p 100", "ransac-2p 1k"),
+        ),
+        runs=100,
+        quick_values=(0.3, 0.5, 0.8, 0.9),
+        quick_runs=8,
+        settings={"noise_px": 1.0},
+    ),
+    Experiment(
+        key="fig7",
+        place="Fig. 7",
+        over="outlier_rate",
+        values=_steps(0.9, 0.95, 0.01),
+        correspondences=200,
+        methods=(
+            *("MC", "MC 3px", "2P1k", "2P10k", "SVD10k", "ML10k"),
+            *("mc", "mc-exact", "ransac-2p 1k", "ransac-2p 10k"),
+        ),
+        runs=100,
+        quick_values=(0.9, 0.95),
+        quick_runs=8,
+        settings={"noise_px": 1.0},
+        quick_leaves_out=_SLOW,
+    ),
+    Experiment(
+        key="fig6-normal",
+        place="Fig. 6, with normal draws",
+        over="outlier_rate",
+        values=_steps(0.0, 0.9, 0.1),
+        correspondences=100,
+        methods=("MC", "MC 3px", "2P100", "2P1k", "mc", "mc-exact"),
+        runs=100,
+        quick_values=(0.5, 0.9),
+        quick_runs=5,
+        cameras=(NORMAL,),
+        settings={"noise_px": 1.0},
+    ),
+    Experiment(
+        key="fig7-normal",
+        place="Fig. 7, with normal draws",
+        over="outlier_rate",
+        values=_steps(0.9, 0.95, 0.01),
+        correspondences=200,
+        methods=("MC", "MC 3px", "2P1k", "2P10k", "mc", "mc-exact"),
+        runs=100,
+        quick_values=(0.9, 0.95),
+        quick_runs=5,
+        cameras=(NORMAL,),
+        settings={"noise_px": 1.0},
+    ),
+    *(_case(key, right, count) for key, (right, count) in CASES.items()),
+)
+"""In the order in which they are run: what the page needs most comes first."""

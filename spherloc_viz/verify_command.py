@@ -1,0 +1,119 @@
+"""``spherloc verify``: the paper's simulations, its claims, and a page that says which hold."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+from spherloc.errors import InputError, reason
+from spherloc.experiments.sweep import run_sweep
+from spherloc.experiments.sweep_log import SweepLog
+from spherloc.experiments.sweep_plan import SweepPlan
+from spherloc.experiments.sweep_rows import SweepRow
+from spherloc.verification.claims import CLAIMS, Checked, check
+from spherloc.verification.experiments import EXPERIMENTS, Experiment
+from spherloc.verification.measured import Measured
+from spherloc.warm_up import warm_up
+from spherloc_viz.progress import progress, say
+from spherloc_viz.verification_page import verification_page
+from spherloc_viz.verification_plots import FIGURES, figure_svg
+
+PAGE, RESULTS, RUNS = "index.md", "claims.json", "runs"
+
+
+def verify(output: Path, quick: bool, workers: int, scheduler: str | None, only: Sequence[str] = ()) -> int:
+    """Do the runs that ``output`` has not got, and write the page; returns the exit code, which is 0.
+
+    ``only`` are keys of experiments; all if there are none. Raises ``InputError`` for one that does not exist, and for
+    whatever makes the runs or the page impossible.
+    """
+    experiments = _chosen(only)
+    plans = {
+        (experiment.key, camera): experiment.plan(camera, quick)
+        for experiment in experiments
+        for camera in experiment.cameras
+    }
+    total = sum(plan.rows for plan in plans.values())
+    say(f"{total:,} runs → {output}. Ctrl-C stops them; the same command goes on.")
+    if scheduler is None:
+        warm_up(say, {entrant.estimator for plan in plans.values() for entrant in plan.entrants})
+    rows: dict[tuple[str, str], list[SweepRow]] = {}
+    for place, (key, plan) in enumerate(plans.items(), 1):
+        title = f"{key[0]}, {key[1]} ({place} of {len(plans)})"
+        rows[key] = _runs(output / RUNS / f"{_file_name(*key)}.csv", title, plan, workers, scheduler)
+    measured = Measured(rows)
+    checked = [check(claim, measured) for claim in CLAIMS]
+    _write(output, measured, checked, plans, quick)
+    for item in checked:
+        say(_line(item))
+    print(f"written to {output / PAGE}, {RESULTS} and figures", flush=True)
+    return 0
+
+
+def _chosen(only: Sequence[str]) -> list[Experiment]:
+    known = [experiment.key for experiment in EXPERIMENTS]
+    for key in only:
+        if key not in known:
+            raise InputError(f"there is no experiment {key!r}; choose from {', '.join(known)}.")
+    return [experiment for experiment in EXPERIMENTS if not only or experiment.key in only]
+
+
+def _file_name(experiment: str, camera: str) -> str:
+    return f"{experiment}_{camera.lower().replace(', ', '_').replace(' ', '_')}"
+
+
+def _runs(path: Path, title: str, plan: SweepPlan, workers: int, scheduler: str | None) -> list[SweepRow]:
+    """All rows of a plan: those of earlier times, and those that are done now."""
+    with SweepLog(path, plan) as log:
+        left = plan.rows - log.done_of_plan()
+        if left:
+            say(f"{title}: {left:,} runs")
+            try:
+                with progress(left, "runs") as advance:
+                    for row in run_sweep(plan, log.done, workers, scheduler, warn=say):
+                        log.append(row)
+                        advance(title)
+            except KeyboardInterrupt:
+                say("stopped; what is done is kept, and the same command goes on from there.")
+                raise
+            log.finish()
+        return list(log.rows)
+
+
+def _line(item: Checked) -> str:
+    condition = f" {item.condition}" if item.condition else ""
+    return f"{item.claim.place}: {item.claim.sentence} {item.verdict.value.upper()}{condition}"
+
+
+def _write(
+    output: Path,
+    measured: Measured,
+    checked: Sequence[Checked],
+    plans: dict[tuple[str, str], SweepPlan],
+    quick: bool,
+) -> None:
+    files: dict[str, str] = {}
+    for (experiment, camera), plan in plans.items():
+        if experiment in FIGURES:
+            files[f"{_file_name(experiment, camera)}.svg"] = figure_svg(experiment, camera, plan.over, measured)
+    pictures = {key: f"{_file_name(*key)}.svg" for key in plans if key[0] in FIGURES}
+    files[PAGE] = verification_page(checked, measured, plans, pictures, quick)
+    files[RESULTS] = json.dumps([_record(item) for item in checked], indent=1) + "\n"
+    for name, text in files.items():
+        path = output / name
+        try:
+            path.write_text(text, encoding="utf-8")
+        except OSError as error:
+            raise InputError(f"{path}: cannot be written ({reason(error)}); give another --output.") from None
+
+
+def _record(item: Checked) -> dict[str, object]:
+    return {
+        "key": item.claim.key,
+        "place": item.claim.place,
+        "claim": item.claim.sentence,
+        "paper": item.claim.paper,
+        "verdict": item.verdict.value,
+        "condition": item.condition,
+        "as_printed": None if item.printed is None else item.printed.ours,
+        "under_the_condition": None if item.other is None else item.other.ours,
+    }
