@@ -4,6 +4,7 @@ import contextlib
 import io
 import os
 import sys
+from collections.abc import Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any
@@ -98,9 +99,9 @@ def run(
 
 @app.command
 def localize(
-    scene: Positional[Path],
+    scenes: Positional[tuple[Path, ...]],
     /,
-    estimator: str = "mc",
+    estimator: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], arg(metavar="NAME[,OPTION=VALUE...]")] = (),
     seed: int = 0,
     option: Settings = (),
     queries: Annotated[tuple[str, ...], arg(metavar="NAME|FIRST:LAST:STEP ...")] = (),
@@ -110,13 +111,14 @@ def localize(
     keep_gigabytes: float = KEEP_GIGABYTES,
     retry_failed: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
 ) -> int:
-    """Localize a sequence of query images against a map.
+    """Localize a sequence of query images against a map, or compare estimators on several.
 
     Every finished query is safe in the output folder at once: stop it when you like, the same command goes on. The
     folder gets results.csv and results.jsonl (a row a query), trajectory.tum and truth.tum (camera poses in the map),
-    trajectory.png (coloured by error), summary.json (success rates at the scene's limits), configuration.json, and
-    a recording of each query. Ends with 0 if every query is localized, 1 if one is doubtful or has no pose, 2 if an
-    input is wrong.
+    trajectory.png (coloured by error), summary.json (success rates at the scene's limits, ATE, RPE),
+    configuration.json, and a recording of each query. Several scenes or estimators have a folder each in it, and get
+    comparison.csv and .md and a picture a scene with all trajectories. Ends with 0 if every query is localized, 1 if
+    one is doubtful or has no pose, 2 if an input is wrong.
 
     For example:
 
@@ -126,14 +128,17 @@ def localize(
 
     spherloc localize my_scene.toml --queries left/0001.png left/0002.png --no-record
 
+    spherloc localize day.toml night.toml --estimator mc --estimator ransac-2p,iterations=100 --output results/both
+
     Args:
-        scene: Scene file (TOML) with query and reference images, or a bundled scene's name; spherloc scenes lists
+        scenes: Scene files (TOML) with query and reference images, or names of bundled scenes; spherloc scenes lists
             them and the kinds.
-        estimator: mc (deterministic maximum consensus), mc-exact or another one; a wrong name lists them all.
+        estimator: mc (deterministic maximum consensus) if not given, mc-exact or another one, with options after
+            commas; a wrong name lists them all. Give it once for each.
         seed: Seed of the estimator, the same for every query.
-        option: Options of the estimator, such as bound_px=4; none and inf are values where they make sense.
+        option: Options of all estimators, such as bound_px=4; none and inf are values where they make sense.
         queries: Only these: names, or places counted from 0, the last one not included; all if not given.
-        output: Folder of the results; recordings/SCENE_ESTIMATOR_SEED if not given.
+        output: Folder of the results; recordings/SCENE_ESTIMATOR_SEED if not given, or recordings/comparison_SEED.
         record: Write a recording of each query.
         recordings: Folder of the recordings; a folder of that name in the output folder if not given.
         keep_gigabytes: What the recordings may take; beyond it the oldest successes that nobody labelled are deleted.
@@ -141,18 +146,35 @@ def localize(
     """
     from spherloc.datasets.scene_file import check_there, scene_path
 
-    scene = scene_path(scene)
-    check_there(scene)
+    paths = [scene_path(scene) for scene in scenes]
+    if not paths:
+        raise InputError("no scene given; name one or more scene files or bundled scenes, such as street_fisheye.")
+    for path in paths:
+        check_there(path)
     from spherloc_viz.batch import Records
-    from spherloc_viz.localize import localize_sequence
+    from spherloc_viz.localize import Solving, compare_sequences, localize_sequence
 
-    folder = output or RECORDINGS / f"{scene.stem}_{estimator}_{seed}"
-    kept = Records(recordings or folder / "recordings", keep_gigabytes=keep_gigabytes) if record else None
+    def solving(name: str, folder: Path) -> Solving:
+        kept = Records(recordings or folder / "recordings", keep_gigabytes=keep_gigabytes) if record else None
+        return Solving(*_name_and_options(name, option), folder, kept)
+
+    names = estimator or ("mc",)
     try:
-        return localize_sequence(scene, estimator, seed, list(chain(*option)), queries, folder, kept, retry_failed)
+        if len(paths) == len(names) == 1:
+            folder = output or RECORDINGS / f"{paths[0].stem}_{names[0]}_{seed}"
+            return localize_sequence(paths[0], [solving(names[0], folder)], seed, queries, retry_failed)
+        base = output or RECORDINGS / f"comparison_{seed}"
+        each = {path: [solving(name, base / path.stem / name) for name in names] for path in paths}
+        return compare_sequences(each, seed, queries, retry_failed, base)
     except KeyboardInterrupt:
         # Without waiting for the thread that matches the next query; all that is done is on the disk.
         os._exit(INTERRUPTED)
+
+
+def _name_and_options(text: str, common: Sequence[Sequence[str]]) -> tuple[str, tuple[str, ...]]:
+    """The estimator of "NAME,OPTION=VALUE", and its options with those of all estimators before them."""
+    name, *options = text.split(",")
+    return name, (*chain(*common), *options)
 
 
 @app.command
@@ -388,6 +410,9 @@ def check_proof(file: Positional[Path], /) -> int:
 def verify(
     quick: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
     only: Annotated[tuple[str, ...], arg(metavar="EXPERIMENT ...")] = (),
+    kitti360: OptionalPath = None,
+    newer_college: OptionalPath = None,
+    matterport360: OptionalPath = None,
     workers: int = 2,
     scheduler: OptionalText = None,
     output: OptionalPath = None,
@@ -395,7 +420,7 @@ def verify(
     """Check the paper's claims: run its simulations and write a page that says which reproduce.
 
     About an hour on two cores, two minutes with --quick. Stop it when you like: the same command goes on. Writes
-    index.md, figures, claims.json and a CSV of all runs.
+    index.md, figures, claims.json and a CSV of all runs. The tables on real images take your copies of the datasets.
 
     For example:
 
@@ -403,9 +428,14 @@ def verify(
 
     spherloc verify --only fig6 fig7 --workers 8
 
+    spherloc verify --kitti360 ~/KITTI-360 --matterport360 ~/Matterport360
+
     Args:
         quick: Few problems at few points, without the slowest methods.
-        only: Only these experiments, such as fig6; a wrong name lists them all.
+        only: Only these experiments, such as fig6, or datasets, such as kitti360; a wrong name lists them all.
+        kitti360: Folder of KITTI-360, for Table II.
+        newer_college: Folder of the Newer College dataset, for Tables IV and V.
+        matterport360: Folder of Matterport360, a folder a building in it, for Table III.
         workers: Processes on this machine.
         scheduler: Address of a Dask scheduler, whose workers do the runs instead.
         output: Folder of the page; verification here if not given, verification-quick with --quick.
@@ -413,7 +443,9 @@ def verify(
     from spherloc_viz.verify_command import verify as do_verify
 
     folder = output or Path("verification-quick" if quick else "verification")
-    return do_verify(folder, quick, workers, scheduler, only)
+    given = {"kitti360": kitti360, "newer-college": newer_college, "matterport360": matterport360}
+    datasets = {key: path for key, path in given.items() if path is not None}
+    return do_verify(folder, quick, workers, scheduler, only, datasets)
 
 
 @app.command

@@ -1,6 +1,7 @@
 """``spherloc localize``: a query sequence against a map, with a progress bar, resumable, into one folder."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from statistics import median
@@ -23,8 +24,9 @@ from spherloc.experiments.results import (
     ResultsLog,
     SequenceResults,
 )
-from spherloc.experiments.sequence import chosen_queries, localize
+from spherloc.experiments.sequence import How, chosen_queries, localize_by_each
 from spherloc.experiments.summary import SuccessRate, Summary, estimated_trajectory, summarize, timed, true_trajectory
+from spherloc.experiments.trajectory_error import TrajectoryError
 from spherloc.frontend.view import View
 from spherloc.trace import Trace
 from spherloc.trajectory import write_tum
@@ -40,20 +42,61 @@ if TYPE_CHECKING:
 MAX_TOLD = 5
 
 
-def localize_sequence(
-    path: Path,
-    estimator: str,
-    seed: int,
-    settings: Sequence[str],
-    queries: Sequence[str],
-    output: Path,
-    records: Records | None,
-    retry_failed: bool,
-) -> int:
-    """Localize the chosen queries that ``output`` has no result of; returns the exit code.
+@dataclass(frozen=True)
+class Solving:
+    """An estimator that localizes a sequence, and where its results go."""
 
-    0 if every chosen query is localized, 1 if one is doubtful or has no pose. Without ``records`` nothing is recorded.
-    Raises ``InputError`` for whatever makes all of it impossible.
+    estimator: str
+    """Registered name."""
+    settings: tuple[str, ...]
+    """Its options as "KEY=VALUE"."""
+    output: Path
+    """Folder of the results."""
+    records: Records | None
+    """How the queries are recorded; None if they are not."""
+
+    @property
+    def label(self) -> str:
+        """As tables and pictures name it."""
+        return " ".join((self.estimator, *self.settings))
+
+
+def localize_sequence(
+    path: Path, solvings: Sequence[Solving], seed: int, queries: Sequence[str], retry_failed: bool
+) -> int:
+    """Localize the chosen queries that have no result yet, by each estimator; returns the exit code.
+
+    0 if every chosen query is localized by each, 1 if one is doubtful or has no pose. Raises ``InputError`` for
+    whatever makes all of it impossible.
+    """
+    results, chosen = localized(path, solvings, seed, queries, retry_failed)
+    for found in results:
+        print(_text(found, summarize(found)), flush=True)
+    return _code(results, chosen)
+
+
+def compare_sequences(
+    solvings: Mapping[Path, Sequence[Solving]], seed: int, queries: Sequence[str], retry_failed: bool, output: Path
+) -> int:
+    """Localize several sequences, each by the ``solvings`` of its path, and put them into one table, written to
+    ``output``; returns the exit code of ``localize_sequence``. Raises ``InputError`` as that does."""
+    from spherloc_viz.localize_comparison import compared, write_comparison
+
+    code, found = 0, []
+    for path, several in solvings.items():
+        results, chosen = localized(path, several, seed, queries, retry_failed)
+        found += [compared(solving.label, item) for solving, item in zip(several, results, strict=True)]
+        code = max(code, _code(results, chosen))
+    print(write_comparison(output, found), flush=True)
+    return code
+
+
+def localized(
+    path: Path, solvings: Sequence[Solving], seed: int, queries: Sequence[str], retry_failed: bool
+) -> tuple[list[SequenceResults], set[str]]:
+    """The results of a sequence by each of the estimators, each query matched once for all; and the chosen queries.
+
+    Raises ``InputError`` as ``localize_sequence`` does.
     """
     scene = load_scene(path)
     if not isinstance(scene, MapScene):
@@ -61,21 +104,34 @@ def localize_sequence(
     if not 0 <= seed < 2**63:
         raise InputError(f"seed is {seed}; give a number from 0 to 2^63 - 1.")
     chosen = chosen_queries(scene, queries)
-    options = _options(scene, estimator, settings)
+    hows = [How(item.estimator, _options(scene, item.estimator, item.settings), seed) for item in solvings]
     for remark in scene.remarks:
         say(remark)
-    with ResultsLog(output, configuration_of(scene, path, estimator, options, seed)) as log:
-        todo = _todo(scene, chosen, log, retry_failed)
-        if todo:
-            warm_up(say, [estimator])
-            with store_of(records) as store:
-                recorder = None if store is None else _Recorder(store, path.resolve(), log)
-                _work(scene, todo, log, (estimator, options, seed), recorder)
-        results = log.results()
-        _finish(log, results)
-    print(_text(results, summarize(results)), flush=True)
-    names = {view.name for view in chosen}
-    return 0 if all(row.status == LOCALIZED for row in results.rows if row.query in names) else 1
+    with ExitStack() as stack:
+        logs: list[ResultsLog] = []
+        for item, how in zip(solvings, hows, strict=True):
+            setting = configuration_of(scene, path, how.estimator, how.options, seed)
+            logs.append(stack.enter_context(ResultsLog(item.output, setting)))
+        todo = [{view.name for view in _todo(scene, chosen, log, retry_failed)} for log in logs]
+        wanted = [(view, [k for k, names in enumerate(todo) if view.name in names]) for view in chosen]
+        wanted = [(view, indices) for view, indices in wanted if indices]
+        if wanted:
+            warm_up(say, {item.estimator for item in solvings})
+            stores = [stack.enter_context(store_of(item.records)) for item in solvings]
+            recorders = [
+                None if store is None else _Recorder(store, path.resolve(), log)
+                for store, log in zip(stores, logs, strict=True)
+            ]
+            _work(scene, wanted, logs, hows, recorders)
+        results = [log.results() for log in logs]
+        for log, found in zip(logs, results, strict=True):
+            _finish(log, found)
+    return results, {view.name for view in chosen}
+
+
+def _code(results: Sequence[SequenceResults], chosen: Collection[str]) -> int:
+    rows = [row for found in results for row in found.rows if row.query in chosen]
+    return 0 if all(row.status == LOCALIZED for row in rows) else 1
 
 
 def _options(scene: MapScene, estimator: str, settings: Sequence[str]) -> Any:
@@ -102,22 +158,28 @@ def _todo(scene: MapScene, chosen: Sequence[View], log: ResultsLog, retry_failed
 
 
 def _work(
-    scene: MapScene, todo: list[View], log: ResultsLog, how: tuple[str, Any, int], recorder: "_Recorder | None"
+    scene: MapScene,
+    wanted: Sequence[tuple[View, Sequence[int]]],
+    logs: Sequence[ResultsLog],
+    hows: Sequence[How],
+    recorders: "Sequence[_Recorder | None]",
 ) -> None:
     failed = 0
     try:
         prepare(scene)
-        with progress(len(todo), "queries") as advance:
-            for row, trace in localize(scene, todo, *how):
+        with progress(sum(len(indices) for _, indices in wanted), "queries") as advance:
+            for index, row, trace in localize_by_each(scene, wanted, hows):
+                recorder = recorders[index]
                 if recorder is not None and trace is not None:
                     row = replace(row, recording=recorder.record(trace, row.query))
                 # Its recording is complete by now, so a row never names one that a killed process left unwritten.
-                log.append(row)
+                logs[index].append(row)
                 failed += row.status not in POSED
                 advance(f"{failed} without a pose")
     except KeyboardInterrupt:
-        so_far = f"{len(log.rows)} of {log.configuration.queries} queries are done"
-        say(f"stopped; {so_far} in {log.folder}, and the same command goes on from there.")
+        for log in logs:
+            so_far = f"{len(log.rows)} of {log.configuration.queries} queries are done"
+            say(f"stopped; {so_far} in {log.folder}, and the same command goes on from there.")
         raise
 
 
@@ -180,6 +242,7 @@ def _text(results: SequenceResults, summary: Summary) -> str:
             f"  median error {summary.median_rotation_error_deg:.3f} deg and "
             f"{100 * summary.median_translation_error_m:.2f} cm, of queries with a pose"
         )
+    lines += [f"  {line}" for line in _trajectory_lines(summary.trajectory)]
     if summary.median_registration_error_m is not None:
         lines.append(f"  median registration error {100 * summary.median_registration_error_m:.2f} cm")
     if summary.mean_f1 is not None:
@@ -197,6 +260,20 @@ def _text(results: SequenceResults, summary: Summary) -> str:
     if not timed(results):
         lines.append("  trajectory: times are places in the sequence, as the queries have no growing times")
     return "\n".join([*lines, f"  written to {results.folder}"])
+
+
+def _trajectory_lines(error: TrajectoryError | None) -> Iterator[str]:
+    """ATE and RPE, of all poses."""
+    if error is None:
+        return
+    aligned = [
+        f"{1e2 * value:.2f} cm {how}"
+        for value, how in ((error.ate_rigid_m, "aligned rigidly"), (error.ate_similarity_m, "with scale"))
+        if value is not None
+    ]
+    yield f"ATE of all {error.poses} poses: {', '.join([f'{1e2 * error.ate_m:.2f} cm', *aligned])}"
+    if error.rpe_m is not None:
+        yield f"RPE from pose to pose: {1e2 * error.rpe_m:.2f} cm, {error.rpe_deg:.3f} deg"
 
 
 def gravity_by_source(rows: Sequence[QueryResult]) -> Iterator[str]:

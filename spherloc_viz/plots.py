@@ -3,6 +3,7 @@
 import io
 import warnings
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,6 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
 from spherloc.experiments.results import FAILED, SequenceResults
+from spherloc.experiments.summary import timed
 from spherloc.experiments.sweep_plan import AXES
 from spherloc.experiments.sweep_rows import Point
 from spherloc.geometry import align_to_down
@@ -121,7 +123,7 @@ def trajectory_png(results: SequenceResults) -> bytes:
     axes.grid(color="0.9", linewidth=0.6)
     axes.set_xlim(middle[0] - half[0], middle[0] + half[0])
     axes.set_ylim(middle[1] - half[1], middle[1] + half[1])
-    _truth(axes, true_places)
+    _truth(axes, true_places, timed(results))
     _estimates(figure, axes, results, places, true_places)
     _without_place(axes, results, places, true_places)
     axes.set_title(_title(results), parse_math=False, fontsize=11)
@@ -134,6 +136,110 @@ def trajectory_png(results: SequenceResults) -> bytes:
         warnings.filterwarnings("ignore", message="Glyph .* missing")  # names in scripts that the font lacks
         figure.savefig(file, format="png", metadata={"Software": None})
     return file.getvalue()
+
+
+SEVERAL_COLORS = ("#1b6ca8", "#c77d0a", "#7b2d8b", "#3a8a3a", "#b02a30", "#5fb3e6", "#8c6d31", "#555555")
+LARGEST_MARKER = 10.0
+MOST_NAMED = 6
+"""Failures of an estimator whose names are written into the picture."""
+
+
+def trajectories_png(several: Sequence[tuple[str, SequenceResults]]) -> bytes:
+    """PNG of one sequence as several estimators localized it: positions and headings by colour, and the true way.
+
+    ``several`` are labels with results of the same scene. A query whose pose is outside the picture or missing is a
+    cross at its true place, named if there are few; a wrong one is joined to its true place. Positions are joined only
+    where the queries follow each other in time. The same results give the same bytes.
+    """
+    first = several[0][1]
+    true_places = _from_above(first, first.true_positions_m)
+    places = [_from_above(results, results.positions_m) for _, results in several]
+    middle, half = _frame(np.concatenate(places), true_places)
+    below = 0.25 * ((len(several) + 2) // 2)
+    height = float(np.clip(0.9 * WIDTH_INCHES * half[1] / half[0] + 1.3 + below, *HEIGHT_INCHES))
+    figure = Figure(figsize=(WIDTH_INCHES, height), dpi=DPI, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot(aspect="equal", axisbelow=True)
+    axes.grid(color="0.9", linewidth=0.6)
+    axes.set_xlim(middle[0] - half[0], middle[0] + half[0])
+    axes.set_ylim(middle[1] - half[1], middle[1] + half[1])
+    _truth(axes, true_places, timed(first))
+    for number, ((label, results), seen) in enumerate(zip(several, places, strict=True)):
+        style = _Style(
+            SEVERAL_COLORS[number % len(SEVERAL_COLORS)],
+            CURVE_MARKERS[number % len(CURVE_MARKERS)],
+            LARGEST_MARKER - (LARGEST_MARKER - 3.0) * number / max(1, len(several) - 1),
+        )
+        _one_of_several(axes, label, results, (seen, true_places), style)
+    axes.set_title(first.configuration.name, parse_math=False, fontsize=11)
+    axes.set_xlabel("metres, in the map")
+    axes.set_ylabel("metres, in the map")
+    figure.legend(loc="outside lower center", ncols=2, fontsize=9, frameon=False)
+    file = io.BytesIO()
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Glyph .* missing")
+        figure.savefig(file, format="png", metadata={"Software": None})
+    return file.getvalue()
+
+
+@dataclass(frozen=True)
+class _Style:
+    """How an estimator's positions are drawn: of several in one place all are seen."""
+
+    color: str
+    marker: str
+    size: float
+    """Points."""
+
+
+def _one_of_several(
+    axes: Axes,
+    label: str,
+    results: SequenceResults,
+    places: tuple[FloatArray, FloatArray],
+    style: _Style,
+) -> None:
+    """Draw one estimator's positions, headings and failures; ``places`` are its own and the true ones (Q, 2)."""
+    seen, true_places = places
+    errors_m, _, limit_m = _errors(results)
+    inside = np.isfinite(seen).all(axis=1) & _inside(axes, seen)
+    with_truth = np.isfinite(true_places).all(axis=1)
+    words = f"{label}: {np.count_nonzero(errors_m <= limit_m)} of {len(seen)} within {limit_m:g} m"
+    line, color = "-" if timed(results) else "none", style.color
+    axes.plot(
+        *seen[inside].T, color=color, linestyle=line, linewidth=0.9, marker=style.marker, markersize=style.size,
+        fillstyle="none", label=words,
+    )  # fmt: skip
+    ahead = _headings(results)[inside]
+    axes.quiver(
+        *seen[inside].T,
+        *ahead.T,
+        color=color,
+        scale=38.0,
+        width=0.002,
+        headwidth=1.0,
+        headlength=0.0,
+        headaxislength=0.0,
+    )
+    wrong = inside & with_truth & (errors_m > limit_m)
+    for start, end in zip(true_places[wrong], seen[wrong], strict=True):
+        axes.plot(*np.stack([start, end]).T, color=color, linewidth=0.7, linestyle=(0, (4, 3)))
+    lost = ~inside & with_truth
+    if lost.any():
+        axes.plot(*true_places[lost].T, "x", color=color, markersize=8.0, markeredgewidth=1.4)
+    if 0 < np.count_nonzero(lost) <= MOST_NAMED:
+        for place in np.flatnonzero(lost):
+            name = results.rows[place].query
+            axes.annotate(name, true_places[place], xytext=(5, 4), textcoords="offset points", fontsize=7, color=color)
+
+
+def _headings(results: SequenceResults) -> FloatArray:
+    """(Q, 2) where the optical axes point, seen from above; zero without a pose."""
+    ahead = np.zeros((len(results.rows), 3))
+    for place, row in enumerate(results.rows):
+        if row.cam_from_map is not None:
+            ahead[place] = row.cam_from_map[2, :3]
+    return _from_above(results, ahead)
 
 
 def _from_above(results: SequenceResults, positions_m: FloatArray) -> FloatArray:
@@ -156,9 +262,14 @@ def _frame(places: FloatArray, true_places: FloatArray) -> tuple[FloatArray, Flo
     return 0.5 * (low + high), np.maximum(half, 0.3 * half.max()) + 2.0 * MARGIN * half.max()
 
 
-def _truth(axes: Axes, true_places: FloatArray) -> None:
+def _truth(axes: Axes, true_places: FloatArray, ordered: bool) -> None:
+    """The true positions, joined where they follow each other in time."""
     if np.isfinite(true_places).any():
-        axes.plot(*true_places.T, color=css(TRUTH), linewidth=1.4, marker=".", markersize=3, label="truth", zorder=2)
+        line, size = ("-", 3.0) if ordered else ("none", 6.0)
+        axes.plot(
+            *true_places.T, color=css(TRUTH), linestyle=line, linewidth=1.4, marker=".", markersize=size, label="truth",
+            zorder=2,
+        )  # fmt: skip
 
 
 def _estimates(

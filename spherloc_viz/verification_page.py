@@ -55,9 +55,11 @@ def verification_page(
     measured: Measured,
     plans: Plans,
     pictures: Mapping[tuple[str, str], str],
+    tables: str,
     quick: bool,
 ) -> str:
-    """The page. ``pictures`` are names of files beside it, by key of experiment and camera."""
+    """The page. ``pictures`` are names of files beside it, by key of experiment and camera; ``tables`` are those of
+    ``verification_datasets``."""
     parts = [HEAD]
     if quick:
         parts.append("!!! warning\n    This is the quick form, with few runs: its intervals are wide.\n")
@@ -65,6 +67,7 @@ def verification_page(
     parts.append(_table(checked, plans))
     parts += [_figure(key, name, plans[key]) for key, name in pictures.items()]
     parts.append(_cases(measured))
+    parts.append(tables)
     parts.append(_settings(plans))
     return "\n".join(parts)
 

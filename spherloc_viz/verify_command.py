@@ -1,10 +1,10 @@
 """``spherloc verify``: the paper's simulations, its claims, and a page that says which hold."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from spherloc.errors import InputError, reason
+from spherloc.errors import InputError, reason, show
 from spherloc.experiments.sweep import run_sweep
 from spherloc.experiments.sweep_log import SweepLog
 from spherloc.experiments.sweep_plan import SweepPlan
@@ -12,19 +12,28 @@ from spherloc.experiments.sweep_rows import SweepRow
 from spherloc.verification.claims import CLAIMS, Checked, check
 from spherloc.verification.experiments import EXPERIMENTS, Experiment
 from spherloc.verification.measured import Measured
+from spherloc.verification.sessions import DATASETS
 from spherloc.warm_up import warm_up
 from spherloc_viz.progress import progress, say
+from spherloc_viz.verification_datasets import run_sessions, tables_text
 from spherloc_viz.verification_page import verification_page
 from spherloc_viz.verification_plots import FIGURES, figure_svg
 
 PAGE, RESULTS, RUNS = "index.md", "claims.json", "runs"
 
 
-def verify(output: Path, quick: bool, workers: int, scheduler: str | None, only: Sequence[str] = ()) -> int:
+def verify(
+    output: Path,
+    quick: bool,
+    workers: int,
+    scheduler: str | None,
+    only: Sequence[str] = (),
+    datasets: Mapping[str, Path] | None = None,
+) -> int:
     """Do the runs that ``output`` has not got, and write the page; returns the exit code, which is 0.
 
-    ``only`` are keys of experiments; all if there are none. Raises ``InputError`` for one that does not exist, and for
-    whatever makes the runs or the page impossible.
+    ``only`` are keys of experiments and datasets; all if there are none. ``datasets`` are folders, by key. Raises
+    ``InputError`` for an experiment that does not exist, and for whatever makes the runs or the page impossible.
     """
     experiments = _chosen(only)
     plans = {
@@ -33,16 +42,18 @@ def verify(output: Path, quick: bool, workers: int, scheduler: str | None, only:
         for camera in experiment.cameras
     }
     total = sum(plan.rows for plan in plans.values())
-    say(f"{total:,} runs → {output}. Ctrl-C stops them; the same command goes on.")
-    if scheduler is None:
+    if plans:
+        say(f"{total:,} runs → {output}. Ctrl-C stops them; the same command goes on.")
+    if plans and scheduler is None:
         warm_up(say, {entrant.estimator for plan in plans.values() for entrant in plan.entrants})
     rows: dict[tuple[str, str], list[SweepRow]] = {}
     for place, (key, plan) in enumerate(plans.items(), 1):
         title = f"{key[0]}, {key[1]} ({place} of {len(plans)})"
         rows[key] = _runs(output / RUNS / f"{_file_name(*key)}.csv", title, plan, workers, scheduler)
+    tables = tables_text(run_sessions(datasets or {}, output / RUNS, quick))
     measured = Measured(rows)
     checked = [check(claim, measured) for claim in CLAIMS]
-    _write(output, measured, checked, plans, quick)
+    _write(output, measured, checked, plans, tables, quick)
     for item in checked:
         say(_line(item))
     print(f"written to {output / PAGE}, {RESULTS} and figures", flush=True)
@@ -50,10 +61,10 @@ def verify(output: Path, quick: bool, workers: int, scheduler: str | None, only:
 
 
 def _chosen(only: Sequence[str]) -> list[Experiment]:
-    known = [experiment.key for experiment in EXPERIMENTS]
+    known = [*(experiment.key for experiment in EXPERIMENTS), *(dataset.key for dataset in DATASETS)]
     for key in only:
         if key not in known:
-            raise InputError(f"there is no experiment {key!r}; choose from {', '.join(known)}.")
+            raise InputError(f"there is no experiment {show(key)}; choose from {', '.join(known)}.")
     return [experiment for experiment in EXPERIMENTS if not only or experiment.key in only]
 
 
@@ -89,6 +100,7 @@ def _write(
     measured: Measured,
     checked: Sequence[Checked],
     plans: dict[tuple[str, str], SweepPlan],
+    tables: str,
     quick: bool,
 ) -> None:
     files: dict[str, str] = {}
@@ -96,7 +108,7 @@ def _write(
         if experiment in FIGURES:
             files[f"{_file_name(experiment, camera)}.svg"] = figure_svg(experiment, camera, plan.over, measured)
     pictures = {key: f"{_file_name(*key)}.svg" for key in plans if key[0] in FIGURES}
-    files[PAGE] = verification_page(checked, measured, plans, pictures, quick)
+    files[PAGE] = verification_page(checked, measured, plans, pictures, tables, quick)
     files[RESULTS] = json.dumps([_record(item) for item in checked], indent=1) + "\n"
     for name, text in files.items():
         path = output / name

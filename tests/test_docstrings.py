@@ -17,7 +17,6 @@ BARE = {
     "spherloc/consensus/yaw_arcs.py deepest_yaw",
     "spherloc/estimators/base.py run_estimator",
     "spherloc/solvers/base.py checked",
-    "spherloc/solvers/linear_pose.py linear_pose",
     "spherloc/solvers/odlt.py weighted",
 }
 """Known to lack shapes or errors; a list that only gets shorter."""

@@ -61,7 +61,12 @@ FLOORS = (
         "spherloc_viz.share",
         "spherloc_viz",
     ),
-    ("spherloc_viz.recording", "spherloc_viz.plots"),
+    (
+        "spherloc_viz.recording",
+        "spherloc_viz.plots",
+        "spherloc_viz.verification_page",
+        "spherloc_viz.verification_plots",
+    ),
     ("spherloc_viz.gallery",),
     ("spherloc_viz.app", "spherloc_viz.lessons", "spherloc_viz.plugins"),
     (
@@ -75,6 +80,9 @@ FLOORS = (
         "spherloc_viz.lesson_command",
         "spherloc_viz.map_report",
         "spherloc_viz.map_command",
+        "spherloc_viz.verify_command",
+        "spherloc_viz.verification_datasets",
+        "spherloc_viz.localize_comparison",
         "spherloc_viz.progress",
         "spherloc_viz.showing",
         "spherloc_viz.cli",

@@ -102,11 +102,12 @@ def spread_balls(
     covering: IndexArray,
     yaw_rad: float,
     most: int,
+    share: int,
     watch: Watch | None = None,
 ) -> tuple[IndexArray, FloatArray, FloatArray, int]:
     """Pairs (S, 2), centres and radii as of ``smallest_balls``, and how many pairs bound a position.
 
-    If these are more than ``most``, the smallest are taken, no correspondence having more than ``share_of_each``; then
+    If these are more than ``most``, the smallest are taken, no correspondence having more than ``share`` of them; then
     the number is that of the pairs that were sorted for it, which may not be all.
     """
     count, sorted_ones = len(aligned.bearings), max(FIRST_SORTED, most + 1)
@@ -114,7 +115,7 @@ def spread_balls(
         pairs, centres, radii = smallest_balls(aligned, bound_rad, arcs, covering, yaw_rad, sorted_ones, watch)
         if len(pairs) <= most:
             return pairs, centres, radii, len(pairs)
-        kept = _spread(pairs, share_of_each(count, most), most, count)
+        kept = _spread(pairs, share, most, count)
         if len(kept) == most or len(pairs) < sorted_ones:
             return pairs[kept], centres[kept], radii[kept], len(pairs)
         sorted_ones *= MORE_SORTED

@@ -29,8 +29,9 @@ WIDEST_RAD = np.radians(60.0)
 and only raise the count everywhere. At 90 % outliers this turns 95 % success into 99 % (MEI) and costs nothing."""
 
 
-MOST_PRINTED_BALLS = 8_000
-"""Balls of Algorithm 2 as printed, whose 32 million edges take 256 MB."""
+MOST_PRINTED_BALLS = 5_000
+"""Balls of Algorithm 2 as printed, whose 12 million edges take 100 MB: enough for all pairs of 100 matches. Of more
+pairs in the rotation clique those with the smallest balls are taken, where the paper says nothing."""
 PRINTED_EFFORT = 10 * EFFORT_LIMIT
 """Of their maximum clique: about 2 s."""
 MOST_CORRESPONDENCES = 10_000
@@ -149,13 +150,11 @@ def _locate(
 ) -> tuple[TranslationStage | None, FloatArray | None]:
     """Balls of the rotation clique, their maximum clique, and the aligned pose (3, 4) that it proposes."""
     yaw, arcs = consensus.yaw_rad, consensus.clique
-    if options.as_printed and len(arcs) > MOST_PRINTED_BALLS:
-        raise InputError(
-            f"option as_printed makes a ball of each of the {len(arcs):,} pairs in the rotation clique and takes up to "
-            f"{MOST_PRINTED_BALLS:,}; give fewer matches or a smaller bound_px, or as_printed=false."
-        )
-    most = len(arcs) if options.as_printed else int(options.max_balls)
-    pairs, centres, radii, bounded = spread_balls(aligned, bounds.radians, (pairs, lo, hi), arcs, yaw, most, watch)
+    most, share = int(options.max_balls), share_of_each(len(aligned.bearings), int(options.max_balls))
+    if options.as_printed:
+        most = share = min(len(arcs), MOST_PRINTED_BALLS)
+    covering = (pairs, lo, hi), arcs, yaw
+    pairs, centres, radii, bounded = spread_balls(aligned, bounds.radians, *covering, most, share, watch)
     if len(pairs) == 0:
         return None, None
     overlap = overlapping(centres, radii)
@@ -164,7 +163,7 @@ def _locate(
     start = _mean_start(*members[1:]) if options.as_printed else _best_start(aligned, bounds, *members)
     stage = TranslationStage(
         candidates=len(arcs),
-        rule=_rule(len(pairs), bounded, len(arcs), share_of_each(len(aligned.bearings), most)),
+        rule=_rule(len(pairs), bounded, len(arcs), share),
         pairs=aligned.index.astype(np.int32)[pairs],
         centres_m=centres,
         radii_m=radii,
@@ -221,5 +220,7 @@ def _rule(kept: int, bounded: int, candidates: int, share: int) -> str:
         return f"All {candidates:,} pairs of the rotation clique."
     if kept == bounded:
         return f"The {kept:,} of {candidates:,} pairs in the rotation clique that bound a position."
+    if share >= kept:
+        return f"The {kept:,} smallest balls of the {candidates:,} pairs in the rotation clique."
     each = "once" if share == 1 else f"at most {share} times"
     return f"The {kept:,} smallest balls of the {candidates:,} pairs in the rotation clique, each match used {each}."

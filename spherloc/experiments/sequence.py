@@ -5,7 +5,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -50,6 +50,17 @@ def chosen_queries(scene: MapScene, words: Sequence[str]) -> tuple[View, ...]:
     return tuple(scene.queries[place] for place in sorted(chosen))
 
 
+class How(NamedTuple):
+    """How queries are solved."""
+
+    estimator: str
+    """Registered name."""
+    options: Any
+    """The estimator's dataclass."""
+    seed: int
+    """The same for every query."""
+
+
 def localize(
     scene: MapScene, queries: Iterable[View], estimator: str, options: Any, seed: int
 ) -> Iterator[tuple[QueryResult, Trace | None]]:
@@ -58,11 +69,24 @@ def localize(
     Gives each query's result, and its trace if there was a problem to solve. What is wrong with one query is said in
     its result and does not stop the others. Raises ``InputError`` for an unknown estimator, wrong options or seed.
     """
+    wanted = ((view, (0,)) for view in queries)
+    for _, row, trace in localize_by_each(scene, wanted, [How(estimator, options, seed)]):
+        yield row, trace
+
+
+def localize_by_each(
+    scene: MapScene, queries: Iterable[tuple[View, Sequence[int]]], hows: Sequence[How]
+) -> Iterator[tuple[int, QueryResult, Trace | None]]:
+    """As ``localize``, each query by several estimators after it was matched once.
+
+    With each query come the indices of the ``hows`` that shall solve it, and with each result that of its own.
+    """
     places = {view.name: place for place, view in enumerate(scene.queries)}
-    for view, (matches, matching_ms) in _one_ahead(lambda view: _match(scene, view), queries):
+    for (view, chosen), (matches, matching_ms) in _one_ahead(lambda item: _match(scene, item[0]), queries):
         row = QueryResult(places[view.name], view.name, FAILED, view.timestamp_s, matching_ms=matching_ms)
         row = replace(row, truth_cam_from_map=_array(view.cam_from_map))
-        yield _solve(scene, view, matches, row, (estimator, options, seed))
+        for index in chosen:
+            yield index, *_solve(scene, view, matches, row, hows[index])
 
 
 def _match(scene: MapScene, view: View) -> tuple[Matches | SpherlocError, float]:
@@ -75,7 +99,7 @@ def _match(scene: MapScene, view: View) -> tuple[Matches | SpherlocError, float]
 
 
 def _solve(
-    scene: MapScene, view: View, matches: Matches | SpherlocError, row: QueryResult, how: tuple[str, Any, int]
+    scene: MapScene, view: View, matches: Matches | SpherlocError, row: QueryResult, how: How
 ) -> tuple[QueryResult, Trace | None]:
     if isinstance(matches, SpherlocError):
         return replace(row, status=_status_without_matches(view), message=str(matches)), None
@@ -84,8 +108,7 @@ def _solve(
         problem = scene.problem_of(view, matches)
     except InputError as error:
         return replace(row, message=str(error), estimated_outlier_rate=matches.estimated_outlier_rate), None
-    estimator, options, seed = how
-    trace = estimate(problem, estimator, options, seed)
+    trace = estimate(problem, how.estimator, how.options, how.seed)
     return _judged(scene, view, matches.references, trace, row), trace
 
 

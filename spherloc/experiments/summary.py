@@ -9,8 +9,10 @@ import numpy as np
 
 from spherloc.datasets.map_scene import Thresholds
 from spherloc.experiments.results import DOUBTFUL, FAILED, LOCALIZED, UNREADABLE, QueryResult, SequenceResults
+from spherloc.experiments.trajectory_error import TrajectoryError, trajectory_error
 from spherloc.geometry import camera_centre, pose
 from spherloc.trajectory import NS_PER_S, Trajectory
+from spherloc.types import FloatArray
 
 Z_95 = 1.959963984540054
 """Standard normal quantile of a two-sided interval of 95 %."""
@@ -74,6 +76,12 @@ class Summary:
     """Of the inliers, at 8 px."""
     mean_f1: float | None
     """Of the inliers, at 8 px."""
+    median_precision: float | None
+    """Over the scored queries, as the paper's tables give it; so are the next two."""
+    median_recall: float | None
+    """Of the inliers, at 8 px."""
+    median_f1: float | None
+    """Of the inliers, at 8 px."""
     median_true_outlier_rate: float | None
     """Over queries with labelled correspondences."""
     median_estimated_outlier_rate: float | None
@@ -82,6 +90,8 @@ class Summary:
     """Over all queries that were matched."""
     median_estimating_ms: float | None
     """Over all queries that were solved."""
+    trajectory: TrajectoryError | None
+    """ATE and RPE of all poses, doubtful ones too; None if no pose has a truth."""
     diagnoses: dict[str, int]
     """Queries by the cause of their diagnosis, most frequent first."""
 
@@ -121,12 +131,25 @@ def summarize(results: SequenceResults) -> Summary:
         mean_precision=_mean(row.precision for row in scored),
         mean_recall=_mean(row.recall for row in scored),
         mean_f1=_mean(row.f1 for row in scored),
+        median_precision=_median(row.precision for row in scored),
+        median_recall=_median(row.recall for row in scored),
+        median_f1=_median(row.f1 for row in scored),
         median_true_outlier_rate=_median(row.true_outlier_rate for row in rows),
         median_estimated_outlier_rate=_median(row.estimated_outlier_rate for row in rows),
         median_matching_ms=_median(row.matching_ms for row in rows if row.matches is not None),
         median_estimating_ms=_median(row.estimating_ms for row in rows),
+        trajectory=_trajectory_error(results),
         diagnoses={cause: causes.count(cause) for cause in sorted(set(causes), key=lambda c: (-causes.count(c), c))},
     )
+
+
+def _trajectory_error(results: SequenceResults) -> TrajectoryError | None:
+    rows = [row for row in results.rows if row.cam_from_map is not None and row.truth_cam_from_map is not None]
+    truth, estimate = (
+        np.array([_inverse(getattr(row, name)) for row in rows]).reshape(-1, 3, 4)
+        for name in ("truth_cam_from_map", "cam_from_map")
+    )
+    return trajectory_error(truth, estimate, timed(results))
 
 
 def success_rates(rows: Sequence[QueryResult], thresholds: Thresholds) -> tuple[SuccessRate, ...]:
@@ -193,9 +216,12 @@ def _trajectory(results: SequenceResults, field: str) -> Trajectory:
     by_time = timed(results)
     rows = [row for row in results.rows if getattr(row, field) is not None]
     times = np.array([_nanoseconds(row, by_time) for row in rows], dtype=np.int64)
-    poses = [getattr(row, field) for row in rows]
-    inverse = [pose(matrix[:, :3].T, camera_centre(matrix)) for matrix in poses]
+    inverse = [_inverse(getattr(row, field)) for row in rows]
     return Trajectory(times, np.array(inverse).reshape(-1, 3, 4))
+
+
+def _inverse(cam_from_map: FloatArray) -> FloatArray:
+    return pose(cam_from_map[:, :3].T, camera_centre(cam_from_map))
 
 
 def _nanoseconds(row: QueryResult, by_time: bool) -> int:

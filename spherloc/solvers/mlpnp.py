@@ -55,7 +55,7 @@ class Mlpnp:
         return self.solve_each(bearings[None], points[None])[0]
 
     def solve_each(self, bearings: FloatArray, points: FloatArray) -> Many:
-        """See ``solvers.base.solve_each``; at most one pose a sample."""
+        """At most one pose for each of B samples: ``bearings`` (B, K, 3) and ``points`` (B, K, 3), metres."""
         points, middle, scale, exists = condition_each(points)
         rotations, translations, solved = _linear_starts(bearings, points)
         exists &= solved

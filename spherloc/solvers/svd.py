@@ -33,7 +33,7 @@ class Svd:
         return self.solve_each(bearings[None], points[None])[0]
 
     def solve_each(self, bearings: FloatArray, points: FloatArray) -> Many:
-        """See ``solvers.base.solve_each``; at most one pose a sample."""
+        """At most one pose for each of B samples: ``bearings`` (B, K, 3) and ``points`` (B, K, 3), metres."""
         conditioned, middle, scale, exists = condition_each(points)
         rotations, translations, solved = linear_poses(bearings, conditioned)
         translations = translations / scale[:, None] - np.einsum("bij,bj->bi", rotations, middle)

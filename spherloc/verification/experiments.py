@@ -5,7 +5,7 @@ estimator is called here where it is this project's own form of it.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from spherloc.datasets import scene_path
@@ -86,23 +86,23 @@ class Experiment:
     """Problems a point in the quick form."""
     cameras: tuple[str, ...] = tuple(CAMERAS)
     """Keys of ``SCENES``."""
-    settings: Mapping[str, float] = field(default_factory=dict)
+    variation: Variation = Variation()
     """What else is set of the simulation."""
     quick_leaves_out: tuple[str, ...] = ()
     """Methods that are too slow for the quick form."""
 
     def plan(self, camera: str, quick: bool = False) -> SweepPlan:
         """The sweep through a camera, a key of ``SCENES``. Raises ``InputError`` if it is impossible."""
-        changes = dict(self.settings)
+        variation = self.variation
         if self.over != "correspondences":
-            changes["correspondences"] = self.correspondences
+            variation = replace(variation, correspondences=self.correspondences)
         return planned(
             scene_path(Path(SCENES[camera])),
             self.over,
             self.quick_values if quick else self.values,
             [METHODS[name] for name in self.taking_part(quick)],
             self.quick_runs if quick else self.runs,
-            Variation(**changes),
+            variation,
         )
 
     def taking_part(self, quick: bool = False) -> tuple[str, ...]:
@@ -133,7 +133,7 @@ def _case(key: str, right: int, count: int) -> Experiment:
         quick_values=(float(count),),
         quick_runs=5,
         cameras=("Kannala-Brandt",),
-        settings={"outlier_rate": (count - right) / count, "noise_px": 3.0},
+        variation=Variation(outlier_rate=(count - right) / count, noise_px=3.0),
         quick_leaves_out=_SLOW,
     )
 
@@ -152,7 +152,7 @@ EXPERIMENTS: Sequence[Experiment] = (
         runs=100,
         quick_values=(0.0, 1.0, 4.0),
         quick_runs=5,
-        settings={"outlier_rate": 0.0},
+        variation=Variation(outlier_rate=0.0),
     ),
     Experiment(
         key="fig6",
@@ -167,7 +167,7 @@ EXPERIMENTS: Sequence[Experiment] = (
         runs=100,
         quick_values=(0.3, 0.5, 0.8, 0.9),
         quick_runs=8,
-        settings={"noise_px": 1.0},
+        variation=Variation(noise_px=1.0),
     ),
     Experiment(
         key="fig7",
@@ -182,7 +182,7 @@ EXPERIMENTS: Sequence[Experiment] = (
         runs=100,
         quick_values=(0.9, 0.95),
         quick_runs=8,
-        settings={"noise_px": 1.0},
+        variation=Variation(noise_px=1.0),
         quick_leaves_out=_SLOW,
     ),
     Experiment(
@@ -196,7 +196,7 @@ EXPERIMENTS: Sequence[Experiment] = (
         quick_values=(0.5, 0.9),
         quick_runs=5,
         cameras=(NORMAL,),
-        settings={"noise_px": 1.0},
+        variation=Variation(noise_px=1.0),
     ),
     Experiment(
         key="fig7-normal",
@@ -209,7 +209,7 @@ EXPERIMENTS: Sequence[Experiment] = (
         quick_values=(0.9, 0.95),
         quick_runs=5,
         cameras=(NORMAL,),
-        settings={"noise_px": 1.0},
+        variation=Variation(noise_px=1.0),
     ),
     *(_case(key, right, count) for key, (right, count) in CASES.items()),
 )

@@ -129,7 +129,7 @@ def smaller_share(first: Cell, second: Cell, name: str) -> tuple[float, float]:
     share = float(np.mean(logs[:, 0] < logs[:, 1]) + 0.5 * np.mean(logs[:, 0] == logs[:, 1]))
     if np.allclose(logs[:, 0], logs[:, 1]):
         return share, 1.0
-    return share, float(wilcoxon(logs[:, 0], logs[:, 1], alternative="less").pvalue)
+    return share, float(wilcoxon(logs[:, 0], logs[:, 1], alternative="less")[1])
 
 
 def at(cells: Sequence[Cell], values: Sequence[float]) -> list[Cell]:

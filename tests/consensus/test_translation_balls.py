@@ -142,8 +142,9 @@ def test_spread_balls_are_the_smallest_that_leave_room_for_others(rng, most):
     for array in (lo, hi, found.clique):
         array.setflags(write=False)
     every, centres, radii = smallest_balls(*data, arcs, found.clique, found.yaw_rad, 10**6)
-    kept, kept_centres, kept_radii, bounded = spread_balls(*data, arcs, found.clique, found.yaw_rad, most)
-    share, used, expected = share_of_each(60, most), np.zeros(60, int), []
+    share = share_of_each(60, most)
+    kept, kept_centres, kept_radii, bounded = spread_balls(*data, arcs, found.clique, found.yaw_rad, most, share)
+    used, expected = np.zeros(60, int), []
     for place, pair in enumerate(every):
         if len(every) <= most or (len(expected) < most and (used[pair] < share).all()):
             used[pair] += 1

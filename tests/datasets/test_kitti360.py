@@ -12,6 +12,7 @@ from spherloc.errors import InputError
 from spherloc.estimators.base import estimate
 from spherloc.geometry import camera_centre, rotation_angle
 from spherloc.worlds import build_world, render
+from spherloc_viz.verification_datasets import run_sessions, tables_text
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
 
@@ -241,3 +242,35 @@ def test_scene_survives_without_the_working_directory(tree, monkeypatch, tmp_pat
     scene = load(tree)
     monkeypatch.chdir(tmp_path)
     assert load_scene(Path(scene.where)).references[0].path.is_file()
+
+
+def test_the_papers_table_of_a_copy_of_the_dataset(tree, tmp_path):
+    """Table II by one command: the sessions that are there, by all of its methods, resumed without a run."""
+    found = run_sessions({"kitti360": tree.root}, tmp_path, quick=True)
+    assert {item.session for item in found} == {"seq1"}
+    assert [item.method for item in found] == [
+        "MC",
+        "2P100",
+        "2P1k",
+        "SVD100",
+        "ML100",
+        "mc",
+        "mc-exact",
+        "ransac-2p 1k",
+    ]
+    rates = {item.method: [rate.rate for rate in item.summary.success] for item in found}
+    assert rates["mc"][-1] == 1.0 and all(len(several) == 3 for several in rates.values())
+    assert [(rate.metres, rate.degrees) for rate in found[0].summary.success] == [(0.5, 1.0), (1.0, 2.0), (2.0, 5.0)]
+    text = tables_text(found)
+    assert "| seq1 | mc |" in text and "| seq2 | ML100 | 0.4 / 8.8 / 39.8 |" in text
+    assert "spherloc verify --matterport360 DIR" in text
+    before = (tmp_path / "kitti360_seq1" / "MC" / "results.jsonl").read_bytes()
+    run_sessions({"kitti360": tree.root}, tmp_path, quick=True)
+    assert (tmp_path / "kitti360_seq1" / "MC" / "results.jsonl").read_bytes() == before
+
+
+def test_a_folder_without_the_papers_sessions_is_refused(tmp_path):
+    with pytest.raises(InputError, match=r"holds no session of KITTI-360 .* spherloc scenes kitti360 shows"):
+        run_sessions({"kitti360": tmp_path}, tmp_path / "out", quick=True)
+    with pytest.raises(InputError, match=r"no such folder; give the folder of Matterport360\."):
+        run_sessions({"matterport360": tmp_path / "nowhere"}, tmp_path / "out", quick=True)

@@ -27,6 +27,8 @@ from spherloc.datasets import load_scene
 from spherloc.errors import InputError
 from spherloc.estimators.base import estimate
 from spherloc.geometry import camera_centre, rotation_angle
+from spherloc.verification.sessions import DATASETS, sessions_of
+from spherloc_viz.verification_datasets import run_sessions
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
 
@@ -259,3 +261,23 @@ def test_camera_without_its_place_at_the_imu_is_one_sentence(copy):
     path.write_text("\n".join(lines[:1] + lines[6:]))
     with pytest.raises(InputError, match="no T_cam_imu"):
         load(copy)
+
+
+def test_the_papers_table_of_a_copy_of_the_dataset(copy, tmp_path):
+    """Tables IV and V by one command; what the copy has elsewhere is said in the session's scene file."""
+    root = copy / "newer-college"
+    (root / "quad-easy").rename(root / "quad-medium")
+    (root / "colmap").rename(root / "quad-medium/colmap")
+    (root / "ground_truth/easy.csv").rename(root / "gt-nc-quad-medium.csv")
+    (root / "ground_truth/hard.csv").rename(root / "gt-nc-quad-hard.csv")
+    dataset = next(item for item in DATASETS if item.key == "newer-college")
+    (session,) = sessions_of(dataset, root)
+    scene = tmp_path / "out/newer-college_quad-hard/scene.toml"
+    scene.parent.mkdir(parents=True)
+    extra = next(line for line in SCENE.splitlines() if line.startswith("cam_from_base"))
+    scene.write_text(session.scene.replace("query_step = 10", "query_step = 1") + extra + "\n")
+    found = run_sessions({"newer-college": root}, tmp_path / "out", quick=True)
+    assert {"R+EPro", "R+EPnP", "R+oDLT"} <= {item.method for item in found}
+    best = next(item.summary for item in found if item.method == "mc")
+    assert [(rate.metres, rate.degrees) for rate in best.success] == [(0.25, 2.0), (0.5, 5.0), (1.0, 8.0)]
+    assert best.success[-1].successes >= 1

@@ -23,7 +23,7 @@ from spherloc.experiments import read_results
 from spherloc.trajectory import read_tum
 from spherloc.warm_up import warm_up
 from spherloc_viz.batch import Records
-from spherloc_viz.localize import localize_sequence
+from spherloc_viz.localize import Solving, localize_sequence
 from spherloc_viz.plots import trajectory_png
 from spherloc_viz.recording.content.data import read_recording
 from spherloc_viz.scene_list import all_scenes, one_kind
@@ -44,7 +44,9 @@ def command(*words: str | Path, environment: dict[str, str], **more) -> subproce
 
 def run(scene: Path, output: Path, **changes: Any) -> int:
     words = {"estimator": "mc", "seed": 0, "settings": (), "queries": (), "retry_failed": False, "records": None}
-    return localize_sequence(scene, output=output, **(words | changes))
+    words |= changes
+    how = [Solving(words["estimator"], words["settings"], output, words["records"])]
+    return localize_sequence(scene, how, words["seed"], words["queries"], words["retry_failed"])
 
 
 def table(folder: Path) -> list[dict[str, str]]:
@@ -232,11 +234,15 @@ def near(image: np.ndarray, color: tuple[int, int, int]) -> int:
 def test_the_picture_shows_truth_errors_and_failures(tmp_path: Path) -> None:
     from spherloc_viz.style import OUTLIER, TRUTH
 
-    good = write_scene(tmp_path, queries=4)
+    good = write_scene(tmp_path, queries=4, timed=True)
     assert run(good, tmp_path / "good") == 0
     png = (tmp_path / "good" / "trajectory.png").read_bytes()
     assert trajectory_png(read_results(tmp_path / "good")) == png
     assert near(pixels_of(png), TRUTH) > 500 and near(pixels_of(png), OUTLIER) == 0
+    (tmp_path / "unordered").mkdir()
+    run(write_scene(tmp_path / "unordered", queries=4), tmp_path / "unordered" / "out")
+    unordered = pixels_of((tmp_path / "unordered" / "out" / "trajectory.png").read_bytes())
+    assert 0 < near(unordered, TRUTH) < 500  # photographs without an order in time are not joined
     (tmp_path / "bad").mkdir()
     bad = write_scene(tmp_path / "bad", queries=4, few=[1], wrong=[2])
     run(bad, tmp_path / "bad" / "out")
@@ -250,6 +256,39 @@ def test_the_picture_shows_truth_errors_and_failures(tmp_path: Path) -> None:
     assert not (tmp_path / "blind" / "out" / "truth.tum").exists()
     (tmp_path / "none").mkdir()
     assert run(write_scene(tmp_path / "none", queries=2, few=[0, 1]), tmp_path / "none" / "out") == 1
+
+
+def test_several_estimators_and_scenes_in_one_table(
+    tmp_path: Path, drawn: dict[str, str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Each result is that of the estimator alone, each query is matched once, and the same command goes on."""
+    scenes = []
+    for name in ("day", "night"):
+        (tmp_path / name).mkdir()
+        scenes.append(write_scene(tmp_path / name, queries=4, few=[1] if name == "night" else []))
+        scenes[-1] = scenes[-1].rename(tmp_path / name / f"{name}.toml")
+        scenes[-1].write_text(scenes[-1].read_text().replace("drawn walk", f"walk by {name}"))
+    out = tmp_path / "both"
+    words = ["--estimator", "mc", "--estimator", "ransac-2p,iterations=200", "--output", out, "--no-record"]
+    process = command(*scenes, *words, environment=drawn)
+    told, errors = process.communicate(timeout=LIMIT_S)
+    assert process.returncode == 1, errors
+    with (out / "comparison.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    named = [("walk by day", "mc"), ("walk by day", "ransac-2p iterations=200")]
+    named += [(name.replace("day", "night"), label) for name, label in named]
+    assert [(row["scene"], row["estimator"]) for row in rows] == named
+    assert [(row["localized"], row["no pose"]) for row in rows] == [("4 of 4", "0")] * 2 + [("3 of 4", "1")] * 2
+    assert "walk by night" in told and (out / "comparison.md").read_text().count("\n") == 6
+    picture = pixels_of((out / "walk_by_day.png").read_bytes())
+    assert near(picture, (27, 108, 168)) > 100  # the first estimator's colour
+    alone = tmp_path / "alone"
+    run(scenes[0], alone, estimator="ransac-2p", settings=("iterations=200",))
+    mine, other = read_results(alone).rows, read_results(out / "day" / "ransac-2p,iterations=200").rows
+    for a, b in zip(mine, other, strict=True):
+        np.testing.assert_array_equal(a.cam_from_map, b.cam_from_map)
+    again = command(*scenes, *words, environment=drawn)
+    assert "4 of 4 queries are done already" in again.communicate(timeout=LIMIT_S)[1]
 
 
 @pytest.mark.usefixtures("drawn")

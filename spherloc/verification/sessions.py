@@ -1,0 +1,146 @@
+"""The sessions of the paper's Tables II to V on the datasets themselves: scene files for a folder of a dataset."""
+
+import tomllib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from spherloc.errors import InputError
+from spherloc.experiments.sweep_plan import Entrant
+from spherloc.files import is_folder
+from spherloc.verification.experiments import BOUND_PX, METHODS
+
+
+@dataclass(frozen=True)
+class Session:
+    """Query images against references, as a scene file says."""
+
+    name: str
+    """As the paper's tables have it."""
+    scene: str
+    """Text of the scene file (TOML)."""
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """A dataset and what the paper does with it."""
+
+    key: str
+    """In scene files and options of the command."""
+    title: str
+    """For people."""
+    methods: tuple[str, ...]
+    """Keys of ``TABLE_METHODS``."""
+    sessions: Callable[[Path], Sequence[Session]]
+    """Of a folder that holds the dataset; raises ``InputError`` if it has none."""
+
+
+def _limited(estimator: str) -> Entrant:
+    return Entrant(estimator, (("as_printed", True), ("bound_px", BOUND_PX), ("iterations", 100)))
+
+
+TABLE_METHODS: Mapping[str, Entrant] = {
+    **{name: METHODS[name] for name in ("MC", "2P100", "2P1k", "SVD100", "ML100")},
+    "R+EPro": _limited("ransac-epropnp"),
+    "R+EPnP": _limited("ransac-epnp"),
+    "R+oDLT": _limited("ransac-odlt"),
+    **{name: METHODS[name] for name in ("mc", "mc-exact", "ransac-2p 1k")},
+}
+"""Methods of Tables II to V; R+* with 100 iterations, as noted under Table IV."""
+_FEW = ("MC", "2P100", "2P1k", "SVD100", "ML100", "mc", "mc-exact", "ransac-2p 1k")
+
+
+def _kitti360(folder: Path) -> list[Session]:
+    """Sequence 5 is the reference, 4 and 6 are the queries (Sec. VI-B.1)."""
+    text = """\
+kind = "kitti360"
+name = "KITTI-360, {name}"
+root = {root}
+reference_sequence = 5
+query_sequence = {query}
+camera = "image_02"
+thresholds = [[1.0, 0.5], [2.0, 1.0], [5.0, 2.0]]
+"""
+    drives = {"seq1": 4, "seq2": 6}
+    there = {
+        name: query
+        for name, query in drives.items()
+        if is_folder(folder / "data_2d_raw" / f"2013_05_28_drive_{query:04d}_sync")
+    }
+    return [Session(name, text.format(name=name, root=_quoted(folder), query=query)) for name, query in there.items()]
+
+
+def _newer_college(folder: Path) -> list[Session]:
+    """The paper names the sessions and not their references: quad-medium and math-easy are taken."""
+    text = """\
+kind = "newer-college"
+name = "Newer College, {name}"
+root = {root}
+calibration = "calibration/camchain.yaml"
+camera = "cam0"
+query_images = "{name}/cam0"
+query_ground_truth = "gt-nc-{name}.csv"
+query_imu = "{name}/imu.csv"
+reference_images = "{reference}/cam0"
+reference_ground_truth = "gt-nc-{reference}.csv"
+model = "{reference}/colmap"
+query_step = 10
+thresholds = [[2.0, 0.25], [5.0, 0.5], [8.0, 1.0]]
+"""
+    references = {
+        "quad-easy": "quad-medium",
+        "quad-hard": "quad-medium",
+        "math-medium": "math-easy",
+        "math-hard": "math-easy",
+    }
+    there = {name: reference for name, reference in references.items() if is_folder(folder / name)}
+    return [
+        Session(name, text.format(name=name, root=_quoted(folder), reference=reference))
+        for name, reference in there.items()
+    ]
+
+
+def _matterport360(folder: Path) -> list[Session]:
+    """Each building is a session: the paper's division of 18 buildings into 7 is not printed."""
+    text = """\
+kind = "matterport360"
+name = "Matterport360, {name}"
+root = {root}
+queries = ["*5_rgb.png"]
+depth = "ray"
+trust_poses = false
+"""
+    buildings = sorted(path for path in folder.iterdir() if any(path.glob("*_rgb.png")))
+    return [Session(path.name, text.format(name=path.name, root=_quoted(path))) for path in buildings]
+
+
+def _quoted(path: Path) -> str:
+    """A path as a TOML string."""
+    text = str(path.resolve()).replace("\\", "\\\\").replace('"', '\\"')
+    return f'"{text}"'
+
+
+DATASETS: Sequence[Dataset] = (
+    Dataset("kitti360", "KITTI-360", _FEW, _kitti360),
+    Dataset("newer-college", "Newer College", tuple(TABLE_METHODS), _newer_college),
+    Dataset("matterport360", "Matterport360", _FEW, _matterport360),
+)
+
+
+def sessions_of(dataset: Dataset, folder: Path) -> Sequence[Session]:
+    """The sessions of a dataset's folder. Raises ``InputError`` if it is no folder or holds none."""
+    if not is_folder(folder):
+        raise InputError(f"{folder}: no such folder; give the folder of {dataset.title}.")
+    found = dataset.sessions(folder)
+    if not found:
+        raise InputError(
+            f"{folder}: holds no session of {dataset.title} that the paper uses; spherloc scenes {dataset.key} shows "
+            "how its folders are named."
+        )
+    return found
+
+
+def printed_tables() -> dict[str, dict[str, Any]]:
+    """The paper's Tables I to VI by key: title, columns and rows, and the dataset where it is of one."""
+    return tomllib.loads((Path(__file__).parent / "tables.toml").read_text(encoding="utf-8"))
