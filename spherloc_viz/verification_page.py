@@ -19,6 +19,18 @@ from spherloc_viz.options import typed
 
 PLAYGROUND = "http://127.0.0.1:8080/"
 """Where ``spherloc play`` listens."""
+PHASES = "phases.svg"
+"""File of the picture of when to choose which."""
+WHEN = f"""\
+## When to choose which
+
+![The quickest estimator that is right in 95 % of the problems]({PHASES})
+
+Sec. VI-C.3 takes 2P-RANSAC up to 80 % outliers and MC beyond. Here, as they are in this project: the colour of a cell
+is the quickest of ransac-2p (1,000 samples), mc and mc-exact that is right in 95 % of the problems. Where a cell is
+grey, chance gives sets of matches as large as the largest that agree (expected false sets of that size: 1 or more), so
+no method that counts matches can know the answer.
+"""
 WORDS: Mapping[Verdict, str] = {
     Verdict.REPRODUCES: "**reproduces**",
     Verdict.ONLY_IF: "**only if**",
@@ -66,6 +78,8 @@ def verification_page(
     parts.append(_counts(checked))
     parts.append(_table(checked, plans))
     parts += [_figure(key, name, plans[key]) for key, name in pictures.items()]
+    if any(experiment.startswith("phase-") for experiment, _ in plans):
+        parts.append(WHEN)
     parts.append(_cases(measured))
     parts.append(tables)
     parts.append(_settings(plans))

@@ -8,10 +8,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch, Rectangle
 
 from spherloc.experiments.sweep_plan import AXES
 from spherloc.metrics import SUCCESS_DEG, SUCCESS_M
 from spherloc.types import FloatArray
+from spherloc.verification.experiments import PHASE_GRAVITY_DEG, PHASE_METHODS, phase_key
 from spherloc.verification.measured import Cell, Measured
 
 FIGURES = ("fig5", "fig6", "fig7", "fig6-normal", "fig7-normal")
@@ -24,6 +26,18 @@ DASHES: Mapping[bool, tuple[int, tuple[int, ...]]] = {True: (0, ()), False: (0, 
 LEAST_ERROR = {"rotation_error_deg": 1e-3, "t_error_m": 1e-4}
 """Where the logarithmic axes of errors start: what is below is rounding."""
 WIDTH_INCHES, HEIGHT_INCHES = 11.0, 4.2
+ENOUGH = 0.95
+"""Success from which on a method is one to choose."""
+PHASE_CAMERA = "MEI"
+CANNOT_BE_KNOWN = "cannot be known: chance gives as large a set"
+NONE_IS_ENOUGH = "no method in 95 %"
+PHASE_COLORS: Mapping[str, str] = {
+    "ransac-2p 1k": "#9ecae1",
+    "mc": "#dcb8e6",
+    "mc-exact": "#a8dba8",
+    NONE_IS_ENOUGH: "#ffffff",
+    CANNOT_BE_KNOWN: "#c8c8c8",
+}
 
 
 def figure_svg(experiment: str, camera: str, over: str, measured: Measured) -> str:
@@ -38,6 +52,54 @@ def figure_svg(experiment: str, camera: str, over: str, measured: Measured) -> s
         file = io.StringIO()
         figure.savefig(file, format="svg", metadata={"Date": None, "Creator": None})
     return file.getvalue()
+
+
+def phase_svg(measured: Measured) -> str:
+    """SVG of which estimator is the quickest that is right in 95 % of the problems, over outlier rate and number of
+    matches, and of where the right answer cannot be known: where chance gives sets as large as the right one."""
+    with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": "spherloc", "font.size": 9}):
+        figure = Figure(figsize=(WIDTH_INCHES, HEIGHT_INCHES), layout="constrained")
+        FigureCanvasSVG(figure)
+        for axes, (gravity_deg, counts) in zip(figure.subplots(1, 2), PHASE_GRAVITY_DEG.items(), strict=True):
+            _phases(axes, measured, gravity_deg, counts)
+        handles = [Patch(facecolor=color, edgecolor="0.4", label=name) for name, color in PHASE_COLORS.items()]
+        figure.legend(handles=handles, loc="outside lower center", ncols=3, fontsize=8.5, frameon=False)
+        file = io.StringIO()
+        figure.savefig(file, format="svg", metadata={"Date": None, "Creator": None})
+    return file.getvalue()
+
+
+def _phases(axes: Axes, measured: Measured, gravity_deg: float, counts: Sequence[int]) -> None:
+    for row, count in enumerate(counts):
+        key = phase_key(count, gravity_deg)
+        for column, value in enumerate(measured.values(key, PHASE_CAMERA)):
+            cells = [measured.cell(key, PHASE_CAMERA, name, value) for name in PHASE_METHODS]
+            known = [cell for cell in cells if cell is not None]
+            color = PHASE_COLORS[_phase_of(known)]
+            axes.add_patch(
+                Rectangle((column - 0.5, row - 0.5), 1.0, 1.0, facecolor=color, edgecolor="0.4", linewidth=0.5)
+            )
+            rates = "\n".join(f"{100 * cell.rate:.0f}" for cell in known)
+            axes.text(column, row, rates, ha="center", va="center", fontsize=6.0, linespacing=0.95)
+    values = measured.values(phase_key(counts[0], gravity_deg), PHASE_CAMERA)
+    axes.set_xlim(-0.5, len(values) - 0.5)
+    axes.set_ylim(-0.5, len(counts) - 0.5)
+    axes.set_xticks(range(len(values)), [f"{100 * value:g}" for value in values])
+    axes.set_yticks(range(len(counts)), [f"{count}" for count in counts])
+    axes.set_xlabel("outliers (%)")
+    axes.set_ylabel("matches")
+    what = "gravity exact" if gravity_deg == 0.0 else f"gravity off by {gravity_deg:g}° (sd of roll and pitch)"
+    axes.set_title(f"{what}; success in % of {', '.join(PHASE_METHODS)}", fontsize=8.5)
+
+
+def _phase_of(cells: Sequence[Cell]) -> str:
+    """The quickest method that is right often enough, or why there is none."""
+    for cell in cells:
+        if cell.rate >= ENOUGH:
+            return cell.place.method
+    exact = next((cell for cell in cells if cell.place.method == "mc-exact"), None)
+    false_sets = 0.0 if exact is None else exact.median("nfa")
+    return CANNOT_BE_KNOWN if false_sets >= 1.0 else NONE_IS_ENOUGH
 
 
 def _noise(figure: Figure, experiment: str, camera: str, measured: Measured) -> None:

@@ -16,8 +16,8 @@ from spherloc.verification.sessions import DATASETS
 from spherloc.warm_up import warm_up
 from spherloc_viz.progress import progress, say
 from spherloc_viz.verification_datasets import run_sessions, tables_text
-from spherloc_viz.verification_page import verification_page
-from spherloc_viz.verification_plots import FIGURES, figure_svg
+from spherloc_viz.verification_page import PHASES, verification_page
+from spherloc_viz.verification_plots import FIGURES, figure_svg, phase_svg
 
 PAGE, RESULTS, RUNS = "index.md", "claims.json", "runs"
 
@@ -107,6 +107,8 @@ def _write(
     for (experiment, camera), plan in plans.items():
         if experiment in FIGURES:
             files[f"{_file_name(experiment, camera)}.svg"] = figure_svg(experiment, camera, plan.over, measured)
+    if any(experiment.startswith("phase-") for experiment, _ in plans):
+        files[PHASES] = phase_svg(measured)
     pictures = {key: f"{_file_name(*key)}.svg" for key in plans if key[0] in FIGURES}
     files[PAGE] = verification_page(checked, measured, plans, pictures, tables, quick)
     files[RESULTS] = json.dumps([_record(item) for item in checked], indent=1) + "\n"

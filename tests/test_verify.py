@@ -114,7 +114,7 @@ def test_every_claim_and_method_has_what_it_needs():
     for experiment in EXPERIMENTS:
         for camera in experiment.cameras:
             plan = experiment.plan(camera)
-            assert plan.runs == 100
+            assert plan.runs == (30 if experiment.key.startswith("phase-") else 100)
             assert [METHODS[name].label for name in experiment.methods] == list(plan.labels)
     assert set(SCENES) >= {camera for experiment in EXPERIMENTS for camera in experiment.cameras}
 

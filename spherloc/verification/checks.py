@@ -6,6 +6,7 @@ the runs on the same problems show it.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.stats import fisher_exact
@@ -77,7 +78,8 @@ def differs(cell: Cell, rate: float, least: bool = False) -> float:
     """p-value of Fisher's exact test that the paper's runs at a rate and ours have the same one."""
     theirs = round(rate * PAPER_RUNS)
     table = [[cell.successes, cell.runs - cell.successes], [theirs, PAPER_RUNS - theirs]]
-    return float(fisher_exact(table, alternative="less" if least else "two-sided").pvalue)
+    tested: Any = fisher_exact(table, alternative="less" if least else "two-sided")
+    return float(tested.pvalue)
 
 
 def drops_at(experiment: str, method: str, value: float, before: Sequence[float], camera: str = PAPERS_CAMERA) -> Check:

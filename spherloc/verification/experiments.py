@@ -84,10 +84,10 @@ class Experiment:
     """Those of the values that the quick form keeps."""
     quick_runs: int
     """Problems a point in the quick form."""
+    variation: Variation
+    """What else is set of the simulation."""
     cameras: tuple[str, ...] = tuple(CAMERAS)
     """Keys of ``SCENES``."""
-    variation: Variation = Variation()
-    """What else is set of the simulation."""
     quick_leaves_out: tuple[str, ...] = ()
     """Methods that are too slow for the quick form."""
 
@@ -135,6 +135,34 @@ def _case(key: str, right: int, count: int) -> Experiment:
         cameras=("Kannala-Brandt",),
         variation=Variation(outlier_rate=(count - right) / count, noise_px=3.0),
         quick_leaves_out=_SLOW,
+    )
+
+
+PHASE_METHODS = ("ransac-2p 1k", "mc", "mc-exact")
+"""From the quickest to the surest."""
+PHASE_COUNTS = (20, 50, 100, 200, 500, 1000)
+PHASE_GRAVITY_DEG: Mapping[float, tuple[int, ...]] = {0.0: PHASE_COUNTS, 1.0: PHASE_COUNTS[:4]}
+"""Standard deviations of the known roll and pitch, degrees, and the numbers of matches that are run with each."""
+
+
+def phase_key(count: int, gravity_deg: float) -> str:
+    """Of the experiment with so many matches and such an error of gravity."""
+    return f"phase-{count}-{gravity_deg:g}deg"
+
+
+def _phase(count: int, gravity_deg: float) -> Experiment:
+    return Experiment(
+        key=phase_key(count, gravity_deg),
+        place="VI-C.3, when to choose which",
+        over="outlier_rate",
+        values=(0.5, 0.6, 0.7, 0.8, 0.85, 0.9, 0.925, 0.95, 0.97, 0.98, 0.99),
+        correspondences=count,
+        methods=PHASE_METHODS,
+        runs=30,
+        quick_values=(0.8, 0.95),
+        quick_runs=2,
+        variation=Variation(noise_px=1.0, gravity_error_deg=gravity_deg),
+        cameras=("MEI",),
     )
 
 
@@ -212,5 +240,6 @@ EXPERIMENTS: Sequence[Experiment] = (
         variation=Variation(noise_px=1.0),
     ),
     *(_case(key, right, count) for key, (right, count) in CASES.items()),
+    *(_phase(count, gravity) for gravity, counts in PHASE_GRAVITY_DEG.items() for count in counts),
 )
 """In the order in which they are run: what the page needs most comes first."""

@@ -3,6 +3,7 @@
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.stats import wilcoxon
@@ -129,7 +130,8 @@ def smaller_share(first: Cell, second: Cell, name: str) -> tuple[float, float]:
     share = float(np.mean(logs[:, 0] < logs[:, 1]) + 0.5 * np.mean(logs[:, 0] == logs[:, 1]))
     if np.allclose(logs[:, 0], logs[:, 1]):
         return share, 1.0
-    return share, float(wilcoxon(logs[:, 0], logs[:, 1], alternative="less")[1])
+    tested: Any = wilcoxon(logs[:, 0], logs[:, 1], alternative="less")
+    return share, float(tested.pvalue)
 
 
 def at(cells: Sequence[Cell], values: Sequence[float]) -> list[Cell]:
