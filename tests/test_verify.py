@@ -120,7 +120,7 @@ def test_every_claim_and_method_has_what_it_needs():
 
 
 def test_unknown_experiments_are_listed(tmp_path):
-    with pytest.raises(InputError, match=r"there is no experiment 'fig99'; choose from fig5, .*case3, kitti360, .*\."):
+    with pytest.raises(InputError, match=r"there is no experiment 'fig99'; choose from fig5, .*case3.*kitti360"):
         verify(tmp_path, quick=True, workers=1, scheduler=None, only=("fig99",))
 
 
