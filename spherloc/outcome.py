@@ -131,6 +131,5 @@ def _error_margin(trace: Trace, aligned: AlignedProblem, state: FloatArray, inli
     drop, sd = LOOSE_ENDS if size >= FEW else 0, gravity_sd_rad(aligned, options)
     rotation, position, _ = pose_sd(aligned, state, inliers, options.noise_px, sd, drop)
     worst = LEAST_SDS * max(np.degrees(rotation) / SUCCESS_DEG, position / SUCCESS_M, 1e-300)
-    return -np.log(
-        worst
-    ), f"Its inliers fix it to no better than {np.degrees(rotation):.2g}° and {position:.2g} m (1 sd)."
+    fixed = f"{np.degrees(rotation):.2g}° and {position:.2g} {trace.problem.unit}"
+    return -np.log(worst), f"Its inliers fix it to no better than {fixed} (1 sd)."

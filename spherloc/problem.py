@@ -63,6 +63,9 @@ class Problem:
     """What the front end expects from the statistics of its matches, 0 to 1; a rough guess."""
     remarks: tuple[str, ...] = ()
     """What the loader and the front end skipped and why, in sentences."""
+    metric: bool = True
+    """Whether the map's lengths are metres. If not, whatever is told in metres is in the map's own units, whose size
+    is unknown."""
 
     def __post_init__(self) -> None:
         pixels, points = _array(self, "pixels", (-1, 2)), _array(self, "points", (-1, 3))
@@ -75,6 +78,8 @@ class Problem:
         _scalar(self, "gravity_sd_rad", 0.0, np.inf, "0 or more, or inf if nothing is known")
         if not isinstance(self.gravity_source, str) or len(self.gravity_source) > MOST_SOURCE:
             raise ProblemError(f"{self.name}: gravity_source is no text of at most {MOST_SOURCE} characters; give one.")
+        if not isinstance(self.metric, bool):
+            raise ProblemError(f"{self.name}: metric is {self.metric!r}; give true or false.")
         _scalar(self, "bound_px", LEAST_PX, MOST_PX, f"{LEAST_PX:g} to {MOST_PX:,.0f} pixels")
         _scalar(self, "estimated_outlier_rate", 0.0, 1.0, "a share from 0 to 1")
         _check_reach(self.name, "points reach", points)
@@ -97,6 +102,11 @@ class Problem:
 
     def __len__(self) -> int:
         return len(self.pixels)
+
+    @property
+    def unit(self) -> str:
+        """What a length of the map is told in: "m" or "units"."""
+        return "m" if self.metric else "units"
 
     @property
     def gravity_words(self) -> str:

@@ -224,6 +224,10 @@ def as_record(path: Path, trace: Trace, diagnosis: Diagnosis, recording: Path | 
     }
 
 
+def _length(metres: float, problem: Problem) -> str:
+    return f"{100 * metres:.2f} cm" if problem.metric else f"{metres:.3g} {problem.unit}"
+
+
 def _gravity(problem: Problem) -> str:
     error_rad = problem.gravity_error_rad
     off = "" if error_rad is None else f"; {np.degrees(error_rad):.3g} deg off the truth"
@@ -253,8 +257,8 @@ def as_text(path: Path, trace: Trace, diagnosis: Diagnosis, recording: Path | No
     if metrics.rotation_error_deg is not None and metrics.translation_error_m is not None:
         verdict = "success" if metrics.success else "failure"
         lines.append(
-            f"  {verdict}: {metrics.rotation_error_deg:.3f} deg and {100 * metrics.translation_error_m:.2f} cm "
-            "off the truth"
+            f"  {verdict}: {metrics.rotation_error_deg:.3f} deg and "
+            f"{_length(metrics.translation_error_m, trace.problem)} off the truth"
         )
     if metrics.precision is not None and metrics.recall is not None and metrics.f1 is not None:
         lines.append(f"  precision {metrics.precision:.3f}, recall {metrics.recall:.3f}, F1 {metrics.f1:.3f}")

@@ -11,7 +11,7 @@ from spherloc.datasets import load_scene
 from spherloc.datasets.map_scene import MapScene
 from spherloc.errors import InputError, RecordingError, shorten, show
 from spherloc.estimators import options_type
-from spherloc.experiments.configuration import configuration_of
+from spherloc.experiments.configuration import Configuration, configuration_of
 from spherloc.experiments.results import (
     LOCALIZED,
     PICTURE,
@@ -236,15 +236,17 @@ def _text(results: SequenceResults, summary: Summary) -> str:
         f"  {summary.localized} of {summary.done} queries are localized, {summary.doubtful} more have a doubtful pose"
         + (f", of {summary.queries} in the scene" if summary.done < summary.queries else ""),
     ]
-    lines += [f"  success {_rate(rate)}" for rate in (*summary.success, *summary.registration_success)]
+    if not setting.metric:
+        lines.append("  units are unknown: lengths are in units of the map, and so are the limits")
+    lines += [f"  success {_rate(rate, setting.unit)}" for rate in (*summary.success, *summary.registration_success)]
     if summary.median_rotation_error_deg is not None and summary.median_translation_error_m is not None:
         lines.append(
             f"  median error {summary.median_rotation_error_deg:.3f} deg and "
-            f"{100 * summary.median_translation_error_m:.2f} cm, of queries with a pose"
+            f"{setting.length(summary.median_translation_error_m)}, of queries with a pose"
         )
-    lines += [f"  {line}" for line in _trajectory_lines(summary.trajectory)]
+    lines += [f"  {line}" for line in _trajectory_lines(summary.trajectory, setting)]
     if summary.median_registration_error_m is not None:
-        lines.append(f"  median registration error {100 * summary.median_registration_error_m:.2f} cm")
+        lines.append(f"  median registration error {setting.length(summary.median_registration_error_m)}")
     if summary.mean_f1 is not None:
         lines.append(
             f"  inliers at 8 px: mean precision {summary.mean_precision:.3f}, recall {summary.mean_recall:.3f}, "
@@ -262,18 +264,18 @@ def _text(results: SequenceResults, summary: Summary) -> str:
     return "\n".join([*lines, f"  written to {results.folder}"])
 
 
-def _trajectory_lines(error: TrajectoryError | None) -> Iterator[str]:
+def _trajectory_lines(error: TrajectoryError | None, setting: Configuration) -> Iterator[str]:
     """ATE and RPE, of all poses."""
     if error is None:
         return
     aligned = [
-        f"{1e2 * value:.2f} cm {how}"
+        f"{setting.length(value)} {how}"
         for value, how in ((error.ate_rigid_m, "aligned rigidly"), (error.ate_similarity_m, "with scale"))
         if value is not None
     ]
-    yield f"ATE of all {error.poses} poses: {', '.join([f'{1e2 * error.ate_m:.2f} cm', *aligned])}"
+    yield f"ATE of all {error.poses} poses: {', '.join([setting.length(error.ate_m), *aligned])}"
     if error.rpe_m is not None:
-        yield f"RPE from pose to pose: {1e2 * error.rpe_m:.2f} cm, {error.rpe_deg:.3f} deg"
+        yield f"RPE from pose to pose: {setting.length(error.rpe_m)}, {error.rpe_deg:.3f} deg"
 
 
 def gravity_by_source(rows: Sequence[QueryResult]) -> Iterator[str]:
@@ -291,8 +293,9 @@ def gravity_by_source(rows: Sequence[QueryResult]) -> Iterator[str]:
         yield f"gravity from {shorten(source)} in {len(told)} {queries}, within {min(bounds):.2g}{most} deg{off}"
 
 
-def _rate(rate: SuccessRate) -> str:
-    limits = f"{rate.metres:g} m" if rate.degrees is None else f"{rate.degrees:g} deg, {rate.metres:g} m"
+def _rate(rate: SuccessRate, unit: str) -> str:
+    length = f"{rate.metres:g} {unit}"
+    limits = length if rate.degrees is None else f"{rate.degrees:g} deg, {length}"
     what = "registration within " if rate.degrees is None else "within "
     if rate.rate is None or rate.low is None or rate.high is None:
         return f"{what}{limits}: nothing to judge"

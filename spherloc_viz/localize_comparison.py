@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from spherloc.errors import InputError, reason
+from spherloc.experiments.configuration import Configuration
 from spherloc.experiments.results import SequenceResults
 from spherloc.experiments.summary import SuccessRate, Summary, summarize
 from spherloc.experiments.sweep_rows import csv_line
@@ -78,16 +79,20 @@ def _row(item: Compared) -> tuple[str, ...]:
         str(told.doubtful),
         str(told.failed),
         " / ".join(NONE if rate.rate is None else f"{100 * rate.rate:.1f}" for rate in rates) or NONE,
-        " / ".join(map(_limit, rates)) or NONE,
+        " / ".join(_limit(rate, item.results.configuration.unit) for rate in rates) or NONE,
         _quantity(told.median_rotation_error_deg, 1.0, "deg"),
-        _quantity(told.median_translation_error_m, 100.0, "cm"),
+        _length(told.median_translation_error_m, item.results.configuration),
         " / ".join(NONE if score is None else f"{100 * score:.1f}" for score in scores),
         _quantity(told.median_estimating_ms, 1.0, "ms"),
     )
 
 
-def _limit(rate: SuccessRate) -> str:
-    return f"{rate.metres:g} m" if rate.degrees is None else f"{rate.metres:g} m {rate.degrees:g}°"
+def _limit(rate: SuccessRate, unit: str) -> str:
+    return f"{rate.metres:g} {unit}" if rate.degrees is None else f"{rate.metres:g} {unit} {rate.degrees:g}°"
+
+
+def _length(value: float | None, setting: Configuration) -> str:
+    return NONE if value is None else setting.length(value)
 
 
 def _quantity(value: float | None, factor: float, unit: str) -> str:

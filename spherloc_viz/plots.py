@@ -127,8 +127,8 @@ def trajectory_png(results: SequenceResults) -> bytes:
     _estimates(figure, axes, results, places, true_places)
     _without_place(axes, results, places, true_places)
     axes.set_title(_title(results), parse_math=False, fontsize=11)
-    axes.set_xlabel("metres, in the map")
-    axes.set_ylabel("metres, in the map")
+    axes.set_xlabel(f"{_in(results)}, in the map")
+    axes.set_ylabel(f"{_in(results)}, in the map")
     if axes.get_legend_handles_labels()[0]:
         axes.legend(loc="best", fontsize=9)
     file = io.BytesIO()
@@ -172,8 +172,8 @@ def trajectories_png(several: Sequence[tuple[str, SequenceResults]]) -> bytes:
         )
         _one_of_several(axes, label, results, (seen, true_places), style)
     axes.set_title(first.configuration.name, parse_math=False, fontsize=11)
-    axes.set_xlabel("metres, in the map")
-    axes.set_ylabel("metres, in the map")
+    axes.set_xlabel(f"{_in(first)}, in the map")
+    axes.set_ylabel(f"{_in(first)}, in the map")
     figure.legend(loc="outside lower center", ncols=2, fontsize=9, frameon=False)
     file = io.BytesIO()
     with warnings.catch_warnings():
@@ -204,7 +204,8 @@ def _one_of_several(
     errors_m, _, limit_m = _errors(results)
     inside = np.isfinite(seen).all(axis=1) & _inside(axes, seen)
     with_truth = np.isfinite(true_places).all(axis=1)
-    words = f"{label}: {np.count_nonzero(errors_m <= limit_m)} of {len(seen)} within {limit_m:g} m"
+    limit = f"{limit_m:g} {results.configuration.unit}"
+    words = f"{label}: {np.count_nonzero(errors_m <= limit_m)} of {len(seen)} within {limit}"
     line, color = "-" if timed(results) else "none", style.color
     axes.plot(
         *seen[inside].T, color=color, linestyle=line, linewidth=0.9, marker=style.marker, markersize=style.size,
@@ -240,6 +241,10 @@ def _headings(results: SequenceResults) -> FloatArray:
         if row.cam_from_map is not None:
             ahead[place] = row.cam_from_map[2, :3]
     return _from_above(results, ahead)
+
+
+def _in(results: SequenceResults) -> str:
+    return "metres" if results.configuration.metric else "units (scale unknown)"
 
 
 def _from_above(results: SequenceResults, positions_m: FloatArray) -> FloatArray:
@@ -288,9 +293,10 @@ def _estimates(
         *places[good].T, c=errors_m[good], vmin=0.0, vmax=error_scale(errors_m[coloured], limit_m), s=30,
         cmap=ramp, edgecolors="0.2", linewidths=0.4, label="estimate" if good.any() else None, zorder=3,
     )  # fmt: skip
-    figure.colorbar(dots, ax=axes, shrink=0.85).set_label(f"{what}, metres")
+    figure.colorbar(dots, ax=axes, shrink=0.85).set_label(f"{what}, {_in(results)}")
     if bad.any():
-        label = f"{np.count_nonzero(bad)} beyond {limit_m:g} m, up to {errors_m[bad].max():.3g} m"
+        unit = results.configuration.unit
+        label = f"{np.count_nonzero(bad)} beyond {limit_m:g} {unit}, up to {errors_m[bad].max():.3g} {unit}"
         axes.plot(*places[bad].T, "o", color=css(OUTLIER), markersize=5.5, label=label, zorder=3)
         for start, end in zip(true_places[bad], places[bad], strict=True):
             axes.plot(*np.stack([start, end]).T, color=css(OUTLIER), linewidth=0.8, zorder=1)

@@ -63,6 +63,8 @@ class MapScene:
     """Pixel bound asked of estimators; None leaves it to them."""
     thresholds: Thresholds = DEFAULT_THRESHOLDS
     """The dataset's own limits of success."""
+    metric: bool = True
+    """Whether the map's lengths are metres; if not, they are its own units, and so are the limits."""
     registration: Registration | None = None
     """Judges a pose by registering point clouds, where no true pose can be trusted."""
     mesh: Callable[[], bytes] | None = None
@@ -141,6 +143,7 @@ class MapScene:
             gravity_sd_rad=sd_rad,
             gravity_source=gravity.source,
             bound_px=self.bound_px,
+            metric=self.metric,
             truth_cam_from_map=view.cam_from_map,
             image=view.path,
             scene=self.where,
@@ -203,7 +206,9 @@ def _contradiction(stated: Gravity, nearby: Gravity | None) -> tuple[str, ...]:
 
 
 REQUIRED = {"kind", "name"}
-OPTIONAL = {"about", "frontend", "gravity", "options", "thresholds"}
+OPTIONAL = {"about", "frontend", "gravity", "options", "thresholds", "units"}
+UNITS: Mapping[str, bool] = {"metres": True, "unknown": False}
+"""What ``units`` may be, and whether lengths are metres then."""
 
 
 @dataclass(frozen=True)
@@ -216,6 +221,7 @@ class MapSettings:
     gravity: GravitySettings
     bound_px: float | None
     thresholds: Thresholds
+    metric: bool
 
     def scene(
         self,
@@ -250,6 +256,7 @@ class MapSettings:
             measured_gravity=gravity.measured,
             bound_px=self.bound_px,
             thresholds=self.thresholds,
+            metric=self.metric,
             remarks=(*remarks, *said),
             **others,
         )
@@ -269,7 +276,16 @@ def read_settings(
         gravity=read_gravity(scene_file.section(table, "gravity", where), where, gravity_bound_deg),
         bound_px=scene_file.bound_px(table, where),
         thresholds=_thresholds(table["thresholds"], where) if "thresholds" in table else thresholds,
+        metric=_metric(table, where),
     )
+
+
+def _metric(table: Mapping[str, Any], where: str) -> bool:
+    """``units = "metres"`` or "unknown"."""
+    units = scene_file.text(table, "units", where) if "units" in table else "metres"
+    if units not in UNITS:
+        raise InputError(f"{where}: units is {show(units)}; give one of {', '.join(UNITS)}.")
+    return UNITS[units]
 
 
 def _thresholds(value: Any, where: str) -> Thresholds:

@@ -32,7 +32,7 @@ def describe(
     return Diagnosis(
         cause=cause,
         doubtful=cause is not Cause.OK,
-        summary=_summary(e, truth, cause, other),
+        summary=_summary(e, truth, cause, other, trace.problem.unit),
         evidence=tuple(_sentences(trace, e, truth, certificate)),
         advice=_advice(trace, e, cause),
         used_truth=truth is not None,
@@ -69,7 +69,7 @@ def _other(e: Evidence, truth: Truth | None, cause: Cause) -> Fit | None:
     return None
 
 
-def _summary(e: Evidence, truth: Truth | None, cause: Cause, other: Fit | None) -> str:
+def _summary(e: Evidence, truth: Truth | None, cause: Cause, other: Fit | None, unit: str) -> str:
     total, bound = len(e.aligned.points), e.bound_px
     run, best, second = (0 if fit is None else fit.support(bound) for fit in (e.run, e.best, other))
     match cause:
@@ -92,14 +92,14 @@ def _summary(e: Evidence, truth: Truth | None, cause: Cause, other: Fit | None) 
             return f"The search missed the best pose: one with {better} of {total} matches exists, the run's has {run}."
         case Cause.UNKNOWN:
             return f"The pose is off the true one, though {run} of {total} matches agree with it and fix it well."
-    return _measured_summary(e, truth, cause)
+    return _measured_summary(e, truth, cause, unit)
 
 
-def _measured_summary(e: Evidence, truth: Truth | None, cause: Cause) -> str:
+def _measured_summary(e: Evidence, truth: Truth | None, cause: Cause, unit: str) -> str:
     """Causes that are a size: by the true pose, or else by the pose that neither gravity nor the bound holds back."""
     if cause is Cause.DEGENERATE:
         source = e if truth is None else truth
-        fixed = f"{_metres(source.position_sd_m)} and {_deg(source.rotation_sd_rad)}"
+        fixed = f"{_distance(source.position_sd_m, unit)} and {_deg(source.rotation_sd_rad)}"
         return f"Many matches agree, but they fix the pose to no better than {fixed} (1 sd)."
     fit = e.free if truth is None else truth.fit
     if fit is None:
@@ -131,11 +131,11 @@ def _sentences(trace: Trace, e: Evidence, truth: Truth | None, certificate: Cert
             yield f"A longer search finds a pose that {best} agree with."
         yield f"Sets of {best} that agree by chance: {_expected(e.nfa(best))} expected."
         if np.isfinite(e.position_sd_m):
-            fixed = f"{_metres(e.position_sd_m)} and {_deg(e.rotation_sd_rad)}"
+            fixed = f"{_distance(e.position_sd_m, trace.problem.unit)} and {_deg(e.rotation_sd_rad)}"
             yield f"They fix it to {fixed} (1 sd)."
     if e.best is not None and e.alternative is not None and e.alternative.support(bound) > 1:
         turn, distance = apart(e.best.cam_from_map, e.alternative.cam_from_map)
-        away = f"{_metres(distance)} and {_deg(turn)}"
+        away = f"{_distance(distance, trace.problem.unit)} and {_deg(turn)}"
         yield f"The next pose, {away} away from the best, has {e.alternative.support(bound)}."
     if e.free is not None and np.isfinite(e.free_tilt_sd_rad):
         one, two, four = (e.free.support(factor * bound) for factor in (1, 2, 4))
@@ -166,7 +166,7 @@ def _truths(trace: Trace, e: Evidence, truth: Truth) -> Iterator[str]:
     right, metrics = int(np.count_nonzero(truth.right)), evaluate(trace)
     yield f"Truth: {right} matches are right, and {truth.fit.support(e.bound_px)} agree with the true pose."
     if metrics.rotation_error_deg is not None and metrics.translation_error_m is not None:
-        error = f"{metrics.translation_error_m:.3g} m and {metrics.rotation_error_deg:.3g}°"
+        error = f"{metrics.translation_error_m:.3g} {trace.problem.unit} and {metrics.rotation_error_deg:.3g}°"
         yield f"Truth: the run's pose is off by {error}; the known gravity by {_deg(truth.tilt_rad)}."
 
 
@@ -174,8 +174,8 @@ def _deg(angle_rad: float) -> str:
     return f"{np.degrees(angle_rad):.2g}°" if angle_rad < 1.7 else f"{np.degrees(angle_rad):.0f}°"
 
 
-def _metres(distance: float) -> str:
-    return f"{distance:.2g} m" if distance < 100 else f"{distance:.0f} m"
+def _distance(distance: float, unit: str) -> str:
+    return f"{distance:.2g} {unit}" if distance < 100 else f"{distance:.0f} {unit}"
 
 
 def _expected(sets: float) -> str:

@@ -83,6 +83,17 @@ class Configuration:
     """Limits of success (degrees, metres), strictest first."""
     registration_thresholds_m: tuple[float, ...] | None
     """Limits of success of the registration error; None if the scene does not judge by it."""
+    metric: bool = True
+    """Whether the map's lengths are metres; if not, they are its own units."""
+
+    @property
+    def unit(self) -> str:
+        """What a length of the map is told in: "m" or "units"."""
+        return "m" if self.metric else "units"
+
+    def length(self, metres: float, digits: int = 2) -> str:
+        """A length to read: centimetres, or units of the map with three digits."""
+        return f"{100 * metres:.{digits}f} cm" if self.metric else f"{metres:.3g} {self.unit}"
 
     def json_text(self) -> str:
         """As ``configuration.json`` holds it; infinity is the text "inf"."""
@@ -114,6 +125,7 @@ def configuration_of(scene: MapScene, path: Path, estimator: str, options: Any, 
         gravity_map=np.asarray(scene.gravity_map, dtype=np.float64),
         thresholds=scene.thresholds,
         registration_thresholds_m=None if scene.registration is None else tuple(scene.registration.thresholds_m),
+        metric=scene.metric,
     )
 
 
@@ -156,6 +168,7 @@ def _parsed(table: Any, where: str) -> Configuration:
         registration_thresholds_m=None
         if registration is None
         else tuple(map(float, numbers(registration, (len(registration),), "registration_thresholds_m", where))),
+        metric=table.get("metric", True) is True,
     )
 
 

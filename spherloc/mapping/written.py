@@ -100,6 +100,7 @@ def _scene(folder: Path, images: Path, names: Sequence[str], about: str, level: 
         f"about = {_text(about)}",
         f"model = {_text(MODEL)}",
         f"images = {_text(_relative(images, folder))}",
+        *_units(scale),
         "# Localized against the other images; those of the map that you name here are left out of it.",
         f"queries = {json.dumps(queries, ensure_ascii=False)}",
         *_gravity(level),
@@ -113,6 +114,7 @@ def _new_scene(folder: Path, images: Path, new_images: Path, view: View, about: 
         f"name = {_text(f'{new_images.name} in {_name(images, scale)}')}",
         f"about = {_text(about)}",
         f"images = {_text(_relative(new_images, folder))}",
+        *_units(scale),
         "",
         "[camera]",
         *(f"{key} = {_value(value)}" for key, value in view.camera.to_dict().items()),
@@ -127,6 +129,10 @@ def _new_scene(folder: Path, images: Path, new_images: Path, view: View, about: 
 
 def _name(images: Path, scale: Scale) -> str:
     return images.resolve().name + ("" if scale.source else " (units unknown)")
+
+
+def _units(scale: Scale) -> list[str]:
+    return [] if scale.source else ['units = "unknown"             # lengths are told in units of the map']
 
 
 def _gravity(level: Level) -> list[str]:

@@ -111,7 +111,11 @@ def summary_html(trace: Trace) -> str:
     inliers = int(np.count_nonzero(trace.inlier_mask))
     facts = [f"{inliers} of {len(trace.problem)} inliers", duration_text(trace.timings_ms["total"])]
     if metrics.rotation_error_deg is not None and metrics.translation_error_m is not None:
-        facts = [angle_text(metrics.rotation_error_deg), length(metrics.translation_error_m), *facts]
+        facts = [
+            angle_text(metrics.rotation_error_deg),
+            length(metrics.translation_error_m, trace.problem.metric),
+            *facts,
+        ]
     line = f'<b style="{_value_css(words)}">{escape(words.capitalize())}</b> · ' + " · ".join(map(escape, facts))
     return box(line, "font-size:12.5px;padding-top:.2em")
 

@@ -13,7 +13,7 @@ from spherloc.refine import residuals_px
 from spherloc.trace import Certificate, ConsensusStage, Trace, YawStage
 from spherloc.types import FloatArray
 from spherloc_viz import style
-from spherloc_viz.layers.frame import RunView, one_color
+from spherloc_viz.layers.frame import RunView, length_text, one_color
 from spherloc_viz.layers.outcome import is_knowable
 from spherloc_viz.layers.primitives import Chart, Curve, Label, SceneItem, Segments, Table
 from spherloc_viz.layers.scene import camera
@@ -92,7 +92,7 @@ def _row(entry: Entry) -> tuple[str, ...]:
         trace.estimator,
         outcome(trace),
         NO_VALUE if turn is None else f"{turn:.3f}°" if turn < 10 else f"{turn:.0f}°",
-        NO_VALUE if shift is None else _length(shift),
+        NO_VALUE if shift is None else _length(shift, trace.problem.metric),
         f"{np.count_nonzero(trace.inlier_mask)}",
         *(
             NO_VALUE if share is None or trace.cam_from_map is None else f"{100 * share:.0f} %"
@@ -111,7 +111,9 @@ def outcome(trace: Trace) -> str:
     return {True: "success", False: "failure", None: "unknown"}[evaluate(trace).success]
 
 
-def _length(metres: float) -> str:
+def _length(metres: float, metric: bool) -> str:
+    if not metric:
+        return length_text(metres, metric)
     return f"{100 * metres:.2f} cm" if metres < 1.0 else f"{metres:.2f} m" if metres < 100 else f"{metres:.0f} m"
 
 

@@ -11,7 +11,7 @@ from spherloc.trace import ConsensusStage, PositionStage
 from spherloc.types import ByteArray, FloatArray
 from spherloc_viz import style
 from spherloc_viz.layers import ring
-from spherloc_viz.layers.frame import Frame, Plan, RunView, even, growing, length, one_color, sphere_box
+from spherloc_viz.layers.frame import Frame, Plan, RunView, even, growing, one_color, sphere_box
 from spherloc_viz.layers.primitives import Chart, Curve, Focus, Graph, Nodes, SceneItem, Segments, Table
 from spherloc_viz.layers.scene import camera
 from spherloc_viz.layers.translation import graph_at, match_nodes
@@ -282,14 +282,16 @@ def _pose(view: RunView, stage: ConsensusStage, rank: int) -> Frame:
     explained = np.zeros(len(view.points), dtype=bool)
     aligned = view.trace.problem.aligned
     explained[aligned.index] = view.residuals_px(state)[aligned.index] <= view.bounds.noise_px
-    off = "" if view.truth is None else f", {translation_error_m(view.truth, state):.3f} m from the true one"
+    unit = view.trace.problem.unit
+    off = "" if view.truth is None else f", {translation_error_m(view.truth, state):.3f} {unit} from the true one"
     if rank == 0:
         then = "No other pose that was tried explains more, so it is what refinement starts from."
     else:
         best = view.aligned_pose(stage.cam_from_map[0])
         away, turned = translation_error_m(best, state), rotation_error_deg(best, state)
         both = np.count_nonzero(explained & view.mask(stage.clique))
-        then = f"It is {away:.2f} m and {turned:.1f}° away from the best pose, and shares {both} matches with the set."
+        apart = f"{away:.2f} {unit} and {turned:.1f}° away"
+        then = f"It is {apart} from the best pose, and shares {both} matches with the set."
     return Frame(
         f"The pose at {view.position(state)}{off} explains {support} of {len(view.points)} matches. {then}",
         f"Σ 1(‖π(R p + t) − u‖ ≤ ε) = {support}",
@@ -305,7 +307,8 @@ def _poses(view: RunView, stage: ConsensusStage) -> Frame:
     alternatives, count, most = states[1:], len(stage.support), highest_bound(stage)
     if alternatives:
         away, turned = translation_error_m(states[0], states[1]), rotation_error_deg(states[0], states[1])
-        other = f"The best other pose, {away:.2f} m and {turned:.1f}° away, explains {stage.support[1]}"
+        apart = f"{away:.2f} {view.trace.problem.unit} and {turned:.1f}° away"
+        other = f"The best other pose, {apart}, explains {stage.support[1]}"
     else:
         other = "No clearly different pose was found beside it"
     note = (
@@ -338,13 +341,13 @@ def _ghosts(view: RunView, alternatives: list[FloatArray]) -> tuple[SceneItem, .
 
 
 def _table(view: RunView, stage: ConsensusStage, states: list[FloatArray]) -> Table:
-    rows = []
+    rows, unit = [], view.trace.problem.unit
     for rank, (state, support) in enumerate(zip(states, stage.support, strict=False), 1):
         centre = camera_centre(view.trace.problem.aligned.unalign_pose(state))
         place = " ".join(f"{value:.2f}" for value in centre)
-        off = () if view.truth is None else (f"{translation_error_m(view.truth, state):.3f} m",)
+        off = () if view.truth is None else (f"{translation_error_m(view.truth, state):.3f} {unit}",)
         rows.append((str(rank), str(support), f"{np.degrees(yaw_of(state[:, :3])):.2f}°", place, *off))
-    columns = ("", "explains", "yaw", "camera (m)", *(() if view.truth is None else ("off the truth",)))
+    columns = ("", "explains", "yaw", f"camera ({unit})", *(() if view.truth is None else ("off the truth",)))
     return Table("verified poses", columns, tuple(rows))
 
 
@@ -379,8 +382,8 @@ def _level(view: RunView, stage: PositionStage, level: int) -> Frame:
     drawn = f" The {len(boxes)} of them that could explain most are drawn." if len(boxes) < left else ""
     boxes_text = "box is" if left == 1 else "boxes are"
     return Frame(
-        f"{left:,} {boxes_text} left, {length(size[0])} to {length(size[2])} long, in which a camera might explain "
-        f"more than the {stage.support} matches of the best pose; one of them up to {most} of {count}.{end}",
+        f"{left:,} {boxes_text} left, {view.length(size[0])} to {view.length(size[2])} long, in which a camera might "
+        f"explain more than the {stage.support} matches of the best pose; one of them up to {most} of {count}.{end}",
         f"max over C ∈ box, θ of Σ 1(|el(p − C) − el(v)| ≤ β + ε) · 1(θ ∈ interval) = {most} > {stage.support}",
         view.standing(np.eye(3)) if pose is None else pose,
         view.colors(style.UNDECIDED),

@@ -117,7 +117,8 @@ def _by_truth(poses: Poses) -> str:
 def _by_alternative(trace: Trace, poses: Poses) -> str:
     if poses.alternative is None or not poses.alternative[1] <= poses.bound_px or trace.cam_from_map is None:
         return ""
-    return f"It agrees with another pose, {_between(trace.cam_from_map, poses.alternative[0])} from the estimated one."
+    away = _between(trace.cam_from_map, poses.alternative[0], trace.problem.unit)
+    return f"It agrees with another pose, {away} from the estimated one."
 
 
 def _by_pairs(poses: Poses) -> str:
@@ -135,11 +136,11 @@ def _off(residual: tuple[float, float]) -> str:
 
 def _away(trace: Trace) -> str:
     truth, estimate = trace.problem.truth_cam_from_map, trace.cam_from_map
-    return "" if truth is None or estimate is None else _between(truth, estimate)
+    return "" if truth is None or estimate is None else _between(truth, estimate, trace.problem.unit)
 
 
-def _between(one: FloatArray, other: FloatArray) -> str:
-    return f"{translation_error_m(one, other):.2f} m and {rotation_error_deg(one, other):.1f}°"
+def _between(one: FloatArray, other: FloatArray, unit: str) -> str:
+    return f"{translation_error_m(one, other):.2f} {unit} and {rotation_error_deg(one, other):.1f}°"
 
 
 def _px(value: float) -> str:

@@ -170,7 +170,20 @@ class RunView:
 
     def place(self, position: FloatArray) -> str:
         """A place (3,) of the aligned map frame in the problem's own map frame, as text."""
-        return place_text(self.trace.problem.aligned.map_turn.T @ position, 2)
+        return place_text(self.trace.problem.aligned.map_turn.T @ position, 2, self.metric)
+
+    @property
+    def metric(self) -> bool:
+        """Whether the map's lengths are metres; else they are its own units."""
+        return self.trace.problem.metric
+
+    def length(self, metres: float) -> str:
+        """A length to read, see ``length``."""
+        return length(metres, self.metric)
+
+    def length_text(self, metres: float) -> str:
+        """A length to read, see ``length_text``."""
+        return length_text(metres, self.metric)
 
     def right_ones(self, indices: np.ndarray) -> str:
         """How many of these correspondences are right, as part of a sentence; empty if that is unknown."""
@@ -198,13 +211,16 @@ def growing(total: int, *sizes: int) -> list[int]:
     return [size for size in sizes if size < total]
 
 
-def place_text(position: FloatArray, digits: int) -> str:
-    """A place (3,) to read, metres."""
-    return f"({', '.join(f'{value:.{digits}f}' for value in position)}) m".replace("-", "−")
+def place_text(position: FloatArray, digits: int, metric: bool = True) -> str:
+    """A place (3,) to read, metres or, if not ``metric``, units of the map."""
+    unit = "m" if metric else UNITS
+    return f"({', '.join(f'{value:.{digits}f}' for value in position)}) {unit}".replace("-", "−")
 
 
-def length(metres: float) -> str:
-    """A length to read: metres, or centimetres where it is short."""
+def length(metres: float, metric: bool = True) -> str:
+    """A length to read: metres, or centimetres where it is short; if not ``metric``, units of the map."""
+    if not metric:
+        return f"{metres:.3g} {UNITS}"
     if metres >= 1.0:
         return f"{metres:.2f} m"
     digits = 0 if metres >= 0.1 else 1 if metres >= 0.01 else 2
@@ -215,8 +231,14 @@ LEAST_M = 1e-4
 """Shorter lengths are told as less than this."""
 
 
-def length_text(length_m: float) -> str:
-    """A length in the unit that suits its size, with two digits."""
+UNITS = "units"
+"""Of a map whose scale is unknown."""
+
+
+def length_text(length_m: float, metric: bool = True) -> str:
+    """A length in the unit that suits its size, with two digits; if not ``metric``, in units of the map."""
+    if not metric:
+        return f"{length_m:.2g} {UNITS}"
     if 0.0 < length_m < LEAST_M:
         return "< 0.1 mm"
     for unit, metres in (("km", 1000.0), ("m", 1.0), ("cm", 0.01)):

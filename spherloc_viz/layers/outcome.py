@@ -3,12 +3,12 @@
 import numpy as np
 
 from spherloc.geometry import camera_centre
-from spherloc.metrics import evaluate
+from spherloc.metrics import SUCCESS_M, evaluate
 from spherloc.outcome import judge
 from spherloc.trace import Certificate, RefinementStage, Trace
 from spherloc_viz import style
 from spherloc_viz.layers import uncertainty
-from spherloc_viz.layers.frame import Frame, Plan, RunView, angle_text, length, length_text, map_focus, place_text
+from spherloc_viz.layers.frame import Frame, Plan, RunView, angle_text, length, map_focus, place_text
 from spherloc_viz.layers.primitives import Table
 
 KNOWABLE = 0.01
@@ -77,8 +77,9 @@ def _pose(view: RunView, cam_from_map: np.ndarray) -> Frame:
         caption += "The truth is unknown, so the share of agreeing matches is all there is to judge it by."
     else:
         verdict = "a success" if metrics.success else "a failure"
-        angle, length = angle_text(metrics.rotation_error_deg), length_text(metrics.translation_error_m)
-        caption += f"It is {angle} and {length} off the truth: {verdict} by the limits of 1° and 10 cm."
+        angle, length = angle_text(metrics.rotation_error_deg), view.length_text(metrics.translation_error_m)
+        limit = view.length_text(SUCCESS_M)
+        caption += f"It is {angle} and {length} off the truth: {verdict} by the limits of 1° and {limit}."
     return Frame(
         caption,
         "success: error < 1° and < 0.1 m   (Sec. VI-A)",
@@ -103,13 +104,13 @@ def outcome_table(trace: Trace) -> Table:
     if trace.cam_from_map is not None:
         judged = judge(trace)
         rows.append(("without the truth", " ".join((f"{judged.outcome}{':' * bool(judged.reasons)}", *judged.reasons))))
-        rows.append(("camera position", place_text(camera_centre(trace.cam_from_map), 3)))
+        rows.append(("camera position", place_text(camera_centre(trace.cam_from_map), 3, trace.problem.metric)))
     if metrics.rotation_error_deg is not None and metrics.translation_error_m is not None:
         rows.append(("rotation error", f"{metrics.rotation_error_deg:.3f}°"))
-        rows.append(("position error", length(metrics.translation_error_m)))
+        rows.append(("position error", length(metrics.translation_error_m, trace.problem.metric)))
     refinement = trace.stage(RefinementStage)
     if refinement is not None and trace.cam_from_map is not None:
-        rows.append(("expected error", uncertainty.spread(refinement)))
+        rows.append(("expected error", uncertainty.spread(refinement, trace.problem.metric)))
     rows.append(("inliers", f"{np.count_nonzero(trace.inlier_mask)} of {len(trace.problem)}"))
     if metrics.precision is not None and metrics.recall is not None and metrics.f1 is not None:
         rows.append(("precision / recall", f"{100 * metrics.precision:.0f} % / {100 * metrics.recall:.0f} %"))

@@ -10,7 +10,7 @@ from spherloc.trace import RefinementStage
 from spherloc.types import BoolArray, FloatArray
 from spherloc_viz import style
 from spherloc_viz.layers import uncertainty
-from spherloc_viz.layers.frame import Frame, Plan, RunView, angle_text, even, length, length_text, one_color, sphere_box
+from spherloc_viz.layers.frame import Frame, Plan, RunView, angle_text, even, one_color, sphere_box
 from spherloc_viz.layers.primitives import Chart, Curve, Focus, SceneItem, Segments
 
 MOST_STATES = 20
@@ -38,14 +38,14 @@ def _state(view: RunView, stage: RefinementStage, k: int) -> Frame:
     """One of the states, and how it moved since the one before."""
     state, count = view.aligned_pose(stage.cam_from_map[k]), len(stage.cost_px2)
     rms, inliers = np.sqrt(stage.cost_px2), stage.inlier_counts
-    off = "" if view.truth is None else f", {length(translation_error_m(view.truth, state))} from the true one"
+    off = "" if view.truth is None else f", {view.length(translation_error_m(view.truth, state))} from the true one"
     if k == 0:
         moved = f"{_steps(count - 1)} follow{'s' if count == 2 else ''}, each a linear problem in {stage.dof} unknowns."
     else:
         before = view.aligned_pose(stage.cam_from_map[k - 1])
         away, turned = translation_error_m(before, state), rotation_error_deg(before, state)
         angle = f"{turned:.3f}°" if turned >= 5e-4 else "less than 0.001°"
-        moved = f"The step moved the camera by {length(away)} and turned it by {angle}."
+        moved = f"The step moved the camera by {view.length(away)} and turned it by {angle}."
     note = "" if count <= MOST_STATES else f"{MOST_STATES} of {count} states are shown, evenly."
     mask = _explained(view, stage, k, state)
     return Frame(
@@ -142,14 +142,14 @@ def _error(view: RunView, stage: RefinementStage) -> Frame:
     expected = (
         "The inliers leave the pose open, so that its error is unknown."
         if known is None
-        else f"By its covariance the pose is {angle_text(known[0])} and {length(known[1])} off, RMS, if its inliers "
-        "are right."
+        else f"By its covariance the pose is {angle_text(known[0])} and {view.length(known[1])} off, RMS, if its "
+        "inliers are right."
     )
     if view.truth is None:
         happened = "The truth is not known here, so that nobody can check."
     else:
         turned, away = rotation_error_deg(view.truth, state), translation_error_m(view.truth, state)
-        happened = f"In truth it is off by {angle_text(turned)} and {length_text(away)}."
+        happened = f"In truth it is off by {angle_text(turned)} and {view.length_text(away)}."
     return Frame(
         f"{expected} {happened}",
         "Σ = σ² (JᵀWJ)⁻¹",
@@ -158,7 +158,7 @@ def _error(view: RunView, stage: RefinementStage) -> Frame:
         view.nobody(),
         note=uncertainty.tilt(stage),
         located=True,
-        tables=(uncertainty.table(stage),),
+        tables=(uncertainty.table(stage, view.metric),),
         focus=_error_focus(view, state),
     )
 
@@ -177,14 +177,14 @@ def _summary(view: RunView, stage: RefinementStage) -> Frame:
     return Frame(
         f"{_steps(len(rms) - 1)} in {stage.dof} degrees of freedom {'takes' if len(rms) == 2 else 'take'} the inliers "
         f"from {rms[0]:.2f} to {rms[-1]:.2f} px RMS, and their number from {counts[0]} to {counts[-1]}. "
-        f"The camera ends at {view.position(state)}, and its error is {uncertainty.spread(stage)}.",
+        f"The camera ends at {view.position(state)}, and its error is {uncertainty.spread(stage, view.metric)}.",
         _objective(stage),
         state,
         view.colors(style.UNDECIDED, (mask, style.INLIER)),
         mask,
         note=uncertainty.tilt(stage),
         located=True,
-        tables=(uncertainty.table(stage),),
+        tables=(uncertainty.table(stage, view.metric),),
     )
 
 

@@ -14,7 +14,7 @@ from spherloc.geometry import camera_centre
 from spherloc.problem import Problem
 from spherloc.types import ByteArray, FloatArray
 from spherloc_viz import style
-from spherloc_viz.layers.frame import Frame, RunView, length_text, one_color
+from spherloc_viz.layers.frame import Frame, RunView, one_color
 from spherloc_viz.layers.primitives import Label, Mesh, Points, SceneItem, Segments, Textured
 from spherloc_viz.layers.query_image import modified, sphere_texture
 from spherloc_viz.layers.uncertainty import error_items
@@ -41,7 +41,7 @@ def scale_bar(view: RunView) -> list[SceneItem]:
     below = start + 0.5 * along - 1.5 * tick
     return [
         Segments("scale/bar", "scale bar", lines, one_color(style.SCALE, len(lines)), 3.0),
-        Label("scale/length", "scale bar", below, length_text(length)),
+        Label("scale/length", "scale bar", below, view.length_text(length)),
     ]
 
 

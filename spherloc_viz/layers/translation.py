@@ -13,7 +13,7 @@ from spherloc.trace import ConsensusStage, TranslationStage
 from spherloc.types import BoolArray, FloatArray, IntArray
 from spherloc_viz import style
 from spherloc_viz.layers.agreement import agreement
-from spherloc_viz.layers.frame import Frame, Plan, RunView, ball_boxes, even, growing, length, one_color
+from spherloc_viz.layers.frame import Frame, Plan, RunView, ball_boxes, even, growing, one_color
 from spherloc_viz.layers.primitives import Balls, Focus, Graph, Label, Nodes, Points, SceneItem, Segments
 from spherloc_viz.layers.ring import GOLDEN
 
@@ -334,7 +334,7 @@ def _from_truth(view: RunView, position: FloatArray) -> str:
     """How far a place (3,) is from the true position, as part of a sentence; empty if that is unknown."""
     if view.truth is None:
         return ""
-    return f", {length(float(np.linalg.norm(position - camera_centre(view.truth))))} from the truth"
+    return f", {view.length(float(np.linalg.norm(position - camera_centre(view.truth))))} from the truth"
 
 
 def _pair(view: RunView, balls: BallSet) -> Frame:
@@ -347,7 +347,7 @@ def _pair(view: RunView, balls: BallSet) -> Frame:
     return Frame(
         f"With the yaw known, matches {first} and {second} have rays of known directions, which come nearest to each "
         f"other at {view.place(centre)}{_from_truth(view, centre)}. If both are right, noise can move the camera by "
-        f"{length(radius_m)} from there at most: a ball that holds every camera position this pair allows.",
+        f"{view.length(radius_m)} from there at most: a ball that holds every camera position this pair allows.",
         "H t = b,  |t_k − t| ≤ r_k   (Eq. 24-27)",
         _turned(view, balls),
         view.colors(style.UNDECIDED, (mask, style.SAMPLE)),
@@ -373,7 +373,7 @@ def _some(view: RunView, balls: BallSet, size: int) -> Frame:
     mask = balls.mask(balls.order[:size])
     shown = balls.by_radius[mask[balls.by_radius]]
     edges, possible = len(balls.edges_within(mask)), size * (size - 1) // 2
-    low, high = (length(float(stage.radii_m[ball])) for ball in shown[[0, -1]])
+    low, high = (view.length(float(stage.radii_m[ball])) for ball in shown[[0, -1]])
     items = balls.items(view, shown, inside)
     if size == SIZES[0] and edges:
         middle = np.mean(stage.centres_m[balls.edges_within(mask)[0]], axis=0)

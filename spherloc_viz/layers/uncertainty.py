@@ -7,7 +7,7 @@ from spherloc.metrics import rotation_error_deg
 from spherloc.trace import RefinementStage
 from spherloc.types import FloatArray
 from spherloc_viz import style
-from spherloc_viz.layers.frame import Frame, RunView, angle_text, length, length_text, one_color
+from spherloc_viz.layers.frame import Frame, RunView, angle_text, length, one_color
 from spherloc_viz.layers.primitives import Label, Points, SceneItem, Segments, Table
 
 LAYER = "uncertainty"
@@ -83,7 +83,7 @@ def _offset(view: RunView, frame: Frame, factor: int) -> list[SceneItem]:
     length_m = float(np.linalg.norm(offset))
     factor = factor if factor * length_m <= ROOM * view.sphere_m else 1
     end = centre + factor * offset
-    length = length_text(length_m) if factor == 1 else f"{length_text(length_m)} × {factor}"
+    length = view.length_text(length_m) if factor == 1 else f"{view.length_text(length_m)} × {factor}"
     text = f"{angle_text(rotation_error_deg(view.truth, frame.cam_from_map))} · {length}"
     # Below the sphere if the error is within it, else just below the line.
     away = BESIDE if factor * length_m < 2.0 * view.sphere_m else 0.3
@@ -120,11 +120,13 @@ def rms(stage: RefinementStage) -> tuple[float, float] | None:
     return float(np.degrees(np.sqrt(variance[:3].sum()))), float(np.sqrt(variance[3:].sum()))
 
 
-def spread(stage: RefinementStage) -> str:
-    """The same in words."""
+def spread(stage: RefinementStage, metric: bool = True) -> str:
+    """The same in words; if not ``metric``, in units of the map."""
     known = rms(stage)
     return (
-        "unknown: the inliers leave it open" if known is None else f"{angle_text(known[0])} and {length(known[1])} RMS"
+        "unknown: the inliers leave it open"
+        if known is None
+        else f"{angle_text(known[0])} and {length(known[1], metric)} RMS"
     )
 
 
@@ -138,12 +140,13 @@ def tilt(stage: RefinementStage) -> str:
     return f"{leans}, which was trusted to {np.degrees(stage.gravity_sd_rad):.3g}° (standard deviation)."
 
 
-def table(stage: RefinementStage) -> Table:
-    """Standard deviations by axis."""
+def table(stage: RefinementStage, metric: bool = True) -> Table:
+    """Standard deviations by axis; if not ``metric``, positions are in units of the map."""
     deviations = np.sqrt(np.diagonal(stage.covariance))
+    places = (length(value, metric) if np.isfinite(value) else "open" for value in deviations[3:])
     rows = (
         ("rotation about x, y, z", _listed(np.degrees(deviations[:3]), "{:.3f}°")),
-        ("position x, y, z", ", ".join(length(value) if np.isfinite(value) else "open" for value in deviations[3:])),
+        ("position x, y, z", ", ".join(places)),
         ("tilt", f"{np.degrees(stage.tilt_rad):.3f}°"),
     )
     return Table("standard deviations", ("", "camera, map frame"), rows)

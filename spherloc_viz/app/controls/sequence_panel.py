@@ -96,12 +96,13 @@ class SequencePanel:
 
 def sequence_html(rows: tuple[QueryResult, ...], scene: MapScene) -> str:
     """How far the sequence is, how many succeed within each limit, and what the colours of the dots mean."""
-    rates = success_rates(rows, scene.thresholds)
+    rates, unit = success_rates(rows, scene.thresholds), "m" if scene.metric else "units"
     lines = [
-        (f"within {rate.degrees:g}° and {rate.metres:g} m", f"{rate.successes} of {rate.judged}") for rate in rates
+        (f"within {rate.degrees:g}° and {rate.metres:g} {unit}", f"{rate.successes} of {rate.judged}") for rate in rates
     ]
     done = ("queries", f"{len(rows)} of {len(scene.queries)}")
     limit_m = scene.thresholds[-1][1]
     errors = [row.translation_error_m for row in rows if row.translation_error_m is not None]
-    worst = f"{100.0 * error_scale(np.array(errors), limit_m):.2g} cm; red beyond {limit_m:g} m"
+    scale, small = (100.0, "cm") if scene.metric else (1.0, unit)
+    worst = f"{scale * error_scale(np.array(errors), limit_m):.2g} {small}; red beyond {limit_m:g} {unit}"
     return table_html(Table("sequence", ("", ""), (done, *lines))) + (ramp_html("0", worst) if errors else "")
