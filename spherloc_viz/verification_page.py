@@ -11,7 +11,7 @@ from spherloc.datasets import load_scene, scene_path
 from spherloc.datasets.variation import settings_of
 from spherloc.experiments.sweep_plan import SweepPlan
 from spherloc.types import FloatArray
-from spherloc.verification.checks import Finding
+from spherloc.verification.checks import PAPERS_CAMERA, Finding
 from spherloc.verification.claims import Checked, Verdict
 from spherloc.verification.experiments import EXPERIMENTS, METHODS, SCENES
 from spherloc.verification.measured import Measured, Place
@@ -30,6 +30,12 @@ Sec. VI-C.3 takes 2P-RANSAC up to 80 % outliers and MC beyond. Here, as they are
 is the quickest of ransac-2p (1,000 samples), mc and mc-exact that is right in 95 % of the problems. Where a cell is
 grey, chance gives sets of matches as large as the largest that agree (expected false sets of that size: 1 or more), so
 no method that counts matches can know the answer.
+"""
+BESIDE_P3P = """\
+## Beside P3P
+
+SVD and MLPnP take 6 matches a sample, the pinhole solvers 5. What gravity is worth shows beside P3P, which takes 3 and
+works on the whole sphere: success in % at each outlier rate, the same bound, samples and last step (6 DoF) for all.
 """
 WORDS: Mapping[Verdict, str] = {
     Verdict.REPRODUCES: "**reproduces**",
@@ -80,6 +86,7 @@ def verification_page(
     parts += [_figure(key, name, plans[key]) for key, name in pictures.items()]
     if any(experiment.startswith("phase-") for experiment, _ in plans):
         parts.append(WHEN)
+    parts.append(_beside_p3p(measured))
     parts.append(_cases(measured))
     parts.append(tables)
     parts.append(_settings(plans))
@@ -149,6 +156,29 @@ def _figure(key: tuple[str, str], name: str, plan: SweepPlan) -> str:
     )
     title = title if camera in title else f"{title}, {camera}"
     return f"## {title}\n\n![{title}]({name})\n\n{plan.runs} problems at each point; {words}.\n"
+
+
+def _beside_p3p(measured: Measured) -> str:
+    """Success of 2P and of the 6-DoF solvers, P3P among them, at equal numbers of samples."""
+    parts: list[str] = []
+    for paper, own, names in (
+        ("fig6", "p3p-fig6", ("2P100", "P3P100", "SVD100", "ML100", "2P1k", "P3P1k", "ML1k")),
+        ("fig7", "p3p-fig7", ("2P1k", "P3P1k", "2P10k", "P3P10k", "SVD10k", "ML10k")),
+    ):
+        values = measured.values(own, PAPERS_CAMERA)
+        if not values:
+            continue
+        count = next(item.correspondences for item in EXPERIMENTS if item.key == own)
+        parts.append(f"| {count} matches | " + " | ".join(f"{100 * value:g} %" for value in values) + " |")
+        parts.append("|---|" + "---|" * len(values))
+        for name in names:
+            key = own if name.startswith("P3P") else paper
+            cells = [measured.cell(key, PAPERS_CAMERA, name, value) for value in values]
+            rates = ["–" if cell is None else f"{100 * cell.rate:.0f}" for cell in cells]
+            if any(cells):
+                parts.append(f"| {name} | {' | '.join(rates)} |")
+        parts.append("")
+    return "\n".join([BESIDE_P3P, *parts]) if parts else ""
 
 
 def _cases(measured: Measured) -> str:

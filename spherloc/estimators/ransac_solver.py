@@ -1,7 +1,8 @@
 """RANSAC around any solver of ``spherloc.solvers``: the baselines that the paper compares 2P with (Sec. VI).
 
 Algorithm 1 with a 6-DoF solver in the place of 2P: sample, solve, count inliers, keep the best, refine. Gravity is not
-used unless ``gravity_sd_deg`` asks the refinement to.
+used unless ``gravity_sd_deg`` asks the refinement to. P3P, which the paper does not compare with, is the solver that
+needs fewest matches without gravity.
 
 The pinhole solvers see the correspondences inside a rectified virtual camera only, from sampling to refinement; those
 outside are lost to them and never count as inliers. For these solvers the paper takes RANSAC "to remove outliers for
@@ -27,6 +28,7 @@ from spherloc.solvers.epnp import Epnp, VirtualPinhole
 from spherloc.solvers.epropnp import EproPnp
 from spherloc.solvers.mlpnp import Mlpnp
 from spherloc.solvers.odlt import Odlt
+from spherloc.solvers.p3p import P3p
 from spherloc.solvers.svd import Svd
 from spherloc.trace import RansacStage
 from spherloc.types import BoolArray, FloatArray, IntArray
@@ -192,6 +194,7 @@ class SolverRansac:
 
 RANSAC_SVD = SolverRansac("ransac-svd", Svd())
 RANSAC_MLPNP = SolverRansac("ransac-mlpnp", Mlpnp())
+RANSAC_P3P = SolverRansac("ransac-p3p", P3p())
 RANSAC_EPNP = SolverRansac("ransac-epnp", Epnp(), Epnp())
 RANSAC_ODLT = SolverRansac("ransac-odlt", Epnp(), Odlt())
 RANSAC_EPROPNP = SolverRansac("ransac-epropnp", Epnp(), EproPnp())

@@ -12,6 +12,7 @@ estimation problem, IJCV 1994.
 
 import numpy as np
 
+from spherloc.solvers.base import Many, checked
 from spherloc.types import FloatArray, IntArray
 
 SAMPLE_SIZE = 3
@@ -19,6 +20,25 @@ LEAST = 1e-9
 """Leading coefficients and denominators below this are rounding."""
 MOST_IMAGINARY = 1e-6
 """Of a root that counts as real, by its absolute value: double roots are found with half of the digits."""
+
+
+class P3p:
+    """Grunert's solution, as RANSAC takes it: up to four poses a sample."""
+
+    name = "P3P"
+    sample_size = SAMPLE_SIZE
+    pinhole = False
+
+    def solve(self, bearings: FloatArray, points: FloatArray) -> FloatArray:
+        """See ``Solver.solve``; of more than three correspondences the first three are taken."""
+        bearings, points = checked(self, bearings, points)
+        return self.solve_each(bearings[None], points[None])[0]
+
+    def solve_each(self, bearings: FloatArray, points: FloatArray) -> Many:
+        """The poses of each of B samples: ``bearings`` (B, K, 3) and ``points`` (B, K, 3), metres."""
+        found, sample = p3p(bearings[:, :SAMPLE_SIZE], points[:, :SAMPLE_SIZE])
+        order = np.argsort(sample, kind="stable")
+        return found[order], sample[order]
 
 
 def p3p(bearings: FloatArray, points: FloatArray) -> tuple[FloatArray, IntArray]:

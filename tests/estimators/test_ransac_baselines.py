@@ -20,9 +20,9 @@ from spherloc.trace import RansacStage, RefinementStage
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
 
-SPHERE = ("ransac-svd", "ransac-mlpnp")
+SPHERE = ("ransac-svd", "ransac-mlpnp", "ransac-p3p")
 PINHOLE = ("ransac-epnp", "ransac-odlt", "ransac-epropnp")
-SIZE = {"ransac-svd": 6, "ransac-mlpnp": 6} | dict.fromkeys(PINHOLE, 5)
+SIZE = {"ransac-svd": 6, "ransac-mlpnp": 6, "ransac-p3p": 3} | dict.fromkeys(PINHOLE, 5)
 
 each = pytest.mark.parametrize("estimator", SPHERE + PINHOLE)
 

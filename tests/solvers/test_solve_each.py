@@ -7,10 +7,11 @@ from pose_samples import around
 from spherloc.solvers.base import solve_each
 from spherloc.solvers.epnp import Epnp
 from spherloc.solvers.mlpnp import Mlpnp
+from spherloc.solvers.p3p import P3p
 from spherloc.solvers.svd import Svd
 
 
-@pytest.mark.parametrize("solver", [Svd(), Mlpnp(), Epnp()], ids=lambda solver: solver.name)
+@pytest.mark.parametrize("solver", [Svd(), Mlpnp(), P3p(), Epnp()], ids=lambda solver: solver.name)
 def test_many_samples_are_solved_as_each_alone(solver, rng):
     samples = [around(rng, 6, noise_rad=1e-3, offset_m=3.0) for _ in range(40)]
     bearings, points = np.array([one for one, _, _ in samples]), np.array([some for _, some, _ in samples])
