@@ -4,6 +4,8 @@ import os
 import signal
 import sys
 
+from spherloc_viz.overview import answer
+
 
 def main() -> None:
     """Entry point of ``spherloc``.
@@ -11,6 +13,10 @@ def main() -> None:
     Ctrl-C ends it without a word as long as it has nothing to keep, while it is importing and after its work is done.
     """
     _fill_standard_streams()
+    told = answer(sys.argv[1:])
+    if told is not None:
+        _print(told[0])
+        sys.exit(told[1])
     heard = signal.getsignal(signal.SIGINT)
     if heard is signal.default_int_handler:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
@@ -26,6 +32,17 @@ def main() -> None:
     finally:
         if heard is signal.default_int_handler:
             signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
+def _print(text: str) -> None:
+    """Print without a buffer, so that nothing is left to be written when Python ends; exits if that fails."""
+    try:
+        os.write(sys.stdout.fileno(), f"{text}\n".encode())
+    except BrokenPipeError:
+        sys.exit(141)
+    except OSError as error:
+        print(f"spherloc: the output cannot be written ({error.strerror}); check the disk.", file=sys.stderr)
+        sys.exit(2)
 
 
 def _fill_standard_streams() -> None:

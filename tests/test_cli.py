@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from dataclasses import dataclass, fields, replace
+from importlib.metadata import version
 from pathlib import Path
 from typing import Literal
 
@@ -320,3 +321,21 @@ def test_real_problems_from_the_command_line(tmp_path: Path, estimator: str) -> 
     for line, (degrees, metres) in zip(result.stdout.splitlines(), limits.values(), strict=True):
         record = json.loads(line)
         assert record["rotation_error_deg"] < degrees and record["translation_error_m"] < metres, record
+
+
+def test_the_first_screen_names_every_command_and_fits() -> None:
+    from scripts.documentation import commands
+    from spherloc_viz.overview import COMMANDS
+
+    def start(*words: str) -> subprocess.CompletedProcess[str]:
+        program = [sys.executable, "-c", "from spherloc_viz.start import main; main()", *words]
+        return subprocess.run(program, capture_output=True, text=True, cwd=ROOT, check=False)
+
+    told = start("--help")
+    assert told.returncode == 0 and told.stdout == start("-h").stdout
+    lines = told.stdout.splitlines()
+    assert len(lines) <= 40 and max(map(len, lines)) <= 100
+    assert {name for named in COMMANDS.values() for name in named} == set(commands())
+    nothing = start()
+    assert (nothing.returncode, nothing.stdout) == (2, told.stdout)
+    assert start("--version").stdout.strip() == f"spherloc {version('spherloc')}"
