@@ -5,14 +5,21 @@ the runs on the same problems show it.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.stats import fisher_exact
 
+from spherloc.datasets import load_scene, scene_path
+from spherloc.datasets.synthetic import SyntheticScene
+from spherloc.estimators import estimate
+from spherloc.geometry import pose, yaw_rotation
 from spherloc.metrics import ransac_success_probability
-from spherloc.verification.experiments import CASES
+from spherloc.problem import Problem
+from spherloc.solvers.two_point import two_point
+from spherloc.verification.experiments import CAMERAS, CASES, METHODS
 from spherloc.verification.measured import Cell, Measured, Place, at, smaller_share
 
 PAPER_RUNS = 100
@@ -24,6 +31,9 @@ NEARLY_ALL = 0.95
 DROP = 0.9
 """A success rate that has dropped significantly is below."""
 PAPERS_CAMERA = "MEI"
+EXACT = 1e-6
+"""Of each number of a pose: without noise nothing but rounding is left."""
+SAME_RUNS = 20
 
 
 @dataclass(frozen=True)
@@ -225,5 +235,56 @@ def best_of_case(key: str, method: str, others: Sequence[str]) -> Check:
         best = max(known, key=lambda rival: rival.rate)
         ours = f"{method}: {_percent(cell)}; best of the others: {best.place.method}, {_percent(best)}"
         return Finding(cell.rate >= best.rate, ours, cell.place, cell.decisive())
+
+    return finding
+
+
+def two_points_suffice(measured: Measured) -> Finding:
+    """2P finds the true yaw and translation from two correspondences without noise, through each camera model."""
+    found: list[str] = []
+    right = total = 0
+    for camera, name in CAMERAS.items():
+        scene = load_scene(scene_path(Path(name)))
+        assert isinstance(scene, SyntheticScene)
+        exact = replace(scene, correspondences=2, outlier_rate=0.0, noise_px=0.0)
+        here = sum(_solved_by_two(exact.problem(seed)) for seed in range(PAPER_RUNS))
+        right, total = right + here, total + PAPER_RUNS
+        found.append(f"{camera}: {here} of {PAPER_RUNS}")
+    return Finding(right == total, "random pairs solved: " + ", ".join(found))
+
+
+def _solved_by_two(problem: Problem) -> bool:
+    aligned, truth = problem.aligned, problem.truth_cam_from_map
+    assert truth is not None
+    yaws, translations, exists = two_point(aligned.bearings[None], aligned.points[None])
+    poses = [pose(yaw_rotation(yaw), t) for yaw, t in zip(yaws[exists], translations[exists], strict=True)]
+    return any(np.abs(aligned.unalign_pose(one) - truth).max() < EXACT for one in poses)
+
+
+def same_for_every_seed(measured: Measured) -> Finding:
+    """MC gives the same pose to the last bit whatever seed it is given."""
+    scene = load_scene(scene_path(Path(CAMERAS[PAPERS_CAMERA])))
+    assert isinstance(scene, SyntheticScene)
+    same = 0
+    for seed in range(SAME_RUNS):
+        problem = scene.problem(seed)
+        one, other = (estimate(problem, "mc", METHODS["MC"].options(problem), seed=s) for s in (0, 1))
+        same += np.array_equal(one.cam_from_map, other.cam_from_map)
+    return Finding(
+        same == SAME_RUNS, f"MC: the same pose to the last bit for two seeds in {same} of {SAME_RUNS} problems"
+    )
+
+
+def quicker_than(experiment: str, method: str, values: Sequence[float], most_ms: float) -> Check:
+    """The median time is below ``most_ms`` at each of the values."""
+
+    def finding(measured: Measured) -> Finding | None:
+        cells = at(measured.curve(experiment, PAPERS_CAMERA, method), values)
+        if not cells:
+            return None
+        slowest = max(cells, key=lambda cell: cell.median("time_ms"))
+        took_ms = slowest.median("time_ms")
+        ours = f"{method}: {took_ms:.3g} ms at {_name(slowest.place.value, experiment)}, the slowest"
+        return Finding(took_ms < most_ms, ours, slowest.place, slowest.rows[0].seed)
 
     return finding

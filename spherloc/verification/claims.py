@@ -19,8 +19,11 @@ from spherloc.verification.checks import (
     follows_eq_28,
     order_of_error,
     precision_is,
+    quicker_than,
     rate_is,
+    same_for_every_seed,
     smaller,
+    two_points_suffice,
 )
 from spherloc.verification.experiments import CASES, NORMAL
 from spherloc.verification.measured import Measured
@@ -97,6 +100,14 @@ _OWN = "arcs wider than 60° are left out and the bound is 3 px (mc, as it is he
 _EXACT = "the consensus is maximized over poses, not over pairs (mc-exact)"
 
 CLAIMS: Sequence[Claim] = (
+    Claim(
+        "two-points",
+        "Abstract, IV-D",
+        "Two correspondences fix the pose of every fisheye and panoramic camera whose roll and pitch are known.",
+        "closed form",
+        two_points_suffice,
+        note="With Eq. 23 multiplied out: as printed it divides by zero for horizontal bearings, see the errata.",
+    ),
     Claim(
         "fig5-mc-accuracy",
         "Fig. 5, VI-A.1",
@@ -334,6 +345,21 @@ CLAIMS: Sequence[Claim] = (
         "less",
         smaller("time_ms", "fig7", ("MC", "2P10k"), _EXTREME),
         ((_OWN, smaller("time_ms", "fig7", ("mc", "ransac-2p 10k"), _EXTREME)),),
+    ),
+    Claim(
+        "vi-c-5hz",
+        "VI-C.3",
+        "MC localizes at about 5 Hz.",
+        "200 ms",
+        quicker_than("fig7", "MC", _EXTREME, 200.0),
+        note="Simulated, 200 matches. With hundreds of right matches all pairs of the rotation clique take far longer.",
+    ),
+    Claim(
+        "vi-c-deterministic",
+        "VI-C.3",
+        "MC is not influenced by random factors: deterministic convergence.",
+        "the same every time",
+        same_for_every_seed,
     ),
     *(
         Claim(

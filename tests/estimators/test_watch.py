@@ -22,6 +22,7 @@ LONG = {
     "ransac-2p": (500, {"iterations": 10_000_000}),
     "ransac-svd": (50, {"iterations": 1_000_000}),
     "ransac-mlpnp": (50, {"iterations": 1_000_000}),
+    "ransac-p3p": (50, {"iterations": 1_000_000}),
     "ransac-epnp": (50, {"iterations": 1_000_000}),
     "ransac-odlt": (50, {"iterations": 1_000_000}),
     "ransac-epropnp": (50, {"iterations": 1_000_000}),

@@ -49,7 +49,8 @@ RECIPES = (
     ),
     _Recipe(
         "Paper Fig. 6 at 90 %",
-        "The paper's fisheye, 100 matches and 10 of them right: maximum consensus finds the pose for every seed.",
+        "The paper's fisheye, 100 matches and 10 of them right: maximum consensus finds the pose, as for 498 of 500 "
+        "seeds.",
         "mei_outliers_90",
         0,
         estimator="mc",
