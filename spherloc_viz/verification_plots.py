@@ -13,7 +13,7 @@ from matplotlib.patches import Patch, Rectangle
 from spherloc.experiments.sweep_plan import AXES
 from spherloc.metrics import SUCCESS_DEG, SUCCESS_M
 from spherloc.types import FloatArray
-from spherloc.verification.experiments import PHASE_GRAVITY_DEG, PHASE_METHODS, phase_key
+from spherloc.verification.experiments import METHODS, PHASE_GRAVITY_DEG, PHASE_METHODS, phase_key
 from spherloc.verification.measured import Cell, Measured
 
 FIGURES = ("fig5", "fig6", "fig7", "fig6-normal", "fig7-normal")
@@ -126,7 +126,7 @@ def _noise(figure: Figure, experiment: str, camera: str, measured: Measured) -> 
                 box.set(facecolor=BOXES[name], alpha=0.75, linewidth=0.5)
             axes.plot([], [], color=BOXES[name], linewidth=6, label=name)
         axes.set_yscale("log")
-        axes.set_ylim(bottom=LEAST_ERROR[column])
+        axes.set_ylim(bottom=0.8 * LEAST_ERROR[column])
         axes.set_xticks(measured.values(experiment, camera))
         axes.set_xlabel("standard deviation of the noise (px)")
         axes.set_ylabel(label)
@@ -150,7 +150,7 @@ def _rates(figure: Figure, experiment: str, camera: str, over: str, measured: Me
         for place, name in enumerate(names):
             cells = measured.curve(experiment, camera, name)
             x = 100.0 * np.array([cell.place.value for cell in cells])
-            color, dash = COLORS[place % len(COLORS)], DASHES[name[0].isupper()]
+            color, dash = COLORS[place % len(COLORS)], DASHES[("as_printed", True) in METHODS[name].changes]
             if value is parts[0][1]:
                 low, high = 100.0 * np.array([cell.interval for cell in cells]).T
                 axes.fill_between(x, low, high, color=color, alpha=0.08, linewidth=0)
