@@ -8,8 +8,11 @@ from typing import Any
 
 from spherloc.errors import InputError
 from spherloc.experiments.sweep_plan import Entrant
-from spherloc.files import is_folder
+from spherloc.files import is_folder, names_in, read_file
 from spherloc.verification.experiments import BOUND_PX, METHODS
+
+MOST_BYTES = 1_000_000
+"""Of the file of the printed tables."""
 
 
 @dataclass(frozen=True)
@@ -111,8 +114,9 @@ queries = ["*5_rgb.png"]
 depth = "ray"
 trust_poses = false
 """
-    buildings = sorted(path for path in folder.iterdir() if any(path.glob("*_rgb.png")))
-    return [Session(path.name, text.format(name=path.name, root=_quoted(path))) for path in buildings]
+    there = sorted(name for name in names_in(folder) if is_folder(folder / name))
+    buildings = [name for name in there if any(image.endswith("_rgb.png") for image in names_in(folder / name))]
+    return [Session(name, text.format(name=name, root=_quoted(folder / name))) for name in buildings]
 
 
 def _quoted(path: Path) -> str:
@@ -143,4 +147,4 @@ def sessions_of(dataset: Dataset, folder: Path) -> Sequence[Session]:
 
 def printed_tables() -> dict[str, dict[str, Any]]:
     """The paper's Tables I to VI by key: title, columns and rows, and the dataset where it is of one."""
-    return tomllib.loads((Path(__file__).parent / "tables.toml").read_text(encoding="utf-8"))
+    return tomllib.loads(read_file(Path(__file__).parent / "tables.toml", MOST_BYTES).decode())

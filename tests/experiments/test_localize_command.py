@@ -23,7 +23,7 @@ from spherloc.experiments import read_results
 from spherloc.trajectory import read_tum
 from spherloc.warm_up import warm_up
 from spherloc_viz.batch import Records
-from spherloc_viz.localize import Solving, localize_sequence
+from spherloc_viz.localize import Solving, compare_sequences, localize_sequence
 from spherloc_viz.plots import trajectory_png
 from spherloc_viz.recording.content.data import read_recording
 from spherloc_viz.scene_list import all_scenes, one_kind
@@ -258,21 +258,18 @@ def test_the_picture_shows_truth_errors_and_failures(tmp_path: Path) -> None:
     assert run(write_scene(tmp_path / "none", queries=2, few=[0, 1]), tmp_path / "none" / "out") == 1
 
 
-def test_several_estimators_and_scenes_in_one_table(
-    tmp_path: Path, drawn: dict[str, str], capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Each result is that of the estimator alone, each query is matched once, and the same command goes on."""
-    scenes = []
+@pytest.mark.usefixtures("drawn")
+def test_several_estimators_and_scenes_in_one_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Each result is that of the estimator alone, and the same command goes on."""
+    out, scenes = tmp_path / "both", {}
     for name in ("day", "night"):
         (tmp_path / name).mkdir()
-        scenes.append(write_scene(tmp_path / name, queries=4, few=[1] if name == "night" else []))
-        scenes[-1] = scenes[-1].rename(tmp_path / name / f"{name}.toml")
-        scenes[-1].write_text(scenes[-1].read_text().replace("drawn walk", f"walk by {name}"))
-    out = tmp_path / "both"
-    words = ["--estimator", "mc", "--estimator", "ransac-2p,iterations=200", "--output", out, "--no-record"]
-    process = command(*scenes, *words, environment=drawn)
-    told, errors = process.communicate(timeout=LIMIT_S)
-    assert process.returncode == 1, errors
+        path = write_scene(tmp_path / name, queries=4, few=[1] if name == "night" else [])
+        path.write_text(path.read_text().replace("drawn walk", f"walk by {name}"))
+        how = [("mc", ()), ("ransac-2p", ("iterations=200",))]
+        scenes[path] = [Solving(estimator, options, out / name / estimator, None) for estimator, options in how]
+    assert compare_sequences(scenes, 0, (), False, out) == 1
+    told = capsys.readouterr().out
     with (out / "comparison.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     named = [("walk by day", "mc"), ("walk by day", "ransac-2p iterations=200")]
@@ -280,15 +277,13 @@ def test_several_estimators_and_scenes_in_one_table(
     assert [(row["scene"], row["estimator"]) for row in rows] == named
     assert [(row["localized"], row["no pose"]) for row in rows] == [("4 of 4", "0")] * 2 + [("3 of 4", "1")] * 2
     assert "walk by night" in told and (out / "comparison.md").read_text().count("\n") == 6
-    picture = pixels_of((out / "walk_by_day.png").read_bytes())
-    assert near(picture, (27, 108, 168)) > 100  # the first estimator's colour
-    alone = tmp_path / "alone"
-    run(scenes[0], alone, estimator="ransac-2p", settings=("iterations=200",))
-    mine, other = read_results(alone).rows, read_results(out / "day" / "ransac-2p,iterations=200").rows
-    for a, b in zip(mine, other, strict=True):
+    assert near(pixels_of((out / "walk_by_day.png").read_bytes()), (27, 108, 168)) > 100  # the first one's colour
+    run(next(iter(scenes)), tmp_path / "alone", estimator="ransac-2p", settings=("iterations=200",))
+    alone, other = read_results(tmp_path / "alone").rows, read_results(out / "day" / "ransac-2p").rows
+    for a, b in zip(alone, other, strict=True):
         np.testing.assert_array_equal(a.cam_from_map, b.cam_from_map)
-    again = command(*scenes, *words, environment=drawn)
-    assert "4 of 4 queries are done already" in again.communicate(timeout=LIMIT_S)[1]
+    compare_sequences(scenes, 0, (), False, out)
+    assert "4 of 4 queries are done already" in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("drawn")
