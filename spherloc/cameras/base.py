@@ -10,6 +10,20 @@ import numpy as np
 
 from spherloc.types import BoolArray, FloatArray
 
+MODEL_NAMES = {
+    "double_sphere": "double sphere",
+    "eucm": "EUCM",
+    "fisheye624": "FISHEYE624",
+    "kannala_brandt": "Kannala-Brandt",
+    "mei": "MEI",
+}
+"""What people call a model; those that are not here are called as in files, with spaces."""
+
+
+def model_name(camera: "Camera") -> str:
+    """The camera's model as people call it."""
+    return MODEL_NAMES.get(camera.model, camera.model.replace("_", " "))
+
 
 @runtime_checkable
 class Camera(Protocol):

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from spherloc.cameras.base import Camera
+from spherloc.cameras.base import Camera, model_name
 from spherloc.cameras.calibration import load_camera
 from spherloc.datasets.map_scene import MapScene
 from spherloc.datasets.point_cloud import OUTLIER_KINDS, Lens, OutlierKind
@@ -177,7 +177,7 @@ def _changed_name(scene: SyntheticScene, changed: SyntheticScene, fields_changed
     before, now = (f"{100 * rate:.3g} % outliers" for rate in (scene.outlier_rate, changed.outlier_rate))
     name = scene.name.replace(before, now)
     words = {
-        "camera": f"through {changed.camera.model.replace('_', ' ')}",
+        "camera": f"through {model_name(changed.camera)}",
         "correspondences": f"{changed.correspondences} matches",
         "noise_px": f"{changed.noise_px:g} px noise",
         "outlier_rate": now,

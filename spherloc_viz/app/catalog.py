@@ -6,7 +6,7 @@ from functools import lru_cache
 from itertools import chain, count
 from pathlib import Path
 
-from spherloc.cameras.base import Camera
+from spherloc.cameras.base import Camera, model_name
 from spherloc.datasets import Scene, bundled_scenes, load_scene
 from spherloc.datasets.failures import StagedScene
 from spherloc.datasets.map_scene import MapScene
@@ -165,4 +165,4 @@ class _Caches:
 
 def camera_label(camera: Camera) -> str:
     """What a camera is called on the page."""
-    return f"{camera.model.replace('_', ' ')}, {camera.width} × {camera.height}"
+    return f"{model_name(camera)}, {camera.width} × {camera.height}"

@@ -68,10 +68,7 @@ def ground(view: RunView) -> list[SceneItem]:
     names = (("x", np.array([1.0, 0.0, 0.0])), ("z, yaw 0°", np.array([0.0, 0.0, 1.0])))
     return [
         Segments("ground/grid", "ground", grid, one_color(style.GROUND, len(grid)), 1.0),
-        *(
-            Label(f"ground/{text[0]}", "ground", edge + (radius + 0.4 * cell) * along, text, 0.25 * cell)
-            for text, along in names
-        ),
+        *(Label(f"ground/{text[0]}", "ground", edge + (radius + 0.4 * cell) * along, text) for text, along in names),
     ]
 
 

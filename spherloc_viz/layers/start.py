@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from spherloc.cameras.base import model_name
 from spherloc.problem import Problem
 from spherloc_viz import style
 from spherloc_viz.layers import ring
@@ -56,7 +57,7 @@ def _problem_note(problem: Problem, count: int, lost: int) -> str:
 def _bearings(view: RunView) -> Frame:
     problem = view.trace.problem
     return Frame(
-        f"The {problem.camera.model.replace('_', ' ')} camera turns each of its {len(problem) - _lost(problem)} usable "
+        f"The {model_name(problem.camera)} camera turns each of its {len(problem) - _lost(problem)} usable "
         "pixels into a direction, a dot on the unit sphere, whatever its lens. "
         "Gravity is known, so the sphere stands upright and only its yaw and position are open.",
         _lens_equation(problem.camera.model),

@@ -127,11 +127,11 @@ def test_gravity_can_be_off_and_scene_and_camera_be_changed(tab: Playground) -> 
     tab.choose("Scene", "MEI fisheye, 90 % outliers")
     expect(tab.value("inliers")).to_have_text(re.compile(r" of 100$"))
     expect(tab.thumb("Outliers (%)")).to_have_attribute("aria-valuenow", "90")
-    tab.choose("Camera", "kannala brandt, 512 × 512")
+    tab.choose("Camera", "Kannala-Brandt, 512 × 512")
     tab.slide("Timeline", "Home")
     expect(tab.step).to_have_value(re.compile("^1/"))
     tab.press("Next")
-    expect(tab.page.get_by_text(re.compile("The kannala brandt camera turns each of its"))).to_be_visible()
+    expect(tab.page.get_by_text(re.compile("The Kannala-Brandt camera turns each of its"))).to_be_visible()
     assert tab.errors == []
 
 

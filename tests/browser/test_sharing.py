@@ -186,7 +186,7 @@ def test_what_is_copied_repeats_the_run_to_the_last_bit(
     tab.entry("Iterations").press("Enter")
     tab.choose("Confidence", "0.9")
     tab.unfold("More of the scene")
-    tab.choose("Camera", "kannala brandt, 512 × 512")
+    tab.choose("Camera", "Kannala-Brandt, 512 × 512")
     go_to(tab, "Matches")
     inlier, hidden = np.flatnonzero(run.inlier_mask)[:2].tolist()
     outlier = int(np.flatnonzero(~run.inlier_mask)[0])
