@@ -114,23 +114,40 @@ def trajectory_png(results: SequenceResults) -> bytes:
     """
     places = _from_above(results, results.positions_m)
     true_places = _from_above(results, results.true_positions_m)
-    middle, half = _frame(places, true_places)
     # About as high as the picture of the map, so that the bar of colours beside it is not longer.
-    height = float(np.clip(0.75 * WIDTH_INCHES * half[1] / half[0] + 1.1, *HEIGHT_INCHES))
+    figure, axes = _from_above_figure(results, _frame(places, true_places), 0.75, 1.1)
+    _truth(axes, true_places, timed(results))
+    _estimates(figure, axes, results, places, true_places)
+    _without_place(axes, results, places, true_places)
+    axes.set_title(_title(results), parse_math=False, fontsize=11)
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(loc="best", fontsize=9)
+    return _png(figure)
+
+
+def _from_above_figure(
+    results: SequenceResults, frame: tuple[FloatArray, FloatArray], share: float, more_inches: float
+) -> tuple[Figure, Axes]:
+    """An empty picture of the map from above, whose middle and half extent are the ``frame``, as high as this asks for
+    by a ``share`` of the width, and ``more_inches``."""
+    middle, half = frame
+    height = float(np.clip(share * WIDTH_INCHES * half[1] / half[0] + more_inches, *HEIGHT_INCHES))
     figure = Figure(figsize=(WIDTH_INCHES, height), dpi=DPI, layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot(aspect="equal", axisbelow=True)
     axes.grid(color="0.9", linewidth=0.6)
     axes.set_xlim(middle[0] - half[0], middle[0] + half[0])
     axes.set_ylim(middle[1] - half[1], middle[1] + half[1])
-    _truth(axes, true_places, timed(results))
-    _estimates(figure, axes, results, places, true_places)
-    _without_place(axes, results, places, true_places)
-    axes.set_title(_title(results), parse_math=False, fontsize=11)
-    axes.set_xlabel(f"{_in(results)}, in the map")
-    axes.set_ylabel(f"{_in(results)}, in the map")
-    if axes.get_legend_handles_labels()[0]:
-        axes.legend(loc="best", fontsize=9)
+    axes.set_xlabel(f"{_unit(results)}, in the map")
+    axes.set_ylabel(f"{_unit(results)}, in the map")
+    return figure, axes
+
+
+def _unit(results: SequenceResults) -> str:
+    return "metres" if results.configuration.metric else "units (scale unknown)"
+
+
+def _png(figure: Figure) -> bytes:
     file = io.BytesIO()
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing")  # names in scripts that the font lacks
@@ -154,15 +171,8 @@ def trajectories_png(several: Sequence[tuple[str, SequenceResults]]) -> bytes:
     first = several[0][1]
     true_places = _from_above(first, first.true_positions_m)
     places = [_from_above(results, results.positions_m) for _, results in several]
-    middle, half = _frame(np.concatenate(places), true_places)
     below = 0.25 * ((len(several) + 2) // 2)
-    height = float(np.clip(0.9 * WIDTH_INCHES * half[1] / half[0] + 1.3 + below, *HEIGHT_INCHES))
-    figure = Figure(figsize=(WIDTH_INCHES, height), dpi=DPI, layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.add_subplot(aspect="equal", axisbelow=True)
-    axes.grid(color="0.9", linewidth=0.6)
-    axes.set_xlim(middle[0] - half[0], middle[0] + half[0])
-    axes.set_ylim(middle[1] - half[1], middle[1] + half[1])
+    figure, axes = _from_above_figure(first, _frame(np.concatenate(places), true_places), 0.9, 1.3 + below)
     _truth(axes, true_places, timed(first))
     for number, ((label, results), seen) in enumerate(zip(several, places, strict=True)):
         style = _Style(
@@ -170,16 +180,10 @@ def trajectories_png(several: Sequence[tuple[str, SequenceResults]]) -> bytes:
             CURVE_MARKERS[number % len(CURVE_MARKERS)],
             LARGEST_MARKER - (LARGEST_MARKER - 3.0) * number / max(1, len(several) - 1),
         )
-        _one_of_several(axes, label, results, (seen, true_places), style)
+        _one_of_several(axes, label, results, seen, style)
     axes.set_title(first.configuration.name, parse_math=False, fontsize=11)
-    axes.set_xlabel(f"{_in(first)}, in the map")
-    axes.set_ylabel(f"{_in(first)}, in the map")
     figure.legend(loc="outside lower center", ncols=2, fontsize=9, frameon=False)
-    file = io.BytesIO()
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Glyph .* missing")
-        figure.savefig(file, format="png", metadata={"Software": None})
-    return file.getvalue()
+    return _png(figure)
 
 
 @dataclass(frozen=True)
@@ -192,15 +196,9 @@ class _Style:
     """Points."""
 
 
-def _one_of_several(
-    axes: Axes,
-    label: str,
-    results: SequenceResults,
-    places: tuple[FloatArray, FloatArray],
-    style: _Style,
-) -> None:
-    """Draw one estimator's positions, headings and failures; ``places`` are its own and the true ones (Q, 2)."""
-    seen, true_places = places
+def _one_of_several(axes: Axes, label: str, results: SequenceResults, seen: FloatArray, style: _Style) -> None:
+    """Draw one estimator's positions ``seen`` from above (Q, 2), its headings and failures."""
+    true_places = _from_above(results, results.true_positions_m)
     errors_m, _, limit_m = _errors(results)
     inside = np.isfinite(seen).all(axis=1) & _inside(axes, seen)
     with_truth = np.isfinite(true_places).all(axis=1)
@@ -241,10 +239,6 @@ def _headings(results: SequenceResults) -> FloatArray:
         if row.cam_from_map is not None:
             ahead[place] = row.cam_from_map[2, :3]
     return _from_above(results, ahead)
-
-
-def _in(results: SequenceResults) -> str:
-    return "metres" if results.configuration.metric else "units (scale unknown)"
 
 
 def _from_above(results: SequenceResults, positions_m: FloatArray) -> FloatArray:
@@ -293,7 +287,7 @@ def _estimates(
         *places[good].T, c=errors_m[good], vmin=0.0, vmax=error_scale(errors_m[coloured], limit_m), s=30,
         cmap=ramp, edgecolors="0.2", linewidths=0.4, label="estimate" if good.any() else None, zorder=3,
     )  # fmt: skip
-    figure.colorbar(dots, ax=axes, shrink=0.85).set_label(f"{what}, {_in(results)}")
+    figure.colorbar(dots, ax=axes, shrink=0.85).set_label(f"{what}, {_unit(results)}")
     if bad.any():
         unit = results.configuration.unit
         label = f"{np.count_nonzero(bad)} beyond {limit_m:g} {unit}, up to {errors_m[bad].max():.3g} {unit}"

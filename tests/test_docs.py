@@ -156,7 +156,7 @@ def command(name: str) -> Callable[..., object] | None:
 @functools.cache
 def flags_of(name: str) -> frozenset[str]:
     """All flags of a command."""
-    return frozenset(re.findall(r"(?<![\w-])--[a-z][a-z-]*", documentation.help_of(name)))
+    return frozenset(re.findall(r"(?<![\w-])--[a-z][a-z0-9-]*", documentation.help_of(name)))
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if list(command_lines(page))], ids=lambda page: page.name)

@@ -269,7 +269,8 @@ def same_for_every_seed(measured: Measured) -> Finding:
     for seed in range(SAME_RUNS):
         problem = scene.problem(seed)
         one, other = (estimate(problem, "mc", METHODS["MC"].options(problem), seed=s) for s in (0, 1))
-        same += np.array_equal(one.cam_from_map, other.cam_from_map)
+        found = [trace.cam_from_map for trace in (one, other) if trace.cam_from_map is not None]
+        same += len(found) == 2 and np.array_equal(*found)
     return Finding(
         same == SAME_RUNS, f"MC: the same pose to the last bit for two seeds in {same} of {SAME_RUNS} problems"
     )
