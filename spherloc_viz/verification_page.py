@@ -13,7 +13,7 @@ from spherloc.experiments.sweep_plan import SweepPlan
 from spherloc.types import FloatArray
 from spherloc.verification.checks import PAPERS_CAMERA, Finding
 from spherloc.verification.claims import Checked, Verdict
-from spherloc.verification.experiments import EXPERIMENTS, METHODS, SCENES
+from spherloc.verification.experiments import EXPERIMENTS, METHODS, NORMAL, SCENES
 from spherloc.verification.measured import Measured, Place
 from spherloc_viz.options import typed
 
@@ -43,6 +43,13 @@ WORDS: Mapping[Verdict, str] = {
     Verdict.DOES_NOT: "**does not**",
     Verdict.NEEDS_DATA: "data needed",
     Verdict.NOT_RUN: "not run",
+}
+COUNTED: Mapping[Verdict, str] = {
+    Verdict.REPRODUCES: "reproduce",
+    Verdict.ONLY_IF: "hold only if something else is chosen",
+    Verdict.DOES_NOT: "do not hold",
+    Verdict.NEEDS_DATA: "need data that are not bundled",
+    Verdict.NOT_RUN: "were not run",
 }
 Plans = Mapping[tuple[str, str], SweepPlan]
 PAPER = "Robust Vehicle Localization for Spherical Camera Models: Solution, Framework, and Verification"
@@ -95,8 +102,8 @@ def verification_page(
 
 def _counts(checked: Sequence[Checked]) -> str:
     found = Counter(item.verdict for item in checked)
-    words = [f"{found[verdict]} {verdict.value}" for verdict in Verdict if found[verdict]]
-    return f"Of {len(checked)} claims: {', '.join(words)}.\n"
+    words = [f"{found[verdict]} {many}" for verdict, many in COUNTED.items() if found[verdict]]
+    return f"Of {len(checked)} claims {', '.join(words)}.\n"
 
 
 def _table(checked: Sequence[Checked], plans: Plans) -> str:
@@ -154,7 +161,7 @@ def _figure(key: tuple[str, str], name: str, plan: SweepPlan) -> str:
         if experiment == "fig5"
         else ("solid: as printed; dashed: this project's own forms; bands: 95 % Wilson intervals")
     )
-    title = title if camera in title else f"{title}, {camera}"
+    title = title if camera == NORMAL else f"{title}, {camera}"
     return f"## {title}\n\n![{title}]({name})\n\n{plan.runs} problems at each point; {words}.\n"
 
 

@@ -120,7 +120,8 @@ CLAIMS: Sequence[Claim] = (
                 smaller("rotation_error_deg", "fig5", ("mc 8px", "2P100"), _NOISE, share_of_values=0.8),
             ),
         ),
-        "With the same last step both end at the same pose: what differs in the figure is where it starts.",
+        "With the same last step both end at the same pose up to 4 px. Beyond, the bound of 8 px cuts off right "
+        "matches, and MC starts with more of them.",
     ),
     Claim(
         "fig5-mc-low-noise",
