@@ -268,9 +268,9 @@ def same_for_every_seed(measured: Measured) -> Finding:
     same = 0
     for seed in range(SAME_RUNS):
         problem = scene.problem(seed)
-        one, other = (estimate(problem, "mc", METHODS["MC"].options(problem), seed=s) for s in (0, 1))
-        found = [trace.cam_from_map for trace in (one, other) if trace.cam_from_map is not None]
-        same += len(found) == 2 and np.array_equal(*found)
+        options = METHODS["MC"].options(problem)
+        one, other = (estimate(problem, "mc", options, seed=s).cam_from_map for s in (0, 1))
+        same += one is not None and other is not None and np.array_equal(one, other)
     return Finding(
         same == SAME_RUNS, f"MC: the same pose to the last bit for two seeds in {same} of {SAME_RUNS} problems"
     )
