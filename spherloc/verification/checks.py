@@ -19,7 +19,7 @@ from spherloc.geometry import pose, yaw_rotation
 from spherloc.metrics import ransac_success_probability
 from spherloc.problem import Problem
 from spherloc.solvers.two_point import two_point
-from spherloc.verification.experiments import CAMERAS, CASES, METHODS
+from spherloc.verification.experiments import CAMERAS, CASES, METHODS, OWN
 from spherloc.verification.measured import Cell, Measured, Place, at, smaller_share
 
 PAPER_RUNS = 100
@@ -228,6 +228,7 @@ def best_of_case(key: str, method: str, others: Sequence[str]) -> Check:
     def finding(measured: Measured) -> Finding | None:
         count = float(CASES[key][1])
         cell = measured.cell(key, "Kannala-Brandt", method, count)
+        cell = cell or measured.cell(key + OWN, "Kannala-Brandt", method, count)
         rivals = [measured.cell(key, "Kannala-Brandt", name, count) for name in others]
         known = [rival for rival in rivals if rival is not None]
         if cell is None or not known:

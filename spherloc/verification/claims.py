@@ -91,6 +91,7 @@ def check(claim: Claim, measured: Measured) -> Checked:
     return Checked(claim, Verdict.DOES_NOT, "", printed, None)
 
 
+_RIVALS = ("2P1k", "2P10k", "SVD10k", "ML10k", "R+EPro", "R+EPnP", "R+oDLT")
 _TO_90 = tuple(round(0.1 * k, 10) for k in range(10))
 _EXTREME = tuple(round(0.9 + 0.01 * k, 10) for k in range(6))
 _NOISE = tuple(float(k) for k in range(1, 11))
@@ -368,12 +369,15 @@ CLAIMS: Sequence[Claim] = (
             f"Table VI, ExpID {number}",
             f"With {right} right ones among {count} matches MC finds the pose best.",
             "MC best or as good as any",
-            best_of_case(key, "MC", ("2P1k", "2P10k", "SVD10k", "ML10k", "R+EPro", "R+EPnP", "R+oDLT")),
+            best_of_case(key, "MC", _RIVALS),
             (
-                (_OWN, best_of_case(key, "mc", ("2P1k", "2P10k", "SVD10k", "ML10k", "R+EPro", "R+EPnP", "R+oDLT"))),
                 (
-                    _EXACT,
-                    best_of_case(key, "mc-exact", ("2P1k", "2P10k", "SVD10k", "ML10k", "R+EPro", "R+EPnP", "R+oDLT")),
+                    "arcs wider than 60° are left out, at 8 px (mc, as it is here)",
+                    best_of_case(key, "mc 8px", _RIVALS),
+                ),
+                (
+                    "the consensus is maximized over poses, at 8 px (mc-exact)",
+                    best_of_case(key, "mc-exact 8px", _RIVALS),
                 ),
             ),
             "The paper's images are not public: random problems with its counts, 3 px of noise.",

@@ -124,14 +124,19 @@ CASES: Mapping[str, tuple[int, int]] = {"case1": (13, 52), "case2": (9, 42), "ca
 """Table VI: right matches and all matches of its three experiments."""
 
 
-def _case(key: str, right: int, count: int) -> Experiment:
+_CASE_OWN = ("mc 8px", "mc-exact 8px", "ransac-2p 1k")
+OWN = "-own"
+"""Ends the key of an experiment with this project's own forms beside another one."""
+
+
+def _case(key: str, right: int, count: int, methods: tuple[str, ...] = _CASE) -> Experiment:
     return Experiment(
         key=key,
-        place="Table VI",
+        place="Table VI" if methods == _CASE else "Table VI, own forms",
         over="correspondences",
         values=(float(count),),
         correspondences=count,
-        methods=_CASE,
+        methods=methods,
         runs=100,
         quick_values=(float(count),),
         quick_runs=5,
@@ -269,6 +274,7 @@ EXPERIMENTS: Sequence[Experiment] = (
         cameras=("MEI",),
     ),
     *(_case(key, right, count) for key, (right, count) in CASES.items()),
+    *(_case(key + OWN, right, count, _CASE_OWN) for key, (right, count) in CASES.items()),
     *(_phase(count, gravity) for gravity, counts in PHASE_GRAVITY_DEG.items() for count in counts),
 )
 """In the order in which they are run: what the page needs most comes first."""
