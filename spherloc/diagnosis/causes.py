@@ -36,6 +36,28 @@ class Cause(StrEnum):
     """The pose is wrong, and nothing that was measured says why."""
 
 
+@dataclass(frozen=True)
+class Measures:
+    """A run's evidence in numbers. None stands for what there is not."""
+
+    residual_median: float | None = None
+    """Median reprojection error of the inliers, in noise bounds (0 to 1)."""
+    residual_p90: float | None = None
+    """Their 90 % quantile, in noise bounds."""
+    alternative_support: float | None = None
+    """Inliers of the best pose that is clearly another one, as a share of the best pose's own."""
+    certificate_gap: float | None = None
+    """Upper bound of the certificate less the lower one, as a share of the upper one; 0 is proven."""
+    tilt_deg: float | None = None
+    """Angle between the given gravity and that of the best pose that does not believe it, degrees."""
+    coverage: float | None = None
+    """Share of the directions with matches, in 48 cells of the sphere, that have inliers too."""
+    rotation_sd_deg: float | None = None
+    """Standard deviation of the best pose's rotation in its worst direction, degrees."""
+    position_sd_m: float | None = None
+    """Standard deviation of its position in the worst direction, in the map's unit."""
+
+
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
     """The cause that explains a run best, and why."""
@@ -55,3 +77,5 @@ class Diagnosis:
     alternative_cam_from_map: FloatArray | None = None
     """Another pose (3, 4) to look at beside the run's own: the second one where two are ambiguous, the better or the
     true one where it is known; else None."""
+    measures: Measures = Measures()
+    """The evidence in numbers."""

@@ -1,9 +1,12 @@
 """From evidence to a cause. The order matters: a cause may look like one asked for later, seldom vice versa."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from spherloc.diagnosis.causes import Cause, Diagnosis
 from spherloc.diagnosis.evidence import WIDER, Evidence, Fit, Truth, certify, different, gather, gather_truth
+from spherloc.diagnosis.measures import measures_of
 from spherloc.diagnosis.words import describe
 from spherloc.metrics import SUCCESS_DEG, SUCCESS_M
 from spherloc.trace import RansacStage, Trace
@@ -49,7 +52,7 @@ def diagnose(trace: Trace, use_truth: bool = True) -> Diagnosis:
     if cause is Cause.ITERATIONS_RAN_OUT and trace.stage(RansacStage) is None:
         cause = Cause.SEARCH_MISSED
     certificate = certify(trace) if cause in TO_BE_PROVEN else trace.certificate
-    return describe(trace, evidence, truth, cause, certificate)
+    return replace(describe(trace, evidence, truth, cause, certificate), measures=measures_of(evidence, certificate))
 
 
 def without_truth(e: Evidence) -> Cause:

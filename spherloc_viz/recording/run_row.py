@@ -62,6 +62,17 @@ class RunRow:
     """Steps on the timeline."""
     key_step: int
     """Index of the step at which the run was decided, or went wrong."""
+    changes: str = ""
+    """What was changed of the scene, in a few words."""
+    residual_median: float | None = None
+    """This and what follows, down to ``position_sd_m``: see ``spherloc.diagnosis.Measures``."""
+    residual_p90: float | None = None
+    alternative_support: float | None = None
+    certificate_gap: float | None = None
+    tilt_deg: float | None = None
+    coverage: float | None = None
+    rotation_sd_deg: float | None = None
+    position_sd_m: float | None = None
     title: str = ""
     """Of a curated case."""
     labels: tuple[str, ...] = ()

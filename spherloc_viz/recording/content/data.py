@@ -25,7 +25,7 @@ from rerun.error_utils import RerunWarning
 
 from spherloc.cameras.calibration import camera_from_table
 from spherloc.datasets.variation import Variation
-from spherloc.diagnosis import Cause, Diagnosis
+from spherloc.diagnosis import Cause, Diagnosis, Measures
 from spherloc.errors import InputError, RecordingError, show
 from spherloc.problem import Problem
 from spherloc.trace import Certificate, Trace
@@ -74,7 +74,9 @@ def data_chunk(trace: Trace, origin: Origin, diagnosis: Diagnosis, full: bool) -
         "problem": _problem_row(trace.problem),
         "run": _run_row(trace),
         "origin": asdict(origin) | {"scene_text": scene_text(origin.scene_path)},
-        "diagnosis": _stored({item.name: getattr(diagnosis, item.name) for item in fields(diagnosis)}),
+        "diagnosis": _stored(
+            {item.name: getattr(diagnosis, item.name) for item in fields(diagnosis) if item.name != "measures"}
+        ),
     }
     for stage in trace.stages:
         row = {item.name: getattr(stage, item.name) for item in fields(stage)}
@@ -166,14 +168,17 @@ def certificate_from_row(row: Row) -> Certificate:
     return Certificate(nfa=row.pop(STORED_AS["nfa"]), **row)
 
 
-def diagnosis_from_row(row: Row) -> Diagnosis:
-    """What was wrong with the run.
+def diagnosis_from_row(row: Row, listed: RunRow) -> Diagnosis:
+    """What was wrong with the run; its measures are those of its row ``listed`` in lists.
 
     Raises ``KeyError``, ``TypeError`` or ``ValueError`` if the row says no such thing.
     """
     alternative = row.pop(STORED_AS["alternative_cam_from_map"], None)
     cause, evidence = Cause(row.pop("cause")), tuple(row.pop("evidence"))
-    return Diagnosis(cause=cause, evidence=evidence, alternative_cam_from_map=alternative, **row)
+    measures = Measures(**{item.name: getattr(listed, item.name) for item in fields(Measures)})
+    return Diagnosis(
+        cause=cause, evidence=evidence, alternative_cam_from_map=alternative, measures=measures, **row
+    )
 
 
 def _chunk(rows: dict[str, Row]) -> Chunk:
@@ -399,15 +404,16 @@ def _run(path: Path, entry: StoreEntry, chunks: Mapping[str, Chunk]) -> Recorded
     run, told = rows["run"], rows.get("diagnosis")
     found = run.pop("certificate", None)
     origin, scene = origin_from_row(rows["origin"]) if "origin" in rows else (None, None)
+    listed = _row(path, entry, chunks)
     return RecordedRun(
-        row=_row(path, entry, chunks),
+        row=listed,
         properties=read_properties(chunks[PROPERTIES]),
         problem=problem_from_row(rows["problem"], str(path)),
         stages={name[len(STAGES) :]: row for name, row in rows.items() if name.startswith(STAGES)},
         certificate=None if found is None else certificate_from_row(found),
         origin=origin,
         scene_text=scene,
-        diagnosis=None if told is None else diagnosis_from_row(told),
+        diagnosis=None if told is None else diagnosis_from_row(told, listed),
         query_image=read_image(chunks[QUERY_IMAGE]) if QUERY_IMAGE in chunks else None,
         **run,
     )

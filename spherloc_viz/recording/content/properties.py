@@ -18,6 +18,7 @@ import pyarrow as pa
 import rerun as rr
 from rerun.chunk import Chunk
 
+from spherloc.datasets.variation import Variation
 from spherloc.diagnosis import Cause, Diagnosis
 from spherloc.metrics import Metrics
 from spherloc.problem import Problem
@@ -173,10 +174,25 @@ def run_row(
         translation_error_m=metrics.translation_error_m,
         time_ms=trace.timings_ms.get("total", 0.0),
         proven=None if certificate is None else certificate.proven,
+        changes=_cut(changes_text(origin.variation)),
+        **asdict(diagnosis.measures),
         title=_cut(origin.title),
         format_version=FORMAT_VERSION,
         **known,
     )
+
+
+def changes_text(variation: Variation) -> str:
+    """What is changed of a scene, in a few words; edits of single matches are counted."""
+    named = {"spoiled": variation.spoiled, "mended": variation.mended, "hidden": variation.hidden}
+    values = (f"{name} {_short(value)}" for name, value in variation.simulation.items())
+    return ", ".join([*values, *(f"{len(matches)} {name}" for name, matches in named.items() if matches)])
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, tuple):
+        return " ".join(map(_short, value))
+    return Path(value).name if isinstance(value, str) else f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def _cut(text: str) -> str:

@@ -1,0 +1,68 @@
+"""All runs of a folder as columns, which a browser filters and sorts by itself."""
+
+import json
+from collections.abc import Mapping, Sequence
+from datetime import datetime
+from math import isfinite
+from typing import Any
+
+from spherloc_viz.app.desk.run_map import FEATURES, run_map
+
+TEXTS = ("source", "scene", "name", "query", "estimator", "outcome", "diagnosis", "changes", "title", "problem_key")
+"""Sent as numbers of different texts."""
+ANSWERS = ("doubtful", "proven")
+"""Yes, no or unknown; sent as texts."""
+NUMBERS = (
+    *("created", "seed", "correspondences", "inliers", "outlier_rate", "rotation_error_deg", "translation_error_m"),
+    *("time_ms", "steps", "key_step", "size_bytes", *FEATURES),
+)
+READ = ("file", "labels", "created", *TEXTS, *ANSWERS, *NUMBERS[1:])
+"""Columns of the index that are needed."""
+DIGITS = 5
+"""That a number is sent with: more than a plot or a table shows."""
+
+
+def columns_json(columns: Mapping[str, Sequence[Any]], notes: Mapping[str, str], version: str) -> str:
+    """The columns as JSON: ``texts`` (values and a code a run), ``numbers`` (null if unknown), files, labels and notes.
+
+    ``columns`` are those of ``READ``; ``notes`` are by file. ``version`` says which state of the list it is.
+    """
+    table = dict(columns)
+    table["created"] = [_seconds(text) for text in columns["created"]]
+    for name in ANSWERS:
+        table[name] = [{None: "", 0: "no", 1: "yes"}[value] for value in columns[name]]
+    table["key_step"] = [index + 1 for index in columns["key_step"]]
+    drawn = run_map(columns)
+    numbers = {name: [_short(value) for value in table[name]] for name in NUMBERS}
+    numbers |= {"map_x": [_short(x) for x in drawn.x], "map_y": [_short(y) for y in drawn.y]}
+    answer = {
+        "version": version,
+        "files": list(columns["file"]),
+        "texts": {name: _coded(table[name]) for name in (*TEXTS, *ANSWERS)},
+        "labels": _coded(columns["labels"]),
+        "notes": dict(notes),
+        "numbers": numbers,
+        "axes": [drawn.x_words, drawn.y_words],
+    }
+    return json.dumps(answer, separators=(",", ":"), allow_nan=False)
+
+
+def _coded(values: Sequence[Any]) -> dict[str, list[Any]]:
+    codes: dict[str, int] = {}
+    numbers = [codes.setdefault(value or "", len(codes)) for value in values]
+    return {"values": list(codes), "codes": numbers}
+
+
+def _short(value: float | None) -> float | None:
+    if value is None or not isfinite(value):
+        return None
+    if isinstance(value, int) or value == int(value):
+        return int(value)
+    return float(f"{value:.{DIGITS}g}")
+
+
+def _seconds(created: str) -> float | None:
+    try:
+        return int(datetime.fromisoformat(created).timestamp())
+    except ValueError:
+        return None

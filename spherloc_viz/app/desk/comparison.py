@@ -1,0 +1,194 @@
+"""Night against night: two sets of runs on the same problems, pair by pair, with tests of the differences."""
+
+import math
+import re
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from spherloc.errors import InputError, show
+from spherloc_viz.recording.run_row import RunRow
+
+KEYS: tuple[Callable[[RunRow], tuple[object, ...]], ...] = (
+    lambda row: (row.problem_key, row.estimator, row.options, row.seed),
+    lambda row: (row.problem_key, row.estimator, row.seed),
+    lambda row: (row.problem_key, row.estimator),
+    lambda row: (row.problem_key, row.seed),
+    lambda row: (row.problem_key,),
+)
+"""What makes two runs a pair; the first one counts by which most of the smaller set has a partner."""
+MEASURED: Mapping[str, str] = {
+    "rotation_error_deg": "rotation error, deg",
+    "translation_error_m": "position error, m",
+    "time_ms": "time, ms",
+}
+"""What is compared pair by pair."""
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two runs on the same problem."""
+
+    before: RunRow
+    after: RunRow
+
+
+@dataclass(frozen=True)
+class Change:
+    """How a number of the pairs has changed."""
+
+    name: str
+    """Column of the runs."""
+    pairs: int
+    """In which both know it."""
+    before: float
+    """Median before; NaN without pairs."""
+    after: float
+    """Median after."""
+    difference: float
+    """Median of the differences, after less before."""
+    p: float
+    """Of Wilcoxon's signed-rank test, two-sided; 1 if no pair differs, NaN without pairs."""
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What became of the runs of one set in the other."""
+
+    pairs: tuple[Pair, ...]
+    """In the order of the second set."""
+    only_before: int
+    """Runs without a partner in the second set."""
+    only_after: int
+    """Runs without a partner in the first set."""
+    broken: tuple[Pair, ...]
+    """Right before, wrong after."""
+    mended: tuple[Pair, ...]
+    """Wrong before, right after."""
+    right_before: int
+    """Pairs that were right before."""
+    right_after: int
+    """Pairs that are right after."""
+    judged: int
+    """Pairs of which both can be judged."""
+    p: float
+    """Of McNemar's exact test of broken against mended, two-sided; 1 if there are none."""
+    changes: tuple[Change, ...]
+    """Of the numbers in ``MEASURED``."""
+
+
+def is_right(row: RunRow) -> bool | None:
+    """Whether a run is right by the truth; where that is not known, whether its diagnosis says nothing against it."""
+    if row.outcome != "unknown":
+        return row.outcome == "success"
+    return None if row.doubtful is None else not row.doubtful
+
+
+def compare(before: Sequence[RunRow], after: Sequence[RunRow]) -> Comparison:
+    """Pair the runs of two sets, and test what has changed.
+
+    Of several runs with the same key the newest one counts. Raises ``InputError`` if no run has a partner.
+    """
+    pairs = _paired(before, after)
+    if not pairs:
+        raise InputError(
+            "no problem occurs in both sets of runs, so there is nothing to compare: run the same scenes and seeds."
+        )
+    judged = [(pair, is_right(pair.before), is_right(pair.after)) for pair in pairs]
+    known = [(pair, was, now) for pair, was, now in judged if was is not None and now is not None]
+    broken = tuple(pair for pair, was, now in known if was and not now)
+    mended = tuple(pair for pair, was, now in known if now and not was)
+    changed = len(broken) + len(mended)
+    return Comparison(
+        pairs=pairs,
+        only_before=len({row.file for row in before} - {pair.before.file for pair in pairs}),
+        only_after=len({row.file for row in after} - {pair.after.file for pair in pairs}),
+        broken=broken,
+        mended=mended,
+        right_before=sum(was for _, was, _ in known),
+        right_after=sum(now for _, _, now in known),
+        judged=len(known),
+        p=float(stats.binomtest(len(broken), changed).pvalue) if changed else 1.0,
+        changes=tuple(_change(name, pairs) for name in MEASURED),
+    )
+
+
+def _paired(before: Sequence[RunRow], after: Sequence[RunRow]) -> tuple[Pair, ...]:
+    best: tuple[Pair, ...] = ()
+    for key in KEYS:
+        # A later one replaces an earlier one of the same key.
+        old = {key(row): row for row in sorted(before, key=lambda row: row.created)}
+        new = {key(row): row for row in sorted(after, key=lambda row: row.created)}
+        pairs = tuple(Pair(old[k], row) for k, row in new.items() if k in old and old[k].file != row.file)
+        if len(pairs) > len(best):
+            best = pairs
+    return best
+
+
+def _change(name: str, pairs: Sequence[Pair]) -> Change:
+    values = [(getattr(pair.before, name), getattr(pair.after, name)) for pair in pairs]
+    known = np.array([pair for pair in values if None not in pair], dtype=np.float64).reshape(-1, 2)
+    if not len(known):
+        return Change(name, 0, math.nan, math.nan, math.nan, math.nan)
+    difference = known[:, 1] - known[:, 0]
+    p = float(stats.wilcoxon(difference).pvalue) if np.any(difference) else 1.0
+    was, now = np.median(known, axis=0)
+    return Change(name, len(known), float(was), float(now), float(np.median(difference)), p)
+
+
+_CONDITION = re.compile(r"\s*([a-z ]+?)\s*(<=|>=|<|>|=)\s*([0-9.]+(?:e-?[0-9]+)?)\s*(%?)\s*")
+QUANTITIES: Mapping[str, Callable[[Comparison], float]] = {
+    "new failures": lambda c: len(c.broken),
+    "mended": lambda c: len(c.mended),
+    "net failures": lambda c: len(c.broken) - len(c.mended),
+    "pairs": lambda c: len(c.pairs),
+    "unpaired": lambda c: c.only_before + c.only_after,
+    "failures": lambda c: c.judged - c.right_after,
+    "success": lambda c: c.right_after / c.judged if c.judged else math.nan,
+    "p": lambda c: c.p,
+}
+"""What a condition can be about."""
+_COMPARE: Mapping[str, Callable[[float, float], bool]] = {
+    "<": lambda a, b: a < b,
+    "<=": lambda a, b: a <= b,
+    ">": lambda a, b: a > b,
+    ">=": lambda a, b: a >= b,
+    "=": lambda a, b: a == b,
+}
+
+
+@dataclass(frozen=True)
+class Condition:
+    """Such as "new failures > 0"; several joined by "and" must all hold."""
+
+    text: str
+    """As it was given."""
+    parts: tuple[tuple[str, str, float], ...]
+    """A quantity, a sign and a number each."""
+
+    def holds(self, comparison: Comparison) -> bool:
+        """Whether it is true of a comparison; nothing is true of an unknown quantity."""
+        return all(_COMPARE[sign](QUANTITIES[name](comparison), number) for name, sign, number in self.parts)
+
+
+def parse_condition(text: str) -> Condition:
+    """A condition from its text; raises ``InputError``, which names what there is, if it cannot be understood."""
+    parts = []
+    for part in text.casefold().split(" and "):
+        found = _CONDITION.fullmatch(part)
+        if found is None or found[1] not in QUANTITIES or found[3].count(".") > 1 or found[3] == ".":
+            known = ", ".join(QUANTITIES)
+            raise InputError(
+                f"{show(text)} is no condition: give a quantity, a sign (<, <=, >, >=, =) and a number, such as "
+                f"'new failures > 0'; quantities are {known}; several are joined by 'and'."
+            )
+        parts.append((found[1], found[2], float(found[3]) / (100.0 if found[4] else 1.0)))
+    return Condition(text, tuple(parts))
+
+
+def causes(pairs: Sequence[Pair]) -> tuple[tuple[str, int], ...]:
+    """Diagnoses of the runs after, and how often each occurs, the most frequent ones first."""
+    return tuple(Counter(pair.after.diagnosis or "not diagnosed" for pair in pairs).most_common())
