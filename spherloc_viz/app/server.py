@@ -29,6 +29,7 @@ from spherloc_viz.app.session import Session
 from spherloc_viz.app.stage import views
 from spherloc_viz.app.status import Status
 from spherloc_viz.app.web.access import Access, Role
+from spherloc_viz.app.web.desk import DeskRoom
 from spherloc_viz.app.web.front_door import FrontDoor
 from spherloc_viz.app.web.guard import open_socket
 from spherloc_viz.app.web.viewer import ViewerRoom, of_index
@@ -97,13 +98,14 @@ def serve(
         index = _open_index(services.recorder, recordings, stack)
         services.library = None if index is None else RunLibrary(index)
         viewer = None if index is None else ViewerRoom(of_index(index))
+        desk = None if services.library is None else DeskRoom(services.library, services.downloads)
         key = secrets.token_urlsafe(32)
         server = start_viser(key)
         stack.callback(stop_viser, server)
         stack.callback(sessions.close)
         sessions.attend(server)
         access = Access(demanded=token or not _is_loopback(listener))
-        door = FrontDoor(host, server.get_port(), key, access, services.downloads, viewer, framed)
+        door = FrontDoor(host, server.get_port(), key, access, services.downloads, viewer, framed, desk)
         asyncio.run(_serve_until_told(door, access, listener))
 
 

@@ -4,7 +4,6 @@ import os
 import stat
 import threading
 import zipfile
-from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -16,9 +15,8 @@ from typing import BinaryIO
 import viser
 
 from spherloc.errors import RecordingError
-from spherloc_viz import style
+from spherloc_viz.app.desk.report import summary_html
 from spherloc_viz.app.review import words
-from spherloc_viz.app.review.rows import badge_html, label_html, picture_html
 from spherloc_viz.app.review.run_library import RunLibrary
 from spherloc_viz.app.review.run_list import RunList
 from spherloc_viz.app.text import box
@@ -29,98 +27,6 @@ from spherloc_viz.recording.index.run_text import rows_text
 from spherloc_viz.recording.reviews import review_path
 from spherloc_viz.recording.run_row import RunRow
 from spherloc_viz.recording.sandbox.examiner import resolve_inside
-
-CSS = """
-:root{color-scheme:light dark}
-body{font:14px/1.45 system-ui,sans-serif;margin:0 auto;max-width:76em;padding:1.5em;
-background:light-dark(#fff,#16181c);color:light-dark(#1c1e22,#e4e6ea)}
-h1{font-size:1.5em;margin:0 0 .2em}h2{font-size:1.05em;margin:1.4em 0 .3em}
-.dim{opacity:.65}table{border-collapse:collapse;width:100%;font-variant-numeric:tabular-nums}
-th,td{text-align:left;vertical-align:top;padding:.45em .7em .45em 0;border-top:1px solid rgba(128,140,160,.25)}
-th{font-weight:600;white-space:nowrap;border-top:0}code{font:12px ui-monospace,Menlo,Consolas,monospace}
-td code{overflow-wrap:anywhere}.name{font-weight:600}.wide{min-width:15em}.num{white-space:nowrap}
-.counts>span{display:inline-block;margin:0 1.4em .3em 0}
-.bar{display:inline-block;height:.6em;border-radius:.3em;margin-right:.5em;vertical-align:.02em}
-"""
-POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
-"""The page has what it needs in itself; nothing that a recording says can load or run anything."""
-PICTURE_PX = 152, 104
-
-
-def summary_html(rows: Sequence[RunRow], remark: str, now: datetime) -> str:
-    """A page about the runs, beside whose file the folder ``recordings`` has theirs."""
-    plural = "s" if len(rows) != 1 else ""
-    title = f"{len(rows):,} recorded run{plural}"
-    made = now.astimezone(UTC).strftime("%Y-%m-%d %H:%M UTC")
-    body = "".join(_row(row) for row in rows)
-    heads = ("", "run", "result", "diagnosis", "review")
-    table = f"<table><tr>{''.join(f'<th>{head}</th>' for head in heads)}</tr>{body}</table>"
-    return (
-        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
-        f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{escape(title)}</title><style>{CSS}</style></head><body>"
-        f'<h1>{escape(title)}</h1><p class="dim">Exported by spherloc, {made}. {escape(remark)}</p>'
-        f"{_counts(rows)}{table}{_how()}</body></html>\n"
-    )
-
-
-def _counts(rows: Sequence[RunRow]) -> str:
-    """How many there are of each outcome, and of each diagnosis with a bar."""
-    outcomes = Counter(row.outcome for row in rows).most_common()
-    causes = Counter(row.diagnosis or "not diagnosed" for row in rows).most_common()
-    first = "".join(f"<span>{badge_html(outcome)} {count:,}</span>" for outcome, count in outcomes)
-    most = max((count for _, count in causes), default=1)
-    color = style.css(style.ESTIMATE)
-    second = "".join(
-        f'<div><span class="bar" style="width:{max(1.0, 160.0 * count / most):.0f}px;background:{color}"></span>'
-        f'{escape(cause)} <span class="dim">{count:,}</span></div>'
-        for cause, count in causes
-    )
-    return f'<div class="counts">{first}</div><h2>Diagnoses</h2>{second}<h2>Runs</h2>'
-
-
-def _row(row: RunRow) -> str:
-    about = [f"{row.estimator}, seed {row.seed}", words.clock(row.created)]
-    result = [
-        f"{row.inliers} of {row.correspondences} inliers",
-        f"outliers {words.percent(row.outlier_rate)}",
-        f"{words.angle(row.rotation_error_deg)} · {words.distance(row.translation_error_m)}",
-        words.duration(row.time_ms),
-    ]
-    review = "".join(map(label_html, row.labels)) + _note(row.note)
-    cells = (
-        picture_html(row.thumbnail, *PICTURE_PX),
-        f'<div class="name">{escape(words.title_of(row))}</div><div class="dim">{escape(" · ".join(about))}</div>'
-        f"<code>recordings/{escape(row.file)}</code>",
-        f"{badge_html(row.outcome)}<div>{'<br>'.join(map(escape, result))}</div>",
-        f'{escape(row.diagnosis)}<div class="dim">{escape(row.summary)}</div>',
-        review,
-    )
-    classes = ("", "wide", "num", "wide", "")
-    return (
-        "<tr>" + "".join(f'<td class="{name}">{cell}</td>' for name, cell in zip(classes, cells, strict=True)) + "</tr>"
-    )
-
-
-def _note(note: str) -> str:
-    return f'<div style="white-space:pre-wrap">{escape(note)}</div>' if note else ""
-
-
-def _how() -> str:
-    ways = (
-        ("spherloc view FILE.rrd", "opens a run in the Rerun viewer, at the step where it was decided"),
-        ("spherloc repeat FILE.rrd", "repeats a run and says whether it comes out the same"),
-        ("spherloc run FILE.rrd", "solves the recorded problem again, with other options if you like"),
-        ("spherloc play --recordings recordings", "reviews all of them on the playground's page"),
-    )
-    rows = "".join(f"<tr><td><code>{escape(code)}</code></td><td>{escape(what)}</td></tr>" for code, what in ways)
-    return (
-        f"<h2>How to open them</h2><table>{rows}</table>"
-        '<p class="dim">Any Rerun viewer opens the files too. Labels and notes are in the files that end with '
-        ".review.rrd; runs.csv has this table for other programs.</p>"
-    )
-
 
 MOST_RUNS = 500
 MOST_BYTES = 200_000_000

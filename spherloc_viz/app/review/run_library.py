@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 from spherloc.errors import RecordingError
 from spherloc_viz.app.review.filters import EXACT, JUDGED, PAGE, Counts, Look
@@ -78,7 +79,7 @@ class RunLibrary:
 
     def rows(self, files: Sequence[str]) -> tuple[RunRow, ...]:
         """The runs of these files, in their order, without those that the list does not have any more."""
-        return tuple(row for row in map(self._index.get, files) if row is not None)
+        return self._index.of_files(files)
 
     def read(self, file: str) -> tuple[RecordedRun, Path]:
         """A recording that another process has found safe to be read; raises ``RecordingError`` if it is not."""
@@ -124,6 +125,19 @@ class RunLibrary:
     def all(self, look: Look, most: int) -> Found:
         """The first ``most`` runs of the list, from all pages."""
         return self._index.find(_query(look), most)
+
+    def columns(self, names: Sequence[str]) -> tuple[dict[str, tuple[Any, ...]], dict[str, str]]:
+        """Columns of all runs and the notes, see ``RunIndex.columns``."""
+        return self._index.columns(names)
+
+    def relabel(self, file: str, add: Sequence[str], remove: Sequence[str], note: str | None) -> tuple[Review, Review]:
+        """Add and remove labels of a run, and replace its note if one is given; returns what was said of it before and
+        what is now."""
+        with self._reviewing:
+            row = self.row(file)
+            kept = [label for label in row.labels if label not in remove]
+            now = self._index.set_review(file, [*kept, *add], row.note if note is None else note)
+            return Review(row.labels, row.note), now
 
     def review(self, file: str, before: Review, now: Review) -> RunRow:
         """Store what a reviewer changed of what is said of a run; returns its row as it is then.

@@ -9,6 +9,7 @@ import aiohttp
 from aiohttp import web
 
 from spherloc_viz.app.web.access import NO_TOKEN, Access, Role, refused
+from spherloc_viz.app.web.desk import DO, MOST_BYTES, NO_RUNS, DeskRoom, is_desk
 from spherloc_viz.app.web.downloads import DOWNLOADS, Downloads
 from spherloc_viz.app.web.guard import SAFE, refusal
 from spherloc_viz.app.web.learn import is_learning, learn_answer
@@ -49,11 +50,12 @@ class FrontDoor:
         downloads: Downloads,
         viewer: ViewerRoom | None = None,
         framed: bool = False,
+        desk: DeskRoom | None = None,
     ) -> None:
-        """``viewer`` is None where nothing is recorded; ``framed`` lets other pages of this machine, such as a
-        notebook's, show the page in a frame."""
+        """``viewer`` and ``desk`` are None where nothing is recorded; ``framed`` lets other pages of this machine, such
+        as a notebook's, show the page in a frame."""
         self._host, self._access = host, access
-        self._viewer = viewer
+        self._viewer, self._desk = viewer, desk
         self._downloads = downloads
         self._upstream = f"http://127.0.0.1:{viser_port}/"
         self._key = key
@@ -65,12 +67,14 @@ class FrontDoor:
 
     async def start(self, listener: socket.socket) -> web.AppRunner:
         """Start serving on a listening socket."""
-        app = web.Application()
+        app = web.Application(client_max_size=MOST_BYTES)
         app.router.add_route("*", "/{path:.*}", self._answer)
         app.cleanup_ctx.append(self._connections)
         app.on_shutdown.append(self._hang_up)
         if self._viewer is not None:
             app.on_cleanup.append(self._viewer.close)
+        if self._desk is not None:
+            app.on_cleanup.append(self._desk.close)
         runner = web.AppRunner(app, access_log=None, handle_signals=False, shutdown_timeout=1.0)
         await runner.setup()
         await web.SockSite(runner, listener).start()
@@ -85,7 +89,9 @@ class FrontDoor:
 
     async def _answer(self, request: web.Request) -> web.StreamResponse:
         upgrade = request.headers.get("Upgrade", "").lower() == "websocket"
-        reason = refusal(request.headers, self._host, upgrade)
+        posted = request.method == "POST" and request.path == DO
+        # A form on another site could post without an Origin of ours; a GET changes nothing.
+        reason = refusal(request.headers, self._host, upgrade or posted)
         if reason is not None:
             return web.Response(status=403, text=reason + "\n")
         entry = None if upgrade else self._access.enter(request)
@@ -94,7 +100,7 @@ class FrontDoor:
         role = self._access.role(request)
         if role is None:
             return refused(request, NO_TOKEN)
-        if request.method not in ("GET", "HEAD"):
+        if request.method not in ("GET", "HEAD") and not posted:
             return web.Response(status=405, text="Only GET is served.\n", headers={"Allow": "GET, HEAD"})
         if request.path.startswith(PAGE):
             if role is not Role.PRESENTER:
@@ -102,6 +108,12 @@ class FrontDoor:
             if self._viewer is None:
                 return web.Response(status=404, text=f"{NOT_RECORDED}\n")
             return await self._viewer.answer(request)
+        if is_desk(request.path):
+            if role is not Role.PRESENTER:
+                return refused(request, NOT_FOR_AUDIENCE)
+            if self._desk is None:
+                return web.Response(status=404, text=f"{NO_RUNS}\n")
+            return await self._desk.answer(request)
         if request.path.startswith(DOWNLOADS):
             if role is not Role.PRESENTER:
                 return refused(request, NOT_FOR_AUDIENCE)

@@ -176,9 +176,7 @@ def diagnosis_from_row(row: Row, listed: RunRow) -> Diagnosis:
     alternative = row.pop(STORED_AS["alternative_cam_from_map"], None)
     cause, evidence = Cause(row.pop("cause")), tuple(row.pop("evidence"))
     measures = Measures(**{item.name: getattr(listed, item.name) for item in fields(Measures)})
-    return Diagnosis(
-        cause=cause, evidence=evidence, alternative_cam_from_map=alternative, measures=measures, **row
-    )
+    return Diagnosis(cause=cause, evidence=evidence, alternative_cam_from_map=alternative, measures=measures, **row)
 
 
 def _chunk(rows: dict[str, Row]) -> Chunk:

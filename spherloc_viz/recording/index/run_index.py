@@ -10,13 +10,15 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
-from typing import Protocol, Self, TypeVar
+from typing import Any, Protocol, Self, TypeVar
 
 from spherloc.errors import InputError, RecordingError, show
 from spherloc_viz.given_files import REVIEW_SUFFIX
 from spherloc_viz.recording.index import file as index_file
 from spherloc_viz.recording.index.query import (
+    AT_ONCE,
     GROUP_KEYS,
+    MAIN,
     DamagedError,
     RunQuery,
     condition,
@@ -277,6 +279,19 @@ class RunIndex:
 
         return self._read(work)
 
+    def of_files(self, files: Sequence[str]) -> tuple[RunRow, ...]:
+        """The runs of these files, in their order, without those that are not known."""
+
+        def work(connection: sqlite3.Connection) -> tuple[RunRow, ...]:
+            ids: dict[str, int] = {}
+            for start in range(0, len(files), AT_ONCE):
+                some = files[start : start + AT_ONCE]
+                places = ", ".join("?" * len(some))
+                ids |= dict(connection.execute(f"SELECT file, id FROM runs WHERE file IN ({places})", some))
+            return rows_of(connection, [ids[file] for file in files if file in ids])
+
+        return self._read(work)
+
     def find(self, query: RunQuery, limit: int | None = 50, offset: int = 0) -> Found:
         """The runs that a query finds, from ``offset`` on and at most ``limit``; None for all."""
         where, values = condition(query)
@@ -289,6 +304,31 @@ class RunIndex:
             return Found(rows_of(connection, ids), total)
 
         return self._read(work)
+
+    def columns(self, names: Sequence[str]) -> tuple[dict[str, tuple[Any, ...]], dict[str, str]]:
+        """Columns of all runs, the oldest first, as the database has them, and the notes of those that have one.
+
+        ``names`` are columns that filters may look at; labels are JSON.
+        """
+        assert set(names) <= set(MAIN)
+
+        def work(connection: sqlite3.Connection) -> tuple[dict[str, tuple[Any, ...]], dict[str, str]]:
+            rows = connection.execute(f"SELECT {', '.join(names)} FROM runs ORDER BY created, file").fetchall()
+            columns = list(zip(*rows, strict=True)) if rows else [()] * len(names)
+            notes = "SELECT file, note FROM runs JOIN details ON details.id = runs.id WHERE note != ''"
+            return dict(zip(names, columns, strict=True)), dict(connection.execute(notes))
+
+        return self._read(work)
+
+    def same_run(self, source: str, problem_key: str, estimator: str, options: str, seed: int) -> str | None:
+        """The file of the newest run from this source that did the very same, if there is one."""
+        select = (
+            "SELECT file FROM runs JOIN details ON details.id = runs.id WHERE problem_key = ? AND source = ? "
+            "AND estimator = ? AND options = ? AND seed = ? ORDER BY created DESC LIMIT 1"
+        )
+        values = (problem_key, source, estimator, options, seed)
+        found = self._read(lambda connection: connection.execute(select, values).fetchone())
+        return None if found is None else found[0]
 
     def groups(self, query: RunQuery, by: str = "diagnosis") -> tuple[tuple[str, int], ...]:
         """Values of ``by``, one of ``GROUP_KEYS``, and how many of the found runs have each, most of them first.
