@@ -14,7 +14,7 @@ from tyro.conf import Positional, arg
 from tyro.extras import SubcommandApp
 
 from spherloc.errors import InputError, SpherlocError, reason, show
-from spherloc_viz import given_files, recording_commands
+from spherloc_viz import given_files, recording_commands, triage_commands
 from spherloc_viz.arguments import OptionalFloat, OptionalNumber, OptionalPath, OptionalText, refuse_repeated
 from spherloc_viz.recording.storage.room import KEEP_GIGABYTES
 
@@ -179,7 +179,7 @@ def _name_and_options(text: str, common: Sequence[Sequence[str]]) -> tuple[str, 
 
 @app.command
 def sweep(
-    scene: Positional[Path],
+    scenes: Positional[tuple[Path, ...]],
     /,
     over: str = "outlier_rate",
     values: Annotated[tuple[str, ...], arg(metavar="NUMBER|FIRST:LAST:STEP ...")] = ("0.5:0.95:0.05",),
@@ -213,18 +213,20 @@ def sweep(
 
     spherloc sweep scenes/fisheye_outliers_90.toml --estimator mc --scheduler tcp://host:8786
 
+    spherloc sweep all --estimator all --runs 36 --keep-gigabytes 20
+
     Args:
-        scene: Scene file (TOML) of a simulation, or a bundled scene's name.
+        scenes: Scene files (TOML) of simulations, or names of bundled scenes; all for every bundled simulation.
         over: outlier_rate, noise_px, correspondences or gravity_error_deg.
         values: Values of it: numbers, or FIRST:LAST:STEP, the last one included.
-        estimator: A registered estimator, with options after commas; give it once for each. mc and ransac-2p if not
-            given.
+        estimator: A registered estimator, with options after commas; give it once for each, or all. mc and
+            ransac-2p if not given.
         set: Changes to the scene at all values, such as noise_px=2; a wrong one lists them all.
         runs: Problems at each value.
         seed: Seed of the first problem; the others count up from it.
         workers: Processes on this machine.
         scheduler: Address of a Dask scheduler, whose workers do the runs instead.
-        out: CSV to write or go on with; recordings/SCENE_OVER_SEED.csv if not given.
+        out: CSV to write or go on with, of one scene; recordings/SCENE_OVER_SEED.csv if not given.
         record: Write a recording of each run, which takes several times as long as many a run; of a cluster's workers
             those on this machine do.
         recordings: Folder of the recordings.
@@ -232,15 +234,27 @@ def sweep(
     """
     from spherloc.datasets.scene_file import check_there, scene_path
 
-    scene = scene_path(scene)
-    check_there(scene)
+    if not scenes:
+        raise InputError("no scene given; name one or more, such as mei_outliers_80, or all.")
+    if [str(scene) for scene in scenes] == ["all"]:
+        from spherloc_viz.sweep import bundled_simulations
+
+        scenes = bundled_simulations()
+    files = [scene_path(scene) for scene in scenes]
+    for file in files:
+        check_there(file)
+    if out is not None and len(files) > 1:
+        raise InputError(f"--out {out} takes one scene, not {len(files)}; leave it out, and each gets a file.")
     from spherloc_viz.batch import Records
+    from spherloc_viz.sweep import all_estimators
     from spherloc_viz.sweep import sweep as do_sweep
 
-    file = out or RECORDINGS / f"{scene.stem}_{over}_{seed}.csv"
-    chosen = estimator or ("mc", "ransac-2p")
+    chosen = all_estimators() if estimator == ("all",) else estimator or ("mc", "ransac-2p")
     kept = Records(recordings, keep_gigabytes=keep_gigabytes) if record else None
-    return do_sweep(scene, over, values, chosen, list(chain(*set)), runs, seed, workers, scheduler, file, kept)
+    for file in files:
+        table = out or RECORDINGS / f"{file.stem}_{over}_{seed}.csv"
+        do_sweep(file, over, values, chosen, list(chain(*set)), runs, seed, workers, scheduler, table, kept)
+    return 0
 
 
 @app.command
@@ -376,6 +390,8 @@ def lesson(
 
 _OTHERS = (
     recording_commands.view,
+    triage_commands.compare,
+    triage_commands.rerun,
     recording_commands.repeat,
     recording_commands.runs,
     recording_commands.steps,

@@ -21,6 +21,8 @@ COMMANDS: Mapping[str, Mapping[str, str]] = {
         "runs": "list runs: which failed, and of what",
         "steps": "find the steps of runs for which a condition holds",
         "view": "open a recording in the Rerun viewer",
+        "compare": "compare two nights of runs: what broke, what was mended",
+        "rerun": "solve recorded problems again, with other options or another estimator",
         "repeat": "solve a recorded problem again and compare",
         "label": "give recordings labels and a note",
         "reindex": "make a folder's list of runs anew",

@@ -9,12 +9,13 @@ from pathlib import Path
 from spherloc import registry
 from spherloc.diagnosis import Cause
 from spherloc.errors import InputError, RecordingError, show
-from spherloc_viz.given_files import check_recording_file, check_recordings_folder
+from spherloc_viz.given_files import check_recording_file, check_recordings_folder, is_recording
 from spherloc_viz.progress import progress, say
 from spherloc_viz.recording.index.query import GROUP_KEYS, OUTCOMES, SORT_KEYS, SOURCES, RunQuery
 from spherloc_viz.recording.index.run_index import Refreshed, RunIndex
 from spherloc_viz.recording.index.run_text import FORMS, counts_text, rows_text
 from spherloc_viz.recording.reviews import Review, checked_review
+from spherloc_viz.recording.run_row import RunRow
 from spherloc_viz.recording.sandbox.examiner import examine, examine_review
 
 SORT_WORDS = {
@@ -186,6 +187,31 @@ def _check_known(index: RunIndex, query: RunQuery) -> None:
     if query.estimator is not None:
         recorded = (name for name, _ in index.groups(RunQuery(), "estimator"))
         one_of("estimator", query.estimator, tuple(dict.fromkeys((*registry.names("estimators"), *recorded))))
+
+
+def rows_at(place: Path, query: RunQuery) -> tuple[Path, tuple[RunRow, ...]]:
+    """The folder and the runs of a folder of recordings, of a set that the desk stored (.txt), or of one recording.
+
+    Raises ``SpherlocError``, in one sentence, if there is no such thing or no run in it.
+    """
+    named: tuple[str, ...] | None = None
+    folder = place
+    if place.suffix == ".txt":
+        from spherloc_viz.app.desk.files import read_set
+
+        named, folder = read_set(place), place.parent.parent
+    elif is_recording(place):
+        check_recording_file(place)
+        named, folder = (place.name,), place.parent
+    with _open(folder) as index:
+        _refresh(index)
+        rows = index.find(replace(query, sort="file", descending=False), None).rows
+        if named is not None:
+            chosen = {row.file for row in rows}
+            rows = tuple(row for row in index.of_files(named) if row.file in chosen)
+    if not rows:
+        raise InputError(f"{place}: has no such run; see spherloc runs {folder}.")
+    return folder, rows
 
 
 def _open(folder: Path) -> RunIndex:

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from spherloc.datasets import load_scene
+from spherloc.datasets import SyntheticScene, bundled_scenes, load_scene
 from spherloc.datasets.variation import parse_variation
 from spherloc.errors import RecordingError
 from spherloc.experiments.sweep import Entrant, Keep, SweepPlan, planned, run_sweep
@@ -15,6 +15,7 @@ from spherloc.warm_up import warm_up
 from spherloc_viz.batch import Records, parse_settings, store_of
 from spherloc_viz.layers.primitives import Table
 from spherloc_viz.layers.sweep import sweep_table
+from spherloc_viz.options import usable_estimators
 from spherloc_viz.progress import progress, say
 
 if TYPE_CHECKING:
@@ -115,6 +116,16 @@ class Recorded:
         self.prune()
         if self._lost > 1:
             say(f"{self._lost:,} times something could not be recorded or listed, the first of which was said.")
+
+
+def bundled_simulations() -> tuple[Path, ...]:
+    """Bundled scenes over whose properties a sweep can go."""
+    return tuple(path for path in bundled_scenes().values() if isinstance(load_scene(path), SyntheticScene))
+
+
+def all_estimators() -> tuple[str, ...]:
+    """Those that are registered and can be used."""
+    return usable_estimators()
 
 
 def parse_entrant(text: str) -> Entrant:

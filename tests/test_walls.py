@@ -75,6 +75,8 @@ FLOORS = (
         "spherloc_viz.batch",
         "spherloc_viz.runs",
         "spherloc_viz.recording_commands",
+        "spherloc_viz.triage",
+        "spherloc_viz.triage_commands",
         "spherloc_viz.localize",
         "spherloc_viz.sweep",
         "spherloc_viz.scene_list",

@@ -93,10 +93,17 @@ def compare(before: Sequence[RunRow], after: Sequence[RunRow]) -> Comparison:
     Of several runs with the same key the newest one counts. Raises ``InputError`` if no run has a partner.
     """
     pairs = _paired(before, after)
+    only_before = len({row.file for row in before} - {pair.before.file for pair in pairs})
+    only_after = len({row.file for row in after} - {pair.after.file for pair in pairs})
     if not pairs:
         raise InputError(
             "no problem occurs in both sets of runs, so there is nothing to compare: run the same scenes and seeds."
         )
+    return compare_pairs(pairs, only_before, only_after)
+
+
+def compare_pairs(pairs: tuple[Pair, ...], only_before: int = 0, only_after: int = 0) -> Comparison:
+    """Test what has changed in pairs that are known; the counts are of runs without a partner."""
     judged = [(pair, is_right(pair.before), is_right(pair.after)) for pair in pairs]
     known = [(pair, was, now) for pair, was, now in judged if was is not None and now is not None]
     broken = tuple(pair for pair, was, now in known if was and not now)
@@ -104,8 +111,8 @@ def compare(before: Sequence[RunRow], after: Sequence[RunRow]) -> Comparison:
     changed = len(broken) + len(mended)
     return Comparison(
         pairs=pairs,
-        only_before=len({row.file for row in before} - {pair.before.file for pair in pairs}),
-        only_after=len({row.file for row in after} - {pair.after.file for pair in pairs}),
+        only_before=only_before,
+        only_after=only_after,
         broken=broken,
         mended=mended,
         right_before=sum(was for _, was, _ in known),

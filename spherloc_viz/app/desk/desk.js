@@ -5,9 +5,10 @@ const SETTINGS = JSON.parse(document.body.dataset.settings);
 const FILTERS = ["outcome", "diagnosis", "estimator", "scene", "source", "labels"];
 const GROUPED = ["diagnosis", "scene", "estimator", "outcome", "changes", "source", "name"];
 const MOST_CHIPS = 12, MOST_GROUP_COLUMNS = 8, EXAMPLES = 5, ROW_PX = 34;
-const WIDTHS = { scene: 170, name: 190, diagnosis: 180, changes: 150, labels: 150, title: 190, created: 120, query: 120, estimator: 110 };
+const WIDTHS = { outcome: 86, scene: 150, name: 190, diagnosis: 165, changes: 150, labels: 150, title: 190, created: 120, query: 120, estimator: 92, outlier_rate: 92, rotation_error_deg: 118, translation_error_m: 120 };
 const DEFAULT_KEYS = ["real failure", "bad map", "bad truth", "calibration", "repeated structure", "look again", "known", "fixed", "ignore"];
 const SEEN = "seen";
+const NEWS_MS = 15000;
 const START = {
   search: "", chosen: {}, ranges: {}, lasso: null, only: null, sort: "created", descending: true,
   columns: ["outcome", "diagnosis", "scene", "estimator", "outlier_rate", "rotation_error_deg", "translation_error_m", "position_sd_m", "certificate_gap", "time_ms", "labels"],
@@ -20,6 +21,7 @@ const plural = (number, noun) => `${count(number)} ${noun}${number === 1 ? "" : 
 let runs, reviews, state = structuredClone(START);
 let fits, listed = new Int32Array(0), chosen = -1, anchor = -1;
 const marked = new Set(), unfolded = new Set(), axes = new Map();
+let newsTimer = 0;
 let saved = { views: {}, sets: {} }, waiting = false;
 const colors = [], hexes = [];
 let outcomeCodes;
@@ -40,6 +42,8 @@ function say(words, wrong = false) {
   news.textContent = words;
   news.hidden = !words;
   news.classList.toggle("wrong", wrong);
+  clearTimeout(newsTimer);
+  if (!wrong) newsTimer = setTimeout(() => { news.hidden = true; }, NEWS_MS);
 }
 
 const title = (name) => (SETTINGS.columns[name] || [name])[0];
@@ -137,7 +141,7 @@ function drawChips() {
     if (values.length < 2 && !now.length && name !== "outcome" && name !== "labels") continue;
     if (!values.length) continue;
     lines.push(element("div", { className: "chips", "data-filter": name }, ...values.map(([value, number]) =>
-      chip(value || "none", number, now.includes(value), () => toggled(name, value), `${title(name)}: ${value || "none"}`,
+      chip(short(value), number, now.includes(value), () => toggled(name, value), `${title(name)}: ${value || "none"}`,
         name === "outcome" ? SETTINGS.colors[value] : null))));
   }
   const brushes = [];

@@ -1,0 +1,133 @@
+"""The commands that compare sets of recorded runs; ``spherloc_viz.cli`` registers them."""
+
+from datetime import UTC, datetime
+from itertools import chain
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from tyro.conf import Positional, arg
+
+from spherloc_viz.arguments import OptionalNumber, OptionalPath, OptionalText
+from spherloc_viz.given_files import check_recording_file, check_recordings_folder, is_recording
+from spherloc_viz.recording.storage.room import KEEP_GIGABYTES
+
+RECORDINGS = Path("recordings")
+Settings = Annotated[tyro.conf.UseAppendAction[tuple[tuple[str, ...], ...]], arg(metavar="KEY=VALUE ...")]
+Conditions = Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], arg(metavar="CONDITION")]
+
+
+def compare(
+    before: Positional[Path],
+    after: Positional[Path],
+    /,
+    before_label: OptionalText = None,
+    after_label: OptionalText = None,
+    fail_if: Conditions = (),
+    report: OptionalPath = None,
+    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
+) -> int:
+    """Compare two sets of runs on the same problems: what broke, what was mended, and by how much errors changed.
+
+    Runs are paired by problem, estimator, options and seed, as far as the two sets share them. Tests are McNemar's
+    exact one and Wilcoxon's signed-rank one. A condition is a quantity, a sign and a number, several joined by "and";
+    quantities are new failures, mended, net failures, pairs, unpaired, failures, success (a share) and p (McNemar's).
+    Ends with 0, or with 1 if a condition of --fail-if holds.
+
+    For example:
+
+    spherloc compare results/monday results/tuesday --fail-if "new failures > 0"
+
+    spherloc compare results/monday results/tuesday --fail-if "success < 95 %" --report night.html
+
+    spherloc compare recordings recordings --before-label v1 --after-label v2 --json
+
+    Args:
+        before: A folder of recordings, or a set of runs that the triage desk stored (.txt).
+        after: The same, of the runs to be judged.
+        before_label: Only runs with this label.
+        after_label: Only runs with this label.
+        fail_if: What must not be; give it once for each.
+        report: An HTML file to write, with pictures of what broke and what was mended.
+        json: Print one JSON object instead.
+    """
+    for place in (before, after):
+        _check_place(place)
+    from spherloc_viz.triage import compare_runs, wanted
+
+    return compare_runs(before, after, (before_label, after_label), wanted(fail_if, report, json))
+
+
+def rerun(
+    runs: Positional[tuple[Path, ...]],
+    /,
+    estimator: OptionalText = None,
+    option: Settings = (),
+    seed: OptionalNumber = None,
+    failed: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
+    label: OptionalText = None,
+    out: OptionalPath = None,
+    keep_gigabytes: float = KEEP_GIGABYTES,
+    fail_if: Conditions = (),
+    report: OptionalPath = None,
+    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
+) -> int:
+    """Solve recorded problems again, with this version, other options or another estimator, and compare.
+
+    Every problem is that of its recording, bit for bit. What is not changed stays as it was recorded: estimator,
+    options and seed. The new runs are recorded. Ends as spherloc compare does.
+
+    For example:
+
+    spherloc rerun recordings --failed --estimator mc-exact
+
+    spherloc rerun "recordings/sets/hard ones.txt" --option bound_px=5 --report bound.html
+
+    spherloc rerun recordings --label regression --fail-if "new failures > 0"
+
+    Args:
+        runs: Recordings (.rrd), folders of recordings, or sets of runs that the triage desk stored (.txt).
+        estimator: Another estimator, with its default options for the problem.
+        option: Options to change.
+        seed: Another seed for all.
+        failed: Only runs that are known to have failed.
+        label: Only runs with this label.
+        out: Folder for the new recordings; recordings/rerun_TIME if not given.
+        keep_gigabytes: What the new recordings may take; beyond it the oldest successes are deleted.
+        fail_if: What must not be, as for spherloc compare; give it once for each.
+        report: An HTML file to write, with pictures of what broke and what was mended.
+        json: Print one JSON object instead.
+    """
+    from spherloc.errors import InputError
+
+    if not runs:
+        raise InputError("no runs given; name recordings (.rrd), folders of them, or a set (.txt).")
+    for place in runs:
+        _check_place(place)
+    from spherloc import registry
+
+    if estimator is not None:
+        registry.lookup("estimators", estimator)
+    from spherloc_viz.batch import Records
+    from spherloc_viz.recording.index.query import RunQuery
+    from spherloc_viz.triage import rerun as do_rerun
+    from spherloc_viz.triage import wanted
+
+    asked = wanted(fail_if, report, json)
+    folder = out or RECORDINGS / f"rerun_{datetime.now(UTC):%Y%m%dT%H%M%SZ}"
+    query = RunQuery(outcome="failure" if failed else None, label=label)
+    records = Records(folder, keep_gigabytes=keep_gigabytes)
+    return do_rerun(runs, query, estimator, list(chain(*option)), seed, records, asked)
+
+
+def _check_place(place: Path) -> None:
+    """Raise ``SpherlocError`` if there are no runs to be had there."""
+    if is_recording(place):
+        check_recording_file(place)
+    elif place.suffix == ".txt":
+        from spherloc.errors import InputError
+
+        if not place.is_file():
+            raise InputError(f"{place}: no such set of runs; the triage desk stores them in the folder sets.")
+    else:
+        check_recordings_folder(place)
