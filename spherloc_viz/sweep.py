@@ -4,7 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from spherloc.datasets import SyntheticScene, bundled_scenes, load_scene
+from spherloc.datasets import bundled_scenes, load_scene
+from spherloc.datasets.synthetic import SyntheticScene
 from spherloc.datasets.variation import parse_variation
 from spherloc.errors import RecordingError
 from spherloc.experiments.sweep import Entrant, Keep, SweepPlan, planned, run_sweep

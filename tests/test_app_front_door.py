@@ -22,6 +22,7 @@ from spherloc_viz.app.server import serve
 from spherloc_viz.app.web import access as access_module
 from spherloc_viz.app.web import viser_internals
 from spherloc_viz.app.web.access import Access, Role
+from spherloc_viz.app.web.desk import DeskRoom
 from spherloc_viz.app.web.downloads import Downloads
 from spherloc_viz.app.web.front_door import FrontDoor
 from spherloc_viz.app.web.guard import is_own_name, open_socket, refusal
@@ -117,6 +118,11 @@ class Door:
         await response.read()
         return response
 
+    async def post(self, path: str, body: bytes, **sent: str) -> aiohttp.ClientResponse:
+        response = await self._client.post(self.url + path, data=body, headers=sent, allow_redirects=False)
+        await response.read()
+        return response
+
     def knock(self, origin: str | None = "own", path: str = "", cookie: str = "", **options: object):
         sent = {} if origin is None else {"Origin": self.url.rstrip("/") if origin == "own" else origin}
         sent |= {"Cookie": cookie} if cookie else {}
@@ -125,10 +131,16 @@ class Door:
 
 @asynccontextmanager
 async def door_to(
-    port: int, viewer: ViewerRoom | None = None, token: bool = False, downloads: Downloads | None = None
+    port: int,
+    viewer: ViewerRoom | None = None,
+    token: bool = False,
+    downloads: Downloads | None = None,
+    desk: DeskRoom | None = None,
 ) -> AsyncIterator[Door]:
     listener, access = open_socket("127.0.0.1", 0), Access(token)
-    runner = await FrontDoor("127.0.0.1", port, KEY, access, downloads or Downloads(), viewer).start(listener)
+    runner = await FrontDoor("127.0.0.1", port, KEY, access, downloads or Downloads(), viewer, False, desk).start(
+        listener
+    )
     try:
         async with aiohttp.ClientSession(cookie_jar=aiohttp.DummyCookieJar()) as client:
             yield Door(listener.getsockname()[1], client, access)

@@ -43,6 +43,9 @@ class Notes:
         self.full = False
         self.overload = ""
 
+    def known(self, trace: Trace, source: str) -> None:
+        return None
+
     def submit(
         self,
         trace: Trace,

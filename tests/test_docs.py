@@ -22,7 +22,7 @@ import yaml
 from scripts import documentation
 from spherloc import registry
 from spherloc.metrics import SUCCESS_DEG, SUCCESS_M
-from spherloc_viz import cli, recording_commands
+from spherloc_viz import cli, recording_commands, triage_commands
 from spherloc_viz.app.catalog import Catalog
 from spherloc_viz.app.glossary import TERMS
 from spherloc_viz.app.session import DIAGNOSE_AFTER_S, QUIET_S
@@ -150,7 +150,7 @@ def command(name: str) -> Callable[..., object] | None:
     if name not in documentation.commands():
         return None
     name = name.replace("-", "_")
-    return next(getattr(module, name) for module in (cli, recording_commands) if hasattr(module, name))
+    return next(getattr(module, name) for module in (cli, recording_commands, triage_commands) if hasattr(module, name))
 
 
 @functools.cache

@@ -84,6 +84,9 @@ class PageRuns:
         submitted = self._submitted
         if submitted is None or submitted.trace is not run.trace:
             submitted = Submitted(run.trace, Path())
+            if (path := self._recorded(run.trace)) is not None:
+                self._submitted = Submitted(run.trace, path, written=True)
+                return f"Recorded as {path.name}", None
             origin = self._origin("page", run.request.scene)
             try:
                 submitted.path = self._recorder.submit(run.trace, origin, diagnosis, submitted.end)
@@ -96,6 +99,19 @@ class PageRuns:
             return f"Recorded as {submitted.path.name}", None
         waiting = self._recorder.overload
         return f"Recording as {submitted.path.name} …{f' {waiting}' if waiting else ''}", LOOK_S
+
+    def _recorded(self, trace: Trace) -> Path | None:
+        """The recording of the very same run by some page: a reload, or undo, makes no second one."""
+        assert self._recorder is not None
+        try:
+            return self._recorder.known(trace, "page")
+        except RecordingError:  # whoever writes the recording tells of it
+            return None
+
+    def keepable(self, trace: Trace) -> str:
+        """The file of a run's recording, if pages made it; else empty."""
+        known, path = self._known, self.path(trace)
+        return "" if path is None or (known is not None and path == known.path) else path.name
 
     def record(self, trace: Trace, scene: SceneRequest) -> None:
         """Record a query of a sequence that a panel localized, if runs are recorded; raises ``RecordingError``."""

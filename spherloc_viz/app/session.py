@@ -380,7 +380,7 @@ class Session:
         withheld = self._display.withheld(run)
         self._services.presented.show(run, self._mesh(run), self._diagnosis(run), withheld)
         sentence, pause = self._runs.finish(run, self._diagnosis(run))
-        self._status.say(sentence)
+        self._status.say(sentence, self._runs.keepable(run.trace))
         return pause
 
     def record(self, trace: Trace, scene: SceneRequest) -> None:

@@ -6,6 +6,7 @@ import threading
 import viser
 
 from spherloc.errors import SpherlocError
+from spherloc_viz.app.review.filters import keep_html
 from spherloc_viz.app.text import status_html
 
 log = logging.getLogger(__name__)
@@ -20,9 +21,9 @@ class Status:
         self._complaint: tuple[str, viser.NotificationHandle] | None = None
         self._lock = threading.Lock()
 
-    def say(self, sentence: str) -> None:
-        """Say what goes on."""
-        html = _line_html(sentence)
+    def say(self, sentence: str, keep: str = "") -> None:
+        """Say what goes on; ``keep`` is the file of a recording that may be kept."""
+        html = _line_html(sentence, keep=keep)
         if self._line.content != html:
             self._line.content = html
 
@@ -54,9 +55,10 @@ class Status:
                 self._complaint = None
 
 
-def _line_html(sentence: str, wrong: bool = False) -> str:
+def _line_html(sentence: str, wrong: bool = False, keep: str = "") -> str:
     """As high as two lines, so that widgets below do not jump under the pointer when the sentence gets longer."""
-    return f'<div style="font-size:12px;min-height:3.4em">{status_html(sentence, wrong)}</div>'
+    button = f'<div style="float:right;padding:.2em .8em 0 0">{keep_html(keep)}</div>' if keep else ""
+    return f'<div style="font-size:12px;min-height:3.4em">{button}{status_html(sentence, wrong)}</div>'
 
 
 SHOWN_S = 15.0

@@ -129,7 +129,7 @@ def _paired(before: Sequence[RunRow], after: Sequence[RunRow]) -> tuple[Pair, ..
         # A later one replaces an earlier one of the same key.
         old = {key(row): row for row in sorted(before, key=lambda row: row.created)}
         new = {key(row): row for row in sorted(after, key=lambda row: row.created)}
-        pairs = tuple(Pair(old[k], row) for k, row in new.items() if k in old and old[k].file != row.file)
+        pairs = tuple(Pair(old[k], row) for k, row in new.items() if k in old and old[k] != row)
         if len(pairs) > len(best):
             best = pairs
     return best

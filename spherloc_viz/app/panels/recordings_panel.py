@@ -1,5 +1,6 @@
 """The tab for reviewing: the list of recordings, the gallery, what is said of the open run, and what is compared."""
 
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +11,7 @@ from spherloc.errors import RecordingError
 from spherloc.types import FloatArray
 from spherloc_viz.app.review.card import comparison_html
 from spherloc_viz.app.review.export import Exporter
-from spherloc_viz.app.review.filters import pill
+from spherloc_viz.app.review.filters import KEPT, pill
 from spherloc_viz.app.review.gallery_list import GalleryList
 from spherloc_viz.app.review.notes import Notes
 from spherloc_viz.app.review.opened import Opened
@@ -67,6 +68,7 @@ class RecordingsPanel:
         self._runs: RunList | None = None
         # Apart, as it may take minutes to take in a thousand new recordings.
         self._preparing = BackgroundWorker(f"spherloc-runs-preparing-{name}", self._complain)
+        self._keeping, self._kept = BackgroundWorker(f"spherloc-runs-keeping-{name}", self._complain), deque[str]()
         self._comparing = BackgroundWorker(f"spherloc-runs-comparing-{name}", self._complain)
         if library is None:
             self._say("Runs are not recorded: start the playground without --no-record to review them here.")
@@ -102,6 +104,7 @@ class RecordingsPanel:
         self._reviewer = Reviewer(touches, self._runs, reviewing, name)
         exporter = Exporter(gui, name, touches, library, page.downloads, self._runs, self._say, self._complain)
         self._parts += [self._notes, self._runs, self._reviewer, exporter]
+        touches.on("run-keep", self._keep)
         touches.on("runs-compare", lambda touch: self._comparing.ask(self._compare))
         touches.on("runs-uncompare", lambda touch: self._uncompare())
 
@@ -111,6 +114,7 @@ class RecordingsPanel:
             part.close()
         self._preparing.close()
         self._comparing.close()
+        self._keeping.close()
 
     def _see(self, touch: Touch) -> None:
         """Other tabs are open now."""
@@ -180,6 +184,19 @@ class RecordingsPanel:
         self._reviewer.relabelled(row)
         self._notes.refresh(row, self._library.labels())
         self._runs.ask()
+
+    def _keep(self, touch: Touch) -> None:
+        """A run that a page made is to stay, and to be listed with the others."""
+        self._kept.append(touch.argument)
+        self._keeping.ask(self._keep_all)
+
+    def _keep_all(self) -> None:
+        assert self._library is not None
+        while self._kept:
+            file = self._kept.popleft()
+            self._library.relabel(file, [KEPT], [], None)
+            self._say(f"Kept {file}, with the label “{KEPT}”.")
+            self._stored(self._library.row(file))
 
     def open_linked(self, file: str) -> Opened:
         """Open a recording to which a link leads; raises ``RecordingError`` if it cannot be."""

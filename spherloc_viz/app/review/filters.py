@@ -8,8 +8,10 @@ from html import escape
 from spherloc_viz import style
 from spherloc_viz.app.review.words import COLORS
 from spherloc_viz.app.text import DIM, box, dot_html
-from spherloc_viz.recording.index.query import MAX_TEXT, OUTCOMES, Range, RunQuery, parse_range, parse_when
+from spherloc_viz.recording.index.query import MAX_TEXT, OUTCOMES, PAGE_KEPT, Range, RunQuery, parse_range, parse_when
 
+KEPT = "kept"
+"""The label of a run that a page made and somebody wants to keep."""
 PAGE = 20
 """Rows that are shown at once."""
 MOST_PAGES = 10**6
@@ -63,6 +65,8 @@ class Look:
     """One of ``OUTLIERS``, or a range as it is typed."""
     when: str | None = None
     """One of ``AGES``."""
+    pages: bool = False
+    """Whether runs that pages made while somebody played are listed too."""
     sort: str = "created"
     descending: bool = True
     page: int = 0
@@ -75,6 +79,7 @@ class Look:
         exact = {name: getattr(self, name) for name in EXACT}
         return RunQuery(
             text=self.text.strip()[:MAX_TEXT] or None,
+            pages=None if self.pages or self.source == "page" else False,
             doubtful=None if self.judged is None else True,
             outlier_rate=self._range(),
             since=None if self.when is None else parse_when(AGES[self.when], now),
@@ -120,7 +125,7 @@ class Look:
 
     def untold(self) -> "Look":
         """The list without filters and an order that tell what came out."""
-        kept = {name: getattr(self, name) for name in ("text", "page", *UNTOLD)}
+        kept = {name: getattr(self, name) for name in ("text", "page", "pages", *UNTOLD)}
         told = self.sort not in UNTOLD_SORTS
         order = {} if told else {"sort": self.sort, "descending": self.descending}
         return Look(**kept, **order, unfolded=self.unfolded if self.unfolded in (*UNTOLD, "sort") else "")
@@ -150,6 +155,8 @@ class Counts:
     doubtful: int
     unfolded: Groups = ()
     """Of the filter that is unfolded, if its values can be counted."""
+    pages: int | None = None
+    """Runs that pages made while somebody played; None if there are no others, so that they are listed anyway."""
 
 
 def filters_html(look: Look, counts: Counts, hidden: bool = False) -> str:
@@ -166,6 +173,10 @@ def filters_html(look: Look, counts: Counts, hidden: bool = False) -> str:
     ]
     if counts.doubtful or look.judged:
         chips.append(_chip("judged", "doubtful", "doubtful", counts.doubtful, look.judged))
+    if counts.pages:
+        hint = f"Runs that pages made while somebody played; the newest {PAGE_KEPT} are stored, and those that you keep"
+        number = f'<span style="{DIM}">{counts.pages:,}</span>'
+        chips.append(pill(f"page runs {number}", "runs-pages:", look.pages, hint))
     causes = [
         _chip("diagnosis", value, value or NOT_DIAGNOSED, count, look.diagnosis)
         for value, count in counts.diagnosis
@@ -204,6 +215,11 @@ def pill(content: str, touch: str, on: bool, hint: str, extra: str = "") -> str:
         f'data-touch="{escape(touch)}" {extra} style="white-space:nowrap;border-radius:1em;padding:.08em .6em;{look}">'
         f"{content}</span>"
     )
+
+
+def keep_html(file: str) -> str:
+    """A button that keeps a run that a page made."""
+    return pill("keep", f"run-keep:{file}", False, f"Label this run “{KEPT}”: it stays, and is listed with the others")
 
 
 def key_html(key: str) -> str:

@@ -8,12 +8,14 @@ from html import escape
 from spherloc.diagnosis import Cause
 from spherloc_viz import style
 from spherloc_viz.app.review import words
-from spherloc_viz.app.review.filters import PAGE, Look, key_html, keyed, pill, sorting_html
+from spherloc_viz.app.review.filters import PAGE, Look, keep_html, key_html, keyed, pill, sorting_html
 from spherloc_viz.app.text import DIM, box, dot_html
 from spherloc_viz.app.web.viewer import viewer_link
 from spherloc_viz.recording.run_row import RunRow
 from spherloc_viz.recording.sandbox.checks import is_thumbnail
 
+DESK = "/desk"
+"""Where the desk is (``app/web/desk.py``)."""
 WIDTH_PX, HEIGHT_PX = 64, 46
 """Of a row's picture."""
 PREVIOUS_KEY, NEXT_KEY = "[", "]"
@@ -82,7 +84,8 @@ def _lines(row: RunRow, now: datetime, hidden: bool) -> str:
     method = f"{escape(row.estimator)} #{row.seed}"
     if hidden:
         return f'{name}<div style="{CUT};{DIM}">{method} · {row.correspondences} matches</div>'
-    how = f'<div style="{CUT}">{verdict_html(row)}<span style="{DIM}"> · {method}</span></div>'
+    changed = f" · {escape(row.changes)}" if row.changes else ""
+    how = f'<div style="{CUT}">{verdict_html(row)}<span style="{DIM}"> · {method}{changed}</span></div>'
     facts = [f"{row.inliers}/{row.correspondences}"]
     facts += [] if row.outlier_rate is None else [f"{100.0 * row.outlier_rate:.0f} % out"]
     errors = (words.angle(row.rotation_error_deg), words.distance(row.translation_error_m))
@@ -113,6 +116,8 @@ def verdict_html(row: RunRow) -> str:
 
 
 def _review(row: RunRow) -> str:
+    if row.source == "page" and not row.labels:
+        return f'<div style="position:relative">{keep_html(row.file)}</div>'
     if not row.labels and not row.note:
         return ""
     labels = "".join(label_html(label) for label in row.labels)
@@ -162,6 +167,10 @@ def pages_html(look: Look, total: int, start: bool | None) -> str:
     parts = [f'<span style="{DIM}">{where}</span>{back}{on}']
     if start is not None:
         parts += ['<span style="flex:1"></span>', sorting_html(look)]
+        parts.append(
+            f'<a href="{DESK}" target="_blank" rel="noopener" title="All runs on a page of their own: groups, plots, '
+            'bulk labels, comparisons" style="color:inherit;white-space:nowrap">triage desk ↗</a>'
+        )
         parts.append(pill("zip", "runs-export:", False, f"Export all {total:,} runs of this list, as far as they fit"))
     if start:
         hint = f"Open one after another, key {NEXT_KEY}"

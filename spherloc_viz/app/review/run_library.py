@@ -46,9 +46,17 @@ class RunLibrary:
                 state += (status.st_mtime_ns, status.st_size)
         return tuple(state)
 
+    def _query(self, look: Look) -> RunQuery:
+        """What to ask the index for; runs that pages made are left out, unless there are no others."""
+        query = look.query(datetime.now(UTC))
+        return query if query.pages is None or self._has_others() else replace(query, pages=None)
+
+    def _has_others(self) -> bool:
+        return bool(self._index.find(RunQuery(pages=False), 0).total)
+
     def page(self, look: Look) -> tuple[Found, Look]:
         """The rows of a page, and the look with a page that exists."""
-        query = _query(look)
+        query = self._query(look)
         found = self._index.find(query, PAGE, PAGE * look.page)
         if found.rows or not look.page:
             return found, look
@@ -59,12 +67,13 @@ class RunLibrary:
         """What each filter would leave."""
         outcome, diagnosis = self._groups(look, "outcome"), self._groups(look, "diagnosis")
         unfolded = self._groups(look, look.unfolded) if look.unfolded in EXACT else ()
-        doubtful = self._index.find(_query(replace(look, judged=JUDGED[0])), 0).total
-        return Counts(total, outcome, diagnosis, doubtful, unfolded)
+        doubtful = self._index.find(self._query(replace(look, judged=JUDGED[0])), 0).total
+        pages = self._index.find(RunQuery(pages=True), 0).total if self._has_others() else None
+        return Counts(total, outcome, diagnosis, doubtful, unfolded, pages)
 
     def _groups(self, look: Look, name: str) -> Sequence[tuple[str, int]]:
         """How many runs there are of each value, if this filter were not set."""
-        return self._index.groups(_query(replace(look, **{name: None})), name)
+        return self._index.groups(self._query(replace(look, **{name: None})), name)
 
     def labels(self) -> tuple[str, ...]:
         """Those that were given to any run, the most used first."""
@@ -99,7 +108,7 @@ class RunLibrary:
 
     def place(self, look: Look, file: str, near: int) -> tuple[int | None, int]:
         """Where a run is in the list, counted from 0, and how long the list is; looked for around ``near`` first."""
-        query = _query(look)
+        query = self._query(look)
         found, at = self._search(query, file, max(0, near - NEAR), 2 * NEAR + 1)
         if at is not None or len(found.rows) == found.total:
             return at, found.total
@@ -120,11 +129,11 @@ class RunLibrary:
 
     def at(self, look: Look, place: int) -> RunRow | None:
         """The run at a place of the list, if there is one."""
-        return next(iter(self._index.find(_query(look), 1, place).rows), None) if place >= 0 else None
+        return next(iter(self._index.find(self._query(look), 1, place).rows), None) if place >= 0 else None
 
     def all(self, look: Look, most: int) -> Found:
         """The first ``most`` runs of the list, from all pages."""
-        return self._index.find(_query(look), most)
+        return self._index.find(self._query(look), most)
 
     def columns(self, names: Sequence[str]) -> tuple[dict[str, tuple[Any, ...]], dict[str, str]]:
         """Columns of all runs and the notes, see ``RunIndex.columns``."""
@@ -158,7 +167,3 @@ def merged(stored: Review, before: Review, now: Review) -> Review:
     kept = (label for label in stored.labels if label in now.labels or label not in before.labels)
     added = (label for label in now.labels if label not in before.labels)
     return Review(tuple(dict.fromkeys((*kept, *added))), stored.note if now.note == before.note else now.note)
-
-
-def _query(look: Look) -> RunQuery:
-    return look.query(datetime.now(UTC))

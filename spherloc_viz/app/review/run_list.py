@@ -117,6 +117,7 @@ class RunList:
         touches.on("runs-sort", lambda touch: self._change(lambda look: look.sorted(touch.argument)))
         touches.on("runs-page", lambda touch: self._change(lambda look: look.turn(touch.argument)))
         touches.on("runs-clear", self._clear)
+        touches.on("runs-pages", lambda touch: self._change(lambda look: replace(look, pages=not look.pages, page=0)))
         touches.on("run-mark", self._mark)
         touches.on("runs-unmark", lambda touch: self._set_marked(()))
 

@@ -18,6 +18,7 @@ from spherloc_viz.app.desk.comparison import MEASURED, Pair, causes, compare
 from spherloc_viz.app.desk.page import desk_page
 from spherloc_viz.app.desk.report import comparison_html, number, p_text, summary_html
 from spherloc_viz.app.review import words
+from spherloc_viz.app.review.rows import DESK
 from spherloc_viz.app.review.run_library import RunLibrary
 from spherloc_viz.app.web.downloads import Download, Downloads
 from spherloc_viz.app.web.guard import SAFE
@@ -25,7 +26,6 @@ from spherloc_viz.app.web.viewer import SORRY_POLICY, sorry_page, viewer_link
 from spherloc_viz.recording.run_row import RunRow
 from spherloc_viz.recording.sandbox.checks import is_thumbnail
 
-DESK = "/desk"
 DO = f"{DESK}/do"
 """The only address that takes a POST."""
 NO_RUNS = "There are no recordings to look at: start the playground without --no-record."
@@ -181,8 +181,9 @@ class DeskRoom:
             file, note = _text(change, "file"), change.get("note")
             if note is not None and not isinstance(note, str):
                 raise InputError(f"{show(note)} is no note.")
+            add, remove = _texts(change, "add"), _texts(change, "remove")
             try:
-                before, now = self._library.relabel(file, _texts(change, "add"), _texts(change, "remove"), note)
+                before, now = self._library.relabel(file, add, remove, note)
             except SpherlocError as error:
                 failed.append({"file": file, "error": str(error)})
                 continue

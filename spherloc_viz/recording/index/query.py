@@ -136,6 +136,8 @@ GROUP_KEYS = ("diagnosis", "outcome", "estimator", "scene", "source", "label", "
 """By what runs can be counted."""
 OUTCOMES = ("success", "failure", "unknown")
 SOURCES = ("page", "command", "sweep", "sequence", "gallery", "unknown")
+PAGE_KEPT = 100
+"""Runs that pages made while somebody played, of which few are kept; labelled ones are not counted."""
 MAX_TEXT = 200
 """Characters of a text that is searched for."""
 
@@ -186,6 +188,8 @@ class RunQuery:
     """Who ran it."""
     problem_key: str | None = None
     """Runs of this very problem."""
+    pages: bool | None = None
+    """Only runs that a page made while somebody played, and nobody labelled; if False, all but those."""
     outlier_rate: Range | None = None
     """0 to 1."""
     rotation_error_deg: Range | None = None
@@ -279,6 +283,8 @@ def condition(query: RunQuery) -> Condition:
         parts.append(_scene(query.scene))
     if query.label is not None:
         parts.append(("id IN (SELECT id FROM labels WHERE label = ?)", [query.label]))
+    if query.pages is not None:
+        parts.append((f"{'' if query.pages else 'NOT '}(source = 'page' AND labels = '[]')", []))
     if query.since is not None:
         parts.append(("created >= ?", [query.since]))
     if query.until is not None:

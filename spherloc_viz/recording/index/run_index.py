@@ -320,13 +320,15 @@ class RunIndex:
 
         return self._read(work)
 
-    def same_run(self, source: str, problem_key: str, estimator: str, options: str, seed: int) -> str | None:
-        """The file of the newest run from this source that did the very same, if there is one."""
+    def same_run(
+        self, source: str, problem_key: str, estimator: str, options: str, seed: int, inliers: int
+    ) -> str | None:
+        """The file of the newest run from this source that did the very same with as many inliers, if there is one."""
         select = (
             "SELECT file FROM runs JOIN details ON details.id = runs.id WHERE problem_key = ? AND source = ? "
-            "AND estimator = ? AND options = ? AND seed = ? ORDER BY created DESC LIMIT 1"
+            "AND estimator = ? AND options = ? AND seed = ? AND inliers = ? ORDER BY created DESC LIMIT 1"
         )
-        values = (problem_key, source, estimator, options, seed)
+        values = (problem_key, source, estimator, options, seed, inliers)
         found = self._read(lambda connection: connection.execute(select, values).fetchone())
         return None if found is None else found[0]
 
@@ -344,6 +346,18 @@ class RunIndex:
         """Size of all recordings together."""
         sql = "SELECT coalesce(sum(size_bytes), 0) FROM runs"
         return self._read(lambda connection: connection.execute(sql).fetchone()[0])
+
+    def old_page_runs(self, keep: int) -> tuple[RunRow, ...]:
+        """Runs that pages made, all but the ``keep`` newest ones, the oldest first; none that has labels or a note."""
+        sql = (
+            "SELECT id FROM runs JOIN details USING (id) WHERE source = 'page' AND labels = '[]' AND note = '' "
+            "ORDER BY created DESC, file DESC LIMIT -1 OFFSET ?"
+        )
+
+        def work(connection: sqlite3.Connection) -> tuple[RunRow, ...]:
+            return rows_of(connection, [run for (run,) in connection.execute(sql, (keep,))][::-1])
+
+        return self._read(work)
 
     def oldest_successes(self, limit: int = 100) -> tuple[RunRow, ...]:
         """Runs that may be deleted to make room, the oldest first.

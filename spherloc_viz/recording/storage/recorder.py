@@ -12,7 +12,7 @@ from spherloc.diagnosis import Diagnosis
 from spherloc.errors import RecordingError
 from spherloc.trace import Trace
 from spherloc_viz.recording.index.run_index import RunIndex
-from spherloc_viz.recording.origin import Origin
+from spherloc_viz.recording.origin import Origin, Source
 from spherloc_viz.recording.storage.room import KEEP_BYTES
 from spherloc_viz.recording.storage.store import RecordingStore, SweepStore
 
@@ -109,6 +109,10 @@ class Recorder:
                 ) from None
             self._waiting += 1
         return path
+
+    def known(self, trace: Trace, source: Source) -> Path | None:
+        """The recording of the very same run, see ``RecordingStore.known``."""
+        return self._store.known(trace, source)
 
     def sweep_store(self) -> SweepStore:
         """What records the runs of a sweep into this folder, in the processes that do them."""

@@ -9,7 +9,7 @@ import threading
 import unicodedata
 import uuid
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from functools import lru_cache
 from pathlib import Path
@@ -20,10 +20,12 @@ from spherloc.errors import RecordingError
 from spherloc.experiments.sweep import Job, SweepPlan
 from spherloc.trace import Trace
 from spherloc_viz.given_files import REVIEW_SUFFIX
+from spherloc_viz.options import json_text
+from spherloc_viz.recording.content.properties import problem_key
 from spherloc_viz.recording.content.writer import write_recording
-from spherloc_viz.recording.index.query import RunQuery
+from spherloc_viz.recording.index.query import PAGE_KEPT, RunQuery
 from spherloc_viz.recording.index.run_index import RunIndex
-from spherloc_viz.recording.origin import Origin
+from spherloc_viz.recording.origin import Origin, Source
 from spherloc_viz.recording.rerun_program import rerun_command, rerun_environment
 from spherloc_viz.recording.reviews import has_review
 from spherloc_viz.recording.run_row import RunRow
@@ -164,6 +166,17 @@ def prune(folder: Path, index: RunIndex, keep_bytes: int) -> Pruned:
     return Pruned(tuple(row.file for row in deleted), sum(row.size_bytes for row in deleted), left, keep_bytes)
 
 
+def prune_pages(folder: Path, index: RunIndex) -> None:
+    """Delete the oldest runs of pages beyond ``PAGE_KEPT``, right or wrong, unless they were labelled or noted.
+
+    Every deletion is first written into ``pruned.log``. Raises ``RecordingError`` if index or log cannot be used.
+    """
+    for row in index.old_page_runs(PAGE_KEPT):
+        _delete(folder / row.file, row)
+        if not (folder / row.file).exists():
+            index.remove(row.file)
+
+
 def prunable(row: RunRow) -> bool:
     """Whether a run is one that nobody will look for: right, or nothing speaks against it, and nobody labelled it."""
     fine = row.outcome == "success" or (row.outcome == "unknown" and row.doubtful is False)
@@ -251,6 +264,16 @@ class RecordingStore:
                 self._index = RunIndex(self.folder, self._notice)
             return self._index
 
+    def known(self, trace: Trace, source: Source) -> Path | None:
+        """The recording of the very same run from this source, if there is one.
+
+        The same are problem, estimator, options, seed and the number of inliers. Raises ``RecordingError``.
+        """
+        options = json_text(asdict(trace.options))
+        key, inliers = problem_key(trace.problem), int(trace.inlier_mask.sum())
+        file = self.index.same_run(source, key, trace.estimator, options, trace.seed, inliers)
+        return None if file is None or not (self.folder / file).exists() else self.folder / file
+
     def path_of(self, trace: Trace) -> Path:
         """A new path for the recording of a run."""
         return self.folder / file_name(trace, datetime.now(UTC))
@@ -281,6 +304,9 @@ class RecordingStore:
             self._unlisted += 1
             if self._unlisted == 1:
                 self._notice(f"A run is recorded, but not listed: {error}")
+        if row.source == "page":
+            with contextlib.suppress(RecordingError):  # it is tried again with the next one
+                prune_pages(self.folder, self.index)
         self._unchecked_bytes += row.size_bytes
         if self._keep_bytes is not None and self._unchecked_bytes > self._keep_bytes / CHECKS:
             with contextlib.suppress(RecordingError):  # it is tried again, and the failing index was spoken of
