@@ -116,11 +116,11 @@ def _again(path: Path, estimator: str | None, changes: dict[str, Any], seed: int
     """Solve a recorded problem; other options than those of another estimator stay as they were recorded."""
     scene = load_recorded_scene(path)
     run = scene.run
-    same = estimator is None or estimator == run.estimator
-    options = recorded_options(run, path) if same else default_options(estimator, run.problem)
+    name = estimator or run.estimator
+    options = recorded_options(run, path) if name == run.estimator else default_options(name, run.problem)
     options = replace(options, **changes)
     check_options(options)
-    trace = solve(run.problem, estimator or run.estimator, options, run.seed if seed is None else seed)
+    trace = solve(run.problem, name, options, run.seed if seed is None else seed)
     return trace, replace(run.origin or Origin(), source="command", title="", story="")
 
 

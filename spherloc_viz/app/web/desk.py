@@ -221,8 +221,8 @@ class DeskRoom:
         return {"address": self._offer(name, summary_html(rows, remark, now)), "name": name, "runs": len(rows)}
 
     def _compare(self, told: Mapping[str, Any]) -> dict[str, Any]:
-        before, after = (self._side(told, side) for side in ("before", "after"))
-        names = [_text(told, f"{side}_name")[:200] for side in ("before", "after")]
+        before, after = self._side(told, "before"), self._side(told, "after")
+        before_name, after_name = _text(told, "before_name")[:200], _text(told, "after_name")[:200]
         found, now = compare(before, after), datetime.now(UTC)
         name = f"spherloc-comparison-{now:%Y%m%dT%H%M%SZ}.html"
         return {
@@ -240,7 +240,7 @@ class DeskRoom:
                 [MEASURED[c.name], number(c.before), number(c.after), number(c.difference), p_text(c.p)]
                 for c in found.changes
             ],
-            "address": self._offer(name, comparison_html(found, *names, now)),
+            "address": self._offer(name, comparison_html(found, before_name, after_name, now)),
             "name": name,
         }
 
