@@ -4,13 +4,13 @@
 const SETTINGS = JSON.parse(document.body.dataset.settings);
 const FILTERS = ["outcome", "diagnosis", "estimator", "scene", "source", "labels"];
 const GROUPED = ["diagnosis", "scene", "estimator", "outcome", "changes", "source", "name"];
-const MOST_CHIPS = 12, MOST_GROUP_COLUMNS = 8, EXAMPLES = 5, ROW_PX = 34;
+const MOST_CHIPS = 6, ALL_CHIPS = 40, MOST_GROUP_COLUMNS = 5, EXAMPLES = 4, ROW_PX = 34;
 const WIDTHS = { outcome: 86, scene: 150, name: 190, diagnosis: 165, changes: 150, labels: 150, title: 190, created: 120, query: 120, estimator: 92, outlier_rate: 92, rotation_error_deg: 118, translation_error_m: 120 };
 const DEFAULT_KEYS = ["real failure", "bad map", "bad truth", "calibration", "repeated structure", "look again", "known", "fixed", "ignore"];
 const SEEN = "seen";
 const NEWS_MS = 15000;
 const START = {
-  search: "", chosen: {}, ranges: {}, lasso: null, only: null, sort: "created", descending: true,
+  search: "", chosen: {}, ranges: {}, lasso: null, only: null, pages: false, sort: "created", descending: true,
   columns: ["outcome", "diagnosis", "scene", "estimator", "outlier_rate", "rotation_error_deg", "translation_error_m", "position_sd_m", "certificate_gap", "time_ms", "labels"],
   x: "outlier_rate", y: "rotation_error_deg", rows: "diagnosis", across: "scene", keys: DEFAULT_KEYS,
 };
@@ -20,7 +20,7 @@ const plural = (number, noun) => `${count(number)} ${noun}${number === 1 ? "" : 
 
 let runs, reviews, state = structuredClone(START);
 let fits, listed = new Int32Array(0), chosen = -1, anchor = -1;
-const marked = new Set(), unfolded = new Set(), axes = new Map();
+const marked = new Set(), unfolded = new Set(), allChips = new Set(), axes = new Map();
 let newsTimer = 0;
 let saved = { views: {}, sets: {} }, waiting = false;
 const colors = [], hexes = [];
@@ -77,6 +77,7 @@ function readState(text) {
   if (Array.isArray(told.only)) found.only = told.only.filter(isText);
   if (runs.has(told.sort)) found.sort = told.sort;
   found.descending = told.descending !== false;
+  found.pages = told.pages === true;
   if (Array.isArray(told.columns)) found.columns = told.columns.filter((name) => name in SETTINGS.columns);
   for (const name of ["x", "y"]) if (told[name] in runs.numbers && told[name] in SETTINGS.columns) found[name] = told[name];
   for (const name of ["rows", "across"]) if (GROUPED.includes(told[name])) found[name] = told[name];
@@ -109,8 +110,9 @@ function soon() {
 
 function draw() {
   const failures = runs.counts(fits, "outcome").find(([outcome]) => outcome === "failure");
+  const others = runs.pageRuns && !state.pages && runs.pageRuns < runs.count ? `, ${plural(runs.pageRuns, "page run")} apart` : "";
   byId("counts").textContent = `${plural(listed.length, "run")} of ${count(runs.count)} listed` +
-    (failures ? `, ${plural(failures[1], "failure")}` : "");
+    (failures ? `, ${plural(failures[1], "failure")}` : "") + others;
   drawChips(); drawMatrix(); drawPlots(); drawHead(); drawRows(); drawTools();
   document.body.dataset.listed = listed.length;
 }
@@ -136,13 +138,21 @@ function drawChips() {
   for (const name of FILTERS) {
     const now = state.chosen[name] || [];
     const counted = runs.counts(now.length ? runs.fitting(filterState(name)) : fits, name);
-    const values = counted.slice(0, MOST_CHIPS);
+    const most = allChips.has(name) ? ALL_CHIPS : MOST_CHIPS;
+    const values = counted.slice(0, most);
     for (const value of now) if (!values.some(([other]) => other === value)) values.push([value, 0]);
     if (values.length < 2 && !now.length && name !== "outcome" && name !== "labels") continue;
     if (!values.length) continue;
+    const more = counted.length > MOST_CHIPS ? [element("button", { className: "chip", title: `More of ${title(name)}`,
+      textContent: allChips.has(name) ? "fewer" : `${count(counted.length - MOST_CHIPS)} more …`,
+      onclick: () => { if (!allChips.delete(name)) allChips.add(name); soon(); } })] : [];
     lines.push(element("div", { className: "chips", "data-filter": name }, ...values.map(([value, number]) =>
       chip(short(value), number, now.includes(value), () => toggled(name, value), `${title(name)}: ${value || "none"}`,
-        name === "outcome" ? SETTINGS.colors[value] : null))));
+        name === "outcome" ? SETTINGS.colors[value] : null)), ...more));
+  }
+  if (runs.pageRuns && runs.pageRuns < runs.count) {
+    lines[0].append(chip("page runs", runs.pageRuns, state.pages, () => change({ pages: !state.pages }),
+      "Runs that pages made while somebody played, and nobody labelled"));
   }
   const brushes = [];
   for (const [name, [low, high]] of Object.entries(state.ranges)) {

@@ -18,8 +18,17 @@ class Runs {
       this.numbers[name] = Float64Array.from(values, (value) => (value === null ? NaN : value));
     }
     this.axes = told.axes;
+    this.fromPages = new Uint8Array(this.count);
+    this.findPageRuns();
     this.index = new Map(told.files.map((file, i) => [file, i]));
     this.orders = new Map(); // by column: all runs in its order, unknown ones last
+  }
+
+  // Runs that a page made while somebody played, and nobody labelled.
+  findPageRuns() {
+    const { values, codes } = this.texts.source, code = values.indexOf("page");
+    this.pageRuns = 0;
+    for (let i = 0; i < this.count; i++) this.pageRuns += this.fromPages[i] = Number(codes[i] === code && !this.labels[i].length);
   }
 
   isNumber(name) { return name in this.numbers; }
@@ -36,6 +45,8 @@ class Runs {
   // 1 for every run that fits all filters of the state.
   fitting(state, lasso = true) {
     const fits = new Uint8Array(this.count).fill(1);
+    const apart = !state.pages && this.pageRuns < this.count && !(state.chosen.source || []).includes("page");
+    if (apart) for (let i = 0; i < this.count; i++) fits[i] = 1 - this.fromPages[i];
     for (const [name, chosen] of Object.entries(state.chosen)) {
       if (!chosen.length) continue;
       if (name === "labels") {

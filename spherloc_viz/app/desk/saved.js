@@ -58,6 +58,7 @@ class Reviews {
       failed.push(...told.failed);
       this.runs.version = told.version;
     }
+    this.runs.findPageRuns();
     if (undoable && back.length) this.steps.push({ back, words });
     this.changed();
     if (failed.length) this.say(`${failed.length} could not be labelled: ${failed[0].error}`, true);
