@@ -7,8 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from axe_playwright_python.sync_playwright import Axe
 from playground import FLAGS, PATIENCE_MS, SCENE, find_chromium, served
 from playwright.sync_api import Browser, Page, expect, sync_playwright
+from test_accessibility import RULES
 
 from spherloc.datasets import load_scene
 from spherloc.estimators import default_options, estimate
@@ -130,6 +132,19 @@ def test_filters_groups_and_order(desk: Desk) -> None:
     assert int(row.locator("td").first.inner_text()) >= SEEDS
     row.locator(".fold").click()
     expect(desk.page.locator("#matrix .examples img").first).to_be_visible()
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_the_desk_is_accessible(desk: Desk, scheme: Any) -> None:
+    desk.page.emulate_media(color_scheme=scheme)
+    desk.chip("failure")
+    desk.listed(SEEDS)
+    desk.page.keyboard.press("ArrowDown")
+    expect(desk.page.locator("#evidence li").first).to_contain_text("agree")
+    desk.page.locator("#matrix .fold").first.click()
+    desk.page.locator("#columns-menu summary").click()
+    found = Axe().run(desk.page, options=RULES).response["violations"]
+    assert [f"{one['id']}: {node['html'][:200]}" for one in found for node in one["nodes"]] == []
 
 
 def test_what_is_brushed_is_what_is_listed(desk: Desk) -> None:

@@ -289,7 +289,8 @@ function drawHead() {
     "aria-sort": state.sort === name ? (state.descending ? "descending" : "ascending") : "none",
     onclick: () => change({ sort: name, descending: state.sort === name ? !state.descending : runs.isNumber(name) }),
   }));
-  byId("head").replaceChildren(element("span", { className: "mark" }), element("span", { className: "picture" }), ...cells);
+  byId("head").replaceChildren(element("span", { className: "mark", role: "columnheader", "aria-label": "Marked" }),
+    element("span", { className: "picture", role: "columnheader", "aria-label": "Picture" }), ...cells);
 }
 
 function drawRows() {
@@ -318,9 +319,9 @@ function row(i) {
   const isMarked = marked.has(i);
   return element("div", { className: `row${isMarked ? " marked" : ""}${i === chosen ? " chosen" : ""}`, role: "row", "data-file": runs.files[i],
     "aria-selected": String(i === chosen), onclick: (event) => clicked(i, event), ondblclick: () => open(i) },
-  element("span", { className: "mark", role: "checkbox", "aria-checked": String(isMarked), "aria-label": "Mark", textContent: isMarked ? "☑" : "☐",
-    onclick: (event) => { event.stopPropagation(); mark(i); } }),
-  element("span", { className: "picture" }, element("img", { src: picture(i), alt: "", loading: "lazy" })), ...cells);
+  element("span", { className: "mark", role: "gridcell", onclick: (event) => { event.stopPropagation(); mark(i); } },
+    element("span", { role: "checkbox", "aria-checked": String(isMarked), "aria-label": "Mark", textContent: isMarked ? "☑" : "☐" })),
+  element("span", { className: "picture", role: "gridcell" }, element("img", { src: picture(i), alt: "", loading: "lazy" })), ...cells);
 }
 
 function clicked(i, event) {
