@@ -173,9 +173,11 @@ def test_what_is_copied_repeats_the_run_to_the_last_bit(
 ) -> None:
     tab = sharing_tab
     path = wait_for_another_recording(tab, None, recordings)
-    for label, key in (("Outliers (%)", "ArrowLeft"), ("Noise (px)", "ArrowRight")):
+    # Of 40 matches 49 % are as many as 50 %: the same problem, whose run is not recorded twice.
+    for label, key, times in (("Outliers (%)", "ArrowLeft", 3), ("Noise (px)", "ArrowRight", 1)):
         tab.thumb(label).focus()
-        tab.page.keyboard.press(key)
+        for _ in range(times):
+            tab.page.keyboard.press(key)
         path = wait_for_another_recording(tab, path, recordings)
     run = read_recording(path)
     assert tab.value("inliers").inner_text() == f"{int(run.inlier_mask.sum())} of 40"
@@ -201,6 +203,6 @@ def test_what_is_copied_repeats_the_run_to_the_last_bit(
         path = wait_for_another_recording(tab, path, recordings)
         run = read_recording(path)
     command = check_repeats(tab, run, tmp_path / "by hand")
-    assert "outlier_rate=0.49" in command and "noise_px=1.1" in command
+    assert "outlier_rate=0.47" in command and "noise_px=1.1" in command
     assert f"--spoil {inlier} --mend {outlier} --hide {hidden}" in command and "iterations=321" in command
     assert tab.errors == []

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from spherloc.datasets import bundled_scenes, load_scene, rendered
 from spherloc.datasets.map_scene import MapScene
@@ -107,9 +108,12 @@ def test_bundled_scenes_bring_their_matches(cache):
     assert isinstance(seeker, ImageMatcher)
     found = replace(seeker, references=stored.references[:1])(query)
     first = stored.reference_index == 0
-    again = "python -m scripts.scene_matches makes them anew"
-    np.testing.assert_allclose(stored.pixels[first], found.pixels, atol=1e-3, err_msg=again)
-    np.testing.assert_allclose(stored.points[first], found.points, atol=1e-3, err_msg=again)
+    one = np.column_stack([stored.pixels[first], stored.points[first]])
+    other = np.column_stack([found.pixels, found.points])
+    # A few matches at a threshold depend on how a processor rounds in OpenCV's vectors.
+    for some, all_ in ((one, other), (other, one)):
+        near = cKDTree(all_).query(some)[0] < 1e-3
+        assert near.mean() > 0.98, "python -m scripts.scene_matches makes them anew"
 
 
 @pytest.mark.parametrize("change", ["another camera", "cut off", "no file"])

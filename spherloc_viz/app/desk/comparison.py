@@ -5,6 +5,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any, cast
 
 import numpy as np
 from scipy import stats
@@ -141,7 +142,7 @@ def _change(name: str, pairs: Sequence[Pair]) -> Change:
     if not len(known):
         return Change(name, 0, math.nan, math.nan, math.nan, math.nan)
     difference = known[:, 1] - known[:, 0]
-    p = float(stats.wilcoxon(difference)[1]) if np.any(difference) else 1.0
+    p = float(cast(Any, stats.wilcoxon(difference)).pvalue) if np.any(difference) else 1.0
     was, now = np.median(known, axis=0)
     return Change(name, len(known), float(was), float(now), float(np.median(difference)), p)
 

@@ -110,7 +110,7 @@ function soon() {
 
 function draw() {
   const failures = runs.counts(fits, "outcome").find(([outcome]) => outcome === "failure");
-  const others = runs.pageRuns && !state.pages && runs.pageRuns < runs.count ? `, ${plural(runs.pageRuns, "page run")} apart` : "";
+  const others = runs.pageRuns && !state.pages && runs.others ? `, ${plural(runs.pageRuns, "page run")} apart` : "";
   byId("counts").textContent = `${plural(listed.length, "run")} of ${count(runs.count)} listed` +
     (failures ? `, ${plural(failures[1], "failure")}` : "") + others;
   drawChips(); drawMatrix(); drawPlots(); drawHead(); drawRows(); drawTools();
@@ -150,7 +150,7 @@ function drawChips() {
       chip(short(value), number, now.includes(value), () => toggled(name, value), `${title(name)}: ${value || "none"}`,
         name === "outcome" ? SETTINGS.colors[value] : null)), ...more));
   }
-  if (runs.pageRuns && runs.pageRuns < runs.count) {
+  if (runs.pageRuns && runs.others) {
     lines[0].append(chip("page runs", runs.pageRuns, state.pages, () => change({ pages: !state.pages }),
       "Runs that pages made while somebody played, and nobody labelled"));
   }

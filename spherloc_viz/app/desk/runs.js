@@ -28,6 +28,7 @@ class Runs {
   findPageRuns() {
     const { values, codes } = this.texts.source, code = values.indexOf("page");
     this.pageRuns = 0;
+    this.others = codes.some((other) => other !== code); // else runs of pages are all that there is, and are listed
     for (let i = 0; i < this.count; i++) this.pageRuns += this.fromPages[i] = Number(codes[i] === code && !this.labels[i].length);
   }
 
@@ -45,7 +46,7 @@ class Runs {
   // 1 for every run that fits all filters of the state.
   fitting(state, lasso = true) {
     const fits = new Uint8Array(this.count).fill(1);
-    const apart = !state.pages && this.pageRuns < this.count && !(state.chosen.source || []).includes("page");
+    const apart = !state.pages && this.others && !(state.chosen.source || []).includes("page");
     if (apart) for (let i = 0; i < this.count; i++) fits[i] = 1 - this.fromPages[i];
     for (const [name, chosen] of Object.entries(state.chosen)) {
       if (!chosen.length) continue;

@@ -64,12 +64,14 @@ def row_html(row: RunRow, marked: bool, opened: bool, now: datetime, hidden: boo
     hint, picture = _hint(row), row.thumbnail
     if hidden:
         link, hint, picture = "", escape(row.file), b""
+    playing = row.source == "page" and not row.labels and not hidden
+    keep = f'<div style="align-self:flex-end;padding-bottom:.2em">{keep_html(row.file)}</div>' if playing else ""
     about = f'<div style="flex:1;min-width:0">{_lines(row, now, hidden)}</div>'
     return (
         f'<div style="{RULE};position:relative;display:flex;align-items:flex-start;padding:2px 0;{ground}">'
         f'<div role="button" tabindex="0" class="touch-row" data-touch="run-open:{file}" title="{hint}" '
         f'style="flex:1;min-width:0;display:flex;gap:.6em;padding-left:2px">{picture_html(picture)}{about}</div>'
-        f"{mark}{link}</div>"
+        f"{mark}{keep}{link}</div>"
     )
 
 
@@ -116,8 +118,6 @@ def verdict_html(row: RunRow) -> str:
 
 
 def _review(row: RunRow) -> str:
-    if row.source == "page" and not row.labels:
-        return f'<div style="position:relative">{keep_html(row.file)}</div>'
     if not row.labels and not row.note:
         return ""
     labels = "".join(label_html(label) for label in row.labels)

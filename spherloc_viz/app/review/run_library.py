@@ -52,7 +52,7 @@ class RunLibrary:
         return query if query.pages is None or self._has_others() else replace(query, pages=None)
 
     def _has_others(self) -> bool:
-        return bool(self._index.find(RunQuery(pages=False), 0).total)
+        return any(source != "page" for source, _ in self._index.groups(RunQuery(), "source"))
 
     def page(self, look: Look) -> tuple[Found, Look]:
         """The rows of a page, and the look with a page that exists."""
