@@ -4,8 +4,12 @@
 const SETTINGS = JSON.parse(document.body.dataset.settings);
 const FILTERS = ["outcome", "diagnosis", "estimator", "scene", "source", "labels"];
 const GROUPED = ["diagnosis", "scene", "estimator", "outcome", "changes", "source", "name"];
-const MOST_CHIPS = 6, ALL_CHIPS = 40, MOST_GROUP_COLUMNS = 5, EXAMPLES = 4, ROW_PX = 34;
-const WIDTHS = { outcome: 86, scene: 150, name: 190, diagnosis: 165, changes: 150, labels: 150, title: 190, created: 120, query: 120, estimator: 92, outlier_rate: 92, rotation_error_deg: 118, translation_error_m: 120 };
+const MOST_CHIPS = 6, ALL_CHIPS = 40, MOST_GROUP_COLUMNS = 6, EXAMPLES = 4, ROW_PX = 34;
+const WIDTHS = {
+  outcome: 80, diagnosis: 150, scene: 140, name: 190, changes: 150, labels: 150, title: 190, created: 110, query: 120, estimator: 92,
+  outlier_rate: 64, rotation_error_deg: 74, translation_error_m: 78, rotation_sd_deg: 74, position_sd_m: 78, certificate_gap: 84,
+  time_ms: 62, correspondences: 60, inliers: 60, seed: 56, steps: 56, key_step: 60,
+};
 const DEFAULT_KEYS = ["real failure", "bad map", "bad truth", "calibration", "repeated structure", "look again", "known", "fixed", "ignore"];
 const SEEN = "seen";
 const NEWS_MS = 15000;
@@ -280,7 +284,7 @@ function select(id, names, name) {
 
 // --- table ---------------------------------------------------------------------------------------------------------
 
-const width = (name) => WIDTHS[name] || 100;
+const width = (name) => WIDTHS[name] || 90;
 
 function drawHead() {
   const cells = state.columns.map((name) => element("button", {
@@ -595,8 +599,9 @@ async function load() {
   outcomeCodes = runs.texts.outcome.codes;
   hexes.splice(0, hexes.length, ...runs.texts.outcome.values.map((outcome) => SETTINGS.colors[outcome]));
   colors.splice(0, colors.length, ...hexes.map(rgb));
-  byId("map-words").textContent = runs.axes[0]
-    ? `Runs with like evidence lie near each other (principal components; → ${runs.axes[0]}; ↑ ${runs.axes[1]}). Draw around some to list them.`
+  const [across, up] = runs.axes.map((words) => SETTINGS.measures.reduce((text, name) => text.replace(name, title(name)), words));
+  byId("map-words").textContent = across
+    ? `Runs with like evidence lie near each other (principal components; → ${across}; ↑ ${up}). Draw around some to list them.`
     : "These runs have no measured evidence: they were recorded by an older version.";
 }
 
