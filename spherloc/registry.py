@@ -28,6 +28,12 @@ KINDS = {
 """What there is to register, the last part of the name of its group of entry points, and what a sentence calls one."""
 RANSAC = "ransac-"
 """A solver "p6" is the estimator "ransac-p6" too, unless there is an estimator of that name."""
+UNLISTED = {
+    ("estimators", "given-pose"): EntryPoint(
+        "given-pose", "spherloc.estimators.given_pose:GivenPose", "spherloc.estimators"
+    )
+}
+"""What spherloc has under a name that no list offers, by kind and name."""
 _AROUND_SOLVER = EntryPoint("around", "spherloc.estimators.ransac_solver:around", "spherloc")
 """Makes that estimator; imported when one is asked for, since it stands on a floor above."""
 
@@ -171,6 +177,8 @@ def _group(kind: str) -> str:
 def _point(kind: str, name: str) -> EntryPoint | None:
     """The entry point that is used; of an estimator maybe that of its solver."""
     found = sorted(entry_points(group=_group(kind), name=name), key=_rank)
+    if not found and (kind, name) in UNLISTED:
+        return UNLISTED[kind, name]
     if found or kind != "estimators" or not name.startswith(RANSAC):
         return found[0] if found else None
     return _point("solvers", name.removeprefix(RANSAC))
@@ -182,7 +190,7 @@ def _rank(point: EntryPoint) -> tuple[bool, str]:
 
 
 def _is_own(point: EntryPoint) -> bool:
-    return _distribution(point) == OWN
+    return point in UNLISTED.values() or _distribution(point) == OWN
 
 
 def _distribution(point: EntryPoint) -> str:

@@ -390,6 +390,7 @@ def lesson(
 
 _OTHERS = (
     recording_commands.view,
+    triage_commands.diagnose,
     triage_commands.compare,
     triage_commands.rerun,
     recording_commands.repeat,

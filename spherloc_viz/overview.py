@@ -11,6 +11,7 @@ COMMANDS: Mapping[str, Mapping[str, str]] = {
     "Localize": {
         "run": "solve problems and print pose, errors, proof and diagnosis",
         "localize": "localize a sequence of images in a map, by one or several estimators",
+        "diagnose": "record and diagnose poses that another program found",
         "map": "make a map of your own photographs",
     },
     "Measure": {

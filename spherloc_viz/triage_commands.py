@@ -8,7 +8,7 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional, arg
 
-from spherloc_viz.arguments import OptionalNumber, OptionalPath, OptionalText
+from spherloc_viz.arguments import OptionalFloat, OptionalNumber, OptionalPath, OptionalText
 from spherloc_viz.given_files import check_recording_file, check_recordings_folder, is_recording
 from spherloc_viz.recording.storage.room import KEEP_GIGABYTES
 
@@ -131,3 +131,62 @@ def _check_place(place: Path) -> None:
             raise InputError(f"{place}: no such set of runs; the triage desk stores them in the folder sets.")
     else:
         check_recordings_folder(place)
+
+
+def diagnose(
+    poses: Positional[Path],
+    scenes: Positional[tuple[Path, ...]],
+    /,
+    bound_px: OptionalFloat = None,
+    label: OptionalText = None,
+    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
+    record: bool = True,
+    recordings: Path = RECORDINGS,
+    keep_gigabytes: float = KEEP_GIGABYTES,
+) -> int:
+    """Record and diagnose poses that another program found, such as hloc or COLMAP.
+
+    Every pose becomes a run of the query of that name, with the scene's matches: what agrees with it, what is wrong
+    with it, and a better pose where there is one. The playground, the triage desk and spherloc rerun take these runs
+    as any other. Poses are x_cam = R x_map + t. Ends with 0 if all are localized, 1 if one is doubtful, 2 if a query
+    had to be left out.
+
+    For example:
+
+    spherloc diagnose hloc_results.txt hloc.toml --label hloc
+
+    spherloc diagnose poses.csv queries/*.toml --bound-px 4 --json
+
+    spherloc rerun recordings --label hloc --estimator mc-exact
+
+    Args:
+        poses: A CSV with the columns name, qw, qx, qy, qz, tx, ty, tz; hloc's results (lines of the same); or the
+            folder of a COLMAP model.
+        scenes: Scene files whose queries they are: of a map with images (hloc, COLMAP and others), or matches in a CSV
+            (kind "correspondences"), named by the problem, its image or the file.
+        bound_px: Bound on the noise of an inlier, px; the scene's, or 3, if not given.
+        label: A label for all of these runs.
+        json: Print one JSON object a pose, on one line; infinity is the text "inf".
+        record: Write a recording of each.
+        recordings: Folder of the recordings.
+        keep_gigabytes: What the recordings may take; beyond it the oldest successes that nobody labelled are deleted.
+    """
+    from spherloc.datasets.scene_file import check_there, scene_path
+    from spherloc.errors import InputError
+
+    if not poses.exists():
+        raise InputError(f"{poses}: no such file; give a file of poses, or the folder of a COLMAP model.")
+    if not scenes:
+        raise InputError("no scene given; name the scene files whose queries the poses are of.")
+    files = [scene_path(scene) for scene in scenes]
+    for file in files:
+        check_there(file)
+    if label is not None:
+        from spherloc_viz.recording.reviews import checked_review
+
+        checked_review([label], "")
+    from spherloc_viz.batch import Records
+    from spherloc_viz.given_poses import diagnose_poses
+
+    kept = Records(recordings, keep_gigabytes=keep_gigabytes) if record else None
+    return diagnose_poses(poses, files, bound_px, label, json, kept)

@@ -75,6 +75,7 @@ FLOORS = (
         "spherloc_viz.batch",
         "spherloc_viz.runs",
         "spherloc_viz.recording_commands",
+        "spherloc_viz.given_poses",
         "spherloc_viz.triage",
         "spherloc_viz.triage_commands",
         "spherloc_viz.localize",

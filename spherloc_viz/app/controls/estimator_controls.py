@@ -6,6 +6,7 @@ from typing import Any
 
 import viser
 
+from spherloc import registry
 from spherloc.errors import InputError, show
 from spherloc.estimators import default_options, options_type
 from spherloc.problem import Problem
@@ -104,6 +105,8 @@ class EstimatorControls:
         start = _name(self._names, START)
         self._estimator = gui.add_dropdown("Estimator", tuple(self._names), initial_value=start)
         self._estimator.on_update(changed)
+        self._unlisted: dict[str, Any] = {}
+        """Options of estimators that no list offers, such as a given pose; opened runs bring them."""
         self._folders: dict[str, viser.GuiFolderHandle] = {}
         self._options: dict[str, dict[str, Option]] = {}
         for label, name in self._names.items():
@@ -123,6 +126,8 @@ class EstimatorControls:
         """
         chosen = self._names[self._estimator.value]
         self._show(chosen)
+        if chosen in self._unlisted:
+            return chosen, self._unlisted[chosen]
         values = {name: option.read() for name, option in self._options[chosen].items()}
         return chosen, options_type(chosen)(**values)
 
@@ -131,10 +136,22 @@ class EstimatorControls:
 
         Raises ``InputError`` if there is none of that name.
         """
+        if ("estimators", name) in registry.UNLISTED:
+            self._offer(name, options)
+            return
         if name not in self._folders:
             raise InputError(f"unknown estimator {show(name)}: choose one of {', '.join(self._folders)}.")
         for key, option in self._options[name].items():
             option.write(getattr(options, key))
+        put(self._estimator, _name(self._names, name))
+        self._show(name)
+
+    def _offer(self, name: str, options: Any) -> None:
+        """Choose an estimator that no list offers, with options that no widget shows."""
+        self._unlisted[name] = options
+        if name not in self._names.values():
+            self._names |= {name: name}
+            self._estimator.options = tuple(self._names)
         put(self._estimator, _name(self._names, name))
         self._show(name)
 
