@@ -35,11 +35,12 @@ class Reviews {
     return this.queue;
   }
 
+  // What was asked before is done first, so that a quick key takes back the change that is still on its way.
   undo() {
-    const step = this.steps.pop();
-    if (!step) return this.queue;
-    this.queue = this.queue.then(() => this.send(step.back, `Undone: ${step.words}`, false))
-      .catch((error) => this.say(error.message, true));
+    this.queue = this.queue.then(() => {
+      const step = this.steps.pop();
+      return step && this.send(step.back, `Undone: ${step.words}`, false);
+    }).catch((error) => this.say(error.message, true));
     return this.queue;
   }
 
