@@ -394,7 +394,8 @@ async function showRun(i) {
     element("h2", { textContent: "Labels" }), element("div", { id: "label-keys" }),
     element("h2", { textContent: "Note" }),
     element("textarea", { id: "note", value: told.note, "aria-label": "Note", onchange: (event) => {
-      reviews.change([{ file, add: [], remove: [], note: event.target.value }], "Note stored.");
+      const note = event.target.value;
+      reviews.change(() => ({ changes: [{ file, add: [], remove: [], note }], words: "Note stored." }));
     } }),
     element("h2", { textContent: "Run" }),
     element("ul", {}, ...told.facts.map((fact) => element("li", { textContent: fact }))),
@@ -432,15 +433,23 @@ const targets = () => (marked.size ? [...marked] : chosen >= 0 ? [chosen] : []);
 function labelWith(label) {
   const which = targets();
   if (!which.length) { say("Choose or mark runs first."); return; }
-  const all = which.every((i) => runs.labels[i].includes(label));
-  const wanted = which.filter((i) => runs.labels[i].includes(label) === all);
-  const changes = wanted.map((i) => ({ file: runs.files[i], add: all ? [] : [label], remove: all ? [label] : [], note: null }));
-  reviews.change(changes, `${all ? "Removed" : "Labelled"} “${label}”: ${plural(changes.length, "run")}.`);
+  const files = which.map((i) => runs.files[i]);
+  reviews.change(() => {
+    const has = (file) => runs.index.has(file) && runs.labels[runs.index.get(file)].includes(label);
+    const all = files.every(has);
+    const changes = files.filter((file) => has(file) === all)
+      .map((file) => ({ file, add: all ? [] : [label], remove: all ? [label] : [], note: null }));
+    return { changes, words: `${all ? "Removed" : "Labelled"} “${label}”: ${plural(changes.length, "run")}.` };
+  });
 }
 
 function seen() {
-  const which = targets().filter((i) => !runs.labels[i].includes(SEEN));
-  if (which.length) reviews.change(which.map((i) => ({ file: runs.files[i], add: [SEEN], remove: [], note: null })), `Seen: ${plural(which.length, "run")}.`);
+  const files = targets().map((i) => runs.files[i]);
+  reviews.change(() => {
+    const changes = files.filter((file) => runs.index.has(file) && !runs.labels[runs.index.get(file)].includes(SEEN))
+      .map((file) => ({ file, add: [SEEN], remove: [], note: null }));
+    return { changes, words: `Seen: ${plural(changes.length, "run")}.` };
+  });
   if (!marked.size) step(1);
 }
 

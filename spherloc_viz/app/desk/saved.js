@@ -29,9 +29,13 @@ class Reviews {
     this.queue = Promise.resolve();
   }
 
-  // changes: [{file, add, remove, note}]
-  change(changes, words) {
-    this.queue = this.queue.then(() => this.send(changes, words, true)).catch((error) => this.say(error.message, true));
+  // make() gives {changes: [{file, add, remove, note}], words} when all that was asked before is done: a label that is
+  // pressed twice is given and taken away, however quickly.
+  change(make) {
+    this.queue = this.queue.then(() => {
+      const { changes, words } = make();
+      return changes.length ? this.send(changes, words, true) : undefined;
+    }).catch((error) => this.say(error.message, true));
     return this.queue;
   }
 
