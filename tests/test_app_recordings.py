@@ -19,6 +19,7 @@ from spherloc_viz.app.catalog import MOST_BRIEF, Catalog, SceneRequest
 from spherloc_viz.app.page_runs import LOOK_S, PageRuns
 from spherloc_viz.app.review import notes as notes_module
 from spherloc_viz.app.review.export import Exporter
+from spherloc_viz.app.review.filters import KEPT
 from spherloc_viz.app.review.run_library import RunLibrary
 from spherloc_viz.app.run_request import Run, RunRequest
 from spherloc_viz.gallery import gallery_cases
@@ -47,6 +48,28 @@ def office(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Office]:
     opened = Office(tmp_path)
     yield opened
     opened.close()
+
+
+def test_a_run_is_recorded_once_and_kept(office: Office) -> None:
+    visitor = office.visit()
+    (first,) = office.files
+    again = office.visit()
+    assert office.files == [first], "another page, or a reload, does the same run"
+    until(lambda: f"Recorded as {first}" in again.session._status._line.content)
+    simulation = again.session._controls.scene._simulation
+    again.set(simulation._outliers, 60.0)
+    until(lambda: len(office.files) == 2)
+    again.set(simulation._outliers, 25.0)
+    until(lambda: f"Recorded as {first}" in again.session._status._line.content)
+    assert len(office.files) == 2, "going back makes no third one"
+    assert f'data-touch="run-keep:{first}"' in again.session._status._line.content
+    visitor.see()
+    until(lambda: f"run-keep:{first}" in visitor.rows)
+    again.touch(f"run-keep:{first}")
+    until(lambda: read_review(office.folder / first).labels == (KEPT,))
+    until(lambda: f"run-keep:{first}" not in visitor.rows and KEPT in visitor.rows)
+    again.touch("run-keep:../gone.rrd")
+    until(lambda: "gone.rrd" in again.panel._status.content)
 
 
 def test_a_run_is_recorded_with_its_origin_and_opened_exactly(office: Office) -> None:
