@@ -424,10 +424,9 @@ def test_what_becomes_of_a_run_is_told_when_it_is_known(tmp_path: Path) -> None:
     class Slow:
         overload = "7 runs wait to be recorded."
 
-        def known(self, trace: object, source: str) -> None:
-            return None
-
-        def submit(self, trace: object, origin: object, diagnosis: object, ended: Callable[..., None]) -> Path:
+        def submit(
+            self, trace: object, origin: object, diagnosis: object, ended: Callable[..., None], known: object
+        ) -> Path:
             self.ended = ended
             return tmp_path / "run.rrd"
 

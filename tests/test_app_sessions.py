@@ -43,15 +43,13 @@ class Notes:
         self.full = False
         self.overload = ""
 
-    def known(self, trace: Trace, source: str) -> None:
-        return None
-
     def submit(
         self,
         trace: Trace,
         origin: Origin | None = None,
         diagnosis: Diagnosis | None = None,
         ended: Ended = lambda error: None,
+        known: object = None,
     ) -> Path:
         if self.full:
             raise RecordingError("run.rrd: the disk is full; make room.")

@@ -36,11 +36,22 @@ class Submitted:
     """A run that was given to the recorder, or was recorded before."""
 
     trace: Trace
-    path: Path
-    """Of its recording, which is there once it is written."""
+    promised: Path
+    """Where its recording will be, unless the very same run is recorded already."""
+    before: Path | None = None
+    """The recording of the very same run, if there is one: a reload, or undo, makes no second one."""
     written: bool = False
     error: RecordingError | None = None
     """Why it could not be written."""
+
+    @property
+    def path(self) -> Path:
+        """Of its recording, which is there once it is written."""
+        return self.before or self.promised
+
+    def known(self, path: Path) -> None:
+        """The very same run is recorded."""
+        self.before = path
 
     def end(self, error: RecordingError | None) -> None:
         """It is written, or not."""
@@ -84,12 +95,9 @@ class PageRuns:
         submitted = self._submitted
         if submitted is None or submitted.trace is not run.trace:
             submitted = Submitted(run.trace, Path())
-            if (path := self._recorded(run.trace)) is not None:
-                self._submitted = Submitted(run.trace, path, written=True)
-                return f"Recorded as {path.name}", None
             origin = self._origin("page", run.request.scene)
             try:
-                submitted.path = self._recorder.submit(run.trace, origin, diagnosis, submitted.end)
+                submitted.promised = self._recorder.submit(run.trace, origin, diagnosis, submitted.end, submitted.known)
             except RecordingError as error:
                 return f"{error} It is tried again.", RETRY_S
             self._submitted = submitted
@@ -99,14 +107,6 @@ class PageRuns:
             return f"Recorded as {submitted.path.name}", None
         waiting = self._recorder.overload
         return f"Recording as {submitted.path.name} …{f' {waiting}' if waiting else ''}", LOOK_S
-
-    def _recorded(self, trace: Trace) -> Path | None:
-        """The recording of the very same run by some page: a reload, or undo, makes no second one."""
-        assert self._recorder is not None
-        try:
-            return self._recorder.known(trace, "page")
-        except RecordingError:  # whoever writes the recording tells of it
-            return None
 
     def keepable(self, trace: Trace) -> str:
         """The file of a run's recording, if pages made it; else empty."""

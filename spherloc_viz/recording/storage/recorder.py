@@ -12,7 +12,7 @@ from spherloc.diagnosis import Diagnosis
 from spherloc.errors import RecordingError
 from spherloc.trace import Trace
 from spherloc_viz.recording.index.run_index import RunIndex
-from spherloc_viz.recording.origin import Origin, Source
+from spherloc_viz.recording.origin import Origin
 from spherloc_viz.recording.storage.room import KEEP_BYTES
 from spherloc_viz.recording.storage.store import RecordingStore, SweepStore
 
@@ -26,7 +26,9 @@ UPKEEP_LIMIT_S = 5.0
 T = TypeVar("T")
 Ended = Callable[[RecordingError | None], None]
 """Is told that a run is written, or why it is not."""
-_Job = tuple[Trace, Path, Origin | None, Diagnosis | None, Ended]
+Known = Callable[[Path], None]
+"""Is told which recording has the very same run."""
+_Job = tuple[Trace, Path, Origin | None, Diagnosis | None, Ended, Known | None]
 
 
 class _StoppedError(Exception):
@@ -90,11 +92,15 @@ class Recorder:
         origin: Origin | None = None,
         diagnosis: Diagnosis | None = None,
         ended: Ended = lambda error: None,
+        known: Known | None = None,
     ) -> Path:
         """Have a run recorded and return the path that its file will have. Never waits.
 
         A run without ``diagnosis`` is diagnosed in the background. ``ended`` is told in a thread of the recorder when
-        the run is written and listed, or why it is not written. Raises ``RecordingError`` if too many runs wait
+        the run is written and listed, or why it is not written. With ``known``, a run whose very same is recorded from
+        the same source is not written once more: ``known`` is told of that recording before ``ended``.
+
+        Raises ``RecordingError`` if too many runs wait
         already, or after ``close``.
         """
         path = self._store.path_of(trace)
@@ -102,17 +108,13 @@ class Recorder:
             if self._closed:
                 raise RecordingError(f"{path.name}: not recorded, since recording has ended.")
             try:
-                self._queue.put_nowait((trace, path, origin, diagnosis, _safe(ended)))
+                self._queue.put_nowait((trace, path, origin, diagnosis, _safe(ended), known))
             except queue.Full:
                 raise RecordingError(
                     f"{path.name}: not recorded, since {QUEUE_LENGTH} runs wait to be recorded."
                 ) from None
             self._waiting += 1
         return path
-
-    def known(self, trace: Trace, source: Source) -> Path | None:
-        """The recording of the very same run, see ``RecordingStore.known``."""
-        return self._store.known(trace, source)
 
     def sweep_store(self) -> SweepStore:
         """What records the runs of a sweep into this folder, in the processes that do them."""
@@ -150,10 +152,20 @@ class Recorder:
                 self._waiting -= 1
 
     def _record(
-        self, trace: Trace, path: Path, origin: Origin | None, diagnosis: Diagnosis | None, ended: Ended
+        self,
+        trace: Trace,
+        path: Path,
+        origin: Origin | None,
+        diagnosis: Diagnosis | None,
+        ended: Ended,
+        known: Known | None,
     ) -> None:
         try:
-            self._store.record(trace, origin, diagnosis, path)
+            before = None if known is None or origin is None else self._store.known(trace, origin.source)
+            if known is not None and before is not None:
+                known(before)
+            else:
+                self._store.record(trace, origin, diagnosis, path)
         except RecordingError as error:
             self._lose(error, ended)
         except Exception as error:  # a bug in drawing one run must not end the recording of the others
