@@ -187,14 +187,19 @@ class Canvas:
             self._follow_step(picture, other_step)
 
     def _follow_step(self, picture: Picture, other_step: bool) -> None:
-        """Go to the step's view unless the viewer is there, or, at the same step, sees its subject well enough."""
+        """Go to the step's view unless the viewer is there; at the same step, keep the view and fit it if it must be.
+
+        A view that was asked for by name stays that view however often the same step is drawn.
+        """
         aspect = self._aspect()
         if other_step:
             view = views.follow(picture, aspect, self._walls)
             if self._followed is None or not views.same(view, self._followed):
                 self._take(None, view, aspect)
-        elif self._looked is not None and not views.shows(self._looked[1], picture.focus.points, aspect):
-            self._look(None, picture)
+        elif self._looked is not None:
+            name = self._looked[0] if self._looked[0] in views.NAMES else None
+            if not views.fits(name, self._looked[1], picture, aspect):
+                self._look(name, picture)
 
     def _look_again(self, view: views.View) -> None:
         """Take a view that is held, also after a page that was still building itself has dropped it."""

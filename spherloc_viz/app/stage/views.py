@@ -108,6 +108,13 @@ def shows(view: View, subject: FloatArray, aspect: float) -> bool:
     return inside and float(np.max(np.ptp(seen, axis=0))) / 2 >= LEAST_SHARE
 
 
+def fits(name: str | None, view: View, picture: Picture, aspect: float) -> bool:
+    """Whether a view of that name, or the step's view for None, still shows what it is for."""
+    if name is None:
+        return shows(view, picture.focus.points, aspect)
+    return same(view, _inside(picture)) if name == INSIDE else shows(view, _subject(name, picture), aspect)
+
+
 def projected(view: View, positions: FloatArray) -> FloatArray:
     """Where positions (K, 3) are seen (K, 2), right and up, as slopes; infinite behind the viewer."""
     backward, sideways = _axes(view.position - view.target)
