@@ -24,7 +24,7 @@ from spherloc_viz.given_files import is_recording
 from spherloc_viz.options import json_text, option_fields
 from spherloc_viz.progress import prepare, say, solve
 from spherloc_viz.recording.origin import Origin
-from spherloc_viz.recording.storage.room import KEEP_GIGABYTES, kept_bytes
+from spherloc_viz.recording.storage.room import kept_bytes
 
 if TYPE_CHECKING:
     from spherloc_viz.recording.storage.store import RecordingStore
@@ -38,8 +38,8 @@ class Records:
     """Of the recordings."""
     full: bool = False
     """Whether every arc and edge is kept."""
-    keep_gigabytes: float = KEEP_GIGABYTES
-    """Size beyond which old successes are deleted."""
+    keep_gigabytes: float | None = None
+    """Size beyond which old successes are deleted; None for the usual, or what is there if that is more."""
 
 
 def run_scenes(
@@ -124,7 +124,7 @@ def store_of(records: Records | None) -> "Iterator[RecordingStore | None]":
     if records is None:
         yield None
         return
-    keep_bytes = kept_bytes(records.keep_gigabytes)
+    keep_bytes = kept_bytes(records.keep_gigabytes, records.folder)
     # Only now, since it takes most of a second.
     from spherloc_viz.recording.storage.store import RecordingStore
 

@@ -16,7 +16,6 @@ from tyro.extras import SubcommandApp
 from spherloc.errors import InputError, SpherlocError, reason, show
 from spherloc_viz import given_files, recording_commands, triage_commands
 from spherloc_viz.arguments import OptionalFloat, OptionalNumber, OptionalPath, OptionalText, refuse_repeated
-from spherloc_viz.recording.storage.room import KEEP_GIGABYTES
 
 RECORDINGS = Path("recordings")
 Settings = Annotated[tyro.conf.UseAppendAction[tuple[tuple[str, ...], ...]], arg(metavar="KEY=VALUE ...")]
@@ -44,7 +43,7 @@ def run(
     record: bool = True,
     full: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
     recordings: Path = RECORDINGS,
-    keep_gigabytes: float = KEEP_GIGABYTES,
+    keep_gigabytes: OptionalFloat = None,
     query: OptionalText = None,
     proof: OptionalPath = None,
 ) -> int:
@@ -79,7 +78,8 @@ def run(
         record: Write a recording of each run.
         full: Keep every step, arc and edge in the recordings, which makes them larger.
         recordings: Folder of the recordings.
-        keep_gigabytes: What the recordings may take; beyond it the oldest successes that nobody labelled are deleted.
+        keep_gigabytes: What the recordings may take (2, or what is there if that is more); beyond it the oldest
+            successes that nobody labelled are deleted.
         query: Name of the query image, in scenes made of images; the first one if not given.
         proof: File (.npz) for the proof of what mc-exact says that no pose can explain; of one scene. Anyone can check
             it: python -m spherloc.proof_check FILE, which needs numpy only.
@@ -108,7 +108,7 @@ def localize(
     output: OptionalPath = None,
     record: bool = True,
     recordings: OptionalPath = None,
-    keep_gigabytes: float = KEEP_GIGABYTES,
+    keep_gigabytes: OptionalFloat = None,
     retry_failed: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
 ) -> int:
     """Localize a sequence of query images against a map, or compare estimators on several.
@@ -141,7 +141,8 @@ def localize(
         output: Folder of the results; recordings/SCENE_ESTIMATOR_SEED if not given, or recordings/comparison_SEED.
         record: Write a recording of each query.
         recordings: Folder of the recordings; a folder of that name in the output folder if not given.
-        keep_gigabytes: What the recordings may take; beyond it the oldest successes that nobody labelled are deleted.
+        keep_gigabytes: What the recordings may take (2, or what is there if that is more); beyond it the oldest
+            successes that nobody labelled are deleted.
         retry_failed: Do queries again that have no pose yet.
     """
     from spherloc.datasets.scene_file import check_there, scene_path
@@ -192,7 +193,7 @@ def sweep(
     out: OptionalPath = None,
     record: bool = True,
     recordings: Path = RECORDINGS,
-    keep_gigabytes: float = KEEP_GIGABYTES,
+    keep_gigabytes: OptionalFloat = None,
 ) -> int:
     """Compare estimators over the outlier rate, noise, number of correspondences or gravity error of a simulation.
 
@@ -230,7 +231,8 @@ def sweep(
         record: Write a recording of each run, which takes several times as long as many a run; of a cluster's workers
             those on this machine do.
         recordings: Folder of the recordings.
-        keep_gigabytes: What the recordings may take; beyond it the oldest successes that nobody labelled are deleted.
+        keep_gigabytes: What the recordings may take (2, or what is there if that is more); beyond it the oldest
+            successes that nobody labelled are deleted.
     """
     from spherloc.datasets.scene_file import check_there, scene_path
 
@@ -265,7 +267,7 @@ def play(
     port: int = 8080,
     record: bool = True,
     recordings: Path = RECORDINGS,
-    keep_gigabytes: float = KEEP_GIGABYTES,
+    keep_gigabytes: OptionalFloat = None,
     allow: tyro.conf.UseAppendAction[tuple[Path, ...]] = (),
     token: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
 ) -> int:
@@ -291,7 +293,8 @@ def play(
         port: Port to listen on; 0 takes a free one.
         record: Write a recording of each run that is settled on.
         recordings: Folder of the recordings.
-        keep_gigabytes: What the recordings may take; beyond it the oldest successes that nobody labelled are deleted.
+        keep_gigabytes: What the recordings may take (2, or what is there if that is more); beyond it the oldest
+            successes that nobody labelled are deleted.
         allow: Another folder that pages may open scenes from; give it once for each.
         token: Demand a token on this machine too, where others have accounts on it.
     """

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from spherloc.datasets import load_scene
 from spherloc.datasets.map_scene import MapScene
+from spherloc.datasets.match_table import MatchTable
 from spherloc.datasets.variation import used_seed
 from spherloc.diagnosis import Diagnosis, diagnose
 from spherloc.errors import InputError, SpherlocError, show
@@ -28,13 +29,13 @@ ESTIMATOR = "given-pose"
 
 def diagnose_poses(
     poses: Path,
-    scenes: Sequence[Path],
+    scenes: Sequence[Path | MatchTable],
     bound_px: float | None,
     label: str | None,
     as_json: bool,
     records: Records | None,
 ) -> int:
-    """Diagnose every pose whose image is a query of one of the scenes; returns the exit code.
+    """Diagnose every pose whose image is a query of one of the scenes or tables; returns the exit code.
 
     0 if all are localized, 1 if one is doubtful, 2 if something had to be left out. Raises ``InputError`` if no pose
     has a query.
@@ -44,17 +45,16 @@ def diagnose_poses(
         raise InputError(f"{poses}: has no pose.")
     code, used = 0, set[str]()
     with store_of(records) as store:
-        for path in scenes:
-            for name, problem, query in _problems(path, given):
+        for scene in scenes:
+            for name, problem, origin in _problems(scene, given):
                 if isinstance(problem, SpherlocError):
-                    say(f"{path}, {name}: {problem} It is left out.")
+                    say(f"{name}: {problem} It is left out.")
                     code = 2
                     continue
                 used.add(name)
                 trace = _run(problem, given[name], bound_px)
                 diagnosis, recording = diagnose(trace), None
                 if store is not None:
-                    origin = Origin("command", str(path.resolve()), used_seed(load_scene(path), None), query)
                     recording = store.record(trace, origin, diagnosis)
                     if label:
                         store.index.set_review(recording.name, [label], "")
@@ -63,22 +63,29 @@ def diagnose_poses(
     if not used and code == 0:
         some = ", ".join(list(given)[:3])
         raise InputError(
-            f"{poses}: no image of a pose is a query of these scenes; its images are such as {show(some)}."
+            f"{poses}: no image of a pose is a query of these scenes or matches; its images are such as {show(some)}."
         )
     if left := [name for name in given if name not in used]:
         say(f"{len(left):,} of {len(given):,} poses have no query in these scenes, such as {show(left[0])}.")
     return code
 
 
-def _problems(path: Path, given: Mapping[str, FloatArray]) -> Iterator[tuple[str, Problem | SpherlocError, str | None]]:
-    """The name of the pose, the problem, and the name of the query, of each query of a scene that has a pose."""
+def _problems(
+    path: Path | MatchTable, given: Mapping[str, FloatArray]
+) -> Iterator[tuple[str, Problem | SpherlocError, Origin]]:
+    """The name of the pose, the problem, and where it is from, of each query that has a pose."""
+    if isinstance(path, MatchTable):
+        for name, one in path.problems(given):
+            yield name, one, Origin("command")
+        return
     scene = load_scene(path)
+    origin = Origin("command", str(path.resolve()), used_seed(scene, None))
     if not isinstance(scene, MapScene):
         problem = scene.problem(None)
         image = None if problem.image is None else problem.image.name
         name = next((name for name in (problem.name, image, path.stem) if name in given), None)
         if name is not None:
-            yield name, problem, None
+            yield name, problem, origin
         return
     views = [view for view in scene.queries if view.name in given]
     if views:
@@ -89,7 +96,7 @@ def _problems(path: Path, given: Mapping[str, FloatArray]) -> Iterator[tuple[str
                 problem: Problem | SpherlocError = scene.problem(None, view.name)
             except SpherlocError as error:
                 problem = error
-            yield view.name, problem, view.name
+            yield view.name, problem, replace(origin, query=view.name)
             advance("")
 
 

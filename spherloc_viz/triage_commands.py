@@ -10,7 +10,6 @@ from tyro.conf import Positional, arg
 
 from spherloc_viz.arguments import OptionalFloat, OptionalNumber, OptionalPath, OptionalText
 from spherloc_viz.given_files import check_recording_file, check_recordings_folder, is_recording
-from spherloc_viz.recording.storage.room import KEEP_GIGABYTES
 
 RECORDINGS = Path("recordings")
 Settings = Annotated[tyro.conf.UseAppendAction[tuple[tuple[str, ...], ...]], arg(metavar="KEY=VALUE ...")]
@@ -67,7 +66,7 @@ def rerun(
     failed: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
     label: OptionalText = None,
     out: OptionalPath = None,
-    keep_gigabytes: float = KEEP_GIGABYTES,
+    keep_gigabytes: OptionalFloat = None,
     fail_if: Conditions = (),
     report: OptionalPath = None,
     json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
@@ -93,7 +92,8 @@ def rerun(
         failed: Only runs that are known to have failed.
         label: Only runs with this label.
         out: Folder for the new recordings; recordings/rerun_TIME if not given.
-        keep_gigabytes: What the new recordings may take; beyond it the oldest successes are deleted.
+        keep_gigabytes: What the new recordings may take (2, or what is there if that is more); beyond it the oldest
+            successes are deleted.
         fail_if: What must not be, as for spherloc compare; give it once for each.
         report: An HTML file to write, with pictures of what broke and what was mended.
         json: Print one JSON object instead.
@@ -135,14 +135,18 @@ def _check_place(place: Path) -> None:
 
 def diagnose(
     poses: Positional[Path],
-    scenes: Positional[tuple[Path, ...]],
+    scenes: Positional[tuple[Path, ...]] = (),
     /,
+    matches: OptionalPath = None,
+    camera: OptionalPath = None,
+    gravity: OptionalPath = None,
+    map_down: tuple[float, float, float] = (0.0, 0.0, -1.0),
     bound_px: OptionalFloat = None,
     label: OptionalText = None,
     json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
     record: bool = True,
     recordings: Path = RECORDINGS,
-    keep_gigabytes: float = KEEP_GIGABYTES,
+    keep_gigabytes: OptionalFloat = None,
 ) -> int:
     """Record and diagnose poses that another program found, such as hloc or COLMAP.
 
@@ -157,27 +161,38 @@ def diagnose(
 
     spherloc diagnose poses.csv queries/*.toml --bound-px 4 --json
 
+    spherloc diagnose poses.csv --matches matches.csv --camera camera.yaml --gravity gravity.txt
+
     spherloc rerun recordings --label hloc --estimator mc-exact
 
     Args:
         poses: A CSV with the columns name, qw, qx, qy, qz, tx, ty, tz; hloc's results (lines of the same); or the
             folder of a COLMAP model.
         scenes: Scene files whose queries they are: of a map with images (hloc, COLMAP and others), or matches in a CSV
-            (kind "correspondences"), named by the problem, its image or the file.
+            (kind "correspondences"), named by the problem, its image or the file. None with --matches.
+        matches: The matches of all queries instead of scenes: a CSV with the columns name, u, v (px), X, Y, Z, and
+            inlier (0 or 1) where that is known.
+        camera: The calibration file of these queries.
+        gravity: Where down is in these queries: rows of "image gx gy gz [sd_deg]". Without it the given poses say so,
+            to within 5 degrees.
+        map_down: With --matches, the vector that points down in the map.
         bound_px: Bound on the noise of an inlier, px; the scene's, or 3, if not given.
         label: A label for all of these runs.
         json: Print one JSON object a pose, on one line; infinity is the text "inf".
         record: Write a recording of each.
         recordings: Folder of the recordings.
-        keep_gigabytes: What the recordings may take; beyond it the oldest successes that nobody labelled are deleted.
+        keep_gigabytes: What the recordings may take (2, or what is there if that is more); beyond it the oldest
+            successes that nobody labelled are deleted.
     """
     from spherloc.datasets.scene_file import check_there, scene_path
     from spherloc.errors import InputError
 
     if not poses.exists():
         raise InputError(f"{poses}: no such file; give a file of poses, or the folder of a COLMAP model.")
-    if not scenes:
-        raise InputError("no scene given; name the scene files whose queries the poses are of.")
+    if not scenes and matches is None:
+        raise InputError("no scene given; name the scene files whose queries the poses are of, or give --matches.")
+    if (matches is None) != (camera is None) or (matches is None and gravity is not None):
+        raise InputError("--matches, the matches of all queries, needs --camera, and these go with --matches only.")
     files = [scene_path(scene) for scene in scenes]
     for file in files:
         check_there(file)
@@ -189,4 +204,9 @@ def diagnose(
     from spherloc_viz.given_poses import diagnose_poses
 
     kept = Records(recordings, keep_gigabytes=keep_gigabytes) if record else None
-    return diagnose_poses(poses, files, bound_px, label, json, kept)
+    tables = []
+    if matches is not None and camera is not None:
+        from spherloc.datasets.match_table import read_match_table
+
+        tables = [read_match_table(matches, camera, gravity, map_down)]
+    return diagnose_poses(poses, [*files, *tables], bound_px, label, json, kept)

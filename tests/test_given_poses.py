@@ -5,16 +5,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cli_process import spherloc
 from recording_samples import scene_problem
 
 from spherloc import registry
 from spherloc.datasets import bundled_scenes
+from spherloc.datasets.match_table import read_match_table
 from spherloc.errors import InputError
 from spherloc.estimators import estimate, options_type
 from spherloc.formats.pose_files import read_poses
 from spherloc.geometry import so3_exp
+from spherloc.problem import Problem
 from spherloc.trajectory import wxyz_from_rotation
 from spherloc.types import FloatArray
+from spherloc_viz import triage_commands
 from spherloc_viz.batch import Records
 from spherloc_viz.given_poses import diagnose_poses
 from spherloc_viz.options import usable_estimators
@@ -115,3 +119,86 @@ def test_poses_become_runs_with_a_diagnosis(tmp_path: Path, capsys: pytest.Captu
     poses.write_text(head + words("nobody", true_pose(), ","))
     with pytest.raises(InputError, match="no image of a pose is a query"):
         diagnose_poses(poses, [bundled_scenes()[NAME]], None, None, False, None)
+
+
+def matches_of(name: str, extra: str = "") -> list[str]:
+    problem = scene_problem(NAME)
+    rows = np.hstack([problem.pixels, problem.points])
+    return [",".join([name, *(repr(float(x)) for x in row)]) + extra for row in rows]
+
+
+def table_files(folder: Path, *rows: str) -> tuple[Path, Path, Path]:
+    """A CSV of matches, a calibration, and a gravity file of the queries a.jpg and b.jpg."""
+    matches, camera, gravity = folder / "matches.csv", folder / "camera.toml", folder / "gravity.txt"
+    matches.write_text("name,u,v,X,Y,Z\n" + "\n".join(rows) + "\n")
+    scene = bundled_scenes()[NAME].read_text()
+    camera.write_text("[camera]\n" + scene.partition("[camera]\n")[2].partition("\n[")[0])
+    down = scene_problem(NAME).gravity_camera
+    gravity.write_text("\n".join(f"{name} {down[0]} {down[1]} {down[2]} 0" for name in ("a.jpg", "b.jpg")) + "\n")
+    return matches, camera, gravity
+
+
+def test_matches_of_all_queries_come_in_one_table(tmp_path: Path) -> None:
+    # The queries' rows need not be together.
+    mixed = [row for pair in zip(matches_of("b.jpg"), matches_of("a.jpg"), strict=True) for row in pair]
+    matches, camera, gravity = table_files(tmp_path, *mixed)
+    problem = scene_problem(NAME)
+    down = tuple(2.0 * float(x) for x in problem.gravity_map)  # of any length
+    table = read_match_table(matches, camera, gravity, down)
+    poses = {"a.jpg": true_pose(), "c.jpg": true_pose()}
+    ((name, read),) = table.problems(poses)
+    assert name == "a.jpg" and isinstance(read, Problem) and read.name == "a.jpg"
+    np.testing.assert_array_equal(read.pixels, problem.pixels)
+    np.testing.assert_array_equal(read.points, problem.points)
+    np.testing.assert_allclose(read.gravity_map, problem.gravity_map, atol=1e-12)
+    np.testing.assert_allclose(read.gravity_camera, problem.gravity_camera, atol=1e-12)
+    assert read.gravity_bound_rad == 0.0 and list(table.matches) == ["b.jpg", "a.jpg"]
+    # Without a gravity file the poses tell it.
+    ((_, read),) = read_match_table(matches, camera, None, down).problems(poses)
+    assert isinstance(read, Problem) and read.gravity_source == "the given pose"
+    np.testing.assert_allclose(read.gravity_camera, true_pose()[:, :3] @ problem.gravity_map, atol=1e-12)
+    assert np.degrees(read.gravity_bound_rad) == pytest.approx(5.0)
+
+
+def test_poses_with_a_table_of_matches_are_diagnosed(tmp_path: Path) -> None:
+    matches, camera, gravity = table_files(tmp_path, *matches_of("a.jpg"), *matches_of("b.jpg"), "c.jpg,1,2,3,4,5")
+    rows = (words("a.jpg", true_pose(), ","), words("b.jpg", wrong_pose(), ","), words("c.jpg", true_pose(), ","))
+    (tmp_path / "poses.csv").write_text("name,qw,qx,qy,qz,tx,ty,tz\n" + "".join(rows))
+    down = [repr(float(x)) for x in scene_problem(NAME).gravity_map]
+    files = ["--matches", matches, "--camera", camera, "--gravity", gravity, "--recordings", "runs"]
+    done = spherloc("diagnose", "poses.csv", *files, "--map-down", *down, cwd=tmp_path)
+    assert done.returncode == 2 and "c.jpg: has no row in the gravity file" in done.stderr
+    assert "a.jpg: " in done.stdout and "b.jpg: " in done.stdout and "search missed the best pose" in done.stdout
+    recorded = [path for path in (tmp_path / "runs").glob("*.rrd") if ".review." not in path.name]
+    assert len(recorded) == 2 and all(repeat(path).same for path in recorded)
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ("u,v,X,Y,Z\n1,2,3,4,5\n", "column 'name' is missing"),
+        ("name,name,u,v,X,Y,Z\n", "column 'name' is given twice"),
+        ("name,u,v,X,Y,Z\na,1,2,3,4\n", "line 2: 5 values under 6 columns"),
+        ("name,u,v,X,Y,Z\na,1,2,3,4,nan\n", "line 2: Z is nan"),
+    ],
+)
+def test_wrong_tables_of_matches(content: str, said: str, tmp_path: Path) -> None:
+    matches, camera, _ = table_files(tmp_path)
+    matches.write_text(content)
+    with pytest.raises(InputError, match=said):
+        read_match_table(matches, camera, None, (0.0, 0.0, -1.0))
+
+
+def test_arguments_that_do_not_go_together(tmp_path: Path) -> None:
+    matches, camera, gravity = table_files(tmp_path, *matches_of("a.jpg"))
+    poses = tmp_path / "poses.csv"
+    poses.write_text("name,qw,qx,qy,qz,tx,ty,tz\n" + words("a.jpg", true_pose(), ","))
+    for given, said in (
+        ({}, "no scene given"),
+        ({"matches": matches}, "needs --camera"),
+        ({"gravity": gravity, "scene": bundled_scenes()[NAME]}, "go with --matches only"),
+        ({"matches": matches, "camera": camera, "map_down": (0.0, 0.0, 0.0)}, "has the length 0"),
+    ):
+        scenes = (given.pop("scene"),) if "scene" in given else ()
+        with pytest.raises(InputError, match=said):
+            triage_commands.diagnose(poses, scenes, record=False, **given)

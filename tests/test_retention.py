@@ -140,12 +140,18 @@ def test_many_at_once_delete_no_more_than_one_alone(tmp_path: Path) -> None:
         assert set(gone) <= {cells[1] for cells in log_of(tmp_path)}
 
 
-def test_sizes_to_be_kept() -> None:
-    assert kept_bytes(2.0) == KEEP_BYTES == 2 * 10**9 and kept_bytes(0.5) == 5 * 10**8
-    assert kept_bytes(math.inf) > 10**18 and kept_bytes(1e300) > 10**18
+def test_sizes_to_be_kept(tmp_path: Path) -> None:
+    assert kept_bytes(2.0, tmp_path) == KEEP_BYTES == 2 * 10**9 and kept_bytes(0.5, tmp_path) == 5 * 10**8
+    assert kept_bytes(math.inf, tmp_path) > 10**18 and kept_bytes(1e300, tmp_path) > 10**18
+    # To open a folder that was given more room deletes nothing, unless a size is said.
+    assert kept_bytes(None, tmp_path / "missing") == kept_bytes(None, tmp_path) == KEEP_BYTES
+    for name, size in (("a.rrd", 2 * 10**9), ("b.RRD", 10**9), ("video.mp4", 10**9)):
+        with (tmp_path / name).open("wb") as file:
+            file.truncate(size)  # takes no room
+    assert kept_bytes(None, tmp_path) == 3 * 10**9 and kept_bytes(2.0, tmp_path) == KEEP_BYTES
     for wrong in (0.0, -1.0, math.nan, -math.inf):
         with pytest.raises(InputError, match="give a positive number, or inf to keep all"):
-            kept_bytes(wrong)
+            kept_bytes(wrong, tmp_path)
 
 
 @needs("no superuser")

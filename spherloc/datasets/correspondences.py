@@ -126,21 +126,43 @@ def read_csv(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     """
     with reading(path, "correct the key 'correspondences'"):
         content = read_file(path, MAX_CSV_BYTES)
+    rows, inliers, _ = _table(content, path, COLUMNS)
+    return rows, inliers
+
+
+def read_csv_of_queries(path: Path) -> dict[str, tuple[np.ndarray, np.ndarray | None]]:
+    """Rows and mask, as ``read_csv`` tells them, of each query by its name, the column ``name``."""
+    with reading(path, "give a CSV of matches"):
+        content = read_file(path, MAX_CSV_BYTES)
+    rows, inliers, names = _table(content, path, ("name", *COLUMNS))
+    unique, first, index = np.unique(np.array(names, dtype=object), return_index=True, return_inverse=True)
+    masks = [index == number for number in np.argsort(first)]
+    return {
+        str(unique[number]): (rows[mask], None if inliers is None else inliers[mask])
+        for number, mask in zip(np.argsort(first), masks, strict=True)
+    }
+
+
+def _table(content: bytes, path: Path, required: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray | None, list[str]]:
+    """Rows (N, 5), mask (N,) or None, and names (N,), which are empty if no column ``name`` is required."""
     try:
-        return _parse(csv.reader(io.TextIOWrapper(io.BytesIO(content), encoding="utf-8-sig", newline="")), path)
+        return _parse(
+            csv.reader(io.TextIOWrapper(io.BytesIO(content), encoding="utf-8-sig", newline="")), path, required
+        )
     except (csv.Error, ValueError) as error:
         raise InputError(f"{path}: not a CSV text file in UTF-8 ({reason(error)}); correct or replace it.") from None
 
 
-def _parse(reader: Any, path: Path) -> tuple[np.ndarray, np.ndarray | None]:
+def _parse(reader: Any, path: Path, required: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray | None, list[str]]:
     header = [name.strip() for name in next(reader, [])]
-    for name in (*COLUMNS, "inlier"):
-        if header.count(name) > 1 or (name in COLUMNS and name not in header):
+    for name in (*required, "inlier"):
+        if header.count(name) > 1 or (name in required and name not in header):
             what = "missing" if name not in header else "given twice"
-            raise InputError(f"{path}: column '{name}' is {what}; the first line must name {', '.join(COLUMNS)}.")
+            raise InputError(f"{path}: column '{name}' is {what}; the first line must name {', '.join(required)}.")
     wanted = [header.index(name) for name in COLUMNS]
+    name_at = header.index("name") if "name" in required else None
     label_at = header.index("inlier") if "inlier" in header else None
-    rows, labels = [], []
+    rows, labels, names = [], [], list[str]()
     for line in reader:
         if not line:
             continue
@@ -150,8 +172,10 @@ def _parse(reader: Any, path: Path) -> tuple[np.ndarray, np.ndarray | None]:
         rows.append([_number(line[at], header[at], place) for at in wanted])
         if label_at is not None:
             labels.append(_label(line[label_at], place))
+        if name_at is not None:
+            names.append(line[name_at].strip())
     array = np.array(rows, dtype=np.float64).reshape(-1, 5)
-    return array, np.array(labels, dtype=bool) if label_at is not None else None
+    return array, np.array(labels, dtype=bool) if label_at is not None else None, names
 
 
 def _number(value: str, column: str, place: str) -> float:

@@ -40,7 +40,7 @@ from spherloc_viz.recording.index.run_index import RunIndex
 from spherloc_viz.recording.replay import RecordedScene, recorded_options
 from spherloc_viz.recording.sandbox.examiner import end_examining
 from spherloc_viz.recording.storage.recorder import Recorder
-from spherloc_viz.recording.storage.room import KEEP_GIGABYTES, kept_bytes
+from spherloc_viz.recording.storage.room import kept_bytes
 
 SWITCH_S = 0.001
 NOT_ENCRYPTED = (
@@ -58,7 +58,7 @@ def serve(
     recordings: Path,
     record: bool = True,
     allow: Sequence[Path] = (),
-    keep_gigabytes: float = KEEP_GIGABYTES,
+    keep_gigabytes: float | None = None,
     token: bool = False,
     framed: bool = False,
     on_address: Callable[[str], None] | None = None,
@@ -69,13 +69,13 @@ def serve(
     Port 0 takes any free port. ``on_address`` is called with the address as soon as browsers can be sent there, where
     they wait until all is ready; ``framed`` lets other pages of this machine, such as a notebook's, show the page in a
     frame. Runs that a page settles on are recorded into ``recordings`` unless ``record`` is false; beyond
-    ``keep_gigabytes`` the oldest successes are deleted. Pages may open scenes from the folder of ``scene`` if it is a
-    scene file, from that of the bundled ones and from ``allow``. A token is
+    ``keep_gigabytes`` (2, or what is there if that is more) the oldest successes are deleted. Pages may open scenes
+    from the folder of ``scene`` if it is a scene file, from that of the bundled ones and from ``allow``. A token is
     demanded if ``token`` says so, and always where the address is not this machine's alone.
     Raises ``InputError`` if the scene, one of these folders or the size cannot be used or the port cannot
     be had, and ``RecordingError`` for a recording that cannot be opened.
     """
-    catalog, keep_bytes = Catalog(scene), kept_bytes(keep_gigabytes)
+    catalog, keep_bytes = Catalog(scene), kept_bytes(keep_gigabytes, recordings)
     first = _first_run(catalog)
     with open_socket(host, port) as listener, contextlib.ExitStack() as stack:
         if on_address is not None:

@@ -1,21 +1,41 @@
 """How much room recordings may take."""
 
+import contextlib
 import math
+import os
 import sys
+from pathlib import Path
 
 from spherloc.errors import InputError
 
 GIGABYTE = 1_000_000_000
 KEEP_GIGABYTES = 2.0
-"""Size of the recordings beyond which old successes are deleted, if nobody says otherwise."""
+"""Size of the recordings beyond which old successes are deleted, if nobody says otherwise and no more are there."""
 KEEP_BYTES = int(KEEP_GIGABYTES * GIGABYTE)
 
 
-def kept_bytes(gigabytes: float) -> int:
-    """The size that recordings may have, in bytes; infinity keeps all. Raises ``InputError`` for what is no size."""
+def kept_bytes(gigabytes: float | None, folder: Path) -> int:
+    """The size that the recordings in ``folder`` may have, in bytes; infinity keeps all.
+
+    If nobody says a size, a folder that holds more than usual already keeps that much: a sweep with a larger limit made
+    it, and to open it must not delete anything. Raises ``InputError`` for what is no size.
+    """
+    if gigabytes is None:
+        return max(KEEP_BYTES, _held_bytes(folder))
     if math.isnan(gigabytes) or gigabytes <= 0:
         raise InputError(f"{gigabytes:g} gigabytes cannot be kept; give a positive number, or inf to keep all.")
     return sys.maxsize if gigabytes >= sys.maxsize / GIGABYTE else int(gigabytes * GIGABYTE)
+
+
+def _held_bytes(folder: Path) -> int:
+    """Size of the recordings in a folder; 0 if it cannot be read, of which whoever writes there tells."""
+    held = 0
+    with contextlib.suppress(OSError), os.scandir(folder) as entries:
+        for entry in entries:
+            if entry.name.lower().endswith(".rrd"):
+                with contextlib.suppress(OSError):  # deleted meanwhile
+                    held += entry.stat().st_size
+    return held
 
 
 def size_words(count: int) -> str:

@@ -1,0 +1,83 @@
+"""Matches of many queries in one CSV, with one camera, as another pipeline writes them beside its poses."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from spherloc.cameras.base import Camera
+from spherloc.cameras.calibration import load_camera
+from spherloc.datasets.correspondences import read_csv_of_queries
+from spherloc.datasets.query_gravity import read_gravity_file
+from spherloc.errors import InputError, ProblemError
+from spherloc.frontend.view import Gravity
+from spherloc.problem import Problem
+from spherloc.types import BoolArray, FloatArray
+
+POSE_BOUND_RAD = float(np.radians(5.0))
+"""Bound on a gravity that follows from a pose which may be wrong."""
+STATED_BOUND_RAD = float(np.radians(3.0))
+"""Bound on a stated gravity without a standard deviation."""
+
+
+@dataclass(frozen=True, eq=False)
+class MatchTable:
+    """What a CSV of matches, a calibration file and, if there is one, a gravity file say."""
+
+    path: Path
+    """The CSV."""
+    matches: Mapping[str, tuple[FloatArray, BoolArray | None]]
+    """Rows u, v (px), X, Y, Z (N, 5) and the mask of right ones (N,), if it is known, by the name of the query."""
+    camera: Camera
+    """Of all queries."""
+    gravity: Mapping[str, Gravity] | None
+    """By the name of the query; None takes it from the poses."""
+    gravity_map: FloatArray
+    """Unit vector (3,) pointing down in the map."""
+
+    def problems(self, poses: Mapping[str, FloatArray]) -> Iterator[tuple[str, Problem | InputError]]:
+        """The problem, or what is wrong, of each query that has one of these poses ``cam_from_map`` (3, 4)."""
+        for name, (rows, inliers) in self.matches.items():
+            if name not in poses:
+                continue
+            try:
+                yield name, self._problem(name, rows, inliers, poses[name])
+            except (InputError, ProblemError) as error:
+                yield name, InputError(f"{self.path}: {error}")
+
+    def _problem(self, name: str, rows: FloatArray, inliers: BoolArray | None, pose: FloatArray) -> Problem:
+        if self.gravity is None:
+            down = pose[:, :3] @ self.gravity_map
+            gravity = Gravity(down / np.linalg.norm(down), "the given pose", POSE_BOUND_RAD)
+        elif name in self.gravity:
+            gravity = self.gravity[name]
+        else:
+            raise InputError(f"{name}: has no row in the gravity file; add one.")
+        return Problem(
+            name=name,
+            camera=self.camera,
+            pixels=rows[:, :2],
+            points=rows[:, 2:],
+            gravity_camera=gravity.down,
+            gravity_map=self.gravity_map,
+            gravity_bound_rad=STATED_BOUND_RAD if gravity.bound_rad is None else gravity.bound_rad,
+            gravity_sd_rad=gravity.sd_rad,
+            gravity_source=gravity.source,
+            truth_inliers=inliers,
+            scene=str(self.path),
+        )
+
+
+def read_match_table(path: Path, camera: Path, gravity: Path | None, gravity_map: tuple[float, ...]) -> MatchTable:
+    """Read a CSV of matches with the columns name, u, v (px), X, Y, Z, a calibration and, if given, a gravity file.
+
+    ``gravity_map`` (3,) points down in the map and may have any length. Raises ``InputError`` or ``CalibrationError``
+    for what cannot be read.
+    """
+    down = np.array(gravity_map, dtype=np.float64)
+    length = float(np.linalg.norm(down))
+    if not 1e-3 < length < 1e6:
+        raise InputError(f"the map's gravity has the length {length:.3g}; give a vector that points down.")
+    stated = None if gravity is None else read_gravity_file(gravity)
+    return MatchTable(path, read_csv_of_queries(path), load_camera(camera), stated, down / length)
