@@ -42,7 +42,13 @@ CASES = (
     "gravity-off",
 )
 """Of the gallery: what there is to be reviewed."""
+NIGHT = (
+    *("sweep", "all", "--estimator", "mc", "--estimator", "ransac-2p", "--estimator", "ransac-p3p"),
+    *("--values", "0.5", "0.8", "0.9", "0.95", "--runs", "12"),
+)
+"""What makes the runs on the triage desk."""
 DOCS = {
+    "desk": "desk_dark_1920x1080",
     "recordings": "recordings_dark_1280x720",
     "playground": "arcs_dark_1280x720",
     "selection": "selection_dark_1280x720",
@@ -202,6 +208,21 @@ def take(page: Page, address: str, dark: bool) -> None:
         page.get_by_text("Dark", exact=True).click()
 
 
+def take_desk(page: Page, address: str, dark: bool) -> None:
+    """Open the triage desk, which follows the theme of the system."""
+    page.emulate_media(color_scheme="dark" if dark else "light")
+    page.goto(f"{address.rstrip('/')}/desk")
+    page.locator("body[data-state=open]").wait_for()
+
+
+def desk(page: Page) -> None:
+    """The failures, and one of them with its evidence."""
+    page.locator("#chips [data-filter=outcome] button", has_text="failure").click()
+    page.wait_for_timeout(500)
+    page.keyboard.press("ArrowDown")
+    page.keyboard.press("ArrowDown")
+
+
 def still(page: Page) -> bytes:
     """The picture of the page once it stays the same for three photographs."""
     last, same, end = b"", 0, time.monotonic() + STILL_S
@@ -220,22 +241,30 @@ def main() -> None:
     FOLDER.mkdir(parents=True, exist_ok=True)
     expect.set_options(timeout=PATIENCE_MS)
     with sync_playwright() as playwright, tempfile.TemporaryDirectory() as folder:
-        recordings = Path(folder)
-        subprocess.run([PROGRAM, "gallery", *CASES, "--output", str(recordings / "gallery")], cwd=ROOT, check=True)
-        for scene, views in SCENES:
+        cases, runs = Path(folder) / "cases", Path(folder) / "runs"
+        for scene, views, recordings, made_by, opened in (
+            *(
+                (scene, views, cases, ("gallery", *CASES, "--output", str(cases / "gallery")), take)
+                for scene, views in SCENES
+            ),
+            (SYNTHETIC, {"desk": desk}, runs, (*NIGHT, "--recordings", str(runs)), take_desk),
+        ):
             rounds = [(size, theme, _chosen(views, size, theme)) for size in SIZES for theme in ("dark", "light")]
-            if any(chosen for _, _, chosen in rounds):
-                with served(scene, recordings) as address:
-                    for size, theme, chosen in rounds:
-                        if chosen:
-                            browser = playwright.chromium.launch(executable_path=path, args=FLAGS)
-                            page = browser.new_page(viewport={"width": size[0], "height": size[1]})
-                            page.add_init_script("localStorage.setItem('spherloc-introduction', 'seen')")
-                            page.set_default_timeout(PATIENCE_MS)
-                            take(page, address, theme == "dark")
-                            for name, view in chosen.items():
-                                picture(page, name, view, theme, size)
-                            browser.close()
+            if not any(chosen for _, _, chosen in rounds):
+                continue
+            if not recordings.exists():
+                subprocess.run([PROGRAM, *made_by], cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
+            with served(scene, recordings) as address:
+                for size, theme, chosen in rounds:
+                    if chosen:
+                        browser = playwright.chromium.launch(executable_path=path, args=FLAGS)
+                        page = browser.new_page(viewport={"width": size[0], "height": size[1]})
+                        page.add_init_script("localStorage.setItem('spherloc-introduction', 'seen')")
+                        page.set_default_timeout(PATIENCE_MS)
+                        opened(page, address, theme == "dark")
+                        for name, view in chosen.items():
+                            picture(page, name, view, theme, size)
+                        browser.close()
 
 
 def _chosen(views: Views, size: tuple[int, int], theme: str) -> Views:

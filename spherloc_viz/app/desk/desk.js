@@ -457,32 +457,43 @@ function open(i) { window.open(pageLink(runs.files[i]), "_blank", "noopener"); }
 
 // --- views, sets, columns ------------------------------------------------------------------------------------------
 
-// What is typed stays when the menu is drawn anew.
-function nameForm(box, words, act) {
-  const before = box.querySelector("input");
-  const input = element("input", { placeholder: words, "aria-label": words, maxLength: 60, value: before ? before.value : "" });
-  return element("form", { className: "entry", onsubmit: (event) => {
-    event.preventDefault();
-    const name = input.value.trim();
-    input.value = "";
-    if (name) act(name);
-  } },
-    input, element("button", { textContent: "Save" }));
+// Below the form for a new name, which is made once: what is being typed there stays, and so does the cursor.
+function drawMenu(id, words, act, lines) {
+  const box = byId(id);
+  if (!box.firstChild) {
+    const input = element("input", { maxLength: 60 });
+    box.append(element("form", { className: "entry", onsubmit: (event) => {
+      event.preventDefault();
+      const name = input.value.trim();
+      input.value = "";
+      if (name) act(name);
+    } }, input, element("button", { textContent: "Save" })), element("div"));
+  }
+  const input = box.querySelector("input");
+  input.placeholder = input.ariaLabel = words;
+  box.lastChild.replaceChildren(...lines);
 }
 
 function drawSaved() {
   const views = Object.entries(saved.views).map(([name, view]) => element("div", { className: "entry" },
     element("button", { textContent: name, onclick: () => { change(readState(encodeURIComponent(JSON.stringify(view)))); byId("views-menu").open = false; } }),
     element("button", { textContent: "✕", title: `Delete the view ${name}`, onclick: () => act({ do: "delete_view", name }) })));
-  byId("views").replaceChildren(nameForm(byId("views"), "Name of this view", (name) => act({ do: "save_view", name, state: JSON.parse(decodeURIComponent(stateText() || "%7B%7D")) }, `View “${name}” is stored.`)),
-    ...views, element("p", { className: "dim", textContent: "The address of this page is a link to what it lists." }));
+  drawMenu("views", "Name of this view", saveView, [...views,
+    element("p", { className: "dim", textContent: "The address of this page is a link to what it lists." })]);
   const sets = Object.entries(saved.sets).map(([name, size]) => element("div", { className: "entry" },
     element("span", { className: "grow", textContent: `${name}: ${plural(size, "run")}` })));
-  byId("sets").replaceChildren(
-    nameForm(byId("sets"), marked.size ? `Name for ${plural(marked.size, "marked run")}` : `Name for ${plural(listed.length, "listed run")}`, async (name) => {
-      const told = await act({ do: "save_set", name, files: filesToSend() });
-      if (told) say(`${plural(told.runs, "run")} stored. Run them again with: spherloc rerun "${told.path}" --estimator mc-exact`);
-    }), ...sets, element("p", { className: "dim", textContent: "A set can be compared here, and run again by spherloc rerun." }));
+  drawMenu("sets", marked.size ? `Name for ${plural(marked.size, "marked run")}` : `Name for ${plural(listed.length, "listed run")}`, saveSet, [...sets,
+    element("p", { className: "dim", textContent: "A set can be compared here, and run again by spherloc rerun." })]);
+}
+
+function saveView(name) {
+  const view = JSON.parse(decodeURIComponent(stateText() || "%7B%7D"));
+  act({ do: "save_view", name, state: view }, `View “${name}” is stored.`);
+}
+
+async function saveSet(name) {
+  const told = await act({ do: "save_set", name, files: filesToSend() });
+  if (told) say(`${plural(told.runs, "run")} stored. Run them again with: spherloc rerun "${told.path}" --estimator mc-exact`);
 }
 
 async function act(what, words = "") {
