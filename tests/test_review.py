@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from rerun.chunk import RrdReader
 
 from spherloc.errors import InputError, RecordingError
+from spherloc_viz.recording import reviews
 from spherloc_viz.recording.content.properties import APPLICATION_ID
 from spherloc_viz.recording.reviews import (
     MOST_BYTES,
@@ -80,6 +81,26 @@ def test_more_than_is_stored_is_a_sentence(tmp_path: Path, labels: list[str], no
     assert list(tmp_path.iterdir()) == []
     full = write_review(tmp_path / "run.rrd", [f"{n}{'x' * 38}" for n in range(20)], "n" * MOST_NOTE_CHARACTERS, "1")
     assert read_review(tmp_path / "run.rrd") == full and len(full.labels) == MOST_LABELS
+
+
+@pytest.mark.parametrize("then", [Review(), Review(("b",), "c")])
+def test_a_review_that_is_removed_or_replaced_while_it_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, then: Review
+):
+    run = tmp_path / "run.rrd"
+    write_review(run, ["a"], "", run_id="1")
+    read, calls = reviews.read_file, []
+
+    def slow(path: Path, most_labels: int) -> tuple[list[str], str]:
+        """As another process may do between the opening of a file and its end."""
+        calls.append(path)
+        if len(calls) == 1:
+            write_review(run, then.labels, then.note, run_id="1")
+            raise RuntimeError("No such file or directory")
+        return read(path, most_labels)
+
+    monkeypatch.setattr(reviews, "read_file", slow)
+    assert read_review(run) == then
 
 
 def test_a_damaged_review_is_a_sentence(tmp_path: Path, rng):

@@ -15,6 +15,7 @@ from rerun.error_utils import RerunWarning
 from spherloc.errors import InputError, RecordingError, show
 from spherloc_viz.given_files import REVIEW_SUFFIX, check_recording_file
 from spherloc_viz.recording.content.properties import APPLICATION_ID, REVIEW_ENTITY, REVIEW_PROPERTY, plain
+from spherloc_viz.recording.storage.unfinished import unfinished
 
 
 def write_file(path: Path, labels: Sequence[str], note: str, run_id: str) -> None:
@@ -122,11 +123,7 @@ def reviewed_name(name: str) -> str:
 
 def has_review(recording: Path) -> bool:
     """Whether there is a review file; none has a name that is too long for the disk."""
-    try:
-        review_path(recording).stat()
-    except OSError:
-        return False
-    return True
+    return bool(_stamp(review_path(recording)))
 
 
 def write_review(recording: Path, labels: Sequence[str], note: str, run_id: str | None = None) -> Review:
@@ -135,10 +132,6 @@ def write_review(recording: Path, labels: Sequence[str], note: str, run_id: str 
     Without any, the file is removed. ``run_id`` is that of the recording, which is read if it is not given. A reader
     never sees half a file. Raises ``InputError`` if they are too long, ``RecordingError`` if they cannot be written.
     """
-    # Here, as lists of runs need only names and limits of this file, and rerun takes a second to load.
-    from spherloc_viz.recording.reviews import recording_id, write_file
-    from spherloc_viz.recording.storage.unfinished import unfinished
-
     review = checked_review(labels, note)
     path = review_path(Path(recording))
     part = unfinished(path)
@@ -162,17 +155,25 @@ def write_review(recording: Path, labels: Sequence[str], note: str, run_id: str 
 def read_review(recording: Path) -> Review:
     """Labels and note of a recording; empty if it has none.
 
-    Raises ``RecordingError``, in one sentence, if the file that has them is damaged.
+    A file that another process replaces or removes meanwhile is read again. Raises ``RecordingError``, in one
+    sentence, if the file that has them is damaged.
     """
     path = review_path(Path(recording))
-    if not has_review(Path(recording)):
-        return Review()
-    from spherloc_viz.recording.reviews import read_file
+    while before := _stamp(path):
+        try:
+            if not path.is_file() or path.stat().st_size > MOST_BYTES:
+                raise ValueError("not a file of labels")
+            return checked_review(*read_file(path, MOST_LABELS))
+        except (OSError, RuntimeError, ValueError, TypeError, LookupError, AttributeError, InputError) as error:
+            if _stamp(path) == before:
+                raise RecordingError(f"{path}: {UNREADABLE}") from error
+    return Review()
 
-    damaged = RecordingError(f"{path}: {UNREADABLE}")
+
+def _stamp(path: Path) -> tuple[int, ...]:
+    """Numbers that another file of this name does not have; empty if there is none, or its name is too long."""
     try:
-        if not path.is_file() or path.stat().st_size > MOST_BYTES:
-            raise damaged
-        return checked_review(*read_file(path, MOST_LABELS))
-    except (OSError, RuntimeError, ValueError, TypeError, LookupError, AttributeError, InputError) as error:
-        raise damaged from error
+        found = path.stat()
+    except OSError:
+        return ()
+    return found.st_ino, found.st_mtime_ns, found.st_size
