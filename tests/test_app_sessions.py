@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -401,6 +402,18 @@ def test_undo_takes_back_what_was_not_solved_yet(house: House, monkeypatch: pyte
     session.step_history(1)
     until(lambda: shown_now() == (77, 4.0))
     session.step_history(-1)
+    session.step_history(-1)
+    until(lambda: shown_now() == (start, None))
+    # What is opened after an Undo that still waits is not what that takes back.
+    at_work.clear()
+    go_on.clear()
+    page.set(scene._simulation._noise, 2.0)
+    until(at_work.is_set)
+    before = session._run.request  # type: ignore[union-attr]
+    session.step_history(-1)
+    session.open(replace(before, scene=replace(before.scene, seed=5)))
+    go_on.set()
+    until(lambda: shown_now() == (5, None))
     session.step_history(-1)
     until(lambda: shown_now() == (start, None))
 

@@ -5,7 +5,9 @@ import time
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import replace
+from operator import itemgetter
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import viser
@@ -47,6 +49,7 @@ VIEWER_STILL_S = 0.3
 """The address follows the viewer when it has not moved for this long."""
 DIAGNOSE_AFTER_S = 0.2
 """A diagnosis costs more than many a run, so it waits until the picture has stood still for this long."""
+T = TypeVar("T")
 
 
 class Session:
@@ -70,14 +73,13 @@ class Session:
         self._diagnoser = LatestWorker(f"spherloc-diagnosis-{number}", self._guarded(self._examine))
         self._pictures = MapPictures(number, self._catalog, self._status.say, self._page.ask, self._guarded)
         self._edits, self._history = Edits(), History()
-        self._opened: tuple[RunRequest, int] | None = None
-        """What is to be opened, and the number of the change that asked for it."""
-        self._steps: deque[tuple[int, int]] = deque()
-        """Steps through the history that are to be made, each with the number of the change that asked for it."""
+        self._asked: deque[tuple[int, RunRequest | int]] = deque()
+        """What is to be opened, and steps through the history that are to be made, each after the number of the change
+        that asked for it."""
         self._roots = Roots(services.roots)
         self._follower = Follower(self._catalog, self._roots, self._problem, self._open_linked)
-        self._link: tuple[str, int] | None = None
-        """A link that is to be followed, and the number of the change before it."""
+        self._links: deque[tuple[int, str]] = deque()
+        """Links that are to be followed, each after the number of the change before it."""
         self._followed = 0
         """How many links were followed."""
         self._in_lesson = False
@@ -136,7 +138,7 @@ class Session:
 
     def open(self, request: RunRequest) -> None:
         """Have the page ask for this."""
-        self._opened = request, self._changes.moment()
+        self._asked.append((self._changes.moment(), request))
         self.changed()
 
     def open_recorded(self, request: RunRequest, path: Path, cam_from_map: FloatArray | None) -> None:
@@ -146,7 +148,7 @@ class Session:
 
     def step_history(self, by: int) -> None:
         """Undo (-1) or redo (+1)."""
-        self._steps.append((by, self._changes.moment()))
+        self._asked.append((self._changes.moment(), by))
         self.changed()
 
     def select(self, places: Iterable[int], extend: bool = False) -> None:
@@ -171,7 +173,7 @@ class Session:
 
     def _note_link(self, touch: Touch) -> None:
         """The page's address is that of a link."""
-        self._link = touch.argument, self._changes.moment()
+        self._links.append((self._changes.moment(), touch.argument))
         self.changed()
 
     def _tell_numbers(self, touch: Touch) -> None:
@@ -216,12 +218,11 @@ class Session:
 
     # What the threads do.
 
-    def _request(self) -> RunRequest:
-        """What the page asks for now."""
-        controls, opened = self._controls, self._opened
+    def _request(self, opened: tuple[int, RunRequest] | None) -> RunRequest:
+        """What the page asks for now, after it has shown what is to be opened, with the number of that change."""
+        controls = self._controls
         if opened is not None:
-            self._opened = None
-            asked, number = opened
+            number, asked = opened
             problem = self._problem(asked.scene)
             options = asked.options or default_options(asked.estimator, problem)
             with self._changes.as_of(number):
@@ -233,8 +234,8 @@ class Session:
                     controls.estimator.follow_problem(self._problem(controls.scene.read()))
         request = RunRequest(self._edits.apply(controls.scene.read()), *controls.estimator.read())
         if opened is not None:
-            self._runs.became(opened[0], request)
-            controls.review.became(opened[0], request)
+            self._runs.became(opened[1], request)
+            controls.review.became(opened[1], request)
         return request
 
     def _solve(self, asked: bool) -> float | None:
@@ -255,15 +256,15 @@ class Session:
 
     def _solve_newest(self) -> float | None:
         """Solve what the page asks for now, if that is not shown. Raises ``Cancelled`` if that was ended."""
-        link, run = self._link, self._run
-        if link is None or run is None:
+        run = self._run
+        if run is None or not self._links:
             return self._solve_request()
-        self._link = None
+        number, link = _taken(self._links)[-1]
         try:
-            followed = self._follower.follow(link[0], run.request, self._view())
-            self._opened = followed.request, link[1]
+            followed = self._follower.follow(link, run.request, self._view())
+            self._asked.append((number, followed.request))
             pause = self._solve_request()
-            self._arrive(followed, link[1])
+            self._arrive(followed, number)
             return pause
         finally:
             self._followed += 1
@@ -297,8 +298,8 @@ class Session:
 
     def _solve_request(self) -> float | None:
         number, gesture = self._changes.moment(), self._changes.gesture
-        self._walk_history(gesture)
-        request = self._request()
+        self._controls.slow.renew()
+        request = self._request(self._newest_opened(gesture))
         self._history.note(request, time.monotonic(), gesture)
         if self._run is None or request != self._run.request:
             problem = self._problem(request.scene)
@@ -319,18 +320,23 @@ class Session:
         self._status.withdraw()
         return QUIET_S
 
-    def _walk_history(self, gesture: int) -> None:
-        """Make the steps that were asked for; what was changed before is noted first, and so is what they take back."""
-        while self._steps:
-            by, number = self._steps.popleft()
+    def _newest_opened(self, gesture: int) -> tuple[int, RunRequest] | None:
+        """What is to be opened, with the number of the change that asked for it, after all that was asked for in its
+        order. Before a step through the history, what was changed until then is noted: it is what Undo takes back."""
+        opened: tuple[int, RunRequest] | None = None
+        for number, asked in sorted(_taken(self._asked), key=itemgetter(0)):
+            if isinstance(asked, RunRequest):
+                opened = number, asked
+                continue
+            by = asked
             try:
-                self._history.note(self._request(), time.monotonic(), gesture)
+                self._history.note(self._request(opened), time.monotonic(), gesture)
             except InputError:
                 # A change that cannot be is in no history: Undo takes it back, and nothing before it.
                 by = max(by, 0)
             request = self._history.step(by)
-            if request is not None:
-                self._opened = request, number
+            opened = None if request is None else (number, request)
+        return opened
 
     def _problem(self, request: SceneRequest) -> Problem:
         """The problem that the page asks for; of images, with word of how far they are.
@@ -463,6 +469,11 @@ class Session:
             return None
 
         return run
+
+
+def _taken(queue: deque[T]) -> list[T]:
+    """All that waits in a queue, which is empty then but for what comes meanwhile."""
+    return [queue.popleft() for _ in range(len(queue))]
 
 
 def _step_key(trace: Trace, followed: Followed) -> str:

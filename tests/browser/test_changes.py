@@ -157,6 +157,37 @@ def test_nothing_is_lost_that_is_changed_at_once(page: Page, stage: Stage) -> No
     assert not desk.failures
 
 
+def test_a_press_counts_for_what_it_met_though_the_page_moves_beneath_it(page: Page, stage: Stage) -> None:
+    """As when a progress bar comes or goes above: a browser makes no click where a press and its end meet others."""
+    (desk,) = stage.desks
+    choice, number = field(page, desk.choice), field(page, desk.number)
+
+    def press(place: Locator) -> None:
+        at, pressed = place.bounding_box(), place.element_handle()
+        assert at is not None
+        page.mouse.move(at["x"] + at["width"] / 2, at["y"] + at["height"] / 2)
+        page.mouse.down()
+        pressed.evaluate("one => { one.style.transform = 'translate(0, 200px)'; }")
+        page.mouse.up()
+        pressed.evaluate("one => { one.style.transform = ''; }")
+
+    choice.click()
+    press(page.get_by_role("option", name="three", exact=True))
+    expect(choice).to_have_value("three")
+    press(field(page, desk.boxes[1]))
+    press(page.get_by_role("button", name="B", exact=True))
+    until(page, lambda: bool(desk.pressed), "the last press arrives")
+    assert desk.pressed == ["B 1000"] and desk.choice.value == "three"
+    assert [box.value for box in desk.boxes] == [False, True, False]
+    # Who goes on elsewhere at once keeps what is typed there: only the list that was chosen from is left.
+    choice.click()
+    page.get_by_role("option", name="two", exact=True).evaluate(
+        "(one, field) => { one.click(); field.focus(); return new Promise(done => setTimeout(done, 200)); }",
+        number.element_handle(),
+    )
+    assert number.evaluate("one => one === document.activeElement")
+
+
 def test_an_older_value_is_dropped_and_an_answer_is_shown(page: Page, stage: Stage) -> None:
     (desk,) = stage.desks
     number, text, choice = (field(page, handle) for handle in (desk.number, desk.text, desk.choice))

@@ -37,10 +37,14 @@ class SlowRun:
             if self._watch is not None:
                 self._watch.cancel()
 
+    def renew(self) -> None:
+        """What is asked for is about to be read: only what is asked for later outdates the run that begins next."""
+        self._outdated = False
+
     def begin(self, lasting: bool = False) -> Watch:
         """A run begins; what it must look at. One that is ``lasting`` does not give way to what is asked for later."""
         with self._lock:
-            self._watch, self._outdated, self._stopped, self._lasting = Watch(), False, False, lasting
+            self._watch, self._stopped, self._lasting = Watch(), False, lasting
             watch = self._watch
         self._clock.ask()
         return watch

@@ -17,6 +17,7 @@ and the console stays clean for errors that matter."""
 STYLE = "touch.css"
 SCRIPTS = (
     "changes.js",
+    "presses.js",
     "touch.js",
     "glossary.js",
     "introduction.js",
@@ -27,10 +28,10 @@ SCRIPTS = (
     "numbers.js",
     "names.js",
 )
-"""What numbers the changes of widgets (``app/web/changes.py``), reports presses (``app/web/touch.py``), shows the
-glossary, the introduction, the captions of the projector view and of phones, and how far the opening of a scene is,
-moves the viewer smoothly, keeps the address (``app/link.py``), mends what is typed into number boxes, and names for
-screen readers what viser does not."""
+"""What numbers the changes of widgets (``app/web/changes.py``), keeps presses beneath which the page moves, reports
+presses (``app/web/touch.py``), shows the glossary, the introduction, the captions of the projector view and of phones,
+and how far the opening of a scene is, moves the viewer smoothly, keeps the address (``app/link.py``), mends what is
+typed into number boxes, and names for screen readers what viser does not."""
 
 
 THIS_MACHINE = "http://localhost:* http://127.0.0.1:* https://localhost:* https://127.0.0.1:*"

@@ -143,12 +143,6 @@
 
   addEventListener("pointercancel", end, true);
 
-  // Who has chosen from a list goes on with keys, which must not be written into its box.
-  addEventListener("click", (event) => {
-    if (!(event.target instanceof Element) || !event.target.closest("[role=option]")) return;
-    setTimeout(() => { if (document.activeElement instanceof HTMLInputElement) document.activeElement.blur(); }, 50);
-  }, true);
-
   // What our other scripts on the page have to tell.
   addEventListener("spherloc-touch", ({ detail }) => {
     const nowhere = { left: 0, top: 0, width: 1, height: 1 };

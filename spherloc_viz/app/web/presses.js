@@ -1,0 +1,36 @@
+// A press counts for what was under the pointer when it went down, also if the page has moved beneath it before it went
+// up: a browser makes a click of the two only where both meet the same element. And who has chosen from a list goes on
+// with keys, which must not be written into its box.
+(() => {
+  const PRESSABLE = "button,a[href],label,summary,input,[role=option],[role=checkbox],[role=switch]", STILL_PX = 4;
+  const AFTER_CHOICE_MS = 50;
+  let down = null, leaving = 0;
+
+  const pressable = (target) => (target instanceof Element ? target.closest(PRESSABLE) : null);
+
+  addEventListener("pointerdown", (event) => {
+    const element = event.isPrimary && event.button === 0 ? pressable(event.target) : null;
+    down = element && { element, x: event.clientX, y: event.clientY };
+    clearTimeout(leaving);
+  }, true);
+
+  addEventListener("pointerup", (event) => {
+    const pressed = down;
+    down = null;
+    if (!pressed?.element.isConnected || !(event.target instanceof Node)) return;
+    if (pressed.element.contains(event.target)) return;
+    if (Math.hypot(event.clientX - pressed.x, event.clientY - pressed.y) < STILL_PX) pressed.element.click();
+  }, true);
+
+  addEventListener("pointercancel", () => { down = null; }, true);
+  addEventListener("keydown", () => clearTimeout(leaving), true);
+
+  addEventListener("click", (event) => {
+    if (!(event.target instanceof Element) || !event.target.closest("[role=option]")) return;
+    const field = document.activeElement;
+    clearTimeout(leaving);
+    leaving = setTimeout(() => {
+      if (field instanceof HTMLInputElement && field === document.activeElement) field.blur();
+    }, AFTER_CHOICE_MS);
+  }, true);
+})();
