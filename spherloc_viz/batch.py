@@ -49,6 +49,7 @@ def run_scenes(
     settings: Sequence[str],
     as_json: bool,
     records: Records | None,
+    *,
     query: str | None = None,
     variation: Variation | None = None,
     proof: Path | None = None,

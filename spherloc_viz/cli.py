@@ -32,6 +32,7 @@ app = SubcommandApp()
 def run(
     scenes: Positional[tuple[Path, ...]],
     /,
+    *,
     estimator: str = "mc",
     seed: OptionalNumber = None,
     option: Settings = (),
@@ -94,13 +95,16 @@ def run(
 
     variation = parse_variation(list(chain(*set)), spoil, mend, hide)
     kept = batch.Records(recordings, full, keep_gigabytes) if record else None
-    return batch.run_scenes(paths, estimator, seed, list(chain(*option)), json, kept, query, variation, proof)
+    return batch.run_scenes(
+        paths, estimator, seed, list(chain(*option)), json, kept, query=query, variation=variation, proof=proof
+    )
 
 
 @app.command
 def localize(
     scenes: Positional[tuple[Path, ...]],
     /,
+    *,
     estimator: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], arg(metavar="NAME[,OPTION=VALUE...]")] = (),
     seed: int = 0,
     option: Settings = (),
@@ -182,6 +186,7 @@ def _name_and_options(text: str, common: Sequence[Sequence[str]]) -> tuple[str, 
 def sweep(
     scenes: Positional[tuple[Path, ...]],
     /,
+    *,
     over: str = "outlier_rate",
     values: Annotated[tuple[str, ...], arg(metavar="NUMBER|FIRST:LAST:STEP ...")] = ("0.5:0.95:0.05",),
     estimator: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], arg(metavar="NAME[,OPTION=VALUE...]")] = (),
@@ -255,7 +260,19 @@ def sweep(
     kept = Records(recordings, keep_gigabytes=keep_gigabytes) if record else None
     for file in files:
         table = out or RECORDINGS / f"{file.stem}_{over}_{seed}.csv"
-        do_sweep(file, over, values, chosen, list(chain(*set)), runs, seed, workers, scheduler, table, kept)
+        do_sweep(
+            file,
+            over,
+            values,
+            chosen,
+            settings=list(chain(*set)),
+            runs=runs,
+            seed=seed,
+            workers=workers,
+            scheduler=scheduler,
+            out=table,
+            records=kept,
+        )
     return 0
 
 
@@ -263,6 +280,7 @@ def sweep(
 def play(
     scene: Positional[Annotated[Path | None, arg(metavar="[PATH]")]] = None,
     /,
+    *,
     host: str = "127.0.0.1",
     port: int = 8080,
     record: bool = True,
@@ -305,7 +323,7 @@ def play(
         given_files.check_scene_file(start)
     from spherloc_viz.app.server import serve
 
-    serve(start, host, port, recordings, record, allow, keep_gigabytes, token)
+    serve(start, host, port, recordings, record=record, allow=allow, keep_gigabytes=keep_gigabytes, token=token)
     return 0
 
 
@@ -313,6 +331,7 @@ def play(
 def map(
     folder: Positional[Annotated[Path, arg(metavar="FOLDER")]],
     /,
+    *,
     camera: OptionalPath = None,
     video: OptionalPath = None,
     frames: int = 40,

@@ -85,6 +85,7 @@ def repeat(
 def runs(
     folder: Positional[Path] = RECORDINGS,
     /,
+    *,
     failed: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
     doubtful: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
     outcome: OptionalText = None,

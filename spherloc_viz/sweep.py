@@ -31,6 +31,7 @@ def sweep(
     over: str,
     values: Sequence[str],
     estimators: Sequence[str],
+    *,
     settings: Sequence[str],
     runs: int,
     seed: int,

@@ -60,6 +60,7 @@ def compare(
 def rerun(
     runs: Positional[tuple[Path, ...]],
     /,
+    *,
     estimator: OptionalText = None,
     option: Settings = (),
     seed: OptionalNumber = None,
@@ -137,6 +138,7 @@ def diagnose(
     poses: Positional[Path],
     scenes: Positional[tuple[Path, ...]] = (),
     /,
+    *,
     matches: OptionalPath = None,
     camera: OptionalPath = None,
     gravity: OptionalPath = None,

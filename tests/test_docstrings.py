@@ -7,19 +7,17 @@ from dataclasses import dataclass
 from pathlib import Path
 
 CORE = Path(__file__).resolve().parents[1] / "spherloc"
-MODULES = [path for path in sorted(CORE.rglob("*.py")) if path.stem == "__init__" or not path.stem.startswith("_")]
+TREES = {
+    path: ast.parse(path.read_text("utf-8"))
+    for room in ("spherloc", "spherloc_viz", "benchmarks", "scripts")
+    for path in sorted((CORE.parent / room).rglob("*.py"))
+}
+MODULES = [path for path in TREES if CORE in path.parents and (path.stem == "__init__" or path.stem[0] != "_")]
 ARRAYS = re.compile(r"\b(FloatArray|IntArray|BoolArray|IndexArray)\b")
 SHAPE = re.compile(r"\((?:\.\.\.|[A-Z]'?|\d+|[a-z]+(?=, \d))(?: [+*] \d)?,(?: ?[\w'+* -]+,?)*\)|\dx\d")
 """Such as (N, 3), (I + 1, 6), (M,), (..., 4) or 6x6."""
 PROTOCOLS = {"solve": "spherloc/solvers/base.py", "run": "spherloc/estimators/base.py"}
 """Methods of which one docstring, at their protocol, is enough."""
-BARE = {
-    "spherloc/consensus/yaw_arcs.py deepest_yaw",
-    "spherloc/estimators/base.py run_estimator",
-    "spherloc/solvers/base.py checked",
-    "spherloc/solvers/odlt.py weighted",
-}
-"""Known to lack shapes or errors; a list that only gets shorter."""
 CAUGHT_BY_CALLERS = {"NotImplementedError", "AssertionError", "StopIteration"}
 """Of whoever does not fulfil a contract, not of whoever calls."""
 
@@ -34,11 +32,10 @@ class Public:
     """The docstrings in which it stands, of its class or module, to which it may leave what is true for all."""
 
     @property
-    def lacking(self) -> bool:
-        """Whether it stands in ``BARE``, or implements a method that is documented elsewhere."""
-        file, _, name = self.place.replace(":", " ").partition(" ")
-        name = name.split()[-1]
-        return f"{file} {name}" in BARE or PROTOCOLS.get(name, file) != file
+    def told_by_protocol(self) -> bool:
+        """Whether it implements a method that is documented elsewhere."""
+        file = self.place.partition(":")[0]
+        return PROTOCOLS.get(self.node.name, file) != file
 
     @property
     def text(self) -> str:
@@ -47,7 +44,7 @@ class Public:
 
 def public(module: Path) -> Iterator[Public]:
     """Those of a module; properties are methods."""
-    tree = ast.parse(module.read_text("utf-8"))
+    tree = TREES[module]
     yield from _inside(tree, f"{module.relative_to(CORE.parent)}", ast.get_docstring(tree) or "")
 
 
@@ -95,9 +92,8 @@ def test_arrays_have_a_shape() -> None:
     functions = [found for found in ALL if isinstance(found.node, ast.FunctionDef)]
     with_arrays = [found for found in functions if arrays(found.node)]
     assert len(with_arrays) > 100
-    assert [
-        found.place for found in with_arrays if not found.lacking and not SHAPE.search(f"{found.text} {found.around}")
-    ] == []
+    bare = [found for found in with_arrays if not SHAPE.search(f"{found.text} {found.around}")]
+    assert [found.place for found in bare if not found.told_by_protocol] == []
 
 
 def test_errors_are_told() -> None:
@@ -105,23 +101,38 @@ def test_errors_are_told() -> None:
     silent = [
         f"{found.place}: {name}"
         for found in functions
-        if not found.lacking
+        if not found.told_by_protocol
         for name in sorted(raised(found.node))
         if not re.search(rf"[Rr]aise[sd]?\b[^.]*{name}|{name}[:`]", f"{found.text}")
     ]
     assert silent == []
 
 
-def test_the_list_of_exceptions_gets_shorter() -> None:
-    """What is mended leaves it."""
-    bare = [found for found in ALL if isinstance(found.node, ast.FunctionDef) and found.lacking]
-    needed = {
-        f"{found.place.partition(':')[0]} {found.node.name}"
-        for found in bare
-        if (arrays(found.node) and not SHAPE.search(f"{found.text} {found.around}"))
-        or any(name not in found.text for name in raised(found.node))
+def test_kernels_say_their_types() -> None:
+    """Numba's functions too, private ones included: what has an array says its shape."""
+    kernels = [
+        (f"{module.relative_to(CORE.parent)}:{node.lineno} {node.name}", node)
+        for module in MODULES
+        for node in ast.walk(TREES[module])
+        if isinstance(node, ast.FunctionDef)
+        and any(ast.unparse(one).startswith("kernel(") for one in node.decorator_list)
+    ]
+    assert len(kernels) > 150
+    assert [place for place, node in kernels if not ast.get_docstring(node)] == []
+    assert [place for place, node in kernels if arrays(node) and not SHAPE.search(ast.get_docstring(node) or "")] == []
+
+
+def test_no_call_counts_more_than_eight_places() -> None:
+    """Beyond eight, parameters have names where they are given."""
+    found = {
+        f"{path.relative_to(CORE.parent)}:{node.lineno} {node.name}": len(given)
+        for path, tree in TREES.items()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+        for given in ([one for one in (*node.args.posonlyargs, *node.args.args) if one.arg not in ("self", "cls")],)
     }
-    assert needed >= BARE
+    assert len(found) > 4000
+    assert {place: count for place, count in found.items() if count > 8} == {}
 
 
 def test_what_lacks_would_be_noticed(tmp_path: Path) -> None:

@@ -227,7 +227,7 @@ def test_the_command_run_solves_recordings(path: Path, tmp_path: Path, capsys: p
     kept = read_recording(Path(record["recording"]))
     assert kept.origin == Origin("command", str(MEI), 0) and kept.row.problem_key == recorded.row.problem_key
     hidden = Variation(hidden=(0, 1))
-    assert run_scenes([path], "mc", 3, [], True, again, None, hidden) == 0
+    assert run_scenes([path], "mc", 3, [], True, again, variation=hidden) == 0
     record = json.loads(capsys.readouterr().out)
     kept = read_recording(Path(record["recording"]))
     assert record["correspondences"] == 98 and kept.origin == Origin("command", str(path), 3, None, hidden)

@@ -144,7 +144,7 @@ def test_names_that_look_like_flags_or_code(tmp_path: Path, monkeypatch: pytest.
 def test_every_scene_is_changed_and_a_wrong_one_is_a_sentence(capsys: pytest.CaptureFixture[str]) -> None:
     street = ROOT / "scenes" / "street_fisheye.toml"
     changes = Variation(outlier_rate=0.5, correspondences=40, hidden=(0, 1))
-    assert run_scenes([MEI, street, PANORAMA], "ransac-2p", None, [], True, None, None, changes) == 2
+    assert run_scenes([MEI, street, PANORAMA], "ransac-2p", None, [], True, None, variation=changes) == 2
     printed = capsys.readouterr()
     records = [json.loads(line) for line in printed.out.splitlines()]
     assert [record["correspondences"] for record in records] == [38, 38] and all(r["success"] for r in records)
@@ -181,6 +181,6 @@ def test_a_mistyped_setting_is_one_line(tmp_path: Path) -> None:
 def test_what_cannot_be_is_one_line(
     capsys: pytest.CaptureFixture[str], variation: Variation, query: str | None, sentence: str
 ) -> None:
-    assert run_scenes([PANORAMA], "mc", None, [], True, None, query, variation) == 2
+    assert run_scenes([PANORAMA], "mc", None, [], True, None, query=query, variation=variation) == 2
     lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("spherloc: ")]
     assert len(lines) == 1 and sentence in lines[0] and str(PANORAMA) in lines[0]

@@ -83,9 +83,9 @@ def test_ctrl_c_keeps_what_is_done_and_the_same_command_goes_on(scene: Path, tmp
 
 def test_wrong_words_are_one_sentence(scene: Path, tmp_path: Path) -> None:
     def call(**changes: object) -> int:
-        given = {"over": "noise_px", "values": ["1"], "estimators": ["mc"], "settings": [], "runs": 1, "seed": 0}
-        more = {"workers": 1, "scheduler": None, "out": tmp_path / "out.csv"}
-        return sweep(scene, **(given | more | changes))  # type: ignore[arg-type]
+        given = {"scene": scene, "over": "noise_px", "values": ["1"], "estimators": ["mc"], "settings": []}
+        more = {"runs": 1, "seed": 0, "workers": 1, "scheduler": None, "out": tmp_path / "out.csv"}
+        return sweep(**(given | more | changes))  # type: ignore[arg-type]
 
     for changes, said in (
         ({"values": ["1:2"]}, "give numbers, or FIRST:LAST:STEP"),
@@ -100,7 +100,7 @@ def test_wrong_words_are_one_sentence(scene: Path, tmp_path: Path) -> None:
             call(**changes)
     with pytest.raises(InputError, match="is no simulation"):
         matches = Path(__file__).resolve().parents[1] / "scenes" / "street_fisheye.toml"
-        sweep(matches, "noise_px", ["1"], ["mc"], [], 1, 0, 1, None, tmp_path / "a.csv")
+        call(scene=matches)
 
 
 def test_entrants_as_people_type_them() -> None:

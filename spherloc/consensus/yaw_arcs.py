@@ -240,9 +240,10 @@ class YawConsensus:
 
 
 def deepest_yaw(lo_rad: FloatArray, hi_rad: FloatArray, watch: Watch | None = None) -> YawConsensus | None:
-    """The yaw that most of the closed arcs [lo, hi] cover (-pi <= lo < pi, hi <= lo + 2 pi); None without arcs.
+    """The yaw that most closed arcs cover, those from ``lo_rad`` (K,) to ``hi_rad`` (K,); None without arcs.
 
-    -pi and pi are one yaw. ``watch`` counts the steps below; raises ``Cancelled``.
+    Arcs have -pi <= lo < pi and hi <= lo + 2 pi; -pi and pi are one yaw. ``watch`` counts the steps below; raises
+    ``Cancelled``.
     """
     if len(lo_rad) == 0:
         return None

@@ -86,6 +86,7 @@ def degree_bounds(
 ) -> IndexArray:
     """(BINS,) bound on the clique number of each bin's graph of ``count`` nodes.
 
+    The edges of bin b are rows ``starts[b]`` to ``starts[b + 1] - 1`` of ``edges`` (E, 2), ``starts`` (BINS + 1,).
     A watch's ``board`` can end it, after which the other bounds are ``count``.
     """
     bound = np.empty(BINS, np.int32)

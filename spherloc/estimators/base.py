@@ -167,7 +167,10 @@ def estimate(
 def run_estimator(
     kind: Any, estimator: str, problem: Problem, options: Any = None, seed: int = 0, watch: Watch | None = None
 ) -> Trace:
-    """``estimate`` by the estimator ``kind``, which need not be registered; ``estimator`` is what it is called."""
+    """``estimate`` by the estimator ``kind``, which need not be registered; ``estimator`` is what it is called.
+
+    Raises ``InputError`` for options of another type, and for what ``estimate`` raises it.
+    """
     options = _default_options(kind.Options, problem) if options is None else options
     if not isinstance(options, kind.Options):
         raise InputError(f"estimator {estimator} takes {kind.Options.__name__}, not {type(options).__name__}.")

@@ -37,7 +37,10 @@ class Solver(Protocol):
 
 
 def checked(solver: Solver, bearings: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Both arrays as kernels want them, or the ``ProblemError`` of ``Solver.solve``."""
+    """``bearings`` (N, 3) and ``points`` (N, 3), metres, as kernels want them: contiguous, float64.
+
+    Raises ``ProblemError`` for other shapes, too few correspondences, or bearings behind a pinhole.
+    """
     bearings = np.ascontiguousarray(bearings, dtype=np.float64)
     points = np.ascontiguousarray(points, dtype=np.float64)
     for what, array in (("bearings", bearings), ("points", points)):

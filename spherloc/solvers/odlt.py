@@ -38,7 +38,10 @@ class Odlt:
         return self.weighted(bearings, points, passes=2)
 
     def weighted(self, bearings: FloatArray, points: FloatArray, passes: int) -> FloatArray:
-        """Like ``solve``, with depths from ``passes - 1`` earlier passes; 1 is the plain transform."""
+        """At most one pose (P, 3, 4) of ``bearings`` (N, 3) and ``points`` (N, 3), metres, see ``solve``.
+
+        Depths come from ``passes - 1`` earlier passes; 1 is the plain transform.
+        """
         bearings, points = checked(self, bearings, points)
         conditioned = condition(points)
         if conditioned is None:

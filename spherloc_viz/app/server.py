@@ -56,6 +56,7 @@ def serve(
     host: str,
     port: int,
     recordings: Path,
+    *,
     record: bool = True,
     allow: Sequence[Path] = (),
     keep_gigabytes: float | None = None,

@@ -49,11 +49,11 @@ def sweep_charts(over: str, labels: Sequence[str], points: Sequence[Point]) -> t
         _chart(over, labels, points, "success", "Success", "success (%)", _success, log=False),
         _chart(
             over, labels, points, "position", "Position error", "position error (m)",
-            lambda point: _three(point.translation_error_m), SUCCESS_M,
+            lambda point: _three(point.translation_error_m), limit=SUCCESS_M,
         ),
         _chart(
             over, labels, points, "rotation", "Rotation error", "rotation error (deg)",
-            lambda point: _three(point.rotation_error_deg), SUCCESS_DEG,
+            lambda point: _three(point.rotation_error_deg), limit=SUCCESS_DEG,
         ),
         _chart(over, labels, points, "time", "Time", "time (ms)", lambda point: _three(point.time_ms)),
     )  # fmt: skip
@@ -71,6 +71,7 @@ def _chart(
     title: str,
     y_label: str,
     three: Callable[[Point], Three],
+    *,
     limit: float | None = None,
     log: bool = True,
 ) -> SweepChart:
