@@ -12,7 +12,7 @@ from spherloc.bounds import bounds_of
 from spherloc.metrics import rotation_error_deg, translation_error_m
 from spherloc.problem import Problem
 
-LEAST_PROBLEMS = 20
+MIN_PROBLEMS = 20
 """A method gets as many even if that takes it longer than its budget, ..."""
 PATIENCE = 3.0
 """... but not longer than as many budgets."""
@@ -78,7 +78,7 @@ def prepared(problem: Problem) -> float:
 def measure(case: Case, methods: dict[str, Method], counts: dict[str, int]) -> dict[str, Any]:
     """Run the case; ``counts`` is how many problems each method gets, those of seeds 0, 1, ...
 
-    A method that has used its budget of seconds gets no further problems (``LEAST_PROBLEMS`` at least): the summary
+    A method that has used its budget of seconds gets no further problems (``MIN_PROBLEMS`` at least): the summary
     says how many it had. Every method first solves a problem that is not counted.
     """
     names = [name for name, count in counts.items() if count > 0]
@@ -108,4 +108,4 @@ def measure(case: Case, methods: dict[str, Method], counts: dict[str, int]) -> d
 def _spent(tally: Tally, method: Method) -> bool:
     budget_s = OUR_BUDGET_S if method.ours else PEER_BUDGET_S
     budgets = 1e-3 * sum(tally.times_ms) / budget_s
-    return budgets > (1.0 if len(tally.times_ms) >= LEAST_PROBLEMS else PATIENCE)
+    return budgets > (1.0 if len(tally.times_ms) >= MIN_PROBLEMS else PATIENCE)

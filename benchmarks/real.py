@@ -27,7 +27,7 @@ FOLDERS = ("aria_adt_fisheye", "aria_gen2")
 METHODS = ("mc-exact", "mc", "auto", "ransac-2p", "PoseLib rig", "pycolmap rig")
 SHARES = (None, 0.2, 0.1, 0.05)
 """Of right matches that a row keeps; None keeps all."""
-LEAST_RIGHT = 6
+MIN_RIGHT = 6
 """Right matches that every problem keeps."""
 SUCCESS_DEG, SUCCESS_M = 1.0, 0.1
 
@@ -56,7 +56,7 @@ def thinned(problem: Problem, share: float, seed: int) -> Problem:
     right = np.zeros(len(problem), dtype=bool)
     right[aligned.index] = residuals_px(aligned, aligned.align_pose(truth)) <= BOUND_PX
     wrong = len(problem) - int(right.sum())
-    keep = max(LEAST_RIGHT, round(share / (1.0 - share) * wrong))
+    keep = max(MIN_RIGHT, round(share / (1.0 - share) * wrong))
     kept = ~right
     kept[np.random.default_rng(seed).permutation(np.flatnonzero(right))[:keep]] = True
     labels = problem.truth_inliers

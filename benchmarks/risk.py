@@ -27,7 +27,7 @@ from spherloc.problem import Problem
 
 LEFT_OUT = ("ok", "larger false consensus", "iterations ran out", "search missed the best pose")
 FIRST_SEED = 110_000
-MOST_RISK = 0.01
+MAX_RISK = 0.01
 LIMITS_M_DEG = {"aria_adt_fisheye": (1.5, 0.1), "aria_gen2": (1.0, 0.1)}
 """Errors up to which a pose of a real set is right: slam_right's truth and calibration disagree by 0.7 degrees."""
 
@@ -114,7 +114,7 @@ def main(estimator: str, seeds: int) -> None:
     print("\n| score | coverage at 1 % risk | risk at 30 % | 40 % | 50 % | 60 % coverage |\n|---|---|---|---|---|---|")
     for name, values in (("the rule's", score), ("inlier count", inliers)):
         coverage, risk = curve(right, values)
-        most = float(coverage[risk <= MOST_RISK].max(initial=0.0))
+        most = float(coverage[risk <= MAX_RISK].max(initial=0.0))
         cells = [f"{100 * np.interp(share, coverage, risk):.1f} %" for share in (0.3, 0.4, 0.5, 0.6)]
         print(f"| {name} | {100 * most:.1f} % | " + " | ".join(cells) + " |")
 

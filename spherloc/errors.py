@@ -6,13 +6,13 @@ Every message is one sentence that says what, where, and what to do.
 import reprlib
 from typing import Any
 
-MOST_QUOTED = 60
+MAX_QUOTED = 60
 """Characters of a quoted value."""
-MOST_REASON = 160
+MAX_REASON = 160
 """Characters of what the system or a library says."""
-MOST_UNBROKEN = 300
+MAX_UNBROKEN = 300
 """Characters without a space between them, such as a path."""
-MOST_MESSAGE = 2000
+MAX_MESSAGE = 2000
 
 
 class SpherlocError(Exception):
@@ -42,34 +42,34 @@ class RecordingError(SpherlocError):
 def legible(text: str) -> str:
     r"""``text`` as one line of bounded length, control characters written as in Python: ``\x1b``.
 
-    Whatever has no space within ``MOST_UNBROKEN`` characters loses its middle, and so does a text that is longer than
-    ``MOST_MESSAGE``.
+    Whatever has no space within ``MAX_UNBROKEN`` characters loses its middle, and so does a text that is longer than
+    ``MAX_MESSAGE``.
     """
-    line = _escaped(_cut(text, MOST_MESSAGE))
-    return _cut(" ".join(_cut(word, MOST_UNBROKEN) for word in line.split(" ")), MOST_MESSAGE)
+    line = _escaped(_cut(text, MAX_MESSAGE))
+    return _cut(" ".join(_cut(word, MAX_UNBROKEN) for word in line.split(" ")), MAX_MESSAGE)
 
 
 def show(value: Any) -> str:
-    """A value as it can be quoted in a message, at most ``MOST_QUOTED`` characters: texts in quotation marks."""
+    """A value as it can be quoted in a message, at most ``MAX_QUOTED`` characters: texts in quotation marks."""
     try:
-        return _cut(_escaped(_QUOTE.repr(value)), MOST_QUOTED)
+        return _cut(_escaped(_QUOTE.repr(value)), MAX_QUOTED)
     except ValueError:  # Python refuses to print very large integers
         return "a number too large to print"
 
 
-def shorten(text: str, most: int = MOST_QUOTED) -> str:
+def shorten(text: str, most: int = MAX_QUOTED) -> str:
     """A name or words from a file as they can be quoted without quotation marks, at most ``most`` characters."""
     return _cut(_escaped(_cut(text, most)), most)
 
 
 def reason(error: BaseException) -> str:
-    """Why the system or a library refused something, as a part of a sentence of at most ``MOST_REASON`` characters."""
+    """Why the system or a library refused something, as a part of a sentence of at most ``MAX_REASON`` characters."""
     try:
         text = getattr(error, "strerror", None) or str(error)
     except Exception:  # an exception of somebody else's whose text cannot be had
         text = ""
-    words = _cut(text or type(error).__name__, 4 * MOST_REASON).split()
-    return _cut(_escaped(" ".join(words)).rstrip("."), MOST_REASON)
+    words = _cut(text or type(error).__name__, 4 * MAX_REASON).split()
+    return _cut(_escaped(" ".join(words)).rstrip("."), MAX_REASON)
 
 
 def _escaped(text: str) -> str:
@@ -93,7 +93,7 @@ class _Quote(reprlib.Repr):
     def __init__(self) -> None:
         super().__init__()
         self.maxlevel = 3
-        self.maxstring = self.maxother = self.maxlong = MOST_QUOTED
+        self.maxstring = self.maxother = self.maxlong = MAX_QUOTED
 
 
 _QUOTE = _Quote()

@@ -14,15 +14,15 @@ from spherloc.refine import RefinementOptions, matches_of, refine, residuals_px
 from spherloc.solvers.p3p import SAMPLE_SIZE, p3p
 from spherloc.types import BoolArray, FloatArray, IntArray
 
-MOST_NFA = 1e-3
+MAX_NFA = 1e-3
 """Expected number of false alarms (NFA) of the size of a set below which it is believed."""
-LEAST_LEAD = 2.0
+MIN_LEAD = 2.0
 """By how many standard deviations of counting one set must be larger than another."""
 TILT_RAD = np.radians(6.0)
 """Gravity errors up to about this are looked for near a pose."""
 SAMPLES, BATCH, CONFIDENCE = 6000, 300, 0.99
 """Most samples of a search, how many at once, and the probability, by Eq. 28, at which it ends."""
-MOST_SCORED = 1000
+MAX_SCORED = 1000
 """Correspondences by which samples are compared, an even choice of all."""
 
 
@@ -54,7 +54,7 @@ def search_without_gravity(aligned: AlignedProblem, bound_px: float) -> FloatArr
     if count <= SAMPLE_SIZE:
         return None
     bounds = bounds_of(free, bound_px)
-    scored = np.unique(np.linspace(0, count - 1, min(count, MOST_SCORED)).astype(np.int64))
+    scored = np.unique(np.linspace(0, count - 1, min(count, MAX_SCORED)).astype(np.int64))
     bearings, points, least_cosine = aligned.bearings[scored], aligned.points[scored], np.cos(bounds.radians[scored])
     rng, best, most, drawn, needed = np.random.default_rng(0), None, 0, 0, SAMPLES
     while drawn < min(needed, SAMPLES):
@@ -121,11 +121,11 @@ def contradicts(
     if cam_from_map is not None:
         tight = count_distinct(aligned, residuals_px(aligned, cam_from_map) <= bound_px)
         beyond = 0.0 < bound_rad < tilt_of(cam_from_map)
-        if beyond and expected_by_chance(count, tight, exact, SAMPLE_SIZE) <= MOST_NFA:
+        if beyond and expected_by_chance(count, tight, exact, SAMPLE_SIZE) <= MAX_NFA:
             return Contradiction(cam_from_map, tight, size, float(tilt_of(cam_from_map)))
         rate = chance_rate(aligned.bearings, np.minimum(bounds_of(aligned, bound_px).radians, np.pi / 2))
-        believed = expected_by_chance(count, size, rate, 2) <= MOST_NFA
-        if believed and lead(nearby_support(aligned, cam_from_map, bound_px, noise_px), size) < LEAST_LEAD:
+        believed = expected_by_chance(count, size, rate, 2) <= MAX_NFA
+        if believed and lead(nearby_support(aligned, cam_from_map, bound_px, noise_px), size) < MIN_LEAD:
             return None
     found = search_without_gravity(aligned, bound_px)
     if found is None:
@@ -133,8 +133,8 @@ def contradicts(
     support = count_distinct(aligned, residuals_px(aligned, found) <= bound_px)
     tilt_rad = float(tilt_of(found))
     if (
-        expected_by_chance(count, support, exact, SAMPLE_SIZE) > MOST_NFA
-        or lead(support, size) < LEAST_LEAD
+        expected_by_chance(count, support, exact, SAMPLE_SIZE) > MAX_NFA
+        or lead(support, size) < MIN_LEAD
         or tilt_rad <= bound_rad
     ):
         return None

@@ -28,7 +28,7 @@ from spherloc.refine import (
 from spherloc.trace import RefinementStage
 from spherloc.types import BoolArray, FloatArray
 
-MOST_STARTS = 4
+MAX_STARTS = 4
 """Poses of a search that are refined."""
 ALTERNATIVE_SHARE = 0.6
 """Share of the most inliers that a start must have: what has less never wins."""
@@ -97,7 +97,7 @@ def conclude_as_printed(
 
 def _promising(aligned: AlignedProblem, starts: Sequence[FloatArray], bounds: Bounds) -> list[FloatArray]:
     """The first start and those of the next ones that explain enough beside it."""
-    counts = [int(np.count_nonzero(residuals_px(aligned, start) <= bounds.pixels)) for start in starts[:MOST_STARTS]]
+    counts = [int(np.count_nonzero(residuals_px(aligned, start) <= bounds.pixels)) for start in starts[:MAX_STARTS]]
     enough = ALTERNATIVE_SHARE * max(counts)
     return [start for k, (start, count) in enumerate(zip(starts, counts, strict=False)) if k == 0 or count >= enough]
 

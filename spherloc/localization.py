@@ -33,7 +33,7 @@ CAMERA = "the camera"
 """What a sentence calls a camera that comes from no file."""
 BOUND_PX = 3.0
 """About so many pixels are the bound on bearings, as the bound on pixels is by default."""
-MOST_OFF_UNIT = 1e-3
+MAX_OFF_UNIT = 1e-3
 """By so much the length of a bearing may differ from 1."""
 
 
@@ -188,8 +188,8 @@ def localize_bearings(
         raise InputError(f"bound_deg is {show(bound_deg)}; give an angle above 0 and below 90 degrees.")
     directions = rows("bearings", bearings, 3)
     off = np.abs(np.linalg.norm(directions, axis=1) - 1.0)
-    if not (off <= MOST_OFF_UNIT).all():
-        row = int(np.flatnonzero(~(off <= MOST_OFF_UNIT))[0])
+    if not (off <= MAX_OFF_UNIT).all():
+        row = int(np.flatnonzero(~(off <= MAX_OFF_UNIT))[0])
         raise InputError(f"bearings row {row} is {show(directions[row].tolist())}; give a unit vector.")
     half = min(max(round(np.pi / (bound_rad / BOUND_PX)), 1), MAX_SIDE_PX // 2)
     camera = Equirectangular(2 * half, half, angular=True)

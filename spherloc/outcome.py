@@ -15,14 +15,14 @@ from spherloc.consensus.chance import chance_rate
 from spherloc.consensus.inliers import mark_each
 from spherloc.consensus.two_point_search import search_two_point
 from spherloc.diagnosis.evidence import FEW, LOOSE_ENDS, different, pose_sd
-from spherloc.free_gravity import LEAST_LEAD, MOST_NFA, count_distinct, expected_by_chance, lead, nearby_support
+from spherloc.free_gravity import MAX_NFA, MIN_LEAD, count_distinct, expected_by_chance, lead, nearby_support
 from spherloc.metrics import SUCCESS_DEG, SUCCESS_M
 from spherloc.problem import AlignedProblem
 from spherloc.refine import RefinementOptions, gravity_sd_rad, residuals_px
 from spherloc.trace import ConsensusStage, RefinementStage, Trace
 from spherloc.types import BoolArray, FloatArray
 
-LEAST_SDS = 2.0
+MIN_SDS = 2.0
 """Standard deviations that must lie within the error of a success."""
 SAMPLES, CONFIDENCE = 2000, 0.99
 """Of the search for an alternative among what the pose does not explain."""
@@ -79,7 +79,7 @@ def judge(trace: Trace) -> Judgement:
 
 def _chance_margin(count: int, size: int, rate: float, fixed_by: int) -> tuple[float, str]:
     expected = max(expected_by_chance(count, size, rate, fixed_by), 1e-300)
-    margin = np.log10(MOST_NFA) - np.log10(min(expected, 1e300))
+    margin = np.log10(MAX_NFA) - np.log10(min(expected, 1e300))
     many = f"{expected:.1g}" if expected < 1e6 else "millions"
     return margin, f"Only {size} different matches agree with it; {many} such sets are expected by chance."
 
@@ -106,9 +106,9 @@ def _alternative_margin(
             yaws, places = found.yaws_rad[best : best + 1], found.translations[best : best + 1]
             mask = mark_each(yaws, places, part.bearings, part.points, part.pixel_from_bearing, limits)[0]
             most = max(most, count_distinct(part, mask))
-    if expected_by_chance(len(aligned.points), most, rate, fixed_by) > MOST_NFA:
+    if expected_by_chance(len(aligned.points), most, rate, fixed_by) > MAX_NFA:
         return np.inf, ""
-    return lead(size, most) - LEAST_LEAD, f"Another pose explains {most} different matches, this one {size}."
+    return lead(size, most) - MIN_LEAD, f"Another pose explains {most} different matches, this one {size}."
 
 
 def _gravity_margin(
@@ -118,7 +118,7 @@ def _gravity_margin(
     size = count_distinct(aligned, inliers)
     free = nearby_support(aligned, state, bound_px, float(options.noise_px))
     return (
-        LEAST_LEAD - lead(free, size),
+        MIN_LEAD - lead(free, size),
         f"Without the known gravity, {free} different matches agree instead of {size}.",
     )
 
@@ -130,6 +130,6 @@ def _error_margin(trace: Trace, aligned: AlignedProblem, state: FloatArray, inli
         return -np.inf, "Its inliers do not fix it."
     drop, sd = LOOSE_ENDS if size >= FEW else 0, gravity_sd_rad(aligned, options)
     rotation, position, _ = pose_sd(aligned, state, inliers, options.noise_px, sd, drop)
-    worst = LEAST_SDS * max(np.degrees(rotation) / SUCCESS_DEG, position / SUCCESS_M, 1e-300)
+    worst = MIN_SDS * max(np.degrees(rotation) / SUCCESS_DEG, position / SUCCESS_M, 1e-300)
     fixed = f"{np.degrees(rotation):.2g}° and {position:.2g} {trace.problem.unit}"
     return -np.log(worst), f"Its inliers fix it to no better than {fixed} (1 sd)."

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from spherloc.cameras.base import Camera
 from spherloc.errors import ProblemError, show
 from spherloc.geometry import align_to_down, pose, tangent_basis
-from spherloc.ranges import LEAST_M, LEAST_PX, MOST_M, MOST_PX, is_number
+from spherloc.ranges import LEAST_PX, MAX_M, MAX_PX, MIN_M, is_number
 from spherloc.types import BoolArray, FloatArray, IntArray
 
-LEAST_STRETCH = 0.01
+MIN_STRETCH = 0.01
 """Smallest ratio of the two singular values of an unprojection's Jacobian that residuals believe in."""
 
-MOST_SOURCE = 200
+MAX_SOURCE = 200
 """Characters of ``Problem.gravity_source``."""
 
 
@@ -76,11 +76,11 @@ class Problem:
         below_90 = float(np.nextafter(np.pi / 2, 0.0))
         _scalar(self, "gravity_bound_rad", 0.0, below_90, "an angle from 0 to below pi / 2")
         _scalar(self, "gravity_sd_rad", 0.0, np.inf, "0 or more, or inf if nothing is known")
-        if not isinstance(self.gravity_source, str) or len(self.gravity_source) > MOST_SOURCE:
-            raise ProblemError(f"{self.name}: gravity_source is no text of at most {MOST_SOURCE} characters; give one.")
+        if not isinstance(self.gravity_source, str) or len(self.gravity_source) > MAX_SOURCE:
+            raise ProblemError(f"{self.name}: gravity_source is no text of at most {MAX_SOURCE} characters; give one.")
         if not isinstance(self.metric, bool):
             raise ProblemError(f"{self.name}: metric is {self.metric!r}; give true or false.")
-        _scalar(self, "bound_px", LEAST_PX, MOST_PX, f"{LEAST_PX:g} to {MOST_PX:,.0f} pixels")
+        _scalar(self, "bound_px", LEAST_PX, MAX_PX, f"{LEAST_PX:g} to {MAX_PX:,.0f} pixels")
         _scalar(self, "estimated_outlier_rate", 0.0, 1.0, "a share from 0 to 1")
         _check_reach(self.name, "points reach", points)
         if self.truth_cam_from_map is not None:
@@ -150,7 +150,7 @@ class Problem:
         left, stretch, right = np.linalg.svd(jacobian)
         largest[usable] = stretch[:, 0]
         # At a panorama's pole one direction collapses; without a floor a point far away would cost nothing.
-        stretch = np.maximum(stretch, LEAST_STRETCH * stretch[:, :1])
+        stretch = np.maximum(stretch, MIN_STRETCH * stretch[:, :1])
         inverse[usable] = np.einsum("nji,nj,nkj,nkl->nil", right, 1.0 / stretch, left, basis)
         return _frozen(inverse), _frozen(largest)
 
@@ -257,10 +257,10 @@ class AlignedProblem:
         return full
 
 
-def _check_reach(name: str, what: str, places_m: FloatArray, least_m: float = LEAST_M) -> None:
+def _check_reach(name: str, what: str, places_m: FloatArray, least_m: float = MIN_M) -> None:
     reach_m = float(np.abs(places_m).max(initial=0.0))
-    if reach_m and not least_m <= reach_m <= MOST_M:
-        limits = f"{least_m:g} to {MOST_M:g} m"
+    if reach_m and not least_m <= reach_m <= MAX_M:
+        limits = f"{least_m:g} to {MAX_M:g} m"
         raise ProblemError(f"{name}: {what} {reach_m:.3g} m from the origin; give metres, {limits}.")
 
 

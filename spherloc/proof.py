@@ -15,14 +15,14 @@ from spherloc.trace import ConsensusStage, Trace
 from spherloc.watch import Watch
 
 MOST_CELLS = 2_000_000
-MOST_FOR_PROOF = 5000
+MAX_FOR_PROOF = 5000
 """Correspondences up to which a proof is written: the checker tests all of them in every cell."""
 
 
 def write_proof(trace: Trace, path: Path, watch: Watch | None = None) -> int:
     """Write the proof of a run's upper bound to an .npz file; returns its number of cells.
 
-    Raises ``InputError`` for a run without certificate, with more than ``MOST_FOR_PROOF`` usable correspondences, or
+    Raises ``InputError`` for a run without certificate, with more than ``MAX_FOR_PROOF`` usable correspondences, or
     whose bound does not follow from cells.
     """
     problem, certificate, stage = trace.problem, trace.certificate, trace.stage(ConsensusStage)
@@ -30,8 +30,8 @@ def write_proof(trace: Trace, path: Path, watch: Watch | None = None) -> int:
         raise InputError(f"{trace.estimator} proves nothing; run mc-exact to have a proof.")
     aligned = problem.aligned
     count = len(aligned.bearings)
-    if count > MOST_FOR_PROOF:
-        raise InputError(f"a proof has up to {MOST_FOR_PROOF:,} correspondences, not {count:,}; thin them.")
+    if count > MAX_FOR_PROOF:
+        raise InputError(f"a proof has up to {MAX_FOR_PROOF:,} correspondences, not {count:,}; thin them.")
     watch = watch or Watch()
     bound_px = bounds_of(aligned, trace.options.bound_px).noise_px
     matches, claim = pack_matches(aligned, bound_px), certificate.upper_bound

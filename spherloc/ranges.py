@@ -7,13 +7,13 @@ from typing import Any
 
 from spherloc.errors import InputError, show
 
-LEAST_PX, MOST_PX = 1e-6, 1e6
+LEAST_PX, MAX_PX = 1e-6, 1e6
 """Pixel bounds and noise."""
-LEAST_M, MOST_M = 1e-12, 1e12
+MIN_M, MAX_M = 1e-12, 1e12
 """The farthest point from the origin; a map may also be all in the origin."""
 LEAST, MOST = 1e-12, 1e12
 """Other options that are neither 0 nor infinite."""
-MOST_SEED = 2**63 - 1
+MAX_SEED = 2**63 - 1
 
 
 def check_option(name: str, value: Any) -> None:
@@ -21,7 +21,7 @@ def check_option(name: str, value: Any) -> None:
     it; what else the option refuses is its own to say."""
     if isinstance(value, bool) or not isinstance(value, Real):
         return
-    least, most = (LEAST_PX, MOST_PX) if name.endswith("_px") else (LEAST, MOST)
+    least, most = (LEAST_PX, MAX_PX) if name.endswith("_px") else (LEAST, MOST)
     try:
         size = abs(float(value))
     except OverflowError:  # an integer beyond all floats
@@ -42,6 +42,6 @@ def is_number(value: Any) -> bool:
 
 
 def check_seed(seed: Any) -> None:
-    """Raise ``InputError`` for what is no whole number from 0 to ``MOST_SEED``."""
-    if isinstance(seed, bool) or not isinstance(seed, Integral) or not 0 <= int(seed) <= MOST_SEED:
+    """Raise ``InputError`` for what is no whole number from 0 to ``MAX_SEED``."""
+    if isinstance(seed, bool) or not isinstance(seed, Integral) or not 0 <= int(seed) <= MAX_SEED:
         raise InputError(f"seed is {show(seed)}; give a whole number from 0 to 2^63 - 1.")

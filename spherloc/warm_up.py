@@ -42,7 +42,7 @@ from spherloc.watch import Watch
 
 FASTEST = "ransac-2p"
 """The estimator with the fewest kernels."""
-MOST_PROCESSES = 4
+MAX_PROCESSES = 4
 """Processes that compile at once: each takes 300 MB."""
 
 
@@ -185,7 +185,7 @@ def _compile_in_order(parts: Sequence[str], stopped: Callable[[], bool] = lambda
 
 def _compile_at_once(parts: Sequence[str], stopped: Callable[[], bool], niceness: int) -> None:
     """As many at once as there are processors."""
-    lanes = min(MOST_PROCESSES, _processors())
+    lanes = min(MAX_PROCESSES, _processors())
     waiting, running = deque(parts), []
     try:
         while (waiting or running) and not stopped():

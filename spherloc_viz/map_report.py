@@ -14,12 +14,12 @@ from spherloc.frontend.view import View
 from spherloc.geometry import camera_centre
 from spherloc.mapping.make import Map
 from spherloc.mapping.photographs import Photographs
-from spherloc.mapping.reconstruction import LEAST_MATCHES
+from spherloc.mapping.reconstruction import MIN_MATCHES
 from spherloc.types import FloatArray
 
 THUMBNAIL_PX = 240
-MOST_THUMBNAILS = 40
-MOST_POINTS = 20_000
+MAX_THUMBNAILS = 40
+MAX_POINTS = 20_000
 WITHIN = 0.98
 """Share of the points that the picture shows: a few far ones would make the rest small."""
 
@@ -57,7 +57,7 @@ def map_report(made: Map, found: Photographs) -> str:
             "<h2>From above</h2>",
             f'<img alt="Points and cameras of the map from above" src="{_from_above(made, unit)}">',
             "<h2>Not in the map</h2>" if left else "",
-            *(_thumbnail(view, made, names) for view in left[:MOST_THUMBNAILS]),
+            *(_thumbnail(view, made, names) for view in left[:MAX_THUMBNAILS]),
             "<h2>Images</h2><table><tr><th>image</th><th>in the map</th><th>best partner</th><th>matches</th></tr>",
             *rows,
             "</table></body></html>",
@@ -100,8 +100,8 @@ def why_not(made: Map, names: list[str], index: int) -> str:
             f"COLMAP placed it so that it leans {made.level.leaning[names[index]]:.1f}° against the map, at a place "
             "that looks like the right one: take more images around it."
         )
-    if counts.max() < LEAST_MATCHES:
-        return f"No other image has {LEAST_MATCHES} matches with it that fit together: take images closer to it."
+    if counts.max() < MIN_MATCHES:
+        return f"No other image has {MIN_MATCHES} matches with it that fit together: take images closer to it."
     best = int(np.where(inside, counts, -1).argmax())
     return (
         f"It has {counts[best]} matches with {names[best]}, too few of which have a point in the map: take "
@@ -128,7 +128,7 @@ def _from_above(made: Map, unit: str) -> str:
     FigureCanvasAgg(figure)
     axes = figure.add_subplot(aspect="equal")
     shown = points[_near(points, centres)]
-    shown = shown[:: max(1, len(shown) // MOST_POINTS)]
+    shown = shown[:: max(1, len(shown) // MAX_POINTS)]
     axes.scatter(shown[:, 0], shown[:, 1], s=1.5, c="#8fa3b8", linewidths=0)
     axes.plot(centres[:, 0], centres[:, 1], color="#d08a1c", linewidth=0.8)
     axes.scatter(centres[:, 0], centres[:, 1], s=28, c="#c0392b", zorder=3)

@@ -102,7 +102,7 @@ WIDTH_INCHES = 9.0
 HEIGHT_INCHES = (4.0, 9.0)
 DPI = 150
 MARGIN = 0.08
-LEAST_EXTENT_M = 1.0
+MIN_EXTENT_M = 1.0
 """So that a camera that stands still is not magnified to its noise."""
 
 
@@ -157,7 +157,7 @@ def _png(figure: Figure) -> bytes:
 
 SEVERAL_COLORS = ("#1b6ca8", "#c77d0a", "#7b2d8b", "#3a8a3a", "#b02a30", "#5fb3e6", "#8c6d31", "#555555")
 LARGEST_MARKER = 10.0
-MOST_NAMED = 6
+MAX_NAMED = 6
 """Failures of an estimator whose names are written into the picture."""
 
 
@@ -226,7 +226,7 @@ def _one_of_several(axes: Axes, label: str, results: SequenceResults, seen: Floa
     lost = ~inside & with_truth
     if lost.any():
         axes.plot(*true_places[lost].T, "x", color=color, markersize=8.0, markeredgewidth=1.4)
-    if 0 < np.count_nonzero(lost) <= MOST_NAMED:
+    if 0 < np.count_nonzero(lost) <= MAX_NAMED:
         for place in np.flatnonzero(lost):
             name = results.rows[place].query
             axes.annotate(name, true_places[place], xytext=(5, 4), textcoords="offset points", fontsize=7, color=color)
@@ -255,9 +255,9 @@ def _frame(places: FloatArray, true_places: FloatArray) -> tuple[FloatArray, Flo
     known = true_places[np.isfinite(true_places).all(axis=1)]
     shown = known if len(known) else places[np.isfinite(places).all(axis=1)]
     if not len(shown):
-        return np.zeros(2), np.full(2, 0.5 * LEAST_EXTENT_M)
+        return np.zeros(2), np.full(2, 0.5 * MIN_EXTENT_M)
     low, high = shown.min(axis=0), shown.max(axis=0)
-    half = 0.5 * np.maximum(high - low, LEAST_EXTENT_M)
+    half = 0.5 * np.maximum(high - low, MIN_EXTENT_M)
     return 0.5 * (low + high), np.maximum(half, 0.3 * half.max()) + 2.0 * MARGIN * half.max()
 
 

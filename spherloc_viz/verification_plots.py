@@ -23,7 +23,7 @@ BOXES: Mapping[str, str] = {"MC": "#7b2d8b", "2P100": "#1b6ca8", "SVD100": "#c77
 COLORS = ("#7b2d8b", "#c06fd0", "#1b6ca8", "#5fb3e6", "#c77d0a", "#3a8a3a", "#8fce6b", "#b02a30", "#111111", "#777777")
 DASHES: Mapping[bool, tuple[int, tuple[int, ...]]] = {True: (0, ()), False: (0, (4, 2))}
 """Of methods as printed, and of this project's own forms."""
-LEAST_ERROR = {"rotation_error_deg": 1e-3, "t_error_m": 1e-4}
+MIN_ERROR = {"rotation_error_deg": 1e-3, "t_error_m": 1e-4}
 """Where the logarithmic axes of errors start: what is below is rounding."""
 WIDTH_INCHES, HEIGHT_INCHES = 11.0, 4.2
 ENOUGH = 0.95
@@ -111,7 +111,7 @@ def _noise(figure: Figure, experiment: str, camera: str, measured: Measured) -> 
             cells = measured.curve(experiment, camera, name)
             width = 0.8 / len(shown)
             middle = [cell.place.value + (place - 0.5 * (len(shown) - 1)) * width for cell in cells]
-            boxes = [np.clip(_finite(cell.values(column)), LEAST_ERROR[column], None) for cell in cells]
+            boxes = [np.clip(_finite(cell.values(column)), MIN_ERROR[column], None) for cell in cells]
             drawn = axes.boxplot(
                 boxes,
                 positions=middle,
@@ -126,7 +126,7 @@ def _noise(figure: Figure, experiment: str, camera: str, measured: Measured) -> 
                 box.set(facecolor=BOXES[name], alpha=0.75, linewidth=0.5)
             axes.plot([], [], color=BOXES[name], linewidth=6, label=name)
         axes.set_yscale("log")
-        axes.set_ylim(bottom=0.8 * LEAST_ERROR[column])
+        axes.set_ylim(bottom=0.8 * MIN_ERROR[column])
         axes.set_xticks(measured.values(experiment, camera))
         axes.set_xlabel("standard deviation of the noise (px)")
         axes.set_ylabel(label)

@@ -14,10 +14,10 @@ from spherloc.consensus.yaw_arcs import yaw_arcs
 from spherloc.estimators import estimate
 from spherloc.trace import ConsensusStage, Trace, TranslationStage
 from spherloc_viz import style
-from spherloc_viz.app.plots.graph_view import MOST_EDGES, cell_nodes, edges_of, graph_html, matrix_png
+from spherloc_viz.app.plots.graph_view import MAX_EDGES, cell_nodes, edges_of, graph_html, matrix_png
 from spherloc_viz.layers import graph_begins, paint, steps
 from spherloc_viz.layers.primitives import Graph
-from spherloc_viz.layers.translation import MOST_NODES, ball_nodes
+from spherloc_viz.layers.translation import MAX_NODES, ball_nodes
 
 
 @pytest.fixture(scope="module")
@@ -102,7 +102,7 @@ def test_drawings_are_small_and_well_formed(mc: Trace, exact: Trace) -> None:
     for trace in (mc, exact):
         for key, graph in graphs(trace).items():
             edges, html = edges_of(graph), graph_html(graph, (0,), np.arange(len(trace.problem)))
-            assert max(len(edges.marked), len(edges.others)) <= MOST_EDGES and len(html) < 60_000, key
+            assert max(len(edges.marked), len(edges.others)) <= MAX_EDGES and len(html) < 60_000, key
             assert ElementTree.fromstring(html).tag == "div"
             assert len(re.findall("<circle", html)) == graph.shown.sum()
 
@@ -118,7 +118,7 @@ def test_more_nodes_are_thinned_evenly(mc: Trace) -> None:
     pairs = np.column_stack([np.arange(count), np.arange(count) + 1]).astype(np.int32)
     large = TranslationStage(**{**vars(stage), "pairs": pairs, "centres_m": centres, "radii_m": radii, "edges": edges})
     nodes = ball_nodes(large)
-    assert len(nodes.number) == MOST_NODES == len(set(nodes.number.tolist())) and nodes.total == count
+    assert len(nodes.number) == MAX_NODES == len(set(nodes.number.tolist())) and nodes.total == count
     np.testing.assert_array_equal(
-        nodes.agrees, apart[np.ix_(nodes.number, nodes.number)] & ~np.eye(MOST_NODES, dtype=bool)
+        nodes.agrees, apart[np.ix_(nodes.number, nodes.number)] & ~np.eye(MAX_NODES, dtype=bool)
     )

@@ -20,7 +20,7 @@ from spherloc.problem import Problem
 from spherloc.trace import Trace
 from spherloc_viz import style
 from spherloc_viz.app.matches import match_drawing as drawing
-from spherloc_viz.app.matches.image_panel import MOST_BYTES, ImagePanel, photo_uri
+from spherloc_viz.app.matches.image_panel import MAX_BYTES, ImagePanel, photo_uri
 from spherloc_viz.app.matches.match_card import CROP_HEIGHT_PX, CROP_WIDTH_PX, SIDE_PX, MatchCard, crops_html
 from spherloc_viz.app.matches.match_table import MatchTable
 from spherloc_viz.app.web.viser_internals import start_viser, stop_viser
@@ -195,11 +195,11 @@ def test_thousands_of_matches_are_thinned_and_counted(server: viser.ViserServer,
     view.draw(run, outcome(run), (17,), np.arange(3000))
     content = view._drawing.content
     drawn = re.search(r"(\d+) of 3,000 dots are drawn", content)
-    assert drawn is not None and drawing.MOST_DOTS <= int(drawn[1]) <= drawing.MOST_DOTS + 1
+    assert drawn is not None and drawing.MAX_DOTS <= int(drawn[1]) <= drawing.MAX_DOTS + 1
     assert len(content) < 32_000 and ">17</text>" in content
     for color in (style.INLIER, style.OUTLIER):
         path = re.search(rf'<path d="([^"]*)" stroke="{style.css(color)}"[^>]*round', content)
-        assert path is not None and path[1].count("M") >= drawing.MOST_DOTS // 2 - 1, "both kinds are seen"
+        assert path is not None and path[1].count("M") >= drawing.MAX_DOTS // 2 - 1, "both kinds are seen"
     view.draw(run, outcome(run), tuple(range(1000)), np.arange(3000))
     assert "100 of 1,000 selected matches have rings" in view._drawing.content and len(view._drawing.content) < 80_000
 
@@ -218,7 +218,7 @@ def test_real_photographs_fit_their_budget(aria: Path, scene_of: SceneOf) -> Non
     image = load_scene(aria / "rgb.toml").problem().image
     for width in (450, 900):
         uri = photo_uri(image, width)
-        assert uri is not None and len(uri) < 1.4 * MOST_BYTES
+        assert uri is not None and len(uri) < 1.4 * MAX_BYTES
     assert photo_uri(image, 900) is photo_uri(image, 900) and photo_uri(None, 900) is None
 
 

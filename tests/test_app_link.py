@@ -14,7 +14,7 @@ from spherloc.datasets.variation import Variation
 from spherloc.errors import RecordingError
 from spherloc.estimators import default_options, estimate
 from spherloc_viz.app.catalog import Catalog, SceneRequest
-from spherloc_viz.app.link import MANY, MOST_LETTERS, ONCE, Follower, PageView, link_of
+from spherloc_viz.app.link import MANY, MAX_LETTERS, ONCE, Follower, PageView, link_of
 from spherloc_viz.app.panels.folders import Roots
 from spherloc_viz.app.review.opened import Opened
 from spherloc_viz.app.run_request import Run, RunRequest
@@ -126,7 +126,7 @@ def test_any_text_leads_to_a_run(place: Place, text: str) -> None:
 
 
 def test_a_long_link_is_not_written(place: Place) -> None:
-    hidden = tuple(range(10_000, 10_000 + MOST_LETTERS // 6))
+    hidden = tuple(range(10_000, 10_000 + MAX_LETTERS // 6))
     scene = SceneRequest(place.label, 1)
     request = RunRequest(scene, "mc", default_options("mc", place.catalog.problem(scene)))
     assert place.link(request, PageView("outcome", hidden, "dark")) == ""

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from spherloc.datasets import bundled_scenes
 from spherloc.datasets.correspondences import CorrespondencesScene
 from spherloc.errors import InputError
-from spherloc_viz.app.panels.folders import MOST_ENTRIES, PAGE, Roots
-from spherloc_viz.app.panels.open_panel import MOST_RECENT, RecentScenes
-from spherloc_viz.app.panels.uploads import MOST_BYTES, MOST_ROWS, File, Form, Scratch, numbers, open_upload
+from spherloc_viz.app.panels.folders import MAX_ENTRIES, PAGE, Roots
+from spherloc_viz.app.panels.open_panel import MAX_RECENT, RecentScenes
+from spherloc_viz.app.panels.uploads import MAX_BYTES, MAX_ROWS, File, Form, Scratch, numbers, open_upload
 from tests.needs import real_data
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -162,21 +162,21 @@ def test_a_folder_that_cannot_be_read_says_so(house: Path, monkeypatch: pytest.M
 
 
 def test_an_endless_folder_is_looked_at_in_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("spherloc_viz.app.panels.folders.MOST_ENTRIES", 5)
+    monkeypatch.setattr("spherloc_viz.app.panels.folders.MAX_ENTRIES", 5)
     for number in range(8):
         (tmp_path / f"{number}.toml").write_text(SCENE)
     listing = Roots([tmp_path]).look_into("0:")
-    assert len(listing.rows) == 5 and "first 5 entries" in listing.remarks[0] and MOST_ENTRIES > 1000
+    assert len(listing.rows) == 5 and "first 5 entries" in listing.remarks[0] and MAX_ENTRIES > 1000
 
 
 def test_recent_scenes_are_remembered_newest_first(tmp_path: Path) -> None:
     recent = RecentScenes(tmp_path / "deep" / "scenes.json")
     assert recent.read() == ((), "")
-    paths = [tmp_path / f"{number}.toml" for number in range(MOST_RECENT + 3)]
+    paths = [tmp_path / f"{number}.toml" for number in range(MAX_RECENT + 3)]
     for path in [*paths, paths[-2]]:
         recent.note(path)
     kept, remark = RecentScenes(tmp_path / "deep" / "scenes.json").read()
-    assert kept[:3] == (paths[-2], paths[-1], paths[-3]) and len(kept) == MOST_RECENT and not remark
+    assert kept[:3] == (paths[-2], paths[-1], paths[-3]) and len(kept) == MAX_RECENT and not remark
     assert [path.name for path in (tmp_path / "deep").iterdir()] == ["scenes.json"], "no half-written file is left"
 
 
@@ -240,9 +240,9 @@ def test_real_matches_are_taken(tmp_path: Path, aria: Path) -> None:
 
 
 NUL = CSV.replace("90", "9\0").encode()
-ROWS = b"u,v,X,Y,Z\n" + b"1,2,3,4,5\n" * MOST_ROWS
+ROWS = b"u,v,X,Y,Z\n" + b"1,2,3,4,5\n" * MAX_ROWS
 BAD = [
-    ({"matches": File("big.csv", b"1" * (MOST_BYTES + 1))}, r"^big\.csv: larger than 10 MB"),
+    ({"matches": File("big.csv", b"1" * (MAX_BYTES + 1))}, r"^big\.csv: larger than 10 MB"),
     ({"matches": File("long.csv", ROWS)}, r"^long\.csv: has more than 200,000 lines"),
     ({"matches": File("old.csv", ROWS.replace(b"\n", b"\r"))}, r"^old\.csv: has more than 200,000 lines"),
     ({"matches": File("empty.csv", b"")}, r"^empty\.csv: is empty"),

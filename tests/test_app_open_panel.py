@@ -12,7 +12,7 @@ import pytest
 import viser
 
 from spherloc_viz.app.panels.open_panel import Opened, OpenPanel, RecentScenes
-from spherloc_viz.app.panels.uploads import MOST_BYTES
+from spherloc_viz.app.panels.uploads import MAX_BYTES
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.web.viser_internals import start_viser, stop_viser
 from tests.connected_page import ConnectedPage
@@ -222,7 +222,7 @@ def test_a_file_too_large_is_turned_away_while_it_arrives(visitor: Visitor) -> N
             ended.append(message["transfer_uuid"])
 
     visitor.page.answer = note
-    visitor.page.upload(visitor.matches, "big.csv", b"x" * 300_000, said=MOST_BYTES + 1)
+    visitor.page.upload(visitor.matches, "big.csv", b"x" * 300_000, said=MAX_BYTES + 1)
     until(lambda: "larger than 10 MB" in visitor.said)
     until(lambda: ended == ["big.csv"])  # else the page keeps its button disabled
     assert not under_way, "nothing of it is kept"

@@ -13,7 +13,7 @@ import trimesh
 import viser
 
 from spherloc_viz import style
-from spherloc_viz.app.stage.painter import MOST_BATCHED, SHELLS, Painter
+from spherloc_viz.app.stage.painter import MAX_BATCHED, SHELLS, Painter
 from spherloc_viz.app.web.viser_internals import start_viser, stop_viser
 from spherloc_viz.layers.frame import one_color
 from spherloc_viz.layers.primitives import Balls, Label, Mesh, Points, Segments, Textured
@@ -135,9 +135,9 @@ def test_what_is_hidden_stays_so_until_it_is_shown_again(painter: Painter, canva
 
 
 def test_many_dots_become_a_cloud_of_full_precision(painter: Painter, canvas: Canvas) -> None:
-    painter.draw([dots(MOST_BATCHED)], ALL)
+    painter.draw([dots(MAX_BATCHED)], ALL)
     assert canvas.calls["/map/points"][0] == "add_batched_meshes_simple"
-    painter.draw([dots(MOST_BATCHED + 1)], ALL)
+    painter.draw([dots(MAX_BATCHED + 1)], ALL)
     node = canvas.nodes["/map/points"]
     method, props = canvas.calls["/map/points"]
     assert method == "add_point_cloud" and props["precision"] == "float32"

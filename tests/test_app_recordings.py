@@ -15,7 +15,7 @@ from spherloc.datasets.variation import Variation
 from spherloc.errors import RecordingError
 from spherloc.estimators import default_options, estimate
 from spherloc_viz.app import session as session_module
-from spherloc_viz.app.catalog import MOST_BRIEF, Catalog, SceneRequest
+from spherloc_viz.app.catalog import MAX_BRIEF, Catalog, SceneRequest
 from spherloc_viz.app.page_runs import LOOK_S, PageRuns
 from spherloc_viz.app.review import notes as notes_module
 from spherloc_viz.app.review.export import Exporter
@@ -36,8 +36,8 @@ def test_recorded_problems_do_not_pile_up(tmp_path: Path) -> None:
     page, before = catalog.branch(), len(catalog.scenes)
     scene = catalog.scenes["tiny"]
     labels = [page.enter(scene, tmp_path / f"{k}.rrd", "tiny (recorded)", brief=True) for k in range(20)]
-    assert len(page.scenes) == before + MOST_BRIEF and len(catalog.scenes) == before
-    assert all(label in page.scenes for label in labels[-MOST_BRIEF:]) and page.path(labels[-1]).name == "19.rrd"
+    assert len(page.scenes) == before + MAX_BRIEF and len(catalog.scenes) == before
+    assert all(label in page.scenes for label in labels[-MAX_BRIEF:]) and page.path(labels[-1]).name == "19.rrd"
     assert page.enter(scene, tmp_path / "19.rrd", "tiny (recorded)", brief=True) == labels[-1]
 
 

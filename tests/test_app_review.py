@@ -22,7 +22,7 @@ from spherloc_viz.app.review.filters import PAGE, Counts, Look, filters_html
 from spherloc_viz.app.review.gallery_list import file_of, gallery_html
 from spherloc_viz.app.review.rows import DESK, WIDTH_PX, rows_html, verdict_html
 from spherloc_viz.app.review.run_library import RunLibrary, merged
-from spherloc_viz.app.web.touch import MOST_LETTERS, Touch, Touches, parse
+from spherloc_viz.app.web.touch import MAX_LETTERS, Touch, Touches, parse
 from spherloc_viz.cli import app
 from spherloc_viz.gallery import gallery_cases
 from spherloc_viz.recording.index.query import Range
@@ -258,7 +258,7 @@ def test_an_export_is_whole_readable_and_bounded(
     assert first["note"] == "'=1+1" and first["labels"] == "a; b" and first["rotation_error_deg"] == "0.0"
     assert packed.runs == 2 and "2 were left out, since their files are gone" in packed.sentence
     assert "5 more were left out" in packed.sentence
-    monkeypatch.setattr(export, "MOST_BYTES", 20)
+    monkeypatch.setattr(export, "MAX_BYTES", 20)
     assert bundle(path, library.folder, rows, 4, NOW, lambda: False).runs == 1
     with pytest.raises(RecordingError, match="nothing to export"):
         bundle(path, library.folder, rows[2:], 2, NOW, lambda: False)
@@ -297,7 +297,7 @@ def report(action: str = "select:12", **changes: object) -> str:
 @pytest.mark.parametrize(
     "wrong",
     [
-        *(None, 7, "", "[]", "{}", b"\xff", "[" * 2000, report("views:\ud800"), report(" " * MOST_LETTERS)),
+        *(None, 7, "", "[]", "{}", b"\xff", "[" * 2000, report("views:\ud800"), report(" " * MAX_LETTERS)),
         *(report(at=place) for place in ([0.5], [2.0, 0.5], [float("nan"), 0.5], [10**400, 0.5], "ab", None)),
     ],
 )

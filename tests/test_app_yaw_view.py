@@ -26,8 +26,8 @@ from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.layers.yaw_story import (
     ALL,
     KINDS,
-    MOST_BARS,
-    MOST_CHOSEN,
+    MAX_BARS,
+    MAX_CHOSEN,
     Arcs,
     Bars,
     Window,
@@ -140,9 +140,9 @@ def test_all_arcs_of_a_window_are_counted_by_their_kind(runs: dict[str, Trace], 
     # Sampling may miss an arc that only just reaches into the window.
     assert all(0 <= a - b <= 3 for a, b in zip(counted, total, strict=True)) and sum(total) > 20
     shown = bars.row >= 0
-    assert MOST_BARS <= np.count_nonzero(shown) <= MOST_BARS + 12 and sum(bars.total) > MOST_BARS
+    assert MAX_BARS <= np.count_nonzero(shown) <= MAX_BARS + 12 and sum(bars.total) > MAX_BARS
     held = np.bincount(bars.kind[bars.owner[shown]], minlength=3)
-    assert (held >= np.minimum(bars.total, MOST_BARS // 3)).all(), "each kind has its share"
+    assert (held >= np.minimum(bars.total, MAX_BARS // 3)).all(), "each kind has its share"
 
 
 arcs_strategy = st.lists(st.tuples(st.floats(-180, 179.99), st.floats(0, 360)), min_size=1, max_size=60)
@@ -271,7 +271,7 @@ def test_one_selected_match_brings_its_pairs(runs: dict[str, Trace]) -> None:
         match = int(run.problem.aligned.index[5])
         bars = bars_in(run, arcs_of(run, (match,)), ALL, (match,))
         held = (bars.pairs == match).any(axis=1)
-        assert np.array_equal(held, bars.chosen) and 3 <= held.sum() <= MOST_CHOSEN + MOST_BARS // 3
+        assert np.array_equal(held, bars.chosen) and 3 <= held.sum() <= MAX_CHOSEN + MAX_BARS // 3
         assert np.array_equal(bars_in(run, arcs_of(run, ()), ALL, ()).chosen.any(), False)
 
 

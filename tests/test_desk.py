@@ -28,7 +28,7 @@ from spherloc_viz.app.desk.page import COLUMNS, desk_page
 from spherloc_viz.app.desk.report import comparison_html, comparison_text
 from spherloc_viz.app.desk.run_map import FEATURES, run_map
 from spherloc_viz.app.review.run_library import RunLibrary
-from spherloc_viz.app.web.desk import MOST_REVIEWED, DeskRoom
+from spherloc_viz.app.web.desk import MAX_REVIEWED, DeskRoom
 from spherloc_viz.app.web.downloads import Downloads
 from spherloc_viz.recording.content.data import read_recording
 from spherloc_viz.recording.content.writer import write_recording
@@ -290,7 +290,7 @@ def test_labels_are_given_taken_back_and_kept(recorded: Path) -> None:
         assert run == {"file": "a.rrd", "before": ["odd"], "noteBefore": "", "labels": ["seen"], "note": "look"}
         runs = await (await door.get("desk/runs")).json()
         assert runs["notes"] == {"a.rrd": "look"} and runs["version"] != told["version"]
-        many = [changes[0]] * (MOST_REVIEWED + 1)
+        many = [changes[0]] * (MAX_REVIEWED + 1)
         assert (await do(door, {"do": "review", "changes": many})).status == 400
 
     visit(recorded, calls)

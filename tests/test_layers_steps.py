@@ -18,7 +18,7 @@ from spherloc_viz import style
 from spherloc_viz.layers import paint, ring, steps, yaw
 from spherloc_viz.layers.frame import RunView
 from spherloc_viz.layers.primitives import Balls, Picture, Points, SceneItem, Segments
-from spherloc_viz.layers.ransac import MOST_IMPROVEMENTS
+from spherloc_viz.layers.ransac import MAX_IMPROVEMENTS
 from spherloc_viz.layers.translation import BallSet
 from spherloc_viz.layers.yaw import Arcs
 
@@ -391,9 +391,9 @@ def test_many_improvements_are_thinned_evenly_with_both_ends(ransac: Trace) -> N
     )
     trace = replace(ransac, stages=(long, *ransac.stages[1:]))
     keys = keys_like(trace, r"sample-\d+")
-    assert len(keys) == MOST_IMPROVEMENTS and (keys[0], keys[-1]) == ("sample-1", "sample-200")
+    assert len(keys) == MAX_IMPROVEMENTS and (keys[0], keys[-1]) == ("sample-1", "sample-200")
     assert not keys_like(trace, r"sample-\d+-pose") and len(steps(trace)) <= 200
-    assert f"{MOST_IMPROVEMENTS} of 200 improvements" in at(trace, "sample-1").step.note
+    assert f"{MAX_IMPROVEMENTS} of 200 improvements" in at(trace, "sample-1").step.note
 
 
 def test_the_history_of_ransac_ends_where_the_step_is(ransac: Trace) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from spherloc_viz.app.lesson_file import MOST_BYTES_OF_FILE, exported, handout_of, recorded_states
+from spherloc_viz.app.lesson_file import MAX_BYTES_OF_FILE, exported, handout_of, recorded_states
 from spherloc_viz.app.stage.still_page import scripts_in
 from spherloc_viz.lessons import lesson_named, lessons
 from spherloc_viz.lessons.html import list_page, notes_page, teacher_page
@@ -41,7 +41,7 @@ def test_an_exported_lesson_has_all_of_its_scenes_and_no_dead_control(page: str)
     numbers = json.loads(part(page, "numbers"))
     assert numbers[str(states.index(changed_state(lesson.moments[1].state, "")))]["pairs_at_yaw"] == "218"
     assert ">218</output>" in body and "<b>90 %</b>" in body, "numbers and settings stand there without the script"
-    assert len(page.encode()) < MOST_BYTES_OF_FILE
+    assert len(page.encode()) < MAX_BYTES_OF_FILE
 
 
 def test_an_exported_lesson_uses_no_network(page: str) -> None:

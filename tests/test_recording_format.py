@@ -23,7 +23,7 @@ from spherloc_viz.layers import paint, steps
 from spherloc_viz.layers.key_step import key_step, step_pose
 from spherloc_viz.recording.content.components import HEIGHT_PX, LONGEST_PX, MATCHES, WIDTH_PX, thumbnail
 from spherloc_viz.recording.content.data import MAX_SCENE_BYTES, NUMBERS, read_recording, read_run_row, scene_text
-from spherloc_viz.recording.content.properties import FORMAT_VERSION, MOST_CHARACTERS, problem_key
+from spherloc_viz.recording.content.properties import FORMAT_VERSION, MAX_CHARACTERS, problem_key
 from spherloc_viz.recording.content.writer import recorded_steps, write_recording
 from spherloc_viz.recording.origin import Origin
 from spherloc_viz.recording.reviews import write_review
@@ -131,10 +131,10 @@ def test_labels_and_note_are_part_of_the_row(trace: Trace, tmp_path: Path) -> No
 
 
 def test_long_names_are_cut_in_the_row_and_whole_in_the_problem(trace: Trace, tmp_path: Path) -> None:
-    long = "<x>" * MOST_CHARACTERS
+    long = "<x>" * MAX_CHARACTERS
     named = replace(trace, problem=replace(trace.problem, name=long, scene=long), message=long)
     row = write_recording(named, tmp_path / "run.rrd")
-    assert all(len(text) == MOST_CHARACTERS for text in (row.name, row.scene, row.message))
+    assert all(len(text) == MAX_CHARACTERS for text in (row.name, row.scene, row.message))
     assert read_recording(tmp_path / "run.rrd").problem.name == long
 
 

@@ -25,7 +25,7 @@ from spherloc_viz.layers import paint, steps
 from spherloc_viz.layers.primitives import Chart, Curve, Picture
 from spherloc_viz.recording.content.columns import Values, static_chunk
 from spherloc_viz.recording.content.layout import append, layout_file, shown_in, split, xxh32
-from spherloc_viz.recording.content.panels import MOST_EDGES, MOST_NODES, panel_chunks, panels_of
+from spherloc_viz.recording.content.panels import MAX_EDGES, MAX_NODES, panel_chunks, panels_of
 from spherloc_viz.recording.content.properties import APPLICATION_ID, REVIEW_ENTITY, legible
 from spherloc_viz.recording.content.writer import write_recording
 from spherloc_viz.recording.rerun_program import rerun_command, rerun_environment
@@ -116,15 +116,15 @@ def test_a_graph_beyond_the_viewers_limits_is_lines(clique_run: Trace) -> None:
     assert stage is not None
     small = panels_of(clique_run)
     count = len(stage.pairs)
-    assert count <= MOST_NODES and len(stage.edges) <= MOST_EDGES and small.graph and not small.large_graph
+    assert count <= MAX_NODES and len(stage.edges) <= MAX_EDGES and small.graph and not small.large_graph
     first, second = np.triu_indices(count, 1)
     dense = replace(stage, edges=np.column_stack([first, second]).astype(np.int32))
     stages = tuple(dense if item is stage else item for item in clique_run.stages)
     trace = replace(clique_run, stages=stages)
     panels = panels_of(trace)
-    assert len(first) > MOST_EDGES and panels.large_graph and not panels.graph
+    assert len(first) > MAX_EDGES and panels.large_graph and not panels.graph
     chunks = {chunk.entity_path: chunk.to_record_batch() for chunk in panel_chunks(trace, panels)}
-    assert len(chunks["/graph/overlaps"].column("LineStrips2D:strips")[0]) == MOST_EDGES
+    assert len(chunks["/graph/overlaps"].column("LineStrips2D:strips")[0]) == MAX_EDGES
     assert len(chunks["/graph/balls"].column("Points2D:positions")[0]) == count
 
 

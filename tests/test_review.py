@@ -11,10 +11,10 @@ from spherloc.errors import InputError, RecordingError
 from spherloc_viz.recording import reviews
 from spherloc_viz.recording.content.properties import APPLICATION_ID
 from spherloc_viz.recording.reviews import (
-    MOST_BYTES,
-    MOST_LABEL_CHARACTERS,
-    MOST_LABELS,
-    MOST_NOTE_CHARACTERS,
+    MAX_BYTES,
+    MAX_LABEL_CHARACTERS,
+    MAX_LABELS,
+    MAX_NOTE_CHARACTERS,
     Review,
     checked_review,
     read_review,
@@ -70,17 +70,17 @@ def test_labels_are_cleaned(tmp_path: Path):
 @pytest.mark.parametrize(
     "labels, note, what",
     [
-        ([str(number) for number in range(MOST_LABELS + 1)], "", "too many"),
-        (["x" * (MOST_LABEL_CHARACTERS + 1)], "", "too long"),
-        ([], "x" * (MOST_NOTE_CHARACTERS + 1), "too long"),
+        ([str(number) for number in range(MAX_LABELS + 1)], "", "too many"),
+        (["x" * (MAX_LABEL_CHARACTERS + 1)], "", "too long"),
+        ([], "x" * (MAX_NOTE_CHARACTERS + 1), "too long"),
     ],
 )
 def test_more_than_is_stored_is_a_sentence(tmp_path: Path, labels: list[str], note: str, what: str):
     with pytest.raises(InputError, match=what):
         write_review(tmp_path / "run.rrd", labels, note, run_id="1")
     assert list(tmp_path.iterdir()) == []
-    full = write_review(tmp_path / "run.rrd", [f"{n}{'x' * 38}" for n in range(20)], "n" * MOST_NOTE_CHARACTERS, "1")
-    assert read_review(tmp_path / "run.rrd") == full and len(full.labels) == MOST_LABELS
+    full = write_review(tmp_path / "run.rrd", [f"{n}{'x' * 38}" for n in range(20)], "n" * MAX_NOTE_CHARACTERS, "1")
+    assert read_review(tmp_path / "run.rrd") == full and len(full.labels) == MAX_LABELS
 
 
 @pytest.mark.parametrize("then", [Review(), Review(("b",), "c")])
@@ -110,7 +110,7 @@ def test_a_damaged_review_is_a_sentence(tmp_path: Path, rng):
     good = path.read_bytes()
     flipped = bytearray(good)
     flipped[int(rng.integers(len(good) // 4, len(good) // 2))] ^= 0xFF
-    for content in (b"", b"no recording", good[: len(good) // 2], bytes(len(good)), good + bytes(MOST_BYTES)):
+    for content in (b"", b"no recording", good[: len(good) // 2], bytes(len(good)), good + bytes(MAX_BYTES)):
         path.write_bytes(content)
         with pytest.raises(RecordingError, match=r"run\.review\.rrd: labels and note cannot be read; delete the file"):
             read_review(run)

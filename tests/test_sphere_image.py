@@ -15,7 +15,7 @@ from spherloc.datasets import load_scene
 from spherloc.datasets.synthetic import SyntheticScene
 from spherloc.geometry import so3_exp
 from spherloc.problem import Problem
-from spherloc_viz.layers.query_image import DIM, MOST_PIXELS, PANORAMA, UNSEEN, photograph, sphere_texture
+from spherloc_viz.layers.query_image import DIM, MAX_PIXELS, PANORAMA, UNSEEN, photograph, sphere_texture
 
 BLOB_PX = 8
 
@@ -118,7 +118,7 @@ def test_large_photographs_are_kept_small(tmp_path: Path) -> None:
     path = tmp_path / "large.png"
     cv2.imwrite(str(path), np.zeros((2000, 4000), np.uint8))
     photo = photograph(path)
-    assert photo is not None and photo.image.shape[0] * photo.image.shape[1] <= 1.01 * MOST_PIXELS
+    assert photo is not None and photo.image.shape[0] * photo.image.shape[1] <= 1.01 * MAX_PIXELS
     assert photo.scale == pytest.approx(photo.image.shape[1] / 4000)
 
 

@@ -19,7 +19,7 @@ from spherloc.datasets.correspondences import read_csv
 from spherloc.datasets.image_folder import read_depth
 from spherloc.datasets.matterport360 import read_dpt, read_pose
 from spherloc.datasets.scene_file import scene_kinds
-from spherloc.errors import MOST_UNBROKEN, CalibrationError, InputError, SpherlocError, legible, show
+from spherloc.errors import MAX_UNBROKEN, CalibrationError, InputError, SpherlocError, legible, show
 from spherloc.experiments.configuration import read_configuration
 from spherloc.experiments.results import read_results
 from spherloc.formats import kitti360_files
@@ -112,7 +112,7 @@ def test_what_is_no_file_is_one_sentence(reader: str, hostile: dict[str, Path]) 
             READERS[reader](path)
         sentence = str(caught.value)
         assert len(sentence) < 1500 and sentence.isprintable(), f"{reader}, {what}: {sentence}"
-        assert max(map(len, sentence.split())) <= MOST_UNBROKEN + 5, f"{reader}, {what}: {sentence}"
+        assert max(map(len, sentence.split())) <= MAX_UNBROKEN + 5, f"{reader}, {what}: {sentence}"
 
 
 def test_paths_within_scenes_too(tmp_path: Path) -> None:

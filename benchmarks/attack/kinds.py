@@ -228,12 +228,12 @@ def _write_upload(folder: Path) -> None:
 
 
 def _read_upload(folder: Path, damaged: Path) -> object:
-    from spherloc_viz.app.panels.uploads import MOST_BYTES, File, Form, open_upload
+    from spherloc_viz.app.panels.uploads import MAX_BYTES, File, Form, open_upload
 
     def content(name: str) -> bytes:
         path = folder / name
         # The browser reads the file, so what is none never comes.
-        return path.read_bytes()[:MOST_BYTES] if path.is_file() else b""
+        return path.read_bytes()[:MAX_BYTES] if path.is_file() else b""
 
     target = folder / "scratch"
     shutil.rmtree(target, ignore_errors=True)

@@ -7,7 +7,7 @@ from typing import Any
 import yaml
 
 from spherloc.cameras._checks import coefficients, finite, located
-from spherloc.errors import MOST_REASON, CalibrationError, reason, shorten, show
+from spherloc.errors import MAX_REASON, CalibrationError, reason, shorten, show
 from spherloc.files import read_file
 
 MAX_FILE_BYTES = 256 * 1024
@@ -69,7 +69,7 @@ def parse_yaml(text: str) -> Any:
         mark = getattr(error, "problem_mark", None)
         place = f"line {mark.line + 1}" if mark else "the text"
         what = shorten(
-            str(getattr(error, "problem", None) or getattr(error, "reason", None) or "syntax error"), MOST_REASON
+            str(getattr(error, "problem", None) or getattr(error, "reason", None) or "syntax error"), MAX_REASON
         )
         raise UnrecognisedError(f"{place} is not valid YAML ({what}): correct it.") from None
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:

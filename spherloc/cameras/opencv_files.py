@@ -16,7 +16,7 @@ from spherloc.errors import CalibrationError, show
 
 _FISHEYE, _RADIAL = {"equidistant", "fisheye"}, {"plumb_bob", "radtan"}
 """Values of ``distortion_model``."""
-_MOST_SKEW = 1e-6
+_MAX_SKEW = 1e-6
 """Of the focal length."""
 
 
@@ -28,7 +28,7 @@ def opencv(document: dict[Any, Any]) -> Camera:
     size = value_of(document, "image_width"), value_of(document, "image_height")
     with located("camera_matrix"):
         fx, skew, cx, zero, fy, cy, *last = _matrix(value_of(document, "camera_matrix"), 9)
-        if abs(skew) > _MOST_SKEW * abs(fx) or (zero, *last) != (0.0, 0.0, 0.0, 1.0):
+        if abs(skew) > _MAX_SKEW * abs(fx) or (zero, *last) != (0.0, 0.0, 0.0, 1.0):
             raise CalibrationError("is no matrix [fx 0 cx; 0 fy cy; 0 0 1]: give one without skew.")
     with located("distortion_coefficients"):
         lens = _matrix(document["distortion_coefficients"], None)

@@ -27,9 +27,9 @@ from spherloc.types import BoolArray, FloatArray, IntArray
 
 _KEPT = 64
 """Images whose observations stay in memory, those used last."""
-_LEAST_AGREEMENT = 0.9
+_MIN_AGREEMENT = 0.9
 """Length of the mean of the cameras' +y axes: 0.9 where all tilt by 25 degrees."""
-_LEAST_ANGLE_DEG = 1.5
+_MIN_ANGLE_DEG = 1.5
 """Between the rays to a point: COLMAP's mapper removes points below it (``filter_min_tri_angle``)."""
 
 
@@ -77,7 +77,7 @@ def model_views(model: ColmapModel, images: Path) -> tuple[list[View], list[str]
 def without_queries(model: ColmapModel, queries: Collection[str], where: str) -> tuple[ColmapModel, list[str]]:
     """The model without the points that it has only because of the images named ``queries``, and a remark on them.
 
-    A point that a query observes stays if the rays to it from other images are ``_LEAST_ANGLE_DEG`` apart. One that
+    A point that a query observes stays if the rays to it from other images are ``_MIN_ANGLE_DEG`` apart. One that
     only the query and one reference (or several at one place) see was intersected with the query's own ray: by its
     construction it fits the query's true pose, so that a match with it would test nothing. For more than two rays their
     angle is that across the box around their unit vectors, at most sqrt(3) times the largest between two.
@@ -97,11 +97,11 @@ def without_queries(model: ColmapModel, queries: Collection[str], where: str) ->
         rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), np.finfo(float).tiny)
         low[places] = np.minimum(low[places], rays)
         high[places] = np.maximum(high[places], rays)
-    apart = np.linalg.norm(high - low, axis=1) >= 2.0 * np.sin(np.radians(_LEAST_ANGLE_DEG) / 2.0)
+    apart = np.linalg.norm(high - low, axis=1) >= 2.0 * np.sin(np.radians(_MIN_ANGLE_DEG) / 2.0)
     stay = ~observed | (np.isfinite(low[:, 0]) & apart)
     if stay.all():
         return model, []
-    reason = f"without the queries, no two images see them from directions {_LEAST_ANGLE_DEG} degrees apart"
+    reason = f"without the queries, no two images see them from directions {_MIN_ANGLE_DEG} degrees apart"
     if others and not stay.any():
         raise InputError(
             f"{where}: no point of the model can be used: {reason}; name fewer queries, or add images to the model."
@@ -150,7 +150,7 @@ def gravity_of_map(own: Mapping[str, Any], references: Iterable[View], where: st
     axes = [reference.cam_from_map[1, :3] for reference in references if reference.cam_from_map is not None]
     mean = np.mean(axes, axis=0) if axes else np.zeros(3)
     length = float(np.linalg.norm(mean))
-    if axes and length < _LEAST_AGREEMENT:
+    if axes and length < _MIN_AGREEMENT:
         raise InputError(
             f"{where}: the reference cameras were not held upright, so they do not show where down is; add a section "
             "[gravity] with map = [x, y, z] pointing down."

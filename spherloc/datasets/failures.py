@@ -399,7 +399,7 @@ def failure_case(cause: str, seed: int) -> FailureCase:
 GroupKind = Literal["right", "agreeing", "near", "doubled", "random"]
 GROUP_KINDS: tuple[str, ...] = get_args(GroupKind)
 CUBE = "cube"
-MOST_MATCHES = 2_000
+MAX_MATCHES = 2_000
 NEAR_M = 0.5
 NEAR_YAW_DEG = 5.0
 """How far a pose that passes for the true one is from it."""
@@ -421,8 +421,8 @@ class Group:
     def __post_init__(self) -> None:
         if self.kind not in GROUP_KINDS:
             raise InputError(f"a group's kind is {show(self.kind)}; give one of {', '.join(GROUP_KINDS)}.")
-        if not 1 <= self.count <= MOST_MATCHES:
-            raise InputError(f"a group's count is {self.count}; give a whole number from 1 to {MOST_MATCHES:,}.")
+        if not 1 <= self.count <= MAX_MATCHES:
+            raise InputError(f"a group's count is {self.count}; give a whole number from 1 to {MAX_MATCHES:,}.")
         if self.place != CUBE and (self.place not in PLACES or self.kind not in ("right", "random")):
             known = f'"{CUBE}" or, for right and random ones, one of {", ".join(PLACES)}'
             raise InputError(f"a group's place is {show(self.place)}; give {known}.")

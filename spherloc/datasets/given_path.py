@@ -13,7 +13,7 @@ VIDEOS = {".360", ".avi", ".insv", ".m4v", ".mkv", ".mov", ".mp4", ".webm"}
 SCENE = "give the path of a scene file (TOML) or a bundled scene's name, which spherloc scenes lists"
 COMMAND = re.compile(r": spherloc [^;]*$")
 """A command at the end of a sentence."""
-_MOST_FOLDERS = 50
+_MAX_FOLDERS = 50
 """Folders in a folder that are looked into for images."""
 
 _COLMAP = "a scene of kind colmap localizes its images: spherloc scenes colmap prints one to start from"
@@ -107,7 +107,7 @@ def _images(names: Sequence[str]) -> int:
 def _image_folders(path: Path, names: Sequence[str]) -> dict[str, int]:
     """How many images there are in those folders in a folder that have some, by name."""
     counts = {}
-    for name in [name for name in names if is_folder(path / name)][:_MOST_FOLDERS]:
+    for name in [name for name in names if is_folder(path / name)][:_MAX_FOLDERS]:
         try:
             counts[name] = _images(names_in(path / name))
         except InputError:

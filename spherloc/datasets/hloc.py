@@ -34,7 +34,7 @@ from spherloc.formats.hloc_files import (
     read_queries,
     read_results,
 )
-from spherloc.frontend.pipeline import MOST_REFERENCES, image_matcher
+from spherloc.frontend.pipeline import MAX_REFERENCES, image_matcher
 from spherloc.frontend.view import Matcher, Matches, View
 from spherloc.types import FloatArray, IntArray
 
@@ -319,7 +319,7 @@ def _retrieved(
     for row, view in enumerate(queries):
         order = np.argsort(-(descriptors[rows] @ descriptors[row]), kind="stable") if known[row] else []
         if len(order):
-            pairs[view.name] = tuple(names[rows[place]] for place in order[:MOST_REFERENCES])
+            pairs[view.name] = tuple(names[rows[place]] for place in order[:MAX_REFERENCES])
     missing = int(np.count_nonzero(~known))
     return pairs, [f"{missing} of {len(names)} images have no descriptor in {file}."] if missing else []
 

@@ -27,7 +27,7 @@ WINDOW_S = 3.0
 turns the average by no more than 1.5 degrees at the ends of a recording, where the window has one side only."""
 MAX_GAP_S = 0.1
 """A longer gap separates the measurements: how the unit turned in it is not known."""
-LEAST_S = 1.0
+MIN_S = 1.0
 """Of measurements without a gap that a direction must come from."""
 DISTURBED_M_S2 = 2.0
 """Forces that differ from gravity by this much weigh 0.6 of the others."""
@@ -113,7 +113,7 @@ def down_at(samples: ImuSamples, timestamps_ns: NDArray[np.int64]) -> FloatArray
     """Unit vectors (N, 3) pointing down in the unit's frame at the given times (N,).
 
     NaN before the first and after the last measurement, in gaps longer than ``MAX_GAP_S`` and where there are less
-    than ``LEAST_S`` of measurements between two gaps.
+    than ``MIN_S`` of measurements between two gaps.
     """
     down = np.full((len(timestamps_ns), 3), np.nan)
     times_ns = samples.timestamps_ns
@@ -121,7 +121,7 @@ def down_at(samples: ImuSamples, timestamps_ns: NDArray[np.int64]) -> FloatArray
     for first, end in zip([0, *cuts], [*cuts, len(times_ns)], strict=True):
         piece, first_ns, last_ns = slice(first, end), times_ns[first], times_ns[end - 1]
         asked = np.flatnonzero((timestamps_ns >= first_ns) & (timestamps_ns <= last_ns))
-        if len(asked) and last_ns - first_ns >= LEAST_S * NS_PER_S:
+        if len(asked) and last_ns - first_ns >= MIN_S * NS_PER_S:
             times_s = (times_ns[piece] - first_ns) / NS_PER_S
             asked_s = (timestamps_ns[asked] - first_ns) / NS_PER_S
             down[asked] = _down(times_s, samples.rates_rad_s[piece], samples.forces_m_s2[piece], asked_s)

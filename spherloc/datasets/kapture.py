@@ -42,7 +42,7 @@ bound_deg = 5.0                  # how far a query's roll and pitch may be from 
 
 GRAVITY_BOUND_DEG = 5.0
 """A reference's roll and pitch are not the query's: cameras are held by hand."""
-_LEAST_NANOSECONDS = 10**17
+_MIN_NANOSECONDS = 10**17
 """Timestamps from here on, March 1973, are nanoseconds; smaller ones may be running numbers."""
 _SELECTION = {"images", "devices", "timestamps", "every"}
 
@@ -163,7 +163,7 @@ def _posed_apart(
 
 
 def _view(kapture: Kapture, root: Path, record: Record) -> View:
-    nanoseconds = abs(record.timestamp) >= _LEAST_NANOSECONDS
+    nanoseconds = abs(record.timestamp) >= _MIN_NANOSECONDS
     return View(
         name=record.image,
         camera=kapture.cameras[record.device],

@@ -48,8 +48,8 @@ THRESHOLDS = ((2.0, 0.25), (5.0, 0.5), (10.0, 5.0))
 """The dataset's own."""
 GRAVITY_BOUND_DEG = 5.0
 POSES, IMAGES = "camera_pose.json", "image"
-_MOST_BYTES = 1 << 26
-_MOST_STEPS = 100_000
+_MAX_BYTES = 1 << 26
+_MAX_STEPS = 100_000
 
 
 def load(table: dict[str, Any], path: Path) -> MapScene:
@@ -86,7 +86,7 @@ def _views(root: Path, table: Mapping[str, Any], key: str, step_key: str, where:
     named = [table[key]] if isinstance(table[key], str) else table[key]
     if not isinstance(named, list) or not named or not all(isinstance(one, str) and one for one in named):
         raise InputError(f"{where}: {key} is {show(table[key])}; give folders below root.")
-    step = scene_file.integer({step_key: 1} | dict(table), step_key, where, 1, _MOST_STEPS)
+    step = scene_file.integer({step_key: 1} | dict(table), step_key, where, 1, _MAX_STEPS)
     sequences = list(dict.fromkeys(one for name in named for one in _sequences(root, name, key, where)))
     views, missing = [], []
     for sequence in sequences:
@@ -117,7 +117,7 @@ def _sequences(root: Path, name: str, key: str, where: str) -> Iterator[_Sequenc
 def _poses(path: Path) -> dict[str, FloatArray]:
     """``cam_from_map`` (3, 4) by the names of the images."""
     with reading(path, "correct the path of the dataset"):
-        content = read_file(path, _MOST_BYTES)
+        content = read_file(path, _MAX_BYTES)
     try:
         table = json.loads(content)
     except (ValueError, RecursionError):

@@ -27,7 +27,7 @@ TRUE_INLIER_PX = 8.0
 ASSUMED_DOWN_DEG = 5.0
 """Bound on the error of a map's gravity that is taken from how its cameras were held."""
 
-MOST_BOUND_RAD = float(np.radians(85.0))
+MAX_BOUND_RAD = float(np.radians(85.0))
 
 Thresholds = tuple[tuple[float, float], ...]
 """Limits (degrees, metres) within which a localization counts as a success, strictest first."""
@@ -186,7 +186,7 @@ class MapScene:
         if not more_rad:
             return bound_rad, sd_rad
         known_rad = bound_rad / BOUND_SD if sd_rad is None else sd_rad
-        return min(bound_rad + more_rad, MOST_BOUND_RAD), float(np.hypot(known_rad, more_rad / BOUND_SD))
+        return min(bound_rad + more_rad, MAX_BOUND_RAD), float(np.hypot(known_rad, more_rad / BOUND_SD))
 
     def _like(self, reference: View) -> Gravity:
         """Of a query that stands as a reference does."""

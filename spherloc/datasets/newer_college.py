@@ -105,13 +105,13 @@ def _check_header(path: Path) -> None:
 
 TOLERANCE = 1e-3
 """How far a rotation given by hand may be from orthonormal."""
-LEAST_SPREAD = 0.02
+MIN_SPREAD = 0.02
 """Positions whose second extent is a smaller share of the first lie on a line, which fixes no rotation about it."""
 FARTHEST = 1e9
 """In the units of either frame."""
 WORST_FIT = 0.1
 """Of the extent of the positions: a larger residual means that they are not the same positions."""
-LEAST_USED = 0.8
+MIN_USED = 0.8
 """Share of the positions that must fit: three of four always do, whatever they are."""
 _REMEDY = "give map_from_model"
 _ROUNDS = 30
@@ -181,7 +181,7 @@ def align(old: FloatArray, new: FloatArray, where: str) -> Alignment:
     good = np.less_equal(residuals, max(_INLIER_MEDIANS * float(np.median(residuals)), 1e-3))
     used, rms = int(good.sum()), float(np.sqrt(np.mean(residuals[good] ** 2)))
     extent = float(np.sqrt(np.mean(np.sum((new - new.mean(axis=0)) ** 2, axis=1))))
-    if rms > WORST_FIT * extent or used < LEAST_USED * len(old):
+    if rms > WORST_FIT * extent or used < MIN_USED * len(old):
         raise InputError(
             f"{where}: the positions do not fit, {used} of {len(old)} by {rms:.2g} m over {extent:.2g} m; take both "
             f"from the same recording, or {_REMEDY}."
@@ -193,7 +193,7 @@ def align(old: FloatArray, new: FloatArray, where: str) -> Alignment:
 def _check_spread(old: FloatArray, new: FloatArray, where: str) -> None:
     for positions in (old, new):
         extents = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False)
-        if not extents[1] > LEAST_SPREAD * extents[0]:
+        if not extents[1] > MIN_SPREAD * extents[0]:
             raise InputError(f"{where}: the positions lie on a line, so that a rotation stays open; {_REMEDY}.")
 
 

@@ -15,7 +15,7 @@ from spherloc.frontend.view import Gravity, View
 from spherloc.types import FloatArray
 
 SOURCE = "pitch and roll in the photograph's tags"
-MOST_BYTES = 1_000_000
+MAX_BYTES = 1_000_000
 _GPANO = "{http://ns.google.com/photos/1.0/panorama/}"
 _PITCH, _ROLL = "PosePitchDegrees", "PoseRollDegrees"
 _LIMITS_DEG = {_PITCH: 90.0, _ROLL: 180.0}
@@ -59,7 +59,7 @@ def _pitch_and_roll(packet: bytes, place: str) -> tuple[float, float]:
     """Degrees; pitch alone is enough, as cameras leave out a roll of 0, and the other way round."""
     damaged = InputError(f"{place}: its XMP tags are damaged, so that its pitch and roll cannot be read.")
     # Declarations could define entities that grow without end or name other files; XMP has none.
-    if len(packet) > MOST_BYTES or b"<!" in packet or b"\0" in packet:
+    if len(packet) > MAX_BYTES or b"<!" in packet or b"\0" in packet:
         raise damaged
     try:
         root = ElementTree.fromstring(packet.strip())

@@ -30,7 +30,7 @@ SOURCES = ("reference", "lines", "tags", "level", "truth")
 _KEYS = {"bound_deg", "sd_deg", "file", "query", "map_bound_deg"}
 BOUND_SD = 3.0
 """A bound in standard deviations."""
-_MOST_SD_DEG = 25.0
+_MAX_SD_DEG = 25.0
 _ROW = re.compile(r'(?:"([^"]+)"|([^\s,"]+))[\s,]+(.*)')
 _COLUMNS = "image gx gy gz [sd_deg]"
 
@@ -190,8 +190,8 @@ def read_gravity_file(path: Path) -> dict[str, Gravity]:
         length = float(np.linalg.norm([x, y, z]))
         if not 1e-3 < length < 1e6:
             raise InputError(f"{place}: its vector has the length {length:.3g}; give one that points down.")
-        if sd_deg and not 0.0 <= sd_deg[0] <= _MOST_SD_DEG:
-            raise InputError(f"{place}: sd_deg is {sd_deg[0]:g}; give degrees from 0 to {_MOST_SD_DEG:g}.")
+        if sd_deg and not 0.0 <= sd_deg[0] <= _MAX_SD_DEG:
+            raise InputError(f"{place}: sd_deg is {sd_deg[0]:g}; give degrees from 0 to {_MAX_SD_DEG:g}.")
         if name in found:
             raise InputError(f"{place}: {show(name)} is there a second time; keep one row.")
         sd_rad = float(np.radians(sd_deg[0])) if sd_deg else None

@@ -27,7 +27,7 @@ GATES_M = (1.0, 0.2)
 """Points farther from the map than this are left out; it shrinks from round to round."""
 STILL_M = 1e-4
 FITS_M = 0.1
-LEAST_FIT = 0.4
+MIN_FIT = 0.4
 """Share of the query's upright surfaces that must lie within ``FITS_M`` of the map: floors fit anywhere."""
 UPRIGHT = 0.7
 """A surface is upright if its normal has less than this along gravity."""
@@ -120,7 +120,7 @@ def registration_error_m(start: Surfaces, fixed: Surfaces, down: FloatArray) -> 
         if still and gate <= 2 * GATES_M[1]:
             break
     upright = np.abs(normals @ down) < UPRIGHT
-    if not upright.any() or np.mean(tree.query(points[upright])[0] < FITS_M) < LEAST_FIT:
+    if not upright.any() or np.mean(tree.query(points[upright])[0] < FITS_M) < MIN_FIT:
         return np.inf
     return float(np.sqrt(np.mean(np.sum((points - start.points) ** 2, axis=1))))
 

@@ -27,8 +27,8 @@ from spherloc.geometry import pose, so3_exp
 from spherloc.types import BoolArray, ByteArray, FloatArray
 from spherloc.worlds import Conditions, World, build_world, image_path, render, stored_range
 
-MOST_VIEWS = 500
-MOST_PIXELS = 4_000_000
+MAX_VIEWS = 500
+MAX_PIXELS = 4_000_000
 """A picture of more takes too long to draw."""
 ROUTE_LIMITS = {"offset_m": (-50.0, 50.0), "heading_deg": (-180.0, 180.0), "start": (0.0, 1.0), "stop": (0.0, 1.0)}
 CONDITION_KEYS = {field.name for field in fields(Conditions)}
@@ -128,8 +128,8 @@ def load(table: dict[str, Any], path: Path) -> MapScene:
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
     camera = camera_from_table(scene_file.section(table, "camera", where), f"{where} [camera]")
-    if camera.width * camera.height > MOST_PIXELS:
-        raise InputError(f"{where} [camera]: more than {MOST_PIXELS:,} pixels take too long to draw; give fewer.")
+    if camera.width * camera.height > MAX_PIXELS:
+        raise InputError(f"{where} [camera]: more than {MAX_PIXELS:,} pixels take too long to draw; give fewer.")
     queries, tilt_deg = _queries(scene_file.section(table, "queries", where), f"{where} [queries]", world, camera)
     settings = map_scene.read_settings(table, where, gravity_bound_deg=tilt_deg)
     references = _references(scene_file.section(table, "references", where), f"{where} [references]", world, camera)
@@ -159,7 +159,7 @@ def _queries(table: Mapping[str, Any], where: str, world: World, camera: Camera)
     views = []
     for number, place in enumerate(_poses(table, where, world)):
         # Occluders and noise differ from those of the references.
-        tilted, seed = _tilted(place, tilt_deg, number), MOST_VIEWS + number
+        tilted, seed = _tilted(place, tilt_deg, number), MAX_VIEWS + number
         views.append(_view(Picture(f"query_{number:03d}", world, camera, tilted, conditions, seed)))
     return tuple(views), tilt_deg
 
@@ -176,7 +176,7 @@ def _view(picture: Picture, lift: DepthLift | None = None) -> RenderedView:
 
 
 def _poses(table: Mapping[str, Any], where: str, world: World) -> FloatArray:
-    count = scene_file.integer(table, "count", where, 1, MOST_VIEWS)
+    count = scene_file.integer(table, "count", where, 1, MAX_VIEWS)
     number = partial(scene_file.number, table, where=where)
     route = {key: number(key, lowest=low, highest=high) for key, (low, high) in ROUTE_LIMITS.items() if key in table}
     return world.route(count, **route)

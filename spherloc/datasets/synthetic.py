@@ -59,7 +59,7 @@ draws = "uniform"                 # optional: of coordinates, in the cube; or "n
 """
 
 MOST_CORRESPONDENCES = 10_000
-MOST_GRAVITY_ERROR_DEG = 10.0
+MAX_GRAVITY_ERROR_DEG = 10.0
 GRAVITY_BOUND_SD = 3.0
 """The bound on gravity, in standard deviations. Errors beyond it (1.1 %) are drawn again, so that the bound is true."""
 LIMITS: Mapping[str, tuple[float, float]] = {
@@ -67,7 +67,7 @@ LIMITS: Mapping[str, tuple[float, float]] = {
     "outlier_rate": (0.0, 1.0),
     "noise_px": (0.0, 100.0),
     "seed": (0, 2**63 - 1),
-    "gravity_error_deg": (0.0, MOST_GRAVITY_ERROR_DEG),
+    "gravity_error_deg": (0.0, MAX_GRAVITY_ERROR_DEG),
     "field_of_view_deg": (10.0, WHOLE_SPHERE_DEG),
     "cloud_height_m": (0.0, 2 * HALF_SIZE_M),
 }

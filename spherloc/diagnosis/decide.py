@@ -15,7 +15,7 @@ CHANCE = 0.01
 """A consensus is believed if fewer sets of its size are expected by chance."""
 LEAST = 4
 """Nor is a smaller consensus ever believed: two matches fix a pose, and a third one agrees too easily."""
-LEAST_RIGHT_RATE = 0.04
+MIN_RIGHT_RATE = 0.04
 """Share of right matches that any right reference image gives: with this many matches, none standing out means that
 the reference is wrong. Without the truth nothing else tells the two apart."""
 SPREAD = 1.5
@@ -68,7 +68,7 @@ def without_truth(e: Evidence) -> Cause:
         if e.found(2.0) >= SPREAD * max(1, free, best):
             return Cause.BOUND_TOO_SMALL
     if not believed:
-        expected = int(LEAST_RIGHT_RATE * len(e.aligned.points))
+        expected = int(MIN_RIGHT_RATE * len(e.aligned.points))
         return Cause.WRONG_REFERENCE if stands_out(e, expected) else Cause.TOO_FEW_INLIERS
     second = 0 if e.alternative is None else e.alternative.support(e.bound_px)
     if stands_out(e, second) and second >= EQUAL * best:

@@ -82,11 +82,11 @@ SAMPLES = 20_000
 MOST_WORK = 20_000_000
 """Samples times correspondences; above it the search draws fewer."""
 CONFIDENCE = 0.9999
-MOST_TILT_RAD = np.radians(12.0)
+MAX_TILT_RAD = np.radians(12.0)
 """Gravity errors up to this are looked for."""
 WIDER = 4.0
 """A noise bound that is too small is looked for up to this many times as much."""
-MOST_CERTIFIED = 500
+MAX_CERTIFIED = 500
 """Correspondences up to which a run without a certificate is given one."""
 EFFORT = 0.3
 """Of an exact search: enough where a pose stands out, and little where many are alike."""
@@ -145,7 +145,7 @@ def alternative(aligned: AlignedProblem, best: Fit, bound_px: float, options: Re
 
 def certify(trace: Trace) -> Certificate | None:
     """The run's certificate, or that of an exact search of its problem; None if that has too many correspondences."""
-    if trace.certificate is not None or len(trace.problem) > MOST_CERTIFIED:
+    if trace.certificate is not None or len(trace.problem) > MAX_CERTIFIED:
         return trace.certificate
     given = {item.name: getattr(trace.options, item.name) for item in fields(RefinementOptions)}
     options = McExactOptions(bound_px=trace.options.bound_px, effort=EFFORT, **given)
@@ -160,8 +160,8 @@ def free_fit(aligned: AlignedProblem, starts: list[FloatArray], bound_px: float)
     """
     free = replace(aligned, gravity_bound_rad=0.0, gravity_sd_rad=np.inf)
     wide, options = WIDER * bound_px, RefinementOptions(gravity_sd_deg=np.inf)
-    steps = wide + float(np.median(aligned.pixels_per_radian)) * MOST_TILT_RAD * 0.5 ** np.arange(5)
-    loose = search(replace(aligned, gravity_bound_rad=MOST_TILT_RAD), wide, options)
+    steps = wide + float(np.median(aligned.pixels_per_radian)) * MAX_TILT_RAD * 0.5 ** np.arange(5)
+    loose = search(replace(aligned, gravity_bound_rad=MAX_TILT_RAD), wide, options)
     fits = []
     for start, levels in [(start, ()) for start in starts] + ([] if loose is None else [(loose, steps)]):
         for level in (*levels, wide):

@@ -21,7 +21,7 @@ OVERHEAD_MS = 2.0
 """Of a run beside its estimator: drawing the problem, judging the pose."""
 KEEPING_MS = 50.0
 """Of a run that is kept, beside that."""
-MOST_DEATHS = 3
+MAX_DEATHS = 3
 LISTEN_S = 0.1
 
 
@@ -129,9 +129,9 @@ class Backlog:
         """A task's worker died. Raises ``InputError`` if it always does."""
         if jobs == self._trial:
             self._deaths[jobs[0]] += 1
-            if self._deaths[jobs[0]] == MOST_DEATHS:
+            if self._deaths[jobs[0]] == MAX_DEATHS:
                 raise InputError(
-                    f"{self._plan.place(jobs[0])}: its worker process was killed {MOST_DEATHS} times; see whether the "
+                    f"{self._plan.place(jobs[0])}: its worker process was killed {MAX_DEATHS} times; see whether the "
                     "memory suffices, or sweep without it."
                 )
         self._leave(jobs)

@@ -35,7 +35,7 @@ AXES: Mapping[str, str] = {
 }
 """What a sweep can go over, and its name for people."""
 
-MOST_VALUES, MOST_ENTRANTS, MOST_RUNS, MOST_ROWS = 200, 20, 100_000, 2_000_000
+MAX_VALUES, MAX_ENTRANTS, MAX_RUNS, MAX_ROWS = 200, 20, 100_000, 2_000_000
 FORMAT = 2
 
 
@@ -243,8 +243,8 @@ def planned(
 
 def _checked_values(over: str, values: Sequence[float]) -> tuple[float, ...]:
     found = tuple(sorted({float(value) for value in values}))
-    if not 1 <= len(found) <= MOST_VALUES:
-        raise InputError(f"the sweep has {len(found)} values; give 1 to {MOST_VALUES} of them.")
+    if not 1 <= len(found) <= MAX_VALUES:
+        raise InputError(f"the sweep has {len(found)} values; give 1 to {MAX_VALUES} of them.")
     strange = next((value for value in found if not np.isfinite(value)), None)
     if strange is None and over == "correspondences":
         strange = next((value for value in found if value != int(value)), None)
@@ -256,8 +256,8 @@ def _checked_values(over: str, values: Sequence[float]) -> tuple[float, ...]:
 
 def _checked_entrants(entrants: Sequence[Entrant]) -> tuple[Entrant, ...]:
     labels = [entrant.label for entrant in entrants]
-    if not 1 <= len(labels) <= MOST_ENTRANTS:
-        raise InputError(f"the sweep has {len(labels)} estimators; give 1 to {MOST_ENTRANTS} of them.")
+    if not 1 <= len(labels) <= MAX_ENTRANTS:
+        raise InputError(f"the sweep has {len(labels)} estimators; give 1 to {MAX_ENTRANTS} of them.")
     twice = next((label for label in labels if labels.count(label) > 1), None)
     if twice is not None:
         raise InputError(f"the sweep has the estimator {show(twice)} twice; give it once, or with other options.")
@@ -270,10 +270,10 @@ def _checked_entrants(entrants: Sequence[Entrant]) -> tuple[Entrant, ...]:
 
 
 def _check_counts(plan: SweepPlan) -> None:
-    if not 1 <= plan.runs <= MOST_RUNS:
-        raise InputError(f"the sweep has {plan.runs} runs a point; give a number from 1 to {MOST_RUNS:,}.")
-    if plan.rows > MOST_ROWS:
-        raise InputError(f"the sweep has {plan.rows:,} runs in all; ask for {MOST_ROWS:,} or fewer.")
+    if not 1 <= plan.runs <= MAX_RUNS:
+        raise InputError(f"the sweep has {plan.runs} runs a point; give a number from 1 to {MAX_RUNS:,}.")
+    if plan.rows > MAX_ROWS:
+        raise InputError(f"the sweep has {plan.rows:,} runs in all; ask for {MAX_ROWS:,} or fewer.")
     if not 0 <= plan.first_seed <= 2**63 - 1 - plan.runs:
         raise InputError(f"the first seed is {plan.first_seed}; give a number from 0 to 2^62.")
 
@@ -320,9 +320,9 @@ def parse_values(texts: Sequence[str]) -> tuple[float, ...]:
             found += numbers
         elif len(numbers) == 3 and all(map(math.isfinite, numbers)) and numbers[2] > 0 and numbers[1] >= numbers[0]:
             first, last, step = numbers
-            count = math.floor((last - first) / step + 1e-6) + 1 if last - first < MOST_VALUES * step else math.inf
-            if count > MOST_VALUES:
-                raise InputError(f"the values {show(text)} are more than {MOST_VALUES}; give a larger step.")
+            count = math.floor((last - first) / step + 1e-6) + 1 if last - first < MAX_VALUES * step else math.inf
+            if count > MAX_VALUES:
+                raise InputError(f"the values {show(text)} are more than {MAX_VALUES}; give a larger step.")
             found += [round(first + k * step, 10) for k in range(int(count))]
         else:
             raise InputError(f"the values {show(text)} are none; give numbers, or FIRST:LAST:STEP such as 0.5:0.9:0.1.")

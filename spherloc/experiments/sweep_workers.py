@@ -18,10 +18,10 @@ from spherloc.experiments.sweep_rows import SweepRow
 from spherloc.trace import Trace
 from spherloc.warm_up import warm_up
 
-MOST_WORKERS = 64
+MAX_WORKERS = 64
 AHEAD = 1
 """Tasks that wait beside those that are being done, so that no worker waits for us."""
-MOST_FAILED_STARTS = 2
+MAX_FAILED_STARTS = 2
 NICENESS = 10
 """Whoever waits for an answer of this machine goes before a sweep in the background."""
 
@@ -107,8 +107,8 @@ class LocalWorkers:
 
     def __init__(self, plan: SweepPlan, workers: int, keep: Keep | None) -> None:
         """Raises ``InputError`` for a wrong number of workers."""
-        if not 1 <= workers <= MOST_WORKERS:
-            raise InputError(f"the sweep has {workers} workers; give a number from 1 to {MOST_WORKERS}.")
+        if not 1 <= workers <= MAX_WORKERS:
+            raise InputError(f"the sweep has {workers} workers; give a number from 1 to {MAX_WORKERS}.")
         self._plan, self._workers, self._keep = plan, workers, keep
         self._tasks: dict[Future[Solved], tuple[Job, ...]] = {}
         self._failed_starts = 0
@@ -158,7 +158,7 @@ class LocalWorkers:
     def _replace(self) -> None:
         begun = _result(self._begun) is not None
         self._failed_starts = 0 if begun else self._failed_starts + 1
-        if self._failed_starts == MOST_FAILED_STARTS:
+        if self._failed_starts == MAX_FAILED_STARTS:
             raise InputError(
                 "the worker processes end while they start: in a script, call this under "
                 "'if __name__ == \"__main__\":', else see whether the memory is full."

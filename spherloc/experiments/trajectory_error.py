@@ -7,7 +7,7 @@ import numpy as np
 from spherloc.geometry import rotation_angle
 from spherloc.types import FloatArray
 
-LEAST_POSES = 3
+MIN_POSES = 3
 """Fewer positions fix no alignment."""
 
 
@@ -54,7 +54,7 @@ def align(places: FloatArray, true_places: FloatArray, with_scale: bool) -> tupl
     Umeyama, "Least-squares estimation of transformation parameters between two point patterns", PAMI 1991. None for
     fewer than 3 places, or if they all lie on a line.
     """
-    if len(places) < LEAST_POSES:
+    if len(places) < MIN_POSES:
         return None
     middle, true_middle = places.mean(axis=0), true_places.mean(axis=0)
     moved, true_moved = places - middle, true_places - true_middle

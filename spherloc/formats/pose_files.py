@@ -12,7 +12,7 @@ from spherloc.formats.text_rows import pose_from_words
 from spherloc.types import FloatArray
 
 NUMBERS = ("qw", "qx", "qy", "qz", "tx", "ty", "tz")
-MOST_BYTES = 200_000_000
+MAX_BYTES = 200_000_000
 PICKLES = (".pkl", ".pickle")
 
 
@@ -34,7 +34,7 @@ def read_poses(path: Path) -> dict[str, FloatArray]:
 
 def _read_csv(path: Path) -> dict[str, FloatArray]:
     with reading(path, "give a CSV of poses"):
-        text = read_file(path, MOST_BYTES).decode("utf-8-sig", errors="replace")
+        text = read_file(path, MAX_BYTES).decode("utf-8-sig", errors="replace")
     lines = csv.reader(io.StringIO(text, newline=""))
     poses: dict[str, FloatArray] = {}
     try:

@@ -74,16 +74,16 @@ def _content(path: Path) -> bytes | None:
 
 
 METHODS = tuple(KINDS)
-MOST_FEATURES = 50_000
+MAX_FEATURES = 50_000
 RIM_PX = 4.0
 """Features this close to pixels that may not be used, and farther for large ones, are the rim's and not the scene's."""
-MOST_PIXELS = 5_000_000
+MAX_PIXELS = 5_000_000
 """Larger images are shrunk to this for detection, as COLMAP does: SIFT needs 250 bytes a pixel."""
 FACE_SHARPNESS = 1.4
 """Pixels of a panorama's face, at its centre, for one of the panorama: a third more right matches than 1.0 gives."""
 SAME_FEATURE_PX = 1.0
 """Two faces place the same feature this close to each other, in pixels of the panorama's horizon."""
-MOST_FACE_PIXELS = 12_000_000
+MAX_FACE_PIXELS = 12_000_000
 """Of all faces of a panorama."""
 
 
@@ -103,8 +103,8 @@ class FeatureOptions:
             raise InputError(f"There are no features {show(self.method)}; take one of {', '.join(METHODS)}.")
         count, kind = self.max_features, KINDS[self.method]
         whole = isinstance(count, int) and not isinstance(count, bool)
-        if count is not None and not (whole and 1 <= count <= MOST_FEATURES):
-            raise InputError(f"max_features is {show(count)}; give a whole number from 1 to {MOST_FEATURES}.")
+        if count is not None and not (whole and 1 <= count <= MAX_FEATURES):
+            raise InputError(f"max_features is {show(count)}; give a whole number from 1 to {MAX_FEATURES}.")
         if kind.packaged and self.weights is None:
             trained.check_installed(self.method)
         if kind.learned and not kind.packaged and self.weights is None:
@@ -173,7 +173,7 @@ def extract(view: View, options: FeatureOptions | None = None) -> Features:
 def _on_image(image: ByteArray, usable: ByteArray, options: FeatureOptions) -> tuple[FloatArray, Descriptors]:
     """Keypoints (N, 5) and descriptors of an image in its own pixels, the strongest first."""
     height, width = image.shape[:2]
-    shrink = min(1.0, (MOST_PIXELS / (width * height)) ** 0.5)
+    shrink = min(1.0, (MAX_PIXELS / (width * height)) ** 0.5)
     if shrink < 1.0:
         small = (max(1, round(width * shrink)), max(1, round(height * shrink)))
         image = np.asarray(cv2.resize(image, small, interpolation=cv2.INTER_AREA), np.uint8)
@@ -191,7 +191,7 @@ def _on_faces(
 
     They are found on flat faces: a panorama stretches what is near its poles, and cuts what is at its seam.
     """
-    faces = panorama_faces(panorama, FACE_SHARPNESS, MOST_FACE_PIXELS)
+    faces = panorama_faces(panorama, FACE_SHARPNESS, MAX_FACE_PIXELS)
     tables, parts = [], []
     for face in range(len(faces)):
         table, descriptors = _detected(*faces.cut(face, image, usable), options)

@@ -26,16 +26,16 @@ SOURCE = "lines of the image"
 
 FACE_DEG = 100.0
 """Field of view of a face: an edge that one face cuts goes on by ten degrees there."""
-MOST_FOCAL_PX = 330.0
+MAX_FOCAL_PX = 330.0
 """Of a face; larger images are made smaller first, since LSD takes time and long edges need no more pixels."""
 RIM_PX = 4
 """Edges that end this close to pixels that the camera does not see are those of the image, not of the scene."""
-LEAST_LENGTH_RAD = np.radians(2.5)
-MOST_LINES = 800
+MIN_LENGTH_RAD = np.radians(2.5)
+MAX_LINES = 800
 """The longest ones."""
 END_SD_PX = 0.4
 """Standard deviation of an edge's ends across it, pixels of a face."""
-MOST_END_SD_RAD = np.radians(2.5)
+MAX_END_SD_RAD = np.radians(2.5)
 """Edges whose ends fix v no better than that are too short to be told from others."""
 
 WITHIN_DEG = 45.0
@@ -45,19 +45,19 @@ GATE_RAD = np.radians(1.5)
 """Edges that are off by less vote for a direction of the grid."""
 LEAN_SD_RAD = np.radians(0.4)
 """Of what is built upright, and of a lens's calibration."""
-MOST_OFF = 0.06
+MAX_OFF = 0.06
 """Largest n . v of an edge that is taken for a vertical one."""
 POLE = 0.95
 """Square of the cosine between v and an edge's middle beyond which the edge says nothing."""
 GROUP_RAD = np.radians(3.0)
 """Edges whose azimuths, or planes, differ by less count as one."""
 
-MOST_NFA = 1e-2
+MAX_NFA = 1e-2
 """Directions in which that many edges would meet by chance."""
-LEAST_GROUPS = 5
+MIN_GROUPS = 5
 RIVAL_DEG, RIVAL_SHARE = 12.0, 0.75
 """Another direction at least that far away must have fewer votes than this share."""
-LEAST_SD_RAD, MOST_SD_RAD = np.radians(0.1), np.radians(1.5)
+MIN_SD_RAD, MAX_SD_RAD = np.radians(0.1), np.radians(1.5)
 BOUND_SD = 3.0
 """The bound in standard deviations."""
 
@@ -130,8 +130,8 @@ def vertical(lines: Lines, near: FloatArray) -> Vertical:
 
     Raises ``InputError``, a part of a sentence, where there is too little evidence.
     """
-    if len(lines) < LEAST_GROUPS:
-        raise InputError(f"it has {len(lines)} straight edges, fewer than {LEAST_GROUPS}.")
+    if len(lines) < MIN_GROUPS:
+        raise InputError(f"it has {len(lines)} straight edges, fewer than {MIN_GROUPS}.")
     grid = _grid(near)
     votes = _votes(lines, grid)
     down = grid[votes.argmax()]
@@ -142,16 +142,16 @@ def vertical(lines: Lines, near: FloatArray) -> Vertical:
     rival = votes[grid @ down < np.cos(np.radians(RIVAL_DEG))].max(initial=0.0)
     if nearer == len(grid):
         raise InputError(f"its edges meet {WITHIN_DEG:g} degrees or more from where down was expected.")
-    if found.groups < LEAST_GROUPS:
-        raise InputError(f"it has the edges of {found.groups} upright things, fewer than {LEAST_GROUPS}.")
+    if found.groups < MIN_GROUPS:
+        raise InputError(f"it has the edges of {found.groups} upright things, fewer than {MIN_GROUPS}.")
     # Directions are tried from the expected one outwards, so that fewer chances are had to find one near it.
-    if _nfa(lines, down, nearer + 1) > MOST_NFA:
+    if _nfa(lines, down, nearer + 1) > MAX_NFA:
         raise InputError("no more of its edges meet in one direction than may do so by chance.")
     if rival > RIVAL_SHARE * votes.max():
         raise InputError("about as many of its edges meet in another direction.")
-    if found.sd_rad > MOST_SD_RAD:
+    if found.sd_rad > MAX_SD_RAD:
         raise InputError(f"its vertical edges fix it to {np.degrees(found.sd_rad):.1f} degrees only.")
-    return Vertical(found.down, max(found.sd_rad, float(LEAST_SD_RAD)), found.groups)
+    return Vertical(found.down, max(found.sd_rad, float(MIN_SD_RAD)), found.groups)
 
 
 def _grid(near: FloatArray) -> FloatArray:
@@ -178,7 +178,7 @@ def _fit(lines: Lines, start: FloatArray, gate_rad: float) -> Vertical:
     along, off = (lines.middles @ start) ** 2, lines.normals @ start
     variance = lines.variance(along)
     wide = variance + gate_rad**2 / 4.0
-    near = (off**2 <= np.minimum(9.0 * wide, MOST_OFF**2)) & (variance < MOST_END_SD_RAD**2) & (along < POLE)
+    near = (off**2 <= np.minimum(9.0 * wide, MAX_OFF**2)) & (variance < MAX_END_SD_RAD**2) & (along < POLE)
     used, along, off, variance, wide = lines.among(near), along[near], off[near], variance[near], wide[near]
     # How likely an edge is a vertical one; n . v of others is uniform from -1 to 1. Floors have edges underfoot.
     prior = 0.5 * (1.0 - along) ** 2
@@ -210,9 +210,9 @@ def _nfa(lines: Lines, down: FloatArray, tests: int) -> float:
 
     along = (lines.middles @ down) ** 2
     variance = lines.variance(along)
-    clear = (variance < MOST_END_SD_RAD**2) & (along < 0.75)
+    clear = (variance < MAX_END_SD_RAD**2) & (along < 0.75)
     normals, along = lines.normals[clear], along[clear]
-    reach = np.minimum(2.0 * np.sqrt(variance[clear] + LEAN_SD_RAD**2), MOST_OFF)
+    reach = np.minimum(2.0 * np.sqrt(variance[clear] + LEAN_SD_RAD**2), MAX_OFF)
     chance = 2 / np.pi * np.arcsin(np.minimum(1.0, reach / np.sqrt(1.0 - along)))
     near = np.abs(normals @ down) <= reach
     cells = np.round(normals * np.where(normals[:, :1] < 0.0, -1.0, 1.0) / GROUP_RAD).astype(int)
@@ -225,7 +225,7 @@ def _nfa(lines: Lines, down: FloatArray, tests: int) -> float:
 def image_lines(image: ByteArray, camera: Camera, usable: BoolArray) -> Lines:
     """The longest straight edges of a grey image (H, W) within its ``usable`` pixels (H, W)."""
     sharpness = _focal_px(camera)
-    focal_px = min(MOST_FOCAL_PX, sharpness)
+    focal_px = min(MAX_FOCAL_PX, sharpness)
     if focal_px < 0.75 * sharpness:
         image = np.asarray(
             cv2.resize(image, None, fx=focal_px / sharpness, fy=focal_px / sharpness, interpolation=cv2.INTER_AREA),
@@ -247,8 +247,8 @@ def image_lines(image: ByteArray, camera: Camera, usable: BoolArray) -> Lines:
     normals, middles = np.cross(first, second), first + second
     sine = np.linalg.norm(normals, axis=1)
     lengths = np.arctan2(sine, (first * second).sum(axis=1))
-    order = np.argsort(-lengths, kind="stable")[:MOST_LINES]
-    order = order[lengths[order] >= LEAST_LENGTH_RAD]
+    order = np.argsort(-lengths, kind="stable")[:MAX_LINES]
+    order = order[lengths[order] >= MIN_LENGTH_RAD]
     return Lines(
         normals[order] / sine[order, None],
         middles[order] / np.linalg.norm(middles[order], axis=1, keepdims=True),

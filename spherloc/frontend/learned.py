@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from spherloc.errors import MOST_REASON, InputError, shorten
+from spherloc.errors import MAX_REASON, InputError, shorten
 from spherloc.files import open_file, reading
 from spherloc.types import ByteArray, FloatArray
 
@@ -123,5 +123,5 @@ def _try_in_child(name: str, weights: Path) -> None:
 
 
 def _refusal(name: str, weights: Path | None, error: cv2.error) -> InputError:
-    said = shorten(" ".join(str(getattr(error, "err", error)).split()), MOST_REASON)
+    said = shorten(" ".join(str(getattr(error, "err", error)).split()), MAX_REASON)
     return InputError(f"{weights}: OpenCV cannot use it for {name} ({said}); give an ONNX file of {name}.")

@@ -35,7 +35,7 @@ _NEIGHBOURS = 36
 """At most as many cells can touch a disc whose radius is three cells and be nearest in it: the search is complete."""
 _CHUNK = 500_000
 """Points that are projected at once: a map of tens of millions must not be held several times."""
-_LEAST_Z = 1e-3
+_MIN_Z = 1e-3
 """Cosine to the optical axis below which a z-depth says nothing about the range."""
 _RIDGE = 0.1
 """Weight of the guess "facing the camera" in a plane fit, in search radii: it decides along a single scan line."""
@@ -65,7 +65,7 @@ class DepthLift:
         depth[inside] = _interpolated(_depth_map(self), pixels[inside], isinstance(self.camera, Equirectangular))
         if self.along == "z":
             with np.errstate(invalid="ignore"):
-                depth /= np.where(bearings[:, 2] > _LEAST_Z, bearings[:, 2], np.nan)
+                depth /= np.where(bearings[:, 2] > _MIN_Z, bearings[:, 2], np.nan)
         return _in_map(bearings, depth, self.cam_from_map)
 
 

@@ -192,7 +192,7 @@ def wrong_matches(features: int, matches: int, ratio: float | None, binary: bool
 
 SAME_PLACE = 0.05
 """Points of two references agree if they are closer than this share of their distance to the first of them."""
-LEAST_SHARED = 10
+MIN_SHARED = 10
 """Query features that a reference must share with the others, or nothing is said of it."""
 ROUNDS = 100
 
@@ -222,4 +222,4 @@ def right_shares(
             weight = shared[i] @ right**2
             if weight > 0:
                 right[i] = min(1.0, agreeing[i] @ right / weight)
-    return np.where(shared.sum(axis=1) >= LEAST_SHARED, right, np.nan)
+    return np.where(shared.sum(axis=1) >= MIN_SHARED, right, np.nan)

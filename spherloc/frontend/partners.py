@@ -19,7 +19,7 @@ _OTHERS = 4
 """Each costs one matching, once."""
 _GROWTH = 2.0
 """Each is so many times farther than the one before: near things need a short baseline, far things a long one."""
-_LEAST_SHARED = 0.25
+_MIN_SHARED = 0.25
 """Of the directions that a view sees: another one that sees fewer of them looks elsewhere."""
 _DIRECTIONS = 300
 
@@ -64,7 +64,7 @@ def _sees_the_same(index: int, other: int, views: Sequence[View], poses: FloatAr
     directions = _lattice()[_sees(views[index].camera)] @ poses[index, :, :3]
     pixels, seen = views[other].camera.project(directions @ poses[other, :, :3].T)
     seen &= in_image(views[other].camera, pixels)
-    return len(directions) > 0 and bool(seen.mean() >= _LEAST_SHARED)
+    return len(directions) > 0 and bool(seen.mean() >= _MIN_SHARED)
 
 
 @lru_cache(maxsize=1)

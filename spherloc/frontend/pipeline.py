@@ -20,7 +20,7 @@ from spherloc.frontend.view import Matcher, Matches, Report, View
 from spherloc.geometry import camera_centre
 from spherloc.types import BoolArray, FloatArray
 
-MOST_REFERENCES = 100
+MAX_REFERENCES = 100
 
 _FEATURE_KEYS = {"features": "method", "max_features": "max_features", "feature_weights": "weights"}
 _MATCH_KEYS = {"matching": "method", "ratio": "ratio", "matching_weights": "weights"}
@@ -60,8 +60,8 @@ def frontend_options(table: Mapping[str, Any], where: str, folder: Path) -> Fron
     except InputError as error:
         raise InputError(f"{place}: {error}") from None
     count = values.get("references", FrontendOptions.references)
-    if isinstance(count, bool) or not isinstance(count, int) or not 1 <= count <= MOST_REFERENCES:
-        raise InputError(f"{place}: references is {show(count)}; give a whole number from 1 to {MOST_REFERENCES}.")
+    if isinstance(count, bool) or not isinstance(count, int) or not 1 <= count <= MAX_REFERENCES:
+        raise InputError(f"{place}: references is {show(count)}; give a whole number from 1 to {MAX_REFERENCES}.")
     return FrontendOptions(features, matching, count)
 
 

@@ -17,7 +17,7 @@ STRONGEST = 4000
 similar ones of 47; with 1,000 features of 41."""
 MOST_SAMPLES = 20_000
 """Descriptors that the vocabulary is learnt from, 300 a word."""
-LEAST_SAMPLES_A_WORD = 30
+MIN_SAMPLES_A_WORD = 30
 """With fewer, a word would describe single features."""
 
 _ROUNDS = 12
@@ -46,7 +46,7 @@ def vocabulary(images: Sequence[Floats], seed: int = 0) -> Floats:
     share = -(-MOST_SAMPLES // max(1, len(images)))
     samples = np.concatenate([image[_some(random, len(image), share)] for image in images])
     samples = samples[_some(random, len(samples), MOST_SAMPLES)]
-    count = max(1, min(WORDS, len(samples) // LEAST_SAMPLES_A_WORD))
+    count = max(1, min(WORDS, len(samples) // MIN_SAMPLES_A_WORD))
     words = samples[_some(random, len(samples), count)]
     for _ in range(_ROUNDS):
         sums, sizes = _sums(samples, words)

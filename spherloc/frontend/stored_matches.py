@@ -16,7 +16,7 @@ from spherloc.frontend.view import Matcher, Matches, NeedsPreparing, Report, Vie
 
 SUFFIX = ".npz"
 """Of the file beside a scene file."""
-MOST_BYTES = 20_000_000
+MAX_BYTES = 20_000_000
 VERSION = 2
 """Raised when pictures, features or matching change, so that stored matches are not those that would be found."""
 
@@ -59,7 +59,7 @@ class StoredMatches:
         """Empty if there is no file, a damaged one, or one of another scene."""
         views = {view.name: view for view in self.references}
         try:
-            with np.load(io.BytesIO(read_file(self.path, MOST_BYTES)), allow_pickle=False) as file:
+            with np.load(io.BytesIO(read_file(self.path, MAX_BYTES)), allow_pickle=False) as file:
                 told = json.loads(str(file["told"]))
                 if told["key"] != self.key:
                     return {}

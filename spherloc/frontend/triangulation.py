@@ -18,7 +18,7 @@ from spherloc.frontend.view import View
 from spherloc.geometry import camera_centre
 from spherloc.types import BoolArray, FloatArray
 
-LEAST_PARALLAX_DEG = 1.0
+MIN_PARALLAX_DEG = 1.0
 """With an error of 0.1 degrees (1 px of a fisheye is 0.15 to 0.25), the range is then good to a tenth."""
 BOUND_PX = 2.0
 
@@ -38,7 +38,7 @@ class TriangulationLift:
     matching: MatchOptions = field(default_factory=MatchOptions)
     bound_px: float = BOUND_PX
     """Of the distance to the epipolar plane and of the reprojection error."""
-    least_parallax_deg: float = LEAST_PARALLAX_DEG
+    least_parallax_deg: float = MIN_PARALLAX_DEG
     """Between the rays of the reference and of one of the others."""
     radius_px: float = SFM_RADIUS_PX
     """A pixel takes the point of the nearest feature within this distance."""

@@ -11,7 +11,7 @@ from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.errors import CalibrationError
 from spherloc.types import FloatArray
 
-MOST_OFF_PX = 0.5
+MAX_OFF_PX = 0.5
 """Largest distance between a pixel of the lens and of its Kannala-Brandt form."""
 WIDEST_RAD = radians(85.0)
 """Directions farther from the optical axis do not count: COLMAP's fisheyes end at 90 degrees."""
@@ -44,7 +44,7 @@ def _fitted(camera: Camera) -> tuple[Camera, str]:
     per_rad = np.median(np.linalg.norm(pixels - half, axis=1) / np.maximum(_angle(bearings), 1e-3))
     found = least_squares(off, [per_rad, per_rad, *half, 0, 0, 0, 0], x_scale=[100, 100, 10, 10, 0.1, 0.1, 0.1, 0.1])
     worst = float(np.linalg.norm(off(found.x).reshape(-1, 2), axis=1).max())
-    if worst > MOST_OFF_PX:
+    if worst > MAX_OFF_PX:
         raise CalibrationError(
             f"COLMAP has no camera model {camera.model}, and the nearest Kannala-Brandt lens is {worst:.1f} px off; "
             "give a calibration as kannala_brandt, fisheye624 or eucm."

@@ -17,10 +17,10 @@ from spherloc.images import grey, read_size
 from spherloc.mapping.lens import for_colmap
 from spherloc.types import ByteArray
 
-LEAST_IMAGES = 2
-MOST_IMAGES = 500
+MIN_IMAGES = 2
+MAX_IMAGES = 500
 """Their features take 4 MB each."""
-LEAST_PANORAMA_PX = 200
+MIN_PANORAMA_PX = 200
 """Of the longer side."""
 SHARPNESS_PX = 512
 """Frames are compared at this longer side."""
@@ -54,7 +54,7 @@ def photographs(folder: Path, camera: Camera | None) -> Photographs:
     size = (camera.width, camera.height) if camera else max(sizes, key=lambda key: len(sizes[key]))
     width, height = size
     if camera is None:
-        if width != 2 * height or width < LEAST_PANORAMA_PX:
+        if width != 2 * height or width < MIN_PANORAMA_PX:
             raise InputError(
                 f"{folder}: its photographs are {width} x {height} pixels, so they are no full panoramas (2 to 1); "
                 "give their calibration with --camera FILE."
@@ -67,14 +67,14 @@ def photographs(folder: Path, camera: Camera | None) -> Photographs:
             f"{len(others)} of {len(others) + len(names)} images were left out, as they are not {width} x {height} "
             f"pixels; the first is {shorten(others[0])}."
         )
-    if len(names) < LEAST_IMAGES:
+    if len(names) < MIN_IMAGES:
         raise InputError(
-            f"{folder}: has {len(names)} photographs of {width} x {height} pixels; a map needs {LEAST_IMAGES} or more, "
+            f"{folder}: has {len(names)} photographs of {width} x {height} pixels; a map needs {MIN_IMAGES} or more, "
             "better ten."
         )
-    if len(names) > MOST_IMAGES:
+    if len(names) > MAX_IMAGES:
         raise InputError(
-            f"{folder}: has {len(names)} photographs, of {MOST_IMAGES} that are mapped at once; take every n-th of "
+            f"{folder}: has {len(names)} photographs, of {MAX_IMAGES} that are mapped at once; take every n-th of "
             'them, or map them with COLMAP and open its model as kind = "colmap".'
         )
     camera, about_lens = for_colmap(camera)

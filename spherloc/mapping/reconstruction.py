@@ -42,14 +42,14 @@ Tell = Callable[[str, int, int], None]
 
 DATABASE_VERSION = 4
 """Raised when pairs are matched or checked in another way."""
-LEAST_MATCHES = 15
+MIN_MATCHES = 15
 """Of a pair of images, after the two-view check."""
 BOUND_RAD = np.radians(0.5)
 """Of a match to its epipolar plane; in pixels it is kept within ``BOUND_PX``."""
 BOUND_PX = 1.5, 6.0
 ONE_PLACE_RAD = np.radians(0.5)
 """Rays of a match that differ by less: two images from one place, which tell nothing of depth."""
-MOST_EXHAUSTIVE = 50
+MAX_EXHAUSTIVE = 50
 """Images of which all pairs are tried; of more, each with its neighbours by name and with those that look alike."""
 NEIGHBOURS, ALIKE = 5, 15
 WIDEST_RAD = np.radians(85.0)
@@ -58,7 +58,7 @@ STRONG = 0.3
 """A strong pair has this share of the matches of the best pair of either image."""
 NEARBY = 2
 """Images next to one in the map, that should match it."""
-LEAST_SUPPORT = 0.15
+MIN_SUPPORT = 0.15
 """Share of the matches of the best pair of either image that two nearby images have; with less they contradict."""
 COST_OF_CONTRADICTION = 4.0
 """Share of the images that a map is worth less for each share of contradictions."""
@@ -124,10 +124,10 @@ def reconstruct(views: Sequence[View], folder: Path, tell: Tell) -> Reconstructi
         counts, same_place = _matched(pycolmap, database, ids, camera, features, usable, tell)
     finally:
         database.close()
-    if counts.max(initial=0) < LEAST_MATCHES:
+    if counts.max(initial=0) < MIN_MATCHES:
         raise InputError(
             f"no two of the {len(views)} photographs show the same place from two positions: the best pair has "
-            f"{counts.max(initial=0)} matches that fit together, of {LEAST_MATCHES} that are needed. Take them closer "
+            f"{counts.max(initial=0)} matches that fit together, of {MIN_MATCHES} that are needed. Take them closer "
             "to each other, half a metre to two metres apart indoors."
         )
     names = [view.name for view in views]
@@ -191,7 +191,7 @@ def _contradictions(
     for row, index in enumerate(inside):
         for place in np.argsort(apart[row])[: min(NEARBY, len(inside) - 1)]:
             other = inside[int(place)]
-            if counts[index, other] < LEAST_SUPPORT * min(best[index], best[other]):
+            if counts[index, other] < MIN_SUPPORT * min(best[index], best[other]):
                 found.append((names[index], names[other]))
     return tuple(found)
 
@@ -265,7 +265,7 @@ def _matched(
     height = round(np.pi * _focal_px(camera))
     sphere = Equirectangular(2 * height, height)
     options = pycolmap.TwoViewGeometryOptions()
-    options.min_num_inliers = LEAST_MATCHES
+    options.min_num_inliers = MIN_MATCHES
     options.ransac.max_error = float(np.clip(BOUND_RAD * sphere.width / tau, *BOUND_PX))
     options.ransac.random_seed = 0
     # Whatever the lens, bearings are compared: of fisheyes COLMAP would ask for fundamental matrices, too.
@@ -292,7 +292,7 @@ def _matched(
         found = match(features[first], features[second])
         pairs = np.column_stack([number_of[first][found.query_index], number_of[second][found.reference_index]])
         pairs = pairs[(pairs >= 0).all(axis=1)].astype(np.uint32)
-        if len(pairs) < LEAST_MATCHES:
+        if len(pairs) < MIN_MATCHES:
             return pairs, None
         geometry = pycolmap.estimate_calibrated_two_view_geometry(
             panorama, pixels[first], panorama, pixels[second], pairs, options
@@ -354,7 +354,7 @@ def _focal_px(camera: Camera) -> float:
 def _pairs(features: Sequence[Features]) -> list[tuple[int, int]]:
     """Which pairs of images are matched."""
     count = len(features)
-    if count <= MOST_EXHAUSTIVE:
+    if count <= MAX_EXHAUSTIVE:
         return list(combinations(range(count), 2))
     pairs = {(first, second) for first, second in combinations(range(count), 2) if second - first <= NEIGHBOURS}
     described = [retrieval.real_descriptors(one) for one in features]
@@ -370,12 +370,12 @@ def _pairs(features: Sequence[Features]) -> list[tuple[int, int]]:
 def _models(pycolmap: Any, database: Path, folder: Path, count: int, tell: Tell) -> list[Any]:
     """COLMAP's models, the one with most images first; none if it finds no first pair."""
     options = pycolmap.IncrementalPipelineOptions()
-    options.min_num_matches, options.min_model_size, options.random_seed = LEAST_MATCHES, 2, 0
+    options.min_num_matches, options.min_model_size, options.random_seed = MIN_MATCHES, 2, 0
     options.num_threads = 1  # else every run gives another map
     options.ba_refine_focal_length = options.ba_refine_extra_params = options.extract_colors = False
     mapper = options.mapper
     mapper.abs_pose_refine_focal_length = mapper.abs_pose_refine_extra_params = False
-    mapper.abs_pose_min_num_inliers, mapper.abs_pose_min_inlier_ratio = LEAST_MATCHES, 0.05
+    mapper.abs_pose_min_num_inliers, mapper.abs_pose_min_inlier_ratio = MIN_MATCHES, 0.05
     options.triangulation.ignore_two_view_tracks = False
     models: list[Any] = []
     for first_pair in _TRIES:

@@ -12,15 +12,15 @@ from spherloc.frontend.view import View
 from spherloc.geometry import DOWN, align_to_down, camera_centre
 from spherloc.types import FloatArray
 
-LEAST_LINES = 3
+MIN_LINES = 3
 """Images whose lines must tell down; of fewer, all images count as held upright."""
-MOST_SPREAD_DEG = 25.0
-LEAST_LIMIT_DEG, LIMIT_SPREADS = 2.0, 5.0
+MAX_SPREAD_DEG = 25.0
+MIN_LIMIT_DEG, LIMIT_SPREADS = 2.0, 5.0
 """An image that leans against the map by more than the first, and by more than so many times the median of all, was
 placed wrongly: at a place that looks like the right one."""
 GROUND_SHARE = 0.1
 """Of the points below the cameras, the part that lies deeper than the ground: reflections, wrong points."""
-LEAST_GROUND_POINTS = 30
+MIN_GROUND_POINTS = 30
 
 
 @dataclass(frozen=True)
@@ -62,17 +62,17 @@ def level_of(poses: Mapping[str, FloatArray], views: Sequence[View]) -> Level:
             measured[view.name] = rotation.T @ gravity_from_lines(view).down
         except InputError:  # too few lines: the others tell
             continue
-    by_lines = len(measured) >= LEAST_LINES
+    by_lines = len(measured) >= MIN_LINES
     directions = measured if by_lines else axes
     down = _middle(np.stack(list(directions.values())))
     off_deg = {name: float(np.degrees(np.arccos(min(1.0, one @ down)))) for name, one in directions.items()}
     spread_deg = float(np.median(list(off_deg.values())))
-    if spread_deg > MOST_SPREAD_DEG:
+    if spread_deg > MAX_SPREAD_DEG:
         raise InputError(
             f"the photographs do not agree on where down is: the median is {spread_deg:.0f} degrees off their mean. "
             "Take them with the camera held upright."
         )
-    limit_deg = max(LEAST_LIMIT_DEG, LIMIT_SPREADS * spread_deg)
+    limit_deg = max(MIN_LIMIT_DEG, LIMIT_SPREADS * spread_deg)
     leaning = {name: off for name, off in off_deg.items() if off > limit_deg}
     source = f"vertical lines of {len(measured)} images" if by_lines else "the images' own vertical, as if held upright"
     return Level(down, source, spread_deg, leaning)
@@ -111,7 +111,7 @@ def scale_by_height(poses: Mapping[str, FloatArray], points: FloatArray, level: 
     below = offset @ level.down
     # Of what is seen at 45 degrees or more below the horizon, nearly all is ground.
     depths = below[below > 0.707 * np.linalg.norm(offset, axis=1)]
-    if len(depths) < LEAST_GROUND_POINTS:
+    if len(depths) < MIN_GROUND_POINTS:
         raise InputError(
             f"only {len(depths)} points of the map lie below the cameras, too few to find the ground; give a distance "
             "between two images with --distance instead."

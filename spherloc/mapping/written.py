@@ -19,10 +19,10 @@ from spherloc.types import FloatArray
 MODEL = "model"
 SCENE = "scene.toml"
 NEW_SCENE = "new_images.toml"
-LEAST_BOUND_DEG = 3.0
+MIN_BOUND_DEG = 3.0
 EVERY = 4
 """Of the map's images every fourth is a query, localized against the others."""
-LEAST_WITHOUT = 4
+MIN_WITHOUT = 4
 """Images of a map from which some can be left out; those of a smaller one are localized with all points."""
 
 
@@ -69,7 +69,7 @@ def write_map(
         (folder / MODEL).mkdir(parents=True, exist_ok=True)
         made.model.write(str(folder / MODEL))
         scene = folder / SCENE
-        if len(names) >= LEAST_WITHOUT:
+        if len(names) >= MIN_WITHOUT:
             content = _scene(folder, images, names, about, level, scale)
         else:
             content = _new_scene(folder, images, images, views[0], about, level, scale)
@@ -136,7 +136,7 @@ def _units(scale: Scale) -> list[str]:
 
 
 def _gravity(level: Level) -> list[str]:
-    bound = max(LEAST_BOUND_DEG, round(2.0 * level.spread_deg, 1))
+    bound = max(MIN_BOUND_DEG, round(2.0 * level.spread_deg, 1))
     return ["", "[gravity]", "map = [0.0, 0.0, -1.0]", f"bound_deg = {bound}"]
 
 

@@ -11,7 +11,7 @@ from spherloc.experiments.sweep_plan import Entrant
 from spherloc.files import is_folder, names_in, read_file
 from spherloc.verification.experiments import BOUND_PX, METHODS
 
-MOST_BYTES = 1_000_000
+MAX_BYTES = 1_000_000
 """Of the file of the printed tables."""
 
 
@@ -147,4 +147,4 @@ def sessions_of(dataset: Dataset, folder: Path) -> Sequence[Session]:
 
 def printed_tables() -> dict[str, dict[str, Any]]:
     """The paper's Tables I to VI by key: title, columns and rows, and the dataset where it is of one."""
-    return tomllib.loads(read_file(Path(__file__).parent / "tables.toml", MOST_BYTES).decode())
+    return tomllib.loads(read_file(Path(__file__).parent / "tables.toml", MAX_BYTES).decode())

@@ -285,8 +285,8 @@ class MeshBuilder:
         )
 
 
-MOST_BYTES = 400_000
-LEAST_TEXTURE_BYTES = 60_000
+MAX_BYTES = 400_000
+MIN_TEXTURE_BYTES = 60_000
 HEADER_BYTES = 2_000
 FLOAT, USHORT, UINT, UBYTE = 5126, 5123, 5125, 5121
 
@@ -300,7 +300,7 @@ def write_glb(mesh: Mesh, atlas: Atlas) -> bytes:
     colour[:, :3] = np.round(np.clip(mesh.tint, 0, 1) * 255)
     index = mesh.faces.astype(np.uint16 if len(vertices) <= 65535 else np.uint32)
     parts = [index.tobytes(), vertices.tobytes(), uv.tobytes(), colour.tobytes()]
-    parts.append(_jpeg(atlas, max(LEAST_TEXTURE_BYTES, MOST_BYTES - HEADER_BYTES - sum(map(len, parts)))))
+    parts.append(_jpeg(atlas, max(MIN_TEXTURE_BYTES, MAX_BYTES - HEADER_BYTES - sum(map(len, parts)))))
     views, binary = [], b""
     for part in parts:
         views.append({"buffer": 0, "byteOffset": len(binary), "byteLength": len(part)})

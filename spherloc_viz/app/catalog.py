@@ -18,9 +18,9 @@ from spherloc_viz.gallery import play_of, staged_path
 from spherloc_viz.given_files import is_recording
 from spherloc_viz.recording.replay import load_recorded_scene
 
-MOST_BRIEF = 8
+MAX_BRIEF = 8
 """Recorded problems that a page offers beside its scenes."""
-MOST_MESHES = 4
+MAX_MESHES = 4
 """Maps whose meshes are kept."""
 
 
@@ -85,9 +85,9 @@ class Catalog:
         entered = self.add(scene, path, label)
         if brief:
             self._brief = [*(other for other in self._brief if other != entered), entered]
-            for old in self._brief[:-MOST_BRIEF]:
+            for old in self._brief[:-MAX_BRIEF]:
                 del self.scenes[old], self._paths[old]
-            self._brief = self._brief[-MOST_BRIEF:]
+            self._brief = self._brief[-MAX_BRIEF:]
         return entered
 
     def enter_case(self, name: str) -> str:
@@ -157,7 +157,7 @@ class _Caches:
         found = self.meshes.get(scene)
         if found is None and scene.mesh is not None:
             found = scene.mesh()
-            for old in tuple(self.meshes)[: 1 - MOST_MESHES]:
+            for old in tuple(self.meshes)[: 1 - MAX_MESHES]:
                 self.meshes.pop(old, None)
             self.meshes[scene] = found
         return found

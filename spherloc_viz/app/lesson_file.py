@@ -14,7 +14,7 @@ from spherloc_viz.app.run_display import without_truth
 from spherloc_viz.app.stage import views
 from spherloc_viz.app.stage.flat_picture import svg
 from spherloc_viz.app.stage.still_page import Still, scene_script, scripts_in, with_policy
-from spherloc_viz.app.stage.walls import MOST_BYTES, Walls
+from spherloc_viz.app.stage.walls import MAX_BYTES, Walls
 from spherloc_viz.app.web.page import QUIET, client_html
 from spherloc_viz.layers import paint, steps, with_alternative
 from spherloc_viz.lessons.html import Form, exported_page, handout_page, links_in, names_in
@@ -23,7 +23,7 @@ from spherloc_viz.lessons.numbers import number_text, numbers_of
 
 ASPECT = 1.15
 """Width over height for which views are chosen: between those of a screen's canvas and of a phone's."""
-MOST_BYTES_OF_FILE = 8_000_000
+MAX_BYTES_OF_FILE = 8_000_000
 BARE = "<style>#root button,[class*=Notifications-root]{display:none!important}</style>"
 """Viser's own buttons and notes would be dead in a file."""
 
@@ -31,7 +31,7 @@ BARE = "<style>#root button,[class*=Notifications-root]{display:none!important}<
 def exported(lesson: Lesson, tell: Callable[[str], None], dark: bool = True) -> str:
     """A lesson as one HTML file with all of its scenes; ``tell`` is called with how far it is, in a few words.
 
-    Raises ``InputError`` for a state that cannot be shown, and for a file of more than ``MOST_BYTES_OF_FILE``.
+    Raises ``InputError`` for a state that cannot be shown, and for a file of more than ``MAX_BYTES_OF_FILE``.
     """
     runs, found = LinkedRuns(), {state: place for place, state in enumerate(recorded_states(lesson))}
     asked = {name for moment in lesson.moments for text in texts(moment) for name in names_in(text)}
@@ -51,7 +51,7 @@ def exported(lesson: Lesson, tell: Callable[[str], None], dark: bool = True) -> 
     forms = [_recorded(found, numbers[found[_state(moment.state)]]) for moment in lesson.moments]
     page = exported_page(lesson, forms, "\n".join(data))
     page = with_policy(page, [*scripts_in(viewer), *scripts])
-    if len(page.encode()) > MOST_BYTES_OF_FILE:
+    if len(page.encode()) > MAX_BYTES_OF_FILE:
         raise InputError(f"the lesson would be a file of {len(page.encode()) / 1e6:.1f} MB; make it two lessons.")
     return page
 
@@ -107,7 +107,7 @@ def still_of(linked: LinkedRun, runs: LinkedRuns, dark: bool) -> Still:
             picture = with_alternative(picture, trace, alternative)
     turn = trace.problem.aligned.map_turn
     mesh = runs.catalog.mesh(run.request.scene.scene)
-    walls = Walls(mesh, turn) if mesh is not None and len(mesh) <= MOST_BYTES else None
+    walls = Walls(mesh, turn) if mesh is not None and len(mesh) <= MAX_BYTES else None
     place = views.follow(picture, ASPECT, walls)
     layers = set(style.LAYERS) - ({"ground"} if mesh is not None else set())
     return Still(

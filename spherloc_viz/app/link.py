@@ -26,9 +26,9 @@ from spherloc_viz.app.run_request import Run, RunRequest
 from spherloc_viz.options import option_fields, typed, usable_estimators
 
 VERSION = 1
-MOST_LETTERS = 15_000
+MAX_LETTERS = 15_000
 """A longer link is not written: some thousand matches are changed by hand."""
-MOST_M, LEAST_M = 1e7, 1e-6
+MAX_M, MIN_M = 1e7, 1e-6
 """How far off a viewer may stand, and how far from what it looks at at least."""
 THEMES = ("dark", "light")
 ANSWERS = ("told", "hidden")
@@ -88,7 +88,7 @@ def link_of(
         ("answers", ANSWERS[1] if view.answers_hidden else None),
     ]
     text = urlencode([(key, value) for key, value in pairs if value])
-    return text if len(text) <= MOST_LETTERS else ""
+    return text if len(text) <= MAX_LETTERS else ""
 
 
 def _changed(options: Any, default: Any) -> list[tuple[str, Any]]:
@@ -278,8 +278,8 @@ def _viewpoint(text: str) -> tuple[float, ...]:
         numbers = tuple(map(float, text.split(",")))
     except ValueError:
         numbers = ()
-    sensible = len(numbers) == 7 and all(abs(number) < MOST_M for number in numbers) and 1.0 <= numbers[6] <= 170.0
-    if not sensible or math.dist(numbers[:3], numbers[3:6]) < LEAST_M:
+    sensible = len(numbers) == 7 and all(abs(number) < MAX_M for number in numbers) and 1.0 <= numbers[6] <= 170.0
+    if not sensible or math.dist(numbers[:3], numbers[3:6]) < MIN_M:
         raise InputError(
             f"view is {show(text)}; give a place, what is looked at, and a field of view from 1 to 170 degrees: seven "
             "numbers with commas between them."

@@ -47,7 +47,7 @@ NOT_ENCRYPTED = (
     "warning: the connection is not encrypted, so whoever can listen on the network can use the links as well; on one "
     "that you do not trust keep to 127.0.0.1 and an SSH tunnel."
 )
-MOST_UNHEARD = 3
+MAX_UNHEARD = 3
 """Notices that are kept for a page that opens later."""
 
 
@@ -211,7 +211,7 @@ class Sessions:
         sessions = self._presenters()
         if not sessions:
             with self._lock:
-                self._unheard = [*self._unheard[1 - MOST_UNHEARD :], sentence]
+                self._unheard = [*self._unheard[1 - MAX_UNHEARD :], sentence]
         for session in sessions:
             session.notices.show(sentence)
 

@@ -24,7 +24,7 @@ _INSTALLED = Path(__file__).resolve().parent / "gallery.toml"
 GALLERY = _INSTALLED if _INSTALLED.is_file() else Path(__file__).resolve().parents[2] / "recordings" / "gallery.toml"
 """An installation has it inside of this package, a checkout in its folder of recordings."""
 FAILURES = ("position", "rotation", "no pose")
-MOST_SEED = 2**63 - 1
+MAX_SEED = 2**63 - 1
 PLAY_KEYS = {"scene", "query", "variation", "staged", "seed", "estimator", "options", "facts"}
 STAGED_NUMBERS = {"noise_px", "gravity_off_deg", "gravity_bound_deg", "focal_off"}
 _KEY = re.compile(r"[a-z0-9]+(-[a-z0-9]+)*")
@@ -149,7 +149,7 @@ def _play(table: dict[str, Any], of: Play | None, where: str) -> Play:
         staged=_staged(table, None if of is None else of.staged, where),
         query=query if of is None else of.query,
         variation=variation if of is None else replace(of.variation, **_changes(variation)),
-        seed=integer(table, "seed", where, 0, MOST_SEED) if "seed" in table else 0 if of is None else of.seed,
+        seed=integer(table, "seed", where, 0, MAX_SEED) if "seed" in table else 0 if of is None else of.seed,
         estimator=estimator,
         options=_options(estimator, scene_file.section(table, "options", where), of.options if same and of else None),
         facts=_facts(scene_file.section(table, "facts", where), where),
@@ -218,7 +218,7 @@ def _staged(table: Mapping[str, Any], base: StagedScene | None, where: str) -> S
     if "groups" in staged:
         given["groups"] = _groups(staged["groups"], place)
     if "seed" in staged:
-        given["seed"] = integer(staged, "seed", place, 0, MOST_SEED)
+        given["seed"] = integer(staged, "seed", place, 0, MAX_SEED)
     given |= {key: scene_file.number(staged, key, place, -1e3, 1e3) for key in STAGED_NUMBERS & staged.keys()}
     return StagedScene(**given) if base is None else replace(base, **given)
 

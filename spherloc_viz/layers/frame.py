@@ -224,10 +224,10 @@ def length(metres: float, metric: bool = True) -> str:
     if metres >= 1.0:
         return f"{metres:.2f} m"
     digits = 0 if metres >= 0.1 else 1 if metres >= 0.01 else 2
-    return f"{100.0 * metres:.{digits}f} cm" if metres >= LEAST_M else "less than 0.1 mm"
+    return f"{100.0 * metres:.{digits}f} cm" if metres >= MIN_M else "less than 0.1 mm"
 
 
-LEAST_M = 1e-4
+MIN_M = 1e-4
 """Shorter lengths are told as less than this."""
 
 
@@ -239,7 +239,7 @@ def length_text(length_m: float, metric: bool = True) -> str:
     """A length in the unit that suits its size, with two digits; if not ``metric``, in units of the map."""
     if not metric:
         return f"{length_m:.2g} {UNITS}"
-    if 0.0 < length_m < LEAST_M:
+    if 0.0 < length_m < MIN_M:
         return "< 0.1 mm"
     for unit, metres in (("km", 1000.0), ("m", 1.0), ("cm", 0.01)):
         if length_m >= 0.995 * metres:

@@ -15,7 +15,7 @@ from spherloc.images import read_image
 from spherloc.problem import Problem
 from spherloc.types import FloatArray
 
-MOST_PIXELS = 4_000_000
+MAX_PIXELS = 4_000_000
 """Larger photographs are shrunk to this many pixels, so that those that are kept take little memory."""
 
 
@@ -52,7 +52,7 @@ def _read(path: Path, changed_ns: int) -> Photograph:
     """``changed_ns`` has a file that was written anew read anew."""
     image = read_image(path)
     height, width = image.shape[:2]
-    scale = min(1.0, (MOST_PIXELS / (width * height)) ** 0.5)
+    scale = min(1.0, (MAX_PIXELS / (width * height)) ** 0.5)
     image = shrunk(image, scale)
     rgb = np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2RGB if image.ndim == 2 else cv2.COLOR_BGR2RGB), np.uint8)
     rgb.setflags(write=False)

@@ -10,9 +10,9 @@ from spherloc_viz import style
 from spherloc_viz.layers.frame import Frame, Plan, RunView, close_focus, even, one_color
 from spherloc_viz.layers.primitives import Chart, Curve, Segments, Table
 
-MOST_IMPROVEMENTS = 60
+MAX_IMPROVEMENTS = 60
 """More improvements are thinned evenly; the first and the last, which is the best, stay."""
-MOST_IN_TWO = 30
+MAX_IN_TWO = 30
 """Up to so many, an improvement has two steps: its sample, and how the matches vote."""
 SHARES = (0.5, 0.2, 0.1, 0.05, 0.02)
 """Shares of inliers for which Eq. 28 is told."""
@@ -22,11 +22,11 @@ CURVE_POINTS = 80
 def plans(view: RunView, stage: RansacStage) -> list[Plan]:
     """What Eq. 28 demands, every improvement, and what became of the demand."""
     count = len(stage.improved_at)
-    shown = even(np.arange(count), MOST_IMPROVEMENTS).tolist()
+    shown = even(np.arange(count), MAX_IMPROVEMENTS).tolist()
     out = [Plan("samples-needed", "How many samples it takes", lambda: _needed(view, stage))]
     for k in shown:
         title, charts = _title(stage, k), {"ransac": partial(chart, stage, k)}
-        if count <= MOST_IN_TWO:
+        if count <= MAX_IN_TWO:
             out.append(Plan(f"sample-{k + 1}-pose", f"{title.split(':')[0]}, a pose", partial(_drawn, view, stage, k)))
         out.append(Plan(f"sample-{k + 1}", title, partial(_improvement, view, stage, k), charts))
     if count:
@@ -114,8 +114,8 @@ def _improvement(view: RunView, stage: RansacStage, k: int) -> Frame:
     then = f"none of the other {stage.iterations - drawn:,} samples beats it" if last else "a later one beats it"
     source = "A fit to the inliers of the step before gives" if refitted else f"Matches {_listed(sample)} fix"
     note = f"Confidence reached: {100 * stage.confidence_reached:.4g} %." if last else ""
-    if total > MOST_IMPROVEMENTS:
-        note += f" {MOST_IMPROVEMENTS} of {total} improvements are shown: evenly, with the first and the last."
+    if total > MAX_IMPROVEMENTS:
+        note += f" {MAX_IMPROVEMENTS} of {total} improvements are shown: evenly, with the first and the last."
     return Frame(
         f"{source} a pose that explains {inliers} of {count} matches; {then}. "
         f"At that share of inliers, {_samples(drawn)} only right matches with probability {chance:.3g}.",

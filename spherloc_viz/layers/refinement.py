@@ -13,7 +13,7 @@ from spherloc_viz.layers import uncertainty
 from spherloc_viz.layers.frame import Frame, Plan, RunView, angle_text, even, one_color, sphere_box
 from spherloc_viz.layers.primitives import Chart, Curve, Focus, SceneItem, Segments
 
-MOST_STATES = 20
+MAX_STATES = 20
 """More states are thinned evenly; the first and the last stay."""
 
 
@@ -21,7 +21,7 @@ def plans(view: RunView, stage: RefinementStage) -> list[Plan]:
     """Every state; inliers, outliers and errors of the last one; and the summary."""
     count = len(stage.cost_px2)
     out = []
-    for k in even(np.arange(count), MOST_STATES).tolist():
+    for k in even(np.arange(count), MAX_STATES).tolist():
         title = "The pose before refinement" if k == 0 else f"Gauss-Newton step {k}"
         charts = {"refinement": partial(chart, stage, k)}
         out.append(Plan(f"refinement-{k}", title, partial(_state, view, stage, k), charts))
@@ -46,7 +46,7 @@ def _state(view: RunView, stage: RefinementStage, k: int) -> Frame:
         away, turned = translation_error_m(before, state), rotation_error_deg(before, state)
         angle = f"{turned:.3f}°" if turned >= 5e-4 else "less than 0.001°"
         moved = f"The step moved the camera by {view.length(away)} and turned it by {angle}."
-    note = "" if count <= MOST_STATES else f"{MOST_STATES} of {count} states are shown, evenly."
+    note = "" if count <= MAX_STATES else f"{MAX_STATES} of {count} states are shown, evenly."
     mask = _explained(view, stage, k, state)
     return Frame(
         f"At {view.position(state)}{off}, the final inliers are off by {rms[k]:.3f} px RMS, and {inliers[k]} matches "

@@ -165,7 +165,7 @@ class BallSet:
         return Segments("balls/edges", "balls", self.stage.centres_m[edges], colors, 1.5)
 
 
-MOST_NODES = 400
+MAX_NODES = 400
 """More are thinned: to the clique, or an even sample of it, and an even sample of the others."""
 INNER, OUTER = 0.08, 0.97
 """Radii within which nodes stand; the whole drawing has radius 1."""
@@ -202,14 +202,14 @@ def match_nodes(view: RunView, stage: ConsensusStage) -> Nodes:
 
 
 def _chosen(total: int, clique: IntArray, order: IntArray) -> IntArray:
-    """Nodes to draw, at most ``MOST_NODES``."""
-    if total <= MOST_NODES:
+    """Nodes to draw, at most ``MAX_NODES``."""
+    if total <= MAX_NODES:
         return order
     inside = np.zeros(total, dtype=bool)
     inside[clique] = True
     members, others = order[inside[order]], order[~inside[order]]
-    take = min(len(members), max(MOST_NODES // 2, MOST_NODES - len(others)))
-    return np.concatenate([even(members, take), even(others, MOST_NODES - take)])
+    take = min(len(members), max(MAX_NODES // 2, MAX_NODES - len(others)))
+    return np.concatenate([even(members, take), even(others, MAX_NODES - take)])
 
 
 def _nodes(

@@ -260,7 +260,7 @@ def _items(view: RunView, arcs: Arcs, shown: np.ndarray, numbers: tuple[int, int
 
 SIZES = (10, 30, 100, 300, 1000, 3000)
 """How many arcs are shown before all are."""
-MOST_CANDIDATES = 8
+MAX_CANDIDATES = 8
 """Candidate yaws shown at most, before the one with the deepest overlap."""
 REACH = 40
 """A peak is the highest within so many quarters of a degree."""
@@ -296,11 +296,11 @@ def plans(view: RunView, stage: YawStage) -> list[Plan]:
 
 def candidate_yaws(stage: YawStage) -> IntArray:
     """Candidate yaws, in quarters of a degree from -180: the highest peaks without the deepest overlap, by yaw."""
-    highest = ring.peaks(stage.overlap, REACH, MOST_CANDIDATES + 1)
+    highest = ring.peaks(stage.overlap, REACH, MAX_CANDIDATES + 1)
     places = len(stage.overlap)
     end = int((stage.yaw_rad + np.pi) / (2 * np.pi) * places)
     gaps = np.abs(highest - end)
-    return np.sort(highest[np.minimum(gaps, places - gaps) > REACH][:MOST_CANDIDATES])
+    return np.sort(highest[np.minimum(gaps, places - gaps) > REACH][:MAX_CANDIDATES])
 
 
 def _some(view: RunView, arcs: Arcs, size: int) -> Frame:

@@ -19,7 +19,7 @@ Window = tuple[float, float]
 """Yaws from the first, in [-180, 180) degrees, to the second, which exceeds 180 where the window crosses the seam."""
 
 ALL: Window = (-180.0, 180.0)
-LEAST_WIDTH_DEG = 0.02
+MIN_WIDTH_DEG = 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +91,7 @@ def window_around(middle_deg: float, width_deg: float) -> Window:
     """The window of that middle and width, at most the circle."""
     if not width_deg < 359.0:
         return ALL
-    width = max(width_deg, LEAST_WIDTH_DEG)
+    width = max(width_deg, MIN_WIDTH_DEG)
     low = round((middle_deg - 0.5 * width + 180.0) % 360.0 - 180.0, 9)
     return low, low + width
 
@@ -104,10 +104,10 @@ def places_of(yaw_deg: float, window: Window) -> list[float]:
 
 WIDTHS_DEG = (1.0, 2.0, 4.0, 6.0, 10.0, 20.0, 30.0, 60.0, 120.0)
 """Of the window around the peak."""
-MOST_BARS = 60
-MOST_CHOSEN = 24
+MAX_BARS = 60
+MAX_CHOSEN = 24
 """Bars that a selection may take of all."""
-MOST_MATCHES, MOST_INLIERS = 32, 20
+MAX_MATCHES, MAX_INLIERS = 32, 20
 """Where a run keeps no arcs: matches whose pairs are looked at, and inliers among them."""
 KINDS = ("both right", "one wrong", "both wrong")
 CELLS = 240
@@ -189,13 +189,13 @@ def arcs_of(trace: Trace, selected: tuple[int, ...]) -> Arcs:
 def _members(trace: Trace, selected: tuple[int, ...]) -> IntArray:
     """Usable matches whose pairs are looked at, ascending: an even sample of inliers, selection and others."""
     usable = trace.problem.aligned.index
-    if len(usable) <= MOST_MATCHES:
+    if len(usable) <= MAX_MATCHES:
         return usable
     wanted = np.zeros(len(trace.problem), dtype=bool)
-    wanted[[number for number in selected if trace.problem.usable[number]][: MOST_MATCHES // 3]] = True
-    wanted[sample(np.flatnonzero(trace.inlier_mask), MOST_INLIERS)] = True
+    wanted[[number for number in selected if trace.problem.usable[number]][: MAX_MATCHES // 3]] = True
+    wanted[sample(np.flatnonzero(trace.inlier_mask), MAX_INLIERS)] = True
     others = usable[~wanted[usable]]
-    wanted[sample(others, MOST_MATCHES - int(np.count_nonzero(wanted)))] = True
+    wanted[sample(others, MAX_MATCHES - int(np.count_nonzero(wanted)))] = True
     return np.flatnonzero(wanted)
 
 
@@ -227,7 +227,7 @@ def _overlapping(arcs: Arcs, low_rad: float, high_rad: float) -> IntArray:
     return np.flatnonzero(inside)
 
 
-def bars_in(trace: Trace, arcs: Arcs, window: Window, selected: tuple[int, ...], most: int = MOST_BARS) -> Bars:
+def bars_in(trace: Trace, arcs: Arcs, window: Window, selected: tuple[int, ...], most: int = MAX_BARS) -> Bars:
     """Selected pairs, wherever their arcs are, and pairs with an arc in a window: an even sample with an equal share of
     each kind.
     """
@@ -238,7 +238,7 @@ def bars_in(trace: Trace, arcs: Arcs, window: Window, selected: tuple[int, ...],
     of_kind = [inside[kind == k] for k in range(len(KINDS))]
     drawn = np.zeros(len(arcs.pairs), dtype=bool)
     if selected:
-        drawn[sample(np.flatnonzero(_chosen(arcs.pairs, selected)), MOST_CHOSEN)] = True
+        drawn[sample(np.flatnonzero(_chosen(arcs.pairs, selected)), MAX_CHOSEN)] = True
     room = most - int(np.count_nonzero(drawn[inside]))
     for place, group in enumerate(sorted(of_kind, key=len)):
         some = sample(group[~drawn[group]], room // (len(KINDS) - place))

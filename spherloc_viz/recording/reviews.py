@@ -66,10 +66,10 @@ def _reader(path: Path) -> RrdReader:
             raise ValueError(str(warning)) from warning
 
 
-MOST_LABELS = 20
-MOST_LABEL_CHARACTERS = 40
-MOST_NOTE_CHARACTERS = 4_000
-MOST_BYTES = 1 << 20
+MAX_LABELS = 20
+MAX_LABEL_CHARACTERS = 40
+MAX_NOTE_CHARACTERS = 4_000
+MAX_BYTES = 1 << 20
 """Of a review file, which has 6 kB and the text."""
 UNREADABLE = "labels and note cannot be read; delete the file and label the run again."
 
@@ -90,14 +90,14 @@ def checked_review(labels: Sequence[str], note: str) -> Review:
     Raises ``InputError`` if there are more or longer ones than are stored.
     """
     clean = tuple(dict.fromkeys(label for label in (_line(text) for text in labels) if label))
-    if len(clean) > MOST_LABELS:
-        raise InputError(f"{len(clean)} labels are too many for a run: give at most {MOST_LABELS}.")
+    if len(clean) > MAX_LABELS:
+        raise InputError(f"{len(clean)} labels are too many for a run: give at most {MAX_LABELS}.")
     for label in clean:
-        if len(label) > MOST_LABEL_CHARACTERS:
-            raise InputError(f"the label {show(label)} is too long: give at most {MOST_LABEL_CHARACTERS} characters.")
+        if len(label) > MAX_LABEL_CHARACTERS:
+            raise InputError(f"the label {show(label)} is too long: give at most {MAX_LABEL_CHARACTERS} characters.")
     text = "\n".join(_printable(line).rstrip() for line in note.splitlines()).strip()
-    if len(text) > MOST_NOTE_CHARACTERS:
-        raise InputError(f"a note of {len(text)} characters is too long: give at most {MOST_NOTE_CHARACTERS}.")
+    if len(text) > MAX_NOTE_CHARACTERS:
+        raise InputError(f"a note of {len(text)} characters is too long: give at most {MAX_NOTE_CHARACTERS}.")
     return Review(clean, text)
 
 
@@ -161,9 +161,9 @@ def read_review(recording: Path) -> Review:
     path = review_path(Path(recording))
     while before := _stamp(path):
         try:
-            if not path.is_file() or path.stat().st_size > MOST_BYTES:
+            if not path.is_file() or path.stat().st_size > MAX_BYTES:
                 raise ValueError("not a file of labels")
-            return checked_review(*read_file(path, MOST_LABELS))
+            return checked_review(*read_file(path, MAX_LABELS))
         except (OSError, RuntimeError, ValueError, TypeError, LookupError, AttributeError, InputError) as error:
             if _stamp(path) == before:
                 raise RecordingError(f"{path}: {UNREADABLE}") from error

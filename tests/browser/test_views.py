@@ -14,7 +14,7 @@ from spherloc_viz.recording.content.data import read_recording
 pytestmark = pytest.mark.browser
 
 EXACT = "mc-exact (exact, certified)"
-LEAST_CONTRAST = 4.5
+MIN_CONTRAST = 4.5
 TABS = ("Yaw", "Charts", "Residuals", "Images", "Matches", "Play", "Compare", "Sweep", "Open", "Share")
 
 READ_CONTRASTS = r"""() => {
@@ -331,7 +331,7 @@ def test_dark_and_light_can_be_read(tab: Playground, address: str) -> None:
         for name in TABS:
             tab.tab(name)
             contrasts = read_contrasts(tab)
-            faint |= {f"{name}: {words}": round(ratio, 2) for words, ratio in contrasts if ratio < LEAST_CONTRAST}
+            faint |= {f"{name}: {words}": round(ratio, 2) for words, ratio in contrasts if ratio < MIN_CONTRAST}
         assert not faint, theme
         tab.tab("Play")
     assert sum(backgrounds[0]) < 200 and sum(backgrounds[1]) > 700

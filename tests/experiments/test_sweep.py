@@ -21,7 +21,7 @@ from spherloc.errors import InputError
 from spherloc.estimators import estimate, options_type
 from spherloc.experiments import sweep_cluster, sweep_workers
 from spherloc.experiments.sweep import (
-    MOST_DEATHS,
+    MAX_DEATHS,
     TASK_S,
     Backlog,
     Entrant,
@@ -179,7 +179,7 @@ def test_a_run_that_always_kills_its_worker_is_named(tmp_path: Path) -> None:
     backlog.put_back(second)
     (bad,) = second
     with pytest.raises(InputError, match=r"mc-exact at outlier rate 0.5, seed 3: its worker process was kill"):
-        for _ in range(10 * MOST_DEATHS * (len(first) + len(second))):
+        for _ in range(10 * MAX_DEATHS * (len(first) + len(second))):
             jobs = backlog.take()
             assert len(jobs) == 1 and backlog.take() == ()
             if jobs == (bad,):

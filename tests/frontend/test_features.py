@@ -186,7 +186,7 @@ def test_features_match_across_the_seam(tmp_path, rng):
 
 def test_large_images_are_shrunk_for_detection(tmp_path, rng, monkeypatch):
     """Their features are still given in the image's own pixels, also where the sides shrink unlike each other."""
-    monkeypatch.setattr(module, "MOST_PIXELS", 160_003)
+    monkeypatch.setattr(module, "MAX_PIXELS", 160_003)
     centres = np.array([(150.5, 200.25), (411.0, 120.0), (600.2, 300.7)])
     found = extract(view_of(tmp_path, blobs(441, 801, centres, 11.0), fisheye_of(801, 441)))
     index, distance = nearest(centres, found.pixels)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from spherloc.frontend.features import Features
 from spherloc.frontend.matching import (
     BINARY_SHARES,
-    LEAST_SHARED,
+    MIN_SHARED,
     RATIOS,
     SHARES,
     MatchOptions,
@@ -90,6 +90,6 @@ def test_agreement_says_nothing_of_references_that_share_too_little(rng):
     found = right_shares([*pixels, alone], [*points, points[0]], [*ranges, ranges[0]])
     assert np.isfinite(found[:2]).all() and np.isnan(found[2])
     assert np.isnan(right_shares(pixels[:1], points[:1], ranges[:1])).all()
-    few = LEAST_SHARED - 1
+    few = MIN_SHARED - 1
     short = right_shares([pixels[0][:few], pixels[0]], [points[0][:few], points[0]], [ranges[0][:few], ranges[0]])
     assert np.isnan(short).all()

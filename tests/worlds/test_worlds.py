@@ -13,7 +13,7 @@ from spherloc.errors import InputError
 from spherloc.geometry import camera_centre
 from spherloc.worlds import WORLDS, Conditions, build_world, image_path, render, stored_range
 from spherloc.worlds.conditions import CLEAR
-from spherloc.worlds.mesh import MOST_BYTES
+from spherloc.worlds.mesh import MAX_BYTES
 from spherloc.worlds.render import draw
 
 KINDS = sorted(WORLDS)
@@ -53,7 +53,7 @@ def test_glb_is_the_mesh(kind):
     world = build_world(kind)
     content = world.glb()
     assert content is world.glb()  # a viewer knows by this that it has it already
-    assert len(content) <= 1.1 * MOST_BYTES
+    assert len(content) <= 1.1 * MAX_BYTES
     scene = trimesh.load_scene(io.BytesIO(content), file_type="glb")
     np.testing.assert_allclose(
         scene.bounds, [world.mesh.vertices.min(axis=0), world.mesh.vertices.max(axis=0)], atol=1e-4

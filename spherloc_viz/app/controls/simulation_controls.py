@@ -13,8 +13,8 @@ from spherloc_viz.app.web.viser_internals import changes_of, put
 
 OWN_CAMERA = "the scene's own"
 RANGES: Mapping[str, int] = {"to 500": 500, "to 5,000": 5000}
-LEAST_POINTS = 10
-MOST_NOISE_PX, MOST_OUTLIERS, MOST_GRAVITY_DEG = 10.0, 99.0, 3.0
+MIN_POINTS = 10
+MAX_NOISE_PX, MAX_OUTLIERS, MAX_GRAVITY_DEG = 10.0, 99.0, 3.0
 KINDS: Mapping[str, str] = {
     "random": "random",
     "coherent: one wrong pose": "coherent",
@@ -46,9 +46,9 @@ class SimulationControls:
         self._true_camera: TrueCamera | None = None
         self._rate = (80.0, 0.8)
         """What the slider shows, and the rate that it means, which may have more digits."""
-        self._points = gui.add_slider("Points", LEAST_POINTS, 500, 1, 100, hint="Correspondences, N.")
-        self._noise = gui.add_slider("Noise (px)", 0.0, MOST_NOISE_PX, 0.1, 1.0, hint="Standard deviation of a pixel.")
-        self._outliers = gui.add_slider("Outliers (%)", 0.0, MOST_OUTLIERS, 1.0, 80.0, hint="Share of wrong matches.")
+        self._points = gui.add_slider("Points", MIN_POINTS, 500, 1, 100, hint="Correspondences, N.")
+        self._noise = gui.add_slider("Noise (px)", 0.0, MAX_NOISE_PX, 0.1, 1.0, hint="Standard deviation of a pixel.")
+        self._outliers = gui.add_slider("Outliers (%)", 0.0, MAX_OUTLIERS, 1.0, 80.0, hint="Share of wrong matches.")
         self._kind = gui.add_dropdown(
             "Wrong matches", tuple(KINDS), hint="Each by chance, all as another camera saw them, or copies of a facade."
         )
@@ -70,7 +70,7 @@ class SimulationControls:
             self._gravity = gui.add_slider(
                 "Gravity error (deg)",
                 0.0,
-                MOST_GRAVITY_DEG,
+                MAX_GRAVITY_DEG,
                 0.05,
                 0.0,
                 hint="Standard deviation of the error of the known roll and pitch; the problem states it.",
@@ -148,9 +148,9 @@ class SimulationControls:
         values |= {name: value for name, value in variation.simulation.items() if name in values}
         self._write_points(values["correspondences"])
         self._rate = (round(100.0 * values["outlier_rate"], 6), values["outlier_rate"])
-        _slide(self._noise, values["noise_px"], MOST_NOISE_PX)
-        _slide(self._outliers, self._rate[0], MOST_OUTLIERS)
-        _slide(self._gravity, values["gravity_error_deg"], MOST_GRAVITY_DEG)
+        _slide(self._noise, values["noise_px"], MAX_NOISE_PX)
+        _slide(self._outliers, self._rate[0], MAX_OUTLIERS)
+        _slide(self._gravity, values["gravity_error_deg"], MAX_GRAVITY_DEG)
         put(self._view, values["field_of_view_deg"])
         put(self._height, values["cloud_height_m"])
         put(self._kind, next(name for name, kind in KINDS.items() if kind == values["outlier_kind"]))
@@ -159,7 +159,7 @@ class SimulationControls:
     def _write_points(self, count: int) -> None:
         if count > RANGES[self._range.value]:
             put(self._range, max(RANGES, key=lambda name: RANGES[name]))
-        self._points.min = min(LEAST_POINTS, count)
+        self._points.min = min(MIN_POINTS, count)
         self._points.max = max(RANGES[self._range.value], count)
         put(self._points, count)
 

@@ -4,7 +4,7 @@
 const LOG_COLUMNS = new Set(["rotation_error_deg", "translation_error_m", "time_ms", "correspondences", "tilt_deg",
   "rotation_sd_deg", "position_sd_m", "size_bytes"]);
 const MARGIN = { left: 46, right: 10, top: 8, bottom: 26 };
-const MOST_LINES = 1200;
+const MAX_LINES = 1200;
 const AXES = ["outlier_rate", "correspondences", "residual_median", "alternative_support", "coverage", "tilt_deg",
   "rotation_error_deg", "time_ms"];
 
@@ -207,7 +207,7 @@ class Parallel {
     const width = canvas.clientWidth, height = canvas.clientHeight;
     context.clearRect(0, 0, width, height);
     const step = (width - 40) / Math.max(1, axes.length - 1), tall = height - 40;
-    const every = Math.max(1, Math.ceil(listed.length / MOST_LINES));
+    const every = Math.max(1, Math.ceil(listed.length / MAX_LINES));
     context.globalAlpha = Math.max(0.06, Math.min(0.6, 120 / Math.max(1, listed.length / every)));
     context.lineWidth = 1;
     for (let at = 0; at < listed.length; at += every) {

@@ -4,7 +4,7 @@
 const SETTINGS = JSON.parse(document.body.dataset.settings);
 const FILTERS = ["outcome", "diagnosis", "estimator", "scene", "source", "labels"];
 const GROUPED = ["diagnosis", "scene", "estimator", "outcome", "changes", "source", "name"];
-const MOST_CHIPS = 6, ALL_CHIPS = 40, MOST_GROUP_COLUMNS = 6, EXAMPLES = 4, ROW_PX = 34;
+const MAX_CHIPS = 6, ALL_CHIPS = 40, MAX_GROUP_COLUMNS = 6, EXAMPLES = 4, ROW_PX = 34;
 const WIDTHS = {
   outcome: 80, diagnosis: 150, scene: 140, name: 190, changes: 150, labels: 150, title: 190, created: 110, query: 120, estimator: 92,
   outlier_rate: 64, rotation_error_deg: 74, translation_error_m: 78, rotation_sd_deg: 74, position_sd_m: 78, certificate_gap: 84,
@@ -142,13 +142,13 @@ function drawChips() {
   for (const name of FILTERS) {
     const now = state.chosen[name] || [];
     const counted = runs.counts(now.length ? runs.fitting(filterState(name)) : fits, name);
-    const most = allChips.has(name) ? ALL_CHIPS : MOST_CHIPS;
+    const most = allChips.has(name) ? ALL_CHIPS : MAX_CHIPS;
     const values = counted.slice(0, most);
     for (const value of now) if (!values.some(([other]) => other === value)) values.push([value, 0]);
     if (values.length < 2 && !now.length && name !== "outcome" && name !== "labels") continue;
     if (!values.length) continue;
-    const more = counted.length > MOST_CHIPS ? [element("button", { className: "chip", title: `More of ${title(name)}`,
-      textContent: allChips.has(name) ? "fewer" : `${count(counted.length - MOST_CHIPS)} more …`,
+    const more = counted.length > MAX_CHIPS ? [element("button", { className: "chip", title: `More of ${title(name)}`,
+      textContent: allChips.has(name) ? "fewer" : `${count(counted.length - MAX_CHIPS)} more …`,
       onclick: () => { if (!allChips.delete(name)) allChips.add(name); soon(); } })] : [];
     lines.push(element("div", { className: "chips", "data-filter": name }, ...values.map(([value, number]) =>
       chip(short(value), number, now.includes(value), () => toggled(name, value), `${title(name)}: ${value || "none"}`,
@@ -184,7 +184,7 @@ function drawMatrix() {
   const shownFits = runs.fitting(open);
   const a = runs.texts[state.rows], b = runs.texts[state.across];
   const rows = runs.counts(shownFits, state.rows).slice(0, 14);
-  const across = state.rows === state.across ? [] : runs.counts(shownFits, state.across).slice(0, MOST_GROUP_COLUMNS);
+  const across = state.rows === state.across ? [] : runs.counts(shownFits, state.across).slice(0, MAX_GROUP_COLUMNS);
   const at = runs.crossed(shownFits, state.rows, state.across);
   const codeOf = (column, value) => column.values.indexOf(value);
   const most = Math.max(1, ...rows.flatMap(([value]) => across.map(([other]) => at(codeOf(a, value), codeOf(b, other)))));

@@ -14,10 +14,10 @@ VIEWS, SETS = "views", "sets"
 """Folders in the folder of the recordings."""
 VIEW_SUFFIX, SET_SUFFIX = ".json", ".txt"
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9 _.-]{0,59}")
-MOST_BYTES = 20 << 20
+MAX_BYTES = 20 << 20
 """Of a file: the names of 100,000 runs take 8 MB."""
-MOST_VIEW_LETTERS = 20_000
-MOST_FILES = 500
+MAX_VIEW_LETTERS = 20_000
+MAX_FILES = 500
 """Views or sets that are listed."""
 
 
@@ -27,7 +27,7 @@ def save_view(folder: Path, name: str, state: dict[str, Any]) -> None:
     Raises ``InputError`` for a name or state that cannot be stored, ``RecordingError`` if the disk cannot.
     """
     text = json.dumps(state, indent=1)
-    if len(text) > MOST_VIEW_LETTERS:
+    if len(text) > MAX_VIEW_LETTERS:
         raise InputError(f"the view {show(name)} is too large to be stored: clear the brush or the lasso.")
     _write(folder / VIEWS / (_checked(name) + VIEW_SUFFIX), text + "\n")
 
@@ -37,7 +37,7 @@ def views(folder: Path) -> dict[str, dict[str, Any]]:
     found: dict[str, dict[str, Any]] = {}
     for path in _files(folder / VIEWS, VIEW_SUFFIX):
         with contextlib.suppress(OSError, ValueError, RecursionError):
-            state = json.loads(_read(path)) if path.stat().st_size <= 4 * MOST_VIEW_LETTERS else None
+            state = json.loads(_read(path)) if path.stat().st_size <= 4 * MAX_VIEW_LETTERS else None
             if isinstance(state, dict):
                 found[path.name.removesuffix(VIEW_SUFFIX)] = state
     return found
@@ -92,13 +92,13 @@ def _checked(name: str) -> str:
 
 def _files(folder: Path, suffix: str) -> list[Path]:
     try:
-        return sorted(path for path in folder.iterdir() if path.name.endswith(suffix))[:MOST_FILES]
+        return sorted(path for path in folder.iterdir() if path.name.endswith(suffix))[:MAX_FILES]
     except OSError:
         return []
 
 
 def _read(path: Path) -> str:
-    if not path.is_file() or path.is_symlink() or path.stat().st_size > MOST_BYTES:
+    if not path.is_file() or path.is_symlink() or path.stat().st_size > MAX_BYTES:
         raise ValueError("no such file, or too large")
     return path.read_text(encoding="utf-8")
 

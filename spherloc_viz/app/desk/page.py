@@ -11,7 +11,7 @@ from string import Template
 from spherloc.diagnosis import Measures
 from spherloc_viz import style
 from spherloc_viz.app.review.words import COLORS
-from spherloc_viz.recording.reviews import MOST_LABELS
+from spherloc_viz.recording.reviews import MAX_LABELS
 
 SCRIPTS = ("runs.js", "charts.js", "saved.js", "desk.js")
 """What knows the runs, draws them, stores and sends, and ties all to the page."""
@@ -59,7 +59,7 @@ def desk_page() -> tuple[str, str]:
         "columns": COLUMNS,
         "colors": {outcome: style.css(color) for outcome, color in COLORS.items()},
         "accent": style.css(style.ESTIMATE),
-        "mostLabels": MOST_LABELS,
+        "mostLabels": MAX_LABELS,
         "measures": list(Measures.__dataclass_fields__),
     }
     page = Template(_text("desk.html")).substitute(

@@ -15,7 +15,7 @@ LOGARITHMIC = ("tilt_deg", "rotation_sd_deg", "position_sd_m")
 """Those that range over orders of magnitude."""
 LEAST = 1e-6
 """Added before a logarithm is taken."""
-MOST_SDS = 3.0
+MAX_SDS = 3.0
 """Values farther from the median count as that far: one odd run must not squeeze all others into a corner."""
 NAMED = 2
 """Columns that an axis is named by."""
@@ -50,7 +50,7 @@ def run_map(columns: Mapping[str, Sequence[Any]]) -> RunMap:
     median = np.nanmedian(np.where(known, values, np.nan), axis=0)
     values = np.where(known, values, median) - median
     spread = values.std(axis=0)
-    values = np.clip(values / np.where(spread > 0.0, spread, 1.0), -MOST_SDS, MOST_SDS)
+    values = np.clip(values / np.where(spread > 0.0, spread, 1.0), -MAX_SDS, MAX_SDS)
     values -= values.mean(axis=0)
     _, vectors = np.linalg.eigh(values.T @ values)
     axes = vectors[:, ::-1][:, :2]

@@ -27,7 +27,7 @@ from spherloc_viz.layers.query_image import modified, photograph, shrunk
 
 GONE = "cannot be read: it is still being drawn, or it is gone."
 QUALITIES = (82, 70, 55, 40)
-MOST_BYTES = 85_000
+MAX_BYTES = 85_000
 """A JPEG is encoded with less quality while it is larger; as text it takes a third more."""
 
 
@@ -48,7 +48,7 @@ def jpeg_uri(image: NDArray[np.uint8]) -> str:
     data = b""
     for quality in QUALITIES:
         data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
-        if len(data) <= MOST_BYTES:
+        if len(data) <= MAX_BYTES:
             break
     return f"data:image/jpeg;base64,{base64.b64encode(data).decode()}"
 

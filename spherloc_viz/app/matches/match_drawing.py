@@ -22,11 +22,11 @@ WIDTH, GAP = 1000.0, 14.0
 """Of the drawing, in its own units; the page scales it."""
 WIDE = 2.6
 """Up to this sum of widths over heights, two images stand side by side."""
-MOST_DOTS = 600
+MAX_DOTS = 600
 LINE_PX, RING = 1.2, 20.0
 DOT_PX = ((500, 3.0), (200, 4.0), (0, 5.5))
 """From this many dots on: their width."""
-MOST_LABELS = 8
+MAX_LABELS = 8
 NAMES = ("query", "reference")
 
 
@@ -95,13 +95,13 @@ def frame_html(places: Sequence[Place], height: float, photos: Sequence[bool], p
 
 
 def thinned(own: IntArray, inlier: BoolArray, chosen: IntArray) -> IntArray:
-    """About ``MOST_DOTS`` of the matches ``own``, inliers last: an even sample of the inliers among all (N,), half if
+    """About ``MAX_DOTS`` of the matches ``own``, inliers last: an even sample of the inliers among all (N,), half if
     others fill the rest, one of the others, and all that are ``chosen``."""
-    if len(own) <= MOST_DOTS:
+    if len(own) <= MAX_DOTS:
         return np.concatenate([own[~inlier[own]], own[inlier[own]]])
     inliers, others = own[inlier[own]], own[~inlier[own]]
-    take = min(len(inliers), max(MOST_DOTS // 2, MOST_DOTS - len(others)))
-    return np.concatenate([even(others, MOST_DOTS - take), np.union1d(even(inliers, take), chosen)])
+    take = min(len(inliers), max(MAX_DOTS // 2, MAX_DOTS - len(others)))
+    return np.concatenate([even(others, MAX_DOTS - take), np.union1d(even(inliers, take), chosen)])
 
 
 def dots(places: FloatArray, colors: ByteArray) -> list[str]:
@@ -152,7 +152,7 @@ def rings(places: FloatArray, numbers: Sequence[int]) -> list[str]:
         for paint, width_px in (("#ffffff", 4.5), (color, 2.5)):
             look = f'fill="none" stroke="{paint}" stroke-width="{width_px}" vector-effect="non-scaling-stroke"'
             parts.append(shapes.dot(x, y, RING, look))
-        if len(numbers) <= MOST_LABELS:
+        if len(numbers) <= MAX_LABELS:
             # Beside the ring, on the side where there is more room, and within the drawing.
             left = x > 0.5 * WIDTH
             parts.append(
@@ -173,7 +173,7 @@ def _by_color(rows: FloatArray, colors: ByteArray) -> list[tuple[str, FloatArray
     return [(f"#{color:06x}", rows[packed == color]) for color in kinds[order].tolist()]
 
 
-MOST_RINGS = 100
+MAX_RINGS = 100
 REACH = 32.0
 """How near to a match a press on an image must be, in units of the drawing: about 12 px."""
 
@@ -222,7 +222,7 @@ def overlay(
     problem, own = trace.problem, view.own
     inlier = inlier_colored(colors)
     chosen = np.intersect1d(np.array(selected, dtype=np.int64), own)
-    drawn = drawing.thinned(own, inlier, even(chosen, MOST_RINGS))
+    drawn = drawing.thinned(own, inlier, even(chosen, MAX_RINGS))
     ends = [places[0].at(problem.pixels)]
     if len(places) > 1 and problem.reference_pixels is not None:
         ends.append(places[1].at(problem.reference_pixels))
@@ -239,9 +239,9 @@ def overlay(
             caption += f" {len(some)} of {len(drawn)} lines are drawn."
     for end in ends:
         parts += drawing.dots(end[drawn], colors[drawn])
-    parts += _selected_parts(even(chosen, MOST_RINGS), ends, predicted, kept)
-    if len(chosen) > MOST_RINGS:
-        caption += f" {MOST_RINGS} of {len(chosen):,} selected matches have rings."
+    parts += _selected_parts(even(chosen, MAX_RINGS), ends, predicted, kept)
+    if len(chosen) > MAX_RINGS:
+        caption += f" {MAX_RINGS} of {len(chosen):,} selected matches have rings."
     if len(drawn) < len(own):
         caption += f" {len(drawn)} of {len(own):,} dots are drawn; every match can be pressed."
     return Overlay(places, parts, caption, [end[own] for end in ends], kept[own])

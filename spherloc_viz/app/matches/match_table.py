@@ -16,7 +16,7 @@ from spherloc_viz.app.text import DIM, WITHHELD, box, status_html
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.layers.matches import FILTERS, SORTS, MatchRows, match_rows, order, reference_votes
 
-MOST_REFERENCES = 8
+MAX_REFERENCES = 8
 
 
 def chip(words: str, touch: str, on: bool, hint: str = "") -> str:
@@ -35,7 +35,7 @@ def chips_html(problem: Problem, inlier_mask: BoolArray, shown: int | None) -> s
     if shown is None or len(matches) < 2:
         return ""
     order = np.lexsort((-matches, -inliers))
-    offered = [int(k) for k in order[:MOST_REFERENCES]]
+    offered = [int(k) for k in order[:MAX_REFERENCES]]
     offered += [] if shown in offered else [shown]
     chips = "".join(
         chip(

@@ -11,9 +11,9 @@ from spherloc.errors import InputError
 
 PAGE = 12
 """Rows that are shown at once."""
-MOST_ENTRIES = 20_000
+MAX_ENTRIES = 20_000
 """Of a larger folder only so many are looked at."""
-MOST_PEEK_BYTES = 100_000
+MAX_PEEK_BYTES = 100_000
 """Larger TOML files are not read before they are opened."""
 
 
@@ -104,7 +104,7 @@ class Roots:
         whole = True
         with os.scandir(folder) as scan:
             for count, entry in enumerate(scan):
-                if count == MOST_ENTRIES:
+                if count == MAX_ENTRIES:
                     whole = False
                     break
                 is_folder = _is_folder(entry)
@@ -129,7 +129,7 @@ def _remarks(hidden: int, outside: int, whole: bool) -> Iterator[str]:
     if outside:
         yield f"{outside} left out, since they are links to folders that are not allowed."
     if not whole:
-        yield f"Only the first {MOST_ENTRIES:,} entries of this folder were looked at."
+        yield f"Only the first {MAX_ENTRIES:,} entries of this folder were looked at."
 
 
 def _is_folder(entry: os.DirEntry) -> bool:
@@ -146,7 +146,7 @@ def describe(path: Path, place: str) -> Row:
             return Row("folder", path.name, place)
         if not path.is_file():  # reading a pipe would wait for ever
             return Row("other", path.name, place, "is no file")
-        if path.stat().st_size > MOST_PEEK_BYTES:
+        if path.stat().st_size > MAX_PEEK_BYTES:
             return Row("scene", path.name, place, "large")
         table = read_table(path)
     except (InputError, OSError):

@@ -13,7 +13,7 @@ from spherloc.datasets import Scene, bundled_scenes, load_scene
 from spherloc.disk_cache import cache_folder, store
 from spherloc.errors import InputError
 from spherloc_viz.app.panels.folders import Listing, Roots, Row, describe
-from spherloc_viz.app.panels.uploads import MOST_BYTES, MOST_CALIBRATION_BYTES, File, Form, Scratch, open_upload
+from spherloc_viz.app.panels.uploads import MAX_BYTES, MAX_CALIBRATION_BYTES, File, Form, Scratch, open_upload
 from spherloc_viz.app.text import DIM, box, status_html
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.web.viser_internals import limit_uploads
@@ -84,9 +84,9 @@ def _row_html(action: str | None, name: str, about: str) -> str:
     return f"<tr{touch}>{cell}</tr>"
 
 
-MOST_RECENT = 8
+MAX_RECENT = 8
 """Scenes that are remembered."""
-MOST_RECENT_BYTES = 100_000
+MAX_RECENT_BYTES = 100_000
 
 _writing = threading.Lock()
 
@@ -102,21 +102,21 @@ class RecentScenes:
         try:
             if not self._path.exists():
                 return (), ""
-            if self._path.stat().st_size > MOST_RECENT_BYTES:
+            if self._path.stat().st_size > MAX_RECENT_BYTES:
                 raise ValueError("too large")
             values = json.loads(self._path.read_text(encoding="utf-8"))
             if not isinstance(values, list) or not all(isinstance(value, str) for value in values):
                 raise ValueError("no list of paths")
         except (OSError, ValueError, RecursionError):
             return (), f"The list of recent scenes ({self._path.name}) is damaged and is begun anew."
-        return tuple(Path(value) for value in values[:MOST_RECENT] if value and "\0" not in value), ""
+        return tuple(Path(value) for value in values[:MAX_RECENT] if value and "\0" not in value), ""
 
     def note(self, path: Path) -> None:
         """Put a scene file in front."""
         with _writing:
             before, _ = self.read()
             paths = [str(path), *(str(other) for other in before if other != path)]
-            store(self._path, json.dumps(paths[:MOST_RECENT], indent=1).encode())
+            store(self._path, json.dumps(paths[:MAX_RECENT], indent=1).encode())
 
 
 UPLOADED = "uploaded: "
@@ -160,7 +160,7 @@ class OpenPanel:
             self._build_form(gui)
         self._list = gui.add_html("")
         # Larger files are turned away before they fill this process's memory.
-        limit_uploads(client, MOST_BYTES, self._complain)
+        limit_uploads(client, MAX_BYTES, self._complain)
         touches.on("open-scene", lambda touch: self._background.ask(lambda: self._open(touch.argument)))
         touches.on("open-folder", self._walk)
         self._background.ask(self._refresh)
@@ -200,7 +200,7 @@ class OpenPanel:
     def _take(self, what: str, given: viser.UploadedFile) -> None:
         """Keep an uploaded file until the form is sent."""
         file = File(given.name, given.content)
-        most = MOST_BYTES if what == "matches" else MOST_CALIBRATION_BYTES
+        most = MAX_BYTES if what == "matches" else MAX_CALIBRATION_BYTES
         if len(file.content) > most:
             self._complain(f"{file.title}: larger than {most / 1e6:.2g} MB; upload a smaller file.")
             return

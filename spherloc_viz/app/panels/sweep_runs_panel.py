@@ -33,7 +33,7 @@ VALUES = {
 """What is offered for each axis."""
 HINT = "FIRST:LAST:STEP, or numbers with commas between them."
 TICKED = ("mc-exact", "mc", "ransac-2p")
-MOST_PAGE_ROWS = 20_000
+MAX_PAGE_ROWS = 20_000
 """Larger sweeps are for the command line, which keeps them on disk."""
 ROOM_EVERY = 100
 """Recorded runs after which old ones may have to make room."""
@@ -182,9 +182,9 @@ class SweepPanel:
         entrants = [Entrant(name) for name in self._names if name in self._ticked]
         values, runs = parse_values([self._values.value]), int(self._runs.value)
         plan = planned(path, over, values, entrants, runs, variation, request.seed)
-        if plan.rows > MOST_PAGE_ROWS:
+        if plan.rows > MAX_PAGE_ROWS:
             raise InputError(
-                f"these are {plan.rows:,} runs; ask for {MOST_PAGE_ROWS:,} or fewer, or take spherloc sweep on the "
+                f"these are {plan.rows:,} runs; ask for {MAX_PAGE_ROWS:,} or fewer, or take spherloc sweep on the "
                 "command line."
             )
         before = self._results

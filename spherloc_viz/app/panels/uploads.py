@@ -22,10 +22,10 @@ from spherloc.cameras.calibration import load_camera
 from spherloc.datasets import Scene, load_scene
 from spherloc.errors import InputError, show
 
-MOST_BYTES = 10_000_000
-MOST_CALIBRATION_BYTES = 256 * 1024
-MOST_ROWS = 200_000
-MOST_NAME = 60
+MAX_BYTES = 10_000_000
+MAX_CALIBRATION_BYTES = 256 * 1024
+MAX_ROWS = 200_000
+MAX_NAME = 60
 """Beyond any pixel and any map, so that squares and products of it are numbers."""
 
 
@@ -41,7 +41,7 @@ class File:
     def title(self) -> str:
         """The name without folders and without what cannot be printed."""
         last = PurePosixPath(self.name.replace("\\", "/")).name
-        return "".join(filter(str.isprintable, last)).strip()[:MOST_NAME] or "upload"
+        return "".join(filter(str.isprintable, last)).strip()[:MAX_NAME] or "upload"
 
 
 @dataclass(frozen=True)
@@ -122,8 +122,8 @@ def open_upload(form: Form, folder: Path) -> tuple[Path, Scene]:
 
 def check_matches(file: File) -> None:
     """Raise ``InputError`` for what is too large, or no text at all, before it is read."""
-    if len(file.content) > MOST_BYTES:
-        raise InputError(f"{file.title}: larger than {MOST_BYTES // 1_000_000} MB; upload fewer matches.")
+    if len(file.content) > MAX_BYTES:
+        raise InputError(f"{file.title}: larger than {MAX_BYTES // 1_000_000} MB; upload fewer matches.")
     if not file.content:
         raise InputError(f"{file.title}: is empty; upload a CSV with the columns u, v, X, Y, Z.")
     nul = file.content.find(b"\0")
@@ -131,8 +131,8 @@ def check_matches(file: File) -> None:
         raise InputError(f"{file.title}: byte {nul} is no text; upload a CSV with the columns u, v, X, Y, Z.")
     # Rows end with \n, \r or both; a quoted line break makes this too many, never too few.
     ends = file.content.count(b"\n") + file.content.count(b"\r") - file.content.count(b"\r\n")
-    if ends > MOST_ROWS:
-        raise InputError(f"{file.title}: has more than {MOST_ROWS:,} lines; upload fewer matches.")
+    if ends > MAX_ROWS:
+        raise InputError(f"{file.title}: has more than {MAX_ROWS:,} lines; upload fewer matches.")
 
 
 def read_calibration(file: File, path: Path) -> Camera:
@@ -141,8 +141,8 @@ def read_calibration(file: File, path: Path) -> Camera:
     Raises ``InputError`` for what is too large or no calibration, and for a TOML with more than a camera in it: an
     upload must not name files.
     """
-    if len(file.content) > MOST_CALIBRATION_BYTES:
-        raise InputError(f"{file.title}: larger than {MOST_CALIBRATION_BYTES // 1024} KiB, which no calibration is.")
+    if len(file.content) > MAX_CALIBRATION_BYTES:
+        raise InputError(f"{file.title}: larger than {MAX_CALIBRATION_BYTES // 1024} KiB, which no calibration is.")
     keys = _toml_keys(file.content)
     if "camera" in keys and len(keys) > 1:
         other = min(keys - {"camera"})

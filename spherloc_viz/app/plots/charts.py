@@ -14,7 +14,7 @@ from spherloc_viz.layers.primitives import Chart, Curve
 
 WIDTH_PX, HEIGHT_PX = 380.0, 180.0
 RIGHT_PX, ROW_PX = 12.0, 15.0
-MOST_DOTS = 40
+MAX_DOTS = 40
 """Corners up to which a line shows each as a dot."""
 MOST_STEPS = 360
 HEADROOM = 1.06
@@ -60,7 +60,7 @@ def chart_svg(
 def _ticks(scale: Scale, apart_px: float, values: list[FloatArray], degrees: bool = False) -> tuple[float, ...]:
     """Round numbers about ``apart_px`` or more from each other; whole ones if all values are."""
     most = max(2, int(abs(scale.high_px - scale.low_px) / apart_px))
-    few = all(len(value) <= MOST_DOTS and np.array_equal(value, np.round(value)) for value in values)
+    few = all(len(value) <= MAX_DOTS and np.array_equal(value, np.round(value)) for value in values)
     if few:
         most = max(2, min(most, int(scale.high - scale.low) + 1))
     return round_ticks(scale.low, scale.high, most, degrees)
@@ -189,7 +189,7 @@ def _line(curve: Curve, x: Scale, y: Scale) -> list[str]:
     if len(xs) == 0:
         return []
     parts = [f'<path d="{shapes.corners(x.px(xs), y.px(ys))}" {shapes.stroke(curve.color, 1.75)}/>']
-    if len(known[0]) <= MOST_DOTS:
+    if len(known[0]) <= MAX_DOTS:
         inside = (known[0] >= x.low) & (known[0] <= x.high)
         for left, top in zip(x.px(known[0][inside]).tolist(), y.px(known[1][inside]).tolist(), strict=True):
             parts.append(

@@ -24,9 +24,9 @@ MIDDLE_PX, RADIUS_PX = (98.0, 110.0), 93.0
 MATRIX_PX = (212.0, 20.0, 186.0)
 """Left, top and size of the matrix."""
 FONT = ' style="font-size:13px"'
-MOST_EDGES = 450
+MAX_EDGES = 450
 """Edges drawn between marked nodes, and as many between others."""
-MOST_LIT = 12
+MAX_LIT = 12
 """Selected nodes that are marked in the matrix."""
 
 
@@ -61,7 +61,7 @@ def edges_of(graph: Graph) -> Edges:
     a, b = edges.T
     both = graph.marked[a] & graph.marked[b]
     marked, others = np.flatnonzero(both), np.flatnonzero(graph.shown[a] & graph.shown[b] & ~both)
-    return Edges(edges[even(marked, MOST_EDGES)], edges[even(others, MOST_EDGES)], len(marked) + len(others))
+    return Edges(edges[even(marked, MAX_EDGES)], edges[even(others, MAX_EDGES)], len(marked) + len(others))
 
 
 def graph_note(graph: Graph, edges: Edges) -> str:
@@ -143,7 +143,7 @@ def _matrix(graph: Graph, lit: NDArray[np.int64]) -> list[str]:
     ]
     there = np.flatnonzero(graph.shown)
     cell = size / max(1, len(there))
-    for k in np.searchsorted(there, lit[:MOST_LIT]).tolist():
+    for k in np.searchsorted(there, lit[:MAX_LIT]).tolist():
         violet = f'fill="{style.css(style.SELECTED)}" fill-opacity=".75"'
         parts.append(shapes.rect(left, top + k * cell, size, min(max(cell, 1.0), 4.0), violet))
         parts.append(shapes.rect(left + k * cell, top, min(max(cell, 1.0), 4.0), size, violet))

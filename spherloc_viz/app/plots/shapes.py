@@ -107,7 +107,7 @@ def wrapped_deg(angle_deg: Any) -> Any:
 
 
 FONT_PX = 13.0
-MOST_CORNERS = 400
+MAX_CORNERS = 400
 """Corners that a line keeps: about one a pixel."""
 TEXT_OPACITY, GRID_OPACITY, AXIS_OPACITY = 0.7, 0.12, 0.4
 
@@ -182,7 +182,7 @@ def corners(x: ArrayLike, y: ArrayLike) -> str:
     return "M" + ("%.1f %.1fL" * (len(flat) // 2) % tuple(flat))[:-1] if flat else ""
 
 
-def thin(x: FloatArray, y: FloatArray, most: int = MOST_CORNERS) -> tuple[FloatArray, FloatArray]:
+def thin(x: FloatArray, y: FloatArray, most: int = MAX_CORNERS) -> tuple[FloatArray, FloatArray]:
     """At most ``most`` (4 or more) of a line's corners (K,): both ends, and the lowest and highest of each stretch."""
     if len(x) <= most:
         return x, y
@@ -198,7 +198,7 @@ def thin(x: FloatArray, y: FloatArray, most: int = MOST_CORNERS) -> tuple[FloatA
     return x[places], y[places]
 
 
-def thin_steps(x: FloatArray, y: FloatArray, most: int = MOST_CORNERS) -> tuple[FloatArray, FloatArray]:
+def thin_steps(x: FloatArray, y: FloatArray, most: int = MAX_CORNERS) -> tuple[FloatArray, FloatArray]:
     """At most ``most`` steps (K,), each the highest of those that it stands for."""
     stride = -(-len(x) // most)
     if stride <= 1:

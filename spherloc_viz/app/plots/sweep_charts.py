@@ -15,7 +15,7 @@ from spherloc_viz.layers.sweep import LIMIT, SweepChart, sweep_charts, sweep_col
 SHOWN = ("sweep success", "sweep rotation", "sweep position", "sweep time")
 """Charts on the page."""
 WIDTH_PX, HEIGHT_PX, RIGHT_PX, TOP_PX, FOOT_PX = 380.0, 165.0, 12.0, 20.0, 33.0
-MOST_DECADES, MOST_TICKS = 5, 6
+MAX_DECADES, MAX_TICKS = 5, 6
 TABLE_PX = 260
 IN_TABLE = ("success", "position error", "time")
 NOTE = (
@@ -49,11 +49,11 @@ def sweep_svg(drawn: SweepChart) -> str:
     if low == high:
         low, high = low - 0.5, high + 0.5
     y = _height(drawn)
-    ticks = decade_ticks(y.low, y.high, MOST_DECADES) if drawn.log else round_ticks(y.low, y.high, MOST_TICKS)
+    ticks = decade_ticks(y.low, y.high, MAX_DECADES) if drawn.log else round_ticks(y.low, y.high, MAX_TICKS)
     texts = tick_texts(ticks, drawn.log)
     left = 9.0 + max(map(shapes.text_width_px, texts), default=0.0)
     x = Scale(low, high, left + 4.0, WIDTH_PX - RIGHT_PX)
-    x_ticks = round_ticks(low, high, MOST_TICKS)
+    x_ticks = round_ticks(low, high, MAX_TICKS)
     parts = shapes.y_axis(y, left, x.high_px, ticks, texts)
     parts += shapes.x_axis(x, y.low_px, x_ticks, tick_texts(x_ticks), chart.x_label)
     parts.append(shapes.text(0.0, 11.0, chart.y_label))

@@ -45,7 +45,7 @@ WINDOW_TOP_PX, WINDOW_FOOT_PX = 116.0, 176.0
 RIGHT_PX = 12.0
 STACK_PX = 196.0
 """Most room for the rows of bars."""
-LEAST_PITCH_PX, MOST_PITCH_PX = 3.0, 9.0
+MIN_PITCH_PX, MAX_PITCH_PX = 3.0, 9.0
 LOOKS = (
     shapes.fill(style.INLIER),
     shapes.fill(style.OUTLIER, 0.5),
@@ -67,7 +67,7 @@ def yaw_svg(story: YawStory, bars: Bars, window: Window, kept: NDArray[np.int64]
     low_px = 9.0 + shapes.text_width_px(tick_texts((story.top,))[0])
     whole = Scale(*ALL, low_px, WIDTH_PX - RIGHT_PX)
     part = Scale(*window, low_px, WIDTH_PX - RIGHT_PX)
-    pitch = min(MOST_PITCH_PX, max(LEAST_PITCH_PX, STACK_PX / max(1, bars.rows)))
+    pitch = min(MAX_PITCH_PX, max(MIN_PITCH_PX, STACK_PX / max(1, bars.rows)))
     foot = WINDOW_FOOT_PX + (8.0 + pitch * bars.rows if bars.rows else 0.0)
     y = Scale(0.0, top, CIRCLE_FOOT_PX, CIRCLE_TOP_PX)
     y_part = Scale(0.0, top, WINDOW_FOOT_PX, WINDOW_TOP_PX)
@@ -265,7 +265,7 @@ def _tips(bars: Bars) -> list[str]:
 NO_ARCS = Arcs(np.zeros((0, 2), np.int64), np.zeros(0), np.zeros(0), "")
 UNTOLD = "Answers are hidden: poses that were tried, the estimate, and which arcs are of right matches are told later."
 PEAK, WHOLE = "Zoom to the peak", "All yaws"
-LEAST_DRAG = 0.012
+MIN_DRAG = 0.012
 """Share of the plot that a press must cross to count as a drag."""
 
 
@@ -342,7 +342,7 @@ class YawView:
             return
         low, width = window[0], window[1] - window[0]
         first, last = sorted((touch.from_x, touch.x))
-        if last - first > LEAST_DRAG:
+        if last - first > MIN_DRAG:
             self._show(window_around(low + 0.5 * (first + last) * width, (last - first) * width))
         elif window == ALL:
             with self._lock:

@@ -28,8 +28,8 @@ from spherloc_viz.recording.reviews import review_path
 from spherloc_viz.recording.run_row import RunRow
 from spherloc_viz.recording.sandbox.examiner import resolve_inside
 
-MOST_RUNS = 500
-MOST_BYTES = 200_000_000
+MAX_RUNS = 500
+MAX_BYTES = 200_000_000
 """Of all files together."""
 
 
@@ -52,21 +52,21 @@ def bundle(
     """Pack recordings of a folder into a zip file; ``total`` is how many were asked for, of which ``rows`` come first.
 
     They are copied in pieces, so that memory does not grow with them. Files that are gone are left out, and so is what
-    goes beyond ``MOST_RUNS`` and ``MOST_BYTES``. Raises ``RecordingError`` if nothing is left, if the file cannot be
+    goes beyond ``MAX_RUNS`` and ``MAX_BYTES``. Raises ``RecordingError`` if nothing is left, if the file cannot be
     written, or if ``closed`` says that nobody waits for it any more; there may be a part of the file then.
     """
     packed: list[RunRow] = []
     size, gone = 0, 0
     try:
         with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as archive:  # recordings are compressed inside
-            for row in rows[:MOST_RUNS]:
+            for row in rows[:MAX_RUNS]:
                 if closed():
                     raise RecordingError("the export was given up, since its page was closed.")
                 with ExitStack() as stack:
                     files = _files(folder, row.file, stack)
                     # Asked before anything is copied: a file may have become a huge one since it was listed.
                     size += sum(count for _, count in files.values())
-                    if size > MOST_BYTES:
+                    if size > MAX_BYTES:
                         break
                     for name, (file, count) in files.items():
                         _copy(archive, f"recordings/{name}", file, count)
@@ -118,9 +118,7 @@ def _remark(left: int, gone: int) -> str:
     """What is not there, in sentences."""
     parts = []
     if left:
-        parts.append(
-            f"{left:,} more were left out: an export has at most {MOST_RUNS} runs and {words.size(MOST_BYTES)}."
-        )
+        parts.append(f"{left:,} more were left out: an export has at most {MAX_RUNS} runs and {words.size(MAX_BYTES)}.")
     if gone:
         parts.append(f"{gone:,} were left out, since their files are gone.")
     return " ".join(parts)
@@ -158,9 +156,9 @@ class Exporter:
     def _export(self) -> None:
         marked = self._runs.marked
         if marked:
-            rows, total = self._library.rows(marked[:MOST_RUNS]), len(marked)
+            rows, total = self._library.rows(marked[:MAX_RUNS]), len(marked)
         else:
-            found = self._library.all(self._runs.look, MOST_RUNS)
+            found = self._library.all(self._runs.look, MAX_RUNS)
             rows, total = found.rows, found.total
         self._offer(None)
         about = sum(row.size_bytes for row in rows)

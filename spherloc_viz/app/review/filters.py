@@ -14,7 +14,7 @@ KEPT = "kept"
 """The label of a run that a page made and somebody wants to keep."""
 PAGE = 20
 """Rows that are shown at once."""
-MOST_PAGES = 10**6
+MAX_PAGES = 10**6
 EXACT = ("outcome", "diagnosis", "estimator", "scene", "label", "source")
 """Filters that take a value which runs have, and by which they are counted."""
 OUTLIERS: Mapping[str, str] = {
@@ -112,7 +112,7 @@ class Look:
 
     def turn(self, page: str) -> "Look":
         """Another page."""
-        fits = page.isascii() and page.isdigit() and int(page) < MOST_PAGES if len(page) < 8 else False
+        fits = page.isascii() and page.isdigit() and int(page) < MAX_PAGES if len(page) < 8 else False
         return replace(self, page=int(page)) if fits else self
 
     def at(self, place: int) -> "Look":
@@ -138,9 +138,9 @@ class Look:
 
 Groups = Sequence[tuple[str, int]]
 
-MOST_CHIPS = 24
+MAX_CHIPS = 24
 """Values that are offered at once, the most frequent ones."""
-MOST_LETTERS = 40
+MAX_LETTERS = 40
 """Of a value; the whole of it is in its hint."""
 NOT_DIAGNOSED, NOTHING = "not diagnosed", "none"
 
@@ -197,7 +197,7 @@ def _chip(
 ) -> str:
     """A value with its count; a press sees those only, or all again."""
     on = chosen == value
-    short = words if len(words) <= MOST_LETTERS else f"…{words[1 - MOST_LETTERS :]}"
+    short = words if len(words) <= MAX_LETTERS else f"…{words[1 - MAX_LETTERS :]}"
     number = "" if count is None else f' <span style="{DIM}">{count:,}</span>'
     dot = "" if color is None else dot_html(color)
     return pill(f"{dot}{escape(short)}{number}", f"runs-filter:{name}:{value}", on, words)
@@ -277,10 +277,10 @@ def _values(look: Look, groups: Groups, sorts: Sequence[str] = tuple(SORTS)) -> 
     if name in fixed:
         return [_chip(name, words, words, None, getattr(look, name)) for words in fixed[name]]
     chosen = getattr(look, name)
-    shown = list(groups[:MOST_CHIPS])
+    shown = list(groups[:MAX_CHIPS])
     if chosen is not None and chosen not in dict(shown):
         shown.append((chosen, 0))
     chips = [_chip(name, value, value or NOTHING, count, chosen) for value, count in shown]
-    if len(groups) > MOST_CHIPS:
-        chips.append(f'<span style="{DIM}">and {len(groups) - MOST_CHIPS:,} more: search for them</span>')
+    if len(groups) > MAX_CHIPS:
+        chips.append(f'<span style="{DIM}">and {len(groups) - MAX_CHIPS:,} more: search for them</span>')
     return chips or [f'<span style="{DIM}">{NOTHING}</span>']

@@ -21,7 +21,7 @@ NEAR = 50
 """A run that was at some place of the list is looked for among so many around it."""
 STRETCH = 500
 """Runs that are looked through at once where it is elsewhere."""
-MOST_LABELS = 12
+MAX_LABELS = 12
 """Labels that are offered, those used most."""
 
 
@@ -77,7 +77,7 @@ class RunLibrary:
 
     def labels(self) -> tuple[str, ...]:
         """Those that were given to any run, the most used first."""
-        return tuple(label for label, _ in self._index.groups(RunQuery(), "label") if label)[:MOST_LABELS]
+        return tuple(label for label, _ in self._index.groups(RunQuery(), "label") if label)[:MAX_LABELS]
 
     def row(self, file: str) -> RunRow:
         """The run of a file; raises ``RecordingError`` if the list does not have it."""

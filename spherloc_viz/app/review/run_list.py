@@ -23,7 +23,7 @@ FOLLOW_S = 1.5
 """While the list is seen, new runs are looked for this often."""
 TYPED_S = 0.25
 """What is typed is searched for when no letter has come for this long."""
-MOST_MARKED = 1000
+MAX_MARKED = 1000
 
 
 class RunList:
@@ -142,7 +142,7 @@ class RunList:
     def _mark(self, touch: Touch) -> None:
         file = touch.argument
         rest = tuple(other for other in self._marked if other != file)
-        self._set_marked(rest if file in self._marked else (*rest, file)[-MOST_MARKED:])
+        self._set_marked(rest if file in self._marked else (*rest, file)[-MAX_MARKED:])
 
     def _set_marked(self, marked: tuple[str, ...]) -> None:
         self._marked = marked

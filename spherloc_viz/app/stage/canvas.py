@@ -16,14 +16,14 @@ from spherloc_viz.app.run_request import Run
 from spherloc_viz.app.stage import views
 from spherloc_viz.app.stage.painter import LABEL_SCALE, Painter
 from spherloc_viz.app.stage.true_camera import TrueCamera
-from spherloc_viz.app.stage.walls import MOST_BYTES, Walls
+from spherloc_viz.app.stage.walls import MAX_BYTES, Walls
 from spherloc_viz.layers.frame import one_color
 from spherloc_viz.layers.primitives import Picture, Points
 
-FIRST_CHECKS, MOST_CHECKS, CHECK_S = 8, 40, 0.4
+FIRST_CHECKS, MAX_CHECKS, CHECK_S = 8, 40, 0.4
 """A page that is still building itself drops its first view and reports that its viewer has not moved; a slow one for
 many checks."""
-MOST_PX = 1 << 20
+MAX_PX = 1 << 20
 """Whatever a page says of its window, it is no larger."""
 HELD = "held"
 """In place of a view's name."""
@@ -84,7 +84,7 @@ class Canvas:
             self._painter.draw_backdrop(mesh, problem.aligned.map_turn, "mesh" in layers)
             self._picture = picture
             solid = mesh if "mesh" in layers else None
-            walls = Walls(solid, problem.aligned.map_turn) if solid is not None and len(solid) <= MOST_BYTES else None
+            walls = Walls(solid, problem.aligned.map_turn) if solid is not None and len(solid) <= MAX_BYTES else None
             walls_came, self._walls = walls is not None and self._walls is None, walls
         if movable or self._movable:
             truth = problem.truth_cam_from_map
@@ -158,7 +158,7 @@ class Canvas:
     def check(self) -> float | None:
         """Seconds to the next look at whether the page dropped its first view; None once it has had time enough."""
         self._checks += 1
-        most = MOST_CHECKS if views.stands_at(self._client, views.START) else FIRST_CHECKS
+        most = MAX_CHECKS if views.stands_at(self._client, views.START) else FIRST_CHECKS
         return CHECK_S if self._checks <= most else None
 
     def _move_viewer(self, run: Run, picture: Picture, walls_came: bool) -> None:
@@ -240,7 +240,7 @@ class Canvas:
         # The page tells its size before it docks the panels, and again some frames later.
         if camera.image_width != self._full_width:
             self._docked_px = 0
-        width_px, height_px = min(camera.image_width, MOST_PX), min(camera.image_height, MOST_PX)
+        width_px, height_px = min(camera.image_width, MAX_PX), min(camera.image_height, MAX_PX)
         return max(0.3, (width_px - self._docked_px) / max(1, height_px))
 
 

@@ -13,7 +13,7 @@ from spherloc_viz.app.stage.views import View, projected
 from spherloc_viz.layers.primitives import Balls, Label, Mesh, Points, SceneItem, Segments
 
 WIDTH, HEIGHT = 560.0, 350.0
-LEAST_DOT_PX, MOST_DOT_PX = 1.2, 12.0
+MIN_DOT_PX, MAX_DOT_PX = 1.2, 12.0
 LINE = 0.6
 """Width of lines by that on the screen, whose canvas is larger."""
 LABEL_PX = 11.0
@@ -61,7 +61,7 @@ def _shapes(item: SceneItem, eye: _Eye) -> Iterator[Shape]:
     match item:
         case Points():
             depths = eye.depths_m(item.positions)
-            radii = np.clip(eye.sizes_px(np.full(len(depths), item.radius_m), depths), LEAST_DOT_PX, MOST_DOT_PX)
+            radii = np.clip(eye.sizes_px(np.full(len(depths), item.radius_m), depths), MIN_DOT_PX, MAX_DOT_PX)
             yield from _discs(eye, item.positions, depths, radii, item.colors, 1.0)
         case Balls():
             depths = eye.depths_m(item.centers)

@@ -20,9 +20,9 @@ OnPick = Callable[[tuple[int, ...], bool], None]
 
 SHELLS = 12
 """Nodes that share the balls of one primitive."""
-MOST_ROUND = 400
+MAX_ROUND = 400
 """Above this many, dots get fewer faces."""
-MOST_BATCHED = 3000
+MAX_BATCHED = 3000
 """Above this many, dots become a point cloud, which costs less."""
 LARGEST_DOT = 0.007
 """Radius of a dot by its distance, as seen from within a camera."""
@@ -98,7 +98,7 @@ class Painter:
             self.eye = eye
             with self._client.atomic():
                 for handle, _, item in self._drawn.values():
-                    if isinstance(item, Points) and len(item.positions) <= MOST_BATCHED:
+                    if isinstance(item, Points) and len(item.positions) <= MAX_BATCHED:
                         handle.batched_scales = np.float32(self._dot_radii_m(item))
 
     def _dot_radii_m(self, item: Points) -> np.ndarray:
@@ -235,7 +235,7 @@ _SHOWN: dict[type[SceneItem], tuple[str, ...]] = {
 def _changing(item: SceneItem) -> dict[str, Any]:
     """The properties of a node that follow the item."""
     match item:
-        case Points() if len(item.positions) > MOST_BATCHED:
+        case Points() if len(item.positions) > MAX_BATCHED:
             return {"points": np.float32(item.positions), "colors": item.colors, "point_size": 2.0 * item.radius_m}
         case Points():
             return _instances(item.positions, np.full(len(item.positions), item.radius_m), item.colors)
@@ -278,7 +278,7 @@ def _add(scene: viser.SceneApi, item: SceneItem, glb: bytes | None, label_scale:
         case Points() if "points" in props:
             return scene.add_point_cloud(name, point_shape="circle", precision="float32", **props)
         case Points():
-            fine = len(item.positions) <= MOST_ROUND
+            fine = len(item.positions) <= MAX_ROUND
             return _add_batch(scene, name, 2 if fine else 1, None, props, "back" if item.rim else "front")
         case Segments():
             return scene.add_line_segments(name, thickness=item.width_px, thickness_units="screen", **props)

@@ -15,7 +15,7 @@ import numpy as np
 from spherloc.types import FloatArray
 from spherloc_viz import style
 from spherloc_viz.app.stage.painter import Painter
-from spherloc_viz.app.stage.views import LEAST_REACH
+from spherloc_viz.app.stage.views import MIN_REACH
 from spherloc_viz.app.web.page import QUIET, client_html
 from spherloc_viz.app.web.viser_internals import start_viser, stop_viser
 from spherloc_viz.layers.primitives import SceneItem
@@ -45,7 +45,7 @@ class Still:
     field_of_view_rad: float
     """From top to bottom."""
     dark: bool
-    reach: float = LEAST_REACH
+    reach: float = MIN_REACH
     """How far is drawn."""
 
 

@@ -21,11 +21,11 @@ MARGINS = np.array([0.13, 0.06])
 """Shares of the canvas' half width and half height that stay free on every side: labels are wide."""
 ROUNDS = 4
 """Perspective shifts the middle of what is seen, so the target is moved there a few times."""
-LEAST_REACH, REACH = 1000.0, 5.0
+MIN_REACH, REACH = 1000.0, 5.0
 """How far a page draws at least, as viser does, and by the distance to what is looked at."""
 STILL = 1e-3
 """Views whose places differ by less, as a share of their distance to what they show, are the same."""
-LEAST_SHARE = 0.5
+MIN_SHARE = 0.5
 """A subject that covers less of the canvas' width and height is shown small."""
 DIRECTIONS = {
     "Overview": (0.55, -0.6, -0.75),
@@ -73,7 +73,7 @@ def same(view: View, other: View) -> bool:
 
 def reach(view: View) -> float:
     """How far a page must draw for a view: a map of mountains is larger than viser thinks."""
-    return max(LEAST_REACH, REACH * float(np.linalg.norm(view.target - view.position)))
+    return max(MIN_REACH, REACH * float(np.linalg.norm(view.target - view.position)))
 
 
 def look(client: viser.ClientHandle, view: View) -> None:
@@ -105,7 +105,7 @@ def shows(view: View, subject: FloatArray, aspect: float) -> bool:
     """Whether a view holds a subject (K, 3) and does not show it small."""
     seen = projected(view, subject) / (np.tan(view.field_of_view_rad / 2) * np.array([aspect, 1.0]))
     inside = bool(np.all(np.abs(seen) <= 1.0))
-    return inside and float(np.max(np.ptp(seen, axis=0))) / 2 >= LEAST_SHARE
+    return inside and float(np.max(np.ptp(seen, axis=0))) / 2 >= MIN_SHARE
 
 
 def fits(name: str | None, view: View, picture: Picture, aspect: float) -> bool:

@@ -18,7 +18,7 @@ TARGETS = 24
 """Lines of sight, at most."""
 NEAR, FAR = 0.08, 0.97
 """Of each line, from the viewer, that is looked at, as shares: the mesh may touch what is to be seen."""
-MOST_BYTES = 60 << 20
+MAX_BYTES = 60 << 20
 """A larger mesh takes too long to read: views are then chosen without it."""
 
 

@@ -29,13 +29,13 @@ from spherloc_viz.recording.sandbox.checks import is_thumbnail
 DO = f"{DESK}/do"
 """The only address that takes a POST."""
 NO_RUNS = "There are no recordings to look at: start the playground without --no-record."
-MOST_BYTES = 32 << 20
+MAX_BYTES = 32 << 20
 """Of what a page sends: the names of 100,000 runs take 8 MB."""
-MOST_REVIEWED = 500
+MAX_REVIEWED = 500
 """Runs that are labelled by one request; a page sends several."""
-MOST_REPORTED = 500
+MAX_REPORTED = 500
 """Runs of a report, whose pictures make it 10 MB."""
-MOST_REPORTS = 20
+MAX_REPORTS = 20
 """Reports that are kept until the server ends; older ones are deleted."""
 COMPRESSION = 1
 """Of gzip: more takes longer than a local connection saves."""
@@ -172,8 +172,8 @@ class DeskRoom:
     def _review(self, told: Mapping[str, Any]) -> dict[str, Any]:
         """Change labels and notes of some runs; tells what each had before and has now, and what could not be done."""
         changes = told.get("changes")
-        if not isinstance(changes, list) or len(changes) > MOST_REVIEWED:
-            raise InputError(f"label at most {MOST_REVIEWED} runs with one request.")
+        if not isinstance(changes, list) or len(changes) > MAX_REVIEWED:
+            raise InputError(f"label at most {MAX_REVIEWED} runs with one request.")
         done, failed = [], []
         for change in changes:
             if not isinstance(change, dict):
@@ -211,11 +211,11 @@ class DeskRoom:
 
     def _report(self, told: Mapping[str, Any]) -> dict[str, Any]:
         asked = _texts(told, "files")
-        rows = self._library.rows(asked[:MOST_REPORTED])
+        rows = self._library.rows(asked[:MAX_REPORTED])
         if not rows:
             raise InputError("no run is listed, so there is nothing to report.")
         left = len(asked) - len(rows)
-        remark = f"The first {MOST_REPORTED} of {len(asked):,} runs." if left else ""
+        remark = f"The first {MAX_REPORTED} of {len(asked):,} runs." if left else ""
         now = datetime.now(UTC)
         name = f"spherloc-runs-{now:%Y%m%dT%H%M%SZ}.html"
         return {"address": self._offer(name, summary_html(rows, remark, now)), "name": name, "runs": len(rows)}
@@ -262,7 +262,7 @@ class DeskRoom:
         self._downloads.offer(download)
         with self._lock:
             self._offered.append(download)
-            old, self._offered = self._offered[:-MOST_REPORTS], self._offered[-MOST_REPORTS:]
+            old, self._offered = self._offered[:-MAX_REPORTS], self._offered[-MAX_REPORTS:]
         for report in old:
             self._downloads.withdraw(report)
         return download.address

@@ -9,7 +9,7 @@ import aiohttp
 from aiohttp import web
 
 from spherloc_viz.app.web.access import NO_TOKEN, Access, Role, refused
-from spherloc_viz.app.web.desk import DO, MOST_BYTES, NO_RUNS, DeskRoom, is_desk
+from spherloc_viz.app.web.desk import DO, MAX_BYTES, NO_RUNS, DeskRoom, is_desk
 from spherloc_viz.app.web.downloads import DOWNLOADS, Downloads
 from spherloc_viz.app.web.guard import SAFE, refusal
 from spherloc_viz.app.web.learn import is_learning, learn_answer
@@ -22,9 +22,9 @@ MAX_MESSAGE_BYTES = 50 * 1024 * 1024
 HEARTBEAT_S = 20.0
 """A page that answers no ping for this long is gone, and its session ends."""
 
-MOST_AUDIENCE = 200
+MAX_AUDIENCE = 200
 """Pages of an audience at once; each takes a thread and some megabytes."""
-FULL = f"The audience is full: {MOST_AUDIENCE} pages are open. Close one, or ask the presenter.\n"
+FULL = f"The audience is full: {MAX_AUDIENCE} pages are open. Close one, or ask the presenter.\n"
 
 PARAMETERS = frozenset(f"initialCamera{part}" for part in ("Position", "LookAt", "Up", "Fov", "Near", "Far")) | {
     "darkMode",
@@ -67,7 +67,7 @@ class FrontDoor:
 
     async def start(self, listener: socket.socket) -> web.AppRunner:
         """Start serving on a listening socket."""
-        app = web.Application(client_max_size=MOST_BYTES)
+        app = web.Application(client_max_size=MAX_BYTES)
         app.router.add_route("*", "/{path:.*}", self._answer)
         app.cleanup_ctx.append(self._connections)
         app.on_shutdown.append(self._hang_up)
@@ -130,7 +130,7 @@ class FrontDoor:
 
     async def _seat(self, request: web.Request) -> web.StreamResponse:
         """One more page of an audience, if there is room."""
-        if self._audience >= MOST_AUDIENCE:
+        if self._audience >= MAX_AUDIENCE:
             return web.Response(status=503, text=FULL)
         self._audience += 1
         try:

@@ -5,7 +5,7 @@
 // data-reveal="NAME" is scrolled to, also while what stands above it grows, until a person scrolls or presses. What a
 // new link with data-fetch leads to is downloaded.
 (() => {
-  const TOUCHABLE = "[data-touch],[data-copy]", LEAST_DRAG_PX = 6, LOOK_EVERY_MS = 150, REVEAL_MS = 3000;
+  const TOUCHABLE = "[data-touch],[data-copy]", MIN_DRAG_PX = 6, LOOK_EVERY_MS = 150, REVEAL_MS = 3000;
   let press = null, shade = null, seen = null, revealed = null, revealUntil = 0, front = "";
   const fetched = new Set();
 
@@ -126,7 +126,7 @@
 
   addEventListener("pointermove", (event) => {
     if (!press?.drag) return;
-    if (Math.abs(event.clientX - press.from.x) < LEAST_DRAG_PX && !shade) return;
+    if (Math.abs(event.clientX - press.from.x) < MIN_DRAG_PX && !shade) return;
     press.box = press.dragBox;
     drawShade(event);
     event.preventDefault();

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-MOST_LETTERS = 20_000
+MAX_LETTERS = 20_000
 """A report has some hundred, but for a link."""
 READY = "<div data-ready></div>"
 """Once this is on the page, it tells what is pressed."""
@@ -69,7 +69,7 @@ class Touches:
 def parse(report: Any) -> Touch | None:
     """The press that a report tells of, or None if it is none."""
     try:
-        if len(report) > MOST_LETTERS:
+        if len(report) > MAX_LETTERS:
             return None
         said: Any = json.loads(report)
         action, _, argument = str(said["action"]).partition(":")

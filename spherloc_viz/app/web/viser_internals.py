@@ -324,9 +324,9 @@ def _wake_on_loop(server: viser.ViserServer) -> None:
     sockets._client_connect_cb.insert(0, connected)
 
 
-MOST_AT_ONCE = 2
+MAX_AT_ONCE = 2
 """Files on their way."""
-LEAST_PART_BYTES = 4096
+MIN_PART_BYTES = 4096
 """The page sends parts of half a megabyte; far smaller ones would fill the memory with their bookkeeping."""
 
 
@@ -343,10 +343,10 @@ def limit_uploads(client: viser.ClientHandle, most_bytes: int, complain: Callabl
         complain(sentence)
 
     def checked_begin(client_id: Any, message: Any) -> None:
-        parts = max(1, most_bytes // LEAST_PART_BYTES)
+        parts = max(1, most_bytes // MIN_PART_BYTES)
         if not (0 <= message.size_bytes <= most_bytes and 0 <= message.part_count <= parts):
             refuse(message, f"the file is larger than {most_bytes / 1e6:.2g} MB; upload a smaller one.")
-        elif len(under_way) >= MOST_AT_ONCE:
+        elif len(under_way) >= MAX_AT_ONCE:
             refuse(message, "two files are on their way already; wait for them.")
         else:
             begin(client_id, message)

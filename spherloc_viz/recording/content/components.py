@@ -47,7 +47,7 @@ FRAME = "/query/frame"
 """Outline of the image, and of what the camera sees of it."""
 LONGEST_PX = 960
 """Longest side of the recorded image."""
-MOST_BYTES = 400_000
+MAX_BYTES = 400_000
 """Of the recorded image: with more, it is pressed harder."""
 QUALITIES = (80, 60, 40, 20)
 DOT_PX = 2.5
@@ -99,7 +99,7 @@ def _pressed(photo: Photograph) -> QueryImage | None:
     image = cv2.cvtColor(small, cv2.COLOR_RGB2BGR)
     for quality in QUALITIES:
         done, content = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
-        if done and len(content) <= MOST_BYTES:
+        if done and len(content) <= MAX_BYTES:
             return QueryImage(content.tobytes(), scale, "")
     return None
 
@@ -128,7 +128,7 @@ def image_chunks(problem: Problem, image: QueryImage) -> Iterator[Chunk]:
 WIDTH_PX, HEIGHT_PX = 96, 64
 MARGIN_PX = 9.0
 BACKGROUND = (30, 33, 39)
-MOST_DOTS = 160
+MAX_DOTS = 160
 """More matches are thinned evenly: a PNG of single dots grows with them."""
 SQUARE = np.array([[0, 0], [1, 0], [0, 1], [1, 1]])
 """Pixels of a dot."""
@@ -147,7 +147,7 @@ def thumbnail(trace: Trace) -> bytes:
     image = np.empty((HEIGHT_PX, WIDTH_PX, 3), np.uint8)
     image[:] = BACKGROUND
     dots = _thumbnail_pixels(flat, *window)
-    shown = np.linspace(0, len(dots) - 1, min(MOST_DOTS, len(dots))).round().astype(int)
+    shown = np.linspace(0, len(dots) - 1, min(MAX_DOTS, len(dots))).round().astype(int)
     agrees = trace.inlier_mask[shown]
     # Those that agree lie on top.
     for mask, color in ((~agrees, style.OUTLIER), (agrees, style.INLIER)):

@@ -220,7 +220,7 @@ EYE = (1.15, -1.2, -1.55)
 """Where one looks from, in the frame in which the scene has radius 1: from the same side as the page's overview."""
 LAYOUT_ROOM = 1 << 20
 """Bytes, many more than a layout takes."""
-MOST_LAYOUTS = 64
+MAX_LAYOUTS = 64
 """Layouts that are kept; runs of one estimator share one or a few."""
 
 
@@ -321,7 +321,7 @@ def _flat_views(panels: Panels) -> list[rrb.View]:
     return views
 
 
-@lru_cache(maxsize=MOST_LAYOUTS)
+@lru_cache(maxsize=MAX_LAYOUTS)
 def layout_file(shown: Shown) -> RrdFile:
     """The blueprint as the parts of an ``.rbl`` file.
 

@@ -34,7 +34,7 @@ REACH_DEG = 8.0
 """Arcs up to so far from the estimated yaw are near the peak."""
 ASPECT = 0.6
 """Height of the stack of arcs by its width."""
-MOST_NODES, MOST_EDGES = 200, 2_000
+MAX_NODES, MAX_EDGES = 200, 2_000
 """The viewer's own graph is fluent up to these; larger ones are lines and dots, of which no more edges are drawn."""
 EDGE: pa.StructType = rr.components.GraphEdgeBatch._ARROW_DATATYPE
 GREY = 0.35
@@ -57,7 +57,7 @@ def panels_of(trace: Trace) -> Panels:
     """Which panels a run has."""
     translation, yaw = trace.stage(TranslationStage), trace.stage(YawStage)
     balls = 0 if translation is None else len(translation.pairs)
-    small = translation is not None and balls <= MOST_NODES and len(translation.edges) <= MOST_EDGES
+    small = translation is not None and balls <= MAX_NODES and len(translation.edges) <= MAX_EDGES
     return Panels(
         arcs=yaw is not None and len(yaw.pairs) > 0,
         graph=small and balls > 0,
@@ -183,7 +183,7 @@ def _graph(stage: TranslationStage) -> Iterator[Chunk]:
 def _large_graph(stage: TranslationStage) -> Iterator[Chunk]:
     """Balls as dots and an even sample of their overlaps as lines."""
     places, inside = _placed(stage)
-    edges = stage.edges[even(np.arange(len(stage.edges)), MOST_EDGES)]
+    edges = stage.edges[even(np.arange(len(stage.edges)), MAX_EDGES)]
     if len(edges):
         yield static_chunk(f"{GRAPH}/overlaps", _lines(places[edges], _edge_colors(edges, inside), 1.0))
     yield static_chunk(

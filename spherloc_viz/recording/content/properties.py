@@ -111,7 +111,7 @@ REVIEW_ENTITY = "/review"
 REVIEW_PROPERTY = "review"
 """Property of the review file: ``labels``, a list of texts, and ``note``, a text."""
 
-MOST_CHARACTERS = 2_000
+MAX_CHARACTERS = 2_000
 """Of a text in a row; longer ones are cut."""
 NOT_RECORDED = {"file", "run_id", "labels", "note", "size_bytes", "thumbnail"}
 """Fields of a row that are no part of the property ``run``: they belong to the file or the review, or are a picture."""
@@ -196,7 +196,7 @@ def _short(value: Any) -> str:
 
 
 def _cut(text: str) -> str:
-    return text if len(text) <= MOST_CHARACTERS else text[: MOST_CHARACTERS - 1] + "…"
+    return text if len(text) <= MAX_CHARACTERS else text[: MAX_CHARACTERS - 1] + "…"
 
 
 def property_chunks(trace: Trace, row: RunRow, created: datetime) -> Iterator[Chunk]:

@@ -40,7 +40,7 @@ T = TypeVar("T")
 
 BATCH = 20
 """Rows that are written at once: others wait a few milliseconds."""
-MOST_WORKERS = 4
+MAX_WORKERS = 4
 """Processes that read recordings, at 20 ms each."""
 WORTH_A_WORKER = 50
 """Recordings for which it pays to start another process, which takes a second."""
@@ -53,7 +53,7 @@ def examine_side_by_side(
 
     They end with this, or with their owner ``examiners``, which raises ``ExaminerError``.
     """
-    workers = max(1, min(MOST_WORKERS, os.cpu_count() or 1, len(paths) // WORTH_A_WORKER))
+    workers = max(1, min(MAX_WORKERS, os.cpu_count() or 1, len(paths) // WORTH_A_WORKER))
     with ThreadPoolExecutor(workers) as threads, (examiners or Examiners()).start(workers) as started:
         readers = [examine_all(paths[k::workers], started[k]) for k in range(workers)]
         # Whoever leaves early, as by Ctrl-C, ends the processes first and waits for no file.
@@ -205,7 +205,7 @@ def _batches(items: Iterable[Item]) -> Iterator[list[Item]]:
         yield batch
 
 
-MOST_TRIES = 4
+MAX_TRIES = 4
 """With a database that gets damaged or set aside meanwhile."""
 PAUSE_S = 0.02
 """Another process needs less to rename a database."""
@@ -397,7 +397,7 @@ class RunIndex:
             put(connection, replace(before, labels=review.labels, note=review.note), stamp_of(path))
             return review
 
-        for _ in range(MOST_TRIES):
+        for _ in range(MAX_TRIES):
             if (review := self._write(work)) is not None:
                 return review
             # Another run lies there than the one that is listed.
@@ -423,7 +423,7 @@ class RunIndex:
             self.folder, self._write, examine or (lambda paths: examine_side_by_side(paths, self.examiners))
         )
         with self._refreshing:
-            for _ in range(MOST_TRIES):
+            for _ in range(MAX_TRIES):
                 self._read(lambda connection: None)
                 opened = self._opened
                 refreshed = refresher.refresh(everything, progress or (lambda done, total: None))
@@ -456,7 +456,7 @@ class RunIndex:
 
     def _do(self, begin: str, work: Callable[[sqlite3.Connection], T]) -> T:
         with self._lock:
-            for tries_left in reversed(range(MOST_TRIES)):
+            for tries_left in reversed(range(MAX_TRIES)):
                 began = time.monotonic()
                 try:
                     result = self._transact(begin, work)
@@ -501,7 +501,7 @@ class RunIndex:
         self._drop()
         self.stale = True
         self._opened += 1
-        for _ in range(MOST_TRIES):
+        for _ in range(MAX_TRIES):
             before = index_file.identity(self.path)
             try:
                 connection = index_file.connect(self.path)

@@ -46,8 +46,8 @@ RUN_COLUMNS = {
 COLUMNS = STEP_COLUMNS | RUN_COLUMNS
 WORDS = ("and", "or", "not", "in", "is", "null", "between", "like", "true", "false")
 """All of SQL that a condition may say: no word that reads a file, names a table, or asks a second question."""
-MOST_CHARACTERS = 1_000
-MOST_PARENTHESES = 50
+MAX_CHARACTERS = 1_000
+MAX_PARENTHESES = 50
 
 _PIECE = re.compile(
     r"\s+|(?P<word>[A-Za-z_]\w*)|(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)(?![\w.])|(?P<text>'(?:[^']|'')*')"
@@ -61,9 +61,9 @@ def checked_condition(text: str) -> str:
 
     Raises ``InputError``, which says what cannot be understood and what there is.
     """
-    if len(text) > MOST_CHARACTERS or text.count("(") > MOST_PARENTHESES:
+    if len(text) > MAX_CHARACTERS or text.count("(") > MAX_PARENTHESES:
         raise InputError(
-            f"a condition may have {MOST_CHARACTERS:,} characters and {MOST_PARENTHESES} parentheses: shorten it."
+            f"a condition may have {MAX_CHARACTERS:,} characters and {MAX_PARENTHESES} parentheses: shorten it."
         )
     pieces: list[str] = []
     place = 0
