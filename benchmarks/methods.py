@@ -15,7 +15,7 @@ from spherloc.types import FloatArray
 BOUND_PX = 3.0
 """The noise bound of every method, px of the scene's camera; noise is 1 px."""
 CONFIDENCE = 0.999
-MOST_ITERATIONS = 100_000
+MAX_ITERATIONS = 100_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +77,7 @@ def our_methods() -> dict[str, Method]:
             "ransac-2p",
             bound_px=BOUND_PX,
             confidence=CONFIDENCE,
-            iterations=MOST_ITERATIONS,
+            iterations=MAX_ITERATIONS,
             local_optimization=True,
         )
     )

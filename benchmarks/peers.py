@@ -17,7 +17,7 @@ import numpy as np
 import poselib
 import pycolmap
 
-from benchmarks.methods import BOUND_PX, CONFIDENCE, MOST_ITERATIONS, Answer, Method, Solve
+from benchmarks.methods import BOUND_PX, CONFIDENCE, MAX_ITERATIONS, Answer, Method, Solve
 from spherloc.geometry import pose
 from spherloc.problem import Problem
 from spherloc.types import FloatArray, IntArray
@@ -115,7 +115,7 @@ def _rig_data(problem: Problem) -> tuple[IntArray, IntArray, FloatArray, float]:
 
 # --- PoseLib ----------------------------------------------------------------------------------------------------------
 
-_POSELIB = {"max_iterations": MOST_ITERATIONS, "min_iterations": 100, "success_prob": CONFIDENCE}
+_POSELIB = {"max_iterations": MAX_ITERATIONS, "min_iterations": 100, "success_prob": CONFIDENCE}
 
 
 def _poselib_fisheye(problem: Problem, seed: int) -> Solve:
@@ -169,8 +169,8 @@ def _poselib_up2p(problem: Problem, seed: int) -> Solve:
 
     def solve() -> Answer:
         rng = np.random.default_rng(seed)
-        best, least, inside_s, drawn, needed = None, np.inf, 0.0, 0, MOST_ITERATIONS
-        while drawn < max(100, needed) and drawn < MOST_ITERATIONS:
+        best, least, inside_s, drawn, needed = None, np.inf, 0.0, 0, MAX_ITERATIONS
+        while drawn < max(100, needed) and drawn < MAX_ITERATIONS:
             pair = rng.choice(len(rows), 2, replace=False)
             drawn += 1
             start = time.perf_counter()
@@ -209,7 +209,7 @@ def _poselib_up2p(problem: Problem, seed: int) -> Solve:
 
 # --- pycolmap ---------------------------------------------------------------------------------------------------------
 
-_COLMAP = {"max_num_trials": MOST_ITERATIONS, "min_num_trials": 100, "min_inlier_ratio": 0.01, "confidence": CONFIDENCE}
+_COLMAP = {"max_num_trials": MAX_ITERATIONS, "min_num_trials": 100, "min_inlier_ratio": 0.01, "confidence": CONFIDENCE}
 
 
 def _colmap_options(threshold: float, seed: int) -> pycolmap.RANSACOptions:
@@ -264,7 +264,7 @@ def _opencv_usac(problem: Problem, seed: int) -> Solve:
     rows = _front(problem, FRONT_RAD)
     params = cv2.UsacParams()
     params.threshold = BOUND_PX * pixel_ratio(problem, rows, to_plane)
-    params.confidence, params.maxIterations = CONFIDENCE, MOST_ITERATIONS
+    params.confidence, params.maxIterations = CONFIDENCE, MAX_ITERATIONS
     params.score, params.sampler = cv2.SCORE_METHOD_MSAC, cv2.SAMPLING_UNIFORM
     params.loMethod, params.randomGeneratorState = cv2.LOCAL_OPTIM_INNER_LO, seed
     pixels, points = to_plane(problem.bearings[rows]), problem.points[rows].copy()
@@ -280,7 +280,7 @@ def _opencv_usac(problem: Problem, seed: int) -> Solve:
 # --- SupeRANSAC -------------------------------------------------------------------------------------------------------
 
 
-_SUPERANSAC = {"max_iterations": MOST_ITERATIONS, "min_iterations": 100, "confidence": CONFIDENCE}
+_SUPERANSAC = {"max_iterations": MAX_ITERATIONS, "min_iterations": 100, "confidence": CONFIDENCE}
 
 
 def _superansac(problem: Problem, seed: int) -> Solve:
@@ -321,7 +321,7 @@ def _superansac(problem: Problem, seed: int) -> Solve:
 def peers() -> dict[str, Method]:
     """All of them by name."""
     rig = "sphere cut into six 90 degree pinhole faces"
-    usac = {"score": "MSAC", "loMethod": "INNER_LO", "maxIterations": MOST_ITERATIONS, "confidence": CONFIDENCE}
+    usac = {"score": "MSAC", "loMethod": "INNER_LO", "maxIterations": MAX_ITERATIONS, "confidence": CONFIDENCE}
     methods = (
         Method("PoseLib rig", _poselib_rig, {"camera": rig, **_POSELIB}),
         Method("PoseLib fisheye", _poselib_fisheye, {"camera": "OPENCV_FISHEYE, k = 0; front half", **_POSELIB}),
@@ -334,7 +334,7 @@ def peers() -> dict[str, Method]:
         Method(
             "PoseLib up2p",
             _poselib_up2p,
-            {"camera": rig, "gravity": "given", "max_iterations": MOST_ITERATIONS, "confidence": CONFIDENCE},
+            {"camera": rig, "gravity": "given", "max_iterations": MAX_ITERATIONS, "confidence": CONFIDENCE},
         ),
         Method("OpenCV USAC", _opencv_usac, {"camera": "pinhole plane, points within 87 degrees", **usac}),
     )

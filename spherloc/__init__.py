@@ -19,13 +19,22 @@ EXPORTS = {
     "load_scene": "datasets",
     "bundled_scenes": "datasets",
     "load_camera": "cameras.calibration",
+    "DoubleSphere": "cameras.double_sphere",
+    "Equirectangular": "cameras.equirectangular",
+    "Eucm": "cameras.eucm",
+    "Fisheye624": "cameras.fisheye624",
+    "KannalaBrandt": "cameras.kannala_brandt",
+    "Mei": "cameras.mei",
     "Problem": "problem",
     "Trace": "trace",
+    "CalibrationError": "errors",
     "InputError": "errors",
+    "ProblemError": "errors",
+    "RecordingError": "errors",
     "SpherlocError": "errors",
 }
-"""What is to be had from the package itself, and where it comes from: imported when it is first asked for, since the
-solvers take a second. ``__init__.pyi`` tells type checkers."""
+"""Names of the package itself and their modules, imported at the first use: the solvers take a second. ``__init__.pyi``
+tells type checkers."""
 
 
 def __getattr__(name: str) -> Any:

@@ -6,10 +6,10 @@ import numpy as np
 
 from spherloc.errors import InputError, show
 from spherloc.problem import AlignedProblem
-from spherloc.ranges import LEAST_PX, MAX_PX
+from spherloc.ranges import MAX_PX, MIN_PX
 from spherloc.types import FloatArray
 
-MIN_BOUND_PX, MAX_BOUND_PX = LEAST_PX / 100, 100 * MAX_PX
+MIN_BOUND_PX, MAX_BOUND_PX = MIN_PX / 100, 100 * MAX_PX
 """What a diagnosis asks for may be some times wider or tighter than what people may give."""
 
 
@@ -32,7 +32,7 @@ def bounds_of(aligned: AlignedProblem, bound_px: float) -> Bounds:
     Raises ``InputError`` for a bound that no estimator can reckon with.
     """
     if not MIN_BOUND_PX <= bound_px <= MAX_BOUND_PX:
-        raise InputError(f"bound_px is {show(bound_px)}; give a number of pixels from {LEAST_PX:g} to {MAX_PX:,.0f}.")
+        raise InputError(f"bound_px is {show(bound_px)}; give a number of pixels from {MIN_PX:g} to {MAX_PX:,.0f}.")
     gravity_rad = aligned.gravity_bound_rad
     radians = np.arcsin(np.minimum(1.0, bound_px * aligned.radians_per_pixel)) + gravity_rad
     pixels = bound_px + gravity_rad * aligned.pixels_per_radian

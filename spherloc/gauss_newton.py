@@ -20,9 +20,9 @@ from spherloc.types import FloatArray
 ROBUST_NONE, ROBUST_HUBER, ROBUST_CAUCHY = 0, 1, 2
 HUBER_WIDTH, CAUCHY_WIDTH = 1.345, 2.3849
 """In standard deviations of the noise: the usual constants, 95 % efficient for a normal residual."""
-LEAST_FOR_SIX_DOF = 4
+MIN_FOR_SIX_DOF = 4
 """Three points leave up to four poses and two leave a curve, so fewer keep their tilt if gravity is unknown."""
-LEAST_GRAVITY_SD_RAD = 1e-9
+MIN_GRAVITY_SD_RAD = 1e-9
 """A prior sharper than this is exact: its residual would be rounding."""
 RANK_TOLERANCE = 1e-12
 """Least pivot of normal equations whose columns have length 1."""
@@ -31,7 +31,7 @@ GAIN_TOLERANCE = 1e-9
 next would be a hundred times shorter."""
 RESIDUAL_TOLERANCE = 1e-10
 """Root mean square residual, in standard deviations, that is nothing but rounding."""
-LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e4
+MIN_DAMPING, MAX_DAMPING = 1e-3, 1e4
 """Damping of the normal equations, relative to their diagonal: what a failed step starts with and what ends the fit."""
 
 
@@ -87,7 +87,7 @@ def polish(matches, chosen, rotation, translation, noise, robust, most_steps):
 
     ``chosen`` (M,) bool, ``rotation`` (3, 3), ``translation`` (3,) m, ``noise`` a ``Noise``, ``robust`` one of
     ``ROBUST_*``. A gravity of standard deviation 0 is 4 DoF: the rotation is projected to a pure yaw first. inf is
-    6 DoF without prior, or 4 DoF at the given tilt for fewer than ``LEAST_FOR_SIX_DOF``. Fewer than two chosen leave
+    6 DoF without prior, or 4 DoF at the given tilt for fewer than ``MIN_FOR_SIX_DOF``. Fewer than two chosen leave
     the pose. The cost never rises (after the projection), and no NaN is written. Chosen points must lie in front of
     their bearings.
     """
@@ -101,7 +101,7 @@ def polish_path(matches, chosen, rotation, translation, noise, robust, most_step
     if count < 2:
         return 0
     middle = moved_point(rotation, translation, centre)
-    if noise.gravity_sd_rad < LEAST_GRAVITY_SD_RAD:
+    if noise.gravity_sd_rad < MIN_GRAVITY_SD_RAD:
         write_yaw(nearest_yaw(rotation), rotation)
         write_translation_to(middle, rotation, centre, translation)
     model = CostModel(noise, robust, degrees_of_freedom(count, noise.gravity_sd_rad))
@@ -110,7 +110,7 @@ def polish_path(matches, chosen, rotation, translation, noise, robust, most_step
     cost = normal_equations(matches, chosen, centre, rotation, middle, model, system)
     floor = count * RESIDUAL_TOLERANCE**2
     steps, damping = 0, 0.0
-    while steps < most_steps and floor < cost < np.inf and damping <= MOST_DAMPING:
+    while steps < most_steps and floor < cost < np.inf and damping <= MAX_DAMPING:
         lower = np.inf
         if solve(system, damping, factor, step):
             turn(step, rotation, turned)
@@ -123,14 +123,14 @@ def polish_path(matches, chosen, rotation, translation, noise, robust, most_step
                 expected -= system.gradient[k] * step[k]
             if lower < np.inf and expected <= GAIN_TOLERANCE * cost:
                 break
-            damping = max(LEAST_DAMPING, 10.0 * damping)
+            damping = max(MIN_DAMPING, 10.0 * damping)
             continue
         gain, cost = cost - lower, lower
         copy_matrix(turned, rotation)
         copy_vector(moved, middle)
         write_translation_to(middle, rotation, centre, translation)
         system, next_system = next_system, system
-        damping = 0.1 * damping if damping > LEAST_DAMPING else 0.0
+        damping = 0.1 * damping if damping > MIN_DAMPING else 0.0
         if steps < len(path):
             write_pose(rotation, translation, path[steps])
         steps += 1
@@ -142,8 +142,8 @@ def polish_path(matches, chosen, rotation, translation, noise, robust, most_step
 @kernel()
 def degrees_of_freedom(count, gravity_sd_rad):
     """6, or 4 where the tilt stays as it is: gravity exact, or unknown with too few of ``count`` points to find it."""
-    unknown = gravity_sd_rad == np.inf and count < LEAST_FOR_SIX_DOF
-    return 4 if unknown or gravity_sd_rad < LEAST_GRAVITY_SD_RAD else 6
+    unknown = gravity_sd_rad == np.inf and count < MIN_FOR_SIX_DOF
+    return 4 if unknown or gravity_sd_rad < MIN_GRAVITY_SD_RAD else 6
 
 
 @kernel()

@@ -11,8 +11,8 @@ from dataclasses import replace
 import numpy as np
 
 from spherloc.bounds import Bounds
-from spherloc.gauss_newton import LEAST_GRAVITY_SD_RAD, ROBUST_NONE, Matches, Noise, polish_path
-from spherloc.narrowing import MOST_DESCENTS, NARROWINGS, descend, narrow, search_nearby, truncated_squares
+from spherloc.gauss_newton import MIN_GRAVITY_SD_RAD, ROBUST_NONE, Matches, Noise, polish_path
+from spherloc.narrowing import MAX_DESCENTS, NARROWINGS, descend, narrow, search_nearby, truncated_squares
 from spherloc.problem import AlignedProblem
 from spherloc.refine import (
     MAX_STEPS,
@@ -48,7 +48,7 @@ def conclude(
     Returns what ``refine`` does. All poses are between the aligned frames.
     """
     matches, noise = matches_of(aligned), noise_of(aligned, options)
-    kept = noise.gravity_sd_rad < LEAST_GRAVITY_SD_RAD
+    kept = noise.gravity_sd_rad < MIN_GRAVITY_SD_RAD
     limits = bounds.pixels.copy() if kept else np.full(len(aligned.points), bounds.noise_px)
     wide = bounds.pixels.copy()
     least, best = np.inf, np.empty((0, 3, 4))
@@ -112,6 +112,6 @@ def _narrowed(matches: Matches, wide: FloatArray, limits: FloatArray, start: Flo
 
 def _descended(matches: Matches, limits: FloatArray, path: FloatArray, noise: Noise) -> tuple[FloatArray, float]:
     """The path (I, 3, 4) and how it goes on downhill, and the truncated squares of its end."""
-    more, last = np.empty((MOST_DESCENTS, 3, 4)), path[-1].copy()
+    more, last = np.empty((MAX_DESCENTS, 3, 4)), path[-1].copy()
     states, cost = descend(matches, limits, last, noise, more)
     return np.concatenate([path, more[:states]]), float(cost)

@@ -1,7 +1,7 @@
 """From arrays to a pose: the way in for programs that have matches of their own."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from functools import cached_property
 from html import escape
 from numbers import Real
@@ -18,7 +18,7 @@ from spherloc.cameras.colmap_models import camera_from_colmap
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.diagnosis import Diagnosis, diagnose
 from spherloc.errors import CalibrationError, InputError, show
-from spherloc.estimators import default_options, estimate
+from spherloc.estimators import estimate
 from spherloc.geometry import camera_centre
 from spherloc.outcome import Judgement, Outcome, judge
 from spherloc.problem import Problem
@@ -90,7 +90,10 @@ class Localization:
         rows = [("outcome", f"{self.outcome} by {self.trace.estimator}")]
         if self.position is not None:
             rows += [
-                ("position", f"{np.array2string(self.position, precision=3, suppress_small=True)} m"),
+                (
+                    "position",
+                    f"{np.array2string(self.position, precision=3, suppress_small=True)} {self.trace.problem.unit}",
+                ),
                 ("inliers", f"{count} of {total}"),
             ]
         if self.certificate is not None:
@@ -157,7 +160,7 @@ def localize(
         gravity_sd_rad=None if gravity_sd_deg is None else _radians("gravity_sd_deg", gravity_sd_deg),
         bound_px=bound_px,
     )
-    return Localization(estimate(problem, estimator, _options(estimator, problem, options), seed))
+    return Localization(estimate(problem, estimator, options, seed))
 
 
 def localize_bearings(
@@ -318,15 +321,3 @@ def _radians(name: str, degrees: Any) -> float:
     if not isinstance(degrees, Real) or isinstance(degrees, bool):
         raise InputError(f"{name} is {show(degrees)}; give a number of degrees.")
     return float(np.radians(float(degrees)))
-
-
-def _options(estimator: str, problem: Problem, given: Any) -> Any:
-    """The options dataclass; of a dict what it names, over the defaults."""
-    default = default_options(estimator, problem)
-    if given is None or not isinstance(given, Mapping):
-        return default if given is None else given
-    known = [item.name for item in fields(default)]
-    unknown = [key for key in given if key not in known]
-    if unknown:
-        raise InputError(f"estimator {estimator} has no option {show(unknown[0])}; it has {', '.join(known)}.")
-    return replace(default, **given)

@@ -9,7 +9,7 @@ passes by those that only the wide bound makes; fits to few random correspondenc
 import numpy as np
 
 from spherloc.gauss_newton import (
-    LEAST_GRAVITY_SD_RAD,
+    MIN_GRAVITY_SD_RAD,
     ROBUST_NONE,
     CostModel,
     Matches,
@@ -40,21 +40,21 @@ NARROWINGS = (1.0, 0.4, 0.15, 0.0)
 """Shares of what gravity's error adds to the bound that the successive bounds keep."""
 GEMAN_MCCLURE_SCALE = 1.0 / 3.0
 """Scale of the Geman-McClure weights in bounds: the bound is three standard deviations of the noise, or so."""
-MOST_STEPS = 6
+MAX_STEPS = 6
 """At each bound."""
-LEAST_STEP = 1e-7
+MIN_STEP = 1e-7
 """Length of a step (rad, and m) at which a bound is done with."""
 DAMPING = 1e-9
 """Of the Gauss-Newton steps, relative to the diagonal: just enough to solve what is almost singular."""
-MOST_DESCENTS = 10
+MAX_DESCENTS = 10
 """Choices of inliers on the way to a minimum of the truncated squares."""
 SAMPLE_SIZE, SAMPLE_STEPS, SAMPLE_DAMPING = 4, 4, 1e-6
 """Correspondences of a random fit, one more than fix a pose, and the steps and damping of its Gauss-Newton."""
 PROMISING_STEPS = 3
 """Robust steps from a random fit that is better than the best pose so far."""
-LEAST_SAMPLES, MOST_SAMPLES = 30, 200
+MIN_SAMPLES, MAX_SAMPLES = 30, 200
 """Sampling goes on for at least so many after the last improvement."""
-MOST_FAILURE_PROBABILITY = 1e-3
+MAX_FAILURE_PROBABILITY = 1e-3
 """Probability, by Eq. 28, that no sample held inliers only, at which sampling ends."""
 FINE_NOISE = 0.3
 """Standard deviation of the finer part of the noise, in units of the stated noise: real matches mix sharp and blurred
@@ -65,7 +65,7 @@ FIRST_EM_ROUNDS, EM_ROUNDS = 20, 3
 """Of expectation and maximisation for the share of finer noise, at the first step and at the others."""
 ADAPTIVE_STEPS, ADAPTIVE_LEAST_STEP = 15, 1e-6
 """Most steps of ``fit_to_noise``, and the length of a step (rad, and m) at which it ends."""
-LEAST_FOR_NOISE = 8
+MIN_FOR_NOISE = 8
 """Correspondences from which something can be said about their noise."""
 
 
@@ -97,7 +97,7 @@ def truncated_squares(matches, limits_px, cam_from_map, noise, most):
     """
     bearings, points, jacobian, p = matches.bearings, matches.points, matches.pixel_jacobian, cam_from_map
     precision, total = noise.sd_px**-2.0, 0.0
-    if LEAST_GRAVITY_SD_RAD <= noise.gravity_sd_rad < np.inf:
+    if MIN_GRAVITY_SD_RAD <= noise.gravity_sd_rad < np.inf:
         total = (tilt_of(p) / noise.gravity_sd_rad) ** 2
     for k in range(len(points)):
         x = p[0, 0] * points[k, 0] + p[0, 1] * points[k, 1] + p[0, 2] * points[k, 2] + p[0, 3]
@@ -133,7 +133,7 @@ def robust_steps(matches, limits_px, cam_from_map, noise, most_steps):
                 for a in range(2):
                     for b in range(3):
                         scaled_jacobian[k, a, b] = share * jacobian[k, a, b]
-        if not _step(Matches(bearings, points, scaled_jacobian), near, cam_from_map, noise, DAMPING) > LEAST_STEP:
+        if not _step(Matches(bearings, points, scaled_jacobian), near, cam_from_map, noise, DAMPING) > MIN_STEP:
             break
 
 
@@ -183,7 +183,7 @@ def narrow(matches, wide_px, tight_px, start, noise, path):
     for index in range(len(NARROWINGS)):
         for k in range(len(limits)):
             limits[k] = tight_px[k] + NARROWINGS[index] * (wide_px[k] - tight_px[k])
-        robust_steps(matches, limits, state, noise, np.int64(MOST_STEPS))
+        robust_steps(matches, limits, state, noise, np.int64(MAX_STEPS))
         copy_matrix(state, path[index])
 
 
@@ -191,20 +191,20 @@ def narrow(matches, wide_px, tight_px, start, noise, path):
 def descend(matches, limits_px, cam_from_map, noise, path):
     """Least squares on the inliers and new choices of these while the truncated squares fall.
 
-    ``cam_from_map`` (3, 4) is changed in place, the pose after each choice written to ``path`` (``MOST_DESCENTS``, 3,
+    ``cam_from_map`` (3, 4) is changed in place, the pose after each choice written to ``path`` (``MAX_DESCENTS``, 3,
     4). Returns how many, and the truncated squares at the bounds ``limits_px`` (M,).
     """
     count, states = len(matches.points), 0
     errors, before, mask = np.empty(count), np.zeros(count, np.bool_), np.empty(count, np.bool_)
     state, no_path = np.empty((3, 4)), np.empty((0, 3, 4))
     least = truncated_squares(matches, limits_px, cam_from_map, noise, np.inf)
-    while states < MOST_DESCENTS:
+    while states < MAX_DESCENTS:
         errors_of(matches, cam_from_map, errors)
         mark_within(errors, limits_px, mask)
         if equal(mask, before):
             break
         rotation, translation = rotation_of(cam_from_map), translation_of(cam_from_map)
-        robust, most_steps = np.int64(ROBUST_NONE), np.int64(MOST_STEPS)
+        robust, most_steps = np.int64(ROBUST_NONE), np.int64(MAX_STEPS)
         polish_path(matches, mask, rotation, translation, noise, robust, most_steps, no_path)
         write_pose(rotation, translation, state)
         cost = truncated_squares(matches, limits_px, state, noise, np.inf)
@@ -240,7 +240,7 @@ def search_nearby(matches, wide_px, limits_px, start, noise, best, least):
     sample, chosen, state = np.empty(SAMPLE_SIZE, np.int64), np.empty(SAMPLE_SIZE, np.bool_), np.empty((3, 4))
     few = Matches(np.empty((SAMPLE_SIZE, 3)), np.empty((SAMPLE_SIZE, 3)), np.empty((SAMPLE_SIZE, 2, 3)))
     fill_vector(chosen, True)
-    while drawn < MOST_SAMPLES and (drawn < needed or drawn < improved + LEAST_SAMPLES):
+    while drawn < MAX_SAMPLES and (drawn < needed or drawn < improved + MIN_SAMPLES):
         for k in range(SAMPLE_SIZE):
             fresh = False
             while not fresh:
@@ -287,7 +287,7 @@ def _samples_needed(matches, limits_px, best, around, errors):
     clean = (inliers / len(around)) ** SAMPLE_SIZE
     if clean >= 1.0:
         return 1
-    return int(min(np.log(MOST_FAILURE_PROBABILITY) / np.log1p(-max(clean, 1e-9)), MOST_SAMPLES))
+    return int(min(np.log(MAX_FAILURE_PROBABILITY) / np.log1p(-max(clean, 1e-9)), MAX_SAMPLES))
 
 
 @kernel()
@@ -326,7 +326,7 @@ def fit_to_noise(matches, limits_px, cam_from_map, noise, path):
     share = PRIOR_FINE / (PRIOR_STATED + PRIOR_FINE)
     for done in range(ADAPTIVE_STEPS):
         errors_of(matches, cam_from_map, errors)
-        if mark_within(errors, limits_px, near) < LEAST_FOR_NOISE:
+        if mark_within(errors, limits_px, near) < MIN_FOR_NOISE:
             return done
         rounds = EM_ROUNDS if done else FIRST_EM_ROUNDS
         share = share_of_fine(errors, near, limits_px, noise.sd_px, share, rounds, fine_probability)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from spherloc.cameras.base import Camera
 from spherloc.errors import ProblemError, show
 from spherloc.geometry import align_to_down, pose, tangent_basis
-from spherloc.ranges import LEAST_PX, MAX_M, MAX_PX, MIN_M, is_number
+from spherloc.ranges import MAX_M, MAX_PX, MIN_M, MIN_PX, is_number
 from spherloc.types import BoolArray, FloatArray, IntArray
 
 MIN_STRETCH = 0.01
@@ -80,7 +80,7 @@ class Problem:
             raise ProblemError(f"{self.name}: gravity_source is no text of at most {MAX_SOURCE} characters; give one.")
         if not isinstance(self.metric, bool):
             raise ProblemError(f"{self.name}: metric is {self.metric!r}; give true or false.")
-        _scalar(self, "bound_px", LEAST_PX, MAX_PX, f"{LEAST_PX:g} to {MAX_PX:,.0f} pixels")
+        _scalar(self, "bound_px", MIN_PX, MAX_PX, f"{MIN_PX:g} to {MAX_PX:,.0f} pixels")
         _scalar(self, "estimated_outlier_rate", 0.0, 1.0, "a share from 0 to 1")
         _check_reach(self.name, "points reach", points)
         if self.truth_cam_from_map is not None:
@@ -102,6 +102,11 @@ class Problem:
 
     def __len__(self) -> int:
         return len(self.pixels)
+
+    def __repr__(self) -> str:
+        width, height = self.camera.width, self.camera.height
+        truth = "" if self.truth_cam_from_map is None else ", true pose known"
+        return f"<Problem {show(self.name)}: {len(self)} matches, {self.camera.model} {width}x{height}{truth}>"
 
     @property
     def unit(self) -> str:

@@ -14,7 +14,7 @@ from spherloc.errors import InputError
 from spherloc.trace import ConsensusStage, Trace
 from spherloc.watch import Watch
 
-MOST_CELLS = 2_000_000
+MAX_CELLS = 2_000_000
 MAX_FOR_PROOF = 5000
 """Correspondences up to which a proof is written: the checker tests all of them in every cell."""
 
@@ -35,7 +35,7 @@ def write_proof(trace: Trace, path: Path, watch: Watch | None = None) -> int:
     watch = watch or Watch()
     bound_px = bounds_of(aligned, trace.options.bound_px).noise_px
     matches, claim = pack_matches(aligned, bound_px), certificate.upper_bound
-    room = (np.empty((MOST_CELLS, AXES)), np.empty((MOST_CELLS, AXES)), np.empty((MOST_CELLS, 2), np.int64))
+    room = (np.empty((MAX_CELLS, AXES)), np.empty((MAX_CELLS, AXES)), np.empty((MAX_CELLS, 2), np.int64))
     memory = (scratch_for(count), np.full(BINS, count, np.int32))
     lowers, uppers = whole_domain(aligned.gravity_bound_rad)
     parts, used = [], 0
@@ -44,7 +44,7 @@ def write_proof(trace: Trace, path: Path, watch: Watch | None = None) -> int:
         made = prove_cells(matches, chart, (lowers[chart], uppers[chart]), claim, SWITCH_RAD, memory, rest, watch.board)
         watch.check()
         if made == -1:
-            raise InputError(f"the proof of at most {claim} needs more than {MOST_CELLS:,} cells; none is written.")
+            raise InputError(f"the proof of at most {claim} needs more than {MAX_CELLS:,} cells; none is written.")
         if made < 0:
             raise InputError(
                 f"that no pose explains more than {claim} follows from pairs of correspondences, or to within rounding "

@@ -7,7 +7,7 @@ from typing import Any
 
 from spherloc.errors import InputError, show
 
-LEAST_PX, MAX_PX = 1e-6, 1e6
+MIN_PX, MAX_PX = 1e-6, 1e6
 """Pixel bounds and noise."""
 MIN_M, MAX_M = 1e-12, 1e12
 """The farthest point from the origin; a map may also be all in the origin."""
@@ -21,7 +21,7 @@ def check_option(name: str, value: Any) -> None:
     it; what else the option refuses is its own to say."""
     if isinstance(value, bool) or not isinstance(value, Real):
         return
-    least, most = (LEAST_PX, MAX_PX) if name.endswith("_px") else (LEAST, MOST)
+    least, most = (MIN_PX, MAX_PX) if name.endswith("_px") else (LEAST, MOST)
     try:
         size = abs(float(value))
     except OverflowError:  # an integer beyond all floats

@@ -13,7 +13,7 @@ import numpy as np
 from spherloc.bounds import Bounds
 from spherloc.errors import InputError, show
 from spherloc.gauss_newton import (
-    LEAST_GRAVITY_SD_RAD,
+    MIN_GRAVITY_SD_RAD,
     ROBUST_CAUCHY,
     ROBUST_HUBER,
     ROBUST_NONE,
@@ -256,7 +256,7 @@ def _alternate(matches, wide_px, tight_px, path, noise, robust, limits, lost):
     fill_vector(lost, False)
     if inliers < 2:
         return states, limit_px
-    if noise.gravity_sd_rad < LEAST_GRAVITY_SD_RAD and tilt_of(path[0]) > 0.0:
+    if noise.gravity_sd_rad < MIN_GRAVITY_SD_RAD and tilt_of(path[0]) > 0.0:
         copy_matrix(levelled(path[0], middle_of(matches.points, mask)[1]), path[1])
         states = 2
         errors_of(matches, path[1], errors)

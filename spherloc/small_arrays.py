@@ -142,7 +142,7 @@ def indices_of_true(mask):
     return indices[:found]
 
 
-MOST_INSERTED = 20
+MAX_INSERTED = 20
 """Fewer numbers are sorted by insertion."""
 
 
@@ -154,7 +154,7 @@ def sort_in_place(values):
     while count > 0:
         count -= 1
         low, high = waiting[count, 0], waiting[count, 1]
-        while high - low >= MOST_INSERTED:
+        while high - low >= MAX_INSERTED:
             a, b, c = values[low], values[(low + high) >> 1], values[high]
             pivot = max(min(a, b), min(max(a, b), c))
             i, j = low, high

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from html import escape
 from types import MappingProxyType
 from typing import Any, ClassVar, TypeVar
 
@@ -260,6 +261,14 @@ class Trace:
 
     def __repr__(self) -> str:
         return f"<Trace of {self.estimator} on {show(self.problem.name)}: {self.message}>"
+
+    def _repr_html_(self) -> str:
+        """What notebooks show: a table with a row a stage."""
+        rows = [("problem", self.problem.name), ("estimator", f"{self.estimator}, seed {self.seed}")]
+        rows += [(f"stage {number}", stage.kind) for number, stage in enumerate(self.stages, 1)]
+        rows += [("outcome", self.message), ("time", f"{self.timings_ms['total']:.1f} ms")]
+        cells = (f"<tr><th>{escape(name)}</th><td>{escape(value)}</td></tr>" for name, value in rows)
+        return f"<table>{''.join(cells)}</table>"
 
     def stage(self, kind: type[StageT]) -> StageT | None:
         """The stage of that type, or None if the run did not reach it."""

@@ -1,7 +1,7 @@
 """Loads or compiles the numeric kernels before somebody waits for an answer.
 
 A kernel is compiled for the types of its arguments, so that one is loaded here only if later calls have the same types.
-That is why kernels pass constants to each other as ``np.int64(MOST_STEPS)``: to numba a constant of a module is a type
+That is why kernels pass constants to each other as ``np.int64(MAX_STEPS)``: to numba a constant of a module is a type
 of its own, its value, for which the callee would be compiled again. And that is why arrays are given to a kernel with
 the same layout, and writable or not, every time.
 
@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from spherloc import kernel_cache, registry
 from spherloc.bounds import bounds_of
 from spherloc.cameras.equirectangular import Equirectangular
-from spherloc.consensus.exact import MOST_POSES, certify
+from spherloc.consensus.exact import MAX_POSES, certify
 from spherloc.consensus.inliers import mark_each
 from spherloc.consensus.level_pose import BestPoses, BoundedMatches, bounded_matches, empty_list
 from spherloc.consensus.pair_arcs import yaws_between
@@ -35,7 +35,7 @@ from spherloc.consensus.yaw_bins import BIN_TURN, degree_bounds, largest_bin_cli
 from spherloc.datasets.synthetic import SyntheticScene
 from spherloc.errors import InputError
 from spherloc.estimators.base import estimate, options_type
-from spherloc.narrowing import MOST_DESCENTS, NARROWINGS, descend, narrow, search_nearby
+from spherloc.narrowing import MAX_DESCENTS, NARROWINGS, descend, narrow, search_nearby
 from spherloc.problem import Problem
 from spherloc.refine import MAX_RESCUES, MAX_STEPS, fitted_path, matches_of, noise_of, record, refined_path, rescue
 from spherloc.watch import Watch
@@ -128,7 +128,7 @@ def _search() -> None:
     mark_each(found.yaws_rad, found.translations, *rays, bounds.pixels)
     start, limits = aligned.align_pose(problem.truth_cam_from_map), np.full(len(aligned.points), bounds.noise_px)
     narrow(matches, bounds.pixels.copy(), limits, start.copy(), noise, np.empty((len(NARROWINGS), 3, 4)))
-    _, cost = descend(matches, limits, start.copy(), noise, np.empty((MOST_DESCENTS, 3, 4)))
+    _, cost = descend(matches, limits, start.copy(), noise, np.empty((MAX_DESCENTS, 3, 4)))
     search_nearby(matches, bounds.pixels.copy(), limits, start.copy(), noise, start.copy(), cost)
     path = np.tile(start, (1 + MAX_RESCUES * MAX_STEPS, 1, 1))
     rescue(matches, limits, np.ones(len(limits), np.bool_), path, 1, noise)
@@ -155,7 +155,7 @@ def _exact_search() -> tuple[BoundedMatches, BestPoses, NDArray[np.int64]]:
     """Matches, an empty list of poses, and the numbers (M,) of all matches."""
     aligned = _murky_problem().aligned
     count = len(aligned.points)
-    return bounded_matches(aligned, bounds_of(aligned, 40.0)), empty_list(MOST_POSES, count), np.arange(count)
+    return bounded_matches(aligned, bounds_of(aligned, 40.0)), empty_list(MAX_POSES, count), np.arange(count)
 
 
 SHARED: dict[str, Callable[[], object]] = {"refinement": _refine, "search": _search}

@@ -21,7 +21,7 @@ nobody can know), in units of the stage's own.
 """
 SLOTS = 8
 """The board fills a line of the processor's cache."""
-MOST_WORK = int(np.iinfo(np.int64).max)
+MAX_WORK = int(np.iinfo(np.int64).max)
 """What the board can count."""
 SELDOM = (1 << 16) - 1
 """Loops of some nanoseconds a turn look at the board where these bits of their counter are 0: it costs nothing then."""
@@ -89,11 +89,11 @@ class Watch:
 
     def expect(self, total: int) -> None:
         """Say how much work the stage is."""
-        self.board[TOTAL] = min(total, MOST_WORK)
+        self.board[TOTAL] = min(total, MAX_WORK)
 
     def reach(self, done: int) -> None:
         """Say how much of it is done; raises ``Cancelled``."""
-        self.board[DONE] = min(done, MOST_WORK)
+        self.board[DONE] = min(done, MAX_WORK)
         self.check()
 
     def finish(self) -> None:

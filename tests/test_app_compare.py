@@ -13,7 +13,7 @@ from spherloc import registry
 from spherloc.datasets.synthetic import SyntheticScene
 from spherloc.errors import InputError
 from spherloc.estimators import estimate, options_type
-from spherloc.estimators.ransac import MOST_ITERATIONS, RansacOptions
+from spherloc.estimators.ransac import MAX_ITERATIONS, RansacOptions
 from spherloc.problem import Problem
 from spherloc.trace import Trace
 from spherloc.watch import Cancelled, Watch
@@ -193,7 +193,7 @@ def test_cancel_ends_it_within_a_run(stage: Stage, runs: tuple[Trace, Trace], mo
             return real(problem, name, options, seed, watch)
         begun.set()
         try:
-            return real(problem, name, RansacOptions(iterations=MOST_ITERATIONS), seed, watch)
+            return real(problem, name, RansacOptions(iterations=MAX_ITERATIONS), seed, watch)
         except Cancelled:
             ended.append(watch)
             raise

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from spherloc_viz import style
 from spherloc_viz.app.plots import shapes
-from spherloc_viz.app.plots.charts import MOST_STEPS, ChartPanel, chart_html, chart_svg, curve_parts
+from spherloc_viz.app.plots.charts import MAX_STEPS, ChartPanel, chart_html, chart_svg, curve_parts
 from spherloc_viz.app.plots.shapes import MINUS, Scale, decade_ticks, round_ticks, tick_texts, wrapped_deg
 from spherloc_viz.app.server import start_viser, stop_viser
 from spherloc_viz.layers.primitives import Chart, Curve
@@ -153,7 +153,7 @@ def test_a_peak_survives_thinning_and_the_drawing_stays_small(rng: np.random.Gen
     text = chart_svg(chart(curve(np.linspace(-180, 179.9, 5000), y, "step"), x_label="yaw (°)"))
     data = next(path.attrib["d"] for path in parsed(text).iter(f"{SVG}path") if "fill-opacity" in path.attrib)
     _, ys = heights(data)
-    assert len(text) < 9000 and data.count("H") <= MOST_STEPS + 1
+    assert len(text) < 9000 and data.count("H") <= MAX_STEPS + 1
     assert ys.max() - ys.min() > 3.0 * (ys.max() - np.sort(ys)[3]), "the peak towers above the rest"
 
 

@@ -18,7 +18,7 @@ from spherloc_viz.recording.content.writer import write_recording
 from tests.waiting import LIMIT_S
 
 ROOT = Path(__file__).resolve().parents[1]
-MOST_ITERATIONS = 10_000_000
+MAX_ITERATIONS = 10_000_000
 
 PROGRAM = """
 import signal, sys
@@ -37,7 +37,7 @@ def endless(tmp_path_factory: pytest.TempPathFactory) -> Path:
     kind = options_type("ransac-2p")
     trace = estimate(problem, "ransac-2p", kind(iterations=10))
     path = tmp_path_factory.mktemp("endless") / "a.rrd"
-    write_recording(replace(trace, options=kind(iterations=MOST_ITERATIONS)), path)
+    write_recording(replace(trace, options=kind(iterations=MAX_ITERATIONS)), path)
     return path
 
 
@@ -46,7 +46,7 @@ def endless(tmp_path_factory: pytest.TempPathFactory) -> Path:
     [
         (("repeat",), "0 of 1 recordings were repeated."),
         (
-            ("run", "--no-record", "--estimator", "ransac-2p", "--option", f"iterations={MOST_ITERATIONS}"),
+            ("run", "--no-record", "--estimator", "ransac-2p", "--option", f"iterations={MAX_ITERATIONS}"),
             "0 of 1 scenes were solved.",
         ),
     ],

@@ -278,7 +278,7 @@ def test_rows_filter_and_sort(trace: Trace) -> None:
 
 
 def test_many_inliers_are_sampled(scene_of: SceneOf, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("spherloc_viz.layers.matches.MOST_PAIRS", 100)
+    monkeypatch.setattr("spherloc_viz.layers.matches.MAX_PAIRS", 100)
     trace = estimate(scene_of("mei", correspondences=60, outlier_rate=0.2).problem(), "ransac-2p")
     rows = match_rows(trace)
     assert rows.partners == 16 < trace.inlier_mask.sum() and rows.agree.max() <= 16

@@ -8,7 +8,7 @@ from spherloc.types import FloatArray
 
 NEIGHBOURHOOD_RAD = 0.2
 """Bearings are counted within this angle, to know how dense they are around each other."""
-MOST_BEARINGS = 200
+MAX_BEARINGS = 200
 """More are thinned: the density is a mean."""
 
 
@@ -19,7 +19,7 @@ def chance_rate(bearings: FloatArray, bound_rad: FloatArray) -> float:
     It is counted in a wider neighbourhood and scaled by the areas of both caps, so that bearings which are all in one
     part of the image meet more often by chance than bearings all around. ``bearings`` (M, 3), ``bound_rad`` (M,).
     """
-    step = -(-len(bearings) // MOST_BEARINGS)
+    step = -(-len(bearings) // MAX_BEARINGS)
     some = bearings[::step]
     near = np.count_nonzero(some @ some.T >= np.cos(NEIGHBOURHOOD_RAD)) - len(some)
     density = max(near, 1) / (len(some) * max(len(some) - 1, 1))

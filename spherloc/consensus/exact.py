@@ -44,17 +44,17 @@ DOUBTFUL_NFA = 1e-6
 """Expected number of false alarms (NFA) of the size of the guess above which better guesses are looked for."""
 LARGEST_NFA = 1000.0
 """NFA of a size at which it says nothing."""
-MOST_LEFT_OUT = 8
+MAX_LEFT_OUT = 8
 """Nodes of a bin more than the best support up to which the whole bin is tried to be certified at once."""
-MOST_POSES = 8
+MAX_POSES = 8
 """Clearly different poses that are remembered."""
 PAIRS_UNTIL, BINS_UNTIL, CLIQUES_UNTIL, SEARCH_UNTIL = 0.5, 0.7, 0.75, 0.98
 """How far the run of an estimator is by ``Watch.fraction`` at the ends of the parts of this search."""
-MOST_TRIALS = 16
+MAX_TRIALS = 16
 """Cliques of a bin that may stay without pose or proof before only larger ones are searched for."""
-MOST_CELLS = 4000
+MAX_CELLS = 4000
 """Cells of yaw and position in one proof."""
-MOST_IN_CELLS = 16
+MAX_IN_CELLS = 16
 """Correspondences up to which cells are tried where duality proves nothing."""
 SORT_EFFORT = 70
 """Words that take as long as sorting an arc in."""
@@ -115,7 +115,7 @@ def exact_consensus(
     deadline = working_s() + time_budget_s
     watch = watch or Watch()
     count = len(aligned.bearings)
-    matches, best = bounded_matches(aligned, bounds), empty_list(MOST_POSES, count)
+    matches, best = bounded_matches(aligned, bounds), empty_list(MAX_POSES, count)
     supports = best.supports
     for yaw, translation in guesses:
         pose = np.empty(5)
@@ -193,7 +193,7 @@ def _certify_bin(
     """
     support, effort = int(best.supports[0]), rows.size
     most = min(len(nodes), colour_bound(rows)) if len(nodes) > support else support
-    if most > support and len(nodes) - support <= MOST_LEFT_OUT:
+    if most > support and len(nodes) - support <= MAX_LEFT_OUT:
         yaws = yaws_between(*span)
         balls = apart_balls(matches, yaws, nodes, len(nodes) - support)
         proven, work = certify(matches, yaws, nodes, balls, best, board)
@@ -320,8 +320,8 @@ def certify(matches, yaws, everybody, balls, best, board):
         support, region = np.int64(best.supports[0]), Region(yaws, balls[b])
         answer, work = prove_none(matches, region, everybody, support, found, board)
         effort += work * ROUND_EFFORT
-        if answer == UNKNOWN and len(everybody) <= MOST_IN_CELLS:
-            answer, work = search_region(matches, region, everybody, support, np.int64(MOST_CELLS), found)
+        if answer == UNKNOWN and len(everybody) <= MAX_IN_CELLS:
+            answer, work = search_region(matches, region, everybody, support, np.int64(MAX_CELLS), found)
             effort += work
         if answer == FOUND:
             improve(matches, everybody, found, best)
@@ -400,5 +400,5 @@ def sweep_bin(matches, arcs, nodes, rows, span, best, effort_limit, board):
         if not proven and len(clique) > len(largest):
             largest = elements(nodes, clique)
         trials += not proven
-        floor = np.int64(supports[0] if trials < MOST_TRIALS else max(supports[0], len(largest)))
+        floor = np.int64(supports[0] if trials < MAX_TRIALS else max(supports[0], len(largest)))
     return max(floor, len(largest)) if exact else whole, largest, effort, exact

@@ -20,9 +20,9 @@ from spherloc.small_arrays import copy_matrix, copy_vector, fill_matrix, fill_ve
 from spherloc.solvers.two_point import solve_pair
 from spherloc.types import BoolArray, FloatArray, IndexArray
 
-LEAST_PIVOT = 1e-10
+MIN_PIVOT = 1e-10
 """Of normal equations, relative to the diagonal, below which the pose is not determined."""
-MOST_PAIRS = 24
+MAX_PAIRS = 24
 """Pairs of a clique that propose a pose."""
 INLIER_ROUNDS, STEPS_PER_ROUND = 4, 3
 """Choices of inliers at most, and Gauss-Newton steps on each."""
@@ -171,7 +171,7 @@ def solve_step(normal, gradient, step):
                 normal[a, b] -= normal[a, d] * normal[b, d]
             normal[a, b] /= normal[b, b]
             normal[a, a] -= normal[a, b] ** 2
-        if not normal[a, a] > LEAST_PIVOT * pivot:
+        if not normal[a, a] > MIN_PIVOT * pivot:
             return -1.0
         normal[a, a] = np.sqrt(normal[a, a])
         step[a] = -gradient[a]
@@ -286,7 +286,7 @@ def _propose(matches, clique, pose):
     size, best, tried = len(clique), 0, 0
     for apart in range(1, size):
         for a in range(size - apart):
-            if tried >= MOST_PAIRS and best > 0:
+            if tried >= MAX_PAIRS and best > 0:
                 return True
             tried += 1
             i, j = clique[a], clique[a + apart]

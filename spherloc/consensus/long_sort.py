@@ -5,9 +5,9 @@ import numpy as np
 from spherloc.kernel_cache import kernel
 from spherloc.watch import SLOTS, stopped
 
-MOST_INSERTED = 15
+MAX_INSERTED = 15
 """Fewer numbers are sorted by insertion."""
-MOST_WAITING = 100
+MAX_WAITING = 100
 """Parts that wait to be sorted. The longer one waits, so that they are at most the logarithm of the count."""
 
 
@@ -18,13 +18,13 @@ def order_of(values, board):
     Stopped by a watch's ``board``, some order.
     """
     order = np.arange(len(values))
-    waiting = np.empty((MOST_WAITING, 2), np.int64)
+    waiting = np.empty((MAX_WAITING, 2), np.int64)
     waiting[0, 0], waiting[0, 1] = 0, len(values) - 1
     count = 1
     while count > 0:
         count -= 1
         low, high = waiting[count, 0], waiting[count, 1]
-        while high - low >= MOST_INSERTED and not stopped(board):
+        while high - low >= MAX_INSERTED and not stopped(board):
             middle = _partition(values, order, low, high)
             if high - middle > middle - low:
                 waiting[count, 0], waiting[count, 1] = middle + 1, high

@@ -39,16 +39,16 @@ from spherloc.watch import DONE, Watch, working_s
 
 SWITCH_RAD = 0.06
 """Mean movement of directions in a box below which it is searched with derivatives."""
-LEAST_PX = 1e-5
+MIN_PX = 1e-5
 """Smaller cells differ by rounding."""
 FIRST_EFFORT = 400_000
 """Tests of a match before threads are started: some hundredths of a second."""
 TASK_EFFORT, TASK_ROUNDS = 400_000, 400
 """Least effort of a task, and its effort for each match: starting one again costs a test of every match."""
 TASKS_A_ROUND = 8
-MOST_SPLITS = 2000
+MAX_SPLITS = 2000
 """Boxes that each task keeps for the picture, ..."""
-MOST_KEPT = 20_000
+MAX_KEPT = 20_000
 """... and all of them together."""
 NEAR_TURN_RAD, NEAR_SHARE, NEAR_GAP, NEAR_EFFORT = 2e-3, 4e-3, 0.01, 60
 """The cell around the first guess: half sides of its turns, rad, and of its position, of the median distance; what may
@@ -118,7 +118,7 @@ class _Worker:
     """Memory of one thread."""
 
     def __init__(self, count: int) -> None:
-        self.memory = memory_for(count, MOST_SPLITS)
+        self.memory = memory_for(count, MAX_SPLITS)
         most = MOST_BOXES + MOST_WAITING + 64
         self.left = Left(np.empty((most, AXES)), np.empty((most, AXES)), np.empty((most, 3), np.int64))
         self.state = np.zeros(STATE, np.int64)
@@ -193,7 +193,7 @@ class _Search:
         half[:YAW] = NEAR_SHARE * float(np.median(seen))
         half[TILT_A:] = np.minimum(half[TILT_A:], self.gravity_bound_rad)
         worker = self._workers[0]
-        limits = Limits(int(NEAR_GAP * self.count), min(effort, NEAR_EFFORT * self.count), LEAST_PX, SWITCH_RAD)
+        limits = Limits(int(NEAR_GAP * self.count), min(effort, NEAR_EFFORT * self.count), MIN_PX, SWITCH_RAD)
         self._prepare(worker)
         everybody = np.arange(self.count, dtype=np.int32)
         search_poses(
@@ -219,7 +219,7 @@ class _Search:
             tasks,
             self.yaw_bound,
             worker.memory,
-            Limits(0, effort, LEAST_PX, SWITCH_RAD),
+            Limits(0, effort, MIN_PX, SWITCH_RAD),
             (worker.best_at, worker.state, worker.left),
             self.watch.board,
         )
@@ -246,7 +246,7 @@ class _Search:
                     now, later = order[:TASKS_A_ROUND], order[TASKS_A_ROUND:]
                     workers = self._workers[: len(now)]
                     left = max(1, effort - self.effort)
-                    limits = Limits(0, min(each, left), LEAST_PX, SWITCH_RAD)
+                    limits = Limits(0, min(each, left), MIN_PX, SWITCH_RAD)
                     for worker in workers:
                         self._prepare(worker)
                     list(pool.map(self._work, workers, now, repeat(limits)))
@@ -288,7 +288,7 @@ class _Search:
         lower, upper, about = [self.lower], [self.upper_ends], [self.about]
         for worker in workers:
             many, splits = int(worker.state[SPLITS]), worker.memory.splits
-            if self._kept < MOST_KEPT:
+            if self._kept < MAX_KEPT:
                 left_ends, right_ends, bounds = splits
                 self._splits.append((left_ends[:many].copy(), right_ends[:many].copy(), bounds[:many].copy()))
                 self._kept += many

@@ -15,7 +15,7 @@ from spherloc.watch import DONE, stopped
 
 NO_TILT, STABBED, LINEAR = 0, 1, 2
 """Why a cell explains no more: all of its tilts are beyond gravity's bound; intervals of yaw; residuals."""
-MOST_WAITING = 4096
+MAX_WAITING = 4096
 """Cells that wait to be split."""
 WINDOW_MARGIN = 1e-12
 """Rad by which windows of yaw are widened; less than the intervals were."""
@@ -31,8 +31,8 @@ def prove_cells(matches, chart, ends, claim, switch_rad, memory, cells, board):
     """
     scratch, unknown = memory
     _, _, about = cells
-    lo, up = np.empty((MOST_WAITING, 6)), np.empty((MOST_WAITING, 6))
-    spans = np.empty((MOST_WAITING, 4), np.int64)
+    lo, up = np.empty((MAX_WAITING, 6)), np.empty((MAX_WAITING, 6))
+    spans = np.empty((MAX_WAITING, 4), np.int64)
     count = len(matches.rows)
     everybody = np.arange(count).astype(np.int32)
     lists = np.empty(48 * count + 4096, np.int32)
@@ -81,14 +81,14 @@ def prove_cells(matches, chart, ends, claim, switch_rad, memory, cells, board):
                     reach[a] = cell[HALF_S] * spread[1] if a == axis else cell[HALF_C + a] * spread[0]
                 else:
                     reach[a] = cell[HALF_ANGLES + a - YAW] if a > 3 else 0.0
-            if np.sum(reach) <= switch_rad and waiting + len(scratch.windows) * 2 + 4 < MOST_WAITING:
+            if np.sum(reach) <= switch_rad and waiting + len(scratch.windows) * 2 + 4 < MAX_WAITING:
                 again, free = keep_possible(matches, cell, everybody, spare, scratch, -1, spread)
                 bound, windows = deepest(scratch, again, free, claim, unknown)
                 used, waiting = _by_yaw(cells, used, lo, up, spans, waiting, (first, last, windows, claim), scratch)
                 continue
         split = np.argmax(reach)
         middle = 0.5 * (lo[waiting, split] + up[waiting, split])
-        if not lo[waiting, split] < middle < up[waiting, split] or waiting + 4 > MOST_WAITING:
+        if not lo[waiting, split] < middle < up[waiting, split] or waiting + 4 > MAX_WAITING:
             return -2
         for side in range(2):
             spans[waiting, 0], spans[waiting, 1], spans[waiting, 2], spans[waiting, 3] = first, last, narrow, known

@@ -36,7 +36,7 @@ UNKNOWN, FOUND, IMPOSSIBLE = 0, 1, 2
 
 LAWSON_ROUNDS = 24
 """Of Lawson's iteration on a set."""
-MOST_SETS = 200
+MAX_SETS = 200
 """Sets that are looked at in one proof."""
 BASIS_SIZES = (5, 7, 10, 16)
 """Members of largest weight that are tried as a set that cannot be explained: few make a small tree."""
@@ -46,9 +46,9 @@ MARGIN = 1.0 + 1e-6
 """Of a proof over rounding."""
 CURVATURE = 1.155
 """|u''| <= CURVATURE (|C'| / |p - C|)^2 for the unit vector u from the camera C to a point p: sqrt(4 / 3)."""
-MOST_WAITING = 4096
+MAX_WAITING = 4096
 """Cells that wait to be split; more are not needed since the deepest is split first."""
-LEAST_CELL_RAD = 1e-5
+MIN_CELL_RAD = 1e-5
 """A cell that moves rays by less is not split: it holds a pose that explains one more to within rounding, or nearly."""
 HALF_DIAGONAL = np.sqrt(3.0)
 """Of a cube, in half sides."""
@@ -84,9 +84,9 @@ def prove_none(matches, region, everybody, floor, found, board=None):
     """
     count = len(everybody)
     spare = count - floor
-    starts = np.empty((MOST_SETS + BASIS_SIZES[-1], 5))
-    removed = np.zeros((MOST_SETS + BASIS_SIZES[-1], count), np.bool_)
-    kept = np.zeros((MOST_SETS + BASIS_SIZES[-1], count), np.bool_)
+    starts = np.empty((MAX_SETS + BASIS_SIZES[-1], 5))
+    removed = np.zeros((MAX_SETS + BASIS_SIZES[-1], count), np.bool_)
+    kept = np.zeros((MAX_SETS + BASIS_SIZES[-1], count), np.bool_)
     starts[0, 0], starts[0, 1] = region.yaws.cos, region.yaws.sin
     copy_vector(region.ball, starts[0, 2:])
     waiting, sets, effort = 1, 0, 0
@@ -106,7 +106,7 @@ def prove_none(matches, region, everybody, floor, found, board=None):
         effort += rounds * count
         if answer == FOUND:
             copy_vector(state.pose, found)
-        if answer != IMPOSSIBLE or sets >= MOST_SETS or waiting + BASIS_SIZES[-1] > len(starts):
+        if answer != IMPOSSIBLE or sets >= MAX_SETS or waiting + BASIS_SIZES[-1] > len(starts):
             return (answer if answer == FOUND else UNKNOWN), effort
         if count_true(gone) + 1 >= spare:
             continue  # without one more, too few would be left
@@ -270,14 +270,14 @@ def search_region(matches, region, everybody, floor, cell_limit, found):
     ``matches`` are ``BoundedMatches``. Returns the answer, and how many cells were looked at, ``cell_limit`` at most.
     """
     c0, s0, slack = region.yaws
-    ball, order, cells = region.ball, np.empty(len(everybody), np.int64), np.empty((MOST_WAITING, 6))
+    ball, order, cells = region.ball, np.empty(len(everybody), np.int64), np.empty((MAX_WAITING, 6))
     copy_vector(everybody, order)
     cells[0, 0], cells[0, 1] = 0.0, slack
     copy_vector(ball, cells[0, 2:])
     waiting, used, exact = 1, 0, True
     reach = _mean_distance(matches.points, everybody, ball)
     while waiting > 0:
-        if used >= cell_limit or waiting > MOST_WAITING - 8:
+        if used >= cell_limit or waiting > MAX_WAITING - 8:
             exact = False
             break
         waiting -= 1
@@ -291,7 +291,7 @@ def search_region(matches, region, everybody, floor, cell_limit, found):
         if _explained(matches, everybody, middle) > floor:
             found[0], found[1], found[2], found[3], found[4] = c, s, x, y, z
             return FOUND, used
-        if half_yaw + half * HALF_DIAGONAL / reach < LEAST_CELL_RAD:
+        if half_yaw + half * HALF_DIAGONAL / reach < MIN_CELL_RAD:
             exact = False
             continue
         if half_yaw * reach > half * HALF_DIAGONAL:

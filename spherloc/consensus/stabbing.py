@@ -44,10 +44,10 @@ FEW_BINS, MANY_BINS = 256, 1024
 """Multiples of the bins of ``yaw_bins``."""
 MANY = 400
 """Matches from which the larger number of bins is used."""
-MOST_SORTED = 1500
+MAX_SORTED = 1500
 """Intervals up to which the exact depth is found where bins do not decide."""
-MOST_WINDOWS = 64
-MOST_GAP = 0.004
+MAX_WINDOWS = 64
+MAX_GAP = 0.004
 """Turns between two windows of yaw up to which they are one."""
 EVERYWHERE = 8.0
 """End of an interval that is the whole circle."""
@@ -63,12 +63,12 @@ class Scratch(NamedTuple):
     steps: NDArray[np.int32]
     """(MANY_BINS + 2,) changes of depth from bin to bin."""
     windows: FloatArray
-    """(MOST_WINDOWS, 2) where the depth exceeds the cutoff, turns; the last may end above 4."""
+    """(MAX_WINDOWS, 2) where the depth exceeds the cutoff, turns; the last may end above 4."""
 
 
 def scratch_for(count: int) -> Scratch:
     """Room for cells of ``count`` matches."""
-    return Scratch(np.empty(count), np.empty(count), np.zeros(MANY_BINS + 2, np.int32), np.empty((MOST_WINDOWS, 2)))
+    return Scratch(np.empty(count), np.empty(count), np.zeros(MANY_BINS + 2, np.int32), np.empty((MAX_WINDOWS, 2)))
 
 
 @kernel(error_model="numpy")
@@ -170,7 +170,7 @@ def deepest(scratch, count, free, cutoff, yaw_bound):
             most = depth
     if most <= cutoff:
         return most, 0
-    if count - free <= MOST_SORTED:
+    if count - free <= MAX_SORTED:
         exact, used = _exactly(scratch, count, free, cutoff)
         return min(exact, most), _clip_windows(windows, used, cutoff, yaw_bound) if exact > cutoff else 0
     used, depth, inside = 0, free, False
@@ -209,7 +209,7 @@ def _open_window(windows, used, start):
 
     Or the last one goes on, if that is near or there is no room for more.
     """
-    if used > 0 and (start - windows[used - 1, 1] <= MOST_GAP or used == len(windows)):
+    if used > 0 and (start - windows[used - 1, 1] <= MAX_GAP or used == len(windows)):
         return used
     windows[used, 0] = windows[used, 1] = start
     return used + 1

@@ -30,11 +30,11 @@ ROUNDING = 1e-9
 """Part by which a lower bound is lowered, so that rounding never turns away a ball."""
 FIRST_SORTED, MORE_SORTED = 32_000, 8
 """Smallest balls that are sorted to spread them, and how many times as many where these are too few."""
-MOST_SORTED = 500_000
+MAX_SORTED = 500_000
 """Numbers whose order is found at once: some hundredths of a second."""
 WATCH_MASK = 1023
 """Where these bits of the number of arcs are 0, the watch is looked at."""
-MOST_FIRST = 16
+MAX_FIRST = 16
 """Candidates from which disjoint pairs are started."""
 
 
@@ -78,7 +78,7 @@ def smallest_balls(
 def _order(values: FloatArray, watch: Watch) -> NDArray[np.int64]:
     """The stable order of values, by halves where one sort would take long: numpy's cannot be stopped."""
     watch.check()
-    if len(values) > MOST_SORTED:
+    if len(values) > MAX_SORTED:
         middle = np.partition(values, len(values) // 2)[len(values) // 2]
         low, high = np.flatnonzero(values < middle), np.flatnonzero(values >= middle)
         if len(low):
@@ -378,7 +378,7 @@ def apart_balls(matches, yaws, nodes, most):
     fill_vector(free, True)
     for b in range(most):
         mate_a, mate_b = -1, -1
-        for a in range(min(MOST_FIRST + most, len(nodes))):
+        for a in range(min(MAX_FIRST + most, len(nodes))):
             if not free[a]:
                 continue
             for other in range(a + 1, len(nodes)):

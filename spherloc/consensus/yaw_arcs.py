@@ -25,15 +25,15 @@ from spherloc.watch import DONE, SELDOM, Watch, stopped
 
 FULL = 2.0 * np.pi
 """The whole circle, rad."""
-MOST_ARCS = 4
+MAX_ARCS = 4
 """Four arcs of a circle intersect in at most four."""
 ROUNDING = 1e-12
 """Slack of every condition, relative to its amplitude, so that rounding never excludes the true yaw."""
-LEAST_SINE = 1e-9
+MIN_SINE = 1e-9
 """Sine of the angle by which the ends of a short arc may be swapped by rounding. No long arc leaves so little open."""
 BINS = 1440
 """Bins of the overlap curve kept for display, a quarter of a degree each."""
-MOST_SORTED = 2_000_000
+MAX_SORTED = 2_000_000
 """Numbers that are sorted at once: some hundredths of a second."""
 
 
@@ -48,7 +48,7 @@ def yaw_arcs(
     watch = watch or Watch()
     count = len(aligned.bearings)
     watch.expect(count * (count - 1) // 2)
-    room = MOST_ARCS * (count * (count - 1) // 2)
+    room = MAX_ARCS * (count * (count - 1) // 2)
     # Memory that is never touched is never used, so room for the worst case costs nothing.
     pairs = np.empty((room, 2), np.int32)
     lo, hi = np.empty(room), np.empty(room)
@@ -64,7 +64,7 @@ def _sine_and_cosine(u0, v0, u1, v1):
     The sine is below 0 only if the arc is longer than half the circle.
     """
     sine, cosine = u0 * v1 - v0 * u1, u0 * u1 + v0 * v1
-    return (0.0 if sine < 0.0 and sine > -LEAST_SINE and cosine > 0.0 else sine), cosine
+    return (0.0 if sine < 0.0 and sine > -MIN_SINE and cosine > 0.0 else sine), cosine
 
 
 @kernel()
@@ -189,8 +189,8 @@ def _fill(bearings, points, eps, widest, pairs, lo, hi, board):
     """
     used = 0
     chords, sines = chord(eps), np.sin(eps)
-    least_cosine = np.cos(widest) - LEAST_SINE if widest < np.pi else -2.0
-    arcs = np.empty((2 * MOST_ARCS, 4))
+    least_cosine = np.cos(widest) - MIN_SINE if widest < np.pi else -2.0
+    arcs = np.empty((2 * MAX_ARCS, 4))
     for i in range(len(bearings)):
         if stopped(board):
             break
@@ -268,7 +268,7 @@ def deepest_yaw(lo_rad: FloatArray, hi_rad: FloatArray, watch: Watch | None = No
 def _sort(values: FloatArray, watch: Watch) -> None:
     """Sort in place, by halves where one sort would take long: numpy's cannot be stopped."""
     watch.check()
-    if len(values) <= MOST_SORTED:
+    if len(values) <= MAX_SORTED:
         values.sort()
         return
     half = len(values) // 2

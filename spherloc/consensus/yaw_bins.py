@@ -34,7 +34,7 @@ BIN_TURN = CIRCLE / BINS
 """Turns of a bin."""
 EFFORT_LIMIT = 200_000
 """Words touched in one bin."""
-MOST_THINNED = 1_000_000
+MAX_THINNED = 1_000_000
 """Edges times words of a graph up to which it is thinned."""
 CLIQUE_MARGIN = 3
 """How much smaller than a clique without pose the next one may be."""
@@ -178,7 +178,7 @@ def core_graph(count, edges, least, board=None):
         return nodes, rows
     for k in range(len(left)):
         set_edge(rows, index_of[left[k, 0]], index_of[left[k, 1]])
-    if len(left) * rows.shape[1] > MOST_THINNED or len(nodes) <= least:
+    if len(left) * rows.shape[1] > MAX_THINNED or len(nodes) <= least:
         return nodes, rows
     kept = remove_weak_edges(rows, least)
     small, old = subgraph(rows, kept)

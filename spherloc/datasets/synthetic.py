@@ -58,12 +58,12 @@ draws = "uniform"                 # optional: of coordinates, in the cube; or "n
 # true_camera = [30, 1, 0, 2]     # optional: yaw (deg) and position (m) of the camera; drawn if absent
 """
 
-MOST_CORRESPONDENCES = 10_000
+MAX_CORRESPONDENCES = 10_000
 MAX_GRAVITY_ERROR_DEG = 10.0
 GRAVITY_BOUND_SD = 3.0
 """The bound on gravity, in standard deviations. Errors beyond it (1.1 %) are drawn again, so that the bound is true."""
 LIMITS: Mapping[str, tuple[float, float]] = {
-    "correspondences": (2, MOST_CORRESPONDENCES),
+    "correspondences": (2, MAX_CORRESPONDENCES),
     "outlier_rate": (0.0, 1.0),
     "noise_px": (0.0, 100.0),
     "seed": (0, 2**63 - 1),
@@ -240,7 +240,7 @@ def load(table: dict[str, Any], path: Path) -> SyntheticScene:
         key: scene_file.number(simulation, key, place, *LIMITS[key])
         for key in ("outlier_rate", "noise_px", *sorted(numbers & simulation.keys()))
     }
-    for key, most in (("correspondences", MOST_CORRESPONDENCES), ("seed", 2**63 - 1)):
+    for key, most in (("correspondences", MAX_CORRESPONDENCES), ("seed", 2**63 - 1)):
         given[key] = scene_file.integer(simulation, key, place, int(LIMITS[key][0]), most)
     for key in ("outlier_kind", "draws"):
         if key in simulation:

@@ -9,7 +9,7 @@ from spherloc.consensus.chance import chance_rate, nfa
 from spherloc.consensus.two_point_search import search_two_point
 from spherloc.estimators.base import estimate
 from spherloc.estimators.mc_exact import McExactOptions
-from spherloc.gauss_newton import LEAST_GRAVITY_SD_RAD, tilt_of
+from spherloc.gauss_newton import MIN_GRAVITY_SD_RAD, tilt_of
 from spherloc.geometry import camera_centre, pose, rotation_angle, transform, yaw_rotation
 from spherloc.metrics import evaluate
 from spherloc.problem import AlignedProblem
@@ -42,7 +42,7 @@ def pose_sd(
     which then seems to fix it.
     """
     each = _information(aligned, cam_from_map, mask) / noise_px**2
-    weight = max(gravity_sd_rad, LEAST_GRAVITY_SD_RAD) ** -2.0
+    weight = max(gravity_sd_rad, MIN_GRAVITY_SD_RAD) ** -2.0
     information = each.sum(axis=0) + np.diag([weight, 0.0, weight, 0.0, 0.0, 0.0])
     for _ in range(min(drop, len(each) - 3)):
         spread = np.linalg.norm(_inverse(information - each)[:, 3:, 3:], ord=2, axis=(1, 2))
@@ -79,7 +79,7 @@ def _inverse(information: FloatArray) -> FloatArray:
 
 SAMPLES = 20_000
 """Most samples of a search: 99 % sure to draw two of 1.5 % right matches together. A confidence ends it earlier."""
-MOST_WORK = 20_000_000
+MAX_WORK = 20_000_000
 """Samples times correspondences; above it the search draws fewer."""
 CONFIDENCE = 0.9999
 MAX_TILT_RAD = np.radians(12.0)
@@ -119,7 +119,7 @@ def fit_of(aligned: AlignedProblem, cam_from_map: FloatArray) -> Fit:
 def search(aligned: AlignedProblem, bound_px: float, options: RefinementOptions) -> FloatArray | None:
     """The pose (3, 4) that a long 2P-RANSAC finds, refined; None if no sample has a pose."""
     bounds = bounds_of(aligned, bound_px)
-    samples = min(SAMPLES, MOST_WORK // len(aligned.points))
+    samples = min(SAMPLES, MAX_WORK // len(aligned.points))
     found = search_two_point(aligned, bounds.pixels, 0, samples, CONFIDENCE, local_optimization=True)
     if not found.found:
         return None

@@ -11,7 +11,7 @@ from spherloc.bounds import Bounds, bounds_of
 from spherloc.consensus.chance import chance_rate, nfa
 from spherloc.consensus.two_point_search import TwoPointSearch, search_two_point
 from spherloc.estimators.base import Clock, Outcome, check_positive
-from spherloc.estimators.mc_exact import MOST_CORRESPONDENCES, ExactMaximumConsensus, McExactOptions
+from spherloc.estimators.mc_exact import MAX_CORRESPONDENCES, ExactMaximumConsensus, McExactOptions
 from spherloc.estimators.ransac import RansacOptions, TwoPointRansac
 from spherloc.free_gravity import Contradiction, contradicts, without_gravity
 from spherloc.geometry import pose, yaw_rotation
@@ -22,11 +22,11 @@ from spherloc.trace import DecisionStage
 from spherloc.types import BoolArray, FloatArray
 
 PROBE_SAMPLES = 500
-MOST_PROBE_SAMPLES = 5000
+MAX_PROBE_SAMPLES = 5000
 PROBE_CONFIDENCE = 0.99
-MOST_FOR_CHEAP_PROOF = 500
+MAX_FOR_CHEAP_PROOF = 500
 """Correspondences up to which the proof costs a few hundredths of a second, so that nothing speaks against it."""
-MOST_NFA_BY_CHANCE = 1e-6
+MAX_NFA_BY_CHANCE = 1e-6
 """Expected number of false alarms (NFA) of the size of the probe's consensus below which it is no chance."""
 RANSAC_CONFIDENCE = 0.9999
 RANSAC_SAMPLES = 100_000
@@ -137,7 +137,7 @@ def _probe_samples(aligned: AlignedProblem) -> int:
         return PROBE_SAMPLES
     clean = (1.0 - aligned.estimated_outlier_rate) ** 2
     needed = np.log1p(-PROBE_CONFIDENCE) / np.log1p(-clean) if 0.0 < clean < 1.0 else 0.0 if clean else np.inf
-    return int(np.clip(needed, PROBE_SAMPLES, MOST_PROBE_SAMPLES))
+    return int(np.clip(needed, PROBE_SAMPLES, MAX_PROBE_SAMPLES))
 
 
 def _decide(aligned: AlignedProblem, bounds: Bounds, probe: TwoPointSearch) -> DecisionStage:
@@ -149,11 +149,11 @@ def _decide(aligned: AlignedProblem, bounds: Bounds, probe: TwoPointSearch) -> D
     share = (
         f"{100 * support / count:.0f} % of {count:,} matches agree with the best of {probe.drawn} sampled pairs{guess}"
     )
-    if count > MOST_CORRESPONDENCES:
+    if count > MAX_CORRESPONDENCES:
         chosen, reason = "ransac-2p", f"{count:,} matches are too many for an exact search."
-    elif count <= MOST_FOR_CHEAP_PROOF:
+    elif count <= MAX_FOR_CHEAP_PROOF:
         chosen, reason = "mc-exact", f"{count:,} matches are few enough to prove the answer in a moment."
-    elif chance < MOST_NFA_BY_CHANCE:
+    elif chance < MAX_NFA_BY_CHANCE:
         chosen, reason = "ransac-2p", f"{share}, which is no chance: sampling finds the pose and is faster."
     else:
         chosen, reason = "mc-exact", f"only {share}, which may be chance: all poses must be searched."

@@ -2,8 +2,9 @@
 
 import platform
 import time
+from collections.abc import Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from importlib.metadata import version
 from numbers import Real
@@ -117,6 +118,15 @@ def _default_options(kind: type, problem: Problem) -> Any:
     return kind(**({} if problem.bound_px is None else {"bound_px": problem.bound_px}))
 
 
+def _changed(estimator: str, default: Any, changes: Mapping[str, Any]) -> Any:
+    """The default options with some of them changed; raises ``InputError`` for an unknown one."""
+    known = [item.name for item in fields(default)]
+    unknown = [key for key in changes if key not in known]
+    if unknown:
+        raise InputError(f"estimator {estimator} has no option {show(unknown[0])}; it has {', '.join(known)}.")
+    return replace(default, **changes)
+
+
 def check_positive(options: Any) -> None:
     """Raise ``InputError`` if a field of ``options`` is no finite positive number."""
     for item in fields(options):
@@ -155,8 +165,9 @@ def estimate(
 ) -> Trace:
     """Solve a problem and return the record of the run.
 
-    ``options`` is an instance of ``options_type(estimator)``; None takes the defaults. The same arguments give the
-    same trace but for its timings. ``watch``, a new one, follows the run and can cancel it from any thread.
+    ``options`` are an instance of ``options_type(estimator)``, or a dict of what differs from the defaults. The same
+    arguments give the same trace but for its timings. ``watch``, a new one, follows the run and can cancel it from any
+    thread.
 
     Raises ``Cancelled`` if it did, ``InputError`` for an unknown estimator, options of another estimator or beyond
     ``spherloc.ranges``, a seed outside 0 to 2^63 - 1, and for whatever an extension raises.
@@ -171,7 +182,8 @@ def run_estimator(
 
     Raises ``InputError`` for options of another type, and for what ``estimate`` raises it.
     """
-    options = _default_options(kind.Options, problem) if options is None else options
+    if options is None or isinstance(options, Mapping):
+        options = _changed(estimator, _default_options(kind.Options, problem), options or {})
     if not isinstance(options, kind.Options):
         raise InputError(f"estimator {estimator} takes {kind.Options.__name__}, not {type(options).__name__}.")
     check_options(options)

@@ -29,12 +29,12 @@ WIDEST_RAD = np.radians(60.0)
 and only raise the count everywhere. At 90 % outliers this turns 95 % success into 99 % (MEI) and costs nothing."""
 
 
-MOST_PRINTED_BALLS = 5_000
+MAX_PRINTED_BALLS = 5_000
 """Balls of Algorithm 2 as printed, whose 12 million edges take 100 MB: enough for all pairs of 100 matches. Of more
 pairs in the rotation clique those with the smallest balls are taken, where the paper says nothing."""
 PRINTED_EFFORT = 10 * EFFORT_LIMIT
 """Of their maximum clique: about 2 s."""
-MOST_CORRESPONDENCES = 10_000
+MAX_CORRESPONDENCES = 10_000
 """Their 50 million pairs take about a minute and 5 GB."""
 
 
@@ -69,9 +69,9 @@ class MaximumConsensus:
     def run(aligned: AlignedProblem, options: McOptions, bounds: Bounds, seed: int, clock: Clock) -> Outcome:
         """Algorithm 2; ``seed`` is not used."""
         count = len(aligned.bearings)
-        if count > MOST_CORRESPONDENCES:
+        if count > MAX_CORRESPONDENCES:
             raise InputError(
-                f"mc compares all pairs and takes up to {MOST_CORRESPONDENCES:,} correspondences, not {count:,}; "
+                f"mc compares all pairs and takes up to {MAX_CORRESPONDENCES:,} correspondences, not {count:,}; "
                 "thin them or use ransac-2p."
             )
         nobody = np.zeros(count, dtype=bool)
@@ -152,7 +152,7 @@ def _locate(
     yaw, arcs = consensus.yaw_rad, consensus.clique
     most, share = int(options.max_balls), share_of_each(len(aligned.bearings), int(options.max_balls))
     if options.as_printed:
-        most = share = min(len(arcs), MOST_PRINTED_BALLS)
+        most = share = min(len(arcs), MAX_PRINTED_BALLS)
     covering = (pairs, lo, hi), arcs, yaw
     pairs, centres, radii, bounded = spread_balls(aligned, bounds.radians, *covering, most, share, watch)
     if len(pairs) == 0:

@@ -21,7 +21,7 @@ from spherloc.consensus.positions import PositionSearch, search_positions
 from spherloc.consensus.two_point_search import TwoPointSearch, search_two_point
 from spherloc.errors import InputError
 from spherloc.estimators.base import Clock, Outcome, check_positive
-from spherloc.gauss_newton import LEAST_FOR_SIX_DOF, ROBUST_CAUCHY, Noise, polish
+from spherloc.gauss_newton import MIN_FOR_SIX_DOF, ROBUST_CAUCHY, Noise, polish
 from spherloc.geometry import pose, yaw_of, yaw_rotation
 from spherloc.last_step import conclude
 from spherloc.problem import AlignedProblem
@@ -30,15 +30,15 @@ from spherloc.trace import Certificate, ConsensusStage, PositionStage, Stage
 from spherloc.types import FloatArray
 from spherloc.watch import working_s
 
-MOST_CORRESPONDENCES = 200_000
+MAX_CORRESPONDENCES = 200_000
 """Some ten seconds and 1 GB."""
-MOST_FOR_PAIRS = 200
+MAX_FOR_PAIRS = 200
 """Correspondences up to which pairs are compared first: they decide in milliseconds where most matches are wrong."""
-FEW_INLIERS, MOST_FOR_FEW = 0.04, 3000
+FEW_INLIERS, MAX_FOR_FEW = 0.04, 3000
 """Share of inliers below which pairs come first for up to so many correspondences."""
 SEED_SAMPLES = 20_000
 """Most samples of the 2P-RANSAC that finds the first lower bound: enough at 1.5 % inliers, and some milliseconds."""
-LEAST_SAMPLES = 100
+MIN_SAMPLES = 100
 SEED_CONFIDENCE = 0.99
 FIRST_STARTS = 3
 """Hypotheses of the sampling, the last ones, that are tried where gravity is uncertain."""
@@ -46,7 +46,7 @@ FIRST_BOUNDS, ROUNDS_PER_BOUND, STEPS_PER_ROUND = 5, 2, 10
 """Of their fits: bounds from the widened one to that of the noise, choices of inliers at each, and steps on each
 choice."""
 YAW_BINS = 1440
-MOST_LEVELS, MOST_BOXES = 12, 200
+MAX_LEVELS, MAX_BOXES = 12, 200
 """Of the boxes that are kept for the picture."""
 
 
@@ -72,7 +72,7 @@ PAIR_EFFORT = 20_000_000
 """Words touched by the search over pairs for an ``effort`` of 1."""
 POSITION_EFFORT = 150_000_000
 """Matches tested by the search over positions for an ``effort`` of 1."""
-MOST_EFFORT = 1 << 50
+MAX_EFFORT = 1 << 50
 """Months of work; more does not fit into the kernels' counters."""
 
 
@@ -85,12 +85,12 @@ class ExactMaximumConsensus:
     def run(aligned: AlignedProblem, options: McExactOptions, bounds: Bounds, seed: int, clock: Clock) -> Outcome:
         """Guess by 2P-RANSAC, search all poses, refine, certify. ``seed`` is that of the RANSAC."""
         count = len(aligned.bearings)
-        if count > MOST_CORRESPONDENCES:
+        if count > MAX_CORRESPONDENCES:
             raise InputError(
-                f"mc-exact takes up to {MOST_CORRESPONDENCES:,} correspondences, not {count:,}; thin them or use "
+                f"mc-exact takes up to {MAX_CORRESPONDENCES:,} correspondences, not {count:,}; thin them or use "
                 "ransac-2p."
             )
-        samples = max(LEAST_SAMPLES, round(min(1.0, options.effort) * SEED_SAMPLES))
+        samples = max(MIN_SAMPLES, round(min(1.0, options.effort) * SEED_SAMPLES))
         with clock.stage("guess", until=0.1):
             guess = search_two_point(
                 aligned, bounds.pixels, seed, samples, SEED_CONFIDENCE, local_optimization=True, watch=clock.watch
@@ -147,15 +147,15 @@ def _search(
     """Pairs where they are faster, then positions unless all is proven."""
     deadline = working_s() + options.time_budget_s
     count, known = len(aligned.bearings), 1 if start is None else start[1]
-    few = known <= FEW_INLIERS * count and count <= MOST_FOR_FEW
+    few = known <= FEW_INLIERS * count and count <= MAX_FOR_FEW
     pairs, effort, yaw_bound = None, 0, None
-    if aligned.gravity_bound_rad == 0.0 and (count <= MOST_FOR_PAIRS or few):
+    if aligned.gravity_bound_rad == 0.0 and (count <= MAX_FOR_PAIRS or few):
         pairs = exact_consensus(
             aligned,
             bounds,
             rate,
             _poses(guess),
-            int(min(options.effort * PAIR_EFFORT, MOST_EFFORT)),
+            int(min(options.effort * PAIR_EFFORT, MAX_EFFORT)),
             options.time_budget_s,
             clock.watch,
         )
@@ -172,7 +172,7 @@ def _search(
         aligned,
         matches,
         start,
-        int(min(options.effort * POSITION_EFFORT, MOST_EFFORT)),
+        int(min(options.effort * POSITION_EFFORT, MAX_EFFORT)),
         deadline,
         yaw_bound,
         clock.watch,
@@ -187,9 +187,9 @@ def _boxes(found: PositionSearch) -> PositionStage | None:
     if not len(levels):
         return None
     rows, counts = [], []
-    for k in np.unique(np.linspace(0, len(levels) - 1, MOST_LEVELS).round().astype(int)):
+    for k in np.unique(np.linspace(0, len(levels) - 1, MAX_LEVELS).round().astype(int)):
         mine = np.flatnonzero(found.level == levels[k])
-        mine = mine[np.argsort(-found.box_bound[mine], kind="stable")][:MOST_BOXES]
+        mine = mine[np.argsort(-found.box_bound[mine], kind="stable")][:MAX_BOXES]
         rows.append(mine)
         counts.append(np.full(len(mine), left[k], np.int32))
     chosen = np.concatenate(rows)
@@ -310,7 +310,7 @@ def _narrowed(
     for limit_px in np.geomspace(widest, bounds.noise_px, FIRST_BOUNDS):
         for _ in range(ROUNDS_PER_BOUND):
             chosen = residuals_px(aligned, pose(rotation, translation)) <= limit_px
-            if np.count_nonzero(chosen) < LEAST_FOR_SIX_DOF:
+            if np.count_nonzero(chosen) < MIN_FOR_SIX_DOF:
                 return found
             noise = Noise(float(limit_px / 3.0), aligned.gravity_bound_rad / 3.0)
             polish(plain_matches, chosen, rotation, translation, noise, ROBUST_CAUCHY, STEPS_PER_ROUND)

@@ -16,7 +16,7 @@ from spherloc.problem import AlignedProblem
 from spherloc.refine import RefinementOptions
 from spherloc.trace import RansacStage
 
-MOST_ITERATIONS = 100_000_000
+MAX_ITERATIONS = 100_000_000
 
 
 @dataclass(frozen=True)
@@ -43,8 +43,8 @@ class RansacOptions(RefinementOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_positive(self)
-        if self.iterations != int(self.iterations) or self.iterations > MOST_ITERATIONS:
-            raise InputError(f"option iterations is {self.iterations}; give a whole number up to {MOST_ITERATIONS:,}.")
+        if self.iterations != int(self.iterations) or self.iterations > MAX_ITERATIONS:
+            raise InputError(f"option iterations is {self.iterations}; give a whole number up to {MAX_ITERATIONS:,}.")
         if self.confidence is not None and self.confidence >= 1.0:
             raise InputError(f"option confidence is {self.confidence}; give a probability below 1.")
         if self.scoring not in get_args(Scoring):

@@ -34,7 +34,7 @@ from spherloc.trace import RansacStage
 from spherloc.types import BoolArray, FloatArray, IntArray
 from spherloc.watch import Watch
 
-MOST_ITERATIONS = 1_000_000
+MAX_ITERATIONS = 1_000_000
 BATCH = 128
 """Samples that are solved at once."""
 
@@ -59,8 +59,8 @@ class SolverRansacOptions(RefinementOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_positive(self)
-        if self.iterations != int(self.iterations) or self.iterations > MOST_ITERATIONS:
-            raise InputError(f"option iterations is {self.iterations}; give a whole number up to {MOST_ITERATIONS:,}.")
+        if self.iterations != int(self.iterations) or self.iterations > MAX_ITERATIONS:
+            raise InputError(f"option iterations is {self.iterations}; give a whole number up to {MAX_ITERATIONS:,}.")
         if self.confidence is not None and self.confidence >= 1.0:
             raise InputError(f"option confidence is {self.confidence}; give a probability below 1.")
         check_switches(self)

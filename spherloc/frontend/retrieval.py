@@ -15,7 +15,7 @@ WORDS = 64
 STRONGEST = 4000
 """Of an image's features so many are described. The nearest reference of 48 rendered queries was among the four most
 similar ones of 47; with 1,000 features of 41."""
-MOST_SAMPLES = 20_000
+MAX_SAMPLES = 20_000
 """Descriptors that the vocabulary is learnt from, 300 a word."""
 MIN_SAMPLES_A_WORD = 30
 """With fewer, a word would describe single features."""
@@ -43,9 +43,9 @@ def vocabulary(images: Sequence[Floats], seed: int = 0) -> Floats:
     Every image gives about as many samples. The same descriptors and seed give the same words.
     """
     random = np.random.default_rng(seed)
-    share = -(-MOST_SAMPLES // max(1, len(images)))
+    share = -(-MAX_SAMPLES // max(1, len(images)))
     samples = np.concatenate([image[_some(random, len(image), share)] for image in images])
-    samples = samples[_some(random, len(samples), MOST_SAMPLES)]
+    samples = samples[_some(random, len(samples), MAX_SAMPLES)]
     count = max(1, min(WORDS, len(samples) // MIN_SAMPLES_A_WORD))
     words = samples[_some(random, len(samples), count)]
     for _ in range(_ROUNDS):

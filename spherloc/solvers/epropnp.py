@@ -23,7 +23,7 @@ HUBER = 0.1
 ITERATIONS = 50
 DECREASE_TOLERANCE = 1e-15
 """Relative to the cost: what rounding hides."""
-FIRST_RADIUS, MOST_RADIUS = 30.0, 1e16
+FIRST_RADIUS, MAX_RADIUS = 30.0, 1e16
 
 
 class EproPnp:
@@ -107,7 +107,7 @@ def _mode(image: FloatArray, points: FloatArray, start: FloatArray) -> FloatArra
         ratio = (cost - reached) / foretold
         if ratio >= 1e-3:
             state, shrink = candidate, 2.0
-            radius = min(radius / max(1.0 / 3.0, 1.0 - (2.0 * ratio - 1.0) ** 3), MOST_RADIUS)
+            radius = min(radius / max(1.0 / 3.0, 1.0 - (2.0 * ratio - 1.0) ** 3), MAX_RADIUS)
             residual, jacobian, cost = _linearized(image, points, state, width)
         else:
             radius, shrink = radius / shrink, 2.0 * shrink

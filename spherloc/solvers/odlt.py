@@ -22,7 +22,7 @@ from spherloc.solvers.epnp import image_plane
 from spherloc.solvers.linear_pose import DEGENERATE, condition, nearest_rotation
 from spherloc.types import FloatArray
 
-LEAST_DEPTH = 1e-3
+MIN_DEPTH = 1e-3
 """Depths are taken to be at least this share of their median: a point at the camera must not outweigh all others."""
 
 
@@ -58,7 +58,7 @@ class Odlt:
             depths = points @ matrix[2, :3] + matrix[2, 3]
             if np.count_nonzero(depths < 0.0) > np.count_nonzero(depths > 0.0):
                 matrix, depths = -matrix, -depths
-            weights = 1.0 / np.maximum(depths, LEAST_DEPTH * np.median(np.abs(depths)))
+            weights = 1.0 / np.maximum(depths, MIN_DEPTH * np.median(np.abs(depths)))
         rotation = nearest_rotation(matrix[:, :3])
         if rotation is None:
             return NO_POSES

@@ -18,7 +18,7 @@ from spherloc.types import FloatArray, IntArray
 SAMPLE_SIZE = 3
 LEAST = 1e-9
 """Leading coefficients and denominators below this are rounding."""
-MOST_IMAGINARY = 1e-6
+MAX_IMAGINARY = 1e-6
 """Of a root that counts as real, by its absolute value: double roots are found with half of the digits."""
 
 
@@ -92,7 +92,7 @@ def _real_roots(polynomial: FloatArray) -> tuple[IntArray, FloatArray]:
     companion[:, [1, 2, 3], [0, 1, 2]] = 1.0
     finite = np.isfinite(companion).all(axis=(1, 2))
     rows, roots = rows[finite], np.linalg.eigvals(companion[finite])
-    real = np.abs(roots.imag) <= MOST_IMAGINARY * np.maximum(np.abs(roots), 1.0)
+    real = np.abs(roots.imag) <= MAX_IMAGINARY * np.maximum(np.abs(roots), 1.0)
     return np.repeat(rows, 4).reshape(-1, 4)[real], np.asarray(roots.real[real], dtype=np.float64)
 
 

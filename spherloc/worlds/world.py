@@ -13,7 +13,7 @@ from spherloc.types import FloatArray
 from spherloc.worlds.mesh import Atlas, Mesh, write_glb
 from spherloc.worlds.rays import RayScene
 
-MOST_POSES = 100_000
+MAX_POSES = 100_000
 
 
 @dataclass(frozen=True)
@@ -118,8 +118,8 @@ class World:
         ``offset_m`` moves it to the left of the path and ``heading_deg`` turns it to the left; ``start`` and ``stop``
         are shares of the path's length. Raises ``InputError`` for an impossible count or a share outside 0 to 1.
         """
-        if not 1 <= count <= MOST_POSES:
-            raise InputError(f"world {self.name}: a route has {count} poses; give a count from 1 to {MOST_POSES:,}.")
+        if not 1 <= count <= MAX_POSES:
+            raise InputError(f"world {self.name}: a route has {count} poses; give a count from 1 to {MAX_POSES:,}.")
         if not (0.0 <= start <= 1.0 and 0.0 <= stop <= 1.0):
             raise InputError(f"world {self.name}: a route goes from {start:g} to {stop:g}; give shares from 0 to 1.")
         places, ahead = self.along(np.linspace(start, stop, count))

@@ -19,7 +19,7 @@ from spherloc_viz.layers.agreement import agreement
 from spherloc_viz.layers.frame import even
 from spherloc_viz.layers.residuals import run_bounds, verdicts
 
-MOST_PAIRS = 20_000
+MAX_PAIRS = 20_000
 """Pairs that are asked whether they agree; of more inliers an even sample is taken."""
 MIN_PARTNERS = 16
 
@@ -93,7 +93,7 @@ def _agreeing(trace: Trace) -> tuple[IntArray, int]:
     inliers = np.flatnonzero(trace.inlier_mask[aligned.index])
     if trace.cam_from_map is None or not len(inliers):
         return agree, 0
-    partners = even(inliers, max(MIN_PARTNERS, MOST_PAIRS // len(aligned.index)))
+    partners = even(inliers, max(MIN_PARTNERS, MAX_PAIRS // len(aligned.index)))
     yaw = yaw_of(aligned.align_pose(trace.cam_from_map)[:, :3])
     everybody = np.arange(len(aligned.index))
     pairs = agreement(aligned, run_bounds(trace).radians, yaw, everybody, partners)

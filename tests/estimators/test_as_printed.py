@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from spherloc.errors import InputError
 from spherloc.estimators import estimate, options_type
-from spherloc.estimators.mc import MOST_PRINTED_BALLS
+from spherloc.estimators.mc import MAX_PRINTED_BALLS
 from spherloc.geometry import camera_centre, pose
 from spherloc.refine import residuals_px
 
@@ -77,7 +77,7 @@ def test_the_default_keeps_known_gravity_and_the_printed_form_does_not(scene_of)
 def test_of_too_many_pairs_the_smallest_balls_are_taken_and_said(scene_of):
     problem = replace(scene_of("panorama"), outlier_rate=0.0, correspondences=120).problem(0)
     balls = run(problem, "mc").stages[1]
-    assert balls.candidates > MOST_PRINTED_BALLS == len(balls.pairs)
+    assert balls.candidates > MAX_PRINTED_BALLS == len(balls.pairs)
     assert balls.rule == f"The 5,000 smallest balls of the {balls.candidates:,} pairs in the rotation clique."
 
 

@@ -14,7 +14,7 @@ from spherloc.errors import InputError
 from spherloc.estimators import estimate, options_type
 from spherloc.geometry import DOWN, pose, so3_exp
 from spherloc.problem import Problem
-from spherloc.ranges import LEAST_PX, MAX_PX
+from spherloc.ranges import MAX_PX, MIN_PX
 from spherloc.refine import residuals_px
 from tests.waiting import LIMIT_S
 
@@ -68,7 +68,7 @@ def test_a_bound_that_no_solver_can_reckon_with_is_one_sentence(scene_of, estima
         estimate(problem, estimator, options_type(estimator)(bound_px=bound_px))
 
 
-@pytest.mark.parametrize("bound_px", [LEAST_PX, MAX_PX])
+@pytest.mark.parametrize("bound_px", [MIN_PX, MAX_PX])
 @pytest.mark.parametrize("estimator", ["mc", "mc-exact", "ransac-2p", "auto"])
 def test_the_tightest_and_widest_bounds_give_an_answer_and_a_diagnosis(scene_of, estimator, bound_px):
     problem = scene_of("mei", correspondences=30).problem()
@@ -112,7 +112,7 @@ from spherloc.errors import InputError
 from spherloc.estimators import estimate, options_type
 from spherloc.geometry import DOWN
 from spherloc.problem import Problem
-from spherloc.ranges import LEAST_PX, MAX_PX
+from spherloc.ranges import MIN_PX, MAX_PX
 rng = np.random.default_rng(0)
 pixels, points = rng.uniform(1, 99, (200_000, 2)), rng.uniform(-5, 5, (200_000, 3))
 try:

@@ -11,7 +11,7 @@ from test_alignment_invariance import turned
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.errors import InputError
 from spherloc.estimators import estimate, options_type
-from spherloc.estimators.mc_exact import MOST_CORRESPONDENCES
+from spherloc.estimators.mc_exact import MAX_CORRESPONDENCES
 from spherloc.geometry import DOWN, rotation_angle
 from spherloc.metrics import evaluate
 from spherloc.problem import Problem
@@ -119,7 +119,7 @@ def crowd(count):
 
 def test_too_many_correspondences():
     with pytest.raises(InputError, match=r"200,000.*200,001.*ransac-2p"):
-        solve(crowd(MOST_CORRESPONDENCES + 1))
+        solve(crowd(MAX_CORRESPONDENCES + 1))
 
 
 @pytest.mark.parametrize("limit", [{"effort": 1e-12}, {"time_budget_s": 1e-9}])

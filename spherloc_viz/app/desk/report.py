@@ -109,7 +109,7 @@ def _how() -> str:
     )
 
 
-MOST_PAIRS = 100
+MAX_PAIRS = 100
 """Of each kind that are shown with their pictures."""
 TABLE_ROWS = 30
 """Causes and scenes that are listed."""
@@ -196,9 +196,9 @@ def _pairs(title: str, pairs: Sequence[Pair], none: str) -> str:
         f'<tr><td><div class="name">{escape(words.title_of(pair.after))}</div>'
         f'<div class="dim">{escape(pair.after.estimator)}, seed {pair.after.seed}</div></td>'
         f"{_side(pair.before)}{_side(pair.after)}</tr>"
-        for pair in pairs[:MOST_PAIRS]
+        for pair in pairs[:MAX_PAIRS]
     )
-    more = f'<p class="dim">and {len(pairs) - MOST_PAIRS:,} more.</p>' if len(pairs) > MOST_PAIRS else ""
+    more = f'<p class="dim">and {len(pairs) - MAX_PAIRS:,} more.</p>' if len(pairs) > MAX_PAIRS else ""
     return (
         f"<h2>{title}: {len(pairs):,}</h2><p>Diagnoses after: {counted}.</p>"
         f"<table><tr><th>run</th><th>before</th><th>after</th></tr>{rows}</table>{more}"

@@ -16,7 +16,7 @@ WIDTH_PX, HEIGHT_PX = 380.0, 180.0
 RIGHT_PX, ROW_PX = 12.0, 15.0
 MAX_DOTS = 40
 """Corners up to which a line shows each as a dot."""
-MOST_STEPS = 360
+MAX_STEPS = 360
 HEADROOM = 1.06
 
 Bands = Mapping[str, tuple[FloatArray, FloatArray]]
@@ -154,7 +154,7 @@ def step_parts(curve: Curve, x: Scale, y: Scale) -> list[str]:
     """A step curve and the area below it, within the ends of the x axis."""
     first = max(0, int(np.searchsorted(curve.x, x.low, "right")) - 1)
     last = int(np.searchsorted(curve.x, x.high, "left"))
-    xs, ys = shapes.thin_steps(curve.x[first:last], curve.y[first:last], MOST_STEPS)
+    xs, ys = shapes.thin_steps(curve.x[first:last], curve.y[first:last], MAX_STEPS)
     if len(xs) == 0:
         return []
     # The last of all ends where it begins; of a part, where the next begins.

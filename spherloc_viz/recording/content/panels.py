@@ -28,7 +28,7 @@ from spherloc_viz.recording.content.columns import (
 from spherloc_viz.recording.content.components import PARTS, Bars
 
 ARCS, GRAPH, RESIDUALS = "/arcs", "/graph", "/charts/residuals"
-MOST_ARCS = 120
+MAX_ARCS = 120
 """Arcs that are shown near the peak."""
 REACH_DEG = 8.0
 """Arcs up to so far from the estimated yaw are near the peak."""
@@ -87,8 +87,8 @@ def _arcs(trace: Trace, stage: YawStage) -> Iterator[Chunk]:
     in_clique[stage.clique] = True
     near = np.flatnonzero(np.abs(away) - half_widths <= reach)
     inside, outside = near[in_clique[near]], near[~in_clique[near]]
-    take = min(len(inside), max(MOST_ARCS // 2, MOST_ARCS - len(outside)))
-    chosen = np.concatenate([even(inside, take), even(outside, MOST_ARCS - take)])
+    take = min(len(inside), max(MAX_ARCS // 2, MAX_ARCS - len(outside)))
+    chosen = np.concatenate([even(inside, take), even(outside, MAX_ARCS - take)])
     chosen = chosen[np.lexsort((-half_widths[chosen], in_clique[chosen]))]
     ends = away[chosen, None] + half_widths[chosen, None] * np.array([-1.0, 1.0])
     ends = estimate + np.degrees(np.clip(ends, -reach, reach))
