@@ -61,7 +61,7 @@ def _joined(*sentences: str) -> str:
 def _how_far(poses: Poses, residual: tuple[float, float]) -> str:
     px, degrees = residual
     if np.isinf(px):
-        return f"At the estimated pose its point lies behind: {degrees:.0f}° from where its pixel looks."
+        return f"At the estimated pose its point is behind the camera: {degrees:.0f}° from the direction of its pixel."
     times = px / poses.bound_px
     if times < NEARLY:
         return f"At the estimated pose it is {_px(px)} off, just beyond its bound of {_px(poses.bound_px)}."
@@ -100,7 +100,7 @@ def _why_lost(trace: Trace, poses: Poses) -> str:
     if poses.truth[0] > poses.bound_px:
         return f"Its label says that it is right, but it is {off} at the true pose too: the bound is too tight for it."
     if evaluate(trace).success:
-        return f"At the true pose it is {off}: the small error of the pose costs it its place."
+        return f"At the true pose it is {off}: the small error of the pose moves it beyond the bound."
     return f"It agrees with the true pose, {off} there, but the run ended {_away(trace)} from it."
 
 

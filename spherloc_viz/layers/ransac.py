@@ -94,9 +94,9 @@ def _in_truth(view: RunView, sample: np.ndarray) -> str:
     """Whether a sample is clean, as a sentence."""
     labels = view.trace.problem.truth_inliers
     if labels is None:
-        return f"Whether these are right nobody knows yet, so all {len(view.points)} matches are asked."
+        return f"Whether these are right is not known yet, so the pose is tested on all {len(view.points)} matches."
     right = int(np.count_nonzero(labels[sample]))
-    return f"In truth {right} of these {len(sample)} are right, which RANSAC cannot know: it asks all matches."
+    return f"In truth {right} of these {len(sample)} are right. RANSAC cannot know: it tests the pose on all."
 
 
 def _line(view: RunView, sample: np.ndarray) -> Segments:

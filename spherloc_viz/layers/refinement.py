@@ -91,7 +91,7 @@ def _inliers(view: RunView, stage: RefinementStage) -> Frame:
     else:
         bound = "the bound"
         if errors.max() > view.bounds.noise_px:
-            bound = f"the bound, which is {view.bounds.noise_px:.3g} px and what gravity may be off"
+            bound = f"the bound, which is {view.bounds.noise_px:.3g} px and what the error of gravity may add"
         told = (
             f"{len(errors)} of {len(mask)} matches are within {bound}; the median one is off by "
             f"{np.median(errors):.2f} px and the worst by {errors.max():.2f} px. "
@@ -117,7 +117,7 @@ def _outliers(view: RunView, stage: RefinementStage) -> Frame:
     seen = errors[np.isfinite(errors)]
     behind = len(errors) - len(seen)
     if not len(errors):
-        told = "Nobody disagrees: all matches are within the bound. There is nothing to reject"
+        told = "All matches are within the bound, so that none is rejected"
     elif not len(seen):
         told = f"All {len(errors)} other matches lie behind the camera at this pose. No bound would make them agree"
     else:
@@ -146,7 +146,7 @@ def _error(view: RunView, stage: RefinementStage) -> Frame:
         "inliers are right."
     )
     if view.truth is None:
-        happened = "The truth is not known here, so that nobody can check."
+        happened = "The truth is not known here, so this cannot be checked."
     else:
         turned, away = rotation_error_deg(view.truth, state), translation_error_m(view.truth, state)
         happened = f"In truth it is off by {angle_text(turned)} and {view.length_text(away)}."

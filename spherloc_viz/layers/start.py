@@ -136,7 +136,8 @@ def _unknowns(view: RunView) -> Frame:
     usable = len(view.trace.problem.aligned.index)
     return Frame(
         "One angle and a position are left: yaw, around the ring, and where the camera stands, 4 numbers instead of 6. "
-        f"A match gives 2 equations, so 2 of the {usable} matches leave two poses, and {usable - 2} matches can vote.",
+        f"A match gives 2 equations, so 2 of the {usable} matches leave two poses, and the other "
+        f"{usable - 2} confirm one of them.",
         "θ, C:  1 + 3 = 2 · 2   (Eq. 18-22)",
         view.standing(np.eye(3)),
         view.colors(style.UNDECIDED),

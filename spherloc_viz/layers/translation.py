@@ -396,7 +396,7 @@ def _all(view: RunView, balls: BallSet) -> Frame:
     stage, inside = balls.stage, np.zeros(len(balls), dtype=bool)
     return Frame(
         f"With the yaw known, each pair says where the camera is, up to a ball; {len(stage.edges):,} pairs of "
-        f"balls overlap. Small balls come from near points under a wide angle, and inliers share one spot.",
+        f"balls overlap. Small balls come from near points under a wide angle; balls of inliers share a position.",
         "H t = b,  |t_k − t| ≤ r_k   (Eq. 24-27)",
         _turned(view, balls),
         view.colors(style.UNDECIDED, (view.mask(stage.pairs), style.CLIQUE)),
