@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from cli_process import SCENE, one_sentence, spherloc, spherloc_here
+from cli_process import SCENE, one_sentence, spherloc_here
 
 from scripts.documentation import commands, help_of
 from spherloc.datasets import bundled_scenes, load_scene, scene_path
@@ -29,7 +29,7 @@ def test_labels_that_a_pattern_finds_too_are_no_recordings(tmp_path: Path) -> No
 
 
 def test_scenes_lists_what_play_and_run_accept(tmp_path: Path) -> None:
-    bundled, kinds = spherloc("scenes", cwd=tmp_path).stdout.split("\n\n")
+    bundled, kinds = spherloc_here("scenes", cwd=tmp_path).stdout.split("\n\n")
     rows = [line.split("  ")[1:] for line in bundled.splitlines()[1:] if not line.startswith("    ")]
     by_name = {name: (kind, title) for name, kind, title in rows}
     assert by_name.keys() == bundled_scenes().keys() and len(rows) >= 9

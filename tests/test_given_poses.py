@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli_process import spherloc
+from cli_process import spherloc_here
 from recording_samples import scene_problem
 
 from spherloc import registry
@@ -166,7 +166,7 @@ def test_poses_with_a_table_of_matches_are_diagnosed(tmp_path: Path) -> None:
     (tmp_path / "poses.csv").write_text("name,qw,qx,qy,qz,tx,ty,tz\n" + "".join(rows))
     down = [repr(float(x)) for x in scene_problem(NAME).gravity_map]
     files = ["--matches", matches, "--camera", camera, "--gravity", gravity, "--recordings", "runs"]
-    done = spherloc("diagnose", "poses.csv", *files, "--map-down", *down, cwd=tmp_path)
+    done = spherloc_here("diagnose", "poses.csv", *files, "--map-down", *down, cwd=tmp_path)
     assert done.returncode == 2 and "c.jpg: has no row in the gravity file" in done.stderr
     assert "a.jpg: " in done.stdout and "b.jpg: " in done.stdout and "search missed the best pose" in done.stdout
     recorded = [path for path in (tmp_path / "runs").glob("*.rrd") if ".review." not in path.name]

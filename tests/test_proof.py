@@ -5,7 +5,7 @@ import sys
 
 import numpy as np
 import pytest
-from cli_process import SCENE, one_sentence, spherloc
+from cli_process import SCENE, one_sentence, spherloc_here
 
 from spherloc.errors import InputError
 from spherloc.estimators import estimate
@@ -129,13 +129,13 @@ def test_what_is_no_proof_is_refused(tmp_path, scene_of):
 
 def test_on_the_command_line(tmp_path):
     given = ("run", SCENE, "--estimator", "mc-exact", "--no-record", "--proof", "proof.npz")
-    done = spherloc(*given, cwd=tmp_path)
+    done = spherloc_here(*given, cwd=tmp_path)
     assert done.returncode == 0 and "check them" in done.stderr
-    checked = spherloc("check-proof", "proof.npz", cwd=tmp_path)
+    checked = spherloc_here("check-proof", "proof.npz", cwd=tmp_path)
     assert checked.returncode == 0 and "cells hold every pose" in checked.stdout
     content = (tmp_path / "proof.npz").read_bytes()
     (tmp_path / "proof.npz").write_bytes(content[: len(content) // 2])
-    refused = spherloc("check-proof", "proof.npz", cwd=tmp_path)
+    refused = spherloc_here("check-proof", "proof.npz", cwd=tmp_path)
     assert refused.returncode == 1 and refused.stderr.startswith("refused: ") and "Traceback" not in refused.stderr
-    twice = spherloc("run", SCENE, SCENE, "--estimator", "mc-exact", "--proof", "proof.npz", cwd=tmp_path)
+    twice = spherloc_here("run", SCENE, SCENE, "--estimator", "mc-exact", "--proof", "proof.npz", cwd=tmp_path)
     assert twice.returncode == 2 and "one scene" in one_sentence(twice)

@@ -62,10 +62,10 @@ def test_every_pose_is_in_one_of_the_charts(rng, scene_of):
 
 
 @pytest.mark.parametrize("bound_rad", [0.0, TILT_RAD])
-def test_half_a_million_poses_obey_the_bounds_of_their_cells(rng, scene_of, bound_rad):
+def test_many_poses_obey_the_bounds_of_their_cells(rng, scene_of, bound_rad):
     """What a cell excludes no pose of it explains, what it is sure of each explains, yaws are in their intervals."""
     checked = decided = 0
-    for seed in range(84):
+    for seed in range(48):
         aligned, truth = tilted(scene_of, seed % 12, bound_rad)
         matches, count = pack_matches(aligned, BOUND_PX), len(aligned.points)
         chart, at = parameters_of(matches, truth)
@@ -109,7 +109,7 @@ def test_half_a_million_poses_obey_the_bounds_of_their_cells(rng, scene_of, boun
         always = np.all(mates, axis=0) & ~open_ones
         assert np.count_nonzero(always) >= sure, "what is surely explained is not"
         assert not np.any(np.any(mates, axis=0) & ~open_ones & ~always), "what is surely not explained is"
-    assert checked >= 250_000 and decided >= 250
+    assert checked >= 140_000 and decided >= 140
 
 
 @pytest.mark.parametrize("seed", [0, 3, 9, 13, 17, 19, 26, 30, 31, 33, 36, 44])

@@ -196,10 +196,9 @@ max_features = 4000
 
 
 @pytest.mark.parametrize("more", ['pairs = "pairs.txt"', 'global_features = "global.h5"'])
-def test_own_matching_of_real_panoramas(tmp_path, tmp_path_factory, monkeypatch, rng, more):
+def test_own_matching_of_real_panoramas(tmp_path, rng, more):
     """Without hloc's matches the project finds its own, of the pairs or of what global descriptors retrieve."""
     data = real_data("stella_equirect_pair")
-    monkeypatch.setenv("SPHERLOC_CACHE", str(tmp_path_factory.getbasetemp() / "hloc_cache"))
     query, reference = "equirectangular_image_002.jpg", "equirectangular_image_001.jpg"
     rows = (data / "colmap_equirect" / "0" / "images.txt").read_text().splitlines()
     words = next(row.split() for row in rows if row.endswith(query))

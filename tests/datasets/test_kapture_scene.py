@@ -23,11 +23,6 @@ def t265():
     return real_data("kapture_t265") / "samples" / "t265"
 
 
-@pytest.fixture(autouse=True)
-def own_cache(tmp_path_factory, monkeypatch):
-    monkeypatch.setenv("SPHERLOC_CACHE", str(tmp_path_factory.getbasetemp() / "kapture_cache"))
-
-
 SCENE = """
 kind = "kapture"
 name = "T265"

@@ -16,11 +16,6 @@ from tests.needs import real_data
 CAMERA = Equirectangular(1920, 960)
 
 
-@pytest.fixture(autouse=True)
-def own_cache(tmp_path, monkeypatch):
-    monkeypatch.setenv("SPHERLOC_CACHE", str(tmp_path / "cache"))
-
-
 @pytest.fixture
 def pair():
     """The two panoramas as views with the poses of COLMAP's model."""

@@ -24,13 +24,6 @@ from spherloc.images import read_depth_png
 from tests.needs import DATA, real_data, require
 
 
-@pytest.fixture(autouse=True, scope="module")
-def _own_cache(tmp_path_factory):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("SPHERLOC_CACHE", str(tmp_path_factory.mktemp("cache")))
-        yield
-
-
 def rotation_from_wxyz(w, x, y, z):
     return np.array(
         [
