@@ -5,12 +5,14 @@ import re
 import pytest
 
 from spherloc.errors import InputError
+from spherloc_viz import style
+from spherloc_viz.app.lesson_file import images_of, images_picture
 from spherloc_viz.app.linked_run import LinkedRuns
 from spherloc_viz.layers import steps
 from spherloc_viz.lessons import lessons
 from spherloc_viz.lessons.claims import holds, split_claim
 from spherloc_viz.lessons.html import FORMULA, changes_in, lesson_page, list_page, names_in
-from spherloc_viz.lessons.lesson import changed_state, parse_lesson
+from spherloc_viz.lessons.lesson import MANY, changed_state, parse_lesson, state_parts
 from spherloc_viz.lessons.numbers import numbers_of
 
 NUMBER = re.compile(r"(?<![\w.])\d[\d,]*(?:\.\d+)?")
@@ -18,8 +20,12 @@ LESSONS = lessons()
 
 
 @pytest.fixture(scope="module")
-def linked():
-    runs = LinkedRuns()
+def runs():
+    return LinkedRuns()
+
+
+@pytest.fixture(scope="module")
+def linked(runs):
     known = {}
 
     def numbers(state):
@@ -67,20 +73,63 @@ def test_a_moment_holds(linked, lesson, moment):
         assert holds(expression, runs), f"{moment.title}: {claim} does not hold of {runs[0]}"
 
 
+def plain(text):
+    """What of a text is prose: no formula, link, number of the run, control or code."""
+    return re.sub(
+        r"\]\(#[^)]*\)|\{[^{}]*\}|`[^`]*`|^```.*?^```", " ", FORMULA.sub(" ", text), flags=re.DOTALL | re.MULTILINE
+    )
+
+
+def known_numbers(moment):
+    """Those in its claims and settings; shares as percentages, too; and how many seeds a claim is about."""
+    answers = () if moment.question is None else moment.question.answers
+    changes = [moment.state, *(changed_state("", one) for one in (moment.before, *(answer.go for answer in answers)))]
+    settings = [value for state in changes for key, value in state_parts(state).items() if key.startswith(MANY)]
+    found = [float(one) for text in (*moment.claims, *settings)
+             for one in re.findall(r"\d+(?:\.\d+)?", text.replace("%3D", " "))]  # fmt: skip
+    found += [float(len(split_claim(claim)[0])) for claim in moment.claims]
+    return {round(number, 6) for number in found + [100 * one for one in found if one <= 1]}
+
+
 @pytest.mark.parametrize("lesson", LESSONS, ids=lambda lesson: lesson.name)
 def test_no_number_comes_from_nowhere(lesson):
-    """A figure in the prose is in a statement that is recomputed, or quoted."""
-    claimed = set(lesson.quoted)
+    """A figure in a moment is in a statement about it that is recomputed, or its source is said."""
+    spoken = set()
+    everything = set().union(*map(known_numbers, lesson.moments))
+    places = [(lesson.title, [lesson.title, lesson.summary, lesson.introduction], everything)]
     for moment in lesson.moments:
-        for claim in moment.claims:
-            found = re.findall(r"\d+(?:\.\d+)?", claim.replace("%3D", " "))
-            claimed |= {float(number) for number in found} | {100 * float(number) for number in found}
-    claimed = {round(number, 6) for number in claimed}
-    for moment in lesson.moments:
+        places.append((moment.title, [moment.notes, *texts(moment)], known_numbers(moment)))
+    for title, said, known in places:
+        figures = [one.replace(",", "") for text in said for one in NUMBER.findall(plain(text))]
+        unknown = [one for one in figures if round(float(one), 6) not in known | lesson.quoted.keys()]
+        assert not unknown, f"{title}: nothing tells where {unknown} come from"
+        spoken |= {float(one) for one in figures}
+    assert lesson.quoted.keys() <= spoken, "a source is said for a number that the text does not have"
+
+
+def test_formulas_of_numbers_are_true():
+    """Such as 0.5^2 = 0.25; to the digits that are given."""
+    checked = 0
+    for moment in (moment for lesson in LESSONS for moment in lesson.moments):
         for text in texts(moment):
-            plain = re.sub(r"\]\(#[^)]*\)|\{[^{}]*\}|`[^`]*`", " ", FORMULA.sub(" ", text))
-            unknown = [one for one in NUMBER.findall(plain) if round(float(one.replace(",", "")), 6) not in claimed]
-            assert not unknown, f"{moment.title}: nothing tells where {unknown} come from"
+            for formula in ("".join(found) for found in FORMULA.findall(text)):
+                left, equals, right = formula.replace("\\cdot", "*").replace("^", "**").partition("=")
+                if equals and re.fullmatch(r"[\d.*/+() -]+", left):
+                    digits = len(right.strip().partition(".")[2])
+                    assert holds(f"round({left}, {digits}) == {right}", [{}]), f"{moment.title}: {formula}"
+                    checked += 1
+    assert checked >= 5
+
+
+def test_the_images_of_a_moment_are_seen(runs):
+    lesson = next(one for one in LESSONS if one.name == "images")
+    night = lesson.moments[2]
+    assert f"/learn/images?{night.state.replace('&', '&amp;')}" in lesson_page(lesson, LESSONS)
+    picture = images_of(runs, night.state)
+    assert picture.count('<image href="data:image/jpeg;base64,') == 2
+    assert f'stroke="{style.css(style.INLIER)}"' in picture
+    with pytest.raises(InputError, match="no lesson shows"):
+        images_picture(changed_state(night.state, "seed=5"))
 
 
 def test_pages_of_all_lessons_are_made():

@@ -1,15 +1,19 @@
 """Lessons as files: a page with recorded scenes that opens without a server, and the hand-out."""
 
 import json
+from base64 import b64encode
 from collections.abc import Callable, Mapping
 from functools import lru_cache
 from html import escape
+from pathlib import Path
 
 from spherloc.diagnosis import diagnose
 from spherloc.errors import InputError
+from spherloc.files import is_file
 from spherloc_viz import style
 from spherloc_viz.app.controls.steps_panel import find_step
 from spherloc_viz.app.linked_run import LinkedRun, LinkedRuns
+from spherloc_viz.app.matches.flat_images import images_svg
 from spherloc_viz.app.run_display import without_truth
 from spherloc_viz.app.stage import views
 from spherloc_viz.app.stage.flat_picture import svg
@@ -17,7 +21,8 @@ from spherloc_viz.app.stage.still_page import Still, scene_script, scripts_in, w
 from spherloc_viz.app.stage.walls import MAX_BYTES, Walls
 from spherloc_viz.app.web.page import QUIET, client_html
 from spherloc_viz.layers import paint, steps, with_alternative
-from spherloc_viz.lessons.html import Form, exported_page, handout_page, links_in, names_in
+from spherloc_viz.lessons import lessons
+from spherloc_viz.lessons.html import Form, Sheet, exported_page, handout_page, has_images, links_in, names_in
 from spherloc_viz.lessons.lesson import Lesson, Moment, changed_state
 from spherloc_viz.lessons.numbers import number_text, numbers_of
 
@@ -48,7 +53,8 @@ def exported(lesson: Lesson, tell: Callable[[str], None], dark: bool = True) -> 
         _data("numbers", json.dumps({str(place): one for place, one in enumerate(numbers)})),
         *(_data(f"scene-{place}", script) for place, script in enumerate(scripts)),
     ]
-    forms = [_recorded(found, numbers[found[_state(moment.state)]]) for moment in lesson.moments]
+    images = {moment.state: _as_data(images_of(runs, moment.state)) for moment in lesson.moments if has_images(moment)}
+    forms = [_recorded(found, numbers[found[_state(moment.state)]], images) for moment in lesson.moments]
     page = exported_page(lesson, forms, "\n".join(data))
     page = with_policy(page, [*scripts_in(viewer), *scripts])
     if len(page.encode()) > MAX_BYTES_OF_FILE:
@@ -59,9 +65,45 @@ def exported(lesson: Lesson, tell: Callable[[str], None], dark: bool = True) -> 
 def handout_of(lesson: Lesson) -> str:
     """A lesson as HTML to be printed; its pictures are inside."""
     runs = LinkedRuns()
-    linked = [runs.run(moment.state) for moment in lesson.moments]
-    pictures = [svg(still_of(one, runs, dark=False)) for one in linked]
-    return handout_page(lesson, list(map(numbers_text, linked)), pictures)
+
+    def told(state: str) -> tuple[dict[str, str], str]:
+        linked = runs.run(state)
+        return numbers_text(linked), svg(still_of(linked, runs, dark=False))
+
+    sheets = []
+    for moment in lesson.moments:
+        shown = told(moment.state)
+        asked = told(changed_state(moment.state, moment.before)) if moment.before else shown
+        sheets.append(Sheet(*shown, *asked))
+    return handout_page(lesson, sheets, lambda state: _as_data(images_of(runs, state)))
+
+
+@lru_cache(maxsize=16)
+def images_picture(state: str) -> str:
+    """Query and reference of a moment's state, SVG; raises ``InputError`` if no moment of a lesson shows them."""
+    shown = {_state(moment.state) for lesson in lessons() for moment in lesson.moments if has_images(moment)}
+    if _state(state) not in shown:
+        raise InputError("no lesson shows these images; the lessons are at /learn.")
+    return images_of(LinkedRuns(), state)
+
+
+def images_of(runs: LinkedRuns, state: str) -> str:
+    """Query and reference of a state with their matches, SVG; raises ``InputError`` if it has none."""
+    linked = runs.run(state)
+    trace = linked.run.trace
+    scene = runs.catalog.map_scene(linked.run.request.scene.scene)
+
+    def draw(path: Path) -> None:
+        """Rendered images are drawn when they are first needed."""
+        for view in () if scene is None else scene.pictures(trace.problem):
+            if view.path == path and not is_file(path):
+                view.make_file()
+
+    return images_svg(trace, paint(trace, find_step(steps(trace), linked.view.step)), draw)
+
+
+def _as_data(image: str) -> str:
+    return f"data:image/svg+xml;base64,{b64encode(image.encode()).decode()}"
 
 
 @lru_cache(maxsize=64)
@@ -134,8 +176,8 @@ def _data(name: str, text: str) -> str:
     return f'<script type="application/json" id="{name}">{text.replace("</", "<" + chr(92) + "/")}</script>'
 
 
-def _recorded(places: Mapping[str, int], numbers: Mapping[str, str]) -> Form:
-    """The form of a moment with recorded scenes; ``numbers`` are those of its run."""
+def _recorded(places: Mapping[str, int], numbers: Mapping[str, str], images: Mapping[str, str]) -> Form:
+    """The form of a moment with recorded scenes; ``numbers`` are those of its run, ``images`` addresses by state."""
 
     def number(name: str) -> str:
         return f'<output data-number="{name}">{escape(numbers[name])}</output>'
@@ -143,4 +185,4 @@ def _recorded(places: Mapping[str, int], numbers: Mapping[str, str]) -> Form:
     def at(state: str) -> str:
         return f"at={places[_state(state)]}"
 
-    return Form(number, at, lambda state, changes: at(changed_state(state, changes)), controls=False)
+    return Form(number, at, lambda state, changes: at(changed_state(state, changes)), False, images.__getitem__)

@@ -12,6 +12,7 @@ from latex2mathml.converter import convert
 from markdown_it import MarkdownIt
 
 from spherloc.errors import InputError, show
+from spherloc_viz import style
 from spherloc_viz.lessons.lesson import Lesson, Moment, Question, changed_state, state_parts
 
 FORMULA = re.compile(r"\$\$(.+?)\$\$|\$(.+?)\$", re.DOTALL)
@@ -20,6 +21,10 @@ LINK = re.compile(r'<a href="#([^"]*)">')
 MARK, END = "\ue000", "\ue001"
 """Around the number of a formula while Markdown is read, which would take its signs for its own."""
 PERCENT = "%"
+PAIR = "images"
+"""Field of the query and the reference image with their matches."""
+IMAGES = "/learn/images"
+"""Address of such a picture, before its state."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +39,8 @@ class Form:
     """What it calls changes, the second, to a state, the first; empty if it cannot show them."""
     controls: bool
     """Whether sliders, choices and links to the playground work."""
+    images: Callable[[str], str] = lambda state: f"{IMAGES}?{state}"
+    """Address of the picture of a state's images."""
 
 
 def live_number(name: str) -> str:
@@ -45,9 +52,11 @@ LIVE = Form(live_number, lambda state: state, lambda state, changes: changes, co
 """Beside the playground."""
 
 
-def printed(numbers: Mapping[str, str]) -> Form:
+def printed(numbers: Mapping[str, str], images: Callable[[str], str]) -> Form:
     """On paper, with these numbers."""
-    return Form(lambda name: f"<b>{escape(numbers[name])}</b>", lambda state: "", lambda state, changes: "", False)
+    return Form(
+        lambda name: f"<b>{escape(numbers[name])}</b>", lambda state: "", lambda state, changes: "", False, images
+    )
 
 
 @cache
@@ -80,7 +89,12 @@ def prose_html(text: str, state: str, form: Form = LIVE) -> str:
 
 def names_in(text: str) -> set[str]:
     """Names of the numbers of the run that a text has."""
-    return {name for name in FIELD.findall(FORMULA.sub("", text)) if " " not in name}
+    return {name for name in FIELD.findall(FORMULA.sub("", text)) if " " not in name and name != PAIR}
+
+
+def has_images(moment: Moment) -> bool:
+    """Whether a moment shows its images."""
+    return any(PAIR in FIELD.findall(text) for text in (moment.prose, moment.after))
 
 
 def links_in(text: str) -> tuple[str, ...]:
@@ -115,6 +129,9 @@ def _link(changes: str, state: str, form: Form) -> str:
 
 def _field(words: str, state: str, form: Form) -> str:
     kind, *rest = words.split(" ", 2)
+    if kind == PAIR and not rest:
+        alt = "The query and a reference image with their matches"
+        return f'<img class="pair" src="{escape(form.images(state))}" alt="{alt}" loading="lazy">'
     if not rest:
         return form.number(kind)
     key = rest[0]
@@ -224,40 +241,74 @@ def _lesson_html(lesson: Lesson, forms: Collection[Form], bar: str, onward: str,
         bar=bar,
         onward=onward,
         count=str(len(lesson.moments)),
+        legend=_legend(),
         data=data,
         script=script,
     )
 
 
-def handout_page(lesson: Lesson, numbers: Collection[Mapping[str, str]], pictures: Collection[str]) -> str:
-    """A lesson to be printed: the numbers of each moment's run, and its picture, SVG."""
+@dataclass(frozen=True)
+class Sheet:
+    """What a moment has on paper."""
+
+    numbers: Mapping[str, str]
+    """Of its run."""
+    picture: str
+    """Its scene, SVG."""
+    asked_numbers: Mapping[str, str]
+    """Of the run that is shown until its question is answered."""
+    asked_picture: str
+    """The scene until then."""
+
+
+def handout_page(lesson: Lesson, sheets: Collection[Sheet], images: Callable[[str], str]) -> str:
+    """A lesson to be printed. What is told once a question is answered stands with the answers, on the last pages;
+    ``images`` is as in ``Form``."""
     parts, solutions = [], []
-    for place, (moment, told, picture) in enumerate(zip(lesson.moments, numbers, pictures, strict=True)):
-        form, state = printed(told), moment.state
-        parts.append(f"<section><h2>{place + 1}. {escape(moment.title)}</h2>")
-        parts.append(f'<figure role="img" aria-label="The scene of {escape(moment.title)}">{picture}</figure>')
+    for place, (moment, sheet) in enumerate(zip(lesson.moments, sheets, strict=True), 1):
+        title, state, question = escape(moment.title), moment.state, moment.question
+        form, told = printed(sheet.asked_numbers, images), printed(sheet.numbers, images)
+        parts.append(f"<section><h2>{place}. {title}</h2>{_figure(sheet.asked_picture, title)}")
         parts.append(prose_html(moment.prose, state, form))
-        question = moment.question
+        after = prose_html(moment.after, state, told)
         if question is not None:
             answers = "".join(f"<li>☐ {_inline(answer.text, state, form)}</li>" for answer in question.answers)
             asked = prose_html(question.ask, state, form)
             parts.append(f'<div class="question">{asked}<ol class="answers">{answers}</ol></div>')
             told_why = "".join(
-                f"<li>{'✓' if answer.right else '✗'} <b>{_inline(answer.text, state, form)}.</b> "
-                f"{_inline(answer.shows, state, form)}</li>"
+                f"<li>{'✓' if answer.right else '✗'} <b>{_inline(answer.text, state, told)}.</b> "
+                f"{_inline(answer.shows, state, told)}</li>"
                 for answer in question.answers
             )
-            solutions.append(f'<h3>{place + 1}. {escape(moment.title)}</h3><ul class="answers">{told_why}</ul>')
-        parts.append(f"{prose_html(moment.after, state, form)}</section>")
+            figure = _figure(sheet.picture, title) if moment.before else ""
+            solutions.append(
+                f'<section><h3>{place}. {title}</h3><ul class="answers">{told_why}</ul>{figure}{after}</section>'
+            )
+            after = ""
+        parts.append(f"{after}</section>")
     if solutions:
-        parts.append(f'<section class="solutions"><h2>Answers</h2>{"".join(solutions)}</section>')
+        parts.append(f'<div class="solutions"><h2>Answers</h2>{"".join(solutions)}</div>')
     return _page(
         "handout.html",
         title=escape(lesson.title),
         summary=escape(lesson.summary),
         introduction=prose_html(lesson.introduction, ""),
         sections="".join(parts),
+        legend=_legend(),
     )
+
+
+def _figure(picture: str, title: str) -> str:
+    return f'<figure role="img" aria-label="The scene of {title}">{picture}</figure>'
+
+
+def _legend() -> str:
+    rows = "".join(
+        f'<li><i style="background:{style.css(color)}"></i>{escape(words)}</li>'
+        for color, words in style.LEGEND
+        if color != style.SELECTED
+    )
+    return f'<ul class="legend" aria-label="Colours">{rows}</ul>'
 
 
 def notes_page(lesson: Lesson) -> str:

@@ -89,8 +89,8 @@ class Lesson:
     """Whether it is for the front of a class, and not of the course."""
     picture: int
     """Number of the moment whose picture stands for the lesson, from 0 on."""
-    quoted: tuple[float, ...]
-    """Numbers in the prose that come from the paper or from how things are made, not from a run."""
+    quoted: Mapping[float, str]
+    """Numbers in the text that come from elsewhere than from a run, and where they come from."""
     introduction: str
     """Markdown before the first moment."""
     moments: tuple[Moment, ...]
@@ -130,10 +130,20 @@ def parse_lesson(text: str, name: str, where: str) -> Lesson:
         _get(table, "order", int, where, 1000),
         _get(table, "lecture", bool, where, False),
         picture,
-        tuple(float(number) for number in _get(table, "quoted", list, where, [])),
+        _quoted(_get(table, "quoted", dict, where, {}), where),
         introduction.strip(),
         moments,
     )
+
+
+def _quoted(table: Mapping[str, object], where: str) -> dict[float, str]:
+    found = {}
+    for number, source in table.items():
+        try:
+            found[float(number)] = str(source)
+        except ValueError:
+            raise InputError(f"{where}: quoted has {show(number)}, which is no number.") from None
+    return found
 
 
 def _moment(text: str, where: str) -> Moment:

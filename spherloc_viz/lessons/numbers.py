@@ -14,6 +14,8 @@ from spherloc_viz.gallery.measures import MEASURES
 CONFIDENCE = 0.999
 """For which the samples that are needed are told."""
 LARGE = 10_000.0
+SMALL = 1e-3
+RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 Number = float | str
 
@@ -131,6 +133,9 @@ def number_text(value: Number) -> str:
         return value
     if not isfinite(value):
         return "infinitely many"
+    if value != 0 and not SMALL <= abs(value) < 1e12:
+        digits, _, power = f"{value:.1e}".partition("e")
+        return f"{digits} × 10{str(int(power)).translate(RAISED)}"
     if value == round(value) or abs(value) >= LARGE:
-        return f"{value:,.0f}" if abs(value) < 1e12 else f"{value:.2g}"
+        return f"{value:,.0f}"
     return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"

@@ -47,7 +47,7 @@ def test_a_lesson_is_read(browser: Browser, address: str) -> None:
     slider.fill("0.9")
     expect(cost.locator("[data-number=samples_needed]")).to_have_text("688")
     frame = next(one for one in page.frames if one != page.main_frame)
-    assert "outlier_rate%3D0.9" in frame.url and "step=samples-needed" in frame.url
+    assert "outlier_rate%3D0.9" in frame.url and "step=outcome" in frame.url
     expect(cost.locator(".open a")).to_have_attribute("href", re.compile("outlier_rate%3D0.9"))
     assert errors == []
     context.close()

@@ -83,7 +83,7 @@ class ImagePanel:
         followed = (problem.name, problem.reference_images, kept[list(selected)].tolist())
         if followed != self._followed:
             self._followed, self._wanted = followed, None
-        colors = _colors(picture, len(problem))
+        colors = match_colors(picture, len(problem))
         written = [modified(path) for path in (problem.image, *problem.reference_images) if path is not None]
         drawn = (selected, self._wanted, colors.tobytes(), kept.tobytes(), hidden, written)
         if self._drawn is not None and self._drawn[0] is trace and self._drawn[1] == drawn:
@@ -91,7 +91,7 @@ class ImagePanel:
         self._drawn = (trace, drawn)
         view = match_view(problem, colors, trace.inlier_mask, selected, self._wanted)
         paths = [problem.image] + ([] if view.reference is None else [problem.reference_images[view.reference]])
-        places, height = drawing.arrange([(problem.camera.width, problem.camera.height), *_sizes(problem, view)])
+        places, height = drawing.arrange([(problem.camera.width, problem.camera.height), *image_sizes(problem, view)])
         shares = [place.width / drawing.WIDTH for place in places]
         uris = [photo_uri(path, round(PHOTO_PX * share)) for path, share in zip(paths, shares, strict=True)]
         self._shown = shown = overlay(trace, view, colors, places, selected, kept, uris[0] is not None)
@@ -119,7 +119,7 @@ def _assign(handle: viser.GuiHtmlHandle, html: str) -> None:
         handle.content = html
 
 
-def _colors(picture: Picture, count: int) -> ByteArray:
+def match_colors(picture: Picture, count: int) -> ByteArray:
     """Colours (N, 3) of the matches at a step: those of the map's points."""
     colors = one_color(style.UNDECIDED, count)
     for item in picture.scene:
@@ -128,7 +128,7 @@ def _colors(picture: Picture, count: int) -> ByteArray:
     return colors
 
 
-def _sizes(problem: Problem, view: MatchView) -> list[tuple[float, float]]:
+def image_sizes(problem: Problem, view: MatchView) -> list[tuple[float, float]]:
     """Width and height of the reference image, px."""
     if view.reference is None or problem.reference_pixels is None:
         return []

@@ -4,15 +4,16 @@ import asyncio
 import base64
 import hashlib
 import re
+from collections.abc import Callable
 
 from aiohttp import web
 
 from spherloc.errors import InputError
-from spherloc_viz.app.lesson_file import handout_of, picture
+from spherloc_viz.app.lesson_file import handout_of, images_picture, picture
 from spherloc_viz.app.web.guard import SAFE
 from spherloc_viz.app.web.viewer import SORRY_POLICY, sorry_page
 from spherloc_viz.lessons import lesson_named, lessons
-from spherloc_viz.lessons.html import lesson_page, list_page, notes_page, teacher_page
+from spherloc_viz.lessons.html import IMAGES, lesson_page, list_page, notes_page, teacher_page
 
 LEARN = "/learn"
 PICTURES = f"{LEARN}/pictures/"
@@ -29,7 +30,11 @@ async def learn_answer(request: web.Request) -> web.Response:
     """The list, a lesson, or a picture; who asks has been checked at the door."""
     path = request.path
     if path.startswith(PICTURES):
-        return await _picture(path.removeprefix(PICTURES))
+        name = path.removeprefix(PICTURES)
+        return await _picture(lambda: picture(lesson_named(name)))
+    if path == IMAGES:
+        state = request.query_string
+        return await _picture(lambda: images_picture(state))
     try:
         if path.rstrip("/") == LEARN:
             return _html(list_page(lessons(), PICTURES))
@@ -46,12 +51,11 @@ async def learn_answer(request: web.Request) -> web.Response:
         return _html(sorry_page(str(error)), SORRY_POLICY, 404)
 
 
-async def _picture(name: str) -> web.Response:
-    """The picture that stands for a lesson; one is made at a time."""
+async def _picture(make: Callable[[], str]) -> web.Response:
+    """A picture, SVG; one is made at a time."""
     try:
-        lesson = lesson_named(name)
         async with _one_at_a_time:
-            image = await asyncio.to_thread(picture, lesson)
+            image = await asyncio.to_thread(make)
     except InputError as error:
         return web.Response(status=404, text=f"{error}\n", headers=SAFE)
     headers = SAFE | {"Cache-Control": "max-age=3600"}
