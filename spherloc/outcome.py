@@ -7,6 +7,7 @@ margin, 0 where belief begins; the least of them is the run's score.
 
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -54,7 +55,22 @@ class Judgement:
 
 
 def judge(trace: Trace) -> Judgement:
-    """Judge a run by its pose, its inliers and their covariance; some milliseconds, the same in every call."""
+    """Judge a run by its pose, its inliers and their covariance: some milliseconds, once for a trace."""
+    known = _JUDGED.get(trace)
+    if known is None:
+        known = _JUDGED[trace] = _judge(trace)
+    return known
+
+
+def known_judgement(trace: Trace) -> Judgement | None:
+    """How a run was judged; None if it was not yet."""
+    return _JUDGED.get(trace)
+
+
+_JUDGED: WeakKeyDictionary[Trace, Judgement] = WeakKeyDictionary()
+
+
+def _judge(trace: Trace) -> Judgement:
     if trace.cam_from_map is None:
         return Judgement(Outcome.FAILED, -np.inf, (trace.message,))
     aligned, bound_px = trace.problem.aligned, float(trace.options.bound_px)

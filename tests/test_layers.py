@@ -24,6 +24,7 @@ from spherloc.trace import (
 )
 from spherloc_viz import style
 from spherloc_viz.layers import paint, steps
+from spherloc_viz.layers.outcome import outcome_table
 from spherloc_viz.layers.primitives import Balls, Curve, Label, Mesh, Picture, Points, SceneItem, Segments, Textured
 
 SCENES = sorted(name for name, path in bundled_scenes().items() if 'kind = "synthetic"' in path.read_text())
@@ -227,12 +228,12 @@ def test_the_decision_has_its_reason_and_its_numbers(exact: Trace) -> None:
     ],
 )
 def test_the_certificate_is_in_the_outcome(exact: Trace, certificate: Certificate, said: str, knowable: bool) -> None:
-    picture = at(replace(exact, certificate=certificate), "outcome")
-    rows = dict(picture.tables[-1].rows)
+    trace = replace(exact, certificate=certificate)
+    picture, rows = at(trace, "outcome"), dict(outcome_table(trace).rows)
     assert said in rows["certificate"] and said.lower() in picture.step.caption.lower()
     assert ("warning" in rows) != knowable
     assert ("The answer cannot be known" in picture.step.note) != knowable
-    assert "certificate" not in dict(at(replace(exact, certificate=None), "outcome").tables[-1].rows)
+    assert "certificate" not in dict(outcome_table(replace(exact, certificate=None)).rows)
 
 
 @pytest.mark.parametrize("size", [2, 3, 6])
@@ -402,7 +403,7 @@ def test_standard_deviations_are_those_of_the_covariance(mc: Trace) -> None:
     assert "its error is 0.30° and 3.0 cm RMS." in picture.step.caption
     assert "leans 0.250° from the given gravity, which was trusted to 0.5°" in picture.step.note
     assert "tilt / σ_g" in picture.step.equation
-    assert dict(at(trace, "outcome").tables[-1].rows)["expected error"] == "0.30° and 3.0 cm RMS"
+    assert dict(outcome_table(trace).rows)["expected error"] == "0.30° and 3.0 cm RMS"
 
 
 @pytest.mark.parametrize(("sd", "said"), [(0.0, "is kept"), (np.inf, "was not used")])
@@ -427,4 +428,4 @@ def test_no_pose_and_no_truth_are_said() -> None:
         assert trace.cam_from_map is None
         picture = paint(trace, len(steps(trace)) - 1)
         assert picture.step.title == "No pose" and "cameras/estimate" not in {found.name for found in picture.scene}
-        assert ("outcome", "no pose") in picture.tables[0].rows
+        assert ("outcome", "no pose") in outcome_table(trace).rows

@@ -19,7 +19,7 @@ from spherloc.problem import Problem
 from spherloc.trace import RefinementStage, Trace
 from spherloc_viz import style
 from spherloc_viz.layers import paint, steps
-from spherloc_viz.layers.frame import angle_text, length_text
+from spherloc_viz.layers.frame import angle_text, icosphere, length_text
 from spherloc_viz.layers.primitives import Label, Mesh, Picture, Points, SceneItem, Segments, Textured
 from spherloc_viz.layers.query_image import DIM
 from spherloc_viz.layers.scene import round_length
@@ -72,7 +72,7 @@ def test_the_ellipsoid_is_that_of_the_covariance_by_the_factor_it_states(
     items = last(with_covariance(turned, covariance))
     lines, label = items["uncertainty/ellipsoid"], text(items["uncertainty/sigmas"])
     assert isinstance(lines, Segments) and label.startswith("3 σ")
-    factor = int(label.partition("×")[2] or 1)
+    factor = int(label.partition("drawn ")[2].removesuffix("×") or 1)
     assert factor in FACTORS and (factor > 1) == (size < 3.0)
     assert turned.cam_from_map is not None
     turn = turned.problem.aligned.map_turn
@@ -114,10 +114,10 @@ def test_errors_are_drawn_and_said_as_the_metrics_have_them(turned: Trace) -> No
     assert isinstance(offset, Segments) and isinstance(angle, Segments)
     drawn, error = offset.points[0, 1] - offset.points[0, 0], camera_centre(truth) - camera_centre(estimated)
     degrees, _, rest = text(items["uncertainty/error"]).partition(" · ")
-    length, _, factor = rest.partition(" × ")
+    length, _, factor = rest.partition(", drawn ")
     assert length == length_text(float(np.linalg.norm(error)))
-    np.testing.assert_allclose(drawn, int(factor or 1) * error, atol=1e-9)
-    assert degrees == angle_text(rotation_error_deg(truth, estimated))
+    np.testing.assert_allclose(drawn, int(factor.removesuffix("×") or 1) * error, atol=1e-9)
+    assert degrees == f"error {angle_text(rotation_error_deg(truth, estimated))}"
     ways = angle.points[:2, 1] - angle.points[:2, 0]
     ways /= np.linalg.norm(ways, axis=1)[:, None]
     np.testing.assert_allclose(ways, [estimated[2, :3], truth[2, :3]], atol=1e-9)
@@ -299,3 +299,12 @@ def test_equal_images_have_equal_keys(tmp_path: Path, scene_of: SceneOf) -> None
         if isinstance(item, Textured)
     ]
     assert keys[0] == keys[1] != keys[2]
+
+
+@pytest.mark.parametrize("divisions", [0, 1, 3])
+def test_the_sphere_is_the_one_that_trimesh_makes(divisions: int) -> None:
+    vertices, faces = icosphere(divisions)
+    mesh, known = trimesh.Trimesh(vertices, faces, process=False), trimesh.creation.icosphere(divisions)
+    assert mesh.is_watertight and mesh.is_winding_consistent and len(faces) == len(known.faces)
+    np.testing.assert_allclose(np.linalg.norm(vertices, axis=1), 1.0, atol=1e-12)
+    np.testing.assert_allclose(mesh.volume, known.volume, rtol=1e-12)  # negative if seen from within

@@ -24,6 +24,7 @@ from spherloc.problem import Problem
 from spherloc.trace import Certificate, RefinementStage, Trace
 from spherloc_viz.layers import paint, steps
 from spherloc_viz.layers.key_step import key_step
+from spherloc_viz.layers.outcome import outcome_table
 from spherloc_viz.layers.primitives import Balls, Label, Mesh, Points, Segments, StepHeading, Textured
 from spherloc_viz.recording.content import data
 from spherloc_viz.recording.content.components import LEVEL_OPACITY
@@ -306,7 +307,7 @@ def test_every_step_shows_its_words(trace: Trace, recorded: Recorded) -> None:
             assert legible(" ".join(part.split())) in text
     outcome = unescaped(recorded.array("/outcome", -1, "TextDocument:text")[0])
     assert trace.message in outcome
-    for table in paint(trace, len(steps(trace)) - 1).tables:
+    for table in (*paint(trace, len(steps(trace)) - 1).tables, outcome_table(trace)):
         for row in table.rows:
             assert all(legible(str(cell)) in outcome for cell in row)
 

@@ -291,5 +291,6 @@ def test_a_legend_does_not_stand_before_the_peak(clique_run: Trace, peak: float)
         Curve("arcs", x, np.exp(-np.abs(x - peak)), (1, 2, 3), "step"),
         Curve("truth", np.array([100.0 - peak]), np.array([2.0]), (1, 2, 3), "marker"),
     )
-    picture = replace(paint(clique_run, 0), charts=(Chart("yaw", "Arcs", "yaw", "arcs", curves),))
+    chart = Chart("yaw", "Arcs", "yaw", "arcs", curves)
+    picture = replace(paint(clique_run, 0), draw_charts=lambda: (chart,))
     assert shown_in([picture], panels_of(clique_run)).charts == (("yaw", "Arcs: arcs over yaw", peak > 50.0),)

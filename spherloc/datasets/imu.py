@@ -11,15 +11,18 @@ from array import array
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from spherloc.errors import InputError, show
 from spherloc.formats.text_rows import finite_numbers, rows
 from spherloc.trajectory import NS_PER_S
 from spherloc.types import FloatArray
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 GRAVITY_M_S2 = 9.81
 WINDOW_S = 3.0
@@ -130,6 +133,9 @@ def down_at(samples: ImuSamples, timestamps_ns: NDArray[np.int64]) -> FloatArray
 
 def _down(times_s: FloatArray, rates_rad_s: FloatArray, forces_m_s2: FloatArray, asked_s: FloatArray) -> FloatArray:
     """Down (N, 3) in the unit's frame at times (N,) within one piece (K,) without gaps."""
+    from scipy.signal import fftconvolve  # its import takes most of a second
+    from scipy.spatial.transform import Rotation
+
     steps_s = np.diff(times_s)
     turns = Rotation.from_rotvec(steps_s[:, None] * (rates_rad_s[1:] + rates_rad_s[:-1]) / 2.0)
     steady_from_unit = _accumulated(np.vstack([[0.0, 0.0, 0.0, 1.0], turns.as_quat()]))
@@ -141,8 +147,6 @@ def _down(times_s: FloatArray, rates_rad_s: FloatArray, forces_m_s2: FloatArray,
     reach = int(3.0 * width)
     window = np.exp(-0.5 * (np.arange(-reach, reach + 1) / width) ** 2)
     forces = weights[:, None] * steady_from_unit.apply(forces_m_s2)
-    from scipy.signal import fftconvolve  # its import takes most of a second
-
     # A sum instead of an average: only its direction is asked for, at the ends of the piece too.
     up = fftconvolve(np.pad(forces, ((reach, reach), (0, 0))), window[:, None], mode="valid", axes=0)
     at = np.minimum(np.searchsorted(times_s, asked_s, side="right") - 1, len(times_s) - 1)
@@ -155,8 +159,10 @@ def _down(times_s: FloatArray, rates_rad_s: FloatArray, forces_m_s2: FloatArray,
     return down / np.where(length > 0.0, length, np.nan)
 
 
-def _accumulated(quaternions: FloatArray) -> Rotation:
+def _accumulated(quaternions: FloatArray) -> "Rotation":
     """Products of the first k rotations, for every k: pairs, then pairs of pairs, so that numpy does the work."""
+    from scipy.spatial.transform import Rotation
+
     product = Rotation.from_quat(quaternions)
     reach = 1
     while reach < len(quaternions):

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from spherloc.cameras.base import Camera
 from spherloc.cameras.calibration import load_camera
@@ -263,6 +262,8 @@ def unwrapped(points: FloatArray, motion: FloatArray) -> FloatArray:
     beside the vehicle, where the fisheyes look, is off by a quarter of a metre. The scanner turns clockwise, so that
     a return at the azimuth a > 0 is a / 2 pi turns old.
     """
+    from scipy.spatial.transform import Rotation  # takes a quarter of a second
+
     turns = np.arctan2(points[:, 1], points[:, 0])[:, None] / (2.0 * np.pi)
     rotation_vector = Rotation.from_matrix(motion[:3, :3]).as_rotvec()
     return Rotation.from_rotvec(turns * rotation_vector).apply(points) + turns * motion[:3, 3]

@@ -18,6 +18,7 @@ from spherloc_viz.app.plots.yaw_view import YawView
 from spherloc_viz.app.run_request import Run
 from spherloc_viz.app.text import legend_html, opening_card_html, opening_html, summary_html, table_html
 from spherloc_viz.app.web.touch import READY, Touch, Touches
+from spherloc_viz.app.web.viser_internals import update_widget
 from spherloc_viz.layers import graph_begins, steps
 from spherloc_viz.layers.primitives import Picture, Table
 
@@ -108,8 +109,7 @@ class LeftPanels:
             summary, ending = opening_html(self._opening), f'<div style="opacity:.35">{ending}</div>'
         front = front_html(picture.step.stage, picture.step.key)
         for widget, html in ((self._front, front), (self._summary, summary), (self._outcome, ending)):
-            if widget.content != html:
-                widget.content = html
+            update_widget(widget, content=html)
         if not self._introduction.content:
             self._introduction.content = introduction_html(steps(run.trace))
 
@@ -145,8 +145,7 @@ class LeftPanels:
 
     def diagnose(self, html: str) -> None:
         """Show what the diagnosis says by now."""
-        if self._diagnosis.content != html:
-            self._diagnosis.content = html
+        update_widget(self._diagnosis, content=html)
 
 
 PROJECTOR_SHARE = 0.4

@@ -11,6 +11,7 @@ import viser
 from spherloc.datasets.map_scene import MapScene
 from spherloc.datasets.synthetic import TrueCamera
 from spherloc.diagnosis import Diagnosis
+from spherloc.outcome import known_judgement
 from spherloc.trace import Trace
 from spherloc_viz.app.controls.controls import DisplayControls
 from spherloc_viz.app.left_panels import LeftPanels
@@ -22,7 +23,7 @@ from spherloc_viz.app.text import diagnosis_html, hidden_html, status_html
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.web.viser_internals import changes_of, set_theme
 from spherloc_viz.layers import paint, steps, with_alternative
-from spherloc_viz.layers.outcome import outcome_table
+from spherloc_viz.layers.outcome import early_table
 from spherloc_viz.layers.primitives import Picture, SceneItem
 from spherloc_viz.layers.selection import with_selection
 
@@ -166,7 +167,7 @@ class RunDisplay:
                 controls.draw(known, diagnosis, hidden)
             # The other views tell inliers by the colours of the picture as it was.
             told = replace(picture, step=drawn.step)
-            outcome = outcome_table(trace)
+            outcome = early_table(trace, known_judgement(known.trace))
             offered = hidden_html(withheld, not presenter) if withheld else ""
             self.panels.draw(blank if early else run, told, pause is not None, outcome, selected, early, offered)
             waiting = "" if hidden else status_html("Diagnosing …")

@@ -17,6 +17,7 @@ from spherloc.datasets.synthetic import TrueCamera
 from spherloc.diagnosis import Diagnosis, diagnose
 from spherloc.errors import InputError, SpherlocError
 from spherloc.estimators import default_options, estimate
+from spherloc.outcome import judge
 from spherloc.problem import Problem
 from spherloc.trace import Trace
 from spherloc.types import FloatArray
@@ -38,7 +39,7 @@ from spherloc_viz.app.services import Services
 from spherloc_viz.app.stage.canvas import panel_widths_px
 from spherloc_viz.app.status import Notices, Status
 from spherloc_viz.app.web.touch import READY, Touch, Touches
-from spherloc_viz.app.web.viser_internals import follow_changes, guard_callbacks
+from spherloc_viz.app.web.viser_internals import follow_changes, guard_callbacks, update_widget
 from spherloc_viz.app.workers import Job, LatestWorker
 from spherloc_viz.layers import steps
 from spherloc_viz.lessons.numbers import number_text, numbers_of
@@ -46,7 +47,7 @@ from spherloc_viz.lessons.numbers import number_text, numbers_of
 QUIET_S = 0.7
 """Runs count as settled, and are recorded, when nothing has changed for this long."""
 VIEWER_STILL_S = 0.3
-"""The address follows the viewer when it has not moved for this long."""
+"""The address follows the page when nothing was drawn and the viewer has not moved for this long."""
 DIAGNOSE_AFTER_S = 0.2
 """A diagnosis costs more than many a run, so it waits until the picture has stood still for this long."""
 T = TypeVar("T")
@@ -414,7 +415,9 @@ class Session:
         diagnosis = self._diagnosis(run)
         self._services.presented.hide(run, self._display.withheld(run))
         pause = self._display.draw(run, self._mesh(run), diagnosis, self._edits.places(run.kept), asked, answers)
-        self._write_address(run)
+        if self._in_lesson:
+            self._write_address(run)
+        self._viewer.ask()
         if diagnosis is None:
             self._diagnoser.ask()
         return pause
@@ -425,8 +428,7 @@ class Session:
         recording = opened.recorded.row.file if opened is not None and opened.request == run.request else None
         link = link_of(run, self._view(), self._catalog, self._services.catalog.scenes, self._roots, recording)
         html = address_html(link, self._name, self._followed, self._told_numbers(run.trace))
-        if self._address.content != html:
-            self._address.content = html
+        update_widget(self._address, content=html)
 
     def _told_numbers(self, trace: Trace) -> dict[str, str] | None:
         """The run's numbers for a lesson, if there is one around the page."""
@@ -452,6 +454,7 @@ class Session:
             return None
         if asked:
             return DIAGNOSE_AFTER_S
+        judge(run.trace)
         self._diagnosed = run.trace, diagnose(run.trace)
         self._services.presented.diagnose(*self._diagnosed)
         self._page.ask()

@@ -8,6 +8,7 @@ import viser
 from spherloc.errors import SpherlocError
 from spherloc_viz.app.review.filters import keep_html
 from spherloc_viz.app.text import status_html
+from spherloc_viz.app.web.viser_internals import update_widget
 
 log = logging.getLogger(__name__)
 
@@ -24,8 +25,7 @@ class Status:
     def say(self, sentence: str, keep: str = "") -> None:
         """Say what goes on; ``keep`` is the file of a recording that may be kept."""
         html = _line_html(sentence, keep=keep)
-        if self._line.content != html:
-            self._line.content = html
+        update_widget(self._line, content=html)
 
     def complain(self, sentence: str) -> None:
         """Say in one sentence what went wrong; the page keeps its last run and stays usable."""

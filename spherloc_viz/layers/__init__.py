@@ -30,7 +30,6 @@ from spherloc_viz.layers import (
     yaw,
 )
 from spherloc_viz.layers.frame import Plan, RunView, focus_of
-from spherloc_viz.layers.outcome import outcome_table
 from spherloc_viz.layers.primitives import Chart, Graph, Picture, Step, StepHeading
 from spherloc_viz.layers.scene import base_items, camera
 
@@ -73,6 +72,13 @@ class _Timeline:
                     raise
                 self.graphs[draw] = None
         return self.graphs[draw]
+
+    def charts_at(self, index: int) -> tuple[Chart, ...]:
+        """The charts as of a step."""
+        named: dict[str, Callable[[], Chart]] = {}
+        for plan in self.plans[: index + 1]:
+            named.update(plan.charts)
+        return tuple(chart for chart in map(self.chart, named.values()) if chart is not None)
 
     def chart(self, draw: Callable[[], Chart]) -> Chart | None:
         """The chart that ``draw`` makes, made once; None where that fails on the numbers of an extension."""
@@ -130,14 +136,10 @@ def paint(trace: Trace, index: int) -> Picture:
     """What the step at ``index`` looks like. Charts of earlier steps stay."""
     timeline = _timeline(trace)
     heading, frame = timeline.headings[index], timeline.plans[index].draw()
-    charts: dict[str, Callable[[], Chart]] = {}
-    for plan in timeline.plans[: index + 1]:
-        charts.update(plan.charts)
-    tables = (*frame.tables, outcome_table(trace)) if index == len(timeline.plans) - 1 else frame.tables
     step = Step(heading.key, heading.title, frame.caption, frame.equation, frame.note, heading.stage)
     scene = base_items(timeline.view, frame) + frame.items
-    drawn = tuple(chart for chart in map(timeline.chart, charts.values()) if chart is not None)
-    return Picture(step, scene, drawn, tables, focus_of(timeline.view, frame), timeline.graph(index))
+    focus = focus_of(timeline.view, frame)
+    return Picture(step, scene, frame.tables, focus, partial(timeline.charts_at, index), partial(timeline.graph, index))
 
 
 def with_alternative(picture: Picture, trace: Trace, cam_from_map: FloatArray) -> Picture:

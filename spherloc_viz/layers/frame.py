@@ -6,7 +6,8 @@ drawn when it is looked at.
 
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cache, cached_property
+from itertools import combinations
 from typing import Any, TypeVar
 
 import numpy as np
@@ -198,6 +199,30 @@ def one_color(color: style.RGB, count: int) -> ByteArray:
     return out
 
 
+@cache
+def icosphere(divisions: int) -> tuple[FloatArray, NDArray[np.int64]]:
+    """The unit sphere: vertices (10 · 4^n + 2, 3) and faces (20 · 4^n, 3), seen from outside, of an icosahedron whose
+    faces were divided into four n times. (trimesh has one, and takes a second to import.)"""
+    golden = (1.0 + np.sqrt(5.0)) / 2.0
+    corners = np.array([[0.0, a, b * golden] for a in (-1.0, 1.0) for b in (-1.0, 1.0)])
+    vertices = np.concatenate([np.roll(corners, shift, axis=1) for shift in range(3)])
+    near = np.isclose(np.linalg.norm(vertices[:, None] - vertices, axis=2), 2.0)
+    faces = np.array([face for face in combinations(range(12), 3) if near[np.ix_(face, face)].sum() == 6])
+    inward = np.linalg.det(vertices[faces]) < 0.0
+    faces[inward] = faces[inward][:, ::-1]
+    vertices /= np.linalg.norm(vertices[0])
+    for _ in range(divisions):
+        sides = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        edges, middle = np.unique(sides, axis=0, return_inverse=True)
+        ab, bc, ca = (len(vertices) + middle.reshape(-1, 3)).T
+        a, b, c = faces.T
+        middles = vertices[edges].sum(axis=1)
+        vertices = np.concatenate([vertices, middles / np.linalg.norm(middles, axis=1, keepdims=True)])
+        parts = (a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)
+        faces = np.concatenate([np.stack(part, axis=1) for part in parts])
+    return vertices, faces
+
+
 def even(indices: np.ndarray, count: int) -> np.ndarray:
     """At most ``count`` of the indices, evenly spaced."""
     if len(indices) <= count:
@@ -267,6 +292,8 @@ RING_ROOM = 3.0
 """Radius of the yaw ring with its outline, in sphere radii."""
 CAMERA_ROOM = 2.0
 """Radius of what is framed around a camera, in sphere radii."""
+FEW_SEEN = 10
+"""From this many points on, they tell where a camera is."""
 FEW_BALLS = 3
 """Up to so many balls are framed whole."""
 
@@ -291,9 +318,13 @@ def ring_focus(view: RunView, *more: FloatArray) -> Focus:
     return Focus("Sphere", np.vstack([ring, *more]) if more else ring, ring)
 
 
-def map_focus(view: RunView, cam_from_map: FloatArray) -> Focus:
-    """The map without its strays, the true camera, and a camera at a pose (3, 4)."""
-    dense = view.kept("dense map", None, lambda: dense_points(view.points))
+def map_focus(view: RunView, cam_from_map: FloatArray, seen: BoolArray | None = None) -> Focus:
+    """The map without its strays, the true camera, and a camera at a pose (3, 4); of the map those of a mask (N,), if
+    these are enough to tell where the camera is in it: a street is much longer than what is seen of it."""
+    if seen is not None and np.count_nonzero(seen) >= FEW_SEEN:
+        dense = dense_points(view.points[seen])
+    else:
+        dense = view.kept("dense map", None, lambda: dense_points(view.points))
     cameras = [cam_from_map] if view.truth is None else [cam_from_map, view.truth]
     boxes = [sphere_box(camera_centre(pose), CAMERA_ROOM * view.sphere_m) for pose in cameras]
     return Focus("Overview", np.vstack([dense, *boxes]), dense)

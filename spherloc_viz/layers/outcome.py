@@ -4,7 +4,7 @@ import numpy as np
 
 from spherloc.geometry import camera_centre
 from spherloc.metrics import SUCCESS_M, evaluate
-from spherloc.outcome import judge
+from spherloc.outcome import Judgement, judge
 from spherloc.trace import Certificate, RefinementStage, Trace
 from spherloc_viz import style
 from spherloc_viz.layers import uncertainty
@@ -88,6 +88,7 @@ def _pose(view: RunView, cam_from_map: np.ndarray) -> Frame:
         trace.inlier_mask,
         note=f"{chances} {remark}".strip(),
         located=True,
+        focus=map_focus(view, cam_from_map, trace.inlier_mask),
     )
 
 
@@ -98,12 +99,16 @@ def _certified(certificate: Certificate) -> tuple[str, str]:
 
 
 def outcome_table(trace: Trace) -> Table:
-    """Pose, errors, scores and times of a run."""
+    """Pose, errors, scores and times of a run, and how it is judged without the truth."""
+    return early_table(trace, judge(trace))
+
+
+def early_table(trace: Trace, judged: Judgement | None) -> Table:
+    """The same with what is known of the judgement by now, since to judge takes longer than many a run."""
     metrics = evaluate(trace)
     rows: list[tuple[str, str]] = [("estimator", trace.estimator), ("outcome", verdict(trace, metrics.success))]
     if trace.cam_from_map is not None:
-        judged = judge(trace)
-        rows.append(("without the truth", " ".join((f"{judged.outcome}{':' * bool(judged.reasons)}", *judged.reasons))))
+        rows.append(("without the truth", "…" if judged is None else _judged(judged)))
         rows.append(("camera position", place_text(camera_centre(trace.cam_from_map), 3, trace.problem.metric)))
     if metrics.rotation_error_deg is not None and metrics.translation_error_m is not None:
         rows.append(("rotation error", f"{metrics.rotation_error_deg:.3f}°"))
@@ -120,6 +125,10 @@ def outcome_table(trace: Trace) -> Table:
     stages = ", ".join(f"{name} {value:.1f}" for name, value in trace.timings_ms.items() if name != "total")
     rows.append(("time", f"{trace.timings_ms['total']:.1f} ms" + (f" ({stages})" if stages else "")))
     return Table("outcome", ("", "this run"), tuple(rows))
+
+
+def _judged(judged: Judgement) -> str:
+    return " ".join((f"{judged.outcome}{':' * bool(judged.reasons)}", *judged.reasons))
 
 
 def _certificate_rows(certificate: Certificate) -> list[tuple[str, str]]:

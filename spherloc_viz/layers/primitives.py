@@ -246,8 +246,18 @@ class Picture:
 
     step: Step
     scene: tuple[SceneItem, ...]
-    charts: tuple[Chart, ...]
     tables: tuple[Table, ...]
     focus: Focus
-    graph: Graph | None = None
-    """What is known of the run's graph by this step; None before there is one."""
+    draw_charts: Callable[[], tuple[Chart, ...]] = tuple
+    """Charts and the graph are drawn when somebody looks at them."""
+    draw_graph: Callable[[], Graph | None] = lambda: None
+
+    @property
+    def charts(self) -> tuple[Chart, ...]:
+        """Plots of this step and of those before it."""
+        return self.draw_charts()
+
+    @property
+    def graph(self) -> Graph | None:
+        """What is known of the run's graph by this step; None before there is one."""
+        return self.draw_graph()

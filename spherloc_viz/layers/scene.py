@@ -14,7 +14,7 @@ from spherloc.geometry import camera_centre
 from spherloc.problem import Problem
 from spherloc.types import ByteArray, FloatArray
 from spherloc_viz import style
-from spherloc_viz.layers.frame import Frame, RunView, one_color
+from spherloc_viz.layers.frame import Frame, RunView, icosphere, one_color
 from spherloc_viz.layers.primitives import Label, Mesh, Points, SceneItem, Segments, Textured
 from spherloc_viz.layers.query_image import modified, sphere_texture
 from spherloc_viz.layers.uncertainty import error_items
@@ -90,12 +90,8 @@ COVERAGE = Equirectangular(512, 256)
 """At these pixels of the image on the sphere the camera is asked what it sees."""
 
 
-@cache
-def _icosphere() -> tuple[np.ndarray, np.ndarray]:
-    import trimesh  # takes half a second
-
-    mesh = trimesh.creation.icosphere(subdivisions=3)
-    return np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
+FINE = 3
+"""How often the faces of the sphere are divided."""
 
 
 def base_items(view: RunView, frame: Frame) -> tuple[SceneItem, ...]:
@@ -148,7 +144,7 @@ def _placed_sphere(view: RunView, frame: Frame) -> tuple[list[SceneItem], FloatA
     """The sphere with the query image, and the places (A, 3) of the bearings on it."""
     rotation, problem = frame.cam_from_map[:, :3], view.trace.problem
     centre = camera_centre(view.standing(rotation) if frame.sphere_aside else frame.cam_from_map)
-    vertices, faces = _icosphere()
+    vertices, faces = icosphere(FINE)
     radius_m = view.sphere_m if problem.image is None else UNDER_IMAGE * view.sphere_m
     surface = Mesh("sphere/surface", "sphere", centre + radius_m * vertices, faces, style.SPHERE, 0.25)
     image = [] if problem.image is None else [_image(problem, centre, view.sphere_m * rotation.T)]

@@ -140,7 +140,9 @@ class BallSet:
         """Some balls, the smallest first, their centres and their overlaps; those of a mask (M,) in their colour."""
         stage, drawn = self.stage, self.drawn(shown, inside)
         items: list[SceneItem] = [self._edges(drawn, inside, color)]
-        dot_m = min(0.02 * view.sphere_m, 0.1 * float(np.median(stage.radii_m)))
+        looked_at = drawn[inside[drawn]] if inside[drawn].any() else drawn
+        # Else the centres of all would hide the few small balls that a step is about.
+        dot_m = min(0.02 * view.sphere_m, 0.1 * float(np.median(stage.radii_m[looked_at])))
         faint = next(opacity for most, opacity in OPACITIES if len(drawn) <= most)
         groups = (("balls/others", ~inside, style.UNDECIDED, faint), ("balls/clique", inside, color, 1.6 * faint))
         for name, members, shade, opacity in groups:

@@ -11,7 +11,7 @@ from spherloc_viz import style
 from spherloc_viz.app.glossary import linked
 from spherloc_viz.app.introduction import opening_step
 from spherloc_viz.app.text import box, step_html, table_html
-from spherloc_viz.app.web.viser_internals import at_once, put
+from spherloc_viz.app.web.viser_internals import at_once, put, update_widget
 from spherloc_viz.layers.primitives import Step, StepHeading, Table
 
 PLAY_S = 3.0
@@ -105,8 +105,7 @@ class StepsPanel:
             (self._text, step_html(step, linked) + "".join(table_html(table) for table in tables)),
         )
         for widget, html in texts:
-            if widget.content != html:
-                widget.content = html
+            update_widget(widget, content=html)
 
     def go(self, key: str) -> None:
         """Go to the step of that key, or to the nearest there is."""

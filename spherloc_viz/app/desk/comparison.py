@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
-from scipy import stats
 
 from spherloc.errors import InputError, show
 from spherloc_viz.recording.run_row import RunRow
@@ -105,6 +104,8 @@ def compare(before: Sequence[RunRow], after: Sequence[RunRow]) -> Comparison:
 
 def compare_pairs(pairs: tuple[Pair, ...], only_before: int = 0, only_after: int = 0) -> Comparison:
     """Test what has changed in pairs that are known; the counts are of runs without a partner."""
+    from scipy import stats  # takes most of a second
+
     judged = [(pair, is_right(pair.before), is_right(pair.after)) for pair in pairs]
     known = [(pair, was, now) for pair, was, now in judged if was is not None and now is not None]
     broken = tuple(pair for pair, was, now in known if was and not now)
@@ -137,6 +138,8 @@ def _paired(before: Sequence[RunRow], after: Sequence[RunRow]) -> tuple[Pair, ..
 
 
 def _change(name: str, pairs: Sequence[Pair]) -> Change:
+    from scipy import stats  # takes most of a second
+
     values = [(getattr(pair.before, name), getattr(pair.after, name)) for pair in pairs]
     known = np.array([pair for pair in values if None not in pair], dtype=np.float64).reshape(-1, 2)
     if not len(known):

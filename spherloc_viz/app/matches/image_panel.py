@@ -20,6 +20,7 @@ from spherloc_viz.app.matches.match_drawing import Overlay, overlay
 from spherloc_viz.app.matches.match_table import chips_html
 from spherloc_viz.app.text import box, status_html
 from spherloc_viz.app.web.touch import Touch, Touches
+from spherloc_viz.app.web.viser_internals import update_widget
 from spherloc_viz.layers.frame import one_color
 from spherloc_viz.layers.matches import MatchView, match_view
 from spherloc_viz.layers.primitives import Picture, Points
@@ -115,8 +116,7 @@ class ImagePanel:
 
 
 def _assign(handle: viser.GuiHtmlHandle, html: str) -> None:
-    if handle.content != html:
-        handle.content = html
+    update_widget(handle, content=html)
 
 
 def match_colors(picture: Picture, count: int) -> ByteArray:

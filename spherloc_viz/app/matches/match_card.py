@@ -15,6 +15,7 @@ from spherloc_viz import style
 from spherloc_viz.app.matches.image_panel import jpeg_uri
 from spherloc_viz.app.matches.match_table import chip
 from spherloc_viz.app.text import DIM, box, table_html
+from spherloc_viz.app.web.viser_internals import update_widget
 from spherloc_viz.layers.explanation import Explanation, Pairs, explain
 from spherloc_viz.layers.primitives import Table
 from spherloc_viz.layers.query_image import photograph
@@ -126,8 +127,7 @@ class MatchCard:
         if self._more.visible != bool(details):
             self._more.visible = bool(details)
         for element, content in ((self._html, html), (self._details, details)):
-            if element.content != content:
-                element.content = content
+            update_widget(element, content=content)
 
 
 def one_html(trace: Trace, what: Explanation, kept: NDArray, editable: bool) -> str:

@@ -14,6 +14,7 @@ from spherloc.types import BoolArray, IntArray
 from spherloc_viz import style
 from spherloc_viz.app.text import DIM, WITHHELD, box, status_html
 from spherloc_viz.app.web.touch import Touch, Touches
+from spherloc_viz.app.web.viser_internals import update_widget
 from spherloc_viz.layers.matches import FILTERS, SORTS, MatchRows, match_rows, order, reference_votes
 
 MAX_REFERENCES = 8
@@ -96,8 +97,7 @@ class MatchTable:
         """
         if hidden:
             self._drawn = None
-            if self._html.content != status_html(WITHHELD):
-                self._html.content = status_html(WITHHELD)
+            update_widget(self._html, content=status_html(WITHHELD))
             return
         drawn = (trace, selected, kept.tobytes(), self._look)
         if self._drawn is not None and self._drawn[0] is trace and self._drawn[1:] == drawn[1:]:
@@ -112,8 +112,7 @@ class MatchTable:
         self._look = look = replace(look, page=page)
         self._drawn = (*drawn[:3], look)
         html = table_html(rows, listed, look, frozenset(selected), kept)
-        if self._html.content != html:
-            self._html.content = html
+        update_widget(self._html, content=html)
 
     def _sort(self, touch: Touch) -> None:
         if touch.argument in SORTS:

@@ -16,7 +16,7 @@ from spherloc_viz.app.panels.folders import Listing, Roots, Row, describe
 from spherloc_viz.app.panels.uploads import MAX_BYTES, MAX_CALIBRATION_BYTES, File, Form, Scratch, open_upload
 from spherloc_viz.app.text import DIM, box, status_html
 from spherloc_viz.app.web.touch import Touch, Touches
-from spherloc_viz.app.web.viser_internals import limit_uploads
+from spherloc_viz.app.web.viser_internals import limit_uploads, update_widget
 from spherloc_viz.app.workers import BackgroundWorker
 
 RULE = "border-top:1px solid rgba(128,140,160,.22)"
@@ -253,8 +253,7 @@ class OpenPanel:
             self._list.content = self._list_html(None)
             raise
         html = self._list_html(listing)
-        if self._list.content != html:
-            self._list.content = html
+        update_widget(self._list, content=html)
 
     def _list_html(self, listing: Listing | None) -> str:
         recent, remark = self._recent.read()

@@ -10,6 +10,7 @@ from spherloc.types import FloatArray
 from spherloc_viz.app.plots import shapes
 from spherloc_viz.app.plots.shapes import MINUS, Scale, round_ticks, tick_texts
 from spherloc_viz.app.text import box
+from spherloc_viz.app.web.viser_internals import update_widget
 from spherloc_viz.layers.primitives import Chart, Curve
 
 WIDTH_PX, HEIGHT_PX = 380.0, 180.0
@@ -226,8 +227,7 @@ class ChartPanel:
             return
         self._shown = charts
         content = "".join(map(chart_html, charts)) or box(escape(NONE_YET))
-        if content != self._html.content:
-            self._html.content = content
+        update_widget(self._html, content=content)
 
 
 def chart_html(chart: Chart) -> str:

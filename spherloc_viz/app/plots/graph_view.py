@@ -15,6 +15,7 @@ from spherloc_viz.app.glossary import help_html, linked
 from spherloc_viz.app.plots import shapes
 from spherloc_viz.app.text import box
 from spherloc_viz.app.web.touch import Touch, Touches
+from spherloc_viz.app.web.viser_internals import update_widget
 from spherloc_viz.layers.frame import even
 from spherloc_viz.layers.primitives import Graph
 
@@ -199,8 +200,7 @@ class GraphView:
             return
         self._drawn, self._graph = drawn, graph
         content = _waiting_html(begins) if graph is None else graph_html(graph, selected, kept)
-        if content != self._html.content:
-            self._html.content = content
+        update_widget(self._html, content=content)
 
     def _press(self, touch: Touch) -> None:
         graph = self._graph

@@ -17,6 +17,7 @@ from spherloc_viz.app.plots.charts import chart_html, curve_parts
 from spherloc_viz.app.plots.shapes import Scale, decade_ticks, round_ticks, tick_texts
 from spherloc_viz.app.text import DIM, WITHHELD, box, dot_html, status_html, table_html
 from spherloc_viz.app.web.touch import Touch, Touches
+from spherloc_viz.app.web.viser_internals import update_widget
 from spherloc_viz.layers.primitives import Chart, Curve
 from spherloc_viz.layers.residuals import (
     Histogram,
@@ -179,8 +180,7 @@ class ResidualView:
         """
         if hidden:
             self._known, self._drawn, self._bins = None, None, {}
-            if self._html.content != status_html(WITHHELD):
-                self._html.content = status_html(WITHHELD)
+            update_widget(self._html, content=status_html(WITHHELD))
             return
         if self._known is None or self._known[0] is not trace:
             residuals, history = residuals_of(trace), history_of(trace)
@@ -193,8 +193,7 @@ class ResidualView:
         content = fall + _residuals_html(residuals, selected) + scores + history_html
         # A press on what was on the page a moment ago selects what is in that bin now.
         self._bins = bins
-        if content != self._html.content:
-            self._html.content = content
+        update_widget(self._html, content=content)
         self._drawn = selected, cost
 
     def _press(self, touch: Touch) -> None:

@@ -18,7 +18,7 @@ from spherloc_viz.app.plots.charts import curve_parts
 from spherloc_viz.app.plots.shapes import MINUS, Scale, round_ticks, tick_texts, wrapped_deg
 from spherloc_viz.app.text import box
 from spherloc_viz.app.web.touch import Touch, Touches
-from spherloc_viz.app.web.viser_internals import at_once
+from spherloc_viz.app.web.viser_internals import at_once, update_widget
 from spherloc_viz.layers.primitives import Curve
 from spherloc_viz.layers.yaw_story import (
     ALL,
@@ -318,8 +318,7 @@ class YawView:
             f"{yaw_svg(story, bars, window, kept, shown_key)}"
             f'<div style="font-size:12px;opacity:.7;padding-top:.3em">{note}</div>'
         )
-        if content != self._html.content:
-            self._html.content = content
+        update_widget(self._html, content=content)
         self._drawn = drawn
 
     def _story(self, trace: Trace) -> YawStory:

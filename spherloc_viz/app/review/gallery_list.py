@@ -12,6 +12,7 @@ from spherloc_viz.app.review.rows import OPENED, RULE, picture_html
 from spherloc_viz.app.review.run_library import RunLibrary
 from spherloc_viz.app.text import DIM, box, status_html
 from spherloc_viz.app.web.touch import Touch, Touches
+from spherloc_viz.app.web.viser_internals import update_widget
 from spherloc_viz.app.workers import BackgroundWorker
 from spherloc_viz.gallery import GalleryCase, Play, gallery_cases, staged_path
 from spherloc_viz.recording.replay import Reopened
@@ -85,8 +86,7 @@ class GalleryList:
 
     def _draw(self) -> None:
         html = gallery_html(gallery_cases(), self._rows(), self._opened)
-        if self._html.content != html:
-            self._html.content = html
+        update_widget(self._html, content=html)
 
     def _fail(self, sentence: str) -> None:
         self._html.content = status_html(sentence[:1].upper() + sentence[1:], wrong=True)

@@ -13,7 +13,7 @@ from spherloc_viz.app.review.filters import pill
 from spherloc_viz.app.review.run_library import RunLibrary
 from spherloc_viz.app.text import box
 from spherloc_viz.app.web.touch import Touch, Touches
-from spherloc_viz.app.web.viser_internals import at_once, changes_of, put
+from spherloc_viz.app.web.viser_internals import at_once, changes_of, put, update_widget
 from spherloc_viz.app.workers import BackgroundWorker
 from spherloc_viz.recording.reviews import Review, checked_review
 from spherloc_viz.recording.run_row import RunRow
@@ -134,8 +134,7 @@ class Notes:
     def _draw(self, offered: tuple[str, ...], own: tuple[str, ...]) -> None:
         chips = "".join(pill(escape(label), f"run-label:{label}", label in own, label) for label in offered)
         html = box(f'<div style="display:flex;flex-wrap:wrap;gap:.3em">{chips}</div>', "font-size:12px")
-        if self._chips.content != html:
-            self._chips.content = html
+        update_widget(self._chips, content=html)
         self._offers = bool(offered)
         self._chips.visible = self._offers and not self._hidden
 

@@ -17,6 +17,7 @@ from spherloc_viz.app.review.run_library import RunLibrary
 from spherloc_viz.app.review.run_list import RunList
 from spherloc_viz.app.run_request import Run, RunRequest
 from spherloc_viz.app.web.touch import Touch, Touches
+from spherloc_viz.app.web.viser_internals import update_widget
 from spherloc_viz.app.workers import BackgroundWorker
 from spherloc_viz.layers.primitives import SceneItem
 from spherloc_viz.recording.replay import Reopened, reopen
@@ -76,8 +77,7 @@ class ReviewCard:
         if opened is not None:
             bar = bar_html(*self._where) + said_html(*self._said)
             html = untold_html(opened, run, bar) if hidden else card_html(opened, run, diagnosis, bar)
-        if self._html.content != html:
-            self._html.content = html
+        update_widget(self._html, content=html)
         self._html.visible = bool(html)
 
     def items(self, run: Run) -> tuple[SceneItem, ...]:

@@ -15,7 +15,7 @@ from spherloc_viz.app.review.rows import rows_html
 from spherloc_viz.app.review.run_library import RunLibrary
 from spherloc_viz.app.text import DIM, box, status_html
 from spherloc_viz.app.web.touch import Touch, Touches
-from spherloc_viz.app.web.viser_internals import put
+from spherloc_viz.app.web.viser_internals import put, update_widget
 from spherloc_viz.app.workers import BackgroundWorker
 from spherloc_viz.recording.index.query import MAX_TEXT
 
@@ -185,8 +185,7 @@ class RunList:
             (self._bar, bar_html(marked)),
         )
         for widget, html in parts:
-            if widget.content != html:
-                widget.content = html
+            update_widget(widget, content=html)
         self._problem.visible = False
         self._show_parts()
         self._drawn()

@@ -52,7 +52,8 @@ class Canvas:
         """
         client.scene.set_up_direction("-y")
         self._client, self._display = client, display
-        self._painter = Painter(client, picked, LABEL_SCALE * text_scale(client.camera.image_width))
+        self._label_scale = LABEL_SCALE * text_scale(client.camera.image_width)
+        self._painter = Painter(client, picked, self._label_scale)
         self._camera = TrueCamera(client, moved)
         self._docked_px, self._full_width = docked_px, client.camera.image_width
         self._step: tuple[str, str] | None = None
@@ -142,13 +143,29 @@ class Canvas:
             return
         if picture is None:
             return
-        in_the_way = views.before_the_eyes(picture, position)
+        in_the_way = views.before_the_eyes(picture, position) | self._cut(picture, position)
         eye = position if views.inside(picture, position) else None
         # Not to wait for a picture that is being drawn each time that the viewer moves.
         if in_the_way != self._painter.hidden or (eye is None) != (self._painter.eye is None):
             with self._lock:
                 self._painter.hide(in_the_way)
                 self._painter.see_from(eye)
+
+    def _cut(self, picture: Picture, position: np.ndarray) -> frozenset[str]:
+        """Names of the words that the canvas' edge would cut for a viewer at that position (3,)."""
+        camera = self._client.camera
+        try:
+            target, angle = np.array(camera.look_at, dtype=np.float64).reshape(3), float(camera.fov)
+        except (TypeError, ValueError):
+            return frozenset()
+        away = target - position
+        if not (0.0 < angle < np.pi and 0.0 < np.hypot(away[0], away[2]) < np.inf):  # a page may say anything
+            return frozenset()
+        return views.cut(picture, views.View(position, target, angle), self._aspect(), self._letter())
+
+    def _letter(self) -> float:
+        """Width of a letter in the canvas, by half its height."""
+        return views.LETTER_PX * self._label_scale / (0.5 * max(1, min(self._client.camera.image_height, MOST_PX)))
 
     @property
     def clicked_left(self) -> bool:
@@ -193,7 +210,7 @@ class Canvas:
         """
         aspect = self._aspect()
         if other_step:
-            view = views.follow(picture, aspect, self._walls)
+            view = views.follow(picture, aspect, self._walls, self._letter())
             if self._followed is None or not views.same(view, self._followed):
                 self._take(None, view, aspect)
         elif self._looked is not None:
@@ -210,7 +227,11 @@ class Canvas:
         """Take the view of that name, or the one of the step."""
         aspect = self._aspect()
         walls = self._walls
-        wanted = views.follow(picture, aspect, walls) if name is None else views.find(name, picture, aspect, walls)
+        wanted = (
+            views.follow(picture, aspect, walls, self._letter())
+            if name is None
+            else views.find(name, picture, aspect, walls)
+        )
         self._take(name, wanted, aspect)
 
     def _take(self, name: str | None, view: views.View, aspect: float) -> None:

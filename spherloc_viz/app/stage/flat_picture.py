@@ -4,7 +4,6 @@ from collections.abc import Iterator
 from html import escape
 
 import numpy as np
-from scipy.spatial import ConvexHull, QhullError
 
 from spherloc.types import FloatArray
 from spherloc_viz import style
@@ -110,6 +109,8 @@ def _lines(eye: _Eye, item: Segments) -> Iterator[Shape]:
 
 
 def _outline(eye: _Eye, item: Mesh) -> Iterator[Shape]:
+    from scipy.spatial import ConvexHull, QhullError  # takes a quarter of a second
+
     depths = eye.depths_m(item.vertices)
     if not len(depths) or depths.min() <= NEAR_M:
         return

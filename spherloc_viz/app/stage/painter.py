@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Hashable, Iterable
 from dataclasses import replace
-from functools import cache, partial
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -12,7 +12,8 @@ import viser.transforms as vtf
 from spherloc_viz import style
 from spherloc_viz.app.stage.appearance import light_bytes, surface_bytes, textured_glb
 from spherloc_viz.app.stage.picking import inside, nearest, viewer_of
-from spherloc_viz.layers.frame import one_color
+from spherloc_viz.app.web.viser_internals import update_node
+from spherloc_viz.layers.frame import icosphere, one_color
 from spherloc_viz.layers.primitives import Balls, Label, Mesh, Points, SceneItem, Segments, Textured
 
 OnPick = Callable[[tuple[int, ...], bool], None]
@@ -28,6 +29,8 @@ LARGEST_DOT = 0.007
 """Radius of a dot by its distance, as seen from within a camera."""
 LABEL_SCALE = 0.9
 """Size of words, by viser's own."""
+PLACE = frozenset({"wxyz", "position"})
+"""Of a node, which are no properties of what is drawn there."""
 
 
 class Painter:
@@ -99,7 +102,7 @@ class Painter:
             with self._client.atomic():
                 for handle, _, item in self._drawn.values():
                     if isinstance(item, Points) and len(item.positions) <= MAX_BATCHED:
-                        handle.batched_scales = np.float32(self._dot_radii_m(item))
+                        update_node(handle, batched_scales=np.float32(self._dot_radii_m(item)))
 
     def _dot_radii_m(self, item: Points) -> np.ndarray:
         radii_m = np.full(len(item.positions), item.radius_m)
@@ -140,8 +143,9 @@ class Painter:
             changing = _changing(item)
             if isinstance(item, Points) and "batched_scales" in changing:
                 changing["batched_scales"] = np.float32(self._dot_radii_m(item))
-            for name, value in changing.items():
-                setattr(handle, name, value)
+            update_node(handle, **{name: value for name, value in changing.items() if name not in PLACE})
+            for name in PLACE & changing.keys():
+                setattr(handle, name, changing[name])
         self._drawn[item.name] = (handle, look, item)
 
     def _glb(self, item: Textured) -> bytes | None:
@@ -264,14 +268,6 @@ def _instances(positions: np.ndarray, radii_m: np.ndarray, colors: np.ndarray) -
     }
 
 
-@cache
-def _unit_ball(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
-    import trimesh  # takes a second
-
-    mesh = trimesh.creation.icosphere(subdivisions=subdivisions)
-    return np.asarray(mesh.vertices), np.asarray(mesh.faces)
-
-
 def _add(scene: viser.SceneApi, item: SceneItem, glb: bytes | None, label_scale: float) -> Any:
     name, props = f"/{item.name}", _changing(item)
     match item:
@@ -311,7 +307,7 @@ def _add_batch(
     props: dict[str, Any],
     side: Literal["front", "back"] = "front",
 ) -> Any:
-    vertices, faces = _unit_ball(subdivisions)
+    vertices, faces = icosphere(subdivisions)
     upright = np.tile(np.array([1.0, 0.0, 0.0, 0.0], np.float32), (len(props["batched_positions"]), 1))
     return scene.add_batched_meshes_simple(
         name,

@@ -17,8 +17,14 @@ WIDE_RAD = np.radians(85.0)
 UP = np.array([0.0, -1.0, 0.0])
 START = (3.0, -3.0, 3.0)
 """Where a page's viewer stands until its first view is set."""
-MARGINS = np.array([0.13, 0.06])
-"""Shares of the canvas' half width and half height that stay free on every side: labels are wide."""
+MARGINS = np.array([0.1, 0.06])
+"""Shares of the canvas' half width and half height that stay free on every side."""
+LETTER_PX = 6.8
+"""Width of a letter of a label of viser's size."""
+WIDE, HIGH = np.array([0.5, 0.0]), np.array([0.6, 1.4])
+"""Half a label's width and height, in letters: for each of its letters, and besides."""
+NEAR = 0.6
+"""How far from its subject a step's words may stand, by the subject's size."""
 ROUNDS = 4
 """Perspective shifts the middle of what is seen, so the target is moved there a few times."""
 MIN_REACH, REACH = 1000.0, 5.0
@@ -87,12 +93,44 @@ def look(client: viser.ClientHandle, view: View) -> None:
         camera.look_at = view.target
 
 
-def follow(picture: Picture, aspect: float, walls: Walls | None = None) -> View:
-    """The view that shows what the step is about, on a canvas of that width over height, between ``walls``."""
+def follow(picture: Picture, aspect: float, walls: Walls | None = None, letter: float = 0.0) -> View:
+    """The view that shows what the step is about, on a canvas of that width over height, between ``walls``; with the
+    words beside it if their letters are wide, by half the canvas' height."""
     focus = picture.focus
     route = [item.positions for item in picture.scene if isinstance(item, Points) and item.layer == "trajectory"]
     subject = np.vstack([focus.points, *route]) if focus.view == "Overview" else focus.points
-    return _clear(focus.view, picture, subject, subject if focus.clear is None else focus.clear, aspect, walls)
+    view = _clear(focus.view, picture, subject, subject if focus.clear is None else focus.clear, aspect, walls)
+    names = _names(picture, subject) if letter else []
+    if not names:
+        return view
+    held = np.vstack([subject, [label.position for label in names]])
+    insets = np.vstack([np.zeros((len(subject), 2)), [_half_size(label, letter) for label in names]])
+    positions, targets = _fits(held, (view.position - view.target)[None], aspect, insets)
+    return View(positions[0], targets[0])
+
+
+def cut(picture: Picture, view: View, aspect: float, letter: float) -> frozenset[str]:
+    """Names of the words that the edge of the canvas would cut."""
+    labels = [item for item in picture.scene if isinstance(item, Label) and item.height_m is None]
+    if not labels:
+        return frozenset()
+    seen = projected(view, np.array([label.position for label in labels])) / np.tan(view.field_of_view_rad / 2)
+    beyond = np.abs(seen) + [_half_size(label, letter) for label in labels] > [aspect, 1.0]
+    return frozenset(label.name for label, outside in zip(labels, beyond.any(axis=1), strict=True) if outside)
+
+
+def _names(picture: Picture, subject: FloatArray) -> list[Label]:
+    """The words that stand beside a subject (K, 3)."""
+    low, high = np.min(subject, axis=0), np.max(subject, axis=0)
+    room = NEAR * float(np.max(high - low))
+    labels = [item for item in picture.scene if isinstance(item, Label) and item.height_m is None]
+    own = [label for label in labels if label.layer not in ("ground", "scale bar")]
+    return [label for label in own if np.all((label.position > low - room) & (label.position < high + room))]
+
+
+def _half_size(label: Label, letter: float) -> FloatArray:
+    """Half the width and height (2,) of words, as ``letter`` is measured."""
+    return letter * (len(label.text) * WIDE + HIGH)
 
 
 def around(places: FloatArray, aspect: float) -> View:
@@ -117,12 +155,12 @@ def fits(name: str | None, view: View, picture: Picture, aspect: float) -> bool:
 
 def projected(view: View, positions: FloatArray) -> FloatArray:
     """Where positions (K, 3) are seen (K, 2), right and up, as slopes; infinite behind the viewer."""
-    backward, sideways = _axes(view.position - view.target)
+    backward, right, up = (axes[0] for axes in _axes((view.position - view.target)[None]))
     offset = positions - view.position
     depth = -(offset @ backward)
     slopes = np.full((len(positions), 2), np.inf)
     ahead = depth > 0
-    slopes[ahead] = (offset @ sideways)[ahead] / depth[ahead, None]
+    slopes[ahead] = (offset[ahead] @ np.column_stack([right, up])) / depth[ahead, None]
     return slopes
 
 
@@ -183,15 +221,15 @@ def _clear(
     name: str, picture: Picture, subject: FloatArray, clear: FloatArray, aspect: float, walls: Walls | None
 ) -> View:
     """A view of a subject (K, 3) from the side of a named view, turned so that little hides ``clear`` (L, 3)."""
-    if name not in ("Sphere", "Balls"):
+    if name not in ("Sphere", "Balls") and (name != "Overview" or walls is None):
         return _fit(subject, np.array(DIRECTIONS[name]), aspect)
     sides = [DIRECTIONS[name]] if walls is None else [DIRECTIONS[name], STEEP]
-    directions = [yaw_rotation(turn) @ np.array(side) for side in sides for turn in TURNS_RAD]
+    directions = np.array([yaw_rotation(turn) @ np.array(side) for side in sides for turn in TURNS_RAD])
     points = next(item for item in picture.scene if isinstance(item, Points) and item.name == "map/points")
-    hidden = [_in_the_way(_fit(clear, one, aspect), points.positions) + 0.5 * k for k, one in enumerate(directions)]
+    hidden = _in_the_way(*_fits(clear, directions, aspect), points.positions) + 0.5 * np.arange(len(directions))
     if walls is not None:
-        blocked = [walls.blocked(_fit(subject, one, aspect).position, subject) for one in directions]
-        hidden = [cost + len(points.positions) * share for cost, share in zip(hidden, blocked, strict=True)]
+        blocked = [walls.blocked(position, subject) for position in _fits(subject, directions, aspect)[0]]
+        hidden += len(points.positions) * np.array(blocked)
     return _fit(subject, directions[int(np.argmin(hidden))], aspect)
 
 
@@ -220,41 +258,63 @@ def _axis(items: dict[str, SceneItem]) -> FloatArray:
 
 def _fit(subject: FloatArray, direction: FloatArray, aspect: float) -> View:
     """The nearest place in that direction from which the canvas holds all of the subject (K, 3)."""
-    backward, sideways = _axes(direction)
-    slopes = np.tan(FIELD_OF_VIEW_RAD / 2) * (1.0 - MARGINS) * np.array([aspect, 1.0])
-    target = (np.min(subject, axis=0) + np.max(subject, axis=0)) / 2
+    positions, targets = _fits(subject, direction[None], aspect)
+    return View(positions[0], targets[0])
+
+
+def _fits(
+    subject: FloatArray, directions: FloatArray, aspect: float, insets: FloatArray | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """The same for directions (D, 3): where to stand (D, 3) and what to look at (D, 3).
+
+    ``insets`` (K, 2) says how far each place stays from the edge, by half the canvas' height, where that is more.
+    """
+    backward, right, up = _axes(directions)
+    edges = np.array([aspect, 1.0])
+    free = np.broadcast_to(MARGINS * edges, (len(subject), 2))
+    if insets is not None:  # some room is left on a canvas that is narrower than its words
+        free = np.clip(insets, free, 0.9 * edges)
+    slopes = np.tan(FIELD_OF_VIEW_RAD / 2) * (edges - free).T
+    middle = (np.min(subject, axis=0) + np.max(subject, axis=0)) / 2
+    offset = subject - middle
+    # Of the subject (D, K), and of the target (D, 1), which moves: towards the viewer, to the right and up.
+    parts = [axes @ offset.T for axes in (backward, right, up)]
+    target = [np.zeros((len(directions), 1)) for _ in parts]
+
+    def least_distance() -> FloatArray:
+        """From how far (D, 1) the subject is seen within the slopes."""
+        depth, *across = (part - place for part, place in zip(parts, target, strict=True))
+        needed = [np.abs(one) / slope + depth for one, slope in zip(across, slopes, strict=True)]
+        return np.maximum(1e-3, np.maximum(*needed).max(axis=1, keepdims=True))
+
     for _ in range(ROUNDS):
-        offset = subject - target
-        depth, across = offset @ backward, offset @ sideways
-        distance = _least_distance(across, depth, slopes)
-        seen = across / np.maximum(distance - depth, 1e-3)[:, None]
-        target = target + distance * sideways @ ((np.min(seen, axis=0) + np.max(seen, axis=0)) / 2)
-    offset = subject - target
-    return View(target + _least_distance(offset @ sideways, offset @ backward, slopes) * backward, target)
+        distance = least_distance()
+        away = np.maximum(distance - parts[0] + target[0], 1e-3)
+        for side in (1, 2):
+            seen, room = (parts[side] - target[side]) / away, slopes[side - 1].max() - slopes[side - 1]
+            low, high = np.min(seen - room, axis=1), np.max(seen + room, axis=1)
+            target[side] = target[side] + distance * (low + high)[:, None] / 2
+    targets = middle + sum(place * axes for place, axes in zip(target, (backward, right, up), strict=True))
+    return targets + least_distance() * backward, targets
 
 
-def _least_distance(across: FloatArray, depth: FloatArray, slopes: FloatArray) -> float:
-    """From how far points (K, 2) across and (K,) nearer than the target are all seen within the slopes (2,)."""
-    return max(1e-3, float(np.max(np.max(np.abs(across) / slopes, axis=1) + depth)))
-
-
-def _axes(direction: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Unit vectors towards a viewer in that direction (3,), and to the viewer's right and up (3, 2)."""
-    backward = direction / np.linalg.norm(direction)
+def _axes(directions: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Unit vectors (D, 3) towards viewers in those directions (D, 3), and to each viewer's right and up."""
+    backward = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     right = np.cross(UP, backward)
-    right /= np.linalg.norm(right)
-    return backward, np.column_stack([right, np.cross(backward, right)])
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    return backward, right, np.cross(backward, right)
 
 
-def _in_the_way(view: View, positions: FloatArray) -> float:
-    """How much of a view the points (N, 3) before its target cover; one as far as the target counts 1."""
-    forward = view.target - view.position
-    distance = float(np.linalg.norm(forward))
-    offset = positions - view.position
-    depth = offset @ forward / distance
-    away = np.linalg.norm(offset, axis=1)
+def _in_the_way(standing: FloatArray, targets: FloatArray, positions: FloatArray) -> FloatArray:
+    """How much of views (D,) from places (D, 3) to targets (D, 3) the points (N, 3) before the targets cover; one as
+    far as its target counts 1."""
+    forward = targets - standing
+    distance = np.linalg.norm(forward, axis=1)[:, None]
+    depth = (forward @ positions.T - np.sum(forward * standing, axis=1)[:, None]) / distance
+    away = np.linalg.norm(positions - standing[:, None], axis=2)
     before = (depth > 0) & (depth < 0.9 * distance) & (depth > np.cos(FIELD_OF_VIEW_RAD / 2) * away)
-    return float(np.sum((distance / np.maximum(depth[before], 1e-3)) ** 2))
+    return np.sum(before * (distance / np.maximum(depth, 1e-3)) ** 2, axis=1)
 
 
 def _subject(name: str, picture: Picture) -> FloatArray:

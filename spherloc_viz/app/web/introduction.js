@@ -64,14 +64,22 @@
 
   function end() {
     remember();
-    card?.remove();
-    card = null;
+    close();
     go(told.end);
   }
 
+  function close() {
+    card?.remove();
+    card = null;
+    document.documentElement.classList.remove("introducing");
+  }
+
+  // The canvas ends above the card, so that the card covers nothing of it: the server fits its view to what is left.
   function place() {
     const box = document.querySelector("canvas")?.getBoundingClientRect();
     if (!box) return;
+    document.documentElement.style.setProperty("--introduction", `${card.offsetHeight + 36}px`);
+    document.documentElement.classList.add("introducing");
     const width = Math.min(32.4 * parseFloat(getComputedStyle(card).fontSize), box.width - 24);
     Object.assign(card.style, { left: `${box.left + (box.width - width) / 2}px`, width: `${width}px` });
   }
@@ -99,8 +107,7 @@
   }, true);
   addEventListener("click", (event) => {
     if (!(event.target instanceof Element) || !event.target.closest(".introduce")) return;
-    card?.remove();
-    card = null;
+    close();
     begin();
   }, true);
 })();

@@ -16,6 +16,7 @@ from spherloc.metrics import evaluate
 from spherloc.trace import Trace
 from spherloc_viz.layers import paint, steps
 from spherloc_viz.layers.key_step import key_step, step_numbers
+from spherloc_viz.layers.outcome import outcome_table
 from spherloc_viz.layers.primitives import Picture, StepHeading
 from spherloc_viz.recording.content.columns import markdown, static_chunk
 from spherloc_viz.recording.content.components import image_chunks, query_image, thumbnail
@@ -131,6 +132,8 @@ def _write(run: _Run, part: Path, file: str) -> RunRow:
     )
     chosen = list(range(len(headings))) if run.full else recorded_steps(headings, key)
     pictures = {index: paint(trace, index) for index in chosen}
+    end = max(chosen)
+    pictures[end] = replace(pictures[end], tables=(*pictures[end].tables, outcome_table(trace)))
     panels = panels_of(trace)
     layout = layout_file(shown_in(list(pictures.values()), panels))
     stream = LazyChunkStream.from_iter(list(_chunks(run, row, pictures, panels)))
