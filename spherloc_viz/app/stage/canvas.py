@@ -165,7 +165,7 @@ class Canvas:
 
     def _letter(self) -> float:
         """Width of a letter in the canvas, by half its height."""
-        return views.LETTER_PX * self._label_scale / (0.5 * max(1, min(self._client.camera.image_height, MOST_PX)))
+        return views.LETTER_PX * self._label_scale / (0.5 * max(1, min(self._client.camera.image_height, MAX_PX)))
 
     @property
     def clicked_left(self) -> bool:
