@@ -11,7 +11,7 @@ from spherloc_viz.app.linked_run import LinkedRuns
 from spherloc_viz.layers import steps
 from spherloc_viz.lessons import lessons
 from spherloc_viz.lessons.claims import holds, split_claim
-from spherloc_viz.lessons.html import FORMULA, changes_in, lesson_page, list_page, names_in
+from spherloc_viz.lessons.html import FORMULA, IMAGES, changes_in, lesson_page, list_page, names_in
 from spherloc_viz.lessons.lesson import MANY, changed_state, parse_lesson, state_parts
 from spherloc_viz.lessons.numbers import numbers_of
 
@@ -124,7 +124,8 @@ def test_formulas_of_numbers_are_true():
 def test_the_images_of_a_moment_are_seen(runs):
     lesson = next(one for one in LESSONS if one.name == "images")
     night = lesson.moments[2]
-    assert f"/learn/images?{night.state.replace('&', '&amp;')}" in lesson_page(lesson, LESSONS)
+    assert f"{IMAGES}?{night.state.replace('&', '&amp;')}" in lesson_page(lesson, LESSONS)
+    assert IMAGES not in {f"/learn/{one.name}" for one in LESSONS}
     picture = images_of(runs, night.state)
     assert picture.count('<image href="data:image/jpeg;base64,') == 2
     assert f'stroke="{style.css(style.INLIER)}"' in picture

@@ -23,7 +23,7 @@ MARK, END = "\ue000", "\ue001"
 PERCENT = "%"
 PAIR = "images"
 """Field of the query and the reference image with their matches."""
-IMAGES = "/learn/images"
+IMAGES = "/learn/matched-images"
 """Address of such a picture, before its state."""
 
 
