@@ -19,12 +19,13 @@ def faults(tab: Playground) -> list[str]:
     """All that is wrong now; of viser's own parts too, none of which is left out."""
     tab.until(lambda: not tab.page.evaluate(MOVING), "nothing fades in any more")
     wrong: list[str] = []
-    for _ in range(3):  # names are given some times a second, so what came just now may be without
+    for _ in range(10):  # names are given some times a second, so what came just now may be without
         found = Axe().run(tab.page, options=RULES).response["violations"]
         wrong = [f"{one['id']}: {node['html'][:200]}" for one in found for node in one["nodes"]]
         wrong += tab.page.evaluate(SMALL)
         if not wrong:
             break
+        tab.page.wait_for_timeout(300)
     return wrong
 
 

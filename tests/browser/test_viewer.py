@@ -144,13 +144,13 @@ def test_it_opens_at_the_step_and_stays_at_home(tab: Tab, home: str, row: RunRow
 def wait_until_drawn(page: Page) -> None:
     """Wait until the true camera is seen in the scene."""
     truth = np.array(style.TRUTH[::-1])
-    for _ in range(120):
+
+    def is_drawn() -> bool:
         picture = cv2.imdecode(np.frombuffer(page.screenshot(), np.uint8), cv2.IMREAD_COLOR)
         assert picture is not None
-        if np.count_nonzero(np.abs(picture.astype(int) - truth).max(axis=2) < 12) > 20:
-            return
-        page.wait_for_timeout(500)
-    pytest.fail("the true camera never appears in the scene")
+        return np.count_nonzero(np.abs(picture.astype(int) - truth).max(axis=2) < 12) > 20
+
+    until(lambda: is_drawn() or page.wait_for_timeout(500))
 
 
 @pytest.mark.parametrize(
