@@ -121,7 +121,9 @@ def _print(name: str, trace: Trace, diagnosis: Diagnosis, recording: Path | None
     metrics = evaluate(trace)
     errors = ""
     if metrics.rotation_error_deg is not None and metrics.translation_error_m is not None:
-        errors = f", {metrics.rotation_error_deg:.3g} deg and {metrics.translation_error_m:.3g} m off"
+        errors = (
+            f", {metrics.rotation_error_deg:.3g} deg and {metrics.translation_error_m:.3g} {trace.problem.unit} off"
+        )
     cause = f"{diagnosis.cause.value}. {diagnosis.summary}"
     print(f"{name}: {int(trace.inlier_mask.sum())} of {len(trace.problem)} agree{errors}: {cause}", flush=True)
     if recording is not None:

@@ -12,7 +12,8 @@ from spherloc.errors import InputError, RecordingError, show
 from spherloc_viz.given_files import check_recording_file, check_recordings_folder, is_recording
 from spherloc_viz.progress import progress, say
 from spherloc_viz.recording.index.query import GROUP_KEYS, OUTCOMES, SORT_KEYS, SOURCES, RunQuery
-from spherloc_viz.recording.index.run_index import Refreshed, RunIndex
+from spherloc_viz.recording.index.refresher import Progress, Refreshed
+from spherloc_viz.recording.index.run_index import RunIndex
 from spherloc_viz.recording.index.run_text import FORMS, counts_text, rows_text
 from spherloc_viz.recording.reviews import Review, checked_review
 from spherloc_viz.recording.run_row import RunRow
@@ -71,7 +72,7 @@ def print_steps(folder: Path, condition: str, limit: int | None, form: str) -> i
     form, most = one_of("format", form, FORMS), _limit(limit, form)
     checked_condition(condition)
     with _open(folder) as index:
-        _refresh(index)
+        _refresh(index, index.examine)  # rerun's catalog reads them in this process
         rows = index.find(RunQuery(), None).rows
     if len(rows) > MANY:
         say(f"reading the steps of {len(rows):,} recordings.")
@@ -128,7 +129,7 @@ def reindex(folder: Path) -> int:
     """Read all recordings of a folder again; returns 1 if files had to be left out."""
     began = time.monotonic()
     with _open(folder) as index:
-        done = _read_files(index, everything=True)
+        done = _read_files(index.rebuild)
     for _, sentence in done.skipped:
         say(sentence)
     left_out = f", {_count(len(done.skipped), 'file')} left out" if done.skipped else ""
@@ -228,13 +229,13 @@ def _limit(limit: int | None, form: str) -> int | None:
     return limit or None
 
 
-def _refresh(index: RunIndex) -> None:
-    """Read what is new; files that are no runs are a line."""
-    if skipped := _read_files(index, everything=False).skipped:
+def _refresh(index: RunIndex, read: Callable[[Progress], Refreshed] | None = None) -> None:
+    """Read what is new, by ``index.refresh`` if nothing else is given; files that are no runs are a line."""
+    if skipped := _read_files(read or index.refresh).skipped:
         say(f"{_count(len(skipped), 'file')} left out, such as {show(skipped[0][0])}; spherloc reindex says why.")
 
 
-def _read_files(index: RunIndex, everything: bool) -> Refreshed:
+def _read_files(read: Callable[[Progress], Refreshed]) -> Refreshed:
     """Bring the index up to date, and show how far it is."""
     with ExitStack() as stack:
         advance: Callable[[str], None] | None = None
@@ -248,7 +249,7 @@ def _read_files(index: RunIndex, everything: bool) -> Refreshed:
                 advance("")
             shown = done
 
-        return index.rebuild(tell) if everything else index.refresh(tell)
+        return read(tell)
 
 
 def _count(count: int, noun: str) -> str:

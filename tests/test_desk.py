@@ -4,7 +4,7 @@ import asyncio
 import json
 import math
 import re
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -20,7 +20,7 @@ from test_app_front_door import Door, door_to
 
 from spherloc.diagnosis import Measures, diagnose
 from spherloc.errors import InputError, RecordingError
-from spherloc.estimators import estimate
+from spherloc.estimators import default_options, estimate
 from spherloc_viz.app.desk import files
 from spherloc_viz.app.desk.columns import NUMBERS, READ, TEXTS, columns_json
 from spherloc_viz.app.desk.comparison import compare, compare_pairs, parse_condition
@@ -79,7 +79,7 @@ def test_measures_say_what_a_run_is_like_and_survive_the_recording(tmp_path: Pat
 def test_columns_are_those_of_the_index(tmp_path: Path) -> None:
     rows = [
         some_row("b.rrd", created="2026-01-02T03:04:06.000+00:00", tilt_deg=1.23456789, labels=("x", "y"), note="n"),
-        some_row("a.rrd", doubtful=None, proven=True, outlier_rate=None, time_ms=float("1e300")),
+        some_row("a.rrd", metric=False, doubtful=None, proven=True, outlier_rate=None, time_ms=float("1e300")),
     ]
     with RunIndex(tmp_path) as index:
         for row in rows:
@@ -90,10 +90,12 @@ def test_columns_are_those_of_the_index(tmp_path: Path) -> None:
     assert told["files"] == ["a.rrd", "b.rrd"] and told["version"] == "7" and told["notes"] == {"b.rrd": "n"}
     values, codes = told["texts"]["proven"]["values"], told["texts"]["proven"]["codes"]
     assert [values[code] for code in codes] == ["yes", ""]
+    values, codes = told["texts"]["units"]["values"], told["texts"]["units"]["codes"]
+    assert [values[code] for code in codes] == ["units", "m"], "older recordings are metric"
     assert told["numbers"]["outlier_rate"] == [None, 0.75] and told["numbers"]["tilt_deg"] == [None, 1.2346]
     assert told["numbers"]["key_step"] == [13, 13], "counted from 1, as the page and Rerun do"
     assert [json.loads(told["labels"]["values"][code]) for code in told["labels"]["codes"]] == [[], ["x", "y"]]
-    assert set(COLUMNS) - {"labels"} <= {*TEXTS, *NUMBERS, "doubtful", "proven"}
+    assert set(COLUMNS) - {"labels"} <= {*TEXTS, *NUMBERS, "doubtful", "proven", "units"}
 
 
 def test_the_map_is_that_of_principal_components() -> None:
@@ -235,12 +237,14 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def visit(folder: Path, calls: Callable[[Door], Awaitable[None]], token: bool = False) -> None:
+def visit(
+    folder: Path, calls: Callable[[Door], Awaitable[None]], token: bool = False, allowed: Sequence[Path] = ()
+) -> None:
     async def run() -> None:
         with RunIndex(folder) as index:
             index.refresh()
             downloads = Downloads()
-            room = DeskRoom(RunLibrary(index), downloads)
+            room = DeskRoom(RunLibrary(index), downloads, allowed)
             async with door_to(1, token=token, downloads=downloads, desk=room) as door:
                 await calls(door)
             downloads.close()
@@ -316,6 +320,28 @@ def test_sets_are_compared_and_reported(recorded: Path) -> None:
         assert refused.status == 400 and "no problem occurs in both" in (await refused.json())["error"]
 
     visit(recorded, calls)
+
+
+def test_a_folder_is_compared_with_another_one_that_may_be_opened(recorded: Path, tmp_path: Path) -> None:
+    other = tmp_path / "nights" / "tuesday"
+    secret = tmp_path / "secret"
+    for folder in (other, secret, other / "gallery"):
+        RunIndex(folder).close()
+    lost = replace(default_options("ransac-2p", scene_problem("mei_outliers_80")), iterations=1)
+    write_recording(estimate(scene_problem("mei_outliers_80"), "ransac-2p", lost, 1), other / "x.rrd")
+    (tmp_path / "nights" / "way out").symlink_to(secret)
+
+    async def calls(door: Door) -> None:
+        told = await (await door.get("desk/folders")).json()
+        assert told == {"folders": [{"place": "1:tuesday", "name": "nights/tuesday"}]}
+        asked = {"do": "compare", "before": ["b.rrd"], "before_name": "monday", "after_name": "tuesday"}
+        found = await (await do(door, asked | {"after_folder": "1:tuesday"})).json()
+        assert found["broken"] == [["b.rrd", "x.rrd"]] and found["pairs"] == 1
+        for place in ("1:../secret", "1:way out", "0:..", "9:", "1:", str(other), "1:tuesday/gone"):
+            refused = await do(door, asked | {"after_folder": place})
+            assert refused.status == 400 and "error" in await refused.json(), place
+
+    visit(recorded, calls, allowed=[tmp_path / "nights"])
 
 
 @pytest.mark.parametrize(

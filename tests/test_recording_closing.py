@@ -121,7 +121,7 @@ def test_closing_a_list_ends_its_refresh_and_says_nothing_of_the_file(stuck: Stu
         assert not thread.is_alive() and len(errors) == 1
     assert not any(map(alive, stuck.readers()))
     with RunIndex(stuck.recordings) as index:
-        assert index.refresh(examine=lambda paths: [(path, RecordingError("bad.")) for path in paths]).skipped == (
+        assert index.refresh(read=lambda paths: [(path, RecordingError("bad.")) for path in paths]).skipped == (
             ("a.rrd", "bad."),
         )
 

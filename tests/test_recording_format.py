@@ -23,6 +23,7 @@ from spherloc_viz.layers import paint, steps
 from spherloc_viz.layers.key_step import key_step, step_pose
 from spherloc_viz.recording.content.components import HEIGHT_PX, LONGEST_PX, MATCHES, WIDTH_PX, thumbnail
 from spherloc_viz.recording.content.data import MAX_SCENE_BYTES, NUMBERS, read_recording, read_run_row, scene_text
+from spherloc_viz.recording.content.head import read_head
 from spherloc_viz.recording.content.properties import FORMAT_VERSION, MAX_CHARACTERS, problem_key
 from spherloc_viz.recording.content.writer import recorded_steps, write_recording
 from spherloc_viz.recording.origin import Origin
@@ -112,7 +113,7 @@ def test_the_row_that_is_returned_is_the_row_that_is_read(run: object, tmp_path:
     trace = made[run]() if isinstance(run, str) else estimate(scene_problem(run[0]), run[1], seed=3)  # type: ignore[index]
     path = tmp_path / "a run.rrd"
     row = write_recording(trace, path, Origin("sweep"))
-    assert read_run_row(path) == read_recording(path).row == row
+    assert read_run_row(path) == read_recording(path).row == row == read_head(path)
     assert (row.file, row.size_bytes, row.format_version) == ("a run.rrd", path.stat().st_size, FORMAT_VERSION)
     assert row.steps == len(steps(trace)) and 0 <= row.key_step < row.steps
     labels = trace.problem.truth_inliers

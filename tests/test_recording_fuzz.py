@@ -19,7 +19,7 @@ from spherloc_viz.recording.content.writer import write_recording
 from spherloc_viz.recording.index.query import RunQuery
 from spherloc_viz.recording.index.run_index import RunIndex
 from spherloc_viz.recording.run_row import RunRow
-from spherloc_viz.recording.sandbox.examiner import examine_all
+from spherloc_viz.recording.sandbox.examiner import Examiner, examine_all
 
 Noise = Callable[[bytes, np.random.Generator], bytes]
 
@@ -84,7 +84,9 @@ def test_whatever_passes_can_be_read_and_the_rest_is_one_sentence(
         paths.append(tmp_path / f"cut-{length}.rrd")
         paths[-1].write_bytes(content[:length])
     passed = 0
-    for path, result in examine_all(paths):
+    with Examiner() as examiner:
+        results = examine_all(paths, examiner)
+    for path, result in results:
         if isinstance(result, RunRow):
             assert read_recording(path).row == result
             passed += 1
@@ -123,8 +125,12 @@ def test_a_list_of_good_and_bad_files_has_the_good_ones(good: Path, tmp_path: Pa
         path.write_bytes(content)
     notices: list[str] = []
     with RunIndex(folder, notices.append) as index:
-        refreshed = index.rebuild()
+        listed = {row.file for row in (index.refresh(), index.find(RunQuery(), limit=None))[1].rows}
+        assert names <= listed and not any(map(index.examined, listed)), "what the start of a file tells is believed"
+        refreshed = index.examine()
         found = index.find(RunQuery(), limit=None)
+        assert all(map(index.examined, names)) and refreshed.read == 10 and len(refreshed.skipped) == len(bad)
+        refreshed = index.rebuild()
     assert {row.file for row in found.rows} == names and refreshed.read == 10 and not notices
     assert len(refreshed.skipped) == len(bad) == 30
     for file, sentence in refreshed.skipped:

@@ -101,7 +101,7 @@ def test_texts_pass_through_a_file_unchanged(tmp_path: Path) -> None:
         assert row == replace(written, labels=review.labels, note=review.note)
         with RunIndex(tmp_path) as index:
             # Through the child that runs already: others take seconds to start.
-            assert index.refresh(examine=lambda paths: ((path, examine(path)) for path in paths)).read == 1
+            assert index.refresh(read=lambda paths: ((path, examine(path)) for path in paths)).read == 1
             found = index.find(RunQuery()).rows
         assert found == (row,)
 

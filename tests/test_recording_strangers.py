@@ -271,7 +271,10 @@ def test_a_bad_file_costs_the_others_nothing(good: Path, tmp_path: Path) -> None
     deadly.write_bytes(has_a_list_that_ends_beyond_its_values(good))
     huge.write_bytes(unpacks_to_much(good))
     paths = [good, deadly, good, huge, tmp_path, good]
-    results = list(examine_all(paths))
+    with Examiner() as examiner:
+        results = examine_all(paths, examiner)
+        told = examiner.told([good, deadly, huge, tmp_path, good])
+    assert told[0] == told[-1] == results[0][1] and told[3] is None, "what a child died of costs the others nothing"
     assert [path for path, _ in results] == paths
     assert [isinstance(result, RunRow) for _, result in results] == [True, False, True, False, False, True]
 
@@ -342,7 +345,7 @@ def test_one_file_is_examined_by_a_child_that_stays(
 def test_a_child_that_cannot_be_started_is_no_fault_of_a_file(good: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "executable", "/nowhere/python")
     with pytest.raises(RecordingError, match="does not start"):
-        list(examine_all([good]))
+        examine_all([good], Examiner())
 
 
 def test_fields_whose_types_are_aliases_are_checked_too() -> None:

@@ -43,10 +43,10 @@ class Files:
 def test_names_in_capitals_are_listed_too(index: RunIndex):
     files = Files(index.folder)
     files.write("a.RRD", "b.Rrd", "c.REVIEW.RRD", "d.rrdx")
-    done = index.refresh(examine=files.examine)
+    done = index.refresh(read=files.examine)
     assert (done.read, done.skipped) == (2, ()) and sorted(files.read) == ["a.RRD", "b.Rrd"]
     write_review(index.folder / "a.RRD", ["seen"], "", run_id="1b2c")
-    assert index.refresh(examine=files.examine).read == 1
+    assert index.refresh(read=files.examine).read == 1
     assert {row.file: row.labels for row in index.find(RunQuery()).rows} == {"a.RRD": ("seen",), "b.Rrd": ()}
 
 
@@ -54,29 +54,29 @@ def test_refresh_reads_only_what_is_new_or_has_changed(index: RunIndex):
     files = Files(index.folder)
     files.write("a.rrd", "b.rrd", "gallery/c.rrd", "notes.txt", "d.rrd.part", "e.review.rrd")
     assert index.stale
-    done = index.refresh(examine=files.examine)
+    done = index.refresh(read=files.examine)
     assert (done.read, done.removed, done.skipped, index.stale) == (3, 0, (), False)
     assert sorted(files.read) == ["a.rrd", "b.rrd", "gallery/c.rrd"]
     assert {row.file for row in index.find(RunQuery()).rows} == {"a.rrd", "b.rrd", "gallery/c.rrd"}
     files.read.clear()
-    assert index.refresh(examine=files.examine).read == 0 and files.read == []
+    assert index.refresh(read=files.examine).read == 0 and files.read == []
     files.write("b.rrd", content="another run")
     (index.folder / "a.rrd").unlink()
     write_review(index.folder / "gallery" / "c.rrd", ["seen"], "", run_id="1b2c")
     index.add(some_row("new.rrd"))
     files.write("bad.rrd", content="bad")
-    done = index.refresh(examine=files.examine)
+    done = index.refresh(read=files.examine)
     assert (done.read, done.removed) == (2, 2), "b and c are read again; a and new have no file"
     assert files.read == ["b.rrd", "bad.rrd", "gallery/c.rrd"]
     assert done.skipped == (("bad.rrd", f"{index.folder / 'bad.rrd'}: is bad."),)
     row = index.get("gallery/c.rrd")
     assert row is not None and row.labels == ("seen",)
     files.read.clear()
-    assert index.refresh(examine=files.examine).skipped == done.skipped and files.read == [], "known to be bad"
+    assert index.refresh(read=files.examine).skipped == done.skipped and files.read == [], "known to be bad"
     files.write("bad.rrd", content="good now")
-    assert index.refresh(examine=files.examine).skipped == ()
+    assert index.refresh(read=files.examine).skipped == ()
     files.write("b.rrd", content="bad now")
-    index.refresh(examine=files.examine)
+    index.refresh(read=files.examine)
     assert index.get("b.rrd") is None, "it was a run once"
 
 
@@ -89,7 +89,7 @@ def test_files_whose_names_no_recording_has_are_left_out(index: RunIndex):
         (Path(os.fsdecode(bytes(index.folder) + b"/\xff.rrd"))).write_text("run")
         names.append("\\udcff.rrd")
     for _ in range(2):
-        done = index.refresh(examine=files.examine)
+        done = index.refresh(read=files.examine)
         assert {file for file, _ in done.skipped} == set(names)
         assert all("not the name of a recording" in sentence for _, sentence in done.skipped)
     assert files.read == ["good.rrd"]
@@ -99,7 +99,7 @@ def test_files_whose_names_no_recording_has_are_left_out(index: RunIndex):
 def test_rebuild_reads_all_and_says_how_far_it_is(index: RunIndex):
     files = Files(index.folder)
     files.write(*(f"{number}.rrd" for number in range(45)))
-    index.refresh(examine=files.examine)
+    index.refresh(read=files.examine)
     index.add(replace(some_row("7.rrd"), inliers=999))
     told: list[tuple[int, int]] = []
     done = index.rebuild(lambda *far: told.append(far), files.examine)
@@ -114,13 +114,13 @@ def test_rebuild_notices_damage_that_no_query_has_met(tmp_path: Path):
     said: list[str] = []
     with RunIndex(tmp_path, said.append) as index:
         files.write(*(f"{number}.rrd" for number in range(200)))
-        index.refresh(examine=files.examine)
+        index.refresh(read=files.examine)
     size = index.path.stat().st_size
     with index.path.open("r+b") as file:
         file.seek(size // 2)
         file.write(b"\xff" * 5000)
     with RunIndex(tmp_path, said.append) as index:
-        assert index.rebuild(examine=files.examine).read == 200
+        assert index.rebuild(read=files.examine).read == 200
         assert index.find(RunQuery()).total == 200
     assert len(said) == 1 and "is damaged" in said[0]
 
@@ -135,14 +135,14 @@ def test_a_label_given_during_a_refresh_stays(index: RunIndex):
         index.set_review("a.rrd", ["meanwhile"], "")
         yield from found
 
-    index.refresh(examine=slow)
+    index.refresh(read=slow)
     row = index.get("a.rrd")
     assert row is not None and row.labels == ("meanwhile",)
 
 
 def test_a_refresh_can_be_stopped(index: RunIndex):
     files = Files(index.folder)
-    files.write(*(f"{number}.rrd" for number in range(45)))
+    files.write(*(f"{number}.rrd" for number in range(145)))
 
     class StoppedError(Exception):
         pass
@@ -154,4 +154,4 @@ def test_a_refresh_can_be_stopped(index: RunIndex):
     with pytest.raises(StoppedError):
         index.refresh(stop, files.examine)
     assert index.stale
-    assert 0 < index.refresh(examine=files.examine).read < 45
+    assert 0 < index.refresh(read=files.examine).read < 145

@@ -119,7 +119,7 @@ def test_rows_that_we_never_write_are_damage(tmp_path: Path, change: str):
     told: list[str] = []
     with RunIndex(tmp_path, told.append) as index:
         assert index.find(RunQuery()).rows == () and index.stale
-        assert index.refresh(examine=lambda paths: ((path, some_row()) for path in paths)).read == 1
+        assert index.refresh(read=lambda paths: ((path, some_row()) for path in paths)).read == 1
         assert index.find(RunQuery()).rows == (some_row(),)
     (sentence,) = told
     assert "is damaged; it is kept as" in sentence
@@ -194,7 +194,7 @@ def test_the_log_that_a_killed_process_leaves_behind_does_no_harm(tmp_path: Path
     with RunIndex(tmp_path, told.append) as index:
         known = index.find(RunQuery(), None).total
         assert known == 20 if not gone else known in (0, 20)
-        rows = index.refresh(examine=lambda paths: ((path, some_row(path.name)) for path in paths))
+        rows = index.refresh(read=lambda paths: ((path, some_row(path.name)) for path in paths))
         assert index.find(RunQuery(), None).total == 20 and not rows.skipped
     assert not told and not log.exists() and len(list(tmp_path.glob("runs.sqlite*"))) == 1
 

@@ -175,7 +175,7 @@ def test_labels_are_given_found_and_taken_away(folder: Path, capsys: pytest.Capt
     (row,) = listed(capsys)
     assert (row["file"], row["labels"], row["note"]) == ("right.rrd", "wrong map; x", "See step 4.")
     runs(folder, text="STEP 4")
-    assert f"{run} [wrong map] [x] See step 4." in capsys.readouterr().out or len(str(run)) > WIDTH - 30
+    assert f"{run} [wrong map] [x] See step 4." in capsys.readouterr().out or len(str(run)) > WIDTH - 32
     assert label((run,), remove=("x",), add=("y",)) == 0
     assert read_review(run) == Review(("wrong map", "y"), "See\nstep 4.")
     capsys.readouterr()

@@ -99,7 +99,7 @@ def serve(
         index = _open_index(services.recorder, recordings, stack)
         services.library = None if index is None else RunLibrary(index)
         viewer = None if index is None else ViewerRoom(of_index(index))
-        desk = None if services.library is None else DeskRoom(services.library, services.downloads)
+        desk = None if services.library is None else DeskRoom(services.library, services.downloads, services.roots)
         key = secrets.token_urlsafe(32)
         server = start_viser(key)
         stack.callback(stop_viser, server)

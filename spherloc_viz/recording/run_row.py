@@ -53,7 +53,7 @@ class RunRow:
     rotation_error_deg: float | None
     """None if there is no truth or no pose."""
     translation_error_m: float | None
-    """Between the camera positions, metres."""
+    """Between the camera positions, metres, or units of the map if it is not ``metric``."""
     time_ms: float
     """Wall time of the estimator."""
     proven: bool | None
@@ -73,6 +73,8 @@ class RunRow:
     coverage: float | None = None
     rotation_sd_deg: float | None = None
     position_sd_m: float | None = None
+    metric: bool | None = None
+    """Whether the map's lengths are metres, else in units of its own; None in older recordings, whose maps were."""
     title: str = ""
     """Of a curated case."""
     labels: tuple[str, ...] = ()
@@ -85,6 +87,11 @@ class RunRow:
     """A small PNG; empty if there is none."""
     format_version: int = 0
     """Of the recording."""
+
+    @property
+    def unit(self) -> str:
+        """What its lengths are told in: "m" or "units"."""
+        return "units" if self.metric is False else "m"
 
     def on_timeline(self, number: int) -> int:
         """Where a step is on the recording's timeline; ``number`` counts from 1, as pages do, and so do timelines of

@@ -10,15 +10,18 @@ const AXES = ["outlier_rate", "correspondences", "residual_median", "alternative
 
 function rgb(hex) { return [1, 3, 5].map((at) => parseInt(hex.slice(at, at + 2), 16)); }
 
-// Maps the values of a column to 0 to 1; what is unknown, or not above zero on a logarithmic axis, has no place.
+const STRIP = 0.08; // of an axis, for runs whose value is unknown; known ones have the rest
+
+// Maps the values of a column to 0 to 1. Unknown ones are spread over a strip at the start, where they can be brushed too.
 class Axis {
   constructor(runs, name) {
     this.name = name;
     const values = runs.numbers[name];
     let low = Infinity, high = -Infinity, least = Infinity;
+    this.strip = 0;
     for (let i = 0; i < values.length; i++) {
       const value = values[i];
-      if (Number.isNaN(value)) continue;
+      if (Number.isNaN(value)) { this.strip = STRIP; continue; }
       if (value < low) low = value;
       if (value > high) high = value;
       if (value > 0 && value < least) least = value;
@@ -30,19 +33,30 @@ class Axis {
     const room = 0.03 * (this.high - this.low);
     this.low -= room; this.high += room;
     this.places = new Float32Array(values.length);
-    const width = this.high - this.low;
+    const scale = (1 - this.strip) / (this.high - this.low);
     for (let i = 0; i < values.length; i++) {
       const value = this.log ? Math.log10(Math.max(values[i], 10 ** (this.low + room))) : values[i];
-      this.places[i] = (value - this.low) / width;
+      this.places[i] = Number.isNaN(value) ? this.strip * (0.15 + 0.7 * ((i * 0.618034) % 1)) : this.strip + (value - this.low) * scale;
     }
   }
   at(place) {
-    const value = this.low + place * (this.high - this.low);
+    const value = this.low + ((place - this.strip) / (1 - this.strip)) * (this.high - this.low);
     return this.log ? 10 ** value : value;
   }
   place(value) {
     const low = this.low, width = this.high - low;
-    return ((this.log ? Math.log10(Math.max(value, 1e-300)) : value) - low) / width;
+    return this.strip + ((1 - this.strip) * ((this.log ? Math.log10(Math.max(value, 1e-300)) : value) - low)) / width;
+  }
+  // What lies between two places: [low, high], and a 1 behind them if it is also what is unknown.
+  range(from, to) {
+    const [a, b] = [Math.min(from, to), Math.max(from, to)];
+    const known = b > this.strip ? [this.at(Math.max(a, this.strip)), this.at(b)] : NOTHING;
+    return a < this.strip ? [...known, 1] : known;
+  }
+  // The places of a range; where only unknown or only known values are in it, it ends with the strip or begins there.
+  span([low, high, unknown]) {
+    const [a, b] = low <= high ? [this.place(low), this.place(high)] : [0, this.strip];
+    return [Math.max(0, unknown ? 0 : a), Math.min(1, b)];
   }
   ticks() {
     const found = [];
@@ -52,7 +66,7 @@ class Axis {
       if (found.length > 1) return found;
       found.length = 0;
     }
-    const [low, high] = [this.at(0), this.at(1)];
+    const [low, high] = [this.at(this.strip), this.at(1)];
     const rough = (high - low) / 4, unit = 10 ** Math.floor(Math.log10(rough));
     const step = unit * [1, 2, 5, 10].find((k) => k * unit >= rough);
     for (let value = Math.ceil(low / step) * step; value <= high; value += step) found.push(Math.abs(value) < step / 1e6 ? 0 : value);
@@ -137,6 +151,10 @@ class Points {
     if (this.withAxes) {
       context.globalAlpha = 0.75;
       context.textAlign = "center";
+      context.globalAlpha = 0.1;
+      context.fillRect(edge.left, edge.top, x.strip * wide, high);
+      context.fillRect(edge.left, edge.top + (1 - y.strip) * high, wide, y.strip * high);
+      context.globalAlpha = 0.75;
       for (const value of x.ticks()) {
         const u = edge.left + x.place(value) * wide;
         context.fillText(tickText(value), u, edge.top + high + 14);
@@ -189,7 +207,7 @@ class Parallel {
       const axis = drag && this.axes[drag.k];
       if (!axis) return;
       const [low, high] = [Math.min(drag.from, drag.to), Math.max(drag.from, drag.to)];
-      brushed(axis.name, high - low < 0.02 ? null : [axis.at(low), axis.at(high)]);
+      brushed(axis.name, high - low < 0.02 ? null : axis.range(low, high));
     });
     this.redrawn = () => {};
   }
@@ -214,13 +232,9 @@ class Parallel {
       const i = listed[at];
       context.strokeStyle = colors[codes[i]];
       context.beginPath();
-      let open = false;
       axes.forEach((axis, k) => {
-        const v = axis.places[i];
-        if (Number.isNaN(v)) { open = false; return; }
-        const x = 20 + k * step, y = 10 + (1 - v) * tall;
-        if (open) context.lineTo(x, y); else context.moveTo(x, y);
-        open = true;
+        const x = 20 + k * step, y = 10 + (1 - axis.places[i]) * tall;
+        if (k) context.lineTo(x, y); else context.moveTo(x, y);
       });
       context.stroke();
     }
@@ -230,14 +244,15 @@ class Parallel {
     axes.forEach((axis, k) => {
       const x = 20 + k * step;
       context.fillStyle = words;
-      context.globalAlpha = 0.5; context.fillRect(x, 10, 1, tall); context.globalAlpha = 1;
+      context.globalAlpha = 0.5; context.fillRect(x, 10, 1, tall);
+      context.globalAlpha = 0.1; context.fillRect(x - 6, 10 + (1 - axis.strip) * tall, 13, axis.strip * tall); context.globalAlpha = 1;
       context.textAlign = k === 0 ? "left" : k === axes.length - 1 ? "right" : "center";
       const at = k === 0 ? 2 : k === axes.length - 1 ? width - 2 : x;
       context.fillText(clipped(context, titles[k], step * 1.02), at, height - 16 + (k % 2) * 12);
-      const drag = this.drag && this.drag.k === k ? [axis.at(Math.min(this.drag.from, this.drag.to)), axis.at(Math.max(this.drag.from, this.drag.to))] : null;
+      const drag = this.drag && this.drag.k === k ? axis.range(this.drag.from, this.drag.to) : null;
       const range = drag || ranges[axis.name];
       if (range) {
-        const [a, b] = range.map((value) => Math.min(1, Math.max(0, axis.place(value))));
+        const [a, b] = axis.span(range);
         context.globalAlpha = 0.35; context.fillRect(x - 6, 10 + (1 - b) * tall, 13, Math.max(2, (b - a) * tall)); context.globalAlpha = 1;
       }
     });

@@ -12,11 +12,13 @@ TEXTS = ("source", "scene", "name", "query", "estimator", "outcome", "diagnosis"
 """Sent as numbers of different texts."""
 ANSWERS = ("doubtful", "proven")
 """Yes, no or unknown; sent as texts."""
+UNITS = {None: "m", 1: "m", 0: "units"}
+"""Of a map's lengths, by whether it is metric; sent as the text ``units``."""
 NUMBERS = (
     *("created", "seed", "correspondences", "inliers", "outlier_rate", "rotation_error_deg", "translation_error_m"),
     *("time_ms", "steps", "key_step", "size_bytes", *FEATURES),
 )
-READ = ("file", "labels", "created", *TEXTS, *ANSWERS, *NUMBERS[1:])
+READ = ("file", "labels", "created", *TEXTS, *ANSWERS, "metric", *NUMBERS[1:])
 """Columns of the index that are needed."""
 DIGITS = 5
 """That a number is sent with: more than a plot or a table shows."""
@@ -31,6 +33,7 @@ def columns_json(columns: Mapping[str, Sequence[Any]], notes: Mapping[str, str],
     table["created"] = [_seconds(text) for text in columns["created"]]
     for name in ANSWERS:
         table[name] = [{None: "", 0: "no", 1: "yes"}[value] for value in columns[name]]
+    table["units"] = [UNITS[value] for value in columns["metric"]]
     table["key_step"] = [index + 1 for index in columns["key_step"]]
     drawn = run_map(columns)
     numbers = {name: [_short(value) for value in table[name]] for name in NUMBERS}
@@ -38,7 +41,7 @@ def columns_json(columns: Mapping[str, Sequence[Any]], notes: Mapping[str, str],
     answer = {
         "version": version,
         "files": list(columns["file"]),
-        "texts": {name: _coded(table[name]) for name in (*TEXTS, *ANSWERS)},
+        "texts": {name: _coded(table[name]) for name in (*TEXTS, *ANSWERS, "units")},
         "labels": _coded(columns["labels"]),
         "notes": dict(notes),
         "numbers": numbers,

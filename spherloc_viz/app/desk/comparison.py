@@ -22,10 +22,10 @@ KEYS: tuple[Callable[[RunRow], tuple[object, ...]], ...] = (
 """What makes two runs a pair; the first one counts by which most of the smaller set has a partner."""
 MEASURED: Mapping[str, str] = {
     "rotation_error_deg": "rotation error, deg",
-    "translation_error_m": "position error, m",
+    "translation_error_m": "position error, {unit}",
     "time_ms": "time, ms",
 }
-"""What is compared pair by pair."""
+"""What is compared pair by pair, and what it is called; ``unit`` is that of the maps."""
 
 
 @dataclass(frozen=True)
@@ -40,8 +40,8 @@ class Pair:
 class Change:
     """How a number of the pairs has changed."""
 
-    name: str
-    """Column of the runs."""
+    title: str
+    """What the number is called, with its unit."""
     pairs: int
     """In which both know it."""
     before: float
@@ -142,12 +142,14 @@ def _change(name: str, pairs: Sequence[Pair]) -> Change:
 
     values = [(getattr(pair.before, name), getattr(pair.after, name)) for pair in pairs]
     known = np.array([pair for pair in values if None not in pair], dtype=np.float64).reshape(-1, 2)
+    unit = " or ".join(sorted({pair.after.unit for pair in pairs}))
+    title = MEASURED[name].format(unit=unit)
     if not len(known):
-        return Change(name, 0, math.nan, math.nan, math.nan, math.nan)
+        return Change(title, 0, math.nan, math.nan, math.nan, math.nan)
     difference = known[:, 1] - known[:, 0]
     p = float(cast(Any, stats.wilcoxon(difference)).pvalue) if np.any(difference) else 1.0
     was, now = np.median(known, axis=0)
-    return Change(name, len(known), float(was), float(now), float(np.median(difference)), p)
+    return Change(title, len(known), float(was), float(now), float(np.median(difference)), p)
 
 
 _CONDITION = re.compile(r"\s*([a-z ]+?)\s*(<=|>=|<|>|=)\s*([0-9.]+(?:e-?[0-9]+)?)\s*(%?)\s*")

@@ -13,6 +13,7 @@ const WIDTHS = {
 const DEFAULT_KEYS = ["real failure", "bad map", "bad truth", "calibration", "repeated structure", "look again", "known", "fixed", "ignore"];
 const SEEN = "seen";
 const NEWS_MS = 15000;
+const STRIP_WORDS = "Runs whose value is unknown lie in the shaded strip.";
 const START = {
   search: "", chosen: {}, ranges: {}, lasso: null, only: null, pages: false, sort: "created", descending: true,
   columns: ["outcome", "diagnosis", "scene", "estimator", "outlier_rate", "rotation_error_deg", "translation_error_m", "position_sd_m", "certificate_gap", "time_ms", "labels"],
@@ -26,7 +27,7 @@ let runs, reviews, state = structuredClone(START);
 let fits, listed = new Int32Array(0), chosen = -1, anchor = -1;
 const marked = new Set(), unfolded = new Set(), allChips = new Set(), axes = new Map();
 let newsTimer = 0;
-let saved = { views: {}, sets: {} }, waiting = false;
+let saved = { views: {}, sets: {}, folders: [] }, waiting = false;
 const colors = [], hexes = [];
 let outcomeCodes;
 
@@ -50,7 +51,8 @@ function say(words, wrong = false) {
   if (!wrong) newsTimer = setTimeout(() => { news.hidden = true; }, NEWS_MS);
 }
 
-const title = (name) => (SETTINGS.columns[name] || [name])[0];
+// Lengths are told in the unit of the listed maps, of which some may have none.
+const title = (name) => (SETTINGS.columns[name] || [name])[0].replace("{unit}", runs.unit);
 
 // --- the state: in the address, so that a link and the browser's back button bring it back -------------------------
 
@@ -72,11 +74,12 @@ function readState(text) {
   const isText = (value) => typeof value === "string" && value.length < 400;
   const isNumber = (value) => typeof value === "number" && Number.isFinite(value);
   const spot = (value) => Array.isArray(value) && value.length === 2 && value.every(isNumber);
+  const isRange = (value) => Array.isArray(value) && (value.length === 2 || value.length === 3) && value.every(isNumber);
   if (isText(told.search)) found.search = told.search;
   for (const [name, values] of Object.entries(told.chosen || {})) {
     if ((name in runs.texts || name === "labels") && Array.isArray(values)) found.chosen[name] = values.filter(isText);
   }
-  for (const [name, range] of Object.entries(told.ranges || {})) if (name in runs.numbers && spot(range)) found.ranges[name] = range;
+  for (const [name, range] of Object.entries(told.ranges || {})) if (name in runs.numbers && isRange(range)) found.ranges[name] = range;
   if (Array.isArray(told.lasso) && told.lasso.length < 3000 && told.lasso.every(spot)) found.lasso = told.lasso;
   if (Array.isArray(told.only)) found.only = told.only.filter(isText);
   if (runs.has(told.sort)) found.sort = told.sort;
@@ -159,8 +162,8 @@ function drawChips() {
       "Runs that pages made while somebody played, and nobody labelled"));
   }
   const brushes = [];
-  for (const [name, [low, high]] of Object.entries(state.ranges)) {
-    brushes.push(chip(`${title(name)}: ${shown(name, low)} to ${shown(name, high)} ✕`, null, true, () => {
+  for (const [name, brushed] of Object.entries(state.ranges)) {
+    brushes.push(chip(`${title(name)}: ${shownRange(name, brushed)} ✕`, null, true, () => {
       const { [name]: gone, ...rest } = state.ranges;
       change({ ranges: rest });
     }, "Take this brush away"));
@@ -249,7 +252,7 @@ function makePlots() {
     const { [state.x]: x, [state.y]: y, ...rest } = state.ranges;
     if (!path) { change({ ranges: rest }); return; }
     const [from, to] = [path[0], path[path.length - 1]];
-    const range = (name, k) => [Math.min(from[k], to[k]), Math.max(from[k], to[k])].map((place) => axis(name).at(place));
+    const range = (name, k) => axis(name).range(from[k], to[k]);
     change({ ranges: { ...rest, [state.x]: range(state.x, 0), ...(state.x === state.y ? {} : { [state.y]: range(state.y, 1) }) } });
   }, false);
   map = new Points(byId("map"), false, (path) => {
@@ -267,11 +270,14 @@ function makePlots() {
 function drawPlots() {
   const x = axis(state.x), y = axis(state.y);
   const { [state.x]: rx, [state.y]: ry } = state.ranges;
-  const box = rx || ry ? [[rx ? x.place(rx[0]) : 0, ry ? y.place(ry[0]) : 0], [rx ? x.place(rx[1]) : 1, ry ? y.place(ry[1]) : 1]] : null;
+  const [across, up] = [rx ? x.span(rx) : [0, 1], ry ? y.span(ry) : [0, 1]];
+  const box = rx || ry ? [[across[0], up[0]], [across[1], up[1]]] : null;
   scatter.draw(x, y, fits, colors, outcomeCodes, chosen, box);
   const mx = axis("map_x"), my = axis("map_y");
   map.draw(mx, my, fits, colors, outcomeCodes, chosen, state.lasso && state.lasso.map(([u, v]) => [mx.place(u), my.place(v)]));
   const every = parallel.draw(AXES.map(axis), listed, hexes, outcomeCodes, state.ranges, AXES.map(title));
+  byId("plot-words").textContent = "Drag a box to list only the runs in it; click to take it away." +
+    (x.strip || y.strip ? ` ${STRIP_WORDS}` : "");
   byId("parallel-words").textContent = "Drag along an axis to brush." + (every > 1 ? ` One line in ${every} is drawn.` : "");
 }
 
@@ -316,7 +322,7 @@ function row(i) {
     const cell = element("span", { className: isNumber ? "number" : "", style: `width:${width(name)}px`, role: "gridcell" });
     if (name === "labels") for (const label of runs.labels[i]) cell.append(element("span", { className: "label", textContent: label }));
     else if (name === "outcome") cell.append(element("span", { className: "dot", style: `background:${SETTINGS.colors[value]}` }), value);
-    else cell.textContent = shown(name, name === "scene" ? short(value) : value);
+    else cell.textContent = shown(name, name === "scene" ? short(value) : value) + (runs.saysUnit(name, i) ? " units" : "");
     if (!isNumber) cell.title = cell.textContent;
     return cell;
   });
@@ -523,12 +529,14 @@ function sides() {
   const estimators = runs.texts.estimator.values.map((name) => ["estimator", name]);
   const sets = Object.keys(saved.sets).map((name) => ["set", name]);
   const now = [["listed", `the ${plural(listed.length, "listed run")}`], ...(marked.size ? [["marked", `the ${plural(marked.size, "marked run")}`]] : [])];
-  return [...now, ...sets, ...labels, ...estimators];
+  const folders = saved.folders.map(({ place, name }) => ["folder", place, name]);
+  return [...now, ...sets, ...labels, ...folders, ...estimators];
 }
 
 function sideOf(text) {
-  const [kind, name] = JSON.parse(text);
+  const [kind, name, words] = JSON.parse(text);
   if (kind === "set") return [{ set: name }, `set ${name}`];
+  if (kind === "folder") return [{ folder: name }, `folder ${words}`];
   const all = Array.from({ length: runs.count }, (_, i) => i);
   const which = kind === "label" ? all.filter((i) => runs.labels[i].includes(name))
     : kind === "estimator" ? [...listed].filter((i) => runs.value("estimator", i) === name)
@@ -536,25 +544,32 @@ function sideOf(text) {
   return [{ files: which.map((i) => runs.files[i]) }, kind === "label" ? `label ${name}` : kind === "estimator" ? `${name}, of the listed runs` : name];
 }
 
-function openCompare() {
-  for (const id of ["before", "after"]) {
-    byId(id).replaceChildren(...sides().map((side) => element("option", { value: JSON.stringify(side), textContent: side[0] === "listed" || side[0] === "marked" ? side[1] : `${side[0]} ${side[1]}` })));
-  }
-  byId("after").selectedIndex = Math.min(1, byId("after").options.length - 1);
+async function openCompare() {
   byId("compared").replaceChildren();
   byId("compare-dialog").showModal();
+  try { saved.folders = (await asked("/desk/folders")).folders; }
+  catch (error) { byId("compared").textContent = error.message; }
+  for (const id of ["before", "after"]) {
+    byId(id).replaceChildren(...sides().map((side) => element("option", { value: JSON.stringify(side), textContent: side[0] === "listed" || side[0] === "marked" ? side[1] : `${side[0]} ${side[2] || side[1]}` })));
+  }
+  byId("after").selectedIndex = Math.min(1, byId("after").options.length - 1);
 }
 
 async function doCompare() {
   const box = byId("compared");
   box.textContent = "Comparing …";
   const [before, beforeName] = sideOf(byId("before").value), [after, afterName] = sideOf(byId("after").value);
-  const side = (which, name) => (which.set ? { [`${name}_set`]: which.set } : { [name]: which.files });
+  const side = (which, name) => (which.files ? { [name]: which.files }
+    : which.set ? { [`${name}_set`]: which.set } : { [`${name}_folder`]: which.folder });
   try {
     const told = await done({ do: "compare", ...side(before, "before"), ...side(after, "after"), before_name: beforeName, after_name: afterName });
     const share = (right) => (told.judged ? `${count(right)} of ${count(told.judged)} (${((100 * right) / told.judged).toFixed(1)} %)` : "none can be judged");
-    const only = (files, words) => element("button", { textContent: `List the ${count(files.length)} ${words}`, disabled: !files.length,
-      onclick: () => { byId("compare-dialog").close(); change({ chosen: {}, ranges: {}, lasso: null, search: "", only: files }); } });
+    const here = after.folder ? 0 : 1; // which run of a pair is on this desk
+    const only = (pairs, words) => element("button", { textContent: `List the ${count(pairs.length)} ${words}`,
+      disabled: !pairs.length || Boolean(before.folder && after.folder), onclick: () => {
+        byId("compare-dialog").close();
+        change({ chosen: {}, ranges: {}, lasso: null, search: "", only: pairs.map((pair) => pair[here]) });
+      } });
     box.replaceChildren(
       element("p", {}, element("b", { id: "verdict", textContent: `${plural(told.broken.length, "new failure")}, ${count(told.mended.length)} mended` }),
         ` of ${plural(told.pairs, "pair")}; McNemar's exact test: p = ${told.p}`),
@@ -636,7 +651,7 @@ async function poll() {
 async function start() {
   try {
     await load();
-    saved = await asked("/desk/saved");
+    saved = { ...saved, ...await asked("/desk/saved") };
   } catch (error) { byId("counts").textContent = ""; say(error.message, true); return; }
   reviews = new Reviews(runs, () => { update(); drawLabelKeys(); }, say);
   state = readState(location.hash.slice(1));

@@ -25,6 +25,7 @@ COLUMNS = {
     "estimator": ("estimator", "Registered name"),
     "source": ("source", "Who ran it"),
     "title": ("title", "Of a curated case"),
+    "units": ("units", "m, or units where the map's scale is unknown"),
     "doubtful": ("doubtful", "Whether the diagnosis speaks against the pose"),
     "proven": ("proven", "Whether the certificate has no gap"),
     "labels": ("labels", "Words of a reviewer"),
@@ -34,7 +35,7 @@ COLUMNS = {
     "inliers": ("inliers", "Correspondences within the noise bound of the pose"),
     "outlier_rate": ("outlier rate", "Share of wrong correspondences, 0 to 1"),
     "rotation_error_deg": ("rotation error, °", "Against the true pose"),
-    "translation_error_m": ("position error, m", "Against the true pose, in the map's unit"),
+    "translation_error_m": ("position error, {unit}", "Against the true pose, in the map's unit"),
     "time_ms": ("time, ms", "Wall time of the estimator"),
     "steps": ("steps", "On the timeline"),
     "key_step": ("key step", "Where the run was decided, or went wrong"),
@@ -46,7 +47,7 @@ COLUMNS = {
     "tilt_deg": ("tilt, °", "Between the given gravity and the matches'"),
     "coverage": ("coverage", "Share of the directions with matches that have inliers"),
     "rotation_sd_deg": ("rotation sd, °", "Standard deviation in the worst direction"),
-    "position_sd_m": ("position sd, m", "Standard deviation in the worst direction, in the map's unit"),
+    "position_sd_m": ("position sd, {unit}", "Standard deviation in the worst direction, in the map's unit"),
 }
 """What each column is called, and what it is."""
 

@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from html import escape
 
 from spherloc_viz import style
-from spherloc_viz.app.desk.comparison import MEASURED, Change, Comparison, Pair, causes
+from spherloc_viz.app.desk.comparison import Change, Comparison, Pair, causes
 from spherloc_viz.app.review import words
 from spherloc_viz.app.review.rows import badge_html, label_html, picture_html
 from spherloc_viz.recording.run_row import RunRow
@@ -72,7 +72,7 @@ def _row(row: RunRow) -> str:
     result = [
         f"{row.inliers} of {row.correspondences} inliers",
         f"outliers {words.percent(row.outlier_rate)}",
-        f"{words.angle(row.rotation_error_deg)} · {words.distance(row.translation_error_m)}",
+        words.errors(row),
         words.duration(row.time_ms),
     ]
     review = "".join(map(label_html, row.labels)) + _note(row.note)
@@ -147,7 +147,7 @@ def comparison_text(comparison: Comparison, before: str, after: str) -> str:
     ]
     for change in comparison.changes:
         lines.append(
-            f"  {MEASURED[change.name]}: median {number(change.before)} -> {number(change.after)}, of the differences "
+            f"  {change.title}: median {number(change.before)} -> {number(change.after)}, of the differences "
             f"{number(change.difference)} (Wilcoxon, {_count(change.pairs, 'pair')}: p = {p_text(change.p)})"
         )
     for title, pairs in (("new failures", comparison.broken), ("mended", comparison.mended)):
@@ -181,7 +181,7 @@ def _share(part: int, whole: int) -> str:
 def _changes(changes: Sequence[Change]) -> str:
     heads = ("", "pairs", "median before", "median after", "median difference", "p (Wilcoxon)")
     body = "".join(
-        f"<tr><td>{escape(MEASURED[change.name])}</td><td>{change.pairs:,}</td><td>{number(change.before)}</td>"
+        f"<tr><td>{escape(change.title)}</td><td>{change.pairs:,}</td><td>{number(change.before)}</td>"
         f"<td>{number(change.after)}</td><td>{number(change.difference)}</td><td>{p_text(change.p)}</td></tr>"
         for change in changes
     )
@@ -206,9 +206,8 @@ def _pairs(title: str, pairs: Sequence[Pair], none: str) -> str:
 
 
 def _side(row: RunRow) -> str:
-    errors = f"{words.angle(row.rotation_error_deg)} · {words.distance(row.translation_error_m)}"
     return (
         f'<td class="wide">{picture_html(row.thumbnail, *PICTURE_PX)}{badge_html(row.outcome)} {escape(row.diagnosis)}'
-        f'<div class="dim">{row.inliers} of {row.correspondences} inliers · {escape(errors)}</div>'
+        f'<div class="dim">{row.inliers} of {row.correspondences} inliers · {escape(words.errors(row))}</div>'
         f"<code>{escape(row.file)}</code></td>"
     )

@@ -1,6 +1,8 @@
 "use strict";
 // All runs of the folder as columns: which of them fit the filters, in what order, and how many there are of each kind.
 
+const LENGTHS = ["translation_error_m", "position_sd_m"];
+const NOTHING = [1, 0]; // a range without known values
 
 class Runs {
   constructor(told) {
@@ -20,6 +22,8 @@ class Runs {
     this.axes = told.axes;
     this.fromPages = new Uint8Array(this.count);
     this.findPageRuns();
+    const units = new Set(Array.from(told.texts.units.codes, (code) => told.texts.units.values[code]));
+    this.unit = ["m", "units"].filter((unit) => units.has(unit)).join(" or ") || "m";
     this.index = new Map(told.files.map((file, i) => [file, i]));
     this.orders = new Map(); // by column: all runs in its order, unknown ones last
   }
@@ -32,6 +36,8 @@ class Runs {
     for (let i = 0; i < this.count; i++) this.pageRuns += this.fromPages[i] = Number(codes[i] === code && !this.labels[i].length);
   }
 
+  // Whether a length must say that it is not in metres, since others in its column are.
+  saysUnit(name, i) { return LENGTHS.includes(name) && this.unit.includes(" ") && this.value("units", i) === "units"; }
   isNumber(name) { return name in this.numbers; }
   has(name) { return name in this.numbers || name in this.texts || name === "labels" || name === "file"; }
 
@@ -62,10 +68,12 @@ class Runs {
       const codes = column.codes;
       for (let i = 0; i < this.count; i++) fits[i] &= wanted[codes[i]];
     }
-    for (const [name, [low, high]] of Object.entries(state.ranges)) {
+    for (const [name, [low, high, unknown]] of Object.entries(state.ranges)) {
       const values = this.numbers[name];
       if (!values) continue;
-      for (let i = 0; i < this.count; i++) if (!(values[i] >= low && values[i] <= high)) fits[i] = 0;
+      for (let i = 0; i < this.count; i++) {
+        if (!(values[i] >= low && values[i] <= high) && !(unknown && Number.isNaN(values[i]))) fits[i] = 0;
+      }
     }
     if (state.only) {
       const wanted = new Uint8Array(this.count);
@@ -175,6 +183,11 @@ function inside(polygon, x, y) {
     if ((yk > y) !== (yj > y) && x < ((xj - xk) * (y - yk)) / (yj - yk) + xk) odd = !odd;
   }
   return odd;
+}
+
+function shownRange(name, [low, high, unknown]) {
+  if (low > high) return "unknown";
+  return `${shown(name, low)} to ${shown(name, high)}${unknown ? ", or unknown" : ""}`;
 }
 
 function shown(name, value) {

@@ -85,7 +85,7 @@ def _title(title: str, row: RunRow) -> str:
 
 def _result(row: RunRow) -> str:
     """What came out of the recorded run, in a line, and what the diagnosis says."""
-    errors = errors_text(row.rotation_error_deg, row.translation_error_m)
+    errors = errors_of(row)
     facts = [f"{row.inliers}/{row.correspondences}", *([errors] if errors != words.UNKNOWN else [])]
     told = "".join(f' · <span style="white-space:nowrap">{fact}</span>' for fact in facts)
     line = f'{verdict_html(row)}<span style="{DIM}">{told}</span>'
@@ -101,17 +101,22 @@ def lines_of(row: RunRow, run: Run, diagnosis: Diagnosis | None) -> list[Line]:
     return [
         ("outcome", badge_html(row.outcome), badge_html(outcome(metrics))),
         ("diagnosis", escape(row.diagnosis or words.UNKNOWN), escape(cause)),
-        ("errors", errors_text(row.rotation_error_deg, row.translation_error_m), errors_text(turn, shift)),
+        ("errors", errors_of(row), errors_text(turn, shift, trace.problem.metric)),
         ("inliers", f"{row.inliers} of {row.correspondences}", f"{inliers} of {len(trace.problem)}"),
         ("time", words.duration(row.time_ms), words.duration(trace.timings_ms["total"])),
     ]
 
 
-def errors_text(rotation_deg: float | None, translation_m: float | None) -> str:
-    """Both errors of a pose."""
+def errors_of(row: RunRow) -> str:
+    """Both errors of a recorded run's pose."""
+    return errors_text(row.rotation_error_deg, row.translation_error_m, row.metric)
+
+
+def errors_text(rotation_deg: float | None, translation_m: float | None, metric: bool | None) -> str:
+    """Both errors of a pose; if it is known not to be ``metric``, the position's in units of the map."""
     if rotation_deg is None and translation_m is None:
         return words.UNKNOWN
-    return escape(f"{words.angle(rotation_deg)} · {words.distance(translation_m)}")
+    return escape(f"{words.angle(rotation_deg)} · {words.distance(translation_m, metric)}")
 
 
 def two_columns_html(lines: Sequence[Line], left: str, right: str) -> str:
@@ -202,8 +207,8 @@ def lines(one: RunRow, other: RunRow) -> list[Line]:
         ("diagnosis", escape(one.diagnosis or words.UNKNOWN), escape(other.diagnosis or words.UNKNOWN)),
         (
             "errors",
-            errors_text(one.rotation_error_deg, one.translation_error_m),
-            errors_text(other.rotation_error_deg, other.translation_error_m),
+            errors_of(one),
+            errors_of(other),
         ),
         ("inliers", f"{one.inliers} of {one.correspondences}", f"{other.inliers} of {other.correspondences}"),
         ("certificate", _proof(one), _proof(other)),

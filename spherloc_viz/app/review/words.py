@@ -34,9 +34,14 @@ def angle(degrees: float | None) -> str:
     return UNKNOWN if degrees is None else angle_text(degrees)
 
 
-def distance(metres: float | None) -> str:
-    """A position error."""
-    return UNKNOWN if metres is None else length(metres)
+def distance(metres: float | None, metric: bool | None) -> str:
+    """A position error; if it is known not to be ``metric``, in units of the map."""
+    return UNKNOWN if metres is None else length(metres, metric is not False)
+
+
+def errors(row: RunRow) -> str:
+    """Both errors of a run's pose."""
+    return f"{angle(row.rotation_error_deg)} · {distance(row.translation_error_m, row.metric)}"
 
 
 def duration(ms: float) -> str:

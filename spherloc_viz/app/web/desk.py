@@ -7,6 +7,7 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 
 from aiohttp import web
@@ -14,7 +15,8 @@ from aiohttp import web
 from spherloc.errors import InputError, RecordingError, SpherlocError, show
 from spherloc_viz.app.desk import files
 from spherloc_viz.app.desk.columns import READ, columns_json
-from spherloc_viz.app.desk.comparison import MEASURED, Pair, causes, compare
+from spherloc_viz.app.desk.comparison import Pair, causes, compare
+from spherloc_viz.app.desk.other_folders import OtherFolders
 from spherloc_viz.app.desk.page import desk_page
 from spherloc_viz.app.desk.report import comparison_html, number, p_text, summary_html
 from spherloc_viz.app.review import words
@@ -49,8 +51,10 @@ def is_desk(path: str) -> bool:
 class DeskRoom:
     """Answers requests for ``/desk...``; who asks has been checked at the door."""
 
-    def __init__(self, library: RunLibrary, downloads: Downloads) -> None:
+    def __init__(self, library: RunLibrary, downloads: Downloads, allowed: Sequence[Path] = ()) -> None:
+        """``allowed`` are the folders below which recordings may be compared with those of the library."""
         self._library, self._downloads = library, downloads
+        self._others = OtherFolders(library.folder, allowed)
         # Of its own: 100,000 runs take a second to be read, and presses on the playground's pages must not wait.
         self._threads = ThreadPoolExecutor(2, "spherloc-desk")
         self._lock = threading.Lock()
@@ -88,6 +92,8 @@ class DeskRoom:
             case "saved":
                 folder = self._library.folder
                 return _json({"views": files.views(folder), "sets": files.sets(folder)})
+            case "folders":
+                return _json({"folders": self._others.listed()})
             case "run":
                 return _json(self._run(request.query.get("run", "")))
             case "evidence":
@@ -133,7 +139,7 @@ class DeskRoom:
             "facts": [
                 f"{row.inliers:,} of {row.correspondences:,} inliers",
                 f"outliers {words.percent(row.outlier_rate)}",
-                f"{words.angle(row.rotation_error_deg)}, {words.distance(row.translation_error_m)} off",
+                f"{words.angle(row.rotation_error_deg)}, {words.distance(row.translation_error_m, row.metric)} off",
                 words.duration(row.time_ms),
                 f"{row.estimator}, seed {row.seed}",
                 f"{row.source}, {words.clock(row.created)}",
@@ -237,15 +243,16 @@ class DeskRoom:
             "brokenCauses": causes(found.broken),
             "p": p_text(found.p),
             "changes": [
-                [MEASURED[c.name], number(c.before), number(c.after), number(c.difference), p_text(c.p)]
-                for c in found.changes
+                [c.title, number(c.before), number(c.after), number(c.difference), p_text(c.p)] for c in found.changes
             ],
             "address": self._offer(name, comparison_html(found, before_name, after_name, now)),
             "name": name,
         }
 
     def _side(self, told: Mapping[str, Any], side: str) -> tuple[RunRow, ...]:
-        """The runs of one side: of files, or of a set by its name."""
+        """The runs of one side: of files, of a set by its name, or of another folder by its place."""
+        if f"{side}_folder" in told:
+            return self._others.rows(_text(told, f"{side}_folder"))
         if f"{side}_set" in told:
             path = files.set_path(self._library.folder, _text(told, f"{side}_set"))
             return self._library.rows(files.read_set(path))
@@ -268,8 +275,8 @@ class DeskRoom:
         return download.address
 
 
-def _files(pairs: Sequence[Pair]) -> list[str]:
-    return [pair.after.file for pair in pairs]
+def _files(pairs: Sequence[Pair]) -> list[tuple[str, str]]:
+    return [(pair.before.file, pair.after.file) for pair in pairs]
 
 
 def _page() -> web.Response:

@@ -108,7 +108,7 @@ class Viewable:
 
 
 def of_index(index: RunIndex) -> Callable[[str], Viewable]:
-    """Finds runs by the names of their files in an index's folder: those that it knows, and what passes examination.
+    """Finds runs by the names of their files in an index's folder: those examined before, and what passes examination.
 
     What it returns raises ``RecordingError`` for what is no recording there, or none of ours.
     """
@@ -119,7 +119,7 @@ def of_index(index: RunIndex) -> Callable[[str], Viewable]:
             state = path.stat()
         except OSError as error:  # it has gone since
             raise RecordingError(f"{file}: the recording cannot be read ({error.strerror}).") from None
-        return Viewable(path, index.get(file) or _examined(path, state.st_mtime_ns, state.st_size))
+        return Viewable(path, index.examined(file) or _examined(path, state.st_mtime_ns, state.st_size))
 
     return find
 

@@ -376,7 +376,7 @@ def _load(path: Path, content: list[str]) -> tuple[StoreEntry, dict[str, Chunk]]
     """Some chunks of a recording by their entities, if it has a format that we know."""
     entry, store = _open(path)
     chunks = {chunk.entity_path: chunk for chunk in store.stream().filter(content=content).to_chunks()}
-    version = read_properties(chunks[PROPERTIES])["format_version"]
+    version = read_properties(chunks[PROPERTIES].to_record_batch())["format_version"]
     if version not in range(OLDEST_VERSION, FORMAT_VERSION + 1):
         advice = f"this spherloc reads formats up to {FORMAT_VERSION}; install the one that wrote it"
         raise RecordingError(f"{path}: has format {version}, and {advice}.")
@@ -384,9 +384,9 @@ def _load(path: Path, content: list[str]) -> tuple[StoreEntry, dict[str, Chunk]]
 
 
 def _row(path: Path, entry: StoreEntry, chunks: Mapping[str, Chunk]) -> RunRow:
-    thumbnail = read_image(chunks[THUMBNAIL]) if THUMBNAIL in chunks else b""
+    thumbnail = read_image(chunks[THUMBNAIL].to_record_batch()) if THUMBNAIL in chunks else b""
     return row_from_properties(
-        read_properties(chunks[PROPERTIES]),
+        read_properties(chunks[PROPERTIES].to_record_batch()),
         file=path.name,
         run_id=entry.recording_id,
         size_bytes=path.stat().st_size,
@@ -405,13 +405,13 @@ def _run(path: Path, entry: StoreEntry, chunks: Mapping[str, Chunk]) -> Recorded
     listed = _row(path, entry, chunks)
     return RecordedRun(
         row=listed,
-        properties=read_properties(chunks[PROPERTIES]),
+        properties=read_properties(chunks[PROPERTIES].to_record_batch()),
         problem=problem_from_row(rows["problem"], str(path)),
         stages={name[len(STAGES) :]: row for name, row in rows.items() if name.startswith(STAGES)},
         certificate=None if found is None else certificate_from_row(found),
         origin=origin,
         scene_text=scene,
         diagnosis=None if told is None else diagnosis_from_row(told, listed),
-        query_image=read_image(chunks[QUERY_IMAGE]) if QUERY_IMAGE in chunks else None,
+        query_image=read_image(chunks[QUERY_IMAGE].to_record_batch()) if QUERY_IMAGE in chunks else None,
         **run,
     )

@@ -175,6 +175,7 @@ def run_row(
         time_ms=trace.timings_ms.get("total", 0.0),
         proven=None if certificate is None else certificate.proven,
         changes=_cut(changes_text(origin.variation)),
+        metric=problem.metric,
         **asdict(diagnosis.measures),
         title=_cut(origin.title),
         format_version=FORMAT_VERSION,
@@ -231,16 +232,15 @@ def _named(values: Mapping[str, Any]) -> list[Values]:
     ]
 
 
-def read_properties(chunk: Chunk) -> dict[str, Any]:
+def read_properties(batch: pa.RecordBatch) -> dict[str, Any]:
     """The values of a chunk of ``property_chunks`` by name."""
-    batch = chunk.to_record_batch()
     names = [name for name in batch.schema.names if pa.types.is_list(batch.column(name).type)]
     return {name: batch.column(name)[0].values[0].as_py() for name in names if len(batch.column(name)[0].values)}
 
 
-def read_image(chunk: Chunk) -> bytes:
+def read_image(batch: pa.RecordBatch) -> bytes:
     """The file in a chunk with an encoded image."""
-    column = chunk.to_record_batch().column("EncodedImage:blob")
+    column = batch.column("EncodedImage:blob")
     return column[0].values[0].values.to_numpy(zero_copy_only=False).tobytes()
 
 

@@ -19,7 +19,7 @@ FILE_NAME = "runs.sqlite"
 """In the folder of the recordings."""
 APPLICATION = 0x53504852
 """SQLite's mark for whose file it is: "SPHR"."""
-VERSION = 3
+VERSION = 4
 """Of the schema."""
 BUSY_S = 15.0
 """How long one waits for other writers, each of which takes milliseconds."""

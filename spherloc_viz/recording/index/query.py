@@ -43,7 +43,8 @@ def _definitions(names: Sequence[str]) -> str:
 
 
 SCHEMA = (
-    f"CREATE TABLE runs (id INTEGER PRIMARY KEY, {_definitions(MAIN)}, stamp TEXT NOT NULL) STRICT",
+    f"CREATE TABLE runs (id INTEGER PRIMARY KEY, {_definitions(MAIN)}, stamp TEXT NOT NULL, "
+    "examined INTEGER NOT NULL) STRICT",
     f"CREATE TABLE details (id INTEGER PRIMARY KEY REFERENCES runs ON DELETE CASCADE, {_definitions(DETAILS)}) STRICT",
     "CREATE TABLE words (id INTEGER PRIMARY KEY REFERENCES runs ON DELETE CASCADE, words TEXT NOT NULL) STRICT",
     "CREATE TABLE labels (label TEXT NOT NULL, id INTEGER NOT NULL REFERENCES runs ON DELETE CASCADE, "
@@ -53,11 +54,13 @@ SCHEMA = (
     "CREATE INDEX runs_by_time ON runs (created, file)",
     "CREATE INDEX runs_by_problem ON runs (problem_key)",
 )
-"""``stamp`` says which version of its files a row was read from; files that could not be read are ``skipped``."""
+"""``stamp`` says which version of its files a row was read from, ``examined`` whether they were read wholly or written
+here; files that could not be read are ``skipped``."""
 
+_STORED = (*MAIN, "stamp", "examined")
 _UPSERT = (
-    f"INSERT INTO runs ({', '.join(MAIN)}, stamp) VALUES ({', '.join('?' * (len(MAIN) + 1))}) "
-    f"ON CONFLICT (file) DO UPDATE SET {', '.join(f'{name} = excluded.{name}' for name in (*MAIN, 'stamp'))} "
+    f"INSERT INTO runs ({', '.join(_STORED)}) VALUES ({', '.join('?' * len(_STORED))}) "
+    f"ON CONFLICT (file) DO UPDATE SET {', '.join(f'{name} = excluded.{name}' for name in _STORED)} "
     "RETURNING id"
 )
 _REPLACE_DETAILS = f"INSERT OR REPLACE INTO details (id, {', '.join(DETAILS)}) VALUES (?{', ?' * len(DETAILS)})"
@@ -66,10 +69,10 @@ AT_ONCE = 500
 """Rows that one statement asks for."""
 
 
-def put(connection: sqlite3.Connection, row: RunRow, stamp: str) -> None:
+def put(connection: sqlite3.Connection, row: RunRow, stamp: str, examined: bool) -> None:
     """Insert a run, or replace the one of the same file."""
     values = {name: getattr(row, name) for name in _COLUMNS} | {"labels": json.dumps(row.labels)}
-    (run,) = connection.execute(_UPSERT, [*(values[name] for name in MAIN), stamp]).fetchone()
+    (run,) = connection.execute(_UPSERT, [*(values[name] for name in MAIN), stamp, examined]).fetchone()
     connection.execute(_REPLACE_DETAILS, [run, *(values[name] for name in DETAILS)])
     connection.execute("INSERT OR REPLACE INTO words VALUES (?, ?)", (run, words(row)))
     connection.execute("DELETE FROM labels WHERE id = ?", (run,))

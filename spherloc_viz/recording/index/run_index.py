@@ -1,19 +1,15 @@
 """The list of all runs of a folder: a database beside the recordings, which are the truth that it is made from."""
 
 import contextlib
-import os
 import sqlite3
 import threading
 import time
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
 from pathlib import Path
-from typing import Any, Protocol, Self, TypeVar
+from typing import Any, Self, TypeVar
 
 from spherloc.errors import InputError, RecordingError, show
-from spherloc_viz.given_files import REVIEW_SUFFIX
 from spherloc_viz.recording.index import file as index_file
 from spherloc_viz.recording.index.query import (
     AT_ONCE,
@@ -27,183 +23,22 @@ from spherloc_viz.recording.index.query import (
     put,
     rows_of,
 )
-from spherloc_viz.recording.reviews import UNREADABLE, Review, has_review, review_path, write_review
+from spherloc_viz.recording.index.refresher import (
+    Progress,
+    Read,
+    Refreshed,
+    Refresher,
+    Which,
+    examine_side_by_side,
+    list_side_by_side,
+    same_recording,
+    stamp_of,
+)
+from spherloc_viz.recording.reviews import Review, write_review
 from spherloc_viz.recording.run_row import RunRow
-from spherloc_viz.recording.sandbox.examiner import Examiners, check_name, examine, examine_all
+from spherloc_viz.recording.sandbox.examiner import Examiners, Result, check_name, examine
 
-Examine = Callable[[Sequence[Path]], Iterable[tuple[Path, RunRow | RecordingError]]]
-"""Reads recordings one after another: the row of each, or what is wrong with it."""
-Progress = Callable[[int, int], None]
-"""Is told how many of how many files are read."""
-Item = TypeVar("Item")
 T = TypeVar("T")
-
-BATCH = 20
-"""Rows that are written at once: others wait a few milliseconds."""
-MAX_WORKERS = 4
-"""Processes that read recordings, at 20 ms each."""
-WORTH_A_WORKER = 50
-"""Recordings for which it pays to start another process, which takes a second."""
-
-
-def examine_side_by_side(
-    paths: Sequence[Path], examiners: Examiners | None = None
-) -> Generator[tuple[Path, RunRow | RecordingError], None, None]:
-    """``examine_all`` by several processes at once, in the order of the paths; by one where there are few paths.
-
-    They end with this, or with their owner ``examiners``, which raises ``ExaminerError``.
-    """
-    workers = max(1, min(MAX_WORKERS, os.cpu_count() or 1, len(paths) // WORTH_A_WORKER))
-    with ThreadPoolExecutor(workers) as threads, (examiners or Examiners()).start(workers) as started:
-        readers = [examine_all(paths[k::workers], started[k]) for k in range(workers)]
-        # Whoever leaves early, as by Ctrl-C, ends the processes first and waits for no file.
-        answers = [threads.submit(next, reader, None) for reader in readers]
-        for number in range(len(paths)):
-            k = number % workers
-            answer = answers[k].result()
-            assert answer is not None
-            answers[k] = threads.submit(next, readers[k], None)
-            yield answer
-
-
-@dataclass(frozen=True)
-class Refreshed:
-    """What reading the files has changed."""
-
-    read: int
-    """Runs that are new, or read again."""
-    removed: int
-    """Runs whose files are gone."""
-    skipped: tuple[tuple[str, str], ...]
-    """Files that are no runs, or whose labels cannot be read, each with a sentence that says why; those found at an
-    earlier time too."""
-
-
-def stamp_of(path: Path) -> str:
-    """Which version of a recording and its review lies there; empty if there is none."""
-    parts = []
-    for file in (path, review_path(path)):
-        try:
-            status = file.stat()
-        except OSError:
-            parts.append("")
-        else:
-            parts.append(f"{status.st_mtime_ns}:{status.st_size}")
-    return " ".join(parts) if parts[0] else ""
-
-
-def files_of(folder: Path) -> dict[str, str]:
-    """Every recording of the folder and of its gallery, by name, with its stamp. Raises ``OSError``."""
-    found: dict[str, str] = {}
-    for place in ("", "gallery/"):
-        inside = folder / place
-        if place and not inside.is_dir():
-            continue
-        for path in inside.iterdir():
-            name = path.name.lower()
-            if name.endswith(".rrd") and not name.endswith(REVIEW_SUFFIX) and (stamp := stamp_of(path)):
-                found[place + path.name] = stamp
-    return found
-
-
-class Write(Protocol):
-    """Runs something in a transaction of its own."""
-
-    def __call__(self, work: Callable[[sqlite3.Connection], T], /) -> T: ...
-
-
-class Refresher:
-    """Brings the tables up to date with the files of a folder."""
-
-    def __init__(self, folder: Path, write: Write, examine: Examine) -> None:
-        self._folder = folder
-        self._write = write
-        self._examine = examine
-
-    def refresh(self, everything: bool, progress: Progress) -> Refreshed:
-        """Read what is new or has changed, or all; the list stays usable meanwhile.
-
-        Raises ``RecordingError`` if the folder cannot be read.
-        """
-        try:
-            files = files_of(self._folder)
-        except OSError as error:
-            reason = error.strerror or error
-            raise RecordingError(f"{self._folder}: the folder cannot be read ({reason}); check it.") from error
-        known = self._write(_known)
-        removed = self._write(lambda connection: self._forget(connection, known.keys() - files.keys()))
-        new = sorted(file for file, stamp in files.items() if everything or known.get(file) != stamp)
-        wanted = [file for file in new if _misnamed(file) is None]
-        misnamed = [(file, error) for file in new if (error := _misnamed(file)) is not None]
-        self._write(lambda connection: self._store(connection, misnamed, files))
-        read = done = 0
-        progress(done, len(wanted))
-        results = self._examine([self._folder / file for file in wanted])
-        with contextlib.closing(results) if isinstance(results, Generator) else contextlib.nullcontext():
-            for batch in _batches(zip(wanted, (result for _, result in results), strict=True)):
-                read += self._write(lambda connection, batch=batch: self._store(connection, batch, files))
-                done += len(batch)
-                progress(done, len(wanted))
-        return Refreshed(read, removed, self._write(_skipped))
-
-    def _forget(self, connection: sqlite3.Connection, files: Iterable[str]) -> int:
-        """Forget files that are gone, and return how many of them were runs."""
-        # A file may have come since the folder was looked at, and its writer has listed it.
-        gone = [(file,) for file in files if _misnamed(file) is not None or not (self._folder / file).exists()]
-        connection.executemany("DELETE FROM skipped WHERE file = ?", gone)
-        return connection.executemany("DELETE FROM runs WHERE file = ?", gone).rowcount if gone else 0
-
-    def _store(
-        self,
-        connection: sqlite3.Connection,
-        batch: Sequence[tuple[str, RunRow | RecordingError]],
-        stamps: Mapping[str, str],
-    ) -> int:
-        """Store what was found in some files, and return how many of them are runs."""
-        runs = 0
-        for file, result in batch:
-            path, stamp = self._folder / file, stamps[file]
-            if stamp_of(path) != stamp:
-                continue  # rewritten, labelled or deleted meanwhile, by somebody who has listed that
-            if isinstance(result, RecordingError):
-                name = file.encode(errors="backslashreplace").decode()  # on a disk it need not be Unicode
-                connection.execute("DELETE FROM runs WHERE file = ?", (name,))
-                _skip(connection, name, stamp, str(result))
-                continue
-            put(connection, replace(result, file=file), stamp)
-            runs += 1
-            if has_review(path) and not result.labels and not result.note:
-                _skip(connection, file, stamp, f"{review_path(path)}: {UNREADABLE}")
-        return runs
-
-
-def _misnamed(file: str) -> RecordingError | None:
-    """What is wrong with the name of a file, if it cannot be that of a recording."""
-    try:
-        check_name(file)
-    except RecordingError as error:
-        return error
-    return None
-
-
-def _known(connection: sqlite3.Connection) -> dict[str, str]:
-    """Files that were read before, with their stamps."""
-    return dict(connection.execute("SELECT file, stamp FROM skipped UNION SELECT file, stamp FROM runs"))
-
-
-def _skip(connection: sqlite3.Connection, file: str, stamp: str, sentence: str) -> None:
-    connection.execute("INSERT OR REPLACE INTO skipped VALUES (?, ?, ?)", (file, stamp, sentence))
-
-
-def _skipped(connection: sqlite3.Connection) -> tuple[tuple[str, str], ...]:
-    return tuple(connection.execute("SELECT file, sentence FROM skipped ORDER BY file"))
-
-
-def _batches(items: Iterable[Item]) -> Iterator[list[Item]]:
-    remaining = iter(items)
-    while batch := list(islice(remaining, BATCH)):
-        yield batch
-
 
 MAX_TRIES = 4
 """With a database that gets damaged or set aside meanwhile."""
@@ -253,7 +88,7 @@ class RunIndex:
         self._read(lambda connection: None)
 
     def add(self, row: RunRow) -> None:
-        """Add a run, or replace the one of the same file."""
+        """Add a run whose recording was written or examined here, or replace the one of the same file."""
         self.add_all([row])
 
     def add_all(self, rows: Sequence[RunRow]) -> None:
@@ -262,7 +97,7 @@ class RunIndex:
 
         def work(connection: sqlite3.Connection) -> None:
             for row, stamp in zip(rows, stamps, strict=True):
-                put(connection, row, stamp)
+                put(connection, row, stamp, examined=True)
 
         self._write(work)
 
@@ -278,6 +113,17 @@ class RunIndex:
             return next(iter(rows_of(connection, ids)), None)
 
         return self._read(work)
+
+    def examined(self, file: str) -> RunRow | None:
+        """The run of a file whose whole content has been examined, or was written here, and is still the same."""
+        sql = "SELECT id, stamp FROM runs WHERE file = ? AND examined"
+
+        def work(connection: sqlite3.Connection) -> tuple[RunRow, str] | None:
+            found = connection.execute(sql, (file,)).fetchone()
+            return None if found is None else (rows_of(connection, [found[0]])[0], found[1])
+
+        found = self._read(work)
+        return found[0] if found is not None and same_recording(found[1], stamp_of(self.folder / file)) else None
 
     def of_files(self, files: Sequence[str]) -> tuple[RunRow, ...]:
         """The runs of these files, in their order, without those that are not known."""
@@ -386,15 +232,16 @@ class RunIndex:
         path = self.folder / check_name(file)
 
         def work(connection: sqlite3.Connection) -> Review | None:
-            found = connection.execute("SELECT id, run_id, stamp FROM runs WHERE file = ?", (file,)).fetchone()
+            sql = "SELECT id, run_id, stamp, examined FROM runs WHERE file = ?"
+            found = connection.execute(sql, (file,)).fetchone()
             if found is None or not path.is_file():
                 raise RecordingError(f"{path}: there is no such run; spherloc runs lists those that there are.")
-            if found[2].partition(" ")[0] != stamp_of(path).partition(" ")[0]:
+            if not same_recording(found[2], stamp_of(path)):
                 return None
             # Written while we alone may write, so that file and database agree on who was last.
             review = write_review(path, labels, note, run_id=found[1])
             (before,) = rows_of(connection, [found[0]])
-            put(connection, replace(before, labels=review.labels, note=review.note), stamp_of(path))
+            put(connection, replace(before, labels=review.labels, note=review.note), stamp_of(path), found[3])
             return review
 
         for _ in range(MAX_TRIES):
@@ -404,33 +251,39 @@ class RunIndex:
             self.add(replace(examine(path), file=file))
         raise RecordingError(f"{path}: another program keeps changing the file; end it and try again.")
 
-    def refresh(self, progress: Progress | None = None, examine: Examine | None = None) -> Refreshed:
-        """Read new and changed recordings of the folder, and forget those that are gone.
+    def refresh(self, progress: Progress | None = None, read: Read | None = None) -> Refreshed:
+        """List new and changed recordings of the folder, and forget those that are gone.
 
-        ``progress`` is told how many of how many are read. Files that are no runs are skipped and named in the answer.
+        Of a file its start is read, where it says what is listed. ``progress`` is told how many of how many are read.
+        Files that are no runs are skipped and named in the answer.
         """
-        return self._refresh(False, progress, examine)
+        return self._refresh("new", progress, read or (lambda paths: list_side_by_side(paths, self.examiners)))
 
-    def rebuild(self, progress: Progress | None = None, examine: Examine | None = None) -> Refreshed:
-        """Read all recordings of the folder again, after a check of the database."""
+    def examine(self, progress: Progress | None = None, read: Read | None = None) -> Refreshed:
+        """Refresh the list, and read the recordings wholly of which only the start has been read."""
+        return self._refresh("unexamined", progress, read or self._examine)
+
+    def rebuild(self, progress: Progress | None = None, read: Read | None = None) -> Refreshed:
+        """Read all recordings of the folder wholly, after a check of the database."""
         with self._lock:
             if self._read(lambda connection: connection.execute("PRAGMA quick_check(1)").fetchone()) != ("ok",):
                 self._set_aside("is damaged", self._file)
-        return self._refresh(True, progress, examine)
+        return self._refresh("all", progress, read or self._examine)
 
-    def _refresh(self, everything: bool, progress: Progress | None, examine: Examine | None) -> Refreshed:
-        refresher = Refresher(
-            self.folder, self._write, examine or (lambda paths: examine_side_by_side(paths, self.examiners))
-        )
+    def _examine(self, paths: Sequence[Path]) -> Iterable[tuple[Path, Result]]:
+        return examine_side_by_side(paths, self.examiners)
+
+    def _refresh(self, which: Which, progress: Progress | None, read: Read) -> Refreshed:
+        refresher = Refresher(self.folder, self._write, read)
         with self._refreshing:
             for _ in range(MAX_TRIES):
                 self._read(lambda connection: None)
                 opened = self._opened
-                refreshed = refresher.refresh(everything, progress or (lambda done, total: None))
+                refreshed = refresher.refresh(which, progress or (lambda done, total: None))
                 if self._opened == opened:  # a database that is set aside takes the rows with it
                     self.stale = False
                     return refreshed
-                everything = False
+                which = "new"
         raise self._damaged_again()
 
     def close(self) -> None:

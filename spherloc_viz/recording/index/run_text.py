@@ -102,6 +102,12 @@ def number_text(value: float | None) -> str:
     return f"{value:.3f}" if value < 10.0 else f"{value:.1f}" if value < 1e5 else f"{value:.0e}"
 
 
+def _position_error(row: RunRow) -> str:
+    """Metres; those of a map whose units are unknown say so."""
+    text = number_text(row.translation_error_m)
+    return text if row.metric is not False or row.translation_error_m is None else f"{text} {row.unit}"
+
+
 _COLUMNS: dict[str, tuple[Callable[[RunRow], str], str]] = {
     "Run": (lambda row: row.title or row.name, "<"),
     "Estimator": (lambda row: row.estimator, "<"),
@@ -110,7 +116,7 @@ _COLUMNS: dict[str, tuple[Callable[[RunRow], str], str]] = {
     "Inliers": (lambda row: f"{row.inliers}/{row.correspondences}", ">"),
     "Outliers": (lambda row: "-" if row.outlier_rate is None else f"{100 * row.outlier_rate:.0f} %", ">"),
     "deg off": (lambda row: number_text(row.rotation_error_deg), ">"),
-    "m off": (lambda row: number_text(row.translation_error_m), ">"),
+    "m off": (_position_error, ">"),
     "ms": (lambda row: f"{row.time_ms:.0f}", ">"),
 }
 

@@ -2,8 +2,9 @@
 
 It reads questions, one a line, ``{"path": "...", "want": "row"}``, and answers each with two lines of JSON:
 ``{"begun": true}``, then ``{"row": {...}}`` or ``{"error": "..."}``. What can be wanted is a row with labels and note,
-a ``bare row`` without, or only the ``review``. Its memory, its processor time a file and what it may write are limited
-where the system can do that; it may die of a file.
+a ``bare row`` without, or only the ``review``. ``{"paths": [...], "want": "rows"}`` asks what many files say of
+themselves: ``{"rows": [...]}`` has null for those that must be asked for one by one. Its memory, its processor time a
+question and what it may write are limited where the system can do that; it may die of a file.
 """
 
 import json
@@ -22,8 +23,9 @@ from rerun.error_utils import RerunWarning
 
 from spherloc.errors import RecordingError, SpherlocError
 from spherloc_viz.recording.content.data import check_recording, read_recording
+from spherloc_viz.recording.content.head import read_head
 from spherloc_viz.recording.content.properties import APPLICATION_ID
-from spherloc_viz.recording.reviews import read_review
+from spherloc_viz.recording.reviews import has_review, read_review
 from spherloc_viz.recording.run_row import RunRow
 from spherloc_viz.recording.sandbox.checks import check_content, check_run, row_from_table, table_from_row
 
@@ -36,7 +38,7 @@ FILE_LIMIT_BYTES = 512 << 20
 MEMORY_LIMIT_BYTES = 640 << 20
 """Beyond what the child takes before the first file."""
 TIME_LIMIT_S = 20
-"""Processor time a file; a good one takes a hundredth of a second."""
+"""Processor time a question; a good file takes a hundredth of a second."""
 IDLE_LIMIT_S = 60
 """After so long without a question it ends."""
 
@@ -69,6 +71,8 @@ def _say(answers: IO[str], answer: dict[str, Any]) -> None:
 
 
 def _answer(question: dict[str, Any]) -> dict[str, Any]:
+    if question["want"] == "rows":
+        return {"rows": [_told(Path(path)) for path in question["paths"]]}
     path = Path(question["path"])
     try:
         if question["want"] == "review":
@@ -96,6 +100,19 @@ def _examined(path: Path, with_review: bool) -> dict[str, Any]:
     table = table_from_row(_reviewed(run.row, path) if with_review else run.row)
     row_from_table(table, path)
     return table
+
+
+def _told(path: Path) -> dict[str, Any] | None:
+    """The row as the start of the file tells it, with labels and note; None where more of it must be read."""
+    try:
+        _check_file(path)
+        row = read_head(path)
+        if row is None or not has_review(path):
+            return None if row is None else table_from_row(row)
+        review = read_review(path)
+        return table_from_row(replace(row, labels=review.labels, note=review.note))
+    except Exception:  # what is wrong with it is said when it is asked for alone
+        return None
 
 
 def _reviewed(row: RunRow, path: Path) -> RunRow:

@@ -13,7 +13,8 @@ import re
 import subprocess
 import sys
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, Self
 
@@ -23,8 +24,10 @@ from spherloc_viz.recording.reviews import UNREADABLE, Review, checked_review, h
 from spherloc_viz.recording.run_row import RunRow
 from spherloc_viz.recording.sandbox.checks import row_from_table
 
-LINE_LIMIT_BYTES = 1 << 21
-"""Of an answer: a row has a thumbnail of some kilobytes."""
+LINE_LIMIT_BYTES = 1 << 22
+"""Of an answer: a row has a thumbnail of some kilobytes, and an answer up to ``AT_ONCE`` rows."""
+AT_ONCE = 100
+"""Files that are asked for with one question."""
 FRUGAL = ("OPENBLAS_NUM_THREADS", "RAYON_NUM_THREADS", "TOKIO_WORKER_THREADS", "MALLOC_ARENA_MAX")
 """How many threads there are; they reserve address space, which the child has little of."""
 
@@ -171,11 +174,29 @@ class Examiner:
         """
         path = path.absolute()  # the child stays in the folder in which it was started
         with self._lock:
-            answer = self._ask(path, "row")
+            answer = self._ask({"path": str(path), "want": "row"})
             if answer is None and has_review(path):
                 # It may be the labels beside it that the child died of.
-                answer = self._ask(path, "bare row")
+                answer = self._ask({"path": str(path), "want": "bare row"})
         return row_from_table(_wanted(answer, path, "row"), path)
+
+    def told(self, paths: Sequence[Path]) -> list[RunRow | None]:
+        """What recordings say of themselves at the start of their files; None for those that must be examined.
+
+        Fifty times as fast as ``examine``: a row has the right form, but nothing says that the rest of its file is
+        whole, fits it, or is safe to be read. Raises ``ExaminerError`` only.
+        """
+        with self._lock:
+            answer = self._ask({"paths": [str(path.absolute()) for path in paths], "want": "rows"})
+        tables = (answer or {}).get("rows")
+        if not isinstance(tables, list) or len(tables) != len(paths):
+            return [None] * len(paths)  # it died of one of them
+        rows: list[RunRow | None] = []
+        for table, path in zip(tables, paths, strict=True):
+            rows.append(None)
+            with contextlib.suppress(RecordingError):
+                rows[-1] = row_from_table(table, path.absolute())
+        return rows
 
     def examine_review(self, path: Path) -> Review:
         """Labels and note of a recording, whose file is safe to be read in this process.
@@ -184,16 +205,15 @@ class Examiner:
         """
         path = path.absolute()
         with self._lock:
-            answer = self._ask(path, "review")
+            answer = self._ask({"path": str(path), "want": "review"})
         table = _wanted(answer, review_path(path), "review")
         try:
             return checked_review(table["labels"], table["note"])
         except (InputError, TypeError, LookupError, AttributeError):
             raise RecordingError(f"{review_path(path)}: {UNREADABLE}") from None
 
-    def _ask(self, path: Path, want: str) -> dict[str, Any] | None:
-        """What the child says; None if it dies or hangs of the file."""
-        question = {"path": str(path), "want": want}
+    def _ask(self, question: dict[str, Any]) -> dict[str, Any] | None:
+        """What the child says; None if it dies or hangs of it."""
         if self._child is not None and not self._child.begin(question, BEGIN_LIMIT_S):
             self._end()  # it had nothing to do for a minute
         if self._child is None:
@@ -271,21 +291,36 @@ def examine_review(path: Path) -> Review:
     return _shared.examine_review(Path(path))
 
 
-def examine_all(
-    paths: Iterable[Path], examiner: Examiner | None = None
-) -> Iterator[tuple[Path, RunRow | RecordingError]]:
-    """Examine many recordings one after another: their rows, or what is wrong with them.
+@dataclass(frozen=True)
+class Told:
+    """A row that a recording says of itself, while the rest of the file is still to be examined."""
 
-    By ``examiner``, or one that ends with this. Raises ``ExaminerError`` only.
-    """
-    with Examiner() if examiner is None else contextlib.nullcontext(examiner) as reader:
-        for path in paths:
-            try:
-                yield path, reader.examine(path)
-            except ExaminerError:
-                raise
-            except RecordingError as error:
-                yield path, error
+    row: RunRow
+    """Of the right form."""
+
+
+Result = RunRow | Told | RecordingError
+"""The row of an examined recording, one that is only told, or what is wrong with the file."""
+
+
+def examine_all(paths: Sequence[Path], examiner: Examiner) -> list[tuple[Path, RunRow | RecordingError]]:
+    """Examine recordings one after another: their rows, or what is wrong with them. Raises ``ExaminerError`` only."""
+    return [(path, _result(path, examiner)) for path in paths]
+
+
+def list_all(paths: Sequence[Path], examiner: Examiner) -> list[tuple[Path, Result]]:
+    """What recordings tell of themselves; those that tell nothing are examined. Raises ``ExaminerError`` only."""
+    told = zip(paths, examiner.told(paths), strict=True)
+    return [(path, _result(path, examiner) if row is None else Told(row)) for path, row in told]
+
+
+def _result(path: Path, examiner: Examiner) -> RunRow | RecordingError:
+    try:
+        return examiner.examine(path)
+    except ExaminerError:
+        raise
+    except RecordingError as error:
+        return error
 
 
 class Examiners:
