@@ -141,6 +141,7 @@ def diagnose(
     *,
     matches: OptionalPath = None,
     camera: OptionalPath = None,
+    model: OptionalPath = None,
     gravity: OptionalPath = None,
     map_down: tuple[float, float, float] = (0.0, 0.0, -1.0),
     bound_px: OptionalFloat = None,
@@ -165,19 +166,22 @@ def diagnose(
 
     spherloc diagnose poses.csv --matches matches.csv --camera camera.yaml --gravity gravity.txt
 
+    spherloc diagnose outputs/results.txt_logs.pkl --model outputs/sfm --label hloc
+
     spherloc rerun recordings --label hloc --estimator mc-exact
 
     Args:
-        poses: A CSV with the columns name, qw, qx, qy, qz, tx, ty, tz; hloc's results (lines of the same); or the
-            folder of a COLMAP model.
+        poses: A CSV with the columns name, qw, qx, qy, qz, tx, ty, tz; hloc's results (lines of the same); hloc's log
+            (.pkl), which has the matches too, so that no scene is needed; or the folder of a COLMAP model.
         scenes: Scene files whose queries they are: of a map with images (hloc, COLMAP and others), or matches in a CSV
             (kind "correspondences"), named by the problem, its image or the file. None with --matches.
         matches: The matches of all queries instead of scenes: a CSV with the columns name, u, v (px), X, Y, Z, and
             inlier (0 or 1) where that is known.
         camera: The calibration file of these queries.
+        model: The COLMAP model of the map, for a log of hloc without scenes.
         gravity: Where down is in these queries: rows of "image gx gy gz [sd_deg]". Without it the given poses say so,
             to within 5 degrees.
-        map_down: With --matches, the vector that points down in the map.
+        map_down: With --matches or a log, the vector that points down in the map.
         bound_px: Bound on the noise of an inlier, px; the scene's, or 3, if not given.
         label: A label for all of these runs.
         json: Print one JSON object a pose, on one line; infinity is the text "inf".
@@ -191,9 +195,14 @@ def diagnose(
 
     if not poses.exists():
         raise InputError(f"{poses}: no such file; give a file of poses, or the folder of a COLMAP model.")
-    if not scenes and matches is None:
+    from spherloc.formats.hloc_log import is_log
+
+    logged = not scenes and matches is None and is_log(poses)
+    if model is not None and not logged:
+        raise InputError("--model goes with hloc's log (.pkl) only, without scenes and without --matches.")
+    if not scenes and matches is None and not logged:
         raise InputError("no scene given; name the scene files whose queries the poses are of, or give --matches.")
-    if (matches is None) != (camera is None) or (matches is None and gravity is not None):
+    if (matches is None) != (camera is None) or (matches is None and gravity is not None and not logged):
         raise InputError("--matches, the matches of all queries, needs --camera, and these go with --matches only.")
     files = [scene_path(scene) for scene in scenes]
     for file in files:
@@ -207,6 +216,14 @@ def diagnose(
 
     kept = Records(recordings, keep_gigabytes=keep_gigabytes) if record else None
     tables = []
+    if logged:
+        from spherloc.datasets.match_table import read_logged_matches
+        from spherloc_viz.progress import say
+
+        table, wrong = read_logged_matches(poses, model, gravity, map_down)
+        for error in wrong:
+            say(f"{error} It is left out.")
+        tables = [table]
     if matches is not None and camera is not None:
         from spherloc.datasets.match_table import read_match_table
 

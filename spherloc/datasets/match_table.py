@@ -1,4 +1,4 @@
-"""Matches of many queries in one CSV, with one camera, as another pipeline writes them beside its poses."""
+"""Matches of many queries as another pipeline writes them beside its poses: one CSV with one camera, or hloc's log."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -11,6 +11,8 @@ from spherloc.cameras.calibration import load_camera
 from spherloc.datasets.correspondences import read_csv_of_queries
 from spherloc.datasets.query_gravity import read_gravity_file
 from spherloc.errors import InputError, ProblemError
+from spherloc.formats.colmap_files import read_model
+from spherloc.formats.hloc_log import LoggedQuery, read_log
 from spherloc.frontend.view import Gravity
 from spherloc.problem import Problem
 from spherloc.types import BoolArray, FloatArray
@@ -23,14 +25,14 @@ STATED_BOUND_RAD = float(np.radians(3.0))
 
 @dataclass(frozen=True, eq=False)
 class MatchTable:
-    """What a CSV of matches, a calibration file and, if there is one, a gravity file say."""
+    """What a CSV of matches and a calibration file say, or a log of hloc, and, if there is one, a gravity file."""
 
     path: Path
-    """The CSV."""
+    """The CSV or the log."""
     matches: Mapping[str, tuple[FloatArray, BoolArray | None]]
     """Rows u, v (px), X, Y, Z (N, 5) and the mask of right ones (N,), if it is known, by the name of the query."""
-    camera: Camera
-    """Of all queries."""
+    cameras: Mapping[str, Camera]
+    """By the name of the query."""
     gravity: Mapping[str, Gravity] | None
     """By the name of the query; None takes it from the poses."""
     gravity_map: FloatArray
@@ -56,7 +58,7 @@ class MatchTable:
             raise InputError(f"{name}: has no row in the gravity file; add one.")
         return Problem(
             name=name,
-            camera=self.camera,
+            camera=self.cameras[name],
             pixels=rows[:, :2],
             points=rows[:, 2:],
             gravity_camera=gravity.down,
@@ -75,9 +77,36 @@ def read_match_table(path: Path, camera: Path, gravity: Path | None, gravity_map
     ``gravity_map`` (3,) points down in the map and may have any length. Raises ``InputError`` or ``CalibrationError``
     for what cannot be read.
     """
+    matches, one = read_csv_of_queries(path), load_camera(camera)
+    return _table(path, matches, dict.fromkeys(matches, one), gravity, gravity_map)
+
+
+def read_logged_matches(
+    path: Path, model: Path | None, gravity: Path | None, gravity_map: tuple[float, ...]
+) -> tuple[MatchTable, tuple[InputError, ...]]:
+    """The matches in hloc's log of queries that were localized, and what is wrong with those that cannot be used.
+
+    ``model`` is the folder of the map's COLMAP model, which newer logs need. Raises ``InputError`` as
+    ``read_match_table`` does.
+    """
+    told = read_log(path, None if model is None else read_model(model))
+    queries = {name: query for name, query in told.items() if isinstance(query, LoggedQuery)}
+    matches = {name: (np.hstack([query.pixels, query.points]), None) for name, query in queries.items()}
+    cameras = {name: query.camera for name, query in queries.items()}
+    wrong = tuple(query for query in told.values() if isinstance(query, InputError))
+    return _table(path, matches, cameras, gravity, gravity_map), wrong
+
+
+def _table(
+    path: Path,
+    matches: Mapping[str, tuple[FloatArray, BoolArray | None]],
+    cameras: Mapping[str, Camera],
+    gravity: Path | None,
+    gravity_map: tuple[float, ...],
+) -> MatchTable:
     down = np.array(gravity_map, dtype=np.float64)
     length = float(np.linalg.norm(down))
     if not 1e-3 < length < 1e6:
         raise InputError(f"the map's gravity has the length {length:.3g}; give a vector that points down.")
     stated = None if gravity is None else read_gravity_file(gravity)
-    return MatchTable(path, read_csv_of_queries(path), load_camera(camera), stated, down / length)
+    return MatchTable(path, matches, cameras, stated, down / length)

@@ -1,4 +1,4 @@
-"""Poses that other programs found: hloc's results, a CSV, or a COLMAP model."""
+"""Poses that other programs found: hloc's results or log, a CSV, or a COLMAP model."""
 
 import csv
 import io
@@ -8,25 +8,25 @@ from spherloc.errors import InputError, show
 from spherloc.files import is_folder, read_file, reading
 from spherloc.formats.colmap_files import read_model
 from spherloc.formats.hloc_files import read_results
+from spherloc.formats.hloc_log import is_log, read_log_poses
 from spherloc.formats.text_rows import pose_from_words
 from spherloc.types import FloatArray
 
 NUMBERS = ("qw", "qx", "qy", "qz", "tx", "ty", "tz")
 MAX_BYTES = 200_000_000
-PICKLES = (".pkl", ".pickle")
 
 
 def read_poses(path: Path) -> dict[str, FloatArray]:
     """Poses ``cam_from_map`` (3, 4) by the name of their image.
 
     From a CSV with the columns name, qw, qx, qy, qz, tx, ty, tz in any order among others, from hloc's lines
-    ``name qw qx qy qz tx ty tz``, or from the folder of a COLMAP model. Raises ``InputError``, which names the line,
-    for what is none of these.
+    ``name qw qx qy qz tx ty tz``, from hloc's log, or from the folder of a COLMAP model. Raises ``InputError``, which
+    names the line, for what is none of these.
     """
     if is_folder(path):
         return {name: image.cam_from_map for name, image in read_model(path).images.items()}
-    if path.suffix.lower() in PICKLES:
-        raise InputError(f"{path}: is a pickle, which could run code; give hloc's results instead, a text of poses.")
+    if is_log(path):
+        return read_log_poses(path)
     if path.suffix.lower() != ".csv":
         return read_results(path)
     return _read_csv(path)

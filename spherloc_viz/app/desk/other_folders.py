@@ -12,11 +12,11 @@ from spherloc_viz.recording.index.run_index import RunIndex
 from spherloc_viz.recording.run_row import RunRow
 from spherloc_viz.recording.storage.store import GALLERY
 
-MOST_LOOKED_INTO = 2_000
+MAX_LOOKED_INTO = 2_000
 """Folders that are searched for recordings."""
-MOST_DEPTH = 5
+MAX_DEPTH = 5
 """Of a folder below one that may be opened."""
-MOST_OFFERED = 200
+MAX_OFFERED = 200
 
 
 class OtherFolders:
@@ -31,10 +31,10 @@ class OtherFolders:
         found: list[dict[str, str]] = []
         looked_into = 0
         for root in self._roots.folders:
-            for folder in _folders(root, MOST_DEPTH):
+            for folder in _folders(root, MAX_DEPTH):
                 looked_into += 1
                 place = self._roots.place(folder)
-                if looked_into > MOST_LOOKED_INTO or len(found) == MOST_OFFERED:
+                if looked_into > MAX_LOOKED_INTO or len(found) == MAX_OFFERED:
                     return found
                 if (
                     folder != self._own

@@ -27,9 +27,9 @@ from spherloc_viz.recording.content.properties import (
 )
 from spherloc_viz.recording.run_row import RunRow
 
-HEAD_BYTES = 1 << 16
+MAX_HEAD_BYTES = 1 << 16
 """Of a file that are read: three times what its properties take."""
-UNPACKED_BYTES = 1 << 20
+MAX_UNPACKED_BYTES = 1 << 20
 """Of one chunk; the properties take 20 kB."""
 _START, _OPTIONS, _END = b"RRF2", bytes([1, 2, 0, 0]), b"RRF2FOOT"
 """Of a file; its options are LZ4 and protobuf; a whole one ends with the last and four more bytes."""
@@ -49,7 +49,7 @@ def read_head(path: Path) -> RunRow | None:
     """
     with path.open("rb") as file:
         size = os.fstat(file.fileno()).st_size
-        start = file.read(HEAD_BYTES)
+        start = file.read(MAX_HEAD_BYTES)
         file.seek(max(0, size - 12))
         end = file.read(12)
     if start[:4] != _START or start[8:12] != _OPTIONS or end[:8] != _END:
@@ -96,7 +96,7 @@ def _messages(start: memoryview) -> Iterator[memoryview]:
 
 def _unpacked(fields: dict[int, Any]) -> tuple[pa.RecordBatch, str]:
     """The chunk of a message, and what it is of."""
-    if fields[2] != _LZ4 or fields[3] > UNPACKED_BYTES:
+    if fields[2] != _LZ4 or fields[3] > MAX_UNPACKED_BYTES:
         raise _OtherError
     with pa.ipc.open_stream(pa.decompress(fields[5], fields[3], codec="lz4_raw")) as stream:
         batch = stream.read_next_batch()
