@@ -75,7 +75,8 @@ def _shapes(item: SceneItem, eye: _Eye) -> Iterator[Shape]:
                 ((x, y),) = eye.pixels(item.position[None])
                 if 0 < x < WIDTH and 0 < y < HEIGHT:
                     # Words stand before everything.
-                    yield -depth, f'<text x="{x:.1f}" y="{y:.1f}" fill="#222">{escape(item.text)}</text>'
+                    look = 'fill="#222" stroke="#fff" stroke-width="3" paint-order="stroke"'
+                    yield -depth, f'<text x="{x:.1f}" y="{y:.1f}" {look}>{escape(item.text)}</text>'
 
 
 def _discs(
