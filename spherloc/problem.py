@@ -63,6 +63,9 @@ class Problem:
     """What the front end expects from the statistics of its matches, 0 to 1; a rough guess."""
     remarks: tuple[str, ...] = ()
     """What the loader and the front end skipped and why, in sentences."""
+    verified_without_point: int = 0
+    """Matches between the query and its references that agree with one motion, but have no point in the map, counted
+    where few have one: more than there are correspondences, the map is too sparse."""
     metric: bool = True
     """Whether the map's lengths are metres. If not, whatever is told in metres is in the map's own units, whose size
     is unknown."""
@@ -81,6 +84,9 @@ class Problem:
         if not isinstance(self.metric, bool):
             raise ProblemError(f"{self.name}: metric is {self.metric!r}; give true or false.")
         _scalar(self, "bound_px", MIN_PX, MAX_PX, f"{MIN_PX:g} to {MAX_PX:,.0f} pixels")
+        lacking = self.verified_without_point
+        if isinstance(lacking, bool) or not isinstance(lacking, int) or lacking < 0:
+            raise ProblemError(f"{self.name}: verified_without_point is {show(lacking)}; give a count from 0.")
         _scalar(self, "estimated_outlier_rate", 0.0, 1.0, "a share from 0 to 1")
         _check_reach(self.name, "points reach", points)
         if self.truth_cam_from_map is not None:

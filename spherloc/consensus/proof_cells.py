@@ -8,7 +8,7 @@ import numpy as np
 
 from spherloc.consensus.pair_arcs import CIRCLE, direction_of_turn
 from spherloc.consensus.pose_cells import CELL_SIZE, HALF_ANGLES, HALF_C, HALF_S, YAW, has_tilt, place_cell
-from spherloc.consensus.pose_search import sort_matches
+from spherloc.consensus.pose_search import FORM, sort_matches
 from spherloc.consensus.stabbing import deepest, keep_possible
 from spherloc.kernel_cache import kernel
 from spherloc.watch import DONE, stopped
@@ -42,6 +42,7 @@ def prove_cells(matches, chart, ends, claim, switch_rad, memory, cells, board):
     spans[0, 1] = count
     waiting, used = 1, 0
     axis = (chart - 1) // 2 if chart > 0 else -1
+    no_forms = np.empty((0, FORM))
     cell, spread, reach, spare = np.empty(CELL_SIZE), np.empty(2), np.empty(6), np.empty(count, np.int32)
     while waiting > 0:
         if stopped(board) or used + 2 * len(scratch.windows) + 8 > len(about):
@@ -56,9 +57,9 @@ def prove_cells(matches, chart, ends, claim, switch_rad, memory, cells, board):
         fits = len(lists) - last >= last - first
         target = lists[last:] if fits else np.empty(last - first, np.int32)
         if narrow == 1:
-            sure, undecided, _ = sort_matches(matches, cell, axis, lists[first:last], target, -1, reach)
+            sure, undecided, _ = sort_matches(matches, cell, axis, lists[first:last], target, no_forms, -1, reach)
             if known + sure + undecided <= claim:
-                bound, more, _ = sort_matches(matches, cell, axis, everybody, spare, -1, reach)
+                bound, more, _ = sort_matches(matches, cell, axis, everybody, spare, no_forms, -1, reach)
                 bound += more
                 if bound <= claim:
                     used = _put(cells, used, lo[waiting], up[waiting], LINEAR, bound)

@@ -152,6 +152,7 @@ class MapScene:
             reference_pixels=matches.reference_pixels,
             estimated_outlier_rate=matches.estimated_outlier_rate,
             remarks=(*self.remarks, *matches.remarks, *said),
+            verified_without_point=matches.verified_without_point,
         )
         if view.cam_from_map is None:
             return problem

@@ -19,6 +19,9 @@ class Cause(StrEnum):
     WRONG_REFERENCE = "wrong reference image"
     """No match is right. Without the truth: no pose stands out, though there are so many matches that a right
     reference image would have given one."""
+    MAP_TOO_SPARSE = "map too sparse"
+    """The reference image is the right one, for many matches with it agree with one motion of the camera; but hardly
+    any of them has a point in the map."""
     GRAVITY_OFF = "gravity prior off"
     """Gravity is off by more than its bound, or than the refinement is told to allow for, and by more than the noise
     bound in the image."""

@@ -67,6 +67,8 @@ def without_truth(e: Evidence) -> Cause:
             return Cause.GRAVITY_OFF
         if e.found(2.0) >= SPREAD * max(1, free, best):
             return Cause.BOUND_TOO_SMALL
+    if not believed and map_is_sparse(e, best):
+        return Cause.MAP_TOO_SPARSE
     if not believed:
         expected = int(MIN_RIGHT_RATE * len(e.aligned.points))
         return Cause.WRONG_REFERENCE if stands_out(e, expected) else Cause.TOO_FEW_INLIERS
@@ -81,6 +83,8 @@ def without_truth(e: Evidence) -> Cause:
 def with_truth(e: Evidence, t: Truth) -> Cause:
     """The cause, given the true pose and which matches are right."""
     right = int(np.count_nonzero(t.right))
+    if not stands_out(e, right) and map_is_sparse(e, right):
+        return Cause.MAP_TOO_SPARSE
     if right < 2:
         return Cause.WRONG_REFERENCE
     if not stands_out(e, right):
@@ -108,6 +112,11 @@ def with_truth(e: Evidence, t: Truth) -> Cause:
 def stands_out(e: Evidence, size: int) -> bool:
     """Whether a consensus of that size is more than chance gives."""
     return size >= LEAST and e.nfa(size) < CHANCE
+
+
+def map_is_sparse(e: Evidence, right: int) -> bool:
+    """Whether more matches than are ``right`` are verified between the images, but have no point in the map."""
+    return e.verified_without_point > right
 
 
 def undetermined(rotation_sd_rad: float, position_sd_m: float) -> bool:

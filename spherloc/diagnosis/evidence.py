@@ -207,6 +207,8 @@ class Evidence:
     """Standard deviation of the best pose's rotation, though the matches that it hangs on most be wrong."""
     position_sd_m: float
     """The same of its position."""
+    verified_without_point: int
+    """See ``Problem``."""
 
     def nfa(self, size: int, wider: float = 1.0, fixed_by: int = 2) -> float:
         """Expected number of false alarms (NFA) of that size within ``wider`` times the bound.
@@ -276,6 +278,7 @@ def gather(trace: Trace) -> Evidence:
         free_tilt_sd_rad=np.inf if free is None else _free_tilt_sd(aligned, free, bound_px),
         rotation_sd_rad=sd[0],
         position_sd_m=sd[1],
+        verified_without_point=trace.problem.verified_without_point,
     )
 
 

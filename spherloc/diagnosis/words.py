@@ -14,6 +14,7 @@ ADVICE = {
     Cause.TOO_FEW_INLIERS: "Get more right matches: more features, a stricter matcher, or more reference images.",
     Cause.FALSE_CONSENSUS: "Look at both poses; take out matches to structure that repeats, or decide by a prior.",
     Cause.WRONG_REFERENCE: "Retrieve other reference images; no estimator can help with these matches.",
+    Cause.MAP_TOO_SPARSE: "Give the references depth, or more points to the map where the query looks.",
     Cause.GRAVITY_OFF: "Correct the known roll and pitch, or state a larger gravity bound and standard deviation.",
     Cause.BOUND_TOO_SMALL: "Raise bound_px to about three standard deviations of the noise, or calibrate better.",
     Cause.DEGENERATE: "Add matches elsewhere in the image and at other depths; until then do not trust the pose.",
@@ -81,6 +82,9 @@ def _summary(e: Evidence, truth: Truth | None, cause: Cause, other: Fit | None, 
             return f"Only {best} of {total} matches agree with any pose, no more than chance gives."
         case Cause.WRONG_REFERENCE:
             return f"None of {total} matches seems right: {best} agree with the best pose, no more than chance gives."
+        case Cause.MAP_TOO_SPARSE:
+            lacking = e.verified_without_point
+            return f"{lacking} matches agree between the images but have no point in the map; {total} have one."
         case Cause.FALSE_CONSENSUS if truth is not None:
             return f"A wrong pose explains more than the true one: {best} of {total} matches against {second}."
         case Cause.FALSE_CONSENSUS:

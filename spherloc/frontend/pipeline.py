@@ -16,6 +16,7 @@ from spherloc.frontend.feature_kinds import KINDS
 from spherloc.frontend.features import FeatureOptions, Features, extract
 from spherloc.frontend.matching import MatchOptions, match, right_shares, wrong_matches
 from spherloc.frontend.triangulation import TriangulationLift
+from spherloc.frontend.two_view import verified
 from spherloc.frontend.view import Matcher, Matches, Report, View
 from spherloc.geometry import camera_centre
 from spherloc.types import BoolArray, FloatArray
@@ -78,6 +79,8 @@ SAME_POINT = 0.02
 """Points of two references are one if they are closer than this share of their distance to the first of them."""
 SHORTLIST = 2
 """Times as many references are matched as stay: matches tell better than retrieval which see the same place."""
+FEW_LIFTED = 100
+"""Correspondences below which it is counted how many right matches have no point in the map."""
 VOCABULARY_IMAGES = 64
 """The words are learnt from so many references, spread over all."""
 
@@ -127,7 +130,7 @@ class ImageMatcher:
                 continue
             if isinstance(reference.lift, TriangulationLift):
                 remarks += reference.lift.remarks
-        return _joined(found, tried, self.options.references, remarks)
+        return _joined(query, found, tried, self.options.references, remarks)
 
     def prepare(self, report: Report) -> None:
         """Describe all references, if there are so many that retrieval has to choose."""
@@ -233,8 +236,13 @@ class _Found:
     reference_pixels: FloatArray
     wrong: float | None
     """How many of them are probably wrong, if anything is known of it."""
-    matches: int
-    """Before lifting."""
+    unlifted: tuple[FloatArray, FloatArray]
+    """(K, 2) pixels in the query and in the reference of the matches without a point in the map."""
+
+    @property
+    def matches(self) -> int:
+        """Before lifting."""
+        return len(self.pixels) + len(self.unlifted[0])
 
 
 def _correspondences(query: Features, reference: View, options: FrontendOptions) -> _Found:
@@ -254,20 +262,32 @@ def _correspondences(query: Features, reference: View, options: FrontendOptions)
         points=points[lifted],
         reference_pixels=reference_pixels[lifted],
         wrong=wrong,
-        matches=len(matches),
+        unlifted=(query.pixels[matches.query_index[~lifted]], reference_pixels[~lifted]),
     )
 
 
-def _joined(found: Sequence[_Found], tried: Sequence[View], most: int, remarks: list[str]) -> Matches:
+def _verified_unlifted(query: View, part: _Found) -> int:
+    """Matches without a point in the map that agree with the motion between the query and the reference."""
+    lifted, lacking = (part.pixels, part.reference_pixels), part.unlifted
+    bearings, seen = query.camera.unproject(np.concatenate([lifted[0], lacking[0]]))
+    others, seen_there = part.reference.camera.unproject(np.concatenate([lifted[1], lacking[1]]))
+    both = seen & seen_there
+    lacks = np.arange(len(both)) >= len(lifted[0])
+    return int(np.count_nonzero(verified(bearings[both], others[both]) & lacks[both]))
+
+
+def _joined(query: View, found: Sequence[_Found], tried: Sequence[View], most: int, remarks: list[str]) -> Matches:
     """What ``most`` references at most gave, those with the most correspondences."""
     found = sorted(found, key=lambda part: -len(part.pixels))[:most]
     ranked = [part for part in found if len(part.pixels)]
     total, lifted = sum(part.matches for part in found), sum(len(part.pixels) for part in found)
+    lacking = sum(_verified_unlifted(query, part) for part in found) if lifted < min(total, FEW_LIFTED) else 0
     if lifted < total:
-        remarks.append(f"{total - lifted:,} of {total:,} matches have no point in the map.")
+        but = f", though {lacking:,} of these agree with the motion between two images" if lacking else ""
+        remarks.append(f"{total - lifted:,} of {total:,} matches have no point in the map{but}.")
     if not ranked:
-        none = np.empty((0, 2))
-        return Matches(none, np.empty((0, 3)), tuple(tried[:most]), np.empty(0, np.int64), none, None, tuple(remarks))
+        none, nobody = np.empty((0, 2)), np.empty(0, np.int64)
+        return Matches(none, np.empty((0, 3)), tuple(tried[:most]), nobody, none, None, tuple(remarks), lacking)
     pixels = np.concatenate([part.pixels for part in ranked])
     points = np.concatenate([part.points for part in ranked])
     index = np.repeat(np.arange(len(ranked)), [len(part.pixels) for part in ranked])
@@ -281,6 +301,7 @@ def _joined(found: Sequence[_Found], tried: Sequence[View], most: int, remarks: 
         reference_pixels=np.concatenate([part.reference_pixels for part in ranked])[keep],
         estimated_outlier_rate=_outlier_rate(ranked, int(keep.sum())),
         remarks=tuple(remarks),
+        verified_without_point=lacking,
     )
 
 

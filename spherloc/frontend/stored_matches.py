@@ -71,6 +71,7 @@ class StoredMatches:
                     references=tuple(views[name] for name in one["references"]),
                     estimated_outlier_rate=one["outlier_rate"],
                     remarks=tuple(one["remarks"]),
+                    verified_without_point=one.get("verified_without_point", 0),
                     **{name: np.asarray(column[rows], _TYPES[name]) for name, column in columns.items()},
                 )
             return found
@@ -92,6 +93,7 @@ def write_matches(path: Path, key: str, found: Iterable[tuple[str, Matches]]) ->
                 "references": [view.name for view in matches.references],
                 "outlier_rate": matches.estimated_outlier_rate,
                 "remarks": list(matches.remarks),
+                "verified_without_point": matches.verified_without_point,
             }
         )
         for column, rows in columns.items():

@@ -131,6 +131,9 @@ class Matches:
     """0 to 1, guessed from the statistics of the matches."""
     remarks: tuple[str, ...] = ()
     """What was skipped and why, in sentences."""
+    verified_without_point: int = 0
+    """Matches that agree with the motion between the query and a reference, but have no point in the map; counted only
+    where few have one."""
 
 
 Report = Callable[[int, int], None]

@@ -18,7 +18,7 @@ from spherloc.consensus.pose_cells import (
     pose_of,
     whole_domain,
 )
-from spherloc.consensus.pose_search import sort_matches
+from spherloc.consensus.pose_search import CUT_BINS, FORM, cut_cell, sort_matches
 from spherloc.consensus.positions import search_positions
 from spherloc.consensus.stabbing import EVERYWHERE, deepest, keep_possible, scratch_for
 from spherloc.geometry import pose
@@ -64,7 +64,7 @@ def test_every_pose_is_in_one_of_the_charts(rng, scene_of):
 @pytest.mark.parametrize("bound_rad", [0.0, TILT_RAD])
 def test_many_poses_obey_the_bounds_of_their_cells(rng, scene_of, bound_rad):
     """What a cell excludes no pose of it explains, what it is sure of each explains, yaws are in their intervals."""
-    checked = decided = 0
+    checked = decided = cut = better = 0
     for seed in range(48):
         aligned, truth = tilted(scene_of, seed % 12, bound_rad)
         matches, count = pack_matches(aligned, BOUND_PX), len(aligned.points)
@@ -85,8 +85,14 @@ def test_many_poses_obey_the_bounds_of_their_cells(rng, scene_of, bound_rad):
         place_cell(chart, lower, upper, cell)
         everybody = np.arange(count, dtype=np.int32)
         axis = (chart - 1) // 2 if chart else -1
-        sure, undecided, _ = sort_matches(matches, cell, axis, everybody, kept, -1, reach)
+        forms = np.empty((count, FORM))
+        sure, undecided, _ = sort_matches(matches, cell, axis, everybody, kept, forms, -1, reach)
         open_ones = np.isin(everybody, kept[:undecided])
+        known = pose_of(matches, chart, np.clip(at, lower, upper))
+        cutoff = max(0, np.count_nonzero(open_ones & (residuals_px(aligned, known) <= BOUND_PX)) - 1)
+        left_lower, left_upper, steps = lower.copy(), upper.copy(), np.empty(CUT_BINS + 1, np.int32)
+        most, share = cut_cell(forms[:undecided], left_lower, left_upper, steps, cutoff, reach)
+        cut += share < 0.5
         scratch = scratch_for(count)
         possible = np.empty(count, np.int32)
         many, free = keep_possible(matches, cell, everybody, possible, scratch, -1, spread)
@@ -96,12 +102,16 @@ def test_many_poses_obey_the_bounds_of_their_cells(rng, scene_of, bound_rad):
         mates = []
         for k in range(90):
             share = rng.uniform(0, 1, AXES) if k % 3 else rng.integers(0, 2, AXES)
-            here = lower + share * (upper - lower)
+            here = np.minimum(lower + share * (upper - lower), upper)
             if k % 5 == 0 and (lower <= at).all() and (at <= upper).all():
                 here = at
             explained = residuals_px(aligned, pose_of(matches, chart, here)) <= BOUND_PX
             mates.append(explained)
             assert np.count_nonzero(explained) <= min(sure + undecided, depth)
+            if np.count_nonzero(explained[open_ones]) > cutoff:
+                better += 1
+                assert np.count_nonzero(explained[open_ones]) <= most
+                assert (left_lower <= here).all() and (here <= left_upper).all(), "a pose that explains more is cut off"
             checked += count
             turn = turn_of(here[3:4])[0]
             inside = (turn - starts) % CIRCLE <= np.where(ends < EVERYWHERE, (ends - starts) % CIRCLE, CIRCLE) + 1e-12
@@ -109,7 +119,7 @@ def test_many_poses_obey_the_bounds_of_their_cells(rng, scene_of, bound_rad):
         always = np.all(mates, axis=0) & ~open_ones
         assert np.count_nonzero(always) >= sure, "what is surely explained is not"
         assert not np.any(np.any(mates, axis=0) & ~open_ones & ~always), "what is surely not explained is"
-    assert checked >= 140_000 and decided >= 140
+    assert checked >= 140_000 and decided >= 140 and cut >= 5 and better >= 50, (cut, better)
 
 
 @pytest.mark.parametrize("seed", [0, 3, 9, 13, 17, 19, 26, 30, 31, 33, 36, 44])

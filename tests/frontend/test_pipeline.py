@@ -9,6 +9,7 @@ import pytest
 from textured_rooms import FISHEYE, MEI, PANORAMA, room_view, standing, wallpaper
 
 from spherloc.datasets.map_scene import MapScene
+from spherloc.diagnosis import Cause, diagnose
 from spherloc.errors import InputError, ProblemError
 from spherloc.estimators import estimate
 from spherloc.frontend.features import FeatureOptions, extract
@@ -151,6 +152,27 @@ def test_references_that_cannot_be_used_are_remarked_and_skipped(references, que
     assert matches.references == (good,)
     for view, reason in zip(bad, ("damaged", "damaged", "200", "no such file", "depth, lidar"), strict=True):
         assert any(view.name in remark and reason in remark for remark in matches.remarks), (view.name, matches.remarks)
+
+
+def test_a_map_with_hardly_a_point_is_told_from_a_wrong_reference(references, queries, folder):
+    """The right reference matches, but eight of its features have points; of another room none matches rightly."""
+    right = references["fisheye"]
+    wrong = room_view(folder, "elsewhere", FISHEYE, standing(0.0, 0.0, 0.0), wallpaper(2))
+    causes = []
+    for reference in (right, wrong):
+        pixels = extract(reference, FeatureOptions(max_features=700)).pixels
+        lifted = reference.lift(pixels)[1]
+        few = np.flatnonzero(lifted)[slice(8) if reference is right else slice(None, None, 2)]
+        sparse = replace(reference, lift=SfmLift(pixels[few], reference.lift(pixels[few])[0]))
+        problem = map_scene([sparse], [queries["fisheye"]]).problem()
+        trace = estimate(problem, "ransac-2p")
+        causes.append([diagnose(trace, use_truth).cause for use_truth in (True, False)])
+        if reference is right:
+            assert problem.verified_without_point > 10 * len(problem), (problem.verified_without_point, len(problem))
+            assert any("agree with the motion between two images" in remark for remark in problem.remarks)
+        else:
+            assert problem.verified_without_point == 0
+    assert causes[0] == [Cause.MAP_TOO_SPARSE] * 2 and Cause.MAP_TOO_SPARSE not in causes[1], causes
 
 
 def test_nothing_usable_gives_no_matches_and_one_sentence(queries, folder):
