@@ -1,5 +1,5 @@
 # Everything is installed into .venv by scripts/setup.sh; `make help` says the rest.
-SCENE ?= scenes/mei_outliers_80.toml
+SCENE ?= scenes/street_dusk_panorama.toml
 PORT ?=
 ARGS ?=
 PYTHON ?= python3

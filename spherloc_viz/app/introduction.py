@@ -32,7 +32,8 @@ MOMENTS: tuple[Moment, ...] = (
         ("outcome",),
         "The pose, and your turn",
         "Green matches agree with the pose, red ones do not. Walk through the steps with Next and Previous, click a "
-        "dot to ask why it was rejected, drag a slider on the right: it is solved anew while you drag.",
+        "dot to ask why it was rejected, drag a slider on the right: it is solved anew while you drag. Presets are "
+        "simulations in which you choose how many matches are wrong.",
     ),
 )
 BY_SAMPLES = {

@@ -355,7 +355,7 @@ def circle(centre: FloatArray, radius_m: float) -> FloatArray:
 
 
 def ball_boxes(centers: FloatArray, radii_m: FloatArray) -> FloatArray:
-    """Boxes (K, 3) around balls (B, 3), (B,): around all of a few; of more, around the denser half.
+    """Points (K, 3) to all sides of balls (B, 3), (B,): of all of a few; of more, of the denser half.
 
     These are the balls nearest to the median of the smaller half: a ball as large as the map holds it all in it.
     """
@@ -365,5 +365,5 @@ def ball_boxes(centers: FloatArray, radii_m: FloatArray) -> FloatArray:
         near = np.argsort(away, kind="stable")[: max(FEW_BALLS, len(away) // 2)]
     else:
         near = np.arange(len(radii_m))
-    reach = radii_m[near, None]
-    return np.vstack([centers[near] - reach, centers[near] + reach])
+    # Not two corners of a box: seen along its diagonal they are one.
+    return np.vstack([sphere_box(centers[ball], float(radii_m[ball])) for ball in near])
