@@ -80,6 +80,11 @@ def camera_centre(cam_from_map: FloatArray) -> FloatArray:
     return -cam_from_map[:, :3].T @ cam_from_map[:, 3]
 
 
+def inverse_pose(cam_from_map: FloatArray) -> FloatArray:
+    """The pose (3, 4) that undoes one (3, 4)."""
+    return pose(cam_from_map[:, :3].T, camera_centre(cam_from_map))
+
+
 def transform(cam_from_map: FloatArray, points: FloatArray) -> FloatArray:
     """Points (N, 3) of the map in the camera frame."""
     return points @ cam_from_map[:, :3].T + cam_from_map[:, 3]

@@ -106,6 +106,7 @@ def localize(
     /,
     *,
     estimator: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], arg(metavar="NAME[,OPTION=VALUE...]")] = (),
+    initialise: OptionalText = None,
     seed: int = 0,
     option: Settings = (),
     queries: Annotated[tuple[str, ...], arg(metavar="NAME|FIRST:LAST:STEP ...")] = (),
@@ -119,8 +120,9 @@ def localize(
 
     Every finished query is safe in the output folder at once: stop it when you like, the same command goes on. The
     folder gets results.csv and results.jsonl (a row a query), trajectory.tum and truth.tum (camera poses in the map),
-    trajectory.png (coloured by error), summary.json (success rates at the scene's limits, ATE, RPE),
-    configuration.json, and a recording of each query. Several scenes or estimators have a folder each in it, and get
+    vehicle.tum (those of the vehicle or device, where the dataset has the camera's place on it), trajectory.png
+    (coloured by error), summary.json (success rates at the scene's limits, ATE, RPE), configuration.json, and a
+    recording of each query. Several scenes or estimators have a folder each in it, and get
     comparison.csv and .md and a picture a scene with all trajectories. Ends with 0 if every query is localized, 1 if
     one is doubtful or has no pose, 2 if an input is wrong.
 
@@ -132,6 +134,8 @@ def localize(
 
     spherloc localize my_scene.toml --queries left/0001.png left/0002.png --no-record
 
+    spherloc localize street_fisheye --initialise mc-exact --estimator ransac-2p
+
     spherloc localize day.toml night.toml --estimator mc --estimator ransac-2p,iterations=100 --output results/both
 
     Args:
@@ -139,6 +143,8 @@ def localize(
             them and the kinds.
         estimator: mc (deterministic maximum consensus) if not given, mc-exact or another one, with options after
             commas; a wrong name lists them all. Give it once for each.
+        initialise: Estimator that solves the first query, and each one that the other one does not localize or that
+            follows such a one; the other one tracks in between.
         seed: Seed of the estimator, the same for every query.
         option: Options of all estimators, such as bound_px=4; none and inf are values where they make sense.
         queries: Only these: names, or places counted from 0, the last one not included; all if not given.
@@ -161,12 +167,13 @@ def localize(
 
     def solving(name: str, folder: Path) -> Solving:
         kept = Records(recordings or folder / "recordings", keep_gigabytes=keep_gigabytes) if record else None
-        return Solving(*_name_and_options(name, option), folder, kept)
+        return Solving(*_name_and_options(name, option), folder, kept, initialise)
 
     names = estimator or ("mc",)
     try:
         if len(paths) == len(names) == 1:
-            folder = output or RECORDINGS / f"{paths[0].stem}_{names[0]}_{seed}"
+            words = names[0] if initialise is None else f"{initialise}+{names[0]}"
+            folder = output or RECORDINGS / f"{paths[0].stem}_{words}_{seed}"
             return localize_sequence(paths[0], [solving(names[0], folder)], seed, queries, retry_failed)
         base = output or RECORDINGS / f"comparison_{seed}"
         each = {path: [solving(name, base / path.stem / name) for name in names] for path in paths}
@@ -189,6 +196,8 @@ def sweep(
     *,
     over: str = "outlier_rate",
     values: Annotated[tuple[str, ...], arg(metavar="NUMBER|FIRST:LAST:STEP ...")] = ("0.5:0.95:0.05",),
+    by: OptionalText = None,
+    by_values: Annotated[tuple[str, ...], arg(metavar="NUMBER|FIRST:LAST:STEP ...")] = (),
     estimator: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], arg(metavar="NAME[,OPTION=VALUE...]")] = (),
     set: Settings = (),
     runs: int = 100,
@@ -219,12 +228,17 @@ def sweep(
 
     spherloc sweep scenes/fisheye_outliers_90.toml --estimator mc --scheduler tcp://host:8786
 
+    spherloc sweep mei_outliers_80 --by correspondences --by-values 20 50 100 200 --runs 30
+
     spherloc sweep all --estimator all --runs 36 --keep-gigabytes 20
 
     Args:
         scenes: Scene files (TOML) of simulations, or names of bundled scenes; all for every bundled simulation.
         over: outlier_rate, noise_px, correspondences or gravity_error_deg.
         values: Values of it: numbers, or FIRST:LAST:STEP, the last one included.
+        by: A second property; the sweep over the first one is done at each of its values, and a table and a map of
+            both are written too.
+        by_values: Its values.
         estimator: A registered estimator, with options after commas; give it once for each, or all. mc and
             ransac-2p if not given.
         set: Changes to the scene at all values, such as noise_px=2; a wrong one lists them all.
@@ -255,24 +269,45 @@ def sweep(
     from spherloc_viz.batch import Records
     from spherloc_viz.sweep import all_estimators
     from spherloc_viz.sweep import sweep as do_sweep
+    from spherloc_viz.sweep_map import sweep_two
 
     chosen = all_estimators() if estimator == ("all",) else estimator or ("mc", "ransac-2p")
     kept = Records(recordings, keep_gigabytes=keep_gigabytes) if record else None
+    if by is None and by_values:
+        raise InputError("--by-values are given without --by; name the second property.")
+    if by is not None and not by_values:
+        raise InputError(f"--by {by} needs --by-values; give some, such as --by-values 50 100 200.")
     for file in files:
-        table = out or RECORDINGS / f"{file.stem}_{over}_{seed}.csv"
-        do_sweep(
-            file,
-            over,
-            values,
-            chosen,
-            settings=list(chain(*set)),
-            runs=runs,
-            seed=seed,
-            workers=workers,
-            scheduler=scheduler,
-            out=table,
-            records=kept,
-        )
+        if by is None:
+            do_sweep(
+                file,
+                over,
+                values,
+                chosen,
+                settings=list(chain(*set)),
+                runs=runs,
+                seed=seed,
+                workers=workers,
+                scheduler=scheduler,
+                out=out or RECORDINGS / f"{file.stem}_{over}_{seed}.csv",
+                records=kept,
+            )
+        else:
+            sweep_two(
+                file,
+                over,
+                values,
+                chosen,
+                by=by,
+                by_values=by_values,
+                settings=list(chain(*set)),
+                runs=runs,
+                seed=seed,
+                workers=workers,
+                scheduler=scheduler,
+                out=out or RECORDINGS / f"{file.stem}_{over}_{by}_{seed}.csv",
+                records=kept,
+            )
     return 0
 
 

@@ -20,12 +20,21 @@ from spherloc.experiments.results import (
     TRAJECTORY,
     TRUE_TRAJECTORY,
     UNREADABLE,
+    VEHICLE_TRAJECTORY,
     QueryResult,
     ResultsLog,
     SequenceResults,
 )
-from spherloc.experiments.sequence import How, chosen_queries, localize_by_each
-from spherloc.experiments.summary import SuccessRate, Summary, estimated_trajectory, summarize, timed, true_trajectory
+from spherloc.experiments.sequence import INITIALISED, How, chosen_queries, localize_by_each
+from spherloc.experiments.summary import (
+    SuccessRate,
+    Summary,
+    estimated_trajectory,
+    summarize,
+    timed,
+    true_trajectory,
+    vehicle_trajectory,
+)
 from spherloc.experiments.trajectory_error import TrajectoryError
 from spherloc.frontend.view import View
 from spherloc.trace import Trace
@@ -54,11 +63,14 @@ class Solving:
     """Folder of the results."""
     records: Records | None
     """How the queries are recorded; None if they are not."""
+    initialise: str | None = None
+    """Registered name of the estimator that solves the first query and those after a loss; None if there is none."""
 
     @property
     def label(self) -> str:
         """As tables and pictures name it."""
-        return " ".join((self.estimator, *self.settings))
+        first = () if self.initialise is None else (f"{self.initialise} +",)
+        return " ".join((*first, self.estimator, *self.settings))
 
 
 def localize_sequence(
@@ -104,19 +116,19 @@ def localized(
     if not 0 <= seed < 2**63:
         raise InputError(f"seed is {seed}; give a number from 0 to 2^63 - 1.")
     chosen = chosen_queries(scene, queries)
-    hows = [How(item.estimator, _options(scene, item.estimator, item.settings), seed) for item in solvings]
+    hows = [_how(scene, item, seed) for item in solvings]
     for remark in scene.remarks:
         say(remark)
     with ExitStack() as stack:
         logs: list[ResultsLog] = []
         for item, how in zip(solvings, hows, strict=True):
-            setting = configuration_of(scene, path, how.estimator, how.options, seed)
+            setting = configuration_of(scene, path, how.estimator, how.options, seed, item.initialise)
             logs.append(stack.enter_context(ResultsLog(item.output, setting)))
         todo = [{view.name for view in _todo(scene, chosen, log, retry_failed)} for log in logs]
         wanted = [(view, [k for k, names in enumerate(todo) if view.name in names]) for view in chosen]
         wanted = [(view, indices) for view, indices in wanted if indices]
         if wanted:
-            warm_up(say, {item.estimator for item in solvings})
+            warm_up(say, {name for item in solvings for name in (item.estimator, item.initialise) if name is not None})
             stores = [stack.enter_context(store_of(item.records)) for item in solvings]
             recorders = [
                 None if store is None else _Recorder(store, path.resolve(), log)
@@ -125,13 +137,18 @@ def localized(
             _work(scene, wanted, logs, hows, recorders)
         results = [log.results() for log in logs]
         for log, found in zip(logs, results, strict=True):
-            _finish(log, found)
+            _finish(log, found, scene)
     return results, {view.name for view in chosen}
 
 
 def _code(results: Sequence[SequenceResults], chosen: Collection[str]) -> int:
     rows = [row for found in results for row in found.rows if row.query in chosen]
     return 0 if all(row.status == LOCALIZED for row in rows) else 1
+
+
+def _how(scene: MapScene, item: Solving, seed: int) -> How:
+    first = None if item.initialise is None else (item.initialise, _options(scene, item.initialise, ()))
+    return How(item.estimator, _options(scene, item.estimator, item.settings), seed, first)
 
 
 def _options(scene: MapScene, estimator: str, settings: Sequence[str]) -> Any:
@@ -216,7 +233,7 @@ class _Recorder:
             return str(path.resolve())
 
 
-def _finish(log: ResultsLog, results: SequenceResults) -> None:
+def _finish(log: ResultsLog, results: SequenceResults, scene: MapScene) -> None:
     """Trajectories, picture and summary of all that is done by now."""
     from spherloc_viz.plots import trajectory_png
 
@@ -224,6 +241,8 @@ def _finish(log: ResultsLog, results: SequenceResults) -> None:
     write_tum(log.folder / TRAJECTORY, estimated_trajectory(results))
     if len(truth):
         write_tum(log.folder / TRUE_TRAJECTORY, truth)
+    if scene.vehicle_from_camera is not None:
+        write_tum(log.folder / VEHICLE_TRAJECTORY, vehicle_trajectory(results, scene.vehicle_from_camera))
     log.write(PICTURE, trajectory_png(results))
     log.write(SUMMARY, (json_text(asdict(summarize(results))) + "\n").encode())
 
@@ -238,6 +257,9 @@ def _text(results: SequenceResults, summary: Summary) -> str:
     ]
     if not setting.metric:
         lines.append("  units are unknown: lengths are in units of the map, and so are the limits")
+    first = sum(any(remark.startswith(INITIALISED) for remark in row.remarks) for row in results.rows)
+    if first:
+        lines.append(f"  {first} initialised by {setting.options['initialise']}, the others tracked")
     lines += [f"  success {_rate(rate, setting.unit)}" for rate in (*summary.success, *summary.registration_success)]
     if summary.median_rotation_error_deg is not None and summary.median_translation_error_m is not None:
         lines.append(

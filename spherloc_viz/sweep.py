@@ -11,7 +11,7 @@ from spherloc.errors import RecordingError
 from spherloc.experiments.sweep import Entrant, Keep, SweepPlan, planned, run_sweep
 from spherloc.experiments.sweep_log import PICTURE, SUMMARY, SweepLog
 from spherloc.experiments.sweep_plan import parse_values
-from spherloc.experiments.sweep_rows import summarize
+from spherloc.experiments.sweep_rows import Point, summarize
 from spherloc.warm_up import warm_up
 from spherloc_viz.batch import Records, parse_settings, store_of
 from spherloc_viz.layers.primitives import Table
@@ -39,8 +39,8 @@ def sweep(
     scheduler: str | None,
     out: Path,
     records: Records | None = None,
-) -> int:
-    """Do the runs that ``out`` has not got; returns the exit code, which is 0.
+) -> tuple[Point, ...]:
+    """Do the runs that ``out`` has not got; returns what all of them come to.
 
     Without ``records`` they are not recorded. Raises ``InputError`` for whatever makes the sweep impossible.
     """
@@ -64,7 +64,7 @@ def sweep(
         log.write(log.beside(PICTURE), sweep_png(load_scene(scene).name, over, plan.labels, points))
         print(text_of(sweep_table(over, points)))
         print(f"written to {out}, {log.beside(SUMMARY).name} and {log.beside(PICTURE).name}", flush=True)
-    return 0
+    return points
 
 
 def _work(

@@ -1,6 +1,5 @@
 """``spherloc verify``: the paper's simulations, its claims, and a page that says which hold."""
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -9,17 +8,22 @@ from spherloc.experiments.sweep import run_sweep
 from spherloc.experiments.sweep_log import SweepLog
 from spherloc.experiments.sweep_plan import SweepPlan
 from spherloc.experiments.sweep_rows import SweepRow
+from spherloc.files import is_file, read_file
 from spherloc.verification.claims import CLAIMS, Checked, check
 from spherloc.verification.experiments import EXPERIMENTS, Experiment
+from spherloc.verification.kept import kept_text, with_kept
 from spherloc.verification.measured import Measured
 from spherloc.verification.sessions import DATASETS
 from spherloc.warm_up import warm_up
 from spherloc_viz.progress import progress, say
 from spherloc_viz.verification_datasets import run_sessions, tables_text
-from spherloc_viz.verification_page import PHASES, verification_page
+from spherloc_viz.verification_page import verification_page
+from spherloc_viz.verification_parts import PHASES, part_pages
 from spherloc_viz.verification_plots import FIGURES, figure_svg, phase_svg
 
-PAGE, RESULTS, RUNS = "index.md", "claims.json", "runs"
+PAGE, TABLES, RESULTS, RUNS = "index.md", "tables.md", "claims.json", "runs"
+MAX_BYTES = 10_000_000
+"""Of the results of an earlier time."""
 
 
 def verify(
@@ -53,6 +57,9 @@ def verify(
     tables = tables_text(run_sessions(datasets or {}, output / RUNS, quick))
     measured = Measured(rows)
     checked = [check(claim, measured) for claim in CLAIMS]
+    if only and is_file(output / RESULTS):
+        text = read_file(output / RESULTS, MAX_BYTES).decode("utf-8", "replace")
+        checked = with_kept(checked, text, str(output / RESULTS))
     _write(output, measured, checked, plans, tables, quick)
     for item in checked:
         say(_line(item))
@@ -110,24 +117,13 @@ def _write(
     if any(experiment.startswith("phase-") for experiment, _ in plans):
         files[PHASES] = phase_svg(measured)
     pictures = {key: f"{_file_name(*key)}.svg" for key in plans if key[0] in FIGURES}
-    files[PAGE] = verification_page(checked, measured, plans, pictures, tables, quick)
-    files[RESULTS] = json.dumps([_record(item) for item in checked], indent=1) + "\n"
+    files |= part_pages(measured, plans, pictures, quick)
+    files[TABLES] = tables
+    files[PAGE] = verification_page(checked, quick, sorted({experiment for experiment, _ in plans}))
+    files[RESULTS] = kept_text(checked)
     for name, text in files.items():
         path = output / name
         try:
             path.write_text(text, encoding="utf-8")
         except OSError as error:
             raise InputError(f"{path}: cannot be written ({reason(error)}); give another --output.") from None
-
-
-def _record(item: Checked) -> dict[str, object]:
-    return {
-        "key": item.claim.key,
-        "place": item.claim.place,
-        "claim": item.claim.sentence,
-        "paper": item.claim.paper,
-        "verdict": item.verdict.value,
-        "condition": item.condition,
-        "as_printed": None if item.printed is None else item.printed.ours,
-        "under_the_condition": None if item.other is None else item.other.ours,
-    }

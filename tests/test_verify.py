@@ -17,6 +17,8 @@ from spherloc.verification.checks import below, drops_at, follows_eq_28, precisi
 from spherloc.verification.claims import CLAIMS, Claim, Verdict, check
 from spherloc.verification.experiments import EXPERIMENTS, METHODS, SCENES
 from spherloc.verification.measured import Measured
+from spherloc.verification.printed import STATEMENTS, Tables, printed_findings
+from spherloc.verification.sessions import printed_tables
 from spherloc_viz.verify_command import verify
 
 GOOD, BAD = (0.1, 0.01), (30.0, 4.0)
@@ -135,16 +137,47 @@ def test_runs_and_page(tmp_path: Path, capsys):
     assert results["table2"]["verdict"] == "data needed"
     assert results["table6-case2"]["verdict"] in {"reproduces", "only if", "does not"}
     assert "<svg" in (tmp_path / "fig7-normal_mei_normal_draws.svg").read_text()
-    assert "| mc |" in page
+    table = (tmp_path / "table6.md").read_text(encoding="utf-8")
+    assert "| mc |" in table and "| case2 | Kannala-Brandt |" in table and not (tmp_path / "choice.md").exists()
+    command = re.search(r"^spherloc run fisheye_outliers_80 .*correspondences=42 .*--estimator mc .*$", page, re.M)
+    assert command is not None
     link = re.search(r"\[as printed\]\(http://127\.0\.0\.1:8080/#([^)]+)\)", page)
     assert link is not None
     said = parse_qs(link[1])
     assert (said["estimator"], said["scene"]) == (["mc"], ["Kannala-Brandt fisheye, 80 % outliers"])
     assert parse_variation(said["set"]).correspondences == 42
     again = capsys.readouterr()
-    verify(tmp_path, quick=True, workers=1, scheduler=None, only=only)
+    verify(tmp_path, quick=True, workers=2, scheduler=None, only=only[:1])
+    # What was not run now is kept from before, and marked.
+    kept = {item["key"]: item for item in json.loads((tmp_path / "claims.json").read_text())}
+    assert kept["table6-case2"] == results["table6-case2"]
+    row = next(
+        line for line in (tmp_path / "index.md").read_text().splitlines() if line.startswith("| Table VI, ExpID 2")
+    )
+    assert "**°" in row and link[1] in row
     assert " runs\n" not in capsys.readouterr().err.split("→", 1)[1]  # nothing was left to do
     assert "written to" in again.out
+
+
+def test_results_of_others_are_refused(tmp_path):
+    (tmp_path / "claims.json").write_text("[1]")
+    with pytest.raises(InputError, match=r"claims\.json: is no result of spherloc verify"):
+        verify(tmp_path, quick=True, workers=1, scheduler=None, only=("kitti360",))
+
+
+def test_the_text_is_checked_against_the_printed_tables():
+    """A changed number changes the verdict of what the text says of it."""
+    text = {statement.sentence: holds for statement, holds, _ in printed_findings()}
+    assert not text["MC outperforms all other methods on math."]  # 87.1 against 87.4 %
+    assert text["MC outperforms all other methods on quad."]
+    assert not text["Right inliers are no more than the right matches."]  # 11 of 9
+    tables = printed_tables()
+    row = next(row for row in tables["table4"]["rows"] if row[0] == "2P100")
+    row[3] = row[3].replace("87.4", "86.4")
+    row = next(row for row in tables["table4"]["rows"] if row[0] == "2P1k")
+    row[3] = row[3].replace("87.2", "86.2")
+    statement = next(item for item in STATEMENTS if item.sentence == "MC outperforms all other methods on math.")
+    assert statement.check(Tables(tables))[0]
 
 
 def test_the_printed_mc_is_outvoted_where_the_exact_consensus_is_not():

@@ -4,7 +4,7 @@ Where the dataset's ``fisheye/mask_left_fisheye.npy`` (or right) is there, what 
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -80,7 +80,8 @@ def load(table: dict[str, Any], path: Path) -> MapScene:
         raise InputError(f"{where}: frame {min(both)} is both query and reference; give other frames or sequences.")
     references = tuple(mapped.references(rig, scans))
     queries = tuple(asked.view(frame, rig) for frame in asked.frames)
-    return settings.scene(path, queries, references, GRAVITY_MAP, mapped.remarks + asked.remarks)
+    scene = settings.scene(path, queries, references, GRAVITY_MAP, mapped.remarks + asked.remarks)
+    return replace(scene, vehicle_from_camera=rig.imu_from_camera[:3])
 
 
 @dataclass(frozen=True, eq=False)

@@ -67,6 +67,8 @@ class MapScene:
     """Whether the map's lengths are metres; if not, they are its own units, and so are the limits."""
     registration: Registration | None = None
     """Judges a pose by registering point clouds, where no true pose can be trusted."""
+    vehicle_from_camera: FloatArray | None = None
+    """Where the query camera is on the vehicle or device (3, 4): p_vehicle = R p_camera + t; None if not known."""
     mesh: Callable[[], bytes] | None = None
     """A binary glTF of the map in the map frame, metres, for the canvas."""
     remarks: tuple[str, ...] = ()

@@ -6,7 +6,7 @@ ground truth lets the loader fit, or a point cloud in the frame of the ground tr
 
 import os
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from itertools import pairwise
 from pathlib import Path
@@ -28,7 +28,7 @@ from spherloc.formats.colmap_model import ColmapImage, ColmapModel
 from spherloc.formats.text_rows import needed_file
 from spherloc.frontend.lifting import PointCloudLift, SfmLift
 from spherloc.frontend.view import Gravity, Lift, View
-from spherloc.geometry import camera_centre, pose
+from spherloc.geometry import camera_centre, inverse_pose, pose
 from spherloc.trajectory import NS_PER_S, Trajectory, pose_at, read_newer_college
 from spherloc.types import BoolArray, FloatArray
 
@@ -254,7 +254,8 @@ def load(table: dict[str, Any], path: Path) -> MapScene:
     rig = _rig(place)
     queries, query_remarks = _queries(place, rig)
     references, reference_remarks = _references(place, rig)
-    return settings.scene(path, queries, references, GRAVITY_MAP, (*reference_remarks, *query_remarks))
+    scene = settings.scene(path, queries, references, GRAVITY_MAP, (*reference_remarks, *query_remarks))
+    return replace(scene, vehicle_from_camera=inverse_pose(rig.cam_from_base[:3]))
 
 
 @dataclass(frozen=True, eq=False)

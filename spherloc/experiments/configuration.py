@@ -106,8 +106,12 @@ class Configuration:
         return [said for key, said in found.items() if "estimator" not in found or not key.startswith("options.")]
 
 
-def configuration_of(scene: MapScene, path: Path, estimator: str, options: Any, seed: int) -> Configuration:
+def configuration_of(
+    scene: MapScene, path: Path, estimator: str, options: Any, seed: int, initialiser: str | None = None
+) -> Configuration:
     """The configuration of localizing the queries of the scene file ``path``; ``options`` is the resolved dataclass.
+
+    An ``initialiser`` (name and options in one text) stands among the options, where there is one.
 
     Raises ``InputError`` if the file can no longer be read.
     """
@@ -118,7 +122,7 @@ def configuration_of(scene: MapScene, path: Path, estimator: str, options: Any, 
         scene_sha256=hashlib.sha256(content).hexdigest(),
         name=scene.name,
         estimator=estimator,
-        options=asdict(options),
+        options=asdict(options) | ({} if initialiser is None else {"initialise": initialiser}),
         seed=seed,
         versions={**versions(), "opencv": cv2.__version__},
         queries=len(scene.queries),

@@ -195,7 +195,8 @@ def _cell(value: Any) -> str:
 
 CONFIGURATION, ROWS, TABLE = "configuration.json", "results.jsonl", "results.csv"
 TRAJECTORY, TRUE_TRAJECTORY, PICTURE, SUMMARY = "trajectory.tum", "truth.tum", "trajectory.png", "summary.json"
-REWRITTEN = (TABLE, TRAJECTORY, TRUE_TRAJECTORY, PICTURE, SUMMARY)
+VEHICLE_TRAJECTORY = "vehicle.tum"
+REWRITTEN = (TABLE, TRAJECTORY, TRUE_TRAJECTORY, VEHICLE_TRAJECTORY, PICTURE, SUMMARY)
 """Files of the folder that every run of the sequence writes anew."""
 MAX_BYTES = 2_000_000_000
 

@@ -13,7 +13,7 @@ from spherloc.datasets.map_scene import MapScene
 from spherloc.diagnosis import diagnose
 from spherloc.errors import InputError, SpherlocError, show
 from spherloc.estimators import estimate
-from spherloc.experiments.results import FAILED, UNREADABLE, QueryResult
+from spherloc.experiments.results import FAILED, LOCALIZED, UNREADABLE, QueryResult
 from spherloc.frontend.view import Matches, View
 from spherloc.metrics import evaluate
 from spherloc.outcome import judge
@@ -23,6 +23,8 @@ from spherloc.types import FloatArray
 T = TypeVar("T")
 R = TypeVar("R")
 
+INITIALISED = "Initialised by"
+"""Begins the remark of a query that the initialiser solved."""
 _SLICE = re.compile(r"(-?\d{0,9}):(-?\d{0,9})(?::(-?\d{0,9}))?")
 
 
@@ -59,6 +61,9 @@ class How(NamedTuple):
     """The estimator's dataclass."""
     seed: int
     """The same for every query."""
+    initialiser: tuple[str, Any] | None = None
+    """Estimator and options that solve the first query, and every one that comes after or is itself not localized
+    (Sec. VI-C); None leaves all to ``estimator``."""
 
 
 def localize(
@@ -82,11 +87,14 @@ def localize_by_each(
     With each query come the indices of the ``hows`` that shall solve it, and with each result that of its own.
     """
     places = {view.name: place for place, view in enumerate(scene.queries)}
+    tracking = [False] * len(hows)
     for (view, chosen), (matches, matching_ms) in _one_ahead(lambda item: _match(scene, item[0]), queries):
         row = QueryResult(places[view.name], view.name, FAILED, view.timestamp_s, matching_ms=matching_ms)
         row = replace(row, truth_cam_from_map=_array(view.cam_from_map))
         for index in chosen:
-            yield index, *_solve(scene, view, matches, row, hows[index])
+            found, trace = _solve(scene, view, matches, row, hows[index], tracking[index])
+            tracking[index] = found.status == LOCALIZED
+            yield index, found, trace
 
 
 def _match(scene: MapScene, view: View) -> tuple[Matches | SpherlocError, float]:
@@ -99,8 +107,10 @@ def _match(scene: MapScene, view: View) -> tuple[Matches | SpherlocError, float]
 
 
 def _solve(
-    scene: MapScene, view: View, matches: Matches | SpherlocError, row: QueryResult, how: How
+    scene: MapScene, view: View, matches: Matches | SpherlocError, row: QueryResult, how: How, tracking: bool
 ) -> tuple[QueryResult, Trace | None]:
+    """``tracking`` says that the query before was localized: then the initialiser is asked only if the estimator does
+    not localize this one."""
     if isinstance(matches, SpherlocError):
         return replace(row, status=_status_without_matches(view), message=str(matches)), None
     row = replace(row, matches=len(matches.pixels), references=len(matches.references), remarks=matches.remarks)
@@ -108,7 +118,15 @@ def _solve(
         problem = scene.problem_of(view, matches)
     except InputError as error:
         return replace(row, message=str(error), estimated_outlier_rate=matches.estimated_outlier_rate), None
-    trace = estimate(problem, how.estimator, how.options, how.seed)
+    if how.initialiser is None or tracking:
+        trace = estimate(problem, how.estimator, how.options, how.seed)
+        judged = _judged(scene, view, matches.references, trace, row)
+        if how.initialiser is None or judged.status == LOCALIZED:
+            return judged, trace
+        row = replace(row, estimating_ms=judged.estimating_ms)
+    name, options = how.initialiser
+    trace = estimate(problem, name, options, how.seed)
+    row = replace(row, remarks=(*row.remarks, f"{INITIALISED} {name}."))
     return _judged(scene, view, matches.references, trace, row), trace
 
 
@@ -147,7 +165,7 @@ def _judged(scene: MapScene, view: View, references: tuple[View, ...], trace: Tr
         precision=metrics.precision,
         recall=metrics.recall,
         f1=metrics.f1,
-        estimating_ms=trace.timings_ms["total"],
+        estimating_ms=trace.timings_ms["total"] + (row.estimating_ms or 0.0),
         diagnosis=str(diagnose(trace).cause),
         message=trace.message if pose is None else " ".join((trace.message, *judged.reasons)),
         remarks=remarks,

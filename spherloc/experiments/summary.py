@@ -10,7 +10,7 @@ import numpy as np
 from spherloc.datasets.map_scene import Thresholds
 from spherloc.experiments.results import DOUBTFUL, FAILED, LOCALIZED, UNREADABLE, QueryResult, SequenceResults
 from spherloc.experiments.trajectory_error import TrajectoryError, trajectory_error
-from spherloc.geometry import camera_centre, pose
+from spherloc.geometry import inverse_pose, pose
 from spherloc.trajectory import NS_PER_S, Trajectory
 from spherloc.types import FloatArray
 
@@ -146,7 +146,7 @@ def summarize(results: SequenceResults) -> Summary:
 def _trajectory_error(results: SequenceResults) -> TrajectoryError | None:
     rows = [row for row in results.rows if row.cam_from_map is not None and row.truth_cam_from_map is not None]
     truth, estimate = (
-        np.array([_inverse(getattr(row, name)) for row in rows]).reshape(-1, 3, 4)
+        np.array([inverse_pose(getattr(row, name)) for row in rows]).reshape(-1, 3, 4)
         for name in ("truth_cam_from_map", "cam_from_map")
     )
     return trajectory_error(truth, estimate, timed(results))
@@ -199,6 +199,17 @@ def estimated_trajectory(results: SequenceResults) -> Trajectory:
     return _trajectory(results, "cam_from_map")
 
 
+def vehicle_trajectory(results: SequenceResults, vehicle_from_camera: FloatArray) -> Trajectory:
+    """Poses ``map_from_vehicle`` of the queries with a pose, by the camera's place on the vehicle (3, 4)."""
+    cameras = estimated_trajectory(results)
+    camera_from_vehicle = inverse_pose(vehicle_from_camera)
+    poses = [
+        pose(one[:, :3] @ camera_from_vehicle[:, :3], one[:, :3] @ camera_from_vehicle[:, 3] + one[:, 3])
+        for one in cameras.map_from_body
+    ]
+    return Trajectory(cameras.timestamps_ns, np.array(poses).reshape(-1, 3, 4))
+
+
 def true_trajectory(results: SequenceResults) -> Trajectory:
     """True poses ``map_from_camera`` of the queries whose truth is known."""
     return _trajectory(results, "truth_cam_from_map")
@@ -216,12 +227,8 @@ def _trajectory(results: SequenceResults, field: str) -> Trajectory:
     by_time = timed(results)
     rows = [row for row in results.rows if getattr(row, field) is not None]
     times = np.array([_nanoseconds(row, by_time) for row in rows], dtype=np.int64)
-    inverse = [_inverse(getattr(row, field)) for row in rows]
+    inverse = [inverse_pose(getattr(row, field)) for row in rows]
     return Trajectory(times, np.array(inverse).reshape(-1, 3, 4))
-
-
-def _inverse(cam_from_map: FloatArray) -> FloatArray:
-    return pose(cam_from_map[:, :3].T, camera_centre(cam_from_map))
 
 
 def _nanoseconds(row: QueryResult, by_time: bool) -> int:

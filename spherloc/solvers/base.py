@@ -57,14 +57,18 @@ Many = tuple[FloatArray, IntArray]
 """Poses (P, 3, 4), cam_from_map, and the sample (P,) that each is a solution of, ascending."""
 
 
-def solve_each(solver: Solver, bearings: FloatArray, points: FloatArray) -> Many:
+def solve_each(
+    solver: Solver, bearings: FloatArray, points: FloatArray, pixel_from_bearing: FloatArray | None = None
+) -> Many:
     """The solver's poses of each of B samples: ``bearings`` (B, K, 3) and ``points`` (B, K, 3), metres.
 
-    A solver may have a method ``solve_each`` that does the same at once, for a fraction of the time.
+    A solver may have a method ``solve_each`` that does the same at once, for a fraction of the time. One that weighs
+    correspondences by their covariances takes ``pixel_from_bearing`` (B, K, 2, 3) there too: the derivative of the
+    pixel by the unit bearing.
     """
     at_once = getattr(solver, "solve_each", None)
     if at_once is not None:
-        return at_once(bearings, points)
+        return at_once(bearings, points, *(() if pixel_from_bearing is None else (pixel_from_bearing,)))
     found = [solver.solve(one, some) for one, some in zip(bearings, points, strict=True)]
     sample = np.repeat(np.arange(len(found)), [len(solutions) for solutions in found])
     return np.concatenate([NO_POSES, *found]), sample

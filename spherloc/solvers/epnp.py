@@ -22,6 +22,7 @@ import numpy as np
 
 from spherloc.solvers.base import NO_POSES, checked, poses
 from spherloc.solvers.linear_pose import condition
+from spherloc.solvers.match_rows import image_plane
 from spherloc.types import BoolArray, FloatArray
 
 
@@ -37,11 +38,6 @@ class VirtualPinhole:
         """Which of the ``bearings`` (M, 3), camera frame, fall into the image: mask (M,)."""
         reach = np.tan(np.radians(self.fov_deg / 2)) * bearings[:, 2]
         return (reach > 0.0) & (np.abs(bearings[:, :2]) <= reach[:, None]).all(axis=1)
-
-
-def image_plane(bearings: FloatArray) -> FloatArray:
-    """Calibrated image coordinates (K, 2), x = v_x / v_z and y = v_y / v_z, of bearings with z > 0."""
-    return np.ascontiguousarray(bearings[:, :2] / bearings[:, 2:])
 
 
 class Epnp:

@@ -23,11 +23,6 @@ def condition(points: FloatArray) -> tuple[FloatArray, FloatArray, float] | None
     return moved / size, middle, 1.0 / size
 
 
-def projectors(bearings: FloatArray) -> FloatArray:
-    """I - v v^T (K, 3, 3) of each bearing: it keeps what is orthogonal to v, and |(I - v v^T) x| = |v x x|."""
-    return np.eye(3) - bearings[:, :, None] * bearings[:, None, :]
-
-
 def condition_each(points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
     """``condition`` for each of B sets of points (B, K, 3): points, means (B, 3), scales (B,), and which exist (B,).
 
@@ -41,12 +36,13 @@ def condition_each(points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArr
     return moved * scale[:, None, None], middle, scale, exists
 
 
-def null_matrix(projector: FloatArray, coordinates: FloatArray) -> FloatArray | None:
-    """M (3, C + 1) of norm 1 that best solves v x M [x; 1] = 0 for coordinates x (K, C); None if several do."""
+def null_matrix(normals: FloatArray, coordinates: FloatArray) -> FloatArray | None:
+    """M (3, C + 1) of norm 1 that best solves n . M [x; 1] = 0 for both normals n of each of K matches (K, 2, 3) and
+    coordinates x (K, C); None if several do."""
     width = coordinates.shape[1] + 1
     known = np.ones((len(coordinates), width))
     known[:, :-1] = coordinates
-    system = (projector[:, :, :, None] * known[:, None, None, :]).reshape(-1, 3 * width)
+    system = (normals[:, :, :, None] * known[:, None, None, :]).reshape(-1, 3 * width)
     _, stretch, right = np.linalg.svd(system, full_matrices=False)
     return right[-1].reshape(3, width) if stretch[-2] > DEGENERATE * stretch[0] else None
 
@@ -66,21 +62,30 @@ def nearest_rotation(matrix: FloatArray) -> FloatArray | None:
 
 
 def translation_given(rotation: FloatArray, projector: FloatArray, points: FloatArray) -> FloatArray | None:
-    """t (3,) that minimizes the sum of |v x (R p + t)|^2; None if all bearings are parallel."""
+    """t (3,) that minimizes the sum of x^T P x, x = R p + t, for ``projector`` P (K, 3, 3), the sum of n n^T over the
+    two normals of a match; None if all bearings are parallel."""
     normal = projector.sum(axis=0)
     if np.linalg.det(normal) <= DEGENERATE * len(points) ** 3:
         return None
     return -np.linalg.solve(normal, np.einsum("nij,nj->i", projector, points @ rotation.T))
 
 
-def linear_poses(bearings: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+def tangents_of(bearings: FloatArray) -> FloatArray:
+    """``tangent_basis`` of each of B samples of unit bearings (B, K, 3): (B, K, 2, 3)."""
+    samples, count = bearings.shape[:2]
+    return tangent_basis(bearings.reshape(-1, 3)).reshape(samples, count, 2, 3)
+
+
+def linear_poses(
+    bearings: FloatArray, points: FloatArray, tangents: FloatArray
+) -> tuple[FloatArray, FloatArray, BoolArray]:
     """R (B, 3, 3) and t (B, 3) by the direct linear transform (null vector, rotation, translation), and which exist.
 
     ``bearings`` (B, K, 3) are unit vectors, ``points`` (B, K, 3) conditioned. The two rows of a correspondence are
-    those of its tangents n: n . (A p + b) = 0. What does not exist is the identity and zero.
+    those of its tangents n (B, K, 2, 3), of mean length 1: n . (A p + b) = 0. What does not exist is the identity and
+    zero.
     """
     samples, count = points.shape[:2]
-    tangents = tangent_basis(bearings.reshape(-1, 3)).reshape(samples, count, 2, 3)
     known = np.concatenate([points, np.ones((samples, count, 1))], axis=2)
     system = (tangents[:, :, :, :, None] * known[:, :, None, None, :]).reshape(samples, 2 * count, 12)
     stretch, right = np.linalg.svd(system, full_matrices=False)[1:]
@@ -92,7 +97,7 @@ def linear_poses(bearings: FloatArray, points: FloatArray) -> tuple[FloatArray, 
     left, stretch, right = np.linalg.svd(matrices[:, :, :3])
     rotations = left @ right
     exists &= (np.linalg.det(rotations) > 0.0) & (stretch[:, 1] > DEGENERATE * stretch[:, 0])
-    projector = projectors(bearings.reshape(-1, 3)).reshape(samples, count, 3, 3)
+    projector = np.einsum("bkri,bkrj->bkij", tangents, tangents)
     normal = projector.sum(axis=1)
     exists &= np.linalg.det(normal) > DEGENERATE * count**3
     rotations[~exists], normal[~exists] = np.eye(3), np.eye(3)

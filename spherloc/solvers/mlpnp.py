@@ -3,8 +3,10 @@
     J(v_i)^T (R p_i + t) = 0,   J(v_i) = null(v_i^T)   (linear, 2 rows a correspondence)
     min over R, t of sum |J(v_i)^T (R p_i + t) / |R p_i + t||^2   (Gauss-Newton)
 
-J spans the tangent plane of a bearing, where its noise lives. All bearings are taken to be equally uncertain in all
-directions, so that the covariance of the paper is a multiple of the identity, and the linear rows are those of ``svd``.
+J spans the tangent plane of a bearing, where its noise lives. Without covariances all bearings are taken to be equally
+uncertain in all directions, and the linear rows are those of ``svd``. With them, both sums are weighed by the inverse
+of the 2 x 2 covariance of each bearing in its tangent plane, here by taking for J the derivative of the pixel by the
+bearing: its rows lie in the tangent plane, and J^T J is that inverse for pixels of equal noise.
 If the points lie in a plane the linear system has only nine unknowns, two columns of the rotation in the plane's own
 axes and t, and the third column is their cross product. Works on the whole sphere; six correspondences (the paper's own
 least number).
@@ -19,7 +21,6 @@ III-3, 2016.
 import numpy as np
 
 from spherloc.gauss_newton import turn
-from spherloc.geometry import tangent_basis
 from spherloc.kernel_cache import kernel
 from spherloc.small_arrays import copy_matrix, copy_vector
 from spherloc.solvers.base import Many, checked, poses_of_samples
@@ -30,7 +31,7 @@ from spherloc.solvers.linear_pose import (
     linear_poses,
     nearest_rotation,
     null_matrix,
-    projectors,
+    tangents_of,
     translation_given,
 )
 from spherloc.types import BoolArray, FloatArray
@@ -54,27 +55,37 @@ class Mlpnp:
         bearings, points = checked(self, bearings, points)
         return self.solve_each(bearings[None], points[None])[0]
 
-    def solve_each(self, bearings: FloatArray, points: FloatArray) -> Many:
-        """At most one pose for each of B samples: ``bearings`` (B, K, 3) and ``points`` (B, K, 3), metres."""
+    def solve_each(
+        self, bearings: FloatArray, points: FloatArray, pixel_from_bearing: FloatArray | None = None
+    ) -> Many:
+        """At most one pose for each of B samples: ``bearings`` (B, K, 3) and ``points`` (B, K, 3), metres.
+
+        ``pixel_from_bearing`` (B, K, 2, 3), px per unit of the bearing, brings the covariances.
+        """
         points, middle, scale, exists = condition_each(points)
-        rotations, translations, solved = _linear_starts(bearings, points)
+        if pixel_from_bearing is None:
+            tangents = tangents_of(bearings)
+        else:
+            tangents = pixel_from_bearing / np.sqrt(0.5 * np.mean(np.sum(pixel_from_bearing**2, axis=(2, 3))))
+        rotations, translations, solved = _linear_starts(bearings, points, tangents)
         exists &= solved
-        tangents = tangent_basis(bearings.reshape(-1, 3)).reshape(*bearings.shape[:2], 2, 3)
-        refine_each(tangents, np.ascontiguousarray(points), rotations, translations, exists)
+        refine_each(np.ascontiguousarray(tangents), np.ascontiguousarray(points), rotations, translations, exists)
         translations = translations / scale[:, None] - np.einsum("bij,bj->bi", rotations, middle)
         return poses_of_samples(rotations, translations, exists)
 
 
-def _linear_starts(bearings: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+def _linear_starts(
+    bearings: FloatArray, points: FloatArray, tangents: FloatArray
+) -> tuple[FloatArray, FloatArray, BoolArray]:
     """R (B, 3, 3), t (B, 3) and which exist (B,), of the linear system that suits the shape of the conditioned points.
 
-    ``bearings`` and ``points`` are (B, K, 3).
+    ``bearings`` and ``points`` are (B, K, 3), ``tangents`` (B, K, 2, 3).
     """
     spread2, axes = np.linalg.eigh(np.einsum("bki,bkj->bij", points, points))
-    rotations, translations, exists = linear_poses(bearings, points)
+    rotations, translations, exists = linear_poses(bearings, points, tangents)
     for sample in np.flatnonzero(spread2[:, 0] <= PLANAR**2 * spread2[:, 2]):
         one, some = bearings[sample], points[sample]
-        found = _planar_pose(one, projectors(one), some, axes[sample][:, ::-1])
+        found = _planar_pose(one, tangents[sample], some, axes[sample][:, ::-1])
         exists[sample] = found is not None
         if found is not None:
             rotations[sample], translations[sample] = found
@@ -83,12 +94,12 @@ def _linear_starts(bearings: FloatArray, points: FloatArray) -> tuple[FloatArray
 
 
 def _planar_pose(
-    bearings: FloatArray, projector: FloatArray, points: FloatArray, axes: FloatArray
+    bearings: FloatArray, tangents: FloatArray, points: FloatArray, axes: FloatArray
 ) -> tuple[FloatArray, FloatArray] | None:
     """R and t of points in the plane of the first two ``axes`` (3, 3), columns."""
     frame = np.column_stack([axes[:, 0], axes[:, 1], np.cross(axes[:, 0], axes[:, 1])])
     coordinates = points @ frame[:, :2]
-    matrix = null_matrix(projector, coordinates)
+    matrix = null_matrix(tangents, coordinates)
     if matrix is None:
         return None
     first, second = facing(matrix, bearings, coordinates)[:, :2].T
@@ -101,6 +112,7 @@ def _planar_pose(
     if turned is None:
         return None
     rotation = turned @ frame.T
+    projector = np.einsum("kri,krj->kij", tangents, tangents)
     translation = translation_given(rotation, projector, points)
     return None if translation is None else (rotation, translation)
 

@@ -1,11 +1,12 @@
 """oDLT: the direct linear transform with the weights that make its solution statistically optimal.
 
-    q_i [x_i]_x (A p_i + b) = 0,   q_i = 1 / (sigma z_i),   z_i the depth of point i
+    q_i n . (A p_i + b) = 0 for both equations n of a match,   q_i = 1 / (sigma z_i),   z_i the depth of point i
 
 Noise sigma of an image point makes a residual of sigma z_i, so the rows of the plain system are far from equally
 certain. Two passes: the plain system gives depths, the weighted one the pose. R is the rotation closest to A in the
 norm of A's information (weighted Procrustes, one Gauss-Newton step), and t solves the weighted rows with R given (the
-paper's LOST refinement). Works on the image plane of a pinhole, whose noise is taken to be the same everywhere; six
+paper's LOST refinement). Works on the image plane of a pinhole, as the paper has it, or with the equations of bearings
+on the whole sphere (``OdltSphere``), where z_i is the distance; noise is taken to be the same everywhere on either. Six
 correspondences. Degenerate for points in one plane.
 
 Differs from the paper: the first pass uses all points, and image coordinates are not normalised once more, since those
@@ -18,8 +19,8 @@ import numpy as np
 
 from spherloc.geometry import skew, so3_exp
 from spherloc.solvers.base import NO_POSES, checked, poses
-from spherloc.solvers.epnp import image_plane
 from spherloc.solvers.linear_pose import DEGENERATE, condition, nearest_rotation
+from spherloc.solvers.match_rows import MatchRows, plane_rows, sphere_rows
 from spherloc.types import FloatArray
 
 MIN_DEPTH = 1e-3
@@ -35,46 +36,55 @@ class Odlt:
 
     def solve(self, bearings: FloatArray, points: FloatArray) -> FloatArray:
         """See ``Solver.solve``; at most one pose."""
-        return self.weighted(bearings, points, passes=2)
-
-    def weighted(self, bearings: FloatArray, points: FloatArray, passes: int) -> FloatArray:
-        """At most one pose (P, 3, 4) of ``bearings`` (N, 3) and ``points`` (N, 3), metres, see ``solve``.
-
-        Depths come from ``passes - 1`` earlier passes; 1 is the plain transform.
-        """
         bearings, points = checked(self, bearings, points)
-        conditioned = condition(points)
-        if conditioned is None:
-            return NO_POSES
-        points, middle, scale = conditioned
-        image, weights = image_plane(bearings), np.ones(len(points))
-        matrix, information = np.empty((3, 4)), np.empty((12, 12))
-        for _ in range(passes):
-            rows = _rows(image, points, weights)
-            _, stretch, right = np.linalg.svd(rows, full_matrices=False)
-            if stretch[-2] <= DEGENERATE * stretch[0]:
-                return NO_POSES
-            matrix, information = right[-1].reshape(3, 4), rows.T @ rows
-            depths = points @ matrix[2, :3] + matrix[2, 3]
-            if np.count_nonzero(depths < 0.0) > np.count_nonzero(depths > 0.0):
-                matrix, depths = -matrix, -depths
-            weights = 1.0 / np.maximum(depths, MIN_DEPTH * np.median(np.abs(depths)))
-        rotation = nearest_rotation(matrix[:, :3])
-        if rotation is None:
-            return NO_POSES
-        scaled = matrix[:, :3] / np.cbrt(np.linalg.det(matrix[:, :3]))
-        rotation = _weighted_procrustes(rotation, scaled, np.diag(information).reshape(3, 4)[:, :3])
-        translation = _translation(image, points @ rotation.T, weights)
-        return poses(rotation, translation / scale - rotation @ middle)
+        return odlt(plane_rows(bearings), points)
 
 
-def _rows(image: FloatArray, points: FloatArray, weights: FloatArray) -> FloatArray:
-    """The system (2 K, 12): x (third row) - (first row) = 0 and y (third row) - (second row) = 0 of [A | b]."""
+class OdltSphere:
+    """Optimal direct linear transform of bearings."""
+
+    name = "oDLT on the sphere"
+    sample_size = 6
+    pinhole = False
+
+    def solve(self, bearings: FloatArray, points: FloatArray) -> FloatArray:
+        """See ``Solver.solve``; at most one pose."""
+        bearings, points = checked(self, bearings, points)
+        return odlt(sphere_rows(bearings), points)
+
+
+def odlt(rows: MatchRows, points: FloatArray, passes: int = 2) -> FloatArray:
+    """At most one pose (S, 3, 4) of points (K, 3) by the equations of their matches, with depths from ``passes - 1``
+    earlier passes; 1 is the plain transform."""
+    conditioned = condition(points)
+    if conditioned is None:
+        return NO_POSES
+    points, middle, scale = conditioned
+    weights = np.ones(len(points))
+    matrix, information = np.empty((3, 4)), np.empty((12, 12))
+    for _ in range(passes):
+        system = _system(rows, points, weights)
+        _, stretch, right = np.linalg.svd(system, full_matrices=False)
+        if stretch[-2] <= DEGENERATE * stretch[0]:
+            return NO_POSES
+        matrix, information = right[-1].reshape(3, 4), system.T @ system
+        depths = rows.ahead(points @ matrix[:, :3].T + matrix[:, 3])
+        if np.count_nonzero(depths < 0.0) > np.count_nonzero(depths > 0.0):
+            matrix, depths = -matrix, -depths
+        weights = 1.0 / np.maximum(depths, MIN_DEPTH * np.median(np.abs(depths)))
+    rotation = nearest_rotation(matrix[:, :3])
+    if rotation is None:
+        return NO_POSES
+    scaled = matrix[:, :3] / np.cbrt(np.linalg.det(matrix[:, :3]))
+    rotation = _weighted_procrustes(rotation, scaled, np.diag(information).reshape(3, 4)[:, :3])
+    translation = _translation(rows, points @ rotation.T, weights)
+    return poses(rotation, translation / scale - rotation @ middle)
+
+
+def _system(rows: MatchRows, points: FloatArray, weights: FloatArray) -> FloatArray:
+    """The equations (2 K, 12) of [A | b], row by row."""
     known = np.column_stack([points, np.ones(len(points))]) * weights[:, None]
-    rows = np.zeros((len(points), 2, 3, 4))
-    rows[:, 0, 0] = rows[:, 1, 1] = -known
-    rows[:, :, 2] = image[:, :, None] * known[:, None]
-    return rows.reshape(-1, 12)
+    return (rows.normals[:, :, :, None] * known[:, None, None, :]).reshape(-1, 12)
 
 
 def _weighted_procrustes(rotation: FloatArray, matrix: FloatArray, weights: FloatArray) -> FloatArray:
@@ -85,11 +95,8 @@ def _weighted_procrustes(rotation: FloatArray, matrix: FloatArray, weights: Floa
     return so3_exp(np.asarray(step, dtype=np.float64)) @ rotation
 
 
-def _translation(image: FloatArray, turned: FloatArray, weights: FloatArray) -> FloatArray:
+def _translation(rows: MatchRows, turned: FloatArray, weights: FloatArray) -> FloatArray:
     """t (3,) from the weighted rows, the points (K, 3) being turned already."""
-    rows = np.zeros((len(image), 2, 3))
-    rows[:, 0, 0] = rows[:, 1, 1] = -1.0
-    rows[:, :, 2] = image
-    right = (turned[:, :2] - image * turned[:, 2:]) * weights[:, None]
-    solution = np.linalg.lstsq((rows * weights[:, None, None]).reshape(-1, 3), right.ravel(), rcond=None)[0]
-    return np.asarray(solution, dtype=np.float64)
+    right = -np.einsum("kri,ki->kr", rows.normals, turned) * weights[:, None]
+    system = (rows.normals * weights[:, None, None]).reshape(-1, 3)
+    return np.asarray(np.linalg.lstsq(system, right.ravel(), rcond=None)[0], dtype=np.float64)

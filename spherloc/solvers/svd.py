@@ -16,7 +16,7 @@ close-range photogrammetry, 1971. Conditioning: Hartley, In defense of the eight
 import numpy as np
 
 from spherloc.solvers.base import Many, checked, poses_of_samples
-from spherloc.solvers.linear_pose import condition_each, linear_poses
+from spherloc.solvers.linear_pose import condition_each, linear_poses, tangents_of
 from spherloc.types import FloatArray
 
 
@@ -35,6 +35,6 @@ class Svd:
     def solve_each(self, bearings: FloatArray, points: FloatArray) -> Many:
         """At most one pose for each of B samples: ``bearings`` (B, K, 3) and ``points`` (B, K, 3), metres."""
         conditioned, middle, scale, exists = condition_each(points)
-        rotations, translations, solved = linear_poses(bearings, conditioned)
+        rotations, translations, solved = linear_poses(bearings, conditioned, tangents_of(bearings))
         translations = translations / scale[:, None] - np.einsum("bij,bj->bi", rotations, middle)
         return poses_of_samples(rotations, translations, exists & solved)

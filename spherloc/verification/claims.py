@@ -73,6 +73,8 @@ class Checked:
     """As printed."""
     other: Finding | None
     """Where the condition holds."""
+    earlier: bool = False
+    """Whether it was found at an earlier time."""
 
 
 def check(claim: Claim, measured: Measured) -> Checked:

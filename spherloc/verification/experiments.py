@@ -24,6 +24,48 @@ def _own(estimator: str, **options: float) -> Entrant:
     return Entrant(estimator, tuple(options.items()))
 
 
+PAPERS_VIEW_DEG = 120.0
+"""Field of view of the paper's rectified images, which it does not print: what wide rectified images keep."""
+WIDE_VIEWS: Mapping[str, float] = {"174°": 174.0, "sphere": 360.0}
+"""What their authors would give the pinhole solvers of a wide camera, with P3P for the samples."""
+PINHOLE_SOLVERS: Mapping[str, str] = {"EPnP": "ransac-epnp", "EPro": "ransac-epropnp", "oDLT": "ransac-odlt"}
+WIDE_SOLVERS: Mapping[str, tuple[str, float]] = {
+    f"{name} {how}": (estimator, view_deg)
+    for how, view_deg in WIDE_VIEWS.items()
+    for name, estimator in PINHOLE_SOLVERS.items()
+}
+"""Estimator and field of view."""
+
+
+def wide(name: str, iterations: int) -> Entrant:
+    """One of ``WIDE_SOLVERS`` with so many samples by P3P."""
+    estimator, view_deg = WIDE_SOLVERS[name]
+    return _printed(estimator, iterations=iterations, view_deg=view_deg)
+
+
+def rectified(estimator: str, iterations: int) -> Entrant:
+    """R+*: rectified, and sampled by EPnP as OpenCV's RANSAC does."""
+    changes = (("as_printed", True), ("bound_px", BOUND_PX), ("iterations", iterations))
+    return Entrant(estimator, (*changes, ("view_deg", PAPERS_VIEW_DEG), ("sampler", "epnp")))
+
+
+ALIKE: Mapping[str, tuple[str, dict[str, float]]] = {
+    "2P": ("ransac-2p", {}),
+    "P3P": ("ransac-p3p", {}),
+    "MLPnP": ("ransac-mlpnp", {"covariances": True}),
+    "SVD": ("ransac-svd", {}),
+    "EPnP": ("ransac-epnp", {"view_deg": 360.0}),
+    "EPro-PnP": ("ransac-epropnp", {"view_deg": 360.0}),
+    "oDLT": ("ransac-odlt", {"view_deg": 360.0}),
+}
+"""Methods under equal terms."""
+
+
+def _alike(estimator: str, **options: float) -> Entrant:
+    """99.9 % confidence of a clean sample, at most 10,000 samples, local optimization, Algorithm 1's last step."""
+    return _printed(estimator, iterations=10_000, confidence=0.999, local_optimization=True, **options)
+
+
 METHODS: Mapping[str, Entrant] = {
     "MC": _printed("mc"),
     "MC 3px": _printed("mc", 3.0),
@@ -32,15 +74,23 @@ METHODS: Mapping[str, Entrant] = {
     "2P10k": _printed("ransac-2p", iterations=10_000),
     "SVD100": _printed("ransac-svd", iterations=100),
     "SVD10k": _printed("ransac-svd", iterations=10_000),
-    "ML100": _printed("ransac-mlpnp", iterations=100),
-    "ML1k": _printed("ransac-mlpnp", iterations=1000),
-    "ML10k": _printed("ransac-mlpnp", iterations=10_000),
+    "ML100": _printed("ransac-mlpnp", iterations=100, covariances=False),
+    "ML1k": _printed("ransac-mlpnp", iterations=1000, covariances=False),
+    "ML10k": _printed("ransac-mlpnp", iterations=10_000, covariances=False),
+    "ML1k cov": _printed("ransac-mlpnp", iterations=1000, covariances=True),
+    "ML10k cov": _printed("ransac-mlpnp", iterations=10_000, covariances=True),
     "P3P100": _printed("ransac-p3p", iterations=100),
     "P3P1k": _printed("ransac-p3p", iterations=1000),
     "P3P10k": _printed("ransac-p3p", iterations=10_000),
-    "R+EPnP": _printed("ransac-epnp", iterations=10_000),
-    "R+EPro": _printed("ransac-epropnp", iterations=10_000),
-    "R+oDLT": _printed("ransac-odlt", iterations=10_000),
+    "R+EPnP": rectified("ransac-epnp", 10_000),
+    "R+EPro": rectified("ransac-epropnp", 10_000),
+    "R+oDLT": rectified("ransac-odlt", 10_000),
+    **{
+        f"{name}, {words}": wide(name, iterations)
+        for words, iterations in (("1k", 1000), ("10k", 10_000))
+        for name in WIDE_SOLVERS
+    },
+    **{f"{name}, alike": _alike(estimator, **options) for name, (estimator, options) in ALIKE.items()},
     "mc": _own("mc"),
     "mc 8px": _own("mc", bound_px=BOUND_PX),
     "mc-exact": _own("mc-exact"),
@@ -51,8 +101,8 @@ METHODS: Mapping[str, Entrant] = {
     "ransac-svd 100": _own("ransac-svd", iterations=100),
     "ransac-mlpnp 100": _own("ransac-mlpnp", iterations=100),
 }
-"""Every method by its name on the page. R+EPro is EPro-PnP's solver alone: its learned weights are not public for
-these matches, so all weights are equal."""
+"""Every method by its name on the page. EPro-PnP is its solver alone: the weights that its network learns are not
+public for these matches, so all weights are equal."""
 
 CAMERAS: Mapping[str, str] = {
     "MEI": "mei_outliers_80",
@@ -117,7 +167,7 @@ def _steps(first: float, last: float, step: float) -> tuple[float, ...]:
     return tuple(round(first + k * step, 10) for k in range(round((last - first) / step) + 1))
 
 
-_SLOW = ("SVD10k", "ML10k", "R+EPnP", "R+EPro", "R+oDLT")
+_SLOW = ("SVD10k", "ML10k", "ML10k cov", "R+EPnP", "R+EPro", "R+oDLT")
 _CASE = ("MC", "2P1k", "2P10k", "SVD10k", "ML10k", "R+EPro", "R+EPnP", "R+oDLT", "mc", "mc-exact")
 
 CASES: Mapping[str, tuple[int, int]] = {"case1": (13, 52), "case2": (9, 42), "case3": (28, 130)}
@@ -127,12 +177,15 @@ CASES: Mapping[str, tuple[int, int]] = {"case1": (13, 52), "case2": (9, 42), "ca
 _CASE_OWN = ("mc 8px", "mc-exact 8px", "ransac-2p 1k")
 OWN = "-own"
 """Ends the key of an experiment with this project's own forms beside another one."""
+WIDE_VIEW = "-wide"
+"""Ends the key of an experiment with the baselines as their authors would run them beside another one."""
+_CASE_WIDE = (*(f"{name}, 10k" for name in WIDE_SOLVERS), "ML10k cov", "P3P10k", "2P10k")
 
 
 def _case(key: str, right: int, count: int, methods: tuple[str, ...] = _CASE) -> Experiment:
     return Experiment(
         key=key,
-        place="Table VI" if methods == _CASE else "Table VI, own forms",
+        place={_CASE: "Table VI", _CASE_OWN: "Table VI, own forms"}.get(methods, "Table VI, wide views"),
         over="correspondences",
         values=(float(count),),
         correspondences=count,
@@ -275,6 +328,33 @@ EXPERIMENTS: Sequence[Experiment] = (
     ),
     *(_case(key, right, count) for key, (right, count) in CASES.items()),
     *(_case(key + OWN, right, count, _CASE_OWN) for key, (right, count) in CASES.items()),
+    *(_case(key + WIDE_VIEW, right, count, _CASE_WIDE) for key, (right, count) in CASES.items()),
+    Experiment(
+        key="wide-fig6",
+        place="Fig. 6, baselines with wide views",
+        over="outlier_rate",
+        values=_steps(0.0, 0.9, 0.1),
+        correspondences=100,
+        methods=(*(f"{name}, 1k" for name in WIDE_SOLVERS), "ML1k cov", "P3P1k", "2P1k"),
+        runs=100,
+        quick_values=(0.5,),
+        quick_runs=3,
+        variation=Variation(noise_px=1.0),
+        cameras=("MEI",),
+    ),
+    Experiment(
+        key="alike",
+        place="Fig. 6, under equal terms",
+        over="outlier_rate",
+        values=_steps(0.0, 0.9, 0.1),
+        correspondences=100,
+        methods=tuple(f"{name}, alike" for name in ALIKE),
+        runs=100,
+        quick_values=(0.5,),
+        quick_runs=3,
+        variation=Variation(noise_px=1.0),
+        cameras=("MEI",),
+    ),
     *(_phase(count, gravity) for gravity, counts in PHASE_GRAVITY_DEG.items() for count in counts),
 )
 """In the order in which they are run: what the page needs most comes first."""

@@ -9,7 +9,7 @@ from typing import Any
 from spherloc.errors import InputError
 from spherloc.experiments.sweep_plan import Entrant
 from spherloc.files import is_folder, names_in, read_file
-from spherloc.verification.experiments import BOUND_PX, METHODS
+from spherloc.verification.experiments import METHODS, WIDE_SOLVERS, rectified, wide
 
 MAX_BYTES = 1_000_000
 """Of the file of the printed tables."""
@@ -39,19 +39,25 @@ class Dataset:
     """Of a folder that holds the dataset; raises ``InputError`` if it has none."""
 
 
-def _limited(estimator: str) -> Entrant:
-    return Entrant(estimator, (("as_printed", True), ("bound_px", BOUND_PX), ("iterations", 100)))
-
-
 TABLE_METHODS: Mapping[str, Entrant] = {
     **{name: METHODS[name] for name in ("MC", "2P100", "2P1k", "SVD100", "ML100")},
-    "R+EPro": _limited("ransac-epropnp"),
-    "R+EPnP": _limited("ransac-epnp"),
-    "R+oDLT": _limited("ransac-odlt"),
+    "R+EPro": rectified("ransac-epropnp", 100),
+    "R+EPnP": rectified("ransac-epnp", 100),
+    "R+oDLT": rectified("ransac-odlt", 100),
+    **{name: wide(name, 100) for name in WIDE_SOLVERS},
     **{name: METHODS[name] for name in ("mc", "mc-exact", "ransac-2p 1k")},
 }
-"""Methods of Tables II to V; R+* with 100 iterations, as noted under Table IV."""
+"""Methods of Tables II to V; R+* with 100 iterations, as noted under Table IV; below them the same
+solvers with wide views, 100 samples by P3P."""
 _FEW = ("MC", "2P100", "2P1k", "SVD100", "ML100", "mc", "mc-exact", "ransac-2p 1k")
+
+
+def iterations(entrant: Entrant) -> str:
+    """How many samples a method draws, as tables say it; none for a search that draws none."""
+    options = dict(entrant.changes)
+    if "iterations" in options:
+        return f"{options['iterations']:,}"
+    return "1,000" if entrant.estimator.startswith("ransac") else "none"
 
 
 def _kitti360(folder: Path) -> list[Session]:

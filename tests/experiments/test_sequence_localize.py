@@ -20,8 +20,15 @@ from spherloc.estimators import options_type
 from spherloc.experiments import SequenceResults
 from spherloc.experiments.configuration import configuration_of
 from spherloc.experiments.results import QueryResult
-from spherloc.experiments.sequence import chosen_queries, localize
-from spherloc.experiments.summary import estimated_trajectory, summarize, timed, true_trajectory, wilson
+from spherloc.experiments.sequence import How, chosen_queries, localize, localize_by_each
+from spherloc.experiments.summary import (
+    estimated_trajectory,
+    summarize,
+    timed,
+    true_trajectory,
+    vehicle_trajectory,
+    wilson,
+)
 from tests.waiting import LIMIT_S
 
 
@@ -203,6 +210,36 @@ def test_limits_are_not_included_and_both_count(tmp_path: Path) -> None:
     scene = replace(sequence_of(5), thresholds=((1.0, 0.1), (2.0, 0.25)), where=str(tmp_path / "s.toml"))
     (tmp_path / "s.toml").write_text("")
     assert [rate.successes for rate in summarize(results_of(scene, rows)).success] == [1, 4]
+
+
+@pytest.mark.usefixtures("drawn")
+def test_one_estimator_initialises_and_the_other_tracks(tmp_path: Path) -> None:
+    """The initialiser solves the first query, one that is not localized, and the one after; its time counts."""
+    scene = scene_of(tmp_path, queries=6, wrong=[2])
+    how = How("ransac-2p", options_type("ransac-2p")(iterations=50), 0, ("mc", options_type("mc")()))
+    found = list(localize_by_each(scene, [(view, [0]) for view in scene.queries], [how]))
+    first = [any("Initialised by mc." in remark for remark in row.remarks) for _, row, _ in found]
+    used = [trace.estimator for _, _, trace in found]
+    assert [row.status == "localized" for _, row, _ in found] == [True, True, False, True, True, True]
+    assert first == [True, False, True, True, False, False]
+    assert used == ["mc" if one else "ransac-2p" for one in first]
+    times = [row.estimating_ms - trace.timings_ms["total"] for _, row, trace in found]
+    assert times[2] > 0.0 and times[:2] + times[3:] == [0.0] * 5  # tracked in vain, then initialised
+
+
+@pytest.mark.usefixtures("drawn")
+def test_a_vehicle_is_where_its_camera_says(tmp_path: Path) -> None:
+    """A point of the vehicle goes through the camera to the same place in the map."""
+    scene = scene_of(tmp_path, queries=3)
+    rotation = Rotation.from_euler("xyz", [10.0, -80.0, 35.0], degrees=True).as_matrix()
+    vehicle_from_camera = np.column_stack([rotation, [0.8, -0.3, 1.4]])
+    rows = [row for row, _ in solve(scene)]
+    found = vehicle_trajectory(results_of(scene, rows), vehicle_from_camera)
+    in_camera = np.array([2.0, -1.0, 5.0])
+    in_vehicle = rotation @ in_camera + vehicle_from_camera[:, 3]
+    for row, map_from_vehicle in zip(rows, found.map_from_body, strict=True):
+        in_map = row.cam_from_map[:, :3].T @ (in_camera - row.cam_from_map[:, 3])
+        np.testing.assert_allclose(map_from_vehicle[:, :3] @ in_vehicle + map_from_vehicle[:, 3], in_map, atol=1e-9)
 
 
 @pytest.mark.usefixtures("drawn")

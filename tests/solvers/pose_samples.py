@@ -6,12 +6,13 @@ from scipy.spatial.transform import Rotation
 from spherloc.geometry import pose, tangent_basis, transform
 from spherloc.metrics import rotation_error_deg, translation_error_m
 from spherloc.solvers.epnp import Epnp
-from spherloc.solvers.epropnp import EproPnp
+from spherloc.solvers.epnp_sphere import EpnpSphere
+from spherloc.solvers.epropnp import EproPnp, EproPnpSphere
 from spherloc.solvers.mlpnp import Mlpnp
-from spherloc.solvers.odlt import Odlt
+from spherloc.solvers.odlt import Odlt, OdltSphere
 from spherloc.solvers.svd import Svd
 
-SOLVERS = (Svd(), Mlpnp(), Epnp(), Odlt(), EproPnp())
+SOLVERS = (Svd(), Mlpnp(), Epnp(), Odlt(), EproPnp(), EpnpSphere(), OdltSphere(), EproPnpSphere())
 
 
 def random_rotation(rng):

@@ -75,3 +75,32 @@ def test_error_is_not_above_that_of_the_authors_code(rng):
         theirs.append(errors(truth, pose(rotation, translation)[None]))
     assert (np.median(ours, axis=0) <= 1.05 * np.median(theirs, axis=0)).all()
     assert np.median(theirs, axis=0)[0] < 5e-3, "otherwise the comparison would mean nothing"
+
+
+def test_covariances_weigh_each_bearing_in_each_direction(rng):
+    """With noise of another size in each direction of each bearing: scipy's least squares in pixels, and a better pose
+    than all alike; of equal noise the same pose as without."""
+    alike, weighed = [], []
+    for _ in range(40):
+        bearings, points, truth = around(rng, 25, offset_m=2.0)
+        basis = tangent_basis(bearings)
+        pixels_per_radian = 10.0 ** rng.uniform(2.0, 4.0, (25, 2))
+        moved = bearings + np.einsum("nij,ni->nj", basis, rng.standard_normal((25, 2)) / pixels_per_radian)
+        moved /= np.linalg.norm(moved, axis=1, keepdims=True)
+        jacobian = pixels_per_radian[:, :, None] * tangent_basis(moved)
+        found = Mlpnp().solve_each(moved[None], points[None], jacobian[None])[0][0]
+
+        def residuals(x, truth=truth, points=points, jacobian=jacobian):
+            turned = Rotation.from_rotvec(x[:3]).as_matrix() @ truth[:, :3]
+            rays = points @ turned.T + truth[:, 3] + x[3:]
+            return np.einsum("nij,nj->ni", jacobian, rays / np.linalg.norm(rays, axis=1, keepdims=True)).ravel()
+
+        x = least_squares(residuals, np.zeros(6), xtol=1e-15, ftol=1e-15, gtol=1e-15).x
+        best = pose(Rotation.from_rotvec(x[:3]).as_matrix() @ truth[:, :3], truth[:, 3] + x[3:])
+        np.testing.assert_allclose(found, best, atol=1e-5)
+        weighed.append(errors(truth, found[None])[0])
+        plain = Mlpnp().solve(moved, points)
+        alike.append(errors(truth, plain)[0])
+        same = Mlpnp().solve_each(moved[None], points[None], 300.0 * tangent_basis(moved)[None])[0]
+        np.testing.assert_allclose(same, plain, atol=1e-9)
+    assert np.median(weighed) < 0.6 * np.median(alike)

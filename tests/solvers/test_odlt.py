@@ -6,7 +6,8 @@ import pytest
 from pose_samples import ahead, errors
 
 from spherloc.geometry import pose
-from spherloc.solvers.odlt import Odlt
+from spherloc.solvers.match_rows import plane_rows
+from spherloc.solvers.odlt import Odlt, odlt
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
 
@@ -30,7 +31,7 @@ def test_weights_beat_the_plain_transform(rng):
     plain, weighted, best = [], [], []
     for _ in range(150):
         bearings, points, truth = on_the_image(rng, 60, 2e-3)
-        plain.append(errors(truth, Odlt().weighted(bearings, points, passes=1)))
+        plain.append(errors(truth, odlt(plane_rows(bearings), points, passes=1)))
         weighted.append(errors(truth, Odlt().solve(bearings, points)))
         image, middle = bearings[:, :2] / bearings[:, 2:], points.mean(axis=0)
         turn, shift = cv2.Rodrigues(truth[:, :3])[0], truth[:, 3] + truth[:, :3] @ middle

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from pose_samples import around
 
-from spherloc.solvers.epnp import VirtualPinhole, image_plane
+from spherloc.solvers.epnp import VirtualPinhole
+from spherloc.solvers.match_rows import image_plane
 
 
 @pytest.mark.parametrize("fov_deg", [60.0, 120.0, 160.0])
