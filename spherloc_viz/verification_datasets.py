@@ -101,7 +101,7 @@ def tables_text(found: Sequence[SessionResult]) -> str:
         ours = [item for item in found if item.dataset == dataset]
         if ours:
             parts.append("Here:\n")
-            parts.append(_markdown(*_measured(ours)))
+            parts.append(measured_table(ours))
         else:
             parts.append(
                 f"Here: data needed. `spherloc verify --{dataset} DIR` adds the table of your copy, with the same "
@@ -120,6 +120,11 @@ def _statements() -> str:
         verdict = "the table says so" if holds else "**the table does not**"
         lines.append(f"| {statement.place} | {statement.sentence} | {ours} | {verdict} |")
     return "\n".join(lines) + "\n"
+
+
+def measured_table(found: Sequence[SessionResult]) -> str:
+    """Markdown of what was measured."""
+    return _markdown(*_measured(found))
 
 
 def _measured(found: Sequence[SessionResult]) -> tuple[list[str], list[list[str]]]:

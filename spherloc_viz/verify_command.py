@@ -19,6 +19,7 @@ from spherloc_viz.progress import progress, say
 from spherloc_viz.verification_datasets import run_sessions, tables_text
 from spherloc_viz.verification_page import verification_page
 from spherloc_viz.verification_parts import PHASES, part_pages
+from spherloc_viz.verification_pictures import failure_table, session_pictures
 from spherloc_viz.verification_plots import FIGURES, figure_svg, phase_svg
 
 PAGE, TABLES, RESULTS, RUNS = "index.md", "tables.md", "claims.json", "runs"
@@ -54,13 +55,21 @@ def verify(
     for place, (key, plan) in enumerate(plans.items(), 1):
         title = f"{key[0]}, {key[1]} ({place} of {len(plans)})"
         rows[key] = _runs(output / RUNS / f"{_file_name(*key)}.csv", title, plan, workers, scheduler)
-    tables = tables_text(run_sessions(datasets or {}, output / RUNS, quick))
+    sessions = run_sessions(datasets or {}, output / RUNS, quick)
+    tables = tables_text(sessions)
+    pictures: dict[str, bytes] = {}
+    if sessions:
+        tables += "\n" + failure_table(output / RUNS)
+        for dataset, session in dict.fromkeys((item.dataset, item.session) for item in sessions):
+            files, words = session_pictures(output / RUNS, dataset, session)
+            pictures |= files
+            tables += "\n" + words
     measured = Measured(rows)
     checked = [check(claim, measured) for claim in CLAIMS]
     if only and is_file(output / RESULTS):
         text = read_file(output / RESULTS, MAX_BYTES).decode("utf-8", "replace")
         checked = with_kept(checked, text, str(output / RESULTS))
-    _write(output, measured, checked, plans, tables, quick)
+    _write(output, measured, checked, plans, tables, pictures, quick)
     for item in checked:
         say(_line(item))
     print(f"written to {output / PAGE}, {RESULTS} and figures", flush=True)
@@ -108,6 +117,7 @@ def _write(
     checked: Sequence[Checked],
     plans: dict[tuple[str, str], SweepPlan],
     tables: str,
+    images: Mapping[str, bytes],
     quick: bool,
 ) -> None:
     files: dict[str, str] = {}
@@ -121,9 +131,9 @@ def _write(
     files[TABLES] = tables
     files[PAGE] = verification_page(checked, quick, sorted({experiment for experiment, _ in plans}))
     files[RESULTS] = kept_text(checked)
-    for name, text in files.items():
+    for name, content in {**{name: text.encode() for name, text in files.items()}, **images}.items():
         path = output / name
         try:
-            path.write_text(text, encoding="utf-8")
+            path.write_bytes(content)
         except OSError as error:
             raise InputError(f"{path}: cannot be written ({reason(error)}); give another --output.") from None

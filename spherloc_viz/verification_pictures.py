@@ -1,0 +1,223 @@
+"""Figs. 8 to 10 of the paper for sessions of a dataset: inliers of one query, failures, and trajectories."""
+
+import io
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from spherloc.datasets import load_scene
+from spherloc.datasets.map_scene import MapScene
+from spherloc.estimators import estimate
+from spherloc.experiments.results import LOCALIZED, SequenceResults, read_results
+from spherloc.frontend.view import Matches
+from spherloc.geometry import align_to_down
+from spherloc.types import BoolArray, FloatArray
+from spherloc.verification.sessions import DATASETS, TABLE_METHODS
+from spherloc_viz.style import ERROR_RAMP, css
+
+DPI = 110
+PANEL_INCHES = (4.2, 4.4)
+MAX_COLUMNS = 3
+FIGURE_METHODS = ("MC", "2P100", "ML100", "mc-exact")
+"""Of the figures; the paper has the first three."""
+RIGHT, WRONG, REJECTED = "#1a9850", "#f28e2b", "#d73027"
+"""An inlier that is right, one that is not, and a match that is no inlier."""
+
+
+FAILURES = """\
+## Fig. 9: why queries fail
+
+The paper shows three kinds: too few inliers, too many outliers, and a wrong reference image. Every failure of a run
+gets its cause by the [diagnosis](../failures.md), here of all queries of the sessions above:
+
+"""
+FIGURES = """\
+## Figs. 8 and 10: several methods in one picture
+
+![Inliers by four methods]({fig8})
+
+Session {session}, query {query}, the one with the most outliers ({share:.0f} % of {matches} matches): green, inliers that
+are right; orange, inliers that are not; red, all other matches.
+
+![Trajectories by four methods]({fig10})
+
+Session {session}: the bluer, the smaller the error (up to {limit:g} m); crosses have no pose. Roughness is the median
+second difference of the positions, small where the way is what the paper calls smooth.
+"""
+LIMIT_M = 0.5
+"""Errors beyond it have one colour in Fig. 10."""
+
+
+def failure_table(results: Path) -> str:
+    """Fig. 9 as Markdown: causes of failure by method, of all sessions in the folder of ``run_sessions``."""
+    counts: dict[str, Counter[str]] = {name: Counter() for name in FIGURE_METHODS}
+    for dataset in DATASETS:
+        for name in FIGURE_METHODS:
+            for path in sorted(results.glob(f"{dataset.key}_*/{name}/results.jsonl")):
+                rows = read_results(path.parent).rows
+                counts[name].update(row.diagnosis or "no problem to solve" for row in rows if row.status != LOCALIZED)
+    lines = ["| cause | " + " | ".join(FIGURE_METHODS) + " |", "|---|" + "---|" * len(FIGURE_METHODS)]
+    for cause in sorted({cause for counter in counts.values() for cause in counter}):
+        lines.append(f"| {cause} | " + " | ".join(str(counts[name][cause]) for name in FIGURE_METHODS) + " |")
+    return FAILURES + "\n".join(lines) + "\n"
+
+
+def session_pictures(results: Path, dataset: str, session: str) -> tuple[dict[str, bytes], str]:
+    """Figs. 8 and 10 of a session in the folder of ``run_sessions``: PNG by file name, and the Markdown about them.
+
+    Nothing and an empty text if no query's truth is known.
+    """
+    folder = results / f"{dataset}_{session}"
+    several = [(name, read_results(folder / name)) for name in FIGURE_METHODS]
+    shares = {row.query: row.true_outlier_rate for row in several[0][1].rows if row.true_outlier_rate is not None}
+    scene = load_scene(folder / "scene.toml")
+    if not shares or not isinstance(scene, MapScene):
+        return {}, ""
+    hardest = max(shares, key=lambda name: shares[name])
+    view = scene.query(hardest)
+    matches = scene.matcher(view)
+    problem = scene.problem_of(view, matches)
+    shown = []
+    for name in FIGURE_METHODS:
+        entrant = TABLE_METHODS[name]
+        trace = estimate(problem, entrant.estimator, entrant.options(problem), 0)
+        shown.append(Inliers(name, trace.inlier_mask))
+    files = {
+        f"fig8_{dataset}_{session}.png": inliers_png(
+            view.read(), matches.references[0].read(), matches, problem.truth_inliers, shown
+        ),
+        f"fig10_{dataset}_{session}.png": trajectories_by_error_png(several, LIMIT_M),
+    }
+    fig8, fig10 = files
+    words = FIGURES.format(
+        fig8=fig8,
+        fig10=fig10,
+        session=session,
+        query=hardest,
+        share=100 * shares[hardest],
+        matches=len(matches.pixels),
+        limit=LIMIT_M,
+    )
+    return files, words
+
+
+@dataclass(frozen=True, eq=False)
+class Inliers:
+    """What one method made of the matches of a query."""
+
+    label: str
+    """The method."""
+    mask: BoolArray
+    """(N,) its inliers."""
+
+
+def inliers_png(
+    query: NDArray[np.uint8],
+    reference: NDArray[np.uint8],
+    matches: Matches,
+    right: BoolArray | None,
+    several: Sequence[Inliers],
+) -> bytes:
+    """PNG of Fig. 8: query and its first reference beside each other, a line a match, a panel a method.
+
+    Inliers are green, those that are not ``right`` (N,) orange, all other matches thin and red. Matches with other
+    references are left out. The same input gives the same bytes.
+    """
+    shown = (matches.reference_index == 0) & np.isfinite(matches.reference_pixels).all(axis=1)
+    scale = query.shape[0] / reference.shape[0]
+    side = cv2.resize(reference, (round(scale * reference.shape[1]), query.shape[0]))
+    both = np.hstack([query, side])[:, :, ::-1]
+    starts, ends = matches.pixels, scale * matches.reference_pixels + [query.shape[1], 0.0]
+    columns = min(len(several), 2)
+    rows = -(-len(several) // columns)
+    size = (6.4 * columns, 6.4 * columns / columns * both.shape[0] / both.shape[1] * rows + 0.35 * rows)
+    figure = Figure(figsize=size, dpi=DPI, layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = list(figure.subplots(rows, columns, squeeze=False).flat)
+    for axes, item in zip(panels, several, strict=False):
+        axes.imshow(both)
+        good = item.mask if right is None else item.mask & right
+        for mask, color, width in ((~item.mask, REJECTED, 0.25), (item.mask & ~good, WRONG, 0.8), (good, RIGHT, 0.8)):
+            for place in np.flatnonzero(mask & shown):
+                axes.plot(*np.stack([starts[place], ends[place]]).T, color=color, linewidth=width)
+        count, of_them = int(np.count_nonzero(item.mask)), int(np.count_nonzero(good))
+        words = f"{count} inliers" if right is None else f"{of_them} right of {count} inliers"
+        axes.set_title(f"{item.label}: {words}", parse_math=False, fontsize=9)
+    for axes in panels:
+        axes.set_axis_off()
+    return _png(figure)
+
+
+def trajectories_by_error_png(several: Sequence[tuple[str, SequenceResults]], limit_m: float) -> bytes:
+    """PNG of Fig. 10: a panel a method, its positions from above, joined and coloured by their error, blue where it is
+    small; beyond ``limit_m`` one colour; the true way is grey, queries without a pose are crosses.
+
+    The same results give the same bytes.
+    """
+    columns = min(len(several), MAX_COLUMNS)
+    rows = -(-len(several) // columns)
+    figure = Figure(figsize=(PANEL_INCHES[0] * columns, PANEL_INCHES[1] * rows), dpi=DPI, layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = list(figure.subplots(rows, columns, squeeze=False).flat)
+    first = several[0][1]
+    turn = align_to_down(first.configuration.gravity_map)
+    truth = (first.true_positions_m @ turn.T)[:, [0, 2]]
+    colors = LinearSegmentedColormap.from_list("error", [css(color) for color in ERROR_RAMP])
+    drawn = None
+    for axes, (label, results) in zip(panels, several, strict=False):
+        drawn = _panel(axes, label, results, truth, turn, limit_m, colors) or drawn
+    for axes in panels[len(several) :]:
+        axes.set_visible(False)
+    if drawn is not None:
+        figure.colorbar(drawn, ax=panels[: len(several)], label="position error (m)", shrink=0.8)
+    return _png(figure)
+
+
+def _panel(
+    axes: Axes,
+    label: str,
+    results: SequenceResults,
+    truth: FloatArray,
+    turn: FloatArray,
+    limit_m: float,
+    colors: LinearSegmentedColormap,
+) -> object:
+    """Draw one method; returns what the colours are of, None if there is no pose."""
+    places = (results.positions_m @ turn.T)[:, [0, 2]]
+    errors = np.linalg.norm(results.positions_m - results.true_positions_m, axis=1)
+    axes.plot(*truth.T, color="0.7", linewidth=2.5, zorder=1)
+    there = np.isfinite(places).all(axis=1)
+    middle, half = np.nanmean(truth, axis=0), 0.6 * np.nanmax(np.ptp(truth, axis=0)) + limit_m
+    axes.plot(*places[there].T, color="0.4", linewidth=0.7, zorder=2)
+    drawn = None
+    if there.any():
+        drawn = axes.scatter(
+            *places[there].T, c=np.minimum(errors[there], limit_m), vmin=0.0, vmax=limit_m, cmap=colors, s=26, zorder=3
+        )
+    if not there.all():
+        axes.plot(*truth[~there].T, "x", color=REJECTED, markersize=7, zorder=3)
+    axes.set_xlim(middle[0] - half, middle[0] + half)
+    axes.set_ylim(middle[1] - half, middle[1] + half)
+    axes.set_aspect("equal")
+    steps = np.diff(places[there], axis=0)
+    rough = float(np.median(np.linalg.norm(np.diff(steps, axis=0), axis=1))) if len(steps) > 1 else np.nan
+    seen = errors[there]
+    words = f"median error {np.median(seen):.2g} m, roughness {rough:.2g} m" if len(seen) else "no pose"
+    axes.set_title(f"{label}\n{words}", parse_math=False, fontsize=9)
+    axes.tick_params(labelsize=7)
+    return drawn
+
+
+def _png(figure: Figure) -> bytes:
+    file = io.BytesIO()
+    figure.savefig(file, format="png", metadata={"Software": None})
+    return file.getvalue()
