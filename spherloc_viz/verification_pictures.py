@@ -45,7 +45,7 @@ FIGURES = """\
 
 ![Inliers by four methods]({fig8})
 
-Session {session}, query {query}, the one with the most outliers ({share:.0f} % of {matches} matches): green, inliers that
+Session {session}, query {query}, which has the most outliers ({share:.0f} % of {matches} matches): green, inliers that
 are right; orange, inliers that are not; red, all other matches.
 
 ![Trajectories by four methods]({fig10})

@@ -172,10 +172,9 @@ def test_the_text_is_checked_against_the_printed_tables():
     assert text["MC outperforms all other methods on quad."]
     assert not text["Right inliers are no more than the right matches."]  # 11 of 9
     tables = printed_tables()
-    row = next(row for row in tables["table4"]["rows"] if row[0] == "2P100")
-    row[3] = row[3].replace("87.4", "86.4")
-    row = next(row for row in tables["table4"]["rows"] if row[0] == "2P1k")
-    row[3] = row[3].replace("87.2", "86.2")
+    for row in tables["table4"]["rows"]:
+        if row[0] != "MC":
+            row[3] = row[3].replace("87.", "86.")  # 2P100, 2P1k and R+EPro, which is as good as MC
     statement = next(item for item in STATEMENTS if item.sentence == "MC outperforms all other methods on math.")
     assert statement.check(Tables(tables))[0]
 
