@@ -19,17 +19,20 @@ from spherloc.geometry import DOWN, pose, so3_exp, tangent_basis
 from spherloc.problem import Problem
 from spherloc.types import FloatArray
 
-MOST = 14
+MAX_COUNT = 14
 KINDS = ("anywhere", "near-horizontal", "near-vertical", "repeated", "narrow", "plane", "far")
 """How bearings and points lie."""
 
 
 def random_problem(seed: int) -> tuple[Problem, float, str]:
-    """A problem with at most ``MOST`` correspondences that the camera sees, its noise bound in px, and its kind."""
+    """A problem with at most ``MAX_COUNT`` matches that the camera sees, its noise bound in px, and its kind."""
     rng = np.random.default_rng([seed, 14])
     kind = KINDS[seed % len(KINDS)]
     camera = _camera(rng)
-    count, bound_px = int(rng.integers(3, MOST + 1)), float(np.exp(rng.uniform(np.log(0.5), np.log(30.0))))
+    count, bound_px = (
+        int(rng.integers(3, MAX_COUNT + 1)),
+        float(np.exp(rng.uniform(np.log(0.5), np.log(30.0)))),
+    )
     # Half of the cameras are mounted level; the others look anywhere.
     mount = so3_exp(rng.uniform(-np.pi, np.pi) * _unit(rng)) if rng.random() < 0.5 else np.eye(3)
     truth = pose(mount @ so3_exp(rng.uniform(-np.pi, np.pi) * DOWN), rng.uniform(-5.0, 5.0, 3))

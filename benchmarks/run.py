@@ -56,7 +56,7 @@ def other_rows(problems: int | None) -> dict[str, tuple[str, Callable[[], Row]]]
     checked = min(problems, 200) if problems is not None else 10_000
     return {
         "certificate": (
-            f"certificate beside brute force, {checked:,} random problems with N <= {certificate.MOST}",
+            f"certificate beside brute force, {checked:,} random problems with N <= {certificate.MAX_COUNT}",
             lambda: certificate.measure(checked),
         ),
         "clique": (

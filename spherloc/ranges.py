@@ -1,4 +1,4 @@
-"""Between which numbers lie: smaller or larger ones under- or overflow in powers that the estimators take of them."""
+"""Limits of numbers in problems and options: beyond them, powers that the estimators compute under- or overflow."""
 
 import math
 from dataclasses import fields
@@ -11,17 +11,17 @@ MIN_PX, MAX_PX = 1e-6, 1e6
 """Pixel bounds and noise."""
 MIN_M, MAX_M = 1e-12, 1e12
 """The farthest point from the origin; a map may also be all in the origin."""
-LEAST, MOST = 1e-12, 1e12
+MIN_OTHER, MAX_OTHER = 1e-12, 1e12
 """Other options that are neither 0 nor infinite."""
 MAX_SEED = 2**63 - 1
 
 
 def check_option(name: str, value: Any) -> None:
-    """Raise ``InputError`` for a number of an option that is NaN or so small or large that nobody can calculate with
-    it; what else the option refuses is its own to say."""
+    """Raise ``InputError`` for a number of an option that is NaN or too small or too large to calculate with; other
+    limits are checked by the options themselves."""
     if isinstance(value, bool) or not isinstance(value, Real):
         return
-    least, most = (MIN_PX, MAX_PX) if name.endswith("_px") else (LEAST, MOST)
+    least, most = (MIN_PX, MAX_PX) if name.endswith("_px") else (MIN_OTHER, MAX_OTHER)
     try:
         size = abs(float(value))
     except OverflowError:  # an integer beyond all floats

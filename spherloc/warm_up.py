@@ -9,6 +9,7 @@ numba compiles one kernel at a time in a process, so that parts of the work are 
 """
 
 import contextlib
+import gc
 import os
 import subprocess
 import sys
@@ -101,8 +102,8 @@ def _uncertain_problem() -> Problem:
     return replace(_scene(), correspondences=40, noise_px=0.5, gravity_error_deg=0.5).problem()
 
 
-def _murky_problem() -> Problem:
-    """So murky that the exact search has to use all that it has."""
+def _noisy_problem() -> Problem:
+    """So noisy that the exact search spends its whole effort."""
     return replace(_scene(), correspondences=12, outlier_rate=0.6, noise_px=10.0).problem()
 
 
@@ -111,27 +112,34 @@ def _refine() -> None:
     problem = _uncertain_problem()
     assert problem.truth_cam_from_map is not None
     aligned, options = problem.aligned, options_type(FASTEST)()
-    bounds = bounds_of(aligned, 3.0)
-    path, _ = refined_path(aligned, aligned.align_pose(problem.truth_cam_from_map), bounds, options)
+    bounds, start = bounds_of(aligned, 3.0), aligned.align_pose(problem.truth_cam_from_map)
+    path, _ = refined_path(aligned, start, bounds, options)
     fitted_path(aligned, path[-1], bounds.pixels, options)
     record(aligned, path, bounds.pixels, options, measured=True)
+    limits, states = np.full(len(aligned.points), bounds.noise_px), np.tile(start, (1 + MAX_RESCUES * MAX_STEPS, 1, 1))
+    everything = np.ones(len(limits), np.bool_)
+    rescue(matches_of(aligned), limits, everything, states, 1, noise_of(aligned, options))
 
 
 def _search() -> None:
-    """The search of two matches, and the fits at narrowing bounds, which all estimators share."""
+    """The search of two matches, which all estimators share."""
+    aligned, options = _uncertain_problem().aligned, options_type(FASTEST)()
+    bounds = bounds_of(aligned, 3.0)
+    found = search_two_point(aligned, bounds.pixels, 0, 100, 0.99, options.scoring, True, Watch())
+    rays = aligned.bearings, aligned.points, aligned.pixel_from_bearing
+    mark_each(found.yaws_rad, found.translations, *rays, bounds.pixels)
+
+
+def _narrow() -> None:
+    """The fits at narrowing bounds, which all estimators share."""
     problem = _uncertain_problem()
     assert problem.truth_cam_from_map is not None
     aligned, options = problem.aligned, options_type(FASTEST)()
     bounds, matches, noise = bounds_of(aligned, 3.0), matches_of(aligned), noise_of(aligned, options)
-    found = search_two_point(aligned, bounds.pixels, 0, 100, 0.99, options.scoring, True, Watch())
-    rays = aligned.bearings, aligned.points, aligned.pixel_from_bearing
-    mark_each(found.yaws_rad, found.translations, *rays, bounds.pixels)
     start, limits = aligned.align_pose(problem.truth_cam_from_map), np.full(len(aligned.points), bounds.noise_px)
     narrow(matches, bounds.pixels.copy(), limits, start.copy(), noise, np.empty((len(NARROWINGS), 3, 4)))
     _, cost = descend(matches, limits, start.copy(), noise, np.empty((MAX_DESCENTS, 3, 4)))
     search_nearby(matches, bounds.pixels.copy(), limits, start.copy(), noise, start.copy(), cost)
-    path = np.tile(start, (1 + MAX_RESCUES * MAX_STEPS, 1, 1))
-    rescue(matches, limits, np.ones(len(limits), np.bool_), path, 1, noise)
 
 
 def _proofs() -> None:
@@ -153,13 +161,14 @@ def _cliques() -> None:
 
 def _exact_search() -> tuple[BoundedMatches, BestPoses, NDArray[np.int64]]:
     """Matches, an empty list of poses, and the numbers (M,) of all matches."""
-    aligned = _murky_problem().aligned
+    aligned = _noisy_problem().aligned
     count = len(aligned.points)
     return bounded_matches(aligned, bounds_of(aligned, 40.0)), empty_list(MAX_POSES, count), np.arange(count)
 
 
-SHARED: dict[str, Callable[[], object]] = {"refinement": _refine, "search": _search}
-"""What all estimators need, by name; compiled first."""
+SHARED: dict[str, Callable[[], object]] = {"refinement": _refine, "search": _search, "narrowing": _narrow}
+"""What all estimators need, by name; compiled first. Those that share kernels are not next to each other, so that the
+later one finds them compiled."""
 
 
 def _runs(estimator: str) -> dict[str, Callable[[], object]]:
@@ -170,7 +179,7 @@ def _runs(estimator: str) -> dict[str, Callable[[], object]]:
     if estimator == "mc-exact":
         runs |= {f"{estimator}, proofs": _proofs, f"{estimator}, cliques": _cliques}
         options = options_type(estimator)(bound_px=40.0)
-        runs[f"{estimator}, large bound"] = lambda: estimate(_murky_problem(), estimator, options)
+        runs[f"{estimator}, large bound"] = lambda: estimate(_noisy_problem(), estimator, options)
     return runs
 
 
@@ -229,6 +238,7 @@ def _mark(part: str) -> Path:
 
 if __name__ == "__main__":
     part = sys.argv[1]
+    gc.disable()  # a twentieth of the time, and the process ends soon
     if hasattr(os, "nice"):
         os.nice(int(sys.argv[2]))
     (_runs(part.partition(",")[0]) | SHARED)[part]()

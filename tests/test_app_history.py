@@ -11,7 +11,7 @@ from spherloc.datasets.variation import Variation
 from spherloc.estimators import options_type
 from spherloc_viz.app.catalog import SceneRequest
 from spherloc_viz.app.edits import Edits
-from spherloc_viz.app.history import MOST, SAME_MOVE_S, History, changed_fields
+from spherloc_viz.app.history import MAX_REQUESTS, SAME_MOVE_S, History, changed_fields
 from spherloc_viz.app.run_request import RunRequest
 
 SCENE = SceneRequest("a scene", 0, None, Variation())
@@ -91,11 +91,11 @@ def test_what_is_switched_to_and_fro_is_no_drag() -> None:
 
 def test_the_oldest_moves_are_forgotten_in_the_middle_of_one_too() -> None:
     history = History()
-    for k in range(MOST + 7):
+    for k in range(MAX_REQUESTS + 7):
         history.note(request(seed=k), 10.0 * k)
     for k in range(30):
-        history.note(request(seed=MOST + 6, noise_px=1.0 + k), 10.0 * (MOST + 8) + 0.1 * k)
-    assert history.step(-1) == request(seed=MOST + 6) and history.step(-1) == request(seed=MOST + 5)
+        history.note(request(seed=MAX_REQUESTS + 6, noise_px=1.0 + k), 10.0 * (MAX_REQUESTS + 8) + 0.1 * k)
+    assert history.step(-1) == request(seed=MAX_REQUESTS + 6) and history.step(-1) == request(seed=MAX_REQUESTS + 5)
 
 
 def test_single_changes_are_never_one_move() -> None:
@@ -148,12 +148,12 @@ def test_two_moves_of_one_slider_are_two() -> None:
 
 def test_it_remembers_so_many() -> None:
     history = History()
-    for k in range(MOST + 50):
+    for k in range(MAX_REQUESTS + 50):
         history.note(request(seed=k), 10.0 * k)
     steps = 0
     while history.step(-1) is not None:
         steps += 1
-    assert steps == MOST - 1
+    assert steps == MAX_REQUESTS - 1
 
 
 @pytest.mark.parametrize(

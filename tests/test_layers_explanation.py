@@ -21,7 +21,7 @@ from spherloc_viz.layers.agreement import agreement, partner_arcs, unbounded
 from spherloc_viz.layers.explanation import WORST, explain
 from spherloc_viz.layers.matches import FILTERS, SORTS, match_rows, order
 from spherloc_viz.layers.residuals import run_bounds, verdicts
-from spherloc_viz.layers.selection import MOST, explain_many
+from spherloc_viz.layers.selection import MAX_COMPARED, explain_many
 
 SceneOf = Callable[..., SyntheticScene]
 
@@ -283,7 +283,7 @@ def test_many_inliers_are_sampled(scene_of: SceneOf, monkeypatch: pytest.MonkeyP
     rows = match_rows(trace)
     assert rows.partners == 16 < trace.inlier_mask.sum() and rows.agree.max() <= 16
     many = explain_many(trace, np.arange(60))
-    assert many.pairs == 60 * 59 // 2 and MOST >= 60
+    assert many.pairs == 60 * 59 // 2 and MAX_COMPARED >= 60
 
 
 def test_real_matches_are_explained(aria: Path) -> None:

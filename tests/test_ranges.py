@@ -13,7 +13,7 @@ from spherloc.diagnosis import diagnose
 from spherloc.errors import InputError, ProblemError
 from spherloc.estimators import estimate, options_type
 from spherloc.problem import Problem
-from spherloc.ranges import MAX_PX, MOST
+from spherloc.ranges import MAX_OTHER, MAX_PX
 from spherloc_viz.options import option_fields
 
 SCENE = SyntheticScene("small", Equirectangular(1024, 512), correspondences=12, outlier_rate=0.25, noise_px=0.5, seed=0)
@@ -47,7 +47,7 @@ def test_the_page_and_the_command_line_have_the_same_ranges() -> None:
         with pytest.raises(InputError) as given:
             options_type("mc-exact")(**{name: float(text)})
         assert str(typed.value) == str(given.value)
-    options = options_type("mc-exact")(effort=MOST, bound_px=MAX_PX)
+    options = options_type("mc-exact")(effort=MAX_OTHER, bound_px=MAX_PX)
     assert estimate(SCENE.problem(), "mc-exact", options).certificate is not None
 
 

@@ -11,10 +11,10 @@ from spherloc.diagnosis.words import describe
 from spherloc.metrics import SUCCESS_DEG, SUCCESS_M
 from spherloc.trace import RansacStage, Trace
 
-CHANCE = 0.01
+MAX_NFA = 0.01
 """A consensus is believed if fewer sets of its size are expected by chance."""
-LEAST = 4
-"""Nor is a smaller consensus ever believed: two matches fix a pose, and a third one agrees too easily."""
+MIN_SUPPORT = 4
+"""No smaller consensus is believed: two matches fix a pose, and a third one agrees too easily."""
 MIN_RIGHT_RATE = 0.04
 """Share of right matches that any right reference image gives: with this many matches, none standing out means that
 the reference is wrong. Without the truth nothing else tells the two apart."""
@@ -22,7 +22,7 @@ SPREAD = 1.5
 """The bound is too small if twice of it holds as many times as many matches: noise of 0.75 times the bound does so."""
 TILT_SDS = 4.0
 """Gravity is off if the matches tilt it beyond what the run believes by as many standard deviations..."""
-HARM = 1.0
+MIN_TILT_IN_BOUNDS = 1.0
 """... and by as many noise bounds in the image: less does no harm. (A calibration that is a little off tilts real
 images by some tenths of a degree.)"""
 AS_GOOD = 0.9
@@ -61,9 +61,9 @@ def without_truth(e: Evidence) -> Cause:
     believed = stands_out(e, best)
     if believed and undetermined(e.rotation_sd_rad, e.position_sd_m):
         return Cause.DEGENERATE
-    if e.free is not None and e.nfa(int(e.found(WIDER)), WIDER, fixed_by=3) < CHANCE:
+    if e.free is not None and e.nfa(int(e.found(WIDER)), WIDER, fixed_by=3) < MAX_NFA:
         free = e.free.support(e.bound_px)
-        if free >= max(LEAST, AS_GOOD * best) and tilts(e, e.free.tilt_rad, TILT_SDS * e.free_tilt_sd_rad):
+        if free >= max(MIN_SUPPORT, AS_GOOD * best) and tilts(e, e.free.tilt_rad, TILT_SDS * e.free_tilt_sd_rad):
             return Cause.GRAVITY_OFF
         if e.found(2.0) >= SPREAD * max(1, free, best):
             return Cause.BOUND_TOO_SMALL
@@ -111,7 +111,7 @@ def with_truth(e: Evidence, t: Truth) -> Cause:
 
 def stands_out(e: Evidence, size: int) -> bool:
     """Whether a consensus of that size is more than chance gives."""
-    return size >= LEAST and e.nfa(size) < CHANCE
+    return size >= MIN_SUPPORT and e.nfa(size) < MAX_NFA
 
 
 def map_is_sparse(e: Evidence, right: int) -> bool:
@@ -128,7 +128,7 @@ def tilts(e: Evidence, tilt_rad: float, slack_rad: float) -> bool:
     """Whether gravity is off by more than the run believes, and so much that it matters."""
     excess = tilt_rad - e.believed_rad
     harm_px = excess * float(np.median(e.aligned.pixels_per_radian))
-    return excess > slack_rad and harm_px > HARM * e.bound_px
+    return excess > slack_rad and harm_px > MIN_TILT_IN_BOUNDS * e.bound_px
 
 
 def missed(e: Evidence, best: int) -> bool:

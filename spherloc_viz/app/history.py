@@ -7,12 +7,12 @@ from typing import Any
 
 from spherloc_viz.app.run_request import RunRequest
 
-MOST = 200
+MAX_REQUESTS = 200
 """Requests that are remembered."""
 SAME_MOVE_S = 5.0
 """Changes of the same control count as one while the pointer is held down, and within this time, since a slider is
 often corrected after a look at the picture. Another control, or an undo, in between ends the move at once."""
-PRESSED = frozenset({"seed", "estimator"})
+NOT_DRAGGED = frozenset({"seed", "estimator"})
 """What is not dragged: each change counts."""
 OPTIONS = "options."
 CAMERA = "true_camera"
@@ -46,14 +46,14 @@ class History:
             del self._requests[self._start + 1 :]
             if self._start < 0 or request != self._requests[self._start]:  # else the move has led back
                 self._requests.append(request)
-            forgotten = max(0, len(self._requests) - MOST)
+            forgotten = max(0, len(self._requests) - MAX_REQUESTS)
             del self._requests[:forgotten]
             self._start -= forgotten
             self._at, self._noted_s, self._moved, self._gesture = len(self._requests) - 1, now_s, moved, gesture
 
     def _goes_on(self, moved: frozenset[str], request: RunRequest) -> bool:
         """Whether a change is of the same things as the last one, and all of them can be dragged."""
-        if moved != self._moved or moved & PRESSED or self._start < 0:
+        if moved != self._moved or moved & NOT_DRAGGED or self._start < 0:
             return False
         parts = [(name, _values(one)[name]) for one in (self._requests[self._at], request) for name in moved]
         return all(type(value) in (int, float) or (name == CAMERA and value is not None) for name, value in parts)

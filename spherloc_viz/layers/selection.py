@@ -187,7 +187,7 @@ def _edges(items: dict[str, SceneItem], trace: Trace, selected: tuple[int, ...])
     return [lines], _note("pairs", len(drawn), len(pairs), True)
 
 
-MOST = 200
+MAX_COMPARED = 200
 """Of more correspondences an even sample is asked for its pairs."""
 
 
@@ -206,7 +206,7 @@ class Traits:
     agree: int
     """Pairs among them that agree at the run's yaw."""
     pairs: int
-    """Pairs among them, of at most ``MOST``."""
+    """Pairs among them, of at most ``MAX_COMPARED``."""
     sentences: tuple[str, ...]
     """What they have in common."""
 
@@ -215,7 +215,7 @@ def explain_many(trace: Trace, numbers: IntArray) -> Traits:
     """What the correspondences (K,) of these indices in the problem have in common."""
     known = verdicts(trace)
     places = np.flatnonzero(np.isin(trace.problem.aligned.index, numbers))
-    places = even(places, MOST)
+    places = even(places, MAX_COMPARED)
     agree, pairs = _agreeing(trace, places)
     errors = None if known.estimate is None else known.estimate.px[numbers]
     known_errors = np.empty(0) if errors is None else errors[~np.isnan(errors)]

@@ -13,7 +13,7 @@ FEATURES = tuple(item.name for item in fields(Measures))
 """Columns that the map is made of."""
 LOGARITHMIC = ("tilt_deg", "rotation_sd_deg", "position_sd_m")
 """Those that range over orders of magnitude."""
-LEAST = 1e-6
+LOGARITHM_OFFSET = 1e-6
 """Added before a logarithm is taken."""
 MAX_SDS = 3.0
 """Values farther from the median count as that far: one odd run must not squeeze all others into a corner."""
@@ -40,7 +40,7 @@ def run_map(columns: Mapping[str, Sequence[Any]]) -> RunMap:
     values = np.array([columns[name] for name in FEATURES], dtype=np.float64).T.reshape(-1, len(FEATURES))
     for name in LOGARITHMIC:
         k = FEATURES.index(name)
-        values[:, k] = np.log10(np.maximum(values[:, k], 0.0) + LEAST)
+        values[:, k] = np.log10(np.maximum(values[:, k], 0.0) + LOGARITHM_OFFSET)
     known = np.isfinite(values)
     usable = np.flatnonzero(known.any(axis=0))
     if len(values) < 2 or not usable.size:

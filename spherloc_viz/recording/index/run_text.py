@@ -15,7 +15,7 @@ from spherloc_viz.recording.run_row import RunRow
 WIDTH = 112
 """Characters of a line of the table; only the name of a file may be longer."""
 GAP = "  "
-LEAST = 8
+MIN_WIDTH = 8
 """Characters that a column which must give way keeps."""
 _GIVE_WAY = ("Run", "Diagnosis", "Estimator")
 """Columns that are cut where the line is too long, in this order."""
@@ -126,7 +126,7 @@ def _table(columns: Mapping[str, tuple[Any, str]], rows: Sequence[Mapping[str, s
     widths = {name: max(len(name), *(len(row[name]) for row in rows)) for name in columns}
     excess = sum(widths.values()) + len(GAP) * (len(widths) - 1) - WIDTH
     for name in _GIVE_WAY:
-        less = max(0, min(excess, widths[name] - max(LEAST, len(name))))
+        less = max(0, min(excess, widths[name] - max(MIN_WIDTH, len(name))))
         widths[name] -= less
         excess -= less
     heads = {name: name for name in columns}
@@ -147,7 +147,7 @@ def _with_files(folder: Path, rows: Sequence[RunRow], lines: Sequence[str]) -> l
         labels = "".join(f" [{one_line(label)}]" for label in row.labels)
         note = f" {one_line(row.note)}" if row.note else ""
         path = f"    {one_line(str(folder / row.file))}"
-        rest = _cut(labels + note, max(0, WIDTH - len(path))) if len(path) < WIDTH - LEAST else ""
+        rest = _cut(labels + note, max(0, WIDTH - len(path))) if len(path) < WIDTH - MIN_WIDTH else ""
         told += [line, path + rest]
         if labels and not rest:
             told.append(f"    {_cut((labels + note).strip(), WIDTH - 4)}")
