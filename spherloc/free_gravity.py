@@ -1,4 +1,4 @@
-"""What agrees without belief in the given gravity: a search by samples of three correspondences, and whether it
+"""The best consensus without the given gravity: a search by samples of three correspondences, and whether it
 contradicts the gravity. Poses are between the aligned frames."""
 
 from dataclasses import dataclass, replace

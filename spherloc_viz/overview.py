@@ -22,7 +22,7 @@ COMMANDS: Mapping[str, Mapping[str, str]] = {
         "runs": "list runs: which failed, and of what",
         "steps": "find the steps of runs for which a condition holds",
         "view": "open a recording in the Rerun viewer",
-        "compare": "compare two nights of runs: what broke, what was mended",
+        "compare": "compare two sets of runs: what fails now, what no longer does",
         "rerun": "solve recorded problems again, with other options or another estimator",
         "repeat": "solve a recorded problem again and compare",
         "label": "give recordings labels and a note",

@@ -114,7 +114,7 @@ def test_the_map_is_that_of_principal_components() -> None:
     assert np.isfinite(run_map(some).x).all() and len(set(run_map(some).x.round(6))) > 1
 
 
-# Night against night.
+# Two sets of runs.
 
 
 def test_a_comparison_counts_and_tests_what_changed() -> None:

@@ -60,8 +60,7 @@ def camera_class_of(model: str) -> type[Camera]:
 def tried(camera: Any, model: str) -> Camera:
     """The camera of an extension's model, after its methods were called once each.
 
-    Raises ``InputError`` if it is no camera: problems are drawn, and pages painted, where nobody could say whose fault
-    an exception is.
+    Raises ``InputError`` if it is no camera: later, an exception of a method would not be known as the extension's.
     """
     what = registry.title("cameras", model)
     with registry.guarded("cameras", model):

@@ -53,7 +53,7 @@ count = 5
 start = 0.1
 stop = 0.9
 offset_m = 0.8
-tilt_deg = 0.5                    # roll and pitch that nobody knows, at most
+tilt_deg = 0.5                    # unknown roll and pitch, at most
 light = "dusk"                    # day, morning, overcast, dusk, night
 season = "autumn"                 # summer, spring, autumn, winter
 occluders = 6
@@ -103,7 +103,7 @@ class RenderedView(View):
         return self.picture.image()
 
     def usable_pixels(self) -> BoolArray:
-        """See ``View``. Features are kept by their image's content, and this is asked before they are sought."""
+        """See ``View``. Features are kept by their image's content, and this is asked before they are detected."""
         self.make_file()
         return super().usable_pixels()
 

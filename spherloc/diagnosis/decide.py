@@ -1,4 +1,4 @@
-"""From evidence to a cause. The order matters: a cause may look like one asked for later, seldom vice versa."""
+"""From evidence to a cause. Order matters: a cause is easily taken for one tested later, seldom for an earlier one."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""What decides the results of a sequence: written beside them, so that nobody mixes the results of two settings."""
+"""What decides the results of a sequence: written beside them, so that results of two settings are never mixed."""
 
 import hashlib
 import json

@@ -146,7 +146,7 @@ class Backlog:
         spent_ms = 0.0
         while self._next is not None:
             job = self._next
-            # A point that nobody has seen yet may take any time, so its first run goes alone.
+            # How long a run takes at a new point is unknown, so the first one is a task of its own.
             runs, total_ms = self._spent_ms.get((job.value, job.entrant), (1, 1e3 * TASK_S))
             cost_ms = total_ms / runs + self._overhead_ms
             if spent_ms and spent_ms + cost_ms > 1e3 * TASK_S:

@@ -89,7 +89,7 @@ MAX_FACE_PIXELS = 12_000_000
 
 @dataclass(frozen=True)
 class FeatureOptions:
-    """What features are sought."""
+    """Which features are detected."""
 
     method: str = "sift"
     """One of ``METHODS``; SIFT is root-normalised."""

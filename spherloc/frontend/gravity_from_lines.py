@@ -2,7 +2,7 @@
 
 An edge and the camera's centre span a plane, which cuts the unit sphere in a great circle with the normal n. All planes
 of vertical edges contain the vertical v, so that n . v = 0 for each. Edges are found by LSD (von Gioi et al. 2010) on
-virtual pinhole faces, on which they are straight whatever the lens. v is sought on a grid of directions around where
+virtual pinhole faces, on which they are straight whatever the lens. v is searched on a grid of directions around where
 down is expected, which keeps horizontal edges from being taken for vertical ones, and refined by least squares,
 where edges one above the other count as one: those of a door frame lean together. It is believed if more edges meet
 there than would by chance (a-contrario, Desolneux et al. 2000).

@@ -14,7 +14,7 @@ from spherloc.geometry import camera_centre
 from spherloc.types import BoolArray, FloatArray
 
 _NEIGHBOURS = 64
-"""Among so many of the nearest views, those are sought that points are triangulated with."""
+"""Among so many of the nearest views, those are chosen with which points are triangulated."""
 _OTHERS = 4
 """Each costs one matching, once."""
 _GROWTH = 2.0

@@ -1,4 +1,4 @@
-"""Matches that come with a scene: what takes long to find, and is the same everywhere, is not sought again."""
+"""Matches that are stored beside a scene file, so that features need not be matched anew on every machine."""
 
 import io
 import json

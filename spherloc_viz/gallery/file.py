@@ -1,4 +1,4 @@
-"""Reads ``gallery.toml``: strictly, since a misspelt key would tell a story that nobody checks."""
+"""Reads ``gallery.toml``: strictly, since a misspelt key would be ignored and its claim not checked."""
 
 import re
 from collections.abc import Mapping

@@ -81,7 +81,7 @@ class RunView:
     def kept(self, name: str, key: Hashable, make: Callable[[], T]) -> T:
         """What ``make`` gives; made anew only if it was made for another ``key`` last time.
 
-        Most steps of a run show what the step before them shows. What is the same object, nobody has to compare.
+        Most steps of a run show what the step before them shows. The same object need not be compared.
         """
         known = self._kept.get(name)
         if known is None or known[0] != key:

@@ -1,4 +1,4 @@
-"""The query image as pictures show it: read once and kept, and as a panorama that the unit sphere wears."""
+"""The query image as pictures show it: read once and kept, and as a panorama on the unit sphere."""
 
 from dataclasses import dataclass
 from functools import lru_cache

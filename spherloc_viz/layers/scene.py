@@ -85,7 +85,7 @@ GHOST_AWAY = 0.3
 UNDER_IMAGE = 0.98
 """Radius of the bare sphere where the query image is around it, in sphere radii."""
 COLUMNS, ROWS = 96, 48
-"""Cells of the sphere that wears the image."""
+"""Cells of the sphere with the image."""
 COVERAGE = Equirectangular(512, 256)
 """At these pixels of the image on the sphere the camera is asked what it sees."""
 

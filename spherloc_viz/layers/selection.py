@@ -31,7 +31,7 @@ CORNERS = 48
 DOT_CORNERS = 20
 """Of each circle around a dot."""
 LIFT = 0.3
-"""From the sphere, that wears the image, to the circles inside and outside, in radii of the circle."""
+"""From the sphere with the image to the circles inside and outside, in radii of the circle."""
 
 
 def with_selection(picture: Picture, trace: Trace, selected: tuple[int, ...]) -> Picture:

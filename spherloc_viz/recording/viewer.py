@@ -60,7 +60,7 @@ def view_in_window(path: Path, row: RunRow, step: int) -> None:
     files = [str(file.resolve()) for file in (path, labels_of(path, row.run_id)) if file is not None]
     with socket.create_server((HOST, 0)) as free:
         port = free.getsockname()[1]
-    # The port is for programs that control the viewer, as we do: nobody else on the network should.
+    # The port is for programs that control the viewer, as this one does: no other machine should reach it.
     command = [*rerun_command(), "--bind", HOST, "--port", str(port), *files]
     with subprocess.Popen(command, env=rerun_environment()) as viewer:
         stand_at(viewer, f"rerun+http://{HOST}:{port}/proxy", row.on_timeline(step))

@@ -1,4 +1,4 @@
-"""Shows how far a run is that takes its time, lets a person end it, and ends it when nobody waits for it any more."""
+"""Shows how far a run is that takes its time, lets a person end it, and ends it when its result is no longer wanted."""
 
 import threading
 

@@ -1,4 +1,4 @@
-"""Night against night: two sets of runs on the same problems, pair by pair, with tests of the differences."""
+"""Two sets of runs on the same problems, compared pair by pair, with statistical tests of the differences."""
 
 import math
 import re

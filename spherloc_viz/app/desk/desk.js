@@ -159,7 +159,7 @@ function drawChips() {
   }
   if (runs.pageRuns && runs.others) {
     lines[0].append(chip("page runs", runs.pageRuns, state.pages, () => change({ pages: !state.pages }),
-      "Runs that pages made while somebody played, and nobody labelled"));
+      "Runs that pages made by themselves and that have no label"));
   }
   const brushes = [];
   for (const [name, brushed] of Object.entries(state.ranges)) {

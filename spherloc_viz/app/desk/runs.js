@@ -28,7 +28,7 @@ class Runs {
     this.orders = new Map(); // by column: all runs in its order, unknown ones last
   }
 
-  // Runs that a page made while somebody played, and nobody labelled.
+  // Runs that pages made by themselves and that have no label.
   findPageRuns() {
     const { values, codes } = this.texts.source, code = values.indexOf("page");
     this.pageRuns = 0;

@@ -188,7 +188,7 @@ def _actions(trace: Trace, count: int, editable: bool) -> str:
     mend = (
         chip("Mend", "mend:", False, f"Put {it} where the true pose sees the point")
         if trace.problem.truth_cam_from_map is not None
-        else _disabled("Mend", "The true pose is unknown, so nobody knows the right pixel")
+        else _disabled("Mend", "The true pose is unknown, and so is the right pixel")
     )
     spoil = chip("Spoil", "spoil:", False, f"Give {it} a wrong pixel at random")
     hide = chip("Hide", "hide:", False, f"Leave {it} out of the problem")

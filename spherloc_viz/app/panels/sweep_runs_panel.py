@@ -135,7 +135,7 @@ class SweepPanel:
                 self._chips.content = chips_html("sweep", self._names, self._ticked)
 
     def _follow(self, event: viser.GuiEvent) -> None:
-        if self._values.value in VALUES.values():  # nobody typed it
+        if self._values.value in VALUES.values():  # it was not typed
             put(self._values, VALUES[self._axis()])
 
     def _axis(self) -> str:

@@ -62,7 +62,7 @@ class Form:
 
 
 class Scratch:
-    """A folder of one session, which nobody else can read; made when it is first needed."""
+    """A folder of one session, which other users of the machine cannot read; made when it is first needed."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()

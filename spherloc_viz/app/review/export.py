@@ -53,7 +53,7 @@ def bundle(
 
     They are copied in pieces, so that memory does not grow with them. Files that are gone are left out, and so is what
     goes beyond ``MAX_RUNS`` and ``MAX_BYTES``. Raises ``RecordingError`` if nothing is left, if the file cannot be
-    written, or if ``closed`` says that nobody waits for it any more; there may be a part of the file then.
+    written, or if ``closed`` says that it is no longer wanted; there may be a part of the file then.
     """
     packed: list[RunRow] = []
     size, gone = 0, 0

@@ -66,7 +66,7 @@ class Look:
     when: str | None = None
     """One of ``AGES``."""
     pages: bool = False
-    """Whether runs that pages made while somebody played are listed too."""
+    """Whether runs that pages made by themselves are listed too."""
     sort: str = "created"
     descending: bool = True
     page: int = 0
@@ -156,7 +156,7 @@ class Counts:
     unfolded: Groups = ()
     """Of the filter that is unfolded, if its values can be counted."""
     pages: int | None = None
-    """Runs that pages made while somebody played; None if there are no others, so that they are listed anyway."""
+    """Runs that pages made by themselves; None if there are no others, so that they are listed anyway."""
 
 
 def filters_html(look: Look, counts: Counts, hidden: bool = False) -> str:
@@ -174,7 +174,7 @@ def filters_html(look: Look, counts: Counts, hidden: bool = False) -> str:
     if counts.doubtful or look.judged:
         chips.append(_chip("judged", "doubtful", "doubtful", counts.doubtful, look.judged))
     if counts.pages:
-        hint = f"Runs that pages made while somebody played; the newest {PAGE_KEPT} are stored, and those that you keep"
+        hint = f"Runs that pages made by themselves; the newest {PAGE_KEPT} are stored, and those that you keep"
         number = f'<span style="{DIM}">{counts.pages:,}</span>'
         chips.append(pill(f"page runs {number}", "runs-pages:", look.pages, hint))
     causes = [

@@ -110,7 +110,7 @@ class Canvas:
             self._take(None, views.around(places, self._aspect()), self._aspect())
 
     def hold(self, step_key: str, viewpoint: tuple[float, ...]) -> None:
-        """Look from there, as ``viewpoint`` told it, for as long as this step is shown and nobody moves."""
+        """Look from there, as ``viewpoint`` told it, for as long as this step is shown and the viewer is not moved."""
         *numbers, degrees = viewpoint
         self._held = step_key, views.View(np.array(numbers[:3]), np.array(numbers[3:]), np.radians(degrees))
         self._looked, self._held_step_came = None, False

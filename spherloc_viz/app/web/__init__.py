@@ -1,1 +1,1 @@
-"""Between browser and page: the front door, viser's page with our script, and all that leans on its insides."""
+"""Between browser and page: the front door, viser's page with our script, and what depends on viser's internals."""

@@ -56,7 +56,7 @@ class Access:
         return f"{address}/?{urlencode({TOKEN: self._tokens[role]})}" if self.demanded else address
 
     def role(self, request: web.Request) -> Role | None:
-        """Who asks, by the cookie; None is nobody."""
+        """Who asks, by the cookie; None without a valid one."""
         return self._role_of(request.cookies.get(self._cookie, "")) if self.demanded else Role.PRESENTER
 
     def enter(self, request: web.Request) -> web.Response | None:

@@ -24,7 +24,7 @@ class Download:
     name: str
     """Under which a browser saves it; letters, digits, ".", "_" and "-" only."""
     address: str
-    """Path of its address, with a token that nobody can guess."""
+    """Path of its address, with a token that cannot be guessed."""
 
 
 class Downloads:

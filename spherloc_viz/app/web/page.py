@@ -12,7 +12,7 @@ import viser
 QUIET = (
     "<script>addEventListener('unhandledrejection',e=>{if(e.reason instanceof EvalError)e.preventDefault()})</script>"
 )
-"""viser loads a sorter for Gaussian splats that wants ``eval``. The policy denies it, nobody here draws splats,
+"""viser loads a sorter for Gaussian splats that wants ``eval``. The policy denies it, no splats are drawn here,
 and the console stays clean for errors that matter."""
 STYLE = "touch.css"
 SCRIPTS = (

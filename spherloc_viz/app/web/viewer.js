@@ -123,7 +123,7 @@
 
   async function open() {
     const [run, ...others] = files.split(" ").map(bytes);
-    // What comes late must not be an error that nobody has heard of.
+    // What comes late must not be reported as an unhandled error.
     for (const other of others) other.catch(() => undefined);
     const [first, wasm] = await Promise.all([run, fetched(`${program}re_viewer_bg.wasm`)]);
     await load(`${program}re_viewer.js`);

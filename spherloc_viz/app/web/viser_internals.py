@@ -1,4 +1,4 @@
-"""Everything that leans on viser's insides, so that a new version of viser is checked against one file."""
+"""Everything that depends on viser's internals, so that a new version of viser is checked against one file."""
 
 import asyncio
 import contextlib
@@ -75,7 +75,7 @@ def start_viser(key: str) -> viser.ViserServer:
     only, every request without the key is refused before the websocket opens (a page of another site that
     guesses the port gets a 403), and the tunnel messages do nothing.
     """
-    # viser greets with a panel naming the internal address, which nobody can use.
+    # viser greets with a panel naming the internal address, which no browser can reach.
     with _demand(key), contextlib.redirect_stdout(io.StringIO()):
         server = viser.ViserServer(host="127.0.0.1", port=0, label="spherloc", verbose=False)
     _disable_sharing(server)
@@ -245,7 +245,7 @@ def at_once(callback: Callback) -> Callback:
 
     viser would call it later, on some thread: by then the next message may have changed the widget's value. So it
     must not take long. A coroutine is called in time too, but viser makes one also of what Python itself sets, and
-    where the loop ends before its turn nobody awaits it.
+    where the loop ends before its turn it is never awaited.
     """
     callback.__dict__["at_once"] = True
     return callback

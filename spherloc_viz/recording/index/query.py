@@ -140,7 +140,7 @@ GROUP_KEYS = ("diagnosis", "outcome", "estimator", "scene", "source", "label", "
 OUTCOMES = ("success", "failure", "unknown")
 SOURCES = ("page", "command", "sweep", "sequence", "gallery", "unknown")
 PAGE_KEPT = 100
-"""Runs that pages made while somebody played, of which few are kept; labelled ones are not counted."""
+"""Runs that pages made by themselves, of which few are kept; labelled ones are not counted."""
 MAX_TEXT = 200
 """Characters of a text that is searched for."""
 
@@ -192,7 +192,7 @@ class RunQuery:
     problem_key: str | None = None
     """Runs of this very problem."""
     pages: bool | None = None
-    """Only runs that a page made while somebody played, and nobody labelled; if False, all but those."""
+    """Only runs that pages made by themselves and that have no label; if False, all but those."""
     outlier_rate: Range | None = None
     """0 to 1."""
     rotation_error_deg: Range | None = None

@@ -222,6 +222,6 @@ def _safe(tell: Callable[[T], None]) -> Callable[[T], None]:
         try:
             tell(what)
         except Exception:
-            log.exception("nobody hears that %s", what)
+            log.exception("a notice could not be shown: %s", what)
 
     return safe

@@ -10,14 +10,14 @@ from spherloc.errors import InputError
 
 GIGABYTE = 1_000_000_000
 KEEP_GIGABYTES = 2.0
-"""Size of the recordings beyond which old successes are deleted, if nobody says otherwise and no more are there."""
+"""Size beyond which old successes are deleted, unless another is given or the recordings take more already."""
 KEEP_BYTES = int(KEEP_GIGABYTES * GIGABYTE)
 
 
 def kept_bytes(gigabytes: float | None, folder: Path) -> int:
     """The size that the recordings in ``folder`` may have, in bytes; infinity keeps all.
 
-    If nobody says a size, a folder that holds more than usual already keeps that much: a sweep with a larger limit made
+    If no size is given, a folder that holds more than usual already keeps that much: a sweep with a larger limit made
     it, and to open it must not delete anything. Raises ``InputError`` for what is no size.
     """
     if gigabytes is None:

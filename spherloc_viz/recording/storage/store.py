@@ -178,7 +178,7 @@ def prune_pages(folder: Path, index: RunIndex) -> None:
 
 
 def prunable(row: RunRow) -> bool:
-    """Whether a run is one that nobody will look for: right, or nothing speaks against it, and nobody labelled it."""
+    """Whether a run may be deleted to make room: it is right or nothing speaks against it, and it has no label."""
     fine = row.outcome == "success" or (row.outcome == "unknown" and row.doubtful is False)
     marked = bool(row.labels or row.note or row.title)
     return fine and not marked and row.source != "gallery" and "/" not in row.file

@@ -11,7 +11,7 @@ from functools import cache, lru_cache
 from pathlib import Path
 
 STALE_AFTER_S = 600.0
-"""An unfinished file this old is nobody's if nothing tells whether its owner lives: a file takes less than a second."""
+"""An unfinished file this old is taken for abandoned if its owner cannot be asked: a file takes less than a second."""
 
 _OWNER = r"(?P<machine>[0-9a-f]{8})-(?P<boot>[0-9a-f]{8})-(?P<pid>\d{1,10})-(?P<start>\d{1,20})-"
 _PART = re.compile(rf"(?P<name>.+\.rrd)\.(?:{_OWNER})?[0-9a-f]{{8}}\.part")
@@ -29,7 +29,7 @@ def target_of(part: Path) -> Path | None:
 
 
 def leftovers(folder: Path) -> list[Path]:
-    """Unfinished recordings in ``folder`` that nobody will finish, because their process has ended or they are old.
+    """Unfinished recordings in ``folder`` that will not be finished, because their process has ended or they are old.
 
     Age counts only where it cannot be known whether the process is alive, as on another machine. Raises ``OSError``
     if the folder cannot be read.
