@@ -7,11 +7,12 @@ import os
 import shutil
 import tempfile
 import time
-import uuid
 import zipfile
 import zlib
 from functools import cache
 from pathlib import Path
+
+from spherloc.files import write_whole
 
 VARIABLE = "SPHERLOC_CACHE"
 """Environment variable that moves the cache."""
@@ -60,16 +61,11 @@ def key_of(*parts: object) -> str:
 
 def store(path: Path, content: bytes) -> bool:
     """Write a file of the cache so that no reader sees half of it; False if that fails, which only costs time."""
-    part = path.with_name(f"{path.name}.{uuid.uuid4().hex[:8]}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        part.write_bytes(content)
-        part.replace(path)
+        write_whole(path, content)
     except OSError:
         return False
-    finally:
-        with contextlib.suppress(OSError):
-            part.unlink(missing_ok=True)
     return True
 
 

@@ -1,4 +1,4 @@
-"""Opens files that a user names: regular ones only, and never more of them than a reader asks for.
+"""Opens files that a user names: regular ones only, and never more of them than a reader asks for; writes whole files.
 
 A link to ``/dev/zero`` has no end and a pipe without a writer keeps whoever opens it waiting for ever. Every refusal is
 an ``OSError`` with a reason in ``strerror``, also for names that no file can have, which Python refuses by ValueError.
@@ -7,8 +7,9 @@ an ``OSError`` with a reason in ``strerror``, also for names that no file can ha
 import errno
 import os
 import stat
+import uuid
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
@@ -122,3 +123,38 @@ def _bytes(count: int) -> str:
 
 def _no_such_name(path: Path) -> OSError:
     return OSError(errno.EINVAL, "no file can have such a name", str(path))
+
+
+def write_whole(path: Path, content: bytes, sync: bool = False) -> None:
+    """Write a file so that no reader sees half of it; ``sync`` waits until it is on the disk.
+
+    Raises ``OSError`` if that fails, and leaves nothing then.
+    """
+    part = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.part")
+    try:
+        with part.open("wb") as file:
+            file.write(content)
+            if sync:
+                file.flush()
+                os.fsync(file.fileno())
+        part.replace(path)
+    finally:
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
+
+
+def lock(handle: int) -> None:
+    """Keep other processes off an open file or folder; the system ends the lock whatever ends this process.
+
+    Raises ``BlockingIOError`` if another process has it. Does nothing where there are no such locks.
+    """
+    try:
+        import fcntl
+    except ImportError:  # Windows
+        return
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise
+    except OSError:  # a file system without locks
+        return

@@ -6,7 +6,6 @@ import io
 import json
 import math
 import os
-import uuid
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -19,7 +18,7 @@ import numpy as np
 from spherloc.datasets.scene_file import numbers
 from spherloc.errors import InputError, reason, show
 from spherloc.experiments.configuration import Configuration, in_short, read_configuration
-from spherloc.files import read_file, reading
+from spherloc.files import lock, read_file, reading, write_whole
 from spherloc.geometry import camera_centre
 from spherloc.outcome import Outcome
 from spherloc.types import FloatArray
@@ -355,18 +354,8 @@ class ResultsLog:
 
     def write(self, name: str, content: bytes) -> None:
         """Write a file into the folder, so that no reader sees half of it. Raises ``InputError`` if that fails."""
-        path = self.folder / name
-        part = path.with_name(f".{name}.{uuid.uuid4().hex[:8]}.part")
-        try:
-            with self._writing(name):
-                with part.open("wb") as file:
-                    file.write(content)
-                    file.flush()
-                    os.fsync(file.fileno())
-                part.replace(path)
-        finally:
-            with contextlib.suppress(OSError):
-                part.unlink(missing_ok=True)
+        with self._writing(name):
+            write_whole(self.folder / name, content, sync=True)
 
     @contextlib.contextmanager
     def _writing(self, name: str):
@@ -382,21 +371,18 @@ class ResultsLog:
         return InputError(f"{self.folder}: results cannot be written there ({reason(error)}); give another folder.")
 
     def _lock(self, stack: contextlib.ExitStack) -> None:
-        """Keep other processes out of the folder; the system ends the lock whatever ends this process."""
-        try:
-            import fcntl
-        except ImportError:  # Windows has no such lock
-            return
+        """Keep other processes out of the folder."""
         try:
             handle = os.open(self.folder, os.O_RDONLY)
-            stack.callback(os.close, handle)
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:  # Windows opens no folders
+            return
+        stack.callback(os.close, handle)
+        try:
+            lock(handle)
         except BlockingIOError:
             raise InputError(
                 f"{self.folder}: another process is localizing into it; wait for it or give another folder."
             ) from None
-        except OSError:  # a file system without locks
-            return
 
     def _configure(self, configuration: Configuration) -> None:
         path = self.folder / CONFIGURATION

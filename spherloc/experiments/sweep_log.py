@@ -3,7 +3,6 @@
 import contextlib
 import json
 import os
-import uuid
 from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
@@ -22,7 +21,7 @@ from spherloc.experiments.sweep_rows import (
     summarize,
     summary_text,
 )
-from spherloc.files import is_file, read_file, reading, size_of
+from spherloc.files import is_file, lock, read_file, reading, size_of, write_whole
 
 MAX_BYTES = 1_000_000_000
 MAX_PLAN_BYTES = 1_000_000
@@ -57,7 +56,10 @@ class SweepLog:
                 self._file = stack.enter_context(self.path.open("ab"))
             except (OSError, ValueError) as error:
                 raise InputError(f"{self.path}: cannot be written ({reason(error)}); give another file.") from None
-            self._lock()
+            try:
+                lock(self._file.fileno())
+            except BlockingIOError:
+                raise InputError(f"{self.path}: another sweep writes to it; wait or give another file.") from None
             if os.path.lexists(self.beside(PLAN)):
                 self._compare()  # another process may have been quicker
             self.write(self.beside(PLAN), (json.dumps(plan.record(), indent=2, allow_nan=False) + "\n").encode())
@@ -102,14 +104,8 @@ class SweepLog:
 
     def write(self, path: Path, content: bytes) -> None:
         """Write a file so that no reader sees half of it. Raises ``InputError`` if that fails."""
-        part = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.part")
-        try:
-            with self._writing(path):
-                part.write_bytes(content)
-                part.replace(path)
-        finally:
-            with contextlib.suppress(OSError):
-                part.unlink(missing_ok=True)
+        with self._writing(path):
+            write_whole(path, content)
 
     @contextlib.contextmanager
     def _writing(self, path: Path) -> Iterator[None]:
@@ -136,19 +132,6 @@ class SweepLog:
             for path in map(self.beside, (SUMMARY, PICTURE)):
                 if os.path.lexists(path):
                     raise InputError(f"{path}: is there already, and the sweep would write to it; give another file.")
-
-    def _lock(self) -> None:
-        """Keep other processes off the file; the system ends the lock whatever ends this process."""
-        try:
-            import fcntl
-        except ImportError:  # Windows has no such lock
-            return
-        try:
-            fcntl.flock(self._file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise InputError(f"{self.path}: another sweep writes to it; wait or give another file.") from None
-        except OSError:  # a file system without locks
-            return
 
     def _compare(self) -> None:
         """Raise ``InputError`` if the plan beside the table is another one."""

@@ -1,4 +1,4 @@
-"""What a story can tell of a run in numbers."""
+"""Numbers of a run that the stories of the gallery and the lessons quote."""
 
 from collections.abc import Callable, Mapping
 from math import comb
@@ -8,7 +8,7 @@ import numpy as np
 from spherloc.geometry import yaw_of
 from spherloc.metrics import evaluate, ransac_success_probability
 from spherloc.refine import residuals_px
-from spherloc.trace import ConsensusStage, RansacStage, Trace, YawStage
+from spherloc.trace import ConsensusStage, RansacStage, StageT, Trace, YawStage
 from spherloc.types import BoolArray, FloatArray
 
 
@@ -56,30 +56,32 @@ def _from_axis_deg(trace: Trace) -> float:
     return float(np.degrees(np.arccos(np.clip(cosines.min(initial=1.0), -1.0, 1.0))))
 
 
-def _stage(trace: Trace) -> RansacStage:
-    stage = trace.stage(RansacStage)
+def stage_of(trace: Trace, kind: type[StageT]) -> StageT:
+    """The stage of a run that a number is of; raises ``ValueError`` if it has none."""
+    stage = trace.stage(kind)
     if stage is None:
-        raise ValueError(f"{trace.estimator} draws no samples that a story could tell of")
+        raise ValueError(f"the run of {trace.estimator} has no {kind.__name__}")
     return stage
+
+
+def _samples(trace: Trace) -> RansacStage:
+    return stage_of(trace, RansacStage)
 
 
 def _samples_per_right_one(trace: Trace) -> float:
     """How many samples it takes on average until one has right matches only."""
-    size = _stage(trace).samples.shape[1]
+    size = _samples(trace).samples.shape[1]
     return comb(len(trace.problem), size) / comb(_count(_right(trace)), size)
 
 
 def _hit_percent(trace: Trace) -> float:
     """Eq. 28, with a sample of different matches."""
     rate = 1.0 / _samples_per_right_one(trace)
-    return 100.0 * ransac_success_probability(rate, 1, _stage(trace).iterations)
+    return 100.0 * ransac_success_probability(rate, 1, _samples(trace).iterations)
 
 
 def _yaw(trace: Trace) -> YawStage:
-    stage = trace.stage(YawStage)
-    if stage is None:
-        raise ValueError(f"{trace.estimator} votes for no yaw that a story could tell of")
-    return stage
+    return stage_of(trace, YawStage)
 
 
 def _right_pairs_chosen(trace: Trace) -> int:
@@ -100,10 +102,7 @@ def _pairs_at_truth(trace: Trace) -> int:
 
 def _least_bound(trace: Trace) -> int:
     """What some pose may explain at the yaw where that is least."""
-    stage = trace.stage(ConsensusStage)
-    if stage is None:
-        raise ValueError(f"{trace.estimator} bounds nothing that a story could tell of")
-    return int(stage.bound.min())
+    return int(stage_of(trace, ConsensusStage).bound.min())
 
 
 def _known(value: float | None) -> float:
@@ -124,8 +123,8 @@ MEASURES: Mapping[str, Callable[[Trace], float]] = {
     "off_deg": lambda trace: _known(evaluate(trace).rotation_error_deg),
     "gravity_off_deg": _gravity_off_deg,
     "from_axis_deg": _from_axis_deg,
-    "samples": lambda trace: _stage(trace).iterations,
-    "sample_size": lambda trace: _stage(trace).samples.shape[1],
+    "samples": lambda trace: _samples(trace).iterations,
+    "sample_size": lambda trace: _samples(trace).samples.shape[1],
     "samples_per_right_one": _samples_per_right_one,
     "hit_percent": _hit_percent,
     "pairs": lambda trace: comb(len(trace.problem), 2),

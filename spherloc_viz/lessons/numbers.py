@@ -9,7 +9,7 @@ from spherloc.bounds import bounds_of
 from spherloc.geometry import yaw_of
 from spherloc.metrics import evaluate
 from spherloc.trace import RansacStage, RefinementStage, Trace, TranslationStage, YawStage
-from spherloc_viz.gallery.measures import MEASURES
+from spherloc_viz.gallery.measures import MEASURES, stage_of
 
 CONFIDENCE = 0.999
 """For which the samples that are needed are told."""
@@ -36,10 +36,7 @@ def _yaw_deg(trace: Trace, cam_from_map: np.ndarray | None) -> float:
 
 
 def _refinement(trace: Trace) -> RefinementStage:
-    stage = trace.stage(RefinementStage)
-    if stage is None:
-        raise ValueError(f"{trace.estimator} refined nothing")
-    return stage
+    return stage_of(trace, RefinementStage)
 
 
 def _position_sd_cm(trace: Trace) -> float:
@@ -47,29 +44,16 @@ def _position_sd_cm(trace: Trace) -> float:
 
 
 def _yaw_stage(trace: Trace) -> YawStage:
-    stage = trace.stage(YawStage)
-    if stage is None:
-        raise ValueError(f"{trace.estimator} has no yaw arcs")
-    return stage
+    return stage_of(trace, YawStage)
 
 
 def _translation(trace: Trace) -> TranslationStage:
-    stage = trace.stage(TranslationStage)
-    if stage is None:
-        raise ValueError(f"{trace.estimator} has no balls")
-    return stage
+    return stage_of(trace, TranslationStage)
 
 
 def _pixel_deg(trace: Trace) -> np.ndarray:
     """(N,) what one pixel is at each match as an angle, deg."""
     return np.degrees(bounds_of(trace.problem.aligned, 1.0).radians)
-
-
-def _improvements(trace: Trace) -> float:
-    stage = trace.stage(RansacStage)
-    if stage is None:
-        raise ValueError(f"{trace.estimator} draws no samples")
-    return len(stage.improved_at)
 
 
 MORE: Mapping[str, Callable[[Trace], float]] = {
@@ -82,7 +66,7 @@ MORE: Mapping[str, Callable[[Trace], float]] = {
     "samples_needed_3": lambda trace: _samples_needed(trace, 3),
     "samples_needed_6": lambda trace: _samples_needed(trace, 6),
     "pairs_of_right": lambda trace: comb(int(MEASURES["right"](trace)), 2),
-    "improvements": _improvements,
+    "improvements": lambda trace: len(stage_of(trace, RansacStage).improved_at),
     "arcs": lambda trace: len(_yaw_stage(trace).pairs),
     "yaw_deg": lambda trace: _yaw_deg(trace, trace.cam_from_map),
     "true_yaw_deg": lambda trace: _yaw_deg(trace, trace.problem.truth_cam_from_map),

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from spherloc.errors import InputError, RecordingError, show
-from spherloc_viz.recording.storage.unfinished import unfinished
+from spherloc.files import write_whole
 
 VIEWS, SETS = "views", "sets"
 """Folders in the folder of the recordings."""
@@ -104,15 +104,10 @@ def _read(path: Path) -> str:
 
 
 def _write(path: Path, text: str) -> None:
-    part = unfinished(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        part.write_text(text, encoding="utf-8")
-        part.replace(path)
+        write_whole(path, text.encode())
     except OSError as error:
         raise RecordingError(
             f"{path}: cannot be stored ({error.strerror or error}); make room or check the folder."
         ) from error
-    finally:
-        with contextlib.suppress(OSError):
-            part.unlink(missing_ok=True)
