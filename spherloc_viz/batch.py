@@ -247,7 +247,7 @@ def as_text(path: Path, trace: Trace, diagnosis: Diagnosis, recording: Path | No
         rows = "\n".join("    " + " ".join(f"{value: .6f}" for value in row) for row in pose)
         lines.append(f"  cam_from_map\n{rows}")
     lines.append(
-        f"  {np.count_nonzero(trace.inlier_mask)} of {len(trace.problem)} correspondences are inliers, "
+        f"  {np.count_nonzero(trace.inlier_mask)} of {len(trace.problem)} matches are inliers, "
         f"{trace.timings_ms['total']:.1f} ms"
     )
     if trace.problem.gravity_source:

@@ -223,7 +223,7 @@ def test_a_wrong_scene_does_not_stop_the_others(tmp_path: Path) -> None:
 
 def test_text_output_tells_pose_inliers_time_and_errors(tmp_path: Path) -> None:
     result = spherloc_here("run", SCENE, "--no-record", cwd=tmp_path)
-    for part in ("cam_from_map", "20 of 100 correspondences are inliers", " ms", "success:", "precision 0.950"):
+    for part in ("cam_from_map", "20 of 100 matches are inliers", " ms", "success:", "precision 0.950"):
         assert part in result.stdout, result.stdout
 
 

@@ -112,7 +112,7 @@ def test_the_commands_of_the_page_work(place: Path, told: tuple[list[Any], list[
     for words, code, output, errors in told[1]:
         assert code == 0, (words, errors)
         if words[0] == "run":
-            assert "correspondences are inliers" in output and "doubtful" not in output
+            assert "matches are inliers" in output and "doubtful" not in output
             recordings += re.findall(r"recorded: (.*)", output)
         elif words[0] == "scenes":
             assert "Matches in a file of numpy" in output and 'matches = "matches.npz"' in output

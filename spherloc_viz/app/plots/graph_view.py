@@ -81,7 +81,7 @@ def _many(name: str) -> str:
 
 
 def _edge(name: str) -> str:
-    return "their overlaps" if name == "ball" else "who agrees"
+    return "their overlaps" if name == "ball" else "which matches agree"
 
 
 def _places(graph: Graph) -> NDArray[np.float64]:
