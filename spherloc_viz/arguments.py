@@ -10,10 +10,10 @@ import tyro
 
 from spherloc.errors import InputError, show
 
-OptionalText = Annotated[str | None, tyro.conf.arg(metavar="STR")]
-OptionalNumber = Annotated[int | None, tyro.conf.arg(metavar="INT")]
-OptionalFloat = Annotated[float | None, tyro.conf.arg(metavar="FLOAT")]
-OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH")]
+OptionalText = Annotated[str | None, tyro.conf.arg(metavar="STR", help_behavior_hint="")]
+OptionalNumber = Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="")]
+OptionalFloat = Annotated[float | None, tyro.conf.arg(metavar="FLOAT", help_behavior_hint="")]
+OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
 """These are for flags that may be left out, whose help would else list None beside the type."""
 _APPEND = typing.get_args(tyro.conf.UseAppendAction[int])[1]
 HINTS = {

@@ -313,7 +313,7 @@ def sweep(
 
 @app.command
 def play(
-    scene: Positional[Annotated[Path | None, arg(metavar="[PATH]")]] = None,
+    scene: Positional[Annotated[Path | None, arg(metavar="[PATH]", help_behavior_hint="")]] = None,
     /,
     *,
     host: str = "127.0.0.1",
@@ -372,7 +372,7 @@ def map(
     frames: int = 40,
     output: OptionalPath = None,
     camera_height: OptionalFloat = None,
-    distance: Annotated[tuple[str, str, float] | None, arg(metavar="IMAGE IMAGE METRES")] = None,
+    distance: Annotated[tuple[str, str, float] | None, arg(metavar="IMAGE IMAGE METRES", help_behavior_hint="")] = None,
     localize: OptionalPath = None,
 ) -> int:
     """Make a map of your own photographs: panoramas, or images of one calibrated wide camera.
@@ -415,7 +415,7 @@ def map(
 
 @app.command
 def lesson(
-    name: Positional[Annotated[str | None, arg(metavar="[NAME]")]] = None,
+    name: Positional[Annotated[str | None, arg(metavar="[NAME]", help_behavior_hint="")]] = None,
     /,
     export: OptionalPath = None,
     handout: OptionalPath = None,
@@ -523,7 +523,7 @@ def verify(
 
 
 @app.command
-def scenes(kind: Positional[Annotated[str | None, arg(metavar="[KIND]")]] = None, /) -> int:
+def scenes(kind: Positional[Annotated[str | None, arg(metavar="[KIND]", help_behavior_hint="")]] = None, /) -> int:
     """List the bundled scenes and the kinds of scene files, or show how a kind is written.
 
     For example:

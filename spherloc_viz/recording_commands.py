@@ -7,11 +7,19 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional, arg
 
+from spherloc.errors import InputError
 from spherloc_viz.arguments import OptionalNumber, OptionalText
 from spherloc_viz.given_files import check_recording_file, check_recordings_folder, none_there, without_reviews
 
 RECORDINGS = Path("recordings")
-RangeText = Annotated[str | None, arg(metavar="RANGE")]
+RangeText = Annotated[str | None, arg(metavar="RANGE", help_behavior_hint="")]
+DateText = Annotated[str | None, arg(metavar="DATE|AGE", help_behavior_hint="")]
+
+
+def _form(json: bool, csv: bool) -> str:
+    if json and csv:
+        raise InputError("--json and --csv are two forms of one answer; give one of them.")
+    return "json" if json else "csv" if csv else "table"
 
 
 def view(
@@ -101,13 +109,14 @@ def runs(
     inliers: RangeText = None,
     correspondences: RangeText = None,
     time: RangeText = None,
-    since: Annotated[str | None, arg(metavar="DATE|AGE")] = None,
-    until: Annotated[str | None, arg(metavar="DATE|AGE")] = None,
+    since: DateText = None,
+    until: DateText = None,
     sort: str = "created",
     ascending: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
     group: OptionalText = None,
     limit: OptionalNumber = None,
-    format: str = "table",
+    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
+    csv: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
 ) -> int:
     """List recorded runs: which failed, and of what.
 
@@ -120,9 +129,9 @@ def runs(
 
     spherloc runs --group diagnosis --since 3d
 
-    spherloc runs --diagnosis false-consensus --sort position-error --format csv
+    spherloc runs --diagnosis false-consensus --sort position-error --csv
 
-    spherloc runs recordings --text "facade night" --label wrong-map --format json
+    spherloc runs recordings --text "facade night" --label wrong-map --json
 
     Args:
         folder: Folder of the recordings.
@@ -147,7 +156,8 @@ def runs(
         ascending: The smallest or oldest first.
         group: Count the runs by diagnosis, outcome, estimator, scene, source, label or problem-key instead.
         limit: How many to list; 0 for all. A table has 50 if it is not given, JSON and CSV have all.
-        format: table, json or csv.
+        json: Print JSON instead of a table.
+        csv: Print CSV instead of a table.
     """
     check_recordings_folder(folder)
     from spherloc_viz import runs as listing
@@ -177,7 +187,7 @@ def runs(
         sort=listing.sort_key(sort),
         descending=not ascending,
     )
-    return listing.print_runs(folder, query, group, limit, format)
+    return listing.print_runs(folder, query, group, limit, _form(json, csv))
 
 
 def steps(
@@ -185,7 +195,8 @@ def steps(
     folder: Positional[Path] = RECORDINGS,
     /,
     limit: OptionalNumber = None,
-    format: str = "table",
+    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
+    csv: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
 ) -> int:
     """List the steps of recorded runs for which a condition holds, such as those that had the right pose and lost it.
 
@@ -200,18 +211,19 @@ def steps(
 
     spherloc steps "position_error_m < 0.1 AND outcome = 'failure'"
 
-    spherloc steps "stage = 'Refinement' AND agreeing < 0.2 * correspondences" recordings --format csv
+    spherloc steps "stage = 'Refinement' AND agreeing < 0.2 * correspondences" recordings --csv
 
     Args:
         condition: What must be true of a step.
         folder: Folder of the recordings.
         limit: How many steps to list; 0 for all. A table has 50 if it is not given, JSON and CSV have all.
-        format: table, json or csv.
+        json: Print JSON instead of a table.
+        csv: Print CSV instead of a table.
     """
     check_recordings_folder(folder)
     from spherloc_viz.runs import print_steps
 
-    return print_steps(folder, condition, limit, format)
+    return print_steps(folder, condition, limit, _form(json, csv))
 
 
 def label(

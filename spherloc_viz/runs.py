@@ -14,7 +14,7 @@ from spherloc_viz.progress import progress, say
 from spherloc_viz.recording.index.query import GROUP_KEYS, OUTCOMES, SORT_KEYS, SOURCES, RunQuery
 from spherloc_viz.recording.index.refresher import Progress, Refreshed
 from spherloc_viz.recording.index.run_index import RunIndex
-from spherloc_viz.recording.index.run_text import FORMS, counts_text, rows_text
+from spherloc_viz.recording.index.run_text import counts_text, rows_text
 from spherloc_viz.recording.reviews import Review, checked_review
 from spherloc_viz.recording.run_row import RunRow
 from spherloc_viz.recording.sandbox.examiner import examine, examine_review
@@ -40,9 +40,9 @@ GALLERY = "gallery"
 def print_runs(folder: Path, query: RunQuery, group: str | None, limit: int | None, form: str) -> int:
     """List the runs of a folder; returns the exit code. Recordings that are new or have changed are read first.
 
-    Raises ``InputError`` for a folder, group or form that there is not, and for values that no run can have.
+    Raises ``InputError`` for a folder or group that there is not, and for values that no run can have.
     """
-    form, most = one_of("format", form, FORMS), _limit(limit, form)
+    most = _limit(limit, form)
     key = None if group is None else one_of("group", group.replace("-", "_"), GROUP_KEYS)
     with _open(folder) as index:
         _refresh(index)
@@ -69,7 +69,7 @@ def print_steps(folder: Path, condition: str, limit: int | None, form: str) -> i
     """
     from spherloc_viz.recording.index.steps import checked_condition, find_steps, steps_text
 
-    form, most = one_of("format", form, FORMS), _limit(limit, form)
+    most = _limit(limit, form)
     checked_condition(condition)
     with _open(folder) as index:
         _refresh(index, index.examine)  # rerun's catalog reads them in this process

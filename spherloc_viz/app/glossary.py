@@ -30,7 +30,7 @@ TERMS: dict[str, str] = {
     "outlier": "A match beyond the bound of the pose at hand.",
     "residual": "How far the map point is seen from the pixel of its match, with the pose at hand.",
     "refinement": "Gauss-Newton steps that move the pose until the residuals of its inliers are least.",
-    "RANSAC": "Draws the smallest sample that fixes a pose, counts the matches that agree, and keeps the best of many poses.",
+    "RANSAC": "Draws the smallest sample that fixes a pose, counts the matches that agree, and keeps the best.",
     "sample": "The matches that RANSAC draws to fix one pose.",
     "certificate": "A bound that no pose can beat; where the pose at hand reaches it, it is proven to be the best.",
     "covariance": "How sure the pose is by its inliers: drawn as an ellipsoid of three standard deviations.",

@@ -21,11 +21,9 @@ _GIVE_WAY = ("Run", "Diagnosis", "Estimator")
 """Columns that are cut where the line is too long, in this order."""
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")
 
-FORMS = ("table", "json", "csv")
-
 
 def rows_text(folder: Path, rows: Sequence[RunRow], form: str) -> str:
-    """Runs in one of ``FORMS``; each line ends with a newline, and without runs a table is empty."""
+    """Runs as "table", "json" or "csv"; each line ends with a newline, and without runs a table is empty."""
     if form == "json":
         return json_lines([_plain(row) for row in rows])
     if form == "csv":
@@ -38,7 +36,7 @@ def rows_text(folder: Path, rows: Sequence[RunRow], form: str) -> str:
 
 
 def counts_text(by: str, counts: Sequence[tuple[str, int]], form: str) -> str:
-    """How many runs have each value, in one of ``FORMS``."""
+    """How many runs have each value, as "table", "json" or "csv"."""
     tables = [{by: value, "runs": count} for value, count in counts]
     if form == "json":
         return json_lines(tables)
