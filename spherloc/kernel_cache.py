@@ -51,10 +51,12 @@ def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     arguments from Python, which saves a fifth of the time; numba itself would make that code for every kernel.
     """
 
+    common: dict[str, Any] = {"nogil": True, **options}
+    no_wrappers: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+
     def decorate(function: Callable[..., Any]) -> Any:
-        called = _cached(numba.njit(nogil=True, **options)(function), kernel_folder())
-        bare = numba.njit(nogil=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, **options)(function)
-        bare = _cached(bare, kernel_folder() / "bare")
+        called = _cached(numba.njit(**common)(function), kernel_folder())
+        bare = _cached(numba.njit(**common, **no_wrappers)(function), kernel_folder() / "bare")
         called.get_call_template, called.get_overload = bare.get_call_template, bare.get_overload
         return called
 
