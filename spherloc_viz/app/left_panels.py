@@ -42,7 +42,7 @@ class LeftPanels:
             touches.on("step", lambda touch: self.steps.go(touch.argument))
             touches.on("move", lambda touch: self.steps.move(touch.argument))
             touches.on("projector", self._widen)
-            self._diagnosis = gui.add_html("")
+            self._diagnosis = self.steps.remark
             gui.add_html(legend_html())
             self._outcome = gui.add_html("")
             self._introduction, self._front, self._ready = gui.add_html(""), gui.add_html(""), gui.add_html("")
