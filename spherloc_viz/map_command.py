@@ -10,7 +10,7 @@ from spherloc.errors import InputError
 from spherloc.frontend.view import View
 from spherloc.mapping.make import Map, Measured, make_map
 from spherloc.mapping.photographs import Photographs, frames_of, photographs
-from spherloc.mapping.reconstruction import Tell
+from spherloc.mapping.upright import Tell
 from spherloc_viz.map_report import map_report
 from spherloc_viz.progress import progress, say
 
@@ -44,7 +44,7 @@ def make(
         report.write_text(map_report(made, found), encoding="utf-8")
     except OSError as error:
         raise InputError(f"{report}: cannot be written ({error.strerror}); give another --output.") from None
-    print("\n".join(_summary(made, found)))
+    print("\n".join(summary(made, found)))
     print(f"report        {report}")
     print(f"see it        spherloc play {made.written.scene}")
     print(f"localize      spherloc localize {made.written.new_scene or made.written.scene}")
@@ -93,16 +93,23 @@ def _kind(view: View) -> str:
     )
 
 
-def _summary(made: Map, found: Photographs) -> list[str]:
+def _units_unknown(made: Map) -> str:
+    return f"units unknown; {made.scale.why_unknown or '--camera-height or --distance gives metres'}"
+
+
+def summary(made: Map, found: Photographs) -> list[str]:
+    """What came of it, in lines."""
     written, missing = made.written, [view.name for view in found.views if view.name not in made.written.poses]
     lines = [
         f"in the map    {len(written.poses)} of {len(found.views)} images, {len(written.points):,} points, "
         f"{written.error_px:.2f} px mean error",
         f"down          from {made.level.source}; single images differ by {made.level.spread_deg:.1f}° (median)",
-        f"scale         {made.scale.source or 'units unknown; --camera-height or --distance gives metres'}",
+        f"scale         {made.scale.source or _units_unknown(made)}",
     ]
     if missing:
         lines.append(f"left out      {', '.join(missing[:5])}{', …' if len(missing) > 5 else ''}: see the report")
+    for group in made.groups:
+        lines.append(f"on its own    {len(group.written.poses)} images that could not be joined: {group.written.scene}")
     if made.made.contradictions:
         first, second = made.made.contradictions[0]
         lines.append(

@@ -13,8 +13,8 @@ from spherloc.errors import InputError
 from spherloc.frontend.view import View
 from spherloc.geometry import camera_centre
 from spherloc.mapping.make import Map
+from spherloc.mapping.pairs import MIN_MATCHES
 from spherloc.mapping.photographs import Photographs
-from spherloc.mapping.reconstruction import MIN_MATCHES
 from spherloc.types import FloatArray
 
 THUMBNAIL_PX = 240
@@ -35,6 +35,8 @@ def map_report(made: Map, found: Photographs) -> str:
     written, views = made.written, found.views
     names = [view.name for view in views]
     scale = made.scale.source or "unknown: one unit is the usual distance between two neighbouring images"
+    if made.scale.why_unknown:
+        scale += f" ({made.scale.why_unknown.rstrip('.')})"
     facts = {
         "Images in the map": f"{len(written.poses)} of {len(views)}",
         "Points": f"{len(written.points):,}",
@@ -92,9 +94,12 @@ def why_not(made: Map, names: list[str], index: int) -> str:
     """Why an image is not in the map, in a sentence."""
     counts = made.made.matches[index]
     inside = np.array([name in made.written.poses for name in names])
-    group = next((group for group in made.made.other_groups if names[index] in group), None)
+    group = next((group for group in made.groups if names[index] in group.written.poses), None)
     if group is not None:
-        return f"It is one of {len(group)} images that fit together, but not with the map: take some in between."
+        return (
+            f"It is one of {len(group.written.poses)} images that fit together, but not with the map: take some in "
+            f"between. They are a map of their own, {group.written.scene.parent.name}."
+        )
     if names[index] in made.level.leaning:
         return (
             f"COLMAP placed it so that it leans {made.level.leaning[names[index]]:.1f}° against the map, at a place "

@@ -86,6 +86,7 @@ FLOORS = (
         "spherloc_viz.lesson_command",
         "spherloc_viz.map_report",
         "spherloc_viz.map_command",
+        "spherloc_viz.map_job",
         "spherloc_viz.verify_command",
         "spherloc_viz.verification_datasets",
         "spherloc_viz.verification_pictures",

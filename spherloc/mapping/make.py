@@ -1,22 +1,30 @@
 """The whole way from photographs to a map on the disk."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from spherloc.errors import InputError, show
 from spherloc.files import is_folder
-from spherloc.frontend.view import View
-from spherloc.mapping.reconstruction import Reconstruction, Tell, reconstruct
+from spherloc.frontend.view import Gravity, View
+from spherloc.mapping.later import place_rest
+from spherloc.mapping.reconstruction import Reconstruction, reconstruct
 from spherloc.mapping.upright import (
     Level,
     Scale,
+    Tell,
     arbitrary_scale,
+    gravity_by_lines,
     level_of,
     scale_by_distance,
     scale_by_height,
 )
 from spherloc.mapping.written import Written, write_map
+
+GROUP = "group"
+"""Name of the folder, with a number, of a map of images that could not be joined with the rest."""
+MIN_OF_GROUP = 3
+"""Images of such a map."""
 
 
 @dataclass(frozen=True)
@@ -37,6 +45,8 @@ class Map:
     level: Level
     scale: Scale
     written: Written
+    groups: "tuple[Map, ...]" = ()
+    """Maps of other images, which could not be joined with this one."""
 
 
 def make_map(
@@ -45,7 +55,7 @@ def make_map(
     """Make a map of images of one camera and write it into ``folder``.
 
     ``new_images`` is a folder of other images of that camera, for which a scene is written too. Raises ``InputError``
-    if they give no map, if what is measured does not fit them, or if a file cannot be read or written.
+    if they give no map, if what is measured names other images, or if a file cannot be read or written.
     """
     if new_images is not None and not is_folder(new_images):
         raise InputError(f"{new_images}: is no folder; give one with images that are to be localized.")
@@ -59,13 +69,54 @@ def make_map(
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{folder}: cannot be made ({error.strerror}); give another --output.") from None
-    made = reconstruct(views, folder, tell)
-    level = level_of(made.poses, views)
+    gravity = gravity_by_lines(views, tell)
+    first, *others = reconstruct(views, [gravity.get(view.name) for view in views], folder, tell)
+    found = _finished(first, views, (), gravity, measured, tell)
+    inside = set(found[0].poses)
+    made = Map(*found, write_map(*found, views, images, folder, new_images))
+    groups: list[Map] = []
+    for other in others:
+        if len(other.poses.keys() - inside) < MIN_OF_GROUP:
+            continue
+        try:
+            found = _finished(other.without(inside), views, inside, gravity, measured, tell)
+        except InputError:  # its images do not agree on where down is
+            continue
+        if len(found[0].poses) < MIN_OF_GROUP:
+            continue
+        inside |= found[0].poses.keys()
+        place = folder / f"{GROUP}_{len(groups) + 2}"
+        try:
+            place.mkdir(exist_ok=True)
+        except OSError as error:
+            raise InputError(f"{place}: cannot be made ({error.strerror}); give another --output.") from None
+        groups.append(Map(*found, write_map(*found, views, images, place, new_images)))
+    return replace(made, groups=tuple(groups))
+
+
+def _finished(
+    made: Reconstruction,
+    views: Sequence[View],
+    elsewhere: Collection[str],
+    gravity: Mapping[str, Gravity],
+    measured: Measured,
+    tell: Tell,
+) -> tuple[Reconstruction, Level, Scale]:
+    """A model with what could be added to it, without what leans against it; its down and its scale."""
+    made = made.without(level_of(made.poses, gravity).leaning)
+    made = place_rest(made, views, elsewhere, gravity, level_of(made.poses, gravity), tell)
+    level = level_of(made.poses, gravity)
     made = made.without(level.leaning)
-    if measured.distance is not None:
-        scale = scale_by_distance(made.poses, *measured.distance)
-    elif measured.camera_height_m is not None:
-        scale = scale_by_height(made.poses, made.points(), level, measured.camera_height_m)
-    else:
-        scale = arbitrary_scale(made.poses)
-    return Map(made, level, scale, write_map(made, level, scale, views, images, folder, new_images))
+    return made, level, scale_of(made, level, measured)
+
+
+def scale_of(made: Reconstruction, level: Level, measured: Measured) -> Scale:
+    """By what is measured; arbitrary, with the reason, if that does not fit the map: the work is done by now."""
+    try:
+        if measured.distance is not None:
+            return scale_by_distance(made.poses, *measured.distance)
+        if measured.camera_height_m is not None:
+            return scale_by_height(made.poses, made.points(), level, measured.camera_height_m)
+    except InputError as error:
+        return replace(arbitrary_scale(made.poses), why_unknown=str(error))
+    return arbitrary_scale(made.poses)

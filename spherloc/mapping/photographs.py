@@ -9,8 +9,9 @@ import cv2
 import numpy as np
 
 from spherloc.cameras.base import Camera
+from spherloc.cameras.calibration import load_camera
 from spherloc.cameras.equirectangular import Equirectangular
-from spherloc.errors import InputError, shorten
+from spherloc.errors import InputError, SpherlocError, shorten
 from spherloc.files import IMAGES, is_file, is_folder, names_in
 from spherloc.frontend.view import View
 from spherloc.images import grey, read_size
@@ -22,6 +23,9 @@ MAX_IMAGES = 500
 """Their features take 4 MB each."""
 MIN_PANORAMA_PX = 200
 """Of the longer side."""
+CALIBRATIONS = (".yaml", ".yml", ".json", ".toml")
+MAX_CALIBRATIONS = 20
+"""Files beside the photographs that are tried as one."""
 SHARPNESS_PX = 512
 """Frames are compared at this longer side."""
 
@@ -36,6 +40,8 @@ class Photographs:
 
 def photographs(folder: Path, camera: Camera | None) -> Photographs:
     """The images of a folder, all of ``camera``; without one they are taken for panoramas if they are 2 to 1.
+
+    Other images without one are of the camera whose calibration lies in the folder, if one of their size does.
 
     Raises ``InputError`` if there are fewer than two of one size or too many, or if their camera is not known or none
     that COLMAP can have.
@@ -53,13 +59,16 @@ def photographs(folder: Path, camera: Camera | None) -> Photographs:
         raise InputError(f"{folder}: has no photographs ({', '.join(sorted(IMAGES))}); give the folder that has them.")
     size = (camera.width, camera.height) if camera else max(sizes, key=lambda key: len(sizes[key]))
     width, height = size
+    if camera is None and width == 2 * height and width >= MIN_PANORAMA_PX:
+        camera = Equirectangular(width, height)
     if camera is None:
-        if width != 2 * height or width < MIN_PANORAMA_PX:
+        camera, name = _calibration_in(folder, size)
+        if camera is None:
             raise InputError(
                 f"{folder}: its photographs are {width} x {height} pixels, so they are no full panoramas (2 to 1); "
                 "give their calibration with --camera FILE."
             )
-        camera = Equirectangular(width, height)
+        remarks.append(f"The calibration is {shorten(name)}, which lies beside the photographs.")
     names = sizes.pop(size, [])
     others = sorted(name for rest in sizes.values() for name in rest)
     if others:
@@ -81,6 +90,19 @@ def photographs(folder: Path, camera: Camera | None) -> Photographs:
     if about_lens:
         remarks.append(about_lens)
     return Photographs(tuple(View(name, camera, folder / name) for name in sorted(names)), tuple(remarks))
+
+
+def _calibration_in(folder: Path, size: tuple[int, int]) -> tuple[Camera | None, str]:
+    """The first camera of that width and height among the files of a folder, and the file's name."""
+    names = [name for name in names_in(folder) if Path(name).suffix.lower() in CALIBRATIONS]
+    for name in names[:MAX_CALIBRATIONS]:
+        try:
+            camera = load_camera(folder / name)
+        except SpherlocError:  # something else
+            continue
+        if (camera.width, camera.height) == size:
+            return camera, name
+    return None, ""
 
 
 def frames_of(video: Path, folder: Path, count: int, advance: Callable[[str], None]) -> int:

@@ -17,7 +17,6 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from itertools import combinations
-from math import tau
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -31,24 +30,17 @@ from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.errors import InputError, reason
 from spherloc.frontend import retrieval
 from spherloc.frontend.features import VERSION, FeatureOptions, Features, extract
-from spherloc.frontend.matching import match
-from spherloc.frontend.view import View
+from spherloc.frontend.view import Gravity, View
 from spherloc.geometry import camera_centre
+from spherloc.mapping.pairs import MIN_MATCHES, Pairs, relative
+from spherloc.mapping.rotations import agreeing
+from spherloc.mapping.triangles import Pair, open_triangles
+from spherloc.mapping.upright import Tell
 from spherloc.registry import require
 from spherloc.types import BoolArray, FloatArray
 
-Tell = Callable[[str, int, int], None]
-"""Told of each piece of work that is done: its kind in the plural, how many are done, how many there are."""
-
-DATABASE_VERSION = 4
+DATABASE_VERSION = 5
 """Raised when pairs are matched or checked in another way."""
-MIN_MATCHES = 15
-"""Of a pair of images, after the two-view check."""
-BOUND_RAD = np.radians(0.5)
-"""Of a match to its epipolar plane; in pixels it is kept within ``BOUND_PX``."""
-BOUND_PX = 1.5, 6.0
-ONE_PLACE_RAD = np.radians(0.5)
-"""Rays of a match that differ by less: two images from one place, which tell nothing of depth."""
 MAX_EXHAUSTIVE = 50
 """Images of which all pairs are tried; of more, each with its neighbours by name and with those that look alike."""
 NEIGHBOURS, ALIKE = 5, 15
@@ -72,7 +64,7 @@ _TRIES = (
 
 @dataclass(frozen=True, eq=False)
 class Reconstruction:
-    """The largest model that COLMAP could make."""
+    """A model that COLMAP could make."""
 
     model: Any
     """``pycolmap.Reconstruction``."""
@@ -80,10 +72,14 @@ class Reconstruction:
     """Poses (3, 4) from the model's frame, which has no scale and no up, by name of a registered image."""
     matches: NDArray[np.int64]
     """(V, V) matches of each pair of images after the two-view check."""
-    other_groups: tuple[tuple[str, ...], ...]
-    """Names of images that fit together, but could not be joined with the rest."""
     contradictions: tuple[tuple[str, str], ...]
     """Names of images that the model puts side by side although they hardly match."""
+    all_matches: NDArray[np.int64]
+    """(V, V) as ``matches``, with those of images that were taken from one place."""
+    database: Path
+    """COLMAP's, with features and matches of all images."""
+    ids: dict[str, int]
+    """Of all images in it, by name."""
 
     def without(self, names: Collection[str]) -> "Reconstruction":
         """The same with fewer images; points that fewer than two others see are gone."""
@@ -100,8 +96,14 @@ class Reconstruction:
         return np.array([point.xyz for point in self.model.points3D.values()]).reshape(-1, 3)
 
 
-def reconstruct(views: Sequence[View], folder: Path, tell: Tell) -> Reconstruction:
+def reconstruct(
+    views: Sequence[View], gravity: Sequence[Gravity | None], folder: Path, tell: Tell
+) -> tuple[Reconstruction, ...]:
     """Map images of one camera; the database in ``folder`` is kept, and what is in it is not done again.
+
+    The map with most images comes first, then those of other images that could not be joined with it.
+
+    ``gravity`` is what lines of the images tell.
 
     Raises ``InputError`` if pycolmap is missing, if an image or the folder cannot be used, or if no two images fit
     together.
@@ -121,7 +123,8 @@ def reconstruct(views: Sequence[View], folder: Path, tell: Tell) -> Reconstructi
         raise InputError(f"{path}: cannot be written ({reason(error)}); give another --output.") from None
     try:
         ids = _described(pycolmap, database, views, features, usable)
-        counts, same_place = _matched(pycolmap, database, ids, camera, features, usable, tell)
+        compared = Pairs(pycolmap, camera, features, usable, gravity)
+        counts, same_place = _matched(database, ids, compared, _pairs(features), tell)
     finally:
         database.close()
     if counts.max(initial=0) < MIN_MATCHES:
@@ -131,17 +134,17 @@ def reconstruct(views: Sequence[View], folder: Path, tell: Tell) -> Reconstructi
             "to each other, half a metre to two metres apart indoors."
         )
     names = [view.name for view in views]
-    made = [_best_model(pycolmap, path, names, ids, counts, same_place, keep, tell) for keep in (0.0, STRONG)]
-    candidates = [one for one in made if one is not None]
+    made = [_models_of(pycolmap, path, names, ids, counts, same_place, keep, tell) for keep in (0.0, STRONG)]
+    candidates = [one for one in made if one]
     if not candidates:
         raise InputError(
             f"COLMAP could not start a map from these {len(views)} photographs, although pairs of them match: they "
             "may have been taken from one place. Take them half a metre to two metres apart."
         )
-    return max(candidates, key=_worth)
+    return max(candidates, key=lambda one: _worth(one[0]))
 
 
-def _best_model(
+def _models_of(
     pycolmap: Any,
     path: Path,
     names: Sequence[str],
@@ -150,8 +153,9 @@ def _best_model(
     same_place: NDArray[np.int64],
     keep: float,
     tell: Tell,
-) -> Reconstruction | None:
-    """The largest model of the pairs with at least the share ``keep`` of the matches of either image's best pair."""
+) -> tuple[Reconstruction, ...]:
+    """Models, the largest first, of the pairs with at least the share ``keep`` of the matches of either image's best
+    pair."""
     with TemporaryDirectory() as folder:  # COLMAP takes all pairs of a database, and writes its models itself, too
         database = Path(folder) / "matches.db"
         shutil.copyfile(path, database)
@@ -160,17 +164,42 @@ def _best_model(
         weak = [pair for pair in pairs if not counts[pair] or counts[pair] < keep * best[list(pair)].max()]
         with pycolmap.Database.open(str(database)) as opened:
             for pair in weak:
-                if counts[pair] or same_place[pair]:
+                if opened.exists_two_view_geometry(*_of(ids, pair)):
                     opened.delete_two_view_geometry(*_of(ids, pair))
                     opened.delete_matches(*_of(ids, pair))
         models = _models(pycolmap, database, Path(folder), len(ids), tell)
-    if not models:
-        return None
-    poses = {image.name: np.asarray(image.cam_from_world().matrix()) for image in _registered(models[0])}
-    groups = [tuple(sorted(image.name for image in _registered(model))) for model in models[1:]]
-    left = [tuple(name for name in group if name not in poses) for group in groups]
-    against = _contradictions(poses, names, counts + same_place)
-    return Reconstruction(models[0], poses, counts, tuple(group for group in left if group), against)
+    number_of = dict(zip(names, ids, strict=True))
+    found = []
+    for model in models:
+        poses = {image.name: np.asarray(image.cam_from_world().matrix()) for image in _registered(model)}
+        against = contradictions(poses, names, counts + same_place)
+        found.append(Reconstruction(model, poses, counts, against, counts + same_place, path, number_of))
+    return untangled(found)
+
+
+def untangled(made: Sequence[Reconstruction]) -> tuple[Reconstruction, ...]:
+    """The models without images that have more matches with those of another one, the largest first.
+
+    Models that share images and yet could not be joined take two places for one somewhere: where the images between
+    them belong is where they match most.
+    """
+    if len(made) < 2:
+        return tuple(made)
+    place = {name: index for index, name in enumerate(made[0].ids)}
+    members = [set(one.poses) for one in made]
+    changed = True
+    while changed:
+        changed = False
+        for name in place:
+            ties = [
+                int(made[0].all_matches[place[name], [place[one] for one in group - {name}]].sum()) for group in members
+            ]
+            for group, tie in zip(members, ties, strict=True):
+                if name in group and tie < max(ties):
+                    group.remove(name)
+                    changed = True
+    left = [one.without(one.poses.keys() - group) for one, group in zip(made, members, strict=True) if len(group) > 1]
+    return tuple(sorted(left, key=lambda one: -len(one.poses)))
 
 
 def _worth(made: Reconstruction) -> float:
@@ -178,10 +207,10 @@ def _worth(made: Reconstruction) -> float:
     return len(made.poses) * (1.0 - COST_OF_CONTRADICTION * share)
 
 
-def _contradictions(
+def contradictions(
     poses: Mapping[str, FloatArray], names: Sequence[str], counts: NDArray[np.int64]
 ) -> tuple[tuple[str, str], ...]:
-    """Images and those next to them that hardly match."""
+    """Images of ``poses`` and those next to them that hardly match, by the ``counts`` (V, V) of all ``names``."""
     inside = [index for index, name in enumerate(names) if name in poses]
     centres = np.stack([camera_centre(poses[names[index]]) for index in inside])
     apart = np.linalg.norm(centres[:, None] - centres[None], axis=2)
@@ -250,75 +279,62 @@ def _described(
 
 
 def _matched(
-    pycolmap: Any,
-    database: Any,
-    ids: Sequence[int],
-    camera: Camera,
-    features: Sequence[Features],
-    usable: Sequence[NDArray[np.int64]],
-    tell: Tell,
+    database: Any, ids: Sequence[int], compared: Pairs, waiting: Sequence[Pair], tell: Tell
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Matches (V, V) of each pair of images that fit two poses, and (V, V) of pairs that were taken from one place.
 
-    They are in the database then.
+    They are in the database then. Pairs that others contradict have none.
     """
-    height = round(np.pi * _focal_px(camera))
-    sphere = Equirectangular(2 * height, height)
-    options = pycolmap.TwoViewGeometryOptions()
-    options.min_num_inliers = MIN_MATCHES
-    options.ransac.max_error = float(np.clip(BOUND_RAD * sphere.width / tau, *BOUND_PX))
-    options.ransac.random_seed = 0
-    # Whatever the lens, bearings are compared: of fisheyes COLMAP would ask for fundamental matrices, too.
-    panorama = pycolmap.Camera(
-        model="EQUIRECTANGULAR", width=sphere.width, height=sphere.height, params=[sphere.width, sphere.height]
-    )
-    pixels = [
-        sphere.project(camera.unproject(found.pixels[index])[0])[0]
-        for found, index in zip(features, usable, strict=True)
-    ]
-    number_of = [np.full(len(found), -1) for found in features]
-    for numbers, index in zip(number_of, usable, strict=True):
-        numbers[index] = np.arange(len(index))
-
-    kinds = pycolmap.TwoViewGeometryConfiguration
-    options.compute_relative_pose = True  # for the angle between the rays of a match
-
-    def fits(geometry: Any) -> bool:
-        if geometry.config == kinds.PLANAR:
-            return geometry.tri_angle < ONE_PLACE_RAD
-        return geometry.config in (kinds.CALIBRATED, kinds.PANORAMIC)
-
-    def verified(first: int, second: int) -> tuple[NDArray[np.uint32], Any]:
-        found = match(features[first], features[second])
-        pairs = np.column_stack([number_of[first][found.query_index], number_of[second][found.reference_index]])
-        pairs = pairs[(pairs >= 0).all(axis=1)].astype(np.uint32)
-        if len(pairs) < MIN_MATCHES:
-            return pairs, None
-        geometry = pycolmap.estimate_calibrated_two_view_geometry(
-            panorama, pixels[first], panorama, pixels[second], pairs, options
-        )
-        return pairs, geometry if fits(geometry) else None
-
-    counts, same_place = np.zeros((2, len(ids), len(ids)), np.int64)
-
-    def count(pair: tuple[int, int], geometry: Any) -> None:
-        (counts if geometry.config == kinds.CALIBRATED else same_place)[pair] = len(geometry.inlier_matches)
-
-    waiting, done = _pairs(features), 0
+    found: dict[Pair, Any] = {}
     todo = [pair for pair in waiting if not database.exists_matches(*_of(ids, pair))]
     for pair in set(waiting) - set(todo):
         if database.exists_two_view_geometry(*_of(ids, pair)):
-            count(pair, database.read_two_view_geometry(*_of(ids, pair)))
-        done += 1
+            found[pair] = database.read_two_view_geometry(*_of(ids, pair))
+    done = len(waiting) - len(todo)
     with ThreadPoolExecutor(_workers()) as pool:
-        for pair, (pairs, geometry) in _as_completed(pool, verified, todo):
+        for pair, (pairs, geometry) in _as_completed(pool, compared.compare, todo):
             if geometry is not None:
-                count(pair, geometry)
+                found[pair] = geometry
                 database.write_two_view_geometry(*_of(ids, pair), geometry)
             database.write_matches(*_of(ids, pair), pairs)  # last: it says that the pair is done
             done += 1
             tell("pairs of images matched", done, len(waiting))
-    return counts + counts.T, same_place + same_place.T
+        same_place = {pair: found.pop(pair) for pair in sorted(found) if compared.same_place(found[pair])}
+        found = _agreeing(found)
+        known = {pair: relative(geometry) for pair, geometry in found.items()}
+        between = {pair: middles for pair, middles in open_triangles(known).items() if pair not in same_place}
+
+        def close(first: int, second: int) -> Any:
+            return compared.between((first, second), matches[first, second], known, between[first, second])
+
+        matches = {
+            pair: database.read_matches(*_of(ids, pair))
+            for pair in sorted(between)
+            if database.exists_matches(*_of(ids, pair))
+        }
+        for done, (pair, geometry) in enumerate(_as_completed(pool, close, list(matches)), start=1):
+            tell("pairs with an image between them matched", done, len(matches))
+            if geometry is not None:
+                found[pair] = geometry
+                if database.exists_two_view_geometry(*_of(ids, pair)):
+                    database.delete_two_view_geometry(*_of(ids, pair))
+                database.write_two_view_geometry(*_of(ids, pair), geometry)
+    return _counts(_agreeing(found), len(ids)), _counts(same_place, len(ids))
+
+
+def _agreeing(found: Mapping[Pair, Any]) -> dict[Pair, Any]:
+    """Those of the pairs whose rotations agree."""
+    rotations = {pair: relative(geometry)[0] for pair, geometry in sorted(found.items())}
+    agree = agreeing(rotations, {pair: len(geometry.inlier_matches) for pair, geometry in found.items()})
+    return {pair: found[pair] for pair in sorted(agree)}
+
+
+def _counts(found: Mapping[Pair, Any], size: int) -> NDArray[np.int64]:
+    """(V, V) matches of each pair."""
+    counts = np.zeros((size, size), np.int64)
+    for pair, geometry in found.items():
+        counts[pair] = counts[pair[::-1]] = len(geometry.inlier_matches)
+    return counts
 
 
 def _as_completed(
@@ -342,13 +358,6 @@ def _workers() -> int:
 
 def _of(ids: Sequence[int], pair: tuple[int, int]) -> tuple[int, int]:
     return ids[pair[0]], ids[pair[1]]
-
-
-def _focal_px(camera: Camera) -> float:
-    """Pixels a radian in the middle of the image."""
-    ahead = np.array([[0.0, 0.0, 1.0], [1e-3, 0.0, 1.0]])
-    pixels, _ = camera.project(ahead)
-    return float(np.linalg.norm(pixels[1] - pixels[0]) / 1e-3)
 
 
 def _pairs(features: Sequence[Features]) -> list[tuple[int, int]]:

@@ -1,6 +1,7 @@
 """Which way is down in a model made of images alone, and how long its unit is."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,9 +9,12 @@ from scipy.spatial import KDTree
 
 from spherloc.errors import InputError, show
 from spherloc.frontend.gravity_from_lines import gravity_from_lines
-from spherloc.frontend.view import View
+from spherloc.frontend.view import Gravity, View
 from spherloc.geometry import DOWN, align_to_down, camera_centre
 from spherloc.types import FloatArray
+
+Tell = Callable[[str, int, int], None]
+"""Told of each piece of work that is done: its kind in the plural, how many are done, how many there are."""
 
 MIN_LINES = 3
 """Images whose lines must tell down; of fewer, all images count as held upright."""
@@ -35,6 +39,8 @@ class Level:
     """Median angle between it and what single images say."""
     leaning: dict[str, float]
     """Images that lean against it, by name, degrees: COLMAP placed them wrongly."""
+    by_lines: bool = False
+    """Whether vertical lines of the images measured it."""
 
 
 @dataclass(frozen=True)
@@ -44,24 +50,31 @@ class Scale:
     metres_per_unit: float
     source: str
     """What measured it, in words; empty if nothing did, and the unit is arbitrary."""
+    why_unknown: str = ""
+    """Why what was measured gave no scale."""
 
 
-def level_of(poses: Mapping[str, FloatArray], views: Sequence[View]) -> Level:
+def gravity_by_lines(views: Sequence[View], tell: Tell) -> dict[str, Gravity]:
+    """Gravity of those images whose vertical lines tell it, by name.
+
+    ``tell`` is told of each image.
+    """
+    found = {}
+    for done, view in enumerate(views, start=1):
+        with suppress(InputError):  # too few lines: the others tell
+            found[view.name] = gravity_from_lines(view)
+        tell("images searched for vertical lines", done, len(views))
+    return found
+
+
+def level_of(poses: Mapping[str, FloatArray], gravity: Mapping[str, Gravity]) -> Level:
     """Down, from the vertical lines of the images, else as the mean of their vertical axes.
 
-    ``poses`` (3, 4) are those of the registered ones, by name. Raises ``InputError`` if the images do not agree.
+    ``poses`` (3, 4) are those of the registered ones, by name, and ``gravity`` is what lines tell.
+    Raises ``InputError`` if the images do not agree.
     """
-    measured: dict[str, FloatArray] = {}
-    axes: dict[str, FloatArray] = {}
-    for view in views:
-        if view.name not in poses:
-            continue
-        rotation = poses[view.name][:, :3]
-        axes[view.name] = rotation.T @ DOWN
-        try:
-            measured[view.name] = rotation.T @ gravity_from_lines(view).down
-        except InputError:  # too few lines: the others tell
-            continue
+    axes = {name: pose[:, :3].T @ DOWN for name, pose in poses.items()}
+    measured = {name: poses[name][:, :3].T @ one.down for name, one in gravity.items() if name in poses}
     by_lines = len(measured) >= MIN_LINES
     directions = measured if by_lines else axes
     down = _middle(np.stack(list(directions.values())))
@@ -75,7 +88,7 @@ def level_of(poses: Mapping[str, FloatArray], views: Sequence[View]) -> Level:
     limit_deg = max(MIN_LIMIT_DEG, LIMIT_SPREADS * spread_deg)
     leaning = {name: off for name, off in off_deg.items() if off > limit_deg}
     source = f"vertical lines of {len(measured)} images" if by_lines else "the images' own vertical, as if held upright"
-    return Level(down, source, spread_deg, leaning)
+    return Level(down, source, spread_deg, leaning, by_lines)
 
 
 def _middle(directions: FloatArray) -> FloatArray:
@@ -94,7 +107,7 @@ def scale_by_distance(poses: Mapping[str, FloatArray], first: str, second: str, 
     """
     for name in (first, second):
         if name not in poses:
-            raise InputError(f"{show(name)} is no image of the map; name two that were registered: {_some(poses)}.")
+            raise InputError(f"{show(name)} did not get into the map; name two of those that did: {_some(poses)}.")
     apart = float(np.linalg.norm(camera_centre(poses[first]) - camera_centre(poses[second])))
     if apart == 0.0:
         raise InputError(f"{show(first)} and {show(second)} were taken from one place; name two others.")

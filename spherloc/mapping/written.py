@@ -137,7 +137,10 @@ def _units(scale: Scale) -> list[str]:
 
 def _gravity(level: Level) -> list[str]:
     bound = max(MIN_BOUND_DEG, round(2.0 * level.spread_deg, 1))
-    return ["", "[gravity]", "map = [0.0, 0.0, -1.0]", f"bound_deg = {bound}"]
+    lines = ["", "[gravity]", "map = [0.0, 0.0, -1.0]", f"bound_deg = {bound}"]
+    if level.by_lines:
+        lines.append('query = "lines"                # where an image shows too few, gravity is that of its reference')
+    return lines
 
 
 def _relative(path: Path, folder: Path) -> str:

@@ -6,10 +6,12 @@ from contextlib import contextmanager
 import viser
 from numpy.typing import NDArray
 
+from spherloc.datasets.map_scene import MapScene
 from spherloc_viz.app.controls.steps_panel import StepsPanel
 from spherloc_viz.app.glossary import glossary_html, heading_html
 from spherloc_viz.app.introduction import introduction_html
 from spherloc_viz.app.matches.image_panel import ImagePanel
+from spherloc_viz.app.matches.lens_panel import LensPanel
 from spherloc_viz.app.matches.match_table import MatchTable
 from spherloc_viz.app.plots.charts import ChartPanel
 from spherloc_viz.app.plots.graph_view import GraphView
@@ -32,9 +34,11 @@ class LeftPanels:
         touches: Touches,
         changed: Callable[[object], None],
         select: Callable[[Iterable[int]], None],
+        scene_of: Callable[[str], MapScene | None],
         width_px: int,
     ) -> None:
-        """``changed`` has the page drawn anew; ``select`` selects matches by their numbers in the problem."""
+        """``changed`` has the page drawn anew; ``select`` selects matches by their numbers in the problem; ``scene_of``
+        gives the scene with images of a label, if it is one."""
         steps, views = gui.add_panel(), gui.add_panel()
         with steps.add_tab("Steps"):
             self._summary = gui.add_html("")
@@ -63,6 +67,7 @@ class LeftPanels:
         with _view(gui, views, "Images"):
             gui.add_html(heading_html("What the camera measured, and where the pose puts it", "residual"))
             self._images = ImagePanel(gui, touches, changed)
+            self._lens = LensPanel(gui, touches, scene_of, changed)
         with _view(gui, views, "Matches"):
             gui.add_html(heading_html("Press a row: the match lights up everywhere", "match"))
             self._matches = MatchTable(gui, touches, changed)
@@ -99,6 +104,7 @@ class LeftPanels:
             self._residuals.draw(run.trace, selected, kept, cost, hidden)
         if "Images" in seen:
             self._images.draw(run.trace, picture, selected, kept, hidden)
+            self._lens.draw(run, hidden)
         if "Matches" in seen:
             self._matches.draw(run.trace, selected, kept, hidden)
         summary, ending = ("", "") if hidden else (summary_html(run.trace), table_html(outcome))

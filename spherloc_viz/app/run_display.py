@@ -64,6 +64,8 @@ class Places:
     """Matches were selected, by their numbers in the problem; or, if true, are to be added to what is."""
     move: Callable[[TrueCamera], None] | None
     """The true camera was dragged to a new place; None where it may not be."""
+    scene_of: Callable[[str], MapScene | None]
+    """The scene with images of that label, if it is one."""
 
 
 class RunDisplay:
@@ -75,7 +77,9 @@ class RunDisplay:
         """``widths_px`` are those of the panels left and right of the canvas."""
         self._client, self.controls = client, controls
         select, movable = places.select, places.move is not None
-        self.panels = LeftPanels(client.gui, touches, places.redraw, lambda chosen: select(chosen, False), widths_px[0])
+        self.panels = LeftPanels(
+            client.gui, touches, places.redraw, lambda chosen: select(chosen, False), places.scene_of, widths_px[0]
+        )
         self.card = MatchCard(client.gui, editable=movable)
         moved = places.move or (lambda place: None)
         self.canvas = Canvas(client, self.controls.display, select, moved, sum(widths_px))

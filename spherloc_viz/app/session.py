@@ -96,7 +96,7 @@ class Session:
         """Whether all widgets are there: the first of them may be used before the last one is made."""
         left_px, right_px = panel_widths_px(client.camera.image_width)
         self._controls = Controls(client, self._catalog, services, self._touches, self, right_px)
-        places = Places(self.redraw, self.select, self._move_camera)
+        places = Places(self.redraw, self.select, self._move_camera, self._catalog.map_scene)
         self._display = RunDisplay(client, self._touches, self._controls, places, (left_px, right_px))
         self._listen()
         self._name, self._address = secrets.token_hex(8), client.gui.add_html("")

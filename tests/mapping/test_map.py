@@ -1,5 +1,8 @@
 """Maps of photographs: rendered panoramas with known poses, on the way that the command takes, and what is refused."""
 
+import json
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -11,10 +14,11 @@ from spherloc.errors import CalibrationError, InputError
 from spherloc.formats.colmap_files import read_model
 from spherloc.geometry import camera_centre, rotation_angle, so3_exp
 from spherloc.mapping.lens import for_colmap
-from spherloc.mapping.make import Measured, make_map
+from spherloc.mapping.make import Measured, make_map, scale_of
 from spherloc.mapping.photographs import frames_of, photographs
-from spherloc.mapping.upright import Level, level_of, scale_by_height, upright_frame
+from spherloc.mapping.upright import Level, gravity_by_lines, level_of, scale_by_height, upright_frame
 from spherloc.problem import Problem
+from spherloc_viz import map_job
 from spherloc_viz.map_report import map_report
 
 IMAGES = ("reference_002", "reference_003", "reference_004", "reference_005", "reference_006")
@@ -94,6 +98,36 @@ def test_the_report_says_what_is_in_the_map(walk):
     assert "4 of 5" in smaller and "reference_004.png: It has " in smaller
 
 
+def test_a_distance_to_an_image_that_is_not_in_the_map_leaves_the_units_unknown(walk):
+    """The work is done by then, so that the map is written all the same, and says why."""
+    _, _, made, *_ = walk
+    name, other = sorted(made.written.poses)[:2]
+    less = replace(made.made, poses={key: pose for key, pose in made.made.poses.items() if key != name})
+    scale = scale_of(less, made.level, Measured(distance=(name, other, 5.9)))
+    assert scale.source == "" and f"'{name}' did not get into the map" in scale.why_unknown
+    assert scale_of(made.made, made.level, Measured(distance=(name, other, 5.9))).metres_per_unit > 0.0
+
+
+def test_the_calibration_beside_the_photographs_is_taken(tmp_path, rng):
+    for name in ("a.png", "b.png"):
+        picture(tmp_path / name, 400, 300, rng)
+    lens = {"model": "kannala_brandt", "width": 640, "height": 480, "fx": 90.0, "fy": 90.0, "cx": 200.0, "cy": 150.0}
+    for name, size in (("a.toml", (640, 480)), ("b.toml", (400, 300))):
+        rows = {**lens, "width": size[0], "height": size[1], "distortion": [0.0, 0.0, 0.0, 0.0]}
+        words = (f'{key} = "{value}"' if isinstance(value, str) else f"{key} = {value}" for key, value in rows.items())
+        (tmp_path / name).write_text("[camera]\n" + "\n".join(words))
+    (tmp_path / "notes.json").write_text("{}")
+    found = photographs(tmp_path, None)
+    assert found.views[0].camera.model == "kannala_brandt" and "b.toml" in found.remarks[0]
+
+
+def test_a_job_tells_what_went_wrong_in_a_line(tmp_path, rng, capsys):
+    picture(tmp_path / "a.png", 400, 300, rng)
+    assert map_job.main(tmp_path, tmp_path / "map") == 1
+    (said,) = map(json.loads, capsys.readouterr().out.splitlines())
+    assert "--camera FILE" in said["error"]
+
+
 def _less(written, name):
     poses = {key: value for key, value in written.poses.items() if key != name}
     return type(written)(written.scene, written.new_scene, poses, written.points, written.error_px)
@@ -171,7 +205,7 @@ def test_images_that_lean_against_the_map_are_told(walk):
     turned = dict(made.written.poses)
     name = sorted(turned)[2]
     turned[name] = np.column_stack([so3_exp(np.array([0.1, 0.0, 0.0])) @ turned[name][:, :3], turned[name][:, 3]])
-    level = level_of(turned, found.views)
+    level = level_of(turned, gravity_by_lines(found.views, lambda *what: None))
     assert list(level.leaning) == [name] and level.leaning[name] == pytest.approx(np.degrees(0.1), abs=1.0)
 
 

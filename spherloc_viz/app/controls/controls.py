@@ -180,7 +180,7 @@ class Controls:
         self.review = ReviewCard(gui, owner.redraw)
         tabs = gui.add_tab_group()
         with tabs.add_tab("Play"):
-            self._build_play(gui)
+            self._build_play(gui, touches)
         with tabs.add_tab("Compare"):
             gui.add_html(heading_html("Several estimators on this problem", "estimator"))
             self.compare = ComparePanel(gui, touches, owner.use_estimator, owner.redraw, owner.prepare_estimator)
@@ -203,7 +203,7 @@ class Controls:
         gui.main_panel.dock_right()
         gui.main_panel.set_width(width_px)
 
-    def _build_play(self, gui: viser.GuiApi) -> None:
+    def _build_play(self, gui: viser.GuiApi, touches: Touches) -> None:
         gui.add_html(heading_html("Drag a slider: it is solved anew meanwhile", "estimator"))
         self._preset = gui.add_dropdown(
             "Preset", preset_names(self._presets, False), hint="Each of them shows one thing."
@@ -215,7 +215,7 @@ class Controls:
         self._movable.on_update(self._owner.redraw)
         self._edits = gui.add_html("", visible=False)
         self.estimator = EstimatorControls(gui, self._owner.changed)
-        self.sequence = SequencePanel(gui, self._chosen_sequence, self._localized)
+        self.sequence = SequencePanel(gui, touches, self._chosen_sequence, self._localized, self._open_query)
         self.display = DisplayControls(gui, self._owner.redraw)
 
     @property
@@ -275,7 +275,7 @@ class Controls:
         return trajectory_items(rows, run.trace.problem.aligned.map_turn, scene.thresholds[-1][1])
 
     def _show_scene(self, label: str) -> None:
-        self.sequence.show(self._catalog.map_scene(label))
+        self.sequence.show(label, self._catalog.map_scene(label))
         self._movable.visible = self._catalog.synthetic(label) is not None
 
     def _follow_preset(self, request: RunRequest, hidden: bool) -> None:
@@ -331,6 +331,11 @@ class Controls:
             raise InputError("this scene has no query images; choose one that has.")
         self._sequence = request
         return request.scene, scene, *self.estimator.read(), request.seed
+
+    def _open_query(self, name: str) -> None:
+        """Go on with another query of the scene at hand."""
+        request = self.scene.read_unchanged()
+        self._owner.open(RunRequest(replace(request, query=name), *self.estimator.read()))
 
     def _localized(self, trace: Trace | None) -> None:
         """One more query of a sequence is done."""

@@ -13,7 +13,9 @@ from spherloc.experiments.results import QueryResult
 from spherloc.experiments.sequence import localize
 from spherloc.experiments.summary import success_rates
 from spherloc.trace import Trace
+from spherloc_viz.app.controls.query_strip import QueryStrip
 from spherloc_viz.app.text import ramp_html, status_html, table_html
+from spherloc_viz.app.web.touch import Touches
 from spherloc_viz.layers.primitives import Table
 from spherloc_viz.style import error_scale
 
@@ -26,30 +28,53 @@ class SequencePanel:
     def __init__(
         self,
         gui: viser.GuiApi,
+        touches: Touches,
         chosen: Callable[[], tuple[str, MapScene, str, Any, int]],
         done: Callable[[Trace | None], None],
+        open_query: Callable[[str], None],
     ) -> None:
         """``chosen`` tells the scene's label, the scene, estimator, options and seed; ``done`` is called for every
-        query with its run, if it came so far."""
+        query with its run, if it came so far; ``open_query`` shows the query of that name."""
         self._chosen, self._done = chosen, done
         self._folder = gui.add_folder("Sequence", visible=False)
         with self._folder:
             self._button = gui.add_button(START)
             self._bar = gui.add_progress_bar(0.0, visible=False)
             self._text = gui.add_html("")
+            self._pictures = gui.add_html("")
         self._button.on_click(self._press)
         self._lock = threading.Lock()
         self._stop: threading.Event | None = None
         self._label, self._rows = "", ()
+        self._shown: tuple[str, MapScene | None] = ("", None)
+        self._hidden = False
+        self._strip = QueryStrip(touches, self._show_pictures, open_query, self._complain)
 
-    def show(self, scene: MapScene | None) -> None:
-        """Show the panel for scenes with queries, and hide it for others."""
+    def show(self, label: str, scene: MapScene | None) -> None:
+        """Show the panel for a scene with queries, and hide it for others."""
         self._folder.visible = scene is not None
+        self._shown = label, scene
+        self._follow()
 
     def hide_answers(self, hidden: bool) -> None:
         """Say nothing of how it went, or say it again."""
         if self._text.visible == hidden:
             self._text.visible = not hidden
+        if self._hidden != hidden:
+            self._hidden = hidden
+            self._follow()
+
+    def _follow(self) -> None:
+        """The strip shows the scene at hand, and what became of its queries."""
+        label, scene = self._shown
+        self._strip.set(scene, self.rows(label), self._hidden)
+
+    def _show_pictures(self, html: str) -> None:
+        if self._pictures.content != html:
+            self._pictures.content = html
+
+    def _complain(self, sentence: str) -> None:
+        self._text.content = status_html(sentence, wrong=True)
 
     def rows(self, label: str) -> tuple[QueryResult, ...]:
         """Results by now, in the order of the sequence; none if the last sequence was of another scene."""
@@ -58,6 +83,7 @@ class SequencePanel:
 
     def close(self) -> None:
         """End after the query at hand; does not wait."""
+        self._strip.close()
         with self._lock:
             if self._stop is not None:
                 self._stop.set()
@@ -83,6 +109,7 @@ class SequencePanel:
                     rows = self._rows
                 self._bar.value = 100.0 * len(rows) / len(scene.queries)
                 self._text.content = sequence_html(rows, scene)
+                self._follow()
                 self._done(trace)
                 if stop.is_set():
                     break

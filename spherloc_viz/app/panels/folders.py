@@ -8,6 +8,7 @@ from typing import Literal
 
 from spherloc.datasets.scene_file import read_table
 from spherloc.errors import InputError
+from spherloc.files import IMAGES
 
 PAGE = 12
 """Rows that are shown at once."""
@@ -45,6 +46,8 @@ class Listing:
     pages: int
     remarks: tuple[str, ...]
     """What is not shown and why, in sentences."""
+    photographs: int
+    """Image files in it."""
 
 
 class Roots:
@@ -88,19 +91,20 @@ class Roots:
         """
         folder = self.find(place)
         try:
-            entries, remarks = self._entries(folder)
+            entries, remarks, photographs = self._entries(folder)
         except OSError as error:
             reason = error.strerror or error
             raise InputError(f"the folder {folder.name} cannot be read ({reason}); choose another.") from None
         pages = max(1, -(-len(entries) // PAGE))
         page = min(max(page, 0), pages - 1)
         rows = tuple(describe(path, own) for path, own in entries[PAGE * page : PAGE * (page + 1)])
-        return Listing(folder, self.place(folder) or "", self.place(folder.parent), rows, page, pages, remarks)
+        above = self.place(folder.parent)
+        return Listing(folder, self.place(folder) or "", above, rows, page, pages, remarks, photographs)
 
-    def _entries(self, folder: Path) -> tuple[list[tuple[Path, str]], tuple[str, ...]]:
-        """Folders, then TOML files, by name, each with its place; and what was left out."""
+    def _entries(self, folder: Path) -> tuple[list[tuple[Path, str]], tuple[str, ...], int]:
+        """Folders, then TOML files, by name, each with its place; what was left out; and how many are images."""
         found: list[tuple[bool, str, Path, str]] = []
-        hidden = outside = 0
+        hidden = outside = photographs = 0
         whole = True
         with os.scandir(folder) as scan:
             for count, entry in enumerate(scan):
@@ -108,6 +112,7 @@ class Roots:
                     whole = False
                     break
                 is_folder = _is_folder(entry)
+                photographs += not is_folder and Path(entry.name).suffix.lower() in IMAGES
                 if not (is_folder or entry.name.lower().endswith(".toml")):
                     continue
                 if entry.name.startswith("."):
@@ -120,7 +125,8 @@ class Roots:
                 else:
                     found.append((not is_folder, entry.name, folder / entry.name, place))
         found.sort(key=lambda item: (item[0], item[1].casefold(), item[1]))
-        return [(path, place) for _, _, path, place in found], tuple(_remarks(hidden, outside, whole))
+        remarks = tuple(_remarks(hidden, outside, whole))
+        return [(path, place) for _, _, path, place in found], remarks, photographs
 
 
 def _remarks(hidden: int, outside: int, whole: bool) -> Iterator[str]:

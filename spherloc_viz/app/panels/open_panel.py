@@ -12,13 +12,19 @@ import viser
 from spherloc.datasets import Scene, bundled_scenes, load_scene
 from spherloc.disk_cache import cache_folder, store
 from spherloc.errors import InputError
+from spherloc.mapping.photographs import MIN_IMAGES
 from spherloc_viz.app.panels.folders import Listing, Roots, Row, describe
+from spherloc_viz.app.panels.map_panel import OUTPUT, MapPanel
 from spherloc_viz.app.panels.uploads import MAX_BYTES, MAX_CALIBRATION_BYTES, File, Form, Scratch, open_upload
 from spherloc_viz.app.text import DIM, box, status_html
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.web.viser_internals import limit_uploads, update_widget
 from spherloc_viz.app.workers import BackgroundWorker
 
+MAP_ABOUT = (
+    "Panoramas twice as wide as high, or images of one camera with its calibration beside them. It takes some minutes, "
+    "and opens when it is done."
+)
 RULE = "border-top:1px solid rgba(128,140,160,.22)"
 
 
@@ -43,6 +49,9 @@ def _folder_html(listing: Listing) -> str:
     """Folder by folder; first the way up, last the other pages."""
     above = "open-folder:" if listing.parent is None else f"open-folder:0:{listing.parent}"
     rows = [_row_html(above, "↑ up" if listing.parent else "↑ all folders", "")]
+    if listing.photographs >= MIN_IMAGES:
+        title = f"Make a map of these {listing.photographs:,} photographs"
+        rows.append(_row_html(f"map-folder:{listing.place}", title, MAP_ABOUT))
     for row in listing.rows:
         if row.kind == "folder":
             rows.append(_row_html(f"open-folder:0:{row.place}", f"{row.name}/", ""))
@@ -156,6 +165,7 @@ class OpenPanel:
         self._files: dict[str, File] = {}
         self._bundled: list[Row] = []
         self._status = gui.add_html("", visible=False)
+        self._map = MapPanel(gui, lambda path: self._background.ask(lambda: self._open_file(path)))
         with gui.add_folder("Upload matches", expand_by_default=False):
             self._build_form(gui)
         self._list = gui.add_html("")
@@ -163,10 +173,12 @@ class OpenPanel:
         limit_uploads(client, MAX_BYTES, self._complain)
         touches.on("open-scene", lambda touch: self._background.ask(lambda: self._open(touch.argument)))
         touches.on("open-folder", self._walk)
+        touches.on("map-folder", lambda touch: self._background.ask(lambda: self._make_map(touch.argument)))
         self._background.ask(self._refresh)
 
     def close(self) -> None:
         """Forget what was uploaded; does not wait for what is being opened."""
+        self._map.close()
         self._background.close()
         self._scratch.close()
 
@@ -225,8 +237,18 @@ class OpenPanel:
         self._open_scene(Opened(UPLOADED + form.matches.title, path, scene))
         self._say("")
 
+    def _make_map(self, place: str) -> None:
+        """Beside the folder, where the command would make it, or in it if what is beside it is not allowed."""
+        folder = self._roots.find(place)
+        if not folder.is_dir():
+            raise InputError("this is no folder; choose one from the list.")
+        above = folder if self._roots.place(folder.parent) is None else folder.parent
+        self._map.start(folder, above / f"{folder.name}{OUTPUT}")
+
     def _open(self, place: str) -> None:
-        path = self._roots.find(place)
+        self._open_file(self._roots.find(place))
+
+    def _open_file(self, path: Path) -> None:
         self._say(f"Opening {path.name} …")
         scene = load_scene(path)
         self._open_scene(Opened(scene.name, path, scene))

@@ -1,0 +1,180 @@
+"""Images that COLMAP left out, placed in its map by an estimator of this project that knows where down is.
+
+An image needs no checked pair for that: its matches with all images of the map are taken together, wrong ones with
+them. A pose is believed by the rule of ``spherloc.outcome`` - no chance, no other pose about as good, fixed well
+enough - and if the images next to it in the map do not hardly match it.
+"""
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import count
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spherloc.errors import ProblemError
+from spherloc.estimators import default_options, estimate
+from spherloc.frontend.view import Gravity, View
+from spherloc.geometry import DOWN
+from spherloc.mapping.reconstruction import NEARBY, Reconstruction, contradictions
+from spherloc.mapping.upright import Level, Tell, arbitrary_scale
+from spherloc.outcome import Outcome, judge
+from spherloc.problem import Problem
+from spherloc.registry import require
+from spherloc.types import FloatArray
+
+ESTIMATOR = "auto"
+MIN_INLIERS = 12
+UNKNOWN_BOUND_RAD = float(np.radians(5.0))
+"""Of gravity in an image without vertical lines, taken for level."""
+MAX_ROUNDS = 4
+"""What is placed adds points, by which others can be placed."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Placed:
+    """One image's pose in the model's frame, and what is seen of the map in it."""
+
+    cam_from_model: FloatArray
+    """(3, 4)."""
+    features: NDArray[np.int64]
+    """(K,) inliers by number in the image."""
+    points: NDArray[np.int64]
+    """(K,) ids of their points."""
+
+
+def place_rest(
+    made: Reconstruction,
+    views: Sequence[View],
+    elsewhere: Collection[str],
+    gravity: Mapping[str, Gravity],
+    level: Level,
+    tell: Tell,
+) -> Reconstruction:
+    """The map with those left-out images whose pose is believed, but for those ``elsewhere``.
+
+    ``gravity`` is what lines tell, by name.
+    """
+    names = [view.name for view in views]
+    for round_number in count(1):
+        left = [view for view in views if view.name not in made.poses and view.name not in elsewhere]
+        placed: dict[str, _Placed] = {}
+        unit = arbitrary_scale(made.poses).metres_per_unit
+        for done, view in enumerate(left, start=1):
+            one = _place(made, view, gravity.get(view.name), level, unit)
+            if one is not None and _undoubted(made, names, view.name, one):
+                placed[view.name] = one
+            tell(f"left-out images tried, round {round_number}", done, len(left))
+        if not placed:
+            return made
+        made = _with(made, placed, names)
+        if round_number == MAX_ROUNDS:
+            return made
+    raise AssertionError  # count has no end
+
+
+def _place(made: Reconstruction, view: View, gravity: Gravity | None, level: Level, unit: float) -> _Placed | None:
+    """The pose of a left-out image, if it is believed."""
+    pycolmap = require("pycolmap", "colmap", "making a map")
+    number = made.ids[view.name]
+    found = [np.empty((0, 2), np.int64)]
+    with pycolmap.Database.open(str(made.database)) as database:
+        keypoints = np.asarray(database.read_keypoints(number), np.float64)[:, :2]
+        for name in made.poses:
+            other = made.model.image(made.ids[name])
+            if not database.exists_matches(number, other.image_id):
+                continue
+            pairs = np.asarray(database.read_matches(number, other.image_id), np.int64).reshape(-1, 2)
+            point_of = np.array([point.point3D_id if point.has_point3D() else -1 for point in other.points2D], np.int64)
+            points = point_of[pairs[:, 1]]
+            found.append(np.column_stack([pairs[:, 0], points])[points >= 0])
+    pairs = np.unique(np.concatenate(found), axis=0)
+    if len(pairs) < MIN_INLIERS:
+        return None
+    pixels = keypoints[pairs[:, 0]]
+    points = np.array([made.model.point3D(int(index)).xyz for index in pairs[:, 1]])
+    bound_rad = UNKNOWN_BOUND_RAD if gravity is None or gravity.bound_rad is None else gravity.bound_rad
+    try:
+        problem = Problem(
+            name=view.name,
+            camera=view.camera,
+            pixels=pixels,
+            points=points * unit,
+            gravity_camera=DOWN if gravity is None else gravity.down,
+            gravity_map=level.down,
+            gravity_bound_rad=bound_rad + float(np.radians(level.spread_deg)),
+            metric=False,
+        )
+    except ProblemError:
+        return None  # none of its features can be seen
+    trace = estimate(problem, ESTIMATOR, default_options(ESTIMATOR, problem), 0)
+    if trace.cam_from_map is None or judge(trace).outcome != Outcome.LOCALIZED:
+        return None
+    inliers = np.flatnonzero(trace.inlier_mask)
+    _, first = np.unique(pairs[inliers, 0], return_index=True)  # a feature has one point
+    inliers = inliers[first]
+    if len(inliers) < MIN_INLIERS:
+        return None
+    pose = trace.cam_from_map
+    return _Placed(np.column_stack([pose[:, :3], pose[:, 3] / unit]), pairs[inliers, 0], pairs[inliers, 1])
+
+
+def _undoubted(made: Reconstruction, names: Sequence[str], name: str, placed: _Placed) -> bool:
+    """Whether some of the images next to it match it: at a place that only looks alike, hardly any do."""
+    poses = {**made.poses, name: placed.cam_from_model}
+    against = [pair for pair in contradictions(poses, names, made.all_matches) if pair[0] == name]
+    return len(against) < NEARBY
+
+
+def _with(made: Reconstruction, placed: Mapping[str, _Placed], names: Sequence[str]) -> Reconstruction:
+    """The map with more images, triangulated and adjusted anew."""
+    pycolmap = require("pycolmap", "colmap", "making a map")
+    model = made.model
+    for name, one in placed.items():
+        frame_id = _image_in(pycolmap, made, made.ids[name])
+        model.frame(frame_id).rig_from_world = pycolmap.Rigid3d(one.cam_from_model)
+        model.register_frame(frame_id)
+        for feature, point in zip(one.features.tolist(), one.points.tolist(), strict=True):
+            model.add_observation(point, pycolmap.TrackElement(made.ids[name], feature))
+    with TemporaryDirectory() as folder:
+        options = pycolmap.IncrementalPipelineOptions()
+        options.num_threads, options.random_seed = 1, 0
+        options.triangulation.ignore_two_view_tracks = False
+        model = pycolmap.triangulate_points(
+            model, str(made.database), folder, folder, clear_points=False, options=options, refine_intrinsics=False
+        )
+    adjusted(pycolmap, model)
+    poses = {
+        image.name: np.asarray(image.cam_from_world().matrix())
+        for image in (model.image(number) for number in model.reg_image_ids())
+    }
+    against = contradictions(poses, names, made.all_matches)
+    return replace(made, model=model, poses=poses, contradictions=against)
+
+
+def _image_in(pycolmap: Any, made: Reconstruction, number: int) -> int:
+    """Id of an image's frame in the model, which COLMAP leaves out if no checked pair has the image."""
+    model = made.model
+    if model.exists_image(number):
+        return int(model.image(number).frame_id)
+    with pycolmap.Database.open(str(made.database)) as database:
+        known = database.read_image(number)
+        keypoints = np.asarray(database.read_keypoints(number), np.float64)[:, :2]
+        frame = database.read_frame(known.frame_id)
+    image = pycolmap.Image(name=known.name, keypoints=keypoints, camera_id=known.camera_id, image_id=number)
+    image.frame_id = known.frame_id
+    if not model.exists_frame(known.frame_id):
+        model.add_frame(frame)
+    model.add_image(image)
+    return int(known.frame_id)
+
+
+def adjusted(pycolmap: Any, model: Any) -> None:
+    """Bundle adjustment of poses and points; the camera stays as it is."""
+    options = pycolmap.BundleAdjustmentOptions()
+    options.refine_focal_length = options.refine_extra_params = options.print_summary = False
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
+    options.ceres.solver_options.num_threads = 1
+    pycolmap.bundle_adjustment(model, options)

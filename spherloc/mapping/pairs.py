@@ -1,0 +1,195 @@
+"""Which matches of two images of one camera fit two poses, and whether that can be chance.
+
+Bearings are compared, whatever the lens. COLMAP's estimator needs one right match of five or six; where gravity is
+known in both images, samples of three find poses among far fewer. What is found is believed if it is no chance (a
+contrario, Moisan and Stival 2004): of many wrong matches, more than fifteen may fit some pose. Then matches that were
+in doubt join, where they fit the pose too.
+"""
+
+from collections.abc import Mapping, Sequence
+from math import pi, tau
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spherloc.cameras.base import Camera
+from spherloc.cameras.equirectangular import Equirectangular
+from spherloc.frontend.feature_kinds import Descriptors
+from spherloc.frontend.features import Features
+from spherloc.frontend.matching import MatchOptions, match
+from spherloc.frontend.view import Gravity
+from spherloc.geometry import DOWN, rotation_angle
+from spherloc.mapping.guided import guided_matches
+from spherloc.mapping.level_pairs import chance_of_fit, fitting, level_pair, log10_nfa
+from spherloc.mapping.rotations import OFF_RAD
+from spherloc.mapping.triangles import MIN_FIT, Pair, Relative, elsewhere, through
+from spherloc.types import FloatArray
+
+MIN_MATCHES = 15
+"""Of a pair of images, after all checks."""
+BOUND_RAD = float(np.radians(0.5))
+"""Of a match to its epipolar plane; in pixels it is kept within ``BOUND_PX``."""
+BOUND_PX = 1.5, 6.0
+ONE_PLACE_RAD = float(np.radians(0.5))
+"""Rays of a match that differ by less: two images from one place, which tell nothing of depth."""
+RATIO = 0.8
+"""Of the distances to the nearest and the second nearest descriptor."""
+LEVEL_BOUND_RAD = float(np.radians(1.2))
+"""Of a match to its epipolar plane where both images are taken for level: gravity is known to a degree or less."""
+PEAK = 1.7
+"""So many times more matches than elsewhere must be near the planes of a direction that a third image gave."""
+LEAN_RAD = float(np.radians(1.5))
+"""By so much, besides the bounds on gravity, down may differ between two images by the pose that their matches fit."""
+MAX_LOG10_NFA = -1.0
+"""Poses that as many of the matches would fit by chance, as a power of ten."""
+
+
+class Pairs:
+    """The images of one camera, two of which are compared at a time, in any thread."""
+
+    def __init__(
+        self,
+        pycolmap: Any,
+        camera: Camera,
+        features: Sequence[Features],
+        usable: Sequence[NDArray[np.int64]],
+        gravity: Sequence[Gravity | None],
+    ) -> None:
+        """``usable`` (K,) are the features of each image that COLMAP may have, ``gravity`` what its lines tell."""
+        self._pycolmap = pycolmap
+        self._features = features
+        height = round(pi * focal_px(camera))
+        sphere = Equirectangular(2 * height, height)
+        bound_px = float(np.clip(BOUND_RAD * sphere.width / tau, *BOUND_PX))
+        self._bound_rad = bound_px * tau / sphere.width
+        self._options = pycolmap.TwoViewGeometryOptions()
+        self._options.min_num_inliers = MIN_MATCHES
+        self._options.ransac.max_error = bound_px
+        self._options.ransac.random_seed = 0
+        self._options.compute_relative_pose = True
+        self._panorama = pycolmap.Camera(
+            model="EQUIRECTANGULAR", width=sphere.width, height=sphere.height, params=[sphere.width, sphere.height]
+        )
+        self._bearings = [camera.unproject(one.pixels[index])[0] for one, index in zip(features, usable, strict=True)]
+        self._pixels = [sphere.project(rays)[0] for rays in self._bearings]
+        self._words = [_unit(one.descriptors[index]) for one, index in zip(features, usable, strict=True)]
+        self._gravity = gravity
+        self._number_of = [np.full(len(found), -1) for found in features]
+        for numbers, index in zip(self._number_of, usable, strict=True):
+            numbers[index] = np.arange(len(index))
+
+    def compare(self, first: int, second: int) -> tuple[NDArray[np.uint32], Any]:
+        """Matches (M, 2) by number of usable feature, and a ``TwoViewGeometry`` of those that fit, or None."""
+        found = match(self._features[first], self._features[second], MatchOptions(ratio=RATIO))
+        pairs = np.column_stack(
+            [self._number_of[first][found.query_index], self._number_of[second][found.reference_index]]
+        )
+        kept = (pairs >= 0).all(axis=1)
+        pairs = pairs[kept][np.argsort(found.ratios[kept], kind="stable")].astype(np.uint32)
+        geometry = self._geometry(first, second, pairs)
+        return pairs, None if geometry is None else self._guided(first, second, geometry)
+
+    def between(self, pair: Pair, pairs: NDArray[np.uint32], known: Mapping[Pair, Relative], middles: list[int]) -> Any:
+        """A ``TwoViewGeometry`` of matches (M, 2) that have a pose by way of the images ``middles``, or None."""
+        if len(pairs) < MIN_FIT:
+            return None
+        first, second = pair
+        rays = self._bearings[first][pairs[:, 0]], self._bearings[second][pairs[:, 1]]
+        pose = through(known, pair, middles, rays, self._bound_rad)
+        if pose is None:
+            return None
+        words = self._words[first], self._words[second]
+        rays = self._bearings[first], self._bearings[second]
+        more = guided_matches(rays, words, *pose, self._bound_rad)
+        if len(more) < MIN_MATCHES:
+            return None
+        # Floors and wallpaper have as many matches whichever way the second camera stands.
+        for other in elsewhere(pose):
+            if PEAK * len(guided_matches(rays, words, pose[0], other, self._bound_rad)) > len(more):
+                return None
+        geometry = self._estimated(first, second, more)
+        if not self._usable(geometry) or self.same_place(geometry) or not self._level(first, second, geometry):
+            return None
+        off = rotation_angle(relative(geometry)[0] @ pose[0].T)
+        return geometry if off <= OFF_RAD else None
+
+    def _geometry(self, first: int, second: int, pairs: NDArray[np.uint32]) -> Any:
+        if len(pairs) < MIN_MATCHES:
+            return None
+        rays = self._bearings[first][pairs[:, 0]], self._bearings[second][pairs[:, 1]]
+        level = level_pair(*rays, (self._down(first), self._down(second)), LEVEL_BOUND_RAD)
+        found = [self._estimated(first, second, pairs)]
+        if level is not None and np.count_nonzero(level.fits) >= MIN_MATCHES:
+            found.append(self._estimated(first, second, pairs[level.fits]))
+        found = [one for one in found if self._usable(one) and self._level(first, second, one)]
+        geometry = max(found, key=lambda one: len(one.inlier_matches), default=None)
+        return geometry if geometry is not None and self._no_chance(geometry, *rays) else None
+
+    def _down(self, index: int) -> FloatArray:
+        gravity = self._gravity[index]
+        return DOWN if gravity is None else gravity.down
+
+    def _level(self, first: int, second: int, geometry: Any) -> bool:
+        """Whether down in one image is down in the other, where lines tell it in both."""
+        one, other = self._gravity[first], self._gravity[second]
+        if one is None or other is None:
+            return True
+        bound_rad = LEAN_RAD + (one.bound_rad or 0.0) + (other.bound_rad or 0.0)
+        return bool(relative(geometry)[0] @ one.down @ other.down >= np.cos(bound_rad))
+
+    def _estimated(self, first: int, second: int, pairs: NDArray[np.uint32]) -> Any:
+        return self._pycolmap.estimate_calibrated_two_view_geometry(
+            self._panorama, self._pixels[first], self._panorama, self._pixels[second], pairs, self._options
+        )
+
+    def _usable(self, geometry: Any) -> bool:
+        kinds = self._pycolmap.TwoViewGeometryConfiguration
+        if geometry.config == kinds.PLANAR:
+            return geometry.tri_angle < ONE_PLACE_RAD
+        return geometry.config in (kinds.CALIBRATED, kinds.PANORAMIC)
+
+    def _no_chance(self, geometry: Any, first: FloatArray, second: FloatArray) -> bool:
+        """Whether bearings (M, 3) of matches would hardly fit any pose so well if all were wrong."""
+        if self.same_place(geometry):
+            return True
+        pose = relative(geometry)
+        fits = fitting(first, second, *pose, self._bound_rad)
+        chance = chance_of_fit(first, second, *pose, self._bound_rad)
+        return log10_nfa(len(first), int(np.count_nonzero(fits)), chance) <= MAX_LOG10_NFA
+
+    def _guided(self, first: int, second: int, geometry: Any) -> Any:
+        """The same with the matches that are found near the epipolar planes, if they are more."""
+        if self.same_place(geometry):
+            return geometry
+        rays = self._bearings[first], self._bearings[second]
+        words = self._words[first], self._words[second]
+        pairs = guided_matches(rays, words, *relative(geometry), self._bound_rad)
+        if len(pairs) <= len(geometry.inlier_matches):
+            return geometry
+        other = self._estimated(first, second, pairs)
+        right = self._usable(other) and not self.same_place(other) and self._level(first, second, other)
+        return other if right and len(other.inlier_matches) > len(geometry.inlier_matches) else geometry
+
+    def same_place(self, geometry: Any) -> bool:
+        """Whether the two images were taken from one place."""
+        return geometry.config != self._pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+
+
+def _unit(descriptors: Descriptors) -> NDArray[np.float32]:
+    """(N, D) of length 1."""
+    words = descriptors.astype(np.float32)
+    return words / np.maximum(np.linalg.norm(words, axis=1, keepdims=True), np.float32(1e-9))
+
+
+def relative(geometry: Any) -> Relative:
+    """Rotation (3, 3) and unit direction (3,) of the second camera from the first."""
+    matrix = np.asarray(geometry.cam2_from_cam1.matrix())
+    return matrix[:, :3], matrix[:, 3] / max(float(np.linalg.norm(matrix[:, 3])), 1e-12)
+
+
+def focal_px(camera: Camera) -> float:
+    """Pixels a radian in the middle of the image."""
+    ahead = np.array([[0.0, 0.0, 1.0], [1e-3, 0.0, 1.0]])
+    pixels, _ = camera.project(ahead)
+    return float(np.linalg.norm(pixels[1] - pixels[0]) / 1e-3)

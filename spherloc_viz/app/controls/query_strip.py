@@ -1,0 +1,214 @@
+"""The queries of a scene as a strip of thumbnails, coloured by what became of them; pressed, a query is shown.
+
+A page of the strip is shown at a time, so that thousands of queries cost no more than some dozens.
+"""
+
+import base64
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Mapping, Sequence
+from html import escape
+
+import cv2
+
+from spherloc.datasets.map_scene import MapScene
+from spherloc.errors import InputError
+from spherloc.experiments.results import DOUBTFUL, FAILED, LOCALIZED, UNREADABLE, QueryResult
+from spherloc.files import is_file
+from spherloc.frontend.view import View
+from spherloc_viz import style
+from spherloc_viz.app.text import DIM, box
+from spherloc_viz.app.web.touch import Touch, Touches
+from spherloc_viz.app.workers import BackgroundWorker
+
+PAGE = 24
+"""Queries that are shown at once."""
+HEIGHT_PX, MAX_WIDTH_PX = 52, 104
+"""Of a thumbnail."""
+KEPT = 400
+"""Thumbnails that are remembered."""
+WAITING = "waiting"
+MARKS = {
+    LOCALIZED: ("✓", style.INLIER),
+    DOUBTFUL: ("?", style.UNDECIDED),
+    FAILED: ("✕", style.OUTLIER),
+    UNREADABLE: ("✕", style.OUTLIER),
+}
+"""Of what became of a query: a sign and a colour."""
+WORST_FIRST = {FAILED: 0, UNREADABLE: 1, DOUBTFUL: 2, LOCALIZED: 3, WAITING: 4}
+ORDERS = {"order": "in order", "outcome": "by outcome", "error": "by error", "inliers": "by inliers"}
+"""Keys of the strip's order, and their words."""
+
+
+class QueryStrip:
+    """One page's. ``set`` and presses only note what is wanted; a thread of its own reads images."""
+
+    def __init__(
+        self,
+        touches: Touches,
+        show: Callable[[str], None],
+        open_query: Callable[[str], None],
+        failed: Callable[[str], None],
+    ) -> None:
+        """``show`` is given the HTML, on the strip's thread, ``open_query`` the name of a query that is pressed, and
+        ``failed`` a sentence if the strip cannot be drawn."""
+        self._show, self._open = show, open_query
+        self._lock = threading.Lock()
+        self._scene: MapScene | None = None
+        self._rows: Mapping[str, QueryResult] = {}
+        self._order, self._page, self._hidden = "order", 0, False
+        self._pictures: OrderedDict[tuple[int, str], str] = OrderedDict()
+        self._worker = BackgroundWorker("spherloc-strip", failed)
+        touches.on("strip-order", self._sort)
+        touches.on("strip-page", self._turn)
+        touches.on("strip-open", self._press)
+
+    def close(self) -> None:
+        """End it after the image at hand; does not wait."""
+        self._worker.close()
+
+    def set(self, scene: MapScene | None, rows: Sequence[QueryResult], hidden: bool) -> None:
+        """Show the queries of a scene and what became of them by now; ``hidden`` tells no answers."""
+        with self._lock:
+            if scene is not self._scene:
+                self._page = 0
+            self._scene, self._hidden = scene, hidden
+            self._rows = {row.query: row for row in rows}
+        self._worker.ask(self._draw)
+
+    def _sort(self, touch: Touch) -> None:
+        if touch.argument in ORDERS:
+            with self._lock:
+                self._order, self._page = touch.argument, 0
+            self._worker.ask(self._draw)
+
+    def _turn(self, touch: Touch) -> None:
+        if touch.argument.isascii() and touch.argument.isdigit() and len(touch.argument) < 6:
+            with self._lock:
+                self._page = int(touch.argument)
+            self._worker.ask(self._draw)
+
+    def _press(self, touch: Touch) -> None:
+        with self._lock:
+            scene = self._scene
+        if scene is not None and any(view.name == touch.argument for view in scene.queries):
+            self._open(touch.argument)
+
+    def _draw(self) -> None:
+        with self._lock:
+            scene, rows, order = self._scene, self._rows, self._order
+            hidden, page = self._hidden, self._page
+        if scene is None:
+            self._show("")
+            return
+        known = {} if hidden else rows
+        views = ordered(scene.queries, known, order)
+        page = min(page, (len(views) - 1) // PAGE)
+        shown = views[page * PAGE : (page + 1) * PAGE]
+        pictures = {view.name: self._picture(scene, view) for view in shown}
+        self._show(strip_html(shown, pictures, known, order, page, len(views), "m" if scene.metric else "units"))
+
+    def _picture(self, scene: MapScene, view: View) -> str:
+        """Address of the view's thumbnail; empty if there is none yet."""
+        key = id(scene), view.name
+        if key not in self._pictures:
+            address = thumbnail(view)
+            if not address:
+                return ""
+            self._pictures[key] = address
+            if len(self._pictures) > KEPT:
+                self._pictures.popitem(last=False)
+        return self._pictures[key]
+
+
+def thumbnail(view: View) -> str:
+    """Address of a small JPEG; empty if the file is not there or cannot be read."""
+    if not is_file(view.path):
+        return ""
+    try:
+        pixels = view.read()
+    except InputError:
+        return ""
+    scale = min(HEIGHT_PX / pixels.shape[0], MAX_WIDTH_PX / pixels.shape[1])
+    small = cv2.resize(pixels, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    done, content = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 75])
+    return f"data:image/jpeg;base64,{base64.b64encode(content.tobytes()).decode('ascii')}" if done else ""
+
+
+def ordered(queries: Sequence[View], rows: Mapping[str, QueryResult], order: str) -> list[View]:
+    """The queries as a key of ``ORDERS`` says: what went wrong first, and last what is not done yet."""
+
+    def key(view: View) -> float:
+        row = rows.get(view.name)
+        if order == "outcome":
+            return WORST_FIRST[WAITING if row is None else row.status]
+        value = None if row is None else row.translation_error_m if order == "error" else row.inliers
+        if value is None:
+            return float("inf")
+        return -value if order == "error" else value
+
+    return list(queries) if order == "order" else sorted(queries, key=key)
+
+
+def strip_html(
+    shown: Sequence[View],
+    pictures: Mapping[str, str],
+    rows: Mapping[str, QueryResult],
+    order: str,
+    page: int,
+    count: int,
+    unit: str,
+) -> str:
+    """A page of the strip, and what sorts and turns it."""
+    sorting = " · ".join(
+        f"<b>{words}</b>" if key == order else _pressed(f"strip-order:{key}", words) for key, words in ORDERS.items()
+    )
+    pages = (count - 1) // PAGE + 1
+    turns = ((page - 1, "‹ before"), (page + 1, "after ›"))
+    links = " ".join(_pressed(f"strip-page:{to}", words) for to, words in turns if 0 <= to < pages)
+    turning = f'<div style="padding:.25em 0">page {page + 1} of {pages} {links}</div>' if pages > 1 else ""
+    cells = "".join(_cell(view, pictures[view.name], rows.get(view.name), unit) for view in shown)
+    return box(
+        f'<div style="{DIM};padding-bottom:.25em">Queries {sorting}</div>'
+        f'<div style="display:flex;flex-wrap:wrap;gap:4px" role="list" aria-label="Queries">{cells}</div>{turning}',
+        "font-size:12px",
+    )
+
+
+def _pressed(action: str, words: str) -> str:
+    return f'<u role="button" tabindex="0" data-touch="{action}" style="cursor:pointer">{words}</u>'
+
+
+def _cell(view: View, picture: str, row: QueryResult | None, unit: str) -> str:
+    mark, border = "", "1px dashed rgba(128,140,160,.6)"
+    if row is not None:
+        sign, color = MARKS[row.status]
+        border = f"3px solid {style.css(color)}"
+        mark = (
+            f'<span aria-hidden="true" style="position:absolute;right:0;bottom:0;padding:0 .3em;color:#fff;'
+            f'background:rgba(20,24,32,.75);font-weight:700">{sign}</span>'
+        )
+    said = said_of(view.name, row, unit)
+    image = (
+        f'<img alt="" src="{picture}" style="display:block;height:{HEIGHT_PX}px">'
+        if picture
+        else f'<div style="width:{HEIGHT_PX}px;height:{HEIGHT_PX}px;background:rgba(128,140,160,.2)"></div>'
+    )
+    return (
+        f'<div role="listitem"><div role="button" tabindex="0" data-touch="strip-open:{escape(view.name)}" '
+        f'title="{escape(said)}" aria-label="{escape(said)}" '
+        f'style="position:relative;border:{border};border-radius:4px;cursor:pointer;overflow:hidden">{image}{mark}'
+        "</div></div>"
+    )
+
+
+def said_of(name: str, row: QueryResult | None, unit: str) -> str:
+    """A query's name and what became of it, in a line."""
+    if row is None:
+        return name
+    parts = [f"{name}: {row.status}"]
+    if row.inliers is not None and row.matches:
+        parts.append(f"{row.inliers} of {row.matches} matches")
+    if row.translation_error_m is not None and row.rotation_error_deg is not None:
+        parts.append(f"{row.translation_error_m:.2g} {unit}, {row.rotation_error_deg:.2g}° off")
+    return ", ".join(parts)

@@ -1,0 +1,87 @@
+"""The map through a query's lens: what is seen where, what hides what, and the strip of queries."""
+
+import cv2
+import numpy as np
+
+from spherloc.cameras.equirectangular import Equirectangular
+from spherloc.cameras.kannala_brandt import KannalaBrandt
+from spherloc.experiments.results import QueryResult
+from spherloc.frontend.view import View
+from spherloc.geometry import pose
+from spherloc_viz.app.controls.query_strip import ordered, strip_html, thumbnail
+from spherloc_viz.layers.lens_view import through_lens
+
+LENS = KannalaBrandt(320, 320, 110.0, 110.0, 160.0, 160.0, (0.0, 0.0, 0.0, 0.0))
+AT_ORIGIN = pose(np.eye(3), np.zeros(3))
+
+
+def reference(path, color, depth_m, centre=(0.0, 0.0, 0.0)):
+    """A one-coloured panorama whose pixels are all that far away."""
+    camera = Equirectangular(256, 128)
+    assert cv2.imwrite(str(path), np.full((128, 256, 3), color[::-1], np.uint8))
+
+    def lift(pixels):
+        bearings, seen = camera.unproject(pixels)
+        return depth_m * bearings + np.array(centre), seen
+
+    return View(path.name, camera, path, AT_ORIGIN, lift=lift)
+
+
+def test_near_things_hide_far_ones(tmp_path):
+    near, far = (200, 30, 30), (30, 30, 200)
+    views = [reference(tmp_path / "far.png", far, 9.0), reference(tmp_path / "near.png", near, 2.0)]
+    for order in (views, views[::-1]):
+        picture, covered = through_lens(LENS, AT_ORIGIN, order)
+        assert picture.shape == (320, 320, 4) and covered > 0.95
+        assert np.abs(picture[40:280, 40:280, :3].astype(int) - near).max() < 12
+
+
+def test_a_thing_is_seen_where_the_lens_puts_it(tmp_path):
+    """A red spot ahead and to the right, from a camera that moved and turned."""
+    camera = Equirectangular(512, 256)
+    image = np.zeros((256, 512, 3), np.uint8)
+    cv2.circle(image, (300, 110), 4, (0, 0, 255), -1)
+    cv2.imwrite(str(tmp_path / "spot.png"), image)
+
+    def lift(pixels):
+        bearings, seen = camera.unproject(pixels)
+        return 5.0 * bearings, seen
+
+    view = View("spot.png", camera, tmp_path / "spot.png", AT_ORIGIN, lift=lift)
+    turn = np.array([[np.cos(0.3), 0.0, np.sin(0.3)], [0.0, 1.0, 0.0], [-np.sin(0.3), 0.0, np.cos(0.3)]])
+    moved = pose(turn, np.array([0.2, -0.1, 0.4]))
+    picture, _ = through_lens(LENS, moved, [view])
+    spot = 5.0 * camera.unproject(np.array([[300.5, 110.5]]))[0][0]
+    (expected,), _ = LENS.project((turn @ spot + moved[:, 3])[None])
+    rows, columns = np.nonzero(picture[..., 0] > 150)
+    assert np.linalg.norm([columns.mean() + 0.5 - expected[0], rows.mean() + 0.5 - expected[1]]) < 2.0
+
+
+def test_without_points_there_is_no_picture(tmp_path):
+    view = reference(tmp_path / "a.png", (9, 9, 9), 1.0)
+    assert through_lens(LENS, AT_ORIGIN, []) is None
+    assert through_lens(LENS, AT_ORIGIN, [View("a.png", view.camera, view.path, AT_ORIGIN)]) is None
+    (tmp_path / "a.png").unlink()
+    assert through_lens(LENS, AT_ORIGIN, [view]) is None
+
+
+def test_the_strip_is_sorted_turned_and_told(tmp_path):
+    """Fifty queries, of which three are done; names are text and not HTML."""
+    queries = [View(f"<q{number:02d}>", LENS, tmp_path / f"{number}.png") for number in range(50)]
+    rows = {
+        "<q07>": QueryResult(7, "<q07>", "localized", matches=90, inliers=60, translation_error_m=0.1),
+        "<q30>": QueryResult(30, "<q30>", "failed"),
+        "<q11>": QueryResult(11, "<q11>", "doubtful", matches=80, inliers=9, translation_error_m=2.0),
+    }
+    names = [view.name for view in ordered(queries, rows, "outcome")[:4]]
+    assert names == ["<q30>", "<q11>", "<q07>", "<q00>"]
+    assert [view.name for view in ordered(queries, rows, "error")[:2]] == ["<q11>", "<q07>"]
+    assert [view.name for view in ordered(queries, rows, "inliers")[:2]] == ["<q11>", "<q07>"]
+    assert ordered(queries, rows, "order") == queries
+    shown = ordered(queries, rows, "outcome")[:24]
+    html = strip_html(shown, dict.fromkeys(names + [view.name for view in shown], ""), rows, "outcome", 0, 50, "m")
+    assert "page 1 of 3" in html and "strip-page:1" in html and "<q30>" not in html and "&lt;q30&gt;: failed" in html
+    assert html.count("strip-open:") == 24 and "9 of 80 matches" in html
+    assert thumbnail(queries[0]) == ""
+    cv2.imwrite(str(queries[0].path), np.full((320, 320, 3), 90, np.uint8))
+    assert thumbnail(queries[0]).startswith("data:image/jpeg;base64,")
