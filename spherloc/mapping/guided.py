@@ -31,24 +31,20 @@ def guided_matches(
     turned, second = np.ascontiguousarray(rays[0] @ rotation.T), np.ascontiguousarray(rays[1])
     nearest, ratios = np.full(len(turned), -1, np.int64), np.ones(len(turned))
     if len(turned) and len(second):
-        _search(
-            turned,
-            second,
-            *descriptors,
-            np.ascontiguousarray(direction),
-            np.sin(bound_rad),
-            MAX_DISTANCE,
-            nearest,
-            ratios,
-        )
+        limits = float(np.sin(bound_rad)), MAX_DISTANCE
+        _search(turned, second, *descriptors, np.ascontiguousarray(direction), limits, nearest, ratios)
     kept = np.flatnonzero((nearest >= 0) & (ratios <= RATIO))
     kept = kept[np.argsort(ratios[kept], kind="stable")]
     return np.column_stack([kept, nearest[kept]]).astype(np.uint32)
 
 
 @kernel(fastmath=True)
-def _search(turned, second, first_words, second_words, t, sine_bound, most_distance, nearest, ratios):
-    """Write the nearest (N,) of each feature, -1 if there is none, and the ratio (N,) of its distances."""
+def _search(turned, second, first_words, second_words, t, limits, nearest, ratios):
+    """Write the nearest (N,) of each feature, -1 if there is none, and the ratio (N,) of its distances.
+
+    ``turned`` (N, 3) and ``second`` (M, 3) are bearings, ``limits`` the sine of the bound and the largest distance.
+    """
+    sine_bound, most_distance = limits
     count, other, size = len(turned), len(second), first_words.shape[1]
     best_of = np.full(other, np.float32(np.inf))
     first_of = np.full(other, -1)

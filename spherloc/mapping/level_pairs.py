@@ -119,6 +119,7 @@ def _normal(a, c, cosine, sine, out):
 
 @kernel()
 def _determinant(a, c, sample, yaw, normals):
+    """Of the normals (3, 3), which are written, of three matches of level bearings ``a`` and ``c`` (N, 3) at a yaw."""
     cosine, sine = np.cos(yaw), np.sin(yaw)
     for k in range(3):
         _normal(a[sample[k]], c[sample[k]], cosine, sine, normals[k])
@@ -147,12 +148,14 @@ def _fits(r, c, t, sine_bound):
 
 @kernel()
 def _fitting(turned, second, direction, sine_bound, found):
+    """Write to ``found`` (N,) which of the bearings (N, 3) fit."""
     for i in range(len(turned)):
         found[i] = _fits(turned[i], second[i], direction, sine_bound)
 
 
 @kernel()
 def _all_fitting(turned, second, direction, sine_bound):
+    """How many of all pairings of bearings (N, 3) fit."""
     count = 0
     for i in range(len(turned)):
         for j in range(len(second)):
