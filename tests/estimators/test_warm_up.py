@@ -70,7 +70,7 @@ warm_up(lambda sentence: print(sentence, flush=True))"""
     assert said == []
 
 
-@pytest.mark.parametrize("part", ["refinement", "search", "mc-exact, uncertain gravity"])
+@pytest.mark.parametrize("part", ["search", "narrowing", "mc-exact, uncertain gravity"])
 def test_a_part_that_is_compiled_in_a_process_of_its_own(part: str) -> None:
     """It failed in silence, and everything was compiled by one process."""
     done = subprocess.run([sys.executable, "-m", "spherloc.warm_up", part, "0"], capture_output=True, text=True)
