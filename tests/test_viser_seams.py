@@ -9,7 +9,7 @@ import viser
 from viser import _messages
 
 from spherloc_viz.app.web.viser_internals import at_once, guard_callbacks, start_viser, stop_viser
-from tests.connected_page import ConnectedPage
+from tests.connected_page import HELLO, ConnectedPage
 from tests.waiting import until
 
 KEY = "a key of this test"
@@ -106,3 +106,21 @@ def test_what_is_to_be_done_at_once_is_done_on_the_loop_in_order_and_its_failure
     assert len({thread for _, _, thread in heard}) == 1 and str(failures[0]) == "the last"
     field.value = 0
     assert heard[-1] == (None, 0, threading.current_thread().name), "and where Python sets it, right there"
+
+
+def test_where_nobody_can_stand_a_page_does_not_stand(server: viser.ViserServer, pages: list[ConnectedPage]) -> None:
+    """viser keeps whatever a page says, and raises when the viewer is moved from there."""
+    page, camera, nan = pages[0], pages[0].handle.camera, float("nan")
+    for wrong in (
+        {"position": (nan, 0.0, 0.0)},
+        {"look_at": (1e308, 1e308, 1e308), "position": (-1e308, -1e308, -1e308)},
+        {"look_at": HELLO["position"]},
+        {"up_direction": (0.0, 0.0, 0.0)},
+        {"wxyz": (1.0, 0.0)},
+        {"look_at": "ab"},
+    ):
+        page.send(HELLO | wrong)
+    page.send(HELLO | {"fov": 0.5})
+    until(lambda: camera.fov == 0.5)
+    camera.position = (1.0, 2.0, 3.0)
+    assert tuple(camera.look_at) == (1.0, 2.0, 6.0)

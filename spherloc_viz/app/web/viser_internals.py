@@ -19,6 +19,7 @@ import websockets.asyncio.server
 from aiohttp.http_exceptions import HttpProcessingError
 from viser import _messages
 
+from spherloc.types import FloatArray
 from spherloc_viz.app.web.changes import Changes
 
 log = logging.getLogger(__name__)
@@ -350,9 +351,42 @@ def _wake_on_loop(server: viser.ViserServer) -> None:
         request = sockets._live_connections[client.client_id].request
         client.role_header = request.headers.get(ROLE_HEADER, "")
         client.get_message_buffer().message_event = _LoopEvent(loop)
+        _check_views(client)
 
     # Before viser's own callback, from which on messages are queued, and before anybody waits for one.
     sockets._client_connect_cb.insert(0, connected)
+
+
+def _check_views(connection: Any) -> None:
+    """Leave out where a page says that its viewer stands if nobody can stand there: viser would keep it, and raise
+    whenever the viewer is moved."""
+    handle_all = connection._handle_incoming_message
+
+    async def handle(client_id: Any, message: Any) -> None:
+        if type(message) is not _messages.ViewerCameraMessage or _is_view(message):
+            await handle_all(client_id, message)
+
+    connection._handle_incoming_message = handle
+
+
+def _is_view(message: Any) -> bool:
+    try:
+        sizes = _numbers((message.fov, message.near, message.far, message.image_height, message.image_width), 5)
+        wxyz, up = _numbers(message.wxyz, 4), _numbers(message.up_direction, 3)
+        with np.errstate(over="ignore", invalid="ignore"):
+            ahead = _numbers(message.look_at, 3) - _numbers(message.position, 3)
+            lengths = [np.linalg.norm(one) for one in (wxyz, up, ahead)]
+    except ValueError:
+        return False
+    return bool(np.isfinite([*sizes, *lengths]).all() and min(lengths) > 0.0)
+
+
+def _numbers(values: Any, count: int) -> FloatArray:
+    """What a page sent as so many numbers; raises ``ValueError`` if it is anything else."""
+    numbers = np.asarray(values)
+    if numbers.dtype.kind not in "iuf" or numbers.shape != (count,):
+        raise ValueError(f"not {count} numbers")
+    return numbers.astype(np.float64)
 
 
 MAX_AT_ONCE = 2
