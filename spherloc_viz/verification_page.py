@@ -58,6 +58,7 @@ need no browser; `spherloc play` lists what they recorded.
 | [Table VI](table6.md) | its three problems, over 100 seeds each |
 | [Tables](tables.md) | Tables I to VI as printed, what the text says of them, and your copies of the datasets |
 | [Baselines](baselines.md) | the compared methods with wide views, sampling of their own and under equal terms |
+| [Precision](precision.md) | each baseline's solver beside OpenCV, PoseLib and what its authors print |
 | [Choice](choice.md) | which framework when (Sec. VI-C), and where no method can know |
 | [Applications](applications.md) | MC that initialises and 2P that tracks, vehicle poses, Figs. 8 to 10 |
 | [Numbers](numbers.md) | every number of the paper, and where it is |
