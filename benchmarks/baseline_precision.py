@@ -1,8 +1,8 @@
 """Precision of each baseline's solver beside implementations that are not ours.
 
-``python -m benchmarks.baseline_precision`` writes docs/verification/precision.md. No outliers and no RANSAC: only what the solvers make of N noisy matches. On the
-image plane the setting is that of the PnP literature (a 640 x 480 image, focal length 800 px, points in a box ahead);
-on the sphere bearings point anywhere, with the same noise as an angle.
+``python -m benchmarks.baseline_precision`` writes docs/verification/precision.md. No outliers and no RANSAC: only what
+the solvers make of N noisy matches. On the image plane the setting is that of the PnP literature (a 640 x 480 image,
+focal length 800 px, points in a box ahead); on the sphere bearings point anywhere, with the same noise as an angle.
 """
 
 from collections.abc import Callable, Mapping

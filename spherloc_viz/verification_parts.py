@@ -170,7 +170,9 @@ def _rates(measured: Measured, key: str, title: str, words: str = "", times: boo
     if not names:
         return ""
     columns = [f"{100 * value:g} %" for value in values]
-    lines = [f"{title}\n", *([words + "\n"] if words else [])]
+    counts = sorted({cell.runs for name in names for cell in measured.curve(key, PAPERS_CAMERA, name)})
+    done = f"{counts[0]}" + (f" to {counts[-1]}" if counts[1:] else "")
+    lines = [f"{title}\n", *([words + "\n"] if words else []), f"{done} problems at each point.\n"]
     lines.append("| outliers | " + " | ".join(columns) + " |")
     lines.append("|---|" + "---|" * len(values))
     for name in names:

@@ -18,6 +18,7 @@ from spherloc.experiments.sweep_rows import SweepRow, point_of
 from spherloc_viz.layers.sweep import LIMIT, sweep_charts, sweep_colors, sweep_table
 from spherloc_viz.plots import sweep_png
 from spherloc_viz.sweep import parse_entrant, sweep
+from spherloc_viz.sweep_map import sweep_two
 from tests.tiny_scene import write_tiny_scene
 from tests.waiting import LIMIT_S
 
@@ -35,6 +36,29 @@ def scene(tmp_path: Path) -> Path:
 
 def lines(path: Path) -> int:
     return path.read_bytes().count(b"\n") if path.exists() else 0
+
+
+def test_two_properties_give_a_row_a_point_and_a_map(scene: Path, tmp_path: Path) -> None:
+    """Each point is that of the sweep over one property with the other one set; impossible pairs are a sentence."""
+    how = {"settings": [], "runs": 2, "seed": 5, "workers": 1, "scheduler": None}
+    out = tmp_path / "two.csv"
+    names = ["ransac-2p,iterations=50"]
+    sweep_two(
+        scene, "outlier_rate", ["0.3", "0.6"], names, by="correspondences", by_values=["12", "24"], out=out, **how
+    )
+    with out.open(newline="") as file:
+        table = list(csv.DictReader(file))
+    points = [(row["correspondences"], row["outlier_rate"]) for row in table]
+    assert points == [("12.0", "0.3"), ("12.0", "0.6"), ("24.0", "0.3"), ("24.0", "0.6")]
+    alone = sweep(
+        scene, "outlier_rate", ["0.3", "0.6"], names, out=tmp_path / "one.csv",
+        **(how | {"settings": ["correspondences=24"]}),
+    )  # fmt: skip
+    assert [int(row["successes"]) for row in table[2:]] == [point.successes for point in alone]
+    picture = cv2.imread(str(out.with_suffix(".png")))
+    assert picture is not None and picture.shape[1] > picture.shape[0]
+    with pytest.raises(InputError, match="a sweep over outlier_rate cannot go by 'outlier_rate' too"):
+        sweep_two(scene, "outlier_rate", ["0.3"], names, by="outlier_rate", by_values=["1"], out=out, **how)
 
 
 def test_ctrl_c_keeps_what_is_done_and_the_same_command_goes_on(scene: Path, tmp_path: Path) -> None:
