@@ -30,6 +30,9 @@ SHARES = (None, 0.2, 0.1, 0.05)
 MIN_RIGHT = 6
 """Right matches that every problem keeps."""
 SUCCESS_DEG, SUCCESS_M = 1.0, 0.1
+HEADER = (
+    "| problems | method | right | median deg | median cm | median ms | proven, largest gap |\n|---" + "|---" * 6 + "|"
+)
 
 
 @dataclass(frozen=True)
@@ -113,8 +116,7 @@ def main() -> None:
     warm_up()
     known = our_methods() | peers()
     methods = [known[name] for name in given.method or METHODS]
-    print("| problems | method | right | median deg | median cm | median ms | proven, largest gap |")
-    print("|---|---|---|---|---|---|---|")
+    print(HEADER)
     for folder in given.set or FOLDERS:
         problems = real_problems(given.data / folder)
         if not problems:

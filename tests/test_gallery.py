@@ -76,7 +76,8 @@ def test_every_number_of_a_story_is_accounted_for(key):
 
 def test_the_gallery_holds_what_it_should():
     assert set(KEYS) >= ASKED_FOR and len(KEYS) >= 14
-    assert {case.cause for case in gallery_cases()} == set(Cause) - {Cause.OK, Cause.UNKNOWN}
+    # A sparse map shows in pictures that are matched anew: ``test_pipeline`` has it.
+    assert {case.cause for case in gallery_cases()} == set(Cause) - {Cause.OK, Cause.UNKNOWN, Cause.MAP_TOO_SPARSE}
     # A reason is shown by taking it away; of pictures nothing can be taken away.
     cured = [any(item.succeeds for item in case.beside) for case in gallery_cases()]
     assert all(cured[k] or case.query for k, case in enumerate(gallery_cases()))

@@ -20,6 +20,8 @@ MIN_RIGHT_RATE = 0.04
 the reference is wrong. Without the truth nothing else tells the two apart."""
 SPREAD = 1.5
 """The bound is too small if twice of it holds as many times as many matches: noise of 0.75 times the bound does so."""
+CHANCE_SDS = 2.0
+"""No match is right if near the true pose there are as many as chance puts there, give or take so many deviations."""
 TILT_SDS = 4.0
 """Gravity is off if the matches tilt it beyond what the run believes by as many standard deviations..."""
 MIN_TILT_IN_BOUNDS = 1.0
@@ -61,10 +63,14 @@ def without_truth(e: Evidence) -> Cause:
     believed = stands_out(e, best)
     if believed and undetermined(e.rotation_sd_rad, e.position_sd_m):
         return Cause.DEGENERATE
-    if e.free is not None and e.nfa(int(e.found(WIDER)), WIDER, fixed_by=3) < MAX_NFA:
+    wide = e.free is not None and e.nfa(int(e.found(WIDER)), WIDER, fixed_by=3) < MAX_NFA
+    tilt_rad = 0.0
+    if e.tilted is not None and e.tilted.support(e.bound_px) >= max(MIN_SUPPORT, AS_GOOD * best):
+        tilt_rad = e.tilted.tilt_rad
+    if (believed or wide) and tilts(e, tilt_rad, TILT_SDS * e.tilted_sd_rad):
+        return Cause.GRAVITY_OFF
+    if e.free is not None and wide:
         free = e.free.support(e.bound_px)
-        if free >= max(MIN_SUPPORT, AS_GOOD * best) and tilts(e, e.free.tilt_rad, TILT_SDS * e.free_tilt_sd_rad):
-            return Cause.GRAVITY_OFF
         if e.found(2.0) >= SPREAD * max(1, free, best):
             return Cause.BOUND_TOO_SMALL
     if not believed and map_is_sparse(e, best):
@@ -83,11 +89,12 @@ def without_truth(e: Evidence) -> Cause:
 def with_truth(e: Evidence, t: Truth) -> Cause:
     """The cause, given the true pose and which matches are right."""
     right = int(np.count_nonzero(t.right))
-    if not stands_out(e, right) and map_is_sparse(e, right):
+    many = stands_out(e, right, t.within)
+    if not many and map_is_sparse(e, right):
         return Cause.MAP_TOO_SPARSE
-    if right < 2:
+    if right < 2 or right <= t.by_chance + CHANCE_SDS * np.sqrt(t.by_chance):
         return Cause.WRONG_REFERENCE
-    if not stands_out(e, right):
+    if not many:
         return Cause.TOO_FEW_INLIERS
     if undetermined(t.rotation_sd_rad, t.position_sd_m):
         return Cause.DEGENERATE
@@ -109,9 +116,9 @@ def with_truth(e: Evidence, t: Truth) -> Cause:
     return Cause.DEGENERATE if undetermined(e.rotation_sd_rad, e.position_sd_m) else Cause.UNKNOWN
 
 
-def stands_out(e: Evidence, size: int) -> bool:
-    """Whether a consensus of that size is more than chance gives."""
-    return size >= MIN_SUPPORT and e.nfa(size) < MAX_NFA
+def stands_out(e: Evidence, size: int, wider: float = 1.0) -> bool:
+    """Whether a consensus of that size, within ``wider`` times the noise bound, is more than chance gives."""
+    return size >= MIN_SUPPORT and e.nfa(size, wider) < MAX_NFA
 
 
 def map_is_sparse(e: Evidence, right: int) -> bool:

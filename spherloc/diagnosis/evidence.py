@@ -192,7 +192,9 @@ class Evidence:
     believed_rad: float
     """How far gravity may be off by what the run was told: its bound, or less if the refinement believes it more."""
     chance_rate: float
-    """Probability that a wrong pose explains one correspondence."""
+    """Probability that a wrong pose with the given gravity explains one correspondence, within its bound too."""
+    free_chance_rate: float
+    """The same for a pose with its own gravity, within the noise bound alone."""
     run: Fit | None
     """The run's own pose."""
     best: Fit | None
@@ -203,6 +205,10 @@ class Evidence:
     """The pose with the most support within a wider bound and without belief in gravity."""
     free_tilt_sd_rad: float
     """Standard deviation of its tilt."""
+    tilted: Fit | None
+    """The one of ``best`` and ``free`` with more support: what tells the tilt of gravity."""
+    tilted_sd_rad: float
+    """Standard deviation of its tilt, where gravity is not believed."""
     rotation_sd_rad: float
     """Standard deviation of the best pose's rotation, though the matches that it hangs on most be wrong."""
     position_sd_m: float
@@ -213,10 +219,15 @@ class Evidence:
     def nfa(self, size: int, wider: float = 1.0, fixed_by: int = 2) -> float:
         """Expected number of false alarms (NFA) of that size within ``wider`` times the bound.
 
-        ``fixed_by`` correspondences fix a pose: 2, or 3 where gravity is free.
+        ``fixed_by`` correspondences fix a pose: 2, or 3 where gravity is free. Where gravity is uncertain, sets of
+        poses with the given one are no more than those of poses with any.
         """
-        rate = min(1.0, self.chance_rate * wider**2)
-        return nfa(len(self.aligned.points), size, rate) * rate ** (2 - fixed_by)
+        free = min(1.0, self.free_chance_rate * wider**2)
+        any_gravity = nfa(len(self.aligned.points), size, free) / free if size > 3 else np.inf
+        if fixed_by == 3:
+            return any_gravity
+        given = nfa(len(self.aligned.points), size, min(1.0, self.chance_rate * wider**2))
+        return min(given, any_gravity) if self.aligned.gravity_bound_rad > 0.0 else given
 
     def alternatives_own(self) -> int:
         """Correspondences that the alternative explains and the best pose does not."""
@@ -230,7 +241,7 @@ class Evidence:
         """Support of the free pose within ``factor`` times the bound, less what is there by chance."""
         if self.free is None:
             return 0.0
-        return self.free.support(factor * self.bound_px) - len(self.aligned.points) * self.chance_rate * factor**2
+        return self.free.support(factor * self.bound_px) - len(self.aligned.points) * self.free_chance_rate * factor**2
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,6 +260,10 @@ class Truth:
     """Standard deviation of a position from all right matches."""
     rotation_sd_rad: float
     """The same of a rotation."""
+    within: float
+    """Noise bounds within which matches are called right; 1 where that is from labels."""
+    by_chance: float
+    """How many matches ``right`` holds by chance: none where it is from labels."""
 
 
 def gather(trace: Trace) -> Evidence:
@@ -266,16 +281,23 @@ def gather(trace: Trace) -> Evidence:
         second = max(others, key=lambda fit: fit.support(bound_px), default=None)
         sd = _sd(aligned, best, bound_px, options)
     free = free_fit(aligned, [fit.cam_from_map for fit in fits[:2]], bound_px)
+    tilted = max((fit for fit in (free, best) if fit), key=lambda fit: fit.support(bound_px), default=None)
+    known = replace(aligned, gravity_bound_rad=0.0)
     return Evidence(
         aligned=aligned,
         bound_px=bound_px,
         believed_rad=min(aligned.gravity_bound_rad, BELIEVED_SDS * gravity_sd_rad(aligned, options)),
         chance_rate=chance_rate(aligned.bearings, bounds.radians),
+        free_chance_rate=chance_rate(aligned.bearings, bounds_of(known, bound_px).radians),
         run=run,
         best=best,
         alternative=second,
         free=free,
-        free_tilt_sd_rad=np.inf if free is None else _free_tilt_sd(aligned, free, bound_px),
+        free_tilt_sd_rad=np.inf if free is None else _free_tilt_sd(aligned, free, WIDER * bound_px),
+        tilted=tilted,
+        tilted_sd_rad=np.inf
+        if tilted is None
+        else _free_tilt_sd(aligned, tilted, (WIDER if tilted is free else 1.0) * bound_px),
         rotation_sd_rad=sd[0],
         position_sd_m=sd[1],
         verified_without_point=trace.problem.verified_without_point,
@@ -309,7 +331,7 @@ def _sd(aligned: AlignedProblem, best: Fit, bound_px: float, options: Refinement
 
 
 def _free_tilt_sd(aligned: AlignedProblem, free: Fit, bound_px: float) -> float:
-    mask = free.errors_px <= WIDER * bound_px
+    mask = free.errors_px <= bound_px
     if np.count_nonzero(mask) < 4:
         return np.inf
     noise_px = float(np.sqrt(np.mean(np.square(free.errors_px[mask])) / 2.0))
@@ -335,7 +357,10 @@ def gather_truth(trace: Trace, bound_px: float) -> Truth | None:
     fit = fit_of(aligned, true)
     if not different(near.cam_from_map, true) and near.support(bound_px) > fit.support(bound_px):
         fit = near
-    right = fit.errors_px <= WIDER * bound_px if labels is None else labels
+    within = WIDER if labels is None else 1.0
+    right = fit.errors_px <= within * bound_px if labels is None else labels
+    rate = chance_rate(aligned.bearings, bounds_of(free, bound_px).radians)
+    by_chance = len(aligned.points) * min(1.0, rate * within**2) if labels is None else 0.0
     rotation_sd, position_sd = np.inf, np.inf
     if np.count_nonzero(right) >= 2:
         gravity_sd = gravity_sd_rad(aligned, options)
@@ -343,4 +368,4 @@ def gather_truth(trace: Trace, bound_px: float) -> Truth | None:
     success = evaluate(trace).success
     if success is None:
         success = trace.cam_from_map is not None and not different(aligned.align_pose(trace.cam_from_map), true)
-    return Truth(success, right, fit, fit_of(aligned, true).tilt_rad, position_sd, rotation_sd)
+    return Truth(success, right, fit, fit_of(aligned, true).tilt_rad, position_sd, rotation_sd, within, by_chance)

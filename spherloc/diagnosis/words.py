@@ -61,7 +61,7 @@ def _other(e: Evidence, truth: Truth | None, cause: Cause) -> Fit | None:
     elif cause in (Cause.ITERATIONS_RAN_OUT, Cause.SEARCH_MISSED):
         candidates = [e.best]
     elif cause in (Cause.GRAVITY_OFF, Cause.BOUND_TOO_SMALL):
-        return e.free
+        return e.tilted if cause is Cause.GRAVITY_OFF else e.free
     else:
         return None
     for fit in candidates:
@@ -105,7 +105,7 @@ def _measured_summary(e: Evidence, truth: Truth | None, cause: Cause, unit: str)
         source = e if truth is None else truth
         fixed = f"{_distance(source.position_sd_m, unit)} and {_deg(source.rotation_sd_rad)}"
         return f"Many matches agree, but they fix the pose to no better than {fixed} (1 sd)."
-    fit = e.free if truth is None else truth.fit
+    fit = truth.fit if truth is not None else e.tilted if cause is Cause.GRAVITY_OFF else e.free
     if fit is None:
         raise ValueError(f"{cause} was found without a pose to show it")
     if cause is Cause.GRAVITY_OFF:
