@@ -7,11 +7,12 @@ import pytest
 from recording_samples import scene_problem
 
 from spherloc.estimators import estimate
-from spherloc.geometry import camera_centre
+from spherloc.geometry import camera_centre, yaw_rotation
 from spherloc.registry import names
 from spherloc.trace import Trace
 from spherloc.types import FloatArray
 from spherloc_viz.app.stage import views
+from spherloc_viz.app.stage.painter import LABEL_SCALE
 from spherloc_viz.layers import paint, steps
 from spherloc_viz.layers.primitives import Balls, Label, Picture, Points, Segments
 
@@ -36,6 +37,8 @@ ABOUT: tuple[tuple[str, tuple[str, ...], float], ...] = (
     (r"sample-\d+-pose", ("cameras/estimate",), 0.05),
     (r"refinement-error", ("uncertainty/ellipsoid", "uncertainty/angle"), 0.4),
 )  # fmt: skip
+LETTER = 2.0 * views.LETTER_PX * LABEL_SCALE / 768
+"""Width of a letter on a page of 1366 x 768, by half its height."""
 BALL_SHARE = 0.04
 """A ball that can be read covers this share of the canvas' height."""
 
@@ -106,6 +109,13 @@ def test_balls_are_large_enough_to_be_seen(aspect: float) -> None:
         assert seen.any() and np.median(heights[seen]) >= BALL_SHARE, f"{heading.key}: {np.median(heights[seen]):.3f}"
         if (size := re.fullmatch(r"balls-(\d+)", heading.key)) and int(size[1]) <= 3:
             assert seen.all() and len(seen) == int(size[1])
+            for turn in (0.0, 1.0, 2.0, 3.0):  # whole balls, from whichever side
+                toward = yaw_rotation(turn) @ np.array([0.5, -0.6, 0.5])
+                place, target = views._fits(picture.focus.points, toward[None], aspect)
+                depth = (place[0] - shown.centers) @ (place[0] - target[0]) / np.linalg.norm(place[0] - target[0])
+                over = on_screen(views.View(place[0], target[0]), shown.centers, aspect)[:, 1]
+                reach = shown.radii_m / depth / np.tan(views.FIELD_OF_VIEW_RAD / 2)
+                assert np.all(np.abs(over) + reach < 1.15), heading.key
 
 
 def test_steps_about_one_thing_are_seen_from_one_side(trace: Trace) -> None:
@@ -134,8 +144,9 @@ def test_new_things_are_named_in_the_canvas_where_they_first_appear() -> None:
                 if word in label.text:
                     named.setdefault(word, heading.key)
             if label.name.endswith("/name"):
-                place = on_screen(views.follow(picture, ASPECTS[0]), label.position[None], ASPECTS[0])
-                assert is_on(place).all(), f"{heading.key}: {label.text}"
+                view = views.follow(picture, ASPECTS[0], letter=LETTER)
+                assert label.name not in views.cut(picture, view, ASPECTS[0], LETTER), f"{heading.key}: {label.text}"
+                assert is_on(on_screen(view, picture.focus.points, ASPECTS[0])).all()
     assert named == {
         "unit sphere": "bearings", "yaw ring": "unknowns", "arc:": "yaw-pair", "ball:": "balls-pair",
         "edge": "balls-3", "clique": "yaw-clique",

@@ -55,7 +55,8 @@ class Canvas:
         self._label_scale = LABEL_SCALE * text_scale(client.camera.image_width)
         self._painter = Painter(client, picked, self._label_scale)
         self._camera = TrueCamera(client, moved)
-        self._docked_px, self._full_width = docked_px, client.camera.image_width
+        self._full_width = client.camera.image_width
+        self._docked_px = docked_px if self._full_width >= NARROW_PX else 0
         self._step: tuple[str, str] | None = None
         self._followed: views.View | None = None
         """The view that showed the subject of the last step that moved the viewer."""
@@ -275,6 +276,8 @@ def text_scale(window_px: int) -> float:
     return next(scale for least, _, scale in WINDOWS_PX if window_px >= least)
 
 
+NARROW_PX = 600
+"""A narrower window has no panels beside its canvas (``captions.js``)."""
 WINDOWS_PX: tuple[tuple[int, tuple[int, int], float], ...] = (
     (3400, (860, 780), 2.0),
     (2500, (650, 585), 1.5),
