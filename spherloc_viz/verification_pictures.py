@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import PathCollection
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
@@ -190,7 +191,7 @@ def _panel(
     turn: FloatArray,
     limit_m: float,
     colors: LinearSegmentedColormap,
-) -> object:
+) -> PathCollection | None:
     """Draw one method; returns what the colours are of, None if there is no pose."""
     places = (results.positions_m @ turn.T)[:, [0, 2]]
     errors = np.linalg.norm(results.positions_m - results.true_positions_m, axis=1)
