@@ -80,7 +80,7 @@
 
   function write(numbers) {
     for (const place of now.querySelectorAll("[data-number]"))
-      place.textContent = numbers[place.dataset.number] ?? "no number";
+      place.textContent = numbers[place.dataset.number] ?? "–";
     document.body.classList.remove("waiting", "opening");
     report(numbers);
   }
