@@ -30,7 +30,7 @@ TABLES_HEAD = """\
 As printed in the paper; below each of those on real images, what your copy of the dataset gives by the same methods, by
 one command. Numbers of iterations: 2P100, SVD100, ML100 and all R+* of Tables II to V draw 100 samples, 2P1k 1,000; in
 Table VI 2P10k, SVD10k, ML10k and R+* draw 10,000; MC draws none. That one command fills these tables is shown by
-[rendered copies of the three datasets](applications.md#tables-ii-to-v-on-rendered-copies).
+[rendered copies of the three datasets](applications.md).
 """
 
 
