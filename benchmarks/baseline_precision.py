@@ -7,6 +7,7 @@ focal length 800 px, points in a box ahead); on the sphere bearings point anywhe
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -38,10 +39,16 @@ def _first(solver: object) -> Solve:
     return solve
 
 
+def _pose(turn: Any, shift: Any) -> FloatArray:
+    """From OpenCV's rotation vector and translation."""
+    rotation, translation = (np.asarray(array, dtype=np.float64) for array in (cv2.Rodrigues(turn)[0], shift))
+    return pose(rotation, translation.ravel())
+
+
 def _opencv(flag: int) -> Solve:
     def solve(bearings: FloatArray, points: FloatArray, truth: FloatArray) -> FloatArray | None:
         good, turn, shift = cv2.solvePnP(points, image_plane(bearings), np.eye(3), None, flags=flag)
-        return pose(np.asarray(cv2.Rodrigues(turn)[0]), np.asarray(shift).ravel()) if good else None
+        return _pose(turn, shift) if good else None
 
     return solve
 
@@ -54,8 +61,8 @@ def _opencv_best(bearings: FloatArray, points: FloatArray, truth: FloatArray) ->
     turn, shift = cv2.solvePnPRefineLM(
         points - middle, image_plane(bearings), np.eye(3), None, cv2.Rodrigues(truth[:, :3])[0], shift, criteria
     )
-    rotation = np.asarray(cv2.Rodrigues(turn)[0])
-    return pose(rotation, np.asarray(shift).ravel() - rotation @ middle)
+    found = _pose(turn, shift)
+    return pose(found[:, :3], found[:, 3] - found[:, :3] @ middle)
 
 
 def _poselib(bearings: FloatArray, points: FloatArray, truth: FloatArray) -> FloatArray | None:

@@ -8,7 +8,9 @@ exact layouts of KITTI-360, Newer College and Matterport360, written by the help
 
 import sys
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -54,8 +56,7 @@ def main() -> None:
 
 def kitti360(root: Path) -> Path:
     """Drive 5 as the reference; drive 4 under clouds, drive 6 at night."""
-    import kitti360_tree as tree
-
+    tree: Any = import_module("kitti360_tree")
     if root.exists():
         return root
     world = tree.build_world("street")
@@ -75,8 +76,7 @@ def kitti360(root: Path) -> Path:
 
 def newer_college(root: Path, results: Path) -> Path:
     """Walks of quad and math; hard ones sway more. The base of the ground truth stands in the scene files."""
-    import newer_college_tree as tree
-
+    tree: Any = import_module("newer_college_tree")
     if not root.exists():
         rng = np.random.default_rng(3)
         tree.write_calibration(root / "calibration/camchain.yaml")
@@ -111,8 +111,7 @@ def newer_college(root: Path, results: Path) -> Path:
 
 def matterport360(root: Path) -> Path:
     """One building, a sixth of whose panoramas are queries."""
-    import matterport360_tree as tree
-
+    tree: Any = import_module("matterport360_tree")
     if not root.exists():
         tree.write_building(root / "apartment", 12)
     return root
