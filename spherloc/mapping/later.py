@@ -25,7 +25,8 @@ from spherloc.problem import Problem
 from spherloc.registry import require
 from spherloc.types import FloatArray
 
-ESTIMATOR = "auto"
+ESTIMATOR = "ransac-2p"
+"""It is compiled in a third of the time of ``auto``, which whoever makes a first map waits for."""
 MIN_INLIERS = 12
 UNKNOWN_BOUND_RAD = float(np.radians(5.0))
 """Of gravity in an image without vertical lines, taken for level."""

@@ -13,6 +13,7 @@ from spherloc.datasets import bundled_scenes, load_scene
 from spherloc.errors import CalibrationError, InputError
 from spherloc.formats.colmap_files import read_model
 from spherloc.geometry import camera_centre, rotation_angle, so3_exp
+from spherloc.mapping.later import place_rest
 from spherloc.mapping.lens import for_colmap
 from spherloc.mapping.make import Measured, make_map, scale_of
 from spherloc.mapping.photographs import frames_of, photographs
@@ -198,6 +199,28 @@ def test_a_lens_that_colmap_lacks_is_fitted():
     bent = Mei(640, 480, 300.0, 300.0, 320.0, 240.0, 0.5, (0.0, 0.0, 0.05, 0.05))
     with pytest.raises(CalibrationError, match="no camera model mei"):
         for_colmap(bent)
+
+
+def test_an_image_that_was_left_out_is_placed(walk):
+    """Where it was, and from there COLMAP triangulates; one that is said to be elsewhere stays out."""
+    _, found, _, again, *_ = walk
+    made, name, tell = again(), "reference_004.png", lambda *what: None
+    unit = made.written.poses
+    before = unit[name]
+    gravity = gravity_by_lines(found.views, tell)
+    level = level_of(unit, gravity)
+    less = replace(made.made, poses=unit).without([name])  # what was written was levelled and scaled
+    assert place_rest(less, found.views, [name], gravity, level, tell) is less
+    more = place_rest(less, found.views, (), gravity, level, tell)
+    assert sorted(more.poses) == sorted(unit)
+    apart = np.linalg.norm(camera_centre(unit["reference_003.png"]) - camera_centre(unit["reference_005.png"]))
+    names = sorted(unit)
+    centres = [np.stack([camera_centre(poses[one]) for one in names]) for poses in (unit, more.poses)]
+    lengths = [np.linalg.norm(one[:, None] - one[None], axis=2) for one in centres]
+    scale = lengths[1].sum() / lengths[0].sum()
+    assert np.abs(lengths[1] / scale - lengths[0]).max() < 0.02 * apart
+    turn = more.poses[name][:, :3] @ more.poses[names[0]][:, :3].T
+    assert rotation_angle(turn @ unit[names[0]][:, :3] @ before[:, :3].T) < np.radians(0.5)
 
 
 def test_images_that_lean_against_the_map_are_told(walk):
