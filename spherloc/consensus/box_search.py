@@ -25,7 +25,7 @@ from spherloc.small_arrays import copy_vector
 from spherloc.types import FloatArray
 from spherloc.watch import stopped
 
-MOST_BOXES = 1024
+MAX_BOXES = 1024
 """Boxes that wait; the deepest is split first."""
 
 
@@ -33,11 +33,11 @@ class Boxes(NamedTuple):
     """Memory of one search."""
 
     lower: FloatArray
-    """(MOST_BOXES, 6)."""
+    """(MAX_BOXES, 6)."""
     upper: FloatArray
-    """(MOST_BOXES, 6)."""
+    """(MAX_BOXES, 6)."""
     spans: NDArray[np.int64]
-    """(MOST_BOXES, 4): where its matches begin and end in ``lists``, its chart, its bound."""
+    """(MAX_BOXES, 4): where its matches begin and end in ``lists``, its chart, its bound."""
     lists: NDArray[np.int32]
     """Matches that waiting boxes may explain."""
 
@@ -79,9 +79,9 @@ def splits_for(count: int) -> Splits:
 def boxes_for(count: int) -> Boxes:
     """Memory for ``count`` matches."""
     return Boxes(
-        np.empty((MOST_BOXES, 6)),
-        np.empty((MOST_BOXES, 6)),
-        np.empty((MOST_BOXES, 4), np.int64),
+        np.empty((MAX_BOXES, 6)),
+        np.empty((MAX_BOXES, 6)),
+        np.empty((MAX_BOXES, 4), np.int64),
         np.empty(24 * count + 4096, np.int32),
     )
 

@@ -43,14 +43,14 @@ from spherloc.watch import stopped
 
 CURVATURE = 1.1547005383792517
 """2 / sqrt 3, of the remainder in ``pose_cells``."""
-MOST_WAITING = 2048
+MAX_WAITING = 2048
 """Cells that wait to be split; the deepest is split first."""
 CELL_EFFORT = 8
 """Matches whose test takes as long as what a cell needs besides."""
 FORM, F_SUM, G_SUM, ALONG, ACROSS = 16, 12, 13, 14, 15
 """Columns of a linear form: f and g by parameter, 6 each, then tau + F, tau + G, and the residual in the middle along
 and across its direction, px."""
-MOST_FORMS = 4096
+MAX_FORMS = 4096
 """Undecided matches up to which a cell is cut."""
 CUT_BINS = 32
 """Bins over each parameter of a cell in which intervals are counted."""
@@ -71,15 +71,15 @@ class Room(NamedTuple):
     """Memory of one search."""
 
     lower: FloatArray
-    """(MOST_WAITING, 6) lower ends of waiting cells."""
+    """(MAX_WAITING, 6) lower ends of waiting cells."""
     upper: FloatArray
-    """(MOST_WAITING, 6) upper ends."""
+    """(MAX_WAITING, 6) upper ends."""
     spans: NDArray[np.int64]
-    """(MOST_WAITING, 3): where its undecided begin and end in ``lists``, and how many are sure."""
+    """(MAX_WAITING, 3): where its undecided begin and end in ``lists``, and how many are sure."""
     lists: NDArray[np.int32]
     """Undecided matches of waiting cells."""
     forms: FloatArray
-    """(MOST_FORMS or fewer, FORM) linear forms of the undecided of one cell."""
+    """(MAX_FORMS or fewer, FORM) linear forms of the undecided of one cell."""
     steps: NDArray[np.int32]
     """(CUT_BINS + 1,) changes of depth from bin to bin."""
 
@@ -111,11 +111,11 @@ class Limits(NamedTuple):
 def room_for(count: int) -> Room:
     """Memory for ``count`` matches."""
     return Room(
-        np.empty((MOST_WAITING, 6)),
-        np.empty((MOST_WAITING, 6)),
-        np.empty((MOST_WAITING, 3), np.int64),
+        np.empty((MAX_WAITING, 6)),
+        np.empty((MAX_WAITING, 6)),
+        np.empty((MAX_WAITING, 3), np.int64),
         np.empty(16 * count + 4096, np.int32),
-        np.empty((min(count, MOST_FORMS), FORM)),
+        np.empty((min(count, MAX_FORMS), FORM)),
         np.empty(CUT_BINS + 1, np.int32),
     )
 

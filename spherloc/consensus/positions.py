@@ -17,14 +17,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spherloc.consensus.box_search import MOST_BOXES, memory_for, search_boxes
+from spherloc.consensus.box_search import MAX_BOXES, memory_for, search_boxes
 from spherloc.consensus.pose_cells import AXES, TILT_A, YAW, PackedMatches, parameters_of, pose_of, whole_domain
 from spherloc.consensus.pose_search import (
     BEST,
     EFFORT,
     HALT,
     LEFT,
-    MOST_WAITING,
+    MAX_WAITING,
     OPEN,
     SPLITS,
     STATE,
@@ -119,7 +119,7 @@ class _Worker:
 
     def __init__(self, count: int) -> None:
         self.memory = memory_for(count, MAX_SPLITS)
-        most = MOST_BOXES + MOST_WAITING + 64
+        most = MAX_BOXES + MAX_WAITING + 64
         self.left = Left(np.empty((most, AXES)), np.empty((most, AXES)), np.empty((most, 3), np.int64))
         self.state = np.zeros(STATE, np.int64)
         self.best_at = np.zeros(1 + AXES)
