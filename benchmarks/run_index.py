@@ -1,14 +1,19 @@
 """The run index at 10,000 runs: every filter, sort order, page and group beside the same in plain Python.
 
-    python -m benchmarks.run_index [--runs 10000] [--repeats 3]
+    python -m benchmarks.run_index [--runs 10000] [--repeats 3] [--files 10000]
 
 The peer keeps a row a run as JSON, one a line, and reads, filters and sorts them for every question, as a program
 without an index would. Times are processor time of the one thread that asks, medians of the repeats, so that a busy
 machine does not count. Prints the slowest question of every kind and writes ``results/run_index.json``.
+
+With ``--files`` it measures only how fast a list is made from so many files, in wall time and with the start of the
+processes that read them. The files are links to one real recording, which is in the system's memory.
 """
 
 import argparse
 import json
+import os
+import resource
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -20,9 +25,13 @@ from typing import Any
 import numpy as np
 
 from benchmarks.machine import describe
+from spherloc.datasets import bundled_scenes, load_scene
 from spherloc.diagnosis import Cause
+from spherloc.estimators import estimate
+from spherloc_viz.recording.content.writer import write_recording
 from spherloc_viz.recording.index.query import GROUP_KEYS, OUTCOMES, SORT_KEYS, Range, RunQuery
 from spherloc_viz.recording.index.run_index import RunIndex
+from spherloc_viz.recording.reviews import review_path, write_review
 from spherloc_viz.recording.run_row import RunRow
 
 RESULTS = Path(__file__).parent / "results" / "run_index.json"
@@ -108,7 +117,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--runs", type=int, default=10_000)
     parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--files", type=int, default=0)
     arguments = parser.parse_args()
+    if arguments.files:
+        _report_files(_from_files(arguments.files))
+        return
     rng = np.random.default_rng(6)
     rows = [synthetic_row(number, rng) for number in range(arguments.runs)]
     with tempfile.TemporaryDirectory() as folder, RunIndex(Path(folder)) as index:
@@ -121,6 +134,57 @@ def main() -> None:
     _report(results)
     if arguments.runs >= 10_000:
         RESULTS.write_text(json.dumps(_rounded(results), indent=1) + "\n", encoding="utf-8")
+
+
+EXAMINED = 500
+"""Files that are read wholly, which takes fifty times as long."""
+
+
+def _from_files(count: int) -> dict[str, float]:
+    """Files a second that are listed, listed with labels, and examined."""
+    problem = load_scene(bundled_scenes()["mei_outliers_80"]).problem(0)
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place)
+        write_recording(estimate(problem, "mc"), folder / "one.rrd")
+        write_review(folder / "one.rrd", ["wrong map"], "Look again.")
+        for number in range(count):
+            os.link(folder / "one.rrd", folder / f"{number}.rrd")
+            if number % 2:
+                os.link(review_path(folder / "one.rrd"), review_path(folder / f"{number}.rrd"))
+        before, began = _all_processor_s(), time.perf_counter()
+        with RunIndex(folder) as index:
+            listed = index.refresh()
+            listing_s = time.perf_counter() - began
+            assert listed.read == count + 1 and not listed.skipped
+        processor_ms = 1e3 * (_all_processor_s() - before) / count
+        for path in list(folder.iterdir())[: -2 * EXAMINED]:
+            path.unlink()
+        with RunIndex(folder) as index:
+            began = time.perf_counter()
+            examined = index.examine().read
+            examining_s = time.perf_counter() - began
+        return {
+            "files": count,
+            "listed_per_s": count / listing_s,
+            "listing_processor_ms": processor_ms,
+            "examined_per_s": examined / examining_s,
+        }
+
+
+def _all_processor_s() -> float:
+    """Of this process and of those that it started and that have ended."""
+    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(one.ru_utime + one.ru_stime for one in used)
+
+
+def _report_files(found: dict[str, float]) -> None:
+    print(
+        f"{found['files']:,.0f} files, every second one with labels: listed at {found['listed_per_s']:,.0f} a second "
+        f"({found['listing_processor_ms']:.2f} ms of processor time each), "
+        f"examined at {found['examined_per_s']:,.0f} a second"
+    )
+    table = {"machine": describe()} | found
+    RESULTS.with_name("run_index_files.json").write_text(json.dumps(_rounded(table), indent=1) + "\n", encoding="utf-8")
 
 
 def _seconds(work: Callable[[], Any]) -> float:

@@ -18,6 +18,7 @@ from spherloc_viz.recording.index.run_text import counts_text, rows_text
 from spherloc_viz.recording.reviews import Review, checked_review
 from spherloc_viz.recording.run_row import RunRow
 from spherloc_viz.recording.sandbox.examiner import examine, examine_review
+from spherloc_viz.recording.storage.room import GALLERY
 
 SORT_WORDS = {
     "outliers": "outlier_rate",
@@ -33,8 +34,6 @@ TABLE_LIMIT = 50
 SCENES_NAMED = 8
 MANY = 500
 """Recordings whose steps take more than some seconds to be read."""
-GALLERY = "gallery"
-"""A folder of recordings that is listed with the folder that it is in."""
 
 
 def print_runs(folder: Path, query: RunQuery, group: str | None, limit: int | None, form: str) -> int:

@@ -145,7 +145,8 @@ def test_sizes_to_be_kept(tmp_path: Path) -> None:
     assert kept_bytes(math.inf, tmp_path) > 10**18 and kept_bytes(1e300, tmp_path) > 10**18
     # To open a folder that was given more room deletes nothing, unless a size is said.
     assert kept_bytes(None, tmp_path / "missing") == kept_bytes(None, tmp_path) == KEEP_BYTES
-    for name, size in (("a.rrd", 2 * 10**9), ("b.RRD", 10**9), ("video.mp4", 10**9)):
+    (tmp_path / "gallery").mkdir()
+    for name, size in (("a.rrd", 2 * 10**9), ("b.RRD", 9 * 10**8), ("gallery/c.rrd", 10**8), ("video.mp4", 10**9)):
         with (tmp_path / name).open("wb") as file:
             file.truncate(size)  # takes no room
     assert kept_bytes(None, tmp_path) == 3 * 10**9 and kept_bytes(2.0, tmp_path) == KEEP_BYTES

@@ -14,6 +14,7 @@ from rerun.error_utils import RerunWarning
 
 from spherloc.errors import InputError, RecordingError, show
 from spherloc_viz.given_files import REVIEW_SUFFIX, check_recording_file
+from spherloc_viz.recording.content.head import OtherError, properties_of
 from spherloc_viz.recording.content.properties import APPLICATION_ID, REVIEW_ENTITY, REVIEW_PROPERTY, plain
 from spherloc_viz.recording.storage.unfinished import unfinished
 
@@ -32,9 +33,12 @@ def write_file(path: Path, labels: Sequence[str], note: str, run_id: str) -> Non
 
 def read_file(path: Path, most_labels: int) -> tuple[list[str], str]:
     """Labels and note of a file. Raises ``TypeError``, ``ValueError`` and what rerun raises if it is damaged."""
-    found = _reader(path).stream().filter(content=[f"/__properties/{REVIEW_PROPERTY}"]).to_chunks()
-    (batch,) = (chunk.to_record_batch() for chunk in found)
-    batch.validate(full=True)
+    try:
+        batch = properties_of(path)[0][REVIEW_PROPERTY]
+    except (OtherError, KeyError):
+        found = _reader(path).stream().filter(content=[f"/__properties/{REVIEW_PROPERTY}"]).to_chunks()
+        (batch,) = (chunk.to_record_batch() for chunk in found)
+        batch.validate(full=True)
     (note,) = _texts(batch.column("note"), 1)
     return _texts(batch.column("labels"), most_labels), note
 

@@ -6,7 +6,7 @@ const FILTERS = ["outcome", "diagnosis", "estimator", "scene", "source", "labels
 const GROUPED = ["diagnosis", "scene", "estimator", "outcome", "changes", "source", "name"];
 const MAX_CHIPS = 6, ALL_CHIPS = 40, MAX_GROUP_COLUMNS = 6, EXAMPLES = 4, ROW_PX = 34;
 const WIDTHS = {
-  outcome: 80, diagnosis: 150, scene: 140, name: 190, changes: 150, labels: 150, title: 190, created: 110, query: 120, estimator: 92,
+  outcome: 80, diagnosis: 150, scene: 140, name: 190, changes: 150, labels: 150, title: 190, created: 110, query: 120, estimator: 112,
   outlier_rate: 64, rotation_error_deg: 74, translation_error_m: 78, rotation_sd_deg: 74, position_sd_m: 78, certificate_gap: 84,
   time_ms: 62, correspondences: 60, inliers: 60, seed: 56, steps: 56, key_step: 60,
 };
@@ -153,7 +153,7 @@ function drawChips() {
     const more = counted.length > MAX_CHIPS ? [element("button", { className: "chip", title: `More of ${title(name)}`,
       textContent: allChips.has(name) ? "fewer" : `${count(counted.length - MAX_CHIPS)} more …`,
       onclick: () => { if (!allChips.delete(name)) allChips.add(name); soon(); } })] : [];
-    lines.push(element("div", { className: "chips", "data-filter": name }, ...values.map(([value, number]) =>
+    lines.push(element("div", { className: "chips", "data-filter": name }, element("span", { className: "kind", textContent: title(name) }), ...values.map(([value, number]) =>
       chip(short(value), number, now.includes(value), () => toggled(name, value), `${title(name)}: ${value || "none"}`,
         name === "outcome" ? SETTINGS.colors[value] : null)), ...more));
   }
@@ -213,6 +213,7 @@ function drawMatrix() {
         className: "fold", textContent: isOpen ? "▾" : "▸", "aria-expanded": String(isOpen), title: "Show example pictures",
         onclick: () => { if (isOpen) unfolded.delete(value); else unfolded.add(value); soon(); },
       }), element("button", { textContent: value || "none", title: `List only: ${value || "none"}`,
+        style: `max-width:${across.length > 3 ? 8.6 : 13}em`,
         "aria-pressed": String(pressed(state.rows, value)), onclick: () => toggled(state.rows, value) })),
       element("td", { textContent: count(number) }), ...cells));
     if (isOpen) body.push(element("tr", { className: "examples" }, element("td", { colSpan: 2 + across.length }, ...examples(a, codeOf(a, value), shownFits))));
@@ -641,11 +642,16 @@ async function load() {
 }
 
 async function poll() {
-  try {
-    const { version } = await asked("/desk/version");
-    if (version !== runs.version && !document.hidden) { await load(); reviews.runs = runs; update(); }
-  } catch { /* the server is away; the next time tells */ }
+  if (!document.hidden) await reviews.between(refresh);
   setTimeout(poll, POLL_MS);
+}
+
+async function refresh() {
+  const { version } = await asked("/desk/version");
+  if (version === runs.version) return;
+  await load();
+  reviews.runs = runs;
+  update();
 }
 
 async function start() {

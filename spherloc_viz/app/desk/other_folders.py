@@ -10,7 +10,7 @@ from spherloc_viz.recording.index.file import FILE_NAME
 from spherloc_viz.recording.index.query import RunQuery
 from spherloc_viz.recording.index.run_index import RunIndex
 from spherloc_viz.recording.run_row import RunRow
-from spherloc_viz.recording.storage.store import GALLERY
+from spherloc_viz.recording.storage.room import GALLERY
 
 MAX_LOOKED_INTO = 2_000
 """Folders that are searched for recordings."""

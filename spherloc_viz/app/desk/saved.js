@@ -39,6 +39,12 @@ class Reviews {
     return this.queue;
   }
 
+  // Runs work() when what was asked before is done: a list that is read between two requests lacks the labels of one.
+  between(work) {
+    this.queue = this.queue.then(work).catch(() => { /* the server is away; the next time tells */ });
+    return this.queue;
+  }
+
   // What was asked before is done first, so that a quick key takes back the change that is still on its way.
   undo() {
     this.queue = this.queue.then(() => {

@@ -38,14 +38,30 @@ _DATA, _LZ4, _RECORDING = 2, 2, 1
 _PROPERTIES = "/__properties"
 
 
-class _OtherError(Exception):
+class OtherError(Exception):
     """It is laid out otherwise than ours."""
 
 
 def read_head(path: Path) -> RunRow | None:
     """What a recording says of itself, without labels and note; None if Rerun's reader must be asked.
 
-    The file may be hostile: call it only in the sandbox. Raises ``OSError``, and what arrow raises.
+    The file may be hostile: call it only in the sandbox. Raises ``OSError``.
+    """
+    try:
+        found, run_id, size = properties_of(path)
+        values = read_properties(found[RUN_PROPERTY])
+        if values.get("format_version") not in range(OLDEST_VERSION, FORMAT_VERSION + 1):
+            return None
+        thumbnail = read_image(found[THUMBNAIL_PROPERTY]) if THUMBNAIL_PROPERTY in found else b""
+        return row_from_properties(values, file=path.name, run_id=run_id, size_bytes=size, thumbnail=thumbnail)
+    except (OtherError, LookupError, TypeError, ValueError, AttributeError):
+        return None
+
+
+def properties_of(path: Path) -> tuple[dict[str, pa.RecordBatch], str, int]:
+    """The properties at the start of a file by their names, the recording's id, and the size of the file.
+
+    Raises ``OtherError`` if Rerun's reader must be asked, ``OSError`` if the file cannot be read.
     """
     with path.open("rb") as file:
         size = os.fstat(file.fileno()).st_size
@@ -53,27 +69,22 @@ def read_head(path: Path) -> RunRow | None:
         file.seek(max(0, size - 12))
         end = file.read(12)
     if start[:4] != _START or start[8:12] != _OPTIONS or end[:8] != _END:
-        return None
+        raise OtherError
     try:
-        found, run_id = _properties(memoryview(start))
-        values = read_properties(found[RUN_PROPERTY])
-        if values.get("format_version") not in range(OLDEST_VERSION, FORMAT_VERSION + 1):
-            return None
-        thumbnail = read_image(found[THUMBNAIL_PROPERTY]) if THUMBNAIL_PROPERTY in found else b""
-        return row_from_properties(values, file=path.name, run_id=run_id, size_bytes=size, thumbnail=thumbnail)
-    except (_OtherError, LookupError, TypeError, ValueError, AttributeError, struct.error, pa.ArrowException):
-        return None
+        return *_properties(memoryview(start)), size
+    except (LookupError, TypeError, ValueError, AttributeError, struct.error, pa.ArrowException) as error:
+        raise OtherError from error
 
 
 def _properties(start: memoryview) -> tuple[dict[str, pa.RecordBatch], str]:
-    """The properties at the start of a file by their names, and the recording's id."""
+    """The properties by their names, and the recording's id."""
     found: dict[str, pa.RecordBatch] = {}
     run_id = ""
     for message in _messages(start):
         fields = _fields(message)
         store = _fields(fields[1])
         if store[1] != _RECORDING or bytes(_fields(store[3])[1]).decode() != APPLICATION_ID:
-            raise _OtherError
+            raise OtherError
         batch, entity = _unpacked(fields)
         run_id = bytes(store[2]).decode()
         if not entity.startswith(f"{_PROPERTIES}/"):  # the last of the properties is of the recording itself
@@ -89,7 +100,7 @@ def _messages(start: memoryview) -> Iterator[memoryview]:
         kind, size = struct.unpack_from("<QQ", start, at)
         at += 16 + size
         if at > len(start):
-            raise _OtherError
+            raise OtherError
         if kind == _DATA:
             yield start[at - size : at]
 
@@ -97,7 +108,7 @@ def _messages(start: memoryview) -> Iterator[memoryview]:
 def _unpacked(fields: dict[int, Any]) -> tuple[pa.RecordBatch, str]:
     """The chunk of a message, and what it is of."""
     if fields[2] != _LZ4 or fields[3] > MAX_UNPACKED_BYTES:
-        raise _OtherError
+        raise OtherError
     with pa.ipc.open_stream(pa.decompress(fields[5], fields[3], codec="lz4_raw")) as stream:
         batch = stream.read_next_batch()
     batch.validate(full=True)
@@ -119,9 +130,9 @@ def _fields(message: Any) -> dict[int, Any]:
         elif kind in (1, 5):
             size = 8 if kind == 1 else 4
         else:
-            raise _OtherError
+            raise OtherError
         if at + size > len(message):
-            raise _OtherError
+            raise OtherError
         found[key >> 3] = message[at : at + size]
         at += size
     return found
@@ -136,4 +147,4 @@ def _integer(message: memoryview, at: int) -> tuple[int, int]:
         value |= (byte & 127) << shift
         if byte < 128:
             return value, at
-    raise _OtherError
+    raise OtherError

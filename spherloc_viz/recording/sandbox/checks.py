@@ -6,7 +6,7 @@ import json
 import re
 import warnings
 from collections.abc import Mapping
-from dataclasses import asdict, is_dataclass
+from dataclasses import is_dataclass
 from datetime import UTC, datetime
 from math import isfinite
 from pathlib import Path
@@ -57,7 +57,7 @@ _INTEGER_LIMIT = 1 << 63
 
 def table_from_row(row: RunRow) -> dict[str, Any]:
     """The row as JSON can have it; its thumbnail as base 64."""
-    return asdict(row) | {"thumbnail": base64.b64encode(row.thumbnail).decode("ascii")}
+    return vars(row) | {"thumbnail": base64.b64encode(row.thumbnail).decode("ascii")}
 
 
 def row_from_table(table: Any, path: Path) -> RunRow:

@@ -8,6 +8,8 @@ from pathlib import Path
 
 from spherloc.errors import InputError
 
+GALLERY = "gallery"
+"""The folder inside that has the curated cases."""
 GIGABYTE = 1_000_000_000
 KEEP_GIGABYTES = 2.0
 """Size beyond which old successes are deleted, unless another is given or the recordings take more already."""
@@ -28,13 +30,15 @@ def kept_bytes(gigabytes: float | None, folder: Path) -> int:
 
 
 def _held_bytes(folder: Path) -> int:
-    """Size of the recordings in a folder; 0 if it cannot be read, of which whoever writes there tells."""
+    """Size of the recordings in a folder and in its gallery; what cannot be read counts nothing, of which whoever
+    writes there tells."""
     held = 0
-    with contextlib.suppress(OSError), os.scandir(folder) as entries:
-        for entry in entries:
-            if entry.name.lower().endswith(".rrd"):
-                with contextlib.suppress(OSError):  # deleted meanwhile
-                    held += entry.stat().st_size
+    for place in (folder, folder / GALLERY):
+        with contextlib.suppress(OSError), os.scandir(place) as entries:
+            for entry in entries:
+                if entry.name.lower().endswith(".rrd"):
+                    with contextlib.suppress(OSError):  # deleted meanwhile
+                        held += entry.stat().st_size
     return held
 
 

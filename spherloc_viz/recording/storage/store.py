@@ -30,7 +30,7 @@ from spherloc_viz.recording.rerun_program import rerun_command, rerun_environmen
 from spherloc_viz.recording.reviews import has_review
 from spherloc_viz.recording.run_row import RunRow
 from spherloc_viz.recording.sandbox.examiner import Examiner, ExaminerError, Examiners, examine_review
-from spherloc_viz.recording.storage.room import KEEP_BYTES, size_words
+from spherloc_viz.recording.storage.room import GALLERY, KEEP_BYTES, size_words
 from spherloc_viz.recording.storage.unfinished import here, leftovers, target_of, unfinished
 
 UNREADABLE_SUFFIX = ".unreadable"
@@ -223,8 +223,6 @@ def _log(log: Path, row: RunRow) -> None:
         ) from error
 
 
-GALLERY = "gallery"
-"""The folder inside that has the curated cases."""
 CHECKS = 50
 """The size of all recordings is looked at when a new part of it, one of so many, was written."""
 
