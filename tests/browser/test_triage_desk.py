@@ -160,14 +160,6 @@ def test_what_is_brushed_is_what_is_listed(desk: Desk) -> None:
     expect(desk.page.locator("#chips", has_text="lasso")).to_have_count(0)
     desk.drag("#parallel", (0.86, 0.1), (0.86, 0.5))
     expect(desk.page.locator("#chips", has_text="rotation error")).to_be_visible()
-    # None of these runs has a certificate: they lie in the strip for what is unknown.
-    desk.page.locator("#clear").click()
-    desk.page.locator("#plot-x").select_option("certificate_gap")
-    desk.drag("#scatter", (0.4, 0.05), (0.9, 0.85))
-    desk.listed(0)
-    desk.drag("#scatter", (0.145, 0.02), (0.18, 0.9))
-    expect(desk.page.locator("#chips button", has_text="certificate gap: unknown")).to_be_visible()
-    desk.listed(2 * SEEDS)
 
 
 def test_keys_label_move_and_undo(desk: Desk, folder: Path) -> None:

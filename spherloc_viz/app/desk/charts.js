@@ -119,75 +119,81 @@ class Points {
   }
   edge() { return this.withAxes ? MARGIN : { left: 6, right: 6, top: 6, bottom: 6 }; }
 
+  // Axes x and y, 1 for every run that is listed, a color for every code of the runs, the chosen run, and what is brushed.
   draw(x, y, fits, colors, codes, chosen, brush) {
     this.x = x; this.y = y;
-    const canvas = this.canvas, scale = sized(canvas), context = canvas.getContext("2d");
-    const edge = this.edge(), width = canvas.width, height = canvas.height;
-    if (!width || !height) return;
-    const left = edge.left * scale, top = edge.top * scale;
-    const inner = width - left - edge.right * scale, tall = height - top - edge.bottom * scale;
-    const image = context.createImageData(width, height), pixels = new Uint32Array(image.data.buffer);
-    const size = x.places.length > 20000 ? Math.round(scale) : Math.round(2 * scale);
+    const canvas = this.canvas, scale = sized(canvas), context = canvas.getContext("2d"), edge = this.edge();
+    if (!canvas.width || !canvas.height) return;
+    const wide = canvas.width / scale - edge.left - edge.right, high = canvas.height / scale - edge.top - edge.bottom;
+    context.putImageData(this.points(context, scale, wide, high, fits, colors, codes), 0, 0);
+    context.save();
+    context.scale(scale, scale);
+    context.translate(edge.left, edge.top);
+    context.fillStyle = context.strokeStyle = getComputedStyle(document.body).color;
+    context.font = "11px system-ui, sans-serif";
+    if (this.withAxes) this.drawAxes(context, wide, high);
+    if (chosen >= 0) {
+      context.beginPath();
+      context.arc(x.places[chosen] * wide, (1 - y.places[chosen]) * high, 6, 0, 7);
+      context.lineWidth = 2;
+      context.stroke();
+    }
+    const path = this.dragged || brush;
+    if (path && path.length > 1) this.drawBrush(context, path.map(([u, v]) => [u * wide, (1 - v) * high]));
+    context.restore();
+  }
+
+  // Faint points first, those that are listed over them.
+  points(context, scale, wide, high, fits, colors, codes) {
+    const width = this.canvas.width, edge = this.edge(), left = edge.left * scale, top = edge.top * scale;
+    const image = context.createImageData(width, this.canvas.height), pixels = new Uint32Array(image.data.buffer);
+    const px = this.x.places, py = this.y.places;
+    const size = px.length > 20000 ? Math.round(scale) : Math.round(2 * scale);
     const packed = colors.map(([r, g, b]) => (255 << 24 | b << 16 | g << 8 | r) >>> 0);
     const faint = (70 << 24 | 150 << 16 | 140 << 8 | 130) >>> 0;
-    const px = x.places, py = y.places;
     for (let pass = 0; pass < 2; pass++) {
       for (let i = 0; i < px.length; i++) {
         if (fits[i] !== pass) continue;
         const u = px[i], v = py[i];
         if (!(u >= 0 && u <= 1 && v >= 0 && v <= 1)) continue;
         const color = pass ? packed[codes[i]] : faint;
-        const column = (left + u * inner) | 0, line = (top + (1 - v) * tall) | 0;
+        const column = (left + u * wide * scale) | 0, line = (top + (1 - v) * high * scale) | 0;
         for (let dy = 0; dy < size; dy++) for (let dx = 0; dx < size; dx++) pixels[(line + dy) * width + column + dx] = color;
       }
     }
-    context.putImageData(image, 0, 0);
-    context.save();
-    context.scale(scale, scale);
-    const words = getComputedStyle(document.body).color;
-    context.fillStyle = context.strokeStyle = words;
-    context.font = "11px system-ui, sans-serif";
-    const wide = inner / scale, high = tall / scale;
-    if (this.withAxes) {
-      context.globalAlpha = 0.75;
-      context.textAlign = "center";
-      context.globalAlpha = 0.1;
-      context.fillRect(edge.left, edge.top, x.strip * wide, high);
-      context.fillRect(edge.left, edge.top + (1 - y.strip) * high, wide, y.strip * high);
-      context.globalAlpha = 0.75;
-      for (const value of x.ticks()) {
-        const u = edge.left + x.place(value) * wide;
-        context.fillText(tickText(value), u, edge.top + high + 14);
-        context.globalAlpha = 0.12; context.fillRect(u, edge.top, 1, high); context.globalAlpha = 0.75;
-      }
-      context.textAlign = "right";
-      for (const value of y.ticks()) {
-        const v = edge.top + (1 - y.place(value)) * high;
-        context.fillText(tickText(value), edge.left - 5, v + 4);
-        context.globalAlpha = 0.12; context.fillRect(edge.left, v, wide, 1); context.globalAlpha = 0.75;
-      }
-      context.globalAlpha = 1;
+    return image;
+  }
+
+  drawAxes(context, wide, high) {
+    const { x, y } = this;
+    context.globalAlpha = 0.1;
+    context.fillRect(0, 0, x.strip * wide, high);
+    context.fillRect(0, (1 - y.strip) * high, wide, y.strip * high);
+    context.textAlign = "center";
+    for (const value of x.ticks()) {
+      const u = x.place(value) * wide;
+      context.globalAlpha = 0.75; context.fillText(tickText(value), u, high + 14);
+      context.globalAlpha = 0.12; context.fillRect(u, 0, 1, high);
     }
-    if (chosen >= 0) {
-      context.beginPath();
-      context.arc(edge.left + px[chosen] * wide, edge.top + (1 - py[chosen]) * high, 6, 0, 7);
-      context.lineWidth = 2;
-      context.stroke();
+    context.textAlign = "right";
+    for (const value of y.ticks()) {
+      const v = (1 - y.place(value)) * high;
+      context.globalAlpha = 0.75; context.fillText(tickText(value), -5, v + 4);
+      context.globalAlpha = 0.12; context.fillRect(0, v, wide, 1);
     }
-    const path = this.dragged || brush;
-    if (path && path.length > 1) {
-      const to = ([u, v]) => [edge.left + u * wide, edge.top + (1 - v) * high];
-      context.lineWidth = 1.5;
-      context.beginPath();
-      if (this.isLasso) path.forEach((spot, k) => (k ? context.lineTo(...to(spot)) : context.moveTo(...to(spot))));
-      else {
-        const [[a, b], [c, d]] = [to(path[0]), to(path[path.length - 1])];
-        context.rect(Math.min(a, c), Math.min(b, d), Math.abs(c - a), Math.abs(d - b));
-      }
-      context.closePath();
-      context.globalAlpha = 0.12; context.fill(); context.globalAlpha = 1; context.stroke();
+    context.globalAlpha = 1;
+  }
+
+  drawBrush(context, path) {
+    context.lineWidth = 1.5;
+    context.beginPath();
+    if (this.isLasso) path.forEach((spot, k) => (k ? context.lineTo(...spot) : context.moveTo(...spot)));
+    else {
+      const [[a, b], [c, d]] = [path[0], path[path.length - 1]];
+      context.rect(Math.min(a, c), Math.min(b, d), Math.abs(c - a), Math.abs(d - b));
     }
-    context.restore();
+    context.closePath();
+    context.globalAlpha = 0.12; context.fill(); context.globalAlpha = 1; context.stroke();
   }
 }
 

@@ -54,27 +54,8 @@ class Runs {
     const fits = new Uint8Array(this.count).fill(1);
     const apart = !state.pages && this.others && !(state.chosen.source || []).includes("page");
     if (apart) for (let i = 0; i < this.count; i++) fits[i] = 1 - this.fromPages[i];
-    for (const [name, chosen] of Object.entries(state.chosen)) {
-      if (!chosen.length) continue;
-      if (name === "labels") {
-        for (let i = 0; i < this.count; i++) {
-          if (!chosen.some((label) => (label === "" ? !this.labels[i].length : this.labels[i].includes(label)))) fits[i] = 0;
-        }
-        continue;
-      }
-      const column = this.texts[name];
-      if (!column) continue;
-      const wanted = Uint8Array.from(column.values, (value) => (chosen.includes(value) ? 1 : 0));
-      const codes = column.codes;
-      for (let i = 0; i < this.count; i++) fits[i] &= wanted[codes[i]];
-    }
-    for (const [name, [low, high, unknown]] of Object.entries(state.ranges)) {
-      const values = this.numbers[name];
-      if (!values) continue;
-      for (let i = 0; i < this.count; i++) {
-        if (!(values[i] >= low && values[i] <= high) && !(unknown && Number.isNaN(values[i]))) fits[i] = 0;
-      }
-    }
+    for (const [name, chosen] of Object.entries(state.chosen)) if (chosen.length) this.keepChosen(fits, name, chosen);
+    for (const [name, range] of Object.entries(state.ranges)) if (this.numbers[name]) this.keepRange(fits, this.numbers[name], range);
     if (state.only) {
       const wanted = new Uint8Array(this.count);
       for (const file of state.only) if (this.index.has(file)) wanted[this.index.get(file)] = 1;
@@ -83,6 +64,25 @@ class Runs {
     for (const word of state.search.toLowerCase().split(/\s+/).filter(Boolean)) this.keepWord(fits, word);
     if (lasso && state.lasso) this.keepLasso(fits, state.lasso);
     return fits;
+  }
+
+  keepChosen(fits, name, chosen) {
+    if (name === "labels") {
+      for (let i = 0; i < this.count; i++) {
+        if (!chosen.some((label) => (label === "" ? !this.labels[i].length : this.labels[i].includes(label)))) fits[i] = 0;
+      }
+      return;
+    }
+    if (!this.texts[name]) return;
+    const { values, codes } = this.texts[name];
+    const wanted = Uint8Array.from(values, (value) => (chosen.includes(value) ? 1 : 0));
+    for (let i = 0; i < this.count; i++) fits[i] &= wanted[codes[i]];
+  }
+
+  keepRange(fits, values, [low, high, unknown]) {
+    for (let i = 0; i < this.count; i++) {
+      if (!(values[i] >= low && values[i] <= high) && !(unknown && Number.isNaN(values[i]))) fits[i] = 0;
+    }
   }
 
   keepWord(fits, word) {
