@@ -44,12 +44,12 @@ gets its cause by the [diagnosis](../failures.md), here of all queries of the se
 FIGURES = """\
 ## Figs. 8 and 10: several methods in one picture
 
-![Inliers by four methods]({fig8})
+![Inliers by several methods]({fig8})
 
 Session {session}, query {query}, which has the most outliers ({share:.0f} % of {matches} matches): green, inliers that
 are right; orange, inliers that are not; red, all other matches.
 
-![Trajectories by four methods]({fig10})
+![Trajectories by several methods]({fig10})
 
 Session {session}: the bluer, the smaller the error (up to {limit:g} m); crosses have no pose. Roughness is the median
 second difference of the positions, small where the way is what the paper calls smooth.
