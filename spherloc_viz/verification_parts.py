@@ -160,6 +160,8 @@ def _baselines(measured: Measured) -> str:
             times=True,
         )
     )
+    if not measured.methods("alike", PAPERS_CAMERA):
+        parts.append("## Under equal terms\n\nNot run for this page: `spherloc verify --only alike` adds it.\n")
     parts.append(_wide_cases(measured))
     return "\n".join(part for part in parts if part)
 
