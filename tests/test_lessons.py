@@ -138,6 +138,7 @@ def test_pages_of_all_lessons_are_made():
         page = lesson_page(lesson, LESSONS)
         assert page.count("<section") == len(lesson.moments)
         assert "$" not in re.sub(r"<script>.*?</script>|<style>.*?</style>", "", page, flags=re.DOTALL)
+    assert len(set(LESSONS)) == len(LESSONS), "their pictures are kept by lesson"
     listed = list_page(LESSONS, "/p/")
     assert all(f"/learn/{lesson.name}" in listed for lesson in LESSONS)
 

@@ -19,7 +19,7 @@ such as ``seed``, ``set.outlier_rate`` or ``option.iterations``; ``{choice KEY O
 import re
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qsl, urlencode
@@ -89,7 +89,7 @@ class Lesson:
     """Whether it is for the front of a class, and not of the course."""
     picture: int
     """Number of the moment whose picture stands for the lesson, from 0 on."""
-    quoted: Mapping[float, str]
+    quoted: Mapping[float, str] = field(hash=False)
     """Numbers in the text that come from elsewhere than from a run, and where they come from."""
     introduction: str
     """Markdown before the first moment."""

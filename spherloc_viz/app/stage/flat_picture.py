@@ -16,6 +16,8 @@ MIN_DOT_PX, MAX_DOT_PX = 1.2, 12.0
 LINE = 0.6
 """Width of lines by that on the screen, whose canvas is larger."""
 LABEL_PX = 11.0
+LETTER = 0.55
+"""Width of a letter by the height of its line, on average."""
 NEAR_M = 1e-3
 """What is nearer to the viewer is left out."""
 
@@ -74,6 +76,8 @@ def _shapes(item: SceneItem, eye: _Eye) -> Iterator[Shape]:
             if depth > NEAR_M:
                 ((x, y),) = eye.pixels(item.position[None])
                 if 0 < x < WIDTH and 0 < y < HEIGHT:
+                    half = min(0.5 * LETTER * LABEL_PX * len(item.text), 0.5 * WIDTH)
+                    x = float(np.clip(x, half, WIDTH - half))
                     # Words stand before everything.
                     look = 'fill="#222" stroke="#fff" stroke-width="3" paint-order="stroke"'
                     yield -depth, f'<text x="{x:.1f}" y="{y:.1f}" {look}>{escape(item.text)}</text>'
