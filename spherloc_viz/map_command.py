@@ -113,7 +113,7 @@ def summary(made: Map, found: Photographs) -> list[str]:
     if made.made.contradictions:
         first, second = made.made.contradictions[0]
         lines.append(
-            f"in doubt      {len(made.made.contradictions)} pairs of images lie side by side and hardly match (such as "
-            f"{first}, {second}): a wall between them, or places that look alike"
+            f"in doubt      {len(made.made.contradictions)} pairs of images see each other and hardly match (such as "
+            f"{first}, {second}): places that look alike may have been taken for one"
         )
     return lines

@@ -73,8 +73,8 @@ def _doubts(made: Map) -> list[str]:
         return []
     pairs = "; ".join(f"{first} and {second}" for first, second in against[:10])
     return [
-        '<p class="out">These images lie side by side in the map and hardly match. There may be a wall between them; '
-        "if there is none, the map takes two places that look alike for one: "
+        '<p class="out">These images lie side by side in the map, in sight of each other, and hardly match. The map '
+        "may take two places that look alike for one: "
         f"{html.escape(pairs)}{' …' if len(against) > 10 else ''}</p>"
     ]
 

@@ -18,7 +18,7 @@ from spherloc.errors import ProblemError
 from spherloc.estimators import default_options, estimate
 from spherloc.frontend.view import Gravity, View
 from spherloc.geometry import DOWN
-from spherloc.mapping.reconstruction import NEARBY, Reconstruction, contradictions
+from spherloc.mapping.reconstruction import Reconstruction, contradictions, points_of
 from spherloc.mapping.upright import Level, Tell, arbitrary_scale
 from spherloc.outcome import Outcome, judge
 from spherloc.problem import Problem
@@ -123,10 +123,11 @@ def _place(made: Reconstruction, view: View, gravity: Gravity | None, level: Lev
 
 
 def _undoubted(made: Reconstruction, names: Sequence[str], name: str, placed: _Placed) -> bool:
-    """Whether some of the images next to it match it: at a place that only looks alike, hardly any do."""
+    """Whether the images next to it that it sees match it: at a place that only looks alike, hardly any do."""
     poses = {**made.poses, name: placed.cam_from_model}
-    against = [pair for pair in contradictions(poses, names, made.all_matches) if pair[0] == name]
-    return len(against) < NEARBY
+    seen = np.array([made.model.point3D(int(index)).xyz for index in placed.points])
+    points = {**points_of(made.model), name: seen}
+    return not any(name in pair for pair in contradictions(poses, names, made.all_matches, points))
 
 
 def _with(made: Reconstruction, placed: Mapping[str, _Placed], names: Sequence[str]) -> Reconstruction:
@@ -151,8 +152,7 @@ def _with(made: Reconstruction, placed: Mapping[str, _Placed], names: Sequence[s
         image.name: np.asarray(image.cam_from_world().matrix())
         for image in (model.image(number) for number in model.reg_image_ids())
     }
-    against = contradictions(poses, names, made.all_matches)
-    return replace(made, model=model, poses=poses, contradictions=against)
+    return replace(made, model=model, poses=poses).judged()
 
 
 def _image_in(pycolmap: Any, made: Reconstruction, number: int) -> int:

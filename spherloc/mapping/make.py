@@ -71,7 +71,7 @@ def make_map(
         raise InputError(f"{folder}: cannot be made ({error.strerror}); give another --output.") from None
     gravity = gravity_by_lines(views, tell)
     first, *others = reconstruct(views, [gravity.get(view.name) for view in views], folder, tell)
-    found = _finished(first, views, (), gravity, measured, tell)
+    found = _finished(first, views, nearer_to_others(first, others), gravity, measured, tell)
     inside = set(found[0].poses)
     made = Map(*found, write_map(*found, views, images, folder, new_images))
     groups: list[Map] = []
@@ -79,7 +79,7 @@ def make_map(
         if len(other.poses.keys() - inside) < MIN_OF_GROUP:
             continue
         try:
-            found = _finished(other.without(inside), views, inside, gravity, measured, tell)
+            found = _finished(other.without(inside), views, names, gravity, measured, tell)  # only the first grows
         except InputError:  # its images do not agree on where down is
             continue
         if len(found[0].poses) < MIN_OF_GROUP:
@@ -92,6 +92,20 @@ def make_map(
             raise InputError(f"{place}: cannot be made ({error.strerror}); give another --output.") from None
         groups.append(Map(*found, write_map(*found, views, images, place, new_images)))
     return replace(made, groups=tuple(groups))
+
+
+def nearer_to_others(made: Reconstruction, others: Sequence[Reconstruction]) -> set[str]:
+    """Names of images that are not in the model and have more matches with those of another one."""
+    place = {name: index for index, name in enumerate(made.ids)}
+
+    def ties(name: str, group: Collection[str]) -> int:
+        return int(made.all_matches[place[name], [place[one] for one in group if one != name]].sum())
+
+    return {
+        name
+        for name in made.ids.keys() - made.poses.keys()
+        if any(ties(name, other.poses) > ties(name, made.poses) for other in others)
+    }
 
 
 def _finished(

@@ -5,10 +5,12 @@ not only a homography: a full sphere sees more than one plane, and what fits one
 floor that looks the same elsewhere.
 
 Places that look alike (two hotel rooms, a row of houses) give matches that fit all the same. A map that takes them for
-one place puts photographs side by side that have hardly a match. So a second map is made of the strong pairs alone, and
-the one that explains more images, less those contradictions, is taken.
+one place puts photographs side by side, with nothing between them, that have hardly a match. There it is cut, where
+fewest matches hold it together. A second map is made of the strong pairs alone, and the one that explains more images,
+less those contradictions, is taken.
 """
 
+import copy
 import hashlib
 import json
 import os
@@ -21,6 +23,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
 
@@ -52,6 +55,9 @@ NEARBY = 2
 """Images next to one in the map, that should match it."""
 MIN_SUPPORT = 0.15
 """Share of the matches of the best pair of either image that two nearby images have; with less they contradict."""
+SIGHT_RAD, SIGHT_POINTS, SIGHT_FACTOR = np.radians(25.0), 8, 1.2
+"""An image sees past another one if it has this many points at most so far off its direction, half of them farther away
+by this factor."""
 COST_OF_CONTRADICTION = 4.0
 """Share of the images that a map is worth less for each share of contradictions."""
 _TRIES = (
@@ -73,7 +79,7 @@ class Reconstruction:
     matches: NDArray[np.int64]
     """(V, V) matches of each pair of images after the two-view check."""
     contradictions: tuple[tuple[str, str], ...]
-    """Names of images that the model puts side by side although they hardly match."""
+    """Names of images that the model puts side by side, in sight of each other, although they hardly match."""
     all_matches: NDArray[np.int64]
     """(V, V) as ``matches``, with those of images that were taken from one place."""
     database: Path
@@ -90,6 +96,11 @@ class Reconstruction:
         poses = {name: pose for name, pose in self.poses.items() if name not in names}
         against = tuple(pair for pair in self.contradictions if not set(pair) & set(names))
         return replace(self, poses=poses, contradictions=against)
+
+    def judged(self) -> "Reconstruction":
+        """The same with the contradictions that it has now."""
+        against = contradictions(self.poses, list(self.ids), self.all_matches, points_of(self.model))
+        return replace(self, contradictions=against)
 
     def points(self) -> FloatArray:
         """(N, 3) in the frame that the model has now."""
@@ -172,9 +183,37 @@ def _models_of(
     found = []
     for model in models:
         poses = {image.name: np.asarray(image.cam_from_world().matrix()) for image in _registered(model)}
-        against = contradictions(poses, names, counts + same_place)
-        found.append(Reconstruction(model, poses, counts, against, counts + same_place, path, number_of))
+        whole = Reconstruction(model, poses, counts, (), counts + same_place, path, number_of)
+        found += parted(whole.judged())
     return untangled(found)
+
+
+def parted(made: Reconstruction) -> list[Reconstruction]:
+    """The model cut until no two images contradict each other: parts of two images or more, the largest first.
+
+    A contradiction says that two images do not belong side by side, so somewhere between them places that only look
+    alike are taken for one: where the cut between the two takes away fewest matches.
+    """
+    if not made.contradictions:
+        return [made]
+    place = {name: index for index, name in enumerate(made.ids)}
+    graph = nx.Graph()
+    graph.add_nodes_from(made.poses)
+    for one, other in combinations(made.poses, 2):
+        if matches := int(made.all_matches[place[one], place[other]]):
+            graph.add_edge(one, other, capacity=matches)
+    cuts = [nx.minimum_cut(graph, *pair) for pair in sorted(set(map(_sorted, made.contradictions)))]
+    _, (first, second) = min(cuts, key=lambda cut: cut[0])
+    parts = []
+    for side in (first, second):
+        if len(made.poses.keys() - side) > 1:
+            part = replace(made, model=copy.deepcopy(made.model)).without(side)
+            parts += parted(part.judged())
+    return sorted(parts, key=lambda part: -len(part.poses))
+
+
+def _sorted(pair: tuple[str, str]) -> tuple[str, str]:
+    return (min(pair), max(pair))
 
 
 def untangled(made: Sequence[Reconstruction]) -> tuple[Reconstruction, ...]:
@@ -208,9 +247,15 @@ def _worth(made: Reconstruction) -> float:
 
 
 def contradictions(
-    poses: Mapping[str, FloatArray], names: Sequence[str], counts: NDArray[np.int64]
+    poses: Mapping[str, FloatArray],
+    names: Sequence[str],
+    counts: NDArray[np.int64],
+    points: Mapping[str, FloatArray],
 ) -> tuple[tuple[str, str], ...]:
-    """Images of ``poses`` and those next to them that hardly match, by the ``counts`` (V, V) of all ``names``."""
+    """Images of ``poses`` and those next to them, in sight of each other, that hardly match.
+
+    ``counts`` (V, V) are the matches of all ``names``, ``points`` (K, 3) what each image sees of the map.
+    """
     inside = [index for index, name in enumerate(names) if name in poses]
     centres = np.stack([camera_centre(poses[names[index]]) for index in inside])
     apart = np.linalg.norm(centres[:, None] - centres[None], axis=2)
@@ -220,9 +265,32 @@ def contradictions(
     for row, index in enumerate(inside):
         for place in np.argsort(apart[row])[: min(NEARBY, len(inside) - 1)]:
             other = inside[int(place)]
-            if counts[index, other] < MIN_SUPPORT * min(best[index], best[other]):
+            if counts[index, other] >= MIN_SUPPORT * min(best[index], best[other]):
+                continue
+            here, there = centres[row], centres[int(place)]
+            if _sees_past(points[names[index]], here, there) and _sees_past(points[names[other]], there, here):
                 found.append((names[index], names[other]))
     return tuple(found)
+
+
+def _sees_past(points: FloatArray, centre: FloatArray, other: FloatArray) -> bool:
+    """Whether what a camera at ``centre`` sees (K, 3) in the direction of another one lies behind that one.
+
+    A wall between the two would be seen before it: then they need no match.
+    """
+    rays, way = points - centre, other - centre
+    depth, distance = np.linalg.norm(rays, axis=1), float(np.linalg.norm(way))
+    near = rays @ way > np.cos(SIGHT_RAD) * depth * distance
+    return np.count_nonzero(near) >= SIGHT_POINTS and bool(np.median(depth[near]) > SIGHT_FACTOR * distance)
+
+
+def points_of(model: Any) -> dict[str, FloatArray]:
+    """What each image of a model sees of the map, (K, 3) by name."""
+    found = {}
+    for image in _registered(model):
+        ids = [point.point3D_id for point in image.points2D if point.has_point3D()]
+        found[image.name] = np.array([model.point3D(one).xyz for one in ids]).reshape(-1, 3)
+    return found
 
 
 def _registered(model: Any) -> list[Any]:

@@ -1,0 +1,74 @@
+"""A map that takes two rooms that look alike for one is cut between them; a wall between two images is no reason."""
+
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from spherloc.geometry import pose
+from spherloc.mapping.make import nearer_to_others
+from spherloc.mapping.reconstruction import Reconstruction, contradictions, parted, untangled
+
+ROOMS = {"day_0", "day_1", "day_2"}, {"night_0", "night_1", "night_2", "night_3"}
+NAMES = sorted(set.union(*ROOMS))
+
+
+def matches_of(alike: int) -> np.ndarray:
+    """(7, 7): many within a room, and ``alike`` between one image of each and one of the other."""
+    counts = np.zeros((7, 7), np.int64)
+    for room in ROOMS:
+        for one in room:
+            for other in room - {one}:
+                counts[NAMES.index(one), NAMES.index(other)] = 200
+    counts[NAMES.index("day_0"), NAMES.index("night_0")] = counts[NAMES.index("night_0"), NAMES.index("day_0")] = alike
+    return counts
+
+
+def centres_of() -> dict[str, np.ndarray]:
+    """The images of both rooms among each other, a metre apart."""
+    mixed = sorted(NAMES, key=lambda name: name[-1])
+    return {name: np.array([1.0 * index, 0.2 * (index % 2), 0.0]) for index, name in enumerate(mixed)}
+
+
+def walls(rng: np.random.Generator) -> np.ndarray:
+    """(N, 3): far on all sides."""
+    rays = rng.normal(size=(600, 3))
+    return 12.0 * rays / np.linalg.norm(rays, axis=1, keepdims=True)
+
+
+def model_of(points: np.ndarray) -> Reconstruction:
+    """A model of COLMAP in which every image sees all points."""
+    model = pycolmap.Reconstruction()
+    camera = pycolmap.Camera(model="EQUIRECTANGULAR", width=200, height=100, params=[200, 100], camera_id=1)
+    model.add_camera_with_trivial_rig(camera)
+    poses = {}
+    for index, (name, centre) in enumerate(sorted(centres_of().items()), start=1):
+        poses[name] = pose(np.eye(3), -centre)
+        image = pycolmap.Image(name=name, keypoints=np.zeros((len(points), 2)), camera_id=1, image_id=index)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(poses[name]))
+    for row, point in enumerate(points):
+        track = pycolmap.Track([pycolmap.TrackElement(index, row) for index in range(1, len(NAMES) + 1)])
+        model.add_point3D(point, track)
+    counts = matches_of(alike=90)
+    ids = {name: index for index, name in enumerate(NAMES, start=1)}
+    return Reconstruction(model, poses, counts, (), counts, Path("unused"), ids).judged()
+
+
+def test_images_in_sight_of_each_other_that_hardly_match(rng):
+    poses = {name: pose(np.eye(3), -centre) for name, centre in centres_of().items()}
+    seen = dict.fromkeys(NAMES, walls(rng))
+    against = contradictions(poses, NAMES, matches_of(alike=90), seen)
+    assert against and all((one in ROOMS[0]) != (other in ROOMS[0]) for one, other in against)
+    assert ("day_0", "night_0") not in against  # these do match
+    near = {name: centre + 0.3 * (walls(rng) / 12.0) for name, centre in centres_of().items()}
+    assert contradictions(poses, NAMES, matches_of(alike=90), near) == ()  # a wall round each
+
+
+def test_a_map_of_two_rooms_in_one_place_is_cut_between_them(rng):
+    parts = untangled(parted(model_of(walls(rng))))
+    assert [set(part.poses) for part in parts] == [ROOMS[1], ROOMS[0]]
+    for part in parts:
+        assert part.contradictions == ()
+        assert {image.name for image in map(part.model.image, part.model.reg_image_ids())} == set(part.poses)
+    left = parts[0].without({"night_3"})
+    assert nearer_to_others(left, parts[1:]) == ROOMS[0]  # none of them is tried in the larger map, night_3 is
