@@ -31,6 +31,8 @@ KERNEL_SOURCES = (
     "solvers",
     "consensus",
     "estimators",
+    "mapping/guided.py",
+    "mapping/level_pairs.py",
 )
 """Files and folders of this package that hold kernels and whatever their values come from."""
 

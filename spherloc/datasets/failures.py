@@ -205,6 +205,13 @@ def _wrong_reference(make: CaseMaker) -> FailureCase:
     return make.case("wrong reference image")
 
 
+def _map_too_sparse(make: CaseMaker) -> FailureCase:
+    """As too few right ones, and 30 to 120 more matches agree between the images but have no point in the map."""
+    make.right(make.whole(2, 3))
+    make.random(make.whole(40, 105))
+    return make.case("map too sparse", verified_without_point=make.whole(30, 120))
+
+
 def _false_consensus(make: CaseMaker) -> FailureCase:
     """Repeated structure: 1.3 to 2 times as many matches agree with one wrong pose as with the true one."""
     count = make.whole(80, 300)
@@ -371,6 +378,7 @@ MAKERS: Mapping[str, Callable[[CaseMaker], FailureCase]] = {
     "iterations ran out": _iterations_ran_out,
     "ambiguous": _ambiguous,
     "search missed the best pose": _search_missed,
+    "map too sparse": _map_too_sparse,
 }
 
 

@@ -71,6 +71,13 @@ def test_too_few_are_as_few_as_chance_gives():
         assert np.count_nonzero(run(case).inlier_mask) <= 5
 
 
+def test_a_sparse_map_lacks_what_the_images_share():
+    for seed in SEEDS:
+        case = failure_case(Cause.MAP_TOO_SPARSE, seed)
+        assert 2 <= np.count_nonzero(case.problem.truth_inliers) <= 3
+        assert case.problem.verified_without_point >= 30
+
+
 def test_wrong_reference_has_nothing_right():
     for seed in SEEDS:
         case = failure_case(Cause.WRONG_REFERENCE, seed)
