@@ -32,6 +32,7 @@ MAY_PRESS = {
     "select-bin",
     "image-pick",
     "image-reference",
+    "lens",
     "match-sort",
     "match-filter",
     "match-page",

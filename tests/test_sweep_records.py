@@ -12,6 +12,7 @@ from sweep_deaths import DeadlyStore
 
 from spherloc.datasets.variation import Variation
 from spherloc.experiments.sweep import Entrant, Job, planned, run_sweep
+from spherloc.experiments.sweep_rows import Point
 from spherloc.experiments.sweep_workers import solve
 from spherloc.trace import Trace
 from spherloc_viz.batch import Records
@@ -27,7 +28,7 @@ ROOT = Path(__file__).resolve().parents[1]
 SCENE = ROOT / "scenes" / "mei_outliers_80.toml"
 
 
-def swept(out: Path, recordings: Path, **changes: object) -> int:
+def swept(out: Path, recordings: Path, **changes: object) -> tuple[Point, ...]:
     words = {"values": ["0.2", "0.5"], "estimators": ["mc", "ransac-2p,iterations=50"], "runs": 3, "seed": 4}
     more = {"workers": 2, "scheduler": None, "out": out, "records": Records(recordings)}
     settings = ["correspondences=30"]
@@ -39,7 +40,7 @@ def here(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, str]:
     """The CSV of a sweep by two workers, the folder of its recordings, and what was said."""
     folder, said = tmp_path_factory.mktemp("here"), io.StringIO()
     with redirect_stderr(said):
-        assert swept(folder / "sweep.csv", folder / "recordings") == 0
+        assert len(swept(folder / "sweep.csv", folder / "recordings")) == 4
     return folder / "sweep.csv", folder / "recordings", said.getvalue()
 
 

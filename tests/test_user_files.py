@@ -131,8 +131,16 @@ def test_paths_within_scenes_too(tmp_path: Path) -> None:
 
 
 OPENERS = {"read_text", "read_bytes", "is_file", "is_dir", "iterdir", "open"}
-OWN_FILES = {"files", "kernel_cache", "worlds.render", "disk_cache", "datasets.scene_file", "mapping.reconstruction"}
-"""Those that open what spherloc itself wrote or brings with it: the fifth its own scenes, the last its database."""
+OWN_FILES = {
+    "files",
+    "kernel_cache",
+    "worlds.render",
+    "disk_cache",
+    "datasets.scene_file",
+    "mapping.reconstruction",
+    "mapping.later",
+}
+"""Those that open what spherloc itself wrote or brings with it: the fifth its own scenes, the last two their database."""
 
 
 def _opens(node: ast.AST) -> str:

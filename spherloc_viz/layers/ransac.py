@@ -96,7 +96,7 @@ def _in_truth(view: RunView, sample: np.ndarray) -> str:
     if labels is None:
         return f"Whether these are right is not known yet, so the pose is tested on all {len(view.points)} matches."
     right = int(np.count_nonzero(labels[sample]))
-    return f"In truth {right} of these {len(sample)} are right. RANSAC cannot know: it tests the pose on all."
+    return f"In truth {right} of these {len(sample)} are right, which RANSAC cannot know: it tests the pose on all."
 
 
 def _line(view: RunView, sample: np.ndarray) -> Segments:

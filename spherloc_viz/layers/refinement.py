@@ -117,7 +117,7 @@ def _outliers(view: RunView, stage: RefinementStage) -> Frame:
     seen = errors[np.isfinite(errors)]
     behind = len(errors) - len(seen)
     if not len(errors):
-        told = "All matches are within the bound, so that none is rejected"
+        told = "All matches are within the bound. None is rejected"
     elif not len(seen):
         told = f"All {len(errors)} other matches lie behind the camera at this pose. No bound would make them agree"
     else:
