@@ -140,7 +140,7 @@ OWN_FILES = {
     "mapping.reconstruction",
     "mapping.later",
 }
-"""Those that open what spherloc itself wrote or brings with it: the fifth its own scenes, the last two their database."""
+"""Those that open what spherloc itself wrote or brings: the fifth its own scenes, the last two their database."""
 
 
 def _opens(node: ast.AST) -> str:

@@ -281,7 +281,7 @@ def _sees_past(points: FloatArray, centre: FloatArray, other: FloatArray) -> boo
     rays, way = points - centre, other - centre
     depth, distance = np.linalg.norm(rays, axis=1), float(np.linalg.norm(way))
     near = rays @ way > np.cos(SIGHT_RAD) * depth * distance
-    return np.count_nonzero(near) >= SIGHT_POINTS and bool(np.median(depth[near]) > SIGHT_FACTOR * distance)
+    return bool(np.count_nonzero(near) >= SIGHT_POINTS and np.median(depth[near]) > SIGHT_FACTOR * distance)
 
 
 def points_of(model: Any) -> dict[str, FloatArray]:
