@@ -74,7 +74,7 @@ def verification_page(checked: Sequence[Checked], quick: bool, made: Sequence[st
     parts.append(_counts(checked))
     if any(item.earlier for item in checked):
         parts.append(
-            "Findings marked ° are those of an earlier whole run, whose code has not changed since: this time only "
+            "Findings marked ° are those of an earlier whole run, maybe of older code: this time only "
             f"{', '.join(made) or 'nothing'} was run.\n"
         )
     parts += [_table(checked), _commands(checked)]
