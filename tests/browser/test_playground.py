@@ -149,6 +149,7 @@ def test_the_introduction_is_shown_once_and_can_be_skipped(browser: Browser, add
     expect(card).to_have_count(0)
     expect(tab.step).to_have_value(re.compile("The yaw most arcs share"))
 
+    expect(tab.page).to_have_url(re.compile("step=yaw-clique"))  # it follows when the page rests
     tab.page.reload()
     expect(tab.value("outcome")).not_to_be_empty()
     tab.page.wait_for_function("() => document.querySelector('[data-introduction]') !== null")
