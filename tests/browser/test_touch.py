@@ -142,10 +142,18 @@ def test_bins_arcs_and_rectangles_select_several(tab: Playground, trace: Trace, 
 
 
 def outcome(tab: Playground) -> dict[str, str]:
-    """What the outcome says, but for how long it took."""
+    """What the outcome says, but for how long it took, once the pose is judged: that follows the picture."""
     script = """cell => [...cell.closest("table").rows].filter(row => row.cells.length === 2)
         .map(row => [row.cells[0].textContent, row.cells[1].textContent])"""
-    return {name: words for name, words in tab.value("outcome").evaluate(script) if "time" not in name}
+    said: dict[str, str] = {}
+
+    def judged() -> bool:
+        said.clear()
+        said.update(tab.value("outcome").evaluate(script))
+        return "…" not in said.values()
+
+    tab.until(judged, "the pose is judged")
+    return {name: words for name, words in said.items() if "time" not in name}
 
 
 def expect_outcome(tab: Playground, words: dict[str, str]) -> None:
