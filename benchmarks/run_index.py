@@ -1,13 +1,14 @@
 """The run index at 10,000 runs: every filter, sort order, page and group beside the same in plain Python.
 
-    python -m benchmarks.run_index [--runs 10000] [--repeats 3] [--files 10000]
+    python -m benchmarks.run_index [--runs 10000] [--repeats 3] [--files 10000] [--folder DIR]
 
 The peer keeps a row a run as JSON, one a line, and reads, filters and sorts them for every question, as a program
 without an index would. Times are processor time of the one thread that asks, medians of the repeats, so that a busy
 machine does not count. Prints the slowest question of every kind and writes ``results/run_index.json``.
 
 With ``--files`` it measures only how fast a list is made from so many files, in wall time and with the start of the
-processes that read them. The files are links to one real recording, which is in the system's memory.
+processes that read them. The files are links to one real recording, which is in the system's memory; with ``--folder``
+they are links to all recordings of a folder, as a sweep made it.
 """
 
 import argparse
@@ -28,6 +29,7 @@ from benchmarks.machine import describe
 from spherloc.datasets import bundled_scenes, load_scene
 from spherloc.diagnosis import Cause
 from spherloc.estimators import estimate
+from spherloc_viz.given_files import REVIEW_SUFFIX
 from spherloc_viz.recording.content.writer import write_recording
 from spherloc_viz.recording.index.query import GROUP_KEYS, OUTCOMES, SORT_KEYS, Range, RunQuery
 from spherloc_viz.recording.index.run_index import RunIndex
@@ -118,9 +120,10 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=10_000)
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--files", type=int, default=0)
+    parser.add_argument("--folder", type=Path)
     arguments = parser.parse_args()
-    if arguments.files:
-        _report_files(_from_files(arguments.files))
+    if arguments.files or arguments.folder:
+        _report_files(_from_files(arguments.files, arguments.folder))
         return
     rng = np.random.default_rng(6)
     rows = [synthetic_row(number, rng) for number in range(arguments.runs)]
@@ -140,35 +143,45 @@ EXAMINED = 500
 """Files that are read wholly, which takes fifty times as long."""
 
 
-def _from_files(count: int) -> dict[str, float]:
-    """Files a second that are listed, listed with labels, and examined."""
-    problem = load_scene(bundled_scenes()["mei_outliers_80"]).problem(0)
-    with tempfile.TemporaryDirectory() as place:
+def _from_files(count: int, real: Path | None) -> dict[str, Any]:
+    """Files a second that are listed, and examined: those of the folder ``real``, or so many, half of them labelled."""
+    with tempfile.TemporaryDirectory(dir=real) as place:  # links lie on the disk of their files
         folder = Path(place)
-        write_recording(estimate(problem, "mc"), folder / "one.rrd")
-        write_review(folder / "one.rrd", ["wrong map"], "Look again.")
-        for number in range(count):
-            os.link(folder / "one.rrd", folder / f"{number}.rrd")
-            if number % 2:
-                os.link(review_path(folder / "one.rrd"), review_path(folder / f"{number}.rrd"))
+        _link_all(folder, real) if real is not None else _link_one(folder, count)
         before, began = _all_processor_s(), time.perf_counter()
         with RunIndex(folder) as index:
             listed = index.refresh()
             listing_s = time.perf_counter() - began
-            assert listed.read == count + 1 and not listed.skipped
-        processor_ms = 1e3 * (_all_processor_s() - before) / count
-        for path in list(folder.iterdir())[: -2 * EXAMINED]:
+            assert listed.read and not listed.skipped
+        processor_ms = 1e3 * (_all_processor_s() - before) / listed.read
+        for path in [path for path in folder.iterdir() if not path.name.endswith(REVIEW_SUFFIX)][:-EXAMINED]:
             path.unlink()
         with RunIndex(folder) as index:
             began = time.perf_counter()
             examined = index.examine().read
             examining_s = time.perf_counter() - began
-        return {
-            "files": count,
-            "listed_per_s": count / listing_s,
-            "listing_processor_ms": processor_ms,
-            "examined_per_s": examined / examining_s,
-        }
+    return {
+        "files": listed.read,
+        "of": "one recording" if real is None else "a folder",
+        "listed_per_s": listed.read / listing_s,
+        "listing_processor_ms": processor_ms,
+        "examined_per_s": examined / examining_s,
+    }
+
+
+def _link_one(folder: Path, count: int) -> None:
+    problem = load_scene(bundled_scenes()["mei_outliers_80"]).problem(0)
+    write_recording(estimate(problem, "mc"), folder / "0.rrd")
+    write_review(folder / "0.rrd", ["wrong map"], "Look again.")
+    for number in range(1, count):
+        os.link(folder / "0.rrd", folder / f"{number}.rrd")
+        if number % 2:
+            os.link(review_path(folder / "0.rrd"), review_path(folder / f"{number}.rrd"))
+
+
+def _link_all(folder: Path, real: Path) -> None:
+    for path in real.glob("*.rrd"):
+        os.link(path, folder / path.name)
 
 
 def _all_processor_s() -> float:
@@ -179,7 +192,7 @@ def _all_processor_s() -> float:
 
 def _report_files(found: dict[str, float]) -> None:
     print(
-        f"{found['files']:,.0f} files, every second one with labels: listed at {found['listed_per_s']:,.0f} a second "
+        f"{found['files']:,.0f} files, links to {found['of']}: listed at {found['listed_per_s']:,.0f} a second "
         f"({found['listing_processor_ms']:.2f} ms of processor time each), "
         f"examined at {found['examined_per_s']:,.0f} a second"
     )

@@ -90,6 +90,8 @@ def _properties(start: memoryview) -> tuple[dict[str, pa.RecordBatch], str]:
         if not entity.startswith(f"{_PROPERTIES}/"):  # the last of the properties is of the recording itself
             break
         found[entity.removeprefix(f"{_PROPERTIES}/")] = batch
+        if found.keys() >= {RUN_PROPERTY, THUMBNAIL_PROPERTY}:
+            break
     return found, run_id
 
 

@@ -36,7 +36,8 @@ THUMBNAIL_LIMIT_BYTES = 262_144
 THUMBNAIL_LIMIT_PX = 2_048
 """A side; a small file can claim a picture that fills the memory of a browser."""
 
-_TYPES: dict[str, Any] = get_type_hints(RunRow)
+_TYPES: dict[str, tuple[Any, ...]] = {name: get_args(kind) or (kind,) for name, kind in get_type_hints(RunRow).items()}
+"""What the value of each field of a row may be."""
 _LONG = ("options", "note")
 _PNG = b"\x89PNG\r\n\x1a\n\x00\x00\x00\x0dIHDR"
 _WORDS = {
@@ -89,21 +90,21 @@ def _bad(path: Path, what: str, value: Any) -> RecordingError:
 
 
 def _value_fits(name: str, value: Any) -> bool:
-    kind = _TYPES[name]
+    kinds = _TYPES[name]
     if value is None:
-        return type(None) in get_args(kind)
+        return type(None) in kinds
     if isinstance(value, bool):
-        return bool in (kind, *get_args(kind))
+        return bool in kinds
     if isinstance(value, str):
-        return str in (kind, *get_args(kind)) and _text_fits(name, value)
+        return str in kinds and _text_fits(name, value)
     if isinstance(value, bytes):
-        return kind is bytes and is_thumbnail(value)
+        return bytes in kinds and is_thumbnail(value)
     if isinstance(value, tuple):
         texts = [isinstance(item, str) and _text_fits(name, item) for item in value]
         return name == "labels" and len(value) <= LABELS_LIMIT and all(texts)
-    if isinstance(value, int) and int in (kind, *get_args(kind)):
+    if isinstance(value, int) and int in kinds:
         return -_INTEGER_LIMIT <= value < _INTEGER_LIMIT and _number_fits(name, value)
-    return isinstance(value, int | float) and float in (kind, *get_args(kind)) and _number_fits(name, value)
+    return isinstance(value, int | float) and float in kinds and _number_fits(name, value)
 
 
 def _text_fits(name: str, text: str) -> bool:
