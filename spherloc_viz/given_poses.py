@@ -12,6 +12,7 @@ from spherloc.diagnosis import Diagnosis, diagnose
 from spherloc.errors import InputError, SpherlocError, show
 from spherloc.estimators import default_options, estimate
 from spherloc.estimators.given_pose import LEAST
+from spherloc.files import is_folder
 from spherloc.formats.pose_files import read_poses
 from spherloc.metrics import evaluate
 from spherloc.outcome import Outcome, judge
@@ -25,6 +26,8 @@ from spherloc_viz.progress import prepare, progress, say
 from spherloc_viz.recording.origin import Origin
 
 ESTIMATOR = "given-pose"
+WITHOUT_POSE = "auto"
+"""Finds what can be found for a query that the other program gave no pose."""
 
 
 def diagnose_poses(
@@ -37,6 +40,7 @@ def diagnose_poses(
 ) -> int:
     """Diagnose every pose whose image is a query of one of the scenes or tables; returns the exit code.
 
+    Queries of a table without a pose are solved by ``WITHOUT_POSE``, where their gravity is stated.
     0 if all are localized, 1 if one is doubtful, 2 if something had to be left out. Raises ``InputError`` if no pose
     has a query.
     """
@@ -52,7 +56,7 @@ def diagnose_poses(
                     code = 2
                     continue
                 used.add(name)
-                trace = _run(problem, given[name], bound_px)
+                trace = _run(problem, given[name], bound_px) if name in given else estimate(problem, WITHOUT_POSE)
                 diagnosis, recording = diagnose(trace), None
                 if store is not None:
                     recording = store.record(trace, origin, diagnosis)
@@ -65,7 +69,8 @@ def diagnose_poses(
         raise InputError(
             f"{poses}: no image of a pose is a query of these scenes or matches; its images are such as {show(some)}."
         )
-    if left := [name for name in given if name not in used]:
+    # A COLMAP model has the images of the map beside the queries.
+    if not is_folder(poses) and (left := [name for name in given if name not in used]):
         say(f"{len(left):,} of {len(given):,} poses have no query in these scenes, such as {show(left[0])}.")
     return code
 
@@ -75,8 +80,14 @@ def _problems(
 ) -> Iterator[tuple[str, Problem | SpherlocError, Origin]]:
     """The name of the pose, the problem, and where it is from, of each query that has a pose."""
     if isinstance(path, MatchTable):
-        for name, one in path.problems(given):
-            yield name, one, Origin("command")
+        for name in path.matches:
+            if name in given or path.gravity is not None:
+                yield name, path.problem(name, given.get(name)), Origin("command")
+        if path.gravity is None and (lost := [name for name in path.matches if name not in given]):
+            say(
+                f"{path.path}: {len(lost):,} queries have no pose, such as {show(lost[0])}; give --gravity, a file "
+                "that says where down is, to see what their matches allow."
+            )
         return
     scene = load_scene(path)
     origin = Origin("command", str(path.resolve()), used_seed(scene, None))
@@ -125,6 +136,7 @@ def _print(name: str, trace: Trace, diagnosis: Diagnosis, recording: Path | None
             f", {metrics.rotation_error_deg:.3g} deg and {metrics.translation_error_m:.3g} {trace.problem.unit} off"
         )
     cause = f"{diagnosis.cause.value}. {diagnosis.summary}"
-    print(f"{name}: {int(trace.inlier_mask.sum())} of {len(trace.problem)} agree{errors}: {cause}", flush=True)
+    solved = "" if trace.estimator == ESTIMATOR else f"no pose was given, {trace.estimator} finds one with which "
+    print(f"{name}: {solved}{int(trace.inlier_mask.sum())} of {len(trace.problem)} agree{errors}: {cause}", flush=True)
     if recording is not None:
         print(f"    {recording}", flush=True)

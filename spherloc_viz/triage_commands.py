@@ -142,6 +142,7 @@ def diagnose(
     matches: OptionalPath = None,
     camera: OptionalPath = None,
     model: OptionalPath = None,
+    database: OptionalPath = None,
     gravity: OptionalPath = None,
     map_down: tuple[float, float, float] = (0.0, 0.0, -1.0),
     bound_px: OptionalFloat = None,
@@ -168,6 +169,8 @@ def diagnose(
 
     spherloc diagnose outputs/results.txt_logs.pkl --model outputs/sfm --label hloc
 
+    spherloc diagnose sparse/with_queries --model sparse/map --database database.db --gravity gravity.txt
+
     spherloc rerun recordings --label hloc --estimator mc-exact
 
     Args:
@@ -178,10 +181,12 @@ def diagnose(
         matches: The matches of all queries instead of scenes: a CSV with the columns name, u, v (px), X, Y, Z, and
             inlier (0 or 1) where that is known.
         camera: The calibration file of these queries.
-        model: The COLMAP model of the map, for a log of hloc without scenes.
+        model: The COLMAP model of the map, for a log of hloc without scenes, or with --database.
+        database: COLMAP's database instead of scenes: the verified matches of all images that --model lacks. With
+            --gravity those that COLMAP could not register are solved by auto and diagnosed too.
         gravity: Where down is in these queries: rows of "image gx gy gz [sd_deg]". Without it the given poses say so,
             to within 5 degrees.
-        map_down: With --matches or a log, the vector that points down in the map.
+        map_down: With --matches, --database or a log, the vector that points down in the map.
         bound_px: Bound on the noise of an inlier, px; the scene's, or 3, if not given.
         label: A label for all of these runs.
         json: Print one JSON object a pose, on one line; infinity is the text "inf".
@@ -197,13 +202,18 @@ def diagnose(
         raise InputError(f"{poses}: no such file; give a file of poses, or the folder of a COLMAP model.")
     from spherloc.formats.hloc_log import is_log
 
-    logged = not scenes and matches is None and is_log(poses)
-    if model is not None and not logged:
-        raise InputError("--model goes with hloc's log (.pkl) only, without scenes and without --matches.")
-    if not scenes and matches is None and not logged:
+    own = matches is None and database is None and not scenes
+    logged = own and is_log(poses)
+    if (model is not None) != (database is not None) and not (logged and database is None):
+        raise InputError("--model, the map, goes with --database, which needs it, or with hloc's log (.pkl).")
+    if sum((bool(scenes), matches is not None, database is not None)) > 1:
+        raise InputError("the matches come from scenes, from --matches or from --database; give one of them.")
+    if own and not logged:
         raise InputError("no scene given; name the scene files whose queries the poses are of, or give --matches.")
-    if (matches is None) != (camera is None) or (matches is None and gravity is not None and not logged):
-        raise InputError("--matches, the matches of all queries, needs --camera, and these go with --matches only.")
+    if (matches is None) != (camera is None) or (gravity is not None and scenes):
+        raise InputError(
+            "--matches needs --camera and goes with it only; --gravity does not go with scenes, which say that."
+        )
     files = [scene_path(scene) for scene in scenes]
     for file in files:
         check_there(file)
@@ -215,17 +225,18 @@ def diagnose(
     from spherloc_viz.given_poses import diagnose_poses
 
     kept = Records(recordings, keep_gigabytes=keep_gigabytes) if record else None
-    tables = []
-    if logged:
-        from spherloc.datasets.match_table import read_logged_matches
-        from spherloc_viz.progress import say
+    if scenes:
+        return diagnose_poses(poses, files, bound_px, label, json, kept)
+    from spherloc.datasets.match_table import read_database_matches, read_logged_matches, read_match_table
+    from spherloc_viz.progress import say
 
+    wrong: tuple[InputError, ...] = ()
+    if database is not None and model is not None:
+        table, wrong = read_database_matches(database, model, gravity, map_down)
+    elif matches is not None and camera is not None:
+        table = read_match_table(matches, camera, gravity, map_down)
+    else:
         table, wrong = read_logged_matches(poses, model, gravity, map_down)
-        for error in wrong:
-            say(f"{error} It is left out.")
-        tables = [table]
-    if matches is not None and camera is not None:
-        from spherloc.datasets.match_table import read_match_table
-
-        tables = [read_match_table(matches, camera, gravity, map_down)]
-    return diagnose_poses(poses, [*files, *tables], bound_px, label, json, kept)
+    for error in wrong:
+        say(f"{error} It is left out.")
+    return diagnose_poses(poses, [table], bound_px, label, json, kept)

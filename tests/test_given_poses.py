@@ -142,16 +142,16 @@ def test_matches_of_all_queries_come_in_one_table(tmp_path: Path) -> None:
     problem = scene_problem(NAME)
     down = tuple(2.0 * float(x) for x in problem.gravity_map)  # of any length
     table = read_match_table(matches, camera, gravity, down)
-    poses = {"a.jpg": true_pose(), "c.jpg": true_pose()}
-    ((name, read),) = table.problems(poses)
-    assert name == "a.jpg" and isinstance(read, Problem) and read.name == "a.jpg"
+    poses = {"a.jpg": true_pose()}
+    read = table.problem("a.jpg", poses["a.jpg"])
+    assert isinstance(read, Problem) and read.name == "a.jpg"
     np.testing.assert_array_equal(read.pixels, problem.pixels)
     np.testing.assert_array_equal(read.points, problem.points)
     np.testing.assert_allclose(read.gravity_map, problem.gravity_map, atol=1e-12)
     np.testing.assert_allclose(read.gravity_camera, problem.gravity_camera, atol=1e-12)
     assert read.gravity_bound_rad == 0.0 and list(table.matches) == ["b.jpg", "a.jpg"]
     # Without a gravity file the poses tell it.
-    ((_, read),) = read_match_table(matches, camera, None, down).problems(poses)
+    read = read_match_table(matches, camera, None, down).problem("a.jpg", poses["a.jpg"])
     assert isinstance(read, Problem) and read.gravity_source == "the given pose"
     np.testing.assert_allclose(read.gravity_camera, true_pose()[:, :3] @ problem.gravity_map, atol=1e-12)
     assert np.degrees(read.gravity_bound_rad) == pytest.approx(5.0)
@@ -192,9 +192,9 @@ def test_arguments_that_do_not_go_together(tmp_path: Path) -> None:
     poses.write_text("name,qw,qx,qy,qz,tx,ty,tz\n" + words("a.jpg", true_pose(), ","))
     for given, said in (
         ({}, "no scene given"),
-        ({"model": tmp_path}, "goes with hloc's log"),
+        ({"model": tmp_path}, "or with hloc's log"),
         ({"matches": matches}, "needs --camera"),
-        ({"gravity": gravity, "scene": bundled_scenes()[NAME]}, "go with --matches only"),
+        ({"gravity": gravity, "scene": bundled_scenes()[NAME]}, "does not go with scenes"),
         ({"matches": matches, "camera": camera, "map_down": (0.0, 0.0, 0.0)}, "has the length 0"),
     ):
         scenes = (given.pop("scene"),) if "scene" in given else ()

@@ -1,6 +1,6 @@
-"""Matches of many queries as another pipeline writes them beside its poses: one CSV with one camera, or hloc's log."""
+"""Matches of many queries of another pipeline: one CSV with one camera, hloc's log, or COLMAP's database."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,6 +11,7 @@ from spherloc.cameras.calibration import load_camera
 from spherloc.datasets.correspondences import read_csv_of_queries
 from spherloc.datasets.query_gravity import read_gravity_file
 from spherloc.errors import InputError, ProblemError
+from spherloc.formats.colmap_database import DatabaseQuery, read_queries_of_database
 from spherloc.formats.colmap_files import read_model
 from spherloc.formats.hloc_log import LoggedQuery, read_log
 from spherloc.frontend.view import Gravity
@@ -25,10 +26,10 @@ STATED_BOUND_RAD = float(np.radians(3.0))
 
 @dataclass(frozen=True, eq=False)
 class MatchTable:
-    """What a CSV of matches and a calibration file say, or a log of hloc, and, if there is one, a gravity file."""
+    """What a CSV of matches and a calibration file, a log of hloc or a database of COLMAP say, and a gravity file."""
 
     path: Path
-    """The CSV or the log."""
+    """The CSV, the log or the database."""
     matches: Mapping[str, tuple[FloatArray, BoolArray | None]]
     """Rows u, v (px), X, Y, Z (N, 5) and the mask of right ones (N,), if it is known, by the name of the query."""
     cameras: Mapping[str, Camera]
@@ -38,18 +39,17 @@ class MatchTable:
     gravity_map: FloatArray
     """Unit vector (3,) pointing down in the map."""
 
-    def problems(self, poses: Mapping[str, FloatArray]) -> Iterator[tuple[str, Problem | InputError]]:
-        """The problem, or what is wrong, of each query that has one of these poses ``cam_from_map`` (3, 4)."""
-        for name, (rows, inliers) in self.matches.items():
-            if name not in poses:
-                continue
-            try:
-                yield name, self._problem(name, rows, inliers, poses[name])
-            except (InputError, ProblemError) as error:
-                yield name, InputError(f"{self.path}: {error}")
+    def problem(self, name: str, pose: FloatArray | None) -> Problem | InputError:
+        """The problem of a query, or what is wrong with it; ``pose`` is its ``cam_from_map`` (3, 4), if it has one."""
+        try:
+            return self._problem(name, *self.matches[name], pose)
+        except (InputError, ProblemError) as error:
+            return InputError(f"{self.path}: {error}")
 
-    def _problem(self, name: str, rows: FloatArray, inliers: BoolArray | None, pose: FloatArray) -> Problem:
+    def _problem(self, name: str, rows: FloatArray, inliers: BoolArray | None, pose: FloatArray | None) -> Problem:
         if self.gravity is None:
+            if pose is None:
+                raise InputError(f"{name}: has no pose and no gravity; give --gravity, a file that says where down is.")
             down = pose[:, :3] @ self.gravity_map
             gravity = Gravity(down / np.linalg.norm(down), "the given pose", POSE_BOUND_RAD)
         elif name in self.gravity:
@@ -91,6 +91,21 @@ def read_logged_matches(
     """
     told = read_log(path, None if model is None else read_model(model))
     queries = {name: query for name, query in told.items() if isinstance(query, LoggedQuery)}
+    matches = {name: (np.hstack([query.pixels, query.points]), None) for name, query in queries.items()}
+    cameras = {name: query.camera for name, query in queries.items()}
+    wrong = tuple(query for query in told.values() if isinstance(query, InputError))
+    return _table(path, matches, cameras, gravity, gravity_map), wrong
+
+
+def read_database_matches(
+    path: Path, model: Path, gravity: Path | None, gravity_map: tuple[float, ...]
+) -> tuple[MatchTable, tuple[InputError, ...]]:
+    """Verified matches in COLMAP's database of images that the map lacks, and what is wrong with the others of them.
+
+    ``model`` is the folder of the map's COLMAP model. Raises ``InputError`` as ``read_match_table`` does.
+    """
+    told = read_queries_of_database(path, read_model(model))
+    queries = {name: query for name, query in told.items() if isinstance(query, DatabaseQuery)}
     matches = {name: (np.hstack([query.pixels, query.points]), None) for name, query in queries.items()}
     cameras = {name: query.camera for name, query in queries.items()}
     wrong = tuple(query for query in told.values() if isinstance(query, InputError))
