@@ -25,6 +25,7 @@ EXPORTS = {
     "Fisheye624": "cameras.fisheye624",
     "KannalaBrandt": "cameras.kannala_brandt",
     "Mei": "cameras.mei",
+    "Ocam": "cameras.ocam",
     "Problem": "problem",
     "Trace": "trace",
     "CalibrationError": "errors",

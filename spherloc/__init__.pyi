@@ -5,6 +5,7 @@ from spherloc.cameras.eucm import Eucm as Eucm
 from spherloc.cameras.fisheye624 import Fisheye624 as Fisheye624
 from spherloc.cameras.kannala_brandt import KannalaBrandt as KannalaBrandt
 from spherloc.cameras.mei import Mei as Mei
+from spherloc.cameras.ocam import Ocam as Ocam
 from spherloc.datasets import bundled_scenes as bundled_scenes
 from spherloc.datasets import load_scene as load_scene
 from spherloc.diagnosis import diagnose as diagnose

@@ -16,6 +16,7 @@ MODEL_NAMES = {
     "fisheye624": "FISHEYE624",
     "kannala_brandt": "Kannala-Brandt",
     "mei": "MEI",
+    "ocam": "OCamCalib",
 }
 """What people call a model; those that are not here are called as in files, with spaces."""
 

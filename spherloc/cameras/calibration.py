@@ -9,7 +9,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-from spherloc.cameras import tool_files
+from spherloc.cameras import ocam_files, tool_files
 from spherloc.cameras._checks import located
 from spherloc.cameras._files import KNOWN, UnrecognisedError, parse_json, parse_yaml, read_text, table_of, value_of
 from spherloc.cameras.base import Camera
@@ -35,7 +35,7 @@ def load_camera(path: str | Path, name: str | None = None) -> Camera:
     Recognised by content: a KITTI-360 YAML (``model_type: MEI``), a Kalibr camchain (``cam0``, ...: pinhole or omni
     with radtan, equidistant or none, ds, eucm), the YAML of stella_vslam (``Camera``), 360Loc (``imgw``) and
     fisheye-calib-adapter (``parameter``), that of OpenCV's samples and of ROS (``distortion_coefficients``), a Basalt
-    JSON (``value0``) and a TOML with a ``[camera]`` table or with its keys at the top. ``name`` picks a camera of a
+    JSON (``value0``), OCamCalib's ``calib_results.txt`` and a TOML with a ``[camera]`` table or with its keys at the top. ``name`` picks a camera of a
     camchain or of a Basalt JSON ("cam1"), by default its first one.
     Principal points that count from the centre of the top-left pixel are moved by +0.5 pixels to this project's
     convention (that centre is (0.5, 0.5)). A file of no such kind is given to the readers of other packages
@@ -77,6 +77,9 @@ def _own_kind(path: Path, name: str | None) -> Camera:
     text = read_text(path)
     if text.lstrip().startswith("{"):
         return _from_json(parse_json(text), name)
+    if ocam_files.is_ocam(text):
+        _refuse_name(name)
+        return ocam_files.ocam(text)
     if _looks_like_yaml(text):
         return _from_yaml(parse_yaml(text), name)
     return _from_toml(text, name)

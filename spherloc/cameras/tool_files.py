@@ -29,6 +29,7 @@ from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.cameras.eucm import Eucm
 from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.cameras.mei import Mei
+from spherloc.cameras.ocam import Ocam
 from spherloc.errors import CalibrationError, show
 from spherloc.types import FloatArray
 
@@ -126,7 +127,7 @@ def adapter(document: dict[Any, Any]) -> Camera:
                 return build(size, table)
         raise CalibrationError(
             f"the keys {show(sorted(map(str, table)))} are those of no supported model: "
-            "give the Kannala-Brandt, double sphere, EUCM or radtan file."
+            "give the Kannala-Brandt, double sphere, EUCM, OCamCalib or radtan file."
         )
 
 
@@ -173,6 +174,15 @@ def _perspective(size: Size, table: dict[Any, Any]) -> Camera:
     return Mei(*size, fx, fy, cx, cy, 0.0, (k1, k2, p1, p2))
 
 
+def _ocam(size: Size, table: dict[Any, Any]) -> Camera:
+    """Its axes are those of the image, unlike OCamCalib's own: u = c x + d y + cx, v = e x + y + cy, z ahead."""
+    c, d, e, cx, cy = numbers_of(table, "c", "d", "e", "cx", "cy")
+    with located("coefficients"):
+        polynomial = value_of(table_of(table["coefficients"]), "unprojection")
+    place = cx + PIXEL_CENTRE_SHIFT, cy + PIXEL_CENTRE_SHIFT
+    return Ocam(*size, *place, (c, d, e, 1.0), polynomial)
+
+
 _Build = Callable[[Size, dict[Any, Any]], Camera]
 
 _BASALT: dict[str, _Build] = {
@@ -188,6 +198,7 @@ _ADAPTER: tuple[tuple[tuple[str, ...], _Build], ...] = (
     (("alpha", "beta"), _eucm),
     (("k1", "k2", "k3", "k4"), _kannala_brandt),
     (("k1", "k2", "p1", "p2"), _perspective),
+    (("c", "d", "e", "coefficients"), _ocam),
 )
 
 

@@ -13,6 +13,7 @@ from spherloc.cameras.eucm import Eucm
 from spherloc.cameras.fisheye624 import Fisheye624
 from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.cameras.mei import Mei
+from spherloc.cameras.ocam import Ocam
 from tests.needs import DATA, real_data
 
 KITTI360_IMAGE_02 = Mei(
@@ -60,6 +61,14 @@ INLINE: dict[str, Camera] = {
     "eucm-infinite-image": Eucm(640, 480, 300.0, 301.0, 318.0, 243.0, 0.3, 0.7),
     "eucm-beyond-180": Eucm(1000, 1000, 350.0, 350.0, 500.0, 500.0, 0.75, 1.2),
     "eucm-pinhole": Eucm(640, 480, 320.0, 322.0, 318.0, 243.0, 0.0, 1.0),
+    "ocam-beyond-180": Ocam(
+        848,
+        800,
+        424.214757,
+        391.449324,
+        (1.0, -0.000071, -0.000325, 0.999134),
+        (289.5569, 0.0, -1.538894e-3, 3.140320e-6, -7.206996e-9),
+    ),
     "624-aria-rgb": Fisheye624(
         1408,
         1408,
