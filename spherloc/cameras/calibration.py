@@ -35,8 +35,8 @@ def load_camera(path: str | Path, name: str | None = None) -> Camera:
     Recognised by content: a KITTI-360 YAML (``model_type: MEI``), a Kalibr camchain (``cam0``, ...: pinhole or omni
     with radtan, equidistant or none, ds, eucm), the YAML of stella_vslam (``Camera``), 360Loc (``imgw``) and
     fisheye-calib-adapter (``parameter``), that of OpenCV's samples and of ROS (``distortion_coefficients``), a Basalt
-    JSON (``value0``), OCamCalib's ``calib_results.txt`` and a TOML with a ``[camera]`` table or with its keys at the top. ``name`` picks a camera of a
-    camchain or of a Basalt JSON ("cam1"), by default its first one.
+    JSON (``value0``), OCamCalib's ``calib_results.txt`` and a TOML with a ``[camera]`` table or with its keys at the
+    top. ``name`` picks a camera of a camchain or of a Basalt JSON ("cam1"), by default its first one.
     Principal points that count from the centre of the top-left pixel are moved by +0.5 pixels to this project's
     convention (that centre is (0.5, 0.5)). A file of no such kind is given to the readers of other packages
     (docs/extending.md).

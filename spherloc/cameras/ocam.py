@@ -117,6 +117,7 @@ class Ocam:
         return depth, slope
 
     def _angle(self, radius: FloatArray) -> FloatArray:
+        """(N,) to the optical axis, rad, at distances (N,)."""
         return np.arctan2(radius, self._depth(radius)[0])
 
     @cached_property
@@ -144,7 +145,11 @@ class Ocam:
         return np.where(inside, radius, np.nan)
 
     def project(self, points: FloatArray) -> tuple[FloatArray, BoolArray]:
-        """See ``Camera.project``; valid is what lies before the fold and within the circle about the image."""
+        """Pixels (N, 2) of camera-frame points (N, 3) in metres, and the mask (N,) of directions that are valid.
+
+        Valid is what lies before the fold and within the circle about the image; other pixels are NaN. Raises
+        ``ProblemError`` for a wrong shape.
+        """
         points = _checks.rows("points", points, 3)
         with np.errstate(all="ignore"):
             x, y, z = points.T
@@ -169,7 +174,10 @@ class Ocam:
         return x, y, depth, np.where(radius > 0.0, slope / radius, 0.0)
 
     def unproject(self, pixels: FloatArray) -> tuple[FloatArray, BoolArray]:
-        """See ``Camera.unproject``."""
+        """Unit bearings (N, 3) of pixels (N, 2), and the mask (N,) of pixels that the lens reaches.
+
+        Raises ``ProblemError`` for a wrong shape.
+        """
         with np.errstate(all="ignore"):
             x, y, depth, _ = self._rays(pixels)
             length = np.hypot(np.hypot(x, y), depth)
@@ -177,7 +185,7 @@ class Ocam:
         return bearings, ~np.isnan(bearings[:, 2])
 
     def unprojection_jacobian(self, pixels: FloatArray) -> FloatArray:
-        """See ``Camera.unprojection_jacobian``."""
+        """d bearing / d pixel (N, 3, 2), per pixel; NaN where ``unproject`` is invalid."""
         with np.errstate(all="ignore"):
             x, y, depth, growth = self._rays(pixels)
             length = np.hypot(np.hypot(x, y), depth)

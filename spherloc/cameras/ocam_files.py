@@ -1,7 +1,7 @@
 """OCamCalib's ``calib_results.txt``: lines of numbers between comments that say what they are.
 
-The toolbox counts rows and columns from the centre of the top-left pixel, (0, 0), its x axis points down along the rows,
-its y axis to the right and its z axis backwards.
+The toolbox counts rows and columns from the centre of the top-left pixel, (0, 0). Its x axis points down along the
+rows, its y axis to the right and its z axis backwards.
 """
 
 from spherloc.cameras._checks import finite
