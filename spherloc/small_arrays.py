@@ -147,10 +147,30 @@ MAX_INSERTED = 20
 
 
 @kernel()
-def sort_in_place(values):
-    """Sort ``values`` (N,) without NaN by quicksort."""
+def _insert(values, low, high):
+    """Sort ``values`` (N,) from index ``low`` to ``high`` by insertion."""
+    for k in range(low + 1, high + 1):
+        value, at = values[k], k
+        while at > low and values[at - 1] > value:
+            values[at] = values[at - 1]
+            at -= 1
+        values[at] = value
+
+
+@kernel()
+def sort_between(values, first, last):
+    """Sort ``values`` (N,) without NaN from index ``first`` to ``last``, by quicksort if they are many."""
+    if last - first < MAX_INSERTED:
+        _insert(values, first, last)
+    else:
+        _sort_many(values, first, last)
+
+
+@kernel()
+def _sort_many(values, first, last):
+    """Sort ``values`` (N,) without NaN from index ``first`` to ``last`` by quicksort."""
     waiting, count = np.empty((64, 2), np.int64), 1
-    waiting[0, 0], waiting[0, 1] = 0, len(values) - 1
+    waiting[0, 0], waiting[0, 1] = first, last
     while count > 0:
         count -= 1
         low, high = waiting[count, 0], waiting[count, 1]
@@ -174,9 +194,4 @@ def sort_in_place(values):
                 waiting[count, 0], waiting[count, 1] = i, high
                 high = j
             count += 1
-        for k in range(low + 1, high + 1):
-            value, at = values[k], k
-            while at > low and values[at - 1] > value:
-                values[at] = values[at - 1]
-                at -= 1
-            values[at] = value
+        _insert(values, low, high)

@@ -19,7 +19,7 @@ from spherloc.consensus.pose_search import (
     room_for,
     search_poses,
 )
-from spherloc.consensus.stabbing import EVERYWHERE, Scratch, deepest, keep_possible, scratch_for
+from spherloc.consensus.stabbing import EVERYWHERE, Scratch, deepest, find_windows, keep_possible, scratch_for
 from spherloc.kernel_cache import kernel
 from spherloc.small_arrays import copy_vector
 from spherloc.types import FloatArray
@@ -155,7 +155,7 @@ def search_boxes(matches, tasks, yaw_bound, memory, limits, found, board):
         kept, free = keep_possible(matches, cell, lists[first:last], target, scratch, cutoff, spread)
         if kept < 0:
             continue
-        bound, windows = deepest(scratch, kept, free, cutoff, yaw_bound)
+        bound = deepest(scratch, kept, free, cutoff, yaw_bound)
         if bound <= cutoff:
             continue
         index = state[SPLITS]
@@ -189,7 +189,7 @@ def search_boxes(matches, tasks, yaw_bound, memory, limits, found, board):
             continue
         copy_vector(lo[waiting], at_lower)
         copy_vector(up[waiting], at_upper)
-        for w in range(windows):
+        for w in range(find_windows(scratch, kept, free, cutoff, yaw_bound)):
             start, end = scratch.windows[w, 0], scratch.windows[w, 1]
             at_lower[3] = _yaw_of_turn(start) - 1e-12
             at_upper[3] = _yaw_of_turn(end) + 1e-12

@@ -9,7 +9,7 @@ import numpy as np
 from spherloc.consensus.pair_arcs import CIRCLE, direction_of_turn
 from spherloc.consensus.pose_cells import CELL_SIZE, HALF_ANGLES, HALF_C, HALF_S, YAW, has_tilt, place_cell
 from spherloc.consensus.pose_search import FORM, sort_matches
-from spherloc.consensus.stabbing import deepest, keep_possible
+from spherloc.consensus.stabbing import deepest, find_windows, keep_possible
 from spherloc.kernel_cache import kernel
 from spherloc.watch import DONE, stopped
 
@@ -68,10 +68,10 @@ def prove_cells(matches, chart, ends, claim, switch_rad, memory, cells, board):
                 first, last, known = last, last + undecided, known + sure
         else:
             kept, free = keep_possible(matches, cell, lists[first:last], target, scratch, -1, spread)
-            bound, windows = deepest(scratch, kept, free, claim, unknown)
+            bound = deepest(scratch, kept, free, claim, unknown)
             if bound <= claim:
                 again, free = keep_possible(matches, cell, everybody, spare, scratch, -1, spread)
-                bound, windows = deepest(scratch, again, free, claim, unknown)
+                bound = deepest(scratch, again, free, claim, unknown)
                 if bound <= claim:
                     used = _put(cells, used, lo[waiting], up[waiting], STABBED, bound)
                     continue
@@ -84,7 +84,7 @@ def prove_cells(matches, chart, ends, claim, switch_rad, memory, cells, board):
                     reach[a] = cell[HALF_ANGLES + a - YAW] if a > 3 else 0.0
             if np.sum(reach) <= switch_rad and waiting + len(scratch.windows) * 2 + 4 < MAX_WAITING:
                 again, free = keep_possible(matches, cell, everybody, spare, scratch, -1, spread)
-                bound, windows = deepest(scratch, again, free, claim, unknown)
+                windows = find_windows(scratch, again, free, claim, unknown)
                 used, waiting = _by_yaw(cells, used, lo, up, spans, waiting, (first, last, windows, claim), scratch)
                 continue
         split = np.argmax(reach)

@@ -10,8 +10,8 @@ and lowers azimuths atan2(z, x) by yaw. So:
   w in the middle and of v': a cap of radius e around v' spans asin(sin e / rho_v) of azimuth if it holds no pole.
 
 Every pose of the cell explains at most those whose interval holds its yaw, so the most intervals over one yaw bound
-the cell. They are counted in bins, both ends rounded outwards, and exactly where bins do not decide. Yaw is measured in
-turns of ``pair_arcs``, from 0 to 4, which need no trigonometry.
+the cell. They are counted in bins, both ends rounded outwards, and exactly in those that may be the deepest. Yaw is
+measured in turns of ``pair_arcs``, from 0 to 4, which need no trigonometry.
 """
 
 from typing import NamedTuple
@@ -37,15 +37,13 @@ from spherloc.consensus.pose_cells import (
     S,
 )
 from spherloc.kernel_cache import kernel
-from spherloc.small_arrays import copy_vector, fill_vector, sort_in_place
+from spherloc.small_arrays import copy_vector, sort_between
 from spherloc.types import FloatArray
 
 FEW_BINS, MANY_BINS = 256, 1024
 """Multiples of the bins of ``yaw_bins``."""
 MANY = 400
 """Matches from which the larger number of bins is used."""
-MAX_SORTED = 1500
-"""Intervals up to which the exact depth is found where bins do not decide."""
 MAX_WINDOWS = 64
 MAX_GAP = 0.004
 """Turns between two windows of yaw up to which they are one."""
@@ -60,15 +58,24 @@ class Scratch(NamedTuple):
     """(M,) first ends of the intervals, turns."""
     ends: FloatArray
     """(M,) last ends; smaller than the first where the interval holds turn 0; ``EVERYWHERE``."""
-    steps: NDArray[np.int32]
-    """(MANY_BINS + 2,) changes of depth from bin to bin."""
     windows: FloatArray
     """(MAX_WINDOWS, 2) where the depth exceeds the cutoff, turns; the last may end above 4."""
+    opened: NDArray[np.int32]
+    """(MANY_BINS,) how many intervals begin in each bin, then where those of deep bins end in ``opening``."""
+    closed: NDArray[np.int32]
+    """(MANY_BINS,) the same of last ends."""
+    before: NDArray[np.int32]
+    """(MANY_BINS,) depth where each bin begins."""
+    opening: FloatArray
+    """(M,) first ends in deep bins, by bin."""
+    closing: FloatArray
+    """(M,) last ends in deep bins, by bin."""
 
 
 def scratch_for(count: int) -> Scratch:
     """Room for cells of ``count`` matches."""
-    return Scratch(np.empty(count), np.empty(count), np.zeros(MANY_BINS + 2, np.int32), np.empty((MAX_WINDOWS, 2)))
+    turns, bins = np.empty((4, count)), np.empty((3, MANY_BINS), np.int32)
+    return Scratch(turns[0], turns[1], np.empty((MAX_WINDOWS, 2)), bins[0], bins[1], bins[2], turns[2], turns[3])
 
 
 @kernel(error_model="numpy")
@@ -122,8 +129,9 @@ def keep_possible(matches, cell, members, kept, scratch, cutoff, spread):
                 continue
             pole = below <= 0.0 or above <= 0.0
         kept[used] = k
-        near += 1.0 / distance
-        far += row[Q_NORM] / distance
+        inverse = 1.0 / distance
+        near += inverse
+        far += row[Q_NORM] * inverse
         if pole or delta_flat >= flat:
             starts[used], ends[used] = 0.0, EVERYWHERE
             free += 1
@@ -145,44 +153,130 @@ def keep_possible(matches, cell, members, kept, scratch, cutoff, spread):
 
 @kernel()
 def deepest(scratch, count, free, cutoff, yaw_bound):
-    """Most of ``count`` intervals over one yaw, and how many windows hold all yaws where that exceeds ``cutoff``.
+    """Most of ``count`` intervals over one yaw; where that does not exceed ``cutoff``, a bound on it.
 
-    Yaws where ``yaw_bound`` (B,), for bins of turn, does not exceed ``cutoff`` are left out.
+    Yaws where ``yaw_bound`` (B,), for bins of turn, does not exceed ``cutoff`` are left out if bins show that nothing
+    else exceeds it.
     """
-    starts, ends, windows = scratch.starts, scratch.ends, scratch.windows
-    bins = MANY_BINS if count >= MANY else FEW_BINS
-    per_turn = bins / CIRCLE
-    steps = scratch.steps
-    fill_vector(steps[: bins + 1], 0)
-    for k in range(count):
-        if ends[k] >= EVERYWHERE:
+    opened, before = scratch.opened, scratch.before
+    bins, depth = _count(scratch, count, free)
+    most, sure, wider = 0, cutoff, bins // len(yaw_bound)
+    for b in range(bins):
+        touching = before[b] + opened[b]
+        if touching > most and yaw_bound[b // wider] > cutoff:
+            most = touching
+        sure = max(sure, before[b])
+    if most <= sure:
+        return most
+    _sort_ends(scratch, count, bins, sure)
+    opening, closing, closed = scratch.opening, scratch.closing, scratch.closed
+    here, there = 0, 0
+    for b in range(bins):
+        if opened[b] < 0:
             continue
-        first, last = min(int(starts[k] * per_turn), bins - 1), min(int(ends[k] * per_turn), bins - 1)
-        steps[first] += 1
-        steps[last + 1] -= 1
-        if ends[k] < starts[k]:
-            steps[0] += 1
-    most, depth = 0, free
-    wider = bins // len(yaw_bound)
+        depth = before[b]
+        while here < opened[b]:
+            if there == closed[b] or opening[here] <= closing[there]:
+                depth += 1
+                here += 1
+                sure = max(sure, depth)
+            else:
+                depth -= 1
+                there += 1
+        there = closed[b]
+    return min(sure, most)
+
+
+@kernel()
+def find_windows(scratch, count, free, cutoff, yaw_bound):
+    """Write windows to ``scratch`` that hold all yaws where the depth, as in ``deepest``, exceeds ``cutoff``; returns
+    how many there are."""
+    windows, opened, closed, before = scratch.windows, scratch.opened, scratch.closed, scratch.before
+    opening, closing = scratch.opening, scratch.closing
+    bins, depth = _count(scratch, count, free)
+    found = _open_window(windows, 0, 0.0) if before[0] > cutoff else 0
+    _sort_ends(scratch, count, bins, cutoff)
+    here, there = 0, 0
     for b in range(bins):
-        depth += steps[b]
-        if depth > most and yaw_bound[b // wider] > cutoff:
-            most = depth
-    if most <= cutoff:
-        return most, 0
-    if count - free <= MAX_SORTED:
-        exact, used = _exactly(scratch, count, free, cutoff)
-        return min(exact, most), _clip_windows(windows, used, cutoff, yaw_bound) if exact > cutoff else 0
-    used, depth, inside = 0, free, False
+        if opened[b] < 0:
+            continue
+        depth = before[b]
+        while here < opened[b] or there < closed[b]:
+            if here < opened[b] and (there == closed[b] or opening[here] <= closing[there]):
+                depth += 1
+                if depth == cutoff + 1:
+                    found = _open_window(windows, found, opening[here])
+                here += 1
+            else:
+                if depth == cutoff + 1:
+                    windows[found - 1, 1] = closing[there]
+                depth -= 1
+                there += 1
+    if depth > cutoff and opened[bins - 1] >= 0:
+        windows[found - 1, 1] = CIRCLE
+    return _clip_windows(windows, found, cutoff, yaw_bound)
+
+
+@kernel()
+def _bin(turn, bins):
+    """The bin of a turn from 0 to 4."""
+    return min(int(turn * (bins / CIRCLE)), bins - 1)
+
+
+@kernel()
+def _count(scratch, count, free):
+    """Count the ends of ``count`` intervals by bin, ``free`` of them being the whole circle.
+
+    Returns how many bins there are, and the depth at the end of the circle.
+    """
+    starts, ends, opened, closed, before = scratch.starts, scratch.ends, scratch.opened, scratch.closed, scratch.before
+    bins = MANY_BINS if count >= MANY else FEW_BINS
     for b in range(bins):
-        depth += steps[b]
-        hot = depth > cutoff and yaw_bound[b // wider] > cutoff
-        if hot:
-            if not inside:
-                used = _open_window(windows, used, b / per_turn)
-            windows[used - 1, 1] = (b + 1) / per_turn
-        inside = hot
-    return most, used
+        opened[b] = closed[b] = 0
+    depth = free
+    for k in range(count):
+        if ends[k] < EVERYWHERE:
+            opened[_bin(starts[k], bins)] += 1
+            closed[_bin(ends[k], bins)] += 1
+            depth += ends[k] < starts[k]
+    for b in range(bins):
+        before[b] = depth
+        depth += opened[b] - closed[b]
+    return bins, depth
+
+
+@kernel()
+def _sort_ends(scratch, count, bins, cutoff):
+    """Sort the ends of ``count`` intervals in deep bins, those that more than ``cutoff`` intervals touch.
+
+    ``opened`` and ``closed`` become where those of each end in ``opening`` and ``closing``; -1 of other bins, where the
+    depth does not exceed ``cutoff``.
+    """
+    starts, ends, opened, closed, before = scratch.starts, scratch.ends, scratch.opened, scratch.closed, scratch.before
+    opening, closing = scratch.opening, scratch.closing
+    here, there = 0, 0
+    for b in range(bins):
+        if before[b] + opened[b] > cutoff:
+            opened[b], here = here, here + opened[b]
+            closed[b], there = there, there + closed[b]
+        else:
+            opened[b] = closed[b] = -1
+    for k in range(count):
+        if ends[k] < EVERYWHERE:
+            b = _bin(starts[k], bins)
+            if opened[b] >= 0:
+                opening[opened[b]] = starts[k]
+                opened[b] += 1
+            b = _bin(ends[k], bins)
+            if closed[b] >= 0:
+                closing[closed[b]] = ends[k]
+                closed[b] += 1
+    here, there = 0, 0
+    for b in range(bins):
+        if opened[b] >= 0:
+            sort_between(opening, here, opened[b] - 1)
+            sort_between(closing, there, closed[b] - 1)
+            here, there = opened[b], closed[b]
 
 
 @kernel()
@@ -213,36 +307,3 @@ def _open_window(windows, used, start):
         return used
     windows[used, 0] = windows[used, 1] = start
     return used + 1
-
-
-@kernel()
-def _exactly(scratch, count, free, cutoff):
-    """``deepest`` by sorting all ends: the depth, and how many windows were written to ``scratch.windows``."""
-    windows = scratch.windows
-    opening, closing = np.empty(count - free), np.empty(count - free)
-    used, depth = 0, free
-    for k in range(count):
-        if scratch.ends[k] < EVERYWHERE:
-            opening[used], closing[used] = scratch.starts[k], scratch.ends[k]
-            depth += scratch.ends[k] < scratch.starts[k]
-            used += 1
-    sort_in_place(opening)
-    sort_in_place(closing)
-    most, here, there, found = depth, 0, 0, 0
-    if depth > cutoff:
-        found = _open_window(windows, 0, 0.0)
-    while here < used or there < used:
-        if here < used and (there == used or opening[here] <= closing[there]):
-            depth += 1
-            if depth == cutoff + 1:
-                found = _open_window(windows, found, opening[here])
-            here += 1
-            most = max(most, depth)
-        else:
-            if depth == cutoff + 1:
-                windows[found - 1, 1] = closing[there]
-            depth -= 1
-            there += 1
-    if depth > cutoff:
-        windows[found - 1, 1] = CIRCLE
-    return most, found

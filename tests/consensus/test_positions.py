@@ -97,7 +97,7 @@ def test_many_poses_obey_the_bounds_of_their_cells(rng, scene_of, bound_rad):
         possible = np.empty(count, np.int32)
         many, free = keep_possible(matches, cell, everybody, possible, scratch, -1, spread)
         starts, ends = scratch.starts[:many].copy(), scratch.ends[:many].copy()
-        depth, _ = deepest(scratch, many, free, -1, np.full(256, count, np.int32))
+        depth = deepest(scratch, many, free, -1, np.full(256, count, np.int32))
         decided += count - undecided
         mates = []
         for k in range(90):
