@@ -162,6 +162,21 @@ def test_what_is_brushed_is_what_is_listed(desk: Desk) -> None:
     expect(desk.page.locator("#chips", has_text="rotation error")).to_be_visible()
 
 
+def test_unknown_values_can_be_brushed(desk: Desk) -> None:
+    desk.page.locator("#plot-x").select_option("certificate_gap")  # which mc does not have
+    box = desk.page.locator("#scatter").bounding_box()
+    assert box is not None
+    left, right = 46.0, 10.0  # margins of the plot, whose first 8 % are for what is unknown
+    strip_end = (left + 0.07 * (box["width"] - left - right)) / box["width"]
+    desk.drag("#scatter", (0.02, 0.02), (strip_end, 0.98))
+    desk.listed(SEEDS)
+    assert all(file.startswith("mc") for file in desk.files())
+    expect(desk.page.locator("#chips")).to_contain_text("certificate gap: unknown")
+    desk.page.reload()
+    desk.listed(SEEDS)
+    assert all(file.startswith("mc") for file in desk.files())
+
+
 def test_keys_label_move_and_undo(desk: Desk, folder: Path) -> None:
     page = desk.page
     first, second = desk.files()[:2]
