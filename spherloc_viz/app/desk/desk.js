@@ -553,11 +553,15 @@ async function openCompare() {
   for (const id of ["before", "after"]) {
     byId(id).replaceChildren(...sides().map((side) => element("option", { value: JSON.stringify(side), textContent: side[0] === "listed" || side[0] === "marked" ? side[1] : `${side[0]} ${side[2] || side[1]}` })));
   }
-  byId("after").selectedIndex = Math.min(1, byId("after").options.length - 1);
+  // Another night lies in another folder; without one two sets of this desk are compared.
+  const folder = sides().findIndex(([kind]) => kind === "folder");
+  byId("before").selectedIndex = Math.max(0, folder);
+  byId("after").selectedIndex = folder >= 0 ? 0 : Math.min(1, byId("after").options.length - 1);
 }
 
 async function doCompare() {
   const box = byId("compared");
+  if (byId("before").value === byId("after").value) { box.textContent = "Both are the same set: choose another one."; return; }
   box.textContent = "Comparing …";
   const [before, beforeName] = sideOf(byId("before").value), [after, afterName] = sideOf(byId("after").value);
   const side = (which, name) => (which.files ? { [name]: which.files }

@@ -129,6 +129,7 @@ class DeskRoom:
     def _run(self, file: str) -> dict[str, Any]:
         """What a panel shows of a run, from the list alone."""
         row = self._library.row(file)
+        errors = (words.angle(row.rotation_error_deg), words.distance(row.translation_error_m, row.metric))
         return {
             "file": row.file,
             "title": words.title_of(row),
@@ -139,7 +140,7 @@ class DeskRoom:
             "facts": [
                 f"{row.inliers:,} of {row.correspondences:,} inliers",
                 f"outliers {words.percent(row.outlier_rate)}",
-                f"{words.angle(row.rotation_error_deg)}, {words.distance(row.translation_error_m, row.metric)} off",
+                *([f"{', '.join(errors)} off"] if row.rotation_error_deg is not None else []),
                 words.duration(row.time_ms),
                 f"{row.estimator}, seed {row.seed}",
                 f"{row.source}, {words.clock(row.created)}",
