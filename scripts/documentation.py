@@ -11,7 +11,7 @@ from pathlib import Path
 from unittest import mock
 
 from scripts.drawing import Drawing
-from spherloc_viz.cli import app
+from spherloc_viz.commands.cli import app
 from tests.test_walls import FLOORS, MODULES, ROOT
 
 COMMANDS = ROOT / "docs" / "reference" / "commands.md"

@@ -17,9 +17,9 @@ import numpy as np
 from spherloc.experiments.summary import summarize
 from spherloc.verification.sessions import DATASETS, sessions_of
 from spherloc.worlds import Conditions
-from spherloc_viz.localize import Solving, localized
-from spherloc_viz.verification_datasets import measured_table, run_sessions
-from spherloc_viz.verification_pictures import failure_table, session_pictures
+from spherloc_viz.commands.localize import Solving, localized
+from spherloc_viz.commands.verify import measured_table, run_sessions
+from spherloc_viz.commands.verify_pictures import failure_table, session_pictures
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = ROOT / "docs" / "verification"

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from spherloc_viz.cli import main
+from spherloc_viz.commands.cli import main
 from tests.waiting import LIMIT_S
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -13,7 +13,7 @@ COMMAND = "from spherloc_viz.start import main\nmain()"
 SEVERAL = """
 import io, json, sys
 from contextlib import redirect_stderr, redirect_stdout
-from spherloc_viz.cli import main
+from spherloc_viz.commands.cli import main
 
 found = []
 for words in json.loads(sys.argv[1]):

@@ -23,7 +23,7 @@ from spherloc_viz.app.review.gallery_list import file_of, gallery_html
 from spherloc_viz.app.review.rows import DESK, WIDTH_PX, rows_html, verdict_html
 from spherloc_viz.app.review.run_library import RunLibrary, merged
 from spherloc_viz.app.web.touch import MAX_LETTERS, Touch, Touches, parse
-from spherloc_viz.cli import app
+from spherloc_viz.commands.cli import app
 from spherloc_viz.gallery import gallery_cases
 from spherloc_viz.recording.index.query import Range
 from spherloc_viz.recording.index.run_index import RunIndex

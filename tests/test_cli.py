@@ -18,7 +18,7 @@ from spherloc.diagnosis import Cause, Diagnosis
 from spherloc.errors import InputError
 from spherloc.estimators import estimate
 from spherloc.trace import Certificate
-from spherloc_viz import batch
+from spherloc_viz.commands import run
 from spherloc_viz.options import json_text
 from tests.needs import DATA, needs
 
@@ -127,10 +127,10 @@ def test_doubtful_runs_get_a_line_of_diagnosis() -> None:
     wrong = Diagnosis(
         Cause.GRAVITY_OFF, True, "It leans.", ("By 3 degrees.",), "Give better gravity.", True, np.eye(3, 4)
     )
-    text = batch.as_text(SCENE, trace, wrong, None)
+    text = run.as_text(SCENE, trace, wrong, None)
     assert "\n  diagnosis: gravity prior off. It leans. Give better gravity." in text
-    assert "diagnosis" not in batch.as_text(SCENE, trace, replace(wrong, cause=Cause.OK, doubtful=False), None)
-    record = json.loads(json_text(batch.as_record(SCENE, trace, wrong, None)))
+    assert "diagnosis" not in run.as_text(SCENE, trace, replace(wrong, cause=Cause.OK, doubtful=False), None)
+    record = json.loads(json_text(run.as_record(SCENE, trace, wrong, None)))
     assert record["diagnosis"]["cause"] == "gravity prior off" and record["diagnosis"]["evidence"] == ["By 3 degrees."]
     assert record["diagnosis"]["alternative_cam_from_map"] == np.eye(3, 4).tolist()
 
@@ -138,7 +138,7 @@ def test_doubtful_runs_get_a_line_of_diagnosis() -> None:
 def test_an_answer_that_cannot_be_known_is_said() -> None:
     trace = estimate(load_scene(SCENE).problem(), "mc")
     fine = Diagnosis(Cause.OK, False, "", (), "", True)
-    text = batch.as_text(SCENE, replace(trace, certificate=Certificate(6, 4, np.inf)), fine, None)
+    text = run.as_text(SCENE, replace(trace, certificate=Certificate(6, 4, np.inf)), fine, None)
     assert "not proven optimal: no pose explains more than 6, so at most 2 more" in text
     assert "The answer cannot be known: inf sets of 4 wrong matches" in text
 
@@ -175,8 +175,8 @@ class Every:
     ],
 )
 def test_option_values(monkeypatch: pytest.MonkeyPatch, setting: str, value: object) -> None:
-    monkeypatch.setattr(batch, "options_type", lambda name: Every)
-    found = batch.parse_settings("any", [setting])[setting.partition("=")[0]]
+    monkeypatch.setattr(run, "options_type", lambda name: Every)
+    found = run.parse_settings("any", [setting])[setting.partition("=")[0]]
     assert found == value and type(found) is type(value)
 
 
@@ -200,9 +200,9 @@ def test_option_values(monkeypatch: pytest.MonkeyPatch, setting: str, value: obj
     ],
 )
 def test_wrong_option_values_name_what_may_be_given(monkeypatch: pytest.MonkeyPatch, setting: str, said: str) -> None:
-    monkeypatch.setattr(batch, "options_type", lambda name: Every)
+    monkeypatch.setattr(run, "options_type", lambda name: Every)
     with pytest.raises(InputError) as error:
-        batch.parse_settings("any", [setting])
+        run.parse_settings("any", [setting])
     assert said in str(error.value)
 
 
@@ -325,7 +325,7 @@ def test_real_problems_from_the_command_line(tmp_path: Path, estimator: str) -> 
 
 def test_the_first_screen_names_every_command_and_fits() -> None:
     from scripts.documentation import commands
-    from spherloc_viz.overview import COMMANDS
+    from spherloc_viz.start import COMMANDS
 
     def start(*words: str) -> subprocess.CompletedProcess[str]:
         program = [sys.executable, "-c", "from spherloc_viz.start import main; main()", *words]

@@ -63,7 +63,7 @@ MISSING = (
 )
 ENDED = """
 import sys
-from spherloc_viz.cli import main
+from spherloc_viz.commands.cli import main
 try:
     main()
 except SystemExit as end:

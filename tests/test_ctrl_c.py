@@ -13,7 +13,7 @@ from spherloc.datasets import load_scene
 from spherloc.datasets.variation import Variation
 from spherloc.errors import InputError
 from spherloc.estimators import estimate, options_type
-from spherloc_viz.progress import solve
+from spherloc_viz.commands.progress import solve
 from spherloc_viz.recording.content.writer import write_recording
 from tests.waiting import LIMIT_S
 
@@ -23,8 +23,8 @@ MAX_ITERATIONS = 10_000_000
 PROGRAM = """
 import signal, sys
 signal.signal(signal.SIGINT, signal.default_int_handler)  # programs in the background begin without it
-from spherloc_viz import progress
-from spherloc_viz.cli import main
+from spherloc_viz.commands import progress
+from spherloc_viz.commands.cli import main
 progress.LINE_EVERY_S = 0.05
 main()
 """

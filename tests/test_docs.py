@@ -21,10 +21,10 @@ import yaml
 from scripts import documentation
 from spherloc import registry
 from spherloc.metrics import SUCCESS_DEG, SUCCESS_M
-from spherloc_viz import cli, recording_commands, triage_commands
 from spherloc_viz.app.catalog import Catalog
 from spherloc_viz.app.glossary import TERMS
 from spherloc_viz.app.session import DIAGNOSE_AFTER_S, QUIET_S
+from spherloc_viz.commands import cli
 from spherloc_viz.gallery import gallery_cases
 from spherloc_viz.recording.storage.room import KEEP_GIGABYTES
 from tests.needs import needs
@@ -149,8 +149,7 @@ def command(name: str) -> Callable[..., object] | None:
     """The function of a command; None if there is no such command."""
     if name not in documentation.commands():
         return None
-    name = name.replace("-", "_")
-    return next(getattr(module, name) for module in (cli, recording_commands, triage_commands) if hasattr(module, name))
+    return next(command for command in cli.COMMANDS if command.__name__ == name.replace("-", "_"))
 
 
 @functools.cache

@@ -16,7 +16,7 @@ from spherloc.datasets.map_scene import MapScene
 from spherloc.diagnosis import Cause
 from spherloc.errors import InputError
 from spherloc.metrics import evaluate
-from spherloc_viz.cli import app
+from spherloc_viz.commands.cli import app
 from spherloc_viz.gallery import GALLERY, gallery_cases
 from spherloc_viz.gallery.case import Played, agrees, faults, loose_numbers, play
 from spherloc_viz.gallery.file import parse_gallery

@@ -33,7 +33,7 @@ PROGRAM = """
 import contextlib, signal, sys, threading, time
 signal.signal(signal.SIGINT, signal.default_int_handler)  # programs in the background begin without it
 from pathlib import Path
-from spherloc_viz.cli import main
+from spherloc_viz.commands.cli import main
 from spherloc_viz.recording.sandbox import examiner
 sys.executable, examiner.FILE_LIMIT_S = sys.argv[1], 3600.0
 folder, pids = Path(sys.argv[2]), Path(sys.argv[3])

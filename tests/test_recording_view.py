@@ -29,7 +29,8 @@ from tests.waiting import LIMIT_S
 # A shell's background job, and what it starts, ignores SIGINT.
 PROGRAM = (
     "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-    "from spherloc_viz.cli import main; sys.argv = ['spherloc', 'view', *sys.argv[1:], '--web', '--port', '0']; main()"
+    "from spherloc_viz.commands.cli import main\n"
+    "sys.argv = ['spherloc', 'view', *sys.argv[1:], '--web', '--port', '0']; main()"
 )
 Run = tuple[Path, RunRow]
 

@@ -15,7 +15,7 @@ from spherloc.datasets.variation import Variation
 from spherloc.errors import InputError, RecordingError
 from spherloc.estimators import estimate, options_type
 from spherloc.trace import Certificate, Trace
-from spherloc_viz.batch import Records, run_scenes
+from spherloc_viz.commands.run import Records, run_scenes
 from spherloc_viz.recording import replay as repeating
 from spherloc_viz.recording.content.data import RecordedRun, read_recording
 from spherloc_viz.recording.content.writer import write_recording

@@ -12,10 +12,10 @@ import pytest
 from run_rows import some_row
 
 from spherloc.errors import RecordingError
+from spherloc_viz.commands.runs import reindex
 from spherloc_viz.recording.index import file as index_file
 from spherloc_viz.recording.index.query import RunQuery
 from spherloc_viz.recording.index.run_index import RunIndex
-from spherloc_viz.runs import reindex
 
 
 def foreign(path: Path) -> None:

@@ -14,6 +14,8 @@ from run_rows import random_row, some_row
 
 from spherloc.errors import InputError
 from spherloc.estimators import default_options, estimate
+from spherloc_viz.commands.recording_commands import label, reindex, runs, steps
+from spherloc_viz.commands.runs import diagnosis_of, sort_key
 from spherloc_viz.recording.content.writer import write_recording
 from spherloc_viz.recording.index.query import RunQuery
 from spherloc_viz.recording.index.run_index import RunIndex
@@ -22,8 +24,6 @@ from spherloc_viz.recording.index.steps import find_steps
 from spherloc_viz.recording.origin import Origin
 from spherloc_viz.recording.reviews import Review, read_review, write_review
 from spherloc_viz.recording.run_row import RunRow
-from spherloc_viz.recording_commands import label, reindex, runs, steps
-from spherloc_viz.runs import diagnosis_of, sort_key
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from cli_process import spherloc_here
 from spherloc.datasets import load_scene
 from spherloc.datasets.variation import Variation
 from spherloc.estimators import default_options, estimate, options_type
-from spherloc_viz.batch import run_scenes
+from spherloc_viz.commands.run import run_scenes
 from spherloc_viz.share import as_command, as_python
 from tests.datasets.test_rendered import SMALL
 from tests.waiting import LIMIT_S

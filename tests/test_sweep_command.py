@@ -15,15 +15,14 @@ from cli_process import spherloc_here
 
 from spherloc.errors import InputError
 from spherloc.experiments.sweep_rows import SweepRow, point_of
+from spherloc_viz.commands.sweep import parse_entrant, sweep, sweep_two
 from spherloc_viz.layers.sweep import LIMIT, sweep_charts, sweep_colors, sweep_table
 from spherloc_viz.plots import sweep_png
-from spherloc_viz.sweep import parse_entrant, sweep
-from spherloc_viz.sweep_map import sweep_two
 from tests.tiny_scene import write_tiny_scene
 from tests.waiting import LIMIT_S
 
 PROGRAM = [sys.executable, "-c", "import signal\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n"
-           "from spherloc_viz.cli import main\nmain()", "sweep"]  # fmt: skip
+           "from spherloc_viz.commands.cli import main\nmain()", "sweep"]  # fmt: skip
 """A shell's background job, and what it starts, ignores SIGINT."""
 NAME = "tiny $\\frac$"
 """Matplotlib would set it as mathematics."""

@@ -15,14 +15,14 @@ from spherloc.experiments.sweep import Entrant, Job, planned, run_sweep
 from spherloc.experiments.sweep_rows import Point
 from spherloc.experiments.sweep_workers import solve
 from spherloc.trace import Trace
-from spherloc_viz.batch import Records
+from spherloc_viz.commands.run import Records
+from spherloc_viz.commands.sweep import Recorded, sweep
 from spherloc_viz.recording.content.data import read_recording
 from spherloc_viz.recording.index.query import RunQuery
 from spherloc_viz.recording.index.run_index import RunIndex
 from spherloc_viz.recording.replay import reopen
 from spherloc_viz.recording.storage import store as storage
 from spherloc_viz.recording.storage.store import RecordingStore, SweepStore, sweep_run_id
-from spherloc_viz.sweep import Recorded, sweep
 
 ROOT = Path(__file__).resolve().parents[1]
 SCENE = ROOT / "scenes" / "mei_outliers_80.toml"

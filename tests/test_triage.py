@@ -9,12 +9,12 @@ from recording_samples import scene_problem
 from spherloc.errors import InputError, SpherlocError
 from spherloc.estimators import default_options, estimate
 from spherloc_viz.app.desk.files import save_set
-from spherloc_viz.batch import Records
+from spherloc_viz.commands.compare import compare_runs, rerun, wanted
+from spherloc_viz.commands.run import Records
 from spherloc_viz.recording.content.data import read_recording
 from spherloc_viz.recording.content.writer import write_recording
 from spherloc_viz.recording.index.query import RunQuery
 from spherloc_viz.recording.reviews import write_review
-from spherloc_viz.triage import compare_runs, rerun, wanted
 
 SPOILED = {"iterations": 1}
 """Options with which RANSAC fails."""

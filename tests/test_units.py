@@ -15,7 +15,7 @@ from spherloc.estimators import estimate, options_type
 from spherloc.experiments.configuration import configuration_of, read_configuration
 from spherloc.outcome import judge
 from spherloc_viz.app.text import summary_html
-from spherloc_viz.batch import as_text
+from spherloc_viz.commands.run import as_text
 from spherloc_viz.layers import paint, steps
 from spherloc_viz.layers.comparison import Entry, comparison_table
 from spherloc_viz.layers.explanation import explain

@@ -19,7 +19,7 @@ from spherloc.verification.experiments import EXPERIMENTS, METHODS, SCENES
 from spherloc.verification.measured import Measured
 from spherloc.verification.printed import STATEMENTS, Tables, printed_findings
 from spherloc.verification.sessions import printed_tables
-from spherloc_viz.verify_command import verify
+from spherloc_viz.commands.verify import verify
 
 GOOD, BAD = (0.1, 0.01), (30.0, 4.0)
 

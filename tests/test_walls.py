@@ -58,44 +58,13 @@ FLOORS = (
         "spherloc_viz.layers",
         "spherloc_viz.options",
         "spherloc_viz.given_files",
-        "spherloc_viz.overview",
         "spherloc_viz.share",
         "spherloc_viz",
     ),
-    (
-        "spherloc_viz.recording",
-        "spherloc_viz.plots",
-        "spherloc_viz.verification_page",
-        "spherloc_viz.verification_parts",
-        "spherloc_viz.verification_plots",
-    ),
+    ("spherloc_viz.recording", "spherloc_viz.plots"),
     ("spherloc_viz.gallery",),
     ("spherloc_viz.app", "spherloc_viz.lessons", "spherloc_viz.plugins"),
-    (
-        "spherloc_viz.arguments",
-        "spherloc_viz.batch",
-        "spherloc_viz.runs",
-        "spherloc_viz.recording_commands",
-        "spherloc_viz.given_poses",
-        "spherloc_viz.triage",
-        "spherloc_viz.triage_commands",
-        "spherloc_viz.localize",
-        "spherloc_viz.sweep",
-        "spherloc_viz.sweep_map",
-        "spherloc_viz.scene_list",
-        "spherloc_viz.lesson_command",
-        "spherloc_viz.map_report",
-        "spherloc_viz.map_command",
-        "spherloc_viz.map_job",
-        "spherloc_viz.verify_command",
-        "spherloc_viz.verification_datasets",
-        "spherloc_viz.verification_pictures",
-        "spherloc_viz.localize_comparison",
-        "spherloc_viz.progress",
-        "spherloc_viz.showing",
-        "spherloc_viz.cli",
-        "spherloc_viz.start",
-    ),
+    ("spherloc_viz.commands", "spherloc_viz.showing", "spherloc_viz.start"),
 )
 """From the ground up; a room is a module or a package with all of its files."""
 
@@ -213,8 +182,8 @@ def test_no_screen_is_loaded(packages):
 def test_the_command_line_answers_before_anything_large_is_loaded():
     """``spherloc --help`` and ``spherloc scenes`` are asked while somebody waits."""
     large = {"numba", "scipy", "cv2", "rerun", "viser", "pyarrow"}
-    assert not loaded_by(["spherloc_viz.cli", "spherloc_viz.recording_commands"]) & {*large, "numpy"}
-    scenes = "from spherloc_viz.scene_list import all_scenes; all_scenes()"
+    assert not loaded_by(["spherloc_viz.commands.cli", "spherloc_viz.commands.recording_commands"]) & {*large, "numpy"}
+    scenes = "from spherloc_viz.commands.bundled import all_scenes; all_scenes()"
     assert not told_by(scenes + LOADER.format(names=[])) & large
 
 

@@ -12,7 +12,7 @@ from spherloc.errors import InputError
 from spherloc.estimators.base import estimate
 from spherloc.geometry import camera_centre, rotation_angle
 from spherloc.worlds import build_world, render
-from spherloc_viz.verification_datasets import run_sessions, tables_text
+from spherloc_viz.commands.verify import run_sessions, tables_text
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
 

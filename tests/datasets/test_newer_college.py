@@ -28,7 +28,7 @@ from spherloc.errors import InputError
 from spherloc.estimators.base import estimate
 from spherloc.geometry import camera_centre, rotation_angle
 from spherloc.verification.sessions import DATASETS, sessions_of
-from spherloc_viz.verification_datasets import run_sessions
+from spherloc_viz.commands.verify import run_sessions
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
 

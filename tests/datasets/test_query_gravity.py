@@ -16,8 +16,8 @@ from spherloc.experiments.results import json_line, row_of_json
 from spherloc.experiments.sequence import localize
 from spherloc.frontend.view import Gravity, Matches, View
 from spherloc.geometry import DOWN
-from spherloc_viz.batch import as_record, as_text
-from spherloc_viz.localize import gravity_by_source as summed_up
+from spherloc_viz.commands.localize import gravity_by_source as summed_up
+from spherloc_viz.commands.run import as_record, as_text
 from tests.datasets.test_image_folder import CAMERA, POSED, make_tree
 from tests.tiny_scene import write_tiny_scene
 

@@ -22,17 +22,17 @@ from spherloc.errors import SpherlocError
 from spherloc.experiments import read_results
 from spherloc.trajectory import read_tum
 from spherloc.warm_up import warm_up
-from spherloc_viz.batch import Records
-from spherloc_viz.localize import Solving, compare_sequences, localize_sequence
+from spherloc_viz.commands.bundled import all_scenes, one_kind
+from spherloc_viz.commands.localize import Solving, compare_sequences, localize_sequence
+from spherloc_viz.commands.run import Records
 from spherloc_viz.plots import trajectory_png
 from spherloc_viz.recording.content.data import read_recording
-from spherloc_viz.scene_list import all_scenes, one_kind
 from tests.cli_process import spherloc_here
 from tests.waiting import LIMIT_S
 
 ROOT = Path(__file__).resolve().parents[2]
 PROGRAM = [sys.executable, "-c", "import signal\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n"
-           "from spherloc_viz.cli import main\nmain()", "localize"]  # fmt: skip
+           "from spherloc_viz.commands.cli import main\nmain()", "localize"]  # fmt: skip
 """A shell's background job, and what it starts, ignores SIGINT."""
 
 

@@ -19,8 +19,7 @@ from spherloc.mapping.make import Measured, make_map, scale_of
 from spherloc.mapping.photographs import frames_of, photographs
 from spherloc.mapping.upright import Level, gravity_by_lines, level_of, scale_by_height, upright_frame
 from spherloc.problem import Problem
-from spherloc_viz import map_job
-from spherloc_viz.map_report import map_report
+from spherloc_viz.commands.map import main, map_report
 
 IMAGES = ("reference_002", "reference_003", "reference_004", "reference_005", "reference_006")
 
@@ -124,7 +123,7 @@ def test_the_calibration_beside_the_photographs_is_taken(tmp_path, rng):
 
 def test_a_job_tells_what_went_wrong_in_a_line(tmp_path, rng, capsys):
     picture(tmp_path / "a.png", 400, 300, rng)
-    assert map_job.main(tmp_path, tmp_path / "map") == 1
+    assert main(tmp_path, tmp_path / "map") == 1
     (said,) = map(json.loads, capsys.readouterr().out.splitlines())
     assert "--camera FILE" in said["error"]
 

@@ -13,7 +13,7 @@ import viser
 
 from spherloc_viz.app.text import box, status_html
 
-MODULE = "spherloc_viz.map_job"
+MODULE = "spherloc_viz.commands.map"
 MAX_LETTERS = 20_000
 """Of a line that the process tells."""
 OUTPUT = "_map"

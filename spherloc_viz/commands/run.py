@@ -20,9 +20,9 @@ from spherloc.outcome import Outcome, judge
 from spherloc.problem import Problem
 from spherloc.trace import Trace
 from spherloc.warm_up import warm_up
+from spherloc_viz.commands.progress import prepare, say, solve
 from spherloc_viz.given_files import is_recording
 from spherloc_viz.options import json_text, option_fields
-from spherloc_viz.progress import prepare, say, solve
 from spherloc_viz.recording.origin import Origin
 from spherloc_viz.recording.storage.room import kept_bytes
 

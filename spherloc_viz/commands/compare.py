@@ -23,16 +23,16 @@ from spherloc_viz.app.desk.comparison import (
     parse_condition,
 )
 from spherloc_viz.app.desk.report import comparison_html, comparison_text
-from spherloc_viz.batch import Records, parse_settings, store_of
+from spherloc_viz.commands.progress import progress, say, solve
+from spherloc_viz.commands.run import Records, parse_settings, store_of
+from spherloc_viz.commands.runs import rows_at
 from spherloc_viz.options import json_text
-from spherloc_viz.progress import progress, say, solve
 from spherloc_viz.recording.index.query import RunQuery
 from spherloc_viz.recording.origin import Origin
 from spherloc_viz.recording.replay import load_recorded_scene, recorded_options
 from spherloc_viz.recording.run_row import RunRow
 from spherloc_viz.recording.sandbox.examiner import examine
 from spherloc_viz.recording.storage.store import RecordingStore
-from spherloc_viz.runs import rows_at
 
 
 @dataclass(frozen=True)

@@ -20,9 +20,9 @@ from spherloc.problem import Problem
 from spherloc.trace import Trace
 from spherloc.trajectory import wxyz_from_rotation
 from spherloc.types import FloatArray
-from spherloc_viz.batch import Records, as_record, store_of
+from spherloc_viz.commands.progress import prepare, progress, say
+from spherloc_viz.commands.run import Records, as_record, store_of
 from spherloc_viz.options import json_text
-from spherloc_viz.progress import prepare, progress, say
 from spherloc_viz.recording.origin import Origin
 
 ESTIMATOR = "given-pose"

@@ -9,8 +9,8 @@ from pathlib import Path
 from spherloc import registry
 from spherloc.diagnosis import Cause
 from spherloc.errors import InputError, RecordingError, show
+from spherloc_viz.commands.progress import progress, say
 from spherloc_viz.given_files import check_recording_file, check_recordings_folder, is_recording
-from spherloc_viz.progress import progress, say
 from spherloc_viz.recording.index.query import GROUP_KEYS, OUTCOMES, SORT_KEYS, SOURCES, RunQuery
 from spherloc_viz.recording.index.refresher import Progress, Refreshed
 from spherloc_viz.recording.index.run_index import RunIndex

@@ -1,34 +1,28 @@
-"""The command line: what each command takes; the work is done elsewhere."""
+"""What the commands take that solve problems; the work is done by the other modules of this folder."""
 
-import contextlib
-import io
 import os
-import sys
 from collections.abc import Sequence
 from itertools import chain
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
 from tyro.conf import Positional, arg
-from tyro.extras import SubcommandApp
 
-from spherloc.errors import InputError, SpherlocError, reason, show
-from spherloc_viz import given_files, recording_commands, triage_commands
-from spherloc_viz.arguments import OptionalFloat, OptionalNumber, OptionalPath, OptionalText, refuse_repeated
-
-RECORDINGS = Path("recordings")
-Settings = Annotated[tyro.conf.UseAppendAction[tuple[tuple[str, ...], ...]], arg(metavar="KEY=VALUE ...")]
-"""Several after one flag, or the flag several times."""
-INTERRUPTED = 130
-"""Exit code after Ctrl-C, as shells have it."""
-BROKEN_PIPE = 141
-"""The same where the reader of the output has gone."""
-
-app = SubcommandApp()
+from spherloc.errors import InputError
+from spherloc_viz import given_files
+from spherloc_viz.commands.flags import (
+    INTERRUPTED,
+    RECORDINGS,
+    Flag,
+    OptionalFloat,
+    OptionalNumber,
+    OptionalPath,
+    OptionalText,
+    Settings,
+)
 
 
-@app.command
 def run(
     scenes: Positional[tuple[Path, ...]],
     /,
@@ -40,9 +34,9 @@ def run(
     spoil: OptionalText = None,
     mend: OptionalText = None,
     hide: OptionalText = None,
-    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
+    json: Flag = False,
     record: bool = True,
-    full: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
+    full: Flag = False,
     recordings: Path = RECORDINGS,
     keep_gigabytes: OptionalFloat = None,
     query: OptionalText = None,
@@ -91,16 +85,15 @@ def run(
     if given_files.none_there(paths, given_files.check_scene_file):
         return 2
     from spherloc.datasets.variation import parse_variation
-    from spherloc_viz import batch
+    from spherloc_viz.commands.run import Records, run_scenes
 
     variation = parse_variation(list(chain(*set)), spoil, mend, hide)
-    kept = batch.Records(recordings, full, keep_gigabytes) if record else None
-    return batch.run_scenes(
+    kept = Records(recordings, full, keep_gigabytes) if record else None
+    return run_scenes(
         paths, estimator, seed, list(chain(*option)), json, kept, query=query, variation=variation, proof=proof
     )
 
 
-@app.command
 def localize(
     scenes: Positional[tuple[Path, ...]],
     /,
@@ -114,7 +107,7 @@ def localize(
     record: bool = True,
     recordings: OptionalPath = None,
     keep_gigabytes: OptionalFloat = None,
-    retry_failed: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
+    retry_failed: Flag = False,
 ) -> int:
     """Localize a sequence of query images against a map, or compare estimators on several.
 
@@ -162,8 +155,8 @@ def localize(
         raise InputError("no scene given; name one or more scene files or bundled scenes, such as street_fisheye.")
     for path in paths:
         check_there(path)
-    from spherloc_viz.batch import Records
-    from spherloc_viz.localize import Solving, compare_sequences, localize_sequence
+    from spherloc_viz.commands.localize import Solving, compare_sequences, localize_sequence
+    from spherloc_viz.commands.run import Records
 
     def solving(name: str, folder: Path) -> Solving:
         kept = Records(recordings or folder / "recordings", keep_gigabytes=keep_gigabytes) if record else None
@@ -189,7 +182,163 @@ def _name_and_options(text: str, common: Sequence[Sequence[str]]) -> tuple[str, 
     return name, (*chain(*common), *options)
 
 
-@app.command
+def diagnose(
+    poses: Positional[Path],
+    scenes: Positional[tuple[Path, ...]] = (),
+    /,
+    *,
+    matches: OptionalPath = None,
+    camera: OptionalPath = None,
+    model: OptionalPath = None,
+    database: OptionalPath = None,
+    gravity: OptionalPath = None,
+    map_down: tuple[float, float, float] = (0.0, 0.0, -1.0),
+    bound_px: OptionalFloat = None,
+    label: OptionalText = None,
+    json: Flag = False,
+    record: bool = True,
+    recordings: Path = RECORDINGS,
+    keep_gigabytes: OptionalFloat = None,
+) -> int:
+    """Record and diagnose poses that another program found, such as hloc or COLMAP.
+
+    Every pose becomes a run of the query of that name, with the scene's matches: what agrees with it, what is wrong
+    with it, and a better pose where there is one. The playground, the triage desk and spherloc rerun take these runs
+    as any other. Poses are x_cam = R x_map + t. Ends with 0 if all are localized, 1 if one is doubtful, 2 if a query
+    had to be left out.
+
+    For example:
+
+    spherloc diagnose hloc_results.txt hloc.toml --label hloc
+
+    spherloc diagnose poses.csv queries/*.toml --bound-px 4 --json
+
+    spherloc diagnose poses.csv --matches matches.csv --camera camera.yaml --gravity gravity.txt
+
+    spherloc diagnose outputs/results.txt_logs.pkl --model outputs/sfm --label hloc
+
+    spherloc diagnose sparse/with_queries --model sparse/map --database database.db --gravity gravity.txt
+
+    spherloc rerun recordings --label hloc --estimator mc-exact
+
+    Args:
+        poses: A CSV with the columns name, qw, qx, qy, qz, tx, ty, tz; hloc's results (lines of the same); hloc's log
+            (.pkl), which has the matches too, so that no scene is needed; or the folder of a COLMAP model.
+        scenes: Scene files whose queries they are: of a map with images (hloc, COLMAP and others), or matches in a CSV
+            (kind "correspondences"), named by the problem, its image or the file. None with --matches.
+        matches: The matches of all queries instead of scenes: a CSV with the columns name, u, v (px), X, Y, Z, and
+            inlier (0 or 1) where that is known.
+        camera: The calibration file of these queries.
+        model: The COLMAP model of the map, for a log of hloc without scenes, or with --database.
+        database: COLMAP's database instead of scenes: the verified matches of all images that --model lacks. With
+            --gravity those that COLMAP could not register are solved by auto and diagnosed too.
+        gravity: Where down is in these queries: rows of "image gx gy gz [sd_deg]". Without it the given poses say so,
+            to within 5 degrees.
+        map_down: With --matches, --database or a log, the vector that points down in the map.
+        bound_px: Bound on the noise of an inlier, px; the scene's, or 3, if not given.
+        label: A label for all of these runs.
+        json: Print one JSON object a pose, on one line; infinity is the text "inf".
+        record: Write a recording of each.
+        recordings: Folder of the recordings.
+        keep_gigabytes: What the recordings may take (2, or what is there if that is more); beyond it the oldest
+            successes that nobody labelled are deleted.
+    """
+    from spherloc.datasets.scene_file import check_there, scene_path
+
+    if not poses.exists():
+        raise InputError(f"{poses}: no such file; give a file of poses, or the folder of a COLMAP model.")
+    from spherloc.formats.hloc_log import is_log
+
+    own = matches is None and database is None and not scenes
+    logged = own and is_log(poses)
+    if (model is not None) != (database is not None) and not (logged and database is None):
+        raise InputError("--model, the map, goes with --database, which needs it, or with hloc's log (.pkl).")
+    if sum((bool(scenes), matches is not None, database is not None)) > 1:
+        raise InputError("the matches come from scenes, from --matches or from --database; give one of them.")
+    if own and not logged:
+        raise InputError("no scene given; name the scene files whose queries the poses are of, or give --matches.")
+    if (matches is None) != (camera is None) or (gravity is not None and scenes):
+        raise InputError(
+            "--matches needs --camera and goes with it only; --gravity does not go with scenes, which say that."
+        )
+    files = [scene_path(scene) for scene in scenes]
+    for file in files:
+        check_there(file)
+    if label is not None:
+        from spherloc_viz.recording.reviews import checked_review
+
+        checked_review([label], "")
+    from spherloc_viz.commands.diagnose import diagnose_poses
+    from spherloc_viz.commands.run import Records
+
+    kept = Records(recordings, keep_gigabytes=keep_gigabytes) if record else None
+    if scenes:
+        return diagnose_poses(poses, files, bound_px, label, json, kept)
+    from spherloc.datasets.match_table import read_database_matches, read_logged_matches, read_match_table
+    from spherloc_viz.commands.progress import say
+
+    wrong: tuple[InputError, ...] = ()
+    if database is not None and model is not None:
+        table, wrong = read_database_matches(database, model, gravity, map_down)
+    elif matches is not None and camera is not None:
+        table = read_match_table(matches, camera, gravity, map_down)
+    else:
+        table, wrong = read_logged_matches(poses, model, gravity, map_down)
+    for error in wrong:
+        say(f"{error} It is left out.")
+    return diagnose_poses(poses, [table], bound_px, label, json, kept)
+
+
+def map(
+    folder: Positional[Annotated[Path, arg(metavar="FOLDER")]],
+    /,
+    *,
+    camera: OptionalPath = None,
+    video: OptionalPath = None,
+    frames: int = 40,
+    output: OptionalPath = None,
+    camera_height: OptionalFloat = None,
+    distance: Annotated[tuple[str, str, float] | None, arg(metavar="IMAGE IMAGE METRES", help_behavior_hint="")] = None,
+    localize: OptionalPath = None,
+) -> int:
+    """Make a map of your own photographs: panoramas, or images of one calibrated wide camera.
+
+    Features, matches, COLMAP's structure from motion, which way is down, and scale if you give one; then a scene file
+    that opens at once. Needs the extra colmap. Stop it when you like: the same command goes on. Ends with 0 if all
+    images are in the map, 1 if some are not (report.html says why), 2 if an input is wrong.
+
+    For example:
+
+    spherloc map my_panoramas
+
+    spherloc map my_fisheyes --camera calibration.yaml --camera-height 1.6
+
+    spherloc map frames --video walk.mp4 --localize new_photographs
+
+    Args:
+        folder: Folder of the photographs; with --video, where its frames are put.
+        camera: Calibration file of the camera; without it, images of 2 to 1 are taken for full panoramas.
+        video: Take frames from this video first, the sharpest of each stretch.
+        frames: How many frames to take.
+        output: Folder of the map; FOLDER_map here if not given.
+        camera_height: Metres of the cameras above the ground: gives the scale.
+        distance: Two images by name and the metres between them: gives the scale.
+        localize: Folder of other images of that camera; a scene is written that localizes them in the map.
+    """
+    from spherloc.mapping.make import Measured
+    from spherloc_viz.commands.map import make
+
+    if camera_height is not None and distance is not None:
+        raise InputError("--camera-height and --distance both give the scale; keep one.")
+    for flag, metres in (("--camera-height", camera_height), ("--distance", distance and distance[2])):
+        if metres is not None and not 0.0 < metres < 1e6:
+            raise InputError(f"{flag} is {metres:g}; give a positive number of metres.")
+    if not 2 <= frames <= 500:
+        raise InputError(f"--frames is {frames}; give a number from 2 to 500.")
+    taken = None if video is None else (video, frames)
+    return make(folder, output, camera, taken, Measured(camera_height, distance), localize)
+
+
 def sweep(
     scenes: Positional[tuple[Path, ...]],
     /,
@@ -258,7 +407,7 @@ def sweep(
     if not scenes:
         raise InputError("no scene given; name one or more, such as mei_outliers_80, or all.")
     if [str(scene) for scene in scenes] == ["all"]:
-        from spherloc_viz.sweep import bundled_simulations
+        from spherloc_viz.commands.sweep import bundled_simulations
 
         scenes = bundled_simulations()
     files = [scene_path(scene) for scene in scenes]
@@ -266,10 +415,9 @@ def sweep(
         check_there(file)
     if out is not None and len(files) > 1:
         raise InputError(f"--out {out} takes one scene, not {len(files)}; leave it out, and each gets a file.")
-    from spherloc_viz.batch import Records
-    from spherloc_viz.sweep import all_estimators
-    from spherloc_viz.sweep import sweep as do_sweep
-    from spherloc_viz.sweep_map import sweep_two
+    from spherloc_viz.commands.run import Records
+    from spherloc_viz.commands.sweep import all_estimators, sweep_two
+    from spherloc_viz.commands.sweep import sweep as do_sweep
 
     chosen = all_estimators() if estimator == ("all",) else estimator or ("mc", "ransac-2p")
     kept = Records(recordings, keep_gigabytes=keep_gigabytes) if record else None
@@ -311,178 +459,8 @@ def sweep(
     return 0
 
 
-@app.command
-def play(
-    scene: Positional[Annotated[Path | None, arg(metavar="[PATH]", help_behavior_hint="")]] = None,
-    /,
-    *,
-    host: str = "127.0.0.1",
-    port: int = 8080,
-    record: bool = True,
-    recordings: Path = RECORDINGS,
-    keep_gigabytes: OptionalFloat = None,
-    allow: tyro.conf.UseAppendAction[tuple[Path, ...]] = (),
-    token: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
-) -> int:
-    """Open the playground in a browser and print its address.
-
-    For example:
-
-    spherloc play
-
-    spherloc play panorama_outliers_90 --port 9000
-
-    spherloc play RUN.rrd
-
-    spherloc play --allow ~/maps
-
-    spherloc play --host 0.0.0.0
-
-    Args:
-        scene: Scene file (TOML), bundled scene's name, or recording (.rrd), whose run is opened, to start with; a
-            bundled scene if not given.
-        host: Address to listen on. Beyond this machine the printed links carry tokens: one link is yours, the other is
-            for an audience, which can only look.
-        port: Port to listen on; 0 takes a free one.
-        record: Write a recording of each run that is settled on.
-        recordings: Folder of the recordings.
-        keep_gigabytes: What the recordings may take (2, or what is there if that is more); beyond it the oldest
-            successes that nobody labelled are deleted.
-        allow: Another folder that pages may open scenes from; give it once for each.
-        token: Demand a token on this machine too, where others have accounts on it.
-    """
-    from spherloc.datasets import scene_path
-
-    start = None if scene is None else scene_path(scene)
-    if start is not None:
-        given_files.check_scene_file(start)
-    from spherloc_viz.app.server import serve
-
-    serve(start, host, port, recordings, record=record, allow=allow, keep_gigabytes=keep_gigabytes, token=token)
-    return 0
-
-
-@app.command
-def map(
-    folder: Positional[Annotated[Path, arg(metavar="FOLDER")]],
-    /,
-    *,
-    camera: OptionalPath = None,
-    video: OptionalPath = None,
-    frames: int = 40,
-    output: OptionalPath = None,
-    camera_height: OptionalFloat = None,
-    distance: Annotated[tuple[str, str, float] | None, arg(metavar="IMAGE IMAGE METRES", help_behavior_hint="")] = None,
-    localize: OptionalPath = None,
-) -> int:
-    """Make a map of your own photographs: panoramas, or images of one calibrated wide camera.
-
-    Features, matches, COLMAP's structure from motion, which way is down, and scale if you give one; then a scene file
-    that opens at once. Needs the extra colmap. Stop it when you like: the same command goes on. Ends with 0 if all
-    images are in the map, 1 if some are not (report.html says why), 2 if an input is wrong.
-
-    For example:
-
-    spherloc map my_panoramas
-
-    spherloc map my_fisheyes --camera calibration.yaml --camera-height 1.6
-
-    spherloc map frames --video walk.mp4 --localize new_photographs
-
-    Args:
-        folder: Folder of the photographs; with --video, where its frames are put.
-        camera: Calibration file of the camera; without it, images of 2 to 1 are taken for full panoramas.
-        video: Take frames from this video first, the sharpest of each stretch.
-        frames: How many frames to take.
-        output: Folder of the map; FOLDER_map here if not given.
-        camera_height: Metres of the cameras above the ground: gives the scale.
-        distance: Two images by name and the metres between them: gives the scale.
-        localize: Folder of other images of that camera; a scene is written that localizes them in the map.
-    """
-    from spherloc.mapping.make import Measured
-    from spherloc_viz.map_command import make
-
-    if camera_height is not None and distance is not None:
-        raise InputError("--camera-height and --distance both give the scale; keep one.")
-    for flag, metres in (("--camera-height", camera_height), ("--distance", distance and distance[2])):
-        if metres is not None and not 0.0 < metres < 1e6:
-            raise InputError(f"{flag} is {metres:g}; give a positive number of metres.")
-    if not 2 <= frames <= 500:
-        raise InputError(f"--frames is {frames}; give a number from 2 to 500.")
-    taken = None if video is None else (video, frames)
-    return make(folder, output, camera, taken, Measured(camera_height, distance), localize)
-
-
-@app.command
-def lesson(
-    name: Positional[Annotated[str | None, arg(metavar="[NAME]", help_behavior_hint="")]] = None,
-    /,
-    export: OptionalPath = None,
-    handout: OptionalPath = None,
-) -> int:
-    """List the lessons, or write one as a file for machines without spherloc or for paper.
-
-    The lessons themselves are at /learn of the playground. An exported lesson is one HTML file with the scenes of all
-    its moments, which opens in any browser without a network; it has no sliders.
-
-    For example:
-
-    spherloc lesson
-
-    spherloc lesson ransac --export ransac.html
-
-    spherloc lesson ransac --handout ransac-handout.html
-
-    Args:
-        name: The lesson.
-        export: HTML file to write, with recorded scenes.
-        handout: HTML file to write, to be printed.
-    """
-    from spherloc_viz.lesson_command import list_lessons, write_lesson
-
-    if name is None:
-        return list_lessons(export, handout)
-    return write_lesson(name, export, handout)
-
-
-_OTHERS = (
-    recording_commands.view,
-    triage_commands.diagnose,
-    triage_commands.compare,
-    triage_commands.rerun,
-    recording_commands.repeat,
-    recording_commands.runs,
-    recording_commands.steps,
-    recording_commands.label,
-    recording_commands.reindex,
-    recording_commands.gallery,
-)
-for _command in _OTHERS:
-    app.command(_command)
-
-
-@app.command
-def check_proof(file: Positional[Path], /) -> int:
-    """Check a proof that spherloc run --proof wrote, with numpy alone.
-
-    Says what is proven, and ends with 0; or why the file proves nothing, and ends with 1.
-
-    Args:
-        file: The proof (.npz).
-    """
-    from spherloc.proof_check import Refused, check
-
-    try:
-        print(check(file))
-    except Refused as refused:
-        print(f"refused: {refused}", file=sys.stderr)
-        return 1
-    return 0
-
-
-@app.command
 def verify(
-    quick: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
+    quick: Flag = False,
     only: Annotated[tuple[str, ...], arg(metavar="EXPERIMENT ...")] = (),
     kitti360: OptionalPath = None,
     newer_college: OptionalPath = None,
@@ -514,104 +492,9 @@ def verify(
         scheduler: Address of a Dask scheduler, whose workers do the runs instead.
         output: Folder of the page; verification here if not given, verification-quick with --quick.
     """
-    from spherloc_viz.verify_command import verify as do_verify
+    from spherloc_viz.commands.verify import verify as do_verify
 
     folder = output or Path("verification-quick" if quick else "verification")
     given = {"kitti360": kitti360, "newer-college": newer_college, "matterport360": matterport360}
     datasets = {key: path for key, path in given.items() if path is not None}
     return do_verify(folder, quick, workers, scheduler, only, datasets)
-
-
-@app.command
-def scenes(kind: Positional[Annotated[str | None, arg(metavar="[KIND]", help_behavior_hint="")]] = None, /) -> int:
-    """List the bundled scenes and the kinds of scene files, or show how a kind is written.
-
-    For example:
-
-    spherloc scenes
-
-    spherloc scenes kitti360
-
-    Args:
-        kind: A kind of scene file to be described, such as kitti360.
-    """
-    from spherloc_viz.scene_list import all_scenes, one_kind
-
-    print(all_scenes() if kind is None else one_kind(kind))
-    return 0
-
-
-@app.command
-def plugins(json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False) -> int:
-    """List what other packages add to spherloc, and what of it cannot be used.
-
-    These are camera models, readers of calibration files, solvers, estimators, kinds of scene files, layers and
-    lessons, which packages register by entry points, see docs/extending.md. Estimators and solvers are tried on a
-    tiny problem. Ends with 0, or with 1 if something cannot be used; everything else works without it.
-
-    For example:
-
-    spherloc plugins
-
-    spherloc plugins --json
-
-    Args:
-        json: Print one JSON object an extension, on one line, and nothing of what spherloc has itself.
-    """
-    from spherloc_viz.plugins import extensions, plugins_json, plugins_text
-    from spherloc_viz.progress import say
-
-    found = extensions(say)
-    if text := plugins_json(found) if json else plugins_text(found):
-        print(text)
-    return 1 if any(extension.problem for extension in found) else 0
-
-
-def main() -> None:
-    """Entry point: every error that a user can cause is one line on stderr and exit code 2."""
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):  # names that are no UTF-8, or a terminal that knows ASCII only
-            stream.reconfigure(errors="backslashreplace")
-    try:
-        refuse_repeated(sys.argv[1:], (run, localize, sweep, play, map, lesson, verify, scenes, plugins, *_OTHERS))
-        code: Any = app.cli(
-            prog="spherloc",
-            description="See why visual localization with fisheye and 360-degree cameras succeeds or fails.",
-            sort_subcommands=False,
-        )
-        _flush()
-    except SystemExit as ended:
-        code = ended.code
-    except SpherlocError as error:
-        _complain(str(error))
-        code = 2
-    except KeyboardInterrupt:
-        code = INTERRUPTED
-    except BrokenPipeError:
-        code = BROKEN_PIPE
-    except OSError as error:
-        what = "" if error.filename is None else f" with {show(error.filename)}"
-        _complain(f"the system cannot go on{what} ({reason(error)}); check the path, the output and the disks.")
-        code = 2
-    try:
-        _flush()
-    except OSError as error:
-        code = code or (BROKEN_PIPE if isinstance(error, BrokenPipeError) else 2)
-    sys.exit(code)
-
-
-def _flush() -> None:
-    """Raises ``OSError`` where the output cannot take it, after which Python does not try again at its end."""
-    output = sys.stdout
-    if output is None:
-        return
-    try:
-        output.flush()
-    except OSError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), output.fileno())
-        raise
-
-
-def _complain(sentence: str) -> None:
-    with contextlib.suppress(OSError):  # there is nobody left to tell
-        print(f"spherloc: {sentence}", file=sys.stderr, flush=True)

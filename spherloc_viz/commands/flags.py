@@ -1,4 +1,4 @@
-"""Refuses a flag that is given twice where only its last value would count."""
+"""Types of flags, and a check of those that are given twice where only the last value would count."""
 
 import typing
 from collections import Counter
@@ -15,6 +15,13 @@ OptionalNumber = Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavio
 OptionalFloat = Annotated[float | None, tyro.conf.arg(metavar="FLOAT", help_behavior_hint="")]
 OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
 """These are for flags that may be left out, whose help would else list None beside the type."""
+Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
+"""A switch without a form that begins with --no-."""
+Settings = Annotated[tyro.conf.UseAppendAction[tuple[tuple[str, ...], ...]], tyro.conf.arg(metavar="KEY=VALUE ...")]
+"""Several after one flag, or the flag several times."""
+RECORDINGS = Path("recordings")
+INTERRUPTED = 130
+"""Exit code after Ctrl-C, as shells have it."""
 _APPEND = typing.get_args(tyro.conf.UseAppendAction[int])[1]
 HINTS = {
     ("run", "--estimator"): "or compare estimators with: spherloc sweep SCENE --estimator A --estimator B",
