@@ -5,14 +5,14 @@ from pathlib import Path
 from spherloc.datasets import bundled_scenes
 from spherloc.datasets.scene_file import SceneKind, read_table, scene_kind, scene_kinds
 from spherloc.errors import InputError
-from spherloc_viz.commands.progress import say
-from spherloc_viz.lessons import lesson_named, lessons
 
 
 def list_lessons(export: Path | None, handout: Path | None) -> int:
     """Print a line a lesson. Raises ``InputError`` if a file was asked for."""
     if export is not None or handout is not None:
         raise InputError("name the lesson that is to be written; spherloc lesson lists them.")
+    from spherloc_viz.lessons import lessons
+
     width = max(len(lesson.name) for lesson in lessons())
     for lesson in lessons():
         print(f"{lesson.name:{width}}  {lesson.minutes:2d} min  {lesson.title}")
@@ -24,6 +24,8 @@ def write_lesson(name: str, export: Path | None, handout: Path | None) -> int:
 
     Raises ``InputError`` if there is no such lesson or a file cannot be written.
     """
+    from spherloc_viz.lessons import lesson_named
+
     lesson = lesson_named(name)
     if export is None and handout is None:
         print(f"{lesson.title}\n{lesson.summary}\nspherloc play, then /learn/{lesson.name}; or --export, --handout.")
@@ -33,6 +35,7 @@ def write_lesson(name: str, export: Path | None, handout: Path | None) -> int:
             raise InputError(f"{path.parent}: is no folder; give a file in one that exists.")
     from spherloc.warm_up import warm_up
     from spherloc_viz.app.lesson_file import exported, handout_of
+    from spherloc_viz.commands.progress import say
 
     warm_up(say, ["mc"])
     if handout is not None:
