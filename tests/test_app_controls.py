@@ -146,7 +146,7 @@ def test_the_true_camera_is_shown_and_put_back(server: viser.ViserServer) -> Non
     assert controls.read().variation == Variation(true_camera=(12.34, 1.0, -2.0, 0.5))
     assert (
         controls._simulation._moved.visible
-        and "yaw 12.3°, at (1.00, -2.00, 0.50) m" in controls._simulation._moved.content
+        and "yaw 12.3°, at (1.00, \N{MINUS SIGN}2.00, 0.50) m" in controls._simulation._moved.content
     )
     asked.clear()
     controls._simulation._put_back(press := Press())

@@ -17,7 +17,7 @@ from spherloc.trace import ConsensusStage, RansacStage, RefinementStage, Stage, 
 from spherloc_viz import style
 from spherloc_viz.layers import paint, ring, steps, yaw
 from spherloc_viz.layers.frame import RunView
-from spherloc_viz.layers.primitives import Balls, Picture, Points, SceneItem, Segments
+from spherloc_viz.layers.primitives import Balls, Picture, Points, SceneItem, Segments, true_minus
 from spherloc_viz.layers.ransac import MAX_IMPROVEMENTS
 from spherloc_viz.layers.translation import BallSet
 from spherloc_viz.layers.yaw import Arcs
@@ -434,3 +434,14 @@ def test_every_state_is_green_where_it_is_within_the_bound(name: str, request: p
     assert set(colored(inliers, style.INLIER)) == set(np.flatnonzero(trace.inlier_mask))
     assert set(colored(outliers, style.OUTLIER)) == set(np.flatnonzero(~trace.inlier_mask))
     assert number_before(outliers.step.caption, "matches disagree") == np.count_nonzero(~trace.inlier_mask)
+
+
+def test_negative_numbers_have_a_true_minus(mc: Trace) -> None:
+    """A hyphen is for ranges and names."""
+    told = [paint(mc, k).step for k, heading in enumerate(steps(mc)) if heading.stage == "Yaw"]
+    words = " ".join(word for step in told for word in (step.title, step.caption, step.note))
+    assert re.search(r"\N{MINUS SIGN}\d", words) and not re.search(r"(^|[^\w)])-\.?\d", words)
+    assert (
+        true_minus("-1 (-.5) Eq. 24-27, a-1, 2026-01-02, 1e-16")
+        == "\N{MINUS SIGN}1 (\N{MINUS SIGN}.5) Eq. 24-27, a-1, 2026-01-02, 1e-16"
+    )

@@ -3,6 +3,7 @@
 Scene positions are metres in the gravity-aligned map frame: y points down. Colours are sRGB bytes.
 """
 
+import re
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,6 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spherloc.types import ByteArray, FloatArray
+
+HYPHEN_MINUS = re.compile(r"(?<![\w.)\]])-(?=\.?\d)")
+"""A hyphen that stands for a minus sign: before a number, and not behind a word or a number as in a range."""
+
+
+def true_minus(text: str) -> str:
+    """Words for people with minus signs in place of the hyphens that Python writes before negative numbers."""
+    return HYPHEN_MINUS.sub("\N{MINUS SIGN}", text) if "-" in text else text
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,6 +120,9 @@ class Label(Primitive):
     height_m: float | None = None
     """Of its letters, so that it shrinks with what it names; None keeps it readable from anywhere."""
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "text", true_minus(self.text))
+
 
 SceneItem = Points | Segments | Balls | Mesh | Textured | Label
 
@@ -209,6 +221,10 @@ class Table:
     columns: tuple[str, ...]
     rows: tuple[tuple[Any, ...], ...]
 
+    def __post_init__(self) -> None:
+        rows = (tuple(true_minus(word) if isinstance(word, str) else word for word in row) for row in self.rows)
+        object.__setattr__(self, "rows", tuple(rows))
+
 
 @dataclass(frozen=True)
 class StepHeading:
@@ -220,6 +236,9 @@ class StepHeading:
     """A few words."""
     stage: str = ""
     """Named stage, such as "Yaw"."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "title", true_minus(self.title))
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,6 +257,10 @@ class Step:
     """What the picture leaves out and by which rule, plain text; may be empty."""
     stage: str = ""
     """Named stage, such as "Yaw"."""
+
+    def __post_init__(self) -> None:
+        for name in ("title", "caption", "note"):
+            object.__setattr__(self, name, true_minus(getattr(self, name)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,6 +10,7 @@ from spherloc.datasets.synthetic import LIMITS, SyntheticScene, TrueCamera
 from spherloc.datasets.variation import Variation
 from spherloc_viz.app.text import box
 from spherloc_viz.app.web.viser_internals import changes_of, put
+from spherloc_viz.layers.primitives import true_minus
 
 OWN_CAMERA = "the scene's own"
 RANGES: Mapping[str, int] = {"to 500": 500, "to 5,000": 5000}
@@ -115,7 +116,7 @@ class SimulationControls:
         if placed is not None:
             yaw_deg, x, y, z = placed
             words = f"The true camera was moved: yaw {yaw_deg:.1f}°, at ({x:.2f}, {y:.2f}, {z:.2f}) m."
-            self._moved.content = box(words, "font-size:12px")
+            self._moved.content = box(true_minus(words), "font-size:12px")
 
     def read(self, scene: SyntheticScene) -> Variation:
         """What is changed about the scene; what is as the scene says is left out."""

@@ -17,7 +17,7 @@ from spherloc_viz.app.matches.match_table import chip
 from spherloc_viz.app.text import DIM, box, table_html
 from spherloc_viz.app.web.viser_internals import update_widget
 from spherloc_viz.layers.explanation import Explanation, Pairs, explain
-from spherloc_viz.layers.primitives import Table
+from spherloc_viz.layers.primitives import Table, true_minus
 from spherloc_viz.layers.query_image import photograph
 from spherloc_viz.layers.selection import Traits, explain_many
 
@@ -217,7 +217,7 @@ def _measures(what: Explanation) -> str:
     rows: list[tuple[str, ...]] = [
         ("residual", *(_px(residual.px) for _, residual, _ in sides)),
         ("angle", *(f"{residual.deg:.3g}°" for _, residual, _ in sides)),
-        ("yaw", *(f"{pairs.yaw_deg:.2f}°" for _, _, pairs in sides)),
+        ("yaw", *(true_minus(f"{pairs.yaw_deg:.2f}°") for _, _, pairs in sides)),
         ("pairs that agree", *(f"{pairs.agree:,} of {what.others:,}" for _, _, pairs in sides)),
         ("with inliers", *(f"{pairs.agree_inliers:,} of {what.inliers:,}" for _, _, pairs in sides)),
     ]
