@@ -1,4 +1,5 @@
-"""How long the page takes to answer: from a widget's message to the last byte, and to the painted frame.
+"""How long the page takes to answer: from the command until it is ready, and from a widget's message to the last byte
+or to the painted frame; alone, and with others who drag at the same time.
 
     .venv/bin/python -m benchmarks.latency             # bytes, a minute
     .venv/bin/python -m benchmarks.latency --browser   # and frames in Chromium with its draw calls stubbed
@@ -9,6 +10,8 @@ measured is one move of a hand, with the whole picture, all panels and the front
 
 import argparse
 import asyncio
+import contextlib
+import time
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,18 +33,18 @@ class Case:
     estimator: str
     median_ms: float
     """What is asked for."""
-    high_ms: float
-    """What is asked for at the 95th percentile."""
     step: bool = False
     """Whether steps are walked instead of runs made."""
 
 
 CASES = (
-    Case("run, N 200", 200, 95.0, "mc-exact (exact, certified)", 15.0, 30.0),
-    Case("run, N 1000", 1000, 95.0, "mc-exact (exact, certified)", 250.0, 250.0),
-    Case("step, N 200, mc-exact", 200, 95.0, "mc-exact (exact, certified)", 15.0, 30.0, step=True),
-    Case("step, N 200, mc", 200, 80.0, "mc (the paper's)", 15.0, 30.0, step=True),
+    Case("run, N 200", 200, 95.0, "mc-exact (exact, certified)", 12.0),
+    Case("run, N 1000", 1000, 95.0, "mc-exact (exact, certified)", 40.0),
+    Case("step, N 200, mc-exact", 200, 95.0, "mc-exact (exact, certified)", 5.0, step=True),
+    Case("step, N 200, mc", 200, 80.0, "mc (the paper's)", 5.0, step=True),
 )
+READY_S, STARTS = 1.5, 5
+CROWD = 5
 
 
 async def prepare(page: PageClient, case: Case) -> None:
@@ -71,6 +74,37 @@ async def answers_ms(case: Case, moves: int) -> tuple[np.ndarray, float]:
             return np.array([1e3 * answer.seconds for answer in found]), kilobytes
 
 
+async def ready_s() -> float:
+    """Seconds from the command until a page that asks at once is ready."""
+    start = time.perf_counter()
+    with playground() as (address, _):
+        async with PageClient(address) as page:
+            await page.until(lambda: page.says("data-ready"), 120.0)
+            return time.perf_counter() - start
+
+
+async def crowd_ms(case: Case, moves: int, clients: int) -> np.ndarray:
+    """Milliseconds (clients * moves,) from a message to the first answer, where all drag without a pause."""
+
+    async def drag(page: PageClient, first: int) -> list[float]:
+        found = []
+        for k in range(moves):
+            start = time.perf_counter()
+            await page.set("Noise (px)", round(0.8 + 0.01 * (first + k), 2))
+            await page.until(lambda start=start: page.last_s > start)
+            found.append(1e3 * (time.perf_counter() - start))
+        return found
+
+    with playground() as (address, _):
+        async with contextlib.AsyncExitStack() as stack:
+            pages = [await stack.enter_async_context(PageClient(address)) for _ in range(clients)]
+            for page in pages:
+                await prepare(page, case)
+            await asyncio.gather(*(drag(page, 0) for page in pages))
+            found = await asyncio.gather(*(drag(page, moves) for page in pages))
+            return np.concatenate(found)
+
+
 def main() -> None:
     """Print the table."""
     words = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -78,18 +112,24 @@ def main() -> None:
     words.add_argument("--browser", action="store_true", help="measure painted frames too")
     given = words.parse_args()
     print("| case | median ms | 95 % ms | asked for | kB |\n|---|---|---|---|---|")
+    starts = 1e3 * np.array([asyncio.run(ready_s()) for _ in range(1 + STARTS)][1:])
+    row("from the command to the page", starts, f"{1e3 * READY_S:g}")
     for case in CASES:
         found, kilobytes = asyncio.run(answers_ms(case, given.moves))
-        median, high = np.percentile(found, [50, 95])
-        print(
-            f"| {case.name} | {median:.1f} | {high:.1f} | {case.median_ms:g} / {case.high_ms:g} | {kilobytes:.0f} |",
-            flush=True,
-        )
+        row(case.name, found, f"{case.median_ms:g}", f"{kilobytes:.0f}")
+    alone = asyncio.run(crowd_ms(CASES[0], given.moves, 1))
+    row("dragged without a pause, N 200, alone", alone, "")
+    together = asyncio.run(crowd_ms(CASES[0], given.moves, CROWD))
+    row(f"... {CROWD} pages at once", together, f"{CROWD * np.median(alone):.0f}")
     if given.browser:
         with playground() as (address, _):
-            found = painted_frames(address, given.moves)
-            median, high = np.percentile(found, [50, 95])
-            print(f"| to the painted frame, N 200 | {median:.0f} | {high:.0f} | | |")
+            row("to the painted frame, N 200", np.asarray(painted_frames(address, given.moves)), "")
+
+
+def row(name: str, found_ms: np.ndarray, asked: str, kilobytes: str = "") -> None:
+    """Print a row of the table."""
+    median, high = np.percentile(found_ms, [50, 95])
+    print(f"| {name} | {median:.1f} | {high:.1f} | {asked} | {kilobytes} |", flush=True)
 
 
 if __name__ == "__main__":

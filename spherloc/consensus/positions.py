@@ -41,8 +41,8 @@ SWITCH_RAD = 0.06
 """Mean movement of directions in a box below which it is searched with derivatives."""
 MIN_PX = 1e-5
 """Smaller cells differ by rounding."""
-FIRST_EFFORT = 400_000
-"""Tests of a match before threads are started: some hundredths of a second."""
+FIRST_EFFORT = 100_000
+"""Tests of a match before threads are started: some thousandths of a second."""
 TASK_EFFORT, TASK_ROUNDS = 400_000, 400
 """Least effort of a task, and its effort for each match: starting one again costs a test of every match."""
 TASKS_A_ROUND = 8

@@ -47,6 +47,12 @@ READ_CONTRASTS = r"""() => {
     }
     return found;
 }"""
+SCROLL_PAST = """title => {
+    let box = title.parentElement;
+    const scrolls = () => box.scrollHeight > box.clientHeight + 1 && getComputedStyle(box).overflowY !== "visible";
+    while (!scrolls()) box = box.parentElement;
+    box.scrollTop = box.scrollHeight;
+}"""
 READ_TIPS = """name => {
     const {camera, canvas, nodeRefFromName} = window.__viserMutable, box = canvas.getBoundingClientRect();
     const node = nodeRefFromName[name], found = [];
@@ -100,6 +106,15 @@ def test_slider_stages_buttons_and_keys_step(tab: Playground, address: str) -> N
     tab.page.keyboard.press("Shift+N")
     expect(tab.step).to_have_value(at(title="One pair of matches"))
     tab.page.keyboard.press("Shift+B")
+    expect(tab.step).to_have_value(at(1))
+
+    # The list of steps stands below what the step says, which a person has to scroll past.
+    tab.step.scroll_into_view_if_needed()
+    tab.page.locator(".step-title").evaluate(SCROLL_PAST)
+    expect(tab.page.locator(".step-title")).not_to_be_in_viewport()
+    tab.page.keyboard.press("n")
+    expect(tab.page.locator(".step-title")).to_be_in_viewport()
+    tab.page.keyboard.press("b")
     expect(tab.step).to_have_value(at(1))
 
     tab.choose("Pace", "4×")

@@ -3,10 +3,11 @@
 // elements with data-view="NAME" are to be seen, so that what stands on a hidden tab need not be drawn. A key presses the
 // element with data-key="KEY". Links within an element are followed, and do not press it. An element that gets another
 // data-reveal="NAME" is scrolled to, also while what stands above it grows, until a person scrolls or presses. What a
-// new link with data-fetch leads to is downloaded.
+// new link with data-fetch leads to is downloaded. When another step comes, a panel that was scrolled past its title
+// shows its beginning.
 (() => {
   const TOUCHABLE = "[data-touch],[data-copy]", MIN_DRAG_PX = 6, LOOK_EVERY_MS = 150, REVEAL_MS = 3000;
-  let press = null, shade = null, seen = null, revealed = null, revealUntil = 0, front = "";
+  let press = null, shade = null, seen = null, revealed = null, revealUntil = 0, front = "", titled = null;
   const fetched = new Set();
 
   function found(event) {
@@ -56,6 +57,14 @@
     if (name !== revealed) revealUntil = Date.now() + REVEAL_MS;
     revealed = name;
     if (element && Date.now() < revealUntil) element.scrollIntoView({ block: "nearest" });
+  }
+
+  function showStep() {
+    const title = seenElements(".step-title").find((one) => !one.closest(".captions")), words = title?.textContent ?? titled;
+    if (words === titled) return;
+    for (let box = title.parentElement; titled !== null && box; box = box.parentElement)
+      if (title.getBoundingClientRect().top < box.getBoundingClientRect().top) box.scrollTop = 0;
+    titled = words;
   }
 
   function fetchFiles() {
@@ -148,7 +157,7 @@
     const nowhere = { left: 0, top: 0, width: 1, height: 1 };
     tell(detail, nowhere, { clientX: 0, clientY: 0 }, { x: 0, y: 0 });
   });
-  setInterval(() => { look(); followStep(); reveal(); fetchFiles(); }, LOOK_EVERY_MS);
+  setInterval(() => { look(); followStep(); showStep(); reveal(); fetchFiles(); }, LOOK_EVERY_MS);
 
   addEventListener("keydown", (event) => {
     const writing = event.target instanceof Element
