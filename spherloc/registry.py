@@ -9,7 +9,7 @@ from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import Distribution, EntryPoint, entry_points
 from typing import Any
 
 from spherloc.errors import InputError, SpherlocError, reason, shorten, show
@@ -63,7 +63,7 @@ class Registered:
 @cache
 def names(kind: str) -> tuple[str, ...]:
     """Names registered for ``kind``, a key of ``KINDS``, by alphabet; nothing is imported."""
-    found = {point.name for point in entry_points(group=_group(kind))}
+    found = {point.name for point in _points(kind)}
     if kind == "estimators":
         found |= {RANSAC + name for name in names("solvers")}
     return tuple(sorted(found))
@@ -113,7 +113,7 @@ def registered(kind: str, taken: Collection[str] = ()) -> tuple[Registered, ...]
 
     ``taken`` are names that spherloc has without an entry point.
     """
-    points = sorted(entry_points(group=_group(kind)), key=lambda point: (point.name, *_rank(point)))
+    points = sorted(_points(kind), key=lambda point: (point.name, *_rank(point)))
     return tuple(
         Registered(
             kind,
@@ -176,7 +176,7 @@ def _group(kind: str) -> str:
 @cache
 def _point(kind: str, name: str) -> EntryPoint | None:
     """The entry point that is used; of an estimator maybe that of its solver."""
-    found = sorted(entry_points(group=_group(kind), name=name), key=_rank)
+    found = sorted((point for point in _points(kind) if point.name == name), key=_rank)
     if not found and (kind, name) in UNLISTED:
         return UNLISTED[kind, name]
     if found or kind != "estimators" or not name.startswith(RANSAC):
@@ -193,8 +193,20 @@ def _is_own(point: EntryPoint) -> bool:
     return point in UNLISTED.values() or _distribution(point) == OWN
 
 
+@cache
+def _points(kind: str) -> tuple[EntryPoint, ...]:
+    """All entry points of a kind; kept, since asking for them reads the list of every installed package."""
+    return tuple(entry_points(group=_group(kind)))
+
+
 def _distribution(point: EntryPoint) -> str:
-    return "" if point.dist is None else str(point.dist.name or "")
+    return "" if point.dist is None else _name(point.dist)
+
+
+@cache
+def _name(distribution: Distribution) -> str:
+    """Its name; kept, since asking for it parses all that is said of the package, its readme included."""
+    return str(distribution.name or "")
 
 
 def require(module: str, extra: str, purpose: str) -> Any:

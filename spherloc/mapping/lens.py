@@ -3,7 +3,6 @@
 from math import radians
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from spherloc.cameras.base import Camera
 from spherloc.cameras.colmap_models import colmap_camera
@@ -31,6 +30,8 @@ def for_colmap(camera: Camera) -> tuple[Camera, str]:
 
 
 def _fitted(camera: Camera) -> tuple[Camera, str]:
+    from scipy.optimize import least_squares  # takes a third of a second
+
     u, v = np.meshgrid(*(np.linspace(0.5, size - 0.5, _GRID) for size in (camera.width, camera.height)))
     pixels = np.column_stack([u.ravel(), v.ravel()])
     bearings, seen = camera.unproject(pixels)

@@ -19,7 +19,6 @@ NEAR = 1e-6
 """Numbers that differ by no more, relative to the largest of them, are equal: they are written with 24 bits."""
 WORDS = "/scene/words"
 """All labels."""
-_AXES = list(rr.ViewCoordinates.columns(xyz=[rr.ViewCoordinates.RDF]))
 
 
 def drawing_chunks(pictures: Mapping[int, Picture], pixels: FloatArray) -> Iterator[Chunk]:
@@ -31,7 +30,7 @@ def drawing_chunks(pictures: Mapping[int, Picture], pixels: FloatArray) -> Itera
     changes its colours has no new positions, and one that has gone has empty rows. Pictures on meshes are left out:
     they would be most of a file, which holds the paths of its images.
     """
-    yield Chunk.from_columns("/", [], _AXES)
+    yield Chunk.from_columns("/", [], list(rr.ViewCoordinates.columns(xyz=[rr.ViewCoordinates.RDF])))
     yield _framing(next(iter(pictures.values())))
     when = np.array(list(pictures), np.int64)
     for (path, kind), track in _tracks(list(pictures.values()), pixels).items():
