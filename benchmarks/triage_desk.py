@@ -24,11 +24,10 @@ from playwright.sync_api import Page, sync_playwright
 from benchmarks.machine import describe
 from benchmarks.run_index import synthetic_row
 from spherloc_viz.app.review.run_library import RunLibrary
-from spherloc_viz.app.web.access import Access
+from spherloc_viz.app.web.access import Access, open_socket
 from spherloc_viz.app.web.desk import DeskRoom
 from spherloc_viz.app.web.downloads import Downloads
 from spherloc_viz.app.web.front_door import FrontDoor
-from spherloc_viz.app.web.guard import open_socket
 from spherloc_viz.recording.index.query import Range, RunQuery
 from spherloc_viz.recording.index.run_index import RunIndex
 

@@ -13,7 +13,7 @@ from spherloc.solvers.base import solver_of
 from spherloc.warm_up import tiny_problem, warm_up
 from spherloc_viz import layers
 from spherloc_viz.layers.extension import layer_of
-from spherloc_viz.lessons.course import lesson_of, own_names
+from spherloc_viz.lessons.lesson import lesson_of, own_names
 from spherloc_viz.options import json_text, option_fields
 
 FORMATS = ("360loc", "adapter", "basalt", "kalibr", "kitti360", "stella", "toml")

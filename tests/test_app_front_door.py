@@ -21,11 +21,10 @@ from spherloc.errors import InputError
 from spherloc_viz.app.server import serve
 from spherloc_viz.app.web import access as access_module
 from spherloc_viz.app.web import viser_internals
-from spherloc_viz.app.web.access import Access, Role
+from spherloc_viz.app.web.access import Access, Role, is_own_name, open_socket, refusal
 from spherloc_viz.app.web.desk import DeskRoom
 from spherloc_viz.app.web.downloads import Downloads
 from spherloc_viz.app.web.front_door import FrontDoor
-from spherloc_viz.app.web.guard import is_own_name, open_socket, refusal
 from spherloc_viz.app.web.page import load_page
 from spherloc_viz.app.web.viewer import ViewerRoom
 from tests.waiting import LIMIT_S

@@ -9,10 +9,9 @@ from hypothesis import strategies as st
 
 from spherloc.datasets.variation import Variation
 from spherloc.estimators import options_type
-from spherloc_viz.app.catalog import SceneRequest
+from spherloc_viz.app.catalog import RunRequest, SceneRequest
 from spherloc_viz.app.edits import Edits
 from spherloc_viz.app.history import MAX_REQUESTS, SAME_MOVE_S, History, changed_fields
-from spherloc_viz.app.run_request import RunRequest
 
 SCENE = SceneRequest("a scene", 0, None, Variation())
 

@@ -13,11 +13,10 @@ from spherloc.datasets import load_scene
 from spherloc.datasets.variation import Variation
 from spherloc.errors import RecordingError
 from spherloc.estimators import default_options, estimate
-from spherloc_viz.app.catalog import Catalog, SceneRequest
+from spherloc_viz.app.catalog import Catalog, Run, RunRequest, SceneRequest
 from spherloc_viz.app.link import MANY, MAX_LETTERS, ONCE, Follower, PageView, link_of
 from spherloc_viz.app.panels.folders import Roots
 from spherloc_viz.app.review.opened import Opened
-from spherloc_viz.app.run_request import Run, RunRequest
 from tests.tiny_scene import write_tiny_scene
 
 VIEW = PageView("outcome", (), "dark")

@@ -24,7 +24,7 @@ from spherloc_viz.app.catalog import Catalog, SceneRequest, camera_label
 from spherloc_viz.app.controls.estimator_controls import EstimatorControls, Option, estimator_labels
 from spherloc_viz.app.controls.steps_panel import find_step
 from spherloc_viz.app.stage import views
-from spherloc_viz.app.stage.appearance import light_bytes, surface_bytes
+from spherloc_viz.app.stage.painter import light_bytes, surface_bytes
 from spherloc_viz.app.text import diagnosis_html, status_html, step_html, table_html
 from spherloc_viz.app.web.viser_internals import start_viser, stop_viser
 from spherloc_viz.app.workers import LatestWorker

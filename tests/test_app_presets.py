@@ -10,9 +10,8 @@ from spherloc.estimators import estimate, options_type
 from spherloc.geometry import camera_centre, rotation_angle
 from spherloc.metrics import evaluate
 from spherloc.trace import Trace
-from spherloc_viz.app.catalog import Catalog, SceneRequest
+from spherloc_viz.app.catalog import Catalog, RunRequest, SceneRequest
 from spherloc_viz.app.controls.presets import RECIPES, Preset, presets
-from spherloc_viz.app.run_request import RunRequest
 
 CATALOG = Catalog(None)
 PRESETS = {preset.title: preset for preset in presets(CATALOG)}

@@ -15,13 +15,12 @@ from spherloc.datasets.variation import Variation
 from spherloc.errors import RecordingError
 from spherloc.estimators import default_options, estimate
 from spherloc_viz.app import session as session_module
-from spherloc_viz.app.catalog import MAX_BRIEF, Catalog, SceneRequest
+from spherloc_viz.app.catalog import MAX_BRIEF, Catalog, Run, RunRequest, SceneRequest
 from spherloc_viz.app.page_runs import LOOK_S, PageRuns
 from spherloc_viz.app.review import notes as notes_module
 from spherloc_viz.app.review.export import Exporter
 from spherloc_viz.app.review.filters import KEPT
 from spherloc_viz.app.review.run_library import RunLibrary
-from spherloc_viz.app.run_request import Run, RunRequest
 from spherloc_viz.gallery import gallery_cases
 from spherloc_viz.recording.content.data import read_recording
 from spherloc_viz.recording.reviews import Review, read_review

@@ -24,7 +24,7 @@ from spherloc_viz.app.catalog import SceneRequest
 from spherloc_viz.app.panels import sweep_runs_panel
 from spherloc_viz.app.panels.compare_panel import chips_html
 from spherloc_viz.app.panels.sweep_runs_panel import CANCEL, START, SweepPanel
-from spherloc_viz.app.plots.sweep_charts import charts_html, sweep_svg, table_html
+from spherloc_viz.app.plots.charts import charts_html, sweep_svg, table_html
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.web.viser_internals import start_viser, stop_viser
 from spherloc_viz.layers.primitives import Chart, Curve

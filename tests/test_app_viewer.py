@@ -21,11 +21,11 @@ from test_app_front_door import Door, door_to
 from spherloc.errors import InputError, RecordingError
 from spherloc.estimators import estimate
 from spherloc_viz.app.web import viewer
+from spherloc_viz.app.web.access import sorry_page
 from spherloc_viz.app.web.viewer import (
     Viewable,
     ViewerRoom,
     of_index,
-    sorry_page,
     viewer_link,
     viewer_page,
     viewer_policy,

@@ -6,14 +6,13 @@ import pytest
 
 from spherloc.errors import InputError
 from spherloc_viz import style
-from spherloc_viz.app.lesson_file import images_of, images_picture
-from spherloc_viz.app.linked_run import LinkedRuns
+from spherloc_viz.app.lesson_file import LinkedRuns, images_of, images_picture
 from spherloc_viz.layers import steps
 from spherloc_viz.lessons import lessons
-from spherloc_viz.lessons.claims import holds, split_claim
 from spherloc_viz.lessons.html import FORMULA, IMAGES, changes_in, lesson_page, list_page, names_in
 from spherloc_viz.lessons.lesson import MANY, changed_state, parse_lesson, state_parts
 from spherloc_viz.lessons.numbers import numbers_of
+from tests.lesson_claims import holds, split_claim
 
 NUMBER = re.compile(r"(?<![\w.])\d[\d,]*(?:\.\d+)?")
 LESSONS = lessons()

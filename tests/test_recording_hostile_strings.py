@@ -21,7 +21,8 @@ from spherloc_viz.app.review.card import comparison_html
 from spherloc_viz.app.review.export import bundle, summary_html
 from spherloc_viz.app.review.filters import Counts, Look, filters_html
 from spherloc_viz.app.review.rows import DESK, rows_html
-from spherloc_viz.app.web.viewer import sorry_page, viewer_page
+from spherloc_viz.app.web.access import sorry_page
+from spherloc_viz.app.web.viewer import viewer_page
 from spherloc_viz.recording.content.writer import write_recording
 from spherloc_viz.recording.index.query import RunQuery
 from spherloc_viz.recording.index.run_index import RunIndex

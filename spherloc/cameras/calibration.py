@@ -14,7 +14,7 @@ from spherloc.cameras._checks import located
 from spherloc.cameras._files import KNOWN, UnrecognisedError, parse_json, parse_yaml, read_text, table_of, value_of
 from spherloc.cameras.base import Camera
 from spherloc.cameras.extensions import camera_class_of, read_by_extensions, tried
-from spherloc.cameras.opencv_files import opencv
+from spherloc.cameras.tool_files import opencv
 from spherloc.errors import CalibrationError, InputError, reason, show
 from spherloc.registry import extension_of, guarded
 

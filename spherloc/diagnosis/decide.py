@@ -5,8 +5,17 @@ from dataclasses import replace
 import numpy as np
 
 from spherloc.diagnosis.causes import Cause, Diagnosis
-from spherloc.diagnosis.evidence import WIDER, Evidence, Fit, Truth, certify, different, gather, gather_truth
-from spherloc.diagnosis.measures import measures_of
+from spherloc.diagnosis.evidence import (
+    WIDER,
+    Evidence,
+    Fit,
+    Truth,
+    certify,
+    different,
+    gather,
+    gather_truth,
+    measures_of,
+)
 from spherloc.diagnosis.words import describe
 from spherloc.metrics import SUCCESS_DEG, SUCCESS_M
 from spherloc.trace import RansacStage, Trace

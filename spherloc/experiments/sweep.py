@@ -2,16 +2,353 @@
 
 >>> plan = planned(Path("scenes/mei_outliers_80.toml"), "outlier_rate", [0.5, 0.9], [Entrant("mc")], runs=100)
 >>> rows = list(run_sweep(plan))
+
+The runs are done by processes on this machine, or by a Dask cluster whose machines have spherloc and can read the scene
+file.
 """
 
+import asyncio
+import contextlib
+import logging
+import multiprocessing
+import os
+import queue
+import signal
 import threading
+import time
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterator, Sequence
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    CancelledError,
+    Future,
+    ProcessPoolExecutor,
+    ThreadPoolExecutor,
+    wait,
+)
+from dataclasses import dataclass
+from functools import cache
+from multiprocessing.connection import Connection
+from typing import Any, Protocol
 
-from spherloc.errors import InputError
+from spherloc.errors import InputError, reason
 from spherloc.experiments.sweep_plan import AXES, Entrant, Job, SweepPlan, planned
 from spherloc.experiments.sweep_rows import SweepRow
-from spherloc.experiments.sweep_workers import Keep, LocalWorkers, Workers
+from spherloc.registry import require
+from spherloc.trace import Trace
+from spherloc.warm_up import warm_up
+
+MAX_WORKERS = 64
+AHEAD = 1
+"""Tasks that wait beside those that are being done, so that no worker waits for us."""
+MAX_FAILED_STARTS = 2
+NICENESS = 10
+"""Whoever waits for an answer of this machine goes before a sweep in the background."""
+
+
+class Keep(Protocol):
+    """Keeps whole runs where they are done. It is sent to the workers, so it is plain data."""
+
+    def __call__(self, plan: SweepPlan, job: Job, trace: Trace) -> str:
+        """Keep a run; returns why it could not be kept, in a sentence, or nothing if it was."""
+        ...
+
+
+@dataclass(frozen=True)
+class Solved:
+    """What a worker has done."""
+
+    rows: list[SweepRow]
+    """A row a run."""
+    complaints: tuple[str, ...] = ()
+    """Why runs could not be kept, a sentence each."""
+    failures: tuple[tuple[str, str], ...] = ()
+    """Estimators of other packages that failed, by their labels, and how."""
+
+
+@dataclass(frozen=True)
+class Done:
+    """A task that has ended."""
+
+    jobs: tuple[Job, ...]
+    """What it was."""
+    solved: Solved | None
+    """Its results; None if its worker died."""
+
+
+class Workers(Protocol):
+    """Workers that do tasks, each of which is a few jobs."""
+
+    def room(self) -> int:
+        """How many more tasks it should be given now."""
+        ...
+
+    def submit(self, jobs: tuple[Job, ...]) -> None:
+        """Take a task."""
+        ...
+
+    def collect(self, timeout_s: float) -> list[Done]:
+        """Tasks that have ended, as soon as there is one; none if there is none in time.
+
+        Raises ``InputError`` if a task is impossible or the workers are lost for good.
+        """
+        ...
+
+    def close(self) -> None:
+        """End the workers, whatever they are doing. May be called twice."""
+        ...
+
+
+def solve(plan: SweepPlan, jobs: Sequence[Job], keep: Keep | None) -> Solved:
+    """What a worker does."""
+    _warm(frozenset(entrant.estimator for entrant in plan.entrants))
+    complaints: list[str] = []
+    failures: dict[str, str] = {}
+    rows = plan.solve(
+        jobs,
+        None if keep is None else lambda job, trace: complaints.append(keep(plan, job, trace)),
+        lambda job, sentence: failures.update({plan.labels[job.entrant]: sentence}),
+    )
+    return Solved(rows, tuple(filter(None, complaints)), tuple(failures.items()))
+
+
+@cache
+def _warm(estimators: frozenset[str]) -> None:
+    """So that no run's time includes the loading of the kernels."""
+    warm_up(estimators=estimators)
+
+
+class LocalWorkers:
+    """Processes on this machine.
+
+    They hold one end of a pipe, the lifeline, and end when its other end is closed: by ``close``, or because this
+    process has ended, whatever ended it. A pool with a dead process is replaced, and its tasks are reported as lost.
+    """
+
+    def __init__(self, plan: SweepPlan, workers: int, keep: Keep | None) -> None:
+        """Raises ``InputError`` for a wrong number of workers."""
+        if not 1 <= workers <= MAX_WORKERS:
+            raise InputError(f"the sweep has {workers} workers; give a number from 1 to {MAX_WORKERS}.")
+        self._plan, self._workers, self._keep = plan, workers, keep
+        self._tasks: dict[Future[Solved], tuple[Job, ...]] = {}
+        self._failed_starts = 0
+        self._start()
+
+    def room(self) -> int:
+        """How many more tasks can be submitted now."""
+        return self._workers + AHEAD - len(self._tasks)
+
+    def submit(self, jobs: tuple[Job, ...]) -> None:
+        """Have a worker do these jobs as one task; does not wait."""
+        try:
+            with _deaf_to_ctrl_c():
+                future = self._pool.submit(solve, self._plan, jobs, self._keep)
+        except BrokenExecutor as error:  # found out before we collected
+            future = Future()
+            future.set_exception(error)
+        self._tasks[future] = jobs
+
+    def collect(self, timeout_s: float) -> list[Done]:
+        """Tasks that ended since the last call; waits so long, seconds, for the first one."""
+        ended, _ = wait(self._tasks, timeout_s, FIRST_COMPLETED)
+        if any(_is_broken(future) for future in ended):
+            ended = set(self._tasks)  # those that have a result keep it
+            self._replace()
+        return [Done(self._tasks.pop(future), _result(future)) for future in ended]
+
+    def close(self) -> None:
+        """Drop what is not begun, and end the processes."""
+        self._lifeline.close()
+        self._pool.shutdown(wait=True, cancel_futures=True)
+
+    def _start(self) -> None:
+        spawn = multiprocessing.get_context("spawn")  # the page has threads, which a fork would break
+        reader, self._lifeline = spawn.Pipe(duplex=False)
+        try:
+            self._pool = ProcessPoolExecutor(self._workers, spawn, _begin, (reader,))
+            with _deaf_to_ctrl_c():
+                self._begun = self._pool.submit(os.getpid)
+        except OSError as error:
+            self._lifeline.close()
+            raise InputError(
+                f"the worker processes cannot be started ({reason(error)}); see whether /dev/shm can be written and "
+                "how many processes are allowed."
+            ) from None
+
+    def _replace(self) -> None:
+        begun = _result(self._begun) is not None
+        self._failed_starts = 0 if begun else self._failed_starts + 1
+        if self._failed_starts == MAX_FAILED_STARTS:
+            raise InputError(
+                "the worker processes end while they start: in a script, call this under "
+                "'if __name__ == \"__main__\":', else see whether the memory is full."
+            )
+        self.close()
+        self._start()
+
+
+def _begin(lifeline: Connection) -> None:
+    """What a worker process does first."""
+    if hasattr(os, "nice"):
+        os.nice(NICENESS)
+    threading.Thread(target=_end_with, args=(lifeline,), name="spherloc-lifeline", daemon=True).start()
+
+
+def _end_with(lifeline: Connection) -> None:
+    with contextlib.suppress(EOFError, OSError):
+        lifeline.recv_bytes()
+    os._exit(0)
+
+
+def _is_broken(future: Future[Solved]) -> bool:
+    return not future.cancelled() and isinstance(future.exception(), BrokenExecutor)
+
+
+def _result(future: Future[Any]) -> Any:
+    """The result of a task that has ended or never will; None if its worker died. Raises what the task raised."""
+    try:
+        return future.result(timeout=0)
+    except (BrokenExecutor, CancelledError, TimeoutError):
+        return None
+
+
+@contextlib.contextmanager
+def _deaf_to_ctrl_c() -> Iterator[None]:
+    """Processes that are started meanwhile never hear of Ctrl-C, which a terminal sends to them too."""
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+CONNECT_S = 10.0
+COUNT_EVERY_S = 2.0
+"""Workers come and go; they are counted this often."""
+PATIENCE_S = 60.0
+"""A cluster may be without any worker for this long."""
+GATHER_S = 2.0
+
+
+class Cluster:
+    """Workers behind a Dask scheduler. Dask does the tasks of a lost worker again, also those with a result."""
+
+    def __init__(self, plan: SweepPlan, address: str, keep: Keep | None) -> None:
+        """Raises ``InputError`` if ``dask.distributed`` is missing, or no scheduler with workers is at ``address``."""
+        self._dask = require("distributed", "cluster", "a sweep on a Dask cluster")
+        self._plan, self._address, self._keep = plan, address, keep
+        # What is said here in a sentence, it would log with tracebacks.
+        logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
+        try:
+            # A client that never reached its scheduler takes 20 s to be deleted, so knock before.
+            with ThreadPoolExecutor(1) as knocking:
+                knocking.submit(asyncio.run, _knock(self._dask, address)).result()
+            self._client: Any = self._dask.Client(address, timeout=CONNECT_S, set_as_default=False)
+        except (OSError, TimeoutError, ValueError, TypeError, ImportError) as error:
+            raise InputError(
+                f"no Dask scheduler answers at '{address}' ({_one_line(error)}); give its address, such as "
+                "tcp://host:8786."
+            ) from None
+        self._tasks: dict[Any, tuple[Job, ...]] = {}
+        self._ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self._threads, self._counted, self._seen = 0, 0.0, time.monotonic()
+        try:
+            with contextlib.suppress(TimeoutError):
+                self._client.wait_for_workers(1, timeout=CONNECT_S)
+            self._count()
+            if not self._threads:
+                raise InputError(f"the Dask cluster at {address} has no workers; start some: dask worker {address}")
+        except BaseException:
+            self.close()
+            raise
+
+    def room(self) -> int:
+        """How many more tasks can be submitted now."""
+        if time.monotonic() - self._counted > COUNT_EVERY_S:
+            self._count()
+        return self._threads + AHEAD - len(self._tasks)
+
+    def submit(self, jobs: tuple[Job, ...]) -> None:
+        """Have a worker do these jobs as one task; does not wait."""
+        future = self._client.submit(solve, self._plan, jobs, self._keep, pure=False)
+        self._tasks[future] = jobs
+        future.add_done_callback(self._ended.put)
+
+    def collect(self, timeout_s: float) -> list[Done]:
+        """Tasks that ended since the last call; waits so long, seconds, for the first one."""
+        found: list[Done] = []
+        with contextlib.suppress(queue.Empty):
+            future = self._ended.get(timeout=timeout_s)
+            while True:
+                if (done := self._gather(future)) is not None:
+                    found.append(done)
+                future = self._ended.get_nowait()
+        if not found:
+            self._check()
+        return found
+
+    def close(self) -> None:
+        """Drop what is not done and let the workers go."""
+        with contextlib.suppress(Exception):  # the scheduler may be gone
+            self._client.cancel(list(self._tasks), asynchronous=False)
+        self._tasks.clear()
+        with contextlib.suppress(Exception):
+            self._client.close(timeout=2)
+
+    def _gather(self, future: Any) -> Done | None:
+        """The task of a future; None if its result was lost with its worker and is being computed again."""
+        try:
+            solved = future.result(timeout=GATHER_S)
+        except self._dask.KilledWorker:
+            solved = None
+        except TimeoutError:
+            future.add_done_callback(self._ended.put)
+            return None
+        except self._dask.CancelledError:
+            raise self._lost() from None
+        return Done(self._tasks.pop(future), solved)
+
+    def _check(self) -> None:
+        if self._client.status != "running":
+            raise self._lost()
+        if time.monotonic() - self._seen > PATIENCE_S:
+            raise InputError(
+                f"the Dask cluster at {self._address} has had no workers for {PATIENCE_S:.0f} s; start some and give "
+                "the same command to go on."
+            )
+
+    def _count(self) -> None:
+        try:
+            self._threads = sum(self._client.nthreads().values())
+        except (OSError, TimeoutError):
+            raise self._lost() from None
+        self._counted = time.monotonic()
+        if self._threads:
+            self._seen = self._counted
+
+    def _lost(self) -> InputError:
+        return InputError(
+            f"the Dask scheduler at {self._address} is gone; start it and give the same command to go on."
+        )
+
+
+async def _knock(dask: Any, address: str) -> None:
+    identity = dask.rpc(address, timeout=CONNECT_S)
+    try:
+        if (await asyncio.wait_for(identity.identity(), CONNECT_S))["type"] != "Scheduler":
+            raise ValueError("it is no scheduler")
+    finally:
+        await identity.close_rpc()
+
+
+def _one_line(error: BaseException) -> str:
+    text = " ".join(str(error).split()) or type(error).__name__
+    return text if len(text) <= 120 else f"{text[:117]}..."
+
 
 __all__ = ["AXES", "Entrant", "Job", "Keep", "SweepPlan", "SweepRow", "planned", "run_sweep"]
 
@@ -74,7 +411,7 @@ def run_sweep(
 def _start_workers(plan: SweepPlan, workers: int, scheduler: str | None, keep: Keep | None) -> Workers:
     if scheduler is None:
         return LocalWorkers(plan, workers, keep)
-    from spherloc.experiments.sweep_cluster import Cluster
+    from spherloc.experiments.sweep import Cluster
 
     return Cluster(plan, scheduler, keep)
 

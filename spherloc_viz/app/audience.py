@@ -10,10 +10,10 @@ from html import escape
 import viser
 
 from spherloc.diagnosis import Diagnosis
+from spherloc_viz.app.catalog import Run
 from spherloc_viz.app.controls.controls import DisplayControls
 from spherloc_viz.app.edits import Edits
 from spherloc_viz.app.run_display import Places, RunDisplay
-from spherloc_viz.app.run_request import Run
 from spherloc_viz.app.services import Services
 from spherloc_viz.app.stage.canvas import panel_widths_px
 from spherloc_viz.app.status import Status

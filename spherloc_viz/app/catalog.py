@@ -1,10 +1,14 @@
-"""The scenes and cameras that the page offers, and the problems that they give."""
+"""The scenes and cameras that the page offers, the problems that they give, and what a page asks for."""
 
 import copy
 from dataclasses import dataclass, field
 from functools import lru_cache
 from itertools import chain, count
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from spherloc.cameras.base import Camera, model_name
 from spherloc.datasets import Scene, bundled_scenes, load_scene
@@ -14,6 +18,7 @@ from spherloc.datasets.synthetic import SyntheticScene
 from spherloc.datasets.variation import Variation
 from spherloc.errors import InputError, show
 from spherloc.problem import Problem
+from spherloc.trace import Trace
 from spherloc_viz.gallery import play_of, staged_path
 from spherloc_viz.given_files import is_recording
 from spherloc_viz.recording.replay import load_recorded_scene
@@ -166,3 +171,24 @@ class _Caches:
 def camera_label(camera: Camera) -> str:
     """What a camera is called on the page."""
     return f"{model_name(camera)}, {camera.width} × {camera.height}"
+
+
+@dataclass(frozen=True)
+class RunRequest:
+    """All that a run depends on."""
+
+    scene: SceneRequest
+    estimator: str
+    """Registered name."""
+    options: Any
+    """The estimator's options dataclass."""
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A request fulfilled."""
+
+    request: RunRequest
+    trace: Trace
+    kept: NDArray[np.int64]
+    """(N,) number that each correspondence of the problem has where nothing is hidden."""

@@ -5,7 +5,7 @@ import math
 import threading
 from typing import Any
 
-from spherloc_viz.app.run_request import RunRequest
+from spherloc_viz.app.catalog import RunRequest
 
 MAX_REQUESTS = 200
 """Requests that are remembered."""

@@ -7,6 +7,7 @@ import viser
 from numpy.typing import NDArray
 
 from spherloc.datasets.map_scene import MapScene
+from spherloc_viz.app.catalog import Run
 from spherloc_viz.app.controls.steps_panel import StepsPanel
 from spherloc_viz.app.glossary import glossary_html, heading_html
 from spherloc_viz.app.introduction import introduction_html
@@ -17,7 +18,6 @@ from spherloc_viz.app.plots.charts import ChartPanel
 from spherloc_viz.app.plots.graph_view import GraphView
 from spherloc_viz.app.plots.residual_view import ResidualView
 from spherloc_viz.app.plots.yaw_view import YawView
-from spherloc_viz.app.run_request import Run
 from spherloc_viz.app.text import legend_html, opening_card_html, opening_html, summary_html, table_html
 from spherloc_viz.app.web.touch import READY, Touch, Touches
 from spherloc_viz.app.web.viser_internals import update_widget

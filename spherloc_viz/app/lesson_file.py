@@ -3,28 +3,79 @@
 import json
 from base64 import b64encode
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import lru_cache
 from html import escape
 from pathlib import Path
 
+import numpy as np
+
 from spherloc.diagnosis import diagnose
 from spherloc.errors import InputError
+from spherloc.estimators import default_options, estimate
 from spherloc.files import is_file
+from spherloc.trace import Trace
 from spherloc_viz import style
+from spherloc_viz.app.catalog import Catalog, Run, RunRequest, SceneRequest
 from spherloc_viz.app.controls.steps_panel import find_step
-from spherloc_viz.app.linked_run import LinkedRun, LinkedRuns
-from spherloc_viz.app.matches.flat_images import images_svg
+from spherloc_viz.app.link import Follower, PageView
+from spherloc_viz.app.matches import match_drawing as drawing
+from spherloc_viz.app.matches.image_panel import image_sizes, match_colors, photo_uri
+from spherloc_viz.app.panels.folders import Roots
+from spherloc_viz.app.review.opened import Opened
 from spherloc_viz.app.run_display import without_truth
 from spherloc_viz.app.stage import views
 from spherloc_viz.app.stage.flat_picture import svg
 from spherloc_viz.app.stage.still_page import Still, scene_script, scripts_in, with_policy
-from spherloc_viz.app.stage.walls import MAX_BYTES, Walls
+from spherloc_viz.app.stage.views import MAX_BYTES, Walls
 from spherloc_viz.app.web.page import QUIET, client_html
 from spherloc_viz.layers import paint, steps, with_alternative
+from spherloc_viz.layers.matches import match_view
+from spherloc_viz.layers.primitives import Picture
 from spherloc_viz.lessons import lessons
 from spherloc_viz.lessons.html import Form, Sheet, exported_page, handout_page, has_images, links_in, names_in
 from spherloc_viz.lessons.lesson import Lesson, Moment, changed_state
 from spherloc_viz.lessons.numbers import number_text, numbers_of
+
+ESTIMATOR = "mc"
+"""Of a link that says none."""
+
+
+def _no_recordings(file: str) -> Opened:
+    raise InputError("a link to a recording needs the playground that has it.")
+
+
+@dataclass(frozen=True)
+class LinkedRun:
+    """What a link leads to."""
+
+    run: Run
+    view: PageView
+
+
+class LinkedRuns:
+    """Runs of links to the scenes that come with the project."""
+
+    def __init__(self) -> None:
+        self.catalog = Catalog(None)
+        self._follower = Follower(self.catalog, Roots(()), self.catalog.problem, _no_recordings)
+        self._last: Run | None = None
+
+    def run(self, link: str) -> LinkedRun:
+        """The run of a link; raises ``InputError`` for what of it cannot be followed."""
+        scene = SceneRequest(next(iter(self.catalog.scenes)), 0)
+        begin = RunRequest(scene, ESTIMATOR, default_options(ESTIMATOR, self.catalog.problem(scene)))
+        followed = self._follower.follow(link, begin, PageView("", (), "dark"))
+        if followed.remarks:
+            raise InputError(" ".join(followed.remarks))
+        request = followed.request
+        if self._last is None or self._last.request != request:
+            problem = self.catalog.problem(request.scene)
+            trace = estimate(problem, request.estimator, request.options, request.scene.seed)
+            kept = request.scene.variation.kept(len(problem) + len(request.scene.variation.hidden))
+            self._last = Run(request, trace, kept)
+        return LinkedRun(self._last, followed.view)
+
 
 ASPECT = 1.15
 """Width over height for which views are chosen: between those of a screen's canvas and of a phone's."""
@@ -186,3 +237,34 @@ def _recorded(places: Mapping[str, int], numbers: Mapping[str, str], images: Map
         return f"at={places[_state(state)]}"
 
     return Form(number, at, lambda state, changes: at(changed_state(state, changes)), False, images.__getitem__)
+
+
+PHOTO_PX = 640
+"""Width of both images together."""
+
+
+def images_svg(trace: Trace, picture: Picture, draw: Callable[[Path], None]) -> str:
+    """The images of a run at a step; ``draw`` is asked to make the file of each, if it is not there.
+
+    Raises ``InputError`` for a problem without images.
+    """
+    problem = trace.problem
+    if problem.image is None:
+        raise InputError(f"{problem.name}: has no images.")
+    colors = match_colors(picture, len(problem))
+    view = match_view(problem, colors, trace.inlier_mask, (), None)
+    paths = [problem.image] + ([] if view.reference is None else [problem.reference_images[view.reference]])
+    for path in paths:
+        draw(path)
+    places, height = drawing.arrange([(problem.camera.width, problem.camera.height), *image_sizes(problem, view)])
+    photos = [
+        f'<image href="{escape(uri)}" x="{place.x:.0f}" y="{place.y:.1f}" width="{place.width:.0f}" '
+        f'height="{place.height:.1f}" preserveAspectRatio="none"/>'
+        for path, place in zip(paths, places, strict=True)
+        if (uri := photo_uri(path, round(PHOTO_PX * place.width / drawing.WIDTH))) is not None
+    ]
+    parts = drawing.overlay(trace, view, colors, places, (), np.arange(len(problem)), bool(photos)).parts
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {drawing.WIDTH:.0f} {height:.1f}" '
+        f'width="{drawing.WIDTH:.0f}" height="{height:.1f}">{"".join(photos)}{"".join(parts)}</svg>'
+    )

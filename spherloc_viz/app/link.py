@@ -19,10 +19,9 @@ from spherloc.datasets.variation import EDITS, Variation, parse_variation, setti
 from spherloc.errors import InputError, SpherlocError, show
 from spherloc.estimators import default_options, options_type
 from spherloc.problem import Problem
-from spherloc_viz.app.catalog import Catalog, SceneRequest
+from spherloc_viz.app.catalog import Catalog, Run, RunRequest, SceneRequest
 from spherloc_viz.app.panels.folders import Roots
 from spherloc_viz.app.review.opened import Opened
-from spherloc_viz.app.run_request import Run, RunRequest
 from spherloc_viz.options import option_fields, typed, usable_estimators
 
 VERSION = 1

@@ -3,8 +3,7 @@
 from collections.abc import Callable
 
 from spherloc.files import is_file
-from spherloc_viz.app.catalog import Catalog
-from spherloc_viz.app.run_request import Run
+from spherloc_viz.app.catalog import Catalog, Run
 from spherloc_viz.app.workers import Job, LatestWorker
 
 

@@ -7,9 +7,8 @@ from spherloc.diagnosis import Diagnosis
 from spherloc.errors import RecordingError
 from spherloc.trace import Trace
 from spherloc.types import FloatArray
-from spherloc_viz.app.catalog import Catalog, SceneRequest
+from spherloc_viz.app.catalog import Catalog, Run, RunRequest, SceneRequest
 from spherloc_viz.app.review.opened import is_same_pose
-from spherloc_viz.app.run_request import Run, RunRequest
 from spherloc_viz.recording.origin import Origin, Source
 from spherloc_viz.recording.replay import origin_of
 from spherloc_viz.recording.storage.recorder import Recorder

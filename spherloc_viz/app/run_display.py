@@ -13,11 +13,11 @@ from spherloc.datasets.synthetic import TrueCamera
 from spherloc.diagnosis import Diagnosis
 from spherloc.outcome import known_judgement
 from spherloc.trace import Trace
+from spherloc_viz.app.catalog import Run
 from spherloc_viz.app.controls.controls import DisplayControls
 from spherloc_viz.app.left_panels import LeftPanels
 from spherloc_viz.app.matches.match_card import MatchCard
 from spherloc_viz.app.panels.export_panel import Shown
-from spherloc_viz.app.run_request import Run
 from spherloc_viz.app.stage.canvas import Canvas
 from spherloc_viz.app.text import diagnosis_html, hidden_html, status_html
 from spherloc_viz.app.web.touch import Touch, Touches

@@ -19,19 +19,17 @@ from spherloc.errors import InputError, RecordingError
 from spherloc.files import is_folder
 from spherloc.warm_up import warm_up
 from spherloc_viz.app.audience import Audience
-from spherloc_viz.app.catalog import Catalog, SceneRequest
+from spherloc_viz.app.catalog import Catalog, RunRequest, SceneRequest
 from spherloc_viz.app.compilation import Compilation, first_and_later
 from spherloc_viz.app.page_runs import Known
 from spherloc_viz.app.review.run_library import RunLibrary
-from spherloc_viz.app.run_request import RunRequest
 from spherloc_viz.app.services import Services
 from spherloc_viz.app.session import Session
 from spherloc_viz.app.stage import views
 from spherloc_viz.app.status import Status
-from spherloc_viz.app.web.access import Access, Role
+from spherloc_viz.app.web.access import Access, Role, open_socket
 from spherloc_viz.app.web.desk import DeskRoom
 from spherloc_viz.app.web.front_door import FrontDoor
-from spherloc_viz.app.web.guard import open_socket
 from spherloc_viz.app.web.viewer import ViewerRoom, of_index
 from spherloc_viz.app.web.viser_internals import role_header, set_theme, start_viser, stop_viser
 from spherloc_viz.given_files import is_recording

@@ -22,7 +22,7 @@ from spherloc.problem import Problem
 from spherloc.trace import Trace
 from spherloc.types import FloatArray
 from spherloc.watch import Cancelled, Watch
-from spherloc_viz.app.catalog import SceneRequest
+from spherloc_viz.app.catalog import Run, RunRequest, SceneRequest
 from spherloc_viz.app.controls.controls import Controls
 from spherloc_viz.app.controls.steps_panel import find_step
 from spherloc_viz.app.edits import Edits
@@ -34,7 +34,6 @@ from spherloc_viz.app.panels.export_panel import Shown
 from spherloc_viz.app.panels.folders import Roots
 from spherloc_viz.app.review.opened import Opened
 from spherloc_viz.app.run_display import Places, RunDisplay
-from spherloc_viz.app.run_request import Run, RunRequest
 from spherloc_viz.app.services import Services
 from spherloc_viz.app.stage.canvas import panel_widths_px
 from spherloc_viz.app.status import Notices, Status

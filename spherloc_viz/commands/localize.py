@@ -30,6 +30,7 @@ from spherloc.experiments.sequence import INITIALISED, How, chosen_queries, loca
 from spherloc.experiments.summary import (
     SuccessRate,
     Summary,
+    TrajectoryError,
     estimated_trajectory,
     summarize,
     timed,
@@ -37,7 +38,6 @@ from spherloc.experiments.summary import (
     vehicle_trajectory,
 )
 from spherloc.experiments.sweep_rows import csv_line
-from spherloc.experiments.trajectory_error import TrajectoryError
 from spherloc.frontend.view import View
 from spherloc.trace import Trace
 from spherloc.trajectory import write_tum

@@ -16,8 +16,7 @@ from spherloc.diagnosis import Cause
 from spherloc.errors import InputError, show
 from spherloc.estimators import options_type
 from spherloc.files import is_file
-from spherloc_viz.gallery.case import Beside, GalleryCase, Play
-from spherloc_viz.gallery.measures import MEASURES
+from spherloc_viz.gallery.case import MEASURES, Beside, GalleryCase, Play
 from spherloc_viz.options import option_fields
 
 _INSTALLED = Path(__file__).resolve().parent / "gallery.toml"

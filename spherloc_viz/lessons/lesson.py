@@ -5,7 +5,7 @@ moment.
 Fenced blocks say what is not prose:
 
 - ``moment``, TOML, once a moment: ``state`` is the text behind the "#" of the page's address; ``minutes`` is how long
-  it takes in front of a class; ``claims`` are statements about its run that a test recomputes (``claims.py``);
+  it takes in front of a class; ``claims`` are statements about its run that a test recomputes;
   ``before`` is what of the state is different until the moment's question is answered.
 - ``question``, TOML: ``ask``, and ``answers``, each with ``text``, ``shows``, ``right`` if it is, and ``go``, what of
   the state changes to show why. What follows the question is told once it is answered.
@@ -16,14 +16,17 @@ In the prose ``$...$`` is a formula (LaTeX), ``{name}`` a number of the run at h
 such as ``seed``, ``set.outlier_rate`` or ``option.iterations``; ``{choice KEY ONE|OTHER}`` offers words.
 """
 
+import contextlib
 import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qsl, urlencode
 
+from spherloc import registry
 from spherloc.errors import InputError, show
 
 MANY = ("set", "option")
@@ -223,3 +226,43 @@ def state_parts(state: str) -> dict[str, str]:
     """Values of a state by key, such as ``seed``; those of ``MANY``, with their name, by ``set.outlier_rate``."""
     pairs: Sequence[tuple[str, str]] = parse_qsl(state, keep_blank_values=True)
     return {f"{key}.{value.partition('=')[0]}" if key in MANY else key: value for key, value in pairs}
+
+
+TEXTS = Path(__file__).with_name("texts")
+KIND = "lessons"
+
+
+@cache
+def lessons() -> tuple[Lesson, ...]:
+    """All lessons that can be read, by their place in the course; ``spherloc plugins`` names the others."""
+    found = list(map(read_lesson, TEXTS.glob("*.md")))
+    for name in registry.names(KIND):
+        if name not in own_names():
+            with contextlib.suppress(InputError):
+                found.append(lesson_of(name))
+    return tuple(sorted(found, key=lambda lesson: (lesson.order, lesson.name)))
+
+
+def own_names() -> tuple[str, ...]:
+    """Names of spherloc's own lessons."""
+    return tuple(path.stem for path in TEXTS.glob("*.md"))
+
+
+def lesson_of(name: str) -> Lesson:
+    """The lesson that another package registers in the group ``spherloc.lessons``: the path of a Markdown file whose
+    stem is the entry point's name.
+
+    Raises ``InputError`` if there is none, or if it cannot be read.
+    """
+    path = registry.lookup(KIND, name)
+    if not isinstance(path, str | Path) or Path(path).stem != name:
+        raise InputError(f"{registry.title(KIND, name)} must be the path of a file {name}.md; mend or uninstall it.")
+    return read_lesson(Path(path))
+
+
+def lesson_named(name: str) -> Lesson:
+    """The lesson of this name; raises ``InputError`` that names those there are."""
+    found = next((lesson for lesson in lessons() if lesson.name == name), None)
+    if found is None:
+        raise InputError(f"there is no lesson {show(name)}; there are {', '.join(one.name for one in lessons())}.")
+    return found

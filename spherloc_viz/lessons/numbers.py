@@ -9,7 +9,7 @@ from spherloc.bounds import bounds_of
 from spherloc.geometry import yaw_of
 from spherloc.metrics import evaluate
 from spherloc.trace import RansacStage, RefinementStage, Trace, TranslationStage, YawStage
-from spherloc_viz.gallery.measures import MEASURES, stage_of
+from spherloc_viz.gallery.case import MEASURES, stage_of
 
 CONFIDENCE = 0.999
 """For which the samples that are needed are told."""

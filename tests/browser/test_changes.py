@@ -14,10 +14,9 @@ from playground import BLIND, PATIENCE_MS, SIZE
 from playwright.sync_api import Browser, Locator, Page, expect
 from viser import _messages
 
-from spherloc_viz.app.web.access import Access
+from spherloc_viz.app.web.access import Access, open_socket
 from spherloc_viz.app.web.downloads import Downloads
 from spherloc_viz.app.web.front_door import FrontDoor
-from spherloc_viz.app.web.guard import open_socket
 from spherloc_viz.app.web.viser_internals import (
     ANSWERS,
     at_once,

@@ -19,9 +19,10 @@ from spherloc.datasets import load_scene
 from spherloc.datasets.variation import Variation
 from spherloc.errors import InputError
 from spherloc.estimators import estimate, options_type
-from spherloc.experiments import sweep_cluster, sweep_workers
+from spherloc.experiments import sweep
 from spherloc.experiments.sweep import (
     MAX_DEATHS,
+    NICENESS,
     TASK_S,
     Backlog,
     Entrant,
@@ -31,7 +32,6 @@ from spherloc.experiments.sweep import (
     planned,
     run_sweep,
 )
-from spherloc.experiments.sweep_workers import NICENESS
 from spherloc.metrics import evaluate
 from spherloc.warm_up import warm_up
 from tests.waiting import LIMIT_S, until
@@ -164,7 +164,7 @@ def test_a_machine_that_starts_no_workers_is_a_sentence(tmp_path: Path, monkeypa
     def read_only(*words: object) -> None:
         raise OSError(errno.EROFS, "Read-only file system")
 
-    monkeypatch.setattr(sweep_workers, "ProcessPoolExecutor", read_only)
+    monkeypatch.setattr(sweep, "ProcessPoolExecutor", read_only)
     with pytest.raises(InputError, match=r"cannot be started \(Read-only file system\); see whether /dev/shm"):
         list(run_sweep(small_plan(tmp_path)))
 
@@ -267,7 +267,7 @@ def test_a_cluster_gives_the_same_rows_though_a_worker_is_killed(tmp_path: Path)
 
 def test_no_cluster_is_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     plan = small_plan(tmp_path)
-    monkeypatch.setattr(sweep_cluster, "CONNECT_S", 0.5)
+    monkeypatch.setattr(sweep, "CONNECT_S", 0.5)
     for address, said in (("tcp://127.0.0.1:9", "no Dask scheduler answers at"), ("host", "missing port number")):
         with pytest.raises(InputError, match=said):
             next(run_sweep(plan, scheduler=address))

@@ -157,6 +157,7 @@ ROWS = st.builds(
     upper_bound=st.none() | st.integers(0, 10_000),
     lower_bound=st.none() | st.integers(0, 10_000),
     nfa=st.none() | FLOATS,
+    t_error_m=st.none() | FLOATS,
 )
 
 

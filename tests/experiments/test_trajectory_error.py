@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from spherloc.experiments.trajectory_error import align, trajectory_error
+from spherloc.experiments.summary import align, trajectory_error
 
 
 def walk(rng, count):

@@ -1,5 +1,6 @@
 """The panel right of the canvas: what is solved and how, comparisons, sweeps, other scenes, and what to take away."""
 
+import threading
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from html import escape
@@ -16,12 +17,11 @@ from spherloc.trace import Trace
 from spherloc.types import FloatArray
 from spherloc.watch import Watch
 from spherloc_viz import share, style
-from spherloc_viz.app.catalog import Catalog, SceneRequest
+from spherloc_viz.app.catalog import Catalog, Run, RunRequest, SceneRequest
 from spherloc_viz.app.controls.estimator_controls import EstimatorControls
 from spherloc_viz.app.controls.presets import Preset, presets
 from spherloc_viz.app.controls.scene_controls import SceneControls
 from spherloc_viz.app.controls.sequence_panel import SequencePanel
-from spherloc_viz.app.controls.slow_run import SlowRun
 from spherloc_viz.app.glossary import heading_html
 from spherloc_viz.app.panels.compare_panel import ComparePanel
 from spherloc_viz.app.panels.export_panel import ExportPanel, Shown
@@ -31,12 +31,12 @@ from spherloc_viz.app.panels.recordings_panel import Page, RecordingsPanel
 from spherloc_viz.app.panels.sweep_runs_panel import SweepPanel
 from spherloc_viz.app.review.opened import Opened
 from spherloc_viz.app.review.reviewer import ReviewCard
-from spherloc_viz.app.run_request import Run, RunRequest
 from spherloc_viz.app.services import Services
 from spherloc_viz.app.stage import views
 from spherloc_viz.app.text import DIM, box
 from spherloc_viz.app.web.touch import Touches
 from spherloc_viz.app.web.viser_internals import at_once, put
+from spherloc_viz.app.workers import LatestWorker
 from spherloc_viz.layers.primitives import SceneItem
 from spherloc_viz.layers.scene import trajectory_items
 from spherloc_viz.recording.replay import Reopened
@@ -364,3 +364,83 @@ def _changes_html(run: Run) -> str:
         ways = " · ".join(f'<u data-touch="{action}" role="button" tabindex="0">{words}</u>' for action, words in links)
         parts.append(f"Matches by hand: {', '.join(done)}. {ways}")
     return box("".join(f"<div>{part}</div>" for part in parts), "font-size:12px") if parts else ""
+
+
+AFTER_S = 0.4
+"""A run that takes longer shows its progress, and gives way to a newer request. Shorter ones are let finish: else
+dragging a slider would show nothing until it stands still."""
+EVERY_S = 0.1
+
+
+class SlowRun:
+    """One session's progress bar and cancel button."""
+
+    def __init__(self, gui: viser.GuiApi, name: str) -> None:
+        self._bar = gui.add_progress_bar(0.0, visible=False)
+        self._button = gui.add_button("Cancel", visible=False, color="red")
+        self._button.on_click(lambda event: self.cancel())
+        self._lock = threading.Lock()
+        self._watch: Watch | None = None
+        self._outdated = False
+        self._stopped = self._lasting = False
+        self._clock = LatestWorker(name, self._tick)
+
+    def start(self) -> None:
+        """Start the clock."""
+        self._clock.start()
+
+    def close(self) -> None:
+        """End the run at hand and the clock; does not wait."""
+        self._clock.close()
+        with self._lock:
+            if self._watch is not None:
+                self._watch.cancel()
+
+    def renew(self) -> None:
+        """What is asked for is about to be read: only what is asked for later outdates the run that begins next."""
+        self._outdated = False
+
+    def begin(self, lasting: bool = False) -> Watch:
+        """A run begins; what it must look at. One that is ``lasting`` does not give way to what is asked for later."""
+        with self._lock:
+            self._watch, self._stopped, self._lasting = Watch(), False, lasting
+            watch = self._watch
+        self._clock.ask()
+        return watch
+
+    def end(self) -> None:
+        """The run has ended."""
+        with self._lock:
+            self._watch = None
+        if self._bar.visible:
+            self._clock.ask()
+
+    def outdate(self) -> None:
+        """Something newer is asked for."""
+        self._outdated = True
+
+    @property
+    def stopped(self) -> bool:
+        """Whether a person ended the last run."""
+        return self._stopped
+
+    def cancel(self) -> None:
+        """A person wants no more of the run at hand."""
+        with self._lock:
+            if self._watch is not None:
+                self._stopped = True
+                self._watch.cancel()
+
+    def _tick(self, asked: bool) -> float | None:
+        with self._lock:
+            watch = self._watch
+        slow = watch is not None and not asked
+        if watch is not None and slow:
+            if self._outdated and not self._lasting:
+                watch.cancel()
+            self._bar.value = 100.0 * watch.fraction
+        if self._bar.visible != slow and (slow or watch is None):
+            self._bar.visible = self._button.visible = slow
+        if watch is None:
+            return None
+        return AFTER_S if asked else EVERY_S

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from spherloc.datasets.map_scene import MapScene
 from spherloc.trace import Trace
+from spherloc_viz.app.catalog import Run
 from spherloc_viz.app.matches.image_panel import jpeg_uri, photo_uri
-from spherloc_viz.app.run_request import Run
 from spherloc_viz.app.text import DIM, box, status_html
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.workers import BackgroundWorker

@@ -9,6 +9,7 @@ import viser
 
 from spherloc.errors import RecordingError
 from spherloc.types import FloatArray
+from spherloc_viz.app.catalog import RunRequest
 from spherloc_viz.app.review.card import comparison_html
 from spherloc_viz.app.review.export import Exporter
 from spherloc_viz.app.review.filters import KEPT, pill
@@ -18,7 +19,6 @@ from spherloc_viz.app.review.opened import Opened
 from spherloc_viz.app.review.reviewer import ReviewCard, Reviewer, Reviewing
 from spherloc_viz.app.review.run_library import RunLibrary
 from spherloc_viz.app.review.run_list import RunList
-from spherloc_viz.app.run_request import RunRequest
 from spherloc_viz.app.text import WITHHELD, box, status_html
 from spherloc_viz.app.web.downloads import Downloads
 from spherloc_viz.app.web.touch import Touch, Touches

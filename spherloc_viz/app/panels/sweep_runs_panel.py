@@ -16,7 +16,7 @@ from spherloc.experiments.sweep_plan import parse_values
 from spherloc.experiments.sweep_rows import rows_text, summarize, summary_text
 from spherloc_viz.app.catalog import SceneRequest
 from spherloc_viz.app.panels.compare_panel import chips_html, ordered
-from spherloc_viz.app.plots.sweep_charts import charts_html, table_html
+from spherloc_viz.app.plots.charts import charts_html, table_html
 from spherloc_viz.app.text import WITHHELD, status_html
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.web.viser_internals import put

@@ -8,12 +8,12 @@ import numpy as np
 from spherloc.diagnosis import Diagnosis
 from spherloc.metrics import evaluate
 from spherloc_viz import style
+from spherloc_viz.app.catalog import Run
 from spherloc_viz.app.history import changed_fields
 from spherloc_viz.app.review import words
 from spherloc_viz.app.review.filters import key_html, keyed, pill
 from spherloc_viz.app.review.opened import Opened, is_same_pose
 from spherloc_viz.app.review.rows import NEXT_KEY, PREVIOUS_KEY, badge_html, verdict_html
-from spherloc_viz.app.run_request import Run
 from spherloc_viz.app.text import DIM, box
 from spherloc_viz.app.web.viewer import viewer_link
 from spherloc_viz.layers import steps

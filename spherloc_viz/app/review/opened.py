@@ -10,7 +10,7 @@ from spherloc import registry
 from spherloc.geometry import camera_centre
 from spherloc.types import FloatArray
 from spherloc_viz import style
-from spherloc_viz.app.run_request import Run, RunRequest
+from spherloc_viz.app.catalog import Run, RunRequest
 from spherloc_viz.layers.comparison import color_of
 from spherloc_viz.layers.frame import RunView
 from spherloc_viz.layers.primitives import Label, SceneItem

@@ -10,12 +10,12 @@ import viser
 
 from spherloc.diagnosis import Diagnosis
 from spherloc.types import FloatArray
+from spherloc_viz.app.catalog import Run, RunRequest
 from spherloc_viz.app.review.card import NAMES, bar_html, card_html, said_html, same_problem, untold_html
 from spherloc_viz.app.review.filters import PAGE
 from spherloc_viz.app.review.opened import AS_RECORDED, Opened, Recorded, reference_items
 from spherloc_viz.app.review.run_library import RunLibrary
 from spherloc_viz.app.review.run_list import RunList
-from spherloc_viz.app.run_request import Run, RunRequest
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.web.viser_internals import update_widget
 from spherloc_viz.app.workers import BackgroundWorker

@@ -11,12 +11,12 @@ import viser
 from spherloc.datasets.map_scene import MapScene
 from spherloc.geometry import align_to_down, camera_centre
 from spherloc_viz import style
+from spherloc_viz.app.catalog import Run
 from spherloc_viz.app.controls.controls import DisplayControls
-from spherloc_viz.app.run_request import Run
 from spherloc_viz.app.stage import views
 from spherloc_viz.app.stage.painter import LABEL_SCALE, Painter
 from spherloc_viz.app.stage.true_camera import TrueCamera
-from spherloc_viz.app.stage.walls import MAX_BYTES, Walls
+from spherloc_viz.app.stage.views import MAX_BYTES, Walls
 from spherloc_viz.layers.frame import one_color
 from spherloc_viz.layers.primitives import Picture, Points
 

@@ -1,15 +1,65 @@
-"""Where the viewer stands: places from which a picture reads well."""
+"""Where the viewer stands: places from which a picture reads well, with no wall between them and what is to be seen."""
 
 from dataclasses import dataclass
+from functools import lru_cache
+from io import BytesIO
 
 import numpy as np
 import viser
+from numpy.typing import NDArray
 
 from spherloc.geometry import yaw_rotation
 from spherloc.types import FloatArray
-from spherloc_viz.app.stage.walls import Walls
 from spherloc_viz.layers.frame import RING_ROOM, SPHERE_ROOM, ball_boxes, circle, dense_points, sphere_box
 from spherloc_viz.layers.primitives import Balls, Label, Mesh, Picture, Points, SceneItem, Segments, Textured
+
+CELLS = 160
+"""Cells of the grid along the mesh's longest side."""
+SAMPLES = 400_000
+"""Places on the surface that fill cells."""
+STEPS = 64
+"""Looks along each line of sight."""
+TARGETS = 24
+"""Lines of sight, at most."""
+NEAR_SHARE, FAR = 0.08, 0.97
+"""Of each line, from the viewer, that is looked at, as shares: the mesh may touch what is to be seen."""
+MAX_BYTES = 60 << 20
+"""A larger mesh takes too long to read: views are then chosen without it."""
+
+
+class Walls:
+    """Cells of a grid, in the aligned map frame, that hold some of a mesh's surface."""
+
+    def __init__(self, glb: bytes, aligned_from_map: FloatArray) -> None:
+        """``glb`` is a binary glTF in the map frame, ``aligned_from_map`` (3, 3) a rotation."""
+        self._turn = aligned_from_map
+        self._low, self._cell_m, self._filled = _grid(glb)
+
+    def blocked(self, position: FloatArray, targets: FloatArray) -> float:
+        """Share of the targets (K, 3) that cannot be seen from a position (3,)."""
+        targets = targets[:: max(1, len(targets) // TARGETS)]
+        along = np.linspace(NEAR_SHARE, FAR, STEPS)[:, None, None]
+        places = (position + along * (targets - position)) @ self._turn  # back into the map frame
+        cells = np.floor((places - self._low) / self._cell_m).astype(np.int64)
+        within = np.all((cells >= 0) & (cells < self._filled.shape), axis=-1)
+        x, y, z = np.moveaxis(np.where(within[..., None], cells, 0), -1, 0)
+        return float(np.mean(np.any(within & self._filled[x, y, z], axis=0)))
+
+
+@lru_cache(maxsize=2)
+def _grid(glb: bytes) -> tuple[FloatArray, float, NDArray[np.bool_]]:
+    """Lower corner (3,) and side of the cells, and which of them hold some of the surface."""
+    import trimesh  # takes a second
+
+    mesh = trimesh.load_mesh(BytesIO(glb), file_type="glb")
+    low, high = np.asarray(mesh.bounds, dtype=np.float64)
+    cell_m = float(np.max(high - low)) / CELLS
+    filled = np.zeros(np.floor((high - low) / cell_m).astype(np.int64) + 1, np.bool_)
+    places = np.asarray(trimesh.sample.sample_surface(mesh, SAMPLES, seed=0)[0])
+    x, y, z = np.floor((places - low) / cell_m).astype(np.int64).T
+    filled[x, y, z] = True
+    return low, cell_m, filled
+
 
 FIELD_OF_VIEW_RAD = np.radians(45.0)
 WIDE_RAD = np.radians(85.0)

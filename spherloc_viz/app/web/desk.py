@@ -22,9 +22,9 @@ from spherloc_viz.app.desk.report import comparison_html, number, p_text, summar
 from spherloc_viz.app.review import words
 from spherloc_viz.app.review.rows import DESK
 from spherloc_viz.app.review.run_library import RunLibrary
+from spherloc_viz.app.web.access import SAFE, SORRY_POLICY, sorry_page
 from spherloc_viz.app.web.downloads import Download, Downloads
-from spherloc_viz.app.web.guard import SAFE
-from spherloc_viz.app.web.viewer import SORRY_POLICY, sorry_page, viewer_link
+from spherloc_viz.app.web.viewer import viewer_link
 from spherloc_viz.recording.run_row import RunRow
 from spherloc_viz.recording.sandbox.checks import is_thumbnail
 

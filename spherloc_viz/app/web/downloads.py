@@ -10,7 +10,7 @@ from pathlib import Path
 from aiohttp import web
 
 from spherloc.errors import RecordingError
-from spherloc_viz.app.web.guard import SAFE
+from spherloc_viz.app.web.access import SAFE
 
 DOWNLOADS = "/download/"
 

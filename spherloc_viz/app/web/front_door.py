@@ -8,10 +8,9 @@ import socket
 import aiohttp
 from aiohttp import web
 
-from spherloc_viz.app.web.access import NO_TOKEN, Access, Role, refused
+from spherloc_viz.app.web.access import NO_TOKEN, SAFE, Access, Role, refusal, refused
 from spherloc_viz.app.web.desk import DO, MAX_BYTES, NO_RUNS, DeskRoom, is_desk
 from spherloc_viz.app.web.downloads import DOWNLOADS, Downloads
-from spherloc_viz.app.web.guard import SAFE, refusal
 from spherloc_viz.app.web.learn import is_learning, learn_answer
 from spherloc_viz.app.web.page import Page, load_page
 from spherloc_viz.app.web.viewer import NOT_RECORDED, PAGE, ViewerRoom

@@ -10,8 +10,7 @@ from aiohttp import web
 
 from spherloc.errors import InputError
 from spherloc_viz.app.lesson_file import handout_of, images_picture, picture
-from spherloc_viz.app.web.guard import SAFE
-from spherloc_viz.app.web.viewer import SORRY_POLICY, sorry_page
+from spherloc_viz.app.web.access import SAFE, SORRY_POLICY, sorry_page
 from spherloc_viz.lessons import lesson_named, lessons
 from spherloc_viz.lessons.html import IMAGES, lesson_page, list_page, notes_page, teacher_page
 

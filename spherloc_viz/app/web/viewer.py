@@ -17,7 +17,7 @@ from urllib.parse import quote, urlencode
 from aiohttp import web
 
 from spherloc.errors import InputError, RecordingError, SpherlocError, show
-from spherloc_viz.app.web.guard import SAFE, open_socket, refusal
+from spherloc_viz.app.web.access import SAFE, SORRY_POLICY, open_socket, refusal, sorry_page
 from spherloc_viz.given_files import REVIEW_SUFFIX
 from spherloc_viz.recording.content.columns import TIMELINE
 from spherloc_viz.recording.index.run_index import RunIndex
@@ -29,20 +29,6 @@ from spherloc_viz.recording.viewer import labels_of, step_of
 
 PROGRAM = "/viewer/program/"
 DATA = "/viewer/data/"
-
-_SORRY = """<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><title>spherloc</title><link rel="icon" href="data:,">
-<style>html{{color-scheme:light dark}}
-body{{font:16px/1.5 system-ui,sans-serif;max-width:40rem;margin:18vh auto;padding:0 1rem;overflow-wrap:anywhere}}
-</style></head>
-<body><p>{sentence}</p></body></html>
-"""
-SORRY_POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; frame-ancestors 'none'"
-
-
-def sorry_page(sentence: str) -> str:
-    """A plain page with one sentence."""
-    return _SORRY.format(sentence=html.escape(sentence))
 
 
 def viewer_page(file: str, row: RunRow, step: int, version: str, timeline: str) -> str:
