@@ -22,6 +22,8 @@ INNER, OUTER = 1.3, 1.95
 STEP_RAD = np.radians(4.0)
 FEWEST_TRACKS = 24
 """The band has room for so many arcs over one yaw, or more if more are drawn there."""
+EXAMPLE_RAD = np.radians(15.0)
+"""Width of the arc that explains what one is."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,13 +65,13 @@ class Arcs:
 
     @cached_property
     def example(self) -> IntArray:
-        """The arcs of one pair: of those with an arc over the estimated yaw the one whose arc there is the shortest,
-        among those with two arcs if there are any."""
+        """The arcs of one pair: of those with an arc over the estimated yaw the one whose arc there is most nearly as
+        wide as can be seen well, among those with two arcs if there are any."""
         arcs, same = self.stage.clique.astype(np.int64), self._continues
         several = same[arcs] | np.append(same[1:], False)[arcs]
         if several.any():
             arcs = arcs[several]
-        first = int(arcs[np.argmin((self.stage.hi_rad - self.stage.lo_rad)[arcs])])
+        first = int(arcs[np.argmin(np.abs((self.stage.hi_rad - self.stage.lo_rad)[arcs] - EXAMPLE_RAD))])
         end = first + 1
         while same[first]:
             first -= 1
@@ -106,14 +108,16 @@ class Arcs:
             others = np.flatnonzero(~self.in_clique)
         return np.concatenate([even(members, take), others[: room - take]])
 
-    def drawn(self, view: RunView, arcs: IntArray, marked: np.ndarray, mark: style.RGB) -> Segments:
+    def drawn(
+        self, view: RunView, arcs: IntArray, marked: np.ndarray, mark: style.RGB, width_px: float = 2.0
+    ) -> Segments:
         """Arcs on the ring around the middle of the map, the marked ones (mask) in their colour. Arcs that overlap lie
         side by side, so that the band is as broad as they are many."""
         order, arc, points = view.kept("arcs", arcs.tobytes(), lambda: self._band(view, arcs))
         colors = one_color(style.UNDECIDED, len(arc))
         colors[marked[order][arc]] = mark
         ids = self.stage.pairs[arcs[order][arc]].astype(np.int64)
-        return Segments("ring/arcs", "yaw ring", points, colors, 2.0, ids=ids)
+        return Segments("ring/arcs", "yaw ring", points, colors, width_px, ids=ids)
 
     def _band(self, view: RunView, arcs: IntArray) -> tuple[IntArray, IntArray, FloatArray]:
         """Some arcs as S straight lines (S, 2, 3), which arc each line is of (S,), and the order of these arcs."""
@@ -250,7 +254,7 @@ def _items(view: RunView, arcs: Arcs, shown: np.ndarray, numbers: tuple[int, int
     ends = view.points[list(numbers)][None]
     ids = np.array([numbers], dtype=np.int64)
     return (
-        arcs.drawn(view, shown, marked, style.SAMPLE),
+        arcs.drawn(view, shown, marked, style.SAMPLE, 7.0),
         ring.outline("ring/overlap", ring.circle(view, view.middle, np.zeros(())), style.SPHERE),
         Segments("ring/candidate", "yaw ring", np.concatenate(spokes), one_color(style.SAMPLE, len(spokes)), 4.0),
         *ring.spokes(view, view.middle, None),
