@@ -79,6 +79,8 @@ class LinkedRuns:
 
 ASPECT = 1.15
 """Width over height for which views are chosen: between those of a screen's canvas and of a phone's."""
+LETTER = views.LETTER_PX / 300.0
+"""Width of a letter by half the height of such a canvas."""
 MAX_BYTES_OF_FILE = 8_000_000
 BARE = "<style>#root button,[class*=Notifications-root]{display:none!important}</style>"
 """Viser's own buttons and notes would be dead in a file."""
@@ -201,12 +203,13 @@ def still_of(linked: LinkedRun, runs: LinkedRuns, dark: bool) -> Still:
     turn = trace.problem.aligned.map_turn
     mesh = runs.catalog.mesh(run.request.scene.scene)
     walls = Walls(mesh, turn) if mesh is not None and len(mesh) <= MAX_BYTES else None
-    place = views.follow(picture, ASPECT, walls)
+    place = views.follow(picture, ASPECT, walls, LETTER)
+    hidden = views.cut(picture, place, ASPECT, LETTER)
     layers = set(style.LAYERS) - ({"ground"} if mesh is not None else set())
     return Still(
         title="",
         note="",
-        items=[item for item in picture.scene if item.layer in layers],
+        items=[item for item in picture.scene if item.layer in layers and item.name not in hidden],
         backdrop=mesh,
         aligned_from_map=turn,
         position=place.position,

@@ -259,16 +259,24 @@ class Session:
         run = self._run
         if run is None or not self._links:
             return self._solve_request()
-        number, link = _taken(self._links)[-1]
+        links = _taken(self._links)
+        number, link = links[-1]
+        arrived = True
         try:
             followed = self._follower.follow(link, run.request, self._view())
             self._asked.append((number, followed.request))
             pause = self._solve_request()
             self._arrive(followed, number)
             return pause
+        except Cancelled:
+            arrived = self._controls.slow.stopped
+            raise
         finally:
-            self._followed += 1
-            self._page.ask()
+            if arrived:
+                self._followed += len(links)
+                self._page.ask()
+            else:  # its run gave way to a change that came meanwhile, and begins anew with it
+                self._links.extendleft(reversed(links))
 
     def _arrive(self, followed: Followed, number: int) -> None:
         """A link was followed: look at its run as it says. ``number`` is that of the change before it."""

@@ -15,6 +15,8 @@ FOOT = 2.05
 """Radius at which the outline has the height 0, in sphere radii."""
 HEIGHT = 0.9
 """Height of the outline at its peak, in sphere radii."""
+END = FOOT + HEIGHT + 0.15
+"""Where lines through the ring end, in sphere radii."""
 DEGREES = 360
 """Corners of the outline."""
 GOLDEN = 0.6180339887498949
@@ -66,20 +68,29 @@ def spokes(view: RunView, centre: FloatArray, yaw_rad: float | None) -> list[Seg
     """Where the camera looks with the estimated yaw, if there is one yet, and with the true one, if that is known."""
     out = [] if yaw_rad is None else [spoke("ring/estimate", view, centre, yaw_rad, style.ESTIMATE)]
     if view.truth is not None:
-        out.append(spoke("ring/truth", view, centre, yaw_of(view.truth[:, :3]), style.TRUTH))
+        # Beyond the ends of the others, which it would hide where they are right.
+        out.append(spoke("ring/truth", view, centre, yaw_of(view.truth[:, :3]), style.TRUTH, END, END + 0.3))
     return out
 
 
-def spoke(name: str, view: RunView, centre: FloatArray, yaw_rad: float, color: style.RGB) -> Segments:
-    """A line from the sphere through the ring where the camera looks with a yaw."""
-    radii = view.sphere_m * np.array([1.0, FOOT + HEIGHT + 0.15])
+def spoke(
+    name: str,
+    view: RunView,
+    centre: FloatArray,
+    yaw_rad: float,
+    color: style.RGB,
+    begin: float = 1.0,
+    end: float = END,
+) -> Segments:
+    """A line where the camera looks with a yaw, from the sphere through the ring, or between two of its radii."""
+    radii = view.sphere_m * np.array([begin, end])
     ends = centre + radii[:, None] * directions(np.array([yaw_rad]))
     return Segments(name, "yaw ring", ends[None], one_color(color, 1), 4.0)
 
 
 def name(path: str, view: RunView, yaw_rad: float, words: str) -> Label:
     """Words outside of the ring at a yaw."""
-    radius_m = view.sphere_m * (FOOT + HEIGHT + 0.15)
+    radius_m = view.sphere_m * END
     place = view.middle + radius_m * directions(np.array([yaw_rad]))[0]
     return Label(path, "yaw ring", place - np.array([0.0, 0.25 * view.sphere_m, 0.0]), words)
 

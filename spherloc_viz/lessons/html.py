@@ -1,6 +1,7 @@
 """Lessons as HTML: the list of all, the page with a lesson's prose beside the scene, and the hand-out."""
 
 import re
+from base64 import b64encode
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -387,4 +388,12 @@ def _timetable(lesson: Lesson) -> str:
 
 
 def _page(name: str, **values: str) -> str:
-    return Template(text_of(name)).substitute(values, style=text_of("lesson.css"))
+    page = Template(text_of(name)).substitute(values, style=text_of("lesson.css"))
+    return page.replace("<style>", f"<style>{_font()}", 1) if "<math" in page else page
+
+
+@cache
+def _font() -> str:
+    """The font of formulas, with the measures by which a browser sets them: many machines have none that has them."""
+    font = Path(__file__).with_name("font").joinpath("formulas.woff2").read_bytes()
+    return f"@font-face{{font-family:formulas;src:url(data:font/woff2;base64,{b64encode(font).decode()})}}\n"

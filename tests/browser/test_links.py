@@ -91,6 +91,15 @@ def test_a_reload_and_a_link_bring_back_what_is_shown(
         page.expect_quiet(address)
 
 
+def test_a_link_is_followed_to_its_end_though_something_is_changed_meanwhile(tab: Playground) -> None:
+    expect(tab.page).to_have_url(re.compile("#v=1&scene=small.street&seed=3&.*step=outcome$"))
+    slow = "#v=1&scene=small+street&seed=3&estimator=ransac-2p&option=iterations%3D9000000&step=sample-1"
+    tab.page.evaluate("link => location.replace(link)", slow)
+    expect(tab.page.get_by_role("button", name="Cancel", exact=True).first).to_be_visible()
+    tab.type("Iterations", "321")
+    expect(tab.page).to_have_url(re.compile("estimator=ransac-2p&option=iterations%3D321&step=sample-1$"))
+
+
 def told_place(link: str) -> list[float]:
     """Where a link says that the viewer stands, as ``Playground.viewer`` measures it; infinite if it does not."""
     found = re.search(r"&view=([^&]*)", link)

@@ -73,6 +73,8 @@ LETTER_PX = 6.8
 """Width of a letter of a label of viser's size."""
 WIDE, HIGH = np.array([0.5, 0.0]), np.array([0.6, 1.4])
 """Half a label's width and height, in letters: for each of its letters, and besides."""
+BESIDE = ("ground", "scale bar")
+"""Layers whose words are the same at every step."""
 NEAR = 0.6
 """How far from its subject a step's words may stand, by the subject's size."""
 ROUNDS = 4
@@ -160,13 +162,20 @@ def follow(picture: Picture, aspect: float, walls: Walls | None = None, letter: 
 
 
 def cut(picture: Picture, view: View, aspect: float, letter: float) -> frozenset[str]:
-    """Names of the words that the edge of the canvas would cut."""
+    """Names of the words that the edge of the canvas would cut, or that would lie on others that tell more."""
     labels = [item for item in picture.scene if isinstance(item, Label) and item.height_m is None]
     if not labels:
         return frozenset()
+    labels.sort(key=lambda label: label.layer in BESIDE)
     seen = projected(view, np.array([label.position for label in labels])) / np.tan(view.field_of_view_rad / 2)
-    beyond = np.abs(seen) + [_half_size(label, letter) for label in labels] > [aspect, 1.0]
-    return frozenset(label.name for label, outside in zip(labels, beyond.any(axis=1), strict=True) if outside)
+    halves = np.array([_half_size(label, letter) for label in labels])
+    shown: list[int] = []
+    for k in range(len(labels)):
+        inside = np.all(np.abs(seen[k]) + halves[k] <= [aspect, 1.0])
+        covers = np.all(np.abs(seen[k] - seen[shown]) < halves[k] + halves[shown], axis=1)
+        if inside and not (labels[k].layer in BESIDE and covers.any()):
+            shown.append(k)
+    return frozenset(label.name for k, label in enumerate(labels) if k not in shown)
 
 
 def _names(picture: Picture, subject: FloatArray) -> list[Label]:
@@ -174,7 +183,7 @@ def _names(picture: Picture, subject: FloatArray) -> list[Label]:
     low, high = np.min(subject, axis=0), np.max(subject, axis=0)
     room = NEAR * float(np.max(high - low))
     labels = [item for item in picture.scene if isinstance(item, Label) and item.height_m is None]
-    own = [label for label in labels if label.layer not in ("ground", "scale bar")]
+    own = [label for label in labels if label.layer not in BESIDE]
     return [label for label in own if np.all((label.position > low - room) & (label.position < high + room))]
 
 

@@ -75,6 +75,7 @@ def _policy(html: str) -> str:
         "script-src": " ".join(f"'sha256-{digest}'" for digest in hashes) or "'none'",
         "style-src": "'unsafe-inline'",
         "img-src": "'self' data:",
+        "font-src": "data:",
         "frame-src": "'self'",
         "base-uri": "'none'",
         "form-action": "'none'",
