@@ -3,6 +3,8 @@
 On the ring, the direction of a yaw is where the camera looks with that yaw.
 """
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from spherloc.geometry import wrap_angle, yaw_of
@@ -17,6 +19,8 @@ HEIGHT = 0.9
 """Height of the outline at its peak, in sphere radii."""
 END = FOOT + HEIGHT + 0.15
 """Where lines through the ring end, in sphere radii."""
+HIDES_RAD = np.radians(4.0)
+"""Lines at a smaller angle look like one."""
 DEGREES = 360
 """Corners of the outline."""
 GOLDEN = 0.6180339887498949
@@ -64,12 +68,18 @@ def bars(name: str, feet: FloatArray, tops: FloatArray, colors: ByteArray) -> Se
     return Segments(name, "yaw ring", np.stack([feet, tops], axis=1), colors, 2.0)
 
 
-def spokes(view: RunView, centre: FloatArray, yaw_rad: float | None) -> list[Segments]:
-    """Where the camera looks with the estimated yaw, if there is one yet, and with the true one, if that is known."""
+def spokes(
+    view: RunView, centre: FloatArray, yaw_rad: float | None, candidates_rad: Iterable[float] = ()
+) -> list[Segments]:
+    """Where the camera looks with the estimated yaw, if there is one yet, and with the true one, if that is known:
+    only beyond the ends of the others where it would hide one of them or a candidate's."""
     out = [] if yaw_rad is None else [spoke("ring/estimate", view, centre, yaw_rad, style.ESTIMATE)]
     if view.truth is not None:
-        # Beyond the ends of the others, which it would hide where they are right.
-        out.append(spoke("ring/truth", view, centre, yaw_of(view.truth[:, :3]), style.TRUTH, END, END + 0.3))
+        true_rad = yaw_of(view.truth[:, :3])
+        others = np.array([*candidates_rad, *([] if yaw_rad is None else [yaw_rad])])
+        hides = np.any(np.cos(others - true_rad) > np.cos(HIDES_RAD))
+        begin, end = (END, END + 0.5) if hides else (1.0, END)
+        out.append(spoke("ring/truth", view, centre, true_rad, style.TRUTH, begin, end))
     return out
 
 

@@ -1,5 +1,6 @@
 """Yaw: arcs of pairs gather on the ring around the sphere, candidate yaws are tried, and most arcs overlap at one."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property, partial
 from heapq import heappop, heappush
@@ -257,7 +258,7 @@ def _items(view: RunView, arcs: Arcs, shown: np.ndarray, numbers: tuple[int, int
         arcs.drawn(view, shown, marked, style.SAMPLE, 7.0),
         ring.outline("ring/overlap", ring.circle(view, view.middle, np.zeros(())), style.SPHERE),
         Segments("ring/candidate", "yaw ring", np.concatenate(spokes), one_color(style.SAMPLE, len(spokes)), 4.0),
-        *ring.spokes(view, view.middle, None),
+        *ring.spokes(view, view.middle, None, middles),
         Segments("pairs/sample", "pairs", ends, one_color(style.SAMPLE, 1), 3.0, ids=ids),
     )
 
@@ -356,7 +357,7 @@ def _candidate(view: RunView, arcs: Arcs, places: IntArray) -> Frame:
     turned, drawn = view.standing(yaw_rotation(yaw)), arcs.spread(style.MAX_DRAWN_ARCS)
     met = arcs.over(drawn, np.radians(lo), np.radians(hi))
     mean = float(np.sum(arcs.stage.hi_rad - arcs.stage.lo_rad)) / (2 * np.pi)
-    items = _ring(view, arcs, drawn, counts, met, style.SAMPLE)
+    items = _ring(view, arcs, drawn, counts, met, style.SAMPLE, (yaw,))
     return Frame(
         f"The candidate yaw {lo:.2f}° lies in up to {here:,} of {len(arcs):,} arcs within a quarter of a degree, the "
         f"most within 10° on either side. {_so_far(counts, places)}",
@@ -389,7 +390,7 @@ def _clique(view: RunView, arcs: Arcs) -> Frame:
         note += f" An even sample of {len(drawn)} of {count:,} arcs is drawn, half of them from the clique."
     interval = np.degrees(stage.best_rad[1] - stage.best_rad[0])
     off = ring.off_truth(view, stage.yaw_rad)
-    items = _ring(view, arcs, drawn, stage.overlap, arcs.in_clique[drawn], style.CLIQUE)
+    items = _ring(view, arcs, drawn, stage.overlap, arcs.in_clique[drawn], style.CLIQUE, (stage.yaw_rad,))
     return Frame(
         f"{len(stage.clique):,} arcs, each of a pair of matches, overlap at {np.degrees(stage.yaw_rad):.2f}°{off}; no "
         f"other yaw lies in more. They are a maximum clique of the rotation graph and agree on an interval of "
@@ -415,13 +416,15 @@ def _ring(
     counts: np.ndarray,
     marked: np.ndarray | None = None,
     mark: style.RGB = style.UNDECIDED,
+    yaws_rad: Iterable[float] = (),
 ) -> tuple[SceneItem, ...]:
-    """Some arcs, those that are marked in their colour, the outline of the counts, and the true yaw if it is known."""
+    """Some arcs, those that are marked in their colour, the outline of the counts, and the true yaw if it is known,
+    where it hides no line at one of ``yaws_rad``."""
     heights = ring.by_degree(counts)
     line = ring.circle(view, view.middle, heights / max(1, int(heights.max())))
     mask = np.zeros(len(drawn), dtype=bool) if marked is None else marked
     band = arcs.drawn(view, drawn, mask, mark)
-    return band, ring.outline("ring/overlap", line, style.SPHERE), *ring.spokes(view, view.middle, None)
+    return band, ring.outline("ring/overlap", line, style.SPHERE), *ring.spokes(view, view.middle, None, yaws_rad)
 
 
 def _growing_chart(view: RunView, arcs: Arcs, size: int) -> Chart:

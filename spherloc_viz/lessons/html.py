@@ -132,7 +132,8 @@ def _field(words: str, state: str, form: Form) -> str:
     kind, *rest = words.split(" ", 2)
     if kind == PAIR and not rest:
         alt = "The query and a reference image with their matches"
-        return f'<img class="pair" src="{escape(form.images(state))}" alt="{alt}" loading="lazy">'
+        later = ' loading="lazy"' if form.controls else ""  # paper may be printed before anybody scrolls
+        return f'<img class="pair" src="{escape(form.images(state))}" alt="{alt}"{later}>'
     if not rest:
         return form.number(kind)
     key = rest[0]

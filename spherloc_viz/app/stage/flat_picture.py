@@ -16,6 +16,8 @@ MIN_DOT_PX, MAX_DOT_PX = 1.2, 12.0
 LINE = 0.6
 """Width of lines by that on the screen, whose canvas is larger."""
 LABEL_PX = 11.0
+MIN_LETTER_PX = 6.0
+"""Words that shrink with what they name are left out where they would be smaller."""
 LETTER = 0.55
 """Width of a letter by the height of its line, on average."""
 NEAR_M = 1e-3
@@ -73,7 +75,8 @@ def _shapes(item: SceneItem, eye: _Eye) -> Iterator[Shape]:
             yield from _outline(eye, item)
         case Label():
             depth = float(eye.depths_m(item.position[None])[0])
-            if depth > NEAR_M:
+            height = np.array([np.inf if item.height_m is None else item.height_m])
+            if depth > NEAR_M and eye.sizes_px(height, np.array([depth]))[0] >= MIN_LETTER_PX:
                 ((x, y),) = eye.pixels(item.position[None])
                 if 0 < x < WIDTH and 0 < y < HEIGHT:
                     half = min(0.5 * LETTER * LABEL_PX * len(item.text), 0.5 * WIDTH)
