@@ -246,3 +246,8 @@ def test_the_panel_sends_charts_when_they_change_and_only_then(server: viser.Vis
     assert panel._html.content == chart_html(first) + chart_html(second)
     panel.draw(())
     assert "<svg" not in panel._html.content and "No chart yet" in panel._html.content
+
+
+def test_rounding_is_no_range() -> None:
+    """Residuals of 1e-13 px have no axis of fourteen decimals."""
+    assert "0.0000" not in chart_svg(chart(curve(np.zeros(1), np.full(1, 8e-14))))

@@ -21,6 +21,8 @@ MAX_DOTS = 40
 """Corners up to which a line shows each as a dot."""
 MAX_STEPS = 360
 HEADROOM = 1.06
+ROUNDING = 1e-9
+"""What differs by less is the same: the two matches that a pose was made of are 1e-13 px off."""
 
 Bands = Mapping[str, tuple[FloatArray, FloatArray]]
 """Lower and upper ends (K,), (K,) of the band around a curve, by the curve's label."""
@@ -84,7 +86,7 @@ def _reach(chart: Chart, bands: Bands) -> tuple[float, float]:
     known = np.concatenate([np.zeros(1), *values])
     known = known[np.isfinite(known)]
     low, high = float(known.min()), float(known.max())
-    return low, (low + HEADROOM * (high - low) if high > low else low + 1.0)
+    return low, (low + HEADROOM * (high - low) if high - low > ROUNDING else low + 1.0)
 
 
 def _legend(chart: Chart, width_px: float) -> list[list[tuple[Curve, float]]]:
