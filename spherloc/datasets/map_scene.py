@@ -14,7 +14,8 @@ from spherloc.datasets.query_gravity import BOUND_SD, GravitySettings, MeasuredG
 from spherloc.datasets.registration import Registration
 from spherloc.errors import InputError, show
 from spherloc.files import is_folder
-from spherloc.frontend.pipeline import image_matcher
+from spherloc.frontend.masks import MAX_NADIR_DEG, MAX_SEAM_DEG, Masks, with_masked_lifts
+from spherloc.frontend.pipeline import ImageMatcher, image_matcher
 from spherloc.frontend.stored_matches import StoredMatches
 from spherloc.frontend.view import Gravity, Matcher, Matches, NeedsPreparing, Report, View
 from spherloc.problem import Problem
@@ -209,7 +210,7 @@ def _contradiction(stated: Gravity, nearby: Gravity | None) -> tuple[str, ...]:
 
 
 REQUIRED = {"kind", "name"}
-OPTIONAL = {"about", "frontend", "gravity", "options", "thresholds", "units"}
+OPTIONAL = {"about", "frontend", "gravity", "masks", "options", "thresholds", "units"}
 UNITS: Mapping[str, bool] = {"metres": True, "unknown": False}
 """What ``units`` may be, and whether lengths are metres then."""
 
@@ -225,6 +226,8 @@ class MapSettings:
     bound_px: float | None
     thresholds: Thresholds
     metric: bool
+    masks: Masks | None
+    """Of queries and references, if the scene file has some."""
 
     def scene(
         self,
@@ -242,11 +245,22 @@ class MapSettings:
         Without a ``matcher`` among them, the front end that [frontend] describes is taken. Raises ``InputError`` for a
         wrong [frontend] and if there is no query or no reference.
         """
-        given = tuple(references)
+        given, asked = tuple(references), tuple(queries)
+        remarks = list(remarks)
+        if self.masks is not None:
+            given, asked = self._masked(path, given, asked, remarks)
         gravity = self.gravity
-        known, said = gravity.of_queries(queries, gravity_map)
-        if "matcher" not in others:
+        known, said = gravity.of_queries(asked, gravity_map)
+        matcher = others.get("matcher")
+        if matcher is None:
             others["matcher"] = image_matcher(given, self.frontend, str(path), path.parent)
+        elif self.masks is not None:
+            if not isinstance(matcher, ImageMatcher):
+                raise InputError(
+                    f"{path}: [masks] is for features that spherloc finds, and these are given; mask the images where "
+                    "the features are found."
+                )
+            others["matcher"] = replace(matcher, references=given)
         return MapScene(
             name=self.name,
             where=str(path),
@@ -264,6 +278,19 @@ class MapSettings:
             **others,
         )
 
+    def _masked(
+        self, path: Path, references: tuple[View, ...], queries: tuple[View, ...], remarks: list[str]
+    ) -> tuple[tuple[View, ...], tuple[View, ...]]:
+        """References and queries without what the masks leave out; adds to ``remarks``."""
+        if self.masks is None or not references + queries:
+            return references, queries
+        try:
+            masked, said = self.masks.on(references + queries)
+        except InputError as error:
+            raise InputError(f"{path} [masks]: {error}") from None
+        remarks += said
+        return with_masked_lifts(masked[: len(references)]), masked[len(references) :]
+
 
 def read_settings(
     table: Mapping[str, Any], where: str, gravity_bound_deg: float, thresholds: Thresholds = DEFAULT_THRESHOLDS
@@ -280,7 +307,23 @@ def read_settings(
         bound_px=scene_file.bound_px(table, where),
         thresholds=_thresholds(table["thresholds"], where) if "thresholds" in table else thresholds,
         metric=_metric(table, where),
+        masks=_masks(scene_file.section(table, "masks", where), where) if "masks" in table else None,
     )
+
+
+def _masks(table: Mapping[str, Any], where: str) -> Masks:
+    """``[masks]``; paths are relative to the scene file."""
+    place = f"{where} [masks]"
+    scene_file.check_keys(table, set(), {"images", "nadir_deg", "seam_deg"}, place)
+    if not table:
+        raise InputError(f"{place}: says nothing; give images, nadir_deg or seam_deg.")
+    images = Path(where).parent / scene_file.text(table, "images", place) if "images" in table else None
+    angles = {
+        key: scene_file.number(table, key, place, 0.0, most)
+        for key, most in (("nadir_deg", MAX_NADIR_DEG), ("seam_deg", MAX_SEAM_DEG))
+        if key in table
+    }
+    return Masks(images, **angles)
 
 
 def _metric(table: Mapping[str, Any], where: str) -> bool:

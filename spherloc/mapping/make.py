@@ -6,8 +6,11 @@ from pathlib import Path
 
 from spherloc.errors import InputError, show
 from spherloc.files import is_folder
+from spherloc.frontend.masks import Masks
+from spherloc.frontend.pipeline import FrontendOptions
 from spherloc.frontend.view import Gravity, View
 from spherloc.mapping.later import place_rest
+from spherloc.mapping.positions import Positions, gps_of_images
 from spherloc.mapping.reconstruction import Reconstruction, reconstruct
 from spherloc.mapping.upright import (
     Level,
@@ -18,8 +21,9 @@ from spherloc.mapping.upright import (
     level_of,
     scale_by_distance,
     scale_by_height,
+    scale_by_positions,
 )
-from spherloc.mapping.written import Written, write_map
+from spherloc.mapping.written import Kept, Written, write_map
 
 GROUP = "group"
 """Name of the folder, with a number, of a map of images that could not be joined with the rest."""
@@ -29,12 +33,14 @@ MIN_OF_GROUP = 3
 
 @dataclass(frozen=True)
 class Measured:
-    """What fixes the map's scale: one of the two, or nothing."""
+    """What fixes the map's scale: one of these, or nothing; then GPS in the photographs does, if it is there."""
 
     camera_height_m: float | None = None
     """Of the cameras above the ground."""
     distance: tuple[str, str, float] | None = None
     """Names of two images, and how many metres they are apart."""
+    positions: Positions | None = None
+    """Of the images, by another source."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,15 +53,25 @@ class Map:
     written: Written
     groups: "tuple[Map, ...]" = ()
     """Maps of other images, which could not be joined with this one."""
+    features: str = "sift"
+    """What was matched, by the name of the features."""
 
 
 def make_map(
-    views: Sequence[View], images: Path, folder: Path, measured: Measured, new_images: Path | None, tell: Tell
+    views: Sequence[View],
+    images: Path,
+    folder: Path,
+    measured: Measured,
+    new_images: Path | None,
+    tell: Tell,
+    masks: Masks | None = None,
+    how: FrontendOptions | None = None,
 ) -> Map:
     """Make a map of images of one camera and write it into ``folder``.
 
-    ``new_images`` is a folder of other images of that camera, for which a scene is written too. Raises ``InputError``
-    if they give no map, if what is measured names other images, or if a file cannot be read or written.
+    ``new_images`` is a folder of other images of that camera, for which a scene is written too; ``masks`` are those
+    that the views have, which the scenes are to have as well, and ``how`` are the features. Raises ``InputError`` if
+    they give no map, if what is measured names other images, or if a file cannot be read or written.
     """
     if new_images is not None and not is_folder(new_images):
         raise InputError(f"{new_images}: is no folder; give one with images that are to be localized.")
@@ -69,11 +85,14 @@ def make_map(
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{folder}: cannot be made ({error.strerror}); give another --output.") from None
+    if measured == Measured():
+        measured = Measured(positions=gps_of_images(views))
+    kept = Kept(masks, how or FrontendOptions())
     gravity = gravity_by_lines(views, tell)
-    first, *others = reconstruct(views, [gravity.get(view.name) for view in views], folder, tell)
+    first, *others = reconstruct(views, [gravity.get(view.name) for view in views], folder, tell, how)
     found = _finished(first, views, nearer_to_others(first, others), gravity, measured, tell)
     inside = set(found[0].poses)
-    made = Map(*found, write_map(*found, views, images, folder, new_images))
+    made = Map(*found, write_map(*found, views, images, folder, new_images, kept), features=kept.how.features.method)
     groups: list[Map] = []
     for other in others:
         if len(other.poses.keys() - inside) < MIN_OF_GROUP:
@@ -90,7 +109,7 @@ def make_map(
             place.mkdir(exist_ok=True)
         except OSError as error:
             raise InputError(f"{place}: cannot be made ({error.strerror}); give another --output.") from None
-        groups.append(Map(*found, write_map(*found, views, images, place, new_images)))
+        groups.append(Map(*found, write_map(*found, views, images, place, new_images, kept)))
     return replace(made, groups=tuple(groups))
 
 
@@ -131,6 +150,8 @@ def scale_of(made: Reconstruction, level: Level, measured: Measured) -> Scale:
             return scale_by_distance(made.poses, *measured.distance)
         if measured.camera_height_m is not None:
             return scale_by_height(made.poses, made.points(), level, measured.camera_height_m)
+        if measured.positions is not None:
+            return scale_by_positions(made.poses, measured.positions, level)
     except InputError as error:
         return replace(arbitrary_scale(made.poses), why_unknown=str(error))
     return arbitrary_scale(made.poses)

@@ -33,8 +33,6 @@ BOUND_RAD = float(np.radians(0.5))
 BOUND_PX = 1.5, 6.0
 ONE_PLACE_RAD = float(np.radians(0.5))
 """Rays of a match that differ by less: two images from one place, which tell nothing of depth."""
-RATIO = 0.8
-"""Of the distances to the nearest and the second nearest descriptor."""
 LEVEL_BOUND_RAD = float(np.radians(1.2))
 """Of a match to its epipolar plane where both images are taken for level: gravity is known to a degree or less."""
 PEAK = 1.7
@@ -55,8 +53,10 @@ class Pairs:
         features: Sequence[Features],
         usable: Sequence[NDArray[np.int64]],
         gravity: Sequence[Gravity | None],
+        matching: MatchOptions,
     ) -> None:
         """``usable`` (K,) are the features of each image that COLMAP may have, ``gravity`` what its lines tell."""
+        self._matching = matching
         self._pycolmap = pycolmap
         self._features = features
         height = round(pi * focal_px(camera))
@@ -81,7 +81,7 @@ class Pairs:
 
     def compare(self, first: int, second: int) -> tuple[NDArray[np.uint32], Any]:
         """Matches (M, 2) by number of usable feature, and a ``TwoViewGeometry`` of those that fit, or None."""
-        found = match(self._features[first], self._features[second], MatchOptions(ratio=RATIO))
+        found = match(self._features[first], self._features[second], self._matching)
         pairs = np.column_stack(
             [self._number_of[first][found.query_index], self._number_of[second][found.reference_index]]
         )

@@ -13,6 +13,7 @@ from spherloc.cameras.calibration import load_camera
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.errors import InputError, SpherlocError, shorten
 from spherloc.files import IMAGES, is_file, is_folder, names_in
+from spherloc.frontend.masks import Masks
 from spherloc.frontend.view import View
 from spherloc.images import grey, read_size
 from spherloc.mapping.lens import for_colmap
@@ -38,13 +39,14 @@ class Photographs:
     remarks: tuple[str, ...]
 
 
-def photographs(folder: Path, camera: Camera | None) -> Photographs:
+def photographs(folder: Path, camera: Camera | None, masks: Masks | None = None) -> Photographs:
     """The images of a folder, all of ``camera``; without one they are taken for panoramas if they are 2 to 1.
 
-    Other images without one are of the camera whose calibration lies in the folder, if one of their size does.
+    Other images without one are of the camera whose calibration lies in the folder, if one of their size does. What
+    ``masks`` leave out gives no features.
 
-    Raises ``InputError`` if there are fewer than two of one size or too many, or if their camera is not known or none
-    that COLMAP can have.
+    Raises ``InputError`` if there are fewer than two of one size or too many, if there is no mask for any of them, or
+    if their camera is not known or none that COLMAP can have.
     """
     if not is_folder(folder):
         raise InputError(f"{folder}: is no folder; give the folder of the photographs.")
@@ -89,7 +91,11 @@ def photographs(folder: Path, camera: Camera | None) -> Photographs:
     camera, about_lens = for_colmap(camera)
     if about_lens:
         remarks.append(about_lens)
-    return Photographs(tuple(View(name, camera, folder / name) for name in sorted(names)), tuple(remarks))
+    views = tuple(View(name, camera, folder / name) for name in sorted(names))
+    if masks is not None:
+        views, without = masks.on(views)
+        remarks += without
+    return Photographs(views, tuple(remarks))
 
 
 def _calibration_in(folder: Path, size: tuple[int, int]) -> tuple[Camera | None, str]:

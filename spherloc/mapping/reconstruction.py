@@ -32,7 +32,8 @@ from spherloc.cameras.colmap_models import colmap_camera
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.errors import InputError, reason
 from spherloc.frontend import retrieval
-from spherloc.frontend.features import VERSION, FeatureOptions, Features, extract
+from spherloc.frontend.features import VERSION, Features, extract
+from spherloc.frontend.pipeline import FrontendOptions
 from spherloc.frontend.view import Gravity, View
 from spherloc.geometry import camera_centre
 from spherloc.mapping.pairs import MIN_MATCHES, Pairs, relative
@@ -108,37 +109,47 @@ class Reconstruction:
 
 
 def reconstruct(
-    views: Sequence[View], gravity: Sequence[Gravity | None], folder: Path, tell: Tell
+    views: Sequence[View],
+    gravity: Sequence[Gravity | None],
+    folder: Path,
+    tell: Tell,
+    how: FrontendOptions | None = None,
 ) -> tuple[Reconstruction, ...]:
     """Map images of one camera; the database in ``folder`` is kept, and what is in it is not done again.
 
     The map with most images comes first, then those of other images that could not be joined with it.
 
-    ``gravity`` is what lines of the images tell.
+    ``gravity`` is what lines of the images tell, ``how`` the features and their matching, SIFT's if it is None.
 
     Raises ``InputError`` if pycolmap is missing, if an image or the folder cannot be used, or if no two images fit
     together.
     """
     pycolmap = require("pycolmap", "colmap", "making a map")
     pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)  # what fails is said here
-    camera = views[0].camera
+    camera, how = views[0].camera, how or FrontendOptions()
     features = []
     for view in views:
-        features.append(extract(view))
+        features.append(extract(view, how.features))
         tell("images searched for features", len(features), len(views))
     usable = [_usable(camera, one.pixels) for one in features]
-    path = folder / f"matches_{_key(views)}.db"
+    path = folder / f"matches_{_key(views, how)}.db"
     try:
         database = pycolmap.Database.open(str(path))
     except Exception as error:  # pycolmap raises whatever SQLite says
         raise InputError(f"{path}: cannot be written ({reason(error)}); give another --output.") from None
     try:
         ids = _described(pycolmap, database, views, features, usable)
-        compared = Pairs(pycolmap, camera, features, usable, gravity)
+        compared = Pairs(pycolmap, camera, features, usable, gravity, how.matching)
         counts, same_place = _matched(database, ids, compared, _pairs(features), tell)
     finally:
         database.close()
     if counts.max(initial=0) < MIN_MATCHES:
+        if same_place.max(initial=0) >= MIN_MATCHES:
+            raise InputError(
+                f"{np.count_nonzero(np.triu(same_place))} pairs of the {len(views)} photographs match as if all were "
+                "taken from one place: if they were not, something moves along and is seen in each, such as a car or a "
+                "tripod, so leave it out with --mask or --nadir."
+            )
         raise InputError(
             f"no two of the {len(views)} photographs show the same place from two positions: the best pair has "
             f"{counts.max(initial=0)} matches that fit together, of {MIN_MATCHES} that are needed. Take them closer "
@@ -297,12 +308,14 @@ def _registered(model: Any) -> list[Any]:
     return [model.image(number) for number in model.reg_image_ids()]
 
 
-def _key(views: Sequence[View]) -> str:
+def _key(views: Sequence[View], how: FrontendOptions) -> str:
     """Of the images and of all that their matches depend on: another key is another database."""
-    said = [DATABASE_VERSION, VERSION, FeatureOptions().method, repr(views[0].camera)]
+    said = [DATABASE_VERSION, VERSION, how.features.method, how.matching.method, repr(views[0].camera)]
     for view in views:
         status = view.path.stat()
         said += [view.name, status.st_size, status.st_mtime_ns]
+        if view.mask is not None:
+            said.append(hashlib.sha256(np.packbits(view.usable_pixels()).tobytes()).hexdigest())
     return hashlib.sha256(json.dumps(said).encode()).hexdigest()[:12]
 
 

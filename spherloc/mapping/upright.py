@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -11,6 +11,7 @@ from spherloc.errors import InputError, show
 from spherloc.frontend.gravity_from_lines import gravity_from_lines
 from spherloc.frontend.view import Gravity, View
 from spherloc.geometry import DOWN, align_to_down, camera_centre
+from spherloc.mapping.positions import MAX_SCALE_SD, Positions, overlaid
 from spherloc.types import FloatArray
 
 Tell = Callable[[str, int, int], None]
@@ -52,6 +53,8 @@ class Scale:
     """What measured it, in words; empty if nothing did, and the unit is arbitrary."""
     why_unknown: str = ""
     """Why what was measured gave no scale."""
+    off_m: Mapping[str, float] = field(default_factory=dict)
+    """Distance of images to the positions that measured it, metres, by name."""
 
 
 def gravity_by_lines(views: Sequence[View], tell: Tell) -> dict[str, Gravity]:
@@ -131,6 +134,32 @@ def scale_by_height(poses: Mapping[str, FloatArray], points: FloatArray, level: 
         )
     height = float(np.quantile(depths, 1.0 - GROUND_SHARE))
     return Scale(metres / height, f"cameras {metres:g} m above the ground")
+
+
+def scale_by_positions(poses: Mapping[str, FloatArray], positions: Positions, level: Level) -> Scale:
+    """The scale at which the images of ``poses`` (3, 4) lie where they are by another source.
+
+    Raises ``InputError`` if too few have a position, or if these do not fix the scale to ``MAX_SCALE_SD``.
+    """
+    names = [name for name in poses if name in positions.by_name]
+    centres = np.array([camera_centre(poses[name]) for name in names]).reshape(-1, 3)
+    places = np.array([positions.by_name[name] for name in names]).reshape(-1, 3)
+    if positions.horizontal:
+        centres, places = (centres @ upright_frame(level).T)[:, :2], places[:, :2]
+    try:
+        found = overlaid(centres, places)
+    except InputError as error:
+        raise InputError(f"{positions.source} gives no scale: {error}") from None
+    off_m = dict(zip(names, found.off_m.tolist(), strict=True))
+    near = int(np.count_nonzero(found.near))
+    measured = f"{near} of {len(names)} images fit it, {float(np.median(found.off_m[found.near])):.2g} m off"
+    if found.scale_sd > MAX_SCALE_SD or 2 * near < len(names):
+        raise InputError(
+            f"{positions.source} gives no scale: {measured} in the median, which leaves it {found.scale_sd:.0%} "
+            "uncertain; give --distance or --camera-height."
+        )
+    source = f"{positions.source}: {measured} in the median, the scale is good to {max(found.scale_sd, 5e-4):.1%}"
+    return Scale(found.scale, source, off_m=off_m)
 
 
 def arbitrary_scale(poses: Mapping[str, FloatArray]) -> Scale:

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 
 from spherloc.errors import InputError
+from spherloc.frontend.masks import Masks
+from spherloc.frontend.pipeline import FrontendOptions
 from spherloc.frontend.view import View
 from spherloc.mapping.reconstruction import Reconstruction
 from spherloc.mapping.upright import Level, Scale, upright_frame
@@ -42,6 +44,15 @@ class Written:
     """Mean reprojection error."""
 
 
+@dataclass(frozen=True)
+class Kept:
+    """What the scenes of a map do as the map does."""
+
+    masks: Masks | None
+    how: FrontendOptions
+    """Features and matching."""
+
+
 def write_map(
     made: Reconstruction,
     level: Level,
@@ -50,10 +61,12 @@ def write_map(
     images: Path,
     folder: Path,
     new_images: Path | None,
+    kept: Kept,
 ) -> Written:
     """Level and scale a model and write it with its scenes into ``folder``.
 
-    ``images`` is the folder of the views, ``new_images`` one of images to be localized. Raises ``InputError`` if
+    ``images`` is the folder of the views, ``new_images`` one of images to be localized, and ``kept`` what scenes of
+    both do as the map does. Raises ``InputError`` if
     something cannot be written.
     """
     pycolmap = require("pycolmap", "colmap", "making a map")
@@ -73,12 +86,12 @@ def write_map(
             content = _scene(folder, images, names, about, level, scale)
         else:
             content = _new_scene(folder, images, images, views[0], about, level, scale)
-        scene.write_text(content, encoding="utf-8")
+        scene.write_text(content + _kept(kept, folder), encoding="utf-8")
         new_scene = None
         if new_images is not None:
             new_scene = folder / NEW_SCENE
             content = _new_scene(folder, images, new_images, views[0], about, level, scale)
-            new_scene.write_text(content, encoding="utf-8")
+            new_scene.write_text(content + _kept(kept, folder), encoding="utf-8")
     except (OSError, RuntimeError) as error:
         raise InputError(f"{folder}: cannot be written ({error}); give another --output.") from None
     return Written(scene, new_scene, poses, made.points(), float(made.model.compute_mean_reprojection_error()))
@@ -141,6 +154,20 @@ def _gravity(level: Level) -> list[str]:
     if level.by_lines:
         lines.append('query = "lines"                # where an image shows too few, gravity is that of its reference')
     return lines
+
+
+def _kept(kept: Kept, folder: Path) -> str:
+    """The sections [masks] and [frontend]; empty where nothing differs from what scenes do anyway."""
+    lines = []
+    if kept.how.features != FrontendOptions().features:
+        lines += ["", "[frontend]", f"features = {_text(kept.how.features.method)}"]
+        lines.append(f"matching = {_text(kept.how.matching.method)}")
+    if kept.masks is not None:
+        lines += ["", "[masks]"]
+        if kept.masks.images is not None:
+            lines.append(f"images = {_text(_relative(kept.masks.images, folder))}")
+        lines += [f"{key} = {value}" for key in ("nadir_deg", "seam_deg") if (value := getattr(kept.masks, key))]
+    return "".join(f"{line}\n" for line in lines)
 
 
 def _relative(path: Path, folder: Path) -> str:

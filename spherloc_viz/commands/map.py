@@ -23,17 +23,26 @@ from matplotlib.figure import Figure
 
 from spherloc.cameras.calibration import load_camera
 from spherloc.cameras.equirectangular import Equirectangular
-from spherloc.errors import InputError, SpherlocError
+from spherloc.errors import InputError, SpherlocError, show
+from spherloc.frontend import trained
+from spherloc.frontend.features import FeatureOptions
+from spherloc.frontend.masks import Masks
+from spherloc.frontend.matching import MatchOptions
+from spherloc.frontend.pipeline import FrontendOptions
 from spherloc.frontend.view import View
 from spherloc.geometry import camera_centre
 from spherloc.mapping.make import Map, Measured, make_map
 from spherloc.mapping.pairs import MIN_MATCHES
 from spherloc.mapping.photographs import Photographs, frames_of, photographs
+from spherloc.mapping.positions import read_positions
 from spherloc.mapping.upright import Tell
 from spherloc.types import FloatArray
 from spherloc_viz.commands.progress import progress, say
 
 REPORT = "report.html"
+MAP_FEATURES = ("sift", "aliked")
+""""sift" is what is taken by itself, though "aliked" be installed: images of one camera have more right matches by it,
+which are better placed (``python -m benchmarks.features``)."""
 
 
 def make(
@@ -43,21 +52,28 @@ def make(
     video: tuple[Path, int] | None,
     measured: Measured,
     new_images: Path | None,
+    masks: Masks | None,
+    positions: Path | None,
+    features: str,
 ) -> int:
     """Make the map, and print what came of it and what to do next; 1 if not all images are in it.
 
-    ``video`` is a file and a number of frames to take from it into ``folder``. Raises ``InputError``.
+    ``video`` is a file and a number of frames to take from it into ``folder``, ``positions`` a file of where the images
+    were taken, and ``features`` one of ``MAP_FEATURES``. Raises ``InputError``.
     """
+    how = how_of(features)
     target = output or Path(f"{folder.resolve().name}_map")
     lens = None if camera is None else load_camera(camera)
     with _stages() as tell:
         if video is not None:
             _take_frames(*video, folder, tell)
-        found = photographs(folder, lens)
+        found = photographs(folder, lens, masks)
+        if positions is not None:
+            measured = Measured(positions=read_positions(positions, found.views))
         for remark in found.remarks:
             say(remark)
         say(f"{len(found.views)} {_kind(found.views[0])} → {target}. Ctrl-C stops it; the same command goes on.")
-        made = make_map(found.views, folder, target, measured, new_images, tell)
+        made = make_map(found.views, folder, target, measured, new_images, tell, masks, how)
     report = target / REPORT
     try:
         report.write_text(map_report(made, found), encoding="utf-8")
@@ -68,6 +84,23 @@ def make(
     print(f"see it        spherloc play {made.written.scene}")
     print(f"localize      spherloc localize {made.written.new_scene or made.written.scene}")
     return 0 if len(made.written.poses) == len(found.views) else 1
+
+
+def how_of(features: str) -> FrontendOptions:
+    """Features with the matching that is theirs; raises ``InputError`` if they are not known or not installed."""
+    if features not in MAP_FEATURES:
+        raise InputError(f"--features is {show(features)}; give {' or '.join(MAP_FEATURES)}.")
+    if features == "sift":
+        return FrontendOptions()
+    return FrontendOptions(FeatureOptions("aliked"), MatchOptions("lightglue", ratio=None))
+
+
+def about_features(made: Map) -> str:
+    """Which features were taken, and which others could have been."""
+    if made.features == "sift":
+        there = "" if trained.installed() else ", with the extra 'learned'"
+        return f"SIFT; ALIKED with LightGlue is --features aliked{there}"
+    return "ALIKED, matched by LightGlue"
 
 
 def _take_frames(video: Path, count: int, folder: Path, tell: Tell) -> None:
@@ -113,7 +146,7 @@ def _kind(view: View) -> str:
 
 
 def _units_unknown(made: Map) -> str:
-    return f"units unknown; {made.scale.why_unknown or '--camera-height or --distance gives metres'}"
+    return f"units unknown; {made.scale.why_unknown or '--camera-height, --distance or --positions gives metres'}"
 
 
 def summary(made: Map, found: Photographs) -> list[str]:
@@ -123,6 +156,7 @@ def summary(made: Map, found: Photographs) -> list[str]:
         f"in the map    {len(written.poses)} of {len(found.views)} images, {len(written.points):,} points, "
         f"{written.error_px:.2f} px mean error",
         f"down          from {made.level.source}; single images differ by {made.level.spread_deg:.1f}° (median)",
+        f"features      {about_features(made)}",
         f"scale         {made.scale.source or _units_unknown(made)}",
     ]
     if missing:
@@ -163,6 +197,7 @@ def map_report(made: Map, found: Photographs) -> str:
         "Points": f"{len(written.points):,}",
         "Mean reprojection error": f"{written.error_px:.2f} px",
         "Down": f"from {made.level.source}; single images differ from it by {made.level.spread_deg:.1f}° in the median",
+        "Features": "SIFT" if made.features == "sift" else "ALIKED, matched by LightGlue",
         "Scale": scale,
     }
     rows = [_row(made, names, index) for index in range(len(views))]
@@ -181,7 +216,8 @@ def map_report(made: Map, found: Photographs) -> str:
             f'<img alt="Points and cameras of the map from above" src="{_from_above(made, unit)}">',
             "<h2>Not in the map</h2>" if left else "",
             *(_thumbnail(view, made, names) for view in left[:MAX_THUMBNAILS]),
-            "<h2>Images</h2><table><tr><th>image</th><th>in the map</th><th>best partner</th><th>matches</th></tr>",
+            "<h2>Images</h2><table><tr><th>image</th><th>in the map</th><th>best partner</th><th>matches</th>"
+            f"{'<th>off its position</th>' if made.scale.off_m else ''}</tr>",
             *rows,
             "</table></body></html>",
         ]
@@ -207,8 +243,16 @@ def _row(made: Map, names: list[str], index: int) -> str:
     partner = names[best] if counts[best] else "none"
     return (
         f"<tr><td>{html.escape(names[index])}</td><td{'' if inside else ' class=out'}>{'yes' if inside else 'no'}</td>"
-        f'<td>{html.escape(partner)}</td><td class="number">{counts[best]:,}</td></tr>'
+        f'<td>{html.escape(partner)}</td><td class="number">{counts[best]:,}</td>{_off(made, names[index])}</tr>'
     )
+
+
+def _off(made: Map, name: str) -> str:
+    """A cell with the distance of an image to the position that was given for it."""
+    if not made.scale.off_m:
+        return ""
+    off_m = made.scale.off_m.get(name)
+    return f'<td class="number">{"" if off_m is None else f"{off_m:.2f} m"}</td>'
 
 
 def why_not(made: Map, names: list[str], index: int) -> str:

@@ -299,6 +299,11 @@ def map(
     output: OptionalPath = None,
     camera_height: OptionalFloat = None,
     distance: Annotated[tuple[str, str, float] | None, arg(metavar="IMAGE IMAGE METRES", help_behavior_hint="")] = None,
+    positions: OptionalPath = None,
+    mask: OptionalPath = None,
+    nadir: OptionalFloat = None,
+    seam: OptionalFloat = None,
+    features: Annotated[str, arg(metavar="sift|aliked")] = "sift",
     localize: OptionalPath = None,
 ) -> int:
     """Make a map of your own photographs: panoramas, or images of one calibrated wide camera.
@@ -323,20 +328,29 @@ def map(
         output: Folder of the map; FOLDER_map here if not given.
         camera_height: Metres of the cameras above the ground: gives the scale.
         distance: Two images by name and the metres between them: gives the scale.
+        positions: Where the images were taken, which gives the scale: rows of image x y z, a table with columns image,
+            lat, lon, or a trajectory (TUM, EuRoC) if their names hold the time. GPS in the photographs needs no file.
+        mask: An image that is black where a photograph may not be used, or a folder of them by the images' names.
+        nadir: Leave out what is within so many degrees of straight down: the car, the tripod.
+        seam: Leave out so many degrees on both sides of the seam between the two lenses of a 360-degree camera.
+        features: What is matched: sift, or aliked with LightGlue (the extra learned).
         localize: Folder of other images of that camera; a scene is written that localizes them in the map.
     """
+    from spherloc.frontend.masks import Masks
     from spherloc.mapping.make import Measured
     from spherloc_viz.commands.map import make
 
-    if camera_height is not None and distance is not None:
-        raise InputError("--camera-height and --distance both give the scale; keep one.")
+    if sum(one is not None for one in (camera_height, distance, positions)) > 1:
+        raise InputError("--camera-height, --distance and --positions all give the scale; keep one.")
     for flag, metres in (("--camera-height", camera_height), ("--distance", distance and distance[2])):
         if metres is not None and not 0.0 < metres < 1e6:
             raise InputError(f"{flag} is {metres:g}; give a positive number of metres.")
     if not 2 <= frames <= 500:
         raise InputError(f"--frames is {frames}; give a number from 2 to 500.")
     taken = None if video is None else (video, frames)
-    return make(folder, output, camera, taken, Measured(camera_height, distance), localize)
+    masked = any(one is not None for one in (mask, nadir, seam))
+    masks = Masks(mask, nadir or 0.0, seam or 0.0) if masked else None
+    return make(folder, output, camera, taken, Measured(camera_height, distance), localize, masks, positions, features)
 
 
 def sweep(

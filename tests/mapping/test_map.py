@@ -12,6 +12,7 @@ from spherloc.cameras.mei import Mei
 from spherloc.datasets import bundled_scenes, load_scene
 from spherloc.errors import CalibrationError, InputError
 from spherloc.formats.colmap_files import read_model
+from spherloc.frontend.masks import Masks
 from spherloc.geometry import camera_centre, rotation_angle, so3_exp
 from spherloc.mapping.later import place_rest
 from spherloc.mapping.lens import for_colmap
@@ -38,12 +39,13 @@ def walk(tmp_path_factory):
     told = []
     first, second = sorted(poses)[:2]
     apart = float(np.linalg.norm(camera_centre(poses[first]) - camera_centre(poses[second])))
-    found = photographs(folder, None)
+    masks = Masks(nadir_deg=12.0)
+    found = photographs(folder, None, masks)
     output = tmp_path_factory.mktemp("map")
     measured = Measured(distance=(first, second, apart))
 
     def again():
-        return make_map(found.views, folder, output, measured, folder, lambda *what: told.append(what))
+        return make_map(found.views, folder, output, measured, folder, lambda *what: told.append(what), masks)
 
     return poses, found, again(), again, told, output
 
@@ -79,6 +81,8 @@ def test_its_scenes_open(walk):
     new = load_scene(made.written.new_scene)
     assert len(new.queries) == 5 and len(new.references) == 5 and new.queries[0].camera == scene.queries[0].camera
     assert len(read_model(output / "model").images) == 5
+    for view in (scene.queries[0], scene.references[0], new.queries[0]):  # the mask of the map is that of the scenes
+        assert not view.usable_pixels()[-1].any() and view.usable_pixels()[200].all()
 
 
 def test_what_is_done_is_not_done_again(walk):
@@ -96,6 +100,8 @@ def test_the_report_says_what_is_in_the_map(walk):
     assert "5 of 5" in page and "Not in the map" not in page and "data:image/png;base64," in page
     smaller = map_report(type(made)(made.made, made.level, made.scale, _less(made.written, "reference_004.png")), found)
     assert "4 of 5" in smaller and "reference_004.png: It has " in smaller
+    off = replace(made, scale=replace(made.scale, off_m={"reference_003.png": 1.239}))
+    assert "1.24 m" in map_report(off, found) and "off its position" not in page
 
 
 def test_a_distance_to_an_image_that_is_not_in_the_map_leaves_the_units_unknown(walk):

@@ -1,0 +1,270 @@
+"""Where photographs were taken by another source, which tells how long a unit of the map is: a trajectory, GPS.
+
+The map's camera centres are laid over these positions by a similarity. Up to half of the positions may be wrong: the
+similarity has the least median of distances (Rousseeuw 1984) and is then fitted to those near it.
+"""
+
+import re
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from decimal import Decimal
+from itertools import combinations
+from math import comb
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+from PIL import Image
+
+from spherloc.datasets.imu import NAME_RULE, timestamp_of
+from spherloc.errors import InputError, shorten, show
+from spherloc.files import open_file, reading
+from spherloc.formats.text_rows import finite_numbers, rows
+from spherloc.frontend.view import View
+from spherloc.trajectory import NS_PER_S, Trajectory, pose_at, read_euroc, read_tum
+from spherloc.types import BoolArray, FloatArray
+
+MIN_POSITIONS = 4
+"""Of images of the map: fewer fit a similarity whatever they are."""
+MAX_SCALE_SD = 0.1
+"""Standard deviation of the scale, as a part of it, with which it is still believed."""
+MAX_GAP_S = 0.5
+"""Poses of a trajectory farther apart are not interpolated."""
+SAMPLES = 2000
+NEAR_SD = 2.5
+"""Positions within so many robust standard deviations are fitted."""
+_COLUMNS = "image x y z in metres"
+_GPS_WORDS = ({"lat", "latitude"}, {"lon", "lng", "long", "longitude"}, {"alt", "altitude"})
+_EQUATOR_M, _FLATTENING = 6_378_137.0, 1.0 / 298.257223563
+"""Of the Earth by WGS 84."""
+_GPS_TAGS = 0x8825
+_DEVICE_NS = re.compile(r"(?:^|\D)(\d{12,17})$", re.ASCII)
+_DECIMAL_S = re.compile(r"(?:^|[^\d.])(\d{1,10}\.\d{1,9})$", re.ASCII)
+"""Ends of names such as camera_87551170813262.png and 1311868164.363181.png."""
+
+
+@dataclass(frozen=True, eq=False)
+class Positions:
+    """Positions of photographs in metres, in any frame."""
+
+    by_name: Mapping[str, FloatArray]
+    """(3,) by the name of the photograph; z is up where ``horizontal``."""
+    source: str
+    """In a few words."""
+    horizontal: bool = False
+    """Heights say nothing, as those of GPS."""
+
+
+@dataclass(frozen=True, eq=False)
+class Overlay:
+    """A similarity that takes points to positions."""
+
+    scale: float
+    """Metres a unit of the points."""
+    scale_sd: float
+    """Its standard deviation, as a part of it, by the distances that are left."""
+    off_m: FloatArray
+    """(N,) distances that are left."""
+    near: BoolArray
+    """(N,) of those that were fitted."""
+
+
+def read_positions(path: Path, views: Sequence[View]) -> Positions:
+    """Positions in a file: rows ``image x y z``, a table with columns image, lat, lon, or a trajectory (TUM, EuRoC).
+
+    A trajectory is asked at the times in the images' names. Raises ``InputError`` for a wrong row, and for a file that
+    has no position of any image.
+    """
+    first = next(iter(rows(path, f"rows of {_COLUMNS}, or a trajectory")), None)
+    if first is None:
+        raise InputError(f"{path}: is empty; give rows of {_COLUMNS}.")
+    words = _words(first[1])
+    if path.suffix.lower() == ".csv" and (len(words) > 8 or words[0].isdigit()):
+        found = _at_times(read_euroc(path), views)
+    elif len(words) == 8 and words[0].replace(".", "", 1).isdigit():
+        found = _of_trajectory(path, views)
+    else:
+        return _of_rows(path, views)
+    if not found:
+        raise InputError(
+            f"{path}: this trajectory has no pose at the time of any of the {len(views)} images; their names must hold "
+            f"it ({NAME_RULE})."
+        )
+    return Positions(found, f"the trajectory {shorten(path.name)}")
+
+
+def _of_trajectory(path: Path, views: Sequence[View]) -> dict[str, FloatArray]:
+    """Of TUM's rows, whose times may be counted in seconds or in nanoseconds."""
+    found: dict[str, FloatArray] = {}
+    with suppress(InputError):  # nanoseconds are too many seconds
+        found = _at_times(read_tum(path, "s"), views)
+    return found or _at_times(read_tum(path, "ns"), views)
+
+
+def _at_times(trajectory: Trajectory, views: Sequence[View]) -> dict[str, FloatArray]:
+    found = {}
+    for view in views:
+        time_ns = _time_ns(view.name)
+        pose = None if time_ns is None else pose_at(trajectory, time_ns, MAX_GAP_S)
+        if pose is not None:
+            found[view.name] = pose[:, 3]
+    return found
+
+
+def _time_ns(name: str) -> int | None:
+    """When an image was taken by its name, on whatever clock: that of a device that was switched on has few digits."""
+    time_ns = timestamp_of(name)
+    if time_ns is not None:
+        return time_ns
+    match = _DEVICE_NS.search(PurePosixPath(name).stem) or _DECIMAL_S.search(PurePosixPath(name).stem)
+    if match is None:
+        return None
+    return int(match[1]) if match.re is _DEVICE_NS else int(Decimal(match[1]) * NS_PER_S)
+
+
+def _words(text: str) -> list[str]:
+    return text.partition("#")[0].replace(",", " ").split()
+
+
+def _of_rows(path: Path, views: Sequence[View]) -> Positions:
+    names = {view.name for view in views}
+    columns: list[int] | None = None
+    found: dict[str, FloatArray] = {}
+    count = 0
+    for number, (place, text) in enumerate(rows(path, f"rows of {_COLUMNS}")):
+        words = _words(text)
+        if number == 0 and (columns := _gps_columns(words)) is not None:
+            continue
+        wanted = 4 if columns is None else max(columns) + 1
+        if len(words) < wanted or (columns is None and len(words) != wanted):
+            what = _COLUMNS if columns is None else "the columns of the first one"
+            raise InputError(f"{place}: has {len(words)} words; give {what}.")
+        numbers = finite_numbers(words[1:4] if columns is None else [words[column] for column in columns], place)
+        if columns is not None and not (abs(numbers[0]) <= 90.0 and abs(numbers[1]) <= 360.0):
+            raise InputError(f"{place}: {numbers[0]:g}, {numbers[1]:g} is no latitude and longitude; give degrees.")
+        if words[0] in found:
+            raise InputError(f"{place}: {show(words[0])} is there a second time; keep one row.")
+        count += 1
+        if words[0] in names:
+            found[words[0]] = np.array([*numbers, 0.0][:3])
+    if not found:
+        raise InputError(
+            f"{path}: none of its {count} rows is of one of the {len(views)} images, such as {show(views[0].name)}; "
+            "name them as the files are called."
+        )
+    if columns is None:
+        return Positions(found, f"the positions in {shorten(path.name)}")
+    return Positions(local_metres(found), f"GPS in {shorten(path.name)}", horizontal=True)
+
+
+def _gps_columns(words: Sequence[str]) -> list[int] | None:
+    """Places of latitude, longitude and, if there is one, altitude in a row of names; None if it is none."""
+    places = [
+        next((at for at, word in enumerate(words) if word.strip('"').lower() in kind), None) for kind in _GPS_WORDS
+    ]
+    if places[0] is None or places[1] is None:
+        return None
+    return [at for at in places if at is not None]
+
+
+def gps_of_images(views: Sequence[View]) -> Positions | None:
+    """Positions in the photographs' own EXIF tags; None if fewer than ``MIN_POSITIONS`` have one."""
+    found = {}
+    for view in views:
+        place = _gps_tag(view.path)
+        if place is not None:
+            found[view.name] = np.array([*place, 0.0])
+    if len(found) < MIN_POSITIONS:
+        return None
+    return Positions(local_metres(found), "GPS in the photographs", horizontal=True)
+
+
+def _gps_tag(path: Path) -> tuple[float, float] | None:
+    """Latitude and longitude, degrees, that a camera wrote into an image; None if there is nothing usable."""
+    try:
+        with reading(path, "correct the path of the image"), open_file(path) as file, Image.open(file) as image:
+            tags = image.getexif().get_ifd(_GPS_TAGS)
+            signs = [tags[1] in ("N", "n"), tags[3] in ("E", "e")]
+            angles = [sum(float(part) / 60**power for power, part in enumerate(tags[tag])) for tag in (2, 4)]
+    except Exception:  # Pillow lets through whatever a damaged tag makes it do
+        return None
+    if not (np.isfinite(angles).all() and angles[0] <= 90.0 and angles[1] <= 180.0) or angles == [0.0, 0.0]:
+        return None
+    latitude, longitude = (angle if sign else -angle for angle, sign in zip(angles, signs, strict=True))
+    return latitude, longitude
+
+
+def local_metres(degrees: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+    """East, north and 0 in metres from the middle one, of latitudes and longitudes (3,) in degrees by name.
+
+    By the Earth's radii of curvature there (WGS 84): good to a millimetre in a hundred metres.
+    """
+    middle = np.median(np.stack(list(degrees.values())), axis=0)
+    sine = np.sin(np.radians(middle[0]))
+    eccentricity2 = _FLATTENING * (2.0 - _FLATTENING)
+    bend = 1.0 - eccentricity2 * sine * sine
+    north_m = np.radians(_EQUATOR_M * (1.0 - eccentricity2) / bend**1.5)
+    east_m = np.radians(_EQUATOR_M / np.sqrt(bend)) * np.cos(np.radians(middle[0]))
+    return {
+        name: np.array([((at[1] - middle[1] + 180.0) % 360.0 - 180.0) * east_m, (at[0] - middle[0]) * north_m, 0.0])
+        for name, at in degrees.items()
+    }
+
+
+def overlaid(points: FloatArray, positions: FloatArray) -> Overlay:
+    """Points (N, D) laid over positions (N, D) in metres, D being 2 or 3, of which half may be wrong.
+
+    Raises ``InputError`` if there are fewer than ``MIN_POSITIONS``, or if points or positions are all one.
+    """
+    count, size = points.shape
+    if count < MIN_POSITIONS:
+        raise InputError(f"only {count} images of the map have a position, of {MIN_POSITIONS} that are needed.")
+    best: tuple[float, FloatArray] | None = None
+    for sample in _samples(count, size):
+        fit = _similarity(points[sample], positions[sample])
+        if fit is None:
+            continue
+        off = _off(fit, points, positions)
+        median = float(np.median(off))
+        if best is None or median < best[0]:
+            best = median, off
+    if best is None:
+        raise InputError("the positions, or the images of the map, are all in one place.")
+    unknowns = 4 if size == 2 else 7
+    sd = 1.4826 * (1.0 + 5.0 / max(1, count - size)) * best[0]
+    near = best[1] <= max(NEAR_SD * sd, float(np.partition(best[1], MIN_POSITIONS - 1)[MIN_POSITIONS - 1]))
+    fit = _similarity(points[near], positions[near])
+    if fit is None:
+        raise InputError("the positions, or the images of the map, are all in one place.")
+    off = _off(fit, points, positions)
+    variance = float(np.sum(off[near] ** 2)) / max(1, size * int(near.sum()) - unknowns)
+    spread = float(np.sum((positions[near] - positions[near].mean(axis=0)) ** 2))
+    return Overlay(float(fit[0]), float(np.sqrt(variance / spread)), off, near)
+
+
+def _samples(count: int, size: int) -> list[list[int]]:
+    """Index sets of ``size`` points, which fix a similarity of the plane or of space; all of them if they are few."""
+    if comb(count, size) <= SAMPLES:
+        return [list(sample) for sample in combinations(range(count), size)]
+    rng = np.random.default_rng(0)
+    return [rng.choice(count, size, replace=False).tolist() for _ in range(SAMPLES)]
+
+
+def _similarity(points: FloatArray, positions: FloatArray) -> tuple[float, FloatArray, FloatArray] | None:
+    """Scale, rotation (D, D) and translation (D,) that take points (N, D) closest to positions (Umeyama 1991)."""
+    middle, target = points.mean(axis=0), positions.mean(axis=0)
+    centred, aimed = points - middle, positions - target
+    spread = float(np.sum(centred**2))
+    left, stretch, right = np.linalg.svd(aimed.T @ centred)
+    mirror = np.ones(len(stretch))
+    mirror[-1] = np.sign(np.linalg.det(left @ right)) or 1.0
+    scale = float(np.sum(stretch * mirror)) / spread if spread > 0.0 else 0.0
+    if not 0.0 < scale < np.inf:
+        return None
+    rotation = left @ np.diag(mirror) @ right
+    return scale, rotation, target - scale * rotation @ middle
+
+
+def _off(fit: tuple[float, FloatArray, FloatArray], points: FloatArray, positions: FloatArray) -> FloatArray:
+    scale, rotation, translation = fit
+    return np.linalg.norm(scale * points @ rotation.T + translation - positions, axis=1)

@@ -1,0 +1,153 @@
+"""The scale of a map by positions of another source, some of them wrong; their files, and GPS in photographs."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from spherloc.cameras.equirectangular import Equirectangular
+from spherloc.errors import InputError
+from spherloc.frontend.view import View
+from spherloc.geometry import so3_exp
+from spherloc.mapping.positions import Positions, gps_of_images, local_metres, overlaid, read_positions
+from spherloc.mapping.upright import Level, scale_by_positions
+
+CLOCK_S = 1_700_000_000
+NAMES = [f"frame_{CLOCK_S + index}_{500_000_000 * (index % 2):09d}.jpg" for index in range(8)]
+VIEWS = [View(name, Equirectangular(400, 200), Path(name)) for name in NAMES]
+
+
+@pytest.mark.parametrize("size", [2, 3])
+def test_scale_is_found_among_wrong_positions(rng, size):
+    points = rng.normal(size=(40, size)) * [10.0, 8.0, 1.0][:size]
+    turn = so3_exp(np.array([0.0, 0.0, 2.1] if size == 2 else [0.4, -1.0, 2.1]))[:size, :size]
+    positions = 2.5 * points @ turn.T + np.array([7.0, -3.0, 100.0])[:size] + 0.05 * rng.normal(size=(40, size))
+    wrong = rng.permutation(40) < 15
+    positions[wrong] += rng.normal(size=(15, size)) * 20.0
+    found = overlaid(points, positions)
+    assert (
+        found.scale == pytest.approx(2.5, rel=0.01) and not found.near[wrong].any() and found.near[~wrong].mean() > 0.8
+    )
+    assert found.off_m[~wrong].max() < 0.3 and found.off_m[wrong].min() > 0.3
+
+
+def test_its_standard_deviation_is_that_of_repetitions(rng):
+    """Of 300 draws of noise, without a wrong position."""
+    points = rng.normal(size=(12, 3)) * 5.0
+    fits = [overlaid(points, 3.0 * points + 0.2 * rng.normal(size=points.shape)) for _ in range(300)]
+    scales = np.array([fit.scale for fit in fits])
+    assert np.median([fit.scale_sd for fit in fits]) == pytest.approx(scales.std() / 3.0, rel=0.3)
+    assert scales.mean() == pytest.approx(3.0, rel=0.01)
+
+
+def test_positions_on_a_line_fix_the_scale_and_a_mirrored_plane_does_not(rng):
+    line = np.outer(np.linspace(0.0, 9.0, 10), [1.0, 2.0, 0.5])
+    assert overlaid(line, 0.7 * line @ so3_exp(np.array([0.2, 0.1, 1.0])).T).scale == pytest.approx(0.7)
+    plane = rng.normal(size=(10, 2))
+    assert overlaid(plane, plane * [1.0, -1.0]).scale_sd > 0.1
+    for points, positions in ((plane, np.ones((10, 2))), (np.ones((10, 2)), plane)):
+        with pytest.raises(InputError, match="all in one place"):
+            overlaid(points, positions)
+    with pytest.raises(InputError, match="only 3 images of the map have a position, of 4"):
+        overlaid(plane[:3], plane[:3])
+
+
+def test_a_map_takes_it_and_says_how_good_it_is(rng):
+    """Heights of GPS say nothing, whichever way the model lies."""
+    level = Level(so3_exp(np.array([0.5, -0.4, 0.3])) @ [0.0, 0.0, -1.0], "a test", 0.0, {})
+    upright = rng.normal(size=(8, 3)) * [20.0, 15.0, 2.0]
+    centres = upright @ so3_exp(np.array([0.5, -0.4, 0.3])).T
+    poses = {name: np.column_stack([np.eye(3), -centre]) for name, centre in zip(NAMES, centres, strict=True)}
+    flat = upright * [2.0, 2.0, 0.0] + rng.normal(size=(8, 3)) * [0.5, 0.5, 0.0]
+    flat[3] += 30.0
+    scale = scale_by_positions(poses, Positions(dict(zip(NAMES, flat, strict=True)), "GPS", horizontal=True), level)
+    assert scale.metres_per_unit == pytest.approx(2.0, rel=0.05) and scale.off_m[NAMES[3]] > 10.0
+    assert scale.source.startswith("GPS: 7 of 8 images fit it, 0.")
+    noise = {name: 60.0 * row for name, row in zip(NAMES, rng.normal(size=(8, 3)), strict=True)}
+    with pytest.raises(InputError, match=r"GPS gives no scale: .* uncertain; give --distance"):
+        scale_by_positions(poses, Positions(noise, "GPS"), level)
+    with pytest.raises(InputError, match="GPS gives no scale: only 0 images"):
+        scale_by_positions(poses, Positions({}, "GPS"), level)
+
+
+@pytest.mark.parametrize("unit", [1, 10**9])
+def test_a_trajectory_is_asked_at_the_times_of_the_images(tmp_path, unit):
+    """TUM's rows in seconds and in nanoseconds: NAMES[3] lies at 3.5 s, between poses at 3.4 and 3.8 s."""
+    path = tmp_path / "poses.txt"
+    tenths = range(2, 60, 4)
+    times = [(CLOCK_S * 10 + at) * unit // 10 if unit > 1 else f"{CLOCK_S + at // 10}.{at % 10}" for at in tenths]
+    rows = (f"{time} {0.2 * at} 0 1 0 0 0 1\n" for time, at in zip(times, tenths, strict=True))
+    path.write_text("# TUM\n" + "".join(rows))
+    found = read_positions(path, VIEWS)
+    assert set(found.by_name) == set(NAMES[1:6]) and found.source == "the trajectory poses.txt"
+    np.testing.assert_allclose(found.by_name[NAMES[3]], [7.0, 0.0, 1.0])
+
+
+@pytest.mark.parametrize("name", ["cam_000000002500000000.png", "rgb_002500000000.png", "a/2.5.png"])
+def test_times_of_other_clocks(tmp_path, name):
+    """Those of a device since it was switched on, and seconds with a point."""
+    path = tmp_path / "poses.tum"
+    path.write_text("2.3 1 2 3 0 0 0 1\n2.7 3 2 3 0 0 0 1\n")
+    found = read_positions(path, [View(name, VIEWS[0].camera, Path(name)), VIEWS[0]])
+    np.testing.assert_allclose(found.by_name[name], [2.0, 2.0, 3.0])
+
+
+def test_rows_of_positions_and_of_gps(tmp_path):
+    path = tmp_path / "positions.csv"
+    path.write_text(f"{NAMES[0]}, 1, 2, 3\n{NAMES[1]} 4 5 6 # a remark\nother.jpg 0 0 0\n")
+    found = read_positions(path, VIEWS)
+    assert {name: place.tolist() for name, place in found.by_name.items()} == {NAMES[0]: [1, 2, 3], NAMES[1]: [4, 5, 6]}
+    path.write_text(f"image,lat,lon,alt\n{NAMES[0]},47.0,8.0,400\n{NAMES[1]},47.001,8.0,410\n{NAMES[2]},47.0,8.001,9\n")
+    found = read_positions(path, VIEWS)
+    first, north, east = (found.by_name[name] for name in NAMES[:3])
+    assert found.horizontal
+    # A minute of latitude is 1,852.2 m there, one of longitude 1,267.9 m (by the tables of the geodesists).
+    np.testing.assert_allclose(north - first, [0.0, 111.18, 0.0], atol=0.02)
+    np.testing.assert_allclose(east - first, [76.06, 0.0, 0.0], atol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("", "is empty"),
+        (f"{NAMES[0]} 1 2\n", "line 1: has 3 words; give image x y z"),
+        (f"{NAMES[0]} 1 2 x\n", "line 1: 'x' is not a finite number"),
+        (f"{NAMES[0]} 1 2 3\n{NAMES[0]} 1 2 3\n", "line 2: .* a second time"),
+        ("a.jpg 1 2 3\n", "none of its 1 rows is of one of the 8 images"),
+        (f"image lat lon\n{NAMES[0]} 97 8\n", "is no latitude"),
+        ("100.5 0 0 0 0 0 0 1\n101.5 0 0 0 0 0 0 1\n", "no pose at the time of any of the 8 images"),
+    ],
+)
+def test_files_that_are_refused(tmp_path, text, sentence):
+    (tmp_path / "positions.txt").write_text(text)
+    with pytest.raises(InputError, match=sentence):
+        read_positions(tmp_path / "positions.txt", VIEWS)
+
+
+def photographed(path, latitude, longitude):
+    image, exif = Image.new("RGB", (40, 20)), Image.Exif()
+    tags = exif.get_ifd(0x8825)
+    for tag, letter, angle in ((1, "NS", latitude), (3, "EW", longitude)):
+        degrees = abs(angle)
+        minutes = 60.0 * (degrees % 1.0)
+        tags[tag], tags[tag + 1] = (
+            letter[int(angle < 0)],
+            (float(int(degrees)), float(int(minutes)), 60.0 * (minutes % 1.0)),
+        )
+    image.save(path, exif=exif)
+
+
+def test_gps_in_photographs(tmp_path):
+    """South and west have negative degrees; an image without tags, and one with senseless ones, have no position."""
+    degrees = {f"{index}.jpg": np.array([-33.45 - 1e-4 * index, -70.66 + 2e-4 * index, 0.0]) for index in range(5)}
+    for name, (latitude, longitude, _) in degrees.items():
+        photographed(tmp_path / name, latitude, longitude)
+    Image.new("RGB", (40, 20)).save(tmp_path / "none.jpg")
+    photographed(tmp_path / "pole.jpg", 100.0, 0.0)
+    views = [View(name, Equirectangular(40, 20), tmp_path / name) for name in [*degrees, "none.jpg", "pole.jpg"]]
+    found = gps_of_images(views)
+    assert found is not None and found.horizontal and set(found.by_name) == set(degrees)
+    for name, place in local_metres(degrees).items():
+        np.testing.assert_allclose(found.by_name[name], place, atol=0.01)
+    assert gps_of_images(views[:3]) is None
