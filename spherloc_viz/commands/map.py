@@ -52,6 +52,7 @@ def make(
     video: tuple[Path, int] | None,
     measured: Measured,
     new_images: Path | None,
+    *,
     masks: Masks | None,
     positions: Path | None,
     features: str,

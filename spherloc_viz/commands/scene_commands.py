@@ -350,7 +350,8 @@ def map(
     taken = None if video is None else (video, frames)
     masked = any(one is not None for one in (mask, nadir, seam))
     masks = Masks(mask, nadir or 0.0, seam or 0.0) if masked else None
-    return make(folder, output, camera, taken, Measured(camera_height, distance), localize, masks, positions, features)
+    measured = Measured(camera_height, distance)
+    return make(folder, output, camera, taken, measured, localize, masks=masks, positions=positions, features=features)
 
 
 def sweep(
