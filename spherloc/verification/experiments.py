@@ -227,6 +227,62 @@ def _phase(count: int, gravity_deg: float) -> Experiment:
     )
 
 
+_FIG6 = Experiment(
+    key="fig6",
+    place="Fig. 6",
+    over="outlier_rate",
+    values=_steps(0.0, 0.9, 0.1),
+    correspondences=100,
+    methods=(
+        *("MC", "MC 3px", "2P100", "2P1k", "SVD100", "ML100", "ML1k"),
+        *("mc", "mc-exact", "ransac-2p 100", "ransac-2p 1k"),
+    ),
+    runs=100,
+    quick_values=(0.3, 0.5, 0.8, 0.9),
+    quick_runs=8,
+    variation=Variation(noise_px=1.0),
+)
+_FIG7 = replace(
+    _FIG6,
+    key="fig7",
+    place="Fig. 7",
+    values=_steps(0.9, 0.95, 0.01),
+    correspondences=200,
+    methods=(
+        *("MC", "MC 3px", "2P1k", "2P10k", "SVD10k", "ML10k"),
+        *("mc", "mc-exact", "ransac-2p 1k", "ransac-2p 10k"),
+    ),
+    quick_values=(0.9, 0.95),
+    quick_leaves_out=_SLOW,
+)
+
+
+def _beside(
+    figure: Experiment,
+    key: str,
+    words: str,
+    methods: tuple[str, ...],
+    quick_values: tuple[float, ...] = (0.9, 0.95),
+    quick_runs: int = 5,
+    camera: str = "MEI",
+) -> Experiment:
+    """The sweep of a figure with other methods or another camera."""
+    return replace(
+        figure,
+        key=key,
+        place=f"{figure.place}, {words}",
+        methods=methods,
+        quick_values=quick_values,
+        quick_runs=quick_runs,
+        quick_leaves_out=(),
+        cameras=(camera,),
+    )
+
+
+_NORMAL_6 = ("MC", "MC 3px", "2P100", "2P1k", "mc", "mc-exact")
+_NORMAL_7 = ("MC", "MC 3px", "2P1k", "2P10k", "mc", "mc-exact")
+_WIDE_6 = (*(f"{name}, 1k" for name in WIDE_SOLVERS), "ML1k cov", "P3P1k", "2P1k")
+
 EXPERIMENTS: Sequence[Experiment] = (
     Experiment(
         key="fig5",
@@ -243,118 +299,17 @@ EXPERIMENTS: Sequence[Experiment] = (
         quick_runs=5,
         variation=Variation(outlier_rate=0.0),
     ),
-    Experiment(
-        key="fig6",
-        place="Fig. 6",
-        over="outlier_rate",
-        values=_steps(0.0, 0.9, 0.1),
-        correspondences=100,
-        methods=(
-            *("MC", "MC 3px", "2P100", "2P1k", "SVD100", "ML100", "ML1k"),
-            *("mc", "mc-exact", "ransac-2p 100", "ransac-2p 1k"),
-        ),
-        runs=100,
-        quick_values=(0.3, 0.5, 0.8, 0.9),
-        quick_runs=8,
-        variation=Variation(noise_px=1.0),
-    ),
-    Experiment(
-        key="fig7",
-        place="Fig. 7",
-        over="outlier_rate",
-        values=_steps(0.9, 0.95, 0.01),
-        correspondences=200,
-        methods=(
-            *("MC", "MC 3px", "2P1k", "2P10k", "SVD10k", "ML10k"),
-            *("mc", "mc-exact", "ransac-2p 1k", "ransac-2p 10k"),
-        ),
-        runs=100,
-        quick_values=(0.9, 0.95),
-        quick_runs=8,
-        variation=Variation(noise_px=1.0),
-        quick_leaves_out=_SLOW,
-    ),
-    Experiment(
-        key="fig6-normal",
-        place="Fig. 6, with normal draws",
-        over="outlier_rate",
-        values=_steps(0.0, 0.9, 0.1),
-        correspondences=100,
-        methods=("MC", "MC 3px", "2P100", "2P1k", "mc", "mc-exact"),
-        runs=100,
-        quick_values=(0.5, 0.9),
-        quick_runs=5,
-        cameras=(NORMAL,),
-        variation=Variation(noise_px=1.0),
-    ),
-    Experiment(
-        key="fig7-normal",
-        place="Fig. 7, with normal draws",
-        over="outlier_rate",
-        values=_steps(0.9, 0.95, 0.01),
-        correspondences=200,
-        methods=("MC", "MC 3px", "2P1k", "2P10k", "mc", "mc-exact"),
-        runs=100,
-        quick_values=(0.9, 0.95),
-        quick_runs=5,
-        cameras=(NORMAL,),
-        variation=Variation(noise_px=1.0),
-    ),
-    Experiment(
-        key="p3p-fig6",
-        place="Fig. 6, beside P3P",
-        over="outlier_rate",
-        values=_steps(0.0, 0.9, 0.1),
-        correspondences=100,
-        methods=("P3P100", "P3P1k"),
-        runs=100,
-        quick_values=(0.5, 0.8),
-        quick_runs=5,
-        variation=Variation(noise_px=1.0),
-        cameras=("MEI",),
-    ),
-    Experiment(
-        key="p3p-fig7",
-        place="Fig. 7, beside P3P",
-        over="outlier_rate",
-        values=_steps(0.9, 0.95, 0.01),
-        correspondences=200,
-        methods=("P3P1k", "P3P10k"),
-        runs=100,
-        quick_values=(0.9, 0.95),
-        quick_runs=5,
-        variation=Variation(noise_px=1.0),
-        cameras=("MEI",),
-    ),
+    _FIG6,
+    _FIG7,
+    _beside(_FIG6, "fig6-normal", "with normal draws", _NORMAL_6, (0.5, 0.9), camera=NORMAL),
+    _beside(_FIG7, "fig7-normal", "with normal draws", _NORMAL_7, camera=NORMAL),
+    _beside(_FIG6, "p3p-fig6", "beside P3P", ("P3P100", "P3P1k"), (0.5, 0.8)),
+    _beside(_FIG7, "p3p-fig7", "beside P3P", ("P3P1k", "P3P10k")),
     *(_case(key, right, count) for key, (right, count) in CASES.items()),
     *(_case(key + OWN, right, count, _CASE_OWN) for key, (right, count) in CASES.items()),
     *(_case(key + WIDE_VIEW, right, count, _CASE_WIDE) for key, (right, count) in CASES.items()),
-    Experiment(
-        key="wide-fig6",
-        place="Fig. 6, baselines with wide views",
-        over="outlier_rate",
-        values=_steps(0.0, 0.9, 0.1),
-        correspondences=100,
-        methods=(*(f"{name}, 1k" for name in WIDE_SOLVERS), "ML1k cov", "P3P1k", "2P1k"),
-        runs=100,
-        quick_values=(0.5,),
-        quick_runs=3,
-        variation=Variation(noise_px=1.0),
-        cameras=("MEI",),
-    ),
-    Experiment(
-        key="alike",
-        place="Fig. 6, under equal terms",
-        over="outlier_rate",
-        values=_steps(0.0, 0.9, 0.1),
-        correspondences=100,
-        methods=tuple(f"{name}, alike" for name in ALIKE),
-        runs=100,
-        quick_values=(0.5,),
-        quick_runs=3,
-        variation=Variation(noise_px=1.0),
-        cameras=("MEI",),
-    ),
+    _beside(_FIG6, "wide-fig6", "baselines with wide views", _WIDE_6, (0.5,), 3),
+    _beside(_FIG6, "alike", "under equal terms", tuple(f"{name}, alike" for name in ALIKE), (0.5,), 3),
     *(_phase(count, gravity) for gravity, counts in PHASE_GRAVITY_DEG.items() for count in counts),
 )
 """In the order in which they are run: what the page needs most comes first."""
