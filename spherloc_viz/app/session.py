@@ -1,5 +1,6 @@
 """One browser client: its own widgets, canvas, run and threads."""
 
+import re
 import secrets
 import time
 from collections import deque
@@ -49,6 +50,9 @@ VIEWER_STILL_S = 0.3
 """The address follows the page when nothing was drawn and the viewer has not moved for this long."""
 DIAGNOSE_AFTER_S = 0.2
 """A diagnosis costs more than many a run, so it waits until the picture has stood still for this long."""
+MIN_PIXEL_RATIO, MAX_PIXEL_RATIO = 0.25, 8.0
+"""What a browser may say of a screen."""
+
 T = TypeVar("T")
 
 
@@ -177,9 +181,10 @@ class Session:
         self.changed()
 
     def _tell_numbers(self, touch: Touch) -> None:
-        """A lesson around the page asks for the numbers of the runs."""
+        """A lesson around the page asks for the numbers of the runs, and says how many pixels of the screen one is."""
         self._in_lesson = True
-        self._display.canvas.fill_page()
+        ratio = float(touch.argument) if re.fullmatch(r"\d{1,2}(\.\d{1,9})?", touch.argument) else 1.0
+        self._display.canvas.fill_page(min(max(ratio, MIN_PIXEL_RATIO), MAX_PIXEL_RATIO))
         self._page.ask()
 
     def _reset(self, event: object) -> None:

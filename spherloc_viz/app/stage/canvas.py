@@ -53,6 +53,7 @@ class Canvas:
         client.scene.set_up_direction("-y")
         self._client, self._display = client, display
         self._label_scale = LABEL_SCALE * text_scale(client.camera.image_width)
+        self._pixel_ratio = 1.0
         self._painter = Painter(client, picked, self._label_scale)
         self._camera = TrueCamera(client, moved)
         self._full_width = client.camera.image_width
@@ -116,9 +117,10 @@ class Canvas:
         self._held = step_key, views.View(np.array(numbers[:3]), np.array(numbers[3:]), np.radians(degrees))
         self._looked, self._held_step_came = None, False
 
-    def fill_page(self) -> None:
-        """There are no panels beside the canvas: a lesson is around the page."""
-        self._docked_px = 0
+    def fill_page(self, pixel_ratio: float) -> None:
+        """There are no panels beside the canvas: a lesson is around the page, which draws a pixel of its style with so
+        many of the screen's."""
+        self._docked_px, self._pixel_ratio = 0, pixel_ratio
         self._follow_page()
 
     def viewpoint(self) -> tuple[float, ...]:
@@ -166,7 +168,8 @@ class Canvas:
 
     def _letter(self) -> float:
         """Width of a letter in the canvas, by half its height."""
-        return views.LETTER_PX * self._label_scale / (0.5 * max(1, min(self._client.camera.image_height, MAX_PX)))
+        height_px = max(1, min(self._client.camera.image_height, MAX_PX))
+        return views.LETTER_PX * self._pixel_ratio * self._label_scale / (0.5 * height_px)
 
     @property
     def clicked_left(self) -> bool:
