@@ -31,6 +31,12 @@ def test_the_projector_view_says_each_step_in_large_type(browser: Browser, addre
     tab.page.keyboard.press("l")
     expect(captions).to_have_count(0)
     expect(tab.page.get_by_role("tab", name="Play", exact=True)).to_be_visible()
+    # The key is known also where a box was ticked last.
+    tab.widget("Dark").focus()
+    tab.page.keyboard.press("l")
+    expect(captions).to_contain_text("Outcome")
+    tab.page.keyboard.press("l")
+    expect(captions).to_have_count(0)
     tab.until(lambda: abs(tab.page.evaluate(WIDTH_PX) - before) < 2, "the view beside the canvas is as it was")
     tab.expect_quiet(address)
     tab.close()

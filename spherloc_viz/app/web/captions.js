@@ -104,7 +104,8 @@
 
   setInterval(look, EVERY_MS);
   addEventListener("keydown", (event) => {
-    const writing = event.target instanceof Element && event.target.closest("input,textarea,select,[contenteditable=true]");
+    const writing = event.target instanceof Element
+      && event.target.closest("input:not([type=checkbox]):not([type=radio]),textarea,select,[contenteditable=true]");
     if (writing || event.ctrlKey || event.metaKey || event.altKey || event.key.toLowerCase() !== "l") return;
     event.preventDefault();
     toggle();
