@@ -8,7 +8,7 @@ where edges one above the other count as one: those of a door frame lean togethe
 there than would by chance (a-contrario, Desolneux et al. 2000).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import cv2
@@ -43,8 +43,14 @@ WITHIN_DEG = 45.0
 GRID_DEG = 1.5
 GATE_RAD = np.radians(1.5)
 """Edges that are off by less vote for a direction of the grid."""
-LEAN_SD_RAD = np.radians(0.4)
+LEAN_SD_RAD = float(np.radians(0.4))
 """Of what is built upright, and of a lens's calibration."""
+LEANS_RAD = np.radians([0.4, 0.6, 0.8, 1.1, 1.5, 2.0, 2.7, 3.6, 4.8, 6.4, 8.5, 11.0])
+"""Standard deviations of leaning that are tried."""
+MAX_LEAN_RAD = float(np.radians(0.7))
+"""From here on the edges do not meet, and the bound is that of a wider fit."""
+LEAN_REACH = float(np.sin(np.radians(25.0)))
+LEAN_STEPS = 6
 MAX_OFF = 0.06
 """Largest n . v of an edge that is taken for a vertical one."""
 POLE = 0.95
@@ -138,6 +144,7 @@ def vertical(lines: Lines, near: FloatArray) -> Vertical:
     for gate_rad in (2.0 * GATE_RAD, *[GATE_RAD] * 8):
         down = _fit(lines, down, gate_rad).down
     found = _fit(lines, down, GATE_RAD)
+    found = replace(found, sd_rad=max(found.sd_rad, _sd_of_leaning(lines, found.down)))
     nearer = int(np.count_nonzero(grid @ near >= down @ near))
     rival = votes[grid @ down < np.cos(np.radians(RIVAL_DEG))].max(initial=0.0)
     if nearer == len(grid):
@@ -173,12 +180,58 @@ def _votes(lines: Lines, directions: FloatArray) -> FloatArray:
     return (weight * np.maximum(0.0, 1.0 - off / (GATE_RAD**2 + 4.0 * lines.variance(along)))).sum(axis=1)
 
 
-def _fit(lines: Lines, start: FloatArray, gate_rad: float) -> Vertical:
-    """One step of weighted least squares from the direction ``start`` (3,), of edges up to ``gate_rad`` off it."""
+def _sd_of_leaning(lines: Lines, down: FloatArray) -> float:
+    """Standard deviation, rad, of a direction ``down`` (3,) if what stands there leans; 0 if it does not.
+
+    Trees and old houses lean: their edges meet nowhere, some of them do by chance, and a narrow gate hides the others.
+    With a wide one the fit is elsewhere, by so much or more.
+    """
+    lean_rad, wide = _lean_sd(lines, down), down
+    if lean_rad <= MAX_LEAN_RAD:
+        return 0.0
+    for _ in range(LEAN_STEPS):
+        found = _fit(lines, wide, 2.5 * lean_rad, lean_rad)
+        wide, lean_rad = found.down, _lean_sd(lines, found.down)
+    apart = float(np.arccos(np.clip(wide @ down, -1.0, 1.0)))
+    return float(np.hypot(found.sd_rad, apart / 2.0))
+
+
+def _lean_sd(lines: Lines, down: FloatArray) -> float:
+    """Standard deviation, rad, by which what stands around the direction ``down`` (3,) leans: one of ``LEANS_RAD``.
+
+    Of edges up to ``LEAN_REACH`` off it, a part lies about 0 by this and by the errors of its ends, and the rest
+    anywhere: the most likely one. Edges of about one azimuth count as one.
+    """
+    along, off = (lines.middles @ down) ** 2, lines.normals @ down
+    variance = lines.variance(along)
+    near = (np.abs(off) < LEAN_REACH) & (variance < MAX_END_SD_RAD**2) & (along < 0.75)
+    if not near.any():
+        return float(LEANS_RAD[0])
+    off, variance = off[near], variance[near]
+    across = tangent_basis(down[None])[0]
+    azimuth = np.arctan2(*(lines.middles[near] @ across.T).T)
+    group = np.unique((azimuth / GROUP_RAD).round().astype(int), return_inverse=True)[1].ravel()
+    weight = 1.0 / np.bincount(group)[group]
+    anywhere = 0.5 / LEAN_REACH
+    wide = variance + LEANS_RAD[:, None] ** 2
+    upright = np.exp(-0.5 * off**2 / wide) / np.sqrt(2 * np.pi * wide)
+    share = np.full((len(LEANS_RAD), 1), 0.5)
+    for _ in range(30):  # expectation maximisation
+        total = share * upright + (1.0 - share) * anywhere
+        share = ((share * upright / total) @ weight / weight.sum()).clip(0.02, 0.98)[:, None]
+    return float(LEANS_RAD[(np.log(total) @ weight).argmax()])
+
+
+def _fit(lines: Lines, start: FloatArray, gate_rad: float, lean_sd_rad: float = LEAN_SD_RAD) -> Vertical:
+    """One step of weighted least squares from the direction ``start`` (3,), of edges up to ``gate_rad`` off it.
+
+    What stands there leans by ``lean_sd_rad``.
+    """
     along, off = (lines.middles @ start) ** 2, lines.normals @ start
     variance = lines.variance(along)
     wide = variance + gate_rad**2 / 4.0
-    near = (off**2 <= np.minimum(9.0 * wide, MAX_OFF**2)) & (variance < MAX_END_SD_RAD**2) & (along < POLE)
+    most_off = max(MAX_OFF, 2.5 * lean_sd_rad)
+    near = (off**2 <= np.minimum(9.0 * wide, most_off**2)) & (variance < MAX_END_SD_RAD**2) & (along < POLE)
     used, along, off, variance, wide = lines.among(near), along[near], off[near], variance[near], wide[near]
     # How likely an edge is a vertical one; n . v of others is uniform from -1 to 1. Floors have edges underfoot.
     prior = 0.5 * (1.0 - along) ** 2
@@ -188,7 +241,7 @@ def _fit(lines: Lines, start: FloatArray, gate_rad: float) -> Vertical:
     azimuth = np.arctan2(*(used.middles @ across.T).T)
     group = np.unique((azimuth / GROUP_RAD).round().astype(int), return_inverse=True)[1].ravel()
     total = np.bincount(group, known)
-    information = 1.0 / (LEAN_SD_RAD**2 + 1.0 / total)
+    information = 1.0 / (lean_sd_rad**2 + 1.0 / total)
     group_off = np.bincount(group, known * off) / total
     robust = 1.0 / (1.0 + group_off**2 * information / 4.0)  # Cauchy's
     weight = known * (information * robust / total)[group]

@@ -11,6 +11,7 @@ import numpy as np
 from spherloc.cameras.base import Camera
 from spherloc.cameras.calibration import load_camera
 from spherloc.cameras.equirectangular import Equirectangular
+from spherloc.datasets.given_path import what_it_is
 from spherloc.errors import InputError, SpherlocError, shorten
 from spherloc.files import IMAGES, is_file, is_folder, names_in
 from spherloc.frontend.masks import Masks
@@ -49,7 +50,7 @@ def photographs(folder: Path, camera: Camera | None, masks: Masks | None = None)
     if their camera is not known or none that COLMAP can have.
     """
     if not is_folder(folder):
-        raise InputError(f"{folder}: is no folder; give the folder of the photographs.")
+        raise InputError(what_it_is(folder) or f"{folder}: is no folder; give the folder of the photographs.")
     sizes: dict[tuple[int, int], list[str]] = {}
     remarks = []
     for name in (name for name in names_in(folder) if Path(name).suffix.lower() in IMAGES):

@@ -146,6 +146,9 @@ def picture(path, width, height, rng):
 def test_photographs_that_are_refused_or_left_out(tmp_path, rng):
     with pytest.raises(InputError, match="is no folder"):
         photographs(tmp_path / "none", None)
+    (tmp_path / "walk.mp4").write_bytes(b"")
+    with pytest.raises(InputError, match=r"is a video; .* spherloc map frames --video .*walk\.mp4$"):
+        photographs(tmp_path / "walk.mp4", None)
     with pytest.raises(InputError, match="has no photographs"):
         photographs(tmp_path, None)
     picture(tmp_path / "a.png", 400, 300, rng)
