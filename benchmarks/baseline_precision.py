@@ -105,7 +105,7 @@ def problem(rng: np.random.Generator, count: int, plane: bool) -> tuple[FloatArr
         rays = rng.uniform([-2.0, -2.0, 4.0], [2.0, 2.0, 8.0], (count, 3))
     else:
         rays = rng.standard_normal((count, 3)) * rng.uniform(2.0, 6.0, (count, 1))
-    truth = pose(Rotation.random(rng=rng).as_matrix(), rng.uniform(-5.0, 5.0, 3))
+    truth = pose(Rotation.random(None, rng).as_matrix(), rng.uniform(-5.0, 5.0, 3))
     points = (rays - truth[:, 3]) @ truth[:, :3]
     noise = NOISE_PX / FOCAL_PX * rng.standard_normal((count, 2))
     if plane:

@@ -39,7 +39,7 @@ def test_yaw_comes_back(yaw):
 
 def test_yaw_of_is_the_closest_yaw(rng):
     """Of a rotation with roll and pitch: no other yaw leaves a smaller angle."""
-    for rotation in Rotation.random(50, rng=rng).as_matrix():
+    for rotation in Rotation.random(50, rng).as_matrix():
         best = rotation_angle(yaw_rotation(yaw_of(rotation)).T @ rotation)
         others = [rotation_angle(yaw_rotation(yaw).T @ rotation) for yaw in np.linspace(-np.pi, np.pi, 200)]
         assert best <= min(others) + 1e-12
@@ -104,7 +104,7 @@ def check_alignment(vector):
 
 def test_pose_centre_and_transform(rng):
     """p_cam = R p + t, and the camera's own position maps to zero."""
-    rotation, translation = Rotation.random(rng=rng).as_matrix(), rng.normal(size=3)
+    rotation, translation = Rotation.random(None, rng).as_matrix(), rng.normal(size=3)
     cam_from_map = pose(rotation, translation)
     assert cam_from_map.shape == (3, 4)
     points = rng.normal(size=(5, 3))

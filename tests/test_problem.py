@@ -151,7 +151,7 @@ def test_alignment_turns_gravity_down_and_poses_back(rng):
         np.testing.assert_allclose(aligned.camera_turn @ gravity[0], DOWN, atol=1e-12)
         np.testing.assert_allclose(aligned.map_turn @ gravity[1], DOWN, atol=1e-12)
         np.testing.assert_allclose(aligned.bearings, problem.bearings @ aligned.camera_turn.T, atol=1e-15)
-        cam_from_map = pose(Rotation.random(rng=rng).as_matrix(), rng.normal(size=3))
+        cam_from_map = pose(Rotation.random(None, rng).as_matrix(), rng.normal(size=3))
         there = aligned.align_pose(cam_from_map)
         np.testing.assert_allclose(aligned.unalign_pose(there), cam_from_map, atol=1e-14)
         # The aligned pose takes aligned points to aligned camera coordinates.

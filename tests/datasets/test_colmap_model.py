@@ -82,14 +82,14 @@ def pycolmap_model(rng):
     for number, kind in enumerate(kinds, start=1):
         camera = pycolmap.Camera.create_from_model_id(number, kind, 300.0, 640, 480)
         model.add_camera(camera)
-        offset = pycolmap.Rigid3d(pycolmap.Rotation3d(Rotation.random(rng=rng).as_quat()), rng.normal(size=3))
+        offset = pycolmap.Rigid3d(pycolmap.Rotation3d(Rotation.random(None, rng).as_quat()), rng.normal(size=3))
         if number == 1:
             rig.add_ref_sensor(camera.sensor_id)
         else:
             rig.add_sensor(camera.sensor_id, offset)
     model.add_rig(rig)
     for frame_id in (1, 2):
-        turn = pycolmap.Rotation3d(Rotation.random(rng=rng).as_quat())
+        turn = pycolmap.Rotation3d(Rotation.random(None, rng).as_quat())
         frame = pycolmap.Frame(frame_id=frame_id, rig_id=1, rig_from_world=pycolmap.Rigid3d(turn, rng.normal(size=3)))
         images = []
         for camera_id in model.cameras:

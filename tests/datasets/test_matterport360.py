@@ -117,7 +117,7 @@ def test_wrong_keys_are_sentences(tmp_path: Path, extra: str, sentence: str | No
 
 
 def test_poses_round_trip(tmp_path: Path, rng: np.random.Generator) -> None:
-    for rotation in Rotation.random(20, rng=rng).as_matrix():
+    for rotation in Rotation.random(20, rng).as_matrix():
         given_pose = pose(rotation, rng.normal(size=3))
         write_pose(tmp_path / "pose.txt", given_pose)
         assert np.abs(read_pose(tmp_path / "pose.txt") - given_pose).max() < 1e-7

@@ -59,7 +59,7 @@ def test_turned_frames_give_the_same_pose_and_inliers(rng, scene_of, camera, est
     for seed in range(4):
         problem = scene_of(camera, outlier_rate=0.6).problem(seed)
         here = estimate(problem, estimator, seed=seed)
-        camera_turn, map_turn = Rotation.random(2, rng=rng).as_matrix()
+        camera_turn, map_turn = Rotation.random(2, rng).as_matrix()
         there = estimate(turned(problem, camera_turn, map_turn), estimator, seed=seed)
         assert here.cam_from_map is not None and there.cam_from_map is not None
         rotation = camera_turn.T @ there.cam_from_map[:, :3] @ map_turn
@@ -83,7 +83,7 @@ def test_upside_down(scene_of, estimator):
 def test_every_pose_of_the_trace_is_in_the_problems_frames(rng, scene_of):
     """Stages hold poses too; one that was not turned back would draw the camera in the wrong place."""
     problem = scene_of("mei", outlier_rate=0.5, noise_px=0.2).problem()
-    camera_turn, map_turn = Rotation.random(2, rng=rng).as_matrix()
+    camera_turn, map_turn = Rotation.random(2, rng).as_matrix()
     other = turned(problem, camera_turn, map_turn)
     truth_rotation = camera_turn @ problem.truth_cam_from_map[:, :3] @ map_turn.T
     truth_shift = camera_turn @ problem.truth_cam_from_map[:, 3]

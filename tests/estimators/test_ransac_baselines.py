@@ -33,7 +33,7 @@ def run(problem, estimator, seed=0, **options):
 
 def front_problem(camera, rng, count=100, outlier_rate=0.0, noise_px=1.0, half_field=1.6):
     """Points in front of a camera that is tilted any way, as gravity says; outliers have each other's pixels."""
-    rotation = Rotation.random(rng=rng).as_matrix()
+    rotation = Rotation.random(None, rng).as_matrix()
     truth = pose(rotation, rng.uniform(-5, 5, 3))
     plane = np.column_stack([rng.uniform(-half_field, half_field, (count, 2)), np.ones(count)])
     rays = plane * rng.uniform(1.0, 8.0, (count, 1))

@@ -16,7 +16,7 @@ SOLVERS = (Svd(), Mlpnp(), Epnp(), Odlt(), EproPnp(), EpnpSphere(), OdltSphere()
 
 
 def random_rotation(rng):
-    return Rotation.random(rng=rng).as_matrix()
+    return Rotation.random(None, rng).as_matrix()
 
 
 def noisy(rng, bearings, noise_rad):
