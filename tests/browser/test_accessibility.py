@@ -41,7 +41,6 @@ def test_every_state_of_the_page_is_accessible(browser: Browser, address: str) -
     tab.row(5).click()
     tab.expect_card(5)
     tab.tab("Compare")
-    tab.touch("compare:ransac-epnp").click()
     tab.press("Compare")
     expect(tab.page.get_by_text("The yaw that each found")).to_be_visible()
     named(tab)
