@@ -116,6 +116,7 @@ def test_slider_stages_buttons_and_keys_step(tab: Playground, address: str) -> N
     expect(tab.page.locator(".step-title")).to_be_in_viewport()
     tab.page.keyboard.press("b")
     expect(tab.step).to_have_value(at(1))
+    expect(tab.page.locator(".step-title")).to_have_text("The matches")
 
     tab.choose("Pace", "4×")
     tab.press("Play")

@@ -61,7 +61,7 @@
 
   function showStep() {
     const title = seenElements(".step-title").find((one) => !one.closest(".captions")), words = title?.textContent ?? titled;
-    if (words === titled) return;
+    if (words === titled || document.querySelector('input[aria-expanded="true"]')) return; // a list that is open stays
     for (let box = title.parentElement; titled !== null && box; box = box.parentElement)
       if (title.getBoundingClientRect().top < box.getBoundingClientRect().top) box.scrollTop = 0;
     titled = words;
