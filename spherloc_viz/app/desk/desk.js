@@ -642,7 +642,8 @@ async function load() {
   const [across, up] = runs.axes.map((words) => SETTINGS.measures.reduce((text, name) => text.replace(name, title(name)), words));
   byId("map-words").textContent = across
     ? `Runs with like evidence lie near each other (principal components; → ${across}; ↑ ${up}). Draw around some to list them.`
-    : "These runs have no measured evidence: they were recorded by an older version.";
+    : runs.count < 2 ? "A map is made of two runs or more."
+      : "These runs have no measured evidence: they were recorded by an older version.";
 }
 
 async function poll() {
