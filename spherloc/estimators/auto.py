@@ -25,7 +25,10 @@ PROBE_SAMPLES = 500
 MAX_PROBE_SAMPLES = 5000
 PROBE_CONFIDENCE = 0.99
 MAX_FOR_CHEAP_PROOF = 500
-"""Correspondences up to which the proof costs a few hundredths of a second, so that nothing speaks against it."""
+"""Correspondences up to which the proof takes a few hundredths of a second where gravity is exact."""
+SHARE_FOR_SAMPLING = 0.4
+"""Share of matches within the noise bound of the probe's refined pose from which on sampling is safe though gravity is
+uncertain: one sampled pair in six is right, and the proof would cost seconds."""
 MAX_NFA_BY_CHANCE = 1e-6
 """Expected number of false alarms (NFA) of the size of the probe's consensus below which it is no chance."""
 RANSAC_CONFIDENCE = 0.9999
@@ -63,10 +66,15 @@ class Auto:
                 watch=clock.watch,
             )
             decision = _decide(aligned, bounds, probe)
-        # With uncertain gravity the exact search takes seconds where it is in vain.
+        # With uncertain gravity the exact search takes seconds: too much where sampling is safe, or gravity is wrong.
         early = decision.chosen == "mc-exact" and aligned.gravity_bound_rad > 0.0
-        if early and (wrong := _gravity_fault(aligned, *_best_of(aligned, bounds, probe, options), options, clock)):
-            return _without_gravity(aligned, wrong, decision, options)
+        if early:
+            best, inliers = _best_of(aligned, bounds, probe, options)
+            share = np.count_nonzero(inliers) / len(inliers)
+            if share >= SHARE_FOR_SAMPLING:
+                early, decision = False, _sampled(decision, share, len(inliers))
+            elif wrong := _gravity_fault(aligned, best, inliers, options, clock):
+                return _without_gravity(aligned, wrong, decision, options)
         shared = {item.name: getattr(options, item.name) for item in fields(options)}
         if decision.chosen == "mc-exact":
             outcome = ExactMaximumConsensus.run(aligned, McExactOptions(**shared), bounds, seed, clock)
@@ -89,6 +97,15 @@ class Auto:
             outcome.note,
             outcome.certificate,
         )
+
+
+def _sampled(decision: DecisionStage, share: float, count: int) -> DecisionStage:
+    """The decision for sampling where a proof would cost seconds and this ``share`` of ``count`` matches agrees."""
+    reason = (
+        f"{100 * share:.0f} % of {count:,} matches agree within the noise bound, so that sampling finds the pose. With "
+        "uncertain gravity the proof would take seconds; mc-exact gives it."
+    )
+    return replace(decision, chosen="ransac-2p", reason=reason)
 
 
 def _best_of(

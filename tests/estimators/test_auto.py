@@ -2,9 +2,11 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from spherloc.estimators import estimate
+from spherloc.metrics import rotation_error_deg
 from spherloc.trace import DecisionStage
 
 
@@ -29,3 +31,15 @@ def test_a_high_expected_outlier_rate_asks_for_more_samples(scene_of):
 def test_any_expectation_is_usable(scene_of, expected):
     stage, trace = decision_of(scene_of, expected)
     assert stage.samples >= 1 and trace.cam_from_map is not None
+
+
+@pytest.mark.parametrize(("outlier_rate", "chosen"), [(0.3, "ransac-2p"), (0.8, "mc-exact")])
+def test_uncertain_gravity_is_proven_where_few_matches_agree_only(scene_of, outlier_rate, chosen):
+    """The proof takes seconds there: not where sampling is safe."""
+    scene = scene_of("panorama", correspondences=60, outlier_rate=outlier_rate, gravity_error_deg=1.0)
+    problem = replace(scene.problem(3), gravity_bound_rad=np.radians(3.0))
+    trace = estimate(problem, "auto")
+    stage = trace.stage(DecisionStage)
+    assert isinstance(stage, DecisionStage) and stage.chosen == chosen
+    assert (trace.certificate is not None) == (chosen == "mc-exact")
+    assert rotation_error_deg(trace.cam_from_map, problem.truth_cam_from_map) < 1.0
