@@ -4,10 +4,15 @@ import json
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from spherloc_viz import style
 from spherloc_viz.app.lesson_file import MAX_BYTES_OF_FILE, exported, handout_of, recorded_states
-from spherloc_viz.app.stage.still_page import scripts_in
+from spherloc_viz.app.stage.flat_picture import svg
+from spherloc_viz.app.stage.still_page import Still, scripts_in
+from spherloc_viz.layers.frame import one_color
+from spherloc_viz.layers.primitives import Balls, Points
 from spherloc_viz.lessons import lesson_named, lessons
 from spherloc_viz.lessons.html import list_page, notes_page, teacher_page
 from spherloc_viz.lessons.lesson import changed_state
@@ -63,6 +68,18 @@ def test_a_hand_out_has_numbers_pictures_and_the_answers_at_its_end() -> None:
     assert "<b>183</b>" in answers and "<b>183</b>" not in questions, "what follows a question is told with its answer"
     assert ">maximum clique</text>" in answers and ">maximum clique</text>" not in questions, "so is its picture"
     assert "For the teacher" not in html
+
+
+def test_on_paper_the_camera_is_drawn_over_the_balls_around_it() -> None:
+    balls = Balls("balls", "balls", np.zeros((50, 3)), np.ones(50), one_color(style.CLIQUE, 50), 0.3)
+    camera = Points("camera", "poses", np.array([[0.5, 0.0, 0.0]]), one_color(style.TRUTH, 1), 0.1)
+    origin, forward, up = np.zeros(3), np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
+    shown = svg(Still("", "", (camera, balls), None, np.eye(3), -5.0 * forward, origin, up, 1.0, False))
+    circles = re.findall("<circle[^>]*>", shown)
+    assert len(circles) == 51
+    assert f'fill="{style.css(style.TRUTH)}"' in circles[-1], "although it is farther away than their centres"
+    opacity = float(re.findall(r'fill-opacity="([^"]+)"', circles[0])[0])
+    assert 0.6 < 1.0 - (1.0 - opacity) ** 50 < 0.8, "one sees through all of them together"
 
 
 def test_the_teacher_is_told_the_timing() -> None:

@@ -16,6 +16,8 @@ CONFIDENCE = 0.999
 LARGE = 10_000.0
 SMALL = 1e-3
 RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+NO_BREAK = "\N{NO-BREAK SPACE}"
+"""Keeps a number on one line."""
 
 Number = float | str
 
@@ -119,7 +121,7 @@ def number_text(value: Number) -> str:
         return "infinitely many"
     if value != 0 and not SMALL <= abs(value) < 1e12:
         digits, _, power = f"{value:.1e}".partition("e")
-        return f"{digits} × 10{str(int(power)).translate(RAISED)}"
+        return f"{digits}{NO_BREAK}×{NO_BREAK}10{str(int(power)).translate(RAISED)}"
     if value == round(value) or abs(value) >= LARGE:
         return f"{value:,.0f}"
     return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"

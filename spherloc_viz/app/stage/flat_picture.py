@@ -22,6 +22,12 @@ LETTER = 0.55
 """Width of a letter by the height of its line, on average."""
 NEAR_M = 1e-3
 """What is nearer to the viewer is left out."""
+MAX_STACKED = 0.7
+"""Opacity of balls that all lie over each other."""
+OUTLINE_PX, OUTLINE_OPACITY = 0.5, 0.35
+"""Of balls, which are as pale as many of them must be."""
+BEHIND_M = 1e6
+"""Added to the distance of balls, of their centres and of lines between these, which would hide the camera in them."""
 
 Shape = tuple[float, str]
 """Distance from the viewer, and its SVG."""
@@ -30,7 +36,9 @@ Shape = tuple[float, str]
 def svg(still: Still) -> str:
     """The picture, ``WIDTH`` by ``HEIGHT``; what is far is drawn first. Pictures on meshes are left out."""
     eye = _Eye(still)
-    shapes = [shape for item in still.items for shape in _shapes(item, eye)]
+    shapes = [
+        (depth + BEHIND_M * (item.layer == "balls"), text) for item in still.items for depth, text in _shapes(item, eye)
+    ]
     body = "".join(text for _, text in sorted(shapes, key=lambda shape: -shape[0]))
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH:g} {HEIGHT:g}">'
@@ -68,7 +76,10 @@ def _shapes(item: SceneItem, eye: _Eye) -> Iterator[Shape]:
             yield from _discs(eye, item.positions, depths, radii, item.colors, 1.0)
         case Balls():
             depths = eye.depths_m(item.centers)
-            yield from _discs(eye, item.centers, depths, eye.sizes_px(item.radii_m, depths), item.colors, item.opacity)
+            radii = eye.sizes_px(item.radii_m, depths)
+            opacity = min(item.opacity, 1.0 - (1.0 - MAX_STACKED) ** (1.0 / max(1, len(radii))))
+            for depth, disc in _discs(eye, item.centers, depths, radii, item.colors, opacity):
+                yield depth + BEHIND_M, disc
         case Segments():
             yield from _lines(eye, item)
         case Mesh():
@@ -89,11 +100,12 @@ def _shapes(item: SceneItem, eye: _Eye) -> Iterator[Shape]:
 def _discs(
     eye: _Eye, positions: FloatArray, depths: FloatArray, radii: FloatArray, colors: np.ndarray, opacity: float
 ) -> Iterator[Shape]:
-    faint = f' fill-opacity="{opacity:.2g}"' if opacity < 1.0 else ""
+    faint = f' fill-opacity="{opacity:.2g}" stroke-opacity="{OUTLINE_OPACITY:g}"' if opacity < 1.0 else ""
     for (x, y), depth, radius, color in zip(eye.pixels(positions), depths, radii, colors, strict=True):
         if depth > NEAR_M and -radius < x < WIDTH + radius and -radius < y < HEIGHT + radius:
             fill = _css(color)
-            yield float(depth), f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius:.1f}" fill="{fill}"{faint}/>'
+            line = f' stroke="{fill}" stroke-width="{OUTLINE_PX:g}"{faint}' if faint else ""
+            yield float(depth), f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius:.1f}" fill="{fill}"{line}/>'
 
 
 def _lines(eye: _Eye, item: Segments) -> Iterator[Shape]:
