@@ -45,8 +45,18 @@ def test_an_exported_lesson_has_all_of_its_scenes_and_no_dead_control(page: str)
     }
     numbers = json.loads(part(page, "numbers"))
     assert numbers[str(states.index(changed_state(lesson.moments[1].state, "")))]["pairs_at_yaw"] == "218"
-    assert ">218</output>" in body and "<b>90 %</b>" in body, "numbers and settings stand there without the script"
+    assert ">218</output>" in body and ">90 %</b>" in body, "numbers and settings stand there without the script"
     assert len(page.encode()) < MAX_BYTES_OF_FILE
+
+
+def test_in_an_exported_lesson_a_setting_follows_the_scene() -> None:
+    lesson = lesson_named("ransac")
+    page, moment = exported(lesson, lambda words: None), lesson.moments[1]
+    states, numbers = recorded_states(lesson), json.loads(part(page, "numbers"))
+    for changes, percent, samples in (("", "60 %", "40"), ("set=outlier_rate%3D0.8", "80 %", "170")):
+        shown = numbers[str(states.index(changed_state(moment.state, changes)))]
+        assert (shown["set.outlier_rate"], shown["samples_needed"]) == (percent, samples)
+    assert '<b data-number="set.outlier_rate">60 %</b>' in page
 
 
 def test_an_exported_lesson_uses_no_network(page: str) -> None:

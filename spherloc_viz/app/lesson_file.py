@@ -33,8 +33,18 @@ from spherloc_viz.layers import paint, steps, with_alternative
 from spherloc_viz.layers.matches import match_view
 from spherloc_viz.layers.primitives import Picture
 from spherloc_viz.lessons import lessons
-from spherloc_viz.lessons.html import Form, Sheet, exported_page, handout_page, has_images, links_in, names_in
-from spherloc_viz.lessons.lesson import Lesson, Moment, changed_state
+from spherloc_viz.lessons.html import (
+    Form,
+    Sheet,
+    exported_page,
+    handout_page,
+    has_images,
+    links_in,
+    names_in,
+    setting_text,
+    settings_in,
+)
+from spherloc_viz.lessons.lesson import Lesson, Moment, changed_state, state_parts
 from spherloc_viz.lessons.numbers import number_text, numbers_of
 
 ESTIMATOR = "mc"
@@ -92,14 +102,20 @@ def exported(lesson: Lesson, tell: Callable[[str], None], dark: bool = True) -> 
     Raises ``InputError`` for a state that cannot be shown, and for a file of more than ``MAX_BYTES_OF_FILE``.
     """
     runs, found = LinkedRuns(), {state: place for place, state in enumerate(recorded_states(lesson))}
-    asked = {name for moment in lesson.moments for text in texts(moment) for name in names_in(text)}
+    said = [text for moment in lesson.moments for text in texts(moment)]
+    asked = {name for text in said for name in names_in(text)}
+    settings = {key: percent for text in said for key, percent in settings_in(text).items()}
     scripts, numbers = [], []
     for state, place in found.items():
         tell(f"scene {place + 1} of {len(found)}")
         linked = runs.run(state)
         scripts.append(scene_script(still_of(linked, runs, dark)))
         told = numbers_text(linked)
-        numbers.append({name: told[name] for name in asked & told.keys()})
+        values = state_parts(state)
+        shown = {
+            key: setting_text(values[key].rpartition("=")[2], settings[key]) for key in settings.keys() & values.keys()
+        }
+        numbers.append({name: told[name] for name in asked & told.keys()} | shown)
     viewer = client_html().replace("<title>Viser</title>", f"<title>scene</title>{QUIET}{BARE}", 1)
     data = [
         _data("viewer", json.dumps(viewer)),
@@ -239,7 +255,13 @@ def _recorded(places: Mapping[str, int], numbers: Mapping[str, str], images: Map
     def at(state: str) -> str:
         return f"at={places[_state(state)]}"
 
-    return Form(number, at, lambda state, changes: at(changed_state(state, changes)), False, images.__getitem__)
+    def setting(key: str, shown: str) -> str:
+        return f'<b data-number="{escape(key)}">{escape(shown)}</b>'
+
+    def change(state: str, changes: str) -> str:
+        return at(changed_state(state, changes))
+
+    return Form(number, at, change, False, images.__getitem__, setting)
 
 
 PHOTO_PX = 640

@@ -42,6 +42,8 @@ class Form:
     """Whether sliders, choices and links to the playground work."""
     images: Callable[[str], str] = lambda state: f"{IMAGES}?{state}"
     """Address of the picture of a state's images."""
+    setting: Callable[[str, str], str] = lambda key, shown: f"<b>{escape(shown)}</b>"
+    """HTML in place of a control, by its key and its value, as it is shown."""
 
 
 def live_number(name: str) -> str:
@@ -93,6 +95,17 @@ def names_in(text: str) -> set[str]:
     return {name for name in FIELD.findall(FORMULA.sub("", text)) if " " not in name and name != PAIR}
 
 
+def settings_in(text: str) -> dict[str, bool]:
+    """Keys of the controls that a text has, and whether they are shown as percentages."""
+    fields = [words.split() for words in FIELD.findall(FORMULA.sub("", text)) if " " in words]
+    return {key: more[-1] == PERCENT for _, key, *more in fields}
+
+
+def setting_text(value: str, percent: bool) -> str:
+    """A value of a state as prose has it."""
+    return f"{100 * float(value):.0f} %" if percent else value
+
+
 def has_images(moment: Moment) -> bool:
     """Whether a moment shows its images."""
     return any(PAIR in FIELD.findall(text) for text in (moment.prose, moment.after))
@@ -140,7 +153,7 @@ def _field(words: str, state: str, form: Form) -> str:
     value = state_parts(state).get(key, "").partition("=")[2] if "." in key else state_parts(state).get(key, "")
     if kind == "choice" and len(rest) == 2:
         if not form.controls:
-            return f"<b>{escape(value)}</b>"
+            return form.setting(key, value)
         options = "".join(
             f"<option{' selected' * (word == value)}>{escape(word)}</option>" for word in rest[1].split("|")
         )
@@ -150,9 +163,9 @@ def _field(words: str, state: str, form: Form) -> str:
         percent = unit == [PERCENT]
         if not value:
             raise InputError(f"the slider of {show(key)} needs a state that says {show(key)}.")
-        shown = f"{100 * float(value):.0f} %" if percent else value
+        shown = setting_text(value, percent)
         if not form.controls:
-            return f"<b>{shown}</b>"
+            return form.setting(key, shown)
         name = key.rpartition(".")[2].replace("_", " ")
         return (
             f'<span class="slider"><input type="range" min="{first}" max="{last}" step="{step}" value="{value}" '
