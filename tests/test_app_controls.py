@@ -170,7 +170,7 @@ def test_seeds(controls: SceneControls) -> None:
     assert controls.read().seed == 0
     for wrong in ("", "-1", "1.5", "²", "9" * 19, "seven"):
         controls._seed.value = wrong
-        with pytest.raises(InputError, match=r"is no whole number from 0 to 2\^63 - 1; type one\."):
+        with pytest.raises(InputError, match=r"is not a whole number from 0 to 2\^63 - 1; type one\."):
             controls.read()
     controls.next_seed()
     assert controls.read().seed == 0

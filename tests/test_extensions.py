@@ -130,7 +130,7 @@ from spherloc_viz.layers.primitives import Chart, Curve, Points
 
 def frame(view, **changes):
     told = {"caption": "Drawn by the layer.", "equation": "", "cam_from_map": view.standing(np.eye(3)),
-            "colors": view.colors(style.UNDECIDED), "rays": view.nobody()}
+            "colors": view.colors(style.UNDECIDED), "rays": view.no_matches()}
     return Frame(**told | changes)
 
 

@@ -67,7 +67,7 @@ class Audience:
         self._display = RunDisplay(client, self._touches, controls, places, (left_px, right_px))
         self._touches.on("select", self._select_numbers)
         self._touches.on("deselect", lambda touch: self._select(()))
-        # Only now may the page tell what is pressed: everything that listens is there.
+        # Only now may the page report presses: all handlers are registered.
         client.gui.add_html(READY)
         self._display.panels.ready()
 

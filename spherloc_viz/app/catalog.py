@@ -24,19 +24,19 @@ from spherloc_viz.given_files import is_recording
 from spherloc_viz.recording.replay import load_recorded_scene
 
 MAX_BRIEF = 8
-"""Recorded problems that a page offers beside its scenes."""
+"""How many recorded problems a page offers beside its scenes."""
 MAX_MESHES = 4
-"""Maps whose meshes are kept."""
+"""For how many maps the meshes are kept."""
 
 
 @dataclass(frozen=True)
 class SceneRequest:
-    """What the page asks of a scene."""
+    """All that the problem of a page depends on."""
 
     scene: str
-    """Its label in the catalog."""
+    """The scene's label in the catalog."""
     seed: int
-    """Of the simulation, of spoiled matches, and of the estimator."""
+    """Seed of the simulation, of spoiled matches, and of the estimator."""
     query: str | None = None
     """Name of a query image, for scenes made of images; None for the first."""
     variation: Variation = field(default_factory=Variation)
@@ -85,8 +85,7 @@ class Catalog:
         return free
 
     def enter(self, scene: Scene, path: Path, label: str, brief: bool) -> str:
-        """``add`` for a scene that is reopened; of the brief ones, of which a reviewer goes through hundreds, only
-        the newest stay."""
+        """``add`` for the scene of a recorded run; of recorded problems (``brief``) only the newest stay."""
         entered = self.add(scene, path, label)
         if brief:
             self._brief = [*(other for other in self._brief if other != entered), entered]
@@ -142,7 +141,7 @@ class Catalog:
 
 
 class _Caches:
-    """What was computed last, by the scenes themselves: their labels may mean other scenes on other pages."""
+    """Newest problems and meshes. Keys are the scenes, since one label can mean two scenes on two pages."""
 
     def __init__(self) -> None:
         self.problem = lru_cache(maxsize=16)(self._problem)
@@ -186,7 +185,7 @@ class RunRequest:
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A request fulfilled."""
+    """A request with its problem and its trace."""
 
     request: RunRequest
     trace: Trace

@@ -120,23 +120,23 @@ class LeftPanels:
             self._introduction.content = introduction_html(steps(run.trace))
 
     def begin_opening(self, label: str) -> None:
-        """Until a run of the scene of this label is shown, say that what is shown is of the scene before."""
+        """Until a run of this scene is shown, say that the panels still show the scene before."""
         self._opening = label
         self._changed(None)
 
     def tell_opening(self, words: str, share: float) -> None:
-        """Say how far the opening is, 0 to 1."""
+        """Show the progress of the opening, 0 to 1."""
         if self._opening:
             self._card.content = opening_card_html(self._opening, words, share)
 
     def end_opening(self) -> None:
-        """The scene before stays."""
+        """The opening has ended without a new run: show the scene before."""
         if self._opening:
             self._opening = self._card.content = ""
             self._changed(None)
 
     def _see(self, touch: Touch) -> None:
-        """Other tabs are open now."""
+        """The page reports which views can be seen now."""
         self._seen = frozenset(touch.argument.split(","))
         self._changed(None)
 
@@ -146,11 +146,11 @@ class LeftPanels:
         self._panel.set_width(max(self._width_px, int(PROJECTOR_SHARE * window_px)))
 
     def ready(self) -> None:
-        """Tell the page that presses are heard, in a panel that stays when the other one is folded."""
+        """Tell the page that presses are handled from now on; in a panel that stays when the other one is folded."""
         self._ready.content = READY
 
     def diagnose(self, html: str) -> None:
-        """Show what the diagnosis says by now."""
+        """Show the newest diagnosis."""
         update_widget(self._diagnosis, content=html)
 
 
@@ -176,7 +176,7 @@ def front_html(stage: str, key: str) -> str:
 
 @contextmanager
 def _view(gui: viser.GuiApi, panel: viser.PanelHandle, name: str) -> Iterator[None]:
-    """A tab of which the page tells whether it is to be seen."""
+    """The content of a tab; the page reports whether it can be seen."""
     with panel.add_tab(name):
         gui.add_html(f'<div data-view="{name}"></div>')
         yield

@@ -1,9 +1,9 @@
-"""What a page shows as a text, which the page keeps behind the "#" of its address: a reload or a link brings it back.
+"""The state of a page as text after the "#" of its address, so that a reload or a link brings it back.
 
 The text is a query string, such as ``v=1&scene=street&seed=3&set=outlier_rate%3D0.4&estimator=mc&step=outcome``. It
-says what differs from what the scene and the estimator say. Anybody may have made it, so scenes are named by their
-label, by their case of the gallery or by a place in an allowed folder, cameras by their label, and nothing else is read
-from the disk.
+holds only what differs from the defaults of scene and estimator. It is untrusted, so a scene is named by its label, by
+its case of the gallery or by a path in an allowed folder, a camera by its label, and nothing else is read from the
+disk.
 """
 
 import json
@@ -26,9 +26,9 @@ from spherloc_viz.options import option_fields, typed, usable_estimators
 
 VERSION = 1
 MAX_LETTERS = 15_000
-"""A longer link is not written: some thousand matches are changed by hand."""
+"""A longer link is not written; one gets so long when some thousand single matches are changed."""
 MAX_M, MIN_M = 1e7, 1e-6
-"""How far off a viewer may stand, and how far from what it looks at at least."""
+"""Largest coordinate of a viewer, and least distance between a viewer and the point that it looks at."""
 THEMES = ("dark", "light")
 ANSWERS = ("told", "hidden")
 LISTS = ("spoil", "mend", "hide")
@@ -42,7 +42,7 @@ MANY = ("set", "option")
 
 @dataclass(frozen=True)
 class PageView:
-    """How a run is looked at."""
+    """How a page shows a run: its step, selection, viewer and what is hidden."""
 
     step: str
     """Key of the step."""
@@ -109,18 +109,18 @@ def address_html(link: str, session: str, followed: int, numbers: Mapping[str, s
 
 @dataclass(frozen=True)
 class Followed:
-    """What a link led to."""
+    """What a link asks for, and what of it could not be opened."""
 
     request: RunRequest
     view: PageView
     remarks: tuple[str, ...]
-    """What of the link could not be opened, a sentence each."""
+    """One sentence for each part of the link that could not be opened."""
     opened: Opened | None = None
-    """The recording that it is a link to."""
+    """The recording that the link names."""
 
 
 class Follower:
-    """Follows links on one page. Whatever a link says wrongly becomes a remark, and the page's own stays."""
+    """Follows links on one page. Each wrong part of a link becomes a remark, and the page keeps its own value there."""
 
     def __init__(
         self,
@@ -142,7 +142,7 @@ class Follower:
         return Followed(request, _view(said, view, opened, remarks), tuple(remarks), opened)
 
     def _recorded(self, said: dict[str, Any], remarks: list[str]) -> Opened | None:
-        """The recording that a link says; if it cannot be opened, the run is made anew from what else is said."""
+        """The recording that a link names; if it cannot be opened, the rest of the link is solved."""
         if "run" not in said:
             return None
         try:
@@ -168,7 +168,7 @@ class Follower:
         return RunRequest(scene, estimator, options)
 
     def _scene(self, said: dict[str, Any], now: SceneRequest, remarks: list[str]) -> SceneRequest:
-        """The scene with its changes; the page's own if the link's is not to be had."""
+        """The scene of the link with its changes; the page's own if that of the link cannot be opened."""
         try:
             label = self._label(said, now.scene)
         except SpherlocError as error:
@@ -177,7 +177,7 @@ class Follower:
         scene = self._catalog.scenes[label]
         seed = said.get("seed", str(getattr(scene, "seed", 0)))
         if not (seed.isascii() and seed.isdigit() and len(seed) < 20 and int(seed) < 2**63):
-            remarks.append(f"the seed {show(seed)} is no whole number from 0 to 2^63 - 1.")
+            remarks.append(f"the seed {show(seed)} is not a whole number from 0 to 2^63 - 1.")
             seed = "0"
         query, images = said.get("query"), self._catalog.map_scene(label)
         try:
@@ -231,7 +231,7 @@ class Follower:
 
 
 def _read(text: str, remarks: list[str]) -> dict[str, Any]:
-    """What a link says, by key: a text, or a list of texts for those of ``MANY``."""
+    """The values of a link by key: a text, or a list of texts for the keys in ``MANY``."""
     said: dict[str, Any] = {}
     try:
         pairs = parse_qsl(text, keep_blank_values=True, max_num_fields=200, errors="strict")
@@ -252,7 +252,7 @@ def _read(text: str, remarks: list[str]) -> dict[str, Any]:
 
 
 def _view(said: dict[str, Any], view: PageView, opened: Opened | None, remarks: list[str]) -> PageView:
-    """How a link looks at its run: a recording without a step at the one that decided it."""
+    """The view that a link asks for; a recording without a step opens at its key step."""
     theme = _one_of(said, "theme", THEMES, remarks)
     hidden = _one_of(said, "answers", ANSWERS, remarks) == ANSWERS[1]
     selected: tuple[int, ...] = ()
@@ -287,7 +287,7 @@ def _viewpoint(text: str) -> tuple[float, ...]:
 
 
 def _one_of(said: dict[str, Any], key: str, words: tuple[str, ...], remarks: list[str]) -> str:
-    """The word that a link says, or the first one."""
+    """The value of a key that takes one of ``words``; without it, the first of them."""
     word = said.get(key, words[0])
     if word not in words:
         remarks.append(f"{key} is {show(word)}; it is {' or '.join(words)}.")

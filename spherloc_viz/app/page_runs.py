@@ -1,4 +1,4 @@
-"""What becomes of one page's runs: those that it settles on are recorded, with where they came from."""
+"""Records the runs of one page that stay unchanged for a while, with their origin."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,9 +14,9 @@ from spherloc_viz.recording.replay import origin_of
 from spherloc_viz.recording.storage.recorder import Recorder
 
 RETRY_S = 1.0
-"""After this long a run is recorded that could not be before."""
+"""Seconds until a recording that failed is tried again."""
 LOOK_S = 0.1
-"""After this long it is looked whether a run is written."""
+"""Seconds between two looks whether a run is written."""
 NOT_RECORDED = "Runs are not recorded."
 
 
@@ -45,7 +45,7 @@ class Submitted:
 
     @property
     def path(self) -> Path:
-        """Of its recording, which is there once it is written."""
+        """Path of its recording; the file exists once it is written."""
         return self.before or self.promised
 
     def known(self, path: Path) -> None:
@@ -70,12 +70,12 @@ class PageRuns:
         self._known = known
 
     def became(self, asked: RunRequest, request: RunRequest) -> None:
-        """The page says in its own words what it was asked for, such as nothing for what the scene says already."""
+        """The page has brought the expected request into its own form, such as no value where it equals the scene's."""
         if self._known is not None and self._known.request is asked:
             self._known = replace(self._known, request=request)
 
     def announce(self, run: Run) -> str:
-        """What will become of a run, in a sentence."""
+        """Whether a run will be recorded, in a sentence."""
         if self._repeats(run):
             return "This run is recorded already."
         return NOT_RECORDED if self._recorder is None else "Will be recorded when nothing changes any more."

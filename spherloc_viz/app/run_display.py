@@ -33,7 +33,7 @@ ANSWERS = frozenset({"outcome", "truth"})
 
 
 class Panel(Protocol):
-    """What the face needs of the panel right of the canvas."""
+    """What ``RunDisplay`` needs of the panel right of the canvas."""
 
     @property
     def display(self) -> DisplayControls:
@@ -50,13 +50,13 @@ class Panel(Protocol):
         ...
 
     def draw(self, run: Run, diagnosis: Diagnosis | None, hidden: bool) -> None:
-        """Follow the run at hand; ``hidden`` tells nothing of the answers."""
+        """Show the settings of this run; if ``hidden``, show nothing that gives an answer away."""
         ...
 
 
 @dataclass(frozen=True)
 class Places:
-    """Where the face tells what is done on it."""
+    """Functions that ``RunDisplay`` calls when the user does something on it."""
 
     redraw: Callable[[object], None]
     """The page is to be drawn anew."""
@@ -85,7 +85,7 @@ class RunDisplay:
         self.canvas = Canvas(client, self.controls.display, select, moved, sum(widths_px))
         self._shown: tuple[Run, bytes | None, Picture] | None = None
         self._map: tuple[str, MapScene, bytes | None] | None = None
-        """What is opened: label, scene and mesh."""
+        """The scene that is being opened: label, scene and mesh."""
         self._revealed: tuple[Run | None, int, frozenset[str]] = None, 0, frozenset()
         """A run, how often answers had been hidden or shown, and which were then asked for although hidden."""
         self._blind: tuple[Run, frozenset[str], Run, Run] | None = None
@@ -95,16 +95,16 @@ class RunDisplay:
         touches.on("reveal", self._reveal)
 
     def withheld(self, run: Run) -> frozenset[str]:
-        """Which of ``ANSWERS`` this page does not tell of a run."""
+        """Which of ``ANSWERS`` this page hides of a run."""
         return ANSWERS - self._told(run) if self.controls.display.answers_hidden else frozenset()
 
     def _told(self, run: Run) -> frozenset[str]:
-        """Which answers of a run were asked for since answers were hidden."""
+        """Which answers of a run the user asked for since answers were hidden."""
         of, times, told = self._revealed
         return told if of is run and times == self.controls.display.times_hidden else frozenset()
 
     def _reveal(self, touch: Touch) -> None:
-        """Tell one of the answers of the run that is shown, until answers are hidden anew or another run comes."""
+        """Show one answer of the shown run, until answers are hidden again or another run is shown."""
         if self._shown is not None:
             run = self._shown[0]
             told = self._told(run) | ANSWERS & {touch.argument}
@@ -123,7 +123,7 @@ class RunDisplay:
             self._client.flush()
 
     def end_opening(self) -> None:
-        """The scene before stays."""
+        """The opening has ended without a new run: show the scene before."""
         self._map = None
         self.panels.end_opening()
 
@@ -169,7 +169,7 @@ class RunDisplay:
                     self._map = None
                     self.canvas.draw(run, drawn, mesh, controls.camera_movable)
                 controls.draw(known, diagnosis, hidden)
-            # The other views tell inliers by the colours of the picture as it was.
+            # The other views take the inliers from the colours of the picture before anything is hidden.
             told = replace(picture, step=drawn.step)
             outcome = early_table(trace, known_judgement(known.trace))
             offered = hidden_html(withheld, not presenter) if withheld else ""
@@ -217,5 +217,5 @@ class RunDisplay:
 
 
 def without_truth(trace: Trace) -> Trace:
-    """A run as it looks where the true pose is not known."""
+    """The run with its true pose and true labels removed."""
     return replace(trace, problem=replace(trace.problem, truth_cam_from_map=None, truth_inliers=None))

@@ -42,8 +42,8 @@ from spherloc_viz.recording.storage.room import kept_bytes
 
 SWITCH_S = 0.001
 NOT_ENCRYPTED = (
-    "warning: the connection is not encrypted, so whoever can listen on the network can use the links as well; on one "
-    "that you do not trust keep to 127.0.0.1 and an SSH tunnel."
+    "warning: the connection is not encrypted, so others who can read the network traffic can use the "
+    "links too; on a network that you do not trust, use 127.0.0.1 and an SSH tunnel."
 )
 MAX_UNHEARD = 3
 """Notices that are kept for a page that opens later."""
@@ -109,7 +109,7 @@ def serve(
 
 
 def _first_run(catalog: Catalog) -> Known | None:
-    """The run of the recording that the catalog begins with, if it does."""
+    """The run of the recording that the catalog begins with; None if it begins with a scene."""
     label, scene = next(iter(catalog.scenes.items()))
     if not isinstance(scene, RecordedScene):
         return None
@@ -148,8 +148,8 @@ def _open_index(recorder: Recorder | None, folder: Path, stack: contextlib.ExitS
 
 
 def _answer_quickly() -> None:
-    """Set the interpreter up for threads that answer people: none waits for another's 5 ms turn, and the collector
-    does not walk through all that was loaded at the start again and again."""
+    """Set the interpreter up for short answers: threads switch sooner than after 5 ms, and the garbage collector
+    leaves out all objects that exist at the start."""
     sys.setswitchinterval(SWITCH_S)
     gc.collect()
     gc.freeze()
@@ -159,7 +159,7 @@ def allowed_roots(scene: Path | None, allow: Sequence[Path]) -> tuple[Path, ...]
     """Folders from which pages may open scenes; raises ``InputError`` for one that is no folder."""
     for folder in allow:
         if not is_folder(folder):
-            raise InputError(f"{folder}: is no folder; give --allow one that exists.")
+            raise InputError(f"{folder}: is not a folder; give --allow a folder that exists.")
     bundled = {path.parent for path in bundled_scenes().values()}
     own = () if scene is None or is_recording(scene) else (scene.parent,)
     return (*allow, *own, *sorted(bundled))
@@ -181,7 +181,7 @@ class Sessions:
     def attend(self, server: viser.ViserServer) -> None:
         """Open a session for every client that connects and close it when the client leaves."""
         server.scene.world_axes.visible = False
-        # A page that opens with another up would turn over after its first view is set.
+        # With another up direction at first, a page would turn the picture over when its first view is set.
         server.initial_camera.up = tuple(views.UP)
         server.initial_camera.position = views.START
         set_theme(server.gui, "dark")
@@ -205,7 +205,7 @@ class Sessions:
             session.notices.recover(sentence)
 
     def notice(self, sentence: str) -> None:
-        """Tell every presenter's page what became of recordings."""
+        """Show every presenter's page a sentence about recordings, such as what was recovered or deleted."""
         sessions = self._presenters()
         if not sessions:
             with self._lock:
@@ -286,7 +286,7 @@ def _address(listener: socket.socket) -> str:
 
 
 def _outward_address(family: int) -> str | None:
-    """This machine's address on the way to others, if there is one; nothing is sent to find out."""
+    """The address by which other machines reach this one; None without a network. Sends nothing."""
     elsewhere = "2001:db8::1" if family == socket.AF_INET6 else "192.0.2.1"  # addresses for documentation
     with socket.socket(family, socket.SOCK_DGRAM) as probe, contextlib.suppress(OSError):
         probe.connect((elsewhere, 9))

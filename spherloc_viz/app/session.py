@@ -47,11 +47,11 @@ from spherloc_viz.lessons.numbers import number_text, numbers_of
 QUIET_S = 0.7
 """Runs count as settled, and are recorded, when nothing has changed for this long."""
 VIEWER_STILL_S = 0.3
-"""The address follows the page when nothing was drawn and the viewer has not moved for this long."""
+"""The address is updated when nothing was drawn and the viewer has not moved for this long."""
 DIAGNOSE_AFTER_S = 0.2
-"""A diagnosis costs more than many a run, so it waits until the picture has stood still for this long."""
+"""A diagnosis often takes longer than a run, so it starts only when the picture has not changed for this long."""
 MIN_PIXEL_RATIO, MAX_PIXEL_RATIO = 0.25, 8.0
-"""What a browser may say of a screen."""
+"""Numbers that a browser may give for the pixel density of its screen."""
 
 T = TypeVar("T")
 
@@ -78,17 +78,17 @@ class Session:
         self._pictures = MapPictures(number, self._catalog, self._status.say, self._page.ask, self._guarded)
         self._edits, self._history = Edits(), History()
         self._asked: deque[tuple[int, RunRequest | int]] = deque()
-        """What is to be opened, and steps through the history that are to be made, each after the number of the change
-        that asked for it."""
+        """Requests to open, and steps through the history (-1 undo, 1 redo), that are still to be done, in their order.
+        Before each of them stands the number of the change that asked for it."""
         self._roots = Roots(services.roots)
         self._follower = Follower(self._catalog, self._roots, self._problem, self._open_linked)
         self._links: deque[tuple[int, str]] = deque()
-        """Links that are to be followed, each after the number of the change before it."""
+        """Links that are still to be followed; before each stands the number of the change that came before it."""
         self._followed = 0
         """How many links were followed."""
         self._in_lesson = False
         self._numbers: tuple[Trace, dict[str, str]] | None = None
-        """Those of a run, for the lesson around the page."""
+        """The numbers of a run as text, for the lesson that shows this page in a frame."""
         self._run: Run | None = None
         self._answers = 0
         """The number of the newest change that the run knows, or an earlier one."""
@@ -104,7 +104,7 @@ class Session:
         self._listen()
         self._name, self._address = secrets.token_hex(8), client.gui.add_html("")
         self._built = True
-        # Only now may the page tell what is pressed: everything that listens is there.
+        # Only now may the page report presses: all handlers are registered.
         client.gui.add_html(READY)
         self._display.panels.ready()
 
@@ -125,10 +125,10 @@ class Session:
             worker.close()
 
     def complain(self, sentence: str) -> None:
-        """Say in one sentence what went wrong; the page keeps its last run and stays usable."""
+        """Show one sentence about what went wrong; the page keeps its last run and stays usable."""
         self._status.complain(sentence)
 
-    # What a person does. All of this comes on threads of viser's or of the front door's, and only notes requests.
+    # What the user does. viser and the front door call these methods on threads of their own; they only note requests.
 
     def changed(self, event: object = None) -> None:
         """A widget that a run depends on was changed on the page by its user."""
@@ -141,12 +141,12 @@ class Session:
         self._page.ask()
 
     def open(self, request: RunRequest) -> None:
-        """Have the page ask for this."""
+        """Set the page to this request, such as a scene that a panel opens."""
         self._asked.append((self._changes.moment(), request))
         self.changed()
 
     def open_recorded(self, request: RunRequest, path: Path, cam_from_map: FloatArray | None) -> None:
-        """Have the page ask for a run that is recorded as ``path``, with this pose (3, 4)."""
+        """Set the page to the request of a run that is recorded as ``path``, with this pose (3, 4)."""
         self._runs.expect(Known(request, path, cam_from_map))
         self.open(request)
 
@@ -176,23 +176,23 @@ class Session:
         on("cancel", lambda touch: self._controls.slow.cancel())
 
     def _note_link(self, touch: Touch) -> None:
-        """The page's address is that of a link."""
+        """The browser went to an address that is a link: it is to be followed."""
         self._links.append((self._changes.moment(), touch.argument))
         self.changed()
 
     def _tell_numbers(self, touch: Touch) -> None:
-        """A lesson around the page asks for the numbers of the runs, and says how many pixels of the screen one is."""
+        """A lesson that shows this page in a frame asks for the numbers of its runs, and gives the pixel density."""
         self._in_lesson = True
         ratio = float(touch.argument) if re.fullmatch(r"\d{1,2}(\.\d{1,9})?", touch.argument) else 1.0
         self._display.canvas.fill_page(min(max(ratio, MIN_PIXEL_RATIO), MAX_PIXEL_RATIO))
         self._page.ask()
 
     def _reset(self, event: object) -> None:
-        """All changes to the scene, at once: it is one step of the history."""
+        """Take back all changes to the scene, as one step of the history."""
         self.open(RunRequest(self._controls.scene.read_unchanged(), *self._controls.estimator.read()))
 
     def _take_back(self, event: object) -> None:
-        """All changes to single matches."""
+        """Take back all changes to single matches."""
         self._edits.clear()
         self.changed()
 
@@ -202,7 +202,7 @@ class Session:
             self._page.ask()
 
     def use_estimator(self, name: str) -> None:
-        """Go on with another estimator and its default options."""
+        """Change to another estimator with its default options."""
         run = self._run
         if run is not None:
             self.open(RunRequest(run.request.scene, name, None))
@@ -224,7 +224,7 @@ class Session:
     # What the threads do.
 
     def _request(self, opened: tuple[int, RunRequest] | None) -> RunRequest:
-        """What the page asks for now, after it has shown what is to be opened, with the number of that change."""
+        """The request of the page after all noted openings and links, with the number of the newest change in it."""
         controls = self._controls
         if opened is not None:
             number, asked = opened
@@ -280,11 +280,11 @@ class Session:
             if arrived:
                 self._followed += len(links)
                 self._page.ask()
-            else:  # its run gave way to a change that came meanwhile, and begins anew with it
+            else:  # the run was ended for a newer change, and is made again with it
                 self._links.extendleft(reversed(links))
 
     def _arrive(self, followed: Followed, number: int) -> None:
-        """A link was followed: look at its run as it says. ``number`` is that of the change before it."""
+        """A link was followed: set step, selection and viewer. ``number`` is that of the change before it."""
         with self._changes.as_of(number):
             self._controls.display.theme = followed.view.theme
             self._controls.display.answers_hidden = followed.view.answers_hidden
@@ -298,13 +298,13 @@ class Session:
             self.complain(" ".join(remark[:1].upper() + remark[1:] for remark in followed.remarks))
 
     def _view(self) -> PageView:
-        """How the page looks at its run."""
+        """Step, selection, viewer and hidden answers of the page, for its link."""
         display = self._controls.display
         viewpoint = self._display.canvas.viewpoint()
         return PageView(self._display.step_key, self._edits.selected, display.theme, display.answers_hidden, viewpoint)
 
     def _open_linked(self, file: str) -> Opened:
-        """Open a recording to which a link leads."""
+        """Open the recording that a link names."""
         opened = self._controls.open_linked(file)
         self._runs.expect(Known(opened.request, opened.path, opened.recorded.cam_from_map))
         return opened
@@ -334,8 +334,8 @@ class Session:
         return QUIET_S
 
     def _newest_opened(self, gesture: int) -> tuple[int, RunRequest] | None:
-        """What is to be opened, with the number of the change that asked for it, after all that was asked for in its
-        order. Before a step through the history, what was changed until then is noted: it is what Undo takes back."""
+        """The request to be shown after all noted openings and steps of the history, with the number of the change that
+        asked for it. What was changed before a step of the history is noted first: that is what Undo takes back."""
         opened: tuple[int, RunRequest] | None = None
         for number, asked in sorted(_taken(self._asked), key=itemgetter(0)):
             if isinstance(asked, RunRequest):
@@ -345,14 +345,14 @@ class Session:
             try:
                 self._history.note(self._request(opened), time.monotonic(), gesture)
             except InputError:
-                # A change that cannot be is in no history: Undo takes it back, and nothing before it.
+                # An invalid change is not in the history: Undo takes back this change and nothing before it.
                 by = max(by, 0)
             request = self._history.step(by)
             opened = None if request is None else (number, request)
         return opened
 
     def _problem(self, request: SceneRequest) -> Problem:
-        """The problem that the page asks for; of images, with word of how far they are.
+        """The problem that the page asks for; while images are matched, the page shows the progress.
 
         Raises ``Cancelled`` if a person ends it while the map is described.
         """
@@ -389,7 +389,7 @@ class Session:
             self._controls.slow.end()
 
     def _settle(self) -> float | None:
-        """Record the page's run; returns seconds to the next attempt if that must wait."""
+        """Record the page's run; returns the seconds to the next attempt, None if there is nothing more to do."""
         run = self._run
         if run is None:
             return None
@@ -410,12 +410,12 @@ class Session:
             self.complain(str(error))
 
     def _diagnosis(self, run: Run) -> Diagnosis | None:
-        """The run's diagnosis, if it is known by now."""
+        """The run's diagnosis; None if it is not ready."""
         known = self._diagnosed
         return known[1] if known is not None and known[0] is run.trace else None
 
     def _mesh(self, run: Run) -> bytes | None:
-        """Of the run's map, if it has one and it is there by now."""
+        """The mesh of the run's map; None if the map has none or it is not ready."""
         return self._catalog.known_mesh(run.request.scene.scene)
 
     def _show(self, asked: bool) -> float | None:
@@ -435,7 +435,7 @@ class Session:
         return pause
 
     def _write_address(self, run: Run) -> None:
-        """Have the page keep what it shows as its address."""
+        """Write what the page shows into the address of the browser."""
         opened = self._controls.review.opened
         recording = opened.recorded.row.file if opened is not None and opened.request == run.request else None
         link = link_of(run, self._view(), self._catalog, self._services.catalog.scenes, self._roots, recording)
@@ -443,7 +443,7 @@ class Session:
         update_widget(self._address, content=html)
 
     def _told_numbers(self, trace: Trace) -> dict[str, str] | None:
-        """The run's numbers for a lesson, if there is one around the page."""
+        """The run's numbers for the lesson that shows this page in a frame; empty without a lesson."""
         if not self._in_lesson:
             return None
         if self._numbers is None or self._numbers[0] is not trace:
@@ -451,7 +451,7 @@ class Session:
         return self._numbers[1]
 
     def _follow_viewer(self, asked: bool) -> float | None:
-        """The viewer thread's job: once the viewer stands still, have the address say where."""
+        """The viewer thread's job: once the viewer stands still, write its place into the address."""
         run = self._run
         if asked:
             return VIEWER_STILL_S
@@ -473,7 +473,7 @@ class Session:
         return None
 
     def _guarded(self, job: Job) -> Job:
-        """The job with its errors turned into sentences on the page; it knows what was changed when it begins."""
+        """The job, with its errors shown as sentences; it knows the changes that were made before it begins."""
 
         def run(asked: bool) -> float | None:
             try:
@@ -487,12 +487,12 @@ class Session:
 
 
 def _taken(queue: deque[T]) -> list[T]:
-    """All that waits in a queue, which is empty then but for what comes meanwhile."""
+    """Take all items that wait in a queue, without waiting for more."""
     return [queue.popleft() for _ in range(len(queue))]
 
 
 def _step_key(trace: Trace, followed: Followed) -> str:
-    """The key of the step that a link leads to; of a recording, the one that decided it, unless the link says."""
+    """The key of the step that a link names; for a recording without one, that of the key step."""
     timeline, opened = steps(trace), followed.opened
     if opened is not None and not followed.view.step:
         return timeline[min(opened.recorded.row.key_step, len(timeline) - 1)].key

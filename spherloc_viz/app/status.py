@@ -28,7 +28,7 @@ class Status:
         update_widget(self._line, content=html)
 
     def complain(self, sentence: str) -> None:
-        """Say in one sentence what went wrong; the page keeps its last run and stays usable."""
+        """Show one sentence about what went wrong; the page keeps its last run and stays usable."""
         sentence = sentence[:1].upper() + sentence[1:]
         with self._lock:
             self._line.content = _line_html(sentence, wrong=True)

@@ -16,7 +16,7 @@ from spherloc_viz.layers.outcome import UNKNOWABLE, verdict
 from spherloc_viz.layers.primitives import Step, Table
 
 DIM = "opacity:.65"
-WITHHELD = "Answers are hidden. What stands here would tell them: switch Hide answers off to see it."
+WITHHELD = "Answers are hidden. This part would show them: switch Hide answers off to see it."
 WORDS = {"success": style.INLIER, "failure": style.OUTLIER, "no pose": style.OUTLIER, UNKNOWABLE: style.OUTLIER}
 """Values of a table that are shown in colour."""
 
@@ -82,7 +82,7 @@ OFFERS = {"outcome": "Show the outcome", "truth": "Show the truth"}
 
 
 def hidden_html(withheld: frozenset[str], buttons: bool) -> str:
-    """Which answers are hidden, each with a button that tells it."""
+    """Which answers are hidden, each with a button that shows it."""
     line = HIDDEN if "outcome" in withheld else "The truth is hidden"
     offers = "".join(
         f'<button class="reveal" data-touch="reveal:{answer}">{words}</button>'
@@ -94,7 +94,7 @@ def hidden_html(withheld: frozenset[str], buttons: bool) -> str:
 
 def opening_html(label: str) -> str:
     """In place of a run's summary, while another scene is opened."""
-    words = f"<b>Opening {escape(label)} …</b> What stands below is still of the scene before."
+    words = f"<b>Opening {escape(label)} …</b> What is below still belongs to the scene before."
     return box(words, "font-size:12.5px;padding-top:.2em")
 
 
@@ -150,6 +150,6 @@ def ramp_html(best: str, worst: str) -> str:
 
 
 def status_html(sentence: str, wrong: bool = False) -> str:
-    """A line about what is going on; red if something went wrong."""
+    """A line about what the page is doing; red if something went wrong."""
     color = f"color:{style.css_text(style.OUTLIER)}" if wrong else DIM
     return box(f'<div style="{color};overflow-wrap:anywhere">{escape(sentence)}</div>', "font-size:12px")

@@ -57,7 +57,7 @@ def _guess(view: RunView, stage: ConsensusStage) -> Frame:
         f"max over R, t of Σ 1(‖π(R p + t) − u‖ ≤ ε) ≥ {seed}",
         view.standing(np.eye(3)),
         view.colors(style.UNDECIDED),
-        view.nobody(),
+        view.no_matches(),
     )
 
 
@@ -80,7 +80,7 @@ def _bound(view: RunView, stage: ConsensusStage) -> Frame:
         formula,
         start,
         view.colors(style.UNDECIDED),
-        view.nobody(),
+        view.no_matches(),
         note=_effort(stage),
         items=(
             *_ring(view, stage),
@@ -117,7 +117,7 @@ def _peak(view: RunView, stage: ConsensusStage, rank: int, place: int, peaks: in
         f"ω(G(θ)) ≤ {here} {'>' if here > best else '≤'} {best}",
         turned,
         view.colors(style.UNDECIDED),
-        view.nobody(),
+        view.no_matches(),
         note=f"Yaws are searched by falling bound until none could hide a better pose.{rest}",
         items=(
             *_ring(view, stage, place),
@@ -203,7 +203,7 @@ def _clique(view: RunView, stage: ConsensusStage) -> Frame:
         f"{size} ≤ max over θ of ω(G(θ)) ≤ {most}",
         view.standing(yaw_rotation(stage.yaw_rad)),
         view.colors(style.UNDECIDED, (stage.clique, style.CLIQUE)),
-        view.nobody(),
+        view.no_matches(),
         note=note,
         items=(_edges(view, pairs),),
         focus=_focus(view, stage.clique),
@@ -246,7 +246,7 @@ def _members(view: RunView, stage: ConsensusStage, size: int) -> Frame:
         f"{size} ≤ max over θ of ω(G(θ))",
         view.standing(yaw_rotation(stage.yaw_rad)),
         view.colors(style.UNDECIDED, (chosen, style.CLIQUE)),
-        view.nobody(),
+        view.no_matches(),
         note=note,
         items=(_edges(view, pairs),),
         focus=_focus(view, chosen),
@@ -387,7 +387,7 @@ def _level(view: RunView, stage: PositionStage, level: int) -> Frame:
         f"max over C ∈ box, θ of Σ 1(|el(p − C) − el(v)| ≤ β + ε) · 1(θ ∈ interval) = {most} > {stage.support}",
         view.standing(np.eye(3)) if pose is None else pose,
         view.colors(style.UNDECIDED),
-        view.nobody(),
+        view.no_matches(),
         note=f"Colour: from grey, one match more than the best pose, to gold, {most}.{inside}{drawn}",
         located=pose is not None,
         items=(_box_edges(boxes, _shades(bound, stage.support)),),

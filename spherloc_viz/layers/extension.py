@@ -148,7 +148,7 @@ def _said(view: RunView, sentence: str) -> Frame:
         "",
         view.standing(np.eye(3)),
         view.colors(style.UNDECIDED),
-        view.nobody(),
+        view.no_matches(),
     )
 
 

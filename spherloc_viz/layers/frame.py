@@ -155,13 +155,13 @@ class RunView:
             out[where] = mark
         return out
 
-    def nobody(self) -> BoolArray:
-        """An empty mask (N,)."""
+    def no_matches(self) -> BoolArray:
+        """A mask (N,) that is false everywhere."""
         return np.zeros(len(self.points), dtype=bool)
 
     def mask(self, indices: np.ndarray) -> BoolArray:
         """A mask (N,) of the correspondences of these indices, of any shape."""
-        out = self.nobody()
+        out = self.no_matches()
         out[indices.ravel()] = True
         return out
 

@@ -60,7 +60,7 @@ def _no_pose(view: RunView) -> Frame:
         "",
         view.standing(np.eye(3)),
         view.colors(style.OUTLIER),
-        view.nobody(),
+        view.no_matches(),
         note=remark,
         focus=map_focus(view, view.standing(np.eye(3))),
     )

@@ -56,7 +56,7 @@ def _needed(view: RunView, stage: RansacStage) -> Frame:
         f"k = log(1 − P) / log(1 − wⁿ),  n = {size},  P = 0.99   (Eq. 28)",
         view.standing(np.eye(3)),
         view.colors(style.UNDECIDED),
-        view.nobody(),
+        view.no_matches(),
         tables=(Table("samples needed for 99 %", ("right matches", "samples"), rows),),
     )
 
@@ -202,7 +202,7 @@ def _decision(view: RunView, stage: DecisionStage) -> Frame:
         f"P = 1 − (1 − wⁿ)ᵏ,  n = 2,  w = {rate:.3g},  k = {stage.samples:,}   (Eq. 28)",
         view.standing(np.eye(3)),
         view.colors(style.UNDECIDED),
-        view.nobody(),
+        view.no_matches(),
         tables=(_decision_table(stage, count),),
     )
 

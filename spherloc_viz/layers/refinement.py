@@ -155,7 +155,7 @@ def _error(view: RunView, stage: RefinementStage) -> Frame:
         "Σ = σ² (JᵀWJ)⁻¹",
         state,
         view.colors(style.UNDECIDED, (mask, style.INLIER)),
-        view.nobody(),
+        view.no_matches(),
         note=uncertainty.tilt(stage),
         located=True,
         tables=(uncertainty.table(stage, view.metric),),
@@ -165,7 +165,7 @@ def _error(view: RunView, stage: RefinementStage) -> Frame:
 
 def _error_focus(view: RunView, state: FloatArray) -> Focus:
     """What is drawn of the error of the refined pose (3, 4), and the sphere."""
-    frame = Frame("", "", state, view.colors(style.UNDECIDED), view.nobody(), located=True)
+    frame = Frame("", "", state, view.colors(style.UNDECIDED), view.no_matches(), located=True)
     lines = [item.points for item in uncertainty.error_items(view, frame) if isinstance(item, Segments)]
     sphere = sphere_box(camera_centre(state), 1.1 * view.sphere_m)
     return Focus("Sphere", np.vstack([sphere, *(line.reshape(-1, 3) for line in lines)]))

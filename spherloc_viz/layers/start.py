@@ -40,7 +40,7 @@ def _problem(view: RunView) -> Frame:
         "s v = R p + t   (Eq. 18)",
         view.standing(np.eye(3)),
         view.colors(style.UNDECIDED),
-        ~view.nobody(),
+        ~view.no_matches(),
         note=_problem_note(problem, count, lost),
     )
 
@@ -63,7 +63,7 @@ def _bearings(view: RunView) -> Frame:
         _lens_equation(problem.camera.model),
         view.standing(np.eye(3)),
         view.colors(style.UNDECIDED),
-        view.nobody(),
+        view.no_matches(),
         items=(_name("sphere", view, "unit sphere: a dot is the direction of a pixel"),),
     )
 
@@ -116,7 +116,7 @@ def _gravity(view: RunView) -> Frame:
         "R = A_camᵀ R_y(θ) A_map,  A g = e_y   (Eq. 1)",
         view.standing(np.eye(3)),
         view.colors(style.UNDECIDED),
-        view.nobody(),
+        view.no_matches(),
         items=_upright(view),
     )
 
@@ -141,7 +141,7 @@ def _unknowns(view: RunView) -> Frame:
         "θ, C:  1 + 3 = 2 · 2   (Eq. 18-22)",
         view.standing(np.eye(3)),
         view.colors(style.UNDECIDED),
-        view.nobody(),
+        view.no_matches(),
         items=(
             *_upright(view),
             *_compass(view),

@@ -267,7 +267,7 @@ NAME_ROOM = 2.5
 
 def plans(view: RunView, stage: TranslationStage) -> list[Plan]:
     """One ball, more and more of them, two greedy cliques, and the maximum one."""
-    balls, nobody = BallSet(stage), np.zeros(0, dtype=np.int64)
+    balls, no_balls = BallSet(stage), np.zeros(0, dtype=np.int64)
     nodes = cache(partial(ball_nodes, stage))
 
     def graph(shown: IntArray | None, marked: IntArray, words: str, color: style.RGB = style.CLIQUE) -> Graph:
@@ -284,10 +284,12 @@ def plans(view: RunView, stage: TranslationStage) -> list[Plan]:
     ]
     for size in growing(len(balls), *SIZES):
         title, draw, words = f"{size} balls and their graph", partial(_some, view, balls, size), f"{size} nodes."
-        out.append(Plan(f"balls-{size}", title, draw, graph=partial(graph, balls.order[:size], nobody, words)))
+        out.append(Plan(f"balls-{size}", title, draw, graph=partial(graph, balls.order[:size], no_balls, words)))
     words = f"All {len(balls):,} nodes."
     out.append(
-        Plan("balls", "Balls of camera positions", lambda: _all(view, balls), graph=partial(graph, None, nobody, words))
+        Plan(
+            "balls", "Balls of camera positions", lambda: _all(view, balls), graph=partial(graph, None, no_balls, words)
+        )
     )
     for key, title, draw, order in (
         ("clique-greedy-smallest", "A clique from the smallest ball", _from_smallest, lambda: balls.by_radius),
@@ -387,7 +389,7 @@ def _some(view: RunView, balls: BallSet, size: int) -> Frame:
         "‖t_k1 − t_k2‖ ≤ r_k1 + r_k2   (Eq. 38)",
         _turned(view, balls),
         view.colors(style.UNDECIDED, (view.mask(stage.pairs[shown]), style.CLIQUE)),
-        view.nobody(),
+        view.no_matches(),
         note=f"Smaller balls come first, spread evenly over them. {_note(balls, shown, inside)}",
         items=items,
         focus=balls.focus(shown),
@@ -402,7 +404,7 @@ def _all(view: RunView, balls: BallSet) -> Frame:
         "H t = b,  |t_k − t| ≤ r_k   (Eq. 24-27)",
         _turned(view, balls),
         view.colors(style.UNDECIDED, (view.mask(stage.pairs), style.CLIQUE)),
-        view.nobody(),
+        view.no_matches(),
         note=_note(balls, balls.by_radius, inside),
         items=balls.items(view, balls.by_radius, inside),
         focus=balls.focus(balls.by_radius),
@@ -431,7 +433,7 @@ def _greedy(view: RunView, balls: BallSet, found: IntArray, first: str, then: st
         f"{len(found):,} ≤ ω(G) = {len(balls.stage.clique):,}" if balls.stage.proven else f"{len(found):,} ≤ ω(G)",
         _turned(view, balls),
         view.colors(style.UNDECIDED, (view.mask(balls.stage.pairs[found]), style.SAMPLE)),
-        view.nobody(),
+        view.no_matches(),
         note=_note(balls, balls.by_radius, inside),
         items=balls.items(view, balls.by_radius, inside, style.SAMPLE),
         focus=balls.focus(balls.by_radius[inside[balls.by_radius]]),
@@ -451,7 +453,7 @@ def _members(view: RunView, balls: BallSet, size: int) -> Frame:
         "C ≈ Σ r_k⁻² C_k / Σ r_k⁻²",
         _turned(view, balls),
         view.colors(style.UNDECIDED, (matches, style.CLIQUE)),
-        view.nobody(),
+        view.no_matches(),
         note=_note(balls, balls.by_radius, inside),
         items=balls.items(view, balls.by_radius, inside),
         focus=balls.focus(chosen),
@@ -468,7 +470,7 @@ def _clique(view: RunView, balls: BallSet) -> Frame:
         "‖t_k1 − t_k2‖ ≤ r_k1 + r_k2   (Eq. 38)",
         start,
         view.colors(style.UNDECIDED, (members, style.CLIQUE)),
-        view.nobody(),
+        view.no_matches(),
         note=_note(balls, balls.by_radius, balls.in_clique),
         located=True,
         sphere_aside=True,

@@ -324,7 +324,7 @@ def _some(view: RunView, arcs: Arcs, size: int) -> Frame:
         f"max over θ of Σ 1(|f(θ)| ≤ τ) = {most:,}   (Eq. 34)",
         start,
         view.colors(style.UNDECIDED),
-        view.nobody(),
+        view.no_matches(),
         note=note,
         items=_ring(view, arcs, drawn, found.overlap),
     )
@@ -343,7 +343,7 @@ def _all(view: RunView, arcs: Arcs) -> Frame:
         "|d1 cos θ + d2 sin θ + d3| ≤ τ   (Eq. 22, 33)",
         start,
         view.colors(style.UNDECIDED),
-        view.nobody(),
+        view.no_matches(),
         note=note,
         items=_ring(view, arcs, drawn, stage.overlap),
     )
@@ -364,7 +364,7 @@ def _candidate(view: RunView, arcs: Arcs, places: IntArray) -> Frame:
         f"Σ 1(|f(θ)| ≤ τ) = {here:,}   (Eq. 34)",
         turned,
         view.colors(style.UNDECIDED),
-        view.nobody(),
+        view.no_matches(),
         note=f"A yaw at random lies in {mean:,.0f} arcs on average. {len(drawn)} arcs are drawn; pink ones hold it.",
         items=(*items, ring.spoke("ring/candidate", view, view.middle, yaw, style.SAMPLE)),
     )
@@ -398,7 +398,7 @@ def _clique(view: RunView, arcs: Arcs) -> Frame:
         "max over θ of Σ 1(|f(θ)| ≤ τ)   (Eq. 34, 37)",
         turned,
         view.colors(style.UNDECIDED, (view.mask(stage.pairs[stage.clique]), style.CLIQUE)),
-        view.nobody(),
+        view.no_matches(),
         note=note,
         items=(
             *items,

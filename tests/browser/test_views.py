@@ -321,7 +321,7 @@ def test_mistakes_are_sentences_and_the_page_stays_usable(tab: Playground, addre
 
     error = tab.value("rotation error").inner_text()
     changed = lambda: expect(tab.value("rotation error")).not_to_have_text(error)  # noqa: E731
-    mistake("Seed", "soon", "The seed 'soon' is no whole number", "8", changed)
+    mistake("Seed", "soon", "The seed 'soon' is not a whole number", "8", changed)
     tab.choose("Estimator", EXACT)
     expect(tab.value("estimator")).to_have_text("mc-exact")
     mistake("Effort", "0", "Option effort is 0", "2", lambda: None)

@@ -151,4 +151,4 @@ class SceneControls:
             return int(text)
         if otherwise is not None:
             return otherwise
-        raise InputError(f"the seed '{text[:30]}' is no whole number from 0 to 2^63 - 1; type one.")
+        raise InputError(f"the seed '{text[:30]}' is not a whole number from 0 to 2^63 - 1; type one.")
