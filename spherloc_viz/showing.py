@@ -28,7 +28,7 @@ HEIGHT_PX = 720
 PATIENCE_S = 5.0
 """How long a server may take to end before it is killed."""
 _open: "set[Playground]" = set()
-"""Nobody may keep what ``show`` returned: the page stays all the same."""
+"""Keeps playgrounds alive whose caller does not keep what ``show`` returned."""
 
 
 class Playground:

@@ -286,7 +286,7 @@ def test_a_press_is_heard_by_all_who_listen() -> None:
     touches.on("views", lambda touch: heard.append(touch.argument))
     touches.deliver(Touch("views", "Yaw", 0.0, 0.0, 0.0, 0.0, False))
     assert heard == ["ZeroDivisionError", "Yaw"]
-    touches.hear(report("views:Charts"))
+    touches.receive(report("views:Charts"))
     assert heard[2:] == ["ZeroDivisionError", "Charts"]
 
 

@@ -57,7 +57,7 @@ class Audience:
         self._status = Status(client)
         guard_callbacks(client, self._status.fail)
         self._touches = Touches(self._status.fail)
-        self._changes = follow_changes(client, self._touches.hear)
+        self._changes = follow_changes(client, self._touches.receive)
         limit_uploads(client, 0, self._status.complain)
         self._edits = Edits()
         self._page = LatestWorker(f"spherloc-page-{client.client_id}", self._draw)

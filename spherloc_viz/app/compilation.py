@@ -10,7 +10,7 @@ from spherloc.watch import Watch
 from spherloc_viz.app.controls.estimator_controls import START
 
 EARLY = ("mc-exact", "ransac-2p", "auto")
-"""Compiled before the others: they are tried first."""
+"""Compiled before the others, since users try them first."""
 PAUSE_S = 0.05
 CLOSING_S = 1.0
 """How long an end waits for a kernel that is being loaded."""
@@ -63,7 +63,7 @@ class Compilation:
 def first_and_later() -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Estimators that must be ready before a page opens, and those that can be compiled later.
 
-    Extensions are among the first: what is wrong with them is said at the start.
+    Extensions are among the first, so that their errors are reported at the start.
     """
     names = registry.names("estimators")
     first = tuple(name for name in names if name == START or registry.extension_of("estimators", name))

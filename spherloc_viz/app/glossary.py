@@ -1,4 +1,4 @@
-"""What the words on the page mean, each in a sentence or two, one press away from where it stands."""
+"""The terms that the page underlines, each explained in a sentence or two when it is pressed."""
 
 import json
 import re

@@ -8,12 +8,12 @@ from typing import Any
 from spherloc_viz.app.catalog import RunRequest
 
 MAX_REQUESTS = 200
-"""Requests that are remembered."""
+"""How many requests are remembered."""
 SAME_MOVE_S = 5.0
 """Changes of the same control count as one while the pointer is held down, and within this time, since a slider is
 often corrected after a look at the picture. Another control, or an undo, in between ends the move at once."""
 NOT_DRAGGED = frozenset({"seed", "estimator"})
-"""What is not dragged: each change counts."""
+"""Parts of a request that no slider changes: each change of them is a step of its own."""
 OPTIONS = "options."
 CAMERA = "true_camera"
 """A place that can be dragged; None for the scene's own."""
@@ -73,7 +73,7 @@ class History:
 
 
 def changed_fields(one: RunRequest, other: RunRequest) -> frozenset[str]:
-    """Names of what differs."""
+    """Names of the values in which two requests differ."""
     return frozenset(name.removeprefix(OPTIONS) for name in _changed(one, other))
 
 
@@ -86,7 +86,7 @@ def _changed(one: RunRequest, other: RunRequest) -> frozenset[str]:
 
 
 def _values(request: RunRequest) -> dict[str, Any]:
-    """All that a request says, by names."""
+    """All values of a request, by name."""
     parts = (("", request.scene), ("", request.scene.variation), (OPTIONS, request.options))
     values = {
         prefix + item.name: getattr(part, item.name) for prefix, part in parts for item in dataclasses.fields(part)

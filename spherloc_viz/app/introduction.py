@@ -1,4 +1,4 @@
-"""Four moments of a run, half a minute, for who sees the page for the first time (``introduction.js`` shows them)."""
+"""The introduction on a first visit: four moments of a run, half a minute (``introduction.js`` shows them)."""
 
 import json
 from collections.abc import Sequence
@@ -57,7 +57,7 @@ BY_SAMPLES = {
         "none.",
     ),
 }
-"""What is said where an estimator goes another way, by the key of its step: title and words."""
+"""Title and words for estimators with other steps, by the key of the step."""
 OPENING = ("yaw-clique", "consensus-bound")
 """Steps of which a page opens at the first that a run has, if it has any."""
 

@@ -1,4 +1,4 @@
-"""Makes what a page shows of a map and takes its time, after the run is on the page: the mesh, and drawn pictures."""
+"""Makes the slow parts of a page after its run is shown: the mesh of the map, and the pictures of a rendered scene."""
 
 from collections.abc import Callable
 

@@ -52,7 +52,7 @@ class Presented:
         self._tell()
 
     def hide(self, run: Run, withheld: frozenset[str]) -> None:
-        """Hide the answers of a run or tell them, if it is the one shown."""
+        """Hide or show the answers of a run, if it is the one shown."""
         with self._lock:
             if self._newest is None or self._newest.run is not run or self._newest.withheld == withheld:
                 return

@@ -69,7 +69,7 @@ class Session:
         self._status = Status(client)
         guard_callbacks(client, self._status.fail)
         self._touches = Touches(self._status.fail)
-        self._changes = follow_changes(client, self._touches.hear)
+        self._changes = follow_changes(client, self._touches.receive)
         number = client.client_id
         self._solver = LatestWorker(f"spherloc-solver-{number}", self._guarded(self._solve))
         self._page = LatestWorker(f"spherloc-page-{number}", self._guarded(self._show))

@@ -1,4 +1,4 @@
-"""What goes on and what went wrong, in one sentence each."""
+"""The status line of a page: what it is doing, or what went wrong, in one sentence."""
 
 import logging
 import threading
@@ -23,7 +23,7 @@ class Status:
         self._lock = threading.Lock()
 
     def say(self, sentence: str, keep: str = "") -> None:
-        """Say what goes on; ``keep`` is the file of a recording that may be kept."""
+        """Show what the page is doing; ``keep`` is the file of a recording that gets a button to keep it."""
         html = _line_html(sentence, keep=keep)
         update_widget(self._line, content=html)
 
@@ -48,7 +48,7 @@ class Status:
         self.complain(f"This is a bug in the playground ({error!r}); change a setting or reload the page.")
 
     def withdraw(self) -> None:
-        """What was wrong is wrong no more."""
+        """The error that is shown is over: take its sentence away."""
         with self._lock:
             if self._complaint is not None:
                 self._complaint[1].remove()

@@ -10,7 +10,7 @@ from functools import partial
 from spherloc.errors import SpherlocError
 
 Job = Callable[[bool], float | None]
-"""Called with whether somebody asked (else its own alarm rang); returns seconds to its next alarm, or None."""
+"""Called with true if it was asked for, false if its own timer ran out; returns seconds for the timer, or None."""
 
 
 class LatestWorker:
@@ -76,7 +76,7 @@ class BackgroundWorker:
     def ask(self, job: Callable[[], None]) -> None:
         """Have a job done as soon as the one at hand is. Never waits.
 
-        The job knows no more of what was changed on the page (``Changes.as_of``) than who asks for it.
+        The job knows the same changes of the page as the caller (``Changes.as_of``).
         """
         with self._lock:
             if self._closed:

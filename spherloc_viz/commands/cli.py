@@ -253,5 +253,5 @@ def _flush() -> None:
 
 
 def _complain(sentence: str) -> None:
-    with contextlib.suppress(OSError):  # there is nobody left to tell
+    with contextlib.suppress(OSError):  # standard error is closed
         print(f"spherloc: {sentence}", file=sys.stderr, flush=True)

@@ -56,9 +56,9 @@ def progress(count: int, plural: str) -> Iterator[Callable[[str], None]]:
 
 
 def solve(problem: Problem, estimator: str, options: Any, seed: int) -> Trace:
-    """``estimate`` for whoever may press Ctrl-C, who is told now and then how far a long run is.
+    """``estimate`` that Ctrl-C can end, and that prints the progress of a long run now and then.
 
-    The main thread could not hear of Ctrl-C while a kernel computes, which can take hours.
+    It runs on another thread: the main thread cannot react to Ctrl-C while a kernel computes, which can take hours.
     """
     watch = Watch()
     with ThreadPoolExecutor(1) as thread:

@@ -130,7 +130,7 @@ def store_of(records: Records | None) -> "Iterator[RecordingStore | None]":
     from spherloc_viz.recording.storage.store import RecordingStore
 
     with RecordingStore(records.folder, say, records.full, keep_bytes) as store:
-        with suppress(OSError):  # whoever cannot read the folder is told when a run cannot be written
+        with suppress(OSError):  # an unreadable folder is reported when a run cannot be written
             try:
                 store.tidy()
             except RecordingError as error:

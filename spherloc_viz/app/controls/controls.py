@@ -1,4 +1,4 @@
-"""The panel right of the canvas: what is solved and how, comparisons, sweeps, other scenes, and what to take away."""
+"""The panel right of the canvas: its tabs Play, Compare, Sweep, Open, Recordings and Share."""
 
 import threading
 from collections.abc import Callable, Sequence
@@ -73,7 +73,7 @@ class DisplayControls:
 
     @property
     def theme(self) -> Literal["dark", "light"]:
-        """How the page shall look."""
+        """Settings of how the page looks."""
         return "dark" if self._dark.value else "light"
 
     @theme.setter
@@ -82,7 +82,7 @@ class DisplayControls:
 
     @property
     def answers_hidden(self) -> bool:
-        """Whether the truth, and before the last step the outcome too, are not to be told."""
+        """Whether the truth and, before the last step, the outcome are hidden."""
         return self._hide.value
 
     @answers_hidden.setter
@@ -127,7 +127,7 @@ UNDO, REDO, NEW_SEED = "Undo", "Redo", "New seed"
 
 
 class Owner(Protocol):
-    """What the controls ask of their session."""
+    """Functions of the session that the controls call."""
 
     def changed(self, event: object = None) -> None:
         """Something that a run depends on was changed."""
@@ -249,7 +249,7 @@ class Controls:
         return () if hidden else self.compare.items(run.trace) + self.review.items(run) + self._trajectory(run)
 
     def draw(self, run: Run, diagnosis: Diagnosis | None, hidden: bool) -> None:
-        """Follow the run at hand; ``diagnosis`` is None for as long as there is none; ``hidden`` tells no answers."""
+        """Show what belongs to the newest run; ``diagnosis`` is None until it is ready; ``hidden`` hides answers."""
         self._follow_preset(run.request, hidden)
         html = _changes_html(run)
         if self._edits.content != html:
@@ -367,8 +367,8 @@ def _changes_html(run: Run) -> str:
 
 
 AFTER_S = 0.4
-"""A run that takes longer shows its progress, and gives way to a newer request. Shorter ones are let finish: else
-dragging a slider would show nothing until it stands still."""
+"""A run that takes longer shows its progress, and is ended by a newer request. Shorter runs are finished: else
+nothing would be shown while a slider is dragged."""
 EVERY_S = 0.1
 
 
@@ -397,11 +397,11 @@ class SlowRun:
                 self._watch.cancel()
 
     def renew(self) -> None:
-        """What is asked for is about to be read: only what is asked for later outdates the run that begins next."""
+        """The page's request is about to be read: only changes after this make the next run outdated."""
         self._outdated = False
 
     def begin(self, lasting: bool = False) -> Watch:
-        """A run begins; what it must look at. One that is ``lasting`` does not give way to what is asked for later."""
+        """A run begins; returns the watch that can end it. A ``lasting`` run is not ended by newer requests."""
         with self._lock:
             self._watch, self._stopped, self._lasting = Watch(), False, lasting
             watch = self._watch
@@ -421,11 +421,11 @@ class SlowRun:
 
     @property
     def stopped(self) -> bool:
-        """Whether a person ended the last run."""
+        """Whether the user ended the last run."""
         return self._stopped
 
     def cancel(self) -> None:
-        """A person wants no more of the run at hand."""
+        """The user cancels the run at hand."""
         with self._lock:
             if self._watch is not None:
                 self._stopped = True

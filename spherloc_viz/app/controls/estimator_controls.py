@@ -74,7 +74,7 @@ class Option:
             self.widget = gui.add_dropdown(label, tuple(self._values), initial_value=start, hint=hint)
 
     def read(self) -> Any:
-        """The option's value; raises ``InputError`` if what is typed is none that solvers can reckon with."""
+        """The option's value; raises ``InputError`` if the typed text is not a number that solvers can use."""
         value = self.widget.value
         if self._values is not None:
             return self._values[value]
@@ -122,7 +122,7 @@ class EstimatorControls:
     def read(self) -> tuple[str, Any]:
         """The chosen estimator and its options; shows the widgets of these options only.
 
-        Raises ``InputError`` for options that cannot be.
+        Raises ``InputError`` for invalid options.
         """
         chosen = self._names[self._estimator.value]
         self._show(chosen)

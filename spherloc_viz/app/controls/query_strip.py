@@ -1,4 +1,4 @@
-"""The queries of a scene as a strip of thumbnails, coloured by what became of them; pressed, a query is shown.
+"""The queries of a scene as a strip of thumbnails, coloured by their outcome; a press on one shows that query.
 
 A page of the strip is shown at a time, so that thousands of queries cost no more than some dozens.
 """

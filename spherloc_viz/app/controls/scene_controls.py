@@ -42,11 +42,11 @@ class SceneControls:
 
     @property
     def reset(self) -> viser.GuiButtonGroupHandle:
-        """The button that sets everything to what the scene says."""
+        """The button that sets everything to the values of the scene file."""
         return self._simulation.reset
 
     def follow_scene(self) -> bool:
-        """If another scene was chosen, set the other widgets to what it says, and tell so."""
+        """If another scene was chosen, set the other widgets to its values; returns whether that was so."""
         label = self._scene.value
         if label == self._followed:
             return False
@@ -61,7 +61,7 @@ class SceneControls:
     def read(self) -> SceneRequest:
         """What the widgets say now, with all matches as they are.
 
-        Raises ``InputError`` if the seed is no seed.
+        Raises ``InputError`` if the seed is not a valid number.
         """
         label, seed = self._scene.value, self._read_seed()
         if self._catalog.map_scene(label) is not None:

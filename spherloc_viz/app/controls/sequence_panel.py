@@ -1,4 +1,4 @@
-"""Localizes all queries of a scene in the background and shows how it goes."""
+"""Localizes all queries of a scene in the background and shows the progress."""
 
 import threading
 from collections.abc import Callable
@@ -57,7 +57,7 @@ class SequencePanel:
         self._follow()
 
     def hide_answers(self, hidden: bool) -> None:
-        """Say nothing of how it went, or say it again."""
+        """Hide the results, or show them again."""
         if self._text.visible == hidden:
             self._text.visible = not hidden
         if self._hidden != hidden:

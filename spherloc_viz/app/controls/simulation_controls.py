@@ -119,7 +119,7 @@ class SimulationControls:
             self._moved.content = box(true_minus(words), "font-size:12px")
 
     def read(self, scene: SyntheticScene) -> Variation:
-        """What is changed about the scene; what is as the scene says is left out."""
+        """What is changed about the scene; values that equal the scene's are left out."""
         shown, rate = self._rate
         percent = float(self._outliers.value)
         values: dict[str, Any] = {

@@ -1,4 +1,4 @@
-"""The timeline of a run: a slider, its stages, a list of the steps, previous, next, play, and what a step says."""
+"""The timeline of a run: a slider, its stages, a list of the steps, previous, next, play, and the step's caption."""
 
 import threading
 from collections.abc import Callable, Sequence
@@ -115,7 +115,7 @@ class StepsPanel:
         self._changed(None)
 
     def move(self, button: str) -> None:
-        """Press "Previous", "Next" or "Play"; anything else is nothing."""
+        """Press "Previous", "Next" or "Play"; other names are ignored."""
         if button in (PREVIOUS, NEXT, PLAY):
             self._press(button)
 
@@ -189,7 +189,7 @@ def find_step(steps: Sequence[StepHeading], key: str) -> int:
 
 
 def _number(parts: str | list[str]) -> float:
-    """The number that a part of a key is; infinite if it is none."""
+    """A part of a key as a number; infinite if it is not a number."""
     text = parts if isinstance(parts, str) else "".join(parts)
     return float(text) if text.isdecimal() else float("inf")
 

@@ -188,14 +188,14 @@ class Condition:
 
 
 def parse_condition(text: str) -> Condition:
-    """A condition from its text; raises ``InputError``, which names what there is, if it cannot be understood."""
+    """A condition from its text; raises ``InputError``, with all quantities, if it cannot be understood."""
     parts = []
     for part in text.casefold().split(" and "):
         found = _CONDITION.fullmatch(part)
         if found is None or found[1] not in QUANTITIES or found[3].count(".") > 1 or found[3] == ".":
             known = ", ".join(QUANTITIES)
             raise InputError(
-                f"{show(text)} is no condition: give a quantity, a sign (<, <=, >, >=, =) and a number, such as "
+                f"{show(text)} is not a condition: give a quantity, a sign (<, <=, >, >=, =) and a number, such as "
                 f"'new failures > 0'; quantities are {known}; several are joined by 'and'."
             )
         parts.append((found[1], found[2], float(found[3]) / (100.0 if found[4] else 1.0)))

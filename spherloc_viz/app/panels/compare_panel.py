@@ -59,7 +59,7 @@ def _chip(action: str, name: str, ticked: bool) -> str:
 
 START, STOP = "Compare", "Cancel"
 VIEW = "Compare"
-"""By this name the page tells whether the panel is seen."""
+"""Name by which the page reports whether the panel can be seen."""
 LIVE_AFTER_S = 0.25
 """A live comparison waits until the problem has stood still for this long."""
 TICKED = ("mc-exact", "mc", "ransac-2p")
@@ -78,7 +78,7 @@ _warm: set[str] = set()
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """What is known by now about one problem."""
+    """The comparison of one problem, as far as it has come."""
 
     problem: Problem
     entries: tuple[Entry, ...] = ()
@@ -145,7 +145,7 @@ class ComparePanel:
         self._halt()
 
     def _see(self, touch: Touch) -> None:
-        """Other tabs are open now."""
+        """The page reports which tabs are open now."""
         seen = VIEW in touch.argument.split(",")
         if seen != self._seen:
             self._seen = seen
@@ -175,7 +175,7 @@ class ComparePanel:
             self._use(touch.argument)
 
     def _start(self, after_s: float = 0.0) -> None:
-        """Compare after a while; what is being compared gives way."""
+        """Compare after a while, and end the comparison at hand."""
         self._halt()
         self._background.ask(partial(self._work, after_s))
 
@@ -259,7 +259,7 @@ class ComparePanel:
 
 
 def _run(trace: Trace, name: str, watch: Watch) -> Trace:
-    """An estimator on the problem of a run; its own first run in this process goes before, unseen.
+    """An estimator on the problem of a run. Before its first run in this process it runs once more, to load its code.
 
     Raises ``Cancelled`` if ``watch`` ends either.
     """

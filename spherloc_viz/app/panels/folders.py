@@ -1,4 +1,7 @@
-"""The folders that a page may look into. What a page sends is (number of a root, relative path), and it is checked."""
+"""The folders in which a page may open files.
+
+A page names a file by the number of an allowed folder and a relative path; both are checked.
+"""
 
 import os
 from collections.abc import Iterator, Sequence
@@ -65,7 +68,7 @@ class Roots:
         """
         number, colon, relative = place.partition(":")
         if not (colon and number.isascii() and number.isdigit() and len(number) < 4):
-            raise InputError("this is no place in an allowed folder; choose one from the list.")
+            raise InputError("this is not a place in an allowed folder; choose one from the list.")
         if int(number) >= len(self.folders):
             raise InputError("this folder is not allowed any more; choose one from the list.")
         try:
@@ -151,7 +154,7 @@ def describe(path: Path, place: str) -> Row:
         if path.is_dir():
             return Row("folder", path.name, place)
         if not path.is_file():  # reading a pipe would wait for ever
-            return Row("other", path.name, place, "is no file")
+            return Row("other", path.name, place, "is not a file")
         if path.stat().st_size > MAX_PEEK_BYTES:
             return Row("scene", path.name, place, "large")
         table = read_table(path)
@@ -159,6 +162,6 @@ def describe(path: Path, place: str) -> Row:
         return Row("other", path.name, place, "cannot be read")
     kind, name = table.get("kind"), table.get("name")
     if not isinstance(kind, str):
-        return Row("other", path.name, place, "is no scene file")
+        return Row("other", path.name, place, "is not a scene file")
     about = " ".join(str(table.get("about", "")).split())
     return Row("scene", path.name, place, ": ".join(filter(None, (f"{name} ({kind})", about))))

@@ -82,7 +82,7 @@ class MapPanel:
 
 
 def _parsed(line: str) -> dict[str, Any] | None:
-    """What a line tells; None for other output."""
+    """The progress in a line of the process's output; None for other output."""
     try:
         said = json.loads(line[:MAX_LETTERS])
     except ValueError:

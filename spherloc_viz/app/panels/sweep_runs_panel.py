@@ -42,7 +42,7 @@ DRAW_SHARE = 0.05
 """Of the time, at most, goes into drawing; the page has more to do."""
 
 _turn = threading.Lock()
-"""Held by the sweep that is running: one at a time on a server, whoever asked for it."""
+"""Held by the sweep that is running: one at a time on a server, for all pages together."""
 _pictures = threading.Lock()
 """Matplotlib is not for several threads at once."""
 

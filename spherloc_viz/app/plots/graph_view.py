@@ -1,4 +1,4 @@
-"""The graph view: the graph that a step speaks of, linked with all that is selected."""
+"""The graph view: the graph of a step, in which selected matches are marked and can be selected."""
 
 import base64
 from collections.abc import Callable, Iterable

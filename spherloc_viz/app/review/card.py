@@ -45,7 +45,7 @@ def bar_html(place: int | None, total: int) -> str:
 
 
 def said_html(sentence: str, wrong: bool) -> str:
-    """A line about what goes on, or went wrong."""
+    """A line about what the page is doing, or what went wrong."""
     look = f"color:{style.css_text(style.OUTLIER)}" if wrong else DIM
     return f'<div style="{look};padding-top:.2em;overflow-wrap:anywhere">{escape(sentence)}</div>' if sentence else ""
 
@@ -64,7 +64,7 @@ def card_html(opened: Opened, run: Run, diagnosis: Diagnosis | None, bar: str) -
 
 
 def untold_html(opened: Opened, run: Run, bar: str) -> str:
-    """The card of a run of which no answers are told."""
+    """The card of a run whose answers are hidden."""
     row = opened.recorded.row
     back = "" if run.request == opened.request else _way("run-return:", "back to the recorded run")
     return _card([bar, _title(words.untold_title_of(row), row), back])

@@ -41,7 +41,7 @@ JUDGED = ("doubtful",)
 """What the diagnosis says of a run, also where the truth is not known."""
 FILTERS = (*EXACT, "judged", "outliers", "when")
 UNTOLD, UNTOLD_SORTS = ("estimator", "scene", "source", "when"), ("created", "name")
-"""Filters and orders that tell nothing of what came out."""
+"""Filters and orders that give no outcome away."""
 UNFOLDED = (*EXACT[2:], "outliers", "when", "sort")
 """What is chosen in a row that is unfolded."""
 
@@ -124,7 +124,7 @@ class Look:
         return Look(sort=self.sort, descending=self.descending)
 
     def untold(self) -> "Look":
-        """The list without filters and an order that tell what came out."""
+        """The list without filters and orders that give the outcome away."""
         kept = {name: getattr(self, name) for name in ("text", "page", "pages", *UNTOLD)}
         told = self.sort not in UNTOLD_SORTS
         order = {} if told else {"sort": self.sort, "descending": self.descending}

@@ -43,7 +43,7 @@ class Opened:
     path: Path
     """Its file."""
     request: RunRequest
-    """Gives the same run again."""
+    """Request that gives the same run again."""
     truth_cam_from_map: FloatArray | None = None
     """The recorded problem's true pose (3, 4), if known."""
     sentence: str = ""

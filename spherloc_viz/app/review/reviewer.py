@@ -62,7 +62,7 @@ class ReviewCard:
             self._redraw()
 
     def became(self, asked: RunRequest, request: RunRequest) -> None:
-        """The page says in its own words what it was asked for."""
+        """The page has brought the request of the open run into its own form."""
         self.amend(lambda opened: replace(opened, request=request) if opened.request is asked else opened)
 
     def place(self, place: int | None, total: int) -> None:
@@ -88,7 +88,7 @@ class ReviewCard:
 
 @dataclass(frozen=True)
 class Reviewing:
-    """What a reviewer needs of the page."""
+    """What ``Reviewer`` needs of the page."""
 
     library: RunLibrary
     roots: tuple[Path, ...]
@@ -107,7 +107,7 @@ class Reviewing:
 
 
 class Reviewer:
-    """One page's. Presses only note what is to be opened; a thread of an background job does it."""
+    """One page's. Presses only note what is to be opened; a background worker opens it."""
 
     def __init__(self, touches: Touches, runs: RunList, reviewing: Reviewing, name: str) -> None:
         self._runs, self._has = runs, reviewing
@@ -190,7 +190,7 @@ class Reviewer:
         self._background.ask(self._walk)
 
     def _walk(self) -> None:
-        """Go on by as many runs as was asked for meanwhile: what is passed quickly is not opened."""
+        """Go on by as many runs as were asked for meanwhile; runs that are passed on the way are not opened."""
         with self._lock:
             by, self._steps = self._steps, 0
         look, opened = self._runs.look, self._has.card.opened

@@ -26,7 +26,7 @@ MAX_LABELS = 12
 
 
 class RunLibrary:
-    """Thread-safe, and slow now and then: asked on the threads of errands only."""
+    """Thread-safe. A call may take seconds, so only background workers call it."""
 
     def __init__(self, index: RunIndex) -> None:
         self._index = index
@@ -64,7 +64,7 @@ class RunLibrary:
         return self._index.find(query, PAGE, PAGE * look.page), look
 
     def counts(self, look: Look, total: int) -> Counts:
-        """What each filter would leave."""
+        """How many runs each filter would leave."""
         outcome, diagnosis = self._groups(look, "outcome"), self._groups(look, "diagnosis")
         unfolded = self._groups(look, look.unfolded) if look.unfolded in EXACT else ()
         doubtful = self._index.find(self._query(replace(look, judged=JUDGED[0])), 0).total

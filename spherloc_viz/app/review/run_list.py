@@ -101,7 +101,7 @@ class RunList:
         self._problem.visible = False
 
     def hide_answers(self, hidden: bool) -> None:
-        """Tell no more of the runs than what they are of, or tell all again."""
+        """Hide the answers of the runs, or show them again."""
         self._untold = hidden
         self.ask()
 
@@ -168,7 +168,7 @@ class RunList:
                 version = newest
                 try:
                     self._draw()
-                except SpherlocError as error:  # what is wrong may pass
+                except SpherlocError as error:  # the error may be temporary
                     self._fail(str(error))
             if due.wait(FOLLOW_S):
                 return

@@ -22,7 +22,7 @@ OTHERS = "trajectory"
 
 @dataclass(frozen=True, eq=False)
 class Viewer:
-    """Where a page looks from, as viser tells it."""
+    """Place and direction from which a page is seen, as viser reports them."""
 
     position: FloatArray
     """(3,)."""

@@ -1,4 +1,4 @@
-"""Who may ask a server of ours, and what every answer forbids the browser.
+"""Which requests a server accepts, and what the headers of its answers forbid the browser.
 
 Where a server listens beyond this machine there are two links, each with a token of its own. A token becomes a cookie,
 and the browser goes on without it in the address, so that a copied address or a picture of the screen gives nothing
@@ -27,7 +27,7 @@ SAFE = {
     "Cross-Origin-Resource-Policy": "same-origin",
     "Cross-Origin-Opener-Policy": "same-origin",
 }
-"""Headers of whatever is served: nothing is taken for what it is not, and no other site can embed or read it."""
+"""Headers of every answer: browsers do not guess its type, and no other site can embed or read it."""
 
 _SORRY = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><title>spherloc</title><link rel="icon" href="data:,">
@@ -56,7 +56,7 @@ def open_socket(host: str, port: int) -> socket.socket:
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         return socket.create_server(address[:2], family=family)
     except socket.gaierror:
-        raise InputError(f"'{host}' is no address of this machine; use --host 127.0.0.1.") from None
+        raise InputError(f"'{host}' is not an address of this machine; use --host 127.0.0.1.") from None
     except OSError as error:
         # Python adds its own words to the system's.
         reason = os.strerror(error.errno) if error.errno else str(error)
@@ -86,7 +86,7 @@ def refusal(headers: CIMultiDictProxy[str], host: str, upgrade: bool) -> str | N
     if len(own) != 1 or not is_own_name(own[0], host):
         return "This address is not the playground's: open the address that the command printed."
     origins = headers.getall("Origin", [])
-    # A browser sends Origin with every websocket; none at all is no browser, and no business of this server.
+    # A browser sends Origin with every websocket; a request without one is no browser's, and is refused.
     if (upgrade and not origins) or any(origin not in _same_origins(own[0]) for origin in origins):
         return "Another site may not use the playground."
     return None
@@ -98,10 +98,10 @@ def _same_origins(netloc: str) -> tuple[str, str]:
 
 TOKEN = "token"
 """What the token is called in a link."""
-NO_TOKEN = "A token is needed here: open the link that spherloc play printed, or ask whoever started it for one."
+NO_TOKEN = "A token is needed here: open the link that spherloc play printed, or ask the person who started it."
 WRONG_TOKEN = (
     "The token in this address is not valid: each start makes new ones, so open the link that spherloc play printed "
-    "last, or ask whoever started it."
+    "last, or ask the person who started it."
 )
 
 _ENTRY = """<!doctype html>
@@ -137,7 +137,7 @@ class Access:
         return f"{address}/?{urlencode({TOKEN: self._tokens[role]})}" if self.demanded else address
 
     def role(self, request: web.Request) -> Role | None:
-        """Who asks, by the cookie; None without a valid one."""
+        """The role that the cookie gives; None without a valid one."""
         return self._role_of(request.cookies.get(self._cookie, "")) if self.demanded else Role.PRESENTER
 
     def enter(self, request: web.Request) -> web.Response | None:
@@ -158,7 +158,7 @@ class Access:
         return answer
 
     def _role_of(self, given: str) -> Role | None:
-        """Whose token it is. Every token is compared, each in a time that does not depend on where they differ."""
+        """The role of a token. Every token is compared, each in a time that does not depend on where they differ."""
         shown = given.encode("utf-8", "surrogatepass")
         found = [role for role, token in self._tokens.items() if hmac.compare_digest(shown, token.encode())]
         return found[0] if found else None

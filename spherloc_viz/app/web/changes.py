@@ -16,7 +16,7 @@ class Changes:
 
     def __init__(self) -> None:
         self._hearing = threading.RLock()
-        """Held while a change is taken over. Whoever asks ``now`` holds no other lock."""
+        """Held while a change is taken over. A thread that calls ``now`` must hold no other lock."""
         self._lock = threading.Lock()
         self._newest = 0
         self._numbers: dict[str, int] = {}

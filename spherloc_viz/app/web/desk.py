@@ -32,7 +32,7 @@ DO = f"{DESK}/do"
 """The only address that takes a POST."""
 NO_RUNS = "There are no recordings to look at: start the playground without --no-record."
 MAX_BYTES = 32 << 20
-"""Of what a page sends: the names of 100,000 runs take 8 MB."""
+"""Largest request, bytes: the names of 100,000 runs take 8 MB."""
 MAX_REVIEWED = 500
 """Runs that are labelled by one request; a page sends several."""
 MAX_REPORTED = 500
@@ -40,7 +40,7 @@ MAX_REPORTED = 500
 MAX_REPORTS = 20
 """Reports that are kept until the server ends; older ones are deleted."""
 COMPRESSION = 1
-"""Of gzip: more takes longer than a local connection saves."""
+"""Level of gzip: a higher one takes more time than it saves on a local connection."""
 
 
 def is_desk(path: str) -> bool:
@@ -49,13 +49,13 @@ def is_desk(path: str) -> bool:
 
 
 class DeskRoom:
-    """Answers requests for ``/desk...``; who asks has been checked at the door."""
+    """Answers requests for ``/desk...``, which the front door has checked."""
 
     def __init__(self, library: RunLibrary, downloads: Downloads, allowed: Sequence[Path] = ()) -> None:
         """``allowed`` are the folders below which recordings may be compared with those of the library."""
         self._library, self._downloads = library, downloads
         self._others = OtherFolders(library.folder, allowed)
-        # Of its own: 100,000 runs take a second to be read, and presses on the playground's pages must not wait.
+        # Threads of its own: reading 100,000 runs takes a second, and the playground's pages must not wait for that.
         self._threads = ThreadPoolExecutor(2, "spherloc-desk")
         self._lock = threading.Lock()
         self._packed: tuple[str, bytes] = ("", b"")
@@ -67,7 +67,7 @@ class DeskRoom:
         self._threads.shutdown(wait=False, cancel_futures=True)
 
     async def answer(self, request: web.Request) -> web.StreamResponse:
-        """The page, something that it shows, or what became of something that it asked for."""
+        """The page itself, data that it shows, or the result of an action that it asks for."""
         given = await request.read() if request.method == "POST" else b""
         try:
             return await asyncio.get_running_loop().run_in_executor(self._threads, self._answer, request, given)
@@ -162,7 +162,7 @@ class DeskRoom:
         return {"evidence": [] if found is None else list(found.evidence), "advice": found.advice if found else ""}
 
     def _do(self, told: Mapping[str, Any]) -> dict[str, Any]:
-        """Do what a page asks for; raises ``InputError`` for what it cannot ask for."""
+        """Do the action that a page asks for; raises ``InputError`` if there is no such action."""
         actions: Mapping[str, Callable[[Mapping[str, Any]], dict[str, Any]]] = {
             "review": self._review,
             "save_view": self._save_view,
@@ -177,17 +177,17 @@ class DeskRoom:
         return action(told)
 
     def _review(self, told: Mapping[str, Any]) -> dict[str, Any]:
-        """Change labels and notes of some runs; tells what each had before and has now, and what could not be done."""
+        """Change labels and notes of some runs; returns those of each before and now, and the errors."""
         changes = told.get("changes")
         if not isinstance(changes, list) or len(changes) > MAX_REVIEWED:
             raise InputError(f"label at most {MAX_REVIEWED} runs with one request.")
         done, failed = [], []
         for change in changes:
             if not isinstance(change, dict):
-                raise InputError(f"{show(change)} is no change of a run's labels.")
+                raise InputError(f"{show(change)} is not a change of a run's labels.")
             file, note = _text(change, "file"), change.get("note")
             if note is not None and not isinstance(note, str):
-                raise InputError(f"{show(note)} is no note.")
+                raise InputError(f"{show(note)} is not a note; a note is text.")
             add, remove = _texts(change, "add"), _texts(change, "remove")
             try:
                 before, now = self._library.relabel(file, add, remove, note)
@@ -297,21 +297,21 @@ def _told(request: web.Request, given: bytes) -> Mapping[str, Any]:
     try:
         told = json.loads(given)
     except (ValueError, RecursionError):
-        raise InputError("what was sent is no JSON.") from None
+        raise InputError("the request is not JSON.") from None
     if not isinstance(told, dict):
-        raise InputError("what was sent is no table.")
+        raise InputError("the request is not a table (JSON object).")
     return told
 
 
 def _text(told: Mapping[str, Any], name: str) -> str:
     value = told.get(name)
     if not isinstance(value, str):
-        raise InputError(f"{name} is missing, or no text.")
+        raise InputError(f"{name} is missing, or is not text.")
     return value
 
 
 def _texts(told: Mapping[str, Any], name: str) -> list[str]:
     values = told.get(name, [])
     if not isinstance(values, list) or not all(isinstance(value, str) for value in values):
-        raise InputError(f"{name} is no list of texts.")
+        raise InputError(f"{name} is not a list of texts.")
     return values

@@ -20,9 +20,9 @@ class Download:
     """A file that is offered."""
 
     path: Path
-    """Where it lies meanwhile."""
+    """Its temporary file."""
     name: str
-    """Under which a browser saves it; letters, digits, ".", "_" and "-" only."""
+    """File name under which a browser saves it; letters, digits, ".", "_" and "-" only."""
     address: str
     """Path of its address, with a token that cannot be guessed."""
 
@@ -50,19 +50,19 @@ class Downloads:
         return Download(folder / token, name, f"{DOWNLOADS}{token}/{name}")
 
     def offer(self, download: Download) -> None:
-        """Serve the file from now on to who knows its address."""
+        """Serve the file from now on to everybody who knows its address."""
         with self._lock:
             self._offered[download.address] = download
 
     def withdraw(self, download: Download) -> None:
-        """Serve it no more, and delete it; who has begun to fetch it gets all of it."""
+        """Serve it no more, and delete it; a download that has begun gets all of it."""
         with self._lock:
             self._offered.pop(download.address, None)
         with contextlib.suppress(OSError):
             download.path.unlink(missing_ok=True)
 
     def answer(self, request: web.Request) -> web.StreamResponse:
-        """The file of a request for ``/download/...``; who asks has been checked at the door."""
+        """The file of a request for ``/download/...``, which the front door has checked."""
         with self._lock:
             found = self._offered.get(request.path)
         if found is None:

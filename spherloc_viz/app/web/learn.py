@@ -26,7 +26,7 @@ def is_learning(path: str) -> bool:
 
 
 async def learn_answer(request: web.Request) -> web.Response:
-    """The list, a lesson, or a picture; who asks has been checked at the door."""
+    """The list, a lesson, or a picture, for a request that the front door has checked."""
     path = request.path
     if path.startswith(PICTURES):
         name = path.removeprefix(PICTURES)

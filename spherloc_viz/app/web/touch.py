@@ -1,4 +1,4 @@
-"""What a person presses in HTML and SVG that Python put on the page; viser's own HTML, plots and images are one-way.
+"""Presses on HTML and SVG that Python put on the page; viser's own HTML, plots and images do not report presses.
 
 The page carries a small script (``touch.js``). Any element with ``data-touch="ACTION:ARGUMENT"`` reports a press of the
 mouse, or Enter where the element has the focus. With ``data-drag`` as well, dragging across it is reported too. Which
@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from typing import Any
 
 MAX_LETTERS = 20_000
-"""A report has some hundred, but for a link."""
+"""Longest report, characters; most have some hundred, links have more."""
 READY = "<div data-ready></div>"
-"""Once this is on the page, it tells what is pressed."""
+"""HTML that makes the page report presses from now on."""
 
 
 @dataclass(frozen=True)
@@ -23,9 +23,9 @@ class Touch:
     """One press. Places are shares of the element's box, from its upper left corner, 0 to 1."""
 
     action: str
-    """What stands before the colon."""
+    """The part of ``data-touch`` before the colon."""
     argument: str
-    """What stands behind it; whatever the page sent, so it must be checked."""
+    """The part behind the colon. Untrusted: it must be checked."""
     x: float
     """Where the press ended."""
     y: float
@@ -51,14 +51,14 @@ class Touches:
         """Call ``handler`` too for every press on an element of that action."""
         self._handlers[action] = (*self._handlers.get(action, ()), handler)
 
-    def hear(self, report: Any) -> None:
-        """Hand on what the page reports, whatever it is; nothing is done about what is no report."""
+    def receive(self, report: Any) -> None:
+        """Pass a report of the page to its handlers; anything that is not a valid report is ignored."""
         touch = parse(report)
         if touch is not None:
             self.deliver(touch)
 
     def deliver(self, touch: Touch) -> None:
-        """Hand a press to its handlers; an unknown action is ignored, since the page may show what is gone by now."""
+        """Pass a press to its handlers; others are ignored: the page may still show removed elements."""
         for handler in self._handlers.get(touch.action, ()):
             try:
                 handler(touch)
@@ -67,13 +67,13 @@ class Touches:
 
 
 def parse(report: Any) -> Touch | None:
-    """The press that a report tells of, or None if it is none."""
+    """The press of a report; None if the report is invalid."""
     try:
         if len(report) > MAX_LETTERS:
             return None
         said: Any = json.loads(report)
         action, _, argument = str(said["action"]).partition(":")
-        argument.encode()  # JSON can say halves of characters, which no file and no database takes
+        argument.encode()  # JSON can hold lone surrogates (halves of characters), which files and databases refuse
         (x, y), (from_x, from_y) = (tuple(map(_share, said[name])) for name in ("at", "from"))
         return Touch(action, argument, x, y, from_x, from_y, said["extend"] is True)
     except (ValueError, TypeError, KeyError, OverflowError, RecursionError):

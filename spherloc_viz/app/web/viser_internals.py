@@ -341,7 +341,7 @@ def _wake_on_loop(server: viser.ViserServer) -> None:
 
     viser sets their event on the thread that queues a message and then, safely, on the loop; the former raises now and
     then, since the loop may change the event's waiters meanwhile. The latter alone suffices: a message is in its buffer
-    before, so whoever waits, or is about to, finds it.
+    before, so a thread that waits, or is about to, finds it.
     """
     sockets: Any = server._websock_server
     loop = sockets._background_event_loop
@@ -358,7 +358,7 @@ def _wake_on_loop(server: viser.ViserServer) -> None:
 
 
 def _check_views(connection: Any) -> None:
-    """Leave out where a page says that its viewer stands if nobody can stand there: viser would keep it, and raise
+    """Ignore a viewer's place that a page reports if its numbers are invalid: viser would keep it, and raise an error
     whenever the viewer is moved."""
     handle_all = connection._handle_incoming_message
 

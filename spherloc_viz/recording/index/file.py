@@ -156,7 +156,7 @@ def set_aside(path: Path, file: tuple[int, int] | None) -> Path | None:
         with _alone(path.parent):
             if file is None or file != identity(path):
                 return None
-            # The file itself last: whoever finds none makes a new one, and must not find the old one's log beside it.
+            # The file itself last: a process that finds none makes a new one, and must not find the old log beside it.
             for end in ("-wal", "-shm", ""):
                 with contextlib.suppress(FileNotFoundError):
                     path.with_name(path.name + end).rename(aside.with_name(aside.name + end))

@@ -74,7 +74,7 @@ def _side_by_side(
     workers = max(1, min(MAX_WORKERS, os.cpu_count() or 1, len(paths) // worth_a_worker))
     answers: deque[Future[Sequence[tuple[Path, T]]]] = deque()
     with ThreadPoolExecutor(workers) as threads, examiners.start(workers) as started:
-        # Whoever leaves early, as by Ctrl-C, ends the processes first and waits for no file.
+        # After an early exit, such as by Ctrl-C, the processes are ended first, without waiting for a file.
         for number, start in enumerate(range(0, len(paths), at_once)):
             answers.append(threads.submit(read, paths[start : start + at_once], started[number % workers]))
             if len(answers) > AHEAD * workers:

@@ -82,7 +82,7 @@ class RunIndex:
         self._opened = 0
         """How often; rises when the database has become another one."""
         self.examiners = Examiners()
-        """Once they are closed, whoever refreshes gets a ``RecordingError``."""
+        """Once they are closed, a refresh raises ``RecordingError``."""
         with contextlib.suppress(OSError):
             self.folder.mkdir(parents=True, exist_ok=True)
         self._read(lambda connection: None)
@@ -208,8 +208,8 @@ class RunIndex:
     def oldest_successes(self, limit: int = 100) -> tuple[RunRow, ...]:
         """Runs that may be deleted to make room, the oldest first.
 
-        Those that nobody will look for: right, or without a truth and with nothing that speaks against them; without
-        labels and note; and none of the gallery.
+        These are runs that are right or, where the truth is unknown, not doubtful; that have no labels and no note; and
+        that are not of the gallery.
         """
         sql = (
             "SELECT id FROM runs JOIN details USING (id) "
@@ -373,7 +373,7 @@ class RunIndex:
         raise self._damaged_again()
 
     def _is_current(self) -> bool:
-        """Whether nobody has replaced the database, or, where it is in memory only, the folder."""
+        """Whether the database, or the folder if the database is in memory only, has not been replaced."""
         place, known = (self.folder, self._place) if self._file is None else (self.path, self._file)
         return known == index_file.identity(place)
 

@@ -85,7 +85,7 @@ class Child:
         return answer if isinstance(answer, dict) else None
 
     def kill(self) -> None:
-        """Kill it, on any thread; whoever waits for an answer gets none."""
+        """Kill the child, on any thread; a thread that waits for its answer gets none."""
         self._process.kill()
 
     def end(self) -> None:
@@ -116,7 +116,7 @@ _NAME_LIMIT = 255
 
 
 def check_name(name: str) -> str:
-    """The name of a recording in its folder, such as a page, an index or an archive tells it, if it is one.
+    """Check and return the name of a recording in its folder, which may come from a page, an index or an archive.
 
     It has letters, digits, ".", "_" and "-", ends with ".rrd" in any case, and may be in the folder "gallery".
     Raises ``RecordingError`` otherwise.
@@ -159,7 +159,7 @@ class Examiner:
         self.close()
 
     def close(self) -> None:
-        """End the child for good, also in the middle of a file: whoever waits for that gets an ``ExaminerError``."""
+        """End the child for good, also in the middle of a file: threads that wait for it get an ``ExaminerError``."""
         self._closed = True  # first, since a child that is just being started is not there yet, but looks at this
         child = self._child
         if child is not None:

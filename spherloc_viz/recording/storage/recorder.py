@@ -216,7 +216,7 @@ class Recorder:
 
 
 def _safe(tell: Callable[[T], None]) -> Callable[[T], None]:
-    """``tell`` for threads that must go on whatever happens to whoever is told."""
+    """``tell`` with its errors caught, for threads that must go on."""
 
     def safe(what: T) -> None:
         try:

@@ -30,8 +30,8 @@ def kept_bytes(gigabytes: float | None, folder: Path) -> int:
 
 
 def _held_bytes(folder: Path) -> int:
-    """Size of the recordings in a folder and in its gallery; what cannot be read counts nothing, of which whoever
-    writes there tells."""
+    """Size of the recordings in a folder and in its gallery. What cannot be read counts as 0: a run that is written
+    there later reports the error."""
     held = 0
     for place in (folder, folder / GALLERY):
         with contextlib.suppress(OSError), os.scandir(place) as entries:
