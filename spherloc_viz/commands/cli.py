@@ -1,4 +1,4 @@
-"""The command line: all commands, and what becomes of errors and of Ctrl-C."""
+"""The command line: all commands, and how errors and Ctrl-C end them."""
 
 import contextlib
 import io

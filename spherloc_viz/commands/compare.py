@@ -37,10 +37,10 @@ from spherloc_viz.recording.storage.store import RecordingStore
 
 @dataclass(frozen=True)
 class Wanted:
-    """What a comparison is to give."""
+    """How a comparison is reported."""
 
     fail_if: tuple[Condition, ...]
-    """It fails if one of them holds."""
+    """Conditions; if one of them holds, the exit code is 1."""
     report: Path | None
     """An HTML file to be written."""
     as_json: bool

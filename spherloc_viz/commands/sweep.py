@@ -120,7 +120,7 @@ class Recorded:
             self.complain(str(error))
 
     def finish(self) -> None:
-        """Make room for the last time, and say how many runs are missing."""
+        """Delete old successes for the last time, and print how many runs could not be recorded."""
         self.prune()
         if self._lost > 1:
             say(f"{self._lost:,} times something could not be recorded or listed, the first of which was said.")

@@ -120,7 +120,7 @@ def session_pictures(results: Path, dataset: str, session: str) -> tuple[dict[st
 
 @dataclass(frozen=True, eq=False)
 class Inliers:
-    """What one method made of the matches of a query."""
+    """Result of one method for the matches of a query."""
 
     label: str
     """The method."""

@@ -33,9 +33,9 @@ POSITION_SLACK_M = 0.5
 def key_step(trace: Trace, diagnosis: Diagnosis) -> int:
     """The index in ``layers.steps(trace)`` of the step at which the run was decided or, if it failed, went wrong.
 
-    A gravity that is off spoils a run before anything is computed. Else, where the truth is known, it is the first
-    stage whose result is wrong; where it is not, the step that shows the cause. A run that looks right was decided
-    where its consensus was found, and one without any such step by its outcome.
+    If the given gravity is wrong, it is the step "gravity", before any computation. Else, where the truth is known,
+    it is the first stage whose result is wrong; where it is not, the step that shows the cause. A run that looks right
+    was decided where its consensus was found, and a run without such a step at its outcome.
     """
     index = {heading.key: number for number, heading in enumerate(steps(trace))}
     wanted = [*_wrong(trace, diagnosis), *_decided(trace, index), "outcome"]

@@ -155,7 +155,7 @@ class Difference:
 
 @dataclass(frozen=True)
 class OtherVersion:
-    """Something that can change a number and is not what it was."""
+    """A version or machine that differs from the recorded one, and can change numbers."""
 
     name: str
     """Package, "python" or "machine"."""
@@ -180,7 +180,7 @@ class Repeated:
     rounding: bool
     """Whether the runs differ, but only in the last digits of numbers."""
     versions: tuple[OtherVersion, ...]
-    """What is not what it was."""
+    """Versions and machine that differ from the recorded ones."""
     assumed: tuple[str, ...]
     """Options that the recording does not know; they have their defaults."""
 
@@ -216,7 +216,7 @@ def repeat(path: Path, solve: Solve | None = None) -> Repeated:
 
 
 def compare(run: RecordedRun, trace: Trace) -> list[Difference]:
-    """In what a run and its repetition differ."""
+    """The results in which a run and its repetition differ."""
     found: list[Difference] = []
     if not same_bits(run.cam_from_map, trace.cam_from_map):
         found.append(_poses(run.cam_from_map, trace.cam_from_map))
@@ -233,7 +233,7 @@ def compare(run: RecordedRun, trace: Trace) -> list[Difference]:
 
 
 def other_versions(recorded: Any, here: Any) -> tuple[OtherVersion, ...]:
-    """What is not what it was, by two tables of versions."""
+    """What differs between two tables of versions."""
     names = dict.fromkeys([*here, *recorded])
     pairs = [OtherVersion(name, recorded.get(name), here.get(name)) for name in names]
     return tuple(pair for pair in pairs if pair.recorded != pair.here)
@@ -338,7 +338,7 @@ def as_record(repeated: Repeated) -> dict[str, Any]:
 
 @dataclass(frozen=True, eq=False)
 class Reopened:
-    """A run as it can be asked for again: these words give the same trace to the last bit."""
+    """All that a recorded run depends on: solving it again gives the same trace to the last bit."""
 
     scene: Scene
     """The live one, or a ``RecordedScene``."""
@@ -357,7 +357,7 @@ class Reopened:
     options: Any
     """An instance of its options."""
     sentence: str = ""
-    """Why it is not the live scene; empty if it is."""
+    """Why the recorded problem is opened instead of the scene; empty if it is the scene."""
 
     @property
     def live(self) -> bool:

@@ -25,7 +25,7 @@ def rerun_command() -> list[str]:
 def rerun_environment() -> dict[str, str]:
     """Our environment for rerun's program, in which it sends no usage data.
 
-    It knows no switch for that but its user's own settings, which are not ours to change, and ``CI``.
+    Its only switches are the settings of its user, which spherloc must not change, and the variable ``CI``.
     """
     environment = {name: value for name, value in os.environ.items() if name != "FORCE_RERUN_ANALYTICS"}
     return environment | {"CI": "true", "TELEMETRY_ENABLED": "false"}
@@ -65,7 +65,7 @@ def _from_program() -> dict[str, bytes]:
     """The files as rerun's program serves them to us once, on this machine; it is ended then."""
     ports = ["--bind", "127.0.0.1", "--port", "auto", "--web-viewer-port", "0"]
     environment = rerun_environment() | {"RUST_LOG": "info", "NO_COLOR": "1"}
-    # A proxy that the environment names knows nothing of this machine's ports.
+    # Without a proxy: one that the environment names cannot reach this machine's ports.
     opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
     with subprocess.Popen(
         [*rerun_command(), "--serve-web", *ports], stderr=subprocess.PIPE, text=True, env=environment

@@ -78,7 +78,7 @@ class RunRow:
     title: str = ""
     """Of a curated case."""
     labels: tuple[str, ...] = ()
-    """Words that a reviewer gave it."""
+    """Labels that a reviewer gave to the run."""
     note: str = ""
     """What a reviewer wrote about it."""
     size_bytes: int = 0
@@ -90,7 +90,7 @@ class RunRow:
 
     @property
     def unit(self) -> str:
-        """What its lengths are told in: "m" or "units"."""
+        """Unit of its lengths: "m" or "units"."""
         return "units" if self.metric is False else "m"
 
     def on_timeline(self, number: int) -> int:

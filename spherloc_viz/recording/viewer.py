@@ -21,7 +21,7 @@ from spherloc_viz.recording.sandbox.examiner import examine_review
 HOST = "127.0.0.1"
 TRIES = 300
 PAUSE_S = 0.2
-"""Between two tries to tell a viewer that is starting where to stand: a minute in all."""
+"""Seconds between two tries to set the step of a viewer that is starting: a minute in all."""
 
 
 def step_of(row: RunRow, request: int | None) -> int:
@@ -74,7 +74,7 @@ def stand_at(viewer: subprocess.Popen[bytes], address: str, place: int) -> bool:
     for _ in range(TRIES):
         if viewer.poll() is not None:
             return False
-        with contextlib.suppress(Exception):  # of many kinds, and all mean: not yet
+        with contextlib.suppress(Exception):  # errors of many kinds, all of which mean that the viewer is not ready
             ViewerClient.connect(address).set_time(TIMELINE, sequence=place, play_state="paused")
             return True
         time.sleep(PAUSE_S)

@@ -308,7 +308,7 @@ class RecordedRun:
     scene_text: str | None
     """The scene file as it was; None if there was none, or none of moderate size."""
     diagnosis: Diagnosis | None
-    """What was wrong with it; None in recordings of format 1."""
+    """The diagnosis of the run; None in recordings of format 1."""
     query_image: bytes | None
     """The query image as it is shown, a JPEG; None if there was none to be read."""
 
@@ -346,7 +346,7 @@ def check_recording(path: Path) -> None:
 
 @contextlib.contextmanager
 def _sentences(path: Path) -> Iterator[None]:
-    """Whatever a file makes rerun or us stumble over, as a sentence."""
+    """Turn every error that a damaged file causes, in rerun or here, into one sentence."""
     try:
         yield
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, RuntimeError, OSError) as error:

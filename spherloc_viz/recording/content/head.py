@@ -39,11 +39,11 @@ _PROPERTIES = "/__properties"
 
 
 class OtherError(Exception):
-    """It is laid out otherwise than ours."""
+    """The file has another layout than the one that spherloc writes."""
 
 
 def read_head(path: Path) -> RunRow | None:
-    """What a recording says of itself, without labels and note; None if Rerun's reader must be asked.
+    """The row at the start of a recording, without labels and note; None if Rerun's reader must read it.
 
     The file may be hostile: call it only in the sandbox. Raises ``OSError``.
     """
