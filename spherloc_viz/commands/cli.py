@@ -55,8 +55,8 @@ def play(
         port: Port to listen on; 0 takes a free one.
         record: Write a recording of each run that is settled on.
         recordings: Folder of the recordings.
-        keep_gigabytes: What the recordings may take (2, or what is there if that is more); beyond it the oldest
-            successes that nobody labelled are deleted.
+        keep_gigabytes: Size limit of the recordings, GB (2, or their present size if larger). Above it the oldest
+            successes without a label or note are deleted.
         allow: Another folder that pages may open scenes from; give it once for each.
         token: Demand a token on this machine too, where others have accounts on it.
     """

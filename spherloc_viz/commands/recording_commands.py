@@ -329,9 +329,9 @@ def rerun(
         failed: Only runs that are known to have failed.
         label: Only runs with this label.
         out: Folder for the new recordings; recordings/rerun_TIME if not given.
-        keep_gigabytes: What the new recordings may take (2, or what is there if that is more); beyond it the oldest
+        keep_gigabytes: Size limit of the new recordings, GB (2, or their present size if larger). Above it the oldest
             successes are deleted.
-        fail_if: What must not be, as for spherloc compare; give it once for each.
+        fail_if: Condition that makes the exit code 1, as for spherloc compare; give it once for each.
         report: An HTML file to write, with pictures of what broke and what was mended.
         json: Print one JSON object instead.
     """

@@ -73,8 +73,8 @@ def run(
         record: Write a recording of each run.
         full: Keep every step, arc and edge in the recordings, which makes them larger.
         recordings: Folder of the recordings.
-        keep_gigabytes: What the recordings may take (2, or what is there if that is more); beyond it the oldest
-            successes that nobody labelled are deleted.
+        keep_gigabytes: Size limit of the recordings, GB (2, or their present size if larger). Above it the oldest
+            successes without a label or note are deleted.
         query: Name of the query image, in scenes made of images; the first one if not given.
         proof: File (.npz) for the proof of what mc-exact says that no pose can explain; of one scene. Anyone can check
             it: python -m spherloc.proof_check FILE, which needs numpy only.
@@ -144,8 +144,8 @@ def localize(
         output: Folder of the results; recordings/SCENE_ESTIMATOR_SEED if not given, or recordings/comparison_SEED.
         record: Write a recording of each query.
         recordings: Folder of the recordings; a folder of that name in the output folder if not given.
-        keep_gigabytes: What the recordings may take (2, or what is there if that is more); beyond it the oldest
-            successes that nobody labelled are deleted.
+        keep_gigabytes: Size limit of the recordings, GB (2, or their present size if larger). Above it the oldest
+            successes without a label or note are deleted.
         retry_failed: Do queries again that have no pose yet.
     """
     from spherloc.datasets.scene_file import check_there, scene_path
@@ -240,8 +240,8 @@ def diagnose(
         json: Print one JSON object a pose, on one line; infinity is the text "inf".
         record: Write a recording of each.
         recordings: Folder of the recordings.
-        keep_gigabytes: What the recordings may take (2, or what is there if that is more); beyond it the oldest
-            successes that nobody labelled are deleted.
+        keep_gigabytes: Size limit of the recordings, GB (2, or their present size if larger). Above it the oldest
+            successes without a label or note are deleted.
     """
     from spherloc.datasets.scene_file import check_there, scene_path
 
@@ -414,8 +414,8 @@ def sweep(
         record: Write a recording of each run, which takes several times as long as many a run; of a cluster's workers
             those on this machine do.
         recordings: Folder of the recordings.
-        keep_gigabytes: What the recordings may take (2, or what is there if that is more); beyond it the oldest
-            successes that nobody labelled are deleted.
+        keep_gigabytes: Size limit of the recordings, GB (2, or their present size if larger). Above it the oldest
+            successes without a label or note are deleted.
     """
     from spherloc.datasets.scene_file import check_there, scene_path
 

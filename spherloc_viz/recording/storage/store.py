@@ -239,7 +239,7 @@ class RecordingStore:
     ) -> None:
         """``on_notice`` gets a sentence for people now and then; ``full`` keeps every arc and edge.
 
-        ``keep_bytes`` is what the recordings may take; None leaves that to somebody else. Nothing is opened yet.
+        ``keep_bytes`` is the size limit of the recordings; with None nothing is deleted here. Nothing is opened yet.
         """
         self.folder = Path(folder)
         self._notice, self._full, self._keep_bytes = on_notice, full, keep_bytes
