@@ -70,7 +70,7 @@ class McExactOptions(RefinementOptions):
 
 PAIR_EFFORT = 20_000_000
 """Words touched by the search over pairs for an ``effort`` of 1."""
-POSITION_EFFORT = 150_000_000
+POSITION_EFFORT = 75_000_000
 """Matches tested by the search over positions for an ``effort`` of 1."""
 MAX_EFFORT = 1 << 50
 """Months of work; more does not fit into the kernels' counters."""
