@@ -140,7 +140,7 @@ def test_what_was_opened_is_recent_for_all(visitor: Visitor, server: viser.Viser
         ("open-scene:0:../secret.toml", "not there or not in an allowed folder"),
         ("open-scene:0:/etc/passwd", "not there or not in an allowed folder"),
         ("open-scene:7:a.toml", "not allowed any more"),
-        ("open-scene:", "no place in an allowed folder"),
+        ("open-scene:", "not a place in an allowed folder"),
         ("open-folder:0:0:..", "not there or not in an allowed folder"),
         ("open-folder:0:0:a.toml", "cannot be read"),
         ("open-scene:0:sub/bad.toml", "unknown dataset"),

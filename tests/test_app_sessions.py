@@ -223,7 +223,7 @@ def test_a_wrong_seed_is_a_sentence_and_the_page_goes_on(house: House) -> None:
         page.set(session._controls.scene._seed, seed)
         until(lambda: session._status._complaint is not None)
         assert session._status._complaint is not None and session._status._complaint[0].endswith("type one.")
-        assert "no whole number" in shown(session) and session._run.trace is before
+        assert "not a whole number" in shown(session) and session._run.trace is before
         page.set(session._controls.scene._seed, str(5 + count))
         until(lambda count=count: session._status._complaint is None and len(house.notes.traces) == count)
         assert house.notes.traces[-1].seed == 5 + count
