@@ -24,7 +24,7 @@ from spherloc.trace import Trace
 from spherloc_viz.recording.content.writer import write_recording
 
 HEIGHT_PX = 720
-"""Of the frame in a notebook."""
+"""Height of the frame in a notebook."""
 PATIENCE_S = 5.0
 """How long a server may take to end before it is killed."""
 _open: "set[Playground]" = set()

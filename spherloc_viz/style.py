@@ -16,10 +16,10 @@ UNDECIDED: RGB = (140, 146, 156)
 SPHERE: RGB = (170, 190, 215)
 SELECTED: RGB = (176, 36, 228)
 SCALE: RGB = (128, 132, 140)
-"""Of the scale bar, which means nothing but its length."""
+"""Colour of the scale bar."""
 GROUND: RGB = (70, 74, 82)
 GROUND_ON_LIGHT: RGB = (200, 204, 210)
-"""Of the grid at the foot of the map, faint on dark and on light."""
+"""Colours of the grid at the foot of the map, faint on dark and on light."""
 
 LEGEND: tuple[tuple[RGB, str], ...] = (
     (INLIER, "inlier"),

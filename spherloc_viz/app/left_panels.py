@@ -155,7 +155,7 @@ class LeftPanels:
 
 
 PROJECTOR_SHARE = 0.4
-"""Of the window, for the view left of the canvas in the projector view."""
+"""Share of the window's width for the view left of the canvas in the projector view."""
 FRONTS = {
     "Matches": "Images",
     "Samples": "Yaw",

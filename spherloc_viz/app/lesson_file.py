@@ -48,7 +48,7 @@ from spherloc_viz.lessons.lesson import Lesson, Moment, changed_state, state_par
 from spherloc_viz.lessons.numbers import number_text, numbers_of
 
 ESTIMATOR = "mc"
-"""Of a link that says none."""
+"""Estimator of a link that names none."""
 
 
 def _no_recordings(file: str) -> Opened:

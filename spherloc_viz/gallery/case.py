@@ -51,7 +51,7 @@ def _agree_with_truth(trace: Trace, wider: float = 1.0) -> int:
 
 
 def _median_error_px(trace: Trace, rim: bool) -> float:
-    """Of the right matches in the outer or the inner half of the view, at the true pose."""
+    """Median error of the right matches in the outer or the inner half of the view, at the true pose."""
     right, errors = _right(trace), _true_errors_px(trace)
     if not right.any():
         return np.nan
@@ -167,7 +167,7 @@ class Play:
     variation: Variation
     """What is changed about the scene."""
     seed: int
-    """Of the estimator and, in synthetic scenes, of the simulation."""
+    """Seed of the estimator and, in synthetic scenes, of the simulation."""
     estimator: str
     """Registered name."""
     options: Any

@@ -19,7 +19,7 @@ from spherloc_viz.recording.reviews import has_review, write_review
 from spherloc_viz.recording.sandbox.examiner import examine, examine_review
 
 WIDTH = 100
-"""Of stories on a terminal, characters."""
+"""Width of stories on a terminal, characters."""
 
 
 def chosen(cases: Sequence[GalleryCase], keys: Sequence[str]) -> tuple[GalleryCase, ...]:

@@ -44,7 +44,7 @@ STAGES: dict[type[Stage], tuple[str, Callable[[RunView, Any], list[Plan]]]] = {
 }
 """What each kind of stage is called, and what draws it."""
 KINDS = tuple(stage.kind for stage in STAGES)
-"""Of the stages that are spherloc's own."""
+"""Kinds of the stages that are spherloc's own."""
 FIRST, LAST = "Matches", "Outcome"
 """Stages that every run has."""
 

@@ -33,7 +33,7 @@ class Poses:
     alternative: tuple[FloatArray, float] | None
     """Another pose (3, 4), and the residual there, px."""
     agree_inliers: tuple[int, int] | None
-    """Of the pairs with the run's other inliers, how many agree at its yaw, and how many there are."""
+    """How many pairs with the run's other inliers agree at its yaw, and how many pairs there are."""
 
 
 def reason(trace: Trace, poses: Poses) -> tuple[str, str]:
@@ -172,13 +172,13 @@ class Pairs:
     agree: int
     """Pairs with an arc over it, and those that say nothing."""
     agree_inliers: int
-    """Of the pairs with the run's other inliers, those that agree."""
+    """How many pairs with the run's other inliers agree."""
     excluded: int
     """Pairs whose arcs lie elsewhere."""
     impossible: int
     """Pairs that agree at no yaw at all."""
     worst: tuple[tuple[int, float], ...]
-    """Of the excluded ones those that are farthest off: the other match and by how many degrees."""
+    """The excluded pairs that are farthest off: the other match and the difference, degrees."""
 
 
 @dataclass(frozen=True)
@@ -214,7 +214,7 @@ class Explanation:
     at_truth: Pairs | None
     """Its pairs at the true yaw."""
     stages: tuple[str, ...]
-    """What part it had in the stages of the run, in words."""
+    """Its part in the stages of the run, in words."""
     verdict: str
     """Kept or rejected, and whether rightly, in a few words."""
     reason: str
@@ -300,7 +300,7 @@ def _pairs(
 
 
 def _alternative(trace: Trace, number: int, given: FloatArray | None) -> tuple[FloatArray, float] | None:
-    """Of the other poses that are known, the one (3, 4) that explains the correspondence best, and its residual, px."""
+    """The other known pose (3, 4) that explains the correspondence best, and its residual, px."""
     stage = trace.stage(ConsensusStage)
     poses = ([] if given is None else [given]) + ([] if stage is None else list(stage.cam_from_map[1:]))
     errors = [float(residuals_at(trace.problem, pose).px[number]) for pose in poses]

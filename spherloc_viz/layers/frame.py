@@ -257,7 +257,7 @@ MIN_M = 1e-4
 
 
 UNITS = "units"
-"""Of a map whose scale is unknown."""
+"""Unit of a map whose scale is unknown."""
 
 
 def length_text(length_m: float, metric: bool = True) -> str:

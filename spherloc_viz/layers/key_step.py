@@ -113,7 +113,7 @@ class StepNumbers:
     agreeing: int
     """Matches that the step shows as agreeing: in the clique, or within the bound."""
     rotation_error_deg: float | None
-    """Of the step's pose; None if it has none or the truth is unknown."""
+    """Rotation error of the step's pose; None if it has no pose or the truth is unknown."""
     translation_error_m: float | None
     """Likewise, between the camera positions, metres."""
 

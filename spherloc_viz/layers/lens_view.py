@@ -18,9 +18,9 @@ from spherloc.types import BoolArray, FloatArray
 from spherloc_viz.layers.query_image import photograph
 
 WIDTH_PX = 640
-"""Of the picture."""
+"""Width of the picture."""
 MAX_PIXELS = 250_000
-"""Of a reference that are looked up."""
+"""Most pixels of a reference that are used."""
 MAX_REFERENCES = 4
 LEVELS = 4
 """Pictures that are drawn, each half as large as the one before: what has no point is filled from a smaller one."""

@@ -114,7 +114,7 @@ class MatchView:
     own: IntArray
     """Indices of the matches with that reference, or of all."""
     lines: IntArray
-    """Of these, the ones to join by a line: inliers of the step at hand and the selected ones, thinned if many."""
+    """Those of them that are joined by a line: inliers of the step and selected ones, thinned if there are many."""
     inliers: int
     """How many of ``own`` have the colour of inliers."""
     caption: str

@@ -118,7 +118,7 @@ class Label(Primitive):
     """(3,) of its middle."""
     text: str
     height_m: float | None = None
-    """Of its letters, so that it shrinks with what it names; None keeps it readable from anywhere."""
+    """Height of its letters, metres, so that it shrinks with what it names; None keeps its size on the screen."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "text", true_minus(self.text))
@@ -204,11 +204,11 @@ class Graph:
 
     nodes: Nodes
     shown: NDArray[np.bool_]
-    """(K,) nodes that are there by now."""
+    """(K,) nodes that the steps so far have added."""
     marked: NDArray[np.bool_]
     """(K,) nodes that the step is about."""
     color: tuple[int, int, int]
-    """Of those."""
+    """Colour of the marked nodes."""
     words: str
     """What is marked, in a sentence."""
 

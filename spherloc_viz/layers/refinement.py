@@ -1,4 +1,4 @@
-"""Refinement: each Gauss-Newton state, who agrees in the end and who does not, how sure the pose is."""
+"""Refinement: each Gauss-Newton state, the matches that agree with the last one, and the uncertainty of the pose."""
 
 from functools import partial
 
@@ -26,8 +26,8 @@ def plans(view: RunView, stage: RefinementStage) -> list[Plan]:
         charts = {"refinement": partial(chart, stage, k)}
         out.append(Plan(f"refinement-{k}", title, partial(_state, view, stage, k), charts))
     out += [
-        Plan("refinement-inliers", "Who agrees", lambda: _inliers(view, stage)),
-        Plan("refinement-outliers", "Who does not", lambda: _outliers(view, stage)),
+        Plan("refinement-inliers", "Matches that agree", lambda: _inliers(view, stage)),
+        Plan("refinement-outliers", "Matches that do not", lambda: _outliers(view, stage)),
         Plan("refinement-error", "How sure the pose is", lambda: _error(view, stage)),
         Plan("refinement", "Refinement", lambda: _summary(view, stage), {"refinement": partial(chart, stage)}),
     ]
@@ -62,7 +62,7 @@ def _state(view: RunView, stage: RefinementStage, k: int) -> Frame:
 
 
 def _explained(view: RunView, stage: RefinementStage, k: int, state: FloatArray) -> BoolArray:
-    """Who is within the bound at a state, by the bound that the stage counted with; else the final inliers."""
+    """Matches within the bound at a state, by the bound that the stage counted with; else the final inliers."""
     aligned, bounds = view.trace.problem.aligned, view.bounds
     errors = view.residuals_px(state)[aligned.index]
     for limits in (bounds.pixels, np.minimum(bounds.pixels, bounds.noise_px)):

@@ -71,7 +71,7 @@ class Residuals:
     histograms: tuple[Histogram, Histogram]
     """In px and in degrees."""
     judged: str
-    """Who says which matches are right: "by the truth" or "by this run's inliers"."""
+    """The source that says which matches are right: "by the truth" or "by this run's inliers"."""
     blind: int
     """Matches whose pixel has no bearing."""
 

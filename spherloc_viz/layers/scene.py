@@ -200,7 +200,7 @@ def _seen(camera: Camera, camera_turn: FloatArray) -> ByteArray:
 
 
 _CORNERS = np.array([[-0.5, -0.4, 0.7], [0.5, -0.4, 0.7], [0.5, 0.4, 0.7], [-0.5, 0.4, 0.7]])
-"""Of the opening of a camera of size 1."""
+"""Corners of the opening of a camera of size 1."""
 _ROOF = np.array([0.0, -0.62, 0.7])
 """Above its upper edge."""
 _EDGES = np.concatenate(

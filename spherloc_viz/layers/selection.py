@@ -27,9 +27,9 @@ INNER, OUTER = 1.06, 1.24
 """Radii of the band of the selected arcs, in sphere radii: between the sphere and the ring of all arcs."""
 STEP_RAD = np.radians(4.0)
 CORNERS = 48
-"""Of the level circle around a ball."""
+"""Corners of the level circle around a ball."""
 DOT_CORNERS = 20
-"""Of each circle around a dot."""
+"""Corners of each circle around a dot."""
 LIFT = 0.3
 """From the sphere with the image to the circles inside and outside, in radii of the circle."""
 
@@ -188,7 +188,7 @@ def _edges(items: dict[str, SceneItem], trace: Trace, selected: tuple[int, ...])
 
 
 MAX_COMPARED = 200
-"""Of more correspondences an even sample is asked for its pairs."""
+"""If there are more correspondences, only the pairs of an even sample are computed."""
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ FACTORS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 ROOM = 3.0
 """An error that would be longer than this, in sphere radii, is not magnified."""
 CORNERS = 40
-"""Of each ellipse."""
+"""Corners of each ellipse."""
 AHEAD = 2.2
 """Length of the viewing directions, in sphere radii."""
 BESIDE = 1.2

@@ -103,7 +103,7 @@ def places_of(yaw_deg: float, window: Window) -> list[float]:
 
 
 WIDTHS_DEG = (1.0, 2.0, 4.0, 6.0, 10.0, 20.0, 30.0, 60.0, 120.0)
-"""Of the window around the peak."""
+"""Widths of the window around the peak."""
 MAX_BARS = 60
 MAX_CHOSEN = 24
 """Bars that a selection may take of all."""

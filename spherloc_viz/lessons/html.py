@@ -267,11 +267,11 @@ class Sheet:
     """What a moment has on paper."""
 
     numbers: Mapping[str, str]
-    """Of its run."""
+    """Numbers of the moment's run, as text."""
     picture: str
     """Its scene, SVG."""
     asked_numbers: Mapping[str, str]
-    """Of the run that is shown until its question is answered."""
+    """Numbers of the run that is shown until the question is answered."""
     asked_picture: str
     """The scene until then."""
 

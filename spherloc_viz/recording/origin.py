@@ -27,7 +27,7 @@ class Origin:
     variation: Variation = field(default_factory=Variation)
     """What was changed about the scene."""
     title: str = ""
-    """Of a curated case; empty for others."""
+    """Title of a curated case; empty for other runs."""
     story: str = ""
     """What a curated case shows, in a few sentences; empty for others."""
 

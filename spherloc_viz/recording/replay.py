@@ -347,7 +347,7 @@ class Reopened:
     label: str
     """What to call it."""
     seed: int
-    """Of the simulation, of spoiled matches, and of the estimator."""
+    """Seed of the simulation, of spoiled matches, and of the estimator."""
     query: str | None
     """Name of the query image; None for the first, or if there is none."""
     variation: Variation

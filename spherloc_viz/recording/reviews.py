@@ -74,7 +74,7 @@ MAX_LABELS = 20
 MAX_LABEL_CHARACTERS = 40
 MAX_NOTE_CHARACTERS = 4_000
 MAX_BYTES = 1 << 20
-"""Of a review file, which has 6 kB and the text."""
+"""Largest review file; it has 6 kB and the text."""
 UNREADABLE = "labels and note cannot be read; delete the file and label the run again."
 
 

@@ -29,7 +29,7 @@ class RunRow:
     estimator: str
     """Registered name."""
     seed: int
-    """Of the estimator."""
+    """Seed of the estimator."""
     options: str
     """Its options as JSON; infinity is the text "inf"."""
     problem_key: str
@@ -76,17 +76,17 @@ class RunRow:
     metric: bool | None = None
     """Whether the map's lengths are metres, else in units of its own; None in older recordings, whose maps were."""
     title: str = ""
-    """Of a curated case."""
+    """Title of a curated case."""
     labels: tuple[str, ...] = ()
     """Labels that a reviewer gave to the run."""
     note: str = ""
     """What a reviewer wrote about it."""
     size_bytes: int = 0
-    """Of the file."""
+    """Size of the file."""
     thumbnail: bytes = b""
     """A small PNG; empty if there is none."""
     format_version: int = 0
-    """Of the recording."""
+    """Format version of the recording."""
 
     @property
     def unit(self) -> str:

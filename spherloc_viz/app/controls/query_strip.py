@@ -24,7 +24,7 @@ from spherloc_viz.app.workers import BackgroundWorker
 PAGE = 24
 """Queries that are shown at once."""
 HEIGHT_PX, MAX_WIDTH_PX = 52, 104
-"""Of a thumbnail."""
+"""Size of a thumbnail."""
 KEPT = 400
 """Thumbnails that are remembered."""
 WAITING = "waiting"
@@ -34,7 +34,7 @@ MARKS = {
     FAILED: ("✕", style.OUTLIER),
     UNREADABLE: ("✕", style.OUTLIER),
 }
-"""Of what became of a query: a sign and a colour."""
+"""Sign and colour of each outcome of a query."""
 WORST_FIRST = {FAILED: 0, UNREADABLE: 1, DOUBTFUL: 2, LOCALIZED: 3, WAITING: 4}
 ORDERS = {"order": "in order", "outcome": "by outcome", "error": "by error", "inliers": "by inliers"}
 """Keys of the strip's order, and their words."""

@@ -13,7 +13,7 @@ TEXTS = ("source", "scene", "name", "query", "estimator", "outcome", "diagnosis"
 ANSWERS = ("doubtful", "proven")
 """Yes, no or unknown; sent as texts."""
 UNITS = {None: "m", 1: "m", 0: "units"}
-"""Of a map's lengths, by whether it is metric; sent as the text ``units``."""
+"""Unit of a map's lengths, by whether the map is metric; sent as the text ``units``."""
 NUMBERS = (
     *("created", "seed", "correspondences", "inliers", "outlier_rate", "rotation_error_deg", "translation_error_m"),
     *("time_ms", "steps", "key_step", "size_bytes", *FEATURES),

@@ -51,12 +51,12 @@ class Change:
     difference: float
     """Median of the differences, after less before."""
     p: float
-    """Of Wilcoxon's signed-rank test, two-sided; 1 if no pair differs, NaN without pairs."""
+    """p-value of Wilcoxon's signed-rank test, two-sided; 1 if no pair differs, NaN without pairs."""
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """What became of the runs of one set in the other."""
+    """How the outcomes of paired runs changed from one set to the other."""
 
     pairs: tuple[Pair, ...]
     """In the order of the second set."""
@@ -75,9 +75,9 @@ class Comparison:
     judged: int
     """Pairs of which both can be judged."""
     p: float
-    """Of McNemar's exact test of broken against mended, two-sided; 1 if there are none."""
+    """p-value of McNemar's exact test of broken against mended, two-sided; 1 if there are none."""
     changes: tuple[Change, ...]
-    """Of the numbers in ``MEASURED``."""
+    """Changes of the numbers in ``MEASURED``."""
 
 
 def is_right(row: RunRow) -> bool | None:

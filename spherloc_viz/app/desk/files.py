@@ -15,7 +15,7 @@ VIEWS, SETS = "views", "sets"
 VIEW_SUFFIX, SET_SUFFIX = ".json", ".txt"
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9 _.-]{0,59}")
 MAX_BYTES = 20 << 20
-"""Of a file: the names of 100,000 runs take 8 MB."""
+"""Largest file, bytes: the names of 100,000 runs take 8 MB."""
 MAX_VIEW_LETTERS = 20_000
 MAX_FILES = 500
 """Views or sets that are listed."""

@@ -15,7 +15,7 @@ from spherloc_viz.recording.storage.room import GALLERY
 MAX_LOOKED_INTO = 2_000
 """Folders that are searched for recordings."""
 MAX_DEPTH = 5
-"""Of a folder below one that may be opened."""
+"""How many levels below an allowed folder are searched."""
 MAX_OFFERED = 200
 
 

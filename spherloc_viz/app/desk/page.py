@@ -14,7 +14,7 @@ from spherloc_viz.app.review.words import COLORS
 from spherloc_viz.recording.reviews import MAX_LABELS
 
 SCRIPTS = ("runs.js", "charts.js", "saved.js", "desk.js")
-"""What knows the runs, draws them, stores and sends, and ties all to the page."""
+"""The page's scripts: those that hold the runs, draw them, store and send, and the one that connects them."""
 COLUMNS = {
     "outcome": ("outcome", "success, failure, or unknown where there is no truth"),
     "diagnosis": ("cause", "What the diagnosis says"),

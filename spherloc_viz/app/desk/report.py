@@ -110,7 +110,7 @@ def _how() -> str:
 
 
 MAX_PAIRS = 100
-"""Of each kind that are shown with their pictures."""
+"""How many runs of each kind are shown with their pictures."""
 TABLE_ROWS = 30
 """Causes and scenes that are listed."""
 

@@ -23,16 +23,16 @@ NAMED = 2
 
 @dataclass(frozen=True, eq=False)
 class RunMap:
-    """Where N runs lie."""
+    """The places of N runs on the map."""
 
     x: FloatArray
     """(N,), in standard deviations along the first component."""
     y: FloatArray
     """(N,), along the second one."""
     x_words: str
-    """What the first component is made of, mostly."""
+    """The quantities with the largest weights in the first component."""
     y_words: str
-    """What the second one is made of."""
+    """Those of the second component."""
 
 
 def run_map(columns: Mapping[str, Sequence[Any]]) -> RunMap:

@@ -17,11 +17,11 @@ from spherloc_viz.layers.lens_view import WIDTH_PX, through_lens
 from spherloc_viz.layers.query_image import modified
 
 BLENDS = {"photograph": 0.0, "half and half": 0.5, "map": 1.0}
-"""What is seen, and how much of it is the map."""
+"""Title of the picture, and the share of it that shows the map."""
 ABOUT = "The matched references' pixels at their points in the map, seen from the estimated pose."
 NOTHING = "The matched references have no point in the map that this pose would see."
 GREY = 40
-"""Of what the map has nothing of."""
+"""Colour of pixels where the map has nothing."""
 
 
 class LensPanel:

@@ -19,7 +19,7 @@ from spherloc_viz.layers.frame import even, one_color
 from spherloc_viz.layers.matches import MatchView, inlier_colored, valid_outlines
 
 WIDTH, GAP = 1000.0, 14.0
-"""Of the drawing, in its own units; the page scales it."""
+"""Size of the drawing, in its own units; the page scales it."""
 WIDE = 2.6
 """Up to this sum of widths over heights, two images stand side by side."""
 MAX_DOTS = 600
@@ -183,7 +183,7 @@ class Overlay:
     """Dots and lines above one or two images. K matches are shown."""
 
     places: list[Place]
-    """Of the images."""
+    """Places of the images in the drawing."""
     parts: list[str]
     """SVG."""
     caption: str

@@ -271,7 +271,7 @@ def _run(trace: Trace, name: str, watch: Watch) -> Trace:
 
 
 def options_like(trace: Trace, name: str) -> Any:
-    """The run's own options; of another estimator its default ones, but with the run's bound, which decides who is an
+    """The run's own options; of another estimator its default ones, but with the run's bound, which decides what is an
     inlier: else two estimators would be asked two questions."""
     if name == trace.estimator:
         return trace.options

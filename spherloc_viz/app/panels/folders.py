@@ -16,7 +16,7 @@ from spherloc.files import IMAGES
 PAGE = 12
 """Rows that are shown at once."""
 MAX_ENTRIES = 20_000
-"""Of a larger folder only so many are looked at."""
+"""Largest number of a folder's entries that are looked at."""
 MAX_PEEK_BYTES = 100_000
 """Larger TOML files are not read before they are opened."""
 

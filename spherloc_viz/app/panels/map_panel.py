@@ -15,7 +15,7 @@ from spherloc_viz.app.text import box, status_html
 
 MODULE = "spherloc_viz.commands.map"
 MAX_LETTERS = 20_000
-"""Of a line that the process tells."""
+"""Longest line that is read from the process."""
 OUTPUT = "_map"
 """What the folder of a map is called, after that of its photographs; as the command calls it."""
 

@@ -39,7 +39,7 @@ ROOM_EVERY = 100
 """Recorded runs after which old ones may have to make room."""
 DRAW_EVERY_S = 0.25
 DRAW_SHARE = 0.05
-"""Of the time, at most, goes into drawing; the page has more to do."""
+"""Largest share of the time that goes into drawing."""
 
 _turn = threading.Lock()
 """Held by the sweep that is running: one at a time on a server, for all pages together."""
@@ -55,7 +55,7 @@ class _Results:
 
     plan: SweepPlan
     name: str
-    """Of the scene."""
+    """Name of the scene."""
     rows: tuple[SweepRow, ...] = ()
 
 

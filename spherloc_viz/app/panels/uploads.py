@@ -51,7 +51,7 @@ class Form:
     matches: File
     """CSV."""
     calibration: File
-    """Of any kind that ``load_camera`` reads."""
+    """A calibration file of any kind that ``load_camera`` reads."""
     gravity_camera: str
     """Three numbers, as all texts below."""
     gravity_map: str

@@ -22,7 +22,7 @@ MAX_DOTS = 40
 MAX_STEPS = 360
 HEADROOM = 1.06
 ROUNDING = 1e-9
-"""What differs by less is the same: the two matches that a pose was made of are 1e-13 px off."""
+"""Values that differ by less count as equal: the two matches that a pose was computed from are 1e-13 px off."""
 
 Bands = Mapping[str, tuple[FloatArray, FloatArray]]
 """Lower and upper ends (K,), (K,) of the band around a curve, by the curve's label."""

@@ -51,7 +51,7 @@ LOOKS = (
     shapes.fill(style.OUTLIER, 0.5),
     shapes.fill(style.OUTLIER),
 )
-"""Of the kinds of pairs."""
+"""Colours of the kinds of pairs."""
 LINK = shapes.stroke(style.SELECTED, 1.5)
 EDGE = f' stroke="{style.css(style.SELECTED)}" stroke-width="1.5"'
 HOVER = (

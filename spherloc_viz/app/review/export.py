@@ -30,7 +30,7 @@ from spherloc_viz.recording.sandbox.examiner import resolve_inside
 
 MAX_RUNS = 500
 MAX_BYTES = 200_000_000
-"""Of all files together."""
+"""Largest size of all files together."""
 
 
 PIECE_BYTES = 1 << 18

@@ -141,7 +141,7 @@ Groups = Sequence[tuple[str, int]]
 MAX_CHIPS = 24
 """Values that are offered at once, the most frequent ones."""
 MAX_LETTERS = 40
-"""Of a value; the whole of it is in its hint."""
+"""Longest value that is shown; a longer one is cut, and its hint shows all of it."""
 NOT_DIAGNOSED, NOTHING = "not diagnosed", "none"
 
 
@@ -154,7 +154,7 @@ class Counts:
     diagnosis: Groups
     doubtful: int
     unfolded: Groups = ()
-    """Of the filter that is unfolded, if its values can be counted."""
+    """Values of the unfolded filter with their counts, if they can be counted."""
     pages: int | None = None
     """Runs that pages made by themselves; None if there are no others, so that they are listed anyway."""
 

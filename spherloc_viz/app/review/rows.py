@@ -17,7 +17,7 @@ from spherloc_viz.recording.sandbox.checks import is_thumbnail
 DESK = "/desk"
 """Where the desk is (``app/web/desk.py``)."""
 WIDTH_PX, HEIGHT_PX = 64, 46
-"""Of a row's picture."""
+"""Size of a row's picture."""
 PREVIOUS_KEY, NEXT_KEY = "[", "]"
 """Open the run before and the next one: viser's canvas has letters and arrows."""
 RULE = "border-top:1px solid rgba(128,140,160,.18)"

@@ -9,7 +9,7 @@ from spherloc_viz.recording.run_row import RunRow
 
 UNKNOWN = "–"
 COLORS = {"success": style.INLIER, "failure": style.OUTLIER, "unknown": style.UNDECIDED}
-"""Of outcomes."""
+"""Colours of outcomes."""
 
 
 def title_of(row: RunRow) -> str:

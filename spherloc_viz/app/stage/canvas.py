@@ -138,7 +138,7 @@ class Canvas:
         return (*view.position.tolist(), *view.target.tolist(), degrees)
 
     def _make_room(self) -> None:
-        """Hide what would be before the eyes of who stands in a camera; on threads of viser's and of the page's."""
+        """Hide what would cover the view of a viewer inside a camera; called on threads of viser and of the page."""
         picture = self._picture
         try:
             position = np.array(self._client.camera.position, dtype=np.float64).reshape(3)

@@ -14,18 +14,18 @@ from spherloc_viz.layers.primitives import Balls, Label, Mesh, Points, SceneItem
 WIDTH, HEIGHT = 560.0, 350.0
 MIN_DOT_PX, MAX_DOT_PX = 1.2, 12.0
 LINE = 0.6
-"""Width of lines by that on the screen, whose canvas is larger."""
+"""Width of lines relative to that on the screen, where the canvas is larger."""
 LABEL_PX = 11.0
 MIN_LETTER_PX = 6.0
 """Words that shrink with what they name are left out where they would be smaller."""
 LETTER = 0.55
 """Width of a letter by the height of its line, on average."""
 NEAR_M = 1e-3
-"""What is nearer to the viewer is left out."""
+"""Shapes nearer to the viewer than this are left out."""
 MAX_STACKED = 0.7
 """Opacity of balls that all lie over each other."""
 OUTLINE_PX, OUTLINE_OPACITY = 0.5, 0.35
-"""Of balls, which are as pale as many of them must be."""
+"""Outline of balls, which are paler the more there are."""
 BEHIND_M = 1e6
 """Added to the distance of balls, of their centres and of lines between these, which would hide the camera in them."""
 

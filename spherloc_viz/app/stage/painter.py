@@ -97,7 +97,7 @@ LARGEST_DOT = 0.007
 LABEL_SCALE = 0.9
 """Size of words, by viser's own."""
 PLACE = frozenset({"wxyz", "position"})
-"""Of a node, which are no properties of what is drawn there."""
+"""Settings of a node that are not properties of the shape drawn there."""
 
 
 class Painter:
@@ -122,7 +122,7 @@ class Painter:
         self.hidden: frozenset[str] = frozenset()
         """Nodes that are left out of what is shown."""
         self.eye: np.ndarray | None = None
-        """Where the viewer stands who is in a camera."""
+        """Position (3,) of a viewer inside a camera."""
         self.dark = True
         """Whether that is what is behind everything."""
         self.clicked_x = 0.5
@@ -162,7 +162,7 @@ class Painter:
                 self._follow()
 
     def see_from(self, eye: np.ndarray | None) -> None:
-        """No dot is larger than ``LARGEST_DOT`` for a viewer who stands in a camera, at ``eye`` (3,): dots would hide
+        """No dot is larger than ``LARGEST_DOT`` for a viewer inside a camera, at ``eye`` (3,): dots would hide
         the photograph. None is for anywhere else."""
         if (eye is None) != (self.eye is None):
             self.eye = eye
@@ -268,7 +268,7 @@ def _size(item: SceneItem) -> int:
 
 
 def _look(item: SceneItem) -> tuple:
-    """What cannot change without adding the node anew: its kind, its size, and what viser sets once."""
+    """Properties that need a new node when they change: kind, size, and what viser sets only once."""
     extra: tuple = ()
     match item:
         case Points():

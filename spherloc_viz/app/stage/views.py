@@ -22,7 +22,7 @@ STEPS = 64
 TARGETS = 24
 """Lines of sight, at most."""
 NEAR_SHARE, FAR = 0.08, 0.97
-"""Of each line, from the viewer, that is looked at, as shares: the mesh may touch what is to be seen."""
+"""Part of each line of sight that is tested, as shares from the viewer: the mesh may touch what is to be seen."""
 MAX_BYTES = 60 << 20
 """A larger mesh takes too long to read: views are then chosen without it."""
 
@@ -63,7 +63,7 @@ def _grid(glb: bytes) -> tuple[FloatArray, float, NDArray[np.bool_]]:
 
 FIELD_OF_VIEW_RAD = np.radians(45.0)
 WIDE_RAD = np.radians(85.0)
-"""Field of view of who stands in the camera."""
+"""Field of view of a viewer inside the camera."""
 UP = np.array([0.0, -1.0, 0.0])
 START = (3.0, -3.0, 3.0)
 """Where a page's viewer stands until its first view is set."""
@@ -93,14 +93,14 @@ DIRECTIONS = {
 }
 """From the subject to the viewer; y points down."""
 STEEP = (0.3, -2.0, -0.6)
-"""Over walls."""
+"""Direction from which a view looks over walls."""
 INSIDE = "From the camera"
 NAMES = (*DIRECTIONS, INSIDE)
 """All views."""
 TURNING = 0.02
-"""How far before the eye of who stands in the camera the point lies around which the mouse turns, in sphere radii."""
+"""Distance, in sphere radii, from a viewer inside the camera to the point around which the mouse turns the view."""
 CLOSE = 0.15
-"""Who is this close to a camera's centre stands in it, in sphere radii."""
+"""Distance from a camera's centre, in sphere radii, within which the viewer counts as inside the camera."""
 TURNS_RAD = np.radians([0, 30, -30, 60, -60, 90, -90, 120, -120, 150, -150, 180])
 """Turns of a view about the vertical, the least first."""
 

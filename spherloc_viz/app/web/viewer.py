@@ -88,7 +88,7 @@ class Viewable:
     """A run that may be viewed."""
 
     path: Path
-    """Of its recording."""
+    """Path of the recording."""
     row: RunRow
     """What is known about it."""
 

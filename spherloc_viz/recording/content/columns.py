@@ -31,7 +31,7 @@ class Values(NamedTuple):
 
     descriptor: rr.ComponentDescriptor
     values: pa.Array
-    """Of all rows."""
+    """Values of all rows, one after the other."""
     lengths: Sequence[int]
     """(R,) how many of them each row has."""
 

@@ -48,7 +48,7 @@ FRAME = "/query/frame"
 LONGEST_PX = 960
 """Longest side of the recorded image."""
 MAX_BYTES = 400_000
-"""Of the recorded image: with more, it is pressed harder."""
+"""Largest recorded image; a larger one is compressed more."""
 QUALITIES = (80, 60, 40, 20)
 DOT_PX = 2.5
 FRAME_PX = 1.0
@@ -202,7 +202,7 @@ def _draw_camera(
 MARKER_SHARE = 0.003
 """Width of a marker's bar, as a share of the chart."""
 LEVEL_OPACITY = 0.25
-"""Of the bar that stands for a level, so that what it is held against shows through."""
+"""Opacity of the bar that stands for a level: the bars behind it stay visible."""
 LINE_SHARE = 0.8
 """Width of the bar of a line's sample, as a share of the least distance between samples."""
 

@@ -28,11 +28,11 @@ from spherloc_viz.recording.content.properties import (
 from spherloc_viz.recording.run_row import RunRow
 
 MAX_HEAD_BYTES = 1 << 16
-"""Of a file that are read: three times what its properties take."""
+"""Bytes that are read at a file's start: three times what its properties take."""
 MAX_UNPACKED_BYTES = 1 << 20
-"""Of one chunk; the properties take 20 kB."""
+"""Largest unpacked chunk; the properties take 20 kB."""
 _START, _OPTIONS, _END = b"RRF2", bytes([1, 2, 0, 0]), b"RRF2FOOT"
-"""Of a file; its options are LZ4 and protobuf; a whole one ends with the last and four more bytes."""
+"""First bytes of a file, its options (LZ4 and protobuf), and, before the last four bytes, the mark at its end."""
 _DATA, _LZ4, _RECORDING = 2, 2, 1
 """Kinds of messages, of packing and of stores."""
 _PROPERTIES = "/__properties"

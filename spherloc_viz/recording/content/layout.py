@@ -261,8 +261,8 @@ def _low_on_the_left(chart: Chart) -> bool:
 def blueprint(shown: Shown) -> rrb.Blueprint:
     """The scene above the image, arcs and graph on the left; what the step says, charts and verdict on the right.
 
-    The layout pauses on the timeline of steps; at which step is up to who opens the recording, since a blueprint has
-    no word for it. A viewer in a page is told by its address.
+    The layout pauses on the timeline of steps. A blueprint cannot say at which step: that is decided when the recording
+    is opened. A viewer in a page is told by its address.
     """
     plots = [
         rrb.BarChartView(

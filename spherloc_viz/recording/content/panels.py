@@ -138,7 +138,7 @@ def _lines(points: FloatArray, colors: NDArray[np.uint32], width_px: float) -> l
 
 
 def _placed(stage: TranslationStage) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Places (M, 2) of the balls, the clique on one circle and the others on another, and who is in the clique."""
+    """Places (M, 2) of the balls, the clique on one circle and the others on another, and a mask (M,) of the clique."""
     inside = np.zeros(len(stage.pairs), dtype=bool)
     inside[stage.clique] = True
     places, start = np.empty((len(inside), 2)), 0.0

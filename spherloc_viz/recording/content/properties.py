@@ -97,7 +97,7 @@ def _cell(value: Any) -> str:
 APPLICATION_ID = "spherloc"
 """What Rerun keeps our recordings, and their layout, apart from others by."""
 FORMAT_VERSION = 4
-"""Of what is recorded and how. A reader opens this one and older ones."""
+"""Version of what is recorded and how. A reader opens this one and older ones."""
 OLDEST_VERSION = 1
 
 RUN_PROPERTY = "run"
@@ -112,7 +112,7 @@ REVIEW_PROPERTY = "review"
 """Property of the review file: ``labels``, a list of texts, and ``note``, a text."""
 
 MAX_CHARACTERS = 2_000
-"""Of a text in a row; longer ones are cut."""
+"""Longest text in a row; a longer one is cut."""
 NOT_RECORDED = {"file", "run_id", "labels", "note", "size_bytes", "thumbnail"}
 """Fields of a row that are no part of the property ``run``: they belong to the file or the review, or are a picture."""
 

@@ -18,13 +18,13 @@ except ImportError:  # Windows
 FILE_NAME = "runs.sqlite"
 """In the folder of the recordings."""
 APPLICATION = 0x53504852
-"""SQLite's mark for whose file it is: "SPHR"."""
+"""SQLite's application id of the file: "SPHR"."""
 VERSION = 4
-"""Of the schema."""
+"""Version of the schema."""
 BUSY_S = 15.0
 """How long one waits for other writers, each of which takes milliseconds."""
 CACHE_KB = 16_384
-"""Of the database in memory: all that filters look at in 10,000 runs."""
+"""SQLite's page cache: it holds all that filters read of 10,000 runs."""
 
 _CANNOT_WRITE = {sqlite3.SQLITE_READONLY, sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_PERM}
 _DAMAGED = {sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB}

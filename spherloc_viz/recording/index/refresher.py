@@ -129,7 +129,7 @@ def same_recording(stamp: str, other: str) -> bool:
 
 
 Which = Literal["new", "unexamined", "all"]
-"""Of the files of a folder; new ones are among the unexamined ones too."""
+"""Which files of a folder are meant; new ones are among the unexamined ones too."""
 
 
 class Write(Protocol):

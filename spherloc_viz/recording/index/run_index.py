@@ -238,7 +238,7 @@ class RunIndex:
                 raise RecordingError(f"{path}: there is no such run; spherloc runs lists those that there are.")
             if not same_recording(found[2], stamp_of(path)):
                 return None
-            # Written while we alone may write, so that file and database agree on who was last.
+            # Written while we alone may write, so that file and database agree on which change was the last.
             review = write_review(path, labels, note, run_id=found[1])
             (before,) = rows_of(connection, [found[0]])
             put(connection, replace(before, labels=review.labels, note=review.note), stamp_of(path), found[3])

@@ -106,7 +106,7 @@ class StepFound:
     agreeing: int
     """Matches that it shows as agreeing."""
     rotation_error_deg: float | None
-    """Of the step's pose; None if it has none or the truth is unknown."""
+    """Rotation error of the step's pose; None if it has no pose or the truth is unknown."""
     position_error_m: float | None
     """Likewise, metres."""
 

@@ -53,7 +53,7 @@ _ONE_OF: dict[str, tuple[str, ...]] = {
 _AT_MOST = {"correspondences": COUNT_LIMIT, "inliers": COUNT_LIMIT, "steps": COUNT_LIMIT, "format_version": 1_000}
 _NOT_NEGATIVE = (*_AT_MOST, "outlier_rate", "rotation_error_deg", "translation_error_m", "time_ms", "size_bytes")
 _INTEGER_LIMIT = 1 << 63
-"""Of SQLite."""
+"""Integers of SQLite are smaller."""
 
 
 def table_from_row(row: RunRow) -> dict[str, Any]:
@@ -157,9 +157,9 @@ CATALOG = {NUMBERS: TYPES, PROPERTIES: RUN_TYPES}
 STORES_LIMIT = 16
 CHUNKS_LIMIT = 100_000
 CONTENT_LIMIT_BYTES = 256 << 20
-"""Of all chunks, unpacked."""
+"""Largest size of all chunks together, unpacked."""
 SCALARS_LIMIT_BYTES = 4 << 20
-"""Of the JSON of a row: names of many reference images are the longest."""
+"""Largest JSON of a row: names of many reference images take most of it."""
 TEXT_LIMIT = 65_536
 """Characters of one text in it."""
 ITEMS_LIMIT = 100_000
@@ -238,7 +238,7 @@ def _check_rows(chunk: Chunk, batch: pa.RecordBatch, path: Path) -> None:
 
 
 def _most_rows(told: Any) -> int:
-    """Of all arrays of a row, by their shapes; 0 if it is none."""
+    """Largest number of rows of the arrays, by their shapes; 0 if there are none."""
     forms = told.get(ARRAYS, ()) if isinstance(told, dict) else ()
     return max((int(shape[0]) for _, _, shape in forms if shape), default=0)
 

@@ -25,7 +25,7 @@ from spherloc_viz.recording.run_row import RunRow
 from spherloc_viz.recording.sandbox.checks import row_from_table
 
 LINE_LIMIT_BYTES = 1 << 22
-"""Of an answer: a row has a thumbnail of some kilobytes, and an answer up to ``AT_ONCE`` rows."""
+"""Longest answer: it has up to ``AT_ONCE`` rows, each with a thumbnail of some kilobytes."""
 AT_ONCE = 100
 """Files that are asked for with one question."""
 FRUGAL = ("OPENBLAS_NUM_THREADS", "RAYON_NUM_THREADS", "TOKIO_WORKER_THREADS", "MALLOC_ARENA_MAX")
@@ -262,7 +262,7 @@ _shared = Examiner()
 
 
 def end_examining() -> None:
-    """End what ``examine`` and ``examine_review`` are reading: who waits for it gets an ``ExaminerError``.
+    """End what ``examine`` and ``examine_review`` are reading: callers that wait for it get an ``ExaminerError``.
 
     For a server that ends, whose threads would be waited for. Another call of them starts another child.
     """
@@ -296,7 +296,7 @@ class Told:
     """A row that a recording says of itself, while the rest of the file is still to be examined."""
 
     row: RunRow
-    """Of the right form."""
+    """The row, after its form was checked."""
 
 
 Result = RunRow | Told | RecordingError

@@ -409,7 +409,7 @@ class SweepStore:
     """
 
     folder: Path
-    """Of the recordings, absolute."""
+    """Absolute path of the recordings' folder."""
     machine: str = field(default_factory=here)
     """Where it was made."""
 

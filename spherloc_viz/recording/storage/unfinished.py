@@ -1,4 +1,4 @@
-"""Unfinished files: their names tell who writes them, so that what a killed process left is recovered or swept."""
+"""Unfinished files: their names tell which process writes them; those of a killed one are recovered or deleted."""
 
 import contextlib
 import hashlib
