@@ -153,8 +153,8 @@ def _matrix(graph: Graph, lit: NDArray[np.int64]) -> list[str]:
 
 
 def matrix_png(graph: Graph) -> str:
-    """The matrix of the nodes that are shown, a pixel a cell, as a PNG in base64: pairs that agree are grey, or, if they
-    are marked, of the marks' colour."""
+    """The matrix of the nodes that are shown, a pixel a cell, as a PNG in base64: pairs that agree are grey, or of the
+    marks' colour if they are marked."""
     grey, there = style.UNDECIDED[::-1], np.flatnonzero(graph.shown)
     look = np.array([(*grey, 26), (*grey, 190), (*graph.color[::-1], 255)], np.uint8)
     marked = graph.marked[there].astype(np.uint8)
