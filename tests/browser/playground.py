@@ -230,7 +230,10 @@ class Playground:
     def choose(self, label: str, option: str) -> None:
         """Choose from a list."""
         self.widget(label).click()
-        self.page.get_by_role("option", name=option, exact=True).click()
+        chosen = self.page.get_by_role("option", name=option, exact=True)
+        expect(chosen).to_be_visible()
+        # Not by the mouse: the open list may move between the choice of a place and the press there.
+        chosen.dispatch_event("click")
 
     def type(self, label: str, text: str) -> None:
         """Type into a box and press Enter."""

@@ -83,7 +83,7 @@ def test_scenes_are_opened_from_allowed_folders(open_page: Callable[..., Playgro
     expect(wrong).to_be_visible()
     assert "broken.toml" in wrong.inner_text() and str(folders) in wrong.inner_text()
     expect(tab.value("inliers")).to_have_text(re.compile(" of 100$"))
-    row(tab, "folder", "north/").click()
+    row(tab, "folder", "north/").press("Enter")  # a mouse might meet another row, since the sentence moves the list
     row(tab, "scene", "street.toml").click()
     expect(tab.value("inliers")).to_have_text(re.compile(" of 33$"))
     expect(wrong).to_have_count(0)
