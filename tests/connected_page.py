@@ -12,7 +12,7 @@ import viser
 import zstandard
 
 from spherloc_viz.app.web.access import Role
-from spherloc_viz.app.web.viser_internals import KEY_HEADER, ROLE_HEADER
+from spherloc_viz.app.web.viser_internals import KEY_HEADER, LINK_HEADER, ROLE_HEADER
 from tests.waiting import LIMIT_S, until
 
 HELLO = {
@@ -32,9 +32,10 @@ HELLO = {
 class Wire:
     """A connection to viser on a thread and an event loop of its own, which end with it."""
 
-    def __init__(self, port: int, key: str, role: str = Role.PRESENTER) -> None:
-        """Connect, and say what a page says first."""
-        self._port, self._key, self._role = port, key, role
+    def __init__(self, port: int, key: str, role: str = Role.PRESENTER, linked: bool = False) -> None:
+        """Connect, and say what a page says first; ``linked`` is one that was opened by a link."""
+        self._port = port
+        self._headers = {KEY_HEADER: key, ROLE_HEADER: role} | ({LINK_HEADER: "linked"} if linked else {})
         self._loop, self._leaving = asyncio.new_event_loop(), asyncio.Event()
         self._socket: aiohttp.ClientWebSocketResponse | None = None
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -51,7 +52,7 @@ class Wire:
         async with aiohttp.ClientSession() as client:
             self._socket = await client.ws_connect(
                 f"http://127.0.0.1:{self._port}/",
-                headers={KEY_HEADER: self._key, ROLE_HEADER: self._role},
+                headers=self._headers,
                 protocols=[f"viser-v{viser.__version__}"],
                 max_msg_size=0,
             )

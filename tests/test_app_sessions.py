@@ -1,6 +1,8 @@
 """A session from connect to disconnect, driven by the messages that a page would send; no browser needed."""
 
+import json
 import threading
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -416,6 +418,30 @@ def test_undo_takes_back_what_was_not_solved_yet(house: House, monkeypatch: pyte
     until(lambda: shown_now() == (5, None))
     session.step_history(-1)
     until(lambda: shown_now() == (start, None))
+
+
+def test_a_page_that_is_opened_by_a_link_begins_with_it(house: House, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing is solved, shown or recorded before, and Undo leads to nothing else."""
+    solved: list[str] = []
+
+    def noted(*words: Any) -> Trace:
+        solved.append(words[1])
+        return estimate(*words)
+
+    monkeypatch.setattr(session_module, "estimate", noted)
+    page = Page(house.server.get_port(), KEY, linked=True)
+    house.pages.append(page)
+    until(lambda: len(house.sessions._open) == 1)
+    (session,) = house.sessions._open.values()
+    assert isinstance(session, Session)
+    press = {"action": "link:v=1&seed=6&estimator=ransac-2p", "at": [0, 0], "from": [0, 0], "extend": False}
+    page.send({"type": "GuiUpdateMessage", "uuid": "", "updates": {"touch": json.dumps(press)}})
+    until(lambda: len(house.notes.traces) == 1)
+    assert solved == ["ransac-2p"] and session._run is not None and session._run.request.scene.seed == 6
+    until(lambda: "estimator=ransac-2p" in session._address.content and 'data-followed="1"' in session._address.content)
+    session.step_history(-1)
+    until(lambda: session._asked == deque() and session._controls.scene._seed.value == "6")
+    assert solved == ["ransac-2p"] and len(house.notes.traces) == 1
 
 
 def test_undo_takes_back_a_change_that_cannot_be_and_nothing_before_it(house: House) -> None:

@@ -39,7 +39,7 @@ from spherloc_viz.app.services import Services
 from spherloc_viz.app.stage.canvas import panel_widths_px
 from spherloc_viz.app.status import Notices, Status
 from spherloc_viz.app.web.touch import READY, Touch, Touches
-from spherloc_viz.app.web.viser_internals import follow_changes, guard_callbacks, update_widget
+from spherloc_viz.app.web.viser_internals import follow_changes, guard_callbacks, is_linked, update_widget
 from spherloc_viz.app.workers import Job, LatestWorker
 from spherloc_viz.layers import steps
 from spherloc_viz.lessons.numbers import number_text, numbers_of
@@ -102,22 +102,25 @@ class Session:
         places = Places(self.redraw, self.select, self._move_camera, self._catalog.map_scene)
         self._display = RunDisplay(client, self._touches, self._controls, places, (left_px, right_px))
         self._listen()
-        self._name, self._address = secrets.token_hex(8), client.gui.add_html("")
         self._built = True
         # Only now may the page report presses: all handlers are registered.
         client.gui.add_html(READY)
+        # And only then may it see where its address is kept: it tells the link that it was opened by at once.
+        self._name = secrets.token_hex(8)
+        self._address = client.gui.add_html(address_html("", self._name, 0))
         self._display.panels.ready()
 
     def start(self) -> None:
-        """Solve and show the first problem, or the recorded run that was asked for."""
+        """Solve and show the first problem, or the recorded run that was asked for; where the page was opened by a
+        link, nothing before the page has told that."""
         self._client.camera.on_update(lambda camera: self._viewer.ask())
         for worker in (self._page, self._viewer, self._diagnoser, self._pictures, self._controls.slow, self._solver):
             worker.start()
         first = self._services.first
-        if first is None:
-            self._solver.ask()
-        else:
+        if first is not None:
             self.open_recorded(first.request, first.path, first.cam_from_map)
+        elif not is_linked(self._client):
+            self._solver.ask()
 
     def close(self) -> None:
         """End the threads; does not wait."""
@@ -261,14 +264,13 @@ class Session:
 
     def _solve_newest(self) -> float | None:
         """Solve what the page asks for now, if that is not shown. Raises ``Cancelled`` if that was ended."""
-        run = self._run
-        if run is None or not self._links:
+        if not self._links:
             return self._solve_request()
         links = _taken(self._links)
         number, link = links[-1]
         arrived = True
         try:
-            followed = self._follower.follow(link, run.request, self._view())
+            followed = self._follower.follow(link, self._shown_request(), self._view())
             self._asked.append((number, followed.request))
             pause = self._solve_request()
             self._arrive(followed, number)
@@ -282,6 +284,12 @@ class Session:
                 self._page.ask()
             else:  # the run was ended for a newer change, and is made again with it
                 self._links.extendleft(reversed(links))
+
+    def _shown_request(self) -> RunRequest:
+        """The request of the run at hand; before there is one, what the page begins with."""
+        if self._run is not None:
+            return self._run.request
+        return RunRequest(self._controls.scene.read(), *self._controls.estimator.read())
 
     def _arrive(self, followed: Followed, number: int) -> None:
         """A link was followed: set step, selection and viewer. ``number`` is that of the change before it."""

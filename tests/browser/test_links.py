@@ -78,6 +78,8 @@ def test_a_reload_and_a_link_bring_back_what_is_shown(
     tab.expect_card(7)
     expect(tab.value("estimator")).to_have_text("ransac-2p")
     assert shown(tab) == before and tab.page.url == link
+    tab.press("Undo")  # nothing was shown before the link
+    assert tab.still(lambda: shown(tab), "the page stays") == before
 
     # In another browser, and in a page that shows something else; what is wrong is said, and the rest is opened.
     other = open_tab()

@@ -6,6 +6,8 @@
 (() => {
   const EVERY_MS = 50, VISERS_THROTTLE_MS = 50, FAR = 8, later = window.setTimeout.bind(window), Plain = window.Worker;
   const POSES = ["SetPositionMessage", "SetOrientationMessage"], BUTTONS = ["GuiButtonMessage", "GuiButtonGroupMessage"];
+  // A page that was opened by a link (link.js) says so when it connects: the server solves nothing before it has the link.
+  const MAX_LETTERS = 15000, LINKED = location.hash.length > 1 && location.hash.length <= MAX_LETTERS ? "?linked" : "";
   let number = 0, gesture = 0, throttled = false, edited = null, line = null;
 
   // viser's page sends the changes of all widgets through one throttle that keeps only the last of those within 50 ms.
@@ -38,7 +40,8 @@
     }
 
     postMessage(data, ...words) {
-      if (data?.type !== "send") super.postMessage(data, ...words);
+      if (data?.type === "set_server") super.postMessage({ ...data, server: data.server + LINKED }, ...words);
+      else if (data?.type !== "send") super.postMessage(data, ...words);
       else if (data.message.type === "GuiUpdateMessage") this.#change(data.message);
       else {
         // All but the place of the viewer, which is told many times a second, has a number too.

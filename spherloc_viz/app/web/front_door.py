@@ -14,7 +14,7 @@ from spherloc_viz.app.web.downloads import DOWNLOADS, Downloads
 from spherloc_viz.app.web.learn import is_learning, learn_answer
 from spherloc_viz.app.web.page import Page, load_page
 from spherloc_viz.app.web.viewer import NOT_RECORDED, PAGE, ViewerRoom
-from spherloc_viz.app.web.viser_internals import KEY_HEADER, ROLE_HEADER
+from spherloc_viz.app.web.viser_internals import KEY_HEADER, LINK_HEADER, ROLE_HEADER
 
 MAX_MESSAGE_BYTES = 50 * 1024 * 1024
 """What viser accepts from a page."""
@@ -31,6 +31,8 @@ PARAMETERS = frozenset(f"initialCamera{part}" for part in ("Position", "LookAt",
     "hideViserLogo",
 }
 """What a link may ask of viser's page. Others are dropped: they make it play another server's file."""
+LINKED = "linked"
+"""What the page asks of its websocket if it was opened by a link (``changes.js``)."""
 LESSONS_NOT_FOR_AUDIENCE = (
     "Lessons are the presenter's to open: the link for an audience shows what the presenter shows."
 )
@@ -119,7 +121,7 @@ class FrontDoor:
             return self._downloads.answer(request)
         if is_learning(request.path):
             return await learn_answer(request) if role is Role.PRESENTER else refused(request, LESSONS_NOT_FOR_AUDIENCE)
-        if not request.query.keys() <= PARAMETERS:
+        if not request.query.keys() <= (PARAMETERS | {LINKED} if upgrade else PARAMETERS):
             raise web.HTTPFound("/")
         if request.path != "/":
             return web.Response(status=404, text="There is nothing here; open /.\n")
@@ -152,13 +154,14 @@ class FrontDoor:
         """Join the page's websocket to one of viser's, which learns whose it is, for as long as both live."""
         assert self._client is not None
         offered = [name for name in re.split(r"[,\s]+", request.headers.get("Sec-WebSocket-Protocol", "")) if name]
+        linked = {LINK_HEADER: LINKED} if LINKED in request.query else {}
         # The client's name and version travel as a subprotocol. Compression would cost more than it saves:
         # viser's messages are compressed already, and its arrays do not compress.
         try:
             upstream = await self._client.ws_connect(
                 self._upstream,
                 protocols=offered,
-                headers={KEY_HEADER: self._key, ROLE_HEADER: role},
+                headers={KEY_HEADER: self._key, ROLE_HEADER: role} | linked,
                 max_msg_size=0,
                 compress=0,
             )

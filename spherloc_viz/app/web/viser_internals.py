@@ -63,6 +63,8 @@ KEY_HEADER = "X-Spherloc-Key"
 """Request header that carries the key; a web page cannot set headers on a websocket, a program can."""
 ROLE_HEADER = "X-Spherloc-Role"
 """Request header that says what the page may do, next to the key."""
+LINK_HEADER = "X-Spherloc-Link"
+"""Request header of a page that was opened by a link, which it will tell."""
 ANSWERS = "answers"
 """Carries, beside a value for a widget, the number of the change that it answers; ``changes.js`` takes it out."""
 
@@ -96,6 +98,11 @@ def set_theme(gui: viser.GuiApi, theme: str) -> None:
 def role_header(client: viser.ClientHandle) -> str:
     """What the header of a client's connection said of its role; empty if nothing."""
     return client._websock_connection.__dict__.get("role_header", "")
+
+
+def is_linked(client: viser.ClientHandle) -> bool:
+    """Whether a client's page was opened by a link, which it will tell."""
+    return client._websock_connection.__dict__.get("linked", False)
 
 
 def stop_viser(server: viser.ViserServer) -> None:
@@ -350,6 +357,7 @@ def _wake_on_loop(server: viser.ViserServer) -> None:
     def connected(client: Any) -> None:
         request = sockets._live_connections[client.client_id].request
         client.role_header = request.headers.get(ROLE_HEADER, "")
+        client.linked = LINK_HEADER in request.headers
         client.get_message_buffer().message_event = _LoopEvent(loop)
         _check_views(client)
 
