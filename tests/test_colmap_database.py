@@ -104,12 +104,12 @@ def test_what_colmap_could_not_register_is_solved_and_diagnosed(project: Path) -
         ("DELETE FROM images WHERE name = 'm.jpg'", "has no image 'm.jpg' of the map"),
         ("DELETE FROM keypoints WHERE image_id = 1", "'q.jpg': has no keypoints"),
         ("UPDATE keypoints SET rows = rows + 1", "not as long as it says"),
-        ("UPDATE keypoints SET rows = -1", "size is impossible"),
-        ("UPDATE two_view_geometries SET cols = 3", "size is impossible"),
-        ("UPDATE two_view_geometries SET data = zeroblob(length(data) - 1) || x'ff'", "size is impossible"),
+        ("UPDATE keypoints SET rows = -1", "of an impossible size"),
+        ("UPDATE two_view_geometries SET cols = 3", "of an impossible size"),
+        ("UPDATE two_view_geometries SET data = zeroblob(length(data) - 1) || x'ff'", "of an impossible size"),
         ("UPDATE two_view_geometries SET data = CAST(zeroblob(length(data) - 1) || x'ff' AS BLOB)", "keypoints that"),
-        ("UPDATE cameras SET model = 99", "of a model that is not known"),
-        ("UPDATE cameras SET params = x'00'", "has not the 2 parameters of EQUIRECTANGULAR"),
+        ("UPDATE cameras SET model = 99", "its model is unknown"),
+        ("UPDATE cameras SET params = x'00'", "does not have the 2 parameters of EQUIRECTANGULAR"),
     ],
 )
 def test_damaged_databases_are_a_sentence(project: Path, statement: str, said: str) -> None:
@@ -129,6 +129,6 @@ def test_damaged_databases_are_a_sentence(project: Path, statement: str, said: s
 def test_another_file_is_no_database(tmp_path: Path, project: Path) -> None:
     (tmp_path / "text.db").write_text("no database" * 100)
     model = read_model(project / "map")
-    for name, said in (("text.db", "is no database of COLMAP"), ("gone.db", "no such file"), ("map", "a folder")):
+    for name, said in (("text.db", "is not a COLMAP database"), ("gone.db", "no such file"), ("map", "a folder")):
         with pytest.raises(InputError, match=said):
             read_queries_of_database(tmp_path / name, model)

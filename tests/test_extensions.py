@@ -397,7 +397,7 @@ def test_commands_go_on(place: Path, done: list[subprocess.CompletedProcess[str]
     assert scenes.returncode == 0 and scenes.stderr == ""
     lines = {line.split()[0]: line for line in scenes.stdout.splitlines() if line.strip()}
     assert "of the extension odd-pack cannot be imported (ModuleNotFoundError" in lines["gone"]
-    assert "'number' of the extension odd-pack is 3, no function" in lines["number"]
+    assert "'number' of the extension odd-pack is 3, not a function" in lines["number"]
     assert "Loads nothing." in lines["crashing"] and "kitti360" in lines
 
     assert several.returncode == 2
@@ -409,9 +409,9 @@ def test_commands_go_on(place: Path, done: list[subprocess.CompletedProcess[str]
             "crashing.toml: the dataset 'crashing' of the extension odd-pack failed (KeyError: 'scene')",
             "gone.toml: the dataset 'gone' of the extension odd-pack cannot be imported",
             "the dataset 'late' of the extension odd-pack failed (KeyError: 'problem')",
-            "the dataset 'empty' of the extension odd-pack gave None, which is no Problem",
+            "the dataset 'empty' of the extension odd-pack gave None, which is not a Problem",
             "nothing.toml: the dataset 'nothing' of the extension odd-pack gave None, which has no name",
-            "number.toml: the dataset 'number' of the extension odd-pack is 3, no function",
+            "number.toml: the dataset 'number' of the extension odd-pack is 3, not a function",
         ),
         strict=True,
     ):
@@ -431,7 +431,7 @@ def test_commands_go_on(place: Path, done: list[subprocess.CompletedProcess[str]
             refuse,
             "the calibration reader 'refusing' of the extension odd-pack refuses it (line 1 is upside down: turn it)",
         ),
-        (refuse, f"the calibration reader 'text' {ODD} gave '# refuse\\n\\x00', which is no camera"),
+        (refuse, f"the calibration reader 'text' {ODD} gave '# refuse\\n\\x00', which is not a camera"),
         (refuse, f"the calibration reader 'gone' {ODD} cannot be imported"),
     ):
         assert ended.returncode == 2 and ended.stdout == "" and words in ended.stderr, ended
@@ -508,10 +508,7 @@ def test_the_page_the_painter_and_the_recorder_go_on(place: Path) -> None:
     assert told["recorded"] == "odd"
     assert "of the extension odd-pack failed (ZeroDivisionError: focal length)" in told["cameras"]["lens"]
     assert "of the extension odd-pack failed (KeyError: 'pixels')" in told["cameras"]["crooked"]
-    assert (
-        "calls its model 'lens'" in told["cameras"]["misnamed"]
-        and "is 3, which is no class" in told["cameras"]["number"]
-    )
+    assert "calls its model 'lens'" in told["cameras"]["misnamed"] and "is 3, not a class" in told["cameras"]["number"]
     assert told["mc"] == "spherloc.estimators.mc", "an extension cannot take the place of spherloc's own"
     assert told["table"] == ["mc", "ransac-2p"]
     assert all(f"'{name}' {ODD}" in told["compared"] for name in ("refusing", "shapeless"))

@@ -109,7 +109,7 @@ def test_nothing_is_run(tmp_path: Path, protocol: int) -> None:
 def test_what_is_no_log_is_a_sentence(content: bytes, tmp_path: Path) -> None:
     path = tmp_path / "logs.pkl"
     path.write_bytes(content)
-    with pytest.raises(InputError, match="no log of hloc") as caught:
+    with pytest.raises(InputError, match="not a log of hloc") as caught:
         read_log_poses(path)
     assert str(caught.value).startswith(f"{path}: ") and str(caught.value).isprintable()
 
@@ -118,9 +118,9 @@ def test_arrays_that_lie_are_refused() -> None:
     content = bytearray(pickle.dumps(np.arange(6.0), 4))
     at = content.index(bytes([ord("K"), 6]))
     content[at + 1] = 7
-    with pytest.raises(PickleDataError, match="none of numbers"):
+    with pytest.raises(PickleDataError, match="does not hold numbers"):
         value_of(read_pickle_data(bytes(content)))
-    with pytest.raises(PickleDataError, match="none of numbers"):
+    with pytest.raises(PickleDataError, match="does not hold numbers"):
         value_of(read_pickle_data(pickle.dumps(np.array([None, "x"], dtype=object), 4)))
 
 
@@ -175,11 +175,11 @@ def test_logs_of_both_ages_give_the_same_query(tmp_path: Path) -> None:
     ("changes", "said"),
     [
         ({"points3D_xyz": None}, "give the COLMAP model"),
-        ({"points3D_xyz": None, "points3D_ids": ["x"]}, "no numbers of points"),
+        ({"points3D_xyz": None, "points3D_ids": ["x"]}, "are not ids of points"),
         ({"keypoints_query": PROBLEM.pixels[:4]}, "has 4 keypoints but"),
-        ({"keypoints_query": np.zeros(4)}, "no array of 2 columns"),
-        ({"keypoints_query": np.array([[None, "x"]], dtype=object)}, "none of numbers"),
-        ({"PnP_ret": {"cam_from_world": pycolmap.Rigid3d()}}, "says no camera"),
+        ({"keypoints_query": np.zeros(4)}, "not an array of 2 columns"),
+        ({"keypoints_query": np.array([[None, "x"]], dtype=object)}, "does not hold numbers"),
+        ({"PnP_ret": {"cam_from_world": pycolmap.Rigid3d()}}, "has no camera"),
         ({"PnP_ret": {"success": True, "qvec": [1, 0, 0], "tvec": [0, 0, 0]}}, "qvec is not 4 numbers"),
         ({"PnP_ret": {"success": True, "qvec": [2, 0, 0, 0], "tvec": [0, 0, 0]}}, "has the length 2"),
     ],

@@ -223,7 +223,7 @@ def test_what_is_wrong_with_bearings_is_one_sentence(problem, changes, sentence)
 def test_gravity_from_an_image_refuses_what_is_no_image_of_the_camera(tmp_path):
     camera = {"model": "equirectangular", "width": 64, "height": 32}
     for image, said in (
-        (np.zeros((32, 64), np.uint8), "the image: gravity cannot be told from its lines"),
+        (np.zeros((32, 64), np.uint8), "the image: gravity cannot be found from its lines"),
         (np.zeros((32, 60), np.uint8), "60 x 32 pixels, its camera 64 x 32"),
         (np.zeros((32, 64)), "float64 of shape"),
         (tmp_path / "none.png", "none.png"),

@@ -161,7 +161,7 @@ def test_runs_and_page(tmp_path: Path, capsys):
 
 def test_results_of_others_are_refused(tmp_path):
     (tmp_path / "claims.json").write_text("[1]")
-    with pytest.raises(InputError, match=r"claims\.json: is no result of spherloc verify"):
+    with pytest.raises(InputError, match=r"claims\.json: is not a result of spherloc verify"):
         verify(tmp_path, quick=True, workers=1, scheduler=None, only=("kitti360",))
 
 

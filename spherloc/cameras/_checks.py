@@ -1,4 +1,4 @@
-"""What camera models share: checks of calibration values and coordinate arrays, ``[camera]`` tables, focal lengths."""
+"""Shared by camera models: checks of calibration values and coordinate arrays, ``[camera]`` tables, focal lengths."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -108,7 +108,7 @@ def rows(name: str, array: Any, columns: int) -> FloatArray:
 
 @dataclass(frozen=True)
 class FocalCamera:
-    """A camera with focal lengths and a principal point; what a focal length is exactly, each model says."""
+    """A camera with focal lengths and a principal point; each model defines its focal length."""
 
     model: ClassVar[str]
 
@@ -137,7 +137,7 @@ class FocalCamera:
     def project(self, points: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Pixels (N, 2) of camera-frame points (N, 3) in metres, and the mask (N,) of directions that are valid.
 
-        Valid is what the model maps to pixels of their own (see its module); other pixels are NaN.
+        A direction is valid where the model is one to one (see its module); other pixels are NaN.
         Raises ``ProblemError`` for a wrong shape.
         """
         points = rows("points", points, 3)
@@ -157,11 +157,11 @@ class FocalCamera:
         return bearings, ~np.isnan(bearings[:, 2])
 
     def _plane_points(self, points: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Where points (N, 3) are seen, in focal lengths from the principal point: x, y and which are valid, (N,)."""
+        """Projections of points (N, 3), in focal lengths from the principal point: x, y and validity, each (N,)."""
         raise NotImplementedError
 
     def _bearings(self, pixels: FloatArray) -> FloatArray:
-        """Unit bearings (N, 3) of pixels (N, 2), NaN where the lens reaches none."""
+        """Unit bearings (N, 3) of pixels (N, 2), NaN for pixels that the lens does not reach."""
         raise NotImplementedError
 
     def check_focal(self) -> None:
@@ -187,10 +187,10 @@ class FocalCamera:
         object.__setattr__(self, "distortion", coefficients("distortion", given, coefficient_names))
 
     def check_sees_image(self, rim: float, shape: str | None = None) -> None:
-        """Raise ``CalibrationError`` for a fisheye camera that can unproject no pixel of its own image.
+        """Raise ``CalibrationError`` for a fisheye camera that cannot unproject any pixel of its own image.
 
         ``rim`` is the distorted radius, in focal lengths, of the last direction that the model can invert; ``shape``
-        quotes the keys that decide on it, by default the distortion.
+        quotes the keys that determine it in the message, by default the distortion.
         """
         if not 1.0 <= rim * min(self.fx, self.fy) < inf:
             quoted = shape or f"camera key 'distortion' is {show(list(getattr(self, 'distortion', ())))}"
@@ -215,7 +215,7 @@ class FocalCamera:
             return (u - self.cx) / self.fx, (v - self.cy) / self.fy
 
     def plane_within(self, pixels: FloatArray, max_radius: float) -> tuple[FloatArray, FloatArray]:
-        """``plane``, with NaN from ``max_radius`` on."""
+        """``plane``, with NaN at and beyond the distance ``max_radius``."""
         x, y = self.plane(pixels)
         with np.errstate(all="ignore"):
             outside = ~(np.hypot(x, y) < max_radius)

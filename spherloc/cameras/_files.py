@@ -1,4 +1,4 @@
-"""Reads calibration files as documents of tables, lists and numbers, and their values with errors that say where."""
+"""Reads calibration files as tables, lists and numbers, with errors that name the place of a wrong value."""
 
 import json
 from pathlib import Path
@@ -11,10 +11,10 @@ from spherloc.errors import MAX_REASON, CalibrationError, reason, shorten, show
 from spherloc.files import read_file
 
 MAX_FILE_BYTES = 256 * 1024
-"""Calibrations take a few kilobytes, and the YAML reader minutes for megabytes."""
+"""Largest calibration file: they take a few kilobytes, and the YAML reader takes minutes for megabytes."""
 
 MAX_VALUES = 100_000
-"""Values of a YAML file with its aliases written out."""
+"""Largest number of values of a YAML file, with its aliases written out."""
 
 PIXEL_CENTRE_SHIFT = 0.5
 """Added to a principal point that counts from the centre of the top-left pixel."""
@@ -26,22 +26,22 @@ KNOWN = (
 
 
 class UnrecognisedError(CalibrationError):
-    """The file is of no kind that spherloc itself reads; an extension may know it."""
+    """The file is of a kind that spherloc itself does not read; an extension may read it."""
 
 
 class _Loader(yaml.SafeLoader):
-    """``yaml.safe_load`` without merge keys, through which a small file can take up all memory."""
+    """``yaml.safe_load`` without merge keys, with which a small file can fill the memory."""
 
     def flatten_mapping(self, node: yaml.MappingNode) -> None:
         """Leave ``<<`` as it is; it is then refused like any unknown tag."""
 
 
-# OpenCV's FileStorage: a table of rows, cols, dt and data, which is taken as such.
+# OpenCV's FileStorage: a table of rows, cols, dt and data, which is read as a plain table.
 _Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", yaml.SafeLoader.construct_yaml_map)
 
 
 def read_text(path: Path) -> str:
-    """The text of a calibration file; raises ``CalibrationError`` if there is no readable text of that size."""
+    """The text of a calibration file; raises ``CalibrationError`` if it is missing, not text, or too large."""
     try:
         content = read_file(path, MAX_FILE_BYTES)
     except FileNotFoundError:
@@ -57,7 +57,7 @@ def read_text(path: Path) -> str:
 def parse_yaml(text: str) -> Any:
     """The document of a YAML text, OpenCV's ``%YAML:1.0`` included; raises ``CalibrationError`` with the line."""
     if text.startswith("%YAML"):
-        text = f"#{text}"  # OpenCV's "%YAML:1.0" is no YAML directive; commented out, the lines keep their numbers
+        text = f"#{text}"  # OpenCV's "%YAML:1.0" is not a valid directive; as a comment it keeps the line numbers
     try:
         loader = _Loader(text)
         root = loader.get_single_node()
@@ -73,7 +73,7 @@ def parse_yaml(text: str) -> Any:
         )
         raise UnrecognisedError(f"{place} is not valid YAML ({what}): correct it.") from None
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
-        # PyYAML lets these through for impossible dates, numbers and tags, and for deep nesting.
+        # PyYAML raises these for impossible dates, numbers and tags, and for deep nesting.
         raise UnrecognisedError(f"a value is not valid YAML ({reason(error)}): correct it.") from None
 
 
@@ -82,7 +82,7 @@ def _refuse_multiplied(root: yaml.Node) -> None:
     counts: dict[int, int | None] = {}
 
     def count(node: yaml.Node) -> int:
-        """Values of a node; None while they are being counted."""
+        """Number of values of a node; None while it is being counted."""
         if id(node) not in counts:
             counts[id(node)] = None
             inner = [part for pair in node.value for part in pair] if isinstance(node, yaml.MappingNode) else node.value
@@ -148,7 +148,7 @@ def size_of(table: dict[Any, Any], key: str) -> tuple[Any, Any]:
 
 
 def _number(value: Any) -> Any:
-    """A number that YAML 1.1 takes for text: 1e-3, without a point."""
+    """The value as a number if it is one that YAML 1.1 takes for text, such as 1e-3, which has no point."""
     try:
         return float(value) if isinstance(value, str) else value
     except ValueError:

@@ -9,17 +9,17 @@ import numpy as np
 from spherloc.types import BoolArray, FloatArray
 
 RIM_MARGIN = 1e-6
-"""Share of a validity limit given up, under a thousandth of a pixel: at the limit itself nothing can be inverted."""
+"""Share by which a validity limit is reduced, less than 0.001 px: at the limit itself nothing can be inverted."""
 
 _REAL_ROOT = 1e-7
-"""Two real roots that coincide come out as a complex pair this close (about sqrt(eps)) to the real axis."""
+"""Largest imaginary part of a real root: rounding makes a double root a complex pair this close to the real axis."""
 
 
 def first_positive_root(coefficients: Sequence[float]) -> float:
     """Smallest t > 0 with 1 + c1 t + c2 t^2 + ... = 0, or inf; ``coefficients`` are c1, c2, ...
 
-    Solved for 1/t: that polynomial has the leading coefficient 1, so that vanishing coefficients cannot blow up. A
-    coefficient that overflowed gives 0.
+    The equation is solved for 1/t: that polynomial has the leading coefficient 1, so that small coefficients cause no
+    overflow. A coefficient that overflowed gives 0.
     """
     if not np.isfinite(coefficients).all():
         return 0.0
@@ -36,7 +36,7 @@ class InverseTable:
         self._nodes = nodes
         self._values = function(nodes)
         self.end = float(self._values[-1])
-        """Value at the last node: the end of what can be inverted."""
+        """Value at the last node; larger values cannot be inverted."""
 
     def __call__(self, values: FloatArray) -> FloatArray:
         """Approximate arguments (N,) that give ``values`` (N,); the last node beyond ``end``."""
@@ -45,13 +45,13 @@ class InverseTable:
 
 _TABLE_NODES = 1025
 _NEWTON_STEPS = 2
-"""Enough from a table of this size: its error of about 1e-6 rad is squared twice."""
+"""Number of Newton steps from the table: its error of about 1e-6 rad is squared twice."""
 _TOLERANCE = 1e-13
 """Residual of the curve, relative to 1 + theta_d, that counts as solved."""
 _ROUNDING = 1e-12
-"""Error of theta_d that the rounding of a pixel may cause, with some reserve, and share of theta given up for it."""
+"""Error of theta_d by the rounding of a pixel, with some reserve, and the share by which theta's limit is reduced."""
 _BISECTIONS = 60
-"""Halvings of pi down to the last digit of a double."""
+"""Number of halvings of pi down to the last digit of a double."""
 _ON_AXIS = 1e-100
 """theta_d below which a pixel is the principal point: the direction of so small a vector has no digits left."""
 
@@ -60,7 +60,7 @@ class AngleCurve:
     """Maps directions to points of a plane in focal lengths from the principal point, and back."""
 
     def __init__(self, coefficients: tuple[float, ...], largest_radius: float = inf) -> None:
-        """``coefficients`` are k1, k2, ...; the curve ends at ``largest_radius`` if it gets that far."""
+        """``coefficients`` are k1, k2, ...; the curve ends at ``largest_radius`` if it reaches it."""
         self._coefficients = coefficients
         self._largest_radius = largest_radius
 
@@ -75,7 +75,7 @@ class AngleCurve:
 
     @property
     def end(self) -> float:
-        """theta_d at ``max_angle_rad``: the end of what can be inverted."""
+        """theta_d at ``max_angle_rad``; larger values cannot be inverted."""
         return self._inverse.end
 
     def radius(self, theta: FloatArray) -> FloatArray:
@@ -138,7 +138,7 @@ class AngleCurve:
         theta = self._inverse(theta_d)
         for _ in range(_NEWTON_STEPS):
             theta -= (self.radius(theta) - theta_d) / self._slope(theta)
-        # A direction at the rim stays valid although its pixel was rounded, and its bearing stays within the rim.
+        # A direction at the rim is valid although its pixel was rounded, and its bearing is limited to the rim.
         inside = theta_d <= self._inverse.end + _ROUNDING
         rim = self.max_angle_rad * (1.0 - _ROUNDING)
         theta = np.where(inside, np.minimum(theta, rim), np.nan)

@@ -1,4 +1,4 @@
-"""What every camera model offers: pixels to unit bearings and back, with validity and a Jacobian.
+"""The interface of camera models: from pixels to unit bearings and back, with validity and a Jacobian.
 
 Camera frame: OpenCV axes (+x right, +y down, +z forward) for every model. Pixels: the centre of the
 top-left pixel is (0.5, 0.5).
@@ -18,11 +18,11 @@ MODEL_NAMES = {
     "mei": "MEI",
     "ocam": "OCamCalib",
 }
-"""What people call a model; those that are not here are called as in files, with spaces."""
+"""Names of models for users; other models are called as in files, with spaces for underscores."""
 
 
 def model_name(camera: "Camera") -> str:
-    """The camera's model as people call it."""
+    """Name of the camera's model for users."""
     return MODEL_NAMES.get(camera.model, camera.model.replace("_", " "))
 
 
@@ -35,12 +35,12 @@ class Camera(Protocol):
 
     @property
     def width(self) -> int:
-        """Of the image, pixels."""
+        """Width of the image, pixels."""
         ...
 
     @property
     def height(self) -> int:
-        """Of the image, pixels."""
+        """Height of the image, pixels."""
         ...
 
     def project(self, points: FloatArray) -> tuple[FloatArray, BoolArray]:

@@ -24,7 +24,7 @@ _ONE_CAMERA = {
     "Camera": tool_files.stella,
     "distortion_coefficients": opencv,
 }
-"""YAML files of one camera without a name, by the key at their top that gives them away."""
+"""Readers of YAML files of one camera without a name, by the top-level key by which the kind is recognised."""
 
 _YAML_KEY = re.compile(r"""["']?[\w.-]+["']?\s*:(\s|$)""")
 
@@ -32,14 +32,14 @@ _YAML_KEY = re.compile(r"""["']?[\w.-]+["']?\s*:(\s|$)""")
 def load_camera(path: str | Path, name: str | None = None) -> Camera:
     """The camera that a calibration file describes.
 
-    Recognised by content: a KITTI-360 YAML (``model_type: MEI``), a Kalibr camchain (``cam0``, ...: pinhole or omni
-    with radtan, equidistant or none, ds, eucm), the YAML of stella_vslam (``Camera``), 360Loc (``imgw``) and
-    fisheye-calib-adapter (``parameter``), that of OpenCV's samples and of ROS (``distortion_coefficients``), a Basalt
-    JSON (``value0``), OCamCalib's ``calib_results.txt`` and a TOML with a ``[camera]`` table or with its keys at the
-    top. ``name`` picks a camera of a camchain or of a Basalt JSON ("cam1"), by default its first one.
-    Principal points that count from the centre of the top-left pixel are moved by +0.5 pixels to this project's
-    convention (that centre is (0.5, 0.5)). A file of no such kind is given to the readers of other packages
-    (docs/extending.md).
+    The kind is recognised by the content: a KITTI-360 YAML (``model_type: MEI``), a Kalibr camchain (``cam0``, ...:
+    pinhole or omni with radtan, equidistant or none, ds, eucm), the YAML of stella_vslam (``Camera``), 360Loc
+    (``imgw``) and fisheye-calib-adapter (``parameter``), that of OpenCV's samples and of ROS
+    (``distortion_coefficients``), a Basalt JSON (``value0``), OCamCalib's ``calib_results.txt`` and a TOML with a
+    ``[camera]`` table or with its keys at the top. ``name`` picks a camera of a camchain or of a Basalt JSON ("cam1"),
+    by default its first one. Principal points that count from the centre of the top-left pixel are moved by +0.5 pixels
+    to this project's convention (that centre is (0.5, 0.5)). A file of another kind is given to the readers of
+    extensions (docs/extending.md).
 
     Raises ``CalibrationError``, naming the file and the place, for whatever cannot be read as a usable camera.
     """
@@ -58,7 +58,7 @@ def camera_from_table(table: Any, where: str) -> Camera:
     with located(where):
         model = value_of(table_of(table), "model")
         try:
-            # The sentence about an unknown model quotes it: a short text on one line.
+            # The message about an unknown model quotes it, so it must be a short text on one line.
             camera_class = camera_class_of(show(model).strip("'"))
         except InputError as error:
             raise CalibrationError(str(error)) from None
@@ -73,7 +73,7 @@ def camera_from_table(table: Any, where: str) -> Camera:
 
 
 def _own_kind(path: Path, name: str | None) -> Camera:
-    """The camera of a file that spherloc itself reads; raises ``UnrecognisedError`` for one of another kind."""
+    """The camera of a file of a kind that spherloc itself reads; raises ``UnrecognisedError`` for another kind."""
     text = read_text(path)
     if text.lstrip().startswith("{"):
         return _from_json(parse_json(text), name)

@@ -1,4 +1,4 @@
-"""COLMAP's camera models (src/colmap/sensor/models.h), read as this project's.
+"""Converts COLMAP's camera models (src/colmap/sensor/models.h) to this project's and back.
 
 COLMAP too puts the centre of the top-left pixel at (0.5, 0.5): principal points are taken as they are.
 """
@@ -94,11 +94,11 @@ _MODELS: dict[str, tuple[str, Callable[..., Any]]] = {
     "EQUIRECTANGULAR": ("w, h", _panorama),
     "SPHERE": ("f, cx, cy", _sphere),
 }
-"""Names of the parameters, in COLMAP's order, and what makes a camera of the size and of them."""
+"""By COLMAP's name of a model: names of the parameters, in COLMAP's order, and the function that makes the camera."""
 
 
 def colmap_camera(camera: Camera) -> tuple[str, list[float]]:
-    """Name and parameters of COLMAP's model of a camera.
+    """Name and parameters of a camera in COLMAP.
 
     Raises ``CalibrationError`` if COLMAP has none.
     """

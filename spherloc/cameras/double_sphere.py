@@ -3,7 +3,7 @@
 A bearing is moved by xi along z, as in the unified model, and then goes through that model's projection (``_unified``
 with beta = 1). Both steps can fold: the first, with xi > 1, where z = -1/xi, the second, with alpha > 1/2, where the
 moved ray has z = -d2 (1 - alpha) / alpha. With xi >= 1 the first comes first, since the moved ray never looks back.
-These are the folds themselves; the limit w2 that the paper prints is up to a few degrees off the second one.
+These are the exact folds; the limit w2 that the paper prints differs from the second one by up to a few degrees.
 """
 
 from dataclasses import dataclass
@@ -19,9 +19,9 @@ from spherloc.errors import CalibrationError
 from spherloc.types import BoolArray, FloatArray
 
 _LARGEST_XI = 1e3
-"""Far beyond any lens, for which xi is between -1 and 1."""
+"""Largest xi, far beyond that of any lens, which is between -1 and 1."""
 _TOUCHES = 1.0 - 1e-6
-"""From here on the centre counts as lying on the first sphere; this loses 0.0015 rad around straight back."""
+"""From this xi on, the second centre counts as lying on the first sphere; 0.0015 rad around -z are lost by that."""
 
 
 @dataclass(frozen=True)
@@ -54,13 +54,13 @@ class DoubleSphere(_checks.FocalCamera):
         second = eucm.max_radius(self.alpha, 1.0)
         if self.xi < _TOUCHES:
             return second
-        # At the end of the first sphere the moved ray has the sine 1 / xi, and it looks sideways where xi is 1.
+        # At the fold of the first sphere the sine of the moved ray's angle is 1 / xi; it is at 90 degrees if xi is 1.
         sine = min(1.0 / self.xi, 1.0)
         depth = self.alpha + (1.0 - self.alpha) * sqrt(1.0 - sine * sine)
         return min(sine / depth * (1.0 - RIM_MARGIN), second) if depth > 0.0 else second
 
     def _plane_points(self, points: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Valid is what lies before both folds (see the module's text)."""
+        """Directions before both folds are valid (see the module's docstring)."""
         x, y, z = points.T
         norm = np.hypot(np.hypot(x, y), z)
         mx, my, valid = eucm.plane_points(x, y, z + self.xi * norm, self.alpha, 1.0)
@@ -78,12 +78,13 @@ class DoubleSphere(_checks.FocalCamera):
         moved = eucm.rays(mx, my, self.alpha, 1.0)
         jacobian = eucm.rays_jacobian(mx, my, self.alpha, 1.0) / (self.fx, self.fy)
         root, reach = self._first_sphere(moved)
-        # d reach = xi reach / root dz, where dz is that of the moved ray
+        # d reach = xi reach / root dz, with z of the moved ray
         longer = (self.xi / root)[:, None, None] * moved[:, :, None] * jacobian[:, None, 2, :]
         return reach[:, None, None] * (jacobian + longer)
 
     def _first_sphere(self, moved: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Where unit rays (N, 3) from (0, 0, -xi) meet the unit sphere: the root in the solution, and the distance."""
+        """Intersection of unit rays (N, 3) from (0, 0, -xi) with the unit sphere: the square root in the solution of
+        the quadratic equation, and the distance along the ray."""
         sine_squared = moved[:, 0] ** 2 + moved[:, 1] ** 2
         root = np.sqrt(1.0 - self.xi**2 * sine_squared)
         return root, self.xi * moved[:, 2] + root

@@ -1,7 +1,7 @@
 """Equirectangular panorama (Sec. IV-B.3, Eq. 15-17), the same as COLMAP's EQUIRECTANGULAR.
 
-The paper's vertical is z (Eq. 17), while the yaw of Eq. 1 turns about y. It is permuted here, once: x_paper = z,
-y_paper = x, z_paper = -y. The centre of the image looks along +z, its right half at +x, its lower half at +y.
+The paper's vertical axis is z (Eq. 17), while the yaw of Eq. 1 turns about y. The axes are permuted here, once:
+x_paper = z, y_paper = x, z_paper = -y. The centre of the image shows +z, its right half +x, its lower half +y.
 """
 
 from dataclasses import dataclass
@@ -49,7 +49,7 @@ class Equirectangular:
             u = (np.arctan2(x, z) / tau + 0.5) * self.width
             v = (np.arctan2(y, horizontal) / pi + 0.5) * self.height
             u[u >= self.width] = 0.0
-            # An image ends before its height, and the pole straight below is part of its last row.
+            # Pixels must be less than the height, so the pole straight below is moved into the last row.
             pixels = np.column_stack([u, np.minimum(v, nextafter(self.height, 0.0))])
         pixels[~valid] = np.nan
         return pixels, valid

@@ -1,6 +1,6 @@
-"""Camera models and calibration readers of other packages: tried before anything relies on them.
+"""Camera models and calibration readers of extensions: each is tried before anything relies on it.
 
-What checks values and arrays of spherloc's own models is to be had from here too.
+The checks of values and arrays of spherloc's own models can be imported from here too.
 """
 
 from collections.abc import Callable
@@ -29,43 +29,43 @@ __all__ = [
 ]
 
 Reader = Callable[[Path, str | None], Camera | None]
-"""A calibration reader: gets the path of a file that exists and that spherloc itself does not recognise, and the name
-of the camera that is asked for, or None for the first or only one.
+"""A calibration reader: its arguments are the path of an existing file that spherloc itself does not recognise, and the
+name of the wanted camera, or None for the first or only one.
 
-Gives the camera, its principal point in this project's convention (the centre of the top-left pixel is (0.5, 0.5)), or
-None for a file of another kind. Raises ``CalibrationError``, one sentence without the file's name, for a file of its
-kind that describes no usable camera.
+It returns the camera, with its principal point in this project's convention (the centre of the top-left pixel is
+(0.5, 0.5)), or None for a file of another kind. It raises ``CalibrationError``, one sentence without the file's name,
+for a file of its kind that does not describe a usable camera.
 """
 
 
 def camera_class_of(model: str) -> type[Camera]:
     """The class registered for a camera model.
 
-    Raises ``InputError`` if there is none, or if it is an extension that is no camera model.
+    Raises ``InputError`` if there is none, or if an extension's object is not a camera model.
     """
     found = registry.lookup("cameras", model)
     missing = [name for name in ("project", "unproject", "unprojection_jacobian", "to_dict", "from_dict")
                if not callable(getattr(found, name, None))]  # fmt: skip
     if not isinstance(found, type) or missing:
-        what = f"{show(found)}, which is no class" if not isinstance(found, type) else f"without {', '.join(missing)}"
+        what = f"{show(found)}, not a class" if not isinstance(found, type) else f"without {', '.join(missing)}"
         raise InputError(f"{registry.title('cameras', model)} is {what}; tell its authors.")
     if getattr(found, "model", None) != model:
         raise InputError(
-            f"{registry.title('cameras', model)} calls its model {show(getattr(found, 'model', None))}; both must be "
-            "one name, tell its authors."
+            f"{registry.title('cameras', model)} calls its model {show(getattr(found, 'model', None))}; both names "
+            "must be equal, tell its authors."
         )
     return found
 
 
 def tried(camera: Any, model: str) -> Camera:
-    """The camera of an extension's model, after its methods were called once each.
+    """The camera of an extension's model, after each of its methods was called once.
 
-    Raises ``InputError`` if it is no camera: later, an exception of a method would not be known as the extension's.
+    Raises ``InputError`` if it is not a camera: of a later exception one would not know that it is the extension's.
     """
     what = registry.title("cameras", model)
     with registry.guarded("cameras", model):
         if not isinstance(camera, Camera):
-            raise InputError(f"{what} made {show(camera)}, which is no camera; tell its authors.")
+            raise InputError(f"{what} made {show(camera)}, which is not a camera; tell its authors.")
         pixels = np.array([[0.5, 0.5], [camera.width / 2, camera.height / 2], [np.nan, 0.0]])
         points = np.array([[0.0, 0.0, 1.0], [0.1, -0.2, 2.0], [1.0, 1.0, -1.0], [0.0, 0.0, 0.0]])
         for name, found, shapes in (
@@ -82,18 +82,18 @@ def tried(camera: Any, model: str) -> Camera:
 
 
 def reader_of(name: str) -> Reader:
-    """A registered calibration reader; raises ``InputError`` if it cannot be imported or is no function."""
+    """A registered calibration reader; raises ``InputError`` if it cannot be imported or is not a function."""
     found = registry.lookup("calibrations", name)
     if not callable(found):
-        raise InputError(f"{registry.title('calibrations', name)} is {show(found)}, no function; tell its authors.")
+        raise InputError(f"{registry.title('calibrations', name)} is {show(found)}, not a function; tell its authors.")
     return cast(Reader, found)
 
 
 def read_by_extensions(path: Path, name: str | None, unknown: str) -> Camera:
-    """The camera that the first registered reader finds in a file, by the alphabet of their names.
+    """The camera that the first of the registered readers, in alphabetical order, finds in a file.
 
-    Raises ``CalibrationError``, without the file's name: ``unknown``, which says that spherloc does not know the file,
-    and why readers refused it, if some did.
+    Raises ``CalibrationError``, without the file's name: the text ``unknown``, which says that spherloc does not know
+    the kind of file, and the reasons of readers that refused it.
     """
     refusals: list[str] = []
     for key in registry.names("calibrations"):
@@ -105,7 +105,7 @@ def read_by_extensions(path: Path, name: str | None, unknown: str) -> Camera:
                 continue
             if isinstance(found, Camera):
                 return found
-            refusals.append(f"{what} gave {show(found)}, which is no camera")
+            refusals.append(f"{what} gave {show(found)}, which is not a camera")
         except CalibrationError as error:
             refusals.append(f"{what} refuses it ({_clause(error)})")
         except SpherlocError as error:

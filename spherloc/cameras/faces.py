@@ -19,9 +19,10 @@ from spherloc.types import BoolArray, ByteArray, FloatArray
 FloatImage = NDArray[np.float32]
 
 FIELD_OF_VIEW_DEG = 80.0
-"""Of each face, along both sides: what belongs to it and a border of two degrees at least."""
+"""Width and height of each face: the directions that belong to it and a border of at least two degrees."""
 RIM_PX = 2
-"""What lies between two faces is found by one of them, even if each places it a little beyond itself."""
+"""Width of the rim that a face shares with its neighbours, in its pixels: a feature between two faces is then found by
+one of them, even if each places it a little outside itself."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +35,7 @@ class Faces:
     size_px: int
     """Width and height of a face."""
     focal_px: float
-    """The principal point is the centre of the face, (size_px / 2, size_px / 2)."""
+    """Focal length, px; the principal point is the centre of the face, (size_px / 2, size_px / 2)."""
 
     def __len__(self) -> int:
         return len(self.face_from_camera)
@@ -46,15 +47,15 @@ class Faces:
         return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
     def nearest(self, bearings: FloatArray) -> NDArray[np.int64]:
-        """(N,) the face that each bearing (N, 3) belongs to."""
+        """Indices (N,) of the faces to which bearings (N, 3) belong."""
         return (bearings @ self.face_from_camera[:, 2].T).argmax(axis=1)
 
     def cut(self, face: int, image: ByteArray, usable: ByteArray) -> tuple[ByteArray, ByteArray, BoolArray]:
-        """A face of a panorama (H, W) or (H, W, 3) with non-zero ``usable`` pixels (H, W).
+        """A face of a panorama (H, W) or (H, W, 3), whose usable pixels are those where ``usable`` (H, W) is not zero.
 
-        Returns its image and its usable pixels, of ``size_px`` each, and the mask of those that belong to it, with a
-        rim of ``RIM_PX`` that its neighbours have too. The image given may be smaller or larger than the panorama's
-        camera says.
+        Returns the face's image and its usable pixels, ``size_px`` wide and high, and the mask of the pixels that
+        belong to it, with a rim of ``RIM_PX`` that belongs to its neighbours too. The given image may have another size
+        than the panorama's camera.
         """
         u, v, own = _lookup(self, face, usable.shape[1], usable.shape[0])
         drawn = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
@@ -64,13 +65,14 @@ class Faces:
 
 @lru_cache(maxsize=12)
 def _lookup(faces: Faces, face: int, width: int, height: int) -> tuple[FloatImage, FloatImage, BoolArray]:
-    """Columns and rows (S, S) of an image where OpenCV finds the pixels of a face; those that are its own, with rim."""
+    """Columns and rows (S, S) in an image, as OpenCV counts them, of a face's pixels, and the mask of its own
+    pixels with the rim."""
     centres = np.arange(faces.size_px) + 0.5
     grid = np.column_stack([part.ravel() for part in np.meshgrid(centres, centres)]).astype(np.float64)
     bearings = faces.bearings(face, grid)
     pixels, _ = Equirectangular(width, height).project(bearings)
     shape = (faces.size_px, faces.size_px)
-    # OpenCV's first pixel has its centre at 0; the rows end at the poles, the columns go round.
+    # OpenCV's first pixel has its centre at 0; rows end at the poles, columns wrap around.
     u = (pixels[:, 0] - 0.5).astype(np.float32).reshape(shape)
     v = (pixels[:, 1] - 0.5).clip(0, height - 1).astype(np.float32).reshape(shape)
     own = (faces.nearest(bearings) == face).reshape(shape).astype(np.uint8)
@@ -81,7 +83,7 @@ def _lookup(faces: Faces, face: int, width: int, height: int) -> tuple[FloatImag
 def panorama_faces(panorama: Equirectangular, sharpness: float, most_pixels: int) -> Faces:
     """The faces of a panorama.
 
-    ``sharpness`` is how many of a face's pixels, at its centre, one pixel of the panorama's horizon becomes; it is
+    ``sharpness`` is the number of pixels at a face's centre per pixel of the panorama's horizon, along one axis; it is
     lowered so that all faces together have at most ``most_pixels``.
     """
     half = tan(radians(FIELD_OF_VIEW_DEG / 2))
@@ -103,7 +105,7 @@ _ICOSAHEDRON = (
 
 
 def _upright(latitude: float, longitude: float) -> FloatArray:
-    """Rotation (3, 3) to a face that looks there, its columns along the meridian of the panorama."""
+    """Rotation (3, 3) to the face that looks in that direction, with its columns along the panorama's meridian."""
     east = np.array([cos(longitude), 0.0, -sin(longitude)])
     axis = np.array([cos(latitude) * sin(longitude), -sin(latitude), cos(latitude) * cos(longitude)])
     return np.stack([east, np.cross(axis, east), axis])

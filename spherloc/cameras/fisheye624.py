@@ -3,7 +3,7 @@
 It is COLMAP's RAD_TAN_THIN_PRISM_FISHEYE. A bearing at the angle theta goes to the radius theta_d, as with
 Kannala-Brandt, at a point q of the plane, and q is then moved by the tangential and prism terms d(q). The derivative
 of d has a norm of at most 1/2 within a disc, ``_prism_radius``; there q + d(q) is one to one, and repeating
-q = m - d(q), kept in the disc, always leads to the one q of a point m. All that is valid lies within that disc, which
+q = m - d(q), kept in the disc, always leads to the one q of a point m. All valid points lie within that disc, which
 for real lenses is far wider than the image.
 """
 
@@ -19,11 +19,11 @@ from spherloc.cameras._radial import AngleCurve, first_positive_root
 from spherloc.types import BoolArray, FloatArray
 
 _FARTHEST = 1e3
-"""Largest disc: no image is a thousand focal lengths wide."""
+"""Largest radius of the disc, focal lengths: no image is a thousand focal lengths wide."""
 _NEWTON_STEPS = 4
-"""Enough for real lenses, whose prism terms are a few thousandths."""
+"""Number of Newton steps: enough for real lenses, whose prism terms are a few thousandths."""
 _PATIENT_STEPS = 60
-"""Each step at least halves the error."""
+"""Number of contracting steps, each of which at least halves the error."""
 _TOLERANCE = 1e-13
 """Residual of q + d(q) = m, relative to 1 + |m|, that counts as solved."""
 
@@ -48,7 +48,7 @@ class Fisheye624(_checks.FocalCamera):
         return self._curve.max_angle_rad
 
     def _plane_points(self, points: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Valid is what is within ``max_angle_rad`` of the optical axis."""
+        """Directions within ``max_angle_rad`` of the optical axis are valid."""
         x, y, valid = self._curve.plane(points)
         dx, dy = self._shift(x, y)
         return x + dx, y + dy, valid

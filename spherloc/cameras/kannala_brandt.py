@@ -2,7 +2,7 @@
 
 Eq. 5-7 go through tan(theta) and end at 90 degrees. The bearing here is
 v = (sin(theta) x0 / theta_d, sin(theta) y0 / theta_d, cos(theta)), the same direction without that end.
-theta_d(theta) grows only up to its first maximum: directions beyond it fall back onto pixels of others and are invalid.
+theta_d(theta) grows only up to its first maximum: directions beyond it have the pixels of others and are invalid.
 """
 
 from dataclasses import dataclass
@@ -39,11 +39,11 @@ class KannalaBrandt(_checks.FocalCamera):
         return self._curve.max_angle_rad
 
     def _plane_points(self, points: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Valid is what is within ``max_angle_rad`` of the optical axis."""
+        """Directions within ``max_angle_rad`` of the optical axis are valid."""
         return self._curve.plane(points)
 
     def _bearings(self, pixels: FloatArray) -> FloatArray:
-        """Eq. 3 to 7."""
+        """Unit bearings (N, 3) of pixels (N, 2) by Eq. 3 to 7; NaN beyond the rim."""
         return self._curve.bearings(*self.plane(pixels))
 
     def unprojection_jacobian(self, pixels: FloatArray) -> FloatArray:

@@ -4,7 +4,7 @@ A bearing is moved by xi along z and divided by its new depth (Eq. 11-12): a poi
 distortion (Eq. 8) then moves that point. Both steps can fold: with xi > 1 the plane point turns back where z = -1/xi,
 and the distortion where its Jacobian stops being positive definite. That Jacobian is symmetric, the Hessian of a
 potential; on a disc where it is positive definite the distortion is the gradient of a strictly convex function and
-therefore one to one. Such a disc, of the radius ``max_radius``, holds all that is valid.
+therefore one to one. All valid points lie in such a disc, of the radius ``max_radius``.
 """
 
 from dataclasses import dataclass
@@ -22,12 +22,12 @@ from spherloc.types import BoolArray, FloatArray
 _FARTHEST = 1e3
 """Largest ``max_radius``: with xi <= 1 the plane has no end, but no image is a thousand focal lengths wide."""
 _LARGEST_XI = 1e3
-"""Far beyond any lens, for which xi is a few at most."""
+"""Largest xi, far beyond that of any lens, which is a few at most."""
 _TABLE_NODES = 1025
 _NEWTON_STEPS = 3
-"""Enough from a table of this size for the tangential terms of real lenses."""
+"""Number of Newton steps from the table: enough for the tangential terms of real lenses."""
 _PATIENT_STEPS = 40
-"""Next to a fold each step only halves the error."""
+"""Number of steps next to a fold, where each step only halves the error."""
 _TOLERANCE = 1e-13
 """Residual of Eq. 8, relative to 1 + the distorted radius, that counts as solved."""
 
@@ -71,7 +71,7 @@ class Mei(_checks.FocalCamera):
         return min(fold, _FARTHEST) * (1.0 - RIM_MARGIN)
 
     def _plane_points(self, points: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Valid is what lies before both folds (see the module's text)."""
+        """Directions before both folds are valid (see the module's docstring)."""
         px, py, pz = points.T
         norm = np.hypot(np.hypot(px, py), pz)
         depth = pz + self.xi * norm
@@ -80,12 +80,12 @@ class Mei(_checks.FocalCamera):
         return *self._distort(x, y), valid
 
     def _bearings(self, pixels: FloatArray) -> FloatArray:
-        """Eq. 8, 13, 14."""
+        """Unit bearings (N, 3) of pixels (N, 2) by Eq. 8, 13, 14; NaN beyond the rim."""
         x, y = self._undistort(pixels)
         s = x * x + y * y
         root = np.sqrt(1.0 + s * (1.0 - self.xi**2))
         scale = (self.xi + root) / (1.0 + s)
-        # Eq. 14 has z = scale - xi; this form of it does not cancel for a large xi.
+        # Eq. 14 has z = scale - xi; this form has no cancellation for a large xi.
         return np.column_stack([scale * x, scale * y, (root - self.xi * s) / (1.0 + s)])
 
     def unprojection_jacobian(self, pixels: FloatArray) -> FloatArray:
@@ -111,13 +111,13 @@ class Mei(_checks.FocalCamera):
     @cached_property
     def _inverse(self) -> InverseTable:
         k1, k2, _, _ = self.distortion
-        # Nodes at equal angles, since the disc may be without end.
+        # Nodes at equal angles, since the radius of the disc may be infinite.
         nodes = np.tan(np.linspace(0.0, atan(self.max_radius), _TABLE_NODES))
         return InverseTable(lambda r: r * (1.0 + r * r * (k1 + k2 * r * r)), nodes)
 
     @cached_property
     def _reach(self) -> float:
-        """No valid point has a larger distorted radius: the tangential terms add at most 3 r^2 hypot(p1, p2)."""
+        """Upper limit of the distorted radius of valid points: the tangential terms add at most 3 r^2 hypot(p1, p2)."""
         return self._inverse.end + 3.0 * self.max_radius**2 * hypot(*self.distortion[2:])
 
     def _distort(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -1,10 +1,10 @@
 """OCamCalib's polynomial (Scaramuzza, Martinelli, Siegwart: A Toolbox for Easily Calibrating Omnidirectional Cameras,
-IROS 2006), for fisheyes and mirrors with one centre.
+IROS 2006), for fisheye lenses and mirrors with one centre of projection.
 
 A pixel minus the principal point is an affine image of a point (x, y) at the distance r from the axis, in pixels, whose
 ray is (x, y, f(r)) with f(r) = a0 + a1 r + a2 r^2 + ... (Eq. 3). The angle to the axis grows with r as long as
-f(r) - r f'(r) > 0; there the model ends, and at the image's farthest corner, beyond which nothing was calibrated. The
-toolbox's second polynomial is a fit of the inverse; here the first one is inverted itself, to the last digits.
+f(r) - r f'(r) > 0; the model ends there or at the image's farthest corner, beyond which nothing was calibrated. The
+toolbox's second polynomial is a fit of the inverse; here the first one is inverted numerically, to the last digits.
 """
 
 from dataclasses import dataclass
@@ -20,13 +20,13 @@ from spherloc.errors import CalibrationError, show
 from spherloc.types import BoolArray, FloatArray
 
 MAX_TERMS = 16
-"""Coefficients of the polynomial; the toolbox takes five."""
+"""Largest number of coefficients of the polynomial; the toolbox uses five."""
 _TABLE_NODES = 1025
 _NEWTON_STEPS = 3
 _BISECTIONS = 60
 _TOLERANCE_RAD = 1e-14
 _ROUNDING = 1e-12
-"""Share of the angle at the end of the model that the rounding of a pixel may cause."""
+"""Relative error of the angle at the end of the model by the rounding of a pixel."""
 _MIN_DETERMINANT = 0.1
 
 
@@ -102,7 +102,7 @@ class Ocam:
         return min(fold, farthest * (1.0 + RIM_MARGIN) + 1.0)
 
     def _plane(self, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """x and y, (N,) each, of pixels (N, 2)."""
+        """x and y, (N,) each, px, of pixels (N, 2) in the plane before the affine map."""
         u, v = _checks.rows("pixels", pixels, 2).T
         a11, a12, a21, a22 = self.affine
         east, south = u - self.cx, v - self.cy
@@ -117,7 +117,7 @@ class Ocam:
         return depth, slope
 
     def _angle(self, radius: FloatArray) -> FloatArray:
-        """(N,) to the optical axis, rad, at distances (N,)."""
+        """Angles (N,) to the optical axis, rad, at distances (N,) px from it."""
         return np.arctan2(radius, self._depth(radius)[0])
 
     @cached_property
@@ -133,7 +133,7 @@ class Ocam:
         for _ in range(_NEWTON_STEPS):
             depth, slope = self._depth(radius)
             radius = radius + (theta - np.arctan2(radius, depth)) * (radius**2 + depth**2) / (depth - radius * slope)
-        # Newton may jump where the angle nearly stands still.
+        # Newton's method may diverge where the angle hardly changes.
         hard = inside & ~(np.abs(self._angle(radius) - theta) <= _TOLERANCE_RAD) | (radius > self.max_radius)
         if hard.any():
             low, high = np.zeros(int(hard.sum())), np.full(int(hard.sum()), self.max_radius)
@@ -147,7 +147,7 @@ class Ocam:
     def project(self, points: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Pixels (N, 2) of camera-frame points (N, 3) in metres, and the mask (N,) of directions that are valid.
 
-        Valid is what lies before the fold and within the circle about the image; other pixels are NaN. Raises
+        Directions before the fold and within the circle around the image are valid; other pixels are NaN. Raises
         ``ProblemError`` for a wrong shape.
         """
         points = _checks.rows("points", points, 3)

@@ -10,7 +10,7 @@ from spherloc.cameras.ocam import MAX_TERMS, Ocam
 from spherloc.errors import CalibrationError, show
 
 MARK = "ocam_model.ss"
-"""In the file's first comment."""
+"""Text in the file's first comment."""
 _PARTS = (
     "the polynomial of cam2world",
     "that of world2cam",
@@ -29,7 +29,7 @@ def is_ocam(text: str) -> bool:
 def ocam(text: str) -> Ocam:
     """The camera of such a file; the inverse polynomial, a fit, is not used.
 
-    Raises ``CalibrationError``, with the line, for what is missing or no number.
+    Raises ``CalibrationError``, with the line, if a part is missing or a word is not a number.
     """
     lines = [(number, line.split()) for number, line in enumerate(text.splitlines(), start=1)]
     lines = [(number, words) for number, words in lines if words and not words[0].startswith("#")]

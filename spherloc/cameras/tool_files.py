@@ -35,13 +35,13 @@ from spherloc.errors import CalibrationError, show
 from spherloc.types import FloatArray
 
 STELLA_PREFIX = "Camera."
-"""In front of OpenVSLAM's keys, where stella_vslam has a section."""
+"""Prefix of OpenVSLAM's keys; stella_vslam has a section instead."""
 
 _NO_LENS = (0.0, 0.0, 0.0, 0.0)
 
 
 def kitti360(document: dict[Any, Any], name: str | None) -> Camera:
-    """MEI with gamma1, gamma2, u0, v0; raises ``CalibrationError`` for what is no such file."""
+    """The camera of a KITTI-360 file: MEI with gamma1, gamma2, u0, v0. Raises ``CalibrationError`` for another file."""
     if document["model_type"] != "MEI":
         raise CalibrationError(f"the model_type {show(document['model_type'])} is not supported: give MEI.")
     own_name = document.get("camera_name")
@@ -57,13 +57,13 @@ def kitti360(document: dict[Any, Any], name: str | None) -> Camera:
 def basalt(document: dict[Any, Any], name: str | None) -> Camera:
     """A camera of a Basalt JSON; they have no names there and are called cam0, cam1, ... in their order.
 
-    Raises ``CalibrationError`` for what is no such file.
+    Raises ``CalibrationError`` for another file.
     """
     with located("value0"):
         rig = table_of(document["value0"])
         cameras, sizes = value_of(rig, "intrinsics"), value_of(rig, "resolution")
         if not isinstance(cameras, list) or not isinstance(sizes, list) or not 1 <= len(cameras) == len(sizes):
-            raise CalibrationError("keys 'intrinsics' and 'resolution' are no lists with an entry a camera: add them.")
+            raise CalibrationError("keys 'intrinsics' and 'resolution' must be lists with an entry a camera: add them.")
         names = [f"cam{number}" for number in range(len(cameras))]
         if name is not None and name not in names:
             raise CalibrationError(f"has no camera {show(name)}: choose one of {', '.join(names)}.")
@@ -81,7 +81,7 @@ def basalt(document: dict[Any, Any], name: str | None) -> Camera:
 def stella(document: dict[Any, Any]) -> Camera:
     """The ``Camera`` section of stella_vslam, or OpenVSLAM's keys ``Camera.model``, ``Camera.fx``, ...
 
-    Raises ``CalibrationError`` for what is no such file.
+    Raises ``CalibrationError`` for another file.
     """
     dotted = {
         key.removeprefix(STELLA_PREFIX): value for key, value in document.items() if str(key).startswith(STELLA_PREFIX)
@@ -114,9 +114,9 @@ def loc360(document: dict[Any, Any]) -> Camera:
 
 
 def adapter(document: dict[Any, Any]) -> Camera:
-    """A file of fisheye-calib-adapter, which names no model: it is known by its keys.
+    """The camera of a file of fisheye-calib-adapter, which names no model: the model is recognised by its keys.
 
-    Raises ``CalibrationError`` for what is no such file.
+    Raises ``CalibrationError`` for another file.
     """
     image = value_of(document, "image")
     with located("image"):
@@ -127,7 +127,7 @@ def adapter(document: dict[Any, Any]) -> Camera:
             if all(key in table for key in keys):
                 return build(size, table)
         raise CalibrationError(
-            f"the keys {show(sorted(map(str, table)))} are those of no supported model: "
+            f"the keys {show(sorted(map(str, table)))} are not those of a supported model: "
             "give the Kannala-Brandt, double sphere, EUCM, OCamCalib or radtan file."
         )
 
@@ -176,7 +176,7 @@ def _perspective(size: Size, table: dict[Any, Any]) -> Camera:
 
 
 def _ocam(size: Size, table: dict[Any, Any]) -> Camera:
-    """Its axes are those of the image, unlike OCamCalib's own: u = c x + d y + cx, v = e x + y + cy, z ahead."""
+    """The adapter's form of OCamCalib, with the image's axes: u = c x + d y + cx, v = e x + y + cy, z forward."""
     c, d, e, cx, cy = numbers_of(table, "c", "d", "e", "cx", "cy")
     with located("coefficients"):
         polynomial = value_of(table_of(table["coefficients"]), "unprojection")
@@ -240,7 +240,7 @@ def read_kalibr_chain(path: str | Path) -> dict[str, KalibrCamera]:
 
 
 def chain_tables(document: Any) -> dict[str, Any]:
-    """The cameras of a camchain in the order of the file; empty if it is none."""
+    """The cameras of a camchain in the order of the file; empty for another file."""
     if not isinstance(document, dict):
         return {}
     return {key: table for key, table in document.items() if isinstance(key, str) and re.fullmatch(r"cam\d+", key)}
@@ -324,26 +324,26 @@ def _rigid(table: dict[Any, Any], key: str) -> FloatArray | None:
         error = np.abs(rotation @ rotation.T - np.eye(3)).max()
         right_handed = np.linalg.det(rotation) > 0.0
     if not (error < _ROTATION_TOLERANCE and right_handed and (matrix[3] == (0.0, 0.0, 0.0, 1.0)).all()):
-        raise CalibrationError(f"key '{key}' is no rotation with a translation: give a rigid 4 x 4 matrix.")
+        raise CalibrationError(f"key '{key}' is not a rotation with a translation: give a rigid 4 x 4 matrix.")
     return matrix
 
 
 _FISHEYE, _RADIAL = {"equidistant", "fisheye"}, {"plumb_bob", "radtan"}
 """Values of ``distortion_model``."""
 _MAX_SKEW = 1e-6
-"""Of the focal length."""
+"""Largest skew of a camera matrix, as a share of the focal length."""
 
 
 def opencv(document: dict[Any, Any]) -> Camera:
     """A pinhole, a fisheye (``fisheye_model: 1``, or ROS's ``distortion_model: equidistant``) or MEI (``xi``).
 
-    Raises ``CalibrationError`` for what is no such file, and where four coefficients may be those of either lens.
+    Raises ``CalibrationError`` for another file, and if its four coefficients may be those of a fisheye or a pinhole.
     """
     size = value_of(document, "image_width"), value_of(document, "image_height")
     with located("camera_matrix"):
         fx, skew, cx, zero, fy, cy, *last = _matrix(value_of(document, "camera_matrix"), 9)
         if abs(skew) > _MAX_SKEW * abs(fx) or (zero, *last) != (0.0, 0.0, 0.0, 1.0):
-            raise CalibrationError("is no matrix [fx 0 cx; 0 fy cy; 0 0 1]: give one without skew.")
+            raise CalibrationError("is not a matrix [fx 0 cx; 0 fy cy; 0 0 1]: give one without skew.")
     with located("distortion_coefficients"):
         lens = _matrix(document["distortion_coefficients"], None)
     middle = cx + PIXEL_CENTRE_SHIFT, cy + PIXEL_CENTRE_SHIFT
@@ -402,5 +402,5 @@ def _matrix(value: Any, count: int | None) -> list[float]:
 
 
 def _names(data: Any) -> str:
-    """As many names as a list has entries, which ``list_of`` then checks one by one."""
+    """Names m0, m1, ..., one for each entry of a list, for the messages of ``list_of``."""
     return ", ".join(f"m{place}" for place in range(min(len(data), 100))) if isinstance(data, list) else "m0"

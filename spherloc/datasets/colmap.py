@@ -1,8 +1,8 @@
 """COLMAP: some images of a model are localized against the others.
 
-Queries are no references, and their poses in the model are the truth. Points that only the queries made possible are
-left out; the others, and all poses, stay as the adjustment of the whole model left them. Lengths are those of the
-model.
+A query is never a reference, and its pose in the model is the truth. Points that only the queries made possible are
+left out; the other points, and all poses, stay as the adjustment of the whole model left them. Lengths are in the
+model's unit.
 """
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -26,11 +26,11 @@ from spherloc.geometry import camera_centre
 from spherloc.types import BoolArray, FloatArray, IntArray
 
 _KEPT = 64
-"""Images whose observations stay in memory, those used last."""
+"""Number of images whose observations stay in memory: those used last."""
 _MIN_AGREEMENT = 0.9
-"""Length of the mean of the cameras' +y axes: 0.9 where all tilt by 25 degrees."""
+"""Least length of the mean of the cameras' unit +y axes: it is 0.9 where all tilt by 25 degrees."""
 _MIN_ANGLE_DEG = 1.5
-"""Between the rays to a point: COLMAP's mapper removes points below it (``filter_min_tri_angle``)."""
+"""Least angle between the rays to a point: COLMAP's mapper removes points below it (``filter_min_tri_angle``)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +118,7 @@ def _observed(model: ColmapModel, name: str) -> IntArray:
 
 
 def some(names: Sequence[str], what: str) -> str:
-    """How many, and the first three by name: "5 images (a, b, c, ...)"."""
+    """Their number, and the names of the first three: "5 images (a, b, c, ...)"."""
     plural = what if len(names) == 1 else f"{what}s"
     return f"{len(names)} {plural} ({', '.join(map(shorten, names[:3]))}{', ...' if len(names) > 3 else ''})"
 
@@ -131,7 +131,7 @@ def split_gravity(table: Mapping[str, Any], where: str) -> tuple[dict[str, Any],
 
 
 def unit_vector(value: Any, key: str, where: str) -> FloatArray:
-    """A vector (3,) of a scene file, scaled to length 1; raises ``InputError`` if it has none."""
+    """A vector (3,) of a scene file, scaled to length 1; raises ``InputError`` if its length is zero or not finite."""
     vector = scene_file.numbers(value, (3,), key, where)
     length = float(np.linalg.norm(vector))
     if not 1e-3 < length < 1e3:

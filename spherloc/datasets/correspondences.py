@@ -47,7 +47,7 @@ bound_px = 4
 COLUMNS = ("u", "v", "X", "Y", "Z")
 MAX_CSV_BYTES = 200_000_000
 LARGEST = 1e9
-"""Of any number, px or m: larger ones overflow in squares and products."""
+"""Largest absolute value of any number, px or m: larger ones overflow in squares and products."""
 
 
 @dataclass(frozen=True, eq=False)

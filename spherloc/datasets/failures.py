@@ -39,9 +39,9 @@ class FailureCase:
     cause: str
     """Value of ``spherloc.diagnosis.Cause``."""
     problem: Problem
-    """With truth and labels."""
+    """The problem, with truth and labels."""
     estimator: str
-    """Registered name."""
+    """Registered name of the estimator."""
     options: Mapping[str, Any]
     """The estimator's options that differ from its defaults for this problem."""
     seed: int
@@ -73,11 +73,11 @@ class CaseMaker:
         return pose(rotation, -rotation @ centre)
 
     def between(self, low: float, high: float) -> float:
-        """From ``low`` to ``high``, uniformly."""
+        """A random number from ``low`` to ``high``, uniformly distributed."""
         return float(self.rng.uniform(low, high))
 
     def whole(self, low: int, high: int) -> int:
-        """From ``low`` to ``high``, both included."""
+        """A random whole number from ``low`` to ``high``, both included."""
         return int(self.rng.integers(low, high + 1))
 
     def cube(self, rng: np.random.Generator, count: int) -> FloatArray:
@@ -165,13 +165,13 @@ class CaseMaker:
 
 @cache
 def cameras() -> tuple[Camera, ...]:
-    """Those of the scenes ``SCENES``."""
+    """The cameras of the scenes ``SCENES``."""
     scenes = bundled_scenes()
     return tuple(load_scene(scenes[name]).problem().camera for name in SCENES)
 
 
 GUESSES = 100
-"""Pairs that mc-exact samples with the least effort."""
+"""Number of pairs that mc-exact samples with the least effort."""
 
 
 def _ok(make: CaseMaker) -> FailureCase:
@@ -206,7 +206,7 @@ def _wrong_reference(make: CaseMaker) -> FailureCase:
 
 
 def _map_too_sparse(make: CaseMaker) -> FailureCase:
-    """As too few right ones, and 30 to 120 more matches agree between the images but have no point in the map."""
+    """Too few right matches, as above, and 30 to 120 more that agree between the images but have no map point."""
     make.right(make.whole(2, 3))
     make.random(make.whole(40, 105))
     return make.case("map too sparse", verified_without_point=make.whole(30, 120))
@@ -410,7 +410,7 @@ CUBE = "cube"
 MAX_MATCHES = 2_000
 NEAR_M = 0.5
 NEAR_YAW_DEG = 5.0
-"""How far a pose that passes for the true one is from it."""
+"""Distance and difference in yaw between the true pose and the one that "near" matches agree with."""
 
 
 @dataclass(frozen=True)
@@ -422,9 +422,9 @@ class Group:
     beside the true one, as where a fence's bars are mistaken for the next ones; "doubled": each point is matched twice,
     right and by one wrong pose; "random": any pixel with any point."""
     count: int
-    """How many; doubled matches are twice as many."""
+    """Number of map points; in a "doubled" group there are twice as many matches."""
     place: str = CUBE
-    """Where their points are: all over the "cube", or a key of ``PLACES``. For right and random ones only."""
+    """Where their points are: all over the "cube", or, for right and random ones only, a key of ``PLACES``."""
 
     def __post_init__(self) -> None:
         if self.kind not in GROUP_KINDS:
@@ -441,21 +441,21 @@ class StagedScene:
     """A problem of groups of correspondences; it follows from its fields alone."""
 
     name: str
-    """Shown to people."""
+    """Name that users see."""
     camera: Camera
-    """What the image was taken with, in truth."""
+    """The camera that really took the image; the calibration may differ from it, see ``focal_off``."""
     groups: tuple[Group, ...]
-    """In any order but for places, which may turn the camera: those first. The matches are shuffled."""
+    """Groups with a place come first, since they may turn the camera; the matches are shuffled."""
     seed: int = 0
-    """Of all draws."""
+    """Seed of every random draw."""
     noise_px: float = 1.0
     """Standard deviation of the pixel noise, px."""
     gravity_off_deg: float = 0.0
     """Angle by which the known gravity is off, to a random side, degrees."""
     gravity_bound_deg: float = 0.0
-    """By how much it is said to be off at most, degrees."""
+    """Stated bound on that angle, degrees."""
     focal_off: float = 0.0
-    """By how much the focal length of the calibration that is given along is too long: 0.02 is two percent."""
+    """Relative error of the calibration's focal length: 0.02 is two percent too long."""
 
     def __post_init__(self) -> None:
         limits = {"seed": (0, 2**63 - 1), "noise_px": (0, 100), "gravity_off_deg": (0, 90)}
@@ -468,7 +468,7 @@ class StagedScene:
             raise InputError(f"{self.name}: a camera of model {self.camera.model} has no focal length to be wrong.")
 
     def problem(self, seed: int | None = None) -> Problem:
-        """The problem; as with measured ones, ``seed`` changes nothing, so that it may be that of the estimator."""
+        """The problem; ``seed`` changes nothing, as with measured ones: it may be the estimator's seed."""
         make = CaseMaker(np.random.default_rng([self.seed, *map(ord, "staged")]))
         make.camera, make.noise_px = self.camera, self.noise_px
         for group in self.groups:
@@ -479,7 +479,7 @@ class StagedScene:
         return replace(problem, name=self.name, camera=self._calibrated(), scene=f"staged: {_words(self.groups)}")
 
     def _calibrated(self) -> Camera:
-        """The camera as the calibration has it."""
+        """The camera with the focal length of the wrong calibration."""
         if not self.focal_off:
             return self.camera
         camera: Any = self.camera  # ``__post_init__`` wants one with focal lengths

@@ -1,4 +1,4 @@
-"""What somebody gave in the place of a scene file, such as a folder of images, and which command takes it."""
+"""Recognizes a path that is not a scene file, such as a folder of images, and names the command that takes it."""
 
 import re
 import shlex
@@ -14,7 +14,7 @@ SCENE = "give the path of a scene file (TOML) or a bundled scene's name, which s
 COMMAND = re.compile(r": spherloc [^;]*$")
 """A command at the end of a sentence."""
 _MAX_FOLDERS = 50
-"""Folders in a folder that are looked into for images."""
+"""Largest number of subfolders that are searched for images."""
 
 _COLMAP = "a scene of kind colmap localizes its images: spherloc scenes colmap prints one to start from"
 _FILES = {
@@ -24,10 +24,10 @@ _FILES = {
         "its matches are solved by a scene of kind correspondences: spherloc scenes correspondences",
     ),
     ".db": (
-        "a database as COLMAP has it, which holds features and matches but no poses and points",
+        "a COLMAP database, which holds features and matches but no poses and points",
         f"the folder with cameras, images and points3D is the map, and {_COLMAP}",
     ),
-    ".h5": ("an HDF5 file, as hloc writes them", "a scene of kind hloc names it: spherloc scenes hloc prints one"),
+    ".h5": ("an HDF5 file, such as hloc writes", "a scene of kind hloc names it: spherloc scenes hloc prints one"),
     ".ply": ("a point cloud or a mesh", "a scene of kind newer-college names it as prior_map"),
     ".vrs": (
         "a recording of Project Aria's glasses",
@@ -43,8 +43,8 @@ _FILES = {
 def what_it_is(path: Path) -> str:
     """What a path is and what takes it: "photos: is a folder of 32 images; make a map of it with: spherloc map photos".
 
-    No full stop follows a command, so that it can be copied. Empty for a path that may be that of a scene file, and for
-    one where there is nothing.
+    No full stop follows a command, so that it can be copied. Empty for a path that may be a scene file, and for one
+    that does not exist.
     """
     if is_folder(path):
         what, advice = _folder(path)
@@ -61,7 +61,7 @@ def _file(path: Path) -> tuple[str, str]:
         return "an image", f"make a map of all images of its folder with: spherloc map {folder}"
     if suffix in VIDEOS:
         return "a video", f"make a map of its frames with: spherloc map frames --video {_quoted(path)}"
-    what, advice = _FILES.get(suffix, ("no scene file", ""))
+    what, advice = _FILES.get(suffix, ("not a scene file", ""))
     return what, f"{advice}; else {SCENE}" if advice else SCENE
 
 
@@ -105,7 +105,7 @@ def _images(names: Sequence[str]) -> int:
 
 
 def _image_folders(path: Path, names: Sequence[str]) -> dict[str, int]:
-    """How many images there are in those folders in a folder that have some, by name."""
+    """Number of images in each subfolder that has some, by its name."""
     counts = {}
     for name in [name for name in names if is_folder(path / name)][:_MAX_FOLDERS]:
         try:

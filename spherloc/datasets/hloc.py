@@ -1,8 +1,9 @@
 """hloc: its features, matches and pairs, and the COLMAP model that it made.
 
-Without ``features`` and ``matches``, the project's own features are matched as [frontend] says: the pairs, or what
-``global_features = "outputs/global-feats.h5"`` retrieves, or what the project retrieves by itself. hloc's models keep
-the order of the keypoints: the i-th in features.h5 is the i-th of the model's image.
+Without ``features`` and ``matches``, the project detects and matches its own features as [frontend] says: in the pairs,
+or with the references that ``global_features = "outputs/global-feats.h5"`` retrieves, or with those that the project
+retrieves by itself. hloc's models keep the order of the keypoints: the i-th in features.h5 is the i-th of the model's
+image.
 
 P.-E. Sarlin, C. Cadena, R. Siegwart, M. Dymczyk: From Coarse to Fine: Robust Hierarchical Localization at Large Scale,
 CVPR 2019.
@@ -39,22 +40,22 @@ from spherloc.frontend.view import Matcher, Matches, View
 from spherloc.types import FloatArray, IntArray
 
 _WORTH_SAYING_PX = 1.0
-"""Rounding and uncertainty of keypoints beyond it are said: bounds on the noise are a few pixels."""
+"""Rounding and uncertainty of keypoints above this are reported in a remark: bounds on the noise are a few pixels."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Pair:
-    """What one reference gives."""
+    """The matches of a query with one reference."""
 
     reference: View
     keypoints: IntArray
-    """(M,) of the query."""
+    """(M,) indices of the query's keypoints."""
     point_ids: IntArray
-    """(M,) of the model."""
+    """(M,) ids of the model's points."""
     points: FloatArray
-    """(M, 3) map frame."""
+    """(M, 3) the points, map frame, m."""
     pixels: FloatArray
-    """(M, 2) in the reference."""
+    """(M, 2) their pixels in the reference."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +68,7 @@ class HlocMatcher:
     """HDF5 file with the matches of the pairs."""
     model: ColmapModel
     references: Mapping[str, View]
-    """By name, all of them images of the model."""
+    """References by name, all of them images of the model."""
     pairs: Mapping[str, tuple[str, ...]]
     """Names of references by query."""
 
@@ -109,7 +110,7 @@ class HlocMatcher:
 
 @dataclass(eq=False)
 class _Found:
-    """What the pairs of a query gave so far."""
+    """The matches that the pairs of a query gave so far."""
 
     pairs: list[_Pair] = field(default_factory=list)
     faults: list[str] = field(default_factory=list)
@@ -123,7 +124,7 @@ class _Found:
             self.pairs.append(pair)
 
     def matches(self, query: View, keypoints: Keypoints, file: Path) -> Matches:
-        """All of it as correspondences; the reference with the most of them is taken for the most similar one."""
+        """All matches as correspondences; the reference with the most of them counts as the most similar one."""
         pairs = sorted(self.pairs, key=lambda pair: -len(pair.keypoints))
         index = _joined([pair.keypoints for pair in pairs], (0,), np.int64)
         ids = _joined([pair.point_ids for pair in pairs], (0,), np.int64)
@@ -228,7 +229,7 @@ def load(table: dict[str, Any], path: Path) -> MapScene:
 def _check_combination(table: Mapping[str, Any], where: str) -> None:
     if ("features" in table) != ("matches" in table):
         one, other = ("features", "matches") if "features" in table else ("matches", "features")
-        raise InputError(f"{where}: '{one}' is of no use without '{other}'; give both or neither.")
+        raise InputError(f"{where}: '{one}' needs '{other}' as well; give both or neither.")
     if "matches" in table and "pairs" not in table:
         raise InputError(f"{where}: key 'pairs' is missing; give the list of pairs that were matched.")
     for one, other in (("matches", "frontend"), ("pairs", "global_features")):
@@ -254,7 +255,7 @@ def _queries(
 
 
 def _truth(path: Path, cameras: Mapping[str, Camera]) -> tuple[dict[str, FloatArray], list[str]]:
-    """Poses by query. hloc's results name an image without its folders, or with the last one only."""
+    """True poses by query. hloc's results name an image without its folders, or with the last one only."""
     by_tail: dict[str, list[str]] = {}
     for name in cameras:
         parts = name.split("/")
@@ -272,7 +273,7 @@ def _truth(path: Path, cameras: Mapping[str, Camera]) -> tuple[dict[str, FloatAr
         if meant:
             poses[meant[0]] = cam_from_map
         others += not meant
-    remarks = [f"{others} of {len(results)} poses in {path} are of no query."] if others else []
+    remarks = [f"{others} of {len(results)} poses in {path} belong to none of the queries."] if others else []
     if len(poses) < len(cameras):
         remarks.append(f"{len(cameras) - len(poses)} of {len(cameras)} queries have no pose in {path}.")
     return poses, remarks
@@ -336,7 +337,7 @@ def _matcher(
         return image_matcher(references, frontend, str(path), path.parent, pairs)
     features, matches = _file(table, "features", path), _file(table, "matches", path)
     for file in (features, matches):
-        with open_hdf5(file):  # says now what is wrong with it
+        with open_hdf5(file):  # a damaged file is refused now, not at the first query
             pass
     return HlocMatcher(
         features=features,

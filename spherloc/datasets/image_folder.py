@@ -1,4 +1,4 @@
-"""Image folder: a user's own panoramas or fisheyes, localized in a COLMAP model or among images with poses."""
+"""Image folder: a user's own panoramas or fisheye images, localized in a COLMAP model or among images with poses."""
 
 import warnings
 from collections.abc import Mapping
@@ -27,7 +27,7 @@ from spherloc.trajectory import Trajectory, pose_at, read_euroc, read_tum
 from spherloc.types import FloatArray
 
 MAX_GAP_S = 0.5
-"""Poses of a trajectory farther apart than this are not interpolated."""
+"""Largest time between two poses of a trajectory that are interpolated."""
 
 _CAMERA_KEYS = {"camera", "calibration", "calibration_camera"}
 _TRAJECTORY_KEYS = {"trajectory", "timestamp_ns", "trajectory_unit", "body_from_camera"}
@@ -37,7 +37,7 @@ _ROTATION_TOLERANCE = 1e-3
 
 @dataclass(frozen=True)
 class PosedImages:
-    """References that could be used, and what is said of the others."""
+    """The usable references, and remarks on the others."""
 
     views: tuple[View, ...]
     remarks: tuple[str, ...]
@@ -66,12 +66,12 @@ def read_pose(value: Any, key: str, where: str) -> FloatArray:
     with np.errstate(over="ignore", invalid="ignore"):
         rigid = np.allclose(rotation @ rotation.T, np.eye(3), rtol=0, atol=_ROTATION_TOLERANCE)
     if not rigid or np.linalg.det(rotation) < 0 or (rows == 4 and matrix[3].tolist() != [0.0, 0.0, 0.0, 1.0]):
-        raise InputError(f"{where}: {key} is no rigid pose; give rows of a rotation and a translation.")
+        raise InputError(f"{where}: {key} is not a rigid pose; give rows of a rotation and a translation.")
     return matrix[:3]
 
 
 def read_references(entries: Any, shared: Camera | None, path: Path) -> PosedImages:
-    """The views of [[references]]; ``shared`` is the camera of those that name none.
+    """The views of [[references]]; ``shared`` is the camera of those without a camera of their own.
 
     A reference whose trajectory has no pose at its time is left out and remarked on. Raises ``InputError`` for a wrong
     key or value and for a missing file.
@@ -126,7 +126,7 @@ def _pose(entry: Mapping[str, Any], path: Path, where: str, trajectories: Any) -
         return read_pose(entry["cam_from_map"], "cam_from_map", where)
     unit = entry.get("trajectory_unit", "s")
     if unit not in ("s", "ns"):
-        raise InputError(f"{where}: trajectory_unit is {show(unit)}; give 's' or 'ns', what its first column counts.")
+        raise InputError(f"{where}: trajectory_unit is {show(unit)}; give 's' or 'ns', the unit of its first column.")
     trajectory: Trajectory = trajectories(path.parent / scene_file.text(entry, "trajectory", where), unit)
     time_ns = scene_file.integer(entry, "timestamp_ns", where, -(2**62), 2**62)
     map_from_body = pose_at(trajectory, time_ns, MAX_GAP_S)
@@ -139,7 +139,7 @@ def _pose(entry: Mapping[str, Any], path: Path, where: str, trajectories: Any) -
 
 
 def _trajectory(path: Path, unit: Literal["s", "ns"]) -> Trajectory:
-    """A EuRoC ground truth (.csv), else rows of TUM whose first column counts ``unit``."""
+    """A EuRoC ground truth (.csv), else a TUM trajectory whose first column is a time in ``unit``."""
     return read_euroc(path) if path.suffix.lower() == ".csv" else read_tum(path, unit)
 
 
@@ -158,9 +158,9 @@ def _lift(entry: Mapping[str, Any], camera: Camera, pose: FloatArray, path: Path
 
 
 def read_depth(path: Path, unit_m: float) -> NDArray[np.float32]:
-    """A depth map (H, W), metres, of a 16-bit PNG or an .npy file whose numbers count units of ``unit_m`` metres.
+    """A depth map (H, W), metres, from a 16-bit PNG or an .npy file whose numbers are in units of ``unit_m`` metres.
 
-    Raises ``InputError`` for what cannot be read. An .npy file with Python objects is refused: they are a pickle.
+    Raises ``InputError`` for a file that cannot be read, and for an .npy file with Python objects, which are a pickle.
     """
     if path.suffix.lower() != ".npy":
         return read_depth_png(path).astype(np.float32) * np.float32(unit_m)
@@ -172,7 +172,7 @@ def read_depth(path: Path, unit_m: float) -> NDArray[np.float32]:
         if depth.ndim == 2 and depth.dtype.kind in "fiu":
             return depth.astype(np.float32) * np.float32(unit_m)
         reason = f"has the shape {depth.shape} of {depth.dtype}"
-    except Exception:  # numpy reads the header as Python text, and lets through whatever that makes of a damaged one
+    except Exception:  # numpy parses the header as Python text, which can raise nearly anything
         reason = "is missing or damaged, or holds Python objects"
     raise InputError(f"{path}: {reason}; give an .npy file with numbers of shape (H, W).")
 
@@ -192,7 +192,7 @@ images = "mapping"
 # calibration = "other.yaml"    # or camera = {...}; that of the queries if absent
 # cam_from_map = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]
 # # or: trajectory = "poses.txt" (TUM; a .csv is EuRoC's), timestamp_ns, body_from_camera (3 or 4 rows),
-# # trajectory_unit = "s" or "ns", what TUM's first column counts
+# # trajectory_unit = "s" or "ns", the unit of TUM's first column
 # # Without the next three keys, its points are triangulated with other references.
 # depth = "reference_depth.png" # 16-bit PNG or .npy
 # depth_unit_m = 0.001
@@ -297,7 +297,7 @@ def _truth(table: dict[str, Any], names: list[str], where: str) -> dict[str, Flo
     truth = scene_file.section(table, "truth", where)
     unknown = sorted(set(truth) - set(names))
     if unknown:
-        raise InputError(f"{where} [truth]: {show(unknown[0])} is no query image; name it as in 'images'.")
+        raise InputError(f"{where} [truth]: {show(unknown[0])} is not a query image; name it as in 'images'.")
     return {name: read_pose(value, show(name), f"{where} [truth]") for name, value in truth.items()}
 
 

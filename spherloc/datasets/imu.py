@@ -1,4 +1,4 @@
-"""Which way is down, from an inertial measurement unit: logs in CSV, and a filter of its two sensors.
+"""The direction of gravity from an inertial measurement unit: reads its CSV logs and filters its two sensors.
 
 An accelerometer measures gravity plus the motion's own acceleration, which for a walking person exceeds a metre per
 second squared but averages out within seconds. The gyroscope says how the unit turned meanwhile: its turns are
@@ -31,7 +31,7 @@ turns the average by no more than 1.5 degrees at the ends of a recording, where 
 MAX_GAP_S = 0.1
 """A longer gap separates the measurements: how the unit turned in it is not known."""
 MIN_S = 1.0
-"""Of measurements without a gap that a direction must come from."""
+"""Least duration of measurements without a gap from which a direction is computed."""
 DISTURBED_M_S2 = 2.0
 """Forces that differ from gravity by this much weigh 0.6 of the others."""
 NAME_RULE = "names like 1625133000_123456789.png (seconds_nanoseconds) or 1625133000123456789.png (nanoseconds)"
@@ -48,19 +48,19 @@ class ImuSamples:
     """Inertial measurements at growing times, in the unit's own frame."""
 
     timestamps_ns: NDArray[np.int64]
-    """(K,)"""
+    """(K,) times, growing."""
     rates_rad_s: FloatArray
-    """(K, 3) gyroscope."""
+    """(K, 3) angular rates of the gyroscope."""
     forces_m_s2: FloatArray
-    """(K, 3) accelerometer: acceleration less gravity, so that it points up at rest."""
+    """(K, 3) specific forces of the accelerometer: acceleration minus gravity, so that they point up at rest."""
 
 
 def read_imu(path: Path) -> ImuSamples:
-    """Rows ``counter,sec,nsec,wx,wy,wz,ax,ay,az`` or, as EuRoC has them, ``timestamp_ns,wx,wy,wz,ax,ay,az``.
+    """Reads rows ``counter,sec,nsec,wx,wy,wz,ax,ay,az`` or, as in EuRoC, ``timestamp_ns,wx,wy,wz,ax,ay,az``.
 
     Rates are in rad/s, accelerations in m/s^2.
 
-    Raises ``InputError``, one sentence with the file and the line, for whatever is no such file.
+    Raises ``InputError``, one sentence with the file and the line, for any other file.
     """
     times, numbers = array("q"), array("d")
     for place, text in rows(path, f"lines of {_COLUMNS}"):
@@ -88,14 +88,14 @@ def read_imu(path: Path) -> ImuSamples:
 
 
 def _time_ns(words: Sequence[str], place: str) -> int:
-    """Of ``timestamp_ns`` or of ``counter,sec,nsec``."""
+    """Time of a row, ns, from its columns ``timestamp_ns`` or ``counter,sec,nsec``."""
     if len(words) == 1:
         if not (words[0].isdecimal() and words[0].isascii() and len(words[0]) < 20):
-            raise InputError(f"{place}: {show(words[0])} is no time in nanoseconds; check the order of the columns.")
+            raise InputError(f"{place}: {show(words[0])} is not a time in nanoseconds; check the order of the columns.")
         return int(words[0])
     _, sec, nsec = finite_numbers(words, place)
     if not (0 <= sec <= _LARGEST_S and 0 <= nsec < NS_PER_S and sec == int(sec) and nsec == int(nsec)):
-        raise InputError(f"{place}: sec {sec:g} and nsec {nsec:g} are no time; check the order of the columns.")
+        raise InputError(f"{place}: sec {sec:g} and nsec {nsec:g} are not a time; check the order of the columns.")
     return int(sec) * NS_PER_S + int(nsec)
 
 
@@ -139,7 +139,7 @@ def _down(times_s: FloatArray, rates_rad_s: FloatArray, forces_m_s2: FloatArray,
     steps_s = np.diff(times_s)
     turns = Rotation.from_rotvec(steps_s[:, None] * (rates_rad_s[1:] + rates_rad_s[:-1]) / 2.0)
     steady_from_unit = _accumulated(np.vstack([[0.0, 0.0, 0.0, 1.0], turns.as_quat()]))
-    # The window counts samples, so each weighs the time around it.
+    # The window counts samples, so each is weighted by the time around it.
     spans_s = np.gradient(times_s)
     disturbance = (np.linalg.norm(forces_m_s2, axis=1) - GRAVITY_M_S2) / DISTURBED_M_S2
     weights = spans_s / (1.0 + disturbance**2)

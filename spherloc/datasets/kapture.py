@@ -1,7 +1,8 @@
 """kapture 1.1: posed images of cameras and rigs, some of them localized against the others.
 
 Depth records are not read: points of a reference are triangulated from other references, those first that a rig took at
-the same time. What a rig took together with a query is no reference. A query's pose, if it has one, is the truth.
+the same time. An image that a rig took together with a query is not a reference. A query's pose, if it has one, is the
+truth.
 
 https://github.com/naver/kapture/blob/main/kapture_format.adoc
 """
@@ -155,9 +156,9 @@ def _posed_apart(
     together = set(partners)
     apart = [record for record in records if record.image not in together]
     unposed = [record.image for record in apart if kapture.pose(record.timestamp, record.device) is None]
-    remarks = [f"{some(partners, 'image')} taken together with a query: no reference."] if partners else []
+    remarks = [f"{some(partners, 'image')} taken together with a query: not used as references."] if partners else []
     if unposed:
-        remarks.append(f"{some(unposed, 'image')} without a pose: no reference.")
+        remarks.append(f"{some(unposed, 'image')} without a pose: not used as references.")
     lost = set(unposed)
     return [record for record in apart if record.image not in lost], remarks
 
@@ -174,7 +175,7 @@ def _view(kapture: Kapture, root: Path, record: Record) -> View:
 
 
 def _references(kapture: Kapture, root: Path, records: Sequence[Record], options: FrontendOptions) -> tuple[View, ...]:
-    """Views whose points are triangulated with others of them, their rig's own first."""
+    """Views whose points are triangulated with other views, those of the same rig and time first."""
     by_rig: dict[tuple[int, str], list[int]] = {}
     for index, record in enumerate(records):
         for rig in kapture.carriers(record.device):

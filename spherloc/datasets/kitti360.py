@@ -1,6 +1,6 @@
 """KITTI-360: fisheye images of one drive, localized in another with poses and laser scans (Sec. VI-B.1).
 
-Where the dataset's ``fisheye/mask_left_fisheye.npy`` (or right) is there, what shows the vehicle itself is not used.
+If the dataset's ``fisheye/mask_left_fisheye.npy`` (or right) exists, pixels that show the vehicle itself are not used.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -43,11 +43,11 @@ query_sequence = 4
 camera = "image_02"            # or "image_03"
 # reference_frames = [0, 2000] # first and last; all if absent. Likewise query_frames
 # reference_step = 5           # every n-th usable frame; likewise query_step
-# scans = 3                    # neighbouring scans that make up the points of a reference; its own one if absent
+# scans = 3                    # neighbouring scans whose points a reference gets; only its own scan if absent
 """
 
 THRESHOLDS = ((1.0, 0.5), (2.0, 1.0), (5.0, 2.0))
-"""Table II."""
+"""Limits (degrees, metres) of Table II."""
 GRAVITY_BOUND_DEG = 2.0
 """Roll and pitch are the reference's: a car's differ by slopes and springs, about a degree on the same street."""
 GRAVITY_MAP = np.array([0.0, 0.0, -1.0])
@@ -91,13 +91,13 @@ class _Recorded:
     drive: Drive
     camera: str
     frames: Sequence[int]
-    """Asked for, with an image, a pose and, for references, a scan; growing."""
+    """Frames asked for that have an image, a pose and, for references, a scan; growing."""
     poses: Mapping[int, FloatArray]
     """``world_from_imu`` of all frames that have one."""
     scans: Sequence[int]
     """All frames with a pose and a scan, growing; empty for queries."""
     times_s: Sequence[float]
-    """By frame; empty if unknown."""
+    """Times of the images by frame; empty if unknown."""
     remarks: tuple[str, ...]
 
     def view(self, frame: int, rig: Rig, lift: PointCloudLift | None = None) -> View:
@@ -114,7 +114,7 @@ class _Recorded:
         )
 
     def camera_pose(self, frame: int, rig: Rig) -> FloatArray:
-        """``cam_from_map`` (3, 4); cam_k -> world = pose cam_to_pose[k]."""
+        """``cam_from_map`` (3, 4) of a frame: the inverse of world_from_imu imu_from_camera."""
         map_from_cam = self.poses[frame] @ rig.imu_from_camera
         return pose(map_from_cam[:3, :3].T, -map_from_cam[:3, :3].T @ map_from_cam[:3, 3])
 
@@ -186,11 +186,11 @@ def _range(table: Mapping[str, Any], key: str, where: str) -> tuple[int, int]:
 
 
 def _remark(frames: set[int], what: str) -> str:
-    """Empty if there are no such frames."""
+    """The remark on some skipped frames; empty if there are none."""
     return f"{_frames(frames)} {what}: skipped." if frames else ""
 
 
 def _frames(frames: set[int]) -> str:
-    """ "12 (3, 5, 8, ...)"."""
+    """Their number, and the first three: "12 (3, 5, 8, ...)"."""
     some = ", ".join(map(str, sorted(frames)[:3]))
     return f"{len(frames)} ({some}{', ...' if len(frames) > 3 else ''})"

@@ -1,8 +1,8 @@
-"""360Loc: panoramas, fisheyes and pinholes of four halls, localized in a map of posed panoramas (Huang et al. 2024).
+"""360Loc: panoramas, fisheye and pinhole images of four halls, localized among posed panoramas (Huang et al. 2024).
 
-Points of the map are triangulated between its panoramas, which come without depth. Images of fisheyes and pinholes are
-cut from panoramas by the dataset's own process.py. A folder of images has ``camera_pose.json``, matrices [R | T] from
-the camera to the world by the name of the image, and a folder ``image``.
+Points of the map are triangulated between its panoramas, which come without depth. Fisheye and pinhole images are
+cut from panoramas by the dataset's own process.py. A sequence is a folder with ``camera_pose.json``, matrices [R | T]
+from the camera to the world by the name of the image, and a folder ``image``.
 
 https://github.com/HuajianUP/360Loc
 """
@@ -45,7 +45,7 @@ bound_deg = 5.0                                   # how far a query's roll and p
 """
 
 THRESHOLDS = ((2.0, 0.25), (5.0, 0.5), (10.0, 5.0))
-"""The dataset's own."""
+"""The dataset's own limits (degrees, metres)."""
 GRAVITY_BOUND_DEG = 5.0
 POSES, IMAGES = "camera_pose.json", "image"
 _MAX_BYTES = 1 << 26
@@ -55,8 +55,8 @@ _MAX_STEPS = 100_000
 def load(table: dict[str, Any], path: Path) -> MapScene:
     """Read a scene of ``kind = "360loc"``; paths in it are relative to its file.
 
-    Raises ``InputError`` for a wrong key, a missing or damaged file, and a matrix that is no pose. Images that are not
-    there are skipped, and the scene's remarks say how many.
+    Raises ``InputError`` for a wrong key, a missing or damaged file, and a matrix that is not a pose. Missing images
+    are skipped, and the scene's remarks say how many.
     """
     where = str(path)
     choices = {"mapping", "query_step", "reference_step"}
@@ -110,7 +110,7 @@ def _sequences(root: Path, name: str, key: str, where: str) -> Iterator[_Sequenc
     inside = [name, *(f"{name}/{one}" for one in names_in(folder))]
     found = [one for one in inside if is_file(root / one / POSES)]
     if not found:
-        raise InputError(f"{where}: {folder} has no {POSES}, nor has a folder in it; name a folder of 360Loc that has.")
+        raise InputError(f"{where}: neither {folder} nor a folder in it has {POSES}; name a folder of 360Loc that has.")
     yield from (_Sequence(root / one, one) for one in found)
 
 
@@ -121,13 +121,13 @@ def _poses(path: Path) -> dict[str, FloatArray]:
     try:
         table = json.loads(content)
     except (ValueError, RecursionError):
-        raise InputError(f"{path}: is no valid JSON; download it again.") from None
+        raise InputError(f"{path}: is not valid JSON; download it again.") from None
     if not isinstance(table, dict) or not table:
         raise InputError(f"{path}: holds no table of poses by image; download it again.")
     poses = {}
     for name, rows in table.items():
         if "/" in name or "\\" in name or "\0" in name or name in ("", ".", ".."):
-            raise InputError(f"{path}: {show(name)} is no name of an image; correct it.")
+            raise InputError(f"{path}: {show(name)} is not the name of an image; correct it.")
         map_from_cam = read_pose(rows, show(name), str(path))
         turn = map_from_cam[:, :3].T
         poses[name] = np.column_stack([turn, -turn @ map_from_cam[:, 3]])
@@ -143,7 +143,7 @@ def _camera(root: Path, sequence: _Sequence, image: Path) -> Camera:
     width, height = read_size(image)
     if width != 2 * height:
         raise InputError(
-            f"{image}: is {width} x {height} pixels, no full panorama, and there is no {file}; check that 'root' is a "
-            "hall of 360Loc."
+            f"{image}: is {width} x {height} pixels, so it is not a full panorama, and there is no {file}; check that "
+            "'root' is a hall of 360Loc."
         )
     return Equirectangular(width, height)

@@ -41,13 +41,13 @@ class MapScene:
     """Queries, references and how to get from one to the other."""
 
     name: str
-    """Shown to people."""
+    """Name that users see."""
     where: str
-    """The scene file."""
+    """Path of the scene file, for messages."""
     queries: tuple[View, ...]
     """In the order of the sequence; at least one."""
     references: tuple[View, ...]
-    """With poses; at least one."""
+    """Images of the map, with poses; at least one."""
     matcher: Matcher
     """Finds 2D-3D correspondences of a query."""
     gravity_map: FloatArray
@@ -59,7 +59,7 @@ class MapScene:
     gravity_map_bound_rad: float = 0.0
     """Bound on the error of ``gravity_map``, which adds to that of a query's gravity unless it follows from the map."""
     measured_gravity: MeasuredGravity | None = None
-    """Measures it in a query whose ``gravity`` is None; None takes that of the query's most similar reference."""
+    """Measures gravity in a query whose ``gravity`` is None; None takes that of the query's most similar reference."""
     bound_px: float | None = None
     """Pixel bound asked of estimators; None leaves it to them."""
     thresholds: Thresholds = DEFAULT_THRESHOLDS
@@ -164,7 +164,7 @@ class MapScene:
         return replace(problem, truth_inliers=aligned.full_mask(close))
 
     def _gravity(self, view: View, matches: Matches) -> tuple[Gravity, tuple[str, ...]]:
-        """Of a query, and what is to be said of it."""
+        """Gravity of a query, and remarks on it."""
         posed = [reference for reference in matches.references if reference.cam_from_map is not None]
         nearby = self._like(posed[0]) if posed else None
         if view.gravity is not None:
@@ -193,13 +193,13 @@ class MapScene:
         return min(bound_rad + more_rad, MAX_BOUND_RAD), float(np.hypot(known_rad, more_rad / BOUND_SD))
 
     def _like(self, reference: View) -> Gravity:
-        """Of a query that stands as a reference does."""
+        """Gravity of a query that has the roll and pitch of a reference."""
         down = np.asarray(reference.cam_from_map)[:, :3] @ self.gravity_map
         return Gravity(down / np.linalg.norm(down), "its most similar reference", by_map=True)
 
 
 def _contradiction(stated: Gravity, nearby: Gravity | None) -> tuple[str, ...]:
-    """What to say of a gravity that points up in the camera of the most similar reference."""
+    """A remark on a gravity that points up in the camera of the most similar reference; empty if it does not."""
     if nearby is None or stated.down @ nearby.down >= 0.0:
         return ()
     angle_deg = np.degrees(np.arccos(np.clip(stated.down @ nearby.down, -1.0, 1.0)))
@@ -212,12 +212,12 @@ def _contradiction(stated: Gravity, nearby: Gravity | None) -> tuple[str, ...]:
 REQUIRED = {"kind", "name"}
 OPTIONAL = {"about", "frontend", "gravity", "masks", "options", "thresholds", "units"}
 UNITS: Mapping[str, bool] = {"metres": True, "unknown": False}
-"""What ``units`` may be, and whether lengths are metres then."""
+"""Values of ``units``, and whether lengths are metres then."""
 
 
 @dataclass(frozen=True)
 class MapSettings:
-    """What the shared keys say."""
+    """The values of the keys that all kinds of map scenes share."""
 
     name: str
     frontend: Mapping[str, Any]
@@ -227,7 +227,7 @@ class MapSettings:
     thresholds: Thresholds
     metric: bool
     masks: Masks | None
-    """Of queries and references, if the scene file has some."""
+    """Masks of queries and references; None if the scene file has none."""
 
     def scene(
         self,
@@ -312,11 +312,11 @@ def read_settings(
 
 
 def _masks(table: Mapping[str, Any], where: str) -> Masks:
-    """``[masks]``; paths are relative to the scene file."""
+    """The section ``[masks]``; paths are relative to the scene file."""
     place = f"{where} [masks]"
     scene_file.check_keys(table, set(), {"images", "nadir_deg", "seam_deg"}, place)
     if not table:
-        raise InputError(f"{place}: says nothing; give images, nadir_deg or seam_deg.")
+        raise InputError(f"{place}: is empty; give images, nadir_deg or seam_deg.")
     images = Path(where).parent / scene_file.text(table, "images", place) if "images" in table else None
     angles = {
         key: scene_file.number(table, key, place, 0.0, most)
@@ -327,7 +327,7 @@ def _masks(table: Mapping[str, Any], where: str) -> Masks:
 
 
 def _metric(table: Mapping[str, Any], where: str) -> bool:
-    """``units = "metres"`` or "unknown"."""
+    """Whether the key ``units`` is "metres" (the default) and not "unknown"."""
     units = scene_file.text(table, "units", where) if "units" in table else "metres"
     if units not in UNITS:
         raise InputError(f"{where}: units is {show(units)}; give one of {', '.join(UNITS)}.")
@@ -335,7 +335,7 @@ def _metric(table: Mapping[str, Any], where: str) -> bool:
 
 
 def _thresholds(value: Any, where: str) -> Thresholds:
-    """``thresholds = [[deg, m], ...]``."""
+    """The limits of the key ``thresholds = [[deg, m], ...]``."""
     rows = len(value) if isinstance(value, list) else 0
     if not 1 <= rows <= 10:
         raise InputError(f"{where}: thresholds must be a list of pairs [degrees, metres], strictest first.")

@@ -26,16 +26,17 @@ STATED_BOUND_RAD = float(np.radians(3.0))
 
 @dataclass(frozen=True, eq=False)
 class MatchTable:
-    """What a CSV of matches and a calibration file, a log of hloc or a database of COLMAP say, and a gravity file."""
+    """Matches, cameras and gravity of many queries, from a CSV with a calibration file, an hloc log, or COLMAP's
+    database."""
 
     path: Path
     """The CSV, the log or the database."""
     matches: Mapping[str, tuple[FloatArray, BoolArray | None]]
     """Rows u, v (px), X, Y, Z (N, 5) and the mask of right ones (N,), if it is known, by the name of the query."""
     cameras: Mapping[str, Camera]
-    """By the name of the query."""
+    """Camera by the name of the query."""
     gravity: Mapping[str, Gravity] | None
-    """By the name of the query; None takes it from the poses."""
+    """Gravity by the name of the query; None takes it from the poses."""
     gravity_map: FloatArray
     """Unit vector (3,) pointing down in the map."""
 
@@ -75,7 +76,7 @@ def read_match_table(path: Path, camera: Path, gravity: Path | None, gravity_map
     """Read a CSV of matches with the columns name, u, v (px), X, Y, Z, a calibration and, if given, a gravity file.
 
     ``gravity_map`` (3,) points down in the map and may have any length. Raises ``InputError`` or ``CalibrationError``
-    for what cannot be read.
+    for a file that cannot be read.
     """
     matches, one = read_csv_of_queries(path), load_camera(camera)
     return _table(path, matches, dict.fromkeys(matches, one), gravity, gravity_map)

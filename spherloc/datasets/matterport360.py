@@ -33,7 +33,7 @@ HEADER = struct.Struct("<fii")
 
 
 def read_dpt(path: Path) -> NDArray[np.float32]:
-    """Depth (H, W), metres, as it is stored: what is not positive and finite is no depth.
+    """Depth (H, W), metres, as it is stored: a value that is not positive and finite means that there is no depth.
 
     Layout: float32 tag 202021.25, int32 width, int32 height, then float32 row by row, all little endian. Raises
     ``InputError`` for a missing file, another tag, or a size that does not fit the file's.
@@ -63,7 +63,7 @@ GRAVITY_MAP = (0.0, 0.0, -1.0)
 GRAVITY_BOUND_DEG = 2.0
 """The scanner stands on a levelled tripod."""
 REGISTRATION_M = (0.4, 0.6, 0.8)
-"""Limits of Table III."""
+"""Limits of Table III on the registration error, m."""
 CAMERA_FROM_BLENDER = np.diag([1.0, -1.0, -1.0])
 """Poses have Blender's camera axes: x right, y up, z backward."""
 AT_CAMERA = np.eye(3, 4)
@@ -82,7 +82,7 @@ trust_poses = true                     # false: poses are judged by registration
 def load(table: dict[str, Any], path: Path) -> MapScene:
     """Read a scene of ``kind = "matterport360"``.
 
-    Raises ``InputError`` for a wrong key, a missing folder, or if nothing of the layout is there.
+    Raises ``InputError`` for a wrong key, a missing folder, or a folder without panoramas.
     """
     where = str(path)
     own = {"root", "queries"}
@@ -154,7 +154,7 @@ def _own_depth(view: View, along: Any) -> Lift:
 def read_pose(path: Path) -> FloatArray:
     """``cam_from_map`` (3, 4) of a pose file: camera centre, then the quaternion x y z w of camera to world.
 
-    Raises ``InputError`` unless the file holds just seven finite numbers of which four are a rotation.
+    Raises ``InputError`` unless the file holds exactly seven finite numbers, of which four are a rotation.
     """
     with reading(path, "correct or remove it"):
         content = read_file(path, MAX_POSE_BYTES)
@@ -162,7 +162,7 @@ def read_pose(path: Path) -> FloatArray:
         words = content.decode("ascii").split()
         numbers = np.array([float(word) for word in words])
     except ValueError:
-        raise InputError(f"{path}: holds something else than numbers; replace it.") from None
+        raise InputError(f"{path}: holds something other than numbers; replace it.") from None
     if numbers.shape != (7,) or not np.isfinite(numbers).all():
         raise InputError(f"{path}: holds {len(numbers)} numbers; a pose has 7 finite ones, x y z qx qy qz qw.")
     x, y, z, w = numbers[3:]

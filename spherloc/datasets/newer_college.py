@@ -34,14 +34,14 @@ from spherloc.types import BoolArray, FloatArray
 
 ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 MAX_CLOUD_BYTES = 1 << 32
-"""The whole campus at a centimetre takes a few gigabytes."""
+"""Largest point cloud, 4 GiB: the whole campus at a spacing of a centimetre takes less."""
 _HEADER_BYTES = 1 << 16
 _ELEMENT = re.compile(rb"element\s+(\S+)\s+(\d{1,18})\s*$")
 
 
 @dataclass(frozen=True)
 class TimedImage:
-    """An image file."""
+    """An image file whose name holds its time."""
 
     name: str
     """Its path below the folder, with forward slashes."""
@@ -71,9 +71,9 @@ def images_in(folder: Path) -> tuple[list[TimedImage], int]:
 
 @lru_cache(maxsize=1)
 def read_cloud(path: Path) -> NDArray[np.float32]:
-    """Points (N, 3) of a PLY file, metres; kept, because all references share them.
+    """Points (N, 3) of a PLY file, metres; cached, because all references share them.
 
-    Raises ``InputError`` for what is no such file or holds no finite point.
+    Raises ``InputError`` for any other file and for one without a finite point.
     """
     import trimesh  # takes half a second
 
@@ -81,7 +81,7 @@ def read_cloud(path: Path) -> NDArray[np.float32]:
     try:
         cloud = trimesh.load(path, file_type="ply", process=False)
         points = np.asarray(getattr(cloud, "vertices", ()), dtype=np.float32).reshape(-1, 3)
-    except Exception as error:  # trimesh lets whatever its parsers stumble over through
+    except Exception as error:  # trimesh passes on whatever its parsers raise
         raise InputError(f"{path}: no readable PLY point cloud ({reason(error)}); export the map again.") from None
     points = points[np.isfinite(points).all(axis=1)]
     if not len(points):
@@ -91,7 +91,7 @@ def read_cloud(path: Path) -> NDArray[np.float32]:
 
 
 def _check_header(path: Path) -> None:
-    """Refuse what claims more than it holds before anything is allocated for it."""
+    """Refuse a file whose header claims more than the file holds, before memory is allocated for it."""
     with reading(path, "give the prior map as a PLY file"), open_file(path) as file:
         size = os.fstat(file.fileno()).st_size
         header, end, _ = file.read(_HEADER_BYTES).partition(b"end_header")
@@ -104,13 +104,13 @@ def _check_header(path: Path) -> None:
 
 
 TOLERANCE = 1e-3
-"""How far a rotation given by hand may be from orthonormal."""
+"""Largest difference of the singular values of a scaled rotation, as a share of the scale: typed ones are rounded."""
 MIN_SPREAD = 0.02
 """Positions whose second extent is a smaller share of the first lie on a line, which fixes no rotation about it."""
 FARTHEST = 1e9
-"""In the units of either frame."""
+"""Largest absolute coordinate of a position, in the units of its frame."""
 WORST_FIT = 0.1
-"""Of the extent of the positions: a larger residual means that they are not the same positions."""
+"""Largest residual, as a share of the positions' extent: beyond it they are not the same positions."""
 MIN_USED = 0.8
 """Share of the positions that must fit: three of four always do, whatever they are."""
 _REMEDY = "give map_from_model"
@@ -124,9 +124,9 @@ class Similarity:
 
     scale: float
     rotation: FloatArray
-    """(3, 3)"""
+    """(3, 3), from the old to the new frame."""
     translation: FloatArray
-    """(3,)"""
+    """(3,), in the unit of the new frame."""
 
     def points(self, points: FloatArray) -> FloatArray:
         """Points (N, 3) in the other frame."""
@@ -144,26 +144,26 @@ class Alignment:
 
     similarity: Similarity
     used: int
-    """Pairs that fit."""
+    """Number of pairs that fit."""
     rms_m: float
-    """Of their residuals."""
+    """Root mean square of their residuals, m."""
 
 
 def similarity_of(value: Any, key: str, where: str) -> Similarity:
     """A similarity given as ``[[...], [...], [...]]``, 3 x 4: scale times rotation, and translation.
 
-    Raises ``InputError`` for another shape, and if the 3 x 3 part is no rotation times a positive scale.
+    Raises ``InputError`` for another shape, and if the 3 x 3 part is not a rotation times a positive scale.
     """
     matrix = numbers(value, (3, 4), key, where)
     left, sizes, right = np.linalg.svd(matrix[:, :3])
     scale = float(sizes.mean())
     if not 1e-9 <= scale <= 1e9 or np.ptp(sizes) > TOLERANCE * scale or np.linalg.det(left @ right) < 0:
-        raise InputError(f"{where}: the 3 x 3 part of {key} is no rotation times a positive scale; correct it.")
+        raise InputError(f"{where}: the 3 x 3 part of {key} is not a rotation times a positive scale; correct it.")
     return Similarity(scale, left @ right, matrix[:, 3])
 
 
 def align(old: FloatArray, new: FloatArray, where: str) -> Alignment:
-    """The similarity that takes the positions ``old`` (N, 3) to ``new`` (N, 3), against a few wrong ones among them.
+    """The similarity that takes the positions ``old`` (N, 3) to ``new`` (N, 3); a few of them may be wrong.
 
     Umeyama's closed form (1991), reweighted so that the sum of distances is least instead of that of squares.
     Raises ``InputError`` for fewer than three pairs, for positions on a line, and for positions that do not fit.
@@ -194,7 +194,7 @@ def _check_spread(old: FloatArray, new: FloatArray, where: str) -> None:
     for positions in (old, new):
         extents = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False)
         if not extents[1] > MIN_SPREAD * extents[0]:
-            raise InputError(f"{where}: the positions lie on a line, so that a rotation stays open; {_REMEDY}.")
+            raise InputError(f"{where}: the positions lie on a line, which does not fix a rotation; {_REMEDY}.")
 
 
 def _umeyama(old: FloatArray, new: FloatArray, weights: FloatArray) -> Similarity:
@@ -227,15 +227,15 @@ model = "quad-easy/colmap"                 # or prior_map = "cloud.ply"
 """
 
 THRESHOLDS = ((2.0, 0.25), (5.0, 0.5), (8.0, 1.0))
-"""Table IV."""
+"""Limits (degrees, metres) of Table IV."""
 GRAVITY_BOUND_DEG = 3.0
-"""What the IMU's filter keeps to for a walking person and a gyroscope with a bias of 0.01 rad/s."""
+"""Largest error of the IMU's filter for a walking person and a gyroscope with a bias of 0.01 rad/s."""
 GRAVITY_MAP = np.array([0.0, 0.0, -1.0])
 """The ground truth's z axis points up: it was registered to a levelled laser scan."""
 MAX_GAP_S = 0.5
-"""Of the ground truth, which comes at 10 Hz."""
+"""Longest gap of the ground truth over which poses are interpolated; it has 10 poses a second."""
 MAP_REACH_M = 60.0
-"""Points of the prior map that are farther from a reference are left out of it."""
+"""Points of the prior map that are farther from a reference's camera are not used for that reference."""
 
 
 def load(table: dict[str, Any], path: Path) -> MapScene:
@@ -278,7 +278,7 @@ class _Place:
         return named
 
     def step(self, key: str) -> int:
-        """Every n-th; by default all."""
+        """The key's n, of "every n-th"; 1 by default."""
         return scene_file.integer({key: 1} | self.table, key, self.where, 1, 100_000)
 
 
@@ -288,9 +288,9 @@ class _Rig:
 
     camera: Camera
     cam_from_imu: FloatArray
-    """(4, 4)"""
+    """Rigid motion (4, 4) from the IMU's frame to the camera's."""
     cam_from_base: FloatArray
-    """(4, 4), the base being the body of the ground truth."""
+    """The same from the base, the body whose poses the ground truth holds."""
     timeshift_s: float
     """Added to a time of the camera to get that of the IMU's clock."""
 
@@ -311,7 +311,7 @@ def _rig(place: _Place) -> _Rig:
         raise InputError(f"{calibration}: has no camera {show(name)}; give one of {', '.join(cameras)}.")
     cam_from_imu = cameras[name].cam_from_imu
     if cam_from_imu is None:
-        raise InputError(f"{calibration}: {name} has no T_cam_imu, without which the IMU says nothing; add it.")
+        raise InputError(f"{calibration}: {name} has no T_cam_imu, which the IMU's measurements need; add it.")
     cam_from_base = cam_from_imu
     if "cam_from_base" in place.table:
         given = similarity_of(place.table["cam_from_base"], "cam_from_base", place.where)
@@ -403,7 +403,7 @@ def _model_references(place: _Place, rig: _Rig) -> tuple[list[View], list[str]]:
 
 
 def _map_from_model(place: _Place, rig: _Rig, model: ColmapModel) -> tuple[Similarity, list[str]]:
-    """Given, or fitted to the true positions of the model's cameras, which a remark then says."""
+    """The key ``map_from_model``, or a fit to the true positions of the model's cameras, with a remark on it."""
     if "map_from_model" in place.table:
         return similarity_of(place.table["map_from_model"], "map_from_model", place.where), []
     truth_file = place.file("reference_ground_truth", "which says where the model's cameras were")

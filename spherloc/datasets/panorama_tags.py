@@ -22,9 +22,9 @@ _LIMITS_DEG = {_PITCH: 90.0, _ROLL: 180.0}
 
 
 def gravity_from_tags(view: View, near: FloatArray | None = None) -> Gravity:
-    """Gravity of a panorama by the pitch and roll in its XMP packet; what is ``near`` (3,) does not matter.
+    """Gravity of a panorama by the pitch and roll in its XMP packet; ``near`` (3,) is not used.
 
-    Raises ``InputError`` if the image cannot be read, has none, or has what is no angle.
+    Raises ``InputError`` if the image cannot be read, or if its tags hold no pitch and roll or no valid angle.
     """
     place = shorten(view.name)
     packet = _packet(view.path)
@@ -51,12 +51,12 @@ def _packet(path: Path) -> bytes | None:
             with Image.open(file) as image:
                 packet = image.info.get("xmp") or image.info.get("XML:com.adobe.xmp")
         except (Image.UnidentifiedImageError, Image.DecompressionBombError, SyntaxError, ValueError):
-            raise InputError(f"{path}: is no image that can be read; give another one.") from None
+            raise InputError(f"{path}: is not an image that can be read; give another one.") from None
     return packet.encode() if isinstance(packet, str) else packet
 
 
 def _pitch_and_roll(packet: bytes, place: str) -> tuple[float, float]:
-    """Degrees; pitch alone is enough, as cameras leave out a roll of 0, and the other way round."""
+    """Pitch and roll, degrees; one of them is enough: cameras leave out an angle of 0."""
     damaged = InputError(f"{place}: its XMP tags are damaged, so that its pitch and roll cannot be read.")
     # Declarations could define entities that grow without end or name other files; XMP has none.
     if len(packet) > MAX_BYTES or b"<!" in packet or b"\0" in packet:
@@ -74,7 +74,7 @@ def _pitch_and_roll(packet: bytes, place: str) -> tuple[float, float]:
                 if abs(angle) > _LIMITS_DEG[name]:
                     limit = _LIMITS_DEG[name]
                     raise InputError(
-                        f"{place}: {name} is {show(angle)}; an angle from {-limit:g} to {limit:g} is meant."
+                        f"{place}: {name} is {show(angle)}; it must be an angle from {-limit:g} to {limit:g}."
                     )
                 found[name] = angle
     if not found:

@@ -16,12 +16,12 @@ Rngs = tuple[np.random.Generator, np.random.Generator, np.random.Generator]
 Draws = Literal["uniform", "normal"]
 DRAWS: tuple[str, ...] = get_args(Draws)
 HALF_SIZE_M = 5.0
-"""Half the side of the paper's cube."""
+"""Half the side of the paper's cube, m."""
 WHOLE_SPHERE_DEG = 360.0
 BATCH = 512
 MAX_BATCHES = 400
 AHEAD_M = (1.0, 10.0)
-"""Distance of points that are drawn in front of a camera that sees too few of the cube's, least and most."""
+"""Least and largest distance of points that are drawn in front of a camera that sees too few points of the cube."""
 AHEAD_DRAWS = 60
 
 
@@ -40,12 +40,12 @@ class Lens:
     """A camera of which only a part of the field of view is used."""
 
     camera: Camera
-    """The whole of it."""
+    """The camera with its full field of view."""
     field_of_view_deg: float = WHOLE_SPHERE_DEG
     """Whatever is farther than half of it from the optical axis is not seen, degrees."""
 
     def sees(self, pixels: FloatArray) -> BoolArray:
-        """Which pixels (N, 2) it can give."""
+        """Which pixels (N, 2) are within the used field of view: a mask (N,)."""
         return sees(self.camera, pixels, self.field_of_view_deg)
 
     def project(self, cam_from_map: FloatArray, points: FloatArray) -> tuple[FloatArray, BoolArray]:
@@ -68,11 +68,11 @@ class Cloud:
     """Random points in the paper's cube, or in a flat part of it."""
 
     name: str
-    """The scene's, for messages."""
+    """Name of the scene, for messages."""
     middle_m: float
     """Height of the middle of a flat cloud (y of the map)."""
     height_m: float = 2 * HALF_SIZE_M
-    """How high it is; at most as high as the cube."""
+    """Height of the cloud, m; at most that of the cube."""
     draws: Draws = "uniform"
     """The distribution of the coordinates: uniform in the cube, or standard normal, m."""
 
@@ -92,9 +92,10 @@ class Cloud:
     ) -> tuple[FloatArray, FloatArray]:
         """Random points (count, 3) that are seen from all ``poses``, and the noise (count, 2) of their pixels, sd 1.
 
-        They are the first that the whole camera sees from the pose ``home`` (3, 4). Those that are not seen from
-        ``poses`` are replaced by others of the cube that are, and if there are too few by points in front of the
-        camera. ``rngs`` draw points, noise, and the points in front. Raises ``InputError`` if too few are seen.
+        They are the first points that the camera, with its full field of view, sees from the pose ``home`` (3, 4).
+        Those that are not seen from ``poses`` are replaced by other points of the cube that are; where these are too
+        few, by points in front of the camera. ``rngs`` draw points, noise, and the points in front, in this order.
+        Raises ``InputError`` if too few are seen.
         """
         whole = Lens(lens.camera)
         changed = lens != whole or len(poses) > 1 or poses[0] is not home
@@ -123,9 +124,9 @@ class Cloud:
     def _ahead(
         self, rng: np.random.Generator, count: int, gaps: IntArray, lens: Lens, poses: Sequence[FloatArray]
     ) -> tuple[FloatArray, FloatArray]:
-        """Points (count, 3) in front of the first of ``poses``, seen from all of them, right in the ``gaps`` only.
+        """Points (count, 3) in front of the first of ``poses``, seen from all of them; only the rows ``gaps`` count.
 
-        The gaps do not depend on each other, so that a point stays when another one gets lost.
+        Each row has random draws of its own, so that a point stays the same when another one is no longer seen.
         """
         points, shifts = np.zeros((count, 3)), rng.standard_normal((count, 2))
         rotation, centre = poses[0][:, :3], camera_centre(poses[0])
@@ -150,7 +151,7 @@ def random_bearings(rng: np.random.Generator, count: int, field_of_view_deg: flo
 
 
 def _keep_or_replace(first: IntArray, seen: BoolArray, count: int) -> IntArray:
-    """Numbers (count,) of ``seen`` points: those of ``first`` stay in their places, others fill the gaps in order.
+    """Indices (count,) of ``seen`` points: those of ``first`` stay in their rows, others fill the gaps in order.
 
     -1 where there are too few.
     """
@@ -169,15 +170,15 @@ OUTLIER_KINDS: tuple[str, ...] = get_args(OutlierKind)
 
 COHERENT_YAW_DEG = (20.0, 60.0)
 COHERENT_SHIFT_M = (1.5, 3.0)
-"""Yaw and distance between the true camera and the one that coherent outliers agree with, least and most."""
+"""Least and largest difference in yaw and position between the true pose and that of coherent outliers."""
 REPEAT_STEP_M = 2.0
 """Distance along the map's x axis after which a repeated facade looks the same again."""
 REPEATS = np.array([1, -1, 2, -2])
-"""How many steps away a match may land; the nearer copies twice as often."""
+"""Steps between a point and the copy that it is matched with; the nearer copies are drawn twice as often."""
 POSE_DRAWS = 60
-"""Wrong poses that are drawn for each point before its wrong pixel is drawn itself."""
+"""Number of wrong poses that are drawn for a point; if none sees the point, a random pixel is drawn instead."""
 NARROW_POSE_DRAWS = 8
-"""As many where the field of view is not the camera's whole one, where most poses do not see the point."""
+"""The same where only a part of the camera's field of view is used: most poses then do not see the point."""
 PIXEL_DRAWS = 400
 
 
@@ -196,9 +197,9 @@ def random_poses(rng: np.random.Generator, count: int, draws: Draws = "uniform")
 def random_pixels(
     rng: np.random.Generator, lens: Lens, points: FloatArray, name: str, draws: Draws = "uniform"
 ) -> FloatArray:
-    """Pixels (N, 2) of the points (N, 3) under a random level pose each under which it is visible.
+    """Pixels (N, 2) of the points (N, 3), each projected by a random level pose of its own that sees it.
 
-    Where many poses in turn do not see a point, its pixel is that of a random bearing. Raises ``InputError``, with
+    Where many drawn poses do not see a point, its pixel is that of a random bearing. Raises ``InputError``, with
     the scene's ``name``, if the camera sees next to nothing.
     """
     pixels = np.full((len(points), 2), np.nan)
@@ -220,8 +221,8 @@ def random_pixels(
 def second_pose(rng: np.random.Generator, truth: FloatArray, field_of_view_deg: float) -> FloatArray:
     """A level pose (3, 4) beside the true one (3, 4): turned by 20 to 60 degrees and 1.5 to 3 m away.
 
-    It is drawn relative to the truth, so that it goes along where the true camera is moved, and is nearer where the
-    field of view is less than 180 degrees, since both cameras must see the same points.
+    It is drawn relative to the truth, so that it moves with the true camera. It is nearer where the field of view is
+    less than 180 degrees, since both cameras must see the same points.
     """
     narrow = min(1.0, field_of_view_deg / 180.0)
     yaw_deg = narrow * rng.uniform(*COHERENT_YAW_DEG) * rng.choice([-1.0, 1.0])
@@ -232,7 +233,7 @@ def second_pose(rng: np.random.Generator, truth: FloatArray, field_of_view_deg: 
 
 
 def clearly_apart(one: FloatArray, other: FloatArray) -> bool:
-    """Whether two level poses (3, 4) are at least 1 m and 10 degrees of yaw apart: none passes for the other."""
+    """Whether two level poses (3, 4) are at least 1 m and 10 degrees of yaw apart, too far to count as the same."""
     apart_m = np.linalg.norm(camera_centre(one) - camera_centre(other))
     return bool(apart_m >= 1.0 and abs(wrap_angle(yaw_of(one[:, :3] @ other[:, :3].T))) >= np.radians(10.0))
 

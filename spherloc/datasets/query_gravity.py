@@ -23,13 +23,13 @@ from spherloc.trajectory import NS_PER_S
 from spherloc.types import FloatArray
 
 MeasuredGravity = Callable[[View, FloatArray | None], Gravity]
-"""Gravity of a query, from about where down is in it (3,), if that is known. ``InputError`` if nothing shows it."""
+"""Measures gravity of a query; takes its approximate direction (3,) or None. May raise ``InputError``."""
 
 SOURCES = ("reference", "lines", "tags", "level", "truth")
 """Values of ``[gravity] query``."""
 _KEYS = {"bound_deg", "sd_deg", "file", "query", "map_bound_deg"}
 BOUND_SD = 3.0
-"""A bound in standard deviations."""
+"""Number of standard deviations that make a bound."""
 _MAX_SD_DEG = 25.0
 _ROW = re.compile(r'(?:"([^"]+)"|([^\s,"]+))[\s,]+(.*)')
 _COLUMNS = "image gx gy gz [sd_deg]"
@@ -42,7 +42,7 @@ class ImuLog:
     file: Path
     samples: ImuSamples
     camera_from_imu: FloatArray
-    """Rotation (3, 3)."""
+    """Rotation (3, 3) from the unit's frame to the camera's."""
 
     def with_gravity(self, views: tuple[View, ...]) -> tuple[View, ...]:
         """The views, with gravity where they have a time within the log and no gravity yet."""
@@ -59,30 +59,30 @@ class ImuLog:
 
 
 def _time_ns(view: View) -> int | None:
-    """When a view was taken, by what the loader knows or by the name of its image."""
+    """When a view was taken, as the loader states it or as the name of its image says; None if neither does."""
     return round(view.timestamp_s * NS_PER_S) if view.timestamp_s is not None else timestamp_of(view.name)
 
 
 @dataclass(frozen=True)
 class GravitySettings:
-    """What the section [gravity] says of the queries."""
+    """The keys of the section [gravity] that are about queries."""
 
     bound_rad: float
-    """Of a gravity that comes without a bound of its own."""
+    """Bound on the error of a gravity that comes without a bound of its own."""
     sd_rad: float | None
-    """The same; None takes a third of the bound."""
+    """Its standard deviation; None takes a third of the bound."""
     query: str
     """One of ``SOURCES``."""
     file: str
     """Path of the gravity file; empty if there is none."""
     stated: Mapping[str, Gravity]
-    """Its rows by the names of the images."""
+    """Rows of the gravity file by the names of the images."""
     bound_is_stated: bool
     """Whether the scene file states ``bound_rad``, which otherwise is the loader's default."""
     map_bound_rad: float = 0.0
     """Bound on the error of the map's own gravity."""
     imu: ImuLog | None = None
-    """Of a unit that moved with the camera."""
+    """Log of an inertial measurement unit that is fixed to the camera; None if there is none."""
 
     def of_queries(self, views: Iterable[View], gravity_map: FloatArray) -> tuple[tuple[View, ...], list[str]]:
         """The queries with their gravity, as far as it is known before they are read, and remarks on the others.
@@ -97,7 +97,7 @@ class GravitySettings:
         without = [view.name for view in queries if self.file and view.name not in self.stated]
         if strange:
             remarks.append(
-                f"{len(strange)} of {len(self.stated)} rows of {self.file} are of no query, the first is "
+                f"{len(strange)} of {len(self.stated)} rows of {self.file} belong to none of the queries, the first is "
                 f"{shorten(strange[0])}."
             )
         if without:
@@ -136,7 +136,7 @@ class GravitySettings:
 
     @property
     def measured(self) -> MeasuredGravity | None:
-        """What measures gravity in a query image."""
+        """The function that measures gravity in a query image; None if none is asked for."""
         return {"lines": _from_lines, "tags": _from_tags}.get(self.query)
 
 
@@ -164,27 +164,27 @@ def read_gravity(table: Mapping[str, Any], where: str, bound_deg: float) -> Grav
 
 
 def _rotation(value: Any, section: str) -> FloatArray:
-    """``camera_from_imu`` (3, 3)."""
+    """The key ``camera_from_imu`` (3, 3)."""
     rotation = scene_file.numbers(value, (3, 3), "camera_from_imu", section)
     with np.errstate(over="ignore", invalid="ignore"):
         proper = np.allclose(rotation @ rotation.T, np.eye(3), rtol=0, atol=1e-3) and np.linalg.det(rotation) > 0
     if not proper:
-        raise InputError(f"{section}: camera_from_imu is no rotation; give the 3 x 3 part of T_cam_imu.")
+        raise InputError(f"{section}: camera_from_imu is not a rotation; give the 3 x 3 part of T_cam_imu.")
     return rotation
 
 
 def read_gravity_file(path: Path) -> dict[str, Gravity]:
-    """Gravity by image.
+    """Gravity by image, from the rows of a gravity file.
 
-    Raises ``InputError``, one sentence with the file and the line, for a row that is none, for a vector without a
-    length, and for an image that is there twice.
+    Raises ``InputError``, one sentence with the file and the line, for a row of another form, for a vector of length
+    zero, and for an image that is there twice.
     """
     found: dict[str, Gravity] = {}
     for place, text in rows(path, f"rows of {_COLUMNS}"):
         match = _ROW.match(text)
         words = match[3].partition("#")[0].replace(",", " ").split() if match else []
         if match is None or len(words) not in (3, 4):
-            raise InputError(f"{place}: is no row {_COLUMNS}; give a name and three or four numbers.")
+            raise InputError(f"{place}: is not a row {_COLUMNS}; give a name and three or four numbers.")
         name = match[1] or match[2]
         x, y, z, *sd_deg = finite_numbers(words, place)
         length = float(np.linalg.norm([x, y, z]))

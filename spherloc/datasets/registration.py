@@ -24,7 +24,8 @@ NORMAL_STEP_PX = 3.0
 """Distance of the neighbours that a surface's normal is taken from."""
 ROUNDS = 40
 GATES_M = (1.0, 0.2)
-"""Points farther from the map than this are left out; it shrinks from round to round."""
+"""Points farther from the map than this are left out: the limit of the first and of the last round, between which it
+shrinks."""
 STILL_M = 1e-4
 FITS_M = 0.1
 MIN_FIT = 0.4
@@ -86,7 +87,7 @@ class DepthRegistration:
 
 
 def surfaces(camera: Camera, lift: Lift) -> Surfaces:
-    """What a lift knows of the surfaces around a camera, in the lift's own frame."""
+    """The surfaces around a camera that a lift gives points of, in the lift's own frame."""
     pixels, seen = camera.project(_sphere(SAMPLES))
     pixels = pixels[seen & in_image(camera, pixels)]
     corners = [lift(pixels + step) for step in ([0.0, 0.0], [NORMAL_STEP_PX, 0.0], [0.0, NORMAL_STEP_PX])]

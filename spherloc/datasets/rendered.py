@@ -29,7 +29,7 @@ from spherloc.worlds import Conditions, World, build_world, image_path, render, 
 
 MAX_VIEWS = 500
 MAX_PIXELS = 4_000_000
-"""A picture of more takes too long to draw."""
+"""Largest number of pixels of a picture; a larger one takes too long to draw."""
 ROUTE_LIMITS = {"offset_m": (-50.0, 50.0), "heading_deg": (-180.0, 180.0), "start": (0.0, 1.0), "stop": (0.0, 1.0)}
 CONDITION_KEYS = {field.name for field in fields(Conditions)}
 GRAVITY_DOWN = np.array([0.0, 0.0, -1.0])
@@ -53,7 +53,7 @@ count = 5
 start = 0.1
 stop = 0.9
 offset_m = 0.8
-tilt_deg = 0.5                    # unknown roll and pitch, at most
+tilt_deg = 0.5                    # largest roll and pitch of a query, which its known gravity does not contain
 light = "dusk"                    # day, morning, overcast, dusk, night
 season = "autumn"                 # summer, spring, autumn, winter
 occluders = 6
@@ -62,7 +62,7 @@ occluders = 6
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """What a picture follows from, and what it is called."""
+    """A picture by all that determines it, and its name."""
 
     name: str
     world: World
@@ -73,7 +73,7 @@ class Picture:
 
     @property
     def path(self) -> Path:
-        """Where it is kept."""
+        """File in which it is kept."""
         return image_path(*self._all)
 
     @property
@@ -81,11 +81,11 @@ class Picture:
         return self.world, self.camera, self.cam_from_map, self.conditions, self.seed, self.name
 
     def image(self) -> ByteArray:
-        """(H, W, 3) BGR, drawn if it is not there yet."""
+        """The image (H, W, 3), BGR, drawn if it is not there yet."""
         return render(*self._all).image
 
     def range_m(self) -> NDArray[np.float32]:
-        """(H, W) metres along the ray."""
+        """Distances (H, W) along the rays, m."""
         kept = stored_range(self.path, self.camera)
         if kept is not None:
             return kept
@@ -116,7 +116,7 @@ class RenderedView(View):
 def load(table: dict[str, Any], path: Path) -> MapScene:
     """Read a scene file with ``kind = "rendered"``; nothing is drawn yet.
 
-    Raises ``InputError`` for unknown or missing keys, an unknown world, or a value out of its limits.
+    Raises ``InputError`` for unknown or missing keys, an unknown world, or a value outside its limits.
     """
     where = str(path)
     known = map_scene.REQUIRED | {"world", "provenance", "camera", "references", "queries"}
@@ -140,7 +140,7 @@ def load(table: dict[str, Any], path: Path) -> MapScene:
 
 
 def _references(table: Mapping[str, Any], where: str, world: World, camera: Camera) -> tuple[View, ...]:
-    """Level cameras with depth."""
+    """Views of the references: level cameras with depth."""
     scene_file.check_keys(table, {"count"}, ROUTE_LIMITS.keys() | CONDITION_KEYS, where)
     conditions = _conditions(table, where)
     views = []

@@ -22,7 +22,7 @@ MAX_BYTES = 1_000_000
 ADVICE = "give the path of a scene file (TOML) or a bundled scene's name"
 _INSTALLED = Path(__file__).resolve().parent / "scenes"
 BUNDLED = _INSTALLED if _INSTALLED.is_dir() else Path(__file__).resolve().parents[2] / "scenes"
-"""An installation has them inside of this package, a checkout beside its packages."""
+"""Folder of the bundled scenes: inside this package in an installation, beside the packages in a checkout."""
 
 
 _KINDS: dict[type, str] = {}
@@ -34,7 +34,7 @@ class Scene(Protocol):
 
     @property
     def name(self) -> str:
-        """Shown to people."""
+        """Name that users see."""
         ...
 
     def problem(self, seed: int | None = None) -> Problem:
@@ -68,17 +68,17 @@ def load_scene(path: Path) -> Scene:
 
 
 def loader_of(kind: str) -> Any:
-    """The loader of a kind of scene files; raises ``InputError`` if there is none or it is no function."""
+    """The loader of a kind of scene files; raises ``InputError`` if there is none or it is not a function."""
     load = registry.lookup("datasets", kind)
     if not callable(load):
-        raise InputError(f"{registry.title('datasets', kind)} is {show(load)}, no function; tell its authors.")
+        raise InputError(f"{registry.title('datasets', kind)} is {show(load)}, not a function; tell its authors.")
     return load
 
 
 def drawn(scene: Scene, problem: Callable[[], Any]) -> Problem:
-    """What ``problem`` gives, a call of the scene's method; of an extension's scene it is looked at.
+    """The result of ``problem``, a call of the scene's method; it is checked if the scene is an extension's.
 
-    Raises ``InputError`` for whatever an extension's scene raises, and if it gives no problem.
+    Raises ``InputError`` for whatever an extension's scene raises, and if its result is not a ``Problem``.
     """
     kind = _KINDS.get(type(scene))
     if kind is None or type(scene).__module__.startswith("spherloc."):
@@ -87,7 +87,7 @@ def drawn(scene: Scene, problem: Callable[[], Any]) -> Problem:
         found = problem()
     if not isinstance(found, Problem):
         raise InputError(
-            f"{scene.name}: {registry.title('datasets', kind)} gave {show(found)}, which is no Problem; tell its "
+            f"{scene.name}: {registry.title('datasets', kind)} gave {show(found)}, which is not a Problem; tell its "
             "authors."
         )
     return found
@@ -96,7 +96,7 @@ def drawn(scene: Scene, problem: Callable[[], Any]) -> Problem:
 def read_table(path: Path) -> dict[str, Any]:
     """The keys of a scene file, not checked yet.
 
-    Raises ``InputError`` for a missing file and for one that is no TOML.
+    Raises ``InputError`` for a missing file and for one that is not TOML.
     """
     with reading(path, ADVICE):
         content = read_file(path, MAX_BYTES)
@@ -105,13 +105,14 @@ def read_table(path: Path) -> dict[str, Any]:
     except UnicodeDecodeError:
         raise InputError(f"{path}: not a text file in UTF-8; give the path of a scene file (TOML).") from None
     except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}: not valid TOML: {reason(error)}; correct it there.") from None
+        raise InputError(f"{path}: not valid TOML: {reason(error)}; correct the file there.") from None
     except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: no usable scene file ({reason(error)}); correct or replace it.") from None
+        raise InputError(f"{path}: not a usable scene file ({reason(error)}); correct or replace it.") from None
 
 
 def check_there(path: Path) -> None:
-    """Raise ``InputError`` if there is no such scene file; of a folder, an image or a video it says what takes it."""
+    """Raise ``InputError`` if there is no such scene file; for a folder, an image or a video it says which command
+    takes it."""
     _refuse_others(path)
     with reading(path, ADVICE):
         size_of(path)
@@ -245,11 +246,11 @@ def scene_kind(name: str) -> SceneKind:
     except InputError as error:
         if name not in registry.names("datasets"):
             raise
-        return SceneKind(name, "", problem=str(error))  # an extension that cannot be imported hides no other
+        return SceneKind(name, "", problem=str(error))  # an extension that cannot be imported must not hide the others
 
 
 def _own_kind(name: str, module: str) -> SceneKind:
-    """From the source of the module: to import all loaders takes seconds."""
+    """A kind of this package, read from the source of its module: importing all loaders takes seconds."""
     path = Path(__file__).with_name(f"{module.rpartition('.')[2]}.py")
     tree = ast.parse(path.read_text(encoding="utf-8"))
     values = {

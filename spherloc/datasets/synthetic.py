@@ -1,10 +1,10 @@
 """The paper's simulation (Sec. VI-A): map points in the cube [-5, 5]^3 seen by a level camera.
 
-Where the paper is silent or breaks: points and positions are uniform in the cube, or standard normal, since it says
-both; points are drawn until N are
-visible, that is valid for the camera model and inside the image after noise; an outlier is the projection of its map
-point by a random wrong pose of its own. The paper's gravity is exact; here it may be off. Beyond the paper, outliers
-may agree with each other, the field of view and the height of the cloud may be smaller, and the camera can be placed.
+Where the paper does not say enough or contradicts itself: points and positions are uniform in the cube, or standard
+normal, since it says both; points are drawn until N are visible, that is, valid for the camera model and inside the
+image after noise; an outlier is the projection of its map point by a random wrong pose of its own. The paper's gravity
+is exact; here it may be off. Beyond the paper, outliers may agree with each other, the field of view and the height of
+the cloud may be smaller, and the position of the camera can be given.
 """
 
 from collections.abc import Mapping
@@ -71,7 +71,7 @@ LIMITS: Mapping[str, tuple[float, float]] = {
     "field_of_view_deg": (10.0, WHOLE_SPHERE_DEG),
     "cloud_height_m": (0.0, 2 * HALF_SIZE_M),
 }
-"""Least and most of every number of a simulation."""
+"""Smallest and largest value of every number of a simulation."""
 TRUE_CAMERA_LIMITS = (360.0, 100.0, 100.0, 100.0)
 """Largest absolute yaw (deg) and coordinates (m)."""
 
@@ -89,11 +89,11 @@ class SyntheticScene:
     """
 
     name: str
-    """Shown to people."""
+    """Name that users see."""
     camera: Camera
     """The query camera."""
     correspondences: int
-    """How many, N."""
+    """Number of correspondences, N."""
     outlier_rate: float
     """Share of wrong correspondences, 0 to 1; rounded to whole correspondences."""
     noise_px: float
@@ -182,7 +182,7 @@ class SyntheticScene:
         )
 
     def _description(self) -> str:
-        """Where a problem comes from, in a line."""
+        """The settings of a problem in one line."""
         kind = "" if self.outlier_kind == "random" else f" {self.outlier_kind}"
         parts = [
             f"N {self.correspondences}, outliers {self.outlier_rate:g}{kind}, noise {self.noise_px:g} px",
@@ -198,8 +198,8 @@ class SyntheticScene:
     def _noisy_pixels(self, lens: Lens, cam_from_map: FloatArray, points: FloatArray, shift: FloatArray) -> FloatArray:
         """Pixels (N, 2) of the points (N, 3), moved by ``noise_px`` times ``shift`` (N, 2).
 
-        At the border inwards, so that all stay visible: the points must not depend on the noise, since dragging it
-        would otherwise replace some of them.
+        At the border they are moved inwards, so that all stay visible: the points must not depend on the noise, since
+        moving its slider would otherwise replace some of them.
         """
         pixels = self.camera.project(transform(cam_from_map, points))[0]
         shift = self.noise_px * shift
@@ -219,7 +219,7 @@ def _placed(true_camera: TrueCamera) -> FloatArray:
 
 
 def _tilted_down(rng: np.random.Generator, sd_rad: float) -> FloatArray:
-    """Gravity (3,) as a camera that is level would measure it: its pitch and roll are off by ``sd_rad`` each."""
+    """Gravity (3,) as a level camera measures it, with errors of pitch and roll of standard deviation ``sd_rad``."""
     tilt = rng.standard_normal(2)
     while np.linalg.norm(tilt) > GRAVITY_BOUND_SD:
         tilt = rng.standard_normal(2)

@@ -21,10 +21,10 @@ from spherloc.types import FloatArray, IntArray
 
 EDITS = ("spoiled", "mended", "hidden")
 SPOIL_STREAM = 17
-"""Keeps the draws of spoiled pixels apart from those of the simulation."""
+"""Number of the random stream of spoiled pixels, which keeps their draws apart from those of the simulation."""
 SPOIL_DRAWS = 32
 SPOIL_LEAST_RAD = np.radians(10.0)
-"""A spoiled pixel's bearing is off by at least so much, where the camera allows it."""
+"""Least angle between the bearings of a spoiled pixel and of the true one, where the camera allows it."""
 
 
 @dataclass(frozen=True)
@@ -35,10 +35,10 @@ class Variation:
     """
 
     camera: str | None = None
-    """Path of a scene or calibration file whose camera sees instead. This and what follows, down to ``true_camera``,
-    is for synthetic scenes only; None leaves it as the scene says."""
+    """Path of a scene or calibration file whose camera replaces the scene's. This field and the next ones, down to
+    ``true_camera``, are for synthetic scenes only; None leaves the scene's value."""
     correspondences: int | None = None
-    """How many, N."""
+    """Number of correspondences, N."""
     noise_px: float | None = None
     """Standard deviation of the pixel noise, px."""
     outlier_rate: float | None = None
@@ -65,13 +65,13 @@ class Variation:
             object.__setattr__(self, name, _numbers(name, getattr(self, name)))
         both = set(self.spoiled) & set(self.mended)
         if both:
-            raise InputError(f"match {min(both)} is to be spoiled and to be mended; choose one of the two.")
+            raise InputError(f"match {min(both)} is both to be spoiled and to be mended; choose one of the two.")
         if self.true_camera is not None:
             object.__setattr__(self, "true_camera", tuple(map(float, self.true_camera)))
 
     @property
     def simulation(self) -> dict[str, Any]:
-        """What is changed of a synthetic scene, by field."""
+        """The changed fields of a synthetic scene, with their values."""
         values = {item.name: getattr(self, item.name) for item in fields(self) if item.name not in EDITS}
         return {name: value for name, value in values.items() if value is not None}
 
@@ -101,8 +101,8 @@ class Variation:
     def problem(self, scene: Scene, seed: int | None = None, query: str | None = None) -> Problem:
         """The changed problem of a scene; ``seed`` replaces its own, ``query`` chooses a query image.
 
-        Raises ``InputError`` for what the scene does not have, a number of a match that does not exist, or a match
-        that cannot be mended.
+        Raises ``InputError`` for a change or a query that the scene does not have, the number of a match that does not
+        exist, or a match that cannot be mended.
         """
         return self.edit(self.unedited(scene, seed, query), used_seed(scene, seed))
 
@@ -158,7 +158,7 @@ class Variation:
         )
 
     def kept(self, count: int) -> IntArray:
-        """The original number (N',) of every correspondence of the problem, of which there were ``count``."""
+        """Original numbers (N',) of the correspondences that are not hidden, of ``count`` in all."""
         self._check(count)
         return np.delete(np.arange(count), list(self.hidden))
 
@@ -173,7 +173,7 @@ class Variation:
 
 
 def _changed_name(scene: SyntheticScene, changed: SyntheticScene, fields_changed: Iterable[str]) -> str:
-    """The scene's name, with what it says of outliers as it is now, and with the other changes."""
+    """The scene's name with its outlier rate brought up to date, followed by the other changes."""
     before, now = (f"{100 * rate:.3g} % outliers" for rate in (scene.outlier_rate, changed.outlier_rate))
     name = scene.name.replace(before, now)
     words = {
@@ -208,7 +208,7 @@ def _camera(path: Path) -> Camera:
     try:
         state = path.stat()
     except (OSError, ValueError):
-        return load_camera(path)  # which says what is wrong
+        return load_camera(path)  # raises an error that says what is wrong
     return _camera_of_state(path, state.st_mtime_ns, state.st_size)
 
 
@@ -232,7 +232,7 @@ def _wrong_pixels(problem: Problem, numbers: tuple[int, ...], seed: int) -> Floa
     least_z = np.nanmin(problem.bearings[:, 2])
     usable = valid & (bearings[:, :, 2] >= least_z)
     angle = np.arccos(np.clip(np.nan_to_num(np.einsum("kdi,ki->kd", bearings, right)), -1.0, 1.0))
-    # The first that is far off; where none is, the farthest; only then one outside the problem's part of the image.
+    # The first candidate that is far off; if none is, the farthest; pixels outside the used part of the image last.
     score = np.where(usable, np.minimum(angle, SPOIL_LEAST_RAD) + 10.0, np.where(valid, angle, -1.0))
     best = np.argmax(score, axis=1)
     lost = score[np.arange(len(numbers)), best] < 0.0

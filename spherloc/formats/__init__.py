@@ -1,1 +1,1 @@
-"""Readers of the files of other tools and datasets: what is in them, and nothing of scenes."""
+"""Readers of the files of other tools and datasets; they know nothing of scenes."""

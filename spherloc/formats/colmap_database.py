@@ -1,4 +1,4 @@
-"""COLMAP's database: what its localizer had to go by, keypoints and verified matches, also of images it gave no pose.
+"""COLMAP's database: keypoints and verified matches of all images, also of those that COLMAP could not localize.
 
 It is a SQLite file, which is opened for reading only and whose triggers and views are not run. Keypoints have the
 centre of the top-left pixel at (0.5, 0.5), as ours. Layout: doc/database.rst of COLMAP 4.2.
@@ -23,7 +23,7 @@ from spherloc.types import FloatArray, IntArray
 _PAIR = 2_147_483_647
 """A pair's id is this times the smaller image id, plus the larger one."""
 MAX_ROWS = 10_000_000
-"""Keypoints of an image, or matches of a pair."""
+"""Largest number of keypoints of an image, and of matches of a pair."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,15 +33,15 @@ class DatabaseQuery:
     pixels: FloatArray
     """(N, 2) px, its keypoints that are matched with points of the map."""
     points: FloatArray
-    """(N, 3) map frame."""
+    """(N, 3) m, these points in the map frame."""
     camera: Camera
 
 
 def read_queries_of_database(path: Path, model: ColmapModel) -> dict[str, DatabaseQuery | InputError]:
-    """Verified matches of each image that the map ``model`` does not have with points of the map, by its name.
+    """Verified matches with points of the map ``model``, by image, of each image that is not in the map.
 
-    A match of two images is one of a query's keypoint with the point that the other image's keypoint has in the map;
-    the same one from several images counts once. Raises ``InputError`` for what is no database of COLMAP.
+    Where a query's keypoint is matched with a keypoint of a map image, it is matched with the map point of that
+    keypoint; the same match from several images counts once. Raises ``InputError`` for a file of another kind.
     """
     with reading(path, "give COLMAP's database"):
         size_of(path)
@@ -50,8 +50,8 @@ def read_queries_of_database(path: Path, model: ColmapModel) -> dict[str, Databa
             database.execute("PRAGMA trusted_schema = OFF")
             database.text_factory = lambda text: text.decode("utf-8", errors="replace")
             return _Reader(path, database).queries(model)
-    except (sqlite3.Error, UnicodeDecodeError) as error:  # the latter of SQLite's own words, which quote the file
-        raise InputError(f"{path}: is no database of COLMAP ({show(str(error))}); give its database.db.") from error
+    except (sqlite3.Error, UnicodeDecodeError) as error:  # the latter from SQLite's messages, which quote the file
+        raise InputError(f"{path}: is not a COLMAP database ({show(str(error))}); give its database.db.") from error
 
 
 class _Reader:
@@ -88,7 +88,7 @@ class _Reader:
         for other, pairs in self._matches(number, references):
             ids = model.images[references[other]].point_ids
             if len(pairs) and not (pairs.max(axis=0) < (len(keypoints), len(ids))).all():
-                raise InputError(f"its matches with {show(references[other])} name keypoints that there are not.")
+                raise InputError(f"its matches with {show(references[other])} name keypoints that do not exist.")
             points = ids[pairs[:, 1]]
             matched.append(np.column_stack([pairs[:, 0], points])[points >= 0])
         both = np.unique(np.concatenate(matched), axis=0)
@@ -97,7 +97,7 @@ class _Reader:
         return DatabaseQuery(keypoints[both[known, 0]], xyz[known], self._camera(camera))
 
     def _matches(self, number: int, references: Collection[int]) -> list[tuple[int, IntArray]]:
-        """The other image, and the keypoints of this one and of that one (M, 2), of each pair with the map."""
+        """For each pair with a map image: that image, and the matches (M, 2), indices of this and of its keypoints."""
         found = []
         for other in references:
             pair = _PAIR * min(number, other) + max(number, other)
@@ -108,7 +108,7 @@ class _Reader:
         return found
 
     def _keypoints(self, number: int) -> FloatArray:
-        """(K, 2) px."""
+        """Keypoints (K, 2) of an image, px."""
         sql = "SELECT rows, cols, data FROM keypoints WHERE image_id = ?"
         row = self._database.execute(sql, (number,)).fetchone()
         if row is None:
@@ -121,12 +121,12 @@ class _Reader:
 
     @staticmethod
     def _array(count: Any, columns: Any, content: Any, kind: np.dtype, wanted: int | None) -> np.ndarray:
-        """The rows of a blob (count, columns)."""
+        """The rows of a blob, an array (count, columns)."""
         if count == 0:
             return np.empty((0, 2), dtype=kind)
         whole = type(count) is int and type(columns) is int and type(content) is bytes
         if not whole or not 0 < count <= MAX_ROWS or not 2 <= columns <= 16 or columns != (wanted or columns):
-            raise InputError("has a table in the database whose size is impossible.")
+            raise InputError("has a table of an impossible size in the database.")
         if len(content) != count * columns * kind.itemsize:
             raise InputError("has a table in the database that is not as long as it says.")
         return np.frombuffer(content, dtype=kind).reshape(count, columns)
@@ -136,9 +136,9 @@ class _Reader:
         row = self._database.execute(sql, (number,)).fetchone()
         where = f"camera {number}"
         if row is None or type(row[0]) is not int or not 0 <= row[0] < len(MODELS):
-            raise InputError(f"{where} is not in the database, or of a model that is not known.")
+            raise InputError(f"{where} is not in the database, or its model is unknown.")
         model, width, height, content = row
         name, count = MODELS[model]
         if type(content) is not bytes or len(content) != 8 * count or type(width) is not int or type(height) is not int:
-            raise InputError(f"{where} has not the {count} parameters of {name}.")
+            raise InputError(f"{where} does not have the {count} parameters of {name}.")
         return camera_from_colmap(name, width, height, np.frombuffer(content, dtype="<f8"), where)

@@ -67,7 +67,7 @@ def _form(folder: Path) -> str:
 
 _SPHERE_ID, _SPHERE_PARAMETERS = 11, 3
 _CAMERA = 0
-"""Type of a sensor."""
+"""Number that rigs.bin and frames.bin use for the sensor type camera."""
 _POINT = np.dtype([("id", "<i8"), ("xyz", "<f8", (3,)), ("rgb", "u1", (3,)), ("error", "<f8"), ("track", "<u8")])
 _TRACK = np.dtype([("image", "<u4"), ("place", "<u4")])
 _MAX_NAME_BYTES = 4096
@@ -191,11 +191,11 @@ def _name(reader: _Reader, number: int) -> str:
     try:
         return name.decode()
     except UnicodeDecodeError:
-        raise reader.broken(f"the name of image {number} is no text in UTF-8") from None
+        raise reader.broken(f"the name of image {number} is not text in UTF-8") from None
 
 
 def _load(path: Path, offset: int, count: int) -> NDArray[Any]:
-    """Observations are read when they are asked for: those of thousands of images would fill the memory."""
+    """Observations of one image, read when they are asked for: those of thousands of images would fill the memory."""
     with reading(path, "load the scene again"), open_file(path) as file:
         observations = np.fromfile(file, OBSERVATION, count, offset=offset)
     if len(observations) != count:
@@ -232,7 +232,7 @@ def _check_tracks(reader: _Reader, parts: ModelParts, content: bytearray) -> Non
 
 
 _MAX_LINE = 64_000_000
-"""Characters of a line: the observations of a million keypoints."""
+"""Largest number of characters of a line: the observations of a million keypoints."""
 _PARAMETERS = dict(MODELS)
 
 
@@ -246,14 +246,14 @@ class _Line:
         return InputError(f"{self.path}, line {self.number}: {what}; correct it, or export the model again.")
 
     def words(self, least: int, form: str) -> list[str]:
-        """At least so many words; ``form`` says what belongs there."""
+        """The words of the line, at least ``least``; ``form`` says what the line should hold."""
         words = self.text.split()
         if len(words) < least:
             raise self.broken(f"{len(words)} values instead of {form}")
         return words
 
     def numbers(self, words: list[str]) -> list[float]:
-        """Finite numbers."""
+        """The words as finite numbers."""
         try:
             values = [float(word) for word in words]
         except ValueError:
@@ -264,7 +264,7 @@ class _Line:
         return values
 
     def whole(self, word: str) -> int:
-        """A whole number that is not negative."""
+        """A word as a whole number that is not negative."""
         if not (word.isascii() and word.isdecimal() and len(word) < 20 and int(word) < 2**63):
             raise self._no_number(word, "a whole number from 0")
         return int(word)
@@ -306,7 +306,7 @@ def _read_text(folder: Path) -> ModelParts:
             with reading(path, "check the file"):
                 step(_lines(path), parts)
         except UnicodeDecodeError:
-            raise InputError(f"{path}: is no text in UTF-8; export the model again.") from None
+            raise InputError(f"{path}: is not text in UTF-8; export the model again.") from None
     return parts
 
 
@@ -340,7 +340,7 @@ def _text_cameras(lines: Iterator[_Line], parts: ModelParts) -> None:
 def _text_rigs(lines: Iterator[_Line], parts: ModelParts) -> None:
     for line in _records(lines):
         number, count, *words = line.words(2, "RIG_ID, NUM_SENSORS and the sensors")
-        words[2:2] = ["0"] if len(words) >= 2 else []  # the reference has no pose, as others may have none
+        words[2:2] = ["0"] if len(words) >= 2 else []  # the reference has no pose in the file
         cameras: list[tuple[int, FloatArray | None]] = []
         for place in range(line.whole(count)):
             sensor_from_rig = np.eye(3, 4) if place == 0 else None
@@ -405,7 +405,7 @@ def _text_points(lines: Iterator[_Line], parts: ModelParts) -> None:
     for line in _records(lines):
         number, *rest = line.words(8, "POINT3D_ID, X, Y, Z, R, G, B, ERROR and the track")
         if len(rest) % 2 == 0:
-            raise line.broken("the track is no list of pairs IMAGE_ID, POINT2D_IDX")
+            raise line.broken("the track is not a list of pairs IMAGE_ID, POINT2D_IDX")
         if line.whole(number) in ids:
             raise line.broken(f"point {number} is there twice")
         ids[line.whole(number)] = None

@@ -1,7 +1,7 @@
 """A COLMAP model: cameras, posed images and points, collected and checked while its files are read.
 
-COLMAP's own reader takes a truncated file for a shorter one, believes every count, and passes NaN on; this one says
-where what is wrong. Poses, observations and points are columns, for which COLMAP has an object each. Layout:
+COLMAP's own reader accepts truncated files, trusts every count, and passes NaN on; this one says what is wrong and
+where. Poses, observations and points are kept in columns, not as one object each, as in COLMAP. Layout:
 doc/format.rst of COLMAP 4.2.
 """
 
@@ -35,19 +35,19 @@ SPHERE = (
 )
 
 OBSERVATION = np.dtype([("pixel", "<f8", (2,)), ("point", "<i8")])
-"""A pixel and the id of its point, -1 for none."""
+"""A keypoint's pixel (px) and the id of its point, -1 for none."""
 
 Broken = Callable[[str], InputError]
-"""Makes the error that says at which place of which file what is wrong."""
+"""Makes the error, which adds the file and the place in it to what is wrong."""
 
 LARGEST = 1e12
-"""Coordinates beyond this are damage, whatever the model's unit: what is computed from them would overflow."""
+"""Coordinates beyond this mean a damaged file, whatever the model's unit: computations with them would overflow."""
 
 _NORM_TOLERANCE = 1e-3
 
 
 RawCamera = tuple[str, int, int, tuple[float, ...]]
-"""COLMAP's model, width, height and parameters."""
+"""COLMAP's name of the camera model, width and height (px), and the parameters."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,9 +86,9 @@ class Points:
     """Columns of P points, by rising id."""
 
     ids: NDArray[np.int64]
-    """(P,)"""
+    """(P,) ids of the points, rising."""
     xyz: FloatArray
-    """(P, 3), in the model's unit, metres if it is scaled."""
+    """(P, 3) positions in the model's unit, which is a metre if the model is scaled."""
     errors_px: FloatArray
     """(P,) mean reprojection error; -1 where COLMAP did not compute it."""
     track_lengths: NDArray[np.int64]
@@ -105,7 +105,7 @@ class ColmapModel:
     points: Points
     """All points, by rising id."""
     raw_cameras: Mapping[int, RawCamera]
-    """By camera id."""
+    """Cameras as in the file, by camera id."""
     remarks: tuple[str, ...] = ()
     """What was left out and why, in sentences."""
 
@@ -114,7 +114,7 @@ class ColmapModel:
         return {}
 
     def camera(self, camera_id: int) -> Camera:
-        """The camera of an id, converted when it is first asked for: one that is not supported harms no other.
+        """The camera of an id, converted when it is first asked for: a model with an unsupported camera is usable too.
 
         Raises ``CalibrationError``.
         """
@@ -128,7 +128,7 @@ class ColmapModel:
         return camera
 
     def point_places(self, ids: NDArray[np.integer]) -> IntArray:
-        """(K,) where points are in the columns of ``points``; -1 for those that the model does not have."""
+        """(K,) rows of the points with these ids (K,) in ``points``; -1 for ids that the model does not have."""
         if not len(self.points.ids):
             return np.full(len(ids), -1)
         place = np.minimum(np.searchsorted(self.points.ids, ids), len(self.points.ids) - 1)
@@ -151,25 +151,25 @@ def _converted(name: str, width: int, height: int, params: tuple[float, ...], wh
 
 @dataclass(eq=False)
 class ModelParts:
-    """What was found so far. Its methods take what a file says next; ``broken`` makes the error if it cannot be."""
+    """What was read so far. Each method adds one record; ``broken`` makes the error if the record cannot be right."""
 
     cameras: dict[int, RawCamera] = field(default_factory=dict)
-    """By camera id."""
+    """Cameras by camera id."""
     rigs: dict[int, dict[int, FloatArray | None]] = field(default_factory=dict)
     """By rig id and camera id, the pose (3, 4) of the camera in the rig; None where the rig leaves it open."""
     frames: dict[int, tuple[int, FloatArray | None]] = field(default_factory=dict)
-    """Of the images that a frame lists, by image id: camera id and pose (3, 4); None where the rig leaves it open."""
+    """Camera id and pose (3, 4) of each image that a frame lists, by image id; None where the rig leaves it open."""
     images: dict[int, ColmapImage] = field(default_factory=dict)
-    """By id, without those that have no pose."""
+    """Images by image id, without those that have no pose."""
     counts: dict[int, int] = field(default_factory=dict)
     """Number of observations by image id, of all images."""
     names: set[str] = field(default_factory=set)
-    """Of all images."""
+    """Names of all images."""
     points: Points = field(init=False)
-    """Set when they are read, which is last."""
+    """The points; set when they are read, which is last."""
 
     def camera(self, number: int, camera: RawCamera, broken: Broken) -> None:
-        """A camera."""
+        """Add a camera."""
         if number in self.cameras:
             raise broken(f"camera {number} is there twice")
         if not np.isfinite(camera[3]).all():
@@ -177,7 +177,7 @@ class ModelParts:
         self.cameras[number] = camera
 
     def rig(self, number: int, sensors: Sequence[tuple[int, FloatArray | None]], broken: Broken) -> None:
-        """A rig with its cameras, each with its pose (3, 4) in the rig; None where that is open."""
+        """Add a rig with its cameras, each with its pose (3, 4) in the rig; None where that is open."""
         cameras = dict(sensors)
         if number in self.rigs:
             raise broken(f"rig {number} is there twice")
@@ -188,7 +188,7 @@ class ModelParts:
     def frame(
         self, number: int, rig: int, rig_from_map: FloatArray, images: Sequence[tuple[int, int]], broken: Broken
     ) -> None:
-        """A frame of a rig with its pose (3, 4) and pairs of a camera id and an image id."""
+        """Add a frame of a rig with its pose (3, 4) and pairs of a camera id and an image id."""
         if rig not in self.rigs:
             raise broken(f"frame {number} is of rig {rig}, which is not among the rigs")
         for camera, image in images:
@@ -204,7 +204,7 @@ class ModelParts:
                 self.frames[image] = camera, pose(cam_from_rig[:, :3] @ rig_from_map[:, :3], position)
 
     def image(self, number: int, image: ColmapImage, broken: Broken) -> None:
-        """An image with the pose beside it, which frames overrule; its observations have been checked."""
+        """Add an image, whose observations have been checked; a frame's pose replaces the image's own."""
         if number in self.counts:
             raise broken(f"image {number} is there twice")
         if not image.name:
@@ -226,12 +226,12 @@ class ModelParts:
 
     @cached_property
     def _keypoints(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Ids of the images, rising, and their numbers of keypoints; asked for once all images are there."""
+        """Ids of the images, rising, and their numbers of keypoints; used once all images are read."""
         known = sorted(self.counts)
         return np.array(known, dtype=np.int64), np.array([self.counts[number] for number in known], dtype=np.int64)
 
     def tracks(self, image_ids: NDArray[np.int64], places: NDArray[np.int64], broken: Broken) -> None:
-        """Which keypoints see some of the points: image ids (T,) and places among the image's keypoints (T,)."""
+        """Check the keypoints that see points: image ids (T,) and indices among the image's keypoints (T,)."""
         known, counts = self._keypoints
         index = np.searchsorted(known, image_ids)
         there = index < len(known)
@@ -260,7 +260,7 @@ def read_pose(numbers: Sequence[float], broken: Broken, what: str) -> FloatArray
     with np.errstate(over="ignore", invalid="ignore"):
         norm = float(np.linalg.norm(values[:4]))
     if not ((np.abs(values) <= LARGEST).all() and abs(norm - 1.0) <= _NORM_TOLERANCE):
-        raise broken(f"the pose of {what} is {show(list(numbers))}, no unit quaternion and possible translation")
+        raise broken(f"the pose of {what} is {show(list(numbers))}, not a unit quaternion and a possible translation")
     return pose(rotation_from_wxyz(values[:4]), values[4:])
 
 

@@ -1,4 +1,4 @@
-"""What hloc writes: HDF5 files of features and matches, and text lists of pairs, queries and results.
+"""Reads hloc's files: features and matches in HDF5, and text lists of pairs, queries and results.
 
 An image's name is its group in features.h5, nested at every "/". hloc's pixels have the centre of the top-left one at
 (0, 0); here 0.5 is added. ``matches0`` of a pair of images has for each keypoint of the first its match in the second,
@@ -22,12 +22,12 @@ from spherloc.registry import require
 from spherloc.types import FloatArray, IntArray
 
 MAX_BYTES = 1 << 28
-"""Of one array: 16 million keypoints."""
+"""Largest size of one array: 16 million keypoints."""
 MAX_TOTAL_BYTES = 1 << 30
-"""Of all global descriptors together."""
+"""Largest size of all global descriptors together."""
 
 _LARGEST_PX = 1e6
-"""Beyond any image; it refuses NaN and infinity too."""
+"""Largest coordinate of a keypoint, beyond any image; the comparison refuses NaN and infinity too."""
 
 
 def read_queries(path: Path) -> tuple[dict[str, Camera], list[str]]:
@@ -93,7 +93,7 @@ class Keypoints:
     rounding_px: float
     """Step of the numbers in the file at its largest coordinate: 1 px and more for half floats beyond 1024 px."""
     uncertainty_px: float | None
-    """How far off hloc takes a keypoint to be, as it found them in a smaller image; None if the file does not say."""
+    """hloc's uncertainty of a keypoint, from the smaller image in which it was found; None if the file has none."""
     image_size: tuple[int, int] | None
     """Width and height of the image in which they were found; None if the file does not say."""
 
@@ -121,7 +121,7 @@ class Hdf5:
             return dataset[()]
 
     def attribute(self, names: Sequence[str], name: str) -> float | None:
-        """A number that is attached to a dataset, None if there is none or it is no number."""
+        """A number that is attached to a dataset; None if there is none or it is not a number."""
         place = f"{self.path}: {show('/'.join(names))}"
         with _guarded(place):
             dataset = self._find(names, place)
@@ -148,7 +148,7 @@ class Hdf5:
 
 @contextmanager
 def open_hdf5(path: Path) -> Iterator[Hdf5]:
-    """A file for reading. Raises ``InputError`` if it is missing, a pickle or no HDF5."""
+    """A file opened for reading. Raises ``InputError`` if it is missing, a pickle or not HDF5."""
     refuse_pickle(path)
     h5py = _h5py()
     with _guarded(str(path)):
@@ -242,7 +242,7 @@ def _h5py() -> Any:
 
 @contextmanager
 def _guarded(place: str) -> Iterator[None]:
-    """One sentence for whatever h5py raises on a damaged file, which is nearly any exception there is."""
+    """One sentence for whatever h5py raises on a damaged file, which can be nearly any exception."""
     try:
         yield
     except InputError:
@@ -264,7 +264,7 @@ def _check(dataset: Any, kinds: str, dimensions: int, place: str) -> None:
         )
     largest = max(_bytes(dataset.shape, dataset.dtype), _bytes(dataset.chunks or (), dataset.dtype))
     if largest > MAX_BYTES:
-        raise InputError(f"{place} claims {largest:,} bytes; more than {MAX_BYTES:,} are no features of an image.")
+        raise InputError(f"{place} claims {largest:,} bytes, more than {MAX_BYTES:,}; write the file again.")
 
 
 def _bytes(shape: Sequence[int], dtype: np.dtype) -> int:

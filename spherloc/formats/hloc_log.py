@@ -1,8 +1,8 @@
 """hloc's logs (``results.txt_logs.pkl``): the matches of every query and the pose that came of them.
 
 A log is a pickle, which is read without running anything in it, see ``pickle_data``. Its pixels have the centre of the
-top-left one at (0.5, 0.5), as ours. Logs of hloc up to 1.3 have the points' coordinates and quaternions as texts of
-results do; later ones have ids of points of the COLMAP model, and objects of pycolmap, whose quaternions end with w.
+top-left one at (0.5, 0.5), as ours. Logs of hloc up to 1.3 have the points' coordinates, and quaternions that begin
+with w; later ones have ids of points of the COLMAP model, and objects of pycolmap, whose quaternions end with w.
 """
 
 from collections.abc import Iterator, Mapping
@@ -24,31 +24,31 @@ from spherloc.types import FloatArray
 
 MAX_BYTES = 1 << 30
 MAX_MATCHES = 1_000_000
-"""Of a query."""
+"""Largest number of matches of a query."""
 NAMES = (".pkl", ".pickle")
-"""Ends of the names of pickles."""
+"""File name endings of pickles."""
 
 
 @dataclass(frozen=True, eq=False)
 class LoggedQuery:
-    """What a log says of a query that was localized."""
+    """Pose and matches of a query that was localized."""
 
     cam_from_map: FloatArray
     """Its pose (3, 4)."""
     pixels: FloatArray
-    """(N, 2) px."""
+    """(N, 2) px, the matched pixels."""
     points: FloatArray
-    """(N, 3) map frame."""
+    """(N, 3) m, their points in the map frame."""
     camera: Camera
 
 
 def is_log(path: Path) -> bool:
-    """Whether it is a pickle by its name."""
+    """Whether the name of a file is that of a pickle."""
     return path.suffix.lower() in NAMES
 
 
 def read_log_poses(path: Path) -> dict[str, FloatArray]:
-    """Poses ``cam_from_map`` (3, 4) of the queries that were localized. Raises ``InputError`` for what is no log."""
+    """Poses ``cam_from_map`` (3, 4) of the queries that were localized. Raises ``InputError`` for another file."""
     poses = {}
     for name, entry, place in _localized(path):
         with _placed(place):
@@ -57,10 +57,10 @@ def read_log_poses(path: Path) -> dict[str, FloatArray]:
 
 
 def read_log(path: Path, model: ColmapModel | None) -> dict[str, LoggedQuery | InputError]:
-    """What a log says of each query that was localized, or why it cannot be used.
+    """Pose and matches of each query that was localized, or why they cannot be used.
 
-    ``model`` is the COLMAP model of the map, which newer logs need, since they only have the numbers of points. Raises
-    ``InputError`` for what is no log.
+    ``model`` is the COLMAP model of the map, which newer logs need, since they have only the ids of points. Raises
+    ``InputError`` for another file.
     """
     found: dict[str, LoggedQuery | InputError] = {}
     for name, entry, place in _localized(path):
@@ -74,7 +74,7 @@ def read_log(path: Path, model: ColmapModel | None) -> dict[str, LoggedQuery | I
 
 @contextmanager
 def _placed(place: str) -> Iterator[None]:
-    """Says where in the log something is wrong."""
+    """Adds the place in the log to an error."""
     try:
         yield
     except PickleDataError as error:
@@ -82,16 +82,16 @@ def _placed(place: str) -> Iterator[None]:
 
 
 def _localized(path: Path) -> Iterator[tuple[str, Mapping[str, Any], str]]:
-    """Name, entry and place of each query that has a pose; of clusters of references the best one's entry."""
+    """Name, entry and place of each query that has a pose; of several clusters of references, the best one's entry."""
     with reading(path, "give hloc's log"):
         content = read_file(path, MAX_BYTES)
     try:
         logs = read_pickle_data(content)
     except PickleDataError as error:
-        raise InputError(f"{path}: {error}, so it is no log of hloc; give results.txt_logs.pkl.") from error
+        raise InputError(f"{path}: {error}, so it is not a log of hloc; give results.txt_logs.pkl.") from error
     queries = _table(_table(logs).get("loc"))
     if not queries:
-        raise InputError(f"{path}: has no query under 'loc', so it is no log of hloc; give results.txt_logs.pkl.")
+        raise InputError(f"{path}: has no query under 'loc', so it is not a log of hloc; give results.txt_logs.pkl.")
     for name, told in queries.items():
         place = f"{path}: {show(name)}"
         entry = _table(told)
@@ -106,7 +106,7 @@ def _localized(path: Path) -> Iterator[tuple[str, Mapping[str, Any], str]]:
 
 
 def _table(found: Any) -> Mapping[str, Any]:
-    """A dict, or what an object of a class has in its fields; empty for anything else."""
+    """A dict, or the fields of an object by name; empty for anything else."""
     if isinstance(found, Noted):
         found = found.state if isinstance(found.state, dict) else found.items
     return found if isinstance(found, dict) else {}
@@ -136,16 +136,16 @@ def _pose(entry: Mapping[str, Any], place: str) -> FloatArray:
 
 
 def _points(entry: Mapping[str, Any], model: ColmapModel | None, place: str) -> FloatArray:
-    """(N, 3); NaN for points that the model does not have."""
+    """Positions (N, 3) of the points, m; NaN for points that the model does not have."""
     stated = entry.get("points3D_xyz")
     if stated is not None:
         return _floats(stated, 3, f"{place}: points3D_xyz")
     ids = entry.get("points3D_ids")
     numbers = [value_of(number) for number in ids] if isinstance(ids, list) else np.ravel(value_of(ids)).tolist()
     if not all(type(number) is int and 0 <= number < 1 << 63 for number in numbers):
-        raise InputError(f"{place}: points3D_ids are no numbers of points.")
+        raise InputError(f"{place}: points3D_ids are not ids of points; give the log as hloc wrote it.")
     if model is None:
-        raise InputError(f"{place}: has only the numbers of its points; give the COLMAP model of the map by --model.")
+        raise InputError(f"{place}: has only the ids of its points; give the COLMAP model of the map by --model.")
     return model.point_xyz(np.array(numbers, dtype=np.int64))
 
 
@@ -158,7 +158,7 @@ def _camera(entry: Mapping[str, Any], place: str) -> Camera:
         model = MODELS[number][0] if isinstance(number, int) and 0 <= number < len(MODELS) else None
     width, height = value_of(told.get("width")), value_of(told.get("height"))
     if not isinstance(model, str) or not isinstance(width, int) or not isinstance(height, int):
-        raise InputError(f"{place}: says no camera; name a scene file of hloc instead, which knows it.")
+        raise InputError(f"{place}: has no camera; give a scene file of kind hloc instead, which names the cameras.")
     params = _numbers(told.get("params"), None, f"{place}: params")
     try:
         return camera_from_colmap(model, width, height, tuple(params), place)
@@ -180,7 +180,7 @@ def _numbers(found: Any, count: int | None, what: str) -> list[float]:
 
 
 def _floats(found: Any, width: int, what: str) -> FloatArray:
-    """An array (N, width), also of a list of rows."""
+    """An array (N, width), from an array or a list of rows."""
     values = value_of(found)
     if isinstance(values, list):
         values = np.array([_numbers(row, width, what) for row in values[: MAX_MATCHES + 1]]).reshape(-1, width)
@@ -190,7 +190,7 @@ def _floats(found: Any, width: int, what: str) -> FloatArray:
         or values.ndim != 2
         or values.shape[1] != width
     ):
-        raise InputError(f"{what} is no array of {width} columns; give the log as hloc wrote it.")
+        raise InputError(f"{what} is not an array of {width} columns; give the log as hloc wrote it.")
     if len(values) > MAX_MATCHES:
         raise InputError(f"{what} has more than {MAX_MATCHES:,} rows.")
     return np.array(values, dtype=np.float64)

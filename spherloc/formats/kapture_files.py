@@ -37,16 +37,16 @@ class Record:
 
 @dataclass(frozen=True, eq=False)
 class Kapture:
-    """What the files of a dataset say."""
+    """The contents of a dataset's files."""
 
     cameras: Mapping[str, Camera]
-    """By sensor."""
+    """Cameras by sensor."""
     rigs: Mapping[str, Mapping[str, FloatArray | None]]
-    """By member (a sensor or a rig) and rig: ``member_from_rig`` (3, 4), None where the file leaves it open."""
+    """``member_from_rig`` (3, 4) by member (a sensor or a rig) and rig; None where the file leaves it open."""
     trajectories: Mapping[tuple[int, str], FloatArray]
     """``device_from_world`` (3, 4) by timestamp and device."""
     records: tuple[Record, ...]
-    """In the order of the file."""
+    """Images in the order of the file."""
     remarks: tuple[str, ...]
     """What was skipped and why."""
 
@@ -188,5 +188,5 @@ def _records(path: Path, devices: set[str]) -> tuple[Record, ...]:
 def _timestamp(word: str, place: str) -> int:
     digits = word.removeprefix("-")
     if not (digits.isascii() and digits.isdigit() and len(digits) < 20 and int(digits) < _LARGEST_TIMESTAMP):
-        raise InputError(f"{place}: the timestamp {show(word)} is no whole number of 64 bits; correct it.")
+        raise InputError(f"{place}: the timestamp {show(word)} is not a whole number of 64 bits; correct it.")
     return int(word)

@@ -20,9 +20,9 @@ from spherloc.formats.text_rows import finite_numbers, needed_file, rows
 from spherloc.types import BoolArray, FloatArray
 
 MAX_SCAN_BYTES = 1 << 28
-"""A hundred times a scan of the dataset."""
+"""Largest file of a scan: a hundred times those of the dataset."""
 FARTHEST_M = 10_000.0
-"""Laser returns beyond this, a hundred times the sensor's range, are no returns but damage."""
+"""Laser returns beyond this, a hundred times the sensor's range, mean a damaged file."""
 MAX_SIDE_PX = 10_000
 FARTHEST_ORIGIN_M = 1e9
 """Beyond this, 25 times around the Earth, a position has lost its millimetres."""
@@ -42,7 +42,7 @@ class Rig:
     imu_from_camera: FloatArray
     imu_from_velodyne: FloatArray
     car_mask: Path | None
-    """Where the image shows the vehicle itself; not everybody has that file."""
+    """File of the mask of the vehicle itself in the image; None if the file is missing."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class Drive:
         return self.root / "data_2d_raw" / self.name / camera / "data_rgb"
 
     def timestamps(self, camera: str) -> Path:
-        """Times of a camera's images, a line a frame; not everybody downloads them."""
+        """Times of a camera's images, a line a frame; the file may be missing."""
         return self.root / "data_2d_raw" / self.name / camera / "timestamps.txt"
 
     @property
@@ -140,7 +140,7 @@ def read_poses(path: Path) -> dict[int, FloatArray]:
     for place, text in rows(path, "the poses.txt of a sequence"):
         frame, *values = text.split()
         if not (frame.isascii() and frame.isdigit() and len(frame) <= 10 and int(frame) > last):
-            raise InputError(f"{place}: the frame {show(frame)} is none after {last}; sort the lines by frame.")
+            raise InputError(f"{place}: the frame {show(frame)} does not come after {last}; sort the lines by frame.")
         last = int(frame)
         poses[last] = _rigid(values, place)
     if not poses:
@@ -163,7 +163,7 @@ def _rigid(words: list[str], place: str) -> FloatArray:
     motion = np.eye(4)
     motion[:3, :3], motion[:3, 3] = left @ right, given[:, 3]
     if not np.abs(motion[:3, :3] - given[:, :3]).max() <= ROTATION_TOLERANCE or np.linalg.det(left @ right) < 0:
-        raise InputError(f"{place}: its 3 x 3 part is no rotation; check the order and number of the values.")
+        raise InputError(f"{place}: its 3 x 3 part is not a rotation; check the order and number of the values.")
     return motion
 
 
@@ -188,24 +188,24 @@ def read_timestamps(path: Path) -> list[float]:
 def without_car(path: Path, camera: Camera) -> BoolArray:
     """(H, W), false where ``fisheye/mask_{left,right}_fisheye.npy`` is not zero: the vehicle, which moves along.
 
-    The mask may be smaller than the image. Raises ``InputError`` for what is no such mask.
+    The mask may be smaller than the image. Raises ``InputError`` if the file is not such a mask.
     """
     try:
         size_of(path)  # refuses a pipe, which numpy would wait for
         # Mapped: a header that claims more than the file holds is refused before anything is allocated.
         mask = np.load(path, mmap_mode="r", allow_pickle=False)
-    except Exception:  # numpy lets whatever its header's parser stumbles over through
+    except Exception:  # numpy parses the header as Python text, which can raise nearly anything
         mask = None
     sides = mask.shape if isinstance(mask, np.ndarray) and mask.dtype.kind in "buif" else ()
     if mask is None or len(sides) != 2 or not 0 < min(sides) <= max(sides) <= MAX_SIDE_PX:
-        raise InputError(f"{path}: no array of rows and columns, as the mask of the car has; replace or remove it.")
+        raise InputError(f"{path}: is not the mask of the car, rows and columns of numbers; replace or remove it.")
     size = (camera.width, camera.height)
     car = cv2.resize((np.asarray(mask) != 0).astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
     return car == 0
 
 
 def frames_in(folder: Path, ending: str, where: str, what: str) -> set[int]:
-    """Frames of the files in a folder that are named by ten digits and ``ending``; others are left alone.
+    """Frames of the files in a folder that are named by ten digits and ``ending``; other files are ignored.
 
     Raises ``InputError`` if there is no such folder; ``what`` says what it should hold.
     """
@@ -218,15 +218,15 @@ def frames_in(folder: Path, ending: str, where: str, what: str) -> set[int]:
 def read_scan(path: Path) -> FloatArray:
     """Laser returns (N, 3), Velodyne frame, metres, of little-endian float32 x, y, z, reflectance.
 
-    Rays without a return, at exactly (0, 0, 0), are no points. Raises ``InputError``, naming the byte, for a damaged
-    file, and for one without any point.
+    Rays without a return, stored as exactly (0, 0, 0), are left out. Raises ``InputError``, naming the byte, for a
+    damaged file, and for one without any point.
     """
     with reading(path, "download the scan or leave out its frame"):
         content = read_file(path, MAX_SCAN_BYTES)
     if len(content) % _POINT_BYTES:
         raise InputError(
-            f"{path}: {len(content)} bytes, but a scan has {_POINT_BYTES} for each point; the file is damaged or no "
-            "scan: replace it."
+            f"{path}: {len(content)} bytes, but a scan has {_POINT_BYTES} for each point; the file is damaged or not "
+            "a scan: replace it."
         )
     rows = np.frombuffer(content, dtype="<f4").reshape(-1, 4)
     points = rows[:, :3].astype(np.float64)
@@ -234,7 +234,7 @@ def read_scan(path: Path) -> FloatArray:
     if len(bad):
         x, y, z = points[bad[0]]
         raise InputError(
-            f"{path}, byte {bad[0] * _POINT_BYTES}: the point ({x:g}, {y:g}, {z:g}) is no laser return in metres; "
+            f"{path}, byte {bad[0] * _POINT_BYTES}: the point ({x:g}, {y:g}, {z:g}) is not a laser return in metres; "
             "the file is damaged: replace it."
         )
     points = points[points.any(axis=1)]
@@ -244,7 +244,7 @@ def read_scan(path: Path) -> FloatArray:
 
 
 def scan_motion(poses: Mapping[int, FloatArray], frame: int, imu_from_velodyne: FloatArray) -> FloatArray | None:
-    """How the scanner moved during the turn of a frame: its pose a turn before, in that of the frame.
+    """How the scanner moved during the turn of a frame: its pose (4, 4) one turn before, in the frame's scanner frame.
 
     From the frame before, else the frame after, as the dataset's own tools do; None where neither has a pose.
     """
@@ -256,7 +256,7 @@ def scan_motion(poses: Mapping[int, FloatArray], frame: int, imu_from_velodyne: 
 
 
 def unwrapped(points: FloatArray, motion: FloatArray) -> FloatArray:
-    """Returns (N, 3) of one turn as if the scanner had stood still where it looked ahead, when the cameras fire.
+    """Returns (N, 3) of one turn, corrected to the moment when the scanner looked ahead, at which the cameras fire.
 
     Raw scans are not corrected for the vehicle's motion (kitti360Scripts, issue 87): at 10 m/s and 10 Hz, what lies
     beside the vehicle, where the fisheyes look, is off by a quarter of a metre. The scanner turns clockwise, so that

@@ -1,4 +1,4 @@
-"""Reads the data in a Python pickle without running anything: objects of classes stay notes of what was to be made.
+"""Reads the data in a Python pickle without running anything: objects of classes are noted and not made.
 
 A pickle is a program for a small machine with a stack. Python's own unpickler imports what the program names and calls
 it. This reader takes the program apart with ``pickletools``, which runs nothing, and goes through it with plain data
@@ -17,32 +17,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 MAX_STEPS = 200_000_000
-"""Of a program; a log of thousands of queries has tens of millions."""
+"""Largest number of instructions of a pickle; a log of thousands of queries has tens of millions."""
 KEYS = (str, int, float, bytes, type(None))
-"""Of a dict: nothing whose hash costs anything."""
+"""Types of a dict's keys: those that are cheap to hash."""
 PLAIN = {"collections.defaultdict", "collections.OrderedDict", "builtins.dict"}
-"""What is a dict for its reader."""
+"""Classes whose objects are read as dicts."""
 
 
 class PickleDataError(Exception):
-    """The program cannot be followed; the message ends a sentence about the file."""
+    """The pickle cannot be read; the message ends a sentence about the file."""
 
 
 @dataclass(eq=False)
 class Noted:
-    """What Python's unpickler would import (``args`` is None) or call."""
+    """An object that Python's unpickler would import (``args`` is None) or make by a call with ``args``."""
 
     name: str
     """Module and name, such as "numpy.dtype"."""
     args: tuple[Any, ...] | None = None
     state: Any = None
-    """What it would be given when it is made; of pairs of a dict and an array's bytes, say."""
+    """Its state, which the unpickler would set after the call, such as a dict of fields or the bytes of an array."""
     items: dict[Any, Any] = field(default_factory=dict)
-    """What would be put into it by keys."""
+    """Items that the unpickler would put into it by keys."""
 
 
 def read_pickle_data(content: bytes) -> Any:
-    """What a pickle holds. Raises ``PickleDataError`` for what is none, or has what no data needs."""
+    """The data of a pickle. Raises ``PickleDataError`` for another file, and for instructions that no data needs."""
     machine = _Machine()
     try:
         for number, (opcode, argument, _) in enumerate(pickletools.genops(io.BytesIO(content))):
@@ -52,7 +52,7 @@ def read_pickle_data(content: bytes) -> Any:
                 return machine.stack.pop()
             machine.do(opcode.name, argument)
     except (ValueError, IndexError, KeyError, TypeError, OverflowError, UnicodeError) as error:
-        raise PickleDataError("is no whole pickle of data") from error
+        raise PickleDataError("is not a complete pickle of data") from error
     raise PickleDataError("ends in the middle")
 
 
@@ -65,7 +65,7 @@ class _Machine:
         self._memory: dict[int, Any] = {}
 
     def do(self, name: str, argument: Any) -> None:
-        """One instruction. Raises what a wrong program causes, and ``PickleDataError`` for one that no data needs."""
+        """Do one instruction. Raises ``PickleDataError`` for one that no data needs, others for a wrong pickle."""
         stack = self.stack
         if name in _PUSH:
             stack.append(argument)
@@ -89,7 +89,7 @@ class _Machine:
             make(self)
 
     def marked(self) -> list[Any]:
-        """What was pushed since the last mark, taken from the stack."""
+        """Take everything that was pushed since the last mark from the stack."""
         start = self._marks.pop()
         taken = self.stack[start:]
         del self.stack[start:]
@@ -122,7 +122,7 @@ def _appends(machine: _Machine) -> None:
 
 def _extend(target: Any, items: list[Any]) -> None:
     if not isinstance(target, list):
-        raise PickleDataError("appends to what is no list")
+        raise PickleDataError("appends to something that is not a list")
     target.extend(items)
 
 
@@ -140,7 +140,7 @@ def _put(target: Any, items: list[Any]) -> None:
     keys = [_key(key) for key in items[::2]]
     table = target.items if isinstance(target, Noted) else target
     if not isinstance(table, dict):
-        raise PickleDataError("puts items into what is no dict")
+        raise PickleDataError("puts items into something that is not a dict")
     table.update(zip(keys, items[1::2], strict=True))
 
 
@@ -154,14 +154,14 @@ def _key(key: Any) -> Any:
 def _stack_global(machine: _Machine) -> None:
     name, module = machine.stack.pop(), machine.stack.pop()
     if not isinstance(name, str) or not isinstance(module, str):
-        raise PickleDataError("names what is no text")
+        raise PickleDataError("has a name that is not a text")
     machine.stack.append(Noted(f"{module}.{name}"))
 
 
 def _call(machine: _Machine) -> None:
     args, called = machine.stack.pop(), machine.stack.pop()
     if not isinstance(called, Noted) or not isinstance(args, tuple):
-        raise PickleDataError("calls what is no name")
+        raise PickleDataError("calls something that is not a name")
     name = called.name if called.args is None else f"{called.name}()"
     machine.stack.append({} if name in PLAIN else Noted(name, args))
 
@@ -170,7 +170,7 @@ def _build(machine: _Machine) -> None:
     state = machine.stack.pop()
     made = machine.stack[-1]
     if not isinstance(made, Noted):
-        raise PickleDataError("gives a state to what has none")
+        raise PickleDataError("gives a state to something that cannot have one")
     made.state = state
 
 
@@ -223,7 +223,7 @@ _SCALARS = {"numpy.core.multiarray.scalar", "numpy._core.multiarray.scalar"}
 
 
 def value_of(found: Any) -> Any:
-    """A number or an array of numpy made of its bytes; anything else as it is.
+    """A number or an array of numpy, made from its bytes; anything else as it is.
 
     Raises ``PickleDataError`` for an array of objects, and for one whose bytes do not fit its shape.
     """
@@ -239,12 +239,12 @@ def value_of(found: Any) -> Any:
             content, kind, shape, order = found.args
             return _array(content, kind, shape, order == "F")
     except (ValueError, TypeError, IndexError) as error:
-        raise PickleDataError("has an array that is none of numbers") from error
+        raise PickleDataError("has an array that does not hold numbers") from error
     return found
 
 
 def _array(content: Any, kind: Any, shape: Any, fortran: bool) -> NDArray[Any]:
-    """An array of its bytes, or of a text with a byte a letter as Python 2 wrote them."""
+    """An array made from its bytes, or from a text with one byte per letter, as Python 2 wrote them."""
     dtype = _dtype(kind)
     if isinstance(content, str):
         content = content.encode("latin-1")

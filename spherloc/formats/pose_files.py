@@ -21,7 +21,7 @@ def read_poses(path: Path) -> dict[str, FloatArray]:
 
     From a CSV with the columns name, qw, qx, qy, qz, tx, ty, tz in any order among others, from hloc's lines
     ``name qw qx qy qz tx ty tz``, from hloc's log, or from the folder of a COLMAP model. Raises ``InputError``, which
-    names the line, for what is none of these.
+    names the line, for any other file.
     """
     if is_folder(path):
         return {name: image.cam_from_map for name, image in read_model(path).images.items()}
@@ -53,5 +53,5 @@ def _read_csv(path: Path) -> dict[str, FloatArray]:
                 raise InputError(f"{place}: {show(cells['name'])} has two poses; remove one line.")
             poses[cells["name"]] = pose_from_words([cells[name] for name in NUMBERS], place)
     except csv.Error as error:
-        raise InputError(f"{path}, line {lines.line_num}: is no CSV ({error}); save it again.") from None
+        raise InputError(f"{path}, line {lines.line_num}: is not CSV ({error}); save it again.") from None
     return poses

@@ -15,14 +15,14 @@ from spherloc.trajectory import rotation_from_wxyz
 from spherloc.types import FloatArray
 
 MAX_BYTES = 1 << 28
-"""Larger than the lists of any dataset: millions of pairs of images or of poses."""
+"""Largest file, 256 MiB: more than the lists of any dataset, with millions of pairs of images or of poses."""
 _MAX_LINE_BYTES = 4096
 _LENGTH_TOLERANCE = 0.05
 _LARGEST_M = 1e9
 
 _PICKLES = (".pkl", ".pickle", ".pt", ".pth")
 _PICKLE_START = re.compile(rb"\x80[\x02-\x05]|\(?[dl]p\d+\n|[}\]]q|c[\w.]+\n\w+\n")
-"""Binary protocols announce themselves; the older ones begin with a container or the name of a class."""
+"""First bytes of a pickle: binary protocols have a mark; the older ones begin with a container or a class's name."""
 
 
 def refuse_pickle(path: Path) -> None:
@@ -42,7 +42,7 @@ def refuse_pickle(path: Path) -> None:
 def rows(path: Path, what: str) -> Iterator[tuple[str, str]]:
     """Place ("file, line 3") and text of every line that is neither empty nor a comment.
 
-    ``what`` says what the file should be ("a list of pairs"). Raises ``InputError`` for what is no text file.
+    ``what`` says what the file should be ("a list of pairs"). Raises ``InputError`` if it is not a text file.
     """
     refuse_pickle(path)
     with reading(path, "correct its path"), open_file(path) as file:
@@ -61,14 +61,14 @@ def rows(path: Path, what: str) -> Iterator[tuple[str, str]]:
 
 
 def finite_numbers(words: Sequence[str], place: str) -> list[float]:
-    """The numbers that ``words`` spell; raises ``InputError`` that says which one spells none."""
+    """The words as finite numbers; raises ``InputError``, which quotes the first word that is not one."""
     numbers = []
     for word in words:
         try:
             number = float(word)
         except ValueError:
             number = math.nan
-        # An underscore is no part of a number, though Python reads over it.
+        # Python accepts underscores in numbers, these files do not.
         if not math.isfinite(number) or "_" in word:
             raise InputError(f"{place}: {show(word)} is not a finite number; correct it.")
         numbers.append(number)
@@ -78,7 +78,7 @@ def finite_numbers(words: Sequence[str], place: str) -> list[float]:
 def pose_from_words(words: Sequence[str], place: str) -> FloatArray:
     """The pose (3, 4) [R | t], metres, of the seven words qw qx qy qz tx ty tz.
 
-    Raises ``InputError`` for another number of words, and for what is no unit quaternion or position.
+    Raises ``InputError`` for another number of words, and for a quaternion or position that cannot be right.
     """
     if len(words) != 7:
         raise InputError(f"{place}: a pose has {len(words)} numbers; give the seven qw qx qy qz tx ty tz.")
@@ -92,7 +92,7 @@ def pose_from_words(words: Sequence[str], place: str) -> FloatArray:
 
 
 def needed_file(root: Path, name: str, where: str, what: str) -> Path:
-    """A file that a dataset's layout demands; raises ``InputError`` that names it if it is missing.
+    """A file that a dataset's layout requires; raises ``InputError`` that names it if it is missing.
 
     ``what`` says what it holds ("the calibration of image_02").
     """

@@ -1,4 +1,4 @@
-"""The kinds of local features: how OpenCV makes each, and what its keypoints mean."""
+"""The kinds of local features: how OpenCV detects each, and what its keypoints mean."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -29,15 +29,15 @@ class Kind:
     run: Callable[[ByteArray, ByteArray, int, Path | None], tuple[FloatArray, Any]]
     """``detect`` of this kind: image, mask, most features, weights -> keypoints (N, 5) and descriptors."""
     reach: float
-    """How far around a keypoint its detector looks, as a part of the keypoint's size."""
+    """Radius of the neighbourhood that the detector uses around a keypoint, as a share of the keypoint's size."""
     binary: bool = False
-    """Its descriptors are bits, compared by their Hamming distance."""
+    """Whether its descriptors are bits, compared by their Hamming distance."""
     learned: bool = False
-    """It can have a file of weights."""
+    """Whether it is a network, which can take a file of weights."""
     packaged: bool = False
-    """It does without one if the extra ``learned`` is installed."""
+    """Whether the extra ``learned`` brings its weights, so that no file is needed."""
     most: int = 8000
-    """Of its features the strongest are kept, unless a number is given."""
+    """Number of features that are kept, the strongest, unless the options give another."""
 
 
 def detect(
@@ -57,7 +57,7 @@ def detect(
 
 
 def keypoint_table(keypoints: Any, shift_px: float = 0.5) -> FloatArray:
-    """(N, 5) of OpenCV's keypoints, whose first pixel has its centre at ``-shift_px + 0.5``."""
+    """OpenCV's keypoints as a table (N, 5); in them, the centre of the first pixel is at ``0.5 - shift_px``."""
     rows = [(point.pt[0], point.pt[1], point.size, np.radians(point.angle), point.response) for point in keypoints]
     table = np.array(rows, np.float64).reshape(-1, 5)
     table[:, :2] += shift_px
@@ -65,7 +65,7 @@ def keypoint_table(keypoints: Any, shift_px: float = 0.5) -> FloatArray:
 
 
 def _sift(image: ByteArray, mask: ByteArray, _most: int, _weights: Path | None) -> tuple[FloatArray, Any]:
-    # Not ``nfeatures``: OpenCV applies it before the mask, and what the mask removes would have used it up.
+    # ``nfeatures`` is not used: OpenCV applies it before the mask, so that masked features would count too.
     # Without the precise upscale every keypoint lies a quarter of a pixel too far right and down.
     sift = cv2.SIFT.create(contrastThreshold=SIFT_CONTRAST, enable_precise_upscale=True)
     keypoints, descriptors = sift.detectAndCompute(grey(image), mask)
@@ -89,7 +89,7 @@ def _orb(image: ByteArray, mask: ByteArray, most: int, _weights: Path | None) ->
 
 
 def _akaze(image: ByteArray, mask: ByteArray, _most: int, _weights: Path | None) -> tuple[FloatArray, Any]:
-    # OpenCV 5 moved it to the contributed modules.
+    # OpenCV 5 moved AKAZE to the contributed modules.
     create = getattr(cv2, "AKAZE_create", None) or _contributed("AKAZE_create")
     if create is None:
         raise InputError(
@@ -104,7 +104,7 @@ def _surf(image: ByteArray, mask: ByteArray, _most: int, _weights: Path | None) 
     create = _contributed("SURF_create")
     try:
         surf = None if create is None else create(hessianThreshold=100.0, extended=True)
-    except cv2.error:  # the contributed modules have it, but were built without it
+    except cv2.error:  # the contributed modules are there, but were built without SURF
         surf = None
     if surf is None:
         raise InputError(
@@ -124,7 +124,7 @@ def _aliked(image: ByteArray, mask: ByteArray, most: int, weights: Path | None) 
 
 
 KINDS = {
-    # Two standard deviations of the Gaussian at which the keypoint was found; size means something else to each.
+    # Two standard deviations of the Gaussian at which the keypoint was found: each detector defines size differently.
     "sift": Kind(_sift, reach=1.0),
     "orb": Kind(_orb, reach=0.2, binary=True),
     "akaze": Kind(_akaze, reach=0.7, binary=True),

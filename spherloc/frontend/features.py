@@ -1,4 +1,4 @@
-"""Local features of an image: keypoints and descriptors, within its valid pixels; of a panorama on virtual faces."""
+"""Local features of an image, keypoints and descriptors, at its valid pixels; for a panorama, on virtual faces."""
 
 import io
 import zipfile
@@ -23,13 +23,13 @@ from spherloc.images import MAX_BYTES
 from spherloc.types import BoolArray, ByteArray, FloatArray
 
 VERSION = 3
-"""Raised when the same options give other features, so that old files are not taken for them."""
+"""Number to be increased when the same options give other features, so that old files are not used."""
 
 
 def feature_file(image: Path, usable: BoolArray, options: Any, panorama: bool) -> Path | None:
-    """Where the features of an image are kept: named by its content, its usable pixels (H, W) and the options.
+    """File of the features of an image: named by its content, its usable pixels (H, W) and the options.
 
-    None if a file cannot be read: whoever needs it says so.
+    None if a file cannot be read; the error is raised where the file is needed.
     """
     contents = [_content(file) for file in (image, options.weights) if file is not None]
     if any(content is None for content in contents):
@@ -47,13 +47,13 @@ def keep(path: Path, table: FloatArray, descriptors: Descriptors) -> None:
 
 
 def fetch(path: Path) -> tuple[FloatArray, Descriptors] | None:
-    """What ``keep`` stored; None if there is nothing, or a damaged file."""
+    """The keypoints and descriptors that ``keep`` stored; None if the file is missing or damaged."""
     content = _content(path)
     if content is None:
         return None
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            if archive.testzip() is not None:  # before numpy believes a damaged header
+            if archive.testzip() is not None:  # numpy would trust a damaged header
                 return None
         with np.load(io.BytesIO(content), allow_pickle=False) as stored:
             table, descriptors = stored["table"], stored["descriptors"]
@@ -76,15 +76,15 @@ def _content(path: Path) -> bytes | None:
 METHODS = tuple(KINDS)
 MAX_FEATURES = 50_000
 RIM_PX = 4.0
-"""Features this close to pixels that may not be used, and farther for large ones, are the rim's and not the scene's."""
+"""Features this close to unusable pixels (large ones also farther away) show the rim of the image and not the scene."""
 MAX_PIXELS = 5_000_000
-"""Larger images are shrunk to this for detection, as COLMAP does: SIFT needs 250 bytes a pixel."""
+"""Largest number of pixels for detection; larger images are shrunk, as in COLMAP: SIFT needs 250 bytes a pixel."""
 FACE_SHARPNESS = 1.4
-"""Pixels of a panorama's face, at its centre, for one of the panorama: a third more right matches than 1.0 gives."""
+"""Pixels at the centre of a panorama's face per pixel of the panorama: a third more right matches than 1.0 gives."""
 SAME_FEATURE_PX = 1.0
-"""Two faces place the same feature this close to each other, in pixels of the panorama's horizon."""
+"""Features of two faces that are closer than this, in pixels of the panorama's horizon, are the same one."""
 MAX_FACE_PIXELS = 12_000_000
-"""Of all faces of a panorama."""
+"""Largest number of pixels of all faces of a panorama together."""
 
 
 @dataclass(frozen=True)
@@ -92,15 +92,15 @@ class FeatureOptions:
     """Which features are detected."""
 
     method: str = "sift"
-    """One of ``METHODS``; SIFT is root-normalised."""
+    """One of ``METHODS``; SIFT descriptors are root-normalised (RootSIFT)."""
     max_features: int | None = None
-    """The strongest are kept; as many as their kind says (``Kind.most``) if it is None."""
+    """Number of features that are kept, the strongest; None takes that of their kind (``Kind.most``)."""
     weights: Path | None = None
-    """ONNX file of the learned methods, ALIKED and DISK; ALIKED does without if the extra ``learned`` is there."""
+    """ONNX file of the learned methods, ALIKED and DISK; ALIKED needs none if the extra ``learned`` is installed."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.method, str) or self.method not in KINDS:
-            raise InputError(f"There are no features {show(self.method)}; take one of {', '.join(METHODS)}.")
+            raise InputError(f"The features {show(self.method)} are unknown; choose one of {', '.join(METHODS)}.")
         count, kind = self.max_features, KINDS[self.method]
         whole = isinstance(count, int) and not isinstance(count, bool)
         if count is not None and not (whole and 1 <= count <= MAX_FEATURES):
@@ -114,7 +114,7 @@ class FeatureOptions:
 
     @property
     def most(self) -> int:
-        """How many features are kept."""
+        """Number of features that are kept."""
         return KINDS[self.method].most if self.max_features is None else self.max_features
 
 
@@ -125,9 +125,9 @@ class Features:
     pixels: FloatArray
     """(N, 2), the centre of the first pixel is (0.5, 0.5)."""
     sizes_px: FloatArray
-    """(N,) diameter of what the feature describes."""
+    """(N,) diameter of the described neighbourhood."""
     angles_rad: FloatArray
-    """(N,) its orientation."""
+    """(N,) orientation."""
     scores: FloatArray
     """(N,) the detector's own measure of strength."""
     descriptors: Descriptors
@@ -189,7 +189,7 @@ def _on_faces(
 ) -> tuple[FloatArray, Descriptors]:
     """Keypoints (N, 5) and descriptors of a panorama in its own pixels, the strongest first.
 
-    They are found on flat faces: a panorama stretches what is near its poles, and cuts what is at its seam.
+    They are found on flat faces, since a panorama stretches things near its poles and cuts things at its seam.
     """
     faces = panorama_faces(panorama, FACE_SHARPNESS, MAX_FACE_PIXELS)
     tables, parts = [], []
@@ -205,8 +205,8 @@ def _on_faces(
 
 
 def _once(table: FloatArray, face_of: NDArray[np.int64], panorama: Equirectangular) -> BoolArray:
-    """(N,) all but the weaker of two features that are the same one, found on two faces (N,)."""
-    from scipy.spatial import KDTree  # a quarter of a second that only panoramas need
+    """Mask (N,) that leaves out the weaker one where the same feature was found on two faces; ``face_of`` is (N,)."""
+    from scipy.spatial import KDTree  # its import takes a quarter of a second, and only panoramas need it
 
     kept = np.ones(len(table), bool)
     if len(table) == 0:
@@ -223,7 +223,7 @@ def _once(table: FloatArray, face_of: NDArray[np.int64], panorama: Equirectangul
 
 
 def _on_panorama(table: FloatArray, faces: Faces, face: int) -> FloatArray:
-    """Keypoints (N, 5) of a face in the panorama's pixels; their size and orientation are those of a step of it."""
+    """Keypoints (N, 5) of a face in the panorama's pixels, with size and orientation by a step of one face pixel."""
     moved = table.copy()
     turn = np.column_stack([np.cos(table[:, 3]), np.sin(table[:, 3])])
     moved[:, :2], _ = faces.panorama.project(faces.bearings(face, table[:, :2]))
@@ -239,7 +239,7 @@ def _on_panorama(table: FloatArray, faces: Faces, face: int) -> FloatArray:
 def _detected(
     image: ByteArray, usable: ByteArray, wanted: BoolArray, options: FeatureOptions
 ) -> tuple[FloatArray, Descriptors]:
-    """Keypoints (N, 5) and descriptors of a flat image, (H, W) masks of what may be used and of what is wanted."""
+    """Keypoints (N, 5) and descriptors of a flat image, with masks (H, W) of the usable and of the wanted pixels."""
     kind = KINDS[options.method]
     room = _room_px(usable)
     mask = (wanted & (room > RIM_PX)).astype(np.uint8)
@@ -254,14 +254,14 @@ def _strongest(table: FloatArray, descriptors: Descriptors, options: FeatureOpti
 
 
 def _room_px(usable: ByteArray) -> NDArray[np.float32]:
-    """(H, W) distance to the nearest pixel that may not be used; the image's own border is none."""
+    """Distances (H, W) to the nearest unusable pixel, px; the border of the image does not count as one."""
     if usable.all():
         return np.full(usable.shape, np.inf, np.float32)
     return np.asarray(cv2.distanceTransform(usable, cv2.DIST_L2, cv2.DIST_MASK_PRECISE), np.float32)
 
 
 def _usable_rows(table: FloatArray, descriptors: Descriptors, room_px: NDArray[np.float32], reach: float) -> BoolArray:
-    """(N,) features that are finite, in the image, and clear of the rim."""
+    """Mask (N,) of the features that are finite, in the image, and far enough from unusable pixels."""
     finite = np.isfinite(table).all(axis=1) & np.isfinite(descriptors).all(axis=1)
     rows, columns = room_px.shape
     u, v = np.floor(np.where(finite, table[:, :2].T, 0.0)).clip(-1, max(rows, columns)).astype(np.int64)

@@ -1,11 +1,11 @@
-"""Which way is down, from the image itself: the direction in which its vertical edges meet.
+"""Gravity from the image itself: the direction in which its vertical edges meet.
 
 An edge and the camera's centre span a plane, which cuts the unit sphere in a great circle with the normal n. All planes
 of vertical edges contain the vertical v, so that n . v = 0 for each. Edges are found by LSD (von Gioi et al. 2010) on
-virtual pinhole faces, on which they are straight whatever the lens. v is searched on a grid of directions around where
-down is expected, which keeps horizontal edges from being taken for vertical ones, and refined by least squares,
-where edges one above the other count as one: those of a door frame lean together. It is believed if more edges meet
-there than would by chance (a-contrario, Desolneux et al. 2000).
+virtual pinhole faces, on which they are straight whatever the lens. v is searched on a grid of directions around the
+expected direction of gravity, so that horizontal edges are not taken for vertical ones, and refined by least squares.
+Edges one above the other count as one, since those of a door frame, for instance, lean together. v is accepted if more
+edges meet there than chance explains (a contrario, Desolneux et al. 2000).
 """
 
 from dataclasses import dataclass, replace
@@ -25,47 +25,47 @@ from spherloc.types import BoolArray, ByteArray, FloatArray
 SOURCE = "lines of the image"
 
 FACE_DEG = 100.0
-"""Field of view of a face: an edge that one face cuts goes on by ten degrees there."""
+"""Field of view of a face: neighbouring faces overlap by ten degrees, in which an edge is seen in both."""
 MAX_FOCAL_PX = 330.0
-"""Of a face; larger images are made smaller first, since LSD takes time and long edges need no more pixels."""
+"""Largest focal length of a face; larger images are shrunk first, since LSD is slow and long edges need no more."""
 RIM_PX = 4
-"""Edges that end this close to pixels that the camera does not see are those of the image, not of the scene."""
+"""Edges that end this close to pixels that the camera does not see are edges of the image and not of the scene."""
 MIN_LENGTH_RAD = np.radians(2.5)
 MAX_LINES = 800
-"""The longest ones."""
+"""Largest number of edges that are used: the longest ones."""
 END_SD_PX = 0.4
-"""Standard deviation of an edge's ends across it, pixels of a face."""
+"""Standard deviation of the ends of an edge, at right angles to it, pixels of a face."""
 MAX_END_SD_RAD = np.radians(2.5)
-"""Edges whose ends fix v no better than that are too short to be told from others."""
+"""Largest standard deviation of an edge's direction by that of its ends; shorter edges are left out."""
 
 WITHIN_DEG = 45.0
-"""Farther from where down is expected lie the directions in which horizontal edges meet."""
+"""Largest angle between v and the expected direction: farther away, horizontal edges meet."""
 GRID_DEG = 1.5
 GATE_RAD = np.radians(1.5)
-"""Edges that are off by less vote for a direction of the grid."""
+"""Edges whose planes miss a direction of the grid by less than this vote for it."""
 LEAN_SD_RAD = float(np.radians(0.4))
-"""Of what is built upright, and of a lens's calibration."""
+"""Standard deviation by which upright edges lean, errors of the calibration included."""
 LEANS_RAD = np.radians([0.4, 0.6, 0.8, 1.1, 1.5, 2.0, 2.7, 3.6, 4.8, 6.4, 8.5, 11.0])
-"""Standard deviations of leaning that are tried."""
+"""Standard deviations of the leaning that are tried."""
 MAX_LEAN_RAD = float(np.radians(0.7))
-"""From here on the edges do not meet, and the bound is that of a wider fit."""
+"""From this leaning on the edges do not meet in one direction, and the bound comes from a fit with a wider gate."""
 LEAN_REACH = float(np.sin(np.radians(25.0)))
 LEAN_STEPS = 6
 MAX_OFF = 0.06
-"""Largest n . v of an edge that is taken for a vertical one."""
+"""Largest |n . v| of an edge that counts as vertical."""
 POLE = 0.95
-"""Square of the cosine between v and an edge's middle beyond which the edge says nothing."""
+"""Largest squared cosine between v and an edge's middle: an edge nearer to the vertical has no information."""
 GROUP_RAD = np.radians(3.0)
 """Edges whose azimuths, or planes, differ by less count as one."""
 
 MAX_NFA = 1e-2
-"""Directions in which that many edges would meet by chance."""
+"""Largest NFA: number of directions in which as many edges would meet by chance."""
 MIN_GROUPS = 5
 RIVAL_DEG, RIVAL_SHARE = 12.0, 0.75
-"""Another direction at least that far away must have fewer votes than this share."""
+"""Another direction at least this far away must have fewer votes than this share of the best direction's."""
 MIN_SD_RAD, MAX_SD_RAD = np.radians(0.1), np.radians(1.5)
 BOUND_SD = 3.0
-"""The bound in standard deviations."""
+"""Number of standard deviations that make the bound."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,13 +85,13 @@ class Lines:
         return len(self.normals)
 
     def among(self, chosen: BoolArray) -> "Lines":
-        """Those of a mask (L,)."""
+        """The edges of a mask (L,)."""
         return Lines(self.normals[chosen], self.middles[chosen], self.lengths_rad[chosen], self.end_sd_rad)
 
     def variance(self, along: FloatArray) -> FloatArray:
         """(..., L) variance of n . v by the errors of the ends, where (middle . v)^2 is ``along`` (..., L).
 
-        Errors that move an edge turn n towards its middle, those that turn it turn n along it.
+        Errors that shift an edge turn n towards the edge's middle; errors that rotate it turn n along the edge.
         """
         moving = 0.5 * self.end_sd_rad**2
         turning = 0.5 * (self.end_sd_rad / np.sin(0.5 * self.lengths_rad)) ** 2
@@ -105,13 +105,13 @@ class Vertical:
     down: FloatArray
     """Unit vector (3,), camera frame."""
     sd_rad: float
-    """Standard deviation of its worse tilt."""
+    """Standard deviation of the worse of its two tilts."""
     groups: int
-    """Edges that meet there, those with about the same azimuth counted once."""
+    """Number of edges that meet there; edges with about the same azimuth count as one."""
 
 
 def gravity_from_lines(view: View, near: FloatArray | None = None) -> Gravity:
-    """Gravity of an image; ``near`` (3,) is about where down is in it, +y if nothing is known.
+    """Gravity of an image; ``near`` (3,) is its expected direction, +y if None.
 
     Raises ``InputError`` if the image cannot be read or shows too few vertical edges.
     """
@@ -122,12 +122,12 @@ def gravity_from_lines(view: View, near: FloatArray | None = None) -> Gravity:
 def gravity_of_pixels(image: ByteArray, camera: Camera, usable: BoolArray, near: FloatArray, name: str) -> Gravity:
     """``gravity_from_lines`` of a grey image (H, W) called ``name``, with its ``usable`` pixels (H, W).
 
-    ``near`` (3,) is about where down is. Raises ``InputError`` that names the image if it shows too few vertical edges.
+    ``near`` (3,) is the expected direction. Raises ``InputError``, which names the image, for too few vertical edges.
     """
     try:
         found = vertical(image_lines(image, camera, usable), near)
     except InputError as error:
-        raise InputError(f"{shorten(name)}: gravity cannot be told from its lines, since {error}") from None
+        raise InputError(f"{shorten(name)}: gravity cannot be found from its lines, since {error}") from None
     return Gravity(found.down, SOURCE, BOUND_SD * found.sd_rad, found.sd_rad)
 
 
@@ -150,10 +150,10 @@ def vertical(lines: Lines, near: FloatArray) -> Vertical:
     if nearer == len(grid):
         raise InputError(f"its edges meet {WITHIN_DEG:g} degrees or more from where down was expected.")
     if found.groups < MIN_GROUPS:
-        raise InputError(f"it has the edges of {found.groups} upright things, fewer than {MIN_GROUPS}.")
-    # Directions are tried from the expected one outwards, so that fewer chances are had to find one near it.
+        raise InputError(f"it has {found.groups} separate vertical edges, fewer than {MIN_GROUPS}.")
+    # Directions are tried from the expected one outwards: the nearer v is to it, the fewer tests count in the NFA.
     if _nfa(lines, down, nearer + 1) > MAX_NFA:
-        raise InputError("no more of its edges meet in one direction than may do so by chance.")
+        raise InputError("no more of its edges meet in one direction than chance explains.")
     if rival > RIVAL_SHARE * votes.max():
         raise InputError("about as many of its edges meet in another direction.")
     if found.sd_rad > MAX_SD_RAD:
@@ -162,7 +162,7 @@ def vertical(lines: Lines, near: FloatArray) -> Vertical:
 
 
 def _grid(near: FloatArray) -> FloatArray:
-    """(G, 3) unit vectors about ``GRID_DEG`` apart, at most ``WITHIN_DEG`` from ``near`` (3,): Fibonacci's lattice."""
+    """Unit vectors (G, 3) about ``GRID_DEG`` apart, at most ``WITHIN_DEG`` from ``near`` (3,): a Fibonacci lattice."""
     cap = 1.0 - np.cos(np.radians(WITHIN_DEG))
     count = int(2 * np.pi * cap / np.radians(GRID_DEG) ** 2)
     height = 1.0 - cap * (np.arange(count) + 0.5) / count
@@ -172,19 +172,19 @@ def _grid(near: FloatArray) -> FloatArray:
 
 
 def _votes(lines: Lines, directions: FloatArray) -> FloatArray:
-    """(G,) how much of the edges' lengths points towards directions (G, 3)."""
+    """Votes (G,) for directions (G, 3): the lengths of the edges that point towards them."""
     off = (directions @ lines.normals.T) ** 2
     along = (directions @ lines.middles.T) ** 2
-    # Whatever is right overhead points there, so an edge counts by its distance from it.
+    # Every edge right overhead points there, so an edge counts by its distance from the direction.
     weight = np.minimum(lines.lengths_rad, 0.5) * (1.0 - along)
     return (weight * np.maximum(0.0, 1.0 - off / (GATE_RAD**2 + 4.0 * lines.variance(along)))).sum(axis=1)
 
 
 def _sd_of_leaning(lines: Lines, down: FloatArray) -> float:
-    """Standard deviation, rad, of a direction ``down`` (3,) if what stands there leans; 0 if it does not.
+    """Standard deviation, rad, of the direction ``down`` (3,) if the things in view lean; 0 if they do not.
 
-    Trees and old houses lean: their edges meet nowhere, some of them do by chance, and a narrow gate hides the others.
-    With a wide one the fit is elsewhere, by so much or more.
+    Trees and old houses lean: their edges do not meet in one direction. Some do by chance, and a narrow gate hides the
+    others. A fit with a wide gate then gives another direction; the difference shows the uncertainty.
     """
     lean_rad, wide = _lean_sd(lines, down), down
     if lean_rad <= MAX_LEAN_RAD:
@@ -197,10 +197,10 @@ def _sd_of_leaning(lines: Lines, down: FloatArray) -> float:
 
 
 def _lean_sd(lines: Lines, down: FloatArray) -> float:
-    """Standard deviation, rad, by which what stands around the direction ``down`` (3,) leans: one of ``LEANS_RAD``.
+    """Standard deviation, rad, by which things lean about ``down`` (3,): the most likely of ``LEANS_RAD``.
 
-    Of edges up to ``LEAN_REACH`` off it, a part lies about 0 by this and by the errors of its ends, and the rest
-    anywhere: the most likely one. Edges of about one azimuth count as one.
+    The model of the edges up to ``LEAN_REACH`` from it: a part has n . v about 0, with this standard deviation and that
+    of the ends, and the rest is uniform. Edges of about one azimuth count as one.
     """
     along, off = (lines.middles @ down) ** 2, lines.normals @ down
     variance = lines.variance(along)
@@ -223,9 +223,9 @@ def _lean_sd(lines: Lines, down: FloatArray) -> float:
 
 
 def _fit(lines: Lines, start: FloatArray, gate_rad: float, lean_sd_rad: float = LEAN_SD_RAD) -> Vertical:
-    """One step of weighted least squares from the direction ``start`` (3,), of edges up to ``gate_rad`` off it.
+    """One step of weighted least squares from the direction ``start`` (3,), with edges up to ``gate_rad`` from it.
 
-    What stands there leans by ``lean_sd_rad``.
+    ``lean_sd_rad`` is the standard deviation by which they lean.
     """
     along, off = (lines.middles @ start) ** 2, lines.normals @ start
     variance = lines.variance(along)
@@ -233,7 +233,7 @@ def _fit(lines: Lines, start: FloatArray, gate_rad: float, lean_sd_rad: float = 
     most_off = max(MAX_OFF, 2.5 * lean_sd_rad)
     near = (off**2 <= np.minimum(9.0 * wide, most_off**2)) & (variance < MAX_END_SD_RAD**2) & (along < POLE)
     used, along, off, variance, wide = lines.among(near), along[near], off[near], variance[near], wide[near]
-    # How likely an edge is a vertical one; n . v of others is uniform from -1 to 1. Floors have edges underfoot.
+    # Probability that an edge is vertical; n . v of others is uniform from -1 to 1, as of edges on the floor below.
     prior = 0.5 * (1.0 - along) ** 2
     density = prior * np.exp(-0.5 * off**2 / wide) / np.sqrt(2 * np.pi * wide)
     known = density / (density + 0.5 * (1.0 - prior)) / variance
@@ -243,7 +243,7 @@ def _fit(lines: Lines, start: FloatArray, gate_rad: float, lean_sd_rad: float = 
     total = np.bincount(group, known)
     information = 1.0 / (lean_sd_rad**2 + 1.0 / total)
     group_off = np.bincount(group, known * off) / total
-    robust = 1.0 / (1.0 + group_off**2 * information / 4.0)  # Cauchy's
+    robust = 1.0 / (1.0 + group_off**2 * information / 4.0)  # Cauchy's weights
     weight = known * (information * robust / total)[group]
     scatter = np.einsum("l,li,lj->ij", weight, used.normals, used.normals)
     down = np.linalg.eigh(scatter)[1][:, 0]
@@ -254,12 +254,12 @@ def _fit(lines: Lines, start: FloatArray, gate_rad: float, lean_sd_rad: float = 
 
 
 def _nfa(lines: Lines, down: FloatArray, tests: int) -> float:
-    """Of ``tests`` directions, how many would by chance have as many edges as ``down`` (3,).
+    """NFA: how many of ``tests`` directions would by chance have as many edges as ``down`` (3,).
 
-    The plane of an edge that is turned at random about its middle m passes v at t or less with the chance
-    (2 / pi) asin(t / |m x v|). Edges of about the same plane count as one.
+    If an edge is turned at random about its middle m, |n . v| is at most t with probability (2 / pi) asin(t / |m x v|).
+    Edges of about the same plane count as one.
     """
-    from scipy.special import gammainc  # the chance that a Poisson variable reaches a number; its import takes long
+    from scipy.special import gammainc  # probability that a Poisson variable reaches a number; a slow import
 
     along = (lines.middles @ down) ** 2
     variance = lines.variance(along)
@@ -318,16 +318,16 @@ class _Face:
     """Rotation (3, 3); the face looks along its own +z."""
     focal_px: float
     places: NDArray[np.float32]
-    """(S, S, 2) where its pixels are in the image, parts of its width and height; 0 where the camera is blind."""
+    """(S, S, 2) places of its pixels in the image, as shares of its width and height; 0 where the camera cannot see."""
     seen: ByteArray
-    """(S, S) 1 where it does, else 0."""
+    """(S, S) 1 where the camera can see, else 0."""
 
     def cut(self, image: ByteArray) -> ByteArray:
         """The face (S, S) of a grey image (H, W) of any size."""
         height, width = image.shape
         # OpenCV's first pixel has its centre at 0.
         u, v = (self.places[..., k] * np.float32(size) - np.float32(0.5) for k, size in enumerate((width, height)))
-        # A panorama goes on at its other side; other images have a rim there, where no edge is kept.
+        # A panorama continues at its other side; other images have a border there, where no edge is kept.
         return np.asarray(cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP), np.uint8)
 
     def rays(self, pixels: FloatArray) -> FloatArray:
@@ -342,12 +342,12 @@ def _rays(pixels: FloatArray, size: int, focal_px: float, face_from_camera: Floa
 
 
 _AXES = ((0, 0, 1), (1, 0, 0), (0, 0, -1), (-1, 0, 0), (0, -1, 0), (0, 1, 0))
-"""Of the faces of a cube."""
+"""Axes of the faces of a cube."""
 
 
 @lru_cache(maxsize=8)
 def _faces(camera: Camera, focal_px: float) -> tuple[_Face, ...]:
-    """Those faces that the camera sees something of."""
+    """The faces of which the camera sees a part."""
     size = int(np.ceil(2 * np.tan(np.radians(FACE_DEG / 2)) * focal_px))
     at = np.arange(size, dtype=np.float64) + 0.5
     centres = np.stack(np.meshgrid(at, at), axis=-1)
@@ -367,7 +367,7 @@ def _faces(camera: Camera, focal_px: float) -> tuple[_Face, ...]:
 
 
 def _focal_px(camera: Camera) -> float:
-    """Pixels a radian where the camera looks, or in the middle of its image if it does not see there."""
+    """Pixels per radian on the camera's +z axis, or in the middle of its image if it does not see along the axis."""
     pixels, seen = camera.project(np.array([[0.0, 0.0, 1.0]]))
     middle = pixels if seen[0] else np.array([[0.5 * camera.width, 0.5 * camera.height]])
     stretch = np.linalg.norm(camera.unprojection_jacobian(middle), ord=2, axis=(1, 2))[0]

@@ -19,7 +19,7 @@ from spherloc.types import ByteArray, FloatArray
 
 ALIKED_INPUT_PX = 640
 DISK_INPUT_PX = 1024
-"""Width and height that OpenCV gives to these networks: what their published files are made for."""
+"""Width and height of these networks' input: OpenCV scales images to it, and the published files are made for it."""
 
 _CREATE = {"ALIKED": "ALIKED_create", "DISK": "DISK_create", "LightGlue": "LightGlueMatcher_create"}
 
@@ -30,26 +30,26 @@ network = getattr(cv2, sys.argv[1])(sys.argv[2])
 if hasattr(network, "detectAndCompute"):
     network.detectAndCompute(np.zeros((64, 64, 3), np.uint8), None)
 """
-"""Loads a network and, if it finds features, runs it once; an error is the parent's to report."""
+"""Script that loads a network and, if it finds features, runs it once; the parent process reports its errors."""
 
 _one_at_a_time = Lock()
-"""OpenCV's networks keep the state of a run, and are shared by all threads."""
+"""Held during a run: OpenCV's networks keep the state of a run, and all threads share them."""
 
 
 def aliked(image: ByteArray, _mask: ByteArray, _most: int, weights: Path | None) -> tuple[FloatArray, Any]:
     """ALIKED features (Zhao et al. 2023) of an image: keypoints (N, 5) as in ``feature_kinds.detect``, descriptors.
 
-    Everywhere in the image: OpenCV's ALIKED knows no mask. Raises ``InputError`` for what is no network of ALIKED.
+    The mask is not used: OpenCV's ALIKED takes none. Raises ``InputError`` if the file is not a network of ALIKED.
     """
     rows, descriptors = _detect("ALIKED", weights, image, None)
-    # The network gives -1 to 1 from the first pixel's centre to the last one's; OpenCV takes them for the image's rim.
+    # The network's -1 and 1 are the centres of the first and the last pixel; OpenCV takes them for the image's borders.
     scale = np.array(image.shape[1::-1]) / ALIKED_INPUT_PX
     rows[:, :2] = rows[:, :2] * (ALIKED_INPUT_PX - 1) / ALIKED_INPUT_PX + 0.5 * scale
     return rows, descriptors
 
 
 def disk(image: ByteArray, mask: ByteArray, _most: int, weights: Path | None) -> tuple[FloatArray, Any]:
-    """DISK features (Tyszkiewicz et al. 2020), as ``aliked``."""
+    """DISK features (Tyszkiewicz et al. 2020), returned as by ``aliked``."""
     rows, descriptors = _detect("DISK", weights, image, mask)
     rows[:, :2] += 0.5 * np.array(image.shape[1::-1]) / DISK_INPUT_PX  # the centre of a pixel of the network
     return rows, descriptors
@@ -62,8 +62,8 @@ def lightglue(
 ) -> NDArray[np.int64]:
     """Index pairs (K, 2) that LightGlue (Lindenberger et al. 2023) finds between two images with features of ALIKED.
 
-    Each image is given by pixels (N, 2), descriptors (N, D) and its size (width, height). Raises ``InputError`` for
-    what is no network of LightGlue for such descriptors.
+    Each image is given by pixels (N, 2), descriptors (N, D) and its size (width, height). Raises ``InputError`` if
+    the file is not a network of LightGlue for such descriptors.
     """
     (pixels, descriptors, size), (other_pixels, other_descriptors, other_size) = query, reference
     matcher = _network("LightGlue", weights)
@@ -112,7 +112,7 @@ def _loaded(name: str, create: Callable[[str], Any], weights: Path, _changed: in
 
 
 def _try_in_child(name: str, weights: Path) -> None:
-    """Raise ``InputError`` if a damaged file ends the whole process or holds it up, as OpenCV 5.0 lets some do."""
+    """Raise ``InputError`` if a damaged file crashes or blocks a child process, as some do with OpenCV 5.0."""
     command = [sys.executable, "-c", _TRIAL, _CREATE[name], str(weights)]
     try:
         done = subprocess.run(command, capture_output=True, timeout=TRIAL_S, check=False)

@@ -1,8 +1,8 @@
-"""From a pixel of a posed reference image to its point in the map: depth maps, point clouds, SfM points.
+"""Lifting: from a pixel of a posed reference image to its map point, by depth maps, point clouds or SfM points.
 
-A lift is cheap to make and reads its file when it is first asked. What it then holds (a depth map, a projected cloud)
-stays in ``_KEPT`` of the lifts at most, those used last: neighbouring queries share their references, while thousands
-of references would fill the memory.
+A lift is cheap to make and reads its file when it is first used. Its data (a depth map, a projected cloud) stay in
+memory for the ``_KEPT`` lifts that were used last: neighbouring queries share their references, while the data of
+thousands of references would fill the memory.
 """
 
 from collections.abc import Callable
@@ -23,34 +23,35 @@ if TYPE_CHECKING:
     from scipy.spatial import KDTree
 
 SAME_SURFACE = 0.05
-"""Ranges that differ by less than this share of themselves belong to one surface."""
+"""Ranges whose relative difference is less than this belong to one surface."""
 SFM_RADIUS_PX = 2.0
 CLOUD_RADIUS_PX = 6.0
-"""Scan lines of lidars are 3 to 4 px apart in the usual fisheyes (64 beams over 27 degrees, 128 over 90)."""
+"""Search radius: scan lines of lidars are 3 to 4 px apart in usual fisheye images (64 beams over 27 degrees, 128 over
+90)."""
 
 _KEPT = 8
 _CELLS_PER_RADIUS = 3
-"""Cells of the depth buffer over the search radius."""
+"""Number of cells of the depth buffer per search radius."""
 _NEIGHBOURS = 36
-"""At most as many cells can touch a disc whose radius is three cells and be nearest in it: the search is complete."""
+"""Number of neighbours that are searched: no more cells touch a disc of three cells' radius, so none is missed."""
 _CHUNK = 500_000
-"""Points that are projected at once: a map of tens of millions must not be held several times."""
+"""Points that are projected at once: a map of tens of millions must not be in memory several times."""
 _MIN_Z = 1e-3
-"""Cosine to the optical axis below which a z-depth says nothing about the range."""
+"""Least cosine to the optical axis for which a z-depth gives a range."""
 _RIDGE = 0.1
-"""Weight of the guess "facing the camera" in a plane fit, in search radii: it decides along a single scan line."""
+"""Weight, in search radii, of the prior that a fitted plane faces the camera: a single scan line does not fix it."""
 
 
 @dataclass(frozen=True, eq=False)
 class DepthLift:
     """Points from the depth map of an image.
 
-    Between pixel centres, depth is interpolated only where the four around agree within ``SAME_SURFACE``; elsewhere
-    the pixel that holds the position gives it, so that no point floats between a near edge and what is behind.
+    Between pixel centres, depth is interpolated only where the four pixels around agree within ``SAME_SURFACE``;
+    elsewhere it is that of the nearest pixel, so that no point lies between a near edge and the surface behind it.
     """
 
     load_depth: Callable[[], NDArray[np.floating]]
-    """(H, W) of the image's size, metres; what is not positive and finite is no depth."""
+    """Loads the depth map (H, W), of the image's size, metres; values that are not positive and finite are missing."""
     camera: Camera
     cam_from_map: FloatArray
     """Pose (3, 4) of the image."""
@@ -58,7 +59,7 @@ class DepthLift:
     """Whether depth is the distance to the camera or only its part along the optical axis."""
 
     def __call__(self, pixels: FloatArray) -> tuple[FloatArray, BoolArray]:
-        """See ``Lift``; raises ``InputError`` for a depth map of another size than the image's too."""
+        """See ``Lift``; also raises ``InputError`` if the depth map has another size than the image."""
         bearings, seen = self.camera.unproject(pixels)
         depth = np.full(len(pixels), np.nan)
         inside = seen & in_image(self.camera, pixels)
@@ -102,13 +103,13 @@ def _interpolated(depth: NDArray[np.float32], pixels: FloatArray, wraps: bool) -
 class PointCloudLift:
     """Points from a cloud (lidar) that is projected into an image.
 
-    Around the pixel, the plane through the projected points gives the range. Where they lie on no single surface, the
-    pixel has a point only if the nearest projected one belongs to the foremost surface: what is seen through the gaps
-    between the points of a near surface is behind it.
+    The range is that of a plane fitted to the projected points around the pixel. Where they do not lie on one surface,
+    the pixel has a point only if the nearest projected one belongs to the foremost surface: other points are behind it
+    and are only seen through the gaps between its points.
     """
 
     load_points: Callable[[], NDArray[np.floating]]
-    """(M, 3) map frame, metres."""
+    """Loads the points (M, 3), map frame, metres."""
     camera: Camera
     cam_from_map: FloatArray
     """Pose (3, 4) of the image."""
@@ -129,19 +130,19 @@ class PointCloudLift:
 
 @dataclass(frozen=True, eq=False)
 class _DepthBuffer:
-    """The nearest of a cloud's points in every cell of the image that holds any."""
+    """For every cell of the image with points of the cloud, the nearest of them."""
 
     tree: "KDTree"
-    """Of their pixels; round the seam of a panorama."""
+    """Search tree of their pixels, which wraps around the seam of a panorama."""
     bearings: FloatArray
-    """(K + 1, 3) in the camera frame; the last one, NaN, is what the tree calls no neighbour."""
+    """(K + 1, 3) in the camera frame; the last one, NaN, stands for "no neighbour" in the tree's answers."""
     inverse_ranges: FloatArray
-    """(K + 1,) per metre."""
+    """(K + 1,) inverse ranges, 1/m."""
 
 
 @lru_cache(maxsize=_KEPT)
 def _depth_buffer(lift: PointCloudLift) -> _DepthBuffer | None:
-    """None if no point of the cloud is in the image."""
+    """The depth buffer of a lift's cloud; None if no point of the cloud is in the image."""
     camera, cloud = lift.camera, np.asarray(lift.load_points())
     if cloud.ndim != 2 or cloud.shape[1] != 3:
         raise InputError(f"the point cloud has the shape {cloud.shape}; give rows of x, y, z in metres.")
@@ -188,7 +189,7 @@ def _surface_range(
     weights = np.where(found, 1.0 / (1.0 + np.where(found, distances, 0.0)) ** 2, 0.0)
     around, inverse = np.where(found[..., None], around, 0.0), np.where(found, inverse, 0.0)
     facing = bearings * inverse[:, :1]
-    # The ridge pulls m to a surface that faces the camera at the range of the nearest point.
+    # The prior (a ridge term) pulls m to a surface that faces the camera at the range of the nearest point.
     spread = np.where(found[..., None], around - bearings[:, None], 0.0)
     ridge = _RIDGE**2 * (weights[..., None] * spread**2).sum(axis=(1, 2)) + 1e-12
     normal = np.einsum("nk,nki,nkj->nij", weights, around, around) + ridge[:, None, None] * np.eye(3)

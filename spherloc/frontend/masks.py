@@ -1,8 +1,8 @@
-"""Pixels that no feature may come from: the car, the tripod, the seam between two lenses, whatever moves along.
+"""Masks: pixels from which no features are taken, such as the car, the tripod, or the seam between two lenses.
 
-A mask is an image of the photographs' size whose dark pixels are left out, as COLMAP has it: one for all images, or a
-folder of them. There the mask of ``walk/a.jpg`` is ``walk/a.jpg.png``, ``walk/a.png`` or ``walk/a.jpg``, else that of
-its camera, ``walk.png``.
+A mask is an image of the photographs' size whose dark pixels are left out, as in COLMAP: one for all images, or a
+folder of them. In a folder, the mask of ``walk/a.jpg`` is ``walk/a.jpg.png``, ``walk/a.png`` or ``walk/a.jpg``, else
+that of its camera, ``walk.png``.
 """
 
 from collections.abc import Sequence
@@ -27,15 +27,16 @@ MAX_SEAM_DEG = 30.0
 
 @dataclass(frozen=True)
 class Masks:
-    """What is left out of images."""
+    """The pixels that are left out of images."""
 
     images: Path | None = None
     """A mask for all images, or a folder with masks by the images' names."""
     nadir_deg: float = 0.0
-    """Half the opening of the cone around the camera's own down (+y): the car or the tripod below a panorama."""
+    """Half the opening angle of a cone around the camera's +y axis that is left out: the car or tripod below a
+    panorama."""
     seam_deg: float = 0.0
-    """Of a panorama on either side of the circle where the lenses of a two-lens camera meet, 90 degrees from its
-    middle."""
+    """Angle on either side of the circle, 90 degrees from the middle of a panorama, where the images of a two-lens
+    camera meet; pixels within it are left out."""
 
     def __post_init__(self) -> None:
         limits = {"nadir_deg": (self.nadir_deg, MAX_NADIR_DEG), "seam_deg": (self.seam_deg, MAX_SEAM_DEG)}
@@ -44,13 +45,13 @@ class Masks:
                 raise InputError(f"{key} of masks is {value:g}; give degrees from 0 to {most:g}.")
 
     def on(self, views: Sequence[View]) -> tuple[tuple[View, ...], list[str]]:
-        """The views with what is left out of them, besides what was before, and a remark on those without a mask.
+        """The views with these masks, added to the masks that they have, and a remark on those without a mask.
 
-        Raises ``InputError`` if the mask or the folder is none, if it has none for any view, or if there is a seam to
-        leave out of images that are no panoramas.
+        Raises ``InputError`` if the mask or the folder cannot be used, if the folder has a mask for none of the views,
+        or if ``seam_deg`` is set and the images are not panoramas.
         """
         if self.seam_deg and not any(isinstance(view.camera, Equirectangular) for view in views):
-            raise InputError("seam_deg of masks is for panoramas, and these images are none; leave it out.")
+            raise InputError("seam_deg of masks is for panoramas, and these images are not panoramas; leave it out.")
         files = self._files(views)
         masked = tuple(
             _masked(view, file, self.nadir_deg, self.seam_deg) for view, file in zip(views, files, strict=True)
@@ -72,7 +73,7 @@ class Masks:
             if not any(files):
                 first = PurePosixPath(views[0].name).with_suffix(".png")
                 raise InputError(
-                    f"{where}: has a mask for none of the {len(views)} images; name them as the images are called, "
+                    f"{where}: has a mask for none of the {len(views)} images; name the masks after the images, "
                     f"such as {first}."
                 )
             return files
@@ -106,7 +107,7 @@ def _masked(view: View, file: Path | None, nadir_deg: float, seam_deg: float) ->
 
 
 def _allowed(view: View, file: Path | None, nadir_deg: float, seam_deg: float) -> BoolArray:
-    """(H, W) of the pixels of a view that may be used."""
+    """Mask (H, W) of the pixels of a view that may be used."""
     allowed = around(view.camera, nadir_deg, seam_deg)
     if view.mask is not None:
         allowed = allowed & view.mask()
@@ -122,20 +123,20 @@ def _allowed(view: View, file: Path | None, nadir_deg: float, seam_deg: float) -
 
 
 def read_mask(path: Path) -> BoolArray:
-    """(H, W): true where an image is at least half as bright as its brightest pixel.
+    """Mask (H, W), true where an image is at least half as bright as its brightest pixel.
 
-    Raises ``InputError`` if it cannot be read or is black all over.
+    Raises ``InputError`` if the image cannot be read or is completely black.
     """
     image = grey(read_image(path))
     brightest = int(image.max())
     if brightest == 0:
-        raise InputError(f"{path}: the mask is black all over, so that nothing is left; what is white is used.")
+        raise InputError(f"{path}: the mask is completely black; make the pixels white that may be used.")
     return 2 * image.astype(np.int32) > brightest
 
 
 @lru_cache(maxsize=8)
 def around(camera: Camera, nadir_deg: float, seam_deg: float) -> BoolArray:
-    """(H, W), read-only: pixels outside of the cone around +y and off the circle z = 0, by angles in degrees."""
+    """Read-only mask (H, W) of the pixels outside the cone around +y and outside the band around the circle z = 0."""
     outside = np.ones((camera.height, camera.width), bool)
     columns = np.arange(camera.width) + 0.5
     rows = max(1, PIXELS_AT_ONCE // camera.width)
@@ -151,7 +152,7 @@ def around(camera: Camera, nadir_deg: float, seam_deg: float) -> BoolArray:
 
 
 def with_masked_lifts(views: Sequence[View]) -> tuple[View, ...]:
-    """The views with lifts that triangulate with the masked ones of them, not with those of before."""
+    """The views, with lifts that triangulate with these masked views and not with the unmasked ones."""
     masked = {view.path: view for view in views}
     found = []
     for view in views:

@@ -15,25 +15,26 @@ from spherloc.types import BoolArray, FloatArray
 
 METHODS = ("nearest", "lightglue")
 BLOCK_BYTES = 16_000_000
-"""Similarities are computed for so much of the query at once."""
+"""Size of the block of similarities that is computed at once."""
 
 
 @dataclass(frozen=True)
 class MatchOptions:
-    """How features are matched."""
+    """Options of the matching of features."""
 
     method: str = "nearest"
     """"nearest": nearest neighbours of descriptors; "lightglue": a network that sees all of both images."""
     ratio: float | None = 0.8
-    """Nearest over second nearest distance is below it (Lowe 2004, Sec. 7.1); None takes all. Not for LightGlue."""
+    """Upper limit of the ratio of the nearest to the second nearest distance (Lowe 2004, Sec. 7.1); None: no limit. Not
+    for LightGlue."""
     mutual: bool = True
-    """The query's feature must be the nearest of the reference's one, too. LightGlue's always are."""
+    """Whether the two features of a match must each be the nearest of the other, as LightGlue's always are."""
     weights: Path | None = None
-    """ONNX file of LightGlue; the extra ``learned`` does without."""
+    """ONNX file of LightGlue; not needed if the extra ``learned`` is installed."""
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
-            raise InputError(f"There is no matching {show(self.method)}; take one of {', '.join(METHODS)}.")
+            raise InputError(f"The matching {show(self.method)} is unknown; choose one of {', '.join(METHODS)}.")
         number = isinstance(self.ratio, int | float) and not isinstance(self.ratio, bool)
         if self.ratio is not None and not (number and 0.0 < self.ratio <= 1.0):
             raise InputError(f"The ratio of matching is {show(self.ratio)}; give a number above 0, up to 1.")
@@ -61,8 +62,8 @@ class FeatureMatches:
 def match(query: Features, reference: Features, options: MatchOptions | None = None) -> FeatureMatches:
     """Matches of two images; none if one has no features.
 
-    A place that has several features (SIFT gives one for each orientation) is matched to another place only once:
-    pairs that say the same would count as independent evidence. Raises ``InputError`` if the features are of different
+    A pixel with several features (SIFT gives one for each orientation) is matched with another pixel only once:
+    repeated pairs would count as independent evidence. Raises ``InputError`` if the features are of different
     kinds, or if LightGlue cannot be used for them.
     """
     options = options or MatchOptions()
@@ -86,7 +87,7 @@ def match(query: Features, reference: Features, options: MatchOptions | None = N
 
 
 def _by_lightglue(query: Features, reference: Features, options: MatchOptions) -> FeatureMatches:
-    if query.method != "aliked":  # OpenCV 5.0 places the keypoints as the networks for ALIKED want them
+    if query.method != "aliked":  # OpenCV 5.0 scales the keypoints as the networks for ALIKED need them
         raise InputError(
             f"LightGlue is for aliked features, not {query.method}; take those, or the matching 'nearest'."
         )
@@ -105,7 +106,7 @@ def _nearest(query: Features, reference: Features, options: MatchOptions) -> Fea
     if binary:
         distances = np.round(distances**2)  # of bits: their Hamming distance
     with np.errstate(invalid="ignore", divide="ignore"):
-        # Two at no distance are as alike as two can be.
+        # If both distances are zero, the ratio is 1: the two descriptors cannot be told apart.
         ratios = np.where(distances[:, 1] == 0.0, 1.0, distances[:, 0] / distances[:, 1])
     kept = mutual if options.mutual else np.ones(len(nearest), bool)
     if options.ratio is not None:
@@ -124,9 +125,9 @@ def two_nearest(
 ) -> tuple[NDArray[np.int64], FloatArray, BoolArray]:
     """Exact nearest neighbours of N descriptors (N, D) among M others (M, D), by Euclidean distance.
 
-    Returns the nearest (N,), the distances (N, 2) to the two nearest (NaN for a second of one), and a mask (N,) of
-    those that are the nearest to their nearest; among equals the first is. No more than a block of the (N, M) distances
-    is in the memory.
+    Returns the nearest (N,), the distances (N, 2) to the two nearest (NaN for the second one if M = 1), and a mask (N,)
+    of mutual nearest neighbours; among equals the first counts. Only a block of the (N, M) distances is in memory at a
+    time.
     """
     count, other = len(query), len(reference)
     # With two more columns the product itself is -d^2 / 2 = q r - |q|^2 / 2 - |r|^2 / 2.
@@ -146,14 +147,14 @@ def two_nearest(
                 best[part] = near[every, two[part, 0]]
                 near[every, two[part, 0]] = -np.inf
     distances = np.full((count, 2), np.nan)
-    # Anew, as the product loses the digits of small distances.
+    # Computed again, since the product loses the digits of small distances.
     for place in range(two.shape[1]):
         distances[:, place] = np.linalg.norm(query - reference[two[:, place]], axis=1)
     return two[:, 0], distances, _first_of(two[:, 0], best == best_of_reference[two[:, 0]])
 
 
 def _first_of(labels: NDArray[np.int64], wanted: BoolArray) -> BoolArray:
-    """The first of the wanted (N,) with each label (N,)."""
+    """Mask (N,) of the first wanted element for each label (N,)."""
     index = np.flatnonzero(wanted)
     _, first = np.unique(labels[index], return_index=True)
     mask = np.zeros(len(wanted), bool)
@@ -162,7 +163,7 @@ def _first_of(labels: NDArray[np.int64], wanted: BoolArray) -> BoolArray:
 
 
 def _once_a_place(found: FeatureMatches, query: Features, reference: Features) -> FeatureMatches:
-    """Of the pairs between the same two pixels only the one with the best ratio, or the first."""
+    """The matches; of several between the same two pixels only the one with the best ratio, or the first."""
     places = np.column_stack([query.pixels[found.query_index], reference.pixels[found.reference_index]])
     best_first = np.argsort(found.ratios, kind="stable")  # NaN comes last
     _, first = np.unique(places[best_first], axis=0, return_index=True)
@@ -173,13 +174,13 @@ def _once_a_place(found: FeatureMatches, query: Features, reference: Features) -
 RATIOS = (0.6, 0.7, 0.8, 0.9, 0.95, 1.0)
 """Bounds on the ratio of the distances to the nearest and the second nearest descriptor."""
 SHARES = (0.0039, 0.0095, 0.026, 0.079, 0.136, 0.25)
-"""Share of the query's features with a wrong match below each of them: means over the data above, of SIFT."""
+"""Share of the query's SIFT features that have a wrong match below each of ``RATIOS``: means over the data above."""
 BINARY_SHARES = (0.0018, 0.0052, 0.018, 0.075, 0.137, 0.25)
-"""Of ORB."""
+"""The same for ORB."""
 
 
 def wrong_matches(features: int, matches: int, ratio: float | None, binary: bool) -> float:
-    """How many of ``matches`` by mutual nearest neighbours are probably wrong, 0 to ``matches``.
+    """Expected number of wrong ones among ``matches`` mutual nearest neighbours, 0 to ``matches``.
 
     ``features`` counts those of the query image, ``ratio`` is the bound that the matches passed, None for no bound,
     and ``binary`` says that descriptors are bits.
@@ -193,14 +194,14 @@ def wrong_matches(features: int, matches: int, ratio: float | None, binary: bool
 SAME_PLACE = 0.05
 """Points of two references agree if they are closer than this share of their distance to the first of them."""
 MIN_SHARED = 10
-"""Query features that a reference must share with the others, or nothing is said of it."""
+"""Least number of query features that a reference must share with the others for an estimate."""
 ROUNDS = 100
 
 
 def right_shares(
     pixels: Sequence[FloatArray], points: Sequence[FloatArray], ranges: Sequence[FloatArray]
 ) -> FloatArray:
-    """Share (R,) of right matches of each of R references, by their agreement; NaN where too little is shared.
+    """Share (R,) of right matches of each of R references, by their agreement; NaN where too few are shared.
 
     ``pixels`` (N, 2) are in the query, ``points`` (N, 3) in the map, and ``ranges`` (N,) are the points' distances to
     their reference, for every reference. If matches are right independently of each other, of those that references i
@@ -218,7 +219,7 @@ def right_shares(
             agreeing[i, j] = agreeing[j, i] = np.count_nonzero(apart <= SAME_PLACE * ranges[i][mine])
     right: NDArray[np.float64] = np.full(count, 0.5)
     for _ in range(ROUNDS):
-        for i in range(count):  # one after another: all at once they would swing
+        for i in range(count):  # one after another: updated all at once they would oscillate
             weight = shared[i] @ right**2
             if weight > 0:
                 right[i] = min(1.0, agreeing[i] @ right / weight)

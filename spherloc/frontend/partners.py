@@ -1,4 +1,4 @@
-"""Which posed images see the same places from elsewhere, so that points can be triangulated between them."""
+"""Finds posed images that see the same places from other positions, so that points can be triangulated between them."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -14,23 +14,24 @@ from spherloc.geometry import camera_centre
 from spherloc.types import BoolArray, FloatArray
 
 _NEIGHBOURS = 64
-"""Among so many of the nearest views, those are chosen with which points are triangulated."""
+"""Number of nearest views among which partners are chosen."""
 _OTHERS = 4
-"""Each costs one matching, once."""
+"""Largest number of partners of a view; each costs one matching, once."""
 _GROWTH = 2.0
-"""Each is so many times farther than the one before: near things need a short baseline, far things a long one."""
+"""Least ratio of a partner's distance to that of the one before: near things need a short baseline, far things a long
+one."""
 _MIN_SHARED = 0.25
-"""Of the directions that a view sees: another one that sees fewer of them looks elsewhere."""
+"""Least share of a view's directions that a partner must see too."""
 _DIRECTIONS = 300
 
 
 def with_triangulation(
     views: Sequence[View], options: FrontendOptions, together: Sequence[Sequence[int]] | None = None
 ) -> tuple[View, ...]:
-    """The views, with poses; those without a lift get one that triangulates with others of them.
+    """The views, all with poses; those without a lift get one that triangulates with other views.
 
-    ``together`` has, for each, the places of others that are taken in any case where they look the same way, such as
-    those of its rig.
+    ``together`` has, for each view, the indices of views that are always used if they look the same way, such as those
+    of its rig.
     """
     with_lifts = []
     for view, places in zip(views, partners(views, together), strict=True):
@@ -41,7 +42,7 @@ def with_triangulation(
 
 
 def partners(views: Sequence[View], together: Sequence[Sequence[int]] | None = None) -> list[list[int]]:
-    """For each of R views with poses, the places of others that see the same things from elsewhere."""
+    """For each of R views with poses, the indices of its partners: views that see the same from other positions."""
     if len(views) < 2:
         return [[] for _ in views]
     from scipy.spatial import KDTree  # takes half a second
@@ -60,7 +61,7 @@ def partners(views: Sequence[View], together: Sequence[Sequence[int]] | None = N
 
 
 def _sees_the_same(index: int, other: int, views: Sequence[View], poses: FloatArray) -> bool:
-    """Whether another view sees enough of the directions that one sees; ``poses`` is (R, 3, 4)."""
+    """Whether view ``other`` sees enough of the directions that view ``index`` sees; ``poses`` is (R, 3, 4)."""
     directions = _lattice()[_sees(views[index].camera)] @ poses[index, :, :3]
     pixels, seen = views[other].camera.project(directions @ poses[other, :, :3].T)
     seen &= in_image(views[other].camera, pixels)
@@ -69,7 +70,7 @@ def _sees_the_same(index: int, other: int, views: Sequence[View], poses: FloatAr
 
 @lru_cache(maxsize=1)
 def _lattice() -> FloatArray:
-    """(D, 3) unit vectors spread evenly over the sphere: Fibonacci's lattice."""
+    """Unit vectors (D, 3), spread evenly over the sphere: a Fibonacci lattice."""
     height = 1.0 - 2.0 * (np.arange(_DIRECTIONS) + 0.5) / _DIRECTIONS
     turn = np.arange(_DIRECTIONS) * np.pi * (3.0 - np.sqrt(5.0))
     radius = np.sqrt(1.0 - height**2)
@@ -78,13 +79,14 @@ def _lattice() -> FloatArray:
 
 @lru_cache(maxsize=64)
 def _sees(camera: Camera) -> BoolArray:
-    """(D,) which directions of the lattice lie in the camera's image."""
+    """Mask (D,) of the directions of the lattice that lie in the camera's image."""
     pixels, seen = camera.project(_lattice())
     return seen & in_image(camera, pixels)
 
 
 def spread(near: Sequence[tuple[float, int]], alike: Callable[[int], bool]) -> list[int]:
-    """At most ``_OTHERS`` of the ``alike`` ones among neighbours at rising distances that lie ever farther apart."""
+    """At most ``_OTHERS`` of the ``alike`` ones among ``near``, (distance, index) by rising distance, whose distances
+    grow by ``_GROWTH``."""
     found, last = [], 0.0
     for distance, other in near:
         if distance > 0.0 and distance >= _GROWTH * last and len(found) < _OTHERS and alike(other):

@@ -29,14 +29,14 @@ _MATCH_KEYS = {"matching": "method", "ratio": "ratio", "matching_weights": "weig
 
 @dataclass(frozen=True)
 class FrontendOptions:
-    """How correspondences are found."""
+    """Options of the front end."""
 
     features: FeatureOptions = field(default_factory=FeatureOptions)
-    """``features``, ``max_features`` and ``feature_weights``."""
+    """The keys ``features``, ``max_features`` and ``feature_weights``."""
     matching: MatchOptions = field(default_factory=MatchOptions)
-    """``matching``, ``ratio`` and ``matching_weights``."""
+    """The keys ``matching``, ``ratio`` and ``matching_weights``."""
     references: int = 4
-    """How many references, the most similar ones, are matched with a query."""
+    """Number of references, the most similar ones, whose matches a query gets."""
 
 
 def frontend_options(table: Mapping[str, Any], where: str, folder: Path) -> FrontendOptions:
@@ -71,18 +71,19 @@ def _weights(folder: Path, key: str, value: Any, place: str) -> Path:
         raise InputError(f"{place}: {key} is {show(value)}; give the path of an ONNX file.")
     path = folder / value
     if not is_file(path):
-        raise InputError(f"{place}: {key} names {path}, which is no file; correct the path.")
+        raise InputError(f"{place}: {key} names {path}, which is not a file; correct the path.")
     return path
 
 
 SAME_POINT = 0.02
-"""Points of two references are one if they are closer than this share of their distance to the first of them."""
+"""Points of two references count as one if they are closer than this share of their distance to the first reference."""
 SHORTLIST = 2
-"""Times as many references are matched as stay: matches tell better than retrieval which see the same place."""
+"""Ratio of the references that are matched to those that are kept: matches show better than retrieval which references
+see the same place."""
 FEW_LIFTED = 100
-"""Correspondences below which it is counted how many right matches have no point in the map."""
+"""If there are fewer correspondences, right matches without a map point are counted too."""
 VOCABULARY_IMAGES = 64
-"""The words are learnt from so many references, spread over all."""
+"""Number of references, spread over all, from which the visual words are learnt."""
 
 
 def image_matcher(
@@ -94,8 +95,8 @@ def image_matcher(
 ) -> Matcher:
     """The matcher that a scene's section [frontend], ``table``, describes.
 
-    ``where`` names the scene file in messages, ``folder`` is what files of weights are relative to, and ``pairs`` gives
-    names of references, the most similar first, by the name of a query, instead of retrieval. Raises ``InputError``
+    ``where`` names the scene file in messages, paths of weights are relative to ``folder``, and ``pairs``, instead of
+    retrieval, gives the names of references, the most similar first, by the name of a query. Raises ``InputError``
     for an unknown key or a wrong value. No image is read yet.
     """
     return ImageMatcher(references, frontend_options(table, where, folder), pairs)
@@ -105,11 +106,11 @@ def image_matcher(
 class ImageMatcher:
     """Finds the correspondences of a query with the references most similar to it.
 
-    Up to ``options.references`` references are all matched; of more, retrieval picks ``SHORTLIST`` times that many, and
-    those with the most correspondences stay. An image is never matched with itself: a map's own images can be localized
-    in it. References with more correspondences are the more similar ones. Where several references give a query
-    keypoint the same point (``SAME_POINT``), it counts once, from the most similar of them; different points are
-    alternatives and all stay.
+    If there are at most ``options.references`` references, all are matched; of more, retrieval picks ``SHORTLIST``
+    times that many, and those with the most correspondences are kept. An image is never matched with itself, so that a
+    map's own images can be localized in it. References with more correspondences count as more similar. Where several
+    references give a query keypoint the same point (``SAME_POINT``), it counts once, from the most similar of them;
+    different points are alternatives and are all kept.
     """
 
     references: tuple[View, ...]
@@ -118,7 +119,7 @@ class ImageMatcher:
     """Names of references by the name of a query, the most similar first."""
 
     def __call__(self, query: View) -> Matches:
-        """See ``Matcher``; none of the references being usable gives no correspondences, and remarks."""
+        """See ``Matcher``; if no reference can be used, there are no correspondences, and remarks say why."""
         features = extract(query, self.options.features)
         tried, remarks = self._candidates(query, features)
         found: list[_Found] = []
@@ -133,13 +134,13 @@ class ImageMatcher:
         return _joined(query, found, tried, self.options.references, remarks)
 
     def prepare(self, report: Report) -> None:
-        """Describe all references, if there are so many that retrieval has to choose."""
+        """Compute global descriptors of all references, if there are so many that retrieval has to choose."""
         if self.pairs is None and len(self.references) > self.options.references and "_index" not in vars(self):
-            # Where cached_property keeps it; that cannot pass on who is to be told.
+            # Stored where cached_property keeps its value, since a property cannot take ``report``.
             vars(self)["_index"] = _index(self.references, self.options, report)
 
     def _candidates(self, query: View, features: Features) -> tuple[list[View], list[str]]:
-        """References to match with, at most as many as the options say, and what to remark."""
+        """References to match with, at most as many as the options say, and remarks."""
         remarks: list[str] = []
         if self.pairs is not None:
             if query.name in self.pairs:
@@ -180,9 +181,9 @@ class _Index:
 
     words: retrieval.Floats
     vectors: retrieval.Floats
-    """(R, K * D)."""
+    """(R, K * D) global descriptors."""
     views: NDArray[np.int64]
-    """(R,) which references these are."""
+    """(R,) indices of the references that they describe."""
     remarks: list[str]
 
     def describe(self, features: Features) -> retrieval.Floats:
@@ -192,7 +193,8 @@ class _Index:
 
 
 def _index(references: Sequence[View], options: FrontendOptions, report: Report) -> _Index:
-    """Features come from the cache on disk the second time, so that they are not held: thousands would not fit."""
+    """The index of the references. Features are not kept in memory, where thousands would not fit, but read again from
+    the cache on disk."""
     failures: dict[int, str] = {}
     seen: set[int] = set()
 
@@ -235,13 +237,13 @@ class _Found:
     points: FloatArray
     reference_pixels: FloatArray
     wrong: float | None
-    """How many of them are probably wrong, if anything is known of it."""
+    """Estimated number of wrong ones among them; None if unknown."""
     unlifted: tuple[FloatArray, FloatArray]
-    """(K, 2) pixels in the query and in the reference of the matches without a point in the map."""
+    """(K, 2) pixels in the query and in the reference of the matches without a map point."""
 
     @property
     def matches(self) -> int:
-        """Before lifting."""
+        """Number of matches before lifting."""
         return len(self.pixels) + len(self.unlifted[0])
 
 
@@ -267,7 +269,7 @@ def _correspondences(query: Features, reference: View, options: FrontendOptions)
 
 
 def _verified_unlifted(query: View, part: _Found) -> int:
-    """Matches without a point in the map that agree with the motion between the query and the reference."""
+    """Number of matches without a map point that agree with the motion between the query and the reference."""
     lifted, lacking = (part.pixels, part.reference_pixels), part.unlifted
     bearings, seen = query.camera.unproject(np.concatenate([lifted[0], lacking[0]]))
     others, seen_there = part.reference.camera.unproject(np.concatenate([lifted[1], lacking[1]]))
@@ -277,7 +279,7 @@ def _verified_unlifted(query: View, part: _Found) -> int:
 
 
 def _joined(query: View, found: Sequence[_Found], tried: Sequence[View], most: int, remarks: list[str]) -> Matches:
-    """What ``most`` references at most gave, those with the most correspondences."""
+    """The matches of at most ``most`` references, those with the most correspondences."""
     found = sorted(found, key=lambda part: -len(part.pixels))[:most]
     ranked = [part for part in found if len(part.pixels)]
     total, lifted = sum(part.matches for part in found), sum(len(part.pixels) for part in found)
@@ -286,8 +288,8 @@ def _joined(query: View, found: Sequence[_Found], tried: Sequence[View], most: i
         but = f", though {lacking:,} of these agree with the motion between two images" if lacking else ""
         remarks.append(f"{total - lifted:,} of {total:,} matches have no point in the map{but}.")
     if not ranked:
-        none, nobody = np.empty((0, 2)), np.empty(0, np.int64)
-        return Matches(none, np.empty((0, 3)), tuple(tried[:most]), nobody, none, None, tuple(remarks), lacking)
+        none, no_index = np.empty((0, 2)), np.empty(0, np.int64)
+        return Matches(none, np.empty((0, 3)), tuple(tried[:most]), no_index, none, None, tuple(remarks), lacking)
     pixels = np.concatenate([part.pixels for part in ranked])
     points = np.concatenate([part.points for part in ranked])
     index = np.repeat(np.arange(len(ranked)), [len(part.pixels) for part in ranked])
@@ -306,7 +308,7 @@ def _joined(query: View, found: Sequence[_Found], tried: Sequence[View], most: i
 
 
 def _outlier_rate(ranked: Sequence[_Found], kept: int) -> float | None:
-    """Of what is kept: repetitions, which are left out, are of right matches."""
+    """Estimated outlier rate of the ``kept`` matches; repetitions, which were left out, count as right ones."""
     if all(part.wrong is None for part in ranked):
         return None
     ranges = [np.linalg.norm(part.points - _centre(part.reference), axis=1) for part in ranked]
@@ -317,7 +319,8 @@ def _outlier_rate(ranked: Sequence[_Found], kept: int) -> float | None:
 
 
 def _repeated(pixels: FloatArray, points: FloatArray, ranges: FloatArray) -> BoolArray:
-    """(N,): an earlier row has the same pixel and, within ``SAME_POINT`` of its range (N,), the same point."""
+    """Mask (N,) of rows for which an earlier row has the same pixel and, within ``SAME_POINT`` of its range (N,), the
+    same point."""
     _, label = np.unique(pixels, axis=0, return_inverse=True)
     order = np.argsort(label.ravel(), kind="stable")
     label, points, ranges = label.ravel()[order], points[order], ranges[order]

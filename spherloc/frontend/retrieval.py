@@ -1,4 +1,4 @@
-"""Image retrieval: which references look like the query. VLAD over local features stands in for NetVLAD.
+"""Image retrieval: which references look like the query. VLAD over local features is used in place of NetVLAD.
 
 H. Jegou, M. Douze, C. Schmid, P. Perez: Aggregating local descriptors into a compact image representation, CVPR 2010;
 normalised within each word as by R. Arandjelovic and A. Zisserman: All about VLAD, CVPR 2013.
@@ -13,15 +13,15 @@ from spherloc.frontend.features import Features
 
 WORDS = 64
 STRONGEST = 4000
-"""Of an image's features so many are described. The nearest reference of 48 rendered queries was among the four most
-similar ones of 47; with 1,000 features of 41."""
+"""Number of an image's features that are used. For 47 of 48 rendered queries, the nearest reference was among the four
+most similar ones; with 1,000 features, for 41."""
 MAX_SAMPLES = 20_000
-"""Descriptors that the vocabulary is learnt from, 300 a word."""
+"""Number of descriptors from which the vocabulary is learnt: 300 per word."""
 MIN_SAMPLES_A_WORD = 30
-"""With fewer, a word would describe single features."""
+"""Least number of descriptors per word; with fewer, a word would describe single features."""
 
 _ROUNDS = 12
-"""Of Lloyd's algorithm: from random starts, words hardly move after ten."""
+"""Number of iterations of Lloyd's algorithm: from random starts, words hardly move after ten."""
 _CHUNK = 4096
 _ROUNDING = 1e-5
 
@@ -58,10 +58,10 @@ def vlad(descriptors: Floats, words: Floats) -> Floats:
     """Unit vector (K * D,) of an image with descriptors (N, D); zero for an image without features."""
     sums, sizes = _sums(descriptors, words)
     residuals = sums - sizes * words
-    # Where a word's features average to the word itself, normalisation would make a direction of rounding errors.
+    # Where the mean of a word's features is the word itself, normalisation would turn rounding errors into a direction.
     residuals[np.abs(residuals) < _ROUNDING * sizes] = 0.0
     residuals = np.sign(residuals) * np.sqrt(np.abs(residuals))
-    # Within a word first: one repeated texture (a hedge, a row of windows) must not drown the others.
+    # Normalised within each word first: one repeated texture (a hedge, a row of windows) must not outweigh the others.
     residuals /= np.maximum(np.linalg.norm(residuals, axis=1, keepdims=True), 1e-12)
     length = np.linalg.norm(residuals)
     return (residuals / max(float(length), 1e-12)).ravel()
@@ -77,7 +77,7 @@ def _some(random: np.random.Generator, count: int, most: int) -> NDArray[np.int6
 
 
 def _sums(descriptors: Floats, words: Floats) -> tuple[Floats, Floats]:
-    """Of the descriptors that are nearest to each word, their sum (K, D) and their number (K, 1)."""
+    """Sum (K, D) and number (K, 1) of the descriptors that are nearest to each word."""
     half = 0.5 * (words**2).sum(axis=1)
     sums, sizes = np.zeros_like(words), np.zeros((len(words), 1), np.float32)
     for start in range(0, len(descriptors), _CHUNK):

@@ -15,21 +15,21 @@ from spherloc.files import read_file
 from spherloc.frontend.view import Matcher, Matches, NeedsPreparing, Report, View
 
 SUFFIX = ".npz"
-"""Of the file beside a scene file."""
+"""Ending of the name of the file beside a scene file."""
 MAX_BYTES = 20_000_000
 VERSION = 2
-"""Raised when pictures, features or matching change, so that stored matches are not those that would be found."""
+"""Number to be increased when pictures, features or matching change, so that old stored matches are not used."""
 
 
 def key_of_table(table: Mapping[str, Any]) -> str:
-    """Changes with whatever of a scene file's ``table`` matches follow from."""
+    """Hash of those parts of a scene file's ``table`` that decide on the matches."""
     told = {"name", "about", "provenance", "thresholds", "gravity", "options"}
     return key_of(VERSION, json.dumps({key: table[key] for key in table.keys() - told}, sort_keys=True))
 
 
 @dataclass(frozen=True, eq=False)
 class StoredMatches:
-    """Takes matches from a file, and those of other queries, or all if the file is of another scene, from a matcher."""
+    """Reads matches from a file; matches of queries that are not in it, or of another scene, come from a matcher."""
 
     matcher: Matcher
     references: tuple[View, ...]
@@ -50,13 +50,13 @@ class StoredMatches:
         return self._by_query.get(query.name)
 
     def prepare(self, report: Report) -> None:
-        """What the matcher has to do once, unless all is stored."""
+        """Prepare the matcher, unless the matches of all queries are stored."""
         if not self._by_query and isinstance(self.matcher, NeedsPreparing):
             self.matcher.prepare(report)
 
     @cached_property
     def _by_query(self) -> Mapping[str, Matches]:
-        """Empty if there is no file, a damaged one, or one of another scene."""
+        """Stored matches by query; empty if the file is missing, damaged, or of another scene."""
         views = {view.name: view for view in self.references}
         try:
             with np.load(io.BytesIO(read_file(self.path, MAX_BYTES)), allow_pickle=False) as file:

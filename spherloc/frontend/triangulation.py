@@ -19,7 +19,8 @@ from spherloc.geometry import camera_centre
 from spherloc.types import BoolArray, FloatArray
 
 MIN_PARALLAX_DEG = 1.0
-"""With an error of 0.1 degrees (1 px of a fisheye is 0.15 to 0.25), the range is then good to a tenth."""
+"""Least parallax: with an error of 0.1 degrees (1 px of a fisheye image is 0.15 to 0.25), the range is then accurate to
+10 %."""
 BOUND_PX = 2.0
 
 
@@ -27,8 +28,8 @@ BOUND_PX = 2.0
 class TriangulationLift:
     """Points of a reference's features that are matched in other references whose poses are known too.
 
-    A match must lie on its epipolar plane, and the point that it gives be in front of both cameras, with enough
-    parallax and little reprojection error. Of several that a feature has, those are taken that agree on one point.
+    A match must lie on its epipolar plane, and its point must be in front of both cameras, with enough parallax and a
+    small reprojection error. If a feature has several matches, those that agree on one point are taken.
     """
 
     view: View
@@ -37,19 +38,19 @@ class TriangulationLift:
     features: FeatureOptions = field(default_factory=FeatureOptions)
     matching: MatchOptions = field(default_factory=MatchOptions)
     bound_px: float = BOUND_PX
-    """Of the distance to the epipolar plane and of the reprojection error."""
+    """Bound on the distance to the epipolar plane and on the reprojection error."""
     least_parallax_deg: float = MIN_PARALLAX_DEG
-    """Between the rays of the reference and of one of the others."""
+    """Least angle between the rays of the reference and of one of the others."""
     radius_px: float = SFM_RADIUS_PX
     """A pixel takes the point of the nearest feature within this distance."""
 
     def __call__(self, pixels: FloatArray) -> tuple[FloatArray, BoolArray]:
-        """See ``Lift``; raises ``InputError`` too if none of the others can be read, or a pose is missing."""
+        """See ``Lift``; also raises ``InputError`` if none of the others can be read, or if a pose is missing."""
         return self._found[0](pixels)
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """Which of the others could not be used, and why."""
+        """Remarks on views that could not be used, and why."""
         return self._found[1]
 
     @cached_property
@@ -84,8 +85,9 @@ def triangulated(
 ) -> FloatArray:
     """Map points (K, 3) of K features of the first of V views, NaN where the observations give none.
 
-    ``cam_from_map`` (V, 3, 4); ``pixels`` (V, K, 2) hold the features' observations, NaN where a view has none. Errors
-    count as angles over the largest stretch of the unprojection, rad/px, at the observed pixel.
+    ``cam_from_map`` (V, 3, 4) are the poses; ``pixels`` (V, K, 2) the features' observations, NaN where a view has
+    none. An error in pixels is an angle divided by the largest singular value of the unprojection's Jacobian, rad/px,
+    at the observed pixel.
     """
     centres = np.stack([camera_centre(matrix) for matrix in cam_from_map])
     origin = centres[0].copy()
@@ -158,7 +160,7 @@ def _intersection(
 
 
 def _agree(centres: FloatArray, rays: FloatArray, bounds: FloatArray, points: FloatArray) -> BoolArray:
-    """(V, K): the view observes the point in front of it, within its bound."""
+    """Mask (V, K): the view observes the point, which is in front of it, within its bound."""
     with np.errstate(invalid="ignore"):
         return _angles(points[None] - centres[:, None], rays) <= bounds
 
@@ -166,9 +168,9 @@ def _agree(centres: FloatArray, rays: FloatArray, bounds: FloatArray, points: Fl
 def _refined(
     centres: FloatArray, rays: FloatArray, bounds: FloatArray, points: FloatArray, support: BoolArray
 ) -> FloatArray:
-    """The points from all views that support them, by angular instead of metric distance to the rays.
+    """The points, refined with all views that support them, by angular instead of metric distances to the rays.
 
-    A point that leaves the bound of one of its views by that stays as it was.
+    A point that would leave the bound of one of its views is not changed.
     """
     known = np.flatnonzero(np.isfinite(points[:, 0]))
     rays, used, refined = rays[:, known], support[:, known], points[known]

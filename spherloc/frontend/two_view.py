@@ -1,4 +1,4 @@
-"""Whether matches between two images agree with one motion of the camera, whatever the map knows of them.
+"""Checks which matches between two images agree with one motion of the camera; no map points are needed.
 
 A match of bearings b (query) and c (reference) fits an essential matrix E if c lies in the plane of b: c . E b = 0.
 That is linear in E, so eight matches fix it (the null space of their equations).
@@ -11,23 +11,24 @@ from spherloc.types import BoolArray, FloatArray
 
 SAMPLE_SIZE = 8
 MAX_SAMPLES, BATCH = 2000, 250
-"""Most samples of a search, and how many at once: 99 % sure to draw eight right ones where 51 % are."""
+"""Largest number of samples, and samples at once: with 51 % right matches, one of the samples is clean with 99 %
+probability."""
 CONFIDENCE = 0.99
 BOUND_RAD = np.radians(0.5)
-"""Of a bearing to its plane."""
+"""Largest angle of a bearing to its epipolar plane."""
 REFITS = 3
 MIN_AGREEING = 15
-"""Fewer agreeing matches verify nothing, ..."""
+"""Least number of agreeing matches."""
 MAX_NFA = 1e-3
-"""... nor do so many as chance gives: the expected number of sets of their size."""
+"""Largest NFA of the agreeing matches: the expected number of sets of their size by chance."""
 CHANCE_RATE = 4.0 * np.sin(BOUND_RAD)
 """Probability that a wrong match is near its plane: sin(bound) for bearings all over the sphere, more in an image."""
 
 
 def verified(query: FloatArray, reference: FloatArray) -> BoolArray:
-    """Mask (N,) of the matches of unit bearings (N, 3) that agree with the motion most agree with.
+    """Mask (N,) of the matches of unit bearings (N, 3) that agree with the motion that most matches support.
 
-    Nothing is marked if they are no more than chance gives. Every call draws alike.
+    It is all false if chance may explain as many. Every call draws the same samples.
     """
     count = len(query)
     none = np.zeros(count, dtype=bool)
@@ -49,13 +50,13 @@ def verified(query: FloatArray, reference: FloatArray) -> BoolArray:
             return none
         again = _fits(np.linalg.svd(rows[best])[2][-1:], query, reference)[0]
         best = again if again.sum() > best.sum() else best
-    # Eight fix a motion, where two fix what ``nfa`` counts.
+    # Eight matches fix a motion, while ``nfa`` counts models that two fix.
     expected = nfa(count, int(best.sum()), CHANCE_RATE) * CHANCE_RATE ** (2 - SAMPLE_SIZE)
     return best if best.sum() >= MIN_AGREEING and expected <= MAX_NFA else none
 
 
 def _fits(essential: FloatArray, query: FloatArray, reference: FloatArray) -> BoolArray:
-    """Mask (S, N) of the matches near their planes by each of the matrices (S, 9), in both images."""
+    """Mask (S, N) of the matches near their epipolar planes in both images, by each of the matrices (S, 9)."""
     matrices, bound = essential.reshape(-1, 3, 3), np.sin(BOUND_RAD)
     there, here = query @ matrices.transpose(0, 2, 1), reference @ matrices
     error = np.abs(np.einsum("sni,ni->sn", there, reference))

@@ -1,4 +1,4 @@
-"""An image with its camera and whatever is known of it: what dataset loaders make and the front end works on."""
+"""An image with its camera, pose, gravity and mask, as far as known: loaders make it and the front end works on it."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,11 +15,11 @@ from spherloc.images import read_image
 from spherloc.types import BoolArray, ByteArray, FloatArray
 
 PIXELS_AT_ONCE = 200_000
-"""A large panorama unprojected as a whole would take gigabytes."""
+"""Number of pixels that are unprojected at once: a large panorama as a whole would take gigabytes."""
 
 
 class Lift(Protocol):
-    """Gives pixels of a reference image their places in the map."""
+    """Gives pixels of a reference image their map points."""
 
     def __call__(self, pixels: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Map points (N, 3), metres, of pixels (N, 2), and a mask (N,) of those that have one; others are NaN.
@@ -31,18 +31,18 @@ class Lift(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Gravity:
-    """Which way is down in one image, how far that may be off, and what says so."""
+    """Gravity in the camera frame of one image, with its uncertainty and its source."""
 
     down: FloatArray
     """Unit vector (3,), camera frame."""
     source: str
-    """A few words, such as "the IMU" or "lines of the image"."""
+    """Where it comes from, in a few words, such as "the IMU" or "lines of the image"."""
     bound_rad: float | None = None
     """Bound on the angular error of ``down``; None takes the scene's."""
     sd_rad: float | None = None
     """Standard deviation of each of its two tilts; None takes a third of the bound."""
     by_map: bool = False
-    """Whether it follows from a pose and the map's gravity, whose error is then no error here."""
+    """Whether it was computed from a pose and the map's gravity, whose error then does not add to its own."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,16 +57,16 @@ class View:
     cam_from_map: FloatArray | None = None
     """Pose (3, 4): a reference's known pose, or a query's true one; None if unknown."""
     gravity: Gravity | None = None
-    """Which way is down in it, if something measured that."""
+    """Gravity in the camera frame, if it was measured."""
     timestamp_s: float | None = None
     """When it was taken, seconds."""
     lift: Lift | None = None
-    """How a reference's pixels get map points; None if they have none."""
+    """Gives map points to a reference's pixels; None if there are none."""
     mask: Callable[[], BoolArray] | None = None
-    """(H, W) of the pixels that may be used; None for all that the camera model can see."""
+    """Loads the mask (H, W) of the pixels that may be used; None for all that the camera model can see."""
 
     def read(self) -> ByteArray:
-        """The pixels, (H, W, 3) BGR or (H, W) grey, read anew every time: a long sequence must not fill the memory.
+        """The image, (H, W, 3) BGR or (H, W) grey; read again at each call, since a sequence would fill the memory.
 
         Raises ``InputError`` if the file cannot be read or has another size than the calibration.
         """
@@ -79,7 +79,7 @@ class View:
         return image
 
     def make_file(self) -> None:
-        """Make the image file if it is one that is drawn when it is first needed, and not there yet."""
+        """Make the image file if it does not exist yet, such as that of a rendered image."""
 
     def usable_pixels(self) -> BoolArray:
         """(H, W): pixels that the camera model can see and that ``mask`` allows.
@@ -128,7 +128,7 @@ class Matches:
     reference_pixels: FloatArray
     """(N, 2) in the reference image; NaN where unknown."""
     estimated_outlier_rate: float | None = None
-    """0 to 1, guessed from the statistics of the matches."""
+    """Outlier rate, 0 to 1, estimated from the statistics of the matches; None if unknown."""
     remarks: tuple[str, ...] = ()
     """What was skipped and why, in sentences."""
     verified_without_point: int = 0
@@ -137,15 +137,15 @@ class Matches:
 
 
 Report = Callable[[int, int], None]
-"""Told how many pieces of a long job are done, and how many there are."""
+"""Called with the number of pieces of a long job that are done, and with their total number."""
 
 
 @runtime_checkable
 class NeedsPreparing(Protocol):
-    """A matcher with work to do once for all queries, which the first of them would otherwise wait for."""
+    """A matcher with work to do once for all queries; without ``prepare`` the first query would wait for it."""
 
     def prepare(self, report: Report) -> None:
-        """Do it, if it is not done; what is wrong is said with each query."""
+        """Do this work, if it is not done; errors are reported with each query instead."""
         ...
 
 
@@ -153,5 +153,6 @@ class Matcher(Protocol):
     """Finds the 2D-3D correspondences of a query image."""
 
     def __call__(self, query: View) -> Matches:
-        """Raises ``InputError`` if the query image cannot be read; what is wrong with single references is a remark."""
+        """The correspondences. Raises ``InputError`` if the query image cannot be read; a reference that cannot be used
+        becomes a remark."""
         ...

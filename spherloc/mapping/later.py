@@ -1,8 +1,8 @@
-"""Images that COLMAP left out, placed in its map by an estimator of this project that knows where down is.
+"""Localizes images that COLMAP left out in the map, by an estimator of this project that uses gravity.
 
-An image needs no checked pair for that: its matches with all images of the map are taken together, wrong ones with
-them. A pose is believed by the rule of ``spherloc.outcome`` - no chance, no other pose about as good, fixed well
-enough - and if the images next to it in the map do not hardly match it.
+An image needs no verified pair for that: its matches with all images of the map are taken together, wrong ones
+included. A pose is accepted if ``spherloc.outcome`` judges it localized (more than chance, no alternative pose, small
+covariance) and if the nearest images of the map match the image well enough.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -26,24 +26,24 @@ from spherloc.registry import require
 from spherloc.types import FloatArray
 
 ESTIMATOR = "ransac-2p"
-"""It is compiled in a third of the time of ``auto``, which whoever makes a first map waits for."""
+"""Registered name of the estimator: it compiles in a third of the time of ``auto``, which delays only the first map."""
 MIN_INLIERS = 12
 UNKNOWN_BOUND_RAD = float(np.radians(5.0))
-"""Of gravity in an image without vertical lines, taken for level."""
+"""Bound on the error of gravity in an image without vertical lines, which is assumed to be level."""
 MAX_ROUNDS = 4
-"""What is placed adds points, by which others can be placed."""
+"""Largest number of rounds: a localized image adds points, by which others can be localized in the next round."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Placed:
-    """One image's pose in the model's frame, and what is seen of the map in it."""
+    """The pose of a localized image in the model's frame, and its inliers."""
 
     cam_from_model: FloatArray
-    """(3, 4)."""
+    """Pose (3, 4)."""
     features: NDArray[np.int64]
-    """(K,) inliers by number in the image."""
+    """(K,) indices of the image's features that are inliers."""
     points: NDArray[np.int64]
-    """(K,) ids of their points."""
+    """(K,) ids of their points in the model."""
 
 
 def place_rest(
@@ -54,9 +54,9 @@ def place_rest(
     level: Level,
     tell: Tell,
 ) -> Reconstruction:
-    """The map with those left-out images whose pose is believed, but for those ``elsewhere``.
+    """The map with those left-out images whose pose is accepted; those named in ``elsewhere`` are not tried.
 
-    ``gravity`` is what lines tell, by name.
+    ``gravity`` is that from vertical lines, by the name of the image.
     """
     names = [view.name for view in views]
     for round_number in count(1):
@@ -77,7 +77,7 @@ def place_rest(
 
 
 def _place(made: Reconstruction, view: View, gravity: Gravity | None, level: Level, unit: float) -> _Placed | None:
-    """The pose of a left-out image, if it is believed."""
+    """The pose of a left-out image; None if it is not accepted."""
     pycolmap = require("pycolmap", "colmap", "making a map")
     number = made.ids[view.name]
     found = [np.empty((0, 2), np.int64)]
@@ -109,7 +109,7 @@ def _place(made: Reconstruction, view: View, gravity: Gravity | None, level: Lev
             metric=False,
         )
     except ProblemError:
-        return None  # none of its features can be seen
+        return None  # none of its features is on a pixel that the camera model sees
     trace = estimate(problem, ESTIMATOR, default_options(ESTIMATOR, problem), 0)
     if trace.cam_from_map is None or judge(trace).outcome != Outcome.LOCALIZED:
         return None
@@ -123,7 +123,7 @@ def _place(made: Reconstruction, view: View, gravity: Gravity | None, level: Lev
 
 
 def _undoubted(made: Reconstruction, names: Sequence[str], name: str, placed: _Placed) -> bool:
-    """Whether the images next to it that it sees match it: at a place that only looks alike, hardly any do."""
+    """Whether its neighbours in the map match it: at a place that only looks alike, hardly any do."""
     poses = {**made.poses, name: placed.cam_from_model}
     seen = np.array([made.model.point3D(int(index)).xyz for index in placed.points])
     points = {**points_of(made.model), name: seen}
@@ -131,7 +131,7 @@ def _undoubted(made: Reconstruction, names: Sequence[str], name: str, placed: _P
 
 
 def _with(made: Reconstruction, placed: Mapping[str, _Placed], names: Sequence[str]) -> Reconstruction:
-    """The map with more images, triangulated and adjusted anew."""
+    """The map with more images, after another triangulation and bundle adjustment."""
     pycolmap = require("pycolmap", "colmap", "making a map")
     model = made.model
     for name, one in placed.items():
@@ -156,7 +156,7 @@ def _with(made: Reconstruction, placed: Mapping[str, _Placed], names: Sequence[s
 
 
 def _image_in(pycolmap: Any, made: Reconstruction, number: int) -> int:
-    """Id of an image's frame in the model, which COLMAP leaves out if no checked pair has the image."""
+    """Id of an image's frame in the model; it is added if COLMAP left it out, as it does without a verified pair."""
     model = made.model
     if model.exists_image(number):
         return int(model.image(number).frame_id)

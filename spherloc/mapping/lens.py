@@ -1,4 +1,4 @@
-"""A lens that COLMAP has no model of, as a Kannala-Brandt camera."""
+"""Writes a lens that COLMAP has no camera model for as a Kannala-Brandt camera."""
 
 from math import radians
 
@@ -57,7 +57,7 @@ def _fitted(camera: Camera) -> tuple[Camera, str]:
 
 
 def _angle(bearings: FloatArray) -> FloatArray:
-    """(N,) to the optical axis, rad."""
+    """Angles (N,) to the optical axis, rad."""
     return np.arctan2(np.hypot(bearings[:, 0], bearings[:, 1]), bearings[:, 2])
 
 

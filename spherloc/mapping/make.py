@@ -1,4 +1,4 @@
-"""The whole way from photographs to a map on the disk."""
+"""Makes a map from photographs and writes it to the disk: all steps in their order."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -28,19 +28,19 @@ from spherloc.mapping.written import Kept, Written, write_map
 GROUP = "group"
 """Name of the folder, with a number, of a map of images that could not be joined with the rest."""
 MIN_OF_GROUP = 3
-"""Images of such a map."""
+"""Least number of images of such a map."""
 
 
 @dataclass(frozen=True)
 class Measured:
-    """What fixes the map's scale: one of these, or nothing; then GPS in the photographs does, if it is there."""
+    """A measurement that fixes the map's scale: one of these fields or none; GPS in the photographs is used then."""
 
     camera_height_m: float | None = None
-    """Of the cameras above the ground."""
+    """Height of the cameras above the ground, m."""
     distance: tuple[str, str, float] | None = None
-    """Names of two images, and how many metres they are apart."""
+    """Names of two images, and their distance, m."""
     positions: Positions | None = None
-    """Of the images, by another source."""
+    """Positions of the images from another source."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +54,7 @@ class Map:
     groups: "tuple[Map, ...]" = ()
     """Maps of other images, which could not be joined with this one."""
     features: str = "sift"
-    """What was matched, by the name of the features."""
+    """Name of the features that were matched."""
 
 
 def make_map(
@@ -69,18 +69,16 @@ def make_map(
 ) -> Map:
     """Make a map of images of one camera and write it into ``folder``.
 
-    ``new_images`` is a folder of other images of that camera, for which a scene is written too; ``masks`` are those
-    that the views have, which the scenes are to have as well, and ``how`` are the features. Raises ``InputError`` if
-    they give no map, if what is measured names other images, or if a file cannot be read or written.
+    ``new_images`` is a folder of other images of that camera, for which a scene is written too; ``masks`` are the masks
+    of the views, which are written into the scenes, and ``how`` says which features are matched. Raises ``InputError``
+    if the images give no map, if ``measured`` names other images, or if a file cannot be read or written.
     """
     if new_images is not None and not is_folder(new_images):
-        raise InputError(f"{new_images}: is no folder; give one with images that are to be localized.")
+        raise InputError(f"{new_images}: is not a folder; give one with images that are to be localized.")
     names = {view.name for view in views}
     for name in () if measured.distance is None else measured.distance[:2]:
         if name not in names:
-            raise InputError(
-                f"{show(name)} is none of the {len(views)} photographs; name two as their files are called."
-            )
+            raise InputError(f"{show(name)} is not one of the {len(views)} photographs; give the names of two files.")
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -98,7 +96,7 @@ def make_map(
         if len(other.poses.keys() - inside) < MIN_OF_GROUP:
             continue
         try:
-            found = _finished(other.without(inside), views, names, gravity, measured, tell)  # only the first grows
+            found = _finished(other.without(inside), views, names, gravity, measured, tell)  # others do not grow
         except InputError:  # its images do not agree on where down is
             continue
         if len(found[0].poses) < MIN_OF_GROUP:
@@ -135,7 +133,7 @@ def _finished(
     measured: Measured,
     tell: Tell,
 ) -> tuple[Reconstruction, Level, Scale]:
-    """A model with what could be added to it, without what leans against it; its down and its scale."""
+    """A model with images added later and without those whose own gravity disagrees; its gravity and its scale."""
     made = made.without(level_of(made.poses, gravity).leaning)
     made = place_rest(made, views, elsewhere, gravity, level_of(made.poses, gravity), tell)
     level = level_of(made.poses, gravity)
@@ -144,7 +142,7 @@ def _finished(
 
 
 def scale_of(made: Reconstruction, level: Level, measured: Measured) -> Scale:
-    """By what is measured; arbitrary, with the reason, if that does not fit the map: the work is done by now."""
+    """The scale by ``measured``; arbitrary, with the reason, if that does not fit: the map itself is finished."""
     try:
         if measured.distance is not None:
             return scale_by_distance(made.poses, *measured.distance)

@@ -1,9 +1,9 @@
-"""Which matches of two images of one camera fit two poses, and whether that can be chance.
+"""Two-view check: which matches of two images of one camera fit a relative pose, and whether chance explains as many.
 
-Bearings are compared, whatever the lens. COLMAP's estimator needs one right match of five or six; where gravity is
-known in both images, samples of three find poses among far fewer. What is found is believed if it is no chance (a
-contrario, Moisan and Stival 2004): of many wrong matches, more than fifteen may fit some pose. Then matches that were
-in doubt join, where they fit the pose too.
+Bearings are compared, so that any lens will do. COLMAP's estimator needs one right match of five or six; where gravity
+is known in both images, samples of three find poses among far fewer right ones. A pose is accepted if chance does not
+explain its matches (a contrario, Moisan and Stival 2004): of many wrong matches, more than fifteen may fit some pose.
+Ambiguous matches that fit the pose are added afterwards.
 """
 
 from collections.abc import Mapping, Sequence
@@ -27,24 +27,24 @@ from spherloc.mapping.triangles import MIN_FIT, Pair, Relative, elsewhere, throu
 from spherloc.types import FloatArray
 
 MIN_MATCHES = 15
-"""Of a pair of images, after all checks."""
+"""Least number of matches of a pair of images, after all checks."""
 BOUND_RAD = float(np.radians(0.5))
-"""Of a match to its epipolar plane; in pixels it is kept within ``BOUND_PX``."""
+"""Largest angle of a match to its epipolar plane; it is limited to what ``BOUND_PX`` allows."""
 BOUND_PX = 1.5, 6.0
 ONE_PLACE_RAD = float(np.radians(0.5))
-"""Rays of a match that differ by less: two images from one place, which tell nothing of depth."""
+"""If the rays of the matches differ by less, the two images were taken from one place and show no depth."""
 LEVEL_BOUND_RAD = float(np.radians(1.2))
-"""Of a match to its epipolar plane where both images are taken for level: gravity is known to a degree or less."""
+"""Largest angle of a match to its epipolar plane where gravity is used: it is known to a degree or less."""
 PEAK = 1.7
-"""So many times more matches than elsewhere must be near the planes of a direction that a third image gave."""
+"""Least ratio of the matches that fit a direction found through a third image to those that fit other directions."""
 LEAN_RAD = float(np.radians(1.5))
-"""By so much, besides the bounds on gravity, down may differ between two images by the pose that their matches fit."""
+"""Angle by which the gravities of two images may differ under their relative pose, besides the bounds on gravity."""
 MAX_LOG10_NFA = -1.0
-"""Poses that as many of the matches would fit by chance, as a power of ten."""
+"""Largest log10 of the NFA: the number of poses that as many of the matches would fit by chance."""
 
 
 class Pairs:
-    """The images of one camera, two of which are compared at a time, in any thread."""
+    """The images of one camera, which are compared in pairs, in any thread."""
 
     def __init__(
         self,
@@ -55,7 +55,7 @@ class Pairs:
         gravity: Sequence[Gravity | None],
         matching: MatchOptions,
     ) -> None:
-        """``usable`` (K,) are the features of each image that COLMAP may have, ``gravity`` what its lines tell."""
+        """``usable`` are the indices (K,) of each image's features for COLMAP, ``gravity`` that from vertical lines."""
         self._matching = matching
         self._pycolmap = pycolmap
         self._features = features
@@ -80,7 +80,7 @@ class Pairs:
             numbers[index] = np.arange(len(index))
 
     def compare(self, first: int, second: int) -> tuple[NDArray[np.uint32], Any]:
-        """Matches (M, 2) by number of usable feature, and a ``TwoViewGeometry`` of those that fit, or None."""
+        """Matches (M, 2), indices of usable features, and a ``TwoViewGeometry`` of those that fit, or None."""
         found = match(self._features[first], self._features[second], self._matching)
         pairs = np.column_stack(
             [self._number_of[first][found.query_index], self._number_of[second][found.reference_index]]
@@ -91,7 +91,8 @@ class Pairs:
         return pairs, None if geometry is None else self._guided(first, second, geometry)
 
     def between(self, pair: Pair, pairs: NDArray[np.uint32], known: Mapping[Pair, Relative], middles: list[int]) -> Any:
-        """A ``TwoViewGeometry`` of matches (M, 2) that have a pose by way of the images ``middles``, or None."""
+        """A ``TwoViewGeometry`` of matches (M, 2), with a pose found through the images ``middles``; None if there is
+        none."""
         if len(pairs) < MIN_FIT:
             return None
         first, second = pair
@@ -104,7 +105,7 @@ class Pairs:
         more = guided_matches(rays, words, *pose, self._bound_rad)
         if len(more) < MIN_MATCHES:
             return None
-        # Floors and wallpaper have as many matches whichever way the second camera stands.
+        # On floors and wallpaper as many matches fit whatever the direction to the second camera is.
         for other in elsewhere(pose):
             if PEAK * len(guided_matches(rays, words, pose[0], other, self._bound_rad)) > len(more):
                 return None
@@ -131,7 +132,7 @@ class Pairs:
         return DOWN if gravity is None else gravity.down
 
     def _level(self, first: int, second: int, geometry: Any) -> bool:
-        """Whether down in one image is down in the other, where lines tell it in both."""
+        """Whether the gravities of both images agree under the pose; true where lines do not show both."""
         one, other = self._gravity[first], self._gravity[second]
         if one is None or other is None:
             return True
@@ -150,7 +151,7 @@ class Pairs:
         return geometry.config in (kinds.CALIBRATED, kinds.PANORAMIC)
 
     def _no_chance(self, geometry: Any, first: FloatArray, second: FloatArray) -> bool:
-        """Whether bearings (M, 3) of matches would hardly fit any pose so well if all were wrong."""
+        """Whether wrong matches alone would hardly fit a pose as well as these bearings (M, 3) do."""
         if self.same_place(geometry):
             return True
         pose = relative(geometry)
@@ -159,7 +160,7 @@ class Pairs:
         return log10_nfa(len(first), int(np.count_nonzero(fits)), chance) <= MAX_LOG10_NFA
 
     def _guided(self, first: int, second: int, geometry: Any) -> Any:
-        """The same with the matches that are found near the epipolar planes, if they are more."""
+        """The geometry with the matches that are found near the epipolar planes, if they are more."""
         if self.same_place(geometry):
             return geometry
         rays = self._bearings[first], self._bearings[second]
@@ -177,7 +178,7 @@ class Pairs:
 
 
 def _unit(descriptors: Descriptors) -> NDArray[np.float32]:
-    """(N, D) of length 1."""
+    """Descriptors (N, D), scaled to length 1."""
     words = descriptors.astype(np.float32)
     return words / np.maximum(np.linalg.norm(words, axis=1, keepdims=True), np.float32(1e-9))
 
@@ -189,7 +190,7 @@ def relative(geometry: Any) -> Relative:
 
 
 def focal_px(camera: Camera) -> float:
-    """Pixels a radian in the middle of the image."""
+    """Pixels per radian in the middle of the image."""
     ahead = np.array([[0.0, 0.0, 1.0], [1e-3, 0.0, 1.0]])
     pixels, _ = camera.project(ahead)
     return float(np.linalg.norm(pixels[1] - pixels[0]) / 1e-3)

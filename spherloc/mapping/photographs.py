@@ -1,4 +1,4 @@
-"""The photographs that a map is made of: a folder's images with their camera, or the sharpest frames of a video."""
+"""The photographs from which a map is made: a folder's images with their camera, or the sharpest frames of a video."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -22,35 +22,35 @@ from spherloc.types import ByteArray
 
 MIN_IMAGES = 2
 MAX_IMAGES = 500
-"""Their features take 4 MB each."""
+"""Largest number of images of a map: the features of each take 4 MB."""
 MIN_PANORAMA_PX = 200
-"""Of the longer side."""
+"""Least length of the longer side of a panorama."""
 CALIBRATIONS = (".yaml", ".yml", ".json", ".toml")
 MAX_CALIBRATIONS = 20
-"""Files beside the photographs that are tried as one."""
+"""Largest number of files beside the photographs that are tried as a calibration."""
 SHARPNESS_PX = 512
-"""Frames are compared at this longer side."""
+"""Frames are scaled to this longer side before their sharpness is compared."""
 
 
 @dataclass(frozen=True)
 class Photographs:
-    """What can be mapped, in the order of names, and what is said of the rest."""
+    """The images that can be mapped, in the order of names, and remarks on the others."""
 
     views: tuple[View, ...]
     remarks: tuple[str, ...]
 
 
 def photographs(folder: Path, camera: Camera | None, masks: Masks | None = None) -> Photographs:
-    """The images of a folder, all of ``camera``; without one they are taken for panoramas if they are 2 to 1.
+    """The images of a folder, all of ``camera``; if it is None, images of 2 to 1 count as panoramas.
 
-    Other images without one are of the camera whose calibration lies in the folder, if one of their size does. What
-    ``masks`` leave out gives no features.
+    For other images the folder is searched for a calibration of their size. Pixels that ``masks`` leave out give no
+    features.
 
-    Raises ``InputError`` if there are fewer than two of one size or too many, if there is no mask for any of them, or
-    if their camera is not known or none that COLMAP can have.
+    Raises ``InputError`` if there are fewer than two images of one size or too many, if no image has a mask, or if
+    their camera is unknown or has no model in COLMAP.
     """
     if not is_folder(folder):
-        raise InputError(what_it_is(folder) or f"{folder}: is no folder; give the folder of the photographs.")
+        raise InputError(what_it_is(folder) or f"{folder}: is not a folder; give the folder of the photographs.")
     sizes: dict[tuple[int, int], list[str]] = {}
     remarks = []
     for name in (name for name in names_in(folder) if Path(name).suffix.lower() in IMAGES):
@@ -68,7 +68,7 @@ def photographs(folder: Path, camera: Camera | None, masks: Masks | None = None)
         camera, name = _calibration_in(folder, size)
         if camera is None:
             raise InputError(
-                f"{folder}: its photographs are {width} x {height} pixels, so they are no full panoramas (2 to 1); "
+                f"{folder}: its photographs are {width} x {height} pixels, so they are not full panoramas (2 to 1); "
                 "give their calibration with --camera FILE."
             )
         remarks.append(f"The calibration is {shorten(name)}, which lies beside the photographs.")
@@ -86,8 +86,8 @@ def photographs(folder: Path, camera: Camera | None, masks: Masks | None = None)
         )
     if len(names) > MAX_IMAGES:
         raise InputError(
-            f"{folder}: has {len(names)} photographs, of {MAX_IMAGES} that are mapped at once; take every n-th of "
-            'them, or map them with COLMAP and open its model as kind = "colmap".'
+            f"{folder}: has {len(names)} photographs, more than {MAX_IMAGES}; take every n-th of them, or map "
+            'them with COLMAP and open its model as kind = "colmap".'
         )
     camera, about_lens = for_colmap(camera)
     if about_lens:
@@ -105,7 +105,7 @@ def _calibration_in(folder: Path, size: tuple[int, int]) -> tuple[Camera | None,
     for name in names[:MAX_CALIBRATIONS]:
         try:
             camera = load_camera(folder / name)
-        except SpherlocError:  # something else
+        except SpherlocError:  # not a calibration
             continue
         if (camera.width, camera.height) == size:
             return camera, name
@@ -113,13 +113,14 @@ def _calibration_in(folder: Path, size: tuple[int, int]) -> tuple[Camera | None,
 
 
 def frames_of(video: Path, folder: Path, count: int, advance: Callable[[str], None]) -> int:
-    """Write some ``count`` frames of a video into ``folder``, the sharpest of each stretch; how many were written.
+    """Write about ``count`` frames of a video into ``folder`` and return their number.
 
-    ``advance`` is called after each with its name. Frames that are there are not written again. Raises ``InputError``
-    if the video cannot be read or the folder cannot be written.
+    The video is divided into equal pieces, of which the sharpest frame each is written. ``advance`` is called after
+    each frame with its file name. Existing frames are not written again. Raises ``InputError`` if the video cannot be
+    read or the folder cannot be written.
     """
     if not is_file(video):
-        raise InputError(f"{video}: is no file; give a video.")
+        raise InputError(f"{video}: is not a file; give a video.")
     reader = cv2.VideoCapture(str(video))
     total = int(reader.get(cv2.CAP_PROP_FRAME_COUNT)) if reader.isOpened() else 0
     if total <= 0:

@@ -1,7 +1,7 @@
-"""Where photographs were taken by another source, which tells how long a unit of the map is: a trajectory, GPS.
+"""Positions of photographs from another source (a trajectory, GPS), which give the map's scale.
 
-The map's camera centres are laid over these positions by a similarity. Up to half of the positions may be wrong: the
-similarity has the least median of distances (Rousseeuw 1984) and is then fitted to those near it.
+The map's camera centres are aligned with these positions by a similarity. Up to half of the positions may be wrong: the
+similarity has the least median of distances (Rousseeuw 1984) and is then fitted to the positions near it.
 """
 
 import re
@@ -25,22 +25,22 @@ from spherloc.trajectory import NS_PER_S, Trajectory, pose_at, read_euroc, read_
 from spherloc.types import BoolArray, FloatArray
 
 MIN_POSITIONS = 4
-"""Of images of the map: fewer fit a similarity whatever they are."""
+"""Least number of the map's images with a position: a similarity fits fewer whatever they are."""
 MAX_SCALE_SD = 0.1
-"""Standard deviation of the scale, as a part of it, with which it is still believed."""
+"""Largest relative standard deviation of the scale."""
 MAX_GAP_S = 0.5
-"""Poses of a trajectory farther apart are not interpolated."""
+"""Largest time between two poses of a trajectory that are interpolated."""
 SAMPLES = 2000
 NEAR_SD = 2.5
-"""Positions within so many robust standard deviations are fitted."""
+"""Positions within this many robust standard deviations are used in the fit."""
 _COLUMNS = "image x y z in metres"
 _GPS_WORDS = ({"lat", "latitude"}, {"lon", "lng", "long", "longitude"}, {"alt", "altitude"})
 _EQUATOR_M, _FLATTENING = 6_378_137.0, 1.0 / 298.257223563
-"""Of the Earth by WGS 84."""
+"""Equatorial radius and flattening of the Earth (WGS 84)."""
 _GPS_TAGS = 0x8825
 _DEVICE_NS = re.compile(r"(?:^|\D)(\d{12,17})$", re.ASCII)
 _DECIMAL_S = re.compile(r"(?:^|[^\d.])(\d{1,10}\.\d{1,9})$", re.ASCII)
-"""Ends of names such as camera_87551170813262.png and 1311868164.363181.png."""
+"""Times at the ends of names such as camera_87551170813262.png (ns) and 1311868164.363181.png (s)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,32 +48,32 @@ class Positions:
     """Positions of photographs in metres, in any frame."""
 
     by_name: Mapping[str, FloatArray]
-    """(3,) by the name of the photograph; z is up where ``horizontal``."""
+    """Position (3,), m, by the name of the photograph; z is up where ``horizontal``."""
     source: str
-    """In a few words."""
+    """Where they come from, in a few words."""
     horizontal: bool = False
-    """Heights say nothing, as those of GPS."""
+    """Whether heights are not used, as with GPS."""
 
 
 @dataclass(frozen=True, eq=False)
 class Overlay:
-    """A similarity that takes points to positions."""
+    """A similarity that aligns points with positions."""
 
     scale: float
-    """Metres a unit of the points."""
+    """Metres per unit of the points."""
     scale_sd: float
-    """Its standard deviation, as a part of it, by the distances that are left."""
+    """Relative standard deviation of the scale, from the distances after the alignment."""
     off_m: FloatArray
-    """(N,) distances that are left."""
+    """(N,) distances between positions and aligned points."""
     near: BoolArray
-    """(N,) of those that were fitted."""
+    """(N,) mask of the positions that the similarity was fitted to."""
 
 
 def read_positions(path: Path, views: Sequence[View]) -> Positions:
     """Positions in a file: rows ``image x y z``, a table with columns image, lat, lon, or a trajectory (TUM, EuRoC).
 
-    A trajectory is asked at the times in the images' names. Raises ``InputError`` for a wrong row, and for a file that
-    has no position of any image.
+    A trajectory is interpolated at the times in the images' names. Raises ``InputError`` for a wrong row, and for a
+    file that has no position of any image.
     """
     first = next(iter(rows(path, f"rows of {_COLUMNS}, or a trajectory")), None)
     if first is None:
@@ -94,9 +94,9 @@ def read_positions(path: Path, views: Sequence[View]) -> Positions:
 
 
 def _of_trajectory(path: Path, views: Sequence[View]) -> dict[str, FloatArray]:
-    """Of TUM's rows, whose times may be counted in seconds or in nanoseconds."""
+    """Positions from the rows of a TUM trajectory, whose times may be in seconds or in nanoseconds."""
     found: dict[str, FloatArray] = {}
-    with suppress(InputError):  # nanoseconds are too many seconds
+    with suppress(InputError):  # times in nanoseconds are refused as seconds: too large
         found = _at_times(read_tum(path, "s"), views)
     return found or _at_times(read_tum(path, "ns"), views)
 
@@ -112,7 +112,7 @@ def _at_times(trajectory: Trajectory, views: Sequence[View]) -> dict[str, FloatA
 
 
 def _time_ns(name: str) -> int | None:
-    """When an image was taken by its name, on whatever clock: that of a device that was switched on has few digits."""
+    """When an image was taken, ns, by its name and on any clock: one that starts with the device has few digits."""
     time_ns = timestamp_of(name)
     if time_ns is not None:
         return time_ns
@@ -141,7 +141,7 @@ def _of_rows(path: Path, views: Sequence[View]) -> Positions:
             raise InputError(f"{place}: has {len(words)} words; give {what}.")
         numbers = finite_numbers(words[1:4] if columns is None else [words[column] for column in columns], place)
         if columns is not None and not (abs(numbers[0]) <= 90.0 and abs(numbers[1]) <= 360.0):
-            raise InputError(f"{place}: {numbers[0]:g}, {numbers[1]:g} is no latitude and longitude; give degrees.")
+            raise InputError(f"{place}: {numbers[0]:g}, {numbers[1]:g} is not a latitude and longitude; give degrees.")
         if words[0] in found:
             raise InputError(f"{place}: {show(words[0])} is there a second time; keep one row.")
         count += 1
@@ -149,8 +149,8 @@ def _of_rows(path: Path, views: Sequence[View]) -> Positions:
             found[words[0]] = np.array([*numbers, 0.0][:3])
     if not found:
         raise InputError(
-            f"{path}: none of its {count} rows is of one of the {len(views)} images, such as {show(views[0].name)}; "
-            "name them as the files are called."
+            f"{path}: none of its {count} rows names one of the {len(views)} images, such as {show(views[0].name)}; "
+            "use the file names of the images."
         )
     if columns is None:
         return Positions(found, f"the positions in {shorten(path.name)}")
@@ -158,7 +158,7 @@ def _of_rows(path: Path, views: Sequence[View]) -> Positions:
 
 
 def _gps_columns(words: Sequence[str]) -> list[int] | None:
-    """Places of latitude, longitude and, if there is one, altitude in a row of names; None if it is none."""
+    """Columns of latitude, longitude and, if there is one, altitude in a row of names; None for another row."""
     places = [
         next((at for at, word in enumerate(words) if word.strip('"').lower() in kind), None) for kind in _GPS_WORDS
     ]
@@ -186,7 +186,7 @@ def _gps_tag(path: Path) -> tuple[float, float] | None:
             tags = image.getexif().get_ifd(_GPS_TAGS)
             signs = [tags[1] in ("N", "n"), tags[3] in ("E", "e")]
             angles = [sum(float(part) / 60**power for power, part in enumerate(tags[tag])) for tag in (2, 4)]
-    except Exception:  # Pillow lets through whatever a damaged tag makes it do
+    except Exception:  # Pillow passes on whatever a damaged tag raises
         return None
     if not (np.isfinite(angles).all() and angles[0] <= 90.0 and angles[1] <= 180.0) or angles == [0.0, 0.0]:
         return None
@@ -195,7 +195,7 @@ def _gps_tag(path: Path) -> tuple[float, float] | None:
 
 
 def local_metres(degrees: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
-    """East, north and 0 in metres from the middle one, of latitudes and longitudes (3,) in degrees by name.
+    """Positions (3,) by name: east, north and 0 in metres from the middle one, of latitudes and longitudes in degrees.
 
     By the Earth's radii of curvature there (WGS 84): good to a millimetre in a hundred metres.
     """
@@ -212,13 +212,13 @@ def local_metres(degrees: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
 
 
 def overlaid(points: FloatArray, positions: FloatArray) -> Overlay:
-    """Points (N, D) laid over positions (N, D) in metres, D being 2 or 3, of which half may be wrong.
+    """The similarity that aligns points (N, D) with positions (N, D) in metres, D = 2 or 3; half of them may be wrong.
 
-    Raises ``InputError`` if there are fewer than ``MIN_POSITIONS``, or if points or positions are all one.
+    Raises ``InputError`` if there are fewer than ``MIN_POSITIONS``, or if points or positions are all in one place.
     """
     count, size = points.shape
     if count < MIN_POSITIONS:
-        raise InputError(f"only {count} images of the map have a position, of {MIN_POSITIONS} that are needed.")
+        raise InputError(f"only {count} images of the map have a position, but {MIN_POSITIONS} are needed.")
     best: tuple[float, FloatArray] | None = None
     for sample in _samples(count, size):
         fit = _similarity(points[sample], positions[sample])

@@ -1,13 +1,13 @@
 """Structure from motion: features and matches of this project, two-view checks and bundle adjustment of COLMAP.
 
 Panoramas stay panoramas: COLMAP's camera EQUIRECTANGULAR. Between two of them a match must fit an essential matrix and
-not only a homography: a full sphere sees more than one plane, and what fits one plane alone is a facade, a poster or a
-floor that looks the same elsewhere.
+not only a homography: a full sphere sees more than one plane, and matches that fit a single plane may be on a facade, a
+poster or a floor that looks the same elsewhere.
 
-Places that look alike (two hotel rooms, a row of houses) give matches that fit all the same. A map that takes them for
-one place puts photographs side by side, with nothing between them, that have hardly a match. There it is cut, where
-fewest matches hold it together. A second map is made of the strong pairs alone, and the one that explains more images,
-less those contradictions, is taken.
+Places that look alike (two hotel rooms, a row of houses) give wrong matches that fit a pose. A map that takes such
+places for one puts photographs next to each other that have hardly a match although nothing is between them: a
+contradiction. The map is then cut where fewest matches connect it. A second map is made from the strong pairs alone,
+and the map with more images, minus a penalty for contradictions, is taken.
 """
 
 import copy
@@ -44,29 +44,30 @@ from spherloc.registry import require
 from spherloc.types import BoolArray, FloatArray
 
 DATABASE_VERSION = 5
-"""Raised when pairs are matched or checked in another way."""
+"""Number to be increased when pairs are matched or checked in another way, so that old databases are not used."""
 MAX_EXHAUSTIVE = 50
-"""Images of which all pairs are tried; of more, each with its neighbours by name and with those that look alike."""
+"""Largest number of images of which all pairs are tried; of more, each is tried with its neighbours by name and with
+similar images."""
 NEIGHBOURS, ALIKE = 5, 15
 WIDEST_RAD = np.radians(85.0)
 """Features farther from the optical axis are left out: COLMAP's fisheyes end at 90 degrees."""
 STRONG = 0.3
 """A strong pair has this share of the matches of the best pair of either image."""
 NEARBY = 2
-"""Images next to one in the map, that should match it."""
+"""Number of nearest images in the map that should match an image."""
 MIN_SUPPORT = 0.15
-"""Share of the matches of the best pair of either image that two nearby images have; with less they contradict."""
+"""Least number of matches of two nearby images, as a share of those of either image's best pair; fewer contradict."""
 SIGHT_RAD, SIGHT_POINTS, SIGHT_FACTOR = np.radians(25.0), 8, 1.2
-"""An image sees past another one if it has this many points at most so far off its direction, half of them farther away
-by this factor."""
+"""An image sees past another camera if it has at least the second number of points within the first angle around the
+direction of that camera, and half of them are farther away than the camera by the third factor."""
 COST_OF_CONTRADICTION = 4.0
-"""Share of the images that a map is worth less for each share of contradictions."""
+"""Weight of the share of contradictions when two maps are compared by their share of images."""
 _TRIES = (
     {"init_min_num_inliers": 50, "init_min_tri_angle": 4.0},
     {"init_min_num_inliers": 25, "init_min_tri_angle": 2.0},
     {"init_min_num_inliers": 15, "init_min_tri_angle": 1.0},
 )
-"""What the first pair of a model must have, in turn until there is a model."""
+"""Conditions for the first pair of a model, tried one after another until there is a model."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,18 +79,19 @@ class Reconstruction:
     poses: dict[str, FloatArray]
     """Poses (3, 4) from the model's frame, which has no scale and no up, by name of a registered image."""
     matches: NDArray[np.int64]
-    """(V, V) matches of each pair of images after the two-view check."""
+    """(V, V) number of matches of each pair of images after the two-view check."""
     contradictions: tuple[tuple[str, str], ...]
-    """Names of images that the model puts side by side, in sight of each other, although they hardly match."""
+    """Names of pairs of images that the model puts next to each other and in sight of each other, but that hardly
+    match."""
     all_matches: NDArray[np.int64]
-    """(V, V) as ``matches``, with those of images that were taken from one place."""
+    """(V, V) like ``matches``, but with pairs of images that were taken from one place."""
     database: Path
-    """COLMAP's, with features and matches of all images."""
+    """COLMAP's database with features and matches of all images."""
     ids: dict[str, int]
-    """Of all images in it, by name."""
+    """Ids of all images in the database, by name."""
 
     def without(self, names: Collection[str]) -> "Reconstruction":
-        """The same with fewer images; points that fewer than two others see are gone."""
+        """The model without the images ``names``, and without points that fewer than two of the other images see."""
         for number in list(self.model.reg_image_ids()):
             image = self.model.image(number)
             if image.name in names:
@@ -99,12 +101,12 @@ class Reconstruction:
         return replace(self, poses=poses, contradictions=against)
 
     def judged(self) -> "Reconstruction":
-        """The same with the contradictions that it has now."""
+        """The model with its contradictions computed anew."""
         against = contradictions(self.poses, list(self.ids), self.all_matches, points_of(self.model))
         return replace(self, contradictions=against)
 
     def points(self) -> FloatArray:
-        """(N, 3) in the frame that the model has now."""
+        """Positions (N, 3) of the points in the model's present frame."""
         return np.array([point.xyz for point in self.model.points3D.values()]).reshape(-1, 3)
 
 
@@ -115,17 +117,17 @@ def reconstruct(
     tell: Tell,
     how: FrontendOptions | None = None,
 ) -> tuple[Reconstruction, ...]:
-    """Map images of one camera; the database in ``folder`` is kept, and what is in it is not done again.
+    """Map images of one camera; the database in ``folder`` is kept, and its features and matches are used again.
 
-    The map with most images comes first, then those of other images that could not be joined with it.
+    The map with most images comes first, then maps of other images that could not be joined with it.
 
-    ``gravity`` is what lines of the images tell, ``how`` the features and their matching, SIFT's if it is None.
+    ``gravity`` is that from the images' vertical lines, ``how`` the features and their matching, SIFT if it is None.
 
     Raises ``InputError`` if pycolmap is missing, if an image or the folder cannot be used, or if no two images fit
     together.
     """
     pycolmap = require("pycolmap", "colmap", "making a map")
-    pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)  # what fails is said here
+    pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)  # errors are reported here instead
     camera, how = views[0].camera, how or FrontendOptions()
     features = []
     for view in views:
@@ -135,7 +137,7 @@ def reconstruct(
     path = folder / f"matches_{_key(views, how)}.db"
     try:
         database = pycolmap.Database.open(str(path))
-    except Exception as error:  # pycolmap raises whatever SQLite says
+    except Exception as error:  # pycolmap passes on whatever SQLite raises
         raise InputError(f"{path}: cannot be written ({reason(error)}); give another --output.") from None
     try:
         ids = _described(pycolmap, database, views, features, usable)
@@ -152,7 +154,7 @@ def reconstruct(
             )
         raise InputError(
             f"no two of the {len(views)} photographs show the same place from two positions: the best pair has "
-            f"{counts.max(initial=0)} matches that fit together, of {MIN_MATCHES} that are needed. Take them closer "
+            f"{counts.max(initial=0)} matches that fit together, but {MIN_MATCHES} are needed. Take them closer "
             "to each other, half a metre to two metres apart indoors."
         )
     names = [view.name for view in views]
@@ -178,7 +180,7 @@ def _models_of(
 ) -> tuple[Reconstruction, ...]:
     """Models, the largest first, of the pairs with at least the share ``keep`` of the matches of either image's best
     pair."""
-    with TemporaryDirectory() as folder:  # COLMAP takes all pairs of a database, and writes its models itself, too
+    with TemporaryDirectory() as folder:  # COLMAP uses all pairs of a database, and writes its models into a folder
         database = Path(folder) / "matches.db"
         shutil.copyfile(path, database)
         best = counts.max(axis=1)
@@ -202,8 +204,8 @@ def _models_of(
 def parted(made: Reconstruction) -> list[Reconstruction]:
     """The model cut until no two images contradict each other: parts of two images or more, the largest first.
 
-    A contradiction says that two images do not belong side by side, so somewhere between them places that only look
-    alike are taken for one: where the cut between the two takes away fewest matches.
+    A contradiction says that two images do not belong next to each other, so somewhere between them the model takes two
+    similar places for one. The cut that separates the two images with the fewest matches is made there.
     """
     if not made.contradictions:
         return [made]
@@ -230,8 +232,8 @@ def _sorted(pair: tuple[str, str]) -> tuple[str, str]:
 def untangled(made: Sequence[Reconstruction]) -> tuple[Reconstruction, ...]:
     """The models without images that have more matches with those of another one, the largest first.
 
-    Models that share images and yet could not be joined take two places for one somewhere: where the images between
-    them belong is where they match most.
+    Models that share images and yet could not be joined take two places for one somewhere. A shared image belongs to
+    the model with which it has most matches.
     """
     if len(made) < 2:
         return tuple(made)
@@ -263,9 +265,9 @@ def contradictions(
     counts: NDArray[np.int64],
     points: Mapping[str, FloatArray],
 ) -> tuple[tuple[str, str], ...]:
-    """Images of ``poses`` and those next to them, in sight of each other, that hardly match.
+    """Pairs of neighbouring images of ``poses``, in sight of each other, that hardly match.
 
-    ``counts`` (V, V) are the matches of all ``names``, ``points`` (K, 3) what each image sees of the map.
+    ``counts`` (V, V) are the numbers of matches of all ``names``, ``points`` (K, 3) the points that each image sees.
     """
     inside = [index for index, name in enumerate(names) if name in poses]
     centres = np.stack([camera_centre(poses[names[index]]) for index in inside])
@@ -285,9 +287,9 @@ def contradictions(
 
 
 def _sees_past(points: FloatArray, centre: FloatArray, other: FloatArray) -> bool:
-    """Whether what a camera at ``centre`` sees (K, 3) in the direction of another one lies behind that one.
+    """Whether the points (K, 3) that a camera at ``centre`` sees in the direction of another camera lie behind it.
 
-    A wall between the two would be seen before it: then they need no match.
+    With a wall between the two cameras they would lie in front of it; such cameras need not match.
     """
     rays, way = points - centre, other - centre
     depth, distance = np.linalg.norm(rays, axis=1), float(np.linalg.norm(way))
@@ -296,7 +298,7 @@ def _sees_past(points: FloatArray, centre: FloatArray, other: FloatArray) -> boo
 
 
 def points_of(model: Any) -> dict[str, FloatArray]:
-    """What each image of a model sees of the map, (K, 3) by name."""
+    """The points (K, 3) that each image of a model sees, by its name."""
     found = {}
     for image in _registered(model):
         ids = [point.point3D_id for point in image.points2D if point.has_point3D()]
@@ -309,7 +311,7 @@ def _registered(model: Any) -> list[Any]:
 
 
 def _key(views: Sequence[View], how: FrontendOptions) -> str:
-    """Of the images and of all that their matches depend on: another key is another database."""
+    """Hash of the images and of all that their matches depend on; it names the database."""
     said = [DATABASE_VERSION, VERSION, how.features.method, how.matching.method, repr(views[0].camera)]
     for view in views:
         status = view.path.stat()
@@ -335,13 +337,13 @@ def _described(
     features: Sequence[Features],
     usable: Sequence[NDArray[np.int64]],
 ) -> list[int]:
-    """Ids of the images in the database, where they are now if they were not."""
+    """Ids of the images in the database; images that are missing there are added with their features."""
     if database.num_images():
         return [database.read_image_with_name(view.name).image_id for view in views]
     name, parameters = colmap_camera(views[0].camera)
     width, height = views[0].camera.width, views[0].camera.height
     camera = pycolmap.Camera(model=name, width=width, height=height, params=parameters)
-    camera.has_prior_focal_length = True  # calibrated, that means
+    camera.has_prior_focal_length = True  # COLMAP's word for calibrated
     camera.camera_id = database.write_camera(camera)
     rig = pycolmap.Rig()
     rig.add_ref_sensor(camera.sensor_id)
@@ -362,9 +364,9 @@ def _described(
 def _matched(
     database: Any, ids: Sequence[int], compared: Pairs, waiting: Sequence[Pair], tell: Tell
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Matches (V, V) of each pair of images that fit two poses, and (V, V) of pairs that were taken from one place.
+    """Numbers of matches (V, V) of each pair that fit a relative pose, and the same of pairs taken from one place.
 
-    They are in the database then. Pairs that others contradict have none.
+    The matches are written into the database. Pairs whose rotation disagrees with others have none.
     """
     found: dict[Pair, Any] = {}
     todo = [pair for pair in waiting if not database.exists_matches(*_of(ids, pair))]
@@ -377,7 +379,7 @@ def _matched(
             if geometry is not None:
                 found[pair] = geometry
                 database.write_two_view_geometry(*_of(ids, pair), geometry)
-            database.write_matches(*_of(ids, pair), pairs)  # last: it says that the pair is done
+            database.write_matches(*_of(ids, pair), pairs)  # last, since it marks the pair as done
             done += 1
             tell("pairs of images matched", done, len(waiting))
         same_place = {pair: found.pop(pair) for pair in sorted(found) if compared.same_place(found[pair])}
@@ -404,14 +406,14 @@ def _matched(
 
 
 def _agreeing(found: Mapping[Pair, Any]) -> dict[Pair, Any]:
-    """Those of the pairs whose rotations agree."""
+    """The pairs whose rotations agree with those of the others."""
     rotations = {pair: relative(geometry)[0] for pair, geometry in sorted(found.items())}
     agree = agreeing(rotations, {pair: len(geometry.inlier_matches) for pair, geometry in found.items()})
     return {pair: found[pair] for pair in sorted(agree)}
 
 
 def _counts(found: Mapping[Pair, Any], size: int) -> NDArray[np.int64]:
-    """(V, V) matches of each pair."""
+    """Number of matches (V, V) of each pair."""
     counts = np.zeros((size, size), np.int64)
     for pair, geometry in found.items():
         counts[pair] = counts[pair[::-1]] = len(geometry.inlier_matches)
@@ -421,7 +423,7 @@ def _counts(found: Mapping[Pair, Any], size: int) -> NDArray[np.int64]:
 def _as_completed(
     pool: ThreadPoolExecutor, work: Callable[[int, int], Any], pairs: Sequence[tuple[int, int]]
 ) -> Iterator[tuple[tuple[int, int], Any]]:
-    """Results as they come; few are begun ahead, so that Ctrl-C need not wait for all."""
+    """Results as they are completed; only a few are started ahead, so that Ctrl-C need not wait for all."""
     running: dict[Future[Any], tuple[int, int]] = {}
     left = iter(pairs)
     while True:
@@ -442,7 +444,7 @@ def _of(ids: Sequence[int], pair: tuple[int, int]) -> tuple[int, int]:
 
 
 def _pairs(features: Sequence[Features]) -> list[tuple[int, int]]:
-    """Which pairs of images are matched."""
+    """The pairs of images that are to be matched."""
     count = len(features)
     if count <= MAX_EXHAUSTIVE:
         return list(combinations(range(count), 2))
@@ -461,7 +463,7 @@ def _models(pycolmap: Any, database: Path, folder: Path, count: int, tell: Tell)
     """COLMAP's models, the one with most images first; none if it finds no first pair."""
     options = pycolmap.IncrementalPipelineOptions()
     options.min_num_matches, options.min_model_size, options.random_seed = MIN_MATCHES, 2, 0
-    options.num_threads = 1  # else every run gives another map
+    options.num_threads = 1  # with more threads every run gives another map
     options.ba_refine_focal_length = options.ba_refine_extra_params = options.extract_colors = False
     mapper = options.mapper
     mapper.abs_pose_refine_focal_length = mapper.abs_pose_refine_extra_params = False

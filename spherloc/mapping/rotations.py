@@ -1,8 +1,9 @@
-"""Pairs of images whose relative rotations agree with each other: those of places that look alike seldom do.
+"""Finds pairs of images whose relative rotations agree; pairs of different places that look alike seldom do.
 
-Round a loop of right pairs rotations multiply to none. The rotations of all images are found by weighted averaging
-(chordal, Geman and McClure's weights), begun on the tree of the pairs that most loops of three agree with (Hartley,
-Trumpf, Dai, Li 2013; Zach, Klopschitz, Pollefeys 2010). A pair that is far off them joins two places that are not one.
+Along a closed loop of right pairs, the product of the relative rotations is the identity. The rotations of all images
+are found by weighted averaging (chordal, Geman and McClure's weights), which starts from the tree of the pairs that
+most loops of three agree with (Hartley, Trumpf, Dai, Li 2013; Zach, Klopschitz, Pollefeys 2010). A pair whose rotation
+is far from these joins two different places.
 """
 
 from collections.abc import Mapping
@@ -17,18 +18,18 @@ from spherloc.types import FloatArray
 Pair = tuple[int, int]
 
 LOOP_RAD = float(np.radians(4.0))
-"""Round a loop of three right pairs at most so much is left."""
+"""Largest angle of the product of the rotations along a loop of three right pairs."""
 OFF_RAD = float(np.radians(4.0))
-"""A pair that is farther off the rotations of its images is wrong."""
+"""Largest angle between a right pair's rotation and the one that the rotations of its images give."""
 SCALE_RAD = float(np.radians(2.0))
-"""Pairs that are off by more count less."""
+"""Angle at which the weight of a pair has fallen to a quarter."""
 SWEEPS = 30
 
 
 def agreeing(rotations: Mapping[Pair, FloatArray], matches: Mapping[Pair, int]) -> set[Pair]:
     """The pairs (i, j) whose rotation (3, 3), j from i, agrees with those of the others, weighted by their matches.
 
-    A pair that is in no loop has nothing to disagree with.
+    A pair that is in no loop cannot be checked and is kept.
     """
     graph = nx.Graph()
     for pair in rotations:
@@ -56,7 +57,7 @@ def agreeing(rotations: Mapping[Pair, FloatArray], matches: Mapping[Pair, int]) 
 
 
 def _loops(graph: nx.Graph, rotations: Mapping[Pair, FloatArray]) -> dict[Pair, tuple[int, int]]:
-    """Of each pair, how many loops of three agree and how many do not."""
+    """For each pair, how many loops of three agree with it and how many do not."""
     found = {pair: (0, 0) for pair in rotations}
     for one, other in rotations:
         for third in set(graph[one]) & set(graph[other]):
@@ -71,7 +72,7 @@ def _loops(graph: nx.Graph, rotations: Mapping[Pair, FloatArray]) -> dict[Pair, 
 
 
 def _from(rotations: Mapping[Pair, FloatArray], start: int, end: int) -> FloatArray:
-    """The rotation (3, 3) of ``end`` from ``start``."""
+    """The rotation (3, 3) from the camera frame of ``start`` to that of ``end``."""
     return rotations[start, end] if start < end else rotations[end, start].T
 
 

@@ -1,8 +1,9 @@
-"""Pairs of images that have too few clear matches on their own, found by way of an image between them.
+"""Relative poses of pairs of images with too few clear matches, found with the help of an image between them.
 
-If the poses of j from i and of k from j are known but for their lengths, the rotation of k from i is known, and its
-direction lies on the arc between R_kj t_ij and t_jk: one unknown instead of five, so that a handful of right matches
-among a hundred is no chance. Such pairs tie the scales of their neighbours together, without which a map falls apart.
+If the relative poses of (i, j) and of (j, k) are known but for the lengths of their baselines, the rotation of (i, k)
+is known, and the direction of its baseline lies on the arc between R_kj t_ij and t_jk: one unknown instead of five, so
+that a handful of right matches among a hundred is more than chance. Such pairs connect the scales of their neighbours,
+without which a map falls into parts.
 """
 
 from collections.abc import Mapping
@@ -20,15 +21,15 @@ Relative = tuple[FloatArray, FloatArray]
 """Rotation (3, 3) and unit direction (3,) of the second camera from the first."""
 
 STEPS = 40
-"""Directions that are tried on the arc."""
+"""Number of directions that are tried on the arc."""
 MIN_FIT = 5
 ELSEWHERE, AWAY_RAD = 4, float(np.radians(25.0))
-"""Other directions with which one is compared, and how far they are off."""
+"""Number of other directions with which a direction is compared, and their angle to it."""
 MAX_LOG10_NFA = -1.0
 
 
 def open_triangles(known: Mapping[Pair, Relative]) -> dict[Pair, list[int]]:
-    """Pairs (i, k) of images that are not known but have images in between, and these."""
+    """Pairs (i, k) of images without a known pose, each with the images j that have one with both."""
     graph = nx.Graph(list(known))
     found: dict[Pair, list[int]] = {}
     for middle in graph:
@@ -46,9 +47,9 @@ def through(
     rays: tuple[FloatArray, FloatArray],
     bound_rad: float,
 ) -> Relative | None:
-    """The pose that most matches fit, of bearings (M, 3), among those that the images in between allow.
+    """The relative pose that most matches of bearings (M, 3) fit, among those that the images in between allow.
 
-    None if no more fit than may by chance.
+    None if no more matches fit than chance allows.
     """
     best: tuple[int, Relative] = MIN_FIT - 1, (np.eye(3), np.zeros(3))
     for middle in middles:
@@ -69,14 +70,14 @@ def through(
 
 
 def elsewhere(pose: Relative) -> FloatArray:
-    """Unit vectors (K, 3) that are ``AWAY_RAD`` off the direction of a pose, all round it."""
+    """Unit vectors (K, 3) at the angle ``AWAY_RAD`` to the direction of a pose, evenly around it."""
     around = tangent_basis(pose[1][None])[0]
     turns = np.arange(ELSEWHERE)[:, None] * 2.0 * np.pi / ELSEWHERE
     return np.cos(AWAY_RAD) * pose[1] + np.sin(AWAY_RAD) * (np.cos(turns) * around[0] + np.sin(turns) * around[1])
 
 
 def _arc(start: FloatArray, end: FloatArray) -> NDArray[np.float64]:
-    """Unit vectors (S, 3) on the shorter arc between two; the ends themselves mean that one baseline is nothing."""
+    """Unit vectors (S, 3) on the shorter arc between two, without the ends: there one baseline would be zero."""
     angle = float(np.arccos(np.clip(start @ end, -1.0, 1.0)))
     if angle < 1e-3:
         return start[None]
@@ -87,7 +88,7 @@ def _arc(start: FloatArray, end: FloatArray) -> NDArray[np.float64]:
 
 
 def _from(known: Mapping[Pair, Relative], start: int, end: int) -> Relative:
-    """Of ``end`` from ``start``."""
+    """The relative pose from the camera ``start`` to ``end``."""
     if start < end:
         return known[start, end]
     rotation, direction = known[end, start]

@@ -1,4 +1,4 @@
-"""Which way is down in a model made of images alone, and how long its unit is."""
+"""Gravity and scale of a model that was made from images alone."""
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -15,65 +15,65 @@ from spherloc.mapping.positions import MAX_SCALE_SD, Positions, overlaid
 from spherloc.types import FloatArray
 
 Tell = Callable[[str, int, int], None]
-"""Told of each piece of work that is done: its kind in the plural, how many are done, how many there are."""
+"""Called after each piece of work: with its kind in the plural, how many are done, and how many there are."""
 
 MIN_LINES = 3
-"""Images whose lines must tell down; of fewer, all images count as held upright."""
+"""Least number of images whose lines give gravity; if there are fewer, all images count as held upright."""
 MAX_SPREAD_DEG = 25.0
 MIN_LIMIT_DEG, LIMIT_SPREADS = 2.0, 5.0
-"""An image that leans against the map by more than the first, and by more than so many times the median of all, was
-placed wrongly: at a place that looks like the right one."""
+"""An image whose own gravity differs from the map's by more than the first (degrees), and by more than the second times
+the median of all images, has a wrong pose: at a place that looks like the right one."""
 GROUND_SHARE = 0.1
-"""Of the points below the cameras, the part that lies deeper than the ground: reflections, wrong points."""
+"""Share of the points below the cameras that lies deeper than the ground: reflections, wrong points."""
 MIN_GROUND_POINTS = 30
 
 
 @dataclass(frozen=True)
 class Level:
-    """Down in a model."""
+    """Gravity in a model."""
 
     down: FloatArray
     """Unit vector (3,), model frame."""
     source: str
-    """What measured it, in words."""
+    """How it was measured, in words."""
     spread_deg: float
-    """Median angle between it and what single images say."""
+    """Median angle between ``down`` and the gravity of single images."""
     leaning: dict[str, float]
-    """Images that lean against it, by name, degrees: COLMAP placed them wrongly."""
+    """Angles, degrees, of images whose own gravity differs too much, by name: COLMAP placed them wrongly."""
     by_lines: bool = False
     """Whether vertical lines of the images measured it."""
 
 
 @dataclass(frozen=True)
 class Scale:
-    """How long the model's unit is."""
+    """Length of the model's unit."""
 
     metres_per_unit: float
     source: str
-    """What measured it, in words; empty if nothing did, and the unit is arbitrary."""
+    """How it was measured, in words; empty if it was not, so that the unit is arbitrary."""
     why_unknown: str = ""
-    """Why what was measured gave no scale."""
+    """Why the measurement gave no scale; empty if it did or if there is none."""
     off_m: Mapping[str, float] = field(default_factory=dict)
     """Distance of images to the positions that measured it, metres, by name."""
 
 
 def gravity_by_lines(views: Sequence[View], tell: Tell) -> dict[str, Gravity]:
-    """Gravity of those images whose vertical lines tell it, by name.
+    """Gravity of those images whose vertical lines show it, by name.
 
-    ``tell`` is told of each image.
+    ``tell`` is called after each image.
     """
     found = {}
     for done, view in enumerate(views, start=1):
-        with suppress(InputError):  # too few lines: the others tell
+        with suppress(InputError):  # too few lines in this image
             found[view.name] = gravity_from_lines(view)
         tell("images searched for vertical lines", done, len(views))
     return found
 
 
 def level_of(poses: Mapping[str, FloatArray], gravity: Mapping[str, Gravity]) -> Level:
-    """Down, from the vertical lines of the images, else as the mean of their vertical axes.
+    """Gravity of the model, from the vertical lines of the images, else as the mean of their vertical axes.
 
-    ``poses`` (3, 4) are those of the registered ones, by name, and ``gravity`` is what lines tell.
+    ``poses`` (3, 4) are those of the registered images, by name, and ``gravity`` is that from vertical lines.
     Raises ``InputError`` if the images do not agree.
     """
     axes = {name: pose[:, :3].T @ DOWN for name, pose in poses.items()}
@@ -125,7 +125,7 @@ def scale_by_height(poses: Mapping[str, FloatArray], points: FloatArray, level: 
     centres = np.stack([camera_centre(pose) for pose in poses.values()])
     offset = points - centres[KDTree(centres).query(points)[1]]
     below = offset @ level.down
-    # Of what is seen at 45 degrees or more below the horizon, nearly all is ground.
+    # Nearly all points that are seen 45 degrees or more below the horizon are on the ground.
     depths = below[below > 0.707 * np.linalg.norm(offset, axis=1)]
     if len(depths) < MIN_GROUND_POINTS:
         raise InputError(
@@ -137,7 +137,7 @@ def scale_by_height(poses: Mapping[str, FloatArray], points: FloatArray, level: 
 
 
 def scale_by_positions(poses: Mapping[str, FloatArray], positions: Positions, level: Level) -> Scale:
-    """The scale at which the images of ``poses`` (3, 4) lie where they are by another source.
+    """The scale that aligns the images of ``poses`` (3, 4) with positions from another source.
 
     Raises ``InputError`` if too few have a position, or if these do not fix the scale to ``MAX_SCALE_SD``.
     """
@@ -155,15 +155,15 @@ def scale_by_positions(poses: Mapping[str, FloatArray], positions: Positions, le
     measured = f"{near} of {len(names)} images fit it, {float(np.median(found.off_m[found.near])):.2g} m off"
     if found.scale_sd > MAX_SCALE_SD or 2 * near < len(names):
         raise InputError(
-            f"{positions.source} gives no scale: {measured} in the median, which leaves it {found.scale_sd:.0%} "
-            "uncertain; give --distance or --camera-height."
+            f"{positions.source} gives no scale: {measured} in the median, so that the scale is uncertain by "
+            f"{found.scale_sd:.0%}; give --distance or --camera-height."
         )
     source = f"{positions.source}: {measured} in the median, the scale is good to {max(found.scale_sd, 5e-4):.1%}"
     return Scale(found.scale, source, off_m=off_m)
 
 
 def arbitrary_scale(poses: Mapping[str, FloatArray]) -> Scale:
-    """The scale at which the nearest other image is one unit away in the median, of ``poses`` (3, 4)."""
+    """The scale at which the median distance between an image of ``poses`` (3, 4) and its nearest one is one unit."""
     centres = np.stack([camera_centre(pose) for pose in poses.values()])
     apart = np.linalg.norm(centres[:, None] - centres[None], axis=2)
     np.fill_diagonal(apart, np.inf)
@@ -173,7 +173,7 @@ def arbitrary_scale(poses: Mapping[str, FloatArray]) -> Scale:
 
 def upright_frame(level: Level) -> FloatArray:
     """Rotation (3, 3) from the model's frame to one whose z axis is up."""
-    to_down = align_to_down(level.down)  # takes down to +y
+    to_down = align_to_down(level.down)  # turns down to +y
     return np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]) @ to_down
 
 

@@ -1,4 +1,4 @@
-"""What a map leaves on the disk: COLMAP's model, and scene files that open it."""
+"""Writes a map to the disk: COLMAP's model, and scene files that open it."""
 
 import json
 import os
@@ -23,30 +23,30 @@ SCENE = "scene.toml"
 NEW_SCENE = "new_images.toml"
 MIN_BOUND_DEG = 3.0
 EVERY = 4
-"""Of the map's images every fourth is a query, localized against the others."""
+"""Every fourth image of the map is a query of the scene file, localized against the others."""
 MIN_WITHOUT = 4
-"""Images of a map from which some can be left out; those of a smaller one are localized with all points."""
+"""Least number of a map's images for which queries are left out of the map; in a smaller map all points are used."""
 
 
 @dataclass(frozen=True, eq=False)
 class Written:
-    """Where things are, and what is in them."""
+    """The files of a map that was written, and the map in its final frame."""
 
     scene: Path
-    """Its queries are images of the map."""
+    """Scene file whose queries are images of the map."""
     new_scene: Path | None
-    """Of other images of the same camera, if there are some."""
+    """Scene file of other images of the same camera; None if there are none."""
     poses: dict[str, FloatArray]
-    """Poses (3, 4) from the map, whose z is up."""
+    """Poses ``cam_from_map`` (3, 4) by the name of the image; the map's z axis points up."""
     points: FloatArray
-    """(N, 3), map frame."""
+    """(N, 3), map frame, in the map's unit."""
     error_px: float
-    """Mean reprojection error."""
+    """Mean reprojection error, px."""
 
 
 @dataclass(frozen=True)
 class Kept:
-    """What the scenes of a map do as the map does."""
+    """Settings of a map that its scene files use too."""
 
     masks: Masks | None
     how: FrontendOptions
@@ -65,9 +65,8 @@ def write_map(
 ) -> Written:
     """Level and scale a model and write it with its scenes into ``folder``.
 
-    ``images`` is the folder of the views, ``new_images`` one of images to be localized, and ``kept`` what scenes of
-    both do as the map does. Raises ``InputError`` if
-    something cannot be written.
+    ``images`` is the folder of the views, ``new_images`` one of images to be localized, and ``kept`` the settings for
+    the scene files of both. Raises ``InputError`` if a file cannot be written.
     """
     pycolmap = require("pycolmap", "colmap", "making a map")
     turn = pycolmap.Rotation3d(upright_frame(level))
@@ -171,7 +170,7 @@ def _kept(kept: Kept, folder: Path) -> str:
 
 
 def _relative(path: Path, folder: Path) -> str:
-    """A path that stays right if both are moved together; absolute on another drive."""
+    """A path relative to the folder, so that both can be moved together; absolute on another drive."""
     try:
         return Path(os.path.relpath(path, folder)).as_posix()
     except ValueError:

@@ -1,1 +1,1 @@
-"""The paper's claims, each measured: its simulations as sweeps, and what their rows say of its sentences."""
+"""The paper's claims, each measured: its simulations as sweeps, and a verdict on each claim from their rows."""

@@ -1,7 +1,7 @@
-"""What decides whether a claim of the paper holds in the runs that were made: one function a kind of claim.
+"""Decides whether a claim of the paper holds in the runs that were made: one function per kind of claim.
 
-A rate holds if chance alone may explain the difference between the paper's runs and ours; an order of two methods if
-the runs on the same problems show it.
+A claim about a rate holds if chance alone may explain the difference between the paper's runs and ours; a claim about
+the order of two methods holds if the runs on the same problems show it.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,16 +23,16 @@ from spherloc.verification.experiments import CAMERAS, CASES, METHODS, OWN
 from spherloc.verification.measured import Cell, Measured, Place, at, smaller_share
 
 PAPER_RUNS = 100
-"""Problems at each point of the paper's figures."""
+"""Number of problems at each point of the paper's figures."""
 CHANCE = 0.05
 """Probability below which chance does not explain a difference, shared by the points of a claim."""
 NEARLY_ALL = 0.95
-"""What "nearly 100 %" is taken to mean at least."""
+"""Least success rate that counts as "nearly 100 %"."""
 DROP = 0.9
-"""A success rate that has dropped significantly is below."""
+"""A success rate below this has dropped significantly."""
 PAPERS_CAMERA = "MEI"
 EXACT = 1e-6
-"""Of each number of a pose: without noise nothing but rounding is left."""
+"""Largest error of each number of a pose without noise, where only rounding is left."""
 SAME_RUNS = 20
 
 
@@ -43,15 +43,15 @@ class Finding:
     holds: bool
     """Whether it does."""
     ours: str
-    """What was measured, in words and numbers."""
+    """The measured result, in words and numbers."""
     decided_by: Place | None = None
     """The point that decides it, if there is one."""
     seed: int = 0
-    """Of the run there to look at."""
+    """Seed of the run at that point that shows it."""
 
 
 Check = Callable[[Measured], Finding | None]
-"""Gives None if runs that it needs are not there."""
+"""Checks a claim; None if runs that it needs are missing."""
 
 
 def _percent(cell: Cell) -> str:
@@ -85,7 +85,7 @@ def rate_is(
 
 
 def differs(cell: Cell, rate: float, least: bool = False) -> float:
-    """p-value of Fisher's exact test that the paper's runs at a rate and ours have the same one."""
+    """p-value of Fisher's exact test of whether the paper's runs, at ``rate``, and ours have the same rate."""
     theirs = round(rate * PAPER_RUNS)
     table = [[cell.successes, cell.runs - cell.successes], [theirs, PAPER_RUNS - theirs]]
     tested: Any = fisher_exact(table, alternative="less" if least else "two-sided")
@@ -137,8 +137,8 @@ def smaller(
     camera: str = PAPERS_CAMERA,
     share_of_values: float = 1.0,
 ) -> Check:
-    """The first method's median of a column is less than ``most`` times the second's, and most paired runs show it, at
-    that share of the values at least."""
+    """The first method's median of a column is less than ``most`` times the second's, and most paired runs confirm it,
+    at least at a share ``share_of_values`` of the values."""
 
     def finding(measured: Measured) -> Finding | None:
         firsts, seconds = (at(measured.curve(experiment, camera, name), values) for name in methods)
@@ -202,7 +202,7 @@ def order_of_error(experiment: str, methods: Sequence[str], value: float, most: 
 
 
 def follows_eq_28(method: str, iterations: int, camera: str = PAPERS_CAMERA) -> Check:
-    """The success of 2P at every rate is what Eq. 28 gives for two inliers in so many samples."""
+    """The success rate of 2P at every outlier rate is that of Eq. 28 for two inliers in ``iterations`` samples."""
 
     def finding(measured: Measured) -> Finding | None:
         cells = measured.curve("fig6", camera, method)

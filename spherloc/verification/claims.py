@@ -30,7 +30,7 @@ from spherloc.verification.measured import Measured
 
 
 class Verdict(StrEnum):
-    """What became of a claim."""
+    """Whether a claim could be reproduced."""
 
     REPRODUCES = "reproduces"
     ONLY_IF = "only if"
@@ -44,37 +44,37 @@ class Claim:
     """A sentence, figure or number of the paper."""
 
     key: str
-    """Unique."""
+    """Unique name of the claim."""
     place: str
-    """In the paper."""
+    """Its place in the paper."""
     sentence: str
-    """What it claims, in short."""
+    """The claim, in short."""
     paper: str
-    """Its value."""
+    """The paper's value."""
     check: Check | None
-    """As printed; None if it takes data that are not bundled."""
+    """Check of the methods as printed; None if it needs data that are not bundled."""
     others: tuple[tuple[str, Check], ...] = ()
-    """What else may be chosen, in words that complete "only if", and the check then."""
+    """Other choices: words that complete "only if", and the check with that choice."""
     note: str = ""
-    """What else there is to say."""
+    """A remark; may be empty."""
 
 
 @dataclass(frozen=True)
 class Checked:
-    """A claim and what became of it."""
+    """A claim and its verdict."""
 
     claim: Claim
     """The claim."""
     verdict: Verdict
-    """What became of it."""
+    """The verdict on it."""
     condition: str
-    """Completes "only if"."""
+    """Words that complete "only if"; empty for other verdicts."""
     printed: Finding | None
-    """As printed."""
+    """The finding for the methods as printed."""
     other: Finding | None
-    """Where the condition holds."""
+    """The finding under the condition."""
     earlier: bool = False
-    """Whether it was found at an earlier time."""
+    """Whether the finding is from an earlier run of the command."""
 
 
 def check(claim: Claim, measured: Measured) -> Checked:
@@ -419,4 +419,4 @@ CLAIMS: Sequence[Claim] = (
         None,
     ),
 )
-"""In the paper's order."""
+"""All claims, in the paper's order."""

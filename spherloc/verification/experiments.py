@@ -27,24 +27,24 @@ def _own(estimator: str, **options: float) -> Entrant:
 PAPERS_VIEW_DEG = 120.0
 """Field of view of the paper's rectified images, which it does not print: what wide rectified images keep."""
 WIDE_VIEWS: Mapping[str, float] = {"174°": 174.0, "sphere": 360.0}
-"""What their authors would give the pinhole solvers of a wide camera, with P3P for the samples."""
+"""Fields of view, degrees, in which the pinhole solvers are run as their authors would, with samples by P3P."""
 PINHOLE_SOLVERS: Mapping[str, str] = {"EPnP": "ransac-epnp", "EPro": "ransac-epropnp", "oDLT": "ransac-odlt"}
 WIDE_SOLVERS: Mapping[str, tuple[str, float]] = {
     f"{name} {how}": (estimator, view_deg)
     for how, view_deg in WIDE_VIEWS.items()
     for name, estimator in PINHOLE_SOLVERS.items()
 }
-"""Estimator and field of view."""
+"""Estimator and field of view, degrees, by the method's name."""
 
 
 def wide(name: str, iterations: int) -> Entrant:
-    """One of ``WIDE_SOLVERS`` with so many samples by P3P."""
+    """One of ``WIDE_SOLVERS`` with ``iterations`` samples by P3P."""
     estimator, view_deg = WIDE_SOLVERS[name]
     return _printed(estimator, iterations=iterations, view_deg=view_deg)
 
 
 def rectified(estimator: str, iterations: int) -> Entrant:
-    """R+*: rectified, and sampled by EPnP as OpenCV's RANSAC does."""
+    """The paper's R+* methods: on rectified images, with samples by EPnP as in OpenCV's RANSAC."""
     changes = (("as_printed", True), ("bound_px", BOUND_PX), ("iterations", iterations))
     return Entrant(estimator, (*changes, ("view_deg", PAPERS_VIEW_DEG), ("sampler", "epnp")))
 
@@ -58,7 +58,7 @@ ALIKE: Mapping[str, tuple[str, dict[str, float]]] = {
     "EPro-PnP": ("ransac-epropnp", {"view_deg": 360.0}),
     "oDLT": ("ransac-odlt", {"view_deg": 360.0}),
 }
-"""Methods under equal terms."""
+"""Methods under equal terms, see ``_alike``."""
 
 
 def _alike(estimator: str, **options: float) -> Entrant:
@@ -120,25 +120,25 @@ class Experiment:
     """A sweep for each of some cameras."""
 
     key: str
-    """In file names."""
+    """Name of the experiment, used in file names."""
     place: str
-    """In the paper."""
+    """Its place in the paper."""
     over: str
-    """What it goes over, a key of ``AXES``."""
+    """The property that is varied, a key of ``AXES``."""
     values: tuple[float, ...]
-    """Ascending."""
+    """Values of the property, ascending."""
     correspondences: int
-    """N; where the sweep goes over it, not used."""
+    """Number of correspondences, N; not used if that is the varied property."""
     methods: tuple[str, ...]
     """Keys of ``METHODS``."""
     runs: int
-    """Problems a point."""
+    """Number of problems per point."""
     quick_values: tuple[float, ...]
-    """Those of the values that the quick form keeps."""
+    """The values that the quick form keeps."""
     quick_runs: int
-    """Problems a point in the quick form."""
+    """Number of problems per point in the quick form."""
     variation: Variation
-    """What else is set of the simulation."""
+    """Other settings of the simulation."""
     cameras: tuple[str, ...] = tuple(CAMERAS)
     """Keys of ``SCENES``."""
     quick_leaves_out: tuple[str, ...] = ()
@@ -176,9 +176,9 @@ CASES: Mapping[str, tuple[int, int]] = {"case1": (13, 52), "case2": (9, 42), "ca
 
 _CASE_OWN = ("mc 8px", "mc-exact 8px", "ransac-2p 1k")
 OWN = "-own"
-"""Ends the key of an experiment with this project's own forms beside another one."""
+"""Ending of the key of an experiment that repeats another one with this project's own forms of the methods."""
 WIDE_VIEW = "-wide"
-"""Ends the key of an experiment with the baselines as their authors would run them beside another one."""
+"""Ending of the key of an experiment that repeats another one with the baselines as their authors would run them."""
 _CASE_WIDE = (*(f"{name}, 10k" for name in WIDE_SOLVERS), "ML10k cov", "P3P10k", "2P10k")
 
 
@@ -200,14 +200,14 @@ def _case(key: str, right: int, count: int, methods: tuple[str, ...] = _CASE) ->
 
 
 PHASE_METHODS = ("ransac-2p 1k", "mc", "mc-exact")
-"""From the quickest to the surest."""
+"""Methods of the experiments on which method to choose, from the fastest to the most robust."""
 PHASE_COUNTS = (20, 50, 100, 200, 500, 1000)
 PHASE_GRAVITY_DEG: Mapping[float, tuple[int, ...]] = {0.0: PHASE_COUNTS, 1.0: PHASE_COUNTS[:4]}
 """Standard deviations of the known roll and pitch, degrees, and the numbers of matches that are run with each."""
 
 
 def phase_key(count: int, gravity_deg: float) -> str:
-    """Of the experiment with so many matches and such an error of gravity."""
+    """Key of the experiment with ``count`` matches and the standard deviation ``gravity_deg`` of roll and pitch."""
     return f"phase-{count}-{gravity_deg:g}deg"
 
 
@@ -312,4 +312,4 @@ EXPERIMENTS: Sequence[Experiment] = (
     _beside(_FIG6, "alike", "under equal terms", tuple(f"{name}, alike" for name in ALIKE), (0.5,), 3),
     *(_phase(count, gravity) for gravity, counts in PHASE_GRAVITY_DEG.items() for count in counts),
 )
-"""In the order in which they are run: what the page needs most comes first."""
+"""All experiments in the order in which they are run: those that the page needs most come first."""

@@ -1,4 +1,4 @@
-"""Findings as they are kept in a file, so that a page can tell of runs that another time has made."""
+"""Stores findings in a file, so that the page can also show those of earlier runs of the command."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -13,18 +13,18 @@ from spherloc.verification.measured import Place
 
 
 def kept_text(checked: Sequence[Checked]) -> str:
-    """JSON of what became of the claims."""
+    """The verdicts on the claims as JSON."""
     return json.dumps([_record(item) for item in checked], indent=1, ensure_ascii=False) + "\n"
 
 
 def with_kept(checked: Sequence[Checked], text: str, where: str) -> list[Checked]:
-    """The claims, those that were not run with what the JSON ``text`` of an earlier time tells, if it is of the same
-    claim. Raises ``InputError``, naming ``where``, for a text that is none of ours."""
+    """The claims; those that were not run get the verdict in the JSON ``text`` of an earlier run of the command, unless
+    the claim has changed. Raises ``InputError``, naming ``where``, for a text that ``kept_text`` did not write."""
     try:
         records = {str(record["key"]): record for record in json.loads(text)}
         earlier = {claim.key: _restored(claim.key, records[claim.key]) for claim in CLAIMS if claim.key in records}
     except (ValueError, KeyError, TypeError, AttributeError):
-        raise InputError(f"{where}: is no result of spherloc verify; move it away, or give another --output.") from None
+        raise InputError(f"{where}: is not a result of spherloc verify; move it, or give another --output.") from None
     found = []
     for item in checked:
         old = earlier.get(item.claim.key) if item.verdict == Verdict.NOT_RUN else None
@@ -54,7 +54,7 @@ def _finding_record(finding: Finding | None) -> dict[str, Any] | None:
 
 
 def _restored(key: str, record: Mapping[str, Any]) -> Checked | None:
-    """What a record tells, None if its claim has changed since."""
+    """The verdict in a record; None if its claim has changed since."""
     claim = next(claim for claim in CLAIMS if claim.key == key)
     if (record["claim"], record["paper"]) != (claim.sentence, claim.paper):
         return None

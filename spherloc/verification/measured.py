@@ -1,4 +1,4 @@
-"""What the rows of the paper's simulations come to, by the paper's own measures of success and error."""
+"""Summarizes the rows of the paper's simulations by the paper's own measures of success and error."""
 
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
@@ -26,7 +26,7 @@ class Place:
     method: str
     """Key of ``METHODS``."""
     value: float
-    """Of what the sweep goes over."""
+    """Value of the property that the sweep varies."""
 
 
 @dataclass(frozen=True)
@@ -34,18 +34,18 @@ class Cell:
     """The runs of a point. Without a pose an error is infinite, and precision, recall and F1 are 0."""
 
     place: Place
-    """Which point."""
+    """The point of the sweep."""
     rows: tuple[SweepRow, ...]
-    """By seed; not empty."""
+    """Its runs by seed; not empty."""
 
     @property
     def runs(self) -> int:
-        """How many."""
+        """Number of runs."""
         return len(self.rows)
 
     @property
     def successes(self) -> int:
-        """Runs with a rotation error below 1 degree and |t_true - t| below 0.1 m (Sec. VI-A)."""
+        """Number of runs with a rotation error below 1 degree and |t_true - t| below 0.1 m (Sec. VI-A)."""
         return sum(succeeded(row) for row in self.rows)
 
     @property
@@ -65,17 +65,17 @@ class Cell:
         return np.array([missing if value is None else value for value in found], dtype=np.float64)
 
     def median(self, name: str) -> float:
-        """Of a column: one of its values, never the mean of a finite and an infinite one."""
+        """Median of a column: one of its values, never the mean of a finite and an infinite one."""
         return float(np.quantile(self.values(name), 0.5, method="inverted_cdf"))
 
     def decisive(self, success: bool = False) -> int:
-        """Seed of the first run that failed (or, if asked for or if none did, succeeded; else of the first)."""
+        """Seed of the first run that failed or, with ``success`` or if none failed, succeeded; else of the first."""
         wanted = [row.seed for row in self.rows if succeeded(row) == success]
         return wanted[0] if wanted else self.rows[0].seed
 
 
 def succeeded(row: SweepRow) -> bool:
-    """Success as the paper has it."""
+    """Whether a run is a success by the paper's definition."""
     rotation_deg, t_m = row.rotation_error_deg, row.t_error_m
     return rotation_deg is not None and t_m is not None and rotation_deg < SUCCESS_DEG and t_m < SUCCESS_M
 
@@ -94,7 +94,7 @@ class Measured:
         self.cells: dict[Place, Cell] = {
             place: Cell(place, tuple(sorted(some, key=lambda row: row.seed))) for place, some in found.items()
         }
-        """By place."""
+        """Cells by place."""
 
     def curve(self, experiment: str, camera: str, method: str) -> tuple[Cell, ...]:
         """The cells of a method, by value."""
@@ -118,8 +118,8 @@ class Measured:
 
 
 def smaller_share(first: Cell, second: Cell, name: str) -> tuple[float, float]:
-    """Share of the common problems on which ``first`` has the smaller value of a column, and how surely that is more
-    than half: the p-value of Wilcoxon's signed-rank test on the differences of the ranks' logarithms, one-sided."""
+    """Share of the common problems on which ``first`` has the smaller value of a column, and a one-sided p-value of it:
+    Wilcoxon's signed-rank test on the differences of the logarithms of the ranks."""
     mine = {row.seed: value for row, value in zip(first.rows, first.values(name), strict=True)}
     other = {row.seed: value for row, value in zip(second.rows, second.values(name), strict=True)}
     seeds = sorted(mine.keys() & other.keys())
@@ -135,5 +135,5 @@ def smaller_share(first: Cell, second: Cell, name: str) -> tuple[float, float]:
 
 
 def at(cells: Sequence[Cell], values: Sequence[float]) -> list[Cell]:
-    """Those of the cells whose value is one of ``values``."""
+    """The cells whose value is one of ``values``."""
     return [cell for cell in cells if any(abs(cell.place.value - value) < 1e-9 for value in values)]

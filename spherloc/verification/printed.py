@@ -1,4 +1,4 @@
-"""What the paper's text says of its own tables, checked against the numbers that are printed in them."""
+"""Checks the paper's sentences about its own tables against the numbers that are printed in them."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from spherloc.types import FloatArray
 from spherloc.verification.sessions import printed_tables
 
 Found = tuple[bool, str]
-"""Whether a sentence is what the table says, and the numbers."""
+"""Whether the table confirms a sentence, and the numbers."""
 ALL = "all"
 """Last column of Table III."""
 
@@ -20,11 +20,11 @@ class Statement:
     """A sentence about a table."""
 
     place: str
-    """In the paper."""
+    """Its place in the paper."""
     sentence: str
-    """What it says, in short."""
+    """The sentence, in short."""
     check: "Callable[[Tables], Found]"
-    """Against the printed numbers."""
+    """Compares it with the printed numbers."""
 
 
 class Tables:
@@ -46,7 +46,7 @@ class Tables:
         return np.array([float(cell) for cell in self._row("table2", session, method)[3:]])
 
     def methods(self, key: str) -> list[str]:
-        """In the order of the table."""
+        """Methods of a table, in its order."""
         place = 1 if key == "table2" else 0
         return list(dict.fromkeys(row[place] for row in self._tables[key]["rows"]))
 
@@ -60,7 +60,7 @@ class Tables:
 
     @staticmethod
     def numbers(cell: str) -> FloatArray:
-        """Of "a / b / c"."""
+        """The numbers of a cell such as "a / b / c"."""
         return np.array([float(part) for part in cell.split("/")])
 
     def _row(self, key: str, first: str, second: str) -> list[str]:
@@ -72,7 +72,7 @@ def _text(values: FloatArray) -> str:
 
 
 def _best_at(session: str, wanted: Mapping[int, str]) -> Callable[[Tables], Found]:
-    """The methods that have the highest success of Table II, by threshold."""
+    """The method ``wanted`` has the highest success rate of Table II at each threshold."""
 
     def found(tables: Tables) -> Found:
         rates = {method: tables.rates("table2", session, method) for method in tables.methods("table2")}
@@ -283,10 +283,10 @@ STATEMENTS: Sequence[Statement] = (
     Statement("Table VI", "Right inliers are no more than the right matches.", _no_more_than_there_are),
     Statement("VI-C.3, Tables II, VI", "MC localizes at about 5 Hz.", _five_hertz),
 )
-"""In the paper's order."""
+"""All statements, in the paper's order."""
 
 
 def printed_findings() -> list[tuple[Statement, bool, str]]:
-    """Each statement, whether it is what the tables say, and the numbers."""
+    """Each statement, whether the tables confirm it, and the numbers."""
     tables = Tables(printed_tables())
     return [(statement, *statement.check(tables)) for statement in STATEMENTS]

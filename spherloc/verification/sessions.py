@@ -12,31 +12,31 @@ from spherloc.files import is_folder, names_in, read_file
 from spherloc.verification.experiments import METHODS, WIDE_SOLVERS, rectified, wide
 
 MAX_BYTES = 1_000_000
-"""Of the file of the printed tables."""
+"""Largest size of the file of the printed tables."""
 
 
 @dataclass(frozen=True)
 class Session:
-    """Query images against references, as a scene file says."""
+    """A session of a dataset: query images and references, as a scene file describes them."""
 
     name: str
-    """As the paper's tables have it."""
+    """Its name in the paper's tables."""
     scene: str
     """Text of the scene file (TOML)."""
 
 
 @dataclass(frozen=True)
 class Dataset:
-    """A dataset and what the paper does with it."""
+    """A dataset, and the methods and sessions for which the paper uses it."""
 
     key: str
-    """In scene files and options of the command."""
+    """Its kind in scene files, and its name in options of the command."""
     title: str
-    """For people."""
+    """Name that users see."""
     methods: tuple[str, ...]
     """Keys of ``TABLE_METHODS``."""
     sessions: Callable[[Path], Sequence[Session]]
-    """Of a folder that holds the dataset; raises ``InputError`` if it has none."""
+    """Gives the sessions in a folder that holds the dataset; raises ``InputError`` if there are none."""
 
 
 TABLE_METHODS: Mapping[str, Entrant] = {
@@ -53,7 +53,7 @@ _FEW = ("MC", "2P100", "2P1k", "SVD100", "ML100", "mc", "mc-exact", "ransac-2p 1
 
 
 def iterations(entrant: Entrant) -> str:
-    """How many samples a method draws, as tables say it; none for a search that draws none."""
+    """Number of samples that a method draws, as the tables print it; empty for a method that draws none."""
     options = dict(entrant.changes)
     if "iterations" in options:
         return f"{options['iterations']:,}"
@@ -81,7 +81,7 @@ thresholds = [[1.0, 0.5], [2.0, 1.0], [5.0, 2.0]]
 
 
 def _newer_college(folder: Path) -> list[Session]:
-    """The paper names the sessions and not their references: quad-medium and math-easy are taken."""
+    """The paper names the sessions but not their references: quad-medium and math-easy are used."""
     text = """\
 kind = "newer-college"
 name = "Newer College, {name}"
@@ -111,7 +111,7 @@ thresholds = [[2.0, 0.25], [5.0, 0.5], [8.0, 1.0]]
 
 
 def _matterport360(folder: Path) -> list[Session]:
-    """Each building is a session: the paper's division of 18 buildings into 7 is not printed."""
+    """Each building is a session: the paper does not print how it divides 18 buildings into 7 sessions."""
     text = """\
 kind = "matterport360"
 name = "Matterport360, {name}"
@@ -139,7 +139,7 @@ DATASETS: Sequence[Dataset] = (
 
 
 def sessions_of(dataset: Dataset, folder: Path) -> Sequence[Session]:
-    """The sessions of a dataset's folder. Raises ``InputError`` if it is no folder or holds none."""
+    """The sessions of a dataset's folder. Raises ``InputError`` if it is not a folder or holds none."""
     if not is_folder(folder):
         raise InputError(f"{folder}: no such folder; give the folder of {dataset.title}.")
     found = dataset.sessions(folder)
@@ -152,5 +152,5 @@ def sessions_of(dataset: Dataset, folder: Path) -> Sequence[Session]:
 
 
 def printed_tables() -> dict[str, dict[str, Any]]:
-    """The paper's Tables I to VI by key: title, columns and rows, and the dataset where it is of one."""
+    """The paper's Tables I to VI by key: title, columns and rows, and the dataset if the table is about one."""
     return tomllib.loads(read_file(Path(__file__).parent / "tables.toml", MAX_BYTES).decode())

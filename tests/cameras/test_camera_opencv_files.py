@@ -75,7 +75,7 @@ def test_ros(tmp_path):
     [
         (ROS.replace("distortion_model: equidistant\n", ""), "may be those of a fisheye or of a pinhole"),
         (ROS.replace("equidistant", "rational_polynomial"), "'rational_polynomial' is not supported"),
-        (ROS.replace("401.5, 0,", "401.5, 3,"), "camera_matrix: is no matrix"),
+        (ROS.replace("401.5, 0,", "401.5, 3,"), "camera_matrix: is not a matrix"),
         (ROS.replace("cols: 4", "cols: 5"), "has 4 numbers in 1 rows and 5 columns"),
         (ROS.replace("[0.02, -0.01, 0.003, -0.0005]", "[a, 1, 2, 3]"), "distortion_coefficients"),
         (ROS.replace("cols: 4", "cols: 5").replace("-0.0005]", "-0.0005, 1]"), "calibrate with k1, k2, k3, k4 alone"),

@@ -176,13 +176,13 @@ def test_every_lens_of_a_chain(written):
 @pytest.mark.parametrize(
     ("old", "new", "part"),
     [
-        ("0.1], [1", "0.1], [2", "cam0: key 'T_cam_imu' is no rotation with a translation"),
-        ("[0, -1, 0, 0.1]", "[0, 1, 0, 0.1]", "cam0: key 'T_cam_imu' is no rotation"),  # a mirror
-        ("[0, 0, 0, 1]]", "[0, 0, 0, 2]]", "cam0: key 'T_cam_imu' is no rotation"),
+        ("0.1], [1", "0.1], [2", "cam0: key 'T_cam_imu' is not a rotation with a translation"),
+        ("[0, -1, 0, 0.1]", "[0, 1, 0, 0.1]", "cam0: key 'T_cam_imu' is not a rotation"),  # a mirror
+        ("[0, 0, 0, 1]]", "[0, 0, 0, 2]]", "cam0: key 'T_cam_imu' is not a rotation"),
         ("[0, 0, 0, 1]]", "[0, 0, 0]]", "cam0: camera key 'T_cam_imu' is [0, 0, 0]: give a list of 4"),
         (", [0, 0, 0, 1]]", "]", "cam0: key 'T_cam_imu' is [[0, -1, 0, 0.1]"),
         ("[0, -1, 0, 0.1]", "[.nan, -1, 0, 0.1]", "cam0: camera key 'T_cam_imu'"),
-        ("[0, -1, 0, 0.1]", "[1.0e300, -1, 0, 0.1]", "cam0: key 'T_cam_imu' is no rotation"),
+        ("[0, -1, 0, 0.1]", "[1.0e300, -1, 0, 0.1]", "cam0: key 'T_cam_imu' is not a rotation"),
         ("- [1.0, 0.0, 0.0, -0.1]", "- 3", "cam1: camera key 'T_cn_cnm1' is 3"),
         ("camera_model: ds", "camera_model: [ds]", "cam1: the camera_model ['ds'] with the distortion_model 'none'"),
         ("[0.6, 1.1,", "[0.6, -1.1,", "cam2: camera key 'beta' is -1.1"),
@@ -252,7 +252,7 @@ def test_each_format_and_its_pixel_centre(written, text, name, expected):
         (STELLA.replace("cols: 640", "cols: wide"), None, "Camera: camera key 'width' is 'wide'"),
         ("Camera: 3", None, "Camera: the camera is 3"),
         ("Camera.model: fisheye", None, "Camera: key 'cols' is missing"),
-        (ADAPTER, None, "parameter: the keys ['cx', 'cy', 'fx', 'fy'] are those of no supported model"),
+        (ADAPTER, None, "parameter: the keys ['cx', 'cy', 'fx', 'fy'] are not those of a supported model"),
         (ADAPTER + "  k1: 0\n  k2: 0\n  k3: 0\n  p1: 0\n  p2: x\n", None, "parameter: camera key 'p2' is 'x'"),
         ("parameter: 3", None, "key 'image' is missing"),
         ("image: 3\nparameter: 3", None, "image: the camera is 3"),
@@ -262,7 +262,11 @@ def test_each_format_and_its_pixel_centre(written, text, name, expected):
         ('{"value0": ' + "[" * 100_000, None, "a value is not valid JSON (maximum recursion depth exceeded"),
         ('{"value0": ' + "9" * 10_000 + "}", None, "a value is not valid JSON (Exceeds the limit"),
         ('{"value0": 3}', None, "value0: the camera is 3"),
-        ('{"value0": {"intrinsics": [], "resolution": []}}', None, "value0: keys 'intrinsics' and 'resolution' are no"),
+        (
+            '{"value0": {"intrinsics": [], "resolution": []}}',
+            None,
+            "value0: keys 'intrinsics' and 'resolution' must be lists",
+        ),
         ('{"value0": {"intrinsics": [3], "resolution": [3]}}', None, "value0: cam0: the camera is 3"),
         (basalt(), "cam2", "value0: has no camera 'cam2': choose one of cam0, cam1"),
         (

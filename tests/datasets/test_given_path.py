@@ -52,10 +52,10 @@ def test_folders(tmp_path, names, said):
         ("a.png", "is an image; make a map of all images of its folder with: spherloc map "),
         ("a.insv", "is a video; make a map of its frames with: spherloc map "),
         ("a.vrs", "is a recording of Project Aria's glasses; save its images"),
-        ("database.db", "is a database as COLMAP has it"),
+        ("database.db", "is a COLMAP database"),
         ("matches.csv", "is a table; its matches are solved by a scene of kind correspondences"),
         ("camera.yaml", "is a YAML file; a calibration is named by the key 'calibration'"),
-        ("README.md", "is no scene file; give the path of a scene file (TOML) or a bundled scene's name"),
+        ("README.md", "is not a scene file; give the path of a scene file (TOML) or a bundled scene's name"),
     ],
 )
 def test_files(tmp_path, name, said):

@@ -145,8 +145,8 @@ def test_truth_names(world, rng):
 @pytest.mark.parametrize(
     ("removed", "added", "said"),
     [
-        ("features", "", "'matches' is of no use without 'features'"),
-        ("matches", "", "'features' is of no use without 'matches'"),
+        ("features", "", "'matches' needs 'features' as well"),
+        ("matches", "", "'features' needs 'matches' as well"),
         ("pairs", "", "key 'pairs' is missing"),
         ("", "[frontend]\nratio = 0.7", "'matches' and 'frontend' say the same"),
         ("", 'global_features = "g.h5"', "'pairs' and 'global_features' say the same"),

@@ -50,7 +50,8 @@ def test_localizes_a_real_frame(tmp_path, t265, camera, other):
     headset's own odometry, and its stereo calibration are good for.
     """
     scene = scene_of(tmp_path, t265 / "ros_kapture", f'queries = ["{camera}/frame_000000002.jpg"]\n{GRAVITY}')
-    assert f"1 image ({other}/frame_000000002.jpg) taken together with a query: no reference." in scene.remarks
+    together = "taken together with a query: not used as references."
+    assert f"1 image ({other}/frame_000000002.jpg) {together}" in scene.remarks
     assert len(scene.references) == 4 and not any("2.jpg" in view.name for view in scene.references)
     query = scene.query()
     matches = scene.matcher(query)
@@ -131,7 +132,7 @@ def test_selection(tmp_path, rest, queries, references):
     remarks = " ".join(scene.remarks)
     assert "1 image (left/3.jpg) not found in" in remarks and "UNKNOWN_CAMERA" in remarks
     # left/2.jpg has no pose; where right/2.jpg is a query, it is no reference for another reason.
-    unposed = "1 image (left/2.jpg) without a pose: no reference." in remarks
+    unposed = "1 image (left/2.jpg) without a pose: not used as references." in remarks
     assert unposed == ("[references]" not in rest and "right/2.jpg" not in queries)
 
 
@@ -153,7 +154,7 @@ def test_the_example_of_a_scene(tmp_path):
 def test_a_query_needs_no_pose(tmp_path):
     scene = small(tmp_path, 'queries = ["left/2.jpg"]')
     assert scene.query().cam_from_map is None
-    assert "1 image (right/2.jpg) taken together with a query: no reference." in scene.remarks
+    assert "1 image (right/2.jpg) taken together with a query: not used as references." in scene.remarks
 
 
 @pytest.mark.parametrize(

@@ -92,11 +92,11 @@ def test_images_that_were_not_cut_yet_are_told(hall, tmp_path):
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        ("{", "is no valid JSON"),
+        ("{", "is not valid JSON"),
         ("[]", "holds no table of poses"),
         ('{"a.jpg": [[1, 0, 0, 0], [0, 1, 0, 0]]}', "'a.jpg' must hold 3 x 4 finite numbers"),
-        ('{"a.jpg": [[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}', "'a.jpg' is no rigid pose"),
-        ('{"../a.jpg": []}', "is no name of an image"),
+        ('{"a.jpg": [[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}', "'a.jpg' is not a rigid pose"),
+        ('{"../a.jpg": []}', "is not the name of an image"),
     ],
 )
 def test_wrong_poses_are_told(hall, tmp_path, content, said):
@@ -111,7 +111,7 @@ def test_wrong_poses_are_told(hall, tmp_path, content, said):
 def test_wrong_folders_are_told(hall):
     for queries, said in (
         ("query_pinhole", "which does not exist"),
-        ("camera_config", "has no camera_pose.json"),
+        ("camera_config", "has camera_pose.json"),
         ([], "give folders below root"),
         (3, "give folders below root"),
     ):

@@ -93,7 +93,7 @@ def test_an_imu_file_as_euroc_has_it(folder):
     samples = read_imu(write(folder, f"#timestamp [ns],w_RS_S_x [rad s^-1]\n{rows}", "imu.csv"))
     assert samples.timestamps_ns.tolist() == [10**18, 10**18 + 5, 10**18 + 10]
     np.testing.assert_array_equal(samples.forces_m_s2[2], [9.7, 0, 2])
-    with pytest.raises(InputError, match=r"line 1: '1.5' is no time in nanoseconds"):
+    with pytest.raises(InputError, match=r"line 1: '1.5' is not a time in nanoseconds"):
         read_imu(write(folder, "1.5,0,0,0,9.8,0,0\n", "wrong.csv"))
 
 

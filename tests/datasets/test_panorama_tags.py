@@ -58,7 +58,7 @@ def test_both_ways_of_writing_them_are_read(tmp_path, packet):
         (None, "a.jpg: has no XMP tags"),
         (attributes('GPano:ProjectionType="equirectangular"'), "hold no pitch and roll"),
         (attributes('GPano:PosePitchDegrees="up"'), "'up' is not a finite number"),
-        (attributes('GPano:PosePitchDegrees="95"'), "PosePitchDegrees is 95.0; an angle from -90 to 90"),
+        (attributes('GPano:PosePitchDegrees="95"'), "PosePitchDegrees is 95.0; it must be an angle from -90 to 90"),
         ("<x:xmpmeta", "XMP tags are damaged"),
         ('<!DOCTYPE a [<!ENTITY b SYSTEM "file:///etc/hostname">]><a>&b;</a>', "XMP tags are damaged"),
     ],
@@ -70,5 +70,5 @@ def test_what_is_missing_or_wrong_is_said(tmp_path, packet, said):
 
 def test_what_is_no_image_is_said(tmp_path):
     (tmp_path / "a.jpg").write_bytes(b"no image")
-    with pytest.raises(InputError, match="is no image that can be read"):
+    with pytest.raises(InputError, match="is not an image that can be read"):
         gravity_from_tags(View("a.jpg", CAMERA, tmp_path / "a.jpg"))

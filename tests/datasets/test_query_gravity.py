@@ -49,8 +49,8 @@ def test_rows_of_a_gravity_file(tmp_path):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("a.jpg 0 1\n", "line 1: is no row image gx gy gz"),
-        ("# c\na.jpg 0 1 0 1 1\n", "line 2: is no row image gx gy gz"),
+        ("a.jpg 0 1\n", "line 1: is not a row image gx gy gz"),
+        ("# c\na.jpg 0 1 0 1 1\n", "line 2: is not a row image gx gy gz"),
         ("a.jpg 0 one 0\n", "line 1: 'one' is not a finite number"),
         ("a.jpg 0 nan 0\n", "line 1: 'nan' is not a finite number"),
         ("a.jpg 0 0 0\n", "line 1: its vector has the length 0;"),
@@ -101,7 +101,7 @@ def test_a_log_of_an_imu_gives_queries_gravity_by_the_times_in_their_names(tmp_p
     assert after.gravity is None and "1 of 2 queries have no gravity from" in remarks[0]
     for table, said in (
         ({"imu": "imu.csv"}, "key 'camera_from_imu' is missing"),
-        ({"imu": "imu.csv", "camera_from_imu": [[1, 0, 0]] * 3}, "is no rotation"),
+        ({"imu": "imu.csv", "camera_from_imu": [[1, 0, 0]] * 3}, "is not a rotation"),
     ):
         with pytest.raises(InputError, match=said):
             read_gravity(table, str(tmp_path / "s.toml"), 3.0)

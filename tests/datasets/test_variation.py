@@ -188,7 +188,7 @@ def test_what_a_scene_does_not_have_is_a_sentence(scene):
 
 
 def test_contradictions_and_negative_numbers_are_sentences():
-    with pytest.raises(InputError, match="match 3 is to be spoiled and to be mended"):
+    with pytest.raises(InputError, match="match 3 is both to be spoiled and to be mended"):
         Variation(spoiled=(1, 3), mended=(3,))
     with pytest.raises(InputError, match="hidden names the match -1"):
         Variation(hidden=(-1,))

@@ -63,10 +63,10 @@ def test_a_camera_on_its_side_is_told_where_down_is_about(tmp_path):
 def test_pictures_without_edges_are_refused_in_a_sentence(tmp_path):
     for walls, said in (
         (np.full((6, TEXELS, TEXELS), 90.0), "straight edges, fewer than 5"),
-        (wallpaper(3), "meet in one direction|upright things|was expected"),
+        (wallpaper(3), "meet in one direction|separate vertical edges|was expected"),
     ):
         turn = so3_exp(np.array([0.1, 0.5, 0.2]))
-        with pytest.raises(InputError, match=f"room.png: gravity cannot be told from its lines, since .*({said})"):
+        with pytest.raises(InputError, match=f"room.png: gravity cannot be found from its lines, since .*({said})"):
             # Close to a corner, where the blank walls' own edges are not seen.
             camera = KannalaBrandt(300, 300, 400.0, 400.0, 150.0, 150.0, (0.0, 0.0, 0.0, 0.0))
             gravity_from_lines(room(tmp_path, camera, turn, np.asarray(walls, np.float32)))

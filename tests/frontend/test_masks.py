@@ -96,7 +96,7 @@ def test_masks_that_are_refused(tmp_path):
         with pytest.raises(InputError, match=sentence):
             masks.on([view])
     (masked,), _ = Masks(tmp_path / "black.png").on([view])
-    with pytest.raises(InputError, match="black all over"):
+    with pytest.raises(InputError, match="completely black"):
         masked.usable_pixels()
     with pytest.raises(InputError, match="nadir_deg of masks is 90"):
         Masks(nadir_deg=90.0)
@@ -122,7 +122,7 @@ def test_a_scene_file_has_them_for_queries_and_references(tmp_path, rng):
         usable = view.usable_pixels()
         assert usable.any() and not usable[:, :160].any()
     for said, sentence in (
-        ("", r"\[masks\]: says nothing"),
+        ("", r"\[masks\]: is empty"),
         ("nadir_deg = 95", r"\[masks\]: nadir_deg is 95"),
         ("seam_deg = 2", r"\[masks\]: seam_deg of masks is for panoramas"),
         ('image = "mask.png"', "unknown key 'image'"),

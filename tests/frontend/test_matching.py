@@ -139,8 +139,8 @@ def test_what_cannot_be_compared(rng):
 @pytest.mark.parametrize(
     "options, reason",
     [
-        ({"method": "flann"}, "no matching 'flann'.*nearest, lightglue"),
-        ({"method": ["nearest"]}, "no matching"),
+        ({"method": "flann"}, "matching 'flann' is unknown.*nearest, lightglue"),
+        ({"method": ["nearest"]}, "is unknown"),
         ({"ratio": 0.0}, "ratio of matching is 0.0"),
         ({"ratio": 1.1}, "ratio"),
         ({"ratio": float("nan")}, "ratio"),

@@ -144,7 +144,7 @@ def picture(path, width, height, rng):
 
 
 def test_photographs_that_are_refused_or_left_out(tmp_path, rng):
-    with pytest.raises(InputError, match="is no folder"):
+    with pytest.raises(InputError, match="is not a folder"):
         photographs(tmp_path / "none", None)
     (tmp_path / "walk.mp4").write_bytes(b"")
     with pytest.raises(InputError, match=r"is a video; .* spherloc map frames --video .*walk\.mp4$"):
@@ -170,7 +170,7 @@ def test_images_that_show_nothing_together(tmp_path, rng):
     for name in ("a.png", "b.png"):
         picture(tmp_path / name, 400, 200, rng)
     found = photographs(tmp_path, None)
-    with pytest.raises(InputError, match=r"'z\.png' is none of the 2 photographs"):
+    with pytest.raises(InputError, match=r"'z\.png' is not one of the 2 photographs"):
         make_map(found.views, tmp_path, tmp_path / "map", Measured(distance=("a.png", "z.png", 1.0)), None, print)
     with pytest.raises(InputError, match="no two of the 2 photographs show the same place"):
         make_map(found.views, tmp_path, tmp_path / "map", Measured(), None, lambda *_: None)

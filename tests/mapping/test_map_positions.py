@@ -49,7 +49,7 @@ def test_positions_on_a_line_fix_the_scale_and_a_mirrored_plane_does_not(rng):
     for points, positions in ((plane, np.ones((10, 2))), (np.ones((10, 2)), plane)):
         with pytest.raises(InputError, match="all in one place"):
             overlaid(points, positions)
-    with pytest.raises(InputError, match="only 3 images of the map have a position, of 4"):
+    with pytest.raises(InputError, match="only 3 images of the map have a position, but 4 are needed"):
         overlaid(plane[:3], plane[:3])
 
 
@@ -65,7 +65,7 @@ def test_a_map_takes_it_and_says_how_good_it_is(rng):
     assert scale.metres_per_unit == pytest.approx(2.0, rel=0.05) and scale.off_m[NAMES[3]] > 10.0
     assert scale.source.startswith("GPS: 7 of 8 images fit it, 0.")
     noise = {name: 60.0 * row for name, row in zip(NAMES, rng.normal(size=(8, 3)), strict=True)}
-    with pytest.raises(InputError, match=r"GPS gives no scale: .* uncertain; give --distance"):
+    with pytest.raises(InputError, match=r"GPS gives no scale: .* uncertain by .*; give --distance"):
         scale_by_positions(poses, Positions(noise, "GPS"), level)
     with pytest.raises(InputError, match="GPS gives no scale: only 0 images"):
         scale_by_positions(poses, Positions({}, "GPS"), level)
@@ -114,8 +114,8 @@ def test_rows_of_positions_and_of_gps(tmp_path):
         (f"{NAMES[0]} 1 2\n", "line 1: has 3 words; give image x y z"),
         (f"{NAMES[0]} 1 2 x\n", "line 1: 'x' is not a finite number"),
         (f"{NAMES[0]} 1 2 3\n{NAMES[0]} 1 2 3\n", "line 2: .* a second time"),
-        ("a.jpg 1 2 3\n", "none of its 1 rows is of one of the 8 images"),
-        (f"image lat lon\n{NAMES[0]} 97 8\n", "is no latitude"),
+        ("a.jpg 1 2 3\n", "none of its 1 rows names one of the 8 images"),
+        (f"image lat lon\n{NAMES[0]} 97 8\n", "is not a latitude"),
         ("100.5 0 0 0 0 0 0 1\n101.5 0 0 0 0 0 0 1\n", "no pose at the time of any of the 8 images"),
     ],
 )
