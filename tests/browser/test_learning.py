@@ -107,6 +107,22 @@ def test_an_exported_lesson_is_read_without_a_server(browser: Browser, tmp_path:
     expect(second.locator("[data-number=pairs_at_yaw]")).to_have_text("218")
     expect(page.locator(".scene iframe")).to_have_count(1)
     page.wait_for_function(f"before => ({arcs})().join() !== before", arg=",".join(first))
+
+    # A scene that is left and wanted again while it is made is made once: a second one would take the first away.
+    page.keyboard.press("PageDown")
+    expect(page.locator("#moment-2")).to_have_class(re.compile("now"))
+    expect(page.locator("body")).not_to_have_class(re.compile("waiting"))
+    most = page.evaluate("""() => new Promise(done => {
+        const box = document.querySelector(".scene");
+        const press = (moment, answer) => document.querySelector(`#moment-${moment} .${answer} button`).click();
+        let most = 0;
+        new MutationObserver(() => { most = Math.max(most, box.children.length); }).observe(box, { childList: true });
+        press(2, "right");
+        setTimeout(() => { press(1, "wrong"); press(2, "right"); setTimeout(() => done(most), 400); }, 300);
+    })""")
+    assert most == 2, "the scene before and the one that is made"
+    expect(page.locator("body")).not_to_have_class(re.compile("waiting"))
+    expect(page.locator(".scene iframe")).to_have_count(1)
     own = path.as_uri()
     assert [url for url in asked if not url.startswith((own, "data:", "blob:", "about:"))] == []
     assert errors == []
