@@ -34,8 +34,8 @@ EXPORTS = {
     "RecordingError": "errors",
     "SpherlocError": "errors",
 }
-"""Names of the package itself and their modules, imported at the first use: the solvers take a second. ``__init__.pyi``
-tells type checkers."""
+"""Public names of the package and their modules, which are imported at the first use, since the solvers take a second.
+``__init__.pyi`` lists them for type checkers."""
 
 
 def __getattr__(name: str) -> Any:

@@ -1,4 +1,4 @@
-"""Bounds on the error of a measured bearing: its noise, and the error of the gravity that it was aligned by."""
+"""Bounds on the error of a measured bearing: its noise, and the error of the gravity by which it was aligned."""
 
 from dataclasses import dataclass
 
@@ -10,12 +10,12 @@ from spherloc.ranges import MAX_PX, MIN_PX
 from spherloc.types import FloatArray
 
 MIN_BOUND_PX, MAX_BOUND_PX = MIN_PX / 100, 100 * MAX_PX
-"""What a diagnosis asks for may be some times wider or tighter than what people may give."""
+"""Limits of ``bound_px``: wider than those for users, since a diagnosis tries other bounds."""
 
 
 @dataclass(frozen=True, eq=False)
 class Bounds:
-    """What an inlier's residual may be. M correspondences."""
+    """Limits of an inlier's residual, for M correspondences."""
 
     noise_px: float
     """Bound on the reprojection error at a pose whose tilt is right, px."""
@@ -26,10 +26,11 @@ class Bounds:
 
 
 def bounds_of(aligned: AlignedProblem, bound_px: float) -> Bounds:
-    """Bounds of every bearing from one pixel bound, through the largest stretch of its unprojection, plus gravity.
+    """Bounds of every bearing from one pixel bound: times the largest singular value of the unprojection's Jacobian,
+    plus the gravity bound.
 
-    Residuals are measured in the tangent plane, so that ``bound_px`` reaches as far as the angle whose sine it is.
-    Raises ``InputError`` for a bound that no estimator can reckon with.
+    Residuals are measured in the tangent plane, so that the angle is the arcsine of that product. Raises ``InputError``
+    for a bound that the estimators cannot compute with.
     """
     if not MIN_BOUND_PX <= bound_px <= MAX_BOUND_PX:
         raise InputError(f"bound_px is {show(bound_px)}; give a number of pixels from {MIN_PX:g} to {MAX_PX:,.0f}.")

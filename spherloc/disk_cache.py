@@ -1,4 +1,5 @@
-"""What can be computed again is kept on disk: rendered images and features, by a key of all that they depend on."""
+"""Cache on disk for results that can be computed again, such as rendered images and features. The key of a file is a
+hash of everything that its content depends on."""
 
 import atexit
 import contextlib
@@ -17,26 +18,26 @@ from spherloc.files import write_whole
 VARIABLE = "SPHERLOC_CACHE"
 """Environment variable that moves the cache."""
 KEEP_BYTES = 2 << 30
-"""What one kind of things may take once it was not used for a while."""
+"""Size to which the files of one kind are reduced, as far as they have not been used recently."""
 UNUSED_S = 7 * 86_400.0
-"""What was used within this time stays: somebody may be looking at it."""
+"""Files that were used within this time are not deleted, since they may be in use."""
 TOUCH_S = 3_600.0
-"""A use is not noted again within this time."""
+"""A use is not recorded again within this time."""
 DAMAGED_NPZ = (OSError, ValueError, LookupError, EOFError, MemoryError, zipfile.BadZipFile, zlib.error, RuntimeError)
-"""What numpy raises for an .npz that was cut off or changed."""
+"""Exceptions that numpy raises for an .npz file that was cut off or changed."""
 
 
 def cache_folder(kind: str) -> Path:
-    """Folder for one kind of things ("renders", "features"): under $SPHERLOC_CACHE, else in the user's cache.
+    """Folder for one kind of files ("renders", "features"): under $SPHERLOC_CACHE, else in the user's cache.
 
-    A user without a home has one that ends with the process.
+    For a user without a home folder it is a temporary folder, which is deleted when the process ends.
     """
     own = os.environ.get(VARIABLE)
     return (Path(own) if own else user_cache() or _temporary()) / kind
 
 
 def user_cache() -> Path | None:
-    """The user's folder for what can be computed again; None for a user without a home."""
+    """The user's cache folder; None for a user without a home folder."""
     try:
         return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "spherloc"
     except RuntimeError:
@@ -51,7 +52,7 @@ def _temporary() -> Path:
 
 
 def key_of(*parts: object) -> str:
-    """A file name for what follows from ``parts``: bytes, or whatever has a ``repr`` that says it all."""
+    """A file name for content that is determined by ``parts``: bytes, or objects whose ``repr`` is complete."""
     digest = hashlib.sha256()
     for part in parts:
         content = part if isinstance(part, bytes) else repr(part).encode()
@@ -60,7 +61,7 @@ def key_of(*parts: object) -> str:
 
 
 def store(path: Path, content: bytes) -> bool:
-    """Write a file of the cache so that no reader sees half of it; False if that fails, which only costs time."""
+    """Write a file of the cache so that no reader sees half of it; False if that fails, which costs only time."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_whole(path, content)
@@ -70,7 +71,7 @@ def store(path: Path, content: bytes) -> bool:
 
 
 def used(path: Path) -> None:
-    """Note that a file of the cache is still wanted."""
+    """Record that a file of the cache was used now."""
     with contextlib.suppress(OSError):
         if time.time() - path.stat().st_mtime > TOUCH_S:
             os.utime(path)
@@ -83,9 +84,10 @@ def make_room_once(folder: Path) -> None:
 
 
 def make_room(folder: Path, keep_bytes: int = KEEP_BYTES) -> int:
-    """Delete the longest unused files of a kind until it takes no more than ``keep_bytes``; returns how many went.
+    """Delete the longest unused files of a kind until all take at most ``keep_bytes``; returns the number of deleted
+    ones.
 
-    Files that were used within a week stay, whatever they take. What cannot be deleted stays too.
+    Files that were used within a week are kept, whatever their size, and so are files that cannot be deleted.
     """
     found = []
     for path in folder.rglob("*"):

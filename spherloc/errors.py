@@ -1,4 +1,4 @@
-"""One exception tree, and how messages quote what they did not write.
+"""The exceptions of this package, and functions that quote foreign text in their messages.
 
 Every message is one sentence that says what, where, and what to do.
 """
@@ -7,11 +7,11 @@ import reprlib
 from typing import Any
 
 MAX_QUOTED = 60
-"""Characters of a quoted value."""
+"""Largest number of characters of a quoted value."""
 MAX_REASON = 160
-"""Characters of what the system or a library says."""
+"""Largest number of characters of a message of the system or a library."""
 MAX_UNBROKEN = 300
-"""Characters without a space between them, such as a path."""
+"""Largest number of characters without a space between them, such as those of a path."""
 MAX_MESSAGE = 2000
 
 
@@ -19,7 +19,7 @@ class SpherlocError(Exception):
     """Base of every error that a user can cause; the command line shows it as one line and exits with code 2."""
 
     def __init__(self, message: str) -> None:
-        """``message`` may quote a user's file: it becomes ``legible``."""
+        """``message`` may quote a user's file; it is made ``legible``."""
         super().__init__(legible(message))
 
 
@@ -28,7 +28,7 @@ class InputError(SpherlocError):
 
 
 class CalibrationError(InputError):
-    """A camera calibration is unreadable or describes no usable camera."""
+    """A camera calibration is unreadable or does not describe a usable camera."""
 
 
 class ProblemError(InputError):
@@ -42,8 +42,8 @@ class RecordingError(SpherlocError):
 def legible(text: str) -> str:
     r"""``text`` as one line of bounded length, control characters written as in Python: ``\x1b``.
 
-    Whatever has no space within ``MAX_UNBROKEN`` characters loses its middle, and so does a text that is longer than
-    ``MAX_MESSAGE``.
+    The middle of a word that is longer than ``MAX_UNBROKEN`` characters is cut out, and so is that of a text longer
+    than ``MAX_MESSAGE``.
     """
     line = _escaped(_cut(text, MAX_MESSAGE))
     return _cut(" ".join(_cut(word, MAX_UNBROKEN) for word in line.split(" ")), MAX_MESSAGE)
@@ -66,14 +66,15 @@ def reason(error: BaseException) -> str:
     """Why the system or a library refused something, as a part of a sentence of at most ``MAX_REASON`` characters."""
     try:
         text = getattr(error, "strerror", None) or str(error)
-    except Exception:  # an exception of somebody else's whose text cannot be had
+    except Exception:  # a foreign exception whose text cannot be made
         text = ""
     words = _cut(text or type(error).__name__, 4 * MAX_REASON).split()
     return _cut(_escaped(" ".join(words)).rstrip("."), MAX_REASON)
 
 
 def _escaped(text: str) -> str:
-    r"""Printable; others as ``\n``, ``\x1b``, ``\u202e``, and a byte of a name that is no UTF-8 as ``\udcff``."""
+    r"""The text with escapes for what is not printable: ``\n``, ``\x1b``, ``\u202e``; ``\udcff`` for a byte of a name
+    that is not UTF-8."""
     if text.isprintable():
         return text
     return "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in text)
@@ -88,7 +89,7 @@ def _cut(text: str, most: int) -> str:
 
 
 class _Quote(reprlib.Repr):
-    """Few items and levels: aliases make a small file of YAML into a tree without end."""
+    """Shows few items and levels of a value: with aliases, a small YAML file can be an endless tree."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -1,7 +1,7 @@
-"""Opens files that a user names: regular ones only, and never more of them than a reader asks for; writes whole files.
+"""Reads files that a user names, regular files of limited size only, and writes files as a whole.
 
-A link to ``/dev/zero`` has no end and a pipe without a writer keeps whoever opens it waiting for ever. Every refusal is
-an ``OSError`` with a reason in ``strerror``, also for names that no file can have, which Python refuses by ValueError.
+A link to ``/dev/zero`` has no end, and opening a pipe without a writer never returns. Every refusal is an ``OSError``
+with a reason in ``strerror``, also for impossible file names, for which Python raises ``ValueError``.
 """
 
 import errno
@@ -17,16 +17,17 @@ from spherloc.errors import InputError, reason
 
 _PIECE_BYTES = 1 << 20
 IMAGES = {".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"}
-"""Endings of the files in a folder that are taken for images, in lower case."""
+"""Endings of the names of files that count as images, in lower case."""
 
 
 def is_file(path: Path) -> bool:
-    """True for a regular file, links followed; False also for what cannot be looked up: too long, no permission."""
+    """True for a regular file, links followed; False also for a path that cannot be looked up: too long, no
+    permission."""
     return _mode_is(path, stat.S_ISREG)
 
 
 def is_folder(path: Path) -> bool:
-    """True for a folder, links followed; False also for what cannot be looked up: too long, no permission."""
+    """True for a folder, links followed; False also for a path that cannot be looked up: too long, no permission."""
     return _mode_is(path, stat.S_ISDIR)
 
 
@@ -38,9 +39,9 @@ def _mode_is(path: Path, kind: Callable[[int], bool]) -> bool:
 
 
 def size_of(path: Path) -> int:
-    """Bytes of a regular file; raises ``OSError`` for whatever is none.
+    """Size of a regular file, bytes; raises ``OSError`` for anything else.
 
-    Ask this before a library opens a path by itself.
+    To be called before a library opens a path by itself.
     """
     try:
         status = Path(path).stat()
@@ -51,7 +52,7 @@ def size_of(path: Path) -> int:
 
 
 def open_file(path: Path) -> BinaryIO:
-    """A regular file, open for reading bytes; raises ``OSError`` for whatever is none, without waiting for it."""
+    """A regular file, opened for reading bytes; raises ``OSError`` for anything else, and never waits for a pipe."""
     size_of(path)  # opening a device may already do something
     try:
         file = open(path, "rb", opener=_without_waiting)  # noqa: SIM115 -- Path.open has no opener
@@ -68,8 +69,8 @@ def open_file(path: Path) -> BinaryIO:
 def read_file(path: Path, most_bytes: int) -> bytes:
     """The content of a regular file.
 
-    Raises ``OSError`` for whatever is none and for one of more than ``most_bytes``, also where it grows beyond them
-    meanwhile or does not tell its size.
+    Raises ``OSError`` for anything else and for a file of more than ``most_bytes``, also if it grows beyond them while
+    it is read or does not state its size.
     """
     with open_file(path) as file:
         size = os.fstat(file.fileno()).st_size
@@ -83,7 +84,8 @@ def read_file(path: Path, most_bytes: int) -> bytes:
 
 @contextmanager
 def reading(path: Path, advice: str) -> Iterator[None]:
-    """Around reading a file: ``InputError`` for every ``OSError``, with ``advice`` ("correct the key 'image'")."""
+    """Context in which a file is read: every ``OSError`` becomes an ``InputError`` with ``advice`` ("correct the key
+    'image'")."""
     try:
         yield
     except FileNotFoundError:
@@ -128,7 +130,7 @@ def _no_such_name(path: Path) -> OSError:
 def write_whole(path: Path, content: bytes, sync: bool = False) -> None:
     """Write a file so that no reader sees half of it; ``sync`` waits until it is on the disk.
 
-    Raises ``OSError`` if that fails, and leaves nothing then.
+    Raises ``OSError`` if that fails; no partial file is left then.
     """
     part = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.part")
     try:
@@ -144,7 +146,7 @@ def write_whole(path: Path, content: bytes, sync: bool = False) -> None:
 
 
 def lock(handle: int) -> None:
-    """Keep other processes off an open file or folder; the system ends the lock whatever ends this process.
+    """Lock an open file or folder against other processes; the system releases the lock however this process ends.
 
     Raises ``BlockingIOError`` if another process has it. Does nothing where there are no such locks.
     """

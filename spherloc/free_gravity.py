@@ -1,5 +1,5 @@
-"""The best consensus without the given gravity: a search by samples of three correspondences, and whether it
-contradicts the gravity. Poses are between the aligned frames."""
+"""Searches the best consensus without the given gravity, by samples of three correspondences, and decides whether it
+contradicts that gravity. Poses are between the aligned frames."""
 
 from dataclasses import dataclass, replace
 
@@ -15,15 +15,15 @@ from spherloc.solvers.p3p import SAMPLE_SIZE, p3p
 from spherloc.types import BoolArray, FloatArray, IntArray
 
 MAX_NFA = 1e-3
-"""Expected number of false alarms (NFA) of the size of a set below which it is believed."""
+"""Largest expected number of false alarms (NFA) of a set that is believed."""
 MIN_LEAD = 2.0
-"""By how many standard deviations of counting one set must be larger than another."""
+"""Number of standard deviations, by counting statistics, by which one set must be larger than another."""
 TILT_RAD = np.radians(6.0)
-"""Gravity errors up to about this are looked for near a pose."""
+"""Gravity errors up to about this are searched for near a pose."""
 SAMPLES, BATCH, CONFIDENCE = 6000, 300, 0.99
-"""Most samples of a search, how many at once, and the probability, by Eq. 28, at which it ends."""
+"""Largest number of samples of a search, samples at once, and the probability, by Eq. 28, at which the search ends."""
 MAX_SCORED = 1000
-"""Correspondences by which samples are compared, an even choice of all."""
+"""Largest number of correspondences by which samples are compared, evenly chosen from all."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,24 +31,24 @@ class Contradiction:
     """A pose that contradicts the given gravity."""
 
     cam_from_map: FloatArray
-    """(3, 4)."""
+    """The pose (3, 4)."""
     support: int
-    """Different matches that agree with it."""
+    """Number of different matches that agree with it."""
     believed_support: int
-    """Different matches that agree with the pose that was found with the given gravity."""
+    """Number of different matches that agree with the pose that was found with the given gravity."""
     tilt_rad: float
     """Angle between the given gravity and the pose's."""
 
 
 def without_gravity(aligned: AlignedProblem) -> AlignedProblem:
-    """The same correspondences, where nothing is known of gravity."""
+    """The same correspondences with unknown gravity."""
     return replace(aligned, gravity_bound_rad=0.0, gravity_sd_rad=np.inf)
 
 
 def search_without_gravity(aligned: AlignedProblem, bound_px: float) -> FloatArray | None:
-    """The refined pose (3, 4) of the most inliers among those of random samples of three; None without a pose.
+    """The refined pose (3, 4) with the most inliers among those of random samples of three; None without a pose.
 
-    Every call draws alike.
+    Every call draws the same samples.
     """
     free, count = without_gravity(aligned), len(aligned.points)
     if count <= SAMPLE_SIZE:
@@ -75,14 +75,15 @@ def search_without_gravity(aligned: AlignedProblem, bound_px: float) -> FloatArr
 
 
 def _supports(poses: FloatArray, bearings: FloatArray, points: FloatArray, least_cosine: FloatArray) -> IntArray:
-    """How many correspondences (M, 3) see their point within the angle of that cosine (M,), for each pose (L, 3, 4)."""
+    """Number of inliers of each pose (L, 3, 4): correspondences whose bearing (M, 3) and direction to the point have a
+    cosine of at least ``least_cosine`` (M,)."""
     rays = poses[:, :, :3] @ points.T + poses[:, :, 3:]
     along = np.einsum("lim,mi->lm", rays, bearings)
     return np.count_nonzero(along >= least_cosine * np.sqrt(np.einsum("lim,lim->lm", rays, rays)), axis=1)
 
 
 def count_distinct(aligned: AlignedProblem, mask: BoolArray) -> int:
-    """Masked correspondences (M,), those that share a point or a bearing counted once."""
+    """Number of the correspondences of ``mask`` (M,); those that share a point or a bearing count once."""
     if not mask.any():
         return 0
     points, bearings = np.unique(aligned.points[mask], axis=0), np.unique(aligned.bearings[mask], axis=0)
@@ -90,17 +91,17 @@ def count_distinct(aligned: AlignedProblem, mask: BoolArray) -> int:
 
 
 def expected_by_chance(count: int, size: int, rate: float, fixed_by: int) -> float:
-    """Expected number of chance sets of that size, where so many correspondences fix a pose."""
+    """Expected number of sets of that size by chance, where ``fixed_by`` correspondences fix a pose."""
     return nfa(count, size, rate) * rate ** (2 - fixed_by) if size > fixed_by else np.inf
 
 
 def lead(size: int, other: int) -> float:
-    """By how many standard deviations of counting the first set is larger than the second."""
+    """Number of standard deviations, by counting statistics, by which the first set is larger than the second."""
     return (size - other) / np.sqrt(max(size + other, 1))
 
 
 def nearby_support(aligned: AlignedProblem, cam_from_map: FloatArray, bound_px: float, noise_px: float) -> int:
-    """Different matches that agree with a pose near this one (3, 4) if gravity is not believed."""
+    """Number of different matches that agree with a pose near this one (3, 4), the given gravity ignored."""
     wide = np.maximum(bounds_of(aligned, bound_px).pixels, bound_px + TILT_RAD * aligned.pixels_per_radian)
     tight, path = np.full(len(wide), bound_px), np.empty((len(NARROWINGS), 3, 4))
     narrow(matches_of(aligned), wide, tight, cam_from_map.copy(), Noise(noise_px, np.inf), path)
@@ -113,8 +114,8 @@ def contradicts(
     """The pose that shows gravity to be beyond its bound, if there is one.
 
     ``cam_from_map`` (3, 4), or None, was found and refined with gravity, and ``inliers`` (M,) agree with it. If it is
-    tilted beyond the bound all the same, it shows that itself. Nothing is searched for while its inliers are more than
-    chance gives and no pose nearby explains clearly more without gravity.
+    nevertheless tilted beyond the bound, it is itself the contradiction. No search is made if its inliers are more than
+    chance explains and no pose nearby explains clearly more without gravity.
     """
     count, size, bound_rad = len(aligned.points), count_distinct(aligned, inliers), aligned.gravity_bound_rad
     exact = chance_rate(aligned.bearings, bounds_of(without_gravity(aligned), bound_px).radians)

@@ -1,4 +1,4 @@
-"""Reads images. Pixels are taken as they are stored: calibrations know nothing of a photograph's orientation tag."""
+"""Reads images. Pixels are used as they are stored: a calibration does not consider a photograph's orientation tag."""
 
 import io
 import warnings
@@ -16,13 +16,13 @@ from spherloc.types import ByteArray
 
 MAX_BYTES = 200_000_000
 MAX_PIXELS = 150_000_000
-"""Beyond any panorama, so that a corrupt header cannot exhaust the memory."""
+"""Largest number of pixels, beyond any panorama, so that a corrupt header cannot exhaust the memory."""
 
 
 def read_image(path: Path) -> ByteArray:
     """An image as (H, W, 3) BGR or (H, W) grey bytes.
 
-    Raises ``InputError`` for what is missing, unreadable, too large or no image.
+    Raises ``InputError`` for a file that is missing, unreadable, too large or not an image.
     """
     image = _decode(path, cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     if image.dtype != np.uint8 or image.ndim not in (2, 3):
@@ -33,18 +33,18 @@ def read_image(path: Path) -> ByteArray:
 def read_depth_png(path: Path) -> NDArray[np.uint16]:
     """A depth map (H, W) of 16-bit numbers, whose unit the caller knows.
 
-    Raises ``InputError`` for what is missing, unreadable, too large or has other than 16 bits and one channel.
+    Raises ``InputError`` for a file that is missing, unreadable, too large or does not have one channel of 16 bits.
     """
     image = _decode(path, cv2.IMREAD_UNCHANGED)
     if image.dtype != np.uint16 or image.ndim != 2:
-        raise InputError(f"{path}: is no depth map; give a PNG with one channel of 16 bits.")
+        raise InputError(f"{path}: is not a depth map; give a PNG with one channel of 16 bits.")
     return image
 
 
 def read_size(path: Path) -> tuple[int, int]:
-    """Width and height of an image by its header alone.
+    """Width and height of an image, px, by its header alone.
 
-    Raises ``InputError`` for what is missing, too large or no image.
+    Raises ``InputError`` for a file that is missing, too large or not an image.
     """
     path = Path(path)
     with reading(path, "correct the path of the image"), open_file(path) as file:
@@ -52,7 +52,7 @@ def read_size(path: Path) -> tuple[int, int]:
 
 
 def grey(image: ByteArray) -> ByteArray:
-    """(H, W) of a BGR or grey image."""
+    """Grey image (H, W) of a BGR or grey image."""
     return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
 
 
@@ -71,14 +71,14 @@ def _decode(path: Path, flags: int) -> NDArray:
 
 
 def _size(file: BinaryIO, path: Path) -> tuple[int, int]:
-    """Width and height by the header; decoders would take all memory that a damaged one asks for."""
+    """Width and height by the header, px; a decoder would allocate all memory that a damaged header asks for."""
     try:
         with warnings.catch_warnings(action="ignore"), Image.open(file) as image:
             width, height = image.size
     except Image.DecompressionBombError:  # Pillow's own limit is a little higher than ours
         width, height = MAX_PIXELS, MAX_PIXELS
-    except Exception:  # Pillow's readers let through whatever a damaged header makes them stumble over
+    except Exception:  # Pillow's readers pass on whatever a damaged header raises
         raise InputError(f"{path}: not an image that can be read, or a damaged one; replace it.") from None
     if not 0 < width * height <= MAX_PIXELS:
-        raise InputError(f"{path}: claims no pixels or more than {MAX_PIXELS:,}; give a smaller image.")
+        raise InputError(f"{path}: claims 0 pixels or more than {MAX_PIXELS:,}; give a smaller image.")
     return width, height

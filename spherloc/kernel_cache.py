@@ -1,8 +1,8 @@
-"""Compiles numeric kernels with numba and keeps the machine code on disk, for just this state of the sources.
+"""Compiles numeric kernels with numba and keeps the machine code on disk, separately for each state of the sources.
 
 numba notices when a kernel's own file changes but not when a function that it calls from another file does, and would
-go on with the old machine code after an update. And of two processes that compile for different types at once, each may
-give its file the same name, so that a later process runs machine code for the wrong types.
+use old machine code after an update. Also, two processes that compile for different types at the same time may give
+their files the same name, so that a later process runs machine code for the wrong types.
 """
 
 import atexit
@@ -34,13 +34,13 @@ KERNEL_SOURCES = (
     "mapping/guided.py",
     "mapping/level_pairs.py",
 )
-"""Files and folders of this package that hold kernels and whatever their values come from."""
+"""Files and folders of this package that hold kernels or code on which their results depend."""
 
 KEPT_STATES = 4
-"""States of the sources whose machine code is kept, for who goes back and forth between them."""
+"""Number of states of the sources whose machine code is kept, for switching between versions."""
 
 VARIABLE = "NUMBA_CACHE_DIR"
-"""numba's environment variable that moves the cache."""
+"""numba's environment variable that sets the folder of its cache."""
 
 
 def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -66,7 +66,7 @@ def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
 
 def _cached(dispatcher: Any, folder: Path) -> Any:
-    """A function of numba that keeps its machine code in a folder."""
+    """The numba function, set up to keep its machine code in a folder."""
     settings: Any = config
     before, settings.CACHE_DIR = settings.CACHE_DIR, str(folder)  # read when the cache is made
     try:
@@ -80,7 +80,7 @@ def _cached(dispatcher: Any, folder: Path) -> Any:
 
 @cache
 def kernel_folder() -> Path:
-    """Folder of the machine code: of $NUMBA_CACHE_DIR, beside the package, in the user's cache, or of this process."""
+    """Folder of the machine code: under $NUMBA_CACHE_DIR, beside the package, in the user's cache, or temporary."""
     package = Path(__file__).parent
     rooms = [package / name for name in KERNEL_SOURCES]
     files = sorted(file for room in rooms for file in (room.rglob("*.py") if room.is_dir() else [room]))
@@ -90,7 +90,8 @@ def kernel_folder() -> Path:
 
 @cache
 def _temporary() -> Path:
-    """A folder of this process and its children alone: whoever can write into a folder of kernels decides what runs."""
+    """A folder for this process and its children alone: others must not write into it, since its machine code is
+    run."""
     folder = Path(tempfile.mkdtemp(prefix="spherloc-kernels-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     os.environ[VARIABLE] = str(folder)
@@ -98,7 +99,7 @@ def _temporary() -> Path:
 
 
 def is_temporary() -> bool:
-    """Whether the machine code is lost when this process ends, since no folder to keep it can be written."""
+    """Whether the machine code is lost when this process ends, since no permanent folder for it is writable."""
     kernel_folder()
     return _temporary.cache_info().currsize > 0
 

@@ -1,8 +1,8 @@
 """The last step of every estimator: from the poses that a search found to the one that is reported.
 
-The pose with the most inliers is not the best one: where gravity is uncertain, many explain as many. So the candidates
-are compared by their truncated squares (``narrowing``) at the bound on the noise, and the reported inliers are those of
-the winner.
+The pose with the most inliers is not always the best one: where gravity is uncertain, many poses have as many inliers.
+So the candidates are compared by their sums of truncated squares (``narrowing``) at the bound on the noise, and the
+reported inliers are those of the best candidate.
 """
 
 from collections.abc import Sequence
@@ -29,21 +29,22 @@ from spherloc.trace import RefinementStage
 from spherloc.types import BoolArray, FloatArray
 
 MAX_STARTS = 4
-"""Poses of a search that are refined."""
+"""Largest number of poses of a search that are refined."""
 ALTERNATIVE_SHARE = 0.6
-"""Share of the most inliers that a start must have: what has less never wins."""
+"""Least share of the largest number of inliers that a start must have: poses with fewer never turn out the best."""
 
 
 def conclude(
     aligned: AlignedProblem, starts: Sequence[FloatArray], bounds: Bounds, options: RefinementOptions
 ) -> tuple[FloatArray, BoolArray, RefinementStage]:
-    """The pose of least truncated squares that is found from the ``starts`` (3, 4) of a search, best first.
+    """The pose with the least sum of truncated squares that is found from the ``starts`` (3, 4) of a search, best
+    first.
 
-    The first four of them that explain enough are refined by ``refine`` and, where gravity is uncertain, by a fit at
+    The first four starts that explain enough are refined by ``refine`` and, where gravity is uncertain, by fits at
     bounds that narrow from one that allows for gravity's error to that of the noise; random fits nearby follow. The
-    truncated squares are those at the bound on the noise; where gravity is kept, at one that allows for its error.
-    Every candidate moves downhill in them to the end. The inliers of the best one are fitted once more, weighed as
-    ``options.robust`` says, and that is taken unless it is farther off than noise explains.
+    squares are truncated at the bound on the noise or, where gravity is kept, at one that allows for its error. Every
+    candidate is improved until that sum no longer falls. The inliers of the best one are fitted once more, weighted as
+    ``options.robust`` says; this fit is the result unless it is farther away than noise explains.
 
     Returns what ``refine`` does. All poses are between the aligned frames.
     """
@@ -55,7 +56,7 @@ def conclude(
     for start in _promising(aligned, starts, bounds):
         plain, reach = refined_path(aligned, start, bounds, options)
         if not kept and reach == np.inf:
-            # Too few for a tilt: there is nothing to choose from.
+            # Too few matches to determine a tilt: there is nothing to choose from.
             return record(aligned, plain, bounds.pixels, options, measured=True)
         for path in [plain] if kept else [plain, _narrowed(matches, wide, limits, start, noise)]:
             path, cost = _descended(matches, limits, path, noise)
@@ -77,10 +78,11 @@ def conclude(
 def conclude_as_printed(
     aligned: AlignedProblem, start: FloatArray, members: BoolArray, bounds: Bounds, options: RefinementOptions
 ) -> tuple[FloatArray, BoolArray, RefinementStage]:
-    """The last line of Algorithms 1 and 2 and nothing else: Gauss-Newton in 6 DoF from ``start`` (3, 4).
+    """Only the last line of Algorithms 1 and 2: Gauss-Newton in 6 DoF from ``start`` (3, 4).
 
-    It fits the matches ``members`` (M,), all weighed alike, without gravity and without choosing them anew; fewer than
-    4 keep their tilt. The reported inliers are the matches within the bound on the noise of the pose that comes out.
+    It fits the matches of ``members`` (M,) with equal weights, without gravity and without choosing the matches again;
+    with fewer than 4 matches the tilt is kept. The reported inliers are the matches within the bound on the noise of
+    the resulting pose.
 
     Returns what ``refine`` does, poses between the aligned frames.
     """
@@ -96,7 +98,7 @@ def conclude_as_printed(
 
 
 def _promising(aligned: AlignedProblem, starts: Sequence[FloatArray], bounds: Bounds) -> list[FloatArray]:
-    """The first start and those of the next ones that explain enough beside it."""
+    """The first start, and those of the next ones that explain enough compared with it."""
     counts = [int(np.count_nonzero(residuals_px(aligned, start) <= bounds.pixels)) for start in starts[:MAX_STARTS]]
     enough = ALTERNATIVE_SHARE * max(counts)
     return [start for k, (start, count) in enumerate(zip(starts, counts, strict=False)) if k == 0 or count >= enough]
@@ -111,7 +113,7 @@ def _narrowed(matches: Matches, wide: FloatArray, limits: FloatArray, start: Flo
 
 
 def _descended(matches: Matches, limits: FloatArray, path: FloatArray, noise: Noise) -> tuple[FloatArray, float]:
-    """The path (I, 3, 4) and how it goes on downhill, and the truncated squares of its end."""
+    """The path (I, 3, 4), continued to a minimum of the sum of truncated squares, and that sum at its end."""
     more, last = np.empty((MAX_DESCENTS, 3, 4)), path[-1].copy()
     states, cost = descend(matches, limits, last, noise, more)
     return np.concatenate([path, more[:states]]), float(cost)

@@ -1,4 +1,4 @@
-"""From arrays to a pose: the way in for programs that have matches of their own."""
+"""From arrays to a pose: the entry points for programs that have matches of their own."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -30,16 +30,16 @@ if TYPE_CHECKING:
     from spherloc.frontend.view import Gravity
 
 CAMERA = "the camera"
-"""What a sentence calls a camera that comes from no file."""
+"""Name, in messages, of a camera that does not come from a file."""
 BOUND_PX = 3.0
-"""About so many pixels are the bound on bearings, as the bound on pixels is by default."""
+"""Approximate size, in pixels of the assumed panorama, of the bound on bearings; the same as the default bound."""
 MAX_OFF_UNIT = 1e-3
-"""By so much the length of a bearing may differ from 1."""
+"""Largest difference of the length of a bearing from 1."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Localization:
-    """What became of one query. N correspondences."""
+    """The result of one query with N correspondences."""
 
     trace: Trace
     """The whole run: all stages with their arrays."""
@@ -66,13 +66,13 @@ class Localization:
 
     @property
     def covariance(self) -> FloatArray | None:
-        """(6, 6) of the pose's error, see ``RefinementStage.covariance``; None without a pose."""
+        """Covariance (6, 6) of the pose's error, see ``RefinementStage.covariance``; None without a pose."""
         stage = self.trace.stage(RefinementStage)
         return None if stage is None else stage.covariance
 
     @cached_property
     def judgement(self) -> Judgement:
-        """Whether the pose is to be believed, with a score and with reasons if it is not."""
+        """Whether the pose can be believed, with a score, and with reasons if it cannot."""
         return judge(self.trace)
 
     @property
@@ -139,11 +139,11 @@ def localize(
         bound_px: Bound on an inlier's reprojection error, pixels; None takes the estimator's own.
         estimator: Registered name, such as "auto", "mc-exact", "mc" or "ransac-2p".
         options: The estimator's options, as a dict of what differs from the defaults or as ``options_type(estimator)``.
-        seed: Of all random draws; the same arguments give the same result.
-        name: What sentences and recordings call the query.
+        seed: Seed of all random draws; the same arguments give the same result.
+        name: Name of the query in messages and recordings.
 
     Returns:
-        The pose, its inliers, covariance and certificate, and whether it is to be believed.
+        The pose, its inliers, covariance and certificate, and whether it can be believed.
 
     Raises:
         InputError: For arrays of a wrong shape or with values that are not finite, a camera that cannot be used, and an
@@ -166,23 +166,22 @@ def localize(
 def localize_bearings(
     bearings: ArrayLike, points: ArrayLike, gravity: ArrayLike, *, bound_deg: float, **settings: Any
 ) -> Localization:
-    """``localize`` from directions instead of pixels and a camera, such as those of a rig or of a camera of your own.
+    """``localize`` from bearings instead of pixels and a camera, such as those of a rig or of a camera of your own.
 
-    The result names a panorama as its camera, whose errors are angles and of which a pixel is about a third of the
-    bound.
+    The camera of the result is a panorama whose errors are angles and of which a pixel is about a third of the bound.
 
     Args:
         bearings: Unit vectors (N, 3) in the camera frame (x right, y down, z forward), one towards each matched point.
         points: Matched map points (N, 3), metres.
         gravity: Vector (3,) that points down in the camera frame, of any length.
         bound_deg: Bound on the angle between an inlier's bearing and its point, degrees, above 0 and below 90.
-        settings: Further arguments of ``localize``, but for ``bound_px``.
+        settings: Further arguments of ``localize``, except ``bound_px``.
 
     Returns:
         As ``localize``.
 
     Raises:
-        InputError: As ``localize``, and for bearings that are no unit vectors.
+        InputError: As ``localize``, and for bearings that are not unit vectors.
     """
     if "bound_px" in settings:
         raise InputError("bearings have no pixels; give bound_deg alone, without bound_px.")
@@ -201,12 +200,12 @@ def localize_bearings(
 
 
 def gravity_from_image(image: Any, camera: Any, near: ArrayLike = (0.0, 1.0, 0.0)) -> "Gravity":
-    """Which way is down in an image, from the direction in which its vertical lines meet.
+    """Gravity in an image, from the direction in which its vertical lines meet.
 
     Args:
         image: The path of an image, or its pixels (H, W) or (H, W, 3), BGR bytes.
         camera: As for ``localize``.
-        near: Vector (3,) that points about down in the camera frame, of any length; by up to 45 degrees it may be off.
+        near: Vector (3,) that points approximately down in the camera frame, of any length; up to 45 degrees off.
 
     Returns:
         ``down`` (3,), a unit vector in the camera frame, with the bound ``bound_rad`` on its error and ``sd_rad``.
@@ -214,7 +213,7 @@ def gravity_from_image(image: Any, camera: Any, near: ArrayLike = (0.0, 1.0, 0.0
     Raises:
         InputError: If the image shows too few vertical lines, cannot be read, or has another size than the camera.
     """
-    # OpenCV takes a while to import.
+    # OpenCV is slow to import.
     from spherloc.frontend.gravity_from_lines import gravity_of_pixels
     from spherloc.frontend.view import seen_pixels
     from spherloc.images import grey, read_image
@@ -238,7 +237,7 @@ def estimate_absolute_pose(
     gravity: ArrayLike,
     **settings: Any,
 ) -> dict[str, Any] | None:
-    """``localize`` in the place of ``pycolmap.estimate_absolute_pose``, with gravity (3,) besides.
+    """``localize`` as a replacement for ``pycolmap.estimate_absolute_pose``, with gravity (3,) as a further argument.
 
     Args:
         points2D: Pixels (N, 2); bearings (N, 3) if ``camera`` is None, see ``localize_bearings``.
@@ -249,10 +248,10 @@ def estimate_absolute_pose(
 
     Returns:
         A dict with ``cam_from_world`` (``pycolmap.Rigid3d``), ``num_inliers`` and ``inlier_mask``, and with
-        ``localization``, what ``localize`` gives; None if there is no pose.
+        ``localization``, the result of ``localize``; None if there is no pose.
 
     Raises:
-        InputError: As ``localize``, without pycolmap, and for bearings without ``bound_deg``.
+        InputError: As ``localize``, if pycolmap is missing, and for bearings without ``bound_deg``.
     """
     pycolmap = require("pycolmap", "colmap", "estimate_absolute_pose")
     if camera is not None:
@@ -272,9 +271,9 @@ def estimate_absolute_pose(
 
 
 def as_camera(camera: Any) -> Camera:
-    """A camera from whatever describes one, see ``localize``.
+    """A camera from any description that ``localize`` takes.
 
-    Raises ``InputError`` for anything else, and ``CalibrationError``, which is one, for a camera that cannot be used.
+    Raises ``InputError`` for anything else, and its subclass ``CalibrationError`` for a camera that cannot be used.
     """
     if isinstance(camera, Camera):
         return camera
@@ -296,7 +295,7 @@ def as_camera(camera: Any) -> Camera:
 
 
 def _from_colmap(model: Any, width: Any, height: Any, params: Any) -> Camera:
-    """Of a COLMAP camera; its model may be a member of pycolmap's enumeration."""
+    """The camera of a COLMAP model, which may be a name or a member of pycolmap's enumeration."""
     return camera_from_colmap(getattr(model, "name", model), width, height, params, CAMERA)
 
 

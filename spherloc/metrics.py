@@ -40,8 +40,8 @@ def rotation_error_deg(truth: FloatArray, estimate: FloatArray) -> float:
 def translation_error_m(truth: FloatArray, estimate: FloatArray) -> float:
     """Distance (metres) between the camera positions -R^T t of two poses (3, 4).
 
-    Sec. VI takes |t_true - t|. That mixes the rotation error with the distance to the map's origin, which nobody cares
-    about: a camera placed to 2 mm but turned by 0.75 degrees, 3 m from the origin, would be 4 cm off.
+    Sec. VI uses |t_true - t|. That mixes the rotation error with the distance to the map's origin, which is arbitrary:
+    a camera placed to 2 mm but turned by 0.75 degrees, 3 m from the origin, would be 4 cm off.
     """
     return float(np.linalg.norm(camera_centre(truth) - camera_centre(estimate)))
 
@@ -62,7 +62,7 @@ def ransac_success_probability(inlier_rate: float, sample_size: int, iterations:
 
 
 def evaluate(trace: Trace) -> Metrics:
-    """Score a run against what is known of its truth."""
+    """Score a run with the true pose and labels, as far as they are known."""
     problem, estimate = trace.problem, trace.cam_from_map
     rotation = translation = t_error = success = None
     if problem.truth_cam_from_map is not None:

@@ -1,7 +1,7 @@
-"""How much larger or smaller than stated the noise of a pose is: for a covariance that holds on real matches.
+"""Estimates the ratio of the real noise to the stated noise, so that the covariance of a pose holds on real matches.
 
 Least squares with residuals r_k and Jacobians J_k has the covariance (sum J' J)^-1 if the noise has unit variance and
-no two residuals are related. Matches that share a map point or a pixel are, so their scores J' r are added up first:
+all residuals are independent. Matches that share a map point or a pixel are not, so their scores J' r are added first:
 with B the sum of the outer products of these sums over G groups, trace((sum J' J)^-1 B) / d estimates the variance of
 the noise times the share by which repeated matches count too often (the cluster-robust covariance as one number,
 which is steadier than the matrix where there are few matches).
@@ -13,9 +13,9 @@ from spherloc.problem import AlignedProblem
 from spherloc.types import BoolArray, FloatArray, IntArray
 
 PRIOR_GROUPS = 10.0
-"""Groups of matches with the stated noise that are believed in beforehand."""
+"""Weight of the prior: as if this number of groups of matches with the stated noise had been measured before."""
 SHARED_PX = 0.15
-"""Error that all matches share, px: no calibration and no map is better, however many matches there are."""
+"""Error that all matches share, px: no calibration or map is more accurate, however many matches there are."""
 _GENERIC_DIRECTION = np.array([0.7390851332151607, 0.5671432904097838, 0.9159655941772190])
 """A direction in which no two different points have the same coordinate, for practical purposes."""
 
@@ -23,9 +23,9 @@ _GENERIC_DIRECTION = np.array([0.7390851332151607, 0.5671432904097838, 0.9159655
 def variance_factor(
     aligned: AlignedProblem, cam_from_map: FloatArray, inliers: BoolArray, noise_px: float, dof: int
 ) -> float:
-    """By what the covariance for a noise of ``noise_px`` must be multiplied at an aligned pose (3, 4).
+    """The factor for the covariance of an aligned pose (3, 4) that assumes a noise of ``noise_px``.
 
-    ``inliers`` (M,) are what was fitted, with ``dof`` degrees of freedom. 1 where they are too few to tell.
+    ``inliers`` (M,) are the fitted matches, ``dof`` the degrees of freedom of the pose. 1 if there are too few inliers.
     """
     if np.count_nonzero(inliers) <= dof:
         return 1.0
@@ -35,7 +35,7 @@ def variance_factor(
     ray = ray / length
     residual = np.einsum("nij,nj->ni", pixel_jacobian, ray) / noise_px
     by_ray = (pixel_jacobian - residual[:, :, None] * noise_px * ray[:, None, :]) / noise_px
-    # A turn moves the ray by w x ray, whatever the distance; a shift by d / length.
+    # A rotation w moves the ray by w x ray at any distance; a translation d by d / distance.
     by_turn = np.cross(ray[:, None, :], by_ray)
     jacobian = np.concatenate([by_turn, by_ray / length[..., None]], axis=2)
     if dof == 4:
@@ -48,7 +48,7 @@ def variance_factor(
     np.add.at(scores, groups, np.einsum("nia,ni->na", jacobian, residual))
     information = np.einsum("nia,nib->ab", jacobian, jacobian) + 1e-12 * np.eye(dof)
     factor = np.trace(np.linalg.solve(information, scores.T @ scores)) / dof
-    # The pose takes half of its freedom from each row of a residual.
+    # Each of the two rows of a residual loses half of the pose's degrees of freedom.
     factor *= count / max(count - 0.5 * dof, 1.0)
     factor = (PRIOR_GROUPS + count * factor) / (PRIOR_GROUPS + count)
     shared = (SHARED_PX / noise_px) ** 2 * np.count_nonzero(inliers) / dof
@@ -56,7 +56,7 @@ def variance_factor(
 
 
 def _groups(points: FloatArray, bearings: FloatArray) -> IntArray:
-    """(K,) number of each match's group: those with the same point, or the same bearing, are together."""
+    """Group numbers (K,) of the matches: those with the same point or the same bearing are in one group."""
     by_point = np.unique(points @ _GENERIC_DIRECTION, return_inverse=True)[1]
     by_bearing = np.unique(bearings @ _GENERIC_DIRECTION, return_inverse=True)[1]
     count = len(points)

@@ -1,8 +1,8 @@
-"""What became of a run without looking at the truth: localized, doubtful or failed, by one rule.
+"""Judges a run without the truth: localized, doubtful or failed, by one rule.
 
-A pose is believed if its inliers are more than chance gives, if no clearly different pose is supported about as well
-and no pose with another gravity much better, and if they fix it to within the error of a success. Each of these is a
-margin, 0 where belief begins; the least of them is the run's score.
+A pose is believed if its inliers are more than chance explains, if no clearly different pose is supported about as well
+and no pose with another gravity much better, and if they fix it to within the errors of a success. Each condition has a
+margin, which is 0 at its limit; the smallest margin is the run's score.
 """
 
 from dataclasses import dataclass, replace
@@ -24,32 +24,32 @@ from spherloc.trace import ConsensusStage, RefinementStage, Trace
 from spherloc.types import BoolArray, FloatArray
 
 MIN_SDS = 2.0
-"""Standard deviations that must lie within the error of a success."""
+"""Number of standard deviations that must lie within the errors of a success."""
 SAMPLES, CONFIDENCE = 2000, 0.99
-"""Of the search for an alternative among what the pose does not explain."""
+"""Samples and confidence of the search for an alternative pose among the matches that the pose does not explain."""
 FAR = 3.0
-"""A correspondence farther off than so many bounds is not explained by the pose."""
+"""A correspondence whose residual exceeds this many bounds is used in that search."""
 
 
 class Outcome(StrEnum):
-    """What became of a run."""
+    """The outcome of a run."""
 
     LOCALIZED = "localized"
     """The pose is believed."""
     DOUBTFUL = "doubtful"
-    """There is a pose, but chance, an alternative, or what its inliers leave open speaks against it."""
+    """There is a pose, but chance, an alternative pose, another gravity or its covariance speaks against it."""
     FAILED = "failed"
     """There is no pose."""
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """An outcome and what it rests on."""
+    """An outcome with its score and its reasons."""
 
     outcome: Outcome
-    """What became of the run."""
+    """The outcome of the run."""
     score: float
-    """The least margin; a pose is believed from 0 on, -inf if there is none."""
+    """The least margin; a pose is believed from 0 on; -inf without a pose."""
     reasons: tuple[str, ...]
     """Sentences: what speaks against the pose, or why there is none; empty if it is believed."""
 
@@ -63,7 +63,7 @@ def judge(trace: Trace) -> Judgement:
 
 
 def known_judgement(trace: Trace) -> Judgement | None:
-    """How a run was judged; None if it was not yet."""
+    """The judgement of a run if it was judged before; else None."""
     return _JUDGED.get(trace)
 
 
@@ -103,7 +103,7 @@ def _chance_margin(count: int, size: int, rate: float, fixed_by: int) -> tuple[f
 def _alternative_margin(
     trace: Trace, aligned: AlignedProblem, state: FloatArray, errors: FloatArray, size: int, rate: float, fixed_by: int
 ) -> tuple[float, str]:
-    """The lead over the best clearly different pose that is itself no chance."""
+    """Margin over the best clearly different pose that chance does not explain."""
     bound_px, most = float(trace.options.bound_px), 0
     poses = (
         [] if (stage := trace.stage(ConsensusStage)) is None else [aligned.align_pose(p) for p in stage.cam_from_map]
@@ -130,7 +130,7 @@ def _alternative_margin(
 def _gravity_margin(
     aligned: AlignedProblem, state: FloatArray, bound_px: float, inliers: BoolArray, options: RefinementOptions
 ) -> tuple[float, str]:
-    """By how little a pose nearby explains more if gravity is not believed."""
+    """Margin against poses nearby that ignore the given gravity and explain more."""
     size = count_distinct(aligned, inliers)
     free = nearby_support(aligned, state, bound_px, float(options.noise_px))
     return (
@@ -140,7 +140,7 @@ def _gravity_margin(
 
 
 def _error_margin(trace: Trace, aligned: AlignedProblem, state: FloatArray, inliers: BoolArray) -> tuple[float, str]:
-    """How much smaller the stated error is than that of a success, in powers of e."""
+    """Margin of the covariance: natural logarithm of the ratio of a success's errors to the stated errors."""
     size, options = int(np.count_nonzero(inliers)), trace.options
     if size < 2:
         return -np.inf, "Its inliers do not fix it."

@@ -15,10 +15,10 @@ from spherloc.ranges import MAX_M, MAX_PX, MIN_M, MIN_PX, is_number
 from spherloc.types import BoolArray, FloatArray, IntArray
 
 MIN_STRETCH = 0.01
-"""Smallest ratio of the two singular values of an unprojection's Jacobian that residuals believe in."""
+"""Smallest ratio of the two singular values of an unprojection's Jacobian; a smaller one is replaced by it."""
 
 MAX_SOURCE = 200
-"""Characters of ``Problem.gravity_source``."""
+"""Largest number of characters of ``Problem.gravity_source``."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +26,7 @@ class Problem:
     """N measured 2D-3D correspondences of one query image. Arrays are copied and made read-only."""
 
     name: str
-    """Shown to people; also the stem of recordings."""
+    """Name that users see; also the beginning of the file names of recordings."""
     camera: Camera
     """The query camera."""
     pixels: FloatArray
@@ -42,9 +42,9 @@ class Problem:
     gravity_sd_rad: float | None = None
     """Standard deviation of each of its two tilts; None takes a third of the bound."""
     gravity_source: str = ""
-    """What says where down is in the camera, in a few words such as "the IMU"; empty if nothing is told of it."""
+    """Source of ``gravity_camera`` in a few words, such as "the IMU"; empty if unknown."""
     bound_px: float | None = None
-    """Pixel bound asked for by the scene; None leaves it to the estimator."""
+    """Bound that the scene asks for, px; None leaves it to the estimator."""
     truth_cam_from_map: FloatArray | None = None
     """True pose (3, 4), if known."""
     truth_inliers: BoolArray | None = None
@@ -58,17 +58,17 @@ class Problem:
     reference_index: IntArray | None = None
     """(N,) index into ``reference_images`` of each correspondence."""
     reference_pixels: FloatArray | None = None
-    """(N, 2) its pixel there; NaN where it is unknown."""
+    """(N, 2) pixel of each correspondence in its reference image; NaN where it is unknown."""
     estimated_outlier_rate: float | None = None
-    """What the front end expects from the statistics of its matches, 0 to 1; a rough guess."""
+    """Rough estimate of the outlier rate, 0 to 1, by the front end from the statistics of its matches."""
     remarks: tuple[str, ...] = ()
-    """What the loader and the front end skipped and why, in sentences."""
+    """Sentences of the loader and the front end about what they skipped and why."""
     verified_without_point: int = 0
-    """Matches between the query and its references that agree with one motion, but have no point in the map, counted
-    where few have one: more than there are correspondences, the map is too sparse."""
+    """Number of matches between the query and its references that agree with one motion but have no map point; counted
+    only if few have one. If it exceeds the number of correspondences, the map is too sparse."""
     metric: bool = True
-    """Whether the map's lengths are metres. If not, whatever is told in metres is in the map's own units, whose size
-    is unknown."""
+    """Whether the map's lengths are metres. If not, all values in metres are in the map's own unit, whose length is
+    unknown."""
 
     def __post_init__(self) -> None:
         pixels, points = _array(self, "pixels", (-1, 2)), _array(self, "points", (-1, 3))
@@ -80,7 +80,7 @@ class Problem:
         _scalar(self, "gravity_bound_rad", 0.0, below_90, "an angle from 0 to below pi / 2")
         _scalar(self, "gravity_sd_rad", 0.0, np.inf, "0 or more, or inf if nothing is known")
         if not isinstance(self.gravity_source, str) or len(self.gravity_source) > MAX_SOURCE:
-            raise ProblemError(f"{self.name}: gravity_source is no text of at most {MAX_SOURCE} characters; give one.")
+            raise ProblemError(f"{self.name}: gravity_source is not a text of up to {MAX_SOURCE} characters; give one.")
         if not isinstance(self.metric, bool):
             raise ProblemError(f"{self.name}: metric is {self.metric!r}; give true or false.")
         _scalar(self, "bound_px", MIN_PX, MAX_PX, f"{MIN_PX:g} to {MAX_PX:,.0f} pixels")
@@ -116,19 +116,19 @@ class Problem:
 
     @property
     def unit(self) -> str:
-        """What a length of the map is told in: "m" or "units"."""
+        """Unit of the map's lengths: "m" or "units"."""
         return "m" if self.metric else "units"
 
     @property
     def gravity_words(self) -> str:
-        """Where gravity comes from and how far it may be off: "from the IMU, within 3 deg"."""
+        """The source of gravity and its bound in words: "from the IMU, within 3 deg"."""
         source = f"from {self.gravity_source}, " if self.gravity_source else ""
         bound_deg = np.degrees(self.gravity_bound_rad)
         return f"{source}{f'within {bound_deg:.2g} deg' if bound_deg else 'taken as exact'}"
 
     @property
     def gravity_error_rad(self) -> float | None:
-        """Angle between ``gravity_camera`` and down at the true pose; None if that is unknown."""
+        """Angle between ``gravity_camera`` and the true pose's gravity; None if the true pose is unknown."""
         if self.truth_cam_from_map is None:
             return None
         down = self.truth_cam_from_map[:, :3] @ self.gravity_map
@@ -160,7 +160,7 @@ class Problem:
         jacobian = basis @ self.camera.unprojection_jacobian(self.pixels[usable])
         left, stretch, right = np.linalg.svd(jacobian)
         largest[usable] = stretch[:, 0]
-        # At a panorama's pole one direction collapses; without a floor a point far away would cost nothing.
+        # At a panorama's pole one singular value is 0; without a lower limit, a residual in that direction would be 0.
         stretch = np.maximum(stretch, MIN_STRETCH * stretch[:, :1])
         inverse[usable] = np.einsum("nji,nj,nkj,nkl->nil", right, 1.0 / stretch, left, basis)
         return _frozen(inverse), _frozen(largest)
@@ -209,7 +209,7 @@ class AlignedProblem:
     """M usable correspondences in frames whose y axes point down; the unknowns are yaw and translation."""
 
     index: IntArray
-    """Their places (M,) in the problem."""
+    """Their indices (M,) in the problem."""
     count: int
     """N, the number of correspondences in the problem."""
     camera_turn: FloatArray
@@ -229,10 +229,10 @@ class AlignedProblem:
     gravity_sd_rad: float
     """Standard deviation of each of its two tilts: 0 where gravity is exact, inf where it is unknown."""
     estimated_outlier_rate: float | None = None
-    """What the front end expects, 0 to 1."""
+    """The front end's estimate of the outlier rate, 0 to 1."""
 
     def __post_init__(self) -> None:
-        # Compiled kernels are made for read-only arrays; others would have them compiled once more.
+        # Kernels are compiled for read-only arrays; for writable ones numba would compile them once more.
         for item in fields(self):
             value = getattr(self, item.name)
             if isinstance(value, np.ndarray):
@@ -240,7 +240,7 @@ class AlignedProblem:
 
     @cached_property
     def pixels_per_radian(self) -> FloatArray:
-        """(M,), px/rad in the direction in which it is largest."""
+        """(M,) pixels per radian, in the direction in which there are most."""
         # The larger singular value of two rows a, b.
         a, b = self.pixel_from_bearing[:, 0], self.pixel_from_bearing[:, 1]
         aa, bb, ab = (np.einsum("ni,ni->n", u, v) for u, v in ((a, a), (b, b), (a, b)))
@@ -286,14 +286,14 @@ def _numbers(problem: Problem, name: str) -> FloatArray:
 
 
 def _of_kind(problem: Problem, name: str, kinds: str) -> NDArray[Any]:
-    """A field as an array of numpy's ``kinds``; raises ``ProblemError`` if it is none."""
+    """A field as an array of one of numpy's ``kinds``; raises ``ProblemError`` if it cannot be one."""
     try:
         array = np.array(getattr(problem, name))
         array = array.astype(np.float64) if array.dtype.kind == "O" else array
     except (TypeError, ValueError, OverflowError):
         array = np.array("")
     if array.dtype.kind not in kinds and array.size:
-        raise ProblemError(f"{problem.name}: {name} is no array of numbers; give one, with rows of the same length.")
+        raise ProblemError(f"{problem.name}: {name} is not an array of numbers; give one with rows of the same length.")
     return array
 
 
@@ -347,11 +347,11 @@ def _unit(problem: Problem, name: str) -> None:
     length = float(np.linalg.norm(vector))
     if abs(length - 1.0) > 1e-3:
         raise ProblemError(f"{problem.name}: {name} has length {length:.4g}; give a unit vector pointing down.")
-    # A vector that is a unit vector already keeps its last bit, so that a problem read back is the same problem.
+    # A unit vector is not changed in its last bits, so that a problem that is read back is the same problem.
     object.__setattr__(problem, name, _frozen(vector / length if abs(length - 1.0) > 1e-15 else vector))
 
 
 def _check_rotation(name: str, cam_from_map: FloatArray) -> None:
     rotation = cam_from_map[:, :3]
     if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) or np.linalg.det(rotation) < 0:
-        raise ProblemError(f"{name}: the left 3x3 block of the true cam_from_map is no rotation matrix.")
+        raise ProblemError(f"{name}: the left 3x3 block of the true cam_from_map is not a rotation matrix; correct it.")

@@ -1,4 +1,5 @@
-"""A proof that no pose explains more than a run's certificate says, as a file that ``proof_check`` verifies."""
+"""Writes the proof of a run's certificate, that no pose explains more matches, to a file that ``proof_check``
+verifies."""
 
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from spherloc.watch import Watch
 
 MAX_CELLS = 2_000_000
 MAX_FOR_PROOF = 5000
-"""Correspondences up to which a proof is written: the checker tests all of them in every cell."""
+"""Largest number of correspondences for which a proof is written: the checker tests all of them in every cell."""
 
 
 def write_proof(trace: Trace, path: Path, watch: Watch | None = None) -> int:

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 Arrays = dict[str, NDArray[Any]]
 
 SLACK = 1e-12
-"""Rad, against rounding."""
+"""Tolerance for rounding, rad."""
 NO_TILT, STABBED, LINEAR = 0, 1, 2
 
 
@@ -29,15 +29,15 @@ UNREADABLE = (
     *(OSError, EOFError, ValueError, KeyError, IndexError, TypeError, MemoryError, zipfile.BadZipFile, zlib.error),
     np.linalg.LinAlgError,
 )
-"""What a file that is no proof may raise."""
+"""Exceptions that reading a file that is not a proof may raise."""
 
 
 class Refused(Exception):  # noqa: N818
-    """The proof does not hold, and why."""
+    """The proof does not hold; the message says why."""
 
 
 def check(path: Path) -> str:
-    """What is proven, as a sentence; raises ``Refused`` if the file proves nothing."""
+    """The proven statement as a sentence; raises ``Refused`` if the proof does not hold."""
     try:
         with np.load(path, allow_pickle=False) as file:
             proof: Arrays = {name: file[name] for name in file.files}
@@ -62,7 +62,7 @@ def _check(proof: Arrays) -> str:
     if np.abs(np.linalg.norm(bearings, axis=1) - 1.0).max(initial=0.0) > 1e-9 or along > 1e-6 * stretch.max(
         initial=1.0
     ):
-        raise Refused("a bearing is no unit vector, or its residual does not vanish in its own direction.")
+        raise Refused("a bearing is not a unit vector, or its residual does not vanish in its own direction.")
     if int(proof["found"]) > max(1, max((_explained(proof, pose) for pose in proof["cam_from_map"]), default=1)):
         raise Refused("the pose explains fewer matches than the file says, or its tilt is beyond the gravity bound.")
     for k in range(7):
@@ -92,7 +92,7 @@ def _check(proof: Arrays) -> str:
 
 
 def _explained(proof: Arrays, pose: NDArray[Any]) -> int:
-    """Matches that a pose (3, 4) explains; 0 if it is none or its tilt is beyond the gravity bound."""
+    """Number of matches that a pose (3, 4) explains; 0 if it is not a pose or its tilt is beyond the gravity bound."""
     rotation = pose[:, :3]
     proper = np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-9 and np.linalg.det(rotation) > 0.0
     if not proper or rotation[1, 1] < np.cos(float(proof["gravity_bound_rad"])) - 1e-12:
@@ -105,7 +105,8 @@ def _explained(proof: Arrays, pose: NDArray[Any]) -> int:
 
 
 def _cover(first: NDArray[Any], last: NDArray[Any], lower: NDArray[Any], upper: NDArray[Any]) -> None:
-    """Refuse cells that leave a part of the box uncovered: cut it where no cell is cut until each part is in one."""
+    """Refuse cells that do not cover the whole box: the box is divided at places where no cell is cut, until each part
+    is a single cell."""
     waiting = [(first, last, np.arange(len(lower)))]
     while waiting:
         first, last, mine = waiting.pop()
@@ -130,7 +131,7 @@ def _cover(first: NDArray[Any], last: NDArray[Any], lower: NDArray[Any], upper: 
 
 
 def _bound(matches: Arrays, chart: int, lower: NDArray[Any], upper: NDArray[Any], rule: int) -> int:
-    """Matches that some pose of a cell may explain."""
+    """Upper bound on the number of matches that a pose of a cell explains."""
     least = np.maximum(np.maximum(lower[4:], -upper[4:]), 0.0)
     limit = float(matches["limit"])
     if rule == NO_TILT:
@@ -174,7 +175,7 @@ def _bound(matches: Arrays, chart: int, lower: NDArray[Any], upper: NDArray[Any]
 
 
 def _stab(matches: Arrays, w: NDArray[Any], reach: Any, tilt: Any, half: Any, lower: Any, upper: Any) -> int:
-    """Most intervals of yaw over one yaw of the cell."""
+    """Largest number of yaw intervals that cover one yaw of the cell."""
     widest = 2.0 * np.arccos(min(1.0, 0.5 * (1.0 + np.sqrt(np.cos(float(matches["limit"]))))))
     middle = 0.5 * (lower + upper)
     psi = min(float(np.hypot(half[4], half[5])), widest + abs(middle[4]) + abs(middle[5]))

@@ -8,11 +8,11 @@ from typing import Any
 from spherloc.errors import InputError, show
 
 MIN_PX, MAX_PX = 1e-6, 1e6
-"""Pixel bounds and noise."""
+"""Limits of pixel bounds and noise."""
 MIN_M, MAX_M = 1e-12, 1e12
-"""The farthest point from the origin; a map may also be all in the origin."""
+"""Limits of the largest distance of a point from the origin; all points may also be in the origin."""
 MIN_OTHER, MAX_OTHER = 1e-12, 1e12
-"""Other options that are neither 0 nor infinite."""
+"""Limits of other options that are neither 0 nor infinite."""
 MAX_SEED = 2**63 - 1
 
 
@@ -37,11 +37,11 @@ def check_options(options: Any) -> None:
 
 
 def is_number(value: Any) -> bool:
-    """A real number of Python or numpy, and no truth value."""
+    """Whether a value is a real number of Python or numpy, and not a bool."""
     return isinstance(value, Real) and not isinstance(value, bool)
 
 
 def check_seed(seed: Any) -> None:
-    """Raise ``InputError`` for what is no whole number from 0 to ``MAX_SEED``."""
+    """Raise ``InputError`` unless the seed is a whole number from 0 to ``MAX_SEED``."""
     if isinstance(seed, bool) or not isinstance(seed, Integral) or not 0 <= int(seed) <= MAX_SEED:
         raise InputError(f"seed is {show(seed)}; give a whole number from 0 to 2^63 - 1.")

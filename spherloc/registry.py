@@ -1,7 +1,7 @@
 """Finds cameras, calibration readers, solvers, estimators, dataset loaders and layers by entry point.
 
-A new kind is one file and one line. What another package registers is an extension (docs/extending.md). One that cannot
-be imported or fails costs itself only: whoever asks for it gets one sentence that names it.
+To add one takes one file and one line. What another package registers is an extension (docs/extending.md). An extension
+that cannot be imported or fails does not affect others: where it is used, one sentence names it.
 """
 
 import importlib
@@ -15,7 +15,7 @@ from typing import Any
 from spherloc.errors import InputError, SpherlocError, reason, shorten, show
 
 OWN = "spherloc"
-"""The distribution whose entry points are no extensions."""
+"""The distribution whose entry points are spherloc's own, not extensions."""
 KINDS = {
     "cameras": "camera",
     "calibrations": "calibration reader",
@@ -25,7 +25,8 @@ KINDS = {
     "layers": "layer",
     "lessons": "lesson",
 }
-"""What there is to register, the last part of the name of its group of entry points, and what a sentence calls one."""
+"""Kinds of things that can be registered: the last part of the name of the group of entry points, and the name of one
+in messages."""
 RANSAC = "ransac-"
 """A solver "p6" is the estimator "ransac-p6" too, unless there is an estimator of that name."""
 UNLISTED = {
@@ -33,9 +34,9 @@ UNLISTED = {
         "given-pose", "spherloc.estimators.given_pose:GivenPose", "spherloc.estimators"
     )
 }
-"""What spherloc has under a name that no list offers, by kind and name."""
+"""spherloc's own objects that can be used by name but are not listed, by kind and name."""
 _AROUND_SOLVER = EntryPoint("around", "spherloc.estimators.ransac_solver:around", "spherloc")
-"""Makes that estimator; imported when one is asked for, since it stands on a floor above."""
+"""Makes that estimator; imported only when one is asked for, since its module is on a higher floor."""
 
 
 @dataclass(frozen=True)
@@ -46,13 +47,13 @@ class Registered:
     """A key of ``KINDS``."""
     name: str
     package: str
-    """Its distribution."""
+    """The distribution that registers it."""
     version: str
-    """Of the distribution; empty if that states none."""
+    """Version of the distribution; empty if it states none."""
     target: str
-    """Where it points, "module:object"."""
+    """The object, "module:object"."""
     clash: str = ""
-    """Why another one is used in its place, as a sentence; empty if it is used."""
+    """Sentence that says why another entry point is used in its place; empty if it is used."""
 
     @property
     def is_own(self) -> bool:
@@ -62,7 +63,7 @@ class Registered:
 
 @cache
 def names(kind: str) -> tuple[str, ...]:
-    """Names registered for ``kind``, a key of ``KINDS``, by alphabet; nothing is imported."""
+    """Names registered for ``kind``, a key of ``KINDS``, in alphabetical order; nothing is imported."""
     found = {point.name for point in _points(kind)}
     if kind == "estimators":
         found |= {RANSAC + name for name in names("solvers")}
@@ -82,11 +83,11 @@ def lookup(kind: str, name: str) -> Any:
         return _AROUND_SOLVER.load()(name, point.name)
     try:
         return point.load()
-    except (Exception, SystemExit) as error:  # whatever the code of others does when it is imported
+    except (Exception, SystemExit) as error:  # foreign code can raise anything when it is imported
         if not extension_of(kind, name):
             raise
         what = f"{shorten(type(error).__name__)}: {reason(error)}"
-        raise InputError(f"{title(kind, name)} cannot be imported ({what}); mend or uninstall it.") from error
+        raise InputError(f"{title(kind, name)} cannot be imported ({what}); repair or uninstall it.") from error
 
 
 @cache
@@ -104,7 +105,7 @@ def own_module(kind: str, name: str) -> str:
 
 
 def title(kind: str, name: str) -> str:
-    """What a sentence calls it, with the extension that it comes from."""
+    """Its name in messages, with the extension that it comes from."""
     return _titled(kind, name, extension_of(kind, name))
 
 
@@ -129,7 +130,7 @@ def registered(kind: str, taken: Collection[str] = ()) -> tuple[Registered, ...]
 
 @contextmanager
 def guarded(kind: str, name: str, where: str = "") -> Iterator[None]:
-    """Around a call into what ``lookup`` gave: whatever an extension raises becomes an ``InputError`` that names it.
+    """Context of a call into an object from ``lookup``: any exception of an extension becomes an ``InputError``.
 
     ``where`` names the file that it was to read.
     """
@@ -150,7 +151,7 @@ def _titled(kind: str, name: str, extension: str) -> str:
 
 
 def _clash(kind: str, point: EntryPoint, taken: Collection[str]) -> str:
-    """Why this one is not used, as a sentence; empty if it is."""
+    """Sentence that says why this one is not used; empty if it is used."""
     mine = _titled(kind, point.name, shorten(_distribution(point) or point.value))
     if _is_own(point):
         return ""
@@ -175,7 +176,7 @@ def _group(kind: str) -> str:
 
 @cache
 def _point(kind: str, name: str) -> EntryPoint | None:
-    """The entry point that is used; of an estimator maybe that of its solver."""
+    """The entry point that is used for a name; for an estimator it may be that of its solver."""
     found = sorted((point for point in _points(kind) if point.name == name), key=_rank)
     if not found and (kind, name) in UNLISTED:
         return UNLISTED[kind, name]
@@ -185,7 +186,7 @@ def _point(kind: str, name: str) -> EntryPoint | None:
 
 
 def _rank(point: EntryPoint) -> tuple[bool, str]:
-    """Of several with one name the lowest is used."""
+    """Sort key: of several entry points with one name the one with the lowest key is used."""
     return not _is_own(point), _distribution(point)
 
 
@@ -205,7 +206,7 @@ def _distribution(point: EntryPoint) -> str:
 
 @cache
 def _name(distribution: Distribution) -> str:
-    """Its name; kept, since asking for it parses all that is said of the package, its readme included."""
+    """Name of a distribution; cached, since the whole metadata of the package are parsed for it, readme included."""
     return str(distribution.name or "")
 
 

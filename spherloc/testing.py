@@ -1,4 +1,4 @@
-"""The contracts of what packages may register, as checks that spherloc's own kinds pass (docs/extending.md).
+"""Checks of the contracts of what packages may register; spherloc's own kinds pass them (docs/extending.md).
 
 Each check raises ``AssertionError`` with one sentence that says what is wrong and where; none needs a test framework.
 """
@@ -36,7 +36,7 @@ from spherloc.watch import Cancelled, Watch
 
 
 class Subject:
-    """What is being checked: the subject of the sentences that say what is wrong with it."""
+    """The object that is being checked; its name is the subject of the sentences about what is wrong."""
 
     def __init__(self, what: str) -> None:
         self._what = what
@@ -51,7 +51,7 @@ class Subject:
         raise AssertionError(f"{self._what} {otherwise}.")
 
     def raises(self, kind: type[Exception], call: Callable[[], Any], of: str) -> None:
-        """Raise ``AssertionError`` unless ``call`` raises this kind of error; ``of`` says of what."""
+        """Raise ``AssertionError`` unless ``call`` raises this kind of error; ``of`` says in which case it should."""
         try:
             call()
         except kind:
@@ -62,12 +62,12 @@ class Subject:
 
 
 def name_of(thing: Any) -> str:
-    """What to call it: its name, or that of its type."""
+    """Its name in messages: its own, or that of its type."""
     return str(getattr(thing, "name", getattr(thing, "__name__", type(thing).__name__)))
 
 
 def difference(one: Any, other: Any, path: str) -> str:
-    """Where two traces, stages or problems differ in anything but times; empty if they do not."""
+    """The path of the first difference, other than of times, of two traces, stages or problems; empty if equal."""
     if isinstance(one, np.ndarray):
         alike = isinstance(other, np.ndarray) and one.dtype == other.dtype and one.tobytes() == other.tobytes()
         return "" if alike and one.shape == other.shape else path
@@ -84,9 +84,9 @@ def difference(one: Any, other: Any, path: str) -> str:
 
 
 GRID = 400
-"""Pixels along the longer side of the image at which a camera is looked at, in even steps."""
+"""Number of pixels along the longer side of the image, in even steps, at which a camera is checked."""
 STEP_PX = 1e-2
-"""Of central differences."""
+"""Step of central differences."""
 
 
 def check_camera(camera: Camera) -> None:
@@ -120,7 +120,7 @@ def check_calibration_reader(reader: Reader | str, path: str | Path, name: str |
     subject = Subject(f"the calibration reader {show(reader if isinstance(reader, str) else name_of(reader))}")
     read = reader_of(reader) if isinstance(reader, str) else reader
     camera = read(Path(path), name)
-    subject.need(isinstance(camera, Camera), f"gives {show(camera)} for {path}, which is no camera")
+    subject.need(isinstance(camera, Camera), f"gives {show(camera)} for {path}, which is not a camera")
     assert isinstance(camera, Camera)
     check_camera(camera)
     content = read_file(Path(path), MAX_FILE_BYTES)
@@ -160,12 +160,12 @@ def _pixels(camera: Camera) -> FloatArray:
 
 
 def _angles(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Between rows of (N, 3), rad."""
+    """Angles (N,) between rows of two arrays (N, 3), rad."""
     return np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), np.sum(a * b, axis=1))
 
 
 def _at(where: FloatArray, wrong: BoolArray) -> str:
-    """One of the places, in words."""
+    """The first of the wrong places, in words."""
     return "(" + ", ".join(f"{value:.6g}" for value in where[int(np.argmax(wrong))]) + ")"
 
 
@@ -177,7 +177,7 @@ def _check_image(camera: Camera, subject: Subject) -> None:
     subject.need(valid.mean() > 0.01, "sees less than 1 % of its own image")
     subject.need(np.isnan(bearings[~valid]).all(), "gives bearings other than NaN where unproject() is invalid")
     wrong = valid & ~(np.abs(np.linalg.norm(bearings, axis=1) - 1.0) < 1e-12)
-    subject.need(not wrong.any(), f"gives a bearing that is no unit vector at the pixel {_at(pixels, wrong)}")
+    subject.need(not wrong.any(), f"gives a bearing that is not a unit vector at the pixel {_at(pixels, wrong)}")
     again, seen = camera.project(bearings)
     forms = np.shape(again) == (len(pixels), 2) and np.shape(seen) == (len(pixels),) and seen.dtype == bool
     subject.need(forms, "gives project() of N points other than pixels (N, 2) and a mask (N,) of bool")
@@ -215,7 +215,7 @@ def _check_jacobian(camera: Camera, subject: Subject) -> None:
     subject.need(np.isnan(analytic[~valid]).all(), "gives a Jacobian other than NaN where unproject() is invalid")
     ends = [[camera.unproject(pixels + sign * axis)[0] for sign in (1, -1)] for axis in np.eye(2) * STEP_PX]
     numeric = np.stack([(ahead - behind) / (2 * STEP_PX) for ahead, behind in ends], axis=-1)
-    # The differences themselves fail where the rim is near, and the model bends without bound there.
+    # Differences fail near the rim, where the second derivatives of the model are unbounded.
     outward = pixels + 0.02 * (pixels - [camera.width / 2, camera.height / 2])
     inside = camera.unproject(outward)[1] & np.isfinite(numeric).all(axis=(1, 2))
     inside[-2:] = False
@@ -282,9 +282,9 @@ def _check_table(camera: Camera, subject: Subject) -> None:
 def check_dataset(scene: str | Path, loader: Callable[[dict[str, Any], Path], Any] | None = None) -> None:
     """Raise ``AssertionError`` unless the scene of a file, and its loader, keep the contract of scene files.
 
-    ``loader`` is the one that is registered for the file's kind if it is not given. The scene has a name and gives the
-    same ``Problem`` whenever it is asked; the loader refuses unknown keys, and values of other types, with an
-    ``InputError`` that names the file; and its module says what it reads and has an ``EXAMPLE`` of its own kind.
+    Without ``loader``, the one that is registered for the file's kind is checked. The scene has a name and always gives
+    the same ``Problem``; the loader refuses unknown keys, and values of other types, with an ``InputError`` that names
+    the file; and its module has a docstring and an ``EXAMPLE`` of its own kind.
     """
     path = Path(scene)
     table = read_table(path)
@@ -293,7 +293,7 @@ def check_dataset(scene: str | Path, loader: Callable[[dict[str, Any], Path], An
     found = load(dict(table), path) if loader else load_scene(path)
     subject.need(isinstance(found.name, str) and found.name.isprintable() and bool(found.name), f"names {path} badly")
     problem = found.problem()
-    subject.need(isinstance(problem, Problem), f"gives {show(problem)} for {path}, which is no Problem")
+    subject.need(isinstance(problem, Problem), f"gives {show(problem)} for {path}, which is not a Problem")
     changed = difference(problem, found.problem(), "the problem")
     subject.need(not changed, f"gives another problem when it is asked again: {changed} of {path} differs")
     changes = [{**table, "no_such_key": 1}]
@@ -326,9 +326,10 @@ def check_solver(solver: Solver | str) -> None:
     """Raise ``AssertionError`` unless a solver, or the one registered under a name, keeps the contract of
     ``spherloc.solvers.base.Solver``.
 
-    Of noise-free correspondences one of its poses is the true one, within 1e-6 rad and m, for one more than
-    ``sample_size`` always and for a minimal sample in 9 of 10; solutions are rotations and finite, also of degenerate
-    input; the same input gives the same bits; its arrays are left alone; and wrong input is a ``ProblemError``.
+    For noise-free correspondences one of its poses is the true one, within 1e-6 rad and m: always for ``sample_size`` +
+    1 of them, and for a minimal sample in 9 of 10 cases. Solutions are finite and have rotation matrices, also for
+    degenerate input; the same input gives the same bits; the input arrays are not changed; and wrong input raises
+    ``ProblemError``.
     """
     subject = Subject(f"the solver {show(solver if isinstance(solver, str) else getattr(solver, 'name', solver))}")
     solver = solver_of(solver) if isinstance(solver, str) else solver
@@ -373,8 +374,9 @@ def check_estimator(estimator: str | Any) -> None:
     ``spherloc.estimators.base.Estimator``.
 
     It finds the pose of easy problems (60 matches, 20 % wrong, 100 degrees wide); the same seed gives the same bits;
-    what it returns has the right forms; too few, wrong and equal matches end in a sentence or a finite pose; options
-    are frozen and refuse nonsense with ``InputError``; and a cancelled run begins no further stage.
+    the results have the right types and shapes; too few, wrong and equal matches give a finite pose or a sentence
+    without a pose; options are frozen and refuse invalid values with ``InputError``; and a cancelled run begins no
+    further stage.
     """
     name = estimator if isinstance(estimator, str) else name_of(estimator)
     subject = Subject(f"the estimator {show(name)}")
@@ -423,7 +425,7 @@ def _check_rotations(found: FloatArray, subject: Subject, where: str) -> None:
     rotations = found[:, :, :3]
     good = np.isfinite(found).all() and np.allclose(rotations @ rotations.transpose(0, 2, 1), np.eye(3), atol=1e-9)
     subject.need(
-        good and (np.linalg.det(rotations) > 0.0).all(), f"gives a pose whose left block is no rotation {where}"
+        good and (np.linalg.det(rotations) > 0.0).all(), f"gives a pose whose left block is not a rotation {where}"
     )
 
 
@@ -441,7 +443,7 @@ class _Impatient(Watch):
 
 
 class _Kept:
-    """An estimator whose outcomes are looked at."""
+    """An estimator whose outcomes are checked."""
 
     def __init__(self, estimator: Any, subject: Subject) -> None:
         self._estimator, self._say = estimator, subject

@@ -31,14 +31,14 @@ class Stage:
 
 @dataclass(frozen=True, eq=False)
 class RansacStage(Stage):
-    """Algorithm 1: the hypotheses that improved on the best one so far. J of them."""
+    """Algorithm 1: the J hypotheses that were better than the best one before."""
 
     kind = "ransac"
     iterations: int
-    """Samples drawn."""
+    """Number of samples drawn."""
     confidence_reached: float
-    """Probability by Eq. 28 that one of them held inliers of the last hypothesis only; what an early test may have lost
-    is taken off."""
+    """Probability by Eq. 28 that one of them had only inliers of the last hypothesis; the probability that an early
+    test rejected it is subtracted."""
     improved_at: IndexArray
     """(J,) iteration of each improvement."""
     samples: IndexArray
@@ -54,15 +54,15 @@ class RansacStage(Stage):
 
 @dataclass(frozen=True, eq=False)
 class YawStage(Stage):
-    """Algorithm 2, lines 3-13: one arc of feasible yaw a root and pair, and where most of them overlap.
+    """Algorithm 2, lines 3-13: an arc of feasible yaw for each root of each pair, and where most of them overlap.
 
-    A arcs; the yaw is the one of the gravity-aligned frames. Arc ends satisfy -pi <= lo < pi and
+    A arcs; yaw is that between the aligned frames. Arc ends satisfy -pi <= lo < pi and
     lo <= hi <= lo + 2 pi, so an arc with hi > pi wraps.
     """
 
     kind = "yaw"
     pairs_total: int
-    """Pairs of usable correspondences, K."""
+    """Number of pairs of usable correspondences, K."""
     rule: str
     """The rule by which arcs were left out, in words."""
     pairs: IndexArray
@@ -74,23 +74,23 @@ class YawStage(Stage):
     overlap: IndexArray
     """(1440,) the most arcs that cover any one yaw in each quarter of a degree, from -pi upwards."""
     best_rad: tuple[float, float]
-    """The interval covered most often."""
+    """The interval that most arcs cover."""
     yaw_rad: float
-    """Its middle: the estimated yaw."""
+    """The middle of that interval: the estimated yaw."""
     clique: IndexArray
     """Indices of the arcs that cover ``yaw_rad``: the maximum clique of the rotation graph (Eq. 37)."""
 
 
 @dataclass(frozen=True, eq=False)
 class TranslationStage(Stage):
-    """Algorithm 2, lines 14-23: one ball of feasible camera positions a pair, and their maximum clique.
+    """Algorithm 2, lines 14-23: a ball of feasible camera positions for each pair, and the maximum clique of the balls.
 
-    M balls, in the gravity-aligned map frame.
+    M balls, in the aligned map frame.
     """
 
     kind = "translation"
     candidates: int
-    """Pairs in the rotation clique, before thinning."""
+    """Number of pairs in the rotation clique, before some are left out."""
     rule: str
     """The rule by which candidates became balls, in words with this run's numbers."""
     pairs: IndexArray
@@ -118,46 +118,47 @@ class ConsensusStage(Stage):
 
     kind = "consensus"
     arcs: int
-    """Arcs of feasible yaw of all pairs."""
+    """Number of arcs of feasible yaw of all pairs."""
     seed_support: int
-    """Correspondences that the first guess explained: cliques must be larger to be looked for."""
+    """Number of correspondences that the first pose explained: only larger cliques are searched for."""
     bound: IndexArray
     """(1440,) no pose with a yaw in that quarter of a degree explains more correspondences, from -pi upwards."""
     effort: int
-    """Words of bitsets that the clique searches touched, all together."""
+    """Number of 64-bit words of bitsets that all clique searches used together."""
     finished: bool
-    """False if the search ran out of its budget, so that ``bound`` is larger than it might be."""
+    """False if the search ended at its budget, so that ``bound`` may be larger than necessary."""
     yaw_rad: float
     """Yaw of the best pose."""
     clique: IndexArray
     """The largest clique found: (S,) indices of correspondences in the problem. Larger than the best support if no
     pose explains all of it."""
     cam_from_map: FloatArray
-    """(C, 3, 4) poses that were verified, best first, the best of every clearly different one."""
+    """(C, 3, 4) verified poses, best first; of poses that are not clearly different only the best."""
     support: IndexArray
-    """(C,) correspondences that each of them explains."""
+    """(C,) number of correspondences that each of them explains."""
 
 
 @dataclass(frozen=True, eq=False)
 class PositionStage(Stage):
-    """The search over camera positions: boxes that could hold a better pose than the best one, and so were split.
+    """The search over camera positions: boxes that might hold a better pose than the best one and were therefore split.
 
-    B boxes, by level; corners in the gravity-aligned map frame.
+    B boxes, by level; corners in the aligned map frame.
     """
 
     kind = "positions"
     boxes_m: NDArray[np.float32]
-    """(B, 2, 3) lower and upper corners, metres. Of a level with many boxes those that might explain most."""
+    """(B, 2, 3) lower and upper corners, metres; of a level with many boxes only those with the largest bounds."""
     level: IndexArray
-    """(B,) how often the first box, which holds the map, was halved to get each; ascending."""
+    """(B,) how often the first box, which holds the map, was halved to get each box; ascending."""
     bound: IndexArray
-    """(B,) no camera in that box explains more, at any yaw and any tilt within the gravity bound."""
+    """(B,) upper bound on the correspondences that a camera in the box explains, at any yaw and any tilt within the
+    gravity bound."""
     left: IndexArray
-    """(B,) boxes of the same level that were split."""
+    """(B,) number of boxes of the same level that were split."""
     support: int
-    """What the best pose explains."""
+    """Number of correspondences that the best pose explains."""
     upper_bound: int
-    """What no pose explains more than, after the search."""
+    """Largest number of correspondences that any pose explains, as proven by the search."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,18 +167,18 @@ class DecisionStage(Stage):
 
     kind = "decision"
     chosen: str
-    """Registered name."""
+    """Registered name of the chosen estimator."""
     reason: str
     """A sentence with this problem's numbers."""
     samples: int
-    """Pairs that the probe sampled."""
+    """Number of pairs that the trial before the choice sampled."""
     inlier_rate: float
-    """Share of the correspondences that the probe's best pose explains."""
+    """Share of the correspondences that the best pose of that trial explains."""
 
 
 @dataclass(frozen=True, eq=False)
 class RefinementStage(Stage):
-    """Gauss-Newton on the sphere. I + 1 states, the first one being the initial pose, the last one the result."""
+    """Gauss-Newton on the sphere: I + 1 states, from the initial pose to the result."""
 
     kind = "refinement"
     dof: int
@@ -187,21 +188,22 @@ class RefinementStage(Stage):
     cost_px2: FloatArray
     """(I + 1,) mean squared residual of the last state's inliers at each state, px^2."""
     inlier_counts: IndexArray
-    """(I + 1,) correspondences at each state within the bound by which the last one's inliers were chosen."""
+    """(I + 1,) number of correspondences at each state within the bound by which the last inliers were chosen."""
     covariance: FloatArray
-    """(6, 6) of the last pose's error, given its inliers: first the rotation vector w, rad, in the problem's camera
-    frame (true R = Exp(w) R), then the camera's position, m, in the problem's map frame (true C = C + error). Roll and
-    pitch have no variance where gravity is exact, so that it is singular there. NaN where inliers and gravity do not
+    """Covariance (6, 6) of the last pose's error, given its inliers: first the rotation vector w, rad, in the problem's
+    camera frame (true R = Exp(w) R), then the camera's position, m, in the problem's map frame (true C = C + error).
+    Roll and pitch have no variance where gravity is exact, so that it is singular there. NaN where inliers and gravity
+    do not
     determine the pose."""
     gravity_sd_rad: float
-    """Standard deviation of each tilt that weighed the given gravity: 0 kept it, inf ignored it."""
+    """Standard deviation of each tilt by which the given gravity was weighted: 0 kept it, inf ignored it."""
     tilt_rad: float
     """Angle between the given gravity and that of the last pose."""
 
 
 @dataclass(frozen=True)
 class Certificate:
-    """What is proven about the consensus of a run.
+    """Proven bounds on the consensus of a run.
 
     Both bounds count correspondences within the noise bound at a pose whose tilt is within the gravity bound.
     """
@@ -216,7 +218,7 @@ class Certificate:
 
     @property
     def gap(self) -> int:
-        """How many more correspondences a better pose could explain."""
+        """Number of further correspondences that another pose might explain."""
         return self.upper_bound - self.lower_bound
 
     @property
@@ -227,30 +229,30 @@ class Certificate:
 
 @dataclass(frozen=True, eq=False)
 class Trace:
-    """Everything about one run. N correspondences."""
+    """Everything about one run with N correspondences."""
 
     problem: Problem
-    """What was solved."""
+    """The problem that was solved."""
     estimator: str
-    """Registered name."""
+    """Registered name of the estimator."""
     options: Any
-    """The estimator's frozen options dataclass, resolved: what really was used."""
+    """The estimator's frozen options dataclass with the values that were really used."""
     seed: int
     """Seed of every random draw."""
     versions: Mapping[str, str]
     """Versions of spherloc, python and the numeric libraries."""
     stages: tuple[Stage, ...]
-    """In the order in which they ran."""
+    """The stages in the order in which they ran."""
     timings_ms: Mapping[str, float]
-    """Wall time a stage, and ``total``."""
+    """Wall time of each stage, and ``total``."""
     cam_from_map: FloatArray | None
-    """Estimated pose (3, 4), or None if the data allow none."""
+    """Estimated pose (3, 4); None if no pose was found."""
     inlier_mask: BoolArray
     """(N,) correspondences within the bound of the estimated pose."""
     message: str
     """The outcome in one sentence."""
     certificate: Certificate | None = None
-    """What is proven about the consensus; None if the estimator proves nothing."""
+    """Proven bounds on the consensus; None if the estimator proves nothing."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "versions", MappingProxyType(dict(self.versions)))
@@ -263,7 +265,7 @@ class Trace:
         return f"<Trace of {self.estimator} on {show(self.problem.name)}: {self.message}>"
 
     def _repr_html_(self) -> str:
-        """What notebooks show: a table with a row a stage."""
+        """HTML for notebooks: a table with a row for each stage."""
         rows = [("problem", self.problem.name), ("estimator", f"{self.estimator}, seed {self.seed}")]
         rows += [(f"stage {number}", stage.kind) for number, stage in enumerate(self.stages, 1)]
         rows += [("outcome", self.message), ("time", f"{self.timings_ms['total']:.1f} ms")]

@@ -22,14 +22,14 @@ from spherloc.types import FloatArray
 NS_PER_S = 1_000_000_000
 
 MAX_FILE_BYTES = 1 << 30
-"""Larger than a day of poses at 100 Hz."""
+"""Largest file, 1 GiB: more than a day of poses at 100 Hz."""
 _MAX_LINE_BYTES = 4096
 _LARGEST_NS = 2**62
-"""About 146 years: beyond any clock, and differences still fit into 64 bits."""
+"""Largest time, about 146 years: beyond any clock, and differences still fit into 64 bits."""
 _LARGEST_M = 1e9
-"""Positions beyond this, 25 times around the Earth, have lost their millimetres and are no positions."""
+"""Largest coordinate of a position, 25 times around the Earth: beyond it a double does not resolve millimetres."""
 _LENGTH_TOLERANCE = 0.05
-"""Quaternions written with two digits are this far from unit length; other columns taken for one are farther."""
+"""Largest difference of a quaternion's length from 1: with two digits it is this large, with wrong columns larger."""
 
 
 @dataclass(frozen=True)
@@ -69,8 +69,8 @@ def rotation_from_wxyz(wxyz: FloatArray) -> FloatArray:
     q = np.asarray(wxyz, dtype=np.float64)
     largest = np.abs(q).max(axis=-1, keepdims=True) if q.ndim and q.shape[-1] == 4 else np.zeros(1)
     if not ((largest > 0.0) & np.isfinite(largest)).all():
-        raise InputError(f"the quaternion {show(q.tolist())} is no rotation: give four finite numbers, not all zero.")
-    q = q / largest  # so that no square overflows or vanishes
+        raise InputError(f"the quaternion {show(q.tolist())} is not a rotation: give four finite numbers, not all 0.")
+    q = q / largest  # so that no square over- or underflows
     w, x, y, z = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
     rows = [
         [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
@@ -86,7 +86,7 @@ def wxyz_from_rotation(rotation: FloatArray) -> FloatArray:
     xx, yy, zz = r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]
     wx, wy, wz = r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]
     xy, xz, yz = r[..., 0, 1] + r[..., 1, 0], r[..., 0, 2] + r[..., 2, 0], r[..., 1, 2] + r[..., 2, 1]
-    # 4 q q^T: each of its rows is the quaternion times one of its entries; the largest entry loses no digits.
+    # Each row of 4 q q^T is the quaternion times one of its entries; the row of the largest entry loses no digits.
     outer = [
         [1.0 + xx + yy + zz, wx, wy, wz],
         [wx, 1.0 + xx - yy - zz, xy, xz],
@@ -122,18 +122,18 @@ def pose_at(trajectory: Trajectory, timestamp_ns: int, max_gap_s: float) -> Floa
 
 
 def read_tum(path: str | Path, unit: Literal["s", "ns"] = "s") -> Trajectory:
-    """A TUM trajectory: rows ``t tx ty tz qx qy qz qw``, by spaces or commas; ``unit`` is that of ``t``.
+    """A TUM trajectory: rows ``t tx ty tz qx qy qz qw``, separated by spaces or commas; ``unit`` is that of ``t``.
 
-    Raises ``InputError``, one sentence with the file and the line, for whatever is no such trajectory.
+    Raises ``InputError``, one sentence with the file and the line, for any other file.
     """
     unit_ns = NS_PER_S if unit == "s" else 1
     return _read(Path(path), _Layout("t tx ty tz qx qy qz qw", (8,), lambda words: _nanoseconds(words[0], unit_ns)))
 
 
 def read_euroc(path: str | Path) -> Trajectory:
-    """A EuRoC ground truth: rows ``timestamp [ns], x, y, z, qw, qx, qy, qz``, and maybe velocity and two biases.
+    """A EuRoC ground truth: rows ``timestamp [ns], x, y, z, qw, qx, qy, qz``, and optionally velocity and two biases.
 
-    Raises ``InputError``, one sentence with the file and the line, for whatever is no such trajectory.
+    Raises ``InputError``, one sentence with the file and the line, for any other file.
     """
     columns = "timestamp [ns], x, y, z, qw, qx, qy, qz"
     return _read(Path(path), _Layout(columns, (8, 17), lambda words: _nanoseconds(words[0], 1), w_first=True))
@@ -142,7 +142,7 @@ def read_euroc(path: str | Path) -> Trajectory:
 def read_newer_college(path: str | Path) -> Trajectory:
     """A Newer College ground truth: rows ``sec,nsec,x,y,z,qx,qy,qz,qw``.
 
-    Raises ``InputError``, one sentence with the file and the line, for whatever is no such trajectory.
+    Raises ``InputError``, one sentence with the file and the line, for any other file.
     """
     columns = "sec,nsec,x,y,z,qx,qy,qz,qw"
     return _read(Path(path), _Layout(columns, (9,), _seconds_and_nanoseconds, time_columns=2))
@@ -167,7 +167,8 @@ def write_tum(path: str | Path, trajectory: Trajectory) -> None:
 
 
 def _slerp(start: FloatArray, end: FloatArray, share: float) -> FloatArray:
-    """The quaternion (4,) at ``share`` of the shorter way from ``start`` to ``end``, both of unit length."""
+    """The quaternion (4,) at ``share`` (0 to 1) of the shorter rotation from ``start`` to ``end``, both of unit
+    length."""
     if start @ end < 0.0:
         end = -end
     # Half the angle between them by the chord: exact for small angles, where the dot product is 1 to rounding.
@@ -180,12 +181,12 @@ def _slerp(start: FloatArray, end: FloatArray, share: float) -> FloatArray:
 
 @dataclass(frozen=True)
 class _Layout:
-    """How a row is laid out: the time, three numbers of the position, four of the quaternion, maybe others."""
+    """Layout of a row: the time, three numbers of the position, four of the quaternion, optionally others."""
 
     columns: str
-    """As they are named to people."""
+    """Names of the columns, for messages."""
     counts: tuple[int, ...]
-    """Numbers in a row."""
+    """Allowed numbers of columns."""
     time_ns: Callable[[list[str]], int]
     """The time of a row; raises ``InputError``."""
     time_columns: int = 1
@@ -219,7 +220,7 @@ def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
     """Line numbers and words of the lines that are neither empty nor comments."""
     with reading(path, "give the path of a trajectory"), open_file(path) as file:
         if os.fstat(file.fileno()).st_size > MAX_FILE_BYTES:
-            raise InputError(f"{path}: larger than {MAX_FILE_BYTES >> 20} MiB, which no trajectory is; split it.")
+            raise InputError(f"{path}: larger than {MAX_FILE_BYTES >> 20} MiB, too large for a trajectory; split it.")
         for line, content in enumerate(iter(lambda: file.readline(_MAX_LINE_BYTES), b""), start=1):
             words = _words(content.removeprefix(b"\xef\xbb\xbf"), f"{path}, line {line}")
             if words:
@@ -232,9 +233,9 @@ def _words(content: bytes, place: str) -> list[str]:
         raise InputError(f"{place}: is longer than {_MAX_LINE_BYTES} bytes; give one pose a line.")
     if content.lstrip().startswith(b"#"):
         return []
-    # An underscore is no part of a number, though Python reads over it.
+    # Python accepts underscores in numbers, these files do not.
     if not content.isascii() or b"_" in content:
-        raise InputError(f"{place}: holds characters that no number has; start comments with #.")
+        raise InputError(f"{place}: holds characters that are not part of a number; start comments with #.")
     return content.decode("ascii").replace(",", " ").split()
 
 
@@ -263,7 +264,7 @@ def _nanoseconds(word: str, unit_ns: int) -> int:
     largest = _LARGEST_NS // unit_ns
     if not time.is_finite() or not -largest <= time <= largest:
         hint = "seconds" if unit_ns == NS_PER_S else "nanoseconds"
-        raise InputError(f"the time {show(word)} is no time in {hint}; check its unit.")
+        raise InputError(f"the time {show(word)} is not a time in {hint}; check its unit.")
     return round(time * unit_ns)
 
 

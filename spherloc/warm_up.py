@@ -1,11 +1,11 @@
-"""Loads or compiles the numeric kernels before somebody waits for an answer.
+"""Loads or compiles the numeric kernels before they are needed, so that the first run does not have to wait.
 
-A kernel is compiled for the types of its arguments, so that one is loaded here only if later calls have the same types.
-That is why kernels pass constants to each other as ``np.int64(MAX_STEPS)``: to numba a constant of a module is a type
-of its own, its value, for which the callee would be compiled again. And that is why arrays are given to a kernel with
-the same layout, and writable or not, every time.
+A kernel is compiled for the types of its arguments, so a kernel that is loaded here is useful only if later calls have
+the same types. That is why kernels pass constants to each other as ``np.int64(MAX_STEPS)``: for numba, a constant of a
+module is a literal with a type of its own, for which the callee would be compiled again. For the same reason, a kernel
+always gets arrays with the same layout, and always writable or always read-only ones.
 
-numba compiles one kernel at a time in a process, so that parts of the work are given to processes of their own.
+numba compiles only one kernel at a time in a process, so parts of the work are done in processes of their own.
 """
 
 import contextlib
@@ -54,14 +54,14 @@ from spherloc.watch import Watch
 FASTEST = "ransac-2p"
 """The estimator with the fewest kernels."""
 MAX_PROCESSES = 4
-"""Processes that compile at once: each takes 300 MB."""
+"""Largest number of processes that compile at the same time: each takes 300 MB."""
 
 
 def warm_up(announce: Callable[[str], None] | None = None, estimators: Iterable[str] | None = None) -> None:
     """Run estimators once on a tiny problem: a minute or so after an installation, a fraction of a second later.
 
     ``estimators`` are the names of those that will be needed; all if it is None. ``announce`` is called with a sentence
-    to show if it will be long, and for every extension that fails here, which hinders nothing else.
+    for the user if it will take long, and with one for every extension that fails here, without effect on others.
     """
     runs: dict[str, Callable[[], object]] = {}
     for name in registry.names("estimators") if estimators is None else estimators:
@@ -75,7 +75,7 @@ def warm_up(announce: Callable[[str], None] | None = None, estimators: Iterable[
                 how_often = "at every start, as no folder to keep them can be written (NUMBA_CACHE_DIR names another)"
             announce(f"compiling the solvers, {how_often}: {_expected(cold)} …")
         if _processors() > 1:
-            # What is left of the fastest estimator is compiled here before another process would have begun.
+            # The rest of the fastest estimator is compiled here, before another process would have started.
             _compile_in_order([part for part in cold if not part.startswith(FASTEST)])
     for part, run in runs.items():
         try:
@@ -90,30 +90,30 @@ def warm_up(announce: Callable[[str], None] | None = None, estimators: Iterable[
 
 
 def compile_apart(estimator: str, stopped: Callable[[], bool]) -> None:
-    """Compile what an estimator needs in processes of low priority, and none of it here.
+    """Compile the kernels of an estimator in processes of low priority, and none in this process.
 
-    Returns when that is done, at once if nothing is missing, or soon after ``stopped`` says so.
+    Returns when that is done, at once if nothing is missing, or soon after ``stopped`` returns true.
     """
     _compile_in_order([part for part in (*SHARED, *_runs(estimator)) if not _is_compiled(part)], stopped, niceness=10)
 
 
 def tiny_problem() -> Problem:
-    """The problem that every estimator has to take: 8 matches, 2 of them wrong."""
+    """A problem that every estimator must be able to solve: 8 matches, 2 of them wrong."""
     return _scene().problem()
 
 
 def _scene() -> SyntheticScene:
-    camera = Equirectangular(width=2048, height=1024)  # sharp enough for every stage to have something to do
+    camera = Equirectangular(width=2048, height=1024)  # sharp enough for every stage to be run
     return SyntheticScene("warm-up", camera, correspondences=8, outlier_rate=0.25, noise_px=0.1, seed=0)
 
 
 def _uncertain_problem() -> Problem:
-    """Uncertain gravity, and enough matches to weigh them: the last step of all."""
+    """A problem with uncertain gravity and enough matches for the whole last step."""
     return replace(_scene(), correspondences=40, noise_px=0.5, gravity_error_deg=0.5).problem()
 
 
 def _noisy_problem() -> Problem:
-    """So noisy that the exact search spends its whole effort."""
+    """A problem so noisy that the exact search uses its whole effort."""
     return replace(_scene(), correspondences=12, outlier_rate=0.6, noise_px=10.0).problem()
 
 
@@ -155,7 +155,7 @@ def _narrow() -> None:
 
 
 def _proofs() -> None:
-    """What the exact search proves bins with."""
+    """The kernels with which the exact search proves the bounds of yaw bins."""
     matches, best, nodes = _exact_search()
     yaws = yaws_between(0.0, BIN_TURN)
     certify(matches, yaws, nodes, apart_balls(matches, yaws, nodes, 2), best, Watch().board)
@@ -179,14 +179,14 @@ def _exact_search() -> tuple[BoundedMatches, BestPoses, NDArray[np.int64]]:
 
 
 SHARED: dict[str, Callable[[], object]] = {"refinement": _refine, "search": _search, "narrowing": _narrow}
-"""What all estimators need, by name; compiled first. Those that share kernels are not next to each other, so that the
-later one finds them compiled."""
+"""Parts that all estimators need, by name; they are compiled first. Parts that share kernels are not next to each
+other, so that the later one finds them compiled."""
 
 
 def _runs(estimator: str) -> dict[str, Callable[[], object]]:
-    """What an estimator has to compute to have all of its kernels compiled, by name; the first is its own."""
+    """Calls that together compile all kernels of an estimator, by name; the first is a run of the estimator itself."""
     runs: dict[str, Callable[[], object]] = {estimator: lambda: estimate(tiny_problem(), estimator)}
-    if estimator == "mc-exact":  # first what shares few kernels with the run that is compiled beside it
+    if estimator == "mc-exact":  # first the parts that share few kernels with the run that is compiled at the same time
         runs |= {f"{estimator}, proofs": _proofs, f"{estimator}, cliques": _cliques}
     if estimator in (FASTEST, "mc-exact"):
         runs[f"{estimator}, uncertain gravity"] = lambda: estimate(_uncertain_problem(), estimator)
@@ -199,14 +199,14 @@ def _runs(estimator: str) -> dict[str, Callable[[], object]]:
 def _compile_in_order(parts: Sequence[str], stopped: Callable[[], bool] = lambda: False, niceness: int = 0) -> None:
     """Compile parts in processes of their own, first those that all estimators share.
 
-    What fails there is compiled later by who needs it, and says why.
+    A part that fails there is compiled later where it is needed, and the error is raised then.
     """
     _compile_at_once([part for part in parts if part in SHARED], stopped, niceness)
     _compile_at_once([part for part in parts if part not in SHARED], stopped, niceness)
 
 
 def _compile_at_once(parts: Sequence[str], stopped: Callable[[], bool], niceness: int) -> None:
-    """As many at once as there are processors."""
+    """Compile parts in processes of their own, as many at once as there are processors."""
     lanes = min(MAX_PROCESSES, _processors())
     waiting, running = deque(parts), []
     try:
@@ -230,7 +230,7 @@ def _processors() -> int:
 
 
 def _expected(cold: Sequence[str]) -> str:
-    """How long compiling may take, in words."""
+    """Expected time of compiling, in words."""
     one_estimator = len({part.partition(",")[0] for part in cold} - SHARED.keys()) <= 1
     return "half a minute to a minute" if one_estimator else "one to two minutes"
 
@@ -251,7 +251,7 @@ def _mark(part: str) -> Path:
 
 if __name__ == "__main__":
     part = sys.argv[1]
-    gc.disable()  # a twentieth of the time, and the process ends soon
+    gc.disable()  # saves a twentieth of the time, and the process ends soon
     if hasattr(os, "nice"):
         os.nice(int(sys.argv[2]))
     (_runs(part.partition(",")[0]) | SHARED)[part]()

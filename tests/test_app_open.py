@@ -266,7 +266,7 @@ BAD = [
     ({"gravity_bound_deg": "much"}, r"^gravity's error is 'much'; give a number\.$"),
     ({"gravity_bound_deg": "200"}, r"bound_deg is 200\.0; give a number from 0 to 90"),
     ({"truth": "1 2 3"}, r"^the true pose is '1 2 3'; give 12 numbers\.$"),
-    ({"truth": "1 " * 12}, r"the true cam_from_map is no rotation matrix"),
+    ({"truth": "1 " * 12}, r"the true cam_from_map is not a rotation matrix"),
     ({"truth": "inf " * 12}, r"^the true pose is 'inf"),
 ]
 

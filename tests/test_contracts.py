@@ -90,7 +90,7 @@ class Narrow(Equirectangular):
         (Shifted, "does not project the bearing of the pixel"),
         (Everywhere, "has no finite Jacobian at the valid pixel (nan, 1)"),
         (Steep, "has another Jacobian than central differences at the pixel ("),
-        (Long, "gives a bearing that is no unit vector at the pixel ("),
+        (Long, "gives a bearing that is not a unit vector at the pixel ("),
         (Warning_, "makes a warning of NaN, infinity or the origin in project()"),
         (Untrue, "is not equal to from_dict() of its to_dict()"),
         (Lenient, "does not raise CalibrationError in from_dict() without model"),
@@ -136,7 +136,7 @@ class Greedy(Svd):
     ("kind", "words"),
     [
         (Turned, "does not find the true pose of 7 correspondences (round 0) without noise"),
-        (Scaled, "gives a pose whose left block is no rotation of 6 correspondences"),
+        (Scaled, "gives a pose whose left block is not a rotation of 6 correspondences"),
         (Careless, "does not raise ProblemError of a point too few"),
         (Random, "is not deterministic"),
         (Greedy, "changes its input"),
@@ -240,7 +240,7 @@ def test_readers_are_tried_with_other_files(tmp_path: Path) -> None:
     assert "raises ZeroDivisionError('division by zero') for a file with b''" in refusal(
         check_calibration_reader, crashing, path
     )
-    assert "which is no camera" in refusal(check_calibration_reader, lambda path, name: None, path)
+    assert "which is not a camera" in refusal(check_calibration_reader, lambda path, name: None, path)
 
 
 def test_broken_datasets_are_refused(tmp_path: Path) -> None:
@@ -263,6 +263,6 @@ def test_broken_datasets_are_refused(tmp_path: Path) -> None:
     assert "takes an unknown key with no_such_key = 1" in refusal(check_dataset, path, lenient)
     assert "raises AttributeError(" in refusal(check_dataset, path, crashing)
     assert "gives another problem when it is asked again: the problem.pixels" in refusal(check_dataset, path, restless)
-    assert "is no Problem" in refusal(
+    assert "is not a Problem" in refusal(
         check_dataset, path, lambda table, path: type("No", (), {"name": "no", "problem": lambda self: None})()
     )

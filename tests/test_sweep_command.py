@@ -121,7 +121,7 @@ def test_wrong_words_are_one_sentence(scene: Path, tmp_path: Path) -> None:
     ):
         with pytest.raises(InputError, match=said):
             call(**changes)
-    with pytest.raises(InputError, match="is no simulation"):
+    with pytest.raises(InputError, match="is not a simulation"):
         matches = Path(__file__).resolve().parents[1] / "scenes" / "street_fisheye.toml"
         call(scene=matches)
 

@@ -102,7 +102,9 @@ def test_real_file_in_nanoseconds_needs_its_unit():
     path = shared("aria_adt_fisheye/poses_world_device_tum.txt")
     trajectory = read_tum(path, unit="ns")
     assert trajectory.timestamps_ns[0] == 87551170910000 and len(trajectory) == 6
-    with pytest.raises(InputError, match=r"line 2: the time '87551170910000' is no time in seconds; check its unit\.$"):
+    with pytest.raises(
+        InputError, match=r"line 2: the time '87551170910000' is not a time in seconds; check its unit\.$"
+    ):
         read_tum(path)
 
 
@@ -149,7 +151,7 @@ def test_half_turns_lose_no_digits(rng):
 
 @pytest.mark.parametrize("wxyz", [[0, 0, 0, 0], [np.nan, 0, 0, 1], [np.inf, 0, 0, 0], [1, 0, 0], 1.0])
 def test_no_rotation_is_refused(wxyz):
-    with pytest.raises(InputError, match=r"is no rotation: give four finite numbers, not all zero\.$"):
+    with pytest.raises(InputError, match=r"is not a rotation: give four finite numbers, not all 0\.$"):
         rotation_from_wxyz(np.array(wxyz, dtype=float))
 
 
@@ -224,12 +226,12 @@ ROW = "1.0 0 0 0 0 0 0 1\n"
         (ROW + "2.0 0 0 0 0 0 0 0", 2, "the quaternion has the length 0 instead of 1"),
         (ROW + "2.0 0 0 0 0 0 0.5 0.5", 2, "the quaternion has the length 0.707"),
         (ROW + "2.0 1e10 0 0 0 0 0 1", 2, "farther than 1e+09 m"),
-        ("nan 0 0 0 0 0 0 1", 1, "no time in seconds"),
-        ("1e30 0 0 0 0 0 0 1", 1, "no time in seconds"),
-        ("1e999999999999 0 0 0 0 0 0 1", 1, "no time in seconds"),
-        ("1" * 4000 + " 0 0 0 0 0 0 1", 1, "no time in seconds"),
-        ("1_0 0 0 0 0 0 0 1", 1, "characters that no number has"),
-        ("\u0661 0 0 0 0 0 0 1", 1, "characters that no number has"),
+        ("nan 0 0 0 0 0 0 1", 1, "not a time in seconds"),
+        ("1e30 0 0 0 0 0 0 1", 1, "not a time in seconds"),
+        ("1e999999999999 0 0 0 0 0 0 1", 1, "not a time in seconds"),
+        ("1" * 4000 + " 0 0 0 0 0 0 1", 1, "not a time in seconds"),
+        ("1_0 0 0 0 0 0 0 1", 1, "characters that are not part of a number"),
+        ("\u0661 0 0 0 0 0 0 1", 1, "characters that are not part of a number"),
         (ROW + "0 " * 5000, 2, "longer than 4096 bytes"),
         (ROW + "#" * 4096 + "2.0 0 0 0 0 0 0 1", 2, "longer than 4096 bytes"),
     ],

@@ -1,4 +1,4 @@
-"""What can be wrong with a run, and the record of what was found."""
+"""The causes of failed and doubtful runs, and the result of a diagnosis."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -10,49 +10,50 @@ class Cause(StrEnum):
     """Why a run failed or is doubtful."""
 
     OK = "ok"
-    """The pose stands out from chance and nothing speaks against it; with the truth: it is right."""
+    """The pose explains more than chance and nothing speaks against it; if the truth is used: the pose is right."""
     TOO_FEW_INLIERS = "too few inliers"
-    """So few matches are right that as many agree with some wrong pose by chance: no method can know the answer."""
+    """So few matches are right that as many agree with some wrong pose by chance: no method can find the answer."""
     FALSE_CONSENSUS = "larger false consensus"
     """A wrong pose explains more matches than the true one, so that no method by consensus finds the true one. Without
-    the truth: a second pose explains many, though fewer, of the matches that the best one does not."""
+    the truth: a second pose explains many of the matches that the best one does not explain, but fewer than that
+    one."""
     WRONG_REFERENCE = "wrong reference image"
     """No match is right. Without the truth: no pose stands out, though there are so many matches that a right
     reference image would have given one."""
     MAP_TOO_SPARSE = "map too sparse"
-    """The reference image is the right one, for many matches with it agree with one motion of the camera; but hardly
-    any of them has a point in the map."""
+    """The reference image is the right one, since many matches with it agree with one motion of the camera; but hardly
+    any of them has a map point."""
     GRAVITY_OFF = "gravity prior off"
-    """Gravity is off by more than its bound, or than the refinement is told to allow for, and by more than the noise
-    bound in the image."""
+    """Gravity is off by more than its bound, or by more than the refinement allows for, and the effect in the image is
+    larger than the noise bound."""
     BOUND_TOO_SMALL = "noise bound too small"
-    """Many right matches are farther off than the noise bound: twice of it holds half as many again, or more."""
+    """Many right matches are beyond the noise bound: within twice the bound there are at least 1.5 times as many."""
     DEGENERATE = "degenerate geometry"
-    """Enough matches agree, but they leave the pose open by more than the error of a success."""
+    """Enough matches agree, but they do not fix the pose to within the errors of a success."""
     ITERATIONS_RAN_OUT = "iterations ran out"
     """RANSAC drew too few samples to find the best pose; another run would find it."""
     AMBIGUOUS = "ambiguous"
     """Two clearly different poses explain (nearly) as many matches."""
     SEARCH_MISSED = "search missed the best pose"
-    """A search without random samples ended at a pose that explains clearly fewer matches than another one."""
+    """A search without random samples ended at a pose that explains clearly fewer matches than another pose."""
     UNKNOWN = "unknown"
-    """The pose is wrong, and nothing that was measured says why."""
+    """The pose is wrong, and no measurement shows why."""
 
 
 @dataclass(frozen=True)
 class Measures:
-    """A run's evidence in numbers. None stands for what there is not."""
+    """A run's evidence in numbers; None for a number that the run does not have."""
 
     residual_median: float | None = None
     """Median reprojection error of the inliers, in noise bounds (0 to 1)."""
     residual_p90: float | None = None
     """Their 90 % quantile, in noise bounds."""
     alternative_support: float | None = None
-    """Inliers of the best pose that is clearly another one, as a share of the best pose's own."""
+    """Support of the best clearly different pose, as a share of that of the best pose."""
     certificate_gap: float | None = None
-    """Upper bound of the certificate less the lower one, as a share of the upper one; 0 is proven."""
+    """Upper bound of the certificate minus the lower bound, as a share of the upper bound; 0 is a proof."""
     tilt_deg: float | None = None
-    """Angle between the given gravity and that of the best pose that does not believe it, degrees."""
+    """Angle between the given gravity and that of the best pose that ignores the given one, degrees."""
     coverage: float | None = None
     """Share of the directions with matches, in 48 cells of the sphere, that have inliers too."""
     rotation_sd_deg: float | None = None
@@ -66,17 +67,17 @@ class Diagnosis:
     """The cause that explains a run best, and why."""
 
     cause: Cause
-    """What it is."""
+    """The cause."""
     doubtful: bool
     """False only if the run looks right."""
     summary: str
-    """One sentence."""
+    """The diagnosis in one sentence."""
     evidence: tuple[str, ...]
     """Sentences with this run's numbers."""
     advice: str
-    """What to do."""
+    """What to do, in a sentence."""
     used_truth: bool
-    """Whether the true pose or true labels were looked at."""
+    """Whether the true pose or true labels were used."""
     alternative_cam_from_map: FloatArray | None = None
     """Another pose (3, 4) to look at beside the run's own: the second one where two are ambiguous, the better or the
     true one where it is known; else None."""

@@ -1,4 +1,5 @@
-"""From evidence to a cause. Order matters: a cause is easily taken for one tested later, seldom for an earlier one."""
+"""Decides on a cause from the evidence. The order of the tests matters: each cause is easily confused with those that
+are tested later, seldom with those that are tested before it."""
 
 from dataclasses import replace
 
@@ -21,32 +22,33 @@ from spherloc.metrics import SUCCESS_DEG, SUCCESS_M
 from spherloc.trace import RansacStage, Trace
 
 MAX_NFA = 0.01
-"""A consensus is believed if fewer sets of its size are expected by chance."""
+"""Largest NFA of a consensus that is believed."""
 MIN_SUPPORT = 4
-"""No smaller consensus is believed: two matches fix a pose, and a third one agrees too easily."""
+"""Least size of a consensus that is believed: two matches fix a pose, and a third one agrees too easily."""
 MIN_RIGHT_RATE = 0.04
-"""Share of right matches that any right reference image gives: with this many matches, none standing out means that
-the reference is wrong. Without the truth nothing else tells the two apart."""
+"""Least share of right matches that a right reference image gives: if no pose stands out although this share of the
+matches would, the reference is wrong. Without the truth nothing else distinguishes this from too few inliers."""
 SPREAD = 1.5
-"""The bound is too small if twice of it holds as many times as many matches: noise of 0.75 times the bound does so."""
+"""The bound is too small if within twice the bound there are this many times more matches than within it: so it is with
+a noise of 0.75 times the bound."""
 CHANCE_SDS = 2.0
-"""No match is right if near the true pose there are as many as chance puts there, give or take so many deviations."""
+"""No match is right if the true pose explains no more than chance, plus this many standard deviations."""
 TILT_SDS = 4.0
-"""Gravity is off if the matches tilt it beyond what the run believes by as many standard deviations..."""
+"""Gravity is off if the matches show a tilt beyond what the run allows for by this many standard deviations ..."""
 MIN_TILT_IN_BOUNDS = 1.0
-"""... and by as many noise bounds in the image: less does no harm. (A calibration that is a little off tilts real
-images by some tenths of a degree.)"""
+"""... and by this many noise bounds in the image: less does no harm. (A slightly wrong calibration tilts real images by
+some tenths of a degree.)"""
 AS_GOOD = 0.9
-"""Provided that the tilted pose has this share of the best level one's support: a true one has more, but wrong matches
-within the wider bound may have pulled it."""
+"""The tilted pose must have at least this share of the best level pose's support: the true one has more, but wrong
+matches within the wider bound may have pulled it away."""
 EQUAL = 0.88
-"""Two poses are equally supported from this ratio on; a measured one varies as noise moves matches over the bound."""
+"""Least ratio of the supports of two poses that count as equal; noise moves matches over the bound."""
 STRONG = 0.45
-"""A second pose with this share of the best one's support is no coincidence: structure repeats itself."""
+"""A second pose with at least this share of the best one's support is not chance: structure repeats itself."""
 MISSED = 0.85
-"""A run whose pose has less than this share of the best pose's support has missed it."""
+"""A run has missed the best pose if its own has less than this share of the best one's support."""
 TILT_RAD = np.radians(0.05)
-"""A true gravity that is beyond what the run believes by more explains a wrong pose that is well supported."""
+"""A true gravity that is beyond what the run allows for by more than this explains a wrong, well supported pose."""
 TO_BE_PROVEN = (Cause.FALSE_CONSENSUS, Cause.AMBIGUOUS, Cause.ITERATIONS_RAN_OUT, Cause.SEARCH_MISSED)
 """Causes whose evidence is complete only with a bound on every pose's support."""
 
@@ -67,7 +69,7 @@ def diagnose(trace: Trace, use_truth: bool = True) -> Diagnosis:
 
 
 def without_truth(e: Evidence) -> Cause:
-    """The cause as far as the matches themselves tell."""
+    """The cause as far as the matches alone show it."""
     best = 0 if e.best is None else e.best.support(e.bound_px)
     believed = stands_out(e, best)
     if believed and undetermined(e.rotation_sd_rad, e.position_sd_m):
@@ -126,12 +128,12 @@ def with_truth(e: Evidence, t: Truth) -> Cause:
 
 
 def stands_out(e: Evidence, size: int, wider: float = 1.0) -> bool:
-    """Whether a consensus of that size, within ``wider`` times the noise bound, is more than chance gives."""
+    """Whether a consensus of that size, within ``wider`` times the noise bound, is more than chance explains."""
     return size >= MIN_SUPPORT and e.nfa(size, wider) < MAX_NFA
 
 
 def map_is_sparse(e: Evidence, right: int) -> bool:
-    """Whether more matches than are ``right`` are verified between the images, but have no point in the map."""
+    """Whether more matches are verified between the images but have no map point than there are ``right`` ones."""
     return e.verified_without_point > right
 
 
@@ -141,7 +143,7 @@ def undetermined(rotation_sd_rad: float, position_sd_m: float) -> bool:
 
 
 def tilts(e: Evidence, tilt_rad: float, slack_rad: float) -> bool:
-    """Whether gravity is off by more than the run believes, and so much that it matters."""
+    """Whether gravity is off by more than the run allows for, and by enough to matter."""
     excess = tilt_rad - e.believed_rad
     harm_px = excess * float(np.median(e.aligned.pixels_per_radian))
     return excess > slack_rad and harm_px > MIN_TILT_IN_BOUNDS * e.bound_px
@@ -153,7 +155,7 @@ def missed(e: Evidence, best: int) -> bool:
 
 
 def _other(e: Evidence, true: Fit) -> int:
-    """Most support of a pose that is clearly not the true one."""
+    """Largest support of a pose that is clearly different from the true one."""
     fits = [fit for fit in (e.run, e.best, e.alternative) if fit is not None]
     wrong = [fit for fit in fits if different(fit.cam_from_map, true.cam_from_map)]
     return max((fit.support(e.bound_px) for fit in wrong), default=0)

@@ -1,5 +1,5 @@
-"""Measures what the diagnosis decides by, and a run's evidence as a few numbers that can be compared over many runs;
-decides nothing. Poses are between the aligned frames.
+"""Measures the evidence for a diagnosis, and summarizes it in a few numbers that can be compared over many runs.
+The decision itself is in ``decide``. Poses are between the aligned frames.
 """
 
 from dataclasses import dataclass, fields, replace
@@ -21,7 +21,7 @@ from spherloc.trace import Certificate, ConsensusStage, Trace
 from spherloc.types import BoolArray, FloatArray
 
 SINGULAR = 1e-12
-"""Information below this share of what each unknown has by itself is rounding."""
+"""Information below this share of what each unknown has by itself counts as zero: it is rounding."""
 
 
 def apart(one: FloatArray, other: FloatArray) -> tuple[float, float]:
@@ -40,9 +40,9 @@ def pose_sd(
 ) -> tuple[float, float, float]:
     """Standard deviations of rotation (rad), position (m) and tilt (rad) in their worst directions.
 
-    They are those of the correspondences of ``mask`` (M,) at an aligned pose (3, 4), less the ``drop`` on which the
-    position hangs most: where the others leave a valley of poses open, some pose in it agrees with a wrong match too,
-    which then seems to fix it.
+    They follow from the correspondences of ``mask`` (M,) at an aligned pose (3, 4), without the ``drop`` ones on which
+    the position depends most: where the others allow a whole range of poses, one of them also agrees with some wrong
+    match, which then seems to fix the position.
     """
     each = _information(aligned, cam_from_map, mask) / noise_px**2
     weight = max(gravity_sd_rad, MIN_GRAVITY_SD_RAD) ** -2.0
@@ -62,7 +62,8 @@ def _worst(covariance: FloatArray) -> float:
 
 
 def _information(aligned: AlignedProblem, cam_from_map: FloatArray, mask: BoolArray) -> FloatArray:
-    """What each masked correspondence says (K, 6, 6) of a turn and a shift of the camera, in its frame, at 1 px."""
+    """Information matrices (K, 6, 6) of the masked correspondences on a rotation (rad) and a translation (m) of the
+    camera, in its frame, for noise of 1 px."""
     rays, weights = transform(cam_from_map, aligned.points[mask]), aligned.pixel_from_bearing[mask]
     length = np.linalg.norm(rays, axis=1)[:, None]
     unit = rays / length
@@ -81,31 +82,32 @@ def _inverse(information: FloatArray) -> FloatArray:
 
 
 SAMPLES = 20_000
-"""Most samples of a search: 99 % sure to draw two of 1.5 % right matches together. A confidence ends it earlier."""
+"""Largest number of samples of a search: with 1.5 % right matches, one of them is clean with 99 % probability. The
+search ends earlier when it reaches its confidence."""
 MAX_WORK = 20_000_000
-"""Samples times correspondences; above it the search draws fewer."""
+"""Largest product of samples and correspondences; with many correspondences the search draws fewer samples."""
 CONFIDENCE = 0.9999
 MAX_TILT_RAD = np.radians(12.0)
-"""Gravity errors up to this are looked for."""
+"""Largest gravity error that is searched for."""
 WIDER = 4.0
-"""A noise bound that is too small is looked for up to this many times as much."""
+"""Largest factor of the noise bound that is tried if the bound may be too small."""
 MAX_CERTIFIED = 500
-"""Correspondences up to which a run without a certificate is given one."""
+"""Largest number of correspondences for which a run without a certificate gets one."""
 EFFORT = 0.3
-"""Of an exact search: enough where a pose stands out, and little where many are alike."""
+"""Effort of that exact search: enough where one pose stands out, and quickly spent where many poses are alike."""
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A pose and what it explains."""
+    """A pose and its reprojection errors."""
 
     cam_from_map: FloatArray
-    """(3, 4)."""
+    """Pose (3, 4)."""
     errors_px: FloatArray
     """(M,) reprojection errors."""
 
     def support(self, bound_px: float) -> int:
-        """How many correspondences are within a bound."""
+        """Number of correspondences within a bound."""
         return int(np.count_nonzero(self.errors_px <= bound_px))
 
     @property
@@ -138,7 +140,7 @@ def subset(aligned: AlignedProblem, mask: BoolArray) -> AlignedProblem:
 
 
 def alternative(aligned: AlignedProblem, best: Fit, bound_px: float, options: RefinementOptions) -> Fit | None:
-    """The pose that explains most of what ``best`` is far from explaining, with its support among all."""
+    """The pose that explains most of the correspondences that are far from ``best``, with its support among all."""
     rest = best.errors_px > 3.0 * bound_px
     if np.count_nonzero(rest) < 2:
         return None
@@ -156,7 +158,7 @@ def certify(trace: Trace) -> Certificate | None:
 
 
 def free_fit(aligned: AlignedProblem, starts: list[FloatArray], bound_px: float) -> Fit | None:
-    """The pose with the most support within ``WIDER`` times the bound where gravity is not believed.
+    """The pose with the most support within ``WIDER`` times the bound where the given gravity is ignored.
 
     From the aligned poses ``starts``, each (3, 4), and from a search that allows for a wrong gravity and tightens its
     bound step by step.
@@ -174,26 +176,26 @@ def free_fit(aligned: AlignedProblem, starts: list[FloatArray], bound_px: float)
 
 
 LOOSE_ENDS = 2
-"""Matches that may agree by chance with one of the poses that all others leave open."""
+"""Number of matches that are left out when it is judged how well the inliers fix a pose: they may agree by chance."""
 FEW = 8
-"""Sets smaller than this are judged with all their members: each is needed."""
+"""Sets smaller than this are judged with all their members, since each is needed."""
 BELIEVED_SDS = 4.0
-"""A refinement that is told gravity's standard deviation follows the matches no farther than so many of it."""
+"""Number of standard deviations of gravity that a refinement allows for at most."""
 DIFFERENT_RAD = np.radians(3.0)
 DIFFERENT_M = 0.3
-"""Poses farther apart than either are clearly different: three times what counts as a success."""
+"""Poses are clearly different if they are farther apart than one of these: three times the errors of a success."""
 
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What can be measured without the truth."""
+    """The measurements that do not need the truth."""
 
     aligned: AlignedProblem
     """The usable correspondences."""
     bound_px: float
     """The run's noise bound."""
     believed_rad: float
-    """How far gravity may be off by what the run was told: its bound, or less if the refinement believes it more."""
+    """Error of gravity that the run allows for: the gravity bound, or less if the refinement trusts gravity more."""
     chance_rate: float
     """Probability that a wrong pose with the given gravity explains one correspondence, within its bound too."""
     free_chance_rate: float
@@ -205,25 +207,25 @@ class Evidence:
     alternative: Fit | None
     """The pose with the most support that is clearly different from ``best``."""
     free: Fit | None
-    """The pose with the most support within a wider bound and without belief in gravity."""
+    """The pose with the most support within a wider bound, the given gravity ignored."""
     free_tilt_sd_rad: float
     """Standard deviation of its tilt."""
     tilted: Fit | None
-    """The one of ``best`` and ``free`` with more support: what tells the tilt of gravity."""
+    """The one of ``best`` and ``free`` with more support, from which the tilt of gravity is taken."""
     tilted_sd_rad: float
-    """Standard deviation of its tilt, where gravity is not believed."""
+    """Standard deviation of its tilt, the given gravity ignored."""
     rotation_sd_rad: float
-    """Standard deviation of the best pose's rotation, though the matches that it hangs on most be wrong."""
+    """Standard deviation of the best pose's rotation without the matches on which it depends most."""
     position_sd_m: float
-    """The same of its position."""
+    """The same for its position."""
     verified_without_point: int
     """See ``Problem``."""
 
     def nfa(self, size: int, wider: float = 1.0, fixed_by: int = 2) -> float:
         """Expected number of false alarms (NFA) of that size within ``wider`` times the bound.
 
-        ``fixed_by`` correspondences fix a pose: 2, or 3 where gravity is free. Where gravity is uncertain, sets of
-        poses with the given one are no more than those of poses with any.
+        ``fixed_by`` correspondences fix a pose: 2, or 3 where gravity is free. Where gravity is uncertain, there are no
+        more sets for poses with the given gravity than for poses with any gravity.
         """
         free = min(1.0, self.free_chance_rate * wider**2)
         any_gravity = nfa(len(self.aligned.points), size, free) / free if size > 3 else np.inf
@@ -233,7 +235,7 @@ class Evidence:
         return min(given, any_gravity) if self.aligned.gravity_bound_rad > 0.0 else given
 
     def alternatives_own(self) -> int:
-        """Correspondences that the alternative explains and the best pose does not."""
+        """Number of correspondences that the alternative explains and the best pose does not."""
         if self.alternative is None or self.best is None:
             return 0
         return int(
@@ -241,7 +243,7 @@ class Evidence:
         )
 
     def found(self, factor: float) -> float:
-        """Support of the free pose within ``factor`` times the bound, less what is there by chance."""
+        """Support of the free pose within ``factor`` times the bound, minus the number expected by chance."""
         if self.free is None:
             return 0.0
         return self.free.support(factor * self.bound_px) - len(self.aligned.points) * self.free_chance_rate * factor**2
@@ -249,7 +251,7 @@ class Evidence:
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """What the true pose and labels add."""
+    """The measurements that need the true pose and labels."""
 
     success: bool
     """Whether the run's pose is right."""
@@ -262,11 +264,11 @@ class Truth:
     position_sd_m: float
     """Standard deviation of a position from all right matches."""
     rotation_sd_rad: float
-    """The same of a rotation."""
+    """The same for a rotation."""
     within: float
-    """Noise bounds within which matches are called right; 1 where that is from labels."""
+    """Number of noise bounds within which matches count as right; 1 if labels say which are right."""
     by_chance: float
-    """How many matches ``right`` holds by chance: none where it is from labels."""
+    """Expected number of matches that are in ``right`` by chance; 0 if labels say which are right."""
 
 
 def gather(trace: Trace) -> Evidence:
@@ -308,7 +310,7 @@ def gather(trace: Trace) -> Evidence:
 
 
 def _other_fits(trace: Trace, bounds: Bounds) -> list[Fit]:
-    """What a longer search finds, and what the run itself found beside its pose."""
+    """Poses from a longer search, and those that the run itself found beside its pose."""
     aligned, options = trace.problem.aligned, trace.options
     found = search(aligned, bounds.noise_px, options)
     stage = trace.stage(ConsensusStage)
@@ -342,7 +344,7 @@ def _free_tilt_sd(aligned: AlignedProblem, free: Fit, bound_px: float) -> float:
 
 
 def gather_truth(trace: Trace, bound_px: float) -> Truth | None:
-    """Look at the true pose and the labels; None if neither is known."""
+    """Measure with the true pose and the labels; None if neither is known."""
     problem, aligned, options = trace.problem, trace.problem.aligned, trace.options
     labels = None if problem.truth_inliers is None else problem.truth_inliers[aligned.index]
     if problem.truth_cam_from_map is not None:
@@ -379,7 +381,7 @@ BANDS, SECTORS = 6, 8
 
 
 def measures_of(e: Evidence, certificate: Certificate | None) -> Measures:
-    """The numbers of a run that has been looked at; those that it cannot have are None."""
+    """The numbers of a run whose evidence was gathered; None for those that it does not have."""
     median = high = coverage = None
     best = 0 if e.best is None else e.best.support(e.bound_px)
     if e.run is not None:

@@ -42,7 +42,7 @@ def describe(
 
 
 def _advice(trace: Trace, e: Evidence, cause: Cause) -> str:
-    """What to do; never to use what was used."""
+    """What to do; never what the run has done already."""
     if cause is Cause.GRAVITY_OFF and e.believed_rad < e.aligned.gravity_bound_rad:
         return "Set gravity_sd_deg to what the problem states, or leave it out; then the refinement corrects the tilt."
     if cause is Cause.SEARCH_MISSED and trace.stage(ConsensusStage) is not None:
@@ -100,7 +100,8 @@ def _summary(e: Evidence, truth: Truth | None, cause: Cause, other: Fit | None, 
 
 
 def _measured_summary(e: Evidence, truth: Truth | None, cause: Cause, unit: str) -> str:
-    """Causes that are a size: by the true pose, or else by the pose that neither gravity nor the bound holds back."""
+    """Summary of causes that are a measured size: from the true pose or, without it, from the pose that ignores the
+    given gravity and has a wider bound."""
     if cause is Cause.DEGENERATE:
         source = e if truth is None else truth
         fixed = f"{_distance(source.position_sd_m, unit)} and {_deg(source.rotation_sd_rad)}"

@@ -1,4 +1,4 @@
-"""What decides the results of a sequence: written beside them, so that results of two settings are never mixed."""
+"""The settings that determine the results of a sequence: stored with them, so that two settings are never mixed."""
 
 import hashlib
 import json
@@ -24,7 +24,7 @@ MAX_TOLD = 3
 def differences(before: Mapping[str, Any], now: Mapping[str, Any], uncompared: Collection[str]) -> dict[str, str]:
     """Phrases such as "seed is 1, was 0" by dotted keys such as "options.bound_px"; absent is the same as None.
 
-    ``uncompared`` are keys of the tables themselves that may differ.
+    ``uncompared`` are top-level keys that may differ.
     """
     tables = [{key: value for key, value in table.items() if key not in uncompared} for table in (before, now)]
     a, b = (dict(_flat(table)) for table in tables)
@@ -33,7 +33,7 @@ def differences(before: Mapping[str, Any], now: Mapping[str, Any], uncompared: C
 
 
 def in_short(phrases: Sequence[str]) -> str:
-    """The first few, and how many more there are."""
+    """The first few phrases, and how many more there are."""
     more = len(phrases) - MAX_TOLD
     return "; ".join([*phrases[:MAX_TOLD], *([f"and {more} more"] if more > 0 else [])])
 
@@ -54,7 +54,7 @@ FORMAT = 1
 MAX_BYTES = 1_000_000
 _KINDS = {"scene": str, "scene_sha256": str, "name": str, "estimator": str, "seed": int, "queries": int}
 _UNCOMPARED = {"scene"}
-"""A scene file that was moved or copied is still the same scene."""
+"""Keys that may differ: a scene file that was moved or copied is still the same scene."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,21 +62,21 @@ class Configuration:
     """The resolved settings of a sequence's run."""
 
     scene: str
-    """The scene file."""
+    """Path of the scene file."""
     scene_sha256: str
     """Hash of its content."""
     name: str
     """The scene's name."""
     estimator: str
-    """Registered name."""
+    """Registered name of the estimator."""
     options: Mapping[str, Any]
     """The estimator's options, all of them."""
     seed: int
     """Seed of the estimator, the same for every query."""
     versions: Mapping[str, str]
-    """Of everything that can change a number."""
+    """Versions of all software that can change a number."""
     queries: int
-    """Query images in the scene."""
+    """Number of query images in the scene."""
     gravity_map: FloatArray
     """Unit vector (3,) pointing down in the map frame."""
     thresholds: Thresholds
@@ -88,21 +88,21 @@ class Configuration:
 
     @property
     def unit(self) -> str:
-        """What a length of the map is told in: "m" or "units"."""
+        """Unit of the map's lengths: "m" or "units"."""
         return "m" if self.metric else "units"
 
     def length(self, metres: float, digits: int = 2) -> str:
-        """A length to read: centimetres, or units of the map with three digits."""
+        """A length as text: in centimetres, or in units of the map with three digits."""
         return f"{100 * metres:.{digits}f} cm" if self.metric else f"{metres:.3g} {self.unit}"
 
     def json_text(self) -> str:
-        """As ``configuration.json`` holds it; infinity is the text "inf"."""
+        """The text of ``configuration.json``; infinity is the text "inf"."""
         return json.dumps({"format": FORMAT} | _plain(self), indent=2, allow_nan=False) + "\n"
 
     def differences(self, now: "Configuration") -> list[str]:
-        """What is not the same in ``now``, as phrases such as "seed is 1, was 0"."""
+        """The differences to ``now``, as phrases such as "seed is 1, was 0"."""
         found = differences(_plain(self), _plain(now), _UNCOMPARED)
-        # Another estimator has other options.
+        # Options of two different estimators cannot be compared.
         return [said for key, said in found.items() if "estimator" not in found or not key.startswith("options.")]
 
 
@@ -111,7 +111,7 @@ def configuration_of(
 ) -> Configuration:
     """The configuration of localizing the queries of the scene file ``path``; ``options`` is the resolved dataclass.
 
-    An ``initialiser`` (name and options in one text) stands among the options, where there is one.
+    If there is an ``initialiser``, its name and options are stored as one text among the options.
 
     Raises ``InputError`` if the file can no longer be read.
     """
@@ -177,7 +177,7 @@ def _parsed(table: Any, where: str) -> Configuration:
 
 
 def _plain(configuration: Configuration) -> dict[str, Any]:
-    """With nothing but what JSON has."""
+    """The configuration as a table of plain JSON values."""
     values = dict(vars(configuration))
     values["options"] = {
         key: "inf" if isinstance(value, float) and math.isinf(value) else value

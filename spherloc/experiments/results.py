@@ -1,4 +1,4 @@
-"""The folder of a sequence's results: every finished query is safe on the disk before the next one is begun."""
+"""The folder of a sequence's results: each finished query is written to the disk before the next one starts."""
 
 import contextlib
 import csv
@@ -31,25 +31,25 @@ STATUSES = (*POSED, FAILED, UNREADABLE)
 
 @dataclass(frozen=True, eq=False)
 class QueryResult:
-    """The result of one query image. What is unknown is None."""
+    """The result of one query image; unknown values are None."""
 
     index: int
     """Place in the scene's sequence, from 0."""
     query: str
     """Name of the query image."""
     status: str
-    """"localized"; "doubtful": a pose that is not to be believed, see ``spherloc.outcome``; "failed": a usable image
-    got no pose; or "unreadable": the image cannot be used, so no method is judged by it."""
+    """"localized"; "doubtful": there is a pose, but it is not believed, see ``spherloc.outcome``; "failed": the image
+    is usable but has no pose; "unreadable": the image cannot be used and does not count in success rates."""
     timestamp_s: float | None = None
     """When the image was taken, seconds."""
     references: int | None = None
-    """Reference images that were matched."""
+    """Number of reference images that were matched."""
     matches: int | None = None
-    """2D-3D correspondences."""
+    """Number of 2D-3D correspondences."""
     inliers: int | None = None
-    """Correspondences that agree with the pose."""
+    """Number of correspondences that agree with the pose."""
     estimated_outlier_rate: float | None = None
-    """What the front end guessed."""
+    """Outlier rate that the front end estimated, 0 to 1."""
     true_outlier_rate: float | None = None
     """Share of the correspondences more than 8 px from their true pixel."""
     rotation_error_deg: float | None = None
@@ -57,7 +57,7 @@ class QueryResult:
     translation_error_m: float | None = None
     """Distance between true and estimated camera position, metres."""
     registration_error_m: float | None = None
-    """How far the query's depth is off the map's at the pose, metres; inf if they do not meet."""
+    """Distance by which registration moves the query's depth to fit the map, metres; inf if it does not fit."""
     precision: float | None = None
     """Share of the inliers that are within 8 px of their true pixel."""
     recall: float | None = None
@@ -65,13 +65,13 @@ class QueryResult:
     f1: float | None = None
     """Harmonic mean of both."""
     gravity_source: str | None = None
-    """What says where down is in the query."""
+    """Source of the query's gravity."""
     gravity_bound_deg: float | None = None
-    """Bound on the error of that, degrees."""
+    """Bound on the error of that gravity, degrees."""
     gravity_error_deg: float | None = None
-    """Angle between it and down at the true pose, degrees."""
+    """Angle between that gravity and the one of the true pose, degrees."""
     matching_ms: float | None = None
-    """Wall time of features, retrieval, matching and lifting; another query may have been solved meanwhile."""
+    """Wall time of features, retrieval, matching and lifting; another query may have been solved at the same time."""
     estimating_ms: float | None = None
     """Wall time of the estimator."""
     diagnosis: str | None = None
@@ -79,7 +79,7 @@ class QueryResult:
     recording: str | None = None
     """The recording's file, relative to the folder of the results if it is inside."""
     message: str = ""
-    """The outcome in a sentence, and of a doubtful one what speaks against it."""
+    """The outcome in a sentence, followed by what speaks against a doubtful pose."""
     remarks: tuple[str, ...] = ()
     """What the front end skipped and why, in sentences."""
     cam_from_map: FloatArray | None = None
@@ -104,14 +104,14 @@ _WHOLE = {"index", "references", "matches", "inliers"}
 _TEXTS = {"query", "status", "gravity_source", "diagnosis", "recording", "message"}
 _NEEDED = {"index", "query", "status", "message", "remarks"}
 _LATER = {"gravity_source", "gravity_bound_deg", "gravity_error_deg"}
-"""Which older files do not have."""
+"""Fields that older files do not have."""
 
 COLUMNS = tuple(name for name in _FIELDS if name not in _POSES)
-"""Of the CSV; poses are in the trajectory."""
+"""Columns of the CSV; poses are in the trajectory."""
 
 
 def json_line(row: QueryResult) -> str:
-    """The row as one JSON object on one line; infinity is the text "inf", as JSON has no word for it."""
+    """The row as one JSON object on one line; infinity is the text "inf", since JSON has no number for it."""
     values = {name: getattr(row, name) for name in _FIELDS}
     for name, value in values.items():
         if isinstance(value, np.ndarray):
@@ -122,16 +122,16 @@ def json_line(row: QueryResult) -> str:
 
 
 def row_of_json(line: str, place: str) -> QueryResult:
-    """The row of a line by ``json_line``; ``place`` names its file and number.
+    """The row of a line that ``json_line`` wrote; ``place`` names the file and the line number.
 
-    Raises ``InputError`` if it is no such line.
+    Raises ``InputError`` for any other line.
     """
     try:
         values = json.loads(line, parse_constant=lambda word: show(word))
     except (ValueError, RecursionError):
         values = None
     if not isinstance(values, dict) or not set(_FIELDS) - _LATER <= set(values) <= set(_FIELDS):
-        raise _damaged(place, "is no result of a query")
+        raise _damaged(place, "is not a result of a query")
     for name in _LATER:
         values.setdefault(name, None)
     for name in _FIELDS:
@@ -148,7 +148,7 @@ def _value(name: str, value: Any, place: str) -> Any:
         try:
             return numbers(value, (3, 4), name, place)
         except InputError:
-            raise _damaged(place, f"has a {name} that is no pose") from None
+            raise _damaged(place, f"has a {name} that is not a pose") from None
     if name == "remarks":
         if isinstance(value, list) and all(isinstance(remark, str) for remark in value):
             return tuple(value)
@@ -170,7 +170,7 @@ def _damaged(place: str, what: str) -> InputError:
 
 
 def csv_text(rows: Iterable[QueryResult], header: bool = True) -> str:
-    """The rows as CSV, a line each: what is unknown is empty, and no spreadsheet takes a cell for a formula."""
+    """The rows as CSV, a line each: unknown values are empty, and no spreadsheet takes a cell for a formula."""
     file = io.StringIO(newline="")
     writer = csv.writer(file, lineterminator="\n")
     if header:
@@ -196,7 +196,7 @@ CONFIGURATION, ROWS, TABLE = "configuration.json", "results.jsonl", "results.csv
 TRAJECTORY, TRUE_TRAJECTORY, PICTURE, SUMMARY = "trajectory.tum", "truth.tum", "trajectory.png", "summary.json"
 VEHICLE_TRAJECTORY = "vehicle.tum"
 REWRITTEN = (TABLE, TRAJECTORY, TRUE_TRAJECTORY, VEHICLE_TRAJECTORY, PICTURE, SUMMARY)
-"""Files of the folder that every run of the sequence writes anew."""
+"""Files of the folder that every run of the sequence writes again."""
 MAX_BYTES = 2_000_000_000
 
 
@@ -205,11 +205,11 @@ class SequenceResults:
     """A sequence's results, in the order of its query images. Q rows."""
 
     folder: Path
-    """Where they were read."""
+    """The folder from which they were read."""
     configuration: Configuration
-    """How they were made."""
+    """The settings with which they were made."""
     rows: tuple[QueryResult, ...]
-    """One a query that is done."""
+    """One row for each finished query."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -233,17 +233,17 @@ class SequenceResults:
 
     @property
     def rotation_errors_deg(self) -> FloatArray:
-        """(Q,) degrees; NaN without a pose or its truth."""
+        """(Q,) rotation errors, degrees; NaN without a pose or its truth."""
         return self._numbers("rotation_error_deg")
 
     @property
     def translation_errors_m(self) -> FloatArray:
-        """(Q,) metres; NaN without a pose or its truth."""
+        """(Q,) position errors, metres; NaN without a pose or its truth."""
         return self._numbers("translation_error_m")
 
     @property
     def registration_errors_m(self) -> FloatArray:
-        """(Q,) metres; NaN without a pose or where nothing was registered."""
+        """(Q,) registration errors, metres; NaN without a pose or where nothing was registered."""
         return self._numbers("registration_error_m")
 
     @property
@@ -257,9 +257,9 @@ class SequenceResults:
 
 
 def read_results(folder: Path) -> SequenceResults:
-    """What ``spherloc localize`` wrote into a folder, finished or not.
+    """The results that ``spherloc localize`` wrote into a folder, finished or not.
 
-    A last line that a killed process left half written is passed over. Raises ``InputError`` that names the file and
+    A last line that a killed process left half written is ignored. Raises ``InputError`` that names the file and
     the line if a file is missing, unreadable or damaged.
     """
     folder = Path(folder)
@@ -269,7 +269,7 @@ def read_results(folder: Path) -> SequenceResults:
 
 
 def _read_rows(path: Path) -> tuple[tuple[QueryResult, ...], int]:
-    """Rows in the order of the sequence, and how many bytes of the file hold whole lines."""
+    """Rows in the order of the sequence, and the number of bytes of the file that hold complete lines."""
     if not os.path.lexists(path):
         return (), 0
     with reading(path, "give another folder"):
@@ -291,7 +291,7 @@ class ResultsLog:
     """Appends rows to the results in a folder. Use it as a context manager; one process at a time may have it."""
 
     def __init__(self, folder: Path, configuration: Configuration) -> None:
-        """Begin a folder of results or go on with one.
+        """Start a folder of results or continue one.
 
         Raises ``InputError`` if the folder cannot be written, if its results were made with another configuration, if
         they are damaged, or if another process is writing there.
@@ -323,7 +323,7 @@ class ResultsLog:
         self._open.close()
 
     def append(self, row: QueryResult) -> None:
-        """Have a row on the disk before this returns. Raises ``InputError`` if that fails; other rows are kept."""
+        """Write a row to the disk, before this returns. Raises ``InputError`` if that fails; other rows are kept."""
         with self._writing(ROWS), (self.folder / ROWS).open("ab") as file:
             file.write(f"{json_line(row)}\n".encode())
             file.flush()
@@ -347,7 +347,7 @@ class ResultsLog:
         return removed
 
     def results(self) -> SequenceResults:
-        """What is done by now, in the order of the sequence, also in ``results.csv``."""
+        """The results so far, in the order of the sequence; they are also written to ``results.csv``."""
         self._write_table()
         ordered = sorted(self.rows.values(), key=lambda row: row.index)
         return SequenceResults(self.folder, self.configuration, tuple(ordered))
@@ -371,10 +371,10 @@ class ResultsLog:
         return InputError(f"{self.folder}: results cannot be written there ({reason(error)}); give another folder.")
 
     def _lock(self, stack: contextlib.ExitStack) -> None:
-        """Keep other processes out of the folder."""
+        """Lock the folder against other processes."""
         try:
             handle = os.open(self.folder, os.O_RDONLY)
-        except OSError:  # Windows opens no folders
+        except OSError:  # Windows cannot open folders
             return
         stack.callback(os.close, handle)
         try:

@@ -1,4 +1,4 @@
-"""Localizes the query images of a map scene, one after another; the next one is matched while one is solved."""
+"""Localizes the query images of a map scene, one after another; while one is solved, the next one is matched."""
 
 import re
 import threading
@@ -24,14 +24,14 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 INITIALISED = "Initialised by"
-"""Begins the remark of a query that the initialiser solved."""
+"""Beginning of the remark of a query that the initialiser solved."""
 _SLICE = re.compile(r"(-?\d{0,9}):(-?\d{0,9})(?::(-?\d{0,9}))?")
 
 
 def chosen_queries(scene: MapScene, words: Sequence[str]) -> tuple[View, ...]:
     """The queries that ``words`` choose, in the order of the sequence; all of them without words.
 
-    A word is a query's name or FIRST:LAST:STEP, places counted from 0 without LAST, as Python slices. Raises
+    A word is a query's name or a slice FIRST:LAST:STEP as in Python: indices from 0, LAST excluded. Raises
     ``InputError`` for a name that does not exist and for a slice that chooses nothing.
     """
     places = {view.name: place for place, view in enumerate(scene.queries)}
@@ -53,17 +53,17 @@ def chosen_queries(scene: MapScene, words: Sequence[str]) -> tuple[View, ...]:
 
 
 class How(NamedTuple):
-    """How queries are solved."""
+    """Estimator, options and seed with which queries are solved."""
 
     estimator: str
-    """Registered name."""
+    """Registered name of the estimator."""
     options: Any
-    """The estimator's dataclass."""
+    """The estimator's options, its dataclass."""
     seed: int
-    """The same for every query."""
+    """Seed, the same for every query."""
     initialiser: tuple[str, Any] | None = None
-    """Estimator and options that solve the first query, and every one that comes after or is itself not localized
-    (Sec. VI-C); None leaves all to ``estimator``."""
+    """Estimator and options that solve the first query, every query after one that was not localized, and every query
+    that ``estimator`` does not localize (Sec. VI-C); None leaves all queries to ``estimator``."""
 
 
 def localize(
@@ -71,8 +71,8 @@ def localize(
 ) -> Iterator[tuple[QueryResult, Trace | None]]:
     """Match and solve queries of the scene in their order; ``options`` is the estimator's dataclass.
 
-    Gives each query's result, and its trace if there was a problem to solve. What is wrong with one query is said in
-    its result and does not stop the others. Raises ``InputError`` for an unknown estimator, wrong options or seed.
+    Gives each query's result, and its trace if there was a problem to solve. An error of one query is reported in its
+    result and does not stop the others. Raises ``InputError`` for an unknown estimator, wrong options or seed.
     """
     wanted = ((view, (0,)) for view in queries)
     for _, row, trace in localize_by_each(scene, wanted, [How(estimator, options, seed)]):
@@ -84,7 +84,7 @@ def localize_by_each(
 ) -> Iterator[tuple[int, QueryResult, Trace | None]]:
     """As ``localize``, each query by several estimators after it was matched once.
 
-    With each query come the indices of the ``hows`` that shall solve it, and with each result that of its own.
+    Each query comes with the indices of the ``hows`` that are to solve it, each result with the index of its own.
     """
     places = {view.name: place for place, view in enumerate(scene.queries)}
     tracking = [False] * len(hows)
@@ -109,8 +109,8 @@ def _match(scene: MapScene, view: View) -> tuple[Matches | SpherlocError, float]
 def _solve(
     scene: MapScene, view: View, matches: Matches | SpherlocError, row: QueryResult, how: How, tracking: bool
 ) -> tuple[QueryResult, Trace | None]:
-    """``tracking`` says that the query before was localized: then the initialiser is asked only if the estimator does
-    not localize this one."""
+    """Solve one query. ``tracking`` says that the query before was localized: then the initialiser is used only if the
+    estimator does not localize this one."""
     if isinstance(matches, SpherlocError):
         return replace(row, status=_status_without_matches(view), message=str(matches)), None
     row = replace(row, matches=len(matches.pixels), references=len(matches.references), remarks=matches.remarks)
@@ -131,7 +131,7 @@ def _solve(
 
 
 def _status_without_matches(view: View) -> str:
-    """An image that cannot be used judges no method; one that can, and that was not matched, is a failure."""
+    """The status of a query without matches: "unreadable" if its image cannot be used, else "failed"."""
     try:
         view.read()
         view.usable_pixels()
@@ -141,7 +141,7 @@ def _status_without_matches(view: View) -> str:
 
 
 def _judged(scene: MapScene, view: View, references: tuple[View, ...], trace: Trace, row: QueryResult) -> QueryResult:
-    """The row with all that the trace tells."""
+    """The row, filled in from the trace."""
     problem, metrics, pose = trace.problem, evaluate(trace), trace.cam_from_map
     judged, registration_error_m = judge(trace), None
     remarks = tuple(dict.fromkeys((*row.remarks, *problem.remarks[len(scene.remarks) :])))
@@ -178,7 +178,7 @@ def _array(value: Any) -> FloatArray | None:
 
 
 class _Job(threading.Thread, Generic[R]):
-    """Work in a thread of its own. Python ends after it: to stop a thread inside OpenCV would crash the process."""
+    """Work in a thread of its own. Python waits for it at the end: stopping a thread inside OpenCV would crash."""
 
     def __init__(self, work: Callable[[], R]) -> None:
         super().__init__(name="spherloc-matching")
@@ -201,7 +201,7 @@ class _Job(threading.Thread, Generic[R]):
 
 
 def _one_ahead(work: Callable[[T], R], items: Iterable[T]) -> Iterator[tuple[T, R]]:
-    """Each item with ``work`` of it, in order; a thread works on the next item while the caller has this one."""
+    """Each item with the result of ``work``, in order; a thread works on the next item while the caller uses one."""
     waiting: tuple[T, _Job[R]] | None = None
     for item in items:
         done = None if waiting is None else (waiting[0], waiting[1].result())

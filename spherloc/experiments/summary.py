@@ -1,6 +1,6 @@
-"""What a sequence's results come to: success rates with their uncertainty, medians, and errors of the whole trajectory.
+"""Summary of a sequence's results: success rates with their uncertainty, medians, and errors of the whole trajectory.
 
-ATE is taken after an alignment, RPE from each pose to the next, as evo defines them.
+ATE is computed after an alignment, RPE from each pose to the next, as the tool evo defines them.
 """
 
 import math
@@ -17,7 +17,7 @@ from spherloc.trajectory import NS_PER_S, Trajectory
 from spherloc.types import FloatArray
 
 MIN_POSES = 3
-"""Fewer positions fix no alignment."""
+"""Least number of positions for an alignment."""
 
 
 @dataclass(frozen=True)
@@ -25,17 +25,17 @@ class TrajectoryError:
     """Root mean squares over the poses that have both an estimate and a truth."""
 
     poses: int
-    """How many."""
+    """Number of these poses."""
     ate_m: float
-    """Of the distances between the positions as they are: the map's frame is the truth's."""
+    """Absolute trajectory error, m: of the distances between positions, without an alignment."""
     ate_rigid_m: float | None
-    """After the best rotation and translation; None for fewer than 3 poses or where these do not fix it."""
+    """The same after the best rotation and translation; None for fewer than 3 poses or where these do not fix it."""
     ate_similarity_m: float | None
-    """After the best scale too."""
+    """The same after the best rotation, translation and scale."""
     rpe_m: float | None
-    """Of the translation's error from each pose to the next one, m; None where the poses have no order in time."""
+    """Relative pose error, m: of the translation from each pose to the next; None without an order in time."""
     rpe_deg: float | None
-    """Of its rotation's error, degrees."""
+    """The same of the rotation, degrees."""
 
 
 def trajectory_error(truth: FloatArray, estimate: FloatArray, ordered: bool) -> TrajectoryError | None:
@@ -85,7 +85,7 @@ def _aligned_error(places: FloatArray, true_places: FloatArray, with_scale: bool
 
 
 def _moves(truth: FloatArray, estimate: FloatArray) -> FloatArray:
-    """(P - 1, 3, 4): the true move from each pose to the next, inverted, times the estimated one."""
+    """Errors (P - 1, 3, 4) of the motion from each pose to the next: inverse of the true times the estimated one."""
     true_moves, moves = _between(truth), _between(estimate)
     rotations = np.swapaxes(true_moves[:, :, :3], 1, 2)
     shift = moves[:, :, 3] - true_moves[:, :, 3]
@@ -93,7 +93,7 @@ def _moves(truth: FloatArray, estimate: FloatArray) -> FloatArray:
 
 
 def _between(poses: FloatArray) -> FloatArray:
-    """(P - 1, 3, 4): each next pose seen from the one before."""
+    """Motions (P - 1, 3, 4): each pose relative to the one before."""
     rotations = np.swapaxes(poses[:-1, :, :3], 1, 2)
     shift = poses[1:, :, 3] - poses[:-1, :, 3]
     return np.concatenate([rotations @ poses[1:, :, :3], np.einsum("pij,pj->pi", rotations, shift)[:, :, None]], axis=2)
@@ -114,18 +114,18 @@ Z_95 = 1.959963984540054
 
 @dataclass(frozen=True)
 class SuccessRate:
-    """How many queries are within one limit."""
+    """Success rate of the queries at one limit."""
 
     degrees: float | None
     """Limit of the rotation error; None where poses are judged by registration."""
     metres: float
     """Limit of the position error, or of the registration error."""
     successes: int
-    """Queries with errors below the limits."""
+    """Number of queries with errors below the limits."""
     judged: int
-    """Queries that could be judged: failed ones too, but not those without truth or with an unreadable image."""
+    """Number of judged queries: failed ones too, but not those without truth or with an unreadable image."""
     rate: float | None
-    """Their ratio, 0 to 1; None if none was judged."""
+    """Ratio of both, 0 to 1; None if none was judged."""
     low: float | None
     """Lower end of the 95 % Wilson interval of the rate."""
     high: float | None
@@ -134,16 +134,16 @@ class SuccessRate:
 
 @dataclass(frozen=True)
 class Summary:
-    """A sequence in numbers. Means and medians are None where nothing is known to take them of."""
+    """A sequence in numbers. Means and medians are None where there are no values."""
 
     queries: int
-    """In the scene."""
+    """Number of queries in the scene; the next ones are numbers of queries too."""
     done: int
-    """With a result."""
+    """Queries with a result."""
     localized: int
-    """With a pose that is believed."""
+    """Queries with a pose that is believed."""
     doubtful: int
-    """With a pose that is not."""
+    """Queries with a pose that is not believed."""
     failed: int
     """Usable images without a pose; they count as failures."""
     unreadable: int
@@ -151,47 +151,47 @@ class Summary:
     without_truth: int
     """Usable images whose true pose is unknown; they are skipped where the truth is needed."""
     not_registered: int
-    """Poses that could not be registered, where a scene judges so; they are skipped there."""
+    """Poses that could not be registered, in scenes that judge by registration; they are skipped there."""
     success: tuple[SuccessRate, ...]
-    """At the scene's limits of pose errors; empty if no query's truth is known."""
+    """Success rates at the scene's limits of pose errors; empty if no query's truth is known."""
     registration_success: tuple[SuccessRate, ...]
-    """At the scene's limits of registration errors; empty if the scene has none."""
+    """Success rates at the scene's limits of registration errors; empty if the scene has none."""
     median_rotation_error_deg: float | None
-    """Over localized queries with known truth, as the next one."""
+    """Median rotation error of the localized queries with known truth, degrees."""
     median_translation_error_m: float | None
-    """Metres."""
+    """Median position error of the same queries, metres."""
     median_registration_error_m: float | None
-    """Over registered queries."""
+    """Median registration error of the registered queries, metres."""
     scored: int
-    """Queries with labelled correspondences, which the next three are the means of; without a pose they count 0."""
+    """Number of queries with labelled correspondences, for the next six; a query without a pose counts as 0 there."""
     mean_precision: float | None
-    """Of the inliers, at 8 px."""
+    """Mean precision of the inliers, at 8 px."""
     mean_recall: float | None
-    """Of the inliers, at 8 px."""
+    """Mean recall of the inliers, at 8 px."""
     mean_f1: float | None
-    """Of the inliers, at 8 px."""
+    """Mean F1 of the inliers, at 8 px."""
     median_precision: float | None
-    """Over the scored queries, as the paper's tables give it; so are the next two."""
+    """Median precision of the inliers, at 8 px, as in the paper's tables."""
     median_recall: float | None
-    """Of the inliers, at 8 px."""
+    """Median recall of the inliers, at 8 px, as in the paper's tables."""
     median_f1: float | None
-    """Of the inliers, at 8 px."""
+    """Median F1 of the inliers, at 8 px, as in the paper's tables."""
     median_true_outlier_rate: float | None
-    """Over queries with labelled correspondences."""
+    """Median outlier rate of the queries with labelled correspondences."""
     median_estimated_outlier_rate: float | None
-    """Over queries for which the front end guessed it."""
+    """Median of the front end's estimates, over the queries that have one."""
     median_matching_ms: float | None
-    """Over all queries that were matched."""
+    """Median over all queries that were matched."""
     median_estimating_ms: float | None
-    """Over all queries that were solved."""
+    """Median over all queries that were solved."""
     trajectory: TrajectoryError | None
     """ATE and RPE of all poses, doubtful ones too; None if no pose has a truth."""
     diagnoses: dict[str, int]
-    """Queries by the cause of their diagnosis, most frequent first."""
+    """Numbers of queries by the cause of their diagnosis, most frequent first."""
 
 
 def wilson(successes: int, judged: int) -> tuple[float, float]:
-    """The 95 % interval of a rate by Wilson's score (1927): right also near 0 and 1 and for few queries."""
+    """The 95 % interval of a rate by Wilson's score (1927): accurate also near 0 and 1 and for few queries."""
     rate, z2 = successes / judged, Z_95**2 / judged
     centre = (rate + z2 / 2) / (1 + z2)
     half = math.sqrt(rate * (1 - rate) * z2 + z2**2 / 4) / (1 + z2)
@@ -199,7 +199,7 @@ def wilson(successes: int, judged: int) -> tuple[float, float]:
 
 
 def summarize(results: SequenceResults) -> Summary:
-    """The summary of what is done by now."""
+    """The summary of the results so far."""
     rows, setting = results.rows, results.configuration
     usable = [row for row in rows if row.status != UNREADABLE]
     with_truth = [row for row in usable if row.truth_cam_from_map is not None]
@@ -247,7 +247,8 @@ def _trajectory_error(results: SequenceResults) -> TrajectoryError | None:
 
 
 def success_rates(rows: Sequence[QueryResult], thresholds: Thresholds) -> tuple[SuccessRate, ...]:
-    """How many queries with known truth are within each of the limits (degrees, metres); none without any truth."""
+    """Success rates of the queries with known truth at each of the limits (degrees, metres); empty without any
+    truth."""
     judged = [row for row in rows if row.status != UNREADABLE and row.truth_cam_from_map is not None]
     return tuple(_rate(judged, *limits) for limits in thresholds) if judged else ()
 
@@ -262,7 +263,7 @@ def _rate(judged: Sequence[QueryResult], degrees: float | None, metres: float) -
 
 
 def _within(row: QueryResult, degrees: float | None, metres: float) -> bool:
-    """Below the limits, as in Sec. VI; a query without a pose never is."""
+    """Whether the errors are below the limits, as in Sec. VI; false for a query without a pose."""
     if degrees is None:
         return row.registration_error_m is not None and row.registration_error_m < metres
     if row.rotation_error_deg is None or row.translation_error_m is None:
@@ -285,7 +286,7 @@ def _mean(values: Iterable[float | None]) -> float | None:
 
 
 LATEST_S = 4e9
-"""Beyond the year 2090; a number larger than that is no time in seconds."""
+"""Latest time, beyond the year 2090: a larger number is not a time in seconds."""
 
 
 def estimated_trajectory(results: SequenceResults) -> Trajectory:
@@ -310,7 +311,7 @@ def true_trajectory(results: SequenceResults) -> Trajectory:
 
 
 def timed(results: SequenceResults) -> bool:
-    """Whether every query has a time and the times grow; else a query's time is its place in the sequence."""
+    """Whether every query has a time and the times grow; else a query's time is its index in the sequence."""
     times = [row.timestamp_s for row in results.rows]
     if any(time is None or not abs(time) < LATEST_S for time in times):
         return False
@@ -327,4 +328,4 @@ def _trajectory(results: SequenceResults, field: str) -> Trajectory:
 
 def _nanoseconds(row: QueryResult, by_time: bool) -> int:
     seconds = row.timestamp_s if by_time and row.timestamp_s is not None else row.index
-    return round(Decimal(repr(seconds)) * NS_PER_S)  # the decimals that were written, not their nearest double
+    return round(Decimal(repr(seconds)) * NS_PER_S)  # exact for the decimals of the shortest repr

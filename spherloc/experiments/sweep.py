@@ -3,8 +3,8 @@
 >>> plan = planned(Path("scenes/mei_outliers_80.toml"), "outlier_rate", [0.5, 0.9], [Entrant("mc")], runs=100)
 >>> rows = list(run_sweep(plan))
 
-The runs are done by processes on this machine, or by a Dask cluster whose machines have spherloc and can read the scene
-file.
+The runs are done by processes on this machine, or by a Dask cluster whose machines have spherloc installed and can read
+the scene file.
 """
 
 import asyncio
@@ -41,28 +41,28 @@ from spherloc.warm_up import warm_up
 
 MAX_WORKERS = 64
 AHEAD = 1
-"""Tasks that wait beside those that are being done, so that no worker waits for us."""
+"""Number of tasks that are queued besides those that are being done, so that no worker has to wait."""
 MAX_FAILED_STARTS = 2
 NICENESS = 10
-"""Whoever waits for an answer of this machine goes before a sweep in the background."""
+"""Niceness of the worker processes: a sweep in the background must not slow down other work on this machine."""
 
 
 class Keep(Protocol):
-    """Keeps whole runs where they are done. It is sent to the workers, so it is plain data."""
+    """Stores whole runs where they are done. It is sent to the workers, so it must be plain data."""
 
     def __call__(self, plan: SweepPlan, job: Job, trace: Trace) -> str:
-        """Keep a run; returns why it could not be kept, in a sentence, or nothing if it was."""
+        """Store a run; returns a sentence that says why it could not be stored, or an empty text."""
         ...
 
 
 @dataclass(frozen=True)
 class Solved:
-    """What a worker has done."""
+    """The results of a task."""
 
     rows: list[SweepRow]
-    """A row a run."""
+    """A row for each run."""
     complaints: tuple[str, ...] = ()
-    """Why runs could not be kept, a sentence each."""
+    """Sentences that say why runs could not be stored."""
     failures: tuple[tuple[str, str], ...] = ()
     """Estimators of other packages that failed, by their labels, and how."""
 
@@ -72,7 +72,7 @@ class Done:
     """A task that has ended."""
 
     jobs: tuple[Job, ...]
-    """What it was."""
+    """The jobs of the task."""
     solved: Solved | None
     """Its results; None if its worker died."""
 
@@ -81,15 +81,15 @@ class Workers(Protocol):
     """Workers that do tasks, each of which is a few jobs."""
 
     def room(self) -> int:
-        """How many more tasks it should be given now."""
+        """Number of further tasks that can be submitted now."""
         ...
 
     def submit(self, jobs: tuple[Job, ...]) -> None:
-        """Take a task."""
+        """Have a worker do a task; does not wait."""
         ...
 
     def collect(self, timeout_s: float) -> list[Done]:
-        """Tasks that have ended, as soon as there is one; none if there is none in time.
+        """Tasks that have ended, as soon as there is one; an empty list if none ends in time.
 
         Raises ``InputError`` if a task is impossible or the workers are lost for good.
         """
@@ -101,7 +101,7 @@ class Workers(Protocol):
 
 
 def solve(plan: SweepPlan, jobs: Sequence[Job], keep: Keep | None) -> Solved:
-    """What a worker does."""
+    """Do the jobs of a task; called in a worker."""
     _warm(frozenset(entrant.estimator for entrant in plan.entrants))
     complaints: list[str] = []
     failures: dict[str, str] = {}
@@ -115,7 +115,7 @@ def solve(plan: SweepPlan, jobs: Sequence[Job], keep: Keep | None) -> Solved:
 
 @cache
 def _warm(estimators: frozenset[str]) -> None:
-    """So that no run's time includes the loading of the kernels."""
+    """Load the kernels, so that no run's time includes it."""
     warm_up(estimators=estimators)
 
 
@@ -136,7 +136,7 @@ class LocalWorkers:
         self._start()
 
     def room(self) -> int:
-        """How many more tasks can be submitted now."""
+        """Number of further tasks that can be submitted now."""
         return self._workers + AHEAD - len(self._tasks)
 
     def submit(self, jobs: tuple[Job, ...]) -> None:
@@ -144,13 +144,13 @@ class LocalWorkers:
         try:
             with _deaf_to_ctrl_c():
                 future = self._pool.submit(solve, self._plan, jobs, self._keep)
-        except BrokenExecutor as error:  # found out before we collected
+        except BrokenExecutor as error:  # noticed before ``collect``
             future = Future()
             future.set_exception(error)
         self._tasks[future] = jobs
 
     def collect(self, timeout_s: float) -> list[Done]:
-        """Tasks that ended since the last call; waits so long, seconds, for the first one."""
+        """Tasks that ended since the last call; waits at most ``timeout_s`` seconds for the first one."""
         ended, _ = wait(self._tasks, timeout_s, FIRST_COMPLETED)
         if any(_is_broken(future) for future in ended):
             ended = set(self._tasks)  # those that have a result keep it
@@ -158,7 +158,7 @@ class LocalWorkers:
         return [Done(self._tasks.pop(future), _result(future)) for future in ended]
 
     def close(self) -> None:
-        """Drop what is not begun, and end the processes."""
+        """Drop tasks that were not begun, and end the processes."""
         self._lifeline.close()
         self._pool.shutdown(wait=True, cancel_futures=True)
 
@@ -189,7 +189,7 @@ class LocalWorkers:
 
 
 def _begin(lifeline: Connection) -> None:
-    """What a worker process does first."""
+    """Start of a worker process."""
     if hasattr(os, "nice"):
         os.nice(NICENESS)
     threading.Thread(target=_end_with, args=(lifeline,), name="spherloc-lifeline", daemon=True).start()
@@ -215,7 +215,7 @@ def _result(future: Future[Any]) -> Any:
 
 @contextlib.contextmanager
 def _deaf_to_ctrl_c() -> Iterator[None]:
-    """Processes that are started meanwhile never hear of Ctrl-C, which a terminal sends to them too."""
+    """Processes that are started within it ignore Ctrl-C, which a terminal sends to them too."""
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield
         return
@@ -228,9 +228,9 @@ def _deaf_to_ctrl_c() -> Iterator[None]:
 
 CONNECT_S = 10.0
 COUNT_EVERY_S = 2.0
-"""Workers come and go; they are counted this often."""
+"""Time between two counts of the workers, whose number can change."""
 PATIENCE_S = 60.0
-"""A cluster may be without any worker for this long."""
+"""Longest time for which a cluster may be without any worker."""
 GATHER_S = 2.0
 
 
@@ -241,10 +241,10 @@ class Cluster:
         """Raises ``InputError`` if ``dask.distributed`` is missing, or no scheduler with workers is at ``address``."""
         self._dask = require("distributed", "cluster", "a sweep on a Dask cluster")
         self._plan, self._address, self._keep = plan, address, keep
-        # What is said here in a sentence, it would log with tracebacks.
+        # Errors are reported here in one sentence; Dask would log them with tracebacks.
         logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
         try:
-            # A client that never reached its scheduler takes 20 s to be deleted, so knock before.
+            # A client that never reached its scheduler takes 20 s to be deleted, so the address is tried before.
             with ThreadPoolExecutor(1) as knocking:
                 knocking.submit(asyncio.run, _knock(self._dask, address)).result()
             self._client: Any = self._dask.Client(address, timeout=CONNECT_S, set_as_default=False)
@@ -267,7 +267,7 @@ class Cluster:
             raise
 
     def room(self) -> int:
-        """How many more tasks can be submitted now."""
+        """Number of further tasks that can be submitted now."""
         if time.monotonic() - self._counted > COUNT_EVERY_S:
             self._count()
         return self._threads + AHEAD - len(self._tasks)
@@ -279,7 +279,7 @@ class Cluster:
         future.add_done_callback(self._ended.put)
 
     def collect(self, timeout_s: float) -> list[Done]:
-        """Tasks that ended since the last call; waits so long, seconds, for the first one."""
+        """Tasks that ended since the last call; waits at most ``timeout_s`` seconds for the first one."""
         found: list[Done] = []
         with contextlib.suppress(queue.Empty):
             future = self._ended.get(timeout=timeout_s)
@@ -292,7 +292,7 @@ class Cluster:
         return found
 
     def close(self) -> None:
-        """Drop what is not done and let the workers go."""
+        """Drop tasks that are not done, and disconnect from the workers."""
         with contextlib.suppress(Exception):  # the scheduler may be gone
             self._client.cancel(list(self._tasks), asynchronous=False)
         self._tasks.clear()
@@ -340,7 +340,7 @@ async def _knock(dask: Any, address: str) -> None:
     identity = dask.rpc(address, timeout=CONNECT_S)
     try:
         if (await asyncio.wait_for(identity.identity(), CONNECT_S))["type"] != "Scheduler":
-            raise ValueError("it is no scheduler")
+            raise ValueError("it is not a scheduler")
     finally:
         await identity.close_rpc()
 
@@ -353,11 +353,11 @@ def _one_line(error: BaseException) -> str:
 __all__ = ["AXES", "Entrant", "Job", "Keep", "SweepPlan", "SweepRow", "planned", "run_sweep"]
 
 TASK_S = 0.3
-"""A task is a few runs that take about as long as this: less would be spent on messages, more would look stuck."""
+"""Target duration of a task, which is a few runs: a shorter one costs too many messages, a longer one looks stuck."""
 OVERHEAD_MS = 2.0
-"""Of a run beside its estimator: drawing the problem, judging the pose."""
+"""Time of a run besides its estimator: drawing the problem, judging the pose."""
 KEEPING_MS = 50.0
-"""Of a run that is kept, beside that."""
+"""Additional time of a run that is stored."""
 MAX_DEATHS = 3
 LISTEN_S = 0.1
 
@@ -372,17 +372,17 @@ def run_sweep(
     complain: Callable[[str], None] = lambda sentence: None,
     warn: Callable[[str], None] = lambda sentence: None,
 ) -> Iterator[SweepRow]:
-    """The rows of a sweep as they come, all points growing evenly; none is done here, all in other processes.
+    """The rows of a sweep as they are completed, evenly over all points; all runs are done in other processes.
 
     ``done`` holds (estimator's label, value, seed) of runs to be left out. ``scheduler`` is the address of a Dask
     scheduler ("tcp://host:8786"), whose workers then do the runs instead of ``workers`` processes on this machine.
-    The rows do not depend on who does them, but for their times and their order. Setting ``stop``, or closing the
-    iterator, ends it within a fraction of a second and leaves no process behind. Runs of a worker that dies are done
-    again.
+    The rows do not depend on which worker does them, except for their times and their order. Setting ``stop``, or
+    closing the iterator, ends it within a fraction of a second and leaves no process behind. Runs of a worker that dies
+    are done again.
 
-    ``keep`` is given every run where it is done, before its row comes here and between the times that are measured;
-    ``complain`` gets a sentence for each that could not be kept. ``warn`` gets one, once for each, about estimators of
-    other packages that fail: such runs count as failures without a pose.
+    ``keep`` is called with every run where it is done, before its row is returned and outside the measured time;
+    ``complain`` gets a sentence for each run that could not be stored. ``warn`` gets one for each estimator of an
+    extension that fails: such runs count as failures without a pose.
 
     Raises ``InputError`` if a run is impossible or kills its worker every time, or if there are no workers.
     """
@@ -417,12 +417,12 @@ def _start_workers(plan: SweepPlan, workers: int, scheduler: str | None, keep: K
 
 
 class Backlog:
-    """The runs that are still to be done, handed out in tasks."""
+    """The runs that are still to be done, divided into tasks."""
 
     def __init__(
         self, plan: SweepPlan, done: Collection[tuple[str, float, int]], overhead_ms: float = OVERHEAD_MS
     ) -> None:
-        """``overhead_ms`` is what a run takes beside its estimator."""
+        """``overhead_ms`` is the time of a run besides its estimator."""
         self._plan, self._overhead_ms = plan, overhead_ms
         known, labels = set(done), plan.labels
         self._fresh = (
@@ -432,20 +432,21 @@ class Backlog:
         )
         self._next = next(self._fresh, None)
         self._suspects: deque[Job] = deque()
-        """Of tasks whose worker died. Each is done alone and with nothing beside it, to tell who kills workers."""
+        """Jobs of tasks whose worker died. Each is done alone, with no other task, to find the one that kills
+        workers."""
         self._trial: tuple[Job, ...] = ()
-        """The suspect that is being done."""
+        """The suspect that is being done, alone."""
         self._deaths: Counter[Job] = Counter()
         self._out: set[tuple[Job, ...]] = set()
         self._spent_ms: dict[tuple[int, int], tuple[int, float]] = {}
 
     @property
     def left(self) -> bool:
-        """Whether anything is not done."""
+        """Whether some runs are not done."""
         return bool(self._next or self._suspects or self._out)
 
     def take(self) -> tuple[Job, ...]:
-        """The next task; nothing if there is none now."""
+        """The next task; empty if there is none now."""
         if self._trial or (self._suspects and self._out):
             return ()
         jobs = self._trial = (self._suspects.popleft(),) if self._suspects else ()
@@ -455,7 +456,7 @@ class Backlog:
         return jobs
 
     def book(self, jobs: tuple[Job, ...], rows: Sequence[SweepRow]) -> Sequence[SweepRow]:
-        """A task is done; gives its rows."""
+        """Note that a task is done; returns its rows."""
         self._leave(jobs)
         for job, row in zip(jobs, rows, strict=True):
             runs, total_ms = self._spent_ms.get((job.value, job.entrant), (0, 0.0))
@@ -463,7 +464,7 @@ class Backlog:
         return rows
 
     def put_back(self, jobs: tuple[Job, ...]) -> None:
-        """A task's worker died. Raises ``InputError`` if it always does."""
+        """Note that a task's worker died. Raises ``InputError`` if that happens every time."""
         if jobs == self._trial:
             self._deaths[jobs[0]] += 1
             if self._deaths[jobs[0]] == MAX_DEATHS:
@@ -483,7 +484,7 @@ class Backlog:
         spent_ms = 0.0
         while self._next is not None:
             job = self._next
-            # How long a run takes at a new point is unknown, so the first one is a task of its own.
+            # The time of a run at a new point is unknown, so the first one is a task of its own.
             runs, total_ms = self._spent_ms.get((job.value, job.entrant), (1, 1e3 * TASK_S))
             cost_ms = total_ms / runs + self._overhead_ms
             if spent_ms and spent_ms + cost_ms > 1e3 * TASK_S:

@@ -1,4 +1,4 @@
-"""The CSV of a sweep: every run is in the file before the next one is noted, and a sweep that was stopped goes on."""
+"""The CSV of a sweep: each run is written before the next one, and a sweep that was stopped can be continued."""
 
 import contextlib
 import json
@@ -28,18 +28,18 @@ MAX_PLAN_BYTES = 1_000_000
 PLAN, SUMMARY, PICTURE = ".plan.json", ".summary.csv", ".png"
 """Endings of the files beside the table."""
 _UNCOMPARED = {"scene", "runs"}
-"""A scene that was moved is the same scene, and more runs add to those that are done."""
+"""Keys that may differ: a scene that was moved is the same scene, and more runs add to those that are done."""
 
 
 class SweepLog:
     """Appends rows to a CSV. Use it as a context manager; one process at a time may have the file.
 
-    Beside ``NAME.csv`` are ``NAME.plan.json``, by which a sweep knows that the files are its own, and, at the end,
+    Beside ``NAME.csv`` it writes ``NAME.plan.json``, by which a sweep recognizes its own files, and, at the end,
     ``NAME.summary.csv`` and ``NAME.png``.
     """
 
     def __init__(self, path: Path, plan: SweepPlan) -> None:
-        """Begin a file or go on with one.
+        """Start a file or continue one.
 
         Raises ``InputError`` if it cannot be written, holds the runs of another plan, is damaged, if another process
         writes to it, or if a file beside it has a name that the sweep would write to and is not the sweep's own.
@@ -48,7 +48,7 @@ class SweepLog:
         if self.path.suffix != ".csv":
             raise InputError(f"{self.path}: the table of a sweep ends with .csv; name it so.")
         self.rows: list[SweepRow] = []
-        """Those of earlier times first."""
+        """The rows so far, those of earlier sessions first."""
         self._refuse_others()
         with contextlib.ExitStack() as stack:
             try:
@@ -61,7 +61,7 @@ class SweepLog:
             except BlockingIOError:
                 raise InputError(f"{self.path}: another sweep writes to it; wait or give another file.") from None
             if os.path.lexists(self.beside(PLAN)):
-                self._compare()  # another process may have been quicker
+                self._compare()  # another process may have written it first
             self.write(self.beside(PLAN), (json.dumps(plan.record(), indent=2, allow_nan=False) + "\n").encode())
             self._read()
             self._open = stack.pop_all()
@@ -72,7 +72,7 @@ class SweepLog:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        with contextlib.suppress(OSError):  # of bytes that found no room: that was said when they were appended
+        with contextlib.suppress(OSError):  # a full disk was reported when the rows were appended
             self._open.close()
 
     @property
@@ -81,23 +81,23 @@ class SweepLog:
         return {(row.estimator, row.value, row.seed) for row in self.rows}
 
     def done_of_plan(self) -> int:
-        """How many of the plan's runs are done; the file may hold more."""
+        """Number of the plan's runs that are done; the file may hold more."""
         last = self._plan.first_seed + self._plan.runs
         return sum(row.seed < last for row in self.rows)
 
     def beside(self, ending: str) -> Path:
-        """``NAME.png`` for ".png"."""
+        """The path beside the table with another ending: ``NAME.png`` for ".png"."""
         return self.path.with_suffix(ending)
 
     def append(self, row: SweepRow) -> None:
-        """Have a row in the file before this returns. Raises ``InputError`` if that fails; other rows are kept."""
+        """Write a row to the file, before this returns. Raises ``InputError`` if that fails; other rows are kept."""
         with self._writing(self.path):
             self._file.write(row_line(row).encode())
             self._file.flush()
         self.rows.append(row)
 
     def finish(self) -> None:
-        """Put the rows in order, whoever was quicker, and write the summary. Raises ``InputError`` if that fails."""
+        """Write the rows in the order of the plan, and the summary. Raises ``InputError`` if that fails."""
         self.write(self.path, rows_text(self._plan.over, self._plan.labels, self.rows).encode())
         points = summarize(self._plan.labels, self.rows)
         self.write(self.beside(SUMMARY), summary_text(self._plan.over, points).encode())
@@ -121,17 +121,17 @@ class SweepLog:
         """Raise ``InputError`` where a new sweep would write to a file that is not its own; before anything is made."""
         if os.path.lexists(self.beside(PLAN)):
             self._compare()
-            # To open a pipe would wait for somebody who reads it.
+            # Opening a pipe would wait for a process that reads it.
             if os.path.lexists(self.path) and not is_file(self.path):
-                raise InputError(f"{self.path}: is no regular file; remove it or give another file.")
+                raise InputError(f"{self.path}: is not a regular file; remove it or give another file.")
         elif os.path.lexists(self.path) and not (is_file(self.path) and size_of(self.path) == 0):
             raise InputError(
-                f"{self.path}: is no table of a sweep, or has lost its {self.beside(PLAN).name}; give another file."
+                f"{self.path}: is not a table of a sweep, or has lost its {self.beside(PLAN).name}; give another file."
             )
         else:
             for path in map(self.beside, (SUMMARY, PICTURE)):
                 if os.path.lexists(path):
-                    raise InputError(f"{path}: is there already, and the sweep would write to it; give another file.")
+                    raise InputError(f"{path}: exists already, and the sweep would write to it; give another file.")
 
     def _compare(self) -> None:
         """Raise ``InputError`` if the plan beside the table is another one."""
@@ -165,8 +165,8 @@ class SweepLog:
         plan = self._plan
         if row.estimator not in plan.labels or row.value not in plan.values or row.seed < plan.first_seed:
             raise InputError(
-                f"{place}: holds {show(row.estimator)} at {row.value:g}, seed {row.seed}, no run of this sweep; delete "
-                "that line."
+                f"{place}: holds {show(row.estimator)} at {row.value:g}, seed {row.seed}, not a run of this sweep; "
+                "delete that line."
             )
         return row
 

@@ -1,4 +1,4 @@
-"""What a sweep does: estimators on problems of one simulated scene, one property of which takes several values.
+"""The plan of a sweep: estimators on problems of one simulated scene, of which one property takes several values.
 
 Figs. 5 to 7 are sweeps: errors against pixel noise, success and time against the outlier rate.
 """
@@ -33,7 +33,7 @@ AXES: Mapping[str, str] = {
     "correspondences": "correspondences",
     "gravity_error_deg": "gravity error (deg)",
 }
-"""What a sweep can go over, and its name for people."""
+"""Properties that a sweep can vary, with their names for users."""
 
 MAX_VALUES, MAX_ENTRANTS, MAX_RUNS, MAX_ROWS = 200, 20, 100_000, 2_000_000
 FORMAT = 2
@@ -44,13 +44,13 @@ class Entrant:
     """An estimator with options."""
 
     estimator: str
-    """Registered name."""
+    """Registered name of the estimator."""
     changes: tuple[tuple[str, Any], ...] = ()
-    """Options by name that are not the default."""
+    """Options that differ from the defaults, by name."""
 
     @property
     def label(self) -> str:
-        """As tables and pictures name it, such as "ransac-2p iterations=1000"."""
+        """Its name in tables and pictures, such as "ransac-2p iterations=1000"."""
         return " ".join([self.estimator, *(f"{key}={value}" for key, value in self.changes)])
 
     def options(self, problem: Problem | None = None) -> Any:
@@ -64,16 +64,16 @@ class Job:
     """One run of a sweep. Jobs in ascending order fill all points evenly: one run of each, then the next."""
 
     run: int
-    """From 0; it decides the seed."""
+    """Number of the problem at each point, from 0; it determines the seed."""
     value: int
     """Index of the value."""
     entrant: int
-    """Index of the estimator, last so that all of them solve a problem while it is at hand."""
+    """Index of the estimator; it is the last field, so that all estimators solve a problem one after another."""
 
 
 @dataclass(frozen=True)
 class SweepPlan:
-    """All that decides a sweep's results: plain data, so that other processes and machines can build its problems.
+    """All that determines a sweep's results: plain data, so that other processes and machines can build its problems.
 
     Made by ``planned``, which checks it.
     """
@@ -87,30 +87,30 @@ class SweepPlan:
     camera_sha256: str | None
     """Hash of the file of the variation's camera, if it has one."""
     over: str
-    """A key of ``AXES``."""
+    """The varied property, a key of ``AXES``."""
     values: tuple[float, ...]
-    """Ascending."""
+    """Values of the property, ascending."""
     entrants: tuple[Entrant, ...]
     """The estimators, each with its options."""
     runs: int
-    """Problems a point."""
+    """Number of problems per point."""
     first_seed: int
-    """Run k has this seed + k, of the simulation and of the estimator, at all points: they are compared in pairs."""
+    """Run k has this seed + k, for simulation and estimator, at all points, so that points are compared in pairs."""
     versions: tuple[tuple[str, str], ...]
-    """Of everything that can change a number; who solves must have the same."""
+    """Versions of all software that can change a number; the workers must have the same."""
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """Of the entrants."""
+        """Labels of the entrants."""
         return tuple(entrant.label for entrant in self.entrants)
 
     @property
     def rows(self) -> int:
-        """Runs in all."""
+        """Number of runs in all."""
         return self.runs * len(self.values) * len(self.entrants)
 
     def jobs(self) -> Iterator[Job]:
-        """All runs in the order in which they are best done."""
+        """All runs in the order in which they are done."""
         for run in range(self.runs):
             for value in range(len(self.values)):
                 for entrant in range(len(self.entrants)):
@@ -122,7 +122,7 @@ class SweepPlan:
         return f"{self.entrants[job.entrant].label} at {at}, seed {self.first_seed + job.run}"
 
     def variation_at(self, value: int) -> Variation:
-        """What is changed about the scene at the value of that index."""
+        """The changes to the scene at the value of that index."""
         number = self.values[value]
         return replace(self.variation, **{self.over: int(number) if self.over == "correspondences" else number})
 
@@ -132,9 +132,9 @@ class SweepPlan:
         done: Callable[[Job, Trace], None] | None = None,
         failed: Callable[[Job, str], None] = lambda job, sentence: None,
     ) -> list[SweepRow]:
-        """Do some of the runs, here and now; ``done`` is given each of them, between the times that are measured.
+        """Do some of the runs in this process; ``done`` is called with each of them, outside the measured time.
 
-        A run in which an estimator of another package fails is a failure without a pose; ``failed`` gets the sentence.
+        A run in which an extension's estimator fails is a failure without a pose; ``failed`` gets a sentence on it.
 
         Raises ``InputError`` if the scene file or the software is not what the plan was made with, or a run is
         impossible.
@@ -172,7 +172,7 @@ class SweepPlan:
         return rows
 
     def check(self) -> None:
-        """Draw the first problem of every value: what would fail at once fails before workers are started.
+        """Draw the first problem of every value, so that errors are found before workers are started.
 
         Raises ``InputError``.
         """
@@ -192,7 +192,7 @@ class SweepPlan:
         return _scene(self.scene, self.scene_sha256)
 
     def record(self) -> dict[str, Any]:
-        """With nothing but what JSON has; infinity is the text "inf"."""
+        """The plan as a table of plain JSON values; infinity is the text "inf"."""
         table = asdict(self)
         table["entrants"] = [{"estimator": item.estimator, "options": dict(item.changes)} for item in self.entrants]
         table |= {"variation": self.variation.simulation, "versions": dict(self.versions)}
@@ -280,12 +280,12 @@ def _check_counts(plan: SweepPlan) -> None:
 
 @lru_cache(maxsize=4)
 def _scene(path: str, sha256: str) -> SyntheticScene:
-    """The scene of a plan. Raises ``InputError`` if its file is gone, has changed, or is no simulation."""
+    """The scene of a plan. Raises ``InputError`` if its file is missing, has changed, or is not a simulation."""
     if content_hash(Path(path)) != sha256:
         raise InputError(f"{path}: has changed since the sweep was planned; start the sweep anew.")
     scene = load_scene(Path(path))
     if not isinstance(scene, SyntheticScene):
-        raise InputError(f"{path}: is no simulation, so nothing about it can be swept; give a synthetic scene.")
+        raise InputError(f"{path}: is not a simulation, so it cannot be swept; give a synthetic scene.")
     return scene
 
 
@@ -325,5 +325,5 @@ def parse_values(texts: Sequence[str]) -> tuple[float, ...]:
                 raise InputError(f"the values {show(text)} are more than {MAX_VALUES}; give a larger step.")
             found += [round(first + k * step, 10) for k in range(int(count))]
         else:
-            raise InputError(f"the values {show(text)} are none; give numbers, or FIRST:LAST:STEP such as 0.5:0.9:0.1.")
+            raise InputError(f"the values are {show(text)}; give numbers, or FIRST:LAST:STEP such as 0.5:0.9:0.1.")
     return tuple(found)

@@ -1,4 +1,4 @@
-"""One row a run of a sweep, its text in CSV, and what the runs at each point come to."""
+"""The row of a run of a sweep, its text in CSV, and the summary of the runs at each point."""
 
 import csv
 import io
@@ -18,14 +18,14 @@ from spherloc.trace import Trace
 
 @dataclass(frozen=True, slots=True)
 class SweepRow:
-    """The result of one estimator on one problem. What is unknown is None."""
+    """The result of one estimator on one problem; unknown values are None."""
 
     estimator: str
     """Label of the estimator and its options."""
     value: float
-    """Of what the sweep goes over."""
+    """Value of the varied property."""
     seed: int
-    """Of the simulation and of the estimator."""
+    """Seed of the simulation and of the estimator."""
     success: bool
     """Rotation error below 1 degree and position error below 0.1 m (Sec. VI-A)."""
     rotation_error_deg: float | None
@@ -37,9 +37,9 @@ class SweepRow:
     time_ms: float
     """Wall time of the estimator."""
     inliers: int
-    """Correspondences that it took for right."""
+    """Number of correspondences that agree with its pose."""
     correspondences: int
-    """Of the problem."""
+    """Number of correspondences of the problem."""
     precision: float | None
     """Share of the inliers that are right."""
     recall: float | None
@@ -110,12 +110,12 @@ _NAMES = tuple(item.name for item in fields(SweepRow))
 
 
 def columns(over: str) -> tuple[str, ...]:
-    """Of the CSV: the value has the name of what the sweep goes over."""
+    """Columns of the CSV; the column of the value has the name of the varied property."""
     return tuple(over if name == "value" else name for name in _NAMES)
 
 
 def csv_line(cells: Iterable[Any]) -> str:
-    """One line of CSV with its end: None is empty, numbers keep all their digits."""
+    """One line of CSV with its line end; None is empty, numbers keep all their digits."""
     file = io.StringIO(newline="")
     csv.writer(file, lineterminator="\n").writerow([_cell(value) for value in cells])
     return file.getvalue()
@@ -127,9 +127,9 @@ def row_line(row: SweepRow) -> str:
 
 
 def row_of_line(line: str, place: str) -> SweepRow:
-    """The row of a line by ``row_line``; ``place`` names its file and number.
+    """The row of a line that ``row_line`` wrote; ``place`` names the file and the line number.
 
-    Raises ``InputError`` if it is no such line.
+    Raises ``InputError`` for any other line.
     """
     try:
         cells: Sequence[str] = next(csv.reader([line]), [])
@@ -155,12 +155,12 @@ def _cell(value: Any) -> str:
 
 
 def _damaged(place: str, what: str) -> InputError:
-    return InputError(f"{place}: {what}, so it is no run of a sweep; delete that line to have the run done again.")
+    return InputError(f"{place}: {what}, so it is not a run of a sweep; delete that line to have the run done again.")
 
 
 @dataclass(frozen=True)
 class Quartiles:
-    """Of some runs. A run without a pose has an infinite error."""
+    """Quartiles of a number of some runs. A run without a pose has an infinite error."""
 
     lower: float
     """A quarter of the runs is below."""
@@ -177,35 +177,35 @@ class Point:
     estimator: str
     """Label of the estimator and its options."""
     value: float
-    """Of what the sweep goes over."""
+    """Value of the varied property."""
     runs: int
-    """Done by now."""
+    """Number of runs so far."""
     successes: int
-    """Errors below 1 degree and 0.1 m."""
+    """Number of runs with errors below 1 degree and 0.1 m."""
     rate: float
-    """Their ratio, 0 to 1."""
+    """Ratio of both, 0 to 1."""
     low: float
     """Lower end of the 95 % Wilson interval of the rate."""
     high: float
     """Its upper end."""
     rotation_error_deg: Quartiles
-    """Of all runs, degrees."""
+    """Rotation errors of all runs, degrees."""
     translation_error_m: Quartiles
-    """Of all runs, metres."""
+    """Position errors of all runs, metres."""
     success_rotation_error_deg: Quartiles | None
-    """Of successes, degrees; None if there is none, as the next one."""
+    """Rotation errors of the successes, degrees; None if there are none."""
     success_translation_error_m: Quartiles | None
-    """Of successes, metres."""
+    """Position errors of the successes, metres; None if there are none."""
     time_ms: Quartiles
-    """Of all runs."""
+    """Times of all runs."""
     mean_precision: float | None
-    """Of the inliers; None if it is unknown, as the next two."""
+    """Mean precision of the inliers; None if it is unknown, as the next two."""
     mean_recall: float | None
-    """Of the inliers."""
+    """Mean recall of the inliers."""
     mean_f1: float | None
-    """Of the inliers."""
+    """Mean F1 of the inliers."""
     proven: int | None
-    """Runs whose consensus is proven to be the largest; None if the estimator proves nothing."""
+    """Number of runs whose consensus is proven to be the largest; None if the estimator proves nothing."""
 
 
 def summarize(labels: Sequence[str], rows: Iterable[SweepRow]) -> tuple[Point, ...]:
@@ -244,7 +244,7 @@ def point_of(rows: Sequence[SweepRow]) -> Point:
 
 def _quartiles(values: Iterable[float | None]) -> Quartiles:
     known = np.array([math.inf if value is None else value for value in values])
-    # No mean of two runs: half of a finite and an infinite error is neither.
+    # Not the mean of two runs, since the mean of a finite and an infinite error makes no sense.
     lower, median, upper = np.quantile(known, [0.25, 0.5, 0.75], method="inverted_cdf")
     return Quartiles(float(lower), float(median), float(upper))
 
@@ -255,7 +255,7 @@ def _mean(values: Iterable[float | None]) -> float | None:
 
 
 def rows_text(over: str, labels: Sequence[str], rows: Iterable[SweepRow]) -> str:
-    """The rows as CSV, ordered by seed, value and estimator, whoever was quicker."""
+    """The rows as CSV, ordered by seed, value and estimator, whatever their order of completion was."""
     place = {label: number for number, label in enumerate(labels)}
     ordered = sorted(rows, key=lambda row: (row.seed, row.value, place[row.estimator]))
     return "".join([csv_line(columns(over)), *map(row_line, ordered)])

@@ -256,7 +256,7 @@ def lesson_of(name: str) -> Lesson:
     """
     path = registry.lookup(KIND, name)
     if not isinstance(path, str | Path) or Path(path).stem != name:
-        raise InputError(f"{registry.title(KIND, name)} must be the path of a file {name}.md; mend or uninstall it.")
+        raise InputError(f"{registry.title(KIND, name)} must be the path of a file {name}.md; repair or uninstall it.")
     return read_lesson(Path(path))
 
 

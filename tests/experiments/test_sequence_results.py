@@ -163,8 +163,8 @@ def test_damage_elsewhere_is_said_and_nothing_is_overwritten(tmp_path: Path) -> 
         log.append(row(1))
     lines = (tmp_path / "results.jsonl").read_bytes().splitlines(keepends=True)
     for content, said in (
-        (lines[0][:40] + b"\n" + lines[1], r"results.jsonl, line 1: is no result of a query"),
-        (lines[0] + b"\0" * 50 + b"\n", r"results.jsonl, line 2: is no result of a query"),
+        (lines[0][:40] + b"\n" + lines[1], r"results.jsonl, line 1: is not a result of a query"),
+        (lines[0] + b"\0" * 50 + b"\n", r"results.jsonl, line 2: is not a result of a query"),
         (lines[0] + lines[0], r"results.jsonl, line 2: the query 'image0.png' is there a second time"),
     ):
         (tmp_path / "results.jsonl").write_bytes(content)

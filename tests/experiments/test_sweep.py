@@ -256,7 +256,7 @@ def test_a_cluster_gives_the_same_rows_though_a_worker_is_killed(tmp_path: Path)
             if len(rows) == 20:
                 os.kill(pids[0], signal.SIGKILL)
         worker_address = list(cluster.workers.values())[1].worker_address
-        with pytest.raises(InputError, match="it is no scheduler"):
+        with pytest.raises(InputError, match="it is not a scheduler"):
             next(run_sweep(plan, scheduler=worker_address))
     assert not alive(pids[0])
     found = untimed(rows)

@@ -101,7 +101,10 @@ def test_damage_is_one_sentence(tmp_path: Path) -> None:
         (first + second, "line 1: is not the heading"),
         (header + "a,b\n" + second, "line 2: has 2 cells, not 16"),
         (header + first.replace("true", "yes").replace("false", "yes"), "line 2: has 'yes' for success"),
-        (header + first + second.replace("0.5", "0.6", 1), "line 3: holds 'mc-exact' at 0.6, seed 3, no run of this"),
+        (
+            header + first + second.replace("0.5", "0.6", 1),
+            "line 3: holds 'mc-exact' at 0.6, seed 3, not a run of",
+        ),
         (header + first + first, "holds a run twice"),
         (header + "\0" * 40 + "\n", "line 2: "),
         (header + '"' + "x" * 200_000 + "\n", "line 2: "),
@@ -112,7 +115,7 @@ def test_damage_is_one_sentence(tmp_path: Path) -> None:
         assert path.read_text() == text
     path.unlink()
     os.mkfifo(path)
-    with pytest.raises(InputError, match=r"sweep.csv: is no regular file; remove it"):
+    with pytest.raises(InputError, match=r"sweep.csv: is not a regular file; remove it"):
         SweepLog(path, plan)
     path.unlink()
     path.write_text(good)
@@ -122,7 +125,7 @@ def test_damage_is_one_sentence(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=r"sweep.plan.json: is damaged|holds the runs of another"):
             SweepLog(path, plan)
     beside.unlink()
-    with pytest.raises(InputError, match="is no table of a sweep, or has lost its"):
+    with pytest.raises(InputError, match="is not a table of a sweep, or has lost its"):
         SweepLog(path, plan)
     with pytest.raises(InputError, match=r"sweep.txt: the table of a sweep ends with \.csv"):
         SweepLog(tmp_path / "sweep.txt", plan)
