@@ -22,10 +22,10 @@ from spherloc_viz.layers.sweep import SweepChart, sweep_charts
 from spherloc_viz.style import ERROR_RAMP, ESTIMATE, OUTLIER, RGB, TRUTH, css, error_scale
 
 SIZE_INCHES, SWEEP_DPI = (10.7, 7.6), 120
-"""1280 pixels wide."""
+"""Size and resolution of a sweep's picture: 1284 pixels wide."""
 CURVE_MARKERS = "os^Dv<>Phd"
 LIGHTEST = 165.0
-"""Lighter colours, made for the dark page too, are darkened to this luminance on white paper."""
+"""Largest luminance of a colour on white paper; lighter ones, made for the dark page too, are darkened to it."""
 
 
 def sweep_png(name: str, over: str, labels: Sequence[str], points: Sequence[Point]) -> bytes:
@@ -103,11 +103,11 @@ HEIGHT_INCHES = (4.0, 9.0)
 DPI = 150
 MARGIN = 0.08
 MIN_EXTENT_M = 1.0
-"""So that a camera that stands still is not magnified to its noise."""
+"""Least extent of the picture, so that a camera that stands still is not magnified to its noise."""
 
 
 def trajectory_png(results: SequenceResults) -> bytes:
-    """PNG of the estimated positions coloured by their error, the true way as a line, and failures as crosses.
+    """PNG of the estimated positions coloured by their error, the true path as a line, and failures as crosses.
 
     Errors beyond the loosest limit of success have one colour. Where the truth is unknown, errors are those of the
     registration, if there are any. The same results give the same bytes.
@@ -128,8 +128,8 @@ def trajectory_png(results: SequenceResults) -> bytes:
 def _from_above_figure(
     results: SequenceResults, frame: tuple[FloatArray, FloatArray], share: float, more_inches: float
 ) -> tuple[Figure, Axes]:
-    """An empty picture of the map from above, whose middle and half extent are the ``frame``, as high as this asks for
-    by a ``share`` of the width, and ``more_inches``."""
+    """An empty picture of the map from above. ``frame`` has its middle and half extent; the height follows from it and
+    from the ``share`` of the width that the map takes, plus ``more_inches``."""
     middle, half = frame
     height = float(np.clip(share * WIDTH_INCHES * half[1] / half[0] + more_inches, *HEIGHT_INCHES))
     figure = Figure(figsize=(WIDTH_INCHES, height), dpi=DPI, layout="constrained")
@@ -158,15 +158,15 @@ def _png(figure: Figure) -> bytes:
 SEVERAL_COLORS = ("#1b6ca8", "#c77d0a", "#7b2d8b", "#3a8a3a", "#b02a30", "#5fb3e6", "#8c6d31", "#555555")
 LARGEST_MARKER = 10.0
 MAX_NAMED = 6
-"""Failures of an estimator whose names are written into the picture."""
+"""Largest number of failures of an estimator whose names are written into the picture."""
 
 
 def trajectories_png(several: Sequence[tuple[str, SequenceResults]]) -> bytes:
-    """PNG of one sequence as several estimators localized it: positions and headings by colour, and the true way.
+    """PNG of one sequence as several estimators localized it: positions and headings by colour, and the true path.
 
     ``several`` are labels with results of the same scene. A query whose pose is outside the picture or missing is a
-    cross at its true place, named if there are few; a wrong one is joined to its true place. Positions are joined only
-    where the queries follow each other in time. The same results give the same bytes.
+    cross at its true position, named if there are few; a wrong position is joined to the true one. Positions are joined
+    only where the queries follow each other in time. The same results give the same bytes.
     """
     first = several[0][1]
     true_places = _from_above(first, first.true_positions_m)
@@ -188,12 +188,12 @@ def trajectories_png(several: Sequence[tuple[str, SequenceResults]]) -> bytes:
 
 @dataclass(frozen=True)
 class _Style:
-    """How an estimator's positions are drawn: of several in one place all are seen."""
+    """How an estimator's positions are drawn: sizes differ, so that several at one place can all be seen."""
 
     color: str
     marker: str
     size: float
-    """Points."""
+    """Size of its markers, points."""
 
 
 def _one_of_several(axes: Axes, label: str, results: SequenceResults, seen: FloatArray, style: _Style) -> None:
@@ -233,7 +233,7 @@ def _one_of_several(axes: Axes, label: str, results: SequenceResults, seen: Floa
 
 
 def _headings(results: SequenceResults) -> FloatArray:
-    """(Q, 2) where the optical axes point, seen from above; zero without a pose."""
+    """Directions (Q, 2) of the optical axes, seen from above; zero without a pose."""
     ahead = np.zeros((len(results.rows), 3))
     for place, row in enumerate(results.rows):
         if row.cam_from_map is not None:
@@ -242,7 +242,7 @@ def _headings(results: SequenceResults) -> FloatArray:
 
 
 def _from_above(results: SequenceResults, positions_m: FloatArray) -> FloatArray:
-    """(Q, 2): to the right and up on the page, seen against gravity and not mirrored."""
+    """Positions (Q, 2) on the page, right and up: seen from above, in the direction of gravity, not mirrored."""
     turned = positions_m @ align_to_down(results.configuration.gravity_map).T
     return turned[:, [0, 2]]
 
@@ -250,7 +250,7 @@ def _from_above(results: SequenceResults, positions_m: FloatArray) -> FloatArray
 def _frame(places: FloatArray, true_places: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Middle (2,) and half the extent (2,) of the picture, metres.
 
-    Those of the true way if it is known: one wrong pose far away must not shrink all the others to a dot.
+    They are those of the true path if it is known: one wrong pose far away must not shrink all others to a dot.
     """
     known = true_places[np.isfinite(true_places).all(axis=1)]
     shown = known if len(known) else places[np.isfinite(places).all(axis=1)]
@@ -262,7 +262,7 @@ def _frame(places: FloatArray, true_places: FloatArray) -> tuple[FloatArray, Flo
 
 
 def _truth(axes: Axes, true_places: FloatArray, ordered: bool) -> None:
-    """The true positions, joined where they follow each other in time."""
+    """Draw the true positions, joined where they follow each other in time."""
     if np.isfinite(true_places).any():
         line, size = ("-", 3.0) if ordered else ("none", 6.0)
         axes.plot(
@@ -306,7 +306,7 @@ def _errors(results: SequenceResults) -> tuple[FloatArray, str, float]:
 
 
 def _without_place(axes: Axes, results: SequenceResults, places: FloatArray, true_places: FloatArray) -> None:
-    """Marks where queries without a pose, or with one outside the picture, truly were; others are only counted."""
+    """Mark the true positions of queries without a pose, or with one outside the picture; others are only counted."""
     failed = np.array([status == FAILED for status in results.status], dtype=bool)
     outside = np.isfinite(places).all(axis=1) & ~_inside(axes, places)
     known = np.isfinite(true_places).all(axis=1)

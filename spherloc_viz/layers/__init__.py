@@ -42,11 +42,11 @@ STAGES: dict[type[Stage], tuple[str, Callable[[RunView, Any], list[Plan]]]] = {
     PositionStage: ("Positions", consensus.position_plans),
     RefinementStage: ("Refinement", refinement.plans),
 }
-"""What each kind of stage is called, and what draws it."""
+"""Name of each kind of stage for users, and the function that plans its steps."""
 KINDS = tuple(stage.kind for stage in STAGES)
 """Kinds of the stages that are spherloc's own."""
 FIRST, LAST = "Matches", "Outcome"
-"""Stages that every run has."""
+"""Names of the first and the last stage, which every run has."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +55,7 @@ class _Timeline:
     plans: tuple[Plan, ...]
     headings: tuple[StepHeading, ...]
     charts: dict[Callable[[], Chart], Chart | None] = field(default_factory=dict)
-    """Those that were drawn already: they stay for all later steps."""
+    """Charts that were drawn already; they are reused by all later steps."""
 
     graphs: dict[Callable[[], Graph], Graph | None] = field(default_factory=dict)
 
@@ -93,7 +93,7 @@ class _Timeline:
 
 
 class _Kept(threading.local):
-    """The timeline that was used last. Each page has a thread that paints, and each of them stays with one run."""
+    """The timeline that was used last, per thread: each page has a thread that paints one run at a time."""
 
     timeline: _Timeline | None = None
 
@@ -123,7 +123,7 @@ def _planned(view: RunView) -> _Timeline:
 
 
 def steps(trace: Trace) -> tuple[StepHeading, ...]:
-    """The headings of a run's steps, from the matches to the outcome. What the steps say is painted with them."""
+    """The headings of a run's steps, from the matches to the outcome. Captions are made when a step is painted."""
     return _timeline(trace).headings
 
 
@@ -133,7 +133,7 @@ def graph_begins(trace: Trace) -> str:
 
 
 def paint(trace: Trace, index: int) -> Picture:
-    """What the step at ``index`` looks like. Charts of earlier steps stay."""
+    """The picture of the step at ``index``. Charts of earlier steps are kept."""
     timeline = _timeline(trace)
     heading, frame = timeline.headings[index], timeline.plans[index].draw()
     step = Step(heading.key, heading.title, frame.caption, frame.equation, frame.note, heading.stage)

@@ -1,4 +1,4 @@
-"""Which pairs of correspondences agree at one yaw: the yaw arcs of both, asked at a single point.
+"""Finds the pairs of correspondences that agree at one yaw, without computing their yaw arcs.
 
 A pair agrees at a yaw that lies in one of its arcs (``spherloc.consensus.yaw_arcs``): |f| <= tau and depths that may be
 positive, with the bounds of ``spherloc.consensus.pair_arcs``. At a fixed yaw all of these are products of bearings v
@@ -17,15 +17,15 @@ from spherloc.problem import AlignedProblem
 from spherloc.types import BoolArray, FloatArray, IntArray
 
 BLOCK = 24
-"""Partners whose arcs with one match are computed by one call: their arcs with each other come along."""
+"""Number of partners whose arcs with one match are computed in one call, which also computes those between partners."""
 
 
 def agreement(
     aligned: AlignedProblem, bound_rad: FloatArray, yaw_rad: float, rows: IntArray, columns: IntArray
 ) -> BoolArray:
-    """Whether each pair (R, C) of places in ``aligned`` agrees at a yaw; false for a match with itself.
+    """Mask (R, C): whether each pair of correspondences of ``aligned`` agrees at a yaw; false for one with itself.
 
-    ``bound_rad`` (M,) bounds the angular error of each bearing. A pair that bounds nothing agrees with every yaw.
+    ``bound_rad`` (M,) bounds the angular error of each bearing. A pair that does not restrict yaw agrees at every yaw.
     """
     v, turned = aligned.bearings, aligned.points @ yaw_rotation(yaw_rad).T
     moments, along = np.cross(turned, v), np.einsum("ni,ni->n", v, turned)
@@ -50,7 +50,7 @@ def agreement(
 
 
 def unbounded(aligned: AlignedProblem, bound_rad: FloatArray, rows: IntArray, columns: IntArray) -> BoolArray:
-    """Whether each pair (R, C) says nothing about yaw: its bearings are too close for their bounds, or its points."""
+    """Mask (R, C): whether a pair does not restrict yaw, since its bearings or points are too close for the bounds."""
     dot = aligned.bearings[rows] @ aligned.bearings[columns].T
     chords = chord(bound_rad)
     close = np.sqrt(np.maximum(1.0 - dot * dot, 0.0)) <= chords[rows][:, None] + chords[columns]
@@ -62,16 +62,16 @@ class PartnerArcs:
     """The yaw arcs of one correspondence with K others. A arcs."""
 
     count: int
-    """K."""
+    """Number of the others, K."""
     partners: IntArray
     """(A,) the other correspondence of each arc, 0 to K - 1."""
     middle_rad: FloatArray
-    """(A,) middles."""
+    """(A,) middles of the arcs."""
     half_rad: FloatArray
-    """(A,) half widths."""
+    """(A,) half widths of the arcs."""
 
     def missed_rad(self, yaw_rad: float) -> FloatArray:
-        """By how much (K,) a yaw misses the nearest arc with each: 0 in an arc, inf where there is none."""
+        """Distances (K,), rad, of a yaw from the nearest arc with each other one: 0 in an arc, inf without an arc."""
         missed = np.full(self.count, np.inf)
         off = np.abs((yaw_rad - self.middle_rad + np.pi) % (2.0 * np.pi) - np.pi)
         np.minimum.at(missed, self.partners, np.maximum(off - self.half_rad, 0.0))
@@ -79,7 +79,7 @@ class PartnerArcs:
 
 
 def partner_arcs(aligned: AlignedProblem, bound_rad: FloatArray, one: int, others: IntArray) -> PartnerArcs:
-    """The arcs of the pairs of the correspondence at place ``one`` with those at ``others`` (K,)."""
+    """The arcs of the pairs of correspondence ``one`` with ``others`` (K,), indices in ``aligned``."""
     partners, ends = [np.empty(0, np.int64)], [np.empty((2, 0))]
     for start in range(0, len(others), BLOCK):
         places = np.append(one, others[start : start + BLOCK])
@@ -94,7 +94,7 @@ def partner_arcs(aligned: AlignedProblem, bound_rad: FloatArray, one: int, other
 
 
 def subset(aligned: AlignedProblem, places: IntArray) -> AlignedProblem:
-    """The correspondences at these places alone."""
+    """The problem with only the correspondences of these indices."""
     return AlignedProblem(
         index=aligned.index[places],
         count=aligned.count,

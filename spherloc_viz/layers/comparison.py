@@ -50,13 +50,13 @@ COLUMNS = (
 REACH = 2.0
 """Residuals are shown up to this many times the largest noise bound."""
 SAMPLES = 120
-"""Corners of a residual curve."""
+"""Number of points of a residual curve."""
 SMALLER = 0.09
-"""Cameras at one place are nested: each is smaller by this share of the first."""
+"""Cameras at one position are nested: each is smaller than the one before by this share of the first one's size."""
 SIZE, TOWER, STOREY = 1.9, 1.75, 0.7
 """Size of the first camera, and heights of the lowest name and of each name above it, in sphere radii."""
 LOWER = 0.07
-"""Markers at one yaw: each is lower by this share of the first."""
+"""Markers at one yaw differ in height: each is lower than the one before by this share of the first one's height."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,23 +65,23 @@ class Entry:
 
     trace: Trace
     diagnosis: Diagnosis | None = None
-    """None as long as it is not known."""
+    """Diagnosis of the run; None until it is known."""
 
     @property
     def color(self) -> style.RGB:
-        """The estimator's."""
+        """Colour of the estimator."""
         return color_of(self.trace.estimator)
 
 
 def color_of(estimator: str) -> style.RGB:
-    """The colour of a registered estimator, whichever others it is compared with."""
+    """The colour of a registered estimator, always the same."""
     known = registry.names("estimators")
     order = [*(name for name in FIRST if name in known), *(name for name in known if name not in FIRST)]
     return PALETTE[order.index(estimator) % len(PALETTE)]
 
 
 def comparison_table(entries: Sequence[Entry]) -> Table:
-    """A row an estimator, all values as text."""
+    """A table with a row for each estimator, all values as text."""
     return Table("comparison", COLUMNS, tuple(_row(entry) for entry in entries))
 
 
@@ -105,7 +105,7 @@ def _row(entry: Entry) -> tuple[str, ...]:
 
 
 def outcome(trace: Trace) -> str:
-    """How a run went, in a word or two."""
+    """The outcome of a run in a word or two."""
     if trace.cam_from_map is None:
         return "no pose"
     return {True: "success", False: "failure", None: "unknown"}[evaluate(trace).success]
@@ -118,7 +118,7 @@ def _length(metres: float, metric: bool) -> str:
 
 
 def duration_text(ms: float) -> str:
-    """A duration in the unit that suits it."""
+    """A duration as text, in a unit that suits its length."""
     return f"{ms:.1f} ms" if ms < 100 else f"{ms:.0f} ms" if ms < 1e4 else f"{ms / 1e3:.1f} s"
 
 
@@ -137,7 +137,7 @@ def comparison_items(entries: Sequence[Entry]) -> tuple[SceneItem, ...]:
         view = RunView(entry.trace)
         pose, name = view.aligned_pose(entry.trace.cam_from_map), entry.trace.estimator
         centre = camera_centre(pose)
-        # Names at one place stand above one another, as far as cameras are not clearly apart.
+        # Names of cameras that are not clearly apart are put one above the other.
         below = sum(bool(np.linalg.norm(centre - other) < view.sphere_m) for other in masts)
         masts.append(centre)
         size_m = SIZE * view.sphere_m * max(0.3, 1.0 - SMALLER * below)
@@ -156,7 +156,7 @@ def _joined(one: Segments, other: Segments) -> Segments:
 
 
 def residual_chart(entries: Sequence[Entry]) -> Chart:
-    """How many matches lie within x px of every estimator's pose, and of the true one where that is known."""
+    """Number of matches with a residual of at most x px, for every estimator's pose and, if known, the true one."""
     bounds = sorted({float(entry.trace.options.bound_px) for entry in entries})
     x = np.linspace(0.0, REACH * bounds[-1], SAMPLES)
     problem = entries[0].trace.problem
@@ -175,7 +175,7 @@ def residual_chart(entries: Sequence[Entry]) -> Chart:
 
 
 def coinciding(chart: Chart) -> str:
-    """A sentence for each set of curves that are the same, of which only the last can be seen; empty if all differ."""
+    """A sentence for each set of equal curves, of which only the last can be seen; empty if all differ."""
     groups: dict[bytes, list[str]] = {}
     for curve in chart.curves:
         groups.setdefault(curve.x.tobytes() + curve.y.tobytes(), []).append(curve.label)
@@ -193,7 +193,7 @@ def _within(trace: Trace, cam_from_map: FloatArray, x: FloatArray) -> FloatArray
 
 
 def yaw_chart(entries: Sequence[Entry]) -> Chart | None:
-    """What one estimator counted over yaw, with the yaw that every one of them found; None if none counted."""
+    """The counts of one estimator over yaw, with the yaws that all of them found; None if no estimator has counts."""
     counted = next(filter(None, (_counts(entry.trace) for entry in entries)), None)
     if counted is None:
         return None

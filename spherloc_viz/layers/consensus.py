@@ -17,23 +17,23 @@ from spherloc_viz.layers.scene import camera
 from spherloc_viz.layers.translation import graph_at, match_nodes
 
 PEAKS = 16
-"""At most so many peaks of the bound are visited."""
+"""Largest number of peaks of the bound that have a step."""
 REACH = 10
-"""A peak is the highest within so many quarters of a degree."""
+"""A peak is the largest value within this many quarters of a degree on both sides."""
 
 
 def highest_bound(stage: ConsensusStage) -> int:
-    """No pose explains more correspondences."""
+    """Largest value of the bound: no pose explains more correspondences."""
     return int(stage.bound.max())
 
 
 def best_support(stage: ConsensusStage) -> int:
-    """Correspondences that the best known pose explains."""
+    """Number of correspondences that the best known pose explains."""
     return int(stage.support.max(initial=stage.seed_support))
 
 
 def _bound_plans(view: RunView, stage: ConsensusStage) -> list[Plan]:
-    """The first guess, the bound, and its peaks from the highest down."""
+    """Steps for the first guess, the bound, and its peaks from the highest down."""
     charts = {"consensus": partial(bound_chart, view, stage)}
     out = [
         Plan("consensus-guess", "The first guess", lambda: _guess(view, stage)),
@@ -127,7 +127,8 @@ def _peak(view: RunView, stage: ConsensusStage, rank: int, place: int, peaks: in
 
 
 def bound_chart(view: RunView, stage: ConsensusStage, candidate_rad: float | None = None) -> Chart:
-    """The bound over yaw, what the first guess and the best pose explain, the truth, the estimate, a candidate yaw."""
+    """Chart of the bound over yaw, with the support of the first guess and of the best pose, and with the true, the
+    estimated and a candidate yaw."""
     peak, ends = float(max(highest_bound(stage), 1)), np.array([-180.0, 180.0])
     curves = [
         ring.step_curve("bound", stage.bound),
@@ -146,8 +147,9 @@ def _yaw(stage: ConsensusStage) -> float | None:
 
 
 def _ring(view: RunView, stage: ConsensusStage, place: int | None = None) -> tuple[SceneItem, ...]:
-    """The bound around the sphere, where it is largest in the colour of the clique, or in that of a sample at one
-    place, and the best pose's support as a circle: what pokes out of it could hide a better pose."""
+    """The bound around the sphere, in the colour of the clique where it is largest, or in that of a sample at
+    ``place``, and the best pose's support as a circle: at yaws where the bound is outside of it there may be a better
+    pose."""
     centre, heights, most = view.middle, ring.by_degree(stage.bound), max(1, highest_bound(stage))
     feet, tops = ring.circle(view, centre, np.zeros(())), ring.circle(view, centre, heights / most)
     colors = one_color(style.UNDECIDED, len(feet))
@@ -165,7 +167,7 @@ def _ring(view: RunView, stage: ConsensusStage, place: int | None = None) -> tup
 
 
 CLIQUE_SIZES = (3, 5, 10, 20, 50, 100)
-"""How many members of the largest set are shown before all are."""
+"""Numbers of members of the largest set that are shown in steps before all are."""
 
 
 def plans(view: RunView, stage: ConsensusStage) -> list[Plan]:
@@ -191,7 +193,7 @@ def plans(view: RunView, stage: ConsensusStage) -> list[Plan]:
 
 
 def _graph(view: RunView, nodes: Callable[[], Nodes], marked: np.ndarray, words: str) -> Graph:
-    """The graph at the best pose's yaw, with some matches (numbers in the problem) marked."""
+    """The graph at the best pose's yaw, with some matches (indices in the problem) marked."""
     return graph_at(nodes, None, np.searchsorted(view.trace.problem.aligned.index, marked), style.CLIQUE, words)
 
 
@@ -211,7 +213,7 @@ def _clique(view: RunView, stage: ConsensusStage) -> Frame:
 
 
 def _agreement(view: RunView, stage: ConsensusStage) -> str:
-    """What the largest set is, and what follows."""
+    """The step of the largest set and its consequence for the bound."""
     size, most, best = len(stage.clique), highest_bound(stage), best_support(stage)
     labels = view.trace.problem.truth_inliers
     right = "" if labels is None else f"{view.right_ones(stage.clique)},"
@@ -277,7 +279,7 @@ def _edges(view: RunView, pairs: np.ndarray) -> Segments:
 
 
 def _pose(view: RunView, stage: ConsensusStage, rank: int) -> Frame:
-    """One of the verified poses, with what it explains."""
+    """The step of one of the verified poses, with the matches that it explains."""
     state, support = view.aligned_pose(stage.cam_from_map[rank]), int(stage.support[rank])
     explained = np.zeros(len(view.points), dtype=bool)
     aligned = view.trace.problem.aligned
@@ -357,7 +359,7 @@ FAINT, STRONG = np.array(style.UNDECIDED, float), np.array(style.CLIQUE, float)
 
 
 def position_plans(view: RunView, stage: PositionStage) -> list[Plan]:
-    """One step a level, from the box around the map to those around the camera."""
+    """One step per level, from the box around the map to the boxes around the camera."""
     out = []
     for rank, level in enumerate(np.unique(stage.level).tolist(), 1):
         left = int(stage.left[stage.level == level][0])
@@ -407,7 +409,7 @@ def _camera_inside(boxes: FloatArray, centre: FloatArray) -> str:
 
 
 def _shades(bound: np.ndarray, support: int) -> ByteArray:
-    """(B, 3): grey for the least that could beat the best pose, gold for the largest bound."""
+    """Colours (B, 3) of boxes: grey for the least bound that exceeds the best support, gold for the largest bound."""
     share = (bound - support) / max(1, int(bound.max()) - support)
     return np.round(FAINT + share[:, None] * (STRONG - FAINT)).astype(np.uint8)
 

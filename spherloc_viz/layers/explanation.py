@@ -1,4 +1,4 @@
-"""Why a run kept or rejected a correspondence, from what its pairs, its residuals and the truth say."""
+"""Explains why a run accepted or rejected a correspondence, by its pairs, its residuals and the truth."""
 
 from dataclasses import dataclass
 
@@ -12,12 +12,12 @@ from spherloc_viz.layers.agreement import PartnerArcs, partner_arcs, unbounded
 from spherloc_viz.layers.residuals import residuals_at, run_bounds, verdicts
 
 NEARLY = 2.0
-"""A residual up to this many times its bound is just beyond it."""
+"""Largest ratio of a residual to its bound that is called just beyond it."""
 
 
 @dataclass(frozen=True, eq=False)
 class Poses:
-    """What the sentences are chosen by: one correspondence at the estimated, the true and another pose."""
+    """Measurements of one correspondence at the estimated, the true and another pose, by which sentences are chosen."""
 
     usable: bool
     kept: bool
@@ -27,17 +27,17 @@ class Poses:
     estimate: tuple[float, float] | None
     """Residual at the run's pose in px and degrees; None without one."""
     truth: tuple[float, float] | None
-    """The same at the true pose."""
+    """Residual at the true pose in px and degrees; None if that is unknown."""
     lost: str
-    """At which stage the run lost it, in a sentence; empty if at none."""
+    """A sentence on the stage at which the run lost it; empty if it did not."""
     alternative: tuple[FloatArray, float] | None
     """Another pose (3, 4), and the residual there, px."""
     agree_inliers: tuple[int, int] | None
-    """How many pairs with the run's other inliers agree at its yaw, and how many pairs there are."""
+    """Number of its pairs with the run's other inliers that agree at the run's yaw, and number of all these pairs."""
 
 
 def reason(trace: Trace, poses: Poses) -> tuple[str, str]:
-    """A verdict in a few words, and why in one or two sentences."""
+    """A verdict in a few words, and the reason in one or two sentences."""
     if not poses.usable:
         return (
             "Cannot be used",
@@ -93,7 +93,7 @@ def _why_rejected(trace: Trace, poses: Poses) -> str:
 
 
 def _why_lost(trace: Trace, poses: Poses) -> str:
-    """A right match that was rejected."""
+    """Why a right match was rejected."""
     if poses.truth is None:
         return "Yet its label says that it is right."
     off = _off(poses.truth)
@@ -144,46 +144,46 @@ def _between(one: FloatArray, other: FloatArray, unit: str) -> str:
 
 
 def _px(value: float) -> str:
-    """Pixels with three digits."""
+    """A length in pixels as text with three digits."""
     return f"{value:.3g} px" if value < 1000 else f"{value:,.0f} px"
 
 
 WORST = 3
-"""Pairs that are named of those whose arcs exclude the true yaw."""
+"""Number of pairs that are named, of those whose arcs exclude the true yaw."""
 ROUNDING_RAD = 1e-12
 
 
 @dataclass(frozen=True)
 class Residual:
-    """How far a correspondence is off at one pose."""
+    """Residual of a correspondence at one pose."""
 
     px: float
-    """Reprojection error to first order; inf more than 90 degrees from the bearing."""
+    """Reprojection error to first order, px; inf if the point is more than 90 degrees from the bearing."""
     deg: float
-    """Angle between the bearing and the ray to the point."""
+    """Angle between the bearing and the ray to the point, degrees."""
 
 
 @dataclass(frozen=True)
 class Pairs:
-    """How the pairs of a correspondence with all others stand to one yaw."""
+    """Agreement of the pairs of a correspondence with all others at one yaw."""
 
     yaw_deg: float
-    """The yaw, of the gravity-aligned frames."""
+    """The yaw between the aligned frames, degrees."""
     agree: int
-    """Pairs with an arc over it, and those that say nothing."""
+    """Number of pairs with an arc over it, and of those that do not restrict yaw."""
     agree_inliers: int
-    """How many pairs with the run's other inliers agree."""
+    """Number of pairs with the run's other inliers that agree."""
     excluded: int
-    """Pairs whose arcs lie elsewhere."""
+    """Number of pairs whose arcs do not contain the yaw."""
     impossible: int
-    """Pairs that agree at no yaw at all."""
+    """Number of pairs that agree at no yaw."""
     worst: tuple[tuple[int, float], ...]
-    """The excluded pairs that are farthest off: the other match and the difference, degrees."""
+    """The excluded pairs whose arcs are farthest from the yaw: the other match and the distance, degrees."""
 
 
 @dataclass(frozen=True)
 class Explanation:
-    """One correspondence in one run."""
+    """The explanation of one correspondence in one run."""
 
     number: int
     """Its index in the problem."""
@@ -192,23 +192,23 @@ class Explanation:
     kept: bool
     """Whether the run calls it an inlier."""
     right: bool | None
-    """Whether it truly is one; None if the truth is unknown."""
+    """Whether it truly is an inlier; None if the truth is unknown."""
     labelled: bool
-    """Whether a label says so, and not only its residual at the true pose."""
+    """Whether that is known from a label, and not only from its residual at the true pose."""
     bound_px: float
     """Bound on its residual at the run's pose; NaN if it is not usable."""
     bound_deg: float
     """Bound on the angular error of its bearing; NaN if it is not usable."""
     estimate: Residual | None
-    """At the run's pose; None without a pose or a bearing."""
+    """Residual at the run's pose; None without a pose or a bearing."""
     truth: Residual | None
-    """At the true pose; None if that is unknown."""
+    """Residual at the true pose; None if that is unknown."""
     others: int
-    """Usable correspondences that it makes a pair with."""
+    """Number of its pairs: of other usable correspondences."""
     silent: int
-    """Pairs that say nothing about yaw, since their bearings or points are too close."""
+    """Number of its pairs that do not restrict yaw, since their bearings or points are too close."""
     inliers: int
-    """Other inliers of the run."""
+    """Number of other inliers of the run."""
     at_estimate: Pairs | None
     """Its pairs at the run's yaw."""
     at_truth: Pairs | None
@@ -216,13 +216,13 @@ class Explanation:
     stages: tuple[str, ...]
     """Its part in the stages of the run, in words."""
     verdict: str
-    """Kept or rejected, and whether rightly, in a few words."""
+    """Whether it was accepted or rejected, and whether rightly, in a few words."""
     reason: str
-    """Why, in one or two sentences."""
+    """The reason in one or two sentences."""
 
 
 def explain(trace: Trace, number: int, alternative_cam_from_map: FloatArray | None = None) -> Explanation:
-    """Why the run kept or rejected the correspondence of that index in the problem.
+    """Explain why the run accepted or rejected the correspondence of that index in the problem.
 
     ``alternative_cam_from_map`` (3, 4) is another pose to hold it against, as a diagnosis may know one; the poses that
     an exact search verified are looked at too. Raises ``IndexError`` if the problem has no such correspondence.
@@ -283,7 +283,7 @@ def explain(trace: Trace, number: int, alternative_cam_from_map: FloatArray | No
 def _pairs(
     trace: Trace, others: IntArray, arcs: PartnerArcs, silent: BoolArray, inliers: BoolArray, cam_from_map: FloatArray
 ) -> Pairs:
-    """How the pairs with ``others`` (K,), places among the usable ones, stand to the yaw of a pose (3, 4)."""
+    """Agreement, at the yaw of a pose (3, 4), of the pairs with ``others`` (K,), indices of usable correspondences."""
     aligned = trace.problem.aligned
     yaw = yaw_of(aligned.align_pose(cam_from_map)[:, :3])
     missed = np.where(silent, 0.0, arcs.missed_rad(yaw))
@@ -311,7 +311,7 @@ def _alternative(trace: Trace, number: int, given: FloatArray | None) -> tuple[F
 
 
 def part_in_stages(trace: Trace, number: int) -> tuple[str, ...]:
-    """What part the correspondence had in the stages of the run, a few words each."""
+    """The part of the correspondence in each stage of the run, in a few words each."""
     parts = []
     for stage in trace.stages:
         if isinstance(stage, RansacStage):
@@ -343,7 +343,7 @@ def _lost_at(trace: Trace, number: int) -> str:
 
 
 def _members(pairs: IndexArray, clique: IndexArray, number: int) -> int:
-    """How many of a clique's pairs hold the correspondence."""
+    """Number of a clique's pairs that contain the correspondence."""
     return int(np.count_nonzero((pairs[clique] == number).any(axis=1)))
 
 

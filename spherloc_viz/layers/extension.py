@@ -29,7 +29,7 @@ from spherloc_viz.layers.primitives import (
 )
 
 UNKNOWN = "Stage"
-"""What a stage is called that has no name here."""
+"""Name of a stage that no layer names."""
 
 ARRAYS: dict[type, tuple[tuple[str, tuple[int | str, ...], str], ...]] = {
     Points: (("positions", ("N", 3), "f"), ("colors", ("N", 3), "u")),
@@ -40,7 +40,7 @@ ARRAYS: dict[type, tuple[tuple[str, tuple[int | str, ...], str], ...]] = {
     Curve: (("x", ("K",), "f"), ("y", ("K",), "f")),
     Focus: (("points", ("K", 3), "f"),),
 }
-"""Field, shape and numpy's kind of the arrays of what can be drawn; a letter is one number in all of them."""
+"""Field, shape and numpy's kind of the arrays of each drawable class; equal letters mean equal lengths."""
 _KINDS = {"f": "fiu", "u": "u", "i": "iu", "b": "b"}
 _WORDS = {"f": "numbers", "u": "uint8", "i": "whole numbers", "b": "truth values"}
 
@@ -51,9 +51,9 @@ class Layer:
     ``spherloc.layers``, under the stage's ``kind``."""
 
     stage: type[Stage]
-    """The class."""
+    """The class of the stages that it draws."""
     title: str
-    """What the stage is called, a word or two, such as "Samples"."""
+    """Name of the stage for users, a word or two, such as "Samples"."""
     plans: Callable[[RunView, Any], list[Plan]]
     """The steps of such a stage of a run, in their order. Keys begin with the stage's kind, such as "guess-3"."""
 
@@ -61,14 +61,14 @@ class Layer:
 def layer_of(kind: str) -> Layer:
     """The layer registered for stages of that kind.
 
-    Raises ``InputError`` if there is none, or if it cannot be imported or is no ``Layer`` of that kind.
+    Raises ``InputError`` if there is none, or if it cannot be imported or is not a ``Layer`` of that kind.
     """
     found = registry.lookup("layers", kind)
     what = registry.title("layers", kind)
     if not (isinstance(found, Layer) and isinstance(found.title, str) and callable(found.plans)):
         raise InputError(f"{what} is {show(found)}, no Layer with title and plans; tell its authors.")
     if not (isinstance(found.stage, type) and issubclass(found.stage, Stage)):
-        raise InputError(f"{what} draws {show(found.stage)}, which is no class of Stage; tell its authors.")
+        raise InputError(f"{what} draws {show(found.stage)}, not a class of Stage; tell its authors.")
     if found.stage.kind != kind:
         raise InputError(f"{what} draws stages of the kind {show(found.stage.kind)}; both must have one name.")
     return found
@@ -80,8 +80,8 @@ def is_extension(view: RunView) -> bool:
 
 
 def named_plans(view: RunView, stage: Stage, taken: Collection[str]) -> tuple[str, list[Plan]]:
-    """Name and steps of a stage that is none of spherloc's own; ``taken`` are the kinds of those, which no other layer
-    draws."""
+    """Name and steps of a stage of an extension; ``taken`` are the kinds of spherloc's own stages, which layers of
+    extensions do not draw."""
     kind = str(stage.kind)
     if kind in taken or kind not in registry.names("layers"):
         return UNKNOWN, unknown(view, stage)
@@ -105,7 +105,7 @@ def unknown(view: RunView, stage: Stage) -> list[Plan]:
 
 
 def guarded_plans(view: RunView, stage: Stage, plans: Callable[[], list[Plan]]) -> list[Plan]:
-    """What ``plans`` gives; for an extension, a stage that cannot be drawn becomes a step that says why."""
+    """The result of ``plans``; if an extension's stage cannot be drawn, a step that says why."""
     if not is_extension(view):
         return plans()
     try:
@@ -139,7 +139,7 @@ def _failure(stage: Stage, error: Exception) -> str:
 
 
 def _said(view: RunView, sentence: str) -> Frame:
-    """A frame that shows nothing of its own."""
+    """A frame with a sentence and nothing else of its own."""
     trace = view.trace
     extension = registry.extension_of("estimators", trace.estimator)
     whose = f" It comes from the estimator {shorten(trace.estimator)}" + (f" of {extension}." if extension else ".")
@@ -153,7 +153,7 @@ def _said(view: RunView, sentence: str) -> Frame:
 
 
 def whole_plans(found: Any, kind: str) -> list[Plan]:
-    """The plans of a stage; raises ``InputError`` if they are no list of them with keys of their own."""
+    """The plans of a stage; raises ``InputError`` unless they are a list of plans with unique keys."""
     if not isinstance(found, list) or not all(isinstance(plan, Plan) for plan in found):
         raise InputError(f"plans() gives {show(found)}, no list of Plan")
     keys = [plan.key for plan in found]
@@ -173,14 +173,14 @@ def whole_frame(frame: Any, count: int) -> Frame:
     for name, shape, kind in (("cam_from_map", (3, 4), "f"), ("colors", (count, 3), "u"), ("rays", (count,), "b")):
         _check_array("the frame", frame, name, shape, kind, {})
     if not all(isinstance(text, str) for text in (frame.caption, frame.equation, frame.note)):
-        raise InputError("caption, equation or note of the frame is no text")
+        raise InputError("caption, equation or note of the frame is not a text")
     for item in frame.items:
         if not isinstance(item, SceneItem) or not isinstance(item.name, str) or item.layer not in style.LAYERS:
-            raise InputError(f"{show(item)} is no primitive in one of the layers {', '.join(style.LAYERS)}")
+            raise InputError(f"{show(item)} is not a primitive in one of the layers {', '.join(style.LAYERS)}")
         _check_arrays(f"the primitive {shorten(item.name)}", item)
     for table in frame.tables:
         if not isinstance(table, Table) or any(len(row) != len(table.columns) for row in table.rows):
-            raise InputError("a table is no Table, or has a row of another length than its columns")
+            raise InputError("a table is not a Table, or has a row of another length than its columns")
     if frame.focus is not None:
         _check_arrays("the focus", frame.focus)
     return frame
@@ -189,16 +189,16 @@ def whole_frame(frame: Any, count: int) -> Frame:
 def whole_chart(chart: Any) -> Chart:
     """The chart; raises ``InputError`` if it cannot be drawn."""
     if not isinstance(chart, Chart) or not all(isinstance(curve, Curve) for curve in chart.curves):
-        raise InputError(f"{show(chart)} is no Chart of curves")
+        raise InputError(f"{show(chart)} is not a Chart of curves")
     for curve in chart.curves:
         _check_arrays(f"the curve {show(curve.label)}", curve)
     return chart
 
 
 def whole_graph(graph: Any) -> Graph:
-    """The graph; raises ``InputError`` if it is none."""
+    """The graph; raises ``InputError`` if it is not a ``Graph`` that can be drawn."""
     if not isinstance(graph, Graph):
-        raise InputError(f"{show(graph)} is no Graph")
+        raise InputError(f"{show(graph)} is not a Graph")
     return graph
 
 

@@ -26,35 +26,35 @@ T = TypeVar("T")
 SPHERE_SHARE = 0.17
 """Radius at which the unit sphere is drawn, as a share of the map's typical extent."""
 DENSE = (0.05, 0.95)
-"""Between these shares of the points, by each coordinate, lies the map; the others are strays."""
+"""Quantiles of each coordinate between which the map lies; points outside count as strays."""
 FEW_DOTS = 200
-"""Up to this many, dots have their full size."""
+"""Largest number of dots with full size; if there are more, dots are smaller."""
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """What one step says and shows."""
+    """Caption and contents of one step."""
 
     caption: str
     """Two sentences with this run's own numbers."""
     equation: str
     cam_from_map: FloatArray
-    """Pose (3, 4) between the aligned frames: the camera's, or where to stand before a position is known."""
+    """Pose (3, 4) between the aligned frames: the camera's, or that of the sphere before a position is known."""
     colors: ByteArray
-    """(N, 3) colour of every correspondence."""
+    """(N, 3) colour of every correspondence, sRGB."""
     rays: BoolArray
     """(N,) mask: correspondences whose match is drawn as a line."""
     note: str = ""
     """What the picture leaves out and by which rule."""
     located: bool = False
-    """Whether the position is an estimate (the camera is drawn) or a place to stand (only the sphere is)."""
+    """Whether the position is an estimate, so that the camera is drawn; otherwise only the sphere is."""
     sphere_aside: bool = False
     """Whether the sphere stays in the middle of the map, where it does not hide the estimated position."""
     items: tuple[SceneItem, ...] = ()
-    """What this stage adds to the canvas."""
+    """Primitives that this stage adds to the canvas."""
     tables: tuple[Table, ...] = ()
     focus: Focus | None = None
-    """What must be on the screen; None for what ``spherloc_viz.layers.frame`` tells from the above."""
+    """The part of the scene that must be on the screen; None derives it from the fields above (``focus_of``)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,18 +68,18 @@ class Plan:
     charts: Mapping[str, Callable[[], Chart]] = field(default_factory=dict)
     """Charts by name. They stay until a later step has one of the same name."""
     graph: Callable[[], Graph] | None = None
-    """What it shows of the run's graph. It stays until a later step has one."""
+    """Makes the graph as the step shows it. It is kept until a later step has one."""
 
 
 @dataclass(frozen=True, eq=False)
 class RunView:
-    """A trace and what all of its frames share."""
+    """A trace, with values that all of its frames share."""
 
     trace: Trace
     _kept: dict[str, tuple[Hashable, Any]] = field(default_factory=dict, init=False)
 
     def kept(self, name: str, key: Hashable, make: Callable[[], T]) -> T:
-        """What ``make`` gives; made anew only if it was made for another ``key`` last time.
+        """The result of ``make``, which is called again only if the ``key`` differs from that of the last call.
 
         Most steps of a run show what the step before them shows. The same object need not be compared.
         """
@@ -117,7 +117,7 @@ class RunView:
 
     @cached_property
     def dot_m(self) -> float:
-        """What dots are measured by, metres: the sphere's radius, less where there are many."""
+        """Unit of the sizes of dots, metres: the sphere's radius, or less if there are many dots."""
         return self.sphere_m * min(1.0, (FEW_DOTS / len(self.points)) ** (1 / 3))
 
     @cached_property
@@ -128,11 +128,11 @@ class RunView:
 
     @cached_property
     def bounds(self) -> Bounds:
-        """What an inlier's residual may be."""
+        """Bounds on an inlier's residual."""
         return bounds_of(self.trace.problem.aligned, self.trace.options.bound_px)
 
     def standing(self, rotation: FloatArray) -> FloatArray:
-        """A pose (3, 4) in the middle of the map with a given rotation: where to draw before a position is known."""
+        """A pose (3, 4) in the middle of the map with a given rotation, used before a position is known."""
         return pose(rotation, -rotation @ self.middle)
 
     def aligned_pose(self, cam_from_map: FloatArray) -> FloatArray:
@@ -148,7 +148,7 @@ class RunView:
         return out
 
     def colors(self, color: style.RGB, *marks: tuple[np.ndarray, style.RGB]) -> ByteArray:
-        """(N, 3): one colour for all, then others for masks or indices, later ones winning."""
+        """Colours (N, 3): one for all, then others for masks or indices; later ones override earlier ones."""
         out = np.empty((len(self.points), 3), np.uint8)
         out[:] = color
         for where, mark in marks:
@@ -179,21 +179,21 @@ class RunView:
         return self.trace.problem.metric
 
     def length(self, metres: float) -> str:
-        """A length to read, see ``length``."""
+        """A length as text, see ``length``."""
         return length(metres, self.metric)
 
     def length_text(self, metres: float) -> str:
-        """A length to read, see ``length_text``."""
+        """A length as text, see ``length_text``."""
         return length_text(metres, self.metric)
 
     def right_ones(self, indices: np.ndarray) -> str:
-        """How many of these correspondences are right, as part of a sentence; empty if that is unknown."""
+        """Number of right ones among these correspondences, as part of a sentence; empty if unknown."""
         labels = self.trace.problem.truth_inliers
         return "" if labels is None else f", {np.count_nonzero(labels[indices])} of them right ones"
 
 
 def one_color(color: style.RGB, count: int) -> ByteArray:
-    """(count, 3) of one colour."""
+    """An array (count, 3) of one colour."""
     out = np.empty((count, 3), np.uint8)
     out[:] = color
     return out
@@ -232,18 +232,18 @@ def even(indices: np.ndarray, count: int) -> np.ndarray:
 
 
 def growing(total: int, *sizes: int) -> list[int]:
-    """The sizes below ``total``: how something of that size is put together."""
+    """The sizes below ``total``, at which something of that size is shown while it grows."""
     return [size for size in sizes if size < total]
 
 
 def place_text(position: FloatArray, digits: int, metric: bool = True) -> str:
-    """A place (3,) to read, metres or, if not ``metric``, units of the map."""
+    """A position (3,) as text, in metres or, if not ``metric``, units of the map."""
     unit = "m" if metric else UNITS
     return f"({', '.join(f'{value:.{digits}f}' for value in position)}) {unit}".replace("-", "−")
 
 
 def length(metres: float, metric: bool = True) -> str:
-    """A length to read: metres, or centimetres where it is short; if not ``metric``, units of the map."""
+    """A length as text: in metres, or centimetres if it is short; if not ``metric``, in units of the map."""
     if not metric:
         return f"{metres:.3g} {UNITS}"
     if metres >= 1.0:
@@ -253,7 +253,7 @@ def length(metres: float, metric: bool = True) -> str:
 
 
 MIN_M = 1e-4
-"""Shorter lengths are told as less than this."""
+"""Shorter lengths are written as "less than" this."""
 
 
 UNITS = "units"
@@ -261,7 +261,7 @@ UNITS = "units"
 
 
 def length_text(length_m: float, metric: bool = True) -> str:
-    """A length in the unit that suits its size, with two digits; if not ``metric``, in units of the map."""
+    """A length as text with two digits, in a unit that suits its size; if not ``metric``, in units of the map."""
     if not metric:
         return f"{length_m:.2g} {UNITS}"
     if 0.0 < length_m < MIN_M:
@@ -273,7 +273,7 @@ def length_text(length_m: float, metric: bool = True) -> str:
 
 
 def angle_text(angle_deg: float) -> str:
-    """An angle with two digits behind the point where it is small."""
+    """An angle as text, with two digits behind the point if it is small."""
     return (
         f"{angle_deg:.3f}°" if angle_deg < 0.0995 else f"{angle_deg:.2f}°" if angle_deg < 9.95 else f"{angle_deg:.0f}°"
     )
@@ -293,14 +293,14 @@ RING_ROOM = 3.0
 CAMERA_ROOM = 2.0
 """Radius of what is framed around a camera, in sphere radii."""
 FEW_SEEN = 10
-"""From this many points on, they tell where a camera is."""
+"""Least number of seen points that show where a camera is in the map."""
 FEW_BALLS = 3
-"""Up to so many balls are framed whole."""
+"""Largest number of balls that are all framed completely."""
 
 
 def focus_of(view: RunView, frame: Frame) -> Focus:
-    """What a frame names itself; else its ring, else its sphere, and wherever matches are drawn as rays or the camera
-    has a position, the whole map."""
+    """The focus of a frame: its own, else its ring, else its sphere; the whole map where matches are drawn as rays or
+    the camera has a position."""
     if frame.focus is not None:
         return frame.focus
     if any(item.layer == "yaw ring" for item in frame.items):
@@ -319,8 +319,8 @@ def ring_focus(view: RunView, *more: FloatArray) -> Focus:
 
 
 def map_focus(view: RunView, cam_from_map: FloatArray, seen: BoolArray | None = None) -> Focus:
-    """The map without its strays, the true camera, and a camera at a pose (3, 4); of the map those of a mask (N,), if
-    these are enough to tell where the camera is in it: a street is much longer than what is seen of it."""
+    """The map without its strays, the true camera, and a camera at a pose (3, 4). Of the map only the ``seen`` points
+    (N,), if these are enough to show where the camera is: a street is much longer than the part that is seen."""
     if seen is not None and np.count_nonzero(seen) >= FEW_SEEN:
         dense = dense_points(view.points[seen])
     else:
@@ -337,19 +337,19 @@ def close_focus(view: RunView, cam_from_map: FloatArray, *more: FloatArray) -> F
 
 
 def dense_points(positions: FloatArray) -> FloatArray:
-    """Those of the points (N, 3) that are no strays."""
+    """The points (N, 3) without strays."""
     away = np.linalg.norm(positions - np.median(positions, axis=0), axis=1)
     return positions[away <= STRAY * np.median(away)]
 
 
 def sphere_box(centre: FloatArray, reach_m: float) -> FloatArray:
-    """Points (6, 3) that far to all sides of a place."""
+    """Points (6, 3) at a distance along all axes from a position."""
     sides = np.vstack([np.eye(3), -np.eye(3)])
     return centre + reach_m * sides
 
 
 def circle(centre: FloatArray, radius_m: float) -> FloatArray:
-    """A level circle (36, 3)."""
+    """Points (36, 3) of a horizontal circle."""
     angle = np.linspace(0.0, 2.0 * np.pi, 36, endpoint=False)
     return centre + radius_m * np.column_stack([np.cos(angle), 0.0 * angle, np.sin(angle)])
 

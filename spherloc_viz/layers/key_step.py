@@ -1,4 +1,4 @@
-"""What a step comes to in numbers, and the step at which a run was decided or went wrong."""
+"""The results of a step in numbers, and the key step, at which a run was decided or went wrong."""
 
 import re
 from collections.abc import Mapping
@@ -23,11 +23,11 @@ BY_CAUSE: dict[Cause, tuple[str, ...]] = {
     Cause.FALSE_CONSENSUS: ("consensus-poses",),
     Cause.ITERATIONS_RAN_OUT: ("samples-drawn",),
 }
-"""Steps that show a cause, of which the first that a run has is taken, whatever its stages found."""
+"""Steps that show a cause, by cause; the first one that a run has is its key step, whatever its stages found."""
 YAW_SLACK_DEG = 3.0
-"""A yaw that is off by more than this is wrong: arcs are some degrees wide, and refinement mends as much."""
+"""Largest error of a yaw that counts as right: arcs are some degrees wide, and refinement corrects that much."""
 POSITION_SLACK_M = 0.5
-"""A position before refinement that is off by more than this is wrong."""
+"""Largest error of a position before refinement that counts as right."""
 
 
 def key_step(trace: Trace, diagnosis: Diagnosis) -> int:
@@ -51,7 +51,7 @@ def _wrong(trace: Trace, diagnosis: Diagnosis) -> list[str]:
         return ["gravity"]
     found = _first_wrong(trace)
     by_cause = BY_CAUSE.get(diagnosis.cause, ())
-    # Where all but the last digits are right, the cause says what was missing.
+    # If only the last digits of the pose are wrong, the cause says what was missing.
     return [*by_cause, found] if found == "refinement" else [found, *by_cause] if found else [*by_cause]
 
 
@@ -109,13 +109,13 @@ class StepNumbers:
     stage: str
     """Named stage, such as "Yaw"."""
     key: str
-    """Such as "yaw-arcs"."""
+    """Key of the step, such as "yaw-arcs"."""
     agreeing: int
-    """Matches that the step shows as agreeing: in the clique, or within the bound."""
+    """Number of matches that the step shows as agreeing: in the clique, or within the bound."""
     rotation_error_deg: float | None
     """Rotation error of the step's pose; None if it has no pose or the truth is unknown."""
     translation_error_m: float | None
-    """Likewise, between the camera positions, metres."""
+    """Distance of the step's camera position from the true one, metres; None likewise."""
 
 
 def step_numbers(trace: Trace, pictures: Mapping[int, Picture]) -> tuple[StepNumbers, ...]:
@@ -135,13 +135,13 @@ def _agreeing(picture: Picture) -> int:
 
 
 def match_colors(picture: Picture) -> ByteArray:
-    """(N, 3) colours of all matches in a picture."""
+    """Colours (N, 3) of all matches in a picture."""
     shown = next((item for item in picture.scene if isinstance(item, Points) and item.name == ALL_MATCHES), None)
     return np.zeros((0, 3), np.uint8) if shown is None else shown.colors
 
 
 def agreeing(colors: ByteArray) -> np.ndarray:
-    """Which of the colours (N, 3) say that a match agrees, (N,)."""
+    """Mask (N,) of the colours (N, 3) that mean that a match agrees."""
     red, green, blue = colors.T
     marked = np.zeros(len(colors), dtype=bool)
     for r, g, b in AGREEING:

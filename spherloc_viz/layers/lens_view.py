@@ -1,7 +1,7 @@
-"""What the map looks like from a pose through the lens of the query: to be compared with the photograph.
+"""Draws the map as it would look from a pose through the lens of the query, for a comparison with the photograph.
 
-The reference images that the query was matched with are the map's look: their pixels have points in the map, by depth
-or by triangulation, which are drawn where the query's camera would see them. Near ones hide far ones.
+The colours come from the reference images that the query was matched with: their pixels have map points, by depth or by
+triangulation, which are drawn where the query's camera would see them. Near points hide far ones.
 """
 
 from collections.abc import Iterable, Sequence
@@ -20,14 +20,15 @@ from spherloc_viz.layers.query_image import photograph
 WIDTH_PX = 640
 """Width of the picture."""
 MAX_PIXELS = 250_000
-"""Most pixels of a reference that are used."""
+"""Largest number of pixels of a reference that are used."""
 MAX_REFERENCES = 4
 LEVELS = 4
-"""Pictures that are drawn, each half as large as the one before: what has no point is filled from a smaller one."""
+"""Number of pictures, each half as large as the one before: gaps of a picture are filled from a smaller one."""
 NEARER = 0.9
-"""A smaller picture goes before a larger one if it is nearer by this factor: that was seen through a gap."""
+"""A pixel of a smaller picture replaces that of a larger one if its distance is less by this factor: the larger one
+shows something far away through a gap."""
 DENSE = 0.05
-"""Share of pixels with points from which on gaps are filled; fewer points are drawn as dots."""
+"""Least share of pixels with points at which gaps are filled; fewer points are drawn as dots."""
 DOT_PX = 2
 
 
@@ -36,7 +37,7 @@ def through_lens(
 ) -> tuple[NDArray[np.uint8], float] | None:
     """Picture (H, W, 4) of the map, sRGB and whether there is something, and the share that is covered, 0 to 1.
 
-    None if no reference has points that the camera sees. What cannot be read is left out.
+    None if no reference has points that the camera sees. References that cannot be read are left out.
     """
     found = [_coloured(view) for view in list(references)[:MAX_REFERENCES] if view.lift is not None]
     points = np.concatenate([one[0] for one in found]) if found else np.empty((0, 3))
@@ -92,7 +93,7 @@ def _drawn(share: FloatArray, ranges: FloatArray, colors: NDArray[np.uint8], siz
 
 
 def _filled(drawn: Sequence[Drawn]) -> Drawn:
-    """The largest picture, with what a smaller one has where it has nothing or what is far behind."""
+    """The largest picture, with pixels of smaller ones where it has gaps or only points far behind."""
     image, depth = drawn[-1]
     for finer, near in drawn[-2::-1]:
         size = finer.shape[1], finer.shape[0]
@@ -104,7 +105,7 @@ def _filled(drawn: Sequence[Drawn]) -> Drawn:
 
 
 def _dotted(image: NDArray[np.uint8], depth: FloatArray) -> Drawn:
-    """Points as dots."""
+    """A picture with few points, each drawn as a dot."""
     kernel = np.ones((2 * DOT_PX + 1, 2 * DOT_PX + 1), np.uint8)
     there = cv2.dilate(np.isfinite(depth).astype(np.uint8), kernel) > 0
     return np.asarray(cv2.dilate(image, kernel), np.uint8), np.where(there, 1.0, np.inf)

@@ -20,26 +20,26 @@ from spherloc_viz.layers.frame import even
 from spherloc_viz.layers.residuals import run_bounds, verdicts
 
 MAX_PAIRS = 20_000
-"""Pairs that are asked whether they agree; of more inliers an even sample is taken."""
+"""Largest number of pairs for which agreement is computed; with more inliers an even sample of them is used."""
 MIN_PARTNERS = 16
 
 
 @dataclass(frozen=True, eq=False)
 class MatchRows:
-    """N matches."""
+    """The values of the columns for N matches."""
 
     kept: BoolArray
     """(N,) inliers of the run."""
     right: BoolArray | None
     """(N,) true inliers; None if the truth is unknown."""
     px: FloatArray
-    """(N,) residual at the run's pose; inf behind, NaN if unknown."""
+    """(N,) residual at the run's pose, px; inf for points behind the bearing, NaN if unknown."""
     deg: FloatArray
-    """(N,) the same as an angle."""
+    """(N,) the same as an angle, degrees."""
     agree: IntArray
-    """(N,) with how many of the ``partners`` it makes a pair that agrees at the run's yaw; -1 if unknown."""
+    """(N,) number of ``partners`` with which it makes a pair that agrees at the run's yaw; -1 if unknown."""
     partners: int
-    """Inliers of the run that were asked."""
+    """Number of inliers of the run with which pairs were computed."""
 
 
 Filter = Callable[[MatchRows], BoolArray]
@@ -50,11 +50,11 @@ FILTERS: dict[str, Filter] = {
     "wrongly kept": lambda rows: rows.kept & (_known(rows) == 0),
     "wrongly rejected": lambda rows: ~rows.kept & (_known(rows) == 1),
 }
-"""Which matches are listed."""
+"""The filters of the table: which matches are listed, by name."""
 
 
 def _known(rows: MatchRows) -> NDArray[np.int8]:
-    """1 for true inliers, 0 for true outliers, -1 if the truth is unknown."""
+    """(N,) 1 for true inliers, 0 for true outliers, -1 if the truth is unknown."""
     return np.full(len(rows.kept), -1, np.int8) if rows.right is None else rows.right.astype(np.int8)
 
 
@@ -66,7 +66,7 @@ SORTS: dict[str, Callable[[MatchRows], NDArray]] = {
     "deg": lambda rows: rows.deg,
     "agrees": lambda rows: -rows.agree,
 }
-"""What ascending order means, by the name of the column; ties keep the order of the numbers."""
+"""Values for the ascending order, by the name of the column; equal ones keep the order of the numbers."""
 
 
 @lru_cache(maxsize=4)
@@ -81,7 +81,7 @@ def match_rows(trace: Trace) -> MatchRows:
 
 
 def order(rows: MatchRows, shown: str, by: str, down: bool) -> IntArray:
-    """Indices of the matches that a filter lists, sorted by a column; what is unknown comes last either way."""
+    """Indices of the matches that a filter lists, sorted by a column; unknown values come last in both directions."""
     chosen = np.flatnonzero(FILTERS[shown](rows))
     values = SORTS[by](rows)[chosen].astype(np.float64)
     return chosen[np.argsort(-values if down else values, kind="stable")]
@@ -102,23 +102,23 @@ def _agreeing(trace: Trace) -> tuple[IntArray, int]:
 
 
 CELLS = 129
-"""Places a side at which a camera is asked what it can see."""
+"""Number of points per side of the grid on which the visible part of an image is determined."""
 
 
 @dataclass(frozen=True, eq=False)
 class MatchView:
-    """Which matches a picture of two images shows."""
+    """The matches in a picture of two images."""
 
     reference: int | None
     """Index of the reference image beside the query; None if there is none, so that only the query is shown."""
     own: IntArray
     """Indices of the matches with that reference, or of all."""
     lines: IntArray
-    """Those of them that are joined by a line: inliers of the step and selected ones, thinned if there are many."""
+    """The ones of ``own`` that are drawn with a line: inliers of the step and selected ones, a sample if many."""
     inliers: int
-    """How many of ``own`` have the colour of inliers."""
+    """Number of ``own`` matches that have the colour of inliers."""
     caption: str
-    """What is seen, in a sentence or two."""
+    """Caption of the picture, a sentence or two."""
 
 
 def match_view(
@@ -128,7 +128,7 @@ def match_view(
     selected: tuple[int, ...] = (),
     reference: int | None = None,
 ) -> MatchView:
-    """What to show of the matches of a problem, whose colours (N, 3) are those of a step.
+    """The matches of a problem to show; their colours (N, 3) are those of a step.
 
     Of several references it is ``reference``, else that of the first of the ``selected`` matches, else the one with
     most inliers.
@@ -148,7 +148,7 @@ def match_view(
 
 
 def reference_votes(problem: Problem, inlier_mask: BoolArray) -> tuple[IntArray, IntArray]:
-    """Inliers and matches (R,) of every reference image; empty without any."""
+    """Numbers of inliers (R,) and of matches (R,) of every reference image; empty without references."""
     count = len(problem.reference_images)
     if problem.reference_index is None or problem.reference_pixels is None or not count:
         return np.empty(0, np.int64), np.empty(0, np.int64)
@@ -158,7 +158,7 @@ def reference_votes(problem: Problem, inlier_mask: BoolArray) -> tuple[IntArray,
 
 @lru_cache(maxsize=16)
 def valid_outlines(camera: Camera) -> tuple[FloatArray, ...]:
-    """Borders (K, 2), px, of what the camera can see of its image; none where that is all of it."""
+    """Borders (K, 2), px, of the visible part of a camera's image; empty if all of the image is visible."""
     columns, rows = (np.linspace(0.0, size, CELLS) for size in (camera.width, camera.height))
     grid: FloatArray = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
     valid = camera.unproject(grid)[1].reshape(CELLS, CELLS)
@@ -170,7 +170,7 @@ def valid_outlines(camera: Camera) -> tuple[FloatArray, ...]:
 
 
 def inlier_colored(colors: ByteArray) -> BoolArray:
-    """Which colours (N, 3) are those of inliers, (N,)."""
+    """Mask (N,) of the colours (N, 3) that mean inlier."""
     return np.asarray(np.equal(colors, np.array(style.INLIER, np.uint8)).all(axis=1))
 
 

@@ -1,4 +1,4 @@
-"""What came of a run: its last step, its tables, and what is proven, in words."""
+"""The outcome of a run: its last step, its tables, and its certificate in words."""
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from spherloc_viz.layers.frame import Frame, Plan, RunView, angle_text, length, 
 from spherloc_viz.layers.primitives import Table
 
 KNOWABLE = 0.01
-"""From this NFA on, the answer cannot be known."""
+"""Largest NFA with which an answer can be known."""
 UNKNOWABLE = "the answer cannot be known"
 
 
@@ -30,7 +30,7 @@ def is_knowable(certificate: Certificate) -> bool:
 
 
 def chance(certificate: Certificate) -> str:
-    """How many sets of wrong matches of that size agree by chance, as a number to read."""
+    """The NFA as text: expected number of sets of wrong matches of that size that agree by chance."""
     value = certificate.nfa
     return f"{value:.2g}" if value >= 1e-99 else "below 1e-99"
 
@@ -93,18 +93,18 @@ def _pose(view: RunView, cam_from_map: np.ndarray) -> Frame:
 
 
 def _certified(certificate: Certificate) -> tuple[str, str]:
-    """What is proven, as the end of a sentence, and what chance alone would do, as a note."""
+    """The proven bounds, as the end of a sentence, and the NFA, as a note."""
     note = f"Expected false sets of this size: {chance(certificate)}. {warning(certificate)}"
     return f"; {proof(certificate)}", note.strip()
 
 
 def outcome_table(trace: Trace) -> Table:
-    """Pose, errors, scores and times of a run, and how it is judged without the truth."""
+    """Pose, errors, scores and times of a run, and its judgement without the truth."""
     return early_table(trace, judge(trace))
 
 
 def early_table(trace: Trace, judged: Judgement | None) -> Table:
-    """The same with what is known of the judgement by now, since to judge takes longer than many a run."""
+    """The same with the judgement if it is known already, since judging can take longer than the run."""
     metrics = evaluate(trace)
     rows: list[tuple[str, str]] = [("estimator", trace.estimator), ("outcome", verdict(trace, metrics.success))]
     if trace.cam_from_map is not None:
@@ -140,7 +140,7 @@ def _certificate_rows(certificate: Certificate) -> list[tuple[str, str]]:
 
 
 def verdict(trace: Trace, success: bool | None) -> str:
-    """What became of a run, in a few words; ``success`` is None if the truth is unknown."""
+    """The outcome of a run in a few words; ``success`` is None if the truth is unknown."""
     if trace.cam_from_map is None:
         return "no pose"
     return {True: "success", False: "failure", None: "pose found, truth unknown"}[success]

@@ -1,4 +1,4 @@
-"""The few neutral things that a painter can draw. Both the page and the recording draw these and nothing else.
+"""The primitives that a painter can draw. Both the page and the recording draw these and nothing else.
 
 Scene positions are metres in the gravity-aligned map frame: y points down. Colours are sRGB bytes.
 """
@@ -19,7 +19,7 @@ HYPHEN_MINUS = re.compile(r"(?<![\w.)\]])-(?=\.?\d)")
 
 
 def true_minus(text: str) -> str:
-    """Words for people with minus signs in place of the hyphens that Python writes before negative numbers."""
+    """Text with minus signs in place of the hyphens that Python writes before negative numbers."""
     return HYPHEN_MINUS.sub("\N{MINUS SIGN}", text) if "-" in text else text
 
 
@@ -30,7 +30,7 @@ class Primitive:
     name: str
     """Unique path within a picture, such as "camera/estimate"; stable over steps and runs."""
     layer: str
-    """The layer that a person switches on and off; one of ``style.LAYERS``."""
+    """The layer that users switch on and off; one of ``style.LAYERS``."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,15 +38,15 @@ class Points(Primitive):
     """Dots."""
 
     positions: FloatArray
-    """(N, 3)."""
+    """(N, 3) positions, metres."""
     colors: ByteArray
-    """(N, 3)."""
+    """(N, 3) colours, sRGB."""
     radius_m: float
-    """Radius of every dot."""
+    """Radius of every dot, metres."""
     ids: NDArray[np.int64] | None = None
     """(N,) index of the correspondence that each dot shows, if it shows one."""
     rim: bool = False
-    """Whether a dot is seen only around what stands at its place: a ring, from wherever one looks."""
+    """Whether only the rim of a dot is seen, around a smaller dot at the same position: a ring from every direction."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,11 +54,11 @@ class Segments(Primitive):
     """Straight lines."""
 
     points: FloatArray
-    """(N, 2, 3) ends."""
+    """(N, 2, 3) ends of the lines, metres."""
     colors: ByteArray
-    """(N, 3)."""
+    """(N, 3) colours, sRGB."""
     width_px: float
-    """Thickness on the screen."""
+    """Thickness on the screen, px."""
     ids: NDArray[np.int64] | None = None
     """(N, 2) the two correspondences that each line shows, if it shows a pair."""
 
@@ -68,13 +68,13 @@ class Balls(Primitive):
     """Translucent spheres."""
 
     centers: FloatArray
-    """(N, 3)."""
+    """(N, 3) centres, metres."""
     radii_m: FloatArray
-    """(N,)."""
+    """(N,) radii, metres."""
     colors: ByteArray
-    """(N, 3)."""
+    """(N, 3) colours, sRGB."""
     opacity: float
-    """0 to 1, of every ball."""
+    """Opacity of every ball, 0 to 1."""
     ids: NDArray[np.int64] | None = None
     """(N, 2) the two correspondences that each ball shows, if it shows a pair."""
 
@@ -84,41 +84,41 @@ class Mesh(Primitive):
     """A triangle mesh of one colour."""
 
     vertices: FloatArray
-    """(V, 3)."""
+    """(V, 3) vertices, metres."""
     faces: NDArray[np.int64]
-    """(F, 3)."""
+    """(F, 3) indices of vertices."""
     color: tuple[int, int, int]
     opacity: float
-    """0 to 1."""
+    """Opacity of the surface, 0 to 1."""
 
 
 @dataclass(frozen=True, eq=False)
 class Textured(Primitive):
-    """A triangle mesh with a picture on it, seen from both sides."""
+    """A triangle mesh with a texture, visible from both sides."""
 
     vertices: FloatArray
-    """(V, 3) in the mesh's own frame."""
+    """(V, 3) vertices in the mesh's own frame."""
     faces: NDArray[np.int64]
-    """(F, 3)."""
+    """(F, 3) indices of vertices."""
     uv: FloatArray
-    """(V, 2) place of each vertex in the picture, from its lower left corner, 0 to 1."""
+    """(V, 2) position of each vertex in the texture, from its lower left corner, 0 to 1."""
     map_from_mesh: FloatArray
-    """(3, 4) rotation times scale, and shift, so that a mesh that moves keeps its vertices and its picture."""
+    """(3, 4) rotation times scale, and translation, so that a mesh that moves keeps its vertices and its texture."""
     image: Callable[[], ByteArray | None]
-    """Makes the picture, (H, W, 3) sRGB or (H, W, 4) with holes where the last is below 128; None if there is none."""
+    """Makes the texture, (H, W, 3) sRGB or (H, W, 4) with holes where the last is below 128; None if there is none."""
     key: Hashable
-    """Equal keys mean equal meshes with equal pictures: a picture is large, so it is made and sent once."""
+    """Equal keys mean equal meshes with equal textures: a texture is large, so it is made and sent only once."""
 
 
 @dataclass(frozen=True, eq=False)
 class Label(Primitive):
-    """A word at a place."""
+    """A text at a position."""
 
     position: FloatArray
-    """(3,) of its middle."""
+    """(3,) position of its middle, metres."""
     text: str
     height_m: float | None = None
-    """Height of its letters, metres, so that it shrinks with what it names; None keeps its size on the screen."""
+    """Height of its letters, metres, so that it shrinks with distance; None keeps its size on the screen."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "text", true_minus(self.text))
@@ -129,14 +129,14 @@ SceneItem = Points | Segments | Balls | Mesh | Textured | Label
 
 @dataclass(frozen=True, eq=False)
 class Focus:
-    """What a step is about, and from which side that reads well."""
+    """The subject of a step, and the direction from which it can be read well."""
 
     view: Literal["Overview", "Sphere", "Balls"]
-    """The direction to look from: that of the view of this name."""
+    """Name of the view from whose direction the step is seen."""
     points: FloatArray
-    """(K, 3) all that must be on the screen."""
+    """(K, 3) points that must be on the screen."""
     clear: FloatArray | None = None
-    """(L, 3) what map points should not hide, where that is not ``points``: steps that share it are seen from the
+    """(L, 3) points that map points should not hide; None takes ``points``. Steps with equal ones are seen from the
     same side."""
 
 
@@ -146,13 +146,13 @@ class Curve:
 
     label: str
     x: FloatArray
-    """(K,) ascending."""
+    """(K,) x of its points, ascending."""
     y: FloatArray
-    """(K,)."""
+    """(K,) y of its points."""
     color: tuple[int, int, int]
     kind: Literal["line", "step", "marker", "level"] = "line"
     """"step" holds y[k] from x[k] to x[k + 1]; "marker" is an upright line at x[0] from y = 0 to y[0]; "level" is a
-    line from (x[0], y[0]) to (x[1], y[0]), a limit to hold other curves against."""
+    line from (x[0], y[0]) to (x[1], y[0]), a limit with which other curves are compared."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,19 +173,20 @@ class Nodes:
     those that agree with most of it."""
 
     name: str
-    """What a node is, such as "ball"."""
+    """Name of one node, such as "ball"."""
     number: NDArray[np.int64]
     """(K,) index of each node in its stage."""
     total: int
-    """How many nodes there are, drawn or not."""
+    """Number of nodes, drawn or not."""
     places: FloatArray
-    """(K, 2) from -1 to 1: nodes near the middle of the clique in space stand near the middle, in their directions."""
+    """(K, 2) positions in the drawing, from -1 to 1: nodes near the clique in space are near the middle, in their
+    directions."""
     matches: NDArray[np.int64]
-    """(K, P) the correspondences that each node is of: two of a ball, one of a match."""
+    """(K, P) the correspondences of each node: two for a ball, one for a match."""
     agrees: NDArray[np.bool_]
-    """(K, K) symmetric; false on the diagonal."""
+    """(K, K) whether two nodes agree: symmetric, false on the diagonal."""
     clique: int
-    """The first so many form the maximum clique."""
+    """Number of nodes of the maximum clique, which come first."""
 
     @cached_property
     def edges(self) -> NDArray[np.int64]:
@@ -193,24 +194,24 @@ class Nodes:
         return np.argwhere(np.triu(self.agrees))
 
     def lit(self, selected: tuple[int, ...]) -> NDArray[np.int64]:
-        """Nodes of the selected correspondences: of one all with it, of several those among them."""
+        """Nodes of the selected correspondences: for one, all nodes with it; for several, the nodes among them."""
         inside = np.isin(self.matches, selected).sum(axis=1)
         return np.flatnonzero(inside >= max(1, min(self.matches.shape[1], len(selected))))
 
 
 @dataclass(frozen=True, eq=False)
 class Graph:
-    """What a step shows of the graph."""
+    """The graph as a step shows it."""
 
     nodes: Nodes
     shown: NDArray[np.bool_]
-    """(K,) nodes that the steps so far have added."""
+    """(K,) mask of the nodes that the steps so far have added."""
     marked: NDArray[np.bool_]
-    """(K,) nodes that the step is about."""
+    """(K,) mask of the nodes that the step is about."""
     color: tuple[int, int, int]
     """Colour of the marked nodes."""
     words: str
-    """What is marked, in a sentence."""
+    """A sentence that says what is marked."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,12 +229,12 @@ class Table:
 
 @dataclass(frozen=True)
 class StepHeading:
-    """What is known of a step before it is painted."""
+    """The part of a step that is known before it is painted."""
 
     key: str
     """Stable name, such as "yaw-arcs" or "sample-3"."""
     title: str
-    """A few words."""
+    """Title of the step, a few words."""
     stage: str = ""
     """Named stage, such as "Yaw"."""
 
@@ -243,12 +244,12 @@ class StepHeading:
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """What one step of a run says."""
+    """The texts of one step of a run."""
 
     key: str
     """Stable name, such as "yaw-arcs" or "sample-3"."""
     title: str
-    """A few words."""
+    """Title of the step, a few words."""
     caption: str
     """Two sentences with this run's own numbers, plain text."""
     equation: str
@@ -265,22 +266,22 @@ class Step:
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """What a step of a run looks like."""
+    """The picture of a step of a run."""
 
     step: Step
     scene: tuple[SceneItem, ...]
     tables: tuple[Table, ...]
     focus: Focus
     draw_charts: Callable[[], tuple[Chart, ...]] = tuple
-    """Charts and the graph are drawn when somebody looks at them."""
+    """Makes the charts; charts and graph are made when they are first used."""
     draw_graph: Callable[[], Graph | None] = lambda: None
 
     @property
     def charts(self) -> tuple[Chart, ...]:
-        """Plots of this step and of those before it."""
+        """Charts of this step and of the steps before it."""
         return self.draw_charts()
 
     @property
     def graph(self) -> Graph | None:
-        """What is known of the run's graph by this step; None before there is one."""
+        """The run's graph as known at this step; None before there is one."""
         return self.draw_graph()

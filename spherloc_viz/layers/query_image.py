@@ -1,4 +1,4 @@
-"""The query image as pictures show it: read once and kept, and as a panorama on the unit sphere."""
+"""The query image for display: read once and cached, and converted to a panorama for the unit sphere."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -16,7 +16,7 @@ from spherloc.problem import Problem
 from spherloc.types import FloatArray
 
 MAX_PIXELS = 4_000_000
-"""Larger photographs are shrunk to this many pixels, so that those that are kept take little memory."""
+"""Number of pixels to which larger photographs are shrunk, so that cached ones take little memory."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +26,7 @@ class Photograph:
     image: NDArray[np.uint8]
     """(H, W, 3) sRGB, read-only."""
     scale: float
-    """Its pixels by those of the file."""
+    """Ratio of its width to that of the file's image."""
 
 
 def photograph(path: Path | None) -> Photograph | None:
@@ -49,7 +49,7 @@ def modified(path: Path) -> int:
 
 @lru_cache(maxsize=8)
 def _read(path: Path, changed_ns: int) -> Photograph:
-    """``changed_ns`` has a file that was written anew read anew."""
+    """The image of a file; ``changed_ns`` is part of the cache's key, so that a changed file is read again."""
     image = read_image(path)
     height, width = image.shape[:2]
     scale = min(1.0, (MAX_PIXELS / (width * height)) ** 0.5)
@@ -70,11 +70,11 @@ def shrunk(image: NDArray[np.uint8], scale: float) -> NDArray[np.uint8]:
 
 PANORAMA = Equirectangular(1024, 512)
 DIM = 0.7
-"""Brightness that the photograph keeps, so that dots stand out on it."""
+"""Factor of the photograph's brightness, so that dots stand out on it."""
 UNSEEN = 96
-"""Grey of what the camera does not see."""
+"""Grey level of directions that the camera does not see."""
 SHARPNESS = 1.5
-"""Pixels of the photograph by those of the panorama, at least: fewer would blur, many more would glitter."""
+"""Least number of photograph pixels per panorama pixel: with fewer it would blur, with many more it would flicker."""
 
 
 def sphere_texture(problem: Problem) -> NDArray[np.uint8] | None:
@@ -92,7 +92,7 @@ def sphere_texture(problem: Problem) -> NDArray[np.uint8] | None:
 
 @lru_cache(maxsize=8)
 def _texture(path: Path, changed_ns: int, camera: Camera, turn: bytes, density: float) -> NDArray[np.uint8] | None:
-    """``density`` is how many pixels of the camera a radian takes; ``turn`` holds ``camera_turn``."""
+    """The texture; ``density`` is the camera's number of pixels per radian, ``turn`` the bytes of ``camera_turn``."""
     photo = photograph(path)
     if photo is None:
         return None

@@ -1,4 +1,5 @@
-"""RANSAC: every hypothesis that beat those before it, and what Eq. 28 expected; the choice of ``auto``."""
+"""RANSAC: every hypothesis that was better than those before it, and the prediction of Eq. 28; the choice of
+``auto``."""
 
 from functools import partial
 
@@ -11,16 +12,16 @@ from spherloc_viz.layers.frame import Frame, Plan, RunView, close_focus, even, o
 from spherloc_viz.layers.primitives import Chart, Curve, Segments, Table
 
 MAX_IMPROVEMENTS = 60
-"""More improvements are thinned evenly; the first and the last, which is the best, stay."""
+"""Largest number of improvements with steps; of more an even sample is shown, with the first and the last, the best."""
 MAX_IN_TWO = 30
-"""Up to so many, an improvement has two steps: its sample, and how the matches vote."""
+"""Largest number of improvements that have two steps each: the sample, and the votes of the matches."""
 SHARES = (0.5, 0.2, 0.1, 0.05, 0.02)
-"""Shares of inliers for which Eq. 28 is told."""
+"""Shares of inliers for which the table of Eq. 28 is computed."""
 CURVE_POINTS = 80
 
 
 def plans(view: RunView, stage: RansacStage) -> list[Plan]:
-    """What Eq. 28 demands, every improvement, and what became of the demand."""
+    """Steps for the number of samples by Eq. 28, every improvement, and a comparison with Eq. 28."""
     count = len(stage.improved_at)
     shown = even(np.arange(count), MAX_IMPROVEMENTS).tolist()
     out = [Plan("samples-needed", "How many samples it takes", lambda: _needed(view, stage))]
@@ -67,7 +68,7 @@ def _samples_for(share: float, size: int, chance: float = 0.99) -> int:
 
 
 def _drawn(view: RunView, stage: RansacStage, k: int) -> Frame:
-    """A sample and its pose, before anybody has voted."""
+    """A sample and its pose, before the matches vote."""
     sample, refitted = stage.samples[k], bool(stage.locally_optimized[k])
     state, colors = view.aligned_pose(stage.cam_from_map[k]), view.colors(style.UNDECIDED, (sample, style.SAMPLE))
     if refitted:
@@ -130,7 +131,7 @@ def _improvement(view: RunView, stage: RansacStage, k: int) -> Frame:
 
 
 def _expected(view: RunView, stage: RansacStage) -> Frame:
-    """Eq. 28 with the best pose's share of inliers, against what happened."""
+    """Eq. 28 with the best pose's share of inliers, compared with this run."""
     mask, size = stage.inlier_masks[-1], _size(stage)
     share, best = np.count_nonzero(mask) / len(mask), int(stage.improved_at[-1]) + 1
     by_then = ransac_success_probability(share, size, best)

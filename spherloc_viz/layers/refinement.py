@@ -14,11 +14,11 @@ from spherloc_viz.layers.frame import Frame, Plan, RunView, angle_text, even, on
 from spherloc_viz.layers.primitives import Chart, Curve, Focus, SceneItem, Segments
 
 MAX_STATES = 20
-"""More states are thinned evenly; the first and the last stay."""
+"""Largest number of states with steps; of more an even sample is shown, with the first and the last."""
 
 
 def plans(view: RunView, stage: RefinementStage) -> list[Plan]:
-    """Every state; inliers, outliers and errors of the last one; and the summary."""
+    """Steps for every state; for inliers, outliers and errors of the last one; and the summary."""
     count = len(stage.cost_px2)
     out = []
     for k in even(np.arange(count), MAX_STATES).tolist():
@@ -72,7 +72,7 @@ def _explained(view: RunView, stage: RefinementStage, k: int, state: FloatArray)
 
 
 def _path(view: RunView, stage: RefinementStage, k: int) -> tuple[SceneItem, ...]:
-    """Where the camera has been."""
+    """The path of the camera so far."""
     states = [camera_centre(view.aligned_pose(state)) for state in stage.cam_from_map[: k + 1]]
     ends = np.stack([states[:-1], states[1:]], axis=1) if k else np.zeros((0, 2, 3))
     return (Segments("cameras/path", "cameras", ends, one_color(style.ESTIMATE, len(ends)), 3.0),)
@@ -164,7 +164,7 @@ def _error(view: RunView, stage: RefinementStage) -> Frame:
 
 
 def _error_focus(view: RunView, state: FloatArray) -> Focus:
-    """What is drawn of the error of the refined pose (3, 4), and the sphere."""
+    """The focus on the drawn error of the refined pose (3, 4) and the sphere."""
     frame = Frame("", "", state, view.colors(style.UNDECIDED), view.no_matches(), located=True)
     lines = [item.points for item in uncertainty.error_items(view, frame) if isinstance(item, Segments)]
     sphere = sphere_box(camera_centre(state), 1.1 * view.sphere_m)

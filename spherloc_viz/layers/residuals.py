@@ -1,4 +1,4 @@
-"""How far matches are from a run's pose, how well its inliers are chosen, and how RANSAC came to its best sample."""
+"""Residuals of the matches at a run's pose, scores of its inliers, and the history of RANSAC."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -37,9 +37,9 @@ class Histogram:
     bin: IntArray
     """(N,) bin of every match."""
     right: IntArray
-    """(B,) right matches."""
+    """(B,) number of right matches."""
     wrong: IntArray
-    """(B,) wrong ones."""
+    """(B,) number of wrong matches."""
     bound: tuple[float, float, float]
     """The smallest, the median and the largest bound of a match: one number where the image stretches alike and gravity
     is exact."""
@@ -47,7 +47,7 @@ class Histogram:
 
 @lru_cache(maxsize=4)
 def bin_words(unit: Unit) -> tuple[str, ...]:
-    """What each bin holds, in words."""
+    """The range of each bin in words."""
     edges = [f"{float(f'{edge:.2g}'):g}" for edge in edges_of(unit)]
     sign, lost = ("°", "without a bearing") if unit == "deg" else (" px", "more than 90° off")
     inner = (f"{low} to {high}{sign}" for low, high in pairwise(edges))
@@ -69,23 +69,23 @@ class Residuals:
     deg: FloatArray
     """(N,) angles between the bearing and the direction to the point, degrees; inf where there is no bearing."""
     histograms: tuple[Histogram, Histogram]
-    """In px and in degrees."""
+    """The histograms in px and in degrees."""
     judged: str
     """The source that says which matches are right: "by the truth" or "by this run's inliers"."""
     blind: int
-    """Matches whose pixel has no bearing."""
+    """Number of matches whose pixel has no bearing."""
 
 
 @dataclass(frozen=True, eq=False)
 class History:
-    """How RANSAC came to its best hypothesis, and Eq. 28's prediction."""
+    """The history of RANSAC's best hypothesis, and Eq. 28's prediction."""
 
     drawn: FloatArray
-    """(J,) samples drawn until each improvement."""
+    """(J,) number of samples drawn until each improvement."""
     inliers: FloatArray
-    """(J,)."""
+    """(J,) number of inliers of each improvement."""
     iterations: int
-    """Samples drawn in all."""
+    """Number of samples drawn in all."""
     share: float
     """w, the share of inliers of the last hypothesis."""
     size: int
@@ -94,14 +94,14 @@ class History:
     """Samples drawn until the first improvement by right matches only; None without one, and without the truth."""
 
     def probability(self, drawn: FloatArray) -> FloatArray:
-        """Eq. 28 for numbers of samples (K,): P = 1 - (1 - w^n)^k."""
+        """Probability (K,) by Eq. 28 for numbers of samples (K,): P = 1 - (1 - w^n)^k."""
         if self.share >= 1.0:
             return np.ones_like(drawn)
         return -np.expm1(drawn * np.log1p(-(self.share**self.size)))
 
     @property
     def half_at(self) -> float:
-        """Samples within which half of all runs draw one of inliers only."""
+        """Number of samples within which half of all runs draw a clean one."""
         if self.share >= 1.0:
             return 1.0
         return float(np.log(0.5) / np.log1p(-(self.share**self.size))) if self.share > 0.0 else np.inf
@@ -139,7 +139,8 @@ def _angles_deg(bearings: FloatArray, points: FloatArray) -> FloatArray:
 
 
 def histogram(unit: Unit, values: FloatArray, right: NDArray[np.bool_], bound: tuple[float, float, float]) -> Histogram:
-    """The values (N,), not below 0, in bins of equal factors; what is no finite number is in the last bin."""
+    """Histogram of values (N,) of 0 or more, in bins of equal ratios; values that are not finite are in the last
+    bin."""
     edges = edges_of(unit)
     place = np.searchsorted(edges, np.nan_to_num(values, nan=np.inf), "right").astype(np.int64)
     count = len(edges) + 1
@@ -148,7 +149,7 @@ def histogram(unit: Unit, values: FloatArray, right: NDArray[np.bool_], bound: t
 
 
 def scores_table(trace: Trace) -> Table:
-    """Precision, recall and F1 with their counts, or what is known without the truth."""
+    """Table of precision, recall and F1 with their counts, or of the counts that are known without the truth."""
     truth, reported = trace.problem.truth_inliers, trace.inlier_mask
     found = int(np.count_nonzero(reported))
     if truth is None:
@@ -164,7 +165,7 @@ def scores_table(trace: Trace) -> Table:
 
 
 def history_of(trace: Trace) -> History | None:
-    """How RANSAC went; None for other runs and where no sample gave a pose."""
+    """The history of a RANSAC run; None for other runs and if no sample gave a pose."""
     stage = trace.stage(RansacStage)
     if stage is None or not len(stage.improved_at):
         return None
@@ -178,7 +179,7 @@ def history_of(trace: Trace) -> History | None:
 
 @dataclass(frozen=True, eq=False)
 class MatchResiduals:
-    """How far every correspondence is off at one pose. N correspondences; NaN where the pixel has no bearing."""
+    """Residuals of N correspondences at one pose; NaN where the pixel has no bearing."""
 
     px: FloatArray
     """(N,) reprojection error to first order; inf more than 90 degrees from the bearing."""
@@ -188,23 +189,23 @@ class MatchResiduals:
 
 @dataclass(frozen=True, eq=False)
 class Verdicts:
-    """Every correspondence of a run, by the run and by the truth. N of them."""
+    """Judgement of the N correspondences of a run, by the run and by the truth."""
 
     kept: BoolArray
-    """(N,) the run calls it an inlier."""
+    """(N,) whether the run calls it an inlier."""
     right: BoolArray | None
-    """(N,) it is truly an inlier: by its label, else within its bound at the true pose; None if neither is known."""
+    """(N,) whether it is a true inlier: by its label, else by its bound at the true pose; None if neither is known."""
     limit_px: FloatArray
     """(N,) the bound on its residual at the run's pose, px: with an estimated tilt the noise bound, else that and what
     gravity's error adds; NaN where the pixel has no bearing."""
     estimate: MatchResiduals | None
-    """At the run's pose."""
+    """Residuals at the run's pose; None without a pose."""
     truth: MatchResiduals | None
-    """At the true pose."""
+    """Residuals at the true pose; None if it is unknown."""
 
 
 def residuals_at(problem: Problem, cam_from_map: FloatArray) -> MatchResiduals:
-    """How far every correspondence is off at a pose (3, 4) of the problem's own frames."""
+    """Residuals of every correspondence at a pose (3, 4) between the problem's own frames."""
     aligned = problem.aligned
     posed = aligned.align_pose(cam_from_map)
     px, rad = np.full(len(problem), np.nan), np.full(len(problem), np.nan)
@@ -216,13 +217,13 @@ def residuals_at(problem: Problem, cam_from_map: FloatArray) -> MatchResiduals:
 
 
 def run_bounds(trace: Trace) -> Bounds:
-    """The bounds that the run's bearings had, (M,) usable correspondences."""
+    """The bounds that the run used, for its M usable correspondences."""
     return bounds_of(trace.problem.aligned, float(trace.options.bound_px))
 
 
 @lru_cache(maxsize=8)
 def verdicts(trace: Trace) -> Verdicts:
-    """What is known of every correspondence of a run (cached)."""
+    """Judgement of every correspondence of a run (cached)."""
     problem, bounds = trace.problem, run_bounds(trace)
     estimate = None if trace.cam_from_map is None else residuals_at(problem, trace.cam_from_map)
     known = problem.truth_cam_from_map

@@ -1,4 +1,4 @@
-"""The ring around the sphere, on which something is shown over yaw, and the chart that shows the same.
+"""The yaw ring around the sphere, which shows a count over yaw, and the chart of the same count.
 
 On the ring, the direction of a yaw is where the camera looks with that yaw.
 """
@@ -20,15 +20,15 @@ HEIGHT = 0.9
 END = FOOT + HEIGHT + 0.15
 """Where lines through the ring end, in sphere radii."""
 HIDES_RAD = np.radians(4.0)
-"""Lines at a smaller angle look like one."""
+"""Least angle between two lines that can be told apart."""
 DEGREES = 360
-"""Corners of the outline."""
+"""Number of points of the outline."""
 GOLDEN = 0.6180339887498949
-"""Multiples of it, less their whole parts, are spread evenly however many are taken."""
+"""Golden ratio: the fractional parts of its multiples are spread evenly, however many are taken."""
 
 
 def directions(yaw_rad: FloatArray) -> FloatArray:
-    """Where the camera looks (N, 3) with the yaws (N,): R^T e_z."""
+    """Directions (N, 3) in which the camera looks with the yaws (N,): R^T e_z."""
     return np.column_stack([-np.sin(yaw_rad), np.zeros_like(yaw_rad), np.cos(yaw_rad)])
 
 
@@ -42,7 +42,7 @@ def by_degree(counts: np.ndarray) -> np.ndarray:
 
 
 def circle(view: RunView, centre: FloatArray, heights: FloatArray) -> FloatArray:
-    """Points (360, 3) around the ring, one a degree, at heights (360,) or () of which 1 is the peak."""
+    """Points (360, 3) around the ring, one per degree, at heights (360,) or (), where 1 is that of the peak."""
     radius = np.broadcast_to(FOOT + HEIGHT * np.asarray(heights), DEGREES)
     return centre + view.sphere_m * radius[:, None] * _EVERY_DEGREE
 
@@ -71,8 +71,8 @@ def bars(name: str, feet: FloatArray, tops: FloatArray, colors: ByteArray) -> Se
 def spokes(
     view: RunView, centre: FloatArray, yaw_rad: float | None, candidates_rad: Iterable[float] = ()
 ) -> list[Segments]:
-    """Where the camera looks with the estimated yaw, if there is one yet, and with the true one, if that is known:
-    only beyond the ends of the others where it would hide one of them or a candidate's."""
+    """Lines in the directions of the estimated yaw, if there is one yet, and of the true one, if that is known. A line
+    that would hide another one or a candidate's is drawn only beyond its end."""
     out = [] if yaw_rad is None else [spoke("ring/estimate", view, centre, yaw_rad, style.ESTIMATE)]
     if view.truth is not None:
         true_rad = yaw_of(view.truth[:, :3])
@@ -92,14 +92,14 @@ def spoke(
     begin: float = 1.0,
     end: float = END,
 ) -> Segments:
-    """A line where the camera looks with a yaw, from the sphere through the ring, or between two of its radii."""
+    """A line in the direction of a yaw, from the sphere through the ring, or between two radii."""
     radii = view.sphere_m * np.array([begin, end])
     ends = centre + radii[:, None] * directions(np.array([yaw_rad]))
     return Segments(name, "yaw ring", ends[None], one_color(color, 1), 4.0)
 
 
 def name(path: str, view: RunView, yaw_rad: float, words: str) -> Label:
-    """Words outside of the ring at a yaw."""
+    """A label outside the ring at a yaw."""
     radius_m = view.sphere_m * END
     place = view.middle + radius_m * directions(np.array([yaw_rad]))[0]
     return Label(path, "yaw ring", place - np.array([0.0, 0.25 * view.sphere_m, 0.0]), words)
@@ -122,19 +122,19 @@ def markers(view: RunView, height: float, yaw_rad: float | None) -> list[Curve]:
 
 
 def marker(label: str, yaw_rad: float, height: float, color: style.RGB) -> Curve:
-    """A yaw in a chart."""
+    """A marker of a yaw in a chart."""
     return Curve(label, np.array([np.degrees(yaw_rad)]), np.array([height]), color, "marker")
 
 
 def off_truth(view: RunView, yaw_rad: float) -> str:
-    """How far a yaw is from the true one, as part of a sentence; empty if that is unknown."""
+    """Difference of a yaw from the true one, as part of a sentence; empty if that is unknown."""
     if view.truth is None:
         return ""
     return f", {abs(np.degrees(wrap_angle(yaw_rad - yaw_of(view.truth[:, :3])))):.2f}° from the truth"
 
 
 def peaks(counts: np.ndarray, reach: int, most: int) -> np.ndarray:
-    """Places of the ``most`` highest peaks of counts (K,) around the circle, highest first.
+    """Indices of the ``most`` highest peaks of counts (K,) around the circle, highest first.
 
     At a peak no count within ``reach`` places is larger, and no other peak is that close. Equal ones come in an order
     that jumps around the circle, so that a few of many do not lie side by side.

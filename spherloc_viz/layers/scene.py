@@ -1,5 +1,5 @@
-"""What every picture shows: map points, the unit sphere with its bearings and the query image, matches, true and
-estimated camera with the error, a scale bar, and a localized sequence."""
+"""Primitives that all pictures share: map points, the unit sphere with its bearings and the query image, matches, true
+and estimated camera with the error, a scale bar, and a localized sequence."""
 
 from collections.abc import Sequence
 from functools import cache, partial
@@ -20,17 +20,17 @@ from spherloc_viz.layers.query_image import modified, sphere_texture
 from spherloc_viz.layers.uncertainty import error_items
 
 BAR_SHARE = 0.25
-"""Length of the scale bar as a share of the map's width, at most."""
+"""Largest length of the scale bar, as a share of the map's width."""
 BAR_TICK = 0.04
 """Height of its marks, as a share of the bar."""
 CELL_SHARE, GROUND_SHARE = 0.2, 0.9
-"""Side of a cell of the ground, at most, and the ground's radius, as shares of the map's width."""
+"""Largest side of a cell of the ground, and the ground's radius, as shares of the map's width."""
 RIM = 72
-"""Pieces of the ground's edge."""
+"""Number of straight pieces of the ground's edge."""
 
 
 def scale_bar(view: RunView) -> list[SceneItem]:
-    """The bar, before the front of the map as the overview shows it, with its length."""
+    """The bar with its length, in front of the map as the overview shows it."""
     low, high = view.dense_box
     length = round_length(BAR_SHARE * max(float((high - low)[[0, 2]].max()), 1e-3))
     start = np.array([0.5 * (low + high)[0] - 0.5 * length, high[1], low[2] - BAR_TICK * length])
@@ -46,7 +46,7 @@ def scale_bar(view: RunView) -> list[SceneItem]:
 
 
 def ground(view: RunView) -> list[SceneItem]:
-    """A round grid at the foot of the map, which tells what is level and what is far, with the map's level axes."""
+    """A round grid below the map, which shows the horizontal and distances, with the map's horizontal axes."""
     low, high = view.dense_box
     middle, extent = 0.5 * (low + high), max(float((high - low)[[0, 2]].max()), 1e-3)
     cell, radius = round_length(CELL_SHARE * extent), GROUND_SHARE * extent
@@ -81,13 +81,13 @@ def round_length(most: float) -> float:
 CAMERA = 1.9
 """Size of a camera, in sphere radii."""
 GHOST_AWAY = 0.3
-"""From this distance to the estimated camera on, in sphere radii, the true one has a body."""
+"""Least distance from the estimated camera, in sphere radii, at which the true one is drawn with a body."""
 UNDER_IMAGE = 0.98
 """Radius of the bare sphere where the query image is around it, in sphere radii."""
 COLUMNS, ROWS = 96, 48
-"""Cells of the sphere with the image."""
+"""Numbers of cells of the sphere with the image."""
 COVERAGE = Equirectangular(512, 256)
-"""At these pixels of the image on the sphere the camera is asked what it sees."""
+"""Panorama at whose pixels it is computed whether the camera sees the direction."""
 
 
 FINE = 3
@@ -97,7 +97,7 @@ FINE = 3
 def base_items(view: RunView, frame: Frame) -> tuple[SceneItem, ...]:
     """The primitives that do not depend on the stage."""
     pose = frame.cam_from_map.tobytes()
-    # Translucent surfaces hide what is drawn after them and lies behind: the ghost comes before the sphere around it.
+    # A translucent surface hides things behind it that are drawn later: so the ghost is drawn before the sphere.
     return (
         *_ghost(view, frame),
         Points("map/points", "map", view.points, frame.colors, 0.07 * view.dot_m, view.numbers),
@@ -141,7 +141,7 @@ def _sphere(view: RunView, frame: Frame) -> list[SceneItem]:
 
 
 def _placed_sphere(view: RunView, frame: Frame) -> tuple[list[SceneItem], FloatArray]:
-    """The sphere with the query image, and the places (A, 3) of the bearings on it."""
+    """The sphere with the query image, and the positions (A, 3) of the bearings on it."""
     rotation, problem = frame.cam_from_map[:, :3], view.trace.problem
     centre = camera_centre(view.standing(rotation) if frame.sphere_aside else frame.cam_from_map)
     vertices, faces = icosphere(FINE)
@@ -160,13 +160,13 @@ def _image(problem: Problem, centre: FloatArray, map_from_sphere: FloatArray) ->
 
 
 def _changed(problem: Problem) -> int:
-    """When the query image was written: it may be drawn only after the run."""
+    """When the query image was written, ns; a rendered one may be written only after the run."""
     return 0 if problem.image is None else modified(problem.image)
 
 
 @cache
 def _panorama() -> tuple[FloatArray, np.ndarray, FloatArray]:
-    """A sphere cut open along its seam: vertices (V, 3), faces (F, 3), and places (V, 2) in a panorama around it."""
+    """A sphere that is open along its seam: vertices (V, 3), faces (F, 3), and texture coordinates (V, 2)."""
     across, up = np.meshgrid(np.linspace(0.0, 1.0, COLUMNS + 1), np.linspace(0.0, 1.0, ROWS + 1))
     uv = np.column_stack([across.ravel(), up.ravel()])
     longitude, latitude = 2.0 * np.pi * (uv[:, 0] - 0.5), np.pi * (uv[:, 1] - 0.5)
@@ -192,7 +192,7 @@ def _sphere_image(problem: Problem) -> ByteArray | None:
 
 
 def _seen(camera: Camera, camera_turn: FloatArray) -> ByteArray:
-    """255 where the camera sees what lies behind a pixel of ``COVERAGE``, else 0."""
+    """255 where the camera sees the direction of a pixel of ``COVERAGE``, else 0."""
     columns, rows = np.meshgrid(np.arange(COVERAGE.width) + 0.5, np.arange(COVERAGE.height) + 0.5)
     bearings, _ = COVERAGE.unproject(np.column_stack([columns.ravel(), rows.ravel()]).astype(np.float64))
     pixels, valid = camera.project(bearings @ camera_turn)
@@ -202,7 +202,7 @@ def _seen(camera: Camera, camera_turn: FloatArray) -> ByteArray:
 _CORNERS = np.array([[-0.5, -0.4, 0.7], [0.5, -0.4, 0.7], [0.5, 0.4, 0.7], [-0.5, 0.4, 0.7]])
 """Corners of the opening of a camera of size 1."""
 _ROOF = np.array([0.0, -0.62, 0.7])
-"""Above its upper edge."""
+"""Tip of the roof above the upper edge of that opening."""
 _EDGES = np.concatenate(
     [
         np.stack([np.zeros((4, 3)), _CORNERS], axis=1),
@@ -210,11 +210,11 @@ _EDGES = np.concatenate(
         [[_CORNERS[0], _ROOF], [_ROOF, _CORNERS[1]]],
     ]
 )
-"""(10, 2, 3)."""
+"""Lines (10, 2, 3) of a camera of size 1."""
 
 
 def _ghost(view: RunView, frame: Frame) -> list[Mesh]:
-    """The true camera's body, to be seen through; not where the estimated camera is in its way."""
+    """The true camera's translucent body; empty if the estimated camera is too near."""
     if view.truth is None:
         return []
     truth, away = view.truth, camera_centre(frame.cam_from_map)
@@ -241,7 +241,7 @@ DOT_SHARE = 0.06
 
 
 def trajectory_items(rows: Sequence[QueryResult], map_turn: FloatArray, limit_m: float) -> tuple[SceneItem, ...]:
-    """What a sequence adds to the canvas.
+    """Primitives of a localized sequence.
 
     ``rows`` are in the order of the sequence, ``map_turn`` (3, 3) turns the map to the aligned map, and ``limit_m``
     is the loosest limit of success. Poses whose truth is unknown have the estimate's colour; a query without a pose is

@@ -1,4 +1,4 @@
-"""The selected correspondences in a picture: what shows them lights up, all else dims."""
+"""Highlights the selected correspondences in a picture and dims all others."""
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -20,22 +20,22 @@ from spherloc_viz.layers.residuals import run_bounds, verdicts
 
 LAYER = "selection"
 DOTS = ("map/points", "sphere/bearings")
-"""What shows single correspondences: the map point and the bearing."""
+"""Names of the dots that show single correspondences: map points and bearings."""
 HALO = 1.8
 """Radius of the ring around a dot, in radii of the dot."""
 INNER, OUTER = 1.06, 1.24
 """Radii of the band of the selected arcs, in sphere radii: between the sphere and the ring of all arcs."""
 STEP_RAD = np.radians(4.0)
 CORNERS = 48
-"""Corners of the level circle around a ball."""
+"""Number of points of the horizontal circle around a ball."""
 DOT_CORNERS = 20
-"""Corners of each circle around a dot."""
+"""Number of points of each circle around a dot."""
 LIFT = 0.3
-"""From the sphere with the image to the circles inside and outside, in radii of the circle."""
+"""Distance of the circles inside and outside from the sphere with the image, in radii of the circle."""
 
 
 def with_selection(picture: Picture, trace: Trace, selected: tuple[int, ...]) -> Picture:
-    """The picture with the selected correspondences (numbers in the problem) lit up and all others dimmed.
+    """The picture with the selected correspondences (indices in the problem) highlighted and all others dimmed.
 
     Drawn are a ring around the map point and the bearing, the ray between them, and, where the picture shows pairs,
     the arcs, the balls and the agreeing pairs of the selected: of one correspondence all pairs with it, of several the
@@ -57,7 +57,7 @@ def with_selection(picture: Picture, trace: Trace, selected: tuple[int, ...]) ->
 
 
 def _dimmed(item: SceneItem, chosen: IntArray) -> SceneItem:
-    """The item with the colours of what it shows of others moved towards grey."""
+    """The item, with the colours of other correspondences moved towards grey."""
     if not isinstance(item, Points | Segments | Balls) or item.layer == "trajectory":
         return item
     if item.ids is not None:
@@ -73,8 +73,8 @@ def _dim(colors: ByteArray, keep: NDArray[np.bool_]) -> ByteArray:
 
 
 def _halos(items: dict[str, SceneItem], chosen: IntArray) -> list[SceneItem]:
-    """Rims around the dots of the selected, and the rays between. Of a dot on a wall or on the image only half is seen,
-    and nothing of its rim: if a few are selected, they get circles too."""
+    """Rims around the dots of the selected, and the rays between. On a wall or on the image only half of a dot is seen
+    and nothing of its rim, so if few are selected, they get circles too."""
     out: list[SceneItem] = []
     places: dict[str, dict[int, FloatArray]] = {}
     radii_m: list[float] = []
@@ -122,7 +122,7 @@ def _pairs(stage: YawStage | TranslationStage, selected: tuple[int, ...]) -> tup
 
 
 def _note(what: str, drawn: int, count: int, agreeing: bool) -> str:
-    """What was left out."""
+    """A sentence on pairs that are not drawn."""
     if drawn == count:
         return ""
     return f"{drawn} of {count:,} {what} of the selection{' in the clique' if agreeing else ''} are highlighted."
@@ -193,26 +193,26 @@ MAX_COMPARED = 200
 
 @dataclass(frozen=True)
 class Traits:
-    """Several correspondences in one run."""
+    """Properties of several correspondences in one run."""
 
     count: int
-    """How many they are."""
+    """Number of the correspondences."""
     kept: int
-    """Those that the run calls inliers."""
+    """Number of those that the run calls inliers."""
     right: int | None
-    """Those that truly are; None if the truth is unknown."""
+    """Number of true inliers; None if the truth is unknown."""
     median_px: float | None
-    """Median residual at the run's pose; None without a pose, or if none of them has a bearing."""
+    """Median residual at the run's pose, px; None without a pose, or if none of them has a bearing."""
     agree: int
-    """Pairs among them that agree at the run's yaw."""
+    """Number of pairs among them that agree at the run's yaw."""
     pairs: int
-    """Pairs among them, of at most ``MAX_COMPARED``."""
+    """Number of pairs among them, of at most ``MAX_COMPARED`` correspondences."""
     sentences: tuple[str, ...]
-    """What they have in common."""
+    """Sentences on what they have in common."""
 
 
 def explain_many(trace: Trace, numbers: IntArray) -> Traits:
-    """What the correspondences (K,) of these indices in the problem have in common."""
+    """The common properties of the correspondences of these indices (K,) in the problem."""
     known = verdicts(trace)
     places = np.flatnonzero(np.isin(trace.problem.aligned.index, numbers))
     places = even(places, MAX_COMPARED)
@@ -240,7 +240,7 @@ def _agreeing(trace: Trace, places: IntArray) -> tuple[int, int]:
 
 
 def _pair(trace: Trace, places: IntArray) -> tuple[str, ...]:
-    """Where the arcs of two correspondences are."""
+    """A sentence on the arcs of two correspondences."""
     if len(places) != 2:
         return ()
     aligned = trace.problem.aligned

@@ -1,4 +1,4 @@
-"""The steps before any estimate: the matches, their bearings on the unit sphere, and what gravity leaves open."""
+"""The steps before any estimate: the matches, their bearings on the unit sphere, and the unknowns that remain."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from spherloc_viz.layers.primitives import Focus, Label, SceneItem, Segments
 
 
 def plans(view: RunView) -> list[Plan]:
-    """Problem, bearings, one match, gravity, and the four unknowns."""
+    """Steps for the problem, the bearings, one match, gravity, and the four unknowns."""
     return [
         Plan("problem", "The matches", lambda: _problem(view)),
         Plan("bearings", "Bearings on the unit sphere", lambda: _bearings(view)),
@@ -22,7 +22,7 @@ def plans(view: RunView) -> list[Plan]:
 
 
 def _lost(problem: Problem) -> int:
-    """Matches whose pixels have no bearing."""
+    """Number of matches whose pixels have no bearing."""
     return int(np.count_nonzero(~problem.usable))
 
 
@@ -69,12 +69,12 @@ def _bearings(view: RunView) -> Frame:
 
 
 def _name(layer: str, view: RunView, words: str) -> Label:
-    """Words above the sphere."""
+    """A label above the sphere."""
     return Label("sphere/name", layer, view.middle - np.array([0.0, 1.2 * view.sphere_m, 0.0]), words)
 
 
 def example(view: RunView) -> int:
-    """A match to explain things by: the first that agrees with the pose, or else the first with a bearing."""
+    """The match that serves as an example: the first that agrees with the pose, or else the first with a bearing."""
     agreeing = np.flatnonzero(view.trace.inlier_mask)
     return int(agreeing[0] if len(agreeing) else view.trace.problem.aligned.index[0])
 
@@ -96,7 +96,7 @@ def _match(view: RunView) -> Frame:
 
 
 def _ray(view: RunView, number: int) -> Segments:
-    """Where the camera could stand with a yaw of 0: from the point backwards along its bearing."""
+    """The possible camera positions for a yaw of 0: the line from the point backwards along its bearing."""
     aligned, point = view.trace.problem.aligned, view.points[number]
     bearing = aligned.bearings[int(np.searchsorted(aligned.index, number))]
     reach = 2.0 * float(np.linalg.norm(point - view.middle))

@@ -1,4 +1,4 @@
-"""The charts of a sweep (as Figs. 5 to 7): success, errors and time, a curve an estimator, with bands."""
+"""The charts of a sweep (as Figs. 5 to 7): success, errors and time, with a curve and a band for each estimator."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -23,15 +23,15 @@ class SweepChart:
     """A chart with bands."""
 
     chart: Chart
-    """A curve an estimator that has a run; there may be the limit of success as a level."""
+    """The chart: a curve for each estimator that has a run, and in some charts the limit of success as a level."""
     bands: Mapping[str, tuple[FloatArray, FloatArray]]
     """Lower and upper ends (K,) of the band around a curve, by the curve's label."""
     log: bool
-    """Whether equal factors of y are equally far apart."""
+    """Whether the y axis is logarithmic."""
 
 
 def sweep_colors(labels: Sequence[str]) -> dict[str, style.RGB]:
-    """A colour for each label: that of its estimator; of several of one estimator, the first has it."""
+    """A colour for each label: that of its estimator for the first label of an estimator, another one for the next."""
     taken: dict[str, style.RGB] = {}
     for label in labels:
         color = color_of(label.split()[0])
@@ -85,8 +85,8 @@ def _chart(
     bands: dict[str, tuple[FloatArray, FloatArray]] = {}
     for label, rows in table.items():
         value, low, middle, high = rows.T
-        # No pose is an infinite error, which has no place on an axis: bands end where the largest known error is, and
-        # curves end before. A logarithm of zero has none either.
+        # A run without a pose has an infinite error, which cannot be drawn: bands end at the largest known error, and
+        # curves are interrupted. The logarithm of zero cannot be drawn either.
         bands[label] = np.clip(low, least if log else 0.0, most), np.clip(high, least if log else 0.0, most)
         middle = np.where(np.isfinite(middle), np.maximum(middle, least) if log else middle, np.nan)
         curves.append(Curve(label, value, middle, colors[label]))
@@ -105,7 +105,7 @@ def _three(found: Quartiles) -> Three:
 
 
 def sweep_table(over: str, points: Sequence[Point]) -> Table:
-    """A row a point."""
+    """A table with a row for each point."""
     columns = (
         "estimator", AXES[over], "success", "95 %", "position error", "rotation error", "time", "precision", "recall",
     )  # fmt: skip

@@ -18,7 +18,7 @@ from spherloc_viz.layers.primitives import Balls, Focus, Graph, Label, Nodes, Po
 from spherloc_viz.layers.ring import GOLDEN
 
 OPACITIES = ((4, 0.3), (12, 0.22), (35, 0.14), (np.inf, 0.1))
-"""Up to how many balls have which opacity: few are seen well, and many do not hide what is behind them."""
+"""Largest number of balls, and their opacity: few balls are seen well, and many do not hide things behind them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +32,7 @@ class BallSet:
 
     @cached_property
     def by_radius(self) -> IntArray:
-        """(M,) the smallest first."""
+        """(M,) indices of the balls, the smallest first."""
         return np.argsort(self.stage.radii_m, kind="stable")
 
     @cached_property
@@ -52,7 +52,7 @@ class BallSet:
 
     @property
     def example(self) -> int:
-        """A ball to explain balls by."""
+        """The ball that serves as an example."""
         return int(self.order[0])
 
     def focus(self, shown: IntArray) -> Focus:
@@ -69,7 +69,7 @@ class BallSet:
 
     @cached_property
     def in_clique(self) -> NDArray[np.bool_]:
-        """(M,) balls of the maximum clique."""
+        """Mask (M,) of the balls of the maximum clique."""
         return self.mask(self.stage.clique)
 
     @cached_property
@@ -79,12 +79,12 @@ class BallSet:
 
     @cached_property
     def degrees(self) -> IntArray:
-        """(M,) how many others each ball overlaps."""
+        """(M,) number of other balls that each ball overlaps."""
         return np.bincount(self.stage.edges.ravel(), minlength=len(self))
 
     @cached_property
     def busiest(self) -> IntArray:
-        """(M,) those that overlap most others first."""
+        """(M,) indices of the balls, those that overlap most others first."""
         return np.argsort(-self.degrees, kind="stable")
 
     def mask(self, balls: np.ndarray) -> NDArray[np.bool_]:
@@ -104,7 +104,7 @@ class BallSet:
 
     @cached_property
     def _starts(self) -> IntArray:
-        """(M + 1,) where each ball's edges to later ones begin: edges are sorted."""
+        """(M + 1,) index of each ball's first edge to a later ball: edges are sorted."""
         return np.searchsorted(self.stage.edges[:, 0], np.arange(len(self) + 1))
 
     def greedy(self, order: IntArray) -> IntArray:
@@ -116,7 +116,7 @@ class BallSet:
         overlap = np.zeros((count, count), dtype=bool)
         overlap.ravel()[count * ends[:, 0] + ends[:, 1]] = True
         rows = np.packbits(overlap | overlap.T, axis=1, bitorder="little")
-        # Whole numbers as sets of bits: one operation a ball, however many there are.
+        # Integers as bit sets: one operation per ball, however many there are.
         fitting, taken = (1 << count) - 1, []
         while fitting:
             ball = (fitting & -fitting).bit_length() - 1
@@ -125,8 +125,8 @@ class BallSet:
         return order[taken]
 
     def drawn(self, shown: IntArray, inside: NDArray[np.bool_]) -> IntArray:
-        """Which of some balls, the smallest first, to draw: of those of a mask (M,) and of the others an even sample
-        of the smaller half, if there are too many. Large balls hold the whole picture in them and hide it."""
+        """The balls to draw, of some balls with the smallest first: if there are too many, an even sample of the
+        smaller half of those of a mask (M,) and of the others. Large balls would contain and hide the whole picture."""
         most = style.MAX_DRAWN_BALLS
         if len(shown) <= most:
             return shown
@@ -141,7 +141,7 @@ class BallSet:
         stage, drawn = self.stage, self.drawn(shown, inside)
         items: list[SceneItem] = [self._edges(drawn, inside, color)]
         looked_at = drawn[inside[drawn]] if inside[drawn].any() else drawn
-        # Else the centres of all would hide the few small balls that a step is about.
+        # With more, the centres would hide the few small balls that a step is about.
         dot_m = min(0.02 * view.sphere_m, 0.1 * float(np.median(stage.radii_m[looked_at])))
         faint = next(opacity for most, opacity in OPACITIES if len(drawn) <= most)
         groups = (("balls/others", ~inside, style.UNDECIDED, faint), ("balls/clique", inside, color, 1.6 * faint))
@@ -168,9 +168,9 @@ class BallSet:
 
 
 MAX_NODES = 400
-"""More are thinned: to the clique, or an even sample of it, and an even sample of the others."""
+"""Largest number of nodes; of more, the clique, or an even sample of it, and an even sample of the others are drawn."""
 INNER, OUTER = 0.08, 0.97
-"""Radii within which nodes stand; the whole drawing has radius 1."""
+"""Smallest and largest radius of a node's position; the whole drawing has radius 1."""
 
 
 def ball_nodes(stage: TranslationStage) -> Nodes:
@@ -217,7 +217,7 @@ def _chosen(total: int, clique: IntArray, order: IntArray) -> IntArray:
 def _nodes(
     name: str, chosen: IntArray, total: int, offsets: FloatArray, matches: IntArray, agrees: BoolArray, clique: IntArray
 ) -> Nodes:
-    """In the order of the matrix. ``offsets`` (K, 3) are where the nodes are, from the middle."""
+    """The nodes in the order of the matrix. ``offsets`` (K, 3) are their positions in space, from the middle."""
     member = np.isin(chosen, clique)
     with_clique = agrees[:, member].sum(axis=1)
     order = np.lexsort((-agrees.sum(axis=1), -with_clique, ~member))
@@ -233,8 +233,8 @@ def _nodes(
 
 
 def _layout(offsets: FloatArray, member: BoolArray) -> FloatArray:
-    """(K, 2) places: directions as in space, seen from above, and as even as directions can be; the members of the
-    clique in a disc of their own, as large as they are many, and within it and around it the nearer the farther in."""
+    """Positions (K, 2) in the drawing: in the directions that nodes have in space, seen from above, but evenly spread.
+    The clique fills a disc in the middle, whose area is its share of the nodes; nearer nodes are farther inside."""
     rank = np.empty(len(offsets))
     away = np.linalg.norm(offsets, axis=1)
     rank[np.lexsort((away, ~member))] = np.arange(len(offsets))
@@ -251,22 +251,22 @@ def _layout(offsets: FloatArray, member: BoolArray) -> FloatArray:
 def graph_at(
     nodes: Callable[[], Nodes], shown: IntArray | None, marked: IntArray, color: style.RGB, words: str
 ) -> Graph:
-    """What a step shows: some nodes, by their numbers in the stage (None for all), and those that it marks."""
+    """The graph of a step: the shown nodes, by their indices in the stage (None for all), and the marked ones."""
     known = nodes()
     there = np.ones(len(known.number), dtype=bool) if shown is None else np.isin(known.number, shown)
     return Graph(known, there, there & np.isin(known.number, marked), color, words)
 
 
 SIZES = (3, 10, 30, 100, 300)
-"""How many balls are shown before all are, in the order of ``BallSet.order``."""
+"""Numbers of balls that are shown in steps before all are, in the order of ``BallSet.order``."""
 CLIQUE_SIZES = (3, 10, 30, 100)
-"""How many members of the maximum clique are shown before all are."""
+"""Numbers of members of the maximum clique that are shown in steps before all are."""
 NAME_ROOM = 2.5
-"""Half width of what is framed around one ball and its name, in radii."""
+"""Half width of the view around one ball and its name, in radii."""
 
 
 def plans(view: RunView, stage: TranslationStage) -> list[Plan]:
-    """One ball, more and more of them, two greedy cliques, and the maximum one."""
+    """Steps for one ball, more and more balls, two greedy cliques, and the maximum clique."""
     balls, no_balls = BallSet(stage), np.zeros(0, dtype=np.int64)
     nodes = cache(partial(ball_nodes, stage))
 
@@ -324,7 +324,7 @@ def _turned(view: RunView, balls: BallSet) -> FloatArray:
 
 
 def _note(balls: BallSet, shown: IntArray, inside: np.ndarray) -> str:
-    """By which rules balls were left out."""
+    """A note on the rules by which balls were left out."""
     drawn = len(balls.drawn(shown, inside))
     if drawn == len(shown):
         return balls.stage.rule
@@ -335,7 +335,7 @@ def _note(balls: BallSet, shown: IntArray, inside: np.ndarray) -> str:
 
 
 def _from_truth(view: RunView, position: FloatArray) -> str:
-    """How far a place (3,) is from the true position, as part of a sentence; empty if that is unknown."""
+    """Distance of a position (3,) from the true one, as part of a sentence; empty if that is unknown."""
     if view.truth is None:
         return ""
     return f", {view.length(float(np.linalg.norm(position - camera_centre(view.truth))))} from the truth"
@@ -367,7 +367,7 @@ def _pair(view: RunView, balls: BallSet) -> Frame:
 
 
 def _name(centre: FloatArray, radius_m: float, words: str) -> Label:
-    """Words above a ball."""
+    """A label above a ball."""
     return Label("balls/name", "balls", centre - np.array([0.0, 1.15 * radius_m, 0.0]), words)
 
 
@@ -423,7 +423,7 @@ def _from_busiest(view: RunView, balls: BallSet) -> Frame:
 
 
 def _greedy(view: RunView, balls: BallSet, found: IntArray, first: str, then: str) -> Frame:
-    """A clique that was put together without looking back."""
+    """The step of a clique that was built greedily."""
     missing = len(balls.stage.clique) - len(found)
     verdict = "which is as large as the maximum" if missing == 0 else f"{missing:,} fewer than the maximum has"
     inside = balls.mask(found)
@@ -480,7 +480,7 @@ def _clique(view: RunView, balls: BallSet) -> Frame:
 
 
 def _clique_name(balls: BallSet) -> Label:
-    """Words above the clique."""
+    """A label above the clique."""
     points = balls.focus(balls.members).points
     place = np.mean(points, axis=0)
     place[1] = np.min(points[:, 1])

@@ -1,4 +1,4 @@
-"""How far a pose is off, and how far it may be off by its covariance: in words, as a table and on the canvas."""
+"""The error of a pose, and its uncertainty by its covariance: in words, as a table and on the canvas."""
 
 import numpy as np
 
@@ -14,16 +14,16 @@ LAYER = "uncertainty"
 SIGMAS = 3.0
 """Half axes of the ellipsoid, in standard deviations."""
 VISIBLE = 0.45
-"""What is drawn of an error is magnified until it is as long as this, in sphere radii."""
+"""Length, in sphere radii, to which a drawn error is magnified."""
 FACTORS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 ROOM = 3.0
 """An error that would be longer than this, in sphere radii, is not magnified."""
 CORNERS = 40
-"""Corners of each ellipse."""
+"""Number of points of each ellipse."""
 AHEAD = 2.2
 """Length of the viewing directions, in sphere radii."""
 BESIDE = 1.2
-"""Where words stand, so that they hide nothing from afar either: so many sphere radii below."""
+"""Distance of labels below the drawing, in sphere radii, so that they do not hide it from afar either."""
 ARC_STEP_RAD = np.radians(3.0)
 
 
@@ -53,17 +53,17 @@ def _half_axes(view: RunView, frame: Frame) -> FloatArray | None:
 
 
 def _factor(length_m: float, sphere_m: float) -> int:
-    """The least round factor by which a length can be seen."""
+    """The smallest round factor with which a length is large enough to be seen."""
     return next((factor for factor in FACTORS if factor * length_m >= VISIBLE * sphere_m), FACTORS[-1])
 
 
 def drawn(factor: int) -> str:
-    """That what is seen is larger than it is, as the end of a label."""
+    """The end of a label that says by which factor the drawing is magnified; empty for 1."""
     return "" if factor == 1 else f", drawn {factor}×"
 
 
 def _ellipsoid(view: RunView, frame: Frame, half_axes: FloatArray, factor: int) -> list[SceneItem]:
-    """Its three principal ellipses: lines hide nothing of what is inside."""
+    """The three principal ellipses of the ellipsoid: lines do not hide things inside it."""
     centre, turns = camera_centre(frame.cam_from_map), np.linspace(0.0, 2.0 * np.pi, CORNERS + 1)
     circle = np.column_stack([np.cos(turns), np.sin(turns)])
     lines = np.concatenate([centre + circle @ np.delete(half_axes, k, axis=0) for k in range(3)])
@@ -136,7 +136,7 @@ def spread(stage: RefinementStage, metric: bool = True) -> str:
 
 
 def tilt(stage: RefinementStage) -> str:
-    """What became of the given gravity, as a sentence."""
+    """A sentence on how the refinement used the given gravity."""
     if stage.gravity_sd_rad == 0.0:
         return "The given gravity is kept."
     leans = f"The camera leans {np.degrees(stage.tilt_rad):.3f}° from the given gravity"

@@ -22,9 +22,9 @@ INNER, OUTER = 1.3, 1.95
 """Radii of the band of arcs, in sphere radii."""
 STEP_RAD = np.radians(4.0)
 FEWEST_TRACKS = 24
-"""The band has room for so many arcs over one yaw, or more if more are drawn there."""
+"""Least number of tracks of the band; it has more if more arcs are drawn over one yaw."""
 EXAMPLE_RAD = np.radians(15.0)
-"""Width of the arc that explains what one is."""
+"""Preferred width of the arc that serves as an example."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,14 +43,14 @@ class Arcs:
 
     @cached_property
     def in_clique(self) -> NDArray[np.bool_]:
-        """(A,) arcs that cover the estimated yaw."""
+        """Mask (A,) of the arcs that cover the estimated yaw."""
         inside = np.zeros(len(self), dtype=bool)
         inside[self.stage.clique] = True
         return inside
 
     @cached_property
     def _continues(self) -> NDArray[np.bool_]:
-        """(A,) arcs of the same pair as the arc before them; the arcs of a pair follow one another."""
+        """Mask (A,) of the arcs of the same pair as the arc before; the arcs of a pair follow one another."""
         pairs = np.ascontiguousarray(self.stage.pairs, dtype=np.int32).view(np.int64).ravel()
         same = np.zeros(len(pairs), dtype=bool)
         same[1:] = pairs[1:] == pairs[:-1]
@@ -58,7 +58,7 @@ class Arcs:
 
     @cached_property
     def pair_counts(self) -> tuple[int, int]:
-        """How many pairs have one arc, and how many have more."""
+        """Number of pairs with one arc, and number of pairs with more."""
         same = self._continues
         pairs = len(same) - int(np.count_nonzero(same))
         several = int(np.count_nonzero(same[1:] & ~same[:-1]))
@@ -66,8 +66,8 @@ class Arcs:
 
     @cached_property
     def example(self) -> IntArray:
-        """The arcs of one pair: of those with an arc over the estimated yaw the one whose arc there is most nearly as
-        wide as can be seen well, among those with two arcs if there are any."""
+        """The arcs of one pair with an arc over the estimated yaw: of such pairs, with two arcs if there are any, the
+        one whose arc there is closest to ``EXAMPLE_RAD`` in width."""
         arcs, same = self.stage.clique.astype(np.int64), self._continues
         several = same[arcs] | np.append(same[1:], False)[arcs]
         if several.any():
@@ -89,13 +89,13 @@ class Arcs:
         return np.arange(min(count, total), dtype=np.int64) * stride % total
 
     def overlap_of(self, arcs: IntArray) -> YawConsensus:
-        """The yaw that most of some arcs share, and their overlap."""
+        """The yaw that most of some arcs cover, and the number of these arcs."""
         found = deepest_yaw(self.stage.lo_rad[arcs], self.stage.hi_rad[arcs])
         assert found is not None
         return found
 
     def over(self, arcs: IntArray, lo_rad: float, hi_rad: float) -> NDArray[np.bool_]:
-        """Which of some arcs touch an interval of yaw within [-pi, pi]."""
+        """Mask of some arcs that touch an interval of yaw within [-pi, pi]."""
         lo, hi = self.stage.lo_rad[arcs], self.stage.hi_rad[arcs]
         return ((lo <= hi_rad) & (hi >= lo_rad)) | (hi >= lo_rad + 2 * np.pi)
 
@@ -143,7 +143,7 @@ def _tracks(lo_rad: FloatArray, hi_rad: FloatArray) -> IntArray:
     for k, (lo, hi) in enumerate(zip(lo_rad.tolist(), hi_rad.tolist(), strict=True)):
         while busy and busy[0][0] < lo:
             heappush(free, heappop(busy)[1])
-        # Each track is either free or busy.
+        # Each track is either free or occupied.
         track = heappop(free) if free else len(busy)
         heappush(busy, (hi, track))
         tracks[k] = track
@@ -152,18 +152,18 @@ def _tracks(lo_rad: FloatArray, hi_rad: FloatArray) -> IntArray:
 
 @dataclass(frozen=True, eq=False)
 class PairRoots:
-    """Eq. 22 of two correspondences."""
+    """The wave of Eq. 22 of two correspondences, and its roots."""
 
     wave: FloatArray
-    """(d1, d2, d3)."""
+    """Its coefficients (d1, d2, d3)."""
     yaws_rad: FloatArray
-    """(0 or 2,) roots, in [-pi, pi)."""
+    """(0 or 2,) its roots, in [-pi, pi)."""
     in_front: np.ndarray
     """(0 or 2,) whether both points are in front of the camera there."""
 
 
 def pair_roots(view: RunView, first: int, second: int) -> PairRoots:
-    """Where the wave of two correspondences is zero."""
+    """The roots of the wave of two correspondences."""
     aligned = view.trace.problem.aligned
     vi, vj = aligned.bearings[np.searchsorted(aligned.index, [first, second])]
     d, n = view.points[first] - view.points[second], np.cross(vi, vj)
@@ -224,7 +224,7 @@ def _roots(view: RunView, arcs: Arcs) -> Frame:
 
 
 def _why(roots: PairRoots, arcs: int) -> str:
-    """Why the pair has as many arcs as it has, as a sentence."""
+    """A sentence on the reason for the number of the pair's arcs."""
     if len(roots.yaws_rad) == 0:
         return "The wave of this pair only comes near zero, so it has no exact root."
     one, two = (f"{value:.2f}°" for value in np.degrees(roots.yaws_rad))
@@ -264,15 +264,15 @@ def _items(view: RunView, arcs: Arcs, shown: np.ndarray, numbers: tuple[int, int
 
 
 SIZES = (10, 30, 100, 300, 1000, 3000)
-"""How many arcs are shown before all are."""
+"""Numbers of arcs that are shown in steps before all are."""
 MAX_CANDIDATES = 8
-"""Candidate yaws shown at most, before the one with the deepest overlap."""
+"""Largest number of candidate yaws with a step, before the one with the largest overlap."""
 REACH = 40
-"""A peak is the highest within so many quarters of a degree."""
+"""A peak is the largest value within this many quarters of a degree on both sides."""
 
 
 def plans(view: RunView, stage: YawStage) -> list[Plan]:
-    """One pair with its arcs, more and more arcs, candidate yaws, and the deepest overlap."""
+    """Steps for one pair with its arcs, more and more arcs, candidate yaws, and the largest overlap."""
     arcs = Arcs(stage)
     own = {"yaw": lambda: counts_chart(view, arcs.overlap_of(arcs.example).overlap)}
     out = [
@@ -300,7 +300,7 @@ def plans(view: RunView, stage: YawStage) -> list[Plan]:
 
 
 def candidate_yaws(stage: YawStage) -> IntArray:
-    """Candidate yaws, in quarters of a degree from -180: the highest peaks without the deepest overlap, by yaw."""
+    """Candidate yaws, in quarters of a degree from -180: the highest peaks except the largest overlap, by yaw."""
     highest = ring.peaks(stage.overlap, REACH, MAX_CANDIDATES + 1)
     places = len(stage.overlap)
     end = int((stage.yaw_rad + np.pi) / (2 * np.pi) * places)
@@ -371,7 +371,7 @@ def _candidate(view: RunView, arcs: Arcs, places: IntArray) -> Frame:
 
 
 def _so_far(counts: np.ndarray, places: IntArray) -> str:
-    """How the last candidate compares with those before it."""
+    """A sentence that compares the last candidate with those before it."""
     if len(places) == 1:
         return "It is the first candidate from −180° on; only the highest peaks are shown."
     best = places[:-1][int(np.argmax(counts[places[:-1]]))]

@@ -1,4 +1,4 @@
-"""What a run says about yaw, as curves over the whole circle, and windows of the circle."""
+"""The results of a run for yaw: curves over the whole circle, and arcs in windows of the circle."""
 
 from dataclasses import dataclass, replace
 
@@ -24,7 +24,7 @@ MIN_WIDTH_DEG = 0.02
 
 @dataclass(frozen=True, eq=False)
 class YawStory:
-    """What a run says about yaw, as curves over -180 to 180 degrees."""
+    """The results of a run for yaw, as curves over -180 to 180 degrees."""
 
     title: str
     y_label: str
@@ -33,7 +33,7 @@ class YawStory:
     hypotheses: tuple[tuple[float, int, str, str], ...]
     """Yaw (degrees), correspondences explained, name and key of the step (or "") of every pose that was tried."""
     top: float
-    """The largest value."""
+    """Largest value of the y axis."""
     estimate_deg: float | None
     truth_deg: float | None
     note: str
@@ -97,7 +97,7 @@ def window_around(middle_deg: float, width_deg: float) -> Window:
 
 
 def places_of(yaw_deg: float, window: Window) -> list[float]:
-    """Where a yaw is in a window: none, one, or two if it is at both ends of the circle."""
+    """Positions of a yaw in a window, degrees: none, one, or two if it is at both ends of the circle."""
     low, high = window
     return [yaw for yaw in (yaw_deg - 360.0, yaw_deg, yaw_deg + 360.0) if low <= yaw <= high]
 
@@ -106,26 +106,26 @@ WIDTHS_DEG = (1.0, 2.0, 4.0, 6.0, 10.0, 20.0, 30.0, 60.0, 120.0)
 """Widths of the window around the peak."""
 MAX_BARS = 60
 MAX_CHOSEN = 24
-"""Bars that a selection may take of all."""
+"""Largest number of bars for selected pairs."""
 MAX_MATCHES, MAX_INLIERS = 32, 20
-"""Where a run keeps no arcs: matches whose pairs are looked at, and inliers among them."""
+"""For a run that stores no arcs: number of matches whose pairs are computed, and of inliers among them."""
 KINDS = ("both right", "one wrong", "both wrong")
 CELLS = 240
-"""Places across the window by which bars are packed into rows."""
+"""Number of cells across the window by which bars are packed into rows."""
 
 
 @dataclass(frozen=True, eq=False)
 class Arcs:
-    """A arcs of feasible yaw of pairs of matches, one or more a pair."""
+    """A arcs of feasible yaw of pairs of matches, one or more per pair."""
 
     pairs: NDArray[np.integer]
-    """(A, 2) correspondences of the problem, ascending."""
+    """(A, 2) indices of the two correspondences of each arc, ascending."""
     lo_rad: FloatArray
-    """(A,) in [-pi, pi)."""
+    """(A,) lower ends, in [-pi, pi)."""
     hi_rad: FloatArray
-    """(A,) not below ``lo_rad``."""
+    """(A,) upper ends, not below ``lo_rad``."""
     rule: str
-    """Which arcs these are, as a sentence; empty if they are the run's own."""
+    """A sentence on the choice of the arcs; empty if they are the run's own."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,27 +133,27 @@ class Bars:
     """P pairs, with an arc in a window or selected, and all of their arcs."""
 
     pairs: IntArray
-    """(P, 2) correspondences of the problem."""
+    """(P, 2) indices of the two correspondences of each pair."""
     kind: IntArray
     """(P,) index into ``KINDS``."""
     chosen: NDArray[np.bool_]
-    """(P,) whether the selection holds the pair."""
+    """(P,) whether the pair is selected."""
     count: IntArray
-    """(P,) arcs of each pair; those outside of the window too."""
+    """(P,) number of arcs of each pair, also outside the window."""
     owner: IntArray
-    """(B,) place in ``pairs`` of each arc."""
+    """(B,) index in ``pairs`` of each arc."""
     lo_deg: FloatArray
-    """(B,) in [-180, 180)."""
+    """(B,) lower ends, in [-180, 180)."""
     hi_deg: FloatArray
-    """(B,) not below ``lo_deg``."""
+    """(B,) upper ends, not below ``lo_deg``."""
     row: IntArray
     """(B,) row of each arc in the window, from the top; -1 outside of it."""
     total: tuple[int, int, int]
-    """Arcs in the window of each kind, drawn or not."""
+    """Number of arcs in the window of each kind, drawn or not."""
 
     @property
     def rows(self) -> int:
-        """How many rows there are."""
+        """Number of rows."""
         return int(self.row.max(initial=-1)) + 1
 
 
@@ -165,7 +165,7 @@ def right_ones(trace: Trace) -> tuple[NDArray[np.bool_], str]:
 
 
 def arcs_of(trace: Trace, selected: tuple[int, ...]) -> Arcs:
-    """The run's own arcs; where it keeps none, those of some matches: of its inliers, the selection and others."""
+    """The run's own arcs; if it stores none, those of some of its inliers, of the selection and of other matches."""
     stage = trace.stage(YawStage)
     if stage is not None:
         return Arcs(stage.pairs, stage.lo_rad, stage.hi_rad, "")
@@ -187,7 +187,7 @@ def arcs_of(trace: Trace, selected: tuple[int, ...]) -> Arcs:
 
 
 def _members(trace: Trace, selected: tuple[int, ...]) -> IntArray:
-    """Usable matches whose pairs are looked at, ascending: an even sample of inliers, selection and others."""
+    """Usable matches whose pairs are computed, ascending: even samples of inliers, selection and others."""
     usable = trace.problem.aligned.index
     if len(usable) <= MAX_MATCHES:
         return usable
@@ -215,7 +215,7 @@ def peak_window(story: YawStory, arcs: Arcs) -> Window:
     reach = np.maximum(np.abs(away[0]), np.abs(away[1]))
     need = 3.0 * np.degrees(float(np.median(reach))) if len(reach) else 10.0
     width = next((width for width in WIDTHS_DEG if width >= need), WIDTHS_DEG[-1])
-    # Rounded, so that the window stands still while a slider moves the estimate by little.
+    # Rounded, so that the window does not move while a slider changes the estimate by little.
     step = 0.1 * width
     return window_around(step * round(story.estimate_deg / step), width)
 
@@ -267,7 +267,7 @@ def bars_in(trace: Trace, arcs: Arcs, window: Window, selected: tuple[int, ...],
 
 
 def _chosen(pairs: NDArray[np.integer], selected: tuple[int, ...]) -> NDArray[np.bool_]:
-    """Which pairs (P, 2) a selection holds: those among the selected, or with the one that is."""
+    """Mask (P,) of the pairs (P, 2) that are selected: those among the selected matches, or all with a single one."""
     if not selected:
         return np.zeros(len(pairs), dtype=bool)
     held = np.isin(pairs, selected)
@@ -275,7 +275,7 @@ def _chosen(pairs: NDArray[np.integer], selected: tuple[int, ...]) -> NDArray[np
 
 
 def spans_in(lo_deg: FloatArray, hi_deg: FloatArray, window: Window) -> tuple[IntArray, FloatArray, FloatArray]:
-    """What of the arcs (B,) lies in a window: indices (S,) of the arcs, ascending, and ends (S,), (S,) in the window.
+    """The parts of arcs (B,) in a window: indices (S,) of the arcs, ascending, and ends (S,), (S,) in the window.
 
     An arc has two parts there if it leaves the window and comes back; one of a whole turn or more does not leave it.
     """
@@ -300,7 +300,7 @@ def _rows(lo_deg: FloatArray, hi_deg: FloatArray, kind: IntArray, window: Window
     masks = dict.fromkeys(arc.tolist(), 0)
     cells = ((left - low) / cell).astype(np.int64).tolist(), ((right - low) / cell).astype(np.int64).tolist()
     for bar, first, last in zip(arc.tolist(), *cells, strict=True):
-        # A bit a cell, and one more so that neighbours do not touch.
+        # One bit per cell, and one more so that neighbours do not touch.
         masks[bar] |= ((1 << (last - first + 2)) - 1) << first
     there = np.array(list(masks), dtype=np.int64)
     taken: list[int] = []
@@ -314,7 +314,8 @@ def _rows(lo_deg: FloatArray, hi_deg: FloatArray, kind: IntArray, window: Window
 
 
 def _first_free(taken: list[int], start: int, mask: int) -> int:
-    """The first row from ``start`` on in which no bit of the mask is taken, a new one if there is none; takes them."""
+    """The first row from ``start`` on in which all bits of the mask are free, else a new row; the bits are then
+    taken."""
     for place in range(start, len(taken)):
         if not taken[place] & mask:
             taken[place] |= mask

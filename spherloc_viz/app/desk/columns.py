@@ -9,9 +9,9 @@ from typing import Any
 from spherloc_viz.app.desk.run_map import FEATURES, run_map
 
 TEXTS = ("source", "scene", "name", "query", "estimator", "outcome", "diagnosis", "changes", "title", "problem_key")
-"""Sent as numbers of different texts."""
+"""Columns of texts, each sent as a list of its different texts and a number per run."""
 ANSWERS = ("doubtful", "proven")
-"""Yes, no or unknown; sent as texts."""
+"""Columns whose values are yes, no or unknown; they are sent as texts."""
 UNITS = {None: "m", 1: "m", 0: "units"}
 """Unit of a map's lengths, by whether the map is metric; sent as the text ``units``."""
 NUMBERS = (
@@ -19,13 +19,14 @@ NUMBERS = (
     *("time_ms", "steps", "key_step", "size_bytes", *FEATURES),
 )
 READ = ("file", "labels", "created", *TEXTS, *ANSWERS, "metric", *NUMBERS[1:])
-"""Columns of the index that are needed."""
+"""Columns of the run index that are read."""
 DIGITS = 5
-"""That a number is sent with: more than a plot or a table shows."""
+"""Digits with which a number is sent: more than a plot or a table shows."""
 
 
 def columns_json(columns: Mapping[str, Sequence[Any]], notes: Mapping[str, str], version: str) -> str:
-    """The columns as JSON: ``texts`` (values and a code a run), ``numbers`` (null if unknown), files, labels and notes.
+    """The columns as JSON: ``texts`` (values and a code per run), ``numbers`` (null if unknown), files, labels and
+    notes.
 
     ``columns`` are those of ``READ``; ``notes`` are by file. ``version`` says which state of the list it is.
     """

@@ -19,13 +19,13 @@ KEYS: tuple[Callable[[RunRow], tuple[object, ...]], ...] = (
     lambda row: (row.problem_key, row.seed),
     lambda row: (row.problem_key,),
 )
-"""What makes two runs a pair; the first one counts by which most of the smaller set has a partner."""
+"""Keys by which two runs can be a pair; the first one by which most runs of the smaller set have a partner is used."""
 MEASURED: Mapping[str, str] = {
     "rotation_error_deg": "rotation error, deg",
     "translation_error_m": "position error, {unit}",
     "time_ms": "time, ms",
 }
-"""What is compared pair by pair, and what it is called; ``unit`` is that of the maps."""
+"""Numbers that are compared pair by pair, with their names; ``unit`` is that of the maps."""
 
 
 @dataclass(frozen=True)
@@ -38,18 +38,18 @@ class Pair:
 
 @dataclass(frozen=True)
 class Change:
-    """How a number of the pairs has changed."""
+    """How a number has changed over the pairs."""
 
     title: str
-    """What the number is called, with its unit."""
+    """Name of the number, with its unit."""
     pairs: int
-    """In which both know it."""
+    """Number of pairs in which both runs have it."""
     before: float
     """Median before; NaN without pairs."""
     after: float
     """Median after."""
     difference: float
-    """Median of the differences, after less before."""
+    """Median of the differences, after minus before."""
     p: float
     """p-value of Wilcoxon's signed-rank test, two-sided; 1 if no pair differs, NaN without pairs."""
 
@@ -59,21 +59,21 @@ class Comparison:
     """How the outcomes of paired runs changed from one set to the other."""
 
     pairs: tuple[Pair, ...]
-    """In the order of the second set."""
+    """All pairs, in the order of the second set."""
     only_before: int
-    """Runs without a partner in the second set."""
+    """Number of runs of the first set without a partner in the second one."""
     only_after: int
-    """Runs without a partner in the first set."""
+    """Number of runs of the second set without a partner in the first one."""
     broken: tuple[Pair, ...]
-    """Right before, wrong after."""
+    """Pairs that are right before and wrong after."""
     mended: tuple[Pair, ...]
-    """Wrong before, right after."""
+    """Pairs that are wrong before and right after."""
     right_before: int
-    """Pairs that were right before."""
+    """Number of judged pairs that are right before."""
     right_after: int
-    """Pairs that are right after."""
+    """Number of judged pairs that are right after."""
     judged: int
-    """Pairs of which both can be judged."""
+    """Number of pairs of which both runs can be judged."""
     p: float
     """p-value of McNemar's exact test of broken against mended, two-sided; 1 if there are none."""
     changes: tuple[Change, ...]
@@ -81,7 +81,7 @@ class Comparison:
 
 
 def is_right(row: RunRow) -> bool | None:
-    """Whether a run is right by the truth; where that is not known, whether its diagnosis says nothing against it."""
+    """Whether a run is right by the truth or, if that is unknown, by its diagnosis; None if it has neither."""
     if row.outcome != "unknown":
         return row.outcome == "success"
     return None if row.doubtful is None else not row.doubtful
@@ -128,7 +128,7 @@ def compare_pairs(pairs: tuple[Pair, ...], only_before: int = 0, only_after: int
 def _paired(before: Sequence[RunRow], after: Sequence[RunRow]) -> tuple[Pair, ...]:
     best: tuple[Pair, ...] = ()
     for key in KEYS:
-        # A later one replaces an earlier one of the same key.
+        # A later run replaces an earlier one with the same key.
         old = {key(row): row for row in sorted(before, key=lambda row: row.created)}
         new = {key(row): row for row in sorted(after, key=lambda row: row.created)}
         pairs = tuple(Pair(old[k], row) for k, row in new.items() if k in old and old[k] != row)
@@ -163,7 +163,7 @@ QUANTITIES: Mapping[str, Callable[[Comparison], float]] = {
     "success": lambda c: c.right_after / c.judged if c.judged else math.nan,
     "p": lambda c: c.p,
 }
-"""What a condition can be about."""
+"""Quantities of a condition, by name."""
 _COMPARE: Mapping[str, Callable[[float, float], bool]] = {
     "<": lambda a, b: a < b,
     "<=": lambda a, b: a <= b,
@@ -175,15 +175,15 @@ _COMPARE: Mapping[str, Callable[[float, float], bool]] = {
 
 @dataclass(frozen=True)
 class Condition:
-    """Such as "new failures > 0"; several joined by "and" must all hold."""
+    """A condition such as "new failures > 0"; if several are joined by "and", all of them must hold."""
 
     text: str
-    """As it was given."""
+    """The condition as the user gave it."""
     parts: tuple[tuple[str, str, float], ...]
-    """A quantity, a sign and a number each."""
+    """Quantity, comparison sign and number of each part."""
 
     def holds(self, comparison: Comparison) -> bool:
-        """Whether it is true of a comparison; nothing is true of an unknown quantity."""
+        """Whether it holds for a comparison; false if a quantity is unknown."""
         return all(_COMPARE[sign](QUANTITIES[name](comparison), number) for name, sign, number in self.parts)
 
 

@@ -11,20 +11,20 @@ from spherloc.errors import InputError, RecordingError, show
 from spherloc.files import write_whole
 
 VIEWS, SETS = "views", "sets"
-"""Folders in the folder of the recordings."""
+"""Names of the folders of views and of sets, inside the folder of the recordings."""
 VIEW_SUFFIX, SET_SUFFIX = ".json", ".txt"
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9 _.-]{0,59}")
 MAX_BYTES = 20 << 20
 """Largest file, bytes: the names of 100,000 runs take 8 MB."""
 MAX_VIEW_LETTERS = 20_000
 MAX_FILES = 500
-"""Views or sets that are listed."""
+"""Largest number of views, and of sets, that are listed."""
 
 
 def save_view(folder: Path, name: str, state: dict[str, Any]) -> None:
-    """Store a view under a name, in place of the one before.
+    """Store a view under a name; it replaces an earlier view of that name.
 
-    Raises ``InputError`` for a name or state that cannot be stored, ``RecordingError`` if the disk cannot.
+    Raises ``InputError`` for a name or state that cannot be stored, ``RecordingError`` if the file cannot be written.
     """
     text = json.dumps(state, indent=1)
     if len(text) > MAX_VIEW_LETTERS:
@@ -33,7 +33,7 @@ def save_view(folder: Path, name: str, state: dict[str, Any]) -> None:
 
 
 def views(folder: Path) -> dict[str, dict[str, Any]]:
-    """All views by name; files that are none are left out."""
+    """All views by name; other files are left out."""
     found: dict[str, dict[str, Any]] = {}
     for path in _files(folder / VIEWS, VIEW_SUFFIX):
         with contextlib.suppress(OSError, ValueError, RecursionError):
@@ -59,7 +59,7 @@ def save_set(folder: Path, name: str, files: Sequence[str]) -> Path:
 
 
 def sets(folder: Path) -> dict[str, int]:
-    """All sets by name, and how many runs each has."""
+    """All sets by name, with their numbers of runs."""
     found: dict[str, int] = {}
     for path in _files(folder / SETS, SET_SUFFIX):
         with contextlib.suppress(RecordingError):
@@ -68,16 +68,16 @@ def sets(folder: Path) -> dict[str, int]:
 
 
 def set_path(folder: Path, name: str) -> Path:
-    """Where a set of that name lies; raises ``InputError`` for a name that none can have."""
+    """Path of the set of that name; raises ``InputError`` for an impossible name."""
     return folder / SETS / (_checked(name) + SET_SUFFIX)
 
 
 def read_set(path: Path) -> tuple[str, ...]:
-    """The recordings of a set; raises ``RecordingError``, in one sentence, if the file is none."""
+    """The recordings of a set; raises ``RecordingError``, in one sentence, if the file is not a set."""
     try:
         text = _read(path)
     except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or "it is no text of names"
+        reason = getattr(error, "strerror", None) or "it is not a text of names"
         raise RecordingError(f"{path}: the set cannot be read ({reason}); save it again.") from error
     return tuple(dict.fromkeys(line.strip() for line in text.splitlines() if line.strip()))
 

@@ -13,21 +13,21 @@ from spherloc_viz.recording.run_row import RunRow
 from spherloc_viz.recording.storage.room import GALLERY
 
 MAX_LOOKED_INTO = 2_000
-"""Folders that are searched for recordings."""
+"""Largest number of folders that are searched for recordings."""
 MAX_DEPTH = 5
 """How many levels below an allowed folder are searched."""
 MAX_OFFERED = 200
 
 
 class OtherFolders:
-    """Folders with a list of runs, beside the one that the desk shows."""
+    """Folders with a list of runs, other than the one that the desk shows."""
 
     def __init__(self, own: Path, allowed: Sequence[Path]) -> None:
-        """``own`` is the folder of the desk's recordings, below which there may be others too."""
+        """``own`` is the folder of the desk's recordings, in which there may be other folders too."""
         self._own, self._roots = Path(os.path.realpath(own)), Roots([own, *allowed])
 
     def listed(self) -> list[dict[str, str]]:
-        """``place`` and ``name`` of each, as a page shows them, those below the desk's own folder first."""
+        """``place`` and ``name`` of each for the page, those inside the desk's own folder first."""
         found: list[dict[str, str]] = []
         looked_into = 0
         for root in self._roots.folders:
@@ -46,7 +46,7 @@ class OtherFolders:
         return found
 
     def rows(self, place: str) -> tuple[RunRow, ...]:
-        """All runs of a folder that was offered, new ones read first.
+        """All runs of a listed folder, after its new recordings have been read.
 
         Raises ``InputError`` for a place that may not be opened or has no runs, ``RecordingError`` as the list does.
         """

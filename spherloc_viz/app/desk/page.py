@@ -49,7 +49,7 @@ COLUMNS = {
     "rotation_sd_deg": ("rotation sd, °", "Standard deviation in the worst direction"),
     "position_sd_m": ("position sd, {unit}", "Standard deviation in the worst direction, in the map's unit"),
 }
-"""What each column is called, and what it is."""
+"""Heading and explanation of each column."""
 
 
 @cache

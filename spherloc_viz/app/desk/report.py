@@ -1,4 +1,4 @@
-"""Runs as one HTML file that can be sent: a list of them, or what two sets of runs differ in."""
+"""Reports on runs as one HTML file that can be sent: a list of runs, or the differences of two sets of runs."""
 
 import math
 from collections import Counter
@@ -25,12 +25,12 @@ td code{overflow-wrap:anywhere}.name{font-weight:600}.wide{min-width:15em}.num{w
 .bar{display:inline-block;height:.6em;border-radius:.3em;margin-right:.5em;vertical-align:.02em}
 """
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
-"""The page has what it needs in itself; nothing that a recording says can load or run anything."""
+"""The page needs no other files; no text of a recording can load or run anything."""
 PICTURE_PX = 152, 104
 
 
 def summary_html(rows: Sequence[RunRow], remark: str, now: datetime) -> str:
-    """A page about the runs, beside whose file the folder ``recordings`` has theirs."""
+    """A page about the runs; their recordings are in the folder ``recordings`` beside the page's file."""
     plural = "s" if len(rows) != 1 else ""
     title = f"{len(rows):,} recorded run{plural}"
     made = now.astimezone(UTC).strftime("%Y-%m-%d %H:%M UTC")
@@ -53,7 +53,7 @@ def _head(title: str) -> str:
 
 
 def _counts(rows: Sequence[RunRow]) -> str:
-    """How many there are of each outcome, and of each diagnosis with a bar."""
+    """Numbers of runs with each outcome and, with a bar, with each diagnosis."""
     outcomes = Counter(row.outcome for row in rows).most_common()
     causes = Counter(row.diagnosis or "not diagnosed" for row in rows).most_common()
     first = "".join(f"<span>{badge_html(outcome)} {count:,}</span>" for outcome, count in outcomes)
@@ -112,11 +112,11 @@ def _how() -> str:
 MAX_PAIRS = 100
 """How many runs of each kind are shown with their pictures."""
 TABLE_ROWS = 30
-"""Causes and scenes that are listed."""
+"""Largest number of causes and of scenes that are listed."""
 
 
 def comparison_html(comparison: Comparison, before: str, after: str, now: datetime) -> str:
-    """A page about what changed from the runs called ``before`` to those called ``after``."""
+    """A page about the changes from the runs called ``before`` to those called ``after``."""
     made = now.astimezone(UTC).strftime("%Y-%m-%d %H:%M UTC")
     broken, mended = len(comparison.broken), len(comparison.mended)
     parts = [
@@ -136,7 +136,7 @@ def comparison_html(comparison: Comparison, before: str, after: str, now: dateti
 
 
 def comparison_text(comparison: Comparison, before: str, after: str) -> str:
-    """The same for a terminal, without the pictures."""
+    """The same as text for a terminal, without pictures."""
     lines = [
         f"{after} against {before}: {_count(len(comparison.pairs), 'pair')} of runs on the same problem",
         f"  right        {_share(comparison.right_before, comparison.judged)} before, "
@@ -161,12 +161,12 @@ def comparison_text(comparison: Comparison, before: str, after: str) -> str:
 
 
 def number(value: float) -> str:
-    """A measured number in three digits."""
+    """A measured number with three digits."""
     return words.UNKNOWN if math.isnan(value) else f"{value:.3g}"
 
 
 def p_text(p: float) -> str:
-    """A p-value in two digits."""
+    """A p-value with two digits."""
     return words.UNKNOWN if math.isnan(p) else "< 1e-16" if p < 1e-16 else f"{p:.2g}"
 
 

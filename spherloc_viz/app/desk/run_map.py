@@ -1,4 +1,4 @@
-"""A map of runs: those with like evidence lie near each other (principal components of their measures)."""
+"""A map of runs: runs with similar evidence are near each other (principal components of their measures)."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -10,15 +10,16 @@ from spherloc.diagnosis import Measures
 from spherloc.types import FloatArray
 
 FEATURES = tuple(item.name for item in fields(Measures))
-"""Columns that the map is made of."""
+"""Columns from which the map is computed."""
 LOGARITHMIC = ("tilt_deg", "rotation_sd_deg", "position_sd_m")
-"""Those that range over orders of magnitude."""
+"""Columns whose logarithm is used, since they vary over orders of magnitude."""
 LOGARITHM_OFFSET = 1e-6
-"""Added before a logarithm is taken."""
+"""Added before the logarithm is taken."""
 MAX_SDS = 3.0
-"""Values farther from the median count as that far: one odd run must not squeeze all others into a corner."""
+"""Largest distance from the median, in standard deviations; values are limited to it, so that one outlier does not
+squeeze all other runs into a corner."""
 NAMED = 2
-"""Columns that an axis is named by."""
+"""Number of columns in the name of an axis."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +33,7 @@ class RunMap:
     x_words: str
     """The quantities with the largest weights in the first component."""
     y_words: str
-    """Those of the second component."""
+    """The quantities with the largest weights in the second component."""
 
 
 def run_map(columns: Mapping[str, Sequence[Any]]) -> RunMap:

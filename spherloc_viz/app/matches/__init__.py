@@ -1,1 +1,1 @@
-"""Single matches: the card, the table and the images."""
+"""Panels about single matches: the card, the table and the images."""

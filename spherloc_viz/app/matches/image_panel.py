@@ -29,11 +29,11 @@ from spherloc_viz.layers.query_image import modified, photograph, shrunk
 GONE = "cannot be read: it is still being drawn, or it is gone."
 QUALITIES = (82, 70, 55, 40)
 MAX_BYTES = 85_000
-"""A JPEG is encoded with less quality while it is larger; as text it takes a third more."""
+"""Largest JPEG; its quality is lowered until it fits. As text it takes a third more."""
 
 
 def photo_uri(path: Path | None, width_px: int) -> str | None:
-    """The image of a file, at most that wide, as a data URI (cached); None without one."""
+    """The image of a file, at most ``width_px`` wide, as a data URI (cached); None without a file."""
     return None if path is None else _photo_uri(path, modified(path), width_px)
 
 
@@ -55,7 +55,7 @@ def jpeg_uri(image: NDArray[np.uint8]) -> str:
 
 
 PHOTO_PX = 900
-"""Width of a photograph that fills the panel."""
+"""Largest width of a photograph in the panel."""
 
 
 class ImagePanel:
@@ -78,8 +78,8 @@ class ImagePanel:
     def draw(
         self, trace: Trace, picture: Picture, selected: tuple[int, ...], kept: NDArray, hidden: bool = False
     ) -> None:
-        """Show the images of a run at a step. ``selected`` are numbers in the problem, ``kept`` (N,) original ones;
-        ``hidden`` does not tell how many inliers a reference has."""
+        """Show the images of a run at a step. ``selected`` are indices in the problem, ``kept`` (N,) the original
+        numbers of the matches; ``hidden`` leaves out the numbers of inliers of the references."""
         problem = trace.problem
         followed = (problem.name, problem.reference_images, kept[list(selected)].tolist())
         if followed != self._followed:
@@ -136,6 +136,6 @@ def image_sizes(problem: Problem, view: MatchView) -> list[tuple[float, float]]:
     if photo is not None:
         height, width = photo.image.shape[:2]
         return [(width / photo.scale, height / photo.scale)]
-    # The image has gone: a frame that holds its keypoints.
+    # The image file is missing: the size is that of a frame around its keypoints.
     most = np.nanmax(np.append(problem.reference_pixels[view.own], [[1.0, 1.0]], axis=0), axis=0)
     return [(float(most[0]), float(most[1]))]

@@ -1,4 +1,4 @@
-"""Looks through the query's lens from the estimated pose: its photograph, the map as it would be seen, or both."""
+"""The view through the query's lens from the estimated pose: the photograph, the map as it would look, or both."""
 
 from collections.abc import Callable
 
@@ -25,7 +25,7 @@ GREY = 40
 
 
 class LensPanel:
-    """One page's. Pictures are made on a thread of its own, for the run at hand only."""
+    """The panel of one page. Pictures are made on a separate thread, for the current run only."""
 
     def __init__(
         self,
@@ -34,17 +34,18 @@ class LensPanel:
         scene_of: Callable[[str], MapScene | None],
         changed: Callable[[object], None],
     ) -> None:
-        """``scene_of`` gives the scene with images of a label, if it is one; ``changed`` has the page drawn anew."""
+        """``scene_of`` returns the map scene of a label, or None; ``changed`` has the page drawn again."""
         self._scene_of, self._changed = scene_of, changed
         self._html = gui.add_html("")
         self._blend = "half and half"
         self._made: tuple[Trace, list[int], str, float] | None = None
-        """The run of a picture, when its references were written, its address, and how much of it has something."""
+        """The run of the picture, the times at which its reference files were written, its address, and the share of it
+        that shows the map."""
         self._worker = BackgroundWorker("spherloc-lens", self._say)
         touches.on("lens", self._choose)
 
     def draw(self, run: Run, hidden: bool) -> None:
-        """Show the run's query; ``hidden`` says that its pose is not to be told."""
+        """Show the run's query; ``hidden`` says that its pose must not be shown."""
         trace, scene = run.trace, self._scene_of(run.request.scene.scene)
         if hidden or scene is None or trace.cam_from_map is None or trace.problem.image is None:
             self._say("")
@@ -81,12 +82,12 @@ def _aspect(trace: Trace) -> str:
 
 
 def _on_grey(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """(H, W, 3) of a picture (H, W, 4)."""
+    """A picture (H, W, 4) on a grey background (H, W, 3)."""
     return np.where(picture[..., 3:] > 0, picture[..., :3], np.uint8(GREY))
 
 
 def lens_html(photo: str | None, picture: str, covered: float, blend: str, aspect: str) -> str:
-    """The photograph below, the map above it as clear as ``blend`` says, and what changes that."""
+    """The photograph, the map above it with the opacity of ``blend``, and the buttons that change it."""
     if not picture:
         return status_html(NOTHING)
     chips = " · ".join(

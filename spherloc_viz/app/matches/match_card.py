@@ -1,4 +1,4 @@
-"""A card about what is selected: what a run made of it and why, and what can be done to it."""
+"""The card about the selected matches: whether the run accepted them and why, and how they can be changed."""
 
 from html import escape
 from pathlib import Path
@@ -22,7 +22,7 @@ from spherloc_viz.layers.query_image import photograph
 from spherloc_viz.layers.selection import Traits, explain_many
 
 SIDE_PX, CROP_WIDTH_PX, CROP_HEIGHT_PX = 48, 156, 104
-"""Pixels of the photograph across a crop, and width and height of the picture."""
+"""Pixels of the photograph that a crop shows vertically, and width and height of the crop's picture."""
 
 
 def crops_html(problem: Problem, number: int) -> str:
@@ -68,9 +68,9 @@ MARGIN_PX = 8.0
 
 
 class MatchCard:
-    """A floating panel that is there while something is selected. Its buttons are touches that the session handles.
+    """A floating panel that is shown while matches are selected. Its buttons are touches that the session handles.
 
-    It lies over the canvas, so what is longer than a glance is folded until it is asked for.
+    It lies over the canvas, so the longer parts are folded until the user opens them.
     """
 
     def __init__(self, gui: viser.GuiApi, editable: bool = True) -> None:
@@ -95,11 +95,12 @@ class MatchCard:
         right: bool = False,
         hidden: bool = False,
     ) -> None:
-        """Show what is selected, numbers in the problem; ``kept`` (N,) are the original ones. ``right`` is whether the
-        card stands on the right of the canvas, when it comes up or is about others: what was clicked is on the left.
+        """Show the selected matches, indices in the problem; ``kept`` (N,) are their original numbers. ``right`` says
+        whether the card is put on the right of the canvas when it opens or its matches change, so that it does not
+        cover a click on the left.
 
-        ``alternative_cam_from_map`` (3, 4) is another pose that a diagnosis knows, to hold a match against. ``hidden``
-        does not tell what the run made of the matches.
+        ``alternative_cam_from_map`` (3, 4) is another pose from a diagnosis, with which a match is compared. ``hidden``
+        leaves out whether the run accepted the matches.
         """
         if self._panel.visible != bool(selected):
             self._panel.visible = bool(selected)
@@ -131,7 +132,7 @@ class MatchCard:
 
 
 def one_html(trace: Trace, what: Explanation, kept: NDArray, editable: bool) -> str:
-    """The card of one match: what became of it and why, and what can be done."""
+    """The card of one match: whether the run accepted it and why, and how it can be changed."""
     title = f'<span style="font-size:15px;font-weight:600">Match {kept[what.number]}</span>'
     color = style.OUTLIER if "wrongly" in what.verdict else style.INLIER if what.kept else None
     look = f"color:{style.css_text(color)};font-weight:600" if color else "font-weight:600"
@@ -141,7 +142,7 @@ def one_html(trace: Trace, what: Explanation, kept: NDArray, editable: bool) -> 
 
 
 def untold_html(trace: Trace, selected: tuple[int, ...], kept: NDArray, editable: bool) -> str:
-    """The card of matches of which nothing is told: which they are, and what can be done."""
+    """The card of matches whose results are hidden: their numbers, and how they can be changed."""
     number = selected[0]
     if len(selected) == 1:
         head, crops = f"{_walk(number, kept)}Match {kept[number]}", crops_html(trace.problem, number)
@@ -152,7 +153,7 @@ def untold_html(trace: Trace, selected: tuple[int, ...], kept: NDArray, editable
 
 
 def details_html(what: Explanation, kept: NDArray) -> str:
-    """What is told of one match on demand."""
+    """The folded part of the card of one match."""
     return _measures(what) + _notes(what, kept)
 
 
@@ -227,7 +228,7 @@ def _measures(what: Explanation) -> str:
 
 
 def _notes(what: Explanation, kept: NDArray) -> str:
-    """Its bound and label, the pairs that exclude the true yaw, and its part in the stages, in small type."""
+    """In small type: its bound and label, the pairs that exclude the true yaw, and its part in the stages."""
     notes = []
     if what.usable:
         notes.append(f"Its bound is {_px(what.bound_px)}, or {what.bound_deg:.2f}° for its bearing.")

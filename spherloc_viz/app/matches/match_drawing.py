@@ -21,28 +21,28 @@ from spherloc_viz.layers.matches import MatchView, inlier_colored, valid_outline
 WIDTH, GAP = 1000.0, 14.0
 """Size of the drawing, in its own units; the page scales it."""
 WIDE = 2.6
-"""Up to this sum of widths over heights, two images stand side by side."""
+"""Largest sum of the aspect ratios of two images that are shown side by side; others stand one above the other."""
 MAX_DOTS = 600
 LINE_PX, RING = 1.2, 20.0
 DOT_PX = ((500, 3.0), (200, 4.0), (0, 5.5))
-"""From this many dots on: their width."""
+"""Least number of dots, and their width in px."""
 MAX_LABELS = 8
 NAMES = ("query", "reference")
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where an image stands in the drawing."""
+    """Position and size of an image in the drawing."""
 
     x: float
     y: float
     width: float
     height: float
     scale: float
-    """Units of the drawing by a pixel of the image."""
+    """Units of the drawing per pixel of the image."""
 
     def at(self, pixels: FloatArray) -> FloatArray:
-        """Pixels (N, 2) of the image in the drawing."""
+        """Positions (N, 2) in the drawing of pixels (N, 2) of the image."""
         return self.scale * pixels + [self.x, self.y]
 
 
@@ -95,8 +95,8 @@ def frame_html(places: Sequence[Place], height: float, photos: Sequence[bool], p
 
 
 def thinned(own: IntArray, inlier: BoolArray, chosen: IntArray) -> IntArray:
-    """About ``MAX_DOTS`` of the matches ``own``, inliers last: an even sample of the inliers among all (N,), half if
-    others fill the rest, one of the others, and all that are ``chosen``."""
+    """About ``MAX_DOTS`` of the matches ``own``, inliers last: even samples of inliers and of others, by the mask
+    ``inlier`` (N,), half of each if there are enough, and all that are ``chosen``."""
     if len(own) <= MAX_DOTS:
         return np.concatenate([own[~inlier[own]], own[inlier[own]]])
     inliers, others = own[inlier[own]], own[~inlier[own]]
@@ -105,7 +105,7 @@ def thinned(own: IntArray, inlier: BoolArray, chosen: IntArray) -> IntArray:
 
 
 def dots(places: FloatArray, colors: ByteArray) -> list[str]:
-    """Dots (N, 2), one path a colour; the last colours lie on top."""
+    """Dots at positions (N, 2), one path per colour; the last colours lie on top."""
     width_px = next(width for least, width in DOT_PX if len(places) >= least)
     look = f'fill="none" stroke-linecap="round" stroke-width="{width_px}" vector-effect="non-scaling-stroke"'
     parts = []
@@ -117,7 +117,7 @@ def dots(places: FloatArray, colors: ByteArray) -> list[str]:
 
 
 def lines(starts: FloatArray, ends: FloatArray, colors: ByteArray, width_px: float, opacity: float) -> list[str]:
-    """Straight lines between places (N, 2), one path a colour."""
+    """Straight lines between positions (N, 2), one path per colour."""
     look = f'fill="none" stroke-width="{width_px:g}" opacity="{opacity:g}" vector-effect="non-scaling-stroke"'
     parts = []
     for color, both in _by_color(np.column_stack([starts, ends]), colors):
@@ -128,7 +128,7 @@ def lines(starts: FloatArray, ends: FloatArray, colors: ByteArray, width_px: flo
 
 
 def crosses(places: FloatArray, color: style.RGB, size: float, width_px: float) -> list[str]:
-    """Diagonal crosses (N, 2)."""
+    """Diagonal crosses at positions (N, 2)."""
     known = places[np.isfinite(places).all(axis=1)]
     if not len(known):
         return []
@@ -164,7 +164,7 @@ def rings(places: FloatArray, numbers: Sequence[int]) -> list[str]:
 
 
 def _by_color(rows: FloatArray, colors: ByteArray) -> list[tuple[str, FloatArray]]:
-    """Rows without gaps in their numbers, by colour, the most frequent colours first."""
+    """Rows without NaN, grouped by colour, the most frequent colours first."""
     known = np.isfinite(rows).all(axis=1)
     rows, colors = rows[known], colors[known]
     packed = colors.astype(np.int64) @ [1 << 16, 1 << 8, 1]
@@ -175,7 +175,7 @@ def _by_color(rows: FloatArray, colors: ByteArray) -> list[tuple[str, FloatArray
 
 MAX_RINGS = 100
 REACH = 32.0
-"""How near to a match a press on an image must be, in units of the drawing: about 12 px."""
+"""Largest distance of a press from the match that it selects, in units of the drawing: about 12 px."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,13 +185,13 @@ class Overlay:
     places: list[Place]
     """Places of the images in the drawing."""
     parts: list[str]
-    """SVG."""
+    """Elements of the SVG."""
     caption: str
-    """What is seen, in sentences."""
+    """Sentences that say what is shown."""
     ends: list[FloatArray]
-    """(K, 2) where the matches are in the drawing, for each image."""
+    """(K, 2) positions of the matches in the drawing, for each image."""
     numbers: IntArray
-    """(K,) their original numbers."""
+    """(K,) original numbers of the matches."""
 
     def nearest(self, image: str, x: float, y: float) -> int | None:
         """Original number of the match nearest to a press at these shares of an image; None if none is near."""
@@ -261,7 +261,7 @@ def _selected_parts(chosen: IntArray, ends: list[FloatArray], predicted: FloatAr
 
 
 def _predicted(trace: Trace, place: Place, query: FloatArray) -> FloatArray | None:
-    """Where (N, 2) in the drawing the estimated pose puts the points; NaN for out of sight and across a seam."""
+    """Positions (N, 2) in the drawing of the points at the estimated pose; NaN if out of sight or across the seam."""
     if trace.cam_from_map is None:
         return None
     pixels, valid = trace.problem.camera.project(transform(trace.cam_from_map, trace.problem.points))
@@ -275,7 +275,7 @@ def _predicted(trace: Trace, place: Place, query: FloatArray) -> FloatArray | No
 
 @lru_cache(maxsize=16)
 def _outlines(camera: Camera, place: Place) -> list[str]:
-    """The border of what the camera sees."""
+    """The border of the part of the image that the camera model sees."""
     parts = []
     for outline in valid_outlines(camera):
         flat = place.at(outline).ravel().tolist()

@@ -1,4 +1,4 @@
-"""All matches as a table: sorted by a press on a heading, filtered, a page at a time."""
+"""The table of all matches, page by page; it can be filtered, and a press on a heading sorts it."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -21,7 +21,7 @@ MAX_REFERENCES = 8
 
 
 def chip(words: str, touch: str, on: bool, hint: str = "") -> str:
-    """A button; ``on`` marks the one that holds now."""
+    """A button; ``on`` highlights the one that is active."""
     look = "background:rgba(80,130,220,.28)" if on else "background:rgba(128,136,150,.16)"
     title = f' title="{escape(hint)}"' if hint else ""
     return (
@@ -61,12 +61,12 @@ COLUMNS = (
     ("deg", "deg", "Angle between its bearing and its point at the estimated pose, degrees"),
     ("agrees", "agrees", "With how many inliers it makes a pair that agrees at the estimated yaw"),
 )
-"""Name, heading and hint."""
+"""Name, heading and hint of each column."""
 
 
 @dataclass(frozen=True)
 class Look:
-    """What of the table is shown."""
+    """Filter, order and page of the table."""
 
     shown: str = "all"
     by: str = "number"
@@ -91,9 +91,10 @@ class MatchTable:
             touches.on(action, handler)
 
     def draw(self, trace: Trace, selected: tuple[int, ...], kept: NDArray, hidden: bool = False) -> None:
-        """Show the matches of a run. ``selected`` are numbers in the problem, ``kept`` (N,) the original ones.
+        """Show the matches of a run. ``selected`` are indices in the problem, ``kept`` (N,) the original numbers.
 
-        A match that was just selected elsewhere brings its page up. ``hidden`` shows none: all columns are answers.
+        If a match was just selected elsewhere, the table turns to its page. ``hidden`` shows no matches, since all
+        columns are answers.
         """
         if hidden:
             self._drawn = None
@@ -133,7 +134,7 @@ class MatchTable:
 
 
 def _page_of(listed: IntArray, selected: tuple[int, ...], page: int) -> int:
-    """The page at hand if it holds one of the selected matches, else that of the first of them that is listed."""
+    """The current page if it holds one of the selected matches, else the page of the first of them that is listed."""
     places = np.flatnonzero(np.isin(listed, selected))
     if not len(places) or (places // PAGE == page).any():
         return page
@@ -141,7 +142,7 @@ def _page_of(listed: IntArray, selected: tuple[int, ...], page: int) -> int:
 
 
 def table_html(rows: MatchRows, listed: IntArray, look: Look, selected: frozenset[int], kept: NDArray) -> str:
-    """The page at hand of the matches ``listed``, with what can be pressed above and below it."""
+    """The current page of the matches ``listed``, with the buttons above and below it."""
     shown = listed[look.page * PAGE : (look.page + 1) * PAGE]
     body = "".join(_row(rows, int(k), int(k) in selected, int(kept[k])) for k in shown)
     table = (

@@ -18,7 +18,7 @@ from spherloc_viz.layers.sweep import LIMIT, SweepChart, sweep_charts, sweep_col
 WIDTH_PX, HEIGHT_PX = 380.0, 180.0
 RIGHT_PX, ROW_PX = 12.0, 15.0
 MAX_DOTS = 40
-"""Corners up to which a line shows each as a dot."""
+"""Largest number of points of a line that are drawn as dots too."""
 MAX_STEPS = 360
 HEADROOM = 1.06
 ROUNDING = 1e-9
@@ -36,10 +36,10 @@ def chart_svg(
     touch: str | None = None,
     bands: Bands | None = None,
 ) -> str:
-    """A chart without its title, as SVG that fits the width of what it stands in.
+    """A chart without its title, as SVG that fits the width of its container.
 
-    ``x_range`` shows a part of it. ``touch`` is the action of a drag across the plot, whose x from 0 to 1 is that
-    range. ``bands`` are drawn behind their curves.
+    ``x_range`` limits the x axis. ``touch`` is the action of a drag across the plot, whose x from 0 to 1 stands for the
+    x axis. ``bands`` are drawn behind their curves.
     """
     bands = bands or {}
     low, high = x_range or _span(chart)
@@ -63,7 +63,7 @@ def chart_svg(
 
 
 def _ticks(scale: Scale, apart_px: float, values: list[FloatArray], degrees: bool = False) -> tuple[float, ...]:
-    """Round numbers about ``apart_px`` or more from each other; whole ones if all values are."""
+    """Round numbers at least about ``apart_px`` from each other; whole numbers if all values are whole."""
     most = max(2, int(abs(scale.high_px - scale.low_px) / apart_px))
     few = all(len(value) <= MAX_DOTS and np.array_equal(value, np.round(value)) for value in values)
     if few:
@@ -72,7 +72,7 @@ def _ticks(scale: Scale, apart_px: float, values: list[FloatArray], degrees: boo
 
 
 def _span(chart: Chart) -> tuple[float, float]:
-    """The x of all curves; in degrees of a whole circle, the circle."""
+    """Range of x of all curves; for degrees around the whole circle, the circle."""
     ends = [curve.x[[0, -1]] for curve in chart.curves if len(curve.x)]
     low, high = (float(np.min(ends)), float(np.max(ends))) if ends else (0.0, 1.0)
     if "°" in chart.x_label and low <= -179.0 and high >= 179.0:
@@ -81,7 +81,7 @@ def _span(chart: Chart) -> tuple[float, float]:
 
 
 def _reach(chart: Chart, bands: Bands) -> tuple[float, float]:
-    """The y from 0, or below, to a little more than the largest."""
+    """Range of y, from 0 or below to a little more than the largest value."""
     values = [curve.y for curve in chart.curves] + [side for band in bands.values() for side in band]
     known = np.concatenate([np.zeros(1), *values])
     known = known[np.isfinite(known)]
@@ -90,7 +90,7 @@ def _reach(chart: Chart, bands: Bands) -> tuple[float, float]:
 
 
 def _legend(chart: Chart, width_px: float) -> list[list[tuple[Curve, float]]]:
-    """Rows of curves with the place of their sample; none if the one curve needs no name."""
+    """Rows of curves with the x of their sample in the legend; none if the only curve needs no name."""
     if len(chart.curves) < 2:
         return []
     start = 14.0 + shapes.text_width_px(chart.y_label)
@@ -106,7 +106,7 @@ def _legend(chart: Chart, width_px: float) -> list[list[tuple[Curve, float]]]:
 
 
 def legend_parts(y_label: str, rows: list[list[tuple[Curve, float]]], width_px: float) -> list[str]:
-    """What is measured, at the upper left, and what each colour stands for, beside it, to the right."""
+    """The label of the y axis, at the upper left, and the meaning of each colour, to its right."""
     parts = [shapes.text(0.0, 11.0, y_label)]
     for k, row in enumerate(rows):
         last, place = row[-1]
@@ -123,8 +123,8 @@ def legend_parts(y_label: str, rows: list[list[tuple[Curve, float]]], width_px: 
 
 
 def curve_parts(curves: tuple[Curve, ...], x: Scale, y: Scale, bands: Bands | None = None) -> list[str]:
-    """The curves between the ends of the x axis: bands below, then lines, then markers, the first of them broad and
-    those after it thin and dashed, so that both show where they coincide."""
+    """The curves within the x axis: bands below, then lines, then markers. The first marker is broad, later ones are
+    thin and dashed, so that both are seen where they coincide."""
     bands = bands or {}
     parts = [_band(curve, x, y, *bands[curve.label]) for curve in curves if curve.label in bands]
     marked = False
@@ -162,23 +162,23 @@ def step_parts(curve: Curve, x: Scale, y: Scale) -> list[str]:
     xs, ys = shapes.thin_steps(curve.x[first:last], curve.y[first:last], MAX_STEPS)
     if len(xs) == 0:
         return []
-    # The last of all ends where it begins; of a part, where the next begins.
+    # The last step of the whole curve ends where it begins; that of a part ends where the next one begins.
     end = min(float(curve.x[min(last, len(curve.x) - 1)]), x.high)
     left, foot = max(x.low, float(xs[0])), y.at(max(0.0, y.low))
     x_px = x.px(np.maximum(xs, left))
-    # One path for both: it begins and ends on the ground, where the fill closes it.
+    # One path for line and area: it begins and ends at y = 0, where the fill closes it.
     data = shapes.steps(x_px, y.px(ys), x.at(end), foot)
     return [f'<path d="{data}" {shapes.stroke(curve.color, 1.25, fill=shapes.fill(curve.color, 0.22))}/>']
 
 
 def _known(curve: Curve, *values: FloatArray) -> tuple[FloatArray, ...]:
-    """x and values (K,) where all are finite."""
+    """The curve's x and the values, each (K,), where all of them are finite."""
     known = np.all([np.isfinite(value) for value in (curve.x, *values)], axis=0)
     return curve.x[known], *(value[known] for value in values)
 
 
 def _clipped(x: Scale, xs: FloatArray, *values: FloatArray) -> tuple[FloatArray, ...]:
-    """A line's corners within the ends of the x axis, cut where it leaves them."""
+    """A line's points within the x axis, cut where the line leaves it."""
     if len(xs) == 0 or (xs[0] >= x.low and xs[-1] <= x.high):
         return xs, *values
     inside = (xs > x.low) & (xs < x.high)
@@ -240,7 +240,7 @@ def chart_html(chart: Chart) -> str:
 
 
 SHOWN = ("sweep success", "sweep rotation", "sweep position", "sweep time")
-"""Charts on the page."""
+"""Charts of a sweep that the page shows."""
 CURVE_WIDTH_PX, CURVE_HEIGHT_PX, CURVE_RIGHT_PX, TOP_PX, FOOT_PX = 380.0, 165.0, 12.0, 20.0, 33.0
 MAX_DECADES, MAX_TICKS = 5, 6
 TABLE_PX = 260
@@ -252,7 +252,7 @@ NOTE = (
 
 
 def charts_html(over: str, labels: Sequence[str], points: Sequence[Point]) -> str:
-    """The charts and what their colours mean."""
+    """The charts of a sweep, with the meaning of their colours."""
     colors = sweep_colors(labels)
     names = "".join(
         f'<span style="white-space:nowrap;margin-right:.9em">{dot_html(colors[label])}{escape(label)}</span>'
@@ -269,7 +269,7 @@ def charts_html(over: str, labels: Sequence[str], points: Sequence[Point]) -> st
 
 
 def sweep_svg(drawn: SweepChart) -> str:
-    """One chart as wide as what it stands in."""
+    """One chart of a sweep, as wide as its container."""
     chart = drawn.chart
     xs = np.concatenate([curve.x for curve in chart.curves]) if chart.curves else np.array([0.0, 1.0])
     low, high = float(xs.min()), float(xs.max())
@@ -300,13 +300,13 @@ def _height(drawn: SweepChart) -> Scale:
     if not len(known):
         return Scale(0.1, 10.0, foot, TOP_PX, log=True)
     low, high = float(known.min()), float(known.max())
-    # A decade at least, so that there is a tick on the axis.
+    # At least a decade, so that there is a tick on the axis.
     margin = max(1.2, (10.0 * low / high) ** 0.5)
     return Scale(low / margin, high * margin, foot, TOP_PX, log=True)
 
 
 def table_html(over: str, labels: Sequence[str], points: Sequence[Point]) -> str:
-    """A row a point, with a bar to scroll if there are many."""
+    """A table with a row for each point, which can be scrolled if there are many."""
     colors, table = sweep_colors(labels), sweep_table(over, points)
     places = [table.columns.index(name) for name in IN_TABLE]
     name = "padding:.12em 0 .12em .6em;text-align:right"

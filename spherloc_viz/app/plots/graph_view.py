@@ -23,28 +23,28 @@ CELL = "graph-cell"
 WIDTH_PX, HEIGHT_PX = 400.0, 208.0
 MIDDLE_PX, RADIUS_PX = (98.0, 110.0), 93.0
 MATRIX_PX = (212.0, 20.0, 186.0)
-"""Left, top and size of the matrix."""
+"""Left, top and size of the matrix, px."""
 FONT = ' style="font-size:13px"'
 MAX_EDGES = 450
-"""Edges drawn between marked nodes, and as many between others."""
+"""Largest number of edges drawn between marked nodes, and of those between others."""
 MAX_LIT = 12
-"""Selected nodes that are marked in the matrix."""
+"""Largest number of selected nodes that are marked in the matrix."""
 
 
 @dataclass(frozen=True, eq=False)
 class Edges:
-    """Those of a graph that are drawn."""
+    """The edges of a graph that are drawn, as indices of nodes."""
 
     marked: NDArray[np.int64]
     """(E, 2) between marked nodes."""
     others: NDArray[np.int64]
     """(F, 2) between nodes of which not both are marked."""
     total: int
-    """How many there are between the nodes that are there, drawn or not."""
+    """Number of edges between the nodes that are shown, drawn or not."""
 
 
 def graph_svg(graph: Graph, edges: Edges, lit: NDArray[np.int64], kept: NDArray[np.int64]) -> str:
-    """The drawing. ``lit`` are the selected nodes, ``kept`` (N,) the numbers that matches are known by."""
+    """The drawing. ``lit`` are the selected nodes, ``kept`` (N,) the numbers of the matches on the page."""
     nodes = graph.nodes
     parts = [
         shapes.text(0.0, 12.0, f"{_many(nodes.name)} and {_edge(nodes.name)}", more=FONT),
@@ -57,7 +57,7 @@ def graph_svg(graph: Graph, edges: Edges, lit: NDArray[np.int64], kept: NDArray[
 
 
 def edges_of(graph: Graph) -> Edges:
-    """An even sample where there are too many."""
+    """The edges to draw: an even sample if there are too many."""
     edges = graph.nodes.edges
     a, b = edges.T
     both = graph.marked[a] & graph.marked[b]
@@ -66,7 +66,7 @@ def edges_of(graph: Graph) -> Edges:
 
 
 def graph_note(graph: Graph, edges: Edges) -> str:
-    """What is left out, and what can be pressed."""
+    """A note on what is left out and what can be pressed."""
     nodes, drawn = graph.nodes, len(edges.marked) + len(edges.others)
     shown = int(np.count_nonzero(graph.shown))
     thin = f"{len(nodes.number):,} of {nodes.total:,} {_many(nodes.name)} are drawn, evenly from clique and rest. "
@@ -85,7 +85,7 @@ def _edge(name: str) -> str:
 
 
 def _places(graph: Graph) -> NDArray[np.float64]:
-    """(K, 2) pixels."""
+    """Positions (K, 2) of the nodes in the drawing, px."""
     return np.array(MIDDLE_PX) + RADIUS_PX * graph.nodes.places
 
 
@@ -104,7 +104,7 @@ def _lines(ends: NDArray[np.float64]) -> str:
 
 
 def _nodes(graph: Graph, lit: NDArray[np.int64], kept: NDArray[np.int64]) -> list[str]:
-    """A dot for every node that is there; those that are marked, and then the selected, above the others."""
+    """A dot for every node that is shown; marked nodes lie above the others, selected ones on top."""
     nodes, places = graph.nodes, _places(graph)
     count = int(np.count_nonzero(graph.shown))
     radius = 5.0 if count <= 12 else 3.6 if count <= 110 else 2.5
@@ -165,7 +165,7 @@ def matrix_png(graph: Graph) -> str:
 
 
 def cell_nodes(graph: Graph, x: float, y: float) -> NDArray[np.int64]:
-    """The nodes of the cell at a place in the matrix, shares of its width and height."""
+    """The nodes of the cell at a point of the matrix, given as shares of its width and height."""
     there = np.flatnonzero(graph.shown)
     return np.unique(there[[min(int(share * len(there)), len(there) - 1) for share in (x, y)]])
 
@@ -179,7 +179,7 @@ NEVER = (
 
 
 class GraphView:
-    """Pressing a node, or a cell of the matrix, selects its matches."""
+    """The panel with graph and matrix. Pressing a node, or a cell of the matrix, selects its matches."""
 
     def __init__(self, gui: viser.GuiApi, touches: Touches, select: Select) -> None:
         """``select`` is called with matches by their numbers in the problem."""
@@ -190,10 +190,11 @@ class GraphView:
         touches.on(CELL, self._press)
 
     def draw(self, graph: Graph | None, begins: str, selected: tuple[int, ...], kept: NDArray[np.int64]) -> None:
-        """Show what there is of the graph by now; before it ``begins``, at the step of that key, how to get there.
+        """Show the graph as far as it is known at this step; before the step with the key ``begins``, a link to that
+        step.
 
-        ``selected`` are numbers in the problem, ``kept`` (N,) those by which matches are known on the page. Sends
-        nothing if nothing changed.
+        ``selected`` are indices in the problem, ``kept`` (N,) the numbers of the matches on the page. Sends nothing if
+        nothing changed.
         """
         drawn = (graph, begins, selected, kept.tobytes())
         if self._drawn is not None and self._drawn[0] is graph and self._drawn[1:] == drawn[1:]:
@@ -211,7 +212,7 @@ class GraphView:
 
 
 def graph_html(graph: Graph, selected: tuple[int, ...], kept: NDArray[np.int64]) -> str:
-    """Both drawings with what they show in words."""
+    """Both drawings, with a description of what they show."""
     lit, edges = graph.nodes.lit(selected), edges_of(graph)
     title = f'<div style="font-weight:600;padding-bottom:.3em">Graph and matrix{help_html("graph")}</div>'
     words = f'<div style="padding-top:.4em">{linked(graph.words)}</div>'

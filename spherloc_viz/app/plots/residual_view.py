@@ -1,5 +1,5 @@
-"""The residual view: how far the matches are from the pose, how well inliers were told from outliers, and how RANSAC
-went."""
+"""The residual view: residuals of the matches at the pose, how well inliers were separated from outliers, and the
+history of RANSAC."""
 
 from collections.abc import Callable
 from html import escape
@@ -33,14 +33,13 @@ SELECT_BIN = "select-bin"
 WIDTH_PX, RIGHT_PX = 380.0, 12.0
 HEIGHT_PX, FOOT_PX, TOP_PX = 150.0, 117.0, 20.0
 GAP_PX = 5.0
-"""Between the bins and those of all that is smaller or larger."""
+"""Gap between the regular bins and the first and last one, which hold all smaller and larger values."""
 UNITS = {"px": "residual (px)", "deg": "residual (°)"}
 
 
 def histogram_svg(histogram: Histogram, selected: NDArray[np.bool_]) -> str:
-    """A histogram, right matches below wrong ones; of the ``selected`` (N,) matches, outlines show how many are in a
-    bin. Every bin that holds something can be pressed.
-    """
+    """A histogram, right matches below wrong ones; outlines show how many of the ``selected`` (N,) matches are in a
+    bin. Every bin that is not empty can be pressed."""
     total = histogram.right + histogram.wrong
     top = 1.08 * max(1, int(total.max()))
     y = Scale(0.0, top, FOOT_PX, TOP_PX)
@@ -68,7 +67,7 @@ def histogram_svg(histogram: Histogram, selected: NDArray[np.bool_]) -> str:
 
 
 def _bars(histogram: Histogram, chosen: NDArray[np.int64], across: list[float], width: float, y: Scale) -> list[str]:
-    """One path a colour, and over each bin that holds something a place to press, as high as the plot."""
+    """One path per colour, and over each bin that is not empty an area to press, as high as the plot."""
     feet, middle = np.full(len(across), FOOT_PX), y.px(histogram.right)
     top = y.px(histogram.right + histogram.wrong)
     parts = [
@@ -89,14 +88,14 @@ def _bars(histogram: Histogram, chosen: NDArray[np.int64], across: list[float], 
 
 
 def _boxes(across: list[float], width: float, feet: FloatArray, tops: FloatArray, name: str, look: str) -> str:
-    """A path of upright boxes, without those of no height."""
+    """A path of upright boxes, without those of height 0."""
     rows = zip(across, feet.tolist(), tops.tolist(), strict=True)
     data = "".join(f"M{x:.1f} {foot:.1f}V{top:.1f}h{width:.1f}V{foot:.1f}z" for x, foot, top in rows if foot > top)
     return f'<path class="{name}" d="{data}" {look}/>' if data else ""
 
 
 def _bound(histogram: Histogram, x: Scale) -> list[str]:
-    """The median bound as a line, and all of them as a band where they are not the same."""
+    """The median bound as a line, and the range of all bounds as a band if they differ."""
     low, middle, high = (x.at(value) for value in histogram.bound)
     parts = []
     least, median, most = (f"{value:.2g}" for value in histogram.bound)
@@ -155,10 +154,10 @@ Select = Callable[[tuple[int, ...]], None]
 
 
 class ResidualView:
-    """Pressing a bin of a histogram selects its matches."""
+    """The panel of the residuals. Pressing a bin of a histogram selects its matches."""
 
     def __init__(self, gui: viser.GuiApi, touches: Touches, changed: Callable[[object], None], select: Select) -> None:
-        """``select`` is called with the matches of a bin that was pressed, by their numbers in the problem."""
+        """``select`` is called with the matches of a bin that was pressed, as indices in the problem."""
         self._changed, self._select = changed, select
         self._known: tuple[Trace, Residuals | None, str, str] | None = None
         self._drawn: tuple[tuple[int, ...], Chart | None] | None = None
@@ -174,9 +173,9 @@ class ResidualView:
         cost: Chart | None = None,
         hidden: bool = False,
     ) -> None:
-        """Show a run with the ``selected`` matches (numbers of the problem) marked; nothing here needs ``kept``, the
-        numbers (N,) by which matches are known on the page. ``cost`` is how the residuals fell so far, to stand above.
-        All of it are answers, which ``hidden`` leaves out. Sends nothing if nothing changed.
+        """Show a run with the ``selected`` matches (indices in the problem) marked; ``kept``, the numbers (N,) of the
+        matches on the page, is not used here. ``cost`` is the chart of the residuals so far, which stands above. All of
+        it are answers, which ``hidden`` leaves out. Sends nothing if nothing changed.
         """
         if hidden:
             self._known, self._drawn, self._bins = None, None, {}
@@ -191,7 +190,7 @@ class ResidualView:
         bins: dict[str, Histogram] = {} if residuals is None else {one.unit: one for one in residuals.histograms}
         fall = "" if cost is None else chart_html(cost)
         content = fall + _residuals_html(residuals, selected) + scores + history_html
-        # A press on what was on the page a moment ago selects what is in that bin now.
+        # A press on a histogram that has changed meanwhile selects the matches that are in that bin now.
         self._bins = bins
         update_widget(self._html, content=content)
         self._drawn = selected, cost
@@ -216,7 +215,7 @@ def _residuals_html(residuals: Residuals | None, selected: tuple[int, ...]) -> s
 
 
 def _legend_html(judged: str) -> str:
-    """What the colours mean: not what the run made of a match, as elsewhere, but what is known of it."""
+    """The meaning of the colours: here whether a match is right, elsewhere whether the run accepted it."""
     dots = "".join(
         f'<span style="margin-right:1.1em">{dot_html(color)}{words}</span>'
         for color, words in ((style.INLIER, "right"), (style.OUTLIER, "wrong"))
@@ -225,7 +224,7 @@ def _legend_html(judged: str) -> str:
 
 
 def residuals_caption(residuals: Residuals) -> str:
-    """What the axes mean, and what the last bins hold."""
+    """The meaning of the axes, and what the last bins hold."""
     words = ["Bins grow by equal factors; the first and the last hold all that is smaller or larger."]
     behind = int(np.count_nonzero(np.isinf(residuals.px))) - residuals.blind
     if behind:
@@ -242,7 +241,7 @@ def _history_html(history: History | None) -> str:
 
 
 def history_caption(history: History) -> str:
-    """Eq. 28 with this run's numbers, and when this run was lucky."""
+    """Eq. 28 with this run's numbers, and the first improvement by a clean sample."""
     share = f"w = {100.0 * history.share:.3g} % inliers, n = {history.size}"
     words = f"P = 1 − (1 − wⁿ)ᵏ (Eq. 28) with {share}: "
     if np.isfinite(history.half_at):
@@ -255,7 +254,7 @@ def history_caption(history: History) -> str:
 
 
 def _title(words: str, term: str | None = None) -> str:
-    """A heading, with a "?" that tells what a term means."""
+    """A heading, with a "?" that explains a term."""
     help_ = "" if term is None else help_html(term)
     return f'<div style="font-weight:600;padding-bottom:.3em">{escape(words)}{help_}</div>'
 

@@ -1,4 +1,4 @@
-"""Drawings as SVG, small and quick to make. Text and axes take the page's own colour, so they suit dark and light.
+"""Drawings as small SVG that is quick to make. Text and axes have the page's own colour, for dark and light pages.
 
 Numbers are pixels of the drawing, which the page scales to the panel's width. Every text is escaped here.
 """
@@ -17,11 +17,11 @@ from spherloc_viz import style
 
 MINUS = "\N{MINUS SIGN}"
 ROUND = (1.0, 2.0, 5.0, 10.0)
-"""Steps between ticks, times a power of ten."""
+"""Possible steps between ticks, times a power of ten."""
 ROUND_DEGREES = (15.0, 30.0, 45.0, 90.0, 180.0)
-"""Steps between ticks of angles above 10 degrees; above these, they are round numbers again."""
+"""Possible steps between ticks of angles above 10 degrees; larger steps are round numbers again."""
 SMALLEST = 1e-300
-"""Below this, a logarithm is not taken."""
+"""Least value of which a logarithm is taken."""
 SHOWN_SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
@@ -36,10 +36,10 @@ class Scale:
     low_px: float
     high_px: float
     log: bool = False
-    """Whether equal factors, not equal differences, are equally far apart; ``low`` must be above 0."""
+    """Whether the scale is logarithmic; ``low`` must then be above 0."""
 
     def px(self, values: ArrayLike) -> FloatArray:
-        """Where numbers (any shape) lie: at most an axis' length beyond its ends, and before it if unknown."""
+        """Pixels of numbers (any shape): at most the length of the axis beyond its ends; before the axis for NaN."""
         values = np.asarray(values, dtype=np.float64)
         low, high = self.low, self.high
         if self.log:
@@ -48,7 +48,7 @@ class Scale:
         return self.low_px + (self.high_px - self.low_px) * share
 
     def at(self, value: float) -> float:
-        """Where one finite number lies."""
+        """Pixel of one finite number."""
         low, high = self.low, self.high
         if self.log:
             value, low, high = math.log10(max(value, SMALLEST)), math.log10(low), math.log10(high)
@@ -58,7 +58,7 @@ class Scale:
 def round_ticks(low: float, high: float, most: int, degrees: bool = False) -> tuple[float, ...]:
     """At most ``most`` (2 or more) numbers from ``low`` to ``high``: multiples of 1, 2 or 5 times a power of ten.
 
-    ``degrees`` takes 15, 30, 45, 90 or 180 for steps between 10 and 180. Empty if the range is.
+    With ``degrees``, steps between 10 and 180 are 15, 30, 45, 90 or 180. Empty if the range is empty.
     """
     span = high - low
     if not (math.isfinite(span) and span > 0.0):
@@ -67,7 +67,7 @@ def round_ticks(low: float, high: float, most: int, degrees: bool = False) -> tu
     while math.floor(high / step + 1e-9) - math.ceil(low / step - 1e-9) + 1 > most:
         step = _round_step(1.01 * step, degrees)
     first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
-    # Half a unit of the 12th digit: multiples of 0.1 print as people write them.
+    # Rounded to 12 digits, so that multiples of 0.1 print without rounding errors.
     digits = 12 - math.floor(math.log10(max(abs(low), abs(high), step)))
     return tuple(round(k * step, digits) + 0.0 for k in range(first, last + 1))
 
@@ -81,14 +81,15 @@ def _round_step(least: float, degrees: bool) -> float:
 
 
 def decade_ticks(low: float, high: float, most: int) -> tuple[float, ...]:
-    """Powers of ten from ``low`` (above 0) to ``high``, every one or every so many that there are at most ``most``."""
+    """Powers of ten from ``low`` (above 0) to ``high``: all, or every n-th so that there are at most ``most``."""
     first, last = math.ceil(math.log10(low) - 1e-9), math.floor(math.log10(high) + 1e-9)
     stride = max(1, -(-(last - first + 1) // most))
     return tuple(10.0**power for power in range(first, last + 1, stride))
 
 
 def tick_texts(ticks: tuple[float, ...], log: bool = False) -> list[str]:
-    """Ticks as text, all with the decimals that their distance needs; powers of ten beyond four digits as such."""
+    """Ticks as text, all with the decimals that their distance needs; from five digits on as powers of ten if
+    ``log``."""
     if log:
         return [_power_text(tick) for tick in ticks]
     step = ticks[1] - ticks[0] if len(ticks) > 1 else 1.0
@@ -102,24 +103,24 @@ def _power_text(tick: float) -> str:
 
 
 def wrapped_deg(angle_deg: Any) -> Any:
-    """Angles brought into [-180, 180), as they are written beside an axis that crosses the seam."""
+    """Angles wrapped into [-180, 180), for the numbers of an axis that crosses +-180 degrees."""
     return (angle_deg + 180.0) % 360.0 - 180.0
 
 
 FONT_PX = 13.0
 MAX_CORNERS = 400
-"""Corners that a line keeps: about one a pixel."""
+"""Largest number of points of a line: about one per pixel."""
 TEXT_OPACITY, GRID_OPACITY, AXIS_OPACITY = 0.7, 0.12, 0.4
 
 
 def number(value: float) -> str:
-    """A coordinate, to 0.1 px."""
+    """A coordinate as text, to 0.1 px."""
     text = f"{value:.1f}"
     return text[:-2] if text.endswith(".0") else text
 
 
 def svg(width_px: float, height_px: float, parts: Sequence[str], label: str) -> str:
-    """A drawing as wide as what it stands in; ``label`` is what a screen reader says."""
+    """A drawing as wide as its container; ``label`` is for screen readers."""
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {number(width_px)} {number(height_px)}" role="img" '
         f'aria-label="{escape(label)}" font-size="{FONT_PX:g}" fill="currentColor" '
@@ -134,12 +135,12 @@ def text(x: float, y: float, words: str, anchor: str = "start", more: str = "") 
 
 
 def text_width_px(words: str) -> float:
-    """About how wide words are."""
+    """Approximate width of a text, px."""
     return 0.6 * FONT_PX * len(words)
 
 
 def tooltip(words: str) -> str:
-    """What the page shows while the pointer rests on the element that this stands in."""
+    """Text that the page shows while the pointer rests on the element that contains this."""
     return f"<title>{escape(words)}</title>"
 
 
@@ -161,7 +162,7 @@ def dot(x: float, y: float, radius: float, look: str, inside: str = "") -> str:
 
 
 def stroke(color: style.RGB | None, width_px: float, more: str = "", fill: str = 'fill="none"') -> str:
-    """Attributes of an outline in a colour, or in the page's own."""
+    """Attributes of an outline in a colour, or in the page's own for None."""
     paint = "currentColor" if color is None else style.css(color)
     return f'{fill} stroke="{paint}" stroke-width="{width_px:g}" stroke-linejoin="round"{more}'
 
@@ -172,18 +173,18 @@ def fill(color: style.RGB, opacity: float = 1.0) -> str:
 
 
 def touch(action: str, drag: bool = False) -> str:
-    """Attributes of what can be pressed or, with ``drag``, dragged across."""
+    """Attributes of an element that can be pressed or, with ``drag``, dragged across."""
     return f' data-touch="{escape(action)}"' + (" data-drag=''" if drag else "")
 
 
 def corners(x: ArrayLike, y: ArrayLike) -> str:
-    """Places as the data of a path, joined by straight lines; empty if there are none."""
+    """Data of a path that joins points by straight lines; empty if there are none."""
     flat = np.column_stack([np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)]).ravel().tolist()
     return "M" + ("%.1f %.1fL" * (len(flat) // 2) % tuple(flat))[:-1] if flat else ""
 
 
 def thin(x: FloatArray, y: FloatArray, most: int = MAX_CORNERS) -> tuple[FloatArray, FloatArray]:
-    """At most ``most`` (4 or more) of a line's corners (K,): both ends, and the lowest and highest of each stretch."""
+    """At most ``most`` (4 or more) of a line's points (K,): both ends, and the lowest and highest of each piece."""
     if len(x) <= most:
         return x, y
     inner = y[1:-1]
@@ -199,7 +200,7 @@ def thin(x: FloatArray, y: FloatArray, most: int = MAX_CORNERS) -> tuple[FloatAr
 
 
 def thin_steps(x: FloatArray, y: FloatArray, most: int = MAX_CORNERS) -> tuple[FloatArray, FloatArray]:
-    """At most ``most`` steps (K,), each the highest of those that it stands for."""
+    """At most ``most`` steps (K,), each with the largest value of the steps that it replaces."""
     stride = -(-len(x) // most)
     if stride <= 1:
         return x, y
@@ -208,8 +209,8 @@ def thin_steps(x: FloatArray, y: FloatArray, most: int = MAX_CORNERS) -> tuple[F
 
 
 def steps(x_px: FloatArray, y_px: FloatArray, end_px: float, foot_px: float) -> str:
-    """The data of a path from the ground up, over steps that hold y[k] from x[k] to x[k + 1], the last until
-    ``end_px``, and down to the ground. Steps of equal height are joined.
+    """Data of a path from the base line ``foot_px`` up, over steps with y[k] from x[k] to x[k + 1], the last one until
+    ``end_px``, and back to the base line. Steps of equal height are joined.
     """
     if len(x_px) == 0:
         return ""
@@ -224,7 +225,7 @@ def steps(x_px: FloatArray, y_px: FloatArray, end_px: float, foot_px: float) -> 
 
 
 def x_axis(scale: Scale, foot_px: float, ticks: Sequence[float], texts: Sequence[str], label: str = "") -> list[str]:
-    """The line under a plot, its ticks and their numbers, and what is measured, under the middle."""
+    """The x axis under a plot with its ticks, their numbers, and the label below the middle."""
     faint = stroke(None, 1, f' opacity="{AXIS_OPACITY}"')
     places = scale.px(ticks).tolist()
     data = "".join(f"M{number(x)} {number(foot_px)}v4" for x in places)

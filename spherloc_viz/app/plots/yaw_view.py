@@ -1,4 +1,4 @@
-"""The yaw view: what a run says about yaw over the whole circle, and the arcs of pairs in a window of it."""
+"""The yaw view: a run's results for yaw over the whole circle, and the arcs of pairs in a window of it."""
 
 import math
 import threading
@@ -44,7 +44,7 @@ CIRCLE_TOP_PX, CIRCLE_FOOT_PX = 21.0, 77.0
 WINDOW_TOP_PX, WINDOW_FOOT_PX = 116.0, 176.0
 RIGHT_PX = 12.0
 STACK_PX = 196.0
-"""Most room for the rows of bars."""
+"""Largest height of the rows of bars."""
 MIN_PITCH_PX, MAX_PITCH_PX = 3.0, 9.0
 LOOKS = (
     shapes.fill(style.INLIER),
@@ -58,11 +58,11 @@ HOVER = (
     "<style>.yaw-second{display:none;pointer-events:none}.yaw-arc:hover+.yaw-second,.yaw-second.chosen{display:inline}"
     ".yaw-arc:hover{stroke:currentColor;stroke-width:1.2}</style>"
 )
-"""A pair under the pointer shows its arcs over the whole circle too."""
+"""Style rules: while the pointer is on a pair, its arcs over the whole circle are shown too."""
 
 
 def yaw_svg(story: YawStory, bars: Bars, window: Window, kept: NDArray[np.int64], now: str) -> str:
-    """The drawing. ``kept`` (N,) are the numbers that matches are known by, ``now`` is the key of the step at hand."""
+    """The drawing. ``kept`` (N,) are the numbers of the matches on the page, ``now`` is the key of the current step."""
     top = 1.08 * story.top
     low_px = 9.0 + shapes.text_width_px(tick_texts((story.top,))[0])
     whole = Scale(*ALL, low_px, WIDTH_PX - RIGHT_PX)
@@ -78,12 +78,12 @@ def yaw_svg(story: YawStory, bars: Bars, window: Window, kept: NDArray[np.int64]
 
 
 def degrees(value: float) -> str:
-    """An angle to read, in [-180, 180)."""
+    """An angle as text, in [-180, 180)."""
     return f"{wrapped_deg(value):.2f}°".replace("-", MINUS)
 
 
 def zoom(window: Window) -> str:
-    """The attributes of what can be dragged across to choose a part of a window."""
+    """Attributes of an area that can be dragged across to choose a part of the window."""
     return shapes.touch(f"{ZOOM}:{window[0]:.6f},{window[1]:.6f}", drag=True)
 
 
@@ -104,7 +104,7 @@ def _legend(story: YawStory) -> list[str]:
 
 
 def _circle(story: YawStory, x: Scale, y: Scale, window: Window, part: Scale) -> list[str]:
-    """The whole circle, with the window marked and led down to where it is drawn wide."""
+    """The whole circle, with the window marked and connected with its wide drawing below."""
     ticks = round_ticks(*ALL, 5, degrees=True)
     parts = shapes.x_axis(x, CIRCLE_FOOT_PX, ticks, tick_texts(ticks))
     parts += curve_parts(tuple(map(_coarse, story.curves)), x, y)
@@ -130,7 +130,7 @@ def _window(story: YawStory, x: Scale, y: Scale, foot: float, now: str) -> list[
     ticks = round_ticks(low, high, 6, degrees=True)
     texts = tick_texts(ticks)
     if high > 180.0:
-        # Beyond the seam the numbers start again.
+        # Beyond +-180 degrees the numbers start again.
         texts = [
             words if tick < 180.0 else tick_texts((tick - 360.0,))[0] for tick, words in zip(ticks, texts, strict=True)
         ]
@@ -145,7 +145,7 @@ def _window(story: YawStory, x: Scale, y: Scale, foot: float, now: str) -> list[
 
 
 def _coarse(curve: Curve) -> Curve:
-    """The curve as the small drawing of the circle needs it."""
+    """The curve with fewer points, for the small drawing of the circle."""
     if curve.kind != "step":
         return curve
     return replace(curve, **dict(zip("xy", shapes.thin_steps(curve.x, curve.y, CIRCLE_STEPS), strict=True)))
@@ -162,7 +162,7 @@ def _beyond(curve: Curve, high: float) -> Curve:
 
 
 def _markers(story: YawStory, x: Scale, top: float, foot: float, window: Window) -> list[str]:
-    """Truth, broad, and estimate, thin and dashed, so that both show where they coincide."""
+    """The true yaw as a broad line and the estimate as a thin dashed one, so that both are seen where they coincide."""
     parts = []
     known = (
         (story.truth_deg, style.TRUTH, 3.5, ""),
@@ -176,7 +176,7 @@ def _markers(story: YawStory, x: Scale, top: float, foot: float, window: Window)
 
 
 def _hypotheses(story: YawStory, x: Scale, y: Scale, window: Window, now: str) -> list[str]:
-    """Stems of the poses that were tried, as high as what they explain; that of the step at hand is filled in."""
+    """A line for the yaw of each pose that was tried, as high as its support; that of the current step is filled."""
     parts = []
     for yaw, count, name, key in story.hypotheses:
         for place in places_of(yaw, window):
@@ -194,8 +194,8 @@ def _hypotheses(story: YawStory, x: Scale, y: Scale, window: Window, now: str) -
 
 
 def _bars(bars: Bars, whole: Scale, part: Scale, pitch: float, window: Window, kept: NDArray[np.int64]) -> list[str]:
-    """A bar an arc in the window; behind it, shown when the pair is pointed at or chosen, what joins
-    it to the other arc of the pair."""
+    """A bar for each arc in the window; behind it a connection with the other arc of the pair, which is shown when the
+    pointer is on the pair or the pair is selected."""
     data, links = _bar_data(bars, whole, part, pitch, window)
     rows = zip(
         kept[bars.pairs].tolist(), bars.kind.tolist(), bars.chosen.tolist(), data, links, _tips(bars), strict=True
@@ -211,9 +211,8 @@ def _bars(bars: Bars, whole: Scale, part: Scale, pitch: float, window: Window, k
 
 
 def _bar_data(bars: Bars, whole: Scale, part: Scale, pitch: float, window: Window) -> tuple[list[str], list[str]]:
-    """The data of two paths for every pair: of its arcs in the window; and, if it has a second arc or is chosen, of
-    ticks at all of its arcs over the whole circle and of what joins them, there and in the window.
-    """
+    """The data of two paths for every pair: its arcs in the window; and, if it has a second arc or is selected, ticks
+    at all of its arcs over the whole circle with the lines that connect them, there and in the window."""
     arc, low, high = spans_in(bars.lo_deg, bars.hi_deg, window)
     left = part.px(low)
     width = np.maximum(1.5, part.px(high) - left)
@@ -251,7 +250,7 @@ def _each(template: str, *columns: NDArray[np.floating]) -> list[str]:
 
 
 def _tips(bars: Bars) -> list[str]:
-    """The ends of every pair's arcs to read, those in the window first."""
+    """The ends of every pair's arcs as text, those in the window first."""
     order = np.lexsort((bars.row < 0, bars.owner))
     texts = _each("%.2f° to %.2f°", bars.lo_deg[order], wrapped_deg(bars.hi_deg[order]))
     for k in np.flatnonzero((bars.hi_deg - bars.lo_deg)[order] >= 360.0).tolist():
@@ -270,7 +269,8 @@ MIN_DRAG = 0.012
 
 
 class YawView:
-    """Zooms by drags over the plots and by buttons; ``draw`` shows a run. Presses only note a window."""
+    """The panel of the yaw; ``draw`` shows a run. Drags over the plots and buttons zoom; they only store the new
+    window."""
 
     def __init__(self, gui: viser.GuiApi, touches: Touches, changed: Callable[[object], None]) -> None:
         self._changed = changed
@@ -293,9 +293,9 @@ class YawView:
         kept: NDArray[np.int64],
         hidden: bool = False,
     ) -> None:
-        """Show a run, at a step, with the pairs of the ``selected`` matches (numbers of the problem) brought out.
+        """Show a run, at a step, with the pairs of the ``selected`` matches (indices in the problem) highlighted.
 
-        ``kept`` (N,) are the numbers by which the matches are known on the page. ``hidden`` leaves out what was found.
+        ``kept`` (N,) are the numbers of the matches on the page. ``hidden`` leaves out the results.
         Sends nothing if nothing changed.
         """
         with self._lock:
@@ -356,14 +356,14 @@ class YawView:
 
 
 def untold(story: YawStory) -> YawStory:
-    """The story without what was found: poses, what they explain, and the estimate."""
+    """The story without its results: poses, their support, and the estimate."""
     curves = tuple(curve for curve in story.curves if curve.kind != "level")
     top = max([1.0, *(float(curve.y.max(initial=0.0)) for curve in curves)])
     return replace(story, curves=curves, hypotheses=(), top=top, estimate_deg=None, note="")
 
 
 def _window_of(argument: str) -> Window | None:
-    """The window that a press says it was on; None if it says nothing sensible."""
+    """The window in the argument of a press; None if the argument is not a valid one."""
     try:
         low, high = map(float, argument.split(","))
     except ValueError:
@@ -373,7 +373,7 @@ def _window_of(argument: str) -> Window | None:
 
 
 def caption(trace: Trace, story: YawStory, arcs: Arcs, bars: Bars) -> str:
-    """Which arcs are shown, by which rule, and what their colours mean."""
+    """The caption: which arcs are shown, by which rule, and the meaning of their colours."""
     total = sum(bars.total)
     if total == 0:
         return " ".join(filter(None, (story.note, arcs.rule, "No pair has an arc in this window.")))

@@ -1,4 +1,4 @@
-"""One client's canvas: draws pictures, moves the viewer, and tells what is picked and dragged."""
+"""One client's canvas: draws pictures, moves the viewer, and reports what is picked and dragged."""
 
 import math
 import threading
@@ -21,22 +21,22 @@ from spherloc_viz.layers.frame import one_color
 from spherloc_viz.layers.primitives import Picture, Points
 
 FIRST_CHECKS, MAX_CHECKS, CHECK_S = 8, 40, 0.4
-"""A page that is still building itself drops its first view and reports that its viewer has not moved; a slow one for
-many checks."""
+"""Number of checks of the first view, their largest number, and the time between two: a page that is still being built
+drops its first view and reports that its viewer has not moved; a slow page does so for many checks."""
 MAX_PX = 1 << 20
-"""Whatever a page says of its window, it is no larger."""
+"""Largest width and height of a window that are accepted from a page."""
 HELD = "held"
-"""In place of a view's name."""
+"""Used in place of a view's name for a view that a link asked for."""
 REFERENCE_DOT = 0.01
-"""Radius of a reference's dot by the extent of all of them, before there is a run."""
+"""Radius of a reference's dot before there is a run, as a share of the extent of all references."""
 MOVE_S = 1.0
-"""The page moves its viewer smoothly, within less (``smooth.js``)."""
+"""Upper limit of the time in which the page moves its viewer smoothly (``smooth.js``)."""
 RESHAPED = 0.02
-"""From this change of the canvas' width over height on, as a share, its view is fitted anew."""
+"""Relative change of the canvas' aspect ratio from which on the view is fitted again."""
 
 
 class Canvas:
-    """What one client sees in three dimensions."""
+    """The 3-D picture of one client."""
 
     def __init__(
         self,
@@ -46,7 +46,7 @@ class Canvas:
         moved: Callable[[tuple[float, float, float, float]], None],
         docked_px: int,
     ) -> None:
-        """``picked`` gets numbers of correspondences in the problem, ``moved`` the true camera's new place.
+        """``picked`` gets indices of correspondences in the problem, ``moved`` the true camera's new pose.
 
         ``docked_px`` is the width of the panels beside the canvas.
         """
@@ -62,13 +62,14 @@ class Canvas:
         self._followed: views.View | None = None
         """The view that showed the subject of the last step that moved the viewer."""
         self._looked: tuple[str | None, views.View, float] | None = None
-        """The last view that was taken: its name, or None for that of the step, and for which canvas."""
+        """The last view that was set: its name, or None for that of the step; the view; and the canvas' aspect
+        ratio."""
         self._taken_s = -math.inf
-        """When that was."""
+        """When that view was set, seconds of a monotonic clock."""
         self._held: tuple[str, views.View] | None = None
-        """A view that a link asked for, and the key of the step at which it does."""
+        """The key of a step, and the view that a link asked for at that step."""
         self._held_step_came = False
-        """Whether that step has been shown: pictures that were asked for before may come first."""
+        """Whether that step has been shown: pictures that were requested before may come first."""
         self._scene: str | None = None
         self._checks, self._movable = 0, False
         self._lock = threading.Lock()
@@ -79,7 +80,7 @@ class Canvas:
     def draw(self, run: Run, picture: Picture, mesh: bytes | None, movable: bool) -> None:
         """Show a picture of a run; ``mesh`` is the map's, and ``movable`` whether the true camera may be dragged."""
         problem, layers = run.trace.problem, self._display.layers()
-        if mesh is not None and "mesh" in layers:  # it has a ground of its own
+        if mesh is not None and "mesh" in layers:  # the mesh has a ground of its own
             layers -= {"ground"}
         with self._lock:
             self._painter.dark = self._display.theme == "dark"
@@ -112,20 +113,21 @@ class Canvas:
             self._take(None, views.around(places, self._aspect()), self._aspect())
 
     def hold(self, step_key: str, viewpoint: tuple[float, ...]) -> None:
-        """Look from there, as ``viewpoint`` told it, for as long as this step is shown and the viewer is not moved."""
+        """Keep the view ``viewpoint``, as the method of that name returns it, while this step is shown and the viewer
+        is not moved."""
         *numbers, degrees = viewpoint
         self._held = step_key, views.View(np.array(numbers[:3]), np.array(numbers[3:]), np.radians(degrees))
         self._looked, self._held_step_came = None, False
 
     def fill_page(self, pixel_ratio: float) -> None:
-        """There are no panels beside the canvas: a lesson is around the page, which draws a pixel of its style with so
-        many of the screen's."""
+        """Use the whole page for the canvas, without panels, as in a lesson; ``pixel_ratio`` is the number of screen
+        pixels per CSS pixel."""
         self._docked_px, self._pixel_ratio = 0, pixel_ratio
         self._follow_page()
 
     def viewpoint(self) -> tuple[float, ...]:
-        """Where the viewer stands (3), what it looks at (3), and its field of view, degrees; empty if that is what the
-        step is seen from anyway."""
+        """The viewer's position (3), target (3), and field of view, degrees; empty if it is the default view of the
+        step."""
         held, looked = self._held, self._looked
         if held is not None and (looked is None or views.stands_at(self._client, held[1])):
             view = held[1]
@@ -142,52 +144,53 @@ class Canvas:
         picture = self._picture
         try:
             position = np.array(self._client.camera.position, dtype=np.float64).reshape(3)
-        except (TypeError, ValueError):  # viser takes whatever a page says of its camera
+        except (TypeError, ValueError):  # viser does not check what a page sends about its camera
             return
         if picture is None:
             return
         in_the_way = views.before_the_eyes(picture, position) | self._cut(picture, position)
         eye = position if views.inside(picture, position) else None
-        # Not to wait for a picture that is being drawn each time that the viewer moves.
+        # Does not wait, since the viewer moves often, for a picture that is being drawn.
         if in_the_way != self._painter.hidden or (eye is None) != (self._painter.eye is None):
             with self._lock:
                 self._painter.hide(in_the_way)
                 self._painter.see_from(eye)
 
     def _cut(self, picture: Picture, position: np.ndarray) -> frozenset[str]:
-        """Names of the words that the canvas' edge would cut for a viewer at that position (3,)."""
+        """Names of the labels that the canvas' edge would cut for a viewer at that position (3,)."""
         camera = self._client.camera
         try:
             target, angle = np.array(camera.look_at, dtype=np.float64).reshape(3), float(camera.fov)
         except (TypeError, ValueError):
             return frozenset()
         away = target - position
-        if not (0.0 < angle < np.pi and 0.0 < np.hypot(away[0], away[2]) < np.inf):  # a page may say anything
+        if not (0.0 < angle < np.pi and 0.0 < np.hypot(away[0], away[2]) < np.inf):  # a page may send anything
             return frozenset()
         return views.cut(picture, views.View(position, target, angle), self._aspect(), self._letter())
 
     def _letter(self) -> float:
-        """Width of a letter in the canvas, by half its height."""
+        """Width of a letter in the canvas, as a share of half the canvas' height."""
         height_px = max(1, min(self._client.camera.image_height, MAX_PX))
         return views.LETTER_PX * self._pixel_ratio * self._label_scale / (0.5 * height_px)
 
     @property
     def clicked_left(self) -> bool:
-        """Whether the canvas was clicked last in its left half."""
+        """Whether the last click on the canvas was in its left half."""
         return self._painter.clicked_x < 0.5
 
     def check(self) -> float | None:
-        """Seconds to the next look at whether the page dropped its first view; None once it has had time enough."""
+        """Seconds until the next check of whether the page dropped its first view; None if no more checks are
+        needed."""
         self._checks += 1
         most = MAX_CHECKS if views.stands_at(self._client, views.START) else FIRST_CHECKS
         return CHECK_S if self._checks <= most else None
 
     def _move_viewer(self, run: Run, picture: Picture, walls_came: bool) -> None:
-        """Go where the person wants, or, if that is to follow the steps, where the step's subject reads best.
+        """Set the view that the user chose or, if that is to follow the steps, the best view of the step's subject.
 
-        There too if another scene has been opened, since nothing of it may be in sight, and if its walls have come.
+        The latter also if another scene was opened, which may be out of sight, and when its walls have arrived.
         """
-        # Not by the problem's name, which follows every slider.
+        # Not compared by the problem's name, which changes with every slider.
         wanted, scene, query = self._display.take_view(), run.request.scene.scene, run.request.scene.query
         step = (f"{scene}, {query}", picture.step.key)
         at_held = self._held is not None and self._held[0] == step[1]
@@ -208,9 +211,9 @@ class Canvas:
             self._follow_step(picture, other_step)
 
     def _follow_step(self, picture: Picture, other_step: bool) -> None:
-        """Go to the step's view unless the viewer is there; at the same step, keep the view and fit it if it must be.
+        """Set the step's view unless it is set already; at the same step, keep the view and fit it again if necessary.
 
-        A view that was asked for by name stays that view however often the same step is drawn.
+        A view that was chosen by name is kept, however often the same step is drawn.
         """
         aspect = self._aspect()
         if other_step:
@@ -223,12 +226,12 @@ class Canvas:
                 self._look(name, picture)
 
     def _look_again(self, view: views.View) -> None:
-        """Take a view that is held, also after a page that was still building itself has dropped it."""
+        """Set a view that is kept, also again after a page that was still being built has dropped it."""
         if self._looked is None or self._looked[0] != HELD or views.stands_at(self._client, views.START):
             self._take(HELD, view, self._aspect())
 
     def _look(self, name: str | None, picture: Picture) -> None:
-        """Take the view of that name, or the one of the step."""
+        """Set the view of that name, or that of the step for None."""
         aspect = self._aspect()
         walls = self._walls
         wanted = (
@@ -245,12 +248,12 @@ class Canvas:
         views.look(self._client, view)
 
     def _untouched(self) -> bool:
-        """Whether the viewer still stands where it was put, or is on its way there."""
+        """Whether the viewer is still where it was put, or on the way there."""
         moving = time.monotonic() - self._taken_s < MOVE_S
         return self._looked is not None and (moving or views.stands_at(self._client, self._looked[1]))
 
     def _follow_page(self) -> None:
-        """The page's viewer has moved, or its canvas has another shape; on threads of viser's."""
+        """Called on viser's threads when the page's viewer has moved or its canvas has another shape."""
         self._make_room()
         looked, picture = self._looked, self._picture
         if looked is None or picture is None:
@@ -262,7 +265,7 @@ class Canvas:
     def _aspect(self) -> float:
         """Width over height of the canvas."""
         camera = self._client.camera
-        # The page tells its size before it docks the panels, and again some frames later.
+        # The page sends its size before it docks the panels, and again some frames later.
         if camera.image_width != self._full_width:
             self._docked_px = 0
         width_px, height_px = min(camera.image_width, MAX_PX), min(camera.image_height, MAX_PX)
@@ -275,12 +278,12 @@ def panel_widths_px(window_px: int) -> tuple[int, int]:
 
 
 def text_scale(window_px: int) -> float:
-    """How much larger words are in a window of that width than on a laptop, as in ``touch.css``."""
+    """Factor of the text size in a window of that width, compared with a laptop, as in ``touch.css``."""
     return next(scale for least, _, scale in WINDOWS_PX if window_px >= least)
 
 
 NARROW_PX = 600
-"""A narrower window has no panels beside its canvas (``captions.js``)."""
+"""Least width of a window with panels beside its canvas (``captions.js``)."""
 WINDOWS_PX: tuple[tuple[int, tuple[int, int], float], ...] = (
     (3400, (860, 780), 2.0),
     (2500, (650, 585), 1.5),
@@ -288,4 +291,4 @@ WINDOWS_PX: tuple[tuple[int, tuple[int, int], float], ...] = (
     (1600, (480, 400), 1.0),
     (0, (380, 340), 1.0),
 )
-"""From this width of the window on: widths of the panels left and right, and the size of words."""
+"""By the least width of the window, px: widths of the panels left and right, px, and the factor of the text size."""

@@ -17,24 +17,24 @@ LINE = 0.6
 """Width of lines relative to that on the screen, where the canvas is larger."""
 LABEL_PX = 11.0
 MIN_LETTER_PX = 6.0
-"""Words that shrink with what they name are left out where they would be smaller."""
+"""Least size of a label whose size depends on its distance; smaller ones are left out."""
 LETTER = 0.55
-"""Width of a letter by the height of its line, on average."""
+"""Average width of a letter as a share of the height of its line."""
 NEAR_M = 1e-3
 """Shapes nearer to the viewer than this are left out."""
 MAX_STACKED = 0.7
-"""Opacity of balls that all lie over each other."""
+"""Largest opacity of balls that all lie over each other."""
 OUTLINE_PX, OUTLINE_OPACITY = 0.5, 0.35
 """Outline of balls, which are paler the more there are."""
 BEHIND_M = 1e6
-"""Added to the distance of balls, of their centres and of lines between these, which would hide the camera in them."""
+"""Added to the distance of balls, their centres and the lines between these, so that they do not hide the camera."""
 
 Shape = tuple[float, str]
-"""Distance from the viewer, and its SVG."""
+"""Distance of a shape from the viewer, m, and its SVG."""
 
 
 def svg(still: Still) -> str:
-    """The picture, ``WIDTH`` by ``HEIGHT``; what is far is drawn first. Pictures on meshes are left out."""
+    """The picture, ``WIDTH`` by ``HEIGHT``; far shapes are drawn first. Textures of meshes are left out."""
     eye = _Eye(still)
     shapes = [
         (depth + BEHIND_M * (item.layer == "balls"), text) for item in still.items for depth, text in _shapes(item, eye)
@@ -48,7 +48,7 @@ def svg(still: Still) -> str:
 
 
 class _Eye:
-    """Where the viewer stands, and how large things are on the picture."""
+    """The viewer's pose and the projection into the picture."""
 
     def __init__(self, still: Still) -> None:
         self.view = View(still.position, still.target, still.field_of_view_rad)
@@ -56,15 +56,15 @@ class _Eye:
         self._scale_px = 0.5 * HEIGHT / np.tan(0.5 * still.field_of_view_rad)
 
     def depths_m(self, positions: FloatArray) -> FloatArray:
-        """(N,) of positions (N, 3) along the line of sight."""
+        """Depths (N,) of positions (N, 3) along the line of sight, m."""
         return (positions - self.view.position) @ self._forward
 
     def pixels(self, positions: FloatArray) -> FloatArray:
-        """(N, 2) of positions (N, 3), from the upper left corner."""
+        """Pixels (N, 2) of positions (N, 3), from the upper left corner."""
         return np.array([0.5 * WIDTH, 0.5 * HEIGHT]) + self._scale_px * projected(self.view, positions) * [1.0, -1.0]
 
     def sizes_px(self, sizes_m: FloatArray, depths_m: FloatArray) -> FloatArray:
-        """(N,) of lengths (N,) at depths (N,)."""
+        """Sizes (N,) in the picture, px, of lengths (N,) at depths (N,)."""
         return self._scale_px * sizes_m / np.maximum(depths_m, NEAR_M)
 
 
@@ -92,7 +92,7 @@ def _shapes(item: SceneItem, eye: _Eye) -> Iterator[Shape]:
                 if 0 < x < WIDTH and 0 < y < HEIGHT:
                     half = min(0.5 * LETTER * LABEL_PX * len(item.text), 0.5 * WIDTH)
                     x = float(np.clip(x, half, WIDTH - half))
-                    # Words stand before everything.
+                    # Labels are drawn in front of everything.
                     look = 'fill="#222" stroke="#fff" stroke-width="3" paint-order="stroke"'
                     yield -depth, f'<text x="{x:.1f}" y="{y:.1f}" {look}>{escape(item.text)}</text>'
 
@@ -114,7 +114,7 @@ def _lines(eye: _Eye, item: Segments) -> Iterator[Shape]:
     for ends, depth, color in zip(item.points, depths, item.colors, strict=True):
         if depth.max() <= NEAR_M:
             continue
-        if depth.min() <= NEAR_M:  # cut off what is behind the viewer
+        if depth.min() <= NEAR_M:  # cut off the part behind the viewer
             near, far = np.argsort(depth)
             share = (depth[far] - NEAR_M) / (depth[far] - depth[near])
             ends = np.stack([ends[far], ends[far] + share * (ends[near] - ends[far])])

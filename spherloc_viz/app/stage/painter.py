@@ -1,4 +1,4 @@
-"""Draws a picture's primitives into one client's canvas, changing what is there rather than drawing anew.
+"""Draws a picture's primitives into one client's canvas; nodes that exist are changed instead of drawn again.
 
 Colours arrive on the screen as the legend shows them.
 """
@@ -59,7 +59,7 @@ UNLIT = "KHR_materials_unlit"
 
 
 def textured_glb(vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray, image: np.ndarray) -> bytes:
-    """The mesh with its picture (H, W, 3 or 4), unlit and seen from both sides, in the colours of the picture."""
+    """The mesh with its texture (H, W, 3 or 4), unlit and visible from both sides, in the colours of the texture."""
     import trimesh  # takes a second
     from trimesh.exchange.gltf import export_glb
     from trimesh.visual.material import PBRMaterial
@@ -73,7 +73,7 @@ def textured_glb(vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray, image:
     )
     visual = TextureVisuals(uv=uv, material=material)
     mesh = trimesh.Trimesh(vertices, faces, visual=visual, process=False)
-    # WebP is a fifth of PNG; without light and shadow, the picture keeps its own.
+    # WebP takes a fifth of PNG; without light and shadow, the texture keeps its colours.
     return export_glb(trimesh.Scene(mesh), extension_webp=True, tree_postprocessor=_unlit)
 
 
@@ -84,25 +84,25 @@ def _unlit(tree: dict[str, Any]) -> None:
 
 
 OnPick = Callable[[tuple[int, ...], bool], None]
-"""Gets the correspondences (numbers in the problem) that were picked, and whether they extend the selection."""
+"""Called with the picked correspondences (indices in the problem) and whether they are added to the selection."""
 
 SHELLS = 12
-"""Nodes that share the balls of one primitive."""
+"""Number of nodes into which the balls of one primitive are divided."""
 MAX_ROUND = 400
-"""Above this many, dots get fewer faces."""
+"""If there are more dots, they have fewer faces."""
 MAX_BATCHED = 3000
-"""Above this many, dots become a point cloud, which costs less."""
+"""If there are more dots, they are drawn as a point cloud, which costs less."""
 LARGEST_DOT = 0.007
-"""Radius of a dot by its distance, as seen from within a camera."""
+"""Largest radius of a dot as a share of its distance, for a viewer inside a camera."""
 LABEL_SCALE = 0.9
-"""Size of words, by viser's own."""
+"""Size of labels, relative to viser's own."""
 PLACE = frozenset({"wxyz", "position"})
 """Settings of a node that are not properties of the shape drawn there."""
 
 
 class Painter:
-    """The canvas of one client. What is picked there is found here, by the ray of the click: so lines, dots of a
-    point cloud and balls within balls can be picked too, and a small dot within some pixels."""
+    """The canvas of one client. Picking is done here, by the ray of the click, so that lines, dots of a point cloud and
+    balls within balls can be picked too, and a small dot within some pixels."""
 
     def __init__(
         self,
@@ -110,23 +110,22 @@ class Painter:
         on_pick: OnPick | None = None,
         label_scale: float = LABEL_SCALE,
     ) -> None:
-        """``label_scale`` is the size of words, by viser's own.
+        """``label_scale`` is the size of labels, relative to viser's own.
 
-        ``on_pick`` is called on viser's threads, and a click on nothing picks (). None is for a page that cannot
-        answer: a still one, which is drawn on a server."""
+        ``on_pick`` is called on viser's threads, with () for a click on nothing; None is for a still page."""
         self._client, self._label_scale = client, label_scale
         self._drawn: dict[str, tuple[Any, tuple, SceneItem]] = {}
         self._textured: dict[str, tuple[Hashable, bytes | None]] = {}
         self._shown: tuple[SceneItem, ...] = ()
         self._names: frozenset[str] = frozenset()
         self.hidden: frozenset[str] = frozenset()
-        """Nodes that are left out of what is shown."""
+        """Names of nodes that are not shown."""
         self.eye: np.ndarray | None = None
         """Position (3,) of a viewer inside a camera."""
         self.dark = True
-        """Whether that is what is behind everything."""
+        """Whether the background is dark."""
         self.clicked_x = 0.5
-        """Where the canvas was clicked last: share of its width."""
+        """Horizontal position of the last click, as a share of the canvas' width."""
         self._backdrop: tuple[bytes, Any] | None = None
         if on_pick is not None:
             scene, extend = client.scene, partial(self._clicked, on_pick, True)
@@ -155,15 +154,15 @@ class Painter:
         self._shown = tuple(shown)
 
     def hide(self, names: frozenset[str]) -> None:
-        """Leave these nodes out of what is shown, from now on; an empty set shows all again."""
+        """Do not show these nodes from now on; an empty set shows all again."""
         if names != self.hidden:
             self.hidden = names
             with self._client.atomic():
                 self._follow()
 
     def see_from(self, eye: np.ndarray | None) -> None:
-        """No dot is larger than ``LARGEST_DOT`` for a viewer inside a camera, at ``eye`` (3,): dots would hide
-        the photograph. None is for anywhere else."""
+        """Limit dots to ``LARGEST_DOT`` for a viewer inside a camera, at ``eye`` (3,), since they would hide the
+        photograph. None is for a viewer outside."""
         if (eye is None) != (self.eye is None):
             self.eye = eye
             with self._client.atomic():
@@ -178,7 +177,7 @@ class Painter:
         return np.minimum(radii_m, LARGEST_DOT * np.linalg.norm(item.positions - self.eye, axis=1))
 
     def _follow(self) -> None:
-        """Have nodes visible that are to be seen."""
+        """Set which nodes are visible."""
         for name, (handle, _, _) in self._drawn.items():
             visible = name in self._names and name not in self.hidden
             if handle.visible != visible:
@@ -187,7 +186,7 @@ class Painter:
     def draw_backdrop(self, glb: bytes | None, aligned_from_map: np.ndarray, visible: bool) -> None:
         """Show the map's mesh, a binary glTF in the map frame, behind the pictures of a run; None for none.
 
-        It belongs to the scene and not to the run, so that recordings, which must be small, do without it.
+        It belongs to the scene and not to the run; recordings, which must be small, do not contain it.
         """
         if self._backdrop is not None and self._backdrop[0] is not glb:
             self._backdrop[1].remove()
@@ -216,7 +215,7 @@ class Painter:
         self._drawn[item.name] = (handle, look, item)
 
     def _glb(self, item: Textured) -> bytes | None:
-        """The item as a binary glTF; None if it has no picture."""
+        """The item as a binary glTF; None if it has no texture."""
         known = self._textured.get(item.name)
         if known is None or known[0] != item.key:
             image = item.image()
@@ -237,9 +236,9 @@ class Painter:
 def _parts(item: SceneItem) -> list[SceneItem]:
     """The item as nodes that are drawn one after another; none if there is nothing to draw.
 
-    Balls within balls: a translucent surface hides what is drawn after it and lies behind. Within a node viser draws
-    by distance of the centres, which says nothing about balls around one spot; but nodes are drawn in the order in
-    which they were added. So balls are drawn in shells, the smallest first.
+    Balls can lie within balls, and a translucent surface hides things behind it that are drawn later. Within a node,
+    viser draws by the distance of the centres, which is no help for balls around one point; but nodes are drawn in the
+    order in which they were added. So balls are divided into nodes, the smallest balls first.
     """
     if not _size(item):
         return []
@@ -253,7 +252,7 @@ def _parts(item: SceneItem) -> list[SceneItem]:
 
 
 def _size(item: SceneItem) -> int:
-    """How many things it draws; viser cannot draw none."""
+    """Number of shapes of an item; viser cannot draw a node with none."""
     match item:
         case Points():
             return len(item.positions)
@@ -287,7 +286,7 @@ def _look(item: SceneItem) -> tuple:
 
 
 def _same(item: SceneItem, other: SceneItem | None) -> bool:
-    """Whether a node that shows the one shows the other; viser compares too, but slowly."""
+    """Whether a node that shows ``item`` also shows ``other``; viser compares too, but slowly."""
     seen, known = vars(item), vars(other)
     return all(seen[name] is known[name] or np.array_equal(seen[name], known[name]) for name in _SHOWN[type(item)])
 
@@ -300,7 +299,7 @@ _SHOWN: dict[type[SceneItem], tuple[str, ...]] = {
     Textured: ("map_from_mesh",),
     Label: ("position", "text", "height_m"),
 }
-"""Fields that a node follows."""
+"""Fields of an item that a node can follow without being added again."""
 
 
 def _changing(item: SceneItem) -> dict[str, Any]:

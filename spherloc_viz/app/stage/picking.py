@@ -1,4 +1,4 @@
-"""Which correspondences a click or a rectangle on the canvas means."""
+"""Finds the correspondences that a click or a rectangle on the canvas picks."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -11,25 +11,25 @@ from spherloc.types import FloatArray
 from spherloc_viz.layers.primitives import Balls, Points, SceneItem, Segments
 
 DOT_PX = 8.0
-"""A click that misses a dot by so much still means it."""
+"""Largest distance of a click from a dot that it picks."""
 LINE_PX = 5.0
-"""The same for lines."""
+"""Largest distance of a click from a line that it picks."""
 NEAR = 1e-6
-"""Depths below this are behind the viewer."""
+"""Depths below this, m, count as behind the viewer."""
 OTHERS = "trajectory"
-"""A layer whose numbers are those of queries, not of correspondences."""
+"""Layer whose ids are those of queries and not of correspondences."""
 
 
 @dataclass(frozen=True, eq=False)
 class Viewer:
-    """Place and direction from which a page is seen, as viser reports them."""
+    """Pose and field of view of a page's viewer, as viser reports them."""
 
     position: FloatArray
-    """(3,)."""
+    """Position (3,), aligned map frame, m."""
     map_from_viewer: FloatArray
-    """(3, 3) rotation; the viewer's axes are OpenCV's."""
+    """Rotation (3, 3); the viewer's axes are OpenCV's."""
     slopes: FloatArray
-    """(2,) half of the canvas's width and height, at depth 1."""
+    """(2,) half of the canvas' width and height, at depth 1."""
     radians_per_pixel: float
 
     def project(self, positions: FloatArray) -> FloatArray:
@@ -40,7 +40,7 @@ class Viewer:
 
 
 def viewer_of(camera: viser.CameraHandle) -> Viewer:
-    """The viewer of a client; its field of view is that of the canvas's height."""
+    """The viewer of a client; viser's field of view is the vertical one."""
     slope, height = float(np.tan(0.5 * camera.fov)), max(1, camera.image_height)
     return Viewer(
         np.array(camera.position),
@@ -67,9 +67,9 @@ def inside(
 def nearest(
     items: Iterable[SceneItem], origin: FloatArray, direction: FloatArray, radians_per_pixel: float
 ) -> tuple[int, ...]:
-    """What a ray from the viewer means: the dot that it meets first or misses least, else a line, else a ball.
+    """The correspondences that a ray from the viewer picks: those of the nearest dot, else of a line, else of a ball.
 
-    Of balls it is the smallest that is hit, since the larger ones around it can be clicked beside it. () for nothing.
+    Of several balls the smallest is picked, since the larger ones around it can be clicked beside it. () for nothing.
     """
     items, forward = tuple(items), direction / np.linalg.norm(direction)
     return (

@@ -21,12 +21,12 @@ from spherloc_viz.app.web.viser_internals import start_viser, stop_viser
 from spherloc_viz.layers.primitives import SceneItem
 
 _one_at_a_time = threading.Lock()
-"""Starting and stopping a viser server changes what belongs to the whole process for a moment."""
+"""Held while a viser server is started and stopped, since that changes global state of the process."""
 
 
 @dataclass(frozen=True, eq=False)
 class Still:
-    """What the file shows."""
+    """A scene with its title, note and view."""
 
     title: str
     note: str
@@ -37,16 +37,16 @@ class Still:
     aligned_from_map: FloatArray
     """Rotation (3, 3) of that mesh."""
     position: FloatArray
-    """(3,) where the viewer stands."""
+    """(3,) position of the viewer."""
     target: FloatArray
-    """(3,) where it looks."""
+    """(3,) point at which the viewer looks."""
     up: FloatArray
-    """(3,)."""
+    """(3,) direction that is up in the picture."""
     field_of_view_rad: float
-    """From top to bottom."""
+    """Vertical field of view."""
     dark: bool
     reach: float = MIN_REACH
-    """How far is drawn."""
+    """Largest distance at which things are drawn."""
 
 
 def still_html(still: Still) -> str:
@@ -56,20 +56,20 @@ def still_html(still: Still) -> str:
 
 
 def with_policy(page: str, more_scripts: Iterable[str] = ()) -> str:
-    """A page that runs its own scripts and ``more_scripts``, fetches nothing, and so needs and uses no network."""
+    """The page with a policy by which it runs only its own scripts and ``more_scripts`` and uses no network."""
     policy = _policy([*scripts_in(page), *more_scripts])
     return page.replace("<head>", f'<head><meta http-equiv="Content-Security-Policy" content="{policy}">', 1)
 
 
 def scripts_in(page: str) -> list[str]:
-    """What of a page is executed."""
+    """The scripts in a page."""
     return re.findall(r"<script\b(?![^>]*application/json)[^>]*>(.*?)</script>", page, flags=re.DOTALL)
 
 
 def scene_script(still: Still) -> str:
     """A script that has viser's page (``client_html``) show the scene. Takes about a second.
 
-    What one client is shown cannot be saved; only what a server shows to all can be. So a server is started for this.
+    viser can save only the scene that a server shows to all clients, not that of one client. So a server is started.
     """
     layers = frozenset(item.layer for item in still.items)
     with _one_at_a_time:
@@ -96,7 +96,7 @@ def scene_script(still: Still) -> str:
 def _embed(page: str, still: Still) -> str:
     """The page with its title and legend, which lie over the canvas."""
     color = "#e8e8ea" if still.dark else "#1a1b1e"
-    # At the bottom, since viser's own notes come down from the top.
+    # At the bottom, since viser's own notifications appear at the top.
     where = "position:fixed;left:16px;right:16px;bottom:12px;z-index:10;pointer-events:none"
     place = f"{where};font-family:system-ui,sans-serif;font-size:13px;color:{color}"
     dot = "display:inline-block;width:.75em;height:.75em;border-radius:50%;margin-right:.4em"

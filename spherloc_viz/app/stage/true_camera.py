@@ -11,7 +11,7 @@ from spherloc.types import FloatArray
 from spherloc_viz.app.web.viser_internals import at_once, put_handle
 
 Place = tuple[float, float, float, float]
-"""Yaw in degrees and position in metres, of a level camera."""
+"""Yaw (degrees) and position x, y, z (metres) of a level camera."""
 
 SIZE_PX = 90.0
 
@@ -19,7 +19,7 @@ SIZE_PX = 90.0
 class TrueCamera:
     """The handle: arrows and a plane move the camera, and a circle around the vertical turns it.
 
-    Where the person put it, it stays until the answer to that very move, or to a later change, arrives.
+    It stays where the user put it until the answer to that move, or to a later change, arrives.
     """
 
     def __init__(self, client: viser.ClientHandle, moved: Callable[[Place], None]) -> None:
@@ -66,7 +66,7 @@ def _handle(client: viser.ClientHandle, name: str, axes: tuple[bool, bool, bool]
 
 
 def place_of(cam_from_map: FloatArray) -> Place:
-    """Yaw (degrees) and position (metres) of a pose (3, 4); what it leans is lost."""
+    """Yaw (degrees) and position (metres) of a pose (3, 4); its tilt is dropped."""
     x, y, z = camera_centre(cam_from_map)
     return float(np.degrees(yaw_of(cam_from_map[:, :3]))), float(x), float(y), float(z)
 

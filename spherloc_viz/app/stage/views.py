@@ -1,4 +1,4 @@
-"""Where the viewer stands: places from which a picture reads well, with no wall between them and what is to be seen."""
+"""Views: positions from which a picture can be read well, without a wall between the viewer and the subject."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -14,17 +14,17 @@ from spherloc_viz.layers.frame import RING_ROOM, SPHERE_ROOM, ball_boxes, circle
 from spherloc_viz.layers.primitives import Balls, Label, Mesh, Picture, Points, SceneItem, Segments, Textured
 
 CELLS = 160
-"""Cells of the grid along the mesh's longest side."""
+"""Number of cells of the grid along the mesh's longest side."""
 SAMPLES = 400_000
-"""Places on the surface that fill cells."""
+"""Number of points on the surface by which cells are marked."""
 STEPS = 64
-"""Looks along each line of sight."""
+"""Number of samples along each line of sight."""
 TARGETS = 24
-"""Lines of sight, at most."""
+"""Largest number of lines of sight."""
 NEAR_SHARE, FAR = 0.08, 0.97
 """Part of each line of sight that is tested, as shares from the viewer: the mesh may touch what is to be seen."""
 MAX_BYTES = 60 << 20
-"""A larger mesh takes too long to read: views are then chosen without it."""
+"""Largest mesh that is read; with a larger one, views are chosen without it."""
 
 
 class Walls:
@@ -66,48 +66,49 @@ WIDE_RAD = np.radians(85.0)
 """Field of view of a viewer inside the camera."""
 UP = np.array([0.0, -1.0, 0.0])
 START = (3.0, -3.0, 3.0)
-"""Where a page's viewer stands until its first view is set."""
+"""Position of a page's viewer until its first view is set."""
 MARGINS = np.array([0.1, 0.06])
-"""Shares of the canvas' half width and half height that stay free on every side."""
+"""Shares of the canvas' half width and half height that stay free on each side."""
 LETTER_PX = 6.8
 """Width of a letter of a label of viser's size."""
 WIDE, HIGH = np.array([0.5, 0.0]), np.array([0.6, 1.4])
-"""Half a label's width and height, in letters: for each of its letters, and besides."""
+"""Half a label's width and height, in widths of a letter: per letter, and in addition."""
 BESIDE = ("ground", "scale bar")
-"""Layers whose words are the same at every step."""
+"""Layers whose labels are the same at every step."""
 NEAR = 0.6
-"""How far from its subject a step's words may stand, by the subject's size."""
+"""Largest distance of a step's labels from its subject, as a share of the subject's size."""
 ROUNDS = 4
-"""Perspective shifts the middle of what is seen, so the target is moved there a few times."""
+"""Number of rounds in which the target is moved to the middle of the projected subject, which perspective shifts."""
 MIN_REACH, REACH = 1000.0, 5.0
-"""How far a page draws at least, as viser does, and by the distance to what is looked at."""
+"""Distance up to which a page draws: at least the first, viser's own, m; and the second times the distance to the
+target."""
 STILL = 1e-3
-"""Views whose places differ by less, as a share of their distance to what they show, are the same."""
+"""Largest difference of the positions of two equal views, as a share of the distance to the target."""
 MIN_SHARE = 0.5
-"""A subject that covers less of the canvas' width and height is shown small."""
+"""Least share of the canvas' width and height that a subject covers; otherwise it counts as shown too small."""
 DIRECTIONS = {
     "Overview": (0.55, -0.6, -0.75),
     "Above": (0.0, -1.0, -0.02),
     "Sphere": (0.3, -0.75, -0.6),
     "Balls": (0.35, -0.45, -0.8),
 }
-"""From the subject to the viewer; y points down."""
+"""Directions of the views, from the subject to the viewer; y points down."""
 STEEP = (0.3, -2.0, -0.6)
 """Direction from which a view looks over walls."""
 INSIDE = "From the camera"
 NAMES = (*DIRECTIONS, INSIDE)
-"""All views."""
+"""Names of all views."""
 TURNING = 0.02
 """Distance, in sphere radii, from a viewer inside the camera to the point around which the mouse turns the view."""
 CLOSE = 0.15
 """Distance from a camera's centre, in sphere radii, within which the viewer counts as inside the camera."""
 TURNS_RAD = np.radians([0, 30, -30, 60, -60, 90, -90, 120, -120, 150, -150, 180])
-"""Turns of a view about the vertical, the least first."""
+"""Rotations of a view about the vertical that are tried, the smallest first."""
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A place to look from."""
+    """Position, target and field of view of the viewer."""
 
     position: FloatArray
     target: FloatArray
@@ -115,7 +116,7 @@ class View:
 
 
 def stands_at(client: viser.ClientHandle, place: View | tuple[float, float, float]) -> bool:
-    """Whether the page says that its viewer stands in a view, or at a place, as far as it tells numbers."""
+    """Whether the page reports that its viewer is in a view, or at a position; false if its report is not numbers."""
     camera = client.camera
     if not isinstance(place, View):
         return bool(np.allclose(camera.position, place))
@@ -130,7 +131,7 @@ def same(view: View, other: View) -> bool:
 
 
 def reach(view: View) -> float:
-    """How far a page must draw for a view: a map of mountains is larger than viser thinks."""
+    """Distance up to which a page must draw for a view, m: a map of mountains is larger than viser's default."""
     return max(MIN_REACH, REACH * float(np.linalg.norm(view.target - view.position)))
 
 
@@ -146,8 +147,8 @@ def look(client: viser.ClientHandle, view: View) -> None:
 
 
 def follow(picture: Picture, aspect: float, walls: Walls | None = None, letter: float = 0.0) -> View:
-    """The view that shows what the step is about, on a canvas of that width over height, between ``walls``; with the
-    words beside it if their letters are wide, by half the canvas' height."""
+    """The view of the step's subject, on a canvas with that aspect ratio, between ``walls``. If ``letter``, the width
+    of a letter as a share of half the canvas' height, is not 0, the labels beside the subject are in view too."""
     focus = picture.focus
     route = [item.positions for item in picture.scene if isinstance(item, Points) and item.layer == "trajectory"]
     subject = np.vstack([focus.points, *route]) if focus.view == "Overview" else focus.points
@@ -162,7 +163,7 @@ def follow(picture: Picture, aspect: float, walls: Walls | None = None, letter: 
 
 
 def cut(picture: Picture, view: View, aspect: float, letter: float) -> frozenset[str]:
-    """Names of the words that the edge of the canvas would cut, or that would lie on others that tell more."""
+    """Names of the labels that the edge of the canvas would cut, or that would cover more important ones."""
     labels = [item for item in picture.scene if isinstance(item, Label) and item.height_m is None]
     if not labels:
         return frozenset()
@@ -179,7 +180,7 @@ def cut(picture: Picture, view: View, aspect: float, letter: float) -> frozenset
 
 
 def _names(picture: Picture, subject: FloatArray) -> list[Label]:
-    """The words that stand beside a subject (K, 3)."""
+    """The labels beside a subject (K, 3)."""
     low, high = np.min(subject, axis=0), np.max(subject, axis=0)
     room = NEAR * float(np.max(high - low))
     labels = [item for item in picture.scene if isinstance(item, Label) and item.height_m is None]
@@ -188,7 +189,7 @@ def _names(picture: Picture, subject: FloatArray) -> list[Label]:
 
 
 def _half_size(label: Label, letter: float) -> FloatArray:
-    """Half the width and height (2,) of words, as ``letter`` is measured."""
+    """Half the width and height (2,) of a label, in the unit of ``letter``."""
     return letter * (len(label.text) * WIDE + HIGH)
 
 
@@ -199,21 +200,21 @@ def around(places: FloatArray, aspect: float) -> View:
 
 
 def shows(view: View, subject: FloatArray, aspect: float) -> bool:
-    """Whether a view holds a subject (K, 3) and does not show it small."""
+    """Whether a subject (K, 3) is inside a view and not shown too small."""
     seen = projected(view, subject) / (np.tan(view.field_of_view_rad / 2) * np.array([aspect, 1.0]))
     inside = bool(np.all(np.abs(seen) <= 1.0))
     return inside and float(np.max(np.ptp(seen, axis=0))) / 2 >= MIN_SHARE
 
 
 def fits(name: str | None, view: View, picture: Picture, aspect: float) -> bool:
-    """Whether a view of that name, or the step's view for None, still shows what it is for."""
+    """Whether a view of that name, or the step's view for None, still shows its subject."""
     if name is None:
         return shows(view, picture.focus.points, aspect)
     return same(view, _inside(picture)) if name == INSIDE else shows(view, _subject(name, picture), aspect)
 
 
 def projected(view: View, positions: FloatArray) -> FloatArray:
-    """Where positions (K, 3) are seen (K, 2), right and up, as slopes; infinite behind the viewer."""
+    """Projections (K, 2) of positions (K, 3), right and up, as slopes; infinite behind the viewer."""
     backward, right, up = (axes[0] for axes in _axes((view.position - view.target)[None]))
     offset = positions - view.position
     depth = -(offset @ backward)
@@ -224,8 +225,8 @@ def projected(view: View, positions: FloatArray) -> FloatArray:
 
 
 def before_the_eyes(picture: Picture, position: FloatArray) -> frozenset[str]:
-    """Names of the cameras in which a viewer at that position (3,) stands, of what is drawn around them, whose lines
-    would cross all that is seen, and of the words in the scene, which would cover the photograph."""
+    """Names of the nodes to hide for a viewer at that position (3,) inside a camera: the camera and things around it,
+    whose lines would cross the whole picture, and labels, which would cover the photograph."""
     surface = _surface(picture)
     if surface is None:
         return frozenset()
@@ -240,7 +241,7 @@ def before_the_eyes(picture: Picture, position: FloatArray) -> frozenset[str]:
 
 
 def inside(picture: Picture, position: FloatArray) -> bool:
-    """Whether a viewer at that position (3,) stands in the estimated camera or in the sphere's centre."""
+    """Whether a viewer at that position (3,) is in the estimated camera or in the sphere's centre."""
     surface = _surface(picture)
     if surface is None:
         return False
@@ -252,7 +253,7 @@ def inside(picture: Picture, position: FloatArray) -> bool:
 
 
 def _surface(picture: Picture) -> Mesh | None:
-    """That of the sphere, if the picture has one."""
+    """The surface of the sphere; None if the picture has none."""
     return next((item for item in picture.scene if isinstance(item, Mesh) and item.name == "sphere/surface"), None)
 
 
@@ -261,14 +262,14 @@ def _radius_m(surface: Mesh) -> float:
 
 
 def _apart(camera: Segments, position: FloatArray) -> float:
-    """From a camera's centre, where its first line begins."""
+    """Distance, m, from a camera's centre, at which its first line begins."""
     return float(np.linalg.norm(camera.points[0, 0] - position))
 
 
 def find(name: str, picture: Picture, aspect: float, walls: Walls | None = None) -> View:
-    """The view of that name, fitted to a picture and to a canvas of that width over height.
+    """The view of that name, fitted to a picture and to a canvas with that aspect ratio.
 
-    Close views are turned about the vertical until little of the ``walls`` and few map points stand in their way.
+    Close views are turned about the vertical until few ``walls`` and map points are in the way.
     """
     if name == INSIDE:
         return _inside(picture)
@@ -279,7 +280,7 @@ def find(name: str, picture: Picture, aspect: float, walls: Walls | None = None)
 def _clear(
     name: str, picture: Picture, subject: FloatArray, clear: FloatArray, aspect: float, walls: Walls | None
 ) -> View:
-    """A view of a subject (K, 3) from the side of a named view, turned so that little hides ``clear`` (L, 3)."""
+    """A view of a subject (K, 3) from the direction of a named view, turned so that little hides ``clear`` (L, 3)."""
     if name not in ("Sphere", "Balls") and (name != "Overview" or walls is None):
         return _fit(subject, np.array(DIRECTIONS[name]), aspect)
     sides = [DIRECTIONS[name]] if walls is None else [DIRECTIONS[name], STEEP]
@@ -293,7 +294,7 @@ def _clear(
 
 
 def _inside(picture: Picture) -> View:
-    """From where the camera, or, while its position is unknown, the sphere is, along its axis."""
+    """The view along the camera's axis from the camera or, while its position is unknown, from the sphere's centre."""
     items = {item.name: item for item in picture.scene}
     surface = _surface(picture)
     assert surface is not None
@@ -306,7 +307,7 @@ def _inside(picture: Picture) -> View:
 
 
 def _axis(items: dict[str, SceneItem]) -> FloatArray:
-    """Where the camera looks (3,); +z of the map if the picture does not tell."""
+    """Direction (3,) of the camera's axis; the map's +z if the picture does not show it."""
     camera, image = items.get("cameras/estimate"), items.get("sphere/image")
     if isinstance(camera, Segments):
         axis = np.sum(camera.points[:4, 1] - camera.points[:4, 0], axis=0)
@@ -316,7 +317,7 @@ def _axis(items: dict[str, SceneItem]) -> FloatArray:
 
 
 def _fit(subject: FloatArray, direction: FloatArray, aspect: float) -> View:
-    """The nearest place in that direction from which the canvas holds all of the subject (K, 3)."""
+    """The nearest view in that direction in which all of the subject (K, 3) is on the canvas."""
     positions, targets = _fits(subject, direction[None], aspect)
     return View(positions[0], targets[0])
 
@@ -324,9 +325,10 @@ def _fit(subject: FloatArray, direction: FloatArray, aspect: float) -> View:
 def _fits(
     subject: FloatArray, directions: FloatArray, aspect: float, insets: FloatArray | None = None
 ) -> tuple[FloatArray, FloatArray]:
-    """The same for directions (D, 3): where to stand (D, 3) and what to look at (D, 3).
+    """The same for directions (D, 3): positions (D, 3) and targets (D, 3).
 
-    ``insets`` (K, 2) says how far each place stays from the edge, by half the canvas' height, where that is more.
+    ``insets`` (K, 2) are least distances of the points from the edge, as shares of half the canvas' height, where they
+    are larger than the margins.
     """
     backward, right, up = _axes(directions)
     edges = np.array([aspect, 1.0])
@@ -341,7 +343,7 @@ def _fits(
     target = [np.zeros((len(directions), 1)) for _ in parts]
 
     def least_distance() -> FloatArray:
-        """From how far (D, 1) the subject is seen within the slopes."""
+        """Least distances (D, 1) from which the subject is within the slopes."""
         depth, *across = (part - place for part, place in zip(parts, target, strict=True))
         needed = [np.abs(one) / slope + depth for one, slope in zip(across, slopes, strict=True)]
         return np.maximum(1e-3, np.maximum(*needed).max(axis=1, keepdims=True))
@@ -366,8 +368,8 @@ def _axes(directions: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def _in_the_way(standing: FloatArray, targets: FloatArray, positions: FloatArray) -> FloatArray:
-    """How much of views (D,) from places (D, 3) to targets (D, 3) the points (N, 3) before the targets cover; one as
-    far as its target counts 1."""
+    """How much (D,) the points (N, 3) in front of the targets cover views from positions (D, 3) to targets (D, 3); a
+    point as far away as its target counts 1."""
     forward = targets - standing
     distance = np.linalg.norm(forward, axis=1)[:, None]
     depth = (forward @ positions.T - np.sum(forward * standing, axis=1)[:, None]) / distance
