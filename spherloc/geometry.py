@@ -75,6 +75,17 @@ def pose(rotation: FloatArray, translation: FloatArray) -> FloatArray:
     return np.column_stack([rotation, translation])
 
 
+def level_poses(yaws_rad: FloatArray, translations: FloatArray) -> FloatArray:
+    """The poses (P, 3, 4) of rotations by yaws (P,) about y (Eq. 1) and translations (P, 3), m."""
+    poses = np.zeros((len(yaws_rad), 3, 4))
+    poses[:, 0, 0] = poses[:, 2, 2] = np.cos(yaws_rad)
+    poses[:, 0, 2] = np.sin(yaws_rad)
+    poses[:, 2, 0] = -poses[:, 0, 2]
+    poses[:, 1, 1] = 1.0
+    poses[:, :, 3] = translations
+    return poses
+
+
 def camera_centre(cam_from_map: FloatArray) -> FloatArray:
     """Camera position (3,) in the map frame: -R^T t."""
     return -cam_from_map[:, :3].T @ cam_from_map[:, 3]

@@ -27,6 +27,7 @@ KERNEL_SOURCES = (
     "small_arrays.py",
     "gauss_newton.py",
     "narrowing.py",
+    "noise_scale.py",
     "refine.py",
     "solvers",
     "consensus",

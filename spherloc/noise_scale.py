@@ -9,7 +9,8 @@ which is steadier than the matrix where there are few matches).
 
 import numpy as np
 
-from spherloc.problem import AlignedProblem
+from spherloc.gauss_newton import Matches
+from spherloc.kernel_cache import kernel
 from spherloc.types import BoolArray, FloatArray, IntArray
 
 PRIOR_GROUPS = 10.0
@@ -20,34 +21,24 @@ _GENERIC_DIRECTION = np.array([0.7390851332151607, 0.5671432904097838, 0.9159655
 """A direction in which no two different points have the same coordinate, for practical purposes."""
 
 
-def variance_factor(
-    aligned: AlignedProblem, cam_from_map: FloatArray, inliers: BoolArray, noise_px: float, dof: int
-) -> float:
+def variance_factor(matches: Matches, cam_from_map: FloatArray, inliers: BoolArray, noise_px: float, dof: int) -> float:
     """The factor for the covariance of an aligned pose (3, 4) that assumes a noise of ``noise_px``.
 
     ``inliers`` (M,) are the fitted matches, ``dof`` the degrees of freedom of the pose. 1 if there are too few inliers.
     """
     if np.count_nonzero(inliers) <= dof:
         return 1.0
-    points, pixel_jacobian = aligned.points[inliers], aligned.pixel_from_bearing[inliers]
-    ray = points @ cam_from_map[:, :3].T + cam_from_map[:, 3]
-    length = np.linalg.norm(ray, axis=1)[:, None]
-    ray = ray / length
-    residual = np.einsum("nij,nj->ni", pixel_jacobian, ray) / noise_px
-    by_ray = (pixel_jacobian - residual[:, :, None] * noise_px * ray[:, None, :]) / noise_px
-    # A rotation w moves the ray by w x ray at any distance; a translation d by d / distance.
-    by_turn = np.cross(ray[:, None, :], by_ray)
-    jacobian = np.concatenate([by_turn, by_ray / length[..., None]], axis=2)
-    if dof == 4:
-        jacobian = jacobian[:, :, [1, 3, 4, 5]]
-    scale = 1.0 / np.maximum(np.sqrt(np.einsum("nia,nia->a", jacobian, jacobian)), 1e-300)
-    jacobian = jacobian * scale
-    groups = _groups(points, aligned.bearings[inliers])
+    groups = _groups(matches.points[inliers], matches.bearings[inliers])
     count = int(groups.max()) + 1
-    scores = np.zeros((count, dof))
-    np.add.at(scores, groups, np.einsum("nia,ni->na", jacobian, residual))
-    information = np.einsum("nia,nib->ab", jacobian, jacobian) + 1e-12 * np.eye(dof)
-    factor = np.trace(np.linalg.solve(information, scores.T @ scores)) / dof
+    information, scores = np.zeros((6, 6)), np.zeros((count, 6))
+    _add_up(matches, inliers, groups, cam_from_map, float(noise_px), information, scores)
+    squares = scores.T @ scores
+    if dof == 4:
+        without_tilt = np.ix_((1, 3, 4, 5), (1, 3, 4, 5))
+        information, squares = information[without_tilt], squares[without_tilt]
+    scale = 1.0 / np.maximum(np.sqrt(np.diagonal(information)), 1e-300)
+    scale = scale[:, None] * scale
+    factor = np.trace(np.linalg.solve(information * scale + 1e-12 * np.eye(dof), squares * scale)) / dof
     # Each of the two rows of a residual loses half of the pose's degrees of freedom.
     factor *= count / max(count - 0.5 * dof, 1.0)
     factor = (PRIOR_GROUPS + count * factor) / (PRIOR_GROUPS + count)
@@ -55,16 +46,63 @@ def variance_factor(
     return float(factor + shared)
 
 
+@kernel()
+def _add_up(matches, inliers, groups, cam_from_map, noise_px, information, scores):
+    """Add the sum of J' J to ``information`` (6, 6), and the scores J' r to the ``scores`` (G, 6) of their groups.
+
+    J is of a step (w, d), rad and m, from a pose (3, 4). ``groups`` (K,) are the numbers of the groups of the
+    ``inliers`` (M,) among the ``matches``; residuals count in units of ``noise_px``.
+    """
+    jacobian, n = np.empty(6), 0
+    for k in range(len(inliers)):
+        if not inliers[k]:
+            continue
+        x, y, z = cam_from_map[0, 3], cam_from_map[1, 3], cam_from_map[2, 3]
+        for b in range(3):
+            x += cam_from_map[0, b] * matches.points[k, b]
+            y += cam_from_map[1, b] * matches.points[k, b]
+            z += cam_from_map[2, b] * matches.points[k, b]
+        length = np.sqrt(x * x + y * y + z * z)
+        x, y, z = x / length, y / length, z / length
+        for row in range(2):
+            by_x, by_y, by_z = (
+                matches.pixel_jacobian[k, row, 0],
+                matches.pixel_jacobian[k, row, 1],
+                matches.pixel_jacobian[k, row, 2],
+            )
+            residual = by_x * x + by_y * y + by_z * z
+            by_x, by_y, by_z = by_x - residual * x, by_y - residual * y, by_z - residual * z
+            # A rotation w moves the ray by w x ray at any distance; a translation d by d / distance.
+            jacobian[0], jacobian[1], jacobian[2] = y * by_z - z * by_y, z * by_x - x * by_z, x * by_y - y * by_x
+            jacobian[3], jacobian[4], jacobian[5] = by_x / length, by_y / length, by_z / length
+            for a in range(6):
+                jacobian[a] /= noise_px
+                scores[groups[n], a] += jacobian[a] * residual / noise_px
+                for b in range(a + 1):
+                    information[a, b] += jacobian[a] * jacobian[b]
+        n += 1
+    for a in range(6):
+        for b in range(a):
+            information[b, a] = information[a, b]
+
+
 def _groups(points: FloatArray, bearings: FloatArray) -> IntArray:
-    """Group numbers (K,) of the matches: those with the same point or the same bearing are in one group."""
-    by_point = np.unique(points @ _GENERIC_DIRECTION, return_inverse=True)[1]
-    by_bearing = np.unique(bearings @ _GENERIC_DIRECTION, return_inverse=True)[1]
+    """(K,) number of each match's group: those with the same point, or the same bearing, are together."""
+    along_point, along_bearing = points @ _GENERIC_DIRECTION, bearings @ _GENERIC_DIRECTION
     count = len(points)
-    if by_point.max() == count - 1 and by_bearing.max() == count - 1:
+    if _are_different(along_point) and _are_different(along_bearing):
         return np.arange(count)
+    by_point = np.unique(along_point, return_inverse=True)[1]
+    by_bearing = np.unique(along_bearing, return_inverse=True)[1]
     from scipy.sparse import coo_array  # takes a quarter of a second
     from scipy.sparse.csgraph import connected_components
 
     shape = (int(by_point.max()) + int(by_bearing.max()) + 2,) * 2
     edges = coo_array((np.ones(count), (by_point, by_point.max() + 1 + by_bearing)), shape=shape)
     return connected_components(edges, directed=False)[1][by_point].astype(np.int64)
+
+
+def _are_different(values: FloatArray) -> bool:
+    """Whether no two of the ``values`` (K,) are equal."""
+    ordered = np.sort(values)
+    return not (ordered[1:] == ordered[:-1]).any()

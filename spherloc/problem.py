@@ -251,6 +251,11 @@ class AlignedProblem:
         rotation = self.camera_turn.T @ cam_from_map[:, :3] @ self.map_turn
         return pose(rotation, self.camera_turn.T @ cam_from_map[:, 3])
 
+    def unalign_poses(self, cam_from_map: FloatArray) -> FloatArray:
+        """``unalign_pose`` of each of P poses (P, 3, 4)."""
+        rotations = self.camera_turn.T @ cam_from_map[:, :, :3] @ self.map_turn
+        return np.concatenate([rotations, (cam_from_map[:, :, 3] @ self.camera_turn)[:, :, None]], axis=2)
+
     def align_pose(self, cam_from_map: FloatArray) -> FloatArray:
         """The inverse of ``unalign_pose``."""
         rotation = self.camera_turn @ cam_from_map[:, :3] @ self.map_turn.T

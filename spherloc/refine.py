@@ -187,7 +187,7 @@ def record(
     last = path[-1].copy()
     dof, centre, steps = _step_covariance(matches, inliers, last, noise, ROBUST_CODES[options.robust])
     if measured and np.isfinite(steps).all():
-        factor = variance_factor(aligned, last, inliers, options.noise_px, dof)
+        factor = variance_factor(matches, last, inliers, options.noise_px, dof)
         measured_noise = Noise(float(options.noise_px * np.sqrt(factor)), noise.gravity_sd_rad)
         dof, centre, steps = _step_covariance(matches, inliers, last, measured_noise, ROBUST_NONE)
     stage = RefinementStage(
@@ -204,8 +204,7 @@ def record(
 
 def _unaligned(aligned: AlignedProblem, path: FloatArray) -> FloatArray:
     """Poses (K, 3, 4) of the problem's own frames. The ends are those of ``unalign_pose`` to the last bit."""
-    turned = aligned.camera_turn.T @ path
-    turned[:, :, :3] = turned[:, :, :3] @ aligned.map_turn
+    turned = aligned.unalign_poses(path)
     turned[0], turned[-1] = aligned.unalign_pose(path[0]), aligned.unalign_pose(path[-1])
     return turned
 

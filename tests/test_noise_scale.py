@@ -11,6 +11,7 @@ from spherloc.estimators import estimate
 from spherloc.estimators.base import options_type
 from spherloc.geometry import camera_centre
 from spherloc.noise_scale import PRIOR_GROUPS, SHARED_PX, variance_factor
+from spherloc.refine import matches_of
 from spherloc.trace import RefinementStage
 
 
@@ -18,7 +19,9 @@ def factor_of(problem, noise_px=1.0, dof=4):
     """At the true pose, less the part that all matches share."""
     aligned = problem.aligned
     everything = np.ones(len(aligned.points), dtype=bool)
-    found = variance_factor(aligned, aligned.align_pose(problem.truth_cam_from_map), everything, noise_px, dof)
+    found = variance_factor(
+        matches_of(aligned), aligned.align_pose(problem.truth_cam_from_map), everything, noise_px, dof
+    )
     return found - (SHARED_PX / noise_px) ** 2 * len(problem) / dof
 
 
@@ -51,8 +54,8 @@ def test_repeated_matches_count_once(scene_of, same):
 
 def test_too_few_say_nothing(scene_of):
     problem = scene_of("panorama", correspondences=4, outlier_rate=0.0, noise_px=9.0).problem(1)
-    aligned, pose = problem.aligned, problem.truth_cam_from_map
-    assert variance_factor(aligned, pose, np.ones(4, dtype=bool), 1.0, 4) == 1.0
+    matches, pose = matches_of(problem.aligned), problem.truth_cam_from_map
+    assert variance_factor(matches, pose, np.ones(4, dtype=bool), 1.0, 4) == 1.0
 
 
 @pytest.mark.parametrize("gravity_error_deg", [0.0, 1.0])

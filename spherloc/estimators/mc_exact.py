@@ -22,7 +22,7 @@ from spherloc.consensus.two_point_search import TwoPointSearch, search_two_point
 from spherloc.errors import InputError
 from spherloc.estimators.base import Clock, Outcome, check_positive
 from spherloc.gauss_newton import MIN_FOR_SIX_DOF, ROBUST_CAUCHY, Noise, polish
-from spherloc.geometry import pose, yaw_of, yaw_rotation
+from spherloc.geometry import level_poses, pose, yaw_of, yaw_rotation
 from spherloc.last_step import conclude
 from spherloc.problem import AlignedProblem
 from spherloc.refine import RefinementOptions, matches_of, residuals_px
@@ -248,7 +248,7 @@ def _stage(
         finished=found.upper <= most,
         yaw_rad=yaw_of(poses[0][:, :3]) if poses else 0.0,
         clique=aligned.index.astype(np.int32)[clique],
-        cam_from_map=np.array([aligned.unalign_pose(pose) for pose in poses]).reshape(-1, 3, 4),
+        cam_from_map=aligned.unalign_poses(np.array(poses).reshape(-1, 3, 4)),
         support=supports,
     )
 
@@ -278,7 +278,7 @@ def first_pose(
     if not guess.found:
         return None
     best = np.argsort(-guess.support, kind="stable")[: FIRST_STARTS if aligned.gravity_bound_rad > 0.0 else 1]
-    poses = [pose(yaw_rotation(float(guess.yaws_rad[k])), guess.translations[k]) for k in best]
+    poses = list(level_poses(guess.yaws_rad[best], guess.translations[best]))
     if aligned.gravity_bound_rad > 0.0:
         poses += [tilted for level in poses for tilted in _narrowed(aligned, bounds, matches, level)]
     counts = [supported(aligned, one, bounds.noise_px) for one in poses]

@@ -10,7 +10,7 @@ from spherloc.consensus.inliers import mark_each
 from spherloc.consensus.two_point_search import Scoring, TwoPointSearch, search_two_point
 from spherloc.errors import InputError, show
 from spherloc.estimators.base import Clock, Outcome, check_positive, check_switches
-from spherloc.geometry import pose, yaw_rotation
+from spherloc.geometry import level_poses
 from spherloc.last_step import conclude, conclude_as_printed
 from spherloc.problem import AlignedProblem
 from spherloc.refine import RefinementOptions
@@ -76,7 +76,7 @@ class TwoPointRansac:
             reason = f"No pose: none of {search.drawn} sampled pairs has a solution in front of the camera."
             return Outcome((stage,), None, np.zeros(len(aligned.bearings), dtype=bool), reason)
         with clock.stage("refinement", until=1.0):
-            start = pose(yaw_rotation(search.yaws_rad[-1]), search.translations[-1])
+            (start,) = level_poses(search.yaws_rad[-1:], search.translations[-1:])
             if options.as_printed:
                 members = stage.inlier_masks[-1][aligned.index]
                 refined, inliers, refinement = conclude_as_printed(aligned, start, members, bounds, options)
@@ -87,9 +87,7 @@ class TwoPointRansac:
 
 def _stage(aligned: AlignedProblem, bounds: Bounds, search: TwoPointSearch) -> RansacStage:
     """The record of a search, in the problem's own frames and numbers."""
-    hypotheses = zip(search.yaws_rad, search.translations, strict=True)
-    poses = [aligned.unalign_pose(pose(yaw_rotation(yaw), translation)) for yaw, translation in hypotheses]
-    masks = np.zeros((len(poses), aligned.count), dtype=bool)
+    masks = np.zeros((len(search.yaws_rad), aligned.count), dtype=bool)
     masks[:, aligned.index] = mark_each(
         search.yaws_rad,
         search.translations,
@@ -103,7 +101,7 @@ def _stage(aligned: AlignedProblem, bounds: Bounds, search: TwoPointSearch) -> R
         confidence_reached=search.confidence_reached,
         improved_at=search.improved_at,
         samples=aligned.index.astype(np.int32)[search.samples],
-        cam_from_map=np.array(poses).reshape(-1, 3, 4),
+        cam_from_map=aligned.unalign_poses(level_poses(search.yaws_rad, search.translations)),
         inlier_masks=masks,
         locally_optimized=search.locally_optimized,
     )

@@ -338,7 +338,7 @@ def _stage(view: _View, drawn: int, found: list[_Hypothesis], size: int) -> Rans
         confidence_reached=ransac_success_probability(rate, size, drawn),
         improved_at=np.array([item.iteration for item in found], dtype=np.int32),
         samples=aligned.index.astype(np.int32)[np.array([item.sample for item in found], dtype=int).reshape(-1, size)],
-        cam_from_map=np.array([aligned.unalign_pose(item.cam_from_map) for item in found]).reshape(-1, 3, 4),
+        cam_from_map=aligned.unalign_poses(np.array([item.cam_from_map for item in found]).reshape(-1, 3, 4)),
         inlier_masks=np.array([aligned.full_mask(item.mask) for item in found], bool).reshape(-1, aligned.count),
         locally_optimized=np.array([item.fitted for item in found], dtype=bool),
     )
