@@ -246,7 +246,7 @@ BAD = [
     ({"matches": File("long.csv", ROWS)}, r"^long\.csv: has more than 200,000 lines"),
     ({"matches": File("old.csv", ROWS.replace(b"\n", b"\r"))}, r"^old\.csv: has more than 200,000 lines"),
     ({"matches": File("empty.csv", b"")}, r"^empty\.csv: is empty"),
-    ({"matches": File("nul.csv", NUL)}, r"^nul\.csv: byte \d+ is no text"),
+    ({"matches": File("nul.csv", NUL)}, r"^nul\.csv: byte \d+ is not text"),
     ({"matches": File("b.csv", b"\x89PNG\r\n\x1a\n\xff")}, r"^b\.csv: not a CSV text file"),
     ({"matches": File("c.csv", b"u,v,X,Y\n1,2,3,4\n")}, r"^c\.csv: column 'Z' is missing"),
     ({"matches": File("f.csv", (CSV + "=1+1,2,3,4,5\n").encode())}, r"^f\.csv, line 14: u is '=1\+1', not a number"),

@@ -309,7 +309,7 @@ def test_the_list_is_searched_marked_compared_and_exported(office: Office) -> No
     visitor.touch("runs-unfold:outliers")
     until(lambda: runs._range.visible)
     visitor.set(runs._range, "much")
-    until(lambda: runs._problem.visible and "is no range" in runs._problem.content)
+    until(lambda: runs._problem.visible and "is not a range" in runs._problem.content)
     visitor.touch("runs-clear:")
     until(lambda: "3 runs" in visitor.rows and not runs._problem.visible)
 

@@ -162,7 +162,7 @@ def test_ranges_are_chosen_or_typed() -> None:
     assert Look().choose("outliers", "above 95 %").query(NOW).outlier_rate == Range(low=0.95, low_open=True)
     since = Look().choose("when", "last hour").query(NOW).since
     assert since is not None and since.startswith("2026-05-01T11:00")
-    with pytest.raises(InputError, match="is no range"):
+    with pytest.raises(InputError, match="is not a range"):
         Look(outliers="many").query(NOW)
     assert len(Look(text="x" * 5000).query(NOW).text or "") == 200
 

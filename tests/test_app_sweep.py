@@ -178,8 +178,8 @@ def test_wrong_wishes_are_one_sentence(desk: Desk) -> None:
     desk.tick("mc")
     desk.scene = Path("nowhere.toml")
     assert "nowhere.toml: no such file" in said()
-    panel._chosen = lambda: (_ for _ in ()).throw(InputError("the seed 'x' is no whole number; type one."))
-    assert said() == "The seed 'x' is no whole number; type one."
+    panel._chosen = lambda: (_ for _ in ()).throw(InputError("the seed 'x' is not a whole number; type one."))
+    assert said() == "The seed 'x' is not a whole number; type one."
     panel._chosen = lambda: 1 / 0
     assert "This is a bug in the playground" in said()
 

@@ -133,7 +133,7 @@ def test_a_false_story_is_found_out():
     (item, trace) = run.beside[0]
     assert "it succeeds, against what is told" in said(beside=((replace(item, succeeds=False), trace),))
     assert loose_numbers(replace(case, story=f"{case.story} 12,345.5 of them.")) == (
-        "12,345.5 is told, but is no fact",
+        "12,345.5 is told, but is not a fact",
     )
     assert "8.46 is a fact, but is not told" in loose_numbers(replace(case, story="Nothing."))
 

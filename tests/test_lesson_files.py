@@ -107,7 +107,7 @@ def test_the_command_says_what_is_wrong(tmp_path: Path) -> None:
     assert done.returncode == 0 and len(done.stdout.splitlines()) == len(lessons())
     for words, said in (
         (("lesson", "nothing"), "there is no lesson 'nothing'"),
-        (("lesson", "ransac", "--export", str(tmp_path / "no" / "x.html")), "is no folder"),
+        (("lesson", "ransac", "--export", str(tmp_path / "no" / "x.html")), "is not a folder"),
         (("lesson", "--export", "x.html"), "name the lesson"),
     ):
         done = spherloc_here(*words, cwd=tmp_path)

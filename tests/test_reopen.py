@@ -69,7 +69,7 @@ def test_the_scenes_own_seed_is_the_one_that_was_used(tmp_path: Path) -> None:
         ({"scene_path": str(SCENES / ".." / "pyproject.toml")}, "pyproject.toml lies outside"),
         ({"scene_path": str(SCENES / "gone.toml")}, "gone.toml is no longer there"),
         ({"scene_path": str(SCENES)}, "scenes is no longer there"),
-        ({"scene_path": "a\0b"}, "is no path"),
+        ({"scene_path": "a\0b"}, "is not a path"),
         ({"variation": replace(EDITED, camera="/etc/passwd")}, "passwd lies outside"),
         ({"variation": replace(EDITED, noise_px=0.31)}, "gives another problem by now (pixels)"),
         ({"variation": replace(EDITED, hidden=(1,))}, "gives another problem by now (pixels, points"),

@@ -196,7 +196,7 @@ def test_options_of_older_recordings_have_their_defaults_and_are_named(path: Pat
     assert recorded_options(run, path) == recorded_options(old, path) and missing_options(old) == ("robust",)
     with pytest.raises(RecordingError, match="unknown estimator 'gone': choose one of"):
         recorded_options(replace(run, estimator="gone"), path)
-    with pytest.raises(RecordingError, match="are no table"):
+    with pytest.raises(RecordingError, match="are not a table"):
         recorded_options(replace(run, options=[1]), path)  # type: ignore[arg-type]
 
 

@@ -124,8 +124,8 @@ def test_forms_say_the_same(folder: Path, capsys: pytest.CaptureFixture[str]):
         ({"sort": "luck"}, "unknown sort 'luck': choose one of created, "),
         ({"group": "luck"}, "unknown group 'luck'"),
         ({"json": True, "csv": True}, "two forms of one answer"),
-        ({"outliers": "many"}, "'many' is no range"),
-        ({"since": "long ago"}, "'long ago' is no time"),
+        ({"outliers": "many"}, "'many' is not a range"),
+        ({"since": "long ago"}, "'long ago' is not a time"),
         ({"limit": -1}, "--limit -1 is negative"),
         ({"failed": True, "outcome": "success"}, "exclude each other"),
     ],
@@ -216,7 +216,7 @@ def test_as_a_user_calls_it(folder: Path):
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.splitlines()[0].split()[:4] == ["Run", "Estimator", "Outcome", "Diagnosis"]
     assert done.stdout.splitlines()[2].strip() == "recordings/hurried.rrd"
-    assert "'x' is no range" in one_sentence(spherloc_here("runs", "--outliers", "x", cwd=folder.parent))
+    assert "'x' is not a range" in one_sentence(spherloc_here("runs", "--outliers", "x", cwd=folder.parent))
 
 
 def test_steps_are_asked_for_over_all_runs(folder: Path, capsys: pytest.CaptureFixture[str]):

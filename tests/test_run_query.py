@@ -97,7 +97,7 @@ def test_times(text: str, end: bool, expected: str):
     "text", ["", "yesterday", "2026-13-01", "3", "3 months", "-2h", "9999-12-31", "0001-01-01T00:00+14:00"]
 )
 def test_what_is_no_time_is_a_sentence(text: str):
-    with pytest.raises(InputError, match="is no time"):
+    with pytest.raises(InputError, match="is not a time"):
         parse_when(text, NOW, end=True)
 
 

@@ -156,7 +156,7 @@ def _answer_quickly() -> None:
 
 
 def allowed_roots(scene: Path | None, allow: Sequence[Path]) -> tuple[Path, ...]:
-    """Folders from which pages may open scenes; raises ``InputError`` for one that is no folder."""
+    """Folders from which pages may open scenes; raises ``InputError`` for one that is not a folder."""
     for folder in allow:
         if not is_folder(folder):
             raise InputError(f"{folder}: is not a folder; give --allow a folder that exists.")

@@ -8,7 +8,7 @@ from spherloc.errors import InputError
 
 
 def list_lessons(export: Path | None, handout: Path | None) -> int:
-    """Print a line a lesson. Raises ``InputError`` if a file was asked for."""
+    """Print a line for each lesson. Raises ``InputError`` if a file was asked for."""
     if export is not None or handout is not None:
         raise InputError("name the lesson that is to be written; spherloc lesson lists them.")
     from spherloc_viz.lessons import lessons
@@ -32,7 +32,7 @@ def write_lesson(name: str, export: Path | None, handout: Path | None) -> int:
         return 0
     for path in filter(None, (export, handout)):
         if not path.parent.is_dir():
-            raise InputError(f"{path.parent}: is no folder; give a file in one that exists.")
+            raise InputError(f"{path.parent}: is not a folder; give a file in one that exists.")
     from spherloc.warm_up import warm_up
     from spherloc_viz.app.lesson_file import exported, handout_of
     from spherloc_viz.commands.progress import say
@@ -64,7 +64,8 @@ def all_scenes() -> str:
 
 
 def one_kind(name: str) -> str:
-    """How a kind is written, the packages it needs, and bundled scenes. Raises ``InputError`` for an unknown kind."""
+    """An example of a kind, the packages it needs, and its bundled scenes. Raises ``InputError`` for an unknown
+    kind."""
     kind = scene_kind(name)
     if kind.problem:
         raise InputError(f"scenes of kind {name} cannot be read: {kind.problem}")

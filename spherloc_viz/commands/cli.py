@@ -201,7 +201,7 @@ COMMANDS = (
     scenes,
     plugins,
 )
-"""In the order of the overview."""
+"""Commands in the order of the overview."""
 app = SubcommandApp()
 for _command in COMMANDS:
     app.command(_command)
@@ -210,7 +210,7 @@ for _command in COMMANDS:
 def main() -> None:
     """Entry point: every error that a user can cause is one line on stderr and exit code 2."""
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):  # names that are no UTF-8, or a terminal that knows ASCII only
+        if isinstance(stream, io.TextIOWrapper):  # names that are not UTF-8, or an ASCII-only terminal
             stream.reconfigure(errors="backslashreplace")
     try:
         refuse_repeated(sys.argv[1:], COMMANDS)

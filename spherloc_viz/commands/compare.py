@@ -37,14 +37,14 @@ from spherloc_viz.recording.storage.store import RecordingStore
 
 @dataclass(frozen=True)
 class Wanted:
-    """How a comparison is reported."""
+    """Settings of the report of a comparison."""
 
     fail_if: tuple[Condition, ...]
     """Conditions; if one of them holds, the exit code is 1."""
     report: Path | None
     """An HTML file to be written."""
     as_json: bool
-    """Whether it is printed for programs."""
+    """Whether it is printed as JSON for programs."""
 
 
 def wanted(fail_if: Sequence[str], report: Path | None, as_json: bool) -> Wanted:
@@ -76,7 +76,7 @@ def rerun(
     records: Records,
     asked: Wanted,
 ) -> int:
-    """Solve recorded problems again and compare with what they were; returns the exit code.
+    """Solve recorded problems again and compare the results with the recorded ones; returns the exit code.
 
     A recording that cannot be read, or not be solved, is reported and left out. Raises ``SpherlocError`` if no run is
     left, and for options that no run can have.
@@ -130,7 +130,7 @@ def _record(store: RecordingStore, trace: Any, origin: Origin) -> RunRow:
 
 
 def _tell(found: Comparison, before: str, after: str, asked: Wanted) -> int:
-    """Print a comparison, and write its report; 1 if a condition holds that it must not."""
+    """Print a comparison, and write its report; returns 1 if one of the conditions holds."""
     if asked.report is not None:
         _write(asked.report, comparison_html(found, before, after, datetime.now(UTC)))
     failed = [condition for condition in asked.fail_if if condition.holds(found)]

@@ -27,7 +27,7 @@ from spherloc_viz.recording.origin import Origin
 
 ESTIMATOR = "given-pose"
 WITHOUT_POSE = "auto"
-"""Finds what can be found for a query that the other program gave no pose."""
+"""Estimator for queries without a pose of the other program."""
 
 
 def diagnose_poses(
@@ -78,7 +78,7 @@ def diagnose_poses(
 def _problems(
     path: Path | MatchTable, given: Mapping[str, FloatArray]
 ) -> Iterator[tuple[str, Problem | SpherlocError, Origin]]:
-    """The name of the pose, the problem, and where it is from, of each query that has a pose."""
+    """For each query that has a pose: the name of the pose, the problem, and its origin."""
     if isinstance(path, MatchTable):
         for name in path.matches:
             if name in given or path.gravity is not None:

@@ -1,4 +1,4 @@
-"""Types of flags, and a check of those that are given twice where only the last value would count."""
+"""Types of flags, and a check for flags that are given twice although only the last value would count."""
 
 import typing
 from collections import Counter
@@ -14,19 +14,19 @@ OptionalText = Annotated[str | None, tyro.conf.arg(metavar="STR", help_behavior_
 OptionalNumber = Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="")]
 OptionalFloat = Annotated[float | None, tyro.conf.arg(metavar="FLOAT", help_behavior_hint="")]
 OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
-"""These are for flags that may be left out, whose help would else list None beside the type."""
+"""Types of optional flags, whose help would otherwise list None beside the type."""
 Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
 """A switch without a form that begins with --no-."""
 Settings = Annotated[tyro.conf.UseAppendAction[tuple[tuple[str, ...], ...]], tyro.conf.arg(metavar="KEY=VALUE ...")]
-"""Several after one flag, or the flag several times."""
+"""Several values after one flag, or the flag several times."""
 RECORDINGS = Path("recordings")
 INTERRUPTED = 130
-"""Exit code after Ctrl-C, as shells have it."""
+"""Exit code after Ctrl-C, as in shells."""
 _APPEND = typing.get_args(tyro.conf.UseAppendAction[int])[1]
 HINTS = {
     ("run", "--estimator"): "or compare estimators with: spherloc sweep SCENE --estimator A --estimator B",
 }
-"""What else helps, by command and flag."""
+"""Further advice for a repeated flag, by command and flag."""
 
 
 def refuse_repeated(words: Sequence[str], commands: Sequence[Callable[..., Any]]) -> None:
@@ -46,7 +46,7 @@ def refuse_repeated(words: Sequence[str], commands: Sequence[Callable[..., Any]]
 
 
 def _flag(word: str) -> str:
-    """``--record`` for ``--no-record`` too, which says the opposite."""
+    """The flag without "no-": ``--record`` for ``--no-record`` too, which sets the opposite value."""
     name = word.partition("=")[0].replace("_", "-")
     return f"--{name.removeprefix('--no-')}" if name.startswith("--no-") else name
 

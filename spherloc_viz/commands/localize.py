@@ -57,22 +57,22 @@ MAX_TOLD = 5
 
 @dataclass(frozen=True)
 class Solving:
-    """An estimator that localizes a sequence, and where its results go."""
+    """An estimator that localizes a sequence, and the folder of its results."""
 
     estimator: str
-    """Registered name."""
+    """Registered name of the estimator."""
     settings: tuple[str, ...]
     """Its options as "KEY=VALUE"."""
     output: Path
     """Folder of the results."""
     records: Records | None
-    """How the queries are recorded; None if they are not."""
+    """Settings with which queries are recorded; None if they are not recorded."""
     initialise: str | None = None
     """Registered name of the estimator that solves the first query and those after a loss; None if there is none."""
 
     @property
     def label(self) -> str:
-        """As tables and pictures name it."""
+        """Its name in tables and pictures."""
         first = () if self.initialise is None else (f"{self.initialise} +",)
         return " ".join((*first, self.estimator, *self.settings))
 
@@ -156,7 +156,7 @@ def _how(scene: MapScene, item: Solving, seed: int) -> How:
 
 
 def _options(scene: MapScene, estimator: str, settings: Sequence[str]) -> Any:
-    """What ``resolved_options`` gives for every query of the scene."""
+    """The options of ``resolved_options``, which are the same for every query of the scene."""
     given = {} if scene.bound_px is None else {"bound_px": scene.bound_px}
     return options_type(estimator)(**(given | parse_settings(estimator, settings)))
 
@@ -193,7 +193,7 @@ def _work(
                 recorder = recorders[index]
                 if recorder is not None and trace is not None:
                     row = replace(row, recording=recorder.record(trace, row.query))
-                # Its recording is complete by now, so a row never names one that a killed process left unwritten.
+                # Written after the recording, so that a row never names one that a killed process left unfinished.
                 logs[index].append(row)
                 failed += row.status not in POSED
                 advance(f"{failed} without a pose")
@@ -209,14 +209,14 @@ class _Recorder:
     """Records the queries of a sequence."""
 
     store: "RecordingStore"
-    """Of the folder of the recordings."""
+    """Store of the folder of the recordings."""
     scene_path: Path
-    """Absolute."""
+    """Absolute path of the scene file."""
     log: ResultsLog
-    """Of the sequence."""
+    """Log of the sequence's results."""
 
     def record(self, trace: Trace, query: str) -> str | None:
-        """Record a query and return the path as the results name it; None if that one run cannot be drawn.
+        """Record a query and return the path for the results; None if this run cannot be drawn.
 
         Raises ``InputError`` where there is no room, since the next ones would be lost too.
         """
@@ -238,7 +238,7 @@ class _Recorder:
 
 
 def _finish(log: ResultsLog, results: SequenceResults, scene: MapScene) -> None:
-    """Trajectories, picture and summary of all that is done by now."""
+    """Write trajectories, picture and summary of all results so far."""
     from spherloc_viz.plots import trajectory_png
 
     truth = true_trajectory(results)
@@ -252,7 +252,7 @@ def _finish(log: ResultsLog, results: SequenceResults, scene: MapScene) -> None:
 
 
 def _text(results: SequenceResults, summary: Summary) -> str:
-    """The summary for people."""
+    """The summary as text for users."""
     setting = results.configuration
     lines = [
         f"{setting.name} ({setting.scene}), {setting.estimator}, seed {setting.seed}",
@@ -291,7 +291,7 @@ def _text(results: SequenceResults, summary: Summary) -> str:
 
 
 def _trajectory_lines(error: TrajectoryError | None, setting: Configuration) -> Iterator[str]:
-    """ATE and RPE, of all poses."""
+    """Lines on ATE and RPE of all poses."""
     if error is None:
         return
     aligned = [
@@ -305,7 +305,7 @@ def _trajectory_lines(error: TrajectoryError | None, setting: Configuration) -> 
 
 
 def gravity_by_source(rows: Sequence[QueryResult]) -> Iterator[str]:
-    """Of each source: in how many queries, its bounds and its true errors."""
+    """A line for each source of gravity: its number of queries, its bounds and its true errors."""
     by_source: dict[str, list[QueryResult]] = {}
     for row in rows:
         if row.gravity_source:
@@ -353,14 +353,14 @@ NONE = "–"
 
 @dataclass(frozen=True)
 class Compared:
-    """A sequence as one estimator localized it."""
+    """The results of one estimator for a sequence."""
 
     label: str
-    """Of the estimator with its options."""
+    """Name of the estimator with its options."""
     results: SequenceResults
-    """Of all queries that are done."""
+    """Results of all finished queries."""
     summary: Summary
-    """Of these."""
+    """Summary of these results."""
 
 
 def compared(label: str, results: SequenceResults) -> Compared:
@@ -369,7 +369,7 @@ def compared(label: str, results: SequenceResults) -> Compared:
 
 
 def write_comparison(folder: Path, found: Sequence[Compared]) -> str:
-    """Write the table (CSV and Markdown) and a picture a sequence to a folder; gives the table as text for people.
+    """Write the table (CSV and Markdown) and a picture of each sequence to a folder; returns the table as text.
 
     Raises ``InputError`` if they cannot be written.
     """

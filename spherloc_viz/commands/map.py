@@ -57,7 +57,7 @@ def make(
     positions: Path | None,
     features: str,
 ) -> int:
-    """Make the map, and print what came of it and what to do next; 1 if not all images are in it.
+    """Make the map, and print the result and what to do next; returns 1 if not all images are in it.
 
     ``video`` is a file and a number of frames to take from it into ``folder``, ``positions`` a file of where the images
     were taken, and ``features`` one of ``MAP_FEATURES``. Raises ``InputError``.
@@ -88,7 +88,7 @@ def make(
 
 
 def how_of(features: str) -> FrontendOptions:
-    """Features with the matching that is theirs; raises ``InputError`` if they are not known or not installed."""
+    """Features with their usual matching; raises ``InputError`` if they are unknown or not installed."""
     if features not in MAP_FEATURES:
         raise InputError(f"--features is {show(features)}; give {' or '.join(MAP_FEATURES)}.")
     if features == "sift":
@@ -97,7 +97,7 @@ def how_of(features: str) -> FrontendOptions:
 
 
 def about_features(made: Map) -> str:
-    """Which features were taken, and which others could have been."""
+    """A sentence on the features that were used, and on others that could be used."""
     if made.features == "sift":
         there = "" if trained.installed() else ", with the extra 'learned'"
         return f"SIFT; ALIKED with LightGlue is --features aliked{there}"
@@ -151,7 +151,7 @@ def _units_unknown(made: Map) -> str:
 
 
 def summary(made: Map, found: Photographs) -> list[str]:
-    """What came of it, in lines."""
+    """The result in lines of text."""
     written, missing = made.written, [view.name for view in found.views if view.name not in made.written.poses]
     lines = [
         f"in the map    {len(written.poses)} of {len(found.views)} images, {len(written.points):,} points, "
@@ -177,7 +177,7 @@ THUMBNAIL_PX = 240
 MAX_THUMBNAILS = 40
 MAX_POINTS = 20_000
 WITHIN = 0.98
-"""Share of the points that the picture shows: a few far ones would make the rest small."""
+"""Share of the points that the picture shows: a few far points would make the others too small."""
 
 STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem; color: #1b1f24; }
@@ -187,7 +187,7 @@ td.number { text-align: right; } img { max-width: 100%; } .out { color: #a11; }
 
 
 def map_report(made: Map, found: Photographs) -> str:
-    """A page without any other file."""
+    """The report as a page that needs no other files."""
     written, views = made.written, found.views
     names = [view.name for view in views]
     scale = made.scale.source or "unknown: one unit is the usual distance between two neighbouring images"
@@ -345,5 +345,5 @@ def _tell(what: dict[str, Any]) -> None:
 
 if __name__ == "__main__":
     if hasattr(os, "nice"):
-        os.nice(5)  # the page that started it goes before
+        os.nice(5)  # lower priority than the page that started it
     sys.exit(main(Path(sys.argv[1]), Path(sys.argv[2])))

@@ -1,4 +1,4 @@
-"""How far a long job is, on stderr, and jobs that Ctrl-C ends at once."""
+"""Progress of long jobs on stderr, and jobs that Ctrl-C ends at once."""
 
 import sys
 import time
@@ -16,13 +16,13 @@ from spherloc.trace import Trace
 from spherloc.watch import Watch
 
 LINE_EVERY_S = 30.0
-"""Where the output is no terminal, progress is a line now and then."""
+"""Seconds between two lines of progress if stderr is not a terminal."""
 BAR_AFTER_S = 1.0
-"""Jobs that end sooner show nothing."""
+"""Least duration of a job, seconds, before its progress is shown."""
 
 
 def say(sentence: str) -> None:
-    """One line on stderr."""
+    """Print one line on stderr."""
     tqdm.write(f"spherloc: {sentence}", file=sys.stderr)  # above the bar, if there is one
     sys.stderr.flush()
 
@@ -73,6 +73,6 @@ def solve(problem: Problem, estimator: str, options: Any, seed: int) -> Trace:
 
 
 def prepare(scene: MapScene) -> None:
-    """Have the scene do what it needs once for all queries, and show how far it is."""
+    """Let the scene prepare what all queries need, and show its progress."""
     with progress(len(scene.references), "references") as advance:
         scene.prepare(lambda done, count: advance(""))

@@ -32,10 +32,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Records:
-    """How runs are recorded."""
+    """Settings of the recording of runs."""
 
     folder: Path
-    """Of the recordings."""
+    """Folder of the recordings."""
     full: bool = False
     """Whether every arc and edge is kept."""
     keep_gigabytes: float | None = None
@@ -118,7 +118,7 @@ def _origin(path: Path, scene: Scene, seed: int | None, query: str | None, varia
 
 @contextmanager
 def store_of(records: Records | None) -> "Iterator[RecordingStore | None]":
-    """Who records runs, in a folder from which the leftovers of killed processes are gone.
+    """The store of recordings, after unfinished files of killed processes in its folder have been recovered.
 
     Raises ``InputError`` for a wrong size to be kept.
     """
@@ -139,7 +139,7 @@ def store_of(records: Records | None) -> "Iterator[RecordingStore | None]":
 
 
 def _problem(path: Path, scene: Scene, seed: int | None, query: str | None, variation: Variation) -> Problem:
-    """A scene's problem; what its loader and its front end skipped is said."""
+    """A scene's problem; the remarks of its loader and its front end are printed."""
     try:
         changed = variation.scene(scene)
         if not isinstance(changed, MapScene):
@@ -236,9 +236,9 @@ def _gravity(problem: Problem) -> str:
 
 
 def as_text(path: Path, trace: Trace, diagnosis: Diagnosis, recording: Path | None) -> str:
-    """A run as a few lines for people."""
+    """A run as a few lines of text for users."""
     metrics, pose = evaluate(trace), trace.cam_from_map
-    # What an untrusted recording says must not steer the terminal.
+    # Texts of an untrusted recording must not control the terminal.
     name = "".join(letter if letter.isprintable() else " " for letter in trace.problem.name)
     lines = [f"{name} ({path}), {trace.estimator}, seed {trace.seed}"]
     if pose is None:

@@ -229,7 +229,7 @@ def _limit(limit: int | None, form: str) -> int | None:
 
 
 def _refresh(index: RunIndex, read: Callable[[Progress], Refreshed] | None = None) -> None:
-    """Read what is new, by ``index.refresh`` if nothing else is given; files that are no runs are a line."""
+    """Read what is new, by ``index.refresh`` if nothing else is given; files that are not runs are one line."""
     if skipped := _read_files(read or index.refresh).skipped:
         say(f"{_count(len(skipped), 'file')} left out, such as {show(skipped[0][0])}; spherloc reindex says why.")
 

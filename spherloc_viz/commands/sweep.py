@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from spherloc_viz.recording.storage.store import RecordingStore
 
 PRUNE_EVERY = 100
-"""Runs of a sweep, of which the workers record some in a second."""
+"""Number of recorded runs between two checks of the folder's size; workers record several runs a second."""
 
 
 def sweep(
@@ -46,7 +46,7 @@ def sweep(
     out: Path,
     records: Records | None = None,
 ) -> tuple[Point, ...]:
-    """Do the runs that ``out`` has not got; returns what all of them come to.
+    """Do the runs that ``out`` does not have yet; returns the summary of all runs.
 
     Without ``records`` they are not recorded. Raises ``InputError`` for whatever makes the sweep impossible.
     """
@@ -98,7 +98,7 @@ class Recorded:
         self._store, self._lost = store, 0
 
     def keep(self, cluster: bool) -> Keep:
-        """What records a run where it is done."""
+        """The function that records a run in its worker."""
         from spherloc_viz.recording.storage.store import SweepStore
 
         folder = self._store.folder.resolve()
@@ -107,7 +107,7 @@ class Recorded:
         return SweepStore(folder)
 
     def complain(self, sentence: str) -> None:
-        """A run could not be recorded: of many, the first one says why."""
+        """Note that a run could not be recorded; only for the first one the reason is printed."""
         self._lost += 1
         if self._lost == 1:
             say(f"{sentence} The sweep goes on.")
@@ -127,12 +127,12 @@ class Recorded:
 
 
 def bundled_simulations() -> tuple[Path, ...]:
-    """Bundled scenes over whose properties a sweep can go."""
+    """Bundled scenes whose properties a sweep can vary."""
     return tuple(path for path in bundled_scenes().values() if isinstance(load_scene(path), SyntheticScene))
 
 
 def all_estimators() -> tuple[str, ...]:
-    """Those that are registered and can be used."""
+    """Registered estimators that can be used."""
     return usable_estimators()
 
 
@@ -153,7 +153,7 @@ def text_of(table: Table) -> str:
 
 
 Points = Mapping[float, Sequence[Point]]
-"""Of each value of the second property."""
+"""Points of the sweep for each value of the second property."""
 PANEL_INCHES, DPI = (5.6, 4.2), 120
 MAX_COLUMNS = 3
 

@@ -33,7 +33,7 @@ from spherloc_viz.commands.verify_pictures import FIGURES, failure_table, figure
 
 PAGE, TABLES, RESULTS, RUNS = "index.md", "tables.md", "claims.json", "runs"
 MAX_BYTES = 10_000_000
-"""Of the results of an earlier time."""
+"""Largest file of earlier results."""
 
 
 def verify(
@@ -44,7 +44,7 @@ def verify(
     only: Sequence[str] = (),
     datasets: Mapping[str, Path] | None = None,
 ) -> int:
-    """Do the runs that ``output`` has not got, and write the page; returns the exit code, which is 0.
+    """Do the runs that ``output`` does not have yet, and write the page; returns the exit code, which is 0.
 
     ``only`` are keys of experiments and datasets; all if there are none. ``datasets`` are folders, by key. Raises
     ``InputError`` for an experiment that does not exist, and for whatever makes the runs or the page impossible.
@@ -98,7 +98,7 @@ def _file_name(experiment: str, camera: str) -> str:
 
 
 def _runs(path: Path, title: str, plan: SweepPlan, workers: int, scheduler: str | None) -> list[SweepRow]:
-    """All rows of a plan: those of earlier times, and those that are done now."""
+    """All rows of a plan: those of earlier runs of the command, and those that are done now."""
     with SweepLog(path, plan) as log:
         left = plan.rows - log.done_of_plan()
         if left:
@@ -164,20 +164,21 @@ Table VI 2P10k, SVD10k, ML10k and R+* draw 10,000; MC draws none. That one comma
 
 @dataclass(frozen=True)
 class SessionResult:
-    """A session as one method localized it."""
+    """The result of one method for a session."""
 
     dataset: str
     """Key of the dataset."""
     session: str
-    """As the paper's tables have it."""
+    """Name of the session in the paper's tables."""
     method: str
     """Key of ``TABLE_METHODS``."""
     summary: Summary
-    """Of its queries."""
+    """Summary of its queries."""
 
 
 def run_sessions(folders: Mapping[str, Path], output: Path, quick: bool) -> list[SessionResult]:
-    """Localize every session of the datasets in ``folders`` (by key) by every method; what is done is not done again.
+    """Localize every session of the datasets in ``folders`` (by key) by every method; finished queries are not
+    repeated.
 
     Scene files and results go to ``output``; a scene file that is there already stays, so that it can say what a copy
     of a dataset has elsewhere. Raises ``InputError`` for a folder that is not the dataset's.
@@ -217,7 +218,8 @@ def _session(dataset: Dataset, session: Session, output: Path, quick: bool) -> l
 
 
 def tables_text(found: Sequence[SessionResult]) -> str:
-    """Markdown of the paper's tables as printed, each with what was measured here below it, or how to."""
+    """Markdown of the paper's tables as printed, each followed by the numbers measured here, or by how to measure
+    them."""
     parts = [TABLES_HEAD]
     for key, table in printed_tables().items():
         limits = f" ({table['limits']})" if "limits" in table else ""
@@ -242,7 +244,7 @@ def tables_text(found: Sequence[SessionResult]) -> str:
 
 
 def _statements() -> str:
-    """What the paper's text says of its tables, each with a verdict."""
+    """The paper's sentences about its tables, each with a verdict."""
     lines = ["## What the text says of the tables\n", "| where | sentence | printed | verdict |", "|---|---|---|---|"]
     for statement, holds, ours in printed_findings():
         verdict = "the table says so" if holds else "**the table does not**"
@@ -251,7 +253,7 @@ def _statements() -> str:
 
 
 def measured_table(found: Sequence[SessionResult]) -> str:
-    """Markdown of what was measured."""
+    """Markdown of the measured numbers."""
     return _markdown(*_measured(found))
 
 

@@ -29,7 +29,7 @@ from spherloc.verification.measured import Cell, Measured, Place, succeeded
 from spherloc_viz.options import typed
 
 PLAYGROUND = "http://127.0.0.1:8080/"
-"""Where ``spherloc play`` listens."""
+"""Address of ``spherloc play`` in the links of the page."""
 WORDS: dict[Verdict, str] = {
     Verdict.REPRODUCES: "**reproduces**",
     Verdict.ONLY_IF: "**only if**",
@@ -82,7 +82,7 @@ need no browser; `spherloc play` lists what they recorded.
 
 
 def verification_page(checked: Sequence[Checked], quick: bool, made: Sequence[str]) -> str:
-    """The page. ``made`` are the keys of the experiments that were run for it."""
+    """The page of the claims. ``made`` are the keys of the experiments that were run for it."""
     parts = [HEAD]
     if quick:
         parts.append(QUICK)
@@ -143,7 +143,7 @@ def _commands(checked: Sequence[Checked]) -> str:
 
 
 def _changes(place: Place) -> list[str]:
-    """What is set of the simulation, as "KEY=VALUE"."""
+    """Settings of the simulation at a place, as "KEY=VALUE"."""
     experiment = next(one for one in EXPERIMENTS if one.key == place.experiment)
     value = f"{int(place.value)}" if experiment.over == "correspondences" else f"{place.value:g}"
     return [*settings_of(experiment.plan(place.camera).variation), f"{experiment.over}={value}"]
@@ -154,7 +154,7 @@ def _options(place: Place) -> list[str]:
 
 
 def address(place: Place, seed: int) -> str:
-    """Of a run on a playground of this machine."""
+    """Address of a run on a playground of this machine."""
     pairs = [("v", "1"), ("scene", load_scene(scene_path(Path(SCENES[place.camera]))).name), ("seed", str(seed))]
     pairs += [("set", text) for text in _changes(place)]
     pairs.append(("estimator", METHODS[place.method].estimator))
@@ -163,7 +163,7 @@ def address(place: Place, seed: int) -> str:
 
 
 def command(place: Place, seed: int) -> str:
-    """The same run in a terminal."""
+    """Command that does the same run in a terminal."""
     options = f" --option {' '.join(_options(place))}" if METHODS[place.method].changes else ""
     return (
         f"spherloc run {SCENES[place.camera]} --seed {seed} --set {' '.join(_changes(place))} "
@@ -175,9 +175,9 @@ PHASES = "phases.svg"
 """File of the picture of when to choose which."""
 CASE_CAMERA = "Kannala-Brandt"
 WIDE_KEYS = ("wide-fig6", "alike")
-"""Experiments of the page of the baselines beside those that end in ``WIDE_VIEW``."""
+"""Experiments of the page of the baselines, besides those whose keys end in ``WIDE_VIEW``."""
 ENOUGH = 6
-"""Right matches that a pinhole solver must see to have a chance: oDLT's least number."""
+"""Number of right matches that a pinhole solver must see to have a chance: the least number for oDLT."""
 
 WHEN = f"""\
 # When to choose which framework
@@ -197,17 +197,17 @@ works on the whole sphere: success in % at each outlier rate, the same bound, sa
 """
 
 Plans = Mapping[tuple[str, str], SweepPlan]
-"""By key of experiment and camera."""
+"""Plans by the keys of experiment and camera."""
 
 
 Page = str
-"""Markdown."""
+"""Text of a page in Markdown."""
 
 
 def part_pages(
     measured: Measured, plans: Plans, pictures: Mapping[tuple[str, str], str], quick: bool
 ) -> dict[str, str]:
-    """The pages by file name, each where one of its experiments is among the ``plans``.
+    """The pages by file name; a page is made if one of its experiments is among the ``plans``.
 
     ``pictures`` are names of files beside them, by key of experiment and camera.
     """
@@ -313,7 +313,7 @@ def _baselines(measured: Measured) -> str:
 
 
 def _rates(measured: Measured, key: str, title: str, words: str = "", times: bool = False) -> str:
-    """Success of every method at every value, with Wilson's interval of the last one, and the time there."""
+    """Table of the success of every method at every value, with Wilson's interval and the time at the last one."""
     values, names = measured.values(key, PAPERS_CAMERA), measured.methods(key, PAPERS_CAMERA)
     if not names:
         return ""
@@ -338,7 +338,7 @@ def _rate(cell: Cell | None, time: bool) -> str:
 
 
 def _wide_cases(measured: Measured) -> str:
-    """Table VI of the baselines with wide views, and what each view sees."""
+    """Table VI for the baselines with wide views, and the numbers of matches in each view."""
     lines = ["## Table VI with wide views\n"]
     lines.append(
         "Success within 1° and 0.1 m, 10,000 samples; random problems with the numbers of Table VI, 3 px of noise.\n"
@@ -373,7 +373,7 @@ def _wide_cases(measured: Measured) -> str:
 
 
 def _seen(key: str, view_deg: float) -> tuple[IntArray, IntArray]:
-    """How many matches, and how many right ones, of each problem of a case are inside a view."""
+    """Numbers of matches, and of right ones, inside a view, for each problem of a case."""
     experiment = next(item for item in EXPERIMENTS if item.key == key + WIDE_VIEW)
     scene = load_scene(scene_path(Path(SCENES[CASE_CAMERA])))
     variation = replace(experiment.variation, correspondences=int(experiment.values[0]))
@@ -430,7 +430,7 @@ def _quartiles(values: FloatArray) -> str:
 
 
 def settings_table(plans: Plans) -> str:
-    """What was run, exactly: values, seeds, methods with their options."""
+    """The exact settings of the runs: values, seeds, methods with their options."""
     lines = ["## Settings\n"]
     lines.append("| experiment | camera | over | set | problems a point | seeds | methods |")
     lines.append("|---|---|---|---|---|---|---|")

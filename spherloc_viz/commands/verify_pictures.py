@@ -1,4 +1,4 @@
-"""The paper's figures, drawn of our own runs: Figs. 5 to 7 as SVG, Figs. 8 to 10 of sessions of a dataset."""
+"""The paper's figures, drawn from our own runs: Figs. 5 to 7 as SVG, Figs. 8 to 10 from sessions of a dataset."""
 
 import io
 from collections import Counter
@@ -36,9 +36,9 @@ DPI = 110
 PANEL_INCHES = (4.2, 4.4)
 MAX_COLUMNS = 3
 FIGURE_METHODS = ("MC", "2P100", "ML100", "mc-exact")
-"""Of the figures; the paper has the first three."""
+"""Methods in the figures; those of the paper are the first three."""
 RIGHT, WRONG, REJECTED = "#1a9850", "#f28e2b", "#d73027"
-"""An inlier that is right, one that is not, and a match that is no inlier."""
+"""Colours of a right inlier, a wrong inlier, and a match that is not an inlier."""
 
 
 FAILURES = """\
@@ -62,7 +62,7 @@ Session {session}: the bluer, the smaller the error (up to {limit:g} m); crosses
 second difference of the positions, small where the way is what the paper calls smooth.
 """
 LIMIT_M = 0.5
-"""Errors beyond it have one colour in Fig. 10."""
+"""Error beyond which all have one colour in Fig. 10."""
 
 
 def failure_table(results: Path) -> str:
@@ -125,7 +125,7 @@ class Inliers:
     label: str
     """The method."""
     mask: BoolArray
-    """(N,) its inliers."""
+    """(N,) mask of its inliers."""
 
 
 def inliers_png(
@@ -135,7 +135,7 @@ def inliers_png(
     right: BoolArray | None,
     several: Sequence[Inliers],
 ) -> bytes:
-    """PNG of Fig. 8: query and its first reference beside each other, a line a match, a panel a method.
+    """PNG of Fig. 8: query and first reference side by side with a line for each match, and a panel for each method.
 
     Inliers are green, those that are not ``right`` (N,) orange, all other matches thin and red. Matches with other
     references are left out. The same input gives the same bytes.
@@ -199,7 +199,7 @@ def _panel(
     limit_m: float,
     colors: LinearSegmentedColormap,
 ) -> PathCollection | None:
-    """Draw one method; returns what the colours are of, None if there is no pose."""
+    """Draw one method; returns the coloured artist for the colour bar, None if there is no pose."""
     places = (results.positions_m @ turn.T)[:, [0, 2]]
     errors = np.linalg.norm(results.positions_m - results.true_positions_m, axis=1)
     axes.plot(*truth.T, color="0.7", linewidth=2.5, zorder=1)
@@ -237,12 +237,12 @@ BOXES: Mapping[str, str] = {"MC": "#7b2d8b", "2P100": "#1b6ca8", "SVD100": "#c77
 """Methods of Fig. 5 and their colours."""
 COLORS = ("#7b2d8b", "#c06fd0", "#1b6ca8", "#5fb3e6", "#c77d0a", "#3a8a3a", "#8fce6b", "#b02a30", "#111111", "#777777")
 DASHES: Mapping[bool, tuple[int, tuple[int, ...]]] = {True: (0, ()), False: (0, (4, 2))}
-"""Of methods as printed, and of this project's own forms."""
+"""Line styles of methods as printed, and of this project's own forms."""
 MIN_ERROR = {"rotation_error_deg": 1e-3, "t_error_m": 1e-4}
-"""Where the logarithmic axes of errors start: what is below is rounding."""
+"""Lower ends of the logarithmic axes of errors; smaller errors are rounding."""
 WIDTH_INCHES, HEIGHT_INCHES = 11.0, 4.2
 ENOUGH = 0.95
-"""Success from which on a method is one to choose."""
+"""Least success rate of a method that can be recommended."""
 PHASE_CAMERA = "MEI"
 CANNOT_BE_KNOWN = "cannot be known: chance gives as large a set"
 NONE_IS_ENOUGH = "no method in 95 %"
@@ -270,8 +270,8 @@ def figure_svg(experiment: str, camera: str, over: str, measured: Measured) -> s
 
 
 def phase_svg(measured: Measured) -> str:
-    """SVG of which estimator is the quickest that is right in 95 % of the problems, over outlier rate and number of
-    matches, and of where the right answer cannot be known: where chance gives sets as large as the right one."""
+    """SVG of the quickest estimator that is right in 95 % of the problems, over outlier rate and number of matches, and
+    of the region where the answer cannot be known: where chance gives sets as large as the right one."""
     with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": "spherloc", "font.size": 9}):
         figure = Figure(figsize=(WIDTH_INCHES, HEIGHT_INCHES), layout="constrained")
         FigureCanvasSVG(figure)

@@ -151,7 +151,7 @@ MEASURES: Mapping[str, Callable[[Trace], float]] = {
     "at_most": lambda trace: _known(None if trace.certificate is None else trace.certificate.upper_bound),
     "nfa": lambda trace: _known(None if trace.certificate is None else trace.certificate.nfa),
 }
-"""By name: counts of matches, pairs and samples, errors against the truth, and what is proven."""
+"""Facts by name: counts of matches, pairs and samples, errors against the truth, and proven bounds."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -324,13 +324,13 @@ def agrees(told: float, measured: float, slack: float = 0.0) -> bool:
 
 
 def loose_numbers(case: GalleryCase) -> tuple[str, ...]:
-    """Numbers of the story that are no fact, no setting and not quoted, and facts that it does not tell."""
+    """Numbers of the story that are neither facts nor settings nor quoted, and facts that it does not mention."""
     plays = (case, *case.beside)
     facts = {float(value) for item in plays for value in item.facts.values()}
     known = facts | {float(value) for value in case.quoted} | {float(value) for value in _numbers(plays)}
     told = {float(text.replace(",", "")): text for text in _NUMBER.findall(_CITATION.sub("", case.story))}
     return tuple(
-        [f"{text} is told, but is no fact" for value, text in told.items() if value not in known]
+        [f"{text} is told, but is not a fact" for value, text in told.items() if value not in known]
         + [f"{value:g} is a fact, but is not told" for value in sorted(facts - told.keys()) if value]
     )
 

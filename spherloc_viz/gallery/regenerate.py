@@ -45,7 +45,7 @@ def regenerate(cases: Sequence[GalleryCase], folder: Path, say: Callable[[str], 
     """Run and record the cases and print a line for each; returns how many fail otherwise than they are told.
 
     ``say`` is told what takes a while, and what is not as it is told. Raises ``RecordingError`` if a recording cannot
-    be written, or would replace a file that is none of the gallery's.
+    be written, or would replace a file that does not belong to the gallery.
     """
     for case in cases:
         _refuse_other(folder / f"{case.key}.rrd")
@@ -76,7 +76,7 @@ def _refuse_other(path: Path) -> None:
     except RecordingError:
         own = False
     if not own:
-        raise RecordingError(f"{path}: is there already and is none of the gallery's; give another --output.")
+        raise RecordingError(f"{path}: exists and does not belong to the gallery; give another --output.")
 
 
 def record(played: Played, folder: Path) -> list[Path]:

@@ -171,7 +171,7 @@ def _field(words: str, state: str, form: Form) -> str:
             f'<span class="slider"><input type="range" min="{first}" max="{last}" step="{step}" value="{value}" '
             f'data-key="{escape(key)}"{" data-percent" * percent} aria-label="{escape(name)}"><b>{shown}</b></span>'
         )
-    raise InputError(f"the text has {show('{' + words + '}')}, which is no number and no control.")
+    raise InputError(f"the text has {show('{' + words + '}')}, which is neither a number nor a control; correct it.")
 
 
 def _inline(text: str, state: str, form: Form) -> str:

@@ -145,7 +145,7 @@ def _quoted(table: Mapping[str, object], where: str) -> dict[float, str]:
         try:
             found[float(number)] = str(source)
         except ValueError:
-            raise InputError(f"{where}: quoted has {show(number)}, which is no number.") from None
+            raise InputError(f"{where}: quoted has {show(number)}, which is not a number; correct it.") from None
     return found
 
 

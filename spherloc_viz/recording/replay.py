@@ -53,7 +53,7 @@ class RecordedScene:
 def load_recorded_scene(path: Path) -> RecordedScene:
     """The scene of a recording (.rrd), which may be untrusted: another process reads it first.
 
-    Raises ``RecordingError``, in one sentence, if there is no such file or it is no whole recording of ours.
+    Raises ``RecordingError``, in one sentence, if there is no such file or it is not a complete recording of spherloc.
     """
     path = Path(path)
     check_recording_file(path)
@@ -83,7 +83,7 @@ def recorded_options(run: RecordedRun, where: Path) -> Any:
     except InputError as error:
         raise RecordingError(f"{where}: {error}") from None
     if not isinstance(run.options, Mapping):
-        raise RecordingError(f"{where}: its options are no table; record the run again.")
+        raise RecordingError(f"{where}: its options are not a table; record the run again.")
     known = {item.name: item for item in option_fields(kind)}
     for name, value in run.options.items():
         if name not in known:
@@ -426,4 +426,4 @@ def _forbidden(file: str, roots: Sequence[Path]) -> str:
             return f"{Path(file).name} lies outside the folders that pages may open scenes from"
         return "" if path.is_file() else f"{Path(file).name} is no longer there"
     except (OSError, ValueError, RuntimeError):  # a path with a NUL, or a loop of links
-        return f"{show(file)} is no path"
+        return f"{show(file)} is not a path"

@@ -136,7 +136,7 @@ class SimulationControls:
         return Variation(camera=camera, true_camera=self._true_camera, **changes)
 
     def write(self, scene: SyntheticScene | None, variation: Variation) -> None:
-        """Show a scene with a variation; nothing of a scene that is no simulation."""
+        """Show the settings of a scene with a variation; none for a scene that is not a simulation."""
         self._folder.visible = scene is not None
         for widget in (self._points, self._noise, self._outliers, self._kind):
             widget.visible = scene is not None

@@ -26,7 +26,7 @@ class Row:
     """One line of a listing."""
 
     kind: Literal["folder", "scene", "other"]
-    """"other" is a TOML file that is no scene."""
+    """Kind of the entry; "other" is a TOML file that is not a scene."""
     name: str
     """File name."""
     place: str

@@ -241,7 +241,7 @@ class OpenPanel:
         """Beside the folder, where the command would make it, or in it if what is beside it is not allowed."""
         folder = self._roots.find(place)
         if not folder.is_dir():
-            raise InputError("this is no folder; choose one from the list.")
+            raise InputError("this is not a folder; choose one from the list.")
         above = folder if self._roots.place(folder.parent) is None else folder.parent
         self._map.start(folder, above / f"{folder.name}{OUTPUT}")
 

@@ -128,7 +128,7 @@ def check_matches(file: File) -> None:
         raise InputError(f"{file.title}: is empty; upload a CSV with the columns u, v, X, Y, Z.")
     nul = file.content.find(b"\0")
     if nul >= 0:
-        raise InputError(f"{file.title}: byte {nul} is no text; upload a CSV with the columns u, v, X, Y, Z.")
+        raise InputError(f"{file.title}: byte {nul} is not text; upload a CSV with the columns u, v, X, Y, Z.")
     # Rows end with \n, \r or both; a quoted line break makes this too many, never too few.
     ends = file.content.count(b"\n") + file.content.count(b"\r") - file.content.count(b"\r\n")
     if ends > MAX_ROWS:

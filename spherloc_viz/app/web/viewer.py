@@ -96,7 +96,7 @@ class Viewable:
 def of_index(index: RunIndex) -> Callable[[str], Viewable]:
     """Finds runs by the names of their files in an index's folder: those examined before, and what passes examination.
 
-    What it returns raises ``RecordingError`` for what is no recording there, or none of ours.
+    The returned function raises ``RecordingError`` for a file that is not a recording there, or not one of spherloc's.
     """
 
     def find(file: str) -> Viewable:

@@ -208,7 +208,7 @@ def follow_changes(client: viser.ClientHandle, pressed: Callable[[Any], None]) -
 
 
 def _hear(client: viser.ClientHandle, changes: Changes, message: Any, pressed: Callable[[Any], None]) -> None:
-    """Take over what a user has changed, and call the callbacks, which are no coroutines."""
+    """Take over what a user has changed, and call the callbacks, which are not coroutines."""
     if not (isinstance(message.uuid, str) and isinstance(message.updates, dict)):
         return
     gui: Any = client.gui

@@ -100,7 +100,7 @@ def _can_be_written(value: Any) -> bool:
 
 
 def scene_text(path: str | None) -> str | None:
-    """The text of a scene file; None if it is no TOML of moderate size, or cannot be read."""
+    """The text of a scene file; None if it is not TOML of moderate size, or cannot be read."""
     if path is None or not path.endswith(".toml"):
         return None
     try:
@@ -135,7 +135,7 @@ def _run_row(trace: Trace) -> Row:
 def problem_from_row(row: Row, where: str) -> Problem:
     """The recorded problem, bit for bit.
 
-    Raises ``SpherlocError`` if the row describes none, and ``KeyError`` or ``TypeError`` if it is no problem's row.
+    Raises ``SpherlocError`` if the row describes none, and ``KeyError`` or ``TypeError`` if it is not a problem's row.
     """
     image = None if row["image"] is None else Path(row["image"])
     references = tuple(Path(text) for text in row.get("reference_images", ()))
@@ -222,7 +222,7 @@ def _unpacked(told: dict[str, Any], arrays: pa.ListArray) -> dict[str, Row]:
         for key, kind, shape in part[ARRAYS]:
             dtype, end = np.dtype(kind), at
             if dtype.kind not in "biuf" or any(size < 0 for size in shape):
-                raise ValueError(f"{key} is no array of numbers")
+                raise ValueError(f"{key} is not an array of numbers")
             end += dtype.itemsize * math.prod(shape)
             row[key], at = content[at:end].view(dtype).reshape(shape), end
             row[key].setflags(write=False)

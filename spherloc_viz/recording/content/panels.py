@@ -47,9 +47,9 @@ class Panels:
 
     arcs: bool
     graph: bool
-    """As the viewer's own graph."""
+    """Whether there is a graph in the viewer's own graph view."""
     large_graph: bool
-    """As lines and dots."""
+    """Whether there is a graph drawn as lines and dots."""
     residuals: bool
 
 

@@ -114,7 +114,8 @@ REVIEW_PROPERTY = "review"
 MAX_CHARACTERS = 2_000
 """Longest text in a row; a longer one is cut."""
 NOT_RECORDED = {"file", "run_id", "labels", "note", "size_bytes", "thumbnail"}
-"""Fields of a row that are no part of the property ``run``: they belong to the file or the review, or are a picture."""
+"""Fields of a row that are not part of the property ``run``: they belong to the file or the review, or are a
+picture."""
 
 _KINDS: dict[type, pa.DataType] = {str: pa.utf8(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
 RUN_TYPES: dict[str, pa.DataType] = {

@@ -16,7 +16,7 @@ except ImportError:  # Windows
     fcntl = None
 
 FILE_NAME = "runs.sqlite"
-"""In the folder of the recordings."""
+"""Name of the index file in the folder of the recordings."""
 APPLICATION = 0x53504852
 """SQLite's application id of the file: "SPHR"."""
 VERSION = 4

@@ -112,7 +112,7 @@ def _labels(told: str) -> tuple[str, ...]:
     except (ValueError, RecursionError):
         labels = None
     if not isinstance(labels, list) or not all(isinstance(label, str) for label in labels):
-        raise DamagedError("labels are no list of texts")
+        raise DamagedError("labels are not a list of texts")
     return tuple(labels)
 
 
@@ -134,9 +134,9 @@ SORT_KEYS = (
     "steps",
     "size_bytes",
 )
-"""By what runs can be sorted; those without a value come last in both directions."""
+"""Columns by which runs can be sorted; runs without a value come last in both directions."""
 GROUP_KEYS = ("diagnosis", "outcome", "estimator", "scene", "source", "label", "problem_key")
-"""By what runs can be counted."""
+"""Columns by which runs can be counted."""
 OUTCOMES = ("success", "failure", "unknown")
 SOURCES = ("page", "command", "sweep", "sequence", "gallery", "unknown")
 PAGE_KEPT = 100
@@ -234,7 +234,7 @@ def parse_range(text: str) -> Range:
     if _ALONE.fullmatch(text):
         number = _finite(text)
         return Range(number - EQUAL * abs(number), number + EQUAL * abs(number))
-    raise InputError(f"{show(text)} is no range: give one such as '>0.9', '<=3', '0.5..0.9' or '0.9'.")
+    raise InputError(f"{show(text)} is not a range: give one such as '>0.9', '<=3', '0.5..0.9' or '0.9'.")
 
 
 def _finite(text: str) -> float:
@@ -259,7 +259,7 @@ def parse_when(text: str, now: datetime, end: bool = False) -> str:
         return _iso(when + timedelta(days=1) if end and re.fullmatch(r"\d{4}-\d\d-\d\d", text) else when)
     except (ValueError, OverflowError):
         pass
-    raise InputError(f"{show(text)} is no time: give a date such as 2026-01-31, 2026-01-31T08:30, or 2h, 3d or 1w ago.")
+    raise InputError(f"{show(text)} is not a time: give one such as 2026-01-31, 2026-01-31T08:30, or 2h, 3d or 1w ago.")
 
 
 def _iso(when: datetime) -> str:

@@ -92,7 +92,7 @@ class Refreshed:
     removed: int
     """Runs whose files are gone."""
     skipped: tuple[tuple[str, str], ...]
-    """Files that are no runs, or whose labels cannot be read, each with a sentence that says why; those found at an
+    """Files that are not runs, or whose labels cannot be read, each with a sentence that says why; those found at an
     earlier time too."""
 
 

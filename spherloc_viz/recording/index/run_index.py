@@ -51,7 +51,7 @@ class Found:
     """A page of the runs that a query finds."""
 
     rows: tuple[RunRow, ...]
-    """In the query's order."""
+    """The runs in the query's order."""
     total: int
     """How many there are on all pages."""
 
@@ -255,7 +255,7 @@ class RunIndex:
         """List new and changed recordings of the folder, and forget those that are gone.
 
         Of a file its start is read, where it says what is listed. ``progress`` is told how many of how many are read.
-        Files that are no runs are skipped and named in the answer.
+        Files that are not runs are skipped and named in the answer.
         """
         return self._refresh("new", progress, read or (lambda paths: list_side_by_side(paths, self.examiners)))
 
@@ -338,7 +338,7 @@ class RunIndex:
             connection.execute("COMMIT")
             return result
         except UnicodeDecodeError as error:
-            raise DamagedError("bytes that are no text") from error
+            raise DamagedError("bytes that are not text") from error
         except (OverflowError, UnicodeError) as error:
             raise RecordingError(f"{self.path}: cannot list or find a text or number ({error}).") from error
         finally:

@@ -354,4 +354,4 @@ def _is_moderate_image(content: bytes) -> bool:
             Image.DecompressionBombError,
             Image.DecompressionBombWarning,
         ) as error:
-            raise ValueError(f"the query image is no JPEG ({show(str(error))})") from error
+            raise ValueError(f"the query image is not a JPEG ({show(str(error))})") from error

@@ -20,7 +20,7 @@ def kept_bytes(gigabytes: float | None, folder: Path) -> int:
     """The size that the recordings in ``folder`` may have, in bytes; infinity keeps all.
 
     If no size is given, a folder that holds more than usual already keeps that much: a sweep with a larger limit made
-    it, and to open it must not delete anything. Raises ``InputError`` for what is no size.
+    it, and to open it must not delete anything. Raises ``InputError`` for a text that is not a size.
     """
     if gigabytes is None:
         return max(KEEP_BYTES, _held_bytes(folder))

@@ -110,9 +110,9 @@ def _merged(part: Path, mended: Path) -> bool:
 
 
 NEWEST_KEPT = 20
-"""The last runs stay whatever they are: somebody may be looking at them."""
+"""Number of the newest runs that are never deleted, since they may be in use."""
 LOG_NAME = "pruned.log"
-"""In the folder of the recordings: a line for every run that was deleted."""
+"""File in the folder of the recordings with a line for every deleted run."""
 AT_ONCE = 50
 
 
