@@ -389,7 +389,7 @@ PLACES: Mapping[str, Callable[[CaseMaker], Cloud]] = {
     "below": _below,
     "behind": _behind,
 }
-"""Where right matches may lie, other than all over the cube. Some turn the camera towards them."""
+"""Places of the points of right matches, other than all over the cube. Some turn the camera towards them."""
 
 
 def failure_case(cause: str, seed: int) -> FailureCase:

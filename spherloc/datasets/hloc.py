@@ -196,7 +196,8 @@ bound_deg = 5.0                            # how far a query's roll and pitch ma
 """
 
 GRAVITY_BOUND_DEG = 5.0
-"""A reference's roll and pitch are not the query's: cameras are held by hand."""
+"""Default bound on the difference of a query's roll and pitch from its most similar reference's: cameras are
+handheld."""
 
 
 def load(table: dict[str, Any], path: Path) -> MapScene:

@@ -42,9 +42,10 @@ bound_deg = 5.0                  # how far a query's roll and pitch may be from 
 """
 
 GRAVITY_BOUND_DEG = 5.0
-"""A reference's roll and pitch are not the query's: cameras are held by hand."""
+"""Default bound on the difference of a query's roll and pitch from its most similar reference's: cameras are
+handheld."""
 _MIN_NANOSECONDS = 10**17
-"""Timestamps from here on, March 1973, are nanoseconds; smaller ones may be running numbers."""
+"""Least timestamp, March 1973, that counts as nanoseconds; smaller ones may be running numbers."""
 _SELECTION = {"images", "devices", "timestamps", "every"}
 
 

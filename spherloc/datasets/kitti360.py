@@ -49,12 +49,13 @@ camera = "image_02"            # or "image_03"
 THRESHOLDS = ((1.0, 0.5), (2.0, 1.0), (5.0, 2.0))
 """Limits (degrees, metres) of Table II."""
 GRAVITY_BOUND_DEG = 2.0
-"""Roll and pitch are the reference's: a car's differ by slopes and springs, about a degree on the same street."""
+"""Default bound on the difference of a query's roll and pitch from its most similar reference's: on the same street a
+car's differ by about a degree, by slopes and springs."""
 GRAVITY_MAP = np.array([0.0, 0.0, -1.0])
-"""The world's z axis points up."""
+"""Gravity in the map frame, whose z axis points up."""
 MAX_SCANS = 99
 _LAST_FRAME = 10**10 - 1
-"""Frames are named by ten digits."""
+"""Largest frame number: frames are named by ten digits."""
 
 
 def load(table: dict[str, Any], path: Path) -> MapScene:

@@ -45,7 +45,7 @@ class MapScene:
     where: str
     """Path of the scene file, for messages."""
     queries: tuple[View, ...]
-    """In the order of the sequence; at least one."""
+    """Query images in the order of the sequence; at least one."""
     references: tuple[View, ...]
     """Images of the map, with poses; at least one."""
     matcher: Matcher

@@ -61,11 +61,11 @@ def read_dpt(path: Path) -> NDArray[np.float32]:
 
 GRAVITY_MAP = (0.0, 0.0, -1.0)
 GRAVITY_BOUND_DEG = 2.0
-"""The scanner stands on a levelled tripod."""
+"""Default bound on the error of gravity: the scanner stands on a levelled tripod."""
 REGISTRATION_M = (0.4, 0.6, 0.8)
 """Limits of Table III on the registration error, m."""
 CAMERA_FROM_BLENDER = np.diag([1.0, -1.0, -1.0])
-"""Poses have Blender's camera axes: x right, y up, z backward."""
+"""Rotation from Blender's camera axes (x right, y up, z backward), which the poses have, to OpenCV's."""
 AT_CAMERA = np.eye(3, 4)
 MAX_POSE_BYTES = 4096
 

@@ -106,13 +106,13 @@ def _check_header(path: Path) -> None:
 TOLERANCE = 1e-3
 """Largest difference of the singular values of a scaled rotation, as a share of the scale: typed ones are rounded."""
 MIN_SPREAD = 0.02
-"""Positions whose second extent is a smaller share of the first lie on a line, which fixes no rotation about it."""
+"""Least ratio of the second to the first extent of positions; below it they lie on a line and do not fix a rotation."""
 FARTHEST = 1e9
 """Largest absolute coordinate of a position, in the units of its frame."""
 WORST_FIT = 0.1
 """Largest residual, as a share of the positions' extent: beyond it they are not the same positions."""
 MIN_USED = 0.8
-"""Share of the positions that must fit: three of four always do, whatever they are."""
+"""Least share of the positions that must fit: of four arbitrary positions, three always fit."""
 _REMEDY = "give map_from_model"
 _ROUNDS = 30
 _INLIER_MEDIANS = 4.0
@@ -231,7 +231,7 @@ THRESHOLDS = ((2.0, 0.25), (5.0, 0.5), (8.0, 1.0))
 GRAVITY_BOUND_DEG = 3.0
 """Largest error of the IMU's filter for a walking person and a gyroscope with a bias of 0.01 rad/s."""
 GRAVITY_MAP = np.array([0.0, 0.0, -1.0])
-"""The ground truth's z axis points up: it was registered to a levelled laser scan."""
+"""Gravity in the map frame: the ground truth's z axis points up, since it was registered to a levelled laser scan."""
 MAX_GAP_S = 0.5
 """Longest gap of the ground truth over which poses are interpolated; it has 10 poses a second."""
 MAP_REACH_M = 60.0

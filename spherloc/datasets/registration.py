@@ -19,7 +19,7 @@ from spherloc.geometry import pose, so3_exp, transform
 from spherloc.types import FloatArray
 
 SAMPLES = 6000
-"""Directions, spread evenly over the sphere, in which a depth map is looked up."""
+"""Number of directions, spread evenly over the sphere, in which a depth map is sampled."""
 NORMAL_STEP_PX = 3.0
 """Distance of the neighbours that a surface's normal is taken from."""
 ROUNDS = 40
@@ -31,7 +31,7 @@ FITS_M = 0.1
 MIN_FIT = 0.4
 """Share of the query's upright surfaces that must lie within ``FITS_M`` of the map: floors fit anywhere."""
 UPRIGHT = 0.7
-"""A surface is upright if its normal has less than this along gravity."""
+"""A surface counts as upright if the component of its unit normal along gravity is less than this."""
 
 
 class Registration(Protocol):

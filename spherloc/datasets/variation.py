@@ -1,4 +1,4 @@
-"""What is changed about a scene before it is solved: its simulation, its camera, and single matches by hand."""
+"""Changes to a scene before it is solved: to its simulation, its camera, and single matches."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace

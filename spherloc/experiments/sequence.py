@@ -82,7 +82,7 @@ def localize(
 def localize_by_each(
     scene: MapScene, queries: Iterable[tuple[View, Sequence[int]]], hows: Sequence[How]
 ) -> Iterator[tuple[int, QueryResult, Trace | None]]:
-    """As ``localize``, each query by several estimators after it was matched once.
+    """Like ``localize``, but each query is matched once and solved by several estimators.
 
     Each query comes with the indices of the ``hows`` that are to solve it, each result with the index of its own.
     """

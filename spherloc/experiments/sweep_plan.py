@@ -83,7 +83,7 @@ class SweepPlan:
     scene_sha256: str
     """Hash of its content."""
     variation: Variation
-    """What is changed about the scene at all points."""
+    """Changes to the scene that hold at all points."""
     camera_sha256: str | None
     """Hash of the file of the variation's camera, if it has one."""
     over: str

@@ -1,7 +1,7 @@
 """COLMAP's database: keypoints and verified matches of all images, also of those that COLMAP could not localize.
 
 It is a SQLite file, which is opened for reading only and whose triggers and views are not run. Keypoints have the
-centre of the top-left pixel at (0.5, 0.5), as ours. Layout: doc/database.rst of COLMAP 4.2.
+centre of the top-left pixel at (0.5, 0.5), as here. Layout: doc/database.rst of COLMAP 4.2.
 """
 
 import sqlite3

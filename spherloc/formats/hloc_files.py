@@ -104,7 +104,7 @@ class Hdf5:
 
     path: Path
     root: Any
-    """Its h5py.File."""
+    """The ``h5py.File``."""
 
     def array(self, names: Sequence[str], kinds: str, dimensions: int) -> NDArray | None:
         """The dataset at the end of groups and its name, or None if there is none.

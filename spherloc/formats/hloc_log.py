@@ -1,7 +1,7 @@
 """hloc's logs (``results.txt_logs.pkl``): the matches of every query and the pose that came of them.
 
 A log is a pickle, which is read without running anything in it, see ``pickle_data``. Its pixels have the centre of the
-top-left one at (0.5, 0.5), as ours. Logs of hloc up to 1.3 have the points' coordinates, and quaternions that begin
+top-left one at (0.5, 0.5), as here. Logs of hloc up to 1.3 have the points' coordinates, and quaternions that begin
 with w; later ones have ids of points of the COLMAP model, and objects of pycolmap, whose quaternions end with w.
 """
 

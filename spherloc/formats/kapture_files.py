@@ -28,11 +28,11 @@ class Record:
     """One image."""
 
     timestamp: int
-    """As in the file: nanoseconds, or a running number."""
+    """Timestamp as in the file: nanoseconds, or a running number."""
     device: str
     """The sensor that took it."""
     image: str
-    """Its path below sensors/records_data."""
+    """Path of the image below sensors/records_data."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,7 +140,7 @@ def _camera(parameters: list[str], place: str) -> Camera:
 
 
 def _rigs(path: Path, sensors: set[str]) -> dict[str, dict[str, FloatArray | None]]:
-    """By member and rig; raises ``InputError`` where a rig holds itself."""
+    """``member_from_rig`` (3, 4) by member and rig; raises ``InputError`` if a rig holds itself."""
     rigs: dict[str, dict[str, FloatArray | None]] = {}
     what = "rig_id, sensor_id, qw, qx, qy, qz, tx, ty, tz"
     for place, (rig, member, *words) in _fields(path, what, 9, 9):

@@ -29,7 +29,7 @@ FARTHEST_ORIGIN_M = 1e9
 ROTATION_TOLERANCE = 1e-3
 """Rotations written with four digits are about this far from orthonormal."""
 SIDES = {"image_02": "left", "image_03": "right"}
-"""Where the fisheye cameras look."""
+"""Side to which each fisheye camera looks."""
 _POINT_BYTES = 16
 _TIME = re.compile(r"(\d{4}-\d\d-\d\d) (\d\d:\d\d:\d\d)(\.\d{1,9})?")
 
@@ -47,7 +47,7 @@ class Rig:
 
 @dataclass(frozen=True)
 class Drive:
-    """Where the files of one sequence are."""
+    """The paths of the files of one sequence."""
 
     root: Path
     number: int

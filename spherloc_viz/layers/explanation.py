@@ -1,4 +1,4 @@
-"""Explains why a run accepted or rejected a correspondence, by its pairs, its residuals and the truth."""
+"""Explains why a run kept or rejected a correspondence, by its pairs, its residuals and the truth."""
 
 from dataclasses import dataclass
 
@@ -216,13 +216,13 @@ class Explanation:
     stages: tuple[str, ...]
     """Its part in the stages of the run, in words."""
     verdict: str
-    """Whether it was accepted or rejected, and whether rightly, in a few words."""
+    """Whether it was kept or rejected, and whether rightly, in a few words."""
     reason: str
     """The reason in one or two sentences."""
 
 
 def explain(trace: Trace, number: int, alternative_cam_from_map: FloatArray | None = None) -> Explanation:
-    """Explain why the run accepted or rejected the correspondence of that index in the problem.
+    """Explain why the run kept or rejected the correspondence of that index in the problem.
 
     ``alternative_cam_from_map`` (3, 4) is another pose to hold it against, as a diagnosis may know one; the poses that
     an exact search verified are looked at too. Raises ``IndexError`` if the problem has no such correspondence.

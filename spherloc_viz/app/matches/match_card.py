@@ -1,4 +1,4 @@
-"""The card about the selected matches: whether the run accepted them and why, and how they can be changed."""
+"""The card about the selected matches: whether the run kept them and why, and how they can be changed."""
 
 from html import escape
 from pathlib import Path
@@ -100,7 +100,7 @@ class MatchCard:
         cover a click on the left.
 
         ``alternative_cam_from_map`` (3, 4) is another pose from a diagnosis, with which a match is compared. ``hidden``
-        leaves out whether the run accepted the matches.
+        leaves out whether the run kept the matches.
         """
         if self._panel.visible != bool(selected):
             self._panel.visible = bool(selected)
@@ -132,7 +132,7 @@ class MatchCard:
 
 
 def one_html(trace: Trace, what: Explanation, kept: NDArray, editable: bool) -> str:
-    """The card of one match: whether the run accepted it and why, and how it can be changed."""
+    """The card of one match: whether the run kept it and why, and how it can be changed."""
     title = f'<span style="font-size:15px;font-weight:600">Match {kept[what.number]}</span>'
     color = style.OUTLIER if "wrongly" in what.verdict else style.INLIER if what.kept else None
     look = f"color:{style.css_text(color)};font-weight:600" if color else "font-weight:600"

@@ -215,7 +215,7 @@ def _residuals_html(residuals: Residuals | None, selected: tuple[int, ...]) -> s
 
 
 def _legend_html(judged: str) -> str:
-    """The meaning of the colours: here whether a match is right, elsewhere whether the run accepted it."""
+    """The meaning of the colours: here whether a match is right, elsewhere whether the run kept it."""
     dots = "".join(
         f'<span style="margin-right:1.1em">{dot_html(color)}{words}</span>'
         for color, words in ((style.INLIER, "right"), (style.OUTLIER, "wrong"))

@@ -73,9 +73,9 @@ class Keypoints:
     """Dots on the image, a primitive of recordings."""
 
     pixels: FloatArray
-    """(N, 2) in the recorded image."""
+    """(N, 2) pixels in the recorded image."""
     colors: ByteArray
-    """(N, 3)."""
+    """(N, 3) colours, sRGB."""
 
 
 def query_image(problem: Problem) -> QueryImage:
@@ -214,9 +214,9 @@ class Bars:
     left: NDArray[np.float64]
     """(K,) left edges."""
     heights: NDArray[np.float64]
-    """(K,)."""
+    """(K,) heights."""
     widths: NDArray[np.float64]
-    """(K,)."""
+    """(K,) widths."""
     color: tuple[int, int, int]
     opacity: float = 1.0
 
