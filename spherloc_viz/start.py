@@ -1,4 +1,4 @@
-"""Where the command line begins, before anything large is imported: all commands on one screen if none is named."""
+"""Start of the command line, before anything large is imported: lists all commands on one screen if none is named."""
 
 import os
 import signal

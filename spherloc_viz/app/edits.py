@@ -100,7 +100,7 @@ class Edits:
             return replace(request, variation=replace(request.variation, **changes))
 
     def places(self, kept: NDArray[np.int64]) -> Numbers:
-        """Where the selected matches are in a problem in which the matches ``kept`` (N,) are left."""
+        """Indices of the selected matches in a problem with only the matches of the numbers ``kept`` (N,)."""
         return tuple(np.flatnonzero(np.isin(kept, self._selected)).tolist())
 
 

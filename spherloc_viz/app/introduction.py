@@ -63,7 +63,7 @@ OPENING = ("yaw-clique", "consensus-bound")
 
 
 def opening_step(steps: Sequence[StepHeading]) -> int:
-    """Where a page opens: at the yaw ring of the run that was found, or else at the outcome."""
+    """Index of the step at which a page opens: that of the found yaw or, without one, the outcome."""
     keys = [step.key for step in steps]
     return next((keys.index(key) for key in OPENING if key in keys), len(keys) - 1)
 

@@ -51,7 +51,7 @@ class PageView:
     theme: str
     answers_hidden: bool = False
     viewpoint: tuple[float, ...] = ()
-    """Where the viewer stands (3), what it looks at (3), and its field of view, degrees; empty for the step's own."""
+    """The viewer's position (3), target (3), and field of view, degrees; empty for the step's own view."""
 
 
 def link_of(

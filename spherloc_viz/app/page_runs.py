@@ -36,7 +36,7 @@ class Submitted:
 
     trace: Trace
     promised: Path
-    """Where its recording will be, unless the very same run is recorded already."""
+    """Path at which it will be recorded; not used if the same run is recorded already (``before``)."""
     before: Path | None = None
     """The recording of the very same run, if there is one: a reload, or undo, makes no second one."""
     written: bool = False

@@ -278,7 +278,7 @@ def _is_loopback(listener: socket.socket) -> bool:
 
 
 def _address(listener: socket.socket) -> str:
-    """Where a browser finds a server; of one that listens on all addresses, at the one that others see."""
+    """Address of a server for a browser; for a server that listens on all addresses, the one that others see."""
     host, port = listener.getsockname()[:2]
     if ipaddress.ip_address(host).is_unspecified:
         host = _outward_address(listener.family) or host

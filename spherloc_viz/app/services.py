@@ -90,7 +90,7 @@ class Services:
     roots: tuple[Path, ...] = ()
     """Folders that pages may open scenes from."""
     recorder: Recorder | None = None
-    """Where settled runs go; None if they are not recorded."""
+    """Recorder of the runs; None if runs are not recorded."""
     library: RunLibrary | None = None
     """The recordings that pages review; None if there is no folder of them."""
     downloads: Downloads = field(default_factory=Downloads)

@@ -93,7 +93,7 @@ def hidden_html(withheld: frozenset[str], buttons: bool) -> str:
 
 
 def opening_html(label: str) -> str:
-    """In place of a run's summary, while another scene is opened."""
+    """Text that is shown in place of a run's summary while another scene is opened."""
     words = f"<b>Opening {escape(label)} …</b> What is below still belongs to the scene before."
     return box(words, "font-size:12.5px;padding-top:.2em")
 

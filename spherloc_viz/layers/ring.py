@@ -18,7 +18,7 @@ FOOT = 2.05
 HEIGHT = 0.9
 """Height of the outline at its peak, in sphere radii."""
 END = FOOT + HEIGHT + 0.15
-"""Where lines through the ring end, in sphere radii."""
+"""Radius at which lines through the ring end, in sphere radii."""
 HIDES_RAD = np.radians(4.0)
 """Least angle between two lines that can be told apart."""
 DEGREES = 360

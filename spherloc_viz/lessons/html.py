@@ -52,7 +52,7 @@ def live_number(name: str) -> str:
 
 
 LIVE = Form(live_number, lambda state: state, lambda state, changes: changes, controls=True)
-"""Beside the playground."""
+"""Form of a lesson beside the playground, with live numbers and controls."""
 
 
 def printed(numbers: Mapping[str, str], images: Callable[[str], str]) -> Form:

@@ -19,7 +19,7 @@ PLAY_S = 3.0
 SHORT = 0.4
 """Share of that time that the steps of a long stage stay, but for the last, which says what came of them."""
 LONG_STAGE = 6
-"""From this many steps on a stage is long."""
+"""Least number of steps of a long stage."""
 PACES = {"1×": 1.0, "2×": 2.0, "4×": 4.0, "½×": 0.5}
 PREVIOUS, NEXT, PLAY, PAUSE = "Previous", "Next", "Play", "Pause"
 BACK, ON = "Previous stage", "Next stage"
@@ -160,7 +160,7 @@ def titles_of(steps: Sequence[StepHeading], told: int) -> tuple[str, ...]:
 
 
 def moved(steps: Sequence[StepHeading], index: int, move: str) -> int:
-    """Where a button leads from a step."""
+    """Index of the step to which a button leads from the step at ``index``."""
     starts = [k for k, step in enumerate(steps) if k == 0 or step.stage != steps[k - 1].stage]
     if move == BACK:
         return max((start for start in starts if start < index), default=0)

@@ -45,7 +45,7 @@ class Listing:
     """Place of the folder above, if that may be looked into."""
     rows: tuple[Row, ...]
     page: int
-    """From 0."""
+    """Index of the page of the listing, from 0."""
     pages: int
     remarks: tuple[str, ...]
     """What is not shown and why, in sentences."""

@@ -238,7 +238,7 @@ class OpenPanel:
         self._say("")
 
     def _make_map(self, place: str) -> None:
-        """Beside the folder, where the command would make it, or in it if what is beside it is not allowed."""
+        """Make a map: beside the folder, as the command does, or inside it if pages may not write beside it."""
         folder = self._roots.find(place)
         if not folder.is_dir():
             raise InputError("this is not a folder; choose one from the list.")

@@ -28,7 +28,7 @@ from spherloc_viz.recording.run_row import RunRow
 
 RUNS, GALLERY = "runs", "gallery"
 VIEW = "Recordings"
-"""By this name the page tells whether the tab is to be seen."""
+"""Name by which the page reports whether the tab is visible."""
 
 
 @dataclass(frozen=True)

@@ -146,7 +146,7 @@ def _remark(opened: Opened, run: Run, is_it: bool) -> str:
 
 
 def _ways(row: RunRow, run: Run | None) -> str:
-    """Where one can go from here: the step that decided, the run itself, the Rerun viewer."""
+    """Buttons that lead from the card to the key step, to the run itself, and to the Rerun viewer."""
     ways = []
     if run is None:
         ways.append(_way("run-return:", "back to the recorded run"))

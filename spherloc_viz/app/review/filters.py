@@ -70,7 +70,7 @@ class Look:
     sort: str = "created"
     descending: bool = True
     page: int = 0
-    """From 0."""
+    """Index of the page of the list, from 0."""
     unfolded: str = ""
     """The filter whose values are offered."""
 

@@ -19,7 +19,7 @@ from spherloc_viz.recording.replay import Reopened
 from spherloc_viz.recording.run_row import RunRow
 
 FOLDER = "gallery"
-"""In the folder of recordings: where the cases' recordings are, once they were made."""
+"""Name of the folder, inside the folder of recordings, of the cases' recordings."""
 
 
 class GalleryList:

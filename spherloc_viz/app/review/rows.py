@@ -15,7 +15,7 @@ from spherloc_viz.recording.run_row import RunRow
 from spherloc_viz.recording.sandbox.checks import is_thumbnail
 
 DESK = "/desk"
-"""Where the desk is (``app/web/desk.py``)."""
+"""Address of the desk (``app/web/desk.py``)."""
 WIDTH_PX, HEIGHT_PX = 64, 46
 """Size of a row's picture."""
 PREVIOUS_KEY, NEXT_KEY = "[", "]"
@@ -155,7 +155,7 @@ def _hint(row: RunRow) -> str:
 
 
 def pages_html(look: Look, total: int, start: bool | None) -> str:
-    """Where in the list one is, and what turns it.
+    """The position in the list, and the buttons that turn its pages.
 
     Above the list also how it is sorted, what exports it and, with ``start``, what opens one run after another; below
     it (``start`` is None) nothing more.

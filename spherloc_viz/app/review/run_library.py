@@ -34,7 +34,7 @@ class RunLibrary:
 
     @property
     def folder(self) -> Path:
-        """Where the recordings are."""
+        """Folder of the recordings."""
         return self._index.folder
 
     def version(self) -> tuple[int, ...]:

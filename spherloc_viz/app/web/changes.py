@@ -20,7 +20,7 @@ class Changes:
         self._lock = threading.Lock()
         self._newest = 0
         self._numbers: dict[str, int] = {}
-        """By what was changed: the number of its change, or of the change that it was set in answer to."""
+        """By name of the changed thing: the number of its change, or of the change to which it was set as an answer."""
         self.gesture = 0
         """Counts the presses and keys on the page: changes of one drag have the same."""
 

@@ -27,10 +27,10 @@ class Touch:
     argument: str
     """The part behind the colon. Untrusted: it must be checked."""
     x: float
-    """Where the press ended."""
+    """Place at which the press ended, with ``y``."""
     y: float
     from_x: float
-    """Where it began: elsewhere if it was a drag."""
+    """Place at which the press began, with ``from_y``; a drag ends at another place."""
     from_y: float
     extend: bool
     """Whether Shift, Ctrl or Cmd was held."""
