@@ -14,7 +14,7 @@ from spherloc.consensus.yaw_arcs import yaw_arcs
 from spherloc.estimators import estimate
 from spherloc.trace import ConsensusStage, Trace, TranslationStage
 from spherloc_viz import style
-from spherloc_viz.app.plots.graph_view import MAX_EDGES, cell_nodes, edges_of, graph_html, matrix_png
+from spherloc_viz.app.plots.graph_view import MAX_EDGES, cell_nodes, edges_of, graph_html, graph_note, matrix_png
 from spherloc_viz.layers import graph_begins, paint, steps
 from spherloc_viz.layers.primitives import Graph
 from spherloc_viz.layers.translation import MAX_NODES, ball_nodes
@@ -122,3 +122,15 @@ def test_more_nodes_are_thinned_evenly(mc: Trace) -> None:
     np.testing.assert_array_equal(
         nodes.agrees, apart[np.ix_(nodes.number, nodes.number)] & ~np.eye(MAX_NODES, dtype=bool)
     )
+
+
+def test_the_note_is_true_of_one_node_and_of_few(mc: Trace) -> None:
+    found = graphs(mc)
+    notes = {key: graph_note(graph, edges_of(graph)) for key, graph in found.items()}
+    assert notes["balls-pair"].startswith("One ball: no edge yet, and a matrix of one cell.")
+    for key, graph in found.items():
+        shown, total = int(graph.shown.sum()), edges_of(graph).total
+        if shown > 1:
+            assert f"each of the {shown:,} nodes." in notes[key]
+            assert ("no edge" in notes[key]) == (total == 0)
+        assert "All 0" not in notes[key] and "All 1 " not in notes[key]

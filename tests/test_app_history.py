@@ -221,9 +221,14 @@ def test_edits_belong_to_a_problem() -> None:
 
 def test_opening_a_wish_takes_over_its_edits() -> None:
     edits = Edits()
+    edits.apply(SCENE)
+    edits.select((3, 40))
+    edits.write(replace(SCENE, variation=Variation(spoiled=(1,))))
+    assert edits.selected == (3, 40), "Undo and Redo keep the selection"
     variation = Variation(spoiled=(1,), mended=(2,), hidden=(5,))
     opened = replace(SCENE, seed=4, variation=variation)
     edits.write(opened)
+    assert edits.selected == (), "numbers of other matches"
     assert edits.apply(replace(opened, variation=Variation())).variation == variation
     edits.show_all()
     assert edits.apply(replace(opened, variation=Variation())).variation == replace(variation, hidden=())

@@ -228,12 +228,32 @@ def test_the_decision_has_its_reason_and_its_numbers(exact: Trace) -> None:
     ],
 )
 def test_the_certificate_is_in_the_outcome(exact: Trace, certificate: Certificate, said: str, knowable: bool) -> None:
-    trace = replace(exact, certificate=certificate)
+    mask = np.arange(len(exact.problem)) < certificate.lower_bound
+    trace = replace(exact, certificate=certificate, inlier_mask=mask)
     picture, rows = at(trace, "outcome"), dict(outcome_table(trace).rows)
     assert said in rows["certificate"] and said.lower() in picture.step.caption.lower()
     assert ("warning" in rows) != knowable
     assert ("The answer cannot be known" in picture.step.note) != knowable
     assert "certificate" not in dict(outcome_table(replace(exact, certificate=None)).rows)
+
+
+@pytest.mark.parametrize(
+    ("more", "bounds", "proof", "why"),
+    [
+        (0, (0, 0), "Proven optimal: no pose explains more than {}", ""),
+        (1, (0, 0), "Before refinement {}, which is proven optimal: no pose explains more", "Refinement makes"),
+        (-1, (0, 0), "Before refinement {}, which is proven optimal: no pose explains more", "can go beyond either"),
+        (1, (2, 0), "so at most 2 more than the {} of the best known pose", "Refinement makes"),
+    ],
+)
+def test_a_certificate_of_another_number_than_the_inliers_is_explained(
+    exact: Trace, more: int, bounds: tuple[int, int], proof: str, why: str
+) -> None:
+    best = int(np.count_nonzero(exact.inlier_mask)) + more
+    trace = replace(exact, certificate=Certificate(best + bounds[0], best + bounds[1], 1e-30))
+    assert dict(outcome_table(trace).rows)["certificate"].endswith(proof.format(best))
+    note = at(trace, "outcome").step.note
+    assert why in note and ("count" in note) == bool(why)
 
 
 @pytest.mark.parametrize("size", [2, 3, 6])

@@ -58,6 +58,22 @@ def test_every_match_is_in_one_bin_of_each_histogram(run: Trace) -> None:
     assert residuals.histograms[0].bound[1] == pytest.approx(run.options.bound_px)
 
 
+def test_the_bound_shown_is_the_one_that_chose_the_inliers(scene_of: SceneOf) -> None:
+    """By the noise where the tilt was estimated, else with gravity's error on top of it."""
+    problem = scene_of("mei", gravity_error_deg=0.5).problem()
+    seen = set()
+    for sd_deg in (np.inf, 0.0):
+        run = estimate(problem, "ransac-2p", RansacOptions(gravity_sd_deg=sd_deg))
+        residuals = residuals_of(run)
+        assert residuals is not None
+        px = residuals.histograms[0]
+        inside = residuals.px <= px.bound[0] - 1e-9
+        assert not np.any(inside & ~run.inlier_mask) and not np.any((residuals.px > px.bound[2]) & run.inlier_mask)
+        assert px.widened == (px.bound[0] > run.options.bound_px + 0.1) == residuals.histograms[1].widened
+        seen.add(px.widened)
+    assert seen == {False, True}
+
+
 def test_the_edges_of_bins_belong_to_the_bin_above() -> None:
     values = np.array([0.0, 0.1, 1.0, 999.0, 1000.0, np.inf, np.nan])
     shown = histogram("px", values, np.array([True] * 3 + [False] * 4), (3.0, 3.0, 3.0))

@@ -159,7 +159,8 @@ def _proofs(trace: Trace, certificate: Certificate | None) -> Iterator[str]:
         reached = 100.0 * ransac.confidence_reached
         yield f"RANSAC drew {ransac.iterations:,} samples and reached a confidence of {reached:.3g} % (Eq. 28)."
     if certificate is not None and certificate.proven:
-        yield f"Proven: no pose within the gravity bound explains more than {certificate.upper_bound}."
+        most = certificate.upper_bound
+        yield f"Proven: no pose within the gravity bound explains more than {most}, and one explains as many."
     elif certificate is not None:
         yield (
             f"Before refinement, no pose within the gravity bound explains more than {certificate.upper_bound}; one "

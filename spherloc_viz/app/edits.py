@@ -81,10 +81,11 @@ class Edits:
             self._changes = Variation()
 
     def write(self, request: SceneRequest) -> None:
-        """Take over the changes of a request."""
+        """Take over the changes of a request; the selection is dropped if it is of another problem."""
         known = request.variation
         with self._lock:
-            self._owner = _owner(request)
+            if _owner(request) != self._owner:
+                self._owner, self._selected = _owner(request), ()
             self._changes = Variation(spoiled=known.spoiled, mended=known.mended, hidden=known.hidden)
 
     def apply(self, request: SceneRequest) -> SceneRequest:

@@ -307,9 +307,10 @@ class Session:
 
     def _view(self) -> PageView:
         """Step, selection, viewer and hidden answers of the page, for its link."""
-        display = self._controls.display
+        display, run = self._controls.display, self._run
+        selected = () if run is None else tuple(run.kept[list(self._edits.places(run.kept))].tolist())
         viewpoint = self._display.canvas.viewpoint()
-        return PageView(self._display.step_key, self._edits.selected, display.theme, display.answers_hidden, viewpoint)
+        return PageView(self._display.step_key, selected, display.theme, display.answers_hidden, viewpoint)
 
     def _open_linked(self, file: str) -> Opened:
         """Open the recording that a link names."""

@@ -267,7 +267,8 @@ def as_text(path: Path, trace: Trace, diagnosis: Diagnosis, recording: Path | No
         # Only now: the layers take half a second.
         from spherloc_viz.layers.outcome import chance, proof, warning
 
-        lines.append(f"  {proof(trace.certificate)}; expected false sets of this size: {chance(trace.certificate)}")
+        proven = proof(trace.certificate, int(np.count_nonzero(trace.inlier_mask)))
+        lines.append(f"  {proven}; expected false sets of this size: {chance(trace.certificate)}")
         lines += [f"  {sentence}" for sentence in (warning(trace.certificate),) if sentence]
     if diagnosis.doubtful:
         lines.append(f"  diagnosis: {diagnosis.cause}. {diagnosis.summary} {diagnosis.advice}".rstrip())

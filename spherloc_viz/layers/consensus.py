@@ -180,7 +180,8 @@ def plans(view: RunView, stage: ConsensusStage) -> list[Plan]:
         graph = partial(_graph, view, nodes, stage.clique[:size], f"{size} of {whole} matches that all agree.")
         out.append(Plan(f"consensus-clique-{size}", title, draw, charts, graph))
     if whole:
-        title, words = "The largest set that agrees", f"{whole} matches that all agree, a full block of the matrix."
+        title, words = "The largest set that agrees", f"{whole} matches that all agree, a full block of the matrix"
+        words += ": the inliers before refinement." if whole == best_support(stage) else "."
         graph = partial(_graph, view, nodes, stage.clique, words)
         out.append(Plan("consensus-clique", title, lambda: _clique(view, stage), charts, graph))
     shown = min(len(stage.support), 1 + style.MAX_DRAWN_ALTERNATIVES)

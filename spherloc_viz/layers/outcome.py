@@ -16,12 +16,27 @@ KNOWABLE = 0.01
 UNKNOWABLE = "the answer cannot be known"
 
 
-def proof(certificate: Certificate) -> str:
-    """Whether a better pose may exist, as part of a sentence."""
+def proof(certificate: Certificate, inliers: int) -> str:
+    """Whether a pose may exist that beats the best known one, as part of a sentence on a run with so many inliers."""
     lower, gap = certificate.lower_bound, certificate.gap
-    if certificate.proven:
+    if not certificate.proven:
+        known = "" if inliers == lower else f" than the {lower} of the best known pose"
+        return f"not proven optimal: no pose explains more than {certificate.upper_bound}, so at most {gap} more{known}"
+    if inliers == lower:
         return f"proven optimal: no pose explains more than {lower}"
-    return f"not proven optimal: no pose explains more than {certificate.upper_bound}, so at most {gap} more"
+    return f"before refinement {lower}, which is proven optimal: no pose explains more"
+
+
+def difference(certificate: Certificate, inliers: int) -> str:
+    """A sentence that says why a run with so many inliers has a certificate of another number; empty if it has not."""
+    if inliers < certificate.lower_bound:
+        return "Refinement makes the squared residuals small, not the count large: matches near the bound can drop out."
+    if inliers > certificate.upper_bound:
+        return (
+            "The certificate counts residuals within the noise bound at poses within the gravity bound; the run's "
+            "count can go beyond either."
+        )
+    return ""
 
 
 def is_knowable(certificate: Certificate) -> bool:
@@ -71,7 +86,7 @@ def _pose(view: RunView, cam_from_map: np.ndarray) -> Frame:
     remark = trace.message.partition(". ")[2]
     inliers = int(np.count_nonzero(trace.inlier_mask))
     total = trace.timings_ms["total"]
-    proven, chances = ("", "") if trace.certificate is None else _certified(trace.certificate)
+    proven, chances = ("", "") if trace.certificate is None else _certified(trace.certificate, inliers)
     caption = f"{inliers} of {len(trace.problem)} matches agree with the pose, found in {total:.1f} ms{proven}. "
     if metrics.rotation_error_deg is None or metrics.translation_error_m is None:
         caption += "The truth is unknown, so the share of agreeing matches is all there is to judge it by."
@@ -79,7 +94,7 @@ def _pose(view: RunView, cam_from_map: np.ndarray) -> Frame:
         verdict = "a success" if metrics.success else "a failure"
         angle, length = angle_text(metrics.rotation_error_deg), view.length_text(metrics.translation_error_m)
         limit = view.length_text(SUCCESS_M)
-        caption += f"It is {angle} and {length} off the truth: {verdict} by the limits of 1° and {limit}."
+        caption += f"The pose is {angle} and {length} off the truth: {verdict} by the limits of 1° and {limit}."
     return Frame(
         caption,
         "success: error < 1° and < 0.1 m   (Sec. VI-A)",
@@ -92,10 +107,11 @@ def _pose(view: RunView, cam_from_map: np.ndarray) -> Frame:
     )
 
 
-def _certified(certificate: Certificate) -> tuple[str, str]:
-    """The proven bounds, as the end of a sentence, and the NFA, as a note."""
-    note = f"Expected false sets of this size: {chance(certificate)}. {warning(certificate)}"
-    return f"; {proof(certificate)}", note.strip()
+def _certified(certificate: Certificate, inliers: int) -> tuple[str, str]:
+    """The proven bounds, as the end of a sentence, and as a note why they differ from the inliers, and the NFA."""
+    chances = f"Expected false sets of this size: {chance(certificate)}."
+    notes = (difference(certificate, inliers), chances, warning(certificate))
+    return f"; {proof(certificate, inliers)}", " ".join(filter(None, notes))
 
 
 def outcome_table(trace: Trace) -> Table:
@@ -121,7 +137,7 @@ def early_table(trace: Trace, judged: Judgement | None) -> Table:
         rows.append(("precision / recall", f"{100 * metrics.precision:.0f} % / {100 * metrics.recall:.0f} %"))
         rows.append(("F1", f"{100 * metrics.f1:.0f} %"))
     if trace.certificate is not None:
-        rows += _certificate_rows(trace.certificate)
+        rows += _certificate_rows(trace.certificate, int(np.count_nonzero(trace.inlier_mask)))
     stages = ", ".join(f"{name} {value:.1f}" for name, value in trace.timings_ms.items() if name != "total")
     rows.append(("time", f"{trace.timings_ms['total']:.1f} ms" + (f" ({stages})" if stages else "")))
     return Table("outcome", ("", "this run"), tuple(rows))
@@ -131,8 +147,8 @@ def _judged(judged: Judgement) -> str:
     return " ".join((f"{judged.outcome}{':' * bool(judged.reasons)}", *judged.reasons))
 
 
-def _certificate_rows(certificate: Certificate) -> list[tuple[str, str]]:
-    rows = [("certificate", proof(certificate).capitalize())]
+def _certificate_rows(certificate: Certificate, inliers: int) -> list[tuple[str, str]]:
+    rows = [("certificate", proof(certificate, inliers).capitalize())]
     rows.append(("expected false sets", f"{chance(certificate)} of {certificate.lower_bound} matches"))
     if not is_knowable(certificate):
         rows.append(("warning", UNKNOWABLE))

@@ -1,6 +1,6 @@
 """Residuals of the matches at a run's pose, scores of its inliers, and the history of RANSAC."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
 from typing import Literal
@@ -41,8 +41,10 @@ class Histogram:
     wrong: IntArray
     """(B,) number of wrong matches."""
     bound: tuple[float, float, float]
-    """The smallest, the median and the largest bound of a match: one number where the image stretches alike and gravity
-    is exact."""
+    """The smallest, the median and the largest bound by which the run's inliers were chosen: one number where the image
+    stretches alike and gravity is exact."""
+    widened: bool = False
+    """Whether these bounds allow for gravity's error, besides the noise."""
 
 
 @lru_cache(maxsize=4)
@@ -116,10 +118,15 @@ def residuals_of(trace: Trace) -> Residuals | None:
     px[aligned.index] = residuals_px(aligned, aligned.align_pose(trace.cam_from_map))
     deg[aligned.index] = _angles_deg(problem.bearings, transform(trace.cam_from_map, problem.points))[aligned.index]
     right, judged = right_ones(trace)
-    bounds = bounds_of(aligned, trace.options.bound_px)
+    bounds = run_bounds(trace)
+    limits_px = verdicts(trace).limit_px[aligned.index]
+    # Both bounds are this wide, or neither: gravity's error is added to the noise in px and in radians.
+    widened = bool(np.any(limits_px > bounds.noise_px))
+    level = replace(aligned, gravity_bound_rad=0.0)
+    limits_rad = bounds.radians if widened else bounds_of(level, bounds.noise_px).radians
     histograms = (
-        histogram("px", px, right, _middle(bounds.pixels)),
-        histogram("deg", deg, right, _middle(np.degrees(bounds.radians))),
+        histogram("px", px, right, _middle(limits_px), widened),
+        histogram("deg", deg, right, _middle(np.degrees(limits_rad)), widened),
     )
     return Residuals(px, deg, histograms, judged, int(np.count_nonzero(~problem.usable)))
 
@@ -138,14 +145,20 @@ def _angles_deg(bearings: FloatArray, points: FloatArray) -> FloatArray:
     return np.degrees(2.0 * np.arctan2(np.sqrt(squares[0]), np.sqrt(squares[1])))
 
 
-def histogram(unit: Unit, values: FloatArray, right: NDArray[np.bool_], bound: tuple[float, float, float]) -> Histogram:
+def histogram(
+    unit: Unit,
+    values: FloatArray,
+    right: NDArray[np.bool_],
+    bound: tuple[float, float, float],
+    widened: bool = False,
+) -> Histogram:
     """Histogram of values (N,) of 0 or more, in bins of equal ratios; values that are not finite are in the last
     bin."""
     edges = edges_of(unit)
     place = np.searchsorted(edges, np.nan_to_num(values, nan=np.inf), "right").astype(np.int64)
     count = len(edges) + 1
     of_right = np.bincount(place[right], minlength=count)
-    return Histogram(unit, edges, place, of_right, np.bincount(place, minlength=count) - of_right, bound)
+    return Histogram(unit, edges, place, of_right, np.bincount(place, minlength=count) - of_right, bound, widened)
 
 
 def scores_table(trace: Trace) -> Table:

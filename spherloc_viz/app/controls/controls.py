@@ -123,6 +123,14 @@ def preset_names(known: Sequence[Preset], hidden: bool) -> tuple[str, ...]:
     return (NO_PRESET, *titles)
 
 
+def story_html(preset: Preset, changed: bool) -> str:
+    """A preset's story, dimmed if the page was ``changed`` since. Both take the same room, that of the longer text."""
+    after = f"Changed from the preset {preset.title}: {preset.story}"
+    texts = ((after, DIM),) if changed else ((after, "visibility:hidden"), (preset.story, ""))
+    words = "".join(f'<div style="grid-area:1/1;{look}">{escape(text)}</div>' for text, look in texts)
+    return box(f'<div style="display:grid">{words}</div>', "font-size:12px")
+
+
 UNDO, REDO, NEW_SEED = "Undo", "Redo", "New seed"
 
 
@@ -174,6 +182,8 @@ class Controls:
         self._sequence: SceneRequest | None = None
         """What the sequence that was started last is of."""
         self._presets = presets(catalog)
+        self._told: Preset | None = None
+        """The preset that was shown last, for as long as its scene is shown."""
         self.slow = SlowRun(gui, f"spherloc-clock-{client.client_id}")
         self._moves = gui.add_button_group("", (UNDO, REDO, NEW_SEED))
         self._moves.on_click(self._move)
@@ -279,7 +289,8 @@ class Controls:
         self._movable.visible = self._catalog.synthetic(label) is not None
 
     def _follow_preset(self, request: RunRequest, hidden: bool) -> None:
-        """Show the preset's name and story for as long as the page is as it says; both are answers."""
+        """Show the preset's name for as long as the page is as it says, and its story for as long as its scene is
+        shown, so that a slider that changes the preset does not move under the pointer. Both are answers."""
         names = preset_names(self._presets, hidden)
         if self._preset.options != names:
             self._preset.options = names
@@ -287,8 +298,11 @@ class Controls:
         place = next((place for place, one in enumerate(asked, 1) if one == request), 0)
         if self._preset.value != names[place]:
             put(self._preset, names[place])
-        told = place > 0 and not hidden
-        html = box(escape(self._presets[place - 1].story), f"font-size:12px;{DIM}") if told else ""
+        if place > 0:
+            self._told = self._presets[place - 1]
+        elif self._told is not None and self._told.scene.scene != request.scene.scene:
+            self._told = None
+        html = "" if hidden or self._told is None else story_html(self._told, changed=place == 0)
         if self._story.content != html:
             self._story.content, self._story.visible = html, bool(html)
 

@@ -69,11 +69,20 @@ def graph_note(graph: Graph, edges: Edges) -> str:
     """A note on what is left out and what can be pressed."""
     nodes, drawn = graph.nodes, len(edges.marked) + len(edges.others)
     shown = int(np.count_nonzero(graph.shown))
-    thin = f"{len(nodes.number):,} of {nodes.total:,} {_many(nodes.name)} are drawn, evenly from clique and rest. "
-    rule = thin if len(nodes.number) < nodes.total else ""
-    count = f"{drawn:,} of {edges.total:,} edges are drawn, evenly"
-    lines = count if drawn < edges.total else f"All {edges.total:,} edges are drawn"
-    return f"{rule}{lines}; the matrix has all of its {shown:,} nodes. Press a node or a cell to select its matches."
+    press = "Press a node or a cell to select its matches."
+    if shown == 1:
+        return f"One {nodes.name}: no edge yet, and a matrix of one cell. {press}"
+    said = []
+    if shown == len(nodes.number) < nodes.total:
+        said.append(f"{shown:,} of {nodes.total:,} {_many(nodes.name)} are drawn, evenly from clique and rest.")
+    if drawn < edges.total:
+        said.append(f"{drawn:,} of the {edges.total:,} edges between them are drawn, evenly.")
+    elif edges.total:
+        said.append(f"All {edges.total:,} edges are drawn." if edges.total > 1 else "The only edge is drawn.")
+    else:
+        said.append("No two of them agree yet, so there is no edge.")
+    said.append(f"The matrix has a row and a column for each of the {shown:,} nodes.")
+    return " ".join([*said, press])
 
 
 def _many(name: str) -> str:
