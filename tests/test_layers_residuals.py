@@ -63,7 +63,7 @@ def test_the_bound_shown_is_the_one_that_chose_the_inliers(scene_of: SceneOf) ->
     problem = scene_of("mei", gravity_error_deg=0.5).problem()
     seen = set()
     for sd_deg in (np.inf, 0.0):
-        run = estimate(problem, "ransac-2p", RansacOptions(gravity_sd_deg=sd_deg))
+        run = estimate(problem, "ransac-2p", RansacOptions(gravity_sd_deg=sd_deg, bound_px=2.0))
         residuals = residuals_of(run)
         assert residuals is not None
         px = residuals.histograms[0]
