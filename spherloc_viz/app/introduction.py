@@ -1,4 +1,4 @@
-"""The introduction on a first visit: four moments of a run, half a minute (``introduction.js`` shows them)."""
+"""The introduction on a first visit: four moments of a run (``introduction.js`` shows them)."""
 
 import json
 from collections.abc import Sequence

@@ -1,10 +1,11 @@
 // Shows the introduction that Python put on the page (data-introduction) on the first visit: a card over the canvas with
-// a few moments, each of which takes the page to a step. It goes on by itself until somebody presses elsewhere, can be
-// skipped, and is not shown again: the browser remembers it. Nor is it shown to whoever comes by a link. An element of the class "introduce" shows it again.
+// a few moments, each of which takes the page to a step. Only the reader turns it: Next, Back and Skip, the arrow keys and
+// Escape. It is not shown again: the browser remembers it. Nor is it shown to whoever comes by a link. An element of the
+// class "introduce" shows it again.
 (() => {
-  const SEEN = "spherloc-introduction", EVERY_MS = 250, MOMENT_MS = 8000;
+  const SEEN = "spherloc-introduction", EVERY_MS = 250;
   const linked = location.hash.length > 1;
-  let card = null, told = null, index = 0, left = 0, paused = false;
+  let card = null, told = null, index = 0;
 
   const remembered = () => {
     try {
@@ -29,35 +30,49 @@
     return made;
   }
 
-  function draw() {
-    const { title, words } = told.moments[index], last = index === told.moments.length - 1;
-    const skip = element("button", "", "Skip"), next = element("button", "main", last ? "Begin" : "Next");
-    skip.addEventListener("click", end);
-    next.addEventListener("click", () => (last ? end() : show(index + 1)));
-    const row = element("div", "row", "");
-    row.append(element("span", "count", `${index + 1} of ${told.moments.length}`), ...(last ? [] : [skip]), next);
-    const bar = element("div", "bar", "");
-    bar.append(element("div", "", ""));
-    card.replaceChildren(element("div", "title", title), element("div", "", words), row, bar);
+  function button(className, words, pressed) {
+    const made = element("button", className, words);
+    made.addEventListener("click", pressed);
+    return made;
   }
+
+  function build() {
+    card = element("div", "introduction", "");
+    card.setAttribute("role", "dialog");
+    card.setAttribute("aria-label", "Introduction");
+    card.setAttribute("aria-live", "polite");
+    const row = element("div", "row", "");
+    row.append(
+      element("span", "count", ""),
+      button("skip", "Skip", end),
+      button("back", "Back", () => turn(-1)),
+      button("main", "Next", () => (index === told.moments.length - 1 ? end() : turn(1))),
+    );
+    card.append(element("div", "title", ""), element("div", "told", ""), row);
+    document.body.append(card);
+  }
+
+  const turn = (by) => show(Math.min(Math.max(index + by, 0), told.moments.length - 1));
 
   function show(number) {
     index = number;
-    left = MOMENT_MS;
-    draw();
-    go(told.moments[index].step);
+    const { title, words, step } = told.moments[index], last = index === told.moments.length - 1;
+    const part = (name) => card.querySelector(`.${name}`);
+    part("title").textContent = title;
+    part("told").textContent = words;
+    part("count").textContent = `${index + 1} of ${told.moments.length}`;
+    part("skip").hidden = last;
+    part("back").hidden = index === 0;
+    part("main").textContent = last ? "Begin" : "Next";
+    if (document.activeElement === document.body || document.activeElement.hidden) part("main").focus();
+    go(step);
   }
 
   function begin() {
     const source = document.querySelector("[data-introduction]");
     if (!source || card || !document.querySelector("canvas")) return;
     told = JSON.parse(source.dataset.introduction);
-    card = element("div", "introduction", "");
-    card.setAttribute("role", "dialog");
-    card.setAttribute("aria-label", "Introduction");
-    card.setAttribute("aria-live", "polite");
-    document.body.append(card);
-    paused = false;
+    build();
     show(0);
     place();
   }
@@ -90,20 +105,17 @@
       return;
     }
     place();
-    if (paused || document.hidden) return;
-    left -= EVERY_MS;
-    const share = 100 * (1 - Math.max(0, left) / MOMENT_MS);
-    card.querySelector(".bar > div").style.width = `${share}%`;
-    if (left <= 0 && index < told.moments.length - 1) show(index + 1);
   }, EVERY_MS);
 
-  addEventListener("pointerdown", (event) => {
-    if (card && event.isTrusted && !(event.target instanceof Element && event.target.closest(".introduction"))) paused = true;
-  }, true);
   addEventListener("keydown", (event) => {
     if (!card || !event.isTrusted) return;
+    const by = { ArrowLeft: -1, ArrowRight: 1 }[event.key];
+    const taken = event.target instanceof Element && event.target.closest("input, textarea, [role=slider], [role=tab]");
     if (event.key === "Escape") end();
-    else if (!(event.target instanceof Element && event.target.closest(".introduction"))) paused = true;
+    else if (by && !taken) {
+      event.stopPropagation(); // the canvas turns by the arrow keys
+      turn(by);
+    }
   }, true);
   addEventListener("click", (event) => {
     if (!(event.target instanceof Element) || !event.target.closest(".introduce")) return;
