@@ -208,8 +208,8 @@ def _measures(what: Explanation) -> str:
     sides = [
         (name, residual, pairs)
         for name, residual, pairs in (
-            ("at the estimate", what.estimate, what.at_estimate),
-            ("at the truth", what.truth, what.at_truth),
+            ("estimate", what.estimate, what.at_estimate),
+            ("truth", what.truth, what.at_truth),
         )
         if residual is not None and pairs is not None
     ]

@@ -156,7 +156,7 @@ def rings(places: FloatArray, numbers: Sequence[int]) -> list[str]:
             # Beside the ring, on the side where there is more room, and within the drawing.
             left = x > 0.5 * WIDTH
             parts.append(
-                f'<text x="{x + (-1.4 if left else 1.4) * RING:.0f}" y="{max(y + 11.0, 30.0):.0f}" font-size="32" '
+                f'<text x="{x + (-1.4 if left else 1.4) * RING:.0f}" y="{max(y + 15.0, 40.0):.0f}" font-size="42" '
                 f'text-anchor="{"end" if left else "start"}" font-weight="600" fill="{color}" stroke="#ffffff" '
                 f'stroke-width="3" paint-order="stroke">{number}</text>'
             )

@@ -47,7 +47,7 @@ def graph_svg(graph: Graph, edges: Edges, lit: NDArray[np.int64], kept: NDArray[
     """The drawing. ``lit`` are the selected nodes, ``kept`` (N,) the numbers of the matches on the page."""
     nodes = graph.nodes
     parts = [
-        shapes.text(0.0, 12.0, f"{_many(nodes.name)} and {_edge(nodes.name)}", more=FONT),
+        shapes.text(0.0, 12.0, _heading(nodes.name), more=FONT),
         shapes.text(MATRIX_PX[0], 12.0, "matrix, clique first", more=FONT),
         *_edges(graph, edges),
         *_nodes(graph, lit, kept),
@@ -89,8 +89,9 @@ def _many(name: str) -> str:
     return "matches" if name == "match" else f"{name}s"
 
 
-def _edge(name: str) -> str:
-    return "their overlaps" if name == "ball" else "which matches agree"
+def _heading(name: str) -> str:
+    """What the drawing of the graph shows, no wider than the drawing."""
+    return "balls and their overlaps" if name == "ball" else f"{_many(name)} and which agree"
 
 
 def _places(graph: Graph) -> NDArray[np.float64]:

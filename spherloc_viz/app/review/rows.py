@@ -22,6 +22,7 @@ PREVIOUS_KEY, NEXT_KEY = "[", "]"
 """Open the run before and the next one: viser's canvas has letters and arrows."""
 RULE = "border-top:1px solid rgba(128,140,160,.18)"
 CUT = "white-space:nowrap;overflow:hidden;text-overflow:ellipsis"
+TWO_LINES = "max-height:2.7em;overflow:hidden;overflow-wrap:anywhere"
 OPENED = "rgba(60,130,230,.2)"
 """Behind the row of the run that is open."""
 
@@ -79,9 +80,8 @@ def _lines(row: RunRow, now: datetime, hidden: bool) -> str:
     """What the run is, what came out, and numbers; below, what a reviewer wrote."""
     title = words.untold_title_of(row) if hidden else words.title_of(row)
     name = (
-        f'<div style="display:flex;gap:.5em"><span style="flex:1;font-weight:600;{CUT}">'
-        f"{escape(title)}</span>"
-        f'<span style="{DIM};white-space:nowrap">{escape(words.moment(row.created, now))}</span></div>'
+        f'<div style="{TWO_LINES}"><span style="{DIM};float:right;padding-left:.5em">'
+        f'{escape(words.moment(row.created, now))}</span><span style="font-weight:600">{escape(title)}</span></div>'
     )
     method = f"{escape(row.estimator)} #{row.seed}"
     if hidden:
