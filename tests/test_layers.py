@@ -26,6 +26,7 @@ from spherloc_viz import style
 from spherloc_viz.layers import paint, steps
 from spherloc_viz.layers.outcome import outcome_table
 from spherloc_viz.layers.primitives import Balls, Curve, Label, Mesh, Picture, Points, SceneItem, Segments, Textured
+from spherloc_viz.layers.translation import MAX_SURFACES
 
 SCENES = sorted(name for name, path in bundled_scenes().items() if 'kind = "synthetic"' in path.read_text())
 
@@ -327,13 +328,24 @@ def test_clique_balls_are_the_clique_and_its_edges_are_gold(mc: Trace) -> None:
     stage = mc.stage(TranslationStage)
     assert stage is not None
     picture = at(mc, "clique")
-    balls, others, edges = (item(picture, f"balls/{name}") for name in ("clique", "others", "edges"))
-    assert isinstance(balls, Balls) and isinstance(others, Balls) and isinstance(edges, Segments)
+    balls, edges = (item(picture, f"balls/{name}") for name in ("clique", "edges"))
+    circled = {name: item(picture, f"balls/{name}-circles") for name in ("clique", "others")}
+    assert isinstance(balls, Balls) and isinstance(edges, Segments)
     centres = item(picture, "balls/clique-centres")
     assert isinstance(centres, Points) and len(centres.positions) == len(stage.clique)
-    assert is_color(balls.colors, style.CLIQUE).all() and len(balls.centers) >= style.MAX_DRAWN_BALLS // 2
+    assert is_color(balls.colors, style.CLIQUE).all() and len(balls.centers) == MAX_SURFACES
     assert set(balls.radii_m) <= set(stage.radii_m[stage.clique])
-    assert len(balls.centers) + len(others.centers) == style.MAX_DRAWN_BALLS < len(stage.radii_m)
+    assert balls.ids is not None
+    pairs = {tuple(pair): ball for ball, pair in enumerate(stage.pairs.tolist())}
+    drawn = [pairs[tuple(pair)] for pair in balls.ids]
+    for name, lines in circled.items():
+        assert isinstance(lines, Segments) and lines.ids is not None
+        own = np.array([pairs[tuple(pair)] for pair in lines.ids])
+        assert (np.isin(own, stage.clique) == (name == "clique")).all()
+        offset = lines.points - stage.centres_m[own][:, None]
+        np.testing.assert_allclose(np.linalg.norm(offset, axis=2), np.tile(stage.radii_m[own][:, None], 2))
+        drawn += np.unique(own).tolist()
+    assert len(drawn) == len(set(drawn)) == style.MAX_DRAWN_BALLS < len(stage.radii_m)
     members = {tuple(centre) for centre in stage.centres_m[stage.clique]}
     for ends, gold in zip(edges.points, is_color(edges.colors, style.CLIQUE), strict=True):
         assert gold == ({tuple(ends[0]), tuple(ends[1])} <= members)
@@ -344,7 +356,9 @@ def test_thinning_is_stated_with_its_numbers(mc: Trace) -> None:
     assert yaw is not None and translation is not None
     assert len(yaw.lo_rad) > style.MAX_DRAWN_ARCS and f"{len(yaw.lo_rad):,}" in at(mc, "yaw-arcs").step.note
     assert len(translation.radii_m) > style.MAX_DRAWN_BALLS
-    assert f"{style.MAX_DRAWN_BALLS} of {len(translation.radii_m)} balls" in at(mc, "clique").step.note
+    note = at(mc, "clique").step.note
+    assert f"{style.MAX_DRAWN_BALLS} of {len(translation.radii_m)} balls" in note
+    assert f"{MAX_SURFACES} balls have a surface" in note
 
 
 def test_yaw_chart_shows_overlap_truth_and_estimate(mc: Trace) -> None:

@@ -354,6 +354,14 @@ def circle(centre: FloatArray, radius_m: float) -> FloatArray:
     return centre + radius_m * np.column_stack([np.cos(angle), 0.0 * angle, np.sin(angle)])
 
 
+def level_circles(centers: FloatArray, radii_m: FloatArray) -> FloatArray:
+    """Lines (48 B, 2, 3) of the level circles around balls (B, 3), (B,)."""
+    turns = np.linspace(0.0, 2.0 * np.pi, 49)
+    level = np.column_stack([np.cos(turns), 0.0 * turns, np.sin(turns)])
+    lines = centers[:, None] + radii_m[:, None, None] * level
+    return np.stack([lines[:, :-1], lines[:, 1:]], axis=2).reshape(-1, 2, 3)
+
+
 def ball_boxes(centers: FloatArray, radii_m: FloatArray) -> FloatArray:
     """Points (K, 3) to all sides of balls (B, 3), (B,): of all of a few; of more, of the denser half.
 

@@ -14,7 +14,7 @@ from spherloc.types import ByteArray, FloatArray, IntArray
 from spherloc_viz import style
 from spherloc_viz.layers import ring
 from spherloc_viz.layers.agreement import agreement, subset
-from spherloc_viz.layers.frame import even, one_color
+from spherloc_viz.layers.frame import even, level_circles, one_color
 from spherloc_viz.layers.primitives import Balls, Picture, Points, SceneItem, Segments
 from spherloc_viz.layers.residuals import run_bounds, verdicts
 
@@ -26,8 +26,6 @@ HALO = 1.8
 INNER, OUTER = 1.06, 1.24
 """Radii of the band of the selected arcs, in sphere radii: between the sphere and the ring of all arcs."""
 STEP_RAD = np.radians(4.0)
-CORNERS = 48
-"""Number of points of the horizontal circle around a ball."""
 DOT_CORNERS = 20
 """Number of points of each circle around a dot."""
 LIFT = 0.3
@@ -164,10 +162,7 @@ def _balls(items: dict[str, SceneItem], trace: Trace, selected: tuple[int, ...])
     by_size = own[np.argsort(stage.radii_m[own], kind="stable")]
     small = by_size[: max(1, len(by_size) // 2)] if len(by_size) > style.MAX_SELECTED_BALLS else by_size
     drawn = even(small, style.MAX_SELECTED_BALLS)
-    turns = np.linspace(0.0, 2.0 * np.pi, CORNERS + 1)
-    level = np.column_stack([np.cos(turns), 0.0 * turns, np.sin(turns)])
-    lines = stage.centres_m[drawn][:, None] + stage.radii_m[drawn][:, None, None] * level
-    ends = np.stack([lines[:, :-1], lines[:, 1:]], axis=2).reshape(-1, 2, 3)
+    ends = level_circles(stage.centres_m[drawn], stage.radii_m[drawn])
     marks = Segments("selection/balls", LAYER, ends, one_color(style.SELECTED, len(ends)), 2.0)
     return [marks], _note("balls", len(drawn), len(own), agreeing)
 

@@ -13,12 +13,14 @@ from spherloc.trace import ConsensusStage, TranslationStage
 from spherloc.types import BoolArray, FloatArray, IntArray
 from spherloc_viz import style
 from spherloc_viz.layers.agreement import agreement
-from spherloc_viz.layers.frame import Frame, Plan, RunView, ball_boxes, even, growing, one_color
+from spherloc_viz.layers.frame import Frame, Plan, RunView, ball_boxes, even, growing, level_circles, one_color
 from spherloc_viz.layers.primitives import Balls, Focus, Graph, Label, Nodes, Points, SceneItem, Segments
 from spherloc_viz.layers.ring import GOLDEN
 
-OPACITIES = ((4, 0.3), (12, 0.22), (35, 0.14), (np.inf, 0.1))
-"""Largest number of balls, and their opacity: few balls are seen well, and many do not hide things behind them."""
+OPACITIES = ((4, 0.3), (np.inf, 0.2))
+"""Largest number of surfaces, and their opacity: few balls are seen well, and many do not hide things behind them."""
+MAX_SURFACES = 10
+"""If there are more balls, the others are drawn as circles."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,23 +136,39 @@ class BallSet:
         take = min(len(halves[0]), max(most // 2, most - len(halves[1])))
         return np.concatenate([even(halves[0], take), even(halves[1], most - take)])
 
+    def solid(self, drawn: IntArray, inside: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Mask (M,) of the balls with a surface: some of the smaller half of the drawn ones of a mask (M,), or of all
+        if none of them is. A large surface would contain the others."""
+        members = drawn[inside[drawn]] if inside[drawn].any() else drawn
+        return self.mask(even(members[: max(MAX_SURFACES, len(members) // 2)], MAX_SURFACES))
+
     def items(
         self, view: RunView, shown: IntArray, inside: NDArray[np.bool_], color: style.RGB = style.CLIQUE
     ) -> tuple[SceneItem, ...]:
-        """Some balls, the smallest first, their centres and their overlaps; those of a mask (M,) in their colour."""
+        """Some balls, the smallest first, their centres and their overlaps; those of a mask (M,) in their colour.
+
+        Many translucent surfaces hide each other and take seconds without a graphics card, so that most balls are
+        drawn as their level circle.
+        """
         stage, drawn = self.stage, self.drawn(shown, inside)
         items: list[SceneItem] = [self._edges(drawn, inside, color)]
         looked_at = drawn[inside[drawn]] if inside[drawn].any() else drawn
         # With more, the centres would hide the few small balls that a step is about.
         dot_m = min(0.02 * view.sphere_m, 0.1 * float(np.median(stage.radii_m[looked_at])))
-        faint = next(opacity for most, opacity in OPACITIES if len(drawn) <= most)
+        solid = self.solid(drawn, inside)
+        faint = next(opacity for most, opacity in OPACITIES if np.count_nonzero(solid) <= most)
         groups = (("balls/others", ~inside, style.UNDECIDED, faint), ("balls/clique", inside, color, 1.6 * faint))
         for name, members, shade, opacity in groups:
-            chosen, centres = drawn[members[drawn]], shown[members[shown]]
-            if len(chosen):
+            chosen, centres = members & solid, shown[members[shown]]
+            if chosen.any():
                 places, radii = stage.centres_m[chosen], stage.radii_m[chosen]
                 ids = stage.pairs[chosen].astype(np.int64)
-                items.append(Balls(name, "balls", places, radii, one_color(shade, len(chosen)), opacity, ids=ids))
+                items.append(Balls(name, "balls", places, radii, one_color(shade, len(ids)), opacity, ids=ids))
+            outlined = drawn[(members & ~solid)[drawn]]
+            if len(outlined):
+                lines = level_circles(stage.centres_m[outlined], stage.radii_m[outlined])
+                ids = np.repeat(stage.pairs[outlined].astype(np.int64), len(lines) // len(outlined), axis=0)
+                items.append(Segments(f"{name}-circles", "balls", lines, one_color(shade, len(lines)), 1.0, ids=ids))
             if len(centres):
                 dots = one_color(shade, len(centres))
                 items.append(Points(f"{name}-centres", "balls", stage.centres_m[centres], dots, dot_m))
@@ -325,13 +343,17 @@ def _turned(view: RunView, balls: BallSet) -> FloatArray:
 
 def _note(balls: BallSet, shown: IntArray, inside: np.ndarray) -> str:
     """A note on the rules by which balls were left out."""
-    drawn = len(balls.drawn(shown, inside))
-    if drawn == len(shown):
-        return balls.stage.rule
-    return (
-        f"{balls.stage.rule} {drawn} of {len(shown):,} balls are drawn with the overlaps between them: an even "
-        "sample of the smaller half of the clique, and of the others; of the rest only the centres."
-    )
+    drawn = balls.drawn(shown, inside)
+    parts = [balls.stage.rule]
+    if len(drawn) < len(shown):
+        parts.append(
+            f"{len(drawn)} of {len(shown):,} balls are drawn with the overlaps between them: an even sample of the "
+            "smaller half of the clique, and of the others; of the rest only the centres."
+        )
+    solid = np.count_nonzero(balls.solid(drawn, inside))
+    if solid < len(drawn):
+        parts.append(f"{solid} balls have a surface, the others their level circle.")
+    return " ".join(parts)
 
 
 def _from_truth(view: RunView, position: FloatArray) -> str:

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from spherloc.geometry import yaw_rotation
 from spherloc.types import FloatArray
-from spherloc_viz.layers.frame import RING_ROOM, SPHERE_ROOM, ball_boxes, circle, dense_points, sphere_box
-from spherloc_viz.layers.primitives import Balls, Label, Mesh, Picture, Points, SceneItem, Segments, Textured
+from spherloc_viz.layers.frame import RING_ROOM, SPHERE_ROOM, circle, dense_points, sphere_box
+from spherloc_viz.layers.primitives import Label, Mesh, Picture, Points, SceneItem, Segments, Textured
 
 CELLS = 160
 """Number of cells of the grid along the mesh's longest side."""
@@ -383,11 +383,8 @@ def _subject(name: str, picture: Picture) -> FloatArray:
     items = {item.name: item for item in picture.scene}
     if name == "Sphere":
         return _sphere(items["sphere/surface"], any(item.layer == "yaw ring" for item in picture.scene))
-    if name == "Balls":
-        for key in ("balls/clique", "balls/others"):
-            balls = items.get(key)
-            if isinstance(balls, Balls):
-                return ball_boxes(balls.centers, balls.radii_m)
+    if name == "Balls" and picture.focus.view == "Balls":
+        return picture.focus.points
     points, surface = items["map/points"], items["sphere/surface"]
     assert isinstance(points, Points) and isinstance(surface, Mesh)
     lines = [
